@@ -33,13 +33,13 @@ import httpx
 from benchmarks.chaos_kind import ChainOptions, undisturbed
 from benchmarks.chaos_machine import BLOWS, Blow, Machine, small_disk
 
-from octasplat.engine.operations.reconstruct import options_of
+from octasplat.engine.dataset.synthetic import SyntheticDatasetConfig, write_synthetic_dataset
+from octasplat.engine.operations.reconstruct import options_from_json
 from octasplat.engine.pipeline import reconstruct
-from octasplat.engine.scene.generated import GeneratedSceneConfig, write_generated_scene
-from octasplat.workers.client.api import Api, ServiceError, Unreachable
-from octasplat.workers.client.upload import scene_files, upload_scene
-from octasplat.workers.store.opening import open_storage
-from octasplat.workers.store.trees import read_manifest
+from octasplat.workers.client.api import Api, ServiceError, ServiceUnreachableError
+from octasplat.workers.client.upload import list_scene_files, upload_scene
+from octasplat.workers.storage.factory import open_storage
+from octasplat.workers.storage.trees import read_manifest
 
 IN_FLIGHT = 20
 OVER = ("succeeded", "failed", "canceled")
@@ -83,7 +83,7 @@ class Run:
             try:
                 with Api(self.machine.address, self.machine.token) as api:
                     return ask(api)
-            except (Unreachable, ServiceError, httpx.HTTPError) as error:
+            except (ServiceUnreachableError, ServiceError, httpx.HTTPError) as error:
                 refused = isinstance(error, ServiceError) and error.status not in (500, 502, 503, 504, 507)
                 if refused or time.monotonic() > deadline:
                     raise
@@ -145,7 +145,7 @@ class Run:
         found: list[str] = []
         storage = open_storage(self.machine.data / "store", floor_bytes=0)
         with Api(self.machine.address, self.machine.token) as api:
-            listed = {job["id"]: job for job in api.pages("/v1/jobs", "jobs", limit=200)}
+            listed = {job["id"]: job for job in api.iterate_pages("/v1/jobs", "jobs", limit=200)}
             if set(listed) != set(self.accepted):
                 found.append(f"{len(self.accepted)} jobs were accepted and {len(listed)} are there")
             for job_id in self.accepted:
@@ -178,7 +178,7 @@ class Run:
     def report(self) -> dict[str, Any]:
         """Numbers of the run, after :meth:`faults`."""
         with Api(self.machine.address, self.machine.token) as api:
-            jobs = list(api.pages("/v1/jobs", "jobs", limit=200))
+            jobs = list(api.iterate_pages("/v1/jobs", "jobs", limit=200))
         return {
             "jobs": len(self.accepted),
             "kinds": dict(Counter(job["kind"] for job in jobs)),
@@ -261,14 +261,14 @@ def _is_compared(name: str) -> bool:
 
 def make_scene(folder: Path) -> Path:
     """A generated scene of eight tiny photographs."""
-    config = GeneratedSceneConfig(views=8, width_px=32, height_px=24, samples_per_side=1, points=300)
-    write_generated_scene(folder, config)
+    config = SyntheticDatasetConfig(views=8, width_px=32, height_px=24, samples_per_side=1, points=300)
+    write_synthetic_dataset(folder, config)
     return folder
 
 
 def undisturbed_reconstruction(scene: Path, folder: Path) -> dict[str, bytes]:
     """Contents by name of what must not depend on what happens on the way."""
-    run = reconstruct(scene, folder, options_of(RECONSTRUCTION).config(), threads=1)
+    run = reconstruct(scene, folder, options_from_json(RECONSTRUCTION).config(), threads=1)
     files = (path for path in run.rglob("*") if path.is_file())
     named = {path.relative_to(run).as_posix(): path for path in files}
     return {name: path.read_bytes() for name, path in named.items() if _is_compared(name)}
@@ -276,7 +276,7 @@ def undisturbed_reconstruction(scene: Path, folder: Path) -> dict[str, bytes]:
 
 def prepare(run: Run, *, chains: int, reconstructions: int, steps: int, seconds: float) -> None:
     """Upload the scene and fill the queue."""
-    run.photographs = {file.name: file.path.read_bytes() for file in scene_files(run.scene)}
+    run.photographs = {file.name: file.path.read_bytes() for file in list_scene_files(run.scene)}
     run.dataset = run.patiently(lambda api: upload_scene(api, run.scene))["id"]
     for number in range(max(chains, reconstructions)):
         if number < reconstructions:

@@ -14,8 +14,8 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from octasplat.engine.errors import Cancelled
 from octasplat.engine.events import CheckpointWritten, StageFinished, StageProgress, StageStarted
-from octasplat.workers.work.kinds import JobKind, register
-from octasplat.workers.work.task import Task
+from octasplat.workers.worker.job_kinds import JobKind, register
+from octasplat.workers.worker.task import Task
 
 EVERY = 5
 RESULT_BLOCKS = 20_000
@@ -76,16 +76,16 @@ def run(task: Task) -> None:
     else:
         kept = json.loads(newest.read_text())
         step, state = kept["step"], bytes.fromhex(kept["state"])
-    task.listener(StageStarted("train", options.steps))
+    task.progress(StageStarted("train", options.steps))
     while step < options.steps:
         time.sleep(options.seconds)
         shut = options.gate and step == options.steps - 1 and not Path(options.gate).exists()
         if shut and not task.should_stop():
-            task.listener(StageProgress("train", step, options.steps))
+            task.progress(StageProgress("train", step, options.steps))
             continue
         step += 1
         state = link(state, step)
-        task.listener(StageProgress("train", step, options.steps))
+        task.progress(StageProgress("train", step, options.steps))
         stop = task.should_stop()
         if stop or step % EVERY == 0:
             path = checkpoints / f"iteration_{step:07d}.npz"
@@ -94,10 +94,10 @@ def run(task: Task) -> None:
                 handle.flush()
                 os.fsync(handle.fileno())
             path.with_suffix(".tmp").replace(path)
-            task.listener(CheckpointWritten(step, str(path)))
+            task.progress(CheckpointWritten(step, str(path)))
         if stop and step < options.steps:
             raise Cancelled("stopped")
-    task.listener(StageFinished("train", 0.0))
+    task.progress(StageFinished("train", 0.0))
     (task.results / "chain.bin").write_bytes(result_of(state))
 
 

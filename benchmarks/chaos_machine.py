@@ -134,7 +134,7 @@ class Machine:
 
     def jobs(self) -> list[psutil.Process]:
         """The children of the worker."""
-        return self.below("octasplat.workers.work.child")
+        return self.below("octasplat.workers.worker.child_main")
 
     def worker(self) -> list[psutil.Process]:
         """The worker that takes jobs."""

@@ -35,9 +35,9 @@ from benchmarks.chaos_machine import ROOT, Machine
 from PIL import Image
 from psycopg import sql
 
-from octasplat.workers.client.upload import scene_files, upload_scene
+from octasplat.workers.client.upload import list_scene_files, upload_scene
+from octasplat.workers.db.migrate import OWN_COMPONENT, Migration, apply_step
 from octasplat.workers.postgres.embedded import EmbeddedPostgres
-from octasplat.workers.records.migrate import OURS, Step, apply_step
 
 STEPS, STEP_SECONDS = 60, 0.1
 CLIENTS, PHOTOGRAPHS, SIDE_PX = 3, 8, 1000
@@ -122,7 +122,7 @@ class Upheavals:
         column = sql.Identifier(f"of_{name}")
         with self.connect() as connection:
             text = sql.SQL("").join(sql.SQL(COLUMN).format(sql.Identifier(t), column) for t in tables)
-            step = Step(OURS, f"9999_{name}.sql", text.as_string(connection))
+            step = Migration(OWN_COMPONENT, f"9999_{name}.sql", text.as_string(connection))
             changing = threading.Thread(target=apply_step, args=(connection, step))
             changing.start()
             while changing.is_alive():
@@ -225,7 +225,7 @@ UPHEAVALS: tuple[Callable[[Upheavals], None], ...] = (
 def upheave(run: Run, folder: Path) -> Upheavals:
     """Do all of them, fetch a result, and look for faults."""
     those = Upheavals(run, folder)
-    run.photographs = {file.name: file.path.read_bytes() for file in scene_files(run.scene)}
+    run.photographs = {file.name: file.path.read_bytes() for file in list_scene_files(run.scene)}
     run.dataset = run.patiently(lambda api: upload_scene(api, run.scene))["id"]
     workers = {process.pid for process in run.machine.kept()} - {p.pid for p in run.machine.front_end()}
     run.submit_chain(STEPS, STEP_SECONDS)

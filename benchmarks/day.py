@@ -138,7 +138,7 @@ def judge(run: Run, turn_seconds: float) -> tuple[dict[str, Any], list[str]]:
     """Figures of an owner, and faults."""
     faults, begins = run.faults(), {}
     with Api(run.machine.address, run.machine.token) as api:
-        jobs = list(api.pages("/v1/jobs", "jobs", limit=200))
+        jobs = list(api.iterate_pages("/v1/jobs", "jobs", limit=200))
         for job in jobs:
             begun = [
                 event["at"]

@@ -15,10 +15,10 @@ from pathlib import Path
 
 import numpy as np
 
-from octasplat.engine.edit.choices import MeshRecovery
-from octasplat.engine.edit.local_maps import legs_world
-from octasplat.engine.edit.recovery import recover_edit
-from octasplat.engine.files import Mesh, export_scene, read_mesh, read_scene
+from octasplat.engine.edit.edit_options import MeshToGaussiansOptions
+from octasplat.engine.edit.mesh_to_gaussians import recover_gaussians
+from octasplat.engine.files import ImportedMesh, export_scene, read_mesh, read_scene
+from octasplat.engine.gaussians.legs import legs_world
 from octasplat.engine.gaussians.model import FlatGaussians
 
 Map = Callable[[np.ndarray], np.ndarray]
@@ -61,7 +61,7 @@ def derivatives(move: Map, points: np.ndarray) -> np.ndarray:
     return np.stack(columns, axis=-1)
 
 
-def fitted_twist(before: Mesh, after: Mesh) -> Map:
+def fitted_twist(before: ImportedMesh, after: ImportedMesh) -> Map:
     """The exact twist that Blender's SimpleDeform made, from the vertices."""
     a, b = before.vertices, after.vertices
     angles = np.angle((b[:, 0] + 1j * b[:, 1]) / (a[:, 0] + 1j * a[:, 1]))
@@ -74,12 +74,12 @@ def fitted_twist(before: Mesh, after: Mesh) -> Map:
     return lambda p: move(p) @ turn.T
 
 
-def row(name: str, gaussians: FlatGaussians, mesh: Mesh, move: Map) -> None:
+def row(name: str, gaussians: FlatGaussians, mesh: ImportedMesh, move: Map) -> None:
     means = gaussians.means_world.astype(np.float64)
     legs = derivatives(move, means) @ legs_world(gaussians)
     for method in ("least-squares", "three-point"):
-        options = MeshRecovery.model_validate({"method": method, "axes": "x0"})
-        result, report = recover_edit(gaussians, mesh, Path("mesh.ply"), options)
+        options = MeshToGaussiansOptions.model_validate({"method": method, "axes": "x0"})
+        result, report = recover_gaussians(gaussians, mesh, Path("mesh.ply"), options)
         expected = covariances(legs)
         error = np.linalg.norm(covariances(legs_world(result)) - expected, axis=(1, 2))
         error /= np.linalg.norm(expected, axis=(1, 2))

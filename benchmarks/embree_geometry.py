@@ -24,17 +24,24 @@ from tracer_vs_mitsuba import SETTINGS, camera_rays, cloud
 
 from octasplat.engine.files import read_scene
 from octasplat.engine.gaussians.model import FlatGaussians
+from octasplat.engine.gaussians.morton import morton_order
 from octasplat.engine.gaussians.octagon import octagon_radii
-from octasplat.engine.gaussians.order import morton_order
 from octasplat.engine.rays import RayBatch
-from octasplat.engine.trace.cpu.bundles import Forward, Hits, Limits, Parameters, Rays, Scene
-from octasplat.engine.trace.cpu.kernels_hit import CONTEXT_WORDS, RECORD_WORDS, intersect_octagon
-from octasplat.engine.trace.cpu.kernels_records import write_boxes, write_records
-from octasplat.engine.trace.cpu.memory import Pool, aligned_empty, empty_result, outputs
+from octasplat.engine.trace.cpu.kernels.kernel_args import (
+    ForwardPass,
+    GaussianParameters,
+    HitArrays,
+    PackedScene,
+    RayArrays,
+    TraceLimits,
+)
+from octasplat.engine.trace.cpu.kernels.octagon_hit import CONTEXT_WORDS, PRIMITIVE_WORDS, intersect_octagon
+from octasplat.engine.trace.cpu.kernels.packed_primitives import pack_primitives, write_boxes
+from octasplat.engine.trace.cpu.memory import ArrayPool, aligned_empty, empty_result, output_arrays
 from octasplat.engine.trace.cpu.packets import PacketTracer, find_packets
 from octasplat.engine.trace.cpu.single_rays import SingleRayTracer
-from octasplat.engine.trace.embree_library import Handle
-from octasplat.engine.trace.kernels_native import int32_pointer
+from octasplat.engine.trace.embree import Handle
+from octasplat.engine.trace.kernels.native import int32_pointer
 from octasplat.engine.trace.protocol import TraceResult
 
 THREADS, REPEATS = 2, 7
@@ -64,28 +71,28 @@ class Boxes:
 
 def prepare(gaussians: FlatGaussians) -> Boxes:
     """Records and boxes of the Gaussians."""
-    parameters = Parameters.of(gaussians)
-    records = aligned_empty((len(gaussians), RECORD_WORDS))
+    parameters = GaussianParameters.from_gaussians(gaussians)
+    records = aligned_empty((len(gaussians), PRIMITIVE_WORDS))
     boxes = np.empty((len(gaussians), 6), np.float32)
-    write_records(records, *parameters, SETTINGS.q)
+    pack_primitives(records, *parameters, SETTINGS.q)
     write_boxes(boxes, *parameters, SETTINGS.q, 0.0)
     return Boxes(gaussians, records, boxes)
 
 
 def prepared(
     scene: Boxes, harmonics: np.ndarray, origins: np.ndarray, directions: np.ndarray
-) -> tuple[TraceResult, Forward]:
+) -> tuple[TraceResult, ForwardPass]:
     """Room for the outputs of the rays, and a pass that records nothing."""
     count = len(origins)
     result = empty_result(count, 0)
-    no_hits = Hits(
+    no_hits = HitArrays(
         np.empty(0, np.int64), np.empty(0, np.int32), np.empty(0, np.float32), np.empty(0, np.float32),
         np.empty((0, 3), np.float32),
     )  # fmt: skip
     features = np.empty((len(scene.gaussians), 0), np.float32)
-    forward = Forward(
-        Rays.of(RayBatch(origins, directions)), Scene(scene.records, harmonics, features),
-        Limits.of(SETTINGS), outputs(result), no_hits, False,
+    forward = ForwardPass(
+        RayArrays.from_batch(RayBatch(origins, directions)), PackedScene(scene.records, harmonics, features),
+        TraceLimits.from_settings(SETTINGS), output_arrays(result), no_hits, False,
     )  # fmt: skip
     return result, forward
 
@@ -97,15 +104,15 @@ class Instances(SingleRayTracer):
         """Build both levels."""
         self._unit = np.array([[-1, -1, -1, 1, 1, 1]], np.float32)
         self.build(self._unit)
-        assert self._scene is not None
+        assert self._bvh is not None
         lib, device = self._device._lib, self._device
         lib.rtcSetGeometryInstancedScene.argtypes = [Handle, Handle]
         lib.rtcSetGeometryTransform.argtypes = [Handle, ctypes.c_uint, ctypes.c_int, ctypes.c_void_p]
         lib.rtcGetGeometry.restype, lib.rtcGetGeometry.argtypes = Handle, [Handle, ctypes.c_uint]
-        inner = lib.rtcGetGeometry(self._scene.handle, 0)
+        inner = lib.rtcGetGeometry(self._bvh.handle, 0)
         lib.rtcSetGeometryIntersectFunction(inner, intersect_instance.address)
         lib.rtcCommitGeometry(inner)
-        lib.rtcJoinCommitScene(self._scene.handle)
+        lib.rtcJoinCommitScene(self._bvh.handle)
         radius = octagon_radii(gaussians.opacities, SETTINGS.q)[:, None]
         axes = gaussians.rotations.astype(np.float64)  # columns: normal, u, v
         half = np.concatenate([np.full((len(gaussians), 1), THICKNESS), radius * gaussians.scales], axis=1)
@@ -116,7 +123,7 @@ class Instances(SingleRayTracer):
         lib.rtcSetSceneBuildQuality(top, 1)
         for row in range(len(gaussians)):
             geometry = lib.rtcNewGeometry(device.handle, INSTANCE)
-            lib.rtcSetGeometryInstancedScene(geometry, self._scene.handle)
+            lib.rtcSetGeometryInstancedScene(geometry, self._bvh.handle)
             address = transforms.ctypes.data + row * transforms.strides[0]
             lib.rtcSetGeometryTransform(geometry, 0, FLOAT3X4_COLUMN_MAJOR, address)
             lib.rtcCommitGeometry(geometry)
@@ -124,7 +131,7 @@ class Instances(SingleRayTracer):
             lib.rtcReleaseGeometry(geometry)
         self.commit_ms = 1e3 * seconds(lambda: lib.rtcJoinCommitScene(top))
         device.check("building the instances")
-        self._bottom, self._scene.handle = self._scene.handle, top
+        self._bottom, self._bvh.handle = self._bvh.handle, top
 
 
 def seconds(work: Callable[[], object]) -> float:
@@ -154,8 +161,8 @@ def resident_mb() -> float:
 def geometry(scene: Boxes, origins: np.ndarray, directions: np.ndarray) -> None:
     """Boxes against instances; a new hierarchy against a refitted one."""
     count = len(scene.gaussians)
-    boxes = SingleRayTracer(Limits.of(SETTINGS), threads=THREADS, build_quality=1)
-    instances = Instances(Limits.of(SETTINGS), threads=THREADS, build_quality=1)
+    boxes = SingleRayTracer(TraceLimits.from_settings(SETTINGS), threads=THREADS, build_quality=1)
+    instances = Instances(TraceLimits.from_settings(SETTINGS), threads=THREADS, build_quality=1)
     gc.collect()
     before = resident_mb()
     build_boxes = 1e3 * seconds(lambda: boxes.build(scene.boxes))
@@ -186,7 +193,7 @@ def geometry(scene: Boxes, origins: np.ndarray, directions: np.ndarray) -> None:
         f"  of the instances' build, Embree's commit {instances.commit_ms:.1f} ms, the rest calls from Python"
     )
 
-    lib, handle = boxes._device._lib, boxes._scene.handle
+    lib, handle = boxes._device._lib, boxes._bvh.handle
     inner = lib.rtcGetGeometry(handle, 0)
     lib.rtcSetGeometryBuildQuality(inner, REFIT)
 
@@ -196,7 +203,7 @@ def geometry(scene: Boxes, origins: np.ndarray, directions: np.ndarray) -> None:
 
     rng = np.random.default_rng(0)
     size = np.exp(scene.gaussians.log_scales).mean()
-    anew = SingleRayTracer(Limits.of(SETTINGS), threads=THREADS, build_quality=1)
+    anew = SingleRayTracer(TraceLimits.from_settings(SETTINGS), threads=THREADS, build_quality=1)
     for moved in (0.1, 0.5, 2.0):
         scene.gaussians.means_world += moved * size * rng.normal(size=(count, 3)).astype(np.float32)
         fresh = prepare(scene.gaussians)
@@ -219,10 +226,10 @@ def storage(scene: Boxes, origins: np.ndarray, directions: np.ndarray) -> None:
     sh = (0.1 * rng.normal(size=(len(g), 9, 3))).astype(np.float32)
     sh[:, 0] = g.sh[:, 0]
     small = np.round(sh / SH_STEP).astype(np.int16)
-    tracer = PacketTracer(Limits.of(SETTINGS), threads=THREADS, pool=Pool())
+    tracer = PacketTracer(TraceLimits.from_settings(SETTINGS), threads=THREADS, pool=ArrayPool())
     tracer.build(scene.records)
     packets, _ = find_packets(RayBatch(origins, directions), "always")
-    kept = tracer.room(packets, len(origins), recording=False)
+    kept = tracer.allocate_hits(packets, len(origins), is_recording=False)
 
     def trace(harmonics: np.ndarray) -> Callable[[], object]:
         return lambda: tracer.trace(prepared(scene, harmonics, origins, directions)[1], packets, kept)

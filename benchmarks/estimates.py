@@ -20,7 +20,7 @@ import psutil
 from PIL import Image
 
 from octasplat.engine.config import resolve_config
-from octasplat.engine.operations.costs import estimate_reconstruction
+from octasplat.engine.operations.cost_model import estimate_reconstruction
 from octasplat.engine.photograph_sizes import Sizes
 
 

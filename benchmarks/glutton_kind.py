@@ -6,8 +6,8 @@ import time
 from pydantic import BaseModel, ConfigDict
 
 from octasplat.engine.events import StageProgress, StageStarted
-from octasplat.workers.work.kinds import JobKind, register
-from octasplat.workers.work.task import Task
+from octasplat.workers.worker.job_kinds import JobKind, register
+from octasplat.workers.worker.task import Task
 
 PIECE_BYTES = 1 << 20
 MOST_PIECES = 4096
@@ -21,12 +21,12 @@ class GluttonOptions(BaseModel):
 
 def run(task: Task) -> None:
     """Write, and tell of it, until there is no room."""
-    task.listener(StageStarted("train", MOST_PIECES))
+    task.progress(StageStarted("train", MOST_PIECES))
     task.run.mkdir(parents=True, exist_ok=True)
     with (task.run / "glutton").open("wb", buffering=0) as handle:
         for number in range(MOST_PIECES):
             handle.write(os.urandom(PIECE_BYTES))
-            task.listener(StageProgress("train", number + 1, MOST_PIECES))
+            task.progress(StageProgress("train", number + 1, MOST_PIECES))
             time.sleep(0.005)
 
 

@@ -19,7 +19,7 @@ import numpy as np
 from tracer_vs_mitsuba import SETTINGS, camera_rays, cloud
 
 from octasplat.engine.gaussians.model import FlatGaussians
-from octasplat.engine.gaussians.order import morton_order
+from octasplat.engine.gaussians.morton import morton_order
 from octasplat.engine.rays import RayBatch
 from octasplat.engine.trace.cpu.tracer import CpuTracer
 from octasplat.engine.trace.protocol import TraceGradients
@@ -47,8 +47,8 @@ def microseconds_a_ray(gaussians: FlatGaussians, zoom: float, repeats: int = 5) 
         start = time.perf_counter()
         seen = tracer.trace(RayBatch(origins, directions), record=True)
         middle = time.perf_counter()
-        assert seen.hits is not None
-        tracer.backward(seen.hits, gradient)
+        assert seen.recording is not None
+        tracer.backward(seen.recording, gradient)
         forward.append(middle - start)
         backward.append(time.perf_counter() - middle)
     scale = 1e6 / len(origins)

@@ -24,9 +24,9 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # else CPU time counts thre
 import numpy as np
 
 from octasplat.engine.config import resolve_config
-from octasplat.engine.scene import Dataset
+from octasplat.engine.dataset import Dataset
 from octasplat.engine.threads import use_threads
-from octasplat.engine.trace.make import make_tracer
+from octasplat.engine.trace.factory import make_tracer
 from octasplat.engine.trace.protocol import Tracer
 from octasplat.engine.train.batches import BatchSource
 from octasplat.engine.train.checkpoint import load_checkpoint, save_checkpoint

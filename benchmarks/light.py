@@ -24,9 +24,10 @@ import numpy as np
 
 from octasplat.engine.gaussians.model import SH_C0, FlatGaussians
 from octasplat.engine.gaussians.octagon import CHI2_3_99
-from octasplat.engine.light.integrator import LitScene, PathTracer
-from octasplat.engine.light.layers import GaussianLayers, stage_layers
-from octasplat.engine.light.stage import (
+from octasplat.engine.pathtracing.compile_meshes import CompiledMeshes, compile_meshes
+from octasplat.engine.pathtracing.gaussian_layers import GaussianLayers, build_gaussian_layers
+from octasplat.engine.pathtracing.path_tracer import PathTracer, PathTracerScene
+from octasplat.engine.pathtracing.stage.model import (
     Diffuse,
     Glass,
     Integrator,
@@ -37,7 +38,6 @@ from octasplat.engine.light.stage import (
     StageGaussians,
     StageMesh,
 )
-from octasplat.engine.light.staging import LitMeshes, stage_meshes
 from octasplat.engine.rays import RayBatch
 from octasplat.engine.trace.protocol import TraceSettings
 
@@ -131,7 +131,7 @@ def frames(size: tuple[int, int], samples: int, gaussians: int, variants: list[s
     """Frames of the stage; Mitsuba takes part where there are no Gaussians."""
     lit = stage(samples)
     layers = None if gaussians == 0 else gaussian_layers(lit, cloud(gaussians), TraceSettings())
-    tracer = PathTracer(LitScene(stage_meshes(lit, Path()), layers), lit.integrator)
+    tracer = PathTracer(PathTracerScene(compile_meshes(lit, Path()), layers), lit.integrator)
     image = camera(*EYE, size, 40).rays()
     works = {"ours": lambda: tracer.render(image)}
     with TemporaryDirectory() as folder:
@@ -165,8 +165,8 @@ def beside_mirror(count: int, size: tuple[int, int], repeats: int) -> None:
     numbers = Integrator(samples=1, max_depth=2, roulette_depth=64, anti_aliasing=False)
     floor = StageMesh(shape="plane", scale=6, material=Mirror())
     lit = Stage(gaussians=(StageGaussians(light="emissive"),), meshes=(floor,), integrator=numbers)
-    dome, meshes = cloud(count), stage_meshes(lit, Path())
-    tracer = PathTracer(LitScene(meshes, gaussian_layers(lit, dome, settings)), numbers)
+    dome, meshes = cloud(count), compile_meshes(lit, Path())
+    tracer = PathTracer(PathTracerScene(meshes, gaussian_layers(lit, dome, settings)), numbers)
     image = camera(*EYE, size, 40).rays()
     theirs = GaussiansBesideMirror(dome, meshes.surfaces.corners_world, settings)
     far = image.origin_world, image.rays.directions_world
@@ -188,7 +188,7 @@ def kinds(count: int) -> None:
             for ball in lit.meshes
             if ball.shape == "sphere" or name != "refracted"
         )
-        some = stage_meshes(lit.model_copy(update={"meshes": meshes}), Path())
+        some = compile_meshes(lit.model_copy(update={"meshes": meshes}), Path())
         first, second, shadow = watched(some, layers, lit.integrator)
         if name == "mirror":
             rates("camera", first, some, layers, count)
@@ -197,7 +197,7 @@ def kinds(count: int) -> None:
             rates("shadow", shadow, some, layers, count)
 
 
-def rates(name: str, rays: RayBatch, meshes: LitMeshes, layers: GaussianLayers, count: int) -> None:
+def rates(name: str, rays: RayBatch, meshes: CompiledMeshes, layers: GaussianLayers, count: int) -> None:
     """How fast rays go through meshes, and through Gaussians."""
     shadow = name == "shadow"
     ask = meshes.triangles.occluded if shadow else meshes.triangles.closest
@@ -213,7 +213,7 @@ class Watched:
         self._inner, self.seen = inner, []  # type: ignore[var-annotated]
 
     def closest(self, rays: RayBatch) -> Any:
-        """See :class:`octasplat.engine.trace.meshes.TriangleScene`."""
+        """See :class:`octasplat.engine.trace.triangle_bvh.TriangleBvh`."""
         hits = self._inner.closest(rays)
         self.seen.append(RayBatch(rays.origins_world, rays.directions_world, rays.t_min, hits.distances))
         return hits
@@ -227,10 +227,10 @@ class Watched:
         return getattr(self._inner, name)
 
 
-def watched(meshes: LitMeshes, layers: GaussianLayers, numbers: Integrator) -> tuple[RayBatch, ...]:
+def watched(meshes: CompiledMeshes, layers: GaussianLayers, numbers: Integrator) -> tuple[RayBatch, ...]:
     """Camera rays, those from the first surfaces on, and those from there to lights, up to what they meet."""
     triangles, casters = Watched(meshes.triangles), Watched(layers.tracer)
-    scene = LitScene(replace(meshes, triangles=triangles), replace(layers, on_meshes=casters))
+    scene = PathTracerScene(replace(meshes, triangles=triangles), replace(layers, on_meshes=casters))
     once = numbers.model_copy(update={"max_depth": 1})
     PathTracer(scene, once).render(camera(*EYE, (240, 135), 40).rays())
     batch = 1 << 17
@@ -240,7 +240,9 @@ def watched(meshes: LitMeshes, layers: GaussianLayers, numbers: Integrator) -> t
 
 def gaussian_layers(lit: Stage, gaussians: FlatGaussians, settings: TraceSettings) -> GaussianLayers:
     """The layers of a stage with one scene of Gaussians."""
-    layers = stage_layers(lit, gaussians, lambda path: sys.exit(str(path)), Path(), settings, size=1.0)
+    layers = build_gaussian_layers(
+        lit, gaussians, lambda path: sys.exit(str(path)), Path(), settings, size=1.0
+    )
     assert layers is not None
     return layers
 

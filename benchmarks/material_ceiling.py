@@ -19,29 +19,29 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int64
 
 from octasplat.engine.colour import linear_to_srgb
+from octasplat.engine.dataset import load_dataset_model
 from octasplat.engine.evaluate.truth import ViewTruth, read_truth
 from octasplat.engine.evaluate.truth_metrics import pooled_psnr
 from octasplat.engine.gaussians.channels import unstacked
-from octasplat.engine.gaussians.frames import quaternions
+from octasplat.engine.gaussians.frames import quaternions_from_matrices
 from octasplat.engine.gaussians.materials import MATERIAL_WIDTHS
 from octasplat.engine.gaussians.model import FlatGaussians
-from octasplat.engine.light.arrays import SurfacePoints
-from octasplat.engine.light.integrator import LitScene, PathTracer
-from octasplat.engine.light.kernels_bsdf import around
-from octasplat.engine.light.layers import stage_layers
-from octasplat.engine.light.stage import Environment, Integrator, Stage, StageGaussians
-from octasplat.engine.light.staging import stage_meshes
+from octasplat.engine.pathtracing.compile_meshes import compile_meshes
+from octasplat.engine.pathtracing.gaussian_layers import build_gaussian_layers
+from octasplat.engine.pathtracing.kernels.kernel_args import SurfaceInteractions
+from octasplat.engine.pathtracing.kernels.principled_bsdf import orthonormal_basis
+from octasplat.engine.pathtracing.path_tracer import PathTracer, PathTracerScene
+from octasplat.engine.pathtracing.stage.model import Environment, Integrator, Stage, StageGaussians
 from octasplat.engine.rays import ImageRays
-from octasplat.engine.render.images import read_image, write_png
-from octasplat.engine.render.jobs import view_shots
-from octasplat.engine.scene import load_scene
+from octasplat.engine.render.image_files import read_image, write_png
+from octasplat.engine.render.shots import view_shots
 from octasplat.engine.trace.protocol import TraceSettings
 
 
 @numba.njit
 def axes_around(x, y, z):  # type: ignore[no-untyped-def]
     """Return two unit vectors across (x, y, z)."""
-    return around(x, y, z)
+    return orthonormal_basis(x, y, z)
 
 
 SPACING = 0.006
@@ -126,7 +126,7 @@ def gaussians_on(
     frames = np.array([(n, *np.reshape(axes_around(*n), (2, 3))) for n in normals]).transpose(0, 2, 1)
     scene = FlatGaussians(
         mean[:, :3].astype(np.float32),
-        quaternions(frames).astype(np.float32),
+        quaternions_from_matrices(frames).astype(np.float32),
         np.full((len(mean), 2), np.log(OVERLAP * spacing), np.float32),
         np.full(len(mean), 7.0, np.float32),
         np.zeros((len(mean), 1, 3), np.float32),
@@ -148,8 +148,10 @@ def tracer_under(
         environment=Environment(file=str(environment), visible=False),
         integrator=settings,
     )
-    layers = stage_layers(stage, gaussians, lambda _path: gaussians, Path(), TraceSettings(), size=1.0)
-    return PathTracer(LitScene(stage_meshes(stage, Path()), layers), settings)
+    layers = build_gaussian_layers(
+        stage, gaussians, lambda _path: gaussians, Path(), TraceSettings(), size=1.0
+    )
+    return PathTracer(PathTracerScene(compile_meshes(stage, Path()), layers), settings)
 
 
 def picture_from(
@@ -171,7 +173,7 @@ def picture_from(
             normals = np.where(facing > -1e-3, normals - (facing + 1e-3) * ways, normals)
             normals /= np.linalg.norm(normals, axis=1, keepdims=True)
             narrow = (a.astype(np.float32) for a in (points + lift * normals, normals, ways, values[:, 3:]))
-            at = SurfacePoints(*(np.ascontiguousarray(a) for a in narrow))
+            at = SurfaceInteractions(*(np.ascontiguousarray(a) for a in narrow))
             pixels = (y[part] * covered.shape[1] + x[part]).astype(np.int64)
             sums[part] += tracer.radiance(at, pixels, np.full(len(pixels), sample))
     picture = np.zeros((*covered.shape, 3))
@@ -203,7 +205,7 @@ def main() -> None:
     parser.add_argument("--pictures", type=Path, help="write pictures there")
     given = parser.parse_args()
     truth = read_truth(given.scene / "truth.json")
-    viewpoints = load_scene(given.scene / "test", least_views=1, for_training=False)
+    viewpoints = load_dataset_model(given.scene / "test", min_views=1, for_training=False)
     shots = view_shots(viewpoints, np.arange(len(viewpoints.views)))
     buffers = {}
     for view, shot in zip(viewpoints.views, shots, strict=True):

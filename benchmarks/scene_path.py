@@ -50,13 +50,13 @@ def main() -> None:
     parser.add_argument("--root", type=Path, default=Path(__file__).resolve().parent.parent)
     sys.path.insert(0, str(parser.parse_args().root.resolve() / "src"))
     from octasplat.engine.config import resolve_config
+    from octasplat.engine.dataset.synthetic import SyntheticDatasetConfig, write_synthetic_dataset
     from octasplat.engine.pipeline import reconstruct
-    from octasplat.engine.scene.generated import GeneratedSceneConfig, write_generated_scene
 
     with tempfile.TemporaryDirectory() as folder:
         scene, output = Path(folder) / "scene", Path(folder) / "output"
-        config = GeneratedSceneConfig(views=8, width_px=64, height_px=48, samples_per_side=1, points=200)
-        write_generated_scene(scene, config)
+        config = SyntheticDatasetConfig(views=8, width_px=64, height_px=48, samples_per_side=1, points=200)
+        write_synthetic_dataset(scene, config)
         settings = resolve_config("fast", assignments=[f"{name}={value}" for name, value in SETTINGS.items()])
         reconstruct(scene, Path(folder) / "warm", settings, threads=1)  # compiles, which takes no profiler
         visits = Visits()

@@ -19,17 +19,17 @@ import numpy as np
 from jaxtyping import Bool, Float32
 
 from octasplat.engine.config import read_config
+from octasplat.engine.dataset import Dataset, load_dataset_model
 from octasplat.engine.evaluate.truth import TRUTH, Truth, read_truth
 from octasplat.engine.files import read_scene
-from octasplat.engine.light.environment import EnvironmentMap, environment_frame
-from octasplat.engine.light.relighting import PathRelighter
-from octasplat.engine.light.split_sum_relighting import SplitSumRelighter
-from octasplat.engine.light.stage import Integrator
-from octasplat.engine.render.environment_map import read_environment
-from octasplat.engine.render.images import read_image, write_png
+from octasplat.engine.pathtracing.environment import EnvironmentMap, environment_frame
+from octasplat.engine.pathtracing.relighting.path_relighter import PathRelighter
+from octasplat.engine.pathtracing.relighting.split_sum_relighter import SplitSumRelighter
+from octasplat.engine.pathtracing.stage.model import Integrator
+from octasplat.engine.render.environment_files import read_environment
+from octasplat.engine.render.image_files import read_image, write_png
 from octasplat.engine.run_folder import CONFIG, ENVIRONMENT, SCENE, run_viewpoints
-from octasplat.engine.scene import Dataset, load_scene
-from octasplat.engine.surface.cameras import photograph_cameras
+from octasplat.engine.surface.depth_cameras import photograph_cameras
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "tools"))
 from lit_surface import in_cycles, in_threejs, view_of
@@ -98,7 +98,7 @@ def main() -> None:
         path for path in (asked.other_dataset / TRUTH, asked.other_dataset.parent / TRUTH) if path.is_file()
     ]
     truth = read_truth(places[0]) if places else None
-    photographs = load_scene(folder, max_side=asked.max_side, least_views=1, for_training=False)
+    photographs = load_dataset_model(folder, max_side=asked.max_side, min_views=1, for_training=False)
     names = [view.name for view in photographs.views]
     wanted = [name for name in (truth.content.relight.views if truth else names) if name in names]
 

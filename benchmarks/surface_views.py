@@ -23,16 +23,16 @@ from scipy.ndimage import map_coordinates
 from octasplat.engine.colour import composited, linear_to_srgb
 from octasplat.engine.config import read_config
 from octasplat.engine.files import read_mesh, read_scene
-from octasplat.engine.files.mesh import Mesh
 from octasplat.engine.gaussians.model import FlatGaussians
+from octasplat.engine.geometry.imported_mesh import ImportedMesh
 from octasplat.engine.rays import ImageRays, RayBatch
-from octasplat.engine.render.images import write_png
-from octasplat.engine.render.jobs import gaussian_turntable, turntable_cameras
+from octasplat.engine.render.image_files import write_png
 from octasplat.engine.render.renderer import background_colour, render_rays
+from octasplat.engine.render.shots import gaussian_turntable, turntable_cameras
 from octasplat.engine.run_folder import CONFIG, SCENE, is_run, open_photographs, photographs_folder
-from octasplat.engine.trace.make import make_tracer
-from octasplat.engine.trace.meshes import TriangleScene
+from octasplat.engine.trace.factory import make_tracer
 from octasplat.engine.trace.protocol import Tracer, TraceSettings
+from octasplat.engine.trace.triangle_bvh import TriangleBvh
 
 TURNTABLE = {"frames": 8, "width_px": 480, "height_px": 480}
 OFFSETS = (-0.25, 0.25)
@@ -43,10 +43,10 @@ class Surface:
     """A mesh as an unlit viewer draws it."""
 
     def __init__(self, path: Path) -> None:
-        mesh = read_mesh(path, looks=True)
-        self._mesh: Mesh = mesh
+        mesh = read_mesh(path, with_materials=True)
+        self._mesh: ImportedMesh = mesh
         turned = mesh.vertices * [1, -1, -1] if path.suffix == ".glb" else mesh.vertices
-        self._scene = TriangleScene(turned.astype(np.float32), mesh.triangles)
+        self._scene = TriangleBvh(turned.astype(np.float32), mesh.triangles)
         self._texture: Picture | None = None
         texture = mesh.materials[0].texture if mesh.materials else None
         if texture is not None and texture.content is not None:
@@ -63,7 +63,7 @@ class Surface:
             origins = np.broadcast_to(image.origin_world, directions.shape)
             hits = self._scene.closest(RayBatch(origins, directions))
             rgb = np.tile(background, (len(directions), 1)).astype(np.float32)
-            hit = hits.hit
+            hit = hits.is_hit
             b = hits.barycentrics[hit]
             weights = np.stack([1 - b.sum(axis=1), b[:, 0], b[:, 1]], axis=1)
             rgb[hit] = self._colours(hits.faces[hit], weights)

@@ -166,7 +166,7 @@ def compare(name: str, gaussians: FlatGaussians, repeats: int, order: Literal["r
         return ours.trace(RayBatch(origins, directions))
 
     def forward_backward() -> GaussianGradients:
-        hits = ours.trace(RayBatch(origins, directions), record=True).hits
+        hits = ours.trace(RayBatch(origins, directions), record=True).recording
         assert hits is not None
         return ours.backward(hits, TraceGradients(rgb_srgb=gradient))
 

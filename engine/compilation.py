@@ -108,7 +108,7 @@ def run_on_threads(kernel: Callable[..., None], threads: int, *arguments: Any) -
     """Call ``kernel(*arguments)`` on ``threads`` threads at once, this one among them; wait for all.
 
     The calls share their work by a counter among the arguments
-    (:func:`octasplat.engine.trace.kernels_native.next_from_counter`).
+    (:func:`octasplat.engine.trace.kernels.native.atomic_fetch_next`).
 
     Raises:
         Exception: what the first call that failed raised.

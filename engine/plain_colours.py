@@ -11,11 +11,11 @@ from octasplat.engine.config import read_config
 from octasplat.engine.errors import OctasplatError
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.rays import ImageRays
-from octasplat.engine.render.jobs import view_shots
-from octasplat.engine.render.one_colour import colours_for_cameras, with_colours
+from octasplat.engine.render.bake_colour import fit_colours_to_cameras, with_constant_colour
+from octasplat.engine.render.shots import view_shots
 from octasplat.engine.run_folder import CONFIG, run_near_world, run_viewpoints
-from octasplat.engine.surface.cameras import cameras_around
-from octasplat.engine.trace.make import make_tracer
+from octasplat.engine.surface.depth_cameras import cameras_around
+from octasplat.engine.trace.factory import make_tracer
 from octasplat.engine.trace.protocol import TraceSettings
 
 SIDE_PX = 160
@@ -59,10 +59,10 @@ class PlainScene:
                 settings, images = _of_run(self._run)
             except OctasplatError as error:
                 self._on_unknown(f"The one colour of each Gaussian is the constant harmonic: {error}")
-                return with_colours(self._gaussians, self._gaussians.base_rgb_srgb)
+                return with_constant_colour(self._gaussians, self._gaussians.base_rgb_srgb)
         tracer = make_tracer(settings, threads=self._threads)
-        colours = colours_for_cameras(self._gaussians, tracer, images, on_pass=self._on_pass)
-        return with_colours(self._gaussians, colours)
+        colours = fit_colours_to_cameras(self._gaussians, tracer, images, on_pass=self._on_pass)
+        return with_constant_colour(self._gaussians, colours)
 
 
 def _of_run(run: Path) -> tuple[TraceSettings, Sequence[Callable[[], ImageRays]]]:

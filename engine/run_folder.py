@@ -7,13 +7,13 @@ from pathlib import Path
 import numpy as np
 
 from octasplat.engine.config import ReconstructionConfig, read_config
+from octasplat.engine.dataset import Dataset, load_dataset_model
+from octasplat.engine.dataset.camera_clearance import CameraClearance
+from octasplat.engine.dataset.views_file import SplitViewpoints, ViewsRecord, read_views, scene_viewpoints
 from octasplat.engine.errors import ConfigError, DatasetError
 from octasplat.engine.events import Listener, StageProgress, Warned
-from octasplat.engine.files import read_facts
-from octasplat.engine.render.environment_map import read_background
-from octasplat.engine.scene import Dataset, load_scene
-from octasplat.engine.scene.near import NearZones
-from octasplat.engine.scene.views_file import SplitViewpoints, ViewsRecord, read_views, scene_viewpoints
+from octasplat.engine.files import read_metadata
+from octasplat.engine.render.environment_files import read_background
 from octasplat.engine.shading.exposure import ExposuresByName
 from octasplat.engine.shading.learnt_background import LearntBackground
 
@@ -84,7 +84,7 @@ def run_viewpoints(
     max_side = max_side or config.max_side
     if scene is None and (output / VIEWS).exists():
         return read_views(output / VIEWS).viewpoints(max_side)
-    photographs = load_scene(
+    photographs = load_dataset_model(
         photographs_folder(output, scene), max_side=max_side, model_folder=found_model(output)
     )
     return scene_viewpoints(photographs, config.test_every, config.held_out)
@@ -100,12 +100,12 @@ def run_near_world(output: Path, viewpoints: SplitViewpoints) -> float:
     Raises:
         ConfigError: ``output`` is no run.
     """
-    noted = read_facts(output / SCENE).near_world if (output / SCENE).exists() else 0.0
+    noted = read_metadata(output / SCENE).near_world if (output / SCENE).exists() else 0.0
     return noted if noted > 0 else read_config(output / CONFIG).train.near * viewpoints.extent
 
 
-def run_near_zones(output: Path, share: float) -> NearZones | None:
-    """Where nothing of a run's scene should stand, see :mod:`octasplat.engine.scene.near`.
+def run_near_zones(output: Path, share: float) -> CameraClearance | None:
+    """Where nothing of a run's scene should stand, see :mod:`octasplat.engine.dataset.camera_clearance`.
 
     Args:
         output: folder of the run.
@@ -120,7 +120,7 @@ def run_near_zones(output: Path, share: float) -> NearZones | None:
         radii = np.array([share * float(known.get(view.name, 0.0)) for view in scene.views])
     except (OSError, ValueError, KeyError, TypeError, AttributeError, ConfigError):
         return None
-    return NearZones.of(scene, radii, scene.train_indices)
+    return CameraClearance.from_views(scene, radii, scene.train_indices)
 
 
 def run_exposures(output: Path) -> ExposuresByName | None:

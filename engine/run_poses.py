@@ -4,16 +4,22 @@ from collections.abc import Callable
 from pathlib import Path
 
 from octasplat.engine.config import ReconstructionConfig
+from octasplat.engine.dataset import Dataset, split_views
+from octasplat.engine.dataset.colmap_model import find_colmap_model_folder, has_colmap_model
+from octasplat.engine.dataset.load import image_folder
 from octasplat.engine.errors import DatasetError, PosesCrashed
 from octasplat.engine.events import Listener, StageProgress, Warned
-from octasplat.engine.poses import Given, adjust_lenses, find_poses, lens_is_in_doubt, place_doubtful
-from octasplat.engine.poses.find import read_record
+from octasplat.engine.poses import (
+    GivenModel,
+    adjust_principal_points,
+    find_poses,
+    needs_per_view_principal_points,
+    repair_poses,
+)
+from octasplat.engine.poses.find_poses import read_pose_record
+from octasplat.engine.poses.photograph_check import check_photographs_decode
 from octasplat.engine.poses.photographs import photographs_in
-from octasplat.engine.poses.readable import refuse_damaged
 from octasplat.engine.run_folder import POSES, found_model
-from octasplat.engine.scene import Dataset, split_views
-from octasplat.engine.scene.colmap import find_model_folder, has_model
-from octasplat.engine.scene.load import photograph_folder
 from octasplat.engine.stages import stage
 from octasplat.engine.train.config import iteration_count
 from octasplat.engine.train.doubts import ITERATIONS as CHECK_ITERATIONS
@@ -38,26 +44,26 @@ def find_missing_poses(
         PosesCrashed: COLMAP died.
         Cancelled: stopped as asked.
     """
-    if config.poses == "given" or (config.poses == "missing" and has_model(scene)):
+    if config.poses == "given" or (config.poses == "missing" and has_colmap_model(scene)):
         return
     if not scene.is_dir():
         raise DatasetError(f"{scene} is not a folder; name the folder that holds the photographs.")
-    folder = photograph_folder(scene)
+    folder = image_folder(scene)
     if not (output / POSES).is_dir():
         _refuse_before_search(scene, folder, config, threads)
-    find_poses(folder, output / POSES, threads=threads, listener=tell, should_stop=should_stop)
+    find_poses(folder, output / POSES, threads=threads, progress=tell, should_stop=should_stop)
 
 
 def _refuse_before_search(scene: Path, folder: Path, config: ReconstructionConfig, threads: int) -> None:
     """Refuse photographs and settings that the dataset would refuse after the search, which takes long."""
     names = photographs_in(folder)
-    split_views(names, config.test_every, config.held_out, where="photographs")
+    split_views(names, config.test_every, config.held_out, source_name="photographs")
     if config.masks == "alpha" and not (scene / "masks").is_dir():
         raise DatasetError(
             f"Masks are to be the alpha, but there is no folder {scene / 'masks'}; put them there (as "
             f"{names[0]}.png) or leave --masks alpha out."
         )
-    refuse_damaged(folder, names, threads=threads)
+    check_photographs_decode(folder, names, threads=threads)
 
 
 def place_misfits(
@@ -90,17 +96,17 @@ def place_misfits(
         )
     if len(doubtful) == 0:
         return False
-    images = photograph_folder(dataset.root)
-    given = Given(
-        model=find_model_folder(dataset.root),
+    images = image_folder(dataset.root)
+    given = GivenModel(
+        model=find_colmap_model_folder(dataset.root),
         names=tuple(view.name for view in dataset.views),
         doubtful=tuple(doubtful.tolist()),
     )
     files = [view.image_path.relative_to(images).as_posix() for view in dataset.views]
     names = [dataset.views[k].name for k in doubtful.tolist()]
     try:
-        moved = place_doubtful(
-            images, files, given, output / POSES, threads=threads, listener=tell, should_stop=should_stop
+        moved = repair_poses(
+            images, files, given, output / POSES, threads=threads, progress=tell, should_stop=should_stop
         )
     except (DatasetError, PosesCrashed) as error:
         tell(Warned(f"The poses of {', '.join(names)} are in doubt, and stay as they are: {error}"))
@@ -125,7 +131,7 @@ def free_lenses(
 ) -> bool:
     """Give each photograph a principal point of its own if the lens moved; whether it did.
 
-    The model is then the one in the run's ``poses/``; see :mod:`octasplat.engine.poses.lens_doubt` for what
+    The model is then the one in the run's ``poses/``; see :mod:`octasplat.engine.poses.lens_check` for what
     is asked first, which takes no time worth a stage.
 
     Raises:
@@ -133,13 +139,13 @@ def free_lenses(
     """
     if not (config.train.per_view_principal_point and _is_long(dataset, config)):
         return False
-    if "lenses" in read_record(output / POSES):
+    if "lenses" in read_pose_record(output / POSES):
         return False
-    if not lens_is_in_doubt(dataset.viewpoints, dataset.points, dataset.observations):
+    if not needs_per_view_principal_points(dataset.viewpoints, dataset.points, dataset.observations):
         return False
-    model = found_model(output) or find_model_folder(dataset.root)
+    model = found_model(output) or find_colmap_model_folder(dataset.root)
     try:
-        facts = adjust_lenses(model, output / POSES, listener=tell, should_stop=should_stop)
+        facts = adjust_principal_points(model, output / POSES, progress=tell, should_stop=should_stop)
     except (DatasetError, PosesCrashed) as error:
         tell(Warned(f"The lens seems to have moved between the photographs, but stays as it is: {error}"))
         return False

@@ -10,22 +10,27 @@ from fastapi import FastAPI
 
 from octasplat.engine import __version__
 from octasplat.engine.errors import OctasplatError
-from octasplat.service.auditing import AuditTrail
-from octasplat.service.forwarding import ProxyHeaders
-from octasplat.service.gate import Gate
-from octasplat.service.guards import BodyGuard, HostGuard, OriginGuard, SafeHeaders
-from octasplat.service.guesses import Guesses
-from octasplat.service.hub import EventHub
-from octasplat.service.making_room import RoomMaker
-from octasplat.service.openapi import describe_fully
+from octasplat.service.audit_middleware import AuditMiddleware
+from octasplat.service.concurrency_limiter import ConcurrencyLimiter
+from octasplat.service.event_broker import EventBroker
+from octasplat.service.eviction import SpaceEvictor
+from octasplat.service.login_throttle import LoginThrottle
+from octasplat.service.middleware import (
+    AllowedHostsMiddleware,
+    BodyLimitMiddleware,
+    SameOriginMiddleware,
+    SecurityHeadersMiddleware,
+)
+from octasplat.service.openapi import extend_openapi
 from octasplat.service.problems import add_problem_handlers
+from octasplat.service.proxy_headers import ProxyHeadersMiddleware
 from octasplat.service.routes import (
     artifacts,
     audit,
     datasets,
     estimates,
+    events_and_logs,
     jobs,
-    journal,
     metrics,
     system,
     webhooks,
@@ -33,12 +38,12 @@ from octasplat.service.routes import (
 from octasplat.service.settings import ServiceSettings
 from octasplat.service.state import Service
 from octasplat.service.web import mount_pages
-from octasplat.workers.ending import end
-from octasplat.workers.queue.procrastinate_slips import ProcrastinateSlips
-from octasplat.workers.records.database import open_pool
-from octasplat.workers.records.migrate import migrate
-from octasplat.workers.records.tokens import add_environment_token, any_token
-from octasplat.workers.store.opening import open_storage
+from octasplat.workers.cancellation import cancel_and_wait
+from octasplat.workers.db.connections import open_pool
+from octasplat.workers.db.migrate import migrate
+from octasplat.workers.db.tokens import add_environment_token, has_any_token
+from octasplat.workers.queue.procrastinate_queue import ProcrastinateQueue
+from octasplat.workers.storage.factory import open_storage
 
 logger = logging.getLogger(__name__)
 
@@ -71,10 +76,10 @@ def create_app(settings: ServiceSettings | None = None) -> FastAPI:
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
         try:
-            async with _running(settings) as service:
+            async with _service_lifespan(settings) as service:
                 app.state.service = service
                 yield
-                service.draining = True
+                service.is_draining = True
         except OctasplatError as error:
             app.state.failure = error  # for whoever started it, as the server knows a traceback only
             raise
@@ -91,26 +96,26 @@ def create_app(settings: ServiceSettings | None = None) -> FastAPI:
     )
     for module_router in (
         datasets.router, jobs.router, estimates.router,
-        journal.router, artifacts.router, webhooks.router, system.router,
+        events_and_logs.router, artifacts.router, webhooks.router, system.router,
         system.health_router, metrics.router, audit.router,
     ):  # fmt: skip
         app.include_router(module_router)
     mount_pages(app)
     add_problem_handlers(app)
-    describe_fully(app)
-    app.add_middleware(AuditTrail)
-    app.add_middleware(BodyGuard, max_body_bytes=settings.max_body_bytes)
-    app.add_middleware(OriginGuard)
+    extend_openapi(app)
+    app.add_middleware(AuditMiddleware)
+    app.add_middleware(BodyLimitMiddleware, max_body_bytes=settings.max_body_bytes)
+    app.add_middleware(SameOriginMiddleware)
     if settings.is_private:
-        app.add_middleware(HostGuard, names=settings.allowed_hosts)
-    app.add_middleware(SafeHeaders)
+        app.add_middleware(AllowedHostsMiddleware, names=settings.allowed_hosts)
+    app.add_middleware(SecurityHeadersMiddleware)
     if settings.proxies:
-        app.add_middleware(ProxyHeaders, proxies=settings.proxies, dialect=settings.proxy_headers)
+        app.add_middleware(ProxyHeadersMiddleware, proxies=settings.proxies, style=settings.proxy_headers)
     return app
 
 
 @asynccontextmanager
-async def _running(settings: ServiceSettings) -> AsyncIterator[Service]:
+async def _service_lifespan(settings: ServiceSettings) -> AsyncIterator[Service]:
     """Database, store and listener for as long as the application lives."""
     conninfo = settings.conninfo()
     await asyncio.to_thread(migrate, conninfo)
@@ -123,30 +128,32 @@ async def _running(settings: ServiceSettings) -> AsyncIterator[Service]:
                 token = await add_environment_token(connection, settings.token.get_secret_value())
                 if token.revoked_at is not None:
                     logger.warning("the token of OCTASPLAT_TOKEN was revoked and stays so; set another one")
-            settings.check_public(await any_token(connection))
-        hub = EventHub(conninfo, listen=settings.listen)
+            settings.check_public(await has_any_token(connection))
+        hub = EventBroker(conninfo, listen=settings.listen)
         listening = asyncio.create_task(hub.run())
-        room = RoomMaker(pool, storage)
+        room = SpaceEvictor(pool, storage)
         try:
-            guesses = Guesses(settings.wrong_token_seconds)
+            guesses = LoginThrottle(settings.wrong_token_seconds)
             yield Service(
                 settings,
                 pool,
-                ProcrastinateSlips(),
+                ProcrastinateQueue(),
                 storage,
                 hub,
                 room,
                 guesses,
                 settings.spool(),
-                _checks(settings),
+                _check_limiter(settings),
             )
         finally:
             await room.close()
             hub.close()
-            await end([listening])
+            await cancel_and_wait([listening])
 
 
-def _checks(settings: ServiceSettings) -> Gate:
+def _check_limiter(settings: ServiceSettings) -> ConcurrencyLimiter:
     """Lets in those whose datasets are checked; half of the places are there for other owners."""
     at_once, waiting = settings.max_checks, settings.max_waiting_checks
-    return Gate("datasets", at_once=at_once, waiting=waiting, of_one_owner=-(-(at_once + waiting) // 2))
+    return ConcurrencyLimiter(
+        "datasets", max_concurrent=at_once, max_waiting=waiting, max_per_owner=-(-(at_once + waiting) // 2)
+    )

@@ -1,6 +1,6 @@
 """Who asks, and what they may do: tokens with scopes, sessions begun with one, or nobody in particular.
 
-Nobody in particular is whoever sits at this machine while there never was a token; see :func:`_is_open`.
+Nobody in particular is whoever sits at this machine while there never was a token; see :func:`_allows_anonymous`.
 """
 
 import time
@@ -11,25 +11,25 @@ from typing import Annotated, Literal
 from fastapi import Depends, Request, Security
 from fastapi.security import APIKeyCookie, HTTPAuthorizationCredentials, HTTPBearer
 
-from octasplat.service.forwarding import passed_through_proxy
-from octasplat.service.problems import Problem
+from octasplat.service.problems import ProblemError
+from octasplat.service.proxy_headers import passed_through_proxy
 from octasplat.service.state import Service, ServiceDep
-from octasplat.workers.records.audit import add_entry
-from octasplat.workers.records.rows import Token
-from octasplat.workers.records.sessions import find_session
-from octasplat.workers.records.tokens import LOCAL_OWNER, any_token, find_token, get_token
+from octasplat.workers.db.audit import add_entry
+from octasplat.workers.db.rows import Token
+from octasplat.workers.db.sessions import find_session
+from octasplat.workers.db.tokens import LOCAL_OWNER, find_token, get_token, has_any_token
 
 Scope = Literal["read", "write", "admin"]
 COOKIE = "octasplat_session"
 SECURE_COOKIE = f"__Host-{COOKIE}"
 """Where there is TLS: browsers take it from this very host only, and send it nowhere else."""
-_IMPLIED: dict[str, frozenset[str]] = {
+_SUFFICIENT_SCOPES: dict[str, frozenset[str]] = {
     "read": frozenset({"read", "write", "admin"}),
     "write": frozenset({"write", "admin"}),
     "admin": frozenset({"admin"}),
 }
-_OPEN_SECONDS = 2.0
-_GUESS_SECONDS = 5
+_TOKEN_CHECK_SECONDS = 2.0
+_THROTTLE_RETRY_SECONDS = 5
 
 _bearer = HTTPBearer(auto_error=False, description="A token made with `octasplat token create`.")
 _cookie = APIKeyCookie(
@@ -55,19 +55,19 @@ class Principal:
 
     def may(self, scope: Scope) -> bool:
         """Whether they may do what needs ``scope``."""
-        return bool(self.scopes & _IMPLIED[scope])
+        return bool(self.scopes & _SUFFICIENT_SCOPES[scope])
 
     @property
-    def sees(self) -> str | None:
+    def visible_owner(self) -> str | None:
         """Whose things are listed; None lists everybody's."""
         return None if self.may("admin") else self.owner
 
-    def owns(self, owner: str) -> bool:
+    def may_see(self, owner: str) -> bool:
         """Whether something of ``owner`` is theirs to see."""
         return self.may("admin") or owner == self.owner
 
 
-async def principal(
+async def authenticate(
     request: Request,
     service: ServiceDep,
     bearer: Annotated[HTTPAuthorizationCredentials | None, Security(_bearer)],
@@ -81,47 +81,49 @@ async def principal(
     """
     who = None
     if bearer is not None:
-        token = await token_of(request, service, bearer.credentials)
+        token = await authenticate_token(request, service, bearer.credentials)
         who = None if token is None else Principal(token.owner, frozenset(token.scopes), token.id)
     elif (secret := session_secret(request)) is not None:
         who = await principal_of_session(service, secret)
-    elif request.headers.get("authorization") is None and await _is_open(service):
+    elif request.headers.get("authorization") is None and await _allows_anonymous(service):
         if passed_through_proxy(request.headers):
             detail = (
                 "This request came by way of a proxy, and without tokens whoever comes may do everything; "
                 "make one with octasplat token create, and name the proxy in OCTASPLAT_PROXIES."
             )
-            raise Problem(403, "open-behind-proxy", detail)
+            raise ProblemError(403, "open-behind-proxy", detail)
         who = Principal(LOCAL_OWNER, frozenset({"admin"}))
     if who is None:
         detail = "A valid token is needed: send the header Authorization: Bearer <token>."
-        raise Problem(401, "unauthorized", detail, headers={"WWW-Authenticate": 'Bearer realm="octasplat"'})
+        raise ProblemError(
+            401, "unauthorized", detail, headers={"WWW-Authenticate": 'Bearer realm="octasplat"'}
+        )
     request.state.who = who  # for the audit
     return who
 
 
-async def token_of(request: Request, service: Service, secret: str) -> Token | None:
+async def authenticate_token(request: Request, service: Service, secret: str) -> Token | None:
     """The valid token of that secret, or after a while None.
 
     Raises:
         Problem: 429 while too many wrong ones of the same address wait for their answer.
     """
-    address = address_of(request)
-    with service.guesses.attempt(address, secret) as is_looked_at:
+    address = client_address(request)
+    with service.login_throttle.attempt(address, secret) as is_looked_at:
         if not is_looked_at:
             detail = "Too many wrong tokens came from this address; try again in a moment."
-            raise Problem(429, "too-many-guesses", detail, retry_seconds=_GUESS_SECONDS)
+            raise ProblemError(429, "too-many-guesses", detail, retry_seconds=_THROTTLE_RETRY_SECONDS)
         async with service.pool.connection() as connection:
             token = await find_token(connection, secret)
         if token is not None:
-            service.guesses.was_right(secret)
-        elif await service.guesses.was_wrong(address):
+            service.login_throttle.record_success(secret)
+        elif await service.login_throttle.delay_failure(address):
             async with service.pool.connection() as connection:
                 await add_entry(connection, address=address, action="wrong token", status=401)
     return token
 
 
-def address_of(request: Request) -> str:
+def client_address(request: Request) -> str:
     """Where a request comes from, as a trusted proxy says if there is one."""
     return request.client.host if request.client is not None else "unknown"
 
@@ -141,23 +143,23 @@ async def principal_of_session(service: Service, secret: str) -> Principal | Non
     return Principal(token.owner, frozenset(token.scopes), token.id, session.id)
 
 
-class _Needs:
+class _RequireScope:
     def __init__(self, scope: Scope) -> None:
         self._scope = scope
 
-    def __call__(self, who: Annotated[Principal, Depends(principal)]) -> Principal:
+    def __call__(self, who: Annotated[Principal, Depends(authenticate)]) -> Principal:
         if not who.may(self._scope):
             detail = f"This token may not do that; one with the scope '{self._scope}' is needed."
-            raise Problem(403, "scope", detail)
+            raise ProblemError(403, "scope", detail)
         return who
 
 
-Reader = Annotated[Principal, Depends(_Needs("read"))]
-Writer = Annotated[Principal, Depends(_Needs("write"))]
-Admin = Annotated[Principal, Depends(_Needs("admin"))]
+Reader = Annotated[Principal, Depends(_RequireScope("read"))]
+Writer = Annotated[Principal, Depends(_RequireScope("write"))]
+Admin = Annotated[Principal, Depends(_RequireScope("admin"))]
 
 
-async def _is_open(service: Service) -> bool:
+async def _allows_anonymous(service: Service) -> bool:
     """Whether whoever reaches the service may use it: from this machine, before there was any token.
 
     Tokens that have expired or were shut out count: that the last of them has ended opens nothing.
@@ -165,8 +167,8 @@ async def _is_open(service: Service) -> bool:
     if not service.settings.is_private or service.settings.proxies:
         return False
     now = time.monotonic()
-    if now - service.tokens_seen > _OPEN_SECONDS:
+    if now - service.tokens_checked_at > _TOKEN_CHECK_SECONDS:
         async with service.pool.connection() as connection:
-            service.has_tokens = await any_token(connection, valid=False)
-        service.tokens_seen = now
+            service.has_tokens = await has_any_token(connection, valid_only=False)
+        service.tokens_checked_at = now
     return not service.has_tokens

@@ -7,14 +7,16 @@ from pathlib import PurePosixPath
 from fastapi import Request, Response
 from fastapi.responses import FileResponse, StreamingResponse
 
-from octasplat.service.etags import matches
+from octasplat.service.etags import etag_matches
 from octasplat.service.intake.receive import format_digest
-from octasplat.service.problems import Problem
+from octasplat.service.problems import ProblemError
 from octasplat.service.state import Service
 
 _RANGE = re.compile(r"bytes=([0-9]{0,18})-([0-9]{0,18})")
-_INLINE = ("image/png", "image/jpeg", "application/json", "text/plain", "model/gltf-binary")
-_SANDBOX = "sandbox; default-src 'none'; img-src 'self' data:; style-src 'unsafe-inline'; script-src 'none'"
+_INLINE_TYPES = ("image/png", "image/jpeg", "application/json", "text/plain", "model/gltf-binary")
+_SANDBOX_POLICY = (
+    "sandbox; default-src 'none'; img-src 'self' data:; style-src 'unsafe-inline'; script-src 'none'"
+)
 
 
 def send_blob(
@@ -48,7 +50,7 @@ def send_blob(
         StorageError: the store does not have it.
     """
     etag = f'"{sha256}"'
-    shown = inline or media_type in _INLINE
+    shown = inline or media_type in _INLINE_TYPES
     headers = {
         "ETag": etag,
         "Repr-Digest": format_digest(sha256),
@@ -57,16 +59,16 @@ def send_blob(
         "Content-Disposition": _disposition(name, shown),
     }
     if media_type == "text/html":
-        headers["Content-Security-Policy"] = _SANDBOX
-    if matches(request.headers.get("if-none-match"), etag):
+        headers["Content-Security-Policy"] = _SANDBOX_POLICY
+    if etag_matches(request.headers.get("if-none-match"), etag):
         return Response(status_code=304, headers=headers)
     path = service.storage.local_path(sha256)
     if path is not None:
         return FileResponse(path, media_type=media_type, headers=headers)
-    return _remote(service, request, sha256, size_bytes, media_type, headers)
+    return _remote_response(service, request, sha256, size_bytes, media_type, headers)
 
 
-def _remote(
+def _remote_response(
     service: Service, request: Request, sha256: str, size: int, media_type: str, headers: dict[str, str]
 ) -> Response:
     """From a store elsewhere, whole or one range."""
@@ -80,7 +82,7 @@ def _remote(
         else:
             start = max(0, size - int(last))
         if start >= stop:
-            raise Problem(
+            raise ProblemError(
                 416, "range", "There is no such range.", headers={"Content-Range": f"bytes */{size}"}
             )
         status = 206

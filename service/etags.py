@@ -2,10 +2,10 @@
 
 from fastapi import Request
 
-from octasplat.service.problems import Problem
+from octasplat.service.problems import ProblemError
 
 
-def matches(header: str | None, etag: str) -> bool:
+def etag_matches(header: str | None, etag: str) -> bool:
     """Whether a header ``If-Match`` or ``If-None-Match`` names ``etag``; weak marks do not matter here."""
     if header is None:
         return False
@@ -20,5 +20,5 @@ def check_precondition(request: Request, etag: str) -> None:
         Problem: 412.
     """
     header = request.headers.get("if-match")
-    if header is not None and not matches(header, etag):
-        raise Problem(412, "precondition", "It has changed since; look at it again.")
+    if header is not None and not etag_matches(header, etag):
+        raise ProblemError(412, "precondition", "It has changed since; look at it again.")

@@ -7,8 +7,8 @@ from collections.abc import Awaitable, Callable
 from typing import Any
 
 from octasplat.service.auth import Principal
-from octasplat.service.problems import Problem
-from octasplat.workers.records.database import Connection
+from octasplat.service.problems import ProblemError
+from octasplat.workers.db.connections import Connection
 
 
 def fingerprint(*parts: Any) -> str:
@@ -16,12 +16,12 @@ def fingerprint(*parts: Any) -> str:
     return hashlib.sha256(json.dumps(parts, sort_keys=True, default=str).encode()).hexdigest()
 
 
-async def once(
+async def create_once(
     connection: Connection,
     who: Principal,
     key: str | None,
     request: str,
-    make: Callable[[], Awaitable[uuid.UUID]],
+    create: Callable[[], Awaitable[uuid.UUID]],
 ) -> tuple[uuid.UUID, bool]:
     """Make something, or find what the same request has made before, in one transaction.
 
@@ -32,7 +32,7 @@ async def once(
         who: asks.
         key: names the request; without one it is always made.
         request: fingerprint of the request.
-        make: makes it and returns its id.
+        create: makes it and returns its id.
 
     Returns:
         The id, and whether it was made now.
@@ -41,7 +41,7 @@ async def once(
         Problem: 422 if the key was used for another request.
     """
     if key is None:
-        return await make(), True
+        return await create(), True
     placeholder = uuid.UUID(int=0)
     cursor = await connection.execute(
         """
@@ -51,7 +51,7 @@ async def once(
         [who.owner, key, request, placeholder],
     )
     if cursor.rowcount:
-        made = await make()
+        made = await create()
         await connection.execute(
             "UPDATE idempotency_keys SET resource_id = %s WHERE owner = %s AND key = %s",
             [made, who.owner, key],
@@ -64,5 +64,5 @@ async def once(
     row = await cursor.fetchone()
     if row is None or row["fingerprint"] != request:
         detail = "This Idempotency-Key was used for another request; choose a new one."
-        raise Problem(422, "idempotency-key", detail)
+        raise ProblemError(422, "idempotency-key", detail)
     return row["resource_id"], False

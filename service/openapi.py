@@ -6,13 +6,13 @@ from fastapi import FastAPI
 from pydantic.json_schema import models_json_schema
 
 from octasplat.service.problems import ProblemDocument
-from octasplat.workers.work.kinds import JobKind, job_kinds
+from octasplat.workers.worker.job_kinds import JobKind, job_kinds
 
 _REF = "#/components/schemas/"
 _DEFAULT_KIND = "reconstruct"
 
 
-def describe_fully(app: FastAPI) -> None:
+def extend_openapi(app: FastAPI) -> None:
     """Put the problem document and the options of jobs into the schemas of ``app``."""
     original = app.openapi
 
@@ -23,14 +23,14 @@ def describe_fully(app: FastAPI) -> None:
             schemas["ProblemDocument"] = ProblemDocument.model_json_schema()
             for name in ("HTTPValidationError", "ValidationError"):
                 schemas.pop(name, None)
-            type_options(schemas)
+            add_option_schemas(schemas)
             app.openapi_schema = document
         return app.openapi_schema
 
     app.openapi = openapi  # type: ignore[method-assign]
 
 
-def type_options(schemas: dict[str, Any]) -> None:
+def add_option_schemas(schemas: dict[str, Any]) -> None:
     """Make ``NewJob`` one schema for each kind of job, told apart by ``kind``, with the options of that kind.
 
     Args:
@@ -41,19 +41,19 @@ def type_options(schemas: dict[str, Any]) -> None:
     """
     kinds = job_kinds()
     references, models = models_json_schema(
-        [(kind.asked, "validation") for kind in kinds], ref_template=_REF + "{model}"
+        [(kind.user_options, "validation") for kind in kinds], ref_template=_REF + "{model}"
     )
     definitions: dict[str, Any] = models.get("$defs", {})
-    by_preset = _decided_by_presets(definitions)
+    by_preset = _schemas_with_presets(definitions)
     for name, found in definitions.items():
-        schema = _fit_for_clients(found, keeps_defaults=name not in by_preset)
+        schema = _without_client_defaults(found, keeps_defaults=name not in by_preset)
         if schemas.setdefault(name, schema) != schema:
             raise ValueError(f"two schemas are called {name}; give the model of the options another name")
     plain = schemas["NewJob"]
     mapping: dict[str, str] = {}
     for kind in kinds:
         name = f"New{kind.name.title().replace('_', '').replace('-', '')}Job"
-        schemas[name] = _new_job(name, plain, kind, references[kind.asked, "validation"])
+        schemas[name] = _new_job_schema(name, plain, kind, references[kind.user_options, "validation"])
         mapping[kind.name] = _REF + name
     schemas["NewJob"] = {
         "title": plain["title"],
@@ -64,13 +64,15 @@ def type_options(schemas: dict[str, Any]) -> None:
     }
 
 
-def _new_job(name: str, plain: dict[str, Any], kind: JobKind[Any], options: dict[str, Any]) -> dict[str, Any]:
+def _new_job_schema(
+    name: str, plain: dict[str, Any], kind: JobKind[Any], options: dict[str, Any]
+) -> dict[str, Any]:
     """The schema of a new job of one kind."""
     properties = dict(plain["properties"])
     properties["kind"] = {"type": "string", "const": kind.name, "title": "Kind", "default": kind.name}
     properties["options"] = {**options, "description": f"See GET /v1/options/{kind.name}."}
     required = [] if kind.name == _DEFAULT_KIND else ["kind"]
-    if kind.asked.model_json_schema().get("required"):
+    if kind.user_options.model_json_schema().get("required"):
         required.append("options")
     schema = {key: value for key, value in plain.items() if key not in ("examples", "required")}
     return {
@@ -82,7 +84,7 @@ def _new_job(name: str, plain: dict[str, Any], kind: JobKind[Any], options: dict
     }
 
 
-def _decided_by_presets(definitions: dict[str, Any]) -> set[str]:
+def _schemas_with_presets(definitions: dict[str, Any]) -> set[str]:
     """The names of the schemas below options that have a preset: their defaults are the preset's."""
     found: set[str] = set()
     waiting = [
@@ -106,7 +108,7 @@ def _references(schema: object) -> list[str]:
     return [name for item in schema for name in _references(item)] if isinstance(schema, list) else []
 
 
-def _fit_for_clients(schema: dict[str, Any], *, keeps_defaults: bool) -> dict[str, Any]:
+def _without_client_defaults(schema: dict[str, Any], *, keeps_defaults: bool) -> dict[str, Any]:
     """The schema without defaults that generated clients would take for what the user wants.
 
     They send the defaults that they know. Those that a preset decides must stay away, and generators refuse
@@ -121,6 +123,8 @@ def _fit_for_clients(schema: dict[str, Any], *, keeps_defaults: bool) -> dict[st
             if key != "default" or "const" in given or (keeps_defaults and not isinstance(value, dict))
         }
         if "properties" in given:
-            inner = _fit_for_clients(properties[name], keeps_defaults=keeps_defaults and not has_preset)
+            inner = _without_client_defaults(
+                properties[name], keeps_defaults=keeps_defaults and not has_preset
+            )
             properties[name] = inner
     return {**schema, "properties": properties} if properties else schema

@@ -7,18 +7,18 @@ from typing import Annotated
 
 from fastapi import Query, Request, Response
 
-from octasplat.service.problems import Problem
+from octasplat.service.problems import ProblemError
 
 Limit = Annotated[int, Query(ge=1, le=200, description="Most entries of one answer.")]
 Cursor = Annotated[str | None, Query(max_length=2000, description="`next` of the answer before.")]
 
 
-def write_cursor(place: str) -> str:
+def encode_cursor(key: str) -> str:
     """A cursor that stands for a place in a list."""
-    return base64.urlsafe_b64encode(place.encode()).decode().rstrip("=")
+    return base64.urlsafe_b64encode(key.encode()).decode().rstrip("=")
 
 
-def read_cursor(cursor: str | None) -> str | None:
+def decode_cursor(cursor: str | None) -> str | None:
     """The place that a cursor stands for.
 
     Raises:
@@ -33,32 +33,32 @@ def read_cursor(cursor: str | None) -> str | None:
             raise ValueError("no place has a NUL")
         return place
     except (binascii.Error, ValueError):
-        raise Problem(422, "cursor", "The cursor is none that this service gave out.") from None
+        raise ProblemError(422, "cursor", "The cursor is none that this service gave out.") from None
 
 
-def read_id_cursor(cursor: str | None) -> uuid.UUID | None:
-    """As :func:`read_cursor`, for a list that is ordered by id."""
-    place = read_cursor(cursor)
+def decode_id_cursor(cursor: str | None) -> uuid.UUID | None:
+    """As :func:`decode_cursor`, for a list that is ordered by id."""
+    place = decode_cursor(cursor)
     try:
         return None if place is None else uuid.UUID(place)
     except ValueError:
-        raise Problem(422, "cursor", "The cursor is none that this service gave out.") from None
+        raise ProblemError(422, "cursor", "The cursor is none that this service gave out.") from None
 
 
-def read_number_cursor(cursor: str | None) -> int | None:
-    """As :func:`read_cursor`, for a list that is ordered by a number that counts up."""
-    place = read_cursor(cursor)
+def decode_number_cursor(cursor: str | None) -> int | None:
+    """As :func:`decode_cursor`, for a list that is ordered by a number that counts up."""
+    place = decode_cursor(cursor)
     if place is None:
         return None
     if not (place.isascii() and place.isdigit() and len(place) < 19):
-        raise Problem(422, "cursor", "The cursor is none that this service gave out.")
+        raise ProblemError(422, "cursor", "The cursor is none that this service gave out.")
     return int(place)
 
 
-def next_cursor(request: Request, response: Response, following: str | None) -> str | None:
+def set_next_link(request: Request, response: Response, next_key: str | None) -> str | None:
     """The cursor of the next part, which the header ``Link`` names as well; None at the end."""
-    if following is None:
+    if next_key is None:
         return None
-    cursor = write_cursor(following)
+    cursor = encode_cursor(next_key)
     response.headers["Link"] = f'<{request.url.include_query_params(cursor=cursor)}>; rel="next"'
     return cursor

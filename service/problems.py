@@ -14,24 +14,24 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 from starlette.exceptions import HTTPException
 
 from octasplat.engine.errors import OctasplatError
-from octasplat.engine.light.stage_file import stage_complaint, stage_keys
-from octasplat.engine.operations.base import complaint
+from octasplat.engine.operations.base import error_text
+from octasplat.engine.pathtracing.stage.stage_file import stage_error_message, stage_key_path
 from octasplat.engine.refusals import SettingsRefused
-from octasplat.service.intake.faults import IntakeRefused
-from octasplat.workers.records.errors import Conflict, Missing
-from octasplat.workers.records.quotas import QuotaExceeded
-from octasplat.workers.store.errors import (
-    BlobMissing,
-    DigestMismatch,
+from octasplat.service.intake.faults import IntakeError
+from octasplat.workers.db.errors import ConflictError, NotFoundError
+from octasplat.workers.db.quotas import QuotaExceededError
+from octasplat.workers.storage.errors import (
+    BlobNotFoundError,
+    ContentTooLargeError,
+    DigestMismatchError,
     StorageError,
-    StorageFull,
-    StorageUnavailable,
-    TooLarge,
+    StorageFullError,
+    StorageUnavailableError,
 )
-from octasplat.workers.work.places import without_paths
+from octasplat.workers.worker.path_redaction import shorten_absolute_paths
 
 MEDIA_TYPE = "application/problem+json"
-TYPES = "urn:octasplat:problem:"
+TYPE_PREFIX = "urn:octasplat:problem:"
 RETRY_SECONDS = 5
 
 logger = logging.getLogger(__name__)
@@ -61,7 +61,7 @@ class ProblemDocument(BaseModel):
     errors: list[dict[str, Any]] | None = None
 
 
-class Problem(Exception):
+class ProblemError(Exception):
     """Something to be answered with a problem document.
 
     Args:
@@ -95,7 +95,7 @@ class Problem(Exception):
     def response(self) -> JSONResponse:
         """The answer."""
         content: dict[str, Any] = {
-            "type": TYPES + self.code,
+            "type": TYPE_PREFIX + self.code,
             "title": HTTPStatus(self.status).phrase,
             "status": self.status,
             "detail": self.detail,
@@ -105,20 +105,20 @@ class Problem(Exception):
         return JSONResponse(content, status_code=self.status, headers=self.headers, media_type=MEDIA_TYPE)
 
 
-def not_found(what: str) -> Problem:
+def not_found_error(kind: str) -> ProblemError:
     """There is none, or it is somebody else's; which of the two is not told."""
-    return Problem(404, "not-found", f"There is no such {what}.")
+    return ProblemError(404, "not-found", f"There is no such {kind}.")
 
 
-def refused_options(error: ValidationError | SettingsRefused, prefix: str = "/options") -> Problem:
+def options_error(error: ValidationError | SettingsRefused, prefix: str = "/options") -> ProblemError:
     """Options that do not fit their schema."""
     if isinstance(error, SettingsRefused):
         faults = [
             {"code": each.code, "detail": each.sentence, "pointer": _pointer(prefix, each.path)}
             for each in error.refusals
         ]
-        return Problem(422, "options", str(error), errors=faults)
-    return Problem(
+        return ProblemError(422, "options", str(error), errors=faults)
+    return ProblemError(
         422,
         "options",
         f"{len(error.errors())} of the options cannot be used; see errors, and GET /v1/options.",
@@ -128,7 +128,7 @@ def refused_options(error: ValidationError | SettingsRefused, prefix: str = "/op
 
 def add_problem_handlers(app: FastAPI) -> None:
     """Answer every error with a problem document."""
-    app.add_exception_handler(Problem, _on_problem)
+    app.add_exception_handler(ProblemError, _on_problem)
     app.add_exception_handler(OctasplatError, _on_octasplat_error)
     app.add_exception_handler(RequestValidationError, _on_validation_error)
     app.add_exception_handler(HTTPException, _on_http_exception)
@@ -139,48 +139,52 @@ def add_problem_handlers(app: FastAPI) -> None:
     app.add_exception_handler(Exception, _on_exception)
 
 
-def problem_of(error: OctasplatError) -> Problem:
+def problem_from_error(error: OctasplatError) -> ProblemError:
     """How an error of ours is answered."""
     detail, again = str(error), RETRY_SECONDS
-    if isinstance(error, IntakeRefused):
+    if isinstance(error, IntakeError):
         status = 408 if error.code == "upload-stalled" else 422
-        return Problem(status, error.code, detail, errors=[fault.as_dict() for fault in error.faults])
-    if isinstance(error, QuotaExceeded):
+        return ProblemError(status, error.code, detail, errors=[fault.as_dict() for fault in error.faults])
+    if isinstance(error, QuotaExceededError):
         # Bytes come back by deleting only, the others also by waiting.
-        status = 413 if error.of == "bytes" else 429
-        return Problem(status, f"quota-{error.of}", detail, retry_seconds=again if status == 429 else None)
-    if isinstance(error, Missing):
-        return not_found(error.what)
-    if isinstance(error, Conflict):
-        return Problem(409, "conflict", detail)
-    if isinstance(error, StorageFull):
-        return Problem(507, "storage-full", without_paths(detail), retry_seconds=again)
-    if isinstance(error, TooLarge):
-        return Problem(413, "too-large", detail)
-    if isinstance(error, DigestMismatch):
-        return Problem(422, "digest-mismatch", detail)
-    if isinstance(error, BlobMissing):
-        return Problem(410, "content-gone", "The content is not in the store any more.")
-    if isinstance(error, StorageUnavailable | StorageError):
+        status = 413 if error.resource == "bytes" else 429
+        return ProblemError(
+            status, f"quota-{error.resource}", detail, retry_seconds=again if status == 429 else None
+        )
+    if isinstance(error, NotFoundError):
+        return not_found_error(error.kind)
+    if isinstance(error, ConflictError):
+        return ProblemError(409, "conflict", detail)
+    if isinstance(error, StorageFullError):
+        return ProblemError(507, "storage-full", shorten_absolute_paths(detail), retry_seconds=again)
+    if isinstance(error, ContentTooLargeError):
+        return ProblemError(413, "too-large", detail)
+    if isinstance(error, DigestMismatchError):
+        return ProblemError(422, "digest-mismatch", detail)
+    if isinstance(error, BlobNotFoundError):
+        return ProblemError(410, "content-gone", "The content is not in the store any more.")
+    if isinstance(error, StorageUnavailableError | StorageError):
         logger.warning("the store: %s", error)
-        return Problem(503, "storage", "The store does not answer; try again later.", retry_seconds=again)
-    return Problem(422, "refused", without_paths(detail))
+        return ProblemError(
+            503, "storage", "The store does not answer; try again later.", retry_seconds=again
+        )
+    return ProblemError(422, "refused", shorten_absolute_paths(detail))
 
 
 async def _on_problem(_request: Request, error: Exception) -> JSONResponse:
-    assert isinstance(error, Problem)
+    assert isinstance(error, ProblemError)
     return error.response()
 
 
 async def _on_octasplat_error(_request: Request, error: Exception) -> JSONResponse:
     assert isinstance(error, OctasplatError)
-    return problem_of(error).response()
+    return problem_from_error(error).response()
 
 
 async def _on_validation_error(_request: Request, error: Exception) -> JSONResponse:
     assert isinstance(error, RequestValidationError)
     faults = [_fault("", fault) for fault in error.errors()]
-    return Problem(
+    return ProblemError(
         422, "request", "The request does not have the form that is asked for; see errors.", errors=faults
     ).response()
 
@@ -193,12 +197,12 @@ async def _on_http_exception(_request: Request, error: Exception) -> JSONRespons
         413: "The request is too long.",
     }.get(error.status_code, str(error.detail))
     code = HTTPStatus(error.status_code).phrase.lower().replace(" ", "-")
-    return Problem(error.status_code, code, detail, headers=error.headers).response()
+    return ProblemError(error.status_code, code, detail, headers=error.headers).response()
 
 
 async def _on_database_error(_request: Request, error: Exception) -> JSONResponse:
     logger.warning("the database: %s", " ".join(str(error).split()))
-    return Problem(
+    return ProblemError(
         503,
         "database",
         "The database does not answer; try again in a moment.",
@@ -209,25 +213,27 @@ async def _on_database_error(_request: Request, error: Exception) -> JSONRespons
 async def _on_data_error(_request: Request, error: Exception) -> JSONResponse:
     logger.warning("the database took a value for impossible: %s", " ".join(str(error).split()))
     detail = "The request holds a value that cannot be stored, such as a NUL character or too large a number."
-    return Problem(422, "request", detail).response()
+    return ProblemError(422, "request", detail).response()
 
 
 async def _on_integrity_error(_request: Request, error: Exception) -> JSONResponse:
     """Two requests at once, of which the other came first."""
     logger.info("the database refused what contradicts it: %s", " ".join(str(error).split()))
     detail = "Something that this builds on was changed or deleted at the same time; look again."
-    return Problem(409, "conflict", detail).response()
+    return ProblemError(409, "conflict", detail).response()
 
 
 async def _on_exception(request: Request, error: Exception) -> JSONResponse:
     logger.error("%s %s failed", request.method, request.url.path, exc_info=error)
-    return Problem(500, "unexpected", "Something went wrong here; the service's log says what.").response()
+    return ProblemError(
+        500, "unexpected", "Something went wrong here; the service's log says what."
+    ).response()
 
 
 def _fault(prefix: str, fault: Mapping[str, Any]) -> dict[str, Any]:
     if fault["loc"][:1] == ("stage",):  # told as whoever reads a stage file would be told
-        keys = ("stage", *stage_keys(fault["loc"][1:]))
-        told = stage_complaint(fault["type"], keys, fault["msg"], fault.get("input"))
+        keys = ("stage", *stage_key_path(fault["loc"][1:]))
+        told = stage_error_message(fault["type"], keys, fault["msg"], fault.get("input"))
         fault = {**fault, "loc": keys, "msg": told}
     where, *path = fault["loc"] or ("",)
     if prefix:
@@ -238,7 +244,7 @@ def _fault(prefix: str, fault: Mapping[str, Any]) -> dict[str, Any]:
         if where == "body"
         else {"parameter": "/".join(str(p) for p in path)}
     )
-    return {"code": str(fault["type"]), "detail": complaint(str(fault["msg"])), **named}
+    return {"code": str(fault["type"]), "detail": error_text(str(fault["msg"])), **named}
 
 
 def _pointer(prefix: str, path: Iterable[str | int]) -> str:

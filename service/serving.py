@@ -15,17 +15,17 @@ from fastapi import FastAPI
 from octasplat.engine.errors import OctasplatError
 from octasplat.service.app import create_app
 from octasplat.service.settings import ServiceSettings
-from octasplat.workers.isolation.abilities import tell_what_lacks
-from octasplat.workers.isolation.hiding import hide_memory
 from octasplat.workers.logs import log_to_stderr
-from octasplat.workers.parent import die_with_server
+from octasplat.workers.parent_death_signal import die_with_local_service
+from octasplat.workers.sandbox.capabilities import log_missing_capabilities
+from octasplat.workers.sandbox.hiding import forbid_memory_access
 from octasplat.workers.settings import load_settings
 
-GRACE_SECONDS = 10
+SHUTDOWN_SECONDS = 10
 KEEP_ALIVE_SECONDS = 75
 
 
-class _Server(uvicorn.Server):
+class _FrontEndServer(uvicorn.Server):
     """Ends streams first when asked to stop, as they would never end by themselves."""
 
     def __init__(self, config: uvicorn.Config) -> None:
@@ -44,17 +44,17 @@ class _Server(uvicorn.Server):
         state = getattr(self.config.loaded_app, "state", None)
         service = getattr(state, "service", None)
         if service is not None:
-            service.draining = True
-            service.hub.close()
+            service.is_draining = True
+            service.event_broker.close()
         await super().shutdown(sockets)
 
 
 def main() -> int:
     """Serve until asked to stop; the address goes to stdout once requests are taken."""
-    hide_memory()
+    forbid_memory_access()
     log_to_stderr()
-    if not die_with_server():
-        tell_what_lacks()
+    if not die_with_local_service():
+        log_missing_capabilities()
     try:
         settings = load_settings(ServiceSettings)
         app = create_app(settings)
@@ -73,20 +73,20 @@ def main() -> int:
             log_config=None,
             access_log=False,
             lifespan="on",
-            timeout_graceful_shutdown=GRACE_SECONDS,
+            timeout_graceful_shutdown=SHUTDOWN_SECONDS,
             timeout_keep_alive=KEEP_ALIVE_SECONDS,
             server_header=False,
             proxy_headers=False,
         )
-        server = _Server(config)
+        server = _FrontEndServer(config)
         name = f"[{settings.host}]" if family == socket.AF_INET6 else settings.host
         server.address = f"http://{name}:{listener.getsockname()[1]}"
         log = logging.getLogger("uvicorn.error")
         log.setLevel(logging.WARNING)
-        log.addFilter(lambda _record: _failure(app) is None)
+        log.addFilter(lambda _record: _startup_error(app) is None)
         with contextlib.suppress(SystemExit):
             asyncio.run(server.serve(sockets=[listener]))
-        if (failure := _failure(app)) is not None:
+        if (failure := _startup_error(app)) is not None:
             raise failure
     except OctasplatError as error:
         sys.stderr.write(f"Error: {error}\n")
@@ -94,7 +94,7 @@ def main() -> int:
     return 0 if server.started else 1
 
 
-def _failure(app: FastAPI) -> OctasplatError | None:
+def _startup_error(app: FastAPI) -> OctasplatError | None:
     """Why the application did not start, if it could say so; a traceback would add nothing."""
     failure: OctasplatError | None = getattr(app.state, "failure", None)
     return failure

@@ -6,14 +6,14 @@ from typing import Annotated
 from pydantic import Field, IPvAnyNetwork, SecretStr
 
 from octasplat.engine.errors import ConfigError
-from octasplat.service.forwarding import Dialect
 from octasplat.service.intake.dataset import DatasetLimits
 from octasplat.service.intake.model_check import ModelLimits
 from octasplat.service.intake.receive import UploadLimits
-from octasplat.service.intake.spool import Spool
-from octasplat.workers.records.quotas import Quota
-from octasplat.workers.settings import LISTED, PREFIX, WorkerSettings
-from octasplat.workers.work.kinds.demands import CEILINGS
+from octasplat.service.intake.spool import SpoolSpace
+from octasplat.service.proxy_headers import HeaderStyle
+from octasplat.workers.db.quotas import Quota
+from octasplat.workers.settings import COMMA_SEPARATED, PREFIX, WorkerSettings
+from octasplat.workers.worker.job_kinds.resource_limits import LIMIT_UNITS
 
 DEFAULT_PORT = 8642
 
@@ -62,9 +62,9 @@ class ServiceSettings(WorkerSettings):
     token_hours: float = Field(0.0, ge=0)
     session_hours: float = Field(168.0, gt=0)
     wrong_token_seconds: float = Field(0.25, ge=0)
-    proxies: Annotated[tuple[IPvAnyNetwork, ...], *LISTED] = ()
-    proxy_headers: Dialect = "x-forwarded"
-    allowed_hosts: Annotated[tuple[str, ...], *LISTED] = ()
+    proxies: Annotated[tuple[IPvAnyNetwork, ...], *COMMA_SEPARATED] = ()
+    proxy_headers: HeaderStyle = "x-forwarded"
+    allowed_hosts: Annotated[tuple[str, ...], *COMMA_SEPARATED] = ()
     max_upload_bytes: int = Field(4 << 30, gt=0)
     max_archive_bytes: int = Field(64 << 30, gt=0)
     max_spool_bytes: int = Field(64 << 30, gt=0)
@@ -101,8 +101,8 @@ class ServiceSettings(WorkerSettings):
 
     @property
     def ceilings(self) -> dict[str, int]:
-        """By the names of :data:`octasplat.workers.work.kinds.demands.CEILINGS`."""
-        found = {name: getattr(self, f"max_{name}") for name in CEILINGS}
+        """By the names of :data:`octasplat.workers.worker.job_kinds.resource_limits.LIMIT_UNITS`."""
+        found = {name: getattr(self, f"max_{name}") for name in LIMIT_UNITS}
         return found if self.max_workspace_bytes else {**found, "workspace_bytes": 1 << 62}
 
     def upload_limits(self) -> UploadLimits:
@@ -113,10 +113,10 @@ class ServiceSettings(WorkerSettings):
         """What the check of a dataset may take, and see."""
         return DatasetLimits(model=ModelLimits(hidden=self.own_folders))
 
-    def spool(self) -> Spool:
+    def spool(self) -> SpoolSpace:
         """Room for archives."""
         folder = self.work_folder / "archives"
-        return Spool(folder, max_bytes=self.max_spool_bytes, floor_bytes=self.floor_bytes)
+        return SpoolSpace(folder, max_bytes=self.max_spool_bytes, floor_bytes=self.floor_bytes)
 
     def check_public(self, has_token: bool) -> None:
         """Refuse to be reached from elsewhere by everybody.

@@ -7,16 +7,16 @@ from typing import Annotated
 
 from fastapi import Depends, Request
 
-from octasplat.service.gate import Gate
-from octasplat.service.guesses import Guesses
-from octasplat.service.hub import EventHub
-from octasplat.service.intake.spool import Spool
-from octasplat.service.making_room import RoomMaker
+from octasplat.service.concurrency_limiter import ConcurrencyLimiter
+from octasplat.service.event_broker import EventBroker
+from octasplat.service.eviction import SpaceEvictor
+from octasplat.service.intake.spool import SpoolSpace
+from octasplat.service.login_throttle import LoginThrottle
 from octasplat.service.metrics import Metrics
 from octasplat.service.settings import ServiceSettings
-from octasplat.workers.queue.port import Slips
-from octasplat.workers.records.database import Pool
-from octasplat.workers.store.protocol import Storage
+from octasplat.workers.db.connections import Pool
+from octasplat.workers.queue.protocol import JobQueue
+from octasplat.workers.storage.protocol import Storage
 
 
 @dataclass
@@ -26,46 +26,46 @@ class Service:
     Attributes:
         settings: its settings.
         pool: connections to the database.
-        slips: the queue.
+        job_queue: the queue.
         storage: the store.
-        hub: tells of events.
-        room: makes room in the store.
-        guesses: counts wrong tokens.
-        spool: room for archives while they are read.
-        checks: lets in those whose datasets are checked.
-        storage_look: what the store was last found to be, or is being.
+        event_broker: tells of events.
+        evictor: makes room in the store.
+        login_throttle: counts wrong tokens.
+        spool_space: room for archives while they are read.
+        check_limiter: lets in those whose datasets are checked.
+        storage_check: what the store was last found to be, or is being.
         metrics: counts what this process does.
-        has_tokens: whether anybody ever had a token, as of ``tokens_seen``.
-        tokens_seen: monotonic time.
-        draining: whether it is about to stop.
-        started: monotonic time.
+        has_tokens: whether anybody ever had a token, as of ``tokens_checked_at``.
+        tokens_checked_at: monotonic time.
+        is_draining: whether it is about to stop.
+        started_at: monotonic time.
     """
 
     settings: ServiceSettings
     pool: Pool
-    slips: Slips
+    job_queue: JobQueue
     storage: Storage
-    hub: EventHub
-    room: RoomMaker
-    guesses: Guesses
-    spool: Spool
-    checks: Gate
-    storage_look: "asyncio.Future[str] | None" = None
+    event_broker: EventBroker
+    evictor: SpaceEvictor
+    login_throttle: LoginThrottle
+    spool_space: SpoolSpace
+    check_limiter: ConcurrencyLimiter
+    storage_check: "asyncio.Future[str] | None" = None
     metrics: Metrics = field(default_factory=Metrics)
     has_tokens: bool = True
-    tokens_seen: float = -1e9
-    draining: bool = False
-    started: float = field(default_factory=time.monotonic)
+    tokens_checked_at: float = -1e9
+    is_draining: bool = False
+    started_at: float = field(default_factory=time.monotonic)
 
-    def forget_tokens(self) -> None:
+    def invalidate_token_state(self) -> None:
         """Look for tokens anew at the next request."""
-        self.tokens_seen = -1e9
+        self.tokens_checked_at = -1e9
 
 
-def service_of(request: Request) -> Service:
+def get_service(request: Request) -> Service:
     """The service that a request has reached."""
     service: Service = request.app.state.service
     return service
 
 
-ServiceDep = Annotated[Service, Depends(service_of)]
+ServiceDep = Annotated[Service, Depends(get_service)]

@@ -1,11 +1,11 @@
 """Addresses of webhooks, refused before anything is stored."""
 
-from octasplat.service.problems import Problem
+from octasplat.service.problems import ProblemError
 from octasplat.service.state import Service
-from octasplat.workers.upkeep.webhooks.addresses import AddressRefused, check_url
+from octasplat.workers.maintenance.webhooks.addresses import AddressRefusedError, check_url
 
 
-def check_address(service: Service, url: str, pointer: str = "#/url") -> None:
+def check_webhook_address(service: Service, url: str, pointer: str = "#/url") -> None:
     """Refuse an address that messages are not sent to.
 
     Raises:
@@ -13,6 +13,6 @@ def check_address(service: Service, url: str, pointer: str = "#/url") -> None:
     """
     try:
         check_url(url, service.settings.webhook_hosts)
-    except AddressRefused as error:
+    except AddressRefusedError as error:
         errors = [{"pointer": pointer, "detail": str(error)}]
-        raise Problem(422, "webhook-address", str(error), errors=errors) from None
+        raise ProblemError(422, "webhook-address", str(error), errors=errors) from None

@@ -14,18 +14,25 @@ import pytest
 from click.testing import CliRunner
 from scipy.spatial import cKDTree
 
-from octasplat.engine.edit.affine import rotation, transform, translation
-from octasplat.engine.edit.choices import Cleaning
 from octasplat.engine.edit.cleaning import clean
 from octasplat.engine.edit.deform import deform
-from octasplat.engine.edit.recovery import recover_edit
-from octasplat.engine.edit.selection import inside_box, merge, with_sh_degree
-from octasplat.engine.files import export_losses, export_scene, exporters, importers, read_mesh, read_scene
-from octasplat.engine.files.encodings import half_turned
+from octasplat.engine.edit.edit_options import CleanupOptions
+from octasplat.engine.edit.mesh_to_gaussians import recover_gaussians
+from octasplat.engine.edit.selection import in_box, merge_scenes, with_sh_degree
+from octasplat.engine.files import (
+    dropped_on_export,
+    export_scene,
+    exporters,
+    importers,
+    read_mesh,
+    read_scene,
+)
+from octasplat.engine.files.encodings import half_turn_gaussians
+from octasplat.engine.gaussians.affine import rotation, transform_gaussians, translation
 from octasplat.engine.gaussians.channels import Channels
 from octasplat.engine.gaussians.model import FlatGaussians, concatenate
+from octasplat.engine.gaussians.morton import morton_order
 from octasplat.engine.gaussians.octagon import SIDES, octagon_triangles
-from octasplat.engine.gaussians.order import morton_order
 from octasplat.engine.train.checkpoint import (
     BestState,
     load_best,
@@ -41,7 +48,7 @@ from octasplat.engine.train.trainer import Trainer
 from octasplat.workers.cli.main import cli
 
 sys.path.append(str(Path(__file__).parent / "train"))
-from flat_world import FlatWorld, small_config
+from planar_dataset import PlanarDataset, small_config
 
 COUNT = 120
 RNG = np.random.default_rng(7)
@@ -138,7 +145,7 @@ def edited(g: FlatGaussians, folder: Path) -> FlatGaussians:
         mesh, vertices=vertices, triangles=octagon_triangles(len(rows) // SIDES), gid=mesh.gid[rows],
         corner=mesh.corner[rows], uv=None, radius=None,
     )  # fmt: skip
-    result, report = recover_edit(g, changed, folder / "a.mesh.ply")
+    result, report = recover_gaussians(g, changed, folder / "a.mesh.ply")
     assert report.deleted == 1 and report.copies > 0 and report.moved > 0 and report.carried > 0
     return result
 
@@ -168,13 +175,13 @@ OPERATIONS: dict[str, Operation] = {
     "clone, split, prune": paper,
     "checkpoint": lambda g, f: load_checkpoint(save_checkpoint(state_of(g), f, "x"), "x").gaussians,
     "best": best,
-    "crop": lambda g, _: g.select(inside_box(g, np.zeros(3), np.ones(3))),
-    "clean": lambda g, _: g.select(clean(g, Cleaning(min_opacity=0.5))[0]),
-    "merge": lambda g, _: merge([g.select(slice(40, None)), g]),
+    "crop": lambda g, _: g.select(in_box(g, np.zeros(3), np.ones(3))),
+    "clean": lambda g, _: g.select(clean(g, CleanupOptions(min_opacity=0.5))[0]),
+    "merge": lambda g, _: merge_scenes([g.select(slice(40, None)), g]),
     "fewer harmonics": lambda g, _: with_sh_degree(g, 0),
-    "move": lambda g, _: transform(g, translation(np.array([1.0, 2, 3]))),
-    "turn": lambda g, _: transform(g, rotation(np.array([1.0, 2, 3]), 40.0)),
-    "turn to y up": lambda g, _: half_turned(g),
+    "move": lambda g, _: transform_gaussians(g, translation(np.array([1.0, 2, 3]))),
+    "turn": lambda g, _: transform_gaussians(g, rotation(np.array([1.0, 2, 3]), 40.0)),
+    "turn to y up": lambda g, _: half_turn_gaussians(g),
     "deform": deformed,
     "edit": edited,
     "drop what is not finite": dropped,
@@ -201,9 +208,9 @@ def test_channels_come_back_from_files(exporter: object, tmp_path: Path) -> None
 
 
 @pytest.mark.parametrize("exporter", exporters(), ids=lambda each: each.name)
-def test_a_format_holds_channels_or_it_is_told(exporter: object) -> None:
-    told = [text for text in export_losses(scene(), [Path("a.x")], exporter.name) if "channels" in text]
-    assert export_losses(scene().bare(), [Path("a.x")], exporter.name) == ()
+def test_formats_keep_channels_or_warn(exporter: object) -> None:
+    told = [text for text in dropped_on_export(scene(), [Path("a.x")], exporter.name) if "channels" in text]
+    assert dropped_on_export(scene().with_base_color_only(), [Path("a.x")], exporter.name) == ()
     if exporter.holds_channels:
         assert told == []
     else:
@@ -211,16 +218,16 @@ def test_a_format_holds_channels_or_it_is_told(exporter: object) -> None:
         assert f"format {exporter.name} " in text and "label, albedo, spectrum" in text
 
 
-def test_what_several_formats_lose_is_told_once() -> None:
+def test_export_to_several_formats_warns_once() -> None:
     paths = [Path("mesh.ply"), Path("mesh.glb"), Path("a.splat"), Path("scene.ply"), Path("mesh.obj")]
-    channels, harmonics = export_losses(scene(), paths)
+    channels, harmonics = dropped_on_export(scene(), paths)
     assert channels.startswith("The formats splat and obj have no place for named channels")
     assert harmonics.startswith("The formats mesh-ply, glb, splat and obj have one colour")
 
 
 def test_a_scene_without_a_channel_gets_zeros(tmp_path: Path) -> None:
     whole = scene()
-    result = merge([whole.without_channels(["albedo"]), whole])
+    result = merge_scenes([whole.without_channels(["albedo"]), whole])
     assert result.channels.widths == {"label": 1, "spectrum": 6, "albedo": 3}
     np.testing.assert_array_equal(result.channels["albedo"][:COUNT], 0)
     np.testing.assert_array_equal(result.channels["albedo"][COUNT:], CHANNELS["albedo"])
@@ -229,8 +236,8 @@ def test_a_scene_without_a_channel_gets_zeros(tmp_path: Path) -> None:
 
 def test_training_takes_channels_along(tmp_path: Path) -> None:
     """Rotations are not trained here, and so say whose channels a Gaussian should have."""
-    world = FlatWorld()
-    start = world.start()
+    world = PlanarDataset()
+    start = world.initial_gaussians()
     start.quats_wxyz[:] = np.random.default_rng(0).standard_normal(start.quats_wxyz.shape)
     names = np.arange(len(start), dtype=np.float32)[:, None]
     first = start.copy().with_channels({"label": names})
@@ -260,7 +267,7 @@ def test_commands_take_channels_along_and_warn_once(tmp_path: Path) -> None:
     assert run("transform", source, "-o", tmp_path / "b.splats.glb", "--scale", 2) == ""
     assert_right_rows(read_scene(tmp_path / "b.splats.glb")[0])
     bare = tmp_path / "bare.ply"
-    export_scene(scene().bare(), bare)
+    export_scene(scene().with_base_color_only(), bare)
     assert "bare.ply: has no channel label, albedo, spectrum; it is 0" in run(
         "merge", source, bare, "-o", tmp_path / "c.ply"
     )

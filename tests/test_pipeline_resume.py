@@ -14,10 +14,10 @@ import numba
 import pytest
 
 from octasplat.engine.config import ReconstructionConfig, resolve_config
+from octasplat.engine.dataset.synthetic import SyntheticDatasetConfig, write_synthetic_dataset
 from octasplat.engine.errors import Cancelled, CheckpointError, ConfigError, OutputError, TrainingFailure
 from octasplat.engine.events import CheckpointWritten, Event
 from octasplat.engine.pipeline import reconstruct
-from octasplat.engine.scene.generated import GeneratedSceneConfig, write_generated_scene
 
 pytestmark = pytest.mark.heavy
 
@@ -70,8 +70,8 @@ def threads_as_before() -> Iterator[None]:
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("resume") / "scene"
-    write_generated_scene(
-        root, GeneratedSceneConfig(views=8, width_px=64, height_px=48, samples_per_side=2, points=600)
+    write_synthetic_dataset(
+        root, SyntheticDatasetConfig(views=8, width_px=64, height_px=48, samples_per_side=2, points=600)
     )
     return root
 
@@ -187,11 +187,11 @@ def test_killed_in_another_stage(scene: Path, whole_run: Path, tmp_path: Path, s
     assert_same(run, whole_run)
 
 
-def test_number_of_threads_does_not_matter(scene: Path, whole_run: Path, tmp_path: Path) -> None:
+def test_pipeline_independent_of_threads(scene: Path, whole_run: Path, tmp_path: Path) -> None:
     assert_same(reconstruct(scene, tmp_path / "run", make_config(), threads=2), whole_run)
 
 
-def test_stopped_as_asked_and_resumed(scene: Path, whole_run: Path, tmp_path: Path) -> None:
+def test_pipeline_stopped_run_resumes_to_same_bytes(scene: Path, whole_run: Path, tmp_path: Path) -> None:
     run, rounds = tmp_path / "run", 0
     seen: list[Event] = []
     while True:
@@ -204,7 +204,7 @@ def test_stopped_as_asked_and_resumed(scene: Path, whole_run: Path, tmp_path: Pa
 
         try:
             reconstruct(
-                scene, run, make_config(), resume=True, threads=1, listener=seen.append, should_stop=stop_soon
+                scene, run, make_config(), resume=True, threads=1, progress=seen.append, should_stop=stop_soon
             )
             break
         except Cancelled:
@@ -257,9 +257,9 @@ def test_checkpoints_of_other_photographs_are_refused_and_kept(
         reconstruct(scene, run, make_config(), threads=1, should_stop=stop_after(3))
     before = sorted(path.name for path in (run / "checkpoints").iterdir())
     other = tmp_path / "other"
-    write_generated_scene(
+    write_synthetic_dataset(
         other,
-        GeneratedSceneConfig(views=8, width_px=64, height_px=48, samples_per_side=1, points=600, seed=5),
+        SyntheticDatasetConfig(views=8, width_px=64, height_px=48, samples_per_side=1, points=600, seed=5),
     )
     shutil.rmtree(run / "cache")
     with pytest.raises(CheckpointError, match="other photographs"):
@@ -267,7 +267,7 @@ def test_checkpoints_of_other_photographs_are_refused_and_kept(
     assert sorted(path.name for path in (run / "checkpoints").iterdir()) == before
 
 
-def test_failed_training_exports_nothing(scene: Path, tmp_path: Path) -> None:
+def test_failed_training_writes_no_exports(scene: Path, tmp_path: Path) -> None:
     run = tmp_path / "run"
     config = make_config(**{"lr.mean": 1e6, "lr.mean_final": 1e6})
     with pytest.raises(TrainingFailure):
@@ -276,7 +276,9 @@ def test_failed_training_exports_nothing(scene: Path, tmp_path: Path) -> None:
     assert not names & {"scene.ply", "mesh.ply", "mesh.obj", "mesh.glb", "metrics.json", "report.html"}
 
 
-def test_run_is_finished_and_resuming_it_is_harmless(scene: Path, whole_run: Path, tmp_path: Path) -> None:
+def test_pipeline_resume_of_finished_run_changes_nothing(
+    scene: Path, whole_run: Path, tmp_path: Path
+) -> None:
     run = tmp_path / "run"
     shutil.copytree(whole_run, run)
     stamps = {path: path.stat().st_mtime_ns for path in run.glob("*.*") if path.name != "events.jsonl"}

@@ -22,9 +22,9 @@ from octasplat.engine.renamed_settings import (
 from octasplat.engine.settings import dump_with_former_settings
 from octasplat.engine.settings_catalog import setting_named
 from octasplat.engine.train.config import McmcConfig, PaperConfig, TrainConfig
-from octasplat.service.actions.asked import resolved
+from octasplat.service.actions.validation import resolve_options
 from octasplat.workers.cli.main import cli
-from octasplat.workers.work.kinds import kind_named
+from octasplat.workers.worker.job_kinds import get_job_kind
 
 FORMER = {
     "preset": "paper",
@@ -106,10 +106,10 @@ def test_former_names_that_are_submitted_mean_the_same_and_are_told(monkeypatch:
     found: list[Any] = []
 
     def keep(_api: object, what: Any, **_how: object) -> dict[str, str]:
-        found.append(resolved(kind_named("reconstruct"), json.loads(json.dumps(what.options))))
+        found.append(resolve_options(get_job_kind("reconstruct"), json.loads(json.dumps(what.options))))
         return {"id": "1"}
 
-    monkeypatch.setattr("octasplat.workers.cli.submitting.submit", keep)
+    monkeypatch.setattr("octasplat.workers.cli.remote_jobs.submit", keep)
     sets = [part for text in FORMER_SETS[1:] for part in ("--set", text)]
     arguments = ["submit", "scene", "--server", "http://127.0.0.1:9", "--preset", "paper"]
     with collected_notices() as notices:
@@ -120,9 +120,9 @@ def test_former_names_that_are_submitted_mean_the_same_and_are_told(monkeypatch:
 
 
 def test_former_names_in_the_options_of_a_job_mean_the_same() -> None:
-    kind = kind_named("reconstruct")
+    kind = get_job_kind("reconstruct")
     with collected_notices() as notices:
-        assert resolved(kind, FORMER) == EXPECTED
+        assert resolve_options(kind, FORMER) == EXPECTED
     assert notices
     stored = EXPECTED.model_dump(mode="json")
     stored |= {"evaluate_background": stored.pop("evaluation_background"), "preset": "paper"}
@@ -130,20 +130,21 @@ def test_former_names_in_the_options_of_a_job_mean_the_same() -> None:
     with pytest.warns(RenamedSettingWarning):
         assert kind.options.model_validate(stored) == EXPECTED
     with pytest.warns(RenamedSettingWarning):
-        assert kind.revised(stored, {"train": {"rates": {"quat": 0.5}}}).train.lr.quat == 0.5
+        assert kind.revise(stored, {"train": {"rates": {"quat": 0.5}}}).train.lr.quat == 0.5
 
 
 def test_former_names_of_a_derived_job_are_read_and_the_later_one_counts() -> None:
-    kind, before = kind_named("relight"), {"environments": ["a.hdr"], "by": "path", "depth": 3}
+    kind, before = get_job_kind("relight"), {"environments": ["a.hdr"], "by": "path", "depth": 3}
     with collected_notices() as notices:
         options = kind.resolve(before)
-        assert kind.revised(before, {"max_bounces": 4}).max_bounces == 4
+        assert kind.revise(before, {"max_bounces": 4}).max_bounces == 4
     assert (options.integrator, options.max_bounces) == ("path", 3)
     assert "by is called integrator now, depth is called max_bounces now; former" in notices[0]
     with collected_notices():
-        assert kind_named("surface").resolve({"texture_side": 256, "settle": True}).refine_vertices
+        assert get_job_kind("surface").resolve({"texture_side": 256, "settle": True}).refine_vertices
         assert (
-            kind_named("export").resolve({"files": ["a.glb"], "texture_size": 64}).falloff_texture_size == 64
+            get_job_kind("export").resolve({"files": ["a.glb"], "texture_size": 64}).falloff_texture_size
+            == 64
         )
 
 

@@ -128,14 +128,14 @@ def test_config_list_shows_the_basic_settings_and_all_on_request() -> None:
     assert "error_power" in config_command("list", "--group", "experimental").stdout
 
 
-def test_config_explain_tells_what_is_known() -> None:
+def test_config_explain_prints_setting() -> None:
     text = config_command("explain", "lr.decay").stdout
     assert "Unit: share" in text and "Default: 0.3" in text and "With redisplats: 0.1" in text
     refused = config_command("explain", "lr.decai")
     assert refused.exit_code == 1 and "the nearest is lr.decay." in refused.stderr
 
 
-def test_config_diff_tells_what_runs_had_changed(tmp_path: Path) -> None:
+def test_config_diff_prints_changed_settings(tmp_path: Path) -> None:
     first = write_run(tmp_path / "first", "iterations=300")
     second = write_run(tmp_path / "second", "iterations=300", "loss.l1=0.5")
     assert config_command("diff", str(first)).stdout == "iterations: 2500 -> 300\n"

@@ -23,7 +23,7 @@ def test_every_operation_is_a_verb_with_a_command_and_a_python_call() -> None:
         assert verb.python, verb.name
 
 
-def test_crop_is_asked_for_in_all_ways() -> None:
+def test_crop_command_job_and_python_match() -> None:
     listed = json.loads(CliRunner().invoke(cli, ["verbs", "--json"]).stdout)
     crop = next(verb for verb in listed if verb["name"] == "crop")
     assert crop["command"] == "octasplat crop"

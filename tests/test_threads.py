@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 import torch
 
-from octasplat.engine.scene.generated import GeneratedSceneConfig, write_generated_scene
-from octasplat.engine.scene.images import resize
+from octasplat.engine.dataset.images import resize
+from octasplat.engine.dataset.synthetic import SyntheticDatasetConfig, write_synthetic_dataset
 from octasplat.engine.threads import one_torch_thread, use_threads
 
 
@@ -26,7 +26,7 @@ def _restore() -> Iterator[None]:
 
 
 @pytest.mark.parametrize("asked", [1, 2, 0, 10_000])
-def test_numba_takes_what_is_asked_and_there(asked: int) -> None:
+def test_numba_threads_are_capped_at_available(asked: int) -> None:
     most = numba.config.NUMBA_NUM_THREADS
     expected = most if asked in (0, 10_000) else min(asked, most)
     assert use_threads(asked) == expected == numba.get_num_threads()
@@ -56,11 +56,11 @@ def test_torch_gets_its_threads_back_after_a_failure() -> None:
 
 
 @pytest.mark.heavy
-def test_a_run_on_one_thread_uses_one(tmp_path: Path) -> None:
+def test_run_with_one_thread_uses_one(tmp_path: Path) -> None:
     """A whole command takes hardly more CPU time than time on the clock, whatever the environment says."""
     scene = tmp_path / "scene"
-    write_generated_scene(
-        scene, GeneratedSceneConfig(views=8, width_px=64, height_px=48, samples_per_side=1, points=500)
+    write_synthetic_dataset(
+        scene, SyntheticDatasetConfig(views=8, width_px=64, height_px=48, samples_per_side=1, points=500)
     )
     command = [
         sys.executable, "-m", "octasplat", "reconstruct", str(scene), "-o", str(tmp_path / "out"), "--quiet",
@@ -74,11 +74,11 @@ def test_a_run_on_one_thread_uses_one(tmp_path: Path) -> None:
     assert used.ru_utime < 1.25 * (time.perf_counter() - began)
 
 
-def test_nothing_goes_on_working_after_hierarchies_were_built_on_one_thread() -> None:
+def test_single_thread_build_leaves_no_running_threads() -> None:
     script = """
 import time
 import numpy as np
-from octasplat.engine.trace.embree_library import Device, MeshScene
+from octasplat.engine.trace.embree import Device, MeshScene
 corners = np.random.default_rng(0).normal(size=(3000, 3)).astype(np.float32)
 faces = np.arange(3000, dtype=np.uint32).reshape(-1, 3)
 scenes = [MeshScene(Device(1), corners, faces) for _ in range(4)]

@@ -17,7 +17,7 @@ from octasplat.workers.postgres.embedded import EmbeddedPostgres
 PREFIX = "OCTASPLAT_"
 
 
-def _listed(value: object) -> object:
+def _split_commas(value: object) -> object:
     """The parts of a text such as ``a,b`` or ``["a", "b"]``; anything else as it is."""
     if not isinstance(value, str):
         return value
@@ -26,9 +26,9 @@ def _listed(value: object) -> object:
     return [part.strip() for part in value.split(",") if part.strip()]
 
 
-LISTED = (NoDecode, BeforeValidator(_listed))
+COMMA_SEPARATED = (NoDecode, BeforeValidator(_split_commas))
 """Marks of a setting with several values, which the environment gives with commas or as JSON."""
-S = TypeVar("S", bound="WorkerSettings")
+SettingsT = TypeVar("SettingsT", bound="WorkerSettings")
 
 
 @dataclass(frozen=True)
@@ -114,8 +114,8 @@ class WorkerSettings(BaseSettings):
     threads: int = Field(0, ge=0)
     pool_size: int = Field(12, gt=1)
     listen: bool = True
-    kind_modules: Annotated[tuple[str, ...], *LISTED] = ()
-    webhook_hosts: Annotated[tuple[str, ...], *LISTED] = ()
+    kind_modules: Annotated[tuple[str, ...], *COMMA_SEPARATED] = ()
+    webhook_hosts: Annotated[tuple[str, ...], *COMMA_SEPARATED] = ()
     keep_jobs_hours: float = Field(0.0, ge=0)
     keep_jobs_hours_by_kind: dict[str, Annotated[float, Field(ge=0)]] = {}
     keep_datasets_hours: float = Field(0.0, ge=0)
@@ -126,7 +126,7 @@ class WorkerSettings(BaseSettings):
 
     @property
     def storage_address(self) -> str:
-        """What :func:`octasplat.workers.store.opening.open_storage` takes."""
+        """What :func:`octasplat.workers.storage.factory.open_storage` takes."""
         return self.storage or str(self.data.absolute() / "store")
 
     @property
@@ -181,7 +181,7 @@ def worker_connections(queues: Mapping[str, int]) -> int:
     return 6 + 4 * sum(queues.values())
 
 
-def load_settings(model: type[S], *, data: Path | None = None, **changes: object) -> S:
+def load_settings(model: type[SettingsT], *, data: Path | None = None, **changes: object) -> SettingsT:
     """Settings from the environment, with what a command line says on top.
 
     Args:

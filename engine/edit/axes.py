@@ -10,24 +10,24 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Bool, Float, Float64
 
-from octasplat.engine.files import Mesh
+from octasplat.engine.files import ImportedMesh
 from octasplat.engine.gaussians.octagon import CHI2_2_99, CHI2_3_99
 
 Axes = Literal["x0", "x90", "x180", "x270"]
 """Angle in degrees by which a file's coordinates must be turned about x to be the scene's."""
 
-TURNS: dict[Axes, Float64[np.ndarray, "3 3"]] = {
+AXIS_ROTATIONS: dict[Axes, Float64[np.ndarray, "3 3"]] = {
     "x0": np.eye(3),
     "x90": np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]),
     "x180": np.diag([1.0, -1, -1]),
     "x270": np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]),
 }
-CLEARLY = 0.5
+MIN_AXES_GAIN = 0.5
 """Another turn must at least halve the median distance to be believed."""
 Q_TOLERANCE = 1e-3
 
 
-def usual_axes(path: Path) -> Axes:
+def default_axes(path: Path) -> Axes:
     """How our own exporter writes this kind of file: the GLB's root node turns the scene by 180 degrees."""
     return "x180" if path.suffix.lower() == ".glb" else "x0"
 
@@ -44,13 +44,13 @@ def detect_axes(
         return usual
     distances = {
         name: float(np.median(np.linalg.norm(edited @ turn.T - unedited, axis=-1)))
-        for name, turn in TURNS.items()
+        for name, turn in AXIS_ROTATIONS.items()
     }
     best = min(distances, key=lambda name: distances[name])
-    return best if distances[best] < CLEARLY * distances[usual] else usual
+    return best if distances[best] < MIN_AXES_GAIN * distances[usual] else usual
 
 
-def infer_q(mesh: Mesh, opacities: Float[np.ndarray, " n"], default: float) -> float:
+def infer_q(mesh: ImportedMesh, opacities: Float[np.ndarray, " n"], default: float) -> float:
     """The Q of the export: as the file states it, else from the octagons' radii or textures, else a default.
 
     A radius is sqrt(Q + 2 ln a) for opacity a, and the texture coordinates hold radius / sqrt(Q).
@@ -74,10 +74,10 @@ def infer_q(mesh: Mesh, opacities: Float[np.ndarray, " n"], default: float) -> f
         with np.errstate(divide="ignore", invalid="ignore"):
             estimates = np.where(squares < 0.9, 2 * logs / (squares - 1), np.nan)
     estimates = estimates[np.isfinite(estimates) & (estimates > 0)]
-    return _snapped(float(np.median(estimates))) if len(estimates) else default
+    return _snap_q(float(np.median(estimates))) if len(estimates) else default
 
 
-def _snapped(q: float) -> float:
+def _snap_q(q: float) -> float:
     """The number that somebody chose, where rounding in the file left it a little off."""
     for chosen in (CHI2_2_99, CHI2_3_99, round(q, 2)):
         if abs(q - chosen) <= Q_TOLERANCE * q:

@@ -9,12 +9,12 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from octasplat.engine.edit.moved_run import is_similarity, write_moved
+from octasplat.engine.edit.run_transform import is_similarity, write_transformed_run_files
 from octasplat.engine.errors import OutputError
-from octasplat.engine.files import read_facts
+from octasplat.engine.files import read_metadata
 from octasplat.engine.files.gaussian_ply import write_gaussian_ply
 from octasplat.engine.gaussians.model import FlatGaussians
-from octasplat.engine.gaussians.scene_facts import SceneFacts
+from octasplat.engine.gaussians.scene_metadata import SceneMetadata
 from octasplat.engine.run_folder import (
     BACKGROUND,
     CONFIG,
@@ -29,9 +29,9 @@ from octasplat.engine.run_folder import (
 )
 from octasplat.engine.writing import telling_of_room, write_json
 
-EDITS = "edits.json"
+EDITS_FILE = "edits.json"
 """What was changed since the training, first to last."""
-_KEPT = (CONFIG, EVENTS, HELD_OUT, TRAINING, VIEWS, ENVIRONMENT, EXACT_ENVIRONMENT, BACKGROUND)
+_COPIED_FILES = (CONFIG, EVENTS, HELD_OUT, TRAINING, VIEWS, ENVIRONMENT, EXACT_ENVIRONMENT, BACKGROUND)
 """What is as true of the scene after it was changed where it stands."""
 
 
@@ -51,7 +51,7 @@ def write_changed_run(
     target: Path,
     note: Mapping[str, object],
     *,
-    facts: SceneFacts | None = None,
+    facts: SceneMetadata | None = None,
     matrix: Float[np.ndarray, "4 4"] | None = None,
 ) -> tuple[str, ...]:
     """Write a folder like that of a run with another scene in it, all at once.
@@ -83,14 +83,14 @@ def write_changed_run(
             if matrix is None:
                 _copy(source, partial)
             elif is_similarity(matrix):
-                told = write_moved(source, partial, matrix)
+                told = write_transformed_run_files(source, partial, matrix)
             else:
                 told = (
                     "Cameras and learnt light cannot follow a scene that was mirrored, sheared or scaled "
                     f"unevenly, so {target} holds the scene alone.",
                 )
-            write_gaussian_ply(gaussians, partial / SCENE, facts=facts or read_facts(source))
-            write_json(partial / EDITS, [*_edits(source), dict(note)])
+            write_gaussian_ply(gaussians, partial / SCENE, facts=facts or read_metadata(source))
+            write_json(partial / EDITS_FILE, [*_read_edits(source), dict(note)])
             partial.replace(target)
     except OSError as error:
         raise OutputError(f"{target} cannot be written ({error.strerror or error}).") from None
@@ -100,18 +100,18 @@ def write_changed_run(
 
 
 def _copy(source: Path, target: Path) -> None:
-    for name in _KEPT:
+    for name in _COPIED_FILES:
         if (source / name).exists():
             shutil.copyfile(source / name, target / name)
     if (source / POSES).is_dir():
         shutil.copytree(source / POSES, target / POSES)
 
 
-def _edits(source: Path) -> list[object]:
-    if not (source / EDITS).exists():
+def _read_edits(source: Path) -> list[object]:
+    if not (source / EDITS_FILE).exists():
         return []
     try:
-        found = json.loads((source / EDITS).read_text(encoding="utf-8"))
+        found = json.loads((source / EDITS_FILE).read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
-        raise OutputError(f"{source / EDITS} cannot be read ({error}); delete it.") from None
+        raise OutputError(f"{source / EDITS_FILE} cannot be read ({error}); delete it.") from None
     return found if isinstance(found, list) else [found]

@@ -6,18 +6,18 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
-from octasplat.engine.edit.choices import Cleaning
+from octasplat.engine.dataset.camera_clearance import CameraClearance
+from octasplat.engine.edit.edit_options import CleanupOptions
 from octasplat.engine.edit.reports import CleanReport
 from octasplat.engine.gaussians.model import FlatGaussians
-from octasplat.engine.scene.near import NearZones
 
-WIDEST_LINK = 8.0
+MAX_LINK = 8.0
 """A Gaussian reaches no further than this many times the distance to its nearest neighbours, so that one huge
 Gaussian does not hold everything together."""
 
 
 def clean(
-    gaussians: FlatGaussians, options: Cleaning, near_zones: NearZones | None = None
+    gaussians: FlatGaussians, options: CleanupOptions, near_zones: CameraClearance | None = None
 ) -> tuple[Bool[np.ndarray, " n"], CleanReport]:
     """Which Gaussians stay, and why the others do not.
 
@@ -30,7 +30,7 @@ def clean(
     keep = ~(faint | small | large)
     near = np.zeros(len(gaussians), np.bool_)
     if near_zones is not None:
-        near = keep & near_zones.holds(gaussians.means_world)
+        near = keep & near_zones.contains(gaussians.means_world)
         keep &= ~near
     floating, groups = 0, 0
     if options.floaters and keep.any():
@@ -64,7 +64,7 @@ def linked_groups(gaussians: FlatGaussians, link: float, neighbours: int) -> tup
     distances, near = KDTree(gaussians.means_world).query(gaussians.means_world, k=count)
     distances, near = distances[:, 1:], near[:, 1:]
     extents = gaussians.scales.max(axis=1).astype(np.float64)
-    extents = np.minimum(extents, WIDEST_LINK * np.median(distances, axis=1))
+    extents = np.minimum(extents, MAX_LINK * np.median(distances, axis=1))
     linked = distances <= link * (extents[:, None] + extents[near])
     rows = np.broadcast_to(np.arange(len(gaussians))[:, None], near.shape)[linked]
     graph = coo_array(

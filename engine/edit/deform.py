@@ -8,10 +8,10 @@ from collections.abc import Callable
 import numpy as np
 from jaxtyping import Bool, Float, Float64
 
-from octasplat.engine.edit.apply import apply_legs_to, blocks
-from octasplat.engine.edit.local_maps import has_area, legs_world
 from octasplat.engine.edit.octagon_fit import fit_octagons
 from octasplat.engine.edit.reports import DeformReport
+from octasplat.engine.gaussians.apply_legs import apply_legs_to, row_blocks
+from octasplat.engine.gaussians.legs import has_area, legs_world
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.gaussians.octagon import SIDES, corner_directions
 
@@ -28,8 +28,8 @@ def deformation_corners(gaussians: FlatGaussians) -> Float64[np.ndarray, "n 8 3"
     An octagon of radius sqrt(2) standard deviations, whatever the opacity; its mean is the centre.
     """
     corners = np.empty((len(gaussians), SIDES, 3))
-    geometry = gaussians.bare()
-    for block in blocks(len(gaussians)):
+    geometry = gaussians.with_base_color_only()
+    for block in row_blocks(len(gaussians)):
         part = geometry.select(block)
         spokes = np.einsum("kc,nic->nki", CUBATURE_RADIUS * corner_directions(), legs_world(part))
         corners[block] = part.means_world.astype(np.float64)[:, None] + spokes
@@ -78,8 +78,8 @@ def deform_to(
     means, legs = np.empty((count, 3)), np.empty((count, 3, 2))
     unmoved, collapsed = np.empty(count, dtype=bool), np.empty(count, dtype=bool)
     residuals = np.empty(count)
-    geometry = gaussians.bare()
-    for block in blocks(count):
+    geometry = gaussians.with_base_color_only()
+    for block in row_blocks(count):
         moved = moved_world[block].astype(np.float64)
         moves = moved - corners_world[block]
         if not np.isfinite(moves).all():

@@ -6,15 +6,15 @@ import numpy as np
 from jaxtyping import Bool, Float64
 
 from octasplat.engine.colour import linear_to_srgb
-from octasplat.engine.edit.choices import MaterialChange
-from octasplat.engine.gaussians.channels import stacked
-from octasplat.engine.gaussians.harmonics import sh_basis, spread_directions
+from octasplat.engine.edit.edit_options import MaterialChange
+from octasplat.engine.gaussians.channels import stack_channels
 from octasplat.engine.gaussians.materials import AMBIENT, MATERIAL_WIDTHS
 from octasplat.engine.gaussians.model import FlatGaussians
+from octasplat.engine.gaussians.spherical_harmonics import fibonacci_sphere, sh_basis
 from octasplat.engine.shading.environment_levels import LightLevels
 from octasplat.engine.shading.split_sum import Surface, shade
 
-_AT_ONCE = 1 << 14
+_ROWS_PER_BLOCK = 1 << 14
 _DIRECTIONS = 64
 """From which a Gaussian is looked at to see how its look changes."""
 
@@ -23,7 +23,7 @@ def with_materials(
     gaussians: FlatGaussians, chosen: Bool[np.ndarray, " n"], change: MaterialChange
 ) -> FlatGaussians:
     """The scene, which has materials, with those of the chosen Gaussians changed and all else shared."""
-    values, factors = change.set.given(), change.scale.given()
+    values, factors = change.set.set_values(), change.scale.set_values()
     changed = {name: gaussians.channels[name].copy() for name in (*values, *factors)}
     for name, value in values.items():
         changed[name][chosen] = value
@@ -32,7 +32,7 @@ def with_materials(
     return gaussians.with_channels(changed)
 
 
-def with_harmonics_following(
+def refit_sh(
     before: FlatGaussians,
     after: FlatGaussians,
     chosen: Bool[np.ndarray, " n"],
@@ -52,17 +52,19 @@ def with_harmonics_following(
         light: levels of the environment that the scene was learnt with.
         frame: its right, up and forward in the world, as rows.
     """
-    directions_world = spread_directions(_DIRECTIONS)
+    directions_world = fibonacci_sphere(_DIRECTIONS)
     solve = np.linalg.pinv(sh_basis(directions_world, after.sh_degree))
     sh, rows = after.sh.copy(), np.flatnonzero(chosen)
-    for start in range(0, len(rows), _AT_ONCE):
-        part = rows[start : start + _AT_ONCE]
-        looks = [_look(scene.select(part), directions_world, light, frame) for scene in (before, after)]
+    for start in range(0, len(rows), _ROWS_PER_BLOCK):
+        part = rows[start : start + _ROWS_PER_BLOCK]
+        looks = [
+            _shaded_colours(scene.select(part), directions_world, light, frame) for scene in (before, after)
+        ]
         sh[part] += np.einsum("kd,ndc->nkc", solve, looks[1] - looks[0]).astype(np.float32)
     return replace(after, sh=sh)
 
 
-def _look(
+def _shaded_colours(
     gaussians: FlatGaussians,
     directions_world: Float64[np.ndarray, "d 3"],
     light: LightLevels,
@@ -73,7 +75,7 @@ def _look(
     directions = np.tile(directions_world, (count, 1))
     normals = np.repeat(gaussians.rotations[:, :, 0].astype(np.float64), views, axis=0)
     normals *= np.where((normals * directions).sum(axis=1) > 0, -1.0, 1.0)[:, None]
-    material = np.repeat(stacked(gaussians.channels, list(MATERIAL_WIDTHS)), views, axis=0)
+    material = np.repeat(stack_channels(gaussians.channels, list(MATERIAL_WIDTHS)), views, axis=0)
     surface = Surface.alone(material, normals, directions)
     if AMBIENT in gaussians.channels:
         seen = np.repeat(gaussians.channels[AMBIENT][:, 0].astype(np.float64), views)

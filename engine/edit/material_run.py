@@ -6,12 +6,12 @@ import numpy as np
 from jaxtyping import Bool
 
 from octasplat.engine.config import read_config
-from octasplat.engine.edit.choices import MaterialChange, Selection
-from octasplat.engine.edit.material_change import with_harmonics_following, with_materials
+from octasplat.engine.edit.edit_options import MaterialChange, Selection
+from octasplat.engine.edit.material_change import refit_sh, with_materials
 from octasplat.engine.errors import ConfigError
 from octasplat.engine.gaussians.materials import require_materials
 from octasplat.engine.gaussians.model import FlatGaussians
-from octasplat.engine.render.environment_map import read_environment
+from octasplat.engine.render.environment_files import read_environment
 from octasplat.engine.run_folder import CONFIG, SCENE, is_run, run_environment
 from octasplat.engine.shading.environment_frame import environment_frame
 from octasplat.engine.shading.learnt_light import LearntLight
@@ -39,16 +39,16 @@ def change_materials(
             f"{source}: none of its {len(chosen):,} Gaussians is chosen, so nothing is changed."
         )
     changed = with_materials(gaussians, chosen, change)
-    if not follows(source):
+    if not has_known_light(source):
         return changed
     settings = read_config(source / CONFIG).train.materials
     light = LearntLight(settings.environment_height)
     light.put(read_environment(run_environment(source)))
     frame = environment_frame(np.array(settings.up_world, np.float64))
-    return with_harmonics_following(gaussians, changed, chosen, light.levels, frame)
+    return refit_sh(gaussians, changed, chosen, light.levels, frame)
 
 
-def follows(source: Path) -> bool:
+def has_known_light(source: Path) -> bool:
     """Whether the harmonics of a scene show its materials in a light that is known."""
     if not is_run(source) or not run_environment(source).exists():
         return False

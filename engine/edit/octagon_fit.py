@@ -5,11 +5,11 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Float64
 
-from octasplat.engine.edit.local_maps import legs_world
+from octasplat.engine.gaussians.legs import legs_world
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.gaussians.octagon import SIDES, corner_directions
 
-LEAST_CORNERS = 3
+MIN_CORNERS = 3
 """An affine map of a plane is fixed by three points; no three corners of an octagon lie on a line."""
 
 
@@ -22,13 +22,13 @@ class OctagonFit:
         legs_world: new legs, not orthogonal where the octagon was sheared.
         residuals: root mean square distance of the corners from the fit, in standard deviations along the
             longer new axis: how far the edit is from an affine map.
-        folded: some triangle around the centre faces against the others.
+        is_folded: some triangle around the centre faces against the others.
     """
 
     means_world: Float64[np.ndarray, "n 3"]
     legs_world: Float64[np.ndarray, "n 3 2"]
     residuals: Float64[np.ndarray, " n"]
-    folded: Bool[np.ndarray, " n"]
+    is_folded: Bool[np.ndarray, " n"]
 
 
 def fit_octagons(
@@ -55,7 +55,7 @@ def fit_octagons(
     codes = np.packbits(present, axis=1, bitorder="little")[:, 0]
     for code in np.unique(codes):
         corners = np.flatnonzero((int(code) >> np.arange(SIDES)) & 1)
-        if len(corners) < LEAST_CORNERS:
+        if len(corners) < MIN_CORNERS:
             continue
         rows = codes == code
         fitted[rows] = np.einsum("fk,nkc->nfc", np.linalg.pinv(design[corners]), moves[rows][:, corners])
@@ -68,7 +68,7 @@ def fit_octagons(
     residuals = rms / np.maximum(largest_scale(legs), np.finfo(np.float32).tiny)
     # Relative to its centre, each corner as it is now: the affine part and what the fit leaves.
     spokes = np.einsum("kc,nic->nki", corner_directions(), legs) * safe_radii[:, None, None] + rest
-    return OctagonFit(means, legs, residuals, _folded(spokes, legs, present))
+    return OctagonFit(means, legs, residuals, _is_folded(spokes, legs, present))
 
 
 def largest_scale(legs: Float64[np.ndarray, "n 3 2"]) -> Float64[np.ndarray, " n"]:
@@ -80,7 +80,7 @@ def largest_scale(legs: Float64[np.ndarray, "n 3 2"]) -> Float64[np.ndarray, " n
     return result
 
 
-def _folded(
+def _is_folded(
     spokes: Float64[np.ndarray, "n 8 3"],
     legs: Float64[np.ndarray, "n 3 2"],
     present: Bool[np.ndarray, "n 8"],

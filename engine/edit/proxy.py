@@ -12,18 +12,18 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64, Int32, Int64
 from scipy.spatial import KDTree
 
-from octasplat.engine.edit.apply import ROWS_AT_ONCE, blocks
-from octasplat.engine.edit.kernels_mean_value import mean_value_weights, winding_numbers
-from octasplat.engine.edit.kernels_proxy import blend, triangle_weights
-from octasplat.engine.edit.mirroring import was_mirrored
+from octasplat.engine.edit.kernels.mean_value import mean_value_weights, winding_numbers
+from octasplat.engine.edit.kernels.proxy import blend, triangle_weights
+from octasplat.engine.edit.mirror_detection import was_mirrored
 from octasplat.engine.errors import SceneFileError
+from octasplat.engine.gaussians.apply_legs import ROWS_PER_BLOCK, row_blocks
 
 Method = Literal["nearest", "mvc"]
 CANDIDATES = 24
-MOST_CUTS = 16
-STORED_BYTES = 1 << 29
+MAX_SUBDIVISIONS = 16
+MAX_CACHE_BYTES = 1 << 29
 """What ties the corners to the proxy is kept from frame to frame up to this size, and found anew beyond."""
-BLOCK_NUMBERS = 1 << 23
+VALUES_PER_BLOCK = 1 << 23
 """Most mean-value coordinates that are computed at once."""
 DEFAULT_REACH = 0.1
 """How far a surface moves what is around it, as a share of the diagonal of its bounding box."""
@@ -36,12 +36,12 @@ class Proxy:
     Attributes:
         vertices_world: positions at rest.
         triangles: vertex indices; those without area are of no use and left out.
-        told_mirrored: whether its deformations mirror it, if somebody knows; else they are looked at.
+        mirrored_override: whether its deformations mirror it, if somebody knows; else they are looked at.
     """
 
     vertices_world: Float64[np.ndarray, "v 3"]
     triangles: Int64[np.ndarray, "t 3"]
-    told_mirrored: bool | None = None
+    mirrored_override: bool | None = None
 
     def __post_init__(self) -> None:
         """Leave out triangles without area."""
@@ -56,10 +56,10 @@ class Proxy:
         """Diagonal of the bounding box, world units."""
         return float(np.linalg.norm(np.ptp(self.vertices_world, axis=0)))
 
-    def mirrored(self, vertices_world: Float64[np.ndarray, "v 3"]) -> bool:
+    def is_mirrored(self, vertices_world: Float64[np.ndarray, "v 3"]) -> bool:
         """Whether moving the vertices to ``vertices_world`` mirrors the space around the mesh."""
-        if self.told_mirrored is not None:
-            return self.told_mirrored
+        if self.mirrored_override is not None:
+            return self.mirrored_override
         return was_mirrored(self.vertices_world, vertices_world, self.triangles, self.is_closed())
 
     def is_closed(self) -> bool:
@@ -75,7 +75,7 @@ class Binding(Protocol):
     """Octagon corners tied to a proxy."""
 
     @property
-    def moving(self) -> Bool[np.ndarray, " n"]:
+    def moving_mask(self) -> Bool[np.ndarray, " n"]:
         """Which Gaussians the proxy moves at all."""
         ...
 
@@ -83,12 +83,12 @@ class Binding(Protocol):
         """Where the corners are once the proxy's vertices are at ``vertices_world``."""
         ...
 
-    def mirrored(self, vertices_world: Float64[np.ndarray, "v 3"]) -> Bool[np.ndarray, " n"]:
+    def mirrored_mask(self, vertices_world: Float64[np.ndarray, "v 3"]) -> Bool[np.ndarray, " n"]:
         """Around which Gaussians space was mirrored then."""
         ...
 
 
-def bind(
+def bind_corners(
     proxy: Proxy,
     corners_world: Float64[np.ndarray, "n 8 3"],
     method: Method = "nearest",
@@ -114,7 +114,7 @@ def bind(
 
 
 @dataclass(frozen=True)
-class _Ties:
+class _TriangleWeights:
     """Triangles that move points, those of point i from ``starts[i]`` to ``starts[i + 1]``, with weights."""
 
     starts: Int64[np.ndarray, " p1"]
@@ -135,51 +135,55 @@ class NearestBinding:
         self._reach = reach_world
         self._near = NearTriangles(proxy)
         self._influence = np.empty(corners_world.shape[:2])
-        self._stored: list[_Ties | None] = []
-        room = STORED_BYTES
-        for block in blocks(len(corners_world)):
-            ties, self._influence[block] = self._tie(corners_world[block])
+        self._stored: list[_TriangleWeights | None] = []
+        room = MAX_CACHE_BYTES
+        for block in row_blocks(len(corners_world)):
+            ties, self._influence[block] = self._bind_corners(corners_world[block])
             room -= ties.nbytes
             self._stored.append(ties if room >= 0 else None)
         self._frames = _triangle_frames(proxy.vertices_world[proxy.triangles])
         self._centres = proxy.vertices_world[proxy.triangles].mean(axis=1)
 
     @property
-    def moving(self) -> Bool[np.ndarray, " n"]:
+    def moving_mask(self) -> Bool[np.ndarray, " n"]:
         """Which Gaussians have a corner within reach."""
         result: np.ndarray = self._influence.max(axis=1) > 0
         return result
 
     def deform(self, vertices_world: Float64[np.ndarray, "v 3"]) -> Float64[np.ndarray, "n 8 3"]:
         """Corners after the proxy's vertices moved."""
-        moved = _checked(vertices_world, self._proxy)[self._proxy.triangles]
+        moved = _check_vertices(vertices_world, self._proxy)[self._proxy.triangles]
         rest = self._proxy.vertices_world[self._proxy.triangles]
-        side = -1.0 if self._proxy.mirrored(vertices_world) else 1.0
+        side = -1.0 if self._proxy.is_mirrored(vertices_world) else 1.0
         derivatives = _moved_frames(moved, rest, side) @ np.linalg.inv(self._frames)
         moved_centres = moved.mean(axis=1)
         result = np.empty_like(self._corners)
-        for block, stored in zip(blocks(len(self._corners)), self._stored, strict=True):
+        for block, stored in zip(row_blocks(len(self._corners)), self._stored, strict=True):
             corners = self._corners[block]
-            ties = self._tie(corners)[0] if stored is None else stored
+            ties = self._bind_corners(corners)[0] if stored is None else stored
             points, places = np.ascontiguousarray(corners.reshape(-1, 3)), np.empty((corners.size // 3, 3))
             blend(
                 points, ties.starts, ties.triangles, ties.weights, derivatives, self._centres, moved_centres,
                 places,
             )  # fmt: skip
-            result[block] = _mix(corners, places.reshape(corners.shape), self._influence[block])
+            result[block] = _blend_corners(corners, places.reshape(corners.shape), self._influence[block])
         return result
 
-    def mirrored(self, vertices_world: Float64[np.ndarray, "v 3"]) -> Bool[np.ndarray, " n"]:
+    def mirrored_mask(self, vertices_world: Float64[np.ndarray, "v 3"]) -> Bool[np.ndarray, " n"]:
         """Which Gaussians follow the proxy more than not, if it was mirrored."""
-        return _followers(self._influence, self._proxy.mirrored(vertices_world))
+        return _mirrored_followers(self._influence, self._proxy.is_mirrored(vertices_world))
 
-    def _tie(self, corners_world: Float64[np.ndarray, "n 8 3"]) -> tuple[_Ties, Float64[np.ndarray, "n 8"]]:
+    def _bind_corners(
+        self, corners_world: Float64[np.ndarray, "n 8 3"]
+    ) -> tuple[_TriangleWeights, Float64[np.ndarray, "n 8"]]:
         """What moves these corners, and how much they follow it."""
-        chosen, weights, distances = self._near.to(corners_world.reshape(-1, 3))
-        influence = _fade(distances, self._reach)
+        chosen, weights, distances = self._near.query(corners_world.reshape(-1, 3))
+        influence = _smooth_falloff(distances, self._reach)
         used = (weights > 0) & (influence > 0)[:, None]
         starts = np.concatenate([[0], np.cumsum(used.sum(axis=1))])
-        return _Ties(starts, chosen[used], weights[used]), influence.reshape(corners_world.shape[:2])
+        return _TriangleWeights(starts, chosen[used], weights[used]), influence.reshape(
+            corners_world.shape[:2]
+        )
 
 
 class MeanValueBinding:
@@ -201,42 +205,42 @@ class MeanValueBinding:
         self._influence = np.repeat(inside[:, None], corners_world.shape[1], axis=1)
         if reach_world is not None and reach_world > 0:
             near = NearTriangles(proxy)
-            for block in blocks(len(corners_world)):
-                distances = near.to(corners_world[block].reshape(-1, 3))[2]
-                faded = _fade(distances, reach_world).reshape(-1, corners_world.shape[1])
+            for block in row_blocks(len(corners_world)):
+                distances = near.query(corners_world[block].reshape(-1, 3))[2]
+                faded = _smooth_falloff(distances, reach_world).reshape(-1, corners_world.shape[1])
                 self._influence[block] = np.maximum(self._influence[block], faded)
         self._rows = np.flatnonzero(self._influence.max(axis=1) > 0)
         self._edges, self._opposite = _edges(proxy.triangles)
         numbers_a_row = corners_world.shape[1] * len(proxy.vertices_world)
-        self._rows_at_once = max(1, min(ROWS_AT_ONCE, BLOCK_NUMBERS // numbers_a_row))
+        self._rows_at_once = max(1, min(ROWS_PER_BLOCK, VALUES_PER_BLOCK // numbers_a_row))
         self._stored: list[np.ndarray] | None = None
-        if self._rows.size * numbers_a_row * 8 <= STORED_BYTES:
+        if self._rows.size * numbers_a_row * 8 <= MAX_CACHE_BYTES:
             self._stored = [self._coordinates(self._rows[block]) for block in self._blocks()]
 
     @property
-    def moving(self) -> Bool[np.ndarray, " n"]:
+    def moving_mask(self) -> Bool[np.ndarray, " n"]:
         """Which Gaussians lie in the cage or within reach of it."""
         result: np.ndarray = self._influence.max(axis=1) > 0
         return result
 
     def deform(self, vertices_world: Float64[np.ndarray, "v 3"]) -> Float64[np.ndarray, "n 8 3"]:
         """Corners after the cage's vertices moved."""
-        shifts = _checked(vertices_world, self._proxy) - self._proxy.vertices_world
+        shifts = _check_vertices(vertices_world, self._proxy) - self._proxy.vertices_world
         result = self._corners.copy()
         for number, block in enumerate(self._blocks()):
             rows = self._rows[block]
             weights = self._coordinates(rows) if self._stored is None else self._stored[number]
             corners = self._corners[rows]
             moved = corners + (weights @ shifts).reshape(corners.shape)
-            result[rows] = _mix(corners, moved, self._influence[rows])
+            result[rows] = _blend_corners(corners, moved, self._influence[rows])
         return result
 
-    def mirrored(self, vertices_world: Float64[np.ndarray, "v 3"]) -> Bool[np.ndarray, " n"]:
+    def mirrored_mask(self, vertices_world: Float64[np.ndarray, "v 3"]) -> Bool[np.ndarray, " n"]:
         """Which Gaussians follow the cage more than not, if it was mirrored."""
-        return _followers(self._influence, self._proxy.mirrored(vertices_world))
+        return _mirrored_followers(self._influence, self._proxy.is_mirrored(vertices_world))
 
     def _blocks(self) -> list[slice]:
-        return list(blocks(len(self._rows), self._rows_at_once))
+        return list(row_blocks(len(self._rows), self._rows_at_once))
 
     def _coordinates(self, rows: Int64[np.ndarray, " r"]) -> Float64[np.ndarray, "p v"]:
         """The coordinates of the corners of some Gaussians."""
@@ -266,7 +270,7 @@ class NearTriangles:
         self._spacing = float(np.median(edges))
         self._classes = _size_classes(self._corners, edges.max(axis=1), self._spacing)
 
-    def to(
+    def query(
         self, points: Float64[np.ndarray, "p 3"]
     ) -> tuple[Int32[np.ndarray, "p k"], Float32[np.ndarray, "p k"], Float64[np.ndarray, " p"]]:
         """Triangles near each point with smooth weights, and the distance to the nearest one."""
@@ -319,11 +323,11 @@ def _size_classes(
 ) -> tuple[_SizeClass, ...]:
     """Return triangles of usual size, all of one class, and larger ones by powers of two."""
     wanted = longest / (2.0 * spacing)
-    octave = np.ceil(np.log2(np.maximum(wanted / MOST_CUTS, 1.0))).astype(np.int64)
+    octave = np.ceil(np.log2(np.maximum(wanted / MAX_SUBDIVISIONS, 1.0))).astype(np.int64)
     classes = []
     for number in np.unique(octave):
         rows = np.flatnonzero(octave == number)
-        cuts = np.clip(np.ceil(wanted[rows]), 1, MOST_CUTS).astype(np.int64)
+        cuts = np.clip(np.ceil(wanted[rows]), 1, MAX_SUBDIVISIONS).astype(np.int64)
         samples, owners = _spread_samples(corners[rows], cuts)
         coarser = float((longest[rows] / cuts).max()) - 2.0 * spacing if number > 0 else 0.0
         classes.append(_SizeClass(KDTree(samples), rows[owners], coarser))
@@ -378,7 +382,7 @@ def _moved_frames(
     return np.stack([*edges, normals], axis=-1)
 
 
-def _fade(distances: Float64[np.ndarray, " p"], reach: float) -> Float64[np.ndarray, " p"]:
+def _smooth_falloff(distances: Float64[np.ndarray, " p"], reach: float) -> Float64[np.ndarray, " p"]:
     """1 up to ``reach``, 0 from twice that on, smooth in between."""
     if np.isinf(reach):
         return np.ones_like(distances)
@@ -387,7 +391,7 @@ def _fade(distances: Float64[np.ndarray, " p"], reach: float) -> Float64[np.ndar
     return result
 
 
-def _mix(
+def _blend_corners(
     rest: Float64[np.ndarray, "n 8 3"],
     moved: Float64[np.ndarray, "n 8 3"],
     influence: Float64[np.ndarray, "n 8"],
@@ -398,13 +402,13 @@ def _mix(
     return result
 
 
-def _followers(influence: Float64[np.ndarray, "n 8"], mirrored: bool) -> Bool[np.ndarray, " n"]:
+def _mirrored_followers(influence: Float64[np.ndarray, "n 8"], mirrored: bool) -> Bool[np.ndarray, " n"]:
     """Gaussians that follow a mirrored proxy by more than half, where the blend is a mirroring, too."""
     result: np.ndarray = (influence.mean(axis=1) > 0.5) & mirrored
     return result
 
 
-def _checked(vertices_world: Float64[np.ndarray, "v 3"], proxy: Proxy) -> Float64[np.ndarray, "v 3"]:
+def _check_vertices(vertices_world: Float64[np.ndarray, "v 3"], proxy: Proxy) -> Float64[np.ndarray, "v 3"]:
     if vertices_world.shape != proxy.vertices_world.shape:
         raise SceneFileError(
             f"The deformed proxy has {len(vertices_world)} vertices, but at rest it has "

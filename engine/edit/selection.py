@@ -8,17 +8,17 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from octasplat.engine.edit.axes import infer_q
-from octasplat.engine.edit.choices import Selection
-from octasplat.engine.edit.matching import match_octagons
-from octasplat.engine.edit.where import where
+from octasplat.engine.edit.edit_options import Selection
+from octasplat.engine.edit.filter_expression import filter_mask
+from octasplat.engine.edit.octagon_matching import match_octagons
 from octasplat.engine.errors import ConfigError
-from octasplat.engine.files import Mesh
-from octasplat.engine.gaussians.channels import common_widths
+from octasplat.engine.files import ImportedMesh
+from octasplat.engine.gaussians.channels import merge_widths
 from octasplat.engine.gaussians.model import FlatGaussians, concatenate
 from octasplat.engine.gaussians.octagon import CHI2_2_99, octagon_radii
 
 
-def chosen_by(gaussians: FlatGaussians, selection: Selection) -> Bool[np.ndarray, " n"]:
+def selection_mask(gaussians: FlatGaussians, selection: Selection) -> Bool[np.ndarray, " n"]:
     """Which of a scene are meant.
 
     Raises:
@@ -26,15 +26,15 @@ def chosen_by(gaussians: FlatGaussians, selection: Selection) -> Bool[np.ndarray
     """
     chosen = np.ones(len(gaussians), dtype=bool)
     if selection.where is not None:
-        chosen &= where(gaussians, selection.where)
+        chosen &= filter_mask(gaussians, selection.where)
     if (box := selection.box) is not None:
-        chosen &= inside_box(gaussians, np.array(box[:3]), np.array(box[3:]))
+        chosen &= in_box(gaussians, np.array(box[:3]), np.array(box[3:]))
     if (sphere := selection.sphere) is not None:
-        chosen &= inside_sphere(gaussians, np.array(sphere[:3]), sphere[3])
+        chosen &= in_sphere(gaussians, np.array(sphere[:3]), sphere[3])
     return ~chosen if selection.inverse else chosen
 
 
-def inside_box(
+def in_box(
     gaussians: FlatGaussians, low_world: Float[np.ndarray, "3"], high_world: Float[np.ndarray, "3"]
 ) -> Bool[np.ndarray, " n"]:
     """Which centres lie in a box along the world's axes, its sides included.
@@ -50,7 +50,7 @@ def inside_box(
     return result
 
 
-def inside_sphere(
+def in_sphere(
     gaussians: FlatGaussians, centre_world: Float[np.ndarray, "3"], radius_world: float
 ) -> Bool[np.ndarray, " n"]:
     """Which centres lie in a sphere.
@@ -65,7 +65,7 @@ def inside_sphere(
     return result
 
 
-def in_mesh(gaussians: FlatGaussians, mesh: Mesh, path: Path) -> Bool[np.ndarray, " n"]:
+def in_mesh(gaussians: FlatGaussians, mesh: ImportedMesh, path: Path) -> Bool[np.ndarray, " n"]:
     """Which Gaussians have their octagon in a mesh that was exported from the scene, wherever it lies now.
 
     Args:
@@ -95,11 +95,11 @@ def with_sh_degree(gaussians: FlatGaussians, degree: int) -> FlatGaussians:
     return result
 
 
-def merge(scenes: Sequence[FlatGaussians], sh_degree: int | None = None) -> FlatGaussians:
+def merge_scenes(scenes: Sequence[FlatGaussians], sh_degree: int | None = None) -> FlatGaussians:
     """All Gaussians of ``scenes``, in order, with harmonics of one degree.
 
     The result has the channels of all scenes; Gaussians of a scene without one have 0 there
-    (:data:`octasplat.engine.gaussians.channels.FILL`).
+    (:data:`octasplat.engine.gaussians.channels.FILL_VALUE`).
 
     Args:
         scenes: at least one.
@@ -109,10 +109,10 @@ def merge(scenes: Sequence[FlatGaussians], sh_degree: int | None = None) -> Flat
         ConfigError: two scenes have a channel of one name and different widths.
     """
     degree = max(scene.sh_degree for scene in scenes) if sh_degree is None else sh_degree
-    widths = common_widths(scene.channels for scene in scenes)
+    widths = merge_widths(scene.channels for scene in scenes)
     return concatenate(
         [
-            replace(with_sh_degree(scene, degree), channels=scene.channels.completed(widths, len(scene)))
+            replace(with_sh_degree(scene, degree), channels=scene.channels.with_filled(widths, len(scene)))
             for scene in scenes
         ]
     )

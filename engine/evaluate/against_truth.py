@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Float32
 
 from octasplat.engine.colour import srgb_to_linear
+from octasplat.engine.dataset import Dataset
 from octasplat.engine.evaluate.truth import Truth, ViewTruth
 from octasplat.engine.evaluate.truth_metrics import (
     TRUTH_DEFINITIONS,
@@ -21,12 +22,11 @@ from octasplat.engine.evaluate.truth_metrics import (
 )
 from octasplat.engine.events import Listener, StageProgress, Warned
 from octasplat.engine.gaussians.materials import ALBEDO, METALLIC, ROUGHNESS
-from octasplat.engine.light.environment import EnvironmentMap, environment_frame
-from octasplat.engine.light.relighting import Relighter, RelitImage
+from octasplat.engine.pathtracing.environment import EnvironmentMap, environment_frame
+from octasplat.engine.pathtracing.relighting.path_relighter import Relighter, RelitImage
 from octasplat.engine.rays import ImageRays
-from octasplat.engine.render.environment_map import read_environment
+from octasplat.engine.render.environment_files import read_environment
 from octasplat.engine.render.renderer import RenderedImage
-from octasplat.engine.scene import Dataset
 
 COVERED = 0.5
 _DECIMALS = 6
@@ -100,7 +100,7 @@ class TruthMeasures:
             return
         pictures, true_pictures, labels = [], [], []
         for folder, path in self.truth.relit:
-            relighter.put(EnvironmentMap(read_environment(path), frame))
+            relighter.set_environment(EnvironmentMap(read_environment(path), frame))
             for name in wanted:
                 rays = dataset.view_rays(names[name])
                 pictures.append(relighter.render(rays))

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32
 
-from octasplat.engine.render.images import resized, write_webp
+from octasplat.engine.render.image_files import shrink_to, write_webp
 
 WORST = 12
 BEST = 4
@@ -42,10 +42,10 @@ class ViewImages:
     def shrunk(self, max_side_px: int = MAX_SIDE_PX) -> "ViewImages":
         """The same at most ``max_side_px`` wide and high."""
         return ViewImages(
-            resized(self.photograph, max_side_px),
-            resized(self.render, max_side_px),
-            resized(self.flip_map[..., None], max_side_px)[..., 0],
-            {name: resized(image, max_side_px) for name, image in self.layers.items()},
+            shrink_to(self.photograph, max_side_px),
+            shrink_to(self.render, max_side_px),
+            shrink_to(self.flip_map[..., None], max_side_px)[..., 0],
+            {name: shrink_to(image, max_side_px) for name, image in self.layers.items()},
         )
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 import numba
 
 from octasplat.engine.colour import composited
+from octasplat.engine.dataset import Dataset
 from octasplat.engine.evaluate.against_truth import TruthMeasures
 from octasplat.engine.evaluate.gallery import ViewImages, WorstAndBest
 from octasplat.engine.evaluate.layers import shown_environment, shown_layers
@@ -24,15 +25,14 @@ from octasplat.engine.evaluate.views import (
 from octasplat.engine.events import Listener, StageProgress, read_events
 from octasplat.engine.gaussians.materials import ALBEDO
 from octasplat.engine.gaussians.model import FlatGaussians
-from octasplat.engine.light.environment import EnvironmentMap
-from octasplat.engine.light.relighting import Relighter
-from octasplat.engine.render.images import write_png
-from octasplat.engine.render.names import render_names
-from octasplat.engine.render.oversampling import render_filtered
+from octasplat.engine.pathtracing.environment import EnvironmentMap
+from octasplat.engine.pathtracing.relighting.path_relighter import Relighter
+from octasplat.engine.render.file_names import unique_render_names
+from octasplat.engine.render.image_files import write_png
 from octasplat.engine.render.renderer import background_colour, front_normals
-from octasplat.engine.scene import Dataset
+from octasplat.engine.render.supersampling import render_filtered
 from octasplat.engine.shading.protocol import ShadingModel
-from octasplat.engine.trace.make import make_tracer
+from octasplat.engine.trace.factory import make_tracer
 from octasplat.engine.trace.protocol import Tracer, TraceSettings
 from octasplat.engine.train.shading import background_of, exposed_as
 from octasplat.engine.writing import write_json
@@ -83,7 +83,7 @@ def evaluate_held_out(
     images = WorstAndBest()
     total = len(dataset.test_indices)
     photographs = [view.name for view in dataset.views]
-    names = dict(zip(photographs, render_names(photographs), strict=True))
+    names = dict(zip(photographs, unique_render_names(photographs), strict=True))
     for view, measured in _measured(
         _rendered(dataset, tracer, shading, background, measures), threads or numba.get_num_threads()
     ):

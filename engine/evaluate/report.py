@@ -27,7 +27,7 @@ from octasplat.engine.evaluate.gallery import (
     magma,
 )
 from octasplat.engine.evaluate.layers import LABELS, shown_environment
-from octasplat.engine.render.images import resized
+from octasplat.engine.render.image_files import shrink_to
 from octasplat.engine.writing import write_text
 
 
@@ -160,7 +160,7 @@ def _content(
 def _map(rgb_srgb: Float32[np.ndarray, "h w 3"]) -> dict[str, object]:
     """The map's picture and size."""
     height, width = rgb_srgb.shape[:2]
-    return {"uri": data_uri(resized(rgb_srgb, MAX_SIDE_PX)), "width": width, "height": height}
+    return {"uri": data_uri(shrink_to(rgb_srgb, MAX_SIDE_PX)), "width": width, "height": height}
 
 
 def _environment(radiance_linear: Float32[np.ndarray, "h w 3"]) -> dict[str, object]:

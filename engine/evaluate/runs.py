@@ -8,18 +8,20 @@ from typing import Literal
 import numpy as np
 
 from octasplat.engine.config import ReconstructionConfig, read_config
+from octasplat.engine.dataset import Dataset
+from octasplat.engine.dataset.views_file import read_views, write_views
 from octasplat.engine.errors import ConfigError, DatasetError, OutputError
 from octasplat.engine.evaluate.held_out import evaluate_held_out
 from octasplat.engine.evaluate.scales import measure_scales
 from octasplat.engine.evaluate.truth import Truth, find_truth
 from octasplat.engine.events import Listener, StageProgress, Warned
-from octasplat.engine.files import read_facts
+from octasplat.engine.files import read_metadata
 from octasplat.engine.files.gaussian_ply import read_gaussian_ply
 from octasplat.engine.gaussians.materials import has_materials
-from octasplat.engine.light.environment import EnvironmentMap, environment_frame
-from octasplat.engine.light.split_sum_relighting import SplitSumRelighter
-from octasplat.engine.poses.find import read_record
-from octasplat.engine.render.environment_map import read_background, read_environment
+from octasplat.engine.pathtracing.environment import EnvironmentMap, environment_frame
+from octasplat.engine.pathtracing.relighting.split_sum_relighter import SplitSumRelighter
+from octasplat.engine.poses.find_poses import read_pose_record
+from octasplat.engine.render.environment_files import read_background, read_environment
 from octasplat.engine.render.renderer import background_colour
 from octasplat.engine.run_folder import (
     BACKGROUND,
@@ -36,12 +38,10 @@ from octasplat.engine.run_folder import (
     run_environment,
     run_exposures,
 )
-from octasplat.engine.scene import Dataset
-from octasplat.engine.scene.views_file import read_views, write_views
 from octasplat.engine.shading.protocol import ShadingModel
 from octasplat.engine.stages import counted_stage, stage
 from octasplat.engine.threads import use_threads
-from octasplat.engine.trace.make import make_tracer
+from octasplat.engine.trace.factory import make_tracer
 from octasplat.engine.train.config import TrainConfig
 from octasplat.engine.train.shading import background_of, deferred_of, exposures_of, make_shading
 from octasplat.engine.versions import versions
@@ -90,7 +90,7 @@ def evaluate(
     dataset = _photographs(output, config, scene, threads, listener)
     _check_world(output, dataset, photographs_folder(output, scene))
     if (output / VIEWS).exists():
-        difference = read_views(output / VIEWS).difference(dataset.record)
+        difference = read_views(output / VIEWS).difference(dataset.views_record)
         if difference is not None:
             listener(Warned(f"{output} was made from other photographs or another model ({difference})."))
     with stage("evaluate", listener, len(dataset.test_indices)):
@@ -181,7 +181,7 @@ def _check_world(output: Path, dataset: Dataset, folder: Path) -> None:
     Raises:
         DatasetError: it does.
     """
-    if (output / VIEWS).exists() and read_views(output / VIEWS).is_of_another_world(dataset.record):
+    if (output / VIEWS).exists() and read_views(output / VIEWS).is_of_another_world(dataset.views_record):
         raise DatasetError(
             f"The photographs in {folder} have other poses than the scene of {output} was made or moved "
             "with; name a folder whose model stands in the same world."
@@ -293,10 +293,10 @@ def _evaluate_on(
     name = on.resolve().name
     into = output / ON / name
     find_truth(on)  # complains before anything is written
-    dataset = Dataset.open_measured(
+    dataset = Dataset.open_for_evaluation(
         on,
         output / CACHE / ON / name,
-        near_world=read_facts(output).near_world,
+        near_world=read_metadata(output).near_world,
         max_side=config.max_side,
         masks=config.masks,
         threads=threads,
@@ -306,20 +306,20 @@ def _evaluate_on(
         listener(Warned(warning))
     _check_world(output, dataset, on)
     if (into / VIEWS).exists():
-        difference = read_views(into / VIEWS).difference(dataset.record)
+        difference = read_views(into / VIEWS).difference(dataset.views_record)
         if difference is not None:
             raise OutputError(
                 f"{into} holds the measures of other photographs than {on} has ({difference}); delete or "
                 "rename that folder."
             )
     with stage("evaluate", listener, len(dataset.test_indices)):
-        write_views(into / VIEWS, dataset.record)
+        write_views(into / VIEWS, dataset.views_record)
         measure_run(dataset, output, config, threads, listener, into)
     return into / "metrics.json"
 
 
 def _placed(output: Path) -> dict[str, object]:
     """How many photographs have poses, which were placed anew, and whether lenses were adjusted."""
-    record = read_record(output / POSES)
+    record = read_pose_record(output / POSES)
     known = {name: record[name] for name in ("placed", "photographs", "moved", "lenses") if name in record}
     return {"poses": known} if known else {}

@@ -10,11 +10,11 @@ import numpy as np
 from jaxtyping import Float32
 
 from octasplat.engine.colour import composited
+from octasplat.engine.dataset import Dataset
 from octasplat.engine.evaluate.metrics import rounded_to_8_bits
 from octasplat.engine.psnr import psnr
 from octasplat.engine.rays import ImageRays
-from octasplat.engine.render.oversampling import render_averaged
-from octasplat.engine.scene import Dataset
+from octasplat.engine.render.supersampling import render_averaged
 from octasplat.engine.shading.protocol import ShadingModel
 from octasplat.engine.trace.protocol import Tracer
 from octasplat.engine.train.shading import exposed_as

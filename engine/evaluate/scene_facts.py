@@ -8,7 +8,7 @@ from jaxtyping import Float64
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.gaussians.rows import row_arrays
 from octasplat.engine.rays import ImageRays
-from octasplat.engine.render.framing import SeenBounds, seen_bounds, solid_middle
+from octasplat.engine.render.framing import VisibleBounds, core_gaussians, visible_bounds
 from octasplat.engine.render.renderer import tile_order
 from octasplat.engine.trace.protocol import Tracer
 
@@ -46,7 +46,7 @@ class SceneFacts:
     channels: dict[str, int]
     box: Box
     box_solid: Box
-    seen: SeenBounds
+    seen: VisibleBounds
     opacity_counts: tuple[int, ...]
     scale_quantiles: tuple[float, ...]
     flatness_median: float
@@ -79,8 +79,8 @@ def scene_facts(gaussians: FlatGaussians, up_world: Float64[np.ndarray, "3"]) ->
         sh_degree=gaussians.sh_degree,
         channels=gaussians.channels.widths,
         box=_box(gaussians.means_world),
-        box_solid=_box(gaussians.means_world[solid_middle(gaussians)]),
-        seen=seen_bounds(gaussians, up_world),
+        box_solid=_box(gaussians.means_world[core_gaussians(gaussians)]),
+        seen=visible_bounds(gaussians, up_world),
         opacity_counts=tuple(int(count) for count in counts),
         scale_quantiles=tuple(float(value) for value in np.quantile(larger, QUANTILES)),
         flatness_median=float(np.median(scales.min(axis=1) / larger)),

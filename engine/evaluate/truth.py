@@ -16,7 +16,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationErr
 from octasplat.engine.colour import srgb_to_linear
 from octasplat.engine.errors import ConfigError, DatasetError
 from octasplat.engine.relative_paths import checked_relative
-from octasplat.engine.render.images import read_image, resized
+from octasplat.engine.render.image_files import read_image, shrink_to
 
 TRUTH = "truth.json"
 _FORMULA = re.compile(r"\bv(?:/(\d+(?:\.\d+)?))?(?:\*(\d+(?:\.\d+)?))?([+-]\d+(?:\.\d+)?)?(?![\w*/+])")
@@ -156,7 +156,7 @@ class Truth:
         if image.shape[2] != 4:
             raise DatasetError(f"{folder / name} has no alpha, which tells the scene from what is behind it.")
         image[..., :3] *= image[..., 3:]
-        return resized(image, max_side_px)
+        return shrink_to(image, max_side_px)
 
     def view(self, name: str, size: tuple[int, int]) -> ViewTruth:
         """The maps of a view.

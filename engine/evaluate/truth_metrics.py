@@ -7,8 +7,8 @@ from jaxtyping import Bool, Float, Float32, Float64
 from scipy.optimize import minimize_scalar
 
 from octasplat.engine.colour import linear_to_srgb
-from octasplat.engine.light.environment import EnvironmentMap
-from octasplat.engine.light.lights import light_arrays, look_up_environment
+from octasplat.engine.pathtracing.environment import EnvironmentMap
+from octasplat.engine.pathtracing.lights import build_light_arrays, eval_environment_map
 
 _OCTAVES = 8.0
 """Scales are looked for between 2 to the power of minus and plus this."""
@@ -124,8 +124,8 @@ def environment_errors(
         [sine * np.sin(around), np.broadcast_to(cosine, (height, width)), sine * np.cos(around)], axis=-1
     )
     directions = (local @ true.frame).reshape(-1, 3)
-    lights = light_arrays((), ours.frame[1], ours)
-    found, _ = look_up_environment(lights, directions)
+    lights = build_light_arrays((), ours.frame[1], ours)
+    found, _ = eval_environment_map(lights, directions)
     wanted = true.radiance_linear.reshape(-1, 3).astype(np.float64)
     weights = np.repeat(np.sin(polar), width)
     scales = best_scales(found, wanted, compressed, weights)

@@ -5,14 +5,14 @@ from pathlib import Path
 from typing import Literal
 
 from octasplat.engine.errors import SceneFileError
-from octasplat.engine.gaussians.channels import grouped, is_usable
+from octasplat.engine.gaussians.channels import group_columns, is_valid_channel_name
 
 ChannelChoice = Literal["own", "all"] | tuple[str, ...]
 """``own``: those that the file says are channels, as ours do; ``all``: every column of which nothing else is
 known, too; or names."""
 
 
-def chosen_columns(
+def select_channel_columns(
     path: Path, declared: Mapping[str, tuple[str, ...]], columns: Iterable[str], choice: ChannelChoice
 ) -> dict[str, tuple[str, ...]]:
     """The columns of each channel that is wanted, by the channel's name.
@@ -29,11 +29,13 @@ def chosen_columns(
     """
     every = list(columns)
     own = {
-        name: named for name, named in declared.items() if set(named) <= set(every) and is_usable(name, named)
+        name: named
+        for name, named in declared.items()
+        if set(named) <= set(every) and is_valid_channel_name(name, named)
     }
     taken = {column for named in own.values() for column in named}
-    rest = grouped(column for column in every if column not in taken)
-    known = {**own, **{name: named for name, named in rest.items() if is_usable(name, named)}}
+    rest = group_columns(column for column in every if column not in taken)
+    known = {**own, **{name: named for name, named in rest.items() if is_valid_channel_name(name, named)}}
     if choice == "own":
         return own
     if choice == "all":

@@ -16,10 +16,10 @@ from octasplat.engine.files.registry import Importer, register
 from octasplat.engine.gaussians.flattening import GaussianCloud
 
 PATTERNS = ("*.compressed.ply",)
-CHUNK = 256
+CHUNK_SIZE = 256
 SH_RANGE = 8.0
 """Higher coefficients lie in [-4, 4]."""
-_PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
+_PACKED_PROPERTIES = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
 _REST_COUNTS = (9, 24, 45)
 
 
@@ -30,28 +30,34 @@ def read(path: Path) -> GaussianCloud:
         SceneFileError: the file is no compressed PLY, is truncated, or its chunks do not fit its Gaussians.
     """
     header = read_ply_header(path)
-    _check(path, header)
+    _check_elements(path, header)
     names = ["chunk", "vertex", *(["sh"] if header.element("sh") is not None else [])]
     _, tables = read_ply(path, names)
-    packed = {name: np.ascontiguousarray(tables["vertex"][name]).astype(np.uint32) for name in _PACKED}
-    chunk = np.arange(len(tables["vertex"])) // CHUNK
+    packed = {
+        name: np.ascontiguousarray(tables["vertex"][name]).astype(np.uint32) for name in _PACKED_PROPERTIES
+    }
+    chunk = np.arange(len(tables["vertex"])) // CHUNK_SIZE
     rgba = packed["packed_color"]
     colour = np.stack([(rgba >> shift) & 255 for shift in (24, 16, 8)], axis=1).astype(np.float32) / 255
     if "min_r" in (tables["chunk"].dtype.names or ()):
-        colour = _within(tables["chunk"], "{}_{}", "rgb", chunk, colour)
+        colour = _dequantise(tables["chunk"], "{}_{}", "rgb", chunk, colour)
     sh = sh0_from_rgb(colour)
     if "sh" in tables:
-        sh = np.concatenate([sh, _rest(tables["sh"])], axis=1)
+        sh = np.concatenate([sh, _sh_rest(tables["sh"])], axis=1)
     return GaussianCloud(
-        means_world=_within(tables["chunk"], "{}_{}", "xyz", chunk, _unit_cube(packed["packed_position"])),
+        means_world=_dequantise(
+            tables["chunk"], "{}_{}", "xyz", chunk, _unpack_11_10_11(packed["packed_position"])
+        ),
         quats_wxyz=_rotations(packed["packed_rotation"]),
-        log_scales=_within(tables["chunk"], "{}_scale_{}", "xyz", chunk, _unit_cube(packed["packed_scale"])),
+        log_scales=_dequantise(
+            tables["chunk"], "{}_scale_{}", "xyz", chunk, _unpack_11_10_11(packed["packed_scale"])
+        ),
         opacity_logits=logits_from_bytes((rgba & 255).astype(np.uint8)),
         sh=sh,
     )
 
 
-def _check(path: Path, header: PlyHeader) -> None:
+def _check_elements(path: Path, header: PlyHeader) -> None:
     chunk, vertex, sh = (header.element(name) for name in ("chunk", "vertex", "sh"))
     if chunk is None or vertex is None:
         raise SceneFileError(f"{path}: is no compressed PLY; it needs the elements 'chunk' and 'vertex'.")
@@ -60,13 +66,13 @@ def _check(path: Path, header: PlyHeader) -> None:
     if "min_r" in chunk.names:
         bounds += [f"{end}_{what}" for end in ("min", "max") for what in ("r", "g", "b")]
     missing = [name for name in bounds if name not in chunk.names]
-    missing += [name for name in _PACKED if name not in vertex.names]
+    missing += [name for name in _PACKED_PROPERTIES if name not in vertex.names]
     if missing:
         raise SceneFileError(f"{path}: is no compressed PLY; it lacks the property {', '.join(missing)}.")
-    wrong = [prop.name for prop in vertex.properties if prop.name in _PACKED and prop.kind != "u4"]
+    wrong = [prop.name for prop in vertex.properties if prop.name in _PACKED_PROPERTIES and prop.kind != "u4"]
     if wrong:
         raise SceneFileError(f"{path}: its property {wrong[0]} should be of type uint.")
-    if chunk.count != -(-vertex.count // CHUNK):
+    if chunk.count != -(-vertex.count // CHUNK_SIZE):
         raise SceneFileError(
             f"{path}: has {chunk.count} chunks for {vertex.count} Gaussians, which do not belong together."
         )
@@ -78,13 +84,13 @@ def _check(path: Path, header: PlyHeader) -> None:
             )
 
 
-def _unit_cube(packed: UInt32[np.ndarray, " n"]) -> Float32[np.ndarray, "n 3"]:
+def _unpack_11_10_11(packed: UInt32[np.ndarray, " n"]) -> Float32[np.ndarray, "n 3"]:
     """11, 10 and 11 bits as numbers in [0, 1]."""
     fields = [(packed >> 21) / 2047, ((packed >> 11) & 1023) / 1023, (packed & 2047) / 2047]
     return np.stack(fields, axis=1).astype(np.float32)
 
 
-def _within(
+def _dequantise(
     chunks: np.ndarray, name: str, axes: str, chunk: Int[np.ndarray, " n"], share: Float32[np.ndarray, "n 3"]
 ) -> Float32[np.ndarray, "n 3"]:
     """Numbers in [0, 1] spread between the bounds of their chunks."""
@@ -100,7 +106,7 @@ def _rotations(packed: UInt32[np.ndarray, " n"]) -> Float32[np.ndarray, "n 4"]:
     return from_smallest_three(small, (packed >> 30).astype(np.int64))
 
 
-def _rest(table: np.ndarray) -> Float32[np.ndarray, "n k 3"]:
+def _sh_rest(table: np.ndarray) -> Float32[np.ndarray, "n k 3"]:
     count = len(table.dtype.names or ())
     steps = columns(table, [f"f_rest_{k}" for k in range(count)])
     share = np.where(steps == 0, 0.0, np.where(steps == 255, 1.0, (steps + 0.5) / 256.0))

@@ -5,13 +5,13 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Float64, UInt32
 
-from octasplat.engine.files.compressed_ply import CHUNK, PATTERNS, SH_RANGE
+from octasplat.engine.files.compressed_ply import CHUNK_SIZE, PATTERNS, SH_RANGE
 from octasplat.engine.files.encodings import SQRT_HALF, smallest_three
-from octasplat.engine.files.options import ExportOptions
+from octasplat.engine.files.export_options import ExportOptions
+from octasplat.engine.files.kd_split import kd_order
 from octasplat.engine.files.ply_container import PlyWriteElement, write_ply
 from octasplat.engine.files.registry import Exporter, register
-from octasplat.engine.files.selection import selected
-from octasplat.engine.files.spatial import compact_order
+from octasplat.engine.files.splat_rows import select_for_export
 from octasplat.engine.gaussians.model import FLAT_SCALE, SH_C0, FlatGaussians
 
 
@@ -21,8 +21,8 @@ def write(gaussians: FlatGaussians, path: Path, options: ExportOptions) -> tuple
     Raises:
         SceneFileError: nothing to write, values that are not finite, or the file cannot be written.
     """
-    scene = selected(gaussians, path, options)
-    scene = scene.select(compact_order(scene.means_world, CHUNK))
+    scene = select_for_export(gaussians, path, options)
+    scene = scene.select(kd_order(scene.means_world, CHUNK_SIZE))
     count = len(scene)
     flat = np.full((count, 1), np.log(FLAT_SCALE))
     groups = {
@@ -30,23 +30,23 @@ def write(gaussians: FlatGaussians, path: Path, options: ExportOptions) -> tuple
         "scale_": np.concatenate([flat, scene.log_scales], axis=1, dtype=np.float64),
         "rgb": 0.5 + SH_C0 * scene.sh[:, 0].astype(np.float64),
     }
-    chunks = np.empty(-(-count // CHUNK), dtype=[(name, "<f4") for name in _bound_names()])
+    chunks = np.empty(-(-count // CHUNK_SIZE), dtype=[(name, "<f4") for name in _bound_names()])
     shares = {}
     for key, values in groups.items():
         low, high = _bounds(values)
         for axis in range(3):
             letter = "rgb"[axis] if key == "rgb" else f"{key}{'xyz'[axis]}"
             chunks[f"min_{letter}"], chunks[f"max_{letter}"] = low[:, axis], high[:, axis]
-        place = np.arange(count) // CHUNK
+        place = np.arange(count) // CHUNK_SIZE
         extent = (high.astype(np.float32) - low.astype(np.float32)).astype(np.float64)[place]
         offset = values - low.astype(np.float32).astype(np.float64)[place]
         shares[key] = np.divide(offset, extent, out=np.zeros_like(values), where=extent > 0)
-    vertices = np.empty(count, dtype=[(f"packed_{what}", "<u4") for what in _WORDS])
-    vertices["packed_position"] = _word(shares[""], (11, 10, 11))
+    vertices = np.empty(count, dtype=[(f"packed_{what}", "<u4") for what in _PACKED_WORDS])
+    vertices["packed_position"] = _pack_word(shares[""], (11, 10, 11))
     vertices["packed_rotation"] = _rotations(scene)
-    vertices["packed_scale"] = _word(shares["scale_"], (11, 10, 11))
+    vertices["packed_scale"] = _pack_word(shares["scale_"], (11, 10, 11))
     opacities = scene.opacities.astype(np.float64)[:, None]
-    vertices["packed_color"] = _word(np.concatenate([shares["rgb"], opacities], axis=1), (8, 8, 8, 8))
+    vertices["packed_color"] = _pack_word(np.concatenate([shares["rgb"], opacities], axis=1), (8, 8, 8, 8))
     elements = [
         PlyWriteElement("chunk", len(chunks), chunks.dtype, [chunks]),
         PlyWriteElement("vertex", count, vertices.dtype, [vertices]),
@@ -60,7 +60,7 @@ def write(gaussians: FlatGaussians, path: Path, options: ExportOptions) -> tuple
     return (path,)
 
 
-_WORDS = ("position", "rotation", "scale", "color")
+_PACKED_WORDS = ("position", "rotation", "scale", "color")
 
 
 def _bound_names() -> list[str]:
@@ -73,11 +73,11 @@ def _bound_names() -> list[str]:
 def _bounds(
     values: Float64[np.ndarray, "n 3"],
 ) -> tuple[Float64[np.ndarray, "c 3"], Float64[np.ndarray, "c 3"]]:
-    starts = np.arange(0, len(values), CHUNK)
+    starts = np.arange(0, len(values), CHUNK_SIZE)
     return np.minimum.reduceat(values, starts), np.maximum.reduceat(values, starts)
 
 
-def _word(shares: Float[np.ndarray, "n f"], bits: tuple[int, ...]) -> UInt32[np.ndarray, " n"]:
+def _pack_word(shares: Float[np.ndarray, "n f"], bits: tuple[int, ...]) -> UInt32[np.ndarray, " n"]:
     word = np.zeros(len(shares), np.uint32)
     for place, size in enumerate(bits):
         steps = (1 << size) - 1
@@ -88,7 +88,7 @@ def _word(shares: Float[np.ndarray, "n f"], bits: tuple[int, ...]) -> UInt32[np.
 
 def _rotations(scene: FlatGaussians) -> UInt32[np.ndarray, " n"]:
     small, largest = smallest_three(scene.quats_wxyz)
-    packed = _word(small / (2.0 * SQRT_HALF) + 0.5, (10, 10, 10))
+    packed = _pack_word(small / (2.0 * SQRT_HALF) + 0.5, (10, 10, 10))
     return np.asarray((largest.astype(np.uint32) << np.uint32(30)) | packed)
 
 

@@ -14,7 +14,7 @@ HALF_TURN_SIGNS = np.array([1, -1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1,
 """Parity of the 16 harmonics under y -> -y, z -> -z."""
 
 
-def dropped_harmonics(degree: int) -> tuple[str, ...]:
+def dropped_sh_message(degree: int) -> tuple[str, ...]:
     """Return what to tell of a file with harmonics of ``degree``, of which only degree 3 can be kept."""
     if degree <= MAX_SH_DEGREE:
         return ()
@@ -88,7 +88,7 @@ def half_turn_points(points: Float32[np.ndarray, "n 3"]) -> Float32[np.ndarray, 
     return points * np.array([1, -1, -1], dtype=np.float32)
 
 
-def half_turned(gaussians: FlatGaussians) -> FlatGaussians:
+def half_turn_gaussians(gaussians: FlatGaussians) -> FlatGaussians:
     """The scene turned by 180 degrees about x: from y down, z forward to y up, z backward, and back.
 
     Only signs change, so doing it twice gives the same bits.

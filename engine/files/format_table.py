@@ -38,8 +38,8 @@ class FormatTable:
 
     def __init__(self, package: str) -> None:
         self._package = package
-        self._known: dict[tuple[type[Entry], str], Entry] = {}
-        self._complete = False
+        self._entries: dict[tuple[type[Entry], str], Entry] = {}
+        self._is_loaded = False
 
     def register(self, entry: Entry) -> None:
         """Add an entry.
@@ -48,26 +48,26 @@ class FormatTable:
             ValueError: there is one of that class and name.
         """
         key = (type(entry), entry.name)
-        if key in self._known:
+        if key in self._entries:
             raise ValueError(f"the {entry.noun} format '{entry.name}' is registered already")
-        self._known[key] = entry
+        self._entries[key] = entry
 
-    def all(self, kind: type[E]) -> tuple[E, ...]:
+    def entries(self, kind: type[E]) -> tuple[E, ...]:
         """All entries of a class, by name."""
-        if not self._complete:
+        if not self._is_loaded:
             for module in pkgutil.iter_modules(importlib.import_module(self._package).__path__):
                 importlib.import_module(f"{self._package}.{module.name}")
-            self._complete = True
-        found = (entry for entry in self._known.values() if isinstance(entry, kind))
+            self._is_loaded = True
+        found = (entry for entry in self._entries.values() if isinstance(entry, kind))
         return tuple(sorted(found, key=lambda entry: entry.name))
 
-    def named(self, kind: type[E], name: str, path: Path) -> E:
+    def get(self, kind: type[E], name: str, path: Path) -> E:
         """The entry of that class and name.
 
         Raises:
             SceneFileError: there is none; the text names ``path`` and lists those that exist.
         """
-        by_name = {entry.name: entry for entry in self.all(kind)}
+        by_name = {entry.name: entry for entry in self.entries(kind)}
         if name not in by_name:
             choices = ", ".join(by_name)
             raise SceneFileError(f"{path}: there is no {kind.noun} format '{name}'; choose one of {choices}.")
@@ -77,17 +77,17 @@ class FormatTable:
         """The entry that takes this file name, or None; upper and lower case are the same."""
         matches = [
             (sum(character not in "*?" for character in pattern), entry)
-            for entry in self.all(kind)
+            for entry in self.entries(kind)
             for pattern in entry.patterns
             if fnmatch.fnmatchcase(path.name.lower(), pattern)
         ]
         return max(matches, key=lambda match: match[0])[1] if matches else None
 
-    def choices(self, kind: type[E]) -> str:
+    def describe_choices(self, kind: type[E]) -> str:
         """All entries with their patterns, for errors."""
-        return "; ".join(f"{entry.name} ({', '.join(entry.patterns)})" for entry in self.all(kind))
+        return "; ".join(f"{entry.name} ({', '.join(entry.patterns)})" for entry in self.entries(kind))
 
     def suffixes(self, kind: type[E]) -> str:
         """The suffixes that entries take, as in ".glb, .ply or .obj"."""
-        found = [pattern.lstrip("*") for entry in self.all(kind) for pattern in entry.patterns]
+        found = [pattern.lstrip("*") for entry in self.entries(kind) for pattern in entry.patterns]
         return " or ".join([", ".join(found[:-1]), found[-1]] if len(found) > 1 else found)

@@ -22,10 +22,10 @@ import numpy as np
 from jaxtyping import Float32
 
 from octasplat.engine.errors import ConfigError, SceneFileError
-from octasplat.engine.files.channel_columns import ChannelChoice, chosen_columns
-from octasplat.engine.files.encodings import MAX_SH_DEGREE, dropped_harmonics
-from octasplat.engine.files.octagon_reading import is_octagon_ply
-from octasplat.engine.files.options import ExportOptions
+from octasplat.engine.files.channel_columns import ChannelChoice, select_channel_columns
+from octasplat.engine.files.encodings import MAX_SH_DEGREE, dropped_sh_message
+from octasplat.engine.files.export_options import ExportOptions
+from octasplat.engine.files.octagon_recovery import is_octagon_ply
 from octasplat.engine.files.ply_container import (
     PlyElement,
     PlyWriteElement,
@@ -35,14 +35,14 @@ from octasplat.engine.files.ply_container import (
     write_ply,
 )
 from octasplat.engine.files.registry import Exporter, Importer, register
-from octasplat.engine.files.selection import selected
-from octasplat.engine.gaussians.channels import Channels, column_names, stacked
+from octasplat.engine.files.splat_rows import select_for_export
+from octasplat.engine.gaussians.channels import Channels, column_names, stack_channels
 from octasplat.engine.gaussians.flattening import FLAT_LOG_SCALE, GaussianCloud, ImportReport, flatten
 from octasplat.engine.gaussians.model import FlatGaussians
-from octasplat.engine.gaussians.scene_facts import NOTHING_KNOWN, SceneFacts
+from octasplat.engine.gaussians.scene_metadata import UNKNOWN_METADATA, SceneMetadata
 
-ROWS_AT_ONCE = 65536
-Dialect = Literal["3dgs", "2dgs", "games"]
+ROWS_PER_BLOCK = 65536
+PlyDialect = Literal["3dgs", "2dgs", "games"]
 """What the scales of a PLY mean.
 
 ``3dgs``: the normal is the axis of the smallest of three; two are read as 2DGS writes them. ``2dgs`` (2D
@@ -64,7 +64,7 @@ def write_gaussian_ply(
     path: Path,
     *,
     sh_pad_degree: int | None = None,
-    facts: SceneFacts = NOTHING_KNOWN,
+    facts: SceneMetadata = UNKNOWN_METADATA,
 ) -> None:
     """Write ``gaussians`` as a 3DGS PLY, atomically and in blocks.
 
@@ -94,7 +94,7 @@ def write_gaussian_ply(
     write_ply(path, [element], [*known, *channel_comments(widths)])
 
 
-def read_ply_facts(path: Path) -> SceneFacts:
+def read_ply_metadata(path: Path) -> SceneMetadata:
     """What a file says of its scene as a whole.
 
     Raises:
@@ -102,7 +102,7 @@ def read_ply_facts(path: Path) -> SceneFacts:
     """
     said = dict(comment.partition(" ")[::2] for comment in reversed(read_ply_header(path).comments))
     known = {}
-    for field in fields(SceneFacts):
+    for field in fields(SceneMetadata):
         if (value := said.get(field.name)) is None:
             continue
         try:
@@ -111,15 +111,15 @@ def read_ply_facts(path: Path) -> SceneFacts:
             raise SceneFileError(
                 f"{path}: its comment {field.name} is {value!r}, which is no number."
             ) from None
-    facts = SceneFacts(**known)
+    facts = SceneMetadata(**known)
     return replace(facts, turned_beyond=min(facts.turned_beyond, 1.0))
 
 
 def _row_blocks(gaussians: FlatGaussians, degree: int, dtype: np.dtype[np.void]) -> Iterator[np.ndarray]:
     rest_own = gaussians.sh.shape[1] - 1
     rest_file = (degree + 1) ** 2 - 1
-    for start in range(0, len(gaussians), ROWS_AT_ONCE):
-        part = slice(start, start + ROWS_AT_ONCE)
+    for start in range(0, len(gaussians), ROWS_PER_BLOCK):
+        part = slice(start, start + ROWS_PER_BLOCK)
         n = len(gaussians.means_world[part])
         values = np.zeros((n, len(dtype.names or ())), dtype="<f4")
         values[:, 0:3] = gaussians.means_world[part]
@@ -133,14 +133,14 @@ def _row_blocks(gaussians: FlatGaussians, degree: int, dtype: np.dtype[np.void])
         tail[:, 2:4] = gaussians.log_scales[part]
         tail[:, 4:8] = gaussians.quats_wxyz[part]
         if gaussians.channels:
-            tail[:, 8:] = stacked(gaussians.view(part).channels)
+            tail[:, 8:] = stack_channels(gaussians.view(part).channels)
         yield values.view(dtype)[:, 0]
 
 
 def read_gaussian_ply(
     path: Path,
     *,
-    dialect: Dialect = "3dgs",
+    dialect: PlyDialect = "3dgs",
     drop_invalid: bool = False,
     channels: ChannelChoice = "own",
 ) -> tuple[FlatGaussians, ImportReport]:
@@ -162,7 +162,9 @@ def read_gaussian_ply(
     return flatten(read_ply_cloud(path, channels, dialect), path, drop_invalid=drop_invalid)
 
 
-def read_ply_cloud(path: Path, channels: ChannelChoice = "own", dialect: Dialect = "3dgs") -> GaussianCloud:
+def read_ply_cloud(
+    path: Path, channels: ChannelChoice = "own", dialect: PlyDialect = "3dgs"
+) -> GaussianCloud:
     """The Gaussians of a PLY as they are in the file, found by property name.
 
     Args:
@@ -192,7 +194,7 @@ def read_ply_cloud(path: Path, channels: ChannelChoice = "own", dialect: Dialect
     colours = columns(table, [*_SH_DC, *names])
     rest = colours[:, 3:].reshape(len(table), 3, kept).transpose(0, 2, 1)
     unnamed = [name for name in vertex.names if name != _FILTER]
-    found = chosen_columns(path, declared_channels(header.comments), unnamed, channels)
+    found = select_channel_columns(path, declared_channels(header.comments), unnamed, channels)
     try:
         named = Channels({name: columns(table, own) for name, own in found.items()})
     except ConfigError as error:
@@ -203,28 +205,28 @@ def read_ply_cloud(path: Path, channels: ChannelChoice = "own", dialect: Dialect
         log_scales=columns(table, _scale_names(scale_count)),
         opacity_logits=columns(table, ["opacity"])[:, 0],
         sh=np.ascontiguousarray(np.concatenate([colours[:, None, :3], rest], axis=1)),
-        notes=dropped_harmonics(degree),
+        notes=dropped_sh_message(degree),
         channels=named,
         normal_axis=_normal_axis(dialect, scale_count),
     )
     if dialect == "3dgs" and scale_count == 2:
-        cloud = replace(cloud, notes=(*cloud.notes, _READ_AS_2DGS))
-    return _smoothed(cloud, columns(table, [_FILTER])[:, 0]) if _FILTER in vertex.names else cloud
+        cloud = replace(cloud, notes=(*cloud.notes, _FLAT_DIALECT_MESSAGE))
+    return _with_mip_filter(cloud, columns(table, [_FILTER])[:, 0]) if _FILTER in vertex.names else cloud
 
 
-_READ_AS_2DGS = (
+_FLAT_DIALECT_MESSAGE = (
     "Its Gaussians have two scales; they were read as 2DGS writes them, with the third axis as the normal. "
     "If GaMeS or REdiSplats wrote the file, import it with --format games."
 )
 
 
-def _normal_axis(dialect: Dialect, scale_count: int) -> Literal[0, 2] | None:
+def _normal_axis(dialect: PlyDialect, scale_count: int) -> Literal[0, 2] | None:
     if dialect == "games":
         return 0
     return 2 if dialect == "2dgs" or scale_count == 2 else None
 
 
-def _smoothed(cloud: GaussianCloud, deviations: Float32[np.ndarray, " n"]) -> GaussianCloud:
+def _with_mip_filter(cloud: GaussianCloud, deviations: Float32[np.ndarray, " n"]) -> GaussianCloud:
     """Return the Gaussians as they are shown by programs that smooth each one.
 
     Each is convolved with a Gaussian of the given standard deviation, and its opacity is lowered so that
@@ -298,9 +300,9 @@ def _check_properties(path: Path, vertex: PlyElement) -> tuple[int, int]:
     return degree, scale_count
 
 
-def _write(gaussians: FlatGaussians, path: Path, options: ExportOptions) -> tuple[Path, ...]:
+def _export(gaussians: FlatGaussians, path: Path, options: ExportOptions) -> tuple[Path, ...]:
     """Write the Gaussians that are not fainter than ``options.min_opacity``."""
-    chosen = selected(gaussians, path, options)
+    chosen = select_for_export(gaussians, path, options)
     write_gaussian_ply(chosen, path, sh_pad_degree=options.sh_pad_degree, facts=options.facts)
     return (path,)
 
@@ -316,22 +318,22 @@ register(
         "Gaussians in the PLY layout of 3DGS",
         read_ply_cloud,
         _recognises,
-        read_with=read_ply_cloud,
+        read_channels=read_ply_cloud,
     )
 )
-_NAMED_DIALECTS: tuple[tuple[Dialect, str], ...] = (
+_NAMED_DIALECTS: tuple[tuple[PlyDialect, str], ...] = (
     ("2dgs", "Gaussians in the PLY layout of 2DGS or gsplat's 2DGS, the normal being the third axis"),
     ("games", "Gaussians in the PLY layout of GaMeS or REdiSplats, the normal being the first axis"),
 )
 for _dialect, _what in _NAMED_DIALECTS:
     _read = functools.partial(read_ply_cloud, dialect=_dialect)
-    register(Importer(_dialect, ("*.ply",), _what, _read, read_with=_read))
+    register(Importer(_dialect, ("*.ply",), _what, _read, read_channels=_read))
 register(
     Exporter(
         "gaussians",
         ("*.ply",),
         "Gaussians as a 3DGS PLY, for splat viewers and for octasplat itself",
-        _write,
+        _export,
         holds_channels=True,
         holds_harmonics=True,
     )

@@ -14,13 +14,13 @@ import numpy as np
 from jaxtyping import Float64
 
 from octasplat.engine.errors import SceneFileError
-from octasplat.engine.files.gltf import GlbFile
-from octasplat.engine.files.mesh_looks import FileImage, MeshMaterial
+from octasplat.engine.files.glb_container import GlbFile
+from octasplat.engine.geometry.mesh_material import FileImage, MeshMaterial
 
-UNDERSTOOD = ("emissive_strength", "ior", "transmission", "unlit", "volume")
+SUPPORTED_EXTENSIONS = ("emissive_strength", "ior", "transmission", "unlit", "volume")
 SUFFIXES = {"image/png": ".png", "image/jpeg": ".jpg", "image/webp": ".webp"}
 KINDS = {b"\x89PNG": ".png", b"\xff\xd8\xff": ".jpg", b"RIFF": ".webp"}
-LESS = {"thicknessTexture", "transmissionTexture"}
+PARTLY_SUPPORTED_EXTENSIONS = {"thicknessTexture", "transmissionTexture"}
 
 
 def glb_materials(file: GlbFile, path: Path) -> tuple[MeshMaterial, ...]:
@@ -31,14 +31,14 @@ def glb_materials(file: GlbFile, path: Path) -> tuple[MeshMaterial, ...]:
         KeyError, IndexError, TypeError, ValueError, AttributeError: the document is damaged.
     """
     return tuple(
-        _Reader(file, path, material).read(number)
+        _MaterialReader(file, path, material).read(number)
         for number, material in enumerate(file.document.get("materials", []))
     )
 
 
 def texture_frame(material: Mapping[str, Any]) -> tuple[int, Float64[np.ndarray, "2 3"]]:
     """Which texture coordinates a material uses, and the matrix that brings them to those of its images."""
-    for info in _infos(material).values():
+    for info in _texture_infos(material).values():
         transform = info.get("extensions", {}).get("KHR_texture_transform", {})
         turn = float(transform.get("rotation", 0.0))
         (x, y), (u, v) = transform.get("scale", (1.0, 1.0)), transform.get("offset", (0.0, 0.0))
@@ -53,7 +53,7 @@ def texture_frame(material: Mapping[str, Any]) -> tuple[int, Float64[np.ndarray,
     return 0, np.eye(2, 3)
 
 
-def _infos(material: Mapping[str, Any]) -> dict[str, Any]:
+def _texture_infos(material: Mapping[str, Any]) -> dict[str, Any]:
     """How a material uses its textures, the one of its colour first."""
     shading = material.get("pbrMetallicRoughness", {})
     found = {
@@ -65,7 +65,7 @@ def _infos(material: Mapping[str, Any]) -> dict[str, Any]:
     return {name: info for name, info in found.items() if info is not None}
 
 
-class _Reader:
+class _MaterialReader:
     """One material on its way."""
 
     def __init__(self, file: GlbFile, path: Path, material: dict[str, Any]) -> None:
@@ -85,7 +85,7 @@ class _Reader:
             strength * float(share) for share in material.get("emissiveFactor", (0.0, 0.0, 0.0))
         )
         base = [float(value) for value in shading.get("baseColorFactor", (1.0, 1.0, 1.0, 1.0))]
-        images = {name: self._image(info) for name, info in _infos(material).items()}
+        images = {name: self._image(info) for name, info in _texture_infos(material).items()}
         return MeshMaterial(
             self._name or f"material {number}",
             (base[0], base[1], base[2]),
@@ -96,7 +96,7 @@ class _Reader:
             transmission=float(extensions.get("transmission", {}).get("transmissionFactor", 0.0)),
             ior=float(extensions.get("ior", {}).get("ior", 1.5)),
             absorption=self._absorption(),
-            passed_over=self._passed_over(),
+            unsupported=self._unsupported_features(),
             **images,  # type: ignore[arg-type]
         )
 
@@ -110,13 +110,13 @@ class _Reader:
         red, green, blue = (-math.log(min(max(share, 1e-6), 1.0)) / distance for share in left)
         return red, green, blue
 
-    def _passed_over(self) -> tuple[str, ...]:
+    def _unsupported_features(self) -> tuple[str, ...]:
         """What is not understood, in words."""
         material = self._material
         found = [
             name if "_" in name and name[:3].isupper() else f"KHR_materials_{name}"
             for name in self._extensions
-            if name not in UNDERSTOOD
+            if name not in SUPPORTED_EXTENSIONS
         ]
         mode = material.get("alphaMode", "OPAQUE")
         if mode != "OPAQUE":
@@ -124,8 +124,8 @@ class _Reader:
         if "occlusionTexture" in material:
             found.append("occlusionTexture")
         for values in self._extensions.values():
-            found += sorted(LESS & set(values))
-        infos = list(_infos(material).values())
+            found += sorted(PARTLY_SUPPORTED_EXTENSIONS & set(values))
+        infos = list(_texture_infos(material).values())
         if len({(i.get("texCoord", 0), str(i.get("extensions"))) for i in infos}) > 1:
             found.append("other texture coordinates than those of its first texture")
         return tuple(found)

@@ -17,33 +17,33 @@ from jaxtyping import Float32, Float64
 
 from octasplat.engine.colour import linear_to_srgb, rounded_bytes, srgb_to_linear
 from octasplat.engine.errors import ConfigError, SceneFileError
-from octasplat.engine.files import gltf
-from octasplat.engine.files.channel_columns import ChannelChoice, chosen_columns
+from octasplat.engine.files import glb_container
+from octasplat.engine.files.channel_columns import ChannelChoice, select_channel_columns
 from octasplat.engine.files.encodings import (
     HALF_TURN_SIGNS,
     MAX_SH_DEGREE,
-    dropped_harmonics,
+    dropped_sh_message,
     half_turn_points,
     half_turn_quats,
     half_turn_sh,
     sh0_from_rgb,
     unit_quats,
 )
-from octasplat.engine.files.gltf import FLOAT, UNSIGNED_BYTE, GlbFile, padded, write_glb
-from octasplat.engine.files.octagon_glb_reading import octagon_q, read_octagons
-from octasplat.engine.files.options import ExportOptions
+from octasplat.engine.files.export_options import ExportOptions
+from octasplat.engine.files.glb_container import FLOAT, UNSIGNED_BYTE, GlbFile, pad_to_four, write_glb
+from octasplat.engine.files.octagon_glb_reader import octagon_q, read_octagons
 from octasplat.engine.files.registry import Exporter, Importer, register
-from octasplat.engine.files.selection import blocks, check_scales, selected
-from octasplat.engine.gaussians.channels import Channels, common_widths
+from octasplat.engine.files.splat_rows import check_scales, iterate_blocks, select_for_export
+from octasplat.engine.gaussians.channels import Channels, merge_widths
 from octasplat.engine.gaussians.flattening import GaussianCloud
-from octasplat.engine.gaussians.frames import quaternions, rotation_matrices
-from octasplat.engine.gaussians.harmonics import rotate_sh
+from octasplat.engine.gaussians.frames import quaternions_from_matrices, rotation_matrices
 from octasplat.engine.gaussians.model import FLAT_SCALE, SH_C0, FlatGaussians
-from octasplat.engine.gaussians.rows import join_rows
+from octasplat.engine.gaussians.rows import concatenate_rows
+from octasplat.engine.gaussians.spherical_harmonics import rotate_sh
 
 EXTENSION = "KHR_gaussian_splatting"
 COLOUR_SPACE = "srgb_rec709_display"
-SIMILARITY = 1e-4
+SIMILARITY_TOLERANCE = 1e-4
 """Relative error up to which a node may fail to be a rotation with one scale."""
 
 
@@ -61,7 +61,7 @@ def read(path: Path, channels: ChannelChoice = "own") -> GaussianCloud:
     file = GlbFile(path)
     clouds = []
     try:
-        declared = gltf.declared_channels(file.document)
+        declared = glb_container.declared_channel_attributes(file.document)
         for matrix, primitive in file.primitives():
             splats = primitive.get("extensions", {}).get(EXTENSION)
             if splats is None:
@@ -70,10 +70,10 @@ def read(path: Path, channels: ChannelChoice = "own") -> GaussianCloud:
                 names = ", ".join(splats["extensions"])
                 raise SceneFileError(f"{path}: its splats need {names}, which is not read.")
             attributes = primitive["attributes"]
-            cloud = _placed(path, _cloud(file, attributes, splats), matrix)
+            cloud = _to_world(path, _read_cloud(file, attributes, splats), matrix)
             columns = {name[1:].lower(): number for name, number in attributes.items() if name[0] == "_"}
-            wanted = chosen_columns(path, declared, columns, channels)
-            named = Channels({name: _channel(file, columns, own) for name, own in wanted.items()})
+            wanted = select_channel_columns(path, declared, columns, channels)
+            named = Channels({name: _read_channel(file, columns, own) for name, own in wanted.items()})
             clouds.append(replace(cloud, channels=named))
         if not clouds:
             q = octagon_q(file)
@@ -82,20 +82,20 @@ def read(path: Path, channels: ChannelChoice = "own") -> GaussianCloud:
             raise SceneFileError(
                 f"{path}: holds no splats ({EXTENSION}); if it is an edited octagon mesh, use octasplat edit."
             )
-        return _joined(clouds)
+        return _concatenate_clouds(clouds)
     except ConfigError as error:
         raise SceneFileError(f"{path}: {error}") from error
-    except gltf.DAMAGE as error:
+    except glb_container.GLB_READ_ERRORS as error:
         raise SceneFileError(f"{path}: its glTF is damaged or not understood ({error}).") from error
 
 
-def _channel(
+def _read_channel(
     file: GlbFile, attributes: Mapping[str, int], columns: tuple[str, ...]
 ) -> Float32[np.ndarray, "n f"]:
     return np.concatenate([file.array(attributes[column], np.float32) for column in columns], axis=1)
 
 
-def _cloud(file: GlbFile, attributes: dict[str, int], splats: dict[str, Any]) -> GaussianCloud:
+def _read_cloud(file: GlbFile, attributes: dict[str, int], splats: dict[str, Any]) -> GaussianCloud:
     """The Gaussians of a primitive, in its own frame."""
     xyzw = file.array(attributes[f"{EXTENSION}:ROTATION"], np.float32)
     sh = _harmonics(file, attributes)
@@ -113,11 +113,11 @@ def _cloud(file: GlbFile, attributes: dict[str, int], splats: dict[str, Any]) ->
         log_scales=log_scales,
         opacity_logits=logits.astype(np.float32),
         sh=sh,
-        notes=(*notes, *dropped_harmonics(_stated_degree(attributes))),
+        notes=(*notes, *dropped_sh_message(_sh_degree_of(attributes))),
     )
 
 
-def _stated_degree(attributes: dict[str, int]) -> int:
+def _sh_degree_of(attributes: dict[str, int]) -> int:
     """Return the highest degree of which there are coefficients."""
     found = (re.fullmatch(rf"{EXTENSION}:SH_DEGREE_(\d+)_COEF_0", name) for name in attributes)
     return max((int(match[1]) for match in found if match), default=0)
@@ -135,10 +135,10 @@ def _harmonics(file: GlbFile, attributes: dict[str, int]) -> Float32[np.ndarray,
     return np.stack(bands, axis=1)
 
 
-def _placed(path: Path, cloud: GaussianCloud, matrix: Float64[np.ndarray, "4 4"]) -> GaussianCloud:
+def _to_world(path: Path, cloud: GaussianCloud, matrix: Float64[np.ndarray, "4 4"]) -> GaussianCloud:
     """The cloud in the world frame: its node's transform, then the half turn to y down."""
     if not np.array_equal(matrix, np.eye(4)):
-        cloud = _transformed(path, cloud, matrix)
+        cloud = _apply_node_transform(path, cloud, matrix)
     return replace(
         cloud,
         means_world=half_turn_points(cloud.means_world),
@@ -147,10 +147,12 @@ def _placed(path: Path, cloud: GaussianCloud, matrix: Float64[np.ndarray, "4 4"]
     )
 
 
-def _transformed(path: Path, cloud: GaussianCloud, matrix: Float64[np.ndarray, "4 4"]) -> GaussianCloud:
+def _apply_node_transform(
+    path: Path, cloud: GaussianCloud, matrix: Float64[np.ndarray, "4 4"]
+) -> GaussianCloud:
     linear = matrix[:3, :3]
     scale = float(np.cbrt(np.linalg.det(linear)))
-    if not scale > 0 or np.abs(linear @ linear.T / scale**2 - np.eye(3)).max() > SIMILARITY:
+    if not scale > 0 or np.abs(linear @ linear.T / scale**2 - np.eye(3)).max() > SIMILARITY_TOLERANCE:
         raise SceneFileError(f"{path}: a node mirrors its splats or scales them unevenly; apply it first.")
     rotation = linear / scale
     frames = rotation @ rotation_matrices(cloud.quats_wxyz.astype(np.float64))
@@ -159,27 +161,27 @@ def _transformed(path: Path, cloud: GaussianCloud, matrix: Float64[np.ndarray, "
     return replace(
         cloud,
         means_world=means.astype(np.float32),
-        quats_wxyz=quaternions(frames).astype(np.float32),
+        quats_wxyz=quaternions_from_matrices(frames).astype(np.float32),
         log_scales=(cloud.log_scales + np.log(scale)).astype(np.float32),
         sh=rotate_sh(cloud.sh, turns),
     )
 
 
-def _joined(clouds: list[GaussianCloud]) -> GaussianCloud:
+def _concatenate_clouds(clouds: list[GaussianCloud]) -> GaussianCloud:
     if len(clouds) == 1:
         return clouds[0]
     most = max(cloud.sh.shape[1] for cloud in clouds)
-    widths = common_widths(cloud.channels for cloud in clouds)
+    widths = merge_widths(cloud.channels for cloud in clouds)
     alike = [
         replace(
             cloud,
             sh=np.pad(cloud.sh, ((0, 0), (0, most - cloud.sh.shape[1]), (0, 0))),
-            channels=cloud.channels.completed(widths, len(cloud.sh)),
+            channels=cloud.channels.with_filled(widths, len(cloud.sh)),
         )
         for cloud in clouds
     ]
     notes = tuple(dict.fromkeys(note for cloud in clouds for note in cloud.notes))
-    return replace(join_rows(alike), notes=notes)
+    return replace(concatenate_rows(alike), notes=notes)
 
 
 @dataclass(frozen=True)
@@ -208,7 +210,7 @@ def _coefficient(number: int) -> Callable[[FlatGaussians], np.ndarray]:
     return lambda some: some.sh[:, number] * HALF_TURN_SIGNS[number]
 
 
-def _numbers(attribute: gltf.ChannelAttribute) -> Callable[[FlatGaussians], np.ndarray]:
+def _float_count(attribute: glb_container.ChannelAttribute) -> Callable[[FlatGaussians], np.ndarray]:
     return lambda some: some.channels[attribute.channel][:, attribute.part]
 
 
@@ -235,8 +237,10 @@ def _attributes(sh_degree: int, widths: Mapping[str, int]) -> tuple[_Attribute, 
         for place in range(2 * degree + 1)
     )
     named = tuple(
-        _Attribute(each.semantic, gltf.vector_type(each.width), FLOAT, each.width * 4, _numbers(each))
-        for each in gltf.channel_attributes(widths)
+        _Attribute(
+            each.semantic, glb_container.vector_type(each.width), FLOAT, each.width * 4, _float_count(each)
+        )
+        for each in glb_container.channel_attributes(widths)
     )
     return basic + harmonics + named
 
@@ -249,37 +253,39 @@ def write(gaussians: FlatGaussians, path: Path, options: ExportOptions) -> tuple
             hold.
         OSError: the file cannot be written.
     """
-    scene = selected(gaussians, path, options)
+    scene = select_for_export(gaussians, path, options)
     check_scales(scene, path)
     layout = _attributes(scene.sh_degree, scene.channels.widths)
-    text = gltf.json_bytes(_document(scene, layout))
-    room = padded(len(text))
+    text = glb_container.json_bytes(_gltf_json(scene, layout))
+    room = pad_to_four(len(text))
     length = len(scene) * sum(attribute.item_bytes for attribute in layout)
-    total = gltf.glb_bytes(room, length)
-    if total > gltf.MAX_BYTES:
+    total = glb_container.glb_size(room, length)
+    if total > glb_container.MAX_BYTES:
         advice = "Leave faint ones out with min_opacity, or export a Gaussian PLY."
-        raise gltf.too_large(path, f"{len(scene)} Gaussians need", total, advice)
-    write_glb(path, room, length, _data(scene, layout), lambda: text)
+        raise glb_container.too_large_error(path, f"{len(scene)} Gaussians need", total, advice)
+    write_glb(path, room, length, _binary_blocks(scene, layout), lambda: text)
     return (path,)
 
 
-def _data(scene: FlatGaussians, layout: tuple[_Attribute, ...]) -> Iterator[bytes]:
+def _binary_blocks(scene: FlatGaussians, layout: tuple[_Attribute, ...]) -> Iterator[bytes]:
     for attribute in layout:
         kind = "u1" if attribute.component == UNSIGNED_BYTE else "<f4"
-        for block in blocks(scene):
+        for block in iterate_blocks(scene):
             yield attribute.rows(block).astype(kind, copy=False).tobytes()
 
 
-def _document(scene: FlatGaussians, layout: tuple[_Attribute, ...]) -> dict[str, object]:
+def _gltf_json(scene: FlatGaussians, layout: tuple[_Attribute, ...]) -> dict[str, object]:
     low, high = scene.means_world.min(axis=0), scene.means_world.max(axis=0)
     views: list[dict[str, object]] = []
     accessors: list[dict[str, object]] = []
     offset = 0
     for number, attribute in enumerate(layout):
         length = len(scene) * attribute.item_bytes
-        views.append({"buffer": 0, "byteOffset": offset, "byteLength": length, "target": gltf.ARRAY_BUFFER})
+        views.append(
+            {"buffer": 0, "byteOffset": offset, "byteLength": length, "target": glb_container.ARRAY_BUFFER}
+        )
         offset += length
-        accessor = gltf.accessor(number, attribute.component, len(scene), attribute.kind)
+        accessor = glb_container.accessor_json(number, attribute.component, len(scene), attribute.kind)
         if attribute.component == UNSIGNED_BYTE:
             accessor["normalized"] = True
         accessors.append(accessor)
@@ -290,7 +296,7 @@ def _document(scene: FlatGaussians, layout: tuple[_Attribute, ...]) -> dict[str,
     }
     primitive = {
         "attributes": {attribute.semantic: number for number, attribute in enumerate(layout)},
-        "mode": gltf.POINTS,
+        "mode": glb_container.POINTS,
         "extensions": {
             EXTENSION: {
                 "kernel": "ellipse",
@@ -300,7 +306,7 @@ def _document(scene: FlatGaussians, layout: tuple[_Attribute, ...]) -> dict[str,
             }
         },
     }
-    extras = gltf.channel_extras(scene.channels.widths)
+    extras = glb_container.channel_extras(scene.channels.widths)
     return {
         "asset": {"version": "2.0", "generator": "octasplat"} | ({"extras": extras} if extras else {}),
         "extensionsUsed": [EXTENSION],

@@ -26,15 +26,14 @@ from jaxtyping import Float32, Int, Int32, UInt8
 
 from octasplat.engine.colour import srgb_to_linear
 from octasplat.engine.errors import ConfigError, SceneFileError
-from octasplat.engine.files import gltf
+from octasplat.engine.files import glb_container
+from octasplat.engine.files.export_options import ExportOptions
+from octasplat.engine.files.glb_container import GlbFile, channel_attributes, pad_to_four, write_glb
 from octasplat.engine.files.glb_materials import glb_materials, texture_frame
-from octasplat.engine.files.gltf import GlbFile, channel_attributes, padded, write_glb
-from octasplat.engine.files.mesh import MIN_OPACITY_KEY, Q_KEY, Mesh
+from octasplat.engine.files.kd_split import kd_split
+from octasplat.engine.files.octagon_batches import OctagonBatch, OctagonSoup
 from octasplat.engine.files.octagon_glb_layout import OPAQUE_CUTOFF, Bounds, GlbLayout
-from octasplat.engine.files.octagon_soup import OctagonBatch, OctagonSoup
-from octasplat.engine.files.options import ExportOptions
 from octasplat.engine.files.registry import Exporter, MeshReader, SurfaceWriter, register
-from octasplat.engine.files.spatial import kd_chunks
 from octasplat.engine.files.textures import (
     material_ramp_png,
     material_ramp_uv,
@@ -44,23 +43,24 @@ from octasplat.engine.files.textures import (
 from octasplat.engine.gaussians.materials import ALBEDO, METALLIC, ROUGHNESS, has_materials
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.gaussians.octagon import SIDES, octagon_triangles
-from octasplat.engine.surface.mesh import TriangleMesh
+from octasplat.engine.geometry.imported_mesh import MIN_OPACITY_KEY, Q_KEY, ImportedMesh
+from octasplat.engine.geometry.triangle_mesh import TriangleMesh
 
 COMPRESSIONS = ("KHR_draco_mesh_compression", "EXT_meshopt_compression", "KHR_meshopt_compression")
 ATTRIBUTES = {"uv": "TEXCOORD_0", "gid": "_GID", "corner": "_CORNER", "radius": "_RADIUS"}
 ATTRIBUTE_WIDTHS = {"uv": 2, "normal": 3, "colour": 3}
 UNLIT = "KHR_materials_unlit"
 SAMPLER = {
-    "magFilter": gltf.LINEAR,
-    "minFilter": gltf.LINEAR_MIPMAP_LINEAR,
-    "wrapS": gltf.CLAMP_TO_EDGE,
-    "wrapT": gltf.CLAMP_TO_EDGE,
+    "magFilter": glb_container.LINEAR,
+    "minFilter": glb_container.LINEAR_MIPMAP_LINEAR,
+    "wrapS": glb_container.CLAMP_TO_EDGE,
+    "wrapT": glb_container.CLAMP_TO_EDGE,
 }
 
-Chunks = list[Int[np.ndarray, "_"]]
+ChunkIndices = list[Int[np.ndarray, "_"]]
 
 
-def read(path: Path) -> Mesh:
+def read(path: Path) -> ImportedMesh:
     """Read the triangles of a GLB, in the frame of its scene, in which glTF says that y is up.
 
     All triangles of the default scene, with node transforms applied.
@@ -68,19 +68,19 @@ def read(path: Path) -> Mesh:
     Raises:
         SceneFileError: the file is no GLB, is damaged, or its meshes are compressed.
     """
-    return _read(path, looks=False)
+    return _read(path, with_materials=False)
 
 
-def read_looks(path: Path) -> Mesh:
+def read_with_materials(path: Path) -> ImportedMesh:
     """The same with materials, normals and colours.
 
     Raises:
         SceneFileError: likewise, or an image is missing.
     """
-    return _read(path, looks=True)
+    return _read(path, with_materials=True)
 
 
-def _read(path: Path, *, looks: bool) -> Mesh:
+def _read(path: Path, *, with_materials: bool) -> ImportedMesh:
     file = GlbFile(path)
     try:
         packed = [name for name in COMPRESSIONS if name in file.document.get("extensionsUsed", [])]
@@ -89,25 +89,25 @@ def _read(path: Path, *, looks: bool) -> Mesh:
                 f"{path}: its meshes are compressed ({packed[0]}), which changes the order of vertices; "
                 "export it without compression."
             )
-        mesh, numbers = _mesh(file, looks=looks)
-        if not looks:
+        mesh, numbers = _mesh(file, with_materials=with_materials)
+        if not with_materials:
             return mesh
         uv = None if mesh.uv is None else mesh.uv[mesh.triangles]
-        return replace(mesh, corner_uv=uv, material_numbers=numbers, materials=glb_materials(file, path))
-    except gltf.DAMAGE as error:
+        return replace(mesh, corner_uv=uv, material_indices=numbers, materials=glb_materials(file, path))
+    except glb_container.GLB_READ_ERRORS as error:
         raise SceneFileError(f"{path}: its glTF is damaged or not understood ({error}).") from error
 
 
-def _mesh(file: GlbFile, *, looks: bool) -> tuple[Mesh, Int32[np.ndarray, " t"]]:
+def _mesh(file: GlbFile, *, with_materials: bool) -> tuple[ImportedMesh, Int32[np.ndarray, " t"]]:
     """All triangles, and the number of the material of each."""
     vertices: list[np.ndarray] = []
     triangles: list[np.ndarray] = []
     numbers: list[np.ndarray] = []
-    names = ATTRIBUTES | ({"normal": "NORMAL", "colour": "COLOR_0"} if looks else {})
+    names = ATTRIBUTES | ({"normal": "NORMAL", "colour": "COLOR_0"} if with_materials else {})
     extras: dict[str, list[np.ndarray]] = {key: [] for key in names}
     count = 0
     for matrix, primitive in file.primitives():
-        if primitive.get("mode", gltf.TRIANGLES) != gltf.TRIANGLES:
+        if primitive.get("mode", glb_container.TRIANGLES) != glb_container.TRIANGLES:
             continue
         attributes = primitive["attributes"]
         positions = file.array(attributes["POSITION"], np.float64)
@@ -117,12 +117,12 @@ def _mesh(file: GlbFile, *, looks: bool) -> tuple[Mesh, Int32[np.ndarray, " t"]]
             indices = file.array(primitive["indices"], np.int64).reshape(-1, 3)
         else:
             indices = np.arange(size - size % 3).reshape(-1, 3)
-        mirrored = looks and np.linalg.det(matrix[:3, :3]) < 0
+        mirrored = with_materials and np.linalg.det(matrix[:3, :3]) < 0
         triangles.append((indices[:, ::-1] if mirrored else indices) + count)
         number = int(primitive.get("material", -1))
         numbers.append(np.full(len(indices), number, np.int32))
         names["uv"], turn = ATTRIBUTES["uv"], np.eye(2, 3)
-        if looks and number >= 0:
+        if with_materials and number >= 0:
             place, turn = texture_frame(file.document["materials"][number])
             names["uv"] = f"TEXCOORD_{place}"
         for key, name in names.items():
@@ -130,26 +130,26 @@ def _mesh(file: GlbFile, *, looks: bool) -> tuple[Mesh, Int32[np.ndarray, " t"]]
                 values = file.array(attributes[name], np.float32)
                 if key == "normal":
                     values = values @ np.linalg.inv(matrix[:3, :3])
-                elif key == "uv" and looks:
+                elif key == "uv" and with_materials:
                     values = values @ turn[:, :2].T + turn[:, 2]
                 extras[key].append(values[:, : ATTRIBUTE_WIDTHS.get(key, 1)].astype(np.float32))
             else:
                 extras[key].append(np.full((size, ATTRIBUTE_WIDTHS.get(key, 1)), np.nan, np.float32))
         count += size
-    whole = {key: _joined(parts) for key, parts in extras.items()}
+    whole = {key: _concatenate_attribute(parts) for key, parts in extras.items()}
     stated = file.document.get("asset", {}).get("extras", {})
     numbers_stated = {
         key: float(value)
         for key in (Q_KEY, MIN_OPACITY_KEY)
         if isinstance(value := stated.get(key), int | float)
     }
-    mesh = Mesh(
+    mesh = ImportedMesh(
         np.concatenate([*vertices, np.zeros((0, 3))]),
         np.concatenate([*triangles, np.zeros((0, 3), np.int64)]),
         uv=whole["uv"],
-        gid=_flat(whole["gid"]),
-        corner=_flat(whole["corner"]),
-        radius=_flat(whole["radius"]),
+        gid=_flatten_scalar(whole["gid"]),
+        corner=_flatten_scalar(whole["corner"]),
+        radius=_flatten_scalar(whole["radius"]),
         q=numbers_stated.get(Q_KEY),
         min_opacity=numbers_stated.get(MIN_OPACITY_KEY),
         normals=whole.get("normal"),
@@ -158,7 +158,7 @@ def _mesh(file: GlbFile, *, looks: bool) -> tuple[Mesh, Int32[np.ndarray, " t"]]
     return mesh, np.concatenate([*numbers, np.zeros(0, np.int32)])
 
 
-def _joined(parts: list[np.ndarray]) -> np.ndarray | None:
+def _concatenate_attribute(parts: list[np.ndarray]) -> np.ndarray | None:
     """One array, or None where no part had the attribute."""
     if not parts:
         return None
@@ -166,7 +166,7 @@ def _joined(parts: list[np.ndarray]) -> np.ndarray | None:
     return None if np.isnan(whole).all() else whole
 
 
-def _flat(values: np.ndarray | None) -> np.ndarray | None:
+def _flatten_scalar(values: np.ndarray | None) -> np.ndarray | None:
     return None if values is None else values[:, 0]
 
 
@@ -187,7 +187,7 @@ def write_octagons(gaussians: FlatGaussians, path: Path, options: ExportOptions)
         options, ramp = options.model_copy(update={"ids": False}), material_ramp_png()
     soup = OctagonSoup(gaussians, path, options, OPAQUE_CUTOFF if options.opaque else None)
     png = white_with_alpha_png(options.falloff_texture_size, options.q)
-    parts = _parts(soup, path, (len(png), len(ramp)), options)
+    parts = _plan_files(soup, path, (len(png), len(ramp)), options)
     paths = [path, *(path.with_name(f"{path.stem}.part{k}{path.suffix}") for k in range(2, len(parts) + 1))]
     for part_path, (layout, chunks) in zip(paths, parts, strict=True):
         bounds: list[Bounds] = []
@@ -196,11 +196,11 @@ def write_octagons(gaussians: FlatGaussians, path: Path, options: ExportOptions)
     return tuple(paths)
 
 
-def _parts(
+def _plan_files(
     soup: OctagonSoup, path: Path, png_sizes: tuple[int, int], options: ExportOptions
-) -> list[tuple[GlbLayout, Chunks]]:
+) -> list[tuple[GlbLayout, ChunkIndices]]:
     """The fewest files that hold all chunks; neighbouring chunks stay together."""
-    chunks = kd_chunks(soup.means_world, options.chunks)
+    chunks = kd_split(soup.means_world, options.chunks)
     channels = channel_attributes(soup.channel_widths, widest=1)
     for count in range(1, len(chunks) + 1):
         bounds = np.linspace(0, len(chunks), count + 1).astype(int).tolist()
@@ -214,11 +214,11 @@ def _parts(
             )
             for group, extras in zip(groups, _extras(soup, options, count), strict=True)
         ]
-        if all(layout.total <= gltf.MAX_BYTES for layout, _ in parts):
+        if all(layout.total <= glb_container.MAX_BYTES for layout, _ in parts):
             return parts
     largest = max(layout.total for layout, _ in parts)
     advice = "Allow more chunks, leave faint Gaussians out with min_opacity, or export a mesh PLY."
-    raise gltf.too_large(path, "its largest chunk needs", largest, advice)
+    raise glb_container.too_large_error(path, "its largest chunk needs", largest, advice)
 
 
 def _extras(soup: OctagonSoup, options: ExportOptions, parts: int) -> list[dict[str, object]]:
@@ -230,25 +230,25 @@ def _extras(soup: OctagonSoup, options: ExportOptions, parts: int) -> list[dict[
     }
     if options.opaque:
         extras["octasplat_opaque_cutoff"] = OPAQUE_CUTOFF
-    extras |= gltf.channel_extras(soup.channel_widths)
+    extras |= glb_container.channel_extras(soup.channel_widths)
     return [extras | ({"octasplat_part": [part, parts]} if parts > 1 else {}) for part in range(1, parts + 1)]
 
 
 def _octagon_data(
     layout: GlbLayout,
     soup: OctagonSoup,
-    chunks: Chunks,
+    chunks: ChunkIndices,
     images: tuple[bytes, bytes],
     options: ExportOptions,
     bounds: list[Bounds],
 ) -> Iterator[bytes]:
     """The binary part in the order of the layout; adds the bounds of each chunk to ``bounds``."""
     fall_off, ramp = images
-    yield fall_off.ljust(padded(len(fall_off)), b"\0")
+    yield fall_off.ljust(pad_to_four(len(fall_off)), b"\0")
     yield octagon_triangles(layout.largest).astype("<u4").tobytes()
     if options.ids:
         yield np.tile(np.arange(SIDES, dtype="<f4"), layout.largest).tobytes()
-    yield ramp.ljust(padded(len(ramp)), b"\0")
+    yield ramp.ljust(pad_to_four(len(ramp)), b"\0")
     for chunk in chunks:
         batch = soup.batch(chunk)
         yield from _chunk_data(batch, options)
@@ -291,7 +291,7 @@ def write_surface(mesh: TriangleMesh, path: Path) -> tuple[Path, ...]:
     data = _SurfaceData()
     shading: dict[str, object] = {"metallicFactor": 0.0, "roughnessFactor": 1.0}
     material: dict[str, object] = {"name": "surface", "pbrMetallicRoughness": shading, "doubleSided": True}
-    node: dict[str, object] = {"name": "surface", "rotation": gltf.HALF_TURN_ABOUT_X, "mesh": 0}
+    node: dict[str, object] = {"name": "surface", "rotation": glb_container.HALF_TURN_ABOUT_X, "mesh": 0}
     document: dict[str, object] = {
         "asset": {"version": "2.0", "generator": "octasplat"},
         "scene": 0,
@@ -304,7 +304,7 @@ def write_surface(mesh: TriangleMesh, path: Path) -> tuple[Path, ...]:
         material["extensions"] = {UNLIT: {}}
     else:
         attributes["TANGENT"] = mesh.materials.tangents
-        node["rotation"] = gltf.light_turn(mesh.materials.light_frame)
+        node["rotation"] = glb_container.light_rotation(mesh.materials.light_frame)
     if mesh.texture_srgb is not None and mesh.uv is not None:
         attributes["TEXCOORD_0"] = mesh.uv
         shading["baseColorTexture"] = data.texture("surface", mesh.texture_srgb)
@@ -320,15 +320,19 @@ def write_surface(mesh: TriangleMesh, path: Path) -> tuple[Path, ...]:
     accessors: list[dict[str, object]] = []
     used: dict[str, int] = {}
     for semantic, values in attributes.items():
-        view = data.add(np.ascontiguousarray(values, "<f4").tobytes(), gltf.ARRAY_BUFFER)
+        view = data.add(np.ascontiguousarray(values, "<f4").tobytes(), glb_container.ARRAY_BUFFER)
         used[semantic] = len(accessors)
-        accessors.append(gltf.accessor(view, gltf.FLOAT, len(values), gltf.vector_type(values.shape[1])))
+        accessors.append(
+            glb_container.accessor_json(
+                view, glb_container.FLOAT, len(values), glb_container.vector_type(values.shape[1])
+            )
+        )
     accessors[0] |= {
         "min": mesh.vertices_world.min(axis=0).tolist(),
         "max": mesh.vertices_world.max(axis=0).tolist(),
     }
-    view = data.add(mesh.faces.astype("<u4").tobytes(), gltf.ELEMENT_ARRAY_BUFFER)
-    accessors.append(gltf.accessor(view, gltf.UNSIGNED_INT, mesh.faces.size, "SCALAR"))
+    view = data.add(mesh.faces.astype("<u4").tobytes(), glb_container.ELEMENT_ARRAY_BUFFER)
+    accessors.append(glb_container.accessor_json(view, glb_container.UNSIGNED_INT, mesh.faces.size, "SCALAR"))
     document |= {
         "meshes": [
             {
@@ -340,11 +344,13 @@ def write_surface(mesh: TriangleMesh, path: Path) -> tuple[Path, ...]:
         "bufferViews": data.views,
         "buffers": [{"byteLength": data.length}],
     }
-    text = gltf.json_bytes(document)
-    room = padded(len(text))
-    if gltf.glb_bytes(room, data.length) > gltf.MAX_BYTES:
+    text = glb_container.json_bytes(document)
+    room = pad_to_four(len(text))
+    if glb_container.glb_size(room, data.length) > glb_container.MAX_BYTES:
         advice = "Decimate it with --max-triangles, or name a .ply."
-        raise gltf.too_large(path, "the surface needs", gltf.glb_bytes(room, data.length), advice)
+        raise glb_container.too_large_error(
+            path, "the surface needs", glb_container.glb_size(room, data.length), advice
+        )
     write_glb(path, room, data.length, data.pieces, lambda: text)
     return (path,)
 
@@ -372,7 +378,7 @@ class _SurfaceData:
         self.views.append({"buffer": 0, "byteOffset": self.length, "byteLength": len(piece)})
         if target is not None:
             self.views[-1]["target"] = target
-        self.pieces.append(piece.ljust(padded(len(piece)), b"\0"))
+        self.pieces.append(piece.ljust(pad_to_four(len(piece)), b"\0"))
         self.length += len(self.pieces[-1])
         return len(self.views) - 1
 
@@ -393,5 +399,5 @@ register(
         holds_channels=True,
     )
 )
-register(MeshReader("glb", ("*.glb",), read, read_looks))
+register(MeshReader("glb", ("*.glb",), read, read_with_materials))
 register(SurfaceWriter("glb", ("*.glb",), write_surface, textured=True, lit=True))

@@ -19,23 +19,29 @@ from jaxtyping import Float32, Int32, Int64
 
 from octasplat.engine.colour import srgb_to_linear
 from octasplat.engine.errors import SceneFileError
-from octasplat.engine.files.mesh import MIN_OPACITY_KEY, Q_KEY, Mesh, stated_number, upright
-from octasplat.engine.files.mesh_looks import MeshMaterial
+from octasplat.engine.files.export_options import ExportOptions
 from octasplat.engine.files.obj_materials import read_mtl
-from octasplat.engine.files.octagon_soup import BATCH, OctagonBatch, OctagonSoup
-from octasplat.engine.files.options import ExportOptions
+from octasplat.engine.files.octagon_batches import BATCH_SIZE, OctagonBatch, OctagonSoup
 from octasplat.engine.files.registry import Exporter, MeshReader, SurfaceWriter, register
 from octasplat.engine.files.textures import grey_png, png_bytes
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.gaussians.octagon import SIDES, octagon_triangles
-from octasplat.engine.surface.mesh import TriangleMesh
+from octasplat.engine.geometry.imported_mesh import (
+    MIN_OPACITY_KEY,
+    Q_KEY,
+    ImportedMesh,
+    flip_v,
+    number_in_comments,
+)
+from octasplat.engine.geometry.mesh_material import MeshMaterial
+from octasplat.engine.geometry.triangle_mesh import TriangleMesh
 from octasplat.engine.writing import replacing, write_text
 
 BLOCK_BYTES = 1 << 22
 NEWLINE, SPACE, TAB = 10, 32, 9  # every other white space lies below the space
 MAX_HEADER_LINES = 64
 DIGIT_LINES = 2000
-LINES_AT_ONCE = 100_000
+LINES_PER_BLOCK = 100_000
 _INDENT = re.compile(rb"^[ \t]+", re.MULTILINE)
 MATERIAL = "octagons"
 POSITION_LINE = "v %.9g %.9g %.9g"
@@ -45,7 +51,7 @@ FACE_LINE = "f %d/%d %d/%d %d/%d\n"
 
 
 @dataclass
-class _Parts:
+class _ObjParts:
     positions: list[np.ndarray] = field(default_factory=list)
     uv: list[np.ndarray] = field(default_factory=list)
     triangles: list[np.ndarray] = field(default_factory=list)
@@ -54,35 +60,35 @@ class _Parts:
     decimals: int = 0
     vertex_count: int = 0
     uv_count: int = 0
-    looks: bool = False
+    with_materials: bool = False
     colours: list[np.ndarray] = field(default_factory=list)
     libraries: list[str] = field(default_factory=list)
-    uses: list[tuple[int, str]] = field(default_factory=list)
+    material_uses: list[tuple[int, str]] = field(default_factory=list)
 
 
-def read(path: Path) -> Mesh:
+def read(path: Path) -> ImportedMesh:
     """Read positions, texture coordinates and faces of an OBJ; colours, normals and groups are passed over.
 
     Raises:
         SceneFileError: the file cannot be read, or a line is not understood.
     """
-    return _read(path, _Parts())
+    return _read(path, _ObjParts())
 
 
-def read_looks(path: Path) -> Mesh:
+def read_with_materials(path: Path) -> ImportedMesh:
     """The same with the texture coordinates of every corner, the colours of vertices, and materials.
 
     Raises:
         SceneFileError: likewise, or an image that its MTL names is missing.
     """
-    return _read(path, _Parts(looks=True))
+    return _read(path, _ObjParts(with_materials=True))
 
 
-def _read(path: Path, parts: _Parts) -> Mesh:
+def _read(path: Path, parts: _ObjParts) -> ImportedMesh:
     try:
         with path.open("rb") as handle:
             for block in _blocks(handle):
-                _take_block(path, block, parts)
+                _parse_block(path, block, parts)
     except OSError as error:
         raise SceneFileError(f"{path}: cannot be read ({error.strerror or error}).") from error
     if not parts.positions:
@@ -90,38 +96,38 @@ def _read(path: Path, parts: _Parts) -> Mesh:
     positions = np.concatenate(parts.positions)
     parts.positions.clear()
     uv = _uv_of_vertices(path, parts, len(positions))
-    looks = _looks(path, parts, len(positions)) if parts.looks else {}
+    looks = _read_materials(path, parts, len(positions)) if parts.with_materials else {}
     parts.uv.clear()
     parts.triangle_uv.clear()
     triangles = np.concatenate([*parts.triangles, np.zeros((0, 3), np.int32)], dtype=np.int64)
     rounding = 0.5 * 10.0**-parts.decimals
-    return Mesh(
+    return ImportedMesh(
         positions,
         triangles,
         uv=uv,
-        q=stated_number(tuple(parts.comments), Q_KEY),
-        min_opacity=stated_number(tuple(parts.comments), MIN_OPACITY_KEY),
+        q=number_in_comments(tuple(parts.comments), Q_KEY),
+        min_opacity=number_in_comments(tuple(parts.comments), MIN_OPACITY_KEY),
         rounding=rounding,
         **looks,
     )
 
 
-def _looks(path: Path, parts: _Parts, count: int) -> dict[str, Any]:
+def _read_materials(path: Path, parts: _ObjParts, count: int) -> dict[str, Any]:
     """Texture coordinates of corners, colours of vertices and materials."""
     places = np.concatenate([*parts.triangle_uv, np.zeros((0, 3), np.int32)])
     looks: dict[str, Any] = {}
     if parts.uv and (places >= 0).any():
-        table = np.concatenate([upright(np.concatenate(parts.uv)), np.full((1, 2), np.nan, np.float32)])
+        table = np.concatenate([flip_v(np.concatenate(parts.uv)), np.full((1, 2), np.nan, np.float32)])
         looks["corner_uv"] = table[places]  # -1 is the last row
     if sum(map(len, parts.colours)) == count:
         looks["rgb_linear"] = srgb_to_linear(np.clip(np.concatenate(parts.colours), 0, 1)).astype(np.float32)
-    if parts.uses:
-        known = {name: k for k, name in enumerate(dict.fromkeys(name for _, name in parts.uses))}
+    if parts.material_uses:
+        known = {name: k for k, name in enumerate(dict.fromkeys(name for _, name in parts.material_uses))}
         materials = read_mtl(path, parts.libraries)
         numbers = np.full(len(places), -1, np.int32)
-        for start, name in parts.uses:
+        for start, name in parts.material_uses:
             numbers[start:] = known[name]
-        missing = MeshMaterial("", passed_over=("no entry in an MTL file",))
+        missing = MeshMaterial("", unsupported=("no entry in an MTL file",))
         looks["material_numbers"] = numbers
         looks["materials"] = tuple(materials.get(name, replace(missing, name=name)) for name in known)
     return looks
@@ -141,7 +147,7 @@ def _blocks(handle: IO[bytes]) -> Iterator[bytes]:
         yield rest + b"\n"
 
 
-def _take_block(path: Path, block: bytes, parts: _Parts) -> None:
+def _parse_block(path: Path, block: bytes, parts: _ObjParts) -> None:
     if not parts.positions:
         for line in block.split(b"\n", MAX_HEADER_LINES)[:MAX_HEADER_LINES]:
             if line.startswith(b"#"):
@@ -170,7 +176,7 @@ def _take_block(path: Path, block: bytes, parts: _Parts) -> None:
         if values.shape[1] < 3:
             raise SceneFileError(f"{path}: a line 'v' has fewer than three numbers.")
         parts.positions.append(values[:, :3].copy())  # without the colours behind them
-        if parts.looks and values.shape[1] >= 6:
+        if parts.with_materials and values.shape[1] >= 6:
             parts.colours.append(values[:, 3:6].astype(np.float32))
         parts.vertex_count += len(values)
         for line in text.split(b"\n", DIGIT_LINES)[:DIGIT_LINES]:
@@ -181,24 +187,24 @@ def _take_block(path: Path, block: bytes, parts: _Parts) -> None:
         parts.uv.append(_numbers(path, text, int(is_uv.sum()), "vt")[:, :2].astype(np.float32))
         parts.uv_count += int(is_uv.sum())
     spans = [(0, len(starts), "")]
-    if parts.looks:
-        _take_libraries(block, parts)
-        spans = _uses(block, starts, first == ord("u"))
+    if parts.with_materials:
+        _parse_libraries(block, parts)
+        spans = _usemtl_ranges(block, starts, first == ord("u"))
     for begin, end, material in spans:
         if material:
-            parts.uses.append((sum(map(len, parts.triangles)), material))
+            parts.material_uses.append((sum(map(len, parts.triangles)), material))
         chosen = is_face.copy()
         chosen[:begin] = chosen[end:] = False
         if chosen.any():
-            _take_faces(path, _lines(data, chosen, lengths), before[chosen], parts)
+            _parse_faces(path, _lines(data, chosen, lengths), before[chosen], parts)
 
 
-def _take_libraries(block: bytes, parts: _Parts) -> None:
+def _parse_libraries(block: bytes, parts: _ObjParts) -> None:
     for line in re.findall(rb"^mtllib[ \t]+(.+)$", block, re.MULTILINE):
         parts.libraries.append(line.decode("utf-8", "replace").strip())
 
 
-def _uses(block: bytes, starts: np.ndarray, candidates: np.ndarray) -> list[tuple[int, int, str]]:
+def _usemtl_ranges(block: bytes, starts: np.ndarray, candidates: np.ndarray) -> list[tuple[int, int, str]]:
     """The lines of a block from one ``usemtl`` to the next, with the name of the material."""
     spans = [(0, len(starts), "")]
     for row in np.flatnonzero(candidates):
@@ -239,7 +245,7 @@ def _ragged_numbers(path: Path, text: bytes, keyword: str) -> np.ndarray:
     return np.array([[float(word) for word in row[:width]] for row in rows])
 
 
-def _take_faces(path: Path, text: bytes, before: Int64[np.ndarray, "f 2"], parts: _Parts) -> None:
+def _parse_faces(path: Path, text: bytes, before: Int64[np.ndarray, "f 2"], parts: _ObjParts) -> None:
     """Take faces as fans of triangles, and the texture coordinates of their corners where they name some.
 
     Args:
@@ -285,26 +291,26 @@ def _is_ragged(text: bytes, words_per_line: int) -> bool:
 
 
 def _add_fans(
-    vertex: np.ndarray, texture: np.ndarray | None, before: Int64[np.ndarray, "f 2"], parts: _Parts
+    vertex: np.ndarray, texture: np.ndarray | None, before: Int64[np.ndarray, "f 2"], parts: _ObjParts
 ) -> None:
     sides = vertex.shape[1]
     fan = np.array([[0, k, k + 1] for k in range(1, sides - 1)])
     # Numbers count from 1; negative ones count back from the newest vertex before the line.
     positions = np.where(vertex > 0, vertex - 1, vertex + before[:, :1])
-    parts.triangles.append(_small(positions[:, fan].reshape(-1, 3)))
+    parts.triangles.append(_to_int32(positions[:, fan].reshape(-1, 3)))
     if texture is None:
         parts.triangle_uv.append(np.full((len(vertex) * len(fan), 3), -1, np.int32))
     else:
         places = np.where(texture > 0, texture - 1, texture + before[:, 1:])
-        parts.triangle_uv.append(_small(places[:, fan].reshape(-1, 3)))
+        parts.triangle_uv.append(_to_int32(places[:, fan].reshape(-1, 3)))
 
 
-def _small(numbers: Int64[np.ndarray, "t 3"]) -> Int32[np.ndarray, "t 3"]:
+def _to_int32(numbers: Int64[np.ndarray, "t 3"]) -> Int32[np.ndarray, "t 3"]:
     """Numbers in half the memory; those that no mesh can hold stay too large."""
     return np.clip(numbers, -1, np.iinfo(np.int32).max).astype(np.int32)
 
 
-def _uv_of_vertices(path: Path, parts: _Parts, count: int) -> Float32[np.ndarray, "v 2"] | None:
+def _uv_of_vertices(path: Path, parts: _ObjParts, count: int) -> Float32[np.ndarray, "v 2"] | None:
     if not parts.uv or not parts.triangle_uv:
         return None
     table = np.concatenate(parts.uv)
@@ -350,8 +356,8 @@ def _octagon_lines(soup: OctagonSoup, material_name: str) -> Iterator[str]:
     )
     for batch in soup.batches():
         yield _vertex_lines(batch)
-    for start in range(0, len(soup), BATCH):
-        count = min(BATCH, len(soup) - start)
+    for start in range(0, len(soup), BATCH_SIZE):
+        count = min(BATCH_SIZE, len(soup) - start)
         indices = octagon_triangles(count) + (1 + start * SIDES)
         yield FACE_LINE * len(indices) % tuple(np.repeat(indices.reshape(-1), 2).tolist())
 
@@ -406,8 +412,8 @@ def _surface_files(path: Path) -> tuple[Path, Path]:
 
 
 def _write_lines(write: Callable[[str], object], line: str, rows: np.ndarray) -> None:
-    for start in range(0, len(rows), LINES_AT_ONCE):
-        part = rows[start : start + LINES_AT_ONCE]
+    for start in range(0, len(rows), LINES_PER_BLOCK):
+        part = rows[start : start + LINES_PER_BLOCK]
         write((line + "\n") * len(part) % tuple(part.reshape(-1).tolist()))
 
 
@@ -420,5 +426,5 @@ register(
         beside=_octagon_files,
     )
 )
-register(MeshReader("obj", ("*.obj",), read, read_looks))
+register(MeshReader("obj", ("*.obj",), read, read_with_materials))
 register(SurfaceWriter("obj", ("*.obj",), write_surface, textured=True, beside=_surface_files))

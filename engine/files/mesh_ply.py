@@ -12,10 +12,9 @@ from jaxtyping import Float32, Int, Int64
 
 from octasplat.engine.colour import srgb_to_linear, to_bytes
 from octasplat.engine.errors import SceneFileError
+from octasplat.engine.files.export_options import ExportOptions
 from octasplat.engine.files.gaussian_ply import channel_comments
-from octasplat.engine.files.mesh import MIN_OPACITY_KEY, Q_KEY, Mesh, stated_number, upright
-from octasplat.engine.files.octagon_soup import BATCH, OctagonSoup
-from octasplat.engine.files.options import ExportOptions
+from octasplat.engine.files.octagon_batches import BATCH_SIZE, OctagonSoup
 from octasplat.engine.files.ply_container import (
     COUNT_SUFFIX,
     PlyWriteElement,
@@ -27,8 +26,15 @@ from octasplat.engine.files.ply_container import (
 from octasplat.engine.files.registry import Exporter, MeshReader, SurfaceWriter, register
 from octasplat.engine.gaussians.channels import column_names
 from octasplat.engine.gaussians.model import FlatGaussians
-from octasplat.engine.gaussians.octagon import FAN, SIDES, octagon_triangles
-from octasplat.engine.surface.mesh import TriangleMesh
+from octasplat.engine.gaussians.octagon import FAN_TRIANGLES, SIDES, octagon_triangles
+from octasplat.engine.geometry.imported_mesh import (
+    MIN_OPACITY_KEY,
+    Q_KEY,
+    ImportedMesh,
+    flip_v,
+    number_in_comments,
+)
+from octasplat.engine.geometry.triangle_mesh import TriangleMesh
 
 _POSITION, _NORMAL = ("x", "y", "z"), ("nx", "ny", "nz")
 COLOURS = ("red", "green", "blue")
@@ -42,7 +48,7 @@ VERTEX = [
 FACE = np.dtype(list_field("vertex_indices", "i4", 3))
 
 
-def read(path: Path) -> Mesh:
+def read(path: Path) -> ImportedMesh:
     """Read a PLY mesh; faces may be triangles or polygons, all of one length.
 
     Raises:
@@ -65,23 +71,23 @@ def read(path: Path) -> Mesh:
         name = next((prop.name for prop in face.lists if prop.name in _FACE_LISTS), None)
         if name is None:
             raise SceneFileError(f"{path}: its faces have no list 'vertex_indices'.")
-        triangles = _fans(np.asarray(read_ply(path, ["face"])[1]["face"][name]))
+        triangles = _fan_triangles(np.asarray(read_ply(path, ["face"])[1]["face"][name]))
     positions = np.empty((len(table), 3))
     for axis, name in enumerate(_POSITION):
         positions[:, axis] = table[name]
-    return Mesh(
+    return ImportedMesh(
         positions,
         triangles,
         uv=columns(table, ("s", "t")) if {"s", "t"} <= set(vertex.names) else None,
         gid=_attribute(table, "gid"),
         corner=_attribute(table, "corner"),
         radius=_attribute(table, "radius"),
-        q=stated_number(header.comments, Q_KEY),
-        min_opacity=stated_number(header.comments, MIN_OPACITY_KEY),
+        q=number_in_comments(header.comments, Q_KEY),
+        min_opacity=number_in_comments(header.comments, MIN_OPACITY_KEY),
     )
 
 
-def read_looks(path: Path) -> Mesh:
+def read_with_materials(path: Path) -> ImportedMesh:
     """The same with normals and colours; a PLY has no materials.
 
     Raises:
@@ -101,13 +107,13 @@ def read_looks(path: Path) -> Mesh:
         colours = srgb_to_linear(np.clip(colours, 0.0, 1.0)).astype(np.float32)
     return replace(
         mesh,
-        corner_uv=None if uv is None else upright(uv)[mesh.triangles],
+        corner_uv=None if uv is None else flip_v(uv)[mesh.triangles],
         normals=columns(table, _NORMAL) if set(_NORMAL) <= names else None,
         rgb_linear=colours,
     )
 
 
-def _fans(polygons: np.ndarray) -> Int64[np.ndarray, "t 3"]:
+def _fan_triangles(polygons: np.ndarray) -> Int64[np.ndarray, "t 3"]:
     sides = polygons.shape[1]
     if sides < 3:
         return np.zeros((0, 3), np.int64)
@@ -145,7 +151,7 @@ def write_octagons(gaussians: FlatGaussians, path: Path, options: ExportOptions)
     names = [column for name, width in widths.items() for column in column_names(name, width)]
     vertex = np.dtype([*VERTEX, *((name, "<f4") for name in names)])
     vertices = PlyWriteElement("vertex", count * SIDES, vertex, _vertices(soup, vertex))
-    faces = PlyWriteElement("face", count * len(FAN), FACE, _faces(count))
+    faces = PlyWriteElement("face", count * len(FAN_TRIANGLES), FACE, _faces(count))
     write_ply(path, [vertices, faces], comments)
     return (path,)
 
@@ -169,8 +175,8 @@ def _vertices(soup: OctagonSoup, vertex: np.dtype[np.void]) -> Iterator[np.ndarr
 
 
 def _faces(count: int) -> Iterator[np.ndarray]:
-    for start in range(0, count, BATCH):
-        yield _face_rows(octagon_triangles(min(BATCH, count - start)) + start * SIDES)
+    for start in range(0, count, BATCH_SIZE):
+        yield _face_rows(octagon_triangles(min(BATCH_SIZE, count - start)) + start * SIDES)
 
 
 def write_surface(mesh: TriangleMesh, path: Path) -> tuple[Path, ...]:
@@ -212,5 +218,5 @@ register(
         holds_channels=True,
     )
 )
-register(MeshReader("mesh-ply", ("*.ply",), read, read_looks))
+register(MeshReader("mesh-ply", ("*.ply",), read, read_with_materials))
 register(SurfaceWriter("mesh-ply", ("*.ply",), write_surface, textured=False))

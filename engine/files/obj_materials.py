@@ -10,15 +10,15 @@ from pathlib import Path
 from typing import Any
 
 from octasplat.engine.errors import SceneFileError
-from octasplat.engine.files.mesh_looks import MeshMaterial, image_beside
+from octasplat.engine.geometry.mesh_material import MeshMaterial, resolve_image
 
 MAX_BYTES = 64 << 20
 NUMBERS = {"Ns", "Ni", "d", "Tr", "Pr", "Pm", "illum"}
 COLOURS = {"Kd", "Ke"}
 IMAGES = {"map_Kd": "texture", "map_Ke": "emission_texture", "norm": "normal_texture"}
-WITHOUT_SAYING = {"Ka", "Ks", "Tf", "Ns", "newmtl", "map_Ka", "map_Ks"}
+IGNORED_KEYS = {"Ka", "Ks", "Tf", "Ns", "newmtl", "map_Ka", "map_Ks"}
 """What older programs write into every file, and what has no counterpart."""
-GLASS = (4, 6, 7, 9)
+GLASS_ILLUM_MODELS = (4, 6, 7, 9)
 """Illumination models with refraction or with transparency by ray tracing."""
 
 
@@ -40,12 +40,12 @@ def read_mtl(obj: Path, names: Sequence[str]) -> dict[str, MeshMaterial]:
             text = path.read_text(encoding="utf-8-sig", errors="replace")
         except OSError as error:
             raise SceneFileError(f"{path}: cannot be read ({error.strerror or error}).") from error
-        for entry in _entries(text):
+        for entry in _parse_entries(text):
             materials[entry["newmtl"]] = _material(path, entry)
     return materials
 
 
-def _entries(text: str) -> list[dict[str, str]]:
+def _parse_entries(text: str) -> list[dict[str, str]]:
     entries: list[dict[str, str]] = []
     for line in text.splitlines():
         words = line.split("#", 1)[0].strip().split(maxsplit=1)
@@ -65,14 +65,14 @@ def _material(path: Path, entry: dict[str, str]) -> MeshMaterial:
     found: dict[str, Any] = {}
     for key, field in IMAGES.items():
         if key in entry:
-            found[field] = image_beside(path, _file_name(entry[key]))
+            found[field] = resolve_image(path, _file_name(entry[key]))
     if "texture" in found:
         colours["Kd"] = (1.0, 1.0, 1.0)  # programs leave a grey here that the image is not meant to have
     if "emission_texture" in found and not any(colours.get("Ke", ())):
         colours["Ke"] = (1.0, 1.0, 1.0)
     opacity = numbers.get("d", 1.0 - numbers.get("Tr", 0.0))
-    clear = int(numbers.get("illum", 0)) in GLASS and ("Ni" in numbers or opacity < 1.0)
-    known = NUMBERS | COLOURS | set(IMAGES) | WITHOUT_SAYING
+    clear = int(numbers.get("illum", 0)) in GLASS_ILLUM_MODELS and ("Ni" in numbers or opacity < 1.0)
+    known = NUMBERS | COLOURS | set(IMAGES) | IGNORED_KEYS
     passed_over = [key for key in entry if key not in known]
     if opacity < 1.0 and not clear:
         passed_over.append(f"opacity {opacity:g}")
@@ -84,7 +84,7 @@ def _material(path: Path, entry: dict[str, str]) -> MeshMaterial:
         emission_linear=colours.get("Ke", (0.0, 0.0, 0.0)),
         transmission=float(clear),
         ior=numbers.get("Ni", 1.5) if numbers.get("Ni", 1.5) >= 1.0 else 1.5,
-        passed_over=tuple(passed_over),
+        unsupported=tuple(passed_over),
         **found,
     )
 

@@ -5,25 +5,25 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from octasplat.engine.files.gltf import (
+from octasplat.engine.files.export_options import ExportOptions
+from octasplat.engine.files.glb_container import (
     ARRAY_BUFFER,
     CLAMP_TO_EDGE,
-    CORES,
+    CORE_NODE_NAME,
     ELEMENT_ARRAY_BUFFER,
     FLOAT,
     HALF_TURN_ABOUT_X,
     LINEAR,
     UNSIGNED_INT,
     ChannelAttribute,
-    accessor,
-    glb_bytes,
+    accessor_json,
+    glb_size,
     json_bytes,
-    light_turn,
-    padded,
+    light_rotation,
+    pad_to_four,
     vector_type,
 )
-from octasplat.engine.files.options import ExportOptions
-from octasplat.engine.gaussians.octagon import FAN, SIDES
+from octasplat.engine.gaussians.octagon import FAN_TRIANGLES, SIDES
 from octasplat.engine.shading.environment_frame import environment_frame
 
 OPAQUE_CUTOFF = 0.2
@@ -91,7 +91,7 @@ class GlbLayout:
         self.largest = max(chunk_sizes)
         self.length = 0
         self._add_view(png_size)
-        self._add_view(self.largest * len(FAN) * 3 * 4, target=ELEMENT_ARRAY_BUFFER)
+        self._add_view(self.largest * len(FAN_TRIANGLES) * 3 * 4, target=ELEMENT_ARRAY_BUFFER)
         if options.ids:
             self._add_view(self.largest * SIDES * 4, target=ARRAY_BUFFER, byteStride=4)
         if options.light_up is not None:
@@ -101,12 +101,12 @@ class GlbLayout:
             for attribute in self._attributes:
                 self._add_view(size * SIDES * attribute.width * 4, target=ARRAY_BUFFER)
         widest = ([WIDEST_NUMBER] * 3, [WIDEST_NUMBER] * 3)
-        self.json_room = padded(len(self.json([widest] * len(chunk_sizes))))
-        self.total = glb_bytes(self.json_room, self.length)
+        self.json_room = pad_to_four(len(self.json([widest] * len(chunk_sizes))))
+        self.total = glb_size(self.json_room, self.length)
 
     def _add_view(self, length: int, **keys: int) -> None:
         self._views.append({"buffer": 0, "byteOffset": self.length, "byteLength": length, **keys})
-        self.length += padded(length)
+        self.length += pad_to_four(length)
 
     def json(self, bounds: list[Bounds]) -> bytes:
         """The JSON part, given each chunk's smallest and largest coordinates."""
@@ -120,18 +120,20 @@ class GlbLayout:
             first_view = self._shared_views + chunk * len(self._attributes)
             for place, attribute in enumerate(self._attributes):
                 used[attribute.semantic] = len(accessors)
-                accessors.append(accessor(first_view + place, FLOAT, size * SIDES, attribute.type))
+                accessors.append(accessor_json(first_view + place, FLOAT, size * SIDES, attribute.type))
             accessors[used["POSITION"]] |= {"min": bounds[chunk][0], "max": bounds[chunk][1]}
             if self._options.ids:
                 used[CORNER.semantic] = len(accessors)
-                accessors.append(accessor(2, FLOAT, size * SIDES, CORNER.type))
-            accessors.append(accessor(1, UNSIGNED_INT, size * len(FAN) * 3, "SCALAR"))
+                accessors.append(accessor_json(2, FLOAT, size * SIDES, CORNER.type))
+            accessors.append(accessor_json(1, UNSIGNED_INT, size * len(FAN_TRIANGLES) * 3, "SCALAR"))
             blended = {"attributes": used, "indices": len(accessors) - 1, "material": 0}
-            solid = {**blended, "material": 1, "extras": {CORES: True}}
+            solid = {**blended, "material": 1, "extras": {CORE_NODE_NAME: True}}
             meshes.append({"primitives": [blended] if self._options.cores is None else [solid, blended]})
         chunks = range(len(self._chunk_sizes))
         lit = self._options.light_up is not None
-        turn = light_turn(environment_frame(np.array(self._options.light_up))) if lit else HALF_TURN_ABOUT_X
+        turn = (
+            light_rotation(environment_frame(np.array(self._options.light_up))) if lit else HALF_TURN_ABOUT_X
+        )
         images = [{"name": "radial_alpha", "mimeType": "image/png", "bufferView": 0}]
         if lit:
             ramp = {"name": "materials", "mimeType": "image/png", "bufferView": self._shared_views - 1}

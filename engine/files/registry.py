@@ -11,12 +11,12 @@ from typing import ClassVar, TypeVar
 
 from octasplat.engine.errors import SceneFileError
 from octasplat.engine.files.channel_columns import ChannelChoice
+from octasplat.engine.files.export_options import ExportOptions
 from octasplat.engine.files.format_table import Entry, FormatTable
-from octasplat.engine.files.mesh import Mesh
-from octasplat.engine.files.options import ExportOptions
 from octasplat.engine.gaussians.flattening import GaussianCloud
 from octasplat.engine.gaussians.model import FlatGaussians
-from octasplat.engine.surface.mesh import TriangleMesh
+from octasplat.engine.geometry.imported_mesh import ImportedMesh
+from octasplat.engine.geometry.triangle_mesh import TriangleMesh
 
 HEAD_BYTES = 4096
 
@@ -39,15 +39,15 @@ class Importer(Entry):
         patterns: file names that it takes where the file's first bytes do not decide.
         description: one line for help texts.
         read: reads the Gaussians as the file has them, in the world frame of the 3DGS family (y down).
-        recognises: whether a file that begins with these bytes (up to ``HEAD_BYTES``) is of this format.
-        read_with: reads the channels that are wanted, too; None where the format has no place for any.
+        matches_head: whether a file that begins with these bytes (up to ``HEAD_BYTES``) is of this format.
+        read_channels: reads the channels that are wanted, too; None where the format has no place for any.
     """
 
     noun: ClassVar[str] = "import"
     description: str
     read: SceneReader
-    recognises: Callable[[bytes], bool] = lambda _head: False
-    read_with: Callable[[Path, ChannelChoice], GaussianCloud] | None = None
+    matches_head: Callable[[bytes], bool] = lambda _head: False
+    read_channels: Callable[[Path, ChannelChoice], GaussianCloud] | None = None
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ class Exporter(Entry):
         patterns: file names that it takes by default.
         description: one line for help texts.
         write: writes the Gaussians to the path and returns every file written, the path itself first.
-        lacking: what is missing on this machine to write it, to be read after the file's name, or None.
+        missing_requirement: what is missing on this machine to write it, to be read after the file's name, or None.
         holds_channels: whether it writes named channels, too.
         holds_harmonics: whether colours may change with the direction.
         beside: names the files that are written beside the path, if there are any.
@@ -68,7 +68,7 @@ class Exporter(Entry):
     noun: ClassVar[str] = "export"
     description: str
     write: SceneWriter
-    lacking: Callable[[], str | None] = lambda: None
+    missing_requirement: Callable[[], str | None] = lambda: None
     holds_channels: bool = False
     holds_harmonics: bool = False
     beside: Callable[[Path], tuple[Path, ...]] = no_files
@@ -82,12 +82,12 @@ class MeshReader(Entry):
         name: of the format.
         patterns: file names that it takes.
         read: reads all triangles.
-        read_looks: reads them with materials, normals and colours too.
+        read_with_materials: reads them with materials, normals and colours too.
     """
 
     noun: ClassVar[str] = "mesh"
-    read: Callable[[Path], Mesh]
-    read_looks: Callable[[Path], Mesh]
+    read: Callable[[Path], ImportedMesh]
+    read_with_materials: Callable[[Path], ImportedMesh]
 
 
 @dataclass(frozen=True)
@@ -122,12 +122,12 @@ def register(entry: E) -> E:
 
 def importers() -> tuple[Importer, ...]:
     """All formats of Gaussians that are read, by name."""
-    return _TABLE.all(Importer)
+    return _TABLE.entries(Importer)
 
 
 def exporters() -> tuple[Exporter, ...]:
     """All formats in which scenes are written, by name."""
-    return _TABLE.all(Exporter)
+    return _TABLE.entries(Exporter)
 
 
 def importer_for(path: Path, format: str | None = None) -> Importer:
@@ -139,14 +139,14 @@ def importer_for(path: Path, format: str | None = None) -> Importer:
         SceneFileError: the file cannot be opened, or no format has that name, those bytes or that file name.
     """
     if format is not None:
-        return _TABLE.named(Importer, format, path)
+        return _TABLE.get(Importer, format, path)
     head = _head(path)
     for importer in importers():
-        if importer.recognises(head):
+        if importer.matches_head(head):
             return importer
     found = _TABLE.by_file_name(Importer, path)
     if found is None:
-        choices = _TABLE.choices(Importer)
+        choices = _TABLE.describe_choices(Importer)
         raise SceneFileError(f"{path}: is no scene of a known format; the formats are {choices}.")
     return found
 
@@ -161,17 +161,17 @@ def exporter_for(path: Path, format: str | None = None) -> Exporter:
         SceneFileError: no format has that name or takes that file name; the text lists those that exist.
     """
     if format is not None:
-        return _TABLE.named(Exporter, format, path)
+        return _TABLE.get(Exporter, format, path)
     found = _TABLE.by_file_name(Exporter, path)
     if found is None:
-        choices = _TABLE.choices(Exporter)
+        choices = _TABLE.describe_choices(Exporter)
         raise SceneFileError(f"{path}: no export format takes this file name; the formats are {choices}.")
     return found
 
 
 def writable_formats() -> tuple[str, ...]:
     """Names of the formats that this machine can write, as of now."""
-    return tuple(exporter.name for exporter in exporters() if exporter.lacking() is None)
+    return tuple(exporter.name for exporter in exporters() if exporter.missing_requirement() is None)
 
 
 def check_writable(names: Iterable[str]) -> None:
@@ -181,7 +181,7 @@ def check_writable(names: Iterable[str]) -> None:
         SceneFileError: no format takes a name, or what its format needs is missing; the text says what to do.
     """
     for name in names:
-        lacking = exporter_for(Path(name)).lacking()
+        lacking = exporter_for(Path(name)).missing_requirement()
         if lacking is not None:
             raise SceneFileError(f"{name}: {lacking}.")
 

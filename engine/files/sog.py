@@ -17,16 +17,16 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from octasplat.engine.errors import SceneFileError
 from octasplat.engine.files.encodings import SQRT_HALF, from_smallest_three, logits_from_bytes
+from octasplat.engine.files.export_options import ExportOptions
 from octasplat.engine.files.gaussian_ply import write_gaussian_ply
-from octasplat.engine.files.options import ExportOptions
 from octasplat.engine.files.registry import Exporter, Importer, register
-from octasplat.engine.files.selection import selected
-from octasplat.engine.files.splat_transform import convert, lacking
+from octasplat.engine.files.splat_rows import select_for_export
+from octasplat.engine.files.splat_transform import convert, missing_converter
 from octasplat.engine.gaussians.flattening import GaussianCloud
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.writing import replacing
 
-META = "meta.json"
+META_FILE = "meta.json"
 PALETTE_COLUMNS = 64
 FIRST_QUAT_TAG = 252
 """Alpha 252 to 255 says which of w, x, y, z is left out."""
@@ -34,7 +34,7 @@ MAX_FILE_BYTES = 1 << 31
 _REST_COUNTS = {0: 0, 1: 3, 2: 8, 3: 15}
 
 
-class _Part(BaseModel):
+class _ParameterMeta(BaseModel):
     """What ``meta.json`` says of one parameter, in either version."""
 
     model_config = ConfigDict(extra="ignore")
@@ -52,11 +52,11 @@ class _Meta(BaseModel):
 
     version: int = 1
     count: int | None = Field(default=None, ge=0)
-    means: _Part
-    scales: _Part
-    quats: _Part
-    sh0: _Part
-    shN: _Part | None = None
+    means: _ParameterMeta
+    scales: _ParameterMeta
+    quats: _ParameterMeta
+    sh0: _ParameterMeta
+    shN: _ParameterMeta | None = None
     antialias: bool = False
 
 
@@ -72,12 +72,14 @@ def read(path: Path) -> GaussianCloud:
     try:
         if path.stat().st_size == 0:
             raise SceneFileError(f"{path}: is empty.")
-        if path.name != META and not zipfile.is_zipfile(path):
+        if path.name != META_FILE and not zipfile.is_zipfile(path):
             raise SceneFileError(f"{path}: is no SOG bundle, which is a ZIP archive, or it is damaged.")
-        if path.name == META:
+        if path.name == META_FILE:
             return _decode(path, path.read_bytes(), _folder_images(path))
         with zipfile.ZipFile(path) as bundle, tempfile.TemporaryDirectory(prefix="octasplat-") as folder:
-            return _decode(path, _member(path, bundle, META), _bundle_images(path, bundle, Path(folder)))
+            return _decode(
+                path, _bundle_member(path, bundle, META_FILE), _bundle_images(path, bundle, Path(folder))
+            )
     except (OSError, zipfile.BadZipFile, RuntimeError, NotImplementedError) as error:
         raise SceneFileError(f"{path}: is damaged or cannot be read ({error}).") from error
 
@@ -92,13 +94,13 @@ def _folder_images(path: Path) -> Images:
 def _bundle_images(path: Path, bundle: zipfile.ZipFile, folder: Path) -> Images:
     def load(name: str) -> UInt8[np.ndarray, "h w 4"]:
         image = folder / Path(name).name
-        image.write_bytes(_member(path, bundle, name))
+        image.write_bytes(_bundle_member(path, bundle, name))
         return _pixels(path, name, image)
 
     return load
 
 
-def _member(path: Path, bundle: zipfile.ZipFile, name: str) -> bytes:
+def _bundle_member(path: Path, bundle: zipfile.ZipFile, name: str) -> bytes:
     """A file of the bundle, at its root or in its only folder."""
     names = [info for info in bundle.infolist() if info.filename.rpartition("/")[2] == Path(name).name]
     if not names:
@@ -137,16 +139,16 @@ def _decode(path: Path, text: bytes, images: Images) -> GaussianCloud:
         meta = _Meta.model_validate(json.loads(text))
     except (ValidationError, ValueError, RecursionError) as error:
         words = " ".join(str(error).split())[:200]
-        raise SceneFileError(f"{path}: its {META} does not describe a SOG ({words}).") from error
+        raise SceneFileError(f"{path}: its {META_FILE} does not describe a SOG ({words}).") from error
     if meta.version not in (1, 2):
         raise SceneFileError(f"{path}: is SOG version {meta.version}; versions 1 and 2 are read.")
     count = meta.count if meta.count is not None else (meta.means.shape or [0])[0]
     if count <= 0:
         raise SceneFileError(f"{path}: holds no Gaussians.")
 
-    def rgba(part: _Part, number: int = 0) -> UInt8[np.ndarray, "n 4"]:
+    def rgba(part: _ParameterMeta, number: int = 0) -> UInt8[np.ndarray, "n 4"]:
         if len(part.files) <= number:
-            raise SceneFileError(f"{path}: its {META} names too few images.")
+            raise SceneFileError(f"{path}: its {META_FILE} names too few images.")
         pixels = images(part.files[number]).reshape(-1, 4)
         if len(pixels) < count:
             raise SceneFileError(
@@ -155,19 +157,19 @@ def _decode(path: Path, text: bytes, images: Images) -> GaussianCloud:
         return pixels[:count]
 
     low, high = rgba(meta.means)[:, :3], rgba(meta.means, 1)[:, :3]
-    curved = _spread(path, meta.means, (low.astype(np.float64) + 256.0 * high) / 65535.0)
+    curved = _dequantise(path, meta.means, (low.astype(np.float64) + 256.0 * high) / 65535.0)
     colour = rgba(meta.sh0)
     if meta.version == 2:
-        scales = _look_up(path, meta.scales, rgba(meta.scales)[:, :3])
-        constant = _look_up(path, meta.sh0, colour[:, :3])
+        scales = _codebook_values(path, meta.scales, rgba(meta.scales)[:, :3])
+        constant = _codebook_values(path, meta.sh0, colour[:, :3])
         logits = logits_from_bytes(colour[:, 3])
     else:
-        scales = _spread(path, meta.scales, rgba(meta.scales)[:, :3] / 255.0).astype(np.float32)
-        both = _spread(path, meta.sh0, colour / 255.0).astype(np.float32)
+        scales = _dequantise(path, meta.scales, rgba(meta.scales)[:, :3] / 255.0).astype(np.float32)
+        both = _dequantise(path, meta.sh0, colour / 255.0).astype(np.float32)
         constant, logits = both[:, :3], both[:, 3]
     sh = constant[:, None, :]
     if meta.shN is not None:
-        sh = np.concatenate([sh, _rest(path, meta.shN, images, rgba(meta.shN, 1))], axis=1)
+        sh = np.concatenate([sh, _sh_rest(path, meta.shN, images, rgba(meta.shN, 1))], axis=1)
     return GaussianCloud(
         means_world=(np.sign(curved) * np.expm1(np.abs(curved))).astype(np.float32),
         quats_wxyz=_rotations(rgba(meta.quats)),
@@ -178,26 +180,28 @@ def _decode(path: Path, text: bytes, images: Images) -> GaussianCloud:
     )
 
 
-def _spread(path: Path, part: _Part, share: np.ndarray) -> np.ndarray:
+def _dequantise(path: Path, part: _ParameterMeta, share: np.ndarray) -> np.ndarray:
     """Numbers in [0, 1] between the bounds of their channel."""
-    low, high = _numbers(path, part.mins), _numbers(path, part.maxs)
+    low, high = _as_float_array(path, part.mins), _as_float_array(path, part.maxs)
     if not len(low) == len(high) == share.shape[1]:
-        raise SceneFileError(f"{path}: its {META} should give {share.shape[1]} bounds for {part.files[0]}.")
+        raise SceneFileError(
+            f"{path}: its {META_FILE} should give {share.shape[1]} bounds for {part.files[0]}."
+        )
     spread: np.ndarray = low + (high - low) * share
     return spread
 
 
-def _look_up(path: Path, part: _Part, codes: np.ndarray) -> Float32[np.ndarray, "*shape"]:
-    book = _numbers(path, part.codebook or [])
+def _codebook_values(path: Path, part: _ParameterMeta, codes: np.ndarray) -> Float32[np.ndarray, "*shape"]:
+    book = _as_float_array(path, part.codebook or [])
     if len(book) != 256:
         raise SceneFileError(f"{path}: the code book for {part.files[0]} should have 256 entries.")
     return book.astype(np.float32)[codes]
 
 
-def _numbers(path: Path, values: Sequence[float] | float) -> np.ndarray:
+def _as_float_array(path: Path, values: Sequence[float] | float) -> np.ndarray:
     numbers: np.ndarray = np.asarray(values, dtype=np.float64).reshape(-1)
     if not np.isfinite(numbers).all():
-        raise SceneFileError(f"{path}: its {META} holds numbers that are not finite.")
+        raise SceneFileError(f"{path}: its {META_FILE} holds numbers that are not finite.")
     return numbers
 
 
@@ -209,8 +213,8 @@ def _rotations(rgba: UInt8[np.ndarray, "n 4"]) -> Float32[np.ndarray, "n 4"]:
     return quats
 
 
-def _rest(
-    path: Path, part: _Part, images: Images, labels: UInt8[np.ndarray, "n 4"]
+def _sh_rest(
+    path: Path, part: _ParameterMeta, images: Images, labels: UInt8[np.ndarray, "n 4"]
 ) -> Float32[np.ndarray, "n k 3"]:
     """Higher harmonics: each Gaussian names an entry of the palette, of which 64 lie in a row."""
     pixels = images(part.files[0])
@@ -223,11 +227,11 @@ def _rest(
     if part.bands is not None and _REST_COUNTS[part.bands] != k:
         raise SceneFileError(f"{path}: its image {part.files[0]} does not fit {part.bands} bands.")
     if part.codebook is not None:
-        palette = _look_up(path, part, pixels[:, :, :3])
+        palette = _codebook_values(path, part, pixels[:, :, :3])
     else:
-        low, high = _numbers(path, part.mins), _numbers(path, part.maxs)
+        low, high = _as_float_array(path, part.mins), _as_float_array(path, part.maxs)
         if len(low) != 1 or len(high) != 1:
-            raise SceneFileError(f"{path}: its {META} should give one bound for {part.files[0]}.")
+            raise SceneFileError(f"{path}: its {META_FILE} should give one bound for {part.files[0]}.")
         palette = (low + (high - low) * (pixels[:, :, :3] / 255.0)).astype(np.float32)
     palette = palette.reshape(rows * PALETTE_COLUMNS, k, 3)
     entry = labels[:, 0].astype(np.int64) + 256 * labels[:, 1].astype(np.int64)
@@ -245,7 +249,7 @@ def write(gaussians: FlatGaussians, path: Path, options: ExportOptions) -> tuple
         SceneFileError: nothing to write, values that are not finite, or the program is missing or fails.
         OSError: the file cannot be written.
     """
-    scene = selected(gaussians, path, options)
+    scene = select_for_export(gaussians, path, options)
     with tempfile.TemporaryDirectory(prefix="octasplat-") as folder, replacing(path) as temporary:
         source, target = Path(folder) / "scene.ply", Path(folder) / "scene.sog"
         write_gaussian_ply(scene, source)
@@ -263,7 +267,11 @@ def _recognises(head: bytes) -> bool:
 
 register(
     Importer(
-        "sog", ("*.sog", META), "SOG of PlayCanvas, bundled or as a folder's meta.json", read, _recognises
+        "sog",
+        ("*.sog", META_FILE),
+        "SOG of PlayCanvas, bundled or as a folder's meta.json",
+        read,
+        _recognises,
     )
 )
 register(
@@ -272,7 +280,7 @@ register(
         ("*.sog",),
         "SOG of PlayCanvas, the smallest; needs splat-transform",
         write,
-        lacking,
+        missing_converter,
         holds_harmonics=True,
     )
 )

@@ -7,14 +7,14 @@ import numpy as np
 from octasplat.engine.colour import rounded_bytes
 from octasplat.engine.errors import SceneFileError
 from octasplat.engine.files.encodings import logits_from_bytes, sh0_from_rgb, unit_quats
-from octasplat.engine.files.options import ExportOptions
+from octasplat.engine.files.export_options import ExportOptions
 from octasplat.engine.files.registry import Exporter, Importer, register
-from octasplat.engine.files.selection import blocks, check_scales, selected
+from octasplat.engine.files.splat_rows import check_scales, iterate_blocks, select_for_export
 from octasplat.engine.gaussians.flattening import GaussianCloud
 from octasplat.engine.gaussians.model import FLAT_SCALE, FlatGaussians
 from octasplat.engine.writing import replacing
 
-SPLAT = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("quat_wxyz", "u1", 4)])
+SPLAT_DTYPE = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("quat_wxyz", "u1", 4)])
 
 
 def read(path: Path) -> GaussianCloud:
@@ -25,11 +25,11 @@ def read(path: Path) -> GaussianCloud:
     """
     try:
         size = path.stat().st_size
-        if size % SPLAT.itemsize:
+        if size % SPLAT_DTYPE.itemsize:
             raise SceneFileError(
                 f"{path}: is no .splat, or is truncated; its {size} bytes are not a multiple of 32."
             )
-        rows = np.fromfile(path, dtype=SPLAT)
+        rows = np.fromfile(path, dtype=SPLAT_DTYPE)
     except OSError as error:
         raise SceneFileError(f"{path}: cannot be read ({error.strerror or error}).") from error
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -50,16 +50,16 @@ def write(gaussians: FlatGaussians, path: Path, options: ExportOptions) -> tuple
         SceneFileError: nothing to write, or values that are not finite.
         OSError: the file cannot be written.
     """
-    gaussians = selected(gaussians, path, options)
+    gaussians = select_for_export(gaussians, path, options)
     check_scales(gaussians, path)
     with replacing(path) as temporary, temporary.open("wb") as handle:
-        for block in blocks(gaussians):
+        for block in iterate_blocks(gaussians):
             handle.write(_rows(block).data)
     return (path,)
 
 
 def _rows(some: FlatGaussians) -> np.ndarray:
-    rows = np.empty(len(some), dtype=SPLAT)
+    rows = np.empty(len(some), dtype=SPLAT_DTYPE)
     rows["mean"] = some.means_world
     rows["scale"][:, 0] = FLAT_SCALE
     rows["scale"][:, 1:] = some.scales

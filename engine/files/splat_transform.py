@@ -9,27 +9,27 @@ from octasplat.engine.errors import SceneFileError
 
 PACKAGE = "@playcanvas/splat-transform"
 PROGRAM = "splat-transform"
-VARIABLE = "OCTASPLAT_SPLAT_TRANSFORM"
+PROGRAM_VARIABLE = "OCTASPLAT_SPLAT_TRANSFORM"
 """Environment variable that names the program where it is not on the PATH."""
-SECONDS = 1800
+TIMEOUT_SECONDS = 1800
 
 
-def converter() -> Path | None:
+def find_converter() -> Path | None:
     """The program, or None where there is none."""
-    named = os.environ.get(VARIABLE)
+    named = os.environ.get(PROGRAM_VARIABLE)
     if named:
         return Path(named) if Path(named).exists() else None
     found = shutil.which(PROGRAM)
     return Path(found) if found else None
 
 
-def lacking() -> str | None:
+def missing_converter() -> str | None:
     """What to do about the program being missing, or None where it is there."""
-    if converter() is not None:
+    if find_converter() is not None:
         return None
     return (
         f"needs the program {PROGRAM}; install node and then it with npm install -g {PACKAGE}, "
-        f"or name it in {VARIABLE}"
+        f"or name it in {PROGRAM_VARIABLE}"
     )
 
 
@@ -44,13 +44,13 @@ def convert(source: Path, target: Path, *options: str) -> None:
     Raises:
         SceneFileError: the program is missing, fails, or writes nothing.
     """
-    program = converter()
+    program = find_converter()
     if program is None:
-        raise SceneFileError(f"{target}: {lacking()}.")
+        raise SceneFileError(f"{target}: {missing_converter()}.")
     command = [str(program), "-q", "-w", "-g", "cpu", *options, str(source.resolve()), str(target.resolve())]
     try:
         done = subprocess.run(  # noqa: S603 - no shell, and the paths are absolute
-            command, capture_output=True, text=True, timeout=SECONDS, check=False
+            command, capture_output=True, text=True, timeout=TIMEOUT_SECONDS, check=False
         )
     except (OSError, subprocess.TimeoutExpired) as error:
         raise SceneFileError(f"{target}: {program.name} could not be run ({error}).") from error

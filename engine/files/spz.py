@@ -10,18 +10,18 @@ from octasplat.engine.errors import SceneFileError
 from octasplat.engine.files.encodings import (
     MAX_SH_DEGREE,
     SQRT_HALF,
-    dropped_harmonics,
+    dropped_sh_message,
     from_smallest_three,
+    half_turn_gaussians,
     half_turn_points,
     half_turn_quats,
     half_turn_sh,
-    half_turned,
     logits_from_bytes,
     smallest_three,
 )
-from octasplat.engine.files.options import ExportOptions
+from octasplat.engine.files.export_options import ExportOptions
 from octasplat.engine.files.registry import Exporter, Importer, register
-from octasplat.engine.files.selection import blocks, selected
+from octasplat.engine.files.splat_rows import iterate_blocks, select_for_export
 from octasplat.engine.files.spz_container import ANTIALIASED, GZIP_MAGIC, MAGIC, SpzFile, read_spz, write_spz
 from octasplat.engine.gaussians.flattening import FLAT_LOG_SCALE, GaussianCloud
 from octasplat.engine.gaussians.model import FlatGaussians
@@ -56,15 +56,15 @@ def read(path: Path) -> GaussianCloud:
     rest = (harmonics.reshape(file.count, -1, 3)[:, : kept - 1].astype(np.float32) - 128.0) / 128.0
     constant = (colours.astype(np.float32) / 255.0 - 0.5) / COLOUR_SCALE
     sh = np.concatenate([constant[:, None, :], rest], axis=1).astype(np.float32)
-    quats = _first_three(rotations) if file.version == 2 else _smallest_three(rotations)
-    notes = [*dropped_harmonics(file.sh_degree)]
+    quats = _decode_xyz(rotations) if file.version == 2 else _decode_smallest_three(rotations)
+    notes = [*dropped_sh_message(file.sh_degree)]
     if file.flags & ANTIALIASED:
         notes.append("The scene was trained with antialiasing, which is not modelled here.")
     return GaussianCloud(
         means_world=half_turn_points(_fixed_point(positions, file.fractional_bits)),
         quats_wxyz=half_turn_quats(quats),
         log_scales=scales.astype(np.float32) / LOG_SCALE_STEPS - LOG_SCALE_OFFSET,
-        thinnest=-LOG_SCALE_OFFSET,
+        min_log_scale=-LOG_SCALE_OFFSET,
         opacity_logits=logits_from_bytes(opacities[:, 0]),
         sh=half_turn_sh(sh),
         notes=tuple(notes),
@@ -79,14 +79,14 @@ def _fixed_point(packed: np.ndarray, fractional_bits: int) -> Float32[np.ndarray
     return (signed / float(1 << fractional_bits)).astype(np.float32)
 
 
-def _first_three(packed: np.ndarray) -> Float32[np.ndarray, "n 4"]:
+def _decode_xyz(packed: np.ndarray) -> Float32[np.ndarray, "n 4"]:
     """Version 2: x, y, z as bytes; w is what is missing to length 1."""
     xyz = packed.astype(np.float64) / 127.5 - 1.0
     w = np.sqrt(np.maximum(0.0, 1.0 - np.sum(xyz**2, axis=1)))
     return np.concatenate([w[:, None], xyz], axis=1).astype(np.float32)
 
 
-def _smallest_three(packed: np.ndarray) -> Float32[np.ndarray, "n 4"]:
+def _decode_smallest_three(packed: np.ndarray) -> Float32[np.ndarray, "n 4"]:
     """Two bits for the place of the largest of x, y, z, w; ten each, the sign first, for the others."""
     words = np.ascontiguousarray(packed).view("<u4")[:, 0]
     fields = np.stack([(words >> shift) & 1023 for shift in (20, 10, 0)], axis=1).astype(np.int64)
@@ -102,11 +102,11 @@ def write(gaussians: FlatGaussians, path: Path, options: ExportOptions) -> tuple
         SceneFileError: nothing to write, values that are not finite, or positions beyond what 24 bits hold.
         OSError: the file cannot be written.
     """
-    scene = selected(gaussians, path, options)
+    scene = select_for_export(gaussians, path, options)
     bits = _fractional_bits(scene, path)
     streams = [bytearray() for _ in range(6)]
-    for block in blocks(scene):
-        for stream, data in zip(streams, _packed(half_turned(block), bits), strict=True):
+    for block in iterate_blocks(scene):
+        for stream, data in zip(streams, _pack_block(half_turn_gaussians(block), bits), strict=True):
             stream += data
     packed = tuple(bytes(stream) for stream in streams)
     file = SpzFile(options.spz_version, len(scene), scene.sh_degree, bits, 0, packed)
@@ -115,16 +115,16 @@ def write(gaussians: FlatGaussians, path: Path, options: ExportOptions) -> tuple
     return (path,)
 
 
-def _packed(scene: FlatGaussians, bits: int) -> tuple[bytes, ...]:
+def _pack_block(scene: FlatGaussians, bits: int) -> tuple[bytes, ...]:
     """The six attributes of a block that is y up."""
     log_scales = np.concatenate([np.full((len(scene), 1), FLAT_LOG_SCALE), scene.log_scales], axis=1)
     return (
-        _packed_positions(scene.means_world.astype(np.float64) * (1 << bits)),
+        _pack_positions(scene.means_world.astype(np.float64) * (1 << bits)),
         rounded_bytes(scene.opacities.astype(np.float64) * 255.0).tobytes(),
         rounded_bytes((scene.sh[:, 0].astype(np.float64) * COLOUR_SCALE + 0.5) * 255.0).tobytes(),
         rounded_bytes((log_scales.astype(np.float64) + LOG_SCALE_OFFSET) * LOG_SCALE_STEPS).tobytes(),
-        _packed_rotations(scene),
-        _packed_harmonics(scene),
+        _pack_rotations(scene),
+        _pack_sh(scene),
     )
 
 
@@ -140,12 +140,12 @@ def _fractional_bits(scene: FlatGaussians, path: Path) -> int:
     return min(max(wanted, FRACTIONAL_BITS), fits, 23)
 
 
-def _packed_positions(steps: Float[np.ndarray, "n 3"]) -> bytes:
+def _pack_positions(steps: Float[np.ndarray, "n 3"]) -> bytes:
     whole = np.ascontiguousarray(np.rint(steps).astype("<i4"))
     return whole.view(np.uint8).reshape(*steps.shape, 4)[:, :, :3].tobytes()
 
 
-def _packed_rotations(scene: FlatGaussians) -> bytes:
+def _pack_rotations(scene: FlatGaussians) -> bytes:
     small, largest = smallest_three(scene.quats_wxyz[:, [1, 2, 3, 0]])
     sizes = np.minimum(np.rint(np.abs(small) / SQRT_HALF * 511.0), 511.0).astype(np.uint32)
     fields = sizes | (np.uint32(512) * (small < 0).astype(np.uint32))
@@ -153,7 +153,7 @@ def _packed_rotations(scene: FlatGaussians) -> bytes:
     return words.astype("<u4").tobytes()
 
 
-def _packed_harmonics(scene: FlatGaussians) -> bytes:
+def _pack_sh(scene: FlatGaussians) -> bytes:
     if scene.sh_degree == 0:
         return b""
     steps = np.full((scene.sh.shape[1] - 1, 1), SH_STEPS[1], dtype=np.float64)

@@ -23,7 +23,7 @@ GZIP_LEVEL, ZSTD_LEVEL = 6, 9
 ANTIALIASED, HAS_EXTENSIONS = 1, 2
 _HEADER = struct.Struct("<4sIIBBBB")
 _HEADER_V4 = struct.Struct("<4sIIBBBBI12x")
-_ENTRY = struct.Struct("<QQ")
+_TOC_ENTRY = struct.Struct("<QQ")
 _GZIP_RATIO = 1040
 """Deflate compresses no better than this, so a header that promises more is wrong."""
 _ZSTD_RATIO = 1 << 17
@@ -98,12 +98,12 @@ def _read_v4(path: Path, data: bytes) -> SpzFile:
     widths = _checked_widths(path, version, degree)
     if stream_count < sum(width > 0 for width in widths):
         raise SceneFileError(f"{path}: is damaged; it has only {stream_count} of its attributes.")
-    offset = contents + stream_count * _ENTRY.size
+    offset = contents + stream_count * _TOC_ENTRY.size
     streams = []
     for number, width in enumerate(widths):
         size, full_size = (0, 0)
         if number < stream_count:
-            size, full_size = _ENTRY.unpack_from(data, contents + number * _ENTRY.size)
+            size, full_size = _TOC_ENTRY.unpack_from(data, contents + number * _TOC_ENTRY.size)
         if full_size != count * width:
             raise SceneFileError(f"{path}: is damaged; attribute {number} does not have {count} items.")
         if offset + size > len(data) or full_size > _ZSTD_RATIO * max(1, size):
@@ -146,5 +146,5 @@ def _write_v4(handle: IO[bytes], file: SpzFile) -> None:
     header = (file.version, file.count, file.sh_degree, file.fractional_bits, file.flags, len(packed))
     handle.write(_HEADER_V4.pack(MAGIC, *header, _HEADER_V4.size))
     for small, stream in zip(packed, streams, strict=True):
-        handle.write(_ENTRY.pack(len(small), len(stream)))
+        handle.write(_TOC_ENTRY.pack(len(small), len(stream)))
     handle.writelines(packed)

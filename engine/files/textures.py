@@ -10,7 +10,7 @@ from jaxtyping import Float32, Float64, UInt8
 
 from octasplat.engine.colour import to_bytes
 
-RAMP_SIDE = 256
+RAMP_SIZE_PX = 256
 
 
 def radial_alpha(size: int, q: float) -> Float64[np.ndarray, "s s"]:
@@ -34,8 +34,8 @@ def grey_png(size: int, q: float) -> bytes:
 
 def material_ramp_png() -> bytes:
     """Metallic in blue along u and roughness in green along v, each step of 8 bits one pixel; red is full."""
-    steps = np.arange(RAMP_SIDE, dtype=np.uint8)
-    pixels = np.full((RAMP_SIDE, RAMP_SIDE, 3), 255, np.uint8)
+    steps = np.arange(RAMP_SIZE_PX, dtype=np.uint8)
+    pixels = np.full((RAMP_SIZE_PX, RAMP_SIZE_PX, 3), 255, np.uint8)
     pixels[..., 1], pixels[..., 2] = steps[:, None], steps
     return _png(pixels, colour_type=2)
 
@@ -45,12 +45,12 @@ def material_ramp_uv(
 ) -> Float32[np.ndarray, "n 2"]:
     """Where the ramp has these values, between its pixels too."""
     both = np.clip(np.concatenate([metallic, roughness], axis=1), 0.0, 1.0)
-    return ((both * (RAMP_SIDE - 1) + 0.5) / RAMP_SIDE).astype(np.float32)
+    return ((both * (RAMP_SIZE_PX - 1) + 0.5) / RAMP_SIZE_PX).astype(np.float32)
 
 
 def png_bytes(rgb_srgb: UInt8[np.ndarray, "h w 3"]) -> bytes:
     """An image as it stands in a PNG file."""
-    from octasplat.engine.render.images import (
+    from octasplat.engine.render.image_files import (
         write_png,  # loads the image library, which the front end has not
     )
 

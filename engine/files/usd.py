@@ -16,11 +16,11 @@ import numpy as np
 
 from octasplat.engine.colour import srgb_to_linear
 from octasplat.engine.errors import SceneFileError
-from octasplat.engine.files.encodings import half_turned, unit_quats
-from octasplat.engine.files.options import ExportOptions
+from octasplat.engine.files.encodings import half_turn_gaussians, unit_quats
+from octasplat.engine.files.export_options import ExportOptions
 from octasplat.engine.files.registry import Exporter, register
-from octasplat.engine.files.selection import check_scales, selected
-from octasplat.engine.gaussians.flattening import turned
+from octasplat.engine.files.splat_rows import check_scales, select_for_export
+from octasplat.engine.gaussians.flattening import rotate_axis_to_first
 from octasplat.engine.gaussians.model import FLAT_SCALE, FlatGaussians
 from octasplat.engine.writing import replacing
 
@@ -44,7 +44,7 @@ def write(gaussians: FlatGaussians, path: Path, options: ExportOptions) -> tuple
         SceneFileError: usd-core is missing or too old, nothing to write, or values that are not finite.
         OSError: the file cannot be written.
     """
-    scene = half_turned(selected(gaussians, path, options))
+    scene = half_turn_gaussians(select_for_export(gaussians, path, options))
     check_scales(scene, path)
     pxr = _usd(path)
     suffix = ".usdc" if path.suffix.lower() in (".usdz", ".usd") else path.suffix.lower()
@@ -60,7 +60,7 @@ def write(gaussians: FlatGaussians, path: Path, options: ExportOptions) -> tuple
     return (path,)
 
 
-def lacking() -> str | None:
+def missing_usd() -> str | None:
     """What is missing to write USD, without loading it; whether an old copy will do shows when it is used."""
     if importlib.util.find_spec("pxr") is None:
         return "needs the package usd-core; install it with pip install 'usd-core>=26.5'"
@@ -76,7 +76,7 @@ def _usd(path: Path) -> dict[str, ModuleType]:
     try:
         from pxr import Sdf, Usd, UsdGeom, UsdUtils, UsdVol, Vt
     except ImportError as error:
-        raise SceneFileError(f"{path}: {lacking() or error}.") from error
+        raise SceneFileError(f"{path}: {missing_usd() or error}.") from error
     if not hasattr(UsdVol, "ParticleField"):
         raise SceneFileError(f"{path}: this usd-core has no ParticleField; install usd-core 26.5 or later.")
     return {
@@ -104,7 +104,7 @@ def _write_stage(pxr: dict[str, ModuleType], scene: FlatGaussians, layer: Path) 
         prim.GetAttribute(name).Set(values)
 
     axis_z = np.ones(len(scene), dtype=np.int64)  # the columns of R become r2, r3, r1
-    quats = unit_quats(turned(scene.quats_wxyz, axis_z)).astype(np.float32)
+    quats = unit_quats(rotate_axis_to_first(scene.quats_wxyz, axis_z)).astype(np.float32)
     scales = np.concatenate([scene.scales, np.full((len(scene), 1), FLAT_SCALE, np.float32)], axis=1)
     attribute("positions", vt.Vec3fArray.FromNumpy(np.ascontiguousarray(scene.means_world)))
     # usd-core keeps quaternions in memory as x, y, z, w.
@@ -135,7 +135,7 @@ register(
         ("*.usdz", "*.usdc", "*.usda", "*.usd"),
         "USD ParticleField with the surflet kernel; needs usd-core",
         write,
-        lacking,
+        missing_usd,
         holds_channels=True,
         holds_harmonics=True,
     )

@@ -14,9 +14,9 @@ from jaxtyping import Float32
 
 from octasplat.engine.errors import ConfigError
 
-FILL = 0.0
+FILL_VALUE = 0.0
 """What Gaussians have that come to a scene from one without the channel."""
-RESERVED = re.compile(
+RESERVED_COLUMNS = re.compile(
     r"x|y|z|n[xyz]|s|t|red|green|blue|alpha|opacity|(f_dc|f_rest|scale|rot)(_\d+)?|packed_.*"
     r"|gid|corner|radius|displaycolor|displayopacity",
     re.IGNORECASE,
@@ -49,7 +49,7 @@ class Channels(Mapping[str, np.ndarray]):
                 raise ValueError(f"channel '{name}' should be float32 of shape (n, f)")
         if len({len(array) for array in self._arrays.values()}) > 1:
             raise ValueError("channels should have a row for every Gaussian")
-        check_names(self.widths)
+        check_channel_names(self.widths)
 
     def __getitem__(self, name: str) -> Float32[np.ndarray, "n f"]:
         return self._arrays[name]
@@ -72,19 +72,19 @@ class Channels(Mapping[str, np.ndarray]):
         """The same channels with ``function`` applied to each array."""
         return Channels({name: function(array) for name, array in self._arrays.items()})
 
-    def completed(self, widths: Mapping[str, int], count: int) -> "Channels":
-        """The channels of ``widths``, in that order, of ``count`` Gaussians; what is missing is ``FILL``."""
+    def with_filled(self, widths: Mapping[str, int], count: int) -> "Channels":
+        """The channels of ``widths``, in that order, of ``count`` Gaussians; what is missing is ``FILL_VALUE``."""
         return Channels(
             {
                 name: self._arrays[name]
                 if name in self._arrays
-                else np.full((count, width), FILL, np.float32)
+                else np.full((count, width), FILL_VALUE, np.float32)
                 for name, width in widths.items()
             }
         )
 
 
-def check_rows(channels: Channels, count: int) -> None:
+def check_row_count(channels: Channels, count: int) -> None:
     """Make sure that channels have ``count`` rows.
 
     Raises:
@@ -95,7 +95,7 @@ def check_rows(channels: Channels, count: int) -> None:
             raise ValueError(f"channel '{name}' has {len(array)} rows for {count} Gaussians")
 
 
-def common_widths(sets: Iterable[Channels]) -> dict[str, int]:
+def merge_widths(sets: Iterable[Channels]) -> dict[str, int]:
     """The channels that any of ``sets`` has, with their widths.
 
     Raises:
@@ -112,7 +112,7 @@ def common_widths(sets: Iterable[Channels]) -> dict[str, int]:
     return widths
 
 
-def stacked(channels: Channels, names: Sequence[str] | None = None) -> Float32[np.ndarray, "n f"]:
+def stack_channels(channels: Channels, names: Sequence[str] | None = None) -> Float32[np.ndarray, "n f"]:
     """Channels side by side, as a tracer takes its features; :func:`unstacked` is the way back.
 
     Args:
@@ -123,7 +123,7 @@ def stacked(channels: Channels, names: Sequence[str] | None = None) -> Float32[n
 
 
 def unstacked(features: Float32[np.ndarray, "n f"], widths: Mapping[str, int]) -> Channels:
-    """The channels of :func:`stacked`, of Gaussians or of rays, copied.
+    """The channels of :func:`stack_channels`, of Gaussians or of rays, copied.
 
     Raises:
         ValueError: the widths do not add up to the number of features.
@@ -144,7 +144,7 @@ def column_names(name: str, width: int) -> tuple[str, ...]:
     return (name,) if width == 1 else tuple(f"{name}_{place}" for place in range(width))
 
 
-def grouped(columns: Iterable[str]) -> dict[str, tuple[str, ...]]:
+def group_columns(columns: Iterable[str]) -> dict[str, tuple[str, ...]]:
     """The way back: names that are numbered from 0 without a gap, two at least, are one channel."""
     found = list(columns)
     numbered: dict[str, set[int]] = {}
@@ -162,12 +162,14 @@ def grouped(columns: Iterable[str]) -> dict[str, tuple[str, ...]]:
     return groups
 
 
-def is_usable(name: str, columns: Iterable[str]) -> bool:
+def is_valid_channel_name(name: str, columns: Iterable[str]) -> bool:
     """Whether a channel may have this name and these columns, as far as they alone are concerned."""
-    return bool(_NAME.fullmatch(name)) and not any(RESERVED.fullmatch(text) for text in (name, *columns))
+    return bool(_NAME.fullmatch(name)) and not any(
+        RESERVED_COLUMNS.fullmatch(text) for text in (name, *columns)
+    )
 
 
-def check_names(widths: Mapping[str, int]) -> None:
+def check_channel_names(widths: Mapping[str, int]) -> None:
     """Make sure that files can hold these channels apart, from each other and from what else they hold.
 
     Raises:
@@ -177,10 +179,10 @@ def check_names(widths: Mapping[str, int]) -> None:
     for name, own in columns.items():
         if not _NAME.fullmatch(name):
             raise ConfigError(f"'{name}' cannot name a channel; use letters, digits and _, a letter first.")
-        if not is_usable(name, own):
+        if not is_valid_channel_name(name, own):
             raise ConfigError(f"'{name}' cannot name a channel, as files use this name for something else.")
     every = [column for own in columns.values() for column in own]
-    if len({column.lower() for column in every}) < len(every) or grouped(every) != columns:
+    if len({column.lower() for column in every}) < len(every) or group_columns(every) != columns:
         raise ConfigError(
             f"The channels {', '.join(widths)} cannot be told apart in a file; choose names that do not end "
             "in _ and a number, and that differ in more than upper and lower case."

@@ -8,18 +8,18 @@ import numpy as np
 from jaxtyping import Bool, Float32, Int
 
 from octasplat.engine.errors import SceneFileError
-from octasplat.engine.gaussians.channels import Channels, check_rows
+from octasplat.engine.gaussians.channels import Channels, check_row_count
 from octasplat.engine.gaussians.model import FLAT_SCALE, FlatGaussians
 from octasplat.engine.gaussians.rows import select_rows
 
 FLAT_LOG_SCALE = np.float32(np.log(FLAT_SCALE))
-ROUNDING = np.float32(1e-5)
+LOG_SCALE_TOLERANCE = np.float32(1e-5)
 """The flat ln scale may be off by this in formats that hold the scale itself."""
-LARGEST_LOGIT = np.float32(16.0)
+MAX_LOGIT = np.float32(16.0)
 """Stands for an infinite logit, which converters write for opacity 1; its sigmoid is 1 - 1e-7."""
-THICK = 0.5
+MAX_THICKNESS_RATIO = 0.5
 """Gaussians whose thickness is more than this share of their next extent are no surfaces."""
-_CYCLIC_TURNS = np.array([[1, 0, 0, 0], [0.5, 0.5, 0.5, 0.5], [0.5, -0.5, -0.5, -0.5]], dtype=np.float32)
+_CYCLIC_ROTATIONS = np.array([[1, 0, 0, 0], [0.5, 0.5, 0.5, 0.5], [0.5, -0.5, -0.5, -0.5]], dtype=np.float32)
 """Quaternions of P_k, whose columns are the axes k, k+1, k+2 (mod 3): they turn axis k into the first."""
 
 
@@ -36,7 +36,7 @@ class GaussianCloud:
             :class:`octasplat.engine.gaussians.model.FlatGaussians`.
         notes: what the reader of the file left out or had to assume, one sentence each.
         channels: what else is known of each, by name.
-        thinnest: the smallest ln scale that the format can hold; what is no thicker counts as flat.
+        min_log_scale: the smallest ln scale that the format can hold; what is no thicker counts as flat.
         normal_axis: the axis that is the normal, whatever the scales, where the format says so. None: the
             smallest of three scales, or axis 0 where there are two.
     """
@@ -48,12 +48,12 @@ class GaussianCloud:
     sh: Float32[np.ndarray, "n k 3"]
     notes: tuple[str, ...] = ()
     channels: Channels = field(default_factory=Channels)
-    thinnest: float = float(FLAT_LOG_SCALE)
+    min_log_scale: float = float(FLAT_LOG_SCALE)
     normal_axis: Literal[0, 2] | None = None
 
     def __post_init__(self) -> None:
         """Make sure that channels have as many rows as there are Gaussians."""
-        check_rows(self.channels, len(self.means_world))
+        check_row_count(self.channels, len(self.means_world))
 
 
 @dataclass(frozen=True)
@@ -69,7 +69,7 @@ class ImportReport:
             needle, no surface at all; 0 if none was flattened).
         max_thickness: the largest such ratio.
         saturated: opacities of exactly 0 or 1, whose infinite logits became -16 or 16.
-        thick: Gaussians whose ratio is more than ``THICK``, which a flat one cannot stand for.
+        thick: Gaussians whose ratio is more than ``MAX_THICKNESS_RATIO``, which a flat one cannot stand for.
         dropped: Gaussians left out because a value was not finite or a rotation had no length.
         notes: what else the reader left out or assumed, one sentence each.
     """
@@ -107,19 +107,19 @@ def flatten(
     if total == 0:
         raise SceneFileError(f"{path}: holds no Gaussians.")
     infinite = np.isinf(cloud.opacity_logits)
-    logits = np.where(infinite, np.copysign(LARGEST_LOGIT, cloud.opacity_logits), cloud.opacity_logits)
+    logits = np.where(infinite, np.copysign(MAX_LOGIT, cloud.opacity_logits), cloud.opacity_logits)
     cloud = replace(cloud, opacity_logits=logits.astype(np.float32))
-    valid = _valid(cloud, path, drop_invalid)
+    valid = _valid_mask(cloud, path, drop_invalid)
     if not valid.all():
         cloud = select_rows(cloud, valid)
     scale_count = cloud.log_scales.shape[1]
     if scale_count == 3 and cloud.normal_axis is None:
-        quats, in_plane, thickness = _flattened(
-            cloud.quats_wxyz, cloud.log_scales, np.float32(max(cloud.thinnest, float(FLAT_LOG_SCALE)))
+        quats, in_plane, thickness = _flatten_smallest_axis(
+            cloud.quats_wxyz, cloud.log_scales, np.float32(max(cloud.min_log_scale, float(FLAT_LOG_SCALE)))
         )
     else:
         normal = cloud.normal_axis or 0
-        quats = turned(cloud.quats_wxyz, np.full(len(cloud.means_world), normal))
+        quats = rotate_axis_to_first(cloud.quats_wxyz, np.full(len(cloud.means_world), normal))
         in_plane, thickness = cloud.log_scales, np.empty(0, np.float32)
         if scale_count == 3:
             in_plane = np.ascontiguousarray(in_plane[:, [(normal + 1) % 3, (normal + 2) % 3]])
@@ -134,14 +134,14 @@ def flatten(
         median_thickness=float(np.median(thickness)) if len(thickness) else 0.0,
         max_thickness=float(thickness.max()) if len(thickness) else 0.0,
         saturated=int(infinite[valid].sum()),
-        thick=int((thickness > THICK).sum()),
+        thick=int((thickness > MAX_THICKNESS_RATIO).sum()),
         dropped=total - len(gaussians),
         notes=cloud.notes,
     )
     return gaussians, report
 
 
-def _valid(cloud: GaussianCloud, path: Path, drop_invalid: bool) -> Bool[np.ndarray, " n"]:
+def _valid_mask(cloud: GaussianCloud, path: Path, drop_invalid: bool) -> Bool[np.ndarray, " n"]:
     """Which Gaussians can be used; raises for the others unless they may be dropped."""
     scales = cloud.log_scales
     ordered = np.sort(scales, axis=1)  # not-a-number comes last
@@ -175,30 +175,32 @@ def _valid(cloud: GaussianCloud, path: Path, drop_invalid: bool) -> Bool[np.ndar
     return valid
 
 
-def _flattened(
-    quats_wxyz: Float32[np.ndarray, "n 4"], log_scales: Float32[np.ndarray, "n 3"], flat: np.float32
+def _flatten_smallest_axis(
+    quats_wxyz: Float32[np.ndarray, "n 4"], log_scales: Float32[np.ndarray, "n 3"], flat_log_scale: np.float32
 ) -> tuple[Float32[np.ndarray, "n 4"], Float32[np.ndarray, "n 2"], Float32[np.ndarray, " m"]]:
     """Make the smallest axis the normal; also the thickness ratio of those that were not flat already.
 
     Axis 0 wins ties, and always where it holds the flat scale, so that our own files stay as they are.
     """
-    own = np.abs(log_scales[:, 0] - flat) <= ROUNDING
+    own = np.abs(log_scales[:, 0] - flat_log_scale) <= LOG_SCALE_TOLERANCE
     axis = np.where(own, 0, np.argmin(log_scales, axis=1))
     order = (axis[:, None] + np.arange(3)) % 3
     ordered = np.take_along_axis(log_scales, order, axis=1)
     in_plane = np.ascontiguousarray(ordered[:, 1:])
-    thick: Bool[np.ndarray, " n"] = ordered[:, 0] > flat + ROUNDING
+    thick: Bool[np.ndarray, " n"] = ordered[:, 0] > flat_log_scale + LOG_SCALE_TOLERANCE
     ratios = np.exp(ordered[thick, 0] - in_plane[thick].min(axis=1))
-    return turned(quats_wxyz, axis), in_plane, ratios
+    return rotate_axis_to_first(quats_wxyz, axis), in_plane, ratios
 
 
-def turned(quats_wxyz: Float32[np.ndarray, "n 4"], axis: Int[np.ndarray, " n"]) -> Float32[np.ndarray, "n 4"]:
+def rotate_axis_to_first(
+    quats_wxyz: Float32[np.ndarray, "n 4"], axis: Int[np.ndarray, " n"]
+) -> Float32[np.ndarray, "n 4"]:
     """Quaternions of R P_axis, whose first column is column ``axis`` of R and the others follow cyclically.
 
     Those of axis 0 keep every bit, and no length changes.
     """
     w, x, y, z = quats_wxyz.T
-    a, b, c, d = _CYCLIC_TURNS[axis].T
+    a, b, c, d = _CYCLIC_ROTATIONS[axis].T
     product = np.stack(
         [
             w * a - x * b - y * c - z * d,

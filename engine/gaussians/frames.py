@@ -22,7 +22,7 @@ def rotation_matrices(quats_wxyz: Float[np.ndarray, "n 4"]) -> Float[np.ndarray,
     return rows.reshape(-1, 3, 3).astype(quats_wxyz.dtype)
 
 
-def quaternions(rotations: Float[np.ndarray, "n 3 3"]) -> Float[np.ndarray, "n 4"]:
+def quaternions_from_matrices(rotations: Float[np.ndarray, "n 3 3"]) -> Float[np.ndarray, "n 4"]:
     """Unit quaternions (w, x, y, z) with w >= 0 of proper rotation matrices.
 
     The largest of the four components is found first and the others follow from it, which is stable for

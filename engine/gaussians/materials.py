@@ -25,7 +25,7 @@ is perceptual: GGX's alpha is its square.
 """
 AMBIENT = "ambient"
 """A channel beside them, which follows from the geometry: share of the light from all around that arrives."""
-BOUNCED = "bounced"
+DIFFUSE_INTERREFLECTION = "bounced"
 """A channel of width 3: irradiance over pi that other surfaces send, in the light a scene was learnt in."""
 DIELECTRIC_F0 = 0.04
 """What a surface that is no metal reflects head-on, that of an index of refraction of 1.5."""
@@ -69,7 +69,7 @@ def split_materials(features: Float[np.ndarray, "n 5"]) -> Channels:
     )
 
 
-def reflective_share(gaussians: FlatGaussians) -> float:
+def reflective_fraction(gaussians: FlatGaussians) -> float:
     """Share of a scene's surface, by area times opacity, that is metal which shows its surroundings.
 
     Where there is next to none, nothing says how bright the environment is, nor what is metal.
@@ -80,7 +80,7 @@ def reflective_share(gaussians: FlatGaussians) -> float:
     return float(area[shows].sum(dtype=np.float64)) / total if total > 0 else 0.0
 
 
-def with_room_for_bounced(gaussians: FlatGaussians) -> FlatGaussians:
+def with_interreflection_channel(gaussians: FlatGaussians) -> FlatGaussians:
     """The same scene with channels of its own for the light that surfaces send each other, black at first.
 
     A scene whose ambient visibility is not known stays without, as nothing says where that light arrives.
@@ -89,4 +89,4 @@ def with_room_for_bounced(gaussians: FlatGaussians) -> FlatGaussians:
         return gaussians
     nothing = np.zeros((len(gaussians), 3), np.float32)
     channels = {name: values.copy() for name, values in gaussians.channels.items()}
-    return gaussians.with_channels({**channels, BOUNCED: nothing})
+    return gaussians.with_channels({**channels, DIFFUSE_INTERREFLECTION: nothing})

@@ -6,9 +6,16 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from jaxtyping import Float32
 
-from octasplat.engine.gaussians.channels import Channels, check_rows
+from octasplat.engine.gaussians.channels import Channels, check_row_count
 from octasplat.engine.gaussians.frames import rotation_matrices
-from octasplat.engine.gaussians.rows import Index, join_rows, map_rows, put_rows, row_arrays, select_rows
+from octasplat.engine.gaussians.rows import (
+    RowIndex,
+    concatenate_rows,
+    map_rows,
+    overwrite_rows,
+    row_arrays,
+    select_rows,
+)
 
 FLAT_SCALE = 1e-5
 """Standard deviation along the normal, s1 = eps of the paper, in world units."""
@@ -41,7 +48,7 @@ class FlatGaussians:
 
     def __post_init__(self) -> None:
         """Make sure that channels have as many rows as there are Gaussians."""
-        check_rows(self.channels, len(self))
+        check_row_count(self.channels, len(self))
 
     def __len__(self) -> int:
         return len(self.means_world)
@@ -72,7 +79,7 @@ class FlatGaussians:
         """Colour of the constant harmonic alone, 1/2 + C0 sh[0], clipped below at 0; display values."""
         return np.maximum(0.5 + np.float32(SH_C0) * self.sh[:, 0], 0.0).astype(np.float32)
 
-    def select(self, index: Index) -> "FlatGaussians":
+    def select(self, index: RowIndex) -> "FlatGaussians":
         """The Gaussians at ``index`` (integers, a mask or a slice), copied."""
         return select_rows(self, index)
 
@@ -80,11 +87,11 @@ class FlatGaussians:
         """The Gaussians of a slice, not copied."""
         return map_rows(self, lambda array: array[part])
 
-    def put(self, index: Index, others: "FlatGaussians") -> None:
+    def put(self, index: RowIndex, others: "FlatGaussians") -> None:
         """Overwrite the Gaussians at ``index`` by ``others``, in place."""
-        put_rows(self, index, others)
+        overwrite_rows(self, index, others)
 
-    def bare(self) -> "FlatGaussians":
+    def with_base_color_only(self) -> "FlatGaussians":
         """The same Gaussians, not copied, with the constant colour only and no channels."""
         return replace(self, sh=self.sh[:, :1], channels=Channels())
 
@@ -115,4 +122,4 @@ class FlatGaussians:
 
 def concatenate(parts: list[FlatGaussians]) -> FlatGaussians:
     """All Gaussians of ``parts``, in order; the parts share their harmonics' degree and their channels."""
-    return join_rows(parts)
+    return concatenate_rows(parts)

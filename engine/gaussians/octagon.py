@@ -6,7 +6,7 @@
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int
 
-from octasplat.engine.gaussians.frames import quaternions
+from octasplat.engine.gaussians.frames import quaternions_from_matrices
 from octasplat.engine.gaussians.model import FlatGaussians
 
 SIDES = 8
@@ -16,7 +16,7 @@ CHI2_2_99 = 9.210340371976184
 """Quantile 0.99 with 2 degrees of freedom, which a flat Gaussian really has: its rim lies at alpha = 0.01."""
 APOTHEM = float(np.cos(np.pi / SIDES))
 """Inner radius of a regular octagon whose corners lie on the unit circle."""
-FAN = np.array([[0, k, k + 1] for k in range(1, SIDES - 1)], dtype=np.int64)
+FAN_TRIANGLES = np.array([[0, k, k + 1] for k in range(1, SIDES - 1)], dtype=np.int64)
 """The six triangles of one octagon, as corner numbers."""
 
 
@@ -52,7 +52,7 @@ def octagon_corners_world(
 
 def octagon_triangles(count: int) -> Int[np.ndarray, "m 3"]:
     """Vertex indices of the fan triangles (0,1,2)...(0,6,7) of ``count`` octagons, one after another."""
-    return (np.arange(count)[:, None, None] * SIDES + FAN).reshape(-1, 3)
+    return (np.arange(count)[:, None, None] * SIDES + FAN_TRIANGLES).reshape(-1, 3)
 
 
 def frames_from_octagons(
@@ -75,8 +75,8 @@ def frames_from_octagons(
     with np.errstate(invalid="ignore", over="ignore"):
         means = (p[:, 2] + p[:, 6]) / 2.0
         legs = np.stack([p[:, 0] - means, p[:, 2] - means], axis=1)
-    rounding = coordinate_rounding(corners_world)
-    quats, lengths, good = frames_from_legs(legs, rounding)
+    rounding = coordinate_rounding_error(corners_world)
+    quats, lengths, good = frames_from_semi_axes(legs, rounding)
     good &= radius > 0
     quats[~good] = (1.0, 0.0, 0.0, 0.0)
     log_scales = np.log(np.where(good[:, None], lengths / np.where(good, radius, 1.0)[:, None], 1.0))
@@ -84,22 +84,22 @@ def frames_from_octagons(
     return means.astype(dtype), quats.astype(dtype), log_scales.astype(dtype), good
 
 
-def coordinate_rounding(points_world: Float[np.ndarray, "n k 3"]) -> Float[np.ndarray, " n"]:
+def coordinate_rounding_error(points_world: Float[np.ndarray, "n k 3"]) -> Float[np.ndarray, " n"]:
     """Length by which the difference of two of a row's points may be off, as coordinates are rounded."""
     largest = np.abs(points_world.astype(np.float64)).max(axis=(1, 2))
     return 2.0 * float(np.finfo(points_world.dtype).eps) * largest
 
 
-def frames_from_legs(
-    legs_world: Float[np.ndarray, "n 2 3"], rounding: Float[np.ndarray, " n"]
+def frames_from_semi_axes(
+    semi_axes_world: Float[np.ndarray, "n 2 3"], rounding: Float[np.ndarray, " n"]
 ) -> tuple[Float[np.ndarray, "n 4"], Float[np.ndarray, "n 2"], Bool[np.ndarray, " n"]]:
     """Quaternions and lengths of in-plane legs, the second leg made orthogonal to the first (Gram-Schmidt).
 
     The mask is False, the rotation the identity and the lengths 1 where a leg is not finite or not longer
     than ``rounding``.
     """
-    finite = np.isfinite(legs_world).all(axis=(1, 2)) & np.isfinite(rounding)
-    leg2, leg3 = np.where(finite[:, None, None], legs_world, 0.0).transpose(1, 0, 2)
+    finite = np.isfinite(semi_axes_world).all(axis=(1, 2)) & np.isfinite(rounding)
+    leg2, leg3 = np.where(finite[:, None, None], semi_axes_world, 0.0).transpose(1, 0, 2)
     length2 = np.linalg.norm(leg2, axis=-1)
     good = finite & (length2 > rounding)
     r2 = np.where(good[:, None], leg2, (1.0, 0.0, 0.0)) / np.where(good, length2, 1.0)[:, None]
@@ -112,4 +112,4 @@ def frames_from_legs(
     rotations = np.stack([np.cross(r2, r3), r2, r3], axis=-1)
     rotations[~good] = np.eye(3)
     lengths = np.where(good[:, None], np.stack([length2, length3], axis=-1), 1.0)
-    return quaternions(rotations), lengths, good
+    return quaternions_from_matrices(rotations), lengths, good

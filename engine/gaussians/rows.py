@@ -12,20 +12,20 @@ import numpy as np
 
 from octasplat.engine.gaussians.channels import Channels
 
-Index = np.ndarray | slice
+RowIndex = np.ndarray | slice
 
 
 @runtime_checkable
-class Table(Protocol):
+class RowTable(Protocol):
     """Any dataclass."""
 
     __dataclass_fields__: ClassVar[dict[str, Field[Any]]]
 
 
-T = TypeVar("T", bound=Table)
+TableT = TypeVar("TableT", bound=RowTable)
 
 
-def row_arrays(table: Table) -> dict[str, np.ndarray]:
+def row_arrays(table: RowTable) -> dict[str, np.ndarray]:
     """Every array of a table by the name of its field; a channel is called ``channels.<name>``."""
     arrays: dict[str, np.ndarray] = {}
     for field in fields(table):
@@ -37,7 +37,7 @@ def row_arrays(table: Table) -> dict[str, np.ndarray]:
     return arrays
 
 
-def from_row_arrays(kind: Callable[..., T], arrays: Mapping[str, np.ndarray]) -> T:
+def from_row_arrays(kind: Callable[..., TableT], arrays: Mapping[str, np.ndarray]) -> TableT:
     """A table made of the arrays that :func:`row_arrays` gave; everything else has its default."""
     values: dict[str, Any] = {}
     channels: dict[str, dict[str, np.ndarray]] = {}
@@ -50,7 +50,7 @@ def from_row_arrays(kind: Callable[..., T], arrays: Mapping[str, np.ndarray]) ->
     return kind(**values, **{field: Channels(named) for field, named in channels.items()})
 
 
-def map_rows(table: T, function: Callable[[np.ndarray], np.ndarray]) -> T:
+def map_rows(table: TableT, function: Callable[[np.ndarray], np.ndarray]) -> TableT:
     """The table with ``function`` applied to each array; what has no rows is kept."""
     changes: dict[str, Any] = {}
     for field in fields(table):
@@ -62,31 +62,31 @@ def map_rows(table: T, function: Callable[[np.ndarray], np.ndarray]) -> T:
     return replace(table, **changes)
 
 
-def select_rows(table: T, index: Index) -> T:
+def select_rows(table: TableT, index: RowIndex) -> TableT:
     """The rows at ``index`` (integers, a mask or a slice), copied."""
     return map_rows(table, lambda array: array[index].copy())
 
 
-def put_rows(table: Table, index: Index, other: Table) -> None:
+def overwrite_rows(table: RowTable, index: RowIndex, other: RowTable) -> None:
     """Overwrite the rows at ``index`` by all rows of ``other``, in place.
 
     Raises:
         ValueError: the tables do not have the same arrays.
     """
     arrays, values = row_arrays(table), row_arrays(other)
-    _check_alike([arrays, values])
+    _check_same_arrays([arrays, values])
     for name, array in arrays.items():
         array[index] = values[name]
 
 
-def join_rows(parts: Sequence[T]) -> T:
+def concatenate_rows(parts: Sequence[TableT]) -> TableT:
     """All rows of ``parts``, in order; what has no rows is taken from the first.
 
     Raises:
         ValueError: the parts do not have the same arrays.
     """
     every = [row_arrays(part) for part in parts]
-    _check_alike(every)
+    _check_same_arrays(every)
     joined = {name: np.concatenate([arrays[name] for arrays in every]) for name in every[0]}
     whole = from_row_arrays(type(parts[0]), joined)
     others = {
@@ -97,7 +97,7 @@ def join_rows(parts: Sequence[T]) -> T:
     return replace(whole, **others)
 
 
-def _check_alike(every: Sequence[Mapping[str, np.ndarray]]) -> None:
+def _check_same_arrays(every: Sequence[Mapping[str, np.ndarray]]) -> None:
     for arrays in every[1:]:
         if arrays.keys() != every[0].keys():
             odd = ", ".join(sorted(arrays.keys() ^ every[0].keys()))

@@ -4,7 +4,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from octasplat.engine.gaussians.model import FlatGaussians
-from octasplat.engine.gaussians.octagon import coordinate_rounding, frames_from_legs
+from octasplat.engine.gaussians.octagon import coordinate_rounding_error, frames_from_semi_axes
 
 
 def triangles_world(gaussians: FlatGaussians) -> Float[np.ndarray, "n 3 3"]:
@@ -31,6 +31,6 @@ def frames_from_triangles(
     vertices = vertices_world.astype(np.float64)
     with np.errstate(invalid="ignore", over="ignore"):
         legs = vertices[:, 1:] - vertices[:, :1]
-    quats, lengths, good = frames_from_legs(legs, coordinate_rounding(vertices_world))
+    quats, lengths, good = frames_from_semi_axes(legs, coordinate_rounding_error(vertices_world))
     dtype = vertices_world.dtype
     return vertices_world[:, 0].copy(), quats.astype(dtype), np.log(lengths).astype(dtype), good

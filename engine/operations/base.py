@@ -103,7 +103,7 @@ OptionsT = TypeVar("OptionsT", bound=Options)
 ModelT = TypeVar("ModelT", bound=BaseModel)
 
 
-def never() -> bool:
+def never_stop() -> bool:
     """Return False: nobody asks to stop."""
     return False
 
@@ -118,7 +118,7 @@ class Run(Protocol[RequestT_contra, ResultT_co]):
         /,
         *,
         progress: Listener = ignore,
-        should_stop: Callable[[], bool] = never,
+        should_stop: Callable[[], bool] = never_stop,
         threads: int = 0,
     ) -> ResultT_co:
         """Do what ``request`` says.
@@ -170,11 +170,11 @@ def options_of(model: type[OptionsT], request: Options) -> OptionsT:
     return options
 
 
-class ContradictoryRequest(ConfigError):
+class ContradictoryRequestError(ConfigError):
     """What is asked for is not complete, or contradicts itself."""
 
 
-def build(
+def build_request(
     model: type[ModelT], values: Mapping[str, Any], place: Callable[[str], str] = lambda path: path
 ) -> ModelT:
     """Return the options or request with these values; None stands for the default.
@@ -192,18 +192,18 @@ def build(
         return model.model_validate({name: value for name, value in values.items() if value is not None})
     except ValidationError as error:
         of_all = not error.errors()[0]["loc"]
-        raise (ContradictoryRequest if of_all else ConfigError)(first_complaint(error, place)) from None
+        raise (ContradictoryRequestError if of_all else ConfigError)(first_error(error, place)) from None
 
 
-def first_complaint(error: ValidationError, place: Callable[[str], str] = lambda path: path) -> str:
+def first_error(error: ValidationError, place: Callable[[str], str] = lambda path: path) -> str:
     """Return the first complaint of a validation as one sentence that names the field."""
     first = error.errors()[0]
     path = ".".join(str(part) for part in first["loc"])
-    message = complaint(first["msg"], place)
+    message = error_text(first["msg"], place)
     return f"{place(path)}: {message}." if path else f"{message}."
 
 
-def complaint(message: str, place: Callable[[str], str] = lambda path: path) -> str:
+def error_text(message: str, place: Callable[[str], str] = lambda path: path) -> str:
     """Return pydantic's message as it was raised by a validator, without a full stop.
 
     Args:
@@ -214,14 +214,14 @@ def complaint(message: str, place: Callable[[str], str] = lambda path: path) -> 
     return re.sub(r"`([\w.]+)`", lambda match: place(match[1]), told)
 
 
-def warn(progress: Listener, message: str) -> None:
+def emit_warning(progress: Listener, message: str) -> None:
     """Tell a warning: something that the user should know; the work goes on."""
     progress(Warned(message))
 
 
 __all__ = [
     "CHANGED_SCENE",
-    "ContradictoryRequest",
+    "ContradictoryRequestError",
     "Event",
     "Listener",
     "Operation",
@@ -235,12 +235,12 @@ __all__ = [
     "ScenesWritten",
     "SourceRequest",
     "WritingRequest",
-    "build",
-    "complaint",
-    "first_complaint",
+    "build_request",
+    "emit_warning",
+    "error_text",
+    "first_error",
     "ignore",
-    "never",
+    "never_stop",
     "options_of",
     "stop_if",
-    "warn",
 ]

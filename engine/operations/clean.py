@@ -7,7 +7,7 @@ from typing import Annotated, ClassVar
 from pydantic import Field, model_validator
 
 from octasplat.engine import renamed_settings
-from octasplat.engine.edit.choices import Cleaning
+from octasplat.engine.edit.edit_options import CleanupOptions
 from octasplat.engine.errors import ConfigError
 from octasplat.engine.events import Listener, ignore
 from octasplat.engine.fields import OUTPUT_FLAGS, Spelling
@@ -17,13 +17,13 @@ from octasplat.engine.operations.base import (
     Options,
     ScenesWritten,
     SourceRequest,
-    never,
+    never_stop,
     options_of,
     stop_if,
 )
 
 
-class CleanOptions(Cleaning, Options):
+class CleanOptions(CleanupOptions, Options):
     """Which Gaussians to remove: the faint, the too small or large, floaters, and those before a camera."""
 
     former_names: ClassVar[renamed_settings.FormerNames] = renamed_settings.CLEAN
@@ -81,7 +81,7 @@ def run(
     request: CleanRequest,
     *,
     progress: Listener = ignore,
-    should_stop: Callable[[], bool] = never,
+    should_stop: Callable[[], bool] = never_stop,
     threads: int = 0,
 ) -> CleanResult:
     """Remove what nobody wants to see; see :class:`octasplat.engine.operations.base.Run`.
@@ -93,7 +93,7 @@ def run(
     from dataclasses import asdict
 
     from octasplat.engine.edit.cleaning import clean
-    from octasplat.engine.operations.scenes import check_changed, edit_note, open_scene, write_changed
+    from octasplat.engine.operations.scene_io import check_changed, edit_note, open_scene, write_changed
     from octasplat.engine.run_folder import is_run, run_near_zones
 
     source: Path = request.source

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from pydantic import model_validator
 
-from octasplat.engine.edit.choices import Selection
+from octasplat.engine.edit.edit_options import Selection
 from octasplat.engine.errors import ConfigError
 from octasplat.engine.events import Listener, ignore
 from octasplat.engine.operations.base import (
@@ -13,7 +13,7 @@ from octasplat.engine.operations.base import (
     Options,
     SceneRequest,
     ScenesWritten,
-    never,
+    never_stop,
     options_of,
     stop_if,
 )
@@ -52,7 +52,7 @@ def run(
     request: CropRequest,
     *,
     progress: Listener = ignore,
-    should_stop: Callable[[], bool] = never,
+    should_stop: Callable[[], bool] = never_stop,
     threads: int = 0,
 ) -> CropResult:
     """Keep part of a scene; see :class:`octasplat.engine.operations.base.Run`.
@@ -61,13 +61,13 @@ def run(
         ConfigError: nothing would be kept.
         SceneFileError: the scene cannot be read or written.
     """
-    from octasplat.engine.edit.selection import chosen_by
-    from octasplat.engine.operations.scenes import check_changed, edit_note, open_scene, write_changed
+    from octasplat.engine.edit.selection import selection_mask
+    from octasplat.engine.operations.scene_io import check_changed, edit_note, open_scene, write_changed
 
     source: Path = request.source
     check_changed("crop", request, request.output)
     gaussians = open_scene(source, progress)
-    keep = chosen_by(gaussians, request)
+    keep = selection_mask(gaussians, request)
     if not keep.any():
         low, high = gaussians.means_world.min(axis=0), gaussians.means_world.max(axis=0)
         bounds = " to ".join(" ".join(f"{value:.4g}" for value in corner) for corner in (low, high))

@@ -10,14 +10,21 @@ import numpy as np
 from jaxtyping import Float64
 from pydantic import Field, PlainSerializer
 
-from octasplat.engine.edit.axes import TURNS, Axes
+from octasplat.engine.edit.axes import AXIS_ROTATIONS, Axes
 from octasplat.engine.edit.reports import DeformReport
 from octasplat.engine.errors import SceneFileError
 from octasplat.engine.events import Listener, ignore
 from octasplat.engine.fields import InputFile, Spelling, Unit
-from octasplat.engine.files import Mesh, read_mesh
-from octasplat.engine.operations.base import Operation, Options, ScenesWritten, never, options_of, stop_if
-from octasplat.engine.operations.patterns import expanded
+from octasplat.engine.files import ImportedMesh, read_mesh
+from octasplat.engine.operations.base import (
+    Operation,
+    Options,
+    ScenesWritten,
+    never_stop,
+    options_of,
+    stop_if,
+)
+from octasplat.engine.operations.file_patterns import expand_patterns
 from octasplat.engine.operations.sequence_request import SequenceRequest
 
 if TYPE_CHECKING:
@@ -85,7 +92,7 @@ def run(
     request: DeformRequest,
     *,
     progress: Listener = ignore,
-    should_stop: Callable[[], bool] = never,
+    should_stop: Callable[[], bool] = never_stop,
     threads: int = 0,
 ) -> DeformResult:
     """Bind the scene to a mesh at rest and move it; see :class:`octasplat.engine.operations.base.Run`.
@@ -94,24 +101,26 @@ def run(
         OctasplatError: something cannot be read or written, or the meshes are not the same one.
     """
     from octasplat.engine.edit.deform import deform_to, deformation_corners
-    from octasplat.engine.operations.scenes import edit_note, open_scene
-    from octasplat.engine.operations.sequences import Frames
+    from octasplat.engine.operations.scene_io import edit_note, open_scene
+    from octasplat.engine.operations.sequences import SceneSequence
 
     source: Path = request.source
-    paths = expanded(request.deformed)
-    frames = Frames("deform", request, paths, [request.proxy])
+    paths = expand_patterns(request.deformed)
+    frames = SceneSequence("deform", request, paths, [request.proxy])
     gaussians = open_scene(source, progress)
     rest = read_mesh(request.proxy)
     corners = deformation_corners(gaussians)
-    binding = _bound(request, _proxy(request, rest), corners)
-    moving, count = int(binding.moving.sum()), len(gaussians)
+    binding = _bind_scene(request, _proxy(request, rest), corners)
+    moving, count = int(binding.moving_mask.sum()), len(gaussians)
     note = edit_note("deform", options_of(DeformOptions, request))
     reports, notes = [], [f"{request.proxy}: moves {moving:,} of {count:,} Gaussians."]
     for number, path in enumerate(paths):
-        vertices = _turned(_same_mesh(path, request.proxy, rest), request.axes)
-        result, report = deform_to(gaussians, corners, binding.deform(vertices), binding.mirrored(vertices))
+        vertices = _rotate_mesh(_check_same_mesh(path, request.proxy, rest), request.axes)
+        result, report = deform_to(
+            gaussians, corners, binding.deform(vertices), binding.mirrored_mask(vertices)
+        )
         stop_if(should_stop)
-        notes += [*_told(path, report), frames.write(number, result, progress, note)]
+        notes += [*_report_text(path, report), frames.write(number, result, progress, note)]
         reports.append(report)
         frames.tell(number, progress)
     frames.write_report([{"deformed": str(path)} for path in paths], map(asdict, reports))
@@ -125,24 +134,24 @@ def run(
     )
 
 
-def _proxy(request: DeformRequest, rest: Mesh) -> "Proxy":
+def _proxy(request: DeformRequest, rest: ImportedMesh) -> "Proxy":
     from octasplat.engine.edit.proxy import Proxy
 
     mirrored = {"auto": None, "yes": True, "no": False}[request.mirrored]
     try:
-        return Proxy(_turned(rest, request.axes), rest.triangles, mirrored)
+        return Proxy(_rotate_mesh(rest, request.axes), rest.triangles, mirrored)
     except SceneFileError as error:
         raise SceneFileError(f"{request.proxy}: {error}") from None
 
 
-def _bound(request: DeformRequest, proxy: "Proxy", corners: Float64[np.ndarray, "n 8 3"]) -> "Binding":
-    from octasplat.engine.edit.proxy import bind
+def _bind_scene(request: DeformRequest, proxy: "Proxy", corners: Float64[np.ndarray, "n 8 3"]) -> "Binding":
+    from octasplat.engine.edit.proxy import bind_corners
 
     try:
-        binding = bind(proxy, corners, request.method, request.reach)
+        binding = bind_corners(proxy, corners, request.method, request.reach)
     except SceneFileError as error:
         raise SceneFileError(f"{request.proxy}: {error}") from None
-    if not binding.moving.any():
+    if not binding.moving_mask.any():
         raise SceneFileError(
             f"{request.proxy}: no Gaussian is near enough to be moved; if the proxy was saved along other "
             "axes, as Blender does for OBJ and GLB, say --axes x90, else widen --reach."
@@ -150,9 +159,9 @@ def _bound(request: DeformRequest, proxy: "Proxy", corners: Float64[np.ndarray, 
     return binding
 
 
-def _same_mesh(path: Path, proxy: Path, rest: Mesh) -> Mesh:
+def _check_same_mesh(path: Path, proxy: Path, rest: ImportedMesh) -> ImportedMesh:
     mesh = read_mesh(path)
-    if len(mesh) != len(rest) or not _same_faces(mesh, rest):
+    if len(mesh) != len(rest) or not _has_same_faces(mesh, rest):
         raise SceneFileError(
             f"{path}: is not the mesh {proxy} with vertices moved; both need the same vertices and faces in "
             "the same order."
@@ -160,12 +169,12 @@ def _same_mesh(path: Path, proxy: Path, rest: Mesh) -> Mesh:
     return mesh
 
 
-def _turned(mesh: Mesh, axes: Axes) -> Float64[np.ndarray, "v 3"]:
-    turned: Float64[np.ndarray, "v 3"] = mesh.vertices @ TURNS[axes].T
+def _rotate_mesh(mesh: ImportedMesh, axes: Axes) -> Float64[np.ndarray, "v 3"]:
+    turned: Float64[np.ndarray, "v 3"] = mesh.vertices @ AXIS_ROTATIONS[axes].T
     return turned
 
 
-def _same_faces(one: Mesh, other: Mesh) -> bool:
+def _has_same_faces(one: ImportedMesh, other: ImportedMesh) -> bool:
     """Whether the same vertices make triangles; programs may have turned over those of a mirrored mesh."""
     if one.triangles.shape != other.triangles.shape:
         return False
@@ -175,7 +184,7 @@ def _same_faces(one: Mesh, other: Mesh) -> bool:
     return np.array_equal(first[np.lexsort(first.T)], second[np.lexsort(second.T)])
 
 
-def _told(path: Path, report: DeformReport) -> list[str]:
+def _report_text(path: Path, report: DeformReport) -> list[str]:
     """A report in words."""
     lines = [
         f"{path}: {report.moved:,} Gaussians moved; distance from an affine map, in standard deviations: "

@@ -7,7 +7,7 @@ from typing import Annotated
 
 from pydantic import Field
 
-from octasplat.engine.edit.choices import MeshRecovery
+from octasplat.engine.edit.edit_options import MeshToGaussiansOptions
 from octasplat.engine.edit.reports import EditReport
 from octasplat.engine.events import Listener, ignore
 from octasplat.engine.fields import InputFile, Spelling
@@ -15,16 +15,16 @@ from octasplat.engine.operations.base import (
     Operation,
     Options,
     ScenesWritten,
-    never,
+    emit_warning,
+    never_stop,
     options_of,
     stop_if,
-    warn,
 )
-from octasplat.engine.operations.patterns import expanded
+from octasplat.engine.operations.file_patterns import expand_patterns
 from octasplat.engine.operations.sequence_request import SequenceRequest
 
 
-class EditOptions(MeshRecovery, Options):
+class EditOptions(MeshToGaussiansOptions, Options):
     """Which meshes become scenes, and how."""
 
     meshes: Annotated[tuple[InputFile, ...], Spelling(("--mesh",), metavar="MESH")] = Field(
@@ -57,7 +57,7 @@ def run(
     request: EditRequest,
     *,
     progress: Listener = ignore,
-    should_stop: Callable[[], bool] = never,
+    should_stop: Callable[[], bool] = never_stop,
     threads: int = 0,
 ) -> EditResult:
     """Recover the scene from each edited mesh; see :class:`octasplat.engine.operations.base.Run`.
@@ -67,36 +67,36 @@ def run(
     Raises:
         OctasplatError: something cannot be read, matched or written.
     """
-    from octasplat.engine.edit.recovery import recover_edit
+    from octasplat.engine.edit.mesh_to_gaussians import recover_gaussians
     from octasplat.engine.files import read_mesh
-    from octasplat.engine.operations.scenes import edit_note, open_scene
-    from octasplat.engine.operations.sequences import Frames
+    from octasplat.engine.operations.scene_io import edit_note, open_scene
+    from octasplat.engine.operations.sequences import SceneSequence
 
     source: Path = request.source
-    meshes = expanded(request.meshes)
-    recovery: MeshRecovery = request
-    frames = Frames("edit", request, meshes)
+    meshes = expand_patterns(request.meshes)
+    recovery: MeshToGaussiansOptions = request
+    frames = SceneSequence("edit", request, meshes)
     gaussians = open_scene(source, progress)
     note = edit_note("edit", options_of(EditOptions, request))
     reports, notes = [], []
     for number, path in enumerate(meshes):
-        result, report = recover_edit(gaussians, read_mesh(path), path, recovery)
+        result, report = recover_gaussians(gaussians, read_mesh(path), path, recovery)
         if recovery.axes == "auto":  # all frames of a sequence came the same way
             recovery = recovery.model_copy(update={"axes": report.axes})
-            _warn_of_axes(path, report, progress)
-        _warn_of_torn(report, progress)
+            _warn_about_axes(path, report, progress)
+        _warn_about_torn(report, progress)
         stop_if(should_stop)
-        notes += [*_told(path, report), frames.write(number, result, progress, note)]
+        notes += [*_report_text(path, report), frames.write(number, result, progress, note)]
         reports.append(report)
         frames.tell(number, progress)
     frames.write_report([{"mesh": str(path)} for path in meshes], map(asdict, reports))
     return EditResult(files=frames.files, folder=frames.folder, notes=tuple(notes), reports=tuple(reports))
 
 
-def _warn_of_axes(path: Path, report: EditReport, progress: Listener) -> None:
+def _warn_about_axes(path: Path, report: EditReport, progress: Listener) -> None:
     """Tell if a mesh seems to have been turned on its way."""
     if report.axes != report.axes_usual:
-        warn(
+        emit_warning(
             progress,
             f"{path} came back along other axes than it was written with (as when a mesh changes format in "
             "Blender) and was turned back; if turning it was your edit, say --axes "
@@ -104,16 +104,16 @@ def _warn_of_axes(path: Path, report: EditReport, progress: Listener) -> None:
         )
 
 
-def _warn_of_torn(report: EditReport, progress: Listener) -> None:
+def _warn_about_torn(report: EditReport, progress: Listener) -> None:
     if report.partial > report.snapped:
-        warn(
+        emit_warning(
             progress,
             f"{report.partial - report.snapped:,} octagons moved with some corners only, which makes long "
             "streaks: select whole octagons in the editor (Select Linked) or say --whole-octagons.",
         )
 
 
-def _told(path: Path, report: EditReport) -> list[str]:
+def _report_text(path: Path, report: EditReport) -> list[str]:
     """A report in words; what did not happen is left out."""
     lines = [
         f"{path}: {report.moved:,} Gaussians moved, {report.unmoved:,} did not "

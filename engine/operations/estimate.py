@@ -10,7 +10,7 @@ from pydantic import Field
 
 from octasplat.engine.events import Listener, ignore
 from octasplat.engine.fields import Positional, Spelling, Unit
-from octasplat.engine.operations.base import Operation, Request, Result, never
+from octasplat.engine.operations.base import Operation, Request, Result, never_stop
 from octasplat.engine.operations.reconstruct import ReconstructOptions
 from octasplat.engine.photograph_sizes import Sizes
 
@@ -66,7 +66,7 @@ def run(
     request: EstimateRequest,
     *,
     progress: Listener = ignore,
-    should_stop: Callable[[], bool] = never,
+    should_stop: Callable[[], bool] = never_stop,
     threads: int = 0,
 ) -> EstimateResult:
     """Estimate a reconstruction; see :class:`octasplat.engine.operations.base.Run`.
@@ -75,10 +75,10 @@ def run(
         DatasetError: there are no photographs, or one cannot be read.
         ConfigError: a setting cannot be used.
     """
-    from octasplat.engine.operations.costs import estimate_reconstruction
-    from octasplat.engine.scene.colmap import has_model
+    from octasplat.engine.dataset.colmap_model import has_colmap_model
+    from octasplat.engine.operations.cost_model import estimate_reconstruction
 
-    config = request.config().with_poses_decided(has_model(request.source))
+    config = request.config().with_poses_decided(has_colmap_model(request.source))
     sizes = photograph_sizes(request.source)
     cores = request.cores or threads or len(os.sched_getaffinity(0))
     found = estimate_reconstruction(config, sizes, cores)
@@ -93,12 +93,12 @@ def photograph_sizes(scene: Path) -> list[Sizes]:
     """
     from PIL import Image
 
+    from octasplat.engine.dataset.load import IMAGE_SUFFIXES, image_folder
     from octasplat.engine.errors import DatasetError
-    from octasplat.engine.scene.load import IMAGE_SUFFIXES, photograph_folder
 
     if not scene.is_dir():
         raise DatasetError(f"{scene} is not a folder; name the folder that holds the photographs.")
-    folder = photograph_folder(scene)
+    folder = image_folder(scene)
     counts: Counter[tuple[int, int]] = Counter()
     found = (path for path in sorted(folder.rglob("*")) if path.suffix.lower() in IMAGE_SUFFIXES)
     for path in found:

@@ -10,7 +10,7 @@ from pydantic import BeforeValidator, Field, model_validator
 from octasplat.engine import renamed_settings
 from octasplat.engine.events import Listener, ignore
 from octasplat.engine.fields import DatasetFolder, Positional, Spelling
-from octasplat.engine.operations.base import Operation, Options, Request, Result, never
+from octasplat.engine.operations.base import Operation, Options, Request, Result, never_stop
 
 _METRICS, _REPORT, _PICTURES = "metrics.json", "report.html", ("renders", "layers")
 
@@ -140,7 +140,7 @@ def run(
     request: EvaluateRequest,
     *,
     progress: Listener = ignore,
-    should_stop: Callable[[], bool] = never,
+    should_stop: Callable[[], bool] = never_stop,
     threads: int = 0,
 ) -> EvaluateResult:
     """Measure a finished run; see :class:`octasplat.engine.operations.base.Run`.
@@ -181,7 +181,7 @@ def run(
     )
 
 
-def _measure_scales(request: EvaluateRequest, listener: Listener, threads: int) -> EvaluateResult:
+def _measure_scales(request: EvaluateRequest, progress: Listener, threads: int) -> EvaluateResult:
     from octasplat.engine.evaluate.runs import SCALES, evaluate_scales
 
     found = evaluate_scales(
@@ -190,7 +190,7 @@ def _measure_scales(request: EvaluateRequest, listener: Listener, threads: int) 
         scene=request.dataset,
         background=request.evaluation_background,
         threads=threads,
-        listener=listener,
+        listener=progress,
     )
     told = {
         scale: ", ".join(f"{psnr:.2f} dB with {rays}" for rays, psnr in row.items())

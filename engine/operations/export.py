@@ -13,10 +13,10 @@ from octasplat.engine.errors import Cancelled, ExportFailed, SceneFileError
 from octasplat.engine.events import Listener, StageProgress, Warned, ignore
 from octasplat.engine.export_names import ExportName
 from octasplat.engine.fields import Group, Positional, Spelling
-from octasplat.engine.files.options import ExportChoices, ExportOptions, OctagonQ
+from octasplat.engine.files.export_options import ExportChoices, ExportOptions, OctagonQ
 from octasplat.engine.files.registry import Exporter, exporter_for
 from octasplat.engine.operations.axes import Axis
-from octasplat.engine.operations.base import Operation, Options, Result, SourceRequest, never, stop_if
+from octasplat.engine.operations.base import Operation, Options, Result, SourceRequest, never_stop, stop_if
 
 if TYPE_CHECKING:
     from octasplat.engine.gaussians.model import FlatGaussians
@@ -45,7 +45,7 @@ def _with_direction(colour: _Colour | None) -> _Colour | None:
     return colour
 
 
-class _Exporting(ExportChoices, Options):
+class _ExportFields(ExportChoices, Options):
     """What the options of a job and those of the command have in common."""
 
     former_names: ClassVar[renamed_settings.FormerNames] = renamed_settings.EXPORT
@@ -82,7 +82,7 @@ class _Exporting(ExportChoices, Options):
     )
 
     @model_validator(mode="after")
-    def _go_together(self) -> "_Exporting":
+    def _go_together(self) -> "_ExportFields":
         if self.up is not None and not self.materials:
             raise ValueError("`up` goes with `materials`")
         targets = self.targets()
@@ -113,7 +113,7 @@ def _format_name(target: Path, asked: str | None) -> str | None:
         return None
 
 
-class ExportJobOptions(_Exporting):
+class ExportJobOptions(_ExportFields):
     """Which files to write, and how."""
 
     files: tuple[ExportName, ...] = Field(
@@ -125,7 +125,7 @@ class ExportJobOptions(_Exporting):
         return tuple(map(Path, self.files))
 
 
-class ExportRequest(_Exporting, SourceRequest):
+class ExportRequest(_ExportFields, SourceRequest):
     """Write the Gaussians of IN, a run's folder or a file of any splat format, to OUT in another format.
 
     OUT's name says the format, unless --format does; the formats are listed below. Where two take a name, as
@@ -160,7 +160,7 @@ def run(
     request: ExportRequest,
     *,
     progress: Listener = ignore,
-    should_stop: Callable[[], bool] = never,
+    should_stop: Callable[[], bool] = never_stop,
     threads: int = 0,
 ) -> ExportResult:
     """Write a scene in other formats; see :class:`octasplat.engine.operations.base.Run`.
@@ -171,10 +171,10 @@ def run(
         ExportFailed: a file could not be written; the others were.
         OctasplatError: the scene cannot be read, or no format takes a name.
     """
-    from octasplat.engine.files import export_losses
-    from octasplat.engine.files.several import export_files
+    from octasplat.engine.files import dropped_on_export
+    from octasplat.engine.files.export_batch import export_batch
     from octasplat.engine.gaussians.materials import require_materials
-    from octasplat.engine.operations.scenes import check_scenes, open_scene
+    from octasplat.engine.operations.scene_io import check_scenes, open_scene
     from octasplat.engine.operations.written_files import remember_written
 
     check_scenes(
@@ -189,7 +189,7 @@ def run(
     if request.materials:
         require_materials(gaussians, request.source)
     else:
-        for text in export_losses(gaussians, list(request.files), request.format):
+        for text in dropped_on_export(gaussians, list(request.files), request.format):
             progress(Warned(text))
 
     def step(done: int) -> None:
@@ -199,15 +199,15 @@ def run(
             progress(StageProgress("export", done, count))
 
     stop_if(should_stop)
-    forms = _Forms(request, gaussians, lambda: step(0), progress, threads)
-    files, failed = export_files(request.files, forms.of, on_done=step, format=request.format)
+    forms = _ExportPreparation(request, gaussians, lambda: step(0), progress, threads)
+    files, failed = export_batch(request.files, forms.prepare, on_done=step, format=request.format)
     if failed is not None:
         remember_written("export", files)  # for the same command, once the others can be written
         raise ExportFailed(failed)
     return ExportResult(files=files)
 
 
-class _Forms:
+class _ExportPreparation:
     """What is written in each format: the scene, and how."""
 
     def __init__(
@@ -221,23 +221,23 @@ class _Forms:
         self._request, self._gaussians = request, gaussians
         self._on_pass, self._progress, self._threads = on_pass, progress, threads
 
-    def of(self, exporter: Exporter) -> "tuple[FlatGaussians, ExportOptions]":
+    def prepare(self, exporter: Exporter) -> "tuple[FlatGaussians, ExportOptions]":
         """Return the scene and the options for a format."""
         request, options = self._request, self._options
         is_glb = exporter.name == "glb"
         if not (exporter.holds_harmonics or (request.materials and is_glb)):
-            gaussians = self._one_colour
+            gaussians = self._baked_colour
         else:
             gaussians = self._gaussians
         if not is_glb:
             return gaussians, options.model_copy(update={"light_up": None})
         if request.for_viewers:
-            return self._drawn_in_order(gaussians, options)
+            return self._in_depth_order(gaussians, options)
         return gaussians, options
 
     @cached_property
     def _options(self) -> ExportOptions:
-        from octasplat.engine.files import read_facts
+        from octasplat.engine.files import read_metadata
         from octasplat.engine.operations.axes import light_up
 
         request = self._request
@@ -245,17 +245,17 @@ class _Forms:
         light = light_up(request.source, request.up).tolist() if request.materials else None
         options = {
             **choices,
-            "facts": read_facts(request.source),
+            "facts": read_metadata(request.source),
             "light_up": light,
             "ids": request.ids and not request.for_viewers,
             "cores": CORES_OF_CHUNKS if request.for_viewers else None,
         }
-        if (q := request.q or self._run_q) is not None:
+        if (q := request.q or self._training_q) is not None:
             options["q"] = q
         return ExportOptions.model_validate(options)
 
     @property
-    def _run_q(self) -> float | None:
+    def _training_q(self) -> float | None:
         """What the scene of a run was trained with."""
         from octasplat.engine.config import read_config
         from octasplat.engine.run_folder import CONFIG, is_run
@@ -265,12 +265,12 @@ class _Forms:
         return read_config(source / CONFIG).train.trace.q if known else None
 
     @cached_property
-    def _one_colour(self) -> "FlatGaussians":
+    def _baked_colour(self) -> "FlatGaussians":
         """The scene with the constant harmonic only."""
         import numpy as np
 
         from octasplat.engine.plain_colours import PlainScene
-        from octasplat.engine.render.one_colour import colours_toward, with_colours
+        from octasplat.engine.render.bake_colour import colours_along, with_constant_colour
         from octasplat.engine.run_folder import is_run
 
         gaussians, source = self._gaussians, self._request.source
@@ -285,15 +285,15 @@ class _Forms:
                 on_pass=lambda _done, _total: self._on_pass(),
                 on_unknown=lambda text: self._progress(Warned(text)),
             ).gaussians
-        return with_colours(gaussians, colours_toward(gaussians, np.array(colour)))
+        return with_constant_colour(gaussians, colours_along(gaussians, np.array(colour)))
 
-    def _drawn_in_order(
+    def _in_depth_order(
         self, gaussians: "FlatGaussians", options: ExportOptions
     ) -> "tuple[FlatGaussians, ExportOptions]":
         """In one chunk and in the order of most photographs' cameras, where these agree; else as it was."""
         import numpy as np
 
-        from octasplat.engine.render.draw_order import AGREEMENT, common_order
+        from octasplat.engine.render.depth_order import MIN_AGREEMENT, shared_depth_order
         from octasplat.engine.run_folder import CONFIG, is_run, run_viewpoints
 
         source = self._request.source
@@ -301,8 +301,8 @@ class _Forms:
             return gaussians, options
         seen = run_viewpoints(source)
         centres = np.stack([seen.views[index].origin_world for index in seen.train_indices])
-        order, agreement = common_order(gaussians.means_world, centres)
-        if agreement < AGREEMENT:
+        order, agreement = shared_depth_order(gaussians.means_world, centres)
+        if agreement < MIN_AGREEMENT:
             return gaussians, options
         return gaussians.select(order), options.model_copy(update={"chunks": 1, "cores": CORES_IN_ORDER})
 

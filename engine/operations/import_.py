@@ -10,7 +10,7 @@ from octasplat.engine.events import Listener, ignore
 from octasplat.engine.fields import InputFile, Positional, Spelling
 from octasplat.engine.files.channel_columns import ChannelChoice
 from octasplat.engine.gaussians.flattening import ImportReport
-from octasplat.engine.operations.base import Operation, Options, Result, WritingRequest, never, stop_if
+from octasplat.engine.operations.base import Operation, Options, Result, WritingRequest, never_stop, stop_if
 
 
 def read_channels(value: object) -> object:
@@ -97,7 +97,7 @@ def run(
     request: ImportRequest,
     *,
     progress: Listener = ignore,
-    should_stop: Callable[[], bool] = never,
+    should_stop: Callable[[], bool] = never_stop,
     threads: int = 0,
 ) -> ImportResult:
     """Read a scene of another program and write it as our own PLY.
@@ -109,9 +109,9 @@ def run(
         SceneFileError: the scene cannot be read.
         OutputError: it cannot be written.
     """
-    from octasplat.engine.files import read_facts, read_scene
+    from octasplat.engine.files import read_metadata, read_scene
     from octasplat.engine.files.gaussian_ply import write_gaussian_ply
-    from octasplat.engine.operations.scenes import check_scenes, tell_import_losses
+    from octasplat.engine.operations.scene_io import check_scenes, report_dropped_on_import
 
     source: Path = request.file
     check_scenes("import", [request.output], [source], overwrite=request.overwrite)
@@ -120,14 +120,14 @@ def run(
         request.format,
         drop_invalid=request.drop_invalid,
         channels=request.channels,
-        listener=progress,
+        progress=progress,
     )
-    tell_import_losses(source, report, progress)
+    report_dropped_on_import(source, report, progress)
     degree = request.sh_degree
     if degree is not None and degree < gaussians.sh_degree:
         gaussians.sh = gaussians.sh[:, : (degree + 1) ** 2].copy()
     stop_if(should_stop)
-    write_gaussian_ply(gaussians, request.output, facts=read_facts(source))
+    write_gaussian_ply(gaussians, request.output, facts=read_metadata(source))
     return ImportResult(files=(request.output,), report=report, channels=tuple(gaussians.channels))
 
 

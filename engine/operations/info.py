@@ -14,7 +14,7 @@ from octasplat.engine.evaluate.scene_facts import OPACITY_EDGES, QUANTILES, HitF
 from octasplat.engine.events import Listener, ignore
 from octasplat.engine.fields import DatasetFolder, Source, Spelling
 from octasplat.engine.operations.axes import Axis, axis_named
-from octasplat.engine.operations.base import Operation, Options, Result, WritingRequest, never, stop_if
+from octasplat.engine.operations.base import Operation, Options, Result, WritingRequest, never_stop, stop_if
 
 _BAR = 24
 
@@ -124,7 +124,7 @@ def run(
     request: InfoRequest,
     *,
     progress: Listener = ignore,
-    should_stop: Callable[[], bool] = never,
+    should_stop: Callable[[], bool] = never_stop,
     threads: int = 0,
 ) -> InfoResult:
     """Look at a scene; see :class:`octasplat.engine.operations.base.Run`.
@@ -136,16 +136,16 @@ def run(
         OutputError: there is no scene yet, or a file cannot be written.
     """
     from octasplat.engine.operations.render_source import open_stage_scene
-    from octasplat.engine.operations.scene_inspection import find_facts
+    from octasplat.engine.operations.scene_inspection import inspect_scene
     from octasplat.engine.operations.written_files import check_targets
-    from octasplat.engine.render.images import write_png
+    from octasplat.engine.render.image_files import write_png
     from octasplat.engine.writing import write_json
 
     source = request.source
     files = tuple(path for path in (request.output, request.picture) if path is not None)
     check_targets("info", files, [source, request.dataset], overwrite=request.overwrite)
     opened = open_stage_scene(source, progress, dataset=request.dataset, threads=threads)
-    found = find_facts(opened, None if request.up is None else axis_named(request.up))
+    found = inspect_scene(opened, None if request.up is None else axis_named(request.up))
     x, y, z = found.up_world.tolist()
     result = InfoResult(
         files=files,

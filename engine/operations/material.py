@@ -5,10 +5,17 @@ from typing import Annotated
 
 from pydantic import Field
 
-from octasplat.engine.edit.choices import MaterialChange, Selection
+from octasplat.engine.edit.edit_options import MaterialChange, Selection
 from octasplat.engine.events import Listener, ignore
 from octasplat.engine.fields import InputFile, Output, Spelling
-from octasplat.engine.operations.base import Operation, Options, SceneRequest, ScenesWritten, never, stop_if
+from octasplat.engine.operations.base import (
+    Operation,
+    Options,
+    SceneRequest,
+    ScenesWritten,
+    never_stop,
+    stop_if,
+)
 
 
 class MaterialOptions(Selection, MaterialChange, Options):
@@ -57,7 +64,7 @@ def run(
     request: MaterialRequest,
     *,
     progress: Listener = ignore,
-    should_stop: Callable[[], bool] = never,
+    should_stop: Callable[[], bool] = never_stop,
     threads: int = 0,
 ) -> MaterialResult:
     """Change the materials of a scene; see :class:`octasplat.engine.operations.base.Run`.
@@ -67,29 +74,29 @@ def run(
         OutputError: the folder is taken or cannot be written.
         SceneFileError: the scene or the mesh cannot be read, or the scene not be written.
     """
-    from octasplat.engine.edit.masked import under_masks
-    from octasplat.engine.edit.material_run import change_materials, edit_note, follows
-    from octasplat.engine.edit.selection import chosen_by, in_mesh
+    from octasplat.engine.edit.mask_selection import select_by_masks
+    from octasplat.engine.edit.material_run import change_materials, edit_note, has_known_light
+    from octasplat.engine.edit.selection import in_mesh, selection_mask
     from octasplat.engine.files import read_mesh
     from octasplat.engine.gaussians.materials import require_materials
-    from octasplat.engine.operations.scenes import check_changed, open_scene, write_changed
+    from octasplat.engine.operations.scene_io import check_changed, open_scene, write_changed
     from octasplat.engine.run_folder import SCENE, is_run
 
     source, output = request.source, request.output
     check_changed("material", request, output, [request.mesh, *request.masks])
     gaussians = open_scene(source, progress)
     require_materials(gaussians, source / SCENE if is_run(source) else source)
-    chosen = chosen_by(gaussians, request.model_copy(update={"inverse": False}))
+    chosen = selection_mask(gaussians, request.model_copy(update={"inverse": False}))
     if request.mesh is not None:
         chosen &= in_mesh(gaussians, read_mesh(request.mesh), request.mesh)
     if request.masks:
-        chosen &= under_masks(source, gaussians, request.masks)
+        chosen &= select_by_masks(source, gaussians, request.masks)
     if request.inverse:
         chosen = ~chosen
     changed = change_materials(source, gaussians, chosen, request)
     count = int(chosen.sum())
     notes = [f"{source}: {count:,} of {len(chosen):,} Gaussians changed."]
-    if not follows(source):
+    if not has_known_light(source):
         notes.append(
             "Viewers and octasplat render show their harmonics, which are as before; relight shows it."
         )

@@ -13,10 +13,10 @@ from octasplat.engine.operations.base import (
     Options,
     SceneRequest,
     ScenesWritten,
-    never,
+    emit_warning,
+    never_stop,
     options_of,
     stop_if,
-    warn,
 )
 
 
@@ -61,7 +61,7 @@ def run(
     request: MergeRequest,
     *,
     progress: Listener = ignore,
-    should_stop: Callable[[], bool] = never,
+    should_stop: Callable[[], bool] = never_stop,
     threads: int = 0,
 ) -> MergeResult:
     """Put scenes together; see :class:`octasplat.engine.operations.base.Run`.
@@ -69,10 +69,10 @@ def run(
     Raises:
         SceneFileError: a scene cannot be read, or the result not be written.
     """
-    from octasplat.engine.edit.selection import merge
-    from octasplat.engine.files import read_facts
-    from octasplat.engine.gaussians.scene_facts import shared_facts
-    from octasplat.engine.operations.scenes import check_changed, edit_note, open_scene, write_changed
+    from octasplat.engine.edit.selection import merge_scenes
+    from octasplat.engine.files import read_metadata
+    from octasplat.engine.gaussians.scene_metadata import merge_metadata
+    from octasplat.engine.operations.scene_io import check_changed, edit_note, open_scene, write_changed
 
     first: Path = request.source
     sources = (first, *request.scenes)
@@ -81,8 +81,8 @@ def run(
     every = dict.fromkeys(name for scene in scenes for name in scene.channels)
     for source, scene in zip(sources, scenes, strict=True):
         if missing := ", ".join(name for name in every if name not in scene.channels):
-            warn(progress, f"{source}: has no channel {missing}; it is 0 there.")
-    merged = merge(scenes, request.sh_degree)
+            emit_warning(progress, f"{source}: has no channel {missing}; it is 0 there.")
+    merged = merge_scenes(scenes, request.sh_degree)
     stop_if(should_stop)
     written = write_changed(
         first,
@@ -90,7 +90,7 @@ def run(
         request.output,
         progress,
         note=edit_note("merge", options_of(MergeOptions, request), gaussians=len(merged)),
-        facts=shared_facts(list(zip(scenes, map(read_facts, sources), strict=True))),
+        facts=merge_metadata(list(zip(scenes, map(read_metadata, sources), strict=True))),
     )
     return MergeResult(
         files=written.files, folder=written.folder, notes=(written.sentence,), counts=tuple(map(len, scenes))

@@ -11,13 +11,13 @@ from octasplat.engine import renamed_settings
 from octasplat.engine.events import Listener, ignore
 from octasplat.engine.fields import ADVANCED, BASIC, PartOf, Positional, Shortcut, Spelling
 from octasplat.engine.nested_options import merged
-from octasplat.engine.operations.base import Operation, Options, Output, Request, Result, never
+from octasplat.engine.operations.base import Operation, Options, Output, Request, Result, never_stop
 from octasplat.engine.refusals import SettingsRefused, refusals_of
 from octasplat.engine.run_settings import RunSettings
 
 if TYPE_CHECKING:
     from octasplat.engine.config import ReconstructionConfig
-    from octasplat.engine.pipeline import Watcher
+    from octasplat.engine.pipeline import OnStep
 
 _CONFIG, _METRICS, _REPORT, _SCENE = "config.json", "metrics.json", "report.html", "scene.ply"
 
@@ -164,7 +164,7 @@ class ReconstructResult(Result):
         return self.summary
 
 
-def options_of(asked: Mapping[str, Any]) -> ReconstructOptions:
+def options_from_json(asked: Mapping[str, Any]) -> ReconstructOptions:
     """Return options from JSON.
 
     Raises:
@@ -198,9 +198,9 @@ def run(
     request: ReconstructRequest,
     *,
     progress: Listener = ignore,
-    should_stop: Callable[[], bool] = never,
+    should_stop: Callable[[], bool] = never_stop,
     threads: int = 0,
-    on_step: "Watcher | None" = None,
+    on_step: "OnStep | None" = None,
 ) -> ReconstructResult:
     """Reconstruct a scene; see :class:`octasplat.engine.operations.base.Run`.
 
@@ -212,7 +212,7 @@ def run(
         on_step: called with the training after each iteration; it must change nothing.
 
     Raises:
-        OctasplatError: as :func:`octasplat.engine.pipeline.reconstruct` does.
+        OctasplatError: as :func:`octasplat.engine.pipeline.reconstruction` does.
     """
     from octasplat.engine.evaluate.summary import run_summary
     from octasplat.engine.pipeline import reconstruct
@@ -226,9 +226,9 @@ def run(
         config,
         resume=request.resume,
         threads=threads,
-        listener=stopping(progress, should_stop),
+        progress=stopping(progress, should_stop),
         should_stop=should_stop,
-        watch=on_step,
+        on_step=on_step,
     )
     return ReconstructResult(
         files=tuple(output / name for name in (_SCENE, *config.exports, _METRICS, _REPORT)),

@@ -11,15 +11,15 @@ from octasplat.engine import renamed_settings
 from octasplat.engine.events import Listener, Warned, ignore
 from octasplat.engine.fields import ADVANCED, InputFile, Spelling, Unit
 from octasplat.engine.operations.axes import Axis, light_up
-from octasplat.engine.operations.base import Operation, never
-from octasplat.engine.operations.pictures import PictureOptions, PictureRequest
+from octasplat.engine.operations.base import Operation, never_stop
 from octasplat.engine.operations.render import RenderResult
+from octasplat.engine.operations.render_options import PictureOptions, PictureRequest
 
 if TYPE_CHECKING:
-    from octasplat.engine.light.relighting import Relighter
+    from octasplat.engine.dataset import Viewpoints
     from octasplat.engine.operations.render_source import RenderSource
-    from octasplat.engine.render.jobs import Shot
-    from octasplat.engine.scene import Viewpoints
+    from octasplat.engine.pathtracing.relighting.path_relighter import Relighter
+    from octasplat.engine.render.shots import Shot
     from octasplat.engine.shading.material_settings import MaterialSettings
 
 SPLIT_SUM_RAYS = 4
@@ -137,7 +137,7 @@ def run(
     request: RelightRequest,
     *,
     progress: Listener = ignore,
-    should_stop: Callable[[], bool] = never,
+    should_stop: Callable[[], bool] = never_stop,
     threads: int = 0,
 ) -> RelightResult:
     """Show a scene in other light; see :class:`octasplat.engine.operations.base.Run`.
@@ -150,14 +150,18 @@ def run(
     """
     from octasplat.engine.config import read_config
     from octasplat.engine.gaussians.materials import require_materials
-    from octasplat.engine.light.relit_pictures import RelitPaint, lit_shots, read_environments
     from octasplat.engine.operations.render_source import (
         picture_output,
         read_render_source,
         requested_cameras,
     )
-    from octasplat.engine.render.identity import identity_of
-    from octasplat.engine.render.jobs import camera_shots
+    from octasplat.engine.pathtracing.relighting.relit_images import (
+        RelitRenderFn,
+        lit_shots,
+        read_environments,
+    )
+    from octasplat.engine.render.render_digest import render_digest
+    from octasplat.engine.render.shots import camera_shots
     from octasplat.engine.run_folder import CONFIG, SCENE, is_run
     from octasplat.engine.stages import stopping
 
@@ -177,8 +181,8 @@ def run(
         "relight", request, tuple(lightings), [request.other_dataset, *request.environments]
     )
     background = request.background or source.background
-    kept = output.kept_images(
-        identity_of(
+    kept = output.finished_images(
+        render_digest(
             "relight",
             source.gaussians,
             source.settings,
@@ -200,7 +204,7 @@ def run(
         )
     )
     relighter = _relighter(request, source, learnt, threads)
-    paint = RelitPaint(relighter, environments, up, background, lightings)
+    paint = RelitRenderFn(relighter, environments, up, background, lightings)
     files = output.write(tuple(lightings), paint, kept, tell)
     return RelightResult(files=files, folder=output.folder, images=len(lightings))
 
@@ -209,16 +213,16 @@ def _views(request: RelightRequest, source: "RenderSource") -> "tuple[Viewpoints
     """Return the views of photographs that are asked for, and the cameras of all photographs among them."""
     import numpy as np
 
+    from octasplat.engine.dataset import Viewpoints, load_dataset_model
     from octasplat.engine.operations.render_source import requested_views
-    from octasplat.engine.render.jobs import view_shots
-    from octasplat.engine.scene import Viewpoints, load_scene
+    from octasplat.engine.render.shots import view_shots
 
     if request.other_dataset is None:
         shots = requested_views(request, source)
         assert source.viewpoints is not None, "views were asked for"
         return Viewpoints(source.viewpoints.views, source.viewpoints.cameras), shots
     max_side = request.max_side or source.max_side
-    others = load_scene(request.other_dataset, max_side=max_side, least_views=1, for_training=False)
+    others = load_dataset_model(request.other_dataset, max_side=max_side, min_views=1, for_training=False)
     shots = view_shots(others, np.arange(len(others.views)), source.near_world)
     return Viewpoints(others.views, others.cameras), shots
 
@@ -226,14 +230,14 @@ def _views(request: RelightRequest, source: "RenderSource") -> "tuple[Viewpoints
 def _relighter(
     request: RelightRequest, source: "RenderSource", learnt: "MaterialSettings | None", threads: int
 ) -> "Relighter":
-    from octasplat.engine.light.relighting import PathRelighter
-    from octasplat.engine.light.split_sum_relighting import SplitSumRelighter
-    from octasplat.engine.light.stage import Integrator
+    from octasplat.engine.pathtracing.relighting.path_relighter import PathRelighter
+    from octasplat.engine.pathtracing.relighting.split_sum_relighter import SplitSumRelighter
+    from octasplat.engine.pathtracing.stage.model import Integrator
 
     if request.integrator == "split-sum":
         return SplitSumRelighter(
             source.gaussians, source.settings, learnt, extent_world=source.extent_world,
-            side=request.rays_across, threads=threads,
+            rays_across_pixel=request.rays_across, threads=threads,
         )  # fmt: skip
     integrator = Integrator(
         samples=request.samples_per_pixel, max_depth=request.max_bounces, roulette_depth=request.max_bounces

@@ -9,16 +9,16 @@ from pydantic import BeforeValidator, Field, model_validator
 
 from octasplat.engine.events import Listener, Warned, ignore
 from octasplat.engine.fields import ADVANCED, Spelling
-from octasplat.engine.light.stage import Stage
-from octasplat.engine.light.stage_file import named_files, read_stage
-from octasplat.engine.operations.base import Operation, Result, never
-from octasplat.engine.operations.pictures import PictureOptions, PictureRequest, check_layers
+from octasplat.engine.operations.base import Operation, Result, never_stop
+from octasplat.engine.operations.render_options import PictureOptions, PictureRequest, check_layers
+from octasplat.engine.pathtracing.stage.model import Stage
+from octasplat.engine.pathtracing.stage.stage_file import read_stage, referenced_files
 
 if TYPE_CHECKING:
     from octasplat.engine.operations.render_source import RenderSource
-    from octasplat.engine.render.cameras import RenderCamera
-    from octasplat.engine.render.jobs import Shot
     from octasplat.engine.render.output import RenderOutput
+    from octasplat.engine.render.pinhole_camera import PinholeCamera
+    from octasplat.engine.render.shots import Shot
 
 PREVIEW_SIDE_PX = 480
 STAGE_LACKS_BACKGROUND = (
@@ -152,7 +152,7 @@ def run(
     request: RenderRequest,
     *,
     progress: Listener = ignore,
-    should_stop: Callable[[], bool] = never,
+    should_stop: Callable[[], bool] = never_stop,
     threads: int = 0,
 ) -> RenderResult:
     """Render new views; see :class:`octasplat.engine.operations.base.Run`.
@@ -168,7 +168,7 @@ def run(
         requested_cameras,
         requested_views,
     )
-    from octasplat.engine.render.jobs import camera_shots
+    from octasplat.engine.render.shots import camera_shots
     from octasplat.engine.stages import stopping
 
     told = "Stopped; the preview is as fine as it was." if request.preview else None
@@ -192,37 +192,37 @@ def _stage_files(request: RenderRequest) -> list[Path]:
     """Return the files that the stage brings."""
     if request.stage is None:
         return []
-    return [request.stage_folder / name for _, name in named_files(request.stage)]
+    return [request.stage_folder / name for _, name in referenced_files(request.stage)]
 
 
 def _render_plain(
     request: RenderRequest,
     source: "RenderSource",
-    cameras: "tuple[RenderCamera, ...] | None",
+    cameras: "tuple[PinholeCamera, ...] | None",
     shots: "tuple[Shot, ...]",
     output: "RenderOutput",
     progress: Listener,
     threads: int,
 ) -> tuple[Path, ...]:
-    from octasplat.engine.render.identity import identity_of
-    from octasplat.engine.render.jobs import scene_paint
+    from octasplat.engine.render.render_digest import render_digest
     from octasplat.engine.render.renderer import background_colour
+    from octasplat.engine.render.shots import scene_render_fn
     from octasplat.engine.shading.plain import PLAIN
-    from octasplat.engine.trace.make import make_tracer
+    from octasplat.engine.trace.factory import make_tracer
 
     transparent = request.background == "transparent"
     background = background_colour("black" if transparent else request.background or source.background)
     learnt = None if request.background else source.learnt  # another colour was asked for, or alpha
     views = None if cameras is not None else (source.viewpoints, source.near_world)
-    kept = output.kept_images(
-        identity_of(
+    kept = output.finished_images(
+        render_digest(
             source.gaussians, source.settings, background, transparent, cameras, None, views,
             source.trained_rad, None if learnt is None else learnt.rgb_srgb, *output.numbered(shots),
         )
     )  # fmt: skip
     tracer = make_tracer(source.settings, threads=threads, build_quality=2)
     tracer.build(source.gaussians)
-    paint = scene_paint(
+    paint = scene_render_fn(
         tracer, background, transparent=transparent, trained_rad=source.trained_rad, shading=learnt or PLAIN
     )
     return output.write(shots, paint, kept, progress)
@@ -231,16 +231,16 @@ def _render_plain(
 def _render_on_stage(
     request: RenderRequest,
     source: "RenderSource",
-    cameras: "tuple[RenderCamera, ...] | None",
+    cameras: "tuple[PinholeCamera, ...] | None",
     shots: "tuple[Shot, ...]",
     output: "RenderOutput",
     progress: Listener,
     threads: int,
 ) -> tuple[Path, ...]:
-    from octasplat.engine.light.rendering import compile_stage
-    from octasplat.engine.light.stage_file import stage_identity
     from octasplat.engine.operations.render_source import stage_scene
-    from octasplat.engine.render.identity import identity_of
+    from octasplat.engine.pathtracing.stage.stage_file import stage_identity
+    from octasplat.engine.pathtracing.stage_rendering import compile_stage
+    from octasplat.engine.render.render_digest import render_digest
     from octasplat.engine.render.renderer import background_colour
 
     stage = request.staged
@@ -253,13 +253,13 @@ def _render_on_stage(
         compile_stage(stage, scene, shots).preview(shots[0], request.output, progress)
         return (request.output,)
     views = None if cameras is not None else (source.viewpoints, source.near_world)
-    kept = output.kept_images(
-        identity_of(
+    kept = output.finished_images(
+        render_digest(
             source.gaussians, source.settings, background, False, cameras,
             stage_identity(stage, request.stage_folder), views, scene.photographs, *output.numbered(shots),
         )
     )  # fmt: skip
-    return output.write(shots, compile_stage(stage, scene, shots).paint, kept, progress)
+    return output.write(shots, compile_stage(stage, scene, shots).render_fn, kept, progress)
 
 
 OPERATION = Operation(

@@ -8,32 +8,32 @@ import numpy as np
 from jaxtyping import Float32
 
 from octasplat.engine.config import read_config
+from octasplat.engine.dataset.model import Viewpoints
+from octasplat.engine.dataset.views_file import SplitViewpoints
 from octasplat.engine.errors import ConfigError, OutputError
 from octasplat.engine.events import Listener, Warned
-from octasplat.engine.files import read_facts
+from octasplat.engine.files import read_metadata
 from octasplat.engine.files.gaussian_ply import read_gaussian_ply
 from octasplat.engine.gaussians.model import FlatGaussians
-from octasplat.engine.light.stage_scene import StageScene
 from octasplat.engine.operations.axes import axis_named
-from octasplat.engine.operations.pictures import PictureRequest
-from octasplat.engine.operations.scenes import open_scene
+from octasplat.engine.operations.render_options import PictureRequest
+from octasplat.engine.operations.scene_io import open_scene
 from octasplat.engine.operations.written_files import check_targets
+from octasplat.engine.pathtracing.stage_scene import StageScene
 from octasplat.engine.relative_paths import normalised
-from octasplat.engine.render.cameras import RenderCamera
-from octasplat.engine.render.jobs import Shot, gaussian_turntable, view_shots
 from octasplat.engine.render.orbit import (
     Orbit,
     PinholeLens,
-    lens_fov_y_degrees,
+    choose_fov_y_degrees,
     orbit_cameras,
     single_camera,
 )
-from octasplat.engine.render.output import RenderOutput, Resumption
+from octasplat.engine.render.output import RenderOutput, ResumeOptions
 from octasplat.engine.render.path_file import path_cameras
+from octasplat.engine.render.pinhole_camera import PinholeCamera
 from octasplat.engine.render.renderer import background_colour
+from octasplat.engine.render.shots import Shot, gaussian_turntable, view_shots
 from octasplat.engine.run_folder import CONFIG, SCENE, is_run, run_background, run_near_world, run_viewpoints
-from octasplat.engine.scene.model import Viewpoints
-from octasplat.engine.scene.views_file import SplitViewpoints
 from octasplat.engine.shading.learnt_background import LearntBackground
 from octasplat.engine.trace.protocol import TraceSettings
 
@@ -102,7 +102,7 @@ def read_render_source(
                 f"{source}: is no folder of a run, so that {dataset} says nothing about it; leave that "
                 "folder out, or name the cameras in another way."
             )
-        gaussians, facts = open_scene(source, progress), read_facts(source)
+        gaussians, facts = open_scene(source, progress), read_metadata(source)
         settings = TraceSettings(flip_normal_cos=facts.turned_beyond)
         return RenderSource(gaussians, settings, facts.near_world, trained_rad=facts.pixel_rad)
     config = read_config(source / CONFIG)
@@ -120,13 +120,13 @@ def read_render_source(
         config.evaluation_background,
         viewpoints,
         config.max_side,
-        read_facts(source).pixel_rad,
+        read_metadata(source).pixel_rad,
         learnt,
         photographs,
     )
 
 
-def requested_cameras(request: PictureRequest, source: RenderSource) -> tuple[RenderCamera, ...] | None:
+def requested_cameras(request: PictureRequest, source: RenderSource) -> tuple[PinholeCamera, ...] | None:
     """Return the cameras of a turntable, of a path or of a single image; None for the photographs' views.
 
     Raises:
@@ -140,7 +140,7 @@ def requested_cameras(request: PictureRequest, source: RenderSource) -> tuple[Re
         lens = PinholeLens(
             request.width_px,
             request.height_px,
-            lens_fov_y_degrees(request.fov_y_degrees, source.viewpoints),
+            choose_fov_y_degrees(request.fov_y_degrees, source.viewpoints),
         )
         orbit = Orbit(
             axis_named(request.up or "-y"),
@@ -201,7 +201,7 @@ def picture_output(
         ConfigError: one image is named for several shots, or a file is read.
         OutputError: a file is there and not by the verb.
     """
-    resumption = Resumption(request.resume, request.or_anew or request.overwrite, request.frames_folder)
+    resumption = ResumeOptions(request.resume, request.or_anew or request.overwrite, request.frames_folder)
     output = RenderOutput(request.output, request.frame_rate, request.format == "exr", resumption)
     output.check_count(len(shots))
     reads = [request.source, request.dataset, request.path_file, *inputs]

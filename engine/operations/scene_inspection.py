@@ -6,17 +6,17 @@ import numpy as np
 from jaxtyping import Float32, Float64
 
 from octasplat.engine.evaluate.scene_facts import HitFacts, SceneFacts, hit_facts, scene_facts
-from octasplat.engine.light.stage_scene import StageScene
-from octasplat.engine.render.jobs import turntable_cameras
+from octasplat.engine.pathtracing.stage_scene import StageScene
 from octasplat.engine.render.renderer import render_rays
-from octasplat.engine.surface.cameras import photograph_cameras
-from octasplat.engine.trace.make import make_tracer
+from octasplat.engine.render.shots import turntable_cameras
+from octasplat.engine.surface.depth_cameras import photograph_cameras
+from octasplat.engine.trace.factory import make_tracer
 
-SIDE_PX = 160
+PICTURE_SIDE_PX = 160
 
 
 @dataclass(frozen=True)
-class Found:
+class SceneInspection:
     """What is known of a scene.
 
     Attributes:
@@ -34,7 +34,7 @@ class Found:
     photographs: int | None
 
 
-def find_facts(scene: StageScene, up_world: Float64[np.ndarray, "3"] | None) -> Found:
+def inspect_scene(scene: StageScene, up_world: Float64[np.ndarray, "3"] | None) -> SceneInspection:
     """Look at a scene; ``up_world`` is what the user says of a file.
 
     Raises:
@@ -42,14 +42,14 @@ def find_facts(scene: StageScene, up_world: Float64[np.ndarray, "3"] | None) -> 
     """
     table = scene.turntable(up_world)
     if scene.photographs is None:
-        (camera,) = turntable_cameras(table, 1, SIDE_PX, SIDE_PX)
+        (camera,) = turntable_cameras(table, 1, PICTURE_SIDE_PX, PICTURE_SIDE_PX)
         image = camera.rays()
     else:
-        image = photograph_cameras(scene.photographs, np.array([0]), SIDE_PX)[0].rays()
+        image = photograph_cameras(scene.photographs, np.array([0]), PICTURE_SIDE_PX)[0].rays()
     tracer = make_tracer(scene.settings, threads=scene.threads)
     tracer.build(scene.gaussians)
     picture = render_rays(tracer, image, scene.background_srgb)
-    return Found(
+    return SceneInspection(
         scene_facts(scene.gaussians, table.up_world),
         hit_facts(tracer, image),
         table.up_world,

@@ -7,9 +7,9 @@ from pathlib import Path
 from octasplat.engine.edit.changed_run import check_new_run
 from octasplat.engine.errors import ConfigError
 from octasplat.engine.events import Listener, StageProgress
-from octasplat.engine.files import read_facts
+from octasplat.engine.files import read_metadata
 from octasplat.engine.gaussians.model import FlatGaussians
-from octasplat.engine.operations.scenes import becomes_run, check_scenes, write_changed, write_scene
+from octasplat.engine.operations.scene_io import check_scenes, is_run_output, write_changed, write_scene
 from octasplat.engine.operations.sequence_request import SequenceRequest
 from octasplat.engine.operations.written_files import check_targets
 from octasplat.engine.writing import write_json
@@ -46,13 +46,13 @@ def targets_for(output: Path, sources: Sequence[Path]) -> tuple[Path, ...]:
     return tuple(targets)
 
 
-class Frames:
+class SceneSequence:
     """The scenes that are written for the meshes of a sequence, or the one scene of one mesh.
 
     Args:
         verb: what writes them.
         request: names the scene that is changed and the output; see :func:`targets_for`, and for one mesh
-            :func:`octasplat.engine.operations.scenes.becomes_run`.
+            :func:`octasplat.engine.operations.scene_io.is_run_output`.
         meshes: those that each make a scene.
         inputs: what else is read.
 
@@ -72,7 +72,7 @@ class Frames:
         source, output = request.source, request.output
         reads, reports = [source, *meshes, *inputs], [] if request.report is None else [request.report]
         self._source = source
-        self._is_run = len(meshes) == 1 and becomes_run(source, output)
+        self._is_run = len(meshes) == 1 and is_run_output(source, output)
         if self._is_run:
             check_new_run(output)
             self._targets: tuple[Path, ...] = (output,)
@@ -99,7 +99,7 @@ class Frames:
             self.files, self.folder = written.files, written.folder
             return written.sentence
         self.files = (*self.files, target)
-        return write_scene(gaussians, read_facts(self._source), target, progress, warn=number == 0)
+        return write_scene(gaussians, read_metadata(self._source), target, progress, warn=number == 0)
 
     def tell(self, number: int, progress: Listener) -> None:
         """Tell that the scene of the mesh with this number is written, where there are several."""

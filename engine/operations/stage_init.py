@@ -11,8 +11,8 @@ from octasplat.engine.errors import OutputError
 from octasplat.engine.events import Listener, ignore
 from octasplat.engine.fields import DatasetFolder, Output, Source
 from octasplat.engine.operations.axes import Axis, axis_named
-from octasplat.engine.operations.base import Operation, Options, Result, WritingRequest, never, stop_if
-from octasplat.engine.operations.pictures import Point
+from octasplat.engine.operations.base import Operation, Options, Result, WritingRequest, never_stop, stop_if
+from octasplat.engine.operations.render_options import Point
 
 
 class StageInitOptions(Options):
@@ -61,7 +61,7 @@ def run(
     request: StageInitRequest,
     *,
     progress: Listener = ignore,
-    should_stop: Callable[[], bool] = never,
+    should_stop: Callable[[], bool] = never_stop,
     threads: int = 0,
 ) -> StageInitResult:
     """Write a first stage; see :class:`octasplat.engine.operations.base.Run`.
@@ -70,18 +70,18 @@ def run(
         OutputError: there is such a file already, or it cannot be written.
         OctasplatError: the scene cannot be read.
     """
-    from octasplat.engine.light.stage_file import write_first_stage
-    from octasplat.engine.light.stage_scene import first_stage_facts
     from octasplat.engine.operations.render_source import open_stage_scene
     from octasplat.engine.operations.written_files import check_targets
+    from octasplat.engine.pathtracing.stage.stage_file import write_stage_template
+    from octasplat.engine.pathtracing.stage_scene import first_stage_layout
 
     output: Path = request.output
     check_targets("stage-init", [output], [request.source, request.dataset], overwrite=request.overwrite)
     scene = open_stage_scene(request.source, progress, dataset=request.dataset, threads=threads)
-    facts = first_stage_facts(scene, None if request.up is None else axis_named(request.up))
+    facts = first_stage_layout(scene, None if request.up is None else axis_named(request.up))
     stop_if(should_stop)
     try:
-        write_first_stage(output, facts)
+        write_stage_template(output, facts)
     except OSError as error:
         raise OutputError(f"Cannot write {output}: {error.strerror or error}.") from error
     return StageInitResult(files=(output,), up=facts.up, has_floor=facts.has_floor)

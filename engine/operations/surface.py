@@ -20,17 +20,17 @@ from octasplat.engine.errors import OutputError
 from octasplat.engine.events import Listener, ignore
 from octasplat.engine.fields import DatasetFolder, Output, Source, Spelling
 from octasplat.engine.operations.axes import Axis, light_up
-from octasplat.engine.operations.base import Operation, Options, Result, WritingRequest, never
+from octasplat.engine.operations.base import Operation, Options, Result, WritingRequest, never_stop
 from octasplat.engine.surface.options import ExtractionOptions
 
 if TYPE_CHECKING:
+    from octasplat.engine.surface.colour_fit import Picture
     from octasplat.engine.surface.extract import ExtractedSurface
-    from octasplat.engine.surface.fitting import Picture
 
 MATERIAL_DEFAULTS: Mapping[str, object] = {"texture_size": 1024, "max_triangles": 60_000}
 """With materials, where nothing else is said."""
 
-ROOM: Mapping[str, object] = {
+ROOM_DEFAULTS: Mapping[str, object] = {
     "unbounded": True,
     "unseen": "solid",
     "backdrop": True,
@@ -110,7 +110,7 @@ class SurfaceOptions(ExtractionOptions, Options):
         if not isinstance(given, Mapping):
             return given
         given = renamed_settings.with_new_names((cls,), given)
-        room = ROOM if _is_on(given.get("room", False)) else {}
+        room = ROOM_DEFAULTS if _is_on(given.get("room", False)) else {}
         materials = MATERIAL_DEFAULTS if _is_on(given.get("materials", False)) else {}
         return {**room, **materials, **given}
 
@@ -188,7 +188,7 @@ class SurfaceLevel(Result):
         volume = f"{self.volume_bytes / 1e6:,.0f} MB of volume"
         return (
             f"{self.triangles:,} triangles, {closed}; voxels of {voxel}, {volume}{holes}.",
-            *_written(self.files),
+            *_file_lines(self.files),
         )
 
 
@@ -205,7 +205,7 @@ class SurfaceResult(Result):
 
     def lines(self) -> tuple[str, ...]:
         """Return what the meshes are like, and all files with their sizes."""
-        light = () if self.environment is None else _written((self.environment,))
+        light = () if self.environment is None else _file_lines((self.environment,))
         return (*(line for level in self.levels for line in level.lines()), *light)
 
 
@@ -213,7 +213,7 @@ def run(
     request: SurfaceRequest,
     *,
     progress: Listener = ignore,
-    should_stop: Callable[[], bool] = never,
+    should_stop: Callable[[], bool] = never_stop,
     threads: int = 0,
 ) -> SurfaceResult:
     """Extract a surface and write it; see :class:`octasplat.engine.operations.base.Run`.
@@ -227,14 +227,14 @@ def run(
     """
     from octasplat.engine.files import check_surface_path, surface_files, write_surface
     from octasplat.engine.gaussians.materials import require_materials
-    from octasplat.engine.operations.scenes import open_scene
-    from octasplat.engine.operations.surface_inputs import camera_views
+    from octasplat.engine.operations.scene_io import open_scene
+    from octasplat.engine.operations.surface_inputs import depth_cameras
     from octasplat.engine.operations.written_files import check_targets
     from octasplat.engine.run_folder import SCENE, is_run
     from octasplat.engine.shading.environment_frame import environment_frame
+    from octasplat.engine.surface.bake_materials import material_features
     from octasplat.engine.surface.extract import extract_levels
-    from octasplat.engine.surface.materials import material_features
-    from octasplat.engine.trace.make import make_tracer
+    from octasplat.engine.trace.factory import make_tracer
 
     source, output = request.source, request.output
     is_textured = request.texture_size is not None
@@ -255,7 +255,7 @@ def run(
         require_materials(gaussians, source / SCENE if is_run(source) else source)
         features, frame = material_features(gaussians), environment_frame(light_up(source, request.up))
         light = _light_to_copy(source, output)
-    cameras, settings = camera_views(source, request.dataset, gaussians, request.depth_side)
+    cameras, settings = depth_cameras(source, request.dataset, gaussians, request.depth_side)
     try:
         output.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -277,7 +277,7 @@ def run(
         _level(surface, write_surface(surface.mesh, place))
         for surface, place in zip(surfaces, request.outputs, strict=True)
     )
-    environment = None if light is None else _copied(light, output)
+    environment = None if light is None else _copy_light(light, output)
     files = (*(path for level in levels for path in level.files), *([environment] if environment else []))
     return SurfaceResult(files=files, folder=output.parent, levels=levels, environment=environment)
 
@@ -295,7 +295,7 @@ def _level(extracted: "ExtractedSurface", files: tuple[Path, ...]) -> SurfaceLev
         files=files,
         triangles=len(extracted.mesh.faces),
         open_edges=extracted.edges.open_edges,
-        is_watertight=extracted.edges.watertight,
+        is_watertight=extracted.edges.is_watertight,
         voxel_world=extracted.region.voxel_world,
         is_contracted=extracted.region.contracted,
         holes_closed=extracted.holes_closed,
@@ -303,7 +303,7 @@ def _level(extracted: "ExtractedSurface", files: tuple[Path, ...]) -> SurfaceLev
     )
 
 
-def _written(files: tuple[Path, ...]) -> tuple[str, ...]:
+def _file_lines(files: tuple[Path, ...]) -> tuple[str, ...]:
     return tuple(f"Wrote {path} ({path.stat().st_size / 1e6:.1f} MB)." for path in files)
 
 
@@ -327,7 +327,7 @@ def _light_to_copy(source: Path, output: Path) -> Path | None:
     )
 
 
-def _copied(light: Path, output: Path) -> Path:
+def _copy_light(light: Path, output: Path) -> Path:
     """Copy the environment beside the output; return its new place."""
     from octasplat.engine.writing import replacing
 

@@ -8,12 +8,14 @@ from jaxtyping import UInt8
 
 from octasplat.engine.colour import to_bytes
 from octasplat.engine.config import read_config
+from octasplat.engine.dataset import Dataset, load_dataset_model
+from octasplat.engine.dataset.views_file import ViewsRecord, read_views
 from octasplat.engine.errors import DatasetError
 from octasplat.engine.events import Listener, Noted, Warned
-from octasplat.engine.files import read_facts
+from octasplat.engine.files import read_metadata
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.rays import ImageRays
-from octasplat.engine.render.cameras import RenderCamera
+from octasplat.engine.render.pinhole_camera import PinholeCamera
 from octasplat.engine.run_folder import (
     CONFIG,
     VIEWS,
@@ -25,17 +27,15 @@ from octasplat.engine.run_folder import (
     run_near_world,
     run_viewpoints,
 )
-from octasplat.engine.scene import Dataset, load_scene
-from octasplat.engine.scene.views_file import ViewsRecord, read_views
 from octasplat.engine.shading.exposure import Exposures
-from octasplat.engine.surface.cameras import cameras_around, photograph_cameras
-from octasplat.engine.surface.fitting import Picture
+from octasplat.engine.surface.colour_fit import Picture
+from octasplat.engine.surface.depth_cameras import cameras_around, photograph_cameras
 from octasplat.engine.trace.protocol import TraceSettings
 
 
-def camera_views(
+def depth_cameras(
     source: Path, dataset: Path | None, gaussians: FlatGaussians, side_px: int
-) -> tuple[tuple[RenderCamera, ...], TraceSettings]:
+) -> tuple[tuple[PinholeCamera, ...], TraceSettings]:
     """Return the cameras to render depth from, and the settings of the tracer.
 
     Args:
@@ -54,17 +54,17 @@ def camera_views(
         settings = read_config(source / CONFIG).train.trace
         near_world = run_near_world(source, seen)
         return photograph_cameras(seen, seen.train_indices, side_px, near_world), settings
-    facts = read_facts(source)
+    facts = read_metadata(source)
     settings = TraceSettings(flip_normal_cos=facts.turned_beyond)
     if dataset is not None:
-        photographs = load_scene(dataset)
+        photographs = load_dataset_model(dataset)
         every = np.arange(len(photographs.views))
         return photograph_cameras(photographs, every, side_px, facts.near_world), settings
     return cameras_around(gaussians, side_px), settings
 
 
 def training_photographs(
-    source: Path, dataset: Path | None, threads: int, listener: Listener, *, copy: Path | None = None
+    source: Path, dataset: Path | None, threads: int, progress: Listener, *, copy: Path | None = None
 ) -> tuple[Picture, ...]:
     """Return the training photographs of a run, all as exposed as the scene.
 
@@ -72,7 +72,7 @@ def training_photographs(
         source: the folder of a run, or a file of Gaussians, which has none.
         dataset: the folder of the photographs; None takes the one that the run was made from.
         threads: for decoding; 0 takes all cores.
-        listener: hears the progress, and why there are none.
+        progress: hears the progress, and why there are none.
         copy: another folder of the photographs that the run was made from.
 
     Returns:
@@ -92,17 +92,17 @@ def training_photographs(
     try:
         folder, model = photographs_folder(source, dataset or copy), found_model(source)
     except DatasetError as error:
-        listener(Noted(f"{instead}. {error}"))
+        progress(Noted(f"{instead}. {error}"))
         return ()
     try:
-        accept = partial(_check_world, source, folder)
+        accept = partial(_check_same_poses, source, folder)
         opened = open_photographs(
-            folder, source, config, threads, listener, model_folder=model, accept=accept
+            folder, source, config, threads, progress, model_folder=model, accept=accept
         )
     except DatasetError as error:
         if dataset is not None:
             raise
-        listener(Warned(f"{instead}. {error}"))
+        progress(Warned(f"{instead}. {error}"))
         return ()
     exposures = None
     if (known := run_exposures(source)) is not None:
@@ -110,7 +110,7 @@ def training_photographs(
     return tuple(partial(_photograph, opened, exposures, index) for index in opened.train_indices.tolist())
 
 
-def _check_world(source: Path, folder: Path, found: ViewsRecord) -> None:
+def _check_same_poses(source: Path, folder: Path, found: ViewsRecord) -> None:
     """Make sure that photographs have the poses that a run was made with, as far as it keeps them.
 
     Raises:

@@ -16,7 +16,7 @@ from octasplat.engine.operations.base import (
     Options,
     SceneRequest,
     ScenesWritten,
-    never,
+    never_stop,
     options_of,
     stop_if,
 )
@@ -64,7 +64,7 @@ class TransformOptions(Options):
         Raises:
             ConfigError: the file of the matrix cannot be read.
         """
-        from octasplat.engine.edit import affine
+        from octasplat.engine.gaussians import affine
 
         turns = np.eye(4)
         if self.up is not None:
@@ -73,7 +73,7 @@ class TransformOptions(Options):
             turns = affine.scaling(np.full(3, self.scale)) @ turns
         for axis, degrees in self.rotate:
             turns = affine.rotation(affine.AXES[axis], degrees) @ turns
-        whole = affine.about(turns, np.array(self.about))
+        whole = affine.conjugate_by_point(turns, np.array(self.about))
         if self.matrix is not None:
             whole = whole @ affine.read_matrix(self.matrix)
         if self.translate is not None:
@@ -105,7 +105,7 @@ def run(
     request: TransformRequest,
     *,
     progress: Listener = ignore,
-    should_stop: Callable[[], bool] = never,
+    should_stop: Callable[[], bool] = never_stop,
     threads: int = 0,
 ) -> TransformResult:
     """Move, turn, scale or shear a scene; see :class:`octasplat.engine.operations.base.Run`.
@@ -114,14 +114,14 @@ def run(
         ConfigError: the matrix cannot be read or flattens space.
         SceneFileError: the scene cannot be read or written.
     """
-    from octasplat.engine.edit.affine import mean_stretch, transform
-    from octasplat.engine.files import read_facts
-    from octasplat.engine.operations.scenes import check_changed, edit_note, open_scene, write_changed
+    from octasplat.engine.files import read_metadata
+    from octasplat.engine.gaussians.affine import mean_scale, transform_gaussians
+    from octasplat.engine.operations.scene_io import check_changed, edit_note, open_scene, write_changed
 
     source: Path = request.source
     check_changed("transform", request, request.output, [request.matrix])
     matrix = request.world_map()
-    moved = transform(open_scene(source, progress), matrix)
+    moved = transform_gaussians(open_scene(source, progress), matrix)
     stop_if(should_stop)
     rows = tuple(map(tuple, matrix.tolist()))
     written = write_changed(
@@ -130,7 +130,7 @@ def run(
         request.output,
         progress,
         note={**edit_note("transform", options_of(TransformOptions, request)), "world_map": rows},
-        facts=read_facts(source).scaled(mean_stretch(matrix)),
+        facts=read_metadata(source).scaled(mean_scale(matrix)),
         matrix=matrix,
     )
     return TransformResult(

@@ -6,7 +6,7 @@ or killed goes on where it was.
     (find poses ->) open the dataset (-> mend poses and lenses) -> train -> evaluate -> export
 """
 
-from octasplat.engine.pipeline.reconstruct import reconstruct
-from octasplat.engine.pipeline.run import Watcher
+from octasplat.engine.pipeline.reconstruction import reconstruct
+from octasplat.engine.pipeline.run import OnStep
 
-__all__ = ["Watcher", "reconstruct"]
+__all__ = ["OnStep", "reconstruct"]

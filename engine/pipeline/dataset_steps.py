@@ -1,8 +1,10 @@
 """The steps before the training: poses are found, and the dataset is opened."""
 
 from octasplat.engine.config import read_config
+from octasplat.engine.dataset import Dataset, write_held_out
+from octasplat.engine.dataset.views_file import write_views
 from octasplat.engine.pipeline.output_folder import write_config
-from octasplat.engine.pipeline.run import Run
+from octasplat.engine.pipeline.run import ReconstructionRun
 from octasplat.engine.run_folder import (
     CONFIG,
     HELD_OUT,
@@ -12,8 +14,6 @@ from octasplat.engine.run_folder import (
     run_scene,
 )
 from octasplat.engine.run_poses import find_missing_poses, free_lenses, place_misfits
-from octasplat.engine.scene import Dataset, write_held_out
-from octasplat.engine.scene.views_file import write_views
 from octasplat.engine.stages import stage
 from octasplat.engine.train.batches import BatchSource
 
@@ -23,11 +23,11 @@ class FindPoses:
 
     is_needed_later = True
 
-    def is_done(self, run: Run) -> bool:
+    def is_done(self, run: ReconstructionRun) -> bool:
         """Return False: what is there is looked at by the search itself."""
         return False
 
-    def __call__(self, run: Run) -> None:
+    def __call__(self, run: ReconstructionRun) -> None:
         """Find them."""
         find_missing_poses(run.scene, run.output, run.config, run.threads, run.progress, run.should_stop)
 
@@ -37,17 +37,17 @@ class OpenDataset:
 
     is_needed_later = True
 
-    def is_done(self, run: Run) -> bool:
+    def is_done(self, run: ReconstructionRun) -> bool:
         """Return False: each run opens its photographs, from a cache if it has one."""
         return False
 
-    def __call__(self, run: Run) -> None:
+    def __call__(self, run: ReconstructionRun) -> None:
         """Open them, and write down which they are."""
         output = run.output
-        run.dataset = _load(run)
+        run.dataset = _load_dataset(run)
         if run.recorded is None:
-            _mend(run)
-            write_views(output / VIEWS, run.dataset.record)
+            _repair_poses(run)
+            write_views(output / VIEWS, run.dataset.views_record)
         held_out = [run.dataset.views[i].name for i in run.dataset.test_indices]
         write_held_out(output / HELD_OUT, held_out)
         if run_scene(output) != run.scene.resolve() or read_config(output / CONFIG) != run.config:
@@ -55,15 +55,15 @@ class OpenDataset:
             write_config(run.scene, output, run.config)
 
 
-def _mend(run: Run) -> None:
+def _repair_poses(run: ReconstructionRun) -> None:
     """Mend poses and lenses that the photographs contradict; loads them anew where the model changed."""
     if place_misfits(run.dataset, run.output, run.config, run.threads, run.progress, run.should_stop):
-        run.dataset = _load(run)
+        run.dataset = _load_dataset(run)
     if free_lenses(run.dataset, run.output, run.config, run.progress, run.should_stop):
-        run.dataset = _load(run)
+        run.dataset = _load_dataset(run)
 
 
-def _load(run: Run) -> Dataset:
+def _load_dataset(run: ReconstructionRun) -> Dataset:
     with stage("load", run.progress):
         dataset = open_photographs(
             run.scene,

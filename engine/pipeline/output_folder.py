@@ -6,11 +6,11 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from octasplat.engine.config import ReconstructionConfig, read_config
+from octasplat.engine.dataset.colmap_model import has_colmap_model
 from octasplat.engine.errors import ConfigError, DatasetError, OutputError
-from octasplat.engine.poses.find import read_record
+from octasplat.engine.poses.find_poses import read_pose_record
 from octasplat.engine.relative_paths import normalised
 from octasplat.engine.run_folder import CACHE, CONFIG, EVENTS, POSES
-from octasplat.engine.scene.colmap import has_model
 from octasplat.engine.versions import versions
 from octasplat.engine.writing import write_json
 
@@ -34,7 +34,9 @@ def claim_output(scene: Path, output: Path, config: ReconstructionConfig, resume
             )
         _check_settings(scene, output, config)
         return False
-    if output.is_dir() and not _is_free(output, config.with_poses_decided(has_model(scene)).poses == "auto"):
+    if output.is_dir() and not _is_unclaimed(
+        output, config.with_poses_decided(has_colmap_model(scene)).poses == "auto"
+    ):
         raise OutputError(f"{output} is not empty and holds no run; name an empty or a new folder.")
     try:
         output.mkdir(parents=True, exist_ok=True)
@@ -49,7 +51,7 @@ def claim_output(scene: Path, output: Path, config: ReconstructionConfig, resume
 
 
 @contextmanager
-def freed_if_refused(output: Path, *, is_new: bool, is_made: bool) -> Iterator[None]:
+def release_on_refusal(output: Path, *, is_new: bool, is_made: bool) -> Iterator[None]:
     """Free the folder of a new run if its photographs or settings are refused, for the corrected command.
 
     The decoded photographs stay, and poses that were found: the corrected command goes on with them.
@@ -65,7 +67,7 @@ def freed_if_refused(output: Path, *, is_new: bool, is_made: bool) -> Iterator[N
         if is_new:
             (output / CONFIG).unlink()
             (output / EVENTS).unlink()
-            if not _were_found(output / POSES):
+            if not _is_from_pose_search(output / POSES):
                 shutil.rmtree(output / POSES, ignore_errors=True)
             if is_made:
                 with suppress(OSError):  # it holds something
@@ -73,23 +75,23 @@ def freed_if_refused(output: Path, *, is_new: bool, is_made: bool) -> Iterator[N
         raise
 
 
-def _is_free(output: Path, finds_poses: bool) -> bool:
+def _is_unclaimed(output: Path, finds_poses: bool) -> bool:
     """Return whether a folder holds nothing, or only what a start that was refused has left."""
     for path in output.iterdir():
         if path.name == CACHE and path.is_dir():
             if not all(file.suffix in (".bin", ".json") for file in path.iterdir()):
                 return False
         elif path.name == POSES and finds_poses:
-            if not _were_found(path):
+            if not _is_from_pose_search(path):
                 return False
         elif not path.name.startswith("."):
             return False
     return True
 
 
-def _were_found(poses: Path) -> bool:
+def _is_from_pose_search(poses: Path) -> bool:
     """Return whether poses are those of a search, which says of which photographs they are."""
-    return "photographs_sha256" in read_record(poses)
+    return "photographs_sha256" in read_pose_record(poses)
 
 
 def write_config(scene: Path, output: Path, config: ReconstructionConfig) -> None:
@@ -104,7 +106,7 @@ def write_config(scene: Path, output: Path, config: ReconstructionConfig) -> Non
 
 def _check_settings(scene: Path, output: Path, config: ReconstructionConfig) -> None:
     """Refuse settings that are not the run's, but for the files to export."""
-    is_posed = has_model(scene)
+    is_posed = has_colmap_model(scene)
     before = read_config(output / CONFIG).model_copy(update={"exports": config.exports})
     if _comparable(before, is_posed) != _comparable(config, is_posed):
         raise ConfigError(

@@ -3,40 +3,40 @@
 from octasplat.engine.errors import ExportFailed
 from octasplat.engine.evaluate.runs import measure_run
 from octasplat.engine.events import StageProgress, Warned
-from octasplat.engine.files import ExportOptions, export_losses, read_facts
+from octasplat.engine.files import ExportOptions, dropped_on_export, read_metadata
+from octasplat.engine.files.export_batch import export_batch, targets_with_known_format
 from octasplat.engine.files.gaussian_ply import read_gaussian_ply
-from octasplat.engine.files.several import export_files, known_targets
-from octasplat.engine.pipeline.run import Run
+from octasplat.engine.pipeline.run import ReconstructionRun
 from octasplat.engine.plain_colours import PlainScene
 from octasplat.engine.run_folder import METRICS, REPORT, SCENE, not_exported
 from octasplat.engine.stages import stage
 
 
-class Evaluate:
+class EvaluateStep:
     """Measure the held-out views; files are exported even if that fails."""
 
     is_needed_later = False
 
-    def is_done(self, run: Run) -> bool:
+    def is_done(self, run: ReconstructionRun) -> bool:
         """Return whether the measurements and the report are there."""
         return (run.output / METRICS).exists() and (run.output / REPORT).exists()
 
-    def __call__(self, run: Run) -> None:
+    def __call__(self, run: ReconstructionRun) -> None:
         """Measure them."""
         with stage("evaluate", run.progress, len(run.dataset.test_indices)):
             measure_run(run.dataset, run.output, run.config, run.threads, run.progress)
 
 
-class Export:
+class ExportStep:
     """Write the files that are missing, all that can be written."""
 
     is_needed_later = True
 
-    def is_done(self, run: Run) -> bool:
+    def is_done(self, run: ReconstructionRun) -> bool:
         """Return False: the stage is told even if all files are there."""
         return False
 
-    def __call__(self, run: Run) -> None:
+    def __call__(self, run: ReconstructionRun) -> None:
         """Write them.
 
         Raises:
@@ -49,13 +49,13 @@ class Export:
             raise ExportFailed(f"{failed} Everything else is there.")
 
 
-def _export(run: Run, names: list[str]) -> str | None:
+def _export(run: ReconstructionRun, names: list[str]) -> str | None:
     """Write files; returns what could not be written and why."""
     output, progress = run.output, run.progress
     gaussians, _ = read_gaussian_ply(output / SCENE)
     if (left_out := not_exported(output)) is not None:
         progress(Warned(left_out))
-    options = ExportOptions(q=run.config.train.trace.q, facts=read_facts(output))
+    options = ExportOptions(q=run.config.train.trace.q, facts=read_metadata(output))
     plain = PlainScene(
         gaussians,
         output,
@@ -64,9 +64,9 @@ def _export(run: Run, names: list[str]) -> str | None:
         on_unknown=lambda text: progress(Warned(text)),
     )
     targets = [output / name for name in names]
-    for lost in export_losses(gaussians, known_targets(targets)):
+    for lost in dropped_on_export(gaussians, targets_with_known_format(targets)):
         progress(Warned(lost))
-    _, failed = export_files(
+    _, failed = export_batch(
         targets,
         lambda exporter: (gaussians if exporter.holds_harmonics else plain.gaussians, options),
         on_done=lambda done: progress(StageProgress("export", done, len(names))),

@@ -7,19 +7,19 @@ from pathlib import Path
 from typing import Protocol, runtime_checkable
 
 from octasplat.engine.config import ReconstructionConfig
+from octasplat.engine.dataset import Dataset
+from octasplat.engine.dataset.views_file import ViewsRecord
 from octasplat.engine.errors import Cancelled, ExportFailed
 from octasplat.engine.events import Listener
-from octasplat.engine.scene import Dataset
-from octasplat.engine.scene.views_file import ViewsRecord
 from octasplat.engine.shading.protocol import ShadingModel
 from octasplat.engine.trace.protocol import Tracer
 
-Watcher = Callable[[int, Dataset, Tracer, ShadingModel], None]
+OnStep = Callable[[int, Dataset, Tracer, ShadingModel], None]
 """Called between two iterations of a training: iterations done, photographs, tracer and shading."""
 
 
 @dataclass
-class Run:
+class ReconstructionRun:
     """What the steps of a run share.
 
     Attributes:
@@ -41,7 +41,7 @@ class Run:
     threads: int
     progress: Listener
     should_stop: Callable[[], bool]
-    on_step: Watcher | None = None
+    on_step: OnStep | None = None
     recorded: ViewsRecord | None = None
     accept: Callable[[ViewsRecord], None] | None = None
     _dataset: Dataset | None = None
@@ -67,14 +67,14 @@ class Step(Protocol):
 
     is_needed_later: bool
 
-    def is_done(self, run: Run) -> bool:
+    def is_done(self, run: ReconstructionRun) -> bool:
         """Return whether its result is there."""
 
-    def __call__(self, run: Run) -> None:
+    def __call__(self, run: ReconstructionRun) -> None:
         """Make its result."""
 
 
-def run_steps(steps: Sequence[Step], run: Run) -> None:
+def run_steps(steps: Sequence[Step], run: ReconstructionRun) -> None:
     """Do all steps whose results are missing; if one fails without which the others can go on, they do.
 
     Raises:

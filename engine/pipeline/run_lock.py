@@ -9,11 +9,11 @@ from pathlib import Path
 
 from octasplat.engine.errors import OutputError
 
-_HELD = frozenset({errno.EAGAIN, errno.EACCES})
+_LOCKED_MESSAGE = frozenset({errno.EAGAIN, errno.EACCES})
 
 
 @contextmanager
-def held_alone(output: Path) -> Iterator[None]:
+def lock_run_folder(output: Path) -> Iterator[None]:
     """Hold the folder of a run until the block ends; the end of the process frees it, too.
 
     A file system that has no locks goes without.
@@ -26,7 +26,7 @@ def held_alone(output: Path) -> Iterator[None]:
         try:
             fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError as error:
-            if error.errno in _HELD:
+            if error.errno in _LOCKED_MESSAGE:
                 raise OutputError(
                     f"Another octasplat works on the run in {output}; wait for it or stop it, or name "
                     "another folder."

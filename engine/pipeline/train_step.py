@@ -7,14 +7,17 @@ import numpy as np
 from jaxtyping import Float64
 
 from octasplat.engine.config import ReconstructionConfig
+from octasplat.engine.dataset import Dataset
+from octasplat.engine.dataset.camera_clearance import CameraClearance, camera_clearances
+from octasplat.engine.dataset.view_frusta import ViewFrusta
 from octasplat.engine.events import Listener, Warned
 from octasplat.engine.files.gaussian_ply import write_gaussian_ply
-from octasplat.engine.gaussians.materials import reflective_share
+from octasplat.engine.gaussians.materials import reflective_fraction
 from octasplat.engine.gaussians.model import FlatGaussians
-from octasplat.engine.gaussians.scene_facts import SceneFacts
-from octasplat.engine.pipeline.run import Run
-from octasplat.engine.render.environment_map import write_background, write_environment
-from octasplat.engine.render.jobs import trained_pixel_rad
+from octasplat.engine.gaussians.scene_metadata import SceneMetadata
+from octasplat.engine.pipeline.run import ReconstructionRun
+from octasplat.engine.render.environment_files import write_background, write_environment
+from octasplat.engine.render.shots import training_pixel_angle
 from octasplat.engine.run_folder import (
     BACKGROUND,
     CHECKPOINTS,
@@ -24,9 +27,6 @@ from octasplat.engine.run_folder import (
     SCENE,
     TRAINING,
 )
-from octasplat.engine.scene import Dataset
-from octasplat.engine.scene.near import NearZones, nearest_distances
-from octasplat.engine.scene.seen import SeenSpace
 from octasplat.engine.shading.protocol import ShadingModel
 from octasplat.engine.stages import StageClock, stage
 from octasplat.engine.threads import use_threads
@@ -42,20 +42,20 @@ from octasplat.engine.train.trainer import Trainer
 from octasplat.engine.train.within import make_plan, read_plan, write_plan
 from octasplat.engine.writing import write_json
 
-LEAST_REFLECTIVE = 0.01
+MIN_REFLECTIVE_SHARE = 0.01
 """Share of the surface that must reflect for materials and the environment to be more than guesses."""
 
 
-class Train:
+class TrainStep:
     """Train the scene; goes on from the newest checkpoint."""
 
     is_needed_later = True
 
-    def is_done(self, run: Run) -> bool:
+    def is_done(self, run: ReconstructionRun) -> bool:
         """Return whether the scene is there."""
         return (run.output / SCENE).exists()
 
-    def __call__(self, run: Run) -> None:
+    def __call__(self, run: ReconstructionRun) -> None:
         """Train, and write the scene after everything else."""
         dataset, config = run.dataset, run.config
         steps = 0
@@ -63,28 +63,31 @@ class Train:
             steps = iteration_count(config.train, dataset.train_pixel_count, shown_share(dataset))
         with stage("train", run.progress, steps) as clock:
             gaussians = _train(run, clock)
-            facts = SceneFacts(
+            facts = SceneMetadata(
                 near_world=dataset.near_world,
-                pixel_rad=trained_pixel_rad(dataset.viewpoints),
+                pixel_rad=training_pixel_angle(dataset.viewpoints),
                 turned_beyond=config.train.trace.flip_normal_cos,
             )
             write_gaussian_ply(gaussians, run.output / SCENE, facts=facts)
 
 
-def _train(run: Run, clock: StageClock) -> FlatGaussians:
-    config = _planned(run.dataset, run.output, run.config, run.threads, run.should_stop, clock)
-    nearest_world = nearest_distances(run.dataset.viewpoints, run.dataset.points)
+def _train(run: ReconstructionRun, clock: StageClock) -> FlatGaussians:
+    config = _plan_settings(run.dataset, run.output, run.config, run.threads, run.should_stop, clock)
+    nearest_world = camera_clearances(run.dataset.viewpoints, run.dataset.points)
     trainer = _trainer(run, config, nearest_world, clock)
     gaussians = trainer.run()
-    _write_surroundings(trainer.shading, gaussians, run.output, run.progress)
-    _write_record(
+    _write_learnt_light(trainer.shading, gaussians, run.output, run.progress)
+    _write_training_record(
         trainer, run.dataset, nearest_world, clock, run.output, keeps_near_free=config.camera_clearance > 0
     )
     return gaussians
 
 
 def _trainer(
-    run: Run, config: TrainConfig, nearest_world: Float64[np.ndarray, " views"], clock: StageClock
+    run: ReconstructionRun,
+    config: TrainConfig,
+    nearest_world: Float64[np.ndarray, " views"],
+    clock: StageClock,
 ) -> Trainer:
     """The training as it begins, or as its newest checkpoint left it."""
     dataset, progress, folder = run.dataset, run.progress, run.output / CHECKPOINTS
@@ -98,8 +101,10 @@ def _trainer(
         state.seconds = clock.seconds()
     else:
         clock.add(state.seconds)
-    zones = NearZones.of(dataset.viewpoints, config.camera_clearance * nearest_world, dataset.train_indices)
-    seen = SeenSpace.of(dataset.viewpoints, dataset.train_indices)
+    zones = CameraClearance.from_views(
+        dataset.viewpoints, config.camera_clearance * nearest_world, dataset.train_indices
+    )
+    seen = ViewFrusta.from_views(dataset.viewpoints, dataset.train_indices)
     trainer: Trainer = Trainer(
         dataset,
         config,
@@ -119,14 +124,14 @@ def _trainer(
     return trainer
 
 
-def _write_surroundings(
+def _write_learnt_light(
     shading: ShadingModel, gaussians: FlatGaussians, output: Path, progress: Listener
 ) -> None:
     """Write the environment and the background that were learnt, if they were."""
     if (deferred := deferred_of(shading)) is not None:
         for name in (EXACT_ENVIRONMENT, ENVIRONMENT):
             write_environment(output / name, deferred.light.radiance_linear)
-        if reflective_share(gaussians) < LEAST_REFLECTIVE:
+        if reflective_fraction(gaussians) < MIN_REFLECTIVE_SHARE:
             progress(
                 Warned(
                     "Nothing was seen that reflects its surroundings clearly: metallic, roughness and the "
@@ -137,7 +142,7 @@ def _write_surroundings(
         write_background(output / BACKGROUND, background.rgb_srgb)
 
 
-def _write_record(
+def _write_training_record(
     trainer: Trainer,
     dataset: Dataset,
     nearest_world: Float64[np.ndarray, " views"],
@@ -166,12 +171,12 @@ def _write_record(
 def _scale_floor(dataset: Dataset, config: TrainConfig) -> ScaleFloor | None:
     if config.min_scale_px == 0:
         return None
-    pixel_rad = trained_pixel_rad(dataset.viewpoints)
+    pixel_rad = training_pixel_angle(dataset.viewpoints)
     origins = np.stack([dataset.views[i].origin_world for i in dataset.train_indices.tolist()])
     return ScaleFloor(origins, config.min_scale_px * pixel_rad)
 
 
-def _planned(
+def _plan_settings(
     dataset: Dataset,
     output: Path,
     settings: ReconstructionConfig,

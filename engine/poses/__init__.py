@@ -3,8 +3,15 @@
 And for those of a given model that stand in the wrong place, or whose lens moved.
 """
 
-from octasplat.engine.poses.config import Given, PosesConfig
-from octasplat.engine.poses.find import adjust_lenses, find_poses, place_doubtful
-from octasplat.engine.poses.lens_doubt import lens_is_in_doubt
+from octasplat.engine.poses.config import GivenModel, PosesConfig
+from octasplat.engine.poses.find_poses import adjust_principal_points, find_poses, repair_poses
+from octasplat.engine.poses.lens_check import needs_per_view_principal_points
 
-__all__ = ["Given", "PosesConfig", "adjust_lenses", "find_poses", "lens_is_in_doubt", "place_doubtful"]
+__all__ = [
+    "GivenModel",
+    "PosesConfig",
+    "adjust_principal_points",
+    "find_poses",
+    "needs_per_view_principal_points",
+    "repair_poses",
+]

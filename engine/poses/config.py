@@ -8,34 +8,34 @@ from pydantic import BaseModel, ConfigDict, Field
 from octasplat.engine.fields import ADVANCED, Unit
 from octasplat.engine.settings import Settings
 
-FEATURES, MATCHES, STAGE = "features", "matches", "poses"
+FEATURES, MATCHES, MAPPING_STAGE = "features", "matches", "poses"
 """The stages of the search."""
-PLACING = "placing"
+PLACING_STAGE = "placing"
 """The last stage where poses are given, and only those in doubt are asked."""
-LENSES = "lenses"
+LENSES_STAGE = "lenses"
 """The only stage where a model's lenses are adjusted."""
-RECORD = "poses.json"
+RECORD_FILE = "poses.json"
 """What was found, and for which photographs; beside the model's files."""
-FOUND = "found"
+FOUND_FOLDER = "found"
 """The model's folder, while it lies below the one for the work."""
 MIN_PHOTOGRAPHS = 3
 MAX_IMAGE_SIDE_PX = 1600
 """Size at most to which photographs are shrunk before features are looked for."""
 MAX_FEATURES = 4096
 """Of a photograph; a second search takes twice as many, and fainter ones."""
-QUICK_FEATURES = 511
+PRESELECTION_FEATURES = 511
 """Of a photograph, for the quick look that says which pairs are alike."""
-QUICK_MATCHES = 12
+PRESELECTION_MATCHES = 12
 """By which two photographs are alike."""
-AGAIN_BELOW = 0.9
+RETRY_BELOW_SHARE = 0.9
 """Share of placed photographs below which a large set, too, is searched a second time."""
 MAX_REPROJECTION_PX = 2.5
 """Mean error above which the result is not trusted."""
 MIN_POINTS = 100
 """Sparse points below which it is not either."""
-WITNESSES = 100
+MAX_WITNESSES = 100
 """Photographs in all that one is matched with where its pose does not fit the first ones."""
-AGREEMENT_PX = 1.5
+INLIER_DISTANCE_PX = 1.5
 """Distance at which a match agrees with a pose, at the size at which features are looked for."""
 
 
@@ -75,8 +75,8 @@ class PosesConfig(Settings):
 DEFAULT_CONFIG = PosesConfig()
 
 
-class Given(BaseModel):
-    """A model of which some poses may be wrong: see :func:`octasplat.engine.poses.misplaced.place_misplaced`.
+class GivenModel(BaseModel):
+    """A model of which some poses may be wrong: see :func:`octasplat.engine.poses.pose_repair.repair_misplaced`.
 
     Attributes:
         model: folder of the COLMAP model.
@@ -91,11 +91,11 @@ class Given(BaseModel):
     doubtful: tuple[int, ...]
 
 
-class Request(BaseModel):
+class PoseSearchRequest(BaseModel):
     """What the process in which COLMAP works is asked.
 
-    With ``given`` see :mod:`octasplat.engine.poses.misplaced`; with the folder of a model, ``lenses_of``, see
-    :mod:`octasplat.engine.poses.lenses`; without either :class:`octasplat.engine.poses.search.Search`.
+    With ``given`` see :mod:`octasplat.engine.poses.pose_repair`; with the folder of a model, ``lenses_of``, see
+    :mod:`octasplat.engine.poses.principal_points`; without either :class:`octasplat.engine.poses.search.PoseSearch`.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -105,5 +105,5 @@ class Request(BaseModel):
     work: Path
     config: PosesConfig
     threads: int
-    given: Given | None = None
+    given: GivenModel | None = None
     lenses_of: Path | None = None

@@ -15,30 +15,30 @@ import pycolmap
 from octasplat.engine.poses.config import (
     MAX_FEATURES,
     MAX_IMAGE_SIDE_PX,
-    QUICK_FEATURES,
-    QUICK_MATCHES,
+    PRESELECTION_FEATURES,
+    PRESELECTION_MATCHES,
     PosesConfig,
 )
 from octasplat.engine.poses.pairs import (
     Pair,
     all_pairs,
-    chosen_pairs,
-    in_batches,
+    batch_pairs,
     largest_features,
+    select_pairs,
 )
 
-Counted = Callable[[int], None]
+OnCount = Callable[[int], None]
 """Told how many are done."""
 
-_PHOTOGRAPHS_AT_ONCE = 4
-_PAIRS_AT_ONCE = 64
-_QUICK_PAIRS_AT_ONCE = 2048
-_FEWEST_QUICK = 4
-_LESS_CLEAR_RATIO = 0.9
+_PHOTOGRAPHS_PER_BATCH = 4
+_PAIRS_PER_BATCH = 64
+_PRESELECTION_PAIRS_PER_BATCH = 2048
+_MIN_PRESELECTION_PHOTOGRAPHS = 4
+_RELAXED_MATCH_RATIO = 0.9
 """A match may be so near in distance to the second best one; otherwise 0.8."""
 
 
-def make_database(
+def create_database(
     database: Path, photographs: Path, names: Sequence[str], *, one_camera: bool
 ) -> tuple[str, ...]:
     """Make a database of photographs, without features.
@@ -54,17 +54,17 @@ def make_database(
         and gives their numbers to those that follow.
     """
     pycolmap.Database.open(database).close()  # COLMAP wants it to exist
-    pycolmap.import_images(database, photographs, _mode(one_camera), list(names))
+    pycolmap.import_images(database, photographs, _camera_mode(one_camera), list(names))
     with pycolmap.Database.open(database) as made:
         by_number = {image.image_id: image.name for image in made.read_all_images()}
     return tuple(by_number[number] for number in range(1, len(by_number) + 1))
 
 
-def _mode(one_camera: bool) -> "pycolmap.CameraMode":
+def _camera_mode(one_camera: bool) -> "pycolmap.CameraMode":
     return pycolmap.CameraMode.SINGLE if one_camera else pycolmap.CameraMode.AUTO
 
 
-def find_features(
+def extract_features(
     database: Path,
     photographs: Path,
     names: Sequence[str],
@@ -73,19 +73,19 @@ def find_features(
     thorough: bool,
     one_camera: bool,
     threads: int,
-    counted: Counted,
+    on_count: OnCount,
 ) -> None:
     """Fill a database with the features of photographs.
 
     Args:
-        database: see :func:`make_database`.
+        database: see :func:`create_database`.
         photographs: folder.
         names: of those of its photographs that are to be looked at.
         config: settings.
         thorough: twice as many features, and fainter ones.
         one_camera: as the database was made.
         threads: to use; -1 means all cores.
-        counted: hears of photographs.
+        on_count: hears of photographs.
     """
     options = pycolmap.FeatureExtractionOptions()
     options.num_threads = threads
@@ -94,17 +94,17 @@ def find_features(
     options.sift.max_num_features = MAX_FEATURES * (2 if thorough else 1)
     if thorough:
         options.sift.peak_threshold /= 3
-    for start in range(0, len(names), _PHOTOGRAPHS_AT_ONCE):
-        some = list(names[start : start + _PHOTOGRAPHS_AT_ONCE])
+    for start in range(0, len(names), _PHOTOGRAPHS_PER_BATCH):
+        some = list(names[start : start + _PHOTOGRAPHS_PER_BATCH])
         pycolmap.extract_features(
             database,
             photographs,
             image_names=some,
-            camera_mode=_mode(one_camera),
+            camera_mode=_camera_mode(one_camera),
             extraction_options=options,
             device=pycolmap.Device.cpu,
         )
-        counted(start + len(some))
+        on_count(start + len(some))
 
 
 def feature_counts(database: Path, photographs: int) -> list[int]:
@@ -121,7 +121,7 @@ def match_pairs(
     *,
     thorough: bool,
     threads: int,
-    counted: Counted,
+    on_count: OnCount,
 ) -> None:
     """Match the features of pairs, and keep what one geometry explains.
 
@@ -132,24 +132,24 @@ def match_pairs(
         config: settings.
         thorough: take matches that are less clear.
         threads: to use; -1 means all cores.
-        counted: hears of pairs.
+        on_count: hears of pairs.
     """
     options = pycolmap.FeatureMatchingOptions()
     options.num_threads = threads
     options.use_gpu = False
     if thorough:
-        options.sift.max_ratio = _LESS_CLEAR_RATIO
+        options.sift.max_ratio = _RELAXED_MATCH_RATIO
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = config.seed
     done = 0
-    for some in in_batches(pairs, _PAIRS_AT_ONCE):
-        _match(database, names, some, options, verification)
+    for some in batch_pairs(pairs, _PAIRS_PER_BATCH):
+        _match_pairs(database, names, some, options, verification)
         done += len(some)
-        counted(done)
+        on_count(done)
 
 
-def quick_pairs(
-    database: Path, names: Sequence[str], config: PosesConfig, *, threads: int, counted: Counted
+def preselect_pairs(
+    database: Path, names: Sequence[str], config: PosesConfig, *, threads: int, on_count: OnCount
 ) -> list[Pair]:
     """Pairs worth matching, by a match of each photograph's largest features with everybody else's.
 
@@ -158,20 +158,20 @@ def quick_pairs(
         names: of the photographs, as they are numbered.
         config: settings.
         threads: to use; -1 means all cores.
-        counted: hears of pairs that are not alike.
+        on_count: hears of pairs that are not alike.
     """
     small = database.with_name("quick.db")
-    _copy_largest_features(database, small, len(names), QUICK_FEATURES)
+    _copy_largest_features(database, small, len(names), PRESELECTION_FEATURES)
     options = pycolmap.FeatureMatchingOptions()
     options.num_threads = threads
     options.use_gpu = False
     options.skip_geometric_verification = True
     verification = pycolmap.TwoViewGeometryOptions()
-    verification.min_num_inliers = _FEWEST_QUICK
+    verification.min_num_inliers = _MIN_PRESELECTION_PHOTOGRAPHS
     alike: dict[Pair, int] = {}
     looked = unlike = 0
-    for some in in_batches(all_pairs(len(names)), _QUICK_PAIRS_AT_ONCE):
-        _match(small, names, some, options, verification)
+    for some in batch_pairs(all_pairs(len(names)), _PRESELECTION_PAIRS_PER_BATCH):
+        _match_pairs(small, names, some, options, verification)
         with pycolmap.Database.open(small) as found:
             ids, counts = found.read_num_matches()
             found.clear_matches()
@@ -179,19 +179,19 @@ def quick_pairs(
             first, second = pycolmap.pair_id_to_image_pair(pair_id)
             alike[first - 1, second - 1] = count
         looked += len(some)
-        unlike = looked - sum(count >= QUICK_MATCHES for count in alike.values())
-        counted(unlike)
+        unlike = looked - sum(count >= PRESELECTION_MATCHES for count in alike.values())
+        on_count(unlike)
     small.unlink()
-    return chosen_pairs(
+    return select_pairs(
         alike,
         len(names),
-        least=QUICK_MATCHES,
+        min_matches=PRESELECTION_MATCHES,
         partners=config.partners,
         neighbours=config.neighbours,
     )
 
 
-def _match(
+def _match_pairs(
     database: Path,
     names: Sequence[str],
     pairs: Sequence[Pair],

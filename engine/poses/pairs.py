@@ -15,8 +15,8 @@ def all_pairs(count: int) -> list[Pair]:
     return list(combinations(range(count), 2))
 
 
-def chosen_pairs(
-    alike: Mapping[Pair, int], count: int, *, least: int, partners: int, neighbours: int
+def select_pairs(
+    match_counts: Mapping[Pair, int], count: int, *, min_matches: int, partners: int, neighbours: int
 ) -> list[Pair]:
     """Pairs that have something in common, and neighbours by name.
 
@@ -24,16 +24,16 @@ def chosen_pairs(
     (3DV 2013): two photographs that share features share some of the largest ones.
 
     Args:
-        alike: matches of the largest features, of pairs that have any.
+        match_counts: matches of the largest features, of pairs that have any.
         count: photographs in all.
-        least: matches that make a pair worth it.
+        min_matches: matches that make a pair worth it.
         partners: most pairs of one photograph, the best ones; another's choice may add to them.
         neighbours: in the order of names, on either side, in any case.
     """
     kept = {(a, b) for a, b in all_pairs(count) if b - a <= neighbours}
     of: list[list[tuple[int, Pair]]] = [[] for _ in range(count)]
-    for pair, matches in alike.items():
-        if matches >= least:
+    for pair, matches in match_counts.items():
+        if matches >= min_matches:
             for end in pair:
                 of[end].append((-matches, pair))
     for found in of:
@@ -41,7 +41,7 @@ def chosen_pairs(
     return sorted(kept)
 
 
-def in_batches(pairs: Iterable[Pair], size: int) -> list[tuple[Pair, ...]]:
+def batch_pairs(pairs: Iterable[Pair], size: int) -> list[tuple[Pair, ...]]:
     """Pairs a few at a time, those of the same photographs together, which COLMAP prepares anew each time."""
     ordered = sorted(pairs, key=lambda pair: (pair[0] // _TILE, pair[1] // _TILE, pair))
     return [tuple(ordered[start : start + size]) for start in range(0, len(ordered), size)]
@@ -54,7 +54,7 @@ def largest_features(keypoints: Float32[np.ndarray, "n 6"], count: int) -> Int64
     return kept
 
 
-def pairs_with(some: Sequence[int], count: int, without: Iterable[Pair]) -> list[Pair]:
-    """Pairs of ``some`` photographs with any other, but for those in ``without``."""
-    wanted = {(min(a, b), max(a, b)) for a in some for b in range(count) if a != b}
-    return sorted(wanted - set(without))
+def pairs_with(photographs: Sequence[int], count: int, excluded: Iterable[Pair]) -> list[Pair]:
+    """Pairs of ``photographs`` photographs with any other, but for those in ``excluded``."""
+    wanted = {(min(a, b), max(a, b)) for a in photographs for b in range(count) if a != b}
+    return sorted(wanted - set(excluded))

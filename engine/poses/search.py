@@ -8,41 +8,41 @@ from typing import Any
 
 import pycolmap
 
+from octasplat.engine.dataset.image_info import ImageInfo
+from octasplat.engine.dataset.images import read_image_info
 from octasplat.engine.errors import DatasetError
 from octasplat.engine.events import Listener, Warned
+from octasplat.engine.poses.ambiguous_structure import count_pair_inliers, find_false_pairs, remove_pairs
 from octasplat.engine.poses.config import (
-    AGAIN_BELOW,
     FEATURES,
+    MAPPING_STAGE,
     MATCHES,
     MAX_REPROJECTION_PX,
     MIN_PHOTOGRAPHS,
     MIN_POINTS,
-    RECORD,
-    STAGE,
+    RECORD_FILE,
+    RETRY_BELOW_SHARE,
     PosesConfig,
 )
 from octasplat.engine.poses.features import (
+    create_database,
+    extract_features,
     feature_counts,
-    find_features,
-    make_database,
     match_pairs,
-    quick_pairs,
+    preselect_pairs,
 )
-from octasplat.engine.poses.folds import false_pairs, pair_votes, without_pairs
-from octasplat.engine.poses.mapping import map_photographs, rank
+from octasplat.engine.poses.incremental_mapping import map_photographs, model_rank
 from octasplat.engine.poses.pairs import Pair, all_pairs, pairs_with
-from octasplat.engine.poses.workshop import linked_photographs, stage_of
-from octasplat.engine.scene.image_info import ImageInfo
-from octasplat.engine.scene.images import read_image_info
+from octasplat.engine.poses.workspace import link_photographs, progress_stage
 from octasplat.engine.writing import write_json
 
-SMALL_PX = 480
+MIN_RECOMMENDED_SIDE_PX = 480
 """Below this, what COLMAP finds was seen to be wrong without any sign of it."""
-_POOR_FEATURES = 50
-_MOST_UNFOLDINGS = 3
+_FEW_FEATURES = 50
+_MAX_DISAMBIGUATIONS = 3
 
 
-class Search:
+class PoseSearch:
     """A search in a folder of its own.
 
     Args:
@@ -51,7 +51,7 @@ class Search:
         work: an empty folder.
         config: settings.
         threads: to use; 0 means all cores.
-        tell: hears the progress.
+        progress: hears the progress.
     """
 
     def __init__(
@@ -61,25 +61,25 @@ class Search:
         work: Path,
         config: PosesConfig,
         threads: int,
-        tell: Listener,
+        progress: Listener,
     ) -> None:
         self._images = images
         self._all_names = tuple(names)
-        self._infos = _readable(images, names)
+        self._infos = _read_image_infos(images, names)
         self._names = tuple(self._infos)
         self._work = work
         self._config = config
         self._threads = threads or -1
-        self._tell = tell
+        self._progress = progress
         self._photographs = work / "photographs"
-        self._aliases = linked_photographs(images, self._names, self._photographs)
+        self._aliases = link_photographs(images, self._names, self._photographs)
         pycolmap.logging.minloglevel = 2  # its warnings are of use to nobody here
-        self._leave_out_unread()
+        self._drop_unreadable()
         self._one_camera = self._has_one_size()
         self._warn_of_small_photographs()
 
     @property
-    def numbered(self) -> tuple[str, ...]:
+    def numbered_names(self) -> tuple[str, ...]:
         """The photographs that are searched, in the order in which COLMAP numbers them."""
         return self._names
 
@@ -94,16 +94,16 @@ class Search:
         """
         count, config = len(self._names), self._config
         best = self._search(thorough=False)
-        placed = rank(best)[0]
-        if placed < count and (count <= config.exhaustive_up_to or placed < AGAIN_BELOW * count):
-            self._tell(
+        placed = model_rank(best)[0]
+        if placed < count and (count <= config.exhaustive_up_to or placed < RETRY_BELOW_SHARE * count):
+            self._progress(
                 Warned(
                     f"{placed} of {count} photographs could be placed at first; they are searched again with "
                     "more features."
                 )
             )
-            best = max(best, self._search(thorough=True), key=rank)
-        self._check(best)
+            best = max(best, self._search(thorough=True), key=model_rank)
+        self._check_model(best)
         names = dict(zip(self._aliases, self._names, strict=True))
         for image in best.images.values():
             image.name = names[image.name]
@@ -113,7 +113,7 @@ class Search:
         best.write_binary(found)
         posed = {best.image(number).name for number in best.reg_image_ids()}
         write_json(
-            found / RECORD,
+            found / RECORD_FILE,
             {
                 "photographs": len(self._all_names),
                 "placed": len(posed),
@@ -128,19 +128,21 @@ class Search:
         self._find_features(database, thorough)
         matched = self._match(database, thorough)
         count = len(self._names)
-        with stage_of(STAGE, count, self._tell) as at:
-            best = self._unfolded(
-                database, map_photographs(database, self._photographs, seed=self._config.seed, counted=at), at
+        with progress_stage(MAPPING_STAGE, count, self._progress) as at:
+            best = self._disambiguate(
+                database,
+                map_photographs(database, self._photographs, seed=self._config.seed, on_count=at),
+                at,
             )
-            if rank(best)[0] < count:
-                best = self._place_the_rest(database, best, matched, at)
-            at(rank(best)[0])
+            if model_rank(best)[0] < count:
+                best = self._register_remaining(database, best, matched, at)
+            at(model_rank(best)[0])
         return best
 
     def _find_features(self, database: Path, thorough: bool) -> None:
-        with stage_of(FEATURES, len(self._names), self._tell) as at:
-            make_database(database, self._photographs, self._aliases, one_camera=self._one_camera)
-            find_features(
+        with progress_stage(FEATURES, len(self._names), self._progress) as at:
+            create_database(database, self._photographs, self._aliases, one_camera=self._one_camera)
+            extract_features(
                 database,
                 self._photographs,
                 self._aliases,
@@ -148,20 +150,22 @@ class Search:
                 thorough=thorough,
                 one_camera=self._one_camera,
                 threads=self._threads,
-                counted=at,
+                on_count=at,
             )
         counts = feature_counts(database, len(self._names))
-        poor = [name for name, found in zip(self._names, counts, strict=True) if found < _POOR_FEATURES]
+        poor = [name for name, found in zip(self._names, counts, strict=True) if found < _FEW_FEATURES]
         if poor:
-            self._tell(
+            self._progress(
                 Warned(f"{len(poor)} photographs show little that can be recognised ({', '.join(poor[:3])}).")
             )
 
     def _match(self, database: Path, thorough: bool) -> list[Pair]:
         pairs = everything = all_pairs(len(self._names))
-        with stage_of(MATCHES, len(everything), self._tell) as at:
+        with progress_stage(MATCHES, len(everything), self._progress) as at:
             if len(self._names) > self._config.exhaustive_up_to:
-                pairs = quick_pairs(database, self._aliases, self._config, threads=self._threads, counted=at)
+                pairs = preselect_pairs(
+                    database, self._aliases, self._config, threads=self._threads, on_count=at
+                )
             unlike = len(everything) - len(pairs)
             match_pairs(
                 database,
@@ -170,32 +174,32 @@ class Search:
                 self._config,
                 thorough=thorough,
                 threads=self._threads,
-                counted=lambda done: at(unlike + done),
+                on_count=lambda done: at(unlike + done),
             )
         return pairs
 
-    def _unfolded(self, database: Path, model: Any, at: Callable[[int], None]) -> Any:
+    def _disambiguate(self, database: Path, model: Any, at: Callable[[int], None]) -> Any:
         """The model, made anew without the false matches of its folds for as long as it has any."""
-        for _ in range(_MOST_UNFOLDINGS):
+        for _ in range(_MAX_DISAMBIGUATIONS):
             if model is None:
                 break
-            votes = pair_votes(model, database)
-            false = false_pairs(votes)
+            votes = count_pair_inliers(model, database)
+            false = find_false_pairs(votes)
             if len(false) == 0:
                 break
             trial = database.with_name("trial.db")
             shutil.copy(database, trial)
-            without_pairs(trial, false)
-            again = map_photographs(trial, self._photographs, seed=self._config.seed, counted=at)
-            if rank(again)[0] < rank(model)[0]:
+            remove_pairs(trial, false)
+            again = map_photographs(trial, self._photographs, seed=self._config.seed, on_count=at)
+            if model_rank(again)[0] < model_rank(model)[0]:
                 break
-            if pair_votes(again, trial).kept.sum() <= votes.kept.sum():
+            if count_pair_inliers(again, trial).inliers.sum() <= votes.inliers.sum():
                 break
             trial.replace(database)
             model = again
         return model
 
-    def _place_the_rest(
+    def _register_remaining(
         self, database: Path, best: Any, matched: list[Pair], at: Callable[[int], None]
     ) -> Any:
         """Photographs that were left out: matched with all others, and placed by fewer matches."""
@@ -210,7 +214,7 @@ class Search:
                 self._config,
                 thorough=True,
                 threads=self._threads,
-                counted=lambda _done: None,
+                on_count=lambda _done: None,
             )
         start = None
         if best is not None:
@@ -218,11 +222,16 @@ class Search:
             start.mkdir(exist_ok=True)
             best.write_binary(start)
         again = map_photographs(
-            database, self._photographs, seed=self._config.seed, counted=at, weak=True, start=start
+            database,
+            self._photographs,
+            seed=self._config.seed,
+            on_count=at,
+            allow_weak_links=True,
+            start=start,
         )
-        return max(best, again, key=rank)
+        return max(best, again, key=model_rank)
 
-    def _leave_out_unread(self) -> None:
+    def _drop_unreadable(self) -> None:
         """Leave out photographs that COLMAP does not read, and warn of all that nobody could read.
 
         COLMAP gives their numbers to those that follow, so that what is left out has to be known before
@@ -232,14 +241,14 @@ class Search:
             DatasetError: too few are left.
         """
         trial = self._work / "readable.db"
-        read = set(make_database(trial, self._photographs, self._aliases, one_camera=False))
+        read = set(create_database(trial, self._photographs, self._aliases, one_camera=False))
         trial.unlink()
         kept = [k for k, alias in enumerate(self._aliases) if alias in read]
         self._names = tuple(self._names[k] for k in kept)
         self._aliases = tuple(self._aliases[k] for k in kept)
         unread = [name for name in self._all_names if name not in set(self._names)]
         if unread:
-            self._tell(
+            self._progress(
                 Warned(
                     f"{len(unread)} of {len(self._all_names)} photographs cannot be read and are left out "
                     f"({', '.join(unread[:3])}{', ...' if len(unread) > 3 else ''}); replace these files."
@@ -262,15 +271,15 @@ class Search:
     def _warn_of_small_photographs(self) -> None:
         infos = [self._infos[name] for name in self._names]
         longest = max(max(info.width_px, info.height_px) for info in infos)
-        if longest < SMALL_PX:
-            self._tell(
+        if longest < MIN_RECOMMENDED_SIDE_PX:
+            self._progress(
                 Warned(
                     f"The photographs are {longest} px long at most; poses found from such small ones may be "
                     "wrong, so give them at full size."
                 )
             )
 
-    def _check(self, best: Any) -> None:
+    def _check_model(self, best: Any) -> None:
         """Refuse a result that would only waste the training."""
         count, config = len(self._names), self._config
         if best is None:
@@ -278,7 +287,7 @@ class Search:
                 "No poses were found: the photographs do not overlap enough, or are blurred or plain; "
                 "take more of them from nearby places, or send a COLMAP model."
             )
-        posed, points = rank(best)
+        posed, points = model_rank(best)
         advice = (
             "take more photographs with more overlap, of things that stand still, or send a COLMAP model."
         )
@@ -290,12 +299,12 @@ class Search:
                 f"The poses are not to be trusted ({points} points, {error_px:.1f} px mean error); {advice}"
             )
         if posed < count:
-            self._tell(
+            self._progress(
                 Warned(f"{count - posed} of {count} photographs could not be placed and are left out.")
             )
 
 
-def _readable(images: Path, names: Sequence[str]) -> dict[str, ImageInfo]:
+def _read_image_infos(images: Path, names: Sequence[str]) -> dict[str, ImageInfo]:
     """Return what the headers of photographs say, for those that can be read."""
     found: dict[str, ImageInfo] = {}
     for name in names:

@@ -9,17 +9,17 @@ from octasplat.engine.gaussians.model import FlatGaussians
 
 MARGIN = 1.08
 """Images are this much wider than what they frame."""
-_SOLID = 0.1
+_MIN_OPACITY = 0.1
 """Fainter Gaussians are haze."""
 _REACH = 3.5
 """What lies further from the middle than this many times three quarters of the scene is its surroundings."""
-_TAIL = 0.002
+_TAIL_QUANTILE = 0.002
 """Share of the opacity at either end of an extent that may be strays."""
 _RING = 64
 
 
 @dataclass(frozen=True)
-class SeenBounds:
+class VisibleBounds:
     """An upright cylinder around what is seen.
 
     Attributes:
@@ -35,7 +35,7 @@ class SeenBounds:
     half_height: float
 
 
-def seen_bounds(gaussians: FlatGaussians, up_world: Float64[np.ndarray, "3"]) -> SeenBounds:
+def visible_bounds(gaussians: FlatGaussians, up_world: Float64[np.ndarray, "3"]) -> VisibleBounds:
     """A robust cylinder around the solid Gaussians: surroundings far away and strays do not count.
 
     Args:
@@ -43,31 +43,33 @@ def seen_bounds(gaussians: FlatGaussians, up_world: Float64[np.ndarray, "3"]) ->
         up_world: direction of the axis, of any length.
     """
     up = up_world / np.linalg.norm(up_world)
-    solid = solid_middle(gaussians)
+    solid = core_gaussians(gaussians)
     points = gaussians.means_world[solid].astype(np.float64)
     reach = np.exp(gaussians.log_scales[solid].astype(np.float64)).max(axis=1)
     weights = gaussians.opacities[solid].astype(np.float64)
     heights = points @ up
-    low, high = _ends(heights, reach, weights)
+    low, high = _robust_range(heights, reach, weights)
     across = points - heights[:, None] * up
     first = np.cross(up, np.eye(3)[int(np.argmin(np.abs(up)))])
     first /= np.linalg.norm(first)
     second = np.cross(up, first)
     middle = np.zeros(3)
     for axis in (first, second):
-        left, right = _ends(across @ axis, reach, weights)
+        left, right = _robust_range(across @ axis, reach, weights)
         middle += 0.5 * (left + right) * axis
     outwards = np.linalg.norm(across - middle, axis=1)
-    radius = max(_ends(outwards, reach, weights)[1], 0.0)
+    radius = max(_robust_range(outwards, reach, weights)[1], 0.0)
     half_height = 0.5 * (high - low)
     smallest = 1e-6 * max(radius, half_height, float(reach.max()))
-    return SeenBounds(middle + 0.5 * (low + high) * up, up, max(radius, smallest), max(half_height, smallest))
+    return VisibleBounds(
+        middle + 0.5 * (low + high) * up, up, max(radius, smallest), max(half_height, smallest)
+    )
 
 
-def solid_middle(gaussians: FlatGaussians) -> Bool[np.ndarray, " n"]:
+def core_gaussians(gaussians: FlatGaussians) -> Bool[np.ndarray, " n"]:
     """The Gaussians that are not faint and that do not lie far outside of where most are; at least one."""
     opacities = gaussians.opacities
-    solid = opacities >= min(_SOLID, 0.5 * float(opacities.max()))
+    solid = opacities >= min(_MIN_OPACITY, 0.5 * float(opacities.max()))
     points = gaussians.means_world.astype(np.float64)
     centre = np.median(points[solid], axis=0)
     distances = np.linalg.norm(points - centre, axis=1)
@@ -76,7 +78,7 @@ def solid_middle(gaussians: FlatGaussians) -> Bool[np.ndarray, " n"]:
 
 
 def fitting_distance(
-    bounds: SeenBounds, elevation_degrees: float, fov_y_degrees: float, aspect: float
+    bounds: VisibleBounds, elevation_degrees: float, fov_y_degrees: float, aspect: float
 ) -> float:
     """How far from the middle a camera has to stand so that the cylinder fits into its image, with a margin.
 
@@ -99,15 +101,17 @@ def fitting_distance(
     return needed
 
 
-def _ends(
+def _robust_range(
     values: Float64[np.ndarray, " n"], reach: Float64[np.ndarray, " n"], weights: Float64[np.ndarray, " n"]
 ) -> tuple[float, float]:
     """Between which values all but the tails lie, each value reaching out by a standard deviation."""
     low, high = values - reach, values + reach
-    return _quantile(low, weights, _TAIL), _quantile(high, weights, 1 - _TAIL)
+    return _weighted_quantile(low, weights, _TAIL_QUANTILE), _weighted_quantile(
+        high, weights, 1 - _TAIL_QUANTILE
+    )
 
 
-def _quantile(
+def _weighted_quantile(
     values: Float64[np.ndarray, " n"], weights: Float64[np.ndarray, " n"], quantile: float
 ) -> float:
     order = np.argsort(values)

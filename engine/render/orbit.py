@@ -5,18 +5,18 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float64
 
+from octasplat.engine.dataset.model import Viewpoints
 from octasplat.engine.gaussians.model import FlatGaussians
-from octasplat.engine.render.cameras import RenderCamera, focal_from_fov
-from octasplat.engine.render.jobs import (
+from octasplat.engine.render.pinhole_camera import PinholeCamera, focal_from_fov
+from octasplat.engine.render.pose_paths import Turntable, look_at
+from octasplat.engine.render.shots import (
     DEFAULT_FOV_Y_DEGREES,
     ELEVATION_DEGREES,
+    fov_y_of_views,
     gaussian_turntable,
-    scene_fov_y_degrees,
-    scene_turntable,
     turntable_cameras,
+    turntable_of_views,
 )
-from octasplat.engine.render.paths import Turntable, look_at
-from octasplat.engine.scene.model import Viewpoints
 
 
 @dataclass(frozen=True)
@@ -51,16 +51,16 @@ class Orbit:
     elevation_degrees: float | None = None
 
 
-def lens_fov_y_degrees(asked_degrees: float | None, viewpoints: Viewpoints | None) -> float:
+def choose_fov_y_degrees(asked_degrees: float | None, viewpoints: Viewpoints | None) -> float:
     """Return the field of view that is asked for, else that of the photographs, else 50 degrees."""
     if asked_degrees is not None:
         return asked_degrees
-    return DEFAULT_FOV_Y_DEGREES if viewpoints is None else scene_fov_y_degrees(viewpoints)
+    return DEFAULT_FOV_Y_DEGREES if viewpoints is None else fov_y_of_views(viewpoints)
 
 
 def orbit_cameras(
     gaussians: FlatGaussians, viewpoints: Viewpoints | None, lens: PinholeLens, orbit: Orbit, frames: int
-) -> tuple[RenderCamera, ...]:
+) -> tuple[PinholeCamera, ...]:
     """Return cameras in equal steps on one turn round a scene.
 
     Args:
@@ -83,7 +83,7 @@ def single_camera(
     lens: PinholeLens,
     orbit: Orbit,
     position_world: Float64[np.ndarray, "3"],
-) -> RenderCamera:
+) -> PinholeCamera:
     """Return the camera at a position, upright as the orbit and looking at its middle.
 
     Raises:
@@ -92,7 +92,7 @@ def single_camera(
     table = _turntable(gaussians, viewpoints, lens, orbit)
     pose = look_at(position_world, table.centre_world, table.up_world)
     focal_px = focal_from_fov(lens.fov_y_degrees, lens.height_px)
-    return RenderCamera.from_pose(pose, lens.width_px, lens.height_px, fy_px=focal_px)
+    return PinholeCamera.from_pose(pose, lens.width_px, lens.height_px, fy_px=focal_px)
 
 
 def _turntable(
@@ -108,7 +108,7 @@ def _turntable(
             elevation_degrees=ELEVATION_DEGREES if elevation is None else elevation,
         )
     else:
-        table = scene_turntable(viewpoints)
+        table = turntable_of_views(viewpoints)
     if orbit.target_world is not None:
         table = replace(table, centre_world=orbit.target_world)
     distance = orbit.distance_world or float(np.hypot(table.radius, table.height))

@@ -6,15 +6,15 @@ from pathlib import Path
 
 from octasplat.engine.errors import ConfigError
 from octasplat.engine.events import ImagesKept, Listener
-from octasplat.engine.render.jobs import Paint, Shot
-from octasplat.engine.render.kept import RECORD, KeptImages
-from octasplat.engine.render.names import IMAGE_SUFFIXES, names_by_number
-from octasplat.engine.render.series import film_files, render_film, render_series
+from octasplat.engine.render.file_names import IMAGE_SUFFIXES, has_number_pattern
+from octasplat.engine.render.resume import RECORD_FILE, FinishedImages
+from octasplat.engine.render.series import film_files, render_series, render_video
+from octasplat.engine.render.shots import RenderFn, Shot
 from octasplat.engine.stages import counted_stage
 
 
 @dataclass(frozen=True)
-class Resumption:
+class ResumeOptions:
     """How a render goes on with the images of an earlier one that was stopped.
 
     Attributes:
@@ -42,22 +42,22 @@ class RenderOutput:
     path: Path
     fps: float
     exr: bool
-    resumption: Resumption = Resumption()
+    resumption: ResumeOptions = ResumeOptions()
 
     @property
-    def is_film(self) -> bool:
+    def is_video(self) -> bool:
         """Whether it is a film."""
         return self.path.suffix.lower() == ".mp4"
 
     @property
-    def is_named_image(self) -> bool:
+    def is_image_name(self) -> bool:
         """Whether the path names images rather than a folder or a film."""
         return self.path.suffix.lower() in IMAGE_SUFFIXES
 
     @property
     def folder(self) -> Path:
         """The folder in which the files lie."""
-        return self.path.parent if self.is_film or self.is_named_image else self.path
+        return self.path.parent if self.is_video or self.is_image_name else self.path
 
     def check_count(self, images: int) -> None:
         """Refuse the name of one image where there are several.
@@ -65,38 +65,40 @@ class RenderOutput:
         Raises:
             ConfigError: they would all be one file.
         """
-        if images > 1 and self.is_named_image and not names_by_number(self.path):
+        if images > 1 and self.is_image_name and not has_number_pattern(self.path):
             pattern = f"{self.path.stem}_%04d{self.path.suffix}"
             raise ConfigError(f"{self.path} names one image for {images}; write a pattern such as {pattern}.")
 
-    def file_of(self, number: int, shot: Shot) -> Path:
+    def path_for(self, number: int, shot: Shot) -> Path:
         """Return the file of a shot: by number in a pattern, by name in a folder."""
-        if not self.is_named_image:
+        if not self.is_image_name:
             return self.path / f"{shot.name}{'.exr' if self.exr else '.png'}"
-        return self.path.with_name(self.path.name % number) if names_by_number(self.path) else self.path
+        return self.path.with_name(self.path.name % number) if has_number_pattern(self.path) else self.path
 
     def numbered(self, shots: Sequence[Shot]) -> tuple[list[str], ...]:
         """Return the names of the shots where files have numbers only: what those stand for; else nothing."""
-        return ([shot.name for shot in shots],) if self.is_named_image else ()
+        return ([shot.name for shot in shots],) if self.is_image_name else ()
 
     def files_of(self, shots: Sequence[Shot]) -> tuple[Path, ...]:
         """Return all files that are written for shots: images, or a film and its frames."""
-        if self.is_film:
+        if self.is_video:
             return (self.path, *film_files(self._frames_folder, len(shots)))
-        return tuple(self.file_of(number, shot) for number, shot in enumerate(shots))
+        return tuple(self.path_for(number, shot) for number, shot in enumerate(shots))
 
     @property
     def _frames_folder(self) -> Path:
         return self.resumption.frames_folder or self.path.with_name(f"{self.path.name}.frames")
 
-    def kept_images(self, identity: str) -> KeptImages:
+    def finished_images(self, identity: str) -> FinishedImages:
         """Return what there is already of images that look as ``identity`` says.
 
         Raises:
             ConfigError: there are images of another render, or of one that is not to be gone on with.
         """
         how, record = self.resumption, self._record
-        return KeptImages(record.parent, identity, resume=how.resume, or_anew=how.or_anew, record=record.name)
+        return FinishedImages(
+            record.parent, identity, resume=how.resume, or_anew=how.or_anew, record=record.name
+        )
 
     @property
     def has_begun(self) -> bool:
@@ -105,12 +107,12 @@ class RenderOutput:
 
     @property
     def _record(self) -> Path:
-        if self.is_named_image:
-            return self.path.with_name(f"{self.path.name}.{RECORD}")
-        return (self._frames_folder if self.is_film else self.path) / RECORD
+        if self.is_image_name:
+            return self.path.with_name(f"{self.path.name}.{RECORD_FILE}")
+        return (self._frames_folder if self.is_video else self.path) / RECORD_FILE
 
     def write(
-        self, shots: tuple[Shot, ...], paint: Paint, kept: KeptImages, progress: Listener
+        self, shots: tuple[Shot, ...], render_fn: RenderFn, finished: FinishedImages, progress: Listener
     ) -> tuple[Path, ...]:
         """Render the shots that are not kept yet, write all, and return the files.
 
@@ -122,7 +124,7 @@ class RenderOutput:
             progress(ImagesKept(count))
 
         with counted_stage("render", progress) as count:
-            if self.is_film:
-                render_film(shots, self.path, self.fps, paint, kept, count, on_kept)
+            if self.is_video:
+                render_video(shots, self.path, self.fps, render_fn, finished, count, on_kept)
                 return (self.path,)
-            return render_series(shots, self.file_of, paint, kept, count, on_kept)
+            return render_series(shots, self.path_for, render_fn, finished, count, on_kept)

@@ -13,7 +13,7 @@ from octasplat.engine.errors import ConfigError
 MAX_FRAMES = 100_000
 _RIGID_TOLERANCE = 1e-3
 """Files have rounded numbers."""
-_LAST = (0.0, 0.0, 0.0, 1.0)
+_LAST_ROW = (0.0, 0.0, 0.0, 1.0)
 
 _Finite = Annotated[float, Field(allow_inf_nan=False)]
 _Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
@@ -55,7 +55,9 @@ def _is_pose(matrix: tuple[_Row, _Row, _Row, _Row]) -> bool:
         for j in range(3)
     )
     is_right_handed = sum(map(operator.mul, across, z)) > 0
-    ends = all(math.isclose(a, b, rel_tol=1e-5, abs_tol=1e-8) for a, b in zip(matrix[3], _LAST, strict=True))
+    ends = all(
+        math.isclose(a, b, rel_tol=1e-5, abs_tol=1e-8) for a, b in zip(matrix[3], _LAST_ROW, strict=True)
+    )
     return is_rigid and is_right_handed and ends
 
 
@@ -121,7 +123,7 @@ def read_path_document(path: Path) -> PathDocument:
         raise ConfigError(f"Cannot read the camera path {path}: {error.strerror or error}.") from error
     except ValidationError as error:
         raise ConfigError(
-            f"The camera path {path} is not valid: {_first(error)} (docs/cameras.md tells the format)."
+            f"The camera path {path} is not valid: {_first_error(error)} (docs/cameras.md tells the format)."
         ) from error
 
 
@@ -135,7 +137,7 @@ def parse_path_text(value: object) -> object:
         raise ValueError(f"the camera path is no JSON: {error}") from None
 
 
-def _first(error: ValidationError) -> str:
+def _first_error(error: ValidationError) -> str:
     """The first fault, as ``frames[3].fx: Input should be ...``."""
     details = error.errors()[0]
     place = ""

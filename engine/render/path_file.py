@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 
 from octasplat.engine.errors import ConfigError, OutputError
-from octasplat.engine.render.cameras import RenderCamera, focal_from_fov
 from octasplat.engine.render.path_document import PathDocument, PathFrame, read_path_document
-from octasplat.engine.render.paths import PosePath
+from octasplat.engine.render.pinhole_camera import PinholeCamera, focal_from_fov
+from octasplat.engine.render.pose_paths import PosePath
 from octasplat.engine.writing import write_json
 
 
@@ -18,7 +18,7 @@ class CameraPath:
     """Cameras to be rendered one after another at ``fps`` frames a second; all of one image size."""
 
     fps: float
-    cameras: tuple[RenderCamera, ...]
+    cameras: tuple[PinholeCamera, ...]
 
 
 def read_camera_path(path: Path) -> CameraPath:
@@ -75,7 +75,7 @@ def write_camera_path(path: Path, camera_path: CameraPath) -> None:
         raise OutputError(f"Cannot write {path}: {error.strerror or error}.") from error
 
 
-def _camera(content: PathDocument, frame: PathFrame) -> RenderCamera:
+def _camera(content: PathDocument, frame: PathFrame) -> PinholeCamera:
     pose = np.array(frame.camera_to_world, dtype=np.float64)
     left, _, right = np.linalg.svd(pose[:3, :3])
     pose[:3, :3] = left @ right  # Rounded digits in the file leave it not quite a rotation.
@@ -83,12 +83,12 @@ def _camera(content: PathDocument, frame: PathFrame) -> RenderCamera:
         fx = fy = focal_from_fov(frame.fov_y_degrees, content.height)
     else:
         fx, fy = frame.fx, frame.fy  # type: ignore[assignment]
-    return RenderCamera.from_pose(
+    return PinholeCamera.from_pose(
         pose, content.width, content.height, fx_px=fx, fy_px=fy, cx_px=frame.cx, cy_px=frame.cy
     )
 
 
-def _between_keys(content: PathDocument, keys: tuple[RenderCamera, ...]) -> tuple[RenderCamera, ...]:
+def _between_keys(content: PathDocument, keys: tuple[PinholeCamera, ...]) -> tuple[PinholeCamera, ...]:
     """Cameras in equal steps of time along a smooth path through the keys, as are their lenses."""
     assert content.seconds is not None
     path = PosePath(np.stack([key.world_from_cam for key in keys]), content.closed)
@@ -101,15 +101,15 @@ def _between_keys(content: PathDocument, keys: tuple[RenderCamera, ...]) -> tupl
         lenses = np.concatenate([lenses, lenses[:1]])
     between = np.stack([np.interp(times, path.key_times, lens) for lens in lenses.T], axis=1)
     return tuple(
-        RenderCamera.from_pose(pose, content.width, content.height, fx_px=fx, fy_px=fy, cx_px=cx, cy_px=cy)
-        for pose, (fx, fy, cx, cy) in zip(path.at(times), between.tolist(), strict=True)
+        PinholeCamera.from_pose(pose, content.width, content.height, fx_px=fx, fy_px=fy, cx_px=cx, cy_px=cy)
+        for pose, (fx, fy, cx, cy) in zip(path.poses_at(times), between.tolist(), strict=True)
     )
 
 
-def path_from_poses(poses: Sequence[np.ndarray], like: RenderCamera, fps: float = 30.0) -> CameraPath:
+def path_from_poses(poses: Sequence[np.ndarray], like: PinholeCamera, fps: float = 30.0) -> CameraPath:
     """A path of cameras at the given poses, with the size and optics of one camera."""
     cameras = tuple(
-        RenderCamera.from_pose(
+        PinholeCamera.from_pose(
             np.asarray(pose, dtype=np.float64), like.width_px, like.height_px,
             fx_px=like.fx_px, fy_px=like.fy_px, cx_px=like.cx_px, cy_px=like.cy_px,
         )

@@ -11,18 +11,18 @@ from octasplat.engine.hashing import unit_numbers
 from octasplat.engine.rays import ImageRays, RayBatch
 from octasplat.engine.shading.plain import PLAIN
 from octasplat.engine.shading.protocol import ShadingModel, Sight
-from octasplat.engine.trace.facing import faced
+from octasplat.engine.trace import ray_hits
+from octasplat.engine.trace.facing_normals import face_viewer
 from octasplat.engine.trace.protocol import Tracer
-from octasplat.engine.trace.ray_hits import heaviest_gaussians
 
-RAYS_AT_ONCE = 1 << 18
-RECORDED_AT_ONCE = 1 << 15
+RAYS_PER_BATCH = 1 << 18
+RECORDED_RAYS_PER_BATCH = 1 << 15
 """Rays at once where their hits are kept: each has room for all that it could meet."""
-FRONT = 0.005
+FRONT_DEPTH_TOLERANCE = 0.005
 """What lies farther behind the median depth than this share of it is another surface."""
 STEPS = np.array([0.7548776662466927, 0.5698402909980532])
 """One over the plastic number, and that squared."""
-TILE = 8
+TILE_SIZE = 8
 """Rays go to the tracer in tiles of this side, so that neighbours are traced together."""
 
 
@@ -69,9 +69,9 @@ def render_rays(
         np.empty((height, width, 3), np.float32),
         layers,
     )
-    for band, order, rays in _bands(image):
+    for band, order, rays in _row_bands(image):
         seen = tracer.trace(rays)
-        dither = dithered(band.start * width + order, sample)
+        dither = pixel_jitter(band.start * width + order, sample)
         developed = shading.develop(Sight(rays, seen, tracer, dither=dither))
         rgb = developed.over(background)
         for name, values in developed.layers.items():
@@ -81,14 +81,14 @@ def render_rays(
             (out.alpha, seen.alpha),
             (out.depth, seen.expected_depth),
             (out.depth_median, seen.depth_median),
-            (out.normal_world, faced(seen.normal_world, rays.directions_world).normal_world),
+            (out.normal_world, face_viewer(seen.normal_world, rays.directions_world).normal_world),
             *((layers[name], values) for name, values in developed.layers.items()),
         ):
             part[band].reshape(len(order), -1)[order] = values.reshape(len(order), -1)
     return out
 
 
-def layer_at(
+def shade_layer(
     tracer: Tracer,
     image: ImageRays,
     pixels: Int64[np.ndarray, " p"],
@@ -107,11 +107,11 @@ def layer_at(
         sample: as for :func:`render_rays`.
     """
     found, alphas = [], []
-    for start in range(0, len(pixels), RAYS_AT_ONCE):
-        chosen = pixels[start : start + RAYS_AT_ONCE]
+    for start in range(0, len(pixels), RAYS_PER_BATCH):
+        chosen = pixels[start : start + RAYS_PER_BATCH]
         rays = image.rays[chosen]
         seen = tracer.trace(rays)
-        developed = shading.develop(Sight(rays, seen, tracer, dither=dithered(chosen, sample)))
+        developed = shading.develop(Sight(rays, seen, tracer, dither=pixel_jitter(chosen, sample)))
         found.append(developed.layers[layer])
         alphas.append(seen.alpha)
     return np.concatenate(found), np.concatenate(alphas)
@@ -131,15 +131,17 @@ def front_normals(
         depth_median: that which :func:`render_rays` found along them.
     """
     out = np.empty((image.height_px, image.width_px, 3), np.float32)
-    for band, order, rays in _bands(image):
+    for band, order, rays in _row_bands(image):
         depth = depth_median[band].reshape(-1)[order]
-        ends = np.where(depth > 0, depth * np.float32(1 + FRONT), np.inf).astype(np.float32)
+        ends = np.where(depth > 0, depth * np.float32(1 + FRONT_DEPTH_TOLERANCE), np.inf).astype(np.float32)
         seen = tracer.trace(replace(rays, t_max=np.minimum(rays.t_max, ends).astype(np.float32)))
-        out[band].reshape(-1, 3)[order] = faced(seen.normal_world, rays.directions_world).normal_world
+        out[band].reshape(-1, 3)[order] = face_viewer(seen.normal_world, rays.directions_world).normal_world
     return out
 
 
-def heaviest_by_pixel(tracer: Tracer, gaussians: FlatGaussians, image: ImageRays) -> Int32[np.ndarray, "h w"]:
+def dominant_gaussians(
+    tracer: Tracer, gaussians: FlatGaussians, image: ImageRays
+) -> Int32[np.ndarray, "h w"]:
     """Return the number of the Gaussian that weighs most on the ray of each pixel, -1 where it met none.
 
     Args:
@@ -148,20 +150,20 @@ def heaviest_by_pixel(tracer: Tracer, gaussians: FlatGaussians, image: ImageRays
         image: the rays, with unit directions.
     """
     out = np.empty((image.height_px, image.width_px), np.int32)
-    for band, order, rays in _bands(image, RECORDED_AT_ONCE):
+    for band, order, rays in _row_bands(image, RECORDED_RAYS_PER_BATCH):
         seen = tracer.trace(rays, record=True)
-        assert seen.hits is not None
-        found = heaviest_gaussians(gaussians, rays, seen.hits, tracer.settings)
+        assert seen.recording is not None
+        found = ray_hits.dominant_gaussians(gaussians, rays, seen.recording, tracer.settings)
         out[band].reshape(-1)[order] = found
     return out
 
 
-def _bands(
-    image: ImageRays, rays_at_once: int = RAYS_AT_ONCE
+def _row_bands(
+    image: ImageRays, rays_at_once: int = RAYS_PER_BATCH
 ) -> Iterator[tuple[slice, Int64[np.ndarray, " r"], RayBatch]]:
     """The rows of an image a band at a time, the numbers of the band's pixels in tiles, and their rays."""
     height, width = image.height_px, image.width_px
-    rows = max(1, rays_at_once // (width * TILE)) * TILE
+    rows = max(1, rays_at_once // (width * TILE_SIZE)) * TILE_SIZE
     for top in range(0, height, rows):
         count = min(rows, height - top)
         order = tile_order(count, width)
@@ -171,11 +173,11 @@ def _bands(
 def tile_order(height: int, width: int) -> Int64[np.ndarray, " r"]:
     """Row-major numbers of an image's pixels, tile after tile."""
     y, x = np.divmod(np.arange(height * width), width)
-    across = -(-width // TILE)
-    return np.argsort((y // TILE) * across + x // TILE, kind="stable")
+    across = -(-width // TILE_SIZE)
+    return np.argsort((y // TILE_SIZE) * across + x // TILE_SIZE, kind="stable")
 
 
-def dithered(pixels: Int64[np.ndarray, " r"], sample: int) -> Float64[np.ndarray, "2 r"]:
+def pixel_jitter(pixels: Int64[np.ndarray, " r"], sample: int) -> Float64[np.ndarray, "2 r"]:
     """Two numbers in [0, 1) for each pixel; those of following samples fill the gaps that are left.
 
     Steps of the plastic number's powers, from a place of the pixel's own: "The Unreasonable Effectiveness of

@@ -8,7 +8,7 @@ from jaxtyping import Float64, Int64
 
 from octasplat.engine.rays import AT_INFINITY, RayBatch
 from octasplat.engine.shading.split_sum import Surface
-from octasplat.engine.trace.facing import Faced, faced
+from octasplat.engine.trace.facing_normals import FacedNormals, face_viewer
 from octasplat.engine.trace.protocol import TraceResult
 
 LEAST_RISE = 0.01
@@ -44,7 +44,7 @@ class Buffer:
     which: Int64[np.ndarray, " p"]
     alpha: Float64[np.ndarray, " p"]
     depth: Float64[np.ndarray, " p"]
-    faced: Faced
+    faced: FacedNormals
     surface: Surface
 
 
@@ -54,7 +54,7 @@ def gather(rays: RayBatch, seen: TraceResult) -> Buffer:
     which = np.flatnonzero(alpha > LEAST_ALPHA)
     alpha = alpha[which]
     directions = rays.directions_world[which]
-    normals = faced(seen.normal_world[which], directions)
+    normals = face_viewer(seen.normal_world[which], directions)
     surface = Surface.alone(seen.features[which, :5] / alpha[:, None], normals.normal_world, directions)
     return Buffer(which, alpha, seen.depth_sum[which] / alpha, normals, surface)
 
@@ -71,7 +71,7 @@ def spread_back(
     which, surface = buffer.which, buffer.surface
     by_features[which, :5] += by_material / buffer.alpha[:, None]
     by_alpha[which] -= (by_material * surface.material).sum(axis=1) / buffer.alpha
-    by_normal[which] += buffer.faced.slope(by_unit_normal, surface.direction_world)
+    by_normal[which] += buffer.faced.backward(by_unit_normal, surface.direction_world)
 
 
 def reflected_rays(

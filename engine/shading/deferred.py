@@ -13,8 +13,8 @@ import numpy as np
 from jaxtyping import Float32, Float64, Int64
 
 from octasplat.engine.colour import linear_to_srgb, srgb_to_linear
-from octasplat.engine.gaussians.channels import stacked
-from octasplat.engine.gaussians.materials import AMBIENT, BOUNCED, MATERIAL_WIDTHS
+from octasplat.engine.gaussians.channels import stack_channels
+from octasplat.engine.gaussians.materials import AMBIENT, DIFFUSE_INTERREFLECTION, MATERIAL_WIDTHS
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.rays import RayBatch
 from octasplat.engine.shading.ambient import OPEN, ambient_visibility, bounced_light
@@ -82,8 +82,12 @@ class Deferred:
 
     def features(self, gaussians: FlatGaussians) -> Float32[np.ndarray, "n f"]:
         """The materials side by side, and what reaches a Gaussian from all around where it is known."""
-        names = [name for name in (*MATERIAL_WIDTHS, AMBIENT, BOUNCED) if name in gaussians.channels]
-        self._features = stacked(gaussians.channels, names)
+        names = [
+            name
+            for name in (*MATERIAL_WIDTHS, AMBIENT, DIFFUSE_INTERREFLECTION)
+            if name in gaussians.channels
+        ]
+        self._features = stack_channels(gaussians.channels, names)
         return self._features
 
     def settle(self, gaussians: FlatGaussians, tracer: Tracer, *, progress: float) -> None:
@@ -121,7 +125,7 @@ class Deferred:
         tracer: Tracer,
     ) -> None:
         """Find the light that others send to the open sides of Gaussians, if the scene has room for it."""
-        if BOUNCED not in gaussians.channels:
+        if DIFFUSE_INTERREFLECTION not in gaussians.channels:
             return
         dim = gaussians.channels[AMBIENT][ids, 0] < OPEN
         bounced = np.zeros((len(ids), 3), np.float32)
@@ -129,7 +133,7 @@ class Deferred:
             gaussians, ids[dim], side[dim], lambda fan: self._radiance(fan, tracer),
             rays=self.settings.ambient_occlusion_rays, leaving=self._leaving_far,
         )  # fmt: skip
-        gaussians.channels[BOUNCED][ids] = bounced
+        gaussians.channels[DIFFUSE_INTERREFLECTION][ids] = bounced
         self._features[ids, BOUNCED_COLUMNS] = bounced
 
     def _radiance(self, rays: RayBatch, tracer: Tracer) -> Float64[np.ndarray, "r 3"]:

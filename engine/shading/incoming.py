@@ -141,14 +141,14 @@ class ByOneRay:
             if settings.indirect == "none":
                 return cls(Seen(visibility, np.zeros((len(rays), 3))))
             hidden = 1.0 - visibility[:, None]
-            return cls(Seen(visibility, hidden * met.rgb_srgb), met.hits, hidden)
+            return cls(Seen(visibility, hidden * met.rgb_srgb), met.recording, hidden)
         met = sight.tracer.trace(rays, record=sight.view is not None)
         visibility = met.transmittance.astype(np.float64)
         if settings.indirect == "none":
             return cls(Seen(visibility, np.zeros((len(rays), 3))))
         alpha = np.maximum(1.0 - visibility, 1e-6)[:, None]
         linear = srgb_to_linear(met.rgb_srgb / alpha)
-        return cls(Seen(visibility, linear * alpha), met.hits, 1.0 / encoding_slope(linear))
+        return cls(Seen(visibility, linear * alpha), met.recording, 1.0 / encoding_slope(linear))
 
     def led(self, back: ShadeGradients) -> float:
         """None: one ray says nothing of those beside it."""

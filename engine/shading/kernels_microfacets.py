@@ -7,17 +7,17 @@ https://arxiv.org/abs/2306.05044).
 
 import math
 
-from octasplat.engine.trace.kernels_native import lean
+from octasplat.engine.trace.kernels.native import njit_no_refcount
 
 
-@lean(forceinline=True)
+@njit_no_refcount(forceinline=True)
 def schlick_weight(cosine):
     """(1 - cosine) to the power of 5."""
     x = min(max(1.0 - cosine, 0.0), 1.0)
     return x * x * x * x * x
 
 
-@lean(forceinline=True)
+@njit_no_refcount(forceinline=True)
 def ggx_density(cos_h, alpha):
     """The microfacet distribution D at a half vector of that cosine."""
     a2 = alpha * alpha
@@ -25,14 +25,14 @@ def ggx_density(cos_h, alpha):
     return a2 / (math.pi * x * x)
 
 
-@lean(forceinline=True)
+@njit_no_refcount(forceinline=True)
 def ggx_masking(cosine, alpha):
     """Smith's G1: the share of the facets that face a direction and are seen from it."""
     c2 = cosine * cosine
     return 2.0 / (1.0 + math.sqrt(1.0 + alpha * alpha * max(1.0 - c2, 0.0) / max(c2, 1e-12)))
 
 
-@lean(forceinline=True)
+@njit_no_refcount(forceinline=True)
 def sample_visible_normal(o_x, o_y, o_z, alpha, u, v):
     """A normal of GGX as it is seen from ``o`` (o_z > 0)."""
     x, y, z = alpha * o_x, alpha * o_y, o_z
@@ -47,7 +47,7 @@ def sample_visible_normal(o_x, o_y, o_z, alpha, u, v):
     return h_x / length, h_y / length, h_z / length
 
 
-@lean(forceinline=True)
+@njit_no_refcount(forceinline=True)
 def table_value(table, cosine, roughness):
     """Bilinear value of a table over (roughness, cosine), both from 0 to 1."""
     rows, columns = table.shape

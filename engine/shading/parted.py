@@ -113,4 +113,4 @@ def part(rays: RayBatch, seen: TraceResult, tracer: Tracer, *, apart_world: floa
         features=divided(seen.features, front.features),
         hit_counts=listed(seen.hit_counts, front.hit_counts),
     )
-    return Parted(joined(rays, front_rays[kept]), parts, two, front.hits, kept)
+    return Parted(joined(rays, front_rays[kept]), parts, two, front.recording, kept)

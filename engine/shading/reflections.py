@@ -116,7 +116,7 @@ def follow_back(
         by_texels: those by the texels are added to this.
     """
     buffer, trace, parted = mirrored.buffer, mirrored.trace, mirrored.parted
-    assert trace.hits is not None
+    assert trace.recording is not None
     which, count = buffer.which, len(parted.rays)
     by_light = parted.each(by_seen.light_linear)[which]
     back = shade_reverse(mirrored.surface, light, frame, by_light * buffer.alpha[:, None])
@@ -131,7 +131,7 @@ def follow_back(
         features=by_features.astype(np.float32),
     )
     by_whole, fronts = parted.back(own)
-    found = ((trace.hits, by_whole), *fronts)
+    found = ((trace.recording, by_whole), *fronts)
     if mirrored.further is None:
         return found
     by_further = Seen(back.visibility, back.indirect)

@@ -3,10 +3,10 @@
 import numpy as np
 from jaxtyping import Float64
 
-from octasplat.engine.surface.mesh import TriangleMesh
+from octasplat.engine.geometry.triangle_mesh import TriangleMesh
 
-RINGS = 64
-CLEARANCE = 1.05
+SPHERE_RINGS = 64
+RADIUS_FACTOR = 1.05
 
 
 def with_backdrop(mesh: TriangleMesh, centre_world: Float64[np.ndarray, "3"]) -> TriangleMesh:
@@ -16,9 +16,9 @@ def with_backdrop(mesh: TriangleMesh, centre_world: Float64[np.ndarray, "3"]) ->
         mesh: without colours.
         centre_world: of the sphere, where the cameras are.
     """
-    radius = CLEARANCE * float(np.linalg.norm(mesh.vertices_world - centre_world, axis=1).max())
-    across = 2 * RINGS
-    height = np.pi * np.arange(1, RINGS) / RINGS
+    radius = RADIUS_FACTOR * float(np.linalg.norm(mesh.vertices_world - centre_world, axis=1).max())
+    across = 2 * SPHERE_RINGS
+    height = np.pi * np.arange(1, SPHERE_RINGS) / SPHERE_RINGS
     turn = 2 * np.pi * np.arange(across) / across
     rings = np.stack(
         [
@@ -29,7 +29,7 @@ def with_backdrop(mesh: TriangleMesh, centre_world: Float64[np.ndarray, "3"]) ->
         axis=-1,
     ).reshape(-1, 3)
     points = np.concatenate([rings, [[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]]])
-    here = np.arange(len(rings)).reshape(RINGS - 1, across)
+    here = np.arange(len(rings)).reshape(SPHERE_RINGS - 1, across)
     beside = np.roll(here, -1, axis=1)
     north, south = len(rings), len(rings) + 1
     faces = np.concatenate(

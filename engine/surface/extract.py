@@ -10,22 +10,22 @@ from scipy.spatial import cKDTree
 
 from octasplat.engine.colour import to_bytes
 from octasplat.engine.events import Listener, ignore
-from octasplat.engine.render.cameras import RenderCamera
+from octasplat.engine.geometry.triangle_mesh import EdgeReport, TriangleMesh, edge_report
+from octasplat.engine.render.pinhole_camera import PinholeCamera
 from octasplat.engine.stages import counted_stage, stopping
 from octasplat.engine.surface.backdrop import with_backdrop
-from octasplat.engine.surface.clean import decimate, keep_large_components
-from octasplat.engine.surface.colours import COLOURS, Look, bake
-from octasplat.engine.surface.depth import render_depth_maps
-from octasplat.engine.surface.fitting import Palette, Picture, TexturePalette, VertexPalette, fitted
+from octasplat.engine.surface.bake_colours import COLOUR_TARGET, BakeTarget, bake
+from octasplat.engine.surface.bake_materials import MATERIAL_TARGET, with_materials
+from octasplat.engine.surface.colour_fit import Palette, Picture, TexturePalette, VertexPalette, fit_colours
+from octasplat.engine.surface.depth_maps import render_depth_maps
 from octasplat.engine.surface.holes import fill_holes
-from octasplat.engine.surface.marching import surface_of
-from octasplat.engine.surface.materials import MATERIALS, with_materials
-from octasplat.engine.surface.mesh import EdgeReport, TriangleMesh, edge_report
+from octasplat.engine.surface.marching_cubes import marching_cubes
+from octasplat.engine.surface.mesh_cleanup import decimate, keep_largest_components
 from octasplat.engine.surface.options import ExtractionOptions
-from octasplat.engine.surface.region import Region, choose_region, focus
-from octasplat.engine.surface.settling import settled
-from octasplat.engine.surface.texture import lay_out
-from octasplat.engine.surface.volume import BYTES_PER_BLOCK, Volume, fuse, solid_where_unseen
+from octasplat.engine.surface.region import Region, choose_region, focus_point
+from octasplat.engine.surface.texture import unwrap
+from octasplat.engine.surface.tsdf_volume import BYTES_PER_BLOCK, TsdfVolume, fill_unseen, fuse_depth_maps
+from octasplat.engine.surface.vertex_refinement import refine_vertices
 from octasplat.engine.trace.protocol import Tracer
 
 Points = Float32[np.ndarray, "n 3"]
@@ -56,7 +56,7 @@ class ExtractedSurface:
 
 def extract_levels(
     tracer: Tracer,
-    cameras: Sequence[RenderCamera],
+    cameras: Sequence[PinholeCamera],
     options: ExtractionOptions,
     levels: Sequence[int | None] = (None,),
     *,
@@ -77,7 +77,7 @@ def extract_levels(
         levels: at most so many triangles; None keeps all.
         scratch: folder for a temporary file of 12 bytes for every pixel of the depth maps.
         light_frame: bake materials, which the tracer then has as its first features
-            (:func:`octasplat.engine.surface.materials.material_features`), for light with these rows right,
+            (:func:`octasplat.engine.surface.bake_materials.material_features`), for light with these rows right,
             up and forward in the world; None bakes colours. Needs a texture.
         photographs: what colours are fitted to; without any, what the scene shows from ``cameras``.
         listener: hears the stages ``depth``, ``fusing``, ``meshing``, ``settling`` and ``decimating`` (if
@@ -90,44 +90,46 @@ def extract_levels(
     """
     tell = stopping(listener, should_stop, "Stopped; no surface was written.")
     if not options.unbounded and options.bounds is None:
-        focus(cameras)  # complain before the long work
+        focus_point(cameras)  # complain before the long work
     with counted_stage("depth", tell, len(cameras)) as progress:
         maps, renders = render_depth_maps(tracer, cameras, options, scratch, progress)
     region = choose_region(maps, options)
     with counted_stage("fusing", tell, 2 * len(cameras)) as progress:
-        volume: Volume | None = fuse(maps, region, options, progress)
+        volume: TsdfVolume | None = fuse_depth_maps(maps, region, options, progress)
     del maps
     assert volume is not None
     if options.unseen == "solid":
-        solid_where_unseen(volume, options.min_weight)
+        fill_unseen(volume, options.min_weight)
     volume_bytes = len(volume.blocks) * BYTES_PER_BLOCK
     with counted_stage("meshing", tell, 3) as progress:
-        mesh = surface_of(volume, options.min_weight)
+        mesh = marching_cubes(volume, options.min_weight)
         volume, found = None, len(mesh.faces)
         progress(1, 3)
-        mesh = _large_parts(mesh, options)
+        mesh = _keep_components(mesh, options)
         progress(2, 3)
         max_rim = None if options.fill_holes == "all" else options.fill_holes * region.voxel_world
         mesh, closed = fill_holes(mesh, max_rim) if max_rim is None or max_rim > 0 else (mesh, 0)
         progress(3, 3)
     if options.refine_vertices:  # while triangles are small enough to show what the pictures do
         with counted_stage("settling", tell, 0) as progress:
-            mesh = settled(mesh, photographs or renders, progress)
-    meshes = _in_levels(mesh, options, levels, tell)
+            mesh = refine_vertices(mesh, photographs or renders, progress)
+    meshes = _decimate_levels(mesh, options, levels, tell)
     del mesh
     result = []
     for mesh in meshes:
         edges = edge_report(mesh.faces)
         if options.backdrop:
             mesh = with_backdrop(mesh, np.mean([camera.centre_world for camera in cameras], axis=0))
-        coloured = _coloured(tracer, cameras, renders, photographs, options, mesh, region, light_frame, tell)
+        coloured = _bake_colours(
+            tracer, cameras, renders, photographs, options, mesh, region, light_frame, tell
+        )
         result.append(ExtractedSurface(coloured, region, volume_bytes, found, closed, edges))
     return tuple(result)
 
 
-def _coloured(
+def _bake_colours(
     tracer: Tracer,
-    cameras: Sequence[RenderCamera],
+    cameras: Sequence[PinholeCamera],
     renders: Sequence[Picture],
     photographs: Sequence[Picture],
     options: ExtractionOptions,
@@ -139,35 +141,37 @@ def _coloured(
     """The mesh with colours in its vertices, or with textures."""
     tolerance = TOLERANCE_VOXELS * region.voxel_world
 
-    def look_at(points: Points, normals: Points, look: Look) -> tuple[np.ndarray, Bool[np.ndarray, " n"]]:
+    def look_at(
+        points: Points, normals: Points, look: BakeTarget
+    ) -> tuple[np.ndarray, Bool[np.ndarray, " n"]]:
         with counted_stage("colouring", tell, 0) as progress:
             baked, seen = bake(points, normals, mesh, cameras, tracer, look, tolerance, progress)
-            return _spread(points, baked, seen), seen
+            return _fill_unseen(points, baked, seen), seen
 
     def colours(palette: Palette, points: Points, normals: Points) -> Points:
         if not (options.fit and photographs):
-            rgb, _ = look_at(points, normals, COLOURS)
+            rgb, _ = look_at(points, normals, COLOUR_TARGET)
         else:  # they show all detail that there is
             rgb = np.full((len(points), 3), 0.5, np.float32)
         if not options.fit:
             return rgb
         with counted_stage("fitting", tell, 0) as progress:
-            return _spread(points, *fitted(palette, rgb, photographs or renders, progress))
+            return _fill_unseen(points, *fit_colours(palette, rgb, photographs or renders, progress))
 
     if options.texture_size is None:
         assert light_frame is None, "materials need a texture"
         rgb = colours(VertexPalette(mesh), mesh.vertices_world, mesh.vertex_normals())
         return replace(mesh, rgb_srgb=rgb)
     with counted_stage("unwrapping", tell, 0):
-        layout = lay_out(mesh, options.texture_size)
+        layout = unwrap(mesh, options.texture_size)
     points, normals = layout.points_world, layout.normals_world
     if light_frame is not None:
-        return with_materials(layout, *look_at(points, normals, MATERIALS), light_frame)
+        return with_materials(layout, *look_at(points, normals, MATERIAL_TARGET), light_frame)
     rgb = colours(TexturePalette(layout), points, normals)
     return replace(layout.mesh, texture_srgb=to_bytes(layout.image(rgb)))
 
 
-def _in_levels(
+def _decimate_levels(
     mesh: TriangleMesh, options: ExtractionOptions, levels: Sequence[int | None], tell: Listener
 ) -> list[TriangleMesh]:
     """The mesh with at most so many triangles, for each level."""
@@ -177,16 +181,16 @@ def _in_levels(
     with counted_stage("decimating", tell, len(levels)) as progress:
         for done, level in enumerate(levels, 1):
             # Thin parts may come apart.
-            meshes.append(mesh if level is None else _large_parts(decimate(mesh, level), options))
+            meshes.append(mesh if level is None else _keep_components(decimate(mesh, level), options))
             progress(done, len(levels))
     return meshes
 
 
-def _large_parts(mesh: TriangleMesh, options: ExtractionOptions) -> TriangleMesh:
-    return keep_large_components(mesh, keep=options.keep_components, min_share=options.min_component)
+def _keep_components(mesh: TriangleMesh, options: ExtractionOptions) -> TriangleMesh:
+    return keep_largest_components(mesh, keep=options.keep_components, min_share=options.min_component)
 
 
-def _spread(
+def _fill_unseen(
     points: Float32[np.ndarray, "n 3"], baked: Float32[np.ndarray, "n c"], seen: Bool[np.ndarray, " n"]
 ) -> Float32[np.ndarray, "n c"]:
     """What was baked, with that of points that nobody sees taken from the nearest that somebody does."""

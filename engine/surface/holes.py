@@ -5,12 +5,12 @@ import heapq
 import numpy as np
 from jaxtyping import Float32, Float64, Int32, Int64
 
-from octasplat.engine.surface.mesh import TriangleMesh, directed_edges
+from octasplat.engine.geometry.triangle_mesh import TriangleMesh, directed_edges
 
-Rim = list[int]
+BoundaryLoop = list[int]
 
 
-def rims(faces: Int32[np.ndarray, "m 3"]) -> list[Rim]:
+def boundary_loops(faces: Int32[np.ndarray, "m 3"]) -> list[BoundaryLoop]:
     """The closed rims of a mesh: vertex numbers along which triangles to close the hole would wind.
 
     A rim that passes a vertex twice is cut there into simple ones.
@@ -24,7 +24,7 @@ def rims(faces: Int32[np.ndarray, "m 3"]) -> list[Rim]:
     after: dict[int, list[int]] = {}
     for start, end in open_edges[:, ::-1].tolist():  # the hole lies on the other side
         after.setdefault(start, []).append(end)
-    found: list[Rim] = []
+    found: list[BoundaryLoop] = []
     while after:
         path = [next(iter(after))]
         place = {path[0]: 0}
@@ -64,17 +64,17 @@ def fill_holes(mesh: TriangleMesh, max_rim: float | None) -> tuple[TriangleMesh,
     count = len(points)
     keys = edges[:, 0] * count + edges[:, 1]
     taken = set(keys.tolist())
-    lonely = _lonely(mesh.faces, keys)
+    lonely = _isolated_faces(mesh.faces, keys)
     new_points: list[Float64[np.ndarray, 3]] = []
     new_faces: list[tuple[int, int, int]] = []
     closed = 0
-    for rim in rims(mesh.faces):
+    for rim in boundary_loops(mesh.faces):
         corners = points[rim]
         length = float(np.linalg.norm(corners - np.roll(corners, -1, axis=0), axis=1).sum())
         if max_rim is not None and length > max_rim:
             continue
         closed += 1
-        patch = None if frozenset(rim) in lonely else _cut_ears(rim, points, taken, count)
+        patch = None if frozenset(rim) in lonely else _ear_clip(rim, points, taken, count)
         if patch is None:
             middle = count + len(new_points)
             new_points.append(corners.mean(axis=0))
@@ -87,15 +87,17 @@ def fill_holes(mesh: TriangleMesh, max_rim: float | None) -> tuple[TriangleMesh,
     return TriangleMesh(np.concatenate([mesh.vertices_world, added]), faces), closed
 
 
-def _lonely(faces: Int32[np.ndarray, "m 3"], edge_keys: Int64[np.ndarray, " e"]) -> set[frozenset[int]]:
+def _isolated_faces(
+    faces: Int32[np.ndarray, "m 3"], edge_keys: Int64[np.ndarray, " e"]
+) -> set[frozenset[int]]:
     """The corners of triangles without neighbours: their own rims, which their like would close."""
     _, place, uses = np.unique(edge_keys, return_inverse=True, return_counts=True)
     alone = (uses[place.reshape(-1)] == 1).reshape(-1, 3).all(axis=1)
     return {frozenset(face) for face in faces[alone].tolist()}
 
 
-def _cut_ears(
-    rim: Rim, points: Float64[np.ndarray, "n 3"], taken: set[int], count: int
+def _ear_clip(
+    rim: BoundaryLoop, points: Float64[np.ndarray, "n 3"], taken: set[int], count: int
 ) -> list[tuple[int, int, int]] | None:
     """Triangles that close a rim, or None where they would need an edge that is there already.
 

@@ -7,13 +7,15 @@ from jaxtyping import Float32, Int
 from scipy.sparse import coo_matrix, csr_matrix, diags
 
 
-def share_rows(shares: Float32[np.ndarray, "r k"], numbers: Int[np.ndarray, "r k"], count: int) -> csr_matrix:
+def interpolation_matrix(
+    shares: Float32[np.ndarray, "r k"], numbers: Int[np.ndarray, "r k"], count: int
+) -> csr_matrix:
     """The matrix that takes values of ``count`` points to means of ``k`` of them."""
     starts = np.arange(len(shares) + 1, dtype=np.int64) * shares.shape[1]
     return csr_matrix((shares.reshape(-1), numbers.reshape(-1), starts), (len(shares), count))
 
 
-def differences(pairs: Int[np.ndarray, "e 2"], count: int) -> csr_matrix:
+def difference_matrix(pairs: Int[np.ndarray, "e 2"], count: int) -> csr_matrix:
     """The matrix D for which x D x is the sum of the squared differences between neighbours."""
     ones = np.ones(len(pairs), np.float32)
     beside = coo_matrix((ones, tuple(pairs.T)), (count, count)).tocsr()
@@ -22,10 +24,10 @@ def differences(pairs: Int[np.ndarray, "e 2"], count: int) -> csr_matrix:
 
 
 def conjugate_gradients(
-    times: Callable[[Float32[np.ndarray, "n c"]], Float32[np.ndarray, "n c"]],
+    apply_matrix: Callable[[Float32[np.ndarray, "n c"]], Float32[np.ndarray, "n c"]],
     diagonal: Float32[np.ndarray, "n #c"],
-    wanted: Float32[np.ndarray, "n c"],
-    rounds: int,
+    right_side: Float32[np.ndarray, "n c"],
+    iterations: int,
     *,
     coupled: bool = False,
 ) -> Float32[np.ndarray, "n c"]:
@@ -34,18 +36,18 @@ def conjugate_gradients(
     SciPy's takes one column at a time, and its products are added up in an order that depends on the threads.
 
     Args:
-        times: a positive definite linear map.
+        apply_matrix: a positive definite linear map.
         diagonal: of the map, by which steps are scaled.
-        wanted: the right side.
-        rounds: how many steps.
+        right_side: the right side.
+        iterations: how many steps.
         coupled: whether columns depend on each other; else each goes at its own pace.
     """
     axis = None if coupled else 0
-    x, rest = np.zeros_like(wanted), wanted
+    x, rest = np.zeros_like(right_side), right_side
     step = rest / diagonal
     before = (rest * step).sum(axis=axis, dtype=np.float64)
-    for _ in range(rounds):
-        image = times(step)
+    for _ in range(iterations):
+        image = apply_matrix(step)
         bent = np.maximum((step * image).sum(axis=axis, dtype=np.float64), 1e-30)
         length = (before / bent).astype(np.float32)
         x, rest = x + length * step, rest - length * image

@@ -3,11 +3,11 @@
 import numpy as np
 from jaxtyping import Bool, Float
 
+from octasplat.engine.geometry.triangle_mesh import TriangleMesh
 from octasplat.engine.rays import RayBatch
-from octasplat.engine.surface.mesh import TriangleMesh
-from octasplat.engine.trace.meshes import TriangleScene
+from octasplat.engine.trace.triangle_bvh import TriangleBvh
 
-NEAR_SHARE = 1e-3
+OFFSET_RATIO = 1e-3
 """The last thousandth of the way to a point is not tested, lest the point's own triangle hide it."""
 
 
@@ -15,9 +15,9 @@ class Occluder:
     """A mesh that hides what is behind it."""
 
     def __init__(self, mesh: TriangleMesh) -> None:
-        self._scene = TriangleScene(mesh.vertices_world, mesh.faces)
+        self._scene = TriangleBvh(mesh.vertices_world, mesh.faces)
 
-    def sees(
+    def is_visible(
         self,
         points_world: Float[np.ndarray, "n 3"],
         viewers_world: Float[np.ndarray, "n 3"],
@@ -32,6 +32,6 @@ class Occluder:
         """
         way = points_world - viewers_world
         length = np.linalg.norm(way, axis=1)
-        reach = np.maximum(length * (1 - NEAR_SHARE) - tolerance, 0.0)
+        reach = np.maximum(length * (1 - OFFSET_RATIO) - tolerance, 0.0)
         directions = way / np.maximum(length, 1e-30)[:, None]
         return ~self._scene.occluded(RayBatch(viewers_world, directions, t_max=reach))

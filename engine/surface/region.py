@@ -7,15 +7,15 @@ import numpy as np
 from jaxtyping import Float, Float64
 
 from octasplat.engine.errors import ConfigError
-from octasplat.engine.render.cameras import RenderCamera
-from octasplat.engine.render.paths import fit_turntable
-from octasplat.engine.surface.depth import DepthMaps
+from octasplat.engine.render.pinhole_camera import PinholeCamera
+from octasplat.engine.render.pose_paths import fit_turntable
+from octasplat.engine.surface.depth_maps import DepthMaps
 from octasplat.engine.surface.options import ExtractionOptions
 
 BLOCK = 8
 """Voxels along a side of a block."""
 MAX_BLOCKS_PER_SIDE = 512
-CONTRACTED_HALF = 2.0
+CONTRACTED_HALF_SIDE = 2.0
 """Contracted space fills the ball of this radius."""
 MIN_TRUNCATION_VOXELS = 4.0
 TRUNCATION_SHARE = 0.03
@@ -23,9 +23,9 @@ TRUNCATION_SHARE = 0.03
 RESOLUTION = 512
 PIXELS_PER_VOXEL = 1.5
 SAMPLES_PER_SIDE = 160
-STRAY_SHARE = 1e-3
+OUTLIER_SHARE = 1e-3
 MARGIN_SHARE = 0.05
-NOTHING_SEEN = (
+NO_SURFACE_MESSAGE = (
     "No surface lies in the region to mesh; name another with --bounds (octasplat info tells where the scene "
     "lies), or use --unbounded."
 )
@@ -85,30 +85,30 @@ def choose_region(maps: DepthMaps, options: ExtractionOptions) -> Region:
         ConfigError: the cameras have no common centre and the options name no box, nothing is seen, or the
             grid is too fine.
     """
-    pixel = 0.0 if options.resolution is not None else _pixel(maps.cameras)
+    pixel = 0.0 if options.resolution is not None else _pixel_width(maps.cameras)
     if options.bounds is not None:
         low, high = np.array(options.bounds[:3]), np.array(options.bounds[3:])
         try:
-            _, distance = focus(maps.cameras)
+            _, distance = focus_point(maps.cameras)
         except ConfigError:
             distance = 0.5 * float((high - low).max())
-        return _grid(low, high, distance, pixel * distance, options)
-    centre, distance = focus(maps.cameras)
+        return _make_grid(low, high, distance, pixel * distance, options)
+    centre, distance = focus_point(maps.cameras)
     if not options.unbounded:
-        box = _seen_box(maps, centre - distance, centre + distance)
-        return _grid(*box, distance, pixel * distance, options)
-    half = np.full(3, CONTRACTED_HALF)
+        box = _depth_bounds(maps, centre - distance, centre + distance)
+        return _make_grid(*box, distance, pixel * distance, options)
+    half = np.full(3, CONTRACTED_HALF_SIDE)
     voxel = None if options.voxel is None else options.voxel / distance
-    grid = _grid(-half, half, 1.0, pixel, options.model_copy(update={"voxel": voxel}))
+    grid = _make_grid(-half, half, 1.0, pixel, options.model_copy(update={"voxel": voxel}))
     return replace(grid, contracted=True, centre_world=centre, radius=distance)
 
 
-def _pixel(cameras: Sequence[RenderCamera]) -> float:
+def _pixel_width(cameras: Sequence[PinholeCamera]) -> float:
     """Width of a pixel at distance 1, in the median."""
     return float(np.median([1.0 / camera.fx_px for camera in cameras]))
 
 
-def _seen_box(
+def _depth_bounds(
     maps: DepthMaps, low: Float64[np.ndarray, "3"], high: Float64[np.ndarray, "3"]
 ) -> tuple[Float64[np.ndarray, "3"], Float64[np.ndarray, "3"]]:
     """The box of the depths within a cube, but for stray ones, and a margin."""
@@ -122,13 +122,13 @@ def _seen_box(
         found.append(points[((points > low) & (points < high)).all(axis=1)])
     points = np.concatenate(found)
     if len(points) == 0:
-        raise ConfigError(NOTHING_SEEN)
-    least, most = np.quantile(points, [STRAY_SHARE, 1 - STRAY_SHARE], axis=0).astype(np.float64)
+        raise ConfigError(NO_SURFACE_MESSAGE)
+    least, most = np.quantile(points, [OUTLIER_SHARE, 1 - OUTLIER_SHARE], axis=0).astype(np.float64)
     margin = MARGIN_SHARE * float((most - least).max())
     return np.maximum(low, least - margin), np.minimum(high, most + margin)
 
 
-def focus(cameras: Sequence[RenderCamera]) -> tuple[Float64[np.ndarray, "3"], float]:
+def focus_point(cameras: Sequence[PinholeCamera]) -> tuple[Float64[np.ndarray, "3"], float]:
     """The point that the cameras look at, and their median distance to it.
 
     Raises:
@@ -146,7 +146,7 @@ def focus(cameras: Sequence[RenderCamera]) -> tuple[Float64[np.ndarray, "3"], fl
     return point, float(np.median(np.linalg.norm(centres - point, axis=1)))
 
 
-def _grid(
+def _make_grid(
     low: Float64[np.ndarray, "3"],
     high: Float64[np.ndarray, "3"],
     distance: float,

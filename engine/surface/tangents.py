@@ -9,7 +9,7 @@ of their corners there.
 import numpy as np
 from jaxtyping import Float32, Float64
 
-from octasplat.engine.surface.mesh import TriangleMesh
+from octasplat.engine.geometry.triangle_mesh import TriangleMesh
 
 
 def vertex_tangents(mesh: TriangleMesh) -> Float32[np.ndarray, "n 4"]:
@@ -35,9 +35,11 @@ def vertex_tangents(mesh: TriangleMesh) -> Float32[np.ndarray, "n 4"]:
     for k in range(3):
         vertex = mesh.faces[:, k]
         normal = normals[vertex]
-        one, two = (_unit(_level(corners[:, (k + j) % 3] - corners[:, k], normal)) for j in (1, 2))
+        one, two = (
+            _unit(_perpendicular_part(corners[:, (k + j) % 3] - corners[:, k], normal)) for j in (1, 2)
+        )
         angle = np.arccos(np.clip((one * two).sum(axis=1), -1.0, 1.0)) * (area != 0)
-        share = angle[:, None] * _unit(_level(along, normal))
+        share = angle[:, None] * _unit(_perpendicular_part(along, normal))
         for row, sign in enumerate((1.0, -1.0)):
             mine = side == sign
             angles[row] += np.bincount(vertex[mine], angle[mine], len(normals))
@@ -50,7 +52,7 @@ def vertex_tangents(mesh: TriangleMesh) -> Float32[np.ndarray, "n 4"]:
     return np.concatenate([tangents, np.where(mirrored, -1.0, 1.0)[:, None]], axis=1).astype(np.float32)
 
 
-def in_tangent_frame(
+def world_to_tangent(
     wanted_world: Float64[np.ndarray, "n 3"],
     normals_world: Float64[np.ndarray, "n 3"],
     tangents: Float64[np.ndarray, "n 4"],
@@ -73,7 +75,7 @@ def in_tangent_frame(
     return _unit(local)
 
 
-def _level(
+def _perpendicular_part(
     vectors: Float64[np.ndarray, "n 3"], normals: Float64[np.ndarray, "n 3"]
 ) -> Float64[np.ndarray, "n 3"]:
     return vectors - (vectors * normals).sum(axis=1, keepdims=True) * normals

@@ -7,8 +7,8 @@ from jaxtyping import Float32, Float64, Int32
 from scipy.ndimage import distance_transform_edt
 from scipy.sparse import coo_matrix
 
-from octasplat.engine.surface.kernels_texture import rasterise
-from octasplat.engine.surface.mesh import TriangleMesh, directed_edges
+from octasplat.engine.geometry.triangle_mesh import TriangleMesh, directed_edges
+from octasplat.engine.surface.kernels.rasterize import rasterise
 
 PADDING_PX = 2
 SMOOTHING_ROUNDS = 20
@@ -36,19 +36,19 @@ class TextureLayout:
     corners: Int32[np.ndarray, "n 3"]
     weights: Float64[np.ndarray, "n 3"]
 
-    def between(self, of_vertices: Float32[np.ndarray, "v c"]) -> Float64[np.ndarray, "n c"]:
+    def interpolate(self, of_vertices: Float32[np.ndarray, "v c"]) -> Float64[np.ndarray, "n c"]:
         """What belongs to vertices, at the pixels' middles."""
         return np.asarray(sum(self.weights[:, k, None] * of_vertices[self.corners[:, k]] for k in range(3)))
 
     @property
     def points_world(self) -> Float32[np.ndarray, "n 3"]:
         """The surface points in the pixels' middles."""
-        return self.between(self.mesh.vertices_world).astype(np.float32)
+        return self.interpolate(self.mesh.vertices_world).astype(np.float32)
 
     @property
     def normals_world(self) -> Float32[np.ndarray, "n 3"]:
         """The unit normals there."""
-        bent = self.between(self.mesh.vertex_normals())
+        bent = self.interpolate(self.mesh.vertex_normals())
         return (bent / np.maximum(np.linalg.norm(bent, axis=1, keepdims=True), 1e-12)).astype(np.float32)
 
     def image(self, values: Float32[np.ndarray, "n c"]) -> Float32[np.ndarray, "h w c"]:
@@ -64,7 +64,7 @@ class TextureLayout:
         return image
 
 
-def lay_out(mesh: TriangleMesh, side_px: int) -> TextureLayout:
+def unwrap(mesh: TriangleMesh, side_px: int) -> TextureLayout:
     """Unwrap a mesh into a square of ``side_px`` pixels (by xatlas).
 
     It is cut where a smooth surface of its shape would be: along its own creases, one that was measured falls
@@ -72,7 +72,7 @@ def lay_out(mesh: TriangleMesh, side_px: int) -> TextureLayout:
     """
     import xatlas
 
-    smooth = smoothed(mesh)
+    smooth = smooth_mesh(mesh)
     atlas = xatlas.Atlas()
     atlas.add_mesh(smooth.vertices_world, mesh.faces.astype(np.uint32), smooth.vertex_normals())
     charts, packing = xatlas.ChartOptions(), xatlas.PackOptions()
@@ -96,7 +96,7 @@ def lay_out(mesh: TriangleMesh, side_px: int) -> TextureLayout:
     return TextureLayout(cut, side_px, rows, columns, corners, np.concatenate([first, others], axis=1))
 
 
-def smoothed(mesh: TriangleMesh) -> TriangleMesh:
+def smooth_mesh(mesh: TriangleMesh) -> TriangleMesh:
     """The mesh without its roughness, as large as it was.
 
     "A signal processing approach to fair surface design" (Taubin 1995,

@@ -91,7 +91,7 @@ class TraceResult:
         normal_world: sum of weight times the normal, turned towards the viewer as the settings say.
         features: sum of weight times the Gaussians' extra channels.
         hit_counts: Gaussians on each ray.
-        hits: the recording, which :meth:`Tracer.backward` needs; None unless the trace was asked for it.
+        recording: the recording, which :meth:`Tracer.backward` needs; None unless the trace was asked for it.
     """
 
     rgb_srgb: Float32[np.ndarray, "r 3"]
@@ -101,7 +101,7 @@ class TraceResult:
     normal_world: Float32[np.ndarray, "r 3"]
     features: Float32[np.ndarray, "r f"]
     hit_counts: Int32[np.ndarray, " r"]
-    hits: "Recording | None" = None
+    recording: "Recording | None" = None
 
     @property
     def alpha(self) -> Float32[np.ndarray, " r"]:
@@ -123,11 +123,11 @@ class Recording(Protocol):
     long as the parameters are those it was made with.
     """
 
-    def of_ray(self, ray: int) -> Int32[np.ndarray, " k"]:
+    def ids_of_ray(self, ray: int) -> Int32[np.ndarray, " k"]:
         """Ids of the Gaussians of one ray, front to back."""
         ...
 
-    def by_ray(self) -> tuple[Int32[np.ndarray, " r"], Int32[np.ndarray, " h"]]:
+    def ids_by_ray(self) -> tuple[Int32[np.ndarray, " r"], Int32[np.ndarray, " h"]]:
         """Hits of each ray, and the ids of all hits, ray by ray and front to back."""
         ...
 
@@ -148,7 +148,7 @@ class TraceGradients:
     ray_errors: Float32[np.ndarray, " r"] | None = None
 
     @property
-    def with_geometry(self) -> bool:
+    def has_geometry(self) -> bool:
         """Whether depth or normals have a gradient."""
         return any(x is not None for x in (self.depth_sum, self.depth_median, self.normal_world))
 
@@ -175,12 +175,12 @@ class GaussianGradients:
     hit_counts: Int32[np.ndarray, " u"]
 
     def numpy(self) -> "GaussianGradients":
-        """These themselves, as :class:`Gradients` asks for."""
+        """These themselves, as :class:`GradientsHandle` asks for."""
         return self
 
 
 @runtime_checkable
-class Gradients(Protocol):
+class GradientsHandle(Protocol):
     """Gradients of the parameters, wherever their tracer keeps them."""
 
     def numpy(self) -> GaussianGradients:
@@ -194,7 +194,7 @@ class Tracer(Protocol):
 
     Rays and outputs are numpy arrays: an iteration has about a megabyte of them, and losses and shading work
     on them here. What has the size of the Gaussians or of their hits is opaque: recordings are only handed
-    back, and gradients are read through :meth:`Gradients.numpy`. So a tracer may keep the parameters on a
+    back, and gradients are read through :meth:`GradientsHandle.numpy`. So a tracer may keep the parameters on a
     device: it uploads them in :meth:`build` and the changed rows in :meth:`refresh`, and leaves its gradients
     where they are, for an optimiser beside them or until somebody asks. (Not chosen: one learner with trace,
     step and download, which would take optimiser, densification and checkpoints into every tracer.)
@@ -234,10 +234,12 @@ class Tracer(Protocol):
         """
         ...
 
-    def backward(self, hits: Recording, gradients: TraceGradients, *, least_weight: float = 0.0) -> Gradients:
+    def backward(
+        self, recording: Recording, gradients: TraceGradients, *, min_blend_weight: float = 0.0
+    ) -> GradientsHandle:
         """Gradients of the parameters for the rays of a recording of this tracer since its last build.
 
-        Gaussians whose weights alpha T on all these rays add up to less than ``least_weight`` are left out.
+        Gaussians whose weights alpha T on all these rays add up to less than ``min_blend_weight`` are left out.
 
         Raises:
             ValueError: the recording is another tracer's, or older than the last build.

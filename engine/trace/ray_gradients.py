@@ -10,11 +10,11 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float32, Float64
 
-from octasplat.engine.gaussians.harmonics import sh_basis, sh_basis_slopes
 from octasplat.engine.gaussians.model import FlatGaussians
+from octasplat.engine.gaussians.spherical_harmonics import sh_basis, sh_basis_gradients
 from octasplat.engine.rays import RayBatch
 from octasplat.engine.trace.protocol import Recording, TraceGradients, TraceSettings
-from octasplat.engine.trace.ray_hits import RayHits, hits_by_pieces
+from octasplat.engine.trace.ray_hits import RayHits, batched_ray_hits
 
 
 @dataclass(frozen=True)
@@ -46,17 +46,17 @@ def ray_gradients(
         features: those that the tracer was built with.
     """
     origins, directions = np.zeros((len(rays), 3), np.float32), np.zeros((len(rays), 3), np.float32)
-    for part, hits in hits_by_pieces(gaussians, rays, recording, settings):
-        given = _Given.of(gradients, part)
-        by_origin, by_direction = _of_hits(gaussians, rays[part], hits, given, settings, features)
+    for part, hits in batched_ray_hits(gaussians, rays, recording, settings):
+        given = _OutputGradients.from_slice(gradients, part)
+        by_origin, by_direction = _hit_gradients(gaussians, rays[part], hits, given, settings, features)
         for axis in range(3):
-            origins[part, axis] = hits.sums(by_origin[:, axis])
-            directions[part, axis] = hits.sums(by_direction[:, axis])
+            origins[part, axis] = hits.sums_per_ray(by_origin[:, axis])
+            directions[part, axis] = hits.sums_per_ray(by_direction[:, axis])
     return RayGradients(origins, directions)
 
 
 @dataclass(frozen=True)
-class _Given:
+class _OutputGradients:
     """Gradients by the outputs of some rays, zero where nothing was given."""
 
     rgb: Float64[np.ndarray, "r 3"]
@@ -67,11 +67,11 @@ class _Given:
     features: Float64[np.ndarray, "r f"] | None
 
     @classmethod
-    def of(cls, gradients: TraceGradients, part: slice) -> "_Given":
-        rgb = gradients.rgb_srgb[part].astype(np.float64)
+    def from_slice(cls, gradients: TraceGradients, ray_slice: slice) -> "_OutputGradients":
+        rgb = gradients.rgb_srgb[ray_slice].astype(np.float64)
 
         def scalar(values: np.ndarray | None) -> Float64[np.ndarray, " r"]:
-            return np.zeros(len(rgb)) if values is None else values[part].astype(np.float64)
+            return np.zeros(len(rgb)) if values is None else values[ray_slice].astype(np.float64)
 
         normal, features = gradients.normal_world, gradients.features
         return cls(
@@ -79,21 +79,21 @@ class _Given:
             scalar(gradients.transmittance),
             scalar(gradients.depth_sum),
             scalar(gradients.depth_median),
-            np.zeros_like(rgb) if normal is None else normal[part].astype(np.float64),
-            None if features is None else features[part].astype(np.float64),
+            np.zeros_like(rgb) if normal is None else normal[ray_slice].astype(np.float64),
+            None if features is None else features[ray_slice].astype(np.float64),
         )
 
 
-def _of_hits(
+def _hit_gradients(
     gaussians: FlatGaussians,
     rays: RayBatch,
     hits: RayHits,
-    given: _Given,
+    output_gradients: _OutputGradients,
     settings: TraceSettings,
     features: Float32[np.ndarray, "n f"] | None,
 ) -> tuple[Float64[np.ndarray, "h 3"], Float64[np.ndarray, "h 3"]]:
     """Gradients by the origin and direction of each hit's ray, of this hit alone."""
-    ray, ids = hits.ray, hits.ids
+    ray, ids = hits.ray_ids, hits.ids
     directions = rays.directions_world.astype(np.float64)[ray]
     normals, weight = hits.frames[:, :, 0], hits.weight
 
@@ -106,30 +106,34 @@ def _of_hits(
     view /= length
     sh = gaussians.sh[ids].astype(np.float64)
     colour = 0.5 + np.einsum("hk,hkc->hc", sh_basis(view, gaussians.sh_degree), sh)
-    by_colour = np.where(colour > 0, weight[:, None] * given.rgb[ray], 0.0)
-    slopes = np.einsum("hki,hkc,hc->hi", sh_basis_slopes(view, gaussians.sh_degree), sh, by_colour)
+    by_colour = np.where(colour > 0, weight[:, None] * output_gradients.rgb[ray], 0.0)
+    slopes = np.einsum("hki,hkc,hc->hi", sh_basis_gradients(view, gaussians.sh_degree), sh, by_colour)
     by_view = (slopes - (slopes * view).sum(axis=1, keepdims=True) * view) / length
 
     # --- what a hit brings for each unit of its weight ---
     cosine_to_mean = np.einsum("hi,hi->h", hits.to_mean, normals) / np.linalg.norm(hits.to_mean, axis=1)
     facing = np.where(cosine_to_mean > settings.flip_normal_cos, -1.0, 1.0)
-    value = np.einsum("hc,hc->h", np.maximum(colour, 0), given.rgb[ray])
-    value += hits.t * given.depth_sum[ray]
-    value += facing * np.einsum("hi,hi->h", normals, given.normal[ray])
-    if features is not None and given.features is not None:
-        value += np.einsum("hf,hf->h", features[ids].astype(np.float64), given.features[ray])
+    value = np.einsum("hc,hc->h", np.maximum(colour, 0), output_gradients.rgb[ray])
+    value += hits.t * output_gradients.depth_sum[ray]
+    value += facing * np.einsum("hi,hi->h", normals, output_gradients.normal[ray])
+    if features is not None and output_gradients.features is not None:
+        value += np.einsum("hf,hf->h", features[ids].astype(np.float64), output_gradients.features[ray])
 
     # --- alpha: what it adds here, less what it hides behind ---
     shares = weight * value
-    behind = hits.sums(shares)[ray] - hits.before(shares) - shares
-    left = np.exp(hits.sums(np.log1p(-hits.alpha)))[ray]
-    by_alpha = hits.through * value - (behind + left * given.transmittance[ray]) / (1 - hits.alpha)
-    by_uv = np.where(hits.clamped, 0.0, -by_alpha * hits.alpha)[:, None] * hits.uv
+    behind = hits.sums_per_ray(shares)[ray] - hits.sums_in_front(shares) - shares
+    left = np.exp(hits.sums_per_ray(np.log1p(-hits.alpha)))[ray]
+    by_alpha = hits.transmittance * value - (behind + left * output_gradients.transmittance[ray]) / (
+        1 - hits.alpha
+    )
+    by_uv = np.where(hits.is_clamped, 0.0, -by_alpha * hits.alpha)[:, None] * hits.uv
 
     # --- the hit in its plane, and its distance ---
     by_hit = np.einsum("hik,hk->hi", hits.frames[:, :, 1:], by_uv / hits.scales)
-    is_median = (hits.through > 0.5) & (hits.through * (1 - hits.alpha) <= 0.5)
-    by_t = weight * given.depth_sum[ray] + np.where(is_median, given.depth_median[ray], 0.0)
+    is_median = (hits.transmittance > 0.5) & (hits.transmittance * (1 - hits.alpha) <= 0.5)
+    by_t = weight * output_gradients.depth_sum[ray] + np.where(
+        is_median, output_gradients.depth_median[ray], 0.0
+    )
     by_t += np.einsum("hi,hi->h", by_hit, directions)
     by_position = by_hit - (by_t / hits.cosine)[:, None] * normals
     by_origin = by_position - np.where(is_near[:, None], by_view, 0.0)

@@ -11,7 +11,7 @@ from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.rays import RayBatch
 from octasplat.engine.trace.protocol import Recording, TraceSettings
 
-HITS_AT_ONCE = 1 << 18
+HITS_PER_BATCH = 1 << 18
 """Rows of one piece; each takes about a kilobyte while gradients are computed."""
 
 
@@ -21,7 +21,7 @@ class RayHits:
 
     Attributes:
         counts: hits of each ray.
-        ray: number of each hit's ray.
+        ray_ids: number of each hit's ray.
         ids: number of each hit's Gaussian.
         to_mean: from the ray's origin to the mean.
         frames: rotation matrices; columns are the normal and the in-plane axes.
@@ -30,12 +30,12 @@ class RayHits:
         t: distance of the hit.
         uv: the hit in standard deviations.
         alpha: opacity at the hit.
-        clamped: whether alpha is at its upper limit.
-        through: transmittance in front of the hit.
+        is_clamped: whether alpha is at its upper limit.
+        transmittance: transmittance in front of the hit.
     """
 
     counts: Int64[np.ndarray, " r"]
-    ray: Int64[np.ndarray, " h"]
+    ray_ids: Int64[np.ndarray, " h"]
     ids: Int64[np.ndarray, " h"]
     to_mean: Float64[np.ndarray, "h 3"]
     frames: Float64[np.ndarray, "h 3 3"]
@@ -44,24 +44,24 @@ class RayHits:
     t: Float64[np.ndarray, " h"]
     uv: Float64[np.ndarray, "h 2"]
     alpha: Float64[np.ndarray, " h"]
-    clamped: Bool[np.ndarray, " h"]
-    through: Float64[np.ndarray, " h"]
+    is_clamped: Bool[np.ndarray, " h"]
+    transmittance: Float64[np.ndarray, " h"]
 
     @property
     def weight(self) -> Float64[np.ndarray, " h"]:
         """Share of each hit in what its ray sees, alpha T."""
-        return self.alpha * self.through
+        return self.alpha * self.transmittance
 
-    def before(self, values: Float64[np.ndarray, " h"]) -> Float64[np.ndarray, " h"]:
+    def sums_in_front(self, values: Float64[np.ndarray, " h"]) -> Float64[np.ndarray, " h"]:
         """Sum of ``values`` over the hits in front of each hit on its ray."""
-        return _sums_before(values, self.counts)
+        return _segmented_exclusive_cumsum(values, self.counts)
 
-    def sums(self, values: Float64[np.ndarray, " h"]) -> Float64[np.ndarray, " r"]:
+    def sums_per_ray(self, values: Float64[np.ndarray, " h"]) -> Float64[np.ndarray, " r"]:
         """Sum of ``values`` over each ray."""
-        return np.bincount(self.ray, values, minlength=len(self.counts))
+        return np.bincount(self.ray_ids, values, minlength=len(self.counts))
 
 
-def hits_by_pieces(
+def batched_ray_hits(
     gaussians: FlatGaussians, rays: RayBatch, recording: Recording, settings: TraceSettings
 ) -> Iterator[tuple[slice, RayHits]]:
     """Yield the hits of consecutive rays, and which rays these are; memory stays bounded.
@@ -72,35 +72,35 @@ def hits_by_pieces(
         recording: which Gaussians each ray met.
         settings: of its tracer.
     """
-    counts, ids = recording.by_ray()
+    counts, ids = recording.ids_by_ray()
     ends = np.cumsum(counts, dtype=np.int64)
     first = 0
     while first < len(rays):
         begin = int(ends[first - 1]) if first else 0
-        last = max(first + 1, int(np.searchsorted(ends, begin + HITS_AT_ONCE, side="right")))
+        last = max(first + 1, int(np.searchsorted(ends, begin + HITS_PER_BATCH, side="right")))
         end = int(ends[last - 1])
         part = slice(first, last)
-        yield part, _evaluate(gaussians, rays[part], counts[part], ids[begin:end], settings)
+        yield part, _evaluate_hits(gaussians, rays[part], counts[part], ids[begin:end], settings)
         first = last
 
 
-def heaviest_gaussians(
+def dominant_gaussians(
     gaussians: FlatGaussians, rays: RayBatch, recording: Recording, settings: TraceSettings
 ) -> Int32[np.ndarray, " r"]:
     """Return the number of the Gaussian that weighs most on each ray, -1 where it met none.
 
-    Of equal weights the one in front counts. The arguments are those of :func:`hits_by_pieces`.
+    Of equal weights the one in front counts. The arguments are those of :func:`batched_ray_hits`.
     """
     heaviest = np.full(len(rays), -1, np.int32)
-    for part, hits in hits_by_pieces(gaussians, rays, recording, settings):
-        order = np.lexsort((-hits.weight, hits.ray))  # stable: of equal ones the front one stays first
+    for part, hits in batched_ray_hits(gaussians, rays, recording, settings):
+        order = np.lexsort((-hits.weight, hits.ray_ids))  # stable: of equal ones the front one stays first
         met = np.flatnonzero(hits.counts)
         firsts = (np.cumsum(hits.counts) - hits.counts)[met]
         heaviest[part][met] = hits.ids[order[firsts]]
     return heaviest
 
 
-def _evaluate(
+def _evaluate_hits(
     gaussians: FlatGaussians,
     rays: RayBatch,
     counts: Int32[np.ndarray, " r"],
@@ -122,13 +122,13 @@ def _evaluate(
     clamped = alpha > settings.alpha_max
     alpha = np.minimum(alpha, settings.alpha_max)
     wide = counts.astype(np.int64)
-    through = np.exp(_sums_before(np.log1p(-alpha), wide))
+    through = np.exp(_segmented_exclusive_cumsum(np.log1p(-alpha), wide))
     return RayHits(
         wide, ray, numbers, to_mean, frames, scales, cosine, t, uv, alpha, clamped, through
     )  # fmt: skip
 
 
-def _sums_before(
+def _segmented_exclusive_cumsum(
     values: Float64[np.ndarray, " h"], counts: Int64[np.ndarray, " r"]
 ) -> Float64[np.ndarray, " h"]:
     total = np.concatenate([[0.0], np.cumsum(values)])

@@ -32,7 +32,9 @@ class ReferenceParameters:
     features: Tensor
 
     @classmethod
-    def of(cls, gaussians: FlatGaussians, features: np.ndarray | None = None) -> "ReferenceParameters":
+    def from_gaussians(
+        cls, gaussians: FlatGaussians, features: np.ndarray | None = None
+    ) -> "ReferenceParameters":
         """Leaves with the values of ``gaussians``."""
         extra = np.zeros((len(gaussians), 0)) if features is None else features
         arrays = (
@@ -148,7 +150,7 @@ def trace_reference(
         # Front to back; equal float32 distances are ordered by id (the sort is stable, ids ascend).
         order = t32[ray, ids] if ranks is None else torch.tensor(ranks[ray])[ids]
         ids = ids[torch.sort(order, stable=True).indices]
-        ids = ids[: _stop(alpha[ray, ids].detach(), settings)]
+        ids = ids[: _hit_count(alpha[ray, ids].detach(), settings)]
         hit_ids.append(ids.numpy())
         al = alpha[ray, ids]
         through = torch.cat([torch.ones(1, dtype=torch.float64), torch.cumprod(1 - al, 0)])
@@ -178,7 +180,7 @@ def trace_reference(
     return ReferenceResult(rgb, through, depth, median, normal, extra, hit_ids)
 
 
-def _stop(alphas: Tensor, settings: TraceSettings) -> int:
+def _hit_count(alphas: Tensor, settings: TraceSettings) -> int:
     """Number of hits that count: the two thresholds of the paper's Algorithm 1, or the single one."""
     t1, t2, second_phase = 1.0, 1.0, False
     for k, alpha in enumerate(alphas.tolist()):

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.rays import RayBatch
+from octasplat.engine.trace.gradient_sums import drop_low_weight
 from octasplat.engine.trace.protocol import (
     GaussianGradients,
     Recording,
@@ -17,9 +18,8 @@ from octasplat.engine.trace.protocol import (
     TraceSettings,
 )
 from octasplat.engine.trace.reference import ReferenceParameters, ReferenceResult, trace_reference
-from octasplat.engine.trace.sums import heavier
 
-PAIRS_AT_ONCE = 1 << 17
+PAIRS_PER_BATCH = 1 << 17
 """Rays times Gaussians of one piece; each pair takes about a kilobyte while its gradient is kept."""
 _OUTPUTS = ("rgb_srgb", "transmittance", "depth_sum", "depth_median", "normal_world", "features")
 _PARAMETERS = ("means_world", "quats_wxyz", "log_scales", "opacity_logits", "sh", "features")
@@ -31,13 +31,13 @@ class ReferenceRecording:
 
     rays: RayBatch
     ids: list[np.ndarray]
-    build: object
+    build_id: object
 
-    def of_ray(self, ray: int) -> Int32[np.ndarray, " k"]:
+    def ids_of_ray(self, ray: int) -> Int32[np.ndarray, " k"]:
         """Ids of the Gaussians of one ray, front to back."""
         return self.ids[ray].astype(np.int32)
 
-    def by_ray(self) -> tuple[Int32[np.ndarray, " r"], Int32[np.ndarray, " h"]]:
+    def ids_by_ray(self) -> tuple[Int32[np.ndarray, " r"], Int32[np.ndarray, " h"]]:
         """Hits of each ray, and the ids of all hits, ray by ray and front to back."""
         counts = np.array([len(ids) for ids in self.ids], np.int32)
         return counts, np.concatenate([np.empty(0, np.int32), *self.ids]).astype(np.int32)
@@ -57,13 +57,13 @@ class ReferenceTracer:
         self.settings = settings or TraceSettings(tracer="reference")
         self._gaussians: FlatGaussians | None = None
         self._features = np.empty((0, 0), np.float32)
-        self._build = object()
+        self._build_id = object()
 
     def build(self, gaussians: FlatGaussians, features: Float32[np.ndarray, "n f"] | None = None) -> None:
         """Take over ``gaussians``; there is nothing to build."""
         self._features = np.empty((len(gaussians), 0), np.float32) if features is None else features
         self._gaussians = gaussians
-        self._build = object()
+        self._build_id = object()
 
     def refresh(self, ids: Int32[np.ndarray, " u"] | None = None) -> None:
         """Nothing to do: parameters are read at each trace."""
@@ -72,7 +72,7 @@ class ReferenceTracer:
         """Follow rays; see the protocol."""
         parameters = self._parameters()
         with torch.no_grad():
-            parts = [trace_reference(parameters, rays[piece], self.settings) for piece in self._pieces(rays)]
+            parts = [trace_reference(parameters, rays[piece], self.settings) for piece in self._batches(rays)]
         hit_ids = [ids for part in parts for ids in part.hit_ids]
         shapes = {"rgb_srgb": (3,), "normal_world": (3,), "features": (self._features.shape[1] + 1,)}
         found = {
@@ -83,8 +83,8 @@ class ReferenceTracer:
         }
         found["features"] = np.ascontiguousarray(found["features"][:, :-1])
         counts = np.array([len(ids) for ids in hit_ids], np.int32)
-        hits = ReferenceRecording(rays, hit_ids, self._build) if record else None
-        return TraceResult(**found, hit_counts=counts, hits=hits)
+        hits = ReferenceRecording(rays, hit_ids, self._build_id) if record else None
+        return TraceResult(**found, hit_counts=counts, recording=hits)
 
     def transmittance(self, rays: RayBatch) -> Float32[np.ndarray, " r"]:
         """What light is left along each ray; see the protocol."""
@@ -94,31 +94,33 @@ class ReferenceTracer:
         )
         left = np.empty(len(rays), np.float32)
         with torch.no_grad():
-            for piece in self._pieces(rays):
+            for piece in self._batches(rays):
                 left[piece] = trace_reference(parameters, rays[piece], unlimited).transmittance.numpy()
         left[left < self.settings.transmittance_min] = 0.0
         return left
 
     def backward(
-        self, hits: Recording, gradients: TraceGradients, *, least_weight: float = 0.0
+        self, recording: Recording, gradients: TraceGradients, *, min_blend_weight: float = 0.0
     ) -> GaussianGradients:
         """Gradients of the raw parameters by autograd; see the protocol."""
-        if not isinstance(hits, ReferenceRecording) or hits.build is not self._build:
+        if not isinstance(recording, ReferenceRecording) or recording.build_id is not self._build_id:
             raise ValueError("the recording is not of this tracer, or older than its last build")
         parameters = self._parameters()
         leaves = [getattr(parameters, name) for name in _PARAMETERS]
         sums = [np.zeros(leaf.shape) for leaf in leaves]
         weights, errors = np.zeros(len(parameters.means_world)), np.zeros(len(parameters.means_world))
-        for piece in self._pieces(hits.rays):
-            result = trace_reference(parameters, hits.rays[piece], self.settings)
-            for total, found in zip(sums, _by_leaves(_loss(result, gradients, piece), leaves), strict=True):
+        for piece in self._batches(recording.rays):
+            result = trace_reference(parameters, recording.rays[piece], self.settings)
+            for total, found in zip(
+                sums, _leaf_gradients(_loss(result, gradients, piece), leaves), strict=True
+            ):
                 total += found
             seen = result.features[:, -1]
-            weights += _by_leaves(seen.sum(), leaves)[-1][:, -1]
+            weights += _leaf_gradients(seen.sum(), leaves)[-1][:, -1]
             if gradients.ray_errors is not None:
                 shared = (seen * torch.tensor(gradients.ray_errors[piece], dtype=torch.float64)).sum()
-                errors += _by_leaves(shared, leaves)[-1][:, -1]
-        ids, counts = np.unique(np.concatenate([np.empty(0, np.int64), *hits.ids]), return_counts=True)
+                errors += _leaf_gradients(shared, leaves)[-1][:, -1]
+        ids, counts = np.unique(np.concatenate([np.empty(0, np.int64), *recording.ids]), return_counts=True)
         rows = {name: total[ids].astype(np.float32) for name, total in zip(_PARAMETERS, sums, strict=True)}
         rows["features"] = np.ascontiguousarray(rows["features"][:, :-1])
         everything = GaussianGradients(
@@ -128,22 +130,22 @@ class ReferenceTracer:
             error_sums=errors[ids].astype(np.float32),
             hit_counts=counts.astype(np.int32),
         )
-        return heavier(everything, least_weight)
+        return drop_low_weight(everything, min_blend_weight)
 
     def _parameters(self) -> ReferenceParameters:
         assert self._gaussians is not None, "build first"
         # One channel more than asked for, whose sum along a ray is the sum of the weights.
         ones = np.ones((len(self._gaussians), 1), np.float32)
-        return ReferenceParameters.of(
+        return ReferenceParameters.from_gaussians(
             self._gaussians, np.concatenate([self._features, ones], axis=1, dtype=np.float32)
         )
 
-    def _pieces(self, rays: RayBatch) -> list[slice]:
-        size = max(1, PAIRS_AT_ONCE // max(1, len(self._features)))
+    def _batches(self, rays: RayBatch) -> list[slice]:
+        size = max(1, PAIRS_PER_BATCH // max(1, len(self._features)))
         return [slice(start, min(start + size, len(rays))) for start in range(0, len(rays), size)]
 
 
-def _loss(result: ReferenceResult, gradients: TraceGradients, piece: slice) -> Tensor:
+def _loss(result: ReferenceResult, gradients: TraceGradients, batch: slice) -> Tensor:
     """The scalar whose gradients by the outputs are ``gradients``."""
     loss = torch.zeros((), dtype=torch.float64)
     for name in _OUTPUTS:
@@ -151,11 +153,11 @@ def _loss(result: ReferenceResult, gradients: TraceGradients, piece: slice) -> T
         if given is not None:
             output = getattr(result, name)
             output = output[:, :-1] if name == "features" else output
-            loss = loss + (output * torch.tensor(given[piece], dtype=torch.float64)).sum()
+            loss = loss + (output * torch.tensor(given[batch], dtype=torch.float64)).sum()
     return loss
 
 
-def _by_leaves(loss: Tensor, leaves: list[Tensor]) -> list[Float64[np.ndarray, "..."]]:
+def _leaf_gradients(loss: Tensor, leaves: list[Tensor]) -> list[Float64[np.ndarray, "..."]]:
     """Gradients of ``loss``, zero where it does not depend on a leaf."""
     if not loss.requires_grad:
         return [np.zeros(leaf.shape) for leaf in leaves]

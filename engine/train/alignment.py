@@ -14,9 +14,9 @@ from jaxtyping import Bool, Float32, Float64, Int64
 from scipy.spatial.transform import Rotation
 
 from octasplat.engine.colour import composited
-from octasplat.engine.scene import Camera
-from octasplat.engine.scene.flow import flow_by_pose
-from octasplat.engine.scene.seen import turned
+from octasplat.engine.dataset import Camera
+from octasplat.engine.dataset.image_motion import image_motion_by_pose
+from octasplat.engine.dataset.view_frusta import rotate_vectors
 from octasplat.engine.train.pixel_sampler import Pixels
 
 STEPS = 2
@@ -51,7 +51,7 @@ class Motion:
 
     def __call__(self, points_cam: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 3"]:
         """The points after the motion."""
-        return turned(points_cam, self.rotation) + self.shift_cam
+        return rotate_vectors(points_cam, self.rotation) + self.shift_cam
 
     def share(self, share: float) -> "Motion":
         """A share of the motion."""
@@ -197,7 +197,7 @@ def _step(
 
     Shifts count in depths while it is solved, so that all six numbers are angles.
     """
-    flow = flow_by_pose(points_cam, camera, depth)
+    flow = image_motion_by_pose(points_cam, camera, depth)
     by_pose = np.einsum("nci,nik->nck", now.shown.slope, flow)
     slopes = np.zeros((len(points_cam), 3, 12))  # by the pose, and by each channel's gain and offset
     slopes[:, :, :6] = by_pose

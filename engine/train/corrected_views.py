@@ -7,8 +7,8 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int64
 from scipy.spatial.transform import Rotation
 
+from octasplat.engine.dataset import Camera, DatasetView
 from octasplat.engine.rays import RayBatch
-from octasplat.engine.scene import Camera, View
 from octasplat.engine.train.alignment import Motion
 from octasplat.engine.train.pixel_sampler import TrainingData
 
@@ -18,7 +18,7 @@ ROUNDS = 3
 
 @runtime_checkable
 class PosedPhotographs(TrainingData, Protocol):
-    """Photographs with their cameras (see :class:`octasplat.engine.scene.Dataset`)."""
+    """Photographs with their cameras (see :class:`octasplat.engine.dataset.Dataset`)."""
 
     cameras: tuple[Camera, ...]
 
@@ -38,7 +38,7 @@ class CorrectedViews:
 
     def __init__(self, given: PosedPhotographs) -> None:
         self.given = given
-        self.views: tuple[View, ...] = given.views
+        self.views: tuple[DatasetView, ...] = given.views
         self.cameras = given.cameras
         self.train_indices: Int64[np.ndarray, " t"] = given.train_indices
         self.test_indices: Int64[np.ndarray, " h"] = given.test_indices
@@ -81,7 +81,7 @@ class CorrectedViews:
         return self.given.pixels(view, y, x)
 
 
-def corrected(view: View, motion: Motion) -> View:
+def corrected(view: DatasetView, motion: Motion) -> DatasetView:
     """A view whose camera's points have moved."""
     rotation = motion.rotation @ view.rotation_cam_from_world
     return replace(
@@ -124,7 +124,7 @@ def without_common(
 
 
 def _common(
-    given: list[View], now: list[View], middle: Float64[np.ndarray, "3"], extent: float
+    given: list[DatasetView], now: list[DatasetView], middle: Float64[np.ndarray, "3"], extent: float
 ) -> tuple[Float64[np.ndarray, "3"], Float64[np.ndarray, "3"], float]:
     """The small turn (rad) about ``middle``, shift and relative growth nearest to all views' motions.
 

@@ -23,7 +23,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int64
 from scipy.spatial import cKDTree
 
-from octasplat.engine.scene import Dataset
+from octasplat.engine.dataset import Dataset
 from octasplat.engine.train.first_background import FirstBackground
 from octasplat.engine.train.kernels_patches import patch_differences
 from octasplat.engine.train.lifted_points import Evidence, LiftedPoints, borne_out

@@ -12,10 +12,10 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Int64
 
+from octasplat.engine.dataset import Dataset
 from octasplat.engine.errors import Cancelled
-from octasplat.engine.scene import Dataset
 from octasplat.engine.threads import use_threads
-from octasplat.engine.trace.make import make_tracer
+from octasplat.engine.trace.factory import make_tracer
 from octasplat.engine.train.batches import still_background
 from octasplat.engine.train.config import Background, TrainConfig
 from octasplat.engine.train.first_state import first_state

@@ -5,7 +5,7 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Float32, Float64, Int64
 
-from octasplat.engine.scene.model import Observations
+from octasplat.engine.dataset.model import Observations
 from octasplat.engine.train.config import TrainConfig
 from octasplat.engine.train.pixel_sampler import TrainingData
 
@@ -20,7 +20,7 @@ CHANGES = 0.05
 
 @runtime_checkable
 class TrackedPhotographs(TrainingData, Protocol):
-    """Photographs with the points that they show (see :class:`octasplat.engine.scene.Dataset`)."""
+    """Photographs with the points that they show (see :class:`octasplat.engine.dataset.Dataset`)."""
 
     observations: Observations
 

@@ -13,9 +13,9 @@ from jaxtyping import Bool, Float32, Float64, Int64
 from scipy.ndimage import distance_transform_edt, gaussian_filter
 from scipy.spatial import cKDTree
 
-from octasplat.engine.scene import Camera
-from octasplat.engine.scene.model import SparsePoints
-from octasplat.engine.scene.seen import is_shown, points_in_cam
+from octasplat.engine.dataset import Camera
+from octasplat.engine.dataset.model import SparsePoints
+from octasplat.engine.dataset.view_frusta import cam_from_world, is_in_image
 from octasplat.engine.shading.learnt_background import LearntBackground
 from octasplat.engine.train.pixel_sampler import TrainingData
 
@@ -35,7 +35,7 @@ SOFT_TEXELS = (2.0, 6.0)
 
 @runtime_checkable
 class MappedPhotographs(TrainingData, Protocol):
-    """Photographs with their sparse model (see :class:`octasplat.engine.scene.Dataset`)."""
+    """Photographs with their sparse model (see :class:`octasplat.engine.dataset.Dataset`)."""
 
     cameras: tuple[Camera, ...]
     points: SparsePoints
@@ -118,13 +118,13 @@ def _seen(
     view = dataset.views[index]
     camera = dataset.cameras[view.camera_index]
     in_cam = np.stack([_cosines(directions, axis) for axis in view.rotation_cam_from_world], axis=1)
-    texel = np.flatnonzero(is_shown(in_cam, camera))
+    texel = np.flatnonzero(is_in_image(in_cam, camera))
     pixels_px = camera.project(in_cam[texel]).reshape(-1, 2)
     x = np.clip(pixels_px[:, 0].astype(np.int64), 0, view.width_px - 1)
     y = np.clip(pixels_px[:, 1].astype(np.int64), 0, view.height_px - 1)
     rgb, _, weight = dataset.pixels(np.full(len(texel), index), y, x)
-    points_cam = points_in_cam(points, view)
-    points_px = camera.project(points_cam[is_shown(points_cam, camera)]).reshape(-1, 2)
+    points_cam = cam_from_world(points, view)
+    points_px = camera.project(points_cam[is_in_image(points_cam, camera)]).reshape(-1, 2)
     empty = np.ones(len(texel), np.bool_)
     if len(points_px):
         reach = EMPTY_SHARE * max(view.width_px, view.height_px)

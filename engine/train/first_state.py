@@ -1,6 +1,6 @@
 """The state before the first iteration, made from the photographs."""
 
-from octasplat.engine.scene import Dataset
+from octasplat.engine.dataset import Dataset
 from octasplat.engine.train.config import TrainConfig
 from octasplat.engine.train.first_background import first_background
 from octasplat.engine.train.initialise import initial_gaussians, with_first_materials

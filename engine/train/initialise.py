@@ -9,11 +9,11 @@ import numpy as np
 from jaxtyping import Float32, Float64
 from scipy.spatial import cKDTree
 
+from octasplat.engine.dataset import Dataset
 from octasplat.engine.errors import DatasetError
-from octasplat.engine.gaussians.frames import frames_from_normals, quaternions
-from octasplat.engine.gaussians.materials import AMBIENT, BOUNCED, MATERIAL_WIDTHS
+from octasplat.engine.gaussians.frames import frames_from_normals, quaternions_from_matrices
+from octasplat.engine.gaussians.materials import AMBIENT, DIFFUSE_INTERREFLECTION, MATERIAL_WIDTHS
 from octasplat.engine.gaussians.model import SH_C0, FlatGaussians
-from octasplat.engine.scene import Dataset
 from octasplat.engine.shading.material_settings import (
     FIRST_ALBEDO,
     FIRST_METALLIC,
@@ -90,7 +90,7 @@ def with_first_materials(gaussians: FlatGaussians, settings: MaterialSettings) -
     values = (FIRST_ALBEDO,) * 3, (FIRST_METALLIC,), (FIRST_ROUGHNESS,)
     first = dict(zip(MATERIAL_WIDTHS, values, strict=True)) | {AMBIENT: (1.0,)}
     if settings.recipe == "split_sum" and settings.diffuse_interreflection:
-        first[BOUNCED] = (0.0,) * 3
+        first[DIFFUSE_INTERREFLECTION] = (0.0,) * 3
     return gaussians.with_channels(
         {name: np.tile(np.array(value, np.float32), (len(gaussians), 1)) for name, value in first.items()}
     )
@@ -178,7 +178,7 @@ def _assemble(
     count = len(points)
     return FlatGaussians(
         means_world=points.astype(np.float32),
-        quats_wxyz=quaternions(frames_from_normals(normals)).astype(np.float32),
+        quats_wxyz=quaternions_from_matrices(frames_from_normals(normals)).astype(np.float32),
         log_scales=np.repeat(np.log(spacing)[:, None], 2, axis=1).astype(np.float32),
         opacity_logits=np.full(count, np.log(opacity / (1 - opacity)), np.float32),
         sh=((rgb_srgb - 0.5) / SH_C0).astype(np.float32)[:, None, :],

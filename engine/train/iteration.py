@@ -10,8 +10,8 @@ import numpy as np
 
 from octasplat.engine.errors import TrainingFailure
 from octasplat.engine.shading.protocol import ShadingModel, Sight
+from octasplat.engine.trace.gradient_sums import add_gradients, drop_low_weight
 from octasplat.engine.trace.protocol import GaussianGradients, Tracer
-from octasplat.engine.trace.sums import add_gradients, heavier
 from octasplat.engine.train.batches import Batch
 from octasplat.engine.train.config import LossWeights, TrainConfig
 from octasplat.engine.train.densify import Densifier
@@ -71,7 +71,7 @@ def differentiate(
         least_weight: Gaussians whose weights over all rays add up to less get no gradients.
     """
     seen = tracer.trace(batch.rays, record=True)
-    assert seen.hits is not None
+    assert seen.recording is not None
     sight = Sight(batch.rays, seen, tracer, batch.view, progress, windows=batch.windows)
     developed = shading.develop(sight)
     render = developed.over(batch.background_srgb)
@@ -80,14 +80,14 @@ def differentiate(
     by_seen = back.seen
     if with_errors:
         by_seen = replace(by_seen, ray_errors=ray_errors(render, batch.target_srgb, batch.weight))
-    recorded = [(seen.hits, by_seen), *back.further]
+    recorded = [(seen.recording, by_seen), *back.further]
     if batch.sight_lines is not None:
         recorded.append(blocked_term(batch.sight_lines, tracer, weights.free_space))
     least = least_weight if len(recorded) == 1 else 0.0  # what several say has to be added up first
-    parts = [tracer.backward(hits, by, least_weight=least).numpy() for hits, by in recorded]
+    parts = [tracer.backward(hits, by, min_blend_weight=least).numpy() for hits, by in recorded]
     return Differentiated(
         loss=loss,
-        gaussians=heavier(add_gradients(parts), least_weight),
+        gaussians=drop_low_weight(add_gradients(parts), least_weight),
         shading=back.parameters,
         hits_per_ray=float(seen.hit_counts.mean()),
     )

@@ -9,7 +9,7 @@ from numba.core import cgutils
 from numba.extending import intrinsic
 
 from octasplat.engine.compilation import device_function, kernel
-from octasplat.engine.trace.kernels_native import ask_for, float32_pointer, lean
+from octasplat.engine.trace.kernels.native import float32_pointer, njit_no_refcount, prefetch_bytes
 
 LANES = 16
 GEOMETRY = 3 + 4 + 2 + 1
@@ -80,7 +80,7 @@ def _word(value):
     return ir.Constant(ir.IntType(32), value)
 
 
-@lean()
+@njit_no_refcount()
 def copy_few(source, target, count):
     """Copy so many float32 from one address to another."""
     read, write = float32_pointer(source), float32_pointer(target)
@@ -88,7 +88,7 @@ def copy_few(source, target, count):
         write[k] = read[k]
 
 
-@lean()
+@njit_no_refcount()
 def step_few(values, gradients, rates, first, second, count, room, numbers):
     """:func:`step_lanes` for the first ``count`` alone, within ``room`` for 64 float32.
 
@@ -105,7 +105,7 @@ def step_few(values, gradients, rates, first, second, count, room, numbers):
     copy_few(room + 3 * line, second, count)
 
 
-@lean(fastmath={"contract"})
+@njit_no_refcount(fastmath={"contract"})
 def own_axes_of(i, quats, room):
     """The axes of Gaussian ``i`` as rows of ``room``: the normal and the two in its plane."""
     w, x, y, z = (
@@ -117,7 +117,7 @@ def own_axes_of(i, quats, room):
     room[2, 0], room[2, 1], room[2, 2] = s * (x * z + w * y), s * (y * z - w * x), 1.0 - s * (x * x + y * y)
 
 
-@lean(fastmath={"contract"})
+@njit_no_refcount(fastmath={"contract"})
 def by_own_turns(k, i, quats, g_quats, out):
     """Gradient of Gaussian ``i`` by turns around its own axes: by d of its quaternion times (1, d)."""
     w, x, y, z = quats[i, 0], quats[i, 1], quats[i, 2], quats[i, 3]
@@ -128,7 +128,7 @@ def by_own_turns(k, i, quats, g_quats, out):
     out[6] = -a * z + b * y - c * x + d * w
 
 
-@lean(fastmath={"contract"})
+@njit_no_refcount(fastmath={"contract"})
 def turn(i, quats, by):
     """Replace the quaternion of Gaussian ``i`` by that times (1, ``by[4:7]``), of length 1."""
     w, x, y, z = (
@@ -142,7 +142,7 @@ def turn(i, quats, by):
     quats[i, 3] = (z + w * c + x * b - y * a) * share
 
 
-@lean(fastmath={"contract"})
+@njit_no_refcount(fastmath={"contract"})
 def step_gaussian(k, i, room, state, gaussian, gradients, rates, regular, corrections):
     """One step of Gaussian ``i``, row ``k`` of the gradients; see :func:`adam_step`."""
     first, second, numbers = state
@@ -213,7 +213,7 @@ def step_gaussian(k, i, room, state, gaussian, gradients, rates, regular, correc
     logits[i] = values[9]
 
 
-@lean(fastmath={"contract"})
+@njit_no_refcount(fastmath={"contract"})
 def step_chunk(begin, end, ids, steps, powers, room, state, gaussian, gradients, rates, regular, corrections):
     """:func:`step_gaussian` for rows ``begin`` to ``end``."""
     first, second, beta1, beta2, epsilon = state
@@ -222,9 +222,9 @@ def step_chunk(begin, end, ids, steps, powers, room, state, gaussian, gradients,
     for k in range(begin, end):
         if k + AHEAD < end:
             ahead = ids[k + AHEAD]
-            ask_for(first.ctypes.data + ahead * moments_bytes, moments_bytes)
-            ask_for(second.ctypes.data + ahead * moments_bytes, moments_bytes)
-            ask_for(sh.ctypes.data + ahead * sh_bytes, sh_bytes)
+            prefetch_bytes(first.ctypes.data + ahead * moments_bytes, moments_bytes)
+            prefetch_bytes(second.ctypes.data + ahead * moments_bytes, moments_bytes)
+            prefetch_bytes(sh.ctypes.data + ahead * sh_bytes, sh_bytes)
         i = ids[k]
         steps[i] += 1
         c1, c2 = 1.0 / (1.0 - powers[0, steps[i]]), 1.0 / (1.0 - powers[1, steps[i]])

@@ -3,13 +3,13 @@
 import numpy as np
 
 from octasplat.engine.compilation import kernel
-from octasplat.engine.trace.kernels_native import lean
+from octasplat.engine.trace.kernels.native import njit_no_refcount
 
 CHUNKS = 64
 """Parts whose sums are added up one after the other: the same on any number of threads."""
 
 
-@lean()
+@njit_no_refcount()
 def _part(first, last, render, target, weight, l1, l2, gradient, sums):
     absolute = squared = 0.0
     for r in range(first, last):

@@ -11,8 +11,8 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int64
 
 from octasplat.engine.colour import composited
+from octasplat.engine.dataset import DatasetView
 from octasplat.engine.psnr import colour_corrected, psnr
-from octasplat.engine.scene import View
 from octasplat.engine.shading.protocol import ShadingModel
 from octasplat.engine.trace.protocol import Tracer
 from octasplat.engine.train.pixel_sampler import TrainingData
@@ -71,7 +71,7 @@ def view_fits(
 
 def misfits(
     fits: ViewFits,
-    views: Sequence[View],
+    views: Sequence[DatasetView],
     train_indices: Int64[np.ndarray, " t"],
     sigmas: float = FAR_BELOW_SIGMAS,
 ) -> Int64[np.ndarray, " m"]:
@@ -110,7 +110,7 @@ def _around(
     indices: Int64[np.ndarray, " v"],
     psnr: Float64[np.ndarray, " v"],
     counts: Bool[np.ndarray, " v"],
-    views: Sequence[View],
+    views: Sequence[DatasetView],
 ) -> Float64[np.ndarray, " v"]:
     """Return the middle of the PSNR of the nearest views of each among those that count, dB.
 

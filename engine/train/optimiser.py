@@ -11,7 +11,7 @@ from jaxtyping import Float32, Float64, Int32
 
 from octasplat.engine.compilation import run_ranges
 from octasplat.engine.gaussians.model import SH_C0, FlatGaussians
-from octasplat.engine.gaussians.rows import join_rows, row_arrays, select_rows
+from octasplat.engine.gaussians.rows import concatenate_rows, row_arrays, select_rows
 from octasplat.engine.threads import threads_in_use
 from octasplat.engine.trace.protocol import GaussianGradients
 from octasplat.engine.train.config import LearningRates, LossWeights
@@ -62,7 +62,7 @@ class Adam:
 
     def append(self, other: "Adam") -> "Adam":
         """This state followed by ``other``."""
-        return join_rows([self, other])
+        return concatenate_rows([self, other])
 
     def widen(self, basis_count: int) -> "Adam":
         """Room for ``basis_count`` harmonics; the new ones start with zero moments."""

@@ -6,8 +6,8 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Float32, Int64
 
+from octasplat.engine.dataset import DatasetView
 from octasplat.engine.rays import RayBatch
-from octasplat.engine.scene import View
 from octasplat.engine.shading.ray_windows import z_order
 
 GOLDEN = (math.sqrt(5) - 1) / 2
@@ -16,7 +16,7 @@ GOLDEN = (math.sqrt(5) - 1) / 2
 
 @runtime_checkable
 class Pixels(Protocol):
-    """What training needs of a dataset (see :class:`octasplat.engine.scene.Dataset`)."""
+    """What training needs of a dataset (see :class:`octasplat.engine.dataset.Dataset`)."""
 
     def rays(
         self, view: Int64[np.ndarray, " r"], y: Int64[np.ndarray, " r"], x: Int64[np.ndarray, " r"]
@@ -35,10 +35,10 @@ class Pixels(Protocol):
 class TrainingData(Pixels, Protocol):
     """The photographs: pixel access, the views and the split.
 
-    See :class:`octasplat.engine.scene.Dataset`.
+    See :class:`octasplat.engine.dataset.Dataset`.
     """
 
-    views: tuple[View, ...]
+    views: tuple[DatasetView, ...]
     train_indices: Int64[np.ndarray, " t"]
     test_indices: Int64[np.ndarray, " h"]
     has_alpha: bool

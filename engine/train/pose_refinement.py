@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float32, Float64, Int64
 
-from octasplat.engine.scene.seen import turned
+from octasplat.engine.dataset.view_frusta import rotate_vectors
 from octasplat.engine.shading.protocol import ShadingModel, Sight
 from octasplat.engine.trace.protocol import Tracer
 from octasplat.engine.train.alignment import Motion, Rendered, aligned, photograph_of
@@ -155,5 +155,5 @@ class PoseRefiner:
             points_world = seen.depth_median[:, None].astype(np.float64) * rays.directions_world
             for index in some.tolist():
                 chosen = met & (view == index)
-                points = turned(points_world[chosen], dataset.views[index].rotation_cam_from_world)
+                points = rotate_vectors(points_world[chosen], dataset.views[index].rotation_cam_from_world)
                 yield index, Rendered(points, rgb[chosen].astype(np.float64))

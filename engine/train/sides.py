@@ -56,11 +56,11 @@ def _towards_viewers(
     """
     rays = dataset.rays(*grid_pixels(indices, view_sizes_px(dataset), TILES))
     seen = tracer.trace(rays, record=True)
-    assert seen.hits is not None
+    assert seen.recording is not None
     by_features = np.zeros_like(seen.features)
     by_features[:, :3] = -rays.directions_world
     given = TraceGradients(rgb_srgb=np.zeros((len(rays), 3), np.float32), features=by_features)
-    found = tracer.backward(seen.hits, given).numpy()
+    found = tracer.backward(seen.recording, given).numpy()
     sums = np.zeros((count, 3))
     sums[found.ids] = found.features[:, :3]
     return sums

@@ -12,9 +12,9 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Float64, Int64
 
+from octasplat.engine.dataset.camera import Camera
+from octasplat.engine.dataset.model import DatasetView, Observations, SparsePoints
 from octasplat.engine.rays import RayBatch
-from octasplat.engine.scene.cameras import Camera
-from octasplat.engine.scene.model import Observations, SparsePoints, View
 from octasplat.engine.trace.protocol import Recording, TraceGradients, Tracer
 
 LEAST_TRACK = 3
@@ -29,10 +29,10 @@ LEAST_ERROR_PX = 0.5
 class PhotographsOfPoints(Protocol):
     """Photographs with the points that they show, and where these lie.
 
-    See :class:`octasplat.engine.scene.Dataset`.
+    See :class:`octasplat.engine.dataset.Dataset`.
     """
 
-    views: tuple[View, ...]
+    views: tuple[DatasetView, ...]
     cameras: tuple[Camera, ...]
     train_indices: Int64[np.ndarray, " t"]
     points: SparsePoints
@@ -84,7 +84,9 @@ class SightLines:
             "ki,kij,kj->k", direction, outer[row], direction
         )  # sum of squared cosines, itself 1
         sharpness = np.sqrt(np.maximum(track[row] - along, 1e-12))
-        pixel_rad = np.array([dataset.cameras[each.camera_index].pixel_rad for each in dataset.views])[view]
+        pixel_rad = np.array([dataset.cameras[each.camera_index].pixel_angle_rad for each in dataset.views])[
+            view
+        ]
         error_px = np.maximum(points.errors_px[row], LEAST_ERROR_PX)
         deviation = error_px * pixel_rad * distance / sharpness
         ends = distance - np.maximum(DEVIATIONS * deviation, margin * distance)
@@ -107,8 +109,8 @@ class SightLines:
 def blocked_term(lines: RayBatch, tracer: Tracer, weight: float) -> tuple[Recording, TraceGradients]:
     """What was traced along lines of sight, and gradients of ``weight`` times their mean hidden share."""
     seen = tracer.trace(lines, record=True)
-    assert seen.hits is not None
+    assert seen.recording is not None
     none = np.zeros_like(seen.rgb_srgb)
-    return seen.hits, TraceGradients(
+    return seen.recording, TraceGradients(
         none, transmittance=np.full(len(lines), -weight / len(lines), np.float32)
     )

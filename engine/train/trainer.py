@@ -7,14 +7,14 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float32
 
+from octasplat.engine.dataset.camera_clearance import CameraClearance
+from octasplat.engine.dataset.view_frusta import ViewFrusta
 from octasplat.engine.errors import Cancelled, ConfigError, TrainingFailure
 from octasplat.engine.events import CheckpointWritten, Listener, TrainingProgress, Warned
 from octasplat.engine.gaussians.model import FlatGaussians
-from octasplat.engine.gaussians.order import morton_order
-from octasplat.engine.scene.near import NearZones
-from octasplat.engine.scene.seen import SeenSpace
+from octasplat.engine.gaussians.morton import morton_order
 from octasplat.engine.shading.protocol import ShadingModel
-from octasplat.engine.trace.make import make_tracer
+from octasplat.engine.trace.factory import make_tracer
 from octasplat.engine.trace.protocol import Tracer
 from octasplat.engine.train.batches import BatchSource, DrawnAhead, still_background
 from octasplat.engine.train.checkpoint import save_checkpoint
@@ -85,8 +85,8 @@ class Trainer:
         threads: int = 0,
         should_stop: Callable[[], bool] = lambda: False,
         scale_floor: ScaleFloor | None = None,
-        near_zones: NearZones | None = None,
-        seen_space: SeenSpace | None = None,
+        near_zones: CameraClearance | None = None,
+        seen_space: ViewFrusta | None = None,
         tracer: Tracer | None = None,
         shading: ShadingModel | None = None,
         onlooker: Callable[[int, Tracer], None] | None = None,
@@ -351,10 +351,10 @@ class Trainer:
         """Which Gaussians are in the grown zone around a camera, and which are that or in no view."""
         near = np.zeros(len(gaussians), np.bool_)
         if self._near_zones is not None:
-            near = self._near_zones.grown(grown).holds(gaussians.means_world)
+            near = self._near_zones.scaled(grown).contains(gaussians.means_world)
         if self._seen_space is None:
             return near, near.copy()
-        return near, near | ~self._seen_space.holds(gaussians.means_world)
+        return near, near | ~self._seen_space.contains(gaussians.means_world)
 
     def _densify(self) -> bool:
         """Let the strategy change the set of Gaussians if it is time; whether it was."""

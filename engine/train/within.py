@@ -12,9 +12,9 @@ from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
+from octasplat.engine.dataset import Dataset
 from octasplat.engine.errors import Cancelled, ConfigError
 from octasplat.engine.gaussians.model import FlatGaussians
-from octasplat.engine.scene import Dataset
 from octasplat.engine.trace.protocol import Tracer
 from octasplat.engine.train.config import MOST_PLANNED_ITERATIONS, TrainConfig, in_one_order, most_gaussians
 from octasplat.engine.train.shown import shown_share

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from octasplat.engine.render.images import write_png
+from octasplat.engine.render.image_files import write_png
 
 ROUND, HIGH, PIXELS = 96, 64, 512
 THICK = 0.06

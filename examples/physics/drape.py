@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float64, Int64
 from mujoco_drop import simulate_cloth
 
 from octasplat.engine.edit.deform import deform_to, deformation_corners
-from octasplat.engine.edit.proxy import Proxy, bind
+from octasplat.engine.edit.proxy import Proxy, bind_corners
 from octasplat.engine.files import read_scene
 from octasplat.engine.gaussians.model import FlatGaussians
 
@@ -59,7 +59,7 @@ class ClothRider:
     ) -> None:
         self._gaussians = gaussians
         self._corners = deformation_corners(gaussians)
-        self._binding = bind(Proxy(vertices_world, triangles), self._corners, reach_world=np.inf)
+        self._binding = bind_corners(Proxy(vertices_world, triangles), self._corners, reach_world=np.inf)
 
     def at(self, nodes_world: Float64[np.ndarray, "v 3"]) -> FlatGaussians:
         """The Gaussians when the grid's vertices are there."""

@@ -16,12 +16,12 @@ from soft_body import Rider, belongs_to, lattice_around
 
 from octasplat.engine.files import read_mesh, read_scene
 from octasplat.engine.gaussians.model import FlatGaussians, concatenate
-from octasplat.engine.render.cameras import RenderCamera, focal_from_fov
-from octasplat.engine.render.images import write_png
-from octasplat.engine.render.paths import look_at
+from octasplat.engine.geometry.triangle_mesh import TriangleMesh
+from octasplat.engine.render.image_files import write_png
+from octasplat.engine.render.pinhole_camera import PinholeCamera, focal_from_fov
+from octasplat.engine.render.pose_paths import look_at
 from octasplat.engine.render.renderer import render_rays
 from octasplat.engine.render.video import VideoWriter
-from octasplat.engine.surface.mesh import TriangleMesh
 from octasplat.engine.trace.cpu.tracer import CpuTracer
 from octasplat.engine.trace.protocol import Tracer
 
@@ -38,7 +38,7 @@ def film(
     still: FlatGaussians,
     rider: Rides,
     frames: np.ndarray,
-    camera: RenderCamera,
+    camera: PinholeCamera,
     tracer: Tracer,
 ) -> Iterator[np.ndarray]:
     """Images of the scene with the moved thing in it, display values (h, w, 3)."""
@@ -52,7 +52,7 @@ def write_film(options: argparse.Namespace, still: FlatGaussians, rider: Rides, 
     """Write the video, and its frames as PNG if asked."""
     pose = look_at(np.array(options.eye), np.array(options.target), np.array([0.0, 0.0, 1.0]))
     focal = focal_from_fov(options.fov, options.height)
-    camera = RenderCamera.from_pose(pose, options.width, options.height, fy_px=focal)
+    camera = PinholeCamera.from_pose(pose, options.width, options.height, fy_px=focal)
     with VideoWriter(options.output, options.fps, options.width, options.height) as video:
         for number, image in enumerate(film(still, rider, frames, camera, CpuTracer())):
             video.write(image)

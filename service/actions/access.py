@@ -3,14 +3,14 @@
 import uuid
 
 from octasplat.service.auth import Principal
-from octasplat.service.problems import Problem, not_found
+from octasplat.service.problems import ProblemError, not_found_error
 from octasplat.service.state import Service
+from octasplat.workers.db.connections import Connection
+from octasplat.workers.db.datasets import get_dataset
+from octasplat.workers.db.errors import ConflictError
+from octasplat.workers.db.rows import Dataset, Job
+from octasplat.workers.maintenance.webhooks.rows import Endpoint, get_endpoint
 from octasplat.workers.queue.jobs import get_job
-from octasplat.workers.records.database import Connection
-from octasplat.workers.records.datasets import get_dataset
-from octasplat.workers.records.errors import Conflict
-from octasplat.workers.records.rows import Dataset, Job
-from octasplat.workers.upkeep.webhooks.rows import Endpoint, get_endpoint
 
 _RETRY_SECONDS = 10
 
@@ -22,8 +22,8 @@ async def owned_job(connection: Connection, who: Principal, job_id: uuid.UUID, *
         Problem: 404.
     """
     job = await get_job(connection, job_id, lock=lock)
-    if job is None or not who.owns(job.owner):
-        raise not_found("job")
+    if job is None or not who.may_see(job.owner):
+        raise not_found_error("job")
     return job
 
 
@@ -42,8 +42,8 @@ async def owned_dataset(
         Problem: 404.
     """
     dataset = await get_dataset(connection, dataset_id, lock=lock)
-    if dataset is None or not who.owns(dataset.owner):
-        raise not_found("dataset")
+    if dataset is None or not who.may_see(dataset.owner):
+        raise not_found_error("dataset")
     return dataset
 
 
@@ -56,7 +56,9 @@ async def open_dataset(connection: Connection, who: Principal, dataset_id: uuid.
     """
     dataset = await owned_dataset(connection, who, dataset_id)
     if dataset.state != "open":
-        raise Conflict(f"The dataset is {dataset.state}, so its files do not change; make a new dataset.")
+        raise ConflictError(
+            f"The dataset is {dataset.state}, so its files do not change; make a new dataset."
+        )
     return dataset
 
 
@@ -67,27 +69,27 @@ async def owned_webhook(connection: Connection, who: Principal, webhook_id: uuid
         Problem: 404.
     """
     endpoint = await get_endpoint(connection, webhook_id)
-    if endpoint is None or not who.owns(endpoint.owner):
-        raise not_found("webhook")
+    if endpoint is None or not who.may_see(endpoint.owner):
+        raise not_found_error("webhook")
     return endpoint
 
 
-def sought(name: str, what: str) -> str:
+def check_searchable_name(name: str, kind: str) -> str:
     """A name to look for.
 
     Raises:
         Problem: 404, as nothing has a name that the database cannot hold.
     """
     if "\0" in name:
-        raise not_found(what)
+        raise not_found_error(kind)
     return name
 
 
-def refuse_while_draining(service: Service) -> None:
+def check_not_draining(service: Service) -> None:
     """Take nothing on that may not be finished.
 
     Raises:
         Problem: 503.
     """
-    if service.draining:
-        raise Problem(503, "draining", "The service is about to stop.", retry_seconds=_RETRY_SECONDS)
+    if service.is_draining:
+        raise ProblemError(503, "draining", "The service is about to stop.", retry_seconds=_RETRY_SECONDS)

@@ -2,14 +2,14 @@
 
 import uuid
 
-from octasplat.service.actions.access import owned_job, read_job, sought
+from octasplat.service.actions.access import check_searchable_name, owned_job, read_job
 from octasplat.service.auth import Principal
-from octasplat.service.problems import not_found
+from octasplat.service.problems import not_found_error
 from octasplat.service.state import Service
-from octasplat.service.threads import Threads, in_thread
+from octasplat.service.thread_pools import ThreadPurpose, run_in_pool
+from octasplat.workers.db.rows import Artifact
 from octasplat.workers.queue import jobs as rows
-from octasplat.workers.records.rows import Artifact
-from octasplat.workers.store.protocol import Blob
+from octasplat.workers.storage.protocol import Blob
 
 
 async def list_artifacts(service: Service, who: Principal, job_id: uuid.UUID) -> list[Artifact]:
@@ -24,18 +24,18 @@ async def list_artifacts(service: Service, who: Principal, job_id: uuid.UUID) ->
 
 
 async def get_artifact(
-    service: Service, who: Principal, job_id: uuid.UUID, name: str, *, what: str = "result"
+    service: Service, who: Principal, job_id: uuid.UUID, name: str, *, kind: str = "result"
 ) -> Artifact:
-    """A result of a job; without one the problem says that there is no such ``what``.
+    """A result of a job; without one the problem says that there is no such ``kind``.
 
     Raises:
         Problem: 404.
     """
     async with service.pool.connection() as connection:
         await owned_job(connection, who, job_id)
-        row = await rows.get_artifact(connection, job_id, sought(name, what))
+        row = await rows.get_artifact(connection, job_id, check_searchable_name(name, kind))
     if row is None:
-        raise not_found(what)
+        raise not_found_error(kind)
     return row
 
 
@@ -48,5 +48,5 @@ async def get_preview(service: Service, who: Principal, job_id: uuid.UUID) -> Bl
     """
     job = await read_job(service, who, job_id)
     if job.preview is None:
-        raise not_found("picture yet")
-    return await in_thread(Threads.DOWNLOADS, service.storage.stat, job.preview["sha256"])
+        raise not_found_error("picture yet")
+    return await run_in_pool(ThreadPurpose.DOWNLOADS, service.storage.stat, job.preview["sha256"])

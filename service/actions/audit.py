@@ -1,12 +1,12 @@
 """Who did what."""
 
-from octasplat.service.actions.parts import Part, cut
+from octasplat.service.actions.pages import Page, page_of
 from octasplat.service.state import Service
-from octasplat.workers.records import audit as rows
-from octasplat.workers.records.audit import AuditEntry
+from octasplat.workers.db import audit as rows
+from octasplat.workers.db.audit import AuditEntry
 
 
-async def list_entries(service: Service, *, before: int | None, limit: int) -> Part[AuditEntry]:
+async def list_entries(service: Service, *, before: int | None, limit: int) -> Page[AuditEntry]:
     """Entries, the newest first.
 
     Args:
@@ -16,4 +16,4 @@ async def list_entries(service: Service, *, before: int | None, limit: int) -> P
     """
     async with service.pool.connection() as connection:
         found = await rows.list_entries(connection, before=before, limit=limit + 1)
-    return cut(found, limit, lambda entry: entry.id)
+    return page_of(found, limit, lambda entry: entry.id)

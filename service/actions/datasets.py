@@ -12,30 +12,30 @@ import psycopg
 from psycopg_pool import PoolTimeout
 
 from octasplat.service.actions.access import owned_dataset
-from octasplat.service.actions.parts import Part, cut
+from octasplat.service.actions.pages import Page, page_of
 from octasplat.service.auth import Principal
-from octasplat.service.idempotency import fingerprint, once
+from octasplat.service.idempotency import create_once, fingerprint
 from octasplat.service.intake.dataset import DatasetFile as IntakeFile
 from octasplat.service.intake.dataset import DatasetSummary, check_dataset
-from octasplat.service.intake.inputs import check_inputs
+from octasplat.service.intake.input_files import check_input_files
 from octasplat.service.schemas.datasets import DatasetChange, NewDataset
 from octasplat.service.state import Service
-from octasplat.service.threads import Threads, in_thread
-from octasplat.workers.records import datasets as rows
-from octasplat.workers.records.database import tried_again
-from octasplat.workers.records.errors import Conflict
-from octasplat.workers.records.quotas import check_new_dataset
-from octasplat.workers.records.rows import Dataset, DatasetFile
+from octasplat.service.thread_pools import ThreadPurpose, run_in_pool
+from octasplat.workers.db import datasets as rows
+from octasplat.workers.db.connections import retry_on_deadlock
+from octasplat.workers.db.errors import ConflictError
+from octasplat.workers.db.quotas import check_new_dataset
+from octasplat.workers.db.rows import Dataset, DatasetFile
 
-END_CHECK_SECONDS = 60.0
+MAX_END_CHECK_SECONDS = 60.0
 """For so long it is tried to say what a check found."""
 
 
-@tried_again
+@retry_on_deadlock
 async def create_dataset(
-    service: Service, who: Principal, new: NewDataset, *, key: str | None = None
+    service: Service, who: Principal, new: NewDataset, *, idempotency_key: str | None = None
 ) -> Dataset:
-    """Make a dataset; the same request with the same ``key`` makes nothing new.
+    """Make a dataset; the same request with the same ``idempotency_key`` makes nothing new.
 
     Raises:
         Problem: 422 if the key was used for another request.
@@ -48,25 +48,25 @@ async def create_dataset(
             return (await rows.create_dataset(connection, who.owner, new.name, new.holds)).id
 
         request = fingerprint("dataset", new.model_dump(exclude=set() if new.holds == "files" else {"holds"}))
-        dataset_id, _ = await once(connection, who, key, request, make)
+        dataset_id, _ = await create_once(connection, who, idempotency_key, request, make)
         return await owned_dataset(connection, who, dataset_id)
 
 
 async def list_datasets(
     service: Service, who: Principal, *, before: uuid.UUID | None = None, limit: int
-) -> Part[Dataset]:
+) -> Page[Dataset]:
     """Datasets that the asker may see, the newest first, those made before ``before``."""
     async with service.pool.connection() as connection:
-        found = await rows.list_datasets(connection, owner=who.sees, before=before, limit=limit + 1)
-    return cut(found, limit, lambda dataset: dataset.id)
+        found = await rows.list_datasets(connection, owner=who.visible_owner, before=before, limit=limit + 1)
+    return page_of(found, limit, lambda dataset: dataset.id)
 
 
-async def list_files_named(
-    service: Service, who: Principal, endings: Sequence[str], *, limit: int
+async def list_files_by_suffix(
+    service: Service, who: Principal, suffixes: Sequence[str], *, limit: int
 ) -> list[tuple[Dataset, str]]:
     """Files of the asker's committed datasets that hold files: those whose names end so, the newest first."""
     async with service.pool.connection() as connection:
-        return await rows.files_named(connection, who.owner, endings, limit=limit)
+        return await rows.list_files_by_suffix(connection, who.owner, suffixes, limit=limit)
 
 
 async def get_dataset(service: Service, who: Principal, dataset_id: uuid.UUID) -> Dataset:
@@ -79,7 +79,7 @@ async def get_dataset(service: Service, who: Principal, dataset_id: uuid.UUID) -
         return await owned_dataset(connection, who, dataset_id)
 
 
-@tried_again
+@retry_on_deadlock
 async def change_dataset(
     service: Service, who: Principal, dataset_id: uuid.UUID, change: DatasetChange
 ) -> Dataset:
@@ -98,7 +98,7 @@ async def change_dataset(
         )
 
 
-@tried_again
+@retry_on_deadlock
 async def delete_dataset(service: Service, who: Principal, dataset_id: uuid.UUID) -> None:
     """Delete a dataset.
 
@@ -109,7 +109,7 @@ async def delete_dataset(service: Service, who: Principal, dataset_id: uuid.UUID
     async with service.pool.connection() as connection:
         await owned_dataset(connection, who, dataset_id)
         await rows.delete_dataset(connection, dataset_id)
-    service.room.after_deletion()
+    service.evictor.evict_if_low_later()
 
 
 async def commit_dataset(service: Service, who: Principal, dataset_id: uuid.UUID) -> Dataset:
@@ -122,7 +122,7 @@ async def commit_dataset(service: Service, who: Principal, dataset_id: uuid.UUID
     """
     async with service.pool.connection() as connection:
         owner = (await owned_dataset(connection, who, dataset_id)).owner
-    async with service.checks.passed(owner):
+    async with service.check_limiter.limited(owner):
         return await _check(service, dataset_id)
 
 
@@ -136,25 +136,25 @@ async def _check(service: Service, dataset_id: uuid.UUID) -> Dataset:
     summary: DatasetSummary | dict[str, Any] | None = None
     renewing = asyncio.create_task(_renew_check(service, check))
     try:
-        known = [_for_intake(f) for f in files]
+        known = [_intake_file(f) for f in files]
         if before.holds == "files":
-            summary = check_inputs(known)
+            summary = check_input_files(known)
         else:
             limits = service.settings.dataset_limits()
-            summary = await in_thread(Threads.CHECKS, check_dataset, service.storage, known, limits)
+            summary = await run_in_pool(ThreadPurpose.CHECKS, check_dataset, service.storage, known, limits)
     finally:
         renewing.cancel()
         # Whatever happens, the dataset must not stay closed.
         dataset = await asyncio.shield(_end_check(service, check, summary))
     if dataset.state != "committed":
-        raise Conflict("The dataset was opened while it was checked; commit it again.")
+        raise ConflictError("The dataset was opened while it was checked; commit it again.")
     return dataset
 
 
 async def _renew_check(service: Service, check: rows.Check) -> None:
     """Say now and then that the check is under way; without that others take it for lost."""
     while True:
-        await asyncio.sleep(rows.CHECK_LOST_SECONDS / 6)
+        await asyncio.sleep(rows.STALE_CHECK_SECONDS / 6)
         with suppress(psycopg.Error, PoolTimeout):
             async with service.pool.connection() as connection:
                 await rows.renew_check(connection, check)
@@ -164,10 +164,10 @@ async def _end_check(
     service: Service, check: rows.Check, summary: DatasetSummary | dict[str, Any] | None
 ) -> Dataset:
     """Say what the check found, again and again while the database is away."""
-    wait, deadline = 0.2, time.monotonic() + END_CHECK_SECONDS
+    wait, deadline = 0.2, time.monotonic() + MAX_END_CHECK_SECONDS
     while True:
         try:
-            return await _say_check(service, check, summary)
+            return await _record_check(service, check, summary)
         except (psycopg.OperationalError, psycopg.InterfaceError, PoolTimeout):
             if time.monotonic() > deadline:
                 raise  # whoever looks after lost checks opens it
@@ -175,22 +175,22 @@ async def _end_check(
         wait = min(2 * wait, 5.0)
 
 
-async def _say_check(
+async def _record_check(
     service: Service, check: rows.Check, summary: DatasetSummary | dict[str, Any] | None
 ) -> Dataset:
     async with service.pool.connection() as connection:
         if summary is None:
-            return await rows.end_check(connection, check, sound=False)
+            return await rows.end_check(connection, check, is_valid=False)
         if isinstance(summary, dict):
-            return await rows.end_check(connection, check, sound=True, facts=summary)
+            return await rows.end_check(connection, check, is_valid=True, facts=summary)
         facts: dict[str, Any] = asdict(summary)
         photographs, has_poses = facts.pop("photographs"), facts.pop("has_model")
         return await rows.end_check(
-            connection, check, sound=True, has_poses=has_poses, photographs=photographs, facts=facts
+            connection, check, is_valid=True, has_poses=has_poses, photographs=photographs, facts=facts
         )
 
 
-def _for_intake(row: DatasetFile) -> IntakeFile:
+def _intake_file(row: DatasetFile) -> IntakeFile:
     return IntakeFile(
         row.path,
         row.sha256,

@@ -1,16 +1,16 @@
 """What a job would take, before it is asked for."""
 
-from octasplat.engine.operations.costs import Estimate
+from octasplat.engine.operations.cost_model import Estimate
 from octasplat.engine.photograph_sizes import Sizes
-from octasplat.service.actions.asked import accepted_kind, input_problem, resolved
+from octasplat.service.actions.validation import input_problem, resolve_options, validate_kind
 from octasplat.service.auth import Principal
-from octasplat.service.limits import check_ceilings, estimate_job
-from octasplat.service.queue_facts import workers_of
+from octasplat.service.job_limits import check_job_limits, estimate_job
+from octasplat.service.queue_workers import live_workers_of_queue
 from octasplat.service.schemas.estimates import NewEstimate
 from octasplat.service.state import Service
+from octasplat.workers.db.connections import Connection
+from octasplat.workers.db.datasets import get_dataset, photograph_sizes
 from octasplat.workers.queue.jobs import get_job
-from octasplat.workers.records.database import Connection
-from octasplat.workers.records.datasets import get_dataset, photograph_sizes
 
 
 async def estimate(service: Service, who: Principal, new: NewEstimate) -> Estimate | None:
@@ -19,13 +19,13 @@ async def estimate(service: Service, who: Principal, new: NewEstimate) -> Estima
     Raises:
         Problem: 422.
     """
-    kind = accepted_kind(new.kind)
-    options = resolved(kind, new.options)
+    kind = validate_kind(new.kind)
+    options = resolve_options(kind, new.options)
     async with service.pool.connection() as connection:
         sizes = [Sizes(group.width_px, group.height_px, group.count) for group in new.photographs]
         sizes += await _sizes_of(connection, who, new)
-        workers = await workers_of(connection, new.queue, service.settings.stale_seconds)
-    check_ceilings(kind, options, sizes, service.settings)
+        workers = await live_workers_of_queue(connection, new.queue, service.settings.stale_seconds)
+    check_job_limits(kind, options, sizes, service.settings)
     return estimate_job(kind, options, sizes, workers)
 
 
@@ -34,12 +34,12 @@ async def _sizes_of(connection: Connection, who: Principal, new: NewEstimate) ->
     dataset_id = new.dataset_id
     if new.source_id is not None:
         job = await get_job(connection, new.source_id)
-        if job is None or not who.owns(job.owner):
+        if job is None or not who.may_see(job.owner):
             raise input_problem("source_id", "There is no such job.")
         dataset_id = dataset_id or job.dataset_id
     if dataset_id is None:
         return []
     dataset = await get_dataset(connection, dataset_id)
-    if dataset is None or not who.owns(dataset.owner):
+    if dataset is None or not who.may_see(dataset.owner):
         raise input_problem("dataset_id", "There is no such dataset.")
     return await photograph_sizes(connection, dataset_id)

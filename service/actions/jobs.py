@@ -9,19 +9,19 @@ from pydantic import ValidationError
 
 from octasplat.engine.errors import ConfigError
 from octasplat.service.actions.access import owned_job
-from octasplat.service.actions.parts import Part, cut
+from octasplat.service.actions.pages import Page, page_of
 from octasplat.service.auth import Principal
-from octasplat.service.limits import limit_notes
-from octasplat.service.problems import Problem
-from octasplat.service.queue_facts import waiting_notes, workers_of
+from octasplat.service.job_limits import limit_notes
+from octasplat.service.problems import ProblemError
+from octasplat.service.queue_workers import live_workers_of_queue, queued_job_notes
 from octasplat.service.schemas.jobs import JobChange, JobView
 from octasplat.service.state import Service
+from octasplat.workers.db.connections import Connection, retry_on_deadlock
+from octasplat.workers.db.rows import Job, JobState
 from octasplat.workers.queue import jobs as rows
-from octasplat.workers.records.database import Connection, tried_again
-from octasplat.workers.records.rows import Job, JobState
-from octasplat.workers.work.kinds import kind_named
+from octasplat.workers.worker.job_kinds import get_job_kind
 
-BUSY_SECONDS = 2
+BUSY_RETRY_SECONDS = 2
 """After which a job that moves is worth another look."""
 
 
@@ -43,7 +43,7 @@ class JobFilter:
 
 
 @dataclass(frozen=True)
-class ShownJob:
+class JobWithView:
     """A job with what is shown of it, both of one moment."""
 
     row: Job
@@ -51,32 +51,32 @@ class ShownJob:
 
 
 async def list_jobs(
-    service: Service, who: Principal, wanted: JobFilter, *, before: uuid.UUID | None, limit: int
-) -> Part[Job]:
+    service: Service, who: Principal, job_filter: JobFilter, *, before: uuid.UUID | None, limit: int
+) -> Page[Job]:
     """Jobs that the asker may see, the newest first.
 
     Args:
         service: the service.
         who: asks.
-        wanted: which of them.
+        job_filter: which of them.
         before: made before this one.
         limit: at most so many.
     """
     async with service.pool.connection() as connection:
         found = await rows.list_jobs(
             connection,
-            owner=who.sees,
-            states=wanted.states,
-            kind=_storable(wanted.kind),
-            label=_storable(wanted.label),
-            dataset_id=wanted.dataset_id,
+            owner=who.visible_owner,
+            states=job_filter.states,
+            kind=_without_nul(job_filter.kind),
+            label=_without_nul(job_filter.label),
+            dataset_id=job_filter.dataset_id,
             before=before,
             limit=limit + 1,
         )
-    return cut(found, limit, lambda job: job.id)
+    return page_of(found, limit, lambda job: job.id)
 
 
-async def get_job(service: Service, who: Principal, job_id: uuid.UUID) -> ShownJob:
+async def get_job(service: Service, who: Principal, job_id: uuid.UUID) -> JobWithView:
     """A job.
 
     Raises:
@@ -84,16 +84,16 @@ async def get_job(service: Service, who: Principal, job_id: uuid.UUID) -> ShownJ
     """
     async with service.pool.connection() as connection:
         job = await owned_job(connection, who, job_id)
-        return ShownJob(job, await job_view(connection, service, job))
+        return JobWithView(job, await job_view(connection, service, job))
 
 
-@tried_again
+@retry_on_deadlock
 async def change_job(
     service: Service,
     who: Principal,
     job_id: uuid.UUID,
     change: JobChange,
-    check: Callable[[ShownJob], None] = lambda _: None,
+    check: Callable[[JobWithView], None] = lambda _: None,
 ) -> JobView:
     """Rename a job, or keep it whatever its age.
 
@@ -109,7 +109,7 @@ async def change_job(
     """
     async with service.pool.connection() as connection, connection.transaction():
         job = await owned_job(connection, who, job_id, lock=True)
-        check(ShownJob(job, await job_view(connection, service, job)))
+        check(JobWithView(job, await job_view(connection, service, job)))
         given = change.model_dump(exclude_unset=True)
         job = await rows.change_job(
             connection,
@@ -120,7 +120,7 @@ async def change_job(
         return await job_view(connection, service, job)
 
 
-@tried_again
+@retry_on_deadlock
 async def cancel_job(service: Service, who: Principal, job_id: uuid.UUID) -> JobView:
     """Ask a job to stop.
 
@@ -130,11 +130,11 @@ async def cancel_job(service: Service, who: Principal, job_id: uuid.UUID) -> Job
     """
     async with service.pool.connection() as connection:
         await owned_job(connection, who, job_id)
-        job = await rows.cancel_job(connection, service.slips, job_id)
+        job = await rows.cancel_job(connection, service.job_queue, job_id)
         return await job_view(connection, service, job)
 
 
-@tried_again
+@retry_on_deadlock
 async def delete_job(service: Service, who: Principal, job_id: uuid.UUID, *, cancel: bool = False) -> None:
     """Delete a finished job with its results.
 
@@ -151,19 +151,19 @@ async def delete_job(service: Service, who: Principal, job_id: uuid.UUID, *, can
     async with service.pool.connection() as connection:
         job = await owned_job(connection, who, job_id)
         if cancel and not job.is_over:
-            job = await rows.cancel_job(connection, service.slips, job_id)
+            job = await rows.cancel_job(connection, service.job_queue, job_id)
     if cancel and not job.is_over:
         detail = "The job is being stopped; repeat the request in a moment."
-        raise Problem(409, "stopping", detail, retry_seconds=BUSY_SECONDS)
+        raise ProblemError(409, "stopping", detail, retry_seconds=BUSY_RETRY_SECONDS)
     async with service.pool.connection() as connection:
         await rows.delete_job(connection, job_id)
-    service.room.after_deletion()
+    service.evictor.evict_if_low_later()
 
 
 def stages_of(job: Job) -> list[str]:
     """Names of the stages of a job, in order."""
     try:
-        kind = kind_named(job.kind)
+        kind = get_job_kind(job.kind)
         return list(kind.stages(kind.options.model_validate(job.options)))
     except (ConfigError, ValidationError):  # of another version
         return []
@@ -174,13 +174,13 @@ async def job_view(connection: Connection, service: Service, job: Job) -> JobVie
     notes: list[str] = []
     if job.state == "queued":
         with suppress(ConfigError, ValidationError):  # of another version
-            kind = kind_named(job.kind)
-            workers = await workers_of(connection, job.queue, service.settings.stale_seconds)
-            notes = waiting_notes(kind, kind.options.model_validate(job.options), job.queue, workers)
+            kind = get_job_kind(job.kind)
+            workers = await live_workers_of_queue(connection, job.queue, service.settings.stale_seconds)
+            notes = queued_job_notes(kind, kind.options.model_validate(job.options), job.queue, workers)
             notes += limit_notes(job.estimate, workers, service.settings)
-    return JobView.of(job, stages_of(job), await rows.queue_position(connection, job), notes)
+    return JobView.from_row(job, stages_of(job), await rows.queue_position(connection, job), notes)
 
 
-def _storable(text: str | None) -> str | None:
+def _without_nul(text: str | None) -> str | None:
     """Postgres holds no NUL, so nothing has it."""
     return text if text is None else text.replace("\0", "\N{REPLACEMENT CHARACTER}")

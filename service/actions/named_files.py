@@ -4,13 +4,13 @@ import uuid
 
 from pydantic import BaseModel
 
-from octasplat.service.actions.asked import input_problem
+from octasplat.service.actions.validation import input_problem
 from octasplat.service.auth import Principal
-from octasplat.service.problems import Problem
-from octasplat.workers.records.database import Connection
-from octasplat.workers.records.datasets import files_of, get_dataset
-from octasplat.workers.store.names import shown_name
-from octasplat.workers.work.kinds import JobKind
+from octasplat.service.problems import ProblemError
+from octasplat.workers.db.connections import Connection
+from octasplat.workers.db.datasets import files_of, get_dataset
+from octasplat.workers.storage.file_names import quoted_name
+from octasplat.workers.worker.job_kinds import JobKind
 
 
 async def check_named_files(
@@ -34,22 +34,24 @@ async def check_named_files(
         if not kind.takes_files:
             raise input_problem("files_id", f"Jobs of the kind {kind.name} take no files.")
         dataset = await get_dataset(connection, files_id, lock=True)
-        if dataset is None or not who.owns(dataset.owner):
+        if dataset is None or not who.may_see(dataset.owner):
             raise input_problem("files_id", "There is no such dataset.")
         if dataset.holds != "files":
             detail = "The dataset holds photographs; make one that holds files."
             raise input_problem("files_id", detail)
         if dataset.state != "committed":
-            raise Problem(409, "dataset-open", "The dataset is not committed yet; POST to its /commit first.")
+            raise ProblemError(
+                409, "dataset-open", "The dataset is not committed yet; POST to its /commit first."
+            )
         sent = {file.path for file in await files_of(connection, files_id)}
     faults = [
         {
             "pointer": f"#/options/{path.replace('.', '/')}",
-            "detail": f"{path}: there is no file {shown_name(name)} among those of files_id; send it.",
+            "detail": f"{path}: there is no file {quoted_name(name)} among those of files_id; send it.",
             "file": name,
         }
         for path, name in names
         if name not in sent
     ]
     if faults:
-        raise Problem(422, "file-missing", faults[0]["detail"], errors=faults)
+        raise ProblemError(422, "file-missing", faults[0]["detail"], errors=faults)

@@ -6,21 +6,21 @@ from octasplat.engine import __version__
 from octasplat.engine.errors import ConfigError
 from octasplat.engine.files import exporters
 from octasplat.service.auth import Principal
-from octasplat.service.limits import ceilings_by_path
-from octasplat.service.problems import not_found
+from octasplat.service.job_limits import limits_by_path
+from octasplat.service.problems import not_found_error
 from octasplat.service.schemas.system import FormatView, InfoView, KindView, QueueList, QueueView, WorkerView
 from octasplat.service.state import Service
-from octasplat.service.threads import Threads, in_thread
-from octasplat.workers.isolation.abilities import abilities
+from octasplat.service.thread_pools import ThreadPurpose, run_in_pool
+from octasplat.workers.db.migrate import missing_migrations
+from octasplat.workers.db.rows import WorkerRow
+from octasplat.workers.db.workers import live_workers
 from octasplat.workers.queue.jobs import queue_depths, running_by_queue
-from octasplat.workers.queue.numbers import read_numbers
-from octasplat.workers.records.migrate import missing_steps
-from octasplat.workers.records.rows import WorkerRow
-from octasplat.workers.records.workers import live_workers
-from octasplat.workers.store.errors import StorageError
-from octasplat.workers.work.kinds import JobKind, job_kinds, kind_named
+from octasplat.workers.queue.service_stats import read_service_stats
+from octasplat.workers.sandbox.capabilities import sandbox_capabilities
+from octasplat.workers.storage.errors import StorageError
+from octasplat.workers.worker.job_kinds import JobKind, get_job_kind, job_kinds
 
-STORAGE_SECONDS = 3.0
+STORAGE_TIMEOUT_SECONDS = 3.0
 """A store that takes longer to answer is not ready."""
 
 
@@ -36,9 +36,9 @@ def get_kind(service: Service, name: str) -> KindView:
         Problem: 404.
     """
     try:
-        return _kind_view(kind_named(name), service)
+        return _kind_view(get_job_kind(name), service)
     except ConfigError:
-        raise not_found("kind of job") from None
+        raise not_found_error("kind of job") from None
 
 
 def describe(service: Service, who: Principal) -> InfoView:
@@ -54,11 +54,11 @@ def describe(service: Service, who: Principal) -> InfoView:
         needs_token=service.has_tokens or not service.settings.is_private,
         owner=who.owner,
         scopes=sorted(who.scopes),
-        isolation=abilities(),
+        isolation=sandbox_capabilities(),
     )
 
 
-async def living_workers(service: Service) -> list[WorkerRow]:
+async def list_live_workers(service: Service) -> list[WorkerRow]:
     """The workers that have been heard of lately."""
     async with service.pool.connection() as connection:
         return await live_workers(connection, service.settings.stale_seconds)
@@ -95,21 +95,23 @@ async def check_readiness(service: Service) -> dict[str, str]:
     return {
         "database": await _check_database(service),
         "storage": await _check_storage(service),
-        "service": "draining" if service.draining else "ok",
+        "service": "draining" if service.is_draining else "ok",
     }
 
 
 async def render_metrics(service: Service) -> bytes:
     """How the service fares, in the format of Prometheus."""
     async with service.pool.connection() as connection:
-        numbers = await read_numbers(connection, service.settings.stale_seconds)
-    free_bytes = await in_thread(Threads.LOOKS, _free_bytes, service)
-    return service.metrics.render(numbers, streams=service.hub.streams, free_bytes=free_bytes)
+        numbers = await read_service_stats(connection, service.settings.stale_seconds)
+    free_bytes = await run_in_pool(ThreadPurpose.STORE_CHECKS, _free_bytes, service)
+    return service.metrics.render(
+        numbers, streams=service.event_broker.subscriber_count, free_bytes=free_bytes
+    )
 
 
 def _kind_view(kind: JobKind, service: Service) -> KindView:
-    schema = kind.asked.model_json_schema()
-    ceilings = ceilings_by_path(kind, service.settings)
+    schema = kind.user_options.model_json_schema()
+    ceilings = limits_by_path(kind, service.settings)
     return KindView(name=kind.name, title=kind.title, needs=kind.needs, options=schema, ceilings=ceilings)
 
 
@@ -120,21 +122,23 @@ async def _check_database(service: Service) -> str:
             applied = {(row["component"], row["name"]) for row in await cursor.fetchall()}
     except Exception:  # noqa: BLE001 - whatever it is, the service is not ready
         return "unreachable"
-    return "ok" if not missing_steps(applied) else "outdated"
+    return "ok" if not missing_migrations(applied) else "outdated"
 
 
 async def _check_storage(service: Service) -> str:
     """Looked at once for all who ask meanwhile; a store that hangs takes no more than one thread."""
-    if service.storage_look is None or service.storage_look.done():
-        service.storage_look = asyncio.ensure_future(in_thread(Threads.LOOKS, _look_at_storage, service))
+    if service.storage_check is None or service.storage_check.done():
+        service.storage_check = asyncio.ensure_future(
+            run_in_pool(ThreadPurpose.STORE_CHECKS, _storage_state, service)
+        )
     try:
-        async with asyncio.timeout(STORAGE_SECONDS):
-            return await asyncio.shield(service.storage_look)
+        async with asyncio.timeout(STORAGE_TIMEOUT_SECONDS):
+            return await asyncio.shield(service.storage_check)
     except TimeoutError:
         return "unreachable"
 
 
-def _look_at_storage(service: Service) -> str:
+def _storage_state(service: Service) -> str:
     try:
         service.storage.check()
         free = service.storage.free_bytes()

@@ -3,12 +3,12 @@
 import uuid
 
 from octasplat.service.auth import Principal
-from octasplat.service.problems import Problem, not_found
+from octasplat.service.problems import ProblemError, not_found_error
 from octasplat.service.schemas.tokens import MadeToken, NewToken, SignInLink, TokenView
 from octasplat.service.state import Service
-from octasplat.workers.records import tokens as rows
-from octasplat.workers.records.rows import Token
-from octasplat.workers.records.sessions import add_link
+from octasplat.workers.db import tokens as rows
+from octasplat.workers.db.rows import Token
+from octasplat.workers.db.sessions import add_link
 
 
 async def list_tokens(service: Service) -> list[Token]:
@@ -17,7 +17,7 @@ async def list_tokens(service: Service) -> list[Token]:
         return await rows.list_tokens(connection)
 
 
-async def make_token(service: Service, new: NewToken) -> MadeToken:
+async def create_token(service: Service, new: NewToken) -> MadeToken:
     """Make a token. From the first one on, nobody gets in without."""
     secret = rows.new_secret()
     async with service.pool.connection() as connection:
@@ -29,8 +29,8 @@ async def make_token(service: Service, new: NewToken) -> MadeToken:
             scopes=new.scopes,
             hours=new.hours or service.settings.token_hours or None,
         )
-    service.forget_tokens()
-    return MadeToken(**TokenView.of(token).model_dump(), token=secret)
+    service.invalidate_token_state()
+    return MadeToken(**TokenView.from_row(token).model_dump(), token=secret)
 
 
 async def revoke_token(service: Service, token_id: uuid.UUID) -> None:
@@ -41,18 +41,18 @@ async def revoke_token(service: Service, token_id: uuid.UUID) -> None:
     """
     async with service.pool.connection() as connection:
         if not await rows.revoke_token(connection, token_id):
-            raise not_found("token")
-    service.forget_tokens()
+            raise not_found_error("token")
+    service.invalidate_token_state()
 
 
-async def make_link(service: Service, who: Principal) -> SignInLink:
+async def create_sign_in_link(service: Service, who: Principal) -> SignInLink:
     """Make a link that signs in once.
 
     Raises:
         Problem: 409 where nobody needs to sign in.
     """
     if who.token_id is None:
-        raise Problem(409, "no-token", "There are no tokens, so nobody has to sign in.")
+        raise ProblemError(409, "no-token", "There are no tokens, so nobody has to sign in.")
     async with service.pool.connection() as connection:
         secret = await add_link(connection, who.token_id)
     return SignInLink(path=f"/sign-in/once?key={secret}")

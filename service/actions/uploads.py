@@ -6,12 +6,16 @@ from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
 from dataclasses import dataclass
 from typing import TypeVar
 
-from octasplat.service.actions.access import open_dataset, owned_dataset, refuse_while_draining, sought
-from octasplat.service.actions.parts import Part, cut
+from octasplat.service.actions.access import (
+    check_not_draining,
+    check_searchable_name,
+    open_dataset,
+    owned_dataset,
+)
+from octasplat.service.actions.pages import Page, page_of
 from octasplat.service.auth import Principal
 from octasplat.service.intake.dataset import check_file_content
-from octasplat.service.intake.inputs import check_input_content, check_input_name
-from octasplat.service.intake.names import check_file_name
+from octasplat.service.intake.input_files import check_input_content, check_input_name
 from octasplat.service.intake.receive import (
     ContentCheck,
     ReceivedArchive,
@@ -19,19 +23,20 @@ from octasplat.service.intake.receive import (
     receive_archive,
     receive_file,
 )
-from octasplat.service.problems import Problem, not_found
+from octasplat.service.intake.upload_names import check_file_name
+from octasplat.service.problems import ProblemError, not_found_error
 from octasplat.service.state import Service
-from octasplat.service.threads import Threads, in_thread
-from octasplat.workers.queue.storing import Note
-from octasplat.workers.records import datasets as rows
-from octasplat.workers.records.database import tried_again
-from octasplat.workers.records.quotas import QuotaExceeded, bytes_left, check_bytes, owned_bytes
-from octasplat.workers.records.rows import Dataset, DatasetFile
-from octasplat.workers.store.errors import BlobMissing, TooLarge
-from octasplat.workers.store.protocol import Storage
+from octasplat.service.thread_pools import ThreadPurpose, run_in_pool
+from octasplat.workers.db import datasets as rows
+from octasplat.workers.db.connections import retry_on_deadlock
+from octasplat.workers.db.quotas import QuotaExceededError, bytes_left, check_bytes, owned_bytes
+from octasplat.workers.db.rows import Dataset, DatasetFile
+from octasplat.workers.queue.storage_leases import StorageLease
+from octasplat.workers.storage.errors import BlobNotFoundError, ContentTooLargeError
+from octasplat.workers.storage.protocol import Storage
 
 logger = logging.getLogger(__name__)
-Received = TypeVar("Received")
+ReceivedT = TypeVar("ReceivedT")
 
 
 @dataclass(frozen=True)
@@ -50,24 +55,24 @@ class Upload:
 
 
 @dataclass(frozen=True)
-class PutFile:
+class StoredFile:
     """A file of a dataset, and whether it was there already."""
 
     row: DatasetFile
-    was_there: bool
+    is_unchanged: bool
 
 
 @dataclass(frozen=True)
-class PutArchive:
+class StoredArchive:
     """Files that came out of an archive, and names of those that are no part of a scene."""
 
     files: list[DatasetFile]
-    left_out: tuple[str, ...]
+    ignored: tuple[str, ...]
 
 
 async def list_files(
     service: Service, who: Principal, dataset_id: uuid.UUID, *, after: str, limit: int
-) -> Part[DatasetFile]:
+) -> Page[DatasetFile]:
     """The files that have arrived, by name, from the one after ``after``.
 
     Raises:
@@ -76,7 +81,7 @@ async def list_files(
     async with service.pool.connection() as connection:
         await owned_dataset(connection, who, dataset_id)
         found = await rows.files_of(connection, dataset_id, after=after, limit=limit + 1)
-    return cut(found, limit, lambda file: file.path)
+    return page_of(found, limit, lambda file: file.path)
 
 
 async def get_file(service: Service, who: Principal, dataset_id: uuid.UUID, path: str) -> DatasetFile:
@@ -87,13 +92,13 @@ async def get_file(service: Service, who: Principal, dataset_id: uuid.UUID, path
     """
     async with service.pool.connection() as connection:
         await owned_dataset(connection, who, dataset_id)
-        row = await rows.get_file(connection, dataset_id, sought(path, "file"))
+        row = await rows.get_file(connection, dataset_id, check_searchable_name(path, "file"))
     if row is None:
-        raise not_found("file")
+        raise not_found_error("file")
     return row
 
 
-@tried_again
+@retry_on_deadlock
 async def remove_file(service: Service, who: Principal, dataset_id: uuid.UUID, path: str) -> None:
     """Take a file out of an open dataset.
 
@@ -103,14 +108,14 @@ async def remove_file(service: Service, who: Principal, dataset_id: uuid.UUID, p
     """
     async with service.pool.connection() as connection:
         await open_dataset(connection, who, dataset_id)
-        if not await rows.remove_file(connection, dataset_id, sought(path, "file")):
-            raise not_found("file")
-    service.room.after_deletion()
+        if not await rows.remove_file(connection, dataset_id, check_searchable_name(path, "file")):
+            raise not_found_error("file")
+    service.evictor.evict_if_low_later()
 
 
 async def put_file(
     service: Service, who: Principal, dataset_id: uuid.UUID, path: str, upload: Upload
-) -> PutFile:
+) -> StoredFile:
     """Put a file into an open dataset. One that is there with the announced digest is not read.
 
     Raises:
@@ -120,16 +125,16 @@ async def put_file(
         QuotaExceeded: its owner may not store as much.
         StorageError: it is not as announced, or there is no room.
     """
-    refuse_while_draining(service)
+    check_not_draining(service)
     async with service.pool.connection() as connection:
         dataset = await open_dataset(connection, who, dataset_id)
-        check = _name_checked(dataset, path)
+        check = _content_check_for(dataset, path)
         known = await rows.get_file(connection, dataset_id, path)
         left = await bytes_left(connection, dataset.owner, service.settings.quota)
         had = await owned_bytes(connection, dataset.owner, upload.sha256) if upload.sha256 is not None else 0
     if known is not None and upload.sha256 == known.sha256:
-        if await in_thread(Threads.UPLOADS, _is_held, service.storage, known):
-            return PutFile(known, was_there=True)
+        if await run_in_pool(ThreadPurpose.UPLOADS, _is_stored, service.storage, known):
+            return StoredFile(known, is_unchanged=True)
         logger.warning("the store lost %s of dataset %s, which is sent again", path, dataset_id)
     if left is not None:
         # What it replaces goes, and content that its owner has already counts once.
@@ -147,13 +152,15 @@ async def put_file(
             check=check,
         )
 
-    async with service.room.upload(upload.size_bytes) as note:
-        received = await _within_quota(receive, left)
-        [row] = await _enter(service, dataset, note, [received])
-    return PutFile(row, was_there=False)
+    async with service.evictor.upload_lease(upload.size_bytes) as note:
+        received = await _limited_by_quota(receive, left)
+        [row] = await _record_files(service, dataset, note, [received])
+    return StoredFile(row, is_unchanged=False)
 
 
-async def put_archive(service: Service, who: Principal, dataset_id: uuid.UUID, upload: Upload) -> PutArchive:
+async def put_archive(
+    service: Service, who: Principal, dataset_id: uuid.UUID, upload: Upload
+) -> StoredArchive:
     """Put the files of a ZIP file into an open dataset, beside those that are there.
 
     Raises:
@@ -163,13 +170,15 @@ async def put_archive(service: Service, who: Principal, dataset_id: uuid.UUID, u
         QuotaExceeded: its owner may not store as much.
         StorageError: it is not as announced, or there is no room.
     """
-    refuse_while_draining(service)
+    check_not_draining(service)
     async with service.pool.connection() as connection:
         dataset = await open_dataset(connection, who, dataset_id)
         left = await bytes_left(connection, dataset.owner, service.settings.quota)
         known = await rows.files_of(connection, dataset_id)
     if dataset.holds == "files":
-        raise Problem(409, "holds-files", "Files that options name are sent one by one, not as an archive.")
+        raise ProblemError(
+            409, "holds-files", "Files that options name are sent one by one, not as an archive."
+        )
     if left is not None:
         # What it replaces goes, all of it where the archive is sent again; the exact count comes at the end.
         left += sum(file.size_bytes for file in known)
@@ -178,28 +187,28 @@ async def put_archive(service: Service, who: Principal, dataset_id: uuid.UUID, u
         return receive_archive(
             service.storage,
             upload.body,
-            service.spool,
+            service.spool_space,
             sha256=upload.sha256,
             size_bytes=upload.size_bytes,
             limits=service.settings.upload_limits(),
             max_bytes=left,
         )
 
-    async with service.room.upload(upload.size_bytes) as note:
-        received = await _within_quota(receive, left)
-        files = await _enter(service, dataset, note, received.files)
-    return PutArchive(files, received.left_out)
+    async with service.evictor.upload_lease(upload.size_bytes) as note:
+        received = await _limited_by_quota(receive, left)
+        files = await _record_files(service, dataset, note, received.files)
+    return StoredArchive(files, received.left_out)
 
 
-def _is_held(storage: Storage, file: DatasetFile) -> bool:
+def _is_stored(storage: Storage, file: DatasetFile) -> bool:
     """Whether the store holds the content of a file, as far as can be seen without reading it."""
     try:
         return storage.stat(file.sha256).size_bytes == file.size_bytes
-    except BlobMissing:
+    except BlobNotFoundError:
         return False
 
 
-def _name_checked(dataset: Dataset, path: str) -> ContentCheck:
+def _content_check_for(dataset: Dataset, path: str) -> ContentCheck:
     """What looks at the content of a file whose name is taken; raises IntakeRefused where it is not."""
     if dataset.holds == "files":
         check_input_name(path)
@@ -208,25 +217,25 @@ def _name_checked(dataset: Dataset, path: str) -> ContentCheck:
     return check_file_content
 
 
-async def _within_quota(receive: Callable[[], Awaitable[Received]], left: int | None) -> Received:
-    """What an upload brings; ``left``, where that is what stopped it, is what its owner may still store."""
+async def _limited_by_quota(receive: Callable[[], Awaitable[ReceivedT]], bytes_left: int | None) -> ReceivedT:
+    """What an upload brings; ``bytes_left``, where that is what stopped it, is what its owner may still store."""
     try:
         return await receive()
-    except TooLarge as error:
-        if left is None or error.max_bytes != left:
+    except ContentTooLargeError as error:
+        if bytes_left is None or error.max_bytes != bytes_left:
             raise
-        raise QuotaExceeded(
-            "bytes", f"{left} bytes are left of what you may store; delete datasets or jobs first."
+        raise QuotaExceededError(
+            "bytes", f"{bytes_left} bytes are left of what you may store; delete datasets or jobs first."
         ) from None
 
 
-@tried_again
-async def _enter(
-    service: Service, dataset: Dataset, note: Note, received: Sequence[ReceivedFile]
+@retry_on_deadlock
+async def _record_files(
+    service: Service, dataset: Dataset, lease: StorageLease, received: Sequence[ReceivedFile]
 ) -> list[DatasetFile]:
     """Enter what is stored into the dataset, or none of it."""
     new = [rows.NewFile(f.path, f.blob.sha256, f.blob.size_bytes, f.facts) for f in received]
-    async with note.naming({file.sha256 for file in new}) as connection:
+    async with lease.reference({file.sha256 for file in new}) as connection:
         files = await rows.put_files(connection, dataset.id, new)
         await check_bytes(connection, dataset.owner, service.settings.quota)
     service.metrics.upload_bytes.inc(sum(file.blob.size_bytes for file in received))

@@ -4,35 +4,35 @@ import uuid
 from dataclasses import dataclass
 
 from octasplat.service.actions.access import owned_job, owned_webhook
-from octasplat.service.actions.parts import Part, cut
+from octasplat.service.actions.pages import Page, page_of
 from octasplat.service.auth import Principal
-from octasplat.service.problems import Problem, not_found
+from octasplat.service.problems import ProblemError, not_found_error
 from octasplat.service.schemas.webhooks import NewWebhook, WebhookChange
 from octasplat.service.state import Service
-from octasplat.service.webhook_addresses import check_address
-from octasplat.workers.records.database import tried_again
-from octasplat.workers.records.locks import lock_owner
-from octasplat.workers.upkeep.webhooks import rows
-from octasplat.workers.upkeep.webhooks.rows import Delivery, Endpoint
-from octasplat.workers.upkeep.webhooks.signing import new_secret
+from octasplat.service.webhook_addresses import check_webhook_address
+from octasplat.workers.db.connections import retry_on_deadlock
+from octasplat.workers.db.locks import lock_owner
+from octasplat.workers.maintenance.webhooks import rows
+from octasplat.workers.maintenance.webhooks.rows import Delivery, Endpoint
+from octasplat.workers.maintenance.webhooks.signing import new_secret
 
 
 @dataclass(frozen=True)
-class NewEndpoint:
+class CreatedEndpoint:
     """A webhook that was just made, with its secret."""
 
     row: Endpoint
     secret: str
 
 
-@tried_again
-async def create_webhook(service: Service, who: Principal, new: NewWebhook) -> NewEndpoint:
+@retry_on_deadlock
+async def create_webhook(service: Service, who: Principal, new: NewWebhook) -> CreatedEndpoint:
     """Be told of the asker's jobs, or of one job.
 
     Raises:
         Problem: 404, or 422 for an address that messages are not sent to.
     """
-    check_address(service, new.url)
+    check_webhook_address(service, new.url)
     secret = new.secret or new_secret()
     async with service.pool.connection() as connection, connection.transaction():
         owner = who.owner
@@ -44,16 +44,16 @@ async def create_webhook(service: Service, who: Principal, new: NewWebhook) -> N
         made = await rows.add_endpoint(
             connection, owner=owner, url=new.url, secret=secret, events=new.events, job_id=new.job_id
         )
-    return NewEndpoint(made, secret)
+    return CreatedEndpoint(made, secret)
 
 
 async def list_webhooks(
     service: Service, who: Principal, *, before: uuid.UUID | None, limit: int
-) -> Part[Endpoint]:
+) -> Page[Endpoint]:
     """Webhooks that the asker may see, the newest first, those made before ``before``."""
     async with service.pool.connection() as connection:
-        found = await rows.list_endpoints(connection, owner=who.sees, before=before, limit=limit + 1)
-    return cut(found, limit, lambda endpoint: endpoint.id)
+        found = await rows.list_endpoints(connection, owner=who.visible_owner, before=before, limit=limit + 1)
+    return page_of(found, limit, lambda endpoint: endpoint.id)
 
 
 async def get_webhook(service: Service, who: Principal, webhook_id: uuid.UUID) -> Endpoint:
@@ -66,7 +66,7 @@ async def get_webhook(service: Service, who: Principal, webhook_id: uuid.UUID) -
         return await owned_webhook(connection, who, webhook_id)
 
 
-@tried_again
+@retry_on_deadlock
 async def change_webhook(
     service: Service, who: Principal, webhook_id: uuid.UUID, change: WebhookChange
 ) -> Endpoint:
@@ -76,13 +76,13 @@ async def change_webhook(
         Problem: 404, or 422 for an address that messages are not sent to.
     """
     if change.url is not None:
-        check_address(service, change.url)
+        check_webhook_address(service, change.url)
     async with service.pool.connection() as connection:
         await owned_webhook(connection, who, webhook_id)
         return await rows.change_endpoint(connection, webhook_id, **change.model_dump(exclude_unset=True))
 
 
-@tried_again
+@retry_on_deadlock
 async def delete_webhook(service: Service, who: Principal, webhook_id: uuid.UUID) -> None:
     """Delete a webhook with its messages.
 
@@ -101,9 +101,9 @@ async def send_test(service: Service, who: Principal, webhook_id: uuid.UUID) -> 
         Problem: 404, or 409 if the webhook is disabled.
     """
     async with service.pool.connection() as connection:
-        endpoint = _enabled(await owned_webhook(connection, who, webhook_id))
+        endpoint = _check_enabled(await owned_webhook(connection, who, webhook_id))
         data = {"webhook_id": str(endpoint.id)}
-        return await rows.add_delivery(connection, endpoint.id, rows.TEST, data)
+        return await rows.add_delivery(connection, endpoint.id, rows.TEST_EVENT, data)
 
 
 async def list_deliveries(
@@ -119,8 +119,8 @@ async def list_deliveries(
         return await rows.list_deliveries(connection, webhook_id, limit)
 
 
-@tried_again
-async def send_again(
+@retry_on_deadlock
+async def redeliver(
     service: Service, who: Principal, webhook_id: uuid.UUID, delivery_id: uuid.UUID
 ) -> Delivery:
     """Send a message once more, with the same id and content.
@@ -129,13 +129,15 @@ async def send_again(
         Problem: 404, or 409 if the webhook is disabled.
     """
     async with service.pool.connection() as connection, connection.transaction():
-        _enabled(await owned_webhook(connection, who, webhook_id))
+        _check_enabled(await owned_webhook(connection, who, webhook_id))
         if await rows.get_delivery(connection, webhook_id, delivery_id) is None:
-            raise not_found("message")
-        return await rows.send_again(connection, delivery_id)
+            raise not_found_error("message")
+        return await rows.redeliver(connection, delivery_id)
 
 
-def _enabled(endpoint: Endpoint) -> Endpoint:
+def _check_enabled(endpoint: Endpoint) -> Endpoint:
     if not endpoint.enabled:
-        raise Problem(409, "webhook-disabled", "The webhook is disabled; PATCH it with enabled true first.")
+        raise ProblemError(
+            409, "webhook-disabled", "The webhook is disabled; PATCH it with enabled true first."
+        )
     return endpoint

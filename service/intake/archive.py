@@ -11,26 +11,26 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import BinaryIO
 
-from octasplat.service.intake.layout import Part, common_folder, is_clutter, part_of
-from octasplat.service.intake.names import FileNames
+from octasplat.service.intake.scene_layout import FileRole, common_folder, file_role, is_ignored_file
+from octasplat.service.intake.upload_names import FileNames
 from octasplat.service.intake.zip_records import (
     DEFLATED,
     IS_ENCRYPTED,
     IS_STRONG,
     STORED,
-    Record,
+    ZipEntry,
+    raise_intake_error,
     read_records,
-    refuse,
 )
-from octasplat.workers.store.names import shown_name
-from octasplat.workers.store.protocol import Blob, BlobWriter
+from octasplat.workers.storage.file_names import quoted_name
+from octasplat.workers.storage.protocol import Blob, BlobWriter
 
 _PIECE_BYTES = 1 << 20
 _NESTED_SUFFIXES = (
     ".zip", ".tar", ".gz", ".tgz", ".bz2", ".tbz2", ".xz", ".txz", ".lzma", ".zst", ".7z", ".rar", ".jar",
     ".cab", ".iso", ".lz4", ".z", ".cbz", ".apk", ".whl",
 )  # fmt: skip
-_KINDS = (
+_MAGIC_NUMBERS = (
     (b"PK\x03\x04", 0, "zip"), (b"PK\x05\x06", 0, "zip"), (b"\x1f\x8b\x08", 0, "gzip"), (b"BZh", 0, "bzip2"),
     (b"\xfd7zXZ\x00", 0, "xz"), (b"7z\xbc\xaf\x27\x1c", 0, "7z"), (b"Rar!\x1a\x07", 0, "rar"),
     (b"\x28\xb5\x2f\xfd", 0, "zstd"), (b"\x04\x22\x4d\x18", 0, "lz4"), (b"MSCF", 0, "cab"),
@@ -64,7 +64,7 @@ class ArchiveFile:
     """A file of the archive that is part of a scene: its name in the dataset, and where it is."""
 
     name: str
-    record: Record
+    record: ZipEntry
 
     @property
     def size_bytes(self) -> int:
@@ -103,11 +103,13 @@ def list_archive(file: BinaryIO, limits: ArchiveLimits = ArchiveLimits()) -> Arc
         IntakeRefused: with one of the codes ``archive-...`` or ``name-...``.
     """
     file.seek(0)
-    kind = archive_kind(file.read(512))
+    kind = archive_type(file.read(512))
     if kind is None:
-        refuse("archive-damaged", "This is not an archive; send the scene as a ZIP file, or file by file.")
+        raise_intake_error(
+            "archive-damaged", "This is not an archive; send the scene as a ZIP file, or file by file."
+        )
     if kind != "zip":
-        refuse(
+        raise_intake_error(
             "archive-kind",
             f"This is a {kind} archive; send the scene as a ZIP file, or its files one by one.",
         )
@@ -116,22 +118,22 @@ def list_archive(file: BinaryIO, limits: ArchiveLimits = ArchiveLimits()) -> Arc
     )
     names = FileNames()
     for record in records:
-        _check_kind(record)
+        _check_entry(record)
         names.add(record.name)
         _check_size(record, limits)
     total = sum(record.size_bytes for record in records)
     if total > limits.max_total_bytes:
-        refuse(
+        raise_intake_error(
             "archive-too-large",
             f"The archive unpacks to {total} bytes; {limits.max_total_bytes} are allowed.",
         )
-    return _listing([record for record in records if not record.name.endswith("/")])
+    return _scene_listing([record for record in records if not record.name.endswith("/")])
 
 
 def unpack_archive(
     file: BinaryIO,
     listing: ArchiveListing,
-    begin: Callable[[ArchiveFile], BlobWriter],
+    open_writer: Callable[[ArchiveFile], BlobWriter],
     on_file: Callable[[ArchiveFile, Blob], None],
 ) -> None:
     """Write the files of an archive to a store.
@@ -139,7 +141,7 @@ def unpack_archive(
     Args:
         file: the archive.
         listing: what :func:`list_archive` said of it.
-        begin: opens the writer for a file.
+        open_writer: opens the writer for a file.
         on_file: told what was stored; it may raise to refuse it. Nothing counts before this function returns.
 
     Raises:
@@ -147,55 +149,61 @@ def unpack_archive(
         StorageError: the store does not take it.
     """
     for entry in listing.files:
-        with begin(entry) as writer:
-            _copy(file, entry, writer)
+        with open_writer(entry) as writer:
+            _copy_entry(file, entry, writer)
             blob = writer.commit()
         on_file(entry, blob)
 
 
-def archive_kind(head: bytes) -> str | None:
+def archive_type(head: bytes) -> str | None:
     """The kind of archive or compressed file that begins with ``head`` (512 bytes), or None."""
-    for magic, position, kind in _KINDS:
+    for magic, position, kind in _MAGIC_NUMBERS:
         if head[position : position + len(magic)] == magic:
             return kind
     return None
 
 
-def _check_kind(record: Record) -> None:
-    name = shown_name(record.name)
+def _check_entry(record: ZipEntry) -> None:
+    name = quoted_name(record.name)
     form = stat.S_IFMT(record.unix_mode)
     if form == stat.S_IFLNK:
-        refuse("archive-link", f"{name} is a link; send the file itself.", record.name)
+        raise_intake_error("archive-link", f"{name} is a link; send the file itself.", record.name)
     is_folder = record.name.endswith("/")
     if form not in (0, stat.S_IFDIR if is_folder else stat.S_IFREG):
-        refuse("archive-special-file", f"{name} is neither a regular file nor a folder.", record.name)
+        raise_intake_error(
+            "archive-special-file", f"{name} is neither a regular file nor a folder.", record.name
+        )
     if record.flags & (IS_ENCRYPTED | IS_STRONG):
-        refuse("archive-encrypted", f"{name} is encrypted; send the archive without a password.", record.name)
+        raise_intake_error(
+            "archive-encrypted", f"{name} is encrypted; send the archive without a password.", record.name
+        )
     if record.method not in (STORED, DEFLATED):
-        refuse(
+        raise_intake_error(
             "archive-method",
             f"{name} is packed by the method {record.method}; pack it with deflate or without compression.",
             record.name,
         )
     if is_folder and (record.size_bytes or record.packed_bytes > 2):
-        refuse("archive-mismatch", f"The folder {name} has a content.", record.name)
+        raise_intake_error("archive-mismatch", f"The folder {name} has a content.", record.name)
     if record.name.lower().endswith(_NESTED_SUFFIXES):
-        refuse("archive-nested", f"{name} is an archive inside the archive; unpack it first.", record.name)
+        raise_intake_error(
+            "archive-nested", f"{name} is an archive inside the archive; unpack it first.", record.name
+        )
 
 
-def _check_size(record: Record, limits: ArchiveLimits) -> None:
-    name = shown_name(record.name)
+def _check_size(record: ZipEntry, limits: ArchiveLimits) -> None:
+    name = quoted_name(record.name)
     if record.size_bytes > limits.max_file_bytes:
-        refuse(
+        raise_intake_error(
             "archive-file-too-large",
             f"{name} unpacks to {record.size_bytes} bytes; {limits.max_file_bytes} are allowed.",
             record.name,
         )
     if record.method == STORED and record.size_bytes != record.packed_bytes:
-        refuse("archive-mismatch", f"{name} is stored as it is but has two lengths.", record.name)
+        raise_intake_error("archive-mismatch", f"{name} is stored as it is but has two lengths.", record.name)
     packed = max(1, record.packed_bytes)
     if record.size_bytes > max(limits.ratio_from_bytes, limits.max_ratio * packed):
-        refuse(
+        raise_intake_error(
             "archive-ratio",
             f"{name} unpacks to {record.size_bytes // packed} times its length; {limits.max_ratio} times are "
             "allowed. Send such a file by itself.",
@@ -203,26 +211,26 @@ def _check_size(record: Record, limits: ArchiveLimits) -> None:
         )
 
 
-def _listing(records: list[Record]) -> ArchiveListing:
-    folder = common_folder([record.name for record in records if not is_clutter(record.name)])
+def _scene_listing(records: list[ZipEntry]) -> ArchiveListing:
+    folder = common_folder([record.name for record in records if not is_ignored_file(record.name)])
     files: list[ArchiveFile] = []
     left_out: list[str] = []
     for record in records:
         name = record.name.removeprefix(folder)
-        if record.name.startswith(folder) and part_of(name) is not Part.OTHER:
+        if record.name.startswith(folder) and file_role(name) is not FileRole.OTHER:
             files.append(ArchiveFile(name, record))
         else:
             left_out.append(record.name)
     if not files:
-        refuse(
+        raise_intake_error(
             "archive-empty",
             "The archive holds no part of a scene; put images/ at its top or into one folder.",
         )
     return ArchiveListing(tuple(files), tuple(left_out), folder)
 
 
-def _copy(file: BinaryIO, entry: ArchiveFile, writer: BlobWriter) -> None:
-    record, name = entry.record, shown_name(entry.record.name)
+def _copy_entry(file: BinaryIO, entry: ArchiveFile, writer: BlobWriter) -> None:
+    record, name = entry.record, quoted_name(entry.record.name)
     inflate = zlib.decompressobj(-zlib.MAX_WBITS) if record.method == DEFLATED else None
     checksum = count = 0
     left = record.packed_bytes
@@ -233,7 +241,7 @@ def _copy(file: BinaryIO, entry: ArchiveFile, writer: BlobWriter) -> None:
         if not pending and left:
             pending = file.read(min(_PIECE_BYTES, left))
             if not pending:
-                refuse("archive-damaged", "The archive was cut short.")
+                raise_intake_error("archive-damaged", "The archive was cut short.")
             left -= len(pending)
         if inflate is None:
             piece, pending = pending, b""
@@ -241,23 +249,29 @@ def _copy(file: BinaryIO, entry: ArchiveFile, writer: BlobWriter) -> None:
             try:
                 piece = inflate.decompress(pending, _PIECE_BYTES)
             except zlib.error:
-                refuse("archive-damaged", f"{name} is damaged in the archive; write it anew.", record.name)
+                raise_intake_error(
+                    "archive-damaged", f"{name} is damaged in the archive; write it anew.", record.name
+                )
             pending = inflate.unconsumed_tail
             if inflate.eof and (inflate.unused_data or left):
-                refuse("archive-mismatch", f"{name} is shorter than the archive announces.", record.name)
+                raise_intake_error(
+                    "archive-mismatch", f"{name} is shorter than the archive announces.", record.name
+                )
         if len(head) < 512:
             head += piece[: 512 - len(head)]
         count += len(piece)
         if count > record.size_bytes:
-            refuse("archive-bomb", f"{name} is longer than the archive announces.", record.name)
+            raise_intake_error("archive-bomb", f"{name} is longer than the archive announces.", record.name)
         checksum = zlib.crc32(piece, checksum)
         writer.write(piece)
         if not left and not pending and (inflate is None or inflate.eof or not piece):
             break
     if count != record.size_bytes or (inflate is not None and not inflate.eof):
-        refuse("archive-mismatch", f"{name} is shorter than the archive announces.", record.name)
+        raise_intake_error("archive-mismatch", f"{name} is shorter than the archive announces.", record.name)
     if checksum != record.crc32:
-        refuse("archive-checksum", f"{name} is damaged: its checksum is wrong.", record.name)
+        raise_intake_error("archive-checksum", f"{name} is damaged: its checksum is wrong.", record.name)
     # The first bytes of a model's file are a count, which may look like anything.
-    if part_of(entry.name) is not Part.MODEL and archive_kind(head) is not None:
-        refuse("archive-nested", f"{name} is an archive inside the archive; unpack it first.", record.name)
+    if file_role(entry.name) is not FileRole.MODEL and archive_type(head) is not None:
+        raise_intake_error(
+            "archive-nested", f"{name} is an archive inside the archive; unpack it first.", record.name
+        )

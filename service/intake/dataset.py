@@ -4,16 +4,16 @@ import unicodedata
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-from octasplat.service.intake.faults import Fault, IntakeRefused
+from octasplat.service.intake.faults import IntakeError, IntakeFault
+from octasplat.service.intake.image_completeness import check_complete
 from octasplat.service.intake.images import ImageHeader, ImageLimits, read_image_header
-from octasplat.service.intake.layout import Part, model_files, part_of
 from octasplat.service.intake.model_check import MIN_VIEWS, ModelLimits, check_model
 from octasplat.service.intake.model_child import ModelAnswer
-from octasplat.service.intake.names import FileNames, scene_part
-from octasplat.service.intake.whole import check_whole
-from octasplat.workers.store.names import shown_name
-from octasplat.workers.store.protocol import Storage
-from octasplat.workers.store.trees import TreeFile
+from octasplat.service.intake.scene_layout import FileRole, file_role, model_files
+from octasplat.service.intake.upload_names import FileNames, check_scene_file
+from octasplat.workers.storage.file_names import quoted_name
+from octasplat.workers.storage.protocol import Storage
+from octasplat.workers.storage.trees import TreeFile
 
 _MAX_FAULTS = 100
 DEFAULT_IMAGE_LIMITS = ImageLimits()
@@ -90,11 +90,11 @@ def check_file_content(
         IntakeRefused: the header is refused, or the file was cut off.
         StorageError: the content cannot be had.
     """
-    if part_of(name) is Part.MODEL:
+    if file_role(name) is FileRole.MODEL:
         return None
     with storage.open(sha256) as file:
         header = read_image_header(file, name, limits)
-        check_whole(file, name, header.kind)
+        check_complete(file, name, header.kind)
         return header
 
 
@@ -112,21 +112,23 @@ def check_dataset(
         IntakeRefused: with all faults that were found.
         StorageError: contents cannot be had.
     """
-    faults: list[Fault] = []
+    faults: list[IntakeFault] = []
     warnings: list[str] = []
-    _check_names(files, faults)
+    _check_file_names(files, faults)
     if faults:
-        raise IntakeRefused(*faults[:_MAX_FAULTS])
+        raise IntakeError(*faults[:_MAX_FAULTS])
     sizes = _image_sizes(storage, files, limits.image, faults, warnings)
     photographs = {path.removeprefix("images/"): s for path, s in sizes.items() if path.startswith("images/")}
-    count = sum(part_of(file.path) is Part.IMAGE for file in files)
+    count = sum(file_role(file.path) is FileRole.IMAGE for file in files)
     if not MIN_VIEWS <= count <= limits.max_photographs:
         wanted = (
             f"at least {MIN_VIEWS} are needed"
             if count < MIN_VIEWS
             else f"{limits.max_photographs} are allowed"
         )
-        faults.append(Fault("dataset-photographs", f"There are {count} photographs in images/; {wanted}."))
+        faults.append(
+            IntakeFault("dataset-photographs", f"There are {count} photographs in images/; {wanted}.")
+        )
     masks = _check_masks(files, sizes, faults, warnings)
     by_name = {file.path: file for file in files}
     model = [
@@ -139,7 +141,7 @@ def check_dataset(
         faults += answer.faults
         warnings += answer.warnings
     if faults:
-        raise IntakeRefused(*faults[:_MAX_FAULTS])
+        raise IntakeError(*faults[:_MAX_FAULTS])
     return DatasetSummary(
         photographs=count,
         pixels=sum(width * height for width, height in photographs.values()),
@@ -154,13 +156,13 @@ def check_dataset(
     )
 
 
-def _check_names(files: Sequence[DatasetFile], faults: list[Fault]) -> None:
+def _check_file_names(files: Sequence[DatasetFile], faults: list[IntakeFault]) -> None:
     known = FileNames()
     for file in files:
         try:
             known.add(file.path)
-            scene_part(file.path)
-        except IntakeRefused as error:
+            check_scene_file(file.path)
+        except IntakeError as error:
             faults += error.faults
 
 
@@ -168,12 +170,12 @@ def _image_sizes(
     storage: Storage,
     files: Sequence[DatasetFile],
     limits: ImageLimits,
-    faults: list[Fault],
+    faults: list[IntakeFault],
     warnings: list[str],
 ) -> dict[str, tuple[int, int]]:
     sizes: dict[str, tuple[int, int]] = {}
     for file in files:
-        if part_of(file.path) is Part.MODEL:
+        if file_role(file.path) is FileRole.MODEL:
             continue
         if file.width_px is not None and file.height_px is not None:
             sizes[file.path] = file.width_px, file.height_px
@@ -182,7 +184,7 @@ def _image_sizes(
             continue
         try:
             header = check_file_content(storage, file.path, file.sha256, limits)
-        except IntakeRefused as error:
+        except IntakeError as error:
             faults += error.faults
             continue
         if header is not None:
@@ -195,12 +197,12 @@ def _image_sizes(
 def _check_masks(
     files: Sequence[DatasetFile],
     sizes: dict[str, tuple[int, int]],
-    faults: list[Fault],
+    faults: list[IntakeFault],
     warnings: list[str],
 ) -> int:
     """Masks against their photographs, which are named alike but for ``.png`` at the end."""
     photographs = {unicodedata.normalize("NFC", path): size for path, size in sizes.items()}
-    masks = [file.path for file in files if part_of(file.path) is Part.MASK]
+    masks = [file.path for file in files if file_role(file.path) is FileRole.MASK]
     alone = 0
     for path in masks:
         of_image = path.removeprefix("masks/").removesuffix(".png")
@@ -210,9 +212,9 @@ def _check_masks(
         elif path in sizes and sizes[path] != photograph:
             width, height = sizes[path]
             faults.append(
-                Fault(
+                IntakeFault(
                     "mask-size",
-                    f"{shown_name(path)} is {width}x{height} but its photograph is "
+                    f"{quoted_name(path)} is {width}x{height} but its photograph is "
                     f"{photograph[0]}x{photograph[1]}; make the mask as large as the photograph.",
                     path,
                 )

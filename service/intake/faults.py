@@ -6,7 +6,7 @@ from octasplat.engine.errors import DatasetError
 
 
 @dataclass(frozen=True)
-class Fault:
+class IntakeFault:
     """One fault.
 
     Attributes:
@@ -32,10 +32,10 @@ class Fault:
         return facts if self.file is None else {**facts, "file": self.file}
 
 
-class IntakeRefused(DatasetError):
+class IntakeError(DatasetError):
     """Something from outside is refused; ``faults`` say why, the text is that of the first."""
 
-    def __init__(self, *faults: Fault) -> None:
+    def __init__(self, *faults: IntakeFault) -> None:
         super().__init__(faults[0].detail)
         self.faults = faults
 

@@ -18,14 +18,14 @@ from PIL.BmpImagePlugin import BmpImageFile
 from PIL.JpegImagePlugin import JpegImageFile
 from PIL.PngImagePlugin import PngImageFile
 
-from octasplat.service.intake.faults import Fault, IntakeRefused
-from octasplat.workers.store.names import shown_name
+from octasplat.service.intake.faults import IntakeError, IntakeFault
+from octasplat.workers.storage.file_names import quoted_name
 
 _SUFFIXES = {
     "JPEG": (".jpg", ".jpeg"), "PNG": (".png",), "TIFF": (".tif", ".tiff"), "WebP": (".webp",),
     "BMP": (".bmp",), "EXR": (".exr",), "HDR": (".hdr",),
 }  # fmt: skip
-_HEADER_FAULTS = (
+_HEADER_ERRORS = (
     OSError, SyntaxError, ValueError, ArithmeticError, LookupError, TypeError, AttributeError, RuntimeError,
     MemoryError, struct.error,
 )  # fmt: skip
@@ -75,14 +75,14 @@ def read_image_header(file: BinaryIO, name: str, limits: ImageLimits = ImageLimi
         IntakeRefused: ``image-kind``, ``image-damaged``, ``image-header-too-long``, ``image-animated``,
             ``image-too-many-pixels`` or ``image-too-long-side``.
     """
-    shown = shown_name(name)
+    shown = quoted_name(name)
     bounded: Any = _BoundedFile(file, limits.max_header_bytes)
     head = bounded.read(32)
     bounded.seek(0)
-    kind = image_kind(head)
+    kind = image_type(head)
     if kind is None:
-        raise IntakeRefused(
-            Fault(
+        raise IntakeError(
+            IntakeFault(
                 "image-kind",
                 f"{shown} is not an image of a known kind; send JPEG, PNG, TIFF, WebP, BMP, EXR or HDR.",
                 name,
@@ -90,23 +90,23 @@ def read_image_header(file: BinaryIO, name: str, limits: ImageLimits = ImageLimi
         )
     try:
         width, height, frames = _READERS[kind](bounded)
-    except _HeaderTooLong:
+    except _HeaderTooLongError:
         detail = f"{shown} has no size in its first {limits.max_header_bytes} bytes of header; write it anew."
-        raise IntakeRefused(Fault("image-header-too-long", detail, name)) from None
-    except _HEADER_FAULTS:
+        raise IntakeError(IntakeFault("image-header-too-long", detail, name)) from None
+    except _HEADER_ERRORS:
         detail = f"{shown} has a damaged {kind} header; replace the file."
-        raise IntakeRefused(Fault("image-damaged", detail, name)) from None
+        raise IntakeError(IntakeFault("image-damaged", detail, name)) from None
     if width < 1 or height < 1:
-        raise IntakeRefused(Fault("image-damaged", f"{shown} is {width}x{height} pixels large.", name))
+        raise IntakeError(IntakeFault("image-damaged", f"{shown} is {width}x{height} pixels large.", name))
     if frames > 1:
         detail = f"{shown} is an animation of {frames} frames; send photographs one by one."
-        raise IntakeRefused(Fault("image-animated", detail, name))
+        raise IntakeError(IntakeFault("image-animated", detail, name))
     if max(width, height) > limits.max_side_px:
         detail = f"{shown} is {width}x{height} pixels large; {limits.max_side_px} are allowed on a side."
-        raise IntakeRefused(Fault("image-too-long-side", detail, name))
+        raise IntakeError(IntakeFault("image-too-long-side", detail, name))
     if width * height > limits.max_pixels:
         detail = f"{shown} has {width * height} pixels ({width}x{height}); {limits.max_pixels} are allowed."
-        raise IntakeRefused(Fault("image-too-many-pixels", detail, name))
+        raise IntakeError(IntakeFault("image-too-many-pixels", detail, name))
     suffix = PurePosixPath(name).suffix.lower()
     odd = suffix not in _SUFFIXES[kind]
     return ImageHeader(
@@ -114,7 +114,7 @@ def read_image_header(file: BinaryIO, name: str, limits: ImageLimits = ImageLimi
     )
 
 
-def image_kind(head: bytes) -> str | None:
+def image_type(head: bytes) -> str | None:
     """The kind of image that begins with ``head`` (32 bytes), or None."""
     if head.startswith(b"RIFF") and head[8:12] == b"WEBP":
         return "WebP"
@@ -128,7 +128,7 @@ def image_kind(head: bytes) -> str | None:
     return None
 
 
-class _HeaderTooLong(Exception):
+class _HeaderTooLongError(Exception):
     """More was read than a header may hold."""
 
 
@@ -171,10 +171,10 @@ class _BoundedFile(io.RawIOBase):
         self._bytes_left -= taken
         self._calls_left -= 1
         if self._bytes_left < 0 or self._calls_left < 0:
-            raise _HeaderTooLong
+            raise _HeaderTooLongError
 
 
-def _with_pillow(reader: Callable[[Any], ImageFile.ImageFile]) -> Callable[[Any], tuple[int, int, int]]:
+def _pillow_reader(reader: Callable[[Any], ImageFile.ImageFile]) -> Callable[[Any], tuple[int, int, int]]:
     """Sizes by one of Pillow's readers, called directly: its limit on pixels is not ours."""
 
     def read(file: Any) -> tuple[int, int, int]:
@@ -185,12 +185,12 @@ def _with_pillow(reader: Callable[[Any], ImageFile.ImageFile]) -> Callable[[Any]
     return read
 
 
-def read_exactly(file: Any, layout: str) -> tuple[Any, ...]:
+def unpack_struct(file: Any, layout: str) -> tuple[Any, ...]:
     """The next values of a file, by their layout as of :mod:`struct`."""
     return struct.unpack(layout, file.read(struct.calcsize(layout)))
 
 
-def _webp(file: Any) -> tuple[int, int, int]:
+def _read_webp_size(file: Any) -> tuple[int, int, int]:
     head = file.read(30)
     chunk = head[12:16]
     if chunk == b"VP8X":
@@ -207,23 +207,23 @@ def _webp(file: Any) -> tuple[int, int, int]:
     raise ValueError("no WebP frame")
 
 
-def _tiff(file: Any) -> tuple[int, int, int]:
+def _read_tiff_size(file: Any) -> tuple[int, int, int]:
     """Size of the first page, the only one that counts."""
     order = "<" if file.read(2) == b"II" else ">"
-    (version,) = read_exactly(file, f"{order}H")
+    (version,) = unpack_struct(file, f"{order}H")
     if version == 43:
         file.seek(8)
-        (start,) = read_exactly(file, f"{order}Q")
+        (start,) = unpack_struct(file, f"{order}Q")
         file.seek(start)
-        (count,) = read_exactly(file, f"{order}Q")
+        (count,) = unpack_struct(file, f"{order}Q")
     else:
-        (start,) = read_exactly(file, f"{order}I")
+        (start,) = unpack_struct(file, f"{order}I")
         file.seek(start)
-        (count,) = read_exactly(file, f"{order}H")
+        (count,) = unpack_struct(file, f"{order}H")
     sizes: dict[int, int] = {}
     for _ in range(min(count, 65_535)):
-        tag, kind = read_exactly(file, f"{order}2H")
-        values, field = read_exactly(file, f"{order}Q8s" if version == 43 else f"{order}I4s")
+        tag, kind = unpack_struct(file, f"{order}2H")
+        values, field = unpack_struct(file, f"{order}Q8s" if version == 43 else f"{order}I4s")
         if tag in (256, 257):
             if values != 1:
                 raise ValueError("several sizes")
@@ -234,23 +234,23 @@ def _tiff(file: Any) -> tuple[int, int, int]:
     return sizes[256], sizes[257], 1
 
 
-def _exr(file: Any) -> tuple[int, int, int]:
-    _, flags = read_exactly(file, "<2I")
+def _read_exr_size(file: Any) -> tuple[int, int, int]:
+    _, flags = unpack_struct(file, "<2I")
     if flags & 0x800:
         raise ValueError("deep data")
-    while name := read_text(file):
-        read_text(file)
-        (length,) = read_exactly(file, "<i")
+    while name := read_null_terminated(file):
+        read_null_terminated(file)
+        (length,) = unpack_struct(file, "<i")
         if length < 0:
             raise ValueError("negative length")
         if name == b"dataWindow":
-            left, top, right, bottom = read_exactly(file, "<4i")
+            left, top, right, bottom = unpack_struct(file, "<4i")
             return right - left + 1, bottom - top + 1, 1
         file.seek(length, io.SEEK_CUR)
     raise ValueError("no data window")
 
 
-def read_text(file: Any) -> bytes:
+def read_null_terminated(file: Any) -> bytes:
     """A text that ends with a zero, of at most 255 bytes."""
     text = bytearray()
     while (letter := file.read(1)) != b"\0":
@@ -260,7 +260,7 @@ def read_text(file: Any) -> bytes:
     return bytes(text)
 
 
-def _hdr(file: Any) -> tuple[int, int, int]:
+def _read_hdr_size(file: Any) -> tuple[int, int, int]:
     while line := file.readline().strip():
         if len(line) > 4000:
             raise ValueError("long line")
@@ -272,11 +272,11 @@ def _hdr(file: Any) -> tuple[int, int, int]:
 
 
 _READERS: dict[str, Callable[[Any], tuple[int, int, int]]] = {
-    "JPEG": _with_pillow(JpegImageFile),
-    "PNG": _with_pillow(PngImageFile),
-    "BMP": _with_pillow(BmpImageFile),
-    "WebP": _webp,
-    "TIFF": _tiff,
-    "EXR": _exr,
-    "HDR": _hdr,
+    "JPEG": _pillow_reader(JpegImageFile),
+    "PNG": _pillow_reader(PngImageFile),
+    "BMP": _pillow_reader(BmpImageFile),
+    "WebP": _read_webp_size,
+    "TIFF": _read_tiff_size,
+    "EXR": _read_exr_size,
+    "HDR": _read_hdr_size,
 }

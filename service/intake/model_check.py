@@ -13,11 +13,11 @@ from pathlib import Path
 from pydantic import ValidationError
 
 from octasplat.engine.isolated_python import python_command
-from octasplat.service.intake.faults import Fault
+from octasplat.service.intake.faults import IntakeFault
 from octasplat.service.intake.model_child import MAX_ANSWER_BYTES, ModelAnswer, ModelRequest
-from octasplat.workers.store.protocol import Storage
-from octasplat.workers.store.trees import TreeFile, fetch_tree
-from octasplat.workers.work.memory import total_bytes
+from octasplat.workers.storage.protocol import Storage
+from octasplat.workers.storage.trees import TreeFile, fetch_tree
+from octasplat.workers.worker.memory_limit import total_memory_bytes
 
 MIN_VIEWS = 3
 """Fewer photographs do not make a scene; as in the engine."""
@@ -38,7 +38,7 @@ class ModelLimits:
         hidden: folders that the child cannot open.
     """
 
-    memory_bytes: int = field(default_factory=lambda: min(6 << 30, max(2 << 30, total_bytes() // 4)))
+    memory_bytes: int = field(default_factory=lambda: min(6 << 30, max(2 << 30, total_memory_bytes() // 4)))
     seconds: int = 120
     max_model_bytes: int = 4 << 30
     hidden: tuple[Path, ...] = ()
@@ -67,7 +67,7 @@ def check_model(
     total = sum(file.size_bytes for file in model)
     if total > limits.max_model_bytes:
         detail = f"The COLMAP model has {total} bytes; {limits.max_model_bytes} are allowed."
-        return ModelAnswer(faults=[Fault("model-too-large", detail)])
+        return ModelAnswer(faults=[IntakeFault("model-too-large", detail)])
     with tempfile.TemporaryDirectory(prefix="octasplat-model-") as folder:
         root = Path(folder)
         fetch_tree(storage, model, root, writable=True)  # copies, as the child is not trusted
@@ -80,10 +80,10 @@ def check_model(
             cpu_seconds=limits.seconds,
             hidden=limits.hidden,
         )
-        return _ask(request, limits)
+        return _run_model_child(request, limits)
 
 
-def _ask(request: ModelRequest, limits: ModelLimits) -> ModelAnswer:
+def _run_model_child(request: ModelRequest, limits: ModelLimits) -> ModelAnswer:
     # Files, not pipes: the child's limit on the length of files then bounds what it can say.
     with tempfile.TemporaryFile() as answer, tempfile.TemporaryFile() as noise:
         child = subprocess.Popen(  # noqa: S603 - a program of ours
@@ -91,14 +91,16 @@ def _ask(request: ModelRequest, limits: ModelLimits) -> ModelAnswer:
             stdin=subprocess.PIPE,
             stdout=answer,
             stderr=noise,
-            env=child_environment(),
+            env=parser_environment(),
             start_new_session=True,
             cwd="/",
         )
         try:
             child.communicate(request.model_dump_json().encode(), timeout=limits.seconds)
         except subprocess.TimeoutExpired:
-            return _failed("model-timeout", f"Reading the COLMAP model took more than {limits.seconds} s.")
+            return _failed_answer(
+                "model-timeout", f"Reading the COLMAP model took more than {limits.seconds} s."
+            )
         finally:
             with suppress(ProcessLookupError):
                 os.killpg(child.pid, signal.SIGKILL)
@@ -108,21 +110,21 @@ def _ask(request: ModelRequest, limits: ModelLimits) -> ModelAnswer:
         noise.seek(max(0, noise.seek(0, os.SEEK_END) - 2000))
         said = noise.read(2000)
     if child.returncode == -signal.SIGXCPU or child.returncode == -signal.SIGKILL:
-        return _failed("model-timeout", f"Reading the COLMAP model took more than {limits.seconds} s.")
+        return _failed_answer("model-timeout", f"Reading the COLMAP model took more than {limits.seconds} s.")
     try:
         return ModelAnswer.model_validate_json(text)
     except ValidationError:
         _log.warning("the reader of a COLMAP model ended with %s: %a", child.returncode, said)
-        return _failed(
+        return _failed_answer(
             "model-crash", "The COLMAP model cannot be read (its reader crashed); write it anew with COLMAP."
         )
 
 
-def child_environment() -> dict[str, str]:
+def parser_environment() -> dict[str, str]:
     """What a child that parses foreign bytes may know: how to find libraries, and no secrets."""
     kept = {name: os.environ[name] for name in _LIBRARY_VARIABLES if name in os.environ}
     return {**kept, "OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1", "PYTHONDONTWRITEBYTECODE": "1"}
 
 
-def _failed(code: str, detail: str) -> ModelAnswer:
-    return ModelAnswer(faults=[Fault(code, detail)])
+def _failed_answer(code: str, detail: str) -> ModelAnswer:
+    return ModelAnswer(faults=[IntakeFault(code, detail)])

@@ -19,13 +19,13 @@ from typing import TYPE_CHECKING, Any
 
 from pydantic import BaseModel
 
-from octasplat.service.intake.faults import Fault
-from octasplat.workers.isolation.confining import confine
-from octasplat.workers.isolation.kernel import PR_SET_PDEATHSIG, prctl
-from octasplat.workers.store.names import NameRefused, check_name, shown_name
+from octasplat.service.intake.faults import IntakeFault
+from octasplat.workers.sandbox.confinement import confine
+from octasplat.workers.sandbox.linux import PR_SET_PDEATHSIG, prctl
+from octasplat.workers.storage.file_names import FileNameError, check_name, quoted_name
 
 if TYPE_CHECKING:
-    from octasplat.engine.scene.colmap import ColmapModel
+    from octasplat.engine.dataset.colmap_model import ColmapModel
 
 MAX_ANSWER_BYTES = 4 << 20
 MAX_FAULTS = 100
@@ -58,7 +58,7 @@ class ModelRequest(BaseModel):
 class ModelAnswer(BaseModel):
     """What the child found: faults, or else what the model holds."""
 
-    faults: list[Fault] = []
+    faults: list[IntakeFault] = []
     views: int = 0
     cameras: int = 0
     camera_models: list[str] = []
@@ -71,11 +71,11 @@ def main() -> None:
     answer_fd = os.dup(1)
     os.dup2(2, 1)  # libraries that talk do so to stderr
     request = ModelRequest.model_validate_json(sys.stdin.buffer.read())
-    _limit(request)
+    _enter_sandbox(request)
     try:
         answer = check(request)
     except MemoryError:
-        answer = _one_fault("model-memory", "The COLMAP model takes too much memory to read.")
+        answer = _fault_answer("model-memory", "The COLMAP model takes too much memory to read.")
     text = answer.model_dump_json().encode()
     with os.fdopen(answer_fd, "wb") as out:
         out.write(text)
@@ -83,15 +83,15 @@ def main() -> None:
 
 def check(request: ModelRequest) -> ModelAnswer:
     """Parse the model and list all that is wrong with it."""
+    from octasplat.engine.dataset.colmap_binary import check_binary_colmap_model
+    from octasplat.engine.dataset.colmap_model import find_colmap_model_folder, read_colmap_model
     from octasplat.engine.errors import DatasetError
-    from octasplat.engine.scene.binary import check_binary_model
-    from octasplat.engine.scene.colmap import find_model_folder, read_colmap_model
 
-    checker = _Checker(request)
+    checker = _ModelChecker(request)
     try:
-        folder = find_model_folder(request.root)
-        check_binary_model(folder)
-        reconstruction = _load(folder)
+        folder = find_colmap_model_folder(request.root)
+        check_binary_colmap_model(folder)
+        reconstruction = _load_reconstruction(folder)
         if reconstruction is not None:
             checker.check_images(reconstruction)
             checker.check_cameras(reconstruction)
@@ -99,13 +99,13 @@ def check(request: ModelRequest) -> ModelAnswer:
             return ModelAnswer(faults=checker.faults)
         model = read_colmap_model(request.root)
     except DatasetError as error:
-        return _one_fault(
-            "model-damaged", _relative(str(error), request.root), _named_file(str(error), request)
+        return _fault_answer(
+            "model-damaged", _without_root(str(error), request.root), _file_in_sentence(str(error), request)
         )
     return checker.summary(model)
 
 
-def _load(folder: Path) -> Any:
+def _load_reconstruction(folder: Path) -> Any:
     """The model as pycolmap reads it, or None where it does not; the engine then says why."""
     import pycolmap
 
@@ -117,17 +117,17 @@ def _load(folder: Path) -> Any:
         return None
 
 
-class _Checker:
+class _ModelChecker:
     """Collects faults, a bounded number of them."""
 
     def __init__(self, request: ModelRequest) -> None:
         self.request = request
-        self.faults: list[Fault] = []
+        self.faults: list[IntakeFault] = []
         self._sizes = {unicodedata.normalize("NFC", name): size for name, size in request.sizes_px.items()}
 
-    def _fault(self, part: str, code: str, detail: str) -> None:
+    def _add_fault(self, model_file: str, code: str, detail: str) -> None:
         if len(self.faults) < MAX_FAULTS:
-            self.faults.append(Fault(code, detail, _file_of(part, self.request)))
+            self.faults.append(IntakeFault(code, detail, _model_file(model_file, self.request)))
 
     def check_images(self, reconstruction: Any) -> None:
         """Names against the photographs, and poses."""
@@ -137,20 +137,22 @@ class _Checker:
         posed = 0
         for image_id, image in sorted(reconstruction.images.items()):
             try:
-                name = check_name(_name(image, int(image_id)))
-            except NameRefused as error:
-                self._fault("images", error.code, f"The COLMAP model names an image so: {error}")
+                name = check_name(_image_name(image, int(image_id)))
+            except FileNameError as error:
+                self._add_fault("images", error.code, f"The COLMAP model names an image so: {error}")
                 continue
             if not image.has_pose:
                 continue
-            shown = shown_name(name)
+            shown = quoted_name(name)
             posed += 1
             key = unicodedata.normalize("NFC", name)
             if key in known:
-                self._fault("images", "model-image-twice", f"The COLMAP model has the image {shown} twice.")
+                self._add_fault(
+                    "images", "model-image-twice", f"The COLMAP model has the image {shown} twice."
+                )
             known.add(key)
             if key not in self._sizes:
-                self._fault(
+                self._add_fault(
                     "images",
                     "model-image-missing",
                     f"The image {shown} of the COLMAP model is not among the photographs in images/; "
@@ -160,11 +162,11 @@ class _Checker:
             quat, translation = np.array(pose.rotation.quat), np.array(pose.translation)
             # A quaternion of zeros would pass for the identity further on.
             if not (np.isfinite(quat).all() and abs(float(np.linalg.norm(quat)) - 1.0) <= _UNIT_TOLERANCE):
-                self._fault("images", "model-pose", f"The rotation of {shown} is not a unit quaternion.")
+                self._add_fault("images", "model-pose", f"The rotation of {shown} is not a unit quaternion.")
             if not (np.isfinite(translation).all() and (abs(translation) < _MAX_COORDINATE).all()):
-                self._fault("images", "model-pose", f"The translation of {shown} is not a usable number.")
+                self._add_fault("images", "model-pose", f"The translation of {shown} is not a usable number.")
         if posed < self.request.min_views:
-            self._fault(
+            self._add_fault(
                 "images",
                 "model-too-few-views",
                 f"The COLMAP model has {posed} posed images; at least {self.request.min_views} are needed.",
@@ -187,28 +189,28 @@ class _Checker:
                 problem = "has no size"
             if problem:
                 bad.add(int(camera_id))
-                self._fault("cameras", "model-camera", f"Camera {camera_id} {problem} ({facts[:200]}).")
+                self._add_fault("cameras", "model-camera", f"Camera {camera_id} {problem} ({facts[:200]}).")
         for image_id, image in sorted(reconstruction.images.items()):
             try:
-                name = _name(image, int(image_id))
-            except NameRefused:
+                name = _image_name(image, int(image_id))
+            except FileNameError:
                 continue  # told already
             size = self._sizes.get(unicodedata.normalize("NFC", name))
             if size is None or not image.has_pose or int(image.camera_id) in bad:
                 continue
             camera = reconstruction.cameras[image.camera_id]
-            if not same_shape((int(camera.width), int(camera.height)), size):
-                self._fault(
+            if not has_same_aspect((int(camera.width), int(camera.height)), size):
+                self._add_fault(
                     "cameras",
                     "model-size",
-                    f"{shown_name(name)} is {size[0]}x{size[1]} but its camera {image.camera_id} "
+                    f"{quoted_name(name)} is {size[0]}x{size[1]} but its camera {image.camera_id} "
                     f"is {camera.width}x{camera.height}; use the photographs COLMAP was given.",
                 )
 
     def summary(self, model: "ColmapModel") -> ModelAnswer:
         """The answer for a model without faults."""
         posed = {unicodedata.normalize("NFC", image.name) for image in model.images}
-        warnings = [_relative(warning, self.request.root) for warning in model.warnings]
+        warnings = [_without_root(warning, self.request.root) for warning in model.warnings]
         unposed = len(self._sizes) - len(posed)
         if unposed:
             warnings.append(f"{unposed} photographs have no pose in the COLMAP model and are left out.")
@@ -221,38 +223,38 @@ class _Checker:
         )
 
 
-def _name(image: Any, image_id: int) -> str:
+def _image_name(image: Any, image_id: int) -> str:
     try:
         return str(image.name)
     except UnicodeDecodeError:
-        raise NameRefused("name-not-text", f"The name of image {image_id} is not UTF-8.") from None
+        raise FileNameError("name-not-text", f"The name of image {image_id} is not UTF-8.") from None
 
 
-def same_shape(camera_px: tuple[int, int], image_px: tuple[int, int]) -> bool:
+def has_same_aspect(camera_px: tuple[int, int], image_px: tuple[int, int]) -> bool:
     """Whether an image is that of the camera but for its scale, to a pixel, as the engine demands."""
     expected_height = camera_px[1] * image_px[0] / camera_px[0]
     expected_width = camera_px[0] * image_px[1] / camera_px[1]
     return min(abs(expected_height - image_px[1]), abs(expected_width - image_px[0])) <= 1
 
 
-def _one_fault(code: str, detail: str, file: str | None = None) -> ModelAnswer:
-    return ModelAnswer(faults=[Fault(code, detail, file)])
+def _fault_answer(code: str, detail: str, file: str | None = None) -> ModelAnswer:
+    return ModelAnswer(faults=[IntakeFault(code, detail, file)])
 
 
-def _file_of(part: str, request: ModelRequest) -> str | None:
-    return request.files.get(f"{part}.bin") or request.files.get(f"{part}.txt")
+def _model_file(stem: str, request: ModelRequest) -> str | None:
+    return request.files.get(f"{stem}.bin") or request.files.get(f"{stem}.txt")
 
 
-def _named_file(sentence: str, request: ModelRequest) -> str | None:
+def _file_in_sentence(sentence: str, request: ModelRequest) -> str | None:
     return next((name for name in request.files.values() if name in sentence), None)
 
 
-def _relative(sentence: str, root: Path) -> str:
+def _without_root(sentence: str, root: Path) -> str:
     """The sentence without the folder of this machine that the model was put into."""
     return sentence.replace(f"{root}/", "").replace(str(root), "the dataset")
 
 
-def _limit(request: ModelRequest) -> None:
+def _enter_sandbox(request: ModelRequest) -> None:
     """Give up what a parser does not need, for good."""
     with contextlib.suppress(OSError):
         prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
@@ -264,7 +266,12 @@ def _limit(request: ModelRequest) -> None:
     ):
         with contextlib.suppress(ValueError):  # already lower
             resource.setrlimit(kind, (value, value))
-    confine(hidden=request.hidden, read=(request.root,), may_start_processes=False, elsewhere_reads_only=True)
+    confine(
+        hidden=request.hidden,
+        readable=(request.root,),
+        may_start_processes=False,
+        is_read_only_elsewhere=True,
+    )
 
 
 if __name__ == "__main__":

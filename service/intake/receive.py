@@ -11,13 +11,13 @@ from typing import BinaryIO
 
 from octasplat.service.intake.archive import ArchiveFile, ArchiveLimits, list_archive, unpack_archive
 from octasplat.service.intake.dataset import DatasetLimits, check_file_content
-from octasplat.service.intake.faults import Fault, IntakeRefused
+from octasplat.service.intake.faults import IntakeError, IntakeFault
 from octasplat.service.intake.images import ImageHeader, ImageLimits
-from octasplat.service.intake.spool import Spool
-from octasplat.service.threads import Threads, in_thread
-from octasplat.workers.store.counting import CountingWriter
-from octasplat.workers.store.os_errors import told
-from octasplat.workers.store.protocol import Blob, BlobWriter, Storage
+from octasplat.service.intake.spool import SpoolSpace
+from octasplat.service.thread_pools import ThreadPurpose, run_in_pool
+from octasplat.workers.storage.os_errors import translate_os_errors
+from octasplat.workers.storage.protocol import Blob, BlobWriter, Storage
+from octasplat.workers.storage.verifying_writer import VerifyingWriter
 
 PIECE_BYTES = 1 << 20
 _CHECK_EVERY_BYTES = 64 << 20
@@ -92,8 +92,8 @@ def parse_digest(repr_digest: str | None) -> str | None:
     except binascii.Error:
         digest = b""
     if len(digest) != 32:
-        raise IntakeRefused(
-            Fault(
+        raise IntakeError(
+            IntakeFault(
                 "digest-malformed",
                 "The header Repr-Digest holds no SHA-256; write it as sha-256=:<base64 of the 32 bytes>:.",
             )
@@ -106,7 +106,9 @@ def format_digest(sha256: str) -> str:
     return f"sha-256=:{base64.b64encode(bytes.fromhex(sha256)).decode()}:"
 
 
-async def receive(stream: AsyncIterator[bytes], writer: BlobWriter, *, idle_seconds: float = 60.0) -> Blob:
+async def receive_body(
+    stream: AsyncIterator[bytes], writer: BlobWriter, *, idle_seconds: float = 60.0
+) -> Blob:
     """Write a body to ``writer`` in threads, about a megabyte at a time, and commit it.
 
     Args:
@@ -129,16 +131,16 @@ async def receive(stream: AsyncIterator[bytes], writer: BlobWriter, *, idle_seco
                 break
             except TimeoutError:
                 detail = f"Nothing came for {idle_seconds:g} s; send the file again."
-                raise IntakeRefused(Fault("upload-stalled", detail)) from None
+                raise IntakeError(IntakeFault("upload-stalled", detail)) from None
             pending += piece
             if len(pending) >= PIECE_BYTES:
-                await in_thread(Threads.UPLOADS, writer.write, bytes(pending))
+                await run_in_pool(ThreadPurpose.UPLOADS, writer.write, bytes(pending))
                 pending.clear()
         if pending:
-            await in_thread(Threads.UPLOADS, writer.write, bytes(pending))
-        return await in_thread(Threads.UPLOADS, writer.commit)
+            await run_in_pool(ThreadPurpose.UPLOADS, writer.write, bytes(pending))
+        return await run_in_pool(ThreadPurpose.UPLOADS, writer.commit)
     except BaseException:
-        await asyncio.shield(in_thread(Threads.UPLOADS, writer.abort))
+        await asyncio.shield(run_in_pool(ThreadPurpose.UPLOADS, writer.abort))
         raise
 
 
@@ -167,21 +169,21 @@ async def receive_file(
 
     Raises:
         IntakeRefused: the header of the image is refused, or nothing came for too long.
-        StorageError: as by :func:`receive`.
+        StorageError: as by :func:`receive_body`.
     """
     most = limits.max_file_bytes if max_bytes is None else min(limits.max_file_bytes, max_bytes)
-    writer = await in_thread(
-        Threads.UPLOADS, storage.begin, sha256=sha256, size_bytes=size_bytes, max_bytes=most
+    writer = await run_in_pool(
+        ThreadPurpose.UPLOADS, storage.open_writer, sha256=sha256, size_bytes=size_bytes, max_bytes=most
     )
-    blob = await receive(stream, writer, idle_seconds=limits.idle_seconds)
-    header = await in_thread(Threads.UPLOADS, check, storage, path, blob.sha256, limits.dataset.image)
+    blob = await receive_body(stream, writer, idle_seconds=limits.idle_seconds)
+    header = await run_in_pool(ThreadPurpose.UPLOADS, check, storage, path, blob.sha256, limits.dataset.image)
     return ReceivedFile(path, blob, header_facts(header))
 
 
 async def receive_archive(
     storage: Storage,
     stream: AsyncIterator[bytes],
-    spool: Spool,
+    spool: SpoolSpace,
     *,
     sha256: str | None = None,
     size_bytes: int | None = None,
@@ -201,15 +203,17 @@ async def receive_archive(
 
     Raises:
         IntakeRefused: the archive or a file in it is refused.
-        StorageError: as by :func:`receive`.
+        StorageError: as by :func:`receive_body`.
     """
     most = limits.max_archive_bytes if max_bytes is None else min(limits.max_archive_bytes, max_bytes)
-    with told(spool.folder):
+    with translate_os_errors(spool.folder):
         spool.folder.mkdir(parents=True, exist_ok=True, mode=0o700)
         file = tempfile.TemporaryFile(dir=spool.folder)  # noqa: SIM115 - closed below
     with file, _SpoolWriter(file, spool, storage, sha256, size_bytes, most) as writer:
-        blob = await receive(stream, writer, idle_seconds=limits.idle_seconds)
-        files, left_out = await in_thread(Threads.UNPACKING, _unpack, storage, file, limits, max_bytes)
+        blob = await receive_body(stream, writer, idle_seconds=limits.idle_seconds)
+        files, left_out = await run_in_pool(
+            ThreadPurpose.UNPACKING, _unpack_archive, storage, file, limits, max_bytes
+        )
     return ReceivedArchive(files, left_out, blob.size_bytes)
 
 
@@ -225,18 +229,18 @@ def header_facts(header: ImageHeader | None) -> dict[str, str | int | None]:
     return facts if header.warning is None else {**facts, "warning": header.warning}
 
 
-def _unpack(
+def _unpack_archive(
     storage: Storage, file: BinaryIO, limits: UploadLimits, max_bytes: int | None
 ) -> tuple[tuple[ReceivedFile, ...], tuple[str, ...]]:
     listing = list_archive(file, limits.archive)
     if max_bytes is not None and listing.size_bytes > max_bytes:
         detail = f"The archive unpacks to {listing.size_bytes} bytes; {max_bytes} are left of your quota."
-        raise IntakeRefused(Fault("archive-too-large", detail))
-    storage.ensure_room(listing.size_bytes)
+        raise IntakeError(IntakeFault("archive-too-large", detail))
+    storage.ensure_space(listing.size_bytes)
     files: list[ReceivedFile] = []
 
     def begin(entry: ArchiveFile) -> BlobWriter:
-        return storage.begin(size_bytes=entry.size_bytes, max_bytes=limits.max_file_bytes)
+        return storage.open_writer(size_bytes=entry.size_bytes, max_bytes=limits.max_file_bytes)
 
     def on_file(entry: ArchiveFile, blob: Blob) -> None:
         header = check_file_content(storage, entry.name, blob.sha256, limits.dataset.image)
@@ -246,13 +250,13 @@ def _unpack(
     return tuple(files), listing.left_out
 
 
-class _SpoolWriter(CountingWriter):
+class _SpoolWriter(VerifyingWriter):
     """Writes an archive into a nameless file of this machine; its room is taken until the context ends."""
 
     def __init__(
         self,
         file: BinaryIO,
-        spool: Spool,
+        spool: SpoolSpace,
         storage: Storage,
         sha256: str | None,
         size_bytes: int | None,
@@ -261,30 +265,30 @@ class _SpoolWriter(CountingWriter):
         self._file = file
         self._spool = spool
         self._storage = storage
-        self._taken_bytes = self._put_bytes = 0
+        self._reserved_bytes = self._written_bytes = 0
         super().__init__(sha256, size_bytes, max_bytes)
-        storage.ensure_room(size_bytes or 0)
-        self._take(size_bytes or 0)
+        storage.ensure_space(size_bytes or 0)
+        self._reserve(size_bytes or 0)
 
     def __exit__(self, *exception: object) -> None:
         super().__exit__(*exception)
-        self._spool.give_back(self._taken_bytes)
-        self._taken_bytes = 0
+        self._spool.release(self._reserved_bytes)
+        self._reserved_bytes = 0
 
-    def _put(self, data: bytes | memoryview) -> None:
-        self._put_bytes += len(data)
-        if self._put_bytes > self._taken_bytes:
-            self._storage.ensure_room(len(data))
-            self._take(max(len(data), _CHECK_EVERY_BYTES))
-        with told(self._spool.folder):
+    def _write_bytes(self, data: bytes | memoryview) -> None:
+        self._written_bytes += len(data)
+        if self._written_bytes > self._reserved_bytes:
+            self._storage.ensure_space(len(data))
+            self._reserve(max(len(data), _CHECK_EVERY_BYTES))
+        with translate_os_errors(self._spool.folder):
             self._file.write(data)
 
-    def _take(self, size_bytes: int) -> None:
-        self._spool.take(size_bytes)
-        self._taken_bytes += size_bytes
+    def _reserve(self, size_bytes: int) -> None:
+        self._spool.reserve(size_bytes)
+        self._reserved_bytes += size_bytes
 
     def _publish(self, blob: Blob) -> None:
-        with told(self._spool.folder):
+        with translate_os_errors(self._spool.folder):
             self._file.flush()
 
     def _discard(self) -> None:

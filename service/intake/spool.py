@@ -4,11 +4,11 @@ import os
 import threading
 from pathlib import Path
 
-from octasplat.workers.store.errors import StorageFull
-from octasplat.workers.store.os_errors import told
+from octasplat.workers.storage.errors import StorageFullError
+from octasplat.workers.storage.os_errors import translate_os_errors
 
 
-class Spool:
+class SpoolSpace:
     """Bounds what all archives take that are being read.
 
     Args:
@@ -21,31 +21,31 @@ class Spool:
         self.folder = folder
         self._max_bytes = max_bytes
         self._floor_bytes = floor_bytes
-        self._taken_bytes = 0
+        self._reserved_bytes = 0
         self._lock = threading.Lock()
 
-    def take(self, size_bytes: int) -> None:
+    def reserve(self, size_bytes: int) -> None:
         """Set so much aside, until it is given back.
 
         Raises:
             StorageFull: there is not as much.
         """
         with self._lock:
-            if self._max_bytes is not None and self._taken_bytes + size_bytes > self._max_bytes:
-                raise StorageFull(
+            if self._max_bytes is not None and self._reserved_bytes + size_bytes > self._max_bytes:
+                raise StorageFullError(
                     f"Archives that are being read have {self._max_bytes} bytes together, of which "
-                    f"{self._taken_bytes} are taken; send this one later, or the files one by one."
+                    f"{self._reserved_bytes} are taken; send this one later, or the files one by one."
                 )
-            with told(self.folder):
+            with translate_os_errors(self.folder):
                 facts = os.statvfs(self.folder)
             if size_bytes > (free := facts.f_bavail * facts.f_frsize - self._floor_bytes):
-                raise StorageFull(
+                raise StorageFullError(
                     f"The disk for archives has {max(0, free)} bytes left but {size_bytes} are needed; "
                     "send this one later, or the files one by one."
                 )
-            self._taken_bytes += size_bytes
+            self._reserved_bytes += size_bytes
 
-    def give_back(self, size_bytes: int) -> None:
+    def release(self, size_bytes: int) -> None:
         """So much is taken no more."""
         with self._lock:
-            self._taken_bytes -= size_bytes
+            self._reserved_bytes -= size_bytes

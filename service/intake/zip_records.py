@@ -10,17 +10,17 @@ import struct
 from dataclasses import dataclass
 from typing import BinaryIO, NoReturn
 
-from octasplat.service.intake.faults import Fault, IntakeRefused
-from octasplat.workers.store.names import shown_name
+from octasplat.service.intake.faults import IntakeError, IntakeFault
+from octasplat.workers.storage.file_names import quoted_name
 
 STORED, DEFLATED = 0, 8
 IS_ENCRYPTED, HAS_DESCRIPTOR, IS_PATCHED, IS_STRONG, IS_UTF8, IS_MASKED = 1, 8, 32, 64, 2048, 8192
 
-_LOCAL = struct.Struct("<4s5H3I2H")
-_CENTRAL = struct.Struct("<4s6H3I5H2I")
-_END = struct.Struct("<4s4H2IH")
-_END_64 = struct.Struct("<4sQ2H2I4Q")
-_LOCATOR_64 = struct.Struct("<4sIQI")
+_LOCAL_LAYOUT = struct.Struct("<4s5H3I2H")
+_CENTRAL_LAYOUT = struct.Struct("<4s6H3I5H2I")
+_END_LAYOUT = struct.Struct("<4s4H2IH")
+_END_64_LAYOUT = struct.Struct("<4sQ2H2I4Q")
+_LOCATOR_64_LAYOUT = struct.Struct("<4sIQI")
 _MAX_COMMENT = 65_535
 _NEWEST_VERSION = 63
 _UNKNOWN_16, _UNKNOWN_32 = 0xFFFF, 0xFFFFFFFF
@@ -28,7 +28,7 @@ _EXTRA_ZIP64, _EXTRA_NAME = 0x0001, 0x7075
 
 
 @dataclass(frozen=True)
-class Record:
+class ZipEntry:
     """One entry, as both lists say.
 
     Attributes:
@@ -55,23 +55,23 @@ class Record:
 
 
 @dataclass(frozen=True)
-class _End:
+class _EndRecord:
     entries: int
     directory_start: int
     directory_bytes: int
     end_of_directory: int
 
 
-def refuse(code: str, detail: str, name: str | None = None) -> NoReturn:
+def raise_intake_error(code: str, detail: str, name: str | None = None) -> NoReturn:
     """Refuse the archive.
 
     Raises:
         IntakeRefused: always.
     """
-    raise IntakeRefused(Fault(code, detail, name))
+    raise IntakeError(IntakeFault(code, detail, name))
 
 
-def read_records(file: BinaryIO, *, max_entries: int, max_directory_bytes: int) -> list[Record]:
+def read_records(file: BinaryIO, *, max_entries: int, max_directory_bytes: int) -> list[ZipEntry]:
     """All entries of a ZIP file in the order of their data.
 
     Args:
@@ -85,133 +85,161 @@ def read_records(file: BinaryIO, *, max_entries: int, max_directory_bytes: int) 
     length = file.seek(0, os.SEEK_END)
     end = _read_end(file, length)
     if end.entries > max_entries:
-        refuse(
+        raise_intake_error(
             "archive-too-many-entries", f"The archive has {end.entries} entries; {max_entries} are allowed."
         )
     if end.directory_bytes > max_directory_bytes:
-        refuse("archive-directory-too-long", "The list of contents of the archive is too long.")
+        raise_intake_error("archive-directory-too-long", "The list of contents of the archive is too long.")
     if end.directory_start + end.directory_bytes != end.end_of_directory:
-        refuse(
+        raise_intake_error(
             "archive-gap",
             "The archive holds bytes that belong to none of its entries (before its beginning or between its "
             "parts); write it anew with an ordinary ZIP program.",
         )
     file.seek(end.directory_start)
     directory = file.read(end.directory_bytes)
-    if (directory + file.read(_END.size + _MAX_COMMENT)).count(b"PK\x05\x06") != 1:
-        refuse("archive-ambiguous", "The archive has two end records; write it anew without a comment.")
+    if (directory + file.read(_END_LAYOUT.size + _MAX_COMMENT)).count(b"PK\x05\x06") != 1:
+        raise_intake_error(
+            "archive-ambiguous", "The archive has two end records; write it anew without a comment."
+        )
     records = [_with_local_header(file, *entry) for entry in _central_entries(directory, end.entries)]
     records.sort(key=lambda record: record.header_start)
     _check_coverage(file, records, end.directory_start)
     return records
 
 
-def _read_end(file: BinaryIO, length: int) -> _End:
-    tail_start = max(0, length - _END.size - _MAX_COMMENT)
+def _read_end(file: BinaryIO, length: int) -> _EndRecord:
+    tail_start = max(0, length - _END_LAYOUT.size - _MAX_COMMENT)
     file.seek(tail_start)
     tail = file.read(length - tail_start)
     position = tail.rfind(b"PK\x05\x06")
-    if position < 0 or position + _END.size > len(tail):
-        refuse("archive-damaged", "The archive has no end record; it was cut short or is not a ZIP file.")
-    _, disk, directory_disk, entries_here, entries, size, start, comment = _END.unpack_from(tail, position)
-    if position + _END.size + comment != len(tail):
-        refuse("archive-data-after-end", "The archive goes on after its end record; write it anew.")
+    if position < 0 or position + _END_LAYOUT.size > len(tail):
+        raise_intake_error(
+            "archive-damaged", "The archive has no end record; it was cut short or is not a ZIP file."
+        )
+    _, disk, directory_disk, entries_here, entries, size, start, comment = _END_LAYOUT.unpack_from(
+        tail, position
+    )
+    if position + _END_LAYOUT.size + comment != len(tail):
+        raise_intake_error(
+            "archive-data-after-end", "The archive goes on after its end record; write it anew."
+        )
     end_start = tail_start + position
     locator = _locator_64(file, end_start)
     if locator is None:
         if disk or directory_disk or entries_here != entries:
-            refuse("archive-several-disks", "The archive is split into several files; send it as one.")
+            raise_intake_error(
+                "archive-several-disks", "The archive is split into several files; send it as one."
+            )
         if _UNKNOWN_32 in (size, start) or entries == _UNKNOWN_16:
-            refuse("archive-damaged", "The archive lacks its ZIP64 record; write it anew.")
-        return _End(entries, start, size, end_start)
-    return _read_end_64(file, locator, end_start - _LOCATOR_64.size, (entries, size, start))
+            raise_intake_error("archive-damaged", "The archive lacks its ZIP64 record; write it anew.")
+        return _EndRecord(entries, start, size, end_start)
+    return _read_end_64(file, locator, end_start - _LOCATOR_64_LAYOUT.size, (entries, size, start))
 
 
 def _locator_64(file: BinaryIO, end_start: int) -> int | None:
-    if end_start < _LOCATOR_64.size:
+    if end_start < _LOCATOR_64_LAYOUT.size:
         return None
-    file.seek(end_start - _LOCATOR_64.size)
-    signature, disk, where, disks = _LOCATOR_64.unpack(file.read(_LOCATOR_64.size))
+    file.seek(end_start - _LOCATOR_64_LAYOUT.size)
+    signature, disk, where, disks = _LOCATOR_64_LAYOUT.unpack(file.read(_LOCATOR_64_LAYOUT.size))
     if signature != b"PK\x06\x07":
         return None
     if disk != 0 or disks > 1:
-        refuse("archive-several-disks", "The archive is split into several files; send it as one.")
+        raise_intake_error(
+            "archive-several-disks", "The archive is split into several files; send it as one."
+        )
     return int(where)
 
 
-def _read_end_64(file: BinaryIO, where: int, must_end: int, short: tuple[int, int, int]) -> _End:
-    if where + _END_64.size != must_end:
-        refuse("archive-gap", "The ZIP64 record of the archive is not where it must be; write it anew.")
+def _read_end_64(file: BinaryIO, where: int, must_end: int, short: tuple[int, int, int]) -> _EndRecord:
+    if where + _END_64_LAYOUT.size != must_end:
+        raise_intake_error(
+            "archive-gap", "The ZIP64 record of the archive is not where it must be; write it anew."
+        )
     file.seek(where)
-    signature, length, _, _, disk, directory_disk, here, entries, size, start = _END_64.unpack(
-        file.read(_END_64.size)
+    signature, length, _, _, disk, directory_disk, here, entries, size, start = _END_64_LAYOUT.unpack(
+        file.read(_END_64_LAYOUT.size)
     )
-    if signature != b"PK\x06\x06" or length != _END_64.size - 12:
-        refuse("archive-damaged", "The ZIP64 record of the archive is damaged; write it anew.")
+    if signature != b"PK\x06\x06" or length != _END_64_LAYOUT.size - 12:
+        raise_intake_error("archive-damaged", "The ZIP64 record of the archive is damaged; write it anew.")
     if disk or directory_disk or here != entries:
-        refuse("archive-several-disks", "The archive is split into several files; send it as one.")
+        raise_intake_error(
+            "archive-several-disks", "The archive is split into several files; send it as one."
+        )
     for old, new, unknown in zip(
         short, (entries, size, start), (_UNKNOWN_16, _UNKNOWN_32, _UNKNOWN_32), strict=True
     ):
         if old not in (new, unknown):
-            refuse("archive-mismatch", "The two end records of the archive contradict each other.")
-    return _End(entries, start, size, where)
+            raise_intake_error(
+                "archive-mismatch", "The two end records of the archive contradict each other."
+            )
+    return _EndRecord(entries, start, size, where)
 
 
-def _central_entries(directory: bytes, count: int) -> list[tuple[Record, bytes]]:
+def _central_entries(directory: bytes, count: int) -> list[tuple[ZipEntry, bytes]]:
     """Records without ``data_start``, with their names as bytes."""
-    entries: list[tuple[Record, bytes]] = []
+    entries: list[tuple[ZipEntry, bytes]] = []
     position = 0
     for _ in range(count):
-        if position + _CENTRAL.size > len(directory):
-            refuse("archive-damaged", "The list of contents of the archive ends early; write it anew.")
+        if position + _CENTRAL_LAYOUT.size > len(directory):
+            raise_intake_error(
+                "archive-damaged", "The list of contents of the archive ends early; write it anew."
+            )
         (
             signature, _, version, flags, method, _, _, crc32, packed, size,
             name_length, extra_length, comment_length, disk, _, attributes, start,
-        ) = _CENTRAL.unpack_from(directory, position)  # fmt: skip
-        position += _CENTRAL.size
+        ) = _CENTRAL_LAYOUT.unpack_from(directory, position)  # fmt: skip
+        position += _CENTRAL_LAYOUT.size
         after = position + name_length + extra_length + comment_length
         if signature != b"PK\x01\x02" or after > len(directory):
-            refuse("archive-damaged", "The list of contents of the archive is damaged; write it anew.")
+            raise_intake_error(
+                "archive-damaged", "The list of contents of the archive is damaged; write it anew."
+            )
         raw_name = directory[position : position + name_length]
-        name = _decoded(raw_name)
+        name = _decode_name(raw_name)
         _check_version(version, name)
         extra = _extra_fields(directory[position + name_length : after - comment_length], name)
-        size, packed, start, disk = _widened(
+        size, packed, start, disk = _zip64_values(
             extra,
             name,
             (size, _UNKNOWN_32, 8), (packed, _UNKNOWN_32, 8), (start, _UNKNOWN_32, 8), (disk, _UNKNOWN_16, 4),
         )  # fmt: skip
         if disk != 0:
-            refuse("archive-several-disks", "The archive is split into several files; send it as one.")
+            raise_intake_error(
+                "archive-several-disks", "The archive is split into several files; send it as one."
+            )
         if extra.get(_EXTRA_NAME, b"\1" + bytes(4) + raw_name)[5:] != raw_name:
-            refuse("archive-second-name", f"The entry {shown_name(name)} carries a second name.", name)
+            raise_intake_error(
+                "archive-second-name", f"The entry {quoted_name(name)} carries a second name.", name
+            )
         # The upper half of the attributes is the mode on Unix; some programs read it whatever the home.
         entries.append(
-            (Record(name, method, flags, crc32, packed, size, start, 0, attributes >> 16), raw_name)
+            (ZipEntry(name, method, flags, crc32, packed, size, start, 0, attributes >> 16), raw_name)
         )
         position = after
     if position != len(directory):
-        refuse(
+        raise_intake_error(
             "archive-gap", "The list of contents of the archive is longer than its entries; write it anew."
         )
     return entries
 
 
-def _with_local_header(file: BinaryIO, record: Record, raw_name: bytes) -> Record:
+def _with_local_header(file: BinaryIO, record: ZipEntry, raw_name: bytes) -> ZipEntry:
     file.seek(record.header_start)
-    header = file.read(_LOCAL.size)
-    if len(header) < _LOCAL.size or header[:4] != b"PK\x03\x04":
-        refuse(
+    header = file.read(_LOCAL_LAYOUT.size)
+    if len(header) < _LOCAL_LAYOUT.size or header[:4] != b"PK\x03\x04":
+        raise_intake_error(
             "archive-mismatch",
-            f"The entry {shown_name(record.name)} is listed but is not where it should be.",
+            f"The entry {quoted_name(record.name)} is listed but is not where it should be.",
             record.name,
         )
-    _, version, flags, method, _, _, crc32, packed, size, name_length, extra_length = _LOCAL.unpack(header)
+    _, version, flags, method, _, _, crc32, packed, size, name_length, extra_length = _LOCAL_LAYOUT.unpack(
+        header
+    )
     _check_version(version, record.name)
     name = file.read(name_length)
     extra = _extra_fields(file.read(extra_length), record.name)
-    size, packed = _widened(extra, record.name, (size, _UNKNOWN_32, 8), (packed, _UNKNOWN_32, 8))
+    size, packed = _zip64_values(extra, record.name, (size, _UNKNOWN_32, 8), (packed, _UNKNOWN_32, 8))
     compared = IS_ENCRYPTED | HAS_DESCRIPTOR | IS_PATCHED | IS_STRONG | IS_UTF8 | IS_MASKED
     same = (name, method, flags & compared) == (raw_name, record.method, record.flags & compared)
     facts, announced = (crc32, packed, size), (record.crc32, record.packed_bytes, record.size_bytes)
@@ -221,17 +249,17 @@ def _with_local_header(file: BinaryIO, record: Record, raw_name: bytes) -> Recor
         here == there or (deferred and here == 0) for here, there in zip(facts, announced, strict=True)
     )
     if extra.get(_EXTRA_NAME, b"\1" + bytes(4) + raw_name)[5:] != raw_name:
-        refuse(
-            "archive-second-name", f"The entry {shown_name(record.name)} carries a second name.", record.name
+        raise_intake_error(
+            "archive-second-name", f"The entry {quoted_name(record.name)} carries a second name.", record.name
         )
     if not same:
-        refuse(
+        raise_intake_error(
             "archive-mismatch",
-            f"The archive describes {shown_name(record.name)} in two ways that contradict each other.",
+            f"The archive describes {quoted_name(record.name)} in two ways that contradict each other.",
             record.name,
         )
-    data_start = record.header_start + _LOCAL.size + name_length + extra_length
-    return Record(
+    data_start = record.header_start + _LOCAL_LAYOUT.size + name_length + extra_length
+    return ZipEntry(
         record.name, record.method, record.flags, record.crc32, record.packed_bytes, record.size_bytes,
         record.header_start, data_start, record.unix_mode,
     )  # fmt: skip
@@ -240,39 +268,41 @@ def _with_local_header(file: BinaryIO, record: Record, raw_name: bytes) -> Recor
 def _check_version(needed: int, name: str) -> None:
     if needed > _NEWEST_VERSION:
         detail = (
-            f"{shown_name(name)} needs a newer reader of ZIP files than there is; write the archive anew."
+            f"{quoted_name(name)} needs a newer reader of ZIP files than there is; write the archive anew."
         )
-        refuse("archive-version", detail, name)
+        raise_intake_error("archive-version", detail, name)
 
 
-def _check_coverage(file: BinaryIO, records: list[Record], directory_start: int) -> None:
+def _check_coverage(file: BinaryIO, records: list[ZipEntry], directory_start: int) -> None:
     position = 0
     starts = [record.header_start for record in records] + [directory_start]
     for record, after in zip(records, starts[1:], strict=True):
-        name = shown_name(record.name)
+        name = quoted_name(record.name)
         data_end = record.data_start + record.packed_bytes
         if record.header_start != position:
-            refuse(
+            raise_intake_error(
                 "archive-gap", "The archive holds bytes that belong to none of its entries; write it anew."
             )
         if data_end > after:
-            refuse("archive-overlap", f"The entry {name} shares its bytes with another.", record.name)
+            raise_intake_error(
+                "archive-overlap", f"The entry {name} shares its bytes with another.", record.name
+            )
         if record.flags & HAS_DESCRIPTOR:
             file.seek(data_end)
             if not _is_descriptor(file.read(min(24, after - data_end)), after - data_end, record):
-                refuse(
+                raise_intake_error(
                     "archive-mismatch", f"The entry {name} is not followed by what describes it.", record.name
                 )
         elif data_end != after:
-            refuse(
+            raise_intake_error(
                 "archive-gap", "The archive holds bytes that belong to none of its entries; write it anew."
             )
         position = after
     if position != directory_start:
-        refuse("archive-gap", "The archive holds bytes but no entries.")
+        raise_intake_error("archive-gap", "The archive holds bytes but no entries.")
 
 
-def _is_descriptor(data: bytes, length: int, record: Record) -> bool:
+def _is_descriptor(data: bytes, length: int, record: ZipEntry) -> bool:
     facts = (record.crc32, record.packed_bytes, record.size_bytes)
     for layout in ("<3I", "<I2Q"):
         for signature in (b"PK\x07\x08", b""):
@@ -281,11 +311,11 @@ def _is_descriptor(data: bytes, length: int, record: Record) -> bool:
     return False
 
 
-def _decoded(name: bytes) -> str:
+def _decode_name(name: bytes) -> str:
     try:
         return name.decode("utf-8")
     except UnicodeDecodeError:
-        refuse(
+        raise_intake_error(
             "name-not-text",
             f"The archive holds a file name that is not UTF-8 ({ascii(name)[2:82]}); write it with a program "
             "that stores names as UTF-8.",
@@ -301,15 +331,15 @@ def _extra_fields(data: bytes, name: str) -> dict[int, bytes]:
         kind, length = struct.unpack_from("<2H", data, position)
         position += 4
         if position + length > len(data) or (kind in (_EXTRA_ZIP64, _EXTRA_NAME) and kind in fields):
-            refuse(
-                "archive-damaged", f"The extra data of {shown_name(name)} in the archive are damaged.", name
+            raise_intake_error(
+                "archive-damaged", f"The extra data of {quoted_name(name)} in the archive are damaged.", name
             )
         fields[kind] = data[position : position + length]
         position += length
     return fields
 
 
-def _widened(extra: dict[int, bytes], name: str, *values: tuple[int, int, int]) -> tuple[int, ...]:
+def _zip64_values(extra: dict[int, bytes], name: str, *values: tuple[int, int, int]) -> tuple[int, ...]:
     """Replace values that are full by those of the ZIP64 field; each is (value, full, width in bytes)."""
     field = extra.get(_EXTRA_ZIP64, b"")
     position = 0
@@ -317,7 +347,9 @@ def _widened(extra: dict[int, bytes], name: str, *values: tuple[int, int, int]) 
     for value, full, width in values:
         if value == full:
             if position + width > len(field):
-                refuse("archive-damaged", f"The archive lacks the length of {shown_name(name)}.", name)
+                raise_intake_error(
+                    "archive-damaged", f"The archive lacks the length of {quoted_name(name)}.", name
+                )
             value = int.from_bytes(field[position : position + width], "little")
             position += width
         found.append(value)

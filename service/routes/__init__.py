@@ -5,7 +5,7 @@ from typing import Any
 from octasplat.service.problems import MEDIA_TYPE, ProblemDocument
 
 
-def problems(*statuses: int) -> dict[int | str, dict[str, Any]]:
+def problem_responses(*statuses: int) -> dict[int | str, dict[str, Any]]:
     """How errors of these statuses are described in OpenAPI; 400, 401, 429 and 503 are everywhere."""
     content = {MEDIA_TYPE: {"schema": {"$ref": "#/components/schemas/ProblemDocument"}}}
     names = {
@@ -21,4 +21,4 @@ def problems(*statuses: int) -> dict[int | str, dict[str, Any]]:
     }
 
 
-__all__ = ["ProblemDocument", "problems"]
+__all__ = ["ProblemDocument", "problem_responses"]

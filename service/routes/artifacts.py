@@ -8,23 +8,27 @@ from fastapi import APIRouter, Path, Query, Request, Response
 from octasplat.service.actions import artifacts as actions
 from octasplat.service.auth import Reader
 from octasplat.service.downloads import send_blob
-from octasplat.service.routes import problems
+from octasplat.service.routes import problem_responses
 from octasplat.service.schemas.artifacts import ArtifactList, ArtifactView
 from octasplat.service.state import ServiceDep
-from octasplat.service.threads import Threads, in_thread
+from octasplat.service.thread_pools import ThreadPurpose, run_in_pool
 
 router = APIRouter(prefix="/v1/jobs", tags=["results"])
 
 
-@router.get("/{job_id}/artifacts", responses=problems(404))
+@router.get("/{job_id}/artifacts", responses=problem_responses(404))
 async def list_artifacts(job_id: uuid.UUID, who: Reader, service: ServiceDep) -> ArtifactList:
     """The results of a job; none before it has succeeded."""
     found = await actions.list_artifacts(service, who, job_id)
-    return ArtifactList(artifacts=[ArtifactView.of(row) for row in found])
+    return ArtifactList(artifacts=[ArtifactView.from_row(row) for row in found])
 
 
-@router.get("/{job_id}/artifacts/{name:path}", responses=problems(404, 410, 416), response_class=Response)
-@router.head("/{job_id}/artifacts/{name:path}", responses=problems(404, 410, 416), include_in_schema=False)
+@router.get(
+    "/{job_id}/artifacts/{name:path}", responses=problem_responses(404, 410, 416), response_class=Response
+)
+@router.head(
+    "/{job_id}/artifacts/{name:path}", responses=problem_responses(404, 410, 416), include_in_schema=False
+)
 async def get_artifact_content(
     job_id: uuid.UUID, name: Annotated[str, Path(max_length=1000)], who: Reader, service: ServiceDep,
     request: Request,
@@ -32,8 +36,8 @@ async def get_artifact_content(
 ) -> Response:  # fmt: skip
     """A result; `Range` and `If-Range` let a download go on."""
     row = await actions.get_artifact(service, who, job_id, name)
-    return await in_thread(
-        Threads.DOWNLOADS,
+    return await run_in_pool(
+        ThreadPurpose.DOWNLOADS,
         lambda: send_blob(
             service,
             request,
@@ -48,14 +52,14 @@ async def get_artifact_content(
 
 @router.get(
     "/{job_id}/preview",
-    responses={200: {"content": {"image/png": {}}}, **problems(404, 410)},
+    responses={200: {"content": {"image/png": {}}}, **problem_responses(404, 410)},
     response_class=Response,
 )
 async def get_preview(job_id: uuid.UUID, who: Reader, service: ServiceDep, request: Request) -> Response:
     """The newest picture of the scene in the making."""
     blob = await actions.get_preview(service, who, job_id)
-    response = await in_thread(
-        Threads.DOWNLOADS,
+    response = await run_in_pool(
+        ThreadPurpose.DOWNLOADS,
         lambda: send_blob(
             service,
             request,

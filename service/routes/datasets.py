@@ -12,9 +12,9 @@ from octasplat.service.actions import uploads
 from octasplat.service.auth import Reader, Writer
 from octasplat.service.downloads import send_blob
 from octasplat.service.intake.receive import parse_digest
-from octasplat.service.paging import Cursor, Limit, next_cursor, read_cursor, read_id_cursor
-from octasplat.service.problems import Problem
-from octasplat.service.routes import problems
+from octasplat.service.paging import Cursor, Limit, decode_cursor, decode_id_cursor, set_next_link
+from octasplat.service.problems import ProblemError
+from octasplat.service.routes import problem_responses
 from octasplat.service.routes.parameters import IdempotencyKey
 from octasplat.service.schemas.datasets import (
     ArchiveView,
@@ -26,8 +26,8 @@ from octasplat.service.schemas.datasets import (
     NewDataset,
 )
 from octasplat.service.state import ServiceDep
-from octasplat.service.threads import Threads, in_thread
-from octasplat.workers.work.media_types import media_type
+from octasplat.service.thread_pools import ThreadPurpose, run_in_pool
+from octasplat.workers.worker.media_types import media_type
 
 router = APIRouter(prefix="/v1/datasets", tags=["datasets"])
 
@@ -38,57 +38,57 @@ Digest = Annotated[
 FilePath = Annotated[str, Path(max_length=1000, description="Such as images/0001.jpg.")]
 
 
-@router.post("", status_code=201, responses=problems())
+@router.post("", status_code=201, responses=problem_responses())
 async def create_dataset(
     new: NewDataset, who: Writer, service: ServiceDep, response: Response, key: IdempotencyKey = None
 ) -> DatasetView:
     """Make a dataset to put photographs into, or files that the options of jobs name."""
-    dataset = await actions.create_dataset(service, who, new, key=key)
+    dataset = await actions.create_dataset(service, who, new, idempotency_key=key)
     response.headers["Location"] = f"/v1/datasets/{dataset.id}"
-    return DatasetView.of(dataset)
+    return DatasetView.from_row(dataset)
 
 
-@router.get("", responses=problems())
+@router.get("", responses=problem_responses())
 async def list_datasets(
     who: Reader, service: ServiceDep, request: Request, response: Response, limit: Limit = 50,
     cursor: Cursor = None,
 ) -> DatasetPage:  # fmt: skip
     """Your datasets, the newest first."""
-    part = await actions.list_datasets(service, who, before=read_id_cursor(cursor), limit=limit)
-    following = next_cursor(request, response, part.following)
-    return DatasetPage(datasets=[DatasetView.of(row) for row in part.rows], next=following)
+    part = await actions.list_datasets(service, who, before=decode_id_cursor(cursor), limit=limit)
+    following = set_next_link(request, response, part.next_key)
+    return DatasetPage(datasets=[DatasetView.from_row(row) for row in part.rows], next=following)
 
 
-@router.get("/{dataset_id}", responses=problems(404))
+@router.get("/{dataset_id}", responses=problem_responses(404))
 async def get_dataset(dataset_id: uuid.UUID, who: Reader, service: ServiceDep) -> DatasetView:
     """A dataset."""
-    return DatasetView.of(await actions.get_dataset(service, who, dataset_id))
+    return DatasetView.from_row(await actions.get_dataset(service, who, dataset_id))
 
 
-@router.patch("/{dataset_id}", responses=problems(404))
+@router.patch("/{dataset_id}", responses=problem_responses(404))
 async def change_dataset(
     dataset_id: uuid.UUID, change: DatasetChange, who: Writer, service: ServiceDep
 ) -> DatasetView:
     """Rename a dataset, or keep it whatever its age."""
-    return DatasetView.of(await actions.change_dataset(service, who, dataset_id, change))
+    return DatasetView.from_row(await actions.change_dataset(service, who, dataset_id, change))
 
 
-@router.delete("/{dataset_id}", status_code=204, responses=problems(404, 409))
+@router.delete("/{dataset_id}", status_code=204, responses=problem_responses(404, 409))
 async def delete_dataset(dataset_id: uuid.UUID, who: Writer, service: ServiceDep) -> None:
     """Delete a dataset that no job needs."""
     await actions.delete_dataset(service, who, dataset_id)
 
 
-@router.get("/{dataset_id}/files", responses=problems(404))
+@router.get("/{dataset_id}/files", responses=problem_responses(404))
 async def list_files(
     dataset_id: uuid.UUID, who: Reader, service: ServiceDep, request: Request, response: Response,
     limit: Annotated[int, Query(ge=1, le=5000)] = 1000, cursor: Cursor = None,
 ) -> FilePage:  # fmt: skip
     """The files that have arrived, by name; whoever resumes an upload sends only the others."""
-    after = read_cursor(cursor) or ""
+    after = decode_cursor(cursor) or ""
     part = await uploads.list_files(service, who, dataset_id, after=after, limit=limit)
-    following = next_cursor(request, response, part.following)
-    return FilePage(files=[FileView.of(row) for row in part.rows], next=following)
+    following = set_next_link(request, response, part.next_key)
+    return FilePage(files=[FileView.from_row(row) for row in part.rows], next=following)
 
 
 @router.put(
@@ -96,7 +96,7 @@ async def list_files(
     status_code=201,
     responses={
         200: {"description": "It was there already", "model": FileView},
-        **problems(404, 408, 409, 413, 507),
+        **problem_responses(404, 408, 409, 413, 507),
     },
     openapi_extra={"requestBody": {"content": {"application/octet-stream": {}}, "required": True}},
 )
@@ -106,20 +106,24 @@ async def put_file(
 ) -> FileView:  # fmt: skip
     """Send a file: the body is its content. A repeat with the same digest does nothing."""
     file = await uploads.put_file(service, who, dataset_id, path, _upload(request, digest))
-    if file.was_there:
+    if file.is_unchanged:
         response.status_code = 200
-    return FileView.of(file.row)
+    return FileView.from_row(file.row)
 
 
-@router.get("/{dataset_id}/files/{path:path}", responses=problems(404, 410, 416), response_class=Response)
-@router.head("/{dataset_id}/files/{path:path}", responses=problems(404, 410, 416), include_in_schema=False)
+@router.get(
+    "/{dataset_id}/files/{path:path}", responses=problem_responses(404, 410, 416), response_class=Response
+)
+@router.head(
+    "/{dataset_id}/files/{path:path}", responses=problem_responses(404, 410, 416), include_in_schema=False
+)
 async def get_file(
     dataset_id: uuid.UUID, path: FilePath, who: Reader, service: ServiceDep, request: Request
 ) -> Response:
     """The content of a file."""
     row = await uploads.get_file(service, who, dataset_id, path)
-    return await in_thread(
-        Threads.DOWNLOADS,
+    return await run_in_pool(
+        ThreadPurpose.DOWNLOADS,
         lambda: send_blob(
             service,
             request,
@@ -131,7 +135,7 @@ async def get_file(
     )
 
 
-@router.delete("/{dataset_id}/files/{path:path}", status_code=204, responses=problems(404, 409))
+@router.delete("/{dataset_id}/files/{path:path}", status_code=204, responses=problem_responses(404, 409))
 async def delete_file(dataset_id: uuid.UUID, path: FilePath, who: Writer, service: ServiceDep) -> None:
     """Take a file out of an open dataset."""
     await uploads.remove_file(service, who, dataset_id, path)
@@ -139,7 +143,7 @@ async def delete_file(dataset_id: uuid.UUID, path: FilePath, who: Writer, servic
 
 @router.put(
     "/{dataset_id}/archive",
-    responses=problems(404, 408, 409, 413, 507),
+    responses=problem_responses(404, 408, 409, 413, 507),
     openapi_extra={"requestBody": {"content": {"application/zip": {}}, "required": True}},
 )
 async def put_archive(
@@ -147,13 +151,15 @@ async def put_archive(
 ) -> ArchiveView:
     """Send a whole scene as a ZIP file; its files join those that are there."""
     archive = await uploads.put_archive(service, who, dataset_id, _upload(request, digest))
-    return ArchiveView(files=[FileView.of(row) for row in archive.files], left_out=list(archive.left_out))
+    return ArchiveView(
+        files=[FileView.from_row(row) for row in archive.files], left_out=list(archive.ignored)
+    )
 
 
-@router.post("/{dataset_id}/commit", responses=problems(404, 409))
+@router.post("/{dataset_id}/commit", responses=problem_responses(404, 409))
 async def commit(dataset_id: uuid.UUID, who: Writer, service: ServiceDep) -> DatasetView:
     """Check the dataset; if it is sound it never changes again and jobs can use it, else see `errors`."""
-    return DatasetView.of(await actions.commit_dataset(service, who, dataset_id))
+    return DatasetView.from_row(await actions.commit_dataset(service, who, dataset_id))
 
 
 def _upload(request: Request, digest: str | None) -> uploads.Upload:
@@ -168,4 +174,4 @@ async def _body(request: Request) -> AsyncIterator[bytes]:
         async for piece in request.stream():
             yield piece
     except ClientDisconnect:
-        raise Problem(400, "upload-broken", "The upload broke off; send the file again.") from None
+        raise ProblemError(400, "upload-broken", "The upload broke off; send the file again.") from None

@@ -4,14 +4,14 @@ from fastapi import APIRouter
 
 from octasplat.service.actions.estimates import estimate
 from octasplat.service.auth import Writer
-from octasplat.service.routes import problems
+from octasplat.service.routes import problem_responses
 from octasplat.service.schemas.estimates import EstimateView, NewEstimate
 from octasplat.service.state import ServiceDep
 
 router = APIRouter(prefix="/v1/estimates", tags=["jobs"])
 
 
-@router.post("", responses=problems(404))
+@router.post("", responses=problem_responses(404))
 async def make_estimate(new: NewEstimate, who: Writer, service: ServiceDep) -> EstimateView:
     """Say what a job would take, without making it; options are checked as if it were made.
 

@@ -6,36 +6,36 @@ from typing import Annotated
 from fastapi import APIRouter, Query, Request, Response
 
 from octasplat.service.actions import jobs as actions
-from octasplat.service.actions.accepting import accept_job
-from octasplat.service.actions.accepting import retry_job as retry_again
-from octasplat.service.actions.jobs import BUSY_SECONDS, JobFilter, ShownJob, stages_of
+from octasplat.service.actions.jobs import BUSY_RETRY_SECONDS, JobFilter, JobWithView, stages_of
+from octasplat.service.actions.submission import retry_job as retry_again
+from octasplat.service.actions.submission import submit_job
 from octasplat.service.auth import Reader, Writer
-from octasplat.service.etags import check_precondition, matches
-from octasplat.service.paging import Cursor, Limit, next_cursor, read_id_cursor
-from octasplat.service.routes import problems
+from octasplat.service.etags import check_precondition, etag_matches
+from octasplat.service.paging import Cursor, Limit, decode_id_cursor, set_next_link
+from octasplat.service.routes import problem_responses
 from octasplat.service.routes.parameters import IdempotencyKey
 from octasplat.service.schemas.jobs import JobChange, JobPage, JobView, NewJob, RetryRequest
 from octasplat.service.state import ServiceDep
-from octasplat.workers.records.rows import JobState
+from octasplat.workers.db.rows import JobState
 
 router = APIRouter(prefix="/v1/jobs", tags=["jobs"])
 
-_IDLE_SECONDS = 30
+_MAX_RETRY_SECONDS = 30
 
 
-@router.post("", status_code=202, responses=problems(404, 409))
+@router.post("", status_code=202, responses=problem_responses(404, 409))
 async def create_job(
     new: NewJob, who: Writer, service: ServiceDep, request: Request, response: Response,
     key: IdempotencyKey = None,
 ) -> JobView:  # fmt: skip
     """Accept a job; poll the address in `Location`, or listen to its `/events`."""
     traceparent = request.headers.get("traceparent", "")[:100] or None
-    view = await accept_job(service, who, new, key=key, traceparent=traceparent)
-    _say_where(response, view)
+    view = await submit_job(service, who, new, idempotency_key=key, traceparent=traceparent)
+    _set_location(response, view)
     return view
 
 
-@router.get("", responses=problems())
+@router.get("", responses=problem_responses())
 async def list_jobs(
     who: Reader, service: ServiceDep, request: Request, response: Response,
     state: Annotated[list[JobState] | None, Query(description="May be given several times.")] = None,
@@ -47,47 +47,47 @@ async def list_jobs(
 ) -> JobPage:  # fmt: skip
     """Your jobs, the newest first."""
     wanted = JobFilter(state or (), kind, label, dataset_id)
-    part = await actions.list_jobs(service, who, wanted, before=read_id_cursor(cursor), limit=limit)
-    following = next_cursor(request, response, part.following)
-    return JobPage(jobs=[JobView.of(job, stages_of(job)) for job in part.rows], next=following)
+    part = await actions.list_jobs(service, who, wanted, before=decode_id_cursor(cursor), limit=limit)
+    following = set_next_link(request, response, part.next_key)
+    return JobPage(jobs=[JobView.from_row(job, stages_of(job)) for job in part.rows], next=following)
 
 
-@router.get("/{job_id}", responses={304: {"description": "Not changed"}, **problems(404)})
+@router.get("/{job_id}", responses={304: {"description": "Not changed"}, **problem_responses(404)})
 async def get_job(
     job_id: uuid.UUID, who: Reader, service: ServiceDep, request: Request, response: Response
 ) -> JobView:
     """A job. Polling with `If-None-Match` costs next to nothing."""
     job = await actions.get_job(service, who, job_id)
     headers = {"ETag": _etag(job), "Cache-Control": "no-cache"}
-    if matches(request.headers.get("if-none-match"), headers["ETag"]):
+    if etag_matches(request.headers.get("if-none-match"), headers["ETag"]):
         return Response(status_code=304, headers=headers)  # type: ignore[return-value]
     response.headers.update(headers)
     if not job.row.is_over:
-        _say_when(response, job.view)
+        _set_retry_after(response, job.view)
     return job.view
 
 
-@router.patch("/{job_id}", responses=problems(404, 412))
+@router.patch("/{job_id}", responses=problem_responses(404, 412))
 async def change_job(
     job_id: uuid.UUID, change: JobChange, who: Writer, service: ServiceDep, request: Request
 ) -> JobView:
     """Rename a job, or keep it whatever its age."""
 
-    def check(job: ShownJob) -> None:
+    def check(job: JobWithView) -> None:
         check_precondition(request, _etag(job))
 
     return await actions.change_job(service, who, job_id, change, check)
 
 
-@router.post("/{job_id}/cancel", status_code=202, responses=problems(404, 409))
+@router.post("/{job_id}/cancel", status_code=202, responses=problem_responses(404, 409))
 async def cancel_job(job_id: uuid.UUID, who: Writer, service: ServiceDep, response: Response) -> JobView:
     """Ask a job to stop; may be repeated. Its checkpoint stays, so that a retry goes on from it."""
     view = await actions.cancel_job(service, who, job_id)
-    _say_where(response, view)
+    _set_location(response, view)
     return view
 
 
-@router.post("/{job_id}/retry", status_code=202, responses=problems(404, 409))
+@router.post("/{job_id}/retry", status_code=202, responses=problem_responses(404, 409))
 async def retry_job(
     job_id: uuid.UUID, who: Writer, service: ServiceDep, response: Response,
     retry: RetryRequest | None = None, key: IdempotencyKey = None,
@@ -98,12 +98,12 @@ async def retry_job(
     trained scene with other `exports`.
     """
     asked = retry or RetryRequest(start="checkpoint")
-    view = await retry_again(service, who, job_id, asked, key=key)
-    _say_where(response, view)
+    view = await retry_again(service, who, job_id, asked, idempotency_key=key)
+    _set_location(response, view)
     return view
 
 
-@router.delete("/{job_id}", status_code=204, responses=problems(404, 409))
+@router.delete("/{job_id}", status_code=204, responses=problem_responses(404, 409))
 async def delete_job(
     job_id: uuid.UUID, who: Writer, service: ServiceDep,
     cancel: Annotated[bool, Query(description="Stop it first if it is not over.")] = False,
@@ -112,18 +112,18 @@ async def delete_job(
     await actions.delete_job(service, who, job_id, cancel=cancel)
 
 
-def _etag(job: ShownJob) -> str:
+def _etag(job: JobWithView) -> str:
     view = job.view
     place = "" if view.queue_position is None else f".{view.queue_position}.{len(view.notes)}"
     return f'"{job.row.version}{place}"'
 
 
-def _say_where(response: Response, view: JobView) -> None:
+def _set_location(response: Response, view: JobView) -> None:
     response.headers["Location"] = f"/v1/jobs/{view.id}"
-    _say_when(response, view)
+    _set_retry_after(response, view)
 
 
-def _say_when(response: Response, view: JobView) -> None:
+def _set_retry_after(response: Response, view: JobView) -> None:
     """Ask again sooner where something moves."""
     ahead = view.queue_position or 0
-    response.headers["Retry-After"] = str(min(_IDLE_SECONDS, BUSY_SECONDS + ahead))
+    response.headers["Retry-After"] = str(min(_MAX_RETRY_SECONDS, BUSY_RETRY_SECONDS + ahead))

@@ -5,7 +5,7 @@ from prometheus_client import CONTENT_TYPE_LATEST
 
 from octasplat.service.actions.system import render_metrics
 from octasplat.service.auth import Reader
-from octasplat.service.routes import problems
+from octasplat.service.routes import problem_responses
 from octasplat.service.state import ServiceDep
 
 router = APIRouter(tags=["health"])
@@ -13,7 +13,7 @@ router = APIRouter(tags=["health"])
 
 @router.get(
     "/metrics",
-    responses={200: {"content": {"text/plain": {"schema": {"type": "string"}}}}, **problems()},
+    responses={200: {"content": {"text/plain": {"schema": {"type": "string"}}}}, **problem_responses()},
     response_class=Response,
 )
 async def get_metrics(_who: Reader, service: ServiceDep) -> Response:

@@ -7,7 +7,7 @@ from fastapi import APIRouter, Response
 from octasplat.service.actions import system as actions
 from octasplat.service.actions import tokens
 from octasplat.service.auth import Admin, Reader, Writer
-from octasplat.service.routes import problems
+from octasplat.service.routes import problem_responses
 from octasplat.service.schemas.system import Health, InfoView, KindList, KindView, QueueList
 from octasplat.service.schemas.tokens import MadeToken, NewToken, SignInLink, TokenList, TokenView
 from octasplat.service.state import ServiceDep
@@ -16,54 +16,54 @@ router = APIRouter(prefix="/v1", tags=["service"])
 health_router = APIRouter(tags=["health"])
 
 
-@router.get("/options", responses=problems())
+@router.get("/options", responses=problem_responses())
 async def list_options(_who: Reader, service: ServiceDep) -> KindList:
     """The kinds of jobs with their options as JSON Schema."""
     return KindList(kinds=actions.list_kinds(service))
 
 
-@router.get("/options/{kind}", responses=problems(404))
+@router.get("/options/{kind}", responses=problem_responses(404))
 async def get_options(kind: str, _who: Reader, service: ServiceDep) -> KindView:
     """One kind of job with its options as JSON Schema."""
     return actions.get_kind(service, kind)
 
 
-@router.get("/info", responses=problems())
+@router.get("/info", responses=problem_responses())
 async def get_info(who: Reader, service: ServiceDep) -> InfoView:
     """Versions, limits, formats, and who you are."""
     return actions.describe(service, who)
 
 
-@router.get("/queues", responses=problems())
+@router.get("/queues", responses=problem_responses())
 async def list_queues(_who: Reader, service: ServiceDep) -> QueueList:
     """What waits, what runs, and who works."""
     return await actions.list_queues(service)
 
 
-@router.get("/tokens", responses=problems())
+@router.get("/tokens", responses=problem_responses())
 async def get_tokens(_who: Admin, service: ServiceDep) -> TokenList:
     """All tokens, without their secrets."""
-    return TokenList(tokens=[TokenView.of(row) for row in await tokens.list_tokens(service)])
+    return TokenList(tokens=[TokenView.from_row(row) for row in await tokens.list_tokens(service)])
 
 
-@router.post("/tokens", status_code=201, responses=problems())
+@router.post("/tokens", status_code=201, responses=problem_responses())
 async def make_token(new: NewToken, _who: Admin, service: ServiceDep, response: Response) -> MadeToken:
     """Make a token. From the first one on, nobody gets in without."""
-    made = await tokens.make_token(service, new)
+    made = await tokens.create_token(service, new)
     response.headers["Location"] = f"/v1/tokens/{made.id}"
     return made
 
 
-@router.delete("/tokens/{token_id}", status_code=204, responses=problems(404))
+@router.delete("/tokens/{token_id}", status_code=204, responses=problem_responses(404))
 async def delete_token(token_id: uuid.UUID, _who: Admin, service: ServiceDep) -> None:
     """Shut a token out, with the sessions of browsers that were begun with it."""
     await tokens.revoke_token(service, token_id)
 
 
-@router.post("/sign-in-links", status_code=201, responses=problems(409))
+@router.post("/sign-in-links", status_code=201, responses=problem_responses(409))
 async def make_link(who: Writer, service: ServiceDep) -> SignInLink:
     """Make a link that signs a browser in with your token, once, within five minutes."""
-    return await tokens.make_link(service, who)
+    return await tokens.create_sign_in_link(service, who)
 
 
 @health_router.get("/healthz")

@@ -7,8 +7,8 @@ from fastapi import APIRouter, Query, Request, Response
 
 from octasplat.service.actions import webhooks as actions
 from octasplat.service.auth import Reader, Writer
-from octasplat.service.paging import Cursor, Limit, next_cursor, read_id_cursor
-from octasplat.service.routes import problems
+from octasplat.service.paging import Cursor, Limit, decode_id_cursor, set_next_link
+from octasplat.service.routes import problem_responses
 from octasplat.service.schemas.webhooks import (
     DeliveryList,
     DeliveryView,
@@ -23,7 +23,7 @@ from octasplat.service.state import ServiceDep
 router = APIRouter(prefix="/v1/webhooks", tags=["webhooks"])
 
 
-@router.post("", status_code=201, responses=problems(404))
+@router.post("", status_code=201, responses=problem_responses(404))
 async def create_webhook(
     new: NewWebhook, who: Writer, service: ServiceDep, response: Response
 ) -> MadeWebhook:
@@ -35,61 +35,61 @@ async def create_webhook(
     """
     made = await actions.create_webhook(service, who, new)
     response.headers["Location"] = f"/v1/webhooks/{made.row.id}"
-    return MadeWebhook(**WebhookView.of(made.row).model_dump(), secret=made.secret)
+    return MadeWebhook(**WebhookView.from_row(made.row).model_dump(), secret=made.secret)
 
 
-@router.get("", responses=problems())
+@router.get("", responses=problem_responses())
 async def list_webhooks(
     who: Reader, service: ServiceDep, request: Request, response: Response, limit: Limit = 50,
     cursor: Cursor = None,
 ) -> WebhookPage:  # fmt: skip
     """Your webhooks, the newest first."""
-    part = await actions.list_webhooks(service, who, before=read_id_cursor(cursor), limit=limit)
-    following = next_cursor(request, response, part.following)
-    return WebhookPage(webhooks=[WebhookView.of(row) for row in part.rows], next=following)
+    part = await actions.list_webhooks(service, who, before=decode_id_cursor(cursor), limit=limit)
+    following = set_next_link(request, response, part.next_key)
+    return WebhookPage(webhooks=[WebhookView.from_row(row) for row in part.rows], next=following)
 
 
-@router.get("/{webhook_id}", responses=problems(404))
+@router.get("/{webhook_id}", responses=problem_responses(404))
 async def get_webhook(webhook_id: uuid.UUID, who: Reader, service: ServiceDep) -> WebhookView:
     """A webhook, without its secret."""
-    return WebhookView.of(await actions.get_webhook(service, who, webhook_id))
+    return WebhookView.from_row(await actions.get_webhook(service, who, webhook_id))
 
 
-@router.patch("/{webhook_id}", responses=problems(404))
+@router.patch("/{webhook_id}", responses=problem_responses(404))
 async def change_webhook(
     webhook_id: uuid.UUID, change: WebhookChange, who: Writer, service: ServiceDep
 ) -> WebhookView:
     """Change a webhook, pause it, or enable it again after the service disabled it."""
-    return WebhookView.of(await actions.change_webhook(service, who, webhook_id, change))
+    return WebhookView.from_row(await actions.change_webhook(service, who, webhook_id, change))
 
 
-@router.delete("/{webhook_id}", status_code=204, responses=problems(404))
+@router.delete("/{webhook_id}", status_code=204, responses=problem_responses(404))
 async def delete_webhook(webhook_id: uuid.UUID, who: Writer, service: ServiceDep) -> None:
     """Delete a webhook; what was not delivered yet is not sent any more."""
     await actions.delete_webhook(service, who, webhook_id)
 
 
-@router.post("/{webhook_id}/test", status_code=202, responses=problems(404, 409))
+@router.post("/{webhook_id}/test", status_code=202, responses=problem_responses(404, 409))
 async def test_webhook(webhook_id: uuid.UUID, who: Writer, service: ServiceDep) -> DeliveryView:
     """Send a message of the type `webhook.test`; see `/deliveries` for what became of it."""
-    return DeliveryView.of(await actions.send_test(service, who, webhook_id))
+    return DeliveryView.from_row(await actions.send_test(service, who, webhook_id))
 
 
-@router.get("/{webhook_id}/deliveries", responses=problems(404))
+@router.get("/{webhook_id}/deliveries", responses=problem_responses(404))
 async def list_deliveries(
     webhook_id: uuid.UUID, who: Reader, service: ServiceDep,
     limit: Annotated[int, Query(ge=1, le=200)] = 50,
 ) -> DeliveryList:  # fmt: skip
     """The newest messages and what became of them; they are kept for 30 days."""
     found = await actions.list_deliveries(service, who, webhook_id, limit)
-    return DeliveryList(deliveries=[DeliveryView.of(row) for row in found])
+    return DeliveryList(deliveries=[DeliveryView.from_row(row) for row in found])
 
 
 @router.post(
-    "/{webhook_id}/deliveries/{delivery_id}/redeliver", status_code=202, responses=problems(404, 409)
+    "/{webhook_id}/deliveries/{delivery_id}/redeliver", status_code=202, responses=problem_responses(404, 409)
 )
 async def redeliver(
     webhook_id: uuid.UUID, delivery_id: uuid.UUID, who: Writer, service: ServiceDep
 ) -> DeliveryView:
     """Send a message once more, with the same id and content."""
-    return DeliveryView.of(await actions.send_again(service, who, webhook_id, delivery_id))
+    return DeliveryView.from_row(await actions.redeliver(service, who, webhook_id, delivery_id))

@@ -2,7 +2,7 @@
 
 from pydantic import BaseModel, ConfigDict
 
-from octasplat.workers.records.rows import Artifact
+from octasplat.workers.db.rows import Artifact
 
 
 class ArtifactView(BaseModel):
@@ -27,7 +27,7 @@ class ArtifactView(BaseModel):
     media_type: str
 
     @classmethod
-    def of(cls, row: Artifact) -> "ArtifactView":
+    def from_row(cls, row: Artifact) -> "ArtifactView":
         """From its row."""
         return cls.model_validate(row, from_attributes=True)
 

@@ -6,11 +6,11 @@ from typing import Any
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from octasplat.service.schemas.base import EXAMPLE_ID, EXAMPLE_TIME, Strict
-from octasplat.workers.records.rows import Dataset, DatasetFile, DatasetHolds, DatasetState
+from octasplat.service.schemas.base import EXAMPLE_ID, EXAMPLE_TIME, RequestBody
+from octasplat.workers.db.rows import Dataset, DatasetFile, DatasetHolds, DatasetState
 
 
-class NewDataset(Strict):
+class NewDataset(RequestBody):
     """A dataset to make."""
 
     model_config = ConfigDict(extra="forbid", json_schema_extra={"examples": [{"name": "fox"}]})
@@ -23,7 +23,7 @@ class NewDataset(Strict):
     )
 
 
-class DatasetChange(Strict):
+class DatasetChange(RequestBody):
     """What may be changed of a dataset."""
 
     model_config = ConfigDict(extra="forbid", json_schema_extra={"examples": [{"pinned": True}]})
@@ -68,7 +68,7 @@ class DatasetView(BaseModel):
     expires_at: datetime | None
 
     @classmethod
-    def of(cls, row: Dataset) -> "DatasetView":
+    def from_row(cls, row: Dataset) -> "DatasetView":
         """From its row."""
         return cls.model_validate(row, from_attributes=True)
 
@@ -104,7 +104,7 @@ class FileView(BaseModel):
     uploaded_at: datetime
 
     @classmethod
-    def of(cls, row: DatasetFile) -> "FileView":
+    def from_row(cls, row: DatasetFile) -> "FileView":
         """From its row."""
         return cls.model_validate(row, from_attributes=True)
 

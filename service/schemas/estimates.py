@@ -5,11 +5,11 @@ from typing import Any
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from octasplat.engine.operations.costs import Estimate
-from octasplat.service.schemas.base import Strict
+from octasplat.engine.operations.cost_model import Estimate
+from octasplat.service.schemas.base import RequestBody
 
 
-class PhotographSizes(Strict):
+class PhotographSizes(RequestBody):
     """Photographs of one size."""
 
     width_px: int = Field(ge=1, le=65_536)
@@ -17,7 +17,7 @@ class PhotographSizes(Strict):
     count: int = Field(1, ge=1, le=1_000_000)
 
 
-class NewEstimate(Strict):
+class NewEstimate(RequestBody):
     """A job that might be asked for; of photographs that are not here yet their sizes are enough."""
 
     model_config = ConfigDict(

@@ -7,13 +7,13 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from octasplat.engine.operations.costs import Estimate
-from octasplat.service.schemas.base import EXAMPLE_ID, EXAMPLE_TIME, Strict
+from octasplat.engine.operations.cost_model import Estimate
+from octasplat.service.schemas.base import EXAMPLE_ID, EXAMPLE_TIME, RequestBody
 from octasplat.service.schemas.webhooks import JobWebhook
-from octasplat.workers.records.rows import Job, JobState
+from octasplat.workers.db.rows import Job, JobState
 
 
-class NewJob(Strict):
+class NewJob(RequestBody):
     """A job to accept."""
 
     model_config = ConfigDict(
@@ -59,14 +59,14 @@ class NewJob(Strict):
     webhook: JobWebhook | None = Field(None, description="Be told of this job; see POST /v1/webhooks.")
 
 
-class JobChange(Strict):
+class JobChange(RequestBody):
     """What may be changed of a job."""
 
     label: str | None = Field(None, max_length=200)
     pinned: bool | None = Field(None, description="Keep it whatever its age.")
 
 
-class RetryRequest(Strict):
+class RetryRequest(RequestBody):
     """Where a retried job begins, and what is to be different."""
 
     model_config = ConfigDict(
@@ -193,7 +193,7 @@ class JobView(BaseModel):
     expires_at: datetime | None
 
     @classmethod
-    def of(
+    def from_row(
         cls, row: Job, stages: list[str], queue_position: int | None = None, notes: Sequence[str] = ()
     ) -> "JobView":
         """From its row."""

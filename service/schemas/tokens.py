@@ -6,11 +6,11 @@ from typing import Literal
 
 from pydantic import BaseModel, Field
 
-from octasplat.service.schemas.base import Strict
-from octasplat.workers.records.rows import Token
+from octasplat.service.schemas.base import RequestBody
+from octasplat.workers.db.rows import Token
 
 
-class NewToken(Strict):
+class NewToken(RequestBody):
     """A token to make."""
 
     name: str = Field(max_length=100)
@@ -33,7 +33,7 @@ class TokenView(BaseModel):
     revoked_at: datetime | None
 
     @classmethod
-    def of(cls, row: Token) -> "TokenView":
+    def from_row(cls, row: Token) -> "TokenView":
         """From its row."""
         return cls.model_validate(row, from_attributes=True)
 

@@ -7,9 +7,15 @@ from typing import Annotated, Any
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
 from octasplat.service.schemas.base import EXAMPLE_ID, EXAMPLE_TIME
-from octasplat.workers.upkeep.webhooks.addresses import MAX_URL
-from octasplat.workers.upkeep.webhooks.rows import ENDS, Delivery, DeliveryState, Endpoint, EventName
-from octasplat.workers.upkeep.webhooks.signing import check_secret
+from octasplat.workers.maintenance.webhooks.addresses import MAX_URL
+from octasplat.workers.maintenance.webhooks.rows import (
+    TERMINAL_EVENTS,
+    Delivery,
+    DeliveryState,
+    Endpoint,
+    EventName,
+)
+from octasplat.workers.maintenance.webhooks.signing import check_secret
 
 _SECRET = "whsec_MfKQ9r8GKYqrTwjUPD8ILPZIo2LaLaSwMfKQ9r8GKYo="  # noqa: S105 - an example
 
@@ -27,7 +33,7 @@ class JobWebhook(BaseModel):
     secret: Secret = Field(
         description="`whsec_` and the base64 of 24 to 64 random bytes; signs the messages."
     )
-    events: Events = list(ENDS)
+    events: Events = list(TERMINAL_EVENTS)
 
 
 class NewWebhook(BaseModel):
@@ -39,7 +45,7 @@ class NewWebhook(BaseModel):
     )
 
     url: Url = Field(description="https, port 443 or 8443, reachable from everywhere.")
-    events: Events = Field(list(ENDS), description="By default the ends of jobs.")
+    events: Events = Field(list(TERMINAL_EVENTS), description="By default the ends of jobs.")
     job_id: uuid.UUID | None = Field(None, description="Tell of this job only.")
     secret: Secret | None = Field(None, description="By default one is made.")
 
@@ -83,7 +89,7 @@ class WebhookView(BaseModel):
     created_at: datetime
 
     @classmethod
-    def of(cls, row: Endpoint) -> "WebhookView":
+    def from_row(cls, row: Endpoint) -> "WebhookView":
         """From its row."""
         return cls.model_validate(row, from_attributes=True)
 
@@ -147,7 +153,7 @@ class DeliveryView(BaseModel):
     tried_at: datetime | None
 
     @classmethod
-    def of(cls, row: Delivery) -> "DeliveryView":
+    def from_row(cls, row: Delivery) -> "DeliveryView":
         """From its row."""
         values = {name: getattr(row, name) for name in cls.model_fields if name != "message_id"}
         values["due_at"] = row.due_at if row.state == "pending" else None

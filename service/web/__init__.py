@@ -6,9 +6,9 @@ from fastapi import FastAPI
 def mount_pages(app: FastAPI) -> None:
     """Add the pages and their static files to the application."""
     from octasplat.service.web import api_page, pages, session
-    from octasplat.service.web.assets import Assets
+    from octasplat.service.web.assets import StaticAssets
 
     app.include_router(session.router)
     app.include_router(pages.router)
     app.include_router(api_page.router)
-    app.mount("/static", Assets(), name="static")
+    app.mount("/static", StaticAssets(), name="static")

@@ -7,7 +7,7 @@ from typing import Any
 from fastapi import APIRouter, Request, Response
 
 from octasplat.service.web.routing import PageRoute
-from octasplat.service.web.templating import page
+from octasplat.service.web.templating import render_page
 
 router = APIRouter(route_class=PageRoute, include_in_schema=False)
 
@@ -26,7 +26,7 @@ class Parameter:
 
 
 @dataclass(frozen=True)
-class Operation:
+class ApiOperation:
     """One thing that can be asked for.
 
     Attributes:
@@ -47,34 +47,36 @@ class Operation:
 
 
 @dataclass
-class Group:
+class OperationGroup:
     """Operations that belong together."""
 
     name: str
-    operations: list[Operation] = field(default_factory=list)
+    operations: list[ApiOperation] = field(default_factory=list)
 
 
 @router.get("/docs")
 async def show_api(request: Request) -> Response:
     """The API."""
     document = request.app.openapi()
-    return page(request, "api.html", groups=groups_of(document), info=document["info"])
+    return render_page(request, "api.html", groups=operation_groups(document), info=document["info"])
 
 
-def groups_of(document: Mapping[str, Any]) -> list[Group]:
+def operation_groups(document: Mapping[str, Any]) -> list[OperationGroup]:
     """All operations of an OpenAPI document, by their first tag."""
-    groups: dict[str, Group] = {}
+    groups: dict[str, OperationGroup] = {}
     for path, item in document["paths"].items():
         for method in _METHODS:
             if method in item:
                 operation = item[method]
                 name = operation.get("tags", ["other"])[0]
-                groups.setdefault(name, Group(name)).operations.append(_operation(method, path, operation))
+                groups.setdefault(name, OperationGroup(name)).operations.append(
+                    _operation(method, path, operation)
+                )
     return list(groups.values())
 
 
-def _operation(method: str, path: str, operation: Mapping[str, Any]) -> Operation:
-    return Operation(
+def _operation(method: str, path: str, operation: Mapping[str, Any]) -> ApiOperation:
+    return ApiOperation(
         method.upper(),
         path,
         operation.get("description") or operation.get("summary", ""),
@@ -82,7 +84,7 @@ def _operation(method: str, path: str, operation: Mapping[str, Any]) -> Operatio
             Parameter(
                 parameter["in"],
                 parameter["name"],
-                _kind(parameter.get("schema", {})),
+                _type_text(parameter.get("schema", {})),
                 parameter.get("description", ""),
                 parameter.get("required", False),
             )
@@ -94,12 +96,12 @@ def _operation(method: str, path: str, operation: Mapping[str, Any]) -> Operatio
     )
 
 
-def _kind(schema: Mapping[str, Any]) -> str:
+def _type_text(schema: Mapping[str, Any]) -> str:
     """The type of a parameter in a word or two."""
     if "anyOf" in schema:
-        return " or ".join(_kind(option) for option in schema["anyOf"] if option.get("type") != "null")
+        return " or ".join(_type_text(option) for option in schema["anyOf"] if option.get("type") != "null")
     if "enum" in schema:
         return " | ".join(map(str, schema["enum"]))
     if schema.get("type") == "array":
-        return f"list of {_kind(schema.get('items', {}))}"
+        return f"list of {_type_text(schema.get('items', {}))}"
     return str(schema.get("format") or schema.get("type", "any"))

@@ -18,15 +18,15 @@ MAX_CAMERAS = 20_000
 MAX_VIEWS = 400
 """Views that the viewer offers; of more, every so manieth."""
 _MAX_NAME_BYTES = 4096
-_PARAMETERS = {0: 3, 1: 4, 2: 4, 3: 5, 4: 8, 5: 8, 6: 12, 7: 5, 8: 4, 9: 5, 10: 12}
+_PARAMETER_COUNTS = {0: 3, 1: 4, 2: 4, 3: 5, 4: 8, 5: 8, 6: 12, 7: 5, 8: 4, 9: 5, 10: 12}
 """Number of parameters by COLMAP's camera model number."""
-_ONE_FOCAL = frozenset({0, 2, 3, 8, 9})
-_ONE_FOCAL_NAMES = frozenset(
+_SINGLE_FOCAL_MODELS = frozenset({0, 2, 3, 8, 9})
+_SINGLE_FOCAL_NAMES = frozenset(
     {"SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE"}
 )
 
 
-class CamerasUnreadable(Exception):
+class CamerasUnreadableError(Exception):
     """The files are not as expected."""
 
 
@@ -65,11 +65,11 @@ def read_poses(cameras: IO[bytes], images: IO[bytes], *, binary: bool) -> list[P
         records = _binary_images(images) if binary else _text_images(images)
         poses = [pose for record in records if (pose := _pose(record, optics)) is not None]
     except (struct.error, ValueError, UnicodeDecodeError, OverflowError, IndexError, EOFError) as error:
-        raise CamerasUnreadable(str(error)) from None
+        raise CamerasUnreadableError(str(error)) from None
     return sorted(poses, key=lambda pose: pose.name)
 
 
-def poses_of_views(content: Mapping[str, Any]) -> list[PhotographPose]:
+def read_view_poses(content: Mapping[str, Any]) -> list[PhotographPose]:
     """The posed photographs of a run's ``views.json``, by name; none where it holds something else."""
     try:
         poses = [_pose_of_view(view, content["cameras"]) for view in content["views"][:MAX_CAMERAS]]
@@ -80,7 +80,7 @@ def poses_of_views(content: Mapping[str, Any]) -> list[PhotographPose]:
 
 def _pose_of_view(view: Mapping[str, Any], cameras: Sequence[Mapping[str, Any]]) -> PhotographPose | None:
     camera = cameras[view["camera"]]
-    fy = float(camera["params"][0 if camera["model"] in _ONE_FOCAL_NAMES else 1])
+    fy = float(camera["params"][0 if camera["model"] in _SINGLE_FOCAL_NAMES else 1])
     seen = _optics(camera["width_px"], camera["height_px"], fy)
     rotation = np.array(view["rotation_cam_from_world"], np.float64)
     translation = np.array(view["translation_cam_from_world"], np.float64)
@@ -99,7 +99,7 @@ def viewer_cameras(poses: list[PhotographPose], held_out: Iterable[str] = ()) ->
     centres = np.stack([pose.centre_world for pose in poses])
     rotations = np.stack([pose.rotation_cam_from_world for pose in poses])
     forwards = rotations[:, 2]
-    up = _up(rotations)
+    up = _estimate_up(rotations)
     middle = centres.mean(axis=0)
     spread = float(np.linalg.norm(centres - middle, axis=1).mean()) or 1.0
     # Least squares of the distances to the axes; the small term keeps parallel axes solvable.
@@ -117,15 +117,15 @@ def viewer_cameras(poses: list[PhotographPose], held_out: Iterable[str] = ()) ->
     step = -(-len(poses) // MAX_VIEWS)
     shown = [pose for k, pose in enumerate(poses) if k % step == 0 or pose.name in held][:MAX_VIEWS]
     return {
-        "up": _numbers(up),
-        "target": _numbers(target),
+        "up": _rounded(up),
+        "target": _rounded(target),
         "radius": round(float(np.median(np.linalg.norm(target - centres, axis=1))) or 1.0, 6),
         "views": [
             {
                 "name": pose.name,
-                "position": _numbers(pose.centre_world),
-                "forward": _numbers(pose.rotation_cam_from_world[2]),
-                "up": _numbers(-pose.rotation_cam_from_world[1]),
+                "position": _rounded(pose.centre_world),
+                "forward": _rounded(pose.rotation_cam_from_world[2]),
+                "up": _rounded(-pose.rotation_cam_from_world[1]),
                 "fov_y_degrees": round(pose.fov_y_degrees, 4),
                 "aspect": round(pose.aspect, 5),
                 "held_out": pose.name in held,
@@ -135,7 +135,7 @@ def viewer_cameras(poses: list[PhotographPose], held_out: Iterable[str] = ()) ->
     }
 
 
-def _up(rotations_cam_from_world: Float64[np.ndarray, "n 3 3"]) -> Float64[np.ndarray, " 3"]:
+def _estimate_up(rotations_cam_from_world: Float64[np.ndarray, "n 3 3"]) -> Float64[np.ndarray, " 3"]:
     """The direction against gravity.
 
     People tilt cameras up and down but seldom roll them, so it is the direction that is closest to square to
@@ -193,10 +193,10 @@ def _binary_optics(file: IO[bytes]) -> dict[int, _Optics]:
     optics = {}
     for _ in range(count):
         camera_id, model, width, height = _unpack(file, "<iiQQ")
-        if model not in _PARAMETERS:
+        if model not in _PARAMETER_COUNTS:
             raise ValueError(f"camera model {model}")
-        parameters = _unpack(file, f"<{_PARAMETERS[model]}d")
-        found = _optics(width, height, parameters[0 if model in _ONE_FOCAL else 1])
+        parameters = _unpack(file, f"<{_PARAMETER_COUNTS[model]}d")
+        found = _optics(width, height, parameters[0 if model in _SINGLE_FOCAL_MODELS else 1])
         if found is not None:
             optics[camera_id] = found
     return optics
@@ -208,7 +208,7 @@ def _binary_images(file: IO[bytes]) -> Iterator[_Record]:
     for _ in range(count):
         _, *numbers, camera_id = _unpack(file, "<i7di")
         name = bytearray()
-        while (letter := _exactly(file, 1)) != b"\0":
+        while (letter := _read_exactly(file, 1)) != b"\0":
             name += letter
             if len(name) > _MAX_NAME_BYTES:
                 raise ValueError("a name without end")
@@ -224,7 +224,7 @@ def _text_optics(file: IO[bytes]) -> dict[int, _Optics]:
         if not words:
             continue
         parameters = [float(word) for word in words[4:]]
-        fy = parameters[0 if words[1] in _ONE_FOCAL_NAMES else 1]
+        fy = parameters[0 if words[1] in _SINGLE_FOCAL_NAMES else 1]
         found = _optics(float(words[2]), float(words[3]), fy)
         if found is not None:
             optics[int(words[0])] = found
@@ -247,10 +247,10 @@ def _text_lines(file: IO[bytes]) -> Iterator[str]:
 
 
 def _unpack(file: IO[bytes], layout: str) -> tuple[Any, ...]:
-    return struct.unpack(layout, _exactly(file, struct.calcsize(layout)))
+    return struct.unpack(layout, _read_exactly(file, struct.calcsize(layout)))
 
 
-def _exactly(file: IO[bytes], count: int) -> bytes:
+def _read_exactly(file: IO[bytes], count: int) -> bytes:
     data = file.read(count)
     if len(data) < count:
         raise EOFError("it ends too early")
@@ -262,5 +262,5 @@ def _check_count(count: float) -> None:
         raise ValueError(f"{count} records")
 
 
-def _numbers(values: Float64[np.ndarray, " n"]) -> list[float]:
+def _rounded(values: Float64[np.ndarray, " n"]) -> list[float]:
     return [round(float(value), 6) for value in values]

@@ -14,7 +14,7 @@ Control = Literal[
     "upload", "uploads",
 ]  # fmt: skip
 
-FILE_NAMES = {
+DEFAULT_FILE_NAMES = {
     "glb": "mesh.glb",
     "mesh-ply": "mesh.ply",
     "obj": "mesh.obj",
@@ -42,11 +42,11 @@ _LABELS = {
     "scale.metallic": "Metallic, times",
     "scale.roughness": "Roughness, times",
 }
-_LOADED = ("stage", "photographs", "camera_path")
+_HIDDEN_OPTIONS = ("stage", "photographs", "camera_path")
 """Options that forms of their own, or the viewer, ask for."""
-_ASSIGNMENTS = "assignments"
+_ASSIGNMENTS_OPTION = "assignments"
 """Settings by name, which a form has as fields."""
-_SHORT = re.compile(r"\b(sh|ssim|l1|l2|fov)\b", re.IGNORECASE)
+_ACRONYMS = re.compile(r"\b(sh|ssim|l1|l2|fov)\b", re.IGNORECASE)
 _UNIT_IN_NAME = re.compile(r" (px|degrees|db|gb)$")
 _CHOICES = {
     ("poses", "given"): "use the COLMAP model",
@@ -67,7 +67,7 @@ class Choice:
 
 
 @dataclass(frozen=True)
-class Field:
+class FormField:
     """One setting.
 
     Attributes:
@@ -104,88 +104,90 @@ class Field:
         return self.path.replace(".", "-")
 
 
-def fields_of(schema: Mapping[str, Any], presets: Presets) -> Iterator[Field]:
+def form_fields(schema: Mapping[str, Any], presets: Presets) -> Iterator[FormField]:
     """Yield the field of each setting of a JSON Schema.
 
     Args:
         schema: of the options.
         presets: values of the options by preset, for options that begin from one.
     """
-    yield from _walk(schema, schema, "", presets)
+    yield from _walk_schema(schema, schema, "", presets)
 
 
 def label_of(name: str) -> str:
     """Return a name of the program as words."""
     words = _UNIT_IN_NAME.sub("", name.replace("_", " ")).capitalize()
-    return _SHORT.sub(lambda found: found[0].upper(), words)
+    return _ACRONYMS.sub(lambda found: found[0].upper(), words)
 
 
-def _walk(
+def _walk_schema(
     root: Mapping[str, Any], schema: Mapping[str, Any], prefix: str, presets: Presets
-) -> Iterator[Field]:
+) -> Iterator[FormField]:
     required = set(schema.get("required", ()))
     for name, raw in schema["properties"].items():
-        given = _resolved(root, raw)
+        given = _resolve_reference(root, raw)
         path = f"{prefix}{name}"
-        if path in _LOADED or path == _ASSIGNMENTS or "shortcut" in given:
+        if path in _HIDDEN_OPTIONS or path == _ASSIGNMENTS_OPTION or "shortcut" in given:
             continue
         if "oneOf" in given:  # one of several sections, told apart by their kind
-            yield from _variants(root, given, path, presets)
+            yield from _variant_fields(root, given, path, presets)
         elif "properties" in given:
-            yield from _walk(root, given, f"{path}.", presets)
+            yield from _walk_schema(root, given, f"{path}.", presets)
         elif "const" not in given:
-            yield _field(path, given, raw.get("default"), presets, name in required)
+            yield _form_field(path, given, raw.get("default"), presets, name in required)
 
 
-def _variants(
-    root: Mapping[str, Any], given: Mapping[str, Any], path: str, presets: Presets
-) -> Iterator[Field]:
+def _variant_fields(
+    root: Mapping[str, Any], schema: Mapping[str, Any], path: str, presets: Presets
+) -> Iterator[FormField]:
     kinds: list[Choice] = []
-    inner: dict[str, tuple[Field, list[str]]] = {}
-    for reference in given["oneOf"]:
-        variant = _resolved(root, reference)
+    inner: dict[str, tuple[FormField, list[str]]] = {}
+    for reference in schema["oneOf"]:
+        variant = _resolve_reference(root, reference)
         kind = str(variant["properties"]["kind"]["const"])
         kinds.append(Choice(kind, kind))
-        for item in _walk(root, variant, f"{path}.", presets):
+        for item in _walk_schema(root, variant, f"{path}.", presets):
             inner.setdefault(item.path, (item, []))[1].append(kind)
-    values = {name: _at(values, f"{path}.kind") for name, values in presets.items()}
-    yield Field(
+    values = {name: _value_at(values, f"{path}.kind") for name, values in presets.items()}
+    yield FormField(
         f"{path}.kind",
         path.rpartition(".")[2].capitalize(),
         "choice",
-        _sentence(given.get("description", "")),
+        _help_sentence(schema.get("description", "")),
         group="advanced",
         choices=tuple(kinds),
-        defaults=_json(values),
+        defaults=_defaults_json(values),
     )
     for item, users in inner.values():
         only = "" if len(users) == len(kinds) else f"Only for {' and '.join(users)}"
         yield replace(item, help=": ".join(text for text in (only, item.help) if text))
 
 
-def _field(path: str, schema: Mapping[str, Any], default: object, presets: Presets, required: bool) -> Field:
+def _form_field(
+    path: str, schema: Mapping[str, Any], default: object, presets: Presets, required: bool
+) -> FormField:
     name = path.rpartition(".")[2]
-    by_preset = {key: _at(values, path) for key, values in presets.items()}
+    by_preset = {key: _value_at(values, path) for key, values in presets.items()}
     by_preset = {key: value for key, value in by_preset.items() if value is not _MISSING}
-    control, values = _control(name, schema)
+    control, values = _control_for(name, schema)
     choices = _file_choices() if control == "files" else tuple(_choice(name, value) for value in values)
-    return Field(
+    return FormField(
         path=path,
         label=_LABELS.get(path) or _LABELS.get(name) or label_of(name),
         control=control,
-        help=_sentence(schema.get("description", "")),
+        help=_help_sentence(schema.get("description", "")),
         unit=schema.get("unit", ""),
         group=cast(Level, schema.get("group", "basic")),
         choices=choices,
-        default=_shown(default),
-        defaults=_json(by_preset) if len(set(map(_shown, by_preset.values()))) > 1 else "",
+        default=_display_text(default),
+        defaults=_defaults_json(by_preset) if len(set(map(_display_text, by_preset.values()))) > 1 else "",
         low=schema.get("minimum", schema.get("exclusiveMinimum")),
         high=schema.get("maximum", schema.get("exclusiveMaximum")),
         required=required,
     )
 
 
-def _control(name: str, schema: Mapping[str, Any]) -> tuple[Control, Sequence[str]]:
+def _control_for(name: str, schema: Mapping[str, Any]) -> tuple[Control, Sequence[str]]:
     """How a value is asked for, and the values to choose from."""
     if "enum" in schema:
         return "choice", [str(value) for value in schema["enum"]]
@@ -227,7 +229,7 @@ def _control_of_several(options: Sequence[Mapping[str, Any]]) -> tuple[Control, 
     return "choice", values
 
 
-def _sentence(text: str) -> str:
+def _help_sentence(text: str) -> str:
     """Words of the program as words of a form, where None is an empty field."""
     return text[:1].upper() + re.sub(r"\bNone\b", "empty", text[1:])
 
@@ -239,10 +241,10 @@ def _choice(name: str, value: str) -> Choice:
 
 def _file_choices() -> tuple[Choice, ...]:
     found = {exporter.name: exporter.description for exporter in exporters()}
-    return tuple(Choice(file, found[name]) for name, file in FILE_NAMES.items() if name in found)
+    return tuple(Choice(file, found[name]) for name, file in DEFAULT_FILE_NAMES.items() if name in found)
 
 
-def _resolved(root: Mapping[str, Any], schema: Mapping[str, Any]) -> Mapping[str, Any]:
+def _resolve_reference(root: Mapping[str, Any], schema: Mapping[str, Any]) -> Mapping[str, Any]:
     """The schema with its reference followed, and with the null of an optional value left out."""
     if "$ref" in schema:
         target: Mapping[str, Any] = root["$defs"][schema["$ref"].rpartition("/")[2]]
@@ -251,14 +253,14 @@ def _resolved(root: Mapping[str, Any], schema: Mapping[str, Any]) -> Mapping[str
         others = [option for option in schema["anyOf"] if option.get("type") != "null"]
         if len(others) == 1:
             rest = {key: value for key, value in schema.items() if key != "anyOf"}
-            return {**_resolved(root, others[0]), **rest}
+            return {**_resolve_reference(root, others[0]), **rest}
     return schema
 
 
 _MISSING = object()
 
 
-def _at(values: Mapping[str, Any], path: str) -> Any:
+def _value_at(values: Mapping[str, Any], path: str) -> Any:
     """The value at a dotted path."""
     found: Any = values
     for part in path.split("."):
@@ -268,7 +270,7 @@ def _at(values: Mapping[str, Any], path: str) -> Any:
     return found
 
 
-def _shown(value: object) -> str:
+def _display_text(value: object) -> str:
     if value is None or isinstance(value, dict):
         return ""
     if isinstance(value, bool):
@@ -278,5 +280,5 @@ def _shown(value: object) -> str:
     return f"{value:g}" if isinstance(value, float) else str(value)
 
 
-def _json(values: Mapping[str, object]) -> str:
-    return json.dumps({name: _shown(value) for name, value in values.items() if value is not _MISSING})
+def _defaults_json(values: Mapping[str, object]) -> str:
+    return json.dumps({name: _display_text(value) for name, value in values.items() if value is not _MISSING})

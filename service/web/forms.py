@@ -7,22 +7,22 @@ from typing import Any
 
 from octasplat.engine.train.config import preset
 from octasplat.engine.train.preset_names import PRESETS
-from octasplat.service.web.form_fields import FILE_NAMES, Field, fields_of
-from octasplat.workers.work.kinds import JobKind
+from octasplat.service.web.form_fields import DEFAULT_FILE_NAMES, FormField, form_fields
+from octasplat.workers.worker.job_kinds import JobKind
 
-_FIRST = (
+_FIRST_FIELDS = (
     "preset", "poses", "max_side", "minutes", "exports", "files",
     "train.iterations", "train.max_gaussians", "train.sh_degree",
 )  # fmt: skip
 """Basic settings that come before the others."""
-_TITLES = {
+_SHORT_TITLES = {
     "evaluate": "Measure it again",
     "export": "Write other formats",
     "render": "Render a video or images",
     "material": "Change materials",
 }
 """What to do with a result, shorter than the kinds say it; a kind that is not here keeps its own title."""
-WITH_ANOTHER_FORM = ("relight",)
+KINDS_WITH_OWN_FORM = ("relight",)
 """Kinds with a form that is made by hand."""
 
 
@@ -31,7 +31,7 @@ class Section:
     """Settings that belong together."""
 
     title: str
-    fields: list[Field] = field(default_factory=list)
+    fields: list[FormField] = field(default_factory=list)
 
 
 @dataclass(frozen=True)
@@ -48,26 +48,28 @@ class OptionsForm:
 
     kind: str
     title: str
-    first: list[Field]
+    first: list[FormField]
     more: list[Section]
-    experimental: list[Field]
+    experimental: list[FormField]
 
 
 def options_form(
-    kind: JobKind, unwritable: Collection[str] = (), ceilings: Mapping[str, int] = MappingProxyType({})
+    kind: JobKind, unwritable: Collection[str] = (), limits: Mapping[str, int] = MappingProxyType({})
 ) -> OptionsForm:
     """Return the form of a kind of job.
 
     Args:
         kind: which.
         unwritable: formats whose files are marked and cannot be chosen.
-        ceilings: of numbers, by their paths.
+        limits: of numbers, by their paths.
     """
-    schema = kind.asked.model_json_schema()
+    schema = kind.user_options.model_json_schema()
     presets = _preset_values(schema)
-    fields = [_capped(_marked(item, unwritable), ceilings) for item in fields_of(schema, presets)]
+    fields = [
+        _cap_limits(_mark_unwritable(item, unwritable), limits) for item in form_fields(schema, presets)
+    ]
     basic = {item.path: item for item in fields if item.group == "basic"}
-    order = [name for name in _FIRST if name in basic] if presets else []
+    order = [name for name in _FIRST_FIELDS if name in basic] if presets else []
     sections: dict[str, Section] = {}
     for item in fields:
         if item.group == "advanced":
@@ -75,24 +77,24 @@ def options_form(
             sections.setdefault(title, Section(_section_title(title))).fields.append(item)
     return OptionsForm(
         kind.name,
-        _TITLES.get(kind.name, kind.title),
+        _SHORT_TITLES.get(kind.name, kind.title),
         [basic[name] for name in dict.fromkeys((*order, *basic))],
         [sections[name] for name in sorted(sections)],
         [item for item in fields if item.group == "experimental"],
     )
 
 
-def _marked(item: Field, unwritable: Collection[str]) -> Field:
+def _mark_unwritable(item: FormField, unwritable: Collection[str]) -> FormField:
     if item.control != "files" or not unwritable:
         return item
-    lacking = {FILE_NAMES[name] for name in unwritable if name in FILE_NAMES}
+    lacking = {DEFAULT_FILE_NAMES[name] for name in unwritable if name in DEFAULT_FILE_NAMES}
     return replace(
         item, choices=tuple(replace(choice, lacking=choice.value in lacking) for choice in item.choices)
     )
 
 
-def _capped(item: Field, ceilings: Mapping[str, int]) -> Field:
-    ceiling = ceilings.get(item.path)
+def _cap_limits(item: FormField, limits: Mapping[str, int]) -> FormField:
+    ceiling = limits.get(item.path)
     if ceiling is None:
         return item
     return replace(item, high=ceiling if item.high is None else min(item.high, ceiling))

@@ -9,29 +9,27 @@ from fastapi import APIRouter, Query, Request, Response
 from fastapi.responses import HTMLResponse, JSONResponse
 
 from octasplat.service.actions import jobs as actions
-from octasplat.service.actions.accepting import retry_job
 from octasplat.service.actions.artifacts import get_artifact, list_artifacts
 from octasplat.service.actions.datasets import list_datasets
-from octasplat.service.actions.system import living_workers
+from octasplat.service.actions.submission import retry_job
+from octasplat.service.actions.system import list_live_workers
 from octasplat.service.auth import Principal, Reader, Writer
 from octasplat.service.downloads import send_blob
-from octasplat.service.intake.layout import model_files
-from octasplat.service.limits import ceilings_by_path
-from octasplat.service.paging import read_id_cursor, write_cursor
-from octasplat.service.queue_facts import unwritable_formats
+from octasplat.service.intake.scene_layout import model_files
+from octasplat.service.job_limits import limits_by_path
+from octasplat.service.paging import decode_id_cursor, encode_cursor
+from octasplat.service.queue_workers import unwritable_formats
 from octasplat.service.schemas.jobs import JobChange, RetryRequest
 from octasplat.service.state import Service, ServiceDep
-from octasplat.service.threads import Threads, in_thread
+from octasplat.service.thread_pools import ThreadPurpose, run_in_pool
 from octasplat.service.web.cameras import (
-    CamerasUnreadable,
-    poses_of_views,
+    CamerasUnreadableError,
     read_poses,
+    read_view_poses,
     viewer_cameras,
 )
-from octasplat.service.web.forms import WITH_ANOTHER_FORM, options_form
-from octasplat.service.web.light import light_form
-from octasplat.service.web.reading import job_counts, job_detail, job_lines, photographs_of
-from octasplat.service.web.relight import relight_form
+from octasplat.service.web.forms import KINDS_WITH_OWN_FORM, options_form
+from octasplat.service.web.relight_form import relight_form
 from octasplat.service.web.results import (
     CONFIG,
     HELD_OUT,
@@ -40,24 +38,26 @@ from octasplat.service.web.results import (
     REPORT,
     SCENE,
     VIEWS,
-    downloads,
-    measured,
+    download_groups,
     read_json,
+    read_measurements,
     read_names,
-    shown_mesh,
+    viewable_mesh,
 )
-from octasplat.service.web.routing import PageRoute, go_to, is_part
-from octasplat.service.web.templating import page
-from octasplat.workers.records.rows import Artifact, DatasetFile
-from octasplat.workers.store.errors import StorageError
-from octasplat.workers.work.kinds import job_kinds, kind_named
+from octasplat.service.web.routing import PageRoute, is_htmx_request, redirect
+from octasplat.service.web.stage_form import stage_form
+from octasplat.service.web.templating import render_page
+from octasplat.service.web.view_models import job_counts, job_detail, list_job_rows, photographs_of
+from octasplat.workers.db.rows import Artifact, DatasetFile
+from octasplat.workers.storage.errors import StorageError
+from octasplat.workers.worker.job_kinds import get_job_kind, job_kinds
 
 router = APIRouter(route_class=PageRoute, include_in_schema=False)
 
-PAGE_LENGTH = 30
+PAGE_SIZE = 30
 MAX_DATASETS = 50
 MAX_PICTURES = 24
-Shown = Literal["all", "active", "done", "failed"]
+StateFilter = Literal["all", "active", "done", "failed"]
 Cursor = Annotated[str | None, Query(max_length=200)]
 
 # The report brings its script along: it runs, but as nobody, and can reach nothing.
@@ -69,19 +69,19 @@ _REPORT_POLICY = (
 
 @router.get("/")
 async def show_jobs(
-    request: Request, who: Reader, service: ServiceDep, show: Shown = "all", cursor: Cursor = None
+    request: Request, who: Reader, service: ServiceDep, show: StateFilter = "all", cursor: Cursor = None
 ) -> Response:
     """The list of jobs."""
-    values = await _list_values(service, who, show, cursor)
-    return page(request, "jobs.html", who, **values)
+    values = await _job_list_context(service, who, show, cursor)
+    return render_page(request, "jobs.html", who, **values)
 
 
 @router.get("/parts/jobs")
 async def show_job_list(
-    request: Request, who: Reader, service: ServiceDep, show: Shown = "all", cursor: Cursor = None
+    request: Request, who: Reader, service: ServiceDep, show: StateFilter = "all", cursor: Cursor = None
 ) -> Response:
     """The list alone."""
-    return page(request, "_jobs.html", who, **await _list_values(service, who, show, cursor))
+    return render_page(request, "_jobs.html", who, **await _job_list_context(service, who, show, cursor))
 
 
 @router.get("/jobs/{job_id}")
@@ -90,36 +90,38 @@ async def show_job(request: Request, job_id: uuid.UUID, who: Reader, service: Se
     detail = await job_detail(service, who, job_id)
     artifacts = await list_artifacts(service, who, job_id)
     photographs = await photographs_of(service, who, job_id)
-    unwritable = unwritable_formats(await living_workers(service))
+    unwritable = unwritable_formats(await list_live_workers(service))
     by_name = {row.name: row for row in artifacts}
-    metrics, config = await in_thread(
-        Threads.DOWNLOADS,
+    metrics, config = await run_in_pool(
+        ThreadPurpose.DOWNLOADS,
         lambda: [read_json(service.storage, by_name.get(name)) for name in (METRICS, CONFIG)],
     )
-    held_out = await in_thread(Threads.DOWNLOADS, read_names, service.storage, by_name.get(HELD_OUT))
-    figures = measured(metrics, artifacts, photographs)
+    held_out = await run_in_pool(ThreadPurpose.DOWNLOADS, read_names, service.storage, by_name.get(HELD_OUT))
+    figures = read_measurements(metrics, artifacts, photographs)
     preview = detail.line.job.preview or {}
     shown = f"images/{preview.get('view')}"
     extra = [
         kind
         for kind in job_kinds()
-        if kind.needs == "result" and kind.name not in WITH_ANOTHER_FORM and _fits(kind.source_files, by_name)
+        if kind.needs == "result"
+        and kind.name not in KINDS_WITH_OWN_FORM
+        and _has_required_file(kind.source_files, by_name)
     ]
-    return page(
+    return render_page(
         request,
         "job.html",
         who,
         detail=detail,
         measured=figures,
-        light=light_form(figures, artifacts, photographs, service.settings) if who.may("write") else None,
+        light=stage_form(figures, artifacts, photographs, service.settings) if who.may("write") else None,
         relight=await relight_form(service, who, artifacts, held_out),
         layers=LAYERS,
         pictures=[row for row in artifacts if row.name.startswith("views/") and row.name.endswith(".png")][
             :MAX_PICTURES
         ],
-        groups=downloads(artifacts),
+        groups=download_groups(artifacts),
         scene=by_name.get(SCENE),
-        mesh=shown_mesh(artifacts),
+        mesh=viewable_mesh(artifacts),
         report=by_name.get(REPORT),
         video=next((row for row in artifacts if row.media_type == "video/mp4"), None),
         q=_octagon_q(config),
@@ -134,15 +136,15 @@ async def show_job(request: Request, job_id: uuid.UUID, who: Reader, service: Se
 @router.get("/parts/jobs/{job_id}")
 async def show_job_status(request: Request, job_id: uuid.UUID, who: Reader, service: ServiceDep) -> Response:
     """How a job fares."""
-    return page(request, "_status.html", who, detail=await job_detail(service, who, job_id))
+    return render_page(request, "_status.html", who, detail=await job_detail(service, who, job_id))
 
 
 @router.get("/jobs/{job_id}/report")
 async def show_report(request: Request, job_id: uuid.UUID, who: Reader, service: ServiceDep) -> Response:
     """The report of a job as a page."""
-    row = await get_artifact(service, who, job_id, REPORT, what="report")
-    response = await in_thread(
-        Threads.DOWNLOADS,
+    row = await get_artifact(service, who, job_id, REPORT, kind="report")
+    response = await run_in_pool(
+        ThreadPurpose.DOWNLOADS,
         lambda: send_blob(
             service, request, sha256=row.sha256, size_bytes=row.size_bytes, media_type="text/html",
             name=REPORT, inline=True,
@@ -158,7 +160,7 @@ async def get_cameras(job_id: uuid.UUID, who: Reader, service: ServiceDep) -> JS
     artifacts = await list_artifacts(service, who, job_id)
     files = await photographs_of(service, who, job_id)
     held_out = next((row for row in artifacts if row.name == HELD_OUT), None)
-    content = await in_thread(Threads.DOWNLOADS, _cameras, service, artifacts, files, held_out)
+    content = await run_in_pool(ThreadPurpose.DOWNLOADS, _cameras, service, artifacts, files, held_out)
     headers = {"Cache-Control": "private, max-age=300"}
     return JSONResponse(content, headers=headers)
 
@@ -168,14 +170,14 @@ async def show_new(
     request: Request, who: Writer, service: ServiceDep, dataset: uuid.UUID | None = None
 ) -> Response:
     """Send photographs and queue their reconstruction."""
-    kind = kind_named("reconstruct")
+    kind = get_job_kind("reconstruct")
     datasets = await list_datasets(service, who, limit=MAX_DATASETS)
-    workers = await living_workers(service)
-    return page(
+    workers = await list_live_workers(service)
+    return render_page(
         request,
         "new.html",
         who,
-        form=options_form(kind, unwritable_formats(workers), ceilings_by_path(kind, service.settings)),
+        form=options_form(kind, unwritable_formats(workers), limits_by_path(kind, service.settings)),
         from_files=[options_form(other) for other in job_kinds() if other.needs == "files"],
         datasets=[row for row in datasets.rows if row.state == "committed" and row.holds == "photographs"],
         chosen=dataset,
@@ -189,7 +191,7 @@ async def show_new(
 async def cancel(request: Request, job_id: uuid.UUID, who: Writer, service: ServiceDep) -> Response:
     """Stop a job."""
     await actions.cancel_job(service, who, job_id)
-    return await _after(request, job_id, who, service)
+    return await _updated_page(request, job_id, who, service)
 
 
 @router.post("/jobs/{job_id}/retry")
@@ -199,7 +201,7 @@ async def retry(
 ) -> Response:  # fmt: skip
     """Queue a job again."""
     await retry_job(service, who, job_id, RetryRequest(start=start))
-    return await _after(request, job_id, who, service)
+    return await _updated_page(request, job_id, who, service)
 
 
 @router.post("/jobs/{job_id}/pin")
@@ -208,44 +210,46 @@ async def pin(
 ) -> Response:
     """Keep a job whatever its age, or no longer."""
     await actions.change_job(service, who, job_id, JobChange(pinned=keep))
-    return await _after(request, job_id, who, service)
+    return await _updated_page(request, job_id, who, service)
 
 
 @router.post("/jobs/{job_id}/delete")
 async def delete(request: Request, job_id: uuid.UUID, who: Writer, service: ServiceDep) -> Response:
     """Delete a job with its results."""
     await actions.delete_job(service, who, job_id)
-    return go_to(request, "/")
+    return redirect(request, "/")
 
 
-async def _after(request: Request, job_id: uuid.UUID, who: Principal, service: Service) -> Response:
+async def _updated_page(request: Request, job_id: uuid.UUID, who: Principal, service: Service) -> Response:
     """What has changed on the page that asked."""
-    if not is_part(request):
-        return go_to(request, f"/jobs/{job_id}")
+    if not is_htmx_request(request):
+        return redirect(request, f"/jobs/{job_id}")
     if request.query_params.get("in") == "list":
         return Response(status_code=200, headers={"HX-Reswap": "none", "HX-Trigger": "jobs-changed"})
     detail = await job_detail(service, who, job_id)
-    response: HTMLResponse = page(request, "_status.html", who, detail=detail)
+    response: HTMLResponse = render_page(request, "_status.html", who, detail=detail)
     response.headers["HX-Trigger"] = json.dumps({"job-changed": {"state": detail.line.job.state}})
     return response
 
 
-async def _list_values(service: Service, who: Principal, show: Shown, cursor: str | None) -> dict[str, Any]:
-    part = await job_lines(service, who, show, read_id_cursor(cursor), PAGE_LENGTH)
+async def _job_list_context(
+    service: Service, who: Principal, show: StateFilter, cursor: str | None
+) -> dict[str, Any]:
+    part = await list_job_rows(service, who, show, decode_id_cursor(cursor), PAGE_SIZE)
     return {
         "lines": part.rows,
-        "next": None if part.following is None else write_cursor(part.following),
+        "next": None if part.next_key is None else encode_cursor(part.next_key),
         "counts": await job_counts(service, who),
         "show": show,
         "cursor": cursor,
     }
 
 
-def _fits(source_files: tuple[str, ...], names: dict[str, Artifact]) -> bool:
+def _has_required_file(source_files: tuple[str, ...], names: dict[str, Artifact]) -> bool:
     return not source_files or source_files[0] in names
 
 
-def _at(config: dict[str, object], *keys: str) -> object:
+def _config_value(config: dict[str, object], *keys: str) -> object:
     found: object = config
     for key in keys:
         found = found.get(key) if isinstance(found, dict) else None
@@ -254,18 +258,18 @@ def _at(config: dict[str, object], *keys: str) -> object:
 
 def _up_world(config: dict[str, object]) -> str:
     """The axis about which the light of a result lies, as JSON."""
-    found = _at(config, "reconstruction", "train", "materials", "up_world")
+    found = _config_value(config, "reconstruction", "train", "materials", "up_world")
     known = isinstance(found, list) and len(found) == 3 and all(isinstance(x, int | float) for x in found)
     return json.dumps(found if known else [0, 0, 1])
 
 
 def _evaluation_background(config: dict[str, object]) -> object:
-    found = _at(config, "reconstruction", "evaluation_background")
-    return found or _at(config, "reconstruction", "evaluate_background") or "black"
+    found = _config_value(config, "reconstruction", "evaluation_background")
+    return found or _config_value(config, "reconstruction", "evaluate_background") or "black"
 
 
 def _octagon_q(config: dict[str, object]) -> float | None:
-    found = _at(config, "reconstruction", "train", "trace", "q")
+    found = _config_value(config, "reconstruction", "train", "trace", "q")
     return float(found) if isinstance(found, int | float) and found > 0 else None
 
 
@@ -275,11 +279,11 @@ def _cameras(
     """The cameras of the poses that the job found, or else of its dataset; none where there is no model."""
     found = {PurePosixPath(row.name).name: row.sha256 for row in artifacts if row.name.startswith("poses/")}
     if not found:
-        found = {name: row.sha256 for name, row in _model(files).items()}
+        found = {name: row.sha256 for name, row in _model_files(files).items()}
     names = read_names(service.storage, held_out)
     views = next((row for row in artifacts if row.name == VIEWS), None)
     if not found and views is not None:  # of a scene that was moved away from its photographs
-        poses = poses_of_views(read_json(service.storage, views))
+        poses = read_view_poses(read_json(service.storage, views))
         return viewer_cameras(poses, names) if poses else {"views": []}
     for suffix in (".bin", ".txt"):
         if f"cameras{suffix}" not in found or f"images{suffix}" not in found:
@@ -290,13 +294,13 @@ def _cameras(
                 service.storage.open(found[f"images{suffix}"]) as images,
             ):
                 poses = read_poses(cameras, images, binary=suffix == ".bin")
-        except (CamerasUnreadable, StorageError):
+        except (CamerasUnreadableError, StorageError):
             break
         if poses:
             return viewer_cameras(poses, names)
     return {"views": []}
 
 
-def _model(files: list[DatasetFile]) -> dict[str, DatasetFile]:
+def _model_files(files: list[DatasetFile]) -> dict[str, DatasetFile]:
     by_path = {file.path: file for file in files}
     return {part: by_path[path] for part, path in model_files(list(by_path)).items()}

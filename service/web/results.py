@@ -9,10 +9,10 @@ from functools import lru_cache
 from pathlib import PurePosixPath
 from typing import Any, cast
 
-from octasplat.engine.render.names import render_names
-from octasplat.workers.records.rows import Artifact, DatasetFile
-from octasplat.workers.store.errors import StorageError
-from octasplat.workers.store.protocol import Storage
+from octasplat.engine.render.file_names import unique_render_names
+from octasplat.workers.db.rows import Artifact, DatasetFile
+from octasplat.workers.storage.errors import StorageError
+from octasplat.workers.storage.protocol import Storage
 
 logger = logging.getLogger(__name__)
 
@@ -32,7 +32,7 @@ LAYERS: Mapping[str, str] = {
 }
 """What can be shown of a view with materials, in the order in which it is offered."""
 LEARNT_LIGHT = "layers/environment.png"
-_SHOWN_BY_BROWSERS = frozenset({".jpg", ".jpeg", ".png", ".webp", ".bmp"})
+_BROWSER_IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".webp", ".bmp"})
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ class Metric:
     higher_is_better: bool = True
 
 
-METRIC_LIST = (
+METRICS_SHOWN = (
     Metric("psnr", "PSNR", 2, "dB", "Peak signal-to-noise ratio; higher is better"),
     Metric("ssim", "SSIM", 4, "", "Structural similarity, as 3DGS computes it; higher is better"),
     Metric("ms_ssim", "MS-SSIM", 4, "", "Structural similarity at several scales; higher is better"),
@@ -56,7 +56,7 @@ METRIC_LIST = (
 
 
 @dataclass(frozen=True)
-class View:
+class HeldOutView:
     """A held-out view: its figures, its render and its photograph.
 
     Attributes:
@@ -79,7 +79,7 @@ class View:
 
 
 @dataclass(frozen=True)
-class Measured:
+class Measurements:
     """What ``metrics.json`` says."""
 
     columns: tuple[Metric, ...]
@@ -87,7 +87,7 @@ class Measured:
     interval: tuple[float, float] | None
     gaussians: int | None
     seconds: float | None
-    views: tuple[View, ...]
+    views: tuple[HeldOutView, ...]
 
 
 @dataclass(frozen=True)
@@ -115,21 +115,21 @@ class DownloadGroup:
 
 def read_json(storage: Storage, row: Artifact | None) -> dict[str, Any]:
     """The content of a small JSON result; empty if it cannot be had."""
-    content = _json(storage, row)
+    content = _read_json(storage, row)
     return content if isinstance(content, dict) else {}
 
 
 def read_names(storage: Storage, row: Artifact | None) -> list[str]:
     """The names in a small JSON result; none if it cannot be had."""
-    content = _json(storage, row)
+    content = _read_json(storage, row)
     return [str(name) for name in content] if isinstance(content, list) else []
 
 
-def _json(storage: Storage, row: Artifact | None) -> object:
+def _read_json(storage: Storage, row: Artifact | None) -> object:
     if row is None or row.size_bytes > MAX_JSON_BYTES:
         return None
     try:
-        text = _text(cast(Hashable, storage), row.sha256)
+        text = _read_text(cast(Hashable, storage), row.sha256)
     except StorageError as error:
         logger.info("%s of job %s cannot be shown: %s", row.name, row.job_id, error)
         return None
@@ -140,14 +140,14 @@ def _json(storage: Storage, row: Artifact | None) -> object:
 
 
 @lru_cache(maxsize=256)
-def _text(storage: Hashable, sha256: str) -> bytes:
+def _read_text(storage: Hashable, sha256: str) -> bytes:
     """Contents never change under their digest, so that lists need not read them again."""
     return b"".join(cast(Storage, storage).read(sha256))
 
 
-def measured(
+def read_measurements(
     metrics: Mapping[str, Any], artifacts: Sequence[Artifact], photographs: Sequence[DatasetFile]
-) -> Measured | None:
+) -> Measurements | None:
     """The figures of a result, the worst view first; None if there are none."""
     mean = _mapping(metrics.get("mean"))
     rows = {str(name): _mapping(row) for name, row in _mapping(metrics.get("views")).items()}
@@ -156,14 +156,14 @@ def measured(
     results = {row.name for row in artifacts}
     files = {file.path for file in photographs}
     views = []
-    for (name, row), rendered in zip(rows.items(), render_names(list(rows)), strict=True):
+    for (name, row), rendered in zip(rows.items(), unique_render_names(list(rows)), strict=True):
         render = f"renders/{rendered}.png"
         photograph = f"images/{name}"
-        shown = photograph in files and PurePosixPath(name).suffix.lower() in _SHOWN_BY_BROWSERS
+        shown = photograph in files and PurePosixPath(name).suffix.lower() in _BROWSER_IMAGE_SUFFIXES
         views.append(
-            View(
+            HeldOutView(
                 name,
-                {metric.key: _number(row.get(metric.key)) for metric in METRIC_LIST},
+                {metric.key: _number(row.get(metric.key)) for metric in METRICS_SHOWN},
                 render if render in results else None,
                 photograph if shown else None,
                 {
@@ -175,14 +175,14 @@ def measured(
                 int(_number(row.get("height")) or 3),
             )
         )
-    views.sort(key=lambda view: (_or(view.values["psnr"], math.inf), view.name))
+    views.sort(key=lambda view: (_value_or(view.values["psnr"], math.inf), view.name))
     interval = metrics.get("mean_psnr_ci95")
     bounds = [_number(bound) for bound in interval] if isinstance(interval, list) else []
     low, high = bounds if len(bounds) == 2 else (None, None)
     gaussians = _number(metrics.get("gaussians"))
-    return Measured(
-        tuple(metric for metric in METRIC_LIST if _number(mean.get(metric.key)) is not None),
-        {metric.key: _number(mean.get(metric.key)) for metric in METRIC_LIST},
+    return Measurements(
+        tuple(metric for metric in METRICS_SHOWN if _number(mean.get(metric.key)) is not None),
+        {metric.key: _number(mean.get(metric.key)) for metric in METRICS_SHOWN},
         (low, high) if low is not None and high is not None else None,
         None if gaussians is None else int(gaussians),
         _number(metrics.get("seconds")),
@@ -195,24 +195,24 @@ def mean_psnr(metrics: Mapping[str, Any]) -> float | None:
     return _number(_mapping(metrics.get("mean")).get("psnr"))
 
 
-def shown_mesh(artifacts: Sequence[Artifact]) -> Artifact | None:
+def viewable_mesh(artifacts: Sequence[Artifact]) -> Artifact | None:
     """Return the result that is a mesh which the page can show; None if there is none."""
     meshes = [row for row in artifacts if row.name.lower().endswith(".glb") and not _holds_splats(row.name)]
-    return min(meshes, key=lambda row: (_rank(row.name), row.name), default=None)
+    return min(meshes, key=lambda row: (_sort_rank(row.name), row.name), default=None)
 
 
-def downloads(artifacts: Sequence[Artifact]) -> list[DownloadGroup]:
+def download_groups(artifacts: Sequence[Artifact]) -> list[DownloadGroup]:
     """The results by what they are for."""
     groups = {title: DownloadGroup(title, [], folded) for title, folded in _GROUPS.items()}
-    for row in sorted(artifacts, key=lambda row: (_rank(row.name), row.name)):
-        group, opens_in = _use_of(row.name)
+    for row in sorted(artifacts, key=lambda row: (_sort_rank(row.name), row.name)):
+        group, opens_in = _group_and_use(row.name)
         groups[group].files.append(Download(row.name, row.size_bytes, opens_in))
     return [group for group in groups.values() if group.files]
 
 
 _SCENE, _FIGURES, _IMAGES, _RECORDS = "Scene and meshes", "Report and figures", "Images", "Records of the run"
 _GROUPS = {_SCENE: False, _FIGURES: False, _IMAGES: True, _RECORDS: True}
-_NAMED = {
+_USE_BY_NAME = {
     SCENE: (_SCENE, "SuperSplat, PlayCanvas, Spark, Unity and Unreal splat plug-ins; octasplat itself"),
     "mesh.ply": (_SCENE, "Blender, MeshLab, CloudCompare: for editing, as it keeps every Gaussian's number"),
     "mesh_alpha.png": (_SCENE, "the texture that mesh.obj uses"),
@@ -229,7 +229,7 @@ _NAMED = {
     "training.json": (_RECORDS, "a text editor"),
     "plan.json": (_RECORDS, "a text editor: what the time for the training was used for"),
 }
-_SUFFIXES = {
+_USE_BY_SUFFIX = {
     ".glb": (
         _SCENE,
         "Blender, three.js, model-viewer, any glTF viewer: looks as it should, fall-off included",
@@ -251,25 +251,25 @@ _SUFFIXES = {
     ".bin": (_RECORDS, "COLMAP"),
     ".txt": (_RECORDS, "COLMAP or a text editor"),
 }
-_OTHER = (_RECORDS, "a text editor")
+_USE_OTHER = (_RECORDS, "a text editor")
 
 
-def _use_of(name: str) -> tuple[str, str]:
+def _group_and_use(name: str) -> tuple[str, str]:
     lower = name.lower()
-    if name in _NAMED:
-        return _NAMED[name]
+    if name in _USE_BY_NAME:
+        return _USE_BY_NAME[name]
     if _holds_splats(name):
         return _SCENE, "three.js, PlayCanvas, Babylon.js: Gaussians by KHR_gaussian_splatting"
     if lower.endswith("mesh.ply"):
-        return _NAMED["mesh.ply"]
-    return _SUFFIXES.get(PurePosixPath(lower).suffix, _OTHER)
+        return _USE_BY_NAME["mesh.ply"]
+    return _USE_BY_SUFFIX.get(PurePosixPath(lower).suffix, _USE_OTHER)
 
 
 def _holds_splats(name: str) -> bool:
     return name.lower().endswith((".splats.glb", "_splats.glb", "-splats.glb"))
 
 
-def _rank(name: str) -> int:
+def _sort_rank(name: str) -> int:
     order = [SCENE, "mesh.glb", "mesh.ply", "mesh.obj", REPORT, METRICS]
     return order.index(name) if name in order else len(order)
 
@@ -284,5 +284,5 @@ def _number(value: object) -> float | None:
     return float(value)
 
 
-def _or(value: float | None, otherwise: float) -> float:
+def _value_or(value: float | None, otherwise: float) -> float:
     return otherwise if value is None else value

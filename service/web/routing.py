@@ -14,8 +14,8 @@ from fastapi.routing import APIRoute
 from psycopg_pool import PoolTimeout
 
 from octasplat.engine.errors import OctasplatError
-from octasplat.service.problems import Problem, not_found, problem_of
-from octasplat.service.web.templating import page
+from octasplat.service.problems import ProblemError, not_found_error, problem_from_error
+from octasplat.service.web.templating import render_page
 
 logger = logging.getLogger(__name__)
 Handler = Callable[[Request], Coroutine[Any, Any, Response]]
@@ -31,47 +31,47 @@ class PageRoute(APIRoute):
         async def handler(request: Request) -> Response:
             try:
                 return await inner(request)
-            except Problem as problem:
-                return _answer(request, problem)
+            except ProblemError as problem:
+                return _error_response(request, problem)
             except RequestValidationError:
-                return _answer(request, not_found("page"))
+                return _error_response(request, not_found_error("page"))
             except OctasplatError as error:
-                return _answer(request, problem_of(error))
+                return _error_response(request, problem_from_error(error))
             except (psycopg.OperationalError, PoolTimeout) as error:
                 logger.warning("the database: %s", " ".join(str(error).split()))
                 detail = "The database does not answer; try again in a moment."
-                return _answer(request, Problem(503, "database", detail))
+                return _error_response(request, ProblemError(503, "database", detail))
 
         return handler
 
 
-def is_part(request: Request) -> bool:
+def is_htmx_request(request: Request) -> bool:
     """Whether htmx asks, to change a part of a page."""
     return request.headers.get("hx-request") == "true"
 
 
-def go_to(request: Request, address: str) -> Response:
+def redirect(request: Request, address: str) -> Response:
     """Send the browser to another page."""
-    if is_part(request):
+    if is_htmx_request(request):
         return Response(headers={"HX-Redirect": address, "HX-Reswap": "none"})
     return RedirectResponse(address, 303)
 
 
-def local_address(address: str | None) -> str:
+def safe_local_path(address: str | None) -> str:
     """``address`` if it is a place on this site, else the first page."""
     if not address or not address.startswith("/") or address[1:2] in ("/", "\\"):
         return "/"
     return address if address.isprintable() else "/"
 
 
-def _answer(request: Request, problem: Problem) -> Response:
+def _error_response(request: Request, problem: ProblemError) -> Response:
     if problem.status == 401:
-        where = request.url.path if request.method == "GET" and not is_part(request) else "/"
-        if is_part(request):
+        where = request.url.path if request.method == "GET" and not is_htmx_request(request) else "/"
+        if is_htmx_request(request):
             where = urllib.parse.urlsplit(request.headers.get("hx-current-url", "/")).path
-        return go_to(request, f"/sign-in?next={urllib.parse.quote(local_address(where), safe='/')}")
-    if is_part(request):
+        return redirect(request, f"/sign-in?next={urllib.parse.quote(safe_local_path(where), safe='/')}")
+    if is_htmx_request(request):
         notice = json.dumps({"notice": {"text": problem.detail, "bad": True}})
         return Response(status_code=problem.status, headers={"HX-Reswap": "none", "HX-Trigger": notice})
     title = {404: "Not here", 403: "Not allowed", 503: "Not now"}.get(problem.status, "That did not work")
-    return page(request, "error.html", status=problem.status, title=title, detail=problem.detail)
+    return render_page(request, "error.html", status=problem.status, title=title, detail=problem.detail)

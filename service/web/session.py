@@ -9,16 +9,16 @@ from octasplat.service.auth import (
     COOKIE,
     SECURE_COOKIE,
     Principal,
+    authenticate_token,
     principal_of_session,
     session_secret,
-    token_of,
 )
 from octasplat.service.state import Service, ServiceDep
-from octasplat.service.web.routing import PageRoute, go_to, local_address
-from octasplat.service.web.templating import page
-from octasplat.workers.records.rows import Token
-from octasplat.workers.records.sessions import begin_session, end_session, use_link
-from octasplat.workers.records.tokens import get_token
+from octasplat.service.web.routing import PageRoute, redirect, safe_local_path
+from octasplat.service.web.templating import render_page
+from octasplat.workers.db.rows import Token
+from octasplat.workers.db.sessions import begin_session, end_session, use_link
+from octasplat.workers.db.tokens import get_token
 
 router = APIRouter(route_class=PageRoute, include_in_schema=False)
 
@@ -30,7 +30,7 @@ async def show_sign_in(
     request: Request, next: Annotated[str | None, Query(max_length=500)] = None
 ) -> Response:
     """The form."""
-    return page(request, "sign_in.html", next=local_address(next), refused=False)
+    return render_page(request, "sign_in.html", next=safe_local_path(next), refused=False)
 
 
 @router.post("/sign-in")
@@ -39,12 +39,12 @@ async def sign_in(request: Request, service: ServiceDep) -> Response:
     body = (await request.body())[:_MAX_FORM_BYTES].decode(errors="replace")
     form = urllib.parse.parse_qs(body)
     secret = form.get("token", [""])[0].strip()
-    following = local_address(form.get("next", ["/"])[0])
-    token = await token_of(request, service, secret) if secret else None
+    following = safe_local_path(form.get("next", ["/"])[0])
+    token = await authenticate_token(request, service, secret) if secret else None
     if token is None:
-        return page(request, "sign_in.html", status=403, next=following, refused=True)
-    response = go_to(request, following)
-    await _begin(request, response, service, token)
+        return render_page(request, "sign_in.html", status=403, next=following, refused=True)
+    response = redirect(request, following)
+    await _begin_session(request, response, service, token)
     return response
 
 
@@ -58,7 +58,7 @@ async def sign_in_once(
         token_id = await use_link(connection, key)
         token = None if token_id is None else await get_token(connection, token_id)
     if token is None:
-        return page(
+        return render_page(
             request,
             "error.html",
             status=403,
@@ -66,8 +66,8 @@ async def sign_in_once(
             detail="This link was opened before or is too old; octasplat open makes another.",
         )
     # A page, as browsers do not send the new cookie to where another program's link is forwarded to.
-    response: Response = page(request, "signed_in.html")
-    await _begin(request, response, service, token)
+    response: Response = render_page(request, "signed_in.html")
+    await _begin_session(request, response, service, token)
     return response
 
 
@@ -79,13 +79,13 @@ async def sign_out(request: Request, service: ServiceDep) -> Response:
         request.state.who = await principal_of_session(service, secret)
         async with service.pool.connection() as connection:
             await end_session(connection, secret)
-    response = go_to(request, "/sign-in")
+    response = redirect(request, "/sign-in")
     response.delete_cookie(COOKIE, httponly=True, samesite="strict")
     response.delete_cookie(SECURE_COOKIE, httponly=True, samesite="strict", secure=True)
     return response
 
 
-async def _begin(request: Request, response: Response, service: Service, token: Token) -> None:
+async def _begin_session(request: Request, response: Response, service: Service, token: Token) -> None:
     hours = service.settings.session_hours
     async with service.pool.connection() as connection:
         session_id, secret = await begin_session(connection, token, hours)

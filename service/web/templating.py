@@ -11,7 +11,7 @@ from fastapi.responses import HTMLResponse
 
 from octasplat.engine import __version__
 from octasplat.service.auth import Principal, session_secret
-from octasplat.service.web import wording
+from octasplat.service.web import formatting
 
 PAGE_HEADERS = {
     "Content-Security-Policy": (
@@ -23,7 +23,7 @@ PAGE_HEADERS = {
     "Cross-Origin-Opener-Policy": "same-origin",
     "Permissions-Policy": "camera=(), microphone=(), geolocation=()",
 }
-STATE_WORDS = {
+STATE_LABELS = {
     "queued": "Queued",
     "running": "Running",
     "canceling": "Stopping",
@@ -33,7 +33,7 @@ STATE_WORDS = {
 }
 
 
-def page(
+def render_page(
     request: Request, template: str, who: Principal | None = None, *, status: int = 200, **values: object
 ) -> HTMLResponse:
     """A rendered template.
@@ -74,15 +74,15 @@ def _environment() -> Any:
         lstrip_blocks=True,
     )
     environment.filters.update(
-        size=wording.size,
-        duration=wording.duration,
-        thousands=wording.thousands,
-        ago=wording.ago,
+        size=formatting.format_size,
+        duration=formatting.format_duration,
+        thousands=formatting.format_thousands,
+        ago=formatting.format_age,
         short=short_id,
-        flat=flattened,
+        flat=flatten_settings,
         words=lambda name: str(name).replace("_", " "),
     )
-    environment.globals["state_words"] = STATE_WORDS
+    environment.globals["state_words"] = STATE_LABELS
     return environment
 
 
@@ -91,12 +91,12 @@ def short_id(job_id: uuid.UUID) -> str:
     return str(job_id)[-6:]
 
 
-def flattened(values: Mapping[str, Any], prefix: str = "") -> list[tuple[str, str]]:
+def flatten_settings(values: Mapping[str, Any], prefix: str = "") -> list[tuple[str, str]]:
     """Nested settings as dotted names and short texts."""
     rows: list[tuple[str, str]] = []
     for key, value in values.items():
         if isinstance(value, Mapping):
-            rows += flattened(value, f"{prefix}{key}.")
+            rows += flatten_settings(value, f"{prefix}{key}.")
         elif isinstance(value, list) and all(isinstance(item, str) for item in value):
             rows.append((f"{prefix}{key}", ", ".join(value)))
         else:

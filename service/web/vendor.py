@@ -12,15 +12,15 @@ import sys
 import tempfile
 from pathlib import Path
 
-HERE = Path(__file__).parent
-RECIPE = HERE / "vendoring"
-TARGET = HERE / "static" / "vendor"
+WEB_FOLDER = Path(__file__).parent
+VENDORING_FOLDER = WEB_FOLDER / "vendoring"
+VENDOR_FOLDER = WEB_FOLDER / "static" / "vendor"
 BUNDLES = ("three", "uplot", "sha256")
 COPIES = {"htmx.js": "htmx.org/dist/htmx.min.js", "uplot.css": "uplot/dist/uPlot.min.css"}
 LICENCES = ("three", "uplot", "htmx.org", "@noble/hashes")
 
 
-def vendor(target: Path = TARGET) -> None:
+def build_vendor_files(target: Path = VENDOR_FOLDER) -> None:
     """Install the packages in a temporary folder, bundle them, and replace ``target``.
 
     Raises:
@@ -31,7 +31,7 @@ def vendor(target: Path = TARGET) -> None:
         raise SystemExit("npm is needed to make static/vendor anew; install Node.js.")
     with tempfile.TemporaryDirectory(prefix="octasplat-vendor-") as name:
         folder = Path(name)
-        shutil.copytree(RECIPE, folder, dirs_exist_ok=True)
+        shutil.copytree(VENDORING_FOLDER, folder, dirs_exist_ok=True)
         command = [npm, "install", "--no-audit", "--no-fund", "--ignore-scripts", "--silent"]
         subprocess.run(command, cwd=folder, check=True)  # noqa: S603 - of our own making
         modules = folder / "node_modules"
@@ -76,5 +76,7 @@ def _licences(modules: Path) -> str:
 
 
 if __name__ == "__main__":
-    vendor()
-    sys.stdout.write("".join(f"{path.name} {path.stat().st_size}\n" for path in sorted(TARGET.iterdir())))
+    build_vendor_files()
+    sys.stdout.write(
+        "".join(f"{path.name} {path.stat().st_size}\n" for path in sorted(VENDOR_FOLDER.iterdir()))
+    )

@@ -21,7 +21,7 @@ from octasplat.engine import __version__
 if TYPE_CHECKING:
     from octasplat.client import Client, Job
     from octasplat.engine.errors import Cancelled, ConfigError, OctasplatError
-    from octasplat.engine.render.cameras import RenderCamera as Camera
+    from octasplat.engine.render.pinhole_camera import PinholeCamera as Camera
     from octasplat.engine.trace.protocol import TraceSettings
     from octasplat.images import Image
     from octasplat.rendering import render
@@ -49,7 +49,7 @@ if TYPE_CHECKING:
     from octasplat.viewer import Viewer, view
 
 _SOURCES = {
-    "Camera": ("engine.render.cameras", "RenderCamera"),
+    "Camera": ("engine.render.pinhole_camera", "PinholeCamera"),
     "Cancelled": ("engine.errors", "Cancelled"),
     "Client": ("client", "Client"),
     "ConfigError": ("engine.errors", "ConfigError"),

@@ -9,15 +9,15 @@ from typing import Any, Literal, cast
 
 from octasplat.engine.errors import ConfigError
 from octasplat.engine.events import Listener
-from octasplat.notebook import default_listener, table_html
-from octasplat.places import PathLike
+from octasplat.notebook import default_progress, table_html
+from octasplat.paths import PathLike
 from octasplat.workers.client import submission
-from octasplat.workers.client.api import Api, ServiceError, Unreachable, find_address, find_token
-from octasplat.workers.client.submission import Derivation, JobFailed, Submission
+from octasplat.workers.client.api import Api, ServiceError, ServiceUnreachableError, find_address, find_token
+from octasplat.workers.client.submission import Derivation, JobFailedError, Submission
 
 JobState = Literal["queued", "running", "canceling", "succeeded", "failed", "canceled"]
 
-__all__ = ["Client", "Job", "JobFailed", "JobState", "Result", "ServiceError", "Unreachable"]
+__all__ = ["Client", "Job", "JobFailedError", "JobState", "Result", "ServiceError", "ServiceUnreachableError"]
 
 
 @dataclass(frozen=True)
@@ -93,7 +93,7 @@ class Client:
             Unreachable: nobody answers.
         """
         what = Submission(Path(photographs), options, label, queue, priority)
-        return Job(self._api, submission.submit(self._api, what, progress or default_listener()))
+        return Job(self._api, submission.submit(self._api, what, progress or default_progress()))
 
     def derive(
         self,
@@ -141,7 +141,7 @@ class Client:
             queue,
             priority,
         )
-        return Job(self._api, submission.derive(self._api, what, progress or default_listener()))
+        return Job(self._api, submission.derive(self._api, what, progress or default_progress()))
 
     def job(self, job_id: str) -> "Job":
         """Return the job with an id.
@@ -153,7 +153,7 @@ class Client:
 
     def jobs(self) -> Iterator["Job"]:
         """Yield all jobs, the newest first."""
-        return (Job(self._api, content) for content in self._api.pages("/v1/jobs", "jobs"))
+        return (Job(self._api, content) for content in self._api.iterate_pages("/v1/jobs", "jobs"))
 
     def __repr__(self) -> str:
         return f"Client({self.url!r})"
@@ -222,8 +222,10 @@ class Job:
             Unreachable: the service was away for two minutes.
         """
         try:
-            self.content = submission.wait_for(self._api, self.id, progress or default_listener(), on_note)
-        except JobFailed:
+            self.content = submission.wait_for_job(
+                self._api, self.id, progress or default_progress(), on_note
+            )
+        except JobFailedError:
             self.refresh()
             raise
         return self
@@ -264,7 +266,9 @@ class Job:
             ServiceError: there are no such results.
             OutputError: a file cannot be written.
         """
-        return submission.fetch(self._api, self.id, Path(folder), names, progress or default_listener())
+        return submission.download_job(
+            self._api, self.id, Path(folder), names, progress or default_progress()
+        )
 
     def __repr__(self) -> str:
         return f"Job({self.id!r}, {self.kind}, {self.state})"

@@ -11,9 +11,9 @@ import numpy as np
 from jaxtyping import Float32, Int32
 
 from octasplat.engine.rays import ImageRays
-from octasplat.engine.render.cameras import RenderCamera
-from octasplat.operating import names_checked
-from octasplat.places import PathLike
+from octasplat.engine.render.pinhole_camera import PinholeCamera
+from octasplat.operation_calls import names_checked
+from octasplat.paths import PathLike
 from octasplat.scenes import Scene
 
 if TYPE_CHECKING:
@@ -55,9 +55,11 @@ class Image:
 
         It is found when it is first asked for, in the scene as it then is.
         """
-        from octasplat.engine.render.renderer import heaviest_by_pixel
+        from octasplat.engine.render.renderer import dominant_gaussians
 
-        return heaviest_by_pixel(_tracer(self._scene, self._threads), self._scene.gaussians, self._rays)
+        return dominant_gaussians(
+            _build_tracer(self._scene, self._threads), self._scene.gaussians, self._rays
+        )
 
     def save(self, path: PathLike) -> Path:
         """Write an 8-bit PNG of the colours, or an OpenEXR with linear colours, alpha, depth and normals.
@@ -70,7 +72,7 @@ class Image:
         >>> osp.render(scene, scene.camera(width=96, height=64)).save("view.png").name
         'view.png'
         """
-        from octasplat.engine.render.images import exr_layers, write_exr, write_png
+        from octasplat.engine.render.image_files import exr_layers, write_exr, write_png
 
         target = Path(path)
         if target.suffix.lower() == ".exr":
@@ -102,7 +104,7 @@ class Image:
 
 @names_checked
 def render_view(
-    scene: Scene, camera: RenderCamera, *, background: Background = "black", threads: int = 0
+    scene: Scene, camera: PinholeCamera, *, background: Background = "black", threads: int = 0
 ) -> Image:
     """Return what a camera sees of a scene in memory, see :func:`octasplat.rendering.render`.
 
@@ -112,21 +114,21 @@ def render_view(
         background: what lies behind, by name or as display values in [0, 1].
         threads: 0 takes all cores; the result does not depend on it.
     """
-    from octasplat.engine.render.oversampling import rays_across, render_averaged
     from octasplat.engine.render.renderer import background_colour
+    from octasplat.engine.render.supersampling import rays_per_pixel_side, render_averaged
     from octasplat.engine.shading.plain import PLAIN
 
     behind = (
         background_colour(background) if isinstance(background, str) else np.array(background, np.float32)
     )
     rays = camera.rays()
-    tracer = _tracer(scene, threads)
-    seen = render_averaged(tracer, rays, behind, PLAIN, rays_across(rays, scene.facts.pixel_rad))
+    tracer = _build_tracer(scene, threads)
+    seen = render_averaged(tracer, rays, behind, PLAIN, rays_per_pixel_side(rays, scene.facts.pixel_rad))
     return Image(seen.rgb_srgb, seen.depth, seen.normal_world, seen.alpha, scene, rays, threads)
 
 
-def _tracer(scene: Scene, threads: int) -> "Tracer":
-    from octasplat.engine.trace.make import make_tracer
+def _build_tracer(scene: Scene, threads: int) -> "Tracer":
+    from octasplat.engine.trace.factory import make_tracer
     from octasplat.engine.trace.protocol import TraceSettings
 
     tracer = make_tracer(TraceSettings(flip_normal_cos=scene.facts.turned_beyond), threads=threads)

@@ -16,11 +16,11 @@ from octasplat.engine.events import (
     TrainingProgress,
     Warned,
 )
-from octasplat.workers.telling.lines import PlainLines
+from octasplat.workers.reporting.event_lines import EventLines
 
 LOGGER = logging.getLogger("octasplat")
-SECONDS_BETWEEN_UPDATES = 0.5
-_KEPT_LINES = 12
+UPDATE_INTERVAL_SECONDS = 0.5
+_MAX_SHOWN_LINES = 12
 
 
 def log_event(event: Event) -> None:
@@ -33,16 +33,16 @@ def log_event(event: Event) -> None:
         LOGGER.debug("%s", event)
 
 
-def default_listener() -> Listener:
+def default_progress() -> Listener:
     """Return what shows events where nobody says how: in the cell of a notebook, or else in the log."""
-    return NotebookProgress() if in_notebook() else EventLog()
+    return NotebookProgress() if in_notebook() else ProgressLog()
 
 
-class EventLog:
+class ProgressLog:
     """Logs events as lines: stages as they begin and end, and every few seconds how far they are."""
 
     def __init__(self) -> None:
-        self._lines = PlainLines(LOGGER.info, warn=_log_warning)
+        self._lines = EventLines(LOGGER.info, warn=_log_warning)
 
     def __call__(self, event: Event) -> None:
         """Log ``event``."""
@@ -68,7 +68,7 @@ class NotebookProgress:
 
     def __init__(self) -> None:
         self._lines: list[str] = []
-        self._stage = PlainLines(self._lines.append, every_seconds=float("inf"))
+        self._stage = EventLines(self._lines.append, interval_seconds=float("inf"))
         self._share: float | None = None
         self._next = 0.0
         self._handle: Any = None
@@ -84,7 +84,7 @@ class NotebookProgress:
             self._share = None
         now = time.monotonic()
         if now >= self._next or isinstance(event, StageFinished | Warned):
-            self._next = now + SECONDS_BETWEEN_UPDATES
+            self._next = now + UPDATE_INTERVAL_SECONDS
             self._update()
 
     def _update(self) -> None:
@@ -99,7 +99,7 @@ class NotebookProgress:
     def html(self) -> str:
         """Return what is shown."""
         bar = "" if self._share is None else f'<progress value="{self._share:.4f}" max="1"></progress>'
-        lines = "<br>".join(html.escape(line) for line in self._lines[-_KEPT_LINES:])
+        lines = "<br>".join(html.escape(line) for line in self._lines[-_MAX_SHOWN_LINES:])
         return f"<div>{lines}<br>{bar}</div>"
 
 

@@ -3,9 +3,9 @@
 from typing import TYPE_CHECKING, Any, Unpack, overload
 
 from octasplat import verbs
-from octasplat.engine.render.cameras import RenderCamera
+from octasplat.engine.render.pinhole_camera import PinholeCamera
 from octasplat.images import Background, Image, render_view
-from octasplat.places import PathLike
+from octasplat.paths import PathLike
 from octasplat.scenes import Scene
 
 if TYPE_CHECKING:
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 @overload
 def render(
-    source: Scene, camera: RenderCamera, /, *, background: Background = "black", threads: int = 0
+    source: Scene, camera: PinholeCamera, /, *, background: Background = "black", threads: int = 0
 ) -> Image: ...
 
 
@@ -24,7 +24,7 @@ def render(
 ) -> "RenderResult": ...
 
 
-def render(source: Scene | PathLike, target: RenderCamera | PathLike, /, **options: Any) -> Any:
+def render(source: Scene | PathLike, target: PinholeCamera | PathLike, /, **options: Any) -> Any:
     """Return what a camera sees of a scene in memory, or write pictures of a file or run.
 
     Of a scene in memory:
@@ -48,8 +48,8 @@ def render(source: Scene | PathLike, target: RenderCamera | PathLike, /, **optio
     >>> osp.render("run", "turntable/", mode="turntable", frames=3, width_px=64, height_px=48).images
     3
     """
-    if isinstance(source, Scene) and isinstance(target, RenderCamera):
+    if isinstance(source, Scene) and isinstance(target, PinholeCamera):
         return render_view(source, target, **options)
-    if isinstance(source, Scene) or isinstance(target, RenderCamera):
+    if isinstance(source, Scene) or isinstance(target, PinholeCamera):
         raise TypeError("a scene in memory goes with a camera, a file or run with a place for pictures")
     return verbs.render(source, target, **options)

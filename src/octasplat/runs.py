@@ -8,9 +8,9 @@ from typing import Any
 
 from octasplat.engine.errors import Cancelled, ConfigError
 from octasplat.engine.events import Event, Listener, TrainingProgress
-from octasplat.notebook import default_listener, table_html
-from octasplat.operating import given_values, run_operation
-from octasplat.places import PathLike
+from octasplat.notebook import default_progress, table_html
+from octasplat.operation_calls import explicit_values, run_operation
+from octasplat.paths import PathLike
 from octasplat.scenes import Scene, load
 
 _CONFIG, _METRICS, _REPORT, _SCENE, _TRAINING = (
@@ -20,7 +20,7 @@ OnStep = Callable[[TrainingProgress], bool | None]
 """Called with the state of the training every few iterations; returning False stops it."""
 
 
-def reconstruct_into(
+def reconstruct_run(
     values: Mapping[str, Any],
     on_step: OnStep | None,
     progress: Listener | None,
@@ -33,13 +33,19 @@ def reconstruct_into(
         Cancelled: ``should_stop`` returned True.
         OctasplatError: as the operation does.
     """
-    from octasplat.engine.operations.reconstruct import ReconstructOptions, ReconstructRequest, options_of
+    from octasplat.engine.operations.reconstruct import (
+        ReconstructOptions,
+        ReconstructRequest,
+        options_from_json,
+    )
 
-    given = given_values(ReconstructRequest, values)
+    given = explicit_values(ReconstructRequest, values)
     # Refused here, so that the sentence is that of a setting wherever it is given.
-    options_of({name: value for name, value in given.items() if name in ReconstructOptions.model_fields})
+    options_from_json(
+        {name: value for name, value in given.items() if name in ReconstructOptions.model_fields}
+    )
     stopped = False
-    shown = progress or default_listener()
+    shown = progress or default_progress()
 
     def listen(event: Event) -> None:
         nonlocal stopped
@@ -89,7 +95,7 @@ class Run:
     @property
     def metrics(self) -> Mapping[str, Any]:
         """What was measured, as ``metrics.json`` holds it; empty before."""
-        return _json(self.path / _METRICS)
+        return _read_json(self.path / _METRICS)
 
     @property
     def psnr(self) -> float | None:
@@ -110,13 +116,13 @@ class Run:
         from octasplat.engine.renamed_settings import with_new_names
 
         path = self.path / _CONFIG
-        found: Mapping[str, Any] = _json(path).get("reconstruction", {})
+        found: Mapping[str, Any] = _read_json(path).get("reconstruction", {})
         return with_new_names((ReconstructionConfig,), found, source=str(path))
 
     @property
     def training(self) -> Mapping[str, Any]:
         """What is noted of the training, such as its ``seconds`` and ``iterations``; empty before its end."""
-        return _json(self.path / _TRAINING)
+        return _read_json(self.path / _TRAINING)
 
     @property
     def report(self) -> Path:
@@ -129,7 +135,7 @@ class Run:
         return load(self.path)
 
     def __repr__(self) -> str:
-        state = "unfinished" if not self.is_finished else _decibels(self.psnr)
+        state = "unfinished" if not self.is_finished else _psnr_text(self.psnr)
         return f"Run({str(self.path)!r}, {state})"
 
     def _repr_html_(self) -> str:
@@ -143,11 +149,11 @@ class Run:
         return table_html(f"Run {self.path}", rows)
 
 
-def _decibels(psnr: float | None) -> str:
+def _psnr_text(psnr: float | None) -> str:
     return "not measured" if psnr is None else f"PSNR {psnr:.2f} dB"
 
 
-def _json(path: Path) -> dict[str, Any]:
+def _read_json(path: Path) -> dict[str, Any]:
     try:
         content: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:

@@ -10,15 +10,15 @@ from jaxtyping import Float, Float32, Float64
 
 from octasplat.engine.errors import ConfigError
 from octasplat.engine.gaussians.channels import Channels
-from octasplat.engine.gaussians.flattening import LARGEST_LOGIT
+from octasplat.engine.gaussians.flattening import MAX_LOGIT
 from octasplat.engine.gaussians.model import FlatGaussians
-from octasplat.engine.gaussians.rows import Index
-from octasplat.engine.gaussians.scene_facts import NOTHING_KNOWN, SceneFacts
+from octasplat.engine.gaussians.rows import RowIndex
+from octasplat.engine.gaussians.scene_metadata import UNKNOWN_METADATA, SceneMetadata
 from octasplat.notebook import log_event, table_html
-from octasplat.places import PathLike
+from octasplat.paths import PathLike
 
 if TYPE_CHECKING:
-    from octasplat.engine.render.cameras import RenderCamera
+    from octasplat.engine.render.pinhole_camera import PinholeCamera
 
 
 class Scene:
@@ -38,7 +38,7 @@ class Scene:
     >>> scene.means += np.float32([0, 0, 1])
     """
 
-    def __init__(self, gaussians: FlatGaussians, facts: SceneFacts = NOTHING_KNOWN) -> None:
+    def __init__(self, gaussians: FlatGaussians, facts: SceneMetadata = UNKNOWN_METADATA) -> None:
         """Take over the engine's Gaussians; :meth:`from_arrays` makes a scene of plain arrays."""
         self.gaussians = gaussians
         self.facts = facts
@@ -166,7 +166,7 @@ class Scene:
         """Unit normals, a copy."""
         return self.gaussians.rotations[:, :, 0].copy()
 
-    def select(self, index: Index) -> "Scene":
+    def select(self, index: RowIndex) -> "Scene":
         """Return the Gaussians of an index, a mask or a slice, copied.
 
         >>> import octasplat as osp
@@ -180,7 +180,7 @@ class Scene:
         """Return an independent copy."""
         return Scene(self.gaussians.copy(), self.facts)
 
-    def camera(self, width: int = 640, height: int = 480, *, fov: float = 50.0) -> "RenderCamera":
+    def camera(self, width: int = 640, height: int = 480, *, fov: float = 50.0) -> "PinholeCamera":
         """Return a camera that sees the whole scene; ``fov`` is its angle of view in degrees, down.
 
         It sees nothing nearer than the scene's file says, as in :func:`octasplat.render` of that file.
@@ -194,7 +194,7 @@ class Scene:
 
     def turntable(
         self, frames: int, width: int = 640, height: int = 480, *, fov: float = 50.0
-    ) -> tuple["RenderCamera", ...]:
+    ) -> tuple["PinholeCamera", ...]:
         """Return cameras that go round the scene once, with -y up as in most scenes that COLMAP made.
 
         They see nothing nearer than the scene's file says.
@@ -203,7 +203,7 @@ class Scene:
         >>> len(osp.load("scene.ply").turntable(12))
         12
         """
-        from octasplat.engine.render.jobs import gaussian_turntable, turntable_cameras
+        from octasplat.engine.render.shots import gaussian_turntable, turntable_cameras
 
         table = gaussian_turntable(self.gaussians, fov_y_degrees=fov, aspect=width / height)
         cameras = turntable_cameras(table, frames, width, height, fov)
@@ -265,7 +265,7 @@ def _opacity_logits(opacities: Float[np.ndarray, "..."]) -> Float64[np.ndarray, 
     if not ((values >= 0) & (values <= 1)).all():
         raise ConfigError("opacities: must be from 0 to 1.")
     with np.errstate(divide="ignore"):
-        return np.clip(np.log(values) - np.log1p(-values), -LARGEST_LOGIT, LARGEST_LOGIT)
+        return np.clip(np.log(values) - np.log1p(-values), -MAX_LOGIT, MAX_LOGIT)
 
 
 def load(source: PathLike, *, drop_invalid: bool = False) -> Scene:
@@ -284,11 +284,11 @@ def load(source: PathLike, *, drop_invalid: bool = False) -> Scene:
     >>> osp.load("scene.ply")
     Scene(1,200 Gaussians, harmonics of degree 1)
     """
-    from octasplat.engine.files import read_facts
-    from octasplat.engine.operations.scenes import open_scene
+    from octasplat.engine.files import read_metadata
+    from octasplat.engine.operations.scene_io import open_scene
 
     path = Path(source)
-    return Scene(open_scene(path, log_event, drop_invalid=drop_invalid), read_facts(path))
+    return Scene(open_scene(path, log_event, drop_invalid=drop_invalid), read_metadata(path))
 
 
 def save(scene: Scene, path: PathLike) -> Path:
@@ -305,7 +305,7 @@ def save(scene: Scene, path: PathLike) -> Path:
     >>> len(osp.load("smaller.spz"))
     1200
     """
-    from octasplat.engine.operations.scenes import write_scene
+    from octasplat.engine.operations.scene_io import write_scene
 
     target = Path(path)
     write_scene(scene.gaussians, scene.facts, target, log_event)

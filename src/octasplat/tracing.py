@@ -12,15 +12,15 @@ from torch import Tensor
 from torch.autograd.function import FunctionCtx, once_differentiable
 
 from octasplat.engine.gaussians.model import FlatGaussians
-from octasplat.engine.gaussians.scene_facts import NOTHING_KNOWN, SceneFacts
+from octasplat.engine.gaussians.scene_metadata import UNKNOWN_METADATA, SceneMetadata
 from octasplat.engine.rays import RayBatch
-from octasplat.engine.render.cameras import RenderCamera
-from octasplat.engine.trace.make import make_tracer
+from octasplat.engine.render.pinhole_camera import PinholeCamera
+from octasplat.engine.trace.factory import make_tracer
 from octasplat.engine.trace.protocol import TraceGradients, Tracer, TraceSettings
 from octasplat.engine.trace.ray_gradients import ray_gradients
 from octasplat.scenes import Scene
 
-_LEAST_ALPHA = 1e-8
+_MIN_ALPHA = 1e-8
 """Rays that met less than this have no depth."""
 
 
@@ -51,7 +51,7 @@ class GaussianTensors:
     opacity_logits: Float[Tensor, " n"]
     sh: Float[Tensor, "n k 3"]
     features: Float[Tensor, "n f"] | None = None
-    facts: SceneFacts = NOTHING_KNOWN
+    facts: SceneMetadata = UNKNOWN_METADATA
 
     @classmethod
     def of(cls, scene: Scene, *, requires_grad: bool = True) -> "GaussianTensors":
@@ -68,7 +68,7 @@ class GaussianTensors:
 
     def scene(self) -> Scene:
         """Return the scene with these parameters, copied."""
-        gaussians = _gaussians(*(_array(tensor) for tensor in self.tensors()[:5]))
+        gaussians = _as_flat_gaussians(*(_as_float32(tensor) for tensor in self.tensors()[:5]))
         return Scene(gaussians.copy(), self.facts)
 
 
@@ -96,7 +96,7 @@ class Rays:
     t_max: float = float("inf")
 
     @classmethod
-    def of(cls, camera: RenderCamera) -> "Rays":
+    def of(cls, camera: PinholeCamera) -> "Rays":
         """Return the rays through the pixels of a camera, row by row."""
         rays = camera.rays().rays
         return cls(torch.tensor(rays.origins_world), torch.tensor(rays.directions_world), camera.near_world)
@@ -143,7 +143,7 @@ class TracedRays:
 
 def trace(
     scene: Scene | GaussianTensors,
-    rays: Rays | RenderCamera,
+    rays: Rays | PinholeCamera,
     *,
     settings: TraceSettings | None = None,
     threads: int = 0,
@@ -174,24 +174,24 @@ def trace(
     given = GaussianTensors.of(scene, requires_grad=False) if isinstance(scene, Scene) else scene
     if settings is None:
         settings = TraceSettings(flip_normal_cos=scene.facts.turned_beyond)
-    lines = Rays.of(rays) if isinstance(rays, RenderCamera) else rays
+    lines = Rays.of(rays) if isinstance(rays, PinholeCamera) else rays
     directions = lines.directions / lines.directions.norm(dim=-1, keepdim=True)
     features = given.features
     if features is None:
         features = given.means.new_zeros((len(given.means), 0))
-    found: tuple[Tensor, ...] = _Trace.apply(  # type: ignore[no-untyped-call]
+    found: tuple[Tensor, ...] = _TraceFunction.apply(  # type: ignore[no-untyped-call]
         given.means, given.quats, given.log_scales, given.opacity_logits, given.sh, features,
-        lines.origins, directions, _Limits(settings, lines.t_min, lines.t_max, threads),
+        lines.origins, directions, _TraceConstants(settings, lines.t_min, lines.t_max, threads),
     )  # fmt: skip
     rgb, transmittance, depth_sum, depth_median, normal, extra = found
     alpha = 1 - transmittance
-    met = alpha > _LEAST_ALPHA
+    met = alpha > _MIN_ALPHA
     depth = torch.where(met, depth_sum / torch.where(met, alpha, 1.0), 0.0)
     return TracedRays(rgb, alpha, depth, depth_median, normal, extra)
 
 
 @dataclass(frozen=True)
-class _Limits:
+class _TraceConstants:
     """What is not differentiated."""
 
     settings: TraceSettings
@@ -200,11 +200,11 @@ class _Limits:
     threads: int
 
 
-class _Lease:
+class _PooledTracer:
     """A tracer of which nobody else makes use until this object is gone; its memory serves the next one."""
 
     def __init__(self, settings: TraceSettings, threads: int) -> None:
-        free = _FREE.setdefault((settings, threads), deque(maxlen=_MOST_FREE))
+        free = _TRACER_POOL.setdefault((settings, threads), deque(maxlen=_MAX_POOLED_TRACERS))
         try:
             self.tracer = free.pop()
         except IndexError:
@@ -212,26 +212,26 @@ class _Lease:
         weakref.finalize(self, free.append, self.tracer).atexit = False
 
 
-_MOST_FREE = 2
+_MAX_POOLED_TRACERS = 2
 """Tracers that are kept for each kind of settings: fresh memory costs more than the tracing in it."""
-_FREE: dict[tuple[TraceSettings, int], deque[Tracer]] = {}
+_TRACER_POOL: dict[tuple[TraceSettings, int], deque[Tracer]] = {}
 
 
-class _Trace(torch.autograd.Function):
+class _TraceFunction(torch.autograd.Function):
     """The tracer with its gradients; all tensors may be of any floating type, results are float32."""
 
     @staticmethod
     def forward(ctx: FunctionCtx, *arguments: Any) -> tuple[Tensor, ...]:
         *tensors, limits = arguments
-        means, quats, log_scales, logits, sh, features, origins, directions = map(_array, tensors)
-        gaussians = _gaussians(means, quats, log_scales, logits, sh)
+        means, quats, log_scales, logits, sh, features, origins, directions = map(_as_float32, tensors)
+        gaussians = _as_flat_gaussians(means, quats, log_scales, logits, sh)
         rays = RayBatch(origins, directions, limits.t_min, limits.t_max)
-        lease = _Lease(limits.settings, limits.threads)
+        lease = _PooledTracer(limits.settings, limits.threads)
         tracer = lease.tracer
         tracer.build(gaussians, features if features.shape[1] else None)
         seen = tracer.trace(rays, record=any(ctx.needs_input_grad))  # type: ignore[attr-defined]
         ctx.save_for_backward(*tensors)  # so that torch notices where they are changed before backward
-        ctx.state = gaussians, rays, lease, seen.hits, features  # type: ignore[attr-defined]
+        ctx.state = gaussians, rays, lease, seen.recording, features  # type: ignore[attr-defined]
         return tuple(
             torch.from_numpy(array)
             for array in (
@@ -246,7 +246,7 @@ class _Trace(torch.autograd.Function):
         tensors = ctx.saved_tensors
         gaussians, rays, lease, hits, features = ctx.state
         tracer = lease.tracer
-        gradients = TraceGradients(*(_array(part) for part in given))
+        gradients = TraceGradients(*(_as_float32(part) for part in given))
         out: list[Tensor | None] = [None] * 9
         if any(ctx.needs_input_grad[:6]):
             found = tracer.backward(hits, gradients).numpy()
@@ -271,12 +271,12 @@ class _Trace(torch.autograd.Function):
         return tuple(out)
 
 
-def _gaussians(
+def _as_flat_gaussians(
     means: np.ndarray, quats: np.ndarray, log_scales: np.ndarray, logits: np.ndarray, sh: np.ndarray
 ) -> FlatGaussians:
     return FlatGaussians(means, quats, log_scales, logits, sh)
 
 
-def _array(tensor: Tensor) -> np.ndarray:
+def _as_float32(tensor: Tensor) -> np.ndarray:
     """The tensor's values as the tracer takes them, not copied where they are that."""
     return np.require(tensor.detach().cpu().to(torch.float32).numpy(), np.float32, ["C", "W"])

@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Any, Literal, TypedDict
 from pydantic import BaseModel
 
 from octasplat.engine.events import Listener
-from octasplat.engine.operations.base import never
-from octasplat.operating import names_checked, run_operation
-from octasplat.places import PathLike
-from octasplat.runs import OnStep, Run, reconstruct_into
+from octasplat.engine.operations.base import never_stop
+from octasplat.operation_calls import names_checked, run_operation
+from octasplat.paths import PathLike
+from octasplat.runs import OnStep, Run, reconstruct_run
 
 if TYPE_CHECKING:
     from octasplat.engine.operations.clean import CleanResult
@@ -97,7 +97,7 @@ def reconstruct(
     resume: bool = False,
     on_step: OnStep | None = None,
     progress: Listener | None = None,
-    should_stop: Callable[[], bool] = never,
+    should_stop: Callable[[], bool] = never_stop,
     threads: int = 0,
 ) -> "Run":
     """Photographs to a scene, its meshes, and measurements.
@@ -160,7 +160,7 @@ def reconstruct(
     >>> run.is_finished, run.training["iterations"]
     (True, 60)
     """
-    return reconstruct_into(
+    return reconstruct_run(
         {
             "preset": preset,
             "max_side": max_side,
@@ -215,7 +215,7 @@ def estimate(
     assignments: Sequence[str] | None = None,
     cores: int | None = None,
     progress: Listener | None = None,
-    should_stop: Callable[[], bool] = never,
+    should_stop: Callable[[], bool] = never_stop,
     threads: int = 0,
 ) -> "EstimateResult":
     """Estimate what a reconstruction takes, before it is begun.
@@ -307,7 +307,7 @@ def evaluate(
     dataset: PathLike | None = None,
     other_dataset: PathLike | None = None,
     progress: Listener | None = None,
-    should_stop: Callable[[], bool] = never,
+    should_stop: Callable[[], bool] = never_stop,
     threads: int = 0,
 ) -> "EvaluateResult":
     """Measure a finished run again.
@@ -361,7 +361,7 @@ def info(
     dataset: PathLike | None = None,
     picture: PathLike | None = None,
     progress: Listener | None = None,
-    should_stop: Callable[[], bool] = never,
+    should_stop: Callable[[], bool] = never_stop,
     threads: int = 0,
 ) -> "InfoResult":
     """What is in a scene: counts, bounds, sizes, cost.
@@ -433,7 +433,7 @@ def surface(
     dataset: PathLike | None = None,
     photographs: PathLike | None = None,
     progress: Listener | None = None,
-    should_stop: Callable[[], bool] = never,
+    should_stop: Callable[[], bool] = never_stop,
     threads: int = 0,
 ) -> "SurfaceResult":
     """One coloured triangle mesh of a scene.
@@ -545,7 +545,7 @@ def material(
     mesh: PathLike | None = None,
     masks: Sequence[PathLike] | None = None,
     progress: Listener | None = None,
-    should_stop: Callable[[], bool] = never,
+    should_stop: Callable[[], bool] = never_stop,
     threads: int = 0,
 ) -> "MaterialResult":
     """Change the materials of a scene.
@@ -635,7 +635,7 @@ def render(
     stage_file: PathLike | None = None,
     stage_folder: PathLike | None = None,
     progress: Listener | None = None,
-    should_stop: Callable[[], bool] = never,
+    should_stop: Callable[[], bool] = never_stop,
     threads: int = 0,
 ) -> "RenderResult":
     """Render new views of a scene as images or a video.
@@ -782,7 +782,7 @@ def relight(
     background: Literal["black", "white", "transparent", "environment"] | None = None,
     other_dataset: PathLike | None = None,
     progress: Listener | None = None,
-    should_stop: Callable[[], bool] = never,
+    should_stop: Callable[[], bool] = never_stop,
     threads: int = 0,
 ) -> "RelightResult":
     """Show a scene with materials in other light.
@@ -902,7 +902,7 @@ def stage_init(
     up: Literal["x", "-x", "y", "-y", "z", "-z"] | None = None,
     dataset: PathLike | None = None,
     progress: Listener | None = None,
-    should_stop: Callable[[], bool] = never,
+    should_stop: Callable[[], bool] = never_stop,
     threads: int = 0,
 ) -> "StageInitResult":
     """Write a commented stage that fits a scene.
@@ -954,7 +954,7 @@ def export(
     up: Literal["x", "-x", "y", "-y", "z", "-z"] | None = None,
     format: str | None = None,
     progress: Listener | None = None,
-    should_stop: Callable[[], bool] = never,
+    should_stop: Callable[[], bool] = never_stop,
     threads: int = 0,
 ) -> "ExportResult":
     """Gaussians to meshes and other formats.
@@ -1032,7 +1032,7 @@ def import_(
     sh_degree: int | None = None,
     channels: Literal["own", "all"] | Sequence[str] | str | None = None,
     progress: Listener | None = None,
-    should_stop: Callable[[], bool] = never,
+    should_stop: Callable[[], bool] = never_stop,
     threads: int = 0,
 ) -> "ImportResult":
     """Splats of any format to a scene of flat Gaussians.
@@ -1092,7 +1092,7 @@ def edit(
     max_residual: float | None = None,
     whole_octagons: bool = False,
     progress: Listener | None = None,
-    should_stop: Callable[[], bool] = never,
+    should_stop: Callable[[], bool] = never_stop,
     threads: int = 0,
 ) -> "EditResult":
     """A mesh edited elsewhere back to Gaussians.
@@ -1169,7 +1169,7 @@ def deform(
     axes: Literal["x0", "x90", "x180", "x270"] | None = None,
     mirrored: Literal["auto", "yes", "no"] | None = None,
     progress: Listener | None = None,
-    should_stop: Callable[[], bool] = never,
+    should_stop: Callable[[], bool] = never_stop,
     threads: int = 0,
 ) -> "DeformResult":
     """A scene that follows a deformed cage or coarse mesh.
@@ -1237,7 +1237,7 @@ def transform(
     translate: Sequence[float] | None = None,
     about: Sequence[float] | None = None,
     progress: Listener | None = None,
-    should_stop: Callable[[], bool] = never,
+    should_stop: Callable[[], bool] = never_stop,
     threads: int = 0,
 ) -> "TransformResult":
     """Move, turn or scale a scene.
@@ -1296,7 +1296,7 @@ def crop(
     sphere: Sequence[float] | None = None,
     inverse: bool = False,
     progress: Listener | None = None,
-    should_stop: Callable[[], bool] = never,
+    should_stop: Callable[[], bool] = never_stop,
     threads: int = 0,
 ) -> "CropResult":
     """Keep part of a scene.
@@ -1350,7 +1350,7 @@ def merge(
     overwrite: bool = False,
     sh_degree: int | None = None,
     progress: Listener | None = None,
-    should_stop: Callable[[], bool] = never,
+    should_stop: Callable[[], bool] = never_stop,
     threads: int = 0,
 ) -> "MergeResult":
     """Put scenes together.
@@ -1405,7 +1405,7 @@ def clean(
     camera_clearance: float | None = None,
     dry_run: bool = False,
     progress: Listener | None = None,
-    should_stop: Callable[[], bool] = never,
+    should_stop: Callable[[], bool] = never_stop,
     threads: int = 0,
 ) -> "CleanResult":
     """Remove faint Gaussians, oversized ones and floaters.

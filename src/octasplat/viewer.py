@@ -10,11 +10,11 @@ from typing import Any
 
 from octasplat.engine.files.gaussian_ply import write_gaussian_ply
 from octasplat.engine.run_folder import CONFIG, is_run, run_viewpoints
-from octasplat.places import PathLike
+from octasplat.paths import PathLike
 from octasplat.runs import Run
 from octasplat.scenes import Scene, load
 from octasplat.service.web.cameras import PhotographPose, viewer_cameras
-from octasplat.service.web.one_scene import SceneServer, ShownScene
+from octasplat.service.web.scene_server import SceneServer, ViewedScene
 
 
 class Viewer:
@@ -29,7 +29,7 @@ class Viewer:
     def __init__(self, server: SceneServer, folder: "tempfile.TemporaryDirectory[str]") -> None:
         """Take over a running server; :func:`view` starts one."""
         self._server = server
-        self._end = weakref.finalize(self, _end, server, folder)
+        self._end = weakref.finalize(self, _close_server, server, folder)
 
     @property
     def url(self) -> str:
@@ -91,7 +91,7 @@ def view(
         write_gaussian_ply(scene.gaussians, ply, facts=scene.facts)
         name = "Scene" if path is None else path.resolve().name
         q = None if run is None else float(Run(run).settings["train"]["trace"]["q"])
-        shown = ShownScene(name, ply, {"views": []} if run is None else _cameras(run), q, background)
+        shown = ViewedScene(name, ply, {"views": []} if run is None else _run_cameras(run), q, background)
         viewer = Viewer(SceneServer(shown, port), folder)
     except BaseException:
         folder.cleanup()
@@ -101,14 +101,14 @@ def view(
     return viewer
 
 
-def _cameras(run: Path) -> Mapping[str, Any]:
+def _run_cameras(run: Path) -> Mapping[str, Any]:
     """Where the photographs of a run were taken, for the page."""
     viewpoints = run_viewpoints(run)
     poses = []
     for shot in viewpoints.views:
         camera = viewpoints.cameras[shot.camera_index]
         # Of a pinhole camera; other lenses are shown as if they were one.
-        fov = 2 * math.degrees(math.atan(shot.height_px * math.tan(camera.pixel_rad) / 2))
+        fov = 2 * math.degrees(math.atan(shot.height_px * math.tan(camera.pixel_angle_rad) / 2))
         poses.append(
             PhotographPose(
                 shot.name,
@@ -122,6 +122,6 @@ def _cameras(run: Path) -> Mapping[str, Any]:
     return viewer_cameras(poses, held_out)
 
 
-def _end(server: SceneServer, folder: "tempfile.TemporaryDirectory[str]") -> None:
+def _close_server(server: SceneServer, folder: "tempfile.TemporaryDirectory[str]") -> None:
     server.close()
     folder.cleanup()

@@ -10,26 +10,26 @@ import pytest
 from small_run import RUN_OPTIONS
 
 import octasplat as osp
+from octasplat.engine.dataset.synthetic import SyntheticDatasetConfig, write_synthetic_dataset
 from octasplat.engine.files.gaussian_ply import write_gaussian_ply
-from octasplat.engine.gaussians.frames import frames_from_normals, quaternions
-from octasplat.engine.gaussians.harmonics import spread_directions
+from octasplat.engine.gaussians.frames import frames_from_normals, quaternions_from_matrices
 from octasplat.engine.gaussians.model import FlatGaussians
-from octasplat.engine.render.environment_map import write_environment
-from octasplat.engine.scene.generated import GeneratedSceneConfig, write_generated_scene
+from octasplat.engine.gaussians.spherical_harmonics import fibonacci_sphere
+from octasplat.engine.render.environment_files import write_environment
 
 COUNT = 1200
 
 
 def small_scene() -> FlatGaussians:
     """A ball of radius 1, whose colours say where the surface faces."""
-    normals = spread_directions(COUNT).astype(np.float32)
+    normals = fibonacci_sphere(COUNT).astype(np.float32)
     random = np.random.default_rng(4)
     sh = np.zeros((COUNT, 4, 3), np.float32)
     sh[:, 0] = normals
     sh[:, 1:] = 0.1 * random.standard_normal((COUNT, 3, 3))
     return FlatGaussians(
         means_world=normals.copy(),
-        quats_wxyz=quaternions(frames_from_normals(normals)),
+        quats_wxyz=quaternions_from_matrices(frames_from_normals(normals)),
         log_scales=np.log(random.uniform(0.03, 0.05, (COUNT, 2))).astype(np.float32),
         opacity_logits=random.uniform(-1, 4, COUNT).astype(np.float32),
         sh=sh,
@@ -48,8 +48,8 @@ def scene_file(tmp_path: Path) -> Path:
 def photographs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder of nine small photographs with their poses."""
     folder = tmp_path_factory.mktemp("photographs") / "photos"
-    config = GeneratedSceneConfig(views=9, width_px=48, height_px=36, samples_per_side=1, points=300)
-    write_generated_scene(folder, config)
+    config = SyntheticDatasetConfig(views=9, width_px=48, height_px=36, samples_per_side=1, points=300)
+    write_synthetic_dataset(folder, config)
     return folder
 
 

@@ -13,10 +13,10 @@ import pytest
 
 import octasplat as osp
 import octasplat.client
-from octasplat.client import JobFailed, ServiceError, Unreachable
+from octasplat.client import JobFailedError, ServiceError, ServiceUnreachableError
 from octasplat.engine.events import Event, StageStarted
 from octasplat.workers.client.api import find_address, find_token
-from postgres_for_tests import short_root
+from postgres_fixtures import short_root
 
 __all__ = ["short_root"]
 pytestmark = pytest.mark.heavy
@@ -61,9 +61,7 @@ SMALL = {
 }
 
 
-def test_photographs_go_to_a_service_and_results_come_back(
-    service: Service, photographs: Path, tmp_path: Path
-) -> None:
+def test_client_submit_and_download_round_trip(service: Service, photographs: Path, tmp_path: Path) -> None:
     events: list[Event] = []
     with osp.Client(service.url, service.token) as client:
         job = client.submit(photographs, label="a trial", progress=events.append, **SMALL)
@@ -81,14 +79,14 @@ def test_photographs_go_to_a_service_and_results_come_back(
         assert client.job(derived.id).kind == "render"
 
 
-def test_what_a_service_refuses_is_told(service: Service, photographs: Path) -> None:
+def test_refused_request_raises_service_error(service: Service, photographs: Path) -> None:
     with osp.Client(service.url, service.token) as client:
         with pytest.raises(ServiceError, match="iteratoins"):
             client.submit(photographs, train={"iteratoins": 3})
         with pytest.raises(ServiceError):
             client.job("00000000-0000-0000-0000-000000000000")
         job = client.submit(photographs, **SMALL).cancel()
-        with pytest.raises(JobFailed, match="cancelled"):
+        with pytest.raises(JobFailedError, match="cancelled"):
             job.wait()
         assert job.state == "canceled"
     with (
@@ -98,11 +96,11 @@ def test_what_a_service_refuses_is_told(service: Service, photographs: Path) -> 
         list(stranger.jobs())
 
 
-def test_nobody_at_an_address_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("octasplat.workers.client.api.STRANGER_SECONDS", 0.1)
+def test_unreachable_address_raises_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("octasplat.workers.client.api.MAX_FIRST_OUTAGE_SECONDS", 0.1)
     with (
         osp.Client("http://127.0.0.1:9", "token") as client,
-        pytest.raises(Unreachable, match="octasplat serve"),
+        pytest.raises(ServiceUnreachableError, match="octasplat serve"),
     ):
         list(client.jobs())
 

@@ -45,7 +45,7 @@ def test_public_names_are_those_that_can_be_imported() -> None:
 
 
 @pytest.mark.parametrize("name", PUBLIC)
-def test_everything_public_of_the_package_has_an_example(name: str) -> None:
+def test_public_names_have_docstring_examples(name: str) -> None:
     value = getattr(octasplat, name)
     if value.__module__.startswith("octasplat.engine"):
         return  # a class of the engine under a shorter name

@@ -17,7 +17,7 @@ print(json.dumps([seconds, loaded, client, dir(octasplat) == sorted(octasplat.__
 """
 
 
-def test_import_is_quick_and_loads_nothing_heavy() -> None:
+def test_import_loads_no_heavy_modules() -> None:
     done = subprocess.run([sys.executable, "-c", CODE], capture_output=True, text=True, check=True)
     seconds, loaded, client, lists_public = json.loads(done.stdout)
     assert loaded == [] and client == [] and lists_public

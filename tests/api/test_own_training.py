@@ -17,7 +17,7 @@ def example() -> ModuleType:
     return module
 
 
-def test_training_of_ones_own_gains_eight_decibels(example: ModuleType) -> None:
+def test_custom_training_loop_gains_eight_decibels(example: ModuleType) -> None:
     scene, psnr = example.train(example.striped_ball(), steps=100)
     assert len(psnr) == 3 and psnr[0] < 15
     assert psnr[-1] - psnr[0] > 8  # 12.6 dB, 17.1 dB, 22.0 dB as it was measured

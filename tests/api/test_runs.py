@@ -13,7 +13,7 @@ import octasplat as osp
 from octasplat.engine.events import Event, StageFinished, TrainingProgress
 
 
-def test_run_stopped_by_a_step_goes_on_to_the_same_bytes(
+def test_run_stopped_by_on_step_resumes_to_same_bytes(
     photographs: Path, finished_run: Path, tmp_path: Path
 ) -> None:
     seen: list[int] = []
@@ -36,7 +36,7 @@ def test_should_stop_raises_and_on_step_does_not(photographs: Path, tmp_path: Pa
         osp.reconstruct(photographs, tmp_path / "run", **RUN_OPTIONS, should_stop=lambda: True)
 
 
-def test_run_says_what_was_measured(finished_run: Path) -> None:
+def test_run_exposes_metrics(finished_run: Path) -> None:
     run = osp.Run(finished_run)
     measured = osp.evaluate(run)
     assert run.psnr == measured.psnr and set(run.views) == set(measured.views)
@@ -58,10 +58,10 @@ def test_refused_settings_have_the_sentence_of_the_command(
     options: dict[str, Any], photographs: Path, tmp_path: Path
 ) -> None:
     from octasplat.engine.errors import OctasplatError
-    from octasplat.engine.operations.reconstruct import options_of
+    from octasplat.engine.operations.reconstruct import options_from_json
 
     with pytest.raises(OctasplatError) as expected:
-        options_of(options).config()
+        options_from_json(options).config()
     with pytest.raises(OctasplatError) as found:
         osp.reconstruct(photographs, tmp_path / "run", **options)
     assert str(found.value) == str(expected.value)
@@ -75,7 +75,7 @@ def test_python_means_the_settings_of_the_request(photographs: Path, tmp_path: P
     assert run.settings == ReconstructOptions.model_validate(RUN_OPTIONS).config().model_dump(mode="json")
 
 
-def test_work_in_a_thread_is_logged_and_prints_nothing(
+def test_reconstruct_in_thread_logs_and_prints_nothing(
     scene_file: Path,
     tmp_path: Path,
     caplog: pytest.LogCaptureFixture,
@@ -104,13 +104,13 @@ def test_notebook_shows_progress_and_ends_with_lines() -> None:
     from IPython.utils.capture import capture_output
 
     from octasplat.engine.events import StageProgress, StageStarted, Warned
-    from octasplat.notebook import EventLog, NotebookProgress, default_listener
+    from octasplat.notebook import NotebookProgress, ProgressLog, default_progress
 
-    assert isinstance(default_listener(), EventLog)
+    assert isinstance(default_progress(), ProgressLog)
     shell = InteractiveShell.instance()
     try:
         shell.kernel = object()
-        listener = default_listener()
+        listener = default_progress()
         assert isinstance(listener, NotebookProgress)
         events: list[Event] = [
             StageStarted("render", 4), StageProgress("render", 1, 4), Warned("a < b"),
@@ -134,7 +134,7 @@ def test_images_of_a_run_are_written_as_the_operation_says(finished_run: Path, t
         osp.render(osp.load(finished_run), tmp_path / "views")  # type: ignore[call-overload]
 
 
-def test_viewer_of_a_run_knows_its_cameras(finished_run: Path) -> None:
+def test_viewer_of_run_has_cameras(finished_run: Path) -> None:
     import json
     import urllib.request
 

@@ -8,7 +8,7 @@ import pytest
 from PIL import Image
 
 import octasplat as osp
-from octasplat.engine.gaussians.scene_facts import SceneFacts
+from octasplat.engine.gaussians.scene_metadata import SceneMetadata
 
 
 def test_arrays_are_views_of_the_scene(scene_file: Path) -> None:
@@ -63,7 +63,7 @@ def test_scene_survives_every_format(scene_file: Path, tmp_path: Path, suffix: s
     np.testing.assert_allclose([lows, highs], [scene.means.min(axis=0), scene.means.max(axis=0)], atol=0.01)
 
 
-def test_losses_of_a_format_are_logged_and_nothing_is_printed(
+def test_save_to_lossy_format_logs_dropped_values(
     scene_file: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture, capfd: pytest.CaptureFixture[str]
 ) -> None:
     with caplog.at_level(logging.INFO, logger="octasplat"):
@@ -103,7 +103,7 @@ def test_results_have_a_page_for_notebooks(scene_file: Path) -> None:
 
 
 def test_saved_pictures_are_read_back(scene_file: Path, tmp_path: Path) -> None:
-    from octasplat.engine.render.images import read_image
+    from octasplat.engine.render.image_files import read_image
 
     scene = osp.load(scene_file)
     image = osp.render(scene, scene.camera(width=32, height=24))
@@ -112,10 +112,10 @@ def test_saved_pictures_are_read_back(scene_file: Path, tmp_path: Path) -> None:
     assert image.save(tmp_path / "a.exr").stat().st_size > 0
 
 
-def test_cameras_of_a_scene_see_what_the_command_shows(scene_file: Path, tmp_path: Path) -> None:
+def test_scene_cameras_match_render_command(scene_file: Path, tmp_path: Path) -> None:
     whole = osp.load(scene_file)
     away = float(np.linalg.norm(whole.camera().centre_world))  # the ball has its middle at the origin
-    scene = osp.Scene(whole.gaussians, SceneFacts(near_world=away))
+    scene = osp.Scene(whole.gaussians, SceneMetadata(near_world=away))
     osp.save(scene, tmp_path / "cut.ply")
     options = {"mode": "turntable", "frames": 1, "width_px": 48, "height_px": 36}
     osp.render(tmp_path / "cut.ply", tmp_path / "frames", **options)
@@ -126,7 +126,7 @@ def test_cameras_of_a_scene_see_what_the_command_shows(scene_file: Path, tmp_pat
     assert loaded.camera().near_world == pytest.approx(away)
 
 
-def test_a_scene_of_nothing_has_a_page(scene_file: Path) -> None:
+def test_empty_scene_has_html_repr(scene_file: Path) -> None:
     scene = osp.load(scene_file)
     nothing = scene.select(scene.opacities > 2)
     assert len(nothing) == 0 and "harmonics" in nothing._repr_html_()

@@ -11,7 +11,7 @@ sys.path.append(str(Path(__file__).parents[1] / "trace"))
 from trace_scenes import make_cloud, rays_inwards, relative_error
 
 import octasplat as osp
-from octasplat.engine.gaussians.scene_facts import SceneFacts
+from octasplat.engine.gaussians.scene_metadata import SceneMetadata
 from octasplat.engine.rays import RayBatch
 from octasplat.engine.trace.reference import ReferenceParameters, ReferenceResult, trace_reference
 
@@ -56,7 +56,7 @@ def test_values_and_gradients_by_parameters_are_those_of_the_reference() -> None
     ours = loss_of(seen.rgb, seen.alpha, seen.depth, seen.depth_median, seen.normal)
     ours.backward()
 
-    reference = ReferenceParameters.of(parameters.scene().gaussians)
+    reference = ReferenceParameters.from_gaussians(parameters.scene().gaussians)
     result = trace_reference(reference, batch, osp.TraceSettings())
     expected = reference_loss_of(result)
     expected.backward()
@@ -77,7 +77,7 @@ def test_gradients_by_rays_are_differences_of_the_loss(name: str) -> None:
     loss_of(seen.rgb, seen.alpha, seen.depth, seen.depth_median, seen.normal).backward()
     found = getattr(lines, name).grad
     assert found is not None
-    reference = ReferenceParameters.of(parameters.scene().gaussians)
+    reference = ReferenceParameters.from_gaussians(parameters.scene().gaussians)
     step, expected = 1e-3, np.zeros((60, 3))
     for axis in range(3):
         losses = []
@@ -137,7 +137,7 @@ def test_double_precision_leaves_get_gradients_of_their_own_type() -> None:
     assert means.grad is not None and means.grad.dtype == torch.float64
 
 
-def test_camera_moves_to_where_the_picture_was_taken() -> None:
+def test_camera_optimisation_recovers_pose() -> None:
     """Gradients by rays find a camera: the smallest use of them."""
     scene = osp.Scene(make_cloud(np.random.default_rng(5), 200, size=0.3))
     camera = osp.Camera.looking_at((0, 0, -3), (0, 0, 0), 24, 24)
@@ -153,7 +153,7 @@ def test_camera_moves_to_where_the_picture_was_taken() -> None:
     assert shift.detach().norm() < 0.01
 
 
-def test_one_ray_is_taken_by_its_number() -> None:
+def test_rays_indexed_by_int_give_one_ray() -> None:
     scene = osp.Scene(make_cloud(np.random.default_rng(3), 40))
     rays = osp.Rays.of(scene.camera(12, 8))
     everything = osp.trace(scene, rays)
@@ -163,7 +163,7 @@ def test_one_ray_is_taken_by_its_number() -> None:
 
 
 def test_what_is_known_of_a_scene_goes_along_with_its_tensors(scene_file: Path) -> None:
-    scene = osp.Scene(osp.load(scene_file).gaussians, SceneFacts(turned_beyond=0.5, near_world=0.1))
+    scene = osp.Scene(osp.load(scene_file).gaussians, SceneMetadata(turned_beyond=0.5, near_world=0.1))
     tensors = osp.GaussianTensors.of(scene)
     assert tensors.scene().facts == scene.facts
     camera = scene.camera(width=48, height=32)

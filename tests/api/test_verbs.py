@@ -13,9 +13,9 @@ import octasplat as osp
 import octasplat.verbs
 from octasplat.engine.errors import ConfigError
 from octasplat.engine.events import Event, StageProgress, Warned
-from octasplat.engine.operations.base import build
+from octasplat.engine.operations.base import build_request
 from octasplat.engine.operations.registry import operation, operation_names
-from octasplat.operating import given_values
+from octasplat.operation_calls import explicit_values
 
 
 def test_verbs_are_written_from_the_requests() -> None:
@@ -35,7 +35,7 @@ def test_every_operation_is_a_function_of_the_package(name: str) -> None:
 def test_refused_values_have_the_sentence_of_the_request(scene_file: Path, tmp_path: Path) -> None:
     values = {"source": scene_file, "output": tmp_path / "a.ply", "where": "colour > 3 and"}
     with pytest.raises(ConfigError) as expected:
-        build(operation("crop").request, values)
+        build_request(operation("crop").request, values)
     with pytest.raises(ConfigError) as found:
         osp.crop(scene_file, tmp_path / "a.ply", where="colour > 3 and")
     assert str(found.value) == str(expected.value)
@@ -59,7 +59,7 @@ def test_a_misspelt_option_is_refused_with_the_nearest_name(scene_file: Path, tm
 def test_what_a_preset_switches_on_can_be_said_to_be_off() -> None:
     request = operation("surface").request
     values = {"source": "run", "output": "a.glb", "room": True, "refine_vertices": False, "backdrop": None}
-    found = build(request, given_values(request, values))
+    found = build_request(request, explicit_values(request, values))
     assert (found.refine_vertices, found.backdrop, found.unbounded) == (False, True, True)
     parameter = inspect.signature(osp.surface).parameters["refine_vertices"]
     assert parameter.default is None

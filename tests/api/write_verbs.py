@@ -37,8 +37,8 @@ from pydantic import BaseModel
 
 from octasplat.engine.events import Listener
 from octasplat.engine.operations.base import never
-from octasplat.operating import names_checked, run_operation
-from octasplat.places import PathLike
+from octasplat.operation_calls import names_checked, run_operation
+from octasplat.paths import PathLike
 from octasplat.runs import OnStep, Run, reconstruct_into
 
 if TYPE_CHECKING:

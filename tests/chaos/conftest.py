@@ -3,7 +3,7 @@
 import sys
 from pathlib import Path
 
-from postgres_for_tests import conninfo, postgres, short_root, template
+from postgres_fixtures import conninfo, postgres, short_root, template
 
 sys.path.append(str(Path(__file__).parents[1] / "work"))
 

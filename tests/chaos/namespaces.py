@@ -13,7 +13,7 @@ BRIDGE = "octabr0"
 GATEWAY = "10.213.77.1"
 
 
-def lacking() -> str | None:
+def missing_requirement() -> str | None:
     """Why there can be no namespaces here, or None."""
     if os.geteuid() != 0:
         return "network namespaces need root"
@@ -26,7 +26,7 @@ def lacking() -> str | None:
 
 
 @dataclass(frozen=True)
-class Host:
+class NamespaceHost:
     """A namespace with one address on the bridge."""
 
     name: str
@@ -36,19 +36,19 @@ class Host:
         """That command, run there."""
         return ["ip", "netns", "exec", self.name, *command]
 
-    def pull_the_plug(self) -> None:
+    def disconnect(self) -> None:
         """From here on nothing comes from there any more, not even the end of a connection."""
         _ip("link", "set", self.cable, "down")
 
-    def plug_in(self) -> None:
+    def reconnect(self) -> None:
         """The opposite."""
         _ip("link", "set", self.cable, "up")
 
 
 @contextlib.contextmanager
-def hosts(count: int) -> Iterator[list[Host]]:
+def hosts(count: int) -> Iterator[list[NamespaceHost]]:
     """Namespaces that reach this one at :data:`GATEWAY` and see neither its network nor its loopback."""
-    made = [Host(f"octahost{number}", f"octa{number}") for number in range(count)]
+    made = [NamespaceHost(f"octahost{number}", f"octa{number}") for number in range(count)]
     try:
         _ip("link", "add", BRIDGE, "type", "bridge")
         _ip("addr", "add", f"{GATEWAY}/24", "dev", BRIDGE)
@@ -70,7 +70,7 @@ def hosts(count: int) -> Iterator[list[Host]]:
 
 
 @contextlib.contextmanager
-def door(socket_path: str, address: str = GATEWAY) -> Iterator[int]:
+def forward_socket(socket_path: str, address: str = GATEWAY) -> Iterator[int]:
     """A port at that address that leads to a Unix socket."""
     loop = asyncio.new_event_loop()
     tasks: set[asyncio.Task[None]] = set()

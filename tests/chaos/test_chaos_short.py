@@ -23,7 +23,7 @@ def machine(short_root: Path) -> Iterator[Machine]:
         machine.stop()
 
 
-def test_nothing_is_lost_whatever_is_killed(machine: Machine, tmp_path: Path) -> None:
+def test_jobs_survive_random_kills(machine: Machine, tmp_path: Path) -> None:
     scene = make_scene(tmp_path / "scene")
     expected = undisturbed_reconstruction(scene, tmp_path / "undisturbed")
     run = Run(machine, scene, random.Random(5), expected)
@@ -63,7 +63,7 @@ GOOD = [
 ]  # fmt: skip
 
 
-def test_the_verdict_sees_what_is_wrong() -> None:
+def test_chaos_check_reports_injected_faults() -> None:
     assert journal_faults(GOOD) == []
     assert journal_faults(GOOD[:-1]) == ["it ended 0 times"]
     assert journal_faults([*GOOD, state(10, 2, "failed")]) == ["it ended 2 times"]

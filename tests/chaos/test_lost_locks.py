@@ -7,15 +7,15 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from worker_bench import ROOT, Bench
+from worker_harness import ROOT, WorkerHarness
 
-from octasplat.workers.records.locks import ROW_SECONDS
+from octasplat.workers.db.locks import ROW_SECONDS
 
 pytestmark = pytest.mark.heavy
 
 HOLDER = """
 import asyncio, sys, time, uuid
-from octasplat.workers.records.database import open_pool
+from octasplat.workers.db.connections import open_pool
 from octasplat.workers.queue.jobs import get_job
 
 async def hold():
@@ -30,13 +30,13 @@ asyncio.run(hold())
 
 
 @pytest.fixture
-def bench(conninfo: str, tmp_path: Path) -> Iterator[Bench]:
-    bench = Bench(conninfo, tmp_path, stale_seconds=3.0)
+def bench(conninfo: str, tmp_path: Path) -> Iterator[WorkerHarness]:
+    bench = WorkerHarness(conninfo, tmp_path, stale_seconds=3.0)
     yield bench
     bench.close()
 
 
-def test_job_goes_on_though_its_lock_was_held_by_a_vanished_process(bench: Bench) -> None:
+def test_job_recovers_after_lock_holder_vanishes(bench: WorkerHarness) -> None:
     first = bench.worker(name="first")
     job_id = bench.submit(options={"steps": 100, "seconds": 0.05})
     bench.wait(job_id, lambda job: job.checkpoint is not None)
@@ -50,7 +50,7 @@ def test_job_goes_on_though_its_lock_was_held_by_a_vanished_process(bench: Bench
         bench.worker(name="second")
         bench.wait(job_id, lambda job: job.worker == "second", ROW_SECONDS + 200)
         assert time.monotonic() - held >= ROW_SECONDS - 1
-        assert bench.over(job_id).state == "succeeded"
+        assert bench.wait_until_finished(job_id).state == "succeeded"
     finally:
         holder.kill()
         holder.wait()

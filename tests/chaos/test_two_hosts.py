@@ -15,13 +15,13 @@ import pytest
 from benchmarks.chaos import journal_faults
 from benchmarks.chaos_kind import ChainOptions, undisturbed
 from moto.server import ThreadedMotoServer
-from namespaces import GATEWAY, Host, door, hosts, lacking
+from namespaces import GATEWAY, NamespaceHost, forward_socket, hosts, missing_requirement
 from psycopg.conninfo import conninfo_to_dict, make_conninfo
-from worker_bench import ROOT, Bench, alive, child_pids
+from worker_harness import ROOT, WorkerHarness, child_pids, is_alive
 
-from octasplat.workers.records.locks import OWNER
+from octasplat.workers.db.locks import OWNER
 from octasplat.workers.settings import WorkerSettings
-from octasplat.workers.store.opening import open_storage
+from octasplat.workers.storage.factory import open_storage
 
 pytestmark = pytest.mark.heavy
 
@@ -39,7 +39,7 @@ PHOTOGRAPHS = {"images/a.png": b"not looked at by this kind", "images/b.png": b"
 class Hosts:
     """Two hosts, at :data:`TIMES`."""
 
-    def __init__(self, bench: Bench, found: list[Host], database: str, store: str) -> None:
+    def __init__(self, bench: WorkerHarness, found: list[NamespaceHost], database: str, store: str) -> None:
         self.bench = bench
         self.found = found
         self._database = database
@@ -69,7 +69,7 @@ class Hosts:
 
 @pytest.fixture
 def two(conninfo: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Hosts]:
-    reason = lacking()
+    reason = missing_requirement()
     if reason is not None:
         pytest.skip(reason)
     for name in ("ACCESS_KEY_ID", "SECRET_ACCESS_KEY"):
@@ -77,8 +77,8 @@ def two(conninfo: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Itera
     monkeypatch.setenv("AWS_DEFAULT_REGION", "us-east-1")
     monkeypatch.setenv("AWS_EC2_METADATA_DISABLED", "true")
     facts = conninfo_to_dict(conninfo)
-    bench = Bench(conninfo, tmp_path)
-    with hosts(2) as found, door(f"{facts['host']}/.s.PGSQL.{facts['port']}") as port:
+    bench = WorkerHarness(conninfo, tmp_path)
+    with hosts(2) as found, forward_socket(f"{facts['host']}/.s.PGSQL.{facts['port']}") as port:
         server = ThreadedMotoServer(ip_address=GATEWAY, port=0, verbose=False)
         server.start()
         endpoint = f"http://{GATEWAY}:{server.get_host_and_port()[1]}"
@@ -103,7 +103,7 @@ def dataset(two: Hosts, store: str) -> uuid.UUID:
             "INSERT INTO datasets (id, owner, name, state) VALUES (%s, 'me', 'd', 'committed')", [made]
         )
         for path, content in PHOTOGRAPHS.items():
-            with storage.begin() as writer:
+            with storage.open_writer() as writer:
                 writer.write(content)
                 blob = writer.commit()
             connection.execute(
@@ -114,7 +114,7 @@ def dataset(two: Hosts, store: str) -> uuid.UUID:
 
 
 @pytest.mark.parametrize("how", ["dead", "cut off"])
-def test_second_host_takes_over(two: Hosts, how: str) -> None:
+def test_job_of_disconnected_host_is_recovered_by_second_host(two: Hosts, how: str) -> None:
     bench, store = two.bench, two.store
     first = two.worker(0)
     options = ChainOptions(seed=1, steps=STEPS, seconds=0.05, gate=str(bench.gate))
@@ -126,7 +126,7 @@ def test_second_host_takes_over(two: Hosts, how: str) -> None:
     while "takes" not in (bench.folder / "host1.log").read_text():
         assert second.poll() is None
         time.sleep(0.1)
-    two.found[0].pull_the_plug()
+    two.found[0].disconnect()
     if how == "dead":
         first.send_signal(signal.SIGKILL)
     died = time.monotonic()
@@ -134,12 +134,12 @@ def test_second_host_takes_over(two: Hosts, how: str) -> None:
     seconds = time.monotonic() - died
     assert seconds <= TAKEN_OVER_SECONDS, bench.worker_logs()
     # The first has let go by itself, or there would be two at work by now.
-    assert not alive(child)
+    assert not is_alive(child)
     bench.wait(job_id, lambda _: any(e.kind == "resumed" for e in bench.events(job_id)), 20)
     if how == "cut off":
-        two.found[0].plug_in()
+        two.found[0].reconnect()
     bench.open_gate()
-    job = bench.over(job_id, 120)
+    job = bench.wait_until_finished(job_id, 120)
     assert (job.state, job.attempt, job.rescues, job.worker) == ("succeeded", 2, 0, "host1")
     events = [
         {"id": e.id, "kind": e.kind, "attempt": e.attempt, "data": e.data} for e in bench.events(job_id)

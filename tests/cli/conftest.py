@@ -13,10 +13,10 @@ import pytest
 from click.testing import CliRunner, Result
 
 from octasplat.engine.config import resolve_config
+from octasplat.engine.dataset.synthetic import SyntheticDatasetConfig, write_synthetic_dataset
 from octasplat.engine.files.gaussian_ply import read_gaussian_ply, write_gaussian_ply
-from octasplat.engine.gaussians.scene_facts import SceneFacts
-from octasplat.engine.render.environment_map import write_environment
-from octasplat.engine.scene.generated import GeneratedSceneConfig, write_generated_scene
+from octasplat.engine.gaussians.scene_metadata import SceneMetadata
+from octasplat.engine.render.environment_files import write_environment
 from octasplat.workers.cli.main import cli
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -86,8 +86,8 @@ def tiny() -> tuple[str, ...]:
 @pytest.fixture(scope="session")
 def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("generated") / "scene"
-    write_generated_scene(
-        root, GeneratedSceneConfig(views=8, width_px=64, height_px=48, samples_per_side=1, points=400)
+    write_synthetic_dataset(
+        root, SyntheticDatasetConfig(views=8, width_px=64, height_px=48, samples_per_side=1, points=400)
     )
     return root
 
@@ -116,7 +116,7 @@ def shiny_run(run, tmp_path_factory) -> Path:
     write_gaussian_ply(
         gaussians.with_channels(channels),
         root / "run" / "scene.ply",
-        facts=SceneFacts(turned_beyond=given.train.trace.flip_normal_cos),
+        facts=SceneMetadata(turned_beyond=given.train.trace.flip_normal_cos),
     )
     for name in ("environment.exr", "environment.hdr"):
         write_environment(root / "run" / name, np.full((16, 32, 3), 0.5, np.float32))

@@ -21,7 +21,7 @@ LIGHT = [name for name in COMMANDS if name != "export"]
 
 
 @pytest.mark.parametrize("arguments", [["--help"], ["--version"], *([name, "--help"] for name in LIGHT)])
-def test_help_imports_nothing_heavy(arguments):
+def test_help_loads_no_heavy_modules(arguments):
     # The options of a command are the fields of its request.
     unwanted = HEAVY if len(arguments) == 2 else (*HEAVY, "pydantic")
     code = f"""
@@ -58,7 +58,7 @@ def test_help_of_export_names_every_format(octasplat):
         assert exporter.name in text, exporter.name
 
 
-def test_version(octasplat):
+def test_version_option_prints_package_version(octasplat):
     assert octasplat("--version").stdout.split()[-1] == __version__
 
 
@@ -71,7 +71,7 @@ def one_error_line(result, code=1):
     return lines[0]
 
 
-def test_missing_scene_folder(octasplat, tmp_path):
+def test_reconstruct_missing_folder_is_named_in_error(octasplat, tmp_path):
     result = octasplat("reconstruct", tmp_path / "nowhere", "-o", tmp_path / "out")
     assert "nowhere" in one_error_line(result)
 
@@ -117,7 +117,7 @@ def test_unknown_preset_is_a_usage_error(octasplat, scene, tmp_path):
     assert "fast" in result.stderr
 
 
-def test_unexpected_errors_are_one_line_too(octasplat, run, monkeypatch):
+def test_unexpected_error_prints_one_line(octasplat, run, monkeypatch):
     monkeypatch.setattr("octasplat.engine.evaluate.runs.evaluate", _broken)
     monkeypatch.delenv("OCTASPLAT_DEBUG", raising=False)
     line = one_error_line(octasplat("evaluate", run.output), code=70)

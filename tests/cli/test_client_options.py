@@ -82,5 +82,5 @@ def test_json_of_a_job_is_all_that_is_printed(octasplat, asked: list[dict], monk
         listener(StageFinished("render", 1.0))
         return JOB
 
-    monkeypatch.setattr(submission, "wait_for", wait_for)
+    monkeypatch.setattr(submission, "wait_for_job", wait_for)
     assert json.loads(octasplat("status", "4711", "--wait", "--json").stdout) == JOB

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from octasplat.workers.cli import demonstration
+from octasplat.workers.cli import demo_run
 
 ROOT = Path(__file__).resolve().parents[2]
 SIZE = ("--views", 4, "--width", 32, "--height", 24)
@@ -24,10 +24,10 @@ def tiny_demo(monkeypatch):
         "probe_rays=256",
         "ssim_patch_side=16",
     )
-    monkeypatch.setattr(demonstration, "DEMO_ASSIGNMENTS", {"fast": settings})
+    monkeypatch.setattr(demo_run, "DEMO_ASSIGNMENTS", {"fast": settings})
 
 
-def test_scene_only(octasplat, tmp_path):
+def test_demo_scene_only_writes_dataset_only(octasplat, tmp_path):
     result = octasplat("demo", "-o", tmp_path / "still", "--dataset-only", *SIZE)
     assert result.exit_code == 0, result.output
     assert len(list((tmp_path / "still" / "images").iterdir())) == 4
@@ -35,7 +35,7 @@ def test_scene_only(octasplat, tmp_path):
 
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
-def test_a_signal_leaves_no_half_of_a_scene(start_octasplat, tmp_path, number, code):
+def test_demo_signal_leaves_no_partial_scene(start_octasplat, tmp_path, number, code):
     process = start_octasplat("demo", "-o", tmp_path / "still", "--dataset-only", "--views", 500)
     deadline = time.monotonic() + 240
     while not any(path.name.endswith(".partial") for path in tmp_path.iterdir()):
@@ -50,7 +50,7 @@ def test_a_signal_leaves_no_half_of_a_scene(start_octasplat, tmp_path, number, c
 
 STOPPED_AT_ONCE = """
 import os, pathlib, signal, sys
-from octasplat.workers.cli.demonstration import make_scene
+from octasplat.workers.cli.demo_run import make_scene
 
 made = pathlib.Path.mkdir
 
@@ -64,14 +64,14 @@ make_scene(pathlib.Path(sys.argv[1]), {"views": 4}, quiet=True)
 """
 
 
-def test_a_signal_at_the_very_beginning_leaves_nothing(tmp_path):
+def test_demo_signal_at_start_leaves_no_files(tmp_path):
     """As it happens on a loaded machine: right after the folder was made."""
     command = [sys.executable, "-c", STOPPED_AT_ONCE, str(tmp_path / "still")]
     assert subprocess.run(command, cwd=ROOT, check=False, timeout=120).returncode == 143
     assert list(tmp_path.iterdir()) == []
 
 
-def test_demo_is_made_once_and_names_its_report(octasplat, tmp_path, tiny_demo, monkeypatch):
+def test_demo_is_generated_once_and_names_report(octasplat, tmp_path, tiny_demo, monkeypatch):
     opened = []
     monkeypatch.setattr(webbrowser, "open", opened.append)
     first = octasplat("demo", "-o", tmp_path, *SIZE)
@@ -87,7 +87,7 @@ def test_demo_is_made_once_and_names_its_report(octasplat, tmp_path, tiny_demo, 
     assert opened == [report.as_uri()]
 
 
-def test_demo_goes_on_by_itself(octasplat, tmp_path, tiny_demo):
+def test_demo_resumes_automatically(octasplat, tmp_path, tiny_demo):
     assert octasplat("demo", "-o", tmp_path, *SIZE).exit_code == 0
     for name in ("report.html", "mesh.glb"):
         (tmp_path / "result" / name).unlink()

@@ -11,10 +11,10 @@ import trimesh
 
 from octasplat.engine.config import resolve_config
 from octasplat.engine.events import Event, Warned
-from octasplat.engine.render.images import read_image
-from octasplat.workers.work.kinds import kind_named
-from octasplat.workers.work.programs import reconstruct
-from octasplat.workers.work.task import Task
+from octasplat.engine.render.image_files import read_image
+from octasplat.workers.worker.handlers import reconstruct
+from octasplat.workers.worker.job_kinds import get_job_kind
+from octasplat.workers.worker.task import Task
 
 SETTINGS = (
     "iterations=60",
@@ -41,7 +41,7 @@ def results(scene, tmp_path_factory) -> Results:
     root = tmp_path_factory.mktemp("job")
     shutil.copytree(scene, root / "dataset")
     config = resolve_config("fast", settings={"test_every": 4, "max_side": 48}, assignments=SETTINGS)
-    options = kind_named("reconstruct").options.model_validate(config.model_dump(mode="json"))
+    options = get_job_kind("reconstruct").options.model_validate(config.model_dump(mode="json"))
     left = root / "attempt" / "run" / "config.json"  # by an attempt of another version
     left.parent.mkdir(parents=True)
     left.write_text(json.dumps({"scene": "elsewhere", "reconstruction": {"a_later_setting": 1}}))
@@ -53,7 +53,7 @@ def results(scene, tmp_path_factory) -> Results:
             root / "dataset",
             "still life",
             threads=1,
-            listener=heard.append,
+            progress=heard.append,
         )
     )
     warnings = tuple(event.message for event in heard if isinstance(event, Warned))
@@ -63,7 +63,7 @@ def results(scene, tmp_path_factory) -> Results:
     return Results(downloaded, scene, warnings)
 
 
-def test_what_another_version_left_is_begun_anew(results):
+def test_retry_with_incompatible_state_restarts_with_warning(results):
     (told,) = [warning for warning in results.warnings if "begins anew" in warning]
     assert (
         "config.json" in told
@@ -71,7 +71,7 @@ def test_what_another_version_left_is_begun_anew(results):
     )
 
 
-def test_its_views_are_rendered_without_photographs(results, octasplat, tmp_path):
+def test_downloaded_run_renders_views_without_photographs(results, octasplat, tmp_path):
     result = octasplat("render", results.folder, "-o", tmp_path / "out")
     assert result.exit_code == 0, result.output
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["view_000.png", "view_004.png"]
@@ -81,7 +81,7 @@ def test_its_views_are_rendered_without_photographs(results, octasplat, tmp_path
 
 
 @pytest.mark.parametrize(("side", "shape"), [(24, (18, 24, 3)), (64, (48, 64, 3)), (640, (48, 64, 3))])
-def test_its_views_at_other_sizes_are_those_of_the_photographs(results, octasplat, tmp_path, side, shape):
+def test_downloaded_run_view_sizes_follow_photographs(results, octasplat, tmp_path, side, shape):
     for name, more in (("without", ()), ("with", ("--dataset", results.photographs))):
         result = octasplat(
             "render", results.folder, "-o", tmp_path / name, "--views", "train", "--max-side", side, *more
@@ -95,7 +95,7 @@ def test_its_views_at_other_sizes_are_those_of_the_photographs(results, octaspla
         assert np.abs(alone - read_image(tmp_path / "with" / name)).max() <= 2 / 255
 
 
-def test_a_turntable_is_that_of_the_photographs(results, octasplat, tmp_path):
+def test_downloaded_run_turntable_matches_original(results, octasplat, tmp_path):
     turn = ("--turntable", "--frames", 2, "--width", 32, "--height", 24)
     for name, more in (("without", ()), ("with", ("--dataset", results.photographs))):
         result = octasplat("render", results.folder, "-o", tmp_path / name, *turn, *more)
@@ -104,7 +104,7 @@ def test_a_turntable_is_that_of_the_photographs(results, octasplat, tmp_path):
         assert (tmp_path / "without" / name).read_bytes() == (tmp_path / "with" / name).read_bytes()
 
 
-def test_a_surface_is_that_of_the_photographs(results, octasplat, tmp_path):
+def test_downloaded_run_surface_matches_original(results, octasplat, tmp_path):
     size = ("--resolution", 32, "--depth-side", 48, "--min-component", 0, "--quiet")
     for name, more in (("without", ()), ("with", ("--dataset", results.photographs))):
         result = octasplat("surface", results.folder, "-o", tmp_path / f"{name}.ply", *size, *more)
@@ -119,7 +119,7 @@ def test_a_surface_is_that_of_the_photographs(results, octasplat, tmp_path):
     assert 0 < np.abs(next(colours) - next(colours)).mean() < 25
 
 
-def test_evaluation_asks_for_the_photographs_by_its_option(results, octasplat, tmp_path):
+def test_evaluate_without_photographs_names_option(results, octasplat, tmp_path):
     before = {path.name for path in results.folder.iterdir()}
     result = octasplat("evaluate", results.folder)
     assert result.exit_code == 1
@@ -138,7 +138,7 @@ def test_evaluation_with_the_photographs_gives_the_same_figures(results, octaspl
     assert after["views"] == before["views"]
 
 
-def test_evaluation_tells_of_other_photographs(results, octasplat, tmp_path):
+def test_evaluate_with_other_photographs_warns(results, octasplat, tmp_path):
     copy, others = tmp_path / "results", tmp_path / "others"
     shutil.copytree(results.folder, copy)
     shutil.copytree(results.photographs, others)
@@ -148,7 +148,7 @@ def test_evaluation_tells_of_other_photographs(results, octasplat, tmp_path):
     assert "Warning:" in result.stderr and "view_004.png with another file" in result.stderr
 
 
-def test_poses_that_the_job_found_are_taken_for_bare_photographs(results, octasplat, tmp_path):
+def test_downloaded_poses_are_used_for_bare_photographs(results, octasplat, tmp_path):
     copy, bare = tmp_path / "results", tmp_path / "bare"
     shutil.copytree(results.folder, copy)
     shutil.copytree(results.photographs / "sparse/0", copy / "poses")

@@ -8,7 +8,7 @@ import pytest
 from octasplat.engine.errors import DatasetError
 from octasplat.engine.operations.estimate import EstimateRequest, run
 from octasplat.engine.photograph_sizes import Sizes
-from octasplat.engine.render.images import write_png
+from octasplat.engine.render.image_files import write_png
 
 
 @pytest.fixture
@@ -33,7 +33,7 @@ def test_estimate_counts_photographs_and_follows_the_options(photographs: Path) 
     assert longer.cpu_seconds > fast.cpu_seconds
 
 
-def test_command_tells_the_estimate_in_a_sentence(octasplat, photographs: Path) -> None:
+def test_estimate_command_prints_sentence(octasplat, photographs: Path) -> None:
     done = octasplat("estimate", photographs, "--preset", "fast", "--cores", 4)
     assert done.exit_code == 0, done.stderr
     assert done.stdout.startswith("10 photographs: about ") and "on 4 cores" in done.stdout

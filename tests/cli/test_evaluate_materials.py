@@ -10,11 +10,11 @@ import pytest
 from pydantic import ValidationError
 
 from octasplat.engine.photograph_sizes import Sizes
-from octasplat.engine.render.environment_map import write_environment
-from octasplat.engine.render.images import read_image
-from octasplat.workers.work.kinds import kind_named
-from octasplat.workers.work.programs import run_operation
-from octasplat.workers.work.task import Task
+from octasplat.engine.render.environment_files import write_environment
+from octasplat.engine.render.image_files import read_image
+from octasplat.workers.worker.handlers import run_operation
+from octasplat.workers.worker.job_kinds import get_job_kind
+from octasplat.workers.worker.task import Task
 
 SIDE = (48, 64)
 
@@ -73,7 +73,7 @@ def test_materials_light_and_relit_pictures_are_measured(shiny_run, scene_with_t
     assert 'id="environment"' in report
 
 
-def test_the_run_is_relit_at_its_own_and_at_other_views(shiny_run, scene_with_truth, octasplat, tmp_path):
+def test_relight_run_at_own_and_other_views(shiny_run, scene_with_truth, octasplat, tmp_path):
     dim = scene_with_truth / "env" / "dim.hdr"
     done = octasplat("relight", shiny_run, "--environment", dim, "-o", tmp_path / "own", "--samples", 1)
     assert done.exit_code == 0, done.output
@@ -92,15 +92,15 @@ def test_the_run_is_relit_at_its_own_and_at_other_views(shiny_run, scene_with_tr
     )  # 0.25 is 0.54 in display values, and rough metal of albedo 0.25 sends back less
 
 
-def test_a_job_relights_with_files_of_its_own(shiny_run, scene_with_truth, tmp_path):
+def test_relight_job_uses_uploaded_files(shiny_run, scene_with_truth, tmp_path):
     shutil.copytree(shiny_run, tmp_path / "attempt" / "run")
     shutil.copytree(scene_with_truth / "env", tmp_path / "attempt" / "files" / "maps")
-    kind = kind_named("relight")
+    kind = get_job_kind("relight")
     asked = {"environments": ["maps/day.hdr", "maps/dim.hdr"], "mode": "views", "format": "png", "samples": 1}
     options = kind.resolve(asked)
     assert [name for _, name in kind.named_files(options)] == asked["environments"]
     size = Sizes(64, 48, 8)
-    assert {demand.of: demand.amount for demand in kind.demands(options, [size])} == {
+    assert {demand.resource: demand.amount for demand in kind.resource_demands(options, [size])} == {
         "render_pixels": 2 * 8 * 64 * 48, "render_paths": 2 * 8 * 64 * 48,
         "workspace_bytes": round(0.4 * 2 * 8 * 64 * 48),
     }  # fmt: skip

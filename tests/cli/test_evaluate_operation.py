@@ -8,11 +8,11 @@ import pytest
 
 from octasplat.engine.errors import Cancelled, ConfigError
 from octasplat.engine.events import StageFinished
-from octasplat.engine.operations.base import build
+from octasplat.engine.operations.base import build_request
 from octasplat.engine.operations.evaluate import OPERATION, EvaluateRequest
-from octasplat.workers.work.kinds import kind_named
-from octasplat.workers.work.programs import run_operation
-from octasplat.workers.work.task import Task
+from octasplat.workers.worker.handlers import run_operation
+from octasplat.workers.worker.job_kinds import get_job_kind
+from octasplat.workers.worker.task import Task
 
 
 @pytest.fixture
@@ -40,7 +40,7 @@ def test_smaller_sizes_are_the_same_by_command_and_job(copy, run, octasplat, tmp
     found = json.loads((copy / "scales.json").read_text())
     assert list(found) == ["1/2", "1/4"] and f"{found['1/2']['4']:.2f} dB with 4" in done.output
     shutil.copytree(run.output, tmp_path / "attempt" / "run", ignore=shutil.ignore_patterns("on", "cache"))
-    kind = kind_named("evaluate")
+    kind = get_job_kind("evaluate")
     options = kind.resolve({"scales": [2, 4]}).model_dump(mode="json")
     assert options == {"all_views": False, "scales": [2, 4]}
     run_operation(Task(tmp_path / "attempt", options, scene=run.scene, threads=1, kind="evaluate"))
@@ -49,7 +49,7 @@ def test_smaller_sizes_are_the_same_by_command_and_job(copy, run, octasplat, tmp
     assert (results / "scales.json").read_bytes() == (copy / "scales.json").read_bytes()
 
 
-def test_all_views_and_another_background(copy, run, octasplat):
+def test_evaluate_all_views_with_other_background(copy, run, octasplat):
     before = (copy / "metrics.json").read_bytes()
     done = octasplat("evaluate", copy, "--all-views", "--evaluation-background", "white", "--threads", 1)
     assert done.exit_code == 0, done.output
@@ -58,7 +58,7 @@ def test_all_views_and_another_background(copy, run, octasplat):
     assert "Mean over 8" in done.output and (copy / "metrics.json").read_bytes() == before
 
 
-def test_a_wish_to_stop_is_heard(copy):
+def test_evaluate_should_stop_cancels(copy):
     with pytest.raises(Cancelled, match="Stopped while evaluating"):
         OPERATION.run(EvaluateRequest(source=copy), should_stop=lambda: True, threads=1)
 
@@ -73,6 +73,6 @@ def test_a_wish_to_stop_is_heard(copy):
         ({"other_dataset": "a", "dataset": "b"}, "choose one of dataset"),
     ],
 )
-def test_what_contradicts_is_refused_in_a_sentence(values, told):
+def test_evaluate_contradictory_options_are_refused(values, told):
     with pytest.raises(ConfigError, match=told):
-        build(EvaluateRequest, {"source": "run", **values})
+        build_request(EvaluateRequest, {"source": "run", **values})

@@ -10,11 +10,11 @@ import pytest
 from octasplat.engine.files import read_scene
 from octasplat.engine.files.gaussian_ply import read_gaussian_ply
 from octasplat.engine.files.ply_container import PlyWriteElement, write_ply
-from octasplat.engine.render.draw_order import AGREEMENT, common_order
+from octasplat.engine.render.depth_order import MIN_AGREEMENT, shared_depth_order
 from octasplat.engine.run_folder import run_viewpoints
 
 
-def test_scene_to_glb(run, octasplat, tmp_path):
+def test_export_ply_to_glb_writes_mesh(run, octasplat, tmp_path):
     target = tmp_path / "scene.glb"
     result = octasplat("export", run.output / "scene.ply", target)
     assert result.exit_code == 0, result.output
@@ -52,13 +52,13 @@ def test_help_lists_every_format(octasplat):
         assert re.search(rf"\n  {exporter.name} +{re.escape(exporter.patterns[0])}[,:]", text)
 
 
-def test_opaque_is_refused_where_it_means_nothing(run, octasplat, tmp_path):
+def test_export_opaque_unsupported_format_is_refused(run, octasplat, tmp_path):
     result = octasplat("export", run.output / "scene.ply", tmp_path / "scene.obj", "--opaque")
     assert result.exit_code == 2 and "--opaque is for GLB" in result.stderr
     assert not list(tmp_path.iterdir())
 
 
-def test_all_files_of_an_obj_are_named(run, octasplat, tmp_path):
+def test_export_obj_prints_all_written_files(run, octasplat, tmp_path):
     result = octasplat("export", run.output / "scene.ply", tmp_path / "scene.obj", "--q", 4)
     assert result.exit_code == 0, result.output
     for path in tmp_path.iterdir():
@@ -76,7 +76,7 @@ def test_options_reach_a_gaussian_ply(run, octasplat, tmp_path):
 
 
 @pytest.mark.parametrize(("thickness", "warns"), [(0.1, False), (0.9, True)])
-def test_what_flattening_loses_is_told(octasplat, tmp_path, thickness, warns):
+def test_export_unflat_scene_warns_of_lost_thickness(octasplat, tmp_path, thickness, warns):
     source = tmp_path / "thick.ply"
     write_thick_gaussians(source, thickness)
     result = octasplat("export", source, tmp_path / "flat.ply")
@@ -85,7 +85,7 @@ def test_what_flattening_loses_is_told(octasplat, tmp_path, thickness, warns):
     assert result.stderr.startswith("Warning: ") == warns
 
 
-def test_format_by_name(run, octasplat, tmp_path):
+def test_export_format_option_overrides_suffix(run, octasplat, tmp_path):
     target = tmp_path / "mesh.data"
     assert octasplat("export", run.output / "scene.ply", target).exit_code == 1
     assert octasplat("export", run.output / "scene.ply", target, "--format", "glb").exit_code == 0
@@ -127,7 +127,7 @@ def test_the_one_colour_of_a_format_without_harmonics_is_chosen(run, octasplat, 
         assert result.exit_code == 1 and not (tmp_path / "x.splat").exists()
 
 
-def test_for_viewers_puts_a_run_in_the_order_of_its_cameras(run, octasplat, tmp_path):
+def test_export_for_viewers_sorts_by_cameras(run, octasplat, tmp_path):
     result = octasplat("export", run.output, tmp_path / "a.glb", "--for-viewers", "--chunks", 4)
     assert result.exit_code == 0, result.output
     data = (tmp_path / "a.glb").read_bytes()
@@ -138,9 +138,9 @@ def test_for_viewers_puts_a_run_in_the_order_of_its_cameras(run, octasplat, tmp_
     back, _ = read_scene(tmp_path / "a.glb")
     seen = run_viewpoints(run.output)
     centres = np.stack([seen.views[index].origin_world for index in seen.train_indices])
-    order, agreement = common_order(back.means_world, centres)
+    order, agreement = shared_depth_order(back.means_world, centres)
     in_order = bool((order == np.arange(len(back))).all())
-    assert in_order == (agreement >= AGREEMENT)
+    assert in_order == (agreement >= MIN_AGREEMENT)
     if in_order:
         assert len(document["meshes"]) == 1
 

@@ -15,7 +15,7 @@ def failing_converter(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("OCTASPLAT_SPLAT_TRANSFORM", str(program))
 
 
-def test_what_cannot_be_written_is_refused_before_the_training(scene, octasplat, tiny, tmp_path, monkeypatch):
+def test_unwritable_exports_are_refused_before_training(scene, octasplat, tiny, tmp_path, monkeypatch):
     monkeypatch.setenv("OCTASPLAT_SPLAT_TRANSFORM", str(tmp_path / "nothing"))
     output = tmp_path / "run"
     result = octasplat("reconstruct", scene, "-o", output, *tiny, "--exports", "mesh.glb,scene.sog")
@@ -30,7 +30,7 @@ def test_what_cannot_be_written_is_refused_before_the_training(scene, octasplat,
         assert result.exit_code == 1 and words in result.stderr and not output.exists()
 
 
-def test_what_succeeded_is_kept_and_other_files_need_no_training(
+def test_failed_export_keeps_results_and_resumes_without_training(
     scene, octasplat, tiny, tmp_path, failing_converter
 ):
     output = tmp_path / "run"

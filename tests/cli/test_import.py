@@ -20,7 +20,7 @@ def flat() -> FlatGaussians:
 
 
 @pytest.mark.parametrize("name", ["a.ply", "a.splat", "a.spz", "a.splats.glb"])
-def test_there_and_back(octasplat, flat, tmp_path, name):
+def test_import_exported_scene_round_trips(octasplat, flat, tmp_path, name):
     write_gaussian_ply(flat, tmp_path / "own.ply")
     assert octasplat("export", tmp_path / "own.ply", tmp_path / name).exit_code == 0
     result = octasplat("import", tmp_path / name, tmp_path / "back.ply")
@@ -32,7 +32,7 @@ def test_there_and_back(octasplat, flat, tmp_path, name):
     np.testing.assert_allclose(back.opacities, flat.opacities, atol=0.003)
 
 
-def test_what_flattening_costs_is_told(octasplat, tmp_path):
+def test_import_reports_flattening_loss(octasplat, tmp_path):
     write_thick(tmp_path / "thick.ply", [0.1, 0.2, 0.2, 0.9])
     result = octasplat("import", tmp_path / "thick.ply", tmp_path / "flat.ply")
     assert result.exit_code == 0, result.output
@@ -46,7 +46,7 @@ def test_what_flattening_costs_is_told(octasplat, tmp_path):
     assert quiet.stdout == "" and quiet.stderr.startswith("Warning: ")
 
 
-def test_bad_gaussians_can_be_left_out(octasplat, flat, tmp_path):
+def test_import_drop_invalid_removes_gaussians(octasplat, flat, tmp_path):
     write_gaussian_ply(flat, tmp_path / "a.ply")
     data = bytearray((tmp_path / "a.ply").read_bytes())
     rows = np.frombuffer(data, "<f4", offset=data.index(b"end_header\n") + 11).reshape(60, -1)
@@ -68,7 +68,7 @@ def test_harmonics_can_be_cut(octasplat, flat, tmp_path):
     np.testing.assert_array_equal(back.sh, flat.sh[:, :4])
 
 
-def test_wrong_names(octasplat, flat, tmp_path):
+def test_import_unsupported_names_are_refused(octasplat, flat, tmp_path):
     write_gaussian_ply(flat, tmp_path / "a.ply")
     result = octasplat("import", tmp_path / "a.ply", tmp_path / "b.glb")
     assert result.exit_code == 2 and "octasplat export writes the other formats" in result.stderr
@@ -102,7 +102,7 @@ def write_thick(path, thicknesses):
     write_ply(path, [PlyWriteElement("vertex", len(rows), rows.dtype, iter([rows]))])
 
 
-def test_further_numbers_are_kept_where_they_are_wanted(octasplat, flat, tmp_path):
+def test_import_channels_option_keeps_extra_properties(octasplat, flat, tmp_path):
     label = np.arange(60, dtype=np.float32)[:, None]
     write_gaussian_ply(flat.with_channels({"label": label, "albedo": np.tile(label, 3)}), tmp_path / "a.ply")
     content = (tmp_path / "a.ply").read_bytes()

@@ -9,13 +9,13 @@ import pytest
 from octasplat.engine.evaluate.scene_facts import OPACITY_EDGES
 from octasplat.engine.files.gaussian_ply import read_gaussian_ply, write_gaussian_ply
 from octasplat.engine.operations.info import OPERATION, InfoRequest
-from octasplat.engine.render.images import read_image
-from octasplat.workers.work.kinds import kind_named
-from octasplat.workers.work.programs import run_operation
-from octasplat.workers.work.task import Task
+from octasplat.engine.render.image_files import read_image
+from octasplat.workers.worker.handlers import run_operation
+from octasplat.workers.worker.job_kinds import get_job_kind
+from octasplat.workers.worker.task import Task
 
 
-def test_facts_on_a_file_are_those_of_its_gaussians(run, octasplat, tmp_path):
+def test_info_of_file_matches_gaussians(run, octasplat, tmp_path):
     gaussians, _ = read_gaussian_ply(run.output / "scene.ply")
     count = len(gaussians)
     gaussians = gaussians.with_channels({"roughness": np.ones((count, 1), np.float32)})
@@ -36,29 +36,29 @@ def test_facts_on_a_file_are_those_of_its_gaussians(run, octasplat, tmp_path):
     assert f"{count:,} Gaussians" in words and "roughness (1)" in words and "\x1b" not in words
 
 
-def test_a_run_knows_its_photographs_and_has_a_picture(run, octasplat, tmp_path):
+def test_info_of_run_has_views_and_thumbnail(run, octasplat, tmp_path):
     result = octasplat("info", run.output, "--picture", tmp_path / "look.png")
     assert result.exit_code == 0, result.output
     assert "a run of 8 photographs" in result.stdout and "of the photographs" in result.stdout
     assert read_image(tmp_path / "look.png").std() > 0.02
 
 
-def test_what_is_no_scene_is_one_sentence(octasplat, tmp_path):
+def test_info_not_a_scene_is_refused(octasplat, tmp_path):
     result = octasplat("info", tmp_path / "none.ply")
     assert result.exit_code == 1 and result.stderr.count("\n") == 1 and "none.ply" in result.stderr
 
 
-def test_a_job_and_a_request_tell_what_the_command_tells(run, octasplat, tmp_path):
+def test_info_job_and_request_match_command(run, octasplat, tmp_path):
     done = octasplat("info", run.output, "--json", "--picture", tmp_path / "look.png", "--threads", 1)
     facts = json.loads(done.stdout)
     (tmp_path / "attempt" / "run").mkdir(parents=True)
-    kind = kind_named("info")
+    kind = get_job_kind("info")
     for name in kind.source_files:
         if (run.output / name).exists():
             shutil.copy(run.output / name, tmp_path / "attempt" / "run" / name)
     heard = []
     options = kind.resolve({}).model_dump(mode="json")
-    run_operation(Task(tmp_path / "attempt", options, threads=1, listener=heard.append, kind="info"))
+    run_operation(Task(tmp_path / "attempt", options, threads=1, progress=heard.append, kind="info"))
     results = tmp_path / "attempt" / "results"
     assert sorted(path.name for path in results.iterdir()) == ["info.json", "picture.png"]
     assert json.loads((results / "info.json").read_text()) == {**facts, "source": "the result"}

@@ -6,8 +6,8 @@ import shutil
 import numpy as np
 import pytest
 
-from octasplat.engine.render.environment_map import read_background
-from octasplat.engine.render.images import read_image
+from octasplat.engine.render.environment_files import read_background
+from octasplat.engine.render.image_files import read_image
 
 LEARNT = ("--set", "background=learnt", "--set", "background_height=32")
 
@@ -21,7 +21,7 @@ def far_run(scene, octasplat, tiny, tmp_path_factory):
     return output
 
 
-def test_the_file_holds_what_is_behind_the_gaussians(far_run, octasplat, tmp_path):
+def test_background_file_holds_trained_background(far_run, octasplat, tmp_path):
     colours = read_background(far_run / "background.exr")
     assert colours.shape == (32, 64, 3) and 0 <= colours.min() < colours.max() <= 1
     copied = tmp_path / "run"
@@ -37,7 +37,7 @@ def test_the_file_holds_what_is_behind_the_gaussians(far_run, octasplat, tmp_pat
     assert result.exit_code != 0 and "background.exr" in result.output
 
 
-def test_renders_show_it_unless_another_background_is_asked_for(far_run, octasplat, tmp_path):
+def test_render_uses_trained_background_by_default(far_run, octasplat, tmp_path):
     name = sorted(path.name for path in (far_run / "renders").iterdir())[0]
     shown = {}
     for background in (None, "black", "transparent"):
@@ -53,7 +53,7 @@ def test_renders_show_it_unless_another_background_is_asked_for(far_run, octaspl
     assert (shown[None] - shown["black"])[beside].mean() > 0
 
 
-def test_what_carries_gaussians_alone_says_so(far_run, run, octasplat, tmp_path):
+def test_export_and_clean_mention_background_file(far_run, run, octasplat, tmp_path):
     for source, told in ((far_run, True), (run.output, False)):
         for command in ("export", "clean"):
             asked = (tmp_path / f"{command}.spz",) if command == "export" else ("--dry-run",)
@@ -62,7 +62,7 @@ def test_what_carries_gaussians_alone_says_so(far_run, run, octasplat, tmp_path)
             assert ("background.exr" in result.output) is told
 
 
-def test_a_run_that_was_stopped_has_the_same_background(far_run, scene, octasplat, tiny, tmp_path):
+def test_resumed_run_has_same_background(far_run, scene, octasplat, tiny, tmp_path):
     other = tmp_path / "run"
     shutil.copytree(far_run, other)
     for path in ("scene.ply", "background.exr", "metrics.json", "training.json"):

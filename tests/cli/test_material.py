@@ -12,11 +12,11 @@ from pydantic import ValidationError
 from octasplat.engine.colour import linear_to_srgb
 from octasplat.engine.files import export_scene, read_mesh
 from octasplat.engine.files.gaussian_ply import read_gaussian_ply, write_gaussian_ply
-from octasplat.engine.render.environment_map import write_environment
-from octasplat.engine.render.images import read_image
-from octasplat.workers.work.kinds import kind_named
-from octasplat.workers.work.programs import run_operation
-from octasplat.workers.work.task import Task
+from octasplat.engine.render.environment_files import write_environment
+from octasplat.engine.render.image_files import read_image
+from octasplat.workers.worker.handlers import run_operation
+from octasplat.workers.worker.job_kinds import get_job_kind
+from octasplat.workers.worker.task import Task
 
 VIEW = "view_000"
 
@@ -39,7 +39,7 @@ def changed(shiny_run, octasplat, tmp_path_factory) -> Path:
     return output
 
 
-def test_the_chosen_ones_have_other_materials_and_nothing_else_changes(shiny_run, changed):
+def test_material_changes_selected_gaussians_only(shiny_run, changed):
     before, after = scene_of(shiny_run), scene_of(changed)
     chosen = before.means_world[:, 0] > 0
     assert 0 < chosen.sum() < len(chosen)
@@ -75,13 +75,13 @@ def test_the_folder_is_a_run_for_every_command(shiny_run, changed, octasplat, tm
     assert done.exit_code == 0 and len(json.loads((tmp_path / "again" / "edits.json").read_text())) == 2
 
 
-def test_a_job_gives_the_bytes_of_the_command(shiny_run, changed, tmp_path):
+def test_material_job_matches_command_bytes(shiny_run, changed, tmp_path):
     shutil.copytree(shiny_run, tmp_path / "attempt" / "run")
     asked = {
         "set": {"albedo": "#ff8000", "metallic": 0}, "scale": {"roughness": 1.5},
         "where": "x > 0 and roughness < 0.6",
     }  # fmt: skip
-    options = kind_named("material").resolve(asked)
+    options = get_job_kind("material").resolve(asked)
     dumped = options.model_dump(mode="json")
     run_operation(Task(tmp_path / "attempt", dumped, title="a thing", threads=1, kind="material"))
     results = tmp_path / "attempt" / "results"
@@ -89,14 +89,14 @@ def test_a_job_gives_the_bytes_of_the_command(shiny_run, changed, tmp_path):
     assert (results / "edits.json").read_bytes() == (changed / "edits.json").read_bytes()
     assert json.loads((results / "config.json").read_text())["scene"] == "a thing"
     for kind in ("relight", "material", "render", "evaluate"):  # what it is given is among these results
-        wanted = set(kind_named(kind).source_files) - {"edits.json", "background.exr"}
+        wanted = set(get_job_kind(kind).source_files) - {"edits.json", "background.exr"}
         assert wanted <= {path.name for path in results.iterdir()}, kind
     for wrong in ({}, {"set": {"roughness": 2}}, {**asked, "where": "open(1) > 2"}):
         with pytest.raises(ValidationError):
-            kind_named("material").resolve(wrong)
+            get_job_kind("material").resolve(wrong)
 
 
-def test_a_job_takes_masks_that_were_sent(shiny_run, octasplat, tmp_path):
+def test_material_job_uses_uploaded_masks(shiny_run, octasplat, tmp_path):
     mask = np.zeros((96, 128), np.uint8)
     mask[:, :64] = 255
     (tmp_path / "attempt" / "files").mkdir(parents=True)
@@ -107,7 +107,7 @@ def test_a_job_takes_masks_that_were_sent(shiny_run, octasplat, tmp_path):
     )  # fmt: skip
     assert done.exit_code == 0, done.output
     shutil.copytree(shiny_run, tmp_path / "attempt" / "run")
-    kind = kind_named("material")
+    kind = get_job_kind("material")
     options = kind.resolve({"set": ["metallic=0"], "inverse": True, "masks": [f"{VIEW}.png"]})
     assert list(kind.named_files(options)) == [("masks.0", f"{VIEW}.png")] and kind.takes_files
     run_operation(Task(tmp_path / "attempt", options.model_dump(mode="json"), threads=1, kind="material"))
@@ -118,7 +118,7 @@ def test_a_job_takes_masks_that_were_sent(shiny_run, octasplat, tmp_path):
     assert not {"mesh", "masks"} & without.keys()  # which workers of the last version do not know
 
 
-def test_harmonics_follow_and_come_back(changed, shiny_run, octasplat, tmp_path):
+def test_material_change_reverted_restores_appearance(changed, shiny_run, octasplat, tmp_path):
     """What is changed back looks as before, and in white light white metal is brighter than black."""
     light = np.full((16, 32, 3), 0.5, np.float32)
     write_environment(changed / "environment.hdr", light)
@@ -156,7 +156,7 @@ def test_a_file_is_changed_by_a_mesh_of_which_the_rest_was_deleted(shiny_run, oc
     assert set(np.flatnonzero(rough)) == set(mesh.gid[kept].astype(int))
 
 
-def test_a_mask_means_what_shows_under_it(shiny_run, octasplat, tmp_path):
+def test_material_mask_selects_visible_gaussians(shiny_run, octasplat, tmp_path):
     """Blue is what the masked half of one picture then shows, and next to nothing of its other half."""
     mask = np.zeros((96, 128), np.uint8)
     mask[:, :64] = 255
@@ -192,7 +192,9 @@ def test_a_mask_means_what_shows_under_it(shiny_run, octasplat, tmp_path):
         (("shiny.ply", "--set", "metallic=1", "--mask", "a.png"), "masks need the folder of a run"),
     ],
 )
-def test_mistakes_are_one_sentence(shiny_run, octasplat, tmp_path, monkeypatch, arguments, told):
+def test_material_invalid_arguments_print_one_sentence(
+    shiny_run, octasplat, tmp_path, monkeypatch, arguments, told
+):
     monkeypatch.chdir(tmp_path)
     write_gaussian_ply(scene_of(shiny_run), tmp_path / "shiny.ply")
     write_gaussian_ply(scene_of(shiny_run).without_channels(["roughness"]), tmp_path / "plain.ply")
@@ -208,13 +210,13 @@ def test_mistakes_are_one_sentence(shiny_run, octasplat, tmp_path, monkeypatch, 
         (("--set", "metallic=1", "--scale", "metallic=2"), "metallic is set and scaled"),
     ],
 )
-def test_requests_that_are_none_are_mistakes_of_usage(shiny_run, octasplat, tmp_path, arguments, told):
+def test_material_without_change_is_usage_error(shiny_run, octasplat, tmp_path, arguments, told):
     done = octasplat("material", shiny_run, *arguments, "-o", tmp_path / "out.ply")
     assert done.exit_code == 2 and told in done.stderr.splitlines()[-1], done.stderr
     assert not (tmp_path / "out.ply").exists()
 
 
-def test_a_folder_that_is_there_and_a_mask_of_nothing(shiny_run, octasplat, tmp_path):
+def test_material_unusable_output_or_mask_is_refused(shiny_run, octasplat, tmp_path):
     (tmp_path / "there").mkdir()
     (tmp_path / "there" / "file").write_text("x")
     (tmp_path / "view_000.png").write_text("no picture")

@@ -9,7 +9,7 @@ import pytest
 
 from octasplat.engine.files.gaussian_ply import read_gaussian_ply
 from octasplat.engine.gaussians.materials import has_materials
-from octasplat.engine.render.environment_map import read_environment
+from octasplat.engine.render.environment_files import read_environment
 
 MATERIALS = (
     "--materials", "--set", "materials.environment_height=16", "--set", "materials.ambient_occlusion_rays=4",
@@ -25,7 +25,7 @@ def materials_run(scene, octasplat, tiny, tmp_path_factory):
     return output
 
 
-def test_it_leaves_materials_and_an_environment(materials_run):
+def test_materials_run_writes_channels_and_environment(materials_run):
     gaussians, _ = read_gaussian_ply(materials_run / "scene.ply")
     assert has_materials(gaussians)
     for values in gaussians.channels.values():
@@ -39,7 +39,7 @@ def test_it_leaves_materials_and_an_environment(materials_run):
     assert train["materials"]["learn"] is True and train["lr"]["quat"] < 0.01
 
 
-def test_it_is_measured_as_it_is_shaded(materials_run, octasplat):
+def test_materials_run_evaluates_shaded_images(materials_run, octasplat):
     before = json.loads((materials_run / "metrics.json").read_text())
     result = octasplat("evaluate", materials_run)
     assert result.exit_code == 0, result.output
@@ -53,7 +53,7 @@ def test_it_is_measured_as_it_is_shaded(materials_run, octasplat):
     assert "Traceback" not in result.output
 
 
-def test_a_stopped_run_goes_on_to_the_same_bytes(
+def test_materials_run_resumes_to_same_bytes(
     materials_run, scene, start_octasplat, tiny, octasplat, tmp_path
 ):
     output = tmp_path / "run"

@@ -18,9 +18,9 @@ from octasplat.engine.events import (
     Warned,
 )
 from octasplat.engine.stages import stopping
-from octasplat.workers.cli.progress import Bars, show_progress
-from octasplat.workers.telling.lines import PlainLines
-from octasplat.workers.telling.wording import rate
+from octasplat.workers.cli.progress import ProgressBars, show_progress
+from octasplat.workers.reporting.event_lines import EventLines
+from octasplat.workers.reporting.wording import format_rate
 
 TRAINING = TrainingProgress(
     iteration=310, total_iterations=1500, loss=0.1, psnr=24.13, gaussians=32000, rays_per_second=310_400,
@@ -30,9 +30,9 @@ HELD_OUT = HeldOutMeasured(iteration=250, psnr=23.04, gaussians=30000, seconds=1
 STATE = "training 24.1 dB, held out 23.0 dB, 32,000 Gaussians, 310k rays/s"
 
 
-def test_plain_lines_tell_the_state_of_the_training():
+def test_plain_lines_show_training_state():
     lines = []
-    show = PlainLines(lines.append, every_seconds=0.0)
+    show = EventLines(lines.append, interval_seconds=0.0)
     for event in (StageStarted("train", 1500), HELD_OUT, TRAINING, StageFinished("train", 83.4)):
         show(event)
     assert lines == [
@@ -42,9 +42,9 @@ def test_plain_lines_tell_the_state_of_the_training():
     ]
 
 
-def test_plain_lines_come_at_intervals():
+def test_plain_lines_are_rate_limited():
     lines = []
-    show = PlainLines(lines.append, every_seconds=0.2)
+    show = EventLines(lines.append, interval_seconds=0.2)
     show(StageStarted("load", 100))
     end = time.monotonic() + 0.5
     while time.monotonic() < end:
@@ -67,7 +67,7 @@ def terminal():
 
 def test_bar_fits_a_narrow_terminal_and_shows_everything(terminal):
     console, written = terminal
-    display = Bars(console, lambda: False)
+    display = ProgressBars(console, lambda: False)
     with display.bars:
         for event in (StageStarted("train", 1500), HELD_OUT, TRAINING):
             display(event)
@@ -78,10 +78,10 @@ def test_bar_fits_a_narrow_terminal_and_shows_everything(terminal):
     assert max(map(len, re.split(r"[\r\n]+", text))) <= 80
 
 
-def test_bar_leaves_one_line_a_stage_and_acknowledges_a_stop(terminal):
+def test_progress_bar_leaves_line_per_stage_and_shows_stop(terminal):
     console, written = terminal
     stop = []
-    display = Bars(console, lambda: bool(stop))
+    display = ProgressBars(console, lambda: bool(stop))
     with display.bars:
         for event in (StageStarted("load"), StageProgress("load", 4, 4), StageFinished("load", 0.25)):
             display(event)
@@ -94,7 +94,7 @@ def test_bar_leaves_one_line_a_stage_and_acknowledges_a_stop(terminal):
     assert "Stopping" in written.getvalue()
 
 
-def test_work_outside_of_training_stops_at_its_next_step():
+def test_should_stop_between_steps_cancels():
     heard, stop = [], []
     listen = stopping(heard.append, lambda: bool(stop))
     listen(StageProgress("export", 1, 3))
@@ -116,10 +116,10 @@ def test_work_outside_of_training_stops_at_its_next_step():
         (duration(59.7), "1:00 min"),
         (duration(185), "3:05 min"),
         (duration(3723), "1:02:03 h"),
-        (rate(870), "870"),
-        (rate(310_400), "310k"),
-        (rate(1_254_000), "1.25M"),
+        (format_rate(870), "870"),
+        (format_rate(310_400), "310k"),
+        (format_rate(1_254_000), "1.25M"),
     ],
 )
-def test_numbers_in_words(shown, expected):
+def test_rate_is_formatted_with_suffix(shown, expected):
     assert shown == expected

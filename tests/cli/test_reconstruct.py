@@ -23,7 +23,7 @@ def events(output):
     return [json.loads(line) for line in (output / "events.jsonl").read_text().splitlines()]
 
 
-def test_a_run_leaves_all_its_files(run):
+def test_reconstruct_writes_all_files(run):
     for name in FILES:
         assert (run.output / name).stat().st_size > 0, name
     assert list((run.output / "checkpoints").glob("*.npz"))
@@ -57,7 +57,7 @@ def test_plain_output_has_no_control_characters_and_names_the_results(run):
     assert "rays/s" in run.stdout
 
 
-def test_the_training_time_is_told_once_and_the_same(run):
+def test_training_time_is_reported_once(run):
     (finished,) = [e for e in events(run.output) if e["kind"] == "stage_finished" and e["stage"] == "train"]
     training = json.loads((run.output / "training.json").read_text())
     assert finished["seconds"] == training["seconds"] == run.metrics()["seconds"]
@@ -65,7 +65,7 @@ def test_the_training_time_is_told_once_and_the_same(run):
     assert len(told) == 2 and len(set(told)) == 1, run.stdout
 
 
-def test_corrected_poses_are_written_where_that_is_asked_for(run, octasplat, tiny, tmp_path):
+def test_reconstruct_writes_refined_poses_on_request(run, octasplat, tiny, tmp_path):
     assert "poses" not in json.loads((run.output / "training.json").read_text())
     output = tmp_path / "run"
     asked = ("--set", "refine_poses=true", "--exports", "")
@@ -101,7 +101,7 @@ def test_resume_with_other_settings_is_refused(run, octasplat):
     assert "settings" in result.stderr
 
 
-def test_resume_without_a_run_starts_and_quiet_says_nothing(scene, octasplat, tiny, tmp_path):
+def test_resume_without_run_starts_and_quiet_prints_nothing(scene, octasplat, tiny, tmp_path):
     result = octasplat(
         "reconstruct", scene, "-o", tmp_path / "run", "--resume", "--quiet", *tiny,
         "--iterations", 3, "--held-out", "view_001.png", "--held-out", "view_002.png",
@@ -141,7 +141,7 @@ def test_a_signal_stops_with_a_checkpoint_and_resume_completes(
     assert finished["seconds"] == metrics["seconds"] > before > 0, "the time before the stop counts too"
 
 
-def test_a_signal_while_evaluating_stops_too(run, octasplat, monkeypatch):
+def test_signal_during_evaluation_stops_run(run, octasplat, monkeypatch):
     (run.output / "report.html").unlink()
 
     def interrupt(*_arguments):
@@ -156,7 +156,7 @@ def test_a_signal_while_evaluating_stops_too(run, octasplat, monkeypatch):
     assert (run.output / "report.html").exists()
 
 
-def test_a_terminal_gets_a_bar(scene, tiny, tmp_path):
+def test_terminal_output_has_progress_bar(scene, tiny, tmp_path):
     master, slave = pty.openpty()
     process = subprocess.Popen(
         [sys.executable, "-c", "from octasplat.workers.cli.main import main; main()",

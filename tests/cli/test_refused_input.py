@@ -45,7 +45,7 @@ def place(model: pycolmap.Reconstruction, name: str, centre_world: np.ndarray) -
         ("points3D.txt", 3, 2, "point 4"),
     ],
 )
-def test_a_number_that_is_none_in_a_text_model(edited, octasplat, tmp_path, file, first, field, whose):
+def test_text_model_with_nan_is_refused(edited, octasplat, tmp_path, file, first, field, whose):
     copy = edited(lambda _model: None, text=True)
     path = copy / "sparse/0" / file
     lines = path.read_text().splitlines()
@@ -61,7 +61,7 @@ def test_a_number_that_is_none_in_a_text_model(edited, octasplat, tmp_path, file
     assert re.search(rf"'nan' where a finite number belongs in {whose} ", result.stderr)
 
 
-def test_a_camera_beyond_all_measure_is_refused(edited, octasplat, tmp_path):
+def test_camera_with_huge_position_is_refused(edited, octasplat, tmp_path):
     copy = edited(lambda model: place(model, "view_003.png", np.array([1e12, 0.0, 0.0])))
     result = octasplat("reconstruct", copy, "-o", tmp_path / "run", *ONE_STEP)
     assert result.exit_code == 1
@@ -69,7 +69,7 @@ def test_a_camera_beyond_all_measure_is_refused(edited, octasplat, tmp_path):
     assert str(copy / "sparse/0") in result.stderr
 
 
-def test_a_camera_that_is_far_off_is_told(edited, octasplat, tmp_path, tiny):
+def test_distant_camera_warns(edited, octasplat, tmp_path, tiny):
     copy = edited(lambda model: place(model, "view_003.png", np.array([200.0, 0.0, 0.0])))
     result = octasplat("reconstruct", copy, "-o", tmp_path / "run", *tiny, *ONE_STEP)
     assert result.exit_code == 0, result.output
@@ -77,7 +77,7 @@ def test_a_camera_that_is_far_off_is_told(edited, octasplat, tmp_path, tiny):
     assert "view_003.png" in result.stderr and "times as far" in result.stderr
 
 
-def test_one_pose_for_all_images_is_refused(edited, octasplat, tmp_path):
+def test_identical_poses_are_refused(edited, octasplat, tmp_path):
     def gather(model: pycolmap.Reconstruction) -> None:
         for frame in model.frames.values():
             frame.rig_from_world = model.frames[1].rig_from_world
@@ -88,7 +88,7 @@ def test_one_pose_for_all_images_is_refused(edited, octasplat, tmp_path):
     assert "view_000.png" in result.stderr
 
 
-def test_poses_shared_by_some_images_are_told(edited, octasplat, tmp_path, tiny):
+def test_duplicate_poses_warn(edited, octasplat, tmp_path, tiny):
     def double(model: pycolmap.Reconstruction) -> None:
         pose = model.find_image_with_name("view_005.png").cam_from_world()
         model.find_image_with_name("view_002.png").frame.rig_from_world = pose

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from octasplat.engine.colour import linear_to_srgb
-from octasplat.engine.files import read_facts
+from octasplat.engine.files import read_metadata
 from octasplat.engine.files.gaussian_ply import read_gaussian_ply, write_gaussian_ply
-from octasplat.engine.render.images import read_channels, read_image
+from octasplat.engine.render.image_files import read_channels, read_image
 
 SIZE = ("--width", 32, "--height", 24)
 
@@ -52,7 +52,7 @@ def test_views_of_a_run_whose_photographs_moved(run, octasplat, tmp_path):
 
 
 @pytest.mark.parametrize("bare", [False, True])
-def test_turntable_as_video(run, octasplat, tmp_path, bare):
+def test_render_turntable_writes_video(run, octasplat, tmp_path, bare):
     source = run.output / "scene.ply" if bare else run.output
     video = tmp_path / "turn.mp4"
     result = octasplat("render", source, "-o", video, "--turntable", "--frames", 4, *SIZE)
@@ -62,7 +62,7 @@ def test_turntable_as_video(run, octasplat, tmp_path, bare):
     assert frames.std() > 1, "the images are empty"
 
 
-def test_seconds_and_fps_give_the_number_of_frames(run, octasplat, tmp_path):
+def test_render_seconds_and_fps_set_frame_count(run, octasplat, tmp_path):
     result = octasplat(
         "render", run.output / "scene.ply", "-o", tmp_path / "f%02d.png", "--seconds", 0.5, "--fps", 6,
         "--up", "z", *SIZE,
@@ -85,7 +85,7 @@ def test_exr_has_depth_and_normals(run, octasplat, tmp_path):
 
 def test_a_run_and_its_file_give_one_picture(run, octasplat, tmp_path):
     gaussians, _ = read_gaussian_ply(run.output / "scene.ply")
-    facts = read_facts(run.output)
+    facts = read_metadata(run.output)
     near = facts.near_world
     assert near > 0
     assert facts.pixel_rad > 0
@@ -114,7 +114,7 @@ def test_a_run_and_its_file_give_one_picture(run, octasplat, tmp_path):
     )
 
 
-def test_background(run, octasplat, tmp_path):
+def test_render_background_sets_empty_pixels(run, octasplat, tmp_path):
     up = np.eye(4)
     up[:3, 3] = (0, 0, 50)  # above everything, looking up
     path = write_path(tmp_path / "cameras.json", up)
@@ -158,7 +158,7 @@ def test_the_documented_camera_path_renders_and_both_of_its_lenses_agree(run, oc
     assert np.abs(read_image(tmp_path / "again/frame_0000.png") - images[1]).mean() < 0.01
 
 
-def test_what_is_no_camera_path_names_the_document(run, octasplat, tmp_path):
+def test_render_invalid_camera_path_is_named(run, octasplat, tmp_path):
     path = tmp_path / "cameras.json"
     path.write_text(documented_path().replace("camera_to_world", "pose"))
     result = octasplat("render", run.output, "-o", tmp_path / "frames", "--path", path)
@@ -187,7 +187,7 @@ def test_contradictions_are_usage_errors(run, octasplat, arguments):
 
 
 @pytest.mark.parametrize("bare", [False, True])
-def test_one_camera_makes_one_file(run, octasplat, tmp_path, bare):
+def test_render_single_camera_writes_one_file(run, octasplat, tmp_path, bare):
     source = run.output / "scene.ply" if bare else run.output
     result = octasplat(
         "render", source, "-o", tmp_path / "still.png", "--camera", 12, 12, 8, "--look-at", 0, 0, 0,
@@ -235,7 +235,7 @@ def test_views_of_a_bare_ply_are_refused(run, octasplat, tmp_path):
 
 
 @pytest.mark.parametrize("source", ["none.ply", "."])
-def test_what_is_no_scene(octasplat, tmp_path, source):
+def test_render_not_a_scene_is_refused(octasplat, tmp_path, source):
     result = octasplat("render", tmp_path / source, "-o", tmp_path / "out")
     assert result.exit_code == 1
     assert result.stderr.startswith("Error: ") and result.stderr.count("\n") == 1

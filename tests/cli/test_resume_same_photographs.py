@@ -10,7 +10,7 @@ import numpy as np
 import pycolmap
 import pytest
 
-from octasplat.engine.render.images import read_image, write_png
+from octasplat.engine.render.image_files import read_image, write_png
 
 
 def content(folder: Path) -> dict[str, tuple[int, bytes]]:
@@ -73,9 +73,7 @@ def fewer_points(model: pycolmap.Reconstruction) -> None:
         (changed_model(fewer_points), "other sparse points"),
     ],
 )
-def test_other_photographs_or_models_are_refused_and_nothing_changes(
-    run, octasplat, tmp_path, change, told, finished
-):
+def test_resume_with_other_photographs_is_refused(run, octasplat, tmp_path, change, told, finished):
     output, others = tmp_path / "run", tmp_path / "others"
     shutil.copytree(run.output, output)
     if not finished:
@@ -90,7 +88,7 @@ def test_other_photographs_or_models_are_refused_and_nothing_changes(
     assert content(output) == before
 
 
-def test_in_place_changes_are_refused_too(run, octasplat, tmp_path):
+def test_resume_with_photographs_changed_in_place_is_refused(run, octasplat, tmp_path):
     output, scene = tmp_path / "run", tmp_path / "scene"
     shutil.copytree(run.scene, scene)
     shutil.copytree(run.output, output)

@@ -21,7 +21,7 @@ def test_run_to_each_format(run, octasplat, tmp_path):
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a.glb", "a.obj", "a.ply"]
 
 
-def test_everything_at_once(run, octasplat, tmp_path):
+def test_surface_all_options_write_textured_obj(run, octasplat, tmp_path):
     result = octasplat(
         "surface", run.output / "scene.ply", "--dataset", run.scene, "-o", tmp_path / "new" / "a.obj", *SMALL,
         "--bounds", "-1,-1,-0.5,1,1,1", "--components", 1, "--fill-holes", "all", "--max-triangles", 500,
@@ -36,7 +36,7 @@ def test_everything_at_once(run, octasplat, tmp_path):
     assert sorted(path.name for path in (tmp_path / "new").iterdir()) == ["a.mtl", "a.obj", "a.png"]
 
 
-def test_several_levels_of_detail_are_those_that_come_one_by_one(run, octasplat, tmp_path):
+def test_surface_levels_of_detail_match_single_runs(run, octasplat, tmp_path):
     options = (*SMALL, "--texture-size", 64, "--threads", 1)
     result = octasplat(
         "surface", run.output, "-o", tmp_path / "a.glb", *options, "--max-triangles", "0.3k,100"
@@ -50,14 +50,14 @@ def test_several_levels_of_detail_are_those_that_come_one_by_one(run, octasplat,
     assert (tmp_path / "b.glb").read_bytes() == (tmp_path / "a_100.glb").read_bytes()
 
 
-def test_unbounded_and_quiet(run, octasplat, tmp_path):
+def test_surface_unbounded_quiet_prints_nothing(run, octasplat, tmp_path):
     result = octasplat("surface", run.output, "-o", tmp_path / "a.ply", *SMALL, "--unbounded", "--quiet")
     assert result.exit_code == 0, result.output
     assert result.output == ""
     assert (tmp_path / "a.ply").exists()
 
 
-def test_file_alone_is_seen_from_all_around(run, octasplat, tmp_path):
+def test_surface_of_file_uses_surrounding_cameras(run, octasplat, tmp_path):
     result = octasplat(
         "surface", run.output / "scene.ply", "-o", tmp_path / "a.ply", "--resolution", 32, "--depth-side", 24
     )
@@ -108,7 +108,7 @@ def test_options_that_make_no_sense(run, octasplat, tmp_path, bad):
     assert bad[1].split(",")[-1] in result.output
 
 
-def test_ctrl_c_leaves_nothing(run, start_octasplat, tmp_path):
+def test_surface_interrupted_leaves_no_files(run, start_octasplat, tmp_path):
     process = start_octasplat(
         "surface", run.output, "-o", tmp_path / "a.ply", "--depth-side", 64, "--resolution", 2000,
         "--threads", 1,

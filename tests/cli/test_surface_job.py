@@ -7,14 +7,14 @@ from pathlib import Path
 import pytest
 from pydantic import ValidationError
 
-from octasplat.engine.operations.base import first_complaint
-from octasplat.engine.operations.surface import MATERIAL_DEFAULTS, ROOM, SurfaceRequest
+from octasplat.engine.operations.base import first_error
+from octasplat.engine.operations.surface import MATERIAL_DEFAULTS, ROOM_DEFAULTS, SurfaceRequest
 from octasplat.engine.photograph_sizes import Sizes
-from octasplat.workers.work.kinds import kind_named
-from octasplat.workers.work.programs import run_operation
-from octasplat.workers.work.task import Task
+from octasplat.workers.worker.handlers import run_operation
+from octasplat.workers.worker.job_kinds import get_job_kind
+from octasplat.workers.worker.task import Task
 
-SURFACE = kind_named("surface")
+SURFACE = get_job_kind("surface")
 
 
 def results_of(run: Path, attempt: Path, options: dict[str, object], **task: object) -> Path:
@@ -111,7 +111,7 @@ def test_materials_bring_their_light(shiny_run, octasplat, tmp_path):
 def test_texts_are_read_alike_by_command_and_job(octasplat, tmp_path, name, flag, text, value):
     with pytest.raises(ValidationError) as refused:
         SURFACE.resolve({name: text})
-    sentence = first_complaint(refused.value).removeprefix(f"{name}: ")
+    sentence = first_error(refused.value).removeprefix(f"{name}: ")
     done = octasplat("surface", tmp_path / "none.ply", "-o", tmp_path / "a.glb", flag, text)
     assert done.exit_code == 1 and done.stderr == f"Error: {flag}: {sentence}\n"
     joined = ",".join(map(str, value)) if isinstance(value, list) else str(value)
@@ -119,19 +119,19 @@ def test_texts_are_read_alike_by_command_and_job(octasplat, tmp_path, name, flag
     assert as_text == as_json == SURFACE.resolve(as_json.model_dump(mode="json"))
 
 
-def test_presets_decide_what_is_left_open():
+def test_surface_job_presets_fill_unset_options():
     room = SURFACE.resolve({"room": True, "resolution": 99, "unseen": "open"})
-    decided = {name: getattr(room, name) for name in ROOM}
-    assert decided == {**ROOM, "resolution": 99, "unseen": "open"}
+    decided = {name: getattr(room, name) for name in ROOM_DEFAULTS}
+    assert decided == {**ROOM_DEFAULTS, "resolution": 99, "unseen": "open"}
     lit = SURFACE.resolve({"materials": True, "max_triangles": "5k"})
     assert lit.texture_size == MATERIAL_DEFAULTS["texture_size"] and dict(lit.levels) == {"5k": 5000}
-    plain = SURFACE.revised(room.model_dump(mode="json"), {"room": False})
+    plain = SURFACE.revise(room.model_dump(mode="json"), {"room": False})
     assert plain == SURFACE.resolve({"resolution": 99})
     request = SurfaceRequest(source="a.ply", output="b.glb", room=True, max_triangles=("5k", "60000"))
     assert request.refine_vertices and [path.name for path in request.outputs] == ["b_5k.glb", "b_60000.glb"]
 
 
-def test_photographs_are_asked_for_where_colours_are_fitted():
+def test_surface_job_colour_fit_needs_photographs():
     for options, needed in (({}, True), ({"fit": False}, False), ({"materials": True}, False)):
         assert SURFACE.needs_photographs(SURFACE.resolve(options)) is needed
 
@@ -146,16 +146,19 @@ def test_photographs_are_asked_for_where_colours_are_fitted():
         ({"bounds": "0,0,0,1,1,0"}, "z0 < z1"),
     ],
 )
-def test_what_contradicts_is_refused(options, told):
+def test_surface_job_contradictory_options_are_refused(options, told):
     with pytest.raises(ValidationError) as refused:
         SURFACE.resolve(options)
-    assert told in first_complaint(refused.value)
+    assert told in first_error(refused.value)
 
 
 def test_maps_and_levels_of_a_surface_have_ceilings():
-    kind = kind_named("surface")
+    kind = get_job_kind("surface")
     options = kind.resolve({"depth_side": 8000, "texture_size": 4096, "max_triangles": "5k,50k"})
-    amounts = {(found.path, found.of): found.amount for found in kind.demands(options, [Sizes(400, 300, 10)])}
+    amounts = {
+        (found.path, found.resource): found.amount
+        for found in kind.resource_demands(options, [Sizes(400, 300, 10)])
+    }
     assert amounts == {
         ("depth_side", "side_px"): 8000,
         ("texture_size", "side_px"): 4096,

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from octasplat.engine.files.gaussian_ply import write_gaussian_ply
-from octasplat.engine.files.gltf import GlbFile
-from octasplat.engine.gaussians.frames import frames_from_normals, quaternions
+from octasplat.engine.files.glb_container import GlbFile
+from octasplat.engine.gaussians.frames import frames_from_normals, quaternions_from_matrices
 from octasplat.engine.gaussians.model import FlatGaussians
-from octasplat.engine.render.environment_map import write_environment
+from octasplat.engine.render.environment_files import write_environment
 
 SMALL = ("--resolution", 32, "--depth-side", 24, "--texture-size", 64, "--max-triangles", 400, "--threads", 1)
 
@@ -22,7 +22,7 @@ def shiny(tmp_path_factory: pytest.TempPathFactory) -> Path:
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     ball = FlatGaussians(
         normals.astype(np.float32),
-        quaternions(frames_from_normals(normals)).astype(np.float32),
+        quaternions_from_matrices(frames_from_normals(normals)).astype(np.float32),
         np.full((800, 2), np.log(0.12), np.float32),
         np.full(800, 6.0, np.float32),
         np.zeros((800, 1, 3), np.float32),
@@ -51,7 +51,7 @@ def test_a_run_gives_textures_and_its_light(shiny, octasplat, tmp_path):
     assert not (tmp_path / "b.glb").exists()
 
 
-def test_a_file_stands_as_it_is_told(shiny, octasplat, tmp_path):
+def test_surface_lit_up_axis_option_orients_glb(shiny, octasplat, tmp_path):
     for up, axis in (((), (0, -1, 0)), (("--up", "z"), (0, 0, 1))):
         result = octasplat(
             "surface", shiny / "scene.ply", "--materials", *up, "-o", tmp_path / "a.glb", *SMALL
@@ -66,7 +66,7 @@ def test_a_file_stands_as_it_is_told(shiny, octasplat, tmp_path):
     ("source", "name", "complaint"),
     [("plain.ply", "a.glb", "has no materials"), ("scene.ply", "a.obj", "written as .glb")],
 )
-def test_refusals(shiny, octasplat, tmp_path, source, name, complaint):
+def test_surface_lit_unusable_input_is_refused(shiny, octasplat, tmp_path, source, name, complaint):
     result = octasplat("surface", shiny / source, "--materials", "-o", tmp_path / name, *SMALL, "--quiet")
     assert result.exit_code == 1
     assert complaint in result.output and result.output.count("\n") == 1

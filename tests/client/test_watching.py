@@ -34,9 +34,9 @@ def serving(address: tuple[str, int]) -> ThreadingHTTPServer:
     return server
 
 
-def test_a_service_may_be_away_for_longer_than_one_request_is_tried(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(api, "STRANGER_SECONDS", 0.5)
-    monkeypatch.setattr(api, "AWAY_SECONDS", 0.5)
+def test_watch_job_survives_long_outage(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(api, "MAX_FIRST_OUTAGE_SECONDS", 0.5)
+    monkeypatch.setattr(api, "MAX_OUTAGE_SECONDS", 0.5)
     server = serving(("127.0.0.1", 0))
     host, port = server.server_address[0], server.server_address[1]
     found: list[str] = []

@@ -22,7 +22,7 @@ KEPT = re.compile(r"PIP_\w+|SSL_CERT_\w+|https?_proxy|no_proxy", re.IGNORECASE)
 """How this machine reaches the network."""
 
 
-def lacking() -> str | None:
+def missing_requirement() -> str | None:
     """Why there can be no such chroot here, or None."""
     if os.geteuid() != 0:
         return "a chroot needs root"
@@ -33,7 +33,7 @@ def lacking() -> str | None:
 
 
 @dataclass
-class Image:
+class ChrootImage:
     """A stage that was built.
 
     Attributes:
@@ -138,7 +138,9 @@ class Image:
 
 
 @contextmanager
-def built(stage: str, folder: Path, arguments: Mapping[str, str] | None = None) -> Iterator[Image]:
+def build_image(
+    stage: str, folder: Path, arguments: Mapping[str, str] | None = None
+) -> Iterator[ChrootImage]:
     """A stage, built step by step in ``folder``; ``arguments`` are those of ARG."""
     for name in ("upper", "work", "root"):
         (folder / name).mkdir(parents=True)
@@ -152,7 +154,7 @@ def built(stage: str, folder: Path, arguments: Mapping[str, str] | None = None) 
         for name in ("/root", "/root/.pyenv"):  # where this machine's Python may be
             if (root / name.lstrip("/")).is_dir():
                 (root / name.lstrip("/")).chmod(0o755)
-        image = Image(root, {"PATH": os.environ["PATH"], "HOME": "/tmp"})
+        image = ChrootImage(root, {"PATH": os.environ["PATH"], "HOME": "/tmp"})
         for at, word, rest in instructions():
             if at in ("base", stage):
                 image.take(word, rest, arguments or {})

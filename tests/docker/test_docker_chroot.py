@@ -10,13 +10,13 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from image_in_chroot import Image, built, lacking
+from image_in_chroot import ChrootImage, build_image, missing_requirement
 from moto.server import ThreadedMotoServer
-from namespaces import door
+from namespaces import forward_socket
 from psycopg.conninfo import conninfo_to_dict, make_conninfo
 from test_docker_files import compose
 
-from octasplat.engine.scene.generated import GeneratedSceneConfig, write_generated_scene
+from octasplat.engine.dataset.synthetic import SyntheticDatasetConfig, write_synthetic_dataset
 from octasplat.workers.client.api import Api
 from octasplat.workers.client.download import download_results
 from octasplat.workers.client.submission import Submission, submit
@@ -27,7 +27,7 @@ pytestmark = [
     pytest.mark.skipif(
         "OCTASPLAT_CHROOT_IMAGES" not in os.environ, reason="OCTASPLAT_CHROOT_IMAGES is not set"
     ),
-    pytest.mark.skipif(lacking() is not None, reason=str(lacking())),
+    pytest.mark.skipif(missing_requirement() is not None, reason=str(missing_requirement())),
 ]
 FEW = {
     "iterations": 60, "rays_per_batch": 256, "max_gaussians": 400, "initial_points": 300, "probe_rays": 256,
@@ -36,15 +36,15 @@ TOKEN = "octa_of_this_test"
 
 
 @pytest.fixture(scope="module")
-def front_end(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Image]:
-    with built("front-end", tmp_path_factory.mktemp("front-end")) as image:
+def front_end(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ChrootImage]:
+    with build_image("front-end", tmp_path_factory.mktemp("front-end")) as image:
         yield image
 
 
 @pytest.fixture(scope="module")
-def worker(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Image]:
+def worker(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ChrootImage]:
     arguments = {"TORCH_INDEX": os.environ.get("TORCH_INDEX", "")}
-    with built("worker-cpu", tmp_path_factory.mktemp("worker-cpu"), arguments) as image:
+    with build_image("worker-cpu", tmp_path_factory.mktemp("worker-cpu"), arguments) as image:
         yield image
 
 
@@ -52,11 +52,13 @@ def worker(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Image]:
 def database(conninfo: str) -> Iterator[str]:
     """The database over TCP, as containers reach it."""
     facts = conninfo_to_dict(conninfo)
-    with door(f"{facts['host']}/.s.PGSQL.{facts['port']}", "127.0.0.1") as port:
+    with forward_socket(f"{facts['host']}/.s.PGSQL.{facts['port']}", "127.0.0.1") as port:
         yield make_conninfo(conninfo, host="127.0.0.1", port=port)
 
 
-def test_the_images_work_together(front_end: Image, worker: Image, database: str, tmp_path: Path) -> None:
+def test_the_images_work_together(
+    front_end: ChrootImage, worker: ChrootImage, database: str, tmp_path: Path
+) -> None:
     store = ThreadedMotoServer(ip_address="127.0.0.1", port=0, verbose=False)
     store.start()
     services = compose()["services"]
@@ -86,8 +88,8 @@ def test_the_images_work_together(front_end: Image, worker: Image, database: str
             assert front.poll() is None and time.monotonic() < deadline, front_end.log()
             time.sleep(0.3)
         scene = tmp_path / "scene"
-        config = GeneratedSceneConfig(views=8, width_px=48, height_px=36, samples_per_side=1, points=500)
-        write_generated_scene(scene, config)
+        config = SyntheticDatasetConfig(views=8, width_px=48, height_px=36, samples_per_side=1, points=500)
+        write_synthetic_dataset(scene, config)
         with Api("http://127.0.0.1:8643", TOKEN) as api:
             job = submit(api, Submission(scene, {"preset": "fast", "train": FEW}))
             done = watch_job(api, job["id"], lambda _event: None, lambda _state: None)
@@ -95,12 +97,12 @@ def test_the_images_work_together(front_end: Image, worker: Image, database: str
             assert {"mesh.glb", "metrics.json"} <= {
                 path.name for path in download_results(api, job["id"], tmp_path / "result")
             }
-        codes = [Image.stop(process) for process in processes]
+        codes = [ChrootImage.stop(process) for process in processes]
         # uvicorn ends by the signal that asked it to, once it is done.
         assert codes[0] in (0, 143) and codes[1:] == [0, 0], (codes, front_end.log() + worker.log())
     finally:
         for process in processes:
-            Image.kill(process)
+            ChrootImage.kill(process)
         store.stop()
     owner = (worker.root / "data").stat()
     assert (owner.st_uid, oct(owner.st_mode & 0o777)) == (10001, "0o711")

@@ -56,7 +56,7 @@ def test_front_end_installs_what_the_project_says() -> None:
     assert not names & {"torch", "numba", "scipy", "embreex", "OpenImageIO"}
 
 
-def test_what_is_copied_exists_and_is_let_in() -> None:
+def test_dockerfile_copies_existing_unignored_files() -> None:
     ignored = (DOCKER / "Dockerfile.dockerignore").read_text().splitlines()
     assert ignored[0] == "*"
     let_in = {line[1:] for line in ignored if line.startswith("!")}
@@ -105,7 +105,7 @@ def test_compose_names_images_that_the_dockerfile_makes() -> None:
         assert service["depends_on"]["database"]["condition"] == "service_healthy"
 
 
-def test_only_the_front_end_is_published_and_to_this_machine_only() -> None:
+def test_compose_publishes_front_end_on_localhost_only() -> None:
     published = {
         name: service["ports"] for name, service in compose()["services"].items() if "ports" in service
     }

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from test_docker_files import ROOT, instructions
 
-from octasplat.engine.scene.generated import GeneratedSceneConfig, write_generated_scene
+from octasplat.engine.dataset.synthetic import SyntheticDatasetConfig, write_synthetic_dataset
 from octasplat.workers.client.api import Api
 from octasplat.workers.client.upload import upload_scene
 
@@ -71,8 +71,8 @@ def test_front_end_and_maintenance_run_without_torch(image: Path, conninfo: str,
         address = api.stdout.readline().strip()
         assert address.startswith("http"), log.read_text()
         scene = tmp_path / "scene"
-        write_generated_scene(
-            scene, GeneratedSceneConfig(views=8, width_px=48, height_px=36, samples_per_side=1, points=500)
+        write_synthetic_dataset(
+            scene, SyntheticDatasetConfig(views=8, width_px=48, height_px=36, samples_per_side=1, points=500)
         )
         with Api(address) as client:
             dataset = upload_scene(client, scene)

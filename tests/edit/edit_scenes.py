@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from octasplat.engine.edit.local_maps import legs_world
+from octasplat.engine.gaussians.legs import legs_world
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.gaussians.rows import row_arrays
 

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from edit_scenes import assert_same, cube
 
-from octasplat.engine.edit.affine import transform
-from octasplat.engine.files import export_scene, read_facts, read_mesh
+from octasplat.engine.files import export_scene, read_mesh, read_metadata
 from octasplat.engine.files.gaussian_ply import read_gaussian_ply, write_gaussian_ply
+from octasplat.engine.gaussians.affine import transform_gaussians
 from octasplat.engine.gaussians.model import FlatGaussians
-from octasplat.engine.gaussians.scene_facts import SceneFacts
+from octasplat.engine.gaussians.scene_metadata import SceneMetadata
 
 Make = Callable[..., FlatGaussians]
 
@@ -46,8 +46,8 @@ def test_edit_without_an_edit(octasplat, scene: Path, tmp_path: Path) -> None:
     assert counts["unmoved"] == 150 and counts["matched_by"] == "ids"
 
 
-def test_what_is_known_of_a_scene_outlives_every_edit(octasplat, make_scene: Make, tmp_path: Path) -> None:
-    scene, facts = make_scene(150), SceneFacts(near_world=0.25, pixel_rad=0.002, turned_beyond=0.5)
+def test_edits_keep_scene_metadata(octasplat, make_scene: Make, tmp_path: Path) -> None:
+    scene, facts = make_scene(150), SceneMetadata(near_world=0.25, pixel_rad=0.002, turned_beyond=0.5)
     channels = {"albedo": np.full((150, 3), 0.5, np.float32), "metallic": np.ones((150, 1), np.float32)}
     lit = scene.with_channels(channels | {"roughness": channels["metallic"]})
     source, out = tmp_path / "scene.ply", tmp_path / "out.ply"
@@ -68,17 +68,17 @@ def test_what_is_known_of_a_scene_outlives_every_edit(octasplat, make_scene: Mak
     ):
         done = octasplat(*command)
         assert done.exit_code == 0, done.output
-        assert astuple(read_facts(out)) == pytest.approx(astuple(facts), rel=1e-12), command
+        assert astuple(read_metadata(out)) == pytest.approx(astuple(facts), rel=1e-12), command
         out.unlink()
     assert octasplat("transform", source, "--scale", 2, "-o", out).exit_code == 0
-    assert astuple(read_facts(out)) == pytest.approx((0.5, 0.002, 0.5), rel=1e-12)
+    assert astuple(read_metadata(out)) == pytest.approx((0.5, 0.002, 0.5), rel=1e-12)
     # What has no materials does not ask which way its normals point; nothing may be hidden that one shows.
-    write_gaussian_ply(scene, tmp_path / "plain.ply", facts=SceneFacts(pixel_rad=0.001))
+    write_gaussian_ply(scene, tmp_path / "plain.ply", facts=SceneMetadata(pixel_rad=0.001))
     assert octasplat("merge", source, tmp_path / "plain.ply", "-o", out).exit_code == 0
-    assert read_facts(out) == SceneFacts(0.0, 0.001, 0.5)
+    assert read_metadata(out) == SceneMetadata(0.0, 0.001, 0.5)
     write_gaussian_ply(lit, tmp_path / "plain.ply")
     assert octasplat("merge", source, tmp_path / "plain.ply", "-o", out).exit_code == 0
-    assert read_facts(out) == SceneFacts()
+    assert read_metadata(out) == SceneMetadata()
 
 
 def test_edit_of_a_sequence_in_the_order_of_its_numbers(octasplat, scene: Path, tmp_path: Path) -> None:
@@ -101,7 +101,7 @@ def test_edit_of_a_sequence_in_the_order_of_its_numbers(octasplat, scene: Path, 
     assert (tmp_path / "folder" / "f10.ply").exists()
 
 
-def test_edit_tells_of_turned_axes(octasplat, scene: Path, tmp_path: Path) -> None:
+def test_edit_reports_rotated_axes(octasplat, scene: Path, tmp_path: Path) -> None:
     octasplat("export", scene, tmp_path / "mesh.obj")
     mesh = read_mesh(tmp_path / "mesh.obj")
     write_obj(tmp_path / "turned.obj", mesh.vertices[:, [0, 2, 1]] * [1, 1, -1], mesh.triangles)
@@ -137,7 +137,7 @@ def test_edit_refuses_in_one_sentence(
 
 
 @pytest.mark.parametrize("method", ["nearest", "mvc"])
-def test_deform(octasplat, scene: Path, tmp_path: Path, method: str) -> None:
+def test_deform_command_follows_mesh(octasplat, scene: Path, tmp_path: Path, method: str) -> None:
     vertices, triangles = cube(3)
     write_obj(tmp_path / "rest.obj", vertices, triangles)
     write_obj(tmp_path / "up1.obj", vertices + np.array([0, 0, 1.0]), triangles)
@@ -216,7 +216,9 @@ def test_transform_crop_merge_clean(octasplat, scene: Path, tmp_path: Path) -> N
         (("clean", "scene.ply", "-o", "out.ply", "--min-scale", "9"), 1, "octasplat info tells its sizes"),
     ],
 )
-def test_mistakes(octasplat, scene: Path, monkeypatch, arguments, code: int, message: str) -> None:
+def test_edit_commands_invalid_arguments_are_refused(
+    octasplat, scene: Path, monkeypatch, arguments, code: int, message: str
+) -> None:
     monkeypatch.chdir(scene.parent)
     result = octasplat(*arguments)
     assert result.exit_code == code and message in result.stderr, result.output
@@ -235,6 +237,9 @@ def test_deform_by_a_mirrored_proxy(octasplat, scene: Path, tmp_path: Path, turn
     )  # fmt: skip
     assert result.exit_code == 0, result.output
     assert "150 mirrored with the proxy" in result.stdout
-    moved, exact = read(tmp_path / "out.ply"), transform(read(scene), np.diag([-1.0, 1.0, 1.0, 1.0]))
+    moved, exact = (
+        read(tmp_path / "out.ply"),
+        transform_gaussians(read(scene), np.diag([-1.0, 1.0, 1.0, 1.0])),
+    )
     np.testing.assert_allclose(moved.means_world, exact.means_world, atol=1e-6)
     np.testing.assert_allclose(moved.sh, exact.sh, atol=1e-4)

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from edit_scenes import assert_same, covariance_errors, moved_covariances, twist
 
-from octasplat.engine.edit.choices import MeshRecovery
-from octasplat.engine.edit.recovery import recover_edit
+from octasplat.engine.edit.edit_options import MeshToGaussiansOptions
+from octasplat.engine.edit.mesh_to_gaussians import recover_gaussians
 from octasplat.engine.errors import SceneFileError
 from octasplat.engine.files import export_scene, read_mesh
 from octasplat.engine.gaussians.model import FlatGaussians
@@ -19,7 +19,7 @@ ROUTES = ("mesh.ply", "mesh.obj", "mesh.glb")
 
 
 @pytest.mark.parametrize("name", ROUTES)
-def test_what_blender_only_opened_and_saved_is_the_same_scene(
+def test_edit_unchanged_blender_export_gives_same_scene(
     blender, make_scene: Make, tmp_path: Path, name: str
 ) -> None:
     g = make_scene(600)  # two chunks, so that the order in a GLB is not that of the scene
@@ -32,15 +32,15 @@ def test_what_blender_only_opened_and_saved_is_the_same_scene(
             # Blender splits vertices for GLB and leaves out attributes whose names have no underscore; an OBJ
             # has no attributes at all.
             with pytest.raises(SceneFileError, match="cannot be matched"):
-                recover_edit(g, read_mesh(tmp_path / target), tmp_path / target)
+                recover_gaussians(g, read_mesh(tmp_path / target), tmp_path / target)
             continue
-        result, report = recover_edit(g, read_mesh(tmp_path / target), tmp_path / target)
+        result, report = recover_gaussians(g, read_mesh(tmp_path / target), tmp_path / target)
         assert_same(result, g)
         assert (report.axes != report.axes_usual) == (name[-3:] != target[-3:])
 
 
 @pytest.mark.parametrize("name", ROUTES[:2])  # each chunk of a GLB is an object that twists by itself
-def test_twist(blender, make_scene: Make, tmp_path: Path, name: str) -> None:
+def test_edit_blender_twist_matches_exact_map(blender, make_scene: Make, tmp_path: Path, name: str) -> None:
     """SimpleDeform turns by 1 radian along the object's height; the exact map is fitted to the vertices."""
     g = make_scene(500)
     export_scene(g, tmp_path / name, format="mesh-ply" if name.endswith("ply") else None)
@@ -60,8 +60,8 @@ def test_twist(blender, make_scene: Make, tmp_path: Path, name: str) -> None:
     expected = back.T @ expected @ back
     errors, centres = {}, {}
     for method in ("least-squares", "three-point"):
-        options = MeshRecovery.model_validate({"method": method, "axes": "x0"})
-        result, report = recover_edit(g, read_mesh(target), target, options)
+        options = MeshToGaussiansOptions.model_validate({"method": method, "axes": "x0"})
+        result, report = recover_gaussians(g, read_mesh(target), target, options)
         errors[method] = covariance_errors(result, expected)
         means = twist_by(phase, axis, exact(g.means_world))
         centres[method] = np.linalg.norm(result.means_world - means, axis=1) / g.scales.max(axis=1)
@@ -91,7 +91,7 @@ def test_cutting_copying_and_welding(blender, make_scene: Make, tmp_path: Path, 
     for edit in ("delete", "duplicate", "weld"):
         target = tmp_path / f"{edit}{source.suffix}"
         blender(source, target, edit)
-        result, reports[edit] = recover_edit(g, read_mesh(target), target)
+        result, reports[edit] = recover_gaussians(g, read_mesh(target), target)
         assert reports[edit].moved == 0
         originals = result.select(np.arange(len(result) - reports[edit].copies))
         if edit != "delete":

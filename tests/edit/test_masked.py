@@ -2,7 +2,7 @@ from pathlib import Path
 
 import pytest
 
-from octasplat.engine.edit.masked import masked_photograph
+from octasplat.engine.edit.mask_selection import photograph_of_mask
 from octasplat.engine.errors import ConfigError
 
 PHOTOGRAPHS = ["0001.jpg", "left/0001.jpg", "right/0001.jpg", "right/0002.jpg", "right/0002.png", "far/9.jpg"]
@@ -22,15 +22,15 @@ PHOTOGRAPHS = ["0001.jpg", "left/0001.jpg", "right/0001.jpg", "right/0002.jpg", 
     ],
 )
 def test_a_mask_belongs_to_the_photograph_in_its_own_folder(mask: str, photograph: str) -> None:
-    assert PHOTOGRAPHS[masked_photograph(Path(mask), PHOTOGRAPHS)] == photograph
+    assert PHOTOGRAPHS[photograph_of_mask(Path(mask), PHOTOGRAPHS)] == photograph
     back = PHOTOGRAPHS[::-1]
-    assert back[masked_photograph(Path(mask), back)] == photograph
+    assert back[photograph_of_mask(Path(mask), back)] == photograph
 
 
 def test_masks_that_could_be_of_several_photographs_are_refused() -> None:
     with pytest.raises(ConfigError, match=r"may be a mask of left/0001\.jpg and right/0001\.jpg"):
-        masked_photograph(Path("0001.png"), PHOTOGRAPHS[1:])
+        photograph_of_mask(Path("0001.png"), PHOTOGRAPHS[1:])
     with pytest.raises(ConfigError, match=r"right/0002\.jpg and right/0002\.png"):
-        masked_photograph(Path("masks/right/0002.png"), PHOTOGRAPHS)
+        photograph_of_mask(Path("masks/right/0002.png"), PHOTOGRAPHS)
     with pytest.raises(ConfigError, match="no photograph of this name"):
-        masked_photograph(Path("masks/0003.png"), PHOTOGRAPHS)
+        photograph_of_mask(Path("masks/0003.png"), PHOTOGRAPHS)

@@ -17,10 +17,10 @@ from edit_scenes import (
 )
 
 from octasplat.engine.edit.deform import deform, deform_to, deformation_corners
-from octasplat.engine.edit.proxy import MeanValueBinding, NearTriangles, Proxy, bind
+from octasplat.engine.edit.proxy import MeanValueBinding, NearTriangles, Proxy, bind_corners
 from octasplat.engine.errors import SceneFileError
-from octasplat.engine.gaussians.harmonics import sh_basis
 from octasplat.engine.gaussians.model import FlatGaussians
+from octasplat.engine.gaussians.spherical_harmonics import sh_basis
 
 Make = Callable[..., FlatGaussians]
 SHEAR = np.array([[1.2, 0.3, 0.0], [0.0, 0.8, 0.1], [0.2, 0.0, 1.0]])
@@ -36,9 +36,9 @@ def follow(
     g: FlatGaussians, proxy: Proxy, move: Callable[[np.ndarray], np.ndarray], **options
 ) -> FlatGaussians:
     corners = deformation_corners(g)
-    binding = bind(proxy, corners, **options)
+    binding = bind_corners(proxy, corners, **options)
     vertices = move(proxy.vertices_world)
-    return deform_to(g, corners, binding.deform(vertices), binding.mirrored(vertices))[0]
+    return deform_to(g, corners, binding.deform(vertices), binding.mirrored_mask(vertices))[0]
 
 
 @pytest.mark.parametrize("method", ["nearest", "mvc"])
@@ -79,7 +79,7 @@ def test_a_bent_sheet_is_followed_to_second_order_in_its_cells(make_scene: Make)
     assert shapes[2] < 0.02
 
 
-def test_a_twisted_sheet(make_scene: Make) -> None:
+def test_proxy_twist_follows_sheet_to_second_order(make_scene: Make) -> None:
     g = near_the_plane(make_scene, 0.0)
     g.quats_wxyz[:] = [np.sqrt(0.5), 0, np.sqrt(0.5), 0]
     move, derivative = twist(1.0, axis=0)
@@ -97,35 +97,35 @@ def test_twist_and_bend_of_a_cage_stay_near_the_exact_maps(make_scene: Make) -> 
 
 
 @pytest.mark.parametrize("method", ["nearest", "mvc"])
-def test_nothing_tears(method: str) -> None:
+def test_proxy_deformation_is_continuous(method: str) -> None:
     random = np.random.default_rng(0)
     vertices, triangles = cube(4, 1.0) if method == "mvc" else grid(10)
     crumpled = vertices + 0.15 * random.standard_normal(vertices.shape)
     start = random.uniform(-0.9, 0.9, (4000, 3)) * [1, 1, 0.9 if method == "mvc" else 0.15]
     step = 1e-5 * random.standard_normal((4000, 3))
     pairs = np.stack([start, start + step], axis=1).repeat(4, axis=1)
-    moved = bind(Proxy(vertices, triangles), pairs, method, None).deform(crumpled)
+    moved = bind_corners(Proxy(vertices, triangles), pairs, method, None).deform(crumpled)
     apart = np.linalg.norm(moved[:, 0] - moved[:, 4], axis=1) / np.linalg.norm(step, axis=1)
     assert apart.max() < 15.0  # a tear of one thousandth of a cell would give 20
 
 
 @pytest.mark.parametrize("method", ["nearest", "mvc"])
-def test_a_proxy_at_rest_leaves_the_scene_as_it_is(make_scene: Make, method: str) -> None:
+def test_proxy_undeformed_leaves_scene_unchanged(make_scene: Make, method: str) -> None:
     g = make_scene(100)
     result = follow(g, Proxy(*cube(3)), lambda p: p, method=method)
     np.testing.assert_allclose(result.means_world, g.means_world, atol=1e-6)
     assert covariance_errors(result, covariances(g)).max() < 1e-5
 
 
-def test_what_is_out_of_reach_keeps_every_bit(make_scene: Make) -> None:
+def test_proxy_leaves_distant_gaussians_unchanged(make_scene: Make) -> None:
     g = make_scene(400, spread=3.0)
     far = np.abs(g.means_world).max(axis=1) > 2.2
     near = np.abs(g.means_world).max(axis=1) < 1.0
     assert far.sum() > 50 and near.sum() > 5
     for method, reach in (("mvc", None), ("mvc", 0.2), ("nearest", 0.2)):
         corners = deformation_corners(g)
-        binding = bind(Proxy(*cube(4)), corners, method, reach)
-        assert not binding.moving[far].any()
+        binding = bind_corners(Proxy(*cube(4)), corners, method, reach)
+        assert not binding.moving_mask[far].any()
         result, report = deform_to(g, corners, binding.deform(cube(4)[0] + np.array([0, 0, 1.0])))
         assert_same(result.select(far), g.select(far))
         assert report.unmoved >= far.sum()
@@ -145,7 +145,7 @@ def test_coordinates_at_corners_on_faces_and_when_not_kept(monkeypatch) -> None:
     np.testing.assert_allclose(kept[0, 0], shifted[3], atol=1e-9)
     np.testing.assert_allclose(kept[1, 0], shifted[triangles[0]].mean(axis=0), atol=1e-9)
     np.testing.assert_allclose(kept[2, 0], shifted[triangles[0][:2]].mean(axis=0), atol=1e-6)
-    monkeypatch.setattr("octasplat.engine.edit.proxy.STORED_BYTES", 0)
+    monkeypatch.setattr("octasplat.engine.edit.proxy.MAX_CACHE_BYTES", 0)
     np.testing.assert_allclose(
         MeanValueBinding(Proxy(vertices, triangles), corners, 0.5).deform(shifted), kept, atol=1e-12
     )
@@ -155,14 +155,14 @@ def test_open_cages_and_other_meshes_are_refused(make_scene: Make) -> None:
     vertices, triangles = cube(2)
     corners = deformation_corners(make_scene(5))
     with pytest.raises(SceneFileError, match="not closed"):
-        bind(Proxy(vertices, triangles[1:]), corners, "mvc")
+        bind_corners(Proxy(vertices, triangles[1:]), corners, "mvc")
     with pytest.raises(SceneFileError, match="the same mesh"):
-        bind(Proxy(vertices, triangles), corners, "mvc").deform(vertices[1:])
+        bind_corners(Proxy(vertices, triangles), corners, "mvc").deform(vertices[1:])
     with pytest.raises(SceneFileError, match="no triangle"):
         Proxy(vertices, triangles[:0])
 
 
-def test_any_function_of_points_drives_a_scene(make_scene: Make) -> None:
+def test_proxy_accepts_arbitrary_map(make_scene: Make) -> None:
     g = make_scene(200, size=0.02)
     move, derivative = twist(0.8)
     seen = []
@@ -219,7 +219,7 @@ MIRRORS = {
 
 @pytest.mark.parametrize("linear", MIRRORS.values(), ids=MIRRORS.keys())
 @pytest.mark.parametrize(("method", "proxy"), [("mvc", ball(3)), ("nearest", ball(4)), ("nearest", bowl(8))])
-def test_a_mirrored_proxy_mirrors_the_scene(make_scene: Make, linear, method: str, proxy) -> None:
+def test_proxy_mirrored_mesh_mirrors_scene(make_scene: Make, linear, method: str, proxy) -> None:
     g = make_scene(200, spread=0.4)
     result = follow(g, Proxy(*proxy), lambda p: p @ linear.T + [1, 2, 3], method=method, reach_world=np.inf)
     scale = np.abs(np.linalg.det(linear)) ** (1 / 3)
@@ -236,41 +236,41 @@ def test_a_mirrored_proxy_mirrors_the_scene(make_scene: Make, linear, method: st
     np.testing.assert_allclose(seen, colours_seen(g, directions), atol=2e-4)
 
 
-def test_a_mirrored_cage_reports_what_it_mirrored(make_scene: Make) -> None:
+def test_proxy_mirrored_cage_reports_gaussians(make_scene: Make) -> None:
     g = make_scene(200, spread=2.0)
     corners = deformation_corners(g)
-    binding = bind(Proxy(*cube(3)), corners, "mvc")
+    binding = bind_corners(Proxy(*cube(3)), corners, "mvc")
     vertices = cube(3)[0] * [-1, 1, 1]
-    result, report = deform_to(g, corners, binding.deform(vertices), binding.mirrored(vertices))
+    result, report = deform_to(g, corners, binding.deform(vertices), binding.mirrored_mask(vertices))
     inside = np.abs(g.means_world).max(axis=1) < 1.2
     assert report.mirrored == report.moved == inside.sum()
     assert_same(result.select(~inside), g.select(~inside))
 
 
-def test_what_only_looks_mirrored_is_not(make_scene: Make) -> None:
+def test_proxy_turned_over_mesh_is_not_mirrored(make_scene: Make) -> None:
     pushed_through = bowl(8)[0] * [1, 1, -1] + 0.1 * np.sin(3 * bowl(8)[0])[:, [1, 0, 2]]
     turned_over = grid(8)[0] * [-1, 1, 1]
     corners = deformation_corners(make_scene(20))
     for (vertices, triangles), moved in ((bowl(8), pushed_through), (grid(8), turned_over)):
-        assert not bind(Proxy(vertices, triangles), corners).mirrored(moved).any()
-    told = bind(Proxy(*grid(8), told_mirrored=True), corners, reach_world=np.inf)
-    assert told.mirrored(turned_over).all()
+        assert not bind_corners(Proxy(vertices, triangles), corners).mirrored_mask(moved).any()
+    told = bind_corners(Proxy(*grid(8), mirrored_override=True), corners, reach_world=np.inf)
+    assert told.mirrored_mask(turned_over).all()
     np.testing.assert_allclose(told.deform(turned_over), corners * [-1, 1, 1], atol=1e-9)
 
 
 @pytest.mark.parametrize("method", ["nearest", "mvc"])
-def test_what_is_not_kept_between_frames_is_the_same(make_scene: Make, monkeypatch, method: str) -> None:
+def test_proxy_uncached_weights_give_same_frames(make_scene: Make, monkeypatch, method: str) -> None:
     corners = deformation_corners(make_scene(300, spread=1.5))
     moved = twist(0.5)[0](cube(3)[0])
-    kept = bind(Proxy(*cube(3)), corners, method, 0.3).deform(moved)
-    monkeypatch.setattr("octasplat.engine.edit.proxy.STORED_BYTES", 0)
-    again = bind(Proxy(*cube(3)), corners, method, 0.3)
+    kept = bind_corners(Proxy(*cube(3)), corners, method, 0.3).deform(moved)
+    monkeypatch.setattr("octasplat.engine.edit.proxy.MAX_CACHE_BYTES", 0)
+    again = bind_corners(Proxy(*cube(3)), corners, method, 0.3)
     np.testing.assert_array_equal(again.deform(moved), kept)
     np.testing.assert_array_equal(again.deform(moved), kept)
 
 
 @pytest.mark.parametrize("size", [30.0, 300.0, 3e4])
-def test_a_floor_of_two_triangles_is_nearest_beneath_a_dense_ball(size: float) -> None:
+def test_proxy_nearest_triangle_with_uneven_density_is_found(size: float) -> None:
     sphere, facets = ball(24)
     radius, centre = 0.5, np.array([0.0, 0.0, 4.5])
     sphere = centre + radius * sphere / np.linalg.norm(sphere, axis=1, keepdims=True)
@@ -280,7 +280,7 @@ def test_a_floor_of_two_triangles_is_nearest_beneath_a_dense_ball(size: float) -
     random = np.random.default_rng(2)
     points = random.uniform([-4, -4, 0.05], [4, 4, 6], (20_000, 3))
     to_ball = np.linalg.norm(points - centre, axis=1) - radius
-    chosen, weights, distances = near.to(points)
+    chosen, weights, distances = near.query(points)
     np.testing.assert_allclose(distances, np.minimum(np.abs(to_ball), points[:, 2]), atol=0.01)
     on_floor = np.where(chosen >= len(facets), weights, 0.0).sum(axis=1)
     sure = np.abs(np.abs(to_ball) - points[:, 2]) > 0.2  # beyond where both are blended

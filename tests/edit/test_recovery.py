@@ -15,33 +15,33 @@ from edit_scenes import (
     twist,
 )
 
-from octasplat.engine.edit.choices import MeshRecovery
-from octasplat.engine.edit.recovery import EditReport, recover_edit
+from octasplat.engine.edit.edit_options import MeshToGaussiansOptions
+from octasplat.engine.edit.mesh_to_gaussians import EditReport, recover_gaussians
 from octasplat.engine.errors import SceneFileError
-from octasplat.engine.files import ExportOptions, Mesh, export_scene, read_mesh
-from octasplat.engine.gaussians.harmonics import sh_basis
+from octasplat.engine.files import ExportOptions, ImportedMesh, export_scene, read_mesh
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.gaussians.octagon import SIDES
+from octasplat.engine.gaussians.spherical_harmonics import sh_basis
 
 Make = Callable[..., FlatGaussians]
 PLY = Path("edited.ply")
 
 
 @pytest.fixture
-def exported(tmp_path: Path) -> Callable[..., Mesh]:
-    def export(gaussians: FlatGaussians, name: str = "mesh.ply", **options: object) -> Mesh:
+def exported(tmp_path: Path) -> Callable[..., ImportedMesh]:
+    def export(gaussians: FlatGaussians, name: str = "mesh.ply", **options: object) -> ImportedMesh:
         export_scene(gaussians, tmp_path / name, ExportOptions.model_validate(options))
         return read_mesh(tmp_path / name)
 
     return export
 
 
-def moved(mesh: Mesh, change: Callable[[np.ndarray], np.ndarray]) -> Mesh:
+def moved(mesh: ImportedMesh, change: Callable[[np.ndarray], np.ndarray]) -> ImportedMesh:
     """The mesh edited and saved in float32."""
     return replace(mesh, vertices=change(mesh.vertices).astype(np.float32).astype(np.float64))
 
 
-def without(mesh: Mesh, gone: np.ndarray) -> Mesh:
+def without(mesh: ImportedMesh, gone: np.ndarray) -> ImportedMesh:
     """The mesh without some vertices and their triangles."""
     number = np.cumsum(~gone) - 1
     triangles = number[mesh.triangles[~gone[mesh.triangles].any(axis=1)]]
@@ -58,13 +58,13 @@ def without(mesh: Mesh, gone: np.ndarray) -> Mesh:
 
 
 def recover(
-    gaussians: FlatGaussians, mesh: Mesh, path: Path = PLY, **options: object
+    gaussians: FlatGaussians, mesh: ImportedMesh, path: Path = PLY, **options: object
 ) -> tuple[FlatGaussians, EditReport]:
-    return recover_edit(gaussians, mesh, path, MeshRecovery.model_validate(options))
+    return recover_gaussians(gaussians, mesh, path, MeshToGaussiansOptions.model_validate(options))
 
 
 @pytest.mark.parametrize("name", ["mesh.ply", "scene.obj", "scene.glb"])
-def test_a_mesh_that_was_not_edited_gives_the_same_bits(make_scene: Make, exported, name: str) -> None:
+def test_recovery_of_unedited_mesh_is_bit_exact(make_scene: Make, exported, name: str) -> None:
     g = make_scene(400)
     g.opacity_logits[:7] = -9.0  # too faint for an octagon
     result, report = recover(g, exported(g, name), Path(name))
@@ -87,13 +87,13 @@ def test_export_options_are_found_out(make_scene: Make, exported, name: str, opt
         assert report.q == pytest.approx(options.get("q", 9.21034), rel=1e-6)
 
 
-def test_q_is_found_from_textures_where_nothing_else_is_left(make_scene: Make, exported) -> None:
+def test_recovery_infers_q_from_texture(make_scene: Make, exported) -> None:
     g = make_scene(200)
     mesh = replace(exported(g, "scene.glb", q=5.0), q=None, radius=None)
     assert recover(g, mesh, Path("scene.glb"))[1].q == pytest.approx(5.0)
 
 
-def test_only_what_moved_is_changed(make_scene: Make, exported) -> None:
+def test_recovery_changes_moved_octagons_only(make_scene: Make, exported) -> None:
     g = make_scene(200)
     mesh = exported(g)
     chosen = g.means_world[:, 0] > 0
@@ -108,7 +108,7 @@ def test_only_what_moved_is_changed(make_scene: Make, exported) -> None:
     np.testing.assert_allclose(result.sh, g.sh, atol=2e-4)
 
 
-def test_octagons_cut_by_a_selection_are_told_and_snapped(make_scene: Make, exported) -> None:
+def test_recovery_partial_octagons_warn_and_snap(make_scene: Make, exported) -> None:
     g = make_scene(400)
     mesh = exported(g)
     old = mesh.vertices.reshape(-1, SIDES, 3)
@@ -132,9 +132,7 @@ def test_octagons_cut_by_a_selection_are_told_and_snapped(make_scene: Make, expo
     assert_same(result.select(~up), g.select(~up))
 
 
-def test_a_part_that_was_turned_as_a_whole_is_neither_mirrored_nor_flipped(
-    make_scene: Make, exported
-) -> None:
+def test_recovery_rotated_part_is_not_mirrored(make_scene: Make, exported) -> None:
     g = make_scene(600)
     mesh = exported(g)
     middle = np.array([0.5, 0.0, 0.0])
@@ -192,7 +190,7 @@ def test_a_twist_keeps_the_covariance_by_least_squares(make_scene: Make, exporte
 
 
 @pytest.mark.parametrize("axis", [0, 1, 2])
-def test_a_mirrored_scene_mirrors_its_colours(make_scene: Make, exported, axis: int) -> None:
+def test_recovery_of_mirrored_mesh_mirrors_harmonics(make_scene: Make, exported, axis: int) -> None:
     g = make_scene(300)
     mirror = np.eye(3)
     mirror[axis, axis] = -1.0
@@ -205,7 +203,7 @@ def test_a_mirrored_scene_mirrors_its_colours(make_scene: Make, exported, axis: 
 
 
 @pytest.mark.parametrize("damaged", ["repair", "drop"])
-def test_missing_corners(make_scene: Make, exported, damaged: str) -> None:
+def test_recovery_octagons_with_missing_corners(make_scene: Make, exported, damaged: str) -> None:
     g = make_scene(100)
     mesh = exported(g)
     gone = np.zeros(len(mesh), dtype=bool)
@@ -227,7 +225,7 @@ def test_missing_corners(make_scene: Make, exported, damaged: str) -> None:
         assert np.linalg.norm(result.means_world[2] - m @ g.means_world[2]) < 0.1
 
 
-def test_what_is_left_of_an_octagon_that_stayed_keeps_its_gaussian(make_scene: Make, exported) -> None:
+def test_recovery_partial_octagon_keeps_gaussian(make_scene: Make, exported) -> None:
     g = make_scene(50)
     mesh = exported(g)
     gone = np.arange(len(mesh)) % SIDES >= np.where(mesh.gid % 2 == 0, 8, 1)
@@ -236,7 +234,7 @@ def test_what_is_left_of_an_octagon_that_stayed_keeps_its_gaussian(make_scene: M
     assert report.incomplete == 25 and report.moved == 0
 
 
-def test_deleted_octagons_take_the_faint_gaussians_beside_them(make_scene: Make, exported) -> None:
+def test_recovery_deletes_faint_neighbours_of_deleted_octagons(make_scene: Make, exported) -> None:
     g = make_scene(200)
     g.opacity_logits[:20] = -9.0
     mesh = exported(g)
@@ -250,7 +248,7 @@ def test_deleted_octagons_take_the_faint_gaussians_beside_them(make_scene: Make,
     assert result.means_world[result.opacities < 0.01][:, 0].max(initial=-1) < 0.3
 
 
-def test_faint_gaussians_follow_their_neighbours(make_scene: Make, exported) -> None:
+def test_recovery_moves_faint_gaussians_with_neighbours(make_scene: Make, exported) -> None:
     g = make_scene(600, spread=0.5)
     g.opacity_logits[:50] = -9.0
     turn = random_turn(8)
@@ -353,7 +351,7 @@ def test_axes_of_mixed_routes_are_found(make_scene: Make, exported, written, cam
     assert np.median(covariance_errors(twisted, moved_covariances(g, derivative))) < 0.01
 
 
-def test_axes_can_be_told(make_scene: Make, exported) -> None:
+def test_recovery_axes_option_is_used(make_scene: Make, exported) -> None:
     g = make_scene(200)
     turned = moved(exported(g), lambda p: p * [1, -1, -1])  # this time by the user
     result, report = recover(g, turned, axes="x0")
@@ -378,7 +376,7 @@ def test_meshes_that_cannot_be_matched_are_refused_with_the_reason(make_scene: M
         recover(g, replace(mesh, gid=np.full(len(mesh), np.nan, np.float32)))
 
 
-def test_needles_survive(make_scene: Make, exported) -> None:
+def test_recovery_keeps_needle_gaussians(make_scene: Make, exported) -> None:
     g = make_scene(100)
     g.log_scales[:, 1] = -14.0
     mesh = exported(g)
@@ -393,9 +391,7 @@ def test_needles_survive(make_scene: Make, exported) -> None:
 
 @pytest.mark.parametrize("name", ["mesh.ply", "scene.glb"])
 @pytest.mark.parametrize("least", [0.0, 0.3])
-def test_octagons_deleted_for_being_faint_stay_deleted(
-    make_scene: Make, exported, name: str, least: float
-) -> None:
+def test_recovery_keeps_min_opacity_deletions(make_scene: Make, exported, name: str, least: float) -> None:
     g = make_scene(400)
     g.opacity_logits[:] = np.linspace(-3.0, 3.0, 400)
     mesh = exported(g, name, min_opacity=least)
@@ -410,7 +406,7 @@ def test_octagons_deleted_for_being_faint_stay_deleted(
     assert len(result) == int((g.opacities >= 0.5).sum()) + report.carried
 
 
-def test_the_least_opacity_can_be_told_where_an_editor_lost_it(make_scene: Make, exported) -> None:
+def test_recovery_min_opacity_option_restores_faint_gaussians(make_scene: Make, exported) -> None:
     g = make_scene(200)
     mesh = replace(exported(g, min_opacity=0.7), min_opacity=None)
     assert recover(g, mesh)[1].deleted == int((g.opacities < 0.7).sum()) > 0

@@ -4,11 +4,11 @@ from pathlib import Path
 
 import numpy as np
 
-from octasplat.engine.render.environment_map import read_environment, write_environment
+from octasplat.engine.render.environment_files import read_environment, write_environment
 from octasplat.engine.run_folder import run_environment
 
 
-def test_the_exact_light_is_taken_where_there_is_one(tmp_path: Path) -> None:
+def test_run_environment_prefers_exact_map(tmp_path: Path) -> None:
     light = np.full((8, 16, 3), (4.0, 0.03, 0.011), np.float32)
     write_environment(tmp_path / "environment.hdr", light)
     coarse = read_environment(run_environment(tmp_path))  # runs of old have no other

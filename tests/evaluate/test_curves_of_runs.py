@@ -44,7 +44,7 @@ def test_earlier_runs_note_less_and_cpu_seconds_stretch_the_time(run):
     assert found.held_out == [(0.0, 20.0), (30.0, 23.0), (60.0, 25.0)]
 
 
-def test_a_suspended_machine_costs_no_cpu_seconds(run):
+def test_cpu_seconds_exclude_suspension(run):
     folder = run("d", [20.0] * 101)
     rows = (folder / "events.jsonl").read_text().splitlines()
     late = [json.loads(row) for row in rows[:-1]]
@@ -55,7 +55,7 @@ def test_a_suspended_machine_costs_no_cpu_seconds(run):
     assert times[-1] < 1000 and max(np.diff(times)) < 0.25 * times[-1]
 
 
-def test_one_picture_of_several_runs(run, tmp_path, capsys):
+def test_curves_of_several_runs_share_plot(run, tmp_path, capsys):
     folders = run("a", [20.0, 23.0, 25.0]), run("b", [20.0, 25.0]), run("c", [14.0, 15.0])
     picture = tmp_path / "curves.png"
     main([f"{folders[0]}=x:old", f"{folders[1]}=x:new", f"{folders[2]}=y:new", "-o", str(picture)])
@@ -68,7 +68,7 @@ def test_one_picture_of_several_runs(run, tmp_path, capsys):
     assert re.search(r"x old: held out 25\.00 dB after 20 s\n", capsys.readouterr().out)
 
 
-def test_what_is_no_run_is_named(run, tmp_path, capsys):
+def test_curves_not_a_run_is_refused(run, tmp_path, capsys):
     with pytest.raises(SystemExit, match=r"empty/events\.jsonl tells of no training"):
         main([str(tmp_path / "empty"), "-o", str(tmp_path / "curves.png")])
     with pytest.raises(SystemExit):

@@ -5,11 +5,11 @@ import shutil
 
 import numpy as np
 
+from octasplat.engine.dataset import Dataset
+from octasplat.engine.dataset.synthetic import SyntheticDatasetConfig, write_synthetic_dataset
 from octasplat.engine.evaluate.held_out import evaluate_held_out
 from octasplat.engine.gaussians.model import FlatGaussians
-from octasplat.engine.render.images import read_image, write_png
-from octasplat.engine.scene import Dataset
-from octasplat.engine.scene.generated import GeneratedSceneConfig, write_generated_scene
+from octasplat.engine.render.image_files import read_image, write_png
 from octasplat.engine.shading.plain import PLAIN
 from octasplat.engine.trace.protocol import TraceSettings
 
@@ -18,8 +18,8 @@ def test_photographs_that_differ_in_the_suffix_alone_both_get_a_render(tmp_path)
     import pycolmap
 
     root = tmp_path / "scene"
-    config = GeneratedSceneConfig(views=4, width_px=32, height_px=24, samples_per_side=1, points=100)
-    write_generated_scene(root, config)
+    config = SyntheticDatasetConfig(views=4, width_px=32, height_px=24, samples_per_side=1, points=100)
+    write_synthetic_dataset(root, config)
     model = pycolmap.Reconstruction(root / "sparse" / "0")
     images = sorted(model.images.values(), key=lambda image: image.name)
     for image, name in zip(images, ("a.tif", "a.png", "b.png", "c.png"), strict=True):

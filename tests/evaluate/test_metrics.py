@@ -71,7 +71,7 @@ def test_colour_correction_agrees_with_numpys_least_squares():
         np.testing.assert_allclose(corrected[..., channel].ravel(), expected, atol=1e-5)
 
 
-def test_colour_correction_of_one_tone_or_of_nothing():
+def test_colour_correction_constant_or_empty_image():
     grey, target = np.full((4, 5, 3), 0.5, np.float32), np.full((4, 5, 3), 0.25, np.float32)
     np.testing.assert_allclose(colour_corrected(grey, target, np.ones((4, 5), np.float32)), target)
     assert (colour_corrected(grey, target, np.zeros((4, 5), np.float32)) == grey).all()
@@ -147,7 +147,7 @@ def test_masked_psnr_is_that_of_the_valid_pixels():
     assert np.isnan(psnr(render, reference, np.zeros_like(weight)))
 
 
-def test_errors_under_the_mask_cost_nothing_once_filled():
+def test_masked_errors_do_not_change_metrics_after_fill():
     _, reference = pair(40, 40)
     weight = np.ones((40, 40), np.float32)
     weight[:10] = 0

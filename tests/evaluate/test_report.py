@@ -9,7 +9,7 @@ from octasplat.engine.errors import OutputError
 from octasplat.engine.evaluate.curves import duration, training_charts
 from octasplat.engine.evaluate.gallery import ViewImages, WorstAndBest, magma
 from octasplat.engine.evaluate.report import write_report
-from octasplat.engine.render.images import read_image
+from octasplat.engine.render.image_files import read_image
 
 
 class Page(HTMLParser):
@@ -100,7 +100,7 @@ def report(tmp_path):
     return write
 
 
-def test_the_page_refers_to_nothing_outside_itself(report, tmp_path):
+def test_report_has_no_external_references(report, tmp_path):
     page = report()
     links = [
         value for _, a in page.tags for key, value in a.items() if key in ("src", "href", "srcset", "data")
@@ -111,7 +111,7 @@ def test_the_page_refers_to_nothing_outside_itself(report, tmp_path):
     assert [a for a in page.all("meta") if "default-src 'none'" in a.get("content", "")]
 
 
-def test_all_views_are_in_the_table_worst_first(report):
+def test_report_lists_views_worst_first(report):
     page = report()
     assert page.rows == page.figures == ["a.jpg", "c.jpg", "b.jpg"]
     assert [a.get("aria-sort") for a in page.all("th")].count("ascending") == 1
@@ -150,7 +150,7 @@ def test_every_view_has_a_slider_that_the_keyboard_reaches(report):
     assert pairs == ["photograph render", "photograph flip", "render flip"]
 
 
-def test_of_many_views_the_worst_and_best_are_embedded_and_the_page_says_so(report):
+def test_report_many_views_embeds_worst_and_best(report):
     psnr = {f"{k:02d}.jpg": float(k) for k in range(30)}
     gallery = WorstAndBest()
     for name in np.random.default_rng(0).permutation(sorted(psnr)).tolist():
@@ -163,7 +163,7 @@ def test_of_many_views_the_worst_and_best_are_embedded_and_the_page_says_so(repo
     assert page.figures == report(metrics=metrics_of(psnr), images=dict.fromkeys(psnr, pictures())).figures
 
 
-def test_a_view_without_psnr_comes_last(report):
+def test_report_sorts_views_without_psnr_last(report):
     page = report(metrics=metrics_of({"a.jpg": None, "b.jpg": 30.0}))
     assert page.rows == ["b.jpg", "a.jpg"]
 
@@ -205,7 +205,7 @@ def test_psnr_without_the_exposure_is_shown_where_it_differs(report, corrected, 
     assert ("PSNR cc" in page.text) == (f"{corrected:.2f}" in page.text) == shown
 
 
-def test_an_early_end_is_told_beside_the_time(report):
+def test_report_shows_early_stop(report):
     metrics = metrics_of({"a.jpg": 25.0}) | {"iterations": 3500, "seconds": 60.0}
     assert "as no more was gained" not in report(metrics=metrics).text
     early = report(metrics=metrics | {"planned_iterations": 5000})
@@ -266,7 +266,7 @@ def test_long_curves_are_thinned_to_their_last_point_and_odd_rows_left_out():
         (7500.0, "2 h 05 min"),
     ],
 )
-def test_durations_read_well(seconds, text):
+def test_duration_is_formatted(seconds, text):
     assert duration(seconds) == text
 
 
@@ -289,7 +289,7 @@ def test_error_colours_are_those_of_flip_itself():
     assert np.abs(magma(values[..., 0]) - coloured).max() < 0.02
 
 
-def test_an_unwritable_place_is_an_output_error(tmp_path):
+def test_report_unwritable_path_raises_output_error(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(OutputError, match=r"report\.html"):
         write_report(tmp_path / "file" / "report.html", title="", metrics={}, events=[], config={}, images={})

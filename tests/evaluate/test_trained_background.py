@@ -5,9 +5,9 @@ from pathlib import Path
 import pytest
 
 from octasplat.engine.config import ReconstructionConfig, read_config, resolve_config
+from octasplat.engine.dataset.synthetic import SyntheticDatasetConfig, write_synthetic_dataset
 from octasplat.engine.events import Event, Warned
 from octasplat.engine.run_folder import open_photographs
-from octasplat.engine.scene.generated import GeneratedSceneConfig, write_generated_scene
 from octasplat.engine.writing import write_json
 
 
@@ -19,7 +19,7 @@ def test_the_default_is_that_of_the_training(trained: str, measured: str) -> Non
     assert config.evaluation_background == measured
 
 
-def test_another_one_is_taken_where_it_is_asked_for(tmp_path: Path) -> None:
+def test_evaluation_background_option_overrides_training(tmp_path: Path) -> None:
     asked = {"evaluation_background": "black"}
     config = resolve_config("fast", settings=asked, assignments=["background=white"])
     assert config.evaluation_background == "black"
@@ -28,9 +28,9 @@ def test_another_one_is_taken_where_it_is_asked_for(tmp_path: Path) -> None:
     assert ReconstructionConfig.model_validate(config.model_dump()) == config
 
 
-def test_a_mismatch_is_told_for_photographs_without_alpha(tmp_path: Path) -> None:
-    config = GeneratedSceneConfig(views=4, width_px=16, height_px=12, samples_per_side=1, points=60)
-    write_generated_scene(tmp_path / "scene", config)
+def test_background_mismatch_without_alpha_warns(tmp_path: Path) -> None:
+    config = SyntheticDatasetConfig(views=4, width_px=16, height_px=12, samples_per_side=1, points=60)
+    write_synthetic_dataset(tmp_path / "scene", config)
 
     def told(**settings: str) -> list[str]:
         events: list[Event] = []

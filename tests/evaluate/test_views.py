@@ -33,11 +33,11 @@ def test_metrics_are_those_of_the_images_rounded_to_8_bits():
     assert row.psnr_foreground is None
 
 
-def test_an_error_smaller_than_half_a_step_is_no_error():
+def test_metrics_ignore_errors_below_quantisation():
     assert measure_view(view(error=0.3 / 255)).metrics.psnr == np.inf
 
 
-def test_pixels_under_the_mask_do_not_matter():
+def test_metrics_ignore_masked_pixels():
     weight = np.ones((30, 40), np.float32)
     weight[:, :15] = 0
     clean = view(weight=weight)
@@ -113,7 +113,7 @@ def test_a_view_without_valid_pixels_does_not_spoil_the_mean():
     assert (rows[1].ssim, rows[1].ssim_valid, rows[1].ms_ssim, rows[1].flip) == (None, None, None, None)
 
 
-def test_a_perfect_view_is_left_out_of_the_mean_and_counted():
+def test_mean_psnr_excludes_and_counts_perfect_views():
     rows = [measure_view(one).metrics for one in (view("a.jpg"), view("b.jpg", 0.0), view("c.jpg", 0.05))]
     summary = summarise(rows)
     assert summary.mean["psnr"] == pytest.approx((rows[0].psnr + rows[2].psnr) / 2)
@@ -160,7 +160,7 @@ def test_sizes_that_differ_are_refused_by_name():
         measure_view(view(render=np.zeros((20, 40, 3), np.float32)))
 
 
-def test_a_render_that_is_no_number_is_refused():
+def test_metrics_non_finite_render_is_refused():
     with pytest.raises(DatasetError, match="no number"):
         measure_view(view(error=np.nan))
 

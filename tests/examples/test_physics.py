@@ -8,11 +8,11 @@ from types import ModuleType
 import numpy as np
 import pytest
 
-from octasplat.engine.gaussians.frames import frames_from_normals, quaternions
+from octasplat.engine.gaussians.frames import frames_from_normals, quaternions_from_matrices
 from octasplat.engine.gaussians.model import FlatGaussians
-from octasplat.engine.render.cameras import RenderCamera, focal_from_fov
-from octasplat.engine.render.paths import look_at
-from octasplat.engine.surface.mesh import TriangleMesh
+from octasplat.engine.geometry.triangle_mesh import TriangleMesh
+from octasplat.engine.render.pinhole_camera import PinholeCamera, focal_from_fov
+from octasplat.engine.render.pose_paths import look_at
 from octasplat.engine.trace.cpu.tracer import CpuTracer
 
 FOLDER = Path(__file__).resolve().parents[2] / "examples" / "physics"
@@ -49,7 +49,7 @@ def skin(box) -> FlatGaussians:
     normals = np.eye(3)[axis] * np.where(side, 1.0, -1.0)[:, None]
     return FlatGaussians(
         (share * [2, 1, 1] + [-1, -0.5, 0]).astype(np.float32),
-        quaternions(frames_from_normals(normals)).astype(np.float32),
+        quaternions_from_matrices(frames_from_normals(normals)).astype(np.float32),
         np.full((1500, 2), np.log(0.06), np.float32),
         np.full(1500, 5.0, np.float32),
         np.full((1500, 1, 3), 1.0, np.float32),
@@ -77,7 +77,7 @@ def test_lattice_holds_the_box(box):
     assert outer == 4 * (across[0] * across[1] + across[1] * across[2] + across[2] * across[0])
 
 
-def test_at_rest_and_under_an_affine_map(box, skin):
+def test_physics_proxy_rest_and_affine_motion_are_exact(box, skin):
     soft_body = load("soft_body")
     lattice = soft_body.lattice_around(box, 0.3)
     rider = soft_body.Rider(skin, lattice)
@@ -94,7 +94,7 @@ def covariances(gaussians: FlatGaussians) -> np.ndarray:
     return np.einsum("nik,njk->nij", axes, axes).astype(np.float64)
 
 
-def test_only_what_is_near_belongs(box, skin):
+def test_physics_object_takes_nearby_gaussians_only(box, skin):
     far = skin.select(np.arange(10))
     far.means_world[:] += np.float32([0, 0, 3])
     inside = skin.select(np.arange(1))
@@ -112,7 +112,7 @@ def test_film_of_a_bend_has_no_holes(box, skin):
     lattice = soft_body.lattice_around(box, 0.2)
     rider = soft_body.Rider(skin, lattice)
     frames = np.stack([bent(lattice.nodes_world, angle) for angle in (0.0, 0.4, 0.8)])
-    camera = RenderCamera.from_pose(
+    camera = PinholeCamera.from_pose(
         look_at(np.array([0.0, -5.0, 1.5]), np.array([0.0, 0.0, 0.5]), np.array([0.0, 0.0, 1.0])),
         48,
         36,
@@ -140,7 +140,7 @@ def bent(points: np.ndarray, angle: float) -> np.ndarray:
     return np.stack([reach * np.sin(turn), points[:, 1], 1 / angle - reach * np.cos(turn)], axis=1)
 
 
-def test_what_stands_on_a_cloth_follows_it(skin):
+def test_physics_gaussians_follow_cloth(skin):
     drape = load("drape")
     vertices, triangles = drape.round_grid(np.array([0.0, 0.0, -0.01]), 1.3, 20)
     radii = np.linalg.norm(vertices[:, :2], axis=1)
@@ -173,7 +173,7 @@ def test_mujoco_lets_a_cloth_sag(tmp_path):
     assert np.median(lengths[1] / lengths[0]) == pytest.approx(1.0, abs=0.1)  # bent, not stretched
 
 
-def test_mujoco_drops_it(box, tmp_path):
+def test_physics_mujoco_object_falls(box, tmp_path):
     if importlib.util.find_spec("mujoco") is None:
         pytest.skip("mujoco is not installed; pip install -c constraints.txt -e '.[examples]'")
     lattice = load("soft_body").lattice_around(box, 0.5)

@@ -8,7 +8,7 @@ from octasplat.engine.gaussians.flattening import GaussianCloud
 
 
 @dataclass(frozen=True)
-class Difference:
+class GaussianDifference:
     """Largest differences: world units, degrees, ln, opacity, coefficients."""
 
     position: float
@@ -24,10 +24,10 @@ class Difference:
             )
 
 
-def difference(a: GaussianCloud, b: GaussianCloud) -> Difference:
+def difference(a: GaussianCloud, b: GaussianCloud) -> GaussianDifference:
     assert a.means_world.shape == b.means_world.shape
     assert a.sh.shape == b.sh.shape
-    return Difference(
+    return GaussianDifference(
         float(np.abs(a.means_world - b.means_world).max()),
         float(rotation_degrees(a.quats_wxyz, b.quats_wxyz).max()),
         float(np.abs(a.log_scales - b.log_scales).max()),

@@ -96,7 +96,7 @@ def test_values_come_back_within_their_quantum(
 
 
 @pytest.mark.parametrize(("degree", "count"), [(0, 1), (3, 3000)])
-def test_what_we_write_comes_back(tmp_path: Path, degree: int, count: int) -> None:
+def test_compressed_ply_round_trips(tmp_path: Path, degree: int, count: int) -> None:
     random = np.random.default_rng(7)
     scene = FlatGaussians(
         random.uniform(-3, 3, (count, 3)).astype(np.float32),
@@ -126,7 +126,7 @@ def test_what_we_write_comes_back(tmp_path: Path, degree: int, count: int) -> No
 
 
 @pytest.mark.parametrize("far", [0, 1, 40])
-def test_few_gaussians_far_away_cost_the_others_no_precision(tmp_path: Path, far: int) -> None:
+def test_compressed_ply_outliers_keep_precision(tmp_path: Path, far: int) -> None:
     random = np.random.default_rng(5)
     count, sigma = 20_000, 0.01
     means = random.uniform(-1, 1, (count, 3))

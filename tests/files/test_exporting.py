@@ -15,7 +15,7 @@ Make = Callable[..., FlatGaussians]
 ALL = ("scene.ply", "mesh.ply", "scene.obj", "scene.glb")
 
 
-def test_all_formats_are_found_by_themselves() -> None:
+def test_exporters_are_discovered() -> None:
     assert {exporter.name for exporter in exporters()} >= {"gaussians", "mesh-ply", "obj", "glb"}
     assert all(exporter.description and exporter.patterns for exporter in exporters())
 
@@ -39,7 +39,7 @@ def test_the_file_name_chooses_the_format(name: str, format: str) -> None:
     assert exporter_for(Path("some/where") / name).name == format
 
 
-def test_an_explicit_format_wins() -> None:
+def test_export_explicit_format_overrides_suffix() -> None:
     assert exporter_for(Path("scene.ply"), "mesh-ply").name == "mesh-ply"
     assert exporter_for(Path("mesh.ply"), "gaussians").name == "gaussians"
 
@@ -51,16 +51,14 @@ def test_unknown_formats_list_the_known_ones() -> None:
         exporter_for(Path("scene.glb"), "fbx")
 
 
-def test_a_name_cannot_be_taken_twice() -> None:
+def test_exporter_duplicate_name_is_refused() -> None:
     glb = exporter_for(Path("a.glb"))
     with pytest.raises(ValueError, match="glb"):
         register(Exporter("glb", ("*.x",), "another", glb.write))
 
 
 @pytest.mark.parametrize("name", ALL)
-def test_every_file_written_is_returned_and_nothing_else_is_left(
-    make_scene: Make, tmp_path: Path, name: str
-) -> None:
+def test_exporters_return_exactly_written_files(make_scene: Make, tmp_path: Path, name: str) -> None:
     written = export_scene(make_scene(20), tmp_path / "new" / name)
     assert written[0] == tmp_path / "new" / name
     assert set(written) == set((tmp_path / "new").iterdir())

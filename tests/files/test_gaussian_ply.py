@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from octasplat.engine.errors import SceneFileError
-from octasplat.engine.files import read_facts, read_scene
+from octasplat.engine.files import read_metadata, read_scene
 from octasplat.engine.files.gaussian_ply import read_gaussian_ply, write_gaussian_ply
 from octasplat.engine.files.ply_container import read_ply
 from octasplat.engine.gaussians.frames import rotation_matrices
 from octasplat.engine.gaussians.model import FlatGaussians
-from octasplat.engine.gaussians.scene_facts import SceneFacts
+from octasplat.engine.gaussians.scene_metadata import SceneMetadata
 
 Make = Callable[..., FlatGaussians]
 TYPES = {"<f4": "float", "<f8": "double", "<i2": "short", "<u1": "uchar"}
@@ -60,26 +60,26 @@ def assert_same_bits(actual: FlatGaussians, expected: FlatGaussians) -> None:
         np.testing.assert_array_equal(a.view(np.uint32), b.view(np.uint32), err_msg=name)
 
 
-def test_what_is_known_of_a_scene_is_kept_in_comments(make_gaussians: Make, tmp_path: Path) -> None:
+def test_gaussian_ply_metadata_in_comments_round_trips(make_gaussians: Make, tmp_path: Path) -> None:
     path = tmp_path / "scene.ply"
-    facts = SceneFacts(near_world=0.125, pixel_rad=1e-3, turned_beyond=0.5)
+    facts = SceneMetadata(near_world=0.125, pixel_rad=1e-3, turned_beyond=0.5)
     write_gaussian_ply(make_gaussians(3), path, facts=facts)
-    assert read_facts(path) == read_facts(tmp_path) == facts
+    assert read_metadata(path) == read_metadata(tmp_path) == facts
     write_gaussian_ply(make_gaussians(3), path)
-    assert read_facts(path) == SceneFacts()
-    assert read_facts(tmp_path / "scene.splat") == SceneFacts()
+    assert read_metadata(path) == SceneMetadata()
+    assert read_metadata(tmp_path / "scene.splat") == SceneMetadata()
 
 
-def test_a_fact_that_is_no_number_is_refused(make_gaussians: Make, tmp_path: Path) -> None:
+def test_gaussian_ply_non_numeric_metadata_is_refused(make_gaussians: Make, tmp_path: Path) -> None:
     path = tmp_path / "scene.ply"
-    write_gaussian_ply(make_gaussians(3), path, facts=SceneFacts(near_world=0.125))
+    write_gaussian_ply(make_gaussians(3), path, facts=SceneMetadata(near_world=0.125))
     path.write_bytes(path.read_bytes().replace(b"near_world 0.125", b"near_world close"))
     with pytest.raises(SceneFileError, match="near_world is 'close', which is no number"):
-        read_facts(path)
+        read_metadata(path)
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_own_files_come_back_bit_for_bit(make_gaussians: Make, tmp_path: Path, degree: int) -> None:
+def test_gaussian_ply_round_trip_is_bit_exact(make_gaussians: Make, tmp_path: Path, degree: int) -> None:
     g = make_gaussians(257, sh_degree=degree)
     g.log_scales[0] = -20.0  # thinner in its plane than our flat axis
     g.log_scales[1] = np.log(np.float32(1e-5))
@@ -141,7 +141,7 @@ def test_properties_are_found_by_name_in_any_order_and_layout(
     assert report.flattened == 0
 
 
-def test_whole_numbers_are_converted(make_gaussians: Make, tmp_path: Path) -> None:
+def test_gaussian_ply_integer_properties_are_converted(make_gaussians: Make, tmp_path: Path) -> None:
     columns = columns_of(make_gaussians(6)) | {"opacity": np.arange(6, dtype=np.int16) - 3}
     back, _ = read_gaussian_ply(write_columns(tmp_path / "a.ply", columns))
     np.testing.assert_array_equal(back.opacity_logits, [-3, -2, -1, 0, 1, 2])
@@ -192,7 +192,7 @@ def test_thick_gaussians_lose_only_their_smallest_axis(make_gaussians: Make, tmp
     assert report.max_thickness == pytest.approx(float(ratios.max()), rel=1e-5)
 
 
-def test_ties_leave_the_axes_as_they_are(make_gaussians: Make, tmp_path: Path) -> None:
+def test_gaussian_ply_equal_scales_keep_axes(make_gaussians: Make, tmp_path: Path) -> None:
     g = make_gaussians(10)
     g.log_scales[:] = -2.0
     scales = np.full((10, 3), -2.0, np.float32)
@@ -283,7 +283,7 @@ def test_lists_and_compressed_files_are_refused(make_gaussians: Make, tmp_path: 
         read_gaussian_ply(path)
 
 
-def test_a_mesh_is_refused_by_what_it_lacks(tmp_path: Path) -> None:
+def test_gaussian_ply_of_mesh_names_missing_property(tmp_path: Path) -> None:
     path = tmp_path / "a.ply"
     path.write_bytes(b"ply\nformat ascii 1.0\nelement vertex 0\nproperty float x\nend_header\n")
     with pytest.raises(SceneFileError, match="not a PLY of Gaussians; it lacks the property y, z, f_dc_0"):

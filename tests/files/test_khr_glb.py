@@ -11,9 +11,9 @@ from octasplat.engine.colour import srgb_to_linear
 from octasplat.engine.errors import SceneFileError
 from octasplat.engine.files import ExportOptions, export_scene, importer_for, read_mesh, read_scene
 from octasplat.engine.gaussians.frames import rotation_matrices
-from octasplat.engine.gaussians.harmonics import sh_basis
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.gaussians.octagon import octagon_corners_world, octagon_radii
+from octasplat.engine.gaussians.spherical_harmonics import sh_basis
 
 Make = Callable[..., FlatGaussians]
 KHR = "KHR_gaussian_splatting"
@@ -162,7 +162,7 @@ def test_several_primitives_and_quantised_attributes(make_scene: Make, tmp_path:
     np.testing.assert_allclose(back.rotations[30:], back.rotations[:30], atol=2e-4)
 
 
-def test_linear_colours_are_converted_and_told(make_scene: Make, tmp_path: Path) -> None:
+def test_khr_glb_linear_colours_are_converted_with_warning(make_scene: Make, tmp_path: Path) -> None:
     scene = make_scene(30)
     export_scene(scene, tmp_path / "a.splats.glb")
     document, binary = parts(tmp_path / "a.splats.glb")
@@ -174,7 +174,7 @@ def test_linear_colours_are_converted_and_told(make_scene: Make, tmp_path: Path)
     np.testing.assert_allclose(again[inside], scene.base_rgb_srgb[inside], atol=1e-5)
 
 
-def test_what_is_no_splat_is_refused(make_scene: Make, tmp_path: Path) -> None:
+def test_khr_glb_without_gaussians_is_refused(make_scene: Make, tmp_path: Path) -> None:
     scene = make_scene(30)
     export_scene(scene, tmp_path / "octagons.glb")
     document, binary = parts(tmp_path / "octagons.glb")

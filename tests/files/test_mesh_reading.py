@@ -93,18 +93,18 @@ def test_obj_relative_numbers_count_back_from_their_own_line(tmp_path: Path, mon
     np.testing.assert_allclose(mesh.uv[:, 0], np.repeat([0, 0.25, 0.5], 3))
 
 
-def test_obj_with_a_byte_order_mark_or_indented_lines_is_whole(tmp_path: Path) -> None:
+def test_obj_with_bom_or_indentation_is_read(tmp_path: Path) -> None:
     path = obj(tmp_path, "\ufeffv 0 0 0\n  v 1 0 0\n\tv 0 1 0\n f 1 2 3\n")
     mesh = read_mesh(path)
     assert mesh.vertices.tolist() == [[0, 0, 0], [1, 0, 0], [0, 1, 0]]
     assert mesh.triangles.tolist() == [[0, 1, 2]]
 
 
-def test_mtl_with_a_byte_order_mark_is_whole(tmp_path: Path) -> None:
+def test_mtl_with_bom_is_read(tmp_path: Path) -> None:
     (tmp_path / "a.mtl").write_text("\ufeffnewmtl red\nKd 1 0 0\n", encoding="utf-8")
     path = obj(tmp_path, "mtllib a.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nusemtl red\nf 1 2 3\n")
-    assert [material.name for material in read_mesh(path, looks=True).materials] == ["red"]
-    assert read_mesh(path, looks=True).materials[0].passed_over == ()
+    assert [material.name for material in read_mesh(path, with_materials=True).materials] == ["red"]
+    assert read_mesh(path, with_materials=True).materials[0].unsupported == ()
 
 
 def test_obj_rounding_follows_the_digits(tmp_path: Path) -> None:
@@ -124,7 +124,7 @@ def test_obj_rounding_follows_the_digits(tmp_path: Path) -> None:
         ("v 0 0 nan\n", "not finite"),
     ],
 )
-def test_damaged_obj(tmp_path: Path, text: str, message: str) -> None:
+def test_obj_damaged_is_refused(tmp_path: Path, text: str, message: str) -> None:
     with pytest.raises(SceneFileError, match=r"mesh\.obj.*" + message):
         read_mesh(obj(tmp_path, text))
 
@@ -185,12 +185,12 @@ def test_glb_node_with_a_matrix(tmp_path: Path) -> None:
         ({"scenes": [{"nodes": []}]}, "holds no vertices"),
     ],
 )
-def test_damaged_glb(tmp_path: Path, changes: dict[str, Any], message: str) -> None:
+def test_glb_damaged_is_refused(tmp_path: Path, changes: dict[str, Any], message: str) -> None:
     with pytest.raises(SceneFileError, match=r"mesh\.glb.*" + message):
         read_mesh(glb(tmp_path, *triangle_document(**changes)))
 
 
-def test_truncated_glb(tmp_path: Path) -> None:
+def test_glb_truncated_is_refused(tmp_path: Path) -> None:
     path = glb(tmp_path, *triangle_document())
     path.write_bytes(path.read_bytes()[:-8])
     with pytest.raises(SceneFileError, match="truncated"):
@@ -223,6 +223,6 @@ def test_ply_of_gaussians_is_no_mesh(tmp_path: Path) -> None:
         read_mesh(path)
 
 
-def test_other_suffixes_are_refused(tmp_path: Path) -> None:
+def test_mesh_unknown_suffix_is_refused(tmp_path: Path) -> None:
     with pytest.raises(SceneFileError, match=r"save it as \.glb, \.ply or \.obj"):
         read_mesh(tmp_path / "mesh.fbx")

@@ -9,7 +9,7 @@ import pytest
 
 import octasplat.engine.files.mesh_obj as obj_module
 from octasplat.engine.errors import SceneFileError
-from octasplat.engine.files import ExportOptions, export_scene, octagon_soup, read_scene
+from octasplat.engine.files import ExportOptions, export_scene, octagon_batches, read_scene
 from octasplat.engine.files.ply_container import read_ply
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.gaussians.octagon import (
@@ -115,8 +115,8 @@ def parse_obj(path: Path) -> dict[str, list[list[str]]]:
 def test_obj_holds_the_same_octagons(
     make_scene: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for module in (obj_module, octagon_soup):
-        monkeypatch.setattr(module, "BATCH", 128)
+    for module in (obj_module, octagon_batches):
+        monkeypatch.setattr(module, "BATCH_SIZE", 128)
     scene = make_scene(600)
     written = export_scene(scene, tmp_path / "fox.obj")
     assert [path.name for path in written] == ["fox.obj", "fox.mtl", "fox_alpha.png"]

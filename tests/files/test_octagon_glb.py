@@ -9,9 +9,9 @@ import pytest
 
 from octasplat.engine.colour import srgb_to_linear
 from octasplat.engine.errors import ConfigError, SceneFileError
-from octasplat.engine.files import ExportOptions, export_scene, gltf
+from octasplat.engine.files import ExportOptions, export_scene, glb_container
+from octasplat.engine.files.kd_split import kd_split
 from octasplat.engine.files.octagon_glb_layout import OPAQUE_CUTOFF
-from octasplat.engine.files.spatial import kd_chunks
 from octasplat.engine.files.textures import radial_alpha
 from octasplat.engine.gaussians.frames import rotation_matrices
 from octasplat.engine.gaussians.materials import MATERIAL_WIDTHS
@@ -139,16 +139,16 @@ def test_chunks_hold_every_octagon_exactly_once(make_scene: Make, tmp_path: Path
 
 def test_chunks_are_compact_and_of_equal_size() -> None:
     points = np.random.default_rng(0).uniform(0, 1, (64 * 300 + 5, 3)).astype(np.float32)
-    chunks = kd_chunks(points, 64)
+    chunks = kd_split(points, 64)
     assert len(chunks) == 64
     assert {len(chunk) for chunk in chunks} <= {300, 301}
     volumes = [float(np.prod(np.ptp(points[chunk], axis=0))) for chunk in chunks]
     assert sum(volumes) < 1.0 and max(volumes) < 3 / 64
-    assert len(kd_chunks(points[:511], 64)) == 1
-    assert len(kd_chunks(np.zeros((1024, 3), np.float32), 64)) == 4
+    assert len(kd_split(points[:511], 64)) == 1
+    assert len(kd_split(np.zeros((1024, 3), np.float32), 64)) == 4
 
 
-def test_json_says_what_viewers_need(make_scene: Make, tmp_path: Path) -> None:
+def test_octagon_glb_json_has_required_fields(make_scene: Make, tmp_path: Path) -> None:
     scene = make_scene(2000)
     export_scene(scene, tmp_path / "a.glb")
     glb = Glb(tmp_path / "a.glb")
@@ -179,21 +179,21 @@ def test_root_node_turns_y_down_into_y_up(make_scene: Make, tmp_path: Path) -> N
     assert all(set(node) == {"name", "mesh"} for node in document["nodes"][1:])
 
 
-def test_ids_can_be_left_out(make_scene: Make, tmp_path: Path) -> None:
+def test_octagon_glb_ids_option_omits_ids(make_scene: Make, tmp_path: Path) -> None:
     export_scene(make_scene(600), tmp_path / "a.glb", ExportOptions(ids=False))
     for arrays in Glb(tmp_path / "a.glb").primitives():
         assert set(arrays) == {"POSITION", "COLOR_0", "TEXCOORD_0", "indices"}
 
 
-def test_more_than_a_glb_can_hold_is_refused_before_writing(
+def test_octagon_glb_too_large_is_refused_before_writing(
     make_scene: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     scene = make_scene(100)
     export_scene(scene, tmp_path / "a.glb")
     size = (tmp_path / "a.glb").stat().st_size
-    monkeypatch.setattr(gltf, "MAX_BYTES", size)
+    monkeypatch.setattr(glb_container, "MAX_BYTES", size)
     export_scene(scene, tmp_path / "b.glb")
-    monkeypatch.setattr(gltf, "MAX_BYTES", size - 1)
+    monkeypatch.setattr(glb_container, "MAX_BYTES", size - 1)
     with pytest.raises(SceneFileError, match=r"c\.glb: not written; .*min_opacity.*mesh PLY"):
         export_scene(scene, tmp_path / "c.glb")
     assert not (tmp_path / "c.glb").exists()
@@ -206,7 +206,7 @@ def test_a_scene_too_large_for_one_file_goes_into_several(
     export_scene(scene, tmp_path / "whole.glb")
     whole = Glb(tmp_path / "whole.glb")
     limit = int(0.45 * (tmp_path / "whole.glb").stat().st_size)
-    monkeypatch.setattr(gltf, "MAX_BYTES", limit)
+    monkeypatch.setattr(glb_container, "MAX_BYTES", limit)
     written = export_scene(scene, tmp_path / "a.glb")
     assert [path.name for path in written] == ["a.glb", "a.part2.glb", "a.part3.glb"]
     assert all(path.stat().st_size <= limit for path in written)
@@ -221,14 +221,14 @@ def test_a_scene_too_large_for_one_file_goes_into_several(
 
 
 @pytest.mark.parametrize(("chunks", "expected"), [(1, 1), (4, 4), (7, 4), (4096, 8)])
-def test_as_many_chunks_as_asked_for(make_scene: Make, tmp_path: Path, chunks: int, expected: int) -> None:
+def test_octagon_glb_chunk_count_option_is_used(
+    make_scene: Make, tmp_path: Path, chunks: int, expected: int
+) -> None:
     export_scene(make_scene(3000), tmp_path / "a.glb", ExportOptions(chunks=chunks))
     assert len(Glb(tmp_path / "a.glb").primitives()) == expected
 
 
-def test_the_opaque_variant_cuts_alpha_and_loses_nothing_above_the_cut(
-    make_scene: Make, tmp_path: Path
-) -> None:
+def test_octagon_glb_opaque_keeps_octagons_above_cutoff(make_scene: Make, tmp_path: Path) -> None:
     scene = make_scene(2000)
     export_scene(scene, tmp_path / "a.glb", ExportOptions(opaque=True, chunks=1))
     glb = Glb(tmp_path / "a.glb")
@@ -271,7 +271,7 @@ def test_lit_octagons_have_their_own_materials(make_scene: Make, tmp_path: Path)
     glb = Glb(tmp_path / "a.glb")
     (arrays,) = glb.primitives()
     ids = np.flatnonzero(octagon_radii(scene.opacities) > 0)
-    (each,) = kd_chunks(scene.means_world[ids], 1)
+    (each,) = kd_split(scene.means_world[ids], 1)
     of = np.repeat(ids[each], 8)
     np.testing.assert_array_equal(arrays["COLOR_0"][:, :3], channels["albedo"][of])
     # As a viewer looks it up: between the pixels' middles of an image of all pairs.

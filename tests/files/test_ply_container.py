@@ -69,7 +69,7 @@ def test_lists_of_unequal_length_are_refused(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("layout", ["binary_little_endian", "ascii"])
 @pytest.mark.parametrize("keep", [0, 7])
-def test_truncated_files_say_how_much_is_there(tmp_path: Path, layout: str, keep: int) -> None:
+def test_ply_truncated_reports_available_rows(tmp_path: Path, layout: str, keep: int) -> None:
     path = tmp_path / "a.ply"
     body = binary("<") if "binary" in layout else b"1.5 -2\n2.5 7\n"
     path.write_bytes((POINTS + FACES).format(layout=layout).encode() + body[:keep])
@@ -79,7 +79,7 @@ def test_truncated_files_say_how_much_is_there(tmp_path: Path, layout: str, keep
         read_ply(path, ["vertex"])
 
 
-def test_a_claim_of_very_many_rows_costs_nothing(tmp_path: Path) -> None:
+def test_ply_huge_row_count_allocates_nothing(tmp_path: Path) -> None:
     path = tmp_path / "a.ply"
     path.write_bytes(
         b"ply\nformat binary_little_endian 1.0\nelement vertex 99999999999\nproperty float x\nend_header\n"

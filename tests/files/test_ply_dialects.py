@@ -8,7 +8,7 @@ import pytest
 from octasplat.engine.errors import SceneFileError
 from octasplat.engine.files import read_scene
 from octasplat.engine.files.ply_container import PlyWriteElement, write_ply
-from octasplat.engine.gaussians.frames import quaternions
+from octasplat.engine.gaussians.frames import quaternions_from_matrices
 from octasplat.engine.gaussians.model import FlatGaussians
 
 FIRST = np.array([0.6, 0.8, 0.0])
@@ -23,7 +23,7 @@ def write_disc(path: Path, axes: list[np.ndarray], scales: list[float], **more: 
     """Write a PLY whose rotation has these columns; its quaternion is not of unit length, as in training."""
     matrix = np.stack(axes, axis=1)[None]
     assert np.linalg.det(matrix[0]) == pytest.approx(1.0)
-    rotation = 1.7 * quaternions(matrix)[0]
+    rotation = 1.7 * quaternions_from_matrices(matrix)[0]
     rest = {f"f_rest_{k}": 0.01 * k for k in range(int(more.pop("rest", 0)))}
     row = {"x": 1.0, "y": 2.0, "z": 3.0, "nx": 0.0, "ny": 0.0, "nz": 0.0}
     row |= {"f_dc_0": 0.1, "f_dc_1": 0.2, "f_dc_2": 0.3, **rest, "opacity": np.log(OPACITY / (1 - OPACITY))}
@@ -57,7 +57,7 @@ DIALECTS = {
 
 
 @pytest.mark.parametrize("dialect", DIALECTS)
-def test_the_disc_of_each_program_is_read_as_it_meant_it(dialect: str, tmp_path: Path) -> None:
+def test_ply_dialect_discs_match_source_program(dialect: str, tmp_path: Path) -> None:
     axes, scales, name = DIALECTS[dialect]
     scene, report = read_scene(write_disc(tmp_path / "a.ply", axes, scales), name)
     assert_is_the_disc(scene)
@@ -77,14 +77,14 @@ def test_the_filter_of_gaussian_opacity_fields_is_folded_in(tmp_path: Path) -> N
     assert scene.channels.widths == {}
 
 
-def test_a_filter_of_zero_changes_nothing(tmp_path: Path) -> None:
+def test_ply_zero_filter_leaves_scales_unchanged(tmp_path: Path) -> None:
     path = write_disc(tmp_path / "a.ply", [NORMAL, FIRST, SECOND], [1e-5, *SIGMAS], filter_3D=0.0)
     scene, _ = read_scene(path)
     assert_is_the_disc(scene)
     assert scene.opacities[0] == pytest.approx(OPACITY)
 
 
-def test_harmonics_of_degree_four_are_cut_and_told(tmp_path: Path) -> None:
+def test_ply_degree_four_harmonics_are_truncated_with_warning(tmp_path: Path) -> None:
     path = write_disc(tmp_path / "a.ply", [NORMAL, FIRST, SECOND], [1e-5, *SIGMAS], rest=72)
     scene, report = read_scene(path)
     expected = 0.01 * np.array([[24 * colour + k for colour in range(3)] for k in range(15)])

@@ -29,9 +29,7 @@ def test_formats_are_found_by_themselves_and_have_names_of_their_own() -> None:
 
 
 @pytest.mark.parametrize("name", ["scene.ply", "scene.splat", "scene.data"])
-def test_what_a_file_begins_with_goes_before_its_name(
-    gaussians: FlatGaussians, tmp_path: Path, name: str
-) -> None:
+def test_read_scene_detects_format_by_content(gaussians: FlatGaussians, tmp_path: Path, name: str) -> None:
     write_gaussian_ply(gaussians, tmp_path / "a.ply")
     (tmp_path / "a.ply").rename(tmp_path / name)
     assert importer_for(tmp_path / name).name == "gaussians"
@@ -59,10 +57,10 @@ def test_unknown_files_are_refused_by_name(tmp_path: Path) -> None:
         read_scene(tmp_path / "a.fbx", "fbx")
 
 
-def test_beginning_and_end_are_told(gaussians: FlatGaussians, tmp_path: Path) -> None:
+def test_read_scene_reports_progress_events(gaussians: FlatGaussians, tmp_path: Path) -> None:
     write_gaussian_ply(gaussians, tmp_path / "a.ply")
     events: list[Event] = []
-    read_scene(tmp_path / "a.ply", listener=events.append)
+    read_scene(tmp_path / "a.ply", progress=events.append)
     assert [type(event) for event in events] == [StageStarted, StageFinished]
 
 

@@ -12,7 +12,7 @@ def row(scale: tuple[float, float, float] = (0.5, 0.25, 1e-5)) -> bytes:
     return struct.pack("<6f8B", 1.0, -2.0, 3.5, *scale, 0, 128, 255, 51, 128, 128, 0, 128)
 
 
-def test_a_file_written_by_hand(tmp_path: Path) -> None:
+def test_splat_known_bytes_are_read(tmp_path: Path) -> None:
     (tmp_path / "a.splat").write_bytes(row() + row((1e-5, 2.0, 3.0)))
     gaussians, report = read_scene(tmp_path / "a.splat")
     assert (report.count, report.sh_degree, report.flattened) == (2, 0, 0)
@@ -49,7 +49,7 @@ def test_files_that_are_none(tmp_path: Path) -> None:
 
 
 @pytest.mark.real
-def test_a_trained_scene(splats: Path) -> None:
+def test_splat_of_trained_scene_is_read(splats: Path) -> None:
     path = splats / "nerf_chair.splat"
     assert importer_for(path).name == "splat"
     gaussians, report = read_scene(path)

@@ -125,7 +125,7 @@ def test_scenes_that_cannot_be_written_leave_no_file(make_flat: Make, tmp_path: 
 
 
 @pytest.mark.parametrize("name", FORMATS)
-def test_our_own_files_are_flat(make_flat: Make, tmp_path: Path, name: str) -> None:
+def test_splat_formats_own_files_stay_flat(make_flat: Make, tmp_path: Path, name: str) -> None:
     export_scene(make_flat(50, 0), tmp_path / name)
     assert read_scene(tmp_path / name)[1].flattened == 0
 
@@ -171,7 +171,7 @@ def test_scales_beyond_float32_are_refused(make_flat: Make, tmp_path: Path, name
     assert not (tmp_path / name).exists()
 
 
-def test_both_versions_of_spz_hold_the_same(make_flat: Make, tmp_path: Path) -> None:
+def test_spz_versions_3_and_4_hold_same_scene(make_flat: Make, tmp_path: Path) -> None:
     scene = make_flat(1000, 3)
     for version in (3, 4):
         export_scene(scene, tmp_path / f"{version}.spz", ExportOptions(spz_version=version))
@@ -181,7 +181,9 @@ def test_both_versions_of_spz_hold_the_same(make_flat: Make, tmp_path: Path) -> 
         np.testing.assert_array_equal(getattr(a, name), getattr(b, name))
 
 
-def test_sog_says_what_to_install(make_flat: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_sog_missing_converter_is_named(
+    make_flat: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setenv("OCTASPLAT_SPLAT_TRANSFORM", str(tmp_path / "nowhere"))
     with pytest.raises(
         SceneFileError, match=r"a\.sog: needs the program splat-transform; .*@playcanvas/splat-transform"
@@ -193,7 +195,7 @@ def test_sog_says_what_to_install(make_flat: Make, tmp_path: Path, monkeypatch: 
 @pytest.mark.parametrize(
     ("script", "message"), [("echo out of order >&2; exit 3", "failed .out of order"), ("exit 0", "failed")]
 )
-def test_a_failing_converter_is_quoted(
+def test_sog_converter_error_is_quoted(
     make_flat: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, script: str, message: str
 ) -> None:
     program = tmp_path / "converter"

@@ -13,7 +13,7 @@ from octasplat.engine.errors import SceneFileError
 from octasplat.engine.files import importer_for, read_scene
 from octasplat.engine.files.gaussian_ply import read_ply_cloud
 from octasplat.engine.gaussians.flattening import GaussianCloud
-from octasplat.engine.gaussians.harmonics import sh_basis
+from octasplat.engine.gaussians.spherical_harmonics import sh_basis
 
 Make = Callable[..., GaussianCloud]
 BITS = 12
@@ -87,7 +87,7 @@ def test_values_come_back_within_their_quantum(
     )
 
 
-def test_higher_harmonics_are_left_out_and_told(make_cloud: Make, tmp_path: Path) -> None:
+def test_spz_higher_harmonics_are_dropped_with_warning(make_cloud: Make, tmp_path: Path) -> None:
     cloud = make_cloud(10, 3)
     header, streams = pack(cloud, 3, degree=4)
     streams[5] = b"".join(streams[5][45 * i : 45 * (i + 1)] + bytes(27) for i in range(10))

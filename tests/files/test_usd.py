@@ -6,8 +6,8 @@ import pytest
 
 from octasplat.engine.errors import SceneFileError
 from octasplat.engine.files import export_scene
-from octasplat.engine.gaussians.harmonics import sh_basis
 from octasplat.engine.gaussians.model import FlatGaussians
+from octasplat.engine.gaussians.spherical_harmonics import sh_basis
 
 usd = pytest.importorskip(
     "pxr.Usd", reason="usd-core is not installed (pip install -c constraints.txt -e '.[usd]')"
@@ -57,7 +57,7 @@ def test_the_surflets_are_our_gaussians(make_scene: Make, tmp_path: Path, name: 
 
 
 @pytest.mark.parametrize("name", ["a.usdc", "a.usdz"])
-def test_usd_core_finds_nothing_wrong(make_scene: Make, tmp_path: Path, name: str) -> None:
+def test_usd_file_passes_compliance_check(make_scene: Make, tmp_path: Path, name: str) -> None:
     from pxr import UsdValidation
 
     export_scene(make_scene(20), tmp_path / name)
@@ -70,7 +70,7 @@ def test_usd_core_finds_nothing_wrong(make_scene: Make, tmp_path: Path, name: st
     assert errors == []
 
 
-def test_without_usd_core_it_says_what_to_install(
+def test_usd_missing_dependency_is_named(
     make_scene: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(__import__("sys").modules, "pxr", None)
@@ -79,7 +79,7 @@ def test_without_usd_core_it_says_what_to_install(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_channels_are_primvars(make_scene: Make, tmp_path: Path) -> None:
+def test_usd_channels_are_primvars(make_scene: Make, tmp_path: Path) -> None:
     from pxr import UsdGeom
 
     albedo, label = np.random.default_rng(0).random((20, 3), np.float32), np.arange(20, dtype=np.float32)

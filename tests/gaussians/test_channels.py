@@ -7,9 +7,9 @@ from octasplat.engine.errors import ConfigError
 from octasplat.engine.gaussians.channels import (
     Channels,
     column_names,
-    common_widths,
-    grouped,
-    stacked,
+    group_columns,
+    merge_widths,
+    stack_channels,
     unstacked,
 )
 from octasplat.engine.gaussians.model import FlatGaussians, concatenate
@@ -27,11 +27,13 @@ def test_columns_of_a_channel_and_back() -> None:
     widths = {"metallic": 1, "albedo": 3, "f_semantic": 12}
     columns = [column for name, width in widths.items() for column in column_names(name, width)]
     assert columns[:4] == ["metallic", "albedo_0", "albedo_1", "albedo_2"]
-    assert grouped(reversed(columns)) == {name: column_names(name, width) for name, width in widths.items()}
+    assert group_columns(reversed(columns)) == {
+        name: column_names(name, width) for name, width in widths.items()
+    }
 
 
 def test_numbers_with_a_gap_or_alone_are_names() -> None:
-    found = grouped(["a_0", "b_1", "b_2", "c_00", "c_1", "d_0", "d_1"])
+    found = group_columns(["a_0", "b_1", "b_2", "c_00", "c_1", "d_0", "d_1"])
     assert list(found) == ["a_0", "b_1", "b_2", "c_00", "c_1", "d"]
     assert found["d"] == ("d_0", "d_1") and found["a_0"] == ("a_0",)
 
@@ -63,14 +65,15 @@ def test_rows_must_be_as_many_as_gaussians(make_gaussians: Make) -> None:
 
 def test_features_of_a_tracer_and_back() -> None:
     channels = some(albedo=3, metallic=1, label=2)
-    features = stacked(channels)
+    features = stack_channels(channels)
     assert features.shape == (4, 6)
     back = unstacked(features, channels.widths)
     assert list(back) == list(channels)
     for name, array in channels.items():
         np.testing.assert_array_equal(back[name], array)
     np.testing.assert_array_equal(
-        stacked(channels, ["metallic", "albedo"]), np.hstack([channels["metallic"], channels["albedo"]])
+        stack_channels(channels, ["metallic", "albedo"]),
+        np.hstack([channels["metallic"], channels["albedo"]]),
     )
     with pytest.raises(ValueError, match="6 features"):
         unstacked(features, {"albedo": 3})
@@ -80,10 +83,10 @@ def test_channels_are_set_replaced_and_taken_away(make_gaussians: Make) -> None:
     scene = make_gaussians(4).with_channels(some(albedo=3)).with_channels(some(metallic=1, albedo=2))
     assert scene.channels.widths == {"albedo": 2, "metallic": 1}
     assert scene.without_channels(["albedo"]).channels.widths == {"metallic": 1}
-    assert scene.bare().channels.widths == {}
+    assert scene.with_base_color_only().channels.widths == {}
 
 
-def test_not_finite_channels_count(make_gaussians: Make) -> None:
+def test_is_finite_includes_channels(make_gaussians: Make) -> None:
     scene = make_gaussians(4).with_channels(some(label=1))
     assert scene.is_finite()
     scene.channels["label"][2] = np.nan
@@ -96,6 +99,6 @@ def test_parts_with_other_channels_do_not_join_unasked(make_gaussians: Make) -> 
 
 
 def test_widths_of_several_scenes() -> None:
-    assert common_widths([some(a=1), some(), some(b=2, a=1)]) == {"a": 1, "b": 2}
+    assert merge_widths([some(a=1), some(), some(b=2, a=1)]) == {"a": 1, "b": 2}
     with pytest.raises(ConfigError, match="'a' has 1 numbers in one scene and 3 in another"):
-        common_widths([some(a=1), some(a=3)])
+        merge_widths([some(a=1), some(a=3)])

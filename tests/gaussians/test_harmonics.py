@@ -5,13 +5,13 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from octasplat.engine.gaussians.harmonics import rotate_sh, sh_basis, sh_rotations
-from octasplat.engine.trace.cpu.kernels_sh import write_basis
+from octasplat.engine.gaussians.spherical_harmonics import rotate_sh, sh_basis, sh_rotation_matrices
+from octasplat.engine.trace.cpu.kernels.spherical_harmonics import eval_sh_basis
 
 
 @numba.njit
 def basis_at(row, x, y, z):
-    write_basis(row, 16, x, y, z)
+    eval_sh_basis(row, 16, x, y, z)
 
 
 def directions(count: int, seed: int = 0) -> np.ndarray:
@@ -50,13 +50,13 @@ def test_a_quarter_turn_about_z_permutes_the_first_band() -> None:
 
 def test_matrices_are_orthogonal_and_follow_one_another() -> None:
     a, b = Rotation.random(2, random_state=1).as_matrix()
-    both, first, second = (sh_rotations(m[None], 3) for m in (b @ a, a, b))
+    both, first, second = (sh_rotation_matrices(m[None], 3) for m in (b @ a, a, b))
     for band in range(3):
         size = 2 * band + 3
         np.testing.assert_allclose(first[band][0] @ first[band][0].T, np.eye(size), atol=1e-12)
         np.testing.assert_allclose(second[band][0] @ first[band][0], both[band][0], atol=1e-12)
 
 
-def test_nothing_turned_is_nothing_changed() -> None:
+def test_harmonics_identity_rotation_is_exact() -> None:
     sh = np.random.default_rng(0).standard_normal((5, 16, 3)).astype(np.float32)
     np.testing.assert_allclose(rotate_sh(sh, np.broadcast_to(np.eye(3), (5, 3, 3))), sh, atol=1e-6)

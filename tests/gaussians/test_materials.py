@@ -9,7 +9,7 @@ from octasplat.engine.errors import ConfigError
 from octasplat.engine.gaussians.materials import (
     f0_linear,
     has_materials,
-    reflective_share,
+    reflective_fraction,
     require_materials,
     split_materials,
 )
@@ -49,4 +49,4 @@ def test_metal_that_is_not_too_rough_reflects() -> None:
     values = np.array([[0.5, 0.5, 0.5, 0.9, 0.1], [0.5, 0.5, 0.5, 0.9, 0.9], [0.5, 0.5, 0.5, 0.1, 0.1]])
     scene = plain(3)
     scene.log_scales[0] = np.log(2)  # four times the area
-    assert reflective_share(scene.with_channels(split_materials(values))) == pytest.approx(4 / 6)
+    assert reflective_fraction(scene.with_channels(split_materials(values))) == pytest.approx(4 / 6)

@@ -3,7 +3,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from octasplat.engine.gaussians.frames import quaternions, rotation_matrices
+from octasplat.engine.gaussians.frames import quaternions_from_matrices, rotation_matrices
 from octasplat.engine.gaussians.model import FlatGaussians, concatenate
 from octasplat.engine.gaussians.octagon import (
     CHI2_2_99,
@@ -80,7 +80,7 @@ def test_fan_triangles_tile_the_octagon_without_overlap() -> None:
     assert areas.sum() == pytest.approx(3 * 2 * np.sqrt(2))
 
 
-def test_nothing_moved_gives_the_same_gaussians(make_gaussians: Make) -> None:
+def test_octagon_fit_of_unmoved_corners_is_exact(make_gaussians: Make) -> None:
     g = make_gaussians(500)
     radii = octagon_radii(g.opacities)
     means, quats, log_scales, good = frames_from_octagons(octagon_corners_world(g, radii), radii)
@@ -108,7 +108,7 @@ def test_rigid_motion_and_uniform_scale_carry_over(make_gaussians: Make) -> None
     assert relative_error(covariances(quats, log_scales), expected) < 2e-3
 
 
-def test_shear_is_dropped_by_gram_schmidt() -> None:
+def test_octagon_fit_drops_shear() -> None:
     g = FlatGaussians(
         np.zeros((1, 3), np.float32),
         np.array([[1, 0, 0, 0]], np.float32),
@@ -125,7 +125,7 @@ def test_shear_is_dropped_by_gram_schmidt() -> None:
 
 
 @pytest.mark.parametrize("centre", [0.0, 100.0])
-def test_crumpled_octagons_are_found_and_leave_the_others_alone(make_gaussians: Make, centre: float) -> None:
+def test_octagon_fit_flags_crumpled_octagons_only(make_gaussians: Make, centre: float) -> None:
     g = make_gaussians(9, seed=4)
     g.opacity_logits[:] = 3.0
     g.log_scales[:] = [[-1.0, -1.5]]
@@ -146,7 +146,7 @@ def test_crumpled_octagons_are_found_and_leave_the_others_alone(make_gaussians: 
     assert np.isfinite(quats).all() and np.isfinite(log_scales).all()
 
 
-def test_a_flip_turns_the_normal_round(make_gaussians: Make) -> None:
+def test_octagon_fit_of_flipped_corners_flips_normal(make_gaussians: Make) -> None:
     g = make_gaussians(20, seed=5)
     g.opacity_logits[:] = 3.0
     radii = octagon_radii(g.opacities)
@@ -165,7 +165,7 @@ def test_quaternions_survive_octagons_of_half_turned_gaussians(make_gaussians: M
     radii = octagon_radii(g.opacities)
     _, quats, _, good = frames_from_octagons(octagon_corners_world(g, radii), radii)
     assert good.all()
-    assert np.abs(np.sum(quats * quaternions(g.rotations), axis=1)).min() > 1 - 1e-6
+    assert np.abs(np.sum(quats * quaternions_from_matrices(g.rotations), axis=1)).min() > 1 - 1e-6
 
 
 def test_opacities_of_extreme_logits_do_not_overflow(make_gaussians: Make) -> None:

@@ -7,10 +7,10 @@ import pytest
 
 from octasplat.engine.gaussians.channels import Channels
 from octasplat.engine.gaussians.rows import (
+    concatenate_rows,
     from_row_arrays,
-    join_rows,
     map_rows,
-    put_rows,
+    overwrite_rows,
     row_arrays,
     select_rows,
 )
@@ -45,8 +45,8 @@ def test_rows_are_selected_joined_and_overwritten_together() -> None:
     assert_rows(chosen, [4, 0, 0])
     chosen.weights[:] = 7
     assert_rows(first, [0, 1, 2, 3, 4])
-    assert_rows(join_rows([second, first]), [10, 11, 12, 0, 1, 2, 3, 4])
-    put_rows(first, np.array([3, 1]), select_rows(second, slice(2)))
+    assert_rows(concatenate_rows([second, first]), [10, 11, 12, 0, 1, 2, 3, 4])
+    overwrite_rows(first, np.array([3, 1]), select_rows(second, slice(2)))
     assert_rows(first, [0, 11, 2, 10, 4])
     assert_rows(map_rows(second, lambda array: array[::-1]), [12, 11, 10])
 
@@ -60,6 +60,9 @@ def test_arrays_by_name_and_back() -> None:
 
 def test_tables_that_differ_are_not_mixed() -> None:
     bare = Table(np.zeros((2, 2)), np.zeros(2))
-    for mix in (lambda: join_rows([table(0, 2), bare]), lambda: put_rows(table(0, 2), slice(2), bare)):
+    for mix in (
+        lambda: concatenate_rows([table(0, 2), bare]),
+        lambda: overwrite_rows(table(0, 2), slice(2), bare),
+    ):
         with pytest.raises(ValueError, match=r"some parts have channels\.label and others have not"):
             mix()

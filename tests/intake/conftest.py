@@ -3,7 +3,7 @@ from pathlib import Path
 
 import pytest
 
-from octasplat.workers.store.local import LocalStorage
+from octasplat.workers.storage.local import LocalStorage
 
 
 @pytest.fixture

@@ -9,13 +9,13 @@ from dataclasses import dataclass, field, replace
 from PIL import Image
 
 from octasplat.service.intake.dataset import DatasetFile
-from octasplat.workers.store.local import LocalStorage
+from octasplat.workers.storage.local import LocalStorage
 
 PINHOLE = 1
 
 
 @dataclass(frozen=True)
-class Cam:
+class CameraRecord:
     camera_id: int = 1
     model: int = PINHOLE
     width: int = 32
@@ -29,7 +29,7 @@ class Cam:
 
 
 @dataclass(frozen=True)
-class Img:
+class ImageRecord:
     image_id: int
     name: str | bytes
     quat_wxyz: tuple[float, ...] = (1.0, 0.0, 0.0, 0.0)
@@ -45,7 +45,7 @@ class Img:
 
 
 @dataclass(frozen=True)
-class Pnt:
+class PointRecord:
     point_id: int
     xyz: tuple[float, ...] = (0.0, 0.0, 0.0)
 
@@ -53,27 +53,29 @@ class Pnt:
         return struct.pack("<Q3d3BdQ", self.point_id, *self.xyz, 1, 2, 3, 0.5, 0)
 
 
-def turned(index: int) -> tuple[float, ...]:
+def rotated_pose(index: int) -> tuple[float, ...]:
     return math.cos(0.1 * index), 0.0, math.sin(0.1 * index), 0.0
 
 
 @dataclass(frozen=True)
-class Model:
+class ColmapModelBuilder:
     """A model of four views; ``counts`` and ``raw`` replace what its files announce or are."""
 
-    cameras: Sequence[Cam] = (Cam(),)
-    images: Sequence[Img] = tuple(Img(i + 1, f"v{i}.png", turned(i), points=2) for i in range(4))
-    points: Sequence[Pnt] = tuple(Pnt(i + 1, (0.1 * i, 0.0, 0.0)) for i in range(5))
+    cameras: Sequence[CameraRecord] = (CameraRecord(),)
+    images: Sequence[ImageRecord] = tuple(
+        ImageRecord(i + 1, f"v{i}.png", rotated_pose(i), points=2) for i in range(4)
+    )
+    points: Sequence[PointRecord] = tuple(PointRecord(i + 1, (0.1 * i, 0.0, 0.0)) for i in range(5))
     counts: dict[str, int] = field(default_factory=dict)
     raw: dict[str, bytes] = field(default_factory=dict)
     folder: str = "sparse/0"
 
-    def with_image(self, **changes: object) -> "Model":
+    def with_image(self, **changes: object) -> "ColmapModelBuilder":
         """The same with another first image."""
         first = replace(self.images[0], **changes)  # type: ignore[arg-type]
         return replace(self, images=(first, *self.images[1:]))
 
-    def with_camera(self, **changes: object) -> "Model":
+    def with_camera(self, **changes: object) -> "ColmapModelBuilder":
         """The same with another camera."""
         return replace(self, cameras=(replace(self.cameras[0], **changes),))  # type: ignore[arg-type]
 
@@ -93,11 +95,11 @@ def photograph(width: int = 32, height: int = 24) -> bytes:
     return out.getvalue()
 
 
-def stored(storage: LocalStorage, files: dict[str, bytes]) -> list[DatasetFile]:
+def store_model(storage: LocalStorage, files: dict[str, bytes]) -> list[DatasetFile]:
     """Put files into a store."""
     found = []
     for path, data in files.items():
-        with storage.begin() as writer:
+        with storage.open_writer() as writer:
             writer.write(data)
             blob = writer.commit()
         found.append(DatasetFile(path, blob.sha256, blob.size_bytes))

@@ -17,20 +17,20 @@ from pathlib import Path
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from zip_builder import Member, build, deflated
+from zip_builder import ZipMember, build_zip, deflated
 
 from octasplat.service.intake.archive import ArchiveFile, ArchiveLimits, list_archive, unpack_archive
-from octasplat.service.intake.faults import IntakeRefused
-from octasplat.workers.store.local import LocalStorage
-from octasplat.workers.store.protocol import Blob
+from octasplat.service.intake.faults import IntakeError
+from octasplat.workers.storage.local import LocalStorage
+from octasplat.workers.storage.protocol import Blob
 
 PHOTO = b"\xff\xd8\xff\xe0 not much of a photograph " * 40
 MODEL = struct.pack("<Q", 0x088B1F) + bytes(300)  # a count that looks like gzip
 LIMITS = ArchiveLimits()
 
 
-def good(name: str = "images/a.jpg") -> Member:
-    return Member(name, PHOTO)
+def good(name: str = "images/a.jpg") -> ZipMember:
+    return ZipMember(name, PHOTO)
 
 
 def take(data: bytes, storage: LocalStorage, limits: ArchiveLimits = LIMITS) -> dict[str, bytes]:
@@ -40,16 +40,18 @@ def take(data: bytes, storage: LocalStorage, limits: ArchiveLimits = LIMITS) -> 
     def on_file(file: ArchiveFile, blob: Blob) -> None:
         found[file.name] = blob.sha256
 
-    unpack_archive(io.BytesIO(data), listing, lambda file: storage.begin(max_bytes=file.size_bytes), on_file)
+    unpack_archive(
+        io.BytesIO(data), listing, lambda file: storage.open_writer(max_bytes=file.size_bytes), on_file
+    )
     return {name: b"".join(storage.read(sha256)) for name, sha256 in found.items()}
 
 
 def refusal(data: bytes, storage: LocalStorage, limits: ArchiveLimits = LIMITS) -> str:
-    with pytest.raises(IntakeRefused) as caught:
+    with pytest.raises(IntakeError) as caught:
         take(data, storage, limits)
     assert str(caught.value).endswith(".")
     assert "\n" not in str(caught.value) and len(str(caught.value)) < 400
-    assert storage.sweep(-60) == 0  # nothing half-written is left
+    assert storage.remove_stale_uploads(-60) == 0  # nothing half-written is left
     return caught.value.code
 
 
@@ -77,7 +79,7 @@ def written_by_zipfile(stream: bool, **files: bytes) -> bytes:
 
 
 @pytest.mark.parametrize("stream", [False, True])
-def test_archives_of_zipfile(local_storage: LocalStorage, stream: bool) -> None:
+def test_archive_by_zipfile_is_accepted(local_storage: LocalStorage, stream: bool) -> None:
     files = {
         "images/a.jpg": PHOTO,
         "images/ä/ü.jpg": b"\xff\xd8\xff" + os.urandom(3_000_000),
@@ -88,14 +90,14 @@ def test_archives_of_zipfile(local_storage: LocalStorage, stream: bool) -> None:
     assert take(written_by_zipfile(stream, **files), local_storage) == files
 
 
-def test_everything_may_lie_in_one_folder_beside_clutter(local_storage: LocalStorage) -> None:
-    data = build(
-        Member("fox/", mode=0o40755),
+def test_archive_in_one_folder_with_clutter_is_accepted(local_storage: LocalStorage) -> None:
+    data = build_zip(
+        ZipMember("fox/", mode=0o40755),
         good("fox/images/a.jpg"),
-        Member("fox/images/.DS_Store", b"x"),
-        Member("__MACOSX/fox/images/._a.jpg", b"x"),
-        Member("fox/README.md", b"x"),
-        Member("fox/sparse/0/cameras.bin", MODEL),
+        ZipMember("fox/images/.DS_Store", b"x"),
+        ZipMember("__MACOSX/fox/images/._a.jpg", b"x"),
+        ZipMember("fox/README.md", b"x"),
+        ZipMember("fox/sparse/0/cameras.bin", MODEL),
     )
     listing = list_archive(io.BytesIO(data))
     assert listing.folder == "fox/"
@@ -110,11 +112,11 @@ def test_descriptors_with_and_without_signature(local_storage: LocalStorage) -> 
     plain = struct.pack("<3I", zlib.crc32(PHOTO), len(packed), len(PHOTO))
     for descriptor in (plain, b"PK\x07\x08" + plain):
         member = replace(good(), flags=0x808, descriptor=descriptor, local={"crc": 0, "packed": 0, "size": 0})
-        assert take(build(member, good("images/b.jpg")), local_storage)["images/a.jpg"] == PHOTO
+        assert take(build_zip(member, good("images/b.jpg")), local_storage)["images/a.jpg"] == PHOTO
 
 
-def test_a_comment_is_harmless(local_storage: LocalStorage) -> None:
-    assert take(build(good(), comment=b"0123456789abcdef" * 2), local_storage) == {"images/a.jpg": PHOTO}
+def test_archive_comment_is_accepted(local_storage: LocalStorage) -> None:
+    assert take(build_zip(good(), comment=b"0123456789abcdef" * 2), local_storage) == {"images/a.jpg": PHOTO}
 
 
 NAMES = {
@@ -155,9 +157,12 @@ NAMES = {
 
 
 @pytest.mark.parametrize(("name", "code"), NAMES.items(), ids=[ascii(name)[:40] for name in NAMES])
-def test_hostile_names(local_storage: LocalStorage, name: str, code: str) -> None:
-    assert refusal(build(good(), Member(name, b"" if name == "/" else PHOTO, mode=0)), local_storage) == code
-    assert list(local_storage.blobs()) == []
+def test_archive_hostile_name_is_refused(local_storage: LocalStorage, name: str, code: str) -> None:
+    assert (
+        refusal(build_zip(good(), ZipMember(name, b"" if name == "/" else PHOTO, mode=0)), local_storage)
+        == code
+    )
+    assert list(local_storage.list_blobs()) == []
 
 
 TWINS = {
@@ -172,8 +177,10 @@ TWINS = {
 
 
 @pytest.mark.parametrize(("pair", "code"), TWINS.items())
-def test_twins(local_storage: LocalStorage, pair: tuple[str, str], code: str) -> None:
-    assert refusal(build(*(good(name) for name in pair)), local_storage) == code
+def test_archive_names_differing_by_case_are_refused(
+    local_storage: LocalStorage, pair: tuple[str, str], code: str
+) -> None:
+    assert refusal(build_zip(*(good(name) for name in pair)), local_storage) == code
 
 
 def linked_kinds() -> dict[str, tuple[int, str]]:
@@ -188,9 +195,9 @@ def linked_kinds() -> dict[str, tuple[int, str]]:
 
 
 @pytest.mark.parametrize(("mode", "code"), linked_kinds().values(), ids=linked_kinds())
-def test_only_regular_files(local_storage: LocalStorage, mode: int, code: str) -> None:
-    member = Member("images/b.jpg", b"/etc/passwd", mode=mode)
-    assert refusal(build(good(), member), local_storage) == code
+def test_archive_special_file_is_refused(local_storage: LocalStorage, mode: int, code: str) -> None:
+    member = ZipMember("images/b.jpg", b"/etc/passwd", mode=mode)
+    assert refusal(build_zip(good(), member), local_storage) == code
 
 
 def field_zip64(*values: int) -> bytes:
@@ -198,81 +205,81 @@ def field_zip64(*values: int) -> bytes:
 
 
 STRUCTURES: dict[str, tuple[Callable[[], bytes], str]] = {
-    "data after the end": (lambda: build(good(), suffix=b"x"), "archive-data-after-end"),
+    "data after the end": (lambda: build_zip(good(), suffix=b"x"), "archive-data-after-end"),
     "archive after the archive": (
-        lambda: build(good(), suffix=build(good("images/b.jpg"))), "archive-gap",
+        lambda: build_zip(good(), suffix=build_zip(good("images/b.jpg"))), "archive-gap",
     ),
-    "data before the beginning": (lambda: build(good(), prefix=b"PK\3\4#!/bin/sh\n"), "archive-gap"),
+    "data before the beginning": (lambda: build_zip(good(), prefix=b"PK\3\4#!/bin/sh\n"), "archive-gap"),
     "gap between entries": (
-        lambda: build(good(), replace(good("images/b.jpg"), before=b"hidden")), "archive-gap",
+        lambda: build_zip(good(), replace(good("images/b.jpg"), before=b"hidden")), "archive-gap",
     ),
-    "gap before the directory": (lambda: build(good(), gap=b"hidden"), "archive-gap"),
-    "bytes in the directory": (lambda: build(good(), directory_extra=b"hidden"), "archive-gap"),
+    "gap before the directory": (lambda: build_zip(good(), gap=b"hidden"), "archive-gap"),
+    "bytes in the directory": (lambda: build_zip(good(), directory_extra=b"hidden"), "archive-gap"),
     "entry that is not listed": (lambda: unlisted(), "archive-gap"),
     "end record in the comment": (
-        lambda: build(good(), comment=b"PK\5\6" + bytes(30)), "archive-data-after-end",
+        lambda: build_zip(good(), comment=b"PK\5\6" + bytes(30)), "archive-data-after-end",
     ),
     "whole end record in the comment": (
-        lambda: build(good(), comment=struct.pack("<4s4H2IH", b"PK\5\6", 0, 0, 0, 0, 0, 0, 0)),
+        lambda: build_zip(good(), comment=struct.pack("<4s4H2IH", b"PK\5\6", 0, 0, 0, 0, 0, 0, 0)),
         "archive-gap",
     ),
-    "another name": (lambda: build(replace(good(), local={"name": b"images/x.jpg"})), "archive-mismatch"),
-    "another method": (lambda: build(replace(good(), local={"method": 0})), "archive-mismatch"),
-    "another length": (lambda: build(replace(good(), local={"size": 3})), "archive-mismatch"),
-    "another packed length": (lambda: build(replace(good(), local={"packed": 3})), "archive-mismatch"),
-    "another checksum": (lambda: build(replace(good(), local={"crc": 3})), "archive-mismatch"),
-    "other flags": (lambda: build(replace(good(), local={"flags": 0x801})), "archive-mismatch"),
-    "no local header": (lambda: build(replace(good(), central={"start": 4})), "archive-mismatch"),
-    "start outside": (lambda: build(replace(good(), central={"start": 2**31})), "archive-mismatch"),
+    "another name": (lambda: build_zip(replace(good(), local={"name": b"images/x.jpg"})), "archive-mismatch"),
+    "another method": (lambda: build_zip(replace(good(), local={"method": 0})), "archive-mismatch"),
+    "another length": (lambda: build_zip(replace(good(), local={"size": 3})), "archive-mismatch"),
+    "another packed length": (lambda: build_zip(replace(good(), local={"packed": 3})), "archive-mismatch"),
+    "another checksum": (lambda: build_zip(replace(good(), local={"crc": 3})), "archive-mismatch"),
+    "other flags": (lambda: build_zip(replace(good(), local={"flags": 0x801})), "archive-mismatch"),
+    "no local header": (lambda: build_zip(replace(good(), central={"start": 4})), "archive-mismatch"),
+    "start outside": (lambda: build_zip(replace(good(), central={"start": 2**31})), "archive-mismatch"),
     "second name": (
-        lambda: build(
+        lambda: build_zip(
             replace(good(), central_extra=struct.pack("<2HBI", 0x7075, 17, 1, 0) + b"images/x.jpg")
         ),
         "archive-second-name",
     ),
     "second local name": (
-        lambda: build(replace(good(), local_extra=struct.pack("<2HBI", 0x7075, 17, 1, 0) + b"images/x.jpg")),
+        lambda: build_zip(replace(good(), local_extra=struct.pack("<2HBI", 0x7075, 17, 1, 0) + b"images/x.jpg")),
         "archive-second-name",
     ),
     "descriptor that lies": (
-        lambda: build(replace(good(), flags=0x808, descriptor=struct.pack("<3I", 1, 2, 3))),
+        lambda: build_zip(replace(good(), flags=0x808, descriptor=struct.pack("<3I", 1, 2, 3))),
         "archive-mismatch",
     ),
-    "descriptor missing": (lambda: build(replace(good(), flags=0x808)), "archive-mismatch"),
+    "descriptor missing": (lambda: build_zip(replace(good(), flags=0x808)), "archive-mismatch"),
     "overlapping entries": (lambda: overlapping(), "archive-overlap"),
     "quoted overlap": (lambda: same_data_twice(), "archive-overlap"),
-    "several disks": (lambda: build(good(), end={"disk": 1}), "archive-several-disks"),
+    "several disks": (lambda: build_zip(good(), end={"disk": 1}), "archive-several-disks"),
     "entry on another disk": (
-        lambda: build(replace(good(), central={"disk": 3})), "archive-several-disks",
+        lambda: build_zip(replace(good(), central={"disk": 3})), "archive-several-disks",
     ),
-    "too few entries announced": (lambda: build(good(), good("b"), end={"entries": 1}), "archive-gap"),
-    "too many entries announced": (lambda: build(good(), end={"entries": 2}), "archive-damaged"),
+    "too few entries announced": (lambda: build_zip(good(), good("b"), end={"entries": 1}), "archive-gap"),
+    "too many entries announced": (lambda: build_zip(good(), end={"entries": 2}), "archive-damaged"),
     "needs a newer reader": (
-        lambda: build(replace(good(), central={"version": 64})), "archive-version",
+        lambda: build_zip(replace(good(), central={"version": 64})), "archive-version",
     ),
     "needs a newer reader locally": (
-        lambda: build(replace(good(), local={"version": 700})), "archive-version",
+        lambda: build_zip(replace(good(), local={"version": 700})), "archive-version",
     ),
-    "encrypted": (lambda: build(replace(good(), flags=0x801)), "archive-encrypted"),
-    "unknown method": (lambda: build(replace(good(), method=14)), "archive-method"),
+    "encrypted": (lambda: build_zip(replace(good(), flags=0x801)), "archive-encrypted"),
+    "unknown method": (lambda: build_zip(replace(good(), method=14)), "archive-method"),
     "zip64 without lengths": (
-        lambda: build(replace(good(), central={"size": 2**32 - 1})), "archive-damaged",
+        lambda: build_zip(replace(good(), central={"size": 2**32 - 1})), "archive-damaged",
     ),
     "zip64 length that lies": (
-        lambda: build(replace(good(), central={"size": 2**32 - 1}, central_extra=field_zip64(2**50))),
+        lambda: build_zip(replace(good(), central={"size": 2**32 - 1}, central_extra=field_zip64(2**50))),
         "archive-mismatch",
     ),
-    "cut short": (lambda: build(good())[:-30], "archive-damaged"),
+    "cut short": (lambda: build_zip(good())[:-30], "archive-damaged"),
     "only a head": (lambda: b"PK\3\4", "archive-damaged"),
     "damaged extra data": (
-        lambda: build(replace(good(), central_extra=b"\1\0\xff\xff..")), "archive-damaged",
+        lambda: build_zip(replace(good(), central_extra=b"\1\0\xff\xff..")), "archive-damaged",
     ),
-    "empty": (lambda: build(), "archive-empty"),
-    "no scene inside": (lambda: build(Member("README.md", b"hello")), "archive-empty"),
+    "empty": (lambda: build_zip(), "archive-empty"),
+    "no scene inside": (lambda: build_zip(ZipMember("README.md", b"hello")), "archive-empty"),
     "folder with a content": (
-        lambda: build(good(), Member("images/x/", b"abcdef", method=0, mode=0)), "archive-mismatch",
+        lambda: build_zip(good(), ZipMember("images/x/", b"abcdef", method=0, mode=0)), "archive-mismatch",
     ),
-    "name in another code": (lambda: build(Member(b"images/\x84.jpg", PHOTO, flags=0)), "name-not-text"),
+    "name in another code": (lambda: build_zip(ZipMember(b"images/\x84.jpg", PHOTO, flags=0)), "name-not-text"),
     "not an archive": (lambda: PHOTO, "archive-damaged"),
     "nothing": (lambda: b"", "archive-damaged"),
 }  # fmt: skip
@@ -280,8 +287,8 @@ STRUCTURES: dict[str, tuple[Callable[[], bytes], str]] = {
 
 def unlisted() -> bytes:
     """Two entries in the file, one in the list of contents."""
-    both = build(good(), good("images/b.jpg"))
-    first_only = build(good())
+    both = build_zip(good(), good("images/b.jpg"))
+    first_only = build_zip(good())
     start = both.index(b"PK\1\2")
     central = first_only[first_only.index(b"PK\1\2") : first_only.index(b"PK\5\6")]
     end = struct.pack("<4s4H2IH", b"PK\5\6", 0, 0, 1, 1, len(central), start, 0)
@@ -290,37 +297,37 @@ def unlisted() -> bytes:
 
 def overlapping() -> bytes:
     """The first entry reaches over the second, as in the bombs that share one kernel."""
-    inner = build(good("images/b.jpg"))
+    inner = build_zip(good("images/b.jpg"))
     inner = inner[: inner.index(b"PK\1\2")]
-    outer = Member("images/a.jpg", inner, method=0)
-    second = Member("images/b.jpg", PHOTO)
-    data = build(outer, second)
+    outer = ZipMember("images/a.jpg", inner, method=0)
+    second = ZipMember("images/b.jpg", PHOTO)
+    data = build_zip(outer, second)
     start = data.index(inner)
     body = data[: start + len(inner)]
-    whole = build(outer, replace(second, central={"start": start}))
+    whole = build_zip(outer, replace(second, central={"start": start}))
     central = whole[whole.index(b"PK\1\2") : whole.index(b"PK\5\6")]
     return body + central + struct.pack("<4s4H2IH", b"PK\5\6", 0, 0, 2, 2, len(central), len(body), 0)
 
 
 def same_data_twice() -> bytes:
-    return build(good(), replace(good(), central={"start": 0}))
+    return build_zip(good(), replace(good(), central={"start": 0}))
 
 
 @pytest.mark.parametrize("case", STRUCTURES)
-def test_structures_that_lie(local_storage: LocalStorage, case: str) -> None:
+def test_archive_inconsistent_structure_is_refused(local_storage: LocalStorage, case: str) -> None:
     make, code = STRUCTURES[case]
     assert refusal(make(), local_storage) == code
 
 
 def test_two_end_records_are_ambiguous(local_storage: LocalStorage) -> None:
-    first = build(good())
+    first = build_zip(good())
     hidden = struct.pack("<4s4H2IH", b"PK\5\6", 0, 0, 1, 1, 0, 0, 0)
-    data = build(replace(good(), central_extra=struct.pack("<2H", 0x9999, len(hidden)) + hidden))
+    data = build_zip(replace(good(), central_extra=struct.pack("<2H", 0x9999, len(hidden)) + hidden))
     assert refusal(data, local_storage) == "archive-ambiguous"
     assert take(first, local_storage)
 
 
-def test_other_kinds_are_refused_by_name(local_storage: LocalStorage) -> None:
+def test_archive_other_format_is_named(local_storage: LocalStorage) -> None:
     target = io.BytesIO()
     with tarfile.open(fileobj=target, mode="w") as archive:
         link = tarfile.TarInfo("images/a.jpg")
@@ -332,46 +339,46 @@ def test_other_kinds_are_refused_by_name(local_storage: LocalStorage) -> None:
         assert refusal(head + bytes(600), local_storage) == "archive-kind"
 
 
-def test_contents_that_lie(local_storage: LocalStorage) -> None:
+def test_archive_inconsistent_content_is_refused(local_storage: LocalStorage) -> None:
     zeros = bytes(600_000)
     cases = {
-        "archive-bomb": Member("images/a.jpg", PHOTO, packed=deflated(PHOTO + zeros)),
-        "archive-checksum": Member("images/a.jpg", PHOTO, packed=deflated(PHOTO[::-1])),
-        "archive-damaged": Member("images/a.jpg", PHOTO, packed=b"\xff" * 50),
-        "archive-mismatch": Member("images/a.jpg", PHOTO, packed=deflated(PHOTO[:-1])),
+        "archive-bomb": ZipMember("images/a.jpg", PHOTO, packed=deflated(PHOTO + zeros)),
+        "archive-checksum": ZipMember("images/a.jpg", PHOTO, packed=deflated(PHOTO[::-1])),
+        "archive-damaged": ZipMember("images/a.jpg", PHOTO, packed=b"\xff" * 50),
+        "archive-mismatch": ZipMember("images/a.jpg", PHOTO, packed=deflated(PHOTO[:-1])),
     }
     for code, member in cases.items():
-        assert refusal(build(member), local_storage) == code
-    more = Member("images/a.jpg", PHOTO, packed=deflated(PHOTO) + b"hidden")
-    assert refusal(build(more), local_storage) == "archive-mismatch"
-    cut = Member("images/a.jpg", PHOTO, packed=deflated(PHOTO)[:-4])
-    assert refusal(build(cut), local_storage) == "archive-mismatch"
-    assert list(local_storage.blobs()) == []
+        assert refusal(build_zip(member), local_storage) == code
+    more = ZipMember("images/a.jpg", PHOTO, packed=deflated(PHOTO) + b"hidden")
+    assert refusal(build_zip(more), local_storage) == "archive-mismatch"
+    cut = ZipMember("images/a.jpg", PHOTO, packed=deflated(PHOTO)[:-4])
+    assert refusal(build_zip(cut), local_storage) == "archive-mismatch"
+    assert list(local_storage.list_blobs()) == []
 
 
-def test_bombs(local_storage: LocalStorage) -> None:
-    flat = build(Member("images/a.bmp", bytes(50_000_000)))
+def test_archive_bomb_is_refused(local_storage: LocalStorage) -> None:
+    flat = build_zip(ZipMember("images/a.bmp", bytes(50_000_000)))
     assert len(flat) < 60_000
     assert refusal(flat, local_storage) == "archive-ratio"
-    many = build(*(Member(f"images/{i}.bmp", bytes(1_000_000)) for i in range(20)))
+    many = build_zip(*(ZipMember(f"images/{i}.bmp", bytes(1_000_000)) for i in range(20)))
     small = replace(LIMITS, max_total_bytes=10_000_000)
     assert refusal(many, local_storage, small) == "archive-too-large"
-    one = build(Member("images/a.jpg", os.urandom(2000)))
+    one = build_zip(ZipMember("images/a.jpg", os.urandom(2000)))
     assert refusal(one, local_storage, replace(LIMITS, max_file_bytes=1000)) == "archive-file-too-large"
-    assert list(local_storage.blobs()) == []
+    assert list(local_storage.list_blobs()) == []
 
 
-def test_many_entries_are_refused_before_they_are_read(local_storage: LocalStorage) -> None:
-    entries = [Member(f"images/{i}.jpg", b"", method=0) for i in range(200)]
+def test_archive_too_many_entries_is_refused_early(local_storage: LocalStorage) -> None:
+    entries = [ZipMember(f"images/{i}.jpg", b"", method=0) for i in range(200)]
     limits = replace(LIMITS, max_entries=199)
-    assert refusal(build(*entries), local_storage, limits) == "archive-too-many-entries"
-    assert len(list_archive(io.BytesIO(build(*entries))).files) == 200
-    long_list = build(good(), directory_extra=bytes(70_000))
+    assert refusal(build_zip(*entries), local_storage, limits) == "archive-too-many-entries"
+    assert len(list_archive(io.BytesIO(build_zip(*entries))).files) == 200
+    long_list = build_zip(good(), directory_extra=bytes(70_000))
     limits = replace(LIMITS, max_directory_bytes=60_000)
     assert refusal(long_list, local_storage, limits) == "archive-directory-too-long"
 
 
-def test_a_million_entries_take_no_time(local_storage: LocalStorage) -> None:
+def test_archive_with_million_entries_is_refused_quickly(local_storage: LocalStorage) -> None:
     locator = struct.pack("<4sIQI", b"PK\6\7", 0, 4, 1)
     end = struct.pack("<4sQ2H2I4Q", b"PK\6\6", 44, 45, 45, 0, 0, 10**6, 10**6, 0, 4)
     data = b"PK\3\4" + end + locator + struct.pack("<4s4H2IH", b"PK\5\6", 0, 0, 65535, 65535, 0, 4, 0)
@@ -381,35 +388,35 @@ def test_a_million_entries_take_no_time(local_storage: LocalStorage) -> None:
 
 
 @pytest.mark.parametrize("name", ["images/b.zip", "masks/x.tar.gz", "c.7z", "images/b.jpg"])
-def test_nested_archives(local_storage: LocalStorage, name: str) -> None:
-    inner = Member(name, build(good()), method=0)
-    assert refusal(build(good(), inner), local_storage) == "archive-nested"
+def test_archive_nested_is_refused(local_storage: LocalStorage, name: str) -> None:
+    inner = ZipMember(name, build_zip(good()), method=0)
+    assert refusal(build_zip(good(), inner), local_storage) == "archive-nested"
 
 
 def test_contents_that_only_look_nested(local_storage: LocalStorage) -> None:
-    data = build(good(), Member("sparse/0/points3D.bin", MODEL))
+    data = build_zip(good(), ZipMember("sparse/0/points3D.bin", MODEL))
     assert take(data, local_storage)["sparse/0/points3D.bin"] == MODEL
 
 
 def test_refusal_from_the_outside_stops(local_storage: LocalStorage) -> None:
-    data = build(good(), good("images/b.jpg"))
+    data = build_zip(good(), good("images/b.jpg"))
     listing = list_archive(io.BytesIO(data))
     with pytest.raises(RuntimeError, match="quota"):
-        unpack_archive(io.BytesIO(data), listing, lambda _: local_storage.begin(), _no_quota)
+        unpack_archive(io.BytesIO(data), listing, lambda _: local_storage.open_writer(), _no_quota)
 
 
 def _no_quota(_file: ArchiveFile, _blob: Blob) -> None:
     raise RuntimeError("quota")
 
 
-SAMPLE = build(
+SAMPLE = build_zip(
     good(),
     replace(
         good("images/b.jpg"),
         flags=0x808,
         descriptor=struct.pack("<3I", zlib.crc32(PHOTO), len(deflated(PHOTO)), len(PHOTO)),
     ),
-    Member("sparse/0/cameras.txt", b"# cameras\n", method=0),
+    ZipMember("sparse/0/cameras.txt", b"# cameras\n", method=0),
     comment=b"hello",
 )
 
@@ -433,7 +440,7 @@ def test_damage_is_refused_or_harmless(changes: list[tuple[int, int]], cut: int)
     try:
         listing = list_archive(file)
         unpack_archive(file, listing, begin, lambda _file, _blob: None)
-    except IntakeRefused as error:
+    except IntakeError as error:
         assert error.code.split("-")[0] in ("archive", "name")
         return
     # What is taken means the same to another reader.

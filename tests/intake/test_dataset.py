@@ -10,132 +10,145 @@ from pathlib import Path
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from model_builder import Cam, Img, Model, Pnt, photograph, photographs, stored, turned
+from model_builder import (
+    CameraRecord,
+    ColmapModelBuilder,
+    ImageRecord,
+    PointRecord,
+    photograph,
+    photographs,
+    rotated_pose,
+    store_model,
+)
 
 from octasplat.service.intake.dataset import DatasetFile, DatasetLimits, DatasetSummary, check_dataset
-from octasplat.service.intake.faults import Fault, IntakeRefused
-from octasplat.service.intake.layout import Part
-from octasplat.service.intake.model_check import ModelLimits, check_model, child_environment
-from octasplat.service.intake.names import check_file_name
-from octasplat.workers.store.local import LocalStorage
-from octasplat.workers.store.trees import TreeFile
+from octasplat.service.intake.faults import IntakeError, IntakeFault
+from octasplat.service.intake.model_check import ModelLimits, check_model, parser_environment
+from octasplat.service.intake.scene_layout import FileRole
+from octasplat.service.intake.upload_names import check_file_name
+from octasplat.workers.storage.local import LocalStorage
+from octasplat.workers.storage.trees import TreeFile
 
 NAN, INF = float("nan"), float("inf")
 
 
-def faults_of(storage: LocalStorage, files: dict[str, bytes], **limits: int) -> Sequence[Fault]:
-    with pytest.raises(IntakeRefused) as caught:
-        check_dataset(storage, stored(storage, files), DatasetLimits(model=ModelLimits(**limits)))
+def faults_of(storage: LocalStorage, files: dict[str, bytes], **limits: int) -> Sequence[IntakeFault]:
+    with pytest.raises(IntakeError) as caught:
+        check_dataset(storage, store_model(storage, files), DatasetLimits(model=ModelLimits(**limits)))
     for fault in caught.value.faults:
         assert fault.detail.endswith(".") and "\n" not in fault.detail and "/tmp" not in fault.detail
     return caught.value.faults
 
 
-def test_a_scene_is_summed_up(local_storage: LocalStorage) -> None:
-    files = {**photographs(), **Model().files(), "masks/v1.png.png": photograph()}
-    summary = check_dataset(local_storage, stored(local_storage, files))
+def test_dataset_summary_counts_files_and_pixels(local_storage: LocalStorage) -> None:
+    files = {**photographs(), **ColmapModelBuilder().files(), "masks/v1.png.png": photograph()}
+    summary = check_dataset(local_storage, store_model(local_storage, files))
     assert summary == DatasetSummary(
         photographs=4, pixels=4 * 32 * 24, size_bytes=sum(map(len, files.values())), masks=1, has_model=True,
         views=4, cameras=1, camera_models=("PINHOLE",), points=5,
     )  # fmt: skip
 
 
-def test_photographs_alone_wait_for_poses(local_storage: LocalStorage) -> None:
-    summary = check_dataset(local_storage, stored(local_storage, photographs()))
+def test_dataset_without_model_has_no_poses(local_storage: LocalStorage) -> None:
+    summary = check_dataset(local_storage, store_model(local_storage, photographs()))
     assert not summary.has_model and summary.photographs == 4 and summary.views == 0
 
 
-def test_sizes_of_the_table_are_taken(local_storage: LocalStorage) -> None:
+def test_dataset_uses_recorded_image_sizes(local_storage: LocalStorage) -> None:
     files = [
         replace(file, width_px=32, height_px=24, sha256="0" * 64, warning="odd")
-        for file in stored(local_storage, photographs())
+        for file in store_model(local_storage, photographs())
     ]
     summary = check_dataset(local_storage, files)
     assert summary.pixels == 4 * 32 * 24 and summary.warnings == ("odd",) * 4
 
 
-def test_reduced_photographs_are_taken(local_storage: LocalStorage) -> None:
-    model = Model().with_camera(width=64, height=48)
-    summary = check_dataset(local_storage, stored(local_storage, {**photographs(), **model.files()}))
+def test_dataset_with_reduced_photographs_is_accepted(local_storage: LocalStorage) -> None:
+    model = ColmapModelBuilder().with_camera(width=64, height=48)
+    summary = check_dataset(local_storage, store_model(local_storage, {**photographs(), **model.files()}))
     assert summary.views == 4
 
 
 def test_oddities_are_warned_of(local_storage: LocalStorage) -> None:
     files = {
         **photographs(["v0.png", "v1.png", "v2.png", "v3.png", "more.png"]),
-        **replace(Model(), cameras=(Cam(), Cam(2)), points=(Pnt(1), Pnt(2, (NAN, 0.0, 0.0)))).files(),
+        **replace(
+            ColmapModelBuilder(),
+            cameras=(CameraRecord(), CameraRecord(2)),
+            points=(PointRecord(1), PointRecord(2, (NAN, 0.0, 0.0))),
+        ).files(),
         "masks/of_nobody.png": photograph(),
         "images/v0.png": photograph(),
     }
-    warnings = check_dataset(local_storage, stored(local_storage, files)).warnings
+    warnings = check_dataset(local_storage, store_model(local_storage, files)).warnings
     for part in ("1 photographs have no pose", "1 points", "1 cameras", "1 masks belong to no photograph"):
         assert any(part in warning for warning in warnings), part
     assert not any("/tmp" in warning for warning in warnings)
 
 
-def test_text_models_too(local_storage: LocalStorage) -> None:
+def test_dataset_text_model_is_accepted(local_storage: LocalStorage) -> None:
     lines = "\n".join(f"{i + 1} 1 0 0 0 {i} 0 4 1 v{i}.png\n" for i in range(4))
     files = {
         "sparse/cameras.txt": b"1 PINHOLE 32 24 30 31 16 12\n",
         "sparse/images.txt": lines.encode() + b"\n",
         "sparse/points3D.txt": b"1 0 0 1 9 9 9 0.5\n",
     }
-    assert check_dataset(local_storage, stored(local_storage, {**photographs(), **files})).views == 4
+    assert check_dataset(local_storage, store_model(local_storage, {**photographs(), **files})).views == 4
     hostile = {**files, "sparse/images.txt": lines.replace("v0.png", "/etc/passwd").encode() + b"\n"}
     (fault,) = faults_of(local_storage, {**photographs(), **hostile})
     assert (fault.code, fault.file) == ("name-absolute", "sparse/images.txt")
 
 
 IMAGES, CAMERAS, POINTS = "sparse/0/images.bin", "sparse/0/cameras.bin", "sparse/0/points3D.bin"
-HORRORS: dict[str, tuple[Callable[[], Model], str, str | None]] = {
-    "traversal": (lambda: Model().with_image(name="../../../../etc/passwd"), "name-traversal", IMAGES),
-    "absolute": (lambda: Model().with_image(name="/etc/passwd"), "name-absolute", IMAGES),
-    "windows": (lambda: Model().with_image(name="..\\..\\evil.png"), "name-backslash", IMAGES),
-    "line break": (lambda: Model().with_image(name="v0.png\nv1.png"), "name-control", IMAGES),
-    "name of 50 MB": (lambda: Model().with_image(name="a" * 50_000_000), "name-too-long", IMAGES),
-    "name not in utf-8": (lambda: Model().with_image(name=b"\xff\xfe.png"), "name-not-text", IMAGES),
-    "no name": (lambda: Model().with_image(name=""), "name-empty", IMAGES),
-    "not uploaded": (lambda: Model().with_image(name="v9.png"), "model-image-missing", IMAGES),
-    "twice": (lambda: Model().with_image(name="v1.png"), "model-image-twice", IMAGES),
-    "zero quaternion": (lambda: Model().with_image(quat_wxyz=(0, 0, 0, 0)), "model-pose", IMAGES),
-    "long quaternion": (lambda: Model().with_image(quat_wxyz=(0, 2, 0, 0)), "model-pose", IMAGES),
-    "no number in quaternion": (lambda: Model().with_image(quat_wxyz=(NAN, 0, 0, 0)), "model-pose", IMAGES),
-    "infinite quaternion": (lambda: Model().with_image(quat_wxyz=(INF, 0, 0, 0)), "model-pose", IMAGES),
-    "no number in translation": (lambda: Model().with_image(translation=(NAN, 0, 0)), "model-pose", IMAGES),
-    "infinite translation": (lambda: Model().with_image(translation=(0, -INF, 0)), "model-pose", IMAGES),
-    "absurd translation": (lambda: Model().with_image(translation=(0, 1e300, 0)), "model-pose", IMAGES),
-    "no focal length": (lambda: Model().with_camera(params=(0, 31, 16, 12)), "model-camera", CAMERAS),
-    "negative focal length": (lambda: Model().with_camera(params=(-3, 31, 16, 12)), "model-camera", CAMERAS),
-    "nan focal length": (lambda: Model().with_camera(params=(NAN, 31, 16, 12)), "model-camera", CAMERAS),
-    "infinite centre": (lambda: Model().with_camera(params=(30, 31, INF, 12)), "model-camera", CAMERAS),
-    "camera without size": (lambda: Model().with_camera(width=0, height=0), "model-camera", CAMERAS),
-    "camera of other size": (lambda: Model().with_camera(width=24, height=32), "model-size", CAMERAS),
-    "camera of 2^60": (lambda: Model().with_camera(width=2**60), "model-size", CAMERAS),
-    "unknown camera model": (lambda: Model().with_camera(model=77), "model-damaged", CAMERAS),
-    "unknown camera": (lambda: Model().with_image(camera_id=9), "model-damaged", None),
-    "camera twice": (lambda: replace(Model(), cameras=(Cam(), Cam())), "model-damaged", None),
+HORRORS: dict[str, tuple[Callable[[], ColmapModelBuilder], str, str | None]] = {
+    "traversal": (lambda: ColmapModelBuilder().with_image(name="../../../../etc/passwd"), "name-traversal", IMAGES),
+    "absolute": (lambda: ColmapModelBuilder().with_image(name="/etc/passwd"), "name-absolute", IMAGES),
+    "windows": (lambda: ColmapModelBuilder().with_image(name="..\\..\\evil.png"), "name-backslash", IMAGES),
+    "line break": (lambda: ColmapModelBuilder().with_image(name="v0.png\nv1.png"), "name-control", IMAGES),
+    "name of 50 MB": (lambda: ColmapModelBuilder().with_image(name="a" * 50_000_000), "name-too-long", IMAGES),
+    "name not in utf-8": (lambda: ColmapModelBuilder().with_image(name=b"\xff\xfe.png"), "name-not-text", IMAGES),
+    "no name": (lambda: ColmapModelBuilder().with_image(name=""), "name-empty", IMAGES),
+    "not uploaded": (lambda: ColmapModelBuilder().with_image(name="v9.png"), "model-image-missing", IMAGES),
+    "twice": (lambda: ColmapModelBuilder().with_image(name="v1.png"), "model-image-twice", IMAGES),
+    "zero quaternion": (lambda: ColmapModelBuilder().with_image(quat_wxyz=(0, 0, 0, 0)), "model-pose", IMAGES),
+    "long quaternion": (lambda: ColmapModelBuilder().with_image(quat_wxyz=(0, 2, 0, 0)), "model-pose", IMAGES),
+    "no number in quaternion": (lambda: ColmapModelBuilder().with_image(quat_wxyz=(NAN, 0, 0, 0)), "model-pose", IMAGES),
+    "infinite quaternion": (lambda: ColmapModelBuilder().with_image(quat_wxyz=(INF, 0, 0, 0)), "model-pose", IMAGES),
+    "no number in translation": (lambda: ColmapModelBuilder().with_image(translation=(NAN, 0, 0)), "model-pose", IMAGES),
+    "infinite translation": (lambda: ColmapModelBuilder().with_image(translation=(0, -INF, 0)), "model-pose", IMAGES),
+    "absurd translation": (lambda: ColmapModelBuilder().with_image(translation=(0, 1e300, 0)), "model-pose", IMAGES),
+    "no focal length": (lambda: ColmapModelBuilder().with_camera(params=(0, 31, 16, 12)), "model-camera", CAMERAS),
+    "negative focal length": (lambda: ColmapModelBuilder().with_camera(params=(-3, 31, 16, 12)), "model-camera", CAMERAS),
+    "nan focal length": (lambda: ColmapModelBuilder().with_camera(params=(NAN, 31, 16, 12)), "model-camera", CAMERAS),
+    "infinite centre": (lambda: ColmapModelBuilder().with_camera(params=(30, 31, INF, 12)), "model-camera", CAMERAS),
+    "camera without size": (lambda: ColmapModelBuilder().with_camera(width=0, height=0), "model-camera", CAMERAS),
+    "camera of other size": (lambda: ColmapModelBuilder().with_camera(width=24, height=32), "model-size", CAMERAS),
+    "camera of 2^60": (lambda: ColmapModelBuilder().with_camera(width=2**60), "model-size", CAMERAS),
+    "unknown camera model": (lambda: ColmapModelBuilder().with_camera(model=77), "model-damaged", CAMERAS),
+    "unknown camera": (lambda: ColmapModelBuilder().with_image(camera_id=9), "model-damaged", None),
+    "camera twice": (lambda: replace(ColmapModelBuilder(), cameras=(CameraRecord(), CameraRecord())), "model-damaged", None),
     "image id twice": (
-        lambda: replace(Model(), images=[Img(1, f"v{i}.png", turned(i)) for i in range(4)]),
+        lambda: replace(ColmapModelBuilder(), images=[ImageRecord(1, f"v{i}.png", rotated_pose(i)) for i in range(4)]),
         "model-damaged", None,
     ),
-    "2^40 points": (lambda: replace(Model(), counts={"points3D": 2**40}), "model-damaged", POINTS),
-    "2^63 images": (lambda: replace(Model(), counts={"images": 2**63}), "model-damaged", IMAGES),
-    "2^64 cameras": (lambda: replace(Model(), counts={"cameras": 2**64 - 1}), "model-damaged", CAMERAS),
-    "one point too many": (lambda: replace(Model(), counts={"points3D": 6}), "model-damaged", POINTS),
-    "one point too few": (lambda: replace(Model(), counts={"points3D": 4}), "model-damaged", POINTS),
-    "empty file": (lambda: replace(Model(), raw={"images.bin": b""}), "model-damaged", IMAGES),
+    "2^40 points": (lambda: replace(ColmapModelBuilder(), counts={"points3D": 2**40}), "model-damaged", POINTS),
+    "2^63 images": (lambda: replace(ColmapModelBuilder(), counts={"images": 2**63}), "model-damaged", IMAGES),
+    "2^64 cameras": (lambda: replace(ColmapModelBuilder(), counts={"cameras": 2**64 - 1}), "model-damaged", CAMERAS),
+    "one point too many": (lambda: replace(ColmapModelBuilder(), counts={"points3D": 6}), "model-damaged", POINTS),
+    "one point too few": (lambda: replace(ColmapModelBuilder(), counts={"points3D": 4}), "model-damaged", POINTS),
+    "empty file": (lambda: replace(ColmapModelBuilder(), raw={"images.bin": b""}), "model-damaged", IMAGES),
     "text as binary": (
-        lambda: replace(Model(), raw={"images.bin": b"# text\n" * 9}), "model-damaged", IMAGES,
+        lambda: replace(ColmapModelBuilder(), raw={"images.bin": b"# text\n" * 9}), "model-damaged", IMAGES,
     ),
-    "file missing": (lambda: replace(Model(), raw={"points3D.bin": b"absent"}), "model-damaged", None),
-    "no views": (lambda: replace(Model(), images=()), "model-too-few-views", IMAGES),
-    "two views": (lambda: replace(Model(), images=Model().images[:2]), "model-too-few-views", IMAGES),
-    "damaged rigs": (lambda: replace(Model(), raw={"rigs.bin": b"\xff" * 40}), "model-damaged", None),
+    "file missing": (lambda: replace(ColmapModelBuilder(), raw={"points3D.bin": b"absent"}), "model-damaged", None),
+    "no views": (lambda: replace(ColmapModelBuilder(), images=()), "model-too-few-views", IMAGES),
+    "two views": (lambda: replace(ColmapModelBuilder(), images=ColmapModelBuilder().images[:2]), "model-too-few-views", IMAGES),
+    "damaged rigs": (lambda: replace(ColmapModelBuilder(), raw={"rigs.bin": b"\xff" * 40}), "model-damaged", None),
 }  # fmt: skip
 
 
 @pytest.mark.parametrize("case", HORRORS)
-def test_models_that_lie(local_storage: LocalStorage, case: str) -> None:
+def test_dataset_inconsistent_model_is_refused(local_storage: LocalStorage, case: str) -> None:
     make, code, file = HORRORS[case]
     began = time.perf_counter()
     faults = faults_of(local_storage, {**photographs(), **make().files()})
@@ -144,9 +157,13 @@ def test_models_that_lie(local_storage: LocalStorage, case: str) -> None:
     assert time.perf_counter() - began < 60
 
 
-def test_all_faults_are_listed_with_pointers(local_storage: LocalStorage) -> None:
-    images = [Img(i + 1, f"../{i}.png") for i in range(3)] + [Img(9, "v0.png", (0, 0, 0, 0), (NAN, 0, 0))]
-    faults = faults_of(local_storage, {**photographs(), **replace(Model(), images=images).files()})
+def test_dataset_faults_have_json_pointers(local_storage: LocalStorage) -> None:
+    images = [ImageRecord(i + 1, f"../{i}.png") for i in range(3)] + [
+        ImageRecord(9, "v0.png", (0, 0, 0, 0), (NAN, 0, 0))
+    ]
+    faults = faults_of(
+        local_storage, {**photographs(), **replace(ColmapModelBuilder(), images=images).files()}
+    )
     codes = [fault.code for fault in faults]
     assert codes.count("name-traversal") == 3 and codes.count("model-pose") == 2
     assert faults[0].as_dict() == {
@@ -157,13 +174,20 @@ def test_all_faults_are_listed_with_pointers(local_storage: LocalStorage) -> Non
     }
 
 
-def test_faults_are_bounded(local_storage: LocalStorage) -> None:
-    images = [Img(i + 1, f"../{i}.png") for i in range(5000)]
-    assert len(faults_of(local_storage, {**photographs(), **replace(Model(), images=images).files()})) == 100
+def test_dataset_fault_list_is_bounded(local_storage: LocalStorage) -> None:
+    images = [ImageRecord(i + 1, f"../{i}.png") for i in range(5000)]
+    assert (
+        len(
+            faults_of(
+                local_storage, {**photographs(), **replace(ColmapModelBuilder(), images=images).files()}
+            )
+        )
+        == 100
+    )
 
 
 def test_files_that_do_not_fit_together(local_storage: LocalStorage) -> None:
-    small = {**photographs(), "masks/v0.png.png": photograph(9, 9), **Model().files()}
+    small = {**photographs(), "masks/v0.png.png": photograph(9, 9), **ColmapModelBuilder().files()}
     (fault,) = faults_of(local_storage, small)
     assert (fault.code, fault.file) == ("mask-size", "masks/v0.png.png")
     (fault,) = faults_of(local_storage, photographs(["v0.png", "v1.png"]))
@@ -180,9 +204,9 @@ def test_files_that_do_not_fit_together(local_storage: LocalStorage) -> None:
 
 
 def test_names_of_single_files() -> None:
-    assert check_file_name("images/a b/ü.jpg") is Part.IMAGE
-    assert check_file_name("masks/a.jpg.png") is Part.MASK
-    assert check_file_name("sparse/0/points3D.bin") is Part.MODEL
+    assert check_file_name("images/a b/ü.jpg") is FileRole.IMAGE
+    assert check_file_name("masks/a.jpg.png") is FileRole.MASK
+    assert check_file_name("sparse/0/points3D.bin") is FileRole.MODEL
     for name, code in (
         ("images/a.jpg/../../x", "name-traversal"),
         ("images/a.exe", "name-unexpected"),
@@ -193,19 +217,19 @@ def test_names_of_single_files() -> None:
         ("images/evil.sh", "name-unexpected"),
         ("images/.hidden.jpg", "name-unexpected"),
     ):
-        with pytest.raises(IntakeRefused) as caught:
+        with pytest.raises(IntakeError) as caught:
             check_file_name(name)
         assert caught.value.code == code
 
 
-def test_limits_of_the_child(local_storage: LocalStorage) -> None:
-    files = {**photographs(), **Model().files()}
+def test_model_child_respects_resource_limits(local_storage: LocalStorage) -> None:
+    files = {**photographs(), **ColmapModelBuilder().files()}
     assert faults_of(local_storage, files, max_model_bytes=100)[0].code == "model-too-large"
     (fault,) = faults_of(local_storage, files, memory_bytes=100 << 20)
     assert fault.code in ("model-memory", "model-crash")
 
 
-def test_a_child_that_hangs_is_stopped(local_storage: LocalStorage) -> None:
+def test_model_child_timeout_is_reported(local_storage: LocalStorage) -> None:
     line = b"1 1 0 0 0 0 0 4 1 v0.png\n\n"
     slow = {
         "sparse/cameras.txt": b"1 PINHOLE 32 24 30 31 16 12\n",
@@ -222,19 +246,19 @@ def test_the_child_knows_no_secrets(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("DATABASE_URL", "postgresql://user:password@host/db")
     monkeypatch.setenv("AWS_SECRET_ACCESS_KEY", "secret")
     monkeypatch.setenv("OCTASPLAT_TOKEN", "secret")
-    assert not {"password", "secret"} & set(" ".join(child_environment().values()).split())
-    assert set(child_environment()) <= {
+    assert not {"password", "secret"} & set(" ".join(parser_environment().values()).split())
+    assert set(parser_environment()) <= {
         "PATH", "LANG", "LC_ALL", "LD_LIBRARY_PATH", "NUMBA_CACHE_DIR", "SYSTEMROOT",
         "OMP_NUM_THREADS", "NUMBA_NUM_THREADS", "PYTHONDONTWRITEBYTECODE",
     }  # fmt: skip
 
 
-def test_nothing_heavy_is_imported() -> None:
+def test_intake_loads_no_heavy_modules() -> None:
     code = (
         "import sys, pkgutil, importlib, octasplat.service.intake as p\n"
         "for m in pkgutil.iter_modules(p.__path__):\n"
         "    importlib.import_module(p.__name__ + '.' + m.name)\n"
-        "import octasplat.workers.store\n"
+        "import octasplat.workers.storage\n"
         "heavy = {'pycolmap', 'torch', 'numba', 'OpenImageIO', 'boto3', 'scipy'} & set(sys.modules)\n"
         "assert not heavy, heavy\n"
     )
@@ -242,7 +266,7 @@ def test_nothing_heavy_is_imported() -> None:
     assert done.returncode == 0, done.stderr
 
 
-VALID = Model().files()
+VALID = ColmapModelBuilder().files()
 
 
 @st.composite
@@ -280,8 +304,8 @@ def damaged_models(draw: st.DrawFn) -> dict[str, bytes]:
     deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture], database=None, max_examples=40
 )
 @given(files=damaged_models())
-def test_damaged_models_are_told(local_storage: LocalStorage, files: dict[str, bytes]) -> None:
-    found = stored(local_storage, files)
+def test_dataset_damaged_model_is_refused(local_storage: LocalStorage, files: dict[str, bytes]) -> None:
+    found = store_model(local_storage, files)
     model = [TreeFile(path=f.path, sha256=f.sha256, size_bytes=f.size_bytes) for f in found]
     sizes = {f"v{i}.png": (32, 24) for i in range(4)}
     answer = check_model(local_storage, model, sizes, ModelLimits(seconds=20))
@@ -292,7 +316,7 @@ def test_damaged_models_are_told(local_storage: LocalStorage, files: dict[str, b
 
 
 @pytest.mark.real
-def test_photographed_scenes_pass(scenes_root: Path, local_storage: LocalStorage) -> None:
+def test_dataset_of_real_scene_is_accepted(scenes_root: Path, local_storage: LocalStorage) -> None:
     checked = 0
     for scene in sorted(path for path in scenes_root.iterdir() if (path / "images").is_dir()):
         files: list[DatasetFile] = []
@@ -300,9 +324,9 @@ def test_photographed_scenes_pass(scenes_root: Path, local_storage: LocalStorage
             name = path.relative_to(scene).as_posix()
             try:
                 check_file_name(name)
-            except IntakeRefused:
+            except IntakeError:
                 continue
-            files += stored(local_storage, {name: path.read_bytes()})
+            files += store_model(local_storage, {name: path.read_bytes()})
         if not any(file.path.startswith(("sparse/", "colmap/")) for file in files):
             continue
         summary = check_dataset(local_storage, files)

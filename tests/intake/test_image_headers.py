@@ -17,7 +17,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
-from octasplat.service.intake.faults import IntakeRefused
+from octasplat.service.intake.faults import IntakeError
 from octasplat.service.intake.images import ImageHeader, ImageLimits, read_image_header
 
 
@@ -26,7 +26,7 @@ def header(data: bytes, name: str = "images/a.jpg", **limits: int) -> ImageHeade
 
 
 def refusal(data: bytes, name: str = "images/a.jpg", **limits: int) -> str:
-    with pytest.raises(IntakeRefused) as caught:
+    with pytest.raises(IntakeError) as caught:
         header(data, name, **limits)
     assert "a.jpg" in str(caught.value) and str(caught.value).endswith(".")
     assert caught.value.faults[0].file == name
@@ -86,7 +86,7 @@ GOOD: dict[str, tuple[str, Callable[[], bytes]]] = {
 
 
 @pytest.mark.parametrize("case", GOOD)
-def test_sizes(case: str) -> None:
+def test_image_header_size_is_read(case: str) -> None:
     kind, make = GOOD[case]
     suffix = {"JPEG": "jpeg", "TIFF": "tif"}.get(kind, kind.lower())
     assert header(make(), f"images/a.{suffix}") == ImageHeader(kind, 31, 17)
@@ -107,7 +107,7 @@ def test_files_of_the_engine_s_library(tmp_path: Path, suffix: str, kind: str) -
     assert header(path.read_bytes(), f"images/a.{suffix}") == ImageHeader(kind, 31, 17)
 
 
-def test_a_large_photograph_of_a_telephone_is_taken() -> None:
+def test_image_header_of_large_photograph_is_accepted() -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert header(png(16_320, 12_240), "images/a.png") == ImageHeader("PNG", 16_320, 12_240)
@@ -119,7 +119,7 @@ def test_orientation_is_not_applied() -> None:
     assert header(pillow("JPEG", exif=exif)) == ImageHeader("JPEG", 31, 17)
 
 
-def test_content_counts_and_a_wrong_suffix_is_told() -> None:
+def test_image_header_wrong_suffix_warns() -> None:
     found = header(pillow("PNG"), "images/a.jpg")
     assert found.kind == "PNG" and found.warning is not None and "PNG" in found.warning
 
@@ -199,7 +199,7 @@ BAD: dict[str, tuple[Callable[[], bytes], str]] = {
 
 
 @pytest.mark.parametrize("case", BAD)
-def test_bad_headers(case: str) -> None:
+def test_image_header_damaged_is_refused(case: str) -> None:
     make, code = BAD[case]
     data = make()
     began = time.perf_counter()
@@ -207,7 +207,7 @@ def test_bad_headers(case: str) -> None:
     assert time.perf_counter() - began < 3
 
 
-def test_limits_can_be_set() -> None:
+def test_image_header_limits_are_configurable() -> None:
     data = pillow("PNG")
     assert refusal(data, max_pixels=31 * 17 - 1) == "image-too-many-pixels"
     assert refusal(data, max_side_px=30) == "image-too-long-side"
@@ -230,7 +230,7 @@ def test_damage_is_refused_or_within_limits(sample: bytes, changes: list[tuple[i
             data[position] = value
     try:
         found = header(bytes(data))
-    except IntakeRefused as error:
+    except IntakeError as error:
         assert error.code.startswith("image-")
     else:
         assert 1 <= found.width_px * found.height_px <= ImageLimits().max_pixels

@@ -12,7 +12,7 @@ def deflated(data: bytes) -> bytes:
 
 
 @dataclass
-class Member:
+class ZipMember:
     """One entry; ``local`` and ``central`` overwrite fields of the headers, whatever is true."""
 
     name: str | bytes
@@ -29,8 +29,8 @@ class Member:
     central: dict[str, Any] = field(default_factory=dict)
 
 
-def build(
-    *members: Member,
+def build_zip(
+    *members: ZipMember,
     prefix: bytes = b"",
     gap: bytes = b"",
     comment: bytes = b"",

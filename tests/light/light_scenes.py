@@ -4,20 +4,20 @@ from pathlib import Path
 
 import numpy as np
 
-from octasplat.engine.gaussians.frames import quaternions
+from octasplat.engine.gaussians.frames import quaternions_from_matrices
 from octasplat.engine.gaussians.model import SH_C0, FlatGaussians, concatenate
-from octasplat.engine.light.film import Film
-from octasplat.engine.light.integrator import LitScene, PathTracer
-from octasplat.engine.light.stage import Stage
-from octasplat.engine.light.staging import stage_meshes
-from octasplat.engine.render.cameras import RenderCamera, focal_from_fov
+from octasplat.engine.pathtracing.compile_meshes import compile_meshes
+from octasplat.engine.pathtracing.film import Film
+from octasplat.engine.pathtracing.path_tracer import PathTracer, PathTracerScene
+from octasplat.engine.pathtracing.stage.model import Stage
+from octasplat.engine.render.pinhole_camera import PinholeCamera, focal_from_fov
 
 UP = (0.0, -1.0, 0.0)
 
 
 def camera(
     eye: tuple[float, ...], target: tuple[float, ...], size: tuple[int, int] = (64, 48), fov: float = 45.0
-) -> RenderCamera:
+) -> PinholeCamera:
     """A camera that looks from one point to another, with -y up; the field of view is from top to bottom."""
     forward = np.array(target, np.float64) - eye
     forward /= np.linalg.norm(forward)
@@ -26,19 +26,19 @@ def camera(
     pose = np.eye(4)
     pose[:3, :3] = np.stack([right, np.cross(forward, right), forward], axis=1)
     pose[:3, 3] = eye
-    return RenderCamera.from_pose(pose, *size, fy_px=focal_from_fov(fov, size[1]))
+    return PinholeCamera.from_pose(pose, *size, fy_px=focal_from_fov(fov, size[1]))
 
 
 def film_of(
     stage: Stage,
-    view: RenderCamera,
+    view: PinholeCamera,
     folder: Path = Path(),
     *,
     background: float = 0.0,
     threads: int = 2,
 ) -> Film:
     """Render a stage without Gaussians."""
-    scene = LitScene(stage_meshes(stage, folder, threads=threads), None, np.full(3, background))
+    scene = PathTracerScene(compile_meshes(stage, folder, threads=threads), None, np.full(3, background))
     return PathTracer(scene, stage.integrator, threads=threads).render(view.rays())
 
 
@@ -72,7 +72,7 @@ def shiny_ball(
     scale = radius * np.sqrt(4 * np.pi / count) * 0.6
     scene = FlatGaussians(
         (radius * n).astype(np.float32),
-        quaternions(np.stack([n, u, np.cross(n, u)], axis=2)).astype(np.float32),
+        quaternions_from_matrices(np.stack([n, u, np.cross(n, u)], axis=2)).astype(np.float32),
         np.full((count, 2), np.log(scale), np.float32),
         np.full(count, 6.0, np.float32),
         np.zeros((count, 1, 3), np.float32),
@@ -95,7 +95,7 @@ def _sheet(
     frame = np.stack([np.cross(u, v), u, v], axis=1)
     return FlatGaussians(
         (centre + a.reshape(-1, 1) * u + b.reshape(-1, 1) * v).astype(np.float32),
-        np.repeat(quaternions(frame[None]), count, axis=0).astype(np.float32),
+        np.repeat(quaternions_from_matrices(frame[None]), count, axis=0).astype(np.float32),
         np.full((count, 2), np.log(2 * half / side), np.float32),
         np.full(count, 8.0, np.float32),
         np.tile((np.array(rgb, np.float32) - 0.5) / np.float32(SH_C0), (count, 1, 1)),

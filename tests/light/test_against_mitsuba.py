@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 from light_scenes import camera, film_of
 
-from octasplat.engine.light.environment import environment_frame
-from octasplat.engine.light.stage import (
+from octasplat.engine.pathtracing.compile_meshes import compile_meshes
+from octasplat.engine.pathtracing.environment import environment_frame
+from octasplat.engine.pathtracing.stage.model import (
     Dielectric,
     Diffuse,
     DirectionalLight,
@@ -27,8 +28,7 @@ from octasplat.engine.light.stage import (
     Stage,
     StageMesh,
 )
-from octasplat.engine.light.staging import stage_meshes
-from octasplat.engine.render.images import write_exr, write_png
+from octasplat.engine.render.image_files import write_exr, write_png
 
 mi = pytest.importorskip("mitsuba")
 pytestmark = pytest.mark.heavy
@@ -85,7 +85,7 @@ def mitsuba_scene(
     depth: int = BOUNCES,
 ) -> Any:
     mi.set_variant(variant)
-    surfaces = stage_meshes(stage, folder, threads=2).surfaces
+    surfaces = compile_meshes(stage, folder, threads=2).surfaces
     t = mi.ScalarTransform4f
     scene: dict[str, Any] = {
         "type": "scene",
@@ -99,7 +99,7 @@ def mitsuba_scene(
         **emitters,
     }  # fmt: skip
     for row, bsdf in enumerate(bsdfs):
-        chosen = surfaces.materials == row
+        chosen = surfaces.material_ids == row
         corners = surfaces.corners_world[chosen].reshape(-1, 3)
         normals = surfaces.corner_normals[chosen].reshape(-1, 3)
         uv = surfaces.corner_uv[chosen].reshape(-1, 2)
@@ -179,7 +179,7 @@ OPAQUE = {
 
 
 @pytest.mark.parametrize("name", OPAQUE)
-def test_a_ball_under_a_lamp(name: str, tmp_path: Path) -> None:
+def test_sphere_under_area_light_matches_mitsuba(name: str, tmp_path: Path) -> None:
     material, bsdf = OPAQUE[name]
     if "dielectric" not in bsdf["type"]:
         bsdf = {"type": "twosided", "bsdf": bsdf} if bsdf["type"] != "principled" else bsdf
@@ -187,7 +187,7 @@ def test_a_ball_under_a_lamp(name: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["mirror", "metal", "principled", "glass", "rough glass"])
-def test_a_ball_under_a_sky(name: str, tmp_path: Path) -> None:
+def test_sphere_under_environment_matches_mitsuba(name: str, tmp_path: Path) -> None:
     material, bsdf = OPAQUE[name]
     environment(tmp_path)
     # Mitsuba's map has y up and looks along +z in its middle, as a map with our frame for that up.
@@ -198,7 +198,7 @@ def test_a_ball_under_a_sky(name: str, tmp_path: Path) -> None:
     print(name, same(turned, tmp_path, [GROUND, bsdf], {"sky": sky}))  # noqa: T201
 
 
-def test_a_textured_dielectric(tmp_path: Path) -> None:
+def test_textured_dielectric_matches_mitsuba(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     write_png(
         tmp_path / "checks.png", np.kron(rng.random((4, 4, 3)), np.ones((32, 32, 1))).astype(np.float32)
@@ -226,7 +226,7 @@ def test_point_and_directional_lights(tmp_path: Path) -> None:
     print("points", same(stage, tmp_path, [GROUND, red], emitters))  # noqa: T201
 
 
-def test_a_ball_that_shines_and_one_of_light(tmp_path: Path) -> None:
+def test_emissive_and_light_spheres_match_mitsuba(tmp_path: Path) -> None:
     glow = Diffuse(colour_srgb=(0, 0, 0), emission=4.0)
     shining = StageMesh(
         shape="cube", scale=0.4, position=(-1, -1.5, 0), rotation_degrees=(20, 30, 0), material=glow
@@ -239,7 +239,7 @@ def test_a_ball_that_shines_and_one_of_light(tmp_path: Path) -> None:
     print("shining", same(stage, tmp_path, [GROUND, red, *areas], {}))  # noqa: T201
 
 
-def test_a_normal_texture(tmp_path: Path) -> None:
+def test_normal_texture_matches_mitsuba(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     slopes = np.kron(rng.uniform(0.25, 0.75, (4, 4, 2)), np.ones((16, 16, 1)))
     pixels = np.concatenate([slopes, np.full((64, 64, 1), 0.95)], axis=2).astype(np.float32)

@@ -5,7 +5,13 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from octasplat.engine.light.bsdf import OpaqueMaterial, RoughGlass, albedo_table, fresnel, frosted_table
+from octasplat.engine.pathtracing.bsdf_tables import (
+    OpaqueMaterial,
+    RoughGlass,
+    albedo_table,
+    fresnel,
+    rough_dielectric_table,
+)
 from octasplat.engine.shading.kernels_microfacets import table_value
 
 
@@ -53,7 +59,7 @@ def test_fresnel_head_on_at_brewster_and_beyond_the_critical_angle() -> None:
     np.testing.assert_allclose(np.sqrt(1 - cos_t[:3] ** 2), 1.5 * np.sin(angles[:3]), rtol=1e-12)
 
 
-def test_index_one_reflects_nothing() -> None:
+def test_dielectric_index_one_reflects_nothing() -> None:
     reflected, cos_t = fresnel(np.linspace(0.01, 1.0, 50), 1.0)
     np.testing.assert_allclose(reflected, 0.0, atol=1e-20)
     np.testing.assert_allclose(cos_t, np.linspace(0.01, 1.0, 50))
@@ -61,7 +67,7 @@ def test_index_one_reflects_nothing() -> None:
 
 @pytest.mark.parametrize("metallic", [0.0, 0.5, 1.0])
 @pytest.mark.parametrize("roughness", [0.1, 0.3, 0.6, 1.0])
-def test_a_white_furnace_keeps_its_energy(metallic: float, roughness: float) -> None:
+def test_bsdf_white_furnace_conserves_energy(metallic: float, roughness: float) -> None:
     # By the material's own samples: value over density is what each of them carries.
     n = 1 << 15
     k = np.arange(n)
@@ -76,7 +82,7 @@ def test_a_white_furnace_keeps_its_energy(metallic: float, roughness: float) -> 
 
 @pytest.mark.parametrize("roughness", [0.35, 0.7])
 @pytest.mark.parametrize("metallic", [0.0, 0.4, 1.0])
-def test_densities_integrate_to_what_stays_above_the_surface(metallic: float, roughness: float) -> None:
+def test_bsdf_pdf_integrates_to_upper_hemisphere_share(metallic: float, roughness: float) -> None:
     lit, patch = hemisphere(1500, 700)
     n = 1 << 15
     rng = np.random.default_rng(2)
@@ -125,7 +131,7 @@ def test_values_do_not_change_when_light_and_viewer_are_swapped() -> None:
 
 
 def test_a_smooth_coat_reflects_what_fresnel_says() -> None:
-    table = albedo_table(1.5).by_cosine[0]
+    table = albedo_table(1.5).directional[0]
     cosines = np.linspace(0, 1, len(table))[2:]
     np.testing.assert_allclose(table[2:], fresnel(cosines, 1.5)[0], atol=2e-3)
 
@@ -137,13 +143,13 @@ def golden(n: int) -> np.ndarray:
 
 @pytest.mark.parametrize("eta", [1.5, 1 / 1.5])
 @pytest.mark.parametrize("roughness", [0.2, 0.6, 1.0])
-def test_rough_glass_keeps_what_its_table_says(eta: float, roughness: float) -> None:
+def test_rough_dielectric_energy_matches_table(eta: float, roughness: float) -> None:
     n = 1 << 14
     for cosine in (0.15, 0.5, 0.95):
         glass, seen = RoughGlass(eta, roughness), towards(cosine, n)
         values, pdf = glass.evaluate(seen, glass.sample(seen, golden(n)))
         kept = np.where(pdf > 0, values / np.maximum(pdf, 1e-30), 0.0).mean()
-        assert abs(kept / value_of(frosted_table(eta).by_cosine, cosine, roughness) - 1) < 0.015
+        assert abs(kept / value_of(rough_dielectric_table(eta).directional, cosine, roughness) - 1) < 0.015
 
 
 @pytest.mark.parametrize("eta", [1.5, 1 / 1.5])

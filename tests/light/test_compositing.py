@@ -8,9 +8,10 @@ from click.testing import CliRunner
 from light_scenes import camera, film_of, psnr, table_with_a_box
 
 from octasplat.engine.files.gaussian_ply import write_gaussian_ply
-from octasplat.engine.light.integrator import LitScene, PathTracer
-from octasplat.engine.light.layers import stage_layers
-from octasplat.engine.light.stage import (
+from octasplat.engine.pathtracing.compile_meshes import compile_meshes
+from octasplat.engine.pathtracing.gaussian_layers import build_gaussian_layers
+from octasplat.engine.pathtracing.path_tracer import PathTracer, PathTracerScene
+from octasplat.engine.pathtracing.stage.model import (
     Diffuse,
     Glass,
     Integrator,
@@ -20,8 +21,7 @@ from octasplat.engine.light.stage import (
     Stage,
     StageMesh,
 )
-from octasplat.engine.light.staging import stage_meshes
-from octasplat.engine.render.images import read_channels
+from octasplat.engine.render.image_files import read_channels
 from octasplat.engine.trace.protocol import TraceSettings
 from octasplat.workers.cli.main import cli
 
@@ -45,11 +45,11 @@ def test_the_layers_make_the_picture_again_and_the_plate_is_the_scene_alone() ->
     stage = Stage(meshes=BALLS, lights=lights, integrator=numbers)
 
     def rendered(stage: Stage):  # type: ignore[no-untyped-def]
-        layers = stage_layers(
+        layers = build_gaussian_layers(
             stage, table_with_a_box(), lambda path: pytest.fail(str(path)), Path(), TraceSettings(), size=1.0,
             threads=2,
         )  # fmt: skip
-        scene = LitScene(stage_meshes(stage, Path(), threads=2), layers, np.full(3, 0.2))
+        scene = PathTracerScene(compile_meshes(stage, Path(), threads=2), layers, np.full(3, 0.2))
         return PathTracer(scene, stage.integrator, threads=2).render(VIEW.rays()).image()
 
     image = rendered(stage)

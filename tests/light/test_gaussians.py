@@ -7,9 +7,10 @@ import pytest
 from light_scenes import camera, psnr
 
 from octasplat.engine.gaussians.model import SH_C0, FlatGaussians
-from octasplat.engine.light.integrator import LitScene, PathTracer
-from octasplat.engine.light.layers import stage_layers
-from octasplat.engine.light.stage import (
+from octasplat.engine.pathtracing.compile_meshes import compile_meshes
+from octasplat.engine.pathtracing.gaussian_layers import build_gaussian_layers
+from octasplat.engine.pathtracing.path_tracer import PathTracer, PathTracerScene
+from octasplat.engine.pathtracing.stage.model import (
     Diffuse,
     DirectionalLight,
     Environment,
@@ -22,9 +23,8 @@ from octasplat.engine.light.stage import (
     StageGaussians,
     StageMesh,
 )
-from octasplat.engine.light.staging import stage_meshes
-from octasplat.engine.render.cameras import RenderCamera
-from octasplat.engine.render.images import write_exr
+from octasplat.engine.render.image_files import write_exr
+from octasplat.engine.render.pinhole_camera import PinholeCamera
 from octasplat.engine.render.renderer import render_rays
 from octasplat.engine.trace.cpu.tracer import CpuTracer
 from octasplat.engine.trace.protocol import TraceSettings
@@ -67,14 +67,14 @@ def wall(
 
 def picture(
     stage: Stage,
-    view: RenderCamera,
+    view: PinholeCamera,
     gaussians: FlatGaussians,
     folder: Path = Path(),
     background: float = 0.0,
     threads: int = 2,
 ) -> np.ndarray:
     """Display values of a stage."""
-    layers = stage_layers(
+    layers = build_gaussian_layers(
         stage,
         gaussians,
         lambda path: pytest.fail(str(path)),
@@ -83,11 +83,11 @@ def picture(
         size=1.0,
         threads=threads,
     )
-    scene = LitScene(stage_meshes(stage, folder, threads=threads), layers, np.full(3, background))
+    scene = PathTracerScene(compile_meshes(stage, folder, threads=threads), layers, np.full(3, background))
     return PathTracer(scene, stage.integrator, threads=threads).render(view.rays()).image().rgb_srgb
 
 
-def plainly(gaussians: FlatGaussians, view: RenderCamera, background: float = 0.0) -> np.ndarray:
+def plainly(gaussians: FlatGaussians, view: PinholeCamera, background: float = 0.0) -> np.ndarray:
     """The picture that the renderer of scenes makes; the background is a display value."""
     tracer = CpuTracer(TraceSettings())
     tracer.build(gaussians)
@@ -101,7 +101,7 @@ def emissive(*meshes: StageMesh, numbers: Integrator = PLAIN, **more: object) ->
 VIEW = camera((0, 0, -2.5), (0, 0, 0), (48, 36), 45)
 
 
-def test_a_stage_with_nothing_in_it_is_the_plain_picture() -> None:
+def test_empty_stage_equals_plain_render() -> None:
     some = cloud(300)
     grey = 0.5
     shown = picture(emissive(), VIEW, some, background=((grey + 0.055) / 1.055) ** 2.4)
@@ -116,8 +116,8 @@ def test_scenes_with_channels_of_their_own_stand_in_one_stage() -> None:
     stage = Stage(gaussians=entries, integrator=PLAIN)
 
     def shown(first: FlatGaussians, second: FlatGaussians) -> np.ndarray:
-        layers = stage_layers(stage, first, lambda path: second, Path(), TraceSettings(), size=1.0)
-        scene = LitScene(stage_meshes(stage, Path()), layers)
+        layers = build_gaussian_layers(stage, first, lambda path: second, Path(), TraceSettings(), size=1.0)
+        scene = PathTracerScene(compile_meshes(stage, Path()), layers)
         return PathTracer(scene, PLAIN).render(VIEW.rays()).image().rgb_srgb
 
     expected = shown(plain, labelled)
@@ -125,7 +125,7 @@ def test_scenes_with_channels_of_their_own_stand_in_one_stage() -> None:
         np.testing.assert_array_equal(shown(first, labelled.with_channels(channels)), expected)
 
 
-def test_a_slab_of_index_one_changes_nothing() -> None:
+def test_dielectric_slab_index_one_is_invisible() -> None:
     some = cloud(300)
     # It cuts through the Gaussians, so that each ray has three layers of them.
     slab = StageMesh(shape="cube", scale=(5, 5, 0.15), rotation_degrees=(0, 20, 0), material=Glass(ior=1.0))
@@ -175,8 +175,8 @@ def test_an_opaque_wall_of_gaussians_casts_the_shadow_of_a_mesh(light: str) -> N
     assert (np.abs(by_mesh - by_gaussians).max(axis=2) > 0.1).mean() < 0.03
 
 
-def picture_without(stage: Stage, view: RenderCamera) -> np.ndarray:
-    scene = LitScene(stage_meshes(stage, Path()), None)
+def picture_without(stage: Stage, view: PinholeCamera) -> np.ndarray:
+    scene = PathTracerScene(compile_meshes(stage, Path()), None)
     return PathTracer(scene, stage.integrator).render(view.rays()).image().rgb_srgb
 
 
@@ -218,7 +218,7 @@ def test_meshes_take_the_light_of_shadowed_gaussians_away_and_no_more() -> None:
     assert len(shadow) > 3 and abs(np.median(shadow) - 0.25) < 0.01
 
 
-def test_relit_gaussians_shine_as_a_matt_wall_of_their_colour() -> None:
+def test_relit_gaussians_match_diffuse_wall() -> None:
     screen = wall(0.0, 2.0, colour=0.6)
     lamp = PointLight(position=(0.5, -0.5, -1.5), intensity=4)
     numbers = Integrator(samples=1, max_depth=1, anti_aliasing=False)

@@ -9,10 +9,10 @@ from light_scenes import camera, psnr
 
 from octasplat.engine.gaussians.model import SH_C0, FlatGaussians
 from octasplat.engine.gaussians.octagon import CHI2_3_99
-from octasplat.engine.light.integrator import LitScene, PathTracer
-from octasplat.engine.light.layers import stage_layers
-from octasplat.engine.light.stage import Integrator, Mirror, Stage, StageGaussians, StageMesh
-from octasplat.engine.light.staging import stage_meshes
+from octasplat.engine.pathtracing.compile_meshes import compile_meshes
+from octasplat.engine.pathtracing.gaussian_layers import build_gaussian_layers
+from octasplat.engine.pathtracing.path_tracer import PathTracer, PathTracerScene
+from octasplat.engine.pathtracing.stage.model import Integrator, Mirror, Stage, StageGaussians, StageMesh
 from octasplat.engine.trace.protocol import TraceSettings
 
 pytest.importorskip("mitsuba")
@@ -50,13 +50,13 @@ def test_gaussians_beside_a_mirror() -> None:
     numbers = Integrator(samples=1, max_depth=4, roulette_depth=64, anti_aliasing=False)
     stage = Stage(gaussians=(StageGaussians(light="emissive"),), meshes=(mirror,), integrator=numbers)
     image = camera((-3.0, -0.5, -7.0), (1.4, 0, 0), (160, 120), 50).rays()
-    layers = stage_layers(stage, some, _nothing, Path(), SETTINGS, size=1.0)
-    meshes = stage_meshes(stage, Path())
-    ours = PathTracer(LitScene(meshes, layers), numbers).render(image).image().rgb_srgb
+    layers = build_gaussian_layers(stage, some, _nothing, Path(), SETTINGS, size=1.0)
+    meshes = compile_meshes(stage, Path())
+    ours = PathTracer(PathTracerScene(meshes, layers), numbers).render(image).image().rgb_srgb
     mirrored = GaussiansBesideMirror(some, meshes.surfaces.corners_world, SETTINGS)
     theirs = mirrored.trace(image.origin_world, image.rays.directions_world).reshape(ours.shape)
     theirs = np.clip(theirs, 0, 1)
-    bare = LitScene(stage_meshes(Stage(gaussians=(), integrator=numbers), Path()), layers)
+    bare = PathTracerScene(compile_meshes(Stage(gaussians=(), integrator=numbers), Path()), layers)
     without = PathTracer(bare, numbers).render(image).image().rgb_srgb
     in_mirror = np.abs(ours - without).max(axis=2) > 0.05
     assert in_mirror.mean() > 0.05

@@ -7,8 +7,9 @@ import pytest
 from light_scenes import camera, film_of, psnr
 
 from octasplat.engine.errors import ConfigError
-from octasplat.engine.light.integrator import LitScene, PathTracer
-from octasplat.engine.light.stage import (
+from octasplat.engine.pathtracing.compile_meshes import check_outside_glass, compile_meshes
+from octasplat.engine.pathtracing.path_tracer import PathTracer, PathTracerScene
+from octasplat.engine.pathtracing.stage.model import (
     Dielectric,
     Diffuse,
     DirectionalLight,
@@ -22,8 +23,7 @@ from octasplat.engine.light.stage import (
     Stage,
     StageMesh,
 )
-from octasplat.engine.light.staging import refuse_inside_glass, stage_meshes
-from octasplat.engine.render.images import write_exr
+from octasplat.engine.render.image_files import write_exr
 
 AHEAD = camera((0, 0, -4), (0, 0, 0), (24, 16), 30)
 WHITE = (1.0, 1.0, 1.0)
@@ -47,7 +47,7 @@ def white_sky(folder: Path, value: float = 1.0) -> Environment:
     ],
     ids=lambda m: m.kind,
 )
-def test_a_white_furnace_shows_nothing(material, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
+def test_white_furnace_has_uniform_radiance(material, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
     ball = StageMesh(shape="sphere", smooth_degrees=180, material=material)
     numbers = Integrator(samples=64, max_depth=32, roulette_depth=32)
     stage = Stage(gaussians=(), meshes=(ball,), environment=white_sky(tmp_path), integrator=numbers)
@@ -56,7 +56,7 @@ def test_a_white_furnace_shows_nothing(material, tmp_path: Path) -> None:  # typ
     assert np.abs(picture.mean(axis=2) - 1).max() < 0.35
 
 
-def test_a_slab_absorbs_by_beers_law_and_reflects_by_fresnels(tmp_path: Path) -> None:
+def test_dielectric_slab_follows_beer_and_fresnel(tmp_path: Path) -> None:
     slab = StageMesh(shape="cube", scale=(5, 5, 0.5), material=Glass(ior=1.5, absorption=(0.7, 0.2, 0.0)))
     numbers = Integrator(samples=1024, max_depth=32, roulette_depth=32, anti_aliasing=False)
     black = Stage(gaussians=(), meshes=(slab,), integrator=numbers)
@@ -70,7 +70,7 @@ def test_a_slab_absorbs_by_beers_law_and_reflects_by_fresnels(tmp_path: Path) ->
     np.testing.assert_allclose(seen, through, atol=0.004)
 
 
-def test_a_slab_moves_what_is_behind_it_as_snell_says(tmp_path: Path) -> None:
+def test_dielectric_slab_offset_follows_snell(tmp_path: Path) -> None:
     # Under 45 degrees, thickness 1, index 1.5: the ray comes out parallel, displaced sideways.
     slab = StageMesh(shape="cube", scale=(20, 20, 0.5), material=Glass(ior=1.5))
     numbers = Integrator(samples=256, max_depth=3, anti_aliasing=False)
@@ -202,14 +202,14 @@ def test_light_of_a_point_goes_straight_through_a_pane(tmp_path: Path) -> None:
 
 def test_glass_that_is_open_and_a_camera_inside_glass_are_refused(tmp_path: Path) -> None:
     ball = StageMesh(shape="sphere", material=Glass())
-    meshes = stage_meshes(Stage(gaussians=(), meshes=(ball,)), tmp_path)
+    meshes = compile_meshes(Stage(gaussians=(), meshes=(ball,)), tmp_path)
     with pytest.raises(ConfigError, match=r"a\.png: the camera stands inside"):
-        refuse_inside_glass(meshes, np.array([0.1, 0.2, 0.3], np.float32), "a.png")
-    refuse_inside_glass(meshes, np.array([0.1, 0.2, 1.3], np.float32), "a.png")
-    refuse_inside_glass(meshes, np.array([-3, -3, -3], np.float32), "a.png")
+        check_outside_glass(meshes, np.array([0.1, 0.2, 0.3], np.float32), "a.png")
+    check_outside_glass(meshes, np.array([0.1, 0.2, 1.3], np.float32), "a.png")
+    check_outside_glass(meshes, np.array([-3, -3, -3], np.float32), "a.png")
     (tmp_path / "leaf.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
     with pytest.raises(ConfigError, match=r"leaf\.obj is not closed"):
-        stage_meshes(Stage(meshes=(StageMesh(file="leaf.obj", material=Glass()),)), tmp_path)
+        compile_meshes(Stage(meshes=(StageMesh(file="leaf.obj", material=Glass()),)), tmp_path)
 
 
 def test_neither_threads_nor_samples_added_later_change_a_picture_of_meshes() -> None:
@@ -225,6 +225,6 @@ def test_neither_threads_nor_samples_added_later_change_a_picture_of_meshes() ->
     view = camera((0, -1, -4), (0, 0, 0), (64, 48), 50)  # more paths than one thread follows at a time
     one, two = (film_of(stage, view, threads=threads).image().rgb_linear for threads in (1, 2))
     np.testing.assert_array_equal(one, two)
-    scene = LitScene(stage_meshes(stage, Path(), threads=2))
+    scene = PathTracerScene(compile_meshes(stage, Path(), threads=2))
     *_, last = PathTracer(scene, numbers, threads=2).refine(view.rays())
     np.testing.assert_allclose(last.image().rgb_linear, one, atol=1e-6)

@@ -7,11 +7,11 @@ import pytest
 from scipy.stats import chi2
 
 from octasplat.engine.errors import ConfigError
-from octasplat.engine.light.environment import EnvironmentMap, environment_frame
-from octasplat.engine.light.lights import light_arrays, look_up_environment, sample_lights
-from octasplat.engine.light.stage import DirectionalLight, PointLight, RectangleLight, SpotLight
-from octasplat.engine.render.environment_map import read_environment, write_environment
-from octasplat.engine.render.images import write_exr
+from octasplat.engine.pathtracing.environment import EnvironmentMap, environment_frame
+from octasplat.engine.pathtracing.lights import build_light_arrays, eval_environment_map, sample_lights
+from octasplat.engine.pathtracing.stage.model import DirectionalLight, PointLight, RectangleLight, SpotLight
+from octasplat.engine.render.environment_files import read_environment, write_environment
+from octasplat.engine.render.image_files import write_exr
 
 UP = np.array([0.0, 0.0, 1.0])
 
@@ -37,35 +37,35 @@ def test_a_parallel_rectangle_lights_by_its_form_factor() -> None:
     ) / (2 * np.pi)
     light = RectangleLight(position=(0, 0, 1), direction=(0, 0, -1), width=2 * a, height=2 * b, radiance=3.0)
     samples = sample_lights(
-        light_arrays((light,), np.array([0.0, 1.0, 0.0])), np.zeros((1 << 14, 3)), stratified(128)
+        build_light_arrays((light,), np.array([0.0, 1.0, 0.0])), np.zeros((1 << 14, 3)), stratified(128)
     )
     # Which side is the level one follows from the up direction that the stage names.
     np.testing.assert_allclose(irradiance(samples), 4 * corner * np.pi * 3.0, rtol=2e-3)
 
 
-def test_a_rectangle_is_black_behind() -> None:
+def test_rectangle_light_back_side_is_black() -> None:
     light = RectangleLight(position=(0, 0, 1), direction=(0, 0, 1), width=1, height=1, radiance=3.0)
     assert (
-        irradiance(sample_lights(light_arrays((light,), UP), np.zeros((16, 3)), stratified(4))) == 0
+        irradiance(sample_lights(build_light_arrays((light,), UP), np.zeros((16, 3)), stratified(4))) == 0
     ).all()
 
 
 def test_points_fall_off_with_the_square_and_directional_lights_not() -> None:
-    point = light_arrays((PointLight(position=(0, 0, 2), intensity=8.0),), UP)
-    sun = light_arrays((DirectionalLight(direction=(1, 0, -1), irradiance=2.0),), UP)
+    point = build_light_arrays((PointLight(position=(0, 0, 2), intensity=8.0),), UP)
+    sun = build_light_arrays((DirectionalLight(direction=(1, 0, -1), irradiance=2.0),), UP)
     np.testing.assert_allclose(irradiance(sample_lights(point, np.zeros((4, 3)), stratified(2))), 2.0)
     np.testing.assert_allclose(
         irradiance(sample_lights(sun, np.full((4, 3), 9.0), stratified(2))), np.sqrt(2)
     )
 
 
-def test_a_spot_shines_into_its_cone() -> None:
+def test_spot_light_is_limited_to_cone() -> None:
     spot = SpotLight(
         position=(0, 0, 1), direction=(0, 0, -1), intensity=1.0, outer_degrees=30, inner_degrees=10
     )
     angles = np.radians([0.0, 9.0, 20.0, 31.0])
     points = np.stack([np.tan(angles), 0 * angles, 0 * angles], axis=1)
-    seen = sample_lights(light_arrays((spot,), UP), points, np.zeros((4, 3))).radiance_linear[:, 0]
+    seen = sample_lights(build_light_arrays((spot,), UP), points, np.zeros((4, 3))).radiance_linear[:, 0]
     outer, inner = np.cos(np.radians([30, 10]))
     falloff = [1.0, 1.0, ((np.cos(angles[2]) - outer) / (inner - outer)) ** 2, 0.0]
     np.testing.assert_allclose(seen, falloff * np.cos(angles) ** 2, rtol=1e-12)
@@ -78,7 +78,7 @@ def test_several_lights_add_up() -> None:
         DirectionalLight(direction=(0, 0, -1), irradiance=0.5),
         RectangleLight(position=(0, 0, -1), direction=(0, 0, -1), width=1, height=1, radiance=9.0),
     )
-    samples = sample_lights(light_arrays(lights, UP), np.zeros((1 << 14, 3)), stratified(128))
+    samples = sample_lights(build_light_arrays(lights, UP), np.zeros((1 << 14, 3)), stratified(128))
     expected = np.array([1.5 + 20 / 10**1.5, 1.5, 1.5])
     np.testing.assert_allclose(irradiance(samples), expected, rtol=5e-3)
     assert 3 not in samples.lights
@@ -93,7 +93,7 @@ def patchy() -> np.ndarray:
 
 def test_an_environments_density_integrates_to_one_and_its_samples_follow_it() -> None:
     frame = environment_frame(np.array([0.2, -1.0, 0.1]), 37.0)
-    lights = light_arrays((), UP, EnvironmentMap(patchy(), frame))
+    lights = build_light_arrays((), UP, EnvironmentMap(patchy(), frame))
     rows, columns = 256, 512
     v, u = np.meshgrid((np.arange(rows) + 0.5) / rows, (np.arange(columns) + 0.5) / columns, indexing="ij")
     local = np.stack(
@@ -105,11 +105,11 @@ def test_an_environments_density_integrates_to_one_and_its_samples_follow_it() -
         axis=-1,
     )
     patches = 2 * np.pi**2 * np.sin(np.pi * v) / v.size
-    radiance, density = look_up_environment(lights, (local @ frame).reshape(-1, 3))
+    radiance, density = eval_environment_map(lights, (local @ frame).reshape(-1, 3))
     assert abs((density * patches.ravel()).sum() - 1) < 1e-3
     n = 100_000
     samples = sample_lights(lights, np.zeros((n, 3)), np.random.default_rng(1).random((n, 3)))
-    again, density_there = look_up_environment(lights, samples.directions_world)
+    again, density_there = eval_environment_map(lights, samples.directions_world)
     np.testing.assert_allclose(samples.density, density_there, rtol=1e-6)
     np.testing.assert_allclose(samples.radiance_linear, again, rtol=1e-6)
     back = samples.directions_world @ frame.T
@@ -127,20 +127,22 @@ def test_an_environments_density_integrates_to_one_and_its_samples_follow_it() -
     np.testing.assert_allclose(irradiance(samples, normal), summed, rtol=0.02)
 
 
-def test_which_way_an_environment_is_turned() -> None:
+def test_environment_rotation_turns_map() -> None:
     radiance = np.zeros((64, 128, 3), np.float32)
     radiance[31:33, 63:65] = 1.0  # the middle
     radiance[:4] = 0.5  # the top
-    colmap = light_arrays((), UP, EnvironmentMap(radiance, environment_frame(np.array([0.0, -1.0, 0.0]))))
-    assert look_up_environment(colmap, np.array([[0.0, 0.0, 1.0]]))[0][0, 0] == 1.0
-    assert look_up_environment(colmap, np.array([[0.0, -1.0, 0.0]]))[0][0, 0] == 0.5
-    level = light_arrays((), UP, EnvironmentMap(radiance, environment_frame(UP)))
-    assert look_up_environment(level, np.array([[1.0, 0.0, 0.0]]))[0][0, 0] == 1.0
-    turned = light_arrays((), UP, EnvironmentMap(radiance, environment_frame(UP, 90.0)))
-    assert look_up_environment(turned, np.array([[0.0, 1.0, 0.0]]))[0][0, 0] == pytest.approx(1.0)
+    colmap = build_light_arrays(
+        (), UP, EnvironmentMap(radiance, environment_frame(np.array([0.0, -1.0, 0.0])))
+    )
+    assert eval_environment_map(colmap, np.array([[0.0, 0.0, 1.0]]))[0][0, 0] == 1.0
+    assert eval_environment_map(colmap, np.array([[0.0, -1.0, 0.0]]))[0][0, 0] == 0.5
+    level = build_light_arrays((), UP, EnvironmentMap(radiance, environment_frame(UP)))
+    assert eval_environment_map(level, np.array([[1.0, 0.0, 0.0]]))[0][0, 0] == 1.0
+    turned = build_light_arrays((), UP, EnvironmentMap(radiance, environment_frame(UP, 90.0)))
+    assert eval_environment_map(turned, np.array([[0.0, 1.0, 0.0]]))[0][0, 0] == pytest.approx(1.0)
 
 
-def test_an_environment_that_is_no_picture_is_refused(tmp_path: Path) -> None:
+def test_environment_invalid_image_is_refused(tmp_path: Path) -> None:
     (tmp_path / "not.hdr").write_bytes(b"#?RADIANCE nonsense")
     with pytest.raises(ConfigError, match=r"not\.hdr"):
         read_environment(tmp_path / "not.hdr")
@@ -153,7 +155,7 @@ def test_an_environment_that_is_no_picture_is_refused(tmp_path: Path) -> None:
         read_environment(tmp_path / "bad.exr")
 
 
-def test_a_written_environment_comes_back(tmp_path: Path) -> None:
+def test_environment_file_round_trips(tmp_path: Path) -> None:
     radiance = np.random.default_rng(0).lognormal(0, 2, (16, 32, 3)).astype(np.float32)
     write_environment(tmp_path / "map.exr", radiance)
     np.testing.assert_array_equal(read_environment(tmp_path / "map.exr"), radiance)

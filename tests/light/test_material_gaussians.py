@@ -8,9 +8,10 @@ from light_scenes import camera, psnr, shiny_ball
 
 from octasplat.engine.colour import linear_to_srgb
 from octasplat.engine.gaussians.model import FlatGaussians
-from octasplat.engine.light.integrator import LitScene, PathTracer
-from octasplat.engine.light.layers import stage_layers
-from octasplat.engine.light.stage import (
+from octasplat.engine.pathtracing.compile_meshes import compile_meshes
+from octasplat.engine.pathtracing.gaussian_layers import build_gaussian_layers
+from octasplat.engine.pathtracing.path_tracer import PathTracer, PathTracerScene
+from octasplat.engine.pathtracing.stage.model import (
     Environment,
     Integrator,
     MetallicRoughness,
@@ -19,8 +20,7 @@ from octasplat.engine.light.stage import (
     StageGaussians,
     StageMesh,
 )
-from octasplat.engine.light.staging import stage_meshes
-from octasplat.engine.render.environment_map import write_environment
+from octasplat.engine.render.environment_files import write_environment
 from octasplat.engine.trace.protocol import TraceSettings
 
 FOLDER = Path(__file__).parent
@@ -35,7 +35,7 @@ def sky(folder: Path, *, white: bool = False) -> str:
 
 
 def picture(stage: Stage, gaussians: FlatGaussians | None, side: int = 24, threads: int = 2) -> np.ndarray:
-    layers = stage_layers(
+    layers = build_gaussian_layers(
         stage,
         gaussians,
         lambda path: pytest.fail(str(path)),
@@ -44,7 +44,7 @@ def picture(stage: Stage, gaussians: FlatGaussians | None, side: int = 24, threa
         size=1.0,
         threads=threads,
     )
-    scene = LitScene(stage_meshes(stage, FOLDER, threads=threads), layers, np.zeros(3))
+    scene = PathTracerScene(compile_meshes(stage, FOLDER, threads=threads), layers, np.zeros(3))
     view = camera((0, 0, -3.2), (0, 0, 0), (side, side), 45.0)
     film = PathTracer(scene, stage.integrator, threads=threads).render(view.rays())
     return film.image().rgb_srgb
@@ -77,7 +77,7 @@ def both(
 @pytest.mark.parametrize(
     ("metallic", "roughness", "least"), [(1.0, 0.15, 33.0), (0.0, 0.3, 36.0), (0.5, 0.6, 36.0)]
 )
-def test_a_ball_of_gaussians_shines_as_a_mesh_does(tmp_path, metallic, roughness, least):
+def test_gaussian_ball_matches_mesh_ball(tmp_path, metallic, roughness, least):
     material = {"albedo": (0.8, 0.5, 0.2), "metallic": metallic, "roughness": roughness}
     ours, theirs = both(sky(tmp_path), material)
     inside = np.s_[7:17, 7:17]  # the outline of a ball of Gaussians is soft
@@ -86,7 +86,7 @@ def test_a_ball_of_gaussians_shines_as_a_mesh_does(tmp_path, metallic, roughness
     assert abs(float(ours[inside].mean() / theirs[inside].mean()) - 1) < 0.02
 
 
-def test_a_mirror_shows_the_gaussians_and_they_show_the_mesh(tmp_path):
+def test_mirror_and_gaussians_reflect_each_other(tmp_path):
     material = {"albedo": (0.9, 0.9, 0.9), "metallic": 1.0, "roughness": 0.2}
     mirror = StageMesh(
         shape="plane", position=(0, 1.3, 0), scale=3.0, material=Mirror(colour_srgb=(0.9, 0.9, 0.9))
@@ -102,7 +102,7 @@ def test_a_mirror_shows_the_gaussians_and_they_show_the_mesh(tmp_path):
     assert psnr(ours[9:16, 9:16], theirs[9:16, 9:16]) > 30
 
 
-def test_a_white_furnace_keeps_its_light(tmp_path):
+def test_material_gaussians_white_furnace_conserves_energy(tmp_path):
     """Smooth metal that reflects everything is nearly white in white light, and never brighter."""
     environment = Environment(file=sky(tmp_path, white=True), visible=True)
     gaussians = shiny_ball(2000, 1.0, albedo=(1.0, 1.0, 1.0), metallic=1.0, roughness=0.2)
@@ -114,7 +114,7 @@ def test_a_white_furnace_keeps_its_light(tmp_path):
     assert image.max() <= 1.0 + 1e-6 and image[9:16, 9:16].mean() > 0.985
 
 
-def test_threads_change_nothing_and_trained_colours_play_no_part(tmp_path):
+def test_material_render_independent_of_threads_and_colours(tmp_path):
     gaussians = shiny_ball(1500, 1.0, albedo=(0.5, 0.5, 0.5), metallic=0.5, roughness=0.3)
     stage = Stage(
         gaussians=(StageGaussians(light="relit"),),

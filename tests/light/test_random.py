@@ -4,13 +4,13 @@ import numba
 import numpy as np
 from scipy.stats import qmc
 
-from octasplat.engine.light.kernels_random import fill_uniform, reversed_bits, sobol_digits
+from octasplat.engine.pathtracing.kernels.sampler import fill_uniform, reverse_bits, sobol_reversed_bits
 
 
 @numba.njit
 def digits(index):
-    first, second = sobol_digits(index)
-    return reversed_bits(first), reversed_bits(second)
+    first, second = sobol_reversed_bits(index)
+    return reverse_bits(first), reverse_bits(second)
 
 
 def numbers(pixel: int, samples: int, pair: int = 0, seed: int = 1) -> np.ndarray:

@@ -9,8 +9,8 @@ from light_scenes import psnr, shiny_ball
 
 from octasplat.engine.colour import linear_to_srgb
 from octasplat.engine.files.gaussian_ply import write_gaussian_ply
-from octasplat.engine.render.environment_map import write_environment
-from octasplat.engine.render.images import read_channels, read_image
+from octasplat.engine.render.environment_files import write_environment
+from octasplat.engine.render.image_files import read_channels, read_image
 from octasplat.workers.cli.main import cli
 
 SMALL = ("--turntable", "--frames", 2, "--width", 32, "--height", 24, "--threads", 2, "--samples", 16)
@@ -69,7 +69,7 @@ def test_several_environments_have_folders_and_a_film(scene, tmp_path):
     assert (tmp_path / "film.mp4").stat().st_size > 500
 
 
-def test_light_is_cut_off_where_asked(scene, tmp_path):
+def test_relight_clamp_limits_radiance(scene, tmp_path):
     """White metal in light of 0.5, or of what is left of it."""
     for most, left in ((0.2, 0.2), (3, 0.5)):
         done = relight(
@@ -82,7 +82,7 @@ def test_light_is_cut_off_where_asked(scene, tmp_path):
 
 
 @pytest.mark.parametrize(("by", "least"), [("split-sum", 60), ("path", 25)])
-def test_a_turned_environment_is_the_map_turned(scene, tmp_path, by, least):
+def test_relight_rotated_environment_equals_rotated_map(scene, tmp_path, by, least):
     for name, environment, turn in (("a", "turned.exr", 0), ("b", "sides.exr", 180), ("c", "sides.exr", 0)):
         done = relight(
             scene / "ball.ply", "--environment", scene / environment, "--rotate", turn, "-o", tmp_path / name,
@@ -104,7 +104,7 @@ def test_a_turned_environment_is_the_map_turned(scene, tmp_path, by, least):
         (("ball.ply", "white.hdr", "other/white.exr"), "two environments"),
     ],
 )
-def test_what_cannot_be_used_is_one_sentence(scene, tmp_path, arguments, told):
+def test_relight_unusable_input_is_refused(scene, tmp_path, arguments, told):
     (scene / "other").mkdir(exist_ok=True)
     write_environment(scene / "other" / "white.exr", np.full((16, 32, 3), 0.5, np.float32))
     (scene / "text.hdr").write_text("no picture")

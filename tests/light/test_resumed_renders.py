@@ -79,7 +79,7 @@ def stopped_by(
     return subprocess.CompletedProcess(command, process.returncode, out, err)
 
 
-def test_a_film_goes_on_after_a_kill(folder: Path) -> None:
+def test_killed_render_resumes_frames(folder: Path) -> None:
     frames = folder / "turn.mp4.frames"
     killed = stopped_by(signal.SIGKILL, folder, "turn.mp4", frames / "unfinished.jsonl")
     assert killed.returncode == -signal.SIGKILL and not (folder / "turn.mp4").exists()
@@ -119,7 +119,7 @@ def test_images_of_another_stage_are_not_mixed_in(
     assert sorted((tmp_path / "views").iterdir()) == before
 
 
-def test_ctrl_c_leaves_whole_images_and_they_are_not_rendered_again(
+def test_interrupted_render_resumes_from_complete_images(
     folder: Path, stopped: subprocess.CompletedProcess[str]
 ) -> None:
     views = folder / "views"

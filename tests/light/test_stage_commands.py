@@ -9,8 +9,8 @@ from light_scenes import table_with_a_box
 
 from octasplat.engine.files.gaussian_ply import write_gaussian_ply
 from octasplat.engine.gaussians.model import FlatGaussians
-from octasplat.engine.light.stage_file import read_stage
-from octasplat.engine.render.images import read_channels, read_image
+from octasplat.engine.pathtracing.stage.stage_file import read_stage
+from octasplat.engine.render.image_files import read_channels, read_image
 from octasplat.workers.cli.main import cli
 
 
@@ -29,7 +29,7 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
 SMALL = ("--turntable", "--frames", 2, "--width", 48, "--height", 36, "--threads", 2)
 
 
-def test_where_there_is_no_floor_the_ball_hangs_free(tmp_path: Path) -> None:
+def test_stage_init_without_floor_places_object_in_air(tmp_path: Path) -> None:
     x, y = np.meshgrid(*[np.linspace(-1, 1, 40, dtype=np.float32)] * 2)
     count = x.size  # a wall: the normals look along z, up is -y
     some = FlatGaussians(
@@ -46,7 +46,7 @@ def test_where_there_is_no_floor_the_ball_hangs_free(tmp_path: Path) -> None:
     assert read_stage(stage).meshes[0].shape == "sphere"
 
 
-def test_the_first_stage_stands_on_the_table_and_is_rendered(scene: Path, tmp_path: Path) -> None:
+def test_stage_init_object_stands_on_surface_and_renders(scene: Path, tmp_path: Path) -> None:
     stage = tmp_path / "stage.toml"
     done = octasplat("stage", "init", scene, "-o", stage)
     assert done.exit_code == 0 and "up is" in done.output, done.output
@@ -68,7 +68,7 @@ def test_the_first_stage_stands_on_the_table_and_is_rendered(scene: Path, tmp_pa
     assert 0.01 < (np.abs(pictures[0] - pictures[1]).max(axis=2) > 0.05).mean() < 0.6
 
 
-def test_a_thing_rests_where_a_ray_meets_the_scene(scene: Path, tmp_path: Path) -> None:
+def test_stage_object_rests_on_surface(scene: Path, tmp_path: Path) -> None:
     stage = tmp_path / "stage.toml"
     stage.write_text(
         "[[gaussians]]\nlight = 'emissive'\n[[meshes]]\nshape = 'cube'\nscale = 0.1\n"
@@ -99,7 +99,7 @@ def test_a_thing_rests_where_a_ray_meets_the_scene(scene: Path, tmp_path: Path) 
         ("[[meshes]]\nshape = 'cube'\non = { view = 'a.jpg', pixel = [1, 1] }", "has no photographs"),
     ],
 )
-def test_a_bad_stage_is_one_sentence_and_nothing_is_rendered(
+def test_invalid_stage_is_refused_before_rendering(
     scene: Path, tmp_path: Path, text: str, words: str
 ) -> None:
     (tmp_path / "leaf.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")

@@ -9,13 +9,24 @@ import pytest
 
 from octasplat.engine.errors import ConfigError
 from octasplat.engine.files import read_mesh
-from octasplat.engine.light.stage import Glass, MetallicRoughness, PointLight, RectangleLight, Stage
-from octasplat.engine.light.stage_file import StageFacts, parse_stage, read_stage, write_first_stage
+from octasplat.engine.pathtracing.stage.model import (
+    Glass,
+    MetallicRoughness,
+    PointLight,
+    RectangleLight,
+    Stage,
+)
+from octasplat.engine.pathtracing.stage.stage_file import (
+    StageLayout,
+    parse_stage,
+    read_stage,
+    write_stage_template,
+)
 
 BALL = '[[meshes]]\nshape = "sphere"\n'
 
 
-def test_a_stage_is_read_with_everything_in_it(tmp_path: Path) -> None:
+def test_stage_file_with_all_keys_is_read(tmp_path: Path) -> None:
     for name in ("a.glb", "b.png", "c.hdr", "d.ply"):
         (tmp_path / name).write_bytes(b"?")
     (tmp_path / "stage.toml").write_text(
@@ -79,13 +90,13 @@ def test_a_stage_is_read_with_everything_in_it(tmp_path: Path) -> None:
         ("[[gaussians]]\nscale = [1, 2, 3]", "one scale"),
     ],
 )
-def test_what_is_wrong_is_said_in_one_sentence_with_its_key(text: str, words: str) -> None:
+def test_stage_file_error_names_key(text: str, words: str) -> None:
     with pytest.raises(ConfigError, match=words) as caught:
         parse_stage(text, "my.toml")
     assert str(caught.value).startswith("my.toml: ") and "\n" not in str(caught.value)
 
 
-def test_a_million_lights_are_refused() -> None:
+def test_stage_file_too_many_lights_is_refused() -> None:
     light = '[[lights]]\nkind = "point"\nposition = [0, 0, 0]\nintensity = 1\n'
     with pytest.raises(ConfigError, match=r"my\.toml: lights: .*at most 1000"):
         parse_stage(light * 1001, "my.toml")
@@ -108,7 +119,7 @@ def test_missing_files_are_named(tmp_path: Path) -> None:
 
 def test_the_first_stage_can_be_read_and_so_can_all_that_it_suggests(tmp_path: Path) -> None:
     path = tmp_path / "stage.toml"
-    write_first_stage(path, StageFacts((0, -1, 0), (0, 0.5, 0), 2.0, (0.6, 0.8, 0)))
+    write_stage_template(path, StageLayout((0, -1, 0), (0, 0.5, 0), 2.0, (0.6, 0.8, 0)))
     stage = read_stage(path)
     assert stage.meshes[0].position == (0.0, 0.26, 0.0)
     assert isinstance(stage.meshes[0].material, Glass)
@@ -129,7 +140,7 @@ def test_the_first_stage_can_be_read_and_so_can_all_that_it_suggests(tmp_path: P
 
 
 def test_reading_stages_needs_neither_torch_nor_numba() -> None:
-    code = "import octasplat.engine.light.stage_file, sys; assert not {'torch', 'numba'} & set(sys.modules)"
+    code = "import octasplat.engine.pathtracing.stage.stage_file, sys; assert not {'torch', 'numba'} & set(sys.modules)"
     subprocess.run([sys.executable, "-c", code], check=True)
 
 
@@ -144,5 +155,5 @@ def test_the_examples_are_stages(tmp_path: Path) -> None:
     subprocess.run([sys.executable, "vase.py"], cwd=tmp_path, check=True)
     stages = [read_stage(path) for path in sorted(tmp_path.glob("*.toml"))]
     assert [stage.gaussians[0].light for stage in stages] == ["shadowed", "emissive", "relit", "shadowed"]
-    vase = read_mesh(tmp_path / "vase.obj", looks=True)
+    vase = read_mesh(tmp_path / "vase.obj", with_materials=True)
     assert vase.materials[0].texture is not None and vase.corner_uv is not None

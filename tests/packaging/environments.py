@@ -41,7 +41,7 @@ def copy_project(target: Path) -> Path:
     return target
 
 
-def build(project: Path, kind: str, target: Path) -> Path:
+def build_distribution(project: Path, kind: str, target: Path) -> Path:
     """Return a wheel or an sdist of a project, built without a network.
 
     Args:

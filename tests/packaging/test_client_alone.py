@@ -5,7 +5,15 @@ import tomllib
 from pathlib import Path
 
 import pytest
-from environments import ROOT, Environment, build, copy_project, empty_environment, link_packages, run
+from environments import (
+    ROOT,
+    Environment,
+    build_distribution,
+    copy_project,
+    empty_environment,
+    link_packages,
+    run,
+)
 
 PROJECT = tomllib.loads((ROOT / "packages" / "client" / "pyproject.toml").read_text())["project"]
 HEAVY = {"torch", "numba", "numpy", "fastapi", "scipy", "psycopg", "embreex", "pycolmap"}
@@ -48,7 +56,7 @@ def client(tmp_path_factory: pytest.TempPathFactory) -> Environment:
     environment = empty_environment(folder / "environment")
     linked = link_packages(environment, PROJECT["dependencies"])
     assert not linked & HEAVY
-    environment.install(build(project, "wheel", folder), cwd=folder)
+    environment.install(build_distribution(project, "wheel", folder), cwd=folder)
     assert {name for name in environment.own_files("octasplat_client") if "dist-info" not in name} == {
         "octasplat"
     }
@@ -81,10 +89,10 @@ def test_sdist_of_the_client_builds_the_same_wheel(tmp_path: Path) -> None:
     import zipfile
 
     project = copy_project(tmp_path / "project") / "packages" / "client"
-    wheel = build(project, "wheel", tmp_path / "first")
-    sdist = build(project, "sdist", tmp_path)
+    wheel = build_distribution(project, "wheel", tmp_path / "first")
+    sdist = build_distribution(project, "sdist", tmp_path)
     with tarfile.open(sdist) as archive:
         archive.extractall(tmp_path / "unpacked", filter="data")
     (unpacked,) = (tmp_path / "unpacked").iterdir()
-    again = build(unpacked, "wheel", tmp_path / "second")
+    again = build_distribution(unpacked, "wheel", tmp_path / "second")
     assert zipfile.ZipFile(wheel).namelist() == zipfile.ZipFile(again).namelist()

@@ -8,7 +8,7 @@ import pytest
 from environments import (
     ROOT,
     Environment,
-    build,
+    build_distribution,
     copy_project,
     empty_environment,
     foreign_wheel,
@@ -20,12 +20,12 @@ VERSION = re.search(r'^version = "(.*)"', (ROOT / "pyproject.toml").read_text(),
 CODE = """
 import sys
 sys.path.remove("")
-import engine, octasplat, octasplat.engine, octasplat.service.web, octasplat.workers.records, service, workers
+import engine, octasplat, octasplat.engine, octasplat.service.web, octasplat.workers.db, service, workers
 from pathlib import Path
 assert engine.OWNER == service.OWNER == workers.OWNER == "somebody else"
 web = Path(octasplat.service.web.__file__).parent
 assert (web / "templates" / "base.html").is_file() and (web / "static" / "viewer" / "page.js").is_file()
-assert list((Path(octasplat.workers.records.__file__).parent / "migrations").glob("*.sql"))
+assert list((Path(octasplat.workers.db.__file__).parent / "migrations").glob("*.sql"))
 print(Path(octasplat.__file__).parent)
 """
 
@@ -48,11 +48,11 @@ def elsewhere(tmp_path: Path) -> Path:
 
 
 def install_wheel(environment: Environment, project: Path) -> None:
-    environment.install(build(project, "wheel", project.parent / "wheels"), cwd=project)
+    environment.install(build_distribution(project, "wheel", project.parent / "wheels"), cwd=project)
 
 
 def install_sdist(environment: Environment, project: Path) -> None:
-    environment.install(build(project, "sdist", project.parent / "sdists"), cwd=project)
+    environment.install(build_distribution(project, "sdist", project.parent / "sdists"), cwd=project)
 
 
 def install_editable(environment: Environment, project: Path) -> None:

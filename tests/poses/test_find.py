@@ -18,9 +18,9 @@ from neighbouring_photographs import write_neighbours
 from octasplat.engine.errors import Cancelled, DatasetError, PosesCrashed
 from octasplat.engine.events import Event, StageFinished, StageProgress, StageStarted, Warned
 from octasplat.engine.poses import find_poses
-from octasplat.engine.poses.find import PosesConfig
-from octasplat.engine.poses.search import Search
-from octasplat.engine.render.images import write_png
+from octasplat.engine.poses.find_poses import PosesConfig
+from octasplat.engine.poses.search import PoseSearch
+from octasplat.engine.render.image_files import write_png
 
 pytestmark = pytest.mark.heavy
 
@@ -61,7 +61,7 @@ def aligned(found: np.ndarray, truth: np.ndarray) -> np.ndarray:
 def test_poses_are_those_of_the_cameras(taken: Photographs, tmp_path: Path) -> None:
     events: list[Event] = []
     model = tmp_path / "poses"
-    find_poses(taken.folder, model, threads=2, listener=events.append)
+    find_poses(taken.folder, model, threads=2, progress=events.append)
     assert [path.name for path in tmp_path.iterdir()] == ["poses"]
     found, truth = centres(model), taken.centres_world
     assert len(found) >= 0.8 * len(truth) and found.keys() <= truth.keys()
@@ -83,11 +83,11 @@ def test_poses_are_those_of_the_cameras(taken: Photographs, tmp_path: Path) -> N
     assert (record["placed"], record["photographs"]) == (len(found), COUNT)
     assert set(record["left_out"]) == truth.keys() - found.keys()
     events.clear()
-    find_poses(taken.folder, model, listener=events.append)
+    find_poses(taken.folder, model, progress=events.append)
     assert events == []
 
 
-def test_photographs_of_nothing_are_refused(tmp_path: Path) -> None:
+def test_find_poses_without_features_is_refused(tmp_path: Path) -> None:
     images = tmp_path / "images"
     rng = np.random.default_rng(3)
     for number in range(4):
@@ -103,7 +103,7 @@ def test_too_few_photographs_are_refused(tmp_path: Path) -> None:
         find_poses(tmp_path / "images", tmp_path / "out")
 
 
-def test_most_photographs_must_be_placed(taken: Photographs, tmp_path: Path) -> None:
+def test_find_poses_too_few_registered_is_refused(taken: Photographs, tmp_path: Path) -> None:
     images = tmp_path / "images"
     images.mkdir()
     for path in sorted((taken.folder).iterdir())[:7]:
@@ -115,7 +115,7 @@ def test_most_photographs_must_be_placed(taken: Photographs, tmp_path: Path) -> 
         find_poses(images, tmp_path / "out", config=PosesConfig(min_share=1.0), threads=2)
 
 
-def test_stops_when_asked(taken: Photographs, tmp_path: Path) -> None:
+def test_find_poses_should_stop_cancels(taken: Photographs, tmp_path: Path) -> None:
     asked = iter(range(1000))
     with pytest.raises(Cancelled):
         find_poses(taken.folder, tmp_path / "out", threads=1, should_stop=lambda: next(asked) >= 1)
@@ -178,10 +178,10 @@ def test_a_file_that_cannot_be_read_takes_no_number_of_another(
     assert names.index(bad) == place
     (tmp_path / "work").mkdir()
     events: list[Event] = []
-    search = Search(images, names, tmp_path / "work", PosesConfig(), 1, events.append)
+    search = PoseSearch(images, names, tmp_path / "work", PosesConfig(), 1, events.append)
     (warning,) = (event.message for event in events if isinstance(event, Warned))
     assert warning.startswith("1 of 4 photographs cannot be read") and bad in warning
-    assert search.numbered == ("0b.png", "1b.png", "2b.png")
+    assert search.numbered_names == ("0b.png", "1b.png", "2b.png")
 
 
 def test_poses_go_to_the_photographs_they_are_of(taken: Photographs, tmp_path: Path) -> None:
@@ -202,16 +202,16 @@ def test_poses_go_to_the_photographs_they_are_of(taken: Photographs, tmp_path: P
     assert record["photographs"] == COUNT + 3 and len(record["left_out"]) == COUNT + 3 - len(found)
 
 
-def test_death_of_colmap_is_told(taken: Photographs, tmp_path: Path) -> None:
+def test_find_poses_colmap_crash_is_reported(taken: Photographs, tmp_path: Path) -> None:
     def kill(event: Event) -> None:
         if isinstance(event, StageStarted) and event.stage == "features":
             (child,) = psutil.Process().children()
             child.send_signal(signal.SIGSEGV)
 
     with pytest.raises(PosesCrashed, match=r"SIGSEGV while looking for features.*run the same command again"):
-        find_poses(taken.folder, tmp_path / "poses", threads=1, listener=kill)
+        find_poses(taken.folder, tmp_path / "poses", threads=1, progress=kill)
     assert list(tmp_path.iterdir()) == []
 
 
-def test_settings_are_json() -> None:
+def test_poses_config_round_trips_json() -> None:
     assert PosesConfig.model_validate(json.loads(PosesConfig().model_dump_json())) == PosesConfig()

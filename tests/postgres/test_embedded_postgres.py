@@ -13,12 +13,12 @@ import psycopg
 import pytest
 from psycopg.conninfo import conninfo_to_dict, make_conninfo
 
+from octasplat.workers.db.errors import DatabaseError
 from octasplat.workers.postgres import embedded
 from octasplat.workers.postgres.binaries import PostgresBinaries, find_binaries
 from octasplat.workers.postgres.embedded import EmbeddedPostgres, sync_file_system
 from octasplat.workers.postgres.server_user import server_user
-from octasplat.workers.records.errors import DatabaseError
-from octasplat.workers.serve.machine import Plan, connections_needed
+from octasplat.workers.serve.local_service import ServeOptions, connections_needed
 from octasplat.workers.settings import WorkerSettings
 
 
@@ -40,7 +40,7 @@ def pid_of(server: EmbeddedPostgres) -> int:
     return int((server.cluster / "postmaster.pid").read_text().split()[0])
 
 
-def test_starts_stops_and_keeps_its_data(server: EmbeddedPostgres) -> None:
+def test_postgres_restart_keeps_data(server: EmbeddedPostgres) -> None:
     assert not server.is_running()
     with pytest.raises(DatabaseError, match="octasplat serve"):
         server.conninfo()
@@ -55,7 +55,7 @@ def test_starts_stops_and_keeps_its_data(server: EmbeddedPostgres) -> None:
     server.stop()
 
 
-def test_nobody_else_gets_in(server: EmbeddedPostgres) -> None:
+def test_postgres_rejects_other_users(server: EmbeddedPostgres) -> None:
     conninfo = server.start()
     assert answer(conninfo, "SHOW listen_addresses") == ""
     folders = (server.cluster, server.home / "run")
@@ -70,7 +70,7 @@ def test_nobody_else_gets_in(server: EmbeddedPostgres) -> None:
         assert server.cluster.stat().st_uid == server_user().uid != 0
 
 
-def test_killed_server_leaves_a_stale_pid_file(server: EmbeddedPostgres) -> None:
+def test_postgres_stale_pid_file_is_removed(server: EmbeddedPostgres) -> None:
     """Also where the number belongs to another process by now, as after a reboot."""
     server.start()
     with psycopg.connect(server.conninfo()) as connection:
@@ -87,7 +87,7 @@ def test_killed_server_leaves_a_stale_pid_file(server: EmbeddedPostgres) -> None
         other.wait()
 
 
-def test_server_outlives_its_parent_and_is_taken_over(server: EmbeddedPostgres) -> None:
+def test_postgres_running_server_is_reused(server: EmbeddedPostgres) -> None:
     code = "from pathlib import Path; " \
            "from octasplat.workers.postgres.embedded import EmbeddedPostgres as E; " \
            f"E(Path({str(server.data)!r})).start()"  # fmt: skip
@@ -121,7 +121,7 @@ def test_socket_path_that_is_too_long_goes_elsewhere(short_root: Path) -> None:
         server.stop()
 
 
-def test_other_version_is_refused_and_nothing_deleted(server: EmbeddedPostgres) -> None:
+def test_postgres_other_version_is_refused_without_deletion(server: EmbeddedPostgres) -> None:
     server.start()
     server.stop()
     version = server.cluster / "PG_VERSION"
@@ -152,7 +152,7 @@ def test_half_made_database_is_made_again(server: EmbeddedPostgres) -> None:
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root runs the server as somebody else")
-def test_root_is_told_of_a_folder_that_shuts_the_server_out(tmp_path: Path) -> None:
+def test_postgres_unreachable_folder_as_root_is_refused(tmp_path: Path) -> None:
     tmp_path.chmod(0o700)
     with pytest.raises(DatabaseError, match=r"cannot pass through.*--data"):
         EmbeddedPostgres(tmp_path / "data").start()
@@ -185,7 +185,7 @@ def test_binaries_out_of_the_servers_reach_are_copied(
         server.stop()
 
 
-def test_a_new_cluster_is_on_the_disk_before_it_takes_its_place(
+def test_postgres_new_cluster_is_synced_before_rename(
     server: EmbeddedPostgres, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     synced = []
@@ -201,7 +201,7 @@ def test_a_new_cluster_is_on_the_disk_before_it_takes_its_place(
 
 
 def test_the_log_does_not_grow_for_ever(server: EmbeddedPostgres, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(embedded, "LOG_BYTES", 20_000)
+    monkeypatch.setattr(embedded, "MAX_LOG_BYTES", 20_000)
     conninfo = server.start()
     log = server.home / "log"
     with psycopg.connect(conninfo, autocommit=True) as connection:
@@ -218,8 +218,8 @@ def test_the_log_does_not_grow_for_ever(server: EmbeddedPostgres, monkeypatch: p
 
 
 def test_connections_grow_with_the_jobs_at_once(short_root: Path) -> None:
-    def plan(**queues: int) -> Plan:
-        return Plan(WorkerSettings(data=short_root / "many"), None, None, queues)
+    def plan(**queues: int) -> ServeOptions:
+        return ServeOptions(WorkerSettings(data=short_root / "many"), None, None, queues)
 
     assert connections_needed(plan(cpu=1)) == 100
     needed = connections_needed(plan(cpu=60))
@@ -242,7 +242,7 @@ def test_the_data_folder_may_have_any_name(short_root: Path, name: str) -> None:
     assert not server.is_running()
 
 
-def test_the_socket_is_found_whatever_the_environment_says(
+def test_postgres_socket_is_independent_of_environment(
     short_root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     server = EmbeddedPostgres(short_root / ("l" * 90))
@@ -256,7 +256,7 @@ def test_the_socket_is_found_whatever_the_environment_says(
         server.stop()
 
 
-def test_a_server_that_an_earlier_version_started_is_found(
+def test_postgres_server_of_earlier_version_is_reused(
     short_root: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """It put its socket where the environment said."""

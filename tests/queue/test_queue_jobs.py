@@ -8,7 +8,11 @@ from typing import Any
 import psycopg
 import pytest
 
-from octasplat.workers.queue.attempts import Attempt, Fenced, Result, claim
+from octasplat.workers.db.connections import Connection, Pool, open_pool
+from octasplat.workers.db.errors import ConflictError, NotFoundError
+from octasplat.workers.db.ids import new_id
+from octasplat.workers.db.rows import Job
+from octasplat.workers.queue.attempts import Attempt, FencedError, ResultFile, claim
 from octasplat.workers.queue.jobs import (
     NewJob,
     artifacts_of,
@@ -20,16 +24,12 @@ from octasplat.workers.queue.jobs import (
     queue_position,
     retry_job,
 )
-from octasplat.workers.queue.port import Slips
-from octasplat.workers.queue.procrastinate_slips import ProcrastinateSlips
-from octasplat.workers.queue.rescue import Suspects, rescue_lost_jobs
-from octasplat.workers.records.database import Connection, Pool, open_pool
-from octasplat.workers.records.errors import Conflict, Missing
-from octasplat.workers.records.ids import new_id
-from octasplat.workers.records.rows import Job
+from octasplat.workers.queue.procrastinate_queue import ProcrastinateQueue
+from octasplat.workers.queue.protocol import JobQueue
+from octasplat.workers.queue.recovery import StalledAttempts, recover_stalled_jobs
 
 NEW = NewJob(owner="me", kind="toy", options={}, queue="cpu")
-SLIPS = ProcrastinateSlips(stale_seconds=5)
+SLIPS = ProcrastinateQueue(stale_seconds=5)
 
 
 def run(conninfo: str, what: Callable[[Pool], Awaitable[Any]]) -> Any:
@@ -63,7 +63,7 @@ async def fetched(pool: Pool, job_id: uuid.UUID) -> Job:
     return job
 
 
-def test_rolled_back_transaction_leaves_neither_job_nor_slip(conninfo: str) -> None:
+def test_create_job_rolled_back_leaves_no_rows(conninfo: str) -> None:
     class Regret(Exception):
         pass
 
@@ -84,13 +84,13 @@ def test_rolled_back_transaction_leaves_neither_job_nor_slip(conninfo: str) -> N
     assert (count(conninfo, "jobs"), count(conninfo, "procrastinate_jobs")) == (1, 1)
 
 
-def test_slip_of_another_time_starts_nothing(conninfo: str) -> None:
+def test_claim_with_stale_entry_returns_none(conninfo: str) -> None:
     async def what(pool: Pool) -> None:
         attempt = await claimed(pool)
         slip = attempt.job.slip
         assert slip is not None
         assert await claim(pool, attempt.job.id, slip, "other") is None
-        await attempt.hand_back(SLIPS, "test")
+        await attempt.requeue(SLIPS, "test")
         assert await claim(pool, attempt.job.id, slip, "other") is None
         again = await fetched(pool, attempt.job.id)
         assert again.slip is not None and again.slip != slip and again.state == "queued"
@@ -101,33 +101,33 @@ def test_slip_of_another_time_starts_nothing(conninfo: str) -> None:
     run(conninfo, what)
 
 
-def test_ghost_can_write_nothing(conninfo: str) -> None:
+def test_fenced_attempt_cannot_write(conninfo: str) -> None:
     async def what(pool: Pool) -> None:
         ghost = await claimed(pool)
-        await ghost.hand_back(SLIPS, "test")
+        await ghost.requeue(SLIPS, "test")
         job = await fetched(pool, ghost.job.id)
         assert job.slip is not None
         attempt = await claim(pool, job.id, job.slip, "second")
         assert attempt is not None
         for write in (
-            lambda: ghost.beat(),
-            lambda: ghost.look(),
-            lambda: ghost.tell("x", {}),
-            lambda: ghost.log(["x"]),
-            lambda: ghost.progress(stage="train", step=1, total_steps=2),
-            lambda: ghost.keep_checkpoint({"stage": "train", "step": 9}, advances=True),
-            lambda: ghost.keep_preview({"sha256": "x"}),
-            lambda: ghost.succeed([Result("a", "b" * 64, 1, "text/plain")]),
+            lambda: ghost.heartbeat(),
+            lambda: ghost.read_state(),
+            lambda: ghost.add_event("x", {}),
+            lambda: ghost.add_log_lines(["x"]),
+            lambda: ghost.set_progress(stage="train", step=1, total_steps=2),
+            lambda: ghost.record_checkpoint({"stage": "train", "step": 9}, is_progress=True),
+            lambda: ghost.record_preview({"sha256": "x"}),
+            lambda: ghost.succeed([ResultFile("a", "b" * 64, 1, "text/plain")]),
             lambda: ghost.fail({"type": "x", "message": "x"}),
             lambda: ghost.cancel(),
-            lambda: ghost.hand_back(SLIPS, "x"),
-            lambda: ghost.lose(SLIPS, {"type": "x", "message": "x"}),
+            lambda: ghost.requeue(SLIPS, "x"),
+            lambda: ghost.requeue_lost(SLIPS, {"type": "x", "message": "x"}),
         ):
-            with pytest.raises(Fenced):
+            with pytest.raises(FencedError):
                 await write()
         assert (await fetched(pool, job.id)).state == "running"
-        await attempt.succeed([Result("a", "b" * 64, 1, "text/plain")])
-        with pytest.raises(Fenced):
+        await attempt.succeed([ResultFile("a", "b" * 64, 1, "text/plain")])
+        with pytest.raises(FencedError):
             await attempt.fail({"type": "x", "message": "x"})
         async with pool.connection() as connection:
             assert [artifact.name for artifact in await artifacts_of(connection, job.id)] == ["a"]
@@ -140,14 +140,14 @@ def test_lost_jobs_are_rescued_three_times_then_failed(conninfo: str) -> None:
         attempt = await claimed(pool)
         job_id = attempt.job.id
         for rescues in (1, 2, 3):
-            assert await rescue_lost_jobs(pool, SLIPS, 5, Suspects(0.0)) == 0  # still fresh
+            assert await recover_stalled_jobs(pool, SLIPS, 5, StalledAttempts(0.0)) == 0  # still fresh
             await make_old(pool, job_id)
-            assert await rescue_lost_jobs(pool, SLIPS, 5, Suspects(0.0)) == 1
+            assert await recover_stalled_jobs(pool, SLIPS, 5, StalledAttempts(0.0)) == 1
             job = await fetched(pool, job_id)
             assert (job.state, job.rescues) == ("queued", rescues) and job.slip is not None
             assert await claim(pool, job_id, job.slip, "w") is not None
         await make_old(pool, job_id)
-        await rescue_lost_jobs(pool, SLIPS, 5, Suspects(0.0))
+        await recover_stalled_jobs(pool, SLIPS, 5, StalledAttempts(0.0))
         job = await fetched(pool, job_id)
         assert job.state == "failed" and job.error is not None and "4 times" in job.error["message"]
         assert job.slip is None
@@ -160,14 +160,14 @@ def test_new_checkpoint_forgives_lost_workers(conninfo: str) -> None:
     async def what(pool: Pool) -> None:
         attempt = await claimed(pool)
         await make_old(pool, attempt.job.id)
-        await rescue_lost_jobs(pool, SLIPS, 5, Suspects(0.0))
+        await recover_stalled_jobs(pool, SLIPS, 5, StalledAttempts(0.0))
         job = await fetched(pool, attempt.job.id)
         assert job.rescues == 1 and job.slip is not None
         second = await claim(pool, job.id, job.slip, "w")
         assert second is not None
-        await second.keep_checkpoint({"stage": "train", "step": 5}, advances=False)
+        await second.record_checkpoint({"stage": "train", "step": 5}, is_progress=False)
         assert (await fetched(pool, job.id)).rescues == 1
-        await second.keep_checkpoint({"stage": "train", "step": 6}, advances=True)
+        await second.record_checkpoint({"stage": "train", "step": 6}, is_progress=True)
         assert (await fetched(pool, job.id)).rescues == 0
 
     run(conninfo, what)
@@ -179,13 +179,13 @@ def test_lost_job_that_was_to_be_cancelled_is_cancelled(conninfo: str) -> None:
         async with pool.connection() as connection:
             await cancel_job(connection, SLIPS, attempt.job.id)
         await make_old(pool, attempt.job.id)
-        await rescue_lost_jobs(pool, SLIPS, 5, Suspects(0.0))
+        await recover_stalled_jobs(pool, SLIPS, 5, StalledAttempts(0.0))
         assert (await fetched(pool, attempt.job.id)).state == "canceled"
 
     run(conninfo, what)
 
 
-def test_queued_job_without_a_living_slip_gets_one(conninfo: str) -> None:
+def test_queued_job_without_entry_is_requeued(conninfo: str) -> None:
     async def what(pool: Pool) -> None:
         async with pool.connection() as connection:
             gone, stuck, fine = [await create_job(connection, SLIPS, NEW) for _ in range(3)]
@@ -195,7 +195,7 @@ def test_queued_job_without_a_living_slip_gets_one(conninfo: str) -> None:
             await connection.execute(
                 "UPDATE procrastinate_jobs SET status = 'doing' WHERE id = %s", [stuck.slip]
             )
-        await rescue_lost_jobs(pool, SLIPS, 5, Suspects(0.0))
+        await recover_stalled_jobs(pool, SLIPS, 5, StalledAttempts(0.0))
         after = [await fetched(pool, job.id) for job in (gone, stuck, fine)]
         assert [job.state for job in after] == ["queued"] * 3
         assert after[0].slip != gone.slip and after[1].slip != stuck.slip and after[2].slip == fine.slip
@@ -204,21 +204,21 @@ def test_queued_job_without_a_living_slip_gets_one(conninfo: str) -> None:
     assert count(conninfo, "procrastinate_jobs") == 3
 
 
-def test_what_is_over_stays_so(conninfo: str) -> None:
+def test_finished_job_state_changes_are_refused(conninfo: str) -> None:
     async def what(pool: Pool) -> None:
         attempt = await claimed(pool)
         await attempt.succeed([])
         async with pool.connection() as connection:
-            with pytest.raises(Conflict, match="succeeded"):
+            with pytest.raises(ConflictError, match="succeeded"):
                 await cancel_job(connection, SLIPS, attempt.job.id)
-            with pytest.raises(Conflict, match="succeeded"):
-                await retry_job(connection, SLIPS, attempt.job.id, fresh=False)
+            with pytest.raises(ConflictError, match="succeeded"):
+                await retry_job(connection, SLIPS, attempt.job.id, from_start=False)
             running = await claimed(pool)
-            with pytest.raises(Conflict, match="cancel it first"):
+            with pytest.raises(ConflictError, match="cancel it first"):
                 await delete_job(connection, running.job.id)
             await delete_job(connection, attempt.job.id)
             assert await get_job(connection, attempt.job.id) is None
-            with pytest.raises(Missing):
+            with pytest.raises(NotFoundError):
                 await cancel_job(connection, SLIPS, attempt.job.id)
 
     run(conninfo, what)
@@ -253,8 +253,8 @@ def test_ids_sort_by_time() -> None:
     assert ids == sorted(ids, key=lambda i: i.int >> 64)
 
 
-def test_port_is_kept() -> None:
-    assert isinstance(SLIPS, Slips)
+def test_procrastinate_queue_implements_protocol() -> None:
+    assert isinstance(SLIPS, JobQueue)
 
 
 async def make_old(pool: Pool, job_id: uuid.UUID) -> None:

@@ -5,7 +5,7 @@ import numpy as np
 import pycolmap
 import pytest
 
-from octasplat.engine.scene import Dataset, load_scene
+from octasplat.engine.dataset import Dataset, load_dataset_model
 
 SCENES = os.environ.get("OCTASPLAT_SCENES")
 
@@ -28,7 +28,7 @@ def test_sparse_points_have_the_colours_of_the_photographs(root, tmp_path):
     """Where structure from motion saw a point, its colour is found, which proves frames, rays and pixels."""
     data = Dataset.open(root, tmp_path / "cache", max_side=200)
     assert len(data.points) > 0
-    model = pycolmap.Reconstruction(str(load_scene(root).model_folder))
+    model = pycolmap.Reconstruction(str(load_dataset_model(root).model_folder))
     seen_by = {image.name: image for image in model.images.values()}
     differences: list[np.ndarray] = []
     misses_px: list[np.ndarray] = []

@@ -10,10 +10,16 @@ from pathlib import Path
 import psycopg
 import pytest
 
+from octasplat.workers.db.errors import DatabaseError
+from octasplat.workers.db.migrate import (
+    all_migrations,
+    migrate,
+    missing_migrations,
+    queue_migrations,
+    wait_for_tables,
+)
 from octasplat.workers.postgres.embedded import EmbeddedPostgres
-from octasplat.workers.records.errors import DatabaseError
-from octasplat.workers.records.migrate import all_steps, migrate, missing_steps, queue_steps, wait_for_tables
-from postgres_for_tests import copied_database
+from postgres_fixtures import copied_database
 
 ROOT = Path(__file__).parents[2]
 
@@ -39,12 +45,12 @@ def shape(conninfo: str) -> set[tuple[str, ...]]:
     return {tuple(map(str, row)) for row in (*columns, *functions, *indexes)}
 
 
-def test_second_time_nothing_is_left_to_do(empty: str) -> None:
+def test_migrate_twice_applies_nothing(empty: str) -> None:
     assert "0001_jobs.sql" in migrate(empty)
     assert migrate(empty) == ()
     with psycopg.connect(empty) as connection:
         rows = connection.execute("SELECT component, name FROM schema_steps").fetchall()
-    assert missing_steps({(str(a), str(b)) for a, b in rows}) == []
+    assert missing_migrations({(str(a), str(b)) for a, b in rows}) == []
 
 
 def test_starts_at_once_apply_every_step_once(empty: str) -> None:
@@ -59,7 +65,7 @@ def test_starts_at_once_apply_every_step_once(empty: str) -> None:
 
 def test_database_of_an_earlier_queue_ends_the_same(empty: str, conninfo: str) -> None:
     """All but the last steps of the queue's library, as an earlier pin had left them, then the rest."""
-    steps = queue_steps()
+    steps = queue_migrations()
     with psycopg.connect(empty, autocommit=True) as connection:
         connection.execute("CREATE TABLE schema_steps (component text, name text, applied_at timestamptz "
                            "NOT NULL DEFAULT now(), PRIMARY KEY (component, name))")  # fmt: skip
@@ -84,7 +90,7 @@ def test_newer_database_is_gone_on_with_if_it_says_so(empty: str) -> None:
     for use in (migrate, wait_for_tables):
         with pytest.raises(DatabaseError, match=r"newer version.*9999_future"):
             use(empty)
-    assert shape(empty) == before and reach[0] in {step.name for step in all_steps()}
+    assert shape(empty) == before and reach[0] in {step.name for step in all_migrations()}
 
 
 def test_workers_and_commands_that_read_leave_the_tables_alone(empty: str, tmp_path: Path) -> None:
@@ -110,5 +116,5 @@ def test_unreachable_database_is_one_sentence(tmp_path: Path) -> None:
 
 
 def test_steps_have_an_order() -> None:
-    names = [step.name for step in all_steps() if step.component == "octasplat"]
+    names = [step.name for step in all_migrations() if step.component == "octasplat"]
     assert names == sorted(names) and len(names) == len(set(names))

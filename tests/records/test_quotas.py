@@ -11,12 +11,12 @@ from psycopg.rows import dict_row
 from psycopg.types.json import Jsonb
 
 from octasplat.workers.cli.commands.quota import quota as quota_command
-from octasplat.workers.records.database import Connection, open_pool
-from octasplat.workers.records.datasets import create_dataset, put_file
-from octasplat.workers.records.locks import lock_owner
-from octasplat.workers.records.quotas import (
+from octasplat.workers.db.connections import Connection, open_pool
+from octasplat.workers.db.datasets import create_dataset, put_file
+from octasplat.workers.db.locks import lock_owner
+from octasplat.workers.db.quotas import (
     Quota,
-    QuotaExceeded,
+    QuotaExceededError,
     Usage,
     bytes_left,
     check_bytes,
@@ -69,7 +69,7 @@ def test_usage_counts_what_an_owner_has(conninfo: str) -> None:
     asyncio.run(check())
 
 
-def test_own_limits_go_before_those_of_the_settings(conninfo: str) -> None:
+def test_owner_quota_overrides_settings(conninfo: str) -> None:
     async def check() -> None:
         connection = await connect(conninfo)
         default = Quota(10, 20, 30)
@@ -77,16 +77,16 @@ def test_own_limits_go_before_those_of_the_settings(conninfo: str) -> None:
         await set_quota(connection, "me", Quota(max_datasets=5))
         await set_quota(connection, "me", Quota(max_jobs=0))
         assert await quota_of(connection, "me", default) == Quota(10, 20, 0)
-        with pytest.raises(QuotaExceeded) as caught:
+        with pytest.raises(QuotaExceededError) as caught:
             await check_new_job(connection, "me", default)
-        assert caught.value.of == "jobs"
+        assert caught.value.resource == "jobs"
         await check_new_job(connection, "other", default)
         await connection.close()
 
     asyncio.run(check())
 
 
-def test_of_many_at_once_only_the_allowed_get_through(conninfo: str) -> None:
+def test_concurrent_requests_respect_quota(conninfo: str) -> None:
     quota = Quota(max_bytes=1000, max_datasets=3)
 
     async def make_dataset(number: int) -> bool:
@@ -95,8 +95,8 @@ def test_of_many_at_once_only_the_allowed_get_through(conninfo: str) -> None:
             async with connection.transaction():
                 await check_new_dataset(connection, "me", quota)
                 await create_dataset(connection, "me", str(number))
-        except QuotaExceeded as error:
-            assert error.of == "datasets"
+        except QuotaExceededError as error:
+            assert error.resource == "datasets"
             return False
         finally:
             await connection.close()
@@ -108,8 +108,8 @@ def test_of_many_at_once_only_the_allowed_get_through(conninfo: str) -> None:
             async with connection.transaction():
                 await put_file(connection, dataset_id, f"images/{number}.jpg", f"{number:064x}", 300)
                 await check_bytes(connection, "me", quota)
-        except QuotaExceeded as error:
-            assert error.of == "bytes" and "1200 bytes of your 1000" in str(error)
+        except QuotaExceededError as error:
+            assert error.resource == "bytes" and "1200 bytes of your 1000" in str(error)
             return False
         finally:
             await connection.close()
@@ -129,7 +129,7 @@ def test_of_many_at_once_only_the_allowed_get_through(conninfo: str) -> None:
     asyncio.run(check())
 
 
-def test_the_command(conninfo: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_quota_command_shows_and_sets_limits(conninfo: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("DATABASE_URL", conninfo)
     run = CliRunner().invoke
     shown = run(quota_command, ["me"])
@@ -149,7 +149,7 @@ def test_the_pool_is_enough(conninfo: str) -> None:
     asyncio.run(check())
 
 
-def test_what_is_counted_is_what_there_is(conninfo: str) -> None:
+def test_usage_count_matches_distinct_contents(conninfo: str) -> None:
     """Whatever comes, is replaced and goes, in any order, the count is that of all distinct contents."""
     truth = """
         SELECT coalesce(sum(size_bytes), 0)::bigint AS n FROM (

@@ -2,14 +2,14 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from octasplat.engine.render.cameras import RenderCamera, focal_from_fov, fov_from_focal
+from octasplat.engine.render.pinhole_camera import PinholeCamera, focal_from_fov, fov_from_focal
 
 
 def camera(**changes):
     pose = np.eye(4)
     pose[:3, :3] = Rotation.from_euler("xyz", [20, -50, 130], degrees=True).as_matrix()
     pose[:3, 3] = [1, -2, 3]
-    return RenderCamera.from_pose(pose, 8, 6, **({"fy_px": 9.0} | changes))
+    return PinholeCamera.from_pose(pose, 8, 6, **({"fy_px": 9.0} | changes))
 
 
 def test_a_ray_projects_back_to_the_centre_of_its_pixel():
@@ -23,7 +23,7 @@ def test_a_ray_projects_back_to_the_centre_of_its_pixel():
 
 
 def test_an_unturned_camera_looks_along_z_with_y_down():
-    one = RenderCamera.from_pose(np.eye(4), 2, 2, fy_px=1.0)
+    one = PinholeCamera.from_pose(np.eye(4), 2, 2, fy_px=1.0)
     directions = one.rays().directions_world
     assert np.allclose(directions[0, 1] * np.sqrt(1.5), [0.5, -0.5, 1])
     assert np.allclose(one.project(np.array([[0.0, 0, 1]])), [[1, 1]])
@@ -32,7 +32,7 @@ def test_an_unturned_camera_looks_along_z_with_y_down():
 
 def test_the_pose_is_given_back():
     one = camera()
-    again = RenderCamera.from_pose(one.world_from_cam, 8, 6, fy_px=9.0)
+    again = PinholeCamera.from_pose(one.world_from_cam, 8, 6, fy_px=9.0)
     assert np.allclose(one.centre_world, [1, -2, 3])
     assert np.allclose(again.rotation_cam_from_world, one.rotation_cam_from_world)
     assert np.allclose(again.translation_cam_from_world, one.translation_cam_from_world)

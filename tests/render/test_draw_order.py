@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
-from octasplat.engine.render.draw_order import common_order
+from octasplat.engine.render.depth_order import shared_depth_order
 
 
 def test_points_on_a_line_are_ordered_from_far_to_near():
     points = np.array([[0, 0, 2.0], [0, 0, 5.0], [0, 0, 3.0]])
-    order, agreement = common_order(points, np.array([[0, 0, 0.0], [0.1, 0, 0]]))
+    order, agreement = shared_depth_order(points, np.array([[0, 0, 0.0], [0.1, 0, 0]]))
     assert order.tolist() == [1, 2, 0]
     assert agreement == pytest.approx(1.0)
 
@@ -16,13 +16,13 @@ def test_points_on_a_line_are_ordered_from_far_to_near():
 def test_the_majority_decides_and_opposite_viewers_do_not_agree():
     points = np.array([[0, 0, z] for z in (1.0, 2.0, 3.0, 4.0)])
     front, back = [0, 0, 0.0], [0, 0, 10.0]
-    order, _ = common_order(points, np.array([front, front, back]))
+    order, _ = shared_depth_order(points, np.array([front, front, back]))
     assert order.tolist() == [3, 2, 1, 0]
     ball = np.random.default_rng(0).standard_normal((500, 3))
     around = 9 * ball[:40] / np.linalg.norm(ball[:40], axis=1, keepdims=True)
-    assert abs(common_order(ball, around)[1]) < 0.3
+    assert abs(shared_depth_order(ball, around)[1]) < 0.3
 
 
-def test_nothing_is_in_order():
-    order, agreement = common_order(np.zeros((0, 3)), np.zeros((2, 3)))
+def test_draw_order_of_empty_scene_is_empty():
+    order, agreement = shared_depth_order(np.zeros((0, 3)), np.zeros((2, 3)))
     assert len(order) == 0 and agreement == 1.0

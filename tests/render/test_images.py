@@ -4,7 +4,7 @@ import pytest
 
 from octasplat.engine.colour import linear_to_srgb, srgb_to_linear, to_bytes
 from octasplat.engine.errors import DatasetError, OutputError
-from octasplat.engine.render import images
+from octasplat.engine.render import image_files
 
 
 @pytest.fixture
@@ -13,16 +13,16 @@ def picture():
 
 
 def test_a_png_keeps_display_values_to_8_bits(tmp_path, picture):
-    images.write_png(tmp_path / "a.png", picture)
-    again = images.read_image(tmp_path / "a.png")
+    image_files.write_png(tmp_path / "a.png", picture)
+    again = image_files.read_image(tmp_path / "a.png")
     assert np.array_equal(to_bytes(again), to_bytes(picture))
     assert [p.name for p in tmp_path.iterdir()] == ["a.png"]
 
 
 def test_a_png_keeps_straight_colours_under_any_alpha(tmp_path, picture):
     alpha = np.linspace(0, 1, 54, dtype=np.float32).reshape(6, 9)
-    images.write_png(tmp_path / "a.png", picture, alpha)
-    again = images.read_image(tmp_path / "a.png")
+    image_files.write_png(tmp_path / "a.png", picture, alpha)
+    again = image_files.read_image(tmp_path / "a.png")
     assert again.shape == (6, 9, 4)
     assert np.array_equal(to_bytes(again[..., :3]), to_bytes(picture))
     assert np.array_equal(to_bytes(again[..., 3]), to_bytes(alpha))
@@ -32,9 +32,9 @@ def test_an_exr_holds_linear_light_depth_alpha_and_normals(tmp_path, picture):
     rng = np.random.default_rng(2)
     alpha, depth = rng.random((6, 9), np.float32), rng.random((6, 9), np.float32) * 1e6
     normals = rng.normal(size=(6, 9, 3)).astype(np.float32)
-    layers = images.exr_layers(picture, alpha=alpha, depth=depth, normals_world=normals)
-    images.write_exr(tmp_path / "a.exr", layers)
-    again = images.read_channels(tmp_path / "a.exr")
+    layers = image_files.exr_layers(picture, alpha=alpha, depth=depth, normals_world=normals)
+    image_files.write_exr(tmp_path / "a.exr", layers)
+    again = image_files.read_channels(tmp_path / "a.exr")
     assert set(again) == {"R", "G", "B", "A", "Z", "N.x", "N.y", "N.z"}
     assert all(np.array_equal(again[name], layers[name]) for name in layers)
     rgb = np.stack([again[c] for c in "RGB"], axis=-1)
@@ -43,8 +43,8 @@ def test_an_exr_holds_linear_light_depth_alpha_and_normals(tmp_path, picture):
 
 def test_a_half_exr_keeps_depth_in_full(tmp_path, picture):
     depth = np.full((6, 9), 123456.789, np.float32)
-    images.write_exr(tmp_path / "a.exr", images.exr_layers(picture, depth=depth), half=True)
-    again = images.read_channels(tmp_path / "a.exr")
+    image_files.write_exr(tmp_path / "a.exr", image_files.exr_layers(picture, depth=depth), half=True)
+    again = image_files.read_channels(tmp_path / "a.exr")
     assert np.array_equal(again["Z"], depth)
     assert np.allclose(again["R"], srgb_to_linear(picture)[..., 0], rtol=1e-3)
     spec = oiio.ImageInput.open(str(tmp_path / "a.exr")).spec()
@@ -60,44 +60,46 @@ def test_the_srgb_curve_has_its_known_points():
 
 def test_shrinking_keeps_the_shape_and_the_mean_and_never_enlarges(picture):
     big = np.repeat(np.repeat(picture, 20, axis=0), 20, axis=1)
-    small = images.resized(big, 90)
+    small = image_files.shrink_to(big, 90)
     assert small.shape == (60, 90, 3)
     assert small.mean() == pytest.approx(big.mean(), abs=2e-3)
-    assert images.resized(big, 180) is big
+    assert image_files.shrink_to(big, 180) is big
 
 
-def test_what_is_no_image_is_refused_by_name(tmp_path):
+def test_read_image_invalid_file_is_named(tmp_path):
     with pytest.raises(DatasetError, match=r"missing\.png"):
-        images.read_image(tmp_path / "missing.png")
+        image_files.read_image(tmp_path / "missing.png")
     (tmp_path / "text.png").write_text("no image")
     with pytest.raises(DatasetError, match=r"text\.png"):
-        images.read_image(tmp_path / "text.png")
+        image_files.read_image(tmp_path / "text.png")
 
 
 def test_a_damaged_image_is_refused_by_name(tmp_path, picture):
     path = tmp_path / "cut.png"
-    images.write_png(path, np.repeat(picture, 30, axis=0))
+    image_files.write_png(path, np.repeat(picture, 30, axis=0))
     path.write_bytes(path.read_bytes()[:400])
     with pytest.raises(DatasetError, match=r"cut\.png"):
-        images.read_image(path)
+        image_files.read_image(path)
 
 
 def test_an_unwritable_place_is_an_output_error(tmp_path, picture):
     (tmp_path / "file").write_text("")
     with pytest.raises(OutputError, match=r"a\.png"):
-        images.write_png(tmp_path / "file" / "a.png", picture)
+        image_files.write_png(tmp_path / "file" / "a.png", picture)
     with pytest.raises(OutputError, match="unknown"):
-        images.write_png(tmp_path / "a.unknown", picture)
+        image_files.write_png(tmp_path / "a.unknown", picture)
 
 
 def test_a_transparent_exr_holds_linear_colours_times_alpha():
     alpha = np.array([[0.0, 0.1, 0.5, 1.0]], np.float32)
     straight = np.full(1, 0.8, np.float32)
     display = np.repeat((alpha * straight)[..., None], 3, axis=-1)
-    layers = images.exr_layers(display, alpha=alpha, transparent=True)
+    layers = image_files.exr_layers(display, alpha=alpha, transparent=True)
     np.testing.assert_allclose(layers["R"], alpha * srgb_to_linear(straight), rtol=1e-5)
     np.testing.assert_array_equal(layers["A"], alpha)
-    opaque = images.exr_layers(display, alpha=alpha)  # over a black background that is part of the picture
+    opaque = image_files.exr_layers(
+        display, alpha=alpha
+    )  # over a black background that is part of the picture
     np.testing.assert_array_equal(opaque["R"], srgb_to_linear(display)[..., 0])
 
 
@@ -105,8 +107,8 @@ def test_a_radiance_picture_is_rounded_to_its_steps(tmp_path):
     random = np.random.default_rng(1)
     linear = np.exp(random.uniform(-6, 6, (32, 64, 3))).astype(np.float32)
     linear[0, 0] = 0
-    images.write_rgbe(tmp_path / "a.hdr", linear)
-    back = images.read_image(tmp_path / "a.hdr")[..., :3]
+    image_files.write_rgbe(tmp_path / "a.hdr", linear)
+    back = image_files.read_image(tmp_path / "a.hdr")[..., :3]
     step = np.ldexp(1.0, np.frexp(linear.max(axis=2, keepdims=True))[1] - 8)
     assert (np.abs(back - linear) <= 0.5 * step * 1.02).mean() > 0.99
     assert (np.abs(back - linear) <= step).all()

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from octasplat.engine.errors import ConfigError
-from octasplat.engine.render.cameras import RenderCamera
 from octasplat.engine.render.path_file import CameraPath, path_from_poses, read_camera_path, write_camera_path
-from octasplat.engine.render.paths import turntable
+from octasplat.engine.render.pinhole_camera import PinholeCamera
+from octasplat.engine.render.pose_paths import turntable
 
 
 @pytest.fixture
@@ -23,7 +23,7 @@ def content(**frame):
 
 def test_a_written_path_reads_back_the_same(path):
     poses = turntable(np.zeros(3), np.array([0.0, -1, 0]), 2.0, 0.5, 5)
-    like = RenderCamera.from_pose(np.eye(4), 64, 48, fy_px=50.0, fx_px=51.0, cx_px=30.0, cy_px=25.0)
+    like = PinholeCamera.from_pose(np.eye(4), 64, 48, fy_px=50.0, fx_px=51.0, cx_px=30.0, cy_px=25.0)
     written = path_from_poses(list(poses), like, 24.0)
     write_camera_path(path, written)
     again = read_camera_path(path)
@@ -59,7 +59,7 @@ def test_a_field_of_view_and_focal_lengths_both_do(path):
         ),
     ],
 )
-def test_a_fault_is_named_by_file_and_field(path, change, message):
+def test_camera_path_error_names_file_and_field(path, change, message):
     path.write_text(json.dumps(content(**change)))
     with pytest.raises(ConfigError, match=rf"path\.json.*{message}"):
         read_camera_path(path)
@@ -77,7 +77,7 @@ def test_a_file_that_is_missing_or_no_json_is_refused(path):
 
 
 def test_cameras_of_two_sizes_make_no_path(path):
-    cameras = tuple(RenderCamera.from_pose(np.eye(4), width, 5, fy_px=5.0) for width in (5, 6))
+    cameras = tuple(PinholeCamera.from_pose(np.eye(4), width, 5, fy_px=5.0) for width in (5, 6))
     with pytest.raises(ConfigError, match="one image size"):
         write_camera_path(path, CameraPath(30.0, cameras))
 

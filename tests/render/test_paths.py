@@ -3,8 +3,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from octasplat.engine.errors import ConfigError
-from octasplat.engine.render.cameras import RenderCamera
-from octasplat.engine.render.paths import PosePath, fit_turntable, interpolate, look_at, turntable
+from octasplat.engine.render.pinhole_camera import PinholeCamera
+from octasplat.engine.render.pose_paths import PosePath, fit_turntable, interpolate, look_at, turntable
 
 CENTRE, UP = np.array([1.0, -2.0, 0.5]), np.array([0.2, -3.0, 0.4])
 
@@ -29,7 +29,7 @@ def test_a_turntable_looks_at_its_centre_from_one_distance():
     poses = turntable(CENTRE, UP, 3.0, 1.5, 12)
     assert_rigid(poses)
     for pose in poses:
-        camera = RenderCamera.from_pose(pose, 40, 30, fy_px=35.0)
+        camera = PinholeCamera.from_pose(pose, 40, 30, fy_px=35.0)
         assert np.allclose(camera.project(CENTRE[None]), [[20, 15]], atol=1e-6)
         above = camera.project((CENTRE + 0.1 * UP)[None])[0]
         assert above[0] == pytest.approx(20, abs=1e-6) and above[1] < 15
@@ -54,19 +54,19 @@ def test_a_path_passes_through_its_key_poses(closed):
     times = path.key_times
     assert times[0] == 0 and times[-1] == 1 and (np.diff(times) > 0).all()
     expected = keys(5) if not closed else np.concatenate([keys(5), keys(5)[:1]])
-    assert np.allclose(path.at(times), expected, atol=1e-9)
-    assert_rigid(path.at(np.linspace(0.0, 1.0, 50)))
+    assert np.allclose(path.poses_at(times), expected, atol=1e-9)
+    assert_rigid(path.poses_at(np.linspace(0.0, 1.0, 50)))
 
 
 @pytest.mark.parametrize("closed", [False, True])
-def test_a_path_has_no_jumps_in_velocity(closed):
+def test_camera_path_velocity_is_continuous(closed):
     path = PosePath(keys(6), closed)
     step = 1e-6
     at = path.key_times[1:-1]
-    before, here, after = path.at(at - step), path.at(at), path.at(at + step)
+    before, here, after = path.poses_at(at - step), path.poses_at(at), path.poses_at(at + step)
     assert np.allclose(after - here, here - before, atol=1e-4 * step * 1e3)
     if closed:
-        ends = path.at(np.array([0.0, step, 1 - step, 1.0]))
+        ends = path.poses_at(np.array([0.0, step, 1 - step, 1.0]))
         assert np.allclose(ends[1] - ends[0], ends[3] - ends[2], atol=1e-3 * step * 1e3)
 
 
@@ -76,7 +76,7 @@ def test_an_open_path_starts_and_ends_at_its_keys():
     assert np.allclose(poses[[0, -1]], keys(4)[[0, -1]], atol=1e-9)
 
 
-def test_between_two_poses_the_path_is_straight_and_even():
+def test_camera_path_of_two_poses_is_linear():
     two = keys(2)
     middle = interpolate(two, 3)[1]
     assert np.allclose(middle[:3, 3], two[:, :3, 3].mean(axis=0))
@@ -124,7 +124,7 @@ def test_a_few_cameras_that_look_elsewhere_do_not_move_the_centre():
     assert fitted.centre_world == pytest.approx(CENTRE, abs=0.01)
 
 
-def test_what_makes_no_path_is_refused():
+def test_camera_path_invalid_keys_are_refused():
     flat = np.tile(np.array([0.0, 0, 1]), (4, 1))
     centres = np.random.default_rng(0).normal(size=(4, 3))
     with pytest.raises(ConfigError, match="same way"):

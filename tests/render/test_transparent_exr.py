@@ -10,13 +10,13 @@ import pytest
 
 from octasplat.engine.colour import linear_to_srgb, srgb_to_linear
 from octasplat.engine.gaussians.model import SH_C0, FlatGaussians
-from octasplat.engine.light.relighting import Relighter
-from octasplat.engine.light.relit_pictures import Lighting, RelitPaint
-from octasplat.engine.render.cameras import RenderCamera
-from octasplat.engine.render.images import read_channels
-from octasplat.engine.render.jobs import Shot, scene_paint
-from octasplat.engine.render.paths import look_at
-from octasplat.engine.trace.make import make_tracer
+from octasplat.engine.pathtracing.relighting.path_relighter import Relighter
+from octasplat.engine.pathtracing.relighting.relit_images import RelitRenderFn, ShotLighting
+from octasplat.engine.render.image_files import read_channels
+from octasplat.engine.render.pinhole_camera import PinholeCamera
+from octasplat.engine.render.pose_paths import look_at
+from octasplat.engine.render.shots import Shot, scene_render_fn
+from octasplat.engine.trace.factory import make_tracer
 from octasplat.engine.trace.protocol import TraceSettings
 
 RGB_SRGB = np.array([0.9, 0.5, 0.2], np.float32)
@@ -24,7 +24,7 @@ RGB_SRGB = np.array([0.9, 0.5, 0.2], np.float32)
 
 def shot() -> Shot:
     pose = look_at(np.array([0.0, 0, -3]), np.zeros(3), np.array([0.0, -1, 0]))
-    camera = RenderCamera.from_pose(pose, 24, 24, fy_px=24.0)
+    camera = PinholeCamera.from_pose(pose, 24, 24, fy_px=24.0)
     return Shot("a", camera.rays)
 
 
@@ -36,7 +36,7 @@ def assert_edges_have_the_colour(path: Path) -> None:
         np.testing.assert_allclose(layers[name][edge] / layers["A"][edge], value, rtol=2e-3)
 
 
-def test_rendered_edges(tmp_path: Path) -> None:
+def test_transparent_exr_edges_of_render_are_premultiplied(tmp_path: Path) -> None:
     disc = FlatGaussians(
         np.zeros((1, 3), np.float32),
         np.array([[np.sqrt(0.5), 0, -np.sqrt(0.5), 0]], np.float32),
@@ -46,7 +46,7 @@ def test_rendered_edges(tmp_path: Path) -> None:
     )
     tracer = make_tracer(TraceSettings(), threads=1)
     tracer.build(disc)
-    paint = scene_paint(tracer, np.zeros(3, np.float32), transparent=True)
+    paint = scene_render_fn(tracer, np.zeros(3, np.float32), transparent=True)
     paint(shot(), tmp_path / "a.exr", lambda _share: None)
     assert_edges_have_the_colour(tmp_path / "a.exr")
 
@@ -67,11 +67,13 @@ def relighter() -> Callable[[np.ndarray], Relighter]:
     return make
 
 
-def test_relit_edges(relighter: Callable[[np.ndarray], Relighter], tmp_path: Path) -> None:
+def test_transparent_exr_edges_of_relight_are_premultiplied(
+    relighter: Callable[[np.ndarray], Relighter], tmp_path: Path
+) -> None:
     coverage = np.linspace(0, 1, 24 * 24, dtype=np.float32).reshape(24, 24)
     one, grey = shot(), np.ones((4, 8, 3), np.float32)
-    paint = RelitPaint(
-        relighter(coverage), {"e": grey}, np.array([0.0, -1, 0]), "transparent", {one: Lighting("e", 0.0)}
+    paint = RelitRenderFn(
+        relighter(coverage), {"e": grey}, np.array([0.0, -1, 0]), "transparent", {one: ShotLighting("e", 0.0)}
     )
     paint(one, tmp_path / "a.exr", lambda _share: None)
     assert_edges_have_the_colour(tmp_path / "a.exr")

@@ -46,7 +46,7 @@ def test_odd_sizes_gain_a_line(tmp_path):
     assert np.abs(frames[0] - COLOURS[0]).max() < 0.03
 
 
-def test_a_failed_block_leaves_the_old_video_and_nothing_else(tmp_path):
+def test_video_writer_error_keeps_previous_file(tmp_path):
     path = tmp_path / "a.mp4"
     path.write_bytes(b"old")
     with pytest.raises(ZeroDivisionError), VideoWriter(path, fps=30.0, width=64, height=48) as video:
@@ -56,7 +56,7 @@ def test_a_failed_block_leaves_the_old_video_and_nothing_else(tmp_path):
     assert [p.name for p in tmp_path.iterdir()] == ["a.mp4"]
 
 
-def test_what_cannot_be_written_is_an_output_error(tmp_path):
+def test_video_writer_unwritable_path_raises_output_error(tmp_path):
     with pytest.raises(OutputError, match="no frames"), VideoWriter(tmp_path / "a.mp4", 30.0, 64, 48):
         pass
     with (

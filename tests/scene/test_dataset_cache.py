@@ -9,8 +9,8 @@ import pycolmap
 import pytest
 
 import octasplat
+from octasplat.engine.dataset import Dataset
 from octasplat.engine.errors import DatasetError, OutputError
-from octasplat.engine.scene import Dataset
 
 
 def stamps(folder: Path) -> dict[str, int]:
@@ -23,7 +23,7 @@ def opaque_fisheye() -> pycolmap.Camera:
     )
 
 
-def test_a_second_run_finds_the_cache(tmp_path, make_scene, save_image):
+def test_dataset_cache_is_reused(tmp_path, make_scene, save_image):
     root = make_scene(tmp_path / "scene", cameras=[opaque_fisheye()])
     save_image(root / "masks/view_0.png.png", np.full((24, 32), 255, np.uint8))
     first: list[tuple[int, int]] = []
@@ -40,7 +40,7 @@ def test_a_second_run_finds_the_cache(tmp_path, make_scene, save_image):
     ]
 
 
-def test_a_changed_photograph_is_read_anew(tmp_path, make_scene, save_image):
+def test_dataset_cache_changed_photograph_invalidates(tmp_path, make_scene, save_image):
     root = make_scene(tmp_path / "scene")
     before = Dataset.open(root, tmp_path / "cache")
     save_image(root / "images/view_1.png", np.full((24, 32, 3), 200, np.uint8))
@@ -50,7 +50,7 @@ def test_a_changed_photograph_is_read_anew(tmp_path, make_scene, save_image):
     assert np.rint(before.view_image(1)[0] * 255)[0, 0].tolist() == [0, 0, 1]
 
 
-def test_other_settings_and_masks_are_read_anew(tmp_path, make_scene, save_image):
+def test_dataset_cache_changed_settings_or_masks_invalidate(tmp_path, make_scene, save_image):
     root = make_scene(tmp_path / "scene")
     Dataset.open(root, tmp_path / "cache")
     small = Dataset.open(root, tmp_path / "cache", max_side=8)
@@ -63,7 +63,7 @@ def test_other_settings_and_masks_are_read_anew(tmp_path, make_scene, save_image
     assert not (tmp_path / "cache/mask.bin").exists()
 
 
-def test_another_camera_gets_other_rays(tmp_path, make_scene):
+def test_dataset_cache_changed_camera_gives_new_rays(tmp_path, make_scene):
     root = make_scene(tmp_path / "scene", cameras=[opaque_fisheye()])
     before = Dataset.open(root, tmp_path / "cache").view_rays(0).directions_world
     other = opaque_fisheye()
@@ -73,7 +73,7 @@ def test_another_camera_gets_other_rays(tmp_path, make_scene):
 
 
 @pytest.mark.parametrize("name", ["rgb.bin", "mask.bin", "pixels.json", "directions.bin", "directions.json"])
-def test_a_damaged_cache_is_made_anew(tmp_path, make_scene, save_image, name):
+def test_dataset_cache_damaged_is_rebuilt(tmp_path, make_scene, save_image, name):
     root = make_scene(tmp_path / "scene", cameras=[opaque_fisheye()])
     save_image(root / "masks/view_0.png.png", np.full((24, 32), 255, np.uint8))
     before = Dataset.open(root, tmp_path / "cache")
@@ -87,7 +87,7 @@ def test_a_damaged_cache_is_made_anew(tmp_path, make_scene, save_image, name):
     np.testing.assert_array_equal(after.view_rays(2).directions_world, expected[1].directions_world)
 
 
-def test_a_photograph_cut_short_leaves_no_cache(tmp_path, make_scene, capfd):
+def test_dataset_cache_truncated_photograph_leaves_no_files(tmp_path, make_scene, capfd):
     root = make_scene(tmp_path / "scene")
     path = root / "images/view_2.png"
     path.write_bytes(path.read_bytes()[:-40])
@@ -96,7 +96,7 @@ def test_a_photograph_cut_short_leaves_no_cache(tmp_path, make_scene, capfd):
     assert list((tmp_path / "cache").iterdir()) == []
 
 
-def test_a_stop_while_decoding_leaves_no_cache(tmp_path, make_scene):
+def test_dataset_cache_cancelled_leaves_no_files(tmp_path, make_scene):
     def stop(done: int, total: int) -> None:
         raise KeyboardInterrupt
 
@@ -107,21 +107,21 @@ def test_a_stop_while_decoding_leaves_no_cache(tmp_path, make_scene):
     Dataset.open(root, tmp_path / "cache")
 
 
-def test_the_number_of_threads_does_not_matter(tmp_path, make_scene):
+def test_dataset_cache_independent_of_threads(tmp_path, make_scene):
     root = make_scene(tmp_path / "scene")
     for threads in (1, 3):
         Dataset.open(root, tmp_path / f"cache_{threads}", max_side=20, threads=threads)
     assert (tmp_path / "cache_1/rgb.bin").read_bytes() == (tmp_path / "cache_3/rgb.bin").read_bytes()
 
 
-def test_a_cache_folder_that_cannot_be_written_is_named(tmp_path, make_scene):
+def test_dataset_cache_unwritable_folder_is_named(tmp_path, make_scene):
     root = make_scene(tmp_path / "scene", cameras=[opaque_fisheye()])
     (tmp_path / "file").write_text("in the way")
     with pytest.raises(OutputError, match="file/cache"):
         Dataset.open(root, tmp_path / "file/cache")
 
 
-def test_another_scene_with_equal_names_sizes_and_times_is_not_mistaken(tmp_path, make_scene, coded):
+def test_dataset_cache_other_scene_with_same_metadata_invalidates(tmp_path, make_scene, coded):
     one = make_scene(tmp_path / "one")
     two = make_scene(tmp_path / "two", images=[(f"view_{i}.png", 0, coded(32, 24, 90 + i)) for i in range(4)])
     for i in range(4):
@@ -145,7 +145,7 @@ def test_photographs_do_not_fill_memory(tmp_path, make_scene):
         import sys
         from pathlib import Path
         import numpy as np
-        from octasplat.engine.scene import Dataset
+        from octasplat.engine.dataset import Dataset
 
         def private_mb():
             lines = Path("/proc/self/status").read_text().splitlines()

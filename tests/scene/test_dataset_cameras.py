@@ -2,7 +2,7 @@ import numpy as np
 import pycolmap
 import pytest
 
-from octasplat.engine.scene import Camera
+from octasplat.engine.dataset import Camera
 
 CAMERAS = {
     "SIMPLE_PINHOLE": [500, 310, 250],
@@ -60,7 +60,7 @@ def test_scaling_is_exact_along_each_axis(model):
     )
 
 
-def test_a_pinhole_ray_is_known():
+def test_pinhole_ray_has_known_direction():
     pinhole = Camera("PINHOLE", (100.0, 200.0, 10.0, 20.0), 64, 64)
     direction = pinhole.directions_cam(np.array([[110.0, 20.0], [10.0, 20.0]]))
     np.testing.assert_allclose(direction, [[np.sqrt(0.5), 0, np.sqrt(0.5)], [0, 0, 1]], atol=1e-15)
@@ -81,7 +81,7 @@ def test_points_a_strong_distortion_never_reaches_have_no_direction():
     assert np.isfinite(directions[1]).all()
 
 
-def test_no_points_give_no_directions():
+def test_pixel_directions_of_no_points_are_empty():
     for model in CAMERAS:
         assert camera(model).directions_cam(np.empty((0, 2))).shape == (0, 3)
 

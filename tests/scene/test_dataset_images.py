@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 
 from octasplat.engine.colour import linear_to_srgb
+from octasplat.engine.dataset.images import read_image_info, read_mask, read_photo
 from octasplat.engine.errors import DatasetError
-from octasplat.engine.scene.images import read_image_info, read_mask, read_photo
 
 
 def read(path, width=None, height=None):
@@ -26,7 +26,7 @@ def test_colours_pass_through_exactly(tmp_path, save_image, dtype, suffix):
     assert alpha is None
 
 
-def test_8_bits_fill_the_range_of_16(tmp_path, save_image):
+def test_read_image_8_bits_scale_to_16(tmp_path, save_image):
     save_image(tmp_path / "a.png", np.array([[[0, 128, 255]]], dtype=np.uint8))
     assert read_photo(tmp_path / "a.png", 1, 1, 16)[0].tolist() == [[[0, 128 * 257, 65535]]]
 
@@ -40,7 +40,7 @@ def test_gray_is_spread_over_three_channels(tmp_path, save_image, suffix):
     assert alpha is None
 
 
-def test_alpha_stays_straight(tmp_path, save_image):
+def test_read_image_keeps_straight_alpha(tmp_path, save_image):
     pixels = noise(6, 8, 4)
     save_image(tmp_path / "a.png", pixels)
     rgb, alpha = read(tmp_path / "a.png")
@@ -48,14 +48,14 @@ def test_alpha_stays_straight(tmp_path, save_image):
     np.testing.assert_array_equal(alpha, pixels[..., 3])
 
 
-def test_gray_with_alpha(tmp_path, save_image):
+def test_read_image_gray_alpha_is_expanded(tmp_path, save_image):
     save_image(tmp_path / "a.png", np.array([[[200, 100]]], dtype=np.uint8))
     rgb, alpha = read(tmp_path / "a.png")
     assert rgb.tolist() == [[[200, 200, 200]]]
     assert alpha.tolist() == [[100]]
 
 
-def test_16_bit_alpha(tmp_path, save_image):
+def test_read_image_16_bit_alpha_is_scaled(tmp_path, save_image):
     save_image(tmp_path / "a.png", np.array([[[60000, 300, 0, 32768]]], dtype=np.uint16))
     rgb, alpha = read(tmp_path / "a.png")
     assert rgb.tolist() == [[[60000, 300, 0]]]
@@ -97,7 +97,7 @@ def test_premultiplied_exr_becomes_straight(tmp_path, save_image):
     ],
     ids=["8 bit", "16 bit", "RGBA", "gray"],
 )
-def test_a_plain_image_stays_plain_when_reduced(tmp_path, save_image, pixels):
+def test_reduce_constant_image_is_constant(tmp_path, save_image, pixels):
     save_image(tmp_path / "a.png", pixels)
     rgb, alpha = read(tmp_path / "a.png", 20, 13)
     assert rgb.shape == (13, 20, 3)
@@ -105,7 +105,7 @@ def test_a_plain_image_stays_plain_when_reduced(tmp_path, save_image, pixels):
     assert alpha is None or (alpha == 137).all()
 
 
-def test_a_ramp_stays_the_same_ramp_when_reduced(tmp_path, save_image):
+def test_reduce_linear_ramp_is_exact(tmp_path, save_image):
     ramp = np.broadcast_to((np.arange(240) + 0.5)[None, :, None], (24, 240, 3)).astype(np.uint8)
     save_image(tmp_path / "a.png", ramp)
     rgb, _ = read(tmp_path / "a.png", 60, 6)

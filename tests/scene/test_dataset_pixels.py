@@ -4,8 +4,8 @@ import numpy as np
 import pycolmap
 import pytest
 
+from octasplat.engine.dataset import Dataset
 from octasplat.engine.errors import DatasetError
-from octasplat.engine.scene import Dataset
 
 
 def all_pixels(data: Dataset, view: int):
@@ -68,7 +68,7 @@ def test_tables_and_direct_rays_agree(tmp_path, make_scene, coded):
         np.testing.assert_array_equal(tabled.view_image(view)[2], direct.view_image(view)[2])
 
 
-def test_whole_views_equal_their_pixels(tmp_path, make_scene, coded):
+def test_dataset_view_equals_sampled_pixels(tmp_path, make_scene, coded):
     data = Dataset.open(mixed_scene(make_scene, tmp_path / "scene", coded), tmp_path / "cache")
     for index, view in enumerate(data.views):
         shape = (view.height_px, view.width_px)
@@ -136,7 +136,7 @@ def test_alpha_that_is_opaque_throughout_does_not_count(tmp_path, make_scene):
     assert not (tmp_path / "cache/alpha.bin").exists()
 
 
-def test_both_uses_of_masks(tmp_path, make_scene, save_image, coded):
+def test_dataset_masks_as_alpha_and_as_ignore(tmp_path, make_scene, save_image, coded):
     transparent = np.concatenate([coded(32, 24, 0), np.full((24, 32, 1), 102, np.uint8)], axis=2)
     images = [
         ("ein Ordner/a.png", 0, transparent),
@@ -173,7 +173,7 @@ def test_masks_as_alpha_are_refused_where_there_are_none(tmp_path, make_scene):
         Dataset.open(root, tmp_path / "cache", masks="alpha")
 
 
-def test_black_masks_are_told(tmp_path, make_scene, save_image):
+def test_dataset_black_masks_warn(tmp_path, make_scene, save_image):
     root = make_scene(tmp_path / "scene")
     for i in range(4):
         save_image(root / f"masks/view_{i}.png.png", np.full((24, 32), 0 if i == 2 else 255, np.uint8))

@@ -3,8 +3,8 @@ import json
 import numpy as np
 import pytest
 
+from octasplat.engine.dataset import SparsePoints, scene_extent, split_views, write_held_out
 from octasplat.engine.errors import ConfigError, DatasetError
-from octasplat.engine.scene import SparsePoints, scene_extent, split_views, write_held_out
 
 NAMES = [f"{i:02d}.jpg" for i in range(18)]
 
@@ -28,7 +28,7 @@ def test_every_eighth_view_is_held_out():
     assert train.dtype == test.dtype == np.int64
 
 
-def test_no_view_is_held_out_when_asked():
+def test_split_test_every_zero_holds_out_none():
     train, test = split_views(NAMES, test_every=0)
     assert len(train) == 18
     assert test.tolist() == []
@@ -44,7 +44,7 @@ def test_unknown_names_are_refused():
         split_views(NAMES, held_out=("99.jpg", "03.jpg"))
 
 
-def test_something_must_be_left_to_train_on():
+def test_split_without_training_views_is_refused():
     with pytest.raises(DatasetError, match="held out"):
         split_views(NAMES, test_every=1)
     with pytest.raises(ConfigError, match="-1"):

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from octasplat.engine.scene import Camera, PosedView, Viewpoints
-from octasplat.engine.scene.seen import is_shown
-from octasplat.engine.surface.cameras import photograph_cameras
+from octasplat.engine.dataset import Camera, PosedView, Viewpoints
+from octasplat.engine.dataset.view_frusta import is_in_image
+from octasplat.engine.surface.depth_cameras import photograph_cameras
 
 PANORAMA = Camera("EQUIRECTANGULAR", (400.0, 200.0), 400, 200)
 FISHEYE = Camera("OPENCV_FISHEYE", (150.0, 150.0, 200.0, 150.0, 0.0, 0.0, 0.0, 0.0), 400, 300)
@@ -15,16 +15,16 @@ def directions(count: int) -> np.ndarray:
     return np.random.default_rng(3).standard_normal((count, 3))
 
 
-def test_a_panorama_shows_the_whole_sphere() -> None:
-    assert is_shown(directions(2000), PANORAMA).all()
-    assert is_shown(directions(2000), PANORAMA.scaled_to(100, 50)).all()
-    assert is_shown(np.vstack([np.eye(3), -np.eye(3)]), PANORAMA).all()
+def test_panorama_rays_cover_sphere() -> None:
+    assert is_in_image(directions(2000), PANORAMA).all()
+    assert is_in_image(directions(2000), PANORAMA.scaled_to(100, 50)).all()
+    assert is_in_image(np.vstack([np.eye(3), -np.eye(3)]), PANORAMA).all()
 
 
 @pytest.mark.parametrize("camera", [FISHEYE, Camera("PINHOLE", (300.0, 300.0, 200.0, 150.0), 400, 300)])
-def test_other_cameras_show_nothing_behind_them(camera: Camera) -> None:
+def test_perspective_camera_ignores_points_behind(camera: Camera) -> None:
     way = directions(2000)
-    assert not is_shown(way, camera)[way[:, 2] <= 0].any()
+    assert not is_in_image(way, camera)[way[:, 2] <= 0].any()
 
 
 def test_surfaces_see_all_around_from_a_panorama() -> None:

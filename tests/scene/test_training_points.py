@@ -7,9 +7,9 @@ import numpy as np
 import pycolmap
 import pytest
 
-from octasplat.engine.scene import Dataset
-from octasplat.engine.scene.model import Observations, SparsePoints
-from octasplat.engine.scene.training_points import known_to
+from octasplat.engine.dataset import Dataset
+from octasplat.engine.dataset.model import Observations, SparsePoints
+from octasplat.engine.dataset.training_points import is_observed_by
 
 SPACING, AWAY, VIEWS = 5.0, 2.0, 60
 
@@ -66,5 +66,5 @@ def test_a_photograph_that_a_track_names_twice_counts_once() -> None:
         nothing, nothing, np.full(2, 3, np.int32), np.zeros(2, np.float32), np.array([4, 7])
     )
     views, ids = np.array([0, 0, 5, 0, 1]), np.array([4, 4, 4, 7, 7])  # view 5 is held out
-    known = known_to(np.array([0, 1]), points, Observations(views, ids, np.zeros((5, 2))))
+    known = is_observed_by(np.array([0, 1]), points, Observations(views, ids, np.zeros((5, 2))))
     assert known.tolist() == [False, True]

@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from octasplat.engine.dataset.views_file import read_views
 from octasplat.engine.errors import ConfigError
-from octasplat.engine.scene.views_file import read_views
 
 
 def views_json(path: Path, name: str) -> Path:
@@ -56,8 +56,8 @@ def test_views_that_were_moved_are_of_another_world_and_adjusted_ones_are_not(tm
     eye, still = np.eye(3), np.zeros(3)
     slightly = np.array([[np.cos(0.02), -np.sin(0.02), 0], [np.sin(0.02), np.cos(0.02), 0], [0, 0, 1]])
     assert not record.is_of_another_world(record)
-    assert not record.is_of_another_world(record.moved(1.0, slightly, np.array([0.02, 0, 0])))
-    assert record.is_of_another_world(record.moved(1.0, eye, np.array([0.5, 0, 0])))
-    assert record.is_of_another_world(record.moved(1.0, slightly @ eye[[1, 2, 0]], still))
+    assert not record.is_of_another_world(record.transformed(1.0, slightly, np.array([0.02, 0, 0])))
+    assert record.is_of_another_world(record.transformed(1.0, eye, np.array([0.5, 0, 0])))
+    assert record.is_of_another_world(record.transformed(1.0, slightly @ eye[[1, 2, 0]], still))
     others = read_views(views_json(tmp_path / "views.json", "b.jpg"))
-    assert not record.is_of_another_world(others.moved(1.0, eye, np.array([0.5, 0, 0])))
+    assert not record.is_of_another_world(others.transformed(1.0, eye, np.array([0.5, 0, 0])))

@@ -3,8 +3,8 @@
 import sys
 from pathlib import Path
 
-from bucket_for_tests import s3_address, s3_bucket
-from postgres_for_tests import conninfo, postgres, short_root, template
+from postgres_fixtures import conninfo, postgres, short_root, template
+from s3_server import s3_address, s3_bucket
 
 sys.path.append(str(Path(__file__).parents[1] / "work"))
 

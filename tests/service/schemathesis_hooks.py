@@ -18,14 +18,14 @@ from schemathesis.generation.meta import TestPhase
 
 sys.path.append(str(Path(__file__).parents[1] / "intake"))
 
-from model_builder import Model, photographs
-from zip_builder import Member, build
+from model_builder import ColmapModelBuilder, photographs
+from zip_builder import ZipMember, build_zip
 
 _IDS = json.loads(Path(os.environ["OCTASPLAT_TEST_IDS"]).read_text())
 _USED = {name: itertools.cycle(ids) for name, ids in _IDS["used"].items()}
 _KEPT = {name: itertools.cycle(ids) for name, ids in _IDS["kept"].items()}
 _COUNT = itertools.count()
-_SCENE = {**photographs(), **Model().files()}
+_SCENE = {**photographs(), **ColmapModelBuilder().files()}
 _FIELDS = st.dictionaries(
     st.sampled_from(("flags", "method", "crc", "packed", "size", "start", "disk", "version")),
     st.integers(0, 0xFFFF),
@@ -50,19 +50,19 @@ def scenes(draw: st.DrawFn) -> bytes:
     contents = dict(_SCENE)
     for name in draw(st.lists(st.sampled_from(sorted(contents)), max_size=2)):
         contents[name] = draw(st.binary(max_size=64))
-    entries = [Member(name, content) for name, content in contents.items()]
+    entries = [ZipMember(name, content) for name, content in contents.items()]
     for name in draw(st.lists(st.one_of(st.text(max_size=20), st.binary(max_size=20)), max_size=2)):
         method, mode = draw(st.sampled_from((0, 8, 9, 99))), draw(st.sampled_from((0o100644, 0o120777, 0)))
         content = draw(st.binary(max_size=64))
         entries.append(
-            Member(name, content, method=method, mode=mode, local=draw(_FIELDS), central=draw(_FIELDS))
+            ZipMember(name, content, method=method, mode=mode, local=draw(_FIELDS), central=draw(_FIELDS))
         )
     end = draw(
         st.one_of(
             st.none(), st.dictionaries(st.sampled_from(("entries", "size", "start")), st.integers(0, 9999))
         )
     )
-    archive = bytearray(build(*entries, suffix=draw(st.sampled_from((b"", b"", b"x"))), end=end))
+    archive = bytearray(build_zip(*entries, suffix=draw(st.sampled_from((b"", b"", b"x"))), end=end))
     for place, value in draw(
         st.lists(st.tuples(st.integers(0, len(archive) - 1), st.integers(0, 255)), max_size=3)
     ):
@@ -70,5 +70,5 @@ def scenes(draw: st.DrawFn) -> bytes:
     return bytes(archive)
 
 
-whole = st.just(build(*(Member(name, content) for name, content in _SCENE.items())))
+whole = st.just(build_zip(*(ZipMember(name, content) for name, content in _SCENE.items())))
 schemathesis.openapi.media_type("application/zip", st.one_of(whole, scenes(), st.binary(max_size=200)))

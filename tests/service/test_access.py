@@ -8,7 +8,7 @@ from typing import Any
 import httpx
 import pytest
 from pydantic import SecretStr
-from service_bench import committed_dataset, running, with_token
+from service_harness import client_with_token, committed_dataset, running_service
 
 from octasplat.engine.errors import ConfigError
 from octasplat.service.state import Service
@@ -20,7 +20,7 @@ Conversation = Callable[[httpx.AsyncClient, Service], Awaitable[None]]
 def talk(conninfo: str, tmp_path: Path) -> Callable[..., None]:
     def run(conversation: Conversation, **settings: Any) -> None:
         async def whole() -> None:
-            async with running(conninfo, tmp_path, **settings) as (http, service):
+            async with running_service(conninfo, tmp_path, **settings) as (http, service):
                 await conversation(http, service)
 
         asyncio.run(whole())
@@ -28,23 +28,23 @@ def talk(conninfo: str, tmp_path: Path) -> Callable[..., None]:
     return run
 
 
-def test_lists_hold_ones_own_and_inputs_must_be_ones_own(talk: Callable[..., None]) -> None:
+def test_lists_and_inputs_are_limited_to_owner(talk: Callable[..., None]) -> None:
     async def conversation(http: httpx.AsyncClient, service: Service) -> None:
-        mine = await with_token(service, "me", "write")
-        stranger = await with_token(service, "stranger", "write")
+        mine = await client_with_token(service, "me", "write")
+        stranger = await client_with_token(service, "stranger", "write")
         taken = {"kind": "toy", "dataset_id": await committed_dataset(service, "me")}
         assert (await http.post("/v1/jobs", json=taken, headers=mine)).status_code == 202
         assert (await http.post("/v1/jobs", json=taken, headers=stranger)).status_code == 422
         for path in ("/v1/jobs", "/v1/datasets"):
             listed = (await http.get(path, headers=stranger)).json()
             assert listed[path.removeprefix("/v1/")] == []
-        admin = await with_token(service, "boss", "admin")
+        admin = await client_with_token(service, "boss", "admin")
         assert len((await http.get("/v1/jobs", headers=admin)).json()["jobs"]) == 1
 
     talk(conversation)
 
 
-def test_without_tokens_only_this_machine_and_no_page_of_others(talk: Callable[..., None]) -> None:
+def test_tokenless_service_accepts_local_same_origin_requests_only(talk: Callable[..., None]) -> None:
     async def conversation(http: httpx.AsyncClient, service: Service) -> None:
         assert (await http.get("/v1/jobs")).status_code == 200
         for host in ("evil.example", "127.0.0.1.evil.example", "", "evil.example:8642"):
@@ -67,7 +67,7 @@ def test_without_tokens_only_this_machine_and_no_page_of_others(talk: Callable[.
     talk(conversation)
 
 
-def test_first_token_shuts_the_door(talk: Callable[..., None]) -> None:
+def test_first_token_ends_anonymous_access(talk: Callable[..., None]) -> None:
     async def conversation(http: httpx.AsyncClient, service: Service) -> None:
         new = {"name": "n", "owner": "me", "scopes": ["admin"]}
         made = (await http.post("/v1/tokens", json=new)).json()
@@ -81,7 +81,7 @@ def test_first_token_shuts_the_door(talk: Callable[..., None]) -> None:
             assert made["token"] not in str(await cursor.fetchall())
         assert (await http.delete(f"/v1/tokens/{made['id']}", headers=headers)).status_code == 204
         assert (await http.get("/v1/jobs", headers=headers)).status_code == 401
-        service.forget_tokens()
+        service.invalidate_token_state()
         assert (await http.get("/v1/jobs")).status_code == 401  # that the last has ended opens nothing
 
     talk(conversation)
@@ -98,7 +98,7 @@ def test_token_of_the_environment_is_let_in(talk: Callable[..., None]) -> None:
 
 def test_public_address_without_a_token_is_refused(conninfo: str, tmp_path: Path) -> None:
     async def start(host: str) -> None:
-        async with running(conninfo, tmp_path, host=host):
+        async with running_service(conninfo, tmp_path, host=host):
             pass
 
     for host in ("0.0.0.0", "::", "192.0.2.7", "example.org"):

@@ -12,12 +12,12 @@ import httpx
 import pytest
 from api_inventory import Operation, operations, undescribed
 from PIL import Image
-from service_bench import claimed, committed_dataset, running, stored, with_token
+from service_harness import claim_job, client_with_token, committed_dataset, running_service, store_content
 
 from octasplat.service.app import create_app
 from octasplat.service.settings import ServiceSettings
 from octasplat.service.state import Service
-from octasplat.workers.queue.attempts import Result
+from octasplat.workers.queue.attempts import ResultFile
 
 OPEN = {"/healthz", "/readyz"}
 """Whoever watches over the service needs no token for these."""
@@ -45,7 +45,7 @@ class Stage:
             ("stranger", "stranger", "write"),
             ("admin", "boss", "admin"),
         ):
-            self.headers[who] = await with_token(self.service, owner, scope)
+            self.headers[who] = await client_with_token(self.service, owner, scope)
         picture = io.BytesIO()
         Image.new("RGB", (8, 8), "red").save(picture, "PNG")
         open_dataset = await self._make("/v1/datasets", {"name": "of-me"})
@@ -54,12 +54,12 @@ class Stage:
         assert put.status_code == 201, put.text
         dataset = await committed_dataset(self.service, "me")
         job_id = await self._make("/v1/jobs", {"kind": "toy", "dataset_id": dataset})
-        attempt = await claimed(self.service, {"id": job_id})
-        sha256 = stored(self.service, picture.getvalue())
-        await attempt.log(["a line of-me"])
-        await attempt.keep_preview({"sha256": sha256, "step": 1, "view": "a.png"})
+        attempt = await claim_job(self.service, {"id": job_id})
+        sha256 = store_content(self.service, picture.getvalue())
+        await attempt.add_log_lines(["a line of-me"])
+        await attempt.record_preview({"sha256": sha256, "step": 1, "view": "a.png"})
         size = len(picture.getvalue())
-        await attempt.succeed([Result("scene.ply", sha256, size, "application/octet-stream")])
+        await attempt.succeed([ResultFile("scene.ply", sha256, size, "application/octet-stream")])
         self.ids = {
             "dataset_id": open_dataset, "job_id": job_id, "path": "images/a.png", "name": "scene.ply",
             "kind": "toy",
@@ -122,7 +122,7 @@ def _is_about_now(operation: Operation) -> bool:
 def stage(conninfo: str, tmp_path: Path) -> Callable[[Callable[[Stage], Awaitable[None]]], None]:
     def run(play: Callable[[Stage], Awaitable[None]]) -> None:
         async def whole() -> None:
-            async with running(conninfo, tmp_path) as (http, service):
+            async with running_service(conninfo, tmp_path) as (http, service):
                 stage = Stage(http, service)
                 await stage.set()
                 await play(stage)
@@ -135,7 +135,7 @@ def stage(conninfo: str, tmp_path: Path) -> Callable[[Callable[[Stage], Awaitabl
 Play = Callable[[Callable[[Stage], Awaitable[None]]], None]
 
 
-def test_no_token_opens_nothing(stage: Play) -> None:
+def test_request_without_token_is_refused_on_every_route(stage: Play) -> None:
     async def play(stage: Stage) -> None:
         before = await stage.everything()
         for operation in operations(APP):
@@ -160,7 +160,7 @@ def test_no_token_opens_nothing(stage: Play) -> None:
     stage(play)
 
 
-def test_stranger_sees_and_changes_nothing_of_mine(stage: Play) -> None:
+def test_other_owner_cannot_read_or_change(stage: Play) -> None:
     async def play(stage: Stage) -> None:
         before = await stage.everything()
         for operation in operations(APP):
@@ -183,7 +183,7 @@ def test_stranger_sees_and_changes_nothing_of_mine(stage: Play) -> None:
     stage(play)
 
 
-def test_reader_reads_everything_and_changes_nothing(stage: Play) -> None:
+def test_read_scope_cannot_change(stage: Play) -> None:
     async def play(stage: Stage) -> None:
         before = await stage.everything()
         for operation in operations(APP):
@@ -201,7 +201,7 @@ def test_reader_reads_everything_and_changes_nothing(stage: Play) -> None:
     stage(play)
 
 
-def test_pages_and_other_undescribed_routes_ask_too(stage: Play) -> None:
+def test_undocumented_routes_require_token(stage: Play) -> None:
     routes = undescribed(APP)
     assert ("GET", "/jobs/{job_id}") in routes and ("HEAD", "/v1/jobs/{job_id}/artifacts/{name}") in routes
 

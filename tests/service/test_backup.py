@@ -10,12 +10,12 @@ from typing import Any
 
 import httpx
 import pytest
-from service_bench import claimed, committed_dataset, running, stored, with_token
-from worker_bench import Bench
+from service_harness import claim_job, client_with_token, committed_dataset, running_service, store_content
+from worker_harness import WorkerHarness
 
 from octasplat.service.state import Service
-from octasplat.workers.queue.attempts import Result
-from postgres_for_tests import EmbeddedPostgres, copied_database
+from octasplat.workers.queue.attempts import ResultFile
+from postgres_fixtures import EmbeddedPostgres, copied_database
 
 sys.path.append(str(Path(__file__).parents[1] / "intake"))
 from model_builder import photograph
@@ -35,14 +35,14 @@ def octasplat(conninfo: str, data: Path, *arguments: object) -> "subprocess.Comp
     return subprocess.run(command, env=environment, cwd=ROOT, capture_output=True, text=True, check=False)
 
 
-def test_a_service_restored_elsewhere_goes_on(
+def test_restored_service_continues_jobs(
     conninfo: str, postgres: EmbeddedPostgres, template: str, tmp_path: Path
 ) -> None:
     backup, here, there = tmp_path / "backup", tmp_path / "here", tmp_path / "there"
     made: dict[str, Any] = {}
 
     async def before(http: httpx.AsyncClient, service: Service) -> None:
-        made["headers"] = await with_token(service, "me", "write")
+        made["headers"] = await client_with_token(service, "me", "write")
         http.headers.update(made["headers"])
         made["dataset"] = (await http.post("/v1/datasets", json={"name": "d"})).headers["Location"]
         address = f"{made['dataset']}/files/images/a.png"
@@ -50,15 +50,15 @@ def test_a_service_restored_elsewhere_goes_on(
         scene = await committed_dataset(service, "me")
         body = {"dataset_id": scene, "kind": "toy", "options": {"steps": 3, "seconds": 0.0}}
         done, under_way, queued = [(await http.post("/v1/jobs", json=body)).json() for _ in range(3)]
-        attempt = await claimed(service, done)
-        result = Result("a.txt", stored(service, b"a result"), 8, "text/plain")
+        attempt = await claim_job(service, done)
+        result = ResultFile("a.txt", store_content(service, b"a result"), 8, "text/plain")
         await attempt.succeed([result])
-        await claimed(service, under_way)
+        await claim_job(service, under_way)
         made["jobs"] = [job["id"] for job in (done, under_way, queued)]
         for again in range(2):
             saved = await asyncio.to_thread(octasplat, conninfo, here, "backup", backup)
             assert saved.returncode == 0, saved.stderr
-            stored(service, f"named by nothing {again}".encode())
+            store_content(service, f"named by nothing {again}".encode())
         # What happens afterwards is not in it.
         assert (await http.delete(made["dataset"])).status_code == 204
         made["usage"] = (len(list((backup / "store").rglob("*"))), len(list(backup.glob("tables-*"))))
@@ -76,7 +76,7 @@ def test_a_service_restored_elsewhere_goes_on(
         made["jobs"].append(new["id"])
 
     async def talk(database: str, folder: Path, conversation: Any) -> None:
-        async with running(database, folder) as (http, service):
+        async with running_service(database, folder) as (http, service):
             await conversation(http, service)
 
     asyncio.run(talk(conninfo, here, before))
@@ -88,11 +88,11 @@ def test_a_service_restored_elsewhere_goes_on(
         assert again.returncode == 1 and "not empty" in again.stderr and again.stderr.count("\n") == 1
         assert octasplat(elsewhere, there, "fsck").returncode == 0
         asyncio.run(talk(elsewhere, there, after))
-        bench = Bench(elsewhere, there)
+        bench = WorkerHarness(elsewhere, there)
         try:
             bench.worker(STALE_SECONDS="10")
             for job in made["jobs"][1:]:
-                row = bench.over(uuid.UUID(job))
+                row = bench.wait_until_finished(uuid.UUID(job))
                 assert (row.state, row.rescues) == ("succeeded", 0)
                 assert bench.results(row.id)["sum.txt"] == b"6"
         finally:
@@ -100,7 +100,7 @@ def test_a_service_restored_elsewhere_goes_on(
 
 
 @pytest.mark.parametrize("folder", ["nothing", "other"])
-def test_what_is_no_backup_is_refused(conninfo: str, tmp_path: Path, folder: str) -> None:
+def test_restore_of_invalid_folder_is_refused(conninfo: str, tmp_path: Path, folder: str) -> None:
     (tmp_path / "nothing").mkdir()
     (tmp_path / "other").mkdir()
     (tmp_path / "other" / "a.txt").write_text("mine")

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
+from octasplat.engine.dataset.synthetic import SyntheticDatasetConfig, write_synthetic_dataset
 from octasplat.engine.isolated_python import python_command
-from octasplat.engine.scene.generated import GeneratedSceneConfig, write_generated_scene
 from octasplat.workers.client.api import Api
 from octasplat.workers.client.upload import upload_scene
 from octasplat.workers.client.watch import watch_job
@@ -62,9 +62,9 @@ def served(project: Path, short_root: Path, tmp_path: Path) -> Iterator[Api]:
     assert process.wait(120) == 0
 
 
-def test_serve_runs_nothing_of_the_current_folder(served: Api, project: Path, tmp_path: Path) -> None:
-    config = GeneratedSceneConfig(views=4, width_px=16, height_px=12, samples_per_side=1, points=60)
-    write_generated_scene(tmp_path / "scene", config)
+def test_serve_ignores_modules_in_current_folder(served: Api, project: Path, tmp_path: Path) -> None:
+    config = SyntheticDatasetConfig(views=4, width_px=16, height_px=12, samples_per_side=1, points=60)
+    write_synthetic_dataset(tmp_path / "scene", config)
     dataset = upload_scene(served, tmp_path / "scene")
     job = served.post("/v1/jobs", {"kind": "toy", "dataset_id": dataset["id"], "options": {"steps": 2}})
     done = watch_job(served, job["id"], lambda _event: None, lambda _state: None)
@@ -73,7 +73,7 @@ def test_serve_runs_nothing_of_the_current_folder(served: Api, project: Path, tm
     assert (project / "a store").is_dir()  # settings mean what they meant where the command was given
 
 
-def test_programs_are_found_wherever_they_start(project: Path, tmp_path: Path) -> None:
+def test_program_paths_are_independent_of_current_folder(project: Path, tmp_path: Path) -> None:
     command = python_command("octasplat", "--version", further_modules=("no_such_module", "toy_kind"))
     environment = {**os.environ, "PYTHONPATH": str(project)}
     done = subprocess.run(command, cwd=project, env=environment, capture_output=True, text=True, check=False)
@@ -81,7 +81,7 @@ def test_programs_are_found_wherever_they_start(project: Path, tmp_path: Path) -
     assert not (tmp_path / "imported").exists()
 
 
-def test_the_installed_command_imports_nothing_of_the_current_folder(project: Path, tmp_path: Path) -> None:
+def test_command_ignores_modules_in_current_folder(project: Path, tmp_path: Path) -> None:
     script = Path(sys.executable).with_name("octasplat")
     if not script.exists():
         pytest.skip("octasplat is not installed beside this Python")

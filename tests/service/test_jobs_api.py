@@ -9,10 +9,10 @@ from typing import Any
 
 import httpx
 import pytest
-from service_bench import claimed, committed_dataset, running, stored
+from service_harness import claim_job, committed_dataset, running_service, store_content
 
 from octasplat.service.state import Service
-from octasplat.workers.queue.attempts import Result
+from octasplat.workers.queue.attempts import ResultFile
 
 Conversation = Callable[[httpx.AsyncClient, Service], Awaitable[None]]
 
@@ -21,7 +21,7 @@ Conversation = Callable[[httpx.AsyncClient, Service], Awaitable[None]]
 def talk(conninfo: str, tmp_path: Path) -> Callable[..., None]:
     def run(conversation: Conversation, **settings: Any) -> None:
         async def whole() -> None:
-            async with running(conninfo, tmp_path, **settings) as (http, service):
+            async with running_service(conninfo, tmp_path, **settings) as (http, service):
                 await conversation(http, service)
 
         asyncio.run(whole())
@@ -100,7 +100,7 @@ def test_job_is_accepted_with_every_setting(talk: Callable[..., None]) -> None:
         ({"kind": "export", "options": {"files": ["a.glb"]}}, 422, "input", "#/source_id"),
     ],
 )
-def test_what_makes_no_sense_is_refused(
+def test_create_job_invalid_request_is_refused(
     talk: Callable[..., None], body: dict[str, Any], status: int, code: str, pointer: str
 ) -> None:
     async def conversation(http: httpx.AsyncClient, service: Service) -> None:
@@ -165,10 +165,10 @@ def test_polling_is_cheap_and_changes_are_guarded(talk: Callable[..., None]) -> 
         seen = {"If-None-Match": first.headers["ETag"]}
         again = await http.get(address, headers=seen)
         assert (again.status_code, again.content) == (304, b"")
-        attempt = await claimed(service, job)
+        attempt = await claim_job(service, job)
         changed = await http.get(address, headers=seen)
         assert changed.status_code == 200 and changed.json()["state"] == "running"
-        await attempt.beat()  # a heartbeat alone changes nothing that anybody sees
+        await attempt.heartbeat()  # a heartbeat alone changes nothing that anybody sees
         assert (
             await http.get(address, headers={"If-None-Match": changed.headers["ETag"]})
         ).status_code == 304
@@ -182,7 +182,7 @@ def test_polling_is_cheap_and_changes_are_guarded(talk: Callable[..., None]) -> 
     talk(conversation)
 
 
-def test_cancel_retry_delete(talk: Callable[..., None]) -> None:
+def test_job_can_be_cancelled_retried_and_deleted(talk: Callable[..., None]) -> None:
     async def conversation(http: httpx.AsyncClient, service: Service) -> None:
         job = await new_job(http, service)
         address = f"/v1/jobs/{job['id']}"
@@ -197,7 +197,7 @@ def test_cancel_retry_delete(talk: Callable[..., None]) -> None:
         assert (retried.status_code, retried.json()["state"]) == (202, "queued")
         again = await http.post(f"{address}/retry", json={"from": "start"}, headers=once)
         assert again.status_code == 202
-        attempt = await claimed(service, job)
+        attempt = await claim_job(service, job)
         stopping = await http.delete(address, params={"cancel": True})
         assert is_problem(stopping, 409, "stopping") and "Retry-After" in stopping.headers
         await attempt.cancel()
@@ -207,7 +207,7 @@ def test_cancel_retry_delete(talk: Callable[..., None]) -> None:
     talk(conversation)
 
 
-def test_list_comes_in_parts(talk: Callable[..., None]) -> None:
+def test_job_list_is_paginated(talk: Callable[..., None]) -> None:
     async def conversation(http: httpx.AsyncClient, service: Service) -> None:
         made = [(await new_job(http, service, label=f"l{n}"))["id"] for n in range(5)]
         address, found = "/v1/jobs?limit=2", []
@@ -230,15 +230,15 @@ def test_list_comes_in_parts(talk: Callable[..., None]) -> None:
 def test_results_in_ranges_with_digest(talk: Callable[..., None]) -> None:
     async def conversation(http: httpx.AsyncClient, service: Service) -> None:
         job = await new_job(http, service)
-        attempt = await claimed(service, job)
+        attempt = await claim_job(service, job)
         content = bytes(range(256)) * 20
-        sha256 = stored(service, content)
-        page = stored(service, b"<script>alert(1)</script>")
+        sha256 = store_content(service, content)
+        page = store_content(service, b"<script>alert(1)</script>")
         await attempt.succeed(
             [
-                Result("mesh.glb", sha256, len(content), "model/gltf-binary"),
-                Result("report.html", page, 25, "text/html"),
-                Result("renders/ü 1.bin", sha256, len(content), "application/octet-stream"),
+                ResultFile("mesh.glb", sha256, len(content), "model/gltf-binary"),
+                ResultFile("report.html", page, 25, "text/html"),
+                ResultFile("renders/ü 1.bin", sha256, len(content), "application/octet-stream"),
             ]
         )
         address = f"/v1/jobs/{job['id']}/artifacts"
@@ -281,9 +281,9 @@ def test_export_of_a_finished_job(talk: Callable[..., None]) -> None:
         source = await new_job(http, service)
         body = {"kind": "export", "source_id": source["id"], "options": {"files": ["a.glb"]}}
         assert is_problem(await http.post("/v1/jobs", json=body), 409, "source")
-        attempt = await claimed(service, source)
+        attempt = await claim_job(service, source)
         await attempt.succeed(
-            [Result("scene.ply", "a" * 64, 1, "x/y"), Result("config.json", "b" * 64, 1, "x/y")]
+            [ResultFile("scene.ply", "a" * 64, 1, "x/y"), ResultFile("config.json", "b" * 64, 1, "x/y")]
         )
         answer = await http.post("/v1/jobs", json=body)
         assert answer.status_code == 202 and answer.json()["dataset_id"] == source["dataset_id"]
@@ -312,13 +312,15 @@ async def events_of(response: httpx.Response) -> AsyncIterator[tuple[str, str, d
 def test_log_timeline_and_stream(talk: Callable[..., None]) -> None:
     async def conversation(http: httpx.AsyncClient, service: Service) -> None:
         job = await new_job(http, service)
-        attempt = await claimed(service, job)
-        await attempt.log([f"line {n}" for n in range(5)])
+        attempt = await claim_job(service, job)
+        await attempt.add_log_lines([f"line {n}" for n in range(5)])
         page = (await http.get(f"/v1/jobs/{job['id']}/logs?limit=3")).json()
         assert [line["text"] for line in page["lines"]] == ["Attempt 1 on w", "line 0", "line 1"]
         rest = (await http.get(f"/v1/jobs/{job['id']}/logs", params={"after": page["next"]})).json()
         assert [line["text"] for line in rest["lines"]] == ["line 2", "line 3", "line 4"]
-        await attempt.progress(stage="train", step=3, total_steps=9, training_psnr=20.5, event={"step": 3})
+        await attempt.set_progress(
+            stage="train", step=3, total_steps=9, training_psnr=20.5, event={"step": 3}
+        )
         await attempt.succeed([])
         timeline = (await http.get(f"/v1/jobs/{job['id']}/timeline")).json()
         kinds = [event["kind"] for event in timeline["events"]]
@@ -339,7 +341,7 @@ def test_the_psnr_is_that_of_held_out_views(talk: Callable[..., None]) -> None:
     async def conversation(http: httpx.AsyncClient, service: Service) -> None:
         job = await new_job(http, service)
         address = f"/v1/jobs/{job['id']}"
-        attempt = await claimed(service, job)
+        attempt = await claim_job(service, job)
 
         async def figures() -> tuple[float | None, float | None]:
             view = (await http.get(address)).json()
@@ -348,22 +350,22 @@ def test_the_psnr_is_that_of_held_out_views(talk: Callable[..., None]) -> None:
             return view["psnr"], view["training_psnr"]
 
         assert await figures() == (None, None)
-        await attempt.progress(stage="train", step=10, total_steps=900, training_psnr=33.19)
+        await attempt.set_progress(stage="train", step=10, total_steps=900, training_psnr=33.19)
         assert await figures() == (None, 33.19)
-        await attempt.tell("held_out_measured", {"iteration": 20, "psnr": 27.5})
-        await attempt.progress(stage="train", step=20, total_steps=900, training_psnr=34.0)
+        await attempt.add_event("held_out_measured", {"iteration": 20, "psnr": 27.5})
+        await attempt.set_progress(stage="train", step=20, total_steps=900, training_psnr=34.0)
         assert await figures() == (27.5, 34.0)
         await attempt.cancel()
         answer = await http.post(f"{address}/retry", json={"from": "checkpoint"})
         assert (answer.json()["psnr"], answer.json()["training_psnr"]) == (27.5, 34.0)
-        attempt = await claimed(service, answer.json())
+        attempt = await claim_job(service, answer.json())
         await attempt.succeed([], 28.56)
         assert await figures() == (28.56, 34.0)
 
     talk(conversation)
 
 
-def test_what_the_service_is(talk: Callable[..., None]) -> None:
+def test_info_describes_service(talk: Callable[..., None]) -> None:
     async def conversation(http: httpx.AsyncClient, service: Service) -> None:
         info = (await http.get("/v1/info")).json()
         assert {"reconstruct", "evaluate", "export", "render", "toy"} <= set(info["kinds"])

@@ -8,13 +8,13 @@ from typing import Any
 
 import httpx
 import pytest
-from service_bench import claimed, committed_dataset, running, with_token
+from service_harness import claim_job, client_with_token, committed_dataset, running_service
 
 from octasplat.service.state import Service
-from octasplat.workers.queue.attempts import Result
-from octasplat.workers.records.datasets import put_file
-from octasplat.workers.records.locks import lock_owner
-from octasplat.workers.records.workers import see_worker
+from octasplat.workers.db.datasets import put_file
+from octasplat.workers.db.locks import lock_owner
+from octasplat.workers.db.workers import record_worker_heartbeat
+from octasplat.workers.queue.attempts import ResultFile
 
 Conversation = Callable[[httpx.AsyncClient, Service], Awaitable[None]]
 PHOTOGRAPHS = [{"width_px": 269, "height_px": 480, "count": 50}]
@@ -24,7 +24,7 @@ PHOTOGRAPHS = [{"width_px": 269, "height_px": 480, "count": 50}]
 def talk(conninfo: str, tmp_path: Path) -> Callable[..., None]:
     def run(conversation: Conversation, **settings: Any) -> None:
         async def whole() -> None:
-            async with running(conninfo, tmp_path, **settings) as (http, service):
+            async with running_service(conninfo, tmp_path, **settings) as (http, service):
                 await conversation(http, service)
 
         asyncio.run(whole())
@@ -74,7 +74,7 @@ def test_too_much_is_refused_with_the_ceiling(
     talk(conversation)
 
 
-def test_ceilings_are_settings_and_hold_for_retries_and_renders(talk: Callable[..., None]) -> None:
+def test_job_limits_apply_to_retries_and_renders(talk: Callable[..., None]) -> None:
     async def conversation(http: httpx.AsyncClient, service: Service) -> None:
         dataset = await photographed_dataset(service, 100, 50, 4)
         body = {"dataset_id": dataset, "options": {"train": {"iterations": 51}}}
@@ -85,8 +85,8 @@ def test_ceilings_are_settings_and_hold_for_retries_and_renders(talk: Callable[.
         assert schema["ceilings"]["train.iterations"] == 50 and schema["ceilings"]["max_side"] == 16_384
         page = (await http.get("/new")).text
         assert 'id="reconstruct-train-iterations"' in page and 'max="50"' in page
-        attempt = await claimed(service, job)
-        await attempt.fail({"type": "x", "message": "x."}, [Result("scene.ply", "a" * 64, 1, "x/y")])
+        attempt = await claim_job(service, job)
+        await attempt.fail({"type": "x", "message": "x."}, [ResultFile("scene.ply", "a" * 64, 1, "x/y")])
         retry = {"from": "start", "options": {"train": {"iterations": 60}}}
         again = await http.post(f"/v1/jobs/{job['id']}/retry", json=retry)
         assert ceiling(again) == ("#/options/train/iterations", 50)
@@ -104,8 +104,8 @@ def test_ceilings_are_settings_and_hold_for_retries_and_renders(talk: Callable[.
 
 def test_high_priorities_are_for_administrators(talk: Callable[..., None]) -> None:
     async def conversation(http: httpx.AsyncClient, service: Service) -> None:
-        writer = await with_token(service, "me", "write")
-        admin = await with_token(service, "boss", "admin")
+        writer = await client_with_token(service, "me", "write")
+        admin = await client_with_token(service, "boss", "admin")
         mine = {"kind": "toy", "dataset_id": await committed_dataset(service, "me")}
         for who, priority, status in (
             (writer, 10, 202),
@@ -121,11 +121,13 @@ def test_high_priorities_are_for_administrators(talk: Callable[..., None]) -> No
     talk(conversation)
 
 
-def test_what_a_job_takes_is_estimated_before_and_when_it_is_made(talk: Callable[..., None]) -> None:
+def test_job_estimate_before_and_at_creation_match(talk: Callable[..., None]) -> None:
     async def conversation(http: httpx.AsyncClient, service: Service) -> None:
         async with service.pool.connection() as connection:
             facts = {"threads": 4, "memory_limit_bytes": 100_000_000}
-            await see_worker(connection, uuid.uuid4(), name="w", queues=["cpu"], slots=2, facts=facts)
+            await record_worker_heartbeat(
+                connection, uuid.uuid4(), name="w", queues=["cpu"], slots=2, facts=facts
+            )
 
         async def estimate(options: dict[str, Any], **body: Any) -> dict[str, Any]:
             answer = await http.post("/v1/estimates", json={"options": options, **body})
@@ -159,7 +161,7 @@ def test_what_a_job_takes_is_estimated_before_and_when_it_is_made(talk: Callable
         assert job["estimate"] == fast
         assert [note for note in job["notes"] if "its workers allow 0.1 GB" in note]
         assert fast["text"] in (await http.get(f"/jobs/{job['id']}")).text
-        stranger = await with_token(service, "stranger", "write")
+        stranger = await client_with_token(service, "stranger", "write")
         for name, thing in (("dataset_id", dataset), ("source_id", job["id"])):
             answer = await http.post("/v1/estimates", json={name: thing}, headers=stranger)
             assert answer.status_code == 422 and answer.json()["errors"][0]["pointer"] == f"#/{name}"
@@ -167,14 +169,14 @@ def test_what_a_job_takes_is_estimated_before_and_when_it_is_made(talk: Callable
     talk(conversation)
 
 
-def test_what_is_sure_to_take_too_much_disk_is_refused(talk: Callable[..., None]) -> None:
+def test_job_exceeding_workspace_limit_is_refused(talk: Callable[..., None]) -> None:
     """Within the ceiling of pixels, and still more than a job's folder may take."""
 
     async def conversation(http: httpx.AsyncClient, service: Service) -> None:
         dataset = await photographed_dataset(service, 64, 48, 3)
         job = (await http.post("/v1/jobs", json={"dataset_id": dataset, "kind": "reconstruct"})).json()
-        attempt = await claimed(service, job)
-        await attempt.succeed([Result("scene.ply", "a" * 64, 1, "text/plain")])
+        attempt = await claim_job(service, job)
+        await attempt.succeed([ResultFile("scene.ply", "a" * 64, 1, "text/plain")])
         pictures = {"frames": 1000, "width_px": 1024, "height_px": 1024}
         body = {"kind": "render", "source_id": job["id"], "options": {**pictures, "format": "exr"}}
         assert ceiling(await http.post("/v1/jobs", json=body)) == ("#/options/format", 4 << 30)

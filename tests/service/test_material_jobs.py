@@ -4,7 +4,7 @@ import asyncio
 from pathlib import Path
 
 import pytest
-from service_bench import committed_dataset, running
+from service_harness import committed_dataset, running_service
 from test_stage_jobs import HDR, finished, sent
 
 from octasplat.engine.errors import ConfigError
@@ -13,9 +13,9 @@ from octasplat.workers.client.submission import Derivation, with_environments
 SHINY = {"environment.hdr": HDR, "scene.ply": b"ply"}
 
 
-def test_materials_and_light_are_asked_for_over_http(conninfo: str, tmp_path: Path) -> None:
+def test_materials_and_relight_jobs_over_http(conninfo: str, tmp_path: Path) -> None:
     async def conversation() -> None:
-        async with running(conninfo, tmp_path) as (http, service):
+        async with running_service(conninfo, tmp_path) as (http, service):
             plain = await finished(http, service, {"scene.ply": b"ply"})
             shiny = await finished(http, service, SHINY)
             change = {"set": {"roughness": 0.3, "albedo": "#ff8000"}, "where": "metallic > 0.5"}
@@ -48,9 +48,9 @@ def test_materials_and_light_are_asked_for_over_http(conninfo: str, tmp_path: Pa
     asyncio.run(conversation())
 
 
-def test_other_photographs_are_measured_over_http(conninfo: str, tmp_path: Path) -> None:
+def test_evaluate_job_measures_other_dataset(conninfo: str, tmp_path: Path) -> None:
     async def conversation() -> None:
-        async with running(conninfo, tmp_path) as (http, service):
+        async with running_service(conninfo, tmp_path) as (http, service):
             source = await finished(http, service, SHINY)
             others, bare = [await committed_dataset(service, has_poses=posed) for posed in (True, False)]
             body = {"kind": "evaluate", "source_id": source}

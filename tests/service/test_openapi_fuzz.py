@@ -18,8 +18,8 @@ from pathlib import Path
 import psycopg
 import pytest
 
-from octasplat.workers.records.locks import OWNER
-from octasplat.workers.store.local import LocalStorage
+from octasplat.workers.db.locks import OWNER
+from octasplat.workers.storage.local import LocalStorage
 
 pytestmark = pytest.mark.heavy
 
@@ -75,7 +75,7 @@ def front_end(conninfo: str, tmp_path: Path) -> Iterator[FrontEnd]:
 def furnish(conninfo: str, tmp_path: Path) -> Path:
     """Datasets and finished jobs with results to ask for; returns the file for the hooks."""
     storage = LocalStorage(tmp_path / "store", floor_bytes=0)
-    with storage.begin() as writer:
+    with storage.open_writer() as writer:
         writer.write(b"ply\n")
         sha256 = writer.commit().sha256
     storage.close()
@@ -119,7 +119,7 @@ AST_IN_THREADS = "AST constructor recursion depth mismatch"
 """CPython 3.11 now and then says so where two threads parse; schemathesis does, and must begin again."""
 
 
-def test_no_request_breaks_the_service(front_end: FrontEnd, conninfo: str, tmp_path: Path) -> None:
+def test_fuzzed_requests_cause_no_server_error(front_end: FrontEnd, conninfo: str, tmp_path: Path) -> None:
     environment = {
         **os.environ,
         "OCTASPLAT_TEST_IDS": str(furnish(conninfo, tmp_path)),

@@ -5,9 +5,9 @@ from typing import Any
 import jsonschema
 import pytest
 
-from octasplat.service.openapi import type_options
+from octasplat.service.openapi import add_option_schemas
 from octasplat.service.schemas.jobs import NewJob
-from octasplat.workers.work.kinds import job_kinds
+from octasplat.workers.worker.job_kinds import job_kinds
 
 ID = "5f1d7a52-0b9c-4a8e-9a3e-2f6c0d6f3b11"
 
@@ -17,7 +17,7 @@ def document() -> dict[str, Any]:
     """The schemas of a document, in which references can be followed."""
     schema = NewJob.model_json_schema(ref_template="#/components/schemas/{model}")
     schemas = {**schema.pop("$defs", {}), "NewJob": schema}
-    type_options(schemas)
+    add_option_schemas(schemas)
     return {"components": {"schemas": schemas}}
 
 
@@ -63,7 +63,7 @@ def test_defaults_that_a_preset_decides_are_left_out(document: dict[str, Any]) -
     assert schemas["McmcConfig"]["properties"]["kind"]["default"] == "mcmc"
 
 
-def test_no_default_is_an_object(document: dict[str, Any]) -> None:
+def test_openapi_options_have_no_object_defaults(document: dict[str, Any]) -> None:
     for name, schema in document["components"]["schemas"].items():
         for field, given in schema.get("properties", {}).items():
             assert not isinstance(given.get("default"), dict) or field == "options", name

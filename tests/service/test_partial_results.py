@@ -12,16 +12,16 @@ from typing import Any
 
 import httpx
 import pytest
-from service_bench import claimed, committed_dataset, running
+from service_harness import claim_job, committed_dataset, running_service
 from test_reconstruction import ROOT, TRAIN, Machine, start
 
+from octasplat.engine.dataset.synthetic import SyntheticDatasetConfig, write_synthetic_dataset
 from octasplat.engine.files import exporters
-from octasplat.engine.scene.generated import GeneratedSceneConfig, write_generated_scene
 from octasplat.service.state import Service
 from octasplat.workers.client.submission import Submission, submit
 from octasplat.workers.client.watch import watch_job
-from octasplat.workers.queue.attempts import Result
-from octasplat.workers.records.workers import see_worker
+from octasplat.workers.db.workers import record_worker_heartbeat
+from octasplat.workers.queue.attempts import ResultFile
 
 Conversation = Callable[[httpx.AsyncClient, Service], Awaitable[None]]
 FORMATS = [exporter.name for exporter in exporters()]
@@ -31,7 +31,7 @@ FORMATS = [exporter.name for exporter in exporters()]
 def talk(conninfo: str, tmp_path: Path) -> Callable[[Conversation], None]:
     def run(conversation: Conversation) -> None:
         async def whole() -> None:
-            async with running(conninfo, tmp_path) as (http, service):
+            async with running_service(conninfo, tmp_path) as (http, service):
                 await conversation(http, service)
 
         asyncio.run(whole())
@@ -42,10 +42,12 @@ def talk(conninfo: str, tmp_path: Path) -> Callable[[Conversation], None]:
 async def worker_lives(service: Service, *lacking: str, queue: str = "cpu") -> None:
     facts = {"formats": [name for name in FORMATS if name not in lacking]}
     async with service.pool.connection() as connection:
-        await see_worker(connection, uuid.uuid4(), name="w", queues=[queue], slots=1, facts=facts)
+        await record_worker_heartbeat(
+            connection, uuid.uuid4(), name="w", queues=[queue], slots=1, facts=facts
+        )
 
 
-def test_what_no_worker_can_write_is_refused(talk: Callable[[Conversation], None]) -> None:
+def test_create_job_unwritable_format_is_refused(talk: Callable[[Conversation], None]) -> None:
     async def conversation(http: httpx.AsyncClient, service: Service) -> None:
         dataset = await committed_dataset(service)
         body = {"dataset_id": dataset, "options": {"exports": ["mesh.glb", "scene.sog"]}}
@@ -81,10 +83,10 @@ def test_retry_with_other_options(talk: Callable[[Conversation], None]) -> None:
         body = {"dataset_id": await committed_dataset(service), "options": {"preset": "fast"}}
         job = (await http.post("/v1/jobs", json=body)).json()
         address = f"/v1/jobs/{job['id']}"
-        attempt = await claimed(service, job)
+        attempt = await claim_job(service, job)
         manifest = {"attempt": 1, "stage": "train", "step": 9, "files": []}
-        await attempt.keep_checkpoint(manifest, advances=True)
-        some = [Result("scene.ply", "a" * 64, 1, "x/y"), Result("config.json", "b" * 64, 1, "x/y")]
+        await attempt.record_checkpoint(manifest, is_progress=True)
+        some = [ResultFile("scene.ply", "a" * 64, 1, "x/y"), ResultFile("config.json", "b" * 64, 1, "x/y")]
         await attempt.fail({"type": "export_failed", "message": "mesh.obj: no."}, some)
         failed = (await http.get(address)).json()
         assert failed["state"] == "failed" and failed["checkpoint"] == {"stage": "train", "step": 9}
@@ -135,11 +137,9 @@ def machine(short_root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
 
 
 @pytest.mark.heavy
-def test_a_file_that_fails_leaves_the_rest_and_a_retry_does_not_train_again(
-    machine: Machine, tmp_path: Path
-) -> None:
-    config = GeneratedSceneConfig(views=8, width_px=48, height_px=36, samples_per_side=1, points=500)
-    write_generated_scene(tmp_path / "scene", config)
+def test_failed_export_keeps_other_results_and_retry_skips_training(machine: Machine, tmp_path: Path) -> None:
+    config = SyntheticDatasetConfig(views=8, width_px=48, height_px=36, samples_per_side=1, points=500)
+    write_synthetic_dataset(tmp_path / "scene", config)
     options = {
         "preset": "fast",
         "train": {**TRAIN, "iterations": 50},

@@ -8,7 +8,7 @@ from typing import Any
 
 import httpx
 import pytest
-from service_bench import claimed, committed_dataset, running, stored
+from service_harness import claim_job, committed_dataset, running_service, store_content
 
 sys.path.append(str(Path(__file__).parents[1] / "intake"))
 from model_builder import photograph
@@ -16,7 +16,7 @@ from model_builder import photograph
 from octasplat.service.actions import datasets as actions
 from octasplat.service.intake.dataset import DatasetSummary
 from octasplat.service.state import Service
-from octasplat.workers.queue.attempts import Result
+from octasplat.workers.queue.attempts import ResultFile
 
 ROUNDS = 12
 
@@ -25,7 +25,7 @@ ROUNDS = 12
 def talk(conninfo: str, tmp_path: Path) -> Callable[..., None]:
     def run(conversation: Any, **settings: Any) -> None:
         async def whole() -> None:
-            async with running(conninfo, tmp_path, **settings) as (http, service):
+            async with running_service(conninfo, tmp_path, **settings) as (http, service):
                 await conversation(http, service)
 
         asyncio.run(whole())
@@ -61,7 +61,7 @@ def test_deletions_and_uploads_at_once(talk: Callable[..., None]) -> None:
     talk(conversation)
 
 
-def test_a_dataset_cannot_be_deleted_while_it_is_checked(
+def test_dataset_deletion_during_check_is_refused(
     talk: Callable[..., None], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     async def conversation(http: httpx.AsyncClient, _: Service) -> None:
@@ -84,7 +84,7 @@ def test_a_dataset_cannot_be_deleted_while_it_is_checked(
     talk(conversation)
 
 
-def test_a_job_deleted_by_several_at_once(talk: Callable[..., None]) -> None:
+def test_concurrent_job_deletions_succeed_once(talk: Callable[..., None]) -> None:
     async def conversation(http: httpx.AsyncClient, service: Service) -> None:
         dataset = await committed_dataset(service)
         for _ in range(ROUNDS):
@@ -107,9 +107,9 @@ def test_ranges_with_thousands_of_digits(talk: Callable[..., None], s3_address: 
     async def conversation(http: httpx.AsyncClient, service: Service) -> None:
         dataset = await committed_dataset(service)
         job = (await http.post("/v1/jobs", json={"dataset_id": dataset, "kind": "toy"})).json()
-        sha256 = stored(service, b"0123456789")
-        attempt = await claimed(service, job)
-        await attempt.succeed([Result("a.bin", sha256, 10, "application/octet-stream")])
+        sha256 = store_content(service, b"0123456789")
+        attempt = await claim_job(service, job)
+        await attempt.succeed([ResultFile("a.bin", sha256, 10, "application/octet-stream")])
         address = f"/v1/jobs/{job['id']}/artifacts/a.bin"
         for asked in (f"bytes={'9' * 5000}-", f"bytes=-{'9' * 5000}", f"bytes=0-{'9' * 5000}"):
             answer = await http.get(address, headers={"Range": asked})

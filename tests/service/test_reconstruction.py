@@ -15,9 +15,9 @@ import psutil
 import pytest
 from click.testing import CliRunner
 
-from octasplat.engine.operations.reconstruct import options_of
+from octasplat.engine.dataset.synthetic import SyntheticDatasetConfig, write_synthetic_dataset
+from octasplat.engine.operations.reconstruct import options_from_json
 from octasplat.engine.pipeline import reconstruct
-from octasplat.engine.scene.generated import GeneratedSceneConfig, write_generated_scene
 from octasplat.workers.cli.main import cli
 from octasplat.workers.client.api import Api, ServiceError
 from octasplat.workers.client.download import download_results
@@ -100,15 +100,15 @@ def start(data: Path) -> Machine:
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("served") / "scene"
-    write_generated_scene(
-        root, GeneratedSceneConfig(views=8, width_px=48, height_px=36, samples_per_side=1, points=500)
+    write_synthetic_dataset(
+        root, SyntheticDatasetConfig(views=8, width_px=48, height_px=36, samples_per_side=1, points=500)
     )
     return root
 
 
 @pytest.fixture(scope="module")
 def undisturbed(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    config = options_of(OPTIONS).config()
+    config = options_from_json(OPTIONS).config()
     return reconstruct(scene, tmp_path_factory.mktemp("undisturbed") / "run", config, threads=1)
 
 
@@ -155,7 +155,7 @@ def check_what_is_shown(api: Api, machine: Machine, job: dict[str, Any]) -> None
     assert previews and all(event["data"]["step"] > 0 for event in previews)
 
 
-def test_everything_is_killed_and_the_result_is_the_same(
+def test_reconstruction_after_kills_gives_same_bytes(
     machine: Machine, scene: Path, undisturbed: Path, tmp_path: Path
 ) -> None:
     with machine.api as api:
@@ -171,7 +171,7 @@ def test_everything_is_killed_and_the_result_is_the_same(
             return found
 
         until(lambda job: job["checkpoint"] is not None and job["checkpoint"]["step"] >= 25)
-        for victim in machine.children("octasplat.workers.work.child"):
+        for victim in machine.children("octasplat.workers.worker.child_main"):
             victim.kill()
         until(lambda job: job["attempt"] >= 2 or job["state"] == "succeeded")
         for victim in machine.children("--queues cpu"):
@@ -201,7 +201,7 @@ def test_everything_is_killed_and_the_result_is_the_same(
     assert (tmp_path / "views" / "view_000.png").exists()
 
 
-def test_stop_and_start_go_on_and_other_kinds_use_the_result(
+def test_restarted_service_continues_and_derived_jobs_use_result(
     short_root: Path, scene: Path, undisturbed: Path, tmp_path: Path
 ) -> None:
     machine = start(short_root / "again")
@@ -262,7 +262,7 @@ def test_stop_and_start_go_on_and_other_kinds_use_the_result(
         assert machine.stop() == 0
 
 
-def test_killed_database_comes_back(machine: Machine, scene: Path) -> None:
+def test_killed_database_is_restarted(machine: Machine, scene: Path) -> None:
     with machine.api as api:
         job = submit(api, Submission(scene, OPTIONS))
         while api.get(f"/v1/jobs/{job['id']}")["checkpoint"] is None:
@@ -273,7 +273,7 @@ def test_killed_database_comes_back(machine: Machine, scene: Path) -> None:
         assert done["state"] == "succeeded", done
 
 
-def test_second_service_on_the_same_data_is_refused(machine: Machine) -> None:
+def test_serve_on_locked_data_folder_is_refused(machine: Machine) -> None:
     command = [sys.executable, "-m", "octasplat", "serve", "--data", str(machine.data), "--port", "0"]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=120, check=False)
     assert done.returncode == 1 and "Another octasplat serve" in done.stderr

@@ -14,13 +14,13 @@ import httpx
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from service_bench import running
+from service_harness import running_service
 from test_reconstruction import ROOT
 from test_stage_jobs import HDR, finished, run, sent  # noqa: F401 (a fixture)
 
+from octasplat.engine.dataset.views_file import ViewsRecord
 from octasplat.engine.errors import ConfigError
 from octasplat.engine.files.gaussian_ply import read_gaussian_ply
-from octasplat.engine.scene.views_file import ViewsRecord
 from octasplat.workers.cli.main import cli
 from octasplat.workers.cli.named_files import with_named_files
 from octasplat.workers.client.submission import Derivation
@@ -38,9 +38,9 @@ def octasplat(*arguments: object) -> None:
     assert done.exit_code == 0, done.output
 
 
-def test_what_cannot_be_done_is_refused_before_it_is_queued(conninfo: str, tmp_path: Path) -> None:
+def test_scene_job_invalid_options_are_refused_before_queueing(conninfo: str, tmp_path: Path) -> None:
     async def conversation() -> None:
-        async with running(conninfo, tmp_path) as (http, service):
+        async with running_service(conninfo, tmp_path) as (http, service):
             source = await finished(http, service, {"scene.ply": b"ply"})
             files = await sent(http, {"a.ply": b"ply\n", "sky.hdr": HDR, "turn.txt": b"1 0 0 0"})
             on = {"source_id": source, "files_id": files}
@@ -171,7 +171,7 @@ def test_jobs_give_the_scenes_of_the_commands(
     octasplat("deform", source, *deformed, "-o", tmp_path / "deform.ply")
 
     async def conversation() -> None:
-        async with running(conninfo, tmp_path, kind_modules=()) as (http, service):
+        async with running_service(conninfo, tmp_path, kind_modules=()) as (http, service):
             jobs = Jobs(http)
             whole = await finished(http, service, {name: (source / name).read_bytes() for name in RUN_FILES})
 

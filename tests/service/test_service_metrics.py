@@ -10,12 +10,12 @@ from typing import Any
 import httpx
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
-from service_bench import claimed, committed_dataset, running, with_token
+from service_harness import claim_job, client_with_token, committed_dataset, running_service
 
 from octasplat.service.state import Service
-from octasplat.workers.queue.rescue import Suspects, rescue_lost_jobs
-from octasplat.workers.records.ids import new_id
-from octasplat.workers.records.workers import see_worker
+from octasplat.workers.db.ids import new_id
+from octasplat.workers.db.workers import record_worker_heartbeat
+from octasplat.workers.queue.recovery import StalledAttempts, recover_stalled_jobs
 
 Conversation = Callable[[httpx.AsyncClient, Service], Awaitable[None]]
 PNG = bytes.fromhex(
@@ -28,7 +28,7 @@ PNG = bytes.fromhex(
 def talk(conninfo: str, tmp_path: Path) -> Callable[..., None]:
     def run(conversation: Conversation, **settings: Any) -> None:
         async def whole() -> None:
-            async with running(conninfo, tmp_path, **settings) as (http, service):
+            async with running_service(conninfo, tmp_path, **settings) as (http, service):
                 await conversation(http, service)
 
         asyncio.run(whole())
@@ -65,12 +65,14 @@ def test_numbers_are_those_of_the_tables(talk: Callable[..., None]) -> None:
             await new_job(http, dataset, queue="large")
         ]
         async with service.pool.connection() as connection:
-            await see_worker(connection, new_id(), name="w", queues=["cpu", "large"], slots=3, facts={})
+            await record_worker_heartbeat(
+                connection, new_id(), name="w", queues=["cpu", "large"], slots=3, facts={}
+            )
             await connection.execute("UPDATE workers SET seen_at = now() - interval '7 seconds'")
             await connection.execute("UPDATE jobs SET queued_at = now() - interval '90 seconds'")
-        first = await claimed(service, jobs[0])
-        await claimed(service, jobs[1])
-        await (await claimed(service, jobs[2])).succeed([])
+        first = await claim_job(service, jobs[0])
+        await claim_job(service, jobs[1])
+        await (await claim_job(service, jobs[2])).succeed([])
         async with service.pool.connection() as connection:
             await connection.execute(
                 "UPDATE jobs SET heartbeat_at = now() - interval '9 s' WHERE state = 'running'"
@@ -94,10 +96,10 @@ def test_rescues_and_poison_are_counted_and_outlive_the_job(talk: Callable[..., 
     async def conversation(http: httpx.AsyncClient, service: Service) -> None:
         job = await new_job(http, await committed_dataset(service))
         for _ in range(4):
-            await claimed(service, job)
+            await claim_job(service, job)
             async with service.pool.connection() as connection:
                 await connection.execute("UPDATE jobs SET heartbeat_at = now() - interval '1 hour'")
-            assert await rescue_lost_jobs(service.pool, service.slips, 20, Suspects(0.0)) == 1
+            assert await recover_stalled_jobs(service.pool, service.job_queue, 20, StalledAttempts(0.0)) == 1
         assert (await http.get(f"/v1/jobs/{job['id']}")).json()["state"] == "failed"
         assert (await http.delete(f"/v1/jobs/{job['id']}")).status_code == 204
         seen = await read(http)
@@ -126,7 +128,7 @@ def test_uploads_and_webhooks_are_counted(talk: Callable[..., None]) -> None:
 
 def test_metrics_need_a_token_where_there_are_any(talk: Callable[..., None]) -> None:
     async def conversation(http: httpx.AsyncClient, service: Service) -> None:
-        reader = await with_token(service, f"u{uuid.uuid4().hex[:5]}", "read")
+        reader = await client_with_token(service, f"u{uuid.uuid4().hex[:5]}", "read")
         assert (await http.get("/metrics")).status_code == 401
         assert await read(http, **reader)
 

@@ -8,7 +8,7 @@ from typing import Any
 import httpx
 import pytest
 from pydantic import SecretStr
-from service_bench import running, with_token
+from service_harness import client_with_token, running_service
 
 from octasplat.engine.errors import ConfigError
 from octasplat.service.state import Service
@@ -21,7 +21,7 @@ BEHIND_TLS = {"X-Forwarded-Proto": "https", "X-Forwarded-For": "203.0.113.9"}
 def talk(conninfo: str, tmp_path: Path) -> Callable[..., None]:
     def run(conversation: Conversation, **settings: Any) -> None:
         async def whole() -> None:
-            async with running(conninfo, tmp_path, **settings) as (http, service):
+            async with running_service(conninfo, tmp_path, **settings) as (http, service):
                 await conversation(http, service)
 
         asyncio.run(whole())
@@ -47,9 +47,9 @@ async def audit(http: httpx.AsyncClient, headers: dict[str, str]) -> list[dict[s
     return entries
 
 
-def test_a_cookie_is_a_session_and_no_token(talk: Callable[..., None]) -> None:
+def test_session_cookie_does_not_contain_token(talk: Callable[..., None]) -> None:
     async def conversation(http: httpx.AsyncClient, service: Service) -> None:
-        bearer = await with_token(service, "me", "admin")
+        bearer = await client_with_token(service, "me", "admin")
         secret = bearer["Authorization"].split()[1]
         line, mine = await sign_in(http, secret)
         assert secret not in line and "HttpOnly" in line and "SameSite=strict" in line
@@ -70,7 +70,7 @@ def test_a_cookie_is_a_session_and_no_token(talk: Callable[..., None]) -> None:
 
 def test_sessions_and_tokens_run_out(talk: Callable[..., None]) -> None:
     async def conversation(http: httpx.AsyncClient, service: Service) -> None:
-        boss = await with_token(service, "boss", "admin")
+        boss = await client_with_token(service, "boss", "admin")
         new = {"name": "n", "owner": "me", "scopes": ["write"], "hours": 1}
         made = (await http.post("/v1/tokens", json=new, headers=boss)).json()
         bearer = {"Authorization": f"Bearer {made['token']}"}
@@ -85,9 +85,9 @@ def test_sessions_and_tokens_run_out(talk: Callable[..., None]) -> None:
     talk(conversation, session_hours=0.5)
 
 
-def test_another_token_in_the_environment_shuts_the_first_out(conninfo: str, tmp_path: Path) -> None:
+def test_environment_token_change_revokes_previous(conninfo: str, tmp_path: Path) -> None:
     async def start(secret: str) -> dict[str, int]:
-        async with running(conninfo, tmp_path, token=SecretStr(secret)) as (http, _):
+        async with running_service(conninfo, tmp_path, token=SecretStr(secret)) as (http, _):
             return {s: await status(http, {"Authorization": f"Bearer {s}"}) for s in ("first", "second")}
 
     assert asyncio.run(start("first")) == {"first": 200, "second": 401}
@@ -96,9 +96,9 @@ def test_another_token_in_the_environment_shuts_the_first_out(conninfo: str, tmp
     assert asyncio.run(start("first")) == {"first": 401, "second": 200}  # and it does not come back
 
 
-def test_cookies_are_safe_behind_a_proxy_that_is_named(talk: Callable[..., None]) -> None:
+def test_cookies_behind_trusted_tls_proxy_are_secure(talk: Callable[..., None]) -> None:
     async def conversation(http: httpx.AsyncClient, service: Service) -> None:
-        secret = (await with_token(service, "me", "admin"))["Authorization"].split()[1]
+        secret = (await client_with_token(service, "me", "admin"))["Authorization"].split()[1]
         line, mine = await sign_in(http, secret, **BEHIND_TLS)
         assert line.startswith("__Host-") and "; Secure" in line and "Domain" not in line
         assert "Path=/" in line
@@ -116,9 +116,9 @@ def test_cookies_are_safe_behind_a_proxy_that_is_named(talk: Callable[..., None]
     talk(conversation, proxies=("127.0.0.0/8",), token=SecretStr("another"))
 
 
-def test_nobody_else_is_believed_about_a_client(talk: Callable[..., None]) -> None:
+def test_proxy_headers_of_untrusted_clients_are_ignored(talk: Callable[..., None]) -> None:
     async def conversation(http: httpx.AsyncClient, service: Service) -> None:
-        secret = (await with_token(service, "me", "admin"))["Authorization"].split()[1]
+        secret = (await client_with_token(service, "me", "admin"))["Authorization"].split()[1]
         for headers in (BEHIND_TLS, {"Forwarded": "for=203.0.113.9;proto=https"}):
             line, mine = await sign_in(http, secret, **headers)
             assert not line.startswith("__Host-") and "Secure" not in line
@@ -144,7 +144,7 @@ def test_the_nearest_hop_counts(
     talk: Callable[..., None], dialect: str, headers: dict[str, str], address: str, is_secure: bool
 ) -> None:
     async def conversation(http: httpx.AsyncClient, service: Service) -> None:
-        secret = (await with_token(service, "me", "admin"))["Authorization"].split()[1]
+        secret = (await client_with_token(service, "me", "admin"))["Authorization"].split()[1]
         line, mine = await sign_in(http, secret, **headers)
         assert ("; Secure" in line) == is_secure
         assert (await audit(http, mine))[0]["address"] == address
@@ -157,7 +157,7 @@ def test_the_nearest_hop_counts(
     )
 
 
-def test_a_proxy_without_tokens_is_refused(talk: Callable[..., None]) -> None:
+def test_proxied_request_without_tokens_is_refused(talk: Callable[..., None]) -> None:
     async def conversation(http: httpx.AsyncClient, _service: Service) -> None:
         assert await status(http, {}) == 200
         for headers in (BEHIND_TLS, {"Forwarded": "for=203.0.113.9"}, {"X-Real-IP": "203.0.113.9"}):
@@ -169,9 +169,9 @@ def test_a_proxy_without_tokens_is_refused(talk: Callable[..., None]) -> None:
         talk(conversation, proxies=("127.0.0.1",))
 
 
-def test_guessing_is_slow_and_keeps_nobody_else_waiting(talk: Callable[..., None]) -> None:
+def test_wrong_tokens_are_throttled_per_address(talk: Callable[..., None]) -> None:
     async def conversation(http: httpx.AsyncClient, service: Service) -> None:
-        mine = await with_token(service, "me", "admin")
+        mine = await client_with_token(service, "me", "admin")
         assert await status(http, mine) == 200
         pending: set[asyncio.Task[httpx.Response]] = set()
         done: set[asyncio.Task[httpx.Response]] = set()
@@ -189,10 +189,10 @@ def test_guessing_is_slow_and_keeps_nobody_else_waiting(talk: Callable[..., None
     talk(conversation, wrong_token_seconds=60.0)
 
 
-def test_it_is_written_down_who_did_what(talk: Callable[..., None]) -> None:
+def test_audit_log_records_changes(talk: Callable[..., None]) -> None:
     async def conversation(http: httpx.AsyncClient, service: Service) -> None:
-        boss = await with_token(service, "boss", "admin")
-        mine = await with_token(service, "me", "read")
+        boss = await client_with_token(service, "boss", "admin")
+        mine = await client_with_token(service, "me", "read")
         new = {"name": "n", "owner": "me", "scopes": ["write"]}
         made = (await http.post("/v1/tokens", json=new, headers=boss)).json()
         assert (await http.post("/v1/tokens", json=new, headers=mine)).status_code == 403
@@ -215,9 +215,9 @@ def test_it_is_written_down_who_did_what(talk: Callable[..., None]) -> None:
     talk(conversation)
 
 
-def test_a_link_signs_in_once(talk: Callable[..., None]) -> None:
+def test_sign_in_link_works_once(talk: Callable[..., None]) -> None:
     async def conversation(http: httpx.AsyncClient, service: Service) -> None:
-        mine = await with_token(service, "me", "write")
+        mine = await client_with_token(service, "me", "write")
         path = (await http.post("/v1/sign-in-links", headers=mine)).json()["path"]
         assert (await http.head(path)).status_code == 405  # looking at it does not use it up
         answer = await http.get(path)

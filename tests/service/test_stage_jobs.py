@@ -16,18 +16,18 @@ import httpx
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from service_bench import claimed, committed_dataset, running, stored
+from service_harness import claim_job, committed_dataset, running_service, store_content
 from test_reconstruction import ROOT
 
+from octasplat.engine.dataset.synthetic import SyntheticDatasetConfig, write_synthetic_dataset
 from octasplat.engine.files.gaussian_ply import read_gaussian_ply
-from octasplat.engine.operations.reconstruct import options_of
+from octasplat.engine.operations.reconstruct import options_from_json
 from octasplat.engine.pipeline import reconstruct
-from octasplat.engine.render.images import write_png
-from octasplat.engine.scene.generated import GeneratedSceneConfig, write_generated_scene
+from octasplat.engine.render.image_files import write_png
 from octasplat.service.state import Service
 from octasplat.workers.cli.main import cli
-from octasplat.workers.queue.attempts import Result
-from octasplat.workers.records.locks import lock_owner
+from octasplat.workers.db.locks import lock_owner
+from octasplat.workers.queue.attempts import ResultFile
 
 TRIANGLE = b"v 0 0 0\nv .3 0 0\nv 0 -.3 0\nf 1 2 3\n"
 HDR = b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 2 +X 2\n" + bytes([128, 128, 128, 128] * 4)
@@ -38,7 +38,7 @@ Conversation = Callable[[httpx.AsyncClient, Service], Awaitable[None]]
 def talk(conninfo: str, tmp_path: Path) -> Callable[..., None]:
     def run(conversation: Conversation, **settings: Any) -> None:
         async def whole() -> None:
-            async with running(conninfo, tmp_path, **settings) as (http, service):
+            async with running_service(conninfo, tmp_path, **settings) as (http, service):
                 await conversation(http, service)
 
         asyncio.run(whole())
@@ -56,12 +56,16 @@ async def finished(http: httpx.AsyncClient, service: Service, files: dict[str, b
             await connection.execute(
                 "INSERT INTO dataset_files (dataset_id, path, sha256, size_bytes, facts) "
                 "VALUES (%s, %s, %s, 1, %s)",
-                [dataset, f"images/{number}.png", stored(service, b"x"), facts],
+                [dataset, f"images/{number}.png", store_content(service, b"x"), facts],
             )
     job = (await http.post("/v1/jobs", json={"dataset_id": dataset})).json()
-    attempt = await claimed(service, job)
+    attempt = await claim_job(service, job)
     await attempt.succeed(
-        [Result(name, stored(service, content), len(content), "x/y") for name, content in files.items()], 20.0
+        [
+            ResultFile(name, store_content(service, content), len(content), "x/y")
+            for name, content in files.items()
+        ],
+        20.0,
     )
     return str(job["id"])
 
@@ -105,7 +109,7 @@ BAD = [
 ]  # fmt: skip
 
 
-def test_a_bad_stage_is_a_problem_that_names_the_key(talk: Callable[..., None]) -> None:
+def test_invalid_stage_problem_names_key(talk: Callable[..., None]) -> None:
     async def conversation(http: httpx.AsyncClient, service: Service) -> None:
         source = await finished(http, service, {"scene.ply": b"ply"})
         files = await sent(http, {"thing.obj": TRIANGLE})
@@ -192,8 +196,8 @@ FRAMES = {"frames": 6, "width_px": 32, "height_px": 24}
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run of a moment, and a stage beside it."""
     root = tmp_path_factory.mktemp("staged")
-    config = GeneratedSceneConfig(views=8, width_px=48, height_px=36, samples_per_side=1, points=500)
-    write_generated_scene(root / "scene", config)
+    config = SyntheticDatasetConfig(views=8, width_px=48, height_px=36, samples_per_side=1, points=500)
+    write_synthetic_dataset(root / "scene", config)
     train = {
         "iterations": 20,
         "rays_per_batch": 512,
@@ -201,7 +205,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
         "initial_points": 400,
         "densify_from_iter": 0,
     }
-    asked = options_of({"preset": "fast", "train": train, "exports": ["mesh.ply"]})
+    asked = options_from_json({"preset": "fast", "train": train, "exports": ["mesh.ply"]})
     reconstruct(root / "scene", root / "run", asked.config(), threads=1)
     (root / "things").mkdir()
     (root / "things" / "t").mkdir()
@@ -217,9 +221,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.heavy
-def test_a_killed_film_goes_on_at_another_worker_with_the_bytes_of_the_command(
-    conninfo: str, tmp_path: Path, run: Path
-) -> None:
+def test_killed_render_job_resumes_to_command_bytes(conninfo: str, tmp_path: Path, run: Path) -> None:
     from octasplat.workers.client.submission import Derivation, with_stage
 
     stage = run / "stages" / "stage.toml"
@@ -247,7 +249,7 @@ def test_a_killed_film_goes_on_at_another_worker_with_the_bytes_of_the_command(
         )  # fmt: skip
 
     async def conversation() -> None:
-        async with running(conninfo, tmp_path, kind_modules=()) as (http, service):
+        async with running_service(conninfo, tmp_path, kind_modules=()) as (http, service):
             names = ("scene.ply", "config.json", "held_out.json", "views.json")
             source = await finished(
                 http, service, {name: (run / "run" / name).read_bytes() for name in names}

@@ -30,7 +30,7 @@ def test_database_that_is_down(tmp_path: Path) -> None:
     assert "hush" not in line
 
 
-def test_no_database_at_all(tmp_path: Path) -> None:
+def test_serve_without_database_is_refused(tmp_path: Path) -> None:
     done = start(OCTASPLAT_DATA=str(tmp_path))
     assert done.returncode == 1 and "Traceback" not in done.stderr
     assert len(done.stderr.splitlines()) == 1 and done.stderr.startswith("Error: ")

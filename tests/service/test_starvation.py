@@ -7,7 +7,7 @@ from typing import Any
 
 import httpx
 import pytest
-from service_bench import running
+from service_harness import running_service
 
 from octasplat.service.actions import datasets as actions
 from octasplat.service.intake.dataset import DatasetSummary
@@ -35,10 +35,10 @@ def slow_checks(monkeypatch: pytest.MonkeyPatch) -> Any:
     return most
 
 
-def test_commits_keep_nobody_else_waiting(conninfo: str, tmp_path: Path, slow_checks: Any) -> None:
+def test_dataset_checks_do_not_block_other_requests(conninfo: str, tmp_path: Path, slow_checks: Any) -> None:
     async def whole() -> None:
         settings = {"max_checks": 2, "max_waiting_checks": 16}
-        async with running(conninfo, tmp_path, **settings) as (http, _):
+        async with running_service(conninfo, tmp_path, **settings) as (http, _):
             addresses = [await new_dataset(http) for _ in range(13)]
             commits = {asyncio.create_task(http.post(f"{address}/commit")) for address in addresses}
             while sum(task.done() for task in commits) < 4:  # nine of eighteen places are one owner's

@@ -4,7 +4,7 @@ import asyncio
 from pathlib import Path
 
 from click.testing import CliRunner
-from service_bench import running
+from service_harness import running_service
 from test_stage_jobs import finished
 
 from octasplat.workers.cli.main import cli
@@ -22,7 +22,7 @@ def test_options_are_refused_with_the_sentence_of_the_command(conninfo: str, tmp
     )
 
     async def conversation() -> None:
-        async with running(conninfo, tmp_path) as (http, service):
+        async with running_service(conninfo, tmp_path) as (http, service):
             source = await finished(http, service, {"scene.ply": b"ply", "environment.hdr": b"hdr"})
             for kind, path, flag, text in cases:
                 name, _, part = path.partition("/")

@@ -22,12 +22,12 @@ import pytest
 from PIL import Image
 
 sys.path.append(str(Path(__file__).parents[1] / "intake"))  # the builders of archives and models
-from model_builder import Model, photograph, photographs
-from zip_builder import Member, build
+from model_builder import ColmapModelBuilder, photograph, photographs
+from zip_builder import ZipMember, build_zip
 
 from octasplat.service.app import create_app
 from octasplat.service.settings import ServiceSettings
-from octasplat.workers.store.local import LocalStorage
+from octasplat.workers.storage.local import LocalStorage
 
 ROOT = Path(__file__).parents[2]
 
@@ -81,10 +81,10 @@ def assert_problem(answer: httpx.Response, status: int, code: str) -> dict[str, 
     return problem
 
 
-def test_file_by_file(talk: Talk, tmp_path: Path) -> None:
+def test_upload_single_files_and_commit(talk: Talk, tmp_path: Path) -> None:
     async def conversation(http: httpx.AsyncClient) -> None:
         dataset = await new_dataset(http)
-        files = {**photographs(), **Model().files()}
+        files = {**photographs(), **ColmapModelBuilder().files()}
         for name, data in files.items():
             answer = await http.put(f"{dataset}/files/{name}", content=data, headers=repr_digest(data))
             assert answer.status_code == 201, answer.text
@@ -105,10 +105,10 @@ def test_file_by_file(talk: Talk, tmp_path: Path) -> None:
     assert not list((tmp_path / "store" / "staging").iterdir())
 
 
-def test_an_archive(talk: Talk, tmp_path: Path) -> None:
-    files = {**photographs(), **Model().files()}
-    data = build(
-        *(Member(f"fox/{name}", content) for name, content in files.items()), Member("fox/x.md", b"x")
+def test_upload_archive_and_commit(talk: Talk, tmp_path: Path) -> None:
+    files = {**photographs(), **ColmapModelBuilder().files()}
+    data = build_zip(
+        *(ZipMember(f"fox/{name}", content) for name, content in files.items()), ZipMember("fox/x.md", b"x")
     )
 
     async def conversation(http: httpx.AsyncClient) -> None:
@@ -123,23 +123,27 @@ def test_an_archive(talk: Talk, tmp_path: Path) -> None:
 
 
 ARCHIVES = {
-    "name-traversal": lambda: build(Member("../evil.jpg", b"x")),
-    "name-absolute": lambda: build(Member("/etc/cron.d/evil", b"x")),
-    "name-drive": lambda: build(Member("C:/evil.jpg", b"x")),
-    "name-twin": lambda: build(Member("images/a.png", photograph()), Member("images/A.png", photograph())),
-    "archive-link": lambda: build(Member("images/a.png", b"/etc/passwd", mode=0o120777)),
-    "archive-ratio": lambda: build(Member("images/a.bmp", bytes(20_000_000))),
-    "archive-data-after-end": lambda: build(Member("images/a.png", photograph()), suffix=b"x"),
-    "archive-mismatch": lambda: build(Member("images/a.png", photograph(), local={"name": b"images/b.png"})),
-    "archive-nested": lambda: build(Member("images/a.zip", b"x")),
+    "name-traversal": lambda: build_zip(ZipMember("../evil.jpg", b"x")),
+    "name-absolute": lambda: build_zip(ZipMember("/etc/cron.d/evil", b"x")),
+    "name-drive": lambda: build_zip(ZipMember("C:/evil.jpg", b"x")),
+    "name-twin": lambda: build_zip(
+        ZipMember("images/a.png", photograph()), ZipMember("images/A.png", photograph())
+    ),
+    "archive-link": lambda: build_zip(ZipMember("images/a.png", b"/etc/passwd", mode=0o120777)),
+    "archive-ratio": lambda: build_zip(ZipMember("images/a.bmp", bytes(20_000_000))),
+    "archive-data-after-end": lambda: build_zip(ZipMember("images/a.png", photograph()), suffix=b"x"),
+    "archive-mismatch": lambda: build_zip(
+        ZipMember("images/a.png", photograph(), local={"name": b"images/b.png"})
+    ),
+    "archive-nested": lambda: build_zip(ZipMember("images/a.zip", b"x")),
     "archive-kind": lambda: b"\x1f\x8b\x08" + bytes(600),
     "archive-damaged": lambda: b"hello",
-    "image-kind": lambda: build(Member("images/a.png", b"<svg>")),
+    "image-kind": lambda: build_zip(ZipMember("images/a.png", b"<svg>")),
 }
 
 
 @pytest.mark.parametrize("code", ARCHIVES)
-def test_hostile_archives(talk: Talk, tmp_path: Path, code: str) -> None:
+def test_upload_hostile_archive_is_refused(talk: Talk, tmp_path: Path, code: str) -> None:
     async def conversation(http: httpx.AsyncClient) -> None:
         dataset = await new_dataset(http)
         problem = assert_problem(await http.put(f"{dataset}/archive", content=ARCHIVES[code]()), 422, code)
@@ -186,16 +190,16 @@ def test_hostile_names_and_contents_of_single_files(talk: Talk) -> None:
 
 
 MODELS = {
-    "name-traversal": lambda: Model().with_image(name="../../../../etc/passwd"),
-    "model-pose": lambda: Model().with_image(quat_wxyz=(0, 0, 0, 0)),
-    "model-camera": lambda: Model().with_camera(params=(-1, 31, 16, 12)),
-    "model-size": lambda: Model().with_camera(width=24, height=32),
-    "model-image-missing": lambda: Model().with_image(name="v9.png"),
-    "model-damaged": lambda: replace(Model(), counts={"points3D": 2**40}),
+    "name-traversal": lambda: ColmapModelBuilder().with_image(name="../../../../etc/passwd"),
+    "model-pose": lambda: ColmapModelBuilder().with_image(quat_wxyz=(0, 0, 0, 0)),
+    "model-camera": lambda: ColmapModelBuilder().with_camera(params=(-1, 31, 16, 12)),
+    "model-size": lambda: ColmapModelBuilder().with_camera(width=24, height=32),
+    "model-image-missing": lambda: ColmapModelBuilder().with_image(name="v9.png"),
+    "model-damaged": lambda: replace(ColmapModelBuilder(), counts={"points3D": 2**40}),
 }
 
 
-def test_hostile_models_are_listed_and_can_be_mended(talk: Talk) -> None:
+def test_upload_hostile_model_lists_faults_and_can_be_replaced(talk: Talk) -> None:
     async def conversation(http: httpx.AsyncClient) -> None:
         dataset = await new_dataset(http)
         for name, data in photographs().items():
@@ -207,14 +211,14 @@ def test_hostile_models_are_listed_and_can_be_mended(talk: Talk) -> None:
             assert problem["errors"][0]["pointer"].startswith("#/files/sparse~10~1")
             assert problem["errors"][0]["file"].startswith("sparse/0/")
             assert (await http.get(dataset)).json()["state"] == "open"
-        for name, data in Model().files().items():
+        for name, data in ColmapModelBuilder().files().items():
             await http.put(f"{dataset}/files/{name}", content=data)
         assert (await http.post(f"{dataset}/commit")).status_code == 200
 
     talk(conversation)
 
 
-def test_limits_of_length(talk: Talk) -> None:
+def test_upload_too_long_is_refused(talk: Talk) -> None:
     async def conversation(http: httpx.AsyncClient) -> None:
         dataset = await new_dataset(http)
         answer = await http.put(f"{dataset}/files/images/a.png", content=bytes(5000))
@@ -231,7 +235,7 @@ def test_limits_of_length(talk: Talk) -> None:
     talk(conversation, max_upload_bytes=4000, max_archive_bytes=8000)
 
 
-def test_quotas(talk: Talk) -> None:
+def test_upload_beyond_quota_is_refused(talk: Talk) -> None:
     size = len(photograph())
 
     async def conversation(http: httpx.AsyncClient) -> None:
@@ -248,8 +252,8 @@ def test_quotas(talk: Talk) -> None:
             if answer.status_code != 201:
                 break
         assert "left of what you may store" in assert_problem(answer, 413, "quota-bytes")["detail"]
-        archive = build(
-            Member("images/z.png", photograph(40, 40)), Member("images/y.png", photograph(50, 40))
+        archive = build_zip(
+            ZipMember("images/z.png", photograph(40, 40)), ZipMember("images/y.png", photograph(50, 40))
         )
         answer = await http.put(f"{dataset}/archive", content=archive)
         assert answer.status_code == 413 or answer.json()["type"].endswith("archive-too-large"), answer.text
@@ -266,7 +270,7 @@ def test_quotas(talk: Talk) -> None:
 def test_jobs_have_a_quota(talk: Talk) -> None:
     async def conversation(http: httpx.AsyncClient) -> None:
         dataset = await new_dataset(http)
-        for name, data in {**photographs(), **Model().files()}.items():
+        for name, data in {**photographs(), **ColmapModelBuilder().files()}.items():
             await http.put(f"{dataset}/files/{name}", content=data)
         await http.post(f"{dataset}/commit")
         body = {"kind": "reconstruct", "dataset_id": dataset.rpartition("/")[2]}
@@ -279,11 +283,13 @@ def test_jobs_have_a_quota(talk: Talk) -> None:
     talk(conversation, quota_jobs=2)
 
 
-def test_a_photograph_that_was_cut_off_is_named(talk: Talk) -> None:
+def test_upload_truncated_photograph_is_named(talk: Talk) -> None:
     picture = io.BytesIO()
     Image.effect_noise((160, 120), 80).convert("RGB").save(picture, "JPEG")
     cut = picture.getvalue()[: len(picture.getvalue()) * 3 // 4]
-    archive = build(*(Member(name, data) for name, data in {**photographs(), "images/v0.jpg": cut}.items()))
+    archive = build_zip(
+        *(ZipMember(name, data) for name, data in {**photographs(), "images/v0.jpg": cut}.items())
+    )
 
     async def conversation(http: httpx.AsyncClient) -> None:
         dataset = await new_dataset(http)
@@ -300,7 +306,7 @@ def test_a_photograph_that_was_cut_off_is_named(talk: Talk) -> None:
     talk(conversation)
 
 
-def test_a_disk_below_its_floor(talk: Talk) -> None:
+def test_upload_on_low_disk_is_refused(talk: Talk) -> None:
     async def conversation(http: httpx.AsyncClient) -> None:
         dataset = await new_dataset(http)
         for path in ("files/images/a.png", "archive"):
@@ -388,7 +394,7 @@ def test_memory_does_not_grow_with_the_upload(
     assert grown < 16 << 10
 
 
-def test_a_killed_service_keeps_whole_files_only(
+def test_upload_to_killed_service_keeps_complete_files_only(
     start_server: Callable[[], tuple[int, Path]], tmp_path: Path
 ) -> None:
     content = os.urandom(1 << 20) * 24
@@ -412,7 +418,7 @@ def test_a_killed_service_keeps_whole_files_only(
         with pytest.raises(httpx.TransportError):
             http.put(f"{dataset}/files/{name}", content=slow_body(), headers=digest)
     storage = LocalStorage(tmp_path / "store", floor_bytes=0)
-    assert len(list(storage.blobs())) == 1
+    assert len(list(storage.list_blobs())) == 1
     _, socket = start_server()
     with connect(socket) as http:
         arrived = http.get(f"{dataset}/files").json()["files"]
@@ -420,6 +426,6 @@ def test_a_killed_service_keeps_whole_files_only(
         answer = http.put(f"{dataset}/files/{name}", content=content, headers=digest)
         assert answer.status_code == 201, answer.text
         assert http.get(f"{dataset}/files/{name}").content == content
-    assert storage.sweep(-60) == 1  # what the killed upload left, for the next sweep
-    assert len(list(storage.blobs())) == 2
+    assert storage.remove_stale_uploads(-60) == 1  # what the killed upload left, for the next sweep
+    assert len(list(storage.list_blobs())) == 2
     storage.close()

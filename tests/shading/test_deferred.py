@@ -8,8 +8,8 @@ import pytest
 
 from octasplat.engine.errors import Cancelled
 from octasplat.engine.events import Event, HeldOutMeasured
-from octasplat.engine.gaussians.channels import stacked
-from octasplat.engine.gaussians.frames import frames_from_normals, quaternions
+from octasplat.engine.gaussians.channels import stack_channels
+from octasplat.engine.gaussians.frames import frames_from_normals, quaternions_from_matrices
 from octasplat.engine.gaussians.model import FlatGaussians, concatenate
 from octasplat.engine.rays import RayBatch
 from octasplat.engine.shading.ambient import ambient_visibility, bounced_light
@@ -18,8 +18,8 @@ from octasplat.engine.shading.deferred import Deferred
 from octasplat.engine.shading.material_settings import MaterialSettings
 from octasplat.engine.shading.protocol import Sight
 from octasplat.engine.trace.cpu.tracer import CpuTracer
+from octasplat.engine.trace.gradient_sums import add_gradients
 from octasplat.engine.trace.protocol import TraceSettings
-from octasplat.engine.trace.sums import add_gradients
 from octasplat.engine.train.batches import BatchSource
 from octasplat.engine.train.checkpoint import latest_checkpoint, load_checkpoint
 from octasplat.engine.train.initialise import with_first_materials
@@ -30,7 +30,7 @@ from octasplat.engine.train.trainer import Trainer
 
 sys.path.append(str(Path(__file__).parents[1] / "train"))
 
-from flat_world import FlatWorld, small_config
+from planar_dataset import PlanarDataset, small_config
 
 BARE = {
     "learn": True,
@@ -51,7 +51,9 @@ def wall(normal: tuple[float, float, float], points: np.ndarray, material: list[
     count = len(points)
     gaussians = FlatGaussians(
         points.astype(np.float32),
-        quaternions(frames_from_normals(np.tile(np.array(normal, float), (count, 1)))).astype(np.float32),
+        quaternions_from_matrices(frames_from_normals(np.tile(np.array(normal, float), (count, 1)))).astype(
+            np.float32
+        ),
         np.full((count, 2), np.log(0.1), np.float32),
         np.full(count, 5.0, np.float32),
         np.zeros((count, 1, 3), np.float32),
@@ -74,11 +76,11 @@ def floor(side: float, step: float, above: float = 0.0) -> np.ndarray:
 @pytest.mark.parametrize("indirect", ["shaded", "harmonics"])
 def test_gradients_agree_with_finite_differences(indirect: str) -> None:
     rng = np.random.default_rng(5)
-    world = FlatWorld()
+    world = PlanarDataset()
     settings = MaterialSettings(
         **BARE, indirect=indirect, blur=0.0, ambient_occlusion=False, roughness_probe_fraction=0.0
     )
-    gaussians = with_first_materials(world.start(opacity=0.6), settings)
+    gaussians = with_first_materials(world.initial_gaussians(opacity=0.6), settings)
     gaussians.means_world[:, 2] = rng.permutation(np.linspace(-0.4, 0.4, len(gaussians)))
     for values in gaussians.channels.values():
         values[:] = rng.uniform(0.2, 0.8, values.shape)
@@ -115,7 +117,7 @@ def test_gradients_agree_with_finite_differences(indirect: str) -> None:
         assert (values[0] - values[1]) / 0.04 == pytest.approx(expected, rel=0.03), name
 
 
-def test_what_only_a_mirror_shows_has_gradients_by_how_much_of_it_there_is() -> None:
+def test_deferred_reflected_gaussians_have_opacity_gradients() -> None:
     mirror = wall((0, 0, 1), floor(0.6, 0.1), [0.9, 0.8, 0.7, 1.0, 0.02])
     lid = wall((0, 0, 1), floor(0.3, 0.1, above=0.5), [0.5, 0.3, 0.1, 0.0, 1.0])
     lid.opacity_logits[:] = np.random.default_rng(1).uniform(-2, 0, len(lid))
@@ -135,12 +137,12 @@ def test_what_only_a_mirror_shows_has_gradients_by_how_much_of_it_there_is() -> 
     def look() -> tuple[float, np.ndarray]:
         tracer.build(scene, model.features(scene))
         seen = tracer.trace(rays, record=True)
-        assert seen.hits is not None
+        assert seen.recording is not None
         sight = Sight(rays, seen, tracer, np.zeros(len(rays), np.int64))
         developed = model.develop(sight)
         error = developed.rgb_srgb - target
         back = model.reverse(sight, developed, 2 * error, np.zeros(len(rays), np.float32))
-        recorded = [(seen.hits, back.seen), *back.further]
+        recorded = [(seen.recording, back.seen), *back.further]
         found = add_gradients([tracer.backward(hits, by).numpy() for hits, by in recorded])
         whole = np.zeros(len(scene))
         whole[found.ids] = found.opacity_logits
@@ -155,7 +157,7 @@ def test_what_only_a_mirror_shows_has_gradients_by_how_much_of_it_there_is() -> 
     assert (values[0] - values[1]) / 0.1 == pytest.approx(float((gradient * direction).sum()), rel=0.03)
 
 
-def test_roughness_learns_from_how_sharply_a_lid_is_mirrored() -> None:
+def test_deferred_roughness_gradient_follows_reflection_sharpness() -> None:
     rough = wall((0, 0, 1), floor(0.8, 0.1), [0.9, 0.9, 0.9, 1.0, 0.35])
     lid = wall((0, 0, 1), floor(0.25, 0.1, above=0.6), [0.4, 0.4, 0.4, 0.0, 1.0])
     scene = concatenate([rough, lid])
@@ -175,11 +177,11 @@ def test_roughness_learns_from_how_sharply_a_lid_is_mirrored() -> None:
         """The sum of what is shown, and its gradient by all roughnesses together."""
         tracer.build(scene, model.features(scene))
         seen = tracer.trace(rays, record=True)
-        assert seen.hits is not None
+        assert seen.recording is not None
         sight = Sight(rays, seen, tracer, np.zeros(3000, np.int64))
         developed = model.develop(sight)
         back = model.reverse(sight, developed, ones, np.zeros(3000, np.float32))
-        found = tracer.backward(seen.hits, back.seen).numpy()
+        found = tracer.backward(seen.recording, back.seen).numpy()
         return float(developed.rgb_srgb.sum(dtype=np.float64)), float(found.features[:, 4].sum())
 
     _, found = look()
@@ -194,7 +196,7 @@ def test_roughness_learns_from_how_sharply_a_lid_is_mirrored() -> None:
     assert 0.3 < found / expected < 3
 
 
-def test_a_mirror_shows_what_stands_before_it_and_else_the_environment() -> None:
+def test_deferred_mirror_reflects_gaussians_and_environment() -> None:
     mirror = wall((0, 0, 1), floor(1.0, 0.1), [1, 1, 1, 1, 0.05])
     red = wall((0, 0, 1), floor(1.0, 0.1, above=1.0), [1, 0, 0, 0.0, 1.0])
     settings = MaterialSettings(**BARE, up_world=(0, 0, 1))
@@ -216,7 +218,7 @@ def test_a_mirror_shows_what_stands_before_it_and_else_the_environment() -> None
         np.testing.assert_allclose(linear, expected, atol=0.012)
 
 
-def test_rays_that_leave_a_rough_heap_of_gaussians_are_not_stopped_by_it() -> None:
+def test_deferred_reflection_rays_skip_own_surface() -> None:
     places = floor(1.0, 0.05)
     places[:, 2] = np.random.default_rng(3).uniform(-0.03, 0.03, len(places))
     mirror = wall((0, 0, 1), places, [1, 1, 1, 1, 0.05])
@@ -258,9 +260,7 @@ def test_ambient_visibility_under_a_lid_is_its_form_factor() -> None:
 
 
 @pytest.mark.parametrize("rebuilds", [128, 100, 64, 20])
-def test_every_gaussian_has_its_turn_of_ambient_visibility(
-    rebuilds: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_ambient_visibility_updates_every_gaussian(rebuilds: int, monkeypatch: pytest.MonkeyPatch) -> None:
     settings = MaterialSettings(learn=True, ambient_occlusion_rebuilds=20, secondary_from=0.0)
     gaussians = with_first_materials(wall((0, 0, 1), floor(2, 0.25), [0.5, 0.5, 0.5, 0, 0.5]), settings)
     looked: list[np.ndarray] = []
@@ -287,7 +287,7 @@ def train(
     folder: Path, *, stop_after: int | None = None, threads: int = 1, recipe: str = "split_sum"
 ) -> tuple[Deferred, TrainState, list[float]]:
     """Train materials; with ``stop_after``, stop there and go on from the checkpoint with a fresh model."""
-    world, events = FlatWorld(), list[Event]()
+    world, events = PlanarDataset(), list[Event]()
     materials = {
         "learn": True,
         "environment_height": 16,
@@ -302,7 +302,7 @@ def train(
         iterations=72,
         trace={"flip_normal_cos": 0.0 if recipe == "ref_gaussian" else 0.5},
     )
-    first = with_first_materials(world.start(opacity=0.6), config.materials)
+    first = with_first_materials(world.initial_gaussians(opacity=0.6), config.materials)
     state = fresh_state(first, config.seed)
 
     def trainer(state: TrainState, last: float) -> tuple[Trainer, Deferred]:
@@ -326,13 +326,16 @@ def train(
 @pytest.mark.parametrize(
     ("recipe", "stop_after"), [("split_sum", 40), ("split_sum", 50), ("ref_gaussian", 50)]
 )
-def test_it_trains_stops_and_goes_on_to_the_same_bytes_on_any_threads(
+def test_deferred_training_resumes_to_same_bytes_on_any_threads(
     tmp_path: Path, recipe: str, stop_after: int
 ) -> None:
     whole, state, psnr = train(tmp_path / "whole", recipe=recipe)
     assert psnr[-1] > psnr[0] + (1 if recipe == "split_sum" else 0.3)
     parts, resumed, _ = train(tmp_path / "parts", stop_after=stop_after, threads=2, recipe=recipe)
     assert parts.light.log_radiance.tobytes() == whole.light.log_radiance.tobytes()
-    assert stacked(resumed.gaussians.channels).tobytes() == stacked(state.gaussians.channels).tobytes()
+    assert (
+        stack_channels(resumed.gaussians.channels).tobytes()
+        == stack_channels(state.gaussians.channels).tobytes()
+    )
     assert resumed.gaussians.quats_wxyz.tobytes() == state.gaussians.quats_wxyz.tobytes()
     assert np.ptp(state.gaussians.channels["albedo"]) > 0.05

@@ -23,7 +23,7 @@ from octasplat.engine.train.trainer import Trainer
 
 sys.path.append(str(Path(__file__).parents[1] / "train"))
 
-from flat_world import FlatWorld, small_config
+from planar_dataset import PlanarDataset, small_config
 
 SIDE, WINDOWS, LOOSE = 4, 3, 5
 COUNT = LOOSE + WINDOWS * SIDE**2
@@ -98,16 +98,16 @@ def test_gradients_are_those_of_the_term_and_of_the_model_inside() -> None:
     assert found.transmittance - by_transmittance == pytest.approx(-alpha.grad.numpy(), abs=1e-5)
 
 
-def tilted(world: FlatWorld) -> FlatGaussians:
+def tilted(world: PlanarDataset) -> FlatGaussians:
     """Gaussians on the plane, each turned out of it."""
-    gaussians = world.start(opacity=0.9)
+    gaussians = world.initial_gaussians(opacity=0.9)
     turns = np.random.default_rng(5).normal(0, 0.15, (len(gaussians), 4))
     gaussians.quats_wxyz += turns.astype(np.float32)
     return gaussians
 
 
 def test_tilted_gaussians_lie_down_on_the_plane(tmp_path: Path) -> None:
-    world = FlatWorld()
+    world = PlanarDataset()
 
     def off_degrees(weight: float) -> float:
         config = small_config(loss={"depth_normal": weight}, rays_per_batch=2048, ray_patch_rays=16)

@@ -7,7 +7,7 @@ from octasplat.engine.rays import RayBatch
 from octasplat.engine.shading.geometry_terms import EDGE, depth_normal_term, smoothness_term
 from octasplat.engine.shading.protocol import Sight
 from octasplat.engine.shading.ray_windows import RayWindows
-from octasplat.engine.trace.make import make_tracer
+from octasplat.engine.trace.factory import make_tracer
 from octasplat.engine.trace.protocol import TraceResult, TraceSettings
 from octasplat.engine.train.pixel_sampler import PixelSampler
 
@@ -91,7 +91,7 @@ def test_the_albedo_of_metals_is_held_more(metallic: float, times: float) -> Non
     assert (found[:, 3:] == 0).all()
 
 
-def test_what_is_half_transparent_is_left_alone() -> None:
+def test_geometry_terms_ignore_translucent_pixels() -> None:
     features = np.random.default_rng(1).uniform(0, 0.5, (SIDE**2, 5))
     found, by_alpha = np.zeros_like(features), np.zeros(SIDE**2)
     smoothness_term(sight(features, np.full(SIDE**2, 0.5)), WEIGHTS, METAL, found, by_alpha)

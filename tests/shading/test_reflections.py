@@ -9,8 +9,8 @@ import pytest
 from octasplat.engine.colour import srgb_to_linear
 from octasplat.engine.gaussians.model import concatenate
 from octasplat.engine.rays import ImageRays, RayBatch
-from octasplat.engine.render.oversampling import pixel_means
 from octasplat.engine.render.renderer import background_colour, render_rays
+from octasplat.engine.render.supersampling import pixel_means
 from octasplat.engine.shading.deferred import Deferred
 from octasplat.engine.shading.lobe import (
     Widening,
@@ -60,7 +60,7 @@ def test_facets_lie_on_both_sides_as_far_off_as_the_roughness_says() -> None:
         assert np.median(facets.slope) == pytest.approx(expected, rel=0.05)
 
 
-def test_differences_of_pairs_are_the_slope_by_the_normal_in_the_mean() -> None:
+def test_reflection_pair_differences_estimate_normal_gradient() -> None:
     count = 40_000
     rng = np.random.default_rng(2)
     way = np.tile(unit(np.array([0.5, -0.2, -1.0])), (count, 1)) + rng.normal(scale=1e-6, size=(count, 3))

@@ -21,7 +21,7 @@ from octasplat.engine.shading.split_sum import Surface, shade, shade_reverse, sp
 
 sys.path.append(str(Path(__file__).parent))
 
-from split_sum_twin import twin
+from split_sum_reference import reference_split_sum
 
 HEIGHT = 16
 FRAME = environment_frame(np.array([0.2, 0.3, 0.9]), 25.0)
@@ -86,7 +86,7 @@ def test_levels_of_even_light_are_even_and_those_of_any_are_lobes() -> None:
         assert np.abs(found / expected - 1).mean() < 0.08  # from a halved map
 
 
-def test_the_way_back_through_the_levels_is_the_transpose() -> None:
+def test_prefilter_backward_is_transpose() -> None:
     rng = np.random.default_rng(1)
     radiance = rng.uniform(0, 1, (HEIGHT, 2 * HEIGHT, 3))
     levels = prefilter(HEIGHT).levels(radiance)
@@ -95,14 +95,14 @@ def test_the_way_back_through_the_levels_is_the_transpose() -> None:
     assert (prefilter(HEIGHT).transposed(gradient) * radiance).sum() == pytest.approx(there, rel=1e-4)
 
 
-def test_values_and_gradients_agree_with_the_twin() -> None:
+def test_split_sum_matches_reference() -> None:
     rng = np.random.default_rng(2)
     levels, points = light(rng), surface(rng, 400)
     leaves = [torch.from_numpy(getattr(points, field.name)).clone() for field in fields(points)]
     leaves.append(torch.from_numpy(levels.texels).double())
     for leaf in leaves:
         leaf.requires_grad_()
-    expected = twin(*leaves, levels, FRAME)
+    expected = reference_split_sum(*leaves, levels, FRAME)
     np.testing.assert_allclose(shade(points, levels, FRAME), expected.detach(), rtol=1e-6, atol=1e-9)
     by_rgb = rng.normal(size=expected.shape)
     expected.backward(torch.from_numpy(by_rgb))
@@ -141,7 +141,7 @@ def test_gradients_agree_with_finite_differences() -> None:
         assert (above - below) / 2 == pytest.approx((gradient * step).sum(), rel=1e-3), name
 
 
-def test_another_level_may_lead_the_reflected_direction_and_nothing_else() -> None:
+def test_split_sum_blur_changes_reflected_direction_only() -> None:
     rng = np.random.default_rng(4)
     levels, points = light(rng), surface(rng, 20)
     sharp = shade_reverse(points, levels, FRAME, np.ones((20, 3)))

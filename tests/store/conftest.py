@@ -3,10 +3,10 @@ from pathlib import Path
 
 import pytest
 
-from bucket_for_tests import s3_address, s3_bucket
-from octasplat.workers.store import Storage
-from octasplat.workers.store.local import LocalStorage
-from octasplat.workers.store.s3 import S3Storage
+from octasplat.workers.storage import Storage
+from octasplat.workers.storage.local import LocalStorage
+from octasplat.workers.storage.s3 import S3Storage
+from s3_server import s3_address, s3_bucket
 
 __all__ = ["s3_address", "s3_bucket"]
 

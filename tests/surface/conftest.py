@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from octasplat.engine.gaussians.frames import frames_from_normals, quaternions
+from octasplat.engine.gaussians.frames import frames_from_normals, quaternions_from_matrices
 from octasplat.engine.gaussians.model import SH_C0, FlatGaussians
-from octasplat.engine.surface.mesh import TriangleMesh
+from octasplat.engine.geometry.triangle_mesh import TriangleMesh
 
 
 @pytest.fixture(scope="session")
@@ -20,7 +20,7 @@ def ball() -> FlatGaussians:
     rgb = np.where(height[:, None] > 0, [0.9, 0.1, 0.1], [0.1, 0.1, 0.9])
     return FlatGaussians(
         normals.astype(np.float32),
-        quaternions(frames_from_normals(normals)).astype(np.float32),
+        quaternions_from_matrices(frames_from_normals(normals)).astype(np.float32),
         np.full((count, 2), np.log(scale), np.float32),
         np.full(count, 6.0, np.float32),
         ((rgb - 0.5) / SH_C0).astype(np.float32)[:, None],

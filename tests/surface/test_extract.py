@@ -12,10 +12,10 @@ from surface_shapes import cameras_on_sphere
 from octasplat.engine.errors import Cancelled, ConfigError, SceneFileError
 from octasplat.engine.events import StageFinished
 from octasplat.engine.files import write_surface
-from octasplat.engine.render.images import read_image
-from octasplat.engine.surface.cameras import cameras_around
+from octasplat.engine.geometry.triangle_mesh import TriangleMesh, edge_report
+from octasplat.engine.render.image_files import read_image
+from octasplat.engine.surface.depth_cameras import cameras_around
 from octasplat.engine.surface.extract import ExtractedSurface, extract_levels
-from octasplat.engine.surface.mesh import TriangleMesh, edge_report
 from octasplat.engine.surface.options import ExtractionOptions
 from octasplat.engine.trace.cpu.tracer import CpuTracer
 
@@ -62,7 +62,7 @@ def test_ball_comes_out_closed_round_and_in_its_colours(surface):
 
 def test_expected_depth_is_there_to_choose(tracer, surface, tmp_path):
     other = extracted(tracer, tmp_path, depth="expected").mesh
-    assert edge_report(other.faces).watertight
+    assert edge_report(other.faces).is_watertight
     assert len(other.vertices_world) != len(surface.mesh.vertices_world) or not np.array_equal(
         other.vertices_world, surface.mesh.vertices_world
     )
@@ -81,7 +81,7 @@ def test_texture_has_the_colours_where_its_coordinates_say(textured):
         assert close.mean() > 0.99
 
 
-def test_glb(surface, textured, tmp_path):
+def test_surface_glb_round_trips(surface, textured, tmp_path):
     assert write_surface(surface.mesh, tmp_path / "a.glb") == (tmp_path / "a.glb",)
     seen = trimesh.load(tmp_path / "a.glb", force="mesh", process=False)
     turned = surface.mesh.vertices_world * [1, -1, -1]
@@ -105,7 +105,7 @@ def test_glb_states_its_lengths(surface, tmp_path):
     assert {view["byteOffset"] % 4 for view in document["bufferViews"]} == {0}
 
 
-def test_ply_and_obj(surface, textured, tmp_path):
+def test_surface_ply_and_obj_round_trip(surface, textured, tmp_path):
     for name in ("a.ply", "a.obj"):
         assert write_surface(surface.mesh, tmp_path / name) == (tmp_path / name,)
         seen = trimesh.load(tmp_path / name, process=False)
@@ -134,7 +134,7 @@ def test_files_that_cannot_be(surface, textured, tmp_path):
         write_surface(surface.mesh, tmp_path / "file" / "a.glb")
 
 
-def test_stages_are_told_and_stopping_leaves_nothing(tracer, tmp_path):
+def test_surface_extraction_reports_stages_and_stops_cleanly(tracer, tmp_path):
     options = ExtractionOptions(resolution=32, depth_side=32)
     cameras = cameras_on_sphere(12, 3.0, 32)
     heard = []
@@ -154,16 +154,16 @@ def test_stages_are_told_and_stopping_leaves_nothing(tracer, tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_cameras_around_see_the_whole_ball(ball, tracer, tmp_path):
+def test_surface_default_cameras_cover_ball(ball, tracer, tmp_path):
     cameras = cameras_around(ball, 64, count=40)
     options = ExtractionOptions(resolution=48, depth_side=64)
     (extracted,) = extract_levels(tracer, cameras, options, scratch=tmp_path)
     mesh = extracted.mesh
-    assert edge_report(mesh.faces).watertight
+    assert edge_report(mesh.faces).is_watertight
     assert np.abs(np.linalg.norm(mesh.vertices_world, axis=1) - 1).max() < 0.04
 
 
-def test_contradicting_options():
+def test_surface_contradictory_options_are_refused():
     with pytest.raises(ValueError, match="contradict"):
         ExtractionOptions(unbounded=True, bounds=(0, 0, 0, 1, 1, 1))
     with pytest.raises(ValueError, match="x0 < x1"):

@@ -6,15 +6,15 @@ import numpy as np
 from surface_shapes import cameras_on_sphere, sphere, volume_of
 
 from octasplat.engine.colour import to_bytes
+from octasplat.engine.geometry.triangle_mesh import TriangleMesh, edge_report
 from octasplat.engine.rays import RayBatch
 from octasplat.engine.surface.backdrop import with_backdrop
-from octasplat.engine.surface.fitting import Picture, TexturePalette, VertexPalette, fitted
-from octasplat.engine.surface.marching import surface_of
-from octasplat.engine.surface.mesh import TriangleMesh, edge_report
-from octasplat.engine.surface.settling import settled
-from octasplat.engine.surface.texture import lay_out
-from octasplat.engine.surface.volume import solid_where_unseen
-from octasplat.engine.trace.meshes import TriangleScene
+from octasplat.engine.surface.colour_fit import Picture, TexturePalette, VertexPalette, fit_colours
+from octasplat.engine.surface.marching_cubes import marching_cubes
+from octasplat.engine.surface.texture import unwrap
+from octasplat.engine.surface.tsdf_volume import fill_unseen
+from octasplat.engine.surface.vertex_refinement import refine_vertices
+from octasplat.engine.trace.triangle_bvh import TriangleBvh
 
 
 def painted(points_world: np.ndarray) -> np.ndarray:
@@ -24,19 +24,19 @@ def painted(points_world: np.ndarray) -> np.ndarray:
 
 def pictures_of(mesh: TriangleMesh, count: int = 20) -> list[Picture]:
     """Of the painted surface, before nothing; alpha is one where there is surface."""
-    scene, pictures = TriangleScene(mesh.vertices_world, mesh.faces), []
+    scene, pictures = TriangleBvh(mesh.vertices_world, mesh.faces), []
     for camera in cameras_on_sphere(count, 3.0, 96):
         rays = camera.rays()
         hits = scene.closest(rays.rays)
-        rgba = np.zeros((len(hits.hit), 4), np.float32)
-        at = rays.origin_world + hits.distances[hits.hit, None] * rays.rays.directions_world[hits.hit]
-        rgba[hits.hit, :3], rgba[hits.hit, 3] = painted(at), 1.0
+        rgba = np.zeros((len(hits.is_hit), 4), np.float32)
+        at = rays.origin_world + hits.distances[hits.is_hit, None] * rays.rays.directions_world[hits.is_hit]
+        rgba[hits.is_hit, :3], rgba[hits.is_hit, 3] = painted(at), 1.0
         pictures.append(partial(lambda *both: both, rays, to_bytes(rgba).reshape(96, 96, 4)))
     return pictures
 
 
 def ball() -> TriangleMesh:
-    mesh = surface_of(volume_of(lambda points: sphere(points, 1.0), 3, 0.125), 0.5)
+    mesh = marching_cubes(volume_of(lambda points: sphere(points, 1.0), 3, 0.125), 0.5)
     return TriangleMesh(mesh.vertices_world, mesh.faces)
 
 
@@ -44,28 +44,30 @@ def test_wrong_colours_of_vertices_are_put_right():
     mesh = ball()
     wrong = np.random.default_rng(0).random((len(mesh.vertices_world), 3)).astype(np.float32)
     right = painted(mesh.vertices_world)
-    found, _ = fitted(VertexPalette(mesh), wrong, pictures_of(mesh))
+    found, _ = fit_colours(VertexPalette(mesh), wrong, pictures_of(mesh))
     assert np.abs(found - right).mean() < 0.03 < 0.2 < np.abs(wrong - right).mean()
-    np.testing.assert_allclose(fitted(VertexPalette(mesh), right, pictures_of(mesh))[0], right, atol=0.03)
+    np.testing.assert_allclose(
+        fit_colours(VertexPalette(mesh), right, pictures_of(mesh))[0], right, atol=0.03
+    )
 
 
 def test_wrong_colours_of_a_texture_are_put_right():
-    layout = lay_out(ball(), 128)
+    layout = unwrap(ball(), 128)
     right = painted(layout.points_world)
     wrong = np.full_like(right, 0.5)
-    found, _ = fitted(TexturePalette(layout), wrong, pictures_of(layout.mesh))
+    found, _ = fit_colours(TexturePalette(layout), wrong, pictures_of(layout.mesh))
     assert np.abs(found - right).mean() < 0.03 < 0.2 < np.abs(wrong - right).mean()
 
 
-def test_what_no_picture_shows_stays_as_it_was():
+def test_colour_fit_keeps_unseen_vertices():
     mesh = ball()
     start = np.full((len(mesh.vertices_world), 3), 0.25, np.float32)
-    found, seen = fitted(VertexPalette(mesh), start, [])
+    found, seen = fit_colours(VertexPalette(mesh), start, [])
     np.testing.assert_array_equal(found, start)
     assert not seen.any()
 
 
-def test_a_surface_settles_where_its_pictures_agree():
+def test_vertex_refinement_moves_surface_to_photo_consistency():
     mesh = ball()
     radii = np.linalg.norm(mesh.vertices_world, axis=1, keepdims=True)
     bumps = 1 + 0.03 * np.sin(5 * mesh.vertices_world[:, :1]) * np.cos(4 * mesh.vertices_world[:, 1:2])
@@ -74,7 +76,7 @@ def test_a_surface_settles_where_its_pictures_agree():
     def off(surface: TriangleMesh) -> float:
         return float(np.abs(np.linalg.norm(surface.vertices_world, axis=1) - 1).mean())
 
-    better = settled(bumpy, pictures_of(mesh))
+    better = refine_vertices(bumpy, pictures_of(mesh))
     assert off(better) < 0.7 * off(bumpy)
     np.testing.assert_array_equal(better.faces, bumpy.faces)
 
@@ -85,12 +87,12 @@ def test_unseen_space_is_closed_where_it_is_solid():
         volume.weights[len(volume.weights) // 2 :] = 0.1
         return volume
 
-    assert edge_report(surface_of(half_seen(), 0.5).faces).open_edges > 0
+    assert edge_report(marching_cubes(half_seen(), 0.5).faces).open_edges > 0
     volume = half_seen()
-    solid_where_unseen(volume, 0.5)
-    inside = np.abs(surface_of(volume, 0.5).vertices_world).max(axis=1) < 1.2
+    fill_unseen(volume, 0.5)
+    inside = np.abs(marching_cubes(volume, 0.5).vertices_world).max(axis=1) < 1.2
     assert inside.sum() > 100
-    whole = surface_of(volume, 0.5)
+    whole = marching_cubes(volume, 0.5)
     rim = edge_report(whole.faces).open_edges
     # Only where the grid itself ends is it still open.
     ends = np.abs(whole.vertices_world).max(axis=1) > 1.3
@@ -102,12 +104,12 @@ def test_a_backdrop_stops_every_ray_and_is_one_closed_thing():
     both = with_backdrop(mesh, np.zeros(3))
     np.testing.assert_array_equal(both.faces[: len(mesh.faces)], mesh.faces)
     sphere_only = both.select_faces(np.arange(len(mesh.faces), len(both.faces)))
-    assert edge_report(sphere_only.faces).watertight
+    assert edge_report(sphere_only.faces).is_watertight
     ways = np.random.default_rng(0).standard_normal((1000, 3))
-    hits = TriangleScene(sphere_only.vertices_world, sphere_only.faces).closest(
+    hits = TriangleBvh(sphere_only.vertices_world, sphere_only.faces).closest(
         RayBatch(np.zeros((1, 3)), ways / np.linalg.norm(ways, axis=1, keepdims=True))
     )
-    assert hits.hit.all()
+    assert hits.is_hit.all()
     corners = sphere_only.face_corners_world
     across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     assert ((across * corners.mean(axis=1)).sum(axis=1) < 0).all()  # seen from inside

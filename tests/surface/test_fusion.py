@@ -5,12 +5,12 @@ import pytest
 from surface_shapes import cameras_on_sphere, sphere_depth
 
 from octasplat.engine.errors import ConfigError
-from octasplat.engine.surface.depth import DepthMaps
-from octasplat.engine.surface.marching import surface_of
-from octasplat.engine.surface.mesh import edge_report
+from octasplat.engine.geometry.triangle_mesh import edge_report
+from octasplat.engine.surface.depth_maps import DepthMaps
+from octasplat.engine.surface.marching_cubes import marching_cubes
 from octasplat.engine.surface.options import ExtractionOptions
-from octasplat.engine.surface.region import choose_region, focus
-from octasplat.engine.surface.volume import fuse
+from octasplat.engine.surface.region import choose_region, focus_point
+from octasplat.engine.surface.tsdf_volume import fuse_depth_maps
 
 RADIUS = 1.0
 
@@ -26,12 +26,12 @@ def sphere_maps(
 def mesh_of(maps, **settings):
     options = ExtractionOptions(**settings)
     region = choose_region(maps, options)
-    return surface_of(fuse(maps, region, options), options.min_weight), region
+    return marching_cubes(fuse_depth_maps(maps, region, options), options.min_weight), region
 
 
 def test_sphere_from_all_sides_is_closed_and_exact():
     mesh, _region = mesh_of(sphere_maps(), resolution=96)
-    assert edge_report(mesh.faces).watertight
+    assert edge_report(mesh.faces).is_watertight
     radii = np.linalg.norm(mesh.vertices_world, axis=1)
     assert np.abs(radii - RADIUS).max() < 0.015
     assert np.sqrt(np.mean((radii - RADIUS) ** 2)) < 0.007
@@ -39,7 +39,7 @@ def test_sphere_from_all_sides_is_closed_and_exact():
 
 def test_region_is_what_the_cameras_surround():
     cameras = cameras_on_sphere(20, 3.0, 16)
-    centre, distance = focus(cameras)
+    centre, distance = focus_point(cameras)
     np.testing.assert_allclose(centre, 0, atol=1e-6)
     assert distance == pytest.approx(3.0)
 
@@ -64,7 +64,7 @@ def test_box_and_voxel_are_kept():
     assert edge_report(mesh.faces).open_edges > 50  # cut off by the box
 
 
-def test_unbounded_reaches_far_things_and_keeps_near_ones():
+def test_fusion_unbounded_covers_near_and_far():
     # Cameras inside a sphere 12 times as large as the ring that they stand on, a small ball in their midst.
     cameras = cameras_on_sphere(60, 1.0, 96, fov=70.0)
     near, far = 0.4, 12.0
@@ -88,7 +88,7 @@ def test_unbounded_reaches_far_things_and_keeps_near_ones():
     assert np.abs(np.median(radii[~inner]) - far) < 0.15 * far
 
 
-def test_what_one_view_makes_up_the_others_clear():
+def test_fusion_outlier_depth_of_one_view_is_removed():
     maps = sphere_maps()
     distances = list(maps.distances)
     bad = distances[7].copy()
@@ -99,7 +99,7 @@ def test_what_one_view_makes_up_the_others_clear():
     assert np.abs(radii - RADIUS).max() < region.voxel_world
 
 
-def test_unknown_depths_leave_a_hole():
+def test_fusion_unknown_depth_leaves_hole():
     maps = sphere_maps()
     distances = []
     for camera, known in zip(maps.cameras, maps.distances, strict=True):
@@ -112,7 +112,7 @@ def test_unknown_depths_leave_a_hole():
     assert edge_report(mesh.faces).open_edges > 20
 
 
-def test_order_of_views_changes_next_to_nothing():
+def test_fusion_is_independent_of_view_order():
     maps = sphere_maps(count=12)
     turned = DepthMaps(maps.cameras[::-1], maps.distances[::-1], maps.cosines[::-1])
     one, _ = mesh_of(maps, bounds=(-1.5,) * 3 + (1.5,) * 3, resolution=48)
@@ -121,7 +121,7 @@ def test_order_of_views_changes_next_to_nothing():
     np.testing.assert_allclose(one.vertices_world, two.vertices_world, atol=1e-5)
 
 
-def test_refusals_say_what_to_do():
+def test_fusion_refusals_name_remedy():
     maps = sphere_maps(count=4)
     with pytest.raises(ConfigError, match="allowed"):
         mesh_of(maps, resolution=64, max_memory_gb=1e-4)
@@ -130,4 +130,4 @@ def test_refusals_say_what_to_do():
     with pytest.raises(ConfigError, match="larger voxels"):
         mesh_of(maps, voxel=1e-5)
     with pytest.raises(ConfigError, match="no common centre"):
-        focus([camera for camera in maps.cameras[:1] for _ in range(3)])
+        focus_point([camera for camera in maps.cameras[:1] for _ in range(3)])

@@ -6,24 +6,29 @@ import numpy as np
 import pytest
 
 from octasplat.engine.config import resolve_config
+from octasplat.engine.dataset import DatasetModel, load_dataset_model
+from octasplat.engine.dataset.synthetic import SyntheticDatasetConfig, write_synthetic_dataset
+from octasplat.engine.dataset.synthetic.still_life import TABLE_RADIUS, build_still_life
 from octasplat.engine.files.gaussian_ply import read_gaussian_ply
+from octasplat.engine.geometry.triangle_mesh import TriangleMesh, edge_report
 from octasplat.engine.pipeline import reconstruct
-from octasplat.engine.render.cameras import RenderCamera
-from octasplat.engine.render.images import read_channels
+from octasplat.engine.render.image_files import read_channels
+from octasplat.engine.render.pinhole_camera import PinholeCamera
 from octasplat.engine.run_folder import SCENE
-from octasplat.engine.scene import SceneModel, load_scene
-from octasplat.engine.scene.generated import GeneratedSceneConfig, write_generated_scene
-from octasplat.engine.scene.generated.arrangement import TABLE_RADIUS, still_life
-from octasplat.engine.surface.cameras import photograph_cameras
-from octasplat.engine.surface.compare import SurfaceScore, distances_to_surface, sample_surface, score
-from octasplat.engine.surface.depth import DepthMaps
+from octasplat.engine.surface.depth_cameras import photograph_cameras
+from octasplat.engine.surface.depth_maps import DepthMaps
 from octasplat.engine.surface.extract import extract_levels
-from octasplat.engine.surface.marching import surface_of
-from octasplat.engine.surface.mesh import TriangleMesh, edge_report
+from octasplat.engine.surface.marching_cubes import marching_cubes
 from octasplat.engine.surface.occlusion import Occluder
 from octasplat.engine.surface.options import ExtractionOptions
 from octasplat.engine.surface.region import choose_region
-from octasplat.engine.surface.volume import fuse
+from octasplat.engine.surface.surface_metrics import (
+    SurfaceMetrics,
+    distances_to_surface,
+    sample_surface,
+    surface_metrics,
+)
+from octasplat.engine.surface.tsdf_volume import fuse_depth_maps
 from octasplat.engine.trace.cpu.tracer import CpuTracer
 
 MIN_VIEWS = 3
@@ -37,28 +42,28 @@ def on_the_table(mesh: TriangleMesh) -> TriangleMesh:
     return mesh.select_faces(near & (corners[..., 2].min(axis=1) > -0.07))
 
 
-def scored(mesh: TriangleMesh, cameras: tuple[RenderCamera, ...], threshold: float) -> SurfaceScore:
+def scored(mesh: TriangleMesh, cameras: tuple[PinholeCamera, ...], threshold: float) -> SurfaceMetrics:
     """How near the things on the table come to the truth."""
     rng = np.random.default_rng(0)
-    life = still_life()
+    life = build_still_life()
     truth = TriangleMesh(life.vertices, life.faces)
     wanted, _ = sample_surface(on_the_table(truth), 20_000, rng)
     occluder = Occluder(truth)
     views = np.zeros(len(wanted), int)
     for camera in cameras:
-        views += occluder.sees(wanted, np.broadcast_to(camera.centre_world, wanted.shape))
+        views += occluder.is_visible(wanted, np.broadcast_to(camera.centre_world, wanted.shape))
     found = on_the_table(mesh)
     there, _ = sample_surface(found, 20_000, rng)
-    return score(
+    return surface_metrics(
         distances_to_surface(there, truth, rng, 500_000),
         distances_to_surface(wanted[views >= MIN_VIEWS], found, rng, 300_000),
         threshold,
     )
 
 
-def scene_and_cameras(root: Path, **size: int) -> tuple[SceneModel, tuple[RenderCamera, ...]]:
-    write_generated_scene(root, GeneratedSceneConfig(**size))
-    scene = load_scene(root)
+def scene_and_cameras(root: Path, **size: int) -> tuple[DatasetModel, tuple[PinholeCamera, ...]]:
+    write_synthetic_dataset(root, SyntheticDatasetConfig(**size))
+    scene = load_dataset_model(root)
     return scene, photograph_cameras(scene, np.arange(len(scene.views)), 800)
 
 
@@ -79,12 +84,12 @@ def test_true_depth_gives_the_true_surface(tmp_path):
         cosines.append(np.abs((normals * directions).sum(axis=-1)).astype(np.float32))
     options = ExtractionOptions(resolution=320)
     maps = DepthMaps(cameras, tuple(distances), tuple(cosines))
-    mesh = surface_of(fuse(maps, choose_region(maps, options), options), options.min_weight)
+    mesh = marching_cubes(fuse_depth_maps(maps, choose_region(maps, options), options), options.min_weight)
     result = scored(mesh, cameras, 0.01)
     assert result.chamfer < 0.004
     assert result.f_score > 0.93
     report = edge_report(mesh.faces)
-    assert report.crowded_edges == report.twisted_edges == 0
+    assert report.non_manifold_edges == report.inconsistent_edges == 0
 
 
 @pytest.mark.heavy

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from octasplat.engine.config import resolve_config
+from octasplat.engine.dataset import Dataset
+from octasplat.engine.dataset.synthetic import SyntheticDatasetConfig, write_synthetic_dataset
+from octasplat.engine.dataset.views_file import read_views, write_views
 from octasplat.engine.errors import DatasetError, OutputError
 from octasplat.engine.events import Event, Noted, Warned
 from octasplat.engine.operations import surface_inputs
 from octasplat.engine.operations.surface_inputs import training_photographs
-from octasplat.engine.scene import Dataset
-from octasplat.engine.scene.generated import GeneratedSceneConfig, write_generated_scene
-from octasplat.engine.scene.views_file import read_views, write_views
 
 TURN = np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]])
 
@@ -23,21 +23,21 @@ TURN = np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]])
 def folder(tmp_path: Path) -> Path:
     """A run's folder, as far as it matters here, and its photographs in ``scene``."""
     scene, run = tmp_path / "scene", tmp_path / "run"
-    write_generated_scene(
-        scene, GeneratedSceneConfig(views=8, width_px=32, height_px=24, samples_per_side=1, points=100)
+    write_synthetic_dataset(
+        scene, SyntheticDatasetConfig(views=8, width_px=32, height_px=24, samples_per_side=1, points=100)
     )
     run.mkdir()
     config = resolve_config("fast")
     content = {"scene": str(scene), "reconstruction": config.model_dump(mode="json")}
     (run / "config.json").write_text(json.dumps(content))
-    write_views(run / "views.json", Dataset.open(scene, run / "cache").record)
+    write_views(run / "views.json", Dataset.open(scene, run / "cache").views_record)
     shutil.rmtree(run / "cache")
     return tmp_path
 
 
 def turned(run: Path) -> None:
     """Make the run one of a world turned by a right angle, as its photographs are not."""
-    write_views(run / "views.json", read_views(run / "views.json").moved(1.0, TURN, np.zeros(3)))
+    write_views(run / "views.json", read_views(run / "views.json").transformed(1.0, TURN, np.zeros(3)))
 
 
 def test_photographs_of_the_run_are_taken_wherever_they_are(folder: Path) -> None:

@@ -9,11 +9,11 @@ from surface_shapes import cameras_on_sphere
 
 from octasplat.engine.colour import linear_to_srgb
 from octasplat.engine.files import read_mesh, write_surface
-from octasplat.engine.files.gltf import GlbFile
+from octasplat.engine.files.glb_container import GlbFile
+from octasplat.engine.geometry.triangle_mesh import TriangleMesh
 from octasplat.engine.shading.environment_frame import environment_frame
+from octasplat.engine.surface.bake_materials import material_features, with_materials
 from octasplat.engine.surface.extract import extract_levels
-from octasplat.engine.surface.materials import material_features, with_materials
-from octasplat.engine.surface.mesh import TriangleMesh
 from octasplat.engine.surface.options import ExtractionOptions
 from octasplat.engine.surface.tangents import vertex_tangents
 from octasplat.engine.surface.texture import TextureLayout
@@ -95,7 +95,7 @@ def turned_square(mirrored: bool) -> TriangleMesh:
 
 
 @pytest.mark.parametrize("mirrored", [False, True])
-def test_a_leaning_normal_leans_the_same_way_in_the_world(mirrored):
+def test_surface_normal_map_matches_world_normals(mirrored):
     mesh = turned_square(mirrored)
     tangents = vertex_tangents(mesh)
     np.testing.assert_allclose(tangents[:, :3], np.tile(np.array([1, 2, 0]) / np.sqrt(5), (4, 1)), atol=1e-6)
@@ -111,7 +111,7 @@ def test_a_leaning_normal_leans_the_same_way_in_the_world(mirrored):
     np.testing.assert_allclose(found[1], (0, 0, 1), atol=0.006)
 
 
-def test_a_normal_that_looks_away_is_laid_down_on_the_surface():
+def test_surface_normal_facing_away_is_projected_to_tangent():
     mesh = turned_square(False)
     layout = TextureLayout(
         mesh, 1, np.array([0]), np.array([0]), np.array([[0, 1, 2]], np.int32), np.array([[1.0, 0, 0]])
@@ -122,7 +122,7 @@ def test_a_normal_that_looks_away_is_laid_down_on_the_surface():
     np.testing.assert_allclose(found[0], (0.995, 0, 0.1), atol=0.006)
 
 
-def test_the_glb_is_lit_and_stands_in_its_light(surface, tmp_path: Path):
+def test_surface_glb_has_materials_and_environment(surface, tmp_path: Path):
     path = tmp_path / "lit.glb"
     assert write_surface(surface, path) == (path,)
     seen = trimesh.load(path, force="mesh", process=False)
@@ -140,7 +140,7 @@ def test_the_glb_is_lit_and_stands_in_its_light(surface, tmp_path: Path):
     document = GlbFile(path).document
     assert "extensionsUsed" not in document
     assert "TANGENT" in document["meshes"][0]["primitives"][0]["attributes"]
-    (again,) = read_mesh(path, looks=True).materials
+    (again,) = read_mesh(path, with_materials=True).materials
     assert (again.metallic, again.roughness) == (1.0, 1.0)
     assert again.normal_texture is not None and again.metallic_roughness_texture is not None
-    assert not again.passed_over or again.passed_over == ("occlusionTexture",)
+    assert not again.unsupported or again.unsupported == ("occlusionTexture",)

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 import trimesh
 
-from octasplat.engine.surface.clean import face_components
-from octasplat.engine.surface.mesh import TriangleMesh
-from octasplat.engine.surface.texture import lay_out
+from octasplat.engine.geometry.triangle_mesh import TriangleMesh
+from octasplat.engine.surface.mesh_cleanup import face_components
+from octasplat.engine.surface.texture import unwrap
 
 SIDE = 512
 
@@ -17,7 +17,7 @@ def test_a_rough_ball_is_cut_into_few_pieces(roughness: float) -> None:
     ball = trimesh.creation.icosphere(subdivisions=4)
     random = np.random.default_rng(0)
     vertices = ball.vertices + roughness * random.standard_normal(ball.vertices.shape)
-    layout = lay_out(TriangleMesh(vertices.astype(np.float32), ball.faces.astype(np.int32)), SIDE)
+    layout = unwrap(TriangleMesh(vertices.astype(np.float32), ball.faces.astype(np.int32)), SIDE)
     mesh = layout.mesh
     piece = face_components(mesh)
     assert piece.max() < 20

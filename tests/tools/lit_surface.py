@@ -10,8 +10,8 @@ from browser import open_page
 from jaxtyping import Float32, Float64
 from npm_packages import npm_folder
 
-from octasplat.engine.render.cameras import RenderCamera
-from octasplat.engine.render.images import read_image
+from octasplat.engine.render.image_files import read_image
+from octasplat.engine.render.pinhole_camera import PinholeCamera
 
 THREE = ("three", "0.187.0")
 PAGE = """<!doctype html>
@@ -56,7 +56,7 @@ window.result = main();
 """
 
 
-def view_of(camera: RenderCamera, light_frame: Float64[np.ndarray, "3 3"]) -> dict[str, object]:
+def view_of(camera: PinholeCamera, light_frame: Float64[np.ndarray, "3 3"]) -> dict[str, object]:
     """A camera where a GLB with materials has it: the light's forward is x, its up y."""
     turn = np.eye(4)
     turn[:3, :3] = light_frame[[2, 1, 0]]
@@ -71,7 +71,7 @@ def view_of(camera: RenderCamera, light_frame: Float64[np.ndarray, "3 3"]) -> di
     }
 
 
-def in_threejs(glb: Path, light: Path, view: dict[str, object]) -> Float32[np.ndarray, "h w 3"]:
+def render_in_threejs(glb: Path, light: Path, view: dict[str, object]) -> Float32[np.ndarray, "h w 3"]:
     """Display values, four samples a pixel."""
     page = open_page(
         PAGE.replace("VIEW", json.dumps(view)),
@@ -85,7 +85,9 @@ def in_threejs(glb: Path, light: Path, view: dict[str, object]) -> Float32[np.nd
     return page.image.astype(np.float32) / np.float32(255)
 
 
-def in_cycles(glb: Path, light: Path, view: dict[str, object], samples: int) -> Float32[np.ndarray, "h w 3"]:
+def render_in_cycles(
+    glb: Path, light: Path, view: dict[str, object], samples: int
+) -> Float32[np.ndarray, "h w 3"]:
     """Display values."""
     with TemporaryDirectory(prefix="octasplat-lit-") as folder:
         place, out = Path(folder) / "view.json", Path(folder) / "out.png"

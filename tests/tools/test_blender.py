@@ -13,7 +13,7 @@ from octasplat.engine.files import ExportOptions, export_scene
 from octasplat.engine.files.ply_container import read_ply
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.gaussians.octagon import octagon_corners_world, octagon_radii
-from octasplat.engine.render.images import read_image, write_exr
+from octasplat.engine.render.image_files import read_image, write_exr
 from octasplat.engine.render.path_file import read_camera_path
 
 pytestmark = [pytest.mark.tools, pytest.mark.heavy]
@@ -53,7 +53,7 @@ def test_cycles_draws_what_we_draw(scene: FlatGaussians, blend: Path, tmp_path: 
 
 
 @pytest.mark.parametrize(("name", "view"), [("a.glb", "standard"), ("a.mesh.ply", "standard")])
-def test_the_standard_view_shows_the_same(scene: FlatGaussians, tmp_path: Path, name: str, view: str) -> None:
+def test_blender_standard_view_matches(scene: FlatGaussians, tmp_path: Path, name: str, view: str) -> None:
     """Of a GLB, too, whose colours and opacities Blender keeps in 8 bits."""
     export_scene(scene, tmp_path / name, ExportOptions(chunks=2))
     write_shell_cameras(tmp_path / "cameras.json")
@@ -63,7 +63,7 @@ def test_the_standard_view_shows_the_same(scene: FlatGaussians, tmp_path: Path, 
     assert psnr_db(tmp_path / "cycles.png", our_view(scene, shell_cameras()[0])) >= 45.0
 
 
-def test_the_camera_comes_back_as_a_path(blend: Path, tmp_path: Path) -> None:
+def test_blender_camera_exports_as_path(blend: Path, tmp_path: Path) -> None:
     run_blender(EXPORT_PATH_SCRIPT, tmp_path / "path.json", "--blend", blend)
     given, back = (
         read_camera_path(path) for path in (blend.with_name("cameras.json"), tmp_path / "path.json")
@@ -94,7 +94,7 @@ def test_the_script_renders_by_itself_and_finds_a_camera(scene: FlatGaussians, t
         ("text.ply", b"hello\n", "is not a PLY file"),
     ],
 )
-def test_the_script_says_what_it_cannot_open(
+def test_blender_script_names_unreadable_file(
     scene: FlatGaussians, tmp_path: Path, name: str, content: bytes | None, message: str
 ) -> None:
     if content is None:

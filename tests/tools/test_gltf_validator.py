@@ -16,7 +16,7 @@ pytestmark = pytest.mark.tools
     "settings", [{}, {"ids": False}, {"opaque": True}, {"chunks": 1}, {"light_up": (0, 0, 1)}]
 )
 @pytest.mark.parametrize("count", [1, 3, 5001])
-def test_the_khronos_validator_finds_nothing_wrong(
+def test_octagon_glb_passes_khronos_validator(
     validate_glb: Callable[[Path], dict[str, Any]], tmp_path: Path, count: int, settings: dict[str, Any]
 ) -> None:
     random = np.random.default_rng(0)

@@ -7,22 +7,22 @@ from typing import Any
 import numpy as np
 import pytest
 from blender_python import SCRIPTS, run_blender
-from lit_surface import in_cycles, in_threejs, view_of
+from lit_surface import render_in_cycles, render_in_threejs, view_of
 
 from octasplat.engine.files import write_surface
-from octasplat.engine.gaussians.frames import frames_from_normals, quaternions
+from octasplat.engine.gaussians.frames import frames_from_normals, quaternions_from_matrices
 from octasplat.engine.gaussians.model import FlatGaussians
-from octasplat.engine.light.environment import EnvironmentMap
-from octasplat.engine.light.relighting import PathRelighter
-from octasplat.engine.light.stage import Integrator
-from octasplat.engine.render.cameras import RenderCamera, focal_from_fov
-from octasplat.engine.render.environment_map import write_environment
-from octasplat.engine.render.paths import look_at
+from octasplat.engine.geometry.triangle_mesh import TriangleMesh
+from octasplat.engine.pathtracing.environment import EnvironmentMap
+from octasplat.engine.pathtracing.relighting.path_relighter import PathRelighter
+from octasplat.engine.pathtracing.stage.model import Integrator
+from octasplat.engine.render.environment_files import write_environment
+from octasplat.engine.render.pinhole_camera import PinholeCamera, focal_from_fov
+from octasplat.engine.render.pose_paths import look_at
 from octasplat.engine.shading.environment_frame import environment_frame
-from octasplat.engine.surface.cameras import cameras_around
+from octasplat.engine.surface.bake_materials import material_features
+from octasplat.engine.surface.depth_cameras import cameras_around
 from octasplat.engine.surface.extract import extract_levels
-from octasplat.engine.surface.materials import material_features
-from octasplat.engine.surface.mesh import TriangleMesh
 from octasplat.engine.surface.options import ExtractionOptions
 from octasplat.engine.trace.cpu.tracer import CpuTracer
 from octasplat.engine.trace.protocol import TraceSettings
@@ -44,7 +44,7 @@ def egg() -> FlatGaussians:
     above = height[:, None] > 0.1
     scene = FlatGaussians(
         (ball * [1, 1, 1.4]).astype(np.float32),
-        quaternions(frames_from_normals(normals)).astype(np.float32),
+        quaternions_from_matrices(frames_from_normals(normals)).astype(np.float32),
         np.full((count, 2), np.log(0.05), np.float32),
         np.full(count, 6.0, np.float32),
         np.zeros((count, 1, 3), np.float32),
@@ -84,7 +84,7 @@ def light() -> np.ndarray:
     return (warm + np.where(v < 0.5, 0.8, 0.2)[..., None] * [0.6, 0.8, 1.0]).astype(np.float32)
 
 
-def test_the_khronos_validator_finds_nothing_wrong(
+def test_lit_surface_glb_passes_khronos_validator(
     validate_glb: Callable[[Path], dict[str, Any]], glb: Path
 ) -> None:
     issues = validate_glb(glb)["issues"]
@@ -109,21 +109,21 @@ def test_blender_has_the_same_triangles_and_tangents(
     assert (found["signs"] == tangents[:, 3]).mean() > 0.99
 
 
-def test_cycles_and_threejs_light_it_as_we_do(glb: Path, light: np.ndarray, tmp_path: Path) -> None:
+def test_lit_surface_matches_cycles_and_threejs(glb: Path, light: np.ndarray, tmp_path: Path) -> None:
     write_environment(tmp_path / "light.hdr", light)
     place = np.array([3.0, 3.0, 1.5])
-    camera = RenderCamera.from_pose(
+    camera = PinholeCamera.from_pose(
         look_at(place, np.zeros(3), np.array([0.0, 0.0, 1.0])), 96, 96, fy_px=focal_from_fov(45, 96)
     )
     ours = PathRelighter(egg(), TraceSettings(), Integrator(samples=64, max_depth=4), threads=2)
-    ours.put(EnvironmentMap(light, FRAME))
+    ours.set_environment(EnvironmentMap(light, FRAME))
     picture = ours.render(camera.rays())
     inside = picture.coverage > 0.99
-    wanted = np.clip(picture.over(np.zeros(3, np.float32)), 0, 1)
+    wanted = np.clip(picture.composite_over(np.zeros(3, np.float32)), 0, 1)
     view = view_of(camera, FRAME)
     for label, seen, least in (
-        ("Cycles", in_cycles(glb, tmp_path / "light.hdr", view, 32), 33.0),
-        ("three.js", in_threejs(glb, tmp_path / "light.hdr", view), 30.0),
+        ("Cycles", render_in_cycles(glb, tmp_path / "light.hdr", view, 32), 33.0),
+        ("three.js", render_in_threejs(glb, tmp_path / "light.hdr", view), 30.0),
     ):
         decibels = -10 * np.log10(np.mean((np.clip(seen, 0, 1) - wanted)[inside] ** 2))
         assert decibels > least, (label, decibels)

@@ -11,7 +11,7 @@ from shell_scene import our_view, shell_scene
 
 from octasplat.engine.colour import to_bytes
 from octasplat.engine.files import export_scene
-from octasplat.engine.render.cameras import RenderCamera, focal_from_fov
+from octasplat.engine.render.pinhole_camera import PinholeCamera, focal_from_fov
 
 pytestmark = [pytest.mark.tools, pytest.mark.heavy]
 
@@ -59,14 +59,14 @@ def spark() -> Path:
 
 
 @pytest.fixture(scope="module")
-def camera() -> RenderCamera:
+def camera() -> PinholeCamera:
     pose = np.eye(4)
     pose[:3, 3] = (0.2, -0.3, -4.0)
-    return RenderCamera.from_pose(pose, SIDE_PX, SIDE_PX, fy_px=focal_from_fov(FOV_DEGREES, SIDE_PX))
+    return PinholeCamera.from_pose(pose, SIDE_PX, SIDE_PX, fy_px=focal_from_fov(FOV_DEGREES, SIDE_PX))
 
 
 def draw(
-    spark: Path, file: Path, camera: RenderCamera, settings: dict[str, float], turn: float = 0.0
+    spark: Path, file: Path, camera: PinholeCamera, settings: dict[str, float], turn: float = 0.0
 ) -> Page:
     """The file in Spark; ``turn`` about x, radians, is for files with y up."""
     # three.js cameras look along -z with y up.
@@ -94,7 +94,7 @@ def draw(
 )
 def test_spark_draws_what_we_draw(
     spark: Path,
-    camera: RenderCamera,
+    camera: PinholeCamera,
     tmp_path: Path,
     name: str,
     turn: float,

@@ -73,7 +73,7 @@ def read(path: Path) -> GaussianCloud:
         ("a.spz", ("--spz-version", "4")),
     ],
 )
-def test_we_read_its_files_as_it_does(
+def test_splat_transform_files_are_read_alike(
     convert: Convert, scene: FlatGaussians, tmp_path: Path, name: str, options: tuple[str, ...]
 ) -> None:
     export_scene(scene, tmp_path / "own.ply")
@@ -89,7 +89,7 @@ def test_we_read_its_files_as_it_does(
     ("name", "version", "degrees"),
     [("a.splat", 3, 0.95), ("a.spz", 3, 0.1), ("a.spz", 4, 0.1), ("a.compressed.ply", 3, 0.1)],
 )
-def test_it_reads_our_files_as_we_do(
+def test_splat_transform_reads_our_files_alike(
     convert: Convert, scene: FlatGaussians, tmp_path: Path, name: str, version: int, degrees: float
 ) -> None:
     export_scene(scene, tmp_path / name, ExportOptions(spz_version=version))
@@ -100,7 +100,9 @@ def test_it_reads_our_files_as_we_do(
     )
 
 
-def test_it_reads_our_ply_bit_for_bit(convert: Convert, scene: FlatGaussians, tmp_path: Path) -> None:
+def test_splat_transform_reads_our_ply_bit_exactly(
+    convert: Convert, scene: FlatGaussians, tmp_path: Path
+) -> None:
     export_scene(scene, tmp_path / "own.ply")
     back, report = read_scene(convert(tmp_path / "own.ply", tmp_path / "back.ply"))
     assert report.flattened == 0
@@ -108,7 +110,7 @@ def test_it_reads_our_ply_bit_for_bit(convert: Convert, scene: FlatGaussians, tm
         np.testing.assert_array_equal(getattr(back, name), getattr(scene, name))
 
 
-def test_we_read_its_glb(convert: Convert, scene: FlatGaussians, tmp_path: Path) -> None:
+def test_splat_transform_glb_is_read(convert: Convert, scene: FlatGaussians, tmp_path: Path) -> None:
     export_scene(scene, tmp_path / "own.ply")
     back, report = read_scene(convert(tmp_path / "own.ply", tmp_path / "theirs.glb"))
     assert (report.count, report.sh_degree, report.flattened) == (3000, 3, 0)

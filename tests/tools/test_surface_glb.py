@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from octasplat.engine.files import write_surface
-from octasplat.engine.surface.mesh import TriangleMesh
+from octasplat.engine.geometry.triangle_mesh import TriangleMesh
 
 pytestmark = pytest.mark.tools
 
@@ -15,7 +15,7 @@ FACES = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]], np.int32)
 
 
 @pytest.mark.parametrize("textured", [False, True])
-def test_the_khronos_validator_finds_nothing_wrong(
+def test_surface_glb_passes_khronos_validator(
     validate_glb: Callable[[Path], dict[str, Any]], tmp_path: Path, textured: bool
 ) -> None:
     if textured:

@@ -10,7 +10,7 @@ from threejs_example import draw_glb
 
 from octasplat.engine.colour import to_bytes
 from octasplat.engine.files import ExportOptions, export_scene
-from octasplat.engine.gaussians.frames import frames_from_normals, quaternions
+from octasplat.engine.gaussians.frames import frames_from_normals, quaternions_from_matrices
 from octasplat.engine.gaussians.model import FlatGaussians
 
 pytestmark = [pytest.mark.tools, pytest.mark.heavy]
@@ -57,7 +57,7 @@ def test_averaged_frames_have_the_right_order_where_octagons_cross(cameras: Path
     assert refined_db > 37.0
 
 
-def test_more_chunks_are_nearer_to_the_truth(cameras: Path, tmp_path: Path) -> None:
+def test_threejs_more_chunks_reduce_error(cameras: Path, tmp_path: Path) -> None:
     scene = shell_scene(20000)
     ours = to_bytes(our_view(scene, shell_cameras()[0]))
     figures = []
@@ -83,7 +83,7 @@ def test_cores_hide_what_lies_behind_whatever_the_order(cameras: Path, tmp_path:
     towards = camera.centre_world / np.linalg.norm(camera.centre_world)
     scene = FlatGaussians(
         np.stack([0.3 * towards, -0.3 * towards]).astype(np.float32),
-        quaternions(frames_from_normals(np.tile(towards, (2, 1)))).astype(np.float32),
+        quaternions_from_matrices(frames_from_normals(np.tile(towards, (2, 1)))).astype(np.float32),
         np.log(np.array([[0.15, 0.15], [0.3, 0.3]], np.float32)),
         np.full(2, 7.0, np.float32),
         np.array([[[1.5, -1.5, -1.5]], [[-1.5, -1.5, 1.5]]], np.float32),

@@ -69,13 +69,13 @@ def assert_same_hits(gaussians: FlatGaussians, rays: RayBatch, *, steepest: floa
     """
     tracer = make_tracer(gaussians, q=Q, transmittance_min=1e-300, max_hits=2048)
     found = tracer.trace(rays, record=True)
-    recording = found.hits
+    recording = found.recording
     assert isinstance(recording, CpuRecording)
     total = unsure = 0
     for ray, (ids, distances, inside, cosine) in enumerate(all_hits(gaussians, rays)):
-        met, met_at = recording.of_ray(ray), recording.hits.distances[recording.place(ray)]
+        met, met_at = recording.ids_of_ray(ray), recording.hits.distances[recording.hit_slice(ray)]
         total += len(ids)
-        if ray in recording.alone:
+        if ray in recording.single_rays:
             assert met.tolist() == ids.tolist(), f"ray {ray}"
             np.testing.assert_array_equal(met_at, distances)
             continue
@@ -97,7 +97,7 @@ def test_ten_thousand_rays_through_a_cloud(rng: np.random.Generator) -> None:
     assert assert_same_hits(cloud, rays_inwards(rng, 10_000)) > 300_000
 
 
-def test_tiles(rng: np.random.Generator) -> None:
+def test_tile_rays_find_brute_force_hits(rng: np.random.Generator) -> None:
     cloud = concatenate([make_cloud(rng, 1500), make_cloud(rng, 200, size=3.0, logits=(-3.0, -1.0))])
     across = np.linspace(-0.1, 0.1, 8)
     a, b = (grid.ravel() for grid in np.meshgrid(across, across))
@@ -111,12 +111,12 @@ def test_tiles(rng: np.random.Generator) -> None:
     assert assert_same_hits(cloud, rays, steepest=0.15) > 12 * 64 * 50
 
 
-def test_more_hits_than_one_traversal_gathers(rng: np.random.Generator) -> None:
+def test_hits_beyond_traversal_capacity_are_found(rng: np.random.Generator) -> None:
     cloud = concatenate([make_cloud(rng, 1500, size=0.3), in_plane(rng, 500, size=0.5)])
     assert assert_same_hits(cloud, rays_inwards(rng, 300)) > 300 * 200
 
 
-def test_thousand_sizes_away(rng: np.random.Generator) -> None:
+def test_distant_small_gaussians_are_hit(rng: np.random.Generator) -> None:
     cloud = make_cloud(rng, 3000, size=0.01, radius=0.1)
     assert assert_same_hits(cloud, rays_inwards(rng, 1000, distance=10.0, spread=0.1)) > 30_000
 

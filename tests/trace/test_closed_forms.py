@@ -39,7 +39,7 @@ def test_median_depth_needs_half_of_the_light() -> None:
 
 # The axes r2, r3 of `facing_z` are y and -x.
 @pytest.mark.parametrize(("x", "y"), [(0, 0.3), (0.2, 0), (-0.2, 0), (0, -0.3)])
-def test_one_sigma_along_each_axis(x: float, y: float) -> None:
+def test_alpha_at_one_sigma_is_known(x: float, y: float) -> None:
     seen = look_up(facing_z([0, 0, 0], scales=[0.3, 0.2], opacities=0.8), x, y)
     assert seen.alpha[0] == pytest.approx(0.8 * np.exp(-0.5), rel=1e-6)
 
@@ -65,8 +65,8 @@ def test_two_gaussians_composite_front_to_back() -> None:
     features = f32([[3.0], [5.0]])
     tracer = make_tracer(pair, features)
     seen = tracer.trace(RayBatch(f32([[0, 0, 0]]), UP), record=True)
-    assert seen.hits is not None
-    assert seen.hits.of_ray(0).tolist() == [1, 0]
+    assert seen.recording is not None
+    assert seen.recording.ids_of_ray(0).tolist() == [1, 0]
     np.testing.assert_allclose(seen.rgb_srgb[0], [0.75 * 0.5, 0.25, 0], atol=1e-6)
     assert seen.transmittance[0] == pytest.approx(0.375, rel=1e-6)
     assert seen.depth_sum[0] == pytest.approx(0.25 * 1 + 0.375 * 2, rel=1e-6)
@@ -75,12 +75,12 @@ def test_two_gaussians_composite_front_to_back() -> None:
     np.testing.assert_allclose(background, [0.75, 0.625, 0.375], atol=1e-6)
 
 
-def test_gradient_of_two_gaussians_by_hand() -> None:
+def test_gradient_of_two_gaussians_matches_closed_form() -> None:
     pair = facing_z([[0, 0, 2], [0, 0, 1]], opacities=[0.5, 0.25], rgb_srgb=[[1, 0.2, 0], [0, 0.6, 0]])
     tracer = make_tracer(pair)
     seen = tracer.trace(RayBatch(f32([[0, 0, 0]]), UP), record=True)
-    assert seen.hits is not None
-    green = tracer.backward(seen.hits, TraceGradients(f32([[0, 1, 0]]), ray_errors=f32([4.0])))
+    assert seen.recording is not None
+    green = tracer.backward(seen.recording, TraceGradients(f32([[0, 1, 0]]), ray_errors=f32([4.0])))
     # C = b 0.6 + (1 - b) a 0.2 with a = 0.5 behind, b = 0.25 before; dC/dlogit = dC/da a (1 - a).
     assert green.ids.tolist() == [0, 1]
     np.testing.assert_allclose(
@@ -116,12 +116,12 @@ def test_faint_gaussian_has_no_octagon() -> None:
     assert look_up(facing_z([0, 0, 0], opacities=0.99 * cut), 0, 0, q=q).hit_counts[0] == 0
 
 
-def test_nearest_distance() -> None:
+def test_nearest_distance_of_stack_is_known() -> None:
     stack = facing_z([[0, 0, z] for z in (-1.0, 0.0, 0.5, 1.0, 2.0)])
     tracer = make_tracer(stack)
     seen = tracer.trace(RayBatch(f32([[0, 0, 0]]), UP, t_min=0.5), record=True)
-    assert seen.hits is not None
-    assert seen.hits.of_ray(0).tolist() == [3, 4]  # strictly beyond t_min
+    assert seen.recording is not None
+    assert seen.recording.ids_of_ray(0).tolist() == [3, 4]  # strictly beyond t_min
     assert look_up(stack, 0, 0, z=0.0).hit_counts[0] == 3  # behind the origin and at it: not seen
 
 
@@ -130,8 +130,8 @@ def test_colour_is_clamped_at_zero_without_gradient() -> None:
     tracer = make_tracer(dark)
     seen = tracer.trace(RayBatch(f32([[0, 0, -1]]), UP), record=True)
     np.testing.assert_allclose(seen.rgb_srgb[0], [0, 0.15, 0.85], atol=1e-6)
-    assert seen.hits is not None
-    gradients = tracer.backward(seen.hits, TraceGradients(f32([[1, 1, 1]])))
+    assert seen.recording is not None
+    gradients = tracer.backward(seen.recording, TraceGradients(f32([[1, 1, 1]])))
     np.testing.assert_allclose(gradients.sh[0, 0], np.array([0, 0.5, 0.5]) * 0.28209479, rtol=1e-5)
 
 
@@ -164,7 +164,7 @@ def test_a_viewer_at_infinity_sees_along_the_ray() -> None:
         np.testing.assert_allclose(seen.rgb_srgb[0] / seen.alpha[0], expected, atol=1e-6)
 
 
-def test_stop_behind_the_gaussian_that_passes_the_threshold() -> None:
+def test_trace_stops_after_transmittance_threshold() -> None:
     stack = facing_z([[0, 0, k] for k in range(1, 9)], opacities=0.5)
     # T after k: 0.5^k.
     for threshold, hits in ((0.3, 2), (0.2, 3), (0.01, 7), (1e-3, 8)):
@@ -180,7 +180,7 @@ def test_pulling_a_tilted_gaussian_moves_the_depth() -> None:
     gaussian = facing_z([0, 0, 1], opacities=0.5)
     tracer = make_tracer(gaussian)
     seen = tracer.trace(RayBatch(f32([[0, 0, 0]]), UP), record=True)
-    assert seen.hits is not None
+    assert seen.recording is not None
     zero = np.zeros((1, 3), np.float32)
-    by_depth = tracer.backward(seen.hits, TraceGradients(zero, depth_sum=f32([1.0])))
+    by_depth = tracer.backward(seen.recording, TraceGradients(zero, depth_sum=f32([1.0])))
     np.testing.assert_allclose(by_depth.means_world[0], [0, 0, 0.5], atol=1e-6)

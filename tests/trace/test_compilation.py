@@ -11,7 +11,7 @@ import pytest
 
 from octasplat.engine import compilation
 from octasplat.engine.compilation import run_on_threads, run_ranges, source_digest
-from octasplat.engine.trace.cpu.kernels_sh import write_basis
+from octasplat.engine.trace.cpu.kernels.spherical_harmonics import eval_sh_basis
 
 
 def run_python(code: str, **environment: str) -> str:
@@ -29,7 +29,7 @@ SORT = """
     import logging
     logging.basicConfig()
     import numpy as np
-    from octasplat.engine.trace.cpu import kernels_sort
+    from octasplat.engine.trace.cpu.kernels import radix_sort as kernels_sort
     order, keys = kernels_sort.stable_order(np.array([3, 1, 2], np.int32), 2, 1)
     print(order, kernels_sort._scatter.stats.cache_hits)
 """
@@ -99,13 +99,13 @@ def test_folder_that_others_can_write_is_not_used(tmp_path: Path) -> None:
 
 def test_device_function_called_from_python_raises() -> None:
     with pytest.raises(KeyError, match="write_basis is called by kernels only"):
-        write_basis(np.zeros(16), 16, 0.0, 0.0, 1.0)
+        eval_sh_basis(np.zeros(16), 16, 0.0, 0.0, 1.0)
 
 
 def test_digest_follows_imports_and_is_stable() -> None:
-    one = source_digest("octasplat.engine.trace.cpu.kernels_sort")
-    assert one == source_digest("octasplat.engine.trace.cpu.kernels_sort")
-    assert one != source_digest("octasplat.engine.trace.cpu.kernels_tree")
+    one = source_digest("octasplat.engine.trace.cpu.kernels.radix_sort")
+    assert one == source_digest("octasplat.engine.trace.cpu.kernels.radix_sort")
+    assert one != source_digest("octasplat.engine.trace.cpu.kernels.packet_bvh")
 
 
 @pytest.mark.parametrize("threads", [1, 2, 5])

@@ -11,18 +11,18 @@ from trace_scenes import (
     make_cloud,
     random_gradients,
     rays_inwards,
+    reference_in_chunks,
     relative_error,
     same_bits,
     scattered,
-    twin_chunks,
     unit,
 )
 
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.rays import RayBatch
 from octasplat.engine.trace.cpu.tracer import CpuTracer
-from octasplat.engine.trace.make import make_tracer
-from octasplat.engine.trace.protocol import Gradients, Recording, Tracer, TraceSettings
+from octasplat.engine.trace.factory import make_tracer
+from octasplat.engine.trace.protocol import GradientsHandle, Recording, Tracer, TraceSettings
 
 TRACERS = ("cpu", "cpu, packets", "cpu, single rays", "reference")
 
@@ -32,7 +32,7 @@ def tracer(request: pytest.FixtureRequest) -> Tracer:
     """One tracer after another, nothing built yet."""
     name, _, way = request.param.partition(", ")
     if way:
-        return CpuTracer(packets="always" if way == "packets" else "never")
+        return CpuTracer(packet_mode="always" if way == "packets" else "never")
     return make_tracer(TraceSettings(tracer=name))
 
 
@@ -57,13 +57,13 @@ def assert_like_the_twin(
     given = random_gradients(
         np.random.default_rng(3), len(rays), 0 if features is None else features.shape[1]
     )
-    ids, values, gradients = twin_chunks(cloud, rays, tracer.settings, features, given)
+    ids, values, gradients = reference_in_chunks(cloud, rays, tracer.settings, features, given)
     seen = tracer.trace(rays, record=True)
     assert hit_lists(seen) == ids
     for name in OUTPUTS:
         assert relative_error(getattr(seen, name), values[name]) < 1e-5, name
-    assert seen.hits is not None
-    found = tracer.backward(seen.hits, given).numpy()
+    assert seen.recording is not None
+    found = tracer.backward(seen.recording, given).numpy()
     assert (np.diff(found.ids) > 0).all()
     counts = np.bincount(np.concatenate([*map(np.array, ids), []]).astype(int), minlength=len(cloud))
     assert found.hit_counts.tolist() == counts[found.ids].tolist()
@@ -72,14 +72,14 @@ def assert_like_the_twin(
         assert relative_error(dense[name], gradients[name]) < 1e-4, name
 
 
-def test_it_follows_the_protocol(tracer: Tracer, rng: np.random.Generator) -> None:
+def test_tracer_implements_protocol(tracer: Tracer, rng: np.random.Generator) -> None:
     assert isinstance(tracer, Tracer)
     cloud = make_cloud(rng, 20)
     tracer.build(cloud)
     seen = tracer.trace(rays_inwards(rng, 5), record=True)
-    assert isinstance(seen.hits, Recording)
-    assert isinstance(tracer.backward(seen.hits, random_gradients(rng, 5)), Gradients)
-    assert tracer.trace(rays_inwards(rng, 5)).hits is None
+    assert isinstance(seen.recording, Recording)
+    assert isinstance(tracer.backward(seen.recording, random_gradients(rng, 5)), GradientsHandle)
+    assert tracer.trace(rays_inwards(rng, 5)).recording is None
 
 
 def test_groups_and_loose_rays_with_limits(tracer: Tracer, rng: np.random.Generator) -> None:
@@ -88,7 +88,7 @@ def test_groups_and_loose_rays_with_limits(tracer: Tracer, rng: np.random.Genera
     assert_like_the_twin(tracer, cloud, mixed_rays(rng), features)
 
 
-def test_one_origin_and_one_limit_stand_for_all(tracer: Tracer, rng: np.random.Generator) -> None:
+def test_shared_origin_and_limits_broadcast(tracer: Tracer, rng: np.random.Generator) -> None:
     cloud = make_cloud(rng, 200, size=0.15)
     tracer.build(cloud)
     origin, directions = np.array([[0.0, 0.0, -3.0]]), unit(rng.normal(size=(30, 3)) * 0.2 + [0, 0, 1])
@@ -112,14 +112,14 @@ def test_transmittance_is_that_of_all_hits(tracer: Tracer, rng: np.random.Genera
     tracer.build(cloud)
     rays = mixed_rays(rng)
     unlimited = TraceSettings(transmittance_min=1e-30, max_hits=4096)
-    expected = twin_chunks(cloud, rays, unlimited)[1]["transmittance"]
+    expected = reference_in_chunks(cloud, rays, unlimited)[1]["transmittance"]
     least = tracer.settings.transmittance_min
     expected[expected < least] = 0.0
     np.testing.assert_allclose(tracer.transmittance(rays), expected, rtol=1e-5)
     assert (expected == 0).any() and ((expected > least) & (expected < 1)).any()
 
 
-def test_a_light_sees_a_point_as_the_point_sees_the_light(tracer: Tracer, rng: np.random.Generator) -> None:
+def test_transmittance_is_symmetric(tracer: Tracer, rng: np.random.Generator) -> None:
     tracer.build(make_cloud(rng, 300, size=0.1))
     light, points = np.array([[0.3, -2.5, 0.4]]), unit(rng.normal(size=(40, 3))) * 0.7
     there = tracer.transmittance(RayBatch.between(light, points))
@@ -155,8 +155,8 @@ def test_recordings_live_side_by_side(tracer: Tracer, rng: np.random.Generator, 
     seen = [tracer.trace(rays, record=True) for rays in batches]
     tracer.trace(rays_inwards(rng, 60), record=True)  # nobody keeps this one
     for k in (first, 1 - first):
-        ids, _, expected = twin_chunks(cloud, batches[k], tracer.settings, given=given[k])
-        hits = seen[k].hits
+        ids, _, expected = reference_in_chunks(cloud, batches[k], tracer.settings, given=given[k])
+        hits = seen[k].recording
         assert hits is not None and hit_lists(seen[k]) == ids
         found = scattered(tracer.backward(hits, given[k]).numpy(), 200)
         for name in PARAMETERS:
@@ -166,7 +166,7 @@ def test_recordings_live_side_by_side(tracer: Tracer, rng: np.random.Generator, 
 def test_errors_are_shared_out_by_weight(tracer: Tracer) -> None:
     tracer.build(facing_z([[0, 0, 2], [0, 0, 1]], opacities=[0.5, 0.25]))
     rays = RayBatch(np.zeros((1, 3)), np.tile([[0.0, 0.0, 1.0]], (2, 1)), t_max=f32([np.inf, 1.5]))
-    hits = tracer.trace(rays, record=True).hits
+    hits = tracer.trace(rays, record=True).recording
     assert hits is not None
     given = random_gradients(np.random.default_rng(0), 2)
     given.ray_errors = f32([4.0, 8.0])
@@ -176,24 +176,24 @@ def test_errors_are_shared_out_by_weight(tracer: Tracer) -> None:
     assert found.hit_counts.tolist() == [1, 2]
 
 
-def test_gaussians_that_hardly_weigh_are_left_out(tracer: Tracer, rng: np.random.Generator) -> None:
+def test_low_weight_gaussians_have_no_gradient(tracer: Tracer, rng: np.random.Generator) -> None:
     cloud = make_cloud(rng, 40)
     rays = mixed_rays(rng)
     tracer.build(cloud)
     given = random_gradients(rng, len(rays), 0)
-    hits = tracer.trace(rays, record=True).hits
+    hits = tracer.trace(rays, record=True).recording
     assert hits is not None
     all_of_them = tracer.backward(hits, given).numpy()
     least = float(np.median(all_of_them.weight_sums))
-    some = tracer.backward(hits, given, least_weight=least).numpy()
+    some = tracer.backward(hits, given, min_blend_weight=least).numpy()
     enough = all_of_them.weight_sums >= least
     assert 0 < enough.sum() < len(enough)
     for name, rows in vars(all_of_them).items():
         assert getattr(some, name).tobytes() == rows[enough].tobytes(), name
-    assert len(tracer.backward(hits, given, least_weight=1e9).numpy().ids) == 0
+    assert len(tracer.backward(hits, given, min_blend_weight=1e9).numpy().ids) == 0
 
 
-def test_changed_parameters_are_read_when_told(tracer: Tracer, rng: np.random.Generator) -> None:
+def test_refresh_reads_changed_parameters(tracer: Tracer, rng: np.random.Generator) -> None:
     cloud, features = make_cloud(rng, 150, size=0.15), f32(rng.random((150, 2)))
     tracer.build(cloud, features)
     cloud.sh += f32(0.1 * rng.normal(size=cloud.sh.shape))
@@ -206,7 +206,7 @@ def test_changed_parameters_are_read_when_told(tracer: Tracer, rng: np.random.Ge
 def test_a_recording_of_another_build_is_refused(tracer: Tracer, rng: np.random.Generator) -> None:
     cloud, rays = make_cloud(rng, 20), rays_inwards(rng, 5)
     tracer.build(cloud)
-    hits = tracer.trace(rays, record=True).hits
+    hits = tracer.trace(rays, record=True).recording
     tracer.build(cloud)
     assert hits is not None
     with pytest.raises(ValueError, match="older than its last build"):
@@ -214,17 +214,17 @@ def test_a_recording_of_another_build_is_refused(tracer: Tracer, rng: np.random.
 
 
 @pytest.mark.parametrize(("gaussians", "rays"), [(0, 5), (20, 0), (0, 0)])
-def test_nothing_to_see_or_to_follow(
+def test_empty_scene_and_no_rays_are_traced(
     tracer: Tracer, rng: np.random.Generator, gaussians: int, rays: int
 ) -> None:
     tracer.build(make_cloud(rng, gaussians))
     batch = RayBatch(f32(rng.normal(size=(rays, 3))) + 9.0, unit(rng.normal(size=(rays, 3)) + 9.0))
     seen = tracer.trace(batch, record=True)
     assert seen.transmittance.tolist() == tracer.transmittance(batch).tolist() == [1.0] * rays
-    assert seen.hits is not None
-    assert len(tracer.backward(seen.hits, random_gradients(rng, rays)).numpy().ids) == 0
+    assert seen.recording is not None
+    assert len(tracer.backward(seen.recording, random_gradients(rng, rays)).numpy().ids) == 0
 
 
-def test_a_tracer_that_is_not_there_is_refused() -> None:
+def test_unknown_tracer_is_refused() -> None:
     with pytest.raises(ValueError, match="tracer"):
         TraceSettings(tracer="cuda")

@@ -43,9 +43,9 @@ def run(scene: Scene, **options: object) -> tuple[TraceResult, GaussianGradients
     cloud, features, rays = scene
     tracer = make_tracer(cloud, features, **options)
     seen = tracer.trace(rays, record=True)
-    assert seen.hits is not None
+    assert seen.recording is not None
     lists = hit_lists(seen)
-    return seen, tracer.backward(seen.hits, random_gradients(np.random.default_rng(1), RAYS, 2)), lists
+    return seen, tracer.backward(seen.recording, random_gradients(np.random.default_rng(1), RAYS, 2)), lists
 
 
 @pytest.mark.parametrize(
@@ -59,7 +59,7 @@ def run(scene: Scene, **options: object) -> tuple[TraceResult, GaussianGradients
         {"box_padding": 0.3, "build_quality": 2, "threads": 2},
     ],
 )
-def test_same_bits(scene: Scene, options: dict[str, float]) -> None:
+def test_trace_is_bit_identical_across_options(scene: Scene, options: dict[str, float]) -> None:
     expected, found = run(scene, threads=1), run(scene, **options)
     same_bits(found[0], expected[0])
     same_bits(found[1], expected[1])
@@ -87,7 +87,7 @@ sys.stdout.write(digest.hexdigest())
 
 
 @pytest.mark.heavy
-def test_four_threads_give_the_bits_of_one() -> None:
+def test_trace_is_bit_identical_across_threads() -> None:
     digests = set()
     for threads in (1, 4):
         done = subprocess.run(
@@ -102,7 +102,7 @@ def test_four_threads_give_the_bits_of_one() -> None:
     assert len(digests) == 1
 
 
-def test_ray_hardly_depends_on_its_companions(
+def test_ray_result_nearly_independent_of_packet(
     scene: Scene,
 ) -> None:
     """A packet rounds slopes against its own axis, so that a ray sees the same but for float32 rounding."""
@@ -116,7 +116,7 @@ def test_ray_hardly_depends_on_its_companions(
             np.testing.assert_allclose(getattr(part, name), expected, rtol=1e-6, atol=1e-6)
 
 
-def test_recording_and_repeating_change_nothing(
+def test_recording_and_repeated_traces_are_bit_identical(
     scene: Scene,
 ) -> None:
     cloud, features, rays = scene
@@ -151,9 +151,9 @@ def test_refresh_is_as_good_as_a_rebuild(rng: np.random.Generator, share: float)
     same_bits(refreshed, rebuilt)
     assert not np.array_equal(before.transmittance, refreshed.transmittance)
     given = random_gradients(rng, 400)
-    assert refreshed.hits is not None and rebuilt.hits is not None
+    assert refreshed.recording is not None and rebuilt.recording is not None
     assert hit_lists(refreshed) == hit_lists(rebuilt)
-    same_bits(tracer.backward(refreshed.hits, given), rebuilt_tracer.backward(rebuilt.hits, given))
+    same_bits(tracer.backward(refreshed.recording, given), rebuilt_tracer.backward(rebuilt.recording, given))
 
 
 def test_rebuilding_with_another_count(rng: np.random.Generator) -> None:

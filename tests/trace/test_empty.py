@@ -16,26 +16,26 @@ def assert_sees_nothing(cloud: FlatGaussians, rays: RayBatch) -> None:
     assert (seen.transmittance == 1).all() and (seen.alpha == 0).all()
     for name in ("rgb_srgb", "depth_sum", "depth_median", "normal_world", "expected_depth"):
         assert not getattr(seen, name).any()
-    assert seen.hits is not None
-    gradients = tracer.backward(seen.hits, random_gradients(np.random.default_rng(0), count))
+    assert seen.recording is not None
+    gradients = tracer.backward(seen.recording, random_gradients(np.random.default_rng(0), count))
     assert len(gradients.ids) == 0
     assert gradients.sh.shape == (0, *cloud.sh.shape[1:])
 
 
-def test_no_gaussians(rng: np.random.Generator) -> None:
+def test_trace_without_gaussians_is_transparent(rng: np.random.Generator) -> None:
     assert_sees_nothing(make_cloud(rng, 0), rays_inwards(rng, 50))
 
 
-def test_no_rays(rng: np.random.Generator) -> None:
+def test_trace_without_rays_is_empty(rng: np.random.Generator) -> None:
     assert_sees_nothing(make_cloud(rng, 50), rays_inwards(rng, 0))
     assert_sees_nothing(make_cloud(rng, 0), rays_inwards(rng, 0))
 
 
-def test_all_invisible(rng: np.random.Generator) -> None:
+def test_trace_of_invisible_gaussians_is_transparent(rng: np.random.Generator) -> None:
     assert_sees_nothing(make_cloud(rng, 50, logits=(-20.0, -10.0)), rays_inwards(rng, 50))
 
 
-def test_all_missed(rng: np.random.Generator) -> None:
+def test_trace_of_missed_gaussians_is_transparent(rng: np.random.Generator) -> None:
     rays = rays_inwards(rng, 50)
     outwards = RayBatch(rays.origins_world, -rays.directions_world)
     assert_sees_nothing(make_cloud(rng, 50, size=0.01), outwards)
@@ -48,8 +48,8 @@ def test_visible_ones_among_invisible(rng: np.random.Generator) -> None:
     assert alone.hit_counts.tolist() == [1]
     hidden = make_cloud(rng, 40, logits=(-20.0, -10.0))
     among = make_tracer(concatenate([hidden, one, hidden])).trace(rays, record=True)
-    assert among.hits is not None
-    assert among.hits.of_ray(0).tolist() == [40]
+    assert among.recording is not None
+    assert among.recording.ids_of_ray(0).tolist() == [40]
     assert among.transmittance[0] == alone.transmittance[0]
 
 

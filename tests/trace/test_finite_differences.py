@@ -37,12 +37,12 @@ def test_every_parameter_of_a_tiny_scene(output: str | None) -> None:
         zeros = {name: np.zeros_like(getattr(given, name)) for name in OUTPUTS}
         given = TraceGradients(**{**zeros, output: getattr(given, output)})
 
-    parameters = ReferenceParameters.of(cloud, features)
+    parameters = ReferenceParameters.from_gaussians(cloud, features)
     result = trace_reference(parameters, rays, tracer.settings)
     twin = reference_gradients(parameters, result, given)
     seen = tracer.trace(rays, record=True)
-    assert seen.hits is not None
-    ours = scattered(tracer.backward(seen.hits, given), 6)
+    assert seen.recording is not None
+    ours = scattered(tracer.backward(seen.recording, given), 6)
 
     for name in PARAMETERS:
         leaf = getattr(parameters, name).detach()

@@ -22,7 +22,7 @@ TRAINING = """
 import sys, tempfile
 from pathlib import Path
 sys.path.insert(0, sys.argv[1])
-from flat_world import FlatWorld, small_config
+from planar_dataset import FlatWorld, small_config
 from octasplat.engine.train.state import fresh_state
 from octasplat.engine.train.trainer import Trainer
 world = FlatWorld()

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import trace_scenes
 from trace_scenes import (
-    assert_like_twin,
+    assert_matches_reference,
     f32,
     facing_z,
     hit_lists,
@@ -60,8 +60,8 @@ def starts(rays: RayBatch) -> list[int]:
 
 def in_packets(seen: TraceResult) -> bool:
     """Whether all rays of a recorded trace went in packets."""
-    assert isinstance(seen.hits, CpuRecording)
-    return len(seen.hits.alone) == 0 and len(seen.hits.packets) > 0
+    assert isinstance(seen.recording, CpuRecording)
+    return len(seen.recording.single_rays) == 0 and len(seen.recording.packets) > 0
 
 
 def test_neighbours_with_one_origin_form_a_packet() -> None:
@@ -70,7 +70,7 @@ def test_neighbours_with_one_origin_form_a_packet() -> None:
     assert starts(RayBatch(origins, directions)) == [0, 3, 5, 6]
 
 
-def test_a_packet_ends_where_it_is_full_or_looks_elsewhere() -> None:
+def test_packet_ends_at_capacity_or_diverging_direction() -> None:
     count = MAX_RAYS + 5
     origins = np.zeros((count, 3), np.float32)
     directions = f32(np.tile([0, 0, 1], (count, 1)))
@@ -80,38 +80,40 @@ def test_a_packet_ends_where_it_is_full_or_looks_elsewhere() -> None:
 
 
 @pytest.mark.parametrize("degree", [0, 3])
-def test_tiles_are_like_the_twin(rng: np.random.Generator, degree: int) -> None:
+def test_packet_tiles_match_reference(rng: np.random.Generator, degree: int) -> None:
     cloud = make_cloud(rng, 1000, degree=degree)
     features = f32(rng.normal(size=(1000, degree)))
-    ours, _ = assert_like_twin(cloud, tile_rays(rng, 4), features=features)
+    ours, _ = assert_matches_reference(cloud, tile_rays(rng, 4), features=features)
     assert in_packets(ours)
     assert ours.hit_counts.mean() > 10
 
 
 @pytest.mark.parametrize("width", [0.01, 0.7])
-def test_narrow_and_wide_tiles_are_like_the_twin(rng: np.random.Generator, width: float) -> None:
+def test_packet_tiles_of_any_width_match_reference(rng: np.random.Generator, width: float) -> None:
     cloud = make_cloud(rng, 1000)
-    ours, _ = assert_like_twin(cloud, tile_rays(rng, 4, width=width))
+    ours, _ = assert_matches_reference(cloud, tile_rays(rng, 4, width=width))
     assert in_packets(ours)
 
 
 def test_rays_from_within_the_cloud(rng: np.random.Generator) -> None:
-    ours, _ = assert_like_twin(make_cloud(rng, 1000, size=0.15), tile_rays(rng, 4, distance=0.3, width=0.8))
+    ours, _ = assert_matches_reference(
+        make_cloud(rng, 1000, size=0.15), tile_rays(rng, 4, distance=0.3, width=0.8)
+    )
     assert in_packets(ours)
 
 
-def test_far_away_and_off_centre(rng: np.random.Generator) -> None:
+def test_packets_far_from_origin_match_reference(rng: np.random.Generator) -> None:
     cloud = make_cloud(rng, 1000)
     rays = tile_rays(rng, 4)
     shift = f32([40.0, -25.0, 10.0])
     cloud.means_world += shift
-    assert_like_twin(cloud, RayBatch(rays.origins_world + shift, rays.directions_world))
+    assert_matches_reference(cloud, RayBatch(rays.origins_world + shift, rays.directions_world))
 
 
-def test_more_candidates_than_there_is_room_for_at_first(rng: np.random.Generator) -> None:
+def test_packet_candidate_buffer_grows(rng: np.random.Generator) -> None:
     cloud = make_cloud(rng, 3000, size=0.3, logits=(-4.0, -2.0))
     rays = tile_rays(rng, 2, side=4)
-    packets, singles = (CpuTracer(packets=way) for way in ("always", "never"))
+    packets, singles = (CpuTracer(packet_mode=way) for way in ("always", "never"))
     for tracer in (packets, singles):
         tracer.build(cloud)
     a, b = (tracer.trace(rays, record=True) for tracer in (packets, singles))
@@ -139,11 +141,11 @@ def test_gradients_equal_those_of_single_rays(rng: np.random.Generator) -> None:
     given = random_gradients(rng, len(rays))
     found = []
     for way in ("always", "never"):
-        tracer = CpuTracer(packets=way)
+        tracer = CpuTracer(packet_mode=way)
         tracer.build(cloud)
         seen = tracer.trace(rays, record=True)
-        assert seen.hits is not None
-        found.append(tracer.backward(seen.hits, given))
+        assert seen.recording is not None
+        found.append(tracer.backward(seen.recording, given))
     a, b = found
     np.testing.assert_array_equal(a.ids, b.ids)
     np.testing.assert_array_equal(a.hit_counts, b.hit_counts)
@@ -159,7 +161,7 @@ def test_gradients_equal_those_of_single_rays(rng: np.random.Generator) -> None:
         assert relative_error(getattr(a, name), getattr(b, name)) < 2e-5, name
 
 
-def test_same_bits_on_any_number_of_threads(rng: np.random.Generator) -> None:
+def test_packets_are_bit_identical_across_threads(rng: np.random.Generator) -> None:
     cloud = make_cloud(rng, 2000, degree=1)
     rays = tile_rays(rng, 12)
     given = random_gradients(rng, len(rays))
@@ -169,9 +171,9 @@ def test_same_bits_on_any_number_of_threads(rng: np.random.Generator) -> None:
         tracer.build(cloud)
         result = tracer.trace(rays, record=True)
         assert in_packets(result)
-        assert result.hits is not None
-        found.append(tracer.backward(result.hits, given))
-        result.hits = None
+        assert result.recording is not None
+        found.append(tracer.backward(result.recording, given))
+        result.recording = None
         seen.append(result)
     same_bits(*seen)
     same_bits(*found)
@@ -192,7 +194,7 @@ def test_refresh_follows_parameters_inside_their_boxes(rng: np.random.Generator)
     same_bits(stale.trace(rays), fresh.trace(rays))
 
 
-def test_a_gaussian_that_vanishes_is_not_seen(rng: np.random.Generator) -> None:
+def test_packet_skips_vanished_gaussian(rng: np.random.Generator) -> None:
     wall = facing_z([[0, 0, 0]], scales=5.0, opacities=0.9)
     origins, directions = np.zeros((16, 3), np.float32), np.tile(f32([0, 0, 1]), (16, 1))
     origins[:, 2] = -1

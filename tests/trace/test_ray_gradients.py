@@ -16,11 +16,11 @@ from trace_scenes import (
     unit,
 )
 
-from octasplat.engine.gaussians.harmonics import sh_basis, sh_basis_slopes
+from octasplat.engine.gaussians.spherical_harmonics import sh_basis, sh_basis_gradients
 from octasplat.engine.rays import AT_INFINITY, RayBatch
 from octasplat.engine.trace.protocol import TraceGradients, TraceSettings
 from octasplat.engine.trace.ray_gradients import ray_gradients
-from octasplat.engine.trace.ray_hits import heaviest_gaussians
+from octasplat.engine.trace.ray_hits import dominant_gaussians
 from octasplat.engine.trace.reference import ReferenceParameters, trace_reference
 from octasplat.engine.trace.reference_tracer import ReferenceTracer
 
@@ -32,7 +32,7 @@ def moved_losses(
     cloud: object, rays: RayBatch, name: str, given: TraceGradients, settings: TraceSettings
 ) -> np.ndarray:
     """Central differences of each ray's own loss by three components, through float64 rays."""
-    parameters = ReferenceParameters.of(cloud)
+    parameters = ReferenceParameters.from_gaussians(cloud)
     found = np.zeros((len(rays), 3))
     for axis in range(3):
         losses, places = [], []
@@ -55,9 +55,9 @@ def moved_losses(
     return found
 
 
-def test_slopes_of_harmonics_are_their_differences(rng: np.random.Generator) -> None:
+def test_harmonics_gradient_matches_finite_differences(rng: np.random.Generator) -> None:
     directions = rng.normal(size=(20, 3))
-    slopes = sh_basis_slopes(directions, 3)
+    slopes = sh_basis_gradients(directions, 3)
     for axis in range(3):
         step = 1e-6 * np.eye(3)[axis]
         differences = (sh_basis(directions + step, 3) - sh_basis(directions - step, 3)) / 2e-6
@@ -76,8 +76,8 @@ def test_ray_gradients_equal_differences_of_the_reference(output: str | None, vi
         zeros = {name: np.zeros_like(getattr(given, name)) for name in OUTPUTS}
         given = TraceGradients(**{**zeros, output: getattr(given, output)})
     seen = tracer.trace(rays, record=True)
-    assert seen.hits is not None
-    ours = ray_gradients(cloud, rays, seen.hits, given, tracer.settings)
+    assert seen.recording is not None
+    ours = ray_gradients(cloud, rays, seen.recording, given, tracer.settings)
     for name in ("origins_world", "directions_world"):
         expected, found = moved_losses(cloud, rays, name, given, tracer.settings), getattr(ours, name)
         errors = np.abs(found - expected).max(axis=1) / max(np.abs(expected).max(), 1e-3)
@@ -95,10 +95,10 @@ def test_moving_all_rays_is_moving_all_gaussians_back(rng: np.random.Generator) 
     rays = RayBatch(camera, directions)
     tracer = make_tracer(cloud, features)
     seen = tracer.trace(rays, record=True)
-    assert seen.hits is not None
+    assert seen.recording is not None
     given = random_gradients(rng, 200, 2)
-    ours = ray_gradients(cloud, rays, seen.hits, given, tracer.settings, features)
-    gaussians = tracer.backward(seen.hits, given)
+    ours = ray_gradients(cloud, rays, seen.recording, given, tracer.settings, features)
+    gaussians = tracer.backward(seen.recording, given)
     np.testing.assert_allclose(
         ours.origins_world.sum(axis=0), -gaussians.means_world.sum(axis=0), rtol=2e-3, atol=2e-3
     )
@@ -110,8 +110,8 @@ def test_hits_by_ray_are_those_of_each_ray(rng: np.random.Generator) -> None:
     ways = f32(unit(rng.normal(size=(70, 3)) * 0.3 + [0, 0, 1]))
     for rays in (rays_inwards(rng, 50), RayBatch(f32([[0.0, 0.0, -3.0]]), ways)):
         seen = make_tracer(cloud).trace(rays, record=True)
-        assert seen.hits is not None
-        counts, ids = seen.hits.by_ray()
+        assert seen.recording is not None
+        counts, ids = seen.recording.ids_by_ray()
         assert [part.tolist() for part in np.split(ids, np.cumsum(counts)[:-1])] == hit_lists(seen)
 
 
@@ -120,8 +120,8 @@ def test_heaviest_gaussian_of_each_ray_has_the_largest_weight(rng: np.random.Gen
     rays = rays_inwards(rng, 80, spread=2.0)
     tracer, reference = make_tracer(cloud), ReferenceTracer()
     seen = tracer.trace(rays, record=True)
-    assert seen.hits is not None
-    found = heaviest_gaussians(cloud, rays, seen.hits, tracer.settings)
+    assert seen.recording is not None
+    found = dominant_gaussians(cloud, rays, seen.recording, tracer.settings)
     # The weights of all Gaussians at once: one feature for each of them.
     reference.build(cloud, np.eye(40, dtype=np.float32))
     weights = reference.trace(rays).features

@@ -7,7 +7,7 @@ from trace_scenes import f32, unit
 from octasplat.engine.rays import ImageRays, RayBatch, joined
 
 
-def test_nothing_is_copied_and_single_limits_stay_single(rng: np.random.Generator) -> None:
+def test_ray_batch_keeps_views_and_scalar_limits(rng: np.random.Generator) -> None:
     origins, directions = f32(rng.normal(size=(4, 3))), f32(rng.normal(size=(4, 3)))
     rays = RayBatch(origins, directions)
     assert np.shares_memory(rays.origins_world, origins)
@@ -16,7 +16,7 @@ def test_nothing_is_copied_and_single_limits_stay_single(rng: np.random.Generato
 
 
 @pytest.mark.parametrize("which", [slice(1, 3), np.array([3, 0]), np.array([True, False, False, True])])
-def test_a_part_of_a_batch(rng: np.random.Generator, which: slice | np.ndarray) -> None:
+def test_ray_batch_selection_keeps_limits(rng: np.random.Generator, which: slice | np.ndarray) -> None:
     directions, t_max = f32(rng.normal(size=(4, 3))), f32([1, 2, 3, 4])
     part = RayBatch(np.ones((1, 3)), directions, 0.5, t_max, -t_max)[which].up_to(t_max[which])
     np.testing.assert_array_equal(part.t_viewer, -t_max[which])
@@ -27,7 +27,7 @@ def test_a_part_of_a_batch(rng: np.random.Generator, which: slice | np.ndarray) 
     assert len(one[np.array([], int)]) == 0 and len(one[np.array([0, 0])]) == 2
 
 
-def test_one_batch_after_another(rng: np.random.Generator) -> None:
+def test_ray_batches_join_with_shared_origins(rng: np.random.Generator) -> None:
     directions = f32(rng.normal(size=(5, 3)))
     both = joined(
         RayBatch(np.ones((1, 3)), directions[:2], 0.5), RayBatch(np.zeros((1, 3)), directions[2:], 0.5)
@@ -40,7 +40,7 @@ def test_one_batch_after_another(rng: np.random.Generator) -> None:
     np.testing.assert_array_equal(twice.directions_world, directions[[0, 0]])
 
 
-def test_ways_between_points(rng: np.random.Generator) -> None:
+def test_ray_batch_between_points_has_their_distance(rng: np.random.Generator) -> None:
     ends = np.concatenate([rng.normal(size=(5, 3)), [[1.0, 2.0, 3.0]]])
     rays = RayBatch.between(np.array([[1.0, 2.0, 3.0]]), ends, gap=0.01)
     np.testing.assert_allclose(np.linalg.norm(rays.directions_world, axis=1), 1, atol=1e-6)

@@ -4,7 +4,7 @@ from collections.abc import Iterator
 
 import numpy as np
 import pytest
-from trace_scenes import assert_like_twin, f32, hit_lists, make_cloud, rays_inwards, same_bits, unit
+from trace_scenes import assert_matches_reference, f32, hit_lists, make_cloud, rays_inwards, same_bits, unit
 
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.rays import RayBatch
@@ -44,10 +44,10 @@ def steps(cloud: FlatGaussians, rng: np.random.Generator) -> Iterator[np.ndarray
         yield ids
 
 
-def test_nothing_is_clipped_as_far_as_training_moves(rng: np.random.Generator, way: str) -> None:
+def test_refit_boxes_cover_training_steps(rng: np.random.Generator, way: str) -> None:
     cloud = make_cloud(rng, 1500, size=0.05)
     rays = tiles(rng)
-    refreshed, fresh = CpuTracer(packets=way, box_padding=0.1), CpuTracer(packets=way)
+    refreshed, fresh = CpuTracer(packet_mode=way, box_padding=0.1), CpuTracer(packet_mode=way)
     refreshed.build(cloud)
     before = refreshed.trace(rays)
     for number, ids in enumerate(steps(cloud, rng)):
@@ -58,13 +58,13 @@ def test_nothing_is_clipped_as_far_as_training_moves(rng: np.random.Generator, w
             assert hit_lists(one) == hit_lists(other)
             same_bits(one, other)
     assert np.abs(before.rgb_srgb - one.rgb_srgb).mean() > 0.05
-    assert_like_twin(cloud, rays[::10])
+    assert_matches_reference(cloud, rays[::10])
 
 
-def test_what_was_invisible_at_the_build_can_appear(rng: np.random.Generator, way: str) -> None:
+def test_refit_shows_gaussians_invisible_at_build(rng: np.random.Generator, way: str) -> None:
     cloud = make_cloud(rng, 300, size=0.1, logits=(-12.0, -8.0))
     rays = tiles(rng)
-    tracer, fresh = CpuTracer(packets=way), CpuTracer(packets=way)
+    tracer, fresh = CpuTracer(packet_mode=way), CpuTracer(packet_mode=way)
     tracer.build(cloud)
     assert not tracer.trace(rays).hit_counts.any()
     cloud.opacity_logits[:150] = 1.0
@@ -75,10 +75,10 @@ def test_what_was_invisible_at_the_build_can_appear(rng: np.random.Generator, wa
     same_bits(seen, fresh.trace(rays))
 
 
-def test_what_has_vanished_leaves_no_box_behind(rng: np.random.Generator, way: str) -> None:
+def test_refit_removes_boxes_of_vanished_gaussians(rng: np.random.Generator, way: str) -> None:
     cloud = make_cloud(rng, 300, size=0.1)
     rays = tiles(rng)
-    tracer = CpuTracer(packets=way)
+    tracer = CpuTracer(packet_mode=way)
     tracer.build(cloud)
     cloud.opacity_logits[:] = -20.0
     tracer.refresh()
@@ -86,7 +86,7 @@ def test_what_has_vanished_leaves_no_box_behind(rng: np.random.Generator, way: s
     cloud.opacity_logits[:] = 1.0
     cloud.means_world += f32(5.0)
     tracer.refresh()
-    fresh = CpuTracer(packets=way)
+    fresh = CpuTracer(packet_mode=way)
     fresh.build(cloud)
     shifted = RayBatch(rays.origins_world + f32(5.0), rays.directions_world)
     assert tracer.trace(shifted).hit_counts.any()

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from octasplat.engine.trace.cpu.kernels_sort import sort_by_gaussian, stable_order
+from octasplat.engine.trace.cpu.kernels.radix_sort import sort_by_gaussian, stable_argsort
 
 
 @pytest.mark.parametrize("threads", [1, 2, 7])
@@ -14,7 +14,7 @@ def test_keys_of_all_64_bits_are_sorted_and_equal_ones_left_as_they_are(count: i
     keys[rng.random(count) < 0.3] = np.uint64(2**64 - 1)
     keys[rng.random(count) < 0.3] >>= np.uint64(55)
     before = keys.copy()
-    order, found = stable_order(keys, 64, threads)
+    order, found = stable_argsort(keys, 64, threads)
     np.testing.assert_array_equal(keys, before)
     np.testing.assert_array_equal(order, np.argsort(keys, kind="stable"))
     np.testing.assert_array_equal(found, np.sort(keys))

@@ -91,15 +91,15 @@ def rays_inwards(
 
 def make_tracer(gaussians: FlatGaussians, features: np.ndarray | None = None, **options: object) -> CpuTracer:
     settings = TraceSettings(**{k: options.pop(k) for k in list(options) if k in TraceSettings.model_fields})
-    tracer = CpuTracer(settings, packets=PACKETS[0], **options)
+    tracer = CpuTracer(settings, packet_mode=PACKETS[0], **options)
     tracer.build(gaussians, features)
     return tracer
 
 
 def hit_lists(seen: TraceResult) -> list[list[int]]:
     """Ids of the Gaussians of each ray of a recorded trace."""
-    assert seen.hits is not None
-    return [seen.hits.of_ray(ray).tolist() for ray in range(len(seen.hit_counts))]
+    assert seen.recording is not None
+    return [seen.recording.ids_of_ray(ray).tolist() for ray in range(len(seen.hit_counts))]
 
 
 def relative_error(found: np.ndarray, expected: np.ndarray) -> float:
@@ -161,7 +161,7 @@ def same_bits(a: object, b: object) -> None:
             assert x.tobytes() == y.tobytes(), field.name
 
 
-def twin_chunks(
+def reference_in_chunks(
     gaussians: FlatGaussians,
     rays: RayBatch,
     settings: TraceSettings,
@@ -173,7 +173,7 @@ def twin_chunks(
     ids: list[list[int]] = []
     values: dict[str, list[np.ndarray]] = {name: [] for name in OUTPUTS}
     total: dict[str, np.ndarray] = {}
-    parameters = ReferenceParameters.of(gaussians, features)
+    parameters = ReferenceParameters.from_gaussians(gaussians, features)
     for start in range(0, len(rays), rays_at_once):
         rows = slice(start, start + rays_at_once)
         result = trace_reference(parameters, rays[rows], settings)
@@ -187,7 +187,7 @@ def twin_chunks(
     return ids, {name: np.concatenate(parts) for name, parts in values.items()}, total
 
 
-def assert_like_twin(
+def assert_matches_reference(
     gaussians: FlatGaussians,
     rays: RayBatch,
     *,
@@ -201,14 +201,14 @@ def assert_like_twin(
     tracer = make_tracer(gaussians, features, **options)
     ours = tracer.trace(rays, record=True)
     given = random_gradients(np.random.default_rng(seed), len(rays), ours.features.shape[1])
-    ids, values, expected = twin_chunks(gaussians, rays, tracer.settings, features, given)
-    assert ours.hits is not None
+    ids, values, expected = reference_in_chunks(gaussians, rays, tracer.settings, features, given)
+    assert ours.recording is not None
     assert hit_lists(ours) == ids
     assert ours.hit_counts.tolist() == [len(row) for row in ids]
     for name in OUTPUTS:
         error = relative_error(getattr(ours, name), values[name])
         assert error < value_tolerance, f"{name}: {error:.2e}"
-    found = scattered(tracer.backward(ours.hits, given), len(gaussians))
+    found = scattered(tracer.backward(ours.recording, given), len(gaussians))
     for name in PARAMETERS:
         error = relative_error(found[name], expected[name])
         assert error < gradient_tolerance, f"gradient of {name}: {error:.2e}"

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 import numpy as np
-from flat_world import random_gaussians
+from planar_dataset import random_gaussians
 
 from octasplat.engine.gaussians.rows import row_arrays
 from octasplat.engine.train.averaging import AVERAGE_EVERY, RunningMean
@@ -34,7 +34,7 @@ def test_the_mean_is_that_of_plain_float32_arithmetic() -> None:
     np.testing.assert_array_equal(mean.gaussians.sh, expected)
 
 
-def test_other_parameters_begin_a_new_mean() -> None:
+def test_averaging_restarts_for_new_parameters() -> None:
     mean = RunningMean()
     mean.add(random_gaussians(12, seed=0))
     wider = random_gaussians(12, seed=1, degree=1)
@@ -45,7 +45,7 @@ def test_other_parameters_begin_a_new_mean() -> None:
     assert mean.gaussians.sh.any()
 
 
-def test_a_checkpoint_keeps_it(tmp_path: Path) -> None:
+def test_averaging_state_survives_checkpoint(tmp_path: Path) -> None:
     state = fresh_state(random_gaussians(12, seed=0), seed=0)
     assert load_checkpoint(save_checkpoint(state, tmp_path, "x"), "x").average.gaussians is None
     for seed in range(3):
@@ -56,7 +56,7 @@ def test_a_checkpoint_keeps_it(tmp_path: Path) -> None:
         np.testing.assert_array_equal(found, row_arrays(state.average.gaussians)[name])
 
 
-def test_which_states_count() -> None:
+def test_averaging_starts_at_configured_iteration() -> None:
     schedule = Schedule(TrainConfig(weight_averaging_start=0.5), 100)
     assert [k for k in range(1, 101) if schedule.averages(k)] == list(range(60, 101, AVERAGE_EVERY))
     assert not any(Schedule(TrainConfig(weight_averaging_start=1), 100).averages(k) for k in range(1, 101))

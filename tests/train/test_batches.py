@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from flat_world import FlatWorld, small_config
+from planar_dataset import PlanarDataset, small_config
 
 from octasplat.engine.errors import ConfigError
 from octasplat.engine.train.batches import BatchSource
@@ -77,7 +77,7 @@ def test_windows_of_a_batch_are_spread_over_the_views_and_within_them() -> None:
             assert len(tiles) >= 4
 
 
-def test_few_windows_a_turn_see_all_views_equally_often_in_time() -> None:
+def test_ray_patches_cover_views_evenly() -> None:
     """Drawn at random, of 300 windows on 50 views some would have fewer than three."""
     sampler = PixelSampler(np.arange(50), np.array([[60, 40]] * 50))
     rng = np.random.default_rng(0)
@@ -86,7 +86,7 @@ def test_few_windows_a_turn_see_all_views_equally_often_in_time() -> None:
     assert tally.min() >= 5 and tally.max() <= 7
 
 
-def test_patches_are_whole_and_in_rows() -> None:
+def test_ray_patches_are_contiguous() -> None:
     sampler = PixelSampler(np.array([1, 2]), SIZES)
     view, y, x = (a.reshape(500, 4, 4) for a in sampler.patches(np.random.default_rng(0), 500, 4))
     assert (view == view[:, :1, :1]).all()
@@ -109,11 +109,11 @@ def test_patch_as_large_as_the_view() -> None:
 @pytest.mark.parametrize(("ssim", "fraction"), [(0.0, 0.25), (0.2, 0.6), (0.2, 1.0)])
 @pytest.mark.parametrize("rays", [256, 1000, 1024])
 @pytest.mark.parametrize("ray_patch_rays", [1, 64])
-def test_batch_has_its_rays(ssim: float, fraction: float, rays: int, window_rays: int) -> None:
-    world = FlatWorld(side_px=40)
+def test_batch_has_its_rays(ssim: float, fraction: float, rays: int, ray_patch_rays: int) -> None:
+    world = PlanarDataset(side_px=40)
     config = small_config(
         rays_per_batch=rays,
-        ray_patch_rays=window_rays,
+        ray_patch_rays=ray_patch_rays,
         ray_patch_side=24,
         ssim_patch_fraction=fraction,
         loss={"ssim": ssim},
@@ -126,16 +126,16 @@ def test_batch_has_its_rays(ssim: float, fraction: float, rays: int, window_rays
 
 def test_ssim_is_refused_where_it_would_be_ignored() -> None:
     with pytest.raises(ConfigError, match="only 12 pixels wide or high; lower ssim_patch_side"):
-        BatchSource(FlatWorld(side_px=12), small_config(loss={"ssim": 0.2}))
+        BatchSource(PlanarDataset(side_px=12), small_config(loss={"ssim": 0.2}))
     with pytest.raises(ConfigError, match="raise rays_per_batch or ssim_patch_fraction"):
         BatchSource(
-            FlatWorld(), small_config(rays_per_batch=256, ssim_patch_fraction=0.3, loss={"ssim": 0.2})
+            PlanarDataset(), small_config(rays_per_batch=256, ssim_patch_fraction=0.3, loss={"ssim": 0.2})
         )
 
 
 @pytest.mark.parametrize(("background", "has_alpha"), [("white", False), ("auto", False), ("auto", True)])
 def test_photographs_lie_over_the_background(background: str, has_alpha: bool) -> None:
-    world = FlatWorld()
+    world = PlanarDataset()
     world.has_alpha = has_alpha
     batch = BatchSource(world, small_config(background=background)).draw(np.random.default_rng(0))
     if has_alpha:

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from flat_world import FlatWorld
+from planar_dataset import PlanarDataset
 
 from octasplat.engine.errors import CheckpointError
 from octasplat.engine.gaussians.rows import row_arrays
@@ -22,7 +22,7 @@ from octasplat.engine.train.state import TrainState
 
 def make_state(iteration: int = 30, count: int = 12) -> TrainState:
     rng = np.random.default_rng(iteration)
-    gaussians = FlatWorld().start(count)
+    gaussians = PlanarDataset().initial_gaussians(count)
     adam = Adam.fresh(gaussians)
     adam.first[:] = rng.normal(size=adam.first.shape)
     adam.steps[:] = 7
@@ -33,7 +33,7 @@ def make_state(iteration: int = 30, count: int = 12) -> TrainState:
     )  # fmt: skip
 
 
-def test_round_trip(tmp_path: Path) -> None:
+def test_checkpoint_round_trips(tmp_path: Path) -> None:
     state = make_state()
     path = save_checkpoint(state, tmp_path, "abc")
     back = load_checkpoint(path, "abc")
@@ -47,7 +47,7 @@ def test_round_trip(tmp_path: Path) -> None:
     np.testing.assert_array_equal(back.rng.random(9), state.rng.random(9))
 
 
-def test_without_a_best_yet(tmp_path: Path) -> None:
+def test_checkpoint_without_best_state_loads(tmp_path: Path) -> None:
     state = make_state(0)
     state.best_psnr, state.densifier = -np.inf, {}
     back = load_checkpoint(save_checkpoint(state, tmp_path, "abc"), "abc")
@@ -62,7 +62,7 @@ def test_newest_is_found_and_old_ones_go(tmp_path: Path) -> None:
     assert len(list(tmp_path.glob("*.npz"))) == 2
 
 
-def test_other_settings_are_refused(tmp_path: Path) -> None:
+def test_checkpoint_of_other_settings_is_refused(tmp_path: Path) -> None:
     path = save_checkpoint(make_state(), tmp_path, "abc")
     with pytest.raises(CheckpointError, match="other settings"):
         load_checkpoint(path, "abd")
@@ -96,13 +96,13 @@ def test_damage_is_refused_or_harmless(tmp_path: Path) -> None:
     assert refused > 100
 
 
-def test_missing_file(tmp_path: Path) -> None:
+def test_checkpoint_missing_file_is_named(tmp_path: Path) -> None:
     with pytest.raises(CheckpointError, match=r"iteration_0000001\.npz"):
         load_checkpoint(tmp_path / "iteration_0000001.npz", "abc")
 
 
-def test_best(tmp_path: Path) -> None:
-    gaussians = FlatWorld().start(20)
+def test_best_checkpoint_round_trips(tmp_path: Path) -> None:
+    gaussians = PlanarDataset().initial_gaussians(20)
     corrections = np.random.default_rng(0).normal(size=(5, 6))
     save_best(BestState(gaussians, {"toy.light": np.arange(3.0)}, corrections), tmp_path)
     back = load_best(tmp_path)

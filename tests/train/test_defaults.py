@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from flat_world import FlatWorld, small_config
+from planar_dataset import PlanarDataset, small_config
 
 from octasplat.engine.train.config import (
     LossWeights,
@@ -34,7 +34,7 @@ from octasplat.engine.train.trainer import Trainer
         (46_000_000, (50_000, 400_000, 600_000, 350_000)),
     ],
 )
-def test_most_gaussians_follow_the_pixels(pixels: int, counts: tuple[int, ...]) -> None:
+def test_default_max_gaussians_scales_with_pixels(pixels: int, counts: tuple[int, ...]) -> None:
     for name, count in zip(PRESETS, counts, strict=True):
         assert most_gaussians(preset(name), pixels) == count
         assert most_gaussians(preset(name).model_copy(update={"max_gaussians": 777}), pixels) == 777
@@ -60,7 +60,7 @@ def test_windows_follow_the_gaussians_or_the_views(
     assert window_side_px(TrainConfig(ray_patch_side=20), longest_px, each_px) == 20
 
 
-def test_what_is_learnt_says_whether_windows_have_one_order() -> None:
+def test_default_sort_depends_on_trained_parameters() -> None:
     assert TrainConfig().trace.sort == "ray"
     for config in (
         TrainConfig(shared_sort_until=0),
@@ -91,7 +91,7 @@ def test_large_scenes_train_longer(pixels: int, count: int) -> None:
 @pytest.mark.parametrize(
     ("shown", "gaussians", "count"), [(1.0, 400_000, 8000), (0.7, 400_000, 11_000), (0.31, 202_533, 23_000)]
 )
-def test_pixels_that_show_nothing_hold_nothing_down(shown: float, gaussians: int, count: int) -> None:
+def test_default_counts_ignore_empty_pixels(shown: float, gaussians: int, count: int) -> None:
     assert most_gaussians(TrainConfig(), 19_600_000, shown) == gaussians
     assert iteration_count(TrainConfig(), 19_600_000, shown) == count
     assert iteration_count(preset("fast"), 19_600_000, shown) == 2500
@@ -104,7 +104,7 @@ def test_pixels_that_show_nothing_hold_nothing_down(shown: float, gaussians: int
 
 @pytest.mark.parametrize("hidden", ["alpha", "weight"])
 def test_the_share_of_pixels_that_show_something(hidden: str) -> None:
-    class Half(FlatWorld):
+    class Half(PlanarDataset):
         def pixels(
             self, view: np.ndarray, y: np.ndarray, x: np.ndarray
         ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -113,21 +113,21 @@ def test_the_share_of_pixels_that_show_something(hidden: str) -> None:
             shown[hidden] = np.where(x < 20, 0, shown[hidden])
             return rgb, shown["alpha"], shown["weight"]
 
-    assert shown_share(FlatWorld()) == 1
+    assert shown_share(PlanarDataset()) == 1
     assert shown_share(Half()) == pytest.approx(0.5, abs=0.01)
 
 
 @pytest.mark.parametrize(("wanted", "count"), [(0, 7000), (80, 80)])
 def test_the_trainer_knows_its_iterations(tmp_path: Path, wanted: int, count: int) -> None:
-    world, config = FlatWorld(), small_config(iterations=wanted)
-    state = fresh_state(world.start(), config.seed)
+    world, config = PlanarDataset(), small_config(iterations=wanted)
+    state = fresh_state(world.initial_gaussians(), config.seed)
     trainer = Trainer(
         world, config, state, folder=tmp_path, fingerprint="test", listener=lambda _event: None, threads=1
     )
     assert trainer.schedule.iterations == count
 
 
-def test_more_rays_an_iteration_want_fewer_iterations() -> None:
+def test_default_iterations_decrease_with_rays_per_batch() -> None:
     assert iteration_count(TrainConfig(rays_per_batch=32_768), 70_000_000) == 15_000
 
 

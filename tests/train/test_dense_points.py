@@ -9,10 +9,10 @@ import pycolmap
 import pytest
 from scipy.spatial import cKDTree
 
-from octasplat.engine.render.images import write_png
-from octasplat.engine.scene import Dataset
-from octasplat.engine.scene.generated import GeneratedSceneConfig, write_generated_scene
-from octasplat.engine.scene.generated.arrangement import still_life
+from octasplat.engine.dataset import Dataset
+from octasplat.engine.dataset.synthetic import SyntheticDatasetConfig, write_synthetic_dataset
+from octasplat.engine.dataset.synthetic.still_life import build_still_life
+from octasplat.engine.render.image_files import write_png
 from octasplat.engine.train.dense_points import dense_points
 from octasplat.engine.train.exposure_changes import evening_gains
 from octasplat.engine.train.first_background import first_background
@@ -22,8 +22,8 @@ from octasplat.engine.train.lifted_points import LiftedPoints
 @pytest.fixture(scope="module")
 def dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
     root: Path = tmp_path_factory.mktemp("lifted")
-    config = GeneratedSceneConfig(views=24, width_px=160, height_px=120, points=1500, samples_per_side=1)
-    write_generated_scene(root / "scene", config)
+    config = SyntheticDatasetConfig(views=24, width_px=160, height_px=120, points=1500, samples_per_side=1)
+    write_synthetic_dataset(root / "scene", config)
     return Dataset.open(root / "scene", root / "cache")
 
 
@@ -31,7 +31,7 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
 def surface() -> cKDTree:
     """300,000 points spread over the true surfaces, some 2 cm apart."""
     rng = np.random.default_rng(1)
-    scene = still_life()
+    scene = build_still_life()
     corners = scene.vertices.astype(np.float64)[scene.faces]
     areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
     chosen = rng.choice(len(corners), 300_000, p=areas / areas.sum())
@@ -98,9 +98,9 @@ def test_things_without_any_point_of_the_model_are_found(
     assert right[lifted.swept].mean() > 0.75 and right.mean() > 0.85
 
 
-def test_what_one_photograph_shows_is_lifted_where_that_is_asked(surface: cKDTree, tmp_path: Path) -> None:
-    config = GeneratedSceneConfig(views=6, width_px=160, height_px=120, points=1500, samples_per_side=1)
-    write_generated_scene(tmp_path / "scene", config)
+def test_dense_points_single_view_option_lifts_pixels(surface: cKDTree, tmp_path: Path) -> None:
+    config = SyntheticDatasetConfig(views=6, width_px=160, height_px=120, points=1500, samples_per_side=1)
+    write_synthetic_dataset(tmp_path / "scene", config)
     few = Dataset.open(tmp_path / "scene", tmp_path / "cache")
     matched, all_of_them = (
         dense_points(few, 4000, np.random.default_rng(0), unseen=unseen) for unseen in (False, True)
@@ -127,23 +127,23 @@ def test_photographs_that_are_exposed_otherwise_match_when_evened(dataset: Datas
     assert found[1] > 0.9 * before
 
 
-def test_same_seed_same_points(dataset: Dataset) -> None:
+def test_dense_points_are_deterministic_for_seed(dataset: Dataset) -> None:
     first, second = (dense_points(dataset, 500, np.random.default_rng(3)) for _ in range(2))
     assert_same(first, second)
 
 
-def test_none_wanted_none_found(dataset: Dataset) -> None:
+def test_dense_points_count_zero_is_empty(dataset: Dataset) -> None:
     nothing = dense_points(dataset, 0, np.random.default_rng(0))
     assert len(nothing) == 0 and nothing.xyz_world.shape == nothing.rgb_srgb.shape == (0, 3)
 
 
-def test_threads_change_nothing(dataset: Dataset) -> None:
+def test_dense_points_independent_of_threads(dataset: Dataset) -> None:
     one, three = (dense_points(dataset, 800, np.random.default_rng(3), threads=n) for n in (1, 3))
     assert len(one) > 300 and one.swept.any()
     assert_same(one, three)
 
 
-def test_what_is_infinitely_far_away_is_not_lifted(dataset: Dataset, tmp_path: Path) -> None:
+def test_dense_points_skip_sky(dataset: Dataset, tmp_path: Path) -> None:
     """Photographs that show the same colour in a direction from wherever they are: all sky."""
     shutil.copytree(dataset.root, tmp_path / "scene")
     for index, view in enumerate(dataset.views):
@@ -160,13 +160,13 @@ def test_what_is_infinitely_far_away_is_not_lifted(dataset: Dataset, tmp_path: P
     assert lifted[0] > 250 and lifted[1] < 0.8 * lifted[0]
 
 
-def test_what_is_near_is_lifted_although_a_background_is_learnt(dataset: Dataset) -> None:
+def test_dense_points_near_surface_with_background_are_lifted(dataset: Dataset) -> None:
     plain = dense_points(dataset, 1000, np.random.default_rng(0))
     before = dense_points(dataset, 1000, np.random.default_rng(0), behind=first_background(dataset))
     assert len(before) > 0.9 * len(plain)
 
 
-def test_pixels_that_show_nothing_are_made_up_for(dataset: Dataset, tmp_path: Path) -> None:
+def test_dense_points_compensate_for_empty_pixels(dataset: Dataset, tmp_path: Path) -> None:
     shutil.copytree(dataset.root, tmp_path / "scene")
     masks = tmp_path / "scene" / "masks"
     masks.mkdir()

@@ -88,7 +88,7 @@ def test_growth_stops_at_the_cap() -> None:
     assert len(apply(mcmc(10, growth=0.25), make([0.5] * 40))[0]) == 40
 
 
-def test_dead_ones_move_into_a_living_one_and_share_its_opacity() -> None:
+def test_mcmc_relocates_dead_gaussians_and_shares_opacity() -> None:
     dead = 1e-4
     before = make([dead, 0.9, dead, dead])
     source = before.select(np.array([1]))
@@ -107,7 +107,7 @@ def test_dead_ones_move_into_a_living_one_and_share_its_opacity() -> None:
     assert not adam.steps.any()
 
 
-def test_new_ones_come_where_the_error_is() -> None:
+def test_mcmc_adds_gaussians_at_error() -> None:
     densifier = mcmc(growth=0.5, error_power=1.0)
     gaussians = make([0.5] * 40)
     errors = np.zeros(40)
@@ -150,7 +150,7 @@ def weighing(weights: np.ndarray, errors: np.ndarray) -> tuple[GaussianGradients
     return replace(gradients, weight_sums=weights.astype(np.float32)), steps
 
 
-def test_those_that_hardly_weigh_go_where_the_error_is() -> None:
+def test_mcmc_relocates_low_weight_gaussians_to_error() -> None:
     """Of forty that may be forty two have no weight, one has little; errors are seen through three others."""
     before = make([0.5] * 40)
     weights, errors = np.full(40, 10.0), np.zeros(40)
@@ -171,7 +171,7 @@ def test_those_that_hardly_weigh_go_where_the_error_is() -> None:
     assert not densifier.state()["weights"].any() and not adam.steps.any()
 
 
-def test_more_error_draws_more_of_them() -> None:
+def test_mcmc_relocation_follows_error() -> None:
     drawn = np.zeros(40)
     for seed in range(200):
         weights, errors = np.full(40, 10.0), np.ones(40)
@@ -188,7 +188,7 @@ def test_more_error_draws_more_of_them() -> None:
 
 
 @pytest.mark.parametrize(("share", "moved"), [(0.0, []), (0.026, [20]), (0.051, [3, 20])])
-def test_only_a_share_of_them_goes_at_a_time(share: float, moved: list[int]) -> None:
+def test_mcmc_relocation_fraction_is_limited(share: float, moved: list[int]) -> None:
     before = make([0.5] * 40)
     weights, errors = np.full(40, 10.0), np.zeros(40)
     weights[3], weights[11], errors[[7, 8]] = 0.1, 0.2, 3.0
@@ -200,7 +200,7 @@ def test_only_a_share_of_them_goes_at_a_time(share: float, moved: list[int]) -> 
     assert changed.tolist() == moved
 
 
-def test_nobody_is_idle_while_there_may_be_more() -> None:
+def test_mcmc_below_cap_grows_without_relocating() -> None:
     before = make([0.5] * 40)
     weights = np.full(40, 10.0)
     weights[3] = 0.0
@@ -211,7 +211,7 @@ def test_nobody_is_idle_while_there_may_be_more() -> None:
     np.testing.assert_array_equal(after.means_world[:40], before.means_world)
 
 
-def test_rounds_begin_where_there_may_be_no_more() -> None:
+def test_mcmc_rounds_at_cap_are_less_frequent() -> None:
     config = McmcConfig(start=20, interval=10, stop_fraction=0.85, relocate_low_weight_rounds=4)
     densifier = make_densifier(config, iterations=200, max_gaussians=50)
     densifier.observe(40, *seen(40, 0.0))
@@ -220,7 +220,7 @@ def test_rounds_begin_where_there_may_be_no_more() -> None:
     assert [k for k in range(1, 201) if densifier.due(k)] == [50, 100, 150]
 
 
-def test_nothing_to_do() -> None:
+def test_mcmc_all_dead_or_at_cap_changes_nothing() -> None:
     all_dead = make([1e-4] * 5)
     after, _ = apply(mcmc(), all_dead.copy())
     np.testing.assert_array_equal(after.opacity_logits, all_dead.opacity_logits)
@@ -229,7 +229,7 @@ def test_nothing_to_do() -> None:
     np.testing.assert_array_equal(after.means_world, full.means_world)
 
 
-def test_same_seed_same_result() -> None:
+def test_densify_is_deterministic_for_seed() -> None:
     results = []
     for seed in (1, 1, 2):
         densifier = mcmc(growth=0.2)
@@ -238,7 +238,7 @@ def test_same_seed_same_result() -> None:
     assert results[0] == results[1] != results[2]
 
 
-def test_many_rounds_stay_finite() -> None:
+def test_densify_repeated_stays_finite() -> None:
     gaussians, rng = make(np.random.default_rng(0).uniform(1e-3, 0.999, 30)), np.random.default_rng(3)
     densifier = mcmc(200, growth=0.3)
     adam = Adam.fresh(gaussians)
@@ -252,7 +252,7 @@ def test_many_rounds_stay_finite() -> None:
 
 @pytest.mark.parametrize("config", [McmcConfig(start=20, interval=10, stop_fraction=0.5),
                                     PaperConfig(start=20, interval=10, stop_fraction=0.5)])  # fmt: skip
-def test_when_it_is_due(config: McmcConfig | PaperConfig) -> None:
+def test_densify_runs_at_configured_iterations(config: McmcConfig | PaperConfig) -> None:
     densifier = make_densifier(config, iterations=100, max_gaussians=10)
     assert [k for k in range(1, 101) if densifier.due(k)] == [20, 30, 40, 50]
 
@@ -306,7 +306,7 @@ def test_clone_split_and_prune_counts() -> None:
     assert not np.array_equal(after.means_world[5], after.means_world[9])
 
 
-def test_cap_takes_the_longest_steps() -> None:
+def test_densify_cap_keeps_largest_gradients() -> None:
     gaussians = make([0.5] * 6, scale=0.02)
     steps = np.zeros((6, 3))
     steps[:, 0] = [0.02, 0.05, 0.0, 0.03, 0.04, 0.02]

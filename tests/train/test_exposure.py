@@ -5,12 +5,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from flat_world import FlatWorld, small_config
+from planar_dataset import PlanarDataset, small_config
 
+from octasplat.engine.dataset.model import Observations
 from octasplat.engine.errors import Cancelled
 from octasplat.engine.events import Event, HeldOutMeasured
 from octasplat.engine.rays import RayBatch
-from octasplat.engine.scene.model import Observations
 from octasplat.engine.shading.exposure import Exposures
 from octasplat.engine.shading.exposure_guess import times_of
 from octasplat.engine.shading.protocol import Sight
@@ -31,7 +31,7 @@ NO_GRADIENTS = GaussianGradients(
 )  # fmt: skip
 
 
-class UnevenWorld(FlatWorld):
+class UnevenWorld(PlanarDataset):
     """Every training photograph has a brightness of its own; the held-out one has the mean of them."""
 
     def __init__(self) -> None:
@@ -48,7 +48,7 @@ class UnevenWorld(FlatWorld):
 def run(folder: Path, config: TrainConfig, *, stop_after: int | None = None) -> tuple[Trainer, list[Event]]:
     """Train on the uneven world; with ``stop_after``, stop there and go on from the checkpoint."""
     world, events = UnevenWorld(), list[Event]()
-    state = fresh_state(world.start(), config.seed)
+    state = fresh_state(world.initial_gaussians(), config.seed)
 
     def trainer(state: TrainState, last: float) -> Trainer:
         return Trainer(
@@ -140,7 +140,7 @@ def test_known_gains_and_offsets_are_found() -> None:
     log_gains -= log_gains.mean(axis=0)
     offsets -= offsets.mean(axis=0)
     exposures = Exposures(4, rate=0.02, decay=0.01)
-    gaussians, nothing = FlatWorld().start(1), np.zeros(256, np.float32)
+    gaussians, nothing = PlanarDataset().initial_gaussians(1), np.zeros(256, np.float32)
     for iteration in range(2000):
         view = rng.integers(0, 4, 256)
         rgb, alpha = rng.random((256, 3)).astype(np.float32), np.ones(256, np.float32)
@@ -184,7 +184,7 @@ def test_a_resumed_run_has_the_same_exposures(tmp_path: Path) -> None:
 NAMES = [f"view_{k:03}.png" for k in range(65)]
 
 
-def test_names_tell_when_photographs_were_taken() -> None:
+def test_exposure_of_held_out_frame_follows_neighbouring_names() -> None:
     """A film of which few frames are kept: the held-out one is like the frame just before it."""
     names = ["take2_0001.jpg", "take2_0002.jpg", "take2_0090.jpg", "take2_0091.jpg", "take2_0180.jpg"]
     np.testing.assert_array_equal(times_of(names), [1, 2, 90, 91, 180])
@@ -201,7 +201,7 @@ def test_names_tell_when_photographs_were_taken() -> None:
     assert off[0] < 0.03 < off[1]
 
 
-def test_a_held_out_view_is_guessed_from_those_beside_it_where_they_tell() -> None:
+def test_exposure_of_held_out_view_is_interpolated() -> None:
     places = np.arange(33)
     smooth, anew = np.sin(places / 5)[:, None] * np.ones(3), np.random.default_rng(0).normal(size=(33, 3))
     for known, told in ((smooth, True), (anew, False)):
@@ -234,7 +234,7 @@ def test_a_held_out_view_is_exposed_by_its_brightness_where_cameras_did_so() -> 
     assert off[1] < 0.01 < 0.04 < off[0]
 
 
-def test_a_brightness_that_tells_nothing_is_not_listened_to() -> None:
+def test_exposure_uncorrelated_brightness_keeps_mean() -> None:
     """Where each photograph is exposed anew, whatever it shows, held-out views keep about the mean."""
     rng = np.random.default_rng(5)
     places = np.arange(65)
@@ -255,7 +255,7 @@ class AutomaticWorld(UnevenWorld):
     """
 
     def __init__(self) -> None:
-        FlatWorld.__init__(self, count=16, held_out=3)
+        PlanarDataset.__init__(self, count=16, held_out=3)
         rng = np.random.default_rng(6)
         self.origins[:, 0] = rng.permutation(np.linspace(-0.5, 0.5, 16))
         self.views = tuple(
@@ -280,7 +280,7 @@ def test_held_out_photographs_of_an_automatic_camera_are_met(tmp_path: Path) -> 
     assert world.log_gains.std() > 0.08
     config = small_config(iterations=400, exposure=True, lr={"exposure": 0.02})
     trainer = Trainer(
-        world, config, fresh_state(world.start(), config.seed), folder=tmp_path, fingerprint="test",
+        world, config, fresh_state(world.initial_gaussians(), config.seed), folder=tmp_path, fingerprint="test",
         listener=lambda _event: None, threads=1,
     )  # fmt: skip
     trainer.run()
@@ -338,7 +338,7 @@ def test_changing_brightness_is_noticed() -> None:
     assert exposure_changes(log_brightness(world)) is None
 
 
-def test_without_the_setting_nothing_is_learnt(tmp_path: Path) -> None:
+def test_exposure_disabled_learns_nothing(tmp_path: Path) -> None:
     trainer, _ = run(tmp_path, small_config(exposure=False))
     assert trainer.state.shading == {}
 

@@ -20,7 +20,7 @@ def grid(side: int = 12, spacing: float = 0.05) -> np.ndarray:
     return np.stack([x.ravel(), y.ravel(), np.zeros(side * side)], axis=-1)
 
 
-def test_points_of_a_plane_lie_flat_in_it() -> None:
+def test_initialise_plane_points_align_normals() -> None:
     tilt = np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))[0]
     first = start(grid() @ tilt.T)
     assert np.abs(first.rotations[:, :, 0] @ tilt[:, 2]).min() > 1 - 1e-5
@@ -33,7 +33,7 @@ def test_scales_are_the_spacing_of_the_points() -> None:
     assert (first.log_scales[:, 0] == first.log_scales[:, 1]).all()
 
 
-def test_opacity_and_colour() -> None:
+def test_initialise_sets_opacity_and_colour() -> None:
     first = start(grid(), rgb=[0.9, 0.2, 0.5], opacity=0.3)
     np.testing.assert_allclose(first.opacities, 0.3, rtol=1e-5)
     np.testing.assert_allclose(first.base_rgb_srgb, [[0.9, 0.2, 0.5]] * 144, atol=1e-6)
@@ -65,7 +65,7 @@ def test_too_many_points_are_thinned() -> None:
 
 
 @pytest.mark.parametrize("count", [1, 2, 5, 9])
-def test_few_points(count: int) -> None:
+def test_initialise_few_points_is_finite(count: int) -> None:
     first = start(grid()[:count])
     assert len(first) == count and first.is_finite() and (first.scales > 0).all()
 
@@ -75,11 +75,11 @@ def test_points_in_one_place() -> None:
     assert first.is_finite() and (first.scales > 0).all()
 
 
-def test_a_point_at_the_cameras() -> None:
+def test_initialise_point_at_camera_is_finite() -> None:
     assert start(np.concatenate([np.median(CAMERAS, axis=0)[None], grid()])).is_finite()
 
 
-def test_no_usable_points() -> None:
+def test_initialise_without_usable_points_is_refused() -> None:
     with pytest.raises(DatasetError, match="lies near the cameras"):
         start(np.full((5, 3), np.nan))
 

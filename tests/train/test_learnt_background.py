@@ -5,14 +5,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from flat_world import FlatWorld, paint, small_config
+from planar_dataset import PlanarDataset, plane_texture, small_config
 
+from octasplat.engine.dataset import Camera
+from octasplat.engine.dataset.model import SparsePoints
 from octasplat.engine.errors import Cancelled, ConfigError
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.rays import RayBatch
-from octasplat.engine.render.environment_map import read_background, write_background
-from octasplat.engine.scene import Camera
-from octasplat.engine.scene.model import SparsePoints
+from octasplat.engine.render.environment_files import read_background, write_background
 from octasplat.engine.shading.exposure import Exposures
 from octasplat.engine.shading.learnt_background import LearntBackground
 from octasplat.engine.shading.protocol import Sight
@@ -33,7 +33,7 @@ def sky(directions: np.ndarray) -> np.ndarray:
     ).astype(np.float32)
 
 
-class UnderTheSky(FlatWorld):
+class UnderTheSky(PlanarDataset):
     """The painted plane is a disc; around it the photographs show the sky."""
 
     def pixels(
@@ -48,9 +48,9 @@ class UnderTheSky(FlatWorld):
         rgb[beside] = sky(rays.directions_world[beside])
         return rgb, alpha, weight
 
-    def start(self, count: int = 300, opacity: float = 0.1) -> FlatGaussians:
+    def initial_gaussians(self, count: int = 300, opacity: float = 0.1) -> FlatGaussians:
         """Grey Gaussians on the disc."""
-        first = super().start(3 * count, opacity)
+        first = super().initial_gaussians(3 * count, opacity)
         return first.select(np.flatnonzero(np.hypot(*first.means_world[:, :2].T) < 0.6))
 
     @property
@@ -66,7 +66,11 @@ class UnderTheSky(FlatWorld):
         xyz = np.stack([radius * np.cos(turn), radius * np.sin(turn), 0 * turn], axis=1).astype(np.float32)
         counts = np.full(len(xyz), 3, np.int32)
         return SparsePoints(
-            xyz, paint(xyz[:, 0], xyz[:, 1]), counts, np.zeros(len(xyz), np.float32), np.arange(len(xyz))
+            xyz,
+            plane_texture(xyz[:, 0], xyz[:, 1]),
+            counts,
+            np.zeros(len(xyz), np.float32),
+            np.arange(len(xyz)),
         )
 
 
@@ -94,7 +98,7 @@ def train(
     """Train on the disc under the sky; with ``stop_after``, stop there and go on from the checkpoint."""
     world = UnderTheSky()
     config = small_config(background="learnt", background_height=16, lr={"background": 0.05}, **changes)
-    state = fresh_state(world.start(), config.seed)
+    state = fresh_state(world.initial_gaussians(), config.seed)
 
     def trainer(state: TrainState, last: float) -> Trainer:
         return Trainer(
@@ -145,7 +149,7 @@ def test_gradients_agree_with_finite_differences() -> None:
         assert sums[row, column, channel] == pytest.approx((above - loss()) / step, abs=1e-5)
 
 
-def test_a_known_sky_is_recovered_behind_what_stands_before_it(tmp_path: Path) -> None:
+def test_background_recovers_known_sky(tmp_path: Path) -> None:
     trainer, world = train(tmp_path, iterations=240)
     background = background_of(trainer.shading)
     assert background is not None
@@ -156,7 +160,7 @@ def test_a_known_sky_is_recovered_behind_what_stands_before_it(tmp_path: Path) -
     assert trainer.views is not None and trainer.views.as_dict()["psnr"] > 27
 
 
-def test_it_begins_with_what_photographs_show_where_no_points_are() -> None:
+def test_background_initialises_from_photographs() -> None:
     world = UnderTheSky()
     first = first_background(world)
     view = np.repeat(world.train_indices, 40)

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
+from octasplat.engine.dataset import Camera, Dataset, PosedView
+from octasplat.engine.dataset.model import Observations, SparsePoints
 from octasplat.engine.rays import RayBatch
-from octasplat.engine.scene import Camera, Dataset, PosedView
-from octasplat.engine.scene.model import Observations, SparsePoints
 from octasplat.engine.train.dense_points import dense_points
 
 WIDTH, HEIGHT, FOCAL, AWAY = 80, 60, 50.0, 2.0

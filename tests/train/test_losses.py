@@ -54,7 +54,7 @@ def autograd_of_ssim(render: np.ndarray, target: np.ndarray) -> tuple[float, np.
 
 
 @pytest.mark.parametrize("side", [11, 16, 24])
-def test_gradient_of_ssim(side: int) -> None:
+def test_ssim_gradient_matches_autograd(side: int) -> None:
     render, target = patches(side=side)
     loss, gradient = ssim_loss(render, target)
     expected_loss, expected = autograd_of_ssim(render, target)

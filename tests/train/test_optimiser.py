@@ -6,7 +6,7 @@ from typing import Literal
 import numpy as np
 import pytest
 import torch
-from flat_world import random_gaussians
+from planar_dataset import random_gaussians
 
 from octasplat.engine.gaussians.frames import rotation_matrices
 from octasplat.engine.gaussians.model import SH_C0, FlatGaussians
@@ -41,7 +41,7 @@ def gradients(of: FlatGaussians, ids: np.ndarray, rng: np.random.Generator) -> G
     )  # fmt: skip
 
 
-def test_like_torch_when_all_are_hit() -> None:
+def test_adam_matches_torch_when_all_gaussians_are_hit() -> None:
     rng = np.random.default_rng(1)
     ours, extent = gaussians(50), 2.0
     rates = LearningRates(mean=1e-3, mean_final=1e-3, mean_unit="extent", quat=2e-3, log_scale=3e-3,
@@ -72,7 +72,7 @@ def test_like_torch_when_all_are_hit() -> None:
         np.testing.assert_allclose(getattr(ours, name), leaves[name].numpy(), atol=2e-6)
 
 
-def test_own_axes_turn_with_the_gaussian_and_leave_the_rest_alone() -> None:
+def test_adam_local_axes_are_rotation_invariant() -> None:
     """What Adam does to a scene does not depend on how the world is turned."""
     rng = np.random.default_rng(3)
     rates = LearningRates(sh_rest_ratio=0.1)
@@ -103,7 +103,7 @@ def test_own_axes_turn_with_the_gaussian_and_leave_the_rest_alone() -> None:
     np.testing.assert_allclose(turned.log_scales, ours.log_scales)
 
 
-def test_own_axes_each_have_their_own_steps() -> None:
+def test_adam_local_axes_have_separate_moments() -> None:
     """A weak steady pull along the normal moves as far as a strong one; in the world's axes it is lost."""
     steps = {}
     for axes in ("own", "world"):
@@ -122,7 +122,7 @@ def test_own_axes_each_have_their_own_steps() -> None:
     assert abs(steps["world"][0]) < 0.2 * abs(steps["own"][0])
 
 
-def test_a_turn_goes_downhill_by_the_angle_that_the_rate_says() -> None:
+def test_adam_rotation_step_equals_learning_rate() -> None:
     ours = gaussians(30, degree=0)
     before, given = ours.rotations.copy(), gradients(ours, np.arange(30), np.random.default_rng(5))
     wanted = given.quats_wxyz.astype(np.float64)
@@ -157,7 +157,7 @@ def test_gaussians_that_are_not_hit_stay_as_they_are() -> None:
     assert adam.steps[hit].tolist() == [1] * 4 and not adam.steps[rest].any()
 
 
-def test_first_step_is_the_rate_whatever_the_gradient() -> None:
+def test_adam_first_step_equals_learning_rate() -> None:
     rates, ours = LearningRates(), gaussians(10)
     before, adam = ours.copy(), Adam.fresh(ours)
     # Each Gaussian has its own count of steps: one that is hit late begins as one that is hit at once.
@@ -199,7 +199,7 @@ def test_rate_of_the_means_falls_exponentially(unit: Literal["size", "extent"]) 
 
 
 @pytest.mark.parametrize("term", ["opacity", "scale"])
-def test_regularisers_push_down(term: str) -> None:
+def test_adam_regulariser_lowers_its_parameter(term: str) -> None:
     ours = gaussians(10)
     before, adam = ours.copy(), Adam.fresh(ours)
     none = gradients(ours, np.arange(10), np.random.default_rng(0))
@@ -243,7 +243,7 @@ def test_select_append_reset_widen() -> None:
     assert not adam.first[2].any() and adam.steps.tolist() == [1, 1, 0, 1, 1, 1]
 
 
-def test_channels_are_stepped_by_their_logits_as_torch_does() -> None:
+def test_adam_channel_step_matches_torch() -> None:
     rng = np.random.default_rng(8)
     scene = with_first_materials(gaussians(6), MaterialSettings()).with_channels(
         {"label": np.full((6, 1), 7.0, np.float32)}

@@ -6,16 +6,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from flat_world import FlatWorld, small_config
+from planar_dataset import PlanarDataset, small_config
 from scipy.spatial.transform import Rotation
 
 from octasplat.engine.config import resolve_config
+from octasplat.engine.dataset import Camera, DatasetView
+from octasplat.engine.dataset.view_frusta import cam_from_world
 from octasplat.engine.errors import Cancelled, ConfigError
 from octasplat.engine.events import Event, HeldOutMeasured, Warned, ignore
 from octasplat.engine.gaussians.rows import row_arrays
 from octasplat.engine.rays import RayBatch
-from octasplat.engine.scene import Camera, View
-from octasplat.engine.scene.seen import points_in_cam
 from octasplat.engine.train.alignment import Motion, Rendered, aligned, photograph_of
 from octasplat.engine.train.batches import grid_pixels
 from octasplat.engine.train.checkpoint import BestState, latest_checkpoint, load_checkpoint, save_best
@@ -30,7 +30,7 @@ WRONG_PX = 0.6
 """Standard deviation of where turn and shift each put the middle of the picture, across and down."""
 
 
-class WrongWorld(FlatWorld):
+class WrongWorld(PlanarDataset):
     """The painted plane from all around, with training views whose poses are not where they say."""
 
     detail = 2.0
@@ -50,7 +50,7 @@ class WrongWorld(FlatWorld):
             views[index] = posed(view, turned, view.origin_world + DISTANCE * shift)
         self.views = tuple(views)
 
-    def _looking_at_the_middle(self, view: View, rng: np.random.Generator) -> View:
+    def _looking_at_the_middle(self, view: DatasetView, rng: np.random.Generator) -> DatasetView:
         origin = np.array([*rng.uniform(-1.2, 1.2, 2), -DISTANCE])
         forward = -origin / np.linalg.norm(origin)
         right = np.cross([0.0, 1.0, 0.0], forward)
@@ -65,14 +65,16 @@ class WrongWorld(FlatWorld):
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         return self.shown(self._rays(self.true, view, y, x))
 
-    def _rays(self, views: tuple[View, ...], view: np.ndarray, y: np.ndarray, x: np.ndarray) -> RayBatch:
+    def _rays(
+        self, views: tuple[DatasetView, ...], view: np.ndarray, y: np.ndarray, x: np.ndarray
+    ) -> RayBatch:
         directions = self.cameras[0].directions_cam(np.stack([x + 0.5, y + 0.5], axis=1))
         rotations = np.stack([v.rotation_cam_from_world.T for v in views])
         origins = np.stack([v.origin_world for v in views])
         return RayBatch(origins[view], np.einsum("nij,nj->ni", rotations[view], directions))
 
 
-def posed(view: View, rotation: np.ndarray, origin: np.ndarray) -> View:
+def posed(view: DatasetView, rotation: np.ndarray, origin: np.ndarray) -> DatasetView:
     return replace(view, rotation_cam_from_world=rotation, translation_cam_from_world=-rotation @ origin)
 
 
@@ -89,7 +91,7 @@ def train(
     trainer = Trainer(
         world,
         config,
-        state or fresh_state(world.start(1000, 0.5, painted=True), config.seed),
+        state or fresh_state(world.initial_gaussians(1000, 0.5, painted=True), config.seed),
         folder=folder,
         fingerprint="test",
         listener=events.append,
@@ -100,18 +102,18 @@ def train(
     return trainer, events
 
 
-def pose(view: View | RefinedPose) -> tuple[np.ndarray, np.ndarray]:
+def pose(view: DatasetView | RefinedPose) -> tuple[np.ndarray, np.ndarray]:
     return np.array(view.rotation_cam_from_world), np.array(view.translation_cam_from_world)
 
 
-def misplaced_px(poses: Mapping[str, View | RefinedPose]) -> np.ndarray:
+def misplaced_px(poses: Mapping[str, DatasetView | RefinedPose]) -> np.ndarray:
     """How far from where they are points of the plane are seen by each view, in the middle."""
     world = WrongWorld()
     true = {view.name: view for view in world.true}
     grid = np.stack(np.meshgrid(*[np.linspace(-0.6, 0.6, 5)] * 2), axis=-1).reshape(-1, 2)
     points = np.column_stack([grid, np.zeros(len(grid))])
 
-    def seen(view: View | RefinedPose) -> np.ndarray:
+    def seen(view: DatasetView | RefinedPose) -> np.ndarray:
         rotation, translation = pose(view)
         return world.cameras[0].project(points @ rotation.T + translation)
 
@@ -123,7 +125,7 @@ def last_psnr(events: list[Event]) -> float:
     return [event.psnr for event in events if isinstance(event, HeldOutMeasured)][-1]
 
 
-def test_wrong_poses_come_right_and_new_views_with_them(tmp_path: Path) -> None:
+def test_pose_refinement_corrects_poses_and_improves_held_out(tmp_path: Path) -> None:
     longer = {
         "iterations": 300,
         "rays_per_batch": 2048,
@@ -147,7 +149,7 @@ def test_wrong_poses_come_right_and_new_views_with_them(tmp_path: Path) -> None:
     assert told.endswith(f" px at most ({largest}).")
 
 
-def test_a_render_that_is_right_tells_the_pose_in_whatever_exposure() -> None:
+def test_pose_refinement_is_independent_of_exposure() -> None:
     world = WrongWorld()
     found = {}
     for index in world.train_indices.tolist():
@@ -158,13 +160,13 @@ def test_a_render_that_is_right_tells_the_pose_in_whatever_exposure() -> None:
         given = world.views[index]
         shown = 0.7 * world.shown(rays)[0].astype(np.float64) + 0.1
         look = photograph_of(world, index, (SIDE_PX, SIDE_PX), np.zeros(3, np.float32))
-        motion = aligned(Rendered(points_in_cam(plane, given), shown), look, world.cameras[0])
+        motion = aligned(Rendered(cam_from_world(plane, given), shown), look, world.cameras[0])
         assert motion is not None
         found[given.name] = corrected(given, motion)
     assert misplaced_px(found).max() < 0.1
 
 
-def test_what_moves_the_whole_scene_is_taken_out() -> None:
+def test_pose_refinement_removes_global_motion() -> None:
     world = WrongWorld()
     corrections = np.zeros((len(world.views), 6))
     turn = Rotation.from_rotvec([0.01, -0.02, 0.015]).as_matrix()
@@ -213,7 +215,7 @@ def test_stopped_and_on_other_threads_the_same_bits_come_out(tmp_path: Path) -> 
         assert values.tobytes() == row_arrays(parts.state.gaussians)[name].tobytes(), name
 
 
-def test_the_best_state_brings_the_poses_that_it_had(tmp_path: Path) -> None:
+def test_pose_refinement_best_checkpoint_restores_poses(tmp_path: Path) -> None:
     train(tmp_path, refine_poses=True, iterations=80)
     path = latest_checkpoint(tmp_path)
     assert path is not None
@@ -228,8 +230,13 @@ def test_the_best_state_brings_the_poses_that_it_had(tmp_path: Path) -> None:
 def test_mirrors_and_photographs_without_cameras_are_refused(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="reflections"):
         resolve_config("fast", materials=True, assignments=["refine_poses=true"])
-    world, config = FlatWorld(), small_config(refine_poses=True)
+    world, config = PlanarDataset(), small_config(refine_poses=True)
     with pytest.raises(ConfigError, match="without cameras"):
         Trainer(
-            world, config, fresh_state(world.start(), 0), folder=tmp_path, fingerprint="", listener=ignore
+            world,
+            config,
+            fresh_state(world.initial_gaussians(), 0),
+            folder=tmp_path,
+            fingerprint="",
+            listener=ignore,
         )

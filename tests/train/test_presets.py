@@ -6,13 +6,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from flat_world import FlatWorld, small_config
+from planar_dataset import PlanarDataset, small_config
 
 from octasplat.engine.config import resolve_config
+from octasplat.engine.dataset.synthetic import SyntheticDatasetConfig, write_synthetic_dataset
 from octasplat.engine.errors import ConfigError
 from octasplat.engine.events import Event, HeldOutMeasured, TrainingProgress
 from octasplat.engine.pipeline import reconstruct
-from octasplat.engine.scene.generated import GeneratedSceneConfig, write_generated_scene
 from octasplat.engine.shading.plain import PLAIN
 from octasplat.engine.trace.cpu.tracer import CpuTracer
 from octasplat.engine.train.batches import BatchSource
@@ -24,16 +24,16 @@ from octasplat.engine.train.trainer import Trainer
 
 
 def held_out_psnr(folder: Path, config: TrainConfig) -> tuple[list[float], Trainer]:
-    world, events = FlatWorld(), list[Event]()
+    world, events = PlanarDataset(), list[Event]()
     trainer = Trainer(
-        world, config, fresh_state(world.start(opacity=config.initial_opacity), config.seed),
+        world, config, fresh_state(world.initial_gaussians(opacity=config.initial_opacity), config.seed),
         folder=folder, fingerprint="test", listener=events.append, threads=1,
     )  # fmt: skip
     trainer.run()
     return [event.psnr for event in events if isinstance(event, HeldOutMeasured)], trainer
 
 
-def test_the_paper_preset_learns_and_densifies(tmp_path: Path) -> None:
+def test_redisplats_preset_trains_and_densifies(tmp_path: Path) -> None:
     paper = preset("redisplats")
     values = paper.model_dump()
     values |= {
@@ -53,12 +53,12 @@ def test_the_paper_preset_learns_and_densifies(tmp_path: Path) -> None:
 
 
 def test_the_gradient_of_ssim_reaches_the_gaussians() -> None:
-    world = FlatWorld()
+    world = PlanarDataset()
     config = small_config(
         ssim_patch_fraction=1.0, ssim_patch_side=32, loss={"l1": 0.0, "l2": 0.0, "ssim": 1.0}
     )
     batch = BatchSource(world, config).draw(np.random.default_rng(0))
-    gaussians = world.start(opacity=0.6)
+    gaussians = world.initial_gaussians(opacity=0.6)
     rng = np.random.default_rng(2)
     gaussians.sh += rng.normal(0, 0.4, gaussians.sh.shape).astype(np.float32)
     tracer = CpuTracer(config.trace, threads=1)
@@ -89,7 +89,7 @@ def test_the_gradient_of_ssim_reaches_the_gaussians() -> None:
         assert (above - below) / (2 * step) == pytest.approx(expected, rel=tolerance)
 
 
-def test_ssim_alone_trains(tmp_path: Path) -> None:
+def test_training_with_ssim_only_improves_psnr(tmp_path: Path) -> None:
     config = small_config(
         iterations=80, rays_per_batch=2048, ssim_patch_fraction=1.0, loss={"l1": 0.0, "l2": 0.0, "ssim": 1.0}
     )
@@ -97,12 +97,12 @@ def test_ssim_alone_trains(tmp_path: Path) -> None:
     assert psnr[-1] > psnr[0] + 5
 
 
-def test_without_a_patch_the_ssim_weight_adds_nothing() -> None:
-    world = FlatWorld()
+def test_ssim_weight_without_patches_is_ignored() -> None:
+    world = PlanarDataset()
     config = small_config(loss={"ssim": 0.5})
     batch = BatchSource(world, config).draw(np.random.default_rng(0))
     tracer = CpuTracer(threads=1)
-    tracer.build(world.start())
+    tracer.build(world.initial_gaussians())
     both = differentiate(batch, tracer, PLAIN, config.loss, progress=0.0)
     plain = differentiate(batch, tracer, PLAIN, LossWeights(), progress=0.0)
     bare = differentiate(replace(batch, patches=0), tracer, PLAIN, config.loss, progress=0.0)
@@ -110,15 +110,15 @@ def test_without_a_patch_the_ssim_weight_adds_nothing() -> None:
 
 
 def test_gaussians_that_hardly_weigh_keep_still() -> None:
-    world = FlatWorld()
+    world = PlanarDataset()
     config = small_config()
     batch = BatchSource(world, config).draw(np.random.default_rng(0))
     tracer = CpuTracer(config.trace, threads=1)
-    tracer.build(world.start(opacity=0.6))
+    tracer.build(world.initial_gaussians(opacity=0.6))
     weights = differentiate(batch, tracer, PLAIN, config.loss, progress=0.0).gaussians
     least = float(np.median(weights.weight_sums))
     heavy = weights.ids[weights.weight_sums >= least]
-    state = fresh_state(world.start(opacity=0.6), 0)
+    state = fresh_state(world.initial_gaussians(opacity=0.6), 0)
     before = state.gaussians.sh.copy()
     tracer.build(state.gaussians)
     densifier = make_densifier(config.densify, iterations=1, max_gaussians=len(before))
@@ -139,14 +139,16 @@ def test_gaussians_that_hardly_weigh_keep_still() -> None:
 @pytest.fixture(scope="module")
 def three_views(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("few") / "scene"
-    write_generated_scene(
-        root, GeneratedSceneConfig(views=3, width_px=64, height_px=48, samples_per_side=1, points=400)
+    write_synthetic_dataset(
+        root, SyntheticDatasetConfig(views=3, width_px=64, height_px=48, samples_per_side=1, points=400)
     )
     return root
 
 
 @pytest.mark.parametrize("training_views", [1, 2])
-def test_fewer_than_three_training_views(three_views: Path, tmp_path: Path, training_views: int) -> None:
+def test_training_with_too_few_views_is_refused(
+    three_views: Path, tmp_path: Path, training_views: int
+) -> None:
     names = sorted(path.name for path in (three_views / "images").iterdir())
     config = resolve_config(
         "fast",
@@ -159,7 +161,7 @@ def test_fewer_than_three_training_views(three_views: Path, tmp_path: Path, trai
         if isinstance(event, TrainingProgress):
             progress.append(event.psnr)
 
-    run = reconstruct(three_views, tmp_path / "run", config, threads=1, listener=listen)
+    run = reconstruct(three_views, tmp_path / "run", config, threads=1, progress=listen)
     metrics = json.loads((run / "metrics.json").read_text())
     assert len(metrics["views"]) == 3 - training_views
     assert progress[-1] > 16 > progress[0]
@@ -173,7 +175,7 @@ def test_settings_that_the_photographs_rule_out_leave_no_output(three_views: Pat
 
 
 @pytest.mark.parametrize("ray_patch_rays", [2, 63])
-def test_windows_are_square(window_rays: int) -> None:
+def test_ray_patch_count_must_be_square(ray_patch_rays: int) -> None:
     with pytest.raises(ConfigError, match="square number"):
         resolve_config("fast", assignments=[f"ray_patch_rays={ray_patch_rays}"])
 
@@ -186,16 +188,16 @@ def psnr_of(scene: Path, output: Path, *assignments: str, max_side: int | None =
 
 
 @pytest.mark.heavy
-def test_the_generated_scene_is_learnt_as_well_as_ever(tmp_path: Path) -> None:
+def test_synthetic_scene_reaches_reference_psnr(tmp_path: Path) -> None:
     scene = tmp_path / "scene"
-    write_generated_scene(scene, GeneratedSceneConfig(views=24, width_px=128, height_px=96))
+    write_synthetic_dataset(scene, SyntheticDatasetConfig(views=24, width_px=128, height_px=96))
     psnr = psnr_of(scene, tmp_path / "run", "iterations=200", "rays_per_batch=8192", "max_gaussians=10000")
     assert psnr > 20.5  # 21.0 when this was written
 
 
 @pytest.mark.heavy
 @pytest.mark.real
-def test_a_photographed_scene_is_learnt_as_well_as_ever(scenes_root: Path, tmp_path: Path) -> None:
+def test_real_scene_reaches_reference_psnr(scenes_root: Path, tmp_path: Path) -> None:
     psnr = psnr_of(scenes_root / "fox", tmp_path / "run", "iterations=200", max_side=240)
     assert psnr > 27.7  # 28.1 when this was written
 

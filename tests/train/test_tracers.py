@@ -4,12 +4,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from flat_world import FlatWorld, small_config
+from planar_dataset import PlanarDataset, small_config
 
+from octasplat.engine.dataset import Dataset
+from octasplat.engine.dataset.synthetic import SyntheticDatasetConfig, write_synthetic_dataset
 from octasplat.engine.events import Event, HeldOutMeasured, TrainingProgress
 from octasplat.engine.gaussians.model import FlatGaussians
-from octasplat.engine.scene import Dataset
-from octasplat.engine.scene.generated import GeneratedSceneConfig, write_generated_scene
 from octasplat.engine.train.fingerprint import run_fingerprint
 from octasplat.engine.train.initialise import initial_gaussians
 from octasplat.engine.train.state import TrainState, fresh_state
@@ -18,13 +18,13 @@ from octasplat.engine.train.trainer import Trainer
 
 def start() -> FlatGaussians:
     """Longer than wide, so that photographs say how each is turned in its plane."""
-    gaussians = FlatWorld().start(120)
+    gaussians = PlanarDataset().initial_gaussians(120)
     gaussians.log_scales[:, 1] += 0.3
     return gaussians
 
 
 def train(folder: Path, tracer: str, iterations: int) -> tuple[TrainState, list[Event]]:
-    world, events = FlatWorld(), list[Event]()
+    world, events = PlanarDataset(), list[Event]()
     config = small_config(
         iterations=iterations, rays_per_batch=64, probe_rays=256, trace={"tracer": tracer},
         shared_sort_until=0, sh_degree_interval=20,
@@ -38,7 +38,7 @@ def train(folder: Path, tracer: str, iterations: int) -> tuple[TrainState, list[
     return trainer.state, events
 
 
-def test_the_slow_twin_learns_the_plane(tmp_path: Path) -> None:
+def test_reference_tracer_trains_plane(tmp_path: Path) -> None:
     state, events = train(tmp_path, "reference", 110)
     held_out = [event.psnr for event in events if isinstance(event, HeldOutMeasured)]
     losses = [event.loss for event in events if isinstance(event, TrainingProgress)]
@@ -47,7 +47,7 @@ def test_the_slow_twin_learns_the_plane(tmp_path: Path) -> None:
     assert state.gaussians.sh_degree == 1 and len(state.gaussians) > 120
 
 
-def test_its_first_steps_are_those_of_the_cpu_tracer(tmp_path: Path) -> None:
+def test_reference_tracer_first_steps_match_cpu_tracer(tmp_path: Path) -> None:
     slow, _ = train(tmp_path / "slow", "reference", 5)
     fast, _ = train(tmp_path / "fast", "cpu", 5)
     assert slow.running_mse == pytest.approx(fast.running_mse, rel=1e-4)
@@ -62,10 +62,10 @@ def test_its_first_steps_are_those_of_the_cpu_tracer(tmp_path: Path) -> None:
 
 
 @pytest.mark.heavy
-def test_the_slow_twin_learns_a_generated_scene(tmp_path: Path) -> None:
+def test_reference_tracer_trains_synthetic_scene(tmp_path: Path) -> None:
     root = tmp_path / "scene"
-    write_generated_scene(
-        root, GeneratedSceneConfig(views=6, width_px=32, height_px=24, samples_per_side=2, points=100)
+    write_synthetic_dataset(
+        root, SyntheticDatasetConfig(views=6, width_px=32, height_px=24, samples_per_side=2, points=100)
     )
     dataset = Dataset.open(root, tmp_path / "cache", test_every=6)
     ends = {}

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from flat_world import FlatWorld, small_config
+from planar_dataset import PlanarDataset, small_config
 
 from octasplat.engine.errors import Cancelled, DatasetError, TrainingFailure
 from octasplat.engine.events import CheckpointWritten, Event, HeldOutMeasured, TrainingProgress, Warned
@@ -22,17 +22,17 @@ def train(
     folder: Path,
     config: TrainConfig,
     *,
-    world: FlatWorld | None = None,
+    world: PlanarDataset | None = None,
     state: TrainState | None = None,
     threads: int = 1,
     should_stop: Callable[[], bool] = lambda: False,
 ) -> tuple[FlatGaussians, list[Event]]:
-    world = world or FlatWorld()
+    world = world or PlanarDataset()
     events: list[Event] = []
     trainer = Trainer(
         world,
         config,
-        state or fresh_state(world.start(), config.seed),
+        state or fresh_state(world.initial_gaussians(), config.seed),
         folder=folder,
         fingerprint="test",
         listener=events.append,
@@ -51,7 +51,7 @@ def whole_run(tmp_path_factory: pytest.TempPathFactory) -> tuple[FlatGaussians, 
     return train(tmp_path_factory.mktemp("whole"), small_config())
 
 
-def test_it_learns_the_plane(whole_run: tuple[FlatGaussians, list[Event]]) -> None:
+def test_trainer_reconstructs_plane(whole_run: tuple[FlatGaussians, list[Event]]) -> None:
     gaussians, events = whole_run
     held_out = [event.psnr for event in events if isinstance(event, HeldOutMeasured)]
     assert held_out[-1] > held_out[0] + 8
@@ -60,7 +60,7 @@ def test_it_learns_the_plane(whole_run: tuple[FlatGaussians, list[Event]]) -> No
     assert 300 < len(gaussians) <= 400
 
 
-def test_events_tell_of_the_progress(whole_run: tuple[FlatGaussians, list[Event]]) -> None:
+def test_trainer_emits_progress_events(whole_run: tuple[FlatGaussians, list[Event]]) -> None:
     gaussians, events = whole_run
     progress = [event for event in events if isinstance(event, TrainingProgress)]
     assert [event.iteration for event in progress] == list(range(10, 121, 10))
@@ -70,22 +70,20 @@ def test_events_tell_of_the_progress(whole_run: tuple[FlatGaussians, list[Event]
     assert [e.iteration for e in events if isinstance(e, CheckpointWritten)] == list(range(0, 121, 20))
 
 
-def test_nothing_is_added_while_the_first_gaussians_are_fitted(tmp_path: Path) -> None:
+def test_trainer_does_not_densify_before_densify_from(tmp_path: Path) -> None:
     _, events = train(tmp_path, small_config(densify_from_iter=75))
     counts = {e.iteration: e.gaussians for e in events if isinstance(e, TrainingProgress)}
     assert counts[70] == counts[10] < counts[90]
 
 
 @pytest.mark.parametrize("threads", [1, 2])
-def test_same_bits_on_any_number_of_threads(
+def test_trainer_is_bit_identical_across_threads(
     whole_run: tuple[FlatGaussians, list[Event]], tmp_path: Path, threads: int
 ) -> None:
     assert content(train(tmp_path, small_config(), threads=threads)[0]) == content(whole_run[0])
 
 
-def test_another_seed_gives_another_scene(
-    whole_run: tuple[FlatGaussians, list[Event]], tmp_path: Path
-) -> None:
+def test_trainer_seed_changes_result(whole_run: tuple[FlatGaussians, list[Event]], tmp_path: Path) -> None:
     assert content(train(tmp_path, small_config(seed=1))[0]) != content(whole_run[0])
 
 
@@ -124,10 +122,10 @@ def test_stopped_and_resumed_gives_the_same_bits(tmp_path: Path, strategy: McmcC
     assert content(found) == content(expected)
 
 
-def test_windows_have_one_order_for_the_first_part_alone(tmp_path: Path) -> None:
-    world, config, orders = FlatWorld(), small_config(shared_sort_until=0.5), dict[int, str]()
+def test_trainer_shared_sort_ends_at_configured_share(tmp_path: Path) -> None:
+    world, config, orders = PlanarDataset(), small_config(shared_sort_until=0.5), dict[int, str]()
     Trainer(
-        world, config, fresh_state(world.start(), config.seed), folder=tmp_path, fingerprint="test",
+        world, config, fresh_state(world.initial_gaussians(), config.seed), folder=tmp_path, fingerprint="test",
         listener=lambda _event: None, threads=1,
         onlooker=lambda iteration, tracer: orders.update({iteration: tracer.settings.sort}),
     ).run()  # fmt: skip
@@ -135,7 +133,7 @@ def test_windows_have_one_order_for_the_first_part_alone(tmp_path: Path) -> None
     assert {order for iteration, order in orders.items() if iteration > 60} == {"ray"}
 
 
-def test_resuming_a_finished_run_gives_its_result(tmp_path: Path) -> None:
+def test_trainer_resume_of_finished_run_returns_result(tmp_path: Path) -> None:
     config = small_config(iterations=40)
     expected, _ = train(tmp_path, config)
     path = latest_checkpoint(tmp_path)
@@ -145,17 +143,17 @@ def test_resuming_a_finished_run_gives_its_result(tmp_path: Path) -> None:
 
 
 def test_damaged_photographs_fail_in_words(tmp_path: Path) -> None:
-    world = FlatWorld()
+    world = PlanarDataset()
     config = small_config()
-    state = fresh_state(world.start(), 0)
+    state = fresh_state(world.initial_gaussians(), 0)
     world.poison = True
     with pytest.raises(TrainingFailure, match="damaged photographs"):
         train(tmp_path, config, world=world, state=state)
 
 
 def test_parameters_that_are_no_numbers_fail_in_words(tmp_path: Path) -> None:
-    world = FlatWorld()
-    state = fresh_state(world.start(), 0)
+    world = PlanarDataset()
+    state = fresh_state(world.initial_gaussians(), 0)
     state.gaussians.sh[:] = np.nan
     with pytest.raises(TrainingFailure):
         train(tmp_path, small_config(), world=world, state=state)
@@ -179,7 +177,7 @@ def test_collapsed_end_gives_the_best_state(tmp_path: Path) -> None:
     path = latest_checkpoint(tmp_path)
     assert path is not None
     state = load_checkpoint(path, "test")
-    best = FlatWorld().start(50)
+    best = PlanarDataset().initial_gaussians(50)
     save_best(BestState(best, {}), tmp_path)
     state.best_psnr = 90.0
     found, events = train(tmp_path, config, state=state)
@@ -188,7 +186,7 @@ def test_collapsed_end_gives_the_best_state(tmp_path: Path) -> None:
 
 
 def test_white_background_and_alpha(tmp_path: Path) -> None:
-    world = FlatWorld()
+    world = PlanarDataset()
     world.has_alpha = True
     for background in ("white", "auto"):
         gaussians, events = train(
@@ -198,12 +196,12 @@ def test_white_background_and_alpha(tmp_path: Path) -> None:
         assert any(isinstance(event, HeldOutMeasured) for event in events)
 
 
-def test_no_held_out_views(tmp_path: Path) -> None:
-    _, events = train(tmp_path, small_config(iterations=20), world=FlatWorld(held_out=0))
+def test_trainer_without_held_out_views_runs(tmp_path: Path) -> None:
+    _, events = train(tmp_path, small_config(iterations=20), world=PlanarDataset(held_out=0))
     assert not any(isinstance(event, HeldOutMeasured) for event in events)
 
 
-class Masked(FlatWorld):
+class Masked(PlanarDataset):
     """Nothing counts but, where there is one, the pixel at ``left``."""
 
     left: tuple[int, int, int] | None = None
@@ -218,7 +216,7 @@ class Masked(FlatWorld):
         return rgb, alpha, np.where(counts, weight, 0).astype(np.float32)
 
 
-def test_masks_that_leave_nothing_are_refused_before_the_training(tmp_path: Path) -> None:
+def test_trainer_empty_masks_are_refused_early(tmp_path: Path) -> None:
     with pytest.raises(DatasetError, match="masks or alpha leave no pixel"):
         train(tmp_path, small_config(iterations=40), world=Masked())
     assert latest_checkpoint(tmp_path) is None

@@ -12,14 +12,14 @@ from click.testing import CliRunner
 from psycopg.types.json import Jsonb
 
 from octasplat.workers.cli.commands.fsck import fsck
-from octasplat.workers.records.database import open_pool
-from octasplat.workers.records.datasets import create_dataset, put_file
-from octasplat.workers.records.locks import lock_owner
-from octasplat.workers.store.local import LocalStorage
+from octasplat.workers.db.connections import open_pool
+from octasplat.workers.db.datasets import create_dataset, put_file
+from octasplat.workers.db.locks import lock_owner
+from octasplat.workers.storage.local import LocalStorage
 
 
 def put(storage: LocalStorage, data: bytes, age_seconds: float = 0) -> str:
-    with storage.begin() as writer:
+    with storage.open_writer() as writer:
         writer.write(data)
         sha256 = writer.commit().sha256
     path = storage.local_path(sha256)
@@ -62,7 +62,7 @@ def store(tmp_path: Path, conninfo: str, monkeypatch: pytest.MonkeyPatch) -> Loc
 
 def damage(storage: LocalStorage, content: str) -> Path:
     """The file of a content, made writable."""
-    for entry in storage.blobs():
+    for entry in storage.list_blobs():
         path = storage.local_path(entry.blob.sha256)
         assert path is not None
         if path.read_bytes() == content.encode():
@@ -77,7 +77,7 @@ def run(*arguments: str) -> tuple[int, str]:
     return result.exit_code, result.output
 
 
-def test_a_sound_store(store: LocalStorage) -> None:
+def test_fsck_of_complete_store_finds_nothing(store: LocalStorage) -> None:
     code, output = run("--verify")
     assert code == 0
     assert "4 places in the tables, 4 contents of 23 bytes in the store, 4 of them read whole." in output
@@ -98,7 +98,7 @@ def test_missing_content_is_named(store: LocalStorage, content: str) -> None:
     assert output.startswith("missing: ") and where[content] in output.splitlines()[0]
 
 
-def test_damage_is_found_by_reading(store: LocalStorage) -> None:
+def test_fsck_verify_finds_damaged_content(store: LocalStorage) -> None:
     damage(store, "photo").write_bytes(b"PHOTO")
     assert run()[0] == 0
     code, output = run("--verify")
@@ -107,17 +107,17 @@ def test_damage_is_found_by_reading(store: LocalStorage) -> None:
     assert "size: " in run()[1]
 
 
-def test_content_that_nothing_names_stays(store: LocalStorage) -> None:
+def test_fsck_keeps_unreferenced_content(store: LocalStorage) -> None:
     old, young = put(store, b"old", age_seconds=7200), put(store, b"young")
     code, output = run("--json")
     report = json.loads(output)
     assert code == 0
     assert (report["unused"], report["unused_bytes"], report["young"]) == ([old], 3, 1)
     assert "1 contents of 3 bytes are named by nothing." in run()[1]
-    assert {old, young} <= {entry.blob.sha256 for entry in store.blobs()}
+    assert {old, young} <= {entry.blob.sha256 for entry in store.list_blobs()}
 
 
-def test_a_database_that_is_down(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_fsck_without_database_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("DATABASE_URL", raising=False)
     result = CliRunner().invoke(fsck, ["--data", str(tmp_path)])
     assert result.exit_code == 1 and "holds no database" in str(result.exception)

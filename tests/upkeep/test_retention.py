@@ -11,32 +11,32 @@ from typing import Any
 import pytest
 from psycopg.types.json import Jsonb
 
-from octasplat.workers.queue.attempts import Attempt, Result, claim
-from octasplat.workers.queue.jobs import NewJob, artifacts_of, change_job, create_job, get_job, retry_job
-from octasplat.workers.queue.procrastinate_slips import ProcrastinateSlips
-from octasplat.workers.records.database import Connection, Pool, open_pool
-from octasplat.workers.records.datasets import (
+from octasplat.workers.db.connections import Connection, Pool, open_pool
+from octasplat.workers.db.datasets import (
     begin_check,
     change_dataset,
     create_dataset,
     get_dataset,
     put_file,
 )
-from octasplat.workers.records.rows import Job
-from octasplat.workers.store.local import LocalStorage
-from octasplat.workers.store.trees import Manifest, TreeFile, publish_manifest
-from octasplat.workers.upkeep.collecting import collect
-from octasplat.workers.upkeep.retention import (
-    Forgotten,
+from octasplat.workers.db.rows import Job
+from octasplat.workers.maintenance.garbage_collection import collect_garbage
+from octasplat.workers.maintenance.retention import (
+    DeletedCounts,
     Retention,
-    forget_expired,
+    delete_expired,
     forget_old_things,
-    set_expiries,
+    update_expiry_times,
 )
+from octasplat.workers.queue.attempts import Attempt, ResultFile, claim
+from octasplat.workers.queue.jobs import NewJob, artifacts_of, change_job, create_job, get_job, retry_job
+from octasplat.workers.queue.procrastinate_queue import ProcrastinateQueue
+from octasplat.workers.storage.local import LocalStorage
+from octasplat.workers.storage.trees import Manifest, TreeFile, publish_manifest
 
 DAY, LONG_AGO = 86_400.0, 10 * 86_400.0
 KEEP = Retention(jobs_hours=100, jobs_hours_by_kind={"render": 1, "export": 0}, datasets_hours=50)
-SLIPS = ProcrastinateSlips()
+SLIPS = ProcrastinateQueue()
 
 
 @pytest.fixture
@@ -78,58 +78,58 @@ async def hours_left(connection: Connection, table: str, row_id: uuid.UUID) -> f
     return left
 
 
-def test_each_kind_has_its_own_time(within: Any) -> None:
+def test_retention_per_kind_overrides_default(within: Any) -> None:
     async def story(pool: Pool, connection: Connection) -> None:
         plain, render, export = [await finished(connection, pool, k) for k in ("x", "render", "export")]
         pinned = await finished(connection, pool)
         await change_job(connection, pinned.id, label=None, pinned=True)
         queued = await create_job(connection, SLIPS, NewJob("me", "x", {}, "cpu"))
-        await set_expiries(connection, KEEP)
+        await update_expiry_times(connection, KEEP)
         assert await hours_left(connection, "jobs", plain.id) == pytest.approx(100, abs=0.1)
         assert await hours_left(connection, "jobs", render.id) == pytest.approx(1, abs=0.1)
         for job in (export, pinned, queued):
             assert await hours_left(connection, "jobs", job.id) is None
         version = (await existing(connection, plain.id)).version
-        await set_expiries(connection, KEEP)
+        await update_expiry_times(connection, KEEP)
         assert (await existing(connection, plain.id)).version == version
-        assert await forget_expired(connection) == Forgotten(0, 0)
+        assert await delete_expired(connection) == DeletedCounts(0, 0)
 
     within(story)
 
 
-def test_by_default_nothing_finished_expires(within: Any) -> None:
+def test_retention_default_keeps_finished_jobs(within: Any) -> None:
     async def story(pool: Pool, connection: Connection) -> None:
         job = await finished(connection, pool)
         await connection.execute("UPDATE jobs SET finished_at = now() - interval '9 years'")
-        await set_expiries(connection, Retention())
+        await update_expiry_times(connection, Retention())
         assert await hours_left(connection, "jobs", job.id) is None
 
     within(story)
 
 
-def test_what_was_old_already_is_told_first(within: Any) -> None:
+def test_retention_gives_notice_before_expiry(within: Any) -> None:
     async def story(pool: Pool, connection: Connection) -> None:
         job = await finished(connection, pool)
         await connection.execute("UPDATE jobs SET finished_at = now() - interval '9 years'")
-        await set_expiries(connection, KEEP)
+        await update_expiry_times(connection, KEEP)
         assert await hours_left(connection, "jobs", job.id) == pytest.approx(24, abs=0.1)
 
     within(story)
 
 
-def test_pin_and_retry_take_it_back(within: Any) -> None:
+def test_retention_pin_and_retry_clear_expiry(within: Any) -> None:
     async def story(pool: Pool, connection: Connection) -> None:
         pinned, retried, left = [await finished(connection, pool) for _ in range(3)]
-        await set_expiries(connection, KEEP)
+        await update_expiry_times(connection, KEEP)
         await connection.execute("UPDATE jobs SET expires_at = now() - interval '1 second'")
         assert (await change_job(connection, pinned.id, label=None, pinned=True)).expires_at is None
-        await retry_job(connection, SLIPS, retried.id, fresh=False)
-        assert await forget_expired(connection) == Forgotten(1, 0)
+        await retry_job(connection, SLIPS, retried.id, from_start=False)
+        assert await delete_expired(connection) == DeletedCounts(1, 0)
         assert await get_job(connection, left.id) is None
         for job in (pinned, retried):
             assert await get_job(connection, job.id) is not None
         await change_job(connection, pinned.id, label=None, pinned=False)
-        await set_expiries(connection, KEEP)
+        await update_expiry_times(connection, KEEP)
         assert (await hours_left(connection, "jobs", pinned.id) or 0) > 1
 
     within(story)
@@ -142,7 +142,7 @@ def test_source_of_an_unfinished_job_waits(within: Any) -> None:
         await connection.execute(
             "UPDATE jobs SET expires_at = now() - interval '1 s' WHERE id = %s", [source.id]
         )
-        assert await forget_expired(connection) == Forgotten(0, 0)
+        assert await delete_expired(connection) == DeletedCounts(0, 0)
         assert await get_job(connection, source.id) is not None
 
     within(story)
@@ -154,18 +154,18 @@ def test_datasets_go_when_no_job_needs_them(within: Any) -> None:
         await connection.execute("UPDATE datasets SET state = 'committed' WHERE id <> %s", [fresh.id])
         await change_dataset(connection, pinned.id, name="d", pinned=True)
         job = await finished(connection, pool, dataset_id=used.id)
-        await set_expiries(connection, KEEP)
+        await update_expiry_times(connection, KEEP)
         assert await hours_left(connection, "datasets", unused.id) == pytest.approx(50, abs=0.1)
         for dataset in (used, pinned, fresh):
             assert await hours_left(connection, "datasets", dataset.id) is None
         await connection.execute("DELETE FROM jobs WHERE id = %s", [job.id])
-        await set_expiries(connection, KEEP)
+        await update_expiry_times(connection, KEEP)
         assert await hours_left(connection, "datasets", used.id) is not None
         await connection.execute(
             "UPDATE datasets SET expires_at = now() - interval '1 s' WHERE expires_at IS NOT NULL"
         )
         await create_job(connection, SLIPS, NewJob("me", "x", {}, "cpu", dataset_id=used.id))
-        assert await forget_expired(connection) == Forgotten(0, 1)
+        assert await delete_expired(connection) == DeletedCounts(0, 1)
         assert await get_dataset(connection, unused.id) is None
         for dataset in (used, pinned, fresh):
             assert await get_dataset(connection, dataset.id) is not None
@@ -173,22 +173,22 @@ def test_datasets_go_when_no_job_needs_them(within: Any) -> None:
     within(story)
 
 
-def test_upload_that_goes_on_keeps_an_open_dataset(within: Any) -> None:
+def test_retention_running_upload_keeps_open_dataset(within: Any) -> None:
     async def story(_pool: Pool, connection: Connection) -> None:
         keep = Retention(open_datasets_hours=10)
         dataset = await create_dataset(connection, "me", "d")
         await connection.execute("UPDATE datasets SET used_at = now() - interval '9 hours'")
-        await set_expiries(connection, keep)
+        await update_expiry_times(connection, keep)
         await connection.execute("UPDATE datasets SET expires_at = now() + interval '1 hour'")
         await put_file(connection, dataset.id, "images/a.jpg", "a" * 64, 1)
-        await set_expiries(connection, keep)
+        await update_expiry_times(connection, keep)
         assert await hours_left(connection, "datasets", dataset.id) == pytest.approx(10, abs=0.1)
 
     within(story)
 
 
 def put(storage: LocalStorage, content: str, age_seconds: float = LONG_AGO) -> str:
-    with storage.begin() as writer:
+    with storage.open_writer() as writer:
         writer.write(content.encode())
         sha256 = writer.commit().sha256
     path = storage.local_path(sha256)
@@ -198,7 +198,7 @@ def put(storage: LocalStorage, content: str, age_seconds: float = LONG_AGO) -> s
 
 
 def held(storage: LocalStorage) -> set[str]:
-    return {entry.blob.sha256 for entry in storage.blobs()}
+    return {entry.blob.sha256 for entry in storage.list_blobs()}
 
 
 async def running(connection: Connection, pool: Pool) -> Attempt:
@@ -214,7 +214,7 @@ def checkpoint(*digests: str) -> dict[str, Any]:
     return {"attempt": 1, "stage": "train", "step": 1, "files": files}
 
 
-def test_only_what_nothing_names_is_collected(within: Any, tmp_path: Path) -> None:
+def test_garbage_collection_removes_unreferenced_content_only(within: Any, tmp_path: Path) -> None:
     storage = LocalStorage(tmp_path / "store", floor_bytes=0)
 
     async def story(pool: Pool, connection: Connection) -> None:
@@ -225,19 +225,19 @@ def test_only_what_nothing_names_is_collected(within: Any, tmp_path: Path) -> No
         dataset = await create_dataset(connection, "me", "d")
         await put_file(connection, dataset.id, "images/a.jpg", photo, 5)
         done = await running(connection, pool)
-        await done.succeed([Result("scene.ply", result, 6, "x")])
+        await done.succeed([ResultFile("scene.ply", result, 6, "x")])
         going = await running(connection, pool)
-        await going.keep_checkpoint(checkpoint(state), advances=True)
-        await going.keep_preview({"sha256": preview, "step": 1, "view": "a"})
+        await going.record_checkpoint(checkpoint(state), is_progress=True)
+        await going.record_preview({"sha256": preview, "step": 1, "view": "a"})
         # Published by an attempt that was lost before it could say so.
         unsaid = put(storage, "unsaid")
         files = (TreeFile(path="scene.ply", sha256=unsaid, size_bytes=6),)
         publish_manifest(storage, f"results/{going.job.id}/1", Manifest(files=files))
         publish_manifest(storage, f"results/{uuid.uuid4()}/1", Manifest(files=files))
-        removed = await collect(pool, storage, unused_seconds=DAY)
+        removed = await collect_garbage(pool, storage, unused_seconds=DAY)
         assert removed is not None and (removed.blobs, removed.size_bytes) == (1, 6)
         assert held(storage) == {young, photo, result, state, preview, unsaid} and unused not in held(storage)
-        assert list(storage.documents("results/")) == [f"results/{going.job.id}/1"]
+        assert list(storage.list_documents("results/")) == [f"results/{going.job.id}/1"]
 
     within(story)
 
@@ -251,36 +251,36 @@ def test_replaced_checkpoints_go_early_but_not_what_others_name(within: Any, tmp
         ]
         attempt = await running(connection, pool)
         other = await running(connection, pool)
-        await other.succeed([Result("scene.ply", shared, 6, "x")])
+        await other.succeed([ResultFile("scene.ply", shared, 6, "x")])
         await change_job(connection, other.job.id, label=None, pinned=True)
-        await attempt.keep_checkpoint(checkpoint(first, both, shared), advances=True)
-        await attempt.keep_checkpoint(checkpoint(both, second), advances=True)
-        assert (await collect(pool, storage, unused_seconds=DAY)) is not None
+        await attempt.record_checkpoint(checkpoint(first, both, shared), is_progress=True)
+        await attempt.record_checkpoint(checkpoint(both, second), is_progress=True)
+        assert (await collect_garbage(pool, storage, unused_seconds=DAY)) is not None
         assert held(storage) == {first, both, second, shared}  # somebody may still read it
         await connection.execute("UPDATE replaced_contents SET replaced_at = now() - interval '1 hour'")
-        await collect(pool, storage, unused_seconds=DAY)
+        await collect_garbage(pool, storage, unused_seconds=DAY)
         assert held(storage) == {both, second, shared}
         await attempt.succeed([])
         await connection.execute("UPDATE replaced_contents SET replaced_at = now() - interval '1 hour'")
-        await collect(pool, storage, unused_seconds=DAY)
+        await collect_garbage(pool, storage, unused_seconds=DAY)
         assert held(storage) == {shared}
         assert [a.sha256 for a in await artifacts_of(connection, other.job.id)] == [shared]
 
     within(story)
 
 
-def test_store_of_another_database_is_left_alone(within: Any, tmp_path: Path) -> None:
+def test_garbage_collection_skips_store_of_other_database(within: Any, tmp_path: Path) -> None:
     storage = LocalStorage(tmp_path / "store", floor_bytes=0)
 
     async def story(pool: Pool, connection: Connection) -> None:
         unused = put(storage, "unused")
-        storage.publish("installation", b"another")
-        assert await collect(pool, storage, unused_seconds=DAY) is None
+        storage.publish_document("installation", b"another")
+        assert await collect_garbage(pool, storage, unused_seconds=DAY) is None
         assert held(storage) == {unused}
-        storage.withdraw("installation")
-        assert await collect(pool, storage, unused_seconds=DAY, every_seconds=60) is not None
+        storage.remove_document("installation")
+        assert await collect_garbage(pool, storage, unused_seconds=DAY, every_seconds=60) is not None
         put(storage, "unused")
-        assert await collect(pool, storage, unused_seconds=DAY, every_seconds=60) is None
+        assert await collect_garbage(pool, storage, unused_seconds=DAY, every_seconds=60) is None
         assert len(held(storage)) == 1
 
     within(story)

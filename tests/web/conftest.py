@@ -19,11 +19,11 @@ sys.path.append(str(Path(__file__).parents[1]))
 sys.path.append(str(Path(__file__).parents[1] / "tools"))
 from browser import PLAYWRIGHT, chromium
 from npm_packages import npm_folder
-from replay import Replay
-from web_bench import ROOT, Browse, Service, StartService
+from run_replay import RunReplay
+from web_harness import ROOT, Browse, RunningService, StartService
 
 from octasplat.workers.postgres.embedded import EmbeddedPostgres
-from postgres_for_tests import copied_database, postgres, short_root, template
+from postgres_fixtures import copied_database, postgres, short_root, template
 
 __all__ = ["postgres", "short_root", "template"]
 
@@ -41,7 +41,7 @@ def start_service(database: str, tmp_path_factory: pytest.TempPathFactory) -> It
     root = tmp_path_factory.mktemp("service")
     processes: list[subprocess.Popen[bytes]] = []
 
-    def start(**settings: str) -> Service:
+    def start(**settings: str) -> RunningService:
         with socket.socket() as probe:
             probe.bind(("127.0.0.1", 0))
             port = probe.getsockname()[1]
@@ -63,7 +63,7 @@ def start_service(database: str, tmp_path_factory: pytest.TempPathFactory) -> It
             except (urllib.error.URLError, OSError):
                 time.sleep(0.1)
         store = root / "store"
-        return Service(url, store, Replay(database, store))
+        return RunningService(url, store, RunReplay(database, store))
 
     yield start
     for process in processes:
@@ -72,7 +72,7 @@ def start_service(database: str, tmp_path_factory: pytest.TempPathFactory) -> It
 
 
 @pytest.fixture(scope="module")
-def service(start_service: StartService) -> Service:
+def service(start_service: StartService) -> RunningService:
     """A front end without tokens."""
     return start_service()
 

@@ -7,12 +7,12 @@ import pytest
 
 from octasplat.engine.train.config import TrainConfig
 from octasplat.engine.train.preset_names import PRESETS
-from octasplat.service.web.form_fields import Field
+from octasplat.service.web.form_fields import FormField
 from octasplat.service.web.forms import OptionsForm, options_form
-from octasplat.workers.work.kinds import JobKind, job_kinds, kind_named
+from octasplat.workers.worker.job_kinds import JobKind, get_job_kind, job_kinds
 
 
-def fields_of(form: OptionsForm) -> dict[str, Field]:
+def fields_of(form: OptionsForm) -> dict[str, FormField]:
     folded = chain(*(section.fields for section in form.more), form.experimental)
     return {f.path: f for f in chain(form.first, folded)}
 
@@ -25,7 +25,7 @@ def leaves(values: dict, prefix: str = "") -> set[str]:
 
 
 def test_every_setting_has_its_field() -> None:
-    kind = kind_named("reconstruct")
+    kind = get_job_kind("reconstruct")
     form = options_form(kind)
     for preset in PRESETS:
         assert leaves(kind.resolve({"preset": preset}).model_dump(mode="json")) <= set(fields_of(form))
@@ -33,8 +33,8 @@ def test_every_setting_has_its_field() -> None:
 
 
 def test_defaults_follow_the_preset() -> None:
-    fields = fields_of(options_form(kind_named("reconstruct")))
-    kind = kind_named("reconstruct")
+    fields = fields_of(options_form(get_job_kind("reconstruct")))
+    kind = get_job_kind("reconstruct")
     shown = json.loads(fields["train.iterations"].defaults)
     assert shown == {
         name: str(kind.resolve({"preset": name}).model_dump()["train"]["iterations"]) for name in PRESETS
@@ -44,7 +44,7 @@ def test_defaults_follow_the_preset() -> None:
 
 
 def test_limits_choices_and_words() -> None:
-    fields = fields_of(options_form(kind_named("reconstruct")))
+    fields = fields_of(options_form(get_job_kind("reconstruct")))
     assert fields["test_every"].low == 0 and fields["test_every"].control == "whole"
     assert (
         fields["train.ssim_patch_fraction"].high == 1
@@ -59,12 +59,12 @@ def test_limits_choices_and_words() -> None:
 
 
 def test_files_are_chosen_from_the_formats() -> None:
-    export = fields_of(options_form(kind_named("export")))
+    export = fields_of(options_form(get_job_kind("export")))
     names = [choice.value for choice in export["files"].choices]
     assert {"mesh.glb", "scene.spz", "scene.splat"} <= set(names)
     assert export["files"].required
     for name in names:  # the kind takes all that is offered
-        kind_named("export").resolve({"files": [name]})
+        get_job_kind("export").resolve({"files": [name]})
 
 
 OURS = [kind for kind in job_kinds() if kind.program.startswith("octasplat.")]
@@ -80,31 +80,31 @@ def test_every_kind_has_a_form_whose_fields_are_explained(kind: JobKind) -> None
 
 
 def test_texts_of_pairs_are_json() -> None:
-    transform = fields_of(options_form(kind_named("transform")))
+    transform = fields_of(options_form(get_job_kind("transform")))
     assert transform["rotate"].control == "json" and transform["translate"].control == "numbers"
     assert transform["up"].control == "list" and transform["matrix"].control == "upload"
 
 
 def test_basic_fields_are_open_others_folded() -> None:
-    form = options_form(kind_named("reconstruct"))
+    form = options_form(get_job_kind("reconstruct"))
     assert {"train.iterations", "train.background", "materials"} <= {f.path for f in form.first}
     assert {f.group for f in form.first} == {"basic"}
     assert {f.group for section in form.more for f in section.fields} == {"advanced"}
     assert "train.plane_sweep_unseen" in {f.path for f in form.experimental}
 
 
-def test_fields_have_units() -> None:
-    fields = fields_of(options_form(kind_named("reconstruct")))
+def test_form_fields_have_units() -> None:
+    fields = fields_of(options_form(get_job_kind("reconstruct")))
     assert fields["max_side"].unit == "px" and fields["train.early_stopping_db"].unit == "dB"
 
 
 def test_values_of_several_types_are_chosen_where_all_are_known() -> None:
-    exposure = fields_of(options_form(kind_named("reconstruct")))["train.exposure"]
+    exposure = fields_of(options_form(get_job_kind("reconstruct")))["train.exposure"]
     assert exposure.control == "choice"
     assert [choice.value for choice in exposure.choices] == ["true", "false", "auto"]
 
 
 def test_boxes_are_numbers_and_files_are_sent() -> None:
-    fields = fields_of(options_form(kind_named("material")))
+    fields = fields_of(options_form(get_job_kind("material")))
     assert fields["box"].control == "numbers"
     assert fields["mesh"].control == "upload" and fields["masks"].control == "uploads"

@@ -7,10 +7,10 @@ from pathlib import Path
 
 import httpx
 import pytest
-from test_parts import client, make_job
+from test_page_parts import client, make_job
 
-from octasplat.workers.records.database import open_pool
-from octasplat.workers.work.kinds import job_kinds
+from octasplat.workers.db.connections import open_pool
+from octasplat.workers.worker.job_kinds import job_kinds
 
 RESULTS = (
     "scene.ply", "config.json", "held_out.json", "views.json", "training.json", "events.jsonl",

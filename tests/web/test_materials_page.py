@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from web_bench import Browse, Service
+from web_harness import Browse, RunningService
 
-from octasplat.engine.render.environment_map import write_environment
-from octasplat.engine.scene.generated import GeneratedSceneConfig, write_generated_scene
+from octasplat.engine.dataset.synthetic import SyntheticDatasetConfig, write_synthetic_dataset
+from octasplat.engine.render.environment_files import write_environment
 from octasplat.workers.cli.main import cli
 
 pytestmark = [pytest.mark.tools, pytest.mark.heavy]
@@ -47,8 +47,8 @@ RUN = (
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A scene, a run of it with materials, and a map of light."""
     root = tmp_path_factory.mktemp("shiny")
-    config = GeneratedSceneConfig(views=8, width_px=64, height_px=48, samples_per_side=1, points=400)
-    write_generated_scene(root / "scene", config)
+    config = SyntheticDatasetConfig(views=8, width_px=64, height_px=48, samples_per_side=1, points=400)
+    write_synthetic_dataset(root / "scene", config)
     done = CliRunner().invoke(cli, ["reconstruct", str(root / "scene"), "-o", str(root / "run"), *RUN, "-q"])
     assert done.exit_code == 0, done.output
     write_environment(root / "a map.hdr", np.full((8, 16, 3), 0.5, np.float32))
@@ -56,7 +56,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def job(service: Service, folder: Path) -> str:
+def job(service: RunningService, folder: Path) -> str:
     """A reconstruction that nobody has worked on yet."""
     command = ("submit", folder / "scene", "--queue", "nobody", "--server", service.url, "-q")
     done = CliRunner().invoke(cli, [str(part) for part in command])
@@ -64,8 +64,8 @@ def job(service: Service, folder: Path) -> str:
     return done.stdout.strip().splitlines()[-1]
 
 
-def test_behind_the_views_in_another_light_and_of_other_stuff(
-    service: Service, browse: Browse, folder: Path, job: str
+def test_materials_page_offers_layers_relight_and_edit(
+    service: RunningService, browse: Browse, folder: Path, job: str
 ) -> None:
     service.worker.run(uuid.UUID(job), folder / "run")
     found = browse("relight", service.url, job=job, map=str(folder / "a map.hdr"), by="path")
@@ -90,7 +90,9 @@ def test_behind_the_views_in_another_light_and_of_other_stuff(
     plain, lit, learnt, plain_again = found["looks"]
     assert plain == plain_again and abs(lit - plain) > 1 and learnt != lit != plain
     assert found["hidden"] and found["refused"] == "Choose a file of light: HDR or EXR."
-    relit, film, changed = (service.ask("GET", f"/v1/jobs/{found[k]}") for k in ("first", "second", "third"))
+    relit, film, changed = (
+        service.request("GET", f"/v1/jobs/{found[k]}") for k in ("first", "second", "third")
+    )
     assert relit["kind"] == film["kind"] == "relight" and relit["source_id"] == film["source_id"] == job
     wanted = {"environments": ["a_map.hdr"], "rotation_degrees": 90, "mode": "views", "integrator": "path"}
     assert wanted.items() <= relit["options"].items() and relit["options"]["samples"] == 64
@@ -102,10 +104,10 @@ def test_behind_the_views_in_another_light_and_of_other_stuff(
 
 
 def test_a_result_without_materials_has_none_of_it(
-    service: Service, folder: Path, job: str, tmp_path: Path
+    service: RunningService, folder: Path, job: str, tmp_path: Path
 ) -> None:
-    dataset = service.ask("GET", f"/v1/jobs/{job}")["dataset_id"]
-    plain = service.ask("POST", "/v1/jobs", {"dataset_id": dataset, "queue": "nobody"})["id"]
+    dataset = service.request("GET", f"/v1/jobs/{job}")["dataset_id"]
+    plain = service.request("POST", "/v1/jobs", {"dataset_id": dataset, "queue": "nobody"})["id"]
     left_out = shutil.ignore_patterns("environment.hdr", "layers")
     shutil.copytree(folder / "run", tmp_path / "run", ignore=left_out)
     service.worker.run(uuid.UUID(plain), tmp_path / "run")

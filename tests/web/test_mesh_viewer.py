@@ -12,7 +12,7 @@ from browser import Page, open_page
 
 import octasplat.service.web as service_web
 from octasplat.engine.files.mesh_glb import write_surface
-from octasplat.engine.surface.mesh import TriangleMesh
+from octasplat.engine.geometry.triangle_mesh import TriangleMesh
 
 pytestmark = [pytest.mark.tools, pytest.mark.heavy]
 

@@ -11,11 +11,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from web_bench import ROOT, Browse, Service, StartService
+from web_harness import ROOT, Browse, RunningService, StartService
 
-from octasplat.engine.light.stage_file import parse_stage
+from octasplat.engine.dataset.synthetic import SyntheticDatasetConfig, write_synthetic_dataset
+from octasplat.engine.pathtracing.stage.stage_file import parse_stage
 from octasplat.engine.render.path_file import read_camera_path
-from octasplat.engine.scene.generated import GeneratedSceneConfig, write_generated_scene
 from octasplat.engine.train.config import preset
 
 pytestmark = [pytest.mark.tools, pytest.mark.heavy]
@@ -38,7 +38,7 @@ OPTIONS = {
 class Flow:
     """A scene that went through the browser, and the job that came of it."""
 
-    service: Service
+    service: RunningService
     folder: Path
     facts: dict[str, Any]
     job: str
@@ -47,8 +47,8 @@ class Flow:
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("generated") / "still life"
-    config = GeneratedSceneConfig(views=VIEWS, width_px=96, height_px=72, samples_per_side=2, points=800)
-    write_generated_scene(root, config)
+    config = SyntheticDatasetConfig(views=VIEWS, width_px=96, height_px=72, samples_per_side=2, points=800)
+    write_synthetic_dataset(root, config)
     return root
 
 
@@ -87,7 +87,7 @@ def work(flow: Flow, database: str) -> Iterator[None]:
     process.wait(120)
 
 
-def test_a_folder_is_sent_and_goes_on_after_a_break(flow: Flow) -> None:
+def test_upload_page_resumes_after_interruption(flow: Flow) -> None:
     facts = flow.facts
     assert facts["empty"] == "Nothing here yet"
     assert facts["chosen"].startswith(f"still life: {VIEWS} photographs and a COLMAP model")
@@ -95,17 +95,19 @@ def test_a_folder_is_sent_and_goes_on_after_a_break(flow: Flow) -> None:
     wanted = {path.relative_to(flow.folder).as_posix() for path in parts if path.is_file()}
     first, second = facts["firstPuts"], facts["secondPuts"]
     assert len(first) >= 5 and len(second) == len(wanted) - 5  # just what had not arrived
-    job = flow.service.ask("GET", f"/v1/jobs/{flow.job}")
-    dataset = flow.service.ask("GET", f"/v1/datasets/{job['dataset_id']}")
-    files = flow.service.ask("GET", f"/v1/datasets/{dataset['id']}/files")["files"]
+    job = flow.service.request("GET", f"/v1/jobs/{flow.job}")
+    dataset = flow.service.request("GET", f"/v1/datasets/{job['dataset_id']}")
+    files = flow.service.request("GET", f"/v1/datasets/{dataset['id']}/files")["files"]
     assert {file["path"] for file in files} == wanted
     assert dataset["name"] == "still life" and dataset["photographs"] == VIEWS and dataset["has_poses"]
-    assert len(flow.service.ask("GET", "/v1/datasets")["datasets"]) == 1  # the second time found the first
+    assert (
+        len(flow.service.request("GET", "/v1/datasets")["datasets"]) == 1
+    )  # the second time found the first
     assert facts["complaints"] == []
 
 
 def test_the_form_asks_for_what_was_filled_in(flow: Flow) -> None:
-    job = flow.service.ask("GET", f"/v1/jobs/{flow.job}")
+    job = flow.service.request("GET", f"/v1/jobs/{flow.job}")
     options = job["options"]
     assert job["label"] == "a still life"
     assert options["preset"] == "fast" and options["poses"] == "given" and options["test_every"] == 4
@@ -116,17 +118,17 @@ def test_the_form_asks_for_what_was_filled_in(flow: Flow) -> None:
     assert flow.facts["namelessOnNew"] == []
 
 
-def test_the_form_says_what_the_job_will_take(flow: Flow) -> None:
+def test_new_job_form_shows_estimate(flow: Flow) -> None:
     facts = flow.facts
     for shown in (facts["estimate"], facts["estimateAnew"]):
         assert shown.startswith("This takes about ") and shown.endswith(", within a factor of two.")
     assert facts["estimate"] != facts["estimateAnew"]  # other options, another time
     assert facts["tooMuch"].startswith("Iterations: ") and "100000" in facts["tooMuch"]
-    job = flow.service.ask("GET", f"/v1/jobs/{flow.job}")
+    job = flow.service.request("GET", f"/v1/jobs/{flow.job}")
     assert facts["estimateAnew"] == f"This takes {job['estimate']['text']}, within a factor of two."
 
 
-def test_a_job_is_followed_to_its_end(watched: dict[str, Any]) -> None:
+def test_job_page_follows_progress_to_end(watched: dict[str, Any]) -> None:
     states = watched["states"]
     assert states[-1] == "succeeded" and "running" in states, states
     assert watched["list"][-1] == "Done"
@@ -141,7 +143,7 @@ def test_a_job_is_followed_to_its_end(watched: dict[str, Any]) -> None:
     assert watched["complaints"] == []
 
 
-def test_the_result(flow: Flow, watched: dict[str, Any], browse: Browse) -> None:
+def test_job_page_shows_result(flow: Flow, watched: dict[str, Any], browse: Browse) -> None:
     found = browse("result", flow.service.url, job=flow.job)
     assert found["worstFirst"] == sorted(found["worstFirst"]) and len(found["worstFirst"]) == 2
     assert found["bestFirst"] == found["worstFirst"][::-1]
@@ -154,7 +156,9 @@ def test_the_result(flow: Flow, watched: dict[str, Any], browse: Browse) -> None
     assert found["viewerReady"] and found["complaints"] == []
 
 
-def test_light_by_form(flow: Flow, watched: dict[str, Any], browse: Browse, tmp_path: Path) -> None:
+def test_stage_form_renders_with_added_mesh(
+    flow: Flow, watched: dict[str, Any], browse: Browse, tmp_path: Path
+) -> None:
     mesh = tmp_path / "a thing.obj"
     mesh.write_text("v 0 0 0\nv 2 0 0\nv 0 2 0\nv 0 0 2\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n")
     found = browse("light", flow.service.url, job=flow.job, mesh=str(mesh))
@@ -168,10 +172,10 @@ def test_light_by_form(flow: Flow, watched: dict[str, Any], browse: Browse, tmp_
     assert found["refused"].startswith("'sky.hdr' is not an image") and found["refused"].count("sky.hdr") == 1
     assert found["preview"] == [96, 72] and found["took"].startswith("The preview took ")
     assert len(found["pictures"]) == 2 and set(found["pictures"]) == {96}
-    job = flow.service.ask("GET", f"/v1/jobs/{found['job']}")
+    job = flow.service.request("GET", f"/v1/jobs/{found['job']}")
     assert (job["kind"], job["source_id"], job["state"]) == ("render", flow.job, "succeeded")
     assert len(job["options"]["stage"]["meshes"]) == 2
-    files = flow.service.ask("GET", f"/v1/datasets/{job['files_id']}/files")["files"]
+    files = flow.service.request("GET", f"/v1/datasets/{job['files_id']}/files")["files"]
     assert [file["path"] for file in files] == ["a_thing.obj"]
     assert found["estimate"].startswith("With 100,000 Gaussians the held-out views would take at most about ")
     assert found["saved"] == {"name": "stage.toml", "same": True}
@@ -181,7 +185,9 @@ def test_light_by_form(flow: Flow, watched: dict[str, Any], browse: Browse, tmp_
     ] == []  # one file is meant to be refused
 
 
-def test_by_keyboard_alone(flow: Flow, watched: dict[str, Any], browse: Browse, tmp_path: Path) -> None:
+def test_pages_are_usable_by_keyboard(
+    flow: Flow, watched: dict[str, Any], browse: Browse, tmp_path: Path
+) -> None:
     found = browse("keyboard", flow.service.url, job=flow.job)
     assert found["first"] == "Skip to the content"
     assert found["keepsFocus"]
@@ -192,7 +198,7 @@ def test_by_keyboard_alone(flow: Flow, watched: dict[str, Any], browse: Browse, 
     cameras = read_camera_path(tmp_path / "path.json").cameras
     assert len(cameras) == 60 and cameras[0].height_px == 720
     views = {
-        view["name"]: view for view in flow.service.ask("GET", f"/jobs/{flow.job}/cameras.json")["views"]
+        view["name"]: view for view in flow.service.request("GET", f"/jobs/{flow.job}/cameras.json")["views"]
     }
     # The first key is where the photograph was taken from that the place names.
     np.testing.assert_allclose(
@@ -207,7 +213,7 @@ def test_by_keyboard_alone(flow: Flow, watched: dict[str, Any], browse: Browse, 
     assert found["complaints"] == []
 
 
-def test_on_a_phone_in_dark_and_light(flow: Flow, watched: dict[str, Any], browse: Browse) -> None:
+def test_pages_fit_phone_in_both_colour_schemes(flow: Flow, watched: dict[str, Any], browse: Browse) -> None:
     found = browse("phone", flow.service.url, job=flow.job)
     assert {name: width for name, width in found["overflow"].items() if width > 0} == {}
     for name, colour in found["background"].items():
@@ -220,18 +226,18 @@ def test_on_a_phone_in_dark_and_light(flow: Flow, watched: dict[str, Any], brows
 
 
 def test_buttons_and_polling_without_events(flow: Flow, browse: Browse) -> None:
-    dataset = flow.service.ask("GET", f"/v1/jobs/{flow.job}")["dataset_id"]
+    dataset = flow.service.request("GET", f"/v1/jobs/{flow.job}")["dataset_id"]
     # A queue that nobody works on.
     body = {"dataset_id": dataset, "queue": "nobody", "options": {"preset": "fast"}}
-    jobs = [flow.service.ask("POST", "/v1/jobs", body)["id"] for _ in range(2)]
+    jobs = [flow.service.request("POST", "/v1/jobs", body)["id"] for _ in range(2)]
     found = browse("actions", flow.service.url, jobs=jobs)
     assert found["asked"] == "Delete this job and its results?"
     assert found["gone"] and found["polled"]
-    assert flow.service.ask("GET", f"/v1/jobs/{uuid.UUID(jobs[0])}")["state"] == "canceled"
+    assert flow.service.request("GET", f"/v1/jobs/{uuid.UUID(jobs[0])}")["state"] == "canceled"
     assert found["complaints"] == []
 
 
-def test_a_token_is_asked_for(start_service: StartService, browse: Browse) -> None:
+def test_pages_ask_for_token(start_service: StartService, browse: Browse) -> None:
     service = start_service(TOKEN="octa_of_this_test")
     found = browse("signIn", service.url, token="octa_of_this_test")
     assert found["sentTo"] == "/sign-in?next=/new"

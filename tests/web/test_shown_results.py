@@ -4,8 +4,8 @@ import uuid
 
 import pytest
 
-from octasplat.service.web.results import shown_mesh
-from octasplat.workers.records.rows import Artifact
+from octasplat.service.web.results import viewable_mesh
+from octasplat.workers.db.rows import Artifact
 
 
 def artifact(name: str) -> Artifact:
@@ -22,5 +22,5 @@ def artifact(name: str) -> Artifact:
     ],
 )
 def test_mesh_that_is_shown(names: list[str], shown: str | None) -> None:
-    found = shown_mesh([artifact(name) for name in names])
+    found = viewable_mesh([artifact(name) for name in names])
     assert (found.name if found else None) == shown

@@ -19,10 +19,10 @@ from octasplat.engine.colour import to_bytes
 from octasplat.engine.files.gaussian_ply import write_gaussian_ply
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.gaussians.octagon import CHI2_2_99, CHI2_3_99
-from octasplat.engine.light.environment import EnvironmentMap, environment_frame
-from octasplat.engine.light.split_sum_relighting import SplitSumRelighter
-from octasplat.engine.render.cameras import RenderCamera, focal_from_fov
-from octasplat.engine.render.environment_map import read_environment, write_environment
+from octasplat.engine.pathtracing.environment import EnvironmentMap, environment_frame
+from octasplat.engine.pathtracing.relighting.split_sum_relighter import SplitSumRelighter
+from octasplat.engine.render.environment_files import read_environment, write_environment
+from octasplat.engine.render.pinhole_camera import PinholeCamera, focal_from_fov
 from octasplat.engine.render.renderer import background_colour, render_rays
 from octasplat.engine.trace.cpu.tracer import CpuTracer
 from octasplat.engine.trace.protocol import TraceSettings
@@ -75,15 +75,15 @@ window.result = (async () => {
 """
 
 
-def camera_at(x: float, y: float, z: float) -> RenderCamera:
+def camera_at(x: float, y: float, z: float) -> PinholeCamera:
     pose = np.eye(4)
     pose[:3, 3] = (x, y, z)
-    return RenderCamera.from_pose(pose, SIDE_PX, SIDE_PX, fy_px=focal_from_fov(FOV_DEGREES, SIDE_PX))
+    return PinholeCamera.from_pose(pose, SIDE_PX, SIDE_PX, fy_px=focal_from_fov(FOV_DEGREES, SIDE_PX))
 
 
 def draw(
     scene: FlatGaussians,
-    camera: RenderCamera,
+    camera: PinholeCamera,
     folder: Path,
     *,
     q: float,
@@ -161,11 +161,13 @@ def test_draws_materials_in_the_light_of_a_map(
     up = (0.0, -1.0, 0.0)
     asked = {"up": up, "degrees": degrees}
     page = draw(scene, camera, tmp_path, q=CHI2_2_99, background=(0, 0, 0), light=asked)
-    relighter = SplitSumRelighter(scene, TraceSettings(), None, extent_world=40.0, side=1, threads=1)
-    relighter.put(
+    relighter = SplitSumRelighter(
+        scene, TraceSettings(), None, extent_world=40.0, rays_across_pixel=1, threads=1
+    )
+    relighter.set_environment(
         EnvironmentMap(read_environment(tmp_path / "light.hdr"), environment_frame(np.array(up), degrees))
     )
-    ours = to_bytes(np.clip(relighter.render(camera.rays()).over(background_colour("black")), 0, 1))
+    ours = to_bytes(np.clip(relighter.render(camera.rays()).composite_over(background_colour("black")), 0, 1))
     assert (ours.max(axis=2) > 20).mean() > 0.1
     quality = psnr(page.image, ours)
     assert quality >= least, page.messages

@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from octasplat.engine.gaussians.frames import quaternions
-from octasplat.engine.render.paths import look_at
+from octasplat.engine.gaussians.frames import quaternions_from_matrices
+from octasplat.engine.render.pose_paths import look_at
 from octasplat.service.web.cameras import (
     MAX_VIEWS,
-    CamerasUnreadable,
+    CamerasUnreadableError,
     PhotographPose,
     read_poses,
     viewer_cameras,
@@ -30,7 +30,7 @@ def rotations() -> np.ndarray:
 
 def model(binary: bool) -> tuple[io.BytesIO, io.BytesIO]:
     """Two cameras, one of them with one focal length and one with two, and four photographs."""
-    quats = quaternions(rotations())
+    quats = quaternions_from_matrices(rotations())
     if not binary:
         cameras = "# a comment\n1 SIMPLE_RADIAL 400 300 500 200 150 0.1\n2 PINHOLE 300 400 310 320 150 200\n"
         lines = ["# a comment"]
@@ -52,7 +52,7 @@ def model(binary: bool) -> tuple[io.BytesIO, io.BytesIO]:
 
 
 @pytest.mark.parametrize("binary", [True, False])
-def test_poses_are_read(binary: bool) -> None:
+def test_web_cameras_read_poses(binary: bool) -> None:
     poses = read_poses(*model(binary), binary=binary)
     assert [pose.name for pose in poses] == [f"a folder/view {k}.jpg" for k in (6, 7, 8, 9)]
     for pose, k in zip(poses, (3, 2, 1, 0), strict=True):
@@ -83,7 +83,7 @@ def test_parallel_cameras_have_something_ahead_to_turn_about() -> None:
     np.testing.assert_allclose(found["up"], UP, atol=1e-6)
 
 
-def test_of_many_views_some_are_offered_and_all_held_out_ones_first_of_all() -> None:
+def test_viewer_cameras_thin_views_and_keep_held_out() -> None:
     rotation = np.eye(3)
     poses = [PhotographPose(f"{k:05}", rotation, np.zeros(3), 50.0, 1.5) for k in range(3000)]
     views = viewer_cameras(poses, ["00001"])["views"]
@@ -94,7 +94,7 @@ def test_of_many_views_some_are_offered_and_all_held_out_ones_first_of_all() -> 
 @pytest.mark.parametrize("cut", [0, 7, 20, 60, 300])
 def test_files_cut_short_are_refused(cut: int) -> None:
     cameras, images = model(True)
-    with pytest.raises(CamerasUnreadable):
+    with pytest.raises(CamerasUnreadableError):
         read_poses(cameras, io.BytesIO(images.getvalue()[:cut]), binary=True)
 
 
@@ -105,9 +105,9 @@ def test_hostile_counts_and_names_are_refused() -> None:
         struct.pack("<Q", 2) + struct.pack("<i7di", 1, *range(7), 1) + b"x" * 9000,
     ):
         cameras.seek(0)
-        with pytest.raises(CamerasUnreadable):
+        with pytest.raises(CamerasUnreadableError):
             read_poses(cameras, io.BytesIO(data), binary=True)
-    with pytest.raises(CamerasUnreadable):
+    with pytest.raises(CamerasUnreadableError):
         read_poses(io.BytesIO(struct.pack("<QiiQQ", 1, 1, 99, 4, 3)), images, binary=True)
 
 
@@ -119,7 +119,7 @@ def test_poses_that_make_no_sense_are_left_out() -> None:
 
 
 @pytest.mark.real
-def test_a_real_model(scenes_root: Path) -> None:
+def test_web_cameras_of_real_model_match_pycolmap(scenes_root: Path) -> None:
     import pycolmap
 
     folder = scenes_root / "fox" / "sparse" / "0"

@@ -8,8 +8,8 @@ from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict
 
-from octasplat.workers.work.kinds import JobKind, register
-from octasplat.workers.work.task import Task
+from octasplat.workers.worker.job_kinds import JobKind, register
+from octasplat.workers.worker.task import Task
 
 
 class SpyOptions(BaseModel):
@@ -52,10 +52,10 @@ def run(task: Task) -> None:
             os.execvp("sleep", ["sleep", "600"])
     if options.children:
         while True:
-            task.listener(_Alive())
+            task.progress(_AliveEvent())
 
 
-class _Alive:
+class _AliveEvent:
     kind = "alive"
 
     def as_dict(self) -> dict[str, object]:

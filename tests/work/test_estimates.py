@@ -3,7 +3,7 @@
 import pytest
 
 from octasplat.engine.config import resolve_config
-from octasplat.engine.operations.costs import Estimate, estimate_reconstruction
+from octasplat.engine.operations.cost_model import Estimate, estimate_reconstruction
 from octasplat.engine.photograph_sizes import Sizes
 
 

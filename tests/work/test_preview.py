@@ -11,17 +11,17 @@ import pytest
 from PIL import Image
 
 from octasplat.engine.config import ReconstructionConfig
+from octasplat.engine.dataset import Dataset
+from octasplat.engine.dataset.synthetic import SyntheticDatasetConfig, write_synthetic_dataset
 from octasplat.engine.events import Event
-from octasplat.engine.operations.reconstruct import options_of
-from octasplat.engine.pipeline import Watcher, reconstruct
+from octasplat.engine.operations.reconstruct import options_from_json
+from octasplat.engine.pipeline import OnStep, reconstruct
 from octasplat.engine.rays import ImageRays, RayBatch
-from octasplat.engine.scene import Dataset
-from octasplat.engine.scene.generated import GeneratedSceneConfig, write_generated_scene
 from octasplat.engine.shading.plain import PLAIN
 from octasplat.engine.shading.protocol import ShadingModel
 from octasplat.engine.trace.protocol import Tracer
-from octasplat.workers.work import preview
-from octasplat.workers.work.preview import Previews, PreviewWritten
+from octasplat.workers.worker import preview
+from octasplat.workers.worker.preview import PreviewRenderer, PreviewWritten
 
 
 class Clock:
@@ -44,8 +44,8 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("watched") / "scene"
-    write_generated_scene(
-        root, GeneratedSceneConfig(views=8, width_px=48, height_px=36, samples_per_side=1, points=500)
+    write_synthetic_dataset(
+        root, SyntheticDatasetConfig(views=8, width_px=48, height_px=36, samples_per_side=1, points=500)
     )
     return root
 
@@ -56,10 +56,10 @@ def config() -> ReconstructionConfig:
         "rebuild_every": 20, "checkpoint_every": 1000, "densify_from_iter": 10, "probe_rays": 256,
         "densify": {"interval": 10, "start": 10},
     }  # fmt: skip
-    return options_of({"preset": "fast", "train": train, "exports": ["mesh.ply"]}).config()
+    return options_from_json({"preset": "fast", "train": train, "exports": ["mesh.ply"]}).config()
 
 
-def watched(clock: Clock, previews: Previews, seconds: float) -> Watcher:
+def watched(clock: Clock, previews: PreviewRenderer, seconds: float) -> OnStep:
     """Every iteration takes so many seconds."""
 
     def watch(iteration: int, dataset: Dataset, tracer: Tracer, shading: ShadingModel) -> None:
@@ -75,28 +75,26 @@ def told_steps(run: Path, told: list[Event]) -> list[int]:
     return [event.step for event in found]
 
 
-def test_pictures_come_between_checkpoints_and_change_nothing(
-    scene: Path, tmp_path: Path, clock: Clock
-) -> None:
+def test_previews_do_not_change_training(scene: Path, tmp_path: Path, clock: Clock) -> None:
     whole = reconstruct(scene, tmp_path / "whole", config(), threads=1)
     told: list[Event] = []
     run = tmp_path / "run"
-    watch = watched(clock, Previews(run, "black", told.append), 1.0)
-    reconstruct(scene, run, config(), threads=1, watch=watch)
+    watch = watched(clock, PreviewRenderer(run, "black", told.append), 1.0)
+    reconstruct(scene, run, config(), threads=1, on_step=watch)
     # At once, after 4 s, and then every 12 s; one that falls on a densification waits for the next iteration.
     steps = told_steps(run, told)
     assert len(steps) == 6 and steps[0] == 1
     assert all(12 <= b - a <= 14 for a, b in pairwise(steps[1:]))
     drawn_often = tmp_path / "often"
-    watch = watched(clock, Previews(drawn_often, "black", lambda _event: None), 60.0)
-    reconstruct(scene, drawn_often, config(), threads=1, watch=watch)
+    watch = watched(clock, PreviewRenderer(drawn_often, "black", lambda _event: None), 60.0)
+    reconstruct(scene, drawn_often, config(), threads=1, on_step=watch)
     for name in ("scene.ply", "mesh.ply", "checkpoints/best.npz", "renders/view_000.png"):
         expected = (whole / name).read_bytes()
         assert (run / name).read_bytes() == expected and (drawn_often / name).read_bytes() == expected
 
 
 @pytest.mark.parametrize(("seconds_per_ray", "least_side_px"), [(1e-9, 320), (2e-5, 120), (1e-2, 96)])
-def test_pictures_become_smaller_where_they_take_long(
+def test_previews_shrink_when_slow(
     tmp_path: Path, clock: Clock, monkeypatch: pytest.MonkeyPatch, seconds_per_ray: float, least_side_px: int
 ) -> None:
     """A picture takes at most 2 % of 12 s, or is as small as pictures become."""
@@ -111,11 +109,11 @@ def test_pictures_become_smaller_where_they_take_long(
     monkeypatch.setattr(preview, "render_rays", render)
     view = SimpleNamespace(name="a.jpg", width_px=1600, height_px=1200, origin_world=np.zeros(3))
     dataset = SimpleNamespace(views=(view,), test_indices=np.array([0]), rays=rays, near_world=0.0)
-    draw: Callable[..., None] = Previews(tmp_path, "black", lambda _event: None)
+    draw: Callable[..., None] = PreviewRenderer(tmp_path, "black", lambda _event: None)
     for iteration in range(4):
         draw(iteration, dataset, None, PLAIN)
         clock.now += 1000
-    with Image.open(tmp_path / preview.FILE) as picture:
+    with Image.open(tmp_path / preview.PREVIEW_FILE) as picture:
         width, height = picture.size
     assert least_side_px <= width <= 320 and abs(width * 0.75 - height) <= 1
     assert width == 96 or seconds_per_ray * width * height <= 0.25

@@ -5,8 +5,8 @@ from typing import Any
 
 import pytest
 
-from octasplat.workers.work import reporter
-from octasplat.workers.work.reporter import Reporter
+from octasplat.workers.worker import reporter
+from octasplat.workers.worker.reporter import Reporter
 
 
 class SlowJournal:
@@ -28,17 +28,17 @@ class SlowJournal:
         await asyncio.sleep(0)
 
 
-def test_an_end_in_the_middle_of_writing_loses_and_repeats_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_reporter_finish_during_flush_writes_each_line_once(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(reporter, "FLUSH_SECONDS", 0.01)
 
     async def job() -> list[str]:
         journal = SlowJournal()
         child = Reporter(journal, workspace=None)  # type: ignore[arg-type]
         for stage in ("load", "evaluate", "export"):
-            child.hear({"kind": "stage_started", "stage": stage, "total_steps": 0})
-            child.hear({"kind": "stage_finished", "stage": stage, "seconds": 1.0})
+            child.on_event({"kind": "stage_started", "stage": stage, "total_steps": 0})
+            child.on_event({"kind": "stage_finished", "stage": stage, "seconds": 1.0})
         await journal.telling.wait()  # the first event is being written, five more were taken
-        child.hear({"kind": "run_finished", "outputs": [], "seconds": 3.0})
+        child.on_event({"kind": "run_finished", "outputs": [], "seconds": 3.0})
         await child.finish()
         return journal.told
 
@@ -50,8 +50,8 @@ def test_an_end_in_the_middle_of_writing_loses_and_repeats_nothing(monkeypatch: 
     assert asyncio.run(job()) == [*stages, "run_finished"]
 
 
-def test_the_log_says_now_and_then_how_far_the_job_is(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(reporter, "PACE_SECONDS", 0.0)
+def test_reporter_logs_progress_at_intervals(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(reporter, "PROGRESS_LINE_SECONDS", 0.0)
 
     class Log(SlowJournal):
         def __init__(self) -> None:
@@ -64,18 +64,18 @@ def test_the_log_says_now_and_then_how_far_the_job_is(monkeypatch: pytest.Monkey
     async def job() -> list[str]:
         journal = Log()
         child = Reporter(journal, workspace=None)  # type: ignore[arg-type]
-        child.hear({"kind": "stage_started", "stage": "train", "total_steps": 900})
+        child.on_event({"kind": "stage_started", "stage": "train", "total_steps": 900})
         progress = {
             "iteration": 450, "total_iterations": 900, "loss": 0.1, "psnr": 24.13, "gaussians": 32000,
             "rays_per_second": 310_400, "hits_per_ray": 5.0, "seconds": 41.0, "seconds_left": 41.0,
         }  # fmt: skip
         measured = {"iteration": 450, "psnr": 23.04, "gaussians": 32000, "seconds": 41.0}
-        child.hear({"kind": "held_out_measured", **measured})
-        child.hear({"kind": "training_progress", **progress})
-        child.hear({"kind": "warning", "message": "It rains."})
+        child.on_event({"kind": "held_out_measured", **measured})
+        child.on_event({"kind": "training_progress", **progress})
+        child.on_event({"kind": "warning", "message": "It rains."})
         for number in range(3 * reporter.MAX_LOG_LINES):
             child.log(f"noise {number}")
-        child.hear({"kind": "error", "type": "x", "message": "x", "cause": ["Caused by rain"]})
+        child.on_event({"kind": "error", "type": "x", "message": "x", "cause": ["Caused by rain"]})
         await child.finish()
         return [line for line in journal.lines if "noise" not in line and "(More" not in line]
 

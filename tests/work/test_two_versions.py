@@ -12,15 +12,15 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from worker_bench import PATIENCE_SECONDS, ROOT, Bench
+from worker_harness import MAX_WAIT_SECONDS, ROOT, WorkerHarness
 
-import lock_order_for_tests
+import lock_order_check
+from octasplat.workers.db.connections import Connection
+from octasplat.workers.db.migrate import migrate
 from octasplat.workers.postgres.embedded import EmbeddedPostgres
 from octasplat.workers.queue.jobs import NewJob, cancel_job, create_job
-from octasplat.workers.queue.procrastinate_slips import ProcrastinateSlips
-from octasplat.workers.records.database import Connection
-from octasplat.workers.records.migrate import migrate
-from postgres_for_tests import copied_database
+from octasplat.workers.queue.procrastinate_queue import ProcrastinateQueue
+from postgres_fixtures import copied_database
 
 PREVIOUS = "5c70baddc6a2"
 """The commit of the release before this one; it is installed from the repository."""
@@ -29,9 +29,9 @@ STALE_SECONDS = 6.0
 
 
 @pytest.fixture
-def bench(conninfo: str, tmp_path: Path) -> Iterator[Bench]:
-    lock_order_for_tests.uninstall(conninfo)  # the version before keeps to no order
-    bench = Bench(conninfo, tmp_path, stale_seconds=STALE_SECONDS)
+def bench(conninfo: str, tmp_path: Path) -> Iterator[WorkerHarness]:
+    lock_order_check.remove_lock_order_checks(conninfo)  # the version before keeps to no order
+    bench = WorkerHarness(conninfo, tmp_path, stale_seconds=STALE_SECONDS)
     yield bench
     bench.close()
 
@@ -53,68 +53,68 @@ def previous(tmp_path: Path) -> Path:
 async def submit_many(connection: Connection) -> list[uuid.UUID]:
     """Jobs of others, of a kind that only a later version knows."""
     new = NewJob(owner="you", kind="later", options={"steps": 3}, queue="cpu")
-    return [(await create_job(connection, ProcrastinateSlips(), new)).id for _ in range(16)]
+    return [(await create_job(connection, ProcrastinateQueue(), new)).id for _ in range(16)]
 
 
 async def cancel_many(connection: Connection, jobs: list[uuid.UUID]) -> None:
     for job_id in jobs:
-        await cancel_job(connection, ProcrastinateSlips(), job_id)
+        await cancel_job(connection, ProcrastinateQueue(), job_id)
 
 
-def starts(bench: Bench, job_id: object) -> list[int]:
+def starts(bench: WorkerHarness, job_id: object) -> list[int]:
     """The steps at which the attempts of a finished job began."""
     return [int(line) for line in bench.results(job_id)["history.txt"].split()]  # type: ignore[arg-type]
 
 
-def test_what_a_worker_does_not_know_it_leaves_to_a_newer_one(bench: Bench) -> None:
+def test_unknown_job_is_left_to_newer_worker(bench: WorkerHarness) -> None:
     old = bench.worker(name="old", STALE_SECONDS="60")
-    bench.up("old")
-    many = bench.do(submit_many)
+    bench.wait_until_up("old")
+    many = bench.run_query(submit_many)
     later = bench.submit("later", options={"steps": 3})
     shaded = bench.submit(options={"steps": 3, "shade": 0.5})
     plain = bench.submit(options={"steps": 3})
-    assert bench.over(plain).worker == "old"  # what it knows it does meanwhile
-    deadline = time.monotonic() + PATIENCE_SECONDS
+    assert bench.wait_until_finished(plain).worker == "old"  # what it knows it does meanwhile
+    deadline = time.monotonic() + MAX_WAIT_SECONDS
     while (bench.folder / "old.log").read_text().count("leaves job") < len(many) + 2:
         assert time.monotonic() < deadline, bench.worker_logs()
         time.sleep(0.05)
-    bench.do(lambda connection: cancel_many(connection, many))
+    bench.run_query(lambda connection: cancel_many(connection, many))
     for job_id in (later, shaded):
         job = bench.job(job_id)
         assert (job.state, job.attempt, job.rescues) == ("queued", 0, 0)
         assert [event.kind for event in bench.events(job_id)] == ["state"]
     old.terminate()
-    assert old.wait(PATIENCE_SECONDS) == 0
+    assert old.wait(MAX_WAIT_SECONDS) == 0
     bench.worker(name="new", STALE_SECONDS="60", KIND_MODULES='["later_toy"]')
     for job_id in (later, shaded):
-        job = bench.over(job_id)
+        job = bench.wait_until_finished(job_id)
         assert (job.state, job.attempt, job.rescues, job.worker) == ("succeeded", 1, 0, "new")
 
 
-def test_versions_that_give_other_results_are_not_mixed(bench: Bench) -> None:
+def test_versions_that_give_other_results_are_not_mixed(bench: WorkerHarness) -> None:
     first = bench.worker(name="first")
-    job_id = bench.submit(options=bench.held())
+    job_id = bench.submit(options=bench.wait_until_held())
     bench.wait_at_gate(job_id)
     bench.worker(name="later", KIND_MODULES='["later_results"]')
     second = bench.worker(name="second")
     for name in ("later", "second"):
-        bench.up(name)
+        bench.wait_until_up(name)
     first.kill()
     bench.wait(job_id, lambda job: job.worker == "second")  # the one that can go on with it
     bench.wait(job_id, lambda _job: "the toy begins at 30" in bench.log(job_id))
     second.kill()
     bench.wait(job_id, lambda job: job.worker == "later")
     bench.open_gate()
-    assert bench.over(job_id).state == "succeeded"
+    assert bench.wait_until_finished(job_id).state == "succeeded"
     assert starts(bench, job_id) == [0] and "begins anew" in bench.log(job_id)
 
 
-def test_the_release_before_works_beside_this_one(
+def test_previous_release_works_beside_current(
     postgres: EmbeddedPostgres, previous: Path, tmp_path: Path
 ) -> None:
     """Jobs go to workers of the version that began them, else begin anew; the earlier front end answers."""
     with copied_database(postgres, "template0") as conninfo:
-        bench = Bench(conninfo, tmp_path, stale_seconds=STALE_SECONDS)
+        bench = WorkerHarness(conninfo, tmp_path, stale_seconds=STALE_SECONDS)
         environment = {**os.environ, "DATABASE_URL": conninfo, "PYTHONPATH": str(previous)}
         settings = {
             "DATA": str(tmp_path),
@@ -133,32 +133,32 @@ def test_the_release_before_works_beside_this_one(
             address = front.stdout.readline().decode().strip()  # its tables are there
             old = bench.worker(name="old", root=previous)
             gates = [str(tmp_path / f"gate-{number}") for number in range(3)]
-            begun = bench.submit(options=bench.held(gate=gates[0]))
+            begun = bench.submit(options=bench.wait_until_held(gate=gates[0]))
             bench.wait_at_gate(begun)
             bench.worker(name="old-too", root=previous)
-            stays = bench.submit(options=bench.held(gate=gates[1]))
+            stays = bench.submit(options=bench.wait_until_held(gate=gates[1]))
             bench.wait_at_gate(stays)
 
             migrate(conninfo)
             new = bench.worker(name="new")
-            bench.up("new")
+            bench.wait_until_up("new")
             old.kill()
             # Results of two versions are not mixed: it waits for the other old worker.
-            handed_back = bench.submit(options=bench.held(gate=gates[2]))
+            handed_back = bench.submit(options=bench.wait_until_held(gate=gates[2]))
             bench.wait_at_gate(handed_back)
             assert bench.job(handed_back).worker == "new"
             Path(gates[1]).touch()
-            assert bench.over(stays).worker == "old-too"
+            assert bench.wait_until_finished(stays).worker == "old-too"
             bench.wait(begun, lambda job: job.worker == "old-too")
             Path(gates[0]).touch()
-            assert bench.over(begun).state == "succeeded" and starts(bench, begun) == [0, 30]
+            assert bench.wait_until_finished(begun).state == "succeeded" and starts(bench, begun) == [0, 30]
             with urllib.request.urlopen(f"{address}/v1/jobs/{begun}", timeout=30) as answer:
                 assert b'"succeeded"' in answer.read()
 
             new.kill()
             bench.wait(handed_back, lambda job: job.worker == "old-too")
             Path(gates[2]).touch()
-            done = bench.over(handed_back)
+            done = bench.wait_until_finished(handed_back)
             assert (done.state, starts(bench, handed_back)) == ("succeeded", [0])
             assert "begins anew" in bench.log(handed_back)
         finally:

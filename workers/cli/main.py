@@ -16,7 +16,7 @@ import click
 
 from octasplat.engine import __version__
 from octasplat.engine.errors import OctasplatError
-from octasplat.workers.cli.signals import Stopped
+from octasplat.workers.cli.signals import StoppedError
 
 # Threads that wait for each other sleep instead of spinning: no slower alone, several times faster on a
 # shared machine. Must be set before OpenMP is loaded; an explicit setting wins.
@@ -75,7 +75,7 @@ def has_command(name: str) -> bool:
     return name in _COMMANDS
 
 
-class _Commands(click.Group):
+class _LazyGroup(click.Group):
     """A group that imports a command when it is called.
 
     Commands end with one sentence and an exit code, never with a traceback.
@@ -106,7 +106,7 @@ class _Commands(click.Group):
             return super().invoke(ctx)
         except (click.ClickException, click.exceptions.Exit, click.Abort):
             raise
-        except Stopped as error:
+        except StoppedError as error:
             click.echo(str(error), err=True)
             ctx.exit(error.exit_code)
         except OctasplatError as error:
@@ -129,7 +129,7 @@ def _fail(ctx: click.Context, message: str, exit_code: int) -> NoReturn:
 
 
 @click.group(
-    cls=_Commands, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100}
+    cls=_LazyGroup, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100}
 )
 @click.version_option(__version__, "--version", prog_name="octasplat")
 def cli() -> None:

@@ -6,12 +6,12 @@ from pathlib import Path
 
 from octasplat.engine.errors import ConfigError
 from octasplat.engine.operations import operation, operation_names
-from octasplat.engine.operations.patterns import expanded
+from octasplat.engine.operations.file_patterns import expand_patterns
 from octasplat.workers.client.submission import Derivation
-from octasplat.workers.store.names import NameRefused, check_name
+from octasplat.workers.storage.file_names import FileNameError, check_name
 
 
-def with_named_files(what: Derivation, given: Sequence[tuple[str, Path]]) -> Derivation:
+def with_named_files(derivation: Derivation, files_by_option: Sequence[tuple[str, Path]]) -> Derivation:
     """The same with files for options that name some, such as ``("meshes", Path("edited.ply"))``.
 
     An option that takes several gets all that are given for it, and patterns such as ``frames/*.ply`` stand
@@ -20,26 +20,26 @@ def with_named_files(what: Derivation, given: Sequence[tuple[str, Path]]) -> Der
     Raises:
         ConfigError: a file is not there, or several are given for an option that takes one.
     """
-    options, files = dict(what.options), dict(what.files)
-    for option in dict.fromkeys(name for name, _ in given):
-        paths = expanded([path for name, path in given if name == option])
-        names = [_sent_name(path, files) for path in paths]
-        if _takes_several(what.kind, option):
+    options, files = dict(derivation.options), dict(derivation.files)
+    for option in dict.fromkeys(name for name, _ in files_by_option):
+        paths = expand_patterns([path for name, path in files_by_option if name == option])
+        names = [_upload_name(path, files) for path in paths]
+        if _is_list_option(derivation.kind, option):
             options[option] = names
         elif len(names) == 1:
             options[option] = names[0]
         else:
             raise ConfigError(f"{option}: takes one file, and {len(names)} are given.")
-    return replace(what, options=options, files=files)
+    return replace(derivation, options=options, files=files)
 
 
-def _sent_name(path: Path, files: dict[str, Path]) -> str:
+def _upload_name(path: Path, files: dict[str, Path]) -> str:
     """A name for a file among those that are sent, which it is added to."""
     if not path.is_file():
         raise ConfigError(f"{path}: there is no such file.")
     try:
         name = check_name(path.name)
-    except NameRefused:
+    except FileNameError:
         name = check_name(f"file_{len(files)}{path.suffix.lower()}")
     if name in files:
         name = check_name(f"{len(files)}/{name}")
@@ -47,7 +47,7 @@ def _sent_name(path: Path, files: dict[str, Path]) -> str:
     return name
 
 
-def _takes_several(kind: str, option: str) -> bool:
+def _is_list_option(kind: str, option: str) -> bool:
     """Whether an option of a verb is a list; one of another kind is taken for one that is not."""
     if kind not in operation_names():
         return False

@@ -11,7 +11,7 @@ from octasplat.engine.threads import available_threads
 F = TypeVar("F", bound=Callable[..., Any])
 
 
-def _cap(_context: click.Context, _parameter: click.Parameter, value: int) -> int:
+def _cap_to_cores(_context: click.Context, _parameter: click.Parameter, value: int) -> int:
     return min(value, available_threads())
 
 
@@ -21,7 +21,7 @@ def threads_option(command: F) -> F:
         "--threads",
         type=click.IntRange(min=0),
         default=0,
-        callback=_cap,
+        callback=_cap_to_cores,
         metavar="N",
         help="Threads to use; 0 (the default) takes all cores.",
     )(command)
@@ -32,7 +32,7 @@ def quiet_option(command: F) -> F:
     return click.option("--quiet", "-q", is_flag=True, help="Show warnings and errors only.")(command)
 
 
-def export_names(text: str | None) -> tuple[str, ...] | None:
+def parse_export_names(text: str | None) -> tuple[str, ...] | None:
     """``mesh.glb,scene.spz`` as names of files; None where nothing was said.
 
     Raises:

@@ -21,13 +21,13 @@ from octasplat.engine.events import (
     Warned,
 )
 from octasplat.engine.stages import DOING
-from octasplat.workers.telling.lines import PlainLines, StageState
-from octasplat.workers.telling.wording import training_state
+from octasplat.workers.reporting.event_lines import EventLines, ProgressState
+from octasplat.workers.reporting.wording import format_training_state
 
-_STOPPING = "Stopping at the next safe point; press Ctrl-C again to stop at once."
+_STOPPING_TEXT = "Stopping at the next safe point; press Ctrl-C again to stop at once."
 
 
-class _Bars(Progress):
+class _ProgressWithDetail(Progress):
     """A bar, and under it a line of details."""
 
     def __init__(self, console: Console, should_stop: Callable[[], bool]) -> None:
@@ -46,53 +46,53 @@ class _Bars(Progress):
         """The bars of the running stage and the details."""
         yield self.make_tasks_table(self.tasks)
         if self._should_stop():
-            yield Text(_STOPPING, style="yellow")
+            yield Text(_STOPPING_TEXT, style="yellow")
         elif self.detail:
             yield Text(f"{'':11}{self.detail}", style="dim")
 
 
-class Bars:
+class ProgressBars:
     """Shows a bar for the running stage; finished stages leave one line each."""
 
     def __init__(self, console: Console, should_stop: Callable[[], bool]) -> None:
         self._console = console
-        self._state = StageState()
+        self._state = ProgressState()
         self._task: TaskID | None = None
-        self.bars = _Bars(console, should_stop)
+        self.bars = _ProgressWithDetail(console, should_stop)
 
     def __call__(self, event: Event) -> None:
         """Show ``event``."""
         self._state.update(event)
         if isinstance(event, StageStarted):
-            self._begin(event)
+            self._start_task(event)
         elif isinstance(event, StageProgress):
             left = self._state.seconds_left
-            self._move(
+            self._advance(
                 event.step, event.total_steps, "" if left is None else f"{clock(left)} left", event.part
             )
         elif isinstance(event, TrainingProgress):
-            self.bars.detail = training_state(event, self._state.held_out)
-            self._move(event.iteration, event.total_iterations, f"{clock(event.seconds_left)} left")
+            self.bars.detail = format_training_state(event, self._state.held_out)
+            self._advance(event.iteration, event.total_iterations, f"{clock(event.seconds_left)} left")
         elif isinstance(event, StageFinished):
-            self._end()
-            self._print(self._state.finished(event))
+            self._end_task()
+            self._print(self._state.finished_line(event))
         elif isinstance(event, Warned):
             self._print(f"Warning: {event.message}", style="yellow")
         elif isinstance(event, Noted):
             self._print(event.message, style="dim")
 
-    def _begin(self, event: StageStarted) -> None:
-        self._end()
+    def _start_task(self, event: StageStarted) -> None:
+        self._end_task()
         self._task = self.bars.add_task(
             DOING.get(event.stage, event.stage), total=event.total_steps or None, count="", left=""
         )
 
-    def _move(self, step: int, total: int, left: str = "", part: float = 0.0) -> None:
+    def _advance(self, step: int, total: int, time_left: str = "", step_fraction: float = 0.0) -> None:
         if self._task is not None:
-            done, count = step + part, f"{step}/{total}"
-            self.bars.update(self._task, completed=done, total=total, count=count, left=left)
+            done, count = step + step_fraction, f"{step}/{total}"
+            self.bars.update(self._task, completed=done, total=total, count=count, left=time_left)
 
-    def _end(self) -> None:
+    def _end_task(self) -> None:
         self.bars.detail = ""
         if self._task is not None:
             self.bars.remove_task(self._task)
@@ -114,21 +114,21 @@ def show_progress(
         should_stop: whether the user asked to stop, which the bar then acknowledges.
     """
     if quiet:
-        yield PlainLines(lambda _line: None, warn=_complain)
+        yield EventLines(lambda _line: None, warn=_write_error_line)
         return
     console = Console(file=sys.stdout)
     if not sys.stdout.isatty() or console.is_dumb_terminal:
-        yield PlainLines(_echo, warn=_complain, note=_complain)
+        yield EventLines(_write_line, warn=_write_error_line, note=_write_error_line)
         return
-    display = Bars(console, should_stop)
+    display = ProgressBars(console, should_stop)
     with display.bars:
         yield display
 
 
-def _echo(line: str) -> None:
+def _write_line(line: str) -> None:
     click.echo(line)
     sys.stdout.flush()
 
 
-def _complain(line: str) -> None:
+def _write_error_line(line: str) -> None:
     click.echo(line, err=True)

@@ -5,33 +5,33 @@ import click
 from octasplat.engine.errors import ExportFailed, NoSpaceLeft
 from octasplat.engine.operations.reconstruct import OPERATION, ReconstructRequest, run_config
 from octasplat.workers.cli.request_options import run_operation
-from octasplat.workers.cli.signals import Stopped
+from octasplat.workers.cli.signals import StoppedError
 
 
 def run_reconstruction(
-    request: ReconstructRequest, *, threads: int, quiet: bool, resumes_by_itself: bool = False
+    request: ReconstructRequest, *, threads: int, quiet: bool, resumes_automatically: bool = False
 ) -> None:
     """Reconstruct, show the progress, and at the end what was reached.
 
-    With ``resumes_by_itself`` a user who stops is not told of ``--resume``, which the command does not have.
+    With ``resumes_automatically`` a user who stops is not told of ``--resume``, which the command does not have.
 
     Raises:
         Stopped: by SIGINT or SIGTERM, after a checkpoint.
         ExportFailed: some files could not be written; what there is was shown.
-        OctasplatError: as :func:`octasplat.engine.pipeline.reconstruct` does.
+        OctasplatError: as :func:`octasplat.engine.pipeline.reconstruction` does.
     """
     import octasplat.engine.pipeline  # noqa: F401 - pycolmap takes SIGTERM when imported, so before we do
     from octasplat.engine.evaluate.summary import run_summary
 
     output = request.output
     try:
-        run_operation(OPERATION, request, quiet=quiet, threads=threads, stops=True)
-    except Stopped as error:
-        if resumes_by_itself:
-            raise Stopped("Stopped; the same command goes on.", error.exit_code) from None
+        run_operation(OPERATION, request, quiet=quiet, threads=threads, is_stoppable=True)
+    except StoppedError as error:
+        if resumes_automatically:
+            raise StoppedError("Stopped; the same command goes on.", error.exit_code) from None
         raise
     except NoSpaceLeft as error:
-        how = "" if resumes_by_itself else " with --resume"
+        how = "" if resumes_automatically else " with --resume"
         raise NoSpaceLeft(f"{error} Then the same command{how} goes on.") from error
     except ExportFailed as error:
         written = [name for name in run_config(request).exports if (output / name).exists()]

@@ -15,23 +15,23 @@ from pydantic_core import PydanticUndefined
 from octasplat.engine.errors import Cancelled
 from octasplat.engine.fields import Positional, Spelling, is_negatable
 from octasplat.engine.operations.base import (
-    ContradictoryRequest,
+    ContradictoryRequestError,
     Operation,
     Result,
-    build,
-    never,
+    build_request,
+    never_stop,
 )
 from octasplat.engine.operations.written_files import remember_written
 from octasplat.engine.renamed_settings import former_names, tell_renamed
 from octasplat.workers.cli.options import quiet_option, threads_option
 from octasplat.workers.cli.progress import show_progress
-from octasplat.workers.cli.signals import Stopped, orderly_termination, stop_on_signals
+from octasplat.workers.cli.signals import StoppedError, exit_on_sigterm, request_stop_on_signals
 
 Command = Callable[..., Any]
 ResultT = TypeVar("ResultT", bound=Result)
 
 
-def request_options(model: type[BaseModel], *, leave_out: Sequence[str] = ()) -> Callable[[Command], Command]:
+def request_options(model: type[BaseModel], *, exclude: Sequence[str] = ()) -> Callable[[Command], Command]:
     """Return a decorator that gives a command the options of a request.
 
     The command is called with one keyword argument for each field; what the user did not give is None. What
@@ -39,13 +39,13 @@ def request_options(model: type[BaseModel], *, leave_out: Sequence[str] = ()) ->
 
     Args:
         model: class of the request.
-        leave_out: fields that the command spells in another way.
+        exclude: fields that the command spells in another way.
     """
     listed = sorted(model.model_fields.items(), key=lambda field: not field[1].is_required())
-    fields = {name: info for name, info in listed if name not in leave_out}
+    fields = {name: info for name, info in listed if name not in exclude}
     values = former_names(model).values
     decorators = [
-        _decorator(name, info, former_values=values.get(name))
+        _option_decorator(name, info, former_values=values.get(name))
         for name, info in fields.items()
         if not _spelling(info).hidden
     ]
@@ -62,7 +62,7 @@ def request_options(model: type[BaseModel], *, leave_out: Sequence[str] = ()) ->
 def operation_command(
     operation: Operation[Any, Any],
     *,
-    stops: bool = False,
+    is_stoppable: bool = False,
     threads: bool = False,
     cls: type[click.Command] = click.Command,
 ) -> click.Command:
@@ -70,14 +70,14 @@ def operation_command(
 
     Args:
         operation: the verb.
-        stops: whether the operation asks ``should_stop``; else a signal ends it where it is.
+        is_stoppable: whether the operation asks ``should_stop``; else a signal ends it where it is.
         threads: whether the command has ``--threads``.
         cls: class of the command.
     """
 
     def run(quiet: bool, threads: int = 0, **given: Any) -> None:
-        request = request_of(operation.request, given)
-        run_operation(operation, request, quiet=quiet, threads=threads, stops=stops)
+        request = request_from_options(operation.request, given)
+        run_operation(operation, request, quiet=quiet, threads=threads, is_stoppable=is_stoppable)
 
     command: Command = run
     command = quiet_option(command)
@@ -90,7 +90,7 @@ def operation_command(
     return made
 
 
-def request_of(model: type[Any], given: dict[str, Any]) -> Any:
+def request_from_options(model: type[Any], given_values: dict[str, Any]) -> Any:
     """Return the request with what the user gave; what was not given keeps its default.
 
     Raises:
@@ -99,17 +99,22 @@ def request_of(model: type[Any], given: dict[str, Any]) -> Any:
     """
     values = {
         name: value
-        for name, value in _by_new_flags(model, given).items()
-        if value is not None and not (value == () and _is_repeated(model.model_fields[name]))
+        for name, value in _by_new_flags(model, given_values).items()
+        if value is not None and not (value == () and _may_repeat(model.model_fields[name]))
     }
     try:
-        return build(model, values, functools.partial(option_name, model))
-    except ContradictoryRequest as error:
+        return build_request(model, values, functools.partial(option_name, model))
+    except ContradictoryRequestError as error:
         raise click.UsageError(str(error)) from None
 
 
 def run_operation(
-    operation: Operation[Any, ResultT], request: Any, *, quiet: bool, threads: int = 0, stops: bool = False
+    operation: Operation[Any, ResultT],
+    request: Any,
+    *,
+    quiet: bool,
+    threads: int = 0,
+    is_stoppable: bool = False,
 ) -> ResultT:
     """Do a request with its progress shown, print what came of it, and return it.
 
@@ -117,18 +122,18 @@ def run_operation(
         OctasplatError: as the operation does.
         Stopped: a signal asked to stop.
     """
-    if stops:
-        with stop_on_signals() as should_stop:
+    if is_stoppable:
+        with request_stop_on_signals() as should_stop:
             try:
                 with show_progress(quiet=quiet, should_stop=should_stop) as progress:
                     result = operation.run(
                         request, progress=progress, should_stop=should_stop, threads=threads
                     )
             except Cancelled as error:
-                raise Stopped(str(error), should_stop.exit_code) from None
+                raise StoppedError(str(error), should_stop.exit_code) from None
     else:
-        with orderly_termination(), show_progress(quiet=quiet) as progress:
-            result = operation.run(request, progress=progress, should_stop=never, threads=threads)
+        with exit_on_sigterm(), show_progress(quiet=quiet) as progress:
+            result = operation.run(request, progress=progress, should_stop=never_stop, threads=threads)
     remember_written(operation.name, result.files)
     if not quiet:
         for line in result.lines():
@@ -142,10 +147,10 @@ def option_name(model: type[BaseModel], path: str) -> str:
     info = model.model_fields.get(name)
     if info is None:
         return path
-    if (place := _mark(info, Positional)) is not None:
+    if (place := _find_mark(info, Positional)) is not None:
         return place.metavar
     part = rest.partition(".")[0]
-    flag = _flags(name, info)[-1].partition("/")[0]
+    flag = _option_flags(name, info)[-1].partition("/")[0]
     return f"{flag} {part}" if part and not part.isdigit() else flag
 
 
@@ -153,7 +158,7 @@ def _former_flags(model: type[BaseModel], fields: Mapping[str, FieldInfo]) -> di
     """Return the field of each flag that the last version had, of those fields that have an option."""
     names = former_names(model)
     spelt = {f"--{old.replace('_', '-')}": new for old, new in names.fields.items()} | dict(names.flags)
-    taken = {flag for name, info in fields.items() for flag in _flags(name, info)}
+    taken = {flag for name, info in fields.items() for flag in _option_flags(name, info)}
     return {
         flag: name
         for flag, name in spelt.items()
@@ -163,7 +168,7 @@ def _former_flags(model: type[BaseModel], fields: Mapping[str, FieldInfo]) -> di
 
 def _former_option(flag: str, info: FieldInfo) -> Callable[[Command], Command]:
     """Return the decorator of a hidden option: the field's by its former flag."""
-    return _decorator(_former_parameter(flag), info, (flag,), hidden=True)
+    return _option_decorator(_former_parameter(flag), info, (flag,), hidden=True)
 
 
 def _former_parameter(flag: str) -> str:
@@ -183,7 +188,7 @@ def _by_new_flags(model: type[BaseModel], given: Mapping[str, Any]) -> dict[str,
     return values
 
 
-def _decorator(
+def _option_decorator(
     name: str,
     info: FieldInfo,
     former: tuple[str, ...] = (),
@@ -200,8 +205,8 @@ def _decorator(
         hidden: whether the help leaves the option out, which need not be given then.
         former_values: values that the last version had, which are taken, too.
     """
-    inner, optional = _without_none(info.annotation)
-    if (place := _mark(info, Positional)) is not None:
+    inner, optional = _strip_optional(info.annotation)
+    if (place := _find_mark(info, Positional)) is not None:
         many = _is_sequence(inner)
         return (
             click.argument(
@@ -209,23 +214,23 @@ def _decorator(
                 metavar=f"{place.metavar}...",
                 nargs=-1,
                 required=info.is_required(),
-                type=_type(get_args(inner)[0], None),
+                type=_click_type(get_args(inner)[0], None),
             )
             if many
             else click.argument(
-                name, metavar=place.metavar, required=info.is_required(), type=_type(inner, info)
+                name, metavar=place.metavar, required=info.is_required(), type=_click_type(inner, info)
             )
         )
     spelling = _spelling(info)
     settings: dict[str, Any] = {
-        "help": _help(info, optional),
+        "help": _help_text(info, optional),
         "required": info.is_required() and not hidden,
         "metavar": spelling.metavar or _metavar(inner),
         "default": None,
         "hidden": hidden,
     }
-    flags = former or _flags(name, info)
-    if _reads_text(info):
+    flags = former or _option_flags(name, info)
+    if _is_parsed_from_text(info):
         if spelling.repeated:
             return click.option(*flags, name, multiple=True, **settings)
         return click.option(*flags, name, type=str, **settings)
@@ -235,40 +240,40 @@ def _decorator(
         item = get_args(inner)[0]
         settings["multiple"] = True
         if get_origin(item) is tuple:
-            return click.option(*flags, name, type=tuple(map(_plain_type, get_args(item))), **settings)
-        return click.option(*flags, name, type=_type(item, None), **settings)
+            return click.option(*flags, name, type=tuple(map(_click_type_of, get_args(item))), **settings)
+        return click.option(*flags, name, type=_click_type(item, None), **settings)
     if get_origin(inner) is tuple:
         parts = get_args(inner)
         if len(set(parts)) == 1:
-            return click.option(*flags, name, nargs=len(parts), type=_type(parts[0], None), **settings)
-        return click.option(*flags, name, type=tuple(map(_plain_type, parts)), **settings)
-    kind = _type(inner, info)
-    if former_values and isinstance(kind, _Choice):
+            return click.option(*flags, name, nargs=len(parts), type=_click_type(parts[0], None), **settings)
+        return click.option(*flags, name, type=tuple(map(_click_type_of, parts)), **settings)
+    kind = _click_type(inner, info)
+    if former_values and isinstance(kind, _ValueChoice):
         kind.also_take(former_values)
     return click.option(*flags, name, type=kind, **settings)
 
 
-def _reads_text(info: FieldInfo) -> bool:
+def _is_parsed_from_text(info: FieldInfo) -> bool:
     return any(isinstance(mark, BeforeValidator) for mark in info.metadata)
 
 
-def _is_repeated(info: FieldInfo) -> bool:
+def _may_repeat(info: FieldInfo) -> bool:
     """Whether the option may be given several times, so that none at all is an empty tuple."""
     return _spelling(info).repeated or (
-        not _reads_text(info) and _is_sequence(_without_none(info.annotation)[0])
+        not _is_parsed_from_text(info) and _is_sequence(_strip_optional(info.annotation)[0])
     )
 
 
-def _flags(name: str, info: FieldInfo) -> tuple[str, ...]:
+def _option_flags(name: str, info: FieldInfo) -> tuple[str, ...]:
     if flags := _spelling(info).flags:
         return flags
     flag = "--" + name.replace("_", "-")
-    inner, _ = _without_none(info.annotation)
+    inner, _ = _strip_optional(info.annotation)
     has_opposite = inner is bool and (info.default is True or is_negatable(info))
     return (f"{flag}/--no-{name.replace('_', '-')}" if has_opposite else flag,)
 
 
-def _help(info: FieldInfo, optional: bool) -> str:
+def _help_text(info: FieldInfo, optional: bool) -> str:
     text = info.description or ""
     default = info.default
     shown = default not in (None, PydanticUndefined, ()) and not isinstance(default, bool | BaseModel)
@@ -285,14 +290,14 @@ def _metavar(annotation: Any) -> str | None:
     return None
 
 
-def _without_none(annotation: Any) -> tuple[Any, bool]:
+def _strip_optional(annotation: Any) -> tuple[Any, bool]:
     """The annotation without None and marks, and whether None was in it."""
     if get_origin(annotation) is Annotated:
-        return _without_none(get_args(annotation)[0])
+        return _strip_optional(get_args(annotation)[0])
     if get_origin(annotation) in (Union, types.UnionType):
         parts = [part for part in get_args(annotation) if part is not type(None)]
         if len(parts) == 1:
-            inner, _ = _without_none(parts[0])
+            inner, _ = _strip_optional(parts[0])
             return inner, True
     return annotation, False
 
@@ -301,7 +306,7 @@ def _is_sequence(annotation: Any) -> bool:
     return get_origin(annotation) is tuple and get_args(annotation)[-1] is Ellipsis
 
 
-class _Choice(click.Choice[Any]):
+class _ValueChoice(click.Choice[Any]):
     """One of several values, which need not be texts."""
 
     def __init__(self, values: Sequence[Any]) -> None:
@@ -320,35 +325,35 @@ class _Choice(click.Choice[Any]):
         return self._values[super().convert(str(value), param, ctx)]
 
 
-def _type(annotation: Any, info: FieldInfo | None) -> Any:
+def _click_type(annotation: Any, info: FieldInfo | None) -> Any:
     marks: list[Any] = list(info.metadata) if info is not None else []
     while get_origin(annotation) is Annotated:
         annotation, *more = get_args(annotation)
         marks += more
-    if values := _literals(annotation):
-        return _Choice(values)
+    if values := _literal_values(annotation):
+        return _ValueChoice(values)
     if annotation is Path:
         return click.Path(path_type=Path)
     if annotation in (int, float):
-        return _range(annotation, marks)
+        return _number_range(annotation, marks)
     return annotation if annotation in (str, bool) else str
 
 
-def _literals(annotation: Any) -> tuple[Any, ...]:
+def _literal_values(annotation: Any) -> tuple[Any, ...]:
     """The values of a literal type, or of a union of such; none where it is something else."""
     if get_origin(annotation) is Literal:
         return get_args(annotation)
     if get_origin(annotation) in (Union, types.UnionType):
-        parts = [_literals(part) for part in get_args(annotation) if part is not type(None)]
+        parts = [_literal_values(part) for part in get_args(annotation) if part is not type(None)]
         return tuple(value for part in parts for value in part) if all(parts) else ()
     return ()
 
 
-def _plain_type(annotation: Any) -> Any:
-    return _type(annotation, None)
+def _click_type_of(annotation: Any) -> Any:
+    return _click_type(annotation, None)
 
 
-def _range(kind: type, marks: Sequence[Any]) -> Any:
+def _number_range(kind: type, marks: Sequence[Any]) -> Any:
     low: Any = None
     high: Any = None
     low_open = high_open = False
@@ -370,8 +375,8 @@ def _range(kind: type, marks: Sequence[Any]) -> Any:
 
 
 def _spelling(info: FieldInfo) -> Spelling:
-    return _mark(info, Spelling) or Spelling()
+    return _find_mark(info, Spelling) or Spelling()
 
 
-def _mark(info: FieldInfo, kind: type[Any]) -> Any:
+def _find_mark(info: FieldInfo, kind: type[Any]) -> Any:
     return next((mark for mark in info.metadata if isinstance(mark, kind)), None)

@@ -12,7 +12,7 @@ SIGNALS = (signal.SIGINT, signal.SIGTERM)
 _SHOW_CURSOR = b"\x1b[?25h"
 
 
-class Stopped(Exception):
+class StoppedError(Exception):
     """The user stopped the command; the text is what to tell, ``exit_code`` what to return."""
 
     def __init__(self, message: str, exit_code: int) -> None:
@@ -37,10 +37,10 @@ class StopFlag:
 
 
 @contextmanager
-def stop_on_signals() -> Iterator[StopFlag]:
+def request_stop_on_signals() -> Iterator[StopFlag]:
     """Inside the block, a first SIGINT or SIGTERM only sets the flag; a second one kills at once.
 
-    To be entered after all imports, as :func:`orderly_termination`. Outside of the main thread,
+    To be entered after all imports, as :func:`exit_on_sigterm`. Outside of the main thread,
     where Python allows no handlers, the flag just stays unset.
     """
     flag = StopFlag()
@@ -66,7 +66,7 @@ def stop_on_signals() -> Iterator[StopFlag]:
 
 
 @contextmanager
-def orderly_termination() -> Iterator[None]:
+def exit_on_sigterm() -> Iterator[None]:
     """Inside the block, SIGTERM unwinds the program (exit code 143), so that unfinished files are removed.
 
     To be entered after all imports: pycolmap takes SIGTERM for itself, to print a stack trace.

@@ -8,7 +8,7 @@ from typing import Any
 from octasplat.engine.operations.base import Operation
 from octasplat.engine.operations.registry import operations
 from octasplat.workers.cli.main import has_command
-from octasplat.workers.work.kinds import job_kinds
+from octasplat.workers.worker.job_kinds import job_kinds
 
 _PAGE = """# Verbs
 

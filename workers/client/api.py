@@ -10,15 +10,15 @@ from typing import Any, Self
 import httpx
 
 from octasplat.engine.errors import OctasplatError
-from octasplat.workers.client.patience import AWAY_SECONDS, STRANGER_SECONDS, Patience
+from octasplat.workers.client.backoff import MAX_FIRST_OUTAGE_SECONDS, MAX_OUTAGE_SECONDS, Backoff
 from octasplat.workers.data_folder import ADDRESS_FILE, TOKEN_FILE, default_data_folder
 
 DEFAULT_ADDRESS = "http://127.0.0.1:8642"
-SERVER, TOKEN, DATA = "OCTASPLAT_SERVER", "OCTASPLAT_TOKEN", "OCTASPLAT_DATA"
-BUSY = frozenset({408, 429})
-AWAY = frozenset({502, 503, 504})
+SERVER_VARIABLE, TOKEN_VARIABLE, DATA_VARIABLE = "OCTASPLAT_SERVER", "OCTASPLAT_TOKEN", "OCTASPLAT_DATA"
+BUSY_STATUSES = frozenset({408, 429})
+UNAVAILABLE_STATUSES = frozenset({502, 503, 504})
 """A proxy answers so for a service that is away, and the service itself while it stops."""
-PROBLEM = "application/problem+json"
+PROBLEM_MEDIA_TYPE = "application/problem+json"
 _TIMEOUT = httpx.Timeout(60.0, connect=10.0)
 
 
@@ -31,14 +31,14 @@ class ServiceError(OctasplatError):
         self.errors = errors
 
 
-class Unreachable(OctasplatError):
+class ServiceUnreachableError(OctasplatError):
     """The service does not answer, or a proxy in front of it says so."""
 
 
 def find_address(environment: Mapping[str, str], data: Path | None = None) -> str:
     """Where the service is: as the environment says, or where ``octasplat serve`` of this machine is."""
-    if environment.get(SERVER):
-        return environment[SERVER].rstrip("/")
+    if environment.get(SERVER_VARIABLE):
+        return environment[SERVER_VARIABLE].rstrip("/")
     return _local_address(data or _data_folder(environment)) or DEFAULT_ADDRESS
 
 
@@ -47,8 +47,8 @@ def find_token(environment: Mapping[str, str], address: str, data: Path | None =
 
     The latter is for that service alone; no other address is ever sent it.
     """
-    if environment.get(TOKEN):
-        return environment[TOKEN]
+    if environment.get(TOKEN_VARIABLE):
+        return environment[TOKEN_VARIABLE]
     folder = data or _data_folder(environment)
     if _local_address(folder) != address.rstrip("/"):
         return None
@@ -59,7 +59,7 @@ def find_token(environment: Mapping[str, str], address: str, data: Path | None =
 
 
 def _data_folder(environment: Mapping[str, str]) -> Path:
-    return Path(environment.get(DATA) or default_data_folder())
+    return Path(environment.get(DATA_VARIABLE) or default_data_folder())
 
 
 def _local_address(folder: Path) -> str | None:
@@ -129,31 +129,31 @@ class Api:
             ServiceError: it was refused.
             Unreachable: nobody answers.
         """
-        patience = self.patience()
+        patience = self.new_backoff()
         while True:
             try:
                 response = self._http.request(method, path, **arguments)
             except httpx.TransportError as error:
                 if not patience.wait():
-                    raise self.unreachable(error) from None
+                    raise self.unreachable_error(error) from None
                 continue
-            if response.status_code not in BUSY | AWAY:
+            if response.status_code not in BUSY_STATUSES | UNAVAILABLE_STATUSES:
                 self._has_answered = True
-                return self._checked(response)
-            self._has_answered = self._has_answered or _is_ours(response)
-            patience.seconds = self.patience().seconds
+                return self._raise_for_status(response)
+            self._has_answered = self._has_answered or _is_from_service(response)
+            patience.seconds = self.new_backoff().seconds
             if not patience.wait(_retry_after(response)):
-                return self._checked(response)
+                return self._raise_for_status(response)
 
-    def patience(self) -> Patience:
+    def new_backoff(self) -> Backoff:
         """For how long the service may be away now."""
-        return Patience(AWAY_SECONDS if self._has_answered else STRANGER_SECONDS)
+        return Backoff(MAX_OUTAGE_SECONDS if self._has_answered else MAX_FIRST_OUTAGE_SECONDS)
 
     def stream(self, method: str, path: str, **arguments: Any) -> Any:
-        """A streamed answer, as a context; the caller checks it with :meth:`check_stream`."""
+        """A streamed answer, as a context; the caller checks it with :meth:`raise_for_stream_status`."""
         return self._http.stream(method, path, **arguments)
 
-    def pages(self, path: str, name: str, **query: Any) -> Iterator[dict[str, Any]]:
+    def iterate_pages(self, path: str, name: str, **query: Any) -> Iterator[dict[str, Any]]:
         """All entries of a list that comes in parts."""
         cursor: str | None = None
         while True:
@@ -163,7 +163,7 @@ class Api:
             if cursor is None:
                 return
 
-    def check_stream(self, response: httpx.Response) -> None:
+    def raise_for_stream_status(self, response: httpx.Response) -> None:
         """Raise unless a streamed answer is good.
 
         Raises:
@@ -172,29 +172,29 @@ class Api:
         """
         if not response.is_success:
             response.read()
-            self._checked(response)
+            self._raise_for_status(response)
         self._has_answered = True
 
-    def unreachable(self, error: Exception | str) -> Unreachable:
+    def unreachable_error(self, error: Exception | str) -> ServiceUnreachableError:
         """What to tell when nobody answers."""
         reason = str(error) or type(error).__name__
-        return Unreachable(
+        return ServiceUnreachableError(
             f"No service answers at {self.address} ({reason}); start one with octasplat serve, or "
-            f"set {SERVER}."
+            f"set {SERVER_VARIABLE}."
         )
 
-    def _checked(self, response: httpx.Response) -> httpx.Response:
+    def _raise_for_status(self, response: httpx.Response) -> httpx.Response:
         """The answer itself, if it is good."""
         if response.is_success:
             return response
-        if response.status_code in AWAY and not _is_ours(response):
-            raise self.unreachable(f"a proxy answers {response.status_code}")
-        raise _refusal(response)
+        if response.status_code in UNAVAILABLE_STATUSES and not _is_from_service(response):
+            raise self.unreachable_error(f"a proxy answers {response.status_code}")
+        raise _service_error(response)
 
 
-def _is_ours(response: httpx.Response) -> bool:
+def _is_from_service(response: httpx.Response) -> bool:
     """Whether an answer comes from the service itself, and not from a proxy in front of it."""
-    return response.is_success or response.headers.get("content-type", "").startswith(PROBLEM)
+    return response.is_success or response.headers.get("content-type", "").startswith(PROBLEM_MEDIA_TYPE)
 
 
 def _json(response: httpx.Response) -> Any:
@@ -204,16 +204,16 @@ def _json(response: httpx.Response) -> Any:
         kind = response.headers.get("content-type", "nothing known")
         raise ServiceError(
             f"{response.request.url} answered with {kind} in the place of JSON, so it is no octasplat "
-            f"service; check {SERVER} and the proxies on the way.",
+            f"service; check {SERVER_VARIABLE} and the proxies on the way.",
             response.status_code,
         ) from None
 
 
-def _refusal(response: httpx.Response) -> ServiceError:
+def _service_error(response: httpx.Response) -> ServiceError:
     """What the service, or whoever answered for it, refuses."""
     if response.is_redirect:
         return ServiceError(
-            f"{response.request.url} is redirected to {response.headers['location']}; set {SERVER} to the "
+            f"{response.request.url} is redirected to {response.headers['location']}; set {SERVER_VARIABLE} to the "
             "address of the service itself.",
             response.status_code,
         )
@@ -222,16 +222,16 @@ def _refusal(response: httpx.Response) -> ServiceError:
         detail, errors = str(problem["detail"]), tuple(problem.get("errors") or ())
     except (ValueError, KeyError, TypeError):
         detail, errors = f"The service answered {response.status_code} to {response.request.url}.", ()
-    further = [_named(e) for e in errors if e.get("detail") and str(e["detail"]) != detail]
+    further = [_error_text(e) for e in errors if e.get("detail") and str(e["detail"]) != detail]
     if further:
         more = f" and {len(further) - 5} more" if len(further) > 5 else ""
         detail = f"{detail} {' '.join(further[:5])}{more}"
     if response.status_code == 401:
-        detail = f"{detail.split(':')[0]}: set {TOKEN}."
+        detail = f"{detail.split(':')[0]}: set {TOKEN_VARIABLE}."
     return ServiceError(detail, response.status_code, errors)
 
 
-def _named(error: Mapping[str, Any]) -> str:
+def _error_text(error: Mapping[str, Any]) -> str:
     """What is wrong, with the option that it is about."""
     detail = str(error["detail"])
     option = str(error.get("pointer", "")).partition("#/options/")[2].replace("/", ".")

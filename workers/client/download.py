@@ -9,10 +9,16 @@ from typing import Any
 import httpx
 
 from octasplat.engine.errors import OutputError
-from octasplat.workers.client.api import AWAY, BUSY, Api, ServiceError, Unreachable
-from octasplat.workers.store.names import NameSet
+from octasplat.workers.client.api import (
+    BUSY_STATUSES,
+    UNAVAILABLE_STATUSES,
+    Api,
+    ServiceError,
+    ServiceUnreachableError,
+)
+from octasplat.workers.storage.file_names import NameSet
 
-MAX_DAMAGED = 3
+MAX_DAMAGED_DOWNLOADS = 3
 """So often a file is fetched anew whose content is not what it should be."""
 
 
@@ -61,7 +67,7 @@ def download_results(
 
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            _save(api, job_id, artifact, path, tell)
+            _download_file(api, job_id, artifact, path, tell)
         except OSError as error:
             raise OutputError(f"{path} cannot be written ({error.strerror or error}).") from None
         done += artifact["size_bytes"]
@@ -70,23 +76,27 @@ def download_results(
     return paths
 
 
-def _save(api: Api, job_id: str, artifact: dict[str, Any], path: Path, tell: Callable[[int], None]) -> None:
+def _download_file(
+    api: Api, job_id: str, artifact: dict[str, Any], path: Path, on_bytes: Callable[[int], None]
+) -> None:
     if path.is_file() and _sha256(path) == artifact["sha256"]:
         return
     partial = path.with_name(f".{artifact['sha256'][:24]}.partial")  # short, as the name may be very long
     address = f"/v1/jobs/{job_id}/artifacts/{urllib.parse.quote(artifact['name'])}"
-    patience, damaged = api.patience(), 0
-    while damaged < MAX_DAMAGED:
+    patience, damaged = api.new_backoff(), 0
+    while damaged < MAX_DAMAGED_DOWNLOADS:
         before = _size(partial)
         try:
-            _go_on(api, address, artifact, partial, tell)
-        except (httpx.TransportError, Unreachable, ServiceError) as error:
-            if isinstance(error, ServiceError) and error.status not in BUSY | AWAY:
+            _resume_download(api, address, artifact, partial, on_bytes)
+        except (httpx.TransportError, ServiceUnreachableError, ServiceError) as error:
+            if isinstance(error, ServiceError) and error.status not in BUSY_STATUSES | UNAVAILABLE_STATUSES:
                 raise
             if _size(partial) > before:
-                patience.renew()
+                patience.reset()
             if not patience.wait():
-                raise (api.unreachable(error) if isinstance(error, httpx.TransportError) else error) from None
+                raise (
+                    api.unreachable_error(error) if isinstance(error, httpx.TransportError) else error
+                ) from None
             continue
         if _sha256(partial) == artifact["sha256"]:
             partial.replace(path)
@@ -96,8 +106,8 @@ def _save(api: Api, job_id: str, artifact: dict[str, Any], path: Path, tell: Cal
     raise OutputError(f"{path} came damaged {damaged} times; the store of the service needs to be looked at.")
 
 
-def _go_on(
-    api: Api, address: str, artifact: dict[str, Any], partial: Path, tell: Callable[[int], None]
+def _resume_download(
+    api: Api, address: str, artifact: dict[str, Any], partial: Path, on_bytes: Callable[[int], None]
 ) -> None:
     begin = _size(partial)
     if begin >= artifact["size_bytes"]:
@@ -107,12 +117,12 @@ def _go_on(
     if begin:
         headers |= {"Range": f"bytes={begin}-", "If-Range": f'"{artifact["sha256"]}"'}
     with api.stream("GET", address, headers=headers) as response:
-        api.check_stream(response)
+        api.raise_for_stream_status(response)
         goes_on = response.status_code == 206
         with partial.open("ab" if goes_on else "wb") as handle:
             for piece in response.iter_bytes():
                 handle.write(piece)
-                tell(handle.tell())
+                on_bytes(handle.tell())
 
 
 def _size(path: Path) -> int:

@@ -8,19 +8,19 @@ from typing import Any
 
 from octasplat.engine.errors import ConfigError, OctasplatError
 from octasplat.engine.events import Listener, Warned, ignore
-from octasplat.engine.light.companions import companions
-from octasplat.engine.light.stage_file import named_files, read_stage, with_files
 from octasplat.engine.nested_options import merged
+from octasplat.engine.pathtracing.stage.sidecar_files import sidecar_files
+from octasplat.engine.pathtracing.stage.stage_file import read_stage, referenced_files, with_renamed_files
 from octasplat.engine.render.path_document import read_path_document
 from octasplat.engine.stages import counted_stage
 from octasplat.workers.client.api import Api
 from octasplat.workers.client.download import download_results
 from octasplat.workers.client.upload import upload_files, upload_scene
 from octasplat.workers.client.watch import watch_job
-from octasplat.workers.store.names import NameRefused, check_name
+from octasplat.workers.storage.file_names import FileNameError, check_name
 
 
-class JobFailed(OctasplatError):
+class JobFailedError(OctasplatError):
     """The job ended without a result."""
 
 
@@ -43,23 +43,23 @@ class Submission:
     priority: int = 0
 
 
-def submit(api: Api, what: Submission, listener: Listener = ignore) -> dict[str, Any]:
+def submit(api: Api, submission: Submission, on_event: Listener = ignore) -> dict[str, Any]:
     """Upload what is missing and queue the job; returns the job.
 
     Args:
         api: the service.
-        what: the scene and what to do with it.
-        listener: hears of the stage ``upload``, whose steps are kB, and of what the service warns of.
+        submission: the scene and what to do with it.
+        on_event: hears of the stage ``upload``, whose steps are kB, and of what the service warns of.
 
     Raises:
         OctasplatError: the scene or the options are refused, or the service does not answer.
     """
     body = {
-        "dataset_id": _dataset_of(api, what.scene, listener),
-        "options": dict(what.options),
-        "label": what.label,
-        "queue": what.queue,
-        "priority": what.priority,
+        "dataset_id": _upload_if_needed(api, submission.scene, on_event),
+        "options": dict(submission.options),
+        "label": submission.label,
+        "queue": submission.queue,
+        "priority": submission.priority,
     }
     job: dict[str, Any] = api.post("/v1/jobs", body)
     return job
@@ -90,7 +90,7 @@ class Derivation:
     priority: int = 0
 
 
-def with_stage(what: Derivation, stage: Path) -> Derivation:
+def with_stage(derivation: Derivation, stage: Path) -> Derivation:
     """The same with a stage and the files that it names; options that say otherwise win.
 
     Files that lie elsewhere than in or below the stage's folder, or whose names a service does not take, are
@@ -101,20 +101,22 @@ def with_stage(what: Derivation, stage: Path) -> Derivation:
     """
     read = read_stage(stage)
     names: dict[str, str] = {}
-    for _, name in named_files(read):
+    for _, name in referenced_files(read):
         try:
             names[name] = check_name(name)
-        except NameRefused:
+        except FileNameError:
             names[name] = check_name(f"elsewhere/{len(names)}/{Path(name).name}")
     files = {sent: stage.parent / name for name, sent in names.items()}
     for sent, path in tuple(files.items()):
-        for beside in companions(path):
+        for beside in sidecar_files(path):
             files[(PurePosixPath(sent).parent / beside).as_posix()] = path.parent / beside
-    stage_options = {"stage": with_files(read, names).model_dump(mode="json")}
-    return replace(what, options=merged(stage_options, what.options), files={**what.files, **files})
+    stage_options = {"stage": with_renamed_files(read, names).model_dump(mode="json")}
+    return replace(
+        derivation, options=merged(stage_options, derivation.options), files={**derivation.files, **files}
+    )
 
 
-def with_camera_path(what: Derivation, path: Path) -> Derivation:
+def with_camera_path(derivation: Derivation, path: Path) -> Derivation:
     """Return the same with the cameras of a path file, whose content goes into the options.
 
     Options that say otherwise win, as another ``camera_path.fps``.
@@ -123,10 +125,10 @@ def with_camera_path(what: Derivation, path: Path) -> Derivation:
         ConfigError: the file cannot be read, or is no camera path.
     """
     document = read_path_document(path).model_dump(mode="json", exclude_none=True)
-    return replace(what, options=merged({"mode": "path", "camera_path": document}, what.options))
+    return replace(derivation, options=merged({"mode": "path", "camera_path": document}, derivation.options))
 
 
-def with_environments(what: Derivation, maps: Sequence[Path]) -> Derivation:
+def with_environments(derivation: Derivation, maps: Sequence[Path]) -> Derivation:
     """The same with maps of light, which are sent under their own names, or plain ones where those are odd.
 
     Raises:
@@ -138,15 +140,19 @@ def with_environments(what: Derivation, maps: Sequence[Path]) -> Derivation:
             raise ConfigError(f"{path}: there is no such file; name an HDR or EXR image.")
         try:
             name = check_name(path.name)
-        except NameRefused:
+        except FileNameError:
             name = check_name(f"map_{len(files)}{path.suffix.lower()}")
         if name in files:
             raise ConfigError(f"{path}: two environments are called {name}; rename one.")
         files[name] = path
-    return replace(what, options={**what.options, "environments": list(files)}, files={**what.files, **files})
+    return replace(
+        derivation,
+        options={**derivation.options, "environments": list(files)},
+        files={**derivation.files, **files},
+    )
 
 
-def derive(api: Api, what: Derivation, listener: Listener = ignore) -> dict[str, Any]:
+def derive(api: Api, derivation: Derivation, on_event: Listener = ignore) -> dict[str, Any]:
     """Send the files that the options name, and queue a job on the results of another or on them.
 
     Returns the job.
@@ -156,39 +162,39 @@ def derive(api: Api, what: Derivation, listener: Listener = ignore) -> dict[str,
         ServiceError: something is refused.
         Unreachable: the service does not answer.
     """
-    for path in what.files.values():
+    for path in derivation.files.values():
         if not path.is_file():
             raise ConfigError(f"{path}: there is no such file.")
     body: dict[str, Any] = {
-        "kind": what.kind,
-        "options": dict(what.options),
-        "label": what.label,
-        "queue": what.queue,
-        "priority": what.priority,
+        "kind": derivation.kind,
+        "options": dict(derivation.options),
+        "label": derivation.label,
+        "queue": derivation.queue,
+        "priority": derivation.priority,
     }
-    if what.source_id is not None:
-        body["source_id"] = what.source_id
-    if what.scene is not None:
-        body["dataset_id"] = _dataset_of(api, what.scene, listener)
-    if what.files:
-        with counted_stage("upload", listener) as progress:
+    if derivation.source_id is not None:
+        body["source_id"] = derivation.source_id
+    if derivation.scene is not None:
+        body["dataset_id"] = _upload_if_needed(api, derivation.scene, on_event)
+    if derivation.files:
+        with counted_stage("upload", on_event) as progress:
             sent = upload_files(
-                api, what.files, name="stage", progress=lambda d, t: progress(d >> 10, t >> 10)
+                api, derivation.files, name="stage", progress=lambda d, t: progress(d >> 10, t >> 10)
             )
         body["files_id"] = sent["id"]
     job: dict[str, Any] = api.post("/v1/jobs", body)
     return job
 
 
-def wait_for(
-    api: Api, job_id: str, listener: Listener = ignore, on_note: Callable[[str], None] = lambda _note: None
+def wait_for_job(
+    api: Api, job_id: str, on_event: Listener = ignore, on_note: Callable[[str], None] = lambda _note: None
 ) -> dict[str, Any]:
     """Follow a job until it is over; returns it.
 
     Args:
         api: the service.
         job_id: which.
-        listener: hears what the engine tells.
+        on_event: hears what the engine tells.
         on_note: told in a sentence when another worker takes the job over.
 
     Raises:
@@ -204,22 +210,22 @@ def wait_for(
         if note is not None:
             on_note(note)
 
-    job = watch_job(api, job_id, listener, on_state)
+    job = watch_job(api, job_id, on_event, on_state)
     if job["state"] == "failed":
-        raise JobFailed(f"The job failed: {job['error']['message']} (octasplat logs {job_id} says more)")
+        raise JobFailedError(f"The job failed: {job['error']['message']} (octasplat logs {job_id} says more)")
     if job["state"] == "canceled":
-        raise JobFailed("The job was cancelled; octasplat retry goes on with it.")
+        raise JobFailedError("The job was cancelled; octasplat retry goes on with it.")
     return job
 
 
-def fetch(
-    api: Api, job_id: str, folder: Path, names: tuple[str, ...] = (), listener: Listener = ignore
+def download_job(
+    api: Api, job_id: str, folder: Path, names: tuple[str, ...] = (), on_event: Listener = ignore
 ) -> tuple[Path, ...]:
     """Save the results of a job, or only those called ``names``; returns the files.
 
-    The stage ``download``, whose steps are kB, is told to ``listener``.
+    The stage ``download``, whose steps are kB, is told to ``on_event``.
     """
-    with counted_stage("download", listener) as progress:
+    with counted_stage("download", on_event) as progress:
         return tuple(
             download_results(
                 api, job_id, folder, names=names, progress=lambda d, t: progress(d >> 10, t >> 10)
@@ -227,19 +233,19 @@ def fetch(
         )
 
 
-def _dataset_of(api: Api, scene: Path, listener: Listener) -> str:
+def _upload_if_needed(api: Api, scene: Path, on_event: Listener) -> str:
     """The dataset of these photographs, sent if that is not done yet."""
-    dataset_id = _as_id(str(scene))
+    dataset_id = _parse_id(str(scene))
     if dataset_id is not None:
         return dataset_id
-    with counted_stage("upload", listener) as progress:
+    with counted_stage("upload", on_event) as progress:
         dataset = upload_scene(api, scene, progress=lambda d, t: progress(d >> 10, t >> 10))
     for warning in dataset["facts"].get("warnings", ()):
-        listener(Warned(warning))
+        on_event(Warned(warning))
     return str(dataset["id"])
 
 
-def _as_id(text: str) -> str | None:
+def _parse_id(text: str) -> str | None:
     try:
         return str(uuid.UUID(text))
     except ValueError:

@@ -13,16 +13,16 @@ from typing import Any
 
 from octasplat.engine.errors import DatasetError
 from octasplat.workers.client.api import Api, ServiceError
-from octasplat.workers.client.patience import Patience
+from octasplat.workers.client.backoff import Backoff
 
-PARALLEL = 4
-CHECK_SECONDS = 600.0
+PARALLEL_UPLOADS = 4
+MAX_CHECK_WAIT_SECONDS = 600.0
 """For so long a check of a dataset that somebody else has begun is waited for."""
-MAX_DELETED = 30
+MAX_DELETED_DATASETS = 30
 """So many datasets of one folder that were deleted are looked past for one that is there."""
 _PIECE_BYTES = 1 << 20
-_PARTS = ("images", "masks", "sparse", "colmap/sparse")
-_CLUTTER = frozenset({"thumbs.db", "desktop.ini"})
+_SCENE_FOLDERS = ("images", "masks", "sparse", "colmap/sparse")
+_IGNORED_NAMES = frozenset({"thumbs.db", "desktop.ini"})
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ class LocalFile:
     size_bytes: int
 
 
-def scene_files(scene: Path) -> list[LocalFile]:
+def list_scene_files(scene: Path) -> list[LocalFile]:
     """The files of a scene folder that belong to a dataset, by name; a bare folder of pictures will do.
 
     Raises:
@@ -43,9 +43,13 @@ def scene_files(scene: Path) -> list[LocalFile]:
     if not scene.is_dir():
         raise DatasetError(f"{scene} is not a folder; name the folder that holds images/ and sparse/.")
     if (scene / "images").is_dir():
-        found = {path.relative_to(scene).as_posix(): path for part in _PARTS for path in _below(scene / part)}
+        found = {
+            path.relative_to(scene).as_posix(): path
+            for part in _SCENE_FOLDERS
+            for path in _files_below(scene / part)
+        }
     else:
-        found = {f"images/{path.name}": path for path in sorted(scene.iterdir()) if _is_wanted(path)}
+        found = {f"images/{path.name}": path for path in sorted(scene.iterdir()) if _is_uploadable(path)}
     if not any(name.startswith("images/") for name in found):
         raise DatasetError(f"{scene} holds no photographs; put them into {scene / 'images'}.")
     return [LocalFile(name, path, path.stat().st_size) for name, path in sorted(found.items())]
@@ -74,14 +78,14 @@ def upload_scene(
         ServiceError: the service refuses it; the text names the files.
     """
     is_archive = scene.is_file()
-    files = [LocalFile(scene.name, scene, scene.stat().st_size)] if is_archive else scene_files(scene)
-    dataset = _dataset_for(api, name or scene.resolve().stem, files)
+    files = [LocalFile(scene.name, scene, scene.stat().st_size)] if is_archive else list_scene_files(scene)
+    dataset = _find_or_create_dataset(api, name or scene.resolve().stem, files)
     if dataset["state"] == "open":
         if is_archive:
             _send_archive(api, dataset["id"], files[0], progress)
         else:
             _send_missing(api, dataset["id"], files, progress)
-    return _committed(api, dataset)
+    return _commit(api, dataset)
 
 
 def upload_files(
@@ -106,15 +110,15 @@ def upload_files(
         ServiceError: the service refuses it; the text names the files.
     """
     local = [LocalFile(called, path, path.stat().st_size) for called, path in sorted(files.items())]
-    dataset = _dataset_for(api, name, local, holds="files")
+    dataset = _find_or_create_dataset(api, name, local, holds="files")
     if dataset["state"] == "open":
         _send_missing(api, dataset["id"], local, progress)
-    return _committed(api, dataset)
+    return _commit(api, dataset)
 
 
-def _committed(api: Api, dataset: dict[str, Any]) -> dict[str, Any]:
+def _commit(api: Api, dataset: dict[str, Any]) -> dict[str, Any]:
     """Commit a dataset, after a check that is under way; one that was broken off is taken over in a while."""
-    address, patience = f"/v1/datasets/{dataset['id']}", Patience(CHECK_SECONDS)
+    address, patience = f"/v1/datasets/{dataset['id']}", Backoff(MAX_CHECK_WAIT_SECONDS)
     while dataset["state"] != "committed":
         try:
             dataset = api.post(f"{address}/commit")
@@ -127,7 +131,7 @@ def _committed(api: Api, dataset: dict[str, Any]) -> dict[str, Any]:
     return dataset
 
 
-def _dataset_for(
+def _find_or_create_dataset(
     api: Api, name: str, files: Iterable[LocalFile], holds: str = "photographs"
 ) -> dict[str, Any]:
     """The dataset that was made for just these files, or a new one."""
@@ -137,7 +141,7 @@ def _dataset_for(
         digest.update(f"{file.name}\0{facts.st_size}\0{facts.st_mtime_ns}\0{facts.st_ino}\n".encode())
     body = {"name": name, "holds": holds} if holds == "files" else {"name": name}
     key = f"scene-{digest.hexdigest()}"
-    for number in range(MAX_DELETED):
+    for number in range(MAX_DELETED_DATASETS):
         try:
             found: dict[str, Any] = api.post("/v1/datasets", body, key=f"{key}-{number}" if number else key)
         except ServiceError as error:
@@ -152,24 +156,24 @@ def _dataset_for(
 def _send_missing(
     api: Api, dataset_id: str, files: list[LocalFile], progress: Callable[[int, int], None]
 ) -> None:
-    there = {f["path"]: f for f in api.pages(f"/v1/datasets/{dataset_id}/files", "files", limit=5000)}
+    there = {f["path"]: f for f in api.iterate_pages(f"/v1/datasets/{dataset_id}/files", "files", limit=5000)}
     wanted = {file.name for file in files}
     for path in there.keys() - wanted:
         try:
-            api.request("DELETE", _address(dataset_id, path))
+            api.request("DELETE", _file_address(dataset_id, path))
         except ServiceError as error:
             if error.status != 404:  # an earlier try, whose answer was lost, has removed it
                 raise
-    counter = _Counter(sum(file.size_bytes for file in files), progress)
+    counter = _ProgressCounter(sum(file.size_bytes for file in files), progress)
 
     def send(file: LocalFile) -> None:
         sha256 = _sha256(file.path)
         known = there.get(file.name)
         if known is None or known["sha256"] != sha256:
-            _put(api, _address(dataset_id, file.name), file.path, sha256)
+            _put_file(api, _file_address(dataset_id, file.name), file.path, sha256)
         counter.add(file.size_bytes)
 
-    with ThreadPoolExecutor(PARALLEL) as pool:
+    with ThreadPoolExecutor(PARALLEL_UPLOADS) as pool:
         jobs = [pool.submit(send, file) for file in files]
         try:
             done, _ = wait(jobs, return_when=FIRST_EXCEPTION)
@@ -181,21 +185,21 @@ def _send_missing(
 
 def _send_archive(api: Api, dataset_id: str, file: LocalFile, progress: Callable[[int, int], None]) -> None:
     progress(0, file.size_bytes)
-    _put(api, f"/v1/datasets/{dataset_id}/archive", file.path, _sha256(file.path))
+    _put_file(api, f"/v1/datasets/{dataset_id}/archive", file.path, _sha256(file.path))
     progress(file.size_bytes, file.size_bytes)
 
 
-def _put(api: Api, address: str, path: Path, sha256: str) -> None:
+def _put_file(api: Api, address: str, path: Path, sha256: str) -> None:
     encoded = base64.b64encode(bytes.fromhex(sha256)).decode()
     headers = {
         "Repr-Digest": f"sha-256=:{encoded}:",
         "Content-Type": "application/octet-stream",
         "Content-Length": str(path.stat().st_size),
     }
-    api.request("PUT", address, content=_Rereadable(path), headers=headers)
+    api.request("PUT", address, content=_RereadableFile(path), headers=headers)
 
 
-class _Rereadable:
+class _RereadableFile:
     """A file's content that can be sent again when the first try breaks off."""
 
     def __init__(self, path: Path) -> None:
@@ -207,7 +211,7 @@ class _Rereadable:
                 yield piece
 
 
-class _Counter:
+class _ProgressCounter:
     def __init__(self, total: int, progress: Callable[[int, int], None]) -> None:
         self._done, self._total, self._progress = 0, total, progress
         self._lock = threading.Lock()
@@ -219,7 +223,7 @@ class _Counter:
             self._progress(self._done, self._total)
 
 
-def _address(dataset_id: str, name: str) -> str:
+def _file_address(dataset_id: str, name: str) -> str:
     return f"/v1/datasets/{dataset_id}/files/{urllib.parse.quote(name)}"
 
 
@@ -228,9 +232,9 @@ def _sha256(path: Path) -> str:
         return hashlib.file_digest(handle, "sha256").hexdigest()
 
 
-def _below(folder: Path) -> Iterator[Path]:
-    return (path for path in sorted(folder.rglob("*")) if _is_wanted(path))
+def _files_below(folder: Path) -> Iterator[Path]:
+    return (path for path in sorted(folder.rglob("*")) if _is_uploadable(path))
 
 
-def _is_wanted(path: Path) -> bool:
-    return path.is_file() and not path.name.startswith(".") and path.name.lower() not in _CLUTTER
+def _is_uploadable(path: Path) -> bool:
+    return path.is_file() and not path.name.startswith(".") and path.name.lower() not in _IGNORED_NAMES

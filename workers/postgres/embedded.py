@@ -26,6 +26,7 @@ import psutil
 import psycopg
 from psycopg.conninfo import make_conninfo
 
+from octasplat.workers.db.errors import DatabaseError
 from octasplat.workers.postgres.binaries import PostgresBinaries, find_binaries
 from octasplat.workers.postgres.server_user import (
     ServerUser,
@@ -33,15 +34,14 @@ from octasplat.workers.postgres.server_user import (
     reachable_binaries,
     server_user,
 )
-from octasplat.workers.records.errors import DatabaseError
 
-NAME = "octasplat"
+DATABASE_NAME = "octasplat"
 """Name of the database and of its user."""
-PORT = 5432
+SOCKET_PORT = 5432
 """Only names the socket; nothing listens on it."""
 START_SECONDS = 60
-LEAST_CONNECTIONS = 100
-LOG_BYTES = 16 << 20
+MIN_CONNECTIONS = 100
+MAX_LOG_BYTES = 16 << 20
 """The log begins anew when it is longer; the one before stays beside it."""
 _MAX_SOCKET_BYTES = 103  # the shortest limit there is (macOS); Linux takes 107
 _SETTINGS = (
@@ -64,7 +64,7 @@ class EmbeddedPostgres:
     """
 
     data: Path
-    connections: int = LEAST_CONNECTIONS
+    connections: int = MIN_CONNECTIONS
 
     @property
     def home(self) -> Path:
@@ -90,7 +90,11 @@ class EmbeddedPostgres:
                 "--data, or set DATABASE_URL."
             ) from None
         return make_conninfo(
-            host=str(self._socket_folder()), port=PORT, user=NAME, dbname=NAME, password=password
+            host=str(self._socket_folder()),
+            port=SOCKET_PORT,
+            user=DATABASE_NAME,
+            dbname=DATABASE_NAME,
+            password=password,
         )
 
     def is_running(self) -> bool:
@@ -112,13 +116,13 @@ class EmbeddedPostgres:
         """
         user = server_user()
         self._make_home(user)
-        with self._alone():
+        with self._folder_lock():
             if not self.is_running():
                 binaries = self._binaries(user)
                 if not (self.cluster / "PG_VERSION").exists():
-                    self._create(binaries, user)
+                    self._create_cluster(binaries, user)
                 self._remove_stale_locks()
-                self._start(binaries, user)
+                self._start_server(binaries, user)
             self._create_database()
         return self.conninfo()
 
@@ -127,8 +131,8 @@ class EmbeddedPostgres:
         if not (self.cluster / "postmaster.pid").exists():
             return
         user = server_user()
-        with self._alone():
-            self._run(
+        with self._folder_lock():
+            self._run_program(
                 self._binaries(user), user, "pg_ctl", "-D", ".", "-m", "fast", "-w", "stop", check=False
             )
 
@@ -147,11 +151,11 @@ class EmbeddedPostgres:
                 facts = folder.lstat()
                 if folder.is_symlink() or facts.st_uid not in (os.geteuid(), user.uid):
                     raise DatabaseError(f"{folder} belongs to somebody else; remove it and start again.")
-                user.own(folder)
+                user.chown(folder)
                 folder.chmod(0o700)
             log = self.home / "log"
             log.touch(mode=0o600)
-            user.own(log)
+            user.chown(log)
         except OSError as error:
             raise DatabaseError(
                 f"{self.home} cannot be used ({error.strerror or error}); name another data folder."
@@ -160,9 +164,9 @@ class EmbeddedPostgres:
     def _socket_folder(self) -> Path:
         """Where the socket is: where the server that runs has put it, else always in the same place."""
         folder = (self.home / "run").resolve()
-        if (told := self._told_socket_folder()) is not None:
+        if (told := self._running_socket_folder()) is not None:
             return told
-        socket = f"{folder}/.s.PGSQL.{PORT}"
+        socket = f"{folder}/.s.PGSQL.{SOCKET_PORT}"
         # A comma separates hosts in what clients are given, and folders in the server's settings.
         if len(os.fsencode(socket)) <= _MAX_SOCKET_BYTES and "," not in socket:
             return folder
@@ -170,14 +174,14 @@ class EmbeddedPostgres:
         # Not in a folder of the environment's choice, which is another for cron and sudo.
         return Path("/tmp") / f"octasplat-{digest}"  # noqa: S108
 
-    def _told_socket_folder(self) -> Path | None:
+    def _running_socket_folder(self) -> Path | None:
         """The folder that a server which runs has written down beside its number."""
         pid_file = self.cluster / "postmaster.pid"
         try:
             line = pid_file.read_text(encoding="utf-8", errors="surrogateescape").split("\n")[4]
         except (OSError, IndexError):
             return None
-        return (self.cluster / line).resolve() if line and is_postgres(pid_file) else None
+        return (self.cluster / line).resolve() if line and is_postgres_running(pid_file) else None
 
     def _binaries(self, user: ServerUser) -> PostgresBinaries:
         version = self.cluster / "PG_VERSION"
@@ -190,7 +194,7 @@ class EmbeddedPostgres:
             ) from None
         return reachable_binaries(find_binaries(major), user, self.home)
 
-    def _create(self, binaries: PostgresBinaries, user: ServerUser) -> None:
+    def _create_cluster(self, binaries: PostgresBinaries, user: ServerUser) -> None:
         """Make the cluster beside its place and rename it, so that a kill leaves no half of one."""
         if self.cluster.exists() and any(self.cluster.iterdir()):
             raise DatabaseError(
@@ -201,15 +205,15 @@ class EmbeddedPostgres:
             shutil.rmtree(left)
         partial = self.home / f"cluster.{os.getpid()}.partial"
         partial.mkdir(mode=0o700)
-        user.own(partial)
+        user.chown(partial)
         password = secrets.token_urlsafe(32)
         with tempfile.NamedTemporaryFile("w", dir=self.home, prefix=".password.", delete=False) as handle:
             handle.write(password)
         given = Path(handle.name)
         try:
-            user.own(given)
-            self._run(
-                binaries, user, "initdb", "-D", ".", "-U", NAME, f"--pwfile={given}", "--auth=scram-sha-256",
+            user.chown(given)
+            self._run_program(
+                binaries, user, "initdb", "-D", ".", "-U", DATABASE_NAME, f"--pwfile={given}", "--auth=scram-sha-256",
                 "--encoding=UTF8", "--locale=C", "--no-sync", cwd=partial,
             )  # fmt: skip
             if user.switches:
@@ -223,7 +227,7 @@ class EmbeddedPostgres:
         # Before it takes its place, so that no power cut leaves half of one there; all at once, as a thousand
         # flushes of single files take seconds on some disks.
         if not sync_file_system(partial):
-            self._run(binaries, user, "initdb", "--sync-only", "-D", ".", cwd=partial)
+            self._run_program(binaries, user, "initdb", "--sync-only", "-D", ".", cwd=partial)
         partial.rename(self.cluster)
         sync_file_system(self.home)
 
@@ -231,11 +235,11 @@ class EmbeddedPostgres:
         """Begin the log anew if it is long."""
         log = self.home / "log"
         with contextlib.suppress(OSError):
-            if log.stat().st_size <= LOG_BYTES:
+            if log.stat().st_size <= MAX_LOG_BYTES:
                 return
             partial = self.home / "log.1.partial"
             with log.open("rb") as source, partial.open("wb") as target:
-                source.seek(-LOG_BYTES, os.SEEK_END)
+                source.seek(-MAX_LOG_BYTES, os.SEEK_END)
                 shutil.copyfileobj(source, target)
             partial.chmod(0o600)
             partial.replace(self.home / "log.1")
@@ -249,12 +253,12 @@ class EmbeddedPostgres:
         """
         for path in (
             self.cluster / "postmaster.pid",
-            self._socket_folder() / f".s.PGSQL.{PORT}.lock",
+            self._socket_folder() / f".s.PGSQL.{SOCKET_PORT}.lock",
         ):
-            if path.exists() and not is_postgres(path):
+            if path.exists() and not is_postgres_running(path):
                 path.unlink(missing_ok=True)
 
-    def _start(self, binaries: PostgresBinaries, user: ServerUser) -> None:
+    def _start_server(self, binaries: PostgresBinaries, user: ServerUser) -> None:
         self.rotate_log()
         # A shell reads the options and the name of the log, so that both are relative: to the cluster, where
         # the server works. The data folder may have any name.
@@ -268,13 +272,13 @@ class EmbeddedPostgres:
         ]
         quoted = " ".join(f"-c '{option}'" for option in options)
         try:
-            self._run(
+            self._run_program(
                 binaries, user, "pg_ctl", "-D", ".", "-w", "-t", str(START_SECONDS),
                 "-l", "../log", "-o", quoted, "start",
             )  # fmt: skip
         except DatabaseError:
             raise DatabaseError(
-                f"The database in {self.home} does not start: {self._last_words()} "
+                f"The database in {self.home} does not start: {self._last_log_error()} "
                 f"(more in {self.home / 'log'})"
             ) from None
 
@@ -282,15 +286,15 @@ class EmbeddedPostgres:
         conninfo = make_conninfo(self.conninfo(), dbname="postgres")
         with psycopg.connect(conninfo, autocommit=True) as connection:
             query = "SELECT 1 FROM pg_database WHERE datname = %s"
-            if connection.execute(query, [NAME]).fetchone() is None:
+            if connection.execute(query, [DATABASE_NAME]).fetchone() is None:
                 connection.execute("CREATE DATABASE octasplat")
 
-    def _last_words(self) -> str:
+    def _last_log_error(self) -> str:
         lines = (self.home / "log").read_text(encoding="utf-8", errors="replace").splitlines()
         telling = [line for line in lines[-20:] if "FATAL" in line or "PANIC" in line] or lines[-1:]
         return telling[-1] if telling else "it says nothing."
 
-    def _run(
+    def _run_program(
         self,
         binaries: PostgresBinaries,
         user: ServerUser,
@@ -327,10 +331,10 @@ class EmbeddedPostgres:
 
     def is_alive(self) -> bool:
         """Whether the server's process lives; cheaper than asking it, as :meth:`is_running` does."""
-        return is_postgres(self.cluster / "postmaster.pid")
+        return is_postgres_running(self.cluster / "postmaster.pid")
 
     @contextlib.contextmanager
-    def _alone(self) -> Iterator[None]:
+    def _folder_lock(self) -> Iterator[None]:
         """Hold the lock of this folder, so that two starts at once make one database."""
         with (self.home / "lock").open("w") as handle:
             fcntl.flock(handle, fcntl.LOCK_EX)
@@ -350,7 +354,7 @@ def sync_file_system(folder: Path) -> bool:
         os.close(fd)
 
 
-def is_postgres(pid_file: Path) -> bool:
+def is_postgres_running(pid_file: Path) -> bool:
     """Whether the number in a pid file is that of a living Postgres."""
     try:
         process = psutil.Process(int(pid_file.read_text(encoding="utf-8").split("\n", 1)[0]))

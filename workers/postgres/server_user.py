@@ -6,8 +6,8 @@ import shutil
 from dataclasses import dataclass
 from pathlib import Path
 
+from octasplat.workers.db.errors import DatabaseError
 from octasplat.workers.postgres.binaries import PostgresBinaries
-from octasplat.workers.records.errors import DatabaseError
 
 _CANDIDATES = ("octasplat", "postgres", "nobody")
 
@@ -26,7 +26,7 @@ class ServerUser:
     gid: int
     switches: bool
 
-    def own(self, path: Path) -> None:
+    def chown(self, path: Path) -> None:
         """Give ``path`` to the user."""
         if self.switches:
             os.chown(path, self.uid, self.gid)
@@ -69,7 +69,7 @@ def check_reachable(folder: Path, user: ServerUser) -> None:
     if not user.switches:
         return
     for above in reversed(folder.resolve().parents):
-        if above.exists() and not _may_pass(above, user):
+        if above.exists() and not _can_traverse(above, user):
             raise DatabaseError(
                 f"As root the database runs as user {pwd.getpwuid(user.uid).pw_name}, who cannot pass "
                 f"through {above}; name a data folder elsewhere (--data), start as another user, or set "
@@ -77,15 +77,15 @@ def check_reachable(folder: Path, user: ServerUser) -> None:
             )
 
 
-def reachable_binaries(binaries: PostgresBinaries, user: ServerUser, keep_in: Path) -> PostgresBinaries:
-    """Binaries that the server's user may run: a copy in ``keep_in`` where the own ones are out of reach."""
+def reachable_binaries(binaries: PostgresBinaries, user: ServerUser, copy_folder: Path) -> PostgresBinaries:
+    """Binaries that the server's user may run: a copy in ``copy_folder`` where the own ones are out of reach."""
     above = (binaries.folder, *binaries.folder.parents)
-    if not user.switches or all(_may_pass(folder, user) for folder in above):
+    if not user.switches or all(_can_traverse(folder, user) for folder in above):
         return binaries
     install = binaries.folder.parent
-    copy = keep_in / f"binaries-{binaries.major}"
+    copy = copy_folder / f"binaries-{binaries.major}"
     if not copy.exists():
-        partial = keep_in / f"binaries-{binaries.major}.{os.getpid()}.partial"
+        partial = copy_folder / f"binaries-{binaries.major}.{os.getpid()}.partial"
         shutil.rmtree(partial, ignore_errors=True)
         shutil.copytree(install, partial / install.parent.name / install.name, symlinks=True)
         # A wheel keeps its libraries beside its package, where the programs look for them.
@@ -98,7 +98,7 @@ def reachable_binaries(binaries: PostgresBinaries, user: ServerUser, keep_in: Pa
     return PostgresBinaries(copy / install.parent.name / install.name / "bin", binaries.major)
 
 
-def _may_pass(folder: Path, user: ServerUser) -> bool:
+def _can_traverse(folder: Path, user: ServerUser) -> bool:
     facts = folder.stat()
     if facts.st_uid == user.uid:
         return bool(facts.st_mode & 0o100)

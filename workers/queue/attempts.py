@@ -1,7 +1,7 @@
 """Changes of jobs by the worker that has them, every one of them fenced by the number of the attempt.
 
 A worker that was taken for dead may come back. By then its job has a higher attempt number or is over, and
-whatever it still wants to write is refused with :class:`Fenced`.
+whatever it still wants to write is refused with :class:`FencedError`.
 """
 
 import uuid
@@ -10,29 +10,29 @@ from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from typing import Any
 
-from octasplat.workers.queue.jobs import get_job, queue_again
-from octasplat.workers.queue.port import Slips
-from octasplat.workers.queue.storing import Note
-from octasplat.workers.records.database import Connection, Pool
-from octasplat.workers.records.journal import add_event, add_log_lines, trim_log
-from octasplat.workers.records.locks import lock_owner
-from octasplat.workers.records.quotas import NO_QUOTA, Quota, check_bytes
-from octasplat.workers.records.rows import TERMINAL, Job
-from octasplat.workers.records.texts import as_json, as_json_or_null, storable_text
+from octasplat.workers.db.connections import Connection, Pool
+from octasplat.workers.db.events_and_logs import add_event, add_log_lines, trim_log
+from octasplat.workers.db.locks import lock_owner
+from octasplat.workers.db.postgres_text import as_json, as_json_or_null, storable_text
+from octasplat.workers.db.quotas import NO_QUOTA, Quota, check_bytes
+from octasplat.workers.db.rows import TERMINAL, Job
+from octasplat.workers.queue.jobs import get_job, requeue_job
+from octasplat.workers.queue.protocol import JobQueue
+from octasplat.workers.queue.storage_leases import StorageLease
 
-MAX_RESCUES = 3
+MAX_RECOVERIES = 3
 """Lost attempts without a new checkpoint after which a job is taken for one that kills its workers."""
 
-KEPT_LOG_LINES = 20_000
+MAX_EARLIER_LOG_LINES = 20_000
 """Lines of the attempts before that stay in the log when a new one begins."""
 
 
-class Fenced(Exception):
+class FencedError(Exception):
     """The attempt is over: the job has gone on without this worker."""
 
 
 @dataclass(frozen=True)
-class Result:
+class ResultFile:
     """A result to publish: its name, content and media type."""
 
     name: str
@@ -48,42 +48,42 @@ class Attempt:
     Args:
         pool: connections.
         job: the row as it was when the attempt began; ``job.attempt`` is the number that fences.
-        shown: a JSON value as its texts may be shown to users; everything that is written goes through it.
+        redact: a JSON value as its texts may be shown to users; everything that is written goes through it.
         quota: what an owner may store who has no limits of their own.
     """
 
     pool: Pool
     job: Job
-    shown: Callable[[Any], Any] = lambda value: value
+    redact: Callable[[Any], Any] = lambda value: value
     quota: Quota = NO_QUOTA
 
-    async def beat(self) -> str:
+    async def heartbeat(self) -> str:
         """Say that the worker lives; returns the state, ``running`` or ``canceling``."""
-        async with self._fenced() as (connection, job):
+        async with self._fenced_transaction() as (connection, job):
             await connection.execute("UPDATE jobs SET heartbeat_at = now() WHERE id = %s", [job.id])
             return job.state
 
-    async def look(self) -> str:
+    async def read_state(self) -> str:
         """The state, without saying anything."""
         async with self.pool.connection() as connection:
             job = await get_job(connection, self.job.id)
-        self._check(job)
+        self._check_fence(job)
         assert job is not None
         return job.state
 
-    async def tell(self, kind: str, data: Mapping[str, Any]) -> None:
+    async def add_event(self, kind: str, data: Mapping[str, Any]) -> None:
         """Add an event to the journal; what was measured on held-out views is also the job's PSNR."""
-        async with self._fenced() as (connection, job):
+        async with self._fenced_transaction() as (connection, job):
             if kind == "held_out_measured":
                 await connection.execute("UPDATE jobs SET psnr = %s WHERE id = %s", [data["psnr"], job.id])
-            await add_event(connection, job.id, job.attempt, kind, self.shown(dict(data)))
+            await add_event(connection, job.id, job.attempt, kind, self.redact(dict(data)))
 
-    async def log(self, lines: Sequence[str]) -> None:
+    async def add_log_lines(self, lines: Sequence[str]) -> None:
         """Add lines to the log."""
-        async with self._fenced() as (connection, job):
-            await add_log_lines(connection, job.id, job.attempt, self.shown(list(lines)))
+        async with self._fenced_transaction() as (connection, job):
+            await add_log_lines(connection, job.id, job.attempt, self.redact(list(lines)))
 
-    async def progress(
+    async def set_progress(
         self,
         *,
         stage: str,
@@ -94,7 +94,7 @@ class Attempt:
         event: Mapping[str, Any] | None = None,
     ) -> None:
         """Say how far the job is; ``event`` goes to the journal besides."""
-        async with self._fenced() as (connection, job):
+        async with self._fenced_transaction() as (connection, job):
             await connection.execute(
                 """
                 UPDATE jobs SET stage = %s, step = %s, total_steps = %s, seconds_left = %s,
@@ -106,36 +106,36 @@ class Attempt:
             if event is not None:
                 await add_event(connection, job.id, job.attempt, "progress", event)
 
-    async def keep_checkpoint(
-        self, manifest: Mapping[str, Any], *, advances: bool, note: Note | None = None
+    async def record_checkpoint(
+        self, manifest: Mapping[str, Any], *, is_progress: bool, lease: StorageLease | None = None
     ) -> None:
         """Record a stored checkpoint; one that advances forgives the job the workers it has lost.
 
         Raises:
-            StorageUnavailable: ``note``, under which it was stored, was given up.
+            StorageUnavailable: ``lease``, under which it was stored, was given up.
             QuotaExceeded: the job's owner may not store as much.
         """
         contents = {file["sha256"] for file in manifest.get("files", ())}
-        async with self._fenced(note, contents, counts=True) as (connection, job):
+        async with self._fenced_transaction(lease, contents, changes_usage=True) as (connection, job):
             await connection.execute(
                 """
                 UPDATE jobs SET checkpoint = %s, rescues = CASE WHEN %s THEN 0 ELSE rescues END WHERE id = %s
                 """,
-                [as_json(dict(manifest)), advances, job.id],
+                [as_json(dict(manifest)), is_progress, job.id],
             )
             await check_bytes(connection, job.owner, self.quota)
             event = {key: manifest[key] for key in ("stage", "step") if key in manifest}
             await add_event(connection, job.id, job.attempt, "checkpoint", event)
 
-    async def keep_preview(self, preview: Mapping[str, Any], note: Note | None = None) -> None:
-        """Record the newest preview picture: ``sha256``, ``step`` and ``view``; ``note`` as above."""
-        async with self._fenced(note, [preview["sha256"]]) as (connection, job):
+    async def record_preview(self, preview: Mapping[str, Any], lease: StorageLease | None = None) -> None:
+        """Record the newest preview picture: ``sha256``, ``step`` and ``view``; ``lease`` as above."""
+        async with self._fenced_transaction(lease, [preview["sha256"]]) as (connection, job):
             await connection.execute(
                 "UPDATE jobs SET preview = %s WHERE id = %s", [as_json(dict(preview)), job.id]
             )
             await add_event(connection, job.id, job.attempt, "preview", preview)
 
-    async def succeed(self, results: Sequence[Result], psnr: float | None = None) -> None:
+    async def succeed(self, results: Sequence[ResultFile], psnr: float | None = None) -> None:
         """Publish the results and end the job.
 
         Args:
@@ -145,131 +145,143 @@ class Attempt:
         Raises:
             QuotaExceeded: the job's owner may not store as much.
         """
-        async with self._fenced(counts=True) as (connection, job):
+        async with self._fenced_transaction(changes_usage=True) as (connection, job):
             if psnr is not None:
                 await connection.execute("UPDATE jobs SET psnr = %s WHERE id = %s", [psnr, job.id])
-            await _show(connection, job, results)
+            await _replace_artifacts(connection, job, results)
             await end_job(connection, job, "succeeded", None)
             await check_bytes(connection, job.owner, self.quota)
 
     async def fail(
         self,
         error: Mapping[str, Any],
-        results: Sequence[Result] = (),
-        note: Note | None = None,
+        results: Sequence[ResultFile] = (),
+        lease: StorageLease | None = None,
         *,
-        unwanted: Sequence[Result] = (),
+        discarded: Sequence[ResultFile] = (),
     ) -> None:
         """End the job for a reason that another try would meet again, with the results there are so far.
 
         Args:
             error: what happened.
             results: those that there are.
-            note: under which they were stored.
-            unwanted: results that are stored and will not be named, so that they go soon.
+            lease: under which they were stored.
+            discarded: results that are stored and will not be named, so that they go soon.
 
         Raises:
-            StorageUnavailable: ``note``, under which they were stored, was given up.
+            StorageUnavailable: ``lease``, under which they were stored, was given up.
             QuotaExceeded: the job's owner may not store as much.
         """
-        async with self._fenced(note, _contents(results), counts=bool(results)) as (connection, job):
+        async with self._fenced_transaction(lease, _digests(results), changes_usage=bool(results)) as (
+            connection,
+            job,
+        ):
             if results:
-                await _show(connection, job, results)
+                await _replace_artifacts(connection, job, results)
                 await check_bytes(connection, job.owner, self.quota)
-            await end_job(connection, job, "failed", self.shown(dict(error)))
+            await end_job(connection, job, "failed", self.redact(dict(error)))
             await connection.execute(
                 "INSERT INTO replaced_contents (sha256) SELECT unnest(%s::text[]) ON CONFLICT DO NOTHING",
-                [sorted(_contents(unwanted))],
+                [sorted(_digests(discarded))],
             )
 
     async def cancel(self) -> None:
         """End the job as its owner asked."""
-        async with self._fenced() as (connection, job):
+        async with self._fenced_transaction() as (connection, job):
             await end_job(connection, job, "canceled", None)
 
-    async def hand_back(self, slips: Slips, reason: str, *, uncounted: int | None = None) -> None:
+    async def requeue(self, job_queue: JobQueue, reason: str, *, max_uncounted: int | None = None) -> None:
         """Put the job back into the queue, as its worker has to go; a cancelled one ends instead.
 
         Args:
-            slips: the queue.
+            job_queue: the queue.
             reason: why.
-            uncounted: how often in a row, without a checkpoint in between, that may happen for the same
+            max_uncounted: how often in a row, without a checkpoint in between, that may happen for the same
                 reason before it counts as a lost attempt; None never counts it.
         """
-        async with self._fenced() as (connection, job):
+        async with self._fenced_transaction() as (connection, job):
             if job.state == "canceling":
                 await end_job(connection, job, "canceled", None)
                 return
-            reason = storable_text(self.shown(reason))
-            if uncounted is not None and await _handed_back(connection, job, reason) >= uncounted:
+            reason = storable_text(self.redact(reason))
+            if max_uncounted is not None and await _count_requeues(connection, job, reason) >= max_uncounted:
                 error = {"type": "worker_failed", "message": f"Handed back too often: {reason}."}
-                await rescue(connection, slips, job, error, keep_slip=True)
+                await recover_attempt(connection, job_queue, job, error, keep_entry=True)
                 return
             await add_event(connection, job.id, job.attempt, "handed_back", {"reason": reason})
             await add_log_lines(connection, job.id, job.attempt, [f"Handed back to the queue: {reason}"])
-            await queue_again(connection, slips, job, keep_slip=True)
+            await requeue_job(connection, job_queue, job, keep_entry=True)
 
-    async def lose(
+    async def requeue_lost(
         self,
-        slips: Slips,
+        job_queue: JobQueue,
         error: Mapping[str, Any],
-        results: Sequence[Result] = (),
-        note: Note | None = None,
+        results: Sequence[ResultFile] = (),
+        lease: StorageLease | None = None,
         *,
-        wait_seconds: float = 0.0,
-        forget_checkpoint: bool = False,
+        delay_seconds: float = 0.0,
+        drop_checkpoint: bool = False,
     ) -> None:
         """The attempt was lost without its worker's intent: another try, or the end if there were enough.
 
         Args:
-            slips: the queue.
+            job_queue: the queue.
             error: what happened.
             results: those that there are, for the end.
-            note: as in :meth:`fail`.
-            wait_seconds: for how long the job is not taken up again.
-            forget_checkpoint: at the end; then a retry begins anew.
+            lease: as in :meth:`fail`.
+            delay_seconds: for how long the job is not taken up again.
+            drop_checkpoint: at the end; then a retry begins anew.
 
         Raises:
             StorageUnavailable: as by :meth:`fail`.
             QuotaExceeded: as by :meth:`fail`.
         """
-        counts = forget_checkpoint or bool(results)
-        async with self._fenced(note, _contents(results), counts=counts) as (connection, job):
-            error = self.shown(dict(error))
-            failed = await rescue(connection, slips, job, error, keep_slip=True, wait_seconds=wait_seconds)
-            if failed and forget_checkpoint:
+        counts = drop_checkpoint or bool(results)
+        async with self._fenced_transaction(lease, _digests(results), changes_usage=counts) as (
+            connection,
+            job,
+        ):
+            error = self.redact(dict(error))
+            failed = await recover_attempt(
+                connection, job_queue, job, error, keep_entry=True, delay_seconds=delay_seconds
+            )
+            if failed and drop_checkpoint:
                 await connection.execute("UPDATE jobs SET checkpoint = NULL WHERE id = %s", [job.id])
             if failed and results:
-                await _show(connection, job, results)
+                await _replace_artifacts(connection, job, results)
                 await check_bytes(connection, job.owner, self.quota)
 
     @asynccontextmanager
-    async def _fenced(
-        self, note: Note | None = None, contents: Collection[str] = (), *, counts: bool = False
+    async def _fenced_transaction(
+        self,
+        lease: StorageLease | None = None,
+        contents: Collection[str] = (),
+        *,
+        changes_usage: bool = False,
     ) -> AsyncIterator[tuple[Connection, Job]]:
         """A transaction that holds the job's lock, if the attempt is still the job's.
 
         Args:
-            note: under which contents were stored that the transaction names.
+            lease: under which contents were stored that the transaction names.
             contents: their digests.
-            counts: whether it changes what the owner stores; the owner's lock is taken before the job's, see
-                :mod:`octasplat.workers.records.locks`.
+            changes_usage: whether it changes what the owner stores; the owner's lock is taken before the job's, see
+                :mod:`octasplat.workers.db.locks`.
         """
-        named = _transaction(self.pool) if note is None else note.naming(contents)
+        named = _transaction(self.pool) if lease is None else lease.reference(contents)
         async with named as connection:
-            if counts:
+            if changes_usage:
                 await lock_owner(connection, self.job.owner)
             job = await get_job(connection, self.job.id, lock=True)
-            self._check(job)
+            self._check_fence(job)
             assert job is not None
             yield connection, job
 
-    def _check(self, job: Job | None) -> None:
+    def _check_fence(self, job: Job | None) -> None:
         if job is None or job.attempt != self.job.attempt or job.state not in ("running", "canceling"):
-            raise Fenced(f"attempt {self.job.attempt} of job {self.job.id} is over")
+            raise FencedError(f"attempt {self.job.attempt} of job {self.job.id} is over")
 
 
-async def _handed_back(connection: Connection, job: Job, reason: str) -> int:
+async def _count_requeues(connection: Connection, job: Job, reason: str) -> int:
     """How often a job was handed back for a reason since it came any further or was accepted."""
     cursor = await connection.execute(
         """
@@ -285,11 +297,11 @@ async def _handed_back(connection: Connection, job: Job, reason: str) -> int:
     return int(row["n"]) if row else 0
 
 
-async def claim(pool: Pool, job_id: uuid.UUID, slip: int, worker: str) -> Attempt | None:
+async def claim(pool: Pool, job_id: uuid.UUID, entry_id: int, worker: str) -> Attempt | None:
     """Begin an attempt at a queued job, or None if the slip is stale: the job has gone on without it."""
     async with pool.connection() as connection, connection.transaction():
         job = await get_job(connection, job_id, lock=True)
-        if job is None or job.state != "queued" or job.slip != slip:
+        if job is None or job.state != "queued" or job.slip != entry_id:
             return None
         await connection.execute(
             """
@@ -307,36 +319,36 @@ async def claim(pool: Pool, job_id: uuid.UUID, slip: int, worker: str) -> Attemp
             [job.owner, job.queue],
         )
         await add_event(connection, job_id, job.attempt + 1, "state", {"state": "running", "worker": worker})
-        await trim_log(connection, job_id, KEPT_LOG_LINES)
+        await trim_log(connection, job_id, MAX_EARLIER_LOG_LINES)
         await add_log_lines(connection, job_id, job.attempt + 1, [f"Attempt {job.attempt + 1} on {worker}"])
         claimed = await get_job(connection, job_id)
     assert claimed is not None
     return Attempt(pool, claimed)
 
 
-async def rescue(
+async def recover_attempt(
     connection: Connection,
-    slips: Slips,
+    job_queue: JobQueue,
     job: Job,
     error: Mapping[str, Any],
     *,
-    keep_slip: bool = False,
-    wait_seconds: float = 0.0,
+    keep_entry: bool = False,
+    delay_seconds: float = 0.0,
 ) -> bool:
     """Give a job whose attempt was lost to another worker; the caller holds the job's lock.
 
     A job that was to be cancelled is cancelled. One that was lost too often without getting any further is
-    failed with ``error``. With ``keep_slip`` the slip is still being delivered and goes by itself. Nobody
-    takes it up before ``wait_seconds`` are over.
+    failed with ``error``. With ``keep_entry`` the slip is still being delivered and goes by itself. Nobody
+    takes it up before ``delay_seconds`` are over.
 
     Returns:
         Whether it failed.
     """
-    if job.slip is not None and not keep_slip:
-        await slips.remove(connection, job.slip)
+    if job.slip is not None and not keep_entry:
+        await job_queue.remove(connection, job.slip)
     if job.state == "canceling":
         await end_job(connection, job, "canceled", None)
-    elif job.rescues >= MAX_RESCUES:
+    elif job.rescues >= MAX_RECOVERIES:
         message = f"{error['message']} This happened {job.rescues + 1} times without getting any further."
         await end_job(connection, job, "failed", {**error, "message": message, "rescues": job.rescues})
         return True
@@ -346,7 +358,7 @@ async def rescue(
         await add_event(connection, job.id, job.attempt, "rescued", data)
         lost = f"Lost, and queued again: {error['message']}"
         await add_log_lines(connection, job.id, job.attempt, [lost])
-        await queue_again(connection, slips, job, keep_slip=keep_slip, wait_seconds=wait_seconds)
+        await requeue_job(connection, job_queue, job, keep_entry=keep_entry, delay_seconds=delay_seconds)
     return False
 
 
@@ -356,11 +368,11 @@ async def _transaction(pool: Pool) -> AsyncIterator[Connection]:
         yield connection
 
 
-def _contents(results: Sequence[Result]) -> set[str]:
+def _digests(results: Sequence[ResultFile]) -> set[str]:
     return {result.sha256 for result in results}
 
 
-async def _show(connection: Connection, job: Job, results: Sequence[Result]) -> None:
+async def _replace_artifacts(connection: Connection, job: Job, results: Sequence[ResultFile]) -> None:
     """Put results into the place of earlier ones; the one place where they become visible."""
     await connection.execute("DELETE FROM artifacts WHERE job_id = %s", [job.id])
     await connection.execute(

@@ -10,19 +10,19 @@ from typing import Any
 
 from psycopg.rows import class_row
 
-from octasplat.workers.queue.port import QueueDepth, Slips
-from octasplat.workers.records.database import Connection, naming
-from octasplat.workers.records.errors import Conflict, Missing
-from octasplat.workers.records.ids import new_id
-from octasplat.workers.records.journal import add_event
-from octasplat.workers.records.locks import about_to_lock_jobs, lock_owner
-from octasplat.workers.records.rows import Artifact, Job
-from octasplat.workers.records.texts import as_json, as_json_or_null
+from octasplat.workers.db.connections import Connection, with_columns
+from octasplat.workers.db.errors import ConflictError, NotFoundError
+from octasplat.workers.db.events_and_logs import add_event
+from octasplat.workers.db.ids import new_id
+from octasplat.workers.db.locks import about_to_lock_jobs, lock_owner
+from octasplat.workers.db.postgres_text import as_json, as_json_or_null
+from octasplat.workers.db.rows import Artifact, Job
+from octasplat.workers.queue.protocol import JobQueue, QueueDepth
 
 
 @dataclass(frozen=True)
 class NewJob:
-    """What a job is made from; see :class:`octasplat.workers.records.rows.Job`."""
+    """What a job is made from; see :class:`octasplat.workers.db.rows.Job`."""
 
     owner: str
     kind: str
@@ -37,11 +37,11 @@ class NewJob:
     files_id: uuid.UUID | None = None
 
 
-async def create_job(connection: Connection, slips: Slips, new: NewJob) -> Job:
+async def create_job(connection: Connection, job_queue: JobQueue, new: NewJob) -> Job:
     """Write the job and its slip in one transaction."""
     async with connection.transaction():
         job_id = new_id()
-        slip = await slips.put(connection, job_id, new.queue, new.priority)
+        slip = await job_queue.enqueue(connection, job_id, new.queue, new.priority)
         await connection.execute(
             """
             INSERT INTO jobs (id, owner, kind, dataset_id, source_id, label, options, queue, priority, slip,
@@ -59,7 +59,7 @@ async def create_job(connection: Connection, slips: Slips, new: NewJob) -> Job:
                 "UPDATE datasets SET used_at = now(), expires_at = NULL WHERE id = %s", [dataset_id]
             )
         await add_event(connection, job_id, 0, "state", {"state": "queued"})
-        return await _existing(connection, job_id)
+        return await _get_job_or_raise(connection, job_id)
 
 
 async def get_job(connection: Connection, job_id: uuid.UUID, *, lock: bool = False) -> Job | None:
@@ -68,7 +68,7 @@ async def get_job(connection: Connection, job_id: uuid.UUID, *, lock: bool = Fal
     if lock:
         await about_to_lock_jobs(connection)
     async with connection.cursor(row_factory=class_row(Job)) as cursor:
-        await cursor.execute(naming(query, Job), [job_id])
+        await cursor.execute(with_columns(query, Job), [job_id])
         return await cursor.fetchone()
 
 
@@ -97,7 +97,7 @@ async def list_jobs(
     """
     async with connection.cursor(row_factory=class_row(Job)) as cursor:
         await cursor.execute(
-            naming(
+            with_columns(
                 """
             SELECT {} FROM jobs
             WHERE (%(owner)s::text IS NULL OR owner = %(owner)s)
@@ -148,7 +148,7 @@ async def queue_position(connection: Connection, job: Job) -> int | None:
     return int(row["ahead"]) if row else 0
 
 
-async def cancel_job(connection: Connection, slips: Slips, job_id: uuid.UUID) -> Job:
+async def cancel_job(connection: Connection, job_queue: JobQueue, job_id: uuid.UUID) -> Job:
     """Cancel a job: at once while it is queued, by its worker when it runs; may be repeated.
 
     Raises:
@@ -156,12 +156,12 @@ async def cancel_job(connection: Connection, slips: Slips, job_id: uuid.UUID) ->
         Missing: there is no such job.
     """
     async with connection.transaction():
-        job = await _existing(connection, job_id, lock=True)
+        job = await _get_job_or_raise(connection, job_id, lock=True)
         if job.state in ("succeeded", "failed"):
-            raise Conflict(f"The job is over ({job.state}), so it cannot be cancelled.")
+            raise ConflictError(f"The job is over ({job.state}), so it cannot be cancelled.")
         if job.state == "queued":
             if job.slip is not None:
-                await slips.remove(connection, job.slip)
+                await job_queue.remove(connection, job.slip)
             await connection.execute(
                 "UPDATE jobs SET state = 'canceled', finished_at = now(), slip = NULL WHERE id = %s", [job_id]
             )
@@ -169,15 +169,15 @@ async def cancel_job(connection: Connection, slips: Slips, job_id: uuid.UUID) ->
         elif job.state == "running":
             await connection.execute("UPDATE jobs SET state = 'canceling' WHERE id = %s", [job_id])
             await add_event(connection, job_id, job.attempt, "state", {"state": "canceling"})
-        return await _existing(connection, job_id)
+        return await _get_job_or_raise(connection, job_id)
 
 
 async def retry_job(
     connection: Connection,
-    slips: Slips,
+    job_queue: JobQueue,
     job_id: uuid.UUID,
     *,
-    fresh: bool,
+    from_start: bool,
     options: Mapping[str, Any] | None = None,
     estimate: Mapping[str, Any] | None = None,
 ) -> Job:
@@ -185,9 +185,9 @@ async def retry_job(
 
     Args:
         connection: to the database.
-        slips: the queue.
+        job_queue: the queue.
         job_id: which.
-        fresh: begin from the start, not from the newest checkpoint.
+        from_start: begin from the start, not from the newest checkpoint.
         options: complete options in the place of the job's own.
         estimate: with them, what the job will take.
 
@@ -196,10 +196,10 @@ async def retry_job(
         Missing: there is no such job.
     """
     async with connection.transaction():
-        await lock_owner(connection, (await _existing(connection, job_id)).owner)
-        job = await _existing(connection, job_id, lock=True)
+        await lock_owner(connection, (await _get_job_or_raise(connection, job_id)).owner)
+        job = await _get_job_or_raise(connection, job_id, lock=True)
         if job.state not in ("failed", "canceled"):
-            raise Conflict(f"Only failed and canceled jobs are retried; this one is {job.state}.")
+            raise ConflictError(f"Only failed and canceled jobs are retried; this one is {job.state}.")
         await connection.execute(
             """
             UPDATE jobs SET rescues = 0, error = NULL, stage = NULL, step = NULL, total_steps = NULL,
@@ -213,25 +213,25 @@ async def retry_job(
             WHERE id = %(id)s
             """,
             {
-                "fresh": fresh,
-                "forget": fresh or options is not None,
+                "fresh": from_start,
+                "forget": from_start or options is not None,
                 "options": as_json_or_null(options),
                 "estimate": as_json_or_null(estimate),
                 "id": job_id,
             },
         )
-        await queue_again(connection, slips, job)
-        return await _existing(connection, job_id)
+        await requeue_job(connection, job_queue, job)
+        return await _get_job_or_raise(connection, job_id)
 
 
-async def queue_again(
+async def requeue_job(
     connection: Connection,
-    slips: Slips,
+    job_queue: JobQueue,
     job: Job,
     *,
-    keep_slip: bool = False,
-    wait_seconds: float = 0.0,
-    quiet: bool = False,
+    keep_entry: bool = False,
+    delay_seconds: float = 0.0,
+    without_event: bool = False,
 ) -> None:
     """Put a job back into its queue with a new slip; the caller holds the job's lock.
 
@@ -240,18 +240,18 @@ async def queue_again(
 
     Args:
         connection: of the transaction.
-        slips: the queue.
+        job_queue: the queue.
         job: which.
-        keep_slip: the old slip is being delivered and goes by itself when that ends.
-        wait_seconds: for how long it is not taken up.
-        quiet: it never ceased to be queued, so that nobody needs to hear of it.
+        keep_entry: the old slip is being delivered and goes by itself when that ends.
+        delay_seconds: for how long it is not taken up.
+        without_event: it never ceased to be queued, so that nobody needs to hear of it.
     """
-    if job.slip is not None and not keep_slip:
-        await slips.remove(connection, job.slip)
-    slip = await slips.put(
-        connection, job.id, job.queue, job.priority, place_of=job.slip, wait_seconds=wait_seconds
+    if job.slip is not None and not keep_entry:
+        await job_queue.remove(connection, job.slip)
+    slip = await job_queue.enqueue(
+        connection, job.id, job.queue, job.priority, position_of=job.slip, delay_seconds=delay_seconds
     )
-    if quiet:
+    if without_event:
         await connection.execute("UPDATE jobs SET slip = %s WHERE id = %s", [slip, job.id])
         return
     await connection.execute(
@@ -274,7 +274,7 @@ async def change_job(connection: Connection, job_id: uuid.UUID, *, label: str | 
         """,
         {"label": label, "pinned": pinned, "id": job_id},
     )
-    return await _existing(connection, job_id)
+    return await _get_job_or_raise(connection, job_id)
 
 
 async def delete_job(connection: Connection, job_id: uuid.UUID) -> None:
@@ -285,10 +285,10 @@ async def delete_job(connection: Connection, job_id: uuid.UUID) -> None:
         Missing: there is no such job.
     """
     async with connection.transaction():
-        await lock_owner(connection, (await _existing(connection, job_id)).owner)
-        job = await _existing(connection, job_id, lock=True)
+        await lock_owner(connection, (await _get_job_or_raise(connection, job_id)).owner)
+        job = await _get_job_or_raise(connection, job_id, lock=True)
         if not job.is_over:
-            raise Conflict(f"The job is {job.state}; cancel it first.")
+            raise ConflictError(f"The job is {job.state}; cancel it first.")
         cursor = await connection.execute(
             """
             SELECT count(*) AS n FROM jobs
@@ -298,7 +298,7 @@ async def delete_job(connection: Connection, job_id: uuid.UUID) -> None:
         )
         row = await cursor.fetchone()
         if row and row["n"]:
-            raise Conflict(f"{row['n']} unfinished jobs work on this job's results; cancel them first.")
+            raise ConflictError(f"{row['n']} unfinished jobs work on this job's results; cancel them first.")
         await connection.execute("UPDATE jobs SET source_id = NULL WHERE source_id = %s", [job_id])
         await connection.execute("DELETE FROM jobs WHERE id = %s", [job_id])
 
@@ -307,7 +307,7 @@ async def artifacts_of(connection: Connection, job_id: uuid.UUID) -> list[Artifa
     """The results of a job, by name."""
     async with connection.cursor(row_factory=class_row(Artifact)) as cursor:
         await cursor.execute(
-            naming("SELECT {} FROM artifacts WHERE job_id = %s ORDER BY name", Artifact), [job_id]
+            with_columns("SELECT {} FROM artifacts WHERE job_id = %s ORDER BY name", Artifact), [job_id]
         )
         return await cursor.fetchall()
 
@@ -316,7 +316,7 @@ async def get_artifact(connection: Connection, job_id: uuid.UUID, name: str) -> 
     """One result of a job, or None."""
     async with connection.cursor(row_factory=class_row(Artifact)) as cursor:
         await cursor.execute(
-            naming("SELECT {} FROM artifacts WHERE job_id = %s AND name = %s", Artifact), [job_id, name]
+            with_columns("SELECT {} FROM artifacts WHERE job_id = %s AND name = %s", Artifact), [job_id, name]
         )
         return await cursor.fetchone()
 
@@ -341,8 +341,8 @@ async def running_by_queue(connection: Connection) -> dict[str, int]:
     return {row["queue"]: row["n"] for row in await cursor.fetchall()}
 
 
-async def _existing(connection: Connection, job_id: uuid.UUID, *, lock: bool = False) -> Job:
+async def _get_job_or_raise(connection: Connection, job_id: uuid.UUID, *, lock: bool = False) -> Job:
     job = await get_job(connection, job_id, lock=lock)
     if job is None:
-        raise Missing("job")
+        raise NotFoundError("job")
     return job

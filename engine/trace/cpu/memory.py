@@ -8,8 +8,12 @@ import numpy as np
 from jaxtyping import Float32, UInt8
 from numpy.typing import DTypeLike
 
-from octasplat.engine.trace.cpu.bundles import OutputGradients, Outputs, RawGradients
-from octasplat.engine.trace.kernels_native import LINE
+from octasplat.engine.trace.cpu.kernels.kernel_args import (
+    GaussianGradientArrays,
+    OutputArrays,
+    OutputGradientArrays,
+)
+from octasplat.engine.trace.kernels.native import CACHE_LINE_BYTES
 from octasplat.engine.trace.protocol import GaussianGradients, TraceGradients, TraceResult
 
 
@@ -19,12 +23,12 @@ def aligned_empty(shape: tuple[int, ...]) -> Float32[np.ndarray, "..."]:
 
 
 def _aligned_bytes(size: int) -> UInt8[np.ndarray, " b"]:
-    raw = np.empty(size + LINE, np.uint8)
-    offset = -raw.ctypes.data % LINE
+    raw = np.empty(size + CACHE_LINE_BYTES, np.uint8)
+    offset = -raw.ctypes.data % CACHE_LINE_BYTES
     return raw[offset : offset + size]
 
 
-class Pool:
+class ArrayPool:
     """Hands out arrays whose memory is used again once nobody holds any array over it.
 
     Fresh pages for large arrays would cost as much as the work done in them. An array, its slices and views
@@ -35,14 +39,14 @@ class Pool:
     def __init__(self) -> None:
         self._free: list[np.ndarray] = []
 
-    def empty(self, *wanted: tuple[tuple[int, ...], DTypeLike]) -> list[np.ndarray]:
+    def empty(self, *specs: tuple[tuple[int, ...], DTypeLike]) -> list[np.ndarray]:
         """Uninitialised arrays of such shapes and types, each from a cache line on.
 
         They lie in one block, which returns when the last of them is gone; pages are only taken when they are
         written to.
         """
-        sizes = [math.prod(shape) * np.dtype(dtype).itemsize for shape, dtype in wanted]
-        ends = list(accumulate(-(-size // LINE) * LINE for size in sizes))
+        sizes = [math.prod(shape) * np.dtype(dtype).itemsize for shape, dtype in specs]
+        ends = list(accumulate(-(-size // CACHE_LINE_BYTES) * CACHE_LINE_BYTES for size in sizes))
         size = ends[-1]
         fitting = [block for block in self._free if size <= block.nbytes <= 4 * size]
         if fitting:
@@ -50,35 +54,35 @@ class Pool:
             self._free = [other for other in self._free if other is not block]
         else:
             block = _aligned_bytes(size + size // 4)
-        lease = _Lease(block)
-        weakref.finalize(lease, _give_back, weakref.ref(self), block).atexit = False
+        lease = _BlockLease(block)
+        weakref.finalize(lease, _return_block, weakref.ref(self), block).atexit = False
         held = np.asarray(lease)
         return [
             held[begin : begin + size].view(dtype).reshape(shape)
-            for begin, size, (shape, dtype) in zip([0, *ends], sizes, wanted, strict=False)
+            for begin, size, (shape, dtype) in zip([0, *ends], sizes, specs, strict=False)
         ]
 
-    def _take_back(self, block: np.ndarray) -> None:
+    def _release(self, block: np.ndarray) -> None:
         self._free.append(block)
-        if len(self._free) > _MOST_FREE:
+        if len(self._free) > _MAX_FREE_BLOCKS:
             del self._free[0]
 
 
-_MOST_FREE = 32
+_MAX_FREE_BLOCKS = 32
 """Blocks kept for later; the one that has waited longest goes first."""
 
 
-class _Lease:
+class _BlockLease:
     """What arrays over a block refer to, so that the end of the last of them is the end of this."""
 
     def __init__(self, block: np.ndarray) -> None:
         self.__array_interface__ = block.__array_interface__
 
 
-def _give_back(pool: "weakref.ref[Pool]", block: np.ndarray) -> None:
+def _return_block(pool: "weakref.ref[ArrayPool]", block: np.ndarray) -> None:
     owner = pool()
     if owner is not None:
-        owner._take_back(block)
+        owner._release(block)
 
 
 def empty_result(rays: int, features: int) -> TraceResult:
@@ -110,43 +114,43 @@ def empty_gradients(gaussians: int, basis_count: int, features: int) -> Gaussian
     )
 
 
-def raw_gradients(gradients: GaussianGradients) -> RawGradients:
+def gradient_arrays(gradients: GaussianGradients) -> GaussianGradientArrays:
     """The arrays of ``gradients`` as kernels take them."""
     g = gradients
-    return RawGradients(
+    return GaussianGradientArrays(
         g.ids, g.means_world, g.quats_wxyz, g.log_scales, g.opacity_logits, g.sh, g.features, g.weight_sums,
         g.error_sums, g.hit_counts,
     )  # fmt: skip
 
 
-def outputs(result: TraceResult) -> Outputs:
+def output_arrays(result: TraceResult) -> OutputArrays:
     """The arrays of ``result`` as kernels take them."""
     r = result
-    return Outputs(
+    return OutputArrays(
         r.rgb_srgb, r.transmittance, r.depth_sum, r.depth_median, r.normal_world, r.features, r.hit_counts
     )
 
 
-def output_gradients(gradients: TraceGradients, rays: int, features: int) -> OutputGradients:
+def output_gradient_arrays(gradients: TraceGradients, rays: int, features: int) -> OutputGradientArrays:
     """``gradients`` as kernels take them, zero where there is none."""
     g = gradients
-    return OutputGradients(
-        contiguous(g.rgb_srgb),
-        or_zeros(g.transmittance, (rays,)),
-        or_zeros(g.depth_sum, (rays,)),
-        or_zeros(g.depth_median, (rays,)),
-        or_zeros(g.normal_world, (rays, 3)),
-        or_zeros(g.features, (rays, features)),
-        or_zeros(g.ray_errors, (rays,)),
-        g.with_geometry,
+    return OutputGradientArrays(
+        contiguous_float32(g.rgb_srgb),
+        zeros_if_none(g.transmittance, (rays,)),
+        zeros_if_none(g.depth_sum, (rays,)),
+        zeros_if_none(g.depth_median, (rays,)),
+        zeros_if_none(g.normal_world, (rays, 3)),
+        zeros_if_none(g.features, (rays, features)),
+        zeros_if_none(g.ray_errors, (rays,)),
+        g.has_geometry,
     )
 
 
-def contiguous(array: np.ndarray) -> np.ndarray:
+def contiguous_float32(array: np.ndarray) -> np.ndarray:
     """``array`` as contiguous float32, itself where it is that already."""
     return np.ascontiguousarray(array, dtype=np.float32)
 
 
-def or_zeros(array: np.ndarray | None, shape: tuple[int, ...]) -> np.ndarray:
+def zeros_if_none(array: np.ndarray | None, shape: tuple[int, ...]) -> np.ndarray:
     """``array``, or zeros where there is none."""
-    return np.zeros(shape, np.float32) if array is None else contiguous(array)
+    return np.zeros(shape, np.float32) if array is None else contiguous_float32(array)

@@ -7,54 +7,54 @@ from jaxtyping import Float32, Int32, Int64
 
 from octasplat.engine.compilation import run_on_threads, run_ranges
 from octasplat.engine.rays import RayBatch
-from octasplat.engine.trace.cpu.bundles import (
-    ByGaussian,
-    Forward,
-    Limits,
-    OneOrderHits,
-    OutputGradients,
+from octasplat.engine.trace.cpu.kernels.kernel_args import (
+    ForwardPass,
+    GaussianParameters,
+    GaussianSegments,
+    OutputGradientArrays,
+    PackedScene,
     PacketHits,
-    Parameters,
-    Rays,
-    Scene,
+    RayArrays,
+    SharedSortHits,
+    TraceLimits,
 )
-from octasplat.engine.trace.cpu.kernels_one_order import see_packets
-from octasplat.engine.trace.cpu.kernels_one_order_backward import replay_one_order
-from octasplat.engine.trace.cpu.kernels_packet import packet_starts
-from octasplat.engine.trace.cpu.kernels_packet_backward import (
+from octasplat.engine.trace.cpu.kernels.packet_backward import (
     GEOMETRY_WORDS,
     ROW_WORDS,
-    Rows,
-    replay_packets,
-    sum_packets,
-    sum_weights,
+    MomentRows,
+    backward_packets,
+    reduce_packets,
+    reduce_weights,
 )
-from octasplat.engine.trace.cpu.kernels_packet_forward import absorb_packets, trace_packets
-from octasplat.engine.trace.cpu.kernels_rays import SPARE
-from octasplat.engine.trace.cpu.kernels_sixteen import LINE
-from octasplat.engine.trace.cpu.kernels_sort import sort_by_gaussian
-from octasplat.engine.trace.cpu.memory import Pool, empty_gradients, raw_gradients
-from octasplat.engine.trace.cpu.packet_tree import PacketTree
+from octasplat.engine.trace.cpu.kernels.packet_candidates import find_packet_starts
+from octasplat.engine.trace.cpu.kernels.packet_forward import packet_transmittance, trace_packets
+from octasplat.engine.trace.cpu.kernels.radix_sort import sort_by_gaussian
+from octasplat.engine.trace.cpu.kernels.rays import HIT_PADDING
+from octasplat.engine.trace.cpu.kernels.shared_sort import trace_packets_shared_sort
+from octasplat.engine.trace.cpu.kernels.shared_sort_backward import backward_packets_shared_sort
+from octasplat.engine.trace.cpu.kernels.simd16 import PACKET_PRIMITIVE_WORDS
+from octasplat.engine.trace.cpu.memory import ArrayPool, empty_gradients, gradient_arrays
+from octasplat.engine.trace.cpu.packet_bvh import PacketBvh
 from octasplat.engine.trace.cpu.recording import CpuRecording
 from octasplat.engine.trace.protocol import GaussianGradients
 
 MAX_RAYS = 64
 """Rays of a packet: their set is the bits of one word."""
-LEAST_COSINE = 0.98
+MIN_PACKET_COSINE = 0.98
 """A packet's rays look this much (11 degrees) the way its first ray looks, so that its pyramid is narrow."""
-WORTH_A_PACKET = 3
+MIN_PACKET_RAYS = 3
 """Rays from which a packet is faster than following each alone."""
-WORTH_A_HIERARCHY = 8
+SINGLE_RAY_RATIO = 8
 """Rays in smaller groups are followed alone if they are one in so many or more; for fewer, building Embree's
 hierarchy would cost more than it saves."""
-SUM_CHUNKS = 16
+REDUCE_CHUNKS_PER_THREAD = 16
 """Chunks a thread when rows are summed: enough that no thread waits long for another."""
 
-Ways = Literal["auto", "always", "never"]
+PacketMode = Literal["auto", "always", "never"]
 
 
 def find_packets(
-    rays: RayBatch, ways: Ways = "auto", *, coloured: bool = True
+    rays: RayBatch, mode: PacketMode = "auto", *, needs_color: bool = True
 ) -> tuple[Int64[np.ndarray, "p 2"], Int64[np.ndarray, " s"]]:
     """Which rays go in packets, and which alone.
 
@@ -64,21 +64,23 @@ def find_packets(
 
     Args:
         rays: any rays.
-        ways: ``auto`` by what is faster; ``always`` (where that is possible) or ``never`` in packets.
-        coloured: whether colours matter.
+        mode: ``auto`` by what is faster; ``always`` (where that is possible) or ``never`` in packets.
+        needs_color: whether colours matter.
 
     Returns:
         First ray of each packet and the one behind its last; and the rays that go alone.
     """
     count = len(rays)
-    if ways == "never" or count == 0 or (coloured and rays.t_viewer.any()) or rays.t_leaves.any():
+    if mode == "never" or count == 0 or (needs_color and rays.t_viewer.any()) or rays.t_leaves.any():
         return np.empty((0, 2), np.int64), np.arange(count)
     starts = np.empty(count + 1, np.int64)
-    groups = packet_starts(rays.origins_world, rays.directions_world, MAX_RAYS, LEAST_COSINE, starts)
+    groups = find_packet_starts(
+        rays.origins_world, rays.directions_world, MAX_RAYS, MIN_PACKET_COSINE, starts
+    )
     packets = np.stack([starts[:groups], starts[1 : groups + 1]], axis=1)
     sizes = packets[:, 1] - packets[:, 0]
-    small = sizes < WORTH_A_PACKET
-    if ways == "always" or WORTH_A_HIERARCHY * int(sizes[small].sum()) < count:
+    small = sizes < MIN_PACKET_RAYS
+    if mode == "always" or SINGLE_RAY_RATIO * int(sizes[small].sum()) < count:
         return packets, np.empty(0, np.int64)
     return packets[~small], np.flatnonzero(np.repeat(small, sizes))
 
@@ -92,95 +94,103 @@ class PacketTracer:
         pool: where memory comes from.
     """
 
-    def __init__(self, limits: Limits, *, threads: int, pool: Pool) -> None:
+    def __init__(self, limits: TraceLimits, *, threads: int, pool: ArrayPool) -> None:
         self._limits = limits
         self._threads = threads
         self._pool = pool
-        self._tree: PacketTree | None = None
-        self._most_met = 0
+        self._bvh: PacketBvh | None = None
+        self._hit_capacity = 0
 
-    def build(self, records: Float32[np.ndarray, "n 16"]) -> None:
+    def build(self, primitives: Float32[np.ndarray, "n 16"]) -> None:
         """Build the hierarchy."""
-        self._tree = PacketTree(records, self._threads)
+        self._bvh = PacketBvh(primitives, self._threads)
 
-    def refresh(self, records: Float32[np.ndarray, "n 16"], ids: Int32[np.ndarray, " u"]) -> None:
+    def refresh(self, primitives: Float32[np.ndarray, "n 16"], ids: Int32[np.ndarray, " u"]) -> None:
         """Take changed records over, and refit the hierarchy."""
-        assert self._tree is not None, "build first"
-        self._tree.refresh(records, ids)
+        assert self._bvh is not None, "build first"
+        self._bvh.refresh(primitives, ids)
 
-    def room(self, packets: Int64[np.ndarray, "p 2"], rays: int, *, recording: bool) -> PacketHits:
+    def allocate_hits(
+        self, packets: Int64[np.ndarray, "p 2"], rays: int, *, is_recording: bool
+    ) -> PacketHits:
         """Memory for what packets keep of their hits."""
-        places = rays * (self._limits.max_hits + SPARE) if recording and len(packets) else 0
+        places = rays * (self._limits.max_hits + HIT_PADDING) if is_recording and len(packets) else 0
         numbers, whole = ((places,), np.float32), ((places,), np.int32)
         us, vs, slots, slot_ids, slot_rgb = self._pool.empty(
             numbers, numbers, whole, whole, ((places, 3), np.float32)
         )
         return PacketHits(us, vs, slots, slot_ids, slot_rgb, slot_counts=np.zeros(len(packets), np.int32))
 
-    def trace(self, forward: Forward, packets: Int64[np.ndarray, "p 2"], kept: PacketHits) -> None:
+    def trace(self, forward: ForwardPass, packets: Int64[np.ndarray, "p 2"], packet_hits: PacketHits) -> None:
         """Follow the rays of the packets."""
-        assert self._tree is not None, "build first"
+        assert self._bvh is not None, "build first"
         run_on_threads(
-            trace_packets, self._threads, forward, packets, self._tree.arrays, kept, np.zeros(1, np.int64)
+            trace_packets,
+            self._threads,
+            forward,
+            packets,
+            self._bvh.arrays,
+            packet_hits,
+            np.zeros(1, np.int64),
         )
 
-    def trace_in_one_order(
-        self, forward: Forward, packets: Int64[np.ndarray, "p 2"], rays: int
-    ) -> OneOrderHits:
+    def trace_shared_sort(
+        self, forward: ForwardPass, packets: Int64[np.ndarray, "p 2"], rays: int
+    ) -> SharedSortHits:
         """Follow the rays of the packets, those of a packet through its Gaussians in one order.
 
         How many a packet will meet is not known before, so that what has no room is traced again.
         """
-        assert self._tree is not None, "build first"
+        assert self._bvh is not None, "build first"
         while True:
-            places = self._most_met if forward.recording else 0
+            places = self._hit_capacity if forward.is_recording else 0
             ids, bits, lines, starts, counts, frames, left = self._pool.empty(
-                ((places,), np.int32), ((places,), np.uint64), ((places, LINE), np.float32),
+                ((places,), np.int32), ((places,), np.uint64), ((places, PACKET_PRIMITIVE_WORDS), np.float32),
                 ((len(packets),), np.int64), ((len(packets),), np.int32), ((len(packets), 9), np.float64),
                 ((rays,), np.float32),
             )  # fmt: skip
-            kept = OneOrderHits(ids, bits, lines, starts, counts, frames, left)
+            kept = SharedSortHits(ids, bits, lines, starts, counts, frames, left)
             met = np.zeros(1, np.int64)
             run_on_threads(
-                see_packets, self._threads,
-                forward, packets, self._tree.arrays, kept, np.zeros(1, np.int64), met,
+                trace_packets_shared_sort, self._threads,
+                forward, packets, self._bvh.arrays, kept, np.zeros(1, np.int64), met,
             )  # fmt: skip
-            if met[0] <= places or not forward.recording:
+            if met[0] <= places or not forward.is_recording:
                 left[:] = forward.out.transmittance
                 return kept
-            self._most_met = int(met[0]) * 5 // 4
+            self._hit_capacity = int(met[0]) * 5 // 4
 
-    def absorb(
+    def write_transmittance(
         self,
-        rays: Rays,
-        scene: Scene,
+        rays: RayArrays,
+        scene: PackedScene,
         packets: Int64[np.ndarray, "p 2"],
         transmittance: Float32[np.ndarray, " r"],
     ) -> None:
         """Write the transmittance of the rays of the packets."""
-        assert self._tree is not None, "build first"
+        assert self._bvh is not None, "build first"
         run_on_threads(
-            absorb_packets, self._threads,
-            rays, scene, self._limits, packets, self._tree.arrays, np.zeros(1, np.int64), transmittance,
+            packet_transmittance, self._threads,
+            rays, scene, self._limits, packets, self._bvh.arrays, np.zeros(1, np.int64), transmittance,
         )  # fmt: skip
 
     def backward(
         self,
         recording: CpuRecording,
-        gradients: OutputGradients,
-        scene: Scene,
-        parameters: Parameters,
-        least_weight: float,
+        gradients: OutputGradientArrays,
+        scene: PackedScene,
+        parameters: GaussianParameters,
+        min_blend_weight: float,
     ) -> GaussianGradients:
         """Gradients of the raw parameters: summed within each packet, then over packets in their order.
 
-        Gaussians whose weights add up to less than ``least_weight`` are left out before the sums.
+        Gaussians whose weights add up to less than ``min_blend_weight`` are left out before the sums.
         """
-        kept = recording.kept
-        counts = kept.counts if isinstance(kept, OneOrderHits) else kept.slot_counts
+        kept = recording.packet_hits
+        counts = kept.counts if isinstance(kept, SharedSortHits) else kept.slot_counts
         firsts = np.concatenate([[0], np.cumsum(counts, dtype=np.int64)])
         count, basis_count, feature_count = int(firsts[-1]), scene.sh.shape[1], scene.features.shape[1]
-        geometry = GEOMETRY_WORDS if gradients.with_geometry else 0
+        geometry = GEOMETRY_WORDS if gradients.has_geometry else 0
         ids, weights, sums, by_geometry, features = self._pool.empty(
             ((count,), np.int32),
             ((count,), np.float32),
@@ -188,26 +198,38 @@ class PacketTracer:
             ((count, geometry), np.float32),
             ((count, feature_count), np.float32),
         )
-        rows = Rows(firsts, ids, weights, sums, by_geometry, features)
-        rays, packets, counter = Rays.of(recording.rays), recording.packets, np.zeros(1, np.int64)
-        if isinstance(kept, OneOrderHits):
+        rows = MomentRows(firsts, ids, weights, sums, by_geometry, features)
+        rays, packets, counter = (
+            RayArrays.from_batch(recording.rays),
+            recording.packets,
+            np.zeros(1, np.int64),
+        )
+        if isinstance(kept, SharedSortHits):
             run_on_threads(
-                replay_one_order, self._threads, rays, packets, kept, self._limits, gradients, counter, rows
+                backward_packets_shared_sort,
+                self._threads,
+                rays,
+                packets,
+                kept,
+                self._limits,
+                gradients,
+                counter,
+                rows,
             )
         else:
             run_on_threads(
-                replay_packets, self._threads,
+                backward_packets, self._threads,
                 rays, packets, recording.hits, kept, recording.counts, parameters, scene.features,
                 self._limits, gradients, counter, rows,
             )  # fmt: skip
-        by_gaussian = ByGaussian(*sort_by_gaussian(rows.ids, len(parameters.means), self._threads))
+        by_gaussian = GaussianSegments(*sort_by_gaussian(rows.ids, len(parameters.means), self._threads))
         met = np.empty(len(by_gaussian.starts) - 1, np.float32)
-        run_ranges(sum_weights, self._threads, len(met), by_gaussian, rows.weights, met)
-        which = np.flatnonzero(met >= least_weight)
+        run_ranges(reduce_weights, self._threads, len(met), by_gaussian, rows.weights, met)
+        which = np.flatnonzero(met >= min_blend_weight)
         out = empty_gradients(len(which), basis_count, feature_count)
         run_on_threads(
-            sum_packets, self._threads,
+            reduce_packets, self._threads,
             rays, packets, parameters, scene, self._limits, by_gaussian, which, rows,
-            SUM_CHUNKS * self._threads, np.zeros(1, np.int64), raw_gradients(out),
+            REDUCE_CHUNKS_PER_THREAD * self._threads, np.zeros(1, np.int64), gradient_arrays(out),
         )  # fmt: skip
         return out

@@ -8,28 +8,35 @@ from octasplat.engine.compilation import run_ranges
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.rays import RayBatch
 from octasplat.engine.threads import use_threads
-from octasplat.engine.trace.cpu.bundles import (
-    Forward,
-    Hits,
-    Limits,
-    OneOrderHits,
+from octasplat.engine.trace.cpu.kernels.kernel_args import (
+    ForwardPass,
+    GaussianParameters,
+    HitArrays,
+    PackedScene,
     PacketHits,
-    Parameters,
-    Rays,
-    Scene,
+    RayArrays,
+    SharedSortHits,
+    TraceLimits,
 )
-from octasplat.engine.trace.cpu.kernels_hit import RECORD_WORDS
-from octasplat.engine.trace.cpu.kernels_rays import SPARE
-from octasplat.engine.trace.cpu.kernels_records import (
-    outgrown_boxes,
-    refresh_records,
+from octasplat.engine.trace.cpu.kernels.octagon_hit import PRIMITIVE_WORDS
+from octasplat.engine.trace.cpu.kernels.packed_primitives import (
+    pack_primitives,
+    refit_outgrown_boxes,
+    repack_primitives,
     write_boxes,
-    write_records,
 )
-from octasplat.engine.trace.cpu.memory import Pool, aligned_empty, empty_result, output_gradients, outputs
-from octasplat.engine.trace.cpu.packets import PacketTracer, Ways, find_packets
+from octasplat.engine.trace.cpu.kernels.rays import HIT_PADDING
+from octasplat.engine.trace.cpu.memory import (
+    ArrayPool,
+    aligned_empty,
+    empty_result,
+    output_arrays,
+    output_gradient_arrays,
+)
+from octasplat.engine.trace.cpu.packets import PacketMode, PacketTracer, find_packets
 from octasplat.engine.trace.cpu.recording import CpuRecording
 from octasplat.engine.trace.cpu.single_rays import SingleRayTracer
+from octasplat.engine.trace.gradient_sums import add_gradients, drop_low_weight
 from octasplat.engine.trace.protocol import (
     GaussianGradients,
     Recording,
@@ -37,7 +44,6 @@ from octasplat.engine.trace.protocol import (
     TraceResult,
     TraceSettings,
 )
-from octasplat.engine.trace.sums import add_gradients, heavier
 
 MAX_RAYS_PER_TRACE = 1 << 28
 
@@ -52,9 +58,9 @@ class CpuTracer:
     A hierarchy only says which octagons to test, the test and the distance come from the parameters, and hits
     are ordered by (float32 distance, id). So neither the shape of a hierarchy nor the number of threads
     changes a result. Single rays test in float64; packets in float32 in a frame of their own
-    (:mod:`octasplat.engine.trace.cpu.kernels_packet`), so that the two agree but for that rounding, which is
+    (:mod:`octasplat.engine.trace.cpu.kernels.packet_candidates`), so that the two agree but for that rounding, which is
     largest for needles and for octagons seen edge on. Where ``settings.order`` is ``packet``, the rays of a
-    packet composite in one order (:mod:`octasplat.engine.trace.cpu.kernels_one_order`), unless Gaussians have
+    packet composite in one order (:mod:`octasplat.engine.trace.cpu.kernels.shared_sort`), unless Gaussians have
     features or there is a second phase. Memory per Gaussian: a record of 64 B, 48 B of the packets' hierarchy
     and a box of 24 B; Embree's hierarchy over the boxes is built when single rays first want it.
 
@@ -66,7 +72,7 @@ class CpuTracer:
         box_padding: fraction of its size by which a Gaussian's box for single rays is enlarged; Embree's
             hierarchy has to be built anew when one leaves it. The packets' boxes are refitted.
         build_quality: Embree's: 0 low, 1 medium, 2 high.
-        packets: whether rays go in packets: "auto" decides by what is faster.
+        packet_mode: whether rays go in packets: "auto" decides by what is faster.
     """
 
     def __init__(
@@ -76,38 +82,43 @@ class CpuTracer:
         threads: int = 0,
         box_padding: float = 0.0,
         build_quality: int = 1,
-        packets: Ways = "auto",
+        packet_mode: PacketMode = "auto",
     ) -> None:
         self.settings = settings or TraceSettings()
         self.threads = threads or int(numba.config.NUMBA_NUM_THREADS)
-        self._limits = Limits.of(self.settings)
+        self._limits = TraceLimits.from_settings(self.settings)
         self._padding = box_padding
-        self._ways = packets
-        self._pool = Pool()
-        self._singles = SingleRayTracer(self._limits, threads=self.threads, build_quality=build_quality)
-        self._packets = PacketTracer(self._limits, threads=self.threads, pool=self._pool)
-        self._built_singles = False
+        self._packet_mode = packet_mode
+        self._pool = ArrayPool()
+        self._single_tracer = SingleRayTracer(self._limits, threads=self.threads, build_quality=build_quality)
+        self._packet_tracer = PacketTracer(self._limits, threads=self.threads, pool=self._pool)
+        self._is_single_built = False
         self._gaussians: FlatGaussians | None = None
         self._features = np.empty((0, 0), np.float32)
-        self._records = aligned_empty((0, RECORD_WORDS))
+        self._primitives = aligned_empty((0, PRIMITIVE_WORDS))
         self._boxes = np.empty((0, 6), np.float32)
-        self._build = object()
+        self._build_id = object()
 
     def build(self, gaussians: FlatGaussians, features: Float32[np.ndarray, "n f"] | None = None) -> None:
         """Take over ``gaussians`` (kept by reference) and build the hierarchy around them."""
         use_threads(self.threads)
         count = len(gaussians)
-        if len(self._records) != count:
-            self._records = aligned_empty((count, RECORD_WORDS))
+        if len(self._primitives) != count:
+            self._primitives = aligned_empty((count, PRIMITIVE_WORDS))
             self._boxes = np.empty((count, 6), np.float32)
         self._gaussians = gaussians
         self._features = np.empty((count, 0), np.float32) if features is None else features
         run_ranges(
-            write_records, self.threads, count, self._records, *Parameters.of(gaussians), self.settings.q
+            pack_primitives,
+            self.threads,
+            count,
+            self._primitives,
+            *GaussianParameters.from_gaussians(gaussians),
+            self.settings.q,
         )
-        self._packets.build(self._records)
-        self._built_singles = False
-        self._build = object()
+        self._packet_tracer.build(self._primitives)
+        self._is_single_built = False
+        self._build_id = object()
 
     def refresh(self, ids: Int32[np.ndarray, " u"] | None = None) -> None:
         """Read changed parameters without rebuilding; see the protocol."""
@@ -115,103 +126,111 @@ class CpuTracer:
         use_threads(self.threads)
         if ids is None:
             ids = np.arange(len(self._gaussians), dtype=np.int32)
-        parameters, q = Parameters.of(self._gaussians), self.settings.q
-        run_ranges(refresh_records, self.threads, len(ids), self._records, ids, *parameters, q)
-        self._packets.refresh(self._records, ids)
-        if self._built_singles:
+        parameters, q = GaussianParameters.from_gaussians(self._gaussians), self.settings.q
+        run_ranges(repack_primitives, self.threads, len(ids), self._primitives, ids, *parameters, q)
+        self._packet_tracer.refresh(self._primitives, ids)
+        if self._is_single_built:
             outgrown = np.zeros(len(ids), np.bool_)
             run_ranges(
-                outgrown_boxes, self.threads, len(ids),
+                refit_outgrown_boxes, self.threads, len(ids),
                 outgrown, self._boxes, ids, *parameters, q, self._padding,
             )  # fmt: skip
-            self._built_singles = not outgrown.any()
+            self._is_single_built = not outgrown.any()
 
     def trace(self, rays: RayBatch, *, record: bool = False) -> TraceResult:
         """Follow rays; see the protocol. Directions must have unit length."""
-        packets, alone = self._sorted_out(rays, coloured=True)
+        packets, alone = self._split_packets(rays, needs_color=True)
         count = len(rays)
         result = empty_result(count, self._features.shape[1])
-        in_one_order = len(packets) > 0 and self._in_one_order
-        hits = self._room(count if record and not (in_one_order and len(alone) == 0) else 0)
-        forward = Forward(Rays.of(rays), self._scene, self._limits, outputs(result), hits, record)
-        kept: PacketHits | OneOrderHits
+        in_one_order = len(packets) > 0 and self._uses_shared_sort
+        hits = self._allocate_hits(count if record and not (in_one_order and len(alone) == 0) else 0)
+        forward = ForwardPass(
+            RayArrays.from_batch(rays), self._packed_scene, self._limits, output_arrays(result), hits, record
+        )
+        kept: PacketHits | SharedSortHits
         if in_one_order:
-            kept = self._packets.trace_in_one_order(forward, packets, count)
+            kept = self._packet_tracer.trace_shared_sort(forward, packets, count)
         else:
-            kept = self._packets.room(packets, count, recording=record)
+            kept = self._packet_tracer.allocate_hits(packets, count, is_recording=record)
             if len(packets):
-                self._packets.trace(forward, packets, kept)
+                self._packet_tracer.trace(forward, packets, kept)
         if len(alone):
-            self._singles.trace(forward, alone)
+            self._single_tracer.trace(forward, alone)
         if record:
-            result.hits = CpuRecording(
-                rays, result.hit_counts, packets, alone, hits, kept, self._limits, self._build
+            result.recording = CpuRecording(
+                rays, result.hit_counts, packets, alone, hits, kept, self._limits, self._build_id
             )
         return result
 
     def transmittance(self, rays: RayBatch) -> Float32[np.ndarray, " r"]:
         """What light is left along each ray; see the protocol."""
-        packets, alone = self._sorted_out(rays, coloured=False)
+        packets, alone = self._split_packets(rays, needs_color=False)
         left = np.empty(len(rays), np.float32)
         if len(packets):
-            self._packets.absorb(Rays.of(rays), self._scene, packets, left)
+            self._packet_tracer.write_transmittance(
+                RayArrays.from_batch(rays), self._packed_scene, packets, left
+            )
         if len(alone):
-            self._singles.absorb(Rays.of(rays), self._scene, alone, left)
+            self._single_tracer.write_transmittance(
+                RayArrays.from_batch(rays), self._packed_scene, alone, left
+            )
         return left
 
     def backward(
-        self, hits: Recording, gradients: TraceGradients, *, least_weight: float = 0.0
+        self, recording: Recording, gradients: TraceGradients, *, min_blend_weight: float = 0.0
     ) -> GaussianGradients:
         """Gradients of the raw parameters; see the protocol."""
-        if not isinstance(hits, CpuRecording) or hits.build is not self._build:
+        if not isinstance(recording, CpuRecording) or recording.build_id is not self._build_id:
             raise ValueError("the recording is not of this tracer, or older than its last build")
         assert self._gaussians is not None
         use_threads(self.threads)
-        if isinstance(hits.kept, OneOrderHits) and gradients.with_geometry:
+        if isinstance(recording.packet_hits, SharedSortHits) and gradients.has_geometry:
             raise ValueError("depths and normals have no gradients in one order: trace with sort='ray'")
-        given = output_gradients(gradients, len(hits.rays), self._features.shape[1])
-        parameters = Parameters.of(self._gaussians)
-        if len(hits.alone) == 0:
-            return self._packets.backward(hits, given, self._scene, parameters, least_weight)
+        given = output_gradient_arrays(gradients, len(recording.rays), self._features.shape[1])
+        parameters = GaussianParameters.from_gaussians(self._gaussians)
+        if len(recording.single_rays) == 0:
+            return self._packet_tracer.backward(
+                recording, given, self._packed_scene, parameters, min_blend_weight
+            )
         parts = []
-        if len(hits.packets):
-            parts.append(self._packets.backward(hits, given, self._scene, parameters, 0.0))
-        parts.append(self._singles.backward(hits, given, self._scene, parameters))
-        return heavier(add_gradients(parts), least_weight)
+        if len(recording.packets):
+            parts.append(self._packet_tracer.backward(recording, given, self._packed_scene, parameters, 0.0))
+        parts.append(self._single_tracer.backward(recording, given, self._packed_scene, parameters))
+        return drop_low_weight(add_gradients(parts), min_blend_weight)
 
     @property
-    def _in_one_order(self) -> bool:
+    def _uses_shared_sort(self) -> bool:
         one_phase = self.settings.second_phase_min is None
         return self.settings.sort == "packet" and one_phase and self._features.shape[1] == 0
 
     @property
-    def _scene(self) -> Scene:
+    def _packed_scene(self) -> PackedScene:
         assert self._gaussians is not None, "build first"
-        return Scene(self._records, self._gaussians.sh, self._features)
+        return PackedScene(self._primitives, self._gaussians.sh, self._features)
 
-    def _sorted_out(
-        self, rays: RayBatch, *, coloured: bool
+    def _split_packets(
+        self, rays: RayBatch, *, needs_color: bool
     ) -> tuple[Int64[np.ndarray, "p 2"], Int64[np.ndarray, " s"]]:
         """Packets and single rays of a batch, with what they need ready."""
         assert len(rays) < MAX_RAYS_PER_TRACE
         use_threads(self.threads)
-        packets, alone = find_packets(rays, self._ways, coloured=coloured)
-        if len(alone) and not self._built_singles:
+        packets, alone = find_packets(rays, self._packet_mode, needs_color=needs_color)
+        if len(alone) and not self._is_single_built:
             assert self._gaussians is not None, "build first"
-            parameters = Parameters.of(self._gaussians)
+            parameters = GaussianParameters.from_gaussians(self._gaussians)
             run_ranges(
                 write_boxes, self.threads, len(self._boxes),
                 self._boxes, *parameters, self.settings.q, self._padding,
             )  # fmt: skip
-            self._singles.build(self._boxes)
-            self._built_singles = True
+            self._single_tracer.build(self._boxes)
+            self._is_single_built = True
         return packets, alone
 
-    def _room(self, rays: int) -> Hits:
+    def _allocate_hits(self, rays: int) -> HitArrays:
         """Memory for the hits of so many recorded rays."""
-        places = rays * (self._limits.max_hits + SPARE)
+        places = rays * (self._limits.max_hits + HIT_PADDING)
         numbers = ((places,), np.float32)
         ids, alphas, distances, rgb = self._pool.empty(
             ((places,), np.int32), numbers, numbers, ((places, 3), np.float32)
         )
-        return Hits(np.empty(rays, np.int64), ids, alphas, distances, rgb)
+        return HitArrays(np.empty(rays, np.int64), ids, alphas, distances, rgb)

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float32, Float64, Int64
 from scipy.spatial import cKDTree
 
-from octasplat.engine.gaussians.frames import quaternions
+from octasplat.engine.gaussians.frames import quaternions_from_matrices
 from octasplat.engine.gaussians.materials import ALBEDO, METALLIC, ROUGHNESS
 from octasplat.engine.gaussians.model import SH_C0, FlatGaussians
 from octasplat.engine.shading.material_settings import (
@@ -131,7 +131,7 @@ def propagate_normals(gaussians: FlatGaussians) -> None:
     length = np.linalg.norm(mean, axis=1, keepdims=True)
     mean = np.where(length > 0, mean / np.maximum(length, 1e-12), normals)
     turned = np.einsum("nij,njk->nik", _turns(normals, mean), frames)
-    gaussians.quats_wxyz[:] = quaternions(turned).astype(np.float32)
+    gaussians.quats_wxyz[:] = quaternions_from_matrices(turned).astype(np.float32)
 
 
 def _turns(

@@ -15,8 +15,8 @@ import click
 from octasplat.engine.errors import ConfigError
 from octasplat.engine.operations.reconstruct import ReconstructOptions
 from octasplat.engine.renamed_settings import tell_renamed
-from octasplat.workers.cli.options import export_names, exports_option, quiet_option
-from octasplat.workers.cli.request_options import request_of, request_options
+from octasplat.workers.cli.options import exports_option, parse_export_names, quiet_option
+from octasplat.workers.cli.request_options import request_from_options, request_options
 
 if TYPE_CHECKING:
     from octasplat.workers.client.api import Api
@@ -80,11 +80,11 @@ def submit(
 
     The same command goes on with an upload that broke off.
     """
-    from octasplat.workers.cli.submitting import submit, submit_and_wait
+    from octasplat.workers.cli.remote_jobs import submit, submit_and_wait
     from octasplat.workers.client.submission import Submission
 
     _check_output(output, wait=wait)
-    options: ReconstructOptions = request_of(ReconstructOptions, given)
+    options: ReconstructOptions = request_from_options(ReconstructOptions, given)
     options.config()  # what cannot be used is refused before anything is sent
     asked = options.model_dump(mode="json", exclude_unset=True)
     what = Submission(scene, asked, label, queue, priority)
@@ -163,7 +163,7 @@ def derive(
     octasplat derive edit last --file meshes=edited.ply, or: octasplat derive import --file file=a.splat
     """
     from octasplat.workers.cli.named_files import with_named_files
-    from octasplat.workers.cli.submitting import derive, submit_and_wait
+    from octasplat.workers.cli.remote_jobs import derive, submit_and_wait
     from octasplat.workers.client.submission import (
         Derivation,
         with_camera_path,
@@ -174,11 +174,11 @@ def derive(
     _check_output(output, wait=wait)
     if former_on is not None:
         tell_renamed({"--on": "--other-dataset"})
-    files = [_file_given(text) for text in given["files"]]
+    files = [_parse_file_option(text) for text in given["files"]]
     with connected(server) as api:
-        source = None if job_id is None else _job(api, job_id)["id"]
+        source = None if job_id is None else _get_job(api, job_id)["id"]
         what = Derivation(
-            source, kind, _assigned({}, given["assignments"]), scene=other_dataset or former_on,
+            source, kind, _with_assignments({}, given["assignments"]), scene=other_dataset or former_on,
             label=given["label"], queue=given["queue"], priority=given["priority"],
         )  # fmt: skip
         what = with_named_files(what, files)
@@ -206,7 +206,9 @@ def jobs(state: tuple[str, ...], limit: int, server: str | None) -> None:
     if not found:
         click.echo("No jobs.")
     for job in found:
-        line = f"{job['id']}  {job['state']:9}  {job['kind']:11}  {_where(job):22}  {_decibels(job):8}"
+        line = (
+            f"{job['id']}  {job['state']:9}  {job['kind']:11}  {_progress_text(job):22}  {_decibels(job):8}"
+        )
         click.echo(f"{line}  {job['label'] or ''}".rstrip())
 
 
@@ -218,16 +220,16 @@ def jobs(state: tuple[str, ...], limit: int, server: str | None) -> None:
 @quiet_option
 def status(job_id: str, wait: bool, as_json: bool, server: str | None, quiet: bool) -> None:
     """Show how far JOB is; 'last' is the newest one."""
-    from octasplat.workers.cli.submitting import wait_for
+    from octasplat.workers.cli.remote_jobs import wait_for
 
     with connected(server) as api:
-        job = _job(api, job_id)
+        job = _get_job(api, job_id)
         if wait:
             job = wait_for(api, job["id"], quiet=quiet or as_json)
     if as_json:
         click.echo(json.dumps(job, indent=2))
         return
-    click.echo(f"{job['kind']} {job['id']}: {job['state']} {_where(job)}".rstrip())
+    click.echo(f"{job['kind']} {job['id']}: {job['state']} {_progress_text(job)}".rstrip())
     if job.get("estimate") and job["state"] in ("queued", "running"):
         click.echo(f"Estimated when it was asked for: {job['estimate']['text']}, within a factor of two.")
     for note in job.get("notes", ()):
@@ -247,20 +249,20 @@ def status(job_id: str, wait: bool, as_json: bool, server: str | None, quiet: bo
 def logs(job_id: str, follow: bool, server: str | None) -> None:
     """Show what JOB did when, and what its program wrote; times are this machine's."""
     with connected(server) as api:
-        job = _job(api, job_id)
+        job = _get_job(api, job_id)
         after = 0
         while True:
             over = job["state"] in ("succeeded", "failed", "canceled")
             page = api.get(f"/v1/jobs/{job['id']}/logs", after=after)
             for line in page["lines"]:
-                click.echo(f"{_clock(line['at'])}  {line['text']}")
+                click.echo(f"{_local_time(line['at'])}  {line['text']}")
             after = page["next"]
             if page["lines"]:
                 continue
             if over or not follow:
                 return
             time.sleep(1)
-            job = _job(api, job["id"])
+            job = _get_job(api, job["id"])
 
 
 @click.command(short_help="Stop a job.")
@@ -269,7 +271,7 @@ def logs(job_id: str, follow: bool, server: str | None) -> None:
 def cancel(job_id: str, server: str | None) -> None:
     """Stop JOB; it keeps its checkpoint."""
     with connected(server) as api:
-        job = api.post(f"/v1/jobs/{_job(api, job_id)['id']}/cancel")
+        job = api.post(f"/v1/jobs/{_get_job(api, job_id)['id']}/cancel")
     click.echo(f"{job['id']}: {job['state']}")
 
 
@@ -287,8 +289,8 @@ def retry(job_id: str, from_start: bool, server: str | None, **given: Any) -> No
     """
     body: dict[str, Any] = {"from": "start" if from_start else "checkpoint"}
     with connected(server) as api:
-        job = _job(api, job_id)
-        if options := _changes(given, job):
+        job = _get_job(api, job_id)
+        if options := _changed_options(given, job):
             body["options"] = options
         job = api.post(f"/v1/jobs/{job['id']}/retry", body)
     click.echo(f"{job['id']}: {job['state']}")
@@ -306,11 +308,11 @@ def download(
     job_id: str, names: tuple[str, ...], output: Path | None, server: str | None, quiet: bool
 ) -> None:
     """Save the results of JOB, or only those called NAMES; goes on where it broke off."""
-    from octasplat.workers.cli.submitting import fetch
+    from octasplat.workers.cli.remote_jobs import download_results
 
     with connected(server) as api:
-        job = _job(api, job_id)
-        fetch(api, job["id"], output or Path(f"octasplat-{job['id'][-12:]}"), names, quiet=quiet)
+        job = _get_job(api, job_id)
+        download_results(api, job["id"], output or Path(f"octasplat-{job['id'][-12:]}"), names, quiet=quiet)
 
 
 def _check_output(output: Path | None, *, wait: bool) -> None:
@@ -319,20 +321,20 @@ def _check_output(output: Path | None, *, wait: bool) -> None:
         raise click.UsageError("-o goes with --wait; octasplat download saves the results later.")
 
 
-def _changes(given: dict[str, Any], job: dict[str, Any]) -> dict[str, Any]:
+def _changed_options(given: dict[str, Any], job: dict[str, Any]) -> dict[str, Any]:
     """What is to be otherwise in the options of a job."""
-    exports = export_names(given["exports"])
+    exports = parse_export_names(given["exports"])
     options: dict[str, Any] = {} if exports is None else {"exports": list(exports)}
     if job["kind"] != "reconstruct":
         # The service replaces an option as a whole, of which a name with dots is only a part.
         sections = {assignment.partition("=")[0].partition(".") for assignment in given["assignments"]}
         known = {name.strip(): job["options"].get(name.strip()) for name, dot, _ in sections if dot}
         kept = {name: value for name, value in copy.deepcopy(known).items() if isinstance(value, dict)}
-        return _assigned(kept | options, given["assignments"])
+        return _with_assignments(kept | options, given["assignments"])
     return options | ({"assignments": list(given["assignments"])} if given["assignments"] else {})
 
 
-def _file_given(text: str) -> tuple[str, Path]:
+def _parse_file_option(text: str) -> tuple[str, Path]:
     """What ``--file`` says: the option, and the file."""
     name, equals, path = text.partition("=")
     if not equals or not path:
@@ -340,7 +342,7 @@ def _file_given(text: str) -> tuple[str, Path]:
     return name.strip(), Path(path)
 
 
-def _assigned(options: dict[str, Any], assignments: tuple[str, ...]) -> dict[str, Any]:
+def _with_assignments(options: dict[str, Any], assignments: tuple[str, ...]) -> dict[str, Any]:
     """The options with ``--set`` on top."""
     for assignment in assignments:
         name, equals, text = assignment.partition("=")
@@ -360,7 +362,7 @@ def _assigned(options: dict[str, Any], assignments: tuple[str, ...]) -> dict[str
     return options
 
 
-def _job(api: "Api", job_id: str) -> dict[str, Any]:
+def _get_job(api: "Api", job_id: str) -> dict[str, Any]:
     if job_id != "last":
         job: dict[str, Any] = api.get(f"/v1/jobs/{job_id}")
         return job
@@ -376,12 +378,12 @@ def _decibels(job: dict[str, Any]) -> str:
     return "" if job["psnr"] is None else f"{job['psnr']:.2f} dB"
 
 
-def _clock(at: str) -> str:
+def _local_time(at: str) -> str:
     """A time of the service as this machine's clock shows it."""
     return datetime.fromisoformat(at).astimezone().strftime("%H:%M:%S")
 
 
-def _where(job: dict[str, Any]) -> str:
+def _progress_text(job: dict[str, Any]) -> str:
     """How far a job is, in a few words."""
     if job["state"] == "queued":
         ahead = job["queue_position"]

@@ -34,7 +34,7 @@ def list_settings(everything: bool, group: str | None, markdown: bool, as_json: 
     wanted = group or ("" if everything else "basic")
     entries = [entry for entry in settings() if not wanted or entry.group == wanted]
     if as_json:
-        _write_json([_entry(entry) for entry in entries])
+        _write_json([_entry_as_dict(entry) for entry in entries])
         return
     width = max(len(entry.name) for entry in entries)
     for entry in entries:
@@ -53,7 +53,7 @@ def explain(name: str, as_json: bool) -> None:
 
     entry = setting_named(name)
     if as_json:
-        _write_json(_entry(entry))
+        _write_json(_entry_as_dict(entry))
         return
     click.echo(f"{entry.name} ({entry.group})")
     for line in textwrap.wrap(entry.description, 92):
@@ -94,7 +94,7 @@ def diff(run: Path, other: Path | None, as_json: bool) -> None:
         click.echo(f"No setting differs from {what}.")
 
 
-def _entry(entry: Any) -> dict[str, Any]:
+def _entry_as_dict(entry: Any) -> dict[str, Any]:
     return {**asdict(entry), "default": entry.default}
 
 

@@ -10,9 +10,9 @@ from octasplat.engine import renamed_settings
 from octasplat.engine.fields import Output, Spelling, Unit
 from octasplat.engine.operations.base import Request
 from octasplat.engine.train.preset_names import PresetName
-from octasplat.workers.cli.browsing import has_display
+from octasplat.workers.cli.browser import has_display
 from octasplat.workers.cli.options import quiet_option, threads_option
-from octasplat.workers.cli.request_options import request_of, request_options
+from octasplat.workers.cli.request_options import request_from_options, request_options
 
 
 class DemoRequest(Request):
@@ -46,17 +46,17 @@ class DemoRequest(Request):
 @quiet_option
 def demo(open_report: bool | None, threads: int, quiet: bool, **given: Any) -> None:
     """Make a scene and reconstruct it; the text of the request is the help."""
-    from octasplat.workers.cli.demonstration import make_scene, reconstruct_scene
+    from octasplat.workers.cli.demo_run import make_demo_scene, reconstruct_demo_scene
 
-    request: DemoRequest = request_of(DemoRequest, given)
+    request: DemoRequest = request_from_options(DemoRequest, given)
     output = request.output
     size = {"views": request.views, "width_px": request.width_px, "height_px": request.height_px}
     if request.dataset_only:
-        make_scene(output, size, quiet=quiet)
+        make_demo_scene(output, size, quiet=quiet)
         click.echo(f"The dataset is in {output}; reconstruct it with: octasplat reconstruct {output} -o OUT")
         return
-    make_scene(output / "scene", size, quiet=quiet)
-    report = reconstruct_scene(
+    make_demo_scene(output / "scene", size, quiet=quiet)
+    report = reconstruct_demo_scene(
         output / "scene", output / "result", request.preset, threads=threads, quiet=quiet
     )
     click.echo(f"Open {report} in a browser to see the result.")

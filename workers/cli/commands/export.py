@@ -7,7 +7,7 @@ from octasplat.engine.operations.export import OPERATION
 from octasplat.workers.cli.request_options import operation_command
 
 
-class _ExportCommand(click.Command):
+class _FormatListCommand(click.Command):
     """Lists the formats of the registry in its help."""
 
     def format_epilog(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
@@ -20,4 +20,4 @@ class _ExportCommand(click.Command):
             formatter.write_dl(rows)
 
 
-export = operation_command(OPERATION, threads=True, cls=_ExportCommand)
+export = operation_command(OPERATION, threads=True, cls=_FormatListCommand)

@@ -7,9 +7,9 @@ import click
 
 if TYPE_CHECKING:
     from octasplat.workers.settings import WorkerSettings
-    from octasplat.workers.store.fsck import Reference, Report
+    from octasplat.workers.storage.fsck import Reference, Report
 
-_SHOWN = 50
+_MAX_SHOWN_FINDINGS = 50
 
 
 @click.command(short_help="Compare the tables of a service with its store.")
@@ -38,19 +38,19 @@ def fsck(data: Path | None, verify: bool, as_json: bool, recount: bool) -> None:
     if as_json:
         click.echo(json.dumps(dataclasses.asdict(report), indent=2))
     else:
-        for line in describe(report):
+        for line in report_lines(report):
             click.echo(line)
     raise SystemExit(0 if report.is_sound else 1)
 
 
-def describe(report: "Report") -> list[str]:
+def report_lines(report: "Report") -> list[str]:
     """The report for people."""
     lines = [
         f"{finding.kind}: {finding.where}: {finding.detail} ({finding.sha256})"
-        for finding in report.findings[:_SHOWN]
+        for finding in report.findings[:_MAX_SHOWN_FINDINGS]
     ]
-    if len(report.findings) > _SHOWN:
-        lines.append(f"... and {len(report.findings) - _SHOWN} more; --json lists all.")
+    if len(report.findings) > _MAX_SHOWN_FINDINGS:
+        lines.append(f"... and {len(report.findings) - _MAX_SHOWN_FINDINGS} more; --json lists all.")
     lines.append(
         f"{report.references} places in the tables, {report.blobs} contents of {report.blob_bytes} bytes in "
         "the store" + (f", {report.verified} of them read whole." if report.verified else ".")
@@ -71,19 +71,19 @@ def describe(report: "Report") -> list[str]:
 def _report(settings: "WorkerSettings", verify: bool) -> "Report":
     import asyncio
 
-    from octasplat.workers.store.fsck import compare
-    from octasplat.workers.store.opening import open_storage
+    from octasplat.workers.storage.factory import open_storage
+    from octasplat.workers.storage.fsck import compare_with_storage
 
     conninfo = settings.conninfo()
     storage = open_storage(settings.storage_address, floor_bytes=0)
-    return compare(storage, asyncio.run(_references(conninfo)), verify=verify)
+    return compare_with_storage(storage, asyncio.run(_references(conninfo)), verify=verify)
 
 
 def _recount(settings: "WorkerSettings") -> list[str]:
     import asyncio
 
-    from octasplat.workers.records.database import open_pool
-    from octasplat.workers.records.quotas import recount
+    from octasplat.workers.db.connections import open_pool
+    from octasplat.workers.db.quotas import recount
 
     async def count() -> list[str]:
         async with open_pool(settings.conninfo(), max_size=1) as pool, pool.connection() as connection:
@@ -96,8 +96,8 @@ def _recount(settings: "WorkerSettings") -> list[str]:
 
 
 async def _references(conninfo: str) -> "list[Reference]":
-    from octasplat.workers.records.database import open_pool
-    from octasplat.workers.records.references import references
+    from octasplat.workers.db.connections import open_pool
+    from octasplat.workers.db.references import references
 
     async with open_pool(conninfo, max_size=1) as pool, pool.connection() as connection:
         return [reference async for reference in references(connection)]

@@ -8,9 +8,9 @@ import click
 
 from octasplat.engine.operations.info import OPERATION, InfoRequest
 from octasplat.workers.cli.options import threads_option
-from octasplat.workers.cli.request_options import request_of, request_options, run_operation
+from octasplat.workers.cli.request_options import request_from_options, request_options, run_operation
 
-WIDTH = 60
+THUMBNAIL_COLUMNS = 60
 """Columns of the picture in a terminal."""
 
 
@@ -20,22 +20,24 @@ WIDTH = 60
 @threads_option
 def info(as_json: bool, threads: int, **given: Any) -> None:
     """Look at a scene."""
-    result = run_operation(OPERATION, request_of(InfoRequest, given), quiet=as_json, threads=threads)
+    result = run_operation(
+        OPERATION, request_from_options(InfoRequest, given), quiet=as_json, threads=threads
+    )
     if as_json:
         click.echo(json.dumps(result.facts(), indent=2))
     elif sys.stdout.isatty():
-        click.echo(_drawn(result.picture_srgb))
+        click.echo(_terminal_image(result.picture_srgb))
 
 
-def _drawn(picture_srgb: Any) -> str:
+def _terminal_image(image_srgb: Any) -> str:
     """Return a picture for a terminal that shows colours: two pixels a letter, one above the other."""
     import numpy as np
 
-    height, width = picture_srgb.shape[:2]
-    rows = 2 * max(1, round(WIDTH * height / width / 2))
+    height, width = image_srgb.shape[:2]
+    rows = 2 * max(1, round(THUMBNAIL_COLUMNS * height / width / 2))
     y = (np.arange(rows) + 0.5) * height // rows
-    x = (np.arange(WIDTH) + 0.5) * width // WIDTH
-    pixels = (255 * picture_srgb[y.astype(int)][:, x.astype(int)]).astype(int)
+    x = (np.arange(THUMBNAIL_COLUMNS) + 0.5) * width // THUMBNAIL_COLUMNS
+    pixels = (255 * image_srgb[y.astype(int)][:, x.astype(int)]).astype(int)
     lines = []
     for upper, lower in zip(pixels[::2], pixels[1::2], strict=True):
         letters = (

@@ -15,7 +15,7 @@ def migrate(data: Path | None) -> None:
     octasplat serve and the front end do so by themselves as they start; workers wait for it, and no other
     command does. Processes of the version before go on meanwhile.
     """
-    from octasplat.workers.records.migrate import migrate
+    from octasplat.workers.db.migrate import migrate
     from octasplat.workers.settings import WorkerSettings, load_settings
 
     applied = migrate(load_settings(WorkerSettings, data=data).conninfo())

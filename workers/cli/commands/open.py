@@ -15,7 +15,7 @@ def open_page(print_link: bool, server: str | None) -> None:
 
     The link that is printed without a display works once, within five minutes.
     """
-    from octasplat.workers.cli.browsing import has_display, open_signed_in, sign_in_link
+    from octasplat.workers.cli.browser import has_display, open_signed_in, sign_in_link
 
     with connected(server) as api:
         if print_link or not has_display():

@@ -6,7 +6,7 @@ from typing import Any
 import click
 
 
-class _Limit(click.ParamType[int]):
+class _SizeNumber(click.ParamType[int]):
     """A number, also with k, M, G or T."""
 
     name = "number"
@@ -24,9 +24,9 @@ class _Limit(click.ParamType[int]):
 
 @click.command(short_help="Show or set what an owner may take.")
 @click.argument("owner")
-@click.option("--bytes", "max_bytes", type=_Limit(), help="Contents stored, e.g. 20G.")
-@click.option("--datasets", "max_datasets", type=_Limit(), help="Datasets.")
-@click.option("--jobs", "max_jobs", type=_Limit(), help="Jobs that are queued or running.")
+@click.option("--bytes", "max_bytes", type=_SizeNumber(), help="Contents stored, e.g. 20G.")
+@click.option("--datasets", "max_datasets", type=_SizeNumber(), help="Datasets.")
+@click.option("--jobs", "max_jobs", type=_SizeNumber(), help="Jobs that are queued or running.")
 @click.option("--clear", is_flag=True, help="Set no limits but those given.")
 @click.option(
     "--data", type=click.Path(path_type=Path), metavar="FOLDER", help="Data folder of octasplat serve."
@@ -41,18 +41,18 @@ def quota(owner: str, clear: bool, data: Path | None, **limits: int | None) -> N
     from octasplat.workers.settings import WorkerSettings, load_settings
 
     settings = load_settings(WorkerSettings, data=data)
-    for line in asyncio.run(_run(settings.conninfo(), owner, clear, limits)):
+    for line in asyncio.run(_set_and_show(settings.conninfo(), owner, clear, limits)):
         click.echo(line)
 
 
-async def _run(conninfo: str, owner: str, clear: bool, limits: dict[str, int | None]) -> list[str]:
-    from octasplat.workers.records.database import open_pool
-    from octasplat.workers.records.quotas import NO_QUOTA, Quota, quota_of, set_quota, usage_of
+async def _set_and_show(conninfo: str, owner: str, clear: bool, limits: dict[str, int | None]) -> list[str]:
+    from octasplat.workers.db.connections import open_pool
+    from octasplat.workers.db.quotas import NO_QUOTA, Quota, quota_of, set_quota, usage_of
 
     async with open_pool(conninfo, max_size=1) as pool, pool.connection() as connection:
         if clear or any(value is not None for value in limits.values()):
             kept = NO_QUOTA if clear else await quota_of(connection, owner)
-            await set_quota(connection, owner, Quota(**limits).or_else(kept))
+            await set_quota(connection, owner, Quota(**limits).with_defaults(kept))
         quota, usage = await quota_of(connection, owner), await usage_of(connection, owner)
     rows = (
         ("bytes", usage.bytes, quota.max_bytes),

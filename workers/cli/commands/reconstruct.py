@@ -6,7 +6,7 @@ import click
 
 from octasplat.engine.operations.reconstruct import OPERATION, ReconstructRequest
 from octasplat.workers.cli.options import quiet_option, threads_option
-from octasplat.workers.cli.request_options import request_of, request_options
+from octasplat.workers.cli.request_options import request_from_options, request_options
 
 
 @click.command(short_help=OPERATION.title, help=ReconstructRequest.__doc__)
@@ -17,4 +17,4 @@ def reconstruct(threads: int, quiet: bool, **given: Any) -> None:
     """Reconstruct a scene; the text of the request is the help."""
     from octasplat.workers.cli.reconstruction import run_reconstruction
 
-    run_reconstruction(request_of(ReconstructRequest, given), threads=threads, quiet=quiet)
+    run_reconstruction(request_from_options(ReconstructRequest, given), threads=threads, quiet=quiet)

@@ -1,6 +1,6 @@
 """``octasplat render``: new views of a scene, as images or a video."""
 
 from octasplat.engine.operations.render import OPERATION
-from octasplat.workers.cli.picture_command import picture_command
+from octasplat.workers.cli.render_command import render_command
 
-render = picture_command(OPERATION, "linear RGB, alpha, depth and normals")
+render = render_command(OPERATION, "linear RGB, alpha, depth and normals")

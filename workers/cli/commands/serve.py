@@ -38,16 +38,16 @@ def serve(
     import threading
 
     from octasplat.engine.errors import OctasplatError
-    from octasplat.workers.cli.browsing import has_display, open_signed_in
+    from octasplat.workers.cli.browser import has_display, open_signed_in
     from octasplat.workers.cli.commands.worker import parse_queues
     from octasplat.workers.client.api import Api
     from octasplat.workers.logs import log_to_stderr
-    from octasplat.workers.serve.machine import Plan, serve
+    from octasplat.workers.serve.local_service import ServeOptions, serve
     from octasplat.workers.settings import WorkerSettings, load_settings
 
     log_to_stderr()
     settings = load_settings(WorkerSettings, data=data)
-    plan = Plan(settings, host, port, parse_queues(queues))
+    plan = ServeOptions(settings, host, port, parse_queues(queues))
 
     def show_page() -> None:
         with contextlib.suppress(OctasplatError), Api.local(settings.data) as api:
@@ -59,7 +59,7 @@ def serve(
             threading.Thread(target=show_page, daemon=True).start()
 
     async def show(address: str) -> None:
-        from octasplat.workers.cli.submitting import run_demo
+        from octasplat.workers.cli.remote_jobs import run_demo
 
         say(address)
         with Api.local(settings.data) as api:

@@ -3,4 +3,4 @@
 from octasplat.engine.operations.surface import OPERATION
 from octasplat.workers.cli.request_options import operation_command
 
-surface = operation_command(OPERATION, stops=True, threads=True)
+surface = operation_command(OPERATION, is_stoppable=True, threads=True)

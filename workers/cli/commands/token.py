@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, TypeVar
 import click
 
 if TYPE_CHECKING:
-    from octasplat.workers.records.database import Connection
+    from octasplat.workers.db.connections import Connection
 
 T = TypeVar("T")
 
@@ -33,7 +33,7 @@ def create(
     name: str, owner: str | None, scopes: tuple[str, ...], days: float | None, data: Path | None
 ) -> None:
     """Make a token called NAME and show its secret, this once. From the first on, nobody gets in without."""
-    from octasplat.workers.records.tokens import add_token, new_secret
+    from octasplat.workers.db.tokens import add_token, new_secret
 
     secret = new_secret()
 
@@ -46,9 +46,9 @@ def create(
             scopes=scopes or ("write",),
             hours=None if days is None else 24 * days,
         )
-        await _write_down(connection, "token create", f"/v1/tokens/{made.id}")
+        await _add_audit_entry(connection, "token create", f"/v1/tokens/{made.id}")
 
-    _with_database(data, add)
+    _run_with_database(data, add)
     click.echo(secret)
 
 
@@ -56,10 +56,10 @@ def create(
 @click.option("--data", type=click.Path(path_type=Path), metavar="FOLDER")
 def list_all(data: Path | None) -> None:
     """List all tokens, without their secrets."""
-    from octasplat.workers.records.tokens import list_tokens
+    from octasplat.workers.db.tokens import list_tokens
 
     now = datetime.now(UTC)
-    for row in _with_database(data, list_tokens):
+    for row in _run_with_database(data, list_tokens):
         state = "revoked" if row.revoked_at else ",".join(row.scopes)
         if row.expires_at is not None and not row.revoked_at:
             state += f"  {'expired' if row.expires_at < now else 'until'} {row.expires_at:%Y-%m-%d}"
@@ -71,22 +71,24 @@ def list_all(data: Path | None) -> None:
 @click.option("--data", type=click.Path(path_type=Path), metavar="FOLDER")
 def revoke(token_id: uuid.UUID, data: Path | None) -> None:
     """Shut the token TOKEN_ID out, with the sessions of browsers that were begun with it."""
-    from octasplat.workers.records.tokens import revoke_token
+    from octasplat.workers.db.tokens import revoke_token
 
     async def shut(connection: "Connection") -> bool:
-        await _write_down(connection, "token revoke", f"/v1/tokens/{token_id}")
+        await _add_audit_entry(connection, "token revoke", f"/v1/tokens/{token_id}")
         return await revoke_token(connection, token_id)
 
-    click.echo("Revoked." if _with_database(data, shut) else "There is no such token.")
+    click.echo("Revoked." if _run_with_database(data, shut) else "There is no such token.")
 
 
-async def _write_down(connection: "Connection", action: str, target: str) -> None:
-    from octasplat.workers.records.audit import add_entry
+async def _add_audit_entry(connection: "Connection", action: str, target: str) -> None:
+    from octasplat.workers.db.audit import add_entry
 
-    await add_entry(connection, address="command line", owner=_user(), action=action, target=target)
+    await add_entry(
+        connection, address="command line", owner=_local_user_name(), action=action, target=target
+    )
 
 
-def _user() -> str:
+def _local_user_name() -> str:
     """The name of whoever gives the command, on this machine."""
     try:
         return getpass.getuser()
@@ -94,14 +96,14 @@ def _user() -> str:
         return str(os.getuid())
 
 
-def _with_database(data: Path | None, what: Callable[["Connection"], Awaitable[T]]) -> T:
+def _run_with_database(data: Path | None, action: Callable[["Connection"], Awaitable[T]]) -> T:
     """Run something on a connection."""
     import asyncio
 
     import psycopg
 
-    from octasplat.workers.records.database import open_pool
-    from octasplat.workers.records.errors import DatabaseError
+    from octasplat.workers.db.connections import open_pool
+    from octasplat.workers.db.errors import DatabaseError
     from octasplat.workers.settings import WorkerSettings, load_settings
 
     conninfo = load_settings(WorkerSettings, data=data).conninfo()
@@ -109,7 +111,7 @@ def _with_database(data: Path | None, what: Callable[["Connection"], Awaitable[T
     async def run() -> T:
         try:
             async with open_pool(conninfo, max_size=1) as pool, pool.connection() as connection:
-                return await what(connection)
+                return await action(connection)
         except (psycopg.errors.UndefinedTable, psycopg.errors.UndefinedColumn):
             raise DatabaseError(
                 "The database lacks tables of this version; run octasplat migrate, or start octasplat "

@@ -47,7 +47,7 @@ def worker(queues: str, name: str | None, data: Path | None) -> None:
 
     from octasplat.workers.logs import log_to_stderr
     from octasplat.workers.settings import WorkerSettings, load_settings
-    from octasplat.workers.work.process import run_worker
+    from octasplat.workers.worker.worker_process import run_worker
 
     chosen = parse_queues(queues)
     log_to_stderr()

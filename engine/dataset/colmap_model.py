@@ -1,0 +1,263 @@
+"""Reading a COLMAP model, with or without rigs, binary or text, into plain records."""
+
+import math
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pycolmap
+from jaxtyping import Float64, Int64
+
+from octasplat.engine.dataset.camera import Camera
+from octasplat.engine.dataset.colmap_binary import check_binary_colmap_model
+from octasplat.engine.dataset.colmap_text import find_text_model_error
+from octasplat.engine.dataset.model import SparsePoints
+from octasplat.engine.dataset.pose_check import check_poses
+from octasplat.engine.errors import DatasetError
+
+MODEL_FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0")
+"""Where a scene keeps its model; the first that holds one counts."""
+
+_MODEL_FILES = ("cameras", "images", "points3D")
+MIN_QUATERNION_NORM = 1e-6
+"""Quaternions shorter than this say nothing about a rotation."""
+UNIT_NORM_TOLERANCE = 1e-9
+"""Lengths of quaternions this near to 1 need no correction."""
+WARN_NORM_TOLERANCE = 1e-3
+"""Lengths of quaternions this near to 1 are of unit ones that a text file rounded: not worth telling."""
+
+
+@dataclass(frozen=True, eq=False)
+class PosedImage:
+    """A registered image of the model: its name, its camera's id, its pose, and the points it shows.
+
+    Attributes:
+        observed_px: where it shows points, at the size COLMAP worked with.
+        observed_point_ids: COLMAP's numbers of these.
+    """
+
+    name: str
+    camera_id: int
+    rotation_cam_from_world: Float64[np.ndarray, "3 3"]
+    translation_cam_from_world: Float64[np.ndarray, "3"]
+    observed_px: Float64[np.ndarray, "k 2"]
+    observed_point_ids: Int64[np.ndarray, " k"]
+
+
+@dataclass(frozen=True, eq=False)
+class ColmapModel:
+    """What a COLMAP model says, checked to be finite.
+
+    Attributes:
+        folder: where it was read from.
+        cameras: by COLMAP's camera id, at the size COLMAP worked with.
+        images: registered images, sorted by name.
+        points: sparse point cloud.
+        warnings: one sentence each on what is odd but usable.
+    """
+
+    folder: Path
+    cameras: dict[int, Camera]
+    images: tuple[PosedImage, ...]
+    points: SparsePoints
+    warnings: tuple[str, ...]
+
+
+def find_colmap_model_folder(root: Path) -> Path:
+    """The folder of the scene's model, the first of :data:`MODEL_FOLDERS` that holds one.
+
+    Raises:
+        DatasetError: there is none, or the first one lacks a file.
+    """
+    for name in MODEL_FOLDERS:
+        folder = root / name
+        if not any(
+            (folder / f"{part}{suffix}").is_file() for part in _MODEL_FILES for suffix in (".bin", ".txt")
+        ):
+            continue
+        for suffix in (".bin", ".txt"):
+            if all((folder / f"{part}{suffix}").is_file() for part in _MODEL_FILES):
+                return folder
+        suffix = ".bin" if any((folder / f"{part}.bin").is_file() for part in _MODEL_FILES) else ".txt"
+        missing = [f"{part}{suffix}" for part in _MODEL_FILES if not (folder / f"{part}{suffix}").is_file()]
+        raise DatasetError(f"{folder} lacks {' and '.join(missing)}; copy the whole COLMAP model there.")
+    raise DatasetError(
+        f"{root} holds no COLMAP model; put cameras, images and points3D (.bin or .txt) into "
+        f"{root / 'sparse/0'}, or have the poses found: octasplat reconstruct with --poses auto, or "
+        "octasplat submit."
+    )
+
+
+def has_colmap_model(root: Path) -> bool:
+    """Whether the scene brings a COLMAP model, or at least a part of one."""
+    return any(
+        (root / name / f"{part}{suffix}").is_file()
+        for name in MODEL_FOLDERS
+        for part in _MODEL_FILES
+        for suffix in (".bin", ".txt")
+    )
+
+
+def read_colmap_model(root: Path, folder: Path | None = None) -> ColmapModel:
+    """Read the COLMAP model of the scene in ``root``, or the one in ``folder``.
+
+    Raises:
+        DatasetError: there is no model, it is damaged, or it holds values that are not finite.
+    """
+    folder = folder or find_colmap_model_folder(root)
+    check_binary_colmap_model(folder)
+    try:
+        reconstruction = pycolmap.Reconstruction(str(folder))
+    except (ValueError, IndexError, KeyError, TypeError, RuntimeError, MemoryError, OSError) as error:
+        fault = find_text_model_error(folder)
+        if fault is not None:
+            raise DatasetError(fault) from error
+        reason = " ".join(str(error).split())[:200].rstrip(".") or type(error).__name__
+        raise DatasetError(
+            f"The COLMAP model in {folder} cannot be read ({reason}); copy it anew or run COLMAP again."
+        ) from error
+    warnings: list[str] = []
+    _normalise_quaternions(reconstruction, folder, warnings)
+    images = _posed_images(reconstruction, folder, warnings)
+    cameras = _cameras(reconstruction, {image.camera_id for image in images}, folder, warnings)
+    points = _sparse_points(reconstruction, folder, warnings)
+    if images:
+        rotations = np.stack([image.rotation_cam_from_world for image in images])
+        translations = np.stack([image.translation_cam_from_world for image in images])
+        names = [image.name for image in images]
+        warnings += check_poses(folder, names, rotations, translations, points)
+    return ColmapModel(folder, cameras, images, points, tuple(warnings))
+
+
+def _normalise_quaternions(reconstruction: Any, folder: Path, warnings: list[str]) -> None:
+    """Bring the quaternions of frames and rigs to unit length, before poses are composed of them.
+
+    pycolmap takes them as they are, and composes anything, even zeros, to something like a pose.
+    """
+    scaled = 0
+    for frame in reconstruction.frames.values():
+        if not frame.has_pose:
+            continue
+        length = frame.rig_from_world.rotation.norm()
+        if not length > MIN_QUATERNION_NORM or not math.isfinite(length):
+            names = sorted(reconstruction.images[data.id].name for data in frame.image_ids)
+            raise DatasetError(
+                f"The pose of {' and '.join(names)} in {folder} has the rotation quaternion "
+                f"{_quaternion_wxyz(frame.rig_from_world)}, which is no rotation; run COLMAP again or remove the image."
+            )
+        frame.rig_from_world, off = _with_unit_rotation(frame.rig_from_world)
+        scaled += off
+    for rig in reconstruction.rigs.values():
+        for sensor, pose in dict(rig.non_ref_sensors).items():
+            if pose is None:
+                continue
+            length = pose.rotation.norm()
+            if not length > MIN_QUATERNION_NORM or not math.isfinite(length):
+                raise DatasetError(
+                    f"Camera {sensor.id} of rig {rig.rig_id} in {folder} has the rotation quaternion "
+                    f"{_quaternion_wxyz(pose)}, which is no rotation; run COLMAP again."
+                )
+            unit, off = _with_unit_rotation(pose)
+            rig.set_sensor_from_rig(sensor, unit)
+            scaled += off
+    if scaled:
+        warnings.append(
+            f"{scaled} rotations of the model in {folder} were quaternions of another length than 1 "
+            "and were normalised."
+        )
+
+
+def _with_unit_rotation(pose: Any) -> tuple[Any, bool]:
+    """``pose`` with its quaternion at length 1, and whether that is worth telling."""
+    length = pose.rotation.norm()
+    if abs(length - 1) <= UNIT_NORM_TOLERANCE:
+        return pose, False
+    unit = pycolmap.Rotation3d(pose.rotation.quat / length)
+    return pycolmap.Rigid3d(unit, pose.translation), abs(length - 1) > WARN_NORM_TOLERANCE
+
+
+def _quaternion_wxyz(pose: Any) -> str:
+    x, y, z, w = pose.rotation.quat.tolist()
+    return f"({w:g}, {x:g}, {y:g}, {z:g})"
+
+
+def _posed_images(reconstruction: Any, folder: Path, warnings: list[str]) -> tuple[PosedImage, ...]:
+    images: list[PosedImage] = []
+    unposed = 0
+    for image in reconstruction.images.values():
+        if not image.has_pose:
+            unposed += 1
+            continue
+        matrix = np.array(image.cam_from_world().matrix(), dtype=np.float64)
+        if not np.isfinite(matrix).all() or abs(np.linalg.det(matrix[:, :3]) - 1) > 1e-3:
+            raise DatasetError(
+                f"The pose of {image.name} in {folder} is not a finite rigid motion; run COLMAP again."
+            )
+        shown = image.get_observation_points2D()
+        observed_px = np.array([point.xy for point in shown], np.float64).reshape(-1, 2)
+        # Beyond what a signed number holds lies only COLMAP's mark for none.
+        observed_points = np.array([point.point3D_id for point in shown], np.uint64).astype(np.int64)
+        pose = matrix[:, :3].copy(), matrix[:, 3].copy()
+        images.append(PosedImage(image.name, int(image.camera_id), *pose, observed_px, observed_points))
+    if unposed:
+        warnings.append(f"{unposed} images of the model in {folder} have no pose and are left out.")
+    return tuple(sorted(images, key=lambda image: image.name))
+
+
+def _cameras(reconstruction: Any, used: set[int], folder: Path, warnings: list[str]) -> dict[int, Camera]:
+    cameras: dict[int, Camera] = {}
+    for camera_id, camera in reconstruction.cameras.items():
+        if camera_id not in used:
+            continue
+        params = np.array(camera.params, dtype=np.float64)
+        focals = params[list(camera.focal_length_idxs())]
+        valid = camera.verify_params() and np.isfinite(params).all() and (focals > 0).all()
+        if not valid or camera.width < 1 or camera.height < 1:
+            raise DatasetError(
+                f"Camera {camera_id} of the model in {folder} has impossible parameters "
+                f"({camera.model_name}, {camera.width}x{camera.height}, {params.tolist()}); run COLMAP again."
+            )
+        cameras[int(camera_id)] = Camera(
+            camera.model_name, tuple(params.tolist()), int(camera.width), int(camera.height)
+        )
+    idle = reconstruction.num_cameras() - len(cameras)
+    if idle:
+        warnings.append(f"{idle} cameras of the model in {folder} belong to no posed image.")
+    return cameras
+
+
+def _sparse_points(reconstruction: Any, folder: Path, warnings: list[str]) -> SparsePoints:
+    points = [point for _, point in sorted(reconstruction.points3D.items(), key=lambda item: item[0])]
+    xyz = np.array([point.xyz for point in points], dtype=np.float32).reshape(-1, 3)
+    rgb = np.array([point.color for point in points], dtype=np.float32).reshape(-1, 3) / np.float32(255)
+    tracks = np.array([point.track.length() for point in points], dtype=np.int32)
+    errors = np.array([point.error for point in points], dtype=np.float32)
+    ids = np.array(sorted(reconstruction.points3D), np.uint64).astype(np.int64)
+    announced = _declared_point_count(folder / "points3D.txt")
+    if not (folder / "points3D.bin").is_file() and announced is not None and announced != len(points):
+        warnings.append(
+            f"{folder / 'points3D.txt'} announces {announced} points but holds {len(points)}; "
+            "it may have been cut short."
+        )
+    finite = np.isfinite(xyz).all(axis=1)
+    if not finite.all():
+        warnings.append(
+            f"{int((~finite).sum())} points of the model in {folder} are not finite and left out."
+        )
+    return SparsePoints(xyz[finite], rgb[finite], tracks[finite], errors[finite], ids[finite])
+
+
+def _declared_point_count(path: Path) -> int | None:
+    """The count that COLMAP writes into the comment at the head of a text file, if it is there."""
+    if not path.is_file():
+        return None
+    with path.open(encoding="utf-8", errors="replace") as lines:
+        for line in lines:
+            if not line.startswith("#"):
+                break
+            found = re.search(r"Number of points: (\d+)", line)
+            if found:
+                return int(found.group(1))
+    return None

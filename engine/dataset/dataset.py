@@ -1,0 +1,375 @@
+"""A scene with its pixels: rays and colours of any pixels of any views."""
+
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float32, Float64, Int, Int64
+
+from octasplat.engine.dataset import kernels_gather
+from octasplat.engine.dataset.camera import Camera
+from octasplat.engine.dataset.camera_clearance import camera_clearances
+from octasplat.engine.dataset.load import load_dataset_model
+from octasplat.engine.dataset.model import DatasetModel, DatasetView, Observations, SparsePoints, Viewpoints
+from octasplat.engine.dataset.pixel_cache import PixelCache, file_digests, open_pixel_cache
+from octasplat.engine.dataset.ray_tables import (
+    MAX_TABLE_BYTES,
+    NO_TABLE_COMPUTED,
+    RayTables,
+    has_rays_everywhere,
+    open_ray_tables,
+    rows_per_block,
+)
+from octasplat.engine.dataset.split import evaluation_split, split_views
+from octasplat.engine.dataset.training_points import training_points
+from octasplat.engine.dataset.views_file import ViewsRecord, views_record
+from octasplat.engine.errors import DatasetError
+from octasplat.engine.rays import ImageRays, RayBatch
+
+MaskUse = Literal["ignore", "alpha"]
+
+NEAR_FROM_POINTS = 0.25
+"""Most that the near distance may be of the distance at which things begin.
+
+Along a wall 2 m away, the path of 400 photographs a metre apart has an extent of which 1 % is 2 m.
+"""
+
+
+class Dataset:
+    """Photographs with poses, ready to train on; pixels stay on disk and are mapped into memory.
+
+    Colours are straight display values; world coordinates are COLMAP's. Every method that takes pixels takes
+    three arrays: the view, the row ``y`` and the column ``x`` of each pixel.
+
+    Attributes:
+        root: folder of the scene.
+        views: all views, sorted by name.
+        cameras: cameras at the working size.
+        points: sparse points that the training views know, see
+            :mod:`octasplat.engine.dataset.training_points`; all of them where all views are held out.
+        observations: of all sparse points.
+        train_indices: views to train on.
+        test_indices: views held out.
+        views_record: what the photographs and their model are, to be compared with those of another time.
+        warnings: one sentence each on what is odd but usable.
+        has_alpha: whether any pixel can have an alpha below 1.
+        has_masks: whether any view has a mask.
+        extent: radius of the training cameras, see :func:`octasplat.engine.dataset.model.scene_extent`.
+        near_world: distance from the cameras at which anything is seen: ``near`` of the extent, but at most
+            :data:`NEAR_FROM_POINTS` of the least distance at which the sparse points around a training camera
+            begin; where it is given, all views are held out.
+    """
+
+    def __init__(
+        self,
+        model: DatasetModel,
+        cache: PixelCache,
+        tables: RayTables,
+        *,
+        test_every: int = 8,
+        held_out: Sequence[str] | None = None,
+        masks: MaskUse = "ignore",
+        near: float = 0.0,
+        near_world: float | None = None,
+    ) -> None:
+        self.root: Path = model.root
+        self.views: tuple[DatasetView, ...] = model.views
+        self.cameras: tuple[Camera, ...] = model.cameras
+        self.warnings: list[str] = [*model.warnings, *cache.warnings]
+        self.train_indices: Int64[np.ndarray, " train"]
+        self.test_indices: Int64[np.ndarray, " test"]
+        names = [view.name for view in model.views]
+        self.train_indices, self.test_indices = (
+            split_views(names, test_every, held_out) if near_world is None else evaluation_split(names)
+        )
+        self.points: SparsePoints = (
+            training_points(self.train_indices, model.points, model.observations)
+            if len(self.train_indices)
+            else model.points
+        )
+        self.observations: Observations = model.observations
+        self.views_record: ViewsRecord = views_record(model, cache.digests, self.test_indices)
+        self.has_masks: bool = len(cache.mask.values) > 0
+        self._mask_is_alpha = masks == "alpha"
+        self.has_alpha: bool = len(cache.alpha.values) > 0 or (self._mask_is_alpha and self.has_masks)
+        self._cache = cache
+        self._ray_tables = tables
+        self._view_sizes: Int64[np.ndarray, "v 2"] = np.array(
+            [[view.width_px, view.height_px] for view in model.views], dtype=np.int64
+        )
+        self._view_camera: Int64[np.ndarray, " v"] = np.array(
+            [view.camera_index for view in model.views], dtype=np.int64
+        )
+        self._rotations_world_from_cam: Float64[np.ndarray, "v 3 3"] = np.stack(
+            [view.rotation_cam_from_world.T for view in model.views]
+        )
+        origins = np.stack([view.origin_world for view in model.views])
+        self._origins_world: Float32[np.ndarray, "v 3"] = origins.astype(np.float32)
+        self._pinhole_params: Float64[np.ndarray, "c 4"] = np.array(
+            [camera.pinhole_params if camera.is_pinhole else (1.0, 1.0, 0.0, 0.0) for camera in model.cameras]
+        )
+        self._has_no_table = tables.offsets == NO_TABLE_COMPUTED
+        lacks_rays = np.array([not (c.is_pinhole or has_rays_everywhere(c)) for c in model.cameras])
+        self._has_invalid_rays = self._has_no_table & lacks_rays
+        if lacks_rays.any():
+            models = sorted({model.cameras[index].model for index in np.flatnonzero(lacks_rays)})
+            self.warnings.append(
+                f"{int(lacks_rays.sum())} cameras ({', '.join(models)}) cannot un-project parts of their "
+                "images; these pixels do not count."
+            )
+        self.extent: float = self.views_record.extent_world
+        self.near_world: float = self._near_distances(near) if near_world is None else near_world
+        self._train_pixels: Int64[np.ndarray, " train"] = np.cumsum(
+            self._view_sizes[self.train_indices].prod(axis=1)
+        )
+
+    @classmethod
+    def open(
+        cls,
+        root: Path,
+        cache_dir: Path,
+        *,
+        max_side: int | None = None,
+        test_every: int = 8,
+        held_out: Sequence[str] | None = None,
+        masks: MaskUse = "ignore",
+        model_folder: Path | None = None,
+        accept: Callable[[ViewsRecord], None] | None = None,
+        near: float = 0.0,
+        threads: int = 0,
+        progress: Callable[[int, int], None] | None = None,
+        max_table_bytes: int = MAX_TABLE_BYTES,
+    ) -> "Dataset":
+        """Load a scene and decode its photographs into ``cache_dir``, or find them there.
+
+        Args:
+            root: folder with ``images/``, a COLMAP model in ``sparse/0``, ``sparse`` or ``colmap/sparse/0``
+                and, if there are any, ``masks/<image name>.png`` (white = valid).
+            cache_dir: folder of the cache, some 3 bytes a pixel (6 if a photograph has more than 8 bits).
+            max_side: cap on the longer side of the photographs, in pixels.
+            test_every: every how-manieth view by name is held out, beginning with the first; 0 for none.
+            held_out: names of the views to hold out instead.
+            masks: ``ignore`` gives pixels outside the mask the weight 0; ``alpha`` multiplies the mask into
+                alpha, for an object on a transparent background.
+            model_folder: where the COLMAP model is, if not in ``root``.
+            accept: told what was found before anything is written; to refuse it, it raises.
+            near: distance at which anything is seen, of the extent.
+            threads: decoding threads; 0 takes one a processor.
+            progress: told (photographs done, photographs in all) while decoding.
+            max_table_bytes: limit on the ray tables of cameras that are not pinholes.
+
+        Raises:
+            DatasetError: something is missing, damaged or does not fit together.
+            OutputError: the cache cannot be written.
+            ConfigError: a setting is out of range.
+        """
+        scene = load_dataset_model(root, max_side=max_side, model_folder=model_folder)
+        _require_masks(scene, root, masks)
+        # Complain before the long work.
+        _, test_indices = split_views([view.name for view in scene.views], test_every, held_out)
+        digests = None
+        if accept is not None:
+            digests = file_digests(scene, cache_dir, threads=threads)
+            accept(views_record(scene, digests, test_indices))
+        cache = open_pixel_cache(scene, cache_dir, digests, threads=threads, progress=progress)
+        tables = open_ray_tables(scene.cameras, cache_dir, max_table_bytes)
+        return cls(scene, cache, tables, test_every=test_every, held_out=held_out, masks=masks, near=near)
+
+    @classmethod
+    def open_for_evaluation(
+        cls,
+        root: Path,
+        cache_dir: Path,
+        *,
+        near_world: float,
+        max_side: int | None = None,
+        masks: MaskUse = "ignore",
+        threads: int = 0,
+        progress: Callable[[int, int], None] | None = None,
+    ) -> "Dataset":
+        """Photographs to measure a scene by that was trained on others: all are held out, one is enough.
+
+        Args:
+            root: as in :meth:`open`; the model needs no points.
+            cache_dir: folder of the cache.
+            near_world: distance at which anything is seen, that of the scene.
+            max_side: cap on the longer side of the photographs, in pixels.
+            masks: as in :meth:`open`.
+            threads: decoding threads; 0 takes one a processor.
+            progress: told (photographs done, photographs in all) while decoding.
+
+        Raises:
+            DatasetError: something is missing, damaged or does not fit together.
+            OutputError: the cache cannot be written.
+        """
+        scene = load_dataset_model(root, max_side=max_side, min_views=1, for_training=False)
+        _require_masks(scene, root, masks)
+        cache = open_pixel_cache(scene, cache_dir, threads=threads, progress=progress)
+        tables = open_ray_tables(scene.cameras, cache_dir, MAX_TABLE_BYTES)
+        return cls(scene, cache, tables, masks=masks, near_world=near_world)
+
+    def _near_distances(self, near: float) -> float:
+        nearest = camera_clearances(self.viewpoints, self.points)[self.train_indices]
+        known = nearest[nearest > 0]
+        cap = NEAR_FROM_POINTS * float(known.min()) if len(known) else np.inf
+        return float(min(near * self.extent, cap))
+
+    @property
+    def viewpoints(self) -> Viewpoints:
+        """Where all of them were taken from, and through which lenses."""
+        return Viewpoints(self.views, self.cameras)
+
+    @property
+    def train_pixel_count(self) -> int:
+        """Number of pixels of all training views, those of weight 0 included."""
+        return int(self._train_pixels[-1])
+
+    def rays(
+        self, view: Int[np.ndarray, " n"], y: Int[np.ndarray, " n"], x: Int[np.ndarray, " n"]
+    ) -> RayBatch:
+        """The unit rays through pixel centres.
+
+        A pixel that its camera model cannot un-project looks along the axis of the camera; :meth:`pixels`
+        gives it the weight 0.
+
+        Raises:
+            IndexError: a pixel does not exist.
+        """
+        view, y, x = _as_int64(view), _as_int64(y), _as_int64(x)
+        origins = np.empty((len(view), 3), dtype=np.float32)
+        directions = np.empty((len(view), 3), dtype=np.float32)
+        bad = kernels_gather.gather_rays(
+            view, y, x, self._view_sizes, self._view_camera, self._rotations_world_from_cam, self._origins_world,
+            self._pinhole_params, self._ray_tables.offsets, self._ray_tables.values.values, origins, directions,
+        )  # fmt: skip
+        self._raise_for_pixels(bad, view, y, x)
+        if self._has_no_table.any():
+            self._compute_rays(view, y, x, directions)
+        return RayBatch(origins, directions, self.near_world)
+
+    def pixels(
+        self, view: Int[np.ndarray, " n"], y: Int[np.ndarray, " n"], x: Int[np.ndarray, " n"]
+    ) -> tuple[Float32[np.ndarray, "n 3"], Float32[np.ndarray, " n"], Float32[np.ndarray, " n"]]:
+        """Straight display colours and alpha in [0, 1], and weights: 1, or 0 where a pixel does not count.
+
+        Raises:
+            IndexError: a pixel does not exist.
+        """
+        view, y, x = _as_int64(view), _as_int64(y), _as_int64(x)
+        rgb = np.empty((len(view), 3), dtype=np.float32)
+        alpha = np.empty(len(view), dtype=np.float32)
+        weight = np.empty(len(view), dtype=np.float32)
+        values = self._cache.rgb.values
+        bad = kernels_gather.gather_pixels(
+            view, y, x, self._view_sizes, self._view_camera, self._cache.offsets, self._ray_tables.offsets,
+            self._ray_tables.values.values, values, np.float32(np.iinfo(values.dtype).max),
+            self._cache.alpha.values, self._cache.mask.values, self._mask_is_alpha, rgb, alpha, weight,
+        )  # fmt: skip
+        self._raise_for_pixels(bad, view, y, x)
+        if self._has_invalid_rays.any():
+            for camera, chosen in self._camera_directions(view, self._has_invalid_rays):
+                found = self.cameras[camera].directions_cam(_pixel_centres(y[chosen], x[chosen]))
+                weight[chosen[np.isnan(found).any(axis=1)]] = 0.0
+        return rgb, alpha, weight
+
+    def view_rays(self, view_index: int) -> ImageRays:
+        """All rays of one view."""
+        width, height = self._view_size(view_index)
+        directions = np.empty((height * width, 3), dtype=np.float32)
+        for pixels, view, y, x in _iterate_row_blocks(view_index, width, height):
+            directions[pixels] = self.rays(view, y, x).directions_world
+        return ImageRays(
+            RayBatch(self._origins_world[[view_index]], directions, self.near_world), height, width
+        )
+
+    def view_image(
+        self, view_index: int
+    ) -> tuple[Float32[np.ndarray, "h w 3"], Float32[np.ndarray, "h w"], Float32[np.ndarray, "h w"]]:
+        """Colours, alpha and weights of all pixels of one view, as by :meth:`pixels`."""
+        width, height = self._view_size(view_index)
+        rgb = np.empty((height * width, 3), dtype=np.float32)
+        alpha = np.empty(height * width, dtype=np.float32)
+        weight = np.empty(height * width, dtype=np.float32)
+        for pixels, view, y, x in _iterate_row_blocks(view_index, width, height):
+            rgb[pixels], alpha[pixels], weight[pixels] = self.pixels(view, y, x)
+        return rgb.reshape(height, width, 3), alpha.reshape(height, width), weight.reshape(height, width)
+
+    def sample_pixels(
+        self, rng: np.random.Generator, count: int
+    ) -> tuple[Int64[np.ndarray, " n"], Int64[np.ndarray, " n"], Int64[np.ndarray, " n"]]:
+        """``count`` pixels (view, y, x), uniform and independent over all pixels of all training views."""
+        drawn = rng.integers(0, self._train_pixels[-1], size=count, dtype=np.int64)
+        which = np.searchsorted(self._train_pixels, drawn, side="right")
+        view = self.train_indices[which]
+        width = self._view_sizes[view, 0]
+        inside = drawn - (self._train_pixels[which] - width * self._view_sizes[view, 1])
+        y = inside // width
+        return view, y, inside - y * width
+
+    def release_pages(self) -> None:
+        """Give mapped pages back to the system, e.g. before a stage that needs the memory."""
+        for mapped in (self._cache.rgb, self._cache.alpha, self._cache.mask, self._ray_tables.values):
+            mapped.release()
+
+    def _view_size(self, view_index: int) -> tuple[int, int]:
+        if not 0 <= view_index < len(self.views):
+            raise IndexError(f"there is no view {view_index} among {len(self.views)}")
+        return self.views[view_index].width_px, self.views[view_index].height_px
+
+    def _raise_for_pixels(
+        self, bad: int, view: Int[np.ndarray, " n"], y: Int[np.ndarray, " n"], x: Int[np.ndarray, " n"]
+    ) -> None:
+        if bad >= 0:
+            raise IndexError(f"there is no pixel with view {view[bad]}, y {y[bad]}, x {x[bad]}")
+
+    def _camera_directions(
+        self, view: Int64[np.ndarray, " n"], wanted: np.ndarray
+    ) -> list[tuple[int, Int64[np.ndarray, " m"]]]:
+        camera = self._view_camera[view]
+        chosen = np.flatnonzero(wanted[camera])
+        chosen = chosen[np.argsort(camera[chosen], kind="stable")]
+        if len(chosen) == 0:
+            return []
+        groups = np.split(chosen, np.flatnonzero(np.diff(camera[chosen])) + 1)
+        return [(int(camera[group[0]]), group) for group in groups]
+
+    def _compute_rays(
+        self,
+        view: Int64[np.ndarray, " n"],
+        y: Int64[np.ndarray, " n"],
+        x: Int64[np.ndarray, " n"],
+        directions: Float32[np.ndarray, "n 3"],
+    ) -> None:
+        for camera, chosen in self._camera_directions(view, self._has_no_table):
+            found = self.cameras[camera].directions_cam(_pixel_centres(y[chosen], x[chosen]))
+            known = np.isfinite(found).all(axis=1)
+            rotations = self._rotations_world_from_cam[view[chosen[known]]]
+            directions[chosen[known]] = np.einsum("nij,nj->ni", rotations, found[known])
+
+
+def _require_masks(model: DatasetModel, root: Path, masks: MaskUse) -> None:
+    if masks == "alpha" and all(view.mask_path is None for view in model.views):
+        raise DatasetError(
+            f"Masks are to be the alpha, but {root / 'masks'} holds none of any photograph; put them "
+            f"there (as {model.views[0].name}.png) or leave --masks alpha out."
+        )
+
+
+def _as_int64(values: Int[np.ndarray, " n"]) -> Int64[np.ndarray, " n"]:
+    return np.ascontiguousarray(values, dtype=np.int64)
+
+
+def _pixel_centres(y: Int64[np.ndarray, " n"], x: Int64[np.ndarray, " n"]) -> Float64[np.ndarray, "n 2"]:
+    return np.stack([x + 0.5, y + 0.5], axis=1)
+
+
+def _iterate_row_blocks(
+    view_index: int, width: int, height: int
+) -> Iterator[tuple[slice, Int64[np.ndarray, " n"], Int64[np.ndarray, " n"], Int64[np.ndarray, " n"]]]:
+    """All pixels of a view, some rows at a time: their place in the view, view, y and x."""
+    step = rows_per_block(width)
+    for start in range(0, height, step):
+        stop = min(start + step, height)
+        y, x = np.divmod(np.arange(start * width, stop * width, dtype=np.int64), width)
+        yield slice(start * width, stop * width), np.full(len(y), view_index, dtype=np.int64), y, x

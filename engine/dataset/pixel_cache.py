@@ -1,0 +1,295 @@
+"""The pixel cache: all photographs of a scene, decoded and reduced, as flat files to be mapped.
+
+``rgb.bin`` holds the colours of all views one after the other, row by row, as uint8 or, if any photograph
+is deeper, uint16; ``alpha.bin`` and ``mask.bin`` hold one byte a pixel and exist only where they are needed.
+``pixels.json`` says from which files they were made: by digests of their contents, and by a stamp of their
+folder, sizes and times, which spares reading them again.
+"""
+
+import hashlib
+import json
+import os
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TypedDict
+
+import numpy as np
+from jaxtyping import Int64
+
+from octasplat.engine.dataset.image_info import ImageInfo
+from octasplat.engine.dataset.images import read_mask, read_photo
+from octasplat.engine.dataset.mapped_array import MappedArray
+from octasplat.engine.dataset.model import DatasetModel, DatasetView
+from octasplat.engine.dataset.views_file import FileDigests
+from octasplat.engine.errors import DatasetError, NoSpaceLeft, OutputError
+from octasplat.engine.writing import replacing, write_json
+
+CACHE_VERSION = 2
+"""Raised whenever the contents of the cache files change for the same photographs."""
+
+DECODING_BYTES = 2 << 30
+"""Memory that decoding threads may take together; one thread always runs."""
+
+Progress = Callable[[int, int], None]
+
+
+@dataclass(frozen=True, eq=False)
+class PixelCache:
+    """Mapped planes of all views; ``alpha`` and ``mask`` are empty where there is nothing to say.
+
+    Attributes:
+        rgb: straight display colours, 3 values a pixel.
+        alpha: 255 where opaque, one value a pixel.
+        mask: 255 where valid, one value a pixel.
+        offsets: first pixel of every view, and the count of all pixels at the end.
+        digests: of the files of every view.
+        warnings: one sentence each on what is odd but usable.
+    """
+
+    rgb: MappedArray
+    alpha: MappedArray
+    mask: MappedArray
+    offsets: Int64[np.ndarray, " views_and_end"]
+    digests: tuple[FileDigests, ...]
+    warnings: tuple[str, ...]
+
+
+def file_digests(model: DatasetModel, folder: Path, *, threads: int = 0) -> tuple[FileDigests, ...]:
+    """Digests of the files of every view, from the cache in ``folder`` where it is that of just these files.
+
+    Raises:
+        DatasetError: a file cannot be read.
+    """
+    index = _read_index(folder, sum(view.width_px * view.height_px for view in model.views))
+    if index is not None and index["stamp"] == _cache_key(model):
+        return tuple(FileDigests(*pair) for pair in index["digests"])
+    with ThreadPoolExecutor(threads if threads > 0 else os.cpu_count() or 1) as pool:
+        return tuple(pool.map(_file_digests, model.views))
+
+
+def open_pixel_cache(
+    model: DatasetModel,
+    folder: Path,
+    digests: Sequence[FileDigests] | None = None,
+    *,
+    threads: int = 0,
+    progress: Progress | None = None,
+) -> PixelCache:
+    """Map the pixels of ``model``, decoding them into ``folder`` first unless they are there already.
+
+    Args:
+        model: the scene.
+        folder: folder of the cache files.
+        digests: of the files of every view, if they are known; files that only moved, or were copied, are
+            then not decoded again.
+        threads: decoding threads; 0 takes one a processor. Fewer run where photographs are huge.
+        progress: told (photographs done, photographs in all) while decoding.
+
+    Raises:
+        DatasetError: a photograph or a mask cannot be read.
+        OutputError: the cache cannot be written.
+    """
+    sizes = [view.width_px * view.height_px for view in model.views]
+    offsets = np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64)
+    stamp, sizes_px = _cache_key(model), [[view.width_px, view.height_px] for view in model.views]
+    known = None if digests is None else [(each.photograph, each.mask) for each in digests]
+    index = _read_index(folder, int(offsets[-1]))
+    if index is not None and index["stamp"] != stamp:
+        if [(*pair,) for pair in index["digests"]] == known and index["sizes_px"] == sizes_px:
+            index["stamp"] = stamp
+            write_json(folder / "pixels.json", index)
+        else:
+            index = None
+    if index is None:
+        _build_cache(model, folder, offsets, stamp, threads, progress)
+        index = _read_index(folder, int(offsets[-1]))
+        if index is None or index["stamp"] != stamp:
+            raise OutputError(
+                f"The pixel cache in {folder} changed while it was written; use another folder."
+            )
+    rgb_type = np.uint8 if index["bits"] == 8 else np.uint16
+    return PixelCache(
+        rgb=MappedArray.open(folder / "rgb.bin", rgb_type),
+        alpha=_open_plane(folder / "alpha.bin", index["alpha"]),
+        mask=_open_plane(folder / "mask.bin", index["mask"]),
+        offsets=offsets,
+        digests=tuple(FileDigests(*pair) for pair in index["digests"]),
+        warnings=tuple(index["warnings"]),
+    )
+
+
+class _Index(TypedDict):
+    version: int
+    stamp: str
+    digests: list[tuple[str, str | None]]
+    sizes_px: list[list[int]]
+    bits: int
+    alpha: bool
+    mask: bool
+    warnings: list[str]
+
+
+def _open_plane(path: Path, exists: bool) -> MappedArray:
+    return MappedArray.open(path, np.uint8) if exists else MappedArray.empty(np.uint8)
+
+
+def _cache_key(model: DatasetModel) -> str:
+    """Names the files by their places, sizes and times, and the size of the views."""
+    sources: list[object] = [str(model.root.resolve())]
+    for view in model.views:
+        for path in (view.image_path, view.mask_path):
+            if path is None:
+                sources.append(None)
+                continue
+            stat = path.stat()
+            sources.append([str(path.relative_to(model.root)), stat.st_size, stat.st_mtime_ns])
+        sources.append([view.width_px, view.height_px])
+    return hashlib.sha256(json.dumps(sources).encode()).hexdigest()
+
+
+def _file_digests(view: DatasetView) -> FileDigests:
+    photograph = _sha256(view.image_path)
+    return FileDigests(photograph, None if view.mask_path is None else _sha256(view.mask_path))
+
+
+def _sha256(path: Path) -> str:
+    try:
+        with path.open("rb") as handle:
+            return hashlib.file_digest(handle, "sha256").hexdigest()
+    except OSError as error:
+        raise DatasetError(f"{path} cannot be read ({error.strerror}); replace the file.") from error
+
+
+def _read_index(folder: Path, pixels: int) -> _Index | None:
+    """The index, if it is of this version and the files are as long as it and the count of pixels say."""
+    try:
+        index: _Index = json.loads((folder / "pixels.json").read_text(encoding="utf-8"))
+        expected = {"rgb.bin": 3 * pixels * index["bits"] // 8}
+        expected |= {f"{name}.bin": pixels for name in ("alpha", "mask") if index[name]}
+        whole = all((folder / name).stat().st_size == size for name, size in expected.items())
+        return index if whole and index["version"] == CACHE_VERSION else None
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+
+
+def _build_cache(
+    model: DatasetModel,
+    folder: Path,
+    offsets: Int64[np.ndarray, " views_and_end"],
+    stamp: str,
+    threads: int,
+    progress: Progress | None,
+) -> None:
+    bits = max(info.bits for info in model.image_infos)
+    pixels = int(offsets[-1])
+    planes = {"rgb": 3 * pixels * bits // 8}
+    if any(info.has_alpha for info in model.image_infos):
+        planes["alpha"] = pixels
+    if any(view.mask_path is not None for view in model.views):
+        planes["mask"] = pixels
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / "pixels.json").unlink(missing_ok=True)
+        with ExitStack() as stack:
+            files: dict[str, int] = {}
+            for name, size in planes.items():
+                temporary = stack.enter_context(replacing(folder / f"{name}.bin"))
+                files[name] = os.open(temporary, os.O_RDWR | os.O_CREAT | os.O_TRUNC, 0o666)
+                stack.callback(os.close, files[name])
+                os.posix_fallocate(files[name], 0, size)  # a full disk shows now, not after an hour
+            summaries = _decode_all(model, offsets, bits, files, threads, progress)
+        # Many RGBA files are opaque throughout; their plane would only cost memory traffic.
+        transparent = any(summary.is_transparent for summary in summaries)
+        for name in ("alpha", "mask"):
+            if name not in planes or (name == "alpha" and not transparent):
+                (folder / f"{name}.bin").unlink(missing_ok=True)
+    except NoSpaceLeft as error:
+        raise NoSpaceLeft(f"{error} The pixel cache takes {sum(planes.values()) / 1e6:,.1f} MB.") from error
+    except OSError as error:
+        raise OutputError(
+            f"The pixel cache cannot be written to {folder} ({error.strerror}); name another folder."
+        ) from error
+    black = [view.name for view, summary in zip(model.views, summaries, strict=True) if summary.is_masked_out]
+    warnings = [f"{len(black)} masks hold no valid (white) pixel, e.g. that of {black[0]}."] if black else []
+    index: _Index = {
+        "version": CACHE_VERSION,
+        "stamp": stamp,
+        "digests": [(each.digests.photograph, each.digests.mask) for each in summaries],
+        "sizes_px": [[view.width_px, view.height_px] for view in model.views],
+        "bits": bits,
+        "alpha": "alpha" in planes and transparent,
+        "mask": "mask" in planes,
+        "warnings": warnings,
+    }
+    write_json(folder / "pixels.json", index)
+
+
+@dataclass(frozen=True)
+class _ViewSummary:
+    digests: FileDigests
+    is_transparent: bool
+    is_masked_out: bool
+
+
+def _decode_all(
+    model: DatasetModel,
+    offsets: Int64[np.ndarray, " views_and_end"],
+    bits: int,
+    files: dict[str, int],
+    threads: int,
+    progress: Progress | None,
+) -> list[_ViewSummary]:
+    def decode(index: int) -> _ViewSummary:
+        return _decode_view(model.views[index], model.image_infos[index], int(offsets[index]), bits, files)
+
+    # Bytes a pixel: as stored, as float32, and a copy of either while channels are rearranged.
+    largest = max(36 * info.width_px * info.height_px for info in model.image_infos)
+    workers = min(threads if threads > 0 else os.cpu_count() or 1, max(1, DECODING_BYTES // largest))
+    summaries: list[_ViewSummary] = []
+    with ThreadPoolExecutor(workers) as pool:
+        futures = [pool.submit(decode, index) for index in range(len(model.views))]
+        try:
+            for future in futures:
+                summaries.append(future.result())
+                if progress is not None:
+                    progress(len(summaries), len(futures))
+        finally:
+            pool.shutdown(cancel_futures=True)
+    return summaries
+
+
+def _decode_view(
+    view: DatasetView, info: ImageInfo, offset: int, bits: int, files: dict[str, int]
+) -> _ViewSummary:
+    width, height = view.width_px, view.height_px
+    digests = _file_digests(view)  # the file is then at hand for the decoder
+    rgb, alpha = read_photo(view.image_path, width, height, bits)
+    if rgb.shape != (height, width, 3):
+        raise DatasetError(
+            f"{view.image_path} changed while it was read; leave the scene alone until it is read."
+        )
+    _write_at_offset(files["rgb"], rgb, offset * 3 * bits // 8)
+    if "alpha" in files:
+        opaque = np.full((height, width), 255, dtype=np.uint8)
+        _write_at_offset(files["alpha"], opaque if alpha is None else alpha, offset)
+    mask = None
+    if "mask" in files:
+        mask = np.full((height, width), 255, dtype=np.uint8)
+        if view.mask_path is not None:
+            mask = read_mask(view.mask_path, (info.width_px, info.height_px), width, height)
+        _write_at_offset(files["mask"], mask, offset)
+    return _ViewSummary(
+        digests=digests,
+        is_transparent=alpha is not None and int(alpha.min()) < 255,
+        is_masked_out=mask is not None and int(mask.max()) < 128,
+    )
+
+
+def _write_at_offset(file: int, values: np.ndarray, position: int) -> None:
+    data = np.ascontiguousarray(values).data.cast("B")
+    while data:
+        written = os.pwrite(file, data, position)
+        data, position = data[written:], position + written

@@ -1,0 +1,60 @@
+"""Which photographs are held out from training."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Int64
+
+from octasplat.engine.errors import ConfigError, DatasetError
+from octasplat.engine.relative_paths import normalised
+from octasplat.engine.writing import write_json
+
+
+def split_views(
+    names: Sequence[str],
+    test_every: int = 8,
+    held_out: Sequence[str] | None = None,
+    *,
+    source_name: str = "model",
+) -> tuple[Int64[np.ndarray, " train"], Int64[np.ndarray, " test"]]:
+    """Indices of the training and of the held-out views.
+
+    Args:
+        names: names of the views, sorted.
+        test_every: every how-manieth view is held out, beginning with the first; 0 holds out none.
+        held_out: names of the views to hold out instead; an umlaut may be spelt as one character or as two.
+        source_name: what the names are of, for complaints.
+
+    Raises:
+        DatasetError: a name in ``held_out`` is unknown, or nothing is left to train on.
+        ConfigError: ``test_every`` is negative.
+    """
+    if test_every < 0:
+        raise ConfigError(f"test_every is {test_every}; it must be 0 (hold out none) or more.")
+    if held_out is not None:
+        chosen = set(map(normalised, held_out))
+        unknown = sorted(chosen - set(map(normalised, names)))
+        if unknown:
+            raise DatasetError(
+                f"{len(unknown)} of the images to hold out are not in the {source_name} "
+                f"({', '.join(unknown[:3])}); give names as they stand there."
+            )
+        is_test = np.array([normalised(name) in chosen for name in names], dtype=bool)
+    else:
+        is_test = np.arange(len(names)) % test_every == 0 if test_every else np.zeros(len(names), dtype=bool)
+    if is_test.all():
+        raise DatasetError(f"All {len(names)} images are held out; leave some to train on.")
+    return np.flatnonzero(~is_test).astype(np.int64), np.flatnonzero(is_test).astype(np.int64)
+
+
+def evaluation_split(
+    names: Sequence[str],
+) -> tuple[Int64[np.ndarray, " train"], Int64[np.ndarray, " test"]]:
+    """The split of photographs that are only measured: none to train on, all held out."""
+    return np.zeros(0, np.int64), np.arange(len(names), dtype=np.int64)
+
+
+def write_held_out(path: Path, names: Sequence[str]) -> None:
+    """Write the names of the held-out views to ``path`` as a JSON list, atomically."""
+    write_json(path, list(names))

@@ -1,0 +1,69 @@
+"""What a generated scene is made with; imports nothing heavy, so that a front end can use it."""
+
+from dataclasses import asdict, dataclass
+
+from octasplat.engine.errors import ConfigError
+
+CAMERA_MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "OPENCV", "OPENCV_FISHEYE")
+
+
+@dataclass(frozen=True)
+class SyntheticDatasetConfig:
+    """Settings of a generated scene; on one machine equal settings give equal files, byte for byte.
+
+    Attributes:
+        views: Number of photographs, on three rings around the table.
+        width_px: Width of a photograph.
+        height_px: Height of a photograph.
+        samples_per_side: A pixel is the mean of this number squared of display colours, on a regular grid.
+        points: Number of points in the COLMAP model.
+        seed: Seeds the jitter of the cameras and the choice of the points; the objects stay the same.
+        camera_model: COLMAP's name of the lens, one of ``CAMERA_MODELS``; it distorts the
+            photographs accordingly.
+        transparent: Write RGBA photographs (straight alpha) that show the table and its objects only, with
+            their coverage of each pixel as alpha.
+        with_masks: Also write the object masks where a reconstruction looks for them: ``masks/``.
+
+    Raises:
+        ConfigError: If a value is out of range.
+    """
+
+    views: int = 40
+    width_px: int = 320
+    height_px: int = 240
+    samples_per_side: int = 3
+    points: int = 10_000
+    seed: int = 0
+    camera_model: str = "PINHOLE"
+    transparent: bool = False
+    with_masks: bool = False
+
+    def __post_init__(self) -> None:
+        ranges = {
+            "views": (3, 1000),
+            "width_px": (8, 8192),
+            "height_px": (8, 8192),
+            "samples_per_side": (1, 16),
+            "points": (1, 1_000_000),
+            "seed": (0, 2**32 - 1),
+        }
+        for name, (low, high) in ranges.items():
+            value = getattr(self, name)
+            if not low <= value <= high:
+                raise ConfigError(
+                    f"Generated scene: {name} is {value}, but must lie between {low} and {high}."
+                )
+        if self.camera_model not in CAMERA_MODELS:
+            names = ", ".join(CAMERA_MODELS)
+            raise ConfigError(
+                f"Generated scene: camera_model is {self.camera_model!r}, but must be one of {names}."
+            )
+
+    @property
+    def objects_only(self) -> bool:
+        """Whether only the table and its objects are to be reconstructed, so that points lie on these."""
+        return self.transparent or self.with_masks
+
+    def as_dict(self) -> dict[str, object]:
+        """The settings as JSON-ready values."""
+        return asdict(self)

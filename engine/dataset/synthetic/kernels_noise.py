@@ -1,0 +1,79 @@
+"""Compiled inner loops of the generated scene: gradient noise, and interpolation on triangles."""
+
+import numpy as np
+
+from octasplat.engine.compilation import device_function, kernel
+
+
+@device_function(inline="always")
+def _hash(x, y, z, seed):  # type: ignore[no-untyped-def]
+    """32 well mixed bits of an integer lattice point."""
+    h = np.uint32(x) * np.uint32(0x8DA6B343) ^ np.uint32(y) * np.uint32(0xD8163841)
+    h = np.uint32(h) ^ np.uint32(z) * np.uint32(0xCB1AB31F) ^ np.uint32(seed) * np.uint32(0x9E3779B1)
+    h = np.uint32(h)
+    h = np.uint32((h ^ (h >> np.uint32(15))) * np.uint32(0x2C1B3C6D))
+    h = np.uint32((h ^ (h >> np.uint32(12))) * np.uint32(0x297A2D39))
+    return np.uint32(h ^ (h >> np.uint32(15)))
+
+
+@kernel()
+def hash_cells(cells, seed, out):  # type: ignore[no-untyped-def]
+    """A number in [0, 1) of every integer cell (n, 3), into ``out`` (n,)."""
+    for i in range(cells.shape[0]):
+        out[i] = np.float32(_hash(cells[i, 0], cells[i, 1], cells[i, 2], seed) >> np.uint32(8)) / np.float32(
+            1 << 24
+        )
+
+
+@device_function(inline="always")
+def _gradient_dot(h, dx, dy, dz):  # type: ignore[no-untyped-def]
+    """Height at an offset from a lattice point, on the plane that the hash gives to that point."""
+    scale = np.float32(1.0 / 511.5)
+    gx = np.float32(h & np.uint32(1023)) * scale - np.float32(1)
+    gy = np.float32((h >> np.uint32(10)) & np.uint32(1023)) * scale - np.float32(1)
+    gz = np.float32((h >> np.uint32(20)) & np.uint32(1023)) * scale - np.float32(1)
+    return gx * dx + gy * dy + gz * dz
+
+
+@kernel()
+def fractal_noise(points, octaves, seed, out):  # type: ignore[no-untyped-def]
+    """Sum of ``octaves`` gradient noises, each twice as fine and half as strong, into ``out`` (n,)."""
+    one = np.float32(1)
+    for i in range(points.shape[0]):
+        total = np.float32(0)
+        strength = np.float32(1.25)
+        px, py, pz = points[i, 0], points[i, 1], points[i, 2]
+        for octave in range(octaves):
+            fx, fy, fz = np.floor(px), np.floor(py), np.floor(pz)
+            ix, iy, iz = np.int32(fx), np.int32(fy), np.int32(fz)
+            x, y, z = px - fx, py - fy, pz - fz
+            # Quintic blending: second derivatives are continuous, so lattice planes do not show.
+            wx = x * x * x * (x * (x * np.float32(6) - np.float32(15)) + np.float32(10))
+            wy = y * y * y * (y * (y * np.float32(6) - np.float32(15)) + np.float32(10))
+            wz = z * z * z * (z * (z * np.float32(6) - np.float32(15)) + np.float32(10))
+            s = seed + octave * 101
+            a = _gradient_dot(_hash(ix, iy, iz, s), x, y, z)
+            b = _gradient_dot(_hash(ix + 1, iy, iz, s), x - one, y, z)
+            c = _gradient_dot(_hash(ix, iy + 1, iz, s), x, y - one, z)
+            d = _gradient_dot(_hash(ix + 1, iy + 1, iz, s), x - one, y - one, z)
+            near = (a + (b - a) * wx) + ((c + (d - c) * wx) - (a + (b - a) * wx)) * wy
+            a = _gradient_dot(_hash(ix, iy, iz + 1, s), x, y, z - one)
+            b = _gradient_dot(_hash(ix + 1, iy, iz + 1, s), x - one, y, z - one)
+            c = _gradient_dot(_hash(ix, iy + 1, iz + 1, s), x, y - one, z - one)
+            d = _gradient_dot(_hash(ix + 1, iy + 1, iz + 1, s), x - one, y - one, z - one)
+            far = (a + (b - a) * wx) + ((c + (d - c) * wx) - (a + (b - a) * wx)) * wy
+            total += strength * (near + (far - near) * wz)
+            strength *= np.float32(0.5)
+            px, py, pz = px * np.float32(2.03), py * np.float32(2.03), pz * np.float32(2.03)
+        out[i] = total
+
+
+@kernel()
+def interpolate_attributes(attributes, faces, face_ids, u, v, out):  # type: ignore[no-untyped-def]
+    """Vertex attributes (vertices, k) at barycentric coordinates (u, v) on faces, into ``out`` (n, k)."""
+    width = attributes.shape[1]
+    for i in range(face_ids.shape[0]):
+        a, b, c = faces[face_ids[i], 0], faces[face_ids[i], 1], faces[face_ids[i], 2]
+        w = np.float32(1) - u[i] - v[i]
+        for k in range(width):
+            out[i, k] = w * attributes[a, k] + u[i] * attributes[b, k] + v[i] * attributes[c, k]

@@ -1,0 +1,173 @@
+"""The still life in Embree, lit once: light that falls on each vertex, and colours of hits."""
+
+import os
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+from jaxtyping import Float, Float32
+
+from octasplat.engine.colour import linear_to_srgb
+from octasplat.engine.dataset.synthetic import kernels_noise
+from octasplat.engine.dataset.synthetic.still_life import StillLife
+from octasplat.engine.rays import RayBatch
+from octasplat.engine.trace.triangle_bvh import TriangleBvh, TriangleHits
+
+# Fixed, so that equal sums are summed alike on every machine.
+_CHUNKS = 16
+THREADS = min(8, os.cpu_count() or 1)
+
+_LAMP_WORLD = np.array([1.9, -1.5, 4.2])
+_LAMP_RADIUS = 0.4
+_LAMP = np.array([1.0, 0.9, 0.76]) * 42.0
+_SPECULAR_STRENGTH = np.array([9.0, 8.2, 7.0], np.float32)
+_ZENITH, _HORIZON, _INDIRECT_LIGHT = (
+    np.array(c) for c in ([0.34, 0.42, 0.6], [0.5, 0.5, 0.52], [0.15, 0.125, 0.1])
+)
+_EXPOSURE = 1.1
+# Shadow rays start this far above the surface, so that a facet does not shade itself.
+_SHADOW_RAY_OFFSET = 1.5e-3
+# Columns of the vertex attributes that a hit interpolates.
+_UV, _XYZ, _NORMAL, _LIGHT, _LAMP_SEEN = slice(0, 2), slice(2, 5), slice(5, 8), slice(8, 11), 11
+
+
+class LitScene:
+    """The still life ready to be photographed; its methods may be called from several threads."""
+
+    def __init__(self, still_life: StillLife) -> None:
+        self.still_life = still_life
+        self._mesh = TriangleBvh(still_life.vertices, still_life.faces, threads=1)
+        light, lamp_seen = self._vertex_irradiance()
+        self._attributes = np.ascontiguousarray(
+            np.concatenate(
+                [still_life.uv, still_life.texture_xyz, still_life.vertex_normals, light, lamp_seen[:, None]],
+                axis=1,
+            ),
+            dtype=np.float32,
+        )
+
+    def trace(
+        self, origins: Float32[np.ndarray, "n 3"], directions: Float32[np.ndarray, "n 3"]
+    ) -> TriangleHits:
+        """First hits along rays in the world frame; directions need not have unit length."""
+        return self._mesh.closest(RayBatch(origins, directions))
+
+    def _shadow_transmittance(
+        self, origins: Float[np.ndarray, "n 3"], directions: Float[np.ndarray, "n 3"]
+    ) -> np.ndarray:
+        """1.0 where nothing lies between an origin and the origin plus its direction, else 0.0."""
+        return 1.0 - self._mesh.occluded(RayBatch(origins, directions, t_max=1.0))
+
+    def _vertex_irradiance(self) -> tuple[Float32[np.ndarray, "n 3"], Float32[np.ndarray, " n"]]:
+        """Irradiance on each vertex (lamp, sky, a constant for bounces) and the share of the lamp seen."""
+        pieces = np.array_split(np.arange(len(self.still_life.vertices)), _CHUNKS)
+        with ThreadPoolExecutor(THREADS) as pool:
+            parts = list(pool.map(self._irradiance_at, pieces))
+        return np.concatenate([light for light, _ in parts]), np.concatenate([seen for _, seen in parts])
+
+    def _irradiance_at(
+        self, which: np.ndarray
+    ) -> tuple[Float32[np.ndarray, "n 3"], Float32[np.ndarray, " n"]]:
+        normals = self.still_life.vertex_normals[which].astype(np.float64)
+        starts = self.still_life.vertices[which] + _SHADOW_RAY_OFFSET * normals
+        light, seen = np.zeros_like(starts), np.zeros(len(starts))
+        lamp_points = _lamp_points(36)
+        for lamp_point in lamp_points:
+            way = lamp_point - starts
+            squared = np.sum(way * way, axis=1)
+            cosine = np.maximum(np.sum(normals * way, axis=1), 0) / np.sqrt(squared)
+            free = np.zeros(len(starts))
+            lit = np.flatnonzero(cosine > 0)
+            free[lit] = self._shadow_transmittance(starts[lit], way[lit])
+            seen += free / len(lamp_points)
+            light += (free * cosine / squared)[:, None] * _LAMP / len(lamp_points)
+        directions = _sphere_directions(112)
+        for direction in directions:
+            cosine = np.maximum(np.sum(normals * direction, axis=1), 0)
+            up = np.flatnonzero(cosine > 0)
+            free = np.zeros((len(starts), 1))
+            free[up, 0] = self._shadow_transmittance(
+                starts[up], np.broadcast_to(20 * direction, (len(up), 3))
+            )
+            sky = np.zeros(3) if direction[2] <= 0 else _sky_radiance(direction[None])[0]
+            light += (4 / len(directions)) * cosine[:, None] * (free * sky + (1 - free) * _INDIRECT_LIGHT)
+        return light.astype(np.float32), seen.astype(np.float32)
+
+    def shade_hits(
+        self, hits: TriangleHits, origins: Float32[np.ndarray, "n 3"], directions: Float32[np.ndarray, "n 3"]
+    ) -> Float32[np.ndarray, "n 3"]:
+        """Display colours in [0, 1] that rays bring back from their hits."""
+        radiance = np.empty_like(directions)
+        missed = ~hits.is_hit
+        radiance[missed] = _sky_radiance(directions[missed])
+        hit = np.flatnonzero(hits.is_hit)
+        faces = hits.faces[hit]
+        at = np.empty((len(hit), self._attributes.shape[1]), np.float32)
+        u, v = np.ascontiguousarray(hits.barycentrics[hit].T)
+        kernels_noise.interpolate_attributes(self._attributes, self.still_life.faces, faces, u, v, at)
+        kinds = self.still_life.face_object[faces]
+        for kind in np.unique(kinds):
+            thing = self.still_life.objects[kind]
+            mine = np.flatnonzero(kinds == kind)
+            here = at[mine]
+            albedo = thing.material(np.ascontiguousarray(here[:, _XYZ]), np.ascontiguousarray(here[:, _UV]))
+            bright = albedo * here[:, _LIGHT]
+            if thing.gloss:
+                rays = hit[mine]
+                places = origins[rays] + hits.distances[rays, None] * directions[rays]
+                bright += (
+                    np.float32(thing.gloss)
+                    * _phong_highlight(places, directions[rays], here[:, _NORMAL])[:, None]
+                    * (here[:, _LAMP_SEEN, None] * _SPECULAR_STRENGTH)
+                )
+            radiance[hit[mine]] = bright
+        return _tonemap(radiance)
+
+
+def _phong_highlight(
+    places: Float32[np.ndarray, "n 3"],
+    directions: Float32[np.ndarray, "n 3"],
+    normals: Float32[np.ndarray, "n 3"],
+) -> Float32[np.ndarray, " n"]:
+    """Mirrored lamp on a glossy surface: a Phong lobe about the mirrored ray."""
+    ahead, upwards, to_lamp = (
+        _normalised(a) for a in (directions, normals, _LAMP_WORLD.astype(np.float32) - places)
+    )
+    mirrored = ahead - 2 * np.sum(ahead * upwards, axis=1, keepdims=True) * upwards
+    return np.maximum(np.sum(mirrored * to_lamp, axis=1), 0) ** 90
+
+
+def _normalised(vectors: Float32[np.ndarray, "n 3"]) -> Float32[np.ndarray, "n 3"]:
+    return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
+
+
+def _lamp_points(count: int) -> Float[np.ndarray, "n 3"]:
+    """Points spread evenly (by the golden angle) over the lamp's disc, which faces the table."""
+    k = np.arange(count)
+    radius, angle = _LAMP_RADIUS * np.sqrt((k + 0.5) / count), k * np.pi * (3 - np.sqrt(5))
+    down = -_LAMP_WORLD / np.linalg.norm(_LAMP_WORLD)
+    side = np.cross(down, [0.0, 0.0, 1.0])
+    side /= np.linalg.norm(side)
+    return (
+        _LAMP_WORLD
+        + np.outer(radius * np.cos(angle), side)
+        + np.outer(radius * np.sin(angle), np.cross(down, side))
+    )
+
+
+def _sphere_directions(count: int) -> Float[np.ndarray, "n 3"]:
+    """Unit vectors spread evenly over the sphere (Fibonacci)."""
+    k = np.arange(count)
+    z, angle = 1 - (2 * k + 1) / count, k * np.pi * (3 - np.sqrt(5))
+    across = np.sqrt(1 - z * z)
+    return np.stack([across * np.cos(angle), across * np.sin(angle), z], axis=1)
+
+
+def _sky_radiance(directions: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+    """Radiance of the open roof."""
+    height = np.clip(directions[:, 2:] / np.linalg.norm(directions, axis=1, keepdims=True), 0, 1)
+    return _HORIZON + (_ZENITH - _HORIZON) * height
+
+
+def _tonemap(radiance: Float32[np.ndarray, "n 3"]) -> Float32[np.ndarray, "n 3"]:
+    """sRGB-encoded colours of linear light, with a soft shoulder so that nothing clips hard."""
+    return linear_to_srgb(1 - np.exp(radiance * np.float32(-_EXPOSURE)))

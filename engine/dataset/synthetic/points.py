@@ -1,0 +1,112 @@
+"""Surface points that several photographs see, as structure from motion would have found them."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import pycolmap
+from jaxtyping import Bool, Float, UInt8
+
+from octasplat.engine.colour import to_bytes
+from octasplat.engine.dataset.synthetic.config import SyntheticDatasetConfig
+from octasplat.engine.dataset.synthetic.lit_scene import LitScene
+from octasplat.engine.dataset.synthetic.photograph_renderer import rays_world
+from octasplat.engine.dataset.synthetic.synthetic_views import SyntheticView, directions_cam, project_visible
+
+# Standard deviation of the points' error, as a share of the extent of the cameras.
+_POSITION_NOISE = 1e-4
+# A point is seen if its ray ends this close to it, as a share of the distance.
+_VISIBILITY_TOLERANCE = 1 - 5e-4
+_BATCH = 4096
+_MAX_BATCHES = 400
+
+
+@dataclass(frozen=True)
+class SurfacePoints:
+    """Points and their tracks.
+
+    Attributes:
+        xyz_world: Positions with a little noise.
+        rgb_srgb8: Mean display colours of a pixel that shows them.
+        observed_px: Exact image positions of the noiseless points; not-a-number where not seen.
+    """
+
+    xyz_world: Float[np.ndarray, "n 3"]
+    rgb_srgb8: UInt8[np.ndarray, "n 3"]
+    observed_px: Float[np.ndarray, "n views 2"]
+
+
+def sample_surface_points(
+    scene: LitScene, camera: pycolmap.Camera, views: list[SyntheticView], config: SyntheticDatasetConfig
+) -> SurfacePoints:
+    """``config.points`` points under randomly chosen pixels, each seen by at least two views.
+
+    Where only the objects are to be reconstructed, the points lie on these. Fewer points come back if the
+    views hardly overlap.
+    """
+    random = np.random.default_rng([config.seed, 2])
+    places: list[np.ndarray] = []
+    colours: list[np.ndarray] = []
+    tracks: list[np.ndarray] = []
+    found = 0
+    for _ in range(_MAX_BATCHES):
+        chosen = np.sort(random.integers(len(views), size=_BATCH))
+        pixels = random.uniform(0.5, np.array([camera.width, camera.height]) - 0.5, (_BATCH, 2))
+        xyz, rgb = _points_under_pixels(
+            scene, camera, [views[k] for k in chosen], pixels, config.objects_only
+        )
+        observed = np.stack([_project_unoccluded(scene, camera, view, xyz) for view in views], axis=1)
+        good = np.sum(np.isfinite(observed[..., 0]), axis=1) >= 2
+        # The batch is sorted by view; a shuffle keeps a cut at the wanted number fair to all views.
+        order = random.permutation(np.flatnonzero(good))[: config.points - found]
+        places.append(xyz[order])
+        colours.append(rgb[order])
+        tracks.append(observed[order])
+        found += len(order)
+        if found == config.points:
+            break
+    xyz = np.concatenate(places)
+    centres = np.array([view.centre_world for view in views])
+    extent = float(np.linalg.norm(np.ptp(centres, axis=0)))
+    return SurfacePoints(
+        xyz + random.normal(0, _POSITION_NOISE * extent, xyz.shape),
+        np.concatenate(colours),
+        np.concatenate(tracks),
+    )
+
+
+def _points_under_pixels(
+    scene: LitScene,
+    camera: pycolmap.Camera,
+    views: list[SyntheticView],
+    pixels: Float[np.ndarray, "n 2"],
+    objects_only: bool,
+) -> tuple[Float[np.ndarray, "m 3"], UInt8[np.ndarray, "m 3"]]:
+    """Where the rays through image positions end, and colours of pixels around these positions."""
+    steps = (np.arange(3) + 0.5) / 3 - 0.5
+    around = pixels[:, None] + np.stack(np.meshgrid(steps, steps), axis=-1).reshape(1, 9, 2)
+    directions = directions_cam(camera, around.reshape(-1, 2)).reshape(-1, 9, 3)
+    rays = [rays_world(view, rows) for view, rows in zip(views, directions, strict=True)]
+    origins, along = (np.concatenate(parts) for parts in zip(*rays, strict=True))
+    hits = scene.trace(origins, along)
+    colours = scene.shade_hits(hits, origins, along).reshape(-1, 9, 3).mean(axis=1)
+    middle = slice(4, None, 9)
+    face = hits.faces[middle]
+    wanted: Bool[np.ndarray, " n"] = face >= 0
+    if objects_only:
+        wanted &= scene.still_life.face_is_foreground[face]
+    distance = np.where(wanted, hits.distances[middle], 0).astype(np.float64)
+    xyz = origins[middle] + distance[:, None] * along[middle]
+    return xyz[wanted], to_bytes(colours[wanted])
+
+
+def _project_unoccluded(
+    scene: LitScene, camera: pycolmap.Camera, view: SyntheticView, xyz: Float[np.ndarray, "n 3"]
+) -> Float[np.ndarray, "n 2"]:
+    """Image positions of the points that ``view`` sees, not-a-number for the others."""
+    pixels = project_visible(camera, view, xyz)
+    inside = np.flatnonzero(np.isfinite(pixels[:, 0]))
+    ways = (xyz[inside] - view.centre_world).astype(np.float32)
+    origins = np.broadcast_to(view.centre_world.astype(np.float32), ways.shape).copy()
+    hidden = scene.trace(origins, ways).distances < _VISIBILITY_TOLERANCE
+    pixels[inside[hidden]] = np.nan
+    return pixels

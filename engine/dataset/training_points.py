@@ -1,0 +1,49 @@
+"""The sparse points that the training photographs know without the held-out ones.
+
+A point that only held-out photographs show, or one training photograph and a held-out one, tells where the
+surface lies that the held-out views are to be measured by. A training must not begin with it.
+"""
+
+import numpy as np
+from jaxtyping import Bool, Int64
+
+from octasplat.engine.dataset.model import Observations, SparsePoints
+
+MIN_OBSERVATIONS = 2
+"""So many training photographs give a point its place."""
+
+
+def is_observed_by(
+    views: Int64[np.ndarray, " t"], points: SparsePoints, observations: Observations
+) -> Bool[np.ndarray, " n"]:
+    """Return which points at least two of ``views`` show.
+
+    All count where no photograph is said to show any, or where none would be left.
+
+    Args:
+        views: indices of the training views.
+        points: sparse points; their ids ascend.
+        observations: of the points.
+    """
+    if len(points) == 0 or len(observations) == 0:
+        return np.ones(len(points), np.bool_)
+    row = np.minimum(np.searchsorted(points.ids, observations.point), len(points) - 1)
+    counted = np.isin(observations.view, views) & (points.ids[row] == observations.point)
+    # A track may name a photograph twice, which tells no more than once.
+    once = np.unique(np.stack([row[counted], observations.view[counted]], axis=1), axis=0)
+    known = np.bincount(once[:, 0], minlength=len(points)) >= MIN_OBSERVATIONS
+    return known if known.any() else np.ones(len(points), np.bool_)
+
+
+def training_points(
+    views: Int64[np.ndarray, " t"], points: SparsePoints, observations: Observations
+) -> SparsePoints:
+    """Return the points that at least two of ``views`` show; see :func:`is_observed_by`."""
+    known = is_observed_by(views, points, observations)
+    return SparsePoints(
+        points.xyz_world[known],
+        points.rgb_srgb[known],
+        points.track_lengths[known],
+        points.errors_px[known],
+        points.ids[known],
+    )

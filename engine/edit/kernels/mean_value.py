@@ -1,0 +1,349 @@
+"""Mean-value coordinates and winding numbers, for eight points at a time.
+
+Of an edge no more is needed than its angle over the sine of it, once for the two triangles beside it: that
+is a polynomial of the cosine unless the angle is wide. What is rare goes a slower way: wide angles, and
+points in the plane of a triangle.
+"""
+
+import math
+
+import llvmlite.ir as ir
+import numpy as np
+from numba import prange, types
+from numba.extending import intrinsic
+from numpy.polynomial import Chebyshev, Polynomial
+
+from octasplat.engine.compilation import device_function, kernel
+from octasplat.engine.trace.cpu.kernels.simd_vector import DOUBLE8, LANES, VectorRows, broadcast
+
+GROUPS_PER_TASK = 16
+FLAT_TOLERANCE = 1e-9
+"""A point lies in the plane of a triangle if its unit vectors to the corners span less than this, as a share
+of what those to the last two do."""
+TINY_LENGTH = 1e-300
+TURN = 2.0 * math.pi
+STEEP_LIMIT = math.tan(math.pi / 8)
+WIDE_ANGLE = 0.25
+"""Angles whose cosine is below this are wide."""
+POINT_ROWS, VERTEX_ROWS = 3, 4
+"""Rows of eight lanes that are kept: of points their place, of vertices the unit vector to them and one over
+their distance. Of edges it is half the angle that they are seen under over its sine."""
+
+
+def _arctangent(squared):
+    root = np.sqrt(np.maximum(squared, TINY_LENGTH))
+    return np.arctan(root) / root
+
+
+def _half_angle_over_sine(missing):
+    # By half the angle, whose sine is known to all digits.
+    half = np.arcsin(np.sqrt(np.maximum(missing, TINY_LENGTH) / 2))
+    return half / np.sin(2 * half)
+
+
+def _fit_polynomial(function, degree: int, end: float) -> list[float]:
+    """Coefficients of a polynomial that is a function from 0 to ``end``, to rounding."""
+    fitted = Chebyshev.interpolate(function, degree, domain=[0.0, end])
+    return [float(value) for value in fitted.convert(kind=Polynomial).coef]
+
+
+ARCTANGENT = _fit_polynomial(_arctangent, 12, STEEP_LIMIT**2)
+"""Coefficients of p in arctan(z) = z p(z^2), up to z = tan(pi / 8)."""
+NARROW = _fit_polynomial(_half_angle_over_sine, 17, 1.0 - WIDE_ANGLE)
+"""Of half an angle over its sine, by what its cosine lacks of 1."""
+
+
+def _polynomial(coefficients, x):
+    value = x * coefficients[-1] + coefficients[-2]
+    for coefficient in coefficients[-3::-1]:
+        value = value * x + coefficient
+    return value
+
+
+def _angle(sine, cosine):
+    """Angles in [0, pi] of vectors whose sines are not negative; both may have any common factor."""
+    ahead = abs(cosine)
+    beyond = sine > ahead
+    small, large = beyond.where(ahead, sine), beyond.where(sine, ahead)
+    # Beyond an eighth of a half turn, what is missing to two eighths.
+    steep = small > large * STEEP_LIMIT
+    z = steep.where(small - large, small) / steep.where(small + large, large).larger(TINY_LENGTH)
+    angle = _polynomial(ARCTANGENT, z * z) * z
+    angle = steep.where(angle + math.pi / 4, angle)
+    angle = beyond.where(angle * -1.0 + math.pi / 2, angle)
+    return (cosine < 0.0).where(angle * -1.0 + math.pi, angle)
+
+
+def _constant_one(builder):
+    return broadcast(builder, ir.Constant(ir.DoubleType(), 1.0))
+
+
+def _cross(a, b):
+    return [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
+
+
+def _dot(a, b):
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+@intrinsic
+def vertex_rows(typingctx, points, x, y, z, near, vertex):
+    """Write the rows of a vertex as seen from the points; bit k: point k is nearer to it than ``near``."""
+    signature = types.int64(types.uintp, *[types.float64] * 4, types.uintp)
+
+    def codegen(context, builder, sig, args):
+        seen_from, rows = (VectorRows(builder, address, DOUBLE8) for address in (args[0], args[5]))
+        way = [broadcast(builder, args[1 + axis]) - seen_from[axis] for axis in range(3)]
+        length = _dot(way, way).sqrt()
+        inverse = _constant_one(builder) / length.maximum(TINY_LENGTH)
+        rows[3] = inverse
+        for axis in range(3):
+            rows[axis] = way[axis] * inverse
+        return (length < broadcast(builder, args[4])).to_bitmask()
+
+    return signature, codegen
+
+
+@intrinsic
+def edge_rows(typingctx, a, b, edge):
+    """Write the row of the edge between two vertices; bit k: point k sees it under a wide angle.
+
+    Then the row is not right; :func:`edge_rows_wide` writes it.
+    """
+    signature = types.int64(types.uintp, types.uintp, types.uintp)
+
+    def codegen(context, builder, sig, args):
+        a, b = (_unit(builder, address) for address in args[:2])
+        cosine = _dot(a, b)
+        VectorRows(builder, args[2], DOUBLE8)[0] = _polynomial(NARROW, cosine * -1.0 + 1.0)
+        return (cosine < WIDE_ANGLE).to_bitmask()
+
+    return signature, codegen
+
+
+@intrinsic
+def edge_rows_wide(typingctx, a, b, edge):
+    """Write the row of the edge between two vertices, whatever its angle."""
+    signature = types.void(types.uintp, types.uintp, types.uintp)
+
+    def codegen(context, builder, sig, args):
+        a, b = (_unit(builder, address) for address in args[:2])
+        across = _cross(a, b)
+        sine = _dot(across, across).sqrt()
+        half = _angle(sine, _dot(a, b)) * 0.5
+        VectorRows(builder, args[2], DOUBLE8)[0] = half / sine.maximum(TINY_LENGTH)
+        return context.get_dummy_value()
+
+    return signature, codegen
+
+
+def _unit(builder, address):
+    rows = VectorRows(builder, address, DOUBLE8)
+    return [rows[axis] for axis in range(3)]
+
+
+class _Triangle:
+    """A triangle as seen from the points."""
+
+    def __init__(self, builder, corners, edges):
+        self._builder = builder
+        self.units = [_unit(builder, builder.extract_value(corners, k)) for k in range(3)]
+        self.normals = [_cross(self.units[(k + 1) % 3], self.units[(k + 2) % 3]) for k in range(3)]
+        self.volume = _dot(self.units[0], self.normals[0])
+        self._shares = [VectorRows(builder, builder.extract_value(edges, k), DOUBLE8)[0] for k in range(3)]
+
+    def add(self, where, sums):
+        """Add the components of the mean vector to the sums of the corners."""
+        builder, normals, shares = self._builder, self.normals, self._shares
+        mean = [
+            shares[0] * normals[0][axis] + shares[1] * normals[1][axis] + shares[2] * normals[2][axis]
+            for axis in range(3)
+        ]
+        inverse = where.where(_constant_one(builder) / self.volume, 0.0)
+        for k, normal in enumerate(normals):
+            row = VectorRows(builder, builder.extract_value(sums, k), DOUBLE8)
+            row[0] = row[0] + _dot(mean, normal) * inverse
+
+
+THREE_CORNERS = types.UniTuple(types.uintp, 3)
+
+
+@intrinsic
+def add_means(typingctx, corners, edges, sums):
+    """Add what a triangle counts for its corners to their sums; bit k: not for point k, to which it is flat.
+
+    All three arguments hold three addresses, of edge k that of the one opposite of corner k.
+    """
+    signature = types.int64(THREE_CORNERS, THREE_CORNERS, THREE_CORNERS)
+
+    def codegen(context, builder, sig, args):
+        triangle = _Triangle(builder, *args[:2])
+        solid = abs(triangle.volume) > FLAT_TOLERANCE
+        triangle.add(solid, args[2])
+        return (~solid).to_bitmask()
+
+    return signature, codegen
+
+
+@intrinsic
+def add_flat_means(typingctx, corners, edges, sums):
+    """Add what :func:`add_means` has left out; bit k: point k lies on the triangle."""
+    signature = types.int64(THREE_CORNERS, THREE_CORNERS, THREE_CORNERS)
+
+    def codegen(context, builder, sig, args):
+        triangle = _Triangle(builder, *args[:2])
+        u, sines = triangle.units, [_dot(normal, normal).sqrt() for normal in triangle.normals]
+        size = abs(triangle.volume)
+        beside = size <= sines[0] * FLAT_TOLERANCE
+        # In the triangle's plane but not on it, a triangle counts nothing.
+        triangle.add((size <= FLAT_TOLERANCE) & ~beside, args[2])
+        around = _angle(sines[0], _dot(u[1], u[2]))
+        for k in (1, 2):
+            around = around + _angle(sines[k], _dot(u[(k + 1) % 3], u[(k + 2) % 3]))
+        return (beside & (around >= TURN - 1e-6)).to_bitmask()
+
+    return signature, codegen
+
+
+@intrinsic
+def add_solid_angle(typingctx, corners, total):
+    """Add half the solid angle of a triangle (Van Oosterom and Strackee 1983) to a row."""
+    signature = types.void(THREE_CORNERS, types.uintp)
+
+    def codegen(context, builder, sig, args):
+        a, b, c = (_unit(builder, builder.extract_value(args[0], k)) for k in range(3))
+        volume = _dot(a, _cross(b, c))
+        angle = _angle(abs(volume), _dot(a, b) + _dot(b, c) + _dot(c, a) + 1.0)
+        rows = VectorRows(builder, args[1], DOUBLE8)
+        rows[0] = rows[0] + (volume < 0.0).select(angle * -1.0, angle)
+        return context.get_dummy_value()
+
+    return signature, codegen
+
+
+@device_function(error_model="numpy")
+def _gather(points, first, vertices, near, rows, seen):
+    """Eight points from ``first`` on (the last one again where there are fewer), and the vertices from there.
+
+    Returns the bits of points that are nearer to a vertex than ``near``.
+    """
+    for lane in range(LANES):
+        i = min(first + lane, len(points) - 1)
+        for axis in range(3):
+            rows[axis, lane] = points[i, axis]
+    met, place, at = 0, rows.ctypes.data, seen.ctypes.data
+    for j in range(len(vertices)):
+        row = np.uintp(at + j * VERTEX_ROWS * LANES * 8)
+        met |= vertex_rows(place, vertices[j, 0], vertices[j, 1], vertices[j, 2], near, row)
+    return met
+
+
+@kernel(parallel=True, error_model="numpy")
+def winding_numbers(points, vertices, triangles, result):
+    """How often a closed mesh winds round each point: the sum of its triangles' solid angles over 4 pi."""
+    chunks = -(-len(points) // (GROUPS_PER_TASK * LANES))
+    for chunk in prange(chunks):
+        _winding_block(points, vertices, triangles, chunk * GROUPS_PER_TASK * LANES, result)
+
+
+@device_function(error_model="numpy")
+def _winding_block(points, vertices, triangles, start, result):
+    rows, total = np.empty((POINT_ROWS, LANES)), np.empty((1, LANES))
+    seen = np.empty((len(vertices) * VERTEX_ROWS, LANES))
+    for first in range(start, min(start + GROUPS_PER_TASK * LANES, len(points)), LANES):
+        _gather(points, first, vertices, 0.0, rows, seen)
+        total[:] = 0.0
+        at, step = seen.ctypes.data, VERTEX_ROWS * LANES * 8
+        for t in range(len(triangles)):
+            a, b, c = triangles[t, 0], triangles[t, 1], triangles[t, 2]
+            add_solid_angle(
+                (np.uintp(at + a * step), np.uintp(at + b * step), np.uintp(at + c * step)), total.ctypes.data
+            )
+        for lane in range(min(LANES, len(points) - first)):
+            result[first + lane] = np.int64(np.rint(total[0, lane] / TURN))
+
+
+@kernel(parallel=True, error_model="numpy")
+def mean_value_weights(points, vertices, triangles, edges, opposite, size, weights):
+    """Mean-value coordinates of points in a closed triangle mesh (Ju, Schaefer, Warren 2005).
+
+    The weights of a triangle are the components of its mean vector, half the sum of its angles times the unit
+    normals of the three planes through the point and an edge, along the directions of its corners. ``size``
+    is a length of the mesh, against which nearness is judged. ``opposite`` names the edge opposite of each
+    corner of each triangle.
+    """
+    chunks = -(-len(points) // (GROUPS_PER_TASK * LANES))
+    for chunk in prange(chunks):
+        start = chunk * GROUPS_PER_TASK * LANES
+        _weights_block(points, vertices, triangles, edges, opposite, 1e-9 * size, start, weights)
+
+
+@device_function(error_model="numpy")
+def _weights_block(points, vertices, triangles, edges, opposite, near, start, weights):
+    count = len(vertices)
+    rows = np.empty((POINT_ROWS, LANES))
+    # Of vertices, then of edges; one array, as numba frees what only its address is used of.
+    seen, sums = np.empty((count * VERTEX_ROWS + len(edges), LANES)), np.empty((count, LANES))
+    row, step = LANES * 8, VERTEX_ROWS * LANES * 8
+    at, counted = seen.ctypes.data, sums.ctypes.data
+    beside = at + count * step
+    for first in range(start, min(start + GROUPS_PER_TASK * LANES, len(points)), LANES):
+        special = _gather(points, first, vertices, near, rows, seen)
+        for e in range(len(edges)):
+            a, b = np.uintp(at + edges[e, 0] * step), np.uintp(at + edges[e, 1] * step)
+            if edge_rows(a, b, np.uintp(beside + e * row)) != 0:
+                edge_rows_wide(a, b, np.uintp(beside + e * row))
+        sums[:] = 0.0
+        for t in range(len(triangles)):
+            a, b, c = triangles[t, 0], triangles[t, 1], triangles[t, 2]
+            d, e, f = opposite[t, 0], opposite[t, 1], opposite[t, 2]
+            corners = np.uintp(at + a * step), np.uintp(at + b * step), np.uintp(at + c * step)
+            sides = np.uintp(beside + d * row), np.uintp(beside + e * row), np.uintp(beside + f * row)
+            into = np.uintp(counted + a * row), np.uintp(counted + b * row), np.uintp(counted + c * row)
+            if add_means(corners, sides, into) != 0:
+                special |= add_flat_means(corners, sides, into)
+        totals = rows[0]
+        totals[:] = 0.0
+        for j in range(count):
+            for lane in range(LANES):
+                sums[j, lane] *= seen[j * VERTEX_ROWS + 3, lane]
+                totals[lane] += sums[j, lane]
+        for lane in range(min(LANES, len(points) - first)):
+            if (special >> lane) & 1:
+                _boundary_coordinates(points[first + lane], vertices, triangles, near, weights[first + lane])
+                continue
+            for j in range(count):
+                weights[first + lane, j] = sums[j, lane] / totals[lane]
+
+
+@device_function(error_model="numpy")
+def _boundary_coordinates(point, vertices, triangles, near, row):
+    """Coordinates of a point that is one of the vertices, or else lies on a triangle: the first one's."""
+    row[:] = 0.0
+    way = np.empty((3, 3))
+    lengths, areas = np.empty(3), np.empty(3)
+    for j in range(len(vertices)):
+        x, y, z = vertices[j, 0] - point[0], vertices[j, 1] - point[1], vertices[j, 2] - point[2]
+        if math.sqrt(x * x + y * y + z * z) < near:
+            row[j] = 1.0
+            return
+    for t in range(len(triangles)):
+        for k in range(3):
+            for axis in range(3):
+                way[k, axis] = vertices[triangles[t, k], axis] - point[axis]
+            lengths[k] = math.sqrt(way[k, 0] ** 2 + way[k, 1] ** 2 + way[k, 2] ** 2)
+        around = volume = 0.0
+        for k in range(2, -1, -1):
+            a, b = way[(k + 1) % 3], way[(k + 2) % 3]
+            x, y = a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2]
+            z = a[0] * b[1] - a[1] * b[0]
+            areas[k] = math.sqrt(x * x + y * y + z * z)
+            around += math.atan2(areas[k], a[0] * b[0] + a[1] * b[1] + a[2] * b[2])
+            volume = x * way[k, 0] + y * way[k, 1] + z * way[k, 2]
+        sine = areas[0] / (lengths[1] * lengths[2])
+        volume /= lengths[0] * lengths[1] * lengths[2]
+        if abs(volume) <= 2.0 * FLAT_TOLERANCE * sine and around >= TURN - 2e-6:
+            total = areas[0] + areas[1] + areas[2]
+            for k in range(3):
+                row[triangles[t, k]] = areas[k] / total
+            return

@@ -1,0 +1,159 @@
+"""What a run knows of its world, in another world: cameras and learnt light moved along with the scene."""
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, Float32, Float64
+
+from octasplat.engine.config import read_config
+from octasplat.engine.dataset.views_file import read_views, write_views
+from octasplat.engine.render.environment_files import (
+    read_background,
+    read_environment,
+    write_background,
+    write_environment,
+)
+from octasplat.engine.run_folder import (
+    BACKGROUND,
+    CONFIG,
+    ENVIRONMENT,
+    EVENTS,
+    EXACT_ENVIRONMENT,
+    HELD_OUT,
+    TRAINING,
+    VIEWS,
+    run_scene,
+)
+from octasplat.engine.shading.environment_frame import environment_frame
+from octasplat.engine.shading.learnt_background import UP_WORLD
+from octasplat.engine.writing import write_json
+
+_TOLERANCE = 1e-6
+"""Of the scale: how far a matrix may be from a similarity, which is what rounding makes of one."""
+
+
+def is_similarity(matrix: Float[np.ndarray, "4 4"]) -> bool:
+    """Return whether an affine map only moves, turns and scales evenly: cameras can follow it."""
+    linear = np.asarray(matrix, np.float64)[:3, :3]
+    scale = _scale_of(matrix)
+    return scale > 0 and bool(
+        np.allclose(linear @ linear.T, scale**2 * np.eye(3), rtol=0, atol=_TOLERANCE * scale**2)
+    )
+
+
+def write_transformed_run_files(
+    source: Path, target: Path, matrix: Float[np.ndarray, "4 4"]
+) -> tuple[str, ...]:
+    """Write the files of a run that are about its world for the world that ``matrix`` makes of it.
+
+    Poses of COLMAP are left out, as ``views.json`` has them, and so is the way to the photographs, whose
+    model is in the old world.
+
+    Args:
+        source: folder of the run.
+        target: folder to write into.
+        matrix: a similarity, see :func:`is_similarity`.
+
+    Returns:
+        What is not as exact as it was, a sentence each.
+    """
+    scale, turn = _scale_of(matrix), _rotation_of(matrix)
+    for name in (EVENTS, HELD_OUT):
+        if (source / name).exists():
+            shutil.copyfile(source / name, target / name)
+    if (source / VIEWS).exists():
+        write_views(target / VIEWS, read_views(source / VIEWS).transformed(scale, turn, matrix[:3, 3]))
+    if (source / TRAINING).exists():
+        training = json.loads((source / TRAINING).read_text(encoding="utf-8"))
+        if "nearest_world" in training:
+            training["nearest_world"] = {
+                name: scale * distance for name, distance in training["nearest_world"].items()
+            }
+        write_json(target / TRAINING, training)
+    told: list[str] = []
+    if (source / CONFIG).exists():
+        told += _write_light(source, target, turn)
+    return tuple(told)
+
+
+def _write_light(source: Path, target: Path, turn: Float64[np.ndarray, "3 3"]) -> list[str]:
+    """Write the settings and the maps; returns what is told of them."""
+    config = read_config(source / CONFIG)
+    up = np.array(config.train.materials.up_world, np.float64)
+    new_up = turn @ up
+    content = json.loads((source / CONFIG).read_text(encoding="utf-8"))
+    content["scene"] = run_scene(source).name
+    if not _is_identity(turn):
+        content["reconstruction"]["train"]["materials"]["up_world"] = new_up.tolist()
+    write_json(target / CONFIG, content)
+    told = []
+    below = environment_frame(np.array(UP_WORLD))
+    for name, old_frame, new_frame in (
+        (EXACT_ENVIRONMENT, environment_frame(up), environment_frame(new_up)),
+        (ENVIRONMENT, environment_frame(up), environment_frame(new_up)),
+        (BACKGROUND, below, below),
+    ):
+        if not (source / name).exists():
+            continue
+        if _is_identity(turn):
+            shutil.copyfile(source / name, target / name)
+            continue
+        told.append(f"{name} was turned with the scene, which makes it a little softer.")
+        if name in (ENVIRONMENT, EXACT_ENVIRONMENT):
+            radiance = read_environment(source / name)
+            write_environment(target / name, rotate_environment(radiance, old_frame, new_frame, turn))
+        else:
+            rgb_srgb = read_background(source / name)
+            write_background(target / name, rotate_environment(rgb_srgb, old_frame, new_frame, turn))
+    return told
+
+
+def rotate_environment(
+    values: Float32[np.ndarray, "h w 3"],
+    old_frame: Float64[np.ndarray, "3 3"],
+    new_frame: Float64[np.ndarray, "3 3"],
+    turn: Float64[np.ndarray, "3 3"],
+) -> Float32[np.ndarray, "h w 3"]:
+    """Return a map of all directions, equirectangular, after what is around was turned; bilinear.
+
+    Args:
+        values: the map.
+        old_frame: its right, up and forward in the old world, as rows.
+        new_frame: those of the result in the new world.
+        turn: rotation from the old world to the new one.
+    """
+    from octasplat.engine.shading.kernels_map import map_colours
+
+    height = len(values)
+    directions = _texel_directions(height) @ new_frame @ turn
+    turned = np.empty((2 * height * height, 3), np.float32)
+    map_colours(
+        np.ascontiguousarray(values).reshape(-1, 3), height, old_frame, directions.astype(np.float32), turned
+    )
+    return turned.reshape(height, 2 * height, 3)
+
+
+def _texel_directions(height: int) -> Float64[np.ndarray, "t 3"]:
+    """Unit directions of the middles of texels, as right, up and forward of the map."""
+    down = np.pi * (np.arange(height) + 0.5) / height
+    round_ = np.pi * ((np.arange(2 * height) + 0.5) / height - 1.0)
+    down, round_ = (part.ravel() for part in np.meshgrid(down, round_, indexing="ij"))
+    return np.stack([np.sin(down) * np.sin(round_), np.cos(down), np.sin(down) * np.cos(round_)], axis=1)
+
+
+def _scale_of(matrix: Float[np.ndarray, "4 4"]) -> float:
+    return float(np.cbrt(np.linalg.det(np.asarray(matrix, np.float64)[:3, :3])))
+
+
+def _rotation_of(matrix: Float[np.ndarray, "4 4"]) -> Float64[np.ndarray, "3 3"]:
+    """The rotation of a similarity, without what rounding added."""
+    u, _, vt = np.linalg.svd(np.asarray(matrix, np.float64)[:3, :3])
+    turn: Float64[np.ndarray, "3 3"] = u @ vt
+    near = np.round(turn)
+    return near if np.allclose(turn, near, rtol=0, atol=1e-12) else turn
+
+
+def _is_identity(turn: Float64[np.ndarray, "3 3"]) -> bool:
+    return bool(np.array_equal(turn, np.eye(3)))

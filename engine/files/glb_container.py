@@ -1,0 +1,272 @@
+"""The binary glTF container: its JSON, the arrays that it describes, and the meshes of its scene.
+
+Only what meshes and splats need of glTF is read, straight into arrays: the general libraries either drop
+vertex attributes that they do not know or stop at the raw bytes.
+"""
+
+import json
+import struct
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float64
+from numpy.typing import DTypeLike
+
+from octasplat.engine.errors import SceneFileError
+from octasplat.engine.gaussians.channels import column_names
+from octasplat.engine.gaussians.frames import quaternions_from_matrices, rotation_matrices
+from octasplat.engine.writing import replacing
+
+MAX_BYTES = 2**32 - 1
+"""A GLB states its length in 32 bits."""
+HEADER_BYTES, CHUNK_HEADER_BYTES = 12, 8
+ARRAY_BUFFER, ELEMENT_ARRAY_BUFFER = 34962, 34963
+UNSIGNED_BYTE, UNSIGNED_INT, FLOAT = 5121, 5125, 5126
+POINTS, TRIANGLES = 0, 4
+LINEAR, LINEAR_MIPMAP_LINEAR, CLAMP_TO_EDGE = 9729, 9987, 33071
+HALF_TURN_ABOUT_X = [1.0, 0.0, 0.0, 0.0]
+"""x, y, z, w, as glTF writes quaternions; brings COLMAP's frame (y down, z forward) to glTF's (y up)."""
+COMPONENTS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
+WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
+CORE_NODE_NAME = "octasplat_cores"
+"""Says in the extras of a primitive that it shows octagons a second time."""
+MAX_NODE_DEPTH = 256
+CHANNELS = "octasplat_channels"
+GLB_READ_ERRORS = (KeyError, IndexError, TypeError, ValueError, AttributeError)
+"""What reading a document that says nonsense may raise."""
+
+
+class GlbFile:
+    """A GLB opened for reading; its data are mapped, not read.
+
+    Attributes:
+        document: the JSON part.
+    """
+
+    def __init__(self, path: Path) -> None:
+        """Open the file.
+
+        Raises:
+            SceneFileError: it cannot be read, is no GLB, is truncated, or its JSON part is damaged.
+        """
+        try:
+            size = path.stat().st_size
+            content = np.memmap(path, np.uint8, "r") if size else np.zeros(0, np.uint8)
+        except OSError as error:
+            raise SceneFileError(f"{path}: cannot be read ({error.strerror or error}).") from error
+        if content[:4].tobytes() != b"glTF" or len(content) < HEADER_BYTES + CHUNK_HEADER_BYTES:
+            raise SceneFileError(f"{path}: is no GLB file.")
+        document: Any = None
+        self._binary = content[:0]
+        offset = HEADER_BYTES
+        while offset + CHUNK_HEADER_BYTES <= len(content):
+            start = offset + CHUNK_HEADER_BYTES
+            length, kind = struct.unpack("<I4s", content[offset:start].tobytes())
+            data = content[start : start + length]
+            if len(data) < length:
+                raise SceneFileError(f"{path}: is truncated.")
+            if kind == b"JSON":
+                try:
+                    document = json.loads(data.tobytes())
+                except (ValueError, RecursionError) as error:
+                    raise SceneFileError(f"{path}: its JSON part is damaged.") from error
+            elif kind == b"BIN\0" and not len(self._binary):
+                self._binary = data
+            offset = start + length
+        if not isinstance(document, dict):
+            raise SceneFileError(f"{path}: has no JSON part.")
+        self.document: dict[str, Any] = document
+
+    def array(self, number: int, dtype: DTypeLike) -> np.ndarray:
+        """The rows of an accessor as ``dtype``, copied; normalised integers become numbers in [-1, 1].
+
+        Raises:
+            KeyError, IndexError, TypeError, ValueError: the document does not describe it, or it is stored in
+                a way that is not read.
+        """
+        accessor = self.document["accessors"][number]
+        if "sparse" in accessor or "bufferView" not in accessor:
+            raise ValueError("sparse accessors are not read")
+        view = self.document["bufferViews"][accessor["bufferView"]]
+        if view.get("buffer", 0) != 0 or "uri" in self.document["buffers"][0]:
+            raise ValueError("its data lies in another file")
+        kind = np.dtype(COMPONENTS[accessor["componentType"]])
+        width, count = WIDTHS[accessor["type"]], int(accessor["count"])
+        offset = view.get("byteOffset", 0) + accessor.get("byteOffset", 0)
+        stride = view.get("byteStride", kind.itemsize * width)
+        values: np.ndarray = np.ndarray((count, width), kind, self._binary, offset, (stride, kind.itemsize))
+        if accessor.get("normalized") and kind.kind in "iu":
+            values = np.maximum(values.astype(np.float64) / np.iinfo(kind).max, -1.0)
+        return values.astype(dtype)
+
+    def view_bytes(self, number: int) -> bytes:
+        """The bytes of a buffer view.
+
+        Raises:
+            KeyError, IndexError, TypeError, ValueError: the document does not describe it, or it is cut.
+        """
+        view = self.document["bufferViews"][number]
+        start, length = int(view.get("byteOffset", 0)), int(view["byteLength"])
+        content = self._binary[start : start + length].tobytes()
+        if len(content) < length or start < 0 or length <= 0:
+            raise ValueError("a buffer view reaches beyond the data")
+        return content
+
+    def primitives(self) -> Iterator[tuple[Float64[np.ndarray, "4 4"], dict[str, Any]]]:
+        """Every primitive of the default scene with the matrix of its node, but for the cores of octagons."""
+        nodes = self.document.get("nodes", [])
+        scenes = self.document.get("scenes", [])
+        roots = scenes[self.document.get("scene", 0)].get("nodes", []) if scenes else range(len(nodes))
+        waiting = [(node, np.eye(4), 0) for node in reversed(roots)]
+        while waiting:
+            number, parent, depth = waiting.pop()
+            if depth > MAX_NODE_DEPTH:
+                raise ValueError("its nodes form a circle or are nested too deeply")
+            node = nodes[number]
+            matrix = parent @ _node_matrix(node)
+            if "mesh" in node:
+                for primitive in self.document["meshes"][node["mesh"]]["primitives"]:
+                    if not primitive.get("extras", {}).get(CORE_NODE_NAME):
+                        yield matrix, primitive
+            waiting += [(child, matrix, depth + 1) for child in reversed(node.get("children", []))]
+
+
+def _node_matrix(node: dict[str, Any]) -> Float64[np.ndarray, "4 4"]:
+    if "matrix" in node:
+        return np.array(node["matrix"], np.float64).reshape(4, 4).T
+    matrix = np.eye(4)
+    if "rotation" in node:
+        x, y, z, w = node["rotation"]
+        if not (x or y or z or w):
+            raise ValueError("the rotation of a node has no length")
+        matrix[:3, :3] = rotation_matrices(np.array([[w, x, y, z]], np.float64))[0]
+    matrix[:3, :3] *= np.array(node.get("scale", (1, 1, 1)), np.float64)
+    matrix[:3, 3] = node.get("translation", (0, 0, 0))
+    return matrix
+
+
+def light_rotation(light_frame: Float64[np.ndarray, "3 3"]) -> list[float]:
+    """The rotation of a root node (x, y, z, w) for what is lit.
+
+    It brings the light's up to y and its forward to x, which is how viewers and Blender lay environments.
+
+    Args:
+        light_frame: right, up and forward of the light, as rows in the world.
+    """
+    w, x, y, z = quaternions_from_matrices(light_frame[None, [2, 1, 0]])[0].tolist()
+    return [x, y, z, w]
+
+
+def pad_to_four(length: int) -> int:
+    """``length`` rounded up to the four bytes to which a GLB aligns everything."""
+    return -(-length // 4) * 4
+
+
+def accessor_json(view: int, component: int, count: int, kind: str) -> dict[str, object]:
+    """The description of an array: all of buffer view ``view``, ``count`` items of type ``kind``."""
+    return {"bufferView": view, "componentType": component, "count": count, "type": kind}
+
+
+def vector_type(width: int) -> str:
+    """How glTF names vectors of 1 to 4 numbers."""
+    return "SCALAR" if width == 1 else f"VEC{width}"
+
+
+@dataclass(frozen=True)
+class ChannelAttribute:
+    """A vertex attribute that holds a channel or one number of it.
+
+    Attributes:
+        semantic: such as ``_ALBEDO``.
+        channel: the channel's name.
+        part: which of its numbers.
+        width: how many these are, at most 4.
+    """
+
+    semantic: str
+    channel: str
+    part: slice
+    width: int
+
+
+def channel_attributes(widths: Mapping[str, int], widest: int = 4) -> tuple[ChannelAttribute, ...]:
+    """The attributes that hold channels: a vector for up to ``widest`` numbers, else one scalar a number.
+
+    Meshes have scalars alone: Blender 5 opens none whose own attributes differ in width.
+    """
+    found: list[ChannelAttribute] = []
+    for name, width in widths.items():
+        if width <= widest:
+            found.append(ChannelAttribute(f"_{name.upper()}", name, slice(0, width), width))
+        else:
+            found += [
+                ChannelAttribute(f"_{column.upper()}", name, slice(place, place + 1), 1)
+                for place, column in enumerate(column_names(name, width))
+            ]
+    return tuple(found)
+
+
+def channel_extras(widths: Mapping[str, int]) -> dict[str, object]:
+    """What the ``extras`` of a file say of its channels: their names and widths."""
+    return {CHANNELS: dict(widths)} if widths else {}
+
+
+def declared_channel_attributes(document: Mapping[str, Any]) -> dict[str, tuple[str, ...]]:
+    """The channels that a file's ``extras`` name, with their attributes in lower case, without the _."""
+    found = document.get("asset", {}).get("extras", {}).get(CHANNELS, {})
+    columns: dict[str, list[str]] = {}
+    for attribute in channel_attributes({name: int(width) for name, width in found.items() if width > 0}):
+        columns.setdefault(attribute.channel, []).append(attribute.semantic[1:].lower())
+    return {name: tuple(own) for name, own in columns.items()}
+
+
+def json_bytes(document: dict[str, object]) -> bytes:
+    """A document as it stands in the file, without what fills it up to four bytes."""
+    return json.dumps(document, separators=(",", ":"), allow_nan=False).encode()
+
+
+def glb_size(json_room: int, length: int) -> int:
+    """Size of a file with so many bytes of JSON and of data."""
+    return HEADER_BYTES + 2 * CHUNK_HEADER_BYTES + json_room + length
+
+
+def too_large_error(path: Path, subject: str, total: int, advice: str) -> SceneFileError:
+    """The error for a file beyond ``MAX_BYTES``; ``subject`` says what needs so much, verb included."""
+    return SceneFileError(
+        f"{path}: not written; {subject} {total / 2**30:.1f} GiB, and a GLB holds at most 4. {advice}"
+    )
+
+
+def write_glb(
+    path: Path, json_room: int, length: int, data: Iterable[bytes], document: Callable[[], bytes]
+) -> None:
+    """Write a GLB, atomically and piece by piece.
+
+    The JSON comes first in the file, but may depend on the data: it is asked for when they are written.
+
+    Args:
+        path: the file, replaced if it exists.
+        json_room: bytes kept for the JSON, a multiple of four.
+        length: bytes of all data together, a multiple of four.
+        data: the binary part in pieces.
+        document: the JSON part, no longer than its room.
+
+    Raises:
+        OSError: the file cannot be written.
+    """
+    with replacing(path) as temporary, temporary.open("wb") as handle:
+        handle.write(struct.pack("<4sII", b"glTF", 2, glb_size(json_room, length)))
+        handle.write(struct.pack("<I4s", json_room, b"JSON"))
+        json_start = handle.tell()
+        handle.seek(json_room, 1)
+        handle.write(struct.pack("<I4s", length, b"BIN\0"))
+        for piece in data:
+            handle.write(piece)
+        assert handle.tell() == glb_size(json_room, length)
+        handle.seek(json_start)
+        text = document()
+        assert len(text) <= json_room
+        handle.write(text.ljust(json_room))

@@ -1,0 +1,53 @@
+"""Splitting a scene into compact parts, for viewers that sort whole objects and for tight bounds."""
+
+import numpy as np
+from jaxtyping import Float, Int
+
+MIN_CHUNK_SIZE = 256
+
+
+def kd_split(points_world: Float[np.ndarray, "n 3"], max_chunks: int) -> list[Int[np.ndarray, "_"]]:
+    """Indices of ``points_world`` in spatially compact chunks of equal size (give or take one point).
+
+    Each part is halved at the median along the axis on which it spreads most, while there may be twice as
+    many chunks and none falls below ``MIN_CHUNK_SIZE`` points. Within a chunk the order is ascending.
+    """
+    chunks = [np.arange(len(points_world))]
+    while 2 * len(chunks) <= max_chunks and len(points_world) // (2 * len(chunks)) >= MIN_CHUNK_SIZE:
+        chunks = [half for chunk in chunks for half in _split_in_half(points_world, chunk)]
+    return [np.sort(chunk) for chunk in chunks]
+
+
+def _split_in_half(
+    points_world: Float[np.ndarray, "n 3"], chunk: Int[np.ndarray, " m"]
+) -> tuple[Int[np.ndarray, " a"], Int[np.ndarray, " b"]]:
+    points = points_world[chunk].astype(np.float64)
+    middle = len(chunk) // 2
+    order = np.argpartition(points[:, int(np.argmax(points.std(axis=0)))], middle)
+    return chunk[order[:middle]], chunk[order[middle:]]
+
+
+def kd_order(points_world: Float[np.ndarray, "n 3"], chunk: int) -> Int[np.ndarray, " n"]:
+    """Return an order of the points in which every run of ``chunk`` of them lies close together.
+
+    Parts are split across their longest side between whole chunks, where the sides of both halves, weighted
+    by their numbers of points, are shortest in sum. So a few points far from all others end up in chunks of
+    their own instead of setting the scale for everything.
+    """
+    done: list[np.ndarray] = []
+    waiting = [np.arange(len(points_world))]
+    while waiting:
+        part = waiting.pop()
+        if len(part) <= chunk:
+            done.append(np.sort(part))
+            continue
+        points = points_world[part]
+        axis = int(np.argmax(points.max(axis=0) - points.min(axis=0)))
+        part = part[np.argsort(points[:, axis], kind="stable")]
+        along = points_world[part, axis].astype(np.float64)
+        splits = np.arange(chunk, len(part), chunk)
+        costs = splits * (along[splits - 1] - along[0]) + (len(part) - splits) * (along[-1] - along[splits])
+        middle = np.abs(2 * splits - len(part))
+        best = splits[np.lexsort((middle, costs))[0]]
+        waiting += [part[best:], part[:best]]
+    return np.concatenate([*done, np.zeros(0, dtype=np.int64)])

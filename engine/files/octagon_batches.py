@@ -1,0 +1,141 @@
+"""What all mesh formats write: the octagons of a scene, with their texture coordinates and colours."""
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float32, Int
+
+from octasplat.engine.errors import SceneFileError
+from octasplat.engine.files.export_options import ExportOptions
+from octasplat.engine.gaussians.channels import Channels
+from octasplat.engine.gaussians.model import FlatGaussians
+from octasplat.engine.gaussians.octagon import (
+    APOTHEM,
+    corner_directions,
+    octagon_corners_world,
+    octagon_radii,
+)
+
+MAX_FLOAT_ID = 1 << 24
+"""Numbers below this are exact in float32, the only type that mesh editors keep for custom attributes."""
+BATCH_SIZE = 16384
+
+
+@dataclass(frozen=True)
+class OctagonBatch:
+    """Some octagons, ready to be written.
+
+    Attributes:
+        ids: number of each Gaussian in the scene given to the exporter.
+        corners_world: corners, in world units.
+        uv: texture coordinates of the corners; the texture spans sqrt(Q) standard deviations to each side, so
+            a fainter Gaussian, whose octagon is smaller, uses less of it.
+        rgb_srgb: colour of the constant harmonic in [0, 1], display values.
+        opacities: in (0, 1].
+        radii: corner radii in standard deviations.
+        normals_world: unit normals, from where the corners run anticlockwise.
+        channels: what else is known of the Gaussians.
+    """
+
+    ids: Int[np.ndarray, " n"]
+    corners_world: Float32[np.ndarray, "n 8 3"]
+    uv: Float32[np.ndarray, "n 8 2"]
+    rgb_srgb: Float32[np.ndarray, "n 3"]
+    opacities: Float32[np.ndarray, " n"]
+    radii: Float32[np.ndarray, " n"]
+    normals_world: Float32[np.ndarray, "n 3"]
+    channels: Channels
+
+
+class OctagonSoup:
+    """The octagons of a scene, computed batch by batch.
+
+    Gaussians whose octagon has no size, or fainter than ``options.min_opacity``, have no place in it.
+
+    Attributes:
+        ids: numbers of the Gaussians that have an octagon, ascending.
+        scene_size: number of Gaussians in the scene.
+        q: the chi-square quantile that the radii come from.
+        min_opacity: the least opacity of a Gaussian with an octagon.
+    """
+
+    def __init__(
+        self, gaussians: FlatGaussians, path: Path, options: ExportOptions, alpha_cutoff: float | None = None
+    ) -> None:
+        """Pick the Gaussians to write; ``path`` only names the file in errors.
+
+        With ``alpha_cutoff`` each octagon is only as large as the ellipse in which alpha reaches that.
+
+        Raises:
+            SceneFileError: no octagons, values that are not finite, or too many Gaussians to number.
+        """
+        if not gaussians.is_finite():
+            raise SceneFileError(f"{path}: not written, as some Gaussians hold values that are not finite.")
+        if len(gaussians) > MAX_FLOAT_ID:
+            raise SceneFileError(
+                f"{path}: not written; a mesh can number {MAX_FLOAT_ID} Gaussians, and the scene has "
+                f"{len(gaussians)}. Export it in parts or as a Gaussian PLY."
+            )
+        self.q = options.q
+        self.min_opacity = options.min_opacity
+        self.scene_size = len(gaussians)
+        self._path = path
+        self._gaussians = gaussians
+        self._opacities = gaussians.opacities
+        self._radii = octagon_radii(self._opacities, options.q)
+        if alpha_cutoff is not None:
+            around = octagon_radii(self._opacities, -2.0 * math.log(alpha_cutoff)) / np.float32(APOTHEM)
+            self._radii = np.minimum(self._radii, around)
+        self.ids = np.flatnonzero((self._radii > 0.0) & (self._opacities >= options.min_opacity))
+        if not len(self.ids):
+            raise SceneFileError(
+                f"{path}: not written, as none of the {len(gaussians)} Gaussians is opaque enough for an "
+                "octagon."
+            )
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+    @property
+    def channel_widths(self) -> dict[str, int]:
+        """The channels of the batches, with their numbers a Gaussian."""
+        return self._gaussians.channels.widths
+
+    @property
+    def means_world(self) -> Float32[np.ndarray, "n 3"]:
+        """Centres of the octagons, world units, in the order of ``ids``."""
+        return self._gaussians.means_world[self.ids]
+
+    def batch(self, places: slice | Int[np.ndarray, " n"]) -> OctagonBatch:
+        """The octagons at ``places``, which count along ``ids``."""
+        ids = self.ids[places]
+        part = self._gaussians.with_base_color_only().select(ids)
+        radii = self._radii[ids]
+        with np.errstate(over="ignore", invalid="ignore"):
+            corners = octagon_corners_world(part, radii)
+        if not np.isfinite(corners).all():
+            raise SceneFileError(
+                f"{self._path}: not written, as some Gaussians are too large for float32 coordinates."
+            )
+        half = 0.5 * radii.astype(np.float64) / np.sqrt(self.q)
+        uv = 0.5 + half[:, None, None] * corner_directions()
+        rgb = np.clip(part.base_rgb_srgb, 0.0, 1.0)
+        channels = {name: array[ids] for name, array in self._gaussians.channels.items()}
+        return OctagonBatch(
+            ids,
+            corners,
+            uv.astype(np.float32),
+            rgb,
+            self._opacities[ids],
+            radii,
+            np.ascontiguousarray(part.rotations[:, :, 0]),
+            Channels(channels),
+        )
+
+    def batches(self) -> Iterator[OctagonBatch]:
+        """All octagons in the order of ``ids``, a few thousand at a time."""
+        for start in range(0, len(self.ids), BATCH_SIZE):
+            yield self.batch(slice(start, start + BATCH_SIZE))

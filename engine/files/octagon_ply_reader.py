@@ -1,0 +1,83 @@
+"""The Gaussians of a mesh PLY of octagons, as far as such a file holds them: one colour each, in bytes."""
+
+from pathlib import Path
+
+import numpy as np
+
+from octasplat.engine.errors import ConfigError, SceneFileError
+from octasplat.engine.files.channel_columns import ChannelChoice, select_channel_columns
+from octasplat.engine.files.encodings import logits_from_bytes, sh0_from_rgb
+from octasplat.engine.files.gaussian_ply import declared_channels
+from octasplat.engine.files.mesh_ply import COLOURS, PATTERNS, VERTEX
+from octasplat.engine.files.octagon_recovery import (
+    edited_octagons_error,
+    gaussians_from_octagons,
+    is_octagon_ply,
+    missing_gaussians_notes,
+)
+from octasplat.engine.files.ply_container import columns, read_ply
+from octasplat.engine.files.registry import Importer, register
+from octasplat.engine.gaussians.channels import Channels
+from octasplat.engine.gaussians.flattening import GaussianCloud
+from octasplat.engine.gaussians.octagon import SIDES
+from octasplat.engine.gaussians.rows import select_rows
+
+_SIZE = "octasplat_gaussians"
+_ROWS_PER_OCTAGON = (*COLOURS, "alpha", "gid", "radius")
+
+
+def read(path: Path, channels: ChannelChoice = "own") -> GaussianCloud:
+    """The Gaussians in the order of their numbers, if the octagons are as they were exported.
+
+    Raises:
+        SceneFileError: no mesh PLY of ours, its octagons were edited, so that only the scene they came from
+            can bring them back, or there is no such channel.
+    """
+    header, tables = read_ply(path, ["vertex"])
+    table = tables["vertex"]
+    known = {name for name, _ in VERTEX}
+    missing = sorted(known - {"s", "t"} - set(table.dtype.names or ()))
+    if missing:
+        raise SceneFileError(
+            f"{path}: its octagons lack the property {', '.join(missing)}; save the mesh with its attributes."
+        )
+    if any(table.dtype[name] != np.uint8 for name in (*COLOURS, "alpha")):
+        raise SceneFileError(f"{path}: its colours are not bytes; bring it back with octasplat edit --mesh.")
+    if len(table) == 0 or len(table) % SIDES:
+        raise edited_octagons_error(path)
+    rows = table.reshape(-1, SIDES)
+    same = all((rows[name] == rows[name][:, :1]).all() for name in _ROWS_PER_OCTAGON)
+    if not same or (rows["corner"] != np.arange(SIDES)).any():
+        raise edited_octagons_error(path)
+    first = np.ascontiguousarray(rows[:, 0])
+    ids = first["gid"].astype(np.int64)
+    if len(np.unique(ids)) != len(ids):
+        raise edited_octagons_error(path)
+    corners = columns(table, ("x", "y", "z")).reshape(-1, SIDES, 3)
+    means, quats, log_scales = gaussians_from_octagons(corners, columns(first, ("radius",))[:, 0], path)
+    others = (name for name in table.dtype.names or () if name not in known)
+    wanted = select_channel_columns(path, declared_channels(header.comments), others, channels)
+    try:
+        named = Channels({name: columns(first, own) for name, own in wanted.items()})
+    except ConfigError as error:
+        raise SceneFileError(f"{path}: {error}") from error
+    sizes = [comment.split()[1] for comment in header.comments if comment.startswith(f"{_SIZE} ")]
+    stated = int(sizes[0]) if sizes and sizes[0].isdecimal() else 0
+    cloud = GaussianCloud(
+        means, quats, log_scales, logits_from_bytes(first["alpha"]),
+        sh0_from_rgb(columns(first, COLOURS) / np.float32(255)),
+        notes=missing_gaussians_notes(stated, len(ids)), channels=named,
+    )  # fmt: skip
+    return select_rows(cloud, np.argsort(ids, kind="stable"))
+
+
+register(
+    Importer(
+        "mesh-ply",
+        PATTERNS,
+        "octagon mesh as it was exported, one colour for each Gaussian",
+        read,
+        is_octagon_ply,
+        read_channels=read,
+    )
+)

@@ -1,0 +1,64 @@
+"""Gaussians back from octagons as they were exported, whatever file holds them."""
+
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float32
+
+from octasplat.engine.errors import SceneFileError
+from octasplat.engine.gaussians.frames import rotation_matrices
+from octasplat.engine.gaussians.octagon import (
+    coordinate_rounding_error,
+    corner_directions,
+    frames_from_octagons,
+)
+
+TOLERANCE = 1e-3
+"""Octagons further from a regular one than this, as a share of their size, were edited."""
+ONE_COLOUR_NOTE = "It holds one colour of each Gaussian, no harmonics."
+
+
+def gaussians_from_octagons(
+    corners_world: Float32[np.ndarray, "n 8 3"], radii: Float32[np.ndarray, " n"], path: Path
+) -> tuple[Float32[np.ndarray, "n 3"], Float32[np.ndarray, "n 4"], Float32[np.ndarray, "n 2"]]:
+    """Centres, rotations and log scales of the Gaussians with these octagons.
+
+    Args:
+        corners_world: corner by corner.
+        radii: of the octagons, in standard deviations.
+        path: named in errors.
+
+    Raises:
+        SceneFileError: an octagon is none any more.
+    """
+    means, quats, log_scales, good = frames_from_octagons(corners_world, radii)
+    legs = rotation_matrices(quats.astype(np.float64))[:, :, 1:] * np.exp(log_scales)[:, None, :]
+    again = means[:, None] + np.einsum("kc,nic->nki", corner_directions(), legs * radii[:, None, None])
+    size = np.linalg.norm(corners_world - means[:, None], axis=2).max(axis=1)
+    off = np.linalg.norm(corners_world - again, axis=2).max(axis=1)
+    if not good.all() or (off > TOLERANCE * size + 4.0 * coordinate_rounding_error(corners_world)).any():
+        raise edited_octagons_error(path)
+    return means, quats, log_scales
+
+
+def edited_octagons_error(path: Path) -> SceneFileError:
+    """What to say of octagons that are not as they were exported."""
+    return SceneFileError(
+        f"{path}: its octagons are not as they were exported; bring them back with octasplat edit --mesh, "
+        "which needs the scene that they came from."
+    )
+
+
+def missing_gaussians_notes(stated: int, found: int) -> tuple[str, ...]:
+    """What a file of octagons lacks of the scene with ``stated`` Gaussians (0 if it does not say)."""
+    if stated <= found:
+        return (ONE_COLOUR_NOTE,)
+    return (ONE_COLOUR_NOTE, f"Left out of its octagons were {stated - found:,} fainter Gaussians.")
+
+
+def is_octagon_ply(head: bytes) -> bool:
+    """Whether a file that begins so is a PLY of octagons with the numbers of their Gaussians."""
+    properties = head.partition(b"end_header")[0].replace(b"\r", b"")
+    return head.startswith(b"ply") and all(
+        f" {name}\n".encode() in properties for name in ("gid", "corner", "radius")
+    )

@@ -1,0 +1,96 @@
+"""Scenes and meshes read from files of any known format."""
+
+import time
+from pathlib import Path
+
+import numpy as np
+
+from octasplat.engine.errors import SceneFileError
+from octasplat.engine.events import Listener, StageFinished, StageStarted, ignore
+from octasplat.engine.files.channel_columns import ChannelChoice
+from octasplat.engine.files.gaussian_ply import read_ply_metadata
+from octasplat.engine.files.registry import importer_for, mesh_reader_for
+from octasplat.engine.gaussians.flattening import ImportReport, flatten
+from octasplat.engine.gaussians.model import FlatGaussians
+from octasplat.engine.gaussians.scene_metadata import UNKNOWN_METADATA, SceneMetadata
+from octasplat.engine.geometry.imported_mesh import ImportedMesh
+
+FOLDER_FILES = ("scene.ply", "meta.json")
+"""What a folder is read by: the scene of a run, or the description of an unpacked SOG."""
+
+
+def read_scene(
+    path: Path,
+    format: str | None = None,
+    *,
+    drop_invalid: bool = False,
+    channels: ChannelChoice = "own",
+    progress: Listener = ignore,
+) -> tuple[FlatGaussians, ImportReport]:
+    """Read the Gaussians of a file of any known format, or of the folder of a run, and flatten them.
+
+    Args:
+        path: the file, or a folder with ``scene.ply`` or with the ``meta.json`` of an unpacked SOG.
+        format: the name of its format; by default the file shows it.
+        drop_invalid: leave out Gaussians with values that are not finite, instead of refusing the file.
+        channels: which named channels are wanted: those that the file says are channels, as ours do; all that
+            nothing else is known of, too; or names.
+        progress: told when reading begins and ends (stage ``read``).
+
+    Returns:
+        Flat Gaussians, and what flattening and reading lost.
+
+    Raises:
+        SceneFileError: the file cannot be read, or has no such channel; the text names it and says why.
+    """
+    source = _scene_file(path)
+    importer = importer_for(source, format)
+    progress(StageStarted("read"))
+    began = time.monotonic()
+    if importer.read_channels is not None:
+        cloud = importer.read_channels(source, channels)
+    elif channels not in ("own", "all", ()):
+        raise SceneFileError(f"{source}: the format {importer.name} has no place for channels.")
+    else:
+        cloud = importer.read(source)
+    scene = flatten(cloud, source, drop_invalid=drop_invalid)
+    progress(StageFinished("read", time.monotonic() - began))
+    return scene
+
+
+def read_metadata(path: Path) -> SceneMetadata:
+    """What a file, or the scene of a run's folder, says of its scene as a whole; only our PLY says anything.
+
+    Raises:
+        SceneFileError: the file cannot be read or is damaged.
+    """
+    source = _scene_file(path)
+    return read_ply_metadata(source) if source.suffix.lower() == ".ply" else UNKNOWN_METADATA
+
+
+def read_mesh(path: Path, *, with_materials: bool = False) -> ImportedMesh:
+    """Read a PLY, OBJ or GLB mesh; ``with_materials`` asks for materials, normals and colours too.
+
+    Raises:
+        SceneFileError: another suffix, a file that cannot be read, is damaged or compressed, or has vertices
+            that are not finite.
+    """
+    reader = mesh_reader_for(path)
+    mesh = reader.read_with_materials(path) if with_materials else reader.read(path)
+    if len(mesh) == 0:
+        raise SceneFileError(f"{path}: holds no vertices.")
+    bad = int((~np.isfinite(mesh.vertices)).any(axis=1).sum())
+    if bad:
+        raise SceneFileError(f"{path}: {bad} of {len(mesh)} vertices are not finite; save the mesh again.")
+    if len(mesh.triangles) and not (mesh.triangles.min() >= 0 and mesh.triangles.max() < len(mesh)):
+        raise SceneFileError(f"{path}: a face names a vertex that is not there; the file is damaged.")
+    return mesh
+
+
+def _scene_file(path: Path) -> Path:
+    if not path.is_dir():
+        return path
+    for name in FOLDER_FILES:
+        if (path / name).exists():
+            return path / name
+    raise SceneFileError(f"{path}: is a folder without a scene; it should hold {' or '.join(FOLDER_FILES)}.")

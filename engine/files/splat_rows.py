@@ -1,0 +1,48 @@
+"""What all splat formats share: which Gaussians go out, whether they can, and in which blocks."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from octasplat.engine.errors import SceneFileError
+from octasplat.engine.files.export_options import ExportOptions
+from octasplat.engine.gaussians.model import FlatGaussians
+
+ROWS_PER_BLOCK = 65536
+MAX_LOG_SCALE = float(np.log(np.finfo(np.float32).max)) - 1e-3
+
+
+def select_for_export(gaussians: FlatGaussians, path: Path, options: ExportOptions) -> FlatGaussians:
+    """The Gaussians not fainter than ``options.min_opacity``, all finite; ``path`` names the file in errors.
+
+    Raises:
+        SceneFileError: nothing to write, or values that are not finite.
+    """
+    if len(gaussians) == 0:
+        raise SceneFileError(f"{path}: not written, as there are no Gaussians.")
+    if not gaussians.is_finite():
+        raise SceneFileError(f"{path}: not written, as some Gaussians hold values that are not finite.")
+    if options.min_opacity > 0.0:
+        count = len(gaussians)
+        gaussians = gaussians.select(gaussians.opacities >= options.min_opacity)
+        if not len(gaussians):
+            raise SceneFileError(f"{path}: not written; all {count} Gaussians are below min_opacity.")
+    return gaussians
+
+
+def check_scales(scene: FlatGaussians, path: Path) -> None:
+    """Raise for standard deviations beyond float32, which only formats that hold their logarithm can write.
+
+    Raises:
+        SceneFileError: some are.
+    """
+    if len(scene) and float(scene.log_scales.max()) >= MAX_LOG_SCALE:
+        raise SceneFileError(f"{path}: not written, as some Gaussians are too large for float32.")
+
+
+def iterate_blocks(scene: FlatGaussians) -> Iterator[FlatGaussians]:
+    """The scene in order, a few thousand Gaussians at a time, without copying it."""
+    for start in range(0, len(scene), ROWS_PER_BLOCK):
+        part = slice(start, start + ROWS_PER_BLOCK)
+        yield scene.view(part)

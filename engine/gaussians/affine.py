@@ -1,0 +1,117 @@
+"""Whole scenes moved, turned, scaled or sheared, in closed form."""
+
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, Float64
+
+from octasplat.engine.errors import ConfigError
+from octasplat.engine.gaussians.apply_legs import apply_legs
+from octasplat.engine.gaussians.legs import legs_world
+from octasplat.engine.gaussians.model import FlatGaussians
+
+AXES: dict[str, Float64[np.ndarray, "3"]] = {
+    sign + name: (1.0 if not sign else -1.0) * np.eye(3)[k]
+    for k, name in enumerate("xyz")
+    for sign in ("", "-")
+}
+
+
+def transform_gaussians(gaussians: FlatGaussians, matrix: Float[np.ndarray, "4 4"]) -> FlatGaussians:
+    """The scene under the affine map x -> M x + t, harmonics turned along (mirrored too, where M mirrors).
+
+    Covariances are exact for any invertible M. A map without rotation and scale leaves frames, scales and
+    colours untouched.
+
+    Raises:
+        ConfigError: the matrix is not finite, not affine or flattens space.
+    """
+    m = np.asarray(matrix, dtype=np.float64)
+    if not np.isfinite(m).all() or not np.array_equal(m[3], [0.0, 0.0, 0.0, 1.0]):
+        raise ConfigError("The matrix must have finite numbers and the last row 0 0 0 1.")
+    linear, shift = m[:3, :3], m[:3, 3]
+    u, stretches, vt = np.linalg.svd(linear)
+    if stretches[2] <= 1e-9 * stretches[0]:
+        raise ConfigError("The matrix flattens space; each direction needs a scale other than 0.")
+    turn = u @ vt
+    count = len(gaussians)
+    means = gaussians.means_world.astype(np.float64) @ linear.T + shift
+    if np.array_equal(linear, np.eye(3)):
+        moved = gaussians.copy()
+        moved.means_world = means.astype(np.float32)
+        return moved
+    signs = np.full(count, np.sign(np.linalg.det(turn)))
+    legs = linear @ legs_world(gaussians)
+    return apply_legs(gaussians, means, legs, signs, np.zeros(count, dtype=bool), turn)
+
+
+def mean_scale(matrix: Float[np.ndarray, "4 4"]) -> float:
+    """How much longer an affine map makes things: the cube root of what it does to volumes."""
+    return float(np.cbrt(abs(np.linalg.det(np.asarray(matrix, np.float64)[:3, :3]))))
+
+
+def translation(offset_world: Float[np.ndarray, "3"]) -> Float64[np.ndarray, "4 4"]:
+    """Matrix that moves by ``offset_world``."""
+    matrix = np.eye(4)
+    matrix[:3, 3] = offset_world
+    return matrix
+
+
+def scaling(factors: Float[np.ndarray, "3"]) -> Float64[np.ndarray, "4 4"]:
+    """Matrix that scales along the world's axes."""
+    return np.diag([*np.asarray(factors, np.float64), 1.0])
+
+
+def rotation(axis_world: Float[np.ndarray, "3"], degrees: float) -> Float64[np.ndarray, "4 4"]:
+    """Matrix that turns about an axis through the origin, counter-clockwise seen from the axis' tip."""
+    axis = np.asarray(axis_world, np.float64)
+    length = float(np.linalg.norm(axis))
+    if not np.isfinite(length) or length == 0.0:
+        raise ConfigError("The axis of a rotation must not be zero.")
+    x, y, z = axis / length
+    # Whole quarter turns come out without rounding.
+    quarters, rest = divmod(degrees, 90.0)
+    angle = np.radians(rest)
+    cos, sin = np.cos(angle), np.sin(angle)
+    for _ in range(int(quarters) % 4):
+        cos, sin = -sin, cos
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    matrix = np.eye(4)
+    matrix[:3, :3] += sin * cross + (1 - cos) * (cross @ cross)
+    return matrix
+
+
+def between_axes(old_up: str, new_up: str) -> Float64[np.ndarray, "4 4"]:
+    """The shortest rotation that brings one axis (``x``, ``-x``, ... ``-z``) to another."""
+    old, new = AXES[old_up], AXES[new_up]
+    if np.array_equal(old, new):
+        return np.eye(4)
+    if np.array_equal(old, -new):
+        return rotation(AXES["x" if old[0] == 0 else "y"], 180.0)
+    return rotation(np.cross(old, new), 90.0)
+
+
+def conjugate_by_point(
+    matrix: Float[np.ndarray, "4 4"], point_world: Float[np.ndarray, "3"]
+) -> Float64[np.ndarray, "4 4"]:
+    """The same map with ``point_world`` in the place of the origin."""
+    result: np.ndarray = translation(point_world) @ matrix @ translation(-np.asarray(point_world))
+    return result
+
+
+def read_matrix(path: Path) -> Float64[np.ndarray, "4 4"]:
+    """A 4 x 4 or 3 x 4 matrix from a text file, row by row; commas and brackets are passed over.
+
+    Raises:
+        ConfigError: the file cannot be read or holds something else.
+    """
+    try:
+        words = path.read_text(encoding="utf-8").translate(str.maketrans(",;[]", "    ")).split()
+        values = np.array([float(word) for word in words])
+    except (OSError, UnicodeDecodeError, ValueError) as error:
+        raise ConfigError(f"{path}: holds no matrix ({error}).") from error
+    if len(values) not in (12, 16):
+        raise ConfigError(f"{path}: holds {len(values)} numbers; a matrix has 12 or 16, row by row.")
+    matrix = np.eye(4)
+    matrix[: len(values) // 4] = values.reshape(-1, 4)
+    return matrix

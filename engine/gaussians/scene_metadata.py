@@ -1,0 +1,42 @@
+"""What a scene's picture needs beside its Gaussians, so that one file is one picture through every edit."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+from octasplat.engine.gaussians.materials import ALBEDO
+from octasplat.engine.gaussians.model import FlatGaussians
+
+
+@dataclass(frozen=True)
+class SceneMetadata:
+    """Numbers that belong to a scene as a whole; 0 where nothing is known.
+
+    Attributes:
+        near_world: distance from a camera at which the scene begins to be seen, as in its training.
+        pixel_rad: the angle of a pixel in the middle of a training view.
+        turned_beyond: of :class:`octasplat.engine.trace.protocol.TraceSettings`; 0: normals have no side.
+    """
+
+    near_world: float = 0.0
+    pixel_rad: float = 0.0
+    turned_beyond: float = 0.0
+
+    def scaled(self, factor: float) -> "SceneMetadata":
+        """The facts of the scene made so many times as large."""
+        return replace(self, near_world=self.near_world * factor)
+
+
+UNKNOWN_METADATA = SceneMetadata()
+
+
+def merge_metadata(scenes: Sequence[tuple[FlatGaussians, SceneMetadata]]) -> SceneMetadata:
+    """The facts of scenes put together: what holds for each of them.
+
+    Whether normals have a side is for those to say that have materials, as no others are lit by them.
+    """
+    lit = [facts.turned_beyond for gaussians, facts in scenes if ALBEDO in gaussians.channels]
+    return SceneMetadata(
+        near_world=min(facts.near_world for _, facts in scenes),
+        pixel_rad=min(facts.pixel_rad for _, facts in scenes),
+        turned_beyond=min(lit, default=0.0),
+    )

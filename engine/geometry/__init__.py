@@ -1,0 +1,1 @@
+"""Triangle meshes and their materials, below the formats that read them."""

@@ -1,0 +1,72 @@
+"""Meshes that come back from an editor, or that drive a scene, whatever file they were in."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float32, Float64, Int32, Int64
+
+from octasplat.engine.geometry.mesh_material import MeshMaterial
+
+
+@dataclass(frozen=True)
+class ImportedMesh:
+    """A triangle mesh, and what else of an octagon mesh survived its way.
+
+    Attributes:
+        vertices: positions as the file gives them, with the transforms of glTF nodes applied; which axes they
+            are along is :mod:`octasplat.engine.edit.axes`' business.
+        triangles: vertex indices; polygons are cut into fans. Empty for a file of points.
+        uv: texture coordinates as the file has them (v may count up or down), or None; NaN where a vertex has
+            none, and the last where it has several.
+        gid: number of the Gaussian that a vertex belongs to, NaN where the file says none, or None.
+        corner: corner number 0 to 7 likewise.
+        radius: radius of the octagon in standard deviations likewise.
+        q: chi-square quantile of the octagons, where the file still names it.
+        min_opacity: octagons were made of Gaussians at least this opaque, where the file still says so.
+        rounding: how far a coordinate may be off because of the digits that the file keeps, beyond float32.
+        corner_uv: of a mesh read with its looks: texture coordinates of the triangles' corners, (0, 0) at the
+            upper left, NaN where there are none; None without any.
+        normals: likewise, of the vertices, NaN where there are none; None without any.
+        rgb_linear: likewise, colours of the vertices.
+        material_indices: likewise, row of each triangle in ``materials``, -1 for none.
+        materials: likewise, those that the file gives.
+    """
+
+    vertices: Float64[np.ndarray, "v 3"]
+    triangles: Int64[np.ndarray, "t 3"]
+    uv: Float32[np.ndarray, "v 2"] | None = None
+    gid: Float32[np.ndarray, " v"] | None = None
+    corner: Float32[np.ndarray, " v"] | None = None
+    radius: Float32[np.ndarray, " v"] | None = None
+    q: float | None = None
+    min_opacity: float | None = None
+    rounding: float = 0.0
+    corner_uv: Float32[np.ndarray, "t 3 2"] | None = None
+    normals: Float32[np.ndarray, "v 3"] | None = None
+    rgb_linear: Float32[np.ndarray, "v 3"] | None = None
+    material_indices: Int32[np.ndarray, " t"] | None = None
+    materials: tuple[MeshMaterial, ...] = ()
+
+    def __len__(self) -> int:
+        return len(self.vertices)
+
+
+def flip_v(uv: Float32[np.ndarray, "v 2"]) -> Float32[np.ndarray, "v 2"]:
+    """Texture coordinates counted from the upper left, where a file counts them from the lower left."""
+    return uv * np.array([1, -1], np.float32) + np.array([0, 1], np.float32)
+
+
+Q_KEY = "octasplat_q"
+MIN_OPACITY_KEY = "octasplat_min_opacity"
+
+
+def number_in_comments(comments: tuple[str, ...], name: str) -> float | None:
+    """Return the number that our exporters write under ``name`` in a comment, or None."""
+    for comment in comments:
+        words = comment.split()
+        if len(words) == 2 and words[0] == name:
+            try:
+                return float(words[1])
+            except ValueError:
+                return None
+    return None

@@ -1,0 +1,83 @@
+"""What a mesh file says of how its surfaces look, in glTF's terms, whatever file it was."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from octasplat.engine.errors import SceneFileError
+
+MAX_IMAGE_BYTES = 1 << 30
+
+
+@dataclass(frozen=True)
+class FileImage:
+    """An image that a mesh file holds or names.
+
+    Attributes:
+        name: what errors call it.
+        suffix: of the image's format, with its dot.
+        content: the encoded image where the mesh file holds it.
+        path: the file where the mesh file names it.
+    """
+
+    name: str
+    suffix: str
+    content: bytes | None = None
+    path: Path | None = None
+
+
+@dataclass(frozen=True)
+class MeshMaterial:
+    """A material of a mesh file.
+
+    Attributes:
+        name: as the file gives it.
+        rgb_linear: base colour.
+        texture: display colours, multiplied by the base colour.
+        metallic: share of the metal.
+        roughness: perceptual.
+        metallic_roughness_texture: roughness in green and metallic in blue, multiplied by the two numbers.
+        emission_linear: radiance of its own light.
+        emission_texture: display colours, multiplied by that radiance.
+        normal_texture: normals in the frame of the texture coordinates.
+        normal_scale: factor of their slopes.
+        transmission: share of the light that goes through instead of being scattered by the ground.
+        ior: index of refraction.
+        absorption: of what lies inside, in each linear channel, per unit of the file.
+        unsupported: what else the file says of it, which is not understood, in words.
+    """
+
+    name: str
+    rgb_linear: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    texture: FileImage | None = None
+    metallic: float = 0.0
+    roughness: float = 1.0
+    metallic_roughness_texture: FileImage | None = None
+    emission_linear: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    emission_texture: FileImage | None = None
+    normal_texture: FileImage | None = None
+    normal_scale: float = 1.0
+    transmission: float = 0.0
+    ior: float = 1.5
+    absorption: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    unsupported: tuple[str, ...] = ()
+
+
+def resolve_image(mesh: Path, name: str) -> FileImage:
+    """The image that a mesh file names, which must lie in the mesh's folder or below.
+
+    Programs like to write where an image was on another computer; then one of the same name beside the mesh
+    is taken.
+
+    Raises:
+        SceneFileError: there is none.
+    """
+    folder = mesh.parent.resolve()
+    plain = name.replace("\\", "/").strip()
+    for candidate in (plain, plain.rsplit("/", 1)[-1]):
+        path = (folder / candidate).resolve()
+        if candidate and path.is_relative_to(folder) and path.is_file():
+            return FileImage(str(path), path.suffix, path=path)
+    raise SceneFileError(
+        f"{mesh}: names the image {plain}, which is not in its folder; put it there, or give the mesh a "
+        "material in the stage."
+    )

@@ -1,0 +1,239 @@
+"""How long a job will take and how much memory, before it is begun; for people, and for ceilings.
+
+The figures come from runs on photographed scenes (``docs/experiments.md``); ``benchmarks/estimates.py``
+compares anew. What the photographs show decides as much as how many they are, so that an estimate is right
+within a factor of two, not better. Imports neither torch nor numba.
+"""
+
+from collections.abc import Sequence
+
+from pydantic import BaseModel, computed_field
+
+from octasplat.engine.config import ReconstructionConfig
+from octasplat.engine.durations import duration
+from octasplat.engine.operations.relight import RelightOptions
+from octasplat.engine.operations.render import RenderOptions
+from octasplat.engine.operations.render_options import PictureOptions
+from octasplat.engine.photograph_sizes import Sizes
+from octasplat.engine.train.config import TrainConfig, in_one_order, iteration_count, most_gaussians
+
+_START_CPU_SECONDS = 16.0
+_LOAD_CPU_SECONDS_PER_PIXEL = 1.0e-7
+_LIFT_CPU_SECONDS_PER_POINT = 7.0e-5
+_EVALUATE_CPU_SECONDS_PER_PIXEL = 2.7e-6
+_RENDER_CPU_SECONDS_PER_PIXEL = 1.5e-6
+_RENDER_START_CPU_SECONDS = 3.0
+"""Measured for a picture of 320 x 240 pixels: 2.6 s, with compiled kernels there."""
+_PATH_CPU_SECONDS = 1.0e-5
+"""For a path of a stage among 100,000 Gaussians (``benchmarks/light.py``)."""
+_RAY_CPU_SECONDS = 5.9e-6
+"""For a ray, forward and backward, of a training that ends with 100,000 Gaussians."""
+_LEAST_RAY_CPU_SECONDS = 1.0e-6
+_RAY_POWER = 0.8
+_FAR_RAY_POWER = 0.45
+"""Powers of the number of Gaussians by which it grows: up to the 200,000 of the runs that it was fitted to,
+and beyond, where an iteration was measured with 100,000 and 1,000,000 (``benchmarks/growth.py``)."""
+_FITTED_GAUSSIANS = 200_000
+_MATERIAL_RAY_CPU_SECONDS = 2.1e-5
+"""For a ray with what it reflects, of a training with materials of so many Gaussians."""
+_MATERIAL_GAUSSIANS = 80_000
+_MATERIAL_EVALUATE_CPU_SECONDS_PER_PIXEL = 5.5e-5
+"""With four to sixteen rays a pixel and what they reflect: 8 to 10 s for each picture of 400 x 400 pixels."""
+_SHARED_SORT_SAVING = 0.6
+"""Share of a ray's time that is saved where the rays of a window composite in one order
+(``docs/experiments.md``, "One order")."""
+_SINGLE_RAY_CPU_SECONDS = 10.8e-6
+"""For a ray that comes alone, as the preset redisplats has them."""
+_PAPER_GAUSSIANS = 60_000
+"""What clone and split comes to, whatever its cap."""
+_START_BYTES = 300 << 20
+_MATERIAL_START_BYTES, _MATERIAL_TRAIN_BYTES = 1_370 << 20, 500 << 20
+"""What materials take whatever the photographs, as they begin and later on."""
+_RAY_BYTES = 21_000
+_PIXEL_BYTES = 290
+"""For a pixel of the largest photograph, when a view is measured; what training needed is free by then."""
+_CACHED_PIXEL_BYTES = 3
+_IMAGE_PIXEL_BYTES = {"exr": 7.0, "png": 0.4, "mp4": 0.4}
+"""The least that a pixel of a rendered image takes on disk, as measured where most of it is empty (28 and 1.1
+where nothing is). Images of a film are kept as PNG until it is written."""
+_CORE_POWER = 0.79
+"""Two cores train 1.73 times as fast as one."""
+_TYPICAL_RENDER_GAUSSIANS = 100_000
+
+
+class Estimate(BaseModel):
+    """What a job will take, within a factor of two.
+
+    Attributes:
+        cpu_seconds: of all cores together, without finding poses.
+        seconds: by the clock, on so many cores with nothing else to do.
+        cores: of the machine that is reckoned with.
+        memory_bytes: largest private memory of the job's process.
+        disk_bytes: the least that its folder takes on the worker's disk; 0 where nobody knows.
+        finds_poses: whether poses are found first, which takes time that is not in it.
+    """
+
+    cpu_seconds: float
+    seconds: float
+    cores: int
+    memory_bytes: int
+    finds_poses: bool = False
+    disk_bytes: int = 0
+
+    @computed_field  # type: ignore[prop-decorator]
+    @property
+    def text(self) -> str:
+        """The same in words."""
+        cores = f"{self.cores} core{'s' if self.cores > 1 else ''}"
+        poses = ", besides the time to find the poses" if self.finds_poses else ""
+        return (
+            f"about {duration(self.seconds)} on {cores} and {self.memory_bytes / 1e9:.1f} GB of memory{poses}"
+        )
+
+
+def estimate_reconstruction(
+    options: ReconstructionConfig, photographs: Sequence[Sizes], cores: int
+) -> Estimate:
+    """The estimate of a reconstruction of these photographs, on a machine of so many cores."""
+    train = options.train
+    shrunk = [_capped_sizes(sizes, options.max_side) for sizes in photographs]
+    count = sum(sizes.count for sizes in shrunk)
+    pixels = sum(sizes.width_px * sizes.height_px * sizes.count for sizes in shrunk)
+    largest = max((sizes.width_px * sizes.height_px for sizes in shrunk), default=0)
+    held_out = _held_out(options, count) / max(count, 1)
+    trained_on = training_pixels(options, photographs)
+    iterations = iteration_count(train, trained_on)
+    gaussians = _gaussians(train, trained_on)
+    training_cpu_seconds = iterations * train.rays_per_batch * _ray_cpu_seconds(train, gaussians)
+    if options.minutes is not None:
+        training_cpu_seconds = 60 * options.minutes * max(1, cores) ** _CORE_POWER
+    materials = train.materials.learn
+    each_pixel = _MATERIAL_EVALUATE_CPU_SECONDS_PER_PIXEL if materials else _EVALUATE_CPU_SECONDS_PER_PIXEL
+    full_pixels = sum(sizes.width_px * sizes.height_px * sizes.count for sizes in photographs)
+    cpu_seconds = (
+        _START_CPU_SECONDS
+        + _LOAD_CPU_SECONDS_PER_PIXEL * full_pixels
+        + _LIFT_CPU_SECONDS_PER_POINT * min(train.initial_points, gaussians) * train.plane_sweep_init
+        + each_pixel * pixels * held_out
+        + training_cpu_seconds
+    )
+    training = _gaussian_bytes(train.sh_degree) * gaussians + _RAY_BYTES * max(
+        train.rays_per_batch, train.probe_rays
+    )
+    if materials:
+        training = max(training + _MATERIAL_TRAIN_BYTES, _MATERIAL_START_BYTES)
+    memory = _START_BYTES + max(training, _PIXEL_BYTES * largest)
+    disk = reconstruction_bytes(options, photographs)
+    return _estimate(cpu_seconds, memory, cores, finds_poses=options.poses == "auto", disk_bytes=disk)
+
+
+def reconstruction_bytes(options: ReconstructionConfig, photographs: Sequence[Sizes]) -> int:
+    """The least that the folder of a reconstruction takes: decoded photographs, and one checkpoint."""
+    shrunk = [_capped_sizes(sizes, options.max_side) for sizes in photographs]
+    pixels = sum(sizes.width_px * sizes.height_px * sizes.count for sizes in shrunk)
+    gaussians = _gaussians(options.train, training_pixels(options, photographs))
+    return _CACHED_PIXEL_BYTES * pixels + _checkpoint_bytes(options.train.sh_degree) * gaussians
+
+
+def image_bytes(options: PictureOptions, photographs: Sequence[Sizes], turns: int = 1) -> int:
+    """The least that the images of a render take, in each of so many environments."""
+    return round(_IMAGE_PIXEL_BYTES[options.format] * rendered_pixels(options, photographs) * turns)
+
+
+def training_pixels(options: ReconstructionConfig, photographs: Sequence[Sizes]) -> int:
+    """Pixels of the views that a reconstruction trains on, all of the photographs having poses."""
+    shrunk = [_capped_sizes(sizes, options.max_side) for sizes in photographs]
+    count = sum(sizes.count for sizes in shrunk)
+    pixels = sum(sizes.width_px * sizes.height_px * sizes.count for sizes in shrunk)
+    return round(pixels * (1 - _held_out(options, count) / max(count, 1)))
+
+
+def estimate_render(options: RenderOptions, photographs: Sequence[Sizes], cores: int) -> Estimate:
+    """The estimate of new views; of views, all photographs are reckoned with."""
+    pixels = rendered_pixels(options, photographs)
+    each = _RENDER_CPU_SECONDS_PER_PIXEL
+    if options.stage is not None:
+        each += _PATH_CPU_SECONDS * options.stage.integrator.samples
+    cpu_seconds = _RENDER_START_CPU_SECONDS + each * pixels
+    memory = _START_BYTES + _gaussian_bytes(2) * _TYPICAL_RENDER_GAUSSIANS
+    return _estimate(cpu_seconds, memory, cores, disk_bytes=image_bytes(options, photographs))
+
+
+def estimate_relight(options: RelightOptions, photographs: Sequence[Sizes], cores: int) -> Estimate:
+    """The estimate of a scene in other light; a ray of the split sum counts as a path."""
+    each = _PATH_CPU_SECONDS * options.samples_per_pixel * len(options.environments)
+    cpu_seconds = _RENDER_START_CPU_SECONDS + each * rendered_pixels(options, photographs)
+    memory = _START_BYTES + _gaussian_bytes(2) * _TYPICAL_RENDER_GAUSSIANS
+    disk = image_bytes(options, photographs, len(options.environments))
+    return _estimate(cpu_seconds, memory, cores, disk_bytes=disk)
+
+
+def rendered_pixels(options: PictureOptions, photographs: Sequence[Sizes]) -> int:
+    """Pixels of all images together that a render makes at most; a preview is one image."""
+    is_preview = isinstance(options, RenderOptions) and options.preview
+    if options.mode == "path" and options.camera_path is not None:
+        path = options.camera_path
+        return (1 if is_preview else path.frame_count) * path.width * path.height
+    if options.mode != "views":
+        return (1 if is_preview else options.frame_count) * options.width_px * options.height_px
+    shrunk = [_capped_sizes(sizes, options.max_side) for sizes in photographs]
+    if options.photographs is not None:
+        largest = max((sizes.width_px * sizes.height_px for sizes in shrunk), default=0)
+        return largest * (1 if is_preview else len(options.photographs))
+    return sum(sizes.width_px * sizes.height_px * sizes.count for sizes in shrunk)
+
+
+def _estimate(
+    cpu_seconds: float, memory_bytes: float, cores: int, *, finds_poses: bool = False, disk_bytes: int = 0
+) -> Estimate:
+    return Estimate(
+        cpu_seconds=round(cpu_seconds, 1),
+        seconds=round(cpu_seconds / max(1, cores) ** _CORE_POWER, 1),
+        cores=max(1, cores),
+        memory_bytes=round(memory_bytes),
+        finds_poses=finds_poses,
+        disk_bytes=disk_bytes,
+    )
+
+
+def _capped_sizes(sizes: Sizes, max_side: int | None) -> Sizes:
+    longest = max(sizes.width_px, sizes.height_px)
+    if max_side is None or longest <= max_side:
+        return sizes
+    scale = max_side / longest
+    return Sizes(max(1, round(sizes.width_px * scale)), max(1, round(sizes.height_px * scale)), sizes.count)
+
+
+def _held_out(options: ReconstructionConfig, count: int) -> int:
+    if options.held_out is not None:
+        return min(len(options.held_out), count)
+    return -(-count // options.test_every) if options.test_every else 0
+
+
+def _gaussians(train: TrainConfig, trained_on: int) -> int:
+    most = most_gaussians(train, trained_on)
+    return min(most, _PAPER_GAUSSIANS) if train.densify.kind == "redisplats" else most
+
+
+def _ray_cpu_seconds(train: TrainConfig, gaussians: int) -> float:
+    if train.ray_patch_rays == 1:
+        return _SINGLE_RAY_CPU_SECONDS
+    if train.materials.learn:
+        return float(_MATERIAL_RAY_CPU_SECONDS * (gaussians / _MATERIAL_GAUSSIANS) ** _FAR_RAY_POWER)
+    near, far = min(gaussians, _FITTED_GAUSSIANS) / 1e5, max(gaussians / _FITTED_GAUSSIANS, 1.0)
+    seconds = max(_RAY_CPU_SECONDS * near**_RAY_POWER * far**_FAR_RAY_POWER, _LEAST_RAY_CPU_SECONDS)
+    saved = _SHARED_SORT_SAVING * train.shared_sort_until if in_one_order(train) else 0.0
+    return float(seconds * (1 - saved))
+
+
+def _gaussian_bytes(sh_degree: int) -> int:
+    """Parameters, gradients, two moments and the mean of the last states as float32, and the hierarchy.
+
+    789 for degree 2 were measured before there was that mean, which adds 148.
+    """
+    return 197 + 20 * (10 + 3 * (sh_degree + 1) ** 2)
+
+
+def _checkpoint_bytes(sh_degree: int) -> int:
+    """Parameters and two moments as float32."""
+    return 12 * (10 + 3 * (sh_degree + 1) ** 2)

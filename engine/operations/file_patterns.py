@@ -1,0 +1,35 @@
+"""Files that are named one by one or by patterns."""
+
+import glob
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+from octasplat.engine.errors import ConfigError
+
+
+def expand_patterns(given: Sequence[Path]) -> tuple[Path, ...]:
+    """Return the files that are named one by one or by patterns such as ``frames/*.ply``.
+
+    The matches of a pattern are in the order of the numbers in their names.
+
+    Raises:
+        ConfigError: a pattern matches nothing.
+    """
+    paths: list[Path] = []
+    for path in given:
+        if path.exists() or not glob.has_magic(str(path)):
+            paths.append(path)
+            continue
+        matches = sorted(glob.glob(str(path), recursive=True), key=_natural_sort_key)  # noqa: PTH207 (may be absolute)
+        if not matches:
+            raise ConfigError(f"{path}: no file matches this pattern.")
+        paths.extend(map(Path, matches))
+    return tuple(paths)
+
+
+def _natural_sort_key(name: str) -> list[tuple[int, int, str]]:
+    """A sort key in which 10 comes after 9."""
+    return [
+        (0, int(part), "") if part.isdigit() else (1, 0, part) for part in re.split(r"(\d+)", name) if part
+    ]

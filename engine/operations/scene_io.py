@@ -1,0 +1,201 @@
+"""Scenes that operations read and write, with a word on what reading or writing loses."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+from pydantic import BaseModel
+
+from octasplat.engine.edit.changed_run import check_new_run, write_changed_run
+from octasplat.engine.events import Listener, Noted, Warned
+from octasplat.engine.fields import map_named_files
+from octasplat.engine.files import (
+    ExportOptions,
+    dropped_on_export,
+    export_scene,
+    exporter_for,
+    read_metadata,
+    read_scene,
+)
+from octasplat.engine.gaussians.flattening import ImportReport
+from octasplat.engine.gaussians.model import FlatGaussians
+from octasplat.engine.gaussians.scene_metadata import SceneMetadata
+from octasplat.engine.operations.base import SourceRequest
+from octasplat.engine.operations.written_files import check_targets
+from octasplat.engine.run_folder import is_run, not_exported
+
+
+def open_scene(path: Path, progress: Listener, *, drop_invalid: bool = False) -> FlatGaussians:
+    """Return the Gaussians of a file of any format or of a run's folder.
+
+    Args:
+        path: the file or folder.
+        progress: told what reading lost: a warning if it changes the look, else a note.
+        drop_invalid: leave out Gaussians with values that are not finite.
+
+    Raises:
+        SceneFileError: the file cannot be read.
+    """
+    gaussians, report = read_scene(path, drop_invalid=drop_invalid)
+    report_dropped_on_import(path, report, progress)
+    if is_run(path) and (left_out := not_exported(path)) is not None:
+        progress(Warned(left_out))
+    return gaussians
+
+
+def report_dropped_on_import(path: Path, report: ImportReport, progress: Listener) -> None:
+    """Tell what reading ``path`` lost: warnings for what changes the look, notes for the rest."""
+    if report.dropped:
+        progress(Noted(f"{path}: {report.dropped:,} Gaussians without finite values were left out."))
+    if report.saturated:
+        progress(Noted(f"{path}: {report.saturated:,} opacities of exactly 0 or 1 were made finite."))
+    if report.flattened:
+        loss = (
+            f"{path}: {report.flattened:,} of {report.count:,} Gaussians were not flat and lost their "
+            f"smallest extent, which was {report.median_thickness:.2g} of the next one in the median"
+        )
+        if 2 * report.thick > report.flattened:
+            progress(Warned(f"{loss}; as flat Gaussians the scene will look different."))
+        else:
+            progress(Noted(f"{loss}."))
+    for note in report.notes:
+        progress(Noted(f"{path}: {note}"))
+
+
+def check_scenes(
+    verb: str,
+    outputs: Sequence[Path],
+    inputs: Sequence[Path | None],
+    *,
+    overwrite: bool,
+    others: Sequence[Path] = (),
+    format: str | None = None,
+) -> None:
+    """Check before long work that scenes can be written.
+
+    Args:
+        verb: what writes them.
+        outputs: the files of the scenes.
+        inputs: what is read.
+        overwrite: whether files are replaced that the verb did not write.
+        others: other files that are written.
+        format: name of the format, if the files' names do not say it.
+
+    Raises:
+        ConfigError: one of them is read.
+        OutputError: one of them is there and not by the verb.
+        SceneFileError: no format takes a name.
+    """
+    beside = [path for output in outputs for path in exporter_for(output, format).beside(output)]
+    check_targets(verb, [*outputs, *beside, *others], inputs, overwrite=overwrite)
+
+
+def write_scene(
+    gaussians: FlatGaussians, facts: SceneMetadata, target: Path, progress: Listener, *, warn: bool = True
+) -> str:
+    """Write a scene in the format of its name; return a sentence that says so.
+
+    Args:
+        gaussians: the scene.
+        facts: what goes along with it.
+        target: the file.
+        progress: told what the format leaves out.
+        warn: whether to tell that.
+
+    Raises:
+        SceneFileError: it cannot be written.
+    """
+    if warn:
+        for text in dropped_on_export(gaussians, [target], None):
+            progress(Warned(text))
+    export_scene(gaussians, target, ExportOptions(facts=facts))
+    what = exporter_for(target).description.partition(";")[0]
+    return f"Wrote {target}: {what}, {len(gaussians):,} Gaussians."
+
+
+def is_run_output(source: Path, output: Path) -> bool:
+    """Return whether a changed scene is written as the folder of a run: it is of one, no file is named."""
+    return is_run(source) and not output.suffix
+
+
+def check_changed(
+    verb: str, request: SourceRequest, output: Path, inputs: Sequence[Path | None] = ()
+) -> None:
+    """Check before long work that a changed scene can be written to ``output``, a file or a run's folder.
+
+    Args:
+        verb: what changes it.
+        request: names the scene that is changed.
+        output: where the other one goes.
+        inputs: what else is read.
+
+    Raises:
+        ConfigError: ``output`` is one of the inputs.
+        OutputError: the folder is taken, or the file there and not by the verb.
+        SceneFileError: no format takes the name.
+    """
+    if is_run_output(request.source, output):
+        check_new_run(output)
+    else:
+        check_scenes(verb, [output], [request.source, *inputs], overwrite=request.overwrite)
+
+
+@dataclass(frozen=True)
+class WrittenScene:
+    """A changed scene that was written.
+
+    Attributes:
+        files: its files.
+        sentence: says so.
+        folder: of the run that it became; None for a file.
+    """
+
+    files: tuple[Path, ...]
+    sentence: str
+    folder: Path | None = None
+
+
+def write_changed(
+    source: Path,
+    gaussians: FlatGaussians,
+    output: Path,
+    progress: Listener,
+    *,
+    note: Mapping[str, object],
+    facts: SceneMetadata | None = None,
+    matrix: Float[np.ndarray, "4 4"] | None = None,
+) -> WrittenScene:
+    """Write the changed scene of ``source``: a file, or a run's folder with what of the run stays valid.
+
+    Args:
+        source: the scene that was changed, a file or a run's folder.
+        gaussians: what became of it.
+        output: where to; see :func:`is_run_output`.
+        progress: told what is lost.
+        note: what was done, for the run's ``edits.json``.
+        facts: what is known of the scene as a whole; None takes that of the source.
+        matrix: the affine map from the source's world to that of the scene, if they are not the same.
+    """
+    if not is_run_output(source, output):
+        return WrittenScene(
+            (output,), write_scene(gaussians, facts or read_metadata(source), output, progress)
+        )
+    for text in write_changed_run(source, gaussians, output, note, facts=facts, matrix=matrix):
+        progress(Warned(text))
+    files = tuple(sorted(path for path in output.rglob("*") if path.is_file()))
+    return WrittenScene(files, f"Wrote {output}: a run with {len(gaussians):,} Gaussians.", output)
+
+
+def edit_note(name: str, options: BaseModel, **counts: int) -> dict[str, object]:
+    """Return what was done in a few words of JSON, for ``edits.json``; of files the names only.
+
+    Args:
+        name: the verb.
+        options: what was asked for.
+        counts: what came of it.
+    """
+    asked = map_named_files(options, lambda path: Path(path.name))
+    kept = type(options).model_construct(**asked).model_dump(mode="json", exclude_defaults=True)
+    return {"operation": name, **kept, **counts}

@@ -1,0 +1,329 @@
+"""From a stage to the arrays that paths are traced through."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool, Float32, Float64, Int32, Int64
+
+from octasplat.engine.colour import srgb_to_linear
+from octasplat.engine.errors import ConfigError
+from octasplat.engine.pathtracing.environment import EnvironmentMap, environment_frame
+from octasplat.engine.pathtracing.imported_materials import ImportedMaterial, import_material
+from octasplat.engine.pathtracing.kernels.kernel_args import MaterialArrays, MeshQueries, SurfaceArrays
+from octasplat.engine.pathtracing.kernels.surface import GLASS
+from octasplat.engine.pathtracing.lights import (
+    EmissiveMesh,
+    LightArrays,
+    build_light_arrays,
+    rectangle_sides,
+    triangle_areas,
+)
+from octasplat.engine.pathtracing.material_table import MaterialTable
+from octasplat.engine.pathtracing.mesh_shapes import (
+    MeshShape,
+    corner_normals,
+    count_open_edges,
+    primitive_shape,
+    read_shape,
+    transform_normals,
+    transform_points,
+    up_axis_rotation,
+)
+from octasplat.engine.pathtracing.stage.model import (
+    Diffuse,
+    Emissive,
+    Glass,
+    Light,
+    PointLight,
+    RectangleLight,
+    Stage,
+    StageMesh,
+)
+from octasplat.engine.rays import RayBatch
+from octasplat.engine.render.environment_files import read_environment
+from octasplat.engine.trace.triangle_bvh import TriangleBvh
+
+SMOOTH_DEGREES = 30.0
+WarnCallback = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class CompiledMeshes:
+    """The meshes, lights and surroundings of a stage, ready to be traced.
+
+    Attributes:
+        surfaces: all triangles, those of visible lights included.
+        triangles: what rays are sent through.
+        obstacles: the same without glass; None where there is no glass.
+        glass: glass alone, its faces in the order of ``glass_faces``.
+        glass_faces: rows in the surfaces.
+        materials: of the triangles.
+        lights: of the stage, with the meshes that shine; the environment is the last of them.
+        environment_visible: whether the camera sees the environment.
+    """
+
+    surfaces: SurfaceArrays
+    triangles: TriangleBvh
+    materials: MaterialArrays
+    lights: LightArrays
+    environment_visible: bool
+    obstacles: TriangleBvh | None = None
+    glass: TriangleBvh | None = None
+    glass_faces: Int64[np.ndarray, " g"] | None = None
+
+    @property
+    def queries(self) -> MeshQueries:
+        """What kernels ask Embree; good while this lives."""
+        if self.obstacles is None or self.glass is None or self.glass_faces is None:
+            every = self.triangles.any_query
+            no_glass = self.triangles.closest_query._replace(scene=0)
+            return MeshQueries(self.triangles.closest_query, every, every, no_glass, np.empty(0, np.int64))
+        return MeshQueries(
+            self.triangles.closest_query, self.triangles.any_query, self.obstacles.any_query,
+            self.glass.closest_query, self.glass_faces,
+        )  # fmt: skip
+
+    def with_lights(self, lights: LightArrays) -> "CompiledMeshes":
+        """The same meshes in other light, their environment unseen by the camera."""
+        return replace(self, lights=lights, environment_visible=False)
+
+
+def compile_meshes(
+    stage: Stage, folder: Path, *, threads: int = 0, warn: WarnCallback = lambda _sentence: None
+) -> CompiledMeshes:
+    """Read and place everything of a stage but its Gaussians.
+
+    Args:
+        stage: whose meshes have no place in the scene left to be found (``on``).
+        folder: where the stage's files are relative to.
+        threads: for building and tracing; 0 takes all.
+        warn: told in a sentence what of a mesh file's materials is not understood.
+
+    Raises:
+        ConfigError: a mesh of glass is not closed, one that shines has no area, or an image is none.
+        SceneFileError: a mesh cannot be read.
+    """
+    up = np.array(stage.up)
+    gathered = _MeshBuilder(MaterialTable(folder), len(stage.lights))
+    for number, mesh in enumerate(stage.meshes):
+        _add_mesh(gathered, mesh, number, load_mesh_shape(mesh, number, folder), up, warn)
+    for number, light in enumerate(stage.lights):
+        corners = _light_triangles(light, up)
+        if corners is not None:
+            row = gathered.table.add_light(number)
+            gathered.add(corners, corner_normals(corners, 0.0), np.full(len(corners), row, np.int32))
+    environment = None
+    if stage.environment is not None:
+        radiance = read_environment(folder / stage.environment.file)
+        environment = EnvironmentMap(
+            radiance * np.float32(stage.environment.strength),
+            environment_frame(up, stage.environment.rotation_degrees),
+        )
+    surfaces, materials = gathered.surfaces(), gathered.table.arrays()
+    lights = build_light_arrays(
+        stage.lights, up, environment, gathered.emissive, materials.texels_linear, materials.texture_sizes
+    )
+    points = surfaces.corners_world.reshape(-1, 3)
+    faces = np.arange(len(points), dtype=np.int32).reshape(-1, 3)
+    is_glass = materials.kinds[surfaces.material_ids] == GLASS
+    some = bool(is_glass.any())
+    return CompiledMeshes(
+        surfaces,
+        TriangleBvh(points, faces, threads=threads),
+        materials,
+        lights,
+        stage.environment is not None and stage.environment.visible,
+        TriangleBvh(points, faces[~is_glass], threads=threads) if some else None,
+        TriangleBvh(points, faces[is_glass], threads=threads) if some else None,
+        np.flatnonzero(is_glass) if some else None,
+    )
+
+
+@dataclass
+class _MeshBuilder:
+    """Triangles of a stage as they come; ``light_count`` counts the stage's own lights."""
+
+    table: MaterialTable
+    light_count: int
+    corners: list[Float32[np.ndarray, "f 3 3"]] = field(default_factory=list)
+    normals: list[Float32[np.ndarray, "f 3 3"]] = field(default_factory=list)
+    uv: list[Float32[np.ndarray, "f 3 2"]] = field(default_factory=list)
+    rows: list[Int32[np.ndarray, " f"]] = field(default_factory=list)
+    rgb_linear: list[Float32[np.ndarray, "f 3 3"] | None] = field(default_factory=list)
+    emissive: list[EmissiveMesh] = field(default_factory=list)
+
+    def add(
+        self,
+        corners: Float32[np.ndarray, "f 3 3"],
+        normals: Float32[np.ndarray, "f 3 3"],
+        rows: Int32[np.ndarray, " f"],
+        uv: Float32[np.ndarray, "f 3 2"] | None = None,
+        rgb_linear: Float32[np.ndarray, "f 3 3"] | None = None,
+    ) -> None:
+        self.corners.append(corners)
+        self.normals.append(normals)
+        self.rows.append(rows)
+        self.uv.append(np.zeros((len(corners), 3, 2), np.float32) if uv is None else np.nan_to_num(uv))
+        self.rgb_linear.append(rgb_linear)
+
+    def surfaces(self) -> SurfaceArrays:
+        coloured = any(rgb is not None for rgb in self.rgb_linear)
+        colours = [
+            np.ones_like(corners) if rgb is None else np.nan_to_num(rgb, nan=1.0)
+            for corners, rgb in zip(self.corners, self.rgb_linear, strict=True)
+            if coloured
+        ]
+        nothing = np.zeros((0, 3, 3), np.float32)
+        return SurfaceArrays(
+            np.concatenate([nothing, *self.corners]),
+            np.concatenate([nothing, *self.normals]),
+            np.concatenate([np.zeros((0, 3, 2), np.float32), *self.uv]),
+            np.concatenate([np.zeros(0, np.int32), *self.rows]),
+            np.concatenate([nothing, *colours]),
+        )
+
+
+def _add_mesh(
+    builder: _MeshBuilder,
+    mesh: StageMesh,
+    number: int,
+    shape: MeshShape,
+    up: Float64[np.ndarray, "3"],
+    warn: WarnCallback,
+) -> None:
+    turn = up_axis_rotation(mesh_up_axis(mesh), mesh.turn_degrees, up)
+    corners = transform_points(shape.vertices, mesh, turn)[shape.faces].astype(np.float32)
+    degrees = SMOOTH_DEGREES if mesh.smooth_degrees is None else mesh.smooth_degrees
+    normals = corner_normals(corners, degrees)
+    if mesh.smooth_degrees is None and shape.normals is not None:
+        stated = transform_normals(shape.normals, mesh, turn)[shape.faces]
+        known = np.isfinite(stated).all(axis=(1, 2))
+        normals[known] = stated[known]
+    rows = np.empty(len(corners), np.int32)
+    name = f"meshes[{number}]"
+    for chosen, given in _face_materials(mesh, name, shape, warn):
+        has_uv = shape.corner_uv is not None and bool(np.isfinite(shape.corner_uv[chosen]).all())
+        tinted = mesh.material is None and shape.corner_rgb_linear is not None
+        row = builder.table.add(
+            given.material, f"{name}.material", has_uv=has_uv, uses_vertex_color=tinted, images=given.images
+        )
+        rows[chosen] = row
+        if isinstance(given.material, Emissive) and given.material.emission > 0.0:
+            area = triangle_areas(corners[chosen])
+            if not area.sum() > 0.0:
+                raise ConfigError(f"{name}: shines, but has no area; give it a surface, or no emission.")
+            own = np.flatnonzero(chosen)[area > 0.0]
+            texture = builder.table.set_emissive(row, builder.light_count + len(builder.emissive))
+            radiance = given.material.emission * srgb_to_linear(np.array(given.material.emission_srgb))
+            uv = np.zeros((len(own), 3, 2), np.float32)
+            if shape.corner_uv is not None:
+                uv = np.nan_to_num(shape.corner_uv[own])
+            builder.emissive.append(EmissiveMesh(corners[own], uv, radiance, texture))
+    builder.add(corners, normals, rows, shape.corner_uv, shape.corner_rgb_linear)
+
+
+def _face_materials(
+    mesh: StageMesh, name: str, shape: MeshShape, warn: WarnCallback
+) -> list[tuple[Bool[np.ndarray, " f"], ImportedMaterial]]:
+    """Which faces of a mesh have which material: the stage's, or else the file's."""
+    if mesh.material is not None:
+        return [(np.ones(len(shape.faces), bool), ImportedMaterial(mesh.material, {}))]
+    numbers = shape.material_numbers
+    if numbers is None:
+        numbers = np.full(len(shape.faces), -1, np.int32)
+    scale = float(np.prod(np.broadcast_to(np.array(mesh.scale), 3))) ** (1 / 3)
+    found = []
+    for value in np.unique(numbers):
+        chosen = numbers == value
+        if value < 0:
+            plain = Diffuse(colour_srgb=(1, 1, 1)) if shape.corner_rgb_linear is not None else Diffuse()
+            found.append((chosen, ImportedMaterial(plain, {})))
+            continue
+
+        def is_closed(chosen: Bool[np.ndarray, " f"] = chosen) -> bool:
+            return count_open_edges(shape, chosen) == 0
+
+        try:
+            given = import_material(
+                shape.materials[value], is_closed, scale, lambda text: warn(f"{mesh.file}: {text}")
+            )
+        except ConfigError as error:
+            raise ConfigError(f"{name}: {mesh.file}: {error}") from None
+        found.append((chosen, given))
+    return found
+
+
+def check_outside_glass(meshes: CompiledMeshes, origin_world: Float32[np.ndarray, "3"], camera: str) -> None:
+    """Refuse a camera within a mesh of glass, from where refraction would go wrong.
+
+    Raises:
+        ConfigError: the camera, which is called ``camera``, stands in glass.
+    """
+    if not (meshes.materials.kinds == GLASS).any():
+        return
+    # A direction that meets edges by bad luck only; what the ray crosses is counted surface by surface.
+    direction = np.array([[0.5773, 0.5774, 0.5772]], np.float32)
+    sides: dict[int, int] = {}
+    t = 0.0
+    for _ in range(10_000):
+        hit = meshes.triangles.closest(RayBatch(origin_world[None], direction, t))
+        face = int(hit.faces[0])
+        if face < 0:
+            break
+        t = float(hit.distances[0]) * (1 + 1e-6) + 1e-9
+        row = int(meshes.surfaces.material_ids[face])
+        corner = meshes.surfaces.corners_world[face].astype(np.float64)
+        normal = np.cross(corner[1] - corner[0], corner[2] - corner[0])
+        sides[row] = sides.get(row, 0) + (1 if float(direction[0] @ normal) > 0 else -1)
+    if any(count > 0 and meshes.materials.kinds[row] == GLASS for row, count in sides.items()):
+        raise ConfigError(f"{camera}: the camera stands inside a mesh of glass; move one of the two.")
+
+
+def mesh_up_axis(mesh: StageMesh) -> str:
+    """The axis of a mesh's own frame that is turned to the stage's up."""
+    if mesh.up_axis is not None:
+        return mesh.up_axis
+    return "y" if mesh.shape is not None or (mesh.file or "").lower().endswith(".glb") else "world"
+
+
+def load_mesh_shape(mesh: StageMesh, number: int, folder: Path) -> MeshShape:
+    """The triangles of mesh ``number`` before it is placed, with what its file says of its looks.
+
+    Raises:
+        ConfigError: it is of glass and not closed.
+        SceneFileError: its file cannot be read.
+    """
+    if mesh.shape is not None:
+        shape, name = primitive_shape(mesh.shape), str(mesh.shape)
+    else:
+        assert mesh.file is not None
+        shape, name = read_shape(folder / mesh.file), str(folder / mesh.file)
+    if isinstance(mesh.material, Glass):
+        count = count_open_edges(shape)
+        if count:
+            raise ConfigError(
+                f"meshes[{number}]: {name} is not closed ({count:,} edges without two faces that wind "
+                "alike), so that it cannot be glass; close it or choose another material."
+            )
+    return shape
+
+
+def _light_triangles(light: Light, up_world: Float64[np.ndarray, "3"]) -> Float32[np.ndarray, "f 3 3"] | None:
+    """The triangles of a light that is seen; None of one that is not."""
+    if isinstance(light, PointLight) and light.radius > 0.0 and light.visible:
+        ball = primitive_shape("sphere")
+        corners = ball.vertices[ball.faces] * light.radius + np.array(light.position)
+        return np.asarray(corners.astype(np.float32))
+    if not (isinstance(light, RectangleLight) and light.visible):
+        return None
+    u, v = rectangle_sides(light, up_world)
+    centre = np.array(light.position)
+    a, b, c, d = (
+        centre - u / 2 - v / 2,
+        centre + u / 2 - v / 2,
+        centre + u / 2 + v / 2,
+        centre - u / 2 + v / 2,
+    )
+    return np.array([[a, b, c], [a, c, d]], np.float32)

@@ -1,0 +1,230 @@
+"""What paths gathered, pixel by pixel, and the picture that it makes.
+
+A pixel has a front layer of Gaussians (premultiplied display colour, transmittance, and the factor that the
+stage's lights give to it) and linear light behind it; see :mod:`octasplat.engine.pathtracing.kernels.gaussian_layer` for the
+reason.
+
+Gaussians with materials that the camera sees are a part of the pixel of their own, encoded by itself, so that
+their edges blend in display values as photographs with alpha do.
+
+A compositor's layers are so made that ``background * shadow`` under ``things`` is the picture again. Things
+and scene meet in display values in the picture, but in linear ones in a compositor: where a pixel is covered
+in part, the alpha of the things is the larger one that this takes, so that nothing becomes negative.
+"""
+
+import copy
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float32, Float64, Int64
+
+from octasplat.engine.colour import linear_to_srgb, srgb_to_linear
+from octasplat.engine.pathtracing.kernels.film import accumulate_pixels
+from octasplat.engine.pathtracing.kernels.kernel_args import PathArrays
+from octasplat.engine.pathtracing.kernels.scatter import FLAG_GAUSSIAN_SURFACE
+
+ToneCurve = Literal["none", "reinhard", "filmic"]
+DenoiseFn = Callable[
+    [Float32[np.ndarray, "h w 3"], Float32[np.ndarray, "h w 3"] | None, Float32[np.ndarray, "h w 3"] | None],
+    Float32[np.ndarray, "h w 3"],
+]
+"""Takes noise from a linear image, guided by the colours and normals of surfaces where they are given."""
+_NO_FACTORS = np.empty(0, np.float32)
+_LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
+_DARK = 1e-6
+
+
+@dataclass(frozen=True)
+class StageImage:
+    """One picture of a stage.
+
+    Attributes:
+        rgb_srgb: display values after exposure and tone curve, clipped to [0, 1].
+        rgb_linear: linear values before both, not clipped.
+        alpha: 1 less what is seen of the background behind everything.
+        layers: what a compositor needs, linear channels by name: ``background``, ``shadow`` and ``things``,
+            each with R, G, B, A; nothing unless they were asked for.
+    """
+
+    rgb_srgb: Float32[np.ndarray, "h w 3"]
+    rgb_linear: Float32[np.ndarray, "h w 3"]
+    alpha: Float32[np.ndarray, "h w"]
+    layers: dict[str, Float32[np.ndarray, "h w"]]
+
+
+class Film:
+    """Sums over the paths of each pixel, in float64 and in a fixed order.
+
+    Args:
+        height: of the picture, pixels.
+        width: of the picture, pixels.
+        has_layers: also keep what the layers of a compositor need.
+        has_guides: also keep what :meth:`denoised` needs.
+
+    Attributes:
+        plate: the scene alone, to be filled alongside; None unless ``has_layers``.
+    """
+
+    def __init__(
+        self, height: int, width: int, *, has_layers: bool = False, has_guides: bool = False
+    ) -> None:
+        self._shape = (height, width)
+        count = height * width
+        self._layer, self._light, self._shade, self._albedo, self._normals = np.zeros((5, count, 3))
+        self._transmittance, self._coverage, self._mesh_visibility, self._samples, self._front = np.zeros(
+            (5, count)
+        )
+        self._front_light = np.zeros((count, 3))
+        self.plate = Film(height, width) if has_layers else None
+        self._without_meshes = Film(height, width) if has_layers else None
+        self._has_guides = has_guides
+
+    def add(
+        self,
+        paths: PathArrays,
+        pixels: Int64[np.ndarray, " n"],
+        path_factors: Float32[np.ndarray, " p"] | None = None,
+    ) -> None:
+        """Add finished paths, equally many to each of ``pixels``, those of one pixel beside each other.
+
+        Args:
+            paths: to add.
+            pixels: where they begin.
+            path_factors: 1 for those that count, 0 for the others; None for all.
+        """
+        each = len(paths.keys) // len(pixels)
+
+        def add(
+            sums: Float64[np.ndarray, "..."],
+            values: Float32[np.ndarray, "..."],
+            factors: Float32[np.ndarray, " f"] = _NO_FACTORS if path_factors is None else path_factors,
+        ) -> None:
+            accumulate_pixels(
+                values.reshape(len(values), -1), factors, each, pixels, sums.reshape(len(sums), -1)
+            )
+
+        front = (paths.flags & FLAG_GAUSSIAN_SURFACE != 0).astype(np.float32)
+        through = paths.transmittance * (1 - front)
+        add(self._layer, paths.layer_srgb)
+        add(self._light, paths.radiance_linear, through if path_factors is None else through * path_factors)
+        add(self._shade, paths.shading_factor)
+        add(self._transmittance, through)
+        add(self._coverage, paths.coverage)
+        add(self._front, front)
+        add(self._front_light, paths.radiance_linear, front if path_factors is None else front * path_factors)
+        if path_factors is not None:
+            add(self._samples, path_factors)
+            return
+        self._samples[pixels] += each
+        if self._has_guides:
+            add(self._albedo, paths.albedo_linear)
+            add(self._normals, paths.normals_world)
+        if self._has_guides or self._without_meshes is not None:
+            add(self._mesh_visibility, paths.mesh_visibility)
+        if self._without_meshes is not None:
+            self._without_meshes.add(paths, pixels, (paths.mesh_visibility == 0.0).astype(np.float32))
+
+    def gaussian_surface(self) -> tuple[Float32[np.ndarray, "h w 3"], Float32[np.ndarray, "h w"]]:
+        """Mean linear radiance of the Gaussians with materials that the camera sees, and their coverage."""
+        linear = _safe_divide(self._front_light, self._front[:, None])
+        coverage = self._front / np.maximum(self._samples, 1)
+        return linear.astype(np.float32).reshape(*self._shape, 3), coverage.astype(np.float32).reshape(
+            self._shape
+        )
+
+    def image(self, *, exposure: float = 0.0, tone: ToneCurve = "none") -> StageImage:
+        """The picture of all paths so far; ``exposure`` is in stops."""
+        linear = self._linear()
+        shown = linear_to_srgb(apply_tone_curve(linear * 2.0**exposure, tone))
+        return StageImage(
+            np.clip(shown, 0.0, 1.0).astype(np.float32).reshape(*self._shape, 3),
+            self._to_image(linear),
+            self._to_image(self._coverage / np.maximum(self._samples, 1)),
+            self._layers(linear),
+        )
+
+    def denoised(self, denoise: DenoiseFn) -> "Film":
+        """The film with less noise in what light brings; the Gaussians' own colours stay as they are."""
+        film = copy.copy(self)
+        count = np.maximum(self._samples, 1)[:, None]
+        if self._mesh_visibility.any():
+            guides = (self._to_image(self._albedo / count), self._to_image(self._normals / count))
+            light = denoise(self._to_image(self._light / count), *guides)
+            smooth = light.reshape(-1, 3).astype(np.float64) * count
+            film._light = np.where(self._mesh_visibility[:, None] > 0.0, smooth, self._light)
+        covered = self._covered()
+        shade = _safe_divide(self._shade, covered, 1.0)
+        if (np.abs(shade - 1.0) > _DARK).any():
+            even = denoise(self._to_image(np.maximum(shade, 0.0)), None, None)
+            film._shade = even.reshape(-1, 3).astype(np.float64) * covered
+        if self._without_meshes is not None:
+            film._without_meshes = self._without_meshes.denoised(denoise)
+        return film
+
+    def _linear(self, *, lit: bool = True) -> Float64[np.ndarray, "n 3"]:
+        """Linear values; not ``lit`` shows the Gaussians as trained."""
+        count = np.maximum(self._samples, 1)[:, None]
+        through, front = self._transmittance[:, None] / count, self._front[:, None] / count
+        covered = np.maximum(1.0 - through - front, 0.0)
+        layer = self._layer / count
+        light = _safe_divide(self._light, self._transmittance[:, None])
+        surface = _safe_divide(self._front_light, self._front[:, None])
+        if lit:
+            shade = _safe_divide(self._shade, self._covered(), 1.0)
+            colour = srgb_to_linear(_safe_divide(layer, covered)) * np.maximum(shade, 0.0)
+            layer = np.where(np.abs(shade - 1.0) < 1e-6, layer, covered * linear_to_srgb(colour))
+        shown = layer + front * linear_to_srgb(surface) + through * linear_to_srgb(light)
+        return np.asarray(srgb_to_linear(shown))
+
+    def _covered(self) -> Float64[np.ndarray, "n 1"]:
+        return (self._samples - self._transmittance - self._front)[:, None]
+
+    def _layers(self, picture: Float64[np.ndarray, "n 3"]) -> dict[str, Float32[np.ndarray, "h w"]]:
+        if self._without_meshes is None or self.plate is None:
+            return {}
+        plain = self._without_meshes._linear(lit=False)
+        seen = (self._without_meshes._samples > 0)[:, None] & (plain > _DARK)
+        shadow = np.where(seen, self._without_meshes._linear() / np.where(seen, plain, 1.0), 1.0)
+        background = self.plate._linear(lit=False)
+        behind = background * shadow
+        alpha = self._mesh_visibility / np.maximum(self._samples, 1)
+        needed = np.where(behind > _DARK, 1.0 - picture / np.maximum(behind, _DARK), 0.0).max(axis=1)
+        alpha = np.where(alpha > 0.0, np.clip(np.maximum(alpha, needed), 0.0, 1.0), 0.0)[:, None]
+        things = np.where(alpha > 0.0, np.maximum(picture - (1.0 - alpha) * behind, 0.0), 0.0)
+        beyond = self.plate._coverage / np.maximum(self.plate._samples, 1)
+        parts = {
+            "background": (background, beyond),
+            "shadow": (shadow, np.clip(1.0 - shadow.mean(axis=1), 0.0, 1.0)),
+            "things": (things, alpha[:, 0]),
+        }
+        channels: dict[str, Float32[np.ndarray, "h w"]] = {}
+        for name, (rgb, a) in parts.items():
+            channels |= {f"{name}.{c}": self._to_image(rgb[:, k]) for k, c in enumerate("RGB")}
+            channels[f"{name}.A"] = self._to_image(a)
+        return channels
+
+    def _to_image(self, values: Float64[np.ndarray, "n *c"]) -> Float32[np.ndarray, "h w *c"]:
+        return values.astype(np.float32).reshape(*self._shape, *values.shape[1:])
+
+
+def apply_tone_curve(linear: Float64[np.ndarray, "n 3"], tone: ToneCurve) -> Float64[np.ndarray, "n 3"]:
+    """Linear values brought into [0, 1] by a tone curve.
+
+    ``reinhard`` divides by 1 plus luminance ("Photographic Tone Reproduction", Reinhard et al. 2002);
+    ``filmic`` is a fit of ACES' reference curve (https://knarkowicz.wordpress.com, "ACES Filmic Tone Mapping
+    Curve", 2016).
+    """
+    if tone == "reinhard":
+        return linear / (1.0 + linear @ _LUMINANCE)[:, None]
+    if tone == "filmic":
+        x = 0.6 * linear
+        return np.clip(x * (2.51 * x + 0.03) / (x * (2.43 * x + 0.59) + 0.14), 0.0, 1.0)
+    return linear
+
+
+def _safe_divide(
+    values: Float64[np.ndarray, "n 3"], by: Float64[np.ndarray, "n 1"], otherwise: float = 0.0
+) -> Float64[np.ndarray, "n 3"]:
+    return np.where(by > 1e-9, values / np.maximum(by, 1e-9), otherwise)

@@ -1,0 +1,165 @@
+"""The Gaussians of a stage as the path tracer sees them: layers on rays, and what they keep off."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool, Float32
+
+from octasplat.engine.edit.selection import merge_scenes
+from octasplat.engine.errors import ConfigError
+from octasplat.engine.gaussians.affine import scaling, transform_gaussians, translation
+from octasplat.engine.gaussians.channels import stack_channels
+from octasplat.engine.gaussians.materials import MATERIAL_WIDTHS, has_materials
+from octasplat.engine.gaussians.model import SH_C0, FlatGaussians
+from octasplat.engine.pathtracing.kernels.gaussian_layer import AMBIENT, RELIT, SHADOWED
+from octasplat.engine.pathtracing.kernels.gaussian_surface import ALBEDO, FEATURE_COUNT, MATERIAL, RAY_OFFSET
+from octasplat.engine.pathtracing.mesh_shapes import rotation_matrix
+from octasplat.engine.pathtracing.stage.model import Stage, StageGaussians
+from octasplat.engine.rays import RayBatch
+from octasplat.engine.trace.facing_normals import face_viewer
+from octasplat.engine.trace.factory import make_tracer
+from octasplat.engine.trace.protocol import Tracer, TraceResult, TraceSettings
+
+BASE_FEATURE_COUNT = 3
+SHADOW_BIAS_FRACTION = 0.03
+RAY_OFFSET_FRACTION = 0.5
+"""Rays leave a surface of Gaussians so far above it, of their standard deviations."""
+
+
+@dataclass(frozen=True)
+class GaussianLayers:
+    """Gaussians, with features that say how they take light.
+
+    Attributes:
+        tracer: all Gaussians, with the features of :mod:`octasplat.engine.pathtracing.kernels.gaussian_layer`.
+        min_transmittance: transmittance at which a ray counts as ended.
+        mesh_shadow_tracer: those that cast shadows on meshes; None where none do.
+        gaussian_shadow_tracer: those that cast shadows on Gaussians.
+        non_shadow_tracer: those that do not; the light that they keep off is in the colours already.
+        shadow_bias: Gaussians nearer than this to a lit layer keep nothing off it, world units.
+        has_material_surfaces: whether some are surfaces of their materials, with the features of
+            :mod:`octasplat.engine.pathtracing.kernels.gaussian_surface`.
+    """
+
+    tracer: Tracer
+    min_transmittance: float
+    mesh_shadow_tracer: Tracer | None = None
+    gaussian_shadow_tracer: Tracer | None = None
+    non_shadow_tracer: Tracer | None = None
+    shadow_bias: float = 0.0
+    has_material_surfaces: bool = False
+
+    def trace(self, rays: RayBatch, t_max: Float32[np.ndarray, " r"]) -> TraceResult:
+        """What lies on rays up to a distance each."""
+        seen = self.tracer.trace(rays.up_to(t_max))
+        if self.tracer.settings.flip_normal_cos > 0:
+            normals = face_viewer(seen.normal_world, rays.directions_world)
+            seen.normal_world = normals.normal_world.astype(np.float32)
+        return seen
+
+
+def build_gaussian_layers(
+    stage: Stage,
+    main_gaussians: FlatGaussians | None,
+    read_gaussians: Callable[[Path], FlatGaussians],
+    folder: Path,
+    settings: TraceSettings,
+    *,
+    size: float,
+    threads: int = 0,
+) -> GaussianLayers | None:
+    """The Gaussian scenes of a stage, placed, joined and ready to be traced; None where it has none.
+
+    Args:
+        stage: what to read.
+        main_gaussians: the scene that is rendered, for entries that name no file.
+        read_gaussians: reads a file of Gaussians.
+        folder: where files are relative to.
+        settings: where rays are cut off.
+        size: of the scene, world units; the bias of shadows is 3 % of it unless the stage says else.
+        threads: for building and tracing; 0 takes all.
+
+    Raises:
+        ConfigError: an entry without a file, and no scene is rendered.
+        SceneFileError: a file cannot be read.
+    """
+    parts, features, surfaces, on_meshes, on_gaussians, biases = [], [], [], [], [], []
+    for number, scene in enumerate(stage.gaussians):
+        if scene.file is None and main_gaussians is None:
+            raise ConfigError(f"gaussians[{number}]: name a file; no scene is rendered here.")
+        gaussians = main_gaussians if scene.file is None else read_gaussians(folder / scene.file)
+        assert gaussians is not None
+        placed = place_gaussians(gaussians, scene)
+        surface = scene.light == "relit" and has_materials(gaussians)
+        parts.append(_without_color(placed) if surface else placed)
+        features.append(_material_features(placed, scene) if surface else _layer_features(placed, scene))
+        surfaces.append(surface)
+        on_meshes.append(np.full(len(gaussians), scene.shadows_on_meshes))
+        on_gaussians.append(np.full(len(gaussians), scene.shadows_on_gaussians))
+        biases.append(SHADOW_BIAS_FRACTION * size if scene.shadow_bias is None else scene.shadow_bias)
+    if not parts:
+        return None
+    # Channels say nothing of light, and two scenes may mean different things by one name.
+    whole = merge_scenes([part.without_channels(tuple(part.channels)) for part in parts])
+    tracer = make_tracer(settings, threads=threads, build_quality=2)
+    columns = FEATURE_COUNT if any(surfaces) else BASE_FEATURE_COUNT
+    tracer.build(whole, np.ascontiguousarray(np.concatenate(features)[:, :columns]))
+
+    def caster(chosen: Bool[np.ndarray, " n"]) -> Tracer | None:
+        if chosen.all() or not chosen.any():
+            return tracer if chosen.any() else None
+        some = make_tracer(settings, threads=threads, build_quality=2)
+        some.build(whole.select(chosen))
+        return some
+
+    casting = np.concatenate(on_gaussians)
+    return GaussianLayers(
+        tracer,
+        settings.transmittance_min,
+        caster(np.concatenate(on_meshes)),
+        caster(casting),
+        caster(~casting),
+        max(biases),
+        any(surfaces),
+    )
+
+
+def place_gaussians(gaussians: FlatGaussians, placement: StageGaussians) -> FlatGaussians:
+    """Gaussians scaled, turned and moved; the very same ones where nothing is to be done."""
+    assert isinstance(placement.scale, float | int)
+    if placement.scale == 1.0 and not any(placement.rotation_degrees) and not any(placement.position):
+        return gaussians
+    matrix = np.eye(4)
+    matrix[:3, :3] = rotation_matrix(placement.rotation_degrees)
+    matrix = translation(np.array(placement.position)) @ matrix @ scaling(np.full(3, placement.scale))
+    return transform_gaussians(gaussians, matrix)
+
+
+def _layer_features(gaussians: FlatGaussians, scene: StageGaussians) -> Float32[np.ndarray, "n f"]:
+    values = np.zeros((len(gaussians), FEATURE_COUNT), np.float32)
+    if scene.light == "shadowed":
+        values[:, SHADOWED] = 1.0 - scene.ambient
+    elif scene.light == "relit":
+        values[:, RELIT], values[:, AMBIENT] = 1.0, scene.ambient
+    return values
+
+
+def _material_features(gaussians: FlatGaussians, scene: StageGaussians) -> Float32[np.ndarray, "n f"]:
+    values = np.zeros((len(gaussians), FEATURE_COUNT), np.float32)
+    values[:, MATERIAL] = 1.0
+    values[:, ALBEDO:RAY_OFFSET] = stack_channels(gaussians.channels, tuple(MATERIAL_WIDTHS))
+    values[:, RAY_OFFSET] = (
+        RAY_OFFSET_FRACTION * np.sqrt(gaussians.scales.prod(axis=1))
+        if scene.shadow_bias is None
+        else scene.shadow_bias
+    )
+    return values
+
+
+def _without_color(gaussians: FlatGaussians) -> FlatGaussians:
+    """The same Gaussians without a colour of their own."""
+    sh = np.zeros((len(gaussians), 1, 3), np.float32)
+    sh[:, 0] = -1.0 / SH_C0
+    return replace(gaussians, sh=sh)

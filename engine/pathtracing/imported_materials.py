@@ -1,0 +1,100 @@
+"""Materials that mesh files bring along, as materials of a stage."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from octasplat.engine.colour import linear_to_srgb
+from octasplat.engine.errors import ConfigError
+from octasplat.engine.geometry.mesh_material import FileImage, MeshMaterial
+from octasplat.engine.pathtracing.stage.model import Glass, Material, MetallicRoughness
+
+MAX_IOR = 4.0
+THIN_IOR = 1.0
+"""Index of refraction of a pane without an inside: light goes straight on."""
+
+
+@dataclass(frozen=True)
+class ImportedMaterial:
+    """A material of a stage that came from a mesh file.
+
+    Attributes:
+        material: with names of images that only ``images`` knows.
+        images: of the file.
+    """
+
+    material: Material
+    images: Mapping[str, FileImage]
+
+
+def import_material(
+    source: MeshMaterial, is_closed: Callable[[], bool], scale: float, warn: Callable[[str], None]
+) -> ImportedMaterial:
+    """What a file's material is on a stage.
+
+    Args:
+        source: the file's.
+        is_closed: whether its triangles close something, so that glass has an inside.
+        scale: world units in one unit of the file.
+        warn: told in a sentence what is not understood.
+
+    Raises:
+        ConfigError: a number is not finite or out of range.
+    """
+    numbers = (*source.rgb_linear, *source.emission_linear, source.metallic, source.roughness, source.ior)
+    if not (np.isfinite(numbers).all() and min(numbers) >= 0.0):
+        raise ConfigError(f"the material {source.name} holds a number that is negative or not finite.")
+    left_out = list(source.unsupported)
+    ior = min(source.ior, MAX_IOR) if source.ior >= 1.0 else 1.5
+    material: Material
+    if source.transmission >= 0.5:
+        named = {"texture": source.texture, "normal texture": source.normal_texture}
+        left_out += [f"{key} on glass" for key, image in named.items() if image is not None]
+        if not is_closed():
+            left_out.append("the refraction of glass that is not closed")
+            ior = THIN_IOR
+        red, green, blue = (value / scale for value in source.absorption)
+        material = Glass(
+            ior=ior,
+            tint_srgb=_to_srgb(source.rgb_linear),
+            absorption=(red, green, blue),
+            roughness=_clamp_unit(source.roughness),
+        )
+        images: dict[str, FileImage] = {}
+    else:
+        if source.transmission > 0.0:
+            left_out.append(f"transmission {source.transmission:g}, which is less than half")
+        fields = {
+            "texture": source.texture,
+            "metallic_roughness_texture": source.metallic_roughness_texture,
+            "normal_texture": source.normal_texture,
+            "emission_texture": source.emission_texture,
+        }
+        strength = max(source.emission_linear)
+        if strength == 0.0:
+            fields["emission_texture"] = None
+        images = {name: image for name, image in fields.items() if image is not None}
+        red, green, blue = (value / strength if strength else 1.0 for value in source.emission_linear)
+        material = MetallicRoughness(
+            colour_srgb=_to_srgb(source.rgb_linear),
+            metallic=_clamp_unit(source.metallic),
+            roughness=_clamp_unit(source.roughness),
+            ior=max(ior, 1.0 + 1e-6),
+            normal_scale=abs(source.normal_scale),
+            emission=strength,
+            emission_srgb=_to_srgb((red, green, blue)),
+            **{name: name for name in images},
+        )
+    if left_out:
+        warn(f"of the material {source.name or 'without a name'} is not used: {', '.join(left_out)}.")
+    return ImportedMaterial(material, images)
+
+
+def _clamp_unit(value: float) -> float:
+    return min(max(value, 0.0), 1.0)
+
+
+def _to_srgb(linear: tuple[float, float, float]) -> tuple[float, float, float]:
+    red, green, blue = linear_to_srgb(np.clip(np.array(linear, np.float64), 0.0, 1.0))
+    return _clamp_unit(float(red)), _clamp_unit(float(green)), _clamp_unit(float(blue))

@@ -1,0 +1,197 @@
+"""Gaussians on a ray: the layer that they are in front of what the ray meets.
+
+How display colours and linear light meet. The trained colours of Gaussians are display values and are
+composited as such, into one layer of premultiplied colour g and transmittance T for each ray.
+
+- On the camera's own ray, and on as long as mirrors and glass pass on all of it in one direction, layers are
+  composited with each other and over what is behind them in display values: g + T encode(L), L the mean
+  linear radiance of what is behind.
+- On any other ray a layer sends the linear radiance (1 - T) decode(g / (1 - T)) and lets T of the linear
+  light behind it through. Where such a ray comes straight from a mirror or from glass and ends in the
+  surroundings, what is behind the layer is known, and the radiance is decode(g + T encode(L)) as for the
+  camera.
+"""
+
+import math
+
+from octasplat.engine.compilation import kernel
+from octasplat.engine.pathtracing.kernels.kernel_args import SAMPLE_PAIRS_PER_BOUNCE
+from octasplat.engine.pathtracing.kernels.lights import (
+    INFINITE_DISTANCE,
+    additive_light_probability,
+    sample_light,
+    sample_light_index,
+)
+from octasplat.engine.pathtracing.kernels.path_surfaces import (
+    CAMERA_SAMPLE_PAIRS,
+    PATH_ENDED,
+    add_radiance,
+    eval_background,
+)
+from octasplat.engine.pathtracing.kernels.sampler import uniform_pair
+from octasplat.engine.pathtracing.kernels.scatter import (
+    FLAG_LOSSLESS,
+    LAYER_LIGHT_SAMPLE,
+    LIGHT_CHOICE_SAMPLE,
+    SHADOW_RAY_SCALE,
+)
+from octasplat.engine.pathtracing.kernels.surface import normalize
+from octasplat.engine.trace.kernels.native import njit_no_refcount
+
+MIN_COVERAGE = 1e-6
+SINGLE_SURFACE_TOLERANCE = 0.05
+SHADOWED, RELIT, AMBIENT = 0, 1, 2
+"""Features of Gaussians: share that shadows take, share that is relit, and that times its ambient part."""
+
+
+@njit_no_refcount(forceinline=True)
+def encode_srgb(linear):
+    """The display value of a linear one (IEC 61966-2-1), also beyond 1."""
+    if linear <= 0.0031308:
+        return 12.92 * max(linear, 0.0)
+    return 1.055 * linear ** (1.0 / 2.4) - 0.055
+
+
+@njit_no_refcount(forceinline=True)
+def decode_srgb(display):
+    """The linear value of a display value, also beyond 1."""
+    if display <= 0.04045:
+        return max(display, 0.0) / 12.92
+    return ((display + 0.055) / 1.055) ** 2.4
+
+
+@kernel(_nrt=False, error_model="numpy")
+def intersect_gaussian_layers(
+    first, last, scratch, paths, active, depth, distances, faces,
+    rgb, transmittance, depth_median, depth_sum, normals, features,
+    lights, environment, integrator, absorption, min_transmittance, shadows,
+):  # fmt: skip
+    """Put the layers of Gaussians in front of the surfaces ``faces`` onto the paths ``active``.
+
+    ``shadows`` gets what the layers ask of lights. A ray of which less than ``min_transmittance`` is left ends: its
+    face becomes :data:`ENDED`.
+    """
+    for k in range(first, last):
+        p = active[k]
+        for channel in range(3):
+            shadows.radiance_linear[k, channel] = shadows.occluded_radiance_linear[k, channel] = 0.0
+        left = float(transmittance[k])
+        share = 1.0 - left
+        if share <= MIN_COVERAGE:
+            continue
+        d, o = paths.directions_world[p], paths.origins_world[p]
+        clear = paths.flags[p] & FLAG_LOSSLESS != 0
+        shadowed, relit = features[k, SHADOWED] / share, features[k, RELIT] / share
+        base = 1.0 - relit + features[k, AMBIENT] / share
+        # The mean distance is smoother than the median, but lies in the air where the layer is two surfaces.
+        distance = depth_sum[k] / share
+        if (
+            abs(distance - depth_median[k]) > SINGLE_SURFACE_TOLERANCE * depth_median[k]
+            and depth_median[k] > 0.0
+        ):
+            distance = depth_median[k]
+        b_r, b_g, b_b = eval_background(lights, environment, integrator, paths.flags[p], d[0], d[1], d[2])
+        # --- what one unit of the layer's light counts, and how its colour is lit ---
+        if clear:
+            g_r = g_g = g_b = paths.transmittance[p] * share
+        else:
+            w = paths.throughput[p]
+            g_r = w[0] * share * decode_srgb(rgb[k, 0] / share)
+            g_g = w[1] * share * decode_srgb(rgb[k, 1] / share)
+            g_b = w[2] * share * decode_srgb(rgb[k, 2] / share)
+            if paths.medium_ids[p] >= 0:
+                medium = absorption[paths.medium_ids[p]]
+                g_r *= math.exp(-medium[0] * distance)
+                g_g *= math.exp(-medium[1] * distance)
+                g_b *= math.exp(-medium[2] * distance)
+        lit_by_stage = shadowed > MIN_COVERAGE or relit > MIN_COVERAGE
+        if lit_by_stage and len(lights.kinds):
+            x, y, z = o[0] + distance * d[0], o[1] + distance * d[1], o[2] + distance * d[2]
+            first_pair = CAMERA_SAMPLE_PAIRS + depth * SAMPLE_PAIRS_PER_BOUNCE
+            _, pick = uniform_pair(paths.keys[p], paths.samples[p], first_pair + LIGHT_CHOICE_SAMPLE)
+            l, chance = sample_light_index(lights, x, y, z, pick)
+            if l >= 0:
+                u, v = uniform_pair(paths.keys[p], paths.samples[p], first_pair + LAYER_LIGHT_SAMPLE)
+                w_x, w_y, w_z, reach, l_r, l_g, l_b, pdf = sample_light(lights, l, x, y, z, u, v)
+                n_x, n_y, n_z = normalize(normals[k, 0], normals[k, 1], normals[k, 2])
+                cosine = max(n_x * w_x + n_y * w_y + n_z * w_z, 0.0)
+                taking = relit + (shadowed if lights.adds_light[l] else 0.0)
+                factor = taking * cosine / (math.pi * chance * (pdf if pdf > 0.0 else 1.0))
+                shadows.radiance_linear[k, 0] = g_r * l_r * factor
+                shadows.radiance_linear[k, 1] = g_g * l_g * factor
+                shadows.radiance_linear[k, 2] = g_b * l_b * factor
+                if shadowed > MIN_COVERAGE and not lights.adds_light[l]:
+                    # Only among the lights that take something is the shadow a mean.
+                    losing = shadowed / max(1.0 - additive_light_probability(lights, x, y, z), 1e-6)
+                    shadows.occluded_radiance_linear[k, 0] = -g_r * losing
+                    shadows.occluded_radiance_linear[k, 1] = -g_g * losing
+                    shadows.occluded_radiance_linear[k, 2] = -g_b * losing
+                shadows.origins_world[k, 0], shadows.origins_world[k, 1], shadows.origins_world[k, 2] = (
+                    x,
+                    y,
+                    z,
+                )
+                shadows.directions_world[k, 0] = w_x
+                shadows.directions_world[k, 1] = w_y
+                shadows.directions_world[k, 2] = w_z
+                shadows.passes_glass[k] = True
+                shadows.t_max[k] = reach * SHADOW_RAY_SCALE if reach < INFINITE_DISTANCE else math.inf
+        if clear:
+            for channel in range(3):
+                paths.layer_srgb[p, channel] += paths.transmittance[p] * rgb[k, channel]
+            paths.shading_factor[p, 0] += g_r * base
+            paths.shading_factor[p, 1] += g_g * base
+            paths.shading_factor[p, 2] += g_b * base
+            paths.transmittance[p] *= left
+            if paths.transmittance[p] < min_transmittance:
+                paths.radiance_linear[p, 0] = b_r
+                paths.radiance_linear[p, 1] = b_g
+                paths.radiance_linear[p, 2] = b_b
+                paths.is_alive[p], faces[k] = False, PATH_ENDED
+            continue
+        known = faces[k] < 0 and paths.pdf[p] == 0.0 and not lit_by_stage and paths.medium_ids[p] < 0
+        if known:
+            w = paths.throughput[p]
+            add_radiance(
+                paths, p,
+                w[0] * (decode_srgb(rgb[k, 0] + left * encode_srgb(b_r)) - left * b_r),
+                w[1] * (decode_srgb(rgb[k, 1] + left * encode_srgb(b_g)) - left * b_g),
+                w[2] * (decode_srgb(rgb[k, 2] + left * encode_srgb(b_b)) - left * b_b),
+                integrator.clamp,
+            )  # fmt: skip
+        else:
+            add_radiance(paths, p, g_r * base, g_g * base, g_b * base, integrator.clamp)
+        for channel in range(3):
+            paths.throughput[p, channel] *= left
+        if left < min_transmittance:
+            paths.is_alive[p], faces[k] = False, PATH_ENDED
+
+
+@kernel(_nrt=False, error_model="numpy")
+def add_layer_light(
+    first,
+    last,
+    scratch,
+    paths,
+    active,
+    radiance,
+    occluded_radiance,
+    mesh_transmittance,
+    caster_transmittance,
+    other_transmittance,
+):
+    """Add what shadow rays of layers brought.
+
+    ``mesh_transmittance`` is the share in each channel that meshes let through, ``caster_transmittance`` and ``other_transmittance``
+    are transmittances of the Gaussians that cast shadows on Gaussians and of those that do not.
+    """
+    for k in range(first, last):
+        p = active[k]
+        for channel in range(3):
+            reached = mesh_transmittance[k, channel] * caster_transmittance[k]
+            taken = other_transmittance[k] * (1.0 - reached)
+            amount = radiance[k, channel] * reached + occluded_radiance[k, channel] * taken
+            if paths.flags[p] & FLAG_LOSSLESS:
+                paths.shading_factor[p, channel] += amount
+            else:
+                paths.radiance_linear[p, channel] += amount

@@ -1,0 +1,147 @@
+"""Gaussians with materials on a ray: a surface that scatters light as a mesh of that material would.
+
+What a ray sees of them is one surface, where half of its light is gone: their mean albedo, metallic,
+roughness and normal, weighted as the tracer composites. A path meets it with the probability of its coverage,
+and else goes on to what is behind; so no light is counted twice, and rays of all kinds see the same.
+"""
+
+import math
+
+from octasplat.engine.compilation import kernel
+from octasplat.engine.pathtracing.kernels.gaussian_layer import MIN_COVERAGE
+from octasplat.engine.pathtracing.kernels.path_surfaces import PATH_ENDED
+from octasplat.engine.pathtracing.kernels.principled_bsdf import BURLEY
+from octasplat.engine.pathtracing.kernels.sampler import pixel_key, uniform_pair
+from octasplat.engine.pathtracing.kernels.scatter import (
+    DIRECTION_SAMPLE,
+    FLAG_CAMERA_RAY,
+    FLAG_GAUSSIAN_SURFACE,
+    LIGHT_CHOICE_SAMPLE,
+    LIGHT_POSITION_SAMPLE,
+    LOBE_SAMPLE,
+    scatter_path,
+)
+from octasplat.engine.pathtracing.kernels.surface import normalize
+from octasplat.engine.trace.kernels.native import njit_no_refcount
+
+MATERIAL, ALBEDO, METALLIC, ROUGHNESS, RAY_OFFSET = 3, 4, 7, 8, 9
+"""Features of Gaussians behind those of :mod:`octasplat.engine.pathtracing.kernels.gaussian_layer`.
+
+Whether they have a material, this, and how far off their surface rays begin, world units.
+"""
+FEATURE_COUNT = 10
+IOR = 1.5
+"""Of what is no metal: it reflects 0.04 head-on."""
+FIRST_PAIR, PAIRS_PER_BOUNCE = 1 << 12, 5
+"""Pairs of numbers of these surfaces, apart from those of meshes."""
+
+
+@njit_no_refcount(forceinline=True)
+def _draw_samples(paths, p, pair, random_numbers):
+    """The numbers of :func:`scatter`, into the first column."""
+    key, sample = paths.keys[p], paths.samples[p]
+    for place in (LOBE_SAMPLE, DIRECTION_SAMPLE, LIGHT_CHOICE_SAMPLE, LIGHT_POSITION_SAMPLE):
+        random_numbers[place, 0, 0], random_numbers[place, 1, 0] = uniform_pair(key, sample, pair + place)
+
+
+@kernel(_nrt=False, error_model="numpy")
+def intersect_gaussian_surfaces(
+    first, last, scratch, paths, active, depth, faces, rgb, transmittance, depth_median, depth_sum, normals,
+    features, materials, lights, integrator, min_transmittance, shadows,
+):  # fmt: skip
+    """Let paths meet the Gaussians with materials on their rays, or take these away from what was seen.
+
+    A path that meets them goes on from there: its face becomes :data:`ENDED`, and nothing of the layer is
+    left. ``shadows`` gets what it asks of lights.
+    """
+    numbers = scratch.random_numbers
+    for k in range(first, last):
+        p = active[k]
+        shadows.radiance_linear[k, 0] = shadows.radiance_linear[k, 1] = shadows.radiance_linear[k, 2] = 0.0
+        left = float(transmittance[k])
+        share = 1.0 - left
+        chance = float(features[k, MATERIAL])
+        if chance <= MIN_COVERAGE:
+            continue
+        if left < min_transmittance:  # the tracer stopped looking here
+            chance /= share
+        pair = FIRST_PAIR + depth * PAIRS_PER_BOUNCE
+        choice, roulette = uniform_pair(paths.keys[p], paths.samples[p], pair)
+        if choice >= chance:
+            # --- past them: what is left is seen as if they were not there ---
+            rest = 1.0 / max(1.0 - chance, MIN_COVERAGE)
+            transmittance[k] = min(left * rest, 1.0)
+            for channel in range(3):
+                rgb[k, channel] *= rest
+                features[k, channel] *= rest
+            depth_sum[k] *= rest
+            continue
+        # Not the mean: the little that shines through to a far side would pull it below the surface.
+        distance = depth_median[k] if depth_median[k] > 0.0 else depth_sum[k] / share
+        transmittance[k] = 1.0
+        faces[k] = PATH_ENDED
+        if depth >= integrator.max_depth:
+            paths.is_alive[p] = False
+            continue
+        if paths.medium_ids[p] >= 0:
+            medium = materials.absorption[paths.medium_ids[p]]
+            for channel in range(3):
+                paths.throughput[p, channel] *= math.exp(-medium[channel] * distance)
+        if depth >= integrator.roulette_depth:
+            w = paths.throughput[p]
+            stay = min(max(w[0], w[1], w[2]), 0.95)
+            if roulette >= stay:
+                paths.is_alive[p] = False
+                continue
+            for channel in range(3):
+                paths.throughput[p, channel] /= stay
+        if paths.flags[p] & FLAG_CAMERA_RAY:
+            paths.flags[p] |= FLAG_GAUSSIAN_SURFACE
+        _draw_samples(paths, p, pair + 1, numbers)
+        o, d = paths.origins_world[p], paths.directions_world[p]
+        n_x, n_y, n_z = normalize(normals[k, 0], normals[k, 1], normals[k, 2])
+        part = 1.0 / float(features[k, MATERIAL])
+        lift = features[k, RAY_OFFSET] * part
+        scatter_path(
+            k, p, 0, numbers, paths, False,
+            o[0] + distance * d[0] + lift * n_x, o[1] + distance * d[1] + lift * n_y,
+            o[2] + distance * d[2] + lift * n_z, n_x, n_y, n_z, n_x, n_y, n_z,
+            min(features[k, ALBEDO] * part, 1.0), min(features[k, ALBEDO + 1] * part, 1.0),
+            min(features[k, ALBEDO + 2] * part, 1.0), min(features[k, METALLIC] * part, 1.0),
+            min(features[k, ROUGHNESS] * part, 1.0), IOR, BURLEY, False,
+            materials.ggx_albedo, materials.coat_albedo[0], materials.coat_mean_albedo[0], lights, integrator, shadows,
+        )  # fmt: skip
+
+
+@kernel(_nrt=False, error_model="numpy")
+def start_paths_at_surfaces(
+    first, last, scratch, interactions, pixels, samples, integrator, materials, lights, paths, shadows
+):
+    """Paths that begin at points of surfaces, as if the camera's rays had met them there."""
+    numbers = scratch.random_numbers
+    for k in range(first, last):
+        paths.keys[k], paths.samples[k] = pixel_key(integrator.seed, pixels[k]), samples[k]
+        for channel in range(3):
+            paths.directions_world[k, channel] = interactions.directions_world[k, channel]
+            paths.throughput[k, channel] = 1.0
+            paths.radiance_linear[k, channel] = 0.0
+            paths.layer_srgb[k, channel] = 0.0
+            paths.shading_factor[k, channel] = 0.0
+            paths.albedo_linear[k, channel], paths.normals_world[k, channel] = 0.0, 0.0
+            shadows.radiance_linear[k, channel] = 0.0
+        paths.transmittance[k], paths.coverage[k], paths.mesh_visibility[k] = 1.0, 1.0, 0.0
+        paths.pdf[k], paths.t_view_origin[k], paths.medium_ids[k] = 0.0, 0.0, -1
+        paths.flags[k], paths.is_alive[k] = FLAG_GAUSSIAN_SURFACE, True
+        _draw_samples(paths, k, FIRST_PAIR + 1, numbers)
+        point, n, material = (
+            interactions.points_world[k],
+            interactions.normals_world[k],
+            interactions.materials[k],
+        )
+        n_x, n_y, n_z = float(n[0]), float(n[1]), float(n[2])
+        scatter_path(
+            k, k, 0, numbers, paths, False, float(point[0]), float(point[1]), float(point[2]),
+            n_x, n_y, n_z, n_x, n_y, n_z, float(material[0]), float(material[1]), float(material[2]),
+            float(material[3]), float(material[4]), IOR, BURLEY, False,
+            materials.ggx_albedo, materials.coat_albedo[0], materials.coat_mean_albedo[0], lights, integrator, shadows,
+        )  # fmt: skip

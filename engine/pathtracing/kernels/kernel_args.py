@@ -1,0 +1,275 @@
+"""What the path tracer's kernels read and write, as named tuples of arrays."""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float32, Float64, Int32, Int64, UInt32
+
+from octasplat.engine.trace.kernels.triangles import EmbreeQuery
+from octasplat.engine.trace.triangle_bvh import allocate_embree_scratch
+
+BLOCK_SIZE = 1024
+"""Rows that a thread works on at a time: few enough for the nearest cache."""
+SAMPLE_PAIRS_PER_BOUNCE = 5
+"""Pairs of uniform numbers that a path uses at each surface."""
+
+
+class SurfaceArrays(NamedTuple):
+    """All triangles of a stage.
+
+    Attributes:
+        corners_world: of each face.
+        corner_normals: shading normals at the corners, unit vectors.
+        corner_uv: texture coordinates at the corners, (0, 0) at the upper left.
+        material_ids: row of each face in :class:`MaterialArrays`.
+        corner_rgb_linear: colours of the corners; no rows at all where no mesh has any.
+    """
+
+    corners_world: Float32[np.ndarray, "f 3 3"]
+    corner_normals: Float32[np.ndarray, "f 3 3"]
+    corner_uv: Float32[np.ndarray, "f 3 2"]
+    material_ids: Int32[np.ndarray, " f"]
+    corner_rgb_linear: Float32[np.ndarray, "g 3 3"]
+
+
+class MaterialArrays(NamedTuple):
+    """``m`` materials.
+
+    Attributes:
+        kinds: which of the kinds of :mod:`octasplat.engine.pathtracing.kernels.surface`.
+        colours_linear: base colour, reflectance or tint.
+        metallic: share of the metal.
+        roughness: perceptual.
+        iors: index of refraction.
+        absorption: per world unit.
+        substrates: how the ground shares light with the coat.
+        energy_compensation: whether light that facets throw at each other is kept.
+        coat_tables: which of the tables the coat has; of rough glass that of entering, leaving has the next.
+        colour_textures: number of a texture, -1 for none.
+        metallic_roughness_textures: likewise.
+        normal_textures: likewise.
+        normal_scales: factor of their slopes.
+        uses_vertex_color: whether the corners' colours count.
+        light_ids: number of the light that a shining surface is, -1 for none.
+        ggx_albedo: table of facets that reflect everything.
+        coat_albedo: tables of dielectrics' surfaces.
+        coat_mean_albedo: their means.
+        texels_linear: all textures' values, one texture after another.
+        texture_sizes: first texel, height and width of each.
+    """
+
+    kinds: Int32[np.ndarray, " m"]
+    colours_linear: Float64[np.ndarray, "m 3"]
+    metallic: Float64[np.ndarray, " m"]
+    roughness: Float64[np.ndarray, " m"]
+    iors: Float64[np.ndarray, " m"]
+    absorption: Float64[np.ndarray, "m 3"]
+    substrates: Int32[np.ndarray, " m"]
+    energy_compensation: Int32[np.ndarray, " m"]
+    coat_tables: Int32[np.ndarray, " m"]
+    colour_textures: Int32[np.ndarray, " m"]
+    metallic_roughness_textures: Int32[np.ndarray, " m"]
+    normal_textures: Int32[np.ndarray, " m"]
+    normal_scales: Float64[np.ndarray, " m"]
+    uses_vertex_color: Int32[np.ndarray, " m"]
+    light_ids: Int32[np.ndarray, " m"]
+    ggx_albedo: Float64[np.ndarray, "a c"]
+    coat_albedo: Float64[np.ndarray, "t a c"]
+    coat_mean_albedo: Float64[np.ndarray, "t a 2"]
+    texels_linear: Float32[np.ndarray, "x 3"]
+    texture_sizes: Int64[np.ndarray, "k 3"]
+
+
+class PathArrays(NamedTuple):
+    """``p`` paths from the camera: what they have gathered, and where they go on.
+
+    Attributes:
+        keys: what a pixel's numbers begin from.
+        samples: number of the path in its pixel.
+        origins_world: where the next ray begins.
+        directions_world: where it goes, unit vectors.
+        throughput: what light that it brings still counts, per channel.
+        radiance_linear: light of the surfaces and surroundings behind the first layer.
+        layer_srgb: display colours of the Gaussians of the first layer, premultiplied.
+        transmittance: what the first layer lets through.
+        shading_factor: sum over the first layer of coverage times the factor that the stage's lights give to it.
+        coverage: 1 less what is seen of the background behind everything.
+        mesh_visibility: what the Gaussians let through of the first mesh that the camera's ray meets; 0 without one.
+        albedo_linear: colour of that mesh, white where it mirrors or lets through, times the same share.
+        normals_world: its shading normal times the same share.
+        pdf: of the last direction over solid angle; 0 for the camera, mirrors and glass.
+        t_view_origin: where on the next ray its viewer stands, see :class:`octasplat.engine.rays.RayBatch`.
+        medium_ids: material that the path is in, -1 for air.
+        flags: bits of :mod:`octasplat.engine.pathtracing.kernels.path_surfaces`.
+        is_alive: whether the path goes on.
+    """
+
+    keys: UInt32[np.ndarray, " p"]
+    samples: Int32[np.ndarray, " p"]
+    origins_world: Float32[np.ndarray, "p 3"]
+    directions_world: Float32[np.ndarray, "p 3"]
+    throughput: Float32[np.ndarray, "p 3"]
+    radiance_linear: Float32[np.ndarray, "p 3"]
+    layer_srgb: Float32[np.ndarray, "p 3"]
+    transmittance: Float32[np.ndarray, " p"]
+    shading_factor: Float32[np.ndarray, "p 3"]
+    coverage: Float32[np.ndarray, " p"]
+    mesh_visibility: Float32[np.ndarray, " p"]
+    albedo_linear: Float32[np.ndarray, "p 3"]
+    normals_world: Float32[np.ndarray, "p 3"]
+    pdf: Float32[np.ndarray, " p"]
+    t_view_origin: Float32[np.ndarray, " p"]
+    medium_ids: Int32[np.ndarray, " p"]
+    flags: Int32[np.ndarray, " p"]
+    is_alive: Bool[np.ndarray, " p"]
+
+
+class ShadowRayArrays(NamedTuple):
+    """Rays from ``n`` lit points to lights, and what they bring where nothing is in the way.
+
+    Attributes:
+        origins_world: the points.
+        directions_world: unit vectors to the lights.
+        t_max: up to where something may be in the way.
+        radiance_linear: what is added where the way is free, times the transmittance of what is in it.
+        occluded_radiance_linear: what is added (it is negative) where a mesh is in the way of light that would have come.
+        passes_glass: whether glass in the way lets light straight through, as no path could find it otherwise.
+    """
+
+    origins_world: Float32[np.ndarray, "n 3"]
+    directions_world: Float32[np.ndarray, "n 3"]
+    t_max: Float32[np.ndarray, " n"]
+    radiance_linear: Float32[np.ndarray, "n 3"]
+    occluded_radiance_linear: Float32[np.ndarray, "n 3"]
+    passes_glass: Bool[np.ndarray, " n"]
+
+
+class SurfaceInteractions(NamedTuple):
+    """``n`` points of surfaces, each seen along a ray.
+
+    Attributes:
+        points_world: from where rays go on, a little off the surface.
+        normals_world: unit normals on the viewer's side.
+        directions_world: unit vectors from the viewer.
+        materials: linear albedo, metallic and perceptual roughness.
+    """
+
+    points_world: Float32[np.ndarray, "n 3"]
+    normals_world: Float32[np.ndarray, "n 3"]
+    directions_world: Float32[np.ndarray, "n 3"]
+    materials: Float32[np.ndarray, "n 5"]
+
+
+class MeshQueries(NamedTuple):
+    """What kernels ask Embree about the meshes of a stage.
+
+    Attributes:
+        closest_hit: the nearest of all triangles.
+        any_hit: whether there is any triangle.
+        any_hit_opaque: whether there is any that is not glass.
+        closest_hit_glass: the nearest of glass; its scene is 0 where there is no glass.
+        glass_faces: rows in the surfaces of the faces of glass.
+    """
+
+    closest_hit: EmbreeQuery
+    any_hit: EmbreeQuery
+    any_hit_opaque: EmbreeQuery
+    closest_hit_glass: EmbreeQuery
+    glass_faces: Int64[np.ndarray, " g"]
+
+
+class PathScratch(NamedTuple):
+    """What one thread's kernels work in, ``b`` rows at a time.
+
+    Attributes:
+        embree: see :func:`octasplat.engine.trace.triangle_bvh.allocate_embree_scratch`.
+        keys: of paths.
+        samples: of paths.
+        random_numbers: pairs of uniform numbers.
+        rows: those of a block that something is done for.
+        t_starts: where their rays begin.
+        is_occluded: whether something is in their way.
+        distances: of what they met.
+        faces: likewise.
+        barycentrics: likewise.
+    """
+
+    embree: Float32[np.ndarray, " w"]
+    keys: UInt32[np.ndarray, " b"]
+    samples: Int32[np.ndarray, " b"]
+    random_numbers: Float64[np.ndarray, "d 2 b"]
+    rows: Int32[np.ndarray, " b"]
+    t_starts: Float32[np.ndarray, " b"]
+    is_occluded: Bool[np.ndarray, " b"]
+    distances: Float32[np.ndarray, " b"]
+    faces: Int32[np.ndarray, " b"]
+    barycentrics: Float32[np.ndarray, "b 2"]
+
+
+class CameraRays(NamedTuple):
+    """A camera's rays.
+
+    Attributes:
+        origin_world: where they begin.
+        directions_world: unit vectors through the centres of the pixels.
+        axis: the camera's axis.
+        aperture: diameter of the lens.
+        focus_distance: along the axis.
+    """
+
+    origin_world: Float64[np.ndarray, "3"]
+    directions_world: Float32[np.ndarray, "h w 3"]
+    axis: Float64[np.ndarray, "3"]
+    aperture: float
+    focus_distance: float
+
+
+class IntegratorParameters(NamedTuple):
+    """The numbers of an integrator that the kernels read.
+
+    See :class:`octasplat.engine.pathtracing.stage.model.Integrator`.
+    """
+
+    seed: int
+    max_depth: int
+    roulette_depth: int
+    clamp: float
+    anti_aliasing: bool
+    environment_visible: bool
+    background_linear: Float64[np.ndarray, "3"]
+
+
+def allocate_paths(count: int) -> PathArrays:
+    """Paths of which nothing is known."""
+
+    def vectors() -> Float32[np.ndarray, "p 3"]:
+        return np.empty((count, 3), np.float32)
+
+    return PathArrays(
+        np.empty(count, np.uint32), np.empty(count, np.int32),
+        vectors(), vectors(), vectors(), vectors(), vectors(),
+        np.empty(count, np.float32), vectors(), np.empty(count, np.float32), np.empty(count, np.float32),
+        vectors(), vectors(), np.empty(count, np.float32), np.empty(count, np.float32),
+        np.empty(count, np.int32), np.empty(count, np.int32), np.empty(count, np.bool_),
+    )  # fmt: skip
+
+
+def allocate_shadow_rays(count: int) -> ShadowRayArrays:
+    """Shadow rays that bring nothing."""
+    return ShadowRayArrays(
+        np.zeros((count, 3), np.float32), np.zeros((count, 3), np.float32), np.zeros(count, np.float32),
+        np.zeros((count, 3), np.float32), np.zeros((count, 3), np.float32), np.zeros(count, np.bool_),
+    )  # fmt: skip
+
+
+def allocate_path_scratch(threads: int) -> list[PathScratch]:
+    """Memory for the kernels of so many threads."""
+    return [
+        PathScratch(
+            allocate_embree_scratch(1)[0], np.empty(BLOCK_SIZE, np.uint32), np.empty(BLOCK_SIZE, np.int32),
+            np.empty((SAMPLE_PAIRS_PER_BOUNCE - 1, 2, BLOCK_SIZE)), np.empty(BLOCK_SIZE, np.int32),
+            np.empty(BLOCK_SIZE, np.float32), np.empty(BLOCK_SIZE, np.bool_),
+            np.empty(BLOCK_SIZE, np.float32), np.empty(BLOCK_SIZE, np.int32), np.empty((BLOCK_SIZE, 2), np.float32),
+        )
+        for _ in range(threads)
+    ]  # fmt: skip

@@ -1,0 +1,371 @@
+"""Compiled functions of lights: which one to ask, a way to it, and how likely that way was.
+
+``lights`` is :class:`octasplat.engine.pathtracing.lights.LightArrays`; p is the point that is lit. Weights of
+lights at a point are what they would bring to a surface that faces them, so that the nearest and strongest is
+asked most.
+"""
+
+import math
+
+from octasplat.engine.compilation import kernel
+from octasplat.engine.pathtracing.kernels.principled_bsdf import orthonormal_basis
+from octasplat.engine.pathtracing.kernels.texture import eval_texture
+from octasplat.engine.trace.kernels.native import njit_no_refcount
+
+POINT, SPOT, DIRECTIONAL, RECTANGLE, ENVIRONMENT, SPHERE, MESH = 0, 1, 2, 3, 4, 5, 6
+INFINITE_DISTANCE = 1e30
+
+
+@njit_no_refcount(forceinline=True)
+def luminance(red, green, blue):
+    """Of linear Rec. 709 values."""
+    return 0.2126 * red + 0.7152 * green + 0.0722 * blue
+
+
+@njit_no_refcount(forceinline=True)
+def _spot_falloff(lights, l, way_x, way_y, way_z):
+    """How much of a spot's intensity goes a way (a unit vector from the light)."""
+    axis = lights.axes[l]
+    cosine = axis[0] * way_x + axis[1] * way_y + axis[2] * way_z
+    outer, inner = lights.cosines[l, 0], lights.cosines[l, 1]
+    share = min(max((cosine - outer) / (inner - outer), 0.0), 1.0)
+    return share * share
+
+
+@njit_no_refcount(forceinline=True)
+def light_importance(lights, l, p_x, p_y, p_z):
+    """About the irradiance that a light gives to a surface at p that faces it; 0 only where it gives none."""
+    power = luminance(lights.rgb_linear[l, 0], lights.rgb_linear[l, 1], lights.rgb_linear[l, 2])
+    kind = lights.kinds[l]
+    if kind in (DIRECTIONAL, ENVIRONMENT):
+        return power
+    way_x = p_x - lights.positions_world[l, 0]
+    way_y = p_y - lights.positions_world[l, 1]
+    way_z = p_z - lights.positions_world[l, 2]
+    squared = max(way_x * way_x + way_y * way_y + way_z * way_z, 1e-20)
+    if kind == RECTANGLE:
+        axis = lights.axes[l]
+        if axis[0] * way_x + axis[1] * way_y + axis[2] * way_z <= 0.0:
+            return 0.0
+        return power * lights.areas[l] / (squared + lights.areas[l] / math.pi)
+    if kind == SPHERE:
+        return power * lights.areas[l] / squared
+    if kind == MESH:
+        return 0.25 * power * lights.areas[l] / (squared + lights.areas[l] / math.pi)
+    if kind == SPOT:
+        distance = math.sqrt(squared)
+        power *= _spot_falloff(lights, l, way_x / distance, way_y / distance, way_z / distance)
+    return power / squared
+
+
+@njit_no_refcount(forceinline=True)
+def sample_light_index(lights, p_x, p_y, p_z, u):
+    """A light and the probability with which it is asked at p; -1 where none shines."""
+    count = len(lights.kinds)
+    if count == 1:
+        return (0, 1.0) if light_importance(lights, 0, p_x, p_y, p_z) > 0.0 else (-1, 0.0)
+    total = 0.0
+    for l in range(count):
+        total += light_importance(lights, l, p_x, p_y, p_z)
+    if not total > 0.0:
+        return -1, 0.0
+    left, found, share = u * total, -1, 0.0
+    for l in range(count):
+        weight = light_importance(lights, l, p_x, p_y, p_z)
+        if weight > 0.0:
+            found, share = l, weight / total  # the last one that shines, should rounding leave a rest
+            left -= weight
+            if left < 0.0:
+                break
+    return found, share
+
+
+@njit_no_refcount(forceinline=True)
+def light_probability(lights, light_id, p_x, p_y, p_z):
+    """The probability with which :func:`sample_light_index` asks the light ``light_id`` at p."""
+    total, own = 0.0, 0.0
+    for l in range(len(lights.kinds)):
+        weight = light_importance(lights, l, p_x, p_y, p_z)
+        total += weight
+        if l == light_id:
+            own = weight
+    return own / total if total > 0.0 else 0.0
+
+
+@njit_no_refcount()
+def additive_light_probability(lights, p_x, p_y, p_z):
+    """The probability with which :func:`sample_light_index` asks at p one of the lights that add theirs."""
+    if not lights.any_adds_light:
+        return 0.0
+    total, adding = 0.0, 0.0
+    for l in range(len(lights.kinds)):
+        weight = light_importance(lights, l, p_x, p_y, p_z)
+        total += weight
+        if lights.adds_light[l]:
+            adding += weight
+    return adding / total if total > 0.0 else 0.0
+
+
+@njit_no_refcount()
+def eval_emission(lights, l, u, v):
+    """Linear radiance of a shining surface at texture coordinates."""
+    rgb = lights.rgb_linear[l]
+    if lights.textures[l] < 0:
+        return rgb[0], rgb[1], rgb[2]
+    red, green, blue = eval_texture(lights, lights.textures[l], u, v)
+    return rgb[0] * red, rgb[1] * green, rgb[2] * blue
+
+
+@njit_no_refcount()
+def emitter_hit_pdf(lights, l, o, distance, cosine):
+    """Density over solid angle with which :func:`sample_light` gives from o the place that a ray met.
+
+    ``distance`` is that of the place and ``cosine`` the cosine there.
+    """
+    if lights.kinds[l] == SPHERE:
+        x, y, z = (
+            lights.positions_world[l, 0] - o[0],
+            lights.positions_world[l, 1] - o[1],
+            lights.positions_world[l, 2] - o[2],
+        )
+        return 1.0 / (
+            2.0 * math.pi * _one_minus_cosine(lights.areas[l] / math.pi / max(x * x + y * y + z * z, 1e-20))
+        )
+    return distance * distance / (max(cosine, 1e-9) * lights.areas[l])
+
+
+@njit_no_refcount()
+def _one_minus_cosine(squared_sine):
+    """1 less the cosine of an angle below 90 degrees, without losing digits where it is small."""
+    squared_sine = min(squared_sine, 1.0)
+    return max(squared_sine / (1.0 + math.sqrt(1.0 - squared_sine)), 1e-12)
+
+
+@njit_no_refcount()
+def _sample_sphere(lights, l, p_x, p_y, p_z, u, v):
+    """A way from p to a ball of light, evenly over the solid angle that it fills."""
+    way_x = lights.positions_world[l, 0] - p_x
+    way_y = lights.positions_world[l, 1] - p_y
+    way_z = lights.positions_world[l, 2] - p_z
+    squared, of_ball = way_x * way_x + way_y * way_y + way_z * way_z, lights.areas[l] / math.pi
+    if squared <= of_ball:
+        return 0.0, 0.0, 1.0, INFINITE_DISTANCE, 0.0, 0.0, 0.0, 1.0
+    distance = math.sqrt(squared)
+    way_x, way_y, way_z = way_x / distance, way_y / distance, way_z / distance
+    cap = _one_minus_cosine(of_ball / squared)
+    cosine = 1.0 - u * cap
+    sine = math.sqrt(max(1.0 - cosine * cosine, 0.0))
+    a_x, a_y, a_z, b_x, b_y, b_z = orthonormal_basis(way_x, way_y, way_z)
+    a, b = sine * math.cos(2.0 * math.pi * v), sine * math.sin(2.0 * math.pi * v)
+    reach = distance * cosine - math.sqrt(max(of_ball - squared * sine * sine, 0.0))
+    rgb = lights.rgb_linear[l]
+    return (
+        a * a_x + b * b_x + cosine * way_x,
+        a * a_y + b * b_y + cosine * way_y,
+        a * a_z + b * b_z + cosine * way_z,
+        reach,
+        rgb[0],
+        rgb[1],
+        rgb[2],
+        1.0 / (2.0 * math.pi * cap),
+    )
+
+
+@njit_no_refcount()
+def _sample_mesh(lights, l, p_x, p_y, p_z, u, v):
+    """A way from p to a shining mesh, evenly over its area."""
+    first, last = lights.mesh_rows[l, 0], lights.mesh_rows[l, 1]
+    row, u = _sample_cdf(lights.mesh_cdf[first : last + 1], u)
+    face = lights.mesh_rows[l, 2] + row
+    corners, uv = lights.mesh_corners_world[face], lights.mesh_uv[face]
+    root = math.sqrt(u)
+    a, b, c = 1.0 - root, root * (1.0 - v), root * v
+    way_x = a * corners[0, 0] + b * corners[1, 0] + c * corners[2, 0] - p_x
+    way_y = a * corners[0, 1] + b * corners[1, 1] + c * corners[2, 1] - p_y
+    way_z = a * corners[0, 2] + b * corners[1, 2] + c * corners[2, 2] - p_z
+    squared = max(way_x * way_x + way_y * way_y + way_z * way_z, 1e-20)
+    distance = math.sqrt(squared)
+    way_x, way_y, way_z = way_x / distance, way_y / distance, way_z / distance
+    s_x, s_y, s_z = (
+        corners[1, 0] - corners[0, 0],
+        corners[1, 1] - corners[0, 1],
+        corners[1, 2] - corners[0, 2],
+    )
+    t_x, t_y, t_z = (
+        corners[2, 0] - corners[0, 0],
+        corners[2, 1] - corners[0, 1],
+        corners[2, 2] - corners[0, 2],
+    )
+    n_x, n_y, n_z = s_y * t_z - s_z * t_y, s_z * t_x - s_x * t_z, s_x * t_y - s_y * t_x
+    length = max(math.sqrt(n_x * n_x + n_y * n_y + n_z * n_z), 1e-30)
+    cosine = abs(n_x * way_x + n_y * way_y + n_z * way_z) / length
+    if cosine <= 1e-9:
+        return way_x, way_y, way_z, distance, 0.0, 0.0, 0.0, 1.0
+    red, green, blue = eval_emission(
+        lights,
+        l,
+        a * uv[0, 0] + b * uv[1, 0] + c * uv[2, 0],
+        a * uv[0, 1] + b * uv[1, 1] + c * uv[2, 1],
+    )
+    return way_x, way_y, way_z, distance, red, green, blue, squared / (cosine * lights.areas[l])
+
+
+@njit_no_refcount(forceinline=True)
+def sample_light(lights, l, p_x, p_y, p_z, u, v):
+    """A way from p to a light: unit direction, distance, linear radiance, density over solid angle.
+
+    A density of 0 marks light that comes from one direction only: in place of radiance there is irradiance.
+    """
+    kind = lights.kinds[l]
+    rgb = lights.rgb_linear[l]
+    if kind == ENVIRONMENT:
+        d_x, d_y, d_z, pdf = sample_environment(lights, u, v)
+        red, green, blue = eval_environment(lights, d_x, d_y, d_z)
+        return d_x, d_y, d_z, INFINITE_DISTANCE, red, green, blue, pdf
+    if kind == SPHERE:
+        return _sample_sphere(lights, l, p_x, p_y, p_z, u, v)
+    if kind == MESH:
+        return _sample_mesh(lights, l, p_x, p_y, p_z, u, v)
+    axis = lights.axes[l]
+    if kind == DIRECTIONAL:
+        return -axis[0], -axis[1], -axis[2], INFINITE_DISTANCE, rgb[0], rgb[1], rgb[2], 0.0
+    way_x = lights.positions_world[l, 0] - p_x
+    way_y = lights.positions_world[l, 1] - p_y
+    way_z = lights.positions_world[l, 2] - p_z
+    if kind == RECTANGLE:
+        a, b = u - 0.5, v - 0.5
+        way_x += a * lights.sides_u[l, 0] + b * lights.sides_v[l, 0]
+        way_y += a * lights.sides_u[l, 1] + b * lights.sides_v[l, 1]
+        way_z += a * lights.sides_u[l, 2] + b * lights.sides_v[l, 2]
+    squared = max(way_x * way_x + way_y * way_y + way_z * way_z, 1e-20)
+    distance = math.sqrt(squared)
+    way_x, way_y, way_z = way_x / distance, way_y / distance, way_z / distance
+    if kind == RECTANGLE:
+        cosine = -(axis[0] * way_x + axis[1] * way_y + axis[2] * way_z)
+        if cosine <= 1e-9:
+            return way_x, way_y, way_z, distance, 0.0, 0.0, 0.0, 1.0
+        pdf = squared / (cosine * lights.areas[l])
+        return way_x, way_y, way_z, distance, rgb[0], rgb[1], rgb[2], pdf
+    falloff = 1.0 / squared
+    if kind == SPOT:
+        falloff *= _spot_falloff(lights, l, -way_x, -way_y, -way_z)
+    return way_x, way_y, way_z, distance, rgb[0] * falloff, rgb[1] * falloff, rgb[2] * falloff, 0.0
+
+
+@njit_no_refcount(forceinline=True)
+def _environment_uv(lights, d_x, d_y, d_z):
+    """Where a direction lies in the map, (u, v) from 0 to 1, and the sine of its angle to up."""
+    frame = lights.environment_frame
+    right = frame[0, 0] * d_x + frame[0, 1] * d_y + frame[0, 2] * d_z
+    up = frame[1, 0] * d_x + frame[1, 1] * d_y + frame[1, 2] * d_z
+    forward = frame[2, 0] * d_x + frame[2, 1] * d_y + frame[2, 2] * d_z
+    sine = math.sqrt(right * right + forward * forward)
+    return 0.5 + math.atan2(right, forward) / (2.0 * math.pi), math.atan2(sine, up) / math.pi, sine
+
+
+@njit_no_refcount(forceinline=True)
+def eval_environment(lights, d_x, d_y, d_z):
+    """Linear radiance from a direction: bilinear between the map's pixels, round at its sides."""
+    radiance = lights.environment_linear
+    height, width, _ = radiance.shape
+    u, v, _ = _environment_uv(lights, d_x, d_y, d_z)
+    x, y = u * width - 0.5, min(max(v * height - 0.5, 0.0), height - 1.0)
+    i, j = math.floor(x), min(int(y), max(height - 2, 0))
+    x, y = x - i, y - j
+    left, right = int(i) % width, (int(i) + 1) % width
+    low = min(j + 1, height - 1)
+    a, b, c, d = (1.0 - x) * (1.0 - y), x * (1.0 - y), (1.0 - x) * y, x * y
+    red = (
+        a * radiance[j, left, 0]
+        + b * radiance[j, right, 0]
+        + c * radiance[low, left, 0]
+        + d * radiance[low, right, 0]
+    )
+    green = (
+        a * radiance[j, left, 1]
+        + b * radiance[j, right, 1]
+        + c * radiance[low, left, 1]
+        + d * radiance[low, right, 1]
+    )
+    blue = (
+        a * radiance[j, left, 2]
+        + b * radiance[j, right, 2]
+        + c * radiance[low, left, 2]
+        + d * radiance[low, right, 2]
+    )
+    return red, green, blue
+
+
+@njit_no_refcount(forceinline=True)
+def environment_pdf(lights, d_x, d_y, d_z):
+    """Density over solid angle with which :func:`sample_environment` gives a direction."""
+    shares = lights.environment_probabilities
+    height, width = shares.shape
+    u, v, sine = _environment_uv(lights, d_x, d_y, d_z)
+    i, j = min(int(u * width), width - 1), min(int(v * height), height - 1)
+    return shares[j, i] * width * height / (2.0 * math.pi * math.pi * max(sine, 1e-9))
+
+
+@njit_no_refcount(forceinline=True)
+def _sample_cdf(cdf, u):
+    """The step of a cumulative sum from 0 to 1 in which u lies, and how far in."""
+    low, high = 0, len(cdf) - 1
+    while high - low > 1:
+        middle = (low + high) // 2
+        if cdf[middle] <= u:
+            low = middle
+        else:
+            high = middle
+    span = cdf[low + 1] - cdf[low]
+    return low, min(max((u - cdf[low]) / span, 0.0), 1.0 - 1e-9) if span > 0.0 else 0.5
+
+
+@njit_no_refcount(forceinline=True)
+def sample_environment(lights, u, v):
+    """A direction, likelier where the map is brighter, and its density over solid angle."""
+    height, width = lights.environment_probabilities.shape
+    j, down = _sample_cdf(lights.environment_row_cdf, v)
+    i, across = _sample_cdf(lights.environment_column_cdf[j], u)
+    polar = (j + down) / height * math.pi
+    around = ((i + across) / width - 0.5) * 2.0 * math.pi
+    sine = math.sin(polar)
+    right, up, forward = sine * math.sin(around), math.cos(polar), sine * math.cos(around)
+    frame = lights.environment_frame
+    d_x = right * frame[0, 0] + up * frame[1, 0] + forward * frame[2, 0]
+    d_y = right * frame[0, 1] + up * frame[1, 1] + forward * frame[2, 1]
+    d_z = right * frame[0, 2] + up * frame[1, 2] + forward * frame[2, 2]
+    pdf = (
+        lights.environment_probabilities[j, i] * width * height / (2.0 * math.pi * math.pi * max(sine, 1e-9))
+    )
+    return d_x, d_y, d_z, pdf
+
+
+@kernel(error_model="numpy")
+def eval_environment_array(lights, directions, radiance, pdf):
+    """Radiance and density of rows of directions."""
+    for n in range(len(directions)):
+        d = directions[n]
+        radiance[n, 0], radiance[n, 1], radiance[n, 2] = eval_environment(lights, d[0], d[1], d[2])
+        pdf[n] = environment_pdf(lights, d[0], d[1], d[2])
+
+
+@kernel(error_model="numpy")
+def light_samples(lights, points, numbers, directions, distances, radiance, density, lights_asked):
+    """:func:`sample_light_index` and :func:`sample_light` at rows of points with three uniform numbers each.
+
+    ``density`` and, of light that comes from one direction only, ``radiance`` hold the choice of the light.
+    """
+    for n in range(len(points)):
+        p = points[n]
+        l, share = sample_light_index(lights, p[0], p[1], p[2], numbers[n, 0])
+        lights_asked[n] = l
+        if l < 0:
+            radiance[n], density[n] = 0.0, 0.0
+            continue
+        d_x, d_y, d_z, distance, red, green, blue, pdf = sample_light(
+            lights, l, p[0], p[1], p[2], numbers[n, 1], numbers[n, 2]
+        )
+        directions[n, 0], directions[n, 1], directions[n, 2] = d_x, d_y, d_z
+        distances[n], density[n] = distance, pdf * share
+        factor = 1.0 if pdf > 0.0 else 1.0 / share
+        radiance[n, 0], radiance[n, 1], radiance[n, 2] = red * factor, green * factor, blue * factor

@@ -1,0 +1,137 @@
+"""Materials as compiled functions of directions: their values, their samples and the densities of these.
+
+Directions are in the frame of the shading normal (z), ``o`` towards the viewer and ``i`` towards the light,
+both of unit length. Values are linear and already hold the cosine to the light. Everything is a pure
+function of its arguments.
+
+Microfacets are those of :mod:`octasplat.engine.shading.kernels_microfacets`. Light that facets throw at each
+other: "Practical multiple scattering compensation for microfacet models" (Turquin 2019). The ground under a
+coat takes what the coat leaves, in both directions: "A Microfacet Based Coupled Specular-Matte BRDF Model"
+(Kelemen and Szirmay-Kalos 2001).
+"""
+
+import math
+
+from octasplat.engine.shading.kernels_microfacets import (
+    ggx_density,
+    ggx_masking,
+    sample_visible_normal,
+    schlick_weight,
+    table_value,
+)
+from octasplat.engine.trace.kernels.native import njit_no_refcount
+
+MIN_ALPHA = 1e-3
+COUPLED, BURLEY = 0, 1
+
+
+@njit_no_refcount(forceinline=True)
+def fresnel_dielectric(cos_o, eta):
+    """Share of unpolarised light that a smooth surface reflects, and the cosine of the refracted ray.
+
+    ``eta`` is the index of refraction on the other side over that on the side of ``cos_o`` >= 0. Where all
+    is reflected the share is 1 and the cosine 0.
+    """
+    sin2_t = (1.0 - cos_o * cos_o) / (eta * eta)
+    if sin2_t >= 1.0:
+        return 1.0, 0.0
+    cos_t = math.sqrt(1.0 - sin2_t)
+    parallel = (eta * cos_o - cos_t) / (eta * cos_o + cos_t)
+    across = (cos_o - eta * cos_t) / (cos_o + eta * cos_t)
+    return 0.5 * (parallel * parallel + across * across), cos_t
+
+
+@njit_no_refcount(forceinline=True)
+def sample_cosine(u, v):
+    """A direction over the hemisphere, as dense as its cosine; its density is cosine / pi."""
+    radius, angle = math.sqrt(u), 2.0 * math.pi * v
+    return radius * math.cos(angle), radius * math.sin(angle), math.sqrt(max(1.0 - u, 0.0))
+
+
+@njit_no_refcount(forceinline=True)
+def specular_probability(o_z, red, green, blue, metallic, roughness, coat_albedo):
+    """Probability with which a sample goes to the specular lobe rather than to the ground."""
+    if metallic >= 1.0:
+        return 1.0
+    sheen = table_value(coat_albedo, o_z, roughness)
+    ground = (1.0 - metallic) * (1.0 - sheen) * (red + green + blue) / 3.0
+    specular = (1.0 - metallic) * sheen + metallic * (red + green + blue) / 3.0
+    if ground <= 0.0:
+        return 1.0
+    return min(max(specular / (specular + ground), 0.1), 0.9)
+
+
+@njit_no_refcount(forceinline=True)
+def principled_eval(
+    o_x, o_y, o_z, i_x, i_y, i_z, red, green, blue, metallic, roughness, ior, substrate, energy_compensation,
+    ggx_albedo, coat_albedo, coat_mean_albedo,
+):  # fmt: skip
+    """Value times cosine (three channels) and density of the mixture of dielectric and metal.
+
+    ``ggx_albedo`` is the table of how much a colourless metal sends back in one bounce, ``coat_albedo`` that of the
+    dielectric's surface, ``coat_mean_albedo`` the cosine-weighted mean of ``coat_albedo`` over all directions.
+    """
+    if o_z <= 0.0 or i_z <= 0.0:
+        return 0.0, 0.0, 0.0, 0.0
+    alpha = max(roughness * roughness, MIN_ALPHA)
+    h_x, h_y, h_z = o_x + i_x, o_y + i_y, o_z + i_z
+    length = math.sqrt(h_x * h_x + h_y * h_y + h_z * h_z)
+    h_x, h_y, h_z = h_x / length, h_y / length, h_z / length
+    cos_d = o_x * h_x + o_y * h_y + o_z * h_z
+    masking_o, masking_i = ggx_masking(o_z, alpha), ggx_masking(i_z, alpha)
+    density = ggx_density(h_z, alpha) / (4.0 * o_z)  # with the cosine to the light divided out
+    specular = density * masking_o * masking_i
+    fresnel, _ = fresnel_dielectric(cos_d, ior)
+    weight = schlick_weight(cos_d)
+    loss = 0.0
+    if energy_compensation and metallic > 0.0:
+        loss = 1.0 / table_value(ggx_albedo, o_z, roughness) - 1.0
+    plain = (1.0 - metallic) * fresnel
+    f_r = specular * (plain + metallic * (red + (1.0 - red) * weight) * (1.0 + red * loss))
+    f_g = specular * (plain + metallic * (green + (1.0 - green) * weight) * (1.0 + green * loss))
+    f_b = specular * (plain + metallic * (blue + (1.0 - blue) * weight) * (1.0 + blue * loss))
+    share = specular_probability(o_z, red, green, blue, metallic, roughness, coat_albedo)
+    if metallic < 1.0:
+        ground = (1.0 - metallic) * i_z / math.pi
+        if substrate == BURLEY:
+            at_o, at_i = schlick_weight(o_z), schlick_weight(i_z)
+            retro = 2.0 * roughness * cos_d * cos_d
+            ground *= (1.0 - 0.5 * at_o) * (1.0 - 0.5 * at_i) + retro * (
+                at_o + at_i + at_o * at_i * (retro - 1.0)
+            )
+        else:
+            left = 1.0 - table_value(coat_mean_albedo, 0.0, roughness)
+            ground *= (
+                (1.0 - table_value(coat_albedo, o_z, roughness))
+                * (1.0 - table_value(coat_albedo, i_z, roughness))
+                / left
+            )
+        f_r += ground * red
+        f_g += ground * green
+        f_b += ground * blue
+    pdf = share * density * masking_o + (1.0 - share) * i_z / math.pi
+    return f_r, f_g, f_b, pdf
+
+
+@njit_no_refcount(forceinline=True)
+def principled_sample(o_x, o_y, o_z, red, green, blue, metallic, roughness, coat_albedo, choice, u, v):
+    """A direction to the light, as dense as :func:`principled_eval` says; worth 0 below the surface."""
+    share = specular_probability(o_z, red, green, blue, metallic, roughness, coat_albedo)
+    if choice >= share:
+        return sample_cosine(u, v)
+    alpha = max(roughness * roughness, MIN_ALPHA)
+    h_x, h_y, h_z = sample_visible_normal(o_x, o_y, o_z, alpha, u, v)
+    twice = 2.0 * (o_x * h_x + o_y * h_y + o_z * h_z)
+    return twice * h_x - o_x, twice * h_y - o_y, twice * h_z - o_z
+
+
+@njit_no_refcount(forceinline=True)
+def orthonormal_basis(n_x, n_y, n_z):
+    """Two unit vectors that make a right-handed frame with the unit vector n as its third axis.
+
+    "Building an Orthonormal Basis, Revisited" (Duff et al. 2017, https://jcgt.org/published/0006/01/01/).
+    """
+    sign = 1.0 if n_z >= 0.0 else -1.0
+    a = -1.0 / (sign + n_z)
+    b = n_x * n_y * a
+    return 1.0 + sign * n_x * n_x * a, sign * b, -sign * n_x, b, sign + n_y * n_y * a, -n_y

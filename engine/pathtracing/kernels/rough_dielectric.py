@@ -1,0 +1,119 @@
+"""Rough glass as compiled functions of directions: its values, its samples and their densities.
+
+GGX facets that reflect and refract, with Smith's separable masking: "Microfacet Models for Refraction through
+Rough Surfaces" (Walter et al. 2007). Directions are in the frame of the shading normal, ``o`` towards the
+viewer (o_z > 0) and ``i`` towards the light, on either side. ``eta`` is the index of refraction on the far
+side over that on the viewer's. Values are of basic radiance, hold the cosine to the light, and are pure
+functions of their arguments.
+"""
+
+import math
+
+import numpy as np
+from numba import prange
+
+from octasplat.engine.compilation import kernel
+from octasplat.engine.pathtracing.kernels.principled_bsdf import MIN_ALPHA, fresnel_dielectric
+from octasplat.engine.pathtracing.kernels.sampler import UINT32_TO_UNIT, reverse_bits
+from octasplat.engine.shading.kernels_microfacets import ggx_density, ggx_masking, sample_visible_normal
+from octasplat.engine.trace.kernels.native import njit_no_refcount
+
+MIN_GLASS_ROUGHNESS = 0.03
+"""Glass of less roughness is smooth."""
+
+
+@njit_no_refcount()
+def rough_dielectric_eval(o_x, o_y, o_z, i_x, i_y, i_z, eta, alpha):
+    """Value times cosine, and the density of :func:`rough_dielectric_sample` over solid angle."""
+    if o_z <= 0.0 or i_z == 0.0:
+        return 0.0, 0.0
+    ratio = 1.0 if i_z > 0.0 else eta
+    h_x, h_y, h_z = o_x + ratio * i_x, o_y + ratio * i_y, o_z + ratio * i_z
+    length = math.sqrt(h_x * h_x + h_y * h_y + h_z * h_z)
+    if length < 1e-9:
+        return 0.0, 0.0
+    if h_z < 0.0:
+        length = -length
+    h_x, h_y, h_z = h_x / length, h_y / length, h_z / length
+    cos_o = o_x * h_x + o_y * h_y + o_z * h_z
+    cos_i = i_x * h_x + i_y * h_y + i_z * h_z
+    if cos_o <= 0.0 or cos_i * i_z <= 0.0:
+        return 0.0, 0.0
+    share, _ = fresnel_dielectric(min(cos_o, 1.0), eta)
+    visible = ggx_density(h_z, alpha) * ggx_masking(o_z, alpha) * cos_o / o_z
+    if i_z > 0.0:
+        pdf = share * visible / (4.0 * cos_o)
+    else:
+        spread = cos_o + eta * cos_i
+        pdf = (1.0 - share) * visible * eta * eta * -cos_i / max(spread * spread, 1e-20)
+    return pdf * ggx_masking(abs(i_z), alpha), pdf
+
+
+@njit_no_refcount()
+def rough_dielectric_sample(o_x, o_y, o_z, eta, alpha, choice, u, v):
+    """A direction to the light, as dense as :func:`rough_dielectric_eval` says, or no direction at all (zeros).
+
+    What facets reflect downwards or refract upwards is not to be taken for the other.
+    """
+    h_x, h_y, h_z = sample_visible_normal(o_x, o_y, o_z, alpha, u, v)
+    cos_o = o_x * h_x + o_y * h_y + o_z * h_z
+    share, cos_t = fresnel_dielectric(min(cos_o, 1.0), eta)
+    if choice < share:
+        up = 2.0 * cos_o * h_z - o_z
+        return (2.0 * cos_o * h_x - o_x, 2.0 * cos_o * h_y - o_y, up) if up > 0.0 else (0.0, 0.0, 0.0)
+    along = cos_o / eta - cos_t
+    down = along * h_z - o_z / eta
+    return (along * h_x - o_x / eta, along * h_y - o_y / eta, down) if down < 0.0 else (0.0, 0.0, 0.0)
+
+
+@kernel(parallel=True, error_model="numpy")
+def integrate_rough_dielectric(eta, samples, table):
+    """Share of light from each direction that one bounce off or through facets keeps, into ``table``.
+
+    Rows are roughness and columns the cosine, both from 0 to 1.
+    """
+    rows, columns = table.shape
+    for j in prange(rows):
+        roughness = j / (rows - 1)
+        alpha = max(roughness * roughness, MIN_ALPHA)
+        for i in range(columns):
+            o_z = max(i / (columns - 1), 1e-4)
+            o_x = math.sqrt(1.0 - o_z * o_z)
+            total = 0.0
+            for k in range(samples):
+                u, v = (k + 0.5) / samples, reverse_bits(np.uint32(k)) * UINT32_TO_UNIT
+                h_x, _, h_z = sample_visible_normal(o_x, 0.0, o_z, alpha, u, v)
+                cos_o = o_x * h_x + o_z * h_z
+                share, cos_t = fresnel_dielectric(min(cos_o, 1.0), eta)
+                up = 2.0 * cos_o * h_z - o_z
+                if up > 0.0:
+                    total += share * ggx_masking(up, alpha)
+                down = (cos_o / eta - cos_t) * h_z - o_z / eta
+                if down < 0.0:
+                    total += (1.0 - share) * ggx_masking(-down, alpha)
+            table[j, i] = total / samples
+
+
+@kernel(parallel=True, error_model="numpy")
+def rough_dielectric_eval_array(o, i, eta, alpha, values, pdf):
+    """:func:`rough_dielectric_eval` of rows of directions."""
+    for n in prange(len(o)):
+        values[n], pdf[n] = rough_dielectric_eval(
+            o[n, 0], o[n, 1], o[n, 2], i[n, 0], i[n, 1], i[n, 2], eta, alpha
+        )
+
+
+@kernel(parallel=True, error_model="numpy")
+def rough_dielectric_sample_array(o, eta, alpha, random_numbers, i):
+    """:func:`rough_dielectric_sample` of rows of directions; ``random_numbers`` are three uniform ones a row."""
+    for n in prange(len(o)):
+        i[n, 0], i[n, 1], i[n, 2] = rough_dielectric_sample(
+            o[n, 0],
+            o[n, 1],
+            o[n, 2],
+            eta,
+            alpha,
+            random_numbers[n, 0],
+            random_numbers[n, 1],
+            random_numbers[n, 2],
+        )

@@ -1,0 +1,147 @@
+"""A path at a surface that scatters: what one light sends to it, and the direction in which it goes on.
+
+The two ways in which light is found are joined by multiple importance sampling with the balance heuristic
+("Optimally Combining Sampling Techniques for Monte Carlo Rendering", Veach and Guibas 1995).
+"""
+
+import math
+
+import numpy as np
+
+from octasplat.engine.pathtracing.kernels.lights import INFINITE_DISTANCE, sample_light, sample_light_index
+from octasplat.engine.pathtracing.kernels.principled_bsdf import (
+    orthonormal_basis,
+    principled_eval,
+    principled_sample,
+    sample_cosine,
+)
+from octasplat.engine.pathtracing.kernels.surface import normalize
+from octasplat.engine.rays import AT_INFINITY
+from octasplat.engine.trace.kernels.native import njit_no_refcount
+
+FLAG_LOSSLESS = 1
+"""Mark: every surface so far passed on all light in one direction; the first layer goes on."""
+FLAG_SCATTERED = 2
+"""Mark: the path has left a matt or rough surface."""
+FLAG_CAMERA_RAY = 4
+"""Mark: the path is still the camera's own ray."""
+FLAG_GAUSSIAN_SURFACE = 8
+"""Mark: what the camera sees in this place is a surface of Gaussians with materials."""
+
+LOBE_SAMPLE, DIRECTION_SAMPLE, LIGHT_CHOICE_SAMPLE, LIGHT_POSITION_SAMPLE, LAYER_LIGHT_SAMPLE = 0, 1, 2, 3, 4
+"""Pairs of uniform numbers of a surface."""
+SHADOW_RAY_SCALE = 1.0 - 1e-4
+
+
+@njit_no_refcount(forceinline=True)
+def spawn_ray(paths, p, x, y, z, d_x, d_y, d_z, pdf):
+    """Send a path on; its viewer is left behind, and lost where the path has been scattered."""
+    o = paths.origins_world[p]
+    if pdf > 0.0:
+        paths.t_view_origin[p] = AT_INFINITY
+    else:
+        paths.t_view_origin[p] -= math.sqrt((x - o[0]) ** 2 + (y - o[1]) ** 2 + (z - o[2]) ** 2)
+    paths.origins_world[p, 0], paths.origins_world[p, 1], paths.origins_world[p, 2] = x, y, z
+    paths.directions_world[p, 0], paths.directions_world[p, 1], paths.directions_world[p, 2] = d_x, d_y, d_z
+    paths.pdf[p] = pdf
+
+
+@njit_no_refcount(forceinline=True)
+def queue_shadow_ray(shadows, k, x, y, z, w_x, w_y, w_z, distance, red, green, blue, clamp):
+    """Ask a light: what it brings if nothing is in its way, no more than ``clamp``."""
+    most = max(red, green, blue)
+    if most > clamp:
+        red, green, blue = red * clamp / most, green * clamp / most, blue * clamp / most
+    shadows.radiance_linear[k, 0], shadows.radiance_linear[k, 1], shadows.radiance_linear[k, 2] = (
+        red,
+        green,
+        blue,
+    )
+    shadows.origins_world[k, 0], shadows.origins_world[k, 1], shadows.origins_world[k, 2] = x, y, z
+    shadows.directions_world[k, 0] = w_x
+    shadows.directions_world[k, 1] = w_y
+    shadows.directions_world[k, 2] = w_z
+    shadows.t_max[k] = distance * SHADOW_RAY_SCALE if distance < INFINITE_DISTANCE else np.inf
+
+
+@njit_no_refcount(forceinline=True)
+def scatter_path(
+    k, p, n, random_numbers, paths, is_diffuse, x, y, z, n_x, n_y, n_z, s_x, s_y, s_z, red, green, blue, metallic,
+    roughness, ior, substrate, energy_compensation, ggx_albedo, coat_albedo, coat_mean_albedo, lights, integrator, shadows,
+):  # fmt: skip
+    """Ask a light, into row ``k`` of ``shadows``, and send path ``p`` on from a point off its surface.
+
+    Column ``n`` of ``random_numbers`` holds pairs of uniform ones. The normal n is the surface's own, s the one that
+    it is shaded by; a ``is_diffuse`` surface has a colour alone.
+    """
+    d = paths.directions_world[p]
+    a_x, a_y, a_z, b_x, b_y, b_z = orthonormal_basis(s_x, s_y, s_z)
+    o_x = -(d[0] * a_x + d[1] * a_y + d[2] * a_z)
+    o_y = -(d[0] * b_x + d[1] * b_y + d[2] * b_z)
+    o_z = -(d[0] * s_x + d[1] * s_y + d[2] * s_z)
+    if len(lights.kinds):
+        l, share = sample_light_index(lights, x, y, z, random_numbers[LIGHT_CHOICE_SAMPLE, 0, n])
+        if l >= 0:
+            u, v = random_numbers[LIGHT_POSITION_SAMPLE, 0, n], random_numbers[LIGHT_POSITION_SAMPLE, 1, n]
+            w_x, w_y, w_z, distance, l_r, l_g, l_b, l_pdf = sample_light(lights, l, x, y, z, u, v)
+            i_z = w_x * s_x + w_y * s_y + w_z * s_z
+            if i_z > 0.0 and w_x * n_x + w_y * n_y + w_z * n_z > 0.0 and l_r + l_g + l_b > 0.0:
+                if is_diffuse:
+                    pdf = i_z / math.pi
+                    f_r, f_g, f_b = red * pdf, green * pdf, blue * pdf
+                else:
+                    f_r, f_g, f_b, pdf = principled_eval(
+                        o_x, o_y, o_z,
+                        w_x * a_x + w_y * a_y + w_z * a_z, w_x * b_x + w_y * b_y + w_z * b_z, i_z,
+                        red, green, blue, metallic, roughness, ior, substrate, energy_compensation,
+                        ggx_albedo, coat_albedo, coat_mean_albedo,
+                    )  # fmt: skip
+                factor = 1.0 / share
+                shadows.passes_glass[k] = l_pdf == 0.0
+                if l_pdf > 0.0:
+                    l_pdf *= share
+                    factor = 1.0 / (l_pdf + pdf) if lights.is_hittable[l] else 1.0 / l_pdf
+                w = paths.throughput[p]
+                l_r, l_g, l_b = (
+                    w[0] * f_r * l_r * factor,
+                    w[1] * f_g * l_g * factor,
+                    w[2] * f_b * l_b * factor,
+                )
+                clamp = integrator.clamp if paths.flags[p] & FLAG_SCATTERED else np.inf
+                queue_shadow_ray(shadows, k, x, y, z, w_x, w_y, w_z, distance, l_r, l_g, l_b, clamp)
+    u, v = random_numbers[DIRECTION_SAMPLE, 0, n], random_numbers[DIRECTION_SAMPLE, 1, n]
+    if is_diffuse:
+        i_x, i_y, i_z = sample_cosine(u, v)
+        pdf = i_z / math.pi
+        f_r, f_g, f_b = red * pdf, green * pdf, blue * pdf
+    else:
+        i_x, i_y, i_z = principled_sample(
+            o_x,
+            o_y,
+            o_z,
+            red,
+            green,
+            blue,
+            metallic,
+            roughness,
+            coat_albedo,
+            random_numbers[LOBE_SAMPLE, 0, n],
+            u,
+            v,
+        )
+        f_r, f_g, f_b, pdf = principled_eval(
+            o_x, o_y, o_z, i_x, i_y, i_z, red, green, blue, metallic, roughness, ior, substrate, energy_compensation,
+            ggx_albedo, coat_albedo, coat_mean_albedo,
+        )  # fmt: skip
+    w_x = i_x * a_x + i_y * b_x + i_z * s_x
+    w_y = i_x * a_y + i_y * b_y + i_z * s_y
+    w_z = i_x * a_z + i_y * b_z + i_z * s_z
+    if not pdf > 0.0 or w_x * n_x + w_y * n_y + w_z * n_z <= 0.0 or f_r + f_g + f_b <= 0.0:
+        paths.is_alive[p] = False
+        return
+    paths.throughput[p, 0] *= f_r / pdf
+    paths.throughput[p, 1] *= f_g / pdf
+    paths.throughput[p, 2] *= f_b / pdf
+    paths.flags[p] = (paths.flags[p] | FLAG_SCATTERED) & ~(FLAG_LOSSLESS | FLAG_CAMERA_RAY)
+    w_x, w_y, w_z = normalize(w_x, w_y, w_z)
+    spawn_ray(paths, p, x, y, z, w_x, w_y, w_z, pdf)

@@ -1,0 +1,146 @@
+"""What a ray finds on a triangle: the point, its normals, and its material with textures looked up."""
+
+import math
+
+from octasplat.engine.pathtracing.kernels.texture import eval_texture
+from octasplat.engine.trace.kernels.native import njit_no_refcount
+
+DIFFUSE, MIRROR, GLASS, PRINCIPLED, EMITTER = 0, 1, 2, 3, 4
+RAY_OFFSET_SCALE = 5e-6
+
+
+@njit_no_refcount(forceinline=True)
+def interpolate_corners(corners, a, b, c):
+    """The point with weights a, b, c of the corners."""
+    return (
+        a * corners[0, 0] + b * corners[1, 0] + c * corners[2, 0],
+        a * corners[0, 1] + b * corners[1, 1] + c * corners[2, 1],
+        a * corners[0, 2] + b * corners[1, 2] + c * corners[2, 2],
+    )
+
+
+@njit_no_refcount(forceinline=True)
+def normalize(x, y, z):
+    """The vector with length 1."""
+    length = max(math.sqrt(x * x + y * y + z * z), 1e-30)
+    return x / length, y / length, z / length
+
+
+@njit_no_refcount(forceinline=True)
+def face_normal(corners):
+    """Unit normal of a triangle, on the side from which its corners run anticlockwise."""
+    u_x, u_y, u_z = (
+        float(corners[1, 0]) - corners[0, 0],
+        float(corners[1, 1]) - corners[0, 1],
+        float(corners[1, 2]) - corners[0, 2],
+    )
+    v_x, v_y, v_z = (
+        float(corners[2, 0]) - corners[0, 0],
+        float(corners[2, 1]) - corners[0, 1],
+        float(corners[2, 2]) - corners[0, 2],
+    )
+    return normalize(u_y * v_z - u_z * v_y, u_z * v_x - u_x * v_z, u_x * v_y - u_y * v_x)
+
+
+@njit_no_refcount(forceinline=True)
+def offset_ray_origin(p_x, p_y, p_z, n_x, n_y, n_z):
+    """The point a little off a surface along n, so that rounding does not put it behind the surface."""
+    step = RAY_OFFSET_SCALE * max(abs(p_x), abs(p_y), abs(p_z), 1e-3)
+    return p_x + step * n_x, p_y + step * n_y, p_z + step * n_z
+
+
+@njit_no_refcount(forceinline=True)
+def eval_material(materials, m, u, v):
+    """Base colour, metallic and roughness of material ``m`` at texture coordinates."""
+    red, green, blue = (
+        materials.colours_linear[m, 0],
+        materials.colours_linear[m, 1],
+        materials.colours_linear[m, 2],
+    )
+    metallic, roughness = materials.metallic[m], materials.roughness[m]
+    texture = materials.colour_textures[m]
+    if texture >= 0:
+        t_r, t_g, t_b = eval_texture(materials, texture, u, v)
+        red, green, blue = red * t_r, green * t_g, blue * t_b
+    texture = materials.metallic_roughness_textures[m]
+    if texture >= 0:
+        _, t_g, t_b = eval_texture(materials, texture, u, v)
+        roughness, metallic = roughness * t_g, metallic * t_b
+    return red, green, blue, metallic, roughness
+
+
+@njit_no_refcount(forceinline=True)
+def eval_vertex_color(surfaces, face, a, b, c):
+    """The colour of the corners of a face at a place, white where no mesh has colours of its own."""
+    if len(surfaces.corner_rgb_linear) == 0:
+        return 1.0, 1.0, 1.0
+    return interpolate_corners(surfaces.corner_rgb_linear[face], a, b, c)
+
+
+@njit_no_refcount(forceinline=True)
+def eval_normal_map(materials, m, corners, uv, u, v, n_x, n_y, n_z, s_x, s_y, s_z, d_x, d_y, d_z):
+    """The shading normal s turned as the normal texture says; n is the face's, on the viewer's side.
+
+    The frame follows the texture coordinates of the face: x where u grows, y where v shrinks, as v counts
+    downwards. s stays where the face has none, or where the viewer would see the new one from behind.
+    """
+    texture = materials.normal_textures[m]
+    if texture < 0:
+        return s_x, s_y, s_z
+    a_u, a_v = float(uv[1, 0]) - uv[0, 0], float(uv[1, 1]) - uv[0, 1]
+    b_u, b_v = float(uv[2, 0]) - uv[0, 0], float(uv[2, 1]) - uv[0, 1]
+    area = a_u * b_v - a_v * b_u
+    if abs(area) < 1e-20:
+        return s_x, s_y, s_z
+    a_x, a_y, a_z = (
+        float(corners[1, 0]) - corners[0, 0],
+        float(corners[1, 1]) - corners[0, 1],
+        float(corners[1, 2]) - corners[0, 2],
+    )
+    b_x, b_y, b_z = (
+        float(corners[2, 0]) - corners[0, 0],
+        float(corners[2, 1]) - corners[0, 1],
+        float(corners[2, 2]) - corners[0, 2],
+    )
+    t_x, t_y, t_z = (
+        (b_v * a_x - a_v * b_x) / area,
+        (b_v * a_y - a_v * b_y) / area,
+        (b_v * a_z - a_v * b_z) / area,
+    )
+    w_x, w_y, w_z = (
+        (b_u * a_x - a_u * b_x) / area,
+        (b_u * a_y - a_u * b_y) / area,
+        (b_u * a_z - a_u * b_z) / area,
+    )
+    along = t_x * s_x + t_y * s_y + t_z * s_z
+    t_x, t_y, t_z = normalize(t_x - along * s_x, t_y - along * s_y, t_z - along * s_z)
+    along, beside = w_x * s_x + w_y * s_y + w_z * s_z, w_x * t_x + w_y * t_y + w_z * t_z
+    w_x, w_y, w_z = normalize(
+        w_x - along * s_x - beside * t_x, w_y - along * s_y - beside * t_y, w_z - along * s_z - beside * t_z
+    )
+    x, y, z = eval_texture(materials, texture, u, v)
+    scale = materials.normal_scales[m]
+    x, y, z = scale * (2.0 * x - 1.0), scale * (2.0 * y - 1.0), max(2.0 * z - 1.0, 1e-3)
+    x, y, z = normalize(x * t_x + y * w_x + z * s_x, x * t_y + y * w_y + z * s_y, x * t_z + y * w_z + z * s_z)
+    if x * d_x + y * d_y + z * d_z > -1e-4 or x * n_x + y * n_y + z * n_z <= 0.0:
+        return s_x, s_y, s_z
+    return x, y, z
+
+
+@njit_no_refcount(forceinline=True)
+def shading_normal(normals, a, b, c, n_x, n_y, n_z, d_x, d_y, d_z):
+    """The interpolated normal on the side of n; n itself where the viewer would see it from behind."""
+    s_x, s_y, s_z = interpolate_corners(normals, a, b, c)
+    s_x, s_y, s_z = normalize(s_x, s_y, s_z)
+    if s_x * n_x + s_y * n_y + s_z * n_z < 0.0:
+        s_x, s_y, s_z = -s_x, -s_y, -s_z
+    if s_x * d_x + s_y * d_y + s_z * d_z > -1e-4:
+        return n_x, n_y, n_z
+    return s_x, s_y, s_z
+
+
+@njit_no_refcount(forceinline=True)
+def reflect(d_x, d_y, d_z, n_x, n_y, n_z):
+    """The direction d after a mirror with the normal n."""
+    twice = 2.0 * (d_x * n_x + d_y * n_y + d_z * n_z)
+    return d_x - twice * n_x, d_y - twice * n_y, d_z - twice * n_z

@@ -1,0 +1,238 @@
+"""Lights of a stage as arrays that the kernels read."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float32, Float64, Int32, Int64
+
+from octasplat.engine.colour import srgb_to_linear
+from octasplat.engine.pathtracing.environment import (
+    EnvironmentMap,
+    build_environment_sampler,
+    mean_irradiance,
+)
+from octasplat.engine.pathtracing.kernels.lights import (
+    DIRECTIONAL,
+    ENVIRONMENT,
+    MESH,
+    POINT,
+    RECTANGLE,
+    SPHERE,
+    SPOT,
+    eval_environment_array,
+    light_samples,
+)
+from octasplat.engine.pathtracing.stage.model import (
+    DirectionalLight,
+    Light,
+    PointLight,
+    RectangleLight,
+    SpotLight,
+)
+
+
+@dataclass(frozen=True)
+class EmissiveMesh:
+    """Triangles that shine alike.
+
+    Attributes:
+        corners_world: of each.
+        corner_uv: texture coordinates.
+        rgb_linear: radiance.
+        texture: number of a texture that is multiplied by it, -1 for none.
+    """
+
+    corners_world: Float32[np.ndarray, "f 3 3"]
+    corner_uv: Float32[np.ndarray, "f 3 2"]
+    rgb_linear: Float64[np.ndarray, "3"]
+    texture: int = -1
+
+
+class LightArrays(NamedTuple):
+    """``l`` lights: those of the stage, shining meshes, and the environment where there is one.
+
+    Attributes:
+        kinds: which of the kinds of :mod:`octasplat.engine.pathtracing.kernels.lights`.
+        positions_world: of points and spots; centres of rectangles, balls and meshes.
+        axes: unit vectors: the way that the light goes, or a rectangle faces.
+        rgb_linear: intensity, irradiance or radiance; of the environment pi times its mean radiance.
+        sides_u: one side of a rectangle.
+        sides_v: the other side.
+        areas: of rectangles and meshes; of balls that of their disc.
+        cosines: of a spot's outer and inner angle.
+        is_hittable: whether rays meet the light, so that it counts for those too.
+        adds_light: whether the light is added to shadowed Gaussians.
+        any_adds_light: whether any is.
+        textures: of meshes, -1 for none.
+        mesh_rows: of meshes: first and last row of their sums, and first triangle.
+        mesh_cdf: cumulative shares of the triangles' areas, from 0 to 1 for each mesh.
+        mesh_corners_world: of the triangles of all meshes.
+        mesh_uv: likewise.
+        texels_linear: see :class:`octasplat.engine.pathtracing.kernels.kernel_args.MaterialArrays`, as the next one.
+        texture_sizes: first texel, height and width of each.
+        environment_linear: the map, one black pixel without one.
+        environment_row_cdf: see :class:`octasplat.engine.pathtracing.environment.EnvironmentSampler`, as the next two.
+        environment_column_cdf: cumulative shares within each row.
+        environment_probabilities: share of each pixel.
+        environment_frame: rows are right, up, forward of the map.
+    """
+
+    kinds: Int32[np.ndarray, " l"]
+    positions_world: Float64[np.ndarray, "l 3"]
+    axes: Float64[np.ndarray, "l 3"]
+    rgb_linear: Float64[np.ndarray, "l 3"]
+    sides_u: Float64[np.ndarray, "l 3"]
+    sides_v: Float64[np.ndarray, "l 3"]
+    areas: Float64[np.ndarray, " l"]
+    cosines: Float64[np.ndarray, "l 2"]
+    is_hittable: Int32[np.ndarray, " l"]
+    adds_light: Int32[np.ndarray, " l"]
+    any_adds_light: bool
+    textures: Int32[np.ndarray, " l"]
+    mesh_rows: Int64[np.ndarray, "l 3"]
+    mesh_cdf: Float64[np.ndarray, " s"]
+    mesh_corners_world: Float32[np.ndarray, "f 3 3"]
+    mesh_uv: Float32[np.ndarray, "f 3 2"]
+    texels_linear: Float32[np.ndarray, "x 3"]
+    texture_sizes: Int64[np.ndarray, "k 3"]
+    environment_linear: Float32[np.ndarray, "h w 3"]
+    environment_row_cdf: Float64[np.ndarray, " h1"]
+    environment_column_cdf: Float64[np.ndarray, "h w1"]
+    environment_probabilities: Float64[np.ndarray, "h w"]
+    environment_frame: Float64[np.ndarray, "3 3"]
+
+    @property
+    def environment_id(self) -> int:
+        """The environment's place among the lights, -1 without one."""
+        count = len(self.kinds)
+        return count - 1 if count and self.kinds[-1] == ENVIRONMENT else -1
+
+
+def build_light_arrays(
+    lights: tuple[Light, ...],
+    up_world: Float64[np.ndarray, "3"],
+    environment: EnvironmentMap | None = None,
+    meshes: Sequence[EmissiveMesh] = (),
+    texels_linear: Float32[np.ndarray, "x 3"] | None = None,
+    texture_sizes: Int64[np.ndarray, "k 3"] | None = None,
+) -> LightArrays:
+    """Arrays of lights, meshes that shine, and the environment, in this order.
+
+    Args:
+        lights: of the stage.
+        up_world: the stage's up.
+        environment: light from all around.
+        meshes: that shine.
+        texels_linear: of the textures of the meshes' light.
+        texture_sizes: likewise.
+    """
+    count = len(lights) + len(meshes) + (environment is not None)
+    kinds, seen, adds = np.zeros((3, count), np.int32)
+    positions, axes, rgb, sides_u, sides_v = np.zeros((5, count, 3))
+    areas, cosines = np.zeros(count), np.tile([0.0, 1.0], (count, 1))
+    textures, rows = np.full(count, -1, np.int32), np.zeros((count, 3), np.int64)
+    for l, light in enumerate(lights):
+        colour = srgb_to_linear(np.array(light.colour_srgb))
+        adds[l] = light.adds_light
+        if not isinstance(light, DirectionalLight):
+            positions[l] = light.position
+        if not isinstance(light, PointLight):
+            axes[l] = np.array(light.direction) / np.linalg.norm(light.direction)
+        if isinstance(light, PointLight | SpotLight):
+            kinds[l], rgb[l] = POINT, colour * light.intensity
+            if isinstance(light, SpotLight):
+                kinds[l] = SPOT
+                cosines[l] = np.cos(np.radians([light.outer_degrees, light.inner_degrees]))
+            elif light.radius > 0.0:
+                areas[l] = np.pi * light.radius**2
+                kinds[l], rgb[l], seen[l] = SPHERE, rgb[l] / areas[l], light.visible
+        elif isinstance(light, DirectionalLight):
+            kinds[l], rgb[l] = DIRECTIONAL, colour * light.irradiance
+        else:
+            kinds[l], rgb[l], seen[l] = RECTANGLE, colour * light.radiance, light.visible
+            sides_u[l], sides_v[l] = rectangle_sides(light, up_world)
+            areas[l] = light.width * light.height
+    sums, corners, uv = [], [np.zeros((0, 3, 3), np.float32)], [np.zeros((0, 3, 2), np.float32)]
+    face, row = 0, 0
+    for l, mesh in enumerate(meshes, len(lights)):
+        own = triangle_areas(mesh.corners_world)
+        kinds[l], rgb[l], areas[l], seen[l], adds[l] = MESH, mesh.rgb_linear, own.sum(), 1, 1
+        positions[l] = own @ mesh.corners_world.mean(axis=1, dtype=np.float64) / own.sum()
+        textures[l], rows[l] = mesh.texture, (row, row + len(own), face)
+        sums.append(np.concatenate([[0.0], np.cumsum(own) / own.sum()]))
+        corners.append(mesh.corners_world)
+        uv.append(mesh.corner_uv)
+        face, row = face + len(own), row + len(own) + 1
+    radiance, frame = np.zeros((1, 1, 3), np.float32), np.eye(3)
+    if environment is not None:
+        radiance, frame = environment.radiance_linear, environment.frame
+        kinds[-1], rgb[-1], seen[-1] = ENVIRONMENT, mean_irradiance(radiance), 1
+    sampler = build_environment_sampler(radiance)
+    return LightArrays(
+        kinds, positions, axes, rgb, sides_u, sides_v, areas, cosines, seen,
+        adds, bool(adds.any()), textures, rows, np.concatenate([np.zeros(0), *sums]), np.concatenate(corners),
+        np.concatenate(uv),
+        np.zeros((0, 3), np.float32) if texels_linear is None else texels_linear,
+        np.zeros((0, 3), np.int64) if texture_sizes is None else texture_sizes,
+        radiance, sampler.row_cdf, sampler.column_cdf, sampler.probabilities, frame,
+    )  # fmt: skip
+
+
+def triangle_areas(corners: Float32[np.ndarray, "f 3 3"]) -> Float64[np.ndarray, " f"]:
+    """Areas of triangles."""
+    sides = (corners[:, 1:] - corners[:, :1]).astype(np.float64)
+    areas: np.ndarray = 0.5 * np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1)
+    return areas
+
+
+def rectangle_sides(
+    light: RectangleLight, up_world: Float64[np.ndarray, "3"]
+) -> tuple[Float64[np.ndarray, "3"], Float64[np.ndarray, "3"]]:
+    """The level side of a rectangle and the other, as vectors; their cross product is the way it faces."""
+    facing = np.array(light.direction) / np.linalg.norm(light.direction)
+    level = np.cross(up_world / np.linalg.norm(up_world), facing)
+    if np.linalg.norm(level) < 1e-6:  # facing up or down: any level direction will do, the same each time
+        level = np.cross(np.eye(3)[np.argmin(np.abs(facing))], facing)
+    level /= np.linalg.norm(level)
+    return level * light.width, np.cross(facing, level) * light.height
+
+
+def eval_environment_map(
+    lights: LightArrays, directions_world: Float64[np.ndarray, "n 3"]
+) -> tuple[Float64[np.ndarray, "n 3"], Float64[np.ndarray, " n"]]:
+    """Linear radiance from unit directions, and the density with which they are sampled."""
+    radiance, density = np.empty((len(directions_world), 3)), np.empty(len(directions_world))
+    eval_environment_array(lights, directions_world, radiance, density)
+    return radiance, density
+
+
+class LightSamples(NamedTuple):
+    """Ways to lights from ``n`` points; see :func:`sample_lights`."""
+
+    directions_world: Float64[np.ndarray, "n 3"]
+    distances: Float64[np.ndarray, " n"]
+    radiance_linear: Float64[np.ndarray, "n 3"]
+    density: Float64[np.ndarray, " n"]
+    lights: Int32[np.ndarray, " n"]
+
+
+def sample_lights(
+    lights: LightArrays, points_world: Float64[np.ndarray, "n 3"], uniform: Float64[np.ndarray, "n 3"]
+) -> LightSamples:
+    """A way from each point to one of the lights, which are asked by what they bring.
+
+    The irradiance of a surface is the mean of radiance times cosine over density; where the density is 0,
+    light comes from one direction only and ``radiance`` is irradiance already.
+    """
+    count = len(points_world)
+    out = LightSamples(
+        np.zeros((count, 3)),
+        np.zeros(count),
+        np.zeros((count, 3)),
+        np.zeros(count),
+        np.zeros(count, np.int32),
+    )
+    light_samples(lights, points_world, uniform, out[0], out[1], out[2], out[3], out[4])
+    return out

@@ -1,0 +1,212 @@
+"""All materials of a stage as rows, with their tables and textures."""
+
+import tempfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float32
+
+from octasplat.engine.colour import srgb_to_linear
+from octasplat.engine.errors import ConfigError, DatasetError
+from octasplat.engine.geometry.mesh_material import FileImage
+from octasplat.engine.pathtracing.bsdf_tables import albedo_table, rough_dielectric_table
+from octasplat.engine.pathtracing.kernels.kernel_args import MaterialArrays
+from octasplat.engine.pathtracing.kernels.principled_bsdf import BURLEY, COUPLED
+from octasplat.engine.pathtracing.kernels.surface import DIFFUSE, EMITTER, GLASS, MIRROR, PRINCIPLED
+from octasplat.engine.pathtracing.stage.model import (
+    Dielectric,
+    Diffuse,
+    Emissive,
+    Glass,
+    Material,
+    Metal,
+    MetallicRoughness,
+    Mirror,
+    NormalMapped,
+)
+from octasplat.engine.render.image_files import read_image
+
+MAX_TEXELS = 1 << 27
+TextureUse = Literal["colour", "light", "data"]
+"""What an image holds: display colours, display colours of light, or numbers that are taken as they are."""
+
+_DEFAULTS: dict[str, np.ndarray] = {
+    "kinds": np.array(DIFFUSE, np.int32),
+    "colours_linear": np.ones(3),
+    "metallic": np.array(0.0),
+    "roughness": np.array(0.0),
+    "iors": np.array(1.5),
+    "absorption": np.zeros(3),
+    "substrates": np.array(COUPLED, np.int32),
+    "energy_compensation": np.array(1, np.int32),
+    "coat_tables": np.array(0, np.int32),
+    "colour_textures": np.array(-1, np.int32),
+    "metallic_roughness_textures": np.array(-1, np.int32),
+    "normal_textures": np.array(-1, np.int32),
+    "normal_scales": np.array(1.0),
+    "uses_vertex_color": np.array(0, np.int32),
+    "light_ids": np.array(-1, np.int32),
+}
+"""What a material is where it says nothing else."""
+
+
+class MaterialTable:
+    """Rows of materials as they come.
+
+    Args:
+        folder: where the names of images are relative to.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._rows: list[dict[str, object]] = []
+        self._albedo_tables: list[tuple[str, float]] = [("coat", 1.5)]
+        self._textures: dict[tuple[FileImage, TextureUse], int] = {}
+        self._images: list[Float32[np.ndarray, "h w 3"]] = []
+
+    def add(
+        self,
+        material: Material,
+        label: str,
+        *,
+        has_uv: bool,
+        uses_vertex_color: bool,
+        images: Mapping[str, FileImage],
+    ) -> int:
+        """The row of a material.
+
+        Args:
+            material: what to add.
+            label: what errors call it.
+            has_uv: whether the mesh has texture coordinates.
+            uses_vertex_color: whether the colours of the mesh's corners count.
+            images: of a mesh file, by the names that the material has for them.
+
+        Raises:
+            ConfigError: an image is none, or the mesh has no texture coordinates for it.
+        """
+        row: dict[str, object] = {"uses_vertex_color": int(uses_vertex_color)}
+
+        def texture(name: str | None, use: TextureUse) -> int:
+            if name is None:
+                return -1
+            path = self._folder / name
+            return self._texture_id(
+                images.get(name) or FileImage(str(path), path.suffix, path=path), use, has_uv, label
+            )
+
+        if isinstance(material, Glass):
+            colour = material.tint_srgb
+            row |= {"kinds": GLASS, "iors": material.ior, "absorption": material.absorption}
+            row |= {"roughness": material.roughness, "energy_compensation": material.multiple_scattering}
+            if material.roughness > 0.0 and material.ior > 1.0:
+                row["coat_tables"] = self._albedo_table_id("rough_dielectric", material.ior)
+                self._albedo_table_id("rough_dielectric", 1.0 / material.ior)
+        else:
+            colour = material.colour_srgb
+            row["kinds"] = {Diffuse: DIFFUSE, Mirror: MIRROR}.get(type(material), PRINCIPLED)
+        row["colours_linear"] = srgb_to_linear(np.array(colour))
+        if isinstance(material, Metal | Dielectric | MetallicRoughness):
+            row["roughness"] = material.roughness
+        if isinstance(material, Metal):
+            row |= {"metallic": 1.0, "energy_compensation": material.multiple_scattering}
+        if isinstance(material, MetallicRoughness):
+            row |= {"metallic": material.metallic, "energy_compensation": material.multiple_scattering}
+            row["substrates"] = BURLEY if material.diffuse == "burley" else COUPLED
+            row["metallic_roughness_textures"] = texture(material.metallic_roughness_texture, "data")
+        if isinstance(material, Dielectric | MetallicRoughness):
+            row |= {"iors": material.ior, "coat_tables": self._albedo_table_id("coat", material.ior)}
+        if isinstance(material, Diffuse | Dielectric | MetallicRoughness):
+            row["colour_textures"] = texture(material.texture, "colour")
+        if isinstance(material, NormalMapped):
+            row["normal_textures"] = texture(material.normal_texture, "data")
+            row["normal_scales"] = material.normal_scale
+        if isinstance(material, Emissive):
+            row["emission"] = texture(material.emission_texture, "light")
+        self._rows.append(row)
+        return len(self._rows) - 1
+
+    def add_light(self, light_id: int) -> int:
+        """The row of the surface of a light."""
+        self._rows.append({"kinds": EMITTER, "light_ids": light_id})
+        return len(self._rows) - 1
+
+    def set_emissive(self, row: int, light_id: int) -> int:
+        """Make a row the surface of a light as well; returns the texture of its light, -1 for none."""
+        self._rows[row]["light_ids"] = light_id
+        texture = self._rows[row]["emission"]
+        assert isinstance(texture, int)
+        return texture
+
+    def arrays(self) -> MaterialArrays:
+        """All rows as arrays."""
+        count = len(self._rows)
+        columns = {
+            name: np.array([row.get(name, default) for row in self._rows], default.dtype).reshape(
+                count, *default.shape
+            )
+            for name, default in _DEFAULTS.items()
+        }
+        tables = [
+            albedo_table(ior) if kind == "coat" else rough_dielectric_table(ior)
+            for kind, ior in self._albedo_tables
+        ]
+        sizes = np.zeros((len(self._images), 3), np.int64)
+        first = 0
+        for k, image in enumerate(self._images):
+            sizes[k] = first, image.shape[0], image.shape[1]
+            first += image.shape[0] * image.shape[1]
+        texels = np.concatenate([np.zeros((0, 3), np.float32), *(i.reshape(-1, 3) for i in self._images)])
+        return MaterialArrays(
+            **columns,
+            ggx_albedo=albedo_table(None).directional,
+            coat_albedo=np.stack([table.directional for table in tables]),
+            coat_mean_albedo=np.stack([table.mean for table in tables]),
+            texels_linear=texels,
+            texture_sizes=sizes,
+        )
+
+    def _albedo_table_id(self, kind: str, ior: float) -> int:
+        """The number of a table; that of light that leaves rough glass comes right after its own."""
+        if kind == "coat" and (kind, ior) in self._albedo_tables:
+            return self._albedo_tables.index((kind, ior))
+        self._albedo_tables.append((kind, ior))
+        return len(self._albedo_tables) - 1
+
+    def _texture_id(self, image: FileImage, use: TextureUse, has_uv: bool, label: str) -> int:
+        """The number of a texture; display values are made linear, unless the image holds linear ones."""
+        if not has_uv:
+            raise ConfigError(f"{label}: {image.name} needs texture coordinates, which the mesh lacks.")
+        if (image, use) not in self._textures:
+            try:
+                values = _read_pixels(image)
+            except DatasetError as error:
+                raise ConfigError(f"{label}: {error}") from None
+            rgb = values[..., :3] if values.shape[2] >= 3 else np.repeat(values[..., :1], 3, axis=2)
+            if use != "data" and image.suffix.lower() not in (".exr", ".hdr"):
+                rgb = srgb_to_linear(rgb)
+            if not np.isfinite(rgb).all():
+                raise ConfigError(f"{label}: {image.name} holds values that are not finite; mend the image.")
+            self._textures[image, use] = len(self._images)
+            most = None if use == "light" else 1.0
+            self._images.append(np.ascontiguousarray(np.clip(rgb, 0.0, most), np.float32))
+            if sum(i.shape[0] * i.shape[1] for i in self._images) > MAX_TEXELS:
+                raise ConfigError(
+                    f"{image.name}: the textures have more than {MAX_TEXELS >> 20} million pixels together."
+                )
+        return self._textures[image, use]
+
+
+def _read_pixels(image: FileImage) -> Float32[np.ndarray, "h w c"]:
+    """The pixels of an image, from where it lies."""
+    if image.path is not None:
+        return read_image(image.path)
+    with tempfile.TemporaryDirectory(prefix="octasplat-") as folder:
+        path = Path(folder) / f"image{image.suffix}"
+        path.write_bytes(image.content or b"")
+        try:
+            return read_image(path)
+        except DatasetError:
+            raise DatasetError(f"{image.name} cannot be read as an image.") from None

@@ -1,0 +1,213 @@
+"""Meshes of a stage: simple shapes, files, their place in the world, and normals that look round."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool, Float, Float32, Float64, Int32, Int64
+from scipy.spatial.transform import Rotation
+
+from octasplat.engine.errors import ConfigError
+from octasplat.engine.files import read_mesh
+from octasplat.engine.geometry.mesh_material import MeshMaterial
+from octasplat.engine.geometry.triangle_mesh import edge_report
+from octasplat.engine.pathtracing.kernels.smooth_normals import smooth_normals
+from octasplat.engine.pathtracing.stage.model import Transformed
+
+SPHERE_DIVISIONS = 5
+WELD_TOLERANCE = 1e-6
+"""Points nearer than this share of the mesh's size are one, whatever the file says."""
+
+
+@dataclass(frozen=True)
+class MeshShape:
+    """Triangles in a frame of their own.
+
+    Attributes:
+        vertices: positions.
+        faces: three vertices each, anticlockwise from outside.
+        corner_uv: texture coordinates of the faces' corners, (0, 0) at the upper left, NaN where there are
+            none; None without any.
+        normals: of the vertices, NaN where they are not known; None without any.
+        corner_rgb_linear: colours of the faces' corners; None without any.
+        material_numbers: row of each face in ``materials``, -1 for none; None without any.
+        materials: of the file.
+    """
+
+    vertices: Float64[np.ndarray, "v 3"]
+    faces: Int64[np.ndarray, "f 3"]
+    corner_uv: Float32[np.ndarray, "f 3 2"] | None = None
+    normals: Float64[np.ndarray, "v 3"] | None = None
+    corner_rgb_linear: Float32[np.ndarray, "f 3 3"] | None = None
+    material_numbers: Int32[np.ndarray, " f"] | None = None
+    materials: tuple[MeshMaterial, ...] = ()
+
+
+def primitive_shape(name: str) -> MeshShape:
+    """A ``sphere`` of radius 1, a ``cube`` from -1 to 1, or a ``plane`` from -1 to 1 whose normal is y."""
+    return {"sphere": _sphere, "cube": _cube, "plane": _plane}[name]()
+
+
+def read_shape(path: Path) -> MeshShape:
+    """The triangles of a mesh file with what it says of their looks.
+
+    Raises:
+        SceneFileError: the file cannot be read.
+        ConfigError: it holds no triangles.
+    """
+    mesh = read_mesh(path, with_materials=True)
+    if len(mesh.triangles) == 0:
+        raise ConfigError(f"{path}: holds no triangles, so that light has nothing to fall on.")
+    return MeshShape(
+        mesh.vertices,
+        mesh.triangles,
+        mesh.corner_uv,
+        None if mesh.normals is None else mesh.normals.astype(np.float64),
+        None if mesh.rgb_linear is None else mesh.rgb_linear[mesh.triangles],
+        mesh.material_indices,
+        mesh.materials,
+    )
+
+
+def rotation_matrix(degrees: tuple[float, float, float]) -> Float64[np.ndarray, "3 3"]:
+    """Turns about the fixed axes x, then y, then z."""
+    matrix = np.eye(3)
+    for axis, angle in enumerate(np.radians(degrees)):
+        turn = np.eye(3)
+        a, b = (axis + 1) % 3, (axis + 2) % 3
+        turn[a, a] = turn[b, b] = np.cos(angle)
+        turn[b, a], turn[a, b] = np.sin(angle), -np.sin(angle)
+        matrix = turn @ matrix
+    return matrix
+
+
+def align_axis_to_up(axis: str, up_world: Float64[np.ndarray, "3"]) -> Float64[np.ndarray, "3 3"]:
+    """The shortest turn that takes an axis (``y``, ``-z``, ...) to a direction; ``world`` turns nothing.
+
+    Opposite directions turn about x, or about y where the axis is x: glTF's y to COLMAP's -y is the half
+    turn about x that the project's own GLB files are written with.
+    """
+    if axis == "world":
+        return np.eye(3)
+    place = "xyz".index(axis[-1])
+    start = np.eye(3)[place] * (-1.0 if axis.startswith("-") else 1.0)
+    end = up_world / np.linalg.norm(up_world)
+    cosine = float(start @ end)
+    if cosine < -1 + 1e-9:
+        return np.diag([-1.0, 1.0, -1.0]) if place == 0 else np.diag([1.0, -1.0, -1.0])
+    v = np.cross(start, end)
+    cross = np.array([[0, -v[2], v[1]], [v[2], 0, -v[0]], [-v[1], v[0], 0]])
+    return np.eye(3) + cross + cross @ cross / (1 + cosine)
+
+
+def up_axis_rotation(
+    axis: str, degrees: float, up_world: Float64[np.ndarray, "3"]
+) -> Float64[np.ndarray, "3 3"]:
+    """The turn of :func:`align_axis_to_up`, and then one about up, anticlockwise seen from above."""
+    up = up_world / np.linalg.norm(up_world)
+    return np.asarray(
+        Rotation.from_rotvec(np.radians(degrees) * up).as_matrix() @ align_axis_to_up(axis, up_world)
+    )
+
+
+def transform_points(
+    points: Float64[np.ndarray, "n 3"],
+    placement: Transformed,
+    rotation: Float64[np.ndarray, "3 3"] | None = None,
+) -> Float64[np.ndarray, "n 3"]:
+    """Points scaled along their own axes, turned by a matrix to the world's, turned as stated, and moved."""
+    whole = rotation_matrix(placement.rotation_degrees) @ (np.eye(3) if rotation is None else rotation)
+    return points * np.array(placement.scale) @ whole.T + np.array(placement.position)
+
+
+def transform_normals(
+    normals: Float64[np.ndarray, "n 3"], placement: Transformed, rotation: Float64[np.ndarray, "3 3"]
+) -> Float32[np.ndarray, "n 3"]:
+    """Normals of points that are :func:`transform_points`, unit vectors; NaN where one has no length."""
+    turned = normals / np.array(placement.scale) @ (rotation_matrix(placement.rotation_degrees) @ rotation).T
+    lengths = np.linalg.norm(turned, axis=1, keepdims=True)
+    return np.asarray((turned / np.where(lengths > 1e-12, lengths, np.nan)).astype(np.float32))
+
+
+def corner_normals(
+    corners_world: Float[np.ndarray, "f 3 3"], smooth_degrees: float
+) -> Float32[np.ndarray, "f 3 3"]:
+    """Normals at the corners of faces: those of neighbours across edges up to an angle are averaged."""
+    points = corners_world.reshape(-1, 3).astype(np.float64)
+    size = max(float(np.ptp(points, axis=0).max(initial=0.0)), 1e-30)
+    _, owner = np.unique(
+        np.round(points / (WELD_TOLERANCE * size)).astype(np.int64), axis=0, return_inverse=True
+    )
+    order = np.argsort(owner.reshape(-1), kind="stable")
+    counts = np.bincount(owner.reshape(-1))
+    starts = np.concatenate([[0], np.cumsum(counts)])
+    normals = np.empty(corners_world.shape, np.float32)
+    least = -2.0 if smooth_degrees >= 180 else np.cos(np.radians(smooth_degrees)) - 1e-9
+    smooth_normals(corners_world.astype(np.float64), order, starts, least, normals)
+    return normals
+
+
+def count_open_edges(shape: MeshShape, face_mask: Bool[np.ndarray, " f"] | None = None) -> int:
+    """Edges that are not shared by two faces that wind alike, of all faces or of some; closed means none.
+
+    Vertices that lie in one place count as one, as in files that repeat them for normals and textures.
+    """
+    size = max(float(np.ptp(shape.vertices, axis=0).max()), 1e-30)
+    _, owner = np.unique(
+        np.round(shape.vertices / (WELD_TOLERANCE * size)).astype(np.int64), axis=0, return_inverse=True
+    )
+    faces = owner.reshape(-1)[shape.faces if face_mask is None else shape.faces[face_mask]].astype(np.int32)
+    sound = (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
+    report = edge_report(faces[sound])
+    return report.open_edges + report.non_manifold_edges + report.inconsistent_edges
+
+
+def _sphere() -> MeshShape:
+    """An icosahedron whose triangles are cut into four again and again."""
+    golden = (1 + 5**0.5) / 2
+    around = np.array([[-1, golden, 0], [1, golden, 0], [-1, -golden, 0], [1, -golden, 0]])
+    vertices = np.concatenate([around, np.roll(around, 1, axis=1), np.roll(around, 2, axis=1)])
+    faces = np.array(
+        [[0, 11, 5], [0, 5, 1], [0, 1, 7], [0, 7, 10], [0, 10, 11], [1, 5, 9], [5, 11, 4], [11, 10, 2],
+         [10, 7, 6], [7, 1, 8], [3, 9, 4], [3, 4, 2], [3, 2, 6], [3, 6, 8], [3, 8, 9], [4, 9, 5], [2, 4, 11],
+         [6, 2, 10], [8, 6, 7], [9, 8, 1]]
+    )  # fmt: skip
+    for _ in range(SPHERE_DIVISIONS):
+        edges = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+        unique, place = np.unique(edges, axis=0, return_inverse=True)
+        middle = place.reshape(-1, 3) + len(vertices)
+        vertices = np.concatenate([vertices, vertices[unique].mean(axis=1)])
+        a, b, c = faces.T
+        ab, bc, ca = middle.T
+        faces = np.concatenate(
+            [np.stack(t, axis=1) for t in ((a, ab, ca), (b, bc, ab), (c, ca, bc), (ab, bc, ca))]
+        )
+    vertices = vertices / np.linalg.norm(vertices, axis=1, keepdims=True)
+    corners = vertices[faces]
+    u = 0.5 + np.arctan2(corners[..., 0], corners[..., 2]) / (2 * np.pi)
+    u = np.where(u.max(axis=1, keepdims=True) - u > 0.5, u + 1, u)  # faces across the seam
+    uv = np.stack([u, np.arccos(np.clip(corners[..., 1], -1, 1)) / np.pi], axis=-1)
+    return MeshShape(vertices, faces.astype(np.int64), uv.astype(np.float32), vertices)
+
+
+def _cube() -> MeshShape:
+    vertices: list[Float64[np.ndarray, 3]] = []
+    faces: list[list[int]] = []
+    uv: list[list[list[int]]] = []
+    for axis in range(3):
+        for sign in (-1.0, 1.0):
+            n = np.eye(3)[axis] * sign
+            u = np.roll(n, 1) if sign > 0 else np.roll(-n, 2)
+            w = np.cross(n, u)
+            first = len(vertices)
+            vertices += [n - u - w, n + u - w, n + u + w, n - u + w]
+            faces += [[first, first + 1, first + 2], [first, first + 2, first + 3]]
+            square = [[0, 1], [1, 1], [1, 0], [0, 0]]
+            uv += [[square[0], square[1], square[2]], [square[0], square[2], square[3]]]
+    return MeshShape(np.array(vertices), np.array(faces, np.int64), np.array(uv, np.float32))
+
+
+def _plane() -> MeshShape:
+    vertices = np.array([[-1.0, 0, 1], [1, 0, 1], [1, 0, -1], [-1, 0, -1]])
+    uv = np.array([[[0, 1], [1, 1], [1, 0]], [[0, 1], [1, 0], [0, 0]]], np.float32)
+    return MeshShape(vertices, np.array([[0, 1, 2], [0, 2, 3]], np.int64), uv)

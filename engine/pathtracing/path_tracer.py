@@ -1,0 +1,436 @@
+"""The path tracer: waves of rays through meshes and Gaussians, from surface to surface."""
+
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+from queue import Queue
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float32, Float64, Int32, Int64
+
+from octasplat.engine.pathtracing.compile_meshes import CompiledMeshes, compile_meshes
+from octasplat.engine.pathtracing.denoising import load_denoiser
+from octasplat.engine.pathtracing.film import Film
+from octasplat.engine.pathtracing.gaussian_layers import GaussianLayers
+from octasplat.engine.pathtracing.kernels.gaussian_layer import add_layer_light, intersect_gaussian_layers
+from octasplat.engine.pathtracing.kernels.gaussian_surface import (
+    intersect_gaussian_surfaces,
+    start_paths_at_surfaces,
+)
+from octasplat.engine.pathtracing.kernels.kernel_args import (
+    BLOCK_SIZE,
+    CameraRays,
+    IntegratorParameters,
+    PathArrays,
+    PathScratch,
+    ShadowRayArrays,
+    SurfaceInteractions,
+    allocate_path_scratch,
+    allocate_paths,
+    allocate_shadow_rays,
+)
+from octasplat.engine.pathtracing.kernels.path_surfaces import add_direct_light, shade_surfaces, start_paths
+from octasplat.engine.pathtracing.kernels.shadow_rays import shadow_transmittance
+from octasplat.engine.pathtracing.kernels.trace_paths import trace_paths
+from octasplat.engine.pathtracing.stage.model import Integrator, Stage
+from octasplat.engine.rays import ImageRays, RayBatch
+from octasplat.engine.render.renderer import tile_order
+from octasplat.engine.threads import use_threads
+from octasplat.engine.trace.protocol import Tracer
+
+PATHS_PER_WAVE = 1 << 18
+"""Paths that are traced together through Gaussians."""
+PATHS_PER_THREAD = 1 << 14
+"""Paths that a thread follows by itself among meshes alone."""
+MIN_TILE_PIXELS = 64
+MIN_ROWS_PER_THREAD = 8192
+INFINITE_T_MAX = np.full(1, np.inf, np.float32)
+
+ProgressCallback = Callable[[int, int], None]
+
+
+@dataclass(frozen=True)
+class PathTracerScene:
+    """Everything that a ray can meet.
+
+    Attributes:
+        meshes: with materials, lights and surroundings.
+        layers: the Gaussians; None without any.
+        background_linear: radiance from where there is neither a mesh, nor Gaussians, nor an environment.
+        environment_only: the environment without meshes and lights, for the plate of layered pictures.
+    """
+
+    meshes: CompiledMeshes
+    layers: GaussianLayers | None = None
+    background_linear: Float64[np.ndarray, "3"] | None = None
+    environment_only: CompiledMeshes | None = None
+
+
+class PathTracer:
+    """Traces paths through a scene of meshes, lights and Gaussians.
+
+    A path is a pure function of the seed, its pixel and its number, so that the number of threads changes
+    nothing.
+
+    Args:
+        scene: what there is.
+        settings: how to trace.
+        threads: for the kernels; 0 takes all.
+
+    Raises:
+        ConfigError: noise is to be taken away, and what can do so is not installed.
+    """
+
+    def __init__(self, scene: PathTracerScene, settings: Integrator, *, threads: int = 0) -> None:
+        self._scene = scene
+        self._settings = settings
+        self._threads = use_threads(threads)
+        self._pool = ThreadPoolExecutor(self._threads)
+        self._scratches = allocate_path_scratch(self._threads)
+        background = np.zeros(3) if scene.background_linear is None else scene.background_linear
+        self._integrator = IntegratorParameters(
+            settings.seed,
+            settings.max_depth,
+            settings.roulette_depth,
+            np.inf if settings.clamp is None else settings.clamp,
+            settings.anti_aliasing,
+            scene.meshes.environment_visible,
+            background.astype(np.float64),
+        )
+        self._denoise = load_denoiser() if settings.denoise else None
+        self._plate: PathTracer | None = None
+        if settings.layers:
+            plain = settings.model_copy(update={"layers": False, "denoise": False})
+            empty = scene.environment_only or compile_meshes(Stage(), Path(), threads=threads)
+            alone = PathTracerScene(empty, scene.layers, scene.background_linear)
+            self._plate = PathTracer(alone, plain, threads=threads)
+
+    def render(
+        self,
+        image: ImageRays,
+        progress: ProgressCallback = lambda _done, _total: None,
+    ) -> Film:
+        """All samples of a picture.
+
+        Args:
+            image: rays through the centres of its pixels.
+            progress: told (batches done, batches in all).
+        """
+        film = self._make_film(image)
+        self.add_samples(film, image, 0, self._settings.samples, progress)
+        return self._denoise_film(film)
+
+    def refine(self, image: ImageRays) -> Iterator[Film]:
+        """The same film again and again, each time with about twice as many samples, until it has all."""
+        film = self._make_film(image)
+        done = 0
+        while done < self._settings.samples:
+            more = min(max(1, done), self._settings.samples - done)
+            self.add_samples(film, image, done, more)
+            done += more
+            yield self._denoise_film(film)
+
+    def _make_film(self, image: ImageRays) -> Film:
+        return Film(
+            image.height_px,
+            image.width_px,
+            has_layers=self._plate is not None,
+            has_guides=self._denoise is not None,
+        )
+
+    def _denoise_film(self, film: Film) -> Film:
+        return film if self._denoise is None else film.denoised(self._denoise)
+
+    def add_samples(
+        self,
+        film: Film,
+        image: ImageRays,
+        first: int,
+        count: int,
+        progress: ProgressCallback = lambda _done, _total: None,
+    ) -> None:
+        """Add the samples ``first`` to ``first + count`` of every pixel to a film."""
+        if self._plate is not None and film.plate is not None:
+            self._plate.add_samples(film.plate, image, first, count)
+        use_threads(self._threads)
+        view = CameraRays(
+            image.origin_world.astype(np.float64),
+            image.directions_world,
+            _optical_axis(image.directions_world),
+            self._settings.aperture,
+            self._settings.focus_distance or 1.0,
+        )
+        order = tile_order(image.height_px, image.width_px)
+        together = PATHS_PER_THREAD if self._scene.layers is None else PATHS_PER_WAVE
+        # Always the same cut, as what is traced together may differ in the last digit.
+        at_once = min(count, together // MIN_TILE_PIXELS)
+        pixels = together // at_once // MIN_TILE_PIXELS * MIN_TILE_PIXELS
+        tops = range(0, len(order), pixels)
+        blocks = range(0, count, at_once)
+        done, whole = 0, len(tops) * len(blocks)
+        for sample in blocks:
+            batches = [
+                _Batch(top, order[top : top + pixels], min(at_once, count - sample), first + sample)
+                for top in tops
+            ]
+            work = self._trace_wavefront if self._scene.layers is not None else self._trace_per_thread
+            for _ in work(film, view, order, image.rays.t_min[:1], batches):
+                progress(done, whole)
+                done += 1
+        progress(whole, whole)
+
+    def _trace_per_thread(
+        self,
+        film: Film,
+        camera_rays: CameraRays,
+        order: Int64[np.ndarray, " n"],
+        t_min: Float32[np.ndarray, "1"],
+        batches: list["_Batch"],
+    ) -> Iterator[None]:
+        """Follow paths among meshes alone, a batch a thread; yields before each batch that is waited for."""
+        meshes = self._scene.meshes
+        given = (meshes.queries, meshes.surfaces, meshes.materials, meshes.lights)
+        environment = meshes.lights.environment_id
+        free: Queue[_Workspace] = Queue()
+        for scratch in self._scratches:
+            free.put(_Workspace.allocate(scratch))
+
+        def work(batch: _Batch) -> None:
+            room = free.get()
+            try:
+                paths = room.paths(len(batch.pixels) * batch.paths_per_pixel)
+                trace_paths(
+                    len(paths.keys), room.scratch, camera_rays, self._integrator, batch.first_pixel, batch.paths_per_pixel,
+                    batch.first_sample, order, t_min, INFINITE_T_MAX, paths, room.active, room.distances, room.faces,
+                    room.barycentrics, *given, environment, room.shadows, room.transmittance,
+                )  # fmt: skip
+                film.add(paths, batch.pixels)
+            finally:
+                free.put(room)
+
+        tasks = [self._pool.submit(work, batch) for batch in batches]
+        try:
+            for task in tasks:
+                yield
+                task.result()
+        finally:
+            for task in tasks:
+                task.cancel()
+
+    def _trace_wavefront(
+        self,
+        film: Film,
+        camera_rays: CameraRays,
+        order: Int64[np.ndarray, " n"],
+        t_min: Float32[np.ndarray, "1"],
+        batches: list["_Batch"],
+    ) -> Iterator[None]:
+        """Follow paths among Gaussians, all threads on one batch; yields before each."""
+        for batch in batches:
+            yield
+            paths = allocate_paths(len(batch.pixels) * batch.paths_per_pixel)
+            self._run_kernel(
+                start_paths, len(paths.keys), camera_rays, self._integrator, batch.first_pixel, batch.paths_per_pixel, batch.first_sample,
+                order, paths,
+            )  # fmt: skip
+            self._trace_paths(paths, t_min)
+            film.add(paths, batch.pixels)
+
+    def radiance(
+        self,
+        interactions: SurfaceInteractions,
+        pixels: Int64[np.ndarray, " n"],
+        samples: Int64[np.ndarray, " n"],
+    ) -> Float32[np.ndarray, "n 3"]:
+        """What points of surfaces send to who sees them, each by one path: linear, unbiased.
+
+        The surface of a point is not part of the scene unless that holds it too.
+
+        Args:
+            interactions: the points.
+            pixels: any number for each; with its sample it decides the path.
+            samples: number of each path among those of its pixel, below 65,536.
+        """
+        use_threads(self._threads)
+        meshes, layers = self._scene.meshes, self._scene.layers
+        count = len(interactions.points_world)
+        paths, shadows = allocate_paths(count), allocate_shadow_rays(count)
+        self._run_kernel(
+            start_paths_at_surfaces, count, interactions, pixels, samples, self._integrator, meshes.materials, meshes.lights,
+            paths, shadows,
+        )  # fmt: skip
+        every = np.arange(count, dtype=np.int32)
+        self._add_surface_light(paths, every, shadows, None if layers is None else layers.tracer)
+        self._trace_paths(paths, np.zeros(1, np.float32), every[paths.is_alive], first_depth=1)
+        return paths.radiance_linear
+
+    def _trace_paths(
+        self,
+        paths: PathArrays,
+        t_min: Float32[np.ndarray, "1"],
+        active: Int32[np.ndarray, " n"] | None = None,
+        first_depth: int = 0,
+    ) -> None:
+        """Follow paths to their ends; the camera sees nothing nearer than ``t_min``.
+
+        ``active`` are those that are left after they ``first_depth`` so many surfaces; None stands for all.
+        """
+        meshes, layers = self._scene.meshes, self._scene.layers
+        environment = meshes.lights.environment_id
+        active = np.arange(len(paths.keys), dtype=np.int32) if active is None else active
+        for depth in range(first_depth, self._integrator.max_depth + 1):
+            rays = RayBatch(
+                paths.origins_world if depth == 0 else paths.origins_world[active],
+                paths.directions_world if depth == 0 else paths.directions_world[active],
+                t_min if depth == 0 else 0.0,
+                t_viewer=0.0 if depth == 0 else paths.t_view_origin[active],
+            )
+            hits = meshes.triangles.closest(rays)
+            shadows = allocate_shadow_rays(len(active))
+            if layers is not None:
+                seen = layers.trace(rays, hits.distances)
+                if layers.has_material_surfaces:
+                    self._run_kernel(
+                        intersect_gaussian_surfaces, len(active), paths, active, depth, hits.faces, seen.rgb_srgb,
+                        seen.transmittance, seen.depth_median, seen.depth_sum, seen.normal_world,
+                        seen.features, meshes.materials, meshes.lights, self._integrator, layers.min_transmittance,
+                        shadows,
+                    )  # fmt: skip
+                    self._add_surface_light(paths, active, shadows, layers.tracer)
+                self._run_kernel(
+                    intersect_gaussian_layers, len(active), paths, active, depth, hits.distances, hits.faces,
+                    seen.rgb_srgb, seen.transmittance, seen.depth_median, seen.depth_sum, seen.normal_world,
+                    seen.features, meshes.lights, environment, self._integrator, meshes.materials.absorption,
+                    layers.min_transmittance, shadows,
+                )  # fmt: skip
+                self._add_layer_light(paths, active, shadows, layers)
+            self._run_kernel(
+                shade_surfaces, len(active),
+                paths, active, depth, hits.distances, hits.faces, hits.barycentrics,
+                meshes.surfaces, meshes.materials, meshes.lights, environment, self._integrator, shadows,
+            )  # fmt: skip
+            self._add_surface_light(
+                paths, active, shadows, None if layers is None else layers.mesh_shadow_tracer
+            )
+            active = active[paths.is_alive[active]]
+            if len(active) == 0:
+                return
+
+    def _shadow_transmittance(
+        self, shadows: ShadowRayArrays, *, passes_rough_glass: bool = False
+    ) -> Float32[np.ndarray, "n 3"]:
+        """The share of light that meshes let through on each ray."""
+        meshes, share = self._scene.meshes, np.empty_like(shadows.radiance_linear)
+        self._run_kernel(
+            shadow_transmittance, len(share), meshes.queries, meshes.surfaces, meshes.materials, shadows,
+            passes_rough_glass, share,
+        )  # fmt: skip
+        return share
+
+    def _add_surface_light(
+        self,
+        paths: PathArrays,
+        active: Int32[np.ndarray, " n"],
+        shadows: ShadowRayArrays,
+        casters: Tracer | None,
+    ) -> None:
+        """Add the light that reaches surfaces past meshes and the Gaussians of ``casters``."""
+        shadows.occluded_radiance_linear[:] = 0.0
+        share = self._shadow_transmittance(shadows)
+        free = np.flatnonzero(share.any(axis=1))
+        if casters is not None and len(free):
+            share[free] *= casters.transmittance(_shadow_ray_batch(shadows, free))[:, None]
+        self._run_kernel(add_direct_light, len(active), paths, active, shadows.radiance_linear, share)
+
+    def _add_layer_light(
+        self,
+        paths: PathArrays,
+        active: Int32[np.ndarray, " n"],
+        shadows: ShadowRayArrays,
+        layers: GaussianLayers,
+    ) -> None:
+        """Add the light that reaches layers of Gaussians, and take what meshes keep off them."""
+        asked = np.flatnonzero(
+            shadows.radiance_linear.any(axis=1) | shadows.occluded_radiance_linear.any(axis=1)
+        )
+        if len(asked) == 0:
+            return
+        share = self._shadow_transmittance(shadows, passes_rough_glass=True)[asked]
+        free, whole = share.any(axis=1), (share == 1.0).all(axis=1)
+        through = np.ones((2, len(asked)), np.float32)
+        for row, tracer in enumerate((layers.gaussian_shadow_tracer, layers.non_shadow_tracer)):
+            # What nobody keeps off needs no tracing where nothing else would count it.
+            needed = free if row == 0 else ~whole | (layers.gaussian_shadow_tracer is not None)
+            if tracer is not None and needed.any():
+                through[row, needed] = tracer.transmittance(
+                    _shadow_ray_batch(shadows, asked[needed], layers.shadow_bias)
+                )
+        self._run_kernel(
+            add_layer_light, len(asked), paths, active[asked], shadows.radiance_linear[asked], shadows.occluded_radiance_linear[asked],
+            share, through[0], through[1],
+        )  # fmt: skip
+
+    def _run_kernel(self, kernel: Callable[..., None], rows: int, *arguments: object) -> None:
+        """Let all threads work on the rows of a kernel. Numba's own loops cannot write to named tuples."""
+        parts = max(1, min(self._threads, rows // MIN_ROWS_PER_THREAD))
+        cuts = [rows * part // parts for part in range(parts + 1)]
+        work = zip(pairwise(cuts), self._scratches, strict=False)
+        if parts == 1:
+            kernel(0, rows, self._scratches[0], *arguments)
+            return
+        tasks = [self._pool.submit(kernel, *cut, scratch, *arguments) for cut, scratch in work]
+        for task in tasks:
+            task.result()
+
+
+class _Batch(NamedTuple):
+    """Paths that are followed together: ``paths_per_pixel`` of the pixels from place ``first_pixel`` on in their order."""
+
+    first_pixel: int
+    pixels: Int64[np.ndarray, " n"]
+    paths_per_pixel: int
+    first_sample: int
+
+
+@dataclass(frozen=True)
+class _Workspace:
+    """Where one thread keeps the paths that it follows, taken once as fresh memory costs time."""
+
+    scratch: PathScratch
+    all_paths: PathArrays
+    shadows: ShadowRayArrays
+    active: Int32[np.ndarray, " b"]
+    distances: Float32[np.ndarray, " b"]
+    faces: Int32[np.ndarray, " b"]
+    barycentrics: Float32[np.ndarray, "b 2"]
+    transmittance: Float32[np.ndarray, "b 3"]
+
+    @classmethod
+    def allocate(cls, scratch: PathScratch) -> "_Workspace":
+        return cls(
+            scratch, allocate_paths(PATHS_PER_THREAD), allocate_shadow_rays(BLOCK_SIZE), np.empty(BLOCK_SIZE, np.int32),
+            np.empty(BLOCK_SIZE, np.float32), np.empty(BLOCK_SIZE, np.int32), np.empty((BLOCK_SIZE, 2), np.float32),
+            np.empty((BLOCK_SIZE, 3), np.float32),
+        )  # fmt: skip
+
+    def paths(self, count: int) -> PathArrays:
+        """The first so many paths."""
+        return PathArrays(*(values[:count] for values in self.all_paths))
+
+
+def _shadow_ray_batch(
+    shadows: ShadowRayArrays, rows: Int64[np.ndarray, " n"], t_min: float = 0.0
+) -> RayBatch:
+    """Some of the shadow rays."""
+    return RayBatch(shadows.origins_world[rows], shadows.directions_world[rows], t_min, shadows.t_max[rows])
+
+
+def _optical_axis(directions_world: Float32[np.ndarray, "h w 3"]) -> Float64[np.ndarray, "3"]:
+    """The direction through the middle of the picture."""
+    height, width = directions_world.shape[:2]
+    middle = directions_world[(height - 1) // 2 : height // 2 + 1, (width - 1) // 2 : width // 2 + 1]
+    axis = middle.reshape(-1, 3).mean(axis=0, dtype=np.float64)
+    return np.asarray(axis / np.linalg.norm(axis))

@@ -1,0 +1,108 @@
+"""Scenes with materials in another light: what a camera sees of them under an environment."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+from jaxtyping import Float32, Float64
+
+from octasplat.engine.colour import linear_to_srgb
+from octasplat.engine.gaussians.model import FlatGaussians
+from octasplat.engine.pathtracing.compile_meshes import compile_meshes
+from octasplat.engine.pathtracing.environment import EnvironmentMap
+from octasplat.engine.pathtracing.gaussian_layers import build_gaussian_layers
+from octasplat.engine.pathtracing.lights import build_light_arrays, eval_environment_map
+from octasplat.engine.pathtracing.path_tracer import PathTracer, PathTracerScene
+from octasplat.engine.pathtracing.stage.model import Integrator, Stage, StageGaussians
+from octasplat.engine.rays import ImageRays
+from octasplat.engine.trace.protocol import TraceSettings
+
+ProgressCallback = Callable[[float], None]
+
+
+def no_progress(_share: float) -> None:
+    """Tell nobody."""
+
+
+@dataclass(frozen=True)
+class RelitImage:
+    """One picture, in front of nothing yet.
+
+    Attributes:
+        linear: radiance of what is seen of the scene, not multiplied by its coverage, without upper limit.
+        coverage: how much of each pixel the scene covers.
+    """
+
+    linear: Float32[np.ndarray, "h w 3"]
+    coverage: Float32[np.ndarray, "h w"]
+
+    def composite_over(
+        self, background_srgb: Float32[np.ndarray, "3"] | Float32[np.ndarray, "h w 3"]
+    ) -> Float32[np.ndarray, "h w 3"]:
+        """Display values over a background, composited as such; beyond 1 where there is more light."""
+        covered = self.coverage[..., None]
+        return np.asarray(covered * linear_to_srgb(self.linear) + (1 - covered) * background_srgb, np.float32)
+
+
+@runtime_checkable
+class Relighter(Protocol):
+    """Shows a scene in the light of an environment."""
+
+    def set_environment(self, environment: EnvironmentMap) -> None:
+        """Take this environment from now on."""
+        ...
+
+    def render(self, image: ImageRays, progress: ProgressCallback = no_progress) -> RelitImage:
+        """What a camera sees; ``progress`` is told the share that is done."""
+        ...
+
+
+class PathRelighter:
+    """By paths of light: right up to noise, with all shadows and inter-reflection.
+
+    Args:
+        gaussians: a scene with materials.
+        settings: where rays are cut off.
+        integrator: samples, depth and seed.
+        threads: to use; 0 takes all.
+    """
+
+    def __init__(
+        self, gaussians: FlatGaussians, settings: TraceSettings, integrator: Integrator, *, threads: int = 0
+    ) -> None:
+        stage = Stage(gaussians=(StageGaussians(light="relit"),), integrator=integrator)
+        self._layers = build_gaussian_layers(
+            stage, gaussians, _refuse_file, Path(), settings, size=1.0, threads=threads
+        )
+        self._meshes = compile_meshes(stage, Path(), threads=threads)
+        self._integrator = integrator
+        self._threads = threads
+        self._tracer: PathTracer | None = None
+
+    def set_environment(self, environment: EnvironmentMap) -> None:
+        """Take this environment from now on."""
+        lights = build_light_arrays((), environment.frame[1], environment)
+        meshes = self._meshes.with_lights(lights)
+        self._tracer = PathTracer(
+            PathTracerScene(meshes, self._layers), self._integrator, threads=self._threads
+        )
+
+    def render(self, image: ImageRays, progress: ProgressCallback = no_progress) -> RelitImage:
+        """What a camera sees; ``progress`` is told the share that is done."""
+        assert self._tracer is not None, "an environment must be put first"
+        film = self._tracer.render(image, lambda done, of: progress(done / of))
+        return RelitImage(*film.gaussian_surface())
+
+
+def render_environment(environment: EnvironmentMap, image: ImageRays) -> Float32[np.ndarray, "h w 3"]:
+    """Display values of the environment itself behind the pixels of a picture."""
+    lights = build_light_arrays((), environment.frame[1], environment)
+    directions: Float64[np.ndarray, "n 3"] = image.directions_world.reshape(-1, 3).astype(np.float64)
+    radiance, _ = eval_environment_map(lights, directions)
+    return linear_to_srgb(radiance).astype(np.float32).reshape(image.height_px, image.width_px, 3)
+
+
+def _refuse_file(path: Path) -> FlatGaussians:
+    raise AssertionError(f"{path}: nothing is read here")

@@ -1,0 +1,455 @@
+"""What a stage is: meshes, lights, an environment and Gaussian scenes that are rendered together.
+
+Positions and lengths are in world units, angles in degrees. Colours of materials and lights are display
+(sRGB-encoded) values in [0, 1] and turned into linear ones for the transport of light; strengths of lights
+are linear. Imports neither torch nor numba.
+"""
+
+import math
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+MAX_MESHES = 1000
+MAX_LIGHTS = 1000
+MAX_SCENES = 100
+
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+UnitInterval = Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)]
+Vector = tuple[Finite, Finite, Finite]
+Color = tuple[UnitInterval, UnitInterval, UnitInterval]
+WHITE = (1.0, 1.0, 1.0)
+
+
+class StageModel(BaseModel):
+    """Base of everything in a stage: unknown keys are refused, and nothing changes afterwards."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class NormalMapped(StageModel):
+    """A surface whose normals an image may change.
+
+    Attributes:
+        normal_texture: image file of normals in the frame of the texture coordinates: x to the right of the
+            image, y up in it, z off the surface, each from -1 to 1 as 0 to 1.
+        normal_scale: factor of x and y.
+    """
+
+    normal_texture: str | None = None
+    normal_scale: NonNegative = 1.0
+
+
+class Emissive(StageModel):
+    """A surface that may shine by itself, on both sides.
+
+    Attributes:
+        emission: linear radiance of its own light, the same in all directions; 0 for none.
+        emission_srgb: colour of that light.
+        emission_texture: image file of display colours, multiplied by it.
+    """
+
+    emission: NonNegative = 0.0
+    emission_srgb: Color = WHITE
+    emission_texture: str | None = None
+
+
+class Diffuse(NormalMapped, Emissive):
+    """A matt surface that sends light evenly everywhere.
+
+    Attributes:
+        colour_srgb: share of the light that it sends back.
+        texture: image file of display colours, multiplied by the colour.
+    """
+
+    kind: Literal["diffuse"] = "diffuse"
+    colour_srgb: Color = (0.8, 0.8, 0.8)
+    texture: str | None = None
+
+
+class Mirror(StageModel):
+    """A perfect mirror; white reflects everything."""
+
+    kind: Literal["mirror"] = "mirror"
+    colour_srgb: Color = WHITE
+
+
+class Glass(StageModel):
+    """Clear or frosted glass, for closed meshes.
+
+    Attributes:
+        ior: index of refraction; that of the surroundings is 1.
+        tint_srgb: colour that light takes at each surface that it passes.
+        absorption: what is absorbed inside in each linear channel, per world unit (Beer's law).
+        roughness: of its surface; perceptual, GGX's alpha is its square; below 0.03 it is smooth.
+        multiple_scattering: light that facets throw at each other is kept, not lost.
+    """
+
+    kind: Literal["glass"] = "glass"
+    ior: Annotated[float, Field(ge=1, le=4)] = 1.5
+    tint_srgb: Color = WHITE
+    absorption: tuple[NonNegative, NonNegative, NonNegative] = (0.0, 0.0, 0.0)
+    roughness: UnitInterval = 0.0
+    multiple_scattering: bool = True
+
+
+class Metal(NormalMapped):
+    """Metal with a microfacet surface (GGX).
+
+    Attributes:
+        colour_srgb: colour of what it reflects head-on.
+        roughness: perceptual, GGX's alpha is its square.
+        multiple_scattering: light that facets throw at each other is kept, not lost.
+    """
+
+    kind: Literal["metal"] = "metal"
+    colour_srgb: Color = (0.9, 0.9, 0.9)
+    roughness: UnitInterval = 0.2
+    multiple_scattering: bool = True
+
+
+class Dielectric(NormalMapped, Emissive):
+    """A coloured ground under a clear coat with a microfacet surface, such as plastic or glaze.
+
+    Attributes:
+        colour_srgb: of the ground.
+        texture: image file of the ground's display colours, multiplied by the colour.
+        roughness: of the coat; perceptual, GGX's alpha is its square.
+        ior: index of refraction of the coat.
+    """
+
+    kind: Literal["dielectric"] = "dielectric"
+    colour_srgb: Color = (0.8, 0.8, 0.8)
+    texture: str | None = None
+    roughness: UnitInterval = 0.3
+    ior: Annotated[float, Field(gt=1, le=4)] = 1.5
+
+
+class MetallicRoughness(NormalMapped, Emissive):
+    """glTF's material: a mixture of a dielectric and a metal.
+
+    Attributes:
+        colour_srgb: of the dielectric's ground and of the metal.
+        texture: image file of display colours, multiplied by the colour.
+        metallic: share of the metal.
+        roughness: perceptual, GGX's alpha is its square.
+        metallic_roughness_texture: image file with roughness in green and metallic in blue, multiplied by
+            the two numbers.
+        ior: index of refraction of the dielectric.
+        diffuse: how the ground shares light with the coat: ``coupled`` keeps all energy, ``burley`` is the
+            diffuse term of Disney's principled material, which does not quite.
+        multiple_scattering: light that facets throw at each other is kept, not lost.
+    """
+
+    kind: Literal["metallic-roughness"] = "metallic-roughness"
+    colour_srgb: Color = WHITE
+    texture: str | None = None
+    metallic: UnitInterval = 0.0
+    roughness: UnitInterval = 1.0
+    metallic_roughness_texture: str | None = None
+    ior: Annotated[float, Field(gt=1, le=4)] = 1.5
+    diffuse: Literal["coupled", "burley"] = "coupled"
+    multiple_scattering: bool = True
+
+
+Material = Annotated[
+    Diffuse | Mirror | Glass | Metal | Dielectric | MetallicRoughness,
+    Field(discriminator="kind"),
+]
+
+
+class Transformed(StageModel):
+    """Something with a place in the world: scaled first, then turned, then moved.
+
+    Attributes:
+        position: where its origin comes to lie.
+        rotation_degrees: about the world's x, then y, then z axis.
+        scale: one factor, or one for each axis of its own.
+    """
+
+    position: Vector = (0.0, 0.0, 0.0)
+    rotation_degrees: Vector = (0.0, 0.0, 0.0)
+    scale: Positive | tuple[Positive, Positive, Positive] = 1.0
+
+
+class RestingPlace(StageModel):
+    """A place on a surface of the Gaussians on which a mesh comes to stand.
+
+    Either a pixel of a photograph or a ray; where it meets the scene (the distance at which half of the
+    light is gone), the mesh's lowest point comes to lie, its middle above it.
+
+    Attributes:
+        view: name of a photograph of the run.
+        pixel: column and row in the photograph at its full size, from its upper left corner.
+        origin: of a ray.
+        direction: of the ray.
+    """
+
+    view: str | None = None
+    pixel: tuple[Finite, Finite] | None = None
+    origin: Vector | None = None
+    direction: Vector | None = None
+
+    @model_validator(mode="after")
+    def _check_one_source(self) -> "RestingPlace":
+        photograph = (self.view is not None, self.pixel is not None)
+        ray = (self.origin is not None, self.direction is not None)
+        if {photograph, ray} != {(True, True), (False, False)}:
+            raise ValueError("give either view and pixel, or origin and direction")
+        if self.direction is not None and not any(self.direction):
+            raise ValueError("the direction has no length")
+        return self
+
+
+class StageMesh(Transformed):
+    """A mesh from a file, or a simple shape.
+
+    Attributes:
+        file: OBJ, PLY or GLB.
+        shape: a ``sphere`` of radius 1, a ``cube`` from -1 to 1, or a ``plane`` from -1 to 1 across the
+            stage's up.
+        up_axis: which of the file's axes is turned to the stage's up; ``world`` leaves the file as it is.
+            By default y for GLB (glTF says so) and world for the others.
+        turn_degrees: about the stage's up, anticlockwise seen from above, before ``rotation_degrees``.
+        smooth_degrees: edges up to this angle are shaded as if they were round; 0 shows every facet. By
+            default the normals of the file are taken, or 30 where it has none.
+        material: what it is made of; by default what the file says of its materials and colours, or else a
+            matt grey.
+        on: a place in the scene on which it stands; its position counts from there.
+    """
+
+    file: str | None = None
+    shape: Literal["sphere", "cube", "plane"] | None = None
+    up_axis: Literal["world", "x", "-x", "y", "-y", "z", "-z"] | None = None
+    turn_degrees: Finite = 0.0
+    smooth_degrees: Annotated[float, Field(ge=0, le=180)] | None = None
+    material: Material | None = None
+    on: RestingPlace | None = None
+
+    @model_validator(mode="after")
+    def _check_one_source(self) -> "StageMesh":
+        if (self.file is None) == (self.shape is None):
+            raise ValueError("give either a file or a shape")
+        return self
+
+
+class LightModel(StageModel):
+    """What all lights have.
+
+    Attributes:
+        colour_srgb: of the light.
+        adds_light: whether it adds its light to shadowed Gaussians. Otherwise their colours hold it already,
+            and they only lose it where something new is in its way.
+    """
+
+    colour_srgb: Color = WHITE
+    adds_light: bool = False
+
+
+class PointLight(LightModel):
+    """Light from one point, or from a ball, to everywhere.
+
+    Attributes:
+        intensity: linear radiant intensity; at distance d it gives the irradiance intensity / d squared.
+        radius: of the ball, whose radiance is the intensity over its disc; 0 is a point, which casts hard
+            shadows.
+        visible: whether cameras, mirrors and glass see the ball, and other lights its shadow.
+    """
+
+    kind: Literal["point"] = "point"
+    position: Vector
+    intensity: NonNegative
+    radius: NonNegative = 0.0
+    visible: bool = True
+
+
+class SpotLight(LightModel):
+    """Light from one point into a cone.
+
+    Attributes:
+        direction: of the cone's axis.
+        outer_degrees: angle from the axis at which the light ends.
+        inner_degrees: angle up to which it has its full intensity; between the two it falls off with the
+            square of a linear function of the cosine, as in glTF's KHR_lights_punctual.
+    """
+
+    kind: Literal["spot"] = "spot"
+    position: Vector
+    direction: Vector
+    intensity: NonNegative
+    outer_degrees: Annotated[float, Field(gt=0, lt=90)] = 30.0
+    inner_degrees: Annotated[float, Field(ge=0, lt=90)] = 20.0
+
+    @model_validator(mode="after")
+    def _check_cone(self) -> "SpotLight":
+        if not any(self.direction):
+            raise ValueError("the direction has no length")
+        if self.inner_degrees >= self.outer_degrees:
+            raise ValueError("inner_degrees must be less than outer_degrees")
+        return self
+
+
+class DirectionalLight(LightModel):
+    """Parallel light from infinitely far away.
+
+    Attributes:
+        direction: the way that the light goes.
+        irradiance: linear, on a surface that faces the light.
+    """
+
+    kind: Literal["directional"] = "directional"
+    direction: Vector
+    irradiance: NonNegative
+
+    @model_validator(mode="after")
+    def _check_direction(self) -> "DirectionalLight":
+        if not any(self.direction):
+            raise ValueError("the direction has no length")
+        return self
+
+
+class RectangleLight(LightModel):
+    """A shining rectangle; its back is black.
+
+    Attributes:
+        position: its centre.
+        direction: the way that it faces.
+        width: along the side that is level with the stage's up.
+        height: along the other side.
+        radiance: linear, the same in all directions in front.
+        visible: whether cameras, mirrors and glass see the rectangle, and other lights its shadow.
+    """
+
+    kind: Literal["rectangle"] = "rectangle"
+    position: Vector
+    direction: Vector
+    width: Positive
+    height: Positive
+    radiance: NonNegative
+    visible: bool = True
+
+    @model_validator(mode="after")
+    def _check_direction(self) -> "RectangleLight":
+        if not any(self.direction):
+            raise ValueError("the direction has no length")
+        return self
+
+
+Light = Annotated[PointLight | SpotLight | DirectionalLight | RectangleLight, Field(discriminator="kind")]
+
+
+class Environment(StageModel):
+    """Light from all around.
+
+    Attributes:
+        file: equirectangular HDR or EXR image of linear radiance, the stage's up at its top.
+        rotation_degrees: turns the image about the stage's up.
+        strength: factor.
+        visible: whether the camera sees it; otherwise it only lights, and shows in mirrors and glass.
+    """
+
+    file: str
+    rotation_degrees: Finite = 0.0
+    strength: NonNegative = 1.0
+    visible: bool = True
+
+
+class StageGaussians(Transformed):
+    """A scene of Gaussians and how it takes part in the light.
+
+    Attributes:
+        file: splat file of any format; None for the scene that is rendered. Its scale is one number.
+        light: ``emissive`` shows the trained colours as they are; ``shadowed`` takes from them what the
+            meshes keep off of the stage's lights, and adds the light of those that add theirs, and of meshes
+            that shine; ``relit`` takes them as the albedo of a matt surface with
+            the octagons' normals that the stage's lights shine on.
+        ambient: share of the trained colour that is there without the stage's lights (shadowed, relit).
+        shadows_on_meshes: whether they keep light off the meshes.
+        shadows_on_gaussians: whether they keep light off the Gaussians. Trained colours hold the scene's
+            own shadows already.
+        shadow_bias: Gaussians nearer than this to a lit point cast no shadow on it, world units; None takes
+            3 % of the scene's size.
+    """
+
+    file: str | None = None
+    light: Literal["emissive", "shadowed", "relit"] = "shadowed"
+    ambient: UnitInterval = 0.4
+    shadows_on_meshes: bool = True
+    shadows_on_gaussians: bool = False
+    shadow_bias: NonNegative | None = None
+
+    @model_validator(mode="after")
+    def _check_one_scale(self) -> "StageGaussians":
+        if isinstance(self.scale, tuple):
+            raise ValueError("Gaussians have one scale; give one number")
+        return self
+
+
+class Integrator(StageModel):
+    """How the picture is computed.
+
+    Attributes:
+        samples: paths a pixel.
+        max_depth: most surfaces that a path meets.
+        roulette_depth: from this surface on paths may end by chance (russian roulette).
+        seed: of the random numbers.
+        anti_aliasing: paths begin all over the pixel rather than at its centre.
+        clamp: most linear radiance that one path brings by way of a matt or rough surface; None for no
+            limit. A limit makes the picture a little darker and takes away bright specks.
+        exposure: factor of the linear picture, in stops (2 to the power of it).
+        tone: curve from linear values to what is shown: ``none`` clips at 1.
+        aperture: diameter of the lens in world units; 0 shows everything sharp.
+        focus_distance: along the camera's axis, world units; what is there is sharp.
+        layers: pictures are EXR files with what a compositor needs: the scene, the shadows and the things.
+        denoise: noise is taken from what light brings, guided by colours and normals; the Gaussians' own
+            colours stay as they are. Needs the extra ``denoise``.
+    """
+
+    samples: Annotated[int, Field(ge=1, le=65536)] = 16
+    max_depth: Annotated[int, Field(ge=1, le=64)] = 8
+    roulette_depth: Annotated[int, Field(ge=1, le=64)] = 4
+    seed: Annotated[int, Field(ge=0, lt=1 << 31)] = 0
+    anti_aliasing: bool = True
+    clamp: Positive | None = None
+    exposure: Annotated[float, Field(ge=-20, le=20)] = 0.0
+    tone: Literal["none", "reinhard", "filmic"] = "none"
+    aperture: NonNegative = 0.0
+    focus_distance: Positive | None = None
+    layers: bool = False
+    denoise: bool = False
+
+    @model_validator(mode="after")
+    def _check_focus(self) -> "Integrator":
+        if self.aperture > 0 and self.focus_distance is None:
+            raise ValueError("an aperture needs a focus_distance")
+        return self
+
+
+class Stage(StageModel):
+    """Everything that is rendered together.
+
+    Attributes:
+        version: of the format.
+        up: the direction that is up in the world.
+        gaussians: Gaussian scenes; by default the one that is rendered.
+        meshes: things put among them.
+        lights: new lights.
+        environment: light from all around.
+        integrator: how the picture is computed.
+    """
+
+    version: Literal[1] = 1
+    up: Vector = (0.0, -1.0, 0.0)
+    gaussians: Annotated[tuple[StageGaussians, ...], Field(max_length=MAX_SCENES)] = (StageGaussians(),)
+    meshes: Annotated[tuple[StageMesh, ...], Field(max_length=MAX_MESHES)] = ()
+    lights: Annotated[tuple[Light, ...], Field(max_length=MAX_LIGHTS)] = ()
+    environment: Environment | None = None
+    integrator: Integrator = Integrator()
+
+    @model_validator(mode="after")
+    def _check_up(self) -> "Stage":
+        if not math.hypot(*self.up) > 1e-6:
+            raise ValueError("up has no length")
+        return self

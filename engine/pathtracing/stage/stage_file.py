@@ -1,0 +1,255 @@
+"""Stage files: TOML read and checked, and a commented one written. Imports neither torch nor numba."""
+
+import tomllib
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from pydantic import ValidationError
+
+from octasplat.engine.errors import ConfigError
+from octasplat.engine.pathtracing.stage.model import Stage
+from octasplat.engine.pathtracing.stage.sidecar_files import sidecar_files
+from octasplat.engine.writing import write_text
+
+MAX_STAGE_BYTES = 16 << 20
+TEXTURE_KEYS = ("texture", "metallic_roughness_texture", "normal_texture", "emission_texture")
+"""Keys of materials that name images."""
+
+
+def read_stage(path: Path) -> Stage:
+    """The stage of a TOML file, with the names of its files made relative to the file's folder.
+
+    Raises:
+        ConfigError: no such file, no TOML, an unknown key, a value out of range, or a file that it names
+            and that is not there.
+    """
+    try:
+        if path.stat().st_size > MAX_STAGE_BYTES:
+            raise ConfigError(f"{path}: is larger than {MAX_STAGE_BYTES >> 20} MB, which no stage needs.")
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path}: the stage cannot be read ({error}).") from None
+    stage = parse_stage(text, str(path))
+    for key, name in referenced_files(stage):
+        if not (path.parent / name).is_file():
+            raise ConfigError(f"{path}: {key}: there is no file {path.parent / name}.")
+    return stage
+
+
+def parse_stage(text: str, name: str) -> Stage:
+    """The stage of a TOML text; ``name`` is what errors call it.
+
+    Raises:
+        ConfigError: no TOML, an unknown key, or a value out of range.
+    """
+    try:
+        return Stage.model_validate(tomllib.loads(text))
+    except tomllib.TOMLDecodeError as error:
+        raise ConfigError(f"{name}: is no TOML: {error}.") from None
+    except ValidationError as error:
+        raise ConfigError(f"{name}: {_error_message(error)}") from None
+
+
+def referenced_files(stage: Stage) -> Iterator[tuple[str, str]]:
+    """The key and the name of every file that a stage names."""
+    if stage.environment is not None:
+        yield "environment.file", stage.environment.file
+    for number, scene in enumerate(stage.gaussians):
+        if scene.file is not None:
+            yield f"gaussians[{number}].file", scene.file
+    for number, mesh in enumerate(stage.meshes):
+        if mesh.file is not None:
+            yield f"meshes[{number}].file", mesh.file
+        for key in TEXTURE_KEYS:
+            texture = getattr(mesh.material, key, None)
+            if texture is not None:
+                yield f"meshes[{number}].material.{key}", texture
+
+
+def stage_identity(stage: Stage, folder: Path) -> tuple[object, ...]:
+    """Return what of a stage decides how a picture looks: itself, and the files that it brings.
+
+    Args:
+        stage: the stage.
+        folder: where the names of its files are relative to.
+    """
+    files = [folder / name for _, name in referenced_files(stage)]
+    return stage, files, [path.parent / name for path in files for name in sidecar_files(path)]
+
+
+def with_renamed_files(stage: Stage, names: Mapping[str, str]) -> Stage:
+    """The stage with its files under other names, by those that they have."""
+    content = stage.model_dump(mode="json")
+    for key, name in referenced_files(stage):
+        *path, last = key.replace("[", ".").replace("]", "").split(".")
+        place: Any = content
+        for part in path:
+            place = place[int(part) if part.isdigit() else part]
+        place[last] = names.get(name, name)
+    return Stage.model_validate(content)
+
+
+BALL_RADIUS_FRACTION = 0.12
+"""Radius of the first stage's ball."""
+
+
+@dataclass(frozen=True)
+class StageLayout:
+    """What a first stage of a scene is fitted to.
+
+    Attributes:
+        up: the direction that is up, a unit vector.
+        floor: a point on what the scene stands on, or on which a ball would stand that hangs free.
+        size: about as large as what the cameras look at, world units.
+        light_direction: the way that the scene's light seems to go.
+        has_floor: whether the scene shows anything level to stand on.
+    """
+
+    up: tuple[float, float, float]
+    floor: tuple[float, float, float]
+    size: float
+    light_direction: tuple[float, float, float]
+    has_floor: bool = True
+
+
+def write_stage_template(path: Path, layout: StageLayout) -> None:
+    """Write a commented stage for a scene: a ball on the floor, a light, and more to uncomment.
+
+    Raises:
+        OSError: the file cannot be written.
+    """
+    radius = BALL_RADIUS_FRACTION * layout.size
+    centre = tuple(p + radius * u for p, u in zip(layout.floor, layout.up, strict=True))
+    lamp = tuple(p - 2.0 * layout.size * d for p, d in zip(layout.floor, layout.light_direction, strict=True))
+    write_text(
+        path,
+        _TEMPLATE.format(
+            up=_format_vector(layout.up),
+            centre=_format_vector(centre),
+            floor=_format_vector(layout.floor),
+            where=BALL_ON_FLOOR if layout.has_floor else BALL_HANGING,
+            light=_format_vector(layout.light_direction),
+            lamp=_format_vector(lamp),
+            radius=f"{radius:.4g}",
+            half=f"{layout.size:.4g}",
+            intensity=f"{4.0 * layout.size**2:.4g}",
+        ),
+    )
+
+
+BALL_ON_FLOOR = "A ball on what seems to be the floor, at"
+BALL_HANGING = "No floor is to be seen: a ball that hangs before what the cameras look at, above"
+
+
+def _format_vector(values: tuple[float, ...]) -> str:
+    return "[" + ", ".join(f"{value:.4g}" for value in values) + "]"
+
+
+def _error_message(error: ValidationError) -> str:
+    """The first thing that is wrong, with the key as one would look for it in the file."""
+    first = error.errors()[0]
+    return stage_error_message(first["type"], stage_key_path(first["loc"]), first["msg"], first.get("input"))
+
+
+def stage_key_path(location: Sequence[int | str]) -> tuple[int | str, ...]:
+    """Where pydantic finds a fault in a stage, as the keys of the file.
+
+    The kinds of a union stand in the location too, but are no keys.
+    """
+    return tuple(part for number, part in enumerate(location) if number == 0 or part not in _UNION_TAGS)
+
+
+def stage_error_message(kind: str, keys: Sequence[int | str], message: str, value: object) -> str:
+    """One of pydantic's faults as a sentence.
+
+    Args:
+        kind: of the fault, as pydantic calls it.
+        keys: where it is.
+        message: pydantic's own.
+        value: what is there.
+    """
+    key = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in keys).removeprefix(".")
+    if kind == "extra_forbidden":
+        return f"there is no key {key}; see docs/light.md for those that there are."
+    message = message.removeprefix("Value error, ")
+    if kind in ("too_long", "missing", "value_error"):
+        return f"{key or 'the stage'}: {message}."
+    return f"{key}: {message} (it is {str(value)[:60]})."
+
+
+_UNION_TAGS = (
+    "diffuse", "mirror", "glass", "metal", "dielectric", "metallic-roughness", "point", "spot",
+    "directional", "rectangle", "float", "constrained-float",
+)  # fmt: skip
+
+_TEMPLATE = """\
+# A stage: things, lights and how the scene takes part. Lengths are in the scene's units, colours are
+# display values from 0 to 1, files are relative to this one. Everything that can be set: docs/light.md.
+version = 1
+up = {up}
+
+# How the scene takes light. emissive: as trained; shadowed: darker where a new thing keeps light off;
+# relit: its colours lit by nothing but the lights below and the ambient share.
+[[gaussians]]
+light = "shadowed"
+ambient = 0.4                    # what is left of the colour in full shadow
+shadows_on_meshes = true
+
+# {where} {floor}.
+[[meshes]]
+shape = "sphere"                 # or: file = "thing.obj"
+position = {centre}
+scale = {radius}
+smooth_degrees = 180
+material = {{ kind = "glass", ior = 1.5 }}
+# material = {{ kind = "mirror" }}
+# material = {{ kind = "metal", colour_srgb = [0.95, 0.8, 0.5], roughness = 0.25 }}
+# material = {{ kind = "dielectric", colour_srgb = [0.7, 0.1, 0.1], roughness = 0.2 }}
+# To stand on what a pixel of a photograph shows (its position then counts from there):
+# on = {{ view = "0001.jpg", pixel = [200, 300] }}
+
+# A mirror for a floor.
+# [[meshes]]
+# shape = "plane"
+# position = {floor}
+# scale = {half}
+# material = {{ kind = "mirror", colour_srgb = [0.9, 0.9, 0.9] }}
+
+# The light, from where it seems to come in the photographs.
+[[lights]]
+kind = "directional"
+direction = {light}
+irradiance = 2.0
+
+# A lamp that is a rectangle casts soft shadows.
+# [[lights]]
+# kind = "rectangle"
+# position = {lamp}
+# direction = {light}
+# width = {half}
+# height = {half}
+# radiance = 8.0
+# visible = false
+
+# [[lights]]
+# kind = "point"
+# position = {lamp}
+# intensity = {intensity}
+# radius = 0.0                    # larger makes its shadows soft
+# adds_light = true               # it is new: not yet in the colours of the photographs
+
+# [environment]
+# file = "studio.hdr"
+# rotation_degrees = 0
+# strength = 1.0
+# visible = false                # the camera sees the scene's own background
+
+[integrator]
+samples = 16                     # a pixel; more is smoother and slower
+max_depth = 8
+clamp = 20.0                     # keeps single paths from leaving bright specks
+exposure = 0.0                   # stops
+tone = "none"                    # or "reinhard", "filmic"
+"""

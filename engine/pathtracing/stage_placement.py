@@ -1,0 +1,191 @@
+"""Where things go in a scene: where one can stand, what a pixel shows, where the light comes from."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float32, Float64
+from scipy.spatial import cKDTree
+
+from octasplat.engine.errors import ConfigError
+from octasplat.engine.gaussians.model import FlatGaussians
+from octasplat.engine.pathtracing.compile_meshes import load_mesh_shape, mesh_up_axis
+from octasplat.engine.pathtracing.mesh_shapes import transform_points, up_axis_rotation
+from octasplat.engine.pathtracing.stage.model import RestingPlace, Stage
+from octasplat.engine.pathtracing.stage.stage_file import BALL_RADIUS_FRACTION, StageLayout
+from octasplat.engine.rays import RayBatch
+from octasplat.engine.trace.protocol import Tracer
+
+Ray = tuple[Float64[np.ndarray, "3"], Float64[np.ndarray, "3"]]
+RayOfPixel = Callable[[str, tuple[float, float]], Ray]
+
+LEVEL_COSINE = 0.9
+MAX_FLOOR_SPOTS = 256
+MIN_OPACITY = 0.3
+MIN_LEVEL_FRACTION = 0.08
+"""Share of the surface at the floor's height that looks up; of a scene without a floor it is some 0.05, as if
+surfaces looked anywhere, of a crumpled blanket 0.11, of a table with things on it one half."""
+HANGING_FRACTIONS = (0.2, 0.3, 0.4, 0.5, 0.6)
+"""Where a ball hangs free, on the way from what the cameras look at to the middle of them."""
+
+
+def place_resting_meshes(
+    stage: Stage, tracer: Tracer | None, ray_of_pixel: RayOfPixel, folder: Path
+) -> Stage:
+    """The stage with the meshes that rest ``on`` something moved there.
+
+    Raises:
+        ConfigError: the stage has no Gaussians, a ray meets nothing, or a photograph is not known.
+    """
+    up = np.array(stage.up) / np.linalg.norm(stage.up)
+    meshes = list(stage.meshes)
+    for number, mesh in enumerate(stage.meshes):
+        if mesh.on is None:
+            continue
+        key = f"meshes[{number}].on"
+        if tracer is None:
+            raise ConfigError(f"{key}: there are no Gaussians on which it could stand.")
+        spot = _resting_point(mesh.on, tracer, ray_of_pixel, key)
+        shape = load_mesh_shape(mesh, number, folder)
+        points = transform_points(
+            shape.vertices, mesh, up_axis_rotation(mesh_up_axis(mesh), mesh.turn_degrees, up)
+        ) - np.array(mesh.position)
+        heights = points @ up
+        middle = (points.min(axis=0) + points.max(axis=0)) / 2
+        foot = middle - (middle @ up - heights.min()) * up
+        position = spot - foot + np.array(mesh.position)
+        meshes[number] = mesh.model_copy(update={"position": tuple(float(x) for x in position), "on": None})
+    return stage.model_copy(update={"meshes": tuple(meshes)})
+
+
+def _resting_point(
+    rest: RestingPlace, tracer: Tracer, ray_of_pixel: RayOfPixel, key: str
+) -> Float64[np.ndarray, "3"]:
+    """The point of the Gaussians on which something comes to rest."""
+    if rest.view is not None and rest.pixel is not None:
+        origin, direction = ray_of_pixel(rest.view, rest.pixel)
+        what = f"pixel {rest.pixel[0]:g}, {rest.pixel[1]:g} of {rest.view}"
+    else:
+        origin, direction = np.array(rest.origin), np.array(rest.direction)
+        what = "the ray"
+    direction = direction / np.linalg.norm(direction)
+    seen = tracer.trace(RayBatch(origin[None], direction[None].astype(np.float32)))
+    if not seen.depth_median[0] > 0:
+        raise ConfigError(f"{key}: {what} meets nothing solid; choose another.")
+    return np.asarray(origin + float(seen.depth_median[0]) * direction)
+
+
+def estimate_stage_layout(
+    gaussians: FlatGaussians,
+    tracer: Tracer,
+    up_world: Float64[np.ndarray, "3"],
+    centre_world: Float64[np.ndarray, "3"],
+    size: float,
+    cameras_world: Float64[np.ndarray, "c 3"],
+) -> StageLayout:
+    """What a first stage is fitted to.
+
+    Args:
+        gaussians: of the scene.
+        tracer: of the same Gaussians.
+        up_world: up.
+        centre_world: of what the cameras look at.
+        size: about as large as that, world units.
+        cameras_world: where some of the cameras are.
+    """
+    up = up_world / np.linalg.norm(up_world)
+    near = np.linalg.norm(gaussians.means_world - centre_world, axis=1) < 1.5 * size
+    some = gaussians.select(near & (gaussians.opacities > MIN_OPACITY))
+    if len(some) < 10:
+        return _stage_layout(up, centre_world, size, -up)
+    normals = some.rotations[:, :, 0].astype(np.float64)
+    towards = cameras_world.mean(axis=0) - some.means_world
+    normals *= np.where((normals * towards).sum(axis=1) < 0, -1.0, 1.0)[:, None]
+    area = (some.opacities * np.exp(some.log_scales.sum(axis=1))).astype(np.float64)
+    spots, standing = _find_floor(some.means_world.astype(np.float64), normals @ up, area, up, size)
+    # Somewhat above the spot, so that the surface itself is not in the way.
+    ways = [RayBatch.between(camera[None], spots + 0.05 * size * up) for camera in cameras_world]
+    seen = np.mean([tracer.transmittance(way) for way in ways], axis=0)
+    free = np.full(len(spots), 0.3 * size)
+    if len(standing):
+        free = np.minimum(cKDTree(standing).query(spots)[0], free)
+    away = np.linalg.norm(spots - centre_world, axis=1)
+    floor = spots[np.argmax(size * seen + free - 0.7 * away)]
+    light = -_estimate_light_direction(some.base_rgb_srgb, normals, area, up)
+    if (
+        level_fraction(some.means_world @ up, normals @ up, area, float(spots[0] @ up), size)
+        >= MIN_LEVEL_FRACTION
+    ):
+        return _stage_layout(up, floor, size, light)
+    places = centre_world + np.array(HANGING_FRACTIONS)[:, None] * (cameras_world.mean(axis=0) - centre_world)
+    seen = np.mean([tracer.transmittance(RayBatch.between(c[None], places)) for c in cameras_world], axis=0)
+    hanging = places[np.argmax(seen > 0.9 * seen.max())]
+    return replace(
+        _stage_layout(up, hanging - BALL_RADIUS_FRACTION * size * up, size, light), has_floor=False
+    )
+
+
+def level_fraction(
+    heights: Float64[np.ndarray, " n"],
+    cosines: Float64[np.ndarray, " n"],
+    area: Float64[np.ndarray, " n"],
+    height: float,
+    size: float,
+) -> float:
+    """Share of the surface about a height that looks up."""
+    near = np.abs(heights - height) < 0.05 * size
+    return float(area[near & (cosines > LEVEL_COSINE)].sum() / max(area[near].sum(), 1e-30))
+
+
+def _find_floor(
+    points: Float64[np.ndarray, "n 3"],
+    cosines: Float64[np.ndarray, " n"],
+    area: Float64[np.ndarray, " n"],
+    up: Float64[np.ndarray, "3"],
+    size: float,
+) -> tuple[Float64[np.ndarray, "s 3"], Float64[np.ndarray, "k 3"]]:
+    """Spots on the height at which most of the level surface lies, and the points that stand on it."""
+    heights = points @ up
+    level = cosines > LEVEL_COSINE
+    if not level.any():
+        level = np.ones(len(points), bool)
+    bins = np.linspace(heights.min(), heights.max() + 1e-9, 65)
+    counts = np.histogram(heights[level], bins, weights=area[level])[0]
+    peak = int(np.argmax(np.convolve(counts, [0.5, 1.0, 0.5], mode="same")))
+    height = (bins[peak] + bins[peak + 1]) / 2
+    on_floor = np.flatnonzero(level & (np.abs(heights - height) < 0.05 * size))
+    if len(on_floor) == 0:
+        on_floor = np.flatnonzero(level)
+    spots = points[on_floor[:: max(1, len(on_floor) // MAX_FLOOR_SPOTS)]]
+    spots = spots + (height - spots @ up)[:, None] * up
+    return spots, points[heights > height + 0.06 * size]
+
+
+def _estimate_light_direction(
+    rgb_srgb: Float32[np.ndarray, "n 3"],
+    normals: Float64[np.ndarray, "n 3"],
+    area: Float64[np.ndarray, " n"],
+    up: Float64[np.ndarray, "3"],
+) -> Float64[np.ndarray, "3"]:
+    """The direction in which surfaces look that are brighter than others, no lower than 30 degrees."""
+    bright = rgb_srgb.astype(np.float64).mean(axis=1)
+    matrix = np.concatenate([np.ones((len(bright), 1)), normals], axis=1)
+    weights = np.sqrt(np.minimum(area, np.quantile(area, 0.95)))
+    towards = np.linalg.lstsq(matrix * weights[:, None], bright * weights, rcond=None)[0][1:]
+    level = towards - (towards @ up) * up
+    height = max(towards @ up, 0.6 * float(np.linalg.norm(level)), 1e-9)
+    towards = level + height * up
+    return np.asarray(towards / np.linalg.norm(towards))
+
+
+def _stage_layout(
+    up: Float64[np.ndarray, "3"],
+    floor: Float64[np.ndarray, "3"],
+    size: float,
+    light: Float64[np.ndarray, "3"],
+) -> StageLayout:
+    def three(values: Float64[np.ndarray, "3"]) -> tuple[float, float, float]:
+        return float(values[0]), float(values[1]), float(values[2])
+
+    return StageLayout(three(up), three(floor), size, three(light))

@@ -1,0 +1,139 @@
+"""Pictures and films of a stage."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from octasplat.engine.colour import srgb_to_linear
+from octasplat.engine.events import Listener
+from octasplat.engine.pathtracing.compile_meshes import CompiledMeshes, check_outside_glass, compile_meshes
+from octasplat.engine.pathtracing.film import StageImage
+from octasplat.engine.pathtracing.gaussian_layers import build_gaussian_layers
+from octasplat.engine.pathtracing.path_tracer import PathTracer, PathTracerScene
+from octasplat.engine.pathtracing.stage.model import Integrator, Stage
+from octasplat.engine.pathtracing.stage_placement import place_resting_meshes
+from octasplat.engine.pathtracing.stage_scene import SIZE_PER_RADIUS, StageScene
+from octasplat.engine.render.image_files import write_exr, write_png
+from octasplat.engine.render.shots import RenderFn, Shot
+from octasplat.engine.stages import counted_stage
+
+
+@dataclass(frozen=True)
+class StageRenderer:
+    """A stage that is ready to be rendered.
+
+    Attributes:
+        tracer: of the stage.
+        settings: how to trace.
+    """
+
+    tracer: PathTracer
+    settings: Integrator
+
+    @property
+    def render_fn(self) -> RenderFn:
+        """What renders a shot to a file."""
+        return stage_render_fn(self.tracer, self.settings)
+
+    def preview(self, shot: Shot, output: Path, progress: Listener) -> None:
+        """Render one shot to a file, finer and finer.
+
+        Raises:
+            OutputError: it cannot be written.
+        """
+        with counted_stage("render", progress) as count:
+            render_preview(self.tracer, self.settings, shot, output, lambda done, of: count(0, 1, done / of))
+            count(1, 1)
+
+
+def compile_stage(stage: Stage, scene: StageScene, shots: Sequence[Shot]) -> StageRenderer:
+    """Read and build everything of a stage, and check the cameras.
+
+    Args:
+        stage: meshes, lights, environment and how the scene takes part.
+        scene: the scene that it is put into.
+        shots: what is to be rendered.
+
+    Raises:
+        OctasplatError: something of the stage cannot be used, or a camera stands in glass.
+    """
+    layers = build_gaussian_layers(
+        stage, scene.gaussians, scene.read_gaussians, scene.folder, scene.settings,
+        size=SIZE_PER_RADIUS * scene.turntable(np.array(stage.up)).radius, threads=scene.threads,
+    )  # fmt: skip
+    stage = place_resting_meshes(
+        stage, None if layers is None else layers.tracer, scene.ray_of_pixel, scene.folder
+    )
+    meshes = compile_meshes(stage, scene.folder, threads=scene.threads, warn=scene.warn)
+    check_cameras_outside_glass(meshes, shots)
+    background = srgb_to_linear(scene.background_srgb.astype(np.float64))
+    only_environment = stage.model_copy(update={"meshes": (), "lights": ()})
+    environment = compile_meshes(only_environment, scene.folder, threads=scene.threads)
+    lit = PathTracerScene(meshes, layers, background, environment)
+    return StageRenderer(PathTracer(lit, stage.integrator, threads=scene.threads), stage.integrator)
+
+
+def stage_render_fn(tracer: PathTracer, settings: Integrator) -> RenderFn:
+    """What renders a shot of a stage to a file.
+
+    ``.exr`` gets the linear picture before exposure and tone curve as R, G, B, and alpha as A; anything else
+    gets 8-bit display values.
+
+    Args:
+        tracer: of the stage.
+        settings: with exposure and tone curve.
+    """
+
+    def paint(shot: Shot, path: Path, part: Callable[[float], None]) -> None:
+        film = tracer.render(shot.rays(), lambda done, of: part(done / of))
+        write_stage_image(path, film.image(exposure=settings.exposure, tone=settings.tone))
+
+    return paint
+
+
+def check_cameras_outside_glass(meshes: CompiledMeshes, shots: Sequence[Shot]) -> None:
+    """Look at all cameras before anything is rendered.
+
+    Raises:
+        ConfigError: one stands in glass.
+    """
+    for shot in shots:
+        check_outside_glass(meshes, shot.rays().origin_world, shot.name)
+
+
+def render_preview(
+    tracer: PathTracer,
+    settings: Integrator,
+    shot: Shot,
+    path: Path,
+    progress: Callable[[int, int], None] = lambda _done, _total: None,
+) -> None:
+    """Render one shot and write it again each time that it has become about twice as fine.
+
+    The last picture is the very one that :func:`stage_render_fn` makes, but for rounding.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    image = shot.rays()
+    done = 0
+    progress(0, settings.samples)
+    for film in tracer.refine(image):
+        write_stage_image(path, film.image(exposure=settings.exposure, tone=settings.tone))
+        done = max(1, min(2 * done, settings.samples))
+        progress(done, settings.samples)
+
+
+def write_stage_image(path: Path, image: StageImage) -> None:
+    """Write a picture: linear channels, alpha and a compositor's layers for ``.exr``, else display values.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    if path.suffix.lower() == ".exr":
+        layers = {name: image.rgb_linear[..., k] for k, name in enumerate("RGB")}
+        write_exr(path, {**layers, "A": image.alpha, **image.layers})
+    else:
+        write_png(path, image.rgb_srgb)

@@ -1,0 +1,116 @@
+"""The main job as a list of steps."""
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+from octasplat.engine.config import ReconstructionConfig
+from octasplat.engine.dataset.views_file import ViewsRecord, read_views
+from octasplat.engine.errors import CheckpointError
+from octasplat.engine.events import JsonLinesListener, Listener, RunFinished, broadcast
+from octasplat.engine.files import check_writable
+from octasplat.engine.pipeline.dataset_steps import FindPoses, OpenDataset
+from octasplat.engine.pipeline.output_folder import claim_output, release_on_refusal
+from octasplat.engine.pipeline.result_steps import EvaluateStep, ExportStep
+from octasplat.engine.pipeline.run import OnStep, ReconstructionRun, run_steps
+from octasplat.engine.pipeline.run_lock import lock_run_folder
+from octasplat.engine.pipeline.train_step import TrainStep
+from octasplat.engine.run_folder import CACHE, EVENTS, SCENE, VIEWS
+from octasplat.engine.threads import use_threads
+
+DATASET_STEPS = (FindPoses(), OpenDataset())
+"""The steps that may refuse the photographs or the settings."""
+RESULT_STEPS = (TrainStep(), EvaluateStep(), ExportStep())
+
+
+def reconstruct(
+    scene: Path,
+    output: Path,
+    config: ReconstructionConfig,
+    *,
+    resume: bool = False,
+    threads: int = 0,
+    progress: Listener = lambda _event: None,
+    should_stop: Callable[[], bool] = lambda: False,
+    on_step: OnStep | None = None,
+) -> Path:
+    """Reconstruct ``scene`` into the folder ``output`` and return it.
+
+    The folder then holds ``scene.ply``, the meshes, ``metrics.json``, ``report.html``, ``renders/``,
+    ``checkpoints/``, ``config.json``, ``held_out.json``, ``views.json`` and ``events.jsonl``.
+
+    Args:
+        scene: folder with photographs and a COLMAP model, see :meth:`octasplat.engine.dataset.Dataset.open`;
+            one of photographs alone, if ``config`` says that poses are to be found, which then are in
+            ``poses/``.
+        output: a folder that does not exist, is empty, or holds the same run if ``resume``.
+        config: all settings.
+        resume: go on with the run that is in ``output``; only ``exports`` may then be others than the run's.
+        threads: for everything; 0 means all cores.
+        progress: hears the events that also go to ``events.jsonl``.
+        should_stop: asked now and then; True stops the run after a checkpoint.
+        on_step: shown the training after each iteration; it must change nothing.
+
+    Raises:
+        DatasetError: the photographs or the model cannot be used, or no poses be found.
+        PosesCrashed: COLMAP died.
+        OutputError: ``output`` holds something else or cannot be written.
+        ConfigError: settings that the photographs rule out or, with ``resume``, other ones than the run's.
+        SceneFileError: a file of ``exports`` could not be written on this machine; told before the training.
+        CheckpointError: with ``resume``, other photographs or another model than the run's.
+        TrainingFailure: training collapsed.
+        ExportFailed: some of ``exports`` could not be written; all the rest is there.
+        Cancelled: stopped as asked.
+    """
+    if not (output / SCENE).exists():
+        check_writable(config.exports)
+    use_threads(threads)
+    is_made, is_new = not output.exists(), claim_output(scene, output, config, resume)
+    with lock_run_folder(output):
+        _run_all_steps(
+            ReconstructionRun(scene, output, config, threads, progress, should_stop, on_step),
+            is_new=is_new,
+            is_made=is_made,
+        )
+    return output
+
+
+def _run_all_steps(run: ReconstructionRun, *, is_new: bool, is_made: bool) -> None:
+    """Do all steps of a run whose folder is claimed."""
+    began, output = time.perf_counter(), run.output
+    recorded = read_views(output / VIEWS) if (output / VIEWS).exists() else None
+    events = JsonLinesListener(output / EVENTS, hold=recorded is not None)
+    tell = broadcast([events, run.progress])
+    run.progress, run.recorded = tell, recorded
+    if recorded is not None:
+        run.accept = _require_same_dataset(recorded, run.scene, output, events)
+    try:
+        with release_on_refusal(output, is_new=is_new, is_made=is_made):
+            run_steps(DATASET_STEPS, run)
+        run_steps(RESULT_STEPS, run)
+        run.dataset.release_pages()
+        tell(RunFinished(_result_names(output), time.perf_counter() - began))
+    finally:
+        events.close()
+
+
+def _result_names(output: Path) -> tuple[str, ...]:
+    """The names of what is in the folder of a run, but for its cache."""
+    names = (path.name for path in output.iterdir())
+    return tuple(sorted(name for name in names if name != CACHE and not name.startswith(".")))
+
+
+def _require_same_dataset(
+    recorded: ViewsRecord, scene: Path, output: Path, events: JsonLinesListener
+) -> Callable[[ViewsRecord], None]:
+    """What lets a run go on with its own photographs only; until then nothing has been written."""
+
+    def accept(found: ViewsRecord) -> None:
+        if (difference := recorded.difference(found)) is not None:
+            raise CheckpointError(
+                f"{output} was made from other photographs or another model than {scene} holds "
+                f"({difference}); name the folder that it was made from, or another output folder."
+            )
+        events.release()
+
+    return accept

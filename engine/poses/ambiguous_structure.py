@@ -1,0 +1,138 @@
+"""Models in which one thing stands in two places, and the false matches that put it there.
+
+A pattern that repeats (a knitted cloth, tiles) gives matches between photographs of different places. Where
+the mapper believes these first, one part of the photographs is put together in itself, but in the wrong place
+beside the other part; the true matches between the two then fit nothing, and are left out without a word. So
+every pair of photographs is asked how many of its matches are one point of the model, and how many are two.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pycolmap
+from jaxtyping import Bool, Float64, Int64
+
+_MAX_INLIER_SHARE_OF_FALSE_PAIR = 0.5
+"""A cut is a fold if no more than so many matches across it are kept for one that is broken."""
+_MIN_INLIER_SHARE_OF_TRUE_PAIR = 0.5
+"""Across a fold, pairs with this share of their matches kept are those that made it."""
+
+
+@dataclass(frozen=True, eq=False)
+class PairInliers:
+    """What became of the matches of each pair.
+
+    Attributes:
+        pairs: numbers of the photographs in the database.
+        inliers: matches whose two features are one point.
+        outliers: matches whose features are two different points.
+    """
+
+    pairs: Int64[np.ndarray, "p 2"]
+    inliers: Int64[np.ndarray, " p"]
+    outliers: Int64[np.ndarray, " p"]
+
+
+def count_pair_inliers(model: Any, database: Path) -> PairInliers:
+    """The votes of all pairs whose two photographs are placed."""
+    points = {
+        number: np.array([p.point3D_id if p.has_point3D() else -1 for p in image.points2D], dtype=np.int64)
+        for number, image in model.images.items()
+        if image.has_pose
+    }
+    with pycolmap.Database.open(database) as source:
+        ids, geometries = source.read_two_view_geometries()
+    pairs, kept, broken = [], [], []
+    for pair_id, geometry in zip(ids, geometries, strict=True):
+        first, second = pycolmap.pair_id_to_image_pair(pair_id)
+        matches = np.asarray(geometry.inlier_matches, dtype=np.int64).reshape(-1, 2)
+        if len(matches) == 0 or first not in points or second not in points:
+            continue
+        a, b = points[first][matches[:, 0]], points[second][matches[:, 1]]
+        both = (a >= 0) & (b >= 0)
+        pairs.append((first, second))
+        kept.append(int((both & (a == b)).sum()))
+        broken.append(int((both & (a != b)).sum()))
+    return PairInliers(
+        np.array(pairs, dtype=np.int64).reshape(-1, 2),
+        np.array(kept, dtype=np.int64),
+        np.array(broken, dtype=np.int64),
+    )
+
+
+def find_false_pairs(votes: PairInliers) -> Int64[np.ndarray, "f 2"]:
+    """The pairs that hold the two sides of a fold together; none where there is no fold.
+
+    A fold is a division of the photographs across which far more matches are broken than kept. It is looked
+    for along the eigenvector of the least eigenvalue of the Laplacian whose weights are kept less broken,
+    and then by moving photographs.
+    """
+    numbers, index = np.unique(votes.pairs, return_inverse=True)
+    if len(numbers) < 3:
+        return votes.pairs[:0]
+    a, b = index.reshape(-1, 2).T
+    weight = np.zeros((len(numbers), len(numbers)))
+    weight[a, b] = weight[b, a] = votes.inliers - votes.outliers
+    side = _min_cut(weight)
+    across = side[a] != side[b]
+    if (
+        votes.inliers[across].sum() > _MAX_INLIER_SHARE_OF_FALSE_PAIR * votes.outliers[across].sum()
+        or not votes.outliers[across].any()
+    ):
+        return votes.pairs[:0]
+    matches = votes.inliers + votes.outliers
+    found: Int64[np.ndarray, "f 2"] = votes.pairs[
+        across & (votes.inliers > _MIN_INLIER_SHARE_OF_TRUE_PAIR * matches)
+    ]
+    return found
+
+
+def remove_pairs(database: Path, pairs: Int64[np.ndarray, "f 2"]) -> None:
+    """Remove pairs, with their matches, from a database that nobody else has open."""
+    with pycolmap.Database.open(database) as target:
+        for first, second in pairs.tolist():
+            target.delete_two_view_geometry(first, second)
+            target.delete_matches(first, second)
+
+
+def _min_cut(weight: Float64[np.ndarray, "n n"]) -> Bool[np.ndarray, " n"]:
+    """Sides of a division with a small sum of the weights across it."""
+    _, vectors = np.linalg.eigh(np.diag(weight.sum(axis=1)) - weight)
+    order = np.argsort(vectors[:, 0], kind="stable")
+    side = np.zeros(len(weight), dtype=bool)
+    best, cut = side.copy(), np.inf
+    for photograph in order[:-1]:
+        side[photograph] = True
+        across = float(weight[side][:, ~side].sum())
+        if across < cut:
+            best, cut = side.copy(), across
+    while True:
+        side, across = _refine_cut(weight, best)
+        if not across < cut:
+            return best
+        best, cut = side, across
+
+
+def _refine_cut(
+    weight: Float64[np.ndarray, "n n"], side: Bool[np.ndarray, " n"]
+) -> tuple[Bool[np.ndarray, " n"], float]:
+    """The best division on the way of moving every photograph once, the most profitable one first.
+
+    Kernighan and Lin, "An Efficient Heuristic Procedure for Partitioning Graphs" (1970), without swaps.
+    """
+    sign = np.where(side, 1.0, -1.0)
+    total = weight.sum()
+    best, least = side, np.inf
+    open_ = np.ones(len(sign), dtype=bool)
+    pull = weight @ sign
+    for _ in range(len(sign)):
+        photograph = int(np.argmax(np.where(open_, -sign * pull, -np.inf)))
+        sign[photograph] = -sign[photograph]
+        pull += 2 * sign[photograph] * weight[:, photograph]
+        open_[photograph] = False
+        across = float(total - sign @ pull) / 4
+        if across < least and abs(sign.sum()) < len(sign):
+            best, least = sign > 0, across
+    return best, least

@@ -1,0 +1,321 @@
+"""Structure from motion on a folder of photographs, in a process that may die without harm."""
+
+import contextlib
+import json
+import os
+import select
+import shutil
+import signal
+import subprocess
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import IO, Any
+
+from octasplat.engine.errors import Cancelled, DatasetError, PosesCrashed
+from octasplat.engine.events import Event, Listener, StageProgress, StageStarted, event_from, ignore
+from octasplat.engine.isolated_python import python_command
+from octasplat.engine.poses.config import (
+    DEFAULT_CONFIG,
+    FOUND_FOLDER,
+    RECORD_FILE,
+    GivenModel,
+    PosesConfig,
+    PoseSearchRequest,
+)
+from octasplat.engine.poses.photographs import photographs_in, photographs_sha256
+from octasplat.engine.writing import write_json
+
+_POLL_SECONDS = 0.5
+_HEARTBEAT_SECONDS = 30.0
+"""How often a step that takes long tells that it is alive."""
+_SINGLE_THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+
+
+def find_poses(
+    images: Path,
+    output: Path,
+    *,
+    config: PosesConfig = DEFAULT_CONFIG,
+    threads: int = 0,
+    progress: Listener = ignore,
+    should_stop: Callable[[], bool] = lambda: False,
+) -> None:
+    """Find where photographs were taken, and a sparse point cloud.
+
+    There are three stages: ``features``, whose steps are photographs, ``matches``, whose steps are pairs of
+    them, and ``poses``, whose steps are photographs again, the last one the number of those placed. Where
+    photographs are left out, the three may come a second time. The same photographs give the same files on
+    any number of threads. A result that is there already is taken as it is.
+
+    Args:
+        images: folder of photographs, also in folders below it if it is called ``images``.
+        output: becomes the folder of the COLMAP model, with ``poses.json`` beside its files. What is needed
+            on the way lies in a hidden folder next to it and is removed.
+        config: settings.
+        threads: to use; 0 means all cores.
+        progress: hears the progress.
+        should_stop: asked now and then; True gives up.
+
+    Raises:
+        DatasetError: too few photographs, or they do not fit together; the text says what to do. Also if the
+            result that is there is of other photographs.
+        PosesCrashed: COLMAP died.
+        Cancelled: stopped as asked.
+    """
+    names = photographs_in(images)
+    sha256 = photographs_sha256(images, names)
+    if output.is_dir():
+        if read_pose_record(output).get("photographs_sha256", sha256) != sha256:
+            raise DatasetError(
+                f"{output} holds poses of other photographs than those in {images}; name another folder for "
+                f"the results, or remove {output} to find them anew."
+            )
+        return
+    with _work_folder(output) as work:
+        request = PoseSearchRequest(
+            images=images.resolve(), names=tuple(names), work=work.resolve(), config=config, threads=threads
+        )
+        _ColmapProcess(request, progress, should_stop).wait()
+        record = read_pose_record(work / FOUND_FOLDER)
+        write_json(work / FOUND_FOLDER / RECORD_FILE, {**record, "photographs_sha256": sha256})
+        (work / FOUND_FOLDER).rename(output)
+
+
+def repair_poses(
+    images: Path,
+    files: Sequence[str],
+    given: GivenModel,
+    output: Path,
+    *,
+    config: PosesConfig = DEFAULT_CONFIG,
+    threads: int = 0,
+    progress: Listener = ignore,
+    should_stop: Callable[[], bool] = lambda: False,
+) -> tuple[str, ...]:
+    """Move photographs of a model that do not stand where their matches with the others say.
+
+    The stages are ``features``, ``matches``, whose steps are pairs of a photograph in doubt with another one,
+    and ``placing``, whose steps are the photographs in doubt. All other poses stay as they are.
+
+    Args:
+        images: folder of the photographs.
+        files: the photographs, below it.
+        given: the model, their names in it, and which of them are in doubt.
+        output: becomes the folder of the changed model, with ``poses.json`` beside its files; nothing is
+            written where no photograph is moved.
+        config: settings.
+        threads: to use; 0 means all cores.
+        progress: hears the progress.
+        should_stop: asked now and then; True gives up.
+
+    Returns:
+        Names of the photographs that were moved.
+
+    Raises:
+        DatasetError: COLMAP refuses to work with the photographs or the model.
+        PosesCrashed: COLMAP died.
+        Cancelled: stopped as asked.
+    """
+    with _work_folder(output) as work:
+        request = PoseSearchRequest(
+            images=images.resolve(),
+            names=tuple(files),
+            work=work.resolve(),
+            config=config,
+            threads=threads,
+            given=given.model_copy(update={"model": given.model.resolve()}),
+        )
+        _ColmapProcess(request, progress, should_stop).wait()
+        moved = tuple(read_pose_record(work / FOUND_FOLDER)["moved"])
+        if moved:
+            (work / FOUND_FOLDER).rename(output)
+    return moved
+
+
+def adjust_principal_points(
+    model: Path,
+    output: Path,
+    *,
+    config: PosesConfig = DEFAULT_CONFIG,
+    progress: Listener = ignore,
+    should_stop: Callable[[], bool] = lambda: False,
+) -> dict[str, float] | None:
+    """Give each photograph of a model a principal point of its own, where that explains far more.
+
+    There is one stage, ``lenses``. See :mod:`octasplat.engine.poses.principal_points`.
+
+    Args:
+        model: folder of the COLMAP model.
+        output: becomes the folder of the changed model, with ``poses.json`` beside its files; it may be the
+            folder of the model that is changed. Nothing is written where the model stays as it is.
+        config: settings.
+        progress: hears the progress.
+        should_stop: asked now and then; True gives up.
+
+    Returns:
+        ``reprojection_px_before`` and ``reprojection_px``, means over the points, and how far the principal
+        points were moved, ``shift_px_median`` and ``shift_px_most``, at the size of the model; None where the
+        model stays.
+
+    Raises:
+        DatasetError: COLMAP refuses to work with the model.
+        PosesCrashed: COLMAP died.
+        Cancelled: stopped as asked.
+    """
+    before = read_pose_record(output)
+    with _work_folder(output) as work:
+        request = PoseSearchRequest(
+            images=model.resolve(),  # no photograph is looked at
+            names=(),
+            work=work.resolve(),
+            config=config,
+            threads=1,
+            lenses_of=model.resolve(),
+        )
+        _ColmapProcess(request, progress, should_stop).wait()
+        facts: dict[str, float] | None = read_pose_record(work / FOUND_FOLDER)["lenses"]
+        if facts is not None:
+            write_json(work / FOUND_FOLDER / RECORD_FILE, {**before, "lenses": facts})
+            if output.is_dir():
+                output.rename(work / "before")
+            (work / FOUND_FOLDER).rename(output)
+    return facts
+
+
+@contextmanager
+def _work_folder(output: Path) -> Iterator[Path]:
+    """An empty hidden folder beside the one for the result, until the block ends."""
+    work = output.with_name(f".{output.name}.work")
+    shutil.rmtree(work, ignore_errors=True)
+    work.mkdir(parents=True)
+    try:
+        yield work
+    finally:
+        shutil.rmtree(work, ignore_errors=True)
+
+
+def read_pose_record(output: Path) -> dict[str, Any]:
+    """What was found, and for which photographs; empty if there is nothing."""
+    try:
+        record: dict[str, Any] = json.loads((output / RECORD_FILE).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+    return record
+
+
+class _ColmapProcess:
+    """One process of COLMAP's, and what it says."""
+
+    def __init__(
+        self, request: PoseSearchRequest, progress: Listener, should_stop: Callable[[], bool]
+    ) -> None:
+        self._request = request
+        self._progress = progress
+        self._should_stop = should_stop
+        self._stage = ""
+        self._last_progress: Event | None = None
+        self._last_event_time = time.monotonic()
+        self._error: str | None = None
+        self._is_done = False
+
+    def wait(self) -> None:
+        """Wait for the result, telling of the progress and hearing of the wish to stop meanwhile.
+
+        Raises:
+            Cancelled: stopped as asked.
+            DatasetError: as the process says.
+            PosesCrashed: it said nothing and died.
+        """
+        log = self._request.work / "log.txt"
+        with log.open("wb") as noise, _start_process(self._request, noise) as process:
+            assert process.stdout is not None
+            rest = b""
+            while piece := self._read_chunk(process.stdout.fileno()):
+                *lines, rest = (rest + piece).split(b"\n")
+                for line in lines:
+                    self._handle_line(line)
+            code = process.wait()
+        if self._error is not None:
+            raise DatasetError(self._error)
+        if not self._is_done:
+            raise PosesCrashed(_crash_message(code, self._stage, log))
+
+    def _read_chunk(self, pipe: int) -> bytes:
+        """What the process says next; nothing at its end."""
+        while True:
+            if self._should_stop():
+                raise Cancelled(
+                    "Stopped while finding poses; the same command with --resume begins them again."
+                )
+            if select.select([pipe], [], [], _POLL_SECONDS)[0]:
+                return os.read(pipe, 1 << 16)
+            if (
+                self._last_progress is not None
+                and time.monotonic() - self._last_event_time > _HEARTBEAT_SECONDS
+            ):
+                self._forward_event(self._last_progress)
+
+    def _handle_line(self, line: bytes) -> None:
+        content = json.loads(line)
+        kind = content.pop("kind")
+        if kind == "done":
+            self._is_done = True
+        elif kind == "error":
+            self._error = content["message"]
+        elif (event := event_from(kind, content)) is not None:
+            self._forward_event(event)
+
+    def _forward_event(self, event: Event) -> None:
+        if isinstance(event, StageStarted):
+            self._stage = event.stage
+        self._last_progress = event if isinstance(event, StageProgress) else None
+        self._last_event_time = time.monotonic()
+        self._progress(event)
+
+
+@contextmanager
+def _start_process(request: PoseSearchRequest, stderr_log: IO[bytes]) -> Iterator["subprocess.Popen[bytes]"]:
+    """The process at work; killed in the end, whatever happens. In the caller's group, to die with it."""
+    environment = {
+        **os.environ,
+        **dict.fromkeys(_SINGLE_THREAD_VARIABLES, "1"),
+    }  # COLMAP has threads of its own
+    process = subprocess.Popen(  # noqa: S603 - a program of ours
+        python_command("octasplat.engine.poses.colmap_process"),
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=stderr_log,
+        env=environment,
+    )
+    assert process.stdin is not None and process.stdout is not None
+    try:
+        with contextlib.suppress(BrokenPipeError):  # it is dead, which is told soon
+            process.stdin.write(request.model_dump_json().encode() + b"\n")
+            process.stdin.flush()
+        yield process
+    finally:
+        process.kill()
+        process.wait()
+        for pipe in (process.stdin, process.stdout):
+            with contextlib.suppress(OSError):
+                pipe.close()
+
+
+def _crash_message(code: int, stage: str, log: Path) -> str:
+    placing = "placing photographs" if stage else "starting"
+    known = {"features": "looking for features", "matches": "matching", "lenses": "adjusting lenses"}
+    doing = known.get(stage, placing)
+    how = f"was ended by {signal.Signals(-code).name}" if code < 0 else f"ended with exit code {code}"
+    text = log.read_text(encoding="utf-8", errors="replace") if log.exists() else ""
+    said = next((line.strip()[:300] for line in reversed(text.splitlines()) if line.strip()), "")
+    advice = (
+        "the machine may have run out of memory: use fewer threads"
+        if code == -signal.SIGKILL
+        else "run the same command again"
+    )
+    return (
+        f"COLMAP {how} while {doing}{f' (it said: {said})' if said else ''}; "
+        f"{advice}, or send a COLMAP model."
+    )

@@ -1,0 +1,89 @@
+"""Poses and points from matches, by COLMAP's incremental mapper, on one thread.
+
+Bundle adjustment adds up in the order in which its threads come, so more of them would give other digits, and
+now and then other photographs; most of the mapper runs on one thread anyway.
+"""
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pycolmap
+
+from octasplat.engine.poses.config import MIN_PHOTOGRAPHS
+
+OnCount = Callable[[int], None]
+
+_WEAK_INLIERS = 15
+"""Matches by which a photograph can be placed where the usual 30 leave some out."""
+_WEAK_INITIAL_INLIERS = 50
+"""The same for the first two."""
+
+
+def map_photographs(
+    database: Path,
+    photographs: Path,
+    *,
+    seed: int,
+    on_count: OnCount,
+    allow_weak_links: bool = False,
+    start: Path | None = None,
+) -> Any:
+    """The model with the most photographs.
+
+    Args:
+        database: with matches.
+        photographs: folder.
+        seed: of everything random.
+        on_count: hears of photographs of the largest model so far.
+        allow_weak_links: place photographs by fewer matches, too.
+        start: folder of a model to go on from.
+
+    Returns:
+        A ``pycolmap.Reconstruction``, or None.
+    """
+    options = pycolmap.IncrementalPipelineOptions()
+    options.num_threads = 1
+    options.random_seed = seed
+    options.mapper.random_seed = seed
+    options.triangulation.random_seed = seed
+    options.ba_use_gpu = False
+    options.min_model_size = MIN_PHOTOGRAPHS
+    options.extract_colors = False
+    if allow_weak_links:
+        options.mapper.abs_pose_min_num_inliers = _WEAK_INLIERS
+        options.mapper.init_min_num_inliers = _WEAK_INITIAL_INLIERS
+    placed = len(pycolmap.Reconstruction(start).reg_image_ids()) if start is not None else 0
+    most = placed
+
+    def first_pair() -> None:
+        nonlocal placed
+        placed = 2
+
+    def another() -> None:
+        nonlocal placed, most
+        placed += 1
+        if placed > most:
+            most = placed
+            on_count(most)
+
+    folder = database.with_name("models")
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir()
+    pycolmap.set_random_seed(seed)
+    models: dict[int, Any] = pycolmap.incremental_mapping(
+        database,
+        photographs,
+        folder,
+        options=options,
+        input_path=start or "",
+        initial_image_pair_callback=first_pair,
+        next_image_callback=another,
+    )
+    return max(models.values(), key=model_rank, default=None)
+
+
+def model_rank(model: Any) -> tuple[int, int]:
+    """What makes one model better than another: its photographs, then its points."""
+    return (0, 0) if model is None else (model.num_reg_images(), model.num_points3D())

@@ -1,0 +1,44 @@
+"""Photographs are read to their ends before poses are searched, which takes far longer."""
+
+import os
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+from octasplat.engine.dataset.images import read_image_info, read_photo
+from octasplat.engine.errors import DatasetError
+
+DECODING_BYTES = 2 << 30
+"""Memory that decoding threads may take together; one thread always runs."""
+
+
+def check_photographs_decode(folder: Path, names: Sequence[str], *, threads: int = 0) -> None:
+    """Refuse photographs whose files begin well and end early: COLMAP takes them, the training cannot.
+
+    Files that are no images from their beginning are left out by COLMAP, and told.
+
+    Raises:
+        DatasetError: a file is damaged or cut short.
+    """
+    sizes = []
+    for name in names:
+        try:
+            info = read_image_info(folder / name)
+        except DatasetError:
+            continue
+        sizes.append((folder / name, info.width_px, info.height_px))
+    # Bytes a pixel: as stored, as float32, and a copy of either while channels are rearranged.
+    largest = max((36 * width * height for _, width, height in sizes), default=1)
+    workers = min(threads if threads > 0 else os.cpu_count() or 1, max(1, DECODING_BYTES // largest))
+
+    def read(file: tuple[Path, int, int]) -> None:
+        path, width, height = file
+        read_photo(path, width, height, 8)
+
+    with ThreadPoolExecutor(workers) as pool:
+        futures = [pool.submit(read, file) for file in sizes]
+        try:
+            for future in futures:
+                future.result()
+        finally:
+            pool.shutdown(cancel_futures=True)

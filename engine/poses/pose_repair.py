@@ -1,0 +1,171 @@
+"""Photographs of a given model that may stand in the wrong place: asked, and moved where they do."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import pycolmap
+
+from octasplat.engine.dataset.images import read_image_info
+from octasplat.engine.errors import DatasetError
+from octasplat.engine.events import Listener
+from octasplat.engine.poses.config import (
+    FEATURES,
+    FOUND_FOLDER,
+    INLIER_DISTANCE_PX,
+    MATCHES,
+    MAX_IMAGE_SIDE_PX,
+    MAX_WITNESSES,
+    PLACING_STAGE,
+    RECORD_FILE,
+    GivenModel,
+    PoseSearchRequest,
+)
+from octasplat.engine.poses.features import create_database, extract_features, match_pairs
+from octasplat.engine.poses.pose_estimation import (
+    Matches,
+    Pose,
+    collect_matches,
+    estimate_pose,
+    is_explained_by_pose,
+)
+from octasplat.engine.poses.workspace import link_photographs, progress_stage
+from octasplat.engine.writing import write_json
+
+
+def repair_misplaced(request: PoseSearchRequest, given: GivenModel, progress: Listener) -> None:
+    """Write the model with the photographs moved that stand in the wrong place, and the names of these.
+
+    Few others are asked first, from all around: not those nearby, as the pose may have been made by false
+    matches with them. Where the given pose does not fit what these say, more are asked.
+
+    Args:
+        request: says where to work and what with.
+        given: the model, and the photographs in doubt.
+        progress: hears the progress.
+    """
+    pycolmap.logging.minloglevel = 2  # its warnings are of use to nobody here
+    hearing = _PoseVerifier(request, given, progress)
+    others = np.setdiff1d(np.arange(len(given.names)), np.array(given.doubtful, dtype=np.int64)).tolist()
+    asked = _evenly_spaced(others, request.config.first_witnesses)
+    hearing.match_with(given.doubtful, asked)
+    left = [k for k in given.doubtful if not hearing.is_consistent(k)]
+    more = _evenly_spaced([k for k in others if k not in asked], MAX_WITNESSES - len(asked))
+    if left and more:
+        hearing.match_with(left, more)
+    moved: dict[int, Pose] = {}
+    with progress_stage(PLACING_STAGE, len(left), progress) as at:
+        for done, k in enumerate(left):
+            if (new := hearing.corrected_pose(k)) is not None:
+                moved[k] = new
+            at(done + 1)
+    found = request.work / FOUND_FOLDER
+    found.mkdir()
+    if moved:
+        for k, pose in moved.items():
+            _set_pose(hearing.model, hearing.images[k], pose)
+        hearing.model.write_binary(found)
+    write_json(found / RECORD_FILE, {"moved": [given.names[k] for k in sorted(moved)]})
+
+
+class _PoseVerifier:
+    """What photographs say of those in doubt.
+
+    Attributes:
+        model: as it is given.
+        images: of the model, by photograph.
+    """
+
+    def __init__(self, request: PoseSearchRequest, given: GivenModel, progress: Listener) -> None:
+        self.model: Any = pycolmap.Reconstruction(given.model)
+        by_name = {image.name: image for image in self.model.images.values()}
+        self.images: dict[int, Any] = {k: by_name[name] for k, name in enumerate(given.names)}
+        self._config, self._tell, self._threads = request.config, progress, request.threads or -1
+        self._doubtful = frozenset(given.doubtful)
+        self._photographs, self._database = request.work / "photographs", request.work / "database.db"
+        self._aliases = link_photographs(request.images, request.names, self._photographs)
+        infos = [read_image_info(request.images / name) for name in request.names]
+        self._sizes_px = [(info.width_px, info.height_px) for info in infos]
+        self._one_camera = len(set(self._sizes_px)) == 1
+        self._matched_pairs: set[int] = set()
+        read = create_database(self._database, self._photographs, self._aliases, one_camera=self._one_camera)
+        if read != self._aliases:  # those after one that is missing would be others
+            pairs = zip(request.names, self._aliases, strict=True)
+            unread = [name for name, alias in pairs if alias not in read]
+            raise DatasetError(f"COLMAP cannot read {', '.join(unread[:3])}.")
+
+    def match_with(self, doubtful: Sequence[int], witnesses: Sequence[int]) -> None:
+        """Match photographs in doubt with others."""
+        new = sorted({*doubtful, *witnesses} - self._matched_pairs)
+        with progress_stage(FEATURES, len(new), self._tell) as at:
+            extract_features(
+                self._database,
+                self._photographs,
+                [self._aliases[k] for k in new],
+                self._config,
+                thorough=False,
+                one_camera=self._one_camera,
+                threads=self._threads,
+                on_count=at,
+            )
+        self._matched_pairs.update(new)
+        pairs = sorted((min(a, b), max(a, b)) for a in doubtful for b in witnesses)
+        with progress_stage(MATCHES, len(pairs), self._tell) as at:
+            match_pairs(
+                self._database,
+                self._aliases,
+                pairs,
+                self._config,
+                thorough=False,
+                threads=self._threads,
+                on_count=at,
+            )
+
+    def is_consistent(self, k: int) -> bool:
+        """Whether a photograph stands where the matches so far say."""
+        matches = self._matches(k)
+        return matches is not None and is_explained_by_pose(
+            self._given_pose(k), matches, self._inlier_distance(k)
+        )
+
+    def corrected_pose(self, k: int) -> Pose | None:
+        """The pose of a photograph in doubt where it is not the given one."""
+        if len(self.images[k].frame.data_ids) > 1:  # it would take the other cameras of its rig along
+            return None
+        matches = self._matches(k)
+        if matches is None:
+            return None
+        return estimate_pose(matches, self._given_pose(k), self._inlier_distance(k), seed=self._config.seed)
+
+    def _matches(self, k: int) -> Matches | None:
+        asked = {k, *self._matched_pairs} - (self._doubtful - {k})
+        images = {number + 1: self.images[number] for number in asked}
+        return collect_matches(k + 1, self.model, images, self._database, self._sizes_px)
+
+    def _given_pose(self, k: int) -> Pose:
+        pose = self.images[k].cam_from_world()
+        return pose.rotation.matrix(), np.asarray(pose.translation)
+
+    def _inlier_distance(self, k: int) -> float:
+        """Distance at which a match agrees, in units of the focal length."""
+        camera, (width_px, height_px) = self.model.cameras[self.images[k].camera_id], self._sizes_px[k]
+        shrunk = min(1.0, MAX_IMAGE_SIDE_PX / max(width_px, height_px))
+        return float(INLIER_DISTANCE_PX * camera.width / width_px / shrunk / camera.mean_focal_length())
+
+
+def _evenly_spaced(numbers: Sequence[int], count: int) -> list[int]:
+    """As many of some numbers as there may be, evenly."""
+    if count <= 0 or not numbers:
+        return []
+    chosen = np.unique(np.linspace(0, len(numbers) - 1, count).round().astype(np.int64))
+    return [numbers[k] for k in chosen.tolist()]
+
+
+def _set_pose(model: Any, image: Any, pose: Pose) -> None:
+    """Give an image another pose; what it took part in as a sparse point was seen from the wrong place."""
+    cam_from_world = pycolmap.Rigid3d(pycolmap.Rotation3d(pose[0]), pose[1])
+    cam_from_rig = image.cam_from_world() * image.frame.rig_from_world.inverse()
+    image.frame.rig_from_world = cam_from_rig.inverse() * cam_from_world
+    for index, point in enumerate(image.points2D):
+        if point.has_point3D():
+            model.delete_observation(image.image_id, index)

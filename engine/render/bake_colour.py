@@ -1,0 +1,154 @@
+"""The one colour of each Gaussian, for files that have no place for colours that change with the direction.
+
+What a ray shows is linear in the colours of the Gaussians: W c, where W holds their weights along the rays.
+So the colours that come nearest to the pictures of the whole scene, taken from given cameras, are a
+least-squares problem, which conjugate gradients solve in a few steps; W is the forward pass of the tracer
+with colours as features, its transpose the backward pass.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Float, Float32, Float64
+
+from octasplat.engine.gaussians.channels import Channels
+from octasplat.engine.gaussians.model import SH_C0, FlatGaussians
+from octasplat.engine.gaussians.spherical_harmonics import sh_basis
+from octasplat.engine.rays import ImageRays, RayBatch
+from octasplat.engine.render.renderer import tile_order
+from octasplat.engine.trace.protocol import TraceGradients, Tracer
+
+CG_ITERATIONS = 4
+"""More follow the given cameras closer, and others less."""
+REGULARISATION = 0.02
+"""Weight, in rays, that holds a Gaussian at its mean colour; those that are hardly seen stay there."""
+
+
+def with_constant_colour(gaussians: FlatGaussians, rgb_srgb: Float32[np.ndarray, "n 3"]) -> FlatGaussians:
+    """The same Gaussians with these colours from every direction."""
+    return replace(gaussians, sh=((rgb_srgb - np.float32(0.5)) / np.float32(SH_C0))[:, None])
+
+
+def colours_along(
+    gaussians: FlatGaussians, direction_world: Float64[np.ndarray, "3"]
+) -> Float32[np.ndarray, "n 3"]:
+    """Display colours as a camera sees them that looks along a direction of any length from far away."""
+    length = np.linalg.norm(direction_world)
+    return _evaluate_colours(gaussians, (direction_world / length)[None])
+
+
+def fit_colours_to_cameras(
+    gaussians: FlatGaussians,
+    tracer: Tracer,
+    images: Sequence[Callable[[], ImageRays]],
+    *,
+    steps: int = CG_ITERATIONS,
+    on_pass: Callable[[int, int], None] = lambda _done, _total: None,
+) -> Float32[np.ndarray, "n 3"]:
+    """The colours with which the cameras see what they see of the scene with its harmonics, by least squares.
+
+    Small images do: each needs one trace and one backward pass a step.
+
+    Args:
+        gaussians: the scene.
+        tracer: with settings as the scene was trained with; it is built anew.
+        images: make the rays of each camera.
+        steps: of the conjugate gradients; 0 gives the mean of what the cameras see of each Gaussian.
+        on_pass: told (passes over the images done, in all); it may raise to stop.
+
+    Returns:
+        Display values in [0, 1]; those of the constant harmonic for Gaussians that no camera sees.
+    """
+    batches = [_batch(make()) for make in images]
+    on_pass(0, steps + 2)
+    tracer.build(gaussians)
+    targets, sums, weights = [], np.zeros((len(gaussians), 3)), np.zeros(len(gaussians))
+    for rays in batches:
+        seen = tracer.trace(rays, record=True)
+        targets.append(seen.rgb_srgb.astype(np.float64))
+        assert seen.recording is not None
+        found = tracer.backward(seen.recording, TraceGradients(np.zeros_like(seen.rgb_srgb))).numpy()
+        away = gaussians.means_world[found.ids] - rays.origins_world[0]
+        away = away / np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-12)
+        sums[found.ids] += found.weight_sums[:, None] * _evaluate_colours(gaussians.select(found.ids), away)
+        weights[found.ids] += found.weight_sums
+        del seen  # its recording's memory serves the next one
+    on_pass(1, steps + 2)
+    means = np.where(
+        weights[:, None] > 0, sums / np.maximum(weights, 1e-12)[:, None], gaussians.base_rgb_srgb
+    )
+    if steps == 0 or not batches:
+        return np.clip(means, 0, 1).astype(np.float32)
+    solve = _NormalEquations(replace(gaussians.with_base_color_only(), channels=Channels()), tracer, batches)
+    colours = _conjugate_gradients(solve, targets, means, weights, steps, on_pass)
+    return np.clip(colours, 0, 1).astype(np.float32)
+
+
+class _NormalEquations:
+    """W^T (W c - y) over all images."""
+
+    def __init__(self, gaussians: FlatGaussians, tracer: Tracer, batches: Sequence[RayBatch]) -> None:
+        self._features = np.zeros((len(gaussians), 3), np.float32)
+        self._tracer, self._batches = tracer, batches
+        tracer.build(gaussians, self._features)
+
+    def __call__(
+        self, colours: Float64[np.ndarray, "n 3"], targets: Sequence[Float64[np.ndarray, "r 3"]] | None = None
+    ) -> Float64[np.ndarray, "n 3"]:
+        self._features[...] = colours
+        self._tracer.refresh()
+        out = np.zeros(colours.shape)
+        for number, rays in enumerate(self._batches):
+            seen = self._tracer.trace(rays, record=True)
+            assert seen.recording is not None
+            rest = seen.features if targets is None else seen.features - targets[number]
+            gradients = TraceGradients(np.zeros_like(seen.rgb_srgb), features=rest.astype(np.float32))
+            found = self._tracer.backward(seen.recording, gradients).numpy()
+            out[found.ids] += found.features
+            del seen  # its recording's memory serves the next one
+        return out
+
+
+def _conjugate_gradients(
+    normal: _NormalEquations,
+    targets: Sequence[Float64[np.ndarray, "r 3"]],
+    start: Float64[np.ndarray, "n 3"],
+    weights: Float64[np.ndarray, " n"],
+    steps: int,
+    on_pass: Callable[[int, int], None],
+) -> Float64[np.ndarray, "n 3"]:
+    """Steps towards the minimum of |W c - y|^2 + HELD |c - start|^2, each channel on its own."""
+    scale = (weights + REGULARISATION)[:, None]
+    colours = start.copy()
+    rest = -normal(colours, targets)
+    on_pass(2, steps + 2)
+    preconditioned = rest / scale
+    direction = preconditioned.copy()
+    product = (rest * preconditioned).sum(axis=0)
+    for step in range(steps):
+        image = normal(direction) + REGULARISATION * direction
+        curvature = (direction * image).sum(axis=0)
+        length = np.divide(product, curvature, out=np.zeros(3), where=curvature > 0)
+        colours += length * direction
+        rest -= length * image
+        preconditioned = rest / scale
+        before, product = product, (rest * preconditioned).sum(axis=0)
+        direction = preconditioned + np.divide(product, before, out=np.zeros(3), where=before > 0) * direction
+        on_pass(min(step + 3, steps + 2), steps + 2)
+    return colours
+
+
+def _batch(image: ImageRays) -> RayBatch:
+    return image.rays[tile_order(image.height_px, image.width_px)]
+
+
+def _evaluate_colours(
+    gaussians: FlatGaussians, directions_world: Float[np.ndarray, "m 3"]
+) -> Float32[np.ndarray, "n 3"]:
+    # m is 1, a direction for all, or n.
+    basis = sh_basis(np.asarray(directions_world, np.float64), gaussians.sh_degree)
+    colours = 0.5 + np.einsum(
+        "nk,nkc->nc", np.broadcast_to(basis, (len(gaussians), basis.shape[1])), gaussians.sh
+    )
+    return np.maximum(colours, 0.0).astype(np.float32)

@@ -1,0 +1,69 @@
+"""Environment maps in files: equirectangular images of linear radiance, HDR or EXR.
+
+A learnt background, whose values are display values, is such a file too, so that other programs can use it.
+"""
+
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float32
+
+from octasplat.engine.colour import linear_to_srgb, srgb_to_linear
+from octasplat.engine.errors import ConfigError, DatasetError
+from octasplat.engine.render.image_files import read_image, write_exr, write_rgbe
+
+MAX_PIXELS = 1 << 27
+
+
+def read_environment(path: Path) -> Float32[np.ndarray, "h w 3"]:
+    """The linear radiance of an HDR or EXR image; a single channel stands for all three.
+
+    Raises:
+        ConfigError: the file is no such image, or holds values that are negative or not finite.
+    """
+    if path.suffix.lower() not in (".hdr", ".exr", ".pic"):
+        raise ConfigError(f"{path}: an environment is an HDR or EXR image; an 8-bit one holds no light.")
+    try:
+        image = read_image(path)
+    except DatasetError as error:
+        raise ConfigError(f"{path}: the environment cannot be read: {error}") from None
+    if image.shape[0] * image.shape[1] > MAX_PIXELS:
+        raise ConfigError(f"{path}: has more than {MAX_PIXELS >> 20} million pixels; make it smaller.")
+    rgb = image[..., :3] if image.shape[2] >= 3 else np.repeat(image[..., :1], 3, axis=2)
+    if not np.isfinite(rgb).all() or (rgb < 0).any():
+        raise ConfigError(f"{path}: holds values that are negative or not finite; mend the image.")
+    return np.ascontiguousarray(rgb)
+
+
+def write_environment(path: Path, radiance_linear: Float32[np.ndarray, "h w 3"]) -> None:
+    """Write a map as RGBE (``.hdr``, to within 1/256 of the brightest channel) or EXR (exactly), atomically.
+
+    Raises:
+        ConfigError: the name ends otherwise.
+        OutputError: the file cannot be written.
+    """
+    suffix = path.suffix.lower()
+    if suffix == ".hdr":
+        write_rgbe(path, radiance_linear)
+    elif suffix == ".exr":
+        write_exr(path, {name: radiance_linear[..., k] for k, name in enumerate("RGB")})
+    else:
+        raise ConfigError(f"{path}: an environment is written as .hdr or .exr.")
+
+
+def write_background(path: Path, rgb_srgb: Float32[np.ndarray, "h w 3"]) -> None:
+    """Write a learnt background, display values, as a map of linear radiance.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    write_environment(path, srgb_to_linear(rgb_srgb).astype(np.float32))
+
+
+def read_background(path: Path) -> Float32[np.ndarray, "h w 3"]:
+    """The display values of a learnt background.
+
+    Raises:
+        ConfigError: the file is no such map.
+    """
+    return linear_to_srgb(read_environment(path)).astype(np.float32)

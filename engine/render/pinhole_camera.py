@@ -1,0 +1,131 @@
+"""Pinhole cameras for new views, and the rays through their pixels."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Float64
+
+from octasplat.engine.rays import ImageRays
+
+
+@dataclass(frozen=True)
+class PinholeCamera:
+    """A pinhole camera: looks along +z, x right, y down; pixel centres at +0.5.
+
+    Attributes:
+        width_px: Image width.
+        height_px: Image height.
+        fx_px: Focal length across.
+        fy_px: Focal length down.
+        cx_px: Principal point from the left edge.
+        cy_px: Principal point from the top edge.
+        rotation_cam_from_world: Takes world directions to camera directions.
+        translation_cam_from_world: The world origin in the camera frame.
+        near_world: Distance from which on anything is seen.
+    """
+
+    width_px: int
+    height_px: int
+    fx_px: float
+    fy_px: float
+    cx_px: float
+    cy_px: float
+    rotation_cam_from_world: Float64[np.ndarray, "3 3"]
+    translation_cam_from_world: Float64[np.ndarray, "3"]
+    near_world: float = 0.0
+
+    @classmethod
+    def from_pose(
+        cls,
+        world_from_cam: Float64[np.ndarray, "4 4"],
+        width_px: int,
+        height_px: int,
+        *,
+        fy_px: float,
+        fx_px: float | None = None,
+        cx_px: float | None = None,
+        cy_px: float | None = None,
+    ) -> "PinholeCamera":
+        """A camera at a pose (camera-to-world matrix); square pixels and a centred axis unless given."""
+        rotation = world_from_cam[:3, :3].T
+        return cls(
+            width_px=width_px,
+            height_px=height_px,
+            fx_px=fy_px if fx_px is None else fx_px,
+            fy_px=fy_px,
+            cx_px=width_px / 2 if cx_px is None else cx_px,
+            cy_px=height_px / 2 if cy_px is None else cy_px,
+            rotation_cam_from_world=np.ascontiguousarray(rotation),
+            translation_cam_from_world=-rotation @ world_from_cam[:3, 3],
+        )
+
+    @classmethod
+    def looking_at(
+        cls,
+        position_world: Sequence[float],
+        target_world: Sequence[float],
+        width_px: int = 640,
+        height_px: int = 480,
+        *,
+        fov_y_degrees: float = 50.0,
+        up_world: Sequence[float] = (0.0, -1.0, 0.0),
+    ) -> "PinholeCamera":
+        """Return a camera that looks at a point and holds ``up_world`` upright in its image.
+
+        Raises:
+            ConfigError: it stands in its target, or looks along the up direction.
+
+        >>> RenderCamera.looking_at((0, 0, -4), (0, 0, 0), 96, 64).centre_world
+        array([ 0.,  0., -4.])
+        """
+        from octasplat.engine.render.pose_paths import look_at
+
+        position, target, up = (
+            np.array(vector, np.float64) for vector in (position_world, target_world, up_world)
+        )
+        focal_px = focal_from_fov(fov_y_degrees, height_px)
+        return cls.from_pose(look_at(position, target, up), width_px, height_px, fy_px=focal_px)
+
+    @property
+    def centre_world(self) -> Float64[np.ndarray, "3"]:
+        """Where the camera stands."""
+        return np.asarray(-self.rotation_cam_from_world.T @ self.translation_cam_from_world)
+
+    @property
+    def world_from_cam(self) -> Float64[np.ndarray, "4 4"]:
+        """The camera-to-world matrix."""
+        pose = np.eye(4)
+        pose[:3, :3] = self.rotation_cam_from_world.T
+        pose[:3, 3] = self.centre_world
+        return pose
+
+    def rays(self) -> ImageRays:
+        """The unit rays through the pixels' centres."""
+        x = (np.arange(self.width_px) + 0.5 - self.cx_px) / self.fx_px
+        y = (np.arange(self.height_px) + 0.5 - self.cy_px) / self.fy_px
+        directions_cam = np.empty((self.height_px, self.width_px, 3))
+        directions_cam[..., 0] = x
+        directions_cam[..., 1] = y[:, None]
+        directions_cam[..., 2] = 1.0
+        directions_cam /= np.linalg.norm(directions_cam, axis=-1, keepdims=True)
+        directions_world = directions_cam @ self.rotation_cam_from_world
+        return ImageRays.of(self.centre_world, directions_world, self.near_world)
+
+    def project(self, points_world: Float[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 2"]:
+        """Pixel coordinates of points; not-a-number for those not in front of the camera."""
+        points_cam = points_world @ self.rotation_cam_from_world.T + self.translation_cam_from_world
+        depth = np.where(points_cam[:, 2] > 0, points_cam[:, 2], np.nan)
+        across = self.fx_px * points_cam[:, 0] / depth + self.cx_px
+        return np.stack([across, self.fy_px * points_cam[:, 1] / depth + self.cy_px], axis=-1)
+
+
+def focal_from_fov(fov_degrees: float, side_px: int) -> float:
+    """The focal length in pixels at which ``side_px`` pixels span the angle ``fov_degrees``."""
+    return side_px / (2 * math.tan(math.radians(fov_degrees) / 2))
+
+
+def fov_from_focal(focal_px: float, side_px: int) -> float:
+    """The angle in degrees that ``side_px`` pixels span at a focal length."""
+    return math.degrees(2 * math.atan(side_px / (2 * focal_px)))

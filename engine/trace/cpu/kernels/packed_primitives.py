@@ -1,0 +1,129 @@
+"""Parameters of flat Gaussians turned into the tracer's records and boxes."""
+
+import math
+
+import numpy as np
+
+from octasplat.engine.compilation import device_function, kernel
+from octasplat.engine.trace.cpu.kernels.octagon_hit import (
+    AXIS_U,
+    AXIS_V,
+    COS_22,
+    INNER_RADIUS,
+    MEAN,
+    NORMAL,
+    OPACITY,
+)
+
+
+@device_function(_nrt=False, error_model="numpy")
+def rotation_columns(q0, q1, q2, q3):
+    """Columns r1, r2, r3 of the rotation of a quaternion (w, x, y, z) of any length, float64."""
+    scale = 1.0 / math.sqrt(q0 * q0 + q1 * q1 + q2 * q2 + q3 * q3)
+    w, x, y, z = q0 * scale, q1 * scale, q2 * scale, q3 * scale
+    return (
+        (1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)),
+        (2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)),
+        (2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)),
+    )
+
+
+@device_function(_nrt=False, error_model="numpy")
+def opacity_and_radius(logit, q):
+    """Opacity, and the octagon's corner radius in standard deviations."""
+    # without overflow at either end
+    part = math.exp(-abs(logit))
+    opacity = (1.0 if logit > 0 else part) / (1.0 + part)
+    return opacity, math.sqrt(max(0.0, q + 2.0 * math.log(opacity)))
+
+
+@device_function(_nrt=False, error_model="numpy")
+def ellipse_semi_axes(i, quats, log_scales, logits, q):
+    """Corner radii in world units along r2 and r3, and those axes."""
+    _r1, r2, r3 = rotation_columns(
+        np.float64(quats[i, 0]), np.float64(quats[i, 1]), np.float64(quats[i, 2]), np.float64(quats[i, 3])
+    )
+    _opacity, radius = opacity_and_radius(np.float64(logits[i]), q)
+    s2, s3 = math.exp(np.float64(log_scales[i, 0])), math.exp(np.float64(log_scales[i, 1]))
+    return radius * s2, radius * s3, r2, r3
+
+
+@device_function(_nrt=False, error_model="numpy")
+def pack_primitive(primitives, i, means, quats, log_scales, logits, q):
+    """Record of one Gaussian."""
+    r1, r2, r3 = rotation_columns(
+        np.float64(quats[i, 0]), np.float64(quats[i, 1]), np.float64(quats[i, 2]), np.float64(quats[i, 3])
+    )
+    per_s2, per_s3 = math.exp(-np.float64(log_scales[i, 0])), math.exp(-np.float64(log_scales[i, 1]))
+    opacity, radius = opacity_and_radius(np.float64(logits[i]), q)
+    for axis in range(3):
+        primitives[i, MEAN + axis] = means[i, axis]
+        primitives[i, NORMAL + axis] = r1[axis]
+        primitives[i, AXIS_U + axis] = r2[axis] * per_s2
+        primitives[i, AXIS_V + axis] = r3[axis] * per_s3
+    # A Gaussian without an octagon must not be hit even through its centre.
+    primitives[i, INNER_RADIUS] = radius * COS_22 if radius > 0.0 else -1.0
+    primitives[i, OPACITY] = opacity
+
+
+@kernel(_nrt=False, error_model="numpy")
+def pack_primitives(first, last, primitives, means, quats, log_scales, logits, q):
+    """All records."""
+    for i in range(first, last):
+        pack_primitive(primitives, i, means, quats, log_scales, logits, q)
+
+
+@device_function(_nrt=False, error_model="numpy")
+def write_box(box, i, means, quats, log_scales, logits, q, padding):
+    """Box of one octagon's ellipse enlarged by the fraction ``padding`` of its size.
+
+    A Gaussian without an octagon gets a box turned inside out, which Embree leaves out of its hierarchy.
+    """
+    a, b, r2, r3 = ellipse_semi_axes(i, quats, log_scales, logits, q)
+    reach = padding * max(a, b)
+    for axis in range(3):
+        half = math.sqrt((a * r2[axis]) ** 2 + (b * r3[axis]) ** 2)
+        centre = np.float64(means[i, axis])
+        # Room for float32 rounding in the box test, and for changes to come.
+        half += reach + 4e-6 * (abs(centre) + half)
+        if a <= 0.0 or not math.isfinite(half):
+            box[axis], box[3 + axis] = np.inf, -np.inf
+        else:
+            box[axis], box[3 + axis] = centre - half, centre + half
+
+
+@kernel(_nrt=False, error_model="numpy")
+def write_boxes(first, last, boxes, means, quats, log_scales, logits, q, padding):
+    """Boxes of all octagons, see :func:`write_box`."""
+    for i in range(first, last):
+        write_box(boxes[i], i, means, quats, log_scales, logits, q, padding)
+
+
+@kernel(error_model="numpy")
+def refit_outgrown_boxes(first, last, outgrown, boxes, ids, means, quats, log_scales, logits, q, padding):
+    """Give those of ``ids`` that have left their box a new one, and mark them in ``outgrown``.
+
+    The new box is larger by ``padding`` and by four times what the Gaussian stuck out, so that one that goes
+    on moving as fast does not need the next one at once.
+    """
+    for k in range(first, last):
+        i = ids[k]
+        now = np.empty(6, np.float32)
+        write_box(now, i, means, quats, log_scales, logits, q, 0.0)
+        out = np.float32(0.0)
+        for axis in range(3):
+            out = max(out, boxes[i, axis] - now[axis], now[3 + axis] - boxes[i, 3 + axis])
+        if out > 0.0 and now[0] <= now[3]:
+            outgrown[k] = True
+            write_box(boxes[i], i, means, quats, log_scales, logits, q, padding)
+            if out < np.inf:
+                for axis in range(3):
+                    boxes[i, axis] -= 4 * out
+                    boxes[i, 3 + axis] += 4 * out
+
+
+@kernel(_nrt=False, error_model="numpy")
+def repack_primitives(first, last, primitives, ids, means, quats, log_scales, logits, q):
+    """Records of the Gaussians ``ids`` from their changed parameters."""
+    for k in range(first, last):
+        pack_primitive(primitives, ids[k], means, quats, log_scales, logits, q)

@@ -1,0 +1,371 @@
+"""Forward passes for packets: candidates once a packet, then each ray sorts and composites its own hits."""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float32, Float64, Int64, UInt64
+
+from octasplat.engine.compilation import device_function, kernel
+from octasplat.engine.trace.cpu.kernels.octagon_hit import MEAN, NORMAL
+from octasplat.engine.trace.cpu.kernels.packet_bvh import WIDTH
+from octasplat.engine.trace.cpu.kernels.packet_candidates import (
+    CANDIDATE_BLOCK_BYTES,
+    CHUNK,
+    COLOR_NORMAL_WORDS,
+    INITIAL_CAPACITY,
+    MASK_BITS,
+    PRIMITIVE_BYTES,
+    allocate_candidates,
+    find_candidates,
+    write_candidate_blocks,
+)
+from octasplat.engine.trace.cpu.kernels.packet_sort import copy_candidates_unsorted, sort_candidates
+from octasplat.engine.trace.cpu.kernels.packet_traversal import allocate_frustum, allocate_traversal
+from octasplat.engine.trace.cpu.kernels.rays import (
+    facing_sign,
+    first_hit_index,
+    primitive_vector,
+    ray_limits,
+    ray_origin,
+    ray_slopes,
+)
+from octasplat.engine.trace.cpu.kernels.simd8 import (
+    accumulate_color_normals,
+    composite8,
+    eval_alphas8,
+    intersect_block8,
+    lookup_slots8,
+    rank_sort,
+    store_hits8,
+)
+from octasplat.engine.trace.cpu.kernels.simd_vector import float32_bits, float32_from_bits, lowest_bit
+from octasplat.engine.trace.cpu.kernels.spherical_harmonics import eval_color, eval_view_basis
+from octasplat.engine.trace.kernels.native import (
+    atomic_fetch_next,
+    njit_no_refcount,
+    prefetch,
+    prefetch_bytes,
+)
+
+RANK_SORT_MAX = 96
+"""Hits that are sorted by counting, for each, the smaller ones, eight at once: quadratic, but without a
+branch that the processor could guess wrongly. The few longer lists take an insertion sort.
+"""
+BLOCKS_PER_CHUNK = CHUNK // WIDTH
+CHUNK_BLOCKS_MASK = np.uint64((1 << BLOCKS_PER_CHUNK) - 1)
+LOW_WORD_MASK = np.uint64(0xFFFFFFFF)
+HIGH_WORD_SHIFT = np.uint64(32)
+
+
+class RayScratch(NamedTuple):
+    """Memory of a thread: harmonics, keys that are sorted, sums of a ray, and eight hits."""
+
+    basis: Float64[np.ndarray, "16"]
+    rank_buffer: UInt64[np.ndarray, "104"]
+    sums: Float64[np.ndarray, "8"]
+    alphas: Float32[np.ndarray, "8"]
+    weights: Float64[np.ndarray, "8"]
+    transmittance_after: Float64[np.ndarray, "8"]
+    depth_sums: Float64[np.ndarray, "8"]
+    candidate_indices: Int64[np.ndarray, "8"]
+    slots: Int64[np.ndarray, "8"]
+
+
+@device_function(error_model="numpy")
+def allocate_ray_scratch():
+    """Memory for rays, one after another."""
+    return RayScratch(
+        np.empty(16, np.float64),
+        np.empty(RANK_SORT_MAX + WIDTH, np.uint64),
+        np.empty(COLOR_NORMAL_WORDS, np.float64),
+        np.empty(WIDTH, np.float32),
+        np.empty(WIDTH, np.float64),
+        np.empty(WIDTH, np.float64),
+        np.empty(WIDTH, np.float64),
+        np.empty(WIDTH, np.int64),
+        np.empty(WIDTH, np.int64),
+    )
+
+
+@njit_no_refcount()
+def sort_ties_by_id(candidates, first, last):
+    """Order the hits ``first`` to ``last``, which are sorted by distance, by id where they share one."""
+    pending, numbers, ids = candidates.hit_keys, candidates.hit_candidates, candidates.ids
+    for i in range(first + 1, last):
+        key = pending[i]
+        if key >> HIGH_WORD_SHIFT != pending[i - 1] >> HIGH_WORD_SHIFT:
+            continue
+        mine = ids[numbers[np.int64(key & LOW_WORD_MASK)]]
+        j = i
+        while (
+            j > first
+            and pending[j - 1] >> HIGH_WORD_SHIFT == key >> HIGH_WORD_SHIFT
+            and ids[numbers[np.int64(pending[j - 1] & LOW_WORD_MASK)]] > mine
+        ):
+            pending[j] = pending[j - 1]
+            j -= 1
+        pending[j] = key
+
+
+@njit_no_refcount()
+def sort_hits(candidates, rank_buffer, first, last):
+    """Sort the hits ``first`` to ``last`` of a ray by distance, and by id where they share one."""
+    if last - first <= RANK_SORT_MAX:
+        if rank_sort(candidates.hit_keys.ctypes.data + first * 8, last - first, rank_buffer.ctypes.data):
+            sort_ties_by_id(candidates, first, last)
+        return
+    pending = candidates.hit_keys
+    for i in range(first + 1, last):
+        key = pending[i]
+        j = i
+        while j > first and pending[j - 1] > key:
+            pending[j] = pending[j - 1]
+            j -= 1
+        pending[j] = key
+    sort_ties_by_id(candidates, first, last)
+
+
+@njit_no_refcount(forceinline=True)
+def intersect_blocks(candidates, ray_bit, first, slopes, limits, hit_count):
+    """Test the ``BLOCKS_PER_CHUNK`` blocks from ``first`` on that the packet's ray ``ray_bit`` may meet.
+
+    Returns how many hits there are then; ``hit_count`` are known already. The blocks' bits lie in one word.
+    """
+    a, b, per_axis = np.float32(slopes[0]), np.float32(slopes[1]), np.float32(slopes[2])
+    t_min, t_max = limits
+    c = candidates
+    rows_at = c.blocks.ctypes.data
+    bits = (
+        c.ray_block_masks[first // MASK_BITS, ray_bit] >> np.uint64(first % MASK_BITS)
+    ) & CHUNK_BLOCKS_MASK
+    bits = np.int64(bits)
+    while bits != 0:
+        block = first + lowest_bit(bits)
+        bits &= bits - 1
+        hit_count += intersect_block8(
+            rows_at + block * CANDIDATE_BLOCK_BYTES, a, b, per_axis, t_min, t_max, block * WIDTH, hit_count,
+            c.hit_keys.ctypes.data, c.alphas.ctypes.data, c.opacities.ctypes.data, c.us.ctypes.data,
+            c.vs.ctypes.data, c.hit_candidates.ctypes.data,
+        )  # fmt: skip
+    return hit_count
+
+
+@njit_no_refcount(forceinline=True)
+def eval_alphas(candidates, first, last, alpha_max):
+    """Alphas of the hits ``first`` to ``last`` of a ray."""
+    for place in range(first, last, WIDTH):
+        eval_alphas8(
+            candidates.alphas.ctypes.data, candidates.opacities.ctypes.data, place, np.float32(alpha_max)
+        )
+
+
+@njit_no_refcount(forceinline=True)
+def prefetch_colors(new_hits, candidate_indices, ids, scene):
+    """Ask for what the hits ``new_hits`` show at once, so that memory is not waited for one by one."""
+    sh_at, sh_bytes = scene.sh.ctypes.data, scene.sh.shape[1] * 12
+    while new_hits != 0:
+        i = ids[candidate_indices[lowest_bit(new_hits)]]
+        prefetch(scene.primitives.ctypes.data + i * PRIMITIVE_BYTES)
+        prefetch_bytes(sh_at + i * sh_bytes, sh_bytes)
+        new_hits &= new_hits - 1
+
+
+@njit_no_refcount(fastmath={"contract"})
+def eval_color_normal(color_normal, i, scene, limits, origin, basis):
+    """What Gaussian ``i`` shows to rays from ``origin``."""
+    record = scene.primitives[i]
+    x, y, z = record[MEAN] - origin[0], record[MEAN + 1] - origin[1], record[MEAN + 2] - origin[2]
+    n0, n1, n2 = primitive_vector(record, NORMAL)
+    eval_view_basis(basis, scene.sh.shape[1], x, y, z)
+    color_normal[0], color_normal[1], color_normal[2] = eval_color(scene.sh, i, basis)
+    color_normal[3] = color_normal[7] = 0.0
+    side = facing_sign((x, y, z), (n0, n1, n2), limits)
+    color_normal[4], color_normal[5], color_normal[6] = side * n0, side * n1, side * n2
+
+
+@njit_no_refcount(fastmath={"contract"})
+def trace_ray(
+    r,
+    ray_bit,
+    first_hit,
+    slot_count,
+    slot_base,
+    origin,
+    frame,
+    forward,
+    candidates,
+    count,
+    packet_hits,
+    scratch,
+):
+    """Follow ray ``r``, which is ray ``ray_bit`` of its packet; its hits are stored from ``first_hit`` on.
+
+    Returns the place behind its last hit, and the number of Gaussians that the packet has met, so far
+    ``slot_count``, which ``packet_hits`` lists from ``slot_base`` on.
+    """
+    limits, hits, out, features = forward.limits, forward.hits, forward.out, forward.scene.features
+    pending, ids = candidates.hit_keys, candidates.ids
+    slot_of, shown = candidates.slots, candidates.color_normals
+    feature_count, recording = features.shape[1], forward.is_recording
+    slopes, span = ray_slopes(forward.rays, r, frame), ray_limits(forward.rays, r)
+    if recording:
+        hits.starts[r] = first_hit
+    scratch.sums[:] = 0.0
+    scratch.depth_sums[:] = 0.0
+    for f in range(feature_count):
+        out.features[r, f] = np.float32(0.0)
+    # The second phase begins where too little is left, and ends where its own part of it is (Algorithm 1).
+    t, stop_below, last_phase = 1.0, limits.eps1, limits.eps2 > 1.0
+    median = np.float32(0.0)
+    found = head = tail = b0 = 0
+    block_count = (count + WIDTH - 1) // WIDTH
+    stop = False
+    while b0 < block_count and not stop:
+        b1 = min(b0 + BLOCKS_PER_CHUNK, block_count)
+        known = tail
+        tail = intersect_blocks(candidates, ray_bit, b0, slopes, span, tail)
+        if tail > known:
+            eval_alphas(candidates, known, tail, limits.alpha_max)
+            sort_hits(candidates, scratch.rank_buffer, head, tail)
+        # What follows lies no nearer than this.
+        nearest = candidates.min_distance_after[min(b1 * WIDTH, count)]
+        safe = np.uint64(float32_bits(nearest)) << HIGH_WORD_SHIFT
+        while not stop and head < tail and pending[head] < safe:
+            keys_at = pending.ctypes.data + head * 8
+            bits = composite8(
+                keys_at, min(tail - head, limits.max_hits - found), safe, candidates.alphas.ctypes.data, t,
+                stop_below, scratch.alphas.ctypes.data, scratch.weights.ctypes.data,
+                scratch.transmittance_after.ctypes.data,
+            )  # fmt: skip
+            taken = n = bits >> (2 * WIDTH)
+            if bits & ((1 << n) - 1) != 0:
+                last = lowest_bit(bits)
+                if not last_phase:
+                    last_phase = True
+                    stop_below = scratch.transmittance_after[last] * limits.eps2
+                    last += 1
+                    while last < n and scratch.transmittance_after[last] >= stop_below:
+                        last += 1
+                if last < n:
+                    taken, stop = last + 1, True
+            if t > 0.5:
+                halves = (bits >> WIDTH) & ((1 << taken) - 1)
+                if halves != 0:
+                    median = float32_from_bits(
+                        np.uint32(pending[head + lowest_bit(halves)] >> HIGH_WORD_SHIFT)
+                    )
+            new = lookup_slots8(
+                keys_at, taken, candidates.hit_candidates.ctypes.data, slot_of.ctypes.data,
+                scratch.weights.ctypes.data, scratch.candidate_indices.ctypes.data, scratch.slots.ctypes.data,
+                scratch.depth_sums.ctypes.data,
+            )  # fmt: skip
+            if new & (new - 1) != 0:
+                prefetch_colors(new, scratch.candidate_indices, ids, forward.scene)
+            while new != 0:
+                k = lowest_bit(new)
+                new &= new - 1
+                number = scratch.candidate_indices[k]
+                scratch.slots[k] = slot_of[number] = slot_count
+                eval_color_normal(
+                    shown[slot_count], ids[number], forward.scene, limits, origin, scratch.basis
+                )
+                if recording:
+                    packet_hits.slot_ids[slot_base + slot_count] = ids[number]
+                    for channel in range(3):
+                        packet_hits.slot_rgb[slot_base + slot_count, channel] = shown[slot_count, channel]
+                slot_count += 1
+            for f in range(feature_count):
+                for k in range(taken):
+                    out.features[r, f] += np.float32(
+                        scratch.weights[k] * features[ids[scratch.candidate_indices[k]], f]
+                    )
+            accumulate_color_normals(
+                scratch.sums.ctypes.data, shown.ctypes.data, scratch.slots.ctypes.data,
+                scratch.weights.ctypes.data, taken,
+            )  # fmt: skip
+            if recording:
+                store_hits8(
+                    keys_at, taken, scratch.alphas.ctypes.data, scratch.slots.ctypes.data,
+                    candidates.us.ctypes.data, candidates.vs.ctypes.data, first_hit, hits.alphas.ctypes.data,
+                    hits.distances.ctypes.data, packet_hits.us.ctypes.data, packet_hits.vs.ctypes.data,
+                    packet_hits.slots.ctypes.data,
+                )  # fmt: skip
+            t = scratch.transmittance_after[taken - 1]
+            head, first_hit, found = head + taken, first_hit + taken, found + taken
+            stop = stop or found >= limits.max_hits
+        b0 = b1
+        stop = stop or nearest >= span[1]
+    out.counts[r] = found
+    out.transmittance[r] = t
+    depth = 0.0
+    for k in range(WIDTH):
+        depth += scratch.depth_sums[k]
+    out.depth_sum[r] = depth
+    out.depth_median[r] = median
+    for axis in range(3):
+        out.rgb[r, axis] = scratch.sums[axis]
+        out.normal[r, axis] = scratch.sums[4 + axis]
+    return first_hit, slot_count
+
+
+@kernel(error_model="numpy")
+def trace_packets(forward, packets, bvh, packet_hits, counter):
+    """Trace packets of rays ``packets[p, 0]`` to ``packets[p, 1]`` until the ``counter`` has passed the last.
+
+    Packet p's hits are stored from the first place of its first ray on, and ``packet_hits`` beside them. A ray's
+    result depends on its packet alone, so it is the same for every number of threads.
+    """
+    pyramid, walk, scratch = allocate_frustum(), allocate_traversal(), allocate_ray_scratch()
+    candidates = allocate_candidates(INITIAL_CAPACITY)
+    while True:
+        packet = atomic_fetch_next(counter.ctypes.data)
+        if packet >= len(packets):
+            break
+        first, last = packets[packet, 0], packets[packet, 1]
+        candidates, count = find_candidates(forward.rays, first, last, bvh, pyramid, walk, candidates)
+        sort_candidates(candidates, count, bvh.order, walk.histogram)
+        origin = ray_origin(forward.rays, first)
+        write_candidate_blocks(candidates, count, forward.scene, origin, pyramid.frame, True)
+        candidates.slots[:count] = -1
+        slots = 0
+        place = slot_base = first_hit_index(first, forward.limits)
+        for r in range(first, last):
+            place, slots = trace_ray(
+                r, r - first, place, slots, slot_base, origin, pyramid.frame, forward, candidates, count,
+                packet_hits, scratch,
+            )  # fmt: skip
+        if forward.is_recording:
+            packet_hits.slot_counts[packet] = slots
+
+
+@njit_no_refcount(fastmath={"contract"})
+def ray_transmittance(r, ray_bit, rays, frame, candidates, count, limits):
+    """What the candidates leave of ray ``r``, ray ``ray_bit`` of its packet; 0 where that is below eps1."""
+    slopes, span = ray_slopes(rays, r, frame), ray_limits(rays, r)
+    block_count = (count + WIDTH - 1) // WIDTH
+    left = 1.0
+    for b0 in range(0, block_count, BLOCKS_PER_CHUNK):
+        tail = intersect_blocks(candidates, ray_bit, b0, slopes, span, 0)
+        eval_alphas(candidates, 0, tail, limits.alpha_max)
+        for m in range(tail):
+            left *= 1.0 - candidates.alphas[m]
+            if left < limits.eps1:
+                return 0.0
+    return left
+
+
+@kernel(error_model="numpy")
+def packet_transmittance(rays, scene, limits, packets, bvh, counter, transmittance):
+    """The transmittance of rays alone: nothing is sorted, no colour is read."""
+    pyramid, walk = allocate_frustum(), allocate_traversal()
+    candidates = allocate_candidates(INITIAL_CAPACITY)
+    while True:
+        packet = atomic_fetch_next(counter.ctypes.data)
+        if packet >= len(packets):
+            break
+        first, last = packets[packet, 0], packets[packet, 1]
+        candidates, count = find_candidates(rays, first, last, bvh, pyramid, walk, candidates)
+        copy_candidates_unsorted(candidates, count, bvh.order)
+        write_candidate_blocks(candidates, count, scene, ray_origin(rays, first), pyramid.frame, False)
+        for r in range(first, last):
+            transmittance[r] = ray_transmittance(r, r - first, rays, pyramid.frame, candidates, count, limits)

@@ -1,0 +1,91 @@
+"""Single rays and vectors out of bundles, where one origin, limit or viewer may stand for all."""
+
+import math
+
+import numpy as np
+
+from octasplat.engine.trace.kernels.native import njit_no_refcount
+
+HIT_PADDING = 8
+"""Places for hits beyond the most that a ray can have, as they are written eight at a time."""
+
+
+@njit_no_refcount(forceinline=True)
+def ray_origin(rays, r):
+    """Origin of ray ``r`` in float64."""
+    o = r if len(rays.origins) > 1 else 0
+    return np.float64(rays.origins[o, 0]), np.float64(rays.origins[o, 1]), np.float64(rays.origins[o, 2])
+
+
+@njit_no_refcount(forceinline=True)
+def ray_direction(rays, r):
+    """Direction of ray ``r`` in float64."""
+    return (
+        np.float64(rays.directions[r, 0]),
+        np.float64(rays.directions[r, 1]),
+        np.float64(rays.directions[r, 2]),
+    )
+
+
+@njit_no_refcount(forceinline=True)
+def ray_slopes(rays, r, frame):
+    """Slopes a and b of ray ``r`` in a packet's ``frame``, and its length over its way along the axis.
+
+    The frame begins with the axis, e and f; the direction is axis + a e + b f over the third number.
+    """
+    d0, d1, d2 = ray_direction(rays, r)
+    per_axis = 1.0 / (d0 * frame[0] + d1 * frame[1] + d2 * frame[2])
+    return (
+        (d0 * frame[3] + d1 * frame[4] + d2 * frame[5]) * per_axis,
+        (d0 * frame[6] + d1 * frame[7] + d2 * frame[8]) * per_axis,
+        per_axis,
+    )
+
+
+@njit_no_refcount(forceinline=True)
+def primitive_vector(primitive, offset):
+    """Three numbers of a record in float64."""
+    return np.float64(primitive[offset]), np.float64(primitive[offset + 1]), np.float64(primitive[offset + 2])
+
+
+@njit_no_refcount(forceinline=True)
+def ray_limits(rays, r):
+    """Between which distances ray ``r`` sees; a single limit stands for all rays."""
+    return rays.t_min[r if len(rays.t_min) > 1 else 0], rays.t_max[r if len(rays.t_max) > 1 else 0]
+
+
+@njit_no_refcount(forceinline=True)
+def ray_t_view_origin(rays, r):
+    """Where on ray ``r`` its viewer stands; a single one stands for all rays."""
+    return np.float64(rays.t_view_origin[r if len(rays.t_view_origin) > 1 else 0])
+
+
+@njit_no_refcount(forceinline=True)
+def ray_t_backface_cull(rays, r, limits):
+    """Up to where ray ``r`` passes what it would meet from behind; a single distance stands for all rays."""
+    if limits.flip_normal_cos == 0.0:  # normals have no side
+        return np.float32(0.0)
+    return rays.t_backface_cull[r if len(rays.t_backface_cull) > 1 else 0]
+
+
+@njit_no_refcount(forceinline=True)
+def facing_sign(to_mean, normal, limits):
+    """1, or -1 where ``normal`` is turned to the viewer.
+
+    See :class:`octasplat.engine.trace.protocol.TraceSettings`.
+
+    ``to_mean`` leads from the origin of a ray to the Gaussian's mean. A ray that meets a Gaussian in front
+    of its origin does so from the side on which the origin lies.
+    """
+    x, y, z = to_mean
+    along = x * normal[0] + y * normal[1] + z * normal[2]
+    if along <= 0.0:
+        return 1.0
+    beyond = limits.flip_normal_cos
+    return -1.0 if beyond == 0.0 or along > beyond * math.sqrt(x * x + y * y + z * z) else 1.0
+
+
+@njit_no_refcount(forceinline=True)
+def first_hit_index(r, limits):
+    """Where the hits of ray ``r`` may be stored from: each ray before it has room for its own."""
+    return r * (limits.max_hits + HIT_PADDING)

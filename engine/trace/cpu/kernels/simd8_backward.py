@@ -1,0 +1,178 @@
+"""Eight hits of a ray at a time backwards, as explicit vectors.
+
+See :mod:`octasplat.engine.trace.cpu.kernels.simd8`.
+"""
+
+import llvmlite.ir as ir
+from numba import types
+from numba.core import cgutils
+from numba.extending import intrinsic
+
+from octasplat.engine.trace.cpu.kernels.simd_ops import (
+    DOUBLE,
+    FLOAT,
+    I32,
+    INT8,
+    LONG8,
+    element_address,
+    first_lanes_mask,
+    gather,
+    keep_first_lanes,
+    load,
+    prefix_scan,
+    shift_lanes,
+    splat,
+    store,
+)
+from octasplat.engine.trace.cpu.kernels.simd_vector import (
+    DOUBLE8,
+    FLOAT8,
+    I64,
+    LANES,
+    Vector,
+    VectorRows,
+    broadcast,
+)
+
+
+@intrinsic
+def transmittance_before8(typingctx, alphas, count, transmittance, transmittance_before):
+    """Write what is left before each of ``count`` of eight hits with float32 ``alphas``, ``transmittance`` at first.
+
+    Returns what is left behind the last of them.
+    """
+    address, double = types.uintp, types.float64
+    signature = double(address, types.int64, double, address)
+
+    def codegen(context, builder, sig, args):
+        alphas, count, t, through = args
+        alpha = keep_first_lanes(builder, VectorRows(builder, alphas, FLOAT8)[0].to_float64(), count)
+        product = prefix_scan(builder, 1.0 - alpha, lambda a, b: a * b, 1.0)
+        store(builder, (shift_lanes(builder, product, 1, 1.0) * broadcast(builder, t)).value, through)
+        return builder.fmul(builder.extract_element(product.value, ir.Constant(I32, LANES - 1)), t)
+
+    return signature, codegen
+
+
+@intrinsic
+def backward_hits8(
+    typingctx, alphas, transmittance_before, weight_gradients, slots, us, vs, slot_rgb, count, gradient_behind, alpha_max, ray_gradients, rows,
+    weights, log_alpha_gradients,
+):  # fmt: skip
+    """Backwards through ``count`` of eight hits: what they add to the rows of their Gaussians.
+
+    Args are the float32 alphas, the transmittance before each, dL by a weight of one of each but for what its
+    colour does to that, int32 slots, u and v, the float32 colours of the slots, dL by what lies behind the
+    last, the alpha (float32) that was clamped and has no gradient, and eight float32 of the ray: 1, 0, its
+    error, dL by its colour, 0, 0. Row s at ``rows`` is that of slot s, sixteen float32.
+
+    Of each hit, with h = dL/d ln(alpha), adds to the first eight the moments h (1, u, v, u^2, u v, v^2,
+    u (u^2 + v^2), v (u^2 + v^2)), and to the others its weight times the eight of the ray, but for the second
+    of them, which counts. Writes weights and h, float32; returns dL by what lies behind the hit before.
+    """
+    address, double = types.uintp, types.float64
+    signature = double(
+        *(address,) * 7, types.int64, double, types.float32, address, address, address, address
+    )
+
+    def codegen(context, builder, sig, args):
+        alphas, through, values, slots, us, vs, slot_rgb, count, behind, alpha_max, by_ray, rows = args[:12]
+        weights, shares = args[12:]
+        valid = first_lanes_mask(builder, count)
+        slot = builder.sext(load(builder, slots, INT8), LONG8)
+        slot = builder.select(valid, slot, ir.Constant(LONG8, [0] * LANES))
+        value = VectorRows(builder, values, DOUBLE8)[0]
+        first_word = builder.mul(slot, ir.Constant(LONG8, [3] * LANES))
+        for channel in range(3):
+            word = builder.add(first_word, ir.Constant(LONG8, [channel] * LANES))
+            colour = builder.fpext(gather(builder, slot_rgb, word, FLOAT8), DOUBLE8)
+            at = builder.add(by_ray, ir.Constant(I64, (3 + channel) * 4))
+            slope = builder.fpext(builder.load(builder.inttoptr(at, FLOAT.as_pointer())), DOUBLE)
+            value = value + Vector(builder, colour) * broadcast(builder, slope)
+        alpha = VectorRows(builder, alphas, FLOAT8)[0].to_float64()
+        clamped = alpha >= broadcast(builder, builder.fpext(alpha_max, DOUBLE))
+        alpha = keep_first_lanes(builder, alpha, count)
+        through = VectorRows(builder, through, DOUBLE8)[0]
+        weight = keep_first_lanes(builder, alpha * through, count)
+        seen = keep_first_lanes(builder, weight * value, count)
+        sums = prefix_scan(builder, seen, lambda a, b: a + b, 0.0, reverse=True)
+        later = shift_lanes(builder, sums, -1, 0.0) + broadcast(builder, behind)
+        h = (through * value - later / (1.0 - alpha)) * alpha
+        h = keep_first_lanes(builder, clamped.select(0.0, h), count)
+        weight, h = builder.fptrunc(weight.value, FLOAT8), builder.fptrunc(h.value, FLOAT8)
+        store(builder, weight, weights)
+        store(builder, h, shares)
+        _accumulate_moments(builder, h, load(builder, us, FLOAT8), load(builder, vs, FLOAT8), weights, by_ray,
+                     slots, rows, count)  # fmt: skip
+        first = builder.extract_element(sums.value, ir.Constant(I32, 0))
+        return builder.fadd(first, behind)
+
+    return signature, codegen
+
+
+@intrinsic
+def accumulate_row(typingctx, sums, row):
+    """Add a row of sixteen float32 to sixteen doubles."""
+    signature = types.void(types.uintp, types.uintp)
+
+    def codegen(context, builder, sig, args):
+        total, added = VectorRows(builder, args[0], DOUBLE8), VectorRows(builder, args[1], FLOAT8)
+        for half in range(2):
+            total[half] = total[half] + added[half].to_float64()
+        return context.get_dummy_value()
+
+    return signature, codegen
+
+
+def _accumulate_moments(builder, h, u, v, weights, ray_gradients, slots, rows, count):
+    """The rows' part of :func:`backward_hits8`."""
+
+    def times(a, b):
+        return builder.fmul(a, b, flags=("contract",))
+
+    def plus(a, b):
+        return builder.fadd(a, b, flags=("contract",))
+
+    hu, hv, square = times(h, u), times(h, v), plus(times(u, u), times(v, v))
+    moments = (h, hu, hv, times(hu, u), times(hu, v), times(hv, v), times(hu, square), times(hv, square))
+    turned = cgutils.alloca_once(builder, ir.ArrayType(FLOAT8, LANES))
+    for k, row in enumerate(_transpose8(builder, moments)):
+        builder.store(row, builder.gep(turned, [ir.Constant(I32, 0), ir.Constant(I32, k)]))
+    ray = load(builder, ray_gradients, FLOAT8)
+    counting = ir.Constant(FLOAT8, [0.0, 1.0, *[0.0] * 6])
+    slots = builder.inttoptr(slots, I32.as_pointer())
+    weights = builder.inttoptr(weights, FLOAT.as_pointer())
+    with cgutils.for_range(builder, count) as loop:
+        k = loop.index
+        slot = builder.sext(builder.load(builder.gep(slots, [k])), I64)
+        at = element_address(builder, rows, slot, 64)
+        moment = builder.load(builder.gep(turned, [ir.Constant(I32, 0), k]))
+        store(builder, builder.fadd(load(builder, at, FLOAT8), moment), at)
+        at = builder.add(at, ir.Constant(I64, 32))
+        weight = splat(builder, builder.load(builder.gep(weights, [k])), FLOAT)
+        added = builder.fadd(plus(times(ray, weight), load(builder, at, FLOAT8)), counting)
+        store(builder, added, at)
+
+
+def _transpose8(builder, rows):
+    """Eight vectors of eight float32, rows and columns exchanged."""
+
+    def mixed(a, b, order):
+        return builder.shuffle_vector(a, b, ir.Constant(INT8, order))
+
+    pairs = [
+        mixed(rows[k], rows[k + 1], order)
+        for k in range(0, LANES, 2)
+        for order in ([0, 8, 1, 9, 4, 12, 5, 13], [2, 10, 3, 11, 6, 14, 7, 15])
+    ]
+    fours = [
+        mixed(pairs[k + half], pairs[k + 2 + half], order)
+        for k in (0, 4)
+        for half in (0, 1)
+        for order in ([0, 1, 8, 9, 4, 5, 12, 13], [2, 3, 10, 11, 6, 7, 14, 15])
+    ]
+    return [
+        mixed(fours[k], fours[k + 4], order)
+        for order in ([0, 1, 2, 3, 8, 9, 10, 11], [4, 5, 6, 7, 12, 13, 14, 15])
+        for k in range(4)
+    ]

@@ -1,0 +1,347 @@
+"""The backward pass: ray by ray down to alpha, then Gaussian by Gaussian to the raw parameters.
+
+The first kernel replays each ray front to back and leaves, for every hit, its weight w = alpha T and
+h = dL/d ln(alpha). After the hits are sorted by Gaussian, the second kernel sums each Gaussian's share in
+ray order in float64: no atomics, no dense buffer, and the same bits on any number of threads.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float32, Int32
+
+from octasplat.engine.compilation import kernel
+from octasplat.engine.gaussians.model import SH_C0
+from octasplat.engine.trace.cpu.kernels.octagon_hit import MEAN, NORMAL, OPACITY
+from octasplat.engine.trace.cpu.kernels.packed_primitives import rotation_columns
+from octasplat.engine.trace.cpu.kernels.rays import (
+    facing_sign,
+    primitive_vector,
+    ray_direction,
+    ray_origin,
+    ray_t_view_origin,
+)
+from octasplat.engine.trace.cpu.kernels.spherical_harmonics import (
+    eval_ray_view_basis,
+    mean_gradient,
+    write_basis_gradient,
+)
+from octasplat.engine.trace.kernels.native import atomic_fetch_next, njit_no_refcount
+
+RED_CLAMPED, GREEN_CLAMPED, BLUE_CLAMPED = 1 << 28, 1 << 29, 1 << 30
+"""Bits of a hit's ray number: this channel's colour was clamped at zero and gets no gradient."""
+RAY_ID_MASK = (1 << 28) - 1
+
+
+class HitGradients(NamedTuple):
+    """What each hit of the replayed rays adds to its Gaussian, ray after ray.
+
+    ``ray_flags`` has a hit's ray in the bits below 2^28; ``h_alpha`` is dL/d ln(alpha), ``g_t`` is dL/dt.
+    """
+
+    ids: Int32[np.ndarray, " e"]
+    ray_flags: Int32[np.ndarray, " e"]
+    weights: Float32[np.ndarray, " e"]
+    h_alpha: Float32[np.ndarray, " e"]
+    g_t: Float32[np.ndarray, " e"]
+
+
+class GaussianMoments(NamedTuple):
+    """Sums over a Gaussian's hits; with the hit at u, v standard deviations and tau = dL/dt / <d, r1>.
+
+    ``n0`` to ``n2`` sum the gradient of the turned normal times the weight, ``m0`` to ``m2`` that by the mean
+    through the direction in which its colour is seen.
+    """
+
+    h: float
+    hu: float
+    hv: float
+    huu: float
+    huv: float
+    hvv: float
+    tau: float
+    tau_u: float
+    tau_v: float
+    n0: float
+    n1: float
+    n2: float
+    m0: float
+    m1: float
+    m2: float
+
+
+@njit_no_refcount(forceinline=True, fastmath={"contract"})
+def backward_ray(r, first, rays, hits, counts, scene, limits, output_gradients, hit_gradients):
+    """dL/dalpha_k = <g, T_k c_k - (C - prefix_k)/(1 - alpha_k)> of the hits of ray ``r``, for every channel.
+
+    They go to ``hit_gradients`` from ``first`` on.
+    """
+    records, features = scene.primitives, scene.features
+    alphas, ts, hit_rgb = hits.alphas, hits.distances, hits.rgb
+    weights = hit_gradients.weights
+    feature_count = features.shape[1]
+    t = 1.0
+    median = -1
+    for k in range(counts[r]):
+        alpha = np.float64(alphas[hits.starts[r] + k])
+        weights[first + k] = alpha * t
+        if t > 0.5 and t * (1.0 - alpha) <= 0.5:
+            median = k
+        t *= 1.0 - alpha
+    g0, g1, g2 = (
+        np.float64(output_gradients.rgb[r, 0]),
+        np.float64(output_gradients.rgb[r, 1]),
+        np.float64(output_gradients.rgb[r, 2]),
+    )
+    gn0 = gn1 = gn2 = gd = gm = 0.0
+    ox, oy, oz = ray_origin(rays, r)
+    if output_gradients.has_geometry:
+        gd, gm = np.float64(output_gradients.depth_sum[r]), np.float64(output_gradients.depth_median[r])
+        gn0, gn1, gn2 = (
+            np.float64(output_gradients.normal[r, 0]),
+            np.float64(output_gradients.normal[r, 1]),
+            np.float64(output_gradients.normal[r, 2]),
+        )
+    # What lies behind the current hit, as the gradient sees it: <g, C - prefix> over all channels. It is
+    # summed from the back in float64: as a difference of sums it would drown behind opaque surfaces.
+    behind = np.float64(output_gradients.transmittance[r]) * t
+    for k in range(counts[r] - 1, -1, -1):
+        e = hits.starts[r] + k
+        out = first + k
+        i = hits.ids[e]
+        alpha = np.float64(alphas[e])
+        weight = np.float64(weights[out])
+        value = g0 * hit_rgb[e, 0] + g1 * hit_rgb[e, 1] + g2 * hit_rgb[e, 2]
+        gt = 0.0
+        through = weight / alpha
+        if output_gradients.has_geometry:
+            value += gd * ts[e]
+            gt = gd * weight
+            n0, n1, n2 = primitive_vector(records[i], NORMAL)
+            x, y, z = primitive_vector(records[i], MEAN)
+            side = facing_sign((x - ox, y - oy, z - oz), (n0, n1, n2), limits)
+            value += side * (gn0 * n0 + gn1 * n1 + gn2 * n2)
+            if k == median:
+                gt += gm
+        for f in range(feature_count):
+            value += np.float64(output_gradients.features[r, f]) * features[i, f]
+        g_alpha = through * value - behind / (1.0 - alpha)
+        behind += weight * value
+        hit_gradients.ids[out] = i
+        flags = np.int64(r)
+        if hit_rgb[e, 0] <= 0.0:
+            flags |= RED_CLAMPED
+        if hit_rgb[e, 1] <= 0.0:
+            flags |= GREEN_CLAMPED
+        if hit_rgb[e, 2] <= 0.0:
+            flags |= BLUE_CLAMPED
+        hit_gradients.ray_flags[out] = flags
+        hit_gradients.h_alpha[out] = 0.0 if alphas[e] >= np.float32(limits.alpha_max) else g_alpha * alpha
+        hit_gradients.g_t[out] = gt
+
+
+@kernel(error_model="numpy")
+def backward_rays(
+    first, last, rays, ray_indices, offsets, hits, counts, scene, limits, output_gradients, hit_gradients
+):
+    """:func:`backward_ray` on the rays ``ray_indices``; ``offsets`` are the places of their hits in ``hit_gradients``."""
+    for s in range(first, last):
+        backward_ray(
+            ray_indices[s], offsets[s], rays, hits, counts, scene, limits, output_gradients, hit_gradients
+        )
+
+
+@njit_no_refcount(forceinline=True, fastmath={"contract"})
+def write_geometry_gradients(segment, i, frame, quats, primitives, moments, out):
+    """Gradients of one Gaussian's raw geometry from its sums over rays.
+
+    In the Gaussian's own frame, with u, v the hit in standard deviations, tau = dL/dt through the point
+    over <d, r1>: dL/dm = S(h u)/s2 r2 + S(h v)/s3 r3 + S(tau) r1, dL/dln s = S(h u^2), S(h v^2), and the
+    frame turns by the torque S r_i x dL/dr_i. ``frame`` are r1, r2, r3, s2 and s3.
+    """
+    q0, q1, q2, q3 = (
+        np.float64(quats[i, 0]), np.float64(quats[i, 1]), np.float64(quats[i, 2]), np.float64(quats[i, 3])
+    )  # fmt: skip
+    r1, r2, r3, s2, s3 = frame
+    inv_s2, inv_s3 = 1.0 / s2, 1.0 / s3
+    # torque = r1 x G1 + r2 x G2 + r3 x G3, G1 = -(sums.tau_u s2 r2 + sums.tau_v s3 r3) + normal channel
+    on_r3, on_r2 = -moments.tau_u * s2, moments.tau_v * s3
+    on_r1 = -moments.huv * s3 * inv_s2 + moments.huv * s2 * inv_s3
+    w0 = on_r1 * r1[0] + on_r2 * r2[0] + on_r3 * r3[0] + r1[1] * moments.n2 - r1[2] * moments.n1
+    w1 = on_r1 * r1[1] + on_r2 * r2[1] + on_r3 * r3[1] + r1[2] * moments.n0 - r1[0] * moments.n2
+    w2 = on_r1 * r1[2] + on_r2 * r2[2] + on_r3 * r3[2] + r1[0] * moments.n1 - r1[1] * moments.n0
+    # dL/dq = 2 (0, w) q / |q|^2: the rotation depends on the direction of q only
+    factor = 2.0 / (q0 * q0 + q1 * q1 + q2 * q2 + q3 * q3)
+    out.quats[segment, 0] = factor * (-w0 * q1 - w1 * q2 - w2 * q3)
+    out.quats[segment, 1] = factor * (w0 * q0 + w1 * q3 - w2 * q2)
+    out.quats[segment, 2] = factor * (w1 * q0 + w2 * q1 - w0 * q3)
+    out.quats[segment, 3] = factor * (w2 * q0 + w0 * q2 - w1 * q1)
+    by_view = moments.m0, moments.m1, moments.m2
+    for axis in range(3):
+        out.means[segment, axis] = (
+            moments.hu * inv_s2 * r2[axis]
+            + moments.hv * inv_s3 * r3[axis]
+            + moments.tau * r1[axis]
+            + by_view[axis]
+        )
+    out.log_scales[segment, 0] = moments.huu
+    out.log_scales[segment, 1] = moments.hvv
+    out.logits[segment] = moments.h * (1.0 - np.float64(primitives[i, OPACITY]))
+
+
+@njit_no_refcount(fastmath={"contract"})
+def reduce_hits_chunk(
+    first,
+    last,
+    scratch,
+    rays,
+    parameters,
+    scene,
+    limits,
+    gaussian_segments,
+    hit_gradients,
+    output_gradients,
+    out,
+):
+    """Gradients of the Gaussians ``first`` to ``last`` of the sorted hits.
+
+    In the Gaussian's own frame, with u, v the hit in standard deviations, tau = dL/dt through the point and
+    c = <d, r1>: dL/dm = S(h u)/s2 r2 + S(h v)/s3 r3 + S(tau/c) r1, dL/dln s = S(h u^2), S(h v^2), and the
+    frame turns by the torque S r_i x dL/dr_i. The term through t (plane hit) is in tau.
+    """
+    basis, sh_sum, feature_sum = scratch
+    order, starts = gaussian_segments.order, gaussian_segments.starts
+    means, quats, log_scales = parameters.means, parameters.quats, parameters.log_scales
+    basis_count = out.sh.shape[1]
+    feature_count = out.features.shape[1]
+    for segment in range(first, last):
+        i = gaussian_segments.ids[starts[segment]]
+        # The frame in float64 from the raw parameters: the record's float32 axes would cost needles digits.
+        q0, q1, q2, q3 = (
+            np.float64(quats[i, 0]), np.float64(quats[i, 1]), np.float64(quats[i, 2]), np.float64(quats[i, 3])
+        )  # fmt: skip
+        r1, r2, r3 = rotation_columns(q0, q1, q2, q3)
+        s2, s3 = math.exp(np.float64(log_scales[i, 0])), math.exp(np.float64(log_scales[i, 1]))
+        inv_s2, inv_s3 = 1.0 / s2, 1.0 / s3
+        m0, m1, m2 = np.float64(means[i, 0]), np.float64(means[i, 1]), np.float64(means[i, 2])
+        n0, n1, n2 = r1
+        a0, a1, a2 = r2[0] * inv_s2, r2[1] * inv_s2, r2[2] * inv_s2
+        b0, b1, b2 = r3[0] * inv_s3, r3[1] * inv_s3, r3[2] * inv_s3
+        s_h = s_hu = s_hv = s_huu = s_hvv = s_huv = 0.0
+        s_tau = s_tau_u = s_tau_v = 0.0
+        s_n0 = s_n1 = s_n2 = s_w = s_error = s_m0 = s_m1 = s_m2 = 0.0
+        sh_sum[:basis_count] = 0.0
+        feature_sum[:] = 0.0
+        for k in range(starts[segment], starts[segment + 1]):
+            e = order[k]
+            r = hit_gradients.ray_flags[e] & RAY_ID_MASK
+            h = np.float64(hit_gradients.h_alpha[e])
+            w = np.float64(hit_gradients.weights[e])
+            d0, d1, d2 = ray_direction(rays, r)
+            o0, o1, o2 = ray_origin(rays, r)
+            x, y, z = o0 - m0, o1 - m1, o2 - m2
+            to_mean = -x, -y, -z
+            inverse = 1.0 / (d0 * n0 + d1 * n1 + d2 * n2)
+            t = -(x * n0 + y * n1 + z * n2) * inverse
+            x += t * d0
+            y += t * d1
+            z += t * d2
+            u = x * a0 + y * a1 + z * a2
+            v = x * b0 + y * b1 + z * b2
+            hu, hv = h * u, h * v
+            tau = (
+                np.float64(hit_gradients.g_t[e])
+                - hu * (a0 * d0 + a1 * d1 + a2 * d2)
+                - hv * (b0 * d0 + b1 * d1 + b2 * d2)
+            )
+            tau *= inverse
+            s_h += h
+            s_hu += hu
+            s_hv += hv
+            s_huu += hu * u
+            s_hvv += hv * v
+            s_huv += hu * v
+            s_tau += tau
+            s_tau_u += tau * u
+            s_tau_v += tau * v
+            s_w += w
+            s_error += w * output_gradients.ray_errors[r]
+            gr = 0.0 if hit_gradients.ray_flags[e] & RED_CLAMPED else w * output_gradients.rgb[r, 0]
+            gg = 0.0 if hit_gradients.ray_flags[e] & GREEN_CLAMPED else w * output_gradients.rgb[r, 1]
+            gb = 0.0 if hit_gradients.ray_flags[e] & BLUE_CLAMPED else w * output_gradients.rgb[r, 2]
+            if basis_count == 1:
+                sh_sum[0, 0] += gr
+                sh_sum[0, 1] += gg
+                sh_sum[0, 2] += gb
+            else:
+                view = eval_ray_view_basis(
+                    basis, basis_count, to_mean, (d0, d1, d2), ray_t_view_origin(rays, r)
+                )
+                for j in range(basis_count):
+                    sh_sum[j, 0] += basis[j] * gr
+                    sh_sum[j, 1] += basis[j] * gg
+                    sh_sum[j, 2] += basis[j] * gb
+                write_basis_gradient(basis, scene.sh, i, basis_count, (gr, gg, gb))
+                m_x, m_y, m_z = mean_gradient(basis, basis_count, view)
+                s_m0, s_m1, s_m2 = s_m0 + m_x, s_m1 + m_y, s_m2 + m_z
+            if output_gradients.has_geometry:
+                facing = w * facing_sign(to_mean, r1, limits)
+                s_n0 += facing * output_gradients.normal[r, 0]
+                s_n1 += facing * output_gradients.normal[r, 1]
+                s_n2 += facing * output_gradients.normal[r, 2]
+            for f in range(feature_count):
+                feature_sum[f] += w * output_gradients.features[r, f]
+        moments = GaussianMoments(
+            s_h, s_hu, s_hv, s_huu, s_huv, s_hvv, s_tau, s_tau_u, s_tau_v, s_n0, s_n1, s_n2, s_m0, s_m1, s_m2
+        )
+        write_geometry_gradients(segment, i, (r1, r2, r3, s2, s3), quats, scene.primitives, moments, out)
+        for j in range(basis_count):
+            for channel in range(3):
+                # degree 0 skips the basis in the loop above
+                out.sh[segment, j, channel] = sh_sum[j, channel] * (SH_C0 if basis_count == 1 else 1.0)
+        for f in range(feature_count):
+            out.features[segment, f] = feature_sum[f]
+        out.ids[segment] = i
+        out.weights[segment] = s_w
+        out.errors[segment] = s_error
+        out.counts[segment] = starts[segment + 1] - starts[segment]
+
+
+@kernel(fastmath={"contract"}, error_model="numpy")
+def reduce_hits(
+    rays,
+    parameters,
+    scene,
+    limits,
+    gaussian_segments,
+    chunk_bounds,
+    counter,
+    hit_gradients,
+    output_gradients,
+    out,
+):
+    """Sum the hits of each Gaussian and turn the sums into gradients of its raw parameters.
+
+    Chunk c has the Gaussians ``chunk_bounds[c]`` to ``chunk_bounds[c + 1]``; ``counter`` holds one zero.
+    """
+    feature_count = out.features.shape[1]
+    memory = np.empty(16), np.empty((16, 3)), np.empty(max(feature_count, 1))
+    while True:
+        chunk = atomic_fetch_next(counter.ctypes.data)
+        if chunk >= len(chunk_bounds) - 1:
+            break
+        first, last = chunk_bounds[chunk], chunk_bounds[chunk + 1]
+        reduce_hits_chunk(
+            first,
+            last,
+            memory,
+            rays,
+            parameters,
+            scene,
+            limits,
+            gaussian_segments,
+            hit_gradients,
+            output_gradients,
+            out,
+        )

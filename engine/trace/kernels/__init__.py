@@ -1,0 +1,1 @@
+"""Numba's tools for kernels, and the kernels of triangle meshes."""

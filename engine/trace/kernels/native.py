@@ -1,0 +1,118 @@
+"""Numba's tools: kernels that count no references, raw memory, native functions, and a shared counter."""
+
+from collections.abc import Callable
+from typing import Any
+
+import llvmlite.ir as ir
+from numba import types
+from numba.core import cgutils
+from numba.extending import intrinsic
+
+from octasplat.engine.compilation import device_function
+
+CACHE_LINE_BYTES = 64
+"""Bytes of a cache line."""
+
+
+def njit_no_refcount(**options: Any) -> Callable[[Any], Any]:
+    """Return :func:`device_function` for functions that make no arrays: no references are counted.
+
+    Else every use of a field of a named tuple counts one up and down again, one by one for all threads, which
+    takes longer than the work of a hit.
+    """
+    return device_function(_nrt=False, error_model="numpy", **options)
+
+
+def _pointer_cast(element):
+    @intrinsic
+    def cast(typingctx, address):
+        signature = types.CPointer(element)(types.uintp)
+
+        def codegen(context, builder, sig, args):
+            return builder.inttoptr(args[0], context.get_value_type(sig.return_type))
+
+        return signature, codegen
+
+    return cast
+
+
+int32_pointer = _pointer_cast(types.int32)
+float32_pointer = _pointer_cast(types.float32)
+float64_pointer = _pointer_cast(types.float64)
+uint64_pointer = _pointer_cast(types.uint64)
+
+
+def _call_address(context, builder, args):
+    """Call the address ``args[0]`` with the others as pointers."""
+    pointer = ir.IntType(8).as_pointer()
+    function_type = ir.FunctionType(ir.VoidType(), [pointer] * (len(args) - 1))
+    address = builder.inttoptr(args[0], function_type.as_pointer())
+    builder.call(address, [builder.inttoptr(argument, pointer) for argument in args[1:]])
+    return context.get_dummy_value()
+
+
+@intrinsic
+def call_with_three_pointers(typingctx, function, first, second, third):
+    """Call ``void function(void*, void*, void*)`` at a run-time address."""
+    signature = types.void(types.uintp, types.uintp, types.uintp, types.uintp)
+
+    def codegen(context, builder, sig, args):
+        return _call_address(context, builder, args)
+
+    return signature, codegen
+
+
+@intrinsic
+def call_with_four_pointers(typingctx, function, first, second, third, fourth):
+    """Call ``void function(void*, void*, void*, void*)`` at a run-time address."""
+    signature = types.void(types.uintp, types.uintp, types.uintp, types.uintp, types.uintp)
+
+    def codegen(context, builder, sig, args):
+        return _call_address(context, builder, args)
+
+    return signature, codegen
+
+
+@intrinsic
+def atomic_fetch_add(typingctx, address, count):
+    """Add ``count`` to the int64 at ``address`` as one indivisible step and return its value before.
+
+    Threads take their chunks of work from such a counter, so that none waits while there is work left.
+    """
+    signature = types.int64(types.uintp, types.int64)
+
+    def codegen(context, builder, sig, args):
+        pointer = builder.inttoptr(args[0], ir.IntType(64).as_pointer())
+        return builder.atomic_rmw("add", pointer, args[1], "monotonic")
+
+    return signature, codegen
+
+
+@njit_no_refcount(forceinline=True)
+def atomic_fetch_next(address):
+    """:func:`atomic_fetch_add` of one."""
+    return atomic_fetch_add(address, 1)
+
+
+@intrinsic
+def prefetch(typingctx, address):
+    """Ask for the cache line at ``address``, which is read some dozen operations later."""
+    signature = types.void(types.uintp)
+
+    def codegen(context, builder, sig, args):
+        pointer = ir.IntType(8).as_pointer()
+        i32 = ir.IntType(32)
+        function_type = ir.FunctionType(ir.VoidType(), [pointer, i32, i32, i32])
+        function = cgutils.get_or_insert_function(builder.module, function_type, "llvm.prefetch.p0")
+        hint = [ir.Constant(i32, 0), ir.Constant(i32, 3), ir.Constant(i32, 1)]
+        builder.call(function, [builder.inttoptr(args[0], pointer), *hint])
+        return context.get_dummy_value()
+
+    return signature, codegen
+
+
+@njit_no_refcount(forceinline=True)
+def prefetch_bytes(address, size):
+    """:func:`prefetch` for all lines of so many bytes."""
+    for line in range(address // CACHE_LINE_BYTES * CACHE_LINE_BYTES, address + size, CACHE_LINE_BYTES):
+        prefetch(line)

@@ -1,0 +1,136 @@
+"""Rays through triangle meshes, by Embree: what a ray meets first, and whether it meets anything."""
+
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+from jaxtyping import Bool, Float, Float32, Int, Int32
+
+from octasplat.engine.rays import RayBatch
+from octasplat.engine.threads import use_threads
+from octasplat.engine.trace.cpu.memory import aligned_empty
+from octasplat.engine.trace.embree import (
+    EmbreeDevice,
+    EmbreeTriangleScene,
+    intersect8_address,
+    occluded8_address,
+)
+from octasplat.engine.trace.kernels.triangles import (
+    LANES,
+    SCRATCH_ROWS,
+    EmbreeQuery,
+    any_hits,
+    any_hits_parallel,
+    closest_hits,
+    closest_hits_parallel,
+)
+
+CHUNKS_PER_THREAD = 16
+
+
+@dataclass(frozen=True)
+class TriangleHits:
+    """First hits of ``r`` rays.
+
+    Attributes:
+        distances: in lengths of the ray's direction; infinite where a ray meets nothing.
+        faces: row of the face; -1 where a ray meets nothing.
+        barycentrics: weights of the face's second and third corner; the first corner has the rest.
+    """
+
+    distances: Float32[np.ndarray, " r"]
+    faces: Int32[np.ndarray, " r"]
+    barycentrics: Float32[np.ndarray, "r 2"]
+
+    @property
+    def is_hit(self) -> Bool[np.ndarray, " r"]:
+        """Whether each ray meets anything."""
+        return self.faces >= 0
+
+
+class TriangleBvh:
+    """A mesh that rays can be sent through; both sides of a triangle are hit.
+
+    Directions may have any length. A ray's result depends on the ray and the mesh alone.
+
+    Args:
+        vertices_world: corners.
+        faces: rows of three corners; none at all is a scene that is never hit.
+        threads: threads for building and tracing; 0 takes all that numba has. With 1 the methods may be
+            called from several threads at once.
+
+    >>> corner = TriangleScene(np.eye(3, dtype=np.float32), np.array([[0, 1, 2]]))
+    >>> towards = np.full((1, 3), 2.0, np.float32)
+    >>> float(corner.closest(RayBatch(np.zeros((1, 3)), towards)).distances[0] * 6)
+    1.0
+    >>> corner.occluded(RayBatch(np.zeros((1, 3)), towards, t_max=0.1)).tolist()
+    [False]
+
+    Raises:
+        ValueError: a face names a vertex that is not there.
+    """
+
+    def __init__(
+        self,
+        vertices_world: Float[np.ndarray, "v 3"],
+        faces: Int[np.ndarray, "f 3"],
+        *,
+        threads: int = 0,
+    ) -> None:
+        count = len(vertices_world)
+        if len(faces) and not 0 <= faces.min() <= faces.max() < count:
+            raise ValueError(f"a face names a vertex that is not among the {count} of the mesh")
+        self._threads = threads or int(numba.config.NUMBA_NUM_THREADS)
+        self._scene = EmbreeTriangleScene(EmbreeDevice(self._threads), vertices_world, faces)
+
+    def closest(self, rays: RayBatch) -> TriangleHits:
+        """The nearest triangle between ``t_min`` and ``t_max`` of each ray."""
+        count = len(rays)
+        distances, faces = np.empty(count, np.float32), np.empty(count, np.int32)
+        barycentrics = np.empty((count, 2), np.float32)
+        query = (self.closest_query, *_ray_arrays(rays), _ALL_RAYS)
+        if self._threads == 1:
+            closest_hits(
+                *query, 0, count, False, allocate_embree_scratch(1)[0], distances, faces, barycentrics
+            )
+        else:
+            use_threads(self._threads)
+            closest_hits_parallel(*query, self._allocate_scratch(count), distances, faces, barycentrics)
+        return TriangleHits(distances, faces, barycentrics)
+
+    def occluded(self, rays: RayBatch) -> Bool[np.ndarray, " r"]:
+        """Whether any triangle lies between ``t_min`` and ``t_max`` of each ray; cheaper than the first."""
+        count = len(rays)
+        found = np.empty(count, np.bool_)
+        query = (self.any_query, *_ray_arrays(rays), _ALL_RAYS)
+        if self._threads == 1:
+            any_hits(*query, 0, count, allocate_embree_scratch(1)[0], found)
+        else:
+            use_threads(self._threads)
+            any_hits_parallel(*query, self._allocate_scratch(count), found)
+        return found
+
+    @property
+    def closest_query(self) -> EmbreeQuery:
+        """What :func:`~octasplat.engine.trace.kernels.triangles.closest_hits` asks; good while this lives."""
+        return EmbreeQuery(intersect8_address(), self._scene.handle)
+
+    @property
+    def any_query(self) -> EmbreeQuery:
+        """What :func:`octasplat.engine.trace.kernels.triangles.any_hits` is to ask; good while this lives."""
+        return EmbreeQuery(occluded8_address(), self._scene.handle)
+
+    def _allocate_scratch(self, rays: int) -> Float32[np.ndarray, "c w"]:
+        return allocate_embree_scratch(max(1, min(rays, CHUNKS_PER_THREAD * self._threads)))
+
+
+_ALL_RAYS = np.empty(0, np.int32)
+
+
+def allocate_embree_scratch(chunks: int) -> Float32[np.ndarray, "c w"]:
+    """Memory in which kernels ask Embree, a row for each that runs at the same time."""
+    return aligned_empty((chunks, SCRATCH_ROWS * LANES))
+
+
+def _ray_arrays(rays: RayBatch) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    return rays.origins_world, rays.directions_world, rays.t_min, rays.t_max

@@ -1,0 +1,97 @@
+"""What happens to a job: its log, its events as a list and as they come."""
+
+import asyncio
+import uuid
+from collections.abc import AsyncGenerator
+
+from octasplat.service.actions.access import read_job
+from octasplat.service.auth import Principal
+from octasplat.service.problems import ProblemError
+from octasplat.service.state import Service
+from octasplat.workers.db.events_and_logs import events_after, log_after
+from octasplat.workers.db.rows import JobEvent, LogLine
+from octasplat.workers.queue.jobs import get_job
+
+_POLL_SECONDS = 2.0
+_PAGE_SIZE = 500
+_RETRY_SECONDS = 10
+
+
+async def read_log(
+    service: Service, who: Principal, job_id: uuid.UUID, *, after: int, limit: int
+) -> list[LogLine]:
+    """Lines of a job's log, after the one with the id ``after``.
+
+    Raises:
+        Problem: 404.
+    """
+    await read_job(service, who, job_id)
+    async with service.pool.connection() as connection:
+        return await log_after(connection, job_id, after, limit)
+
+
+async def read_events(
+    service: Service, who: Principal, job_id: uuid.UUID, *, after: int, limit: int
+) -> list[JobEvent]:
+    """What happened to a job, after the event with the id ``after``.
+
+    Raises:
+        Problem: 404.
+    """
+    await read_job(service, who, job_id)
+    async with service.pool.connection() as connection:
+        return await events_after(connection, job_id, after, limit)
+
+
+async def follow_events(
+    service: Service, who: Principal, job_id: uuid.UUID, *, after: int
+) -> AsyncGenerator[JobEvent | None, None] | None:
+    """What happens to a job until it is over, as it happens; None where everything was told already.
+
+    In the place of an event comes None as a sign of life, where nothing has happened for a while.
+
+    Raises:
+        Problem: 404, or 503 with too many who listen.
+    """
+    job = await read_job(service, who, job_id)
+    if service.event_broker.subscriber_count >= service.settings.max_streams:
+        detail = "Too many streams are open; poll GET /v1/jobs/{id} instead."
+        raise ProblemError(503, "streams", detail, retry_seconds=_RETRY_SECONDS)
+    if job.is_over:
+        async with service.pool.connection() as connection:
+            if not await events_after(connection, job_id, after, 1):
+                return None
+    return _events(service, who, job_id, after)
+
+
+async def _events(
+    service: Service, who: Principal, job_id: uuid.UUID, after: int
+) -> AsyncGenerator[JobEvent | None, None]:
+    ping = service.settings.ping_seconds
+    quiet = 0.0
+    wait = ping if service.settings.listen else min(ping, _POLL_SECONDS)
+    with service.event_broker.subscribe(job_id) as news:
+        while not service.event_broker.is_closing:
+            news.clear()
+            async with service.pool.connection() as connection:
+                job = await get_job(connection, job_id)
+                if job is None or not who.may_see(job.owner):
+                    return  # it was deleted, which ends the stream
+                over = job.is_over
+                events = await events_after(connection, job_id, after, _PAGE_SIZE)
+            for event in events:
+                after = event.id
+                yield event
+            if len(events) == _PAGE_SIZE:
+                continue
+            if over:
+                return
+            quiet = 0.0 if events else quiet + wait
+            if quiet >= ping:
+                yield None
+                quiet = 0.0
+            try:
+                async with asyncio.timeout(wait):
+                    await news.wait()
+            except TimeoutError:
+                continue

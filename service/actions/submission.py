@@ -1,0 +1,297 @@
+"""Jobs taken on: new ones, and those that are tried again."""
+
+import uuid
+from dataclasses import dataclass, replace
+from typing import Any
+
+from pydantic import BaseModel, ValidationError
+
+from octasplat.engine.errors import ConfigError
+from octasplat.engine.operations.cost_model import Estimate
+from octasplat.engine.refusals import SettingsRefused
+from octasplat.engine.renamed_settings import collected_notices
+from octasplat.service.actions.access import check_not_draining, owned_job
+from octasplat.service.actions.jobs import job_view
+from octasplat.service.actions.named_files import check_named_files
+from octasplat.service.actions.validation import input_problem, resolve_options, validate_kind
+from octasplat.service.auth import Principal
+from octasplat.service.idempotency import create_once, fingerprint
+from octasplat.service.job_limits import check_job_limits, check_priority, estimate_job
+from octasplat.service.problems import ProblemError, options_error
+from octasplat.service.queue_workers import check_formats_writable, live_workers_of_queue
+from octasplat.service.schemas.jobs import JobView, NewJob, RetryRequest
+from octasplat.service.state import Service
+from octasplat.service.webhook_addresses import check_webhook_address
+from octasplat.workers.db.connections import Connection, retry_on_deadlock
+from octasplat.workers.db.datasets import get_dataset, photograph_sizes
+from octasplat.workers.db.locks import lock_owner
+from octasplat.workers.db.quotas import check_new_job
+from octasplat.workers.db.rows import Dataset, Job
+from octasplat.workers.maintenance.webhooks.rows import add_endpoint
+from octasplat.workers.queue import jobs as rows
+from octasplat.workers.worker.job_kinds import JobKind, get_job_kind
+
+
+@dataclass(frozen=True)
+class _RequestedJob:
+    """A new job as it was asked for: its kind and the complete options."""
+
+    new: NewJob
+    kind: JobKind
+    options: BaseModel
+    traceparent: str | None
+
+
+@dataclass(frozen=True)
+class _JobInputs:
+    """What a job works on, and the options that fit it."""
+
+    dataset_id: uuid.UUID | None
+    source_id: uuid.UUID | None
+    options: BaseModel
+    files_id: uuid.UUID | None = None
+
+
+@retry_on_deadlock
+async def submit_job(
+    service: Service,
+    who: Principal,
+    request: NewJob,
+    *,
+    idempotency_key: str | None = None,
+    traceparent: str | None = None,
+) -> JobView:
+    """Accept a job.
+
+    Args:
+        service: the service.
+        who: asks.
+        request: the job.
+        idempotency_key: the same request with it makes nothing new.
+        traceparent: what the job's log is to name (W3C Trace Context).
+
+    Raises:
+        Problem: 409, 422, or 503 if the service is about to stop.
+        QuotaExceeded: the asker has too many jobs.
+    """
+    check_not_draining(service)
+    kind = validate_kind(request.kind)
+    with collected_notices() as notices:
+        asked = _RequestedJob(request, kind, resolve_options(kind, request.options), traceparent)
+    check_priority(who, request.priority, service.settings)
+    if request.webhook is not None:
+        check_webhook_address(service, request.webhook.url, "#/webhook/url")
+    async with service.pool.connection() as connection, connection.transaction():
+
+        async def make() -> uuid.UUID:
+            return await _create_job(connection, service, who, asked)
+
+        # Without what was not asked for: a version that knows more may get the repetition.
+        named = fingerprint("job", request.model_dump(mode="json", exclude_defaults=True))
+        job_id, _ = await create_once(connection, who, idempotency_key, named, make)
+        view = await job_view(connection, service, await owned_job(connection, who, job_id))
+        return view.model_copy(update={"notes": [*view.notes, *notices]})
+
+
+@retry_on_deadlock
+async def retry_job(
+    service: Service,
+    who: Principal,
+    job_id: uuid.UUID,
+    request: RetryRequest,
+    *,
+    idempotency_key: str | None = None,
+) -> JobView:
+    """Queue a failed or cancelled job again.
+
+    Args:
+        service: the service.
+        who: asks.
+        job_id: the job.
+        request: where it begins, and with which options.
+        idempotency_key: the same request with it does nothing more.
+
+    Raises:
+        Problem: 404, 409 or 422.
+        Conflict: it waits, runs or has succeeded.
+        QuotaExceeded: its owner has too many jobs.
+    """
+    async with service.pool.connection() as connection, connection.transaction():
+        owner = (await owned_job(connection, who, job_id)).owner
+
+        async def make() -> uuid.UUID:
+            await lock_owner(connection, owner)
+            job = await owned_job(connection, who, job_id, lock=True)
+            await check_new_job(connection, owner, service.settings.quota)
+            options, estimate = await _revised_options(connection, service, who, job, request)
+            await rows.retry_job(
+                connection,
+                service.job_queue,
+                job_id,
+                from_start=request.start == "start",
+                options=options,
+                estimate=estimate,
+            )
+            return job_id
+
+        named = fingerprint(
+            "retry", str(job_id), request.start, *([request.options] if request.options else [])
+        )
+        with collected_notices() as notices:
+            await create_once(connection, who, idempotency_key, named, make)
+        view = await job_view(connection, service, await owned_job(connection, who, job_id))
+        return view.model_copy(update={"notes": [*view.notes, *notices]})
+
+
+async def _create_job(
+    connection: Connection, service: Service, who: Principal, requested: _RequestedJob
+) -> uuid.UUID:
+    new, kind = requested.new, requested.kind
+    await lock_owner(connection, who.owner)
+    inputs = await _check_inputs(connection, who, requested)
+    await check_new_job(connection, who.owner, service.settings.quota)
+    workers = await live_workers_of_queue(connection, new.queue, service.settings.stale_seconds)
+    check_formats_writable(kind, inputs.options, new.queue, workers)
+    sizes = await photograph_sizes(connection, inputs.dataset_id) if inputs.dataset_id is not None else []
+    check_job_limits(kind, inputs.options, sizes, service.settings)
+    made = rows.NewJob(
+        owner=who.owner,
+        kind=kind.name,
+        options=inputs.options.model_dump(mode="json"),
+        queue=new.queue,
+        priority=new.priority,
+        dataset_id=inputs.dataset_id,
+        source_id=inputs.source_id,
+        label=new.label,
+        estimate=_estimate_as_json(estimate_job(kind, inputs.options, sizes, workers)),
+        files_id=inputs.files_id,
+        traceparent=requested.traceparent,
+    )
+    job_id = (await rows.create_job(connection, service.job_queue, made)).id
+    if new.webhook is not None:
+        await add_endpoint(
+            connection,
+            owner=who.owner,
+            url=new.webhook.url,
+            secret=new.webhook.secret,
+            events=new.webhook.events,
+            job_id=job_id,
+        )
+    return job_id
+
+
+async def _check_inputs(connection: Connection, who: Principal, requested: _RequestedJob) -> _JobInputs:
+    """What the job works on, checked."""
+    needed = {"result": _check_source, "dataset": _check_dataset, "files": _check_files}[requested.kind.needs]
+    inputs = await needed(connection, who, requested)
+    files_id = requested.new.files_id
+    await check_named_files(connection, who, requested.kind, inputs.options, files_id)
+    return replace(inputs, files_id=files_id)
+
+
+async def _check_source(connection: Connection, who: Principal, requested: _RequestedJob) -> _JobInputs:
+    new, kind = requested.new, requested.kind
+    if new.source_id is None:
+        raise input_problem("source_id", f"The kind {kind.name} works on source_id, a finished job.")
+    if new.dataset_id is not None and not kind.takes_other_photographs:
+        detail = f"The kind {kind.name} works on source_id alone, a finished job."
+        raise input_problem("dataset_id", detail)
+    source = await rows.get_job(connection, new.source_id, lock=True)
+    if source is None or not who.may_see(source.owner):
+        raise input_problem("source_id", "There is no such job.")
+    names = {artifact.name for artifact in await rows.artifacts_of(connection, source.id)}
+    if source.state != "succeeded" and not (source.state == "failed" and names):
+        raise ProblemError(409, "source", f"The job in source_id is {source.state} and has no results.")
+    if kind.source_files and kind.source_files[0] not in names:
+        raise input_problem("source_id", f"The job in source_id has no {kind.source_files[0]}.")
+    if new.dataset_id is not None and kind.takes_other_photographs:
+        dataset = await _get_photographs(connection, who, new.dataset_id)
+        if not dataset.has_poses:
+            detail = "The dataset holds no COLMAP model, which says where in the scene its photographs are."
+            raise input_problem("dataset_id", detail)
+        return _JobInputs(dataset.id, source.id, kind.for_other_photographs(requested.options))
+    if source.dataset_id is None and kind.needs_photographs(requested.options):
+        detail = (
+            "The scene of the job in source_id is not where photographs show it; name some as dataset_id."
+        )
+        raise input_problem("source_id", detail)
+    return _JobInputs(source.dataset_id if kind.keeps_world_frame else None, source.id, requested.options)
+
+
+async def _check_files(connection: Connection, who: Principal, requested: _RequestedJob) -> _JobInputs:
+    new, name = requested.new, requested.kind.name
+    for place in ("source_id", "dataset_id"):
+        if getattr(new, place) is not None:
+            raise input_problem(place, f"A job of the kind {name} works on files_id alone.")
+    if new.files_id is None:
+        detail = f"A job of the kind {name} works on files_id, a dataset that holds files."
+        raise input_problem("files_id", detail)
+    return _JobInputs(None, None, requested.options)
+
+
+async def _check_dataset(connection: Connection, who: Principal, requested: _RequestedJob) -> _JobInputs:
+    new, kind = requested.new, requested.kind
+    if new.dataset_id is None or new.source_id is not None:
+        raise input_problem("dataset_id", f"A job of the kind {kind.name} works on dataset_id, a dataset.")
+    dataset = await _get_photographs(connection, who, new.dataset_id)
+    if kind.needs_poses(requested.options) and not dataset.has_poses:
+        detail = "The dataset holds no COLMAP model; set the option poses to auto, or send a model."
+        raise ProblemError(422, "poses", detail, errors=[{"pointer": "#/options/poses", "detail": detail}])
+    return _JobInputs(dataset.id, None, kind.with_poses_known(requested.options, dataset.has_poses))
+
+
+async def _get_photographs(connection: Connection, who: Principal, dataset_id: uuid.UUID) -> Dataset:
+    """A dataset of photographs that is ready."""
+    dataset = await get_dataset(connection, dataset_id, lock=True)
+    if dataset is None or not who.may_see(dataset.owner):
+        raise input_problem("dataset_id", "There is no such dataset.")
+    if dataset.holds != "photographs":
+        raise input_problem("dataset_id", "The dataset holds no photographs; give it as files_id.")
+    if dataset.state != "committed":
+        raise ProblemError(
+            409, "dataset-open", "The dataset is not committed yet; POST to its /commit first."
+        )
+    return dataset
+
+
+async def _revised_options(
+    connection: Connection, service: Service, who: Principal, job: Job, request: RetryRequest
+) -> tuple[dict[str, Any] | None, dict[str, Any] | None]:
+    """The options of a job that is tried again, checked, and their estimate; None leaves them as they are."""
+    workers = await live_workers_of_queue(connection, job.queue, service.settings.stale_seconds)
+    try:
+        kind = get_job_kind(job.kind)
+        before = kind.options.model_validate(job.options)
+    except (ConfigError, ValidationError):
+        if not request.options:
+            return None, None
+        detail = "The job is of another version, so its options cannot be changed; make a new one."
+        raise ProblemError(409, "version", detail) from None
+    if kind.needs == "result" and job.source_id is None:
+        raise ProblemError(409, "source", "The job whose results it works on was deleted; make a new job.")
+    try:
+        options = kind.revise(job.options, request.options) if request.options else before
+    except (ValidationError, SettingsRefused) as error:
+        raise options_error(error) from None
+    check_formats_writable(kind, options, job.queue, workers)
+    await check_named_files(connection, who, kind, options, job.files_id)
+    sizes = await photograph_sizes(connection, job.dataset_id) if job.dataset_id is not None else []
+    check_job_limits(kind, options, sizes, service.settings)
+    if not request.options:
+        return None, None
+    if kind.needs == "dataset" and job.dataset_id is not None:
+        dataset = await get_dataset(connection, job.dataset_id)
+        options = kind.with_poses_known(options, dataset is not None and dataset.has_poses)
+    if (
+        request.start == "checkpoint"
+        and job.checkpoint is not None
+        and not kind.is_resumable_with(before, options)
+    ):
+        detail = "With these options the work begins anew; ask for that with from: start."
+        raise ProblemError(422, "other-work", detail, errors=[{"pointer": "#/options", "detail": detail}])
+    return options.model_dump(mode="json"), _estimate_as_json(estimate_job(kind, options, sizes, workers))
+
+
+def _estimate_as_json(estimate: Estimate | None) -> dict[str, Any] | None:
+    """An estimate as the table keeps it."""
+    return None if estimate is None else estimate.model_dump(mode="json")

@@ -1,0 +1,42 @@
+"""What is asked for: the kind of a job and its options, checked before anything is looked up."""
+
+from collections.abc import Mapping
+from typing import Any
+
+from pydantic import BaseModel, ValidationError
+
+from octasplat.engine.errors import ConfigError
+from octasplat.engine.refusals import SettingsRefused
+from octasplat.service.problems import ProblemError, options_error
+from octasplat.workers.worker.job_kinds import JobKind, get_job_kind
+
+
+def validate_kind(name: str) -> JobKind:
+    """The kind of that name.
+
+    Raises:
+        Problem: 422.
+    """
+    try:
+        return get_job_kind(name)
+    except ConfigError as error:
+        raise ProblemError(
+            422, "kind", str(error), errors=[{"pointer": "#/kind", "detail": str(error)}]
+        ) from None
+
+
+def resolve_options(kind: JobKind, values: Mapping[str, Any]) -> BaseModel:
+    """Complete options.
+
+    Raises:
+        Problem: 422.
+    """
+    try:
+        return kind.options.model_validate(kind.resolve(values).model_dump(mode="json"))
+    except (ValidationError, SettingsRefused) as error:
+        raise options_error(error) from None
+
+
+def input_problem(name: str, detail: str) -> ProblemError:
+    """What a job is to work on is not there, or does not fit its kind."""
+    return ProblemError(422, "input", detail, errors=[{"pointer": f"#/{name}", "detail": detail}])

@@ -1,0 +1,77 @@
+"""Who did what: each change that is asked for goes into the table before its answer is given."""
+
+import logging
+from typing import TYPE_CHECKING
+
+import psycopg
+from psycopg_pool import PoolTimeout
+from starlette.datastructures import Headers
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from octasplat.workers.db.audit import add_entry
+
+if TYPE_CHECKING:
+    from octasplat.service.state import Service
+
+logger = logging.getLogger(__name__)
+
+_UNAUDITED_METHODS = frozenset({"GET", "HEAD", "OPTIONS", "TRACE", "PUT"})
+"""Reading, and the single files of datasets, whose commits are told."""
+
+
+class AuditMiddleware:
+    """Writes down who asked for a change, if that is known, and what came of it.
+
+    Args:
+        app: behind it.
+    """
+
+    def __init__(self, app: ASGIApp) -> None:
+        self._app = app
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Pass a request on, and its answer once it is written down."""
+        if scope["type"] != "http":
+            await self._app(scope, receive, send)
+            return
+        state = scope.setdefault("state", {})
+        told = False
+
+        async def tell(status: int, headers: Headers) -> None:
+            nonlocal told
+            if told or (scope["method"] in _UNAUDITED_METHODS and not state.get("is_change")):
+                return
+            if state.get("who") is None:  # or whoever comes could fill the table
+                return
+            told = True
+            await _write_entry(scope, status, headers.get("location"))
+
+        async def send_told(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                await tell(message["status"], Headers(raw=message["headers"]))
+            await send(message)
+
+        try:
+            await self._app(scope, receive, send_told)
+        except Exception:
+            await tell(500, Headers())
+            raise
+
+
+async def _write_entry(scope: Scope, status: int, location: str | None) -> None:
+    service: Service = scope["app"].state.service
+    who = scope["state"]["who"]
+    try:
+        async with service.pool.connection() as connection:
+            await add_entry(
+                connection,
+                owner=who.owner,
+                token_id=who.token_id,
+                session_id=who.session_id,
+                address=scope["client"][0] if scope.get("client") else "unknown",
+                action=f"{scope['method']} {scope['path']}",
+                target=location,
+                status=status,
+            )
+    except (psycopg.Error, PoolTimeout) as error:
+        logger.warning("%s %s was not written down: %s", scope["method"], scope["path"], error)

@@ -1,0 +1,88 @@
+"""Tells streams when a job has new events: one listening connection for all of them."""
+
+import asyncio
+import contextlib
+import logging
+import uuid
+from collections.abc import Iterator
+
+import psycopg
+from psycopg.conninfo import make_conninfo
+
+from octasplat.workers.db.connections import KEEPALIVES
+from octasplat.workers.db.events_and_logs import CHANNEL
+
+logger = logging.getLogger(__name__)
+_RECONNECT_SECONDS = 1.0
+
+
+class EventBroker:
+    """Wakes who waits for a job's events.
+
+    Args:
+        conninfo: how to connect.
+        listen: False where notifications do not arrive; streams then look by themselves.
+    """
+
+    def __init__(self, conninfo: str, *, listen: bool = True) -> None:
+        self._conninfo = conninfo
+        self._listen = listen
+        self._subscribers: dict[uuid.UUID, set[asyncio.Event]] = {}
+        self._closing = asyncio.Event()
+
+    @property
+    def subscriber_count(self) -> int:
+        """Number of streams that wait."""
+        return sum(len(events) for events in self._subscribers.values())
+
+    @property
+    def is_closing(self) -> bool:
+        """Whether streams should end."""
+        return self._closing.is_set()
+
+    def close(self) -> None:
+        """Wake everybody for the last time."""
+        self._closing.set()
+        self._wake_all()
+
+    @contextlib.contextmanager
+    def subscribe(self, job_id: uuid.UUID) -> Iterator[asyncio.Event]:
+        """An event that is set whenever the job has something new, until the block ends."""
+        event = asyncio.Event()
+        self._subscribers.setdefault(job_id, set()).add(event)
+        try:
+            yield event
+        finally:
+            events = self._subscribers[job_id]
+            events.discard(event)
+            if not events:
+                del self._subscribers[job_id]
+
+    async def run(self) -> None:
+        """Listen until cancelled, again after every loss of the connection."""
+        while self._listen:
+            try:
+                await self._listen_once()
+            except (psycopg.Error, OSError) as error:
+                logger.info("not hearing of events for a moment: %s", error)
+            except Exception:
+                logger.exception("listening to events failed and is begun again")
+            self._wake_all()
+            await asyncio.sleep(_RECONNECT_SECONDS)
+
+    async def _listen_once(self) -> None:
+        connection = await psycopg.AsyncConnection.connect(
+            make_conninfo(self._conninfo, **KEEPALIVES), autocommit=True, connect_timeout=10
+        )
+        async with connection:
+            await connection.execute(f"LISTEN {CHANNEL}")
+            self._wake_all()  # something may have happened while nobody listened
+            async for notification in connection.notifies():
+                with contextlib.suppress(ValueError):
+                    for event in self._subscribers.get(uuid.UUID(notification.payload), ()):
+                        event.set()
+
+    def _wake_all(self) -> None:
+        for events in self._subscribers.values():
+            for event in events:
+                event.set()

@@ -1,0 +1,190 @@
+"""Whether an image file is all there, without decoding it.
+
+A file that was cut off still has its header, and readers show the missing part in grey or not at all. Where a
+format says how long it is, or ends with a mark, that is looked at; it takes a few reads, whatever the size.
+Not noticed: data that are damaged in the middle, a JPEG that was cut off and then closed with an end mark,
+and cut-off HDR files, whose rows have any length.
+"""
+
+import io
+import os
+import struct
+from collections.abc import Callable
+from typing import BinaryIO
+
+from octasplat.service.intake.faults import IntakeError, IntakeFault
+from octasplat.service.intake.images import read_null_terminated, unpack_struct
+from octasplat.workers.storage.file_names import quoted_name
+
+_TAIL_BYTES = 64 << 10
+_PIECE_BYTES = 1 << 20
+_MAX_BYTES = 256 << 20
+_MAX_SEGMENTS = 100_000
+_READ_ERRORS = (OSError, ValueError, LookupError, ArithmeticError, struct.error)
+_EXR_ROWS = {0: 1, 1: 1, 2: 1, 3: 16, 4: 32, 5: 16, 6: 32, 7: 32, 8: 32, 9: 256}
+_TIFF_LAYOUTS = {3: "H", 4: "I", 16: "Q"}
+
+
+def check_complete(file: BinaryIO, name: str, kind: str) -> None:
+    """Refuse an image that was cut off.
+
+    Args:
+        file: seekable, with a header that :func:`octasplat.service.intake.images.read_image_header` found
+            sound.
+        name: its name in the dataset, for the sentence.
+        kind: of the image.
+
+    Raises:
+        IntakeRefused: ``image-cut-off``.
+    """
+    size_bytes = file.seek(0, io.SEEK_END)
+    file.seek(0)
+    try:
+        whole = _CHECKS.get(kind, _assume_complete)(file, size_bytes)
+    except _READ_ERRORS:
+        whole = False  # what says how long it is lies beyond the end
+    if not whole:
+        detail = (
+            f"{quoted_name(name)} is cut off: the end of its {kind} data is missing; send the whole file."
+        )
+        raise IntakeError(IntakeFault("image-cut-off", detail, name))
+
+
+def _is_jpeg_complete(file: BinaryIO, size_bytes: int) -> bool:
+    """An end mark follows the first scan. Within a scan the two bytes of the mark occur nowhere else."""
+    start = _first_scan_offset(file)
+    file.seek(max(start, size_bytes - _TAIL_BYTES))
+    if b"\xff\xd9" in file.read(_TAIL_BYTES):
+        return True
+    # Some cameras append a film or a second picture.
+    file.seek(start)
+    last = b""
+    for _ in range(_MAX_BYTES // _PIECE_BYTES):
+        piece = file.read(_PIECE_BYTES)
+        if not piece:
+            return False
+        if b"\xff\xd9" in last + piece:
+            return True
+        last = piece[-1:]
+    return True
+
+
+def _first_scan_offset(file: BinaryIO) -> int:
+    """Where the data of the first scan begin."""
+    file.seek(2)
+    marked = False
+    for _ in range(_MAX_SEGMENTS):
+        (byte,) = unpack_struct(file, ">B")
+        if not marked or byte in (0, 0xFF) or 0xD0 <= byte <= 0xD8:  # fill bytes and marks without data
+            marked = byte == 0xFF
+            continue
+        (length,) = unpack_struct(file, ">H")
+        file.seek(length - 2, os.SEEK_CUR)
+        if byte == 0xDA:
+            return file.tell()
+        marked = False
+    raise ValueError("no scan")
+
+
+def _is_png_complete(file: BinaryIO, size_bytes: int) -> bool:
+    """The end chunk is there."""
+    file.seek(max(0, size_bytes - 12))
+    if file.read(12)[4:8] == b"IEND":
+        return True
+    file.seek(8)
+    for _ in range(_MAX_SEGMENTS):
+        length, kind = unpack_struct(file, ">I4s")
+        if kind == b"IEND":
+            return True
+        file.seek(length + 4, os.SEEK_CUR)
+    return True
+
+
+def _is_webp_complete(file: BinaryIO, size_bytes: int) -> bool:
+    """The container is as long as it says; the last byte may be padding that was left away."""
+    (length,) = struct.unpack_from("<I", file.read(8), 4)
+    return bool(size_bytes >= 8 + length - 1)
+
+
+def _is_bmp_complete(file: BinaryIO, size_bytes: int) -> bool:
+    """There are as many rows as the header says, where they are not compressed."""
+    head = file.read(34)
+    (start,) = struct.unpack_from("<I", head, 10)
+    if struct.unpack_from("<I", head, 14)[0] < 40:
+        return True
+    width, height, _, bits, compression = struct.unpack_from("<2i2HI", head, 18)
+    if compression not in (0, 3):
+        return True
+    return bool(size_bytes >= start + abs(height) * ((width * bits + 31) // 32 * 4))
+
+
+def _is_tiff_complete(file: BinaryIO, size_bytes: int) -> bool:
+    """All strips or tiles of the first page lie within the file."""
+    order = "<" if file.read(2) == b"II" else ">"
+    (version,) = unpack_struct(file, f"{order}H")
+    big = version == 43
+    file.seek(8 if big else 4)
+    address = f"{order}{'Q' if big else 'I'}"
+    (start,) = unpack_struct(file, address)
+    file.seek(start)
+    (count,) = unpack_struct(file, f"{order}{'Q' if big else 'H'}")
+    fields = [unpack_struct(file, f"{order}2H{'Q8s' if big else 'I4s'}") for _ in range(min(count, 65_535))]
+    values = {
+        tag: _tiff_values(file, f"{order}{_TIFF_LAYOUTS[kind]}", number, inline, address)
+        for tag, kind, number, inline in fields
+        if tag in (273, 279, 324, 325) and kind in _TIFF_LAYOUTS
+    }
+    for offsets, lengths in ((273, 279), (324, 325)):
+        ends = zip(values.get(offsets, ()), values.get(lengths, ()), strict=False)
+        if any(offset + length > size_bytes for offset, length in ends):
+            return False
+    return True
+
+
+def _tiff_values(file: BinaryIO, layout: str, number: int, inline: bytes, address: str) -> tuple[int, ...]:
+    """The values of a field, which stand in the field itself if they fit."""
+    order, letter = layout[0], layout[1]
+    length = struct.calcsize(layout) * number
+    if length <= len(inline):
+        return struct.unpack_from(f"{order}{number}{letter}", inline)
+    if length > _MAX_BYTES // 16:
+        raise ValueError("too many strips")
+    (start,) = struct.unpack_from(address, inline)
+    file.seek(start)
+    return unpack_struct(file, f"{order}{number}{letter}")
+
+
+def _is_exr_complete(file: BinaryIO, size_bytes: int) -> bool:
+    """All blocks of rows lie within the file, where it has one part without tiles."""
+    _, flags = unpack_struct(file, "<2I")
+    if flags & (0x200 | 0x800 | 0x1000):
+        return True
+    rows, compression = 0, 0
+    while name := read_null_terminated(file):
+        read_null_terminated(file)
+        (length,) = unpack_struct(file, "<I")
+        if name == b"compression":
+            (compression,) = unpack_struct(file, "<B")
+        elif name == b"dataWindow":
+            _, top, _, bottom = unpack_struct(file, "<4i")
+            rows = bottom - top + 1
+        else:
+            file.seek(length, os.SEEK_CUR)
+    if compression not in _EXR_ROWS:
+        return True
+    blocks = -(-rows // _EXR_ROWS[compression])
+    if blocks > _MAX_BYTES // 64:
+        return False
+    last = max(unpack_struct(file, f"<{blocks}Q"))
+    file.seek(last)
+    _, length = unpack_struct(file, "<2I")
+    return bool(last + 8 + length <= size_bytes)
+
+
+def _assume_complete(_file: BinaryIO, _size_bytes: int) -> bool:
+    return True
+
+
+_CHECKS: dict[str, Callable[[BinaryIO, int], bool]] = {
+    "JPEG": _is_jpeg_complete, "PNG": _is_png_complete, "WebP": _is_webp_complete, "BMP": _is_bmp_complete, "TIFF": _is_tiff_complete, "EXR": _is_exr_complete,
+}  # fmt: skip

@@ -1,0 +1,84 @@
+"""Files that the options of a job name, such as the meshes and textures of a stage, at the door."""
+
+import zipfile
+from collections.abc import Sequence
+from pathlib import PurePosixPath
+from typing import Any, BinaryIO
+
+from octasplat.service.intake.dataset import DatasetFile
+from octasplat.service.intake.faults import IntakeError, IntakeFault
+from octasplat.service.intake.image_completeness import check_complete
+from octasplat.service.intake.images import ImageHeader, ImageLimits, read_image_header
+from octasplat.service.intake.scene_layout import IMAGE_SUFFIXES, is_ignored_file
+from octasplat.service.intake.upload_names import FileNames
+from octasplat.workers.storage.file_names import quoted_name
+from octasplat.workers.storage.protocol import Storage
+
+MAX_FILES = 1000
+MAX_TEXT_LINE_BYTES = 1 << 16
+_MAGIC_NUMBERS = {".glb": b"glTF", ".ply": b"ply"}
+_UNCHECKED_SUFFIXES = frozenset({".splat", ".spz"})
+"""Nothing in their first bytes says what they are; whoever reads them says so."""
+_TEXT_SUFFIXES = frozenset({".obj", ".mtl", ".txt"})
+ALLOWED_SUFFIXES = frozenset(
+    {".sog", *_TEXT_SUFFIXES, *_MAGIC_NUMBERS, *_UNCHECKED_SUFFIXES, *IMAGE_SUFFIXES}
+)
+
+
+def check_input_name(name: str) -> None:
+    """Look at a file's name.
+
+    Raises:
+        IntakeRefused: ``name-...``; ``name-unexpected``, as nothing reads such files.
+    """
+    FileNames().add(name)
+    if is_ignored_file(name) or PurePosixPath(name).suffix.lower() not in ALLOWED_SUFFIXES:
+        detail = (
+            f"{quoted_name(name)} is none of the files that options can name: meshes (.obj .mtl .ply .glb), "
+            "surroundings (.hdr .exr), textures, splats and matrices (.txt)."
+        )
+        raise IntakeError(IntakeFault("name-unexpected", detail, name))
+
+
+def check_input_content(storage: Storage, name: str, sha256: str, limits: ImageLimits) -> ImageHeader | None:
+    """Look at the first bytes of a stored file; the header of an image, else None.
+
+    Raises:
+        IntakeRefused: it is not what its name says, or was cut off.
+        StorageError: the content cannot be had.
+    """
+    suffix = PurePosixPath(name).suffix.lower()
+    with storage.open(sha256) as file:
+        if suffix in IMAGE_SUFFIXES:
+            header = read_image_header(file, name, limits)
+            check_complete(file, name, header.kind)
+            return header
+        if not _matches_suffix(file, suffix):
+            what = "text" if suffix in _TEXT_SUFFIXES else f"{suffix[1:].upper()} file"
+            detail = f"{quoted_name(name)} is no {what} by its content; send the file anew."
+            raise IntakeError(IntakeFault("file-kind", detail, name))
+    return None
+
+
+def _matches_suffix(file: BinaryIO, suffix: str) -> bool:
+    if suffix == ".sog":
+        return zipfile.is_zipfile(file)
+    head = file.read(4096)
+    if suffix in _TEXT_SUFFIXES:
+        return b"\0" not in head
+    return head.startswith(_MAGIC_NUMBERS.get(suffix, b""))
+
+
+def check_input_files(files: Sequence[DatasetFile]) -> dict[str, Any]:
+    """Look at all files together; returns what is to be told of them.
+
+    Raises:
+        IntakeRefused: there are none or too many, or two have names that some systems take for one.
+    """
+    if not 1 <= len(files) <= MAX_FILES:
+        detail = f"There are {len(files)} files; 1 to {MAX_FILES} are taken."
+        raise IntakeError(IntakeFault("dataset-files", detail))
+    known = FileNames()
+    for file in files:
+        known.add(file.path)
+    return {"files": len(files), "size_bytes": sum(file.size_bytes for file in files)}

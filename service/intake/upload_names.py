@@ -1,0 +1,67 @@
+"""Names of files at the door: each is checked once, where it comes in, and taken as it is behind it.
+
+The doors are a file that is put (:func:`check_file_name`), and many that come or are counted together
+(:class:`FileNames`): those of an archive, and those of a dataset that is committed.
+"""
+
+from octasplat.service.intake.faults import IntakeError, IntakeFault
+from octasplat.service.intake.scene_layout import FileRole, file_role
+from octasplat.workers.storage.file_names import FileNameError, NameSet, check_name, quoted_name
+
+
+def check_file_name(name: str) -> FileRole:
+    """What a file of that name is in a dataset.
+
+    Raises:
+        IntakeRefused: the name is refused (``name-...``), or is that of no part of a scene
+            (``name-unexpected``).
+    """
+    try:
+        check_name(name)
+    except FileNameError as error:
+        raise _intake_error(error, name) from None
+    return check_scene_file(name)
+
+
+def check_scene_file(name: str) -> FileRole:
+    """What a file of that name, which is checked, is in a scene.
+
+    Raises:
+        IntakeRefused: ``name-unexpected``, as it is no part of one.
+    """
+    part = file_role(name)
+    if part is FileRole.OTHER:
+        raise IntakeError(
+            IntakeFault(
+                "name-unexpected",
+                f"{quoted_name(name)} is no part of a scene; these are images/, masks/ and the COLMAP model "
+                "in sparse/0.",
+                name,
+            )
+        )
+    return part
+
+
+class FileNames:
+    """Names taken so far; adding one checks it by itself and against all the others."""
+
+    def __init__(self) -> None:
+        self._names = NameSet()
+
+    def add(self, name: str) -> None:
+        """Take the name of a file, or that of a folder, which ends with a slash.
+
+        Raises:
+            IntakeRefused: ``name-...``.
+        """
+        try:
+            if name.endswith("/"):
+                self._names.add_folder(name.removesuffix("/"))
+            else:
+                self._names.add(name)
+        except FileNameError as error:
+            raise _intake_error(error, name) from None
+
+
+def _intake_error(error: FileNameError, name: str) -> IntakeError:
+    return IntakeError(IntakeFault(error.code, str(error), name))

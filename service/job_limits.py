@@ -1,0 +1,124 @@
+"""What a job asks for, against the ceilings of the service; and what it will take."""
+
+import os
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from pydantic import BaseModel
+
+from octasplat.engine.operations.cost_model import Estimate
+from octasplat.engine.photograph_sizes import Sizes
+from octasplat.service.auth import Principal
+from octasplat.service.problems import ProblemError
+from octasplat.service.settings import ServiceSettings
+from octasplat.workers.db.rows import WorkerRow
+from octasplat.workers.settings import PREFIX
+from octasplat.workers.worker.job_kinds import JobKind
+from octasplat.workers.worker.job_kinds.resource_limits import exceeded_limits
+
+
+def check_job_limits(
+    kind: JobKind, options: BaseModel, sizes: Sequence[Sizes], settings: ServiceSettings
+) -> None:
+    """Refuse options that ask for too much.
+
+    Raises:
+        Problem: 422, with each such option and its ceiling.
+    """
+    found = exceeded_limits(kind.resource_demands(options, sizes), settings.ceilings)
+    # What it takes on disk follows from the others, so that it is told only if none of them is too much.
+    found = [excess for excess in found if excess.demand.resource != "workspace_bytes"] or found
+    faults = [
+        {
+            "pointer": f"#/options/{excess.demand.path.replace('.', '/')}",
+            "detail": excess.sentence,
+            "ceiling": excess.limit,
+            "setting": f"{PREFIX}MAX_{excess.demand.resource.upper()}",
+        }
+        for excess in found
+    ]
+    if faults:
+        raise ProblemError(422, "ceiling", str(faults[0]["detail"]), errors=faults)
+
+
+def check_priority(who: Principal, priority: int, settings: ServiceSettings) -> None:
+    """Keep high priorities for administrators.
+
+    Raises:
+        Problem: 422.
+    """
+    if priority <= settings.max_priority or who.may("admin"):
+        return
+    detail = f"The priority is {priority}; you may give at most {settings.max_priority}, administrators more."
+    setting = f"{PREFIX}MAX_PRIORITY"
+    fault = {
+        "pointer": "#/priority", "detail": detail, "ceiling": settings.max_priority, "setting": setting,
+    }  # fmt: skip
+    raise ProblemError(422, "ceiling", detail, errors=[fault])
+
+
+def limits_by_path(kind: JobKind, settings: ServiceSettings) -> dict[str, int]:
+    """What each option may ask for, of those that say it themselves."""
+    try:
+        options = kind.resolve({})
+    except ValueError:  # something has to be given
+        return {}
+    numbers = [
+        demand
+        for demand in kind.resource_demands(options, ())
+        if demand.resource not in ("exports", "render_pixels", "render_paths", "workspace_bytes")
+    ]
+    return {
+        demand.path: settings.ceilings[demand.resource]
+        for demand in numbers
+        if demand.path != "train.ssim_patch_side"
+    }
+
+
+def estimate_job(
+    kind: JobKind, options: BaseModel, sizes: Sequence[Sizes], workers: Sequence[WorkerRow]
+) -> Estimate | None:
+    """What a job will take on the best of ``workers``, or where there are none on a machine as this one.
+
+    None where nobody knows, as without any photographs whose sizes are known.
+    """
+    if not sizes:
+        return None
+    return kind.estimate(options, sizes, max(map(_cores, workers), default=os.cpu_count() or 1))
+
+
+def limit_notes(
+    estimate: Mapping[str, Any] | None, workers: Sequence[WorkerRow], settings: ServiceSettings
+) -> list[str]:
+    """What the owner of a job should know that is likely to meet a limit, in sentences."""
+    if estimate is None:
+        return []
+    known = Estimate.model_validate(dict(estimate))
+    notes = []
+    limits = [row.facts.get("memory_limit_bytes") for row in workers]
+    allowed = [int(limit) for limit in limits if isinstance(limit, int)]
+    if allowed and len(allowed) == len(limits) and known.memory_bytes > max(allowed):
+        notes.append(
+            f"It may need {known.memory_bytes / 1e9:.1f} GB of memory, and its workers allow "
+            f"{max(allowed) / 1e9:.1f} GB; ask for fewer Gaussians, rays or pixels."
+        )
+    disks = [row.facts.get("disk_bytes") for row in workers]
+    rooms = [int(room) for room in disks if isinstance(room, int)]
+    if rooms and len(rooms) == len(disks) and known.disk_bytes > max(rooms):
+        notes.append(
+            f"It needs at least {known.disk_bytes / 1e9:.1f} GB of disk, and no worker has more than "
+            f"{max(rooms) / 1e9:.1f} GB."
+        )
+    hours = settings.max_job_hours
+    if hours and known.seconds > 3600 * hours:
+        notes.append(
+            f"It may take {known.seconds / 3600:.0f} hours, and is ended after {hours:g}; ask for less."
+        )
+    return notes
+
+
+def _cores(worker: WorkerRow) -> int:
+    """Cores that one job of a worker has, where it says so."""
+    found = worker.facts.get("threads", worker.facts.get("cores"))
+    cores = found if isinstance(found, int) and found > 0 else 1
+    return max(1, cores // max(1, worker.slots))

@@ -1,0 +1,131 @@
+"""Requests that are turned away before anybody looks at them: foreign names, foreign pages, long bodies."""
+
+from urllib.parse import urlsplit
+
+from starlette.datastructures import Headers
+from starlette.middleware.body_limit import RequestBodyLimitMiddleware
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from octasplat.service.problems import ProblemError
+
+_LOCAL_HOSTS = frozenset({"localhost", "127.0.0.1", "::1"})
+_SAFE_METHODS = frozenset({"GET", "HEAD", "OPTIONS", "TRACE"})
+
+
+class AllowedHostsMiddleware:
+    """Takes requests for this machine's own names only, so that no web page comes in under its own.
+
+    Args:
+        app: behind it.
+        names: further names, without a port.
+    """
+
+    def __init__(self, app: ASGIApp, names: tuple[str, ...] = ()) -> None:
+        self._app = app
+        self._names = _LOCAL_HOSTS | {name.lower() for name in names}
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Let a request through or answer 421."""
+        if scope["type"] == "http" and _host_name(Headers(scope=scope).get("host", "")) not in self._names:
+            detail = (
+                "This service answers to localhost and 127.0.0.1 only; OCTASPLAT_ALLOWED_HOSTS adds more."
+            )
+            await ProblemError(421, "host", detail).response()(scope, receive, send)
+            return
+        await self._app(scope, receive, send)
+
+
+class SameOriginMiddleware:
+    """Takes no changes that another site's page asks a browser to make."""
+
+    def __init__(self, app: ASGIApp) -> None:
+        self._app = app
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Let a request through or answer 403."""
+        if (
+            scope["type"] == "http"
+            and scope["method"] not in _SAFE_METHODS
+            and _is_cross_site(Headers(scope=scope))
+        ):
+            detail = "This request comes from a page of another site."
+            await ProblemError(403, "origin", detail).response()(scope, receive, send)
+            return
+        await self._app(scope, receive, send)
+
+
+class BodyLimitMiddleware:
+    """Limits the length of every body but those of uploads, which are counted where they are written."""
+
+    def __init__(self, app: ASGIApp, max_body_bytes: int) -> None:
+        self._app = app
+        self._limited = RequestBodyLimitMiddleware(app, max_body_size=max_body_bytes)
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Pass a request on with its limit."""
+        if scope["type"] != "http" or scope["method"] == "PUT":
+            await self._app(scope, receive, send)
+            return
+        replaced = False
+
+        async def send_as_problem(message: Message) -> None:
+            nonlocal replaced
+            is_start = message["type"] == "http.response.start"
+            if is_start and message["status"] == 413 and _PLAIN_TEXT_HEADER in message["headers"]:
+                replaced = True
+                await ProblemError(413, "too-large", "The request is too long.").response()(
+                    scope, receive, send
+                )
+            elif not replaced:
+                await send(message)
+
+        await self._limited(scope, receive, send_as_problem)
+
+
+class SecurityHeadersMiddleware:
+    """Says to browsers that nothing here is to be guessed at, framed or remembered by others."""
+
+    def __init__(self, app: ASGIApp) -> None:
+        self._app = app
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Add the headers to the answer."""
+
+        async def with_headers(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                given = {name.lower() for name, _ in message["headers"]}
+                message["headers"] = [
+                    *message["headers"],
+                    *((name, value) for name, value in _SECURITY_HEADERS if name not in given),
+                ]
+            await send(message)
+
+        await self._app(scope, receive, with_headers if scope["type"] == "http" else send)
+
+
+_PLAIN_TEXT_HEADER = (b"content-type", b"text/plain; charset=utf-8")
+_SECURITY_HEADERS = (
+    (b"x-content-type-options", b"nosniff"),
+    (b"x-frame-options", b"SAMEORIGIN"),
+    (b"referrer-policy", b"same-origin"),
+    (b"cross-origin-resource-policy", b"same-origin"),
+)
+
+
+def _is_cross_site(headers: Headers) -> bool:
+    if headers.get("sec-fetch-site") in ("cross-site", "same-site"):
+        return True
+    origin = headers.get("origin")
+    if origin is None:
+        return False
+    try:
+        return urlsplit(origin).netloc.lower() != headers.get("host", "").lower()
+    except ValueError:
+        return True
+
+
+def _host_name(host: str) -> str:
+    try:
+        return (urlsplit(f"//{host}").hostname or "").lower()
+    except ValueError:
+        return ""

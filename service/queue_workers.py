@@ -1,0 +1,75 @@
+"""What the workers that live can do for a job, and what its owner should know about that."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from pydantic import BaseModel
+
+from octasplat.engine.files import exporter_for, exporters
+from octasplat.service.problems import ProblemError
+from octasplat.workers.db.connections import Connection
+from octasplat.workers.db.rows import WorkerRow
+from octasplat.workers.db.workers import live_workers
+from octasplat.workers.worker.job_kinds import JobKind
+
+
+async def live_workers_of_queue(connection: Connection, queue: str, stale_seconds: float) -> list[WorkerRow]:
+    """The living workers that take jobs from a queue."""
+    return [row for row in await live_workers(connection, stale_seconds) if queue in row.queues]
+
+
+def unwritable_formats(workers: Sequence[WorkerRow]) -> dict[str, str]:
+    """Formats that none of ``workers`` can write, with what they need.
+
+    Without workers there are none: nobody can say what those that come will be able to write.
+    """
+    takers = [row for row in workers if row.queues]  # others look after lost jobs only
+    if not takers:
+        return {}
+    able = {str(name) for row in takers for name in row.facts.get("formats", _ALL_FORMATS)}
+    return {exporter.name: exporter.description for exporter in exporters() if exporter.name not in able}
+
+
+def check_formats_writable(
+    kind: JobKind, options: BaseModel, queue: str, workers: Sequence[WorkerRow]
+) -> None:
+    """Refuse files that no living worker of the queue can write.
+
+    Raises:
+        Problem: 422, with the place of each such file.
+    """
+    lacking = unwritable_formats(workers)
+    faults = [
+        {
+            "pointer": f"#/options/{kind.export_option}/{place}",
+            "detail": f"No worker of the queue {queue} can write {name}: {lacking[form]}.",
+        }
+        for place, name in enumerate(kind.exported_files(options))
+        if (form := exporter_for(Path(name)).name) in lacking
+    ]
+    if faults:
+        detail = f"{faults[0]['detail']} Ask for other files, or have it installed where the workers run."
+        raise ProblemError(422, "unwritable", detail, errors=faults)
+
+
+def queued_job_notes(
+    kind: JobKind, options: BaseModel, queue: str, workers: Sequence[WorkerRow]
+) -> list[str]:
+    """What the owner of a job that waits should know, in sentences."""
+    if workers:
+        takers = [row for row in workers if kind.name in row.facts.get("kinds", (kind.name,))]
+        if takers:
+            return []
+        return [
+            f"No worker of the queue {queue} knows jobs of the kind {kind.name}; the job waits for one of a "
+            "newer version."
+        ]
+    notes = [f"No worker takes jobs from the queue {queue} now; the job waits for one."]
+    needy = [name for name in kind.exported_files(options) if "needs" in exporter_for(Path(name)).description]
+    if needy:
+        notes.append(f"Whether {' and '.join(needy)} can be written is not known before a worker is there.")
+    return notes
+
+
+_ALL_FORMATS = tuple(exporter.name for exporter in exporters())
+"""What a worker of an earlier version, which does not say, is taken to write."""

@@ -1,0 +1,81 @@
+"""What happens to a job: its log, its events as a list and as a stream."""
+
+import json
+import uuid
+from collections.abc import AsyncGenerator, AsyncIterator
+from contextlib import aclosing
+from typing import Annotated
+
+from fastapi import APIRouter, Header, Query, Response
+from fastapi.responses import StreamingResponse
+from fastapi.sse import format_sse_event
+
+from octasplat.service.actions import events_and_logs as actions
+from octasplat.service.auth import Reader
+from octasplat.service.routes import problem_responses
+from octasplat.service.schemas.events_and_logs import EventPage, EventView, LogLineView, LogPage
+from octasplat.service.state import ServiceDep
+from octasplat.workers.db.rows import JobEvent
+
+router = APIRouter(prefix="/v1/jobs", tags=["progress"])
+
+After = Annotated[int, Query(ge=0, lt=1 << 62, description="`next` of the answer before.")]
+
+
+@router.get("/{job_id}/logs", responses=problem_responses(404))
+async def read_log(
+    job_id: uuid.UUID, who: Reader, service: ServiceDep, after: After = 0,
+    limit: Annotated[int, Query(ge=1, le=5000)] = 1000,
+) -> LogPage:  # fmt: skip
+    """What the job did when: stages, pace, warnings, errors with their cause, and what its program wrote."""
+    lines = await actions.read_log(service, who, job_id, after=after, limit=limit)
+    return LogPage(lines=[LogLineView.from_row(row) for row in lines], next=lines[-1].id if lines else after)
+
+
+@router.get("/{job_id}/timeline", responses=problem_responses(404))
+async def read_timeline(
+    job_id: uuid.UUID, who: Reader, service: ServiceDep, after: After = 0,
+    limit: Annotated[int, Query(ge=1, le=5000)] = 1000,
+) -> EventPage:  # fmt: skip
+    """What happened to the job, as a list; `/events` is the same as a stream."""
+    events = await actions.read_events(service, who, job_id, after=after, limit=limit)
+    return EventPage(
+        events=[EventView.from_row(row) for row in events], next=events[-1].id if events else after
+    )
+
+
+@router.get(
+    "/{job_id}/events",
+    response_class=StreamingResponse,
+    responses={
+        200: {"description": "Server-sent events", "content": {"text/event-stream": {}}},
+        204: {"description": "The job is over and everything was told"},
+        **problem_responses(404),
+    },
+)
+async def stream_events(
+    job_id: uuid.UUID, who: Reader, service: ServiceDep,
+    last_event_id: Annotated[str | None, Header(max_length=40)] = None,
+    after: After = 0,
+) -> Response:  # fmt: skip
+    """What happens to the job, as it happens; after a break `Last-Event-ID` says what was heard last."""
+    if last_event_id is not None and last_event_id.isdecimal():
+        after = min(int(last_event_id), (1 << 62) - 1)
+    events = await actions.follow_events(service, who, job_id, after=after)
+    if events is None:
+        return Response(status_code=204)
+    headers = {"Cache-Control": "no-cache", "X-Accel-Buffering": "no"}
+    return StreamingResponse(_encode_stream(events), media_type="text/event-stream", headers=headers)
+
+
+async def _encode_stream(events: AsyncGenerator[JobEvent | None, None]) -> AsyncIterator[bytes]:
+    """Events as they are sent, with signs of life in between."""
+    async with aclosing(events):
+        yield b"retry: 2000\n\n"
+        async for event in events:
+            yield b": ping\n\n" if event is None else _encode_event(event)
+
+
+def _encode_event(event: JobEvent) -> bytes:
+    data = {**event.data, "attempt": event.attempt, "at": event.at.isoformat()}
+    return format_sse_event(data_str=json.dumps(data), event=event.kind, id=str(event.id))

@@ -1,0 +1,51 @@
+"""What happens to a job: its log and its events."""
+
+from datetime import datetime
+from typing import Any
+
+from pydantic import BaseModel
+
+from octasplat.workers.db.rows import JobEvent, LogLine
+
+
+class LogLineView(BaseModel):
+    """A line of a job's log."""
+
+    id: int
+    attempt: int
+    text: str
+    at: datetime
+
+    @classmethod
+    def from_row(cls, row: LogLine) -> "LogLineView":
+        """From its row."""
+        return cls.model_validate(row, from_attributes=True)
+
+
+class LogPage(BaseModel):
+    """A part of a job's log; ask again with `after` set to `next`."""
+
+    lines: list[LogLineView]
+    next: int
+
+
+class EventView(BaseModel):
+    """Something that happened to a job."""
+
+    id: int
+    attempt: int
+    kind: str
+    data: dict[str, Any]
+    at: datetime
+
+    @classmethod
+    def from_row(cls, row: JobEvent) -> "EventView":
+        """From its row."""
+        return cls.model_validate(row, from_attributes=True)
+
+
+class EventPage(BaseModel):
+    """A part of what happened; ask again with `after` set to `next`."""
+
+    events: list[EventView]
+    next: int

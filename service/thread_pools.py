@@ -1,0 +1,44 @@
+"""Threads by purpose, so that what is slow or comes in numbers keeps nothing else waiting."""
+
+import asyncio
+import contextvars
+import functools
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from enum import Enum, auto
+from typing import TypeVar
+
+T = TypeVar("T")
+
+
+class ThreadPurpose(Enum):
+    """What threads are for."""
+
+    UPLOADS = auto()
+    """Writing what is sent, and looking at its headers."""
+    UNPACKING = auto()
+    """Reading archives that have come."""
+    CHECKS = auto()
+    """Checking datasets; how many at once is bounded further, see :class:`octasplat.service.concurrency_limiter.ConcurrencyLimiter`."""
+    DOWNLOADS = auto()
+    """Looking up what is read."""
+    STORE_CHECKS = auto()
+    """Asking how the store fares."""
+
+
+_POOL_SIZES = {
+    ThreadPurpose.UPLOADS: 16,
+    ThreadPurpose.UNPACKING: 3,
+    ThreadPurpose.CHECKS: 8,
+    ThreadPurpose.DOWNLOADS: 12,
+    ThreadPurpose.STORE_CHECKS: 4,
+}
+_POOLS = {purpose: ThreadPoolExecutor(most, purpose.name.lower()) for purpose, most in _POOL_SIZES.items()}
+
+
+async def run_in_pool(
+    purpose: ThreadPurpose, function: Callable[..., T], /, *values: object, **named: object
+) -> T:
+    """Call a function that blocks in one of the threads for ``purpose``; as :func:`asyncio.to_thread`."""
+    call = functools.partial(contextvars.copy_context().run, function, *values, **named)
+    return await asyncio.get_running_loop().run_in_executor(_POOLS[purpose], call)

@@ -1,0 +1,63 @@
+"""What the form of another light needs of a finished job with materials: its views, and maps of light."""
+
+import uuid
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from octasplat.service.actions.datasets import list_files_by_suffix
+from octasplat.service.auth import Principal
+from octasplat.service.settings import ServiceSettings
+from octasplat.service.state import Service
+from octasplat.service.web.results import LEARNT_LIGHT
+from octasplat.service.web.stage_form import MAX_VIEWS, PREVIEW_PRIORITY
+from octasplat.workers.db.rows import Artifact
+from octasplat.workers.worker.job_kinds import get_job_kind
+
+ENVIRONMENT_SUFFIXES = (".hdr", ".exr")
+MAX_ENVIRONMENTS = 60
+
+
+@dataclass(frozen=True)
+class UploadedEnvironment:
+    """A map of light that was sent before: its dataset, what that is called, and its name in it."""
+
+    dataset_id: uuid.UUID
+    title: str
+    name: str
+
+
+@dataclass(frozen=True)
+class RelightForm:
+    """The form of another light.
+
+    Attributes:
+        views: names of the photographs that were held out, for previews.
+        maps: that are here already, the newest first.
+        learnt: name of the result that shows the light which the job learnt.
+        priority: of a preview.
+        max_file_bytes: length of one file that is sent.
+    """
+
+    views: list[str]
+    maps: list[UploadedEnvironment]
+    learnt: str | None
+    priority: int
+    max_file_bytes: int
+
+
+async def relight_form(
+    service: Service, who: Principal, artifacts: Sequence[Artifact], held_out: Sequence[str]
+) -> RelightForm | None:
+    """The form for a job's result; None where it has no materials, or the asker may queue nothing."""
+    names = {row.name for row in artifacts}
+    if not who.may("write") or not names.issuperset(get_job_kind("relight").source_files):
+        return None
+    files = await list_files_by_suffix(service, who, ENVIRONMENT_SUFFIXES, limit=MAX_ENVIRONMENTS)
+    settings: ServiceSettings = service.settings
+    return RelightForm(
+        sorted(held_out)[:MAX_VIEWS],
+        [UploadedEnvironment(dataset.id, dataset.name, path) for dataset, path in files],
+        LEARNT_LIGHT if LEARNT_LIGHT in names else None,
+        min(PREVIEW_PRIORITY, settings.max_priority),
+        settings.max_upload_bytes,
+    )

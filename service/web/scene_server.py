@@ -1,0 +1,131 @@
+"""A small server for the viewer of one scene on this machine, without jobs, database or sign-in."""
+
+import json
+import mimetypes
+import sys
+import threading
+from collections.abc import Mapping
+from dataclasses import dataclass
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from typing import Any
+from urllib.parse import unquote, urlsplit
+
+from octasplat.service.web.assets import STATIC_FOLDER
+from octasplat.service.web.templating import PAGE_HEADERS, render_template
+
+_LOCAL_HOSTS = frozenset({"127.0.0.1", "localhost"})
+
+
+@dataclass(frozen=True)
+class ViewedScene:
+    """What the page shows.
+
+    Attributes:
+        name: its heading.
+        ply: the scene as a file.
+        cameras: as :func:`octasplat.service.web.cameras.viewer_cameras` returns them; without views, the
+            page looks at the middle of the scene.
+        q: squared radius of an opaque octagon in standard deviations; None for the usual one.
+        background: ``black`` or ``white``.
+    """
+
+    name: str
+    ply: Path
+    cameras: Mapping[str, Any]
+    q: float | None
+    background: str
+
+
+class SceneServer:
+    """Serves the page of one scene to browsers of this machine, from a thread of its own.
+
+    Args:
+        scene: what to show.
+        port: where; 0 takes a free one.
+    """
+
+    def __init__(self, scene: ViewedScene, port: int = 0) -> None:
+        self._server = _SceneHttpServer(scene, port)
+        self._thread = threading.Thread(target=self._server.serve_forever, name="scene-server", daemon=True)
+        self._thread.start()
+
+    @property
+    def url(self) -> str:
+        """The address of the page."""
+        return f"http://127.0.0.1:{self._server.server_port}/"
+
+    def close(self) -> None:
+        """End the server."""
+        self._server.shutdown()
+        self._server.server_close()
+        self._thread.join()
+
+    def wait(self) -> None:
+        """Wait until somebody closes the server."""
+        self._thread.join()
+
+
+class _SceneHttpServer(ThreadingHTTPServer):
+    daemon_threads = True
+
+    def __init__(self, scene: ViewedScene, port: int) -> None:
+        super().__init__(("127.0.0.1", port), _SceneHandler)
+        self.scene = scene
+
+    def handle_error(self, request: object, client_address: object) -> None:
+        """Say nothing of browsers that leave before the end."""
+        if not isinstance(sys.exception(), ConnectionError):
+            super().handle_error(request, client_address)  # type: ignore[arg-type]
+
+
+class _SceneHandler(BaseHTTPRequestHandler):
+    server: _SceneHttpServer
+
+    def do_GET(self) -> None:
+        host = urlsplit(f"//{self.headers.get('Host', '')}").hostname
+        path = unquote(urlsplit(self.path).path)
+        scene = self.server.scene
+        if host not in _LOCAL_HOSTS:  # a page from elsewhere whose name leads here must not read the scene
+            self.send_error(403)
+        elif path == "/":
+            text = render_template(
+                "viewer.html",
+                name=scene.name,
+                size_bytes=scene.ply.stat().st_size,
+                q=scene.q,
+                background=scene.background,
+            )
+            self._send(text.encode(), "text/html; charset=utf-8", PAGE_HEADERS)
+        elif path == "/cameras.json":
+            self._send(json.dumps(scene.cameras).encode(), "application/json")
+        elif path == "/scene.ply":
+            self._send(scene.ply.read_bytes(), "application/octet-stream")
+        else:
+            self._send_asset(path)
+
+    def _send_asset(self, path: str) -> None:
+        file = (STATIC_FOLDER / path.removeprefix("/static/")).resolve()
+        if (
+            not path.startswith("/static/")
+            or not file.is_relative_to(STATIC_FOLDER.resolve())
+            or not file.is_file()
+        ):
+            self.send_error(404)
+            return
+        kind = "text/javascript" if file.suffix == ".js" else mimetypes.guess_type(file.name)[0]
+        self._send(file.read_bytes(), kind or "application/octet-stream")
+
+    def _send(self, content: bytes, kind: str, headers: Mapping[str, str] | None = None) -> None:
+        self.send_response(200)
+        for name, value in {
+            "Content-Type": kind,
+            "Content-Length": str(len(content)),
+            **(headers or {}),
+        }.items():
+            self.send_header(name, value)
+        self.end_headers()
+        self.wfile.write(content)
+
+    def log_message(self, format: str, *arguments: object) -> None:
+        """Write nothing."""

@@ -1,0 +1,271 @@
+"""The client waits for a service that is started again, and says what stands in its place."""
+
+import hashlib
+import json
+import threading
+import time
+from collections.abc import Callable, Iterator
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from octasplat.workers.client import backoff
+from octasplat.workers.client.api import Api, ServiceError, ServiceUnreachableError
+from octasplat.workers.client.download import download_results
+from octasplat.workers.client.upload import upload_files
+from octasplat.workers.client.watch import watch_job
+
+Answer = tuple[int, dict[str, str], bytes]
+AWAY_SECONDS = 12.5
+"""What a restart takes where one slow upload holds it up."""
+
+
+class Front:
+    """A server that answers as a function says; None breaks the connection off after half of the answer."""
+
+    def __init__(self, answer: Callable[[str, str, dict[str, str], bytes], Answer]) -> None:
+        self.asked: list[str] = []
+        front = self
+
+        class Handler(BaseHTTPRequestHandler):
+            def handle_any(self) -> None:
+                length = int(self.headers.get("Content-Length") or 0)
+                body = self.rfile.read(length)
+                front.asked.append(f"{self.command} {self.path}")
+                status, headers, content = answer(self.command, self.path, dict(self.headers), body)
+                self.send_response(status)
+                for name, value in {"Content-Length": str(len(content)), **headers}.items():
+                    self.send_header(name, value)
+                self.end_headers()
+                self.wfile.write(content)
+
+            do_GET = do_POST = do_PUT = do_DELETE = handle_any
+
+            def log_message(self, *_arguments: object) -> None: ...
+
+        self._handler = Handler
+        self.port = 0
+        self.start()
+
+    def start(self) -> None:
+        self._server = ThreadingHTTPServer(("127.0.0.1", self.port), self._handler)
+        self.port = int(self._server.server_address[1])
+        threading.Thread(target=self._server.serve_forever, args=(0.02,), daemon=True).start()
+
+    def stop(self) -> None:
+        self._server.shutdown()
+        self._server.server_close()
+
+    def start_again_after(self, seconds: float) -> None:
+        self.stop()
+        threading.Timer(seconds, self.start).start()
+
+    @property
+    def address(self) -> str:
+        return f"http://127.0.0.1:{self.port}"
+
+
+@pytest.fixture
+def serve() -> Iterator[Callable[..., Front]]:
+    fronts: list[Front] = []
+
+    def make(answer: Callable[[str, str, dict[str, str], bytes], Answer]) -> Front:
+        fronts.append(Front(answer))
+        return fronts[-1]
+
+    yield make
+    for front in fronts:
+        front.stop()
+
+
+def as_json(value: Any, status: int = 200) -> Answer:
+    return status, {"Content-Type": "application/json"}, json.dumps(value).encode()
+
+
+def as_page(status: int) -> Answer:
+    return status, {"Content-Type": "text/html"}, b"<html>from a proxy</html>"
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_requests_survive_service_restart(serve: Callable[..., Front], known: bool) -> None:
+    front = serve(lambda *_: as_json({"fine": True}))
+    with Api(front.address) as api:
+        if known:
+            api.get("/v1")
+        front.start_again_after(AWAY_SECONDS)
+        assert api.get("/v1") == {"fine": True}
+
+
+def test_missing_service_fails_quickly(serve: Callable[..., Front], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("octasplat.workers.client.api.MAX_FIRST_OUTAGE_SECONDS", 1.0)
+    front = serve(lambda *_: as_json({}))
+    front.stop()
+    began = time.monotonic()
+    with Api(front.address) as api, pytest.raises(ServiceUnreachableError, match="octasplat serve"):
+        api.get("/v1")
+    front.start()
+    assert time.monotonic() - began < 10
+
+
+def test_pauses_grow_and_end(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock, pauses = [0.0], list[float]()
+
+    def sleep(seconds: float) -> None:
+        pauses.append(seconds)
+        clock[0] += seconds
+
+    monkeypatch.setattr(backoff.time, "monotonic", lambda: clock[0])
+    monkeypatch.setattr(backoff.time, "sleep", sleep)
+    waiting = backoff.Backoff(120.0)
+    while waiting.wait():
+        pass
+    assert sum(pauses) == pytest.approx(120.0) and 12 <= len(pauses) <= 30
+    assert pauses[0] < 0.5 and max(pauses) <= 10.0
+    waiting.reset()
+    assert waiting.wait(min_seconds=5.0) and pauses[-1] == 5.0
+
+
+def test_redirect_raises_error_with_target(serve: Callable[..., Front], tmp_path: Path) -> None:
+    elsewhere = {"Location": "https://other.example/v1"}
+    front = serve(lambda *_: (308, elsewhere, b""))
+    with Api(front.address) as api:
+        for ask in (lambda: api.get("/v1"), lambda: api.request("PUT", "/v1", content=b"x")):
+            with pytest.raises(
+                ServiceError, match=r"redirected to https://other.example/v1.*OCTASPLAT_SERVER"
+            ):
+                ask()
+
+
+def test_pages_of_others_are_no_answers(serve: Callable[..., Front]) -> None:
+    front = serve(lambda *_: as_page(200))
+    with Api(front.address) as api, pytest.raises(ServiceError, match=r"text/html.*no octasplat service"):
+        api.get("/v1")
+
+
+@pytest.mark.parametrize("status", [502, 503, 504])
+def test_gateway_error_is_retried(serve: Callable[..., Front], status: int) -> None:
+    left = [3]
+
+    def answer(_method: str, path: str, _headers: dict[str, str], _body: bytes) -> Answer:
+        if left[0]:
+            left[0] -= 1
+            return as_page(status)
+        if path.endswith("/events"):
+            left[0] = 0
+            return 200, {"Content-Type": "text/event-stream"}, b""
+        return as_json({"state": "succeeded"})
+
+    front = serve(answer)
+    with Api(front.address) as api:
+        assert watch_job(api, "x", lambda _e: None, lambda _s: None)["state"] == "succeeded"
+
+
+def test_lasting_gateway_error_is_reported(
+    serve: Callable[..., Front], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("octasplat.workers.client.api.MAX_FIRST_OUTAGE_SECONDS", 0.5)
+    front = serve(lambda *_: as_page(502))
+    with Api(front.address) as api, pytest.raises(ServiceUnreachableError, match="a proxy answers 502"):
+        api.get("/v1")
+
+
+def test_interrupted_download_resumes_with_long_names(serve: Callable[..., Front], tmp_path: Path) -> None:
+    content = bytes(range(256)) * 64
+    name = "n" * 236 + ".bin"
+    sha256 = hashlib.sha256(content).hexdigest()
+
+    def answer(_method: str, path: str, headers: dict[str, str], _body: bytes) -> Answer:
+        if path.endswith("/artifacts"):
+            return as_json({"artifacts": [{"name": name, "sha256": sha256, "size_bytes": len(content)}]})
+        begin = int(headers.get("Range", "bytes=0-")[6:-1])
+        rest = content[begin:]
+        return (206 if begin else 200), {"Content-Length": str(len(rest))}, rest[: len(content) // 8]
+
+    front = serve(answer)
+    with Api(front.address) as api:
+        [path] = download_results(api, "x", tmp_path)
+    assert path.read_bytes() == content and path.name == name
+    assert sum("n" * 200 in asked for asked in front.asked) == 8
+    assert [left.name for left in tmp_path.iterdir()] == [name]
+
+
+class Datasets:
+    """A service that keeps datasets, and forgets what is deleted."""
+
+    def __init__(self) -> None:
+        self.made: dict[str, dict[str, Any] | None] = {}
+        self.uploads = 0
+        self.refusals = 0
+
+    def __call__(self, method: str, path: str, headers: dict[str, str], _body: bytes) -> Answer:
+        problem = {"detail": "no"}
+        if path == "/v1/datasets":
+            key = headers["Idempotency-Key"]
+            if key in self.made and self.made[key] is None:
+                return as_json(problem, 404)
+            dataset = self.made.setdefault(key, {"id": f"d{len(self.made)}", "state": "open"})
+            return as_json(dataset)
+        dataset = next(d for d in self.made.values() if d is not None and d["id"] == path.split("/")[3])
+        if path.endswith("/commit"):
+            if self.refusals:
+                self.refusals -= 1
+                dataset["state"] = "checking"
+                return as_json({"detail": "The dataset is being checked already."}, 409)
+            dataset["state"] = "committed"
+            return as_json(dataset)
+        if "/files" in path:
+            if method == "PUT":
+                self.uploads += 1
+            return as_json({"files": [], "next": None})
+        return as_json(dataset)
+
+
+def test_upload_after_dataset_deletion_is_sent_once(serve: Callable[..., Front], tmp_path: Path) -> None:
+    service = Datasets()
+    (tmp_path / "a.obj").write_text("x")
+    files = {"a.obj": tmp_path / "a.obj"}
+    with Api(serve(service).address) as api:
+        upload_files(api, files)
+        for _ in range(3):
+            service.made = dict.fromkeys(service.made)
+            for _ in range(3):
+                upload_files(api, files)
+    assert service.uploads == 1 + 3
+
+
+def test_commit_after_interrupted_check_succeeds(serve: Callable[..., Front], tmp_path: Path) -> None:
+    service = Datasets()
+    service.refusals = 3
+    (tmp_path / "a.obj").write_text("x")
+    with Api(serve(service).address) as api:
+        assert upload_files(api, {"a.obj": tmp_path / "a.obj"})["state"] == "committed"
+        for dataset in service.made.values():
+            assert dataset is not None
+            dataset["state"] = "checking"  # by a front end that was killed
+        assert upload_files(api, {"a.obj": tmp_path / "a.obj"})["state"] == "committed"
+
+
+def test_a_file_that_is_gone_already_need_not_be_removed(serve: Callable[..., Front], tmp_path: Path) -> None:
+    """As when the service ended after it removed the file and before it said so."""
+    (tmp_path / "a").write_bytes(b"x")
+    there, removals = {"a", "b"}, [0]
+
+    def answer(method: str, path: str, _headers: dict[str, str], _body: bytes) -> Answer:
+        name = path.rpartition("/")[2]
+        if method == "DELETE":
+            removals[0] += 1
+            if name in there:
+                there.remove(name)
+                return 503, {"Content-Type": "application/problem+json"}, b"{}"
+            return as_json({"detail": "There is no such file."}, 404)
+        if path.startswith("/v1/datasets/d/files?"):
+            digest = hashlib.sha256(b"x").hexdigest()
+            return as_json({"files": [{"path": n, "sha256": digest} for n in sorted(there)], "next": None})
+        return as_json({"id": "d", "state": "committed" if path.endswith("/commit") else "open"})
+
+    front = serve(answer)
+    with Api(front.address) as api:
+        assert upload_files(api, {"a": tmp_path / "a"})["state"] == "committed"
+    assert removals == [2] and there == {"a"}

@@ -1,0 +1,162 @@
+"""A lens that moved between photographs is noticed and given to each of them, and none that stood still."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+
+from octasplat.engine.config import resolve_config
+from octasplat.engine.dataset.load import load_dataset_model
+from octasplat.engine.dataset.synthetic import SyntheticDatasetConfig, write_synthetic_dataset
+from octasplat.engine.errors import Cancelled, DatasetError
+from octasplat.engine.events import Event, StageFinished, StageStarted, Warned
+from octasplat.engine.pipeline import reconstruct
+from octasplat.engine.poses import adjust_principal_points, needs_per_view_principal_points
+
+VIEWS = 20
+NOISE_PX = 0.3
+SHIFTS_PX = np.random.default_rng(7).uniform(-12, 12, (VIEWS, 2)).round()
+SETTINGS = (
+    "iterations=1000",
+    "rays_per_batch=512",
+    "max_gaussians=500",
+    "probe_rays=256",
+    "repair_poses=false",
+)
+
+
+def write_scene(root: Path, shifts_px: np.ndarray) -> Path:
+    """Generated photographs moved by whole pixels, with what they show of the points, found to 0.3 px."""
+    write_synthetic_dataset(
+        root,
+        SyntheticDatasetConfig(views=VIEWS, width_px=240, height_px=180, samples_per_side=1, points=1500),
+    )
+    model = pycolmap.Reconstruction(str(root / "sparse" / "0"))
+    rng = np.random.default_rng(3)
+    for image, shift in zip(sorted(model.images.values(), key=lambda i: i.name), shifts_px, strict=True):
+        for spot in image.points2D:
+            spot.xy = spot.xy + shift + rng.normal(0, NOISE_PX, 2)
+        path = root / "images" / image.name
+        bitmap = pycolmap.Bitmap.read(str(path), True)
+        moved = np.roll(bitmap.to_array(), shift.astype(int)[::-1], axis=(0, 1))
+        pycolmap.Bitmap.from_array(np.ascontiguousarray(moved)).write(str(path))
+    model.write_binary(str(root / "sparse" / "0"))
+    return root
+
+
+@pytest.fixture(scope="module")
+def moved(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_scene(tmp_path_factory.mktemp("moved") / "scene", SHIFTS_PX)
+
+
+@pytest.fixture(scope="module")
+def still(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_scene(tmp_path_factory.mktemp("still") / "scene", np.zeros((VIEWS, 2)))
+
+
+def principal_points(model: Path) -> np.ndarray:
+    found = pycolmap.Reconstruction(str(model))
+    images = sorted(found.images.values(), key=lambda image: image.name)
+    cameras = [found.cameras[image.camera_id] for image in images]
+    return np.array([[camera.principal_point_x, camera.principal_point_y] for camera in cameras])
+
+
+def centres(model: Path) -> np.ndarray:
+    images = sorted(pycolmap.Reconstruction(str(model)).images.values(), key=lambda image: image.name)
+    return np.array([image.projection_center() for image in images])
+
+
+def test_lens_check_flags_shifted_principal_points_only(moved: Path, still: Path) -> None:
+    for root, expected in ((moved, True), (still, False)):
+        scene = load_dataset_model(root)
+        assert needs_per_view_principal_points(scene, scene.points, scene.observations) is expected
+
+
+def test_the_principal_points_come_out_where_the_pictures_were_moved(moved: Path, tmp_path: Path) -> None:
+    model, found = moved / "sparse" / "0", tmp_path / "found"
+    facts = adjust_principal_points(model, found)
+    assert facts is not None
+    assert facts["reprojection_px"] < 1.1 * NOISE_PX < 0.75 * facts["reprojection_px_before"]
+    given = principal_points(model)
+    np.testing.assert_allclose(principal_points(found) - given, SHIFTS_PX, atol=2.0)
+    # The cameras stand where they stood: the given poses were right but for the pictures.
+    size = np.linalg.norm(centres(model) - centres(model).mean(axis=0), axis=1).mean()
+    np.testing.assert_allclose(centres(found), centres(model), atol=0.01 * size)
+    assert json.loads((found / "poses.json").read_text())["lenses"] == facts
+    again = tmp_path / "again"
+    adjust_principal_points(model, again)
+    for path in found.iterdir():
+        assert (again / path.name).read_bytes() == path.read_bytes()
+    # The folder of the model itself may be the one to change; what its record says stays.
+    (again / "poses.json").write_text('{"moved": ["a.png"]}')
+    assert adjust_principal_points(again, again) is None
+    assert json.loads((again / "poses.json").read_text()) == {"moved": ["a.png"]}
+
+
+def test_lens_fit_keeps_unshifted_principal_point(still: Path, tmp_path: Path) -> None:
+    assert adjust_principal_points(still / "sparse" / "0", tmp_path / "none") is None
+    assert not any(tmp_path.iterdir())
+
+
+def test_lens_fit_unreadable_model_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(DatasetError, match=r"COLMAP cannot adjust the model in .*gone"):
+        adjust_principal_points(tmp_path / "gone", tmp_path / "none")
+    assert not any(tmp_path.iterdir())
+
+
+def test_photographs_that_show_few_points_keep_their_lens(moved: Path, tmp_path: Path) -> None:
+    model = pycolmap.Reconstruction(str(moved / "sparse" / "0"))
+    poor, none = sorted(model.images.values(), key=lambda image: image.name)[4:6]
+    for image, left in ((poor, 60), (none, 0)):
+        shown = [k for k, spot in enumerate(image.points2D) if spot.has_point3D()]
+        for k in shown[left:]:
+            model.delete_observation(image.image_id, k)
+    given = tmp_path / "given"
+    given.mkdir()
+    model.write_binary(str(given))
+    assert adjust_principal_points(given, tmp_path / "found") is not None
+    shifts = principal_points(tmp_path / "found") - principal_points(given)
+    assert not shifts[4:6].any()
+    assert np.abs(np.delete(shifts - SHIFTS_PX, [4, 5], axis=0)).max() < 2.5
+    poses = [
+        pycolmap.Reconstruction(str(folder)).images[none.image_id].cam_from_world().matrix()
+        for folder in (given, tmp_path / "found")
+    ]
+    np.testing.assert_allclose(poses[0], poses[1], atol=1e-12)
+
+
+@pytest.mark.heavy
+def test_lens_fit_runs_during_reconstruction_and_resumes(moved: Path, tmp_path: Path) -> None:
+    output, events = tmp_path / "run", list[Event]()
+    config = resolve_config("fast", settings={"exports": ()}, assignments=SETTINGS)
+    begun: list[str] = []
+
+    def note(event: Event) -> None:
+        if isinstance(event, StageStarted):
+            begun.append(event.stage)
+
+    with pytest.raises(Cancelled, match="--resume"):
+        reconstruct(
+            moved, output, config, resume=True, progress=note, should_stop=lambda: begun[-1:] == ["lenses"]
+        )
+    assert not (output / "poses").exists()
+    reconstruct(moved, output, config, resume=True, progress=events.append)
+    stages = [event.stage for event in events if isinstance(event, StageFinished)]
+    assert stages == ["load", "lenses", "load", "train", "evaluate", "export"]
+    assert any("lens moved" in event.message for event in events if isinstance(event, Warned))
+    metrics = json.loads((output / "metrics.json").read_text())
+    assert metrics["poses"]["lenses"]["shift_px_median"] > 5
+    cameras = json.loads((output / "views.json").read_text())["cameras"]
+    assert len(cameras) == VIEWS
+
+    begun.clear()
+    config = resolve_config(
+        "fast", settings={"exports": ()}, assignments=[*SETTINGS, "per_view_principal_point=false"]
+    )
+    with pytest.raises(Cancelled):
+        reconstruct(
+            moved, tmp_path / "given", config, progress=note, should_stop=lambda: begun[-1:] == ["train"]
+        )
+    assert begun == ["load", "train"]

@@ -1,0 +1,334 @@
+"""One job's trouble, or that of the machine around it, stays where it is."""
+
+import asyncio
+from collections.abc import Awaitable, Callable
+from pathlib import Path
+from typing import Any
+
+import psycopg
+import pytest
+
+from octasplat.workers.db.connections import Connection, Pool, open_pool, retry_on_deadlock
+from octasplat.workers.db.datasets import (
+    begin_check,
+    create_dataset,
+    end_check,
+    get_dataset,
+    put_file,
+    renew_check,
+    reopen_stale_checks,
+)
+from octasplat.workers.db.events_and_logs import events_after, log_after
+from octasplat.workers.db.locks import lock_owner, lock_store
+from octasplat.workers.db.rows import Job
+from octasplat.workers.maintenance.webhooks.rows import add_endpoint, delete_endpoint
+from octasplat.workers.queue.attempts import Attempt, ResultFile, claim
+from octasplat.workers.queue.jobs import NewJob, change_job, create_job, get_job
+from octasplat.workers.queue.procrastinate_queue import ProcrastinateQueue
+from octasplat.workers.queue.recovery import StalledAttempts, recover_stalled_jobs
+from octasplat.workers.queue.storage_leases import (
+    mark_for_removal,
+    removal_transaction,
+    storage_lease,
+    unmark_for_removal,
+)
+from octasplat.workers.storage.errors import StorageUnavailableError
+from octasplat.workers.storage.local import LocalStorage
+
+NEW = NewJob(owner="me", kind="toy", options={}, queue="cpu")
+SLIPS = ProcrastinateQueue(stale_seconds=5)
+SOON_SECONDS = 5.0
+"""What waits for nobody takes less, also on a busy machine."""
+
+
+def run(conninfo: str, what: Callable[[Pool], Awaitable[Any]]) -> Any:
+    async def inside() -> Any:
+        async with open_pool(conninfo, max_size=6) as pool:
+            return await what(pool)
+
+    return asyncio.run(inside())
+
+
+async def begun(pool: Pool, job: Job | None = None) -> Attempt:
+    if job is None:
+        async with pool.connection() as connection:
+            job = await create_job(connection, SLIPS, NEW)
+    assert job.slip is not None
+    attempt = await claim(pool, job.id, job.slip, "w")
+    assert attempt is not None
+    return attempt
+
+
+async def now(pool: Pool, attempt: Attempt) -> Job:
+    async with pool.connection() as connection:
+        job = await get_job(connection, attempt.job.id)
+    assert job is not None
+    return job
+
+
+def test_job_events_with_invalid_text_are_stored(conninfo: str) -> None:
+    odd = "header \0 and \ud800"
+
+    async def what(pool: Pool) -> None:
+        attempt = await begun(pool)
+        await attempt.add_event("warning", {"message": odd, "value": float("nan")})
+        await attempt.add_log_lines([odd])
+        await attempt.record_checkpoint({"stage": odd, "step": 1, "files": []}, is_progress=True)
+        await attempt.fail({"type": "odd", "message": odd})
+        job = await now(pool, attempt)
+        assert job.state == "failed" and job.error is not None
+        assert job.error["message"] == "header \ufffd and \ufffd"
+        async with pool.connection() as connection:
+            told = {event.kind: event.data for event in await events_after(connection, job.id)}
+            lines = [line.text for line in await log_after(connection, job.id)]
+        assert told["warning"] == {"message": "header \ufffd and \ufffd", "value": None}
+        assert "header \ufffd and \ufffd" in lines
+
+    run(conninfo, what)
+
+
+def test_job_with_repeated_worker_failures_fails(conninfo: str) -> None:
+    async def what(pool: Pool) -> None:
+        attempt = await begun(pool)
+        rescues = []
+        while (job := await now(pool, attempt)).state != "failed":
+            attempt = attempt if job.state == "running" else await begun(pool, job)
+            if len(rescues) == 2:
+                await attempt.requeue(SLIPS, "its worker is stopping", max_uncounted=3)
+                attempt = await begun(pool, await now(pool, attempt))
+            await attempt.requeue(SLIPS, "its worker failed (KeyError)", max_uncounted=3)
+            rescues.append((await now(pool, attempt)).rescues)
+        assert rescues == [0, 0, 0, 1, 2, 3, 3]
+        assert job.error is not None and job.error["type"] == "worker_failed"
+        assert "its worker failed (KeyError)" in job.error["message"]
+
+    run(conninfo, what)
+
+
+def test_checkpoint_resets_worker_failures(conninfo: str) -> None:
+    async def what(pool: Pool) -> None:
+        attempt = await begun(pool)
+        for step in range(8):
+            await attempt.record_checkpoint({"stage": "x", "step": step, "files": []}, is_progress=True)
+            await attempt.requeue(SLIPS, "its worker failed (KeyError)", max_uncounted=3)
+            job = await now(pool, attempt)
+            assert job.rescues == 0
+            attempt = await begun(pool, job)
+
+    run(conninfo, what)
+
+
+def test_clock_jump_does_not_recover_live_jobs(conninfo: str) -> None:
+    async def what(pool: Pool) -> None:
+        living, lost = await begun(pool), await begun(pool)
+        async with pool.connection() as connection:  # as by a clock that jumped
+            await connection.execute("UPDATE jobs SET heartbeat_at = heartbeat_at - interval '1 hour'")
+        suspects = StalledAttempts(0.3)
+        assert await recover_stalled_jobs(pool, SLIPS, 5, suspects) == 0
+        await living.heartbeat()
+        await asyncio.sleep(0.4)
+        assert await recover_stalled_jobs(pool, SLIPS, 5, suspects) == 1
+        assert [(await now(pool, a)).state for a in (living, lost)] == ["running", "queued"]
+
+    run(conninfo, what)
+
+
+def test_a_worker_lost_before_the_clock_was_set_back_is_missed_all_the_same(conninfo: str) -> None:
+    async def what(pool: Pool) -> None:
+        living, lost = await begun(pool), await begun(pool)
+        async with pool.connection() as connection:
+            await connection.execute("UPDATE jobs SET heartbeat_at = heartbeat_at + interval '1 hour'")
+        suspects = StalledAttempts(0.3)
+        assert await recover_stalled_jobs(pool, SLIPS, 5, suspects) == 0
+        await living.heartbeat()
+        await asyncio.sleep(0.4)
+        assert await recover_stalled_jobs(pool, SLIPS, 5, suspects) == 1
+        assert [(await now(pool, a)).state for a in (living, lost)] == ["running", "queued"]
+
+    run(conninfo, what)
+
+
+@pytest.mark.parametrize("lock", ["owner", "store"])
+def test_heartbeat_is_not_blocked_by_other_locks(conninfo: str, tmp_path: Path, lock: str) -> None:
+    """An owner's archive is being entered, or unused contents are being marked, for a long time."""
+    storage = LocalStorage(tmp_path / "store", floor_bytes=0)
+    with storage.open_writer() as writer:
+        writer.write(b"x")
+        blob = writer.commit()
+    manifest = {"stage": "x", "step": 1, "files": [{"path": "a", "sha256": blob.sha256, "size_bytes": 1}]}
+
+    async def what(pool: Pool) -> None:
+        attempt = await begun(pool)
+        async with storage_lease(pool, storage) as note, pool.connection() as connection:
+            if lock == "owner":
+                await lock_owner(connection, "me")
+            else:
+                await lock_store(connection, shared=False)
+            keeping = asyncio.create_task(attempt.record_checkpoint(manifest, is_progress=True, lease=note))
+            ending = asyncio.create_task(
+                attempt.fail({"type": "x", "message": "x"}, [ResultFile("a", blob.sha256, 1, "")], note)
+            )
+            await asyncio.sleep(0.5)
+            assert not keeping.done() and not ending.done()
+            async with asyncio.timeout(SOON_SECONDS):
+                assert await attempt.heartbeat() == "running"
+            await connection.rollback()
+            await asyncio.wait([keeping, ending])
+        assert (await now(pool, attempt)).state == "failed"
+
+    run(conninfo, what)
+
+
+def test_contents_that_are_being_removed_are_waited_for_without_a_lock(conninfo: str, tmp_path: Path) -> None:
+    storage = LocalStorage(tmp_path / "store", floor_bytes=0)
+
+    def stored(content: bytes) -> str:
+        with storage.open_writer() as writer:
+            writer.write(content)
+            return writer.commit().sha256
+
+    async def what(pool: Pool) -> None:
+        attempt = await begun(pool)
+        async with storage_lease(pool, storage) as note, pool.connection() as connection:
+            kept, gone = stored(b"kept"), stored(b"gone")
+            async with removal_transaction(connection):
+                await mark_for_removal(connection, [kept, gone])
+            tellings = [
+                asyncio.create_task(attempt.record_preview({"sha256": sha256, "step": 1, "view": "a"}, note))
+                for sha256 in (kept, gone)
+            ]
+            await asyncio.sleep(0.5)
+            assert not any(telling.done() for telling in tellings)
+            async with asyncio.timeout(SOON_SECONDS):
+                await attempt.heartbeat()
+            storage.delete(gone)
+            async with connection.transaction():
+                await unmark_for_removal(connection, [kept, gone])
+            await tellings[0]
+            with pytest.raises(StorageUnavailableError, match="removed meanwhile"):
+                await tellings[1]
+
+    run(conninfo, what)
+
+
+def test_webhook_deletion_during_job_end_succeeds(conninfo: str) -> None:
+    async def what(pool: Pool) -> None:
+        attempt = await begun(pool)
+        async with pool.connection() as connection:
+            hook = await add_endpoint(
+                connection, owner="me", url="https://example.org", secret="s", events=["job.failed"]
+            )
+        async with pool.connection() as connection:
+            await delete_endpoint(connection, hook.id)
+            ending = asyncio.create_task(attempt.fail({"type": "x", "message": "x"}))
+            await asyncio.sleep(0.5)
+            assert not ending.done()
+            await connection.commit()
+            await ending
+        assert (await now(pool, attempt)).state == "failed"
+
+    run(conninfo, what)
+
+
+def test_transaction_after_deadlock_is_retried(conninfo: str) -> None:
+    """Two that lock the same rows in different orders; the database ends one of them."""
+
+    async def what(pool: Pool) -> None:
+        ids = [(await begun(pool)).job.id for _ in range(2)]
+        both = asyncio.Barrier(2)
+        tries = 0
+
+        @retry_on_deadlock
+        async def lock(first: int, second: int) -> None:
+            nonlocal tries
+            tries += 1
+            async with pool.connection() as connection, connection.transaction():
+                await get_job(connection, ids[first], lock=True)
+                if tries <= 2:
+                    await both.wait()
+                await get_job(connection, ids[second], lock=True)
+
+        await asyncio.gather(lock(0, 1), lock(1, 0))
+        assert tries == 3
+
+    run(conninfo, what)
+
+
+def test_the_order_of_locks_is_checked_here(conninfo: str) -> None:
+    async def what(pool: Pool) -> None:
+        attempt = await begun(pool)
+        for lock in (lambda c: lock_owner(c, "me"), lambda c: lock_store(c, shared=True)):
+            with pytest.raises(psycopg.errors.RaiseException, match="order of locks"):
+                async with pool.connection() as connection:
+                    await get_job(connection, attempt.job.id, lock=True)
+                    await lock(connection)
+        with pytest.raises(psycopg.errors.RaiseException, match="order of locks"):
+            async with pool.connection() as connection:
+                await lock_owner(connection, "me")
+                await lock_store(connection, shared=False)
+
+    run(conninfo, what)
+
+
+def test_jobs_are_locked_before_datasets(conninfo: str) -> None:
+    async def what(pool: Pool) -> None:
+        attempt = await begun(pool)
+        job_id = attempt.job.id
+        async with pool.connection() as connection:
+            dataset = await create_dataset(connection, "me", "d")
+        takes: tuple[Callable[[Connection], Awaitable[object]], ...] = (
+            lambda c: get_job(c, job_id, lock=True),
+            lambda c: c.execute("UPDATE jobs SET label = 'x' WHERE id = %s", [job_id]),
+            lambda c: change_job(c, job_id, label="y", pinned=False),
+        )
+        for take in takes:
+            with pytest.raises(psycopg.errors.RaiseException, match="order of locks: rows of jobs"):
+                async with pool.connection() as connection:
+                    await get_dataset(connection, dataset.id, lock=True)
+                    await take(connection)
+        async with pool.connection() as connection:
+            await get_job(connection, job_id, lock=True)
+            await get_dataset(connection, dataset.id, lock=True)
+            await connection.execute("UPDATE jobs SET label = 'x' WHERE id = %s", [job_id])
+
+    run(conninfo, what)
+
+
+def test_stale_dataset_check_is_reopened(conninfo: str) -> None:
+    async def what(pool: Pool) -> None:
+        async with pool.connection() as connection:
+            ids = [(await create_dataset(connection, "me", "d")).id for _ in range(2)]
+            for dataset_id in ids:
+                await begin_check(connection, dataset_id)
+            query = "UPDATE datasets SET used_at = now() - interval '10 minutes' WHERE id = %s"
+            await connection.execute(query, [ids[0]])
+            assert await reopen_stale_checks(connection) == 1
+            found = [await get_dataset(connection, dataset_id) for dataset_id in ids]
+        assert [dataset.state for dataset in found if dataset] == ["open", "checking"]
+
+    run(conninfo, what)
+
+
+def test_a_check_that_was_silent_for_long_says_nothing_of_later_files(conninfo: str) -> None:
+    """Its process was frozen; meanwhile the dataset was opened, changed, and is being checked again."""
+
+    async def what(pool: Pool) -> None:
+        async with pool.connection() as connection:
+            dataset_id = (await create_dataset(connection, "me", "d")).id
+        async with pool.connection() as connection:
+            frozen = await begin_check(connection, dataset_id)
+            await renew_check(connection, frozen)
+            await connection.execute("UPDATE datasets SET used_at = now() - interval '10 minutes'")
+            assert await reopen_stale_checks(connection) == 1
+        async with pool.connection() as connection:
+            await put_file(connection, dataset_id, "images/a.jpg", "b" * 64, 2)
+            later = await begin_check(connection, dataset_id)
+        async with pool.connection() as connection:
+            await renew_check(connection, frozen)
+            dataset = await end_check(connection, frozen, is_valid=True, photographs=1)
+            assert dataset.state == "checking" and dataset.photographs == 0
+            await renew_check(connection, later)
+            dataset = await end_check(connection, later, is_valid=True, photographs=2)
+            assert dataset.state == "committed" and dataset.photographs == 2
+
+    run(conninfo, what)

@@ -1,0 +1,190 @@
+"""A model that uses everything the protocol has trains through the real trainer, its gradients are right.
+
+It shades by a channel of the Gaussians, their normals and a lamp that belongs to the scene, and adds what
+further rays of its own see. So nothing in the loop has to change for a model of materials.
+"""
+
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+import pytest
+from jaxtyping import Float32
+
+from octasplat.engine.errors import Cancelled
+from octasplat.engine.events import Event, HeldOutMeasured
+from octasplat.engine.gaussians.model import FlatGaussians
+from octasplat.engine.rays import RayBatch
+from octasplat.engine.shading.exposure import Exposures
+from octasplat.engine.shading.protocol import Developed, Reversed, ShadingModel, Sight
+from octasplat.engine.trace.cpu.tracer import CpuTracer
+from octasplat.engine.trace.protocol import (
+    GaussianGradients,
+    TraceGradients,
+    Tracer,
+    TraceResult,
+    TraceSettings,
+)
+from octasplat.engine.train.batches import Batch, BatchSource
+from octasplat.engine.train.checkpoint import latest_checkpoint, load_checkpoint
+from octasplat.engine.train.config import McmcConfig
+from octasplat.engine.train.iteration import differentiate
+from octasplat.engine.train.state import TrainState, fresh_state
+from octasplat.engine.train.trainer import Trainer
+
+sys.path.append(str(Path(__file__).parents[1] / "train"))
+
+from planar_dataset import PlanarDataset, small_config
+
+SHARE = np.float32(0.3)
+ASIDE = np.array([0.2, 0.1, 0.0], np.float32)
+
+
+class Lamp:
+    """rgb = albedo * lamp * (1 - <normal, direction>) / 2 + 0.3 * what parallel rays see of the Gaussians."""
+
+    name = "lamp"
+
+    def __init__(self, gaussians: FlatGaussians) -> None:
+        self.albedo = np.full((len(gaussians), 3), 0.4, np.float32)
+        self.lamp = np.ones(3, np.float32)
+
+    def features(self, gaussians: FlatGaussians) -> Float32[np.ndarray, "n 3"]:
+        assert len(gaussians) == len(self.albedo)
+        return self.albedo
+
+    def settle(self, gaussians: FlatGaussians, tracer: Tracer, *, progress: float) -> None:
+        self.settled = progress
+
+    def _facing(self, sight: Sight) -> Float32[np.ndarray, "r 1"]:
+        return (1 - (sight.seen.normal_world * sight.rays.directions_world).sum(axis=1))[:, None] / 2
+
+    def develop(self, sight: Sight) -> Developed:
+        rays = RayBatch(sight.rays.origins_world + ASIDE, sight.rays.directions_world, sight.rays.t_min)
+        beside = sight.tracer.trace(rays, record=True)
+        rgb = sight.seen.features * self.lamp * self._facing(sight) + SHARE * beside.rgb_srgb
+        return Developed(rgb, sight.seen.transmittance, beside)
+
+    def reverse(
+        self, sight: Sight, developed: Developed, by_rgb: np.ndarray, by_transmittance: np.ndarray
+    ) -> Reversed:
+        beside = developed.kept
+        assert isinstance(beside, TraceResult) and beside.recording is not None
+        facing, features = self._facing(sight), sight.seen.features
+        by_facing = (by_rgb * features * self.lamp).sum(axis=1, keepdims=True)
+        return Reversed(
+            TraceGradients(
+                rgb_srgb=np.zeros_like(by_rgb),
+                transmittance=by_transmittance,
+                features=by_rgb * self.lamp * facing,
+                normal_world=-by_facing / 2 * sight.rays.directions_world,
+            ),
+            further=((beside.recording, TraceGradients(rgb_srgb=SHARE * by_rgb)),),
+            parameters={"lamp.lamp": (by_rgb * features * facing).sum(axis=0)},
+        )
+
+    def step(
+        self,
+        gaussians: FlatGaussians,
+        gradients: GaussianGradients,
+        parameters: Mapping[str, np.ndarray],
+        *,
+        progress: float,
+    ) -> None:
+        assert 0 <= self.settled <= progress < 1
+        self.lamp -= np.float32(0.1) * parameters["lamp.lamp"]
+        self.albedo[gradients.ids] -= np.float32(10) * gradients.features
+
+    def state(self) -> dict[str, np.ndarray]:
+        return {"lamp.albedo": self.albedo, "lamp.lamp": self.lamp}
+
+    def restore(self, state: Mapping[str, np.ndarray]) -> None:
+        self.albedo, self.lamp = state["lamp.albedo"], state["lamp.lamp"]
+
+
+def made(rng: np.random.Generator) -> tuple[FlatGaussians, Lamp, Batch]:
+    world = PlanarDataset()
+    gaussians = world.initial_gaussians(opacity=0.6)
+    gaussians.sh += rng.normal(0, 0.3, gaussians.sh.shape).astype(np.float32)
+    # Apart in depth, so that turning them a little changes no order.
+    gaussians.means_world[:, 2] = rng.permutation(np.linspace(-0.4, 0.4, len(gaussians)))
+    model = Lamp(gaussians)
+    model.albedo[:] = rng.uniform(0.1, 0.9, model.albedo.shape)
+    model.lamp[:] = (0.9, 0.7, 1.1)
+    return gaussians, model, BatchSource(world, small_config()).draw(rng)
+
+
+def test_gradients_of_several_traces_agree_with_finite_differences() -> None:
+    rng = np.random.default_rng(5)
+    gaussians, lamp, batch = made(rng)
+    # Exposures around it, so that models can be put into each other.
+    model = Exposures(7, rate=0.01, inner=lamp)
+    model.log_gains[:] = rng.normal(0, 0.2, (7, 3))
+    # Octagons so wide that Gaussians have faded at their edges, through which no gradient goes.
+    tracer = CpuTracer(TraceSettings(q=30.0, transmittance_min=1e-6), threads=1)
+    weights = small_config(loss={"l1": 0.0, "l2": 1.0}).loss
+
+    def look() -> tuple[float, dict[str, np.ndarray]]:
+        tracer.build(gaussians, model.features(gaussians))
+        found = differentiate(batch, tracer, model, weights, progress=0.5)
+        whole = {"lamp": found.shading["lamp.lamp"]}
+        for name, like in (
+            ("features", lamp.albedo),
+            ("sh", gaussians.sh),
+            ("opacity_logits", gaussians.opacity_logits),
+            ("quats_wxyz", gaussians.quats_wxyz),
+        ):
+            whole[name] = np.zeros_like(like)
+            whole[name][found.gaussians.ids] = getattr(found.gaussians, name)
+        return found.loss.value, whole
+
+    _, gradients = look()
+    for name, gradient in gradients.items():
+        parameter = {"lamp": lamp.lamp, "features": lamp.albedo}.get(name)
+        if parameter is None:
+            parameter = getattr(gaussians, name)
+        before = parameter.copy()
+        direction = (gradient / np.linalg.norm(gradient)).astype(np.float32)
+        step = np.float32(0.001 if name == "quats_wxyz" else 0.02)  # so small that no order changes
+        parameter[:] = before + step * direction
+        above, _ = look()
+        parameter[:] = before - step * direction
+        below, _ = look()
+        parameter[:] = before
+        expected = float((gradient * direction).sum())
+        assert (above - below) / (2 * step) == pytest.approx(expected, rel=0.02), name
+
+
+def train(folder: Path, *, stop_after: int | None = None) -> tuple[Lamp, TrainState, list[float]]:
+    """Train the lamp; with ``stop_after``, stop there and go on from the checkpoint with a fresh model."""
+    world, events = PlanarDataset(), list[Event]()
+    config = small_config(densify=McmcConfig(start=10_000).model_dump(), sh_degree=0)
+    state = fresh_state(world.initial_gaussians(opacity=0.6), config.seed)
+
+    def trainer(state: TrainState, last: float) -> tuple[Trainer, Lamp]:
+        model = Lamp(state.gaussians)
+        return Trainer(
+            world, config, state, folder=folder, fingerprint="test", listener=events.append, threads=1,
+            should_stop=lambda: state.iteration >= last, shading=model,
+        ), model  # fmt: skip
+
+    if stop_after is not None:
+        with pytest.raises(Cancelled):
+            trainer(state, stop_after)[0].run()
+        path = latest_checkpoint(folder)
+        assert path is not None
+        state = load_checkpoint(path, "test")
+    last, model = trainer(state, np.inf)
+    assert isinstance(model, ShadingModel)
+    last.run()
+    return model, state, [event.psnr for event in events if isinstance(event, HeldOutMeasured)]
+
+
+def test_custom_shading_model_trains_and_resumes(tmp_path: Path) -> None:
+    whole, state, psnr = train(tmp_path / "whole")
+    assert psnr[-1] > psnr[0] + 4
+    assert np.ptp(whole.albedo) > 0.1 and (whole.lamp != 1).all()
+    parts, resumed, _ = train(tmp_path / "parts", stop_after=50)
+    assert parts.albedo.tobytes() == whole.albedo.tobytes() and parts.lamp.tobytes() == whole.lamp.tobytes()
+    assert resumed.gaussians.sh.tobytes() == state.gaussians.sh.tobytes()

@@ -1,0 +1,38 @@
+"""Which points at swept depths are believed: what stands beside something known, what several views found."""
+
+import numpy as np
+import pytest
+
+from octasplat.engine.train.lifted_points import Evidence, LiftedPoints, borne_out
+
+KNOWN = np.array([[0.0, 0.0, 10.0]])
+FAR_OFF = np.array([[5.0, 0.0, 10.0]])
+AROUND = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]])
+
+
+def believed(xyz_world: np.ndarray, view: list[int], rivalry: float, *, swept: bool = True) -> list[bool]:
+    """What is said of points ten away from their cameras."""
+    count = len(xyz_world)
+    found = LiftedPoints(
+        xyz_world.astype(np.float32), np.zeros((count, 3), np.float32), np.full(count, swept, np.bool_)
+    )
+    evidence = Evidence(np.array(view, np.int64), np.full(count, 10.0), np.full(count, rivalry))
+    return borne_out(found, evidence, KNOWN).tolist()
+
+
+def test_a_point_beside_something_known_is_right() -> None:
+    assert believed(np.array([[0.25, 0.0, 10.0], [0.35, 0.0, 10.0]]), [0, 0], 0.95) == [True, False]
+
+
+@pytest.mark.parametrize(("views", "right"), [([0, 1, 2, 3], True), ([0, 1, 2, 2], False), ([4] * 4, False)])
+def test_three_other_views_that_found_the_same_place_bear_a_point_out(views: list[int], right: bool) -> None:
+    same = FAR_OFF + 0.1 * AROUND
+    assert believed(same, views, 0.45) == [right] * 4
+    assert believed(same, views, 0.6) == [False] * 4
+    spread = FAR_OFF + 0.5 * AROUND
+    assert believed(spread, views, 0.45) == [False] * 4
+
+
+def test_lifted_points_without_other_suggestions_are_rejected() -> None:
+    assert believed(KNOWN, [0], 0.1, swept=False) == [False]
+    assert believed(np.empty((0, 3)), [], 0.1) == []

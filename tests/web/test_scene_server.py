@@ -1,0 +1,93 @@
+"""The viewer of one scene without the service."""
+
+import errno
+import http.client
+import json
+import socket
+import tempfile
+import urllib.request
+from collections.abc import Iterator
+from pathlib import Path
+from urllib.parse import urlsplit
+
+import numpy as np
+import pytest
+from web_harness import Browse
+
+import octasplat as osp
+
+
+@pytest.fixture
+def scene() -> osp.Scene:
+    """A wall of bright Gaussians."""
+    count = 400
+    random = np.random.default_rng(3)
+    means = np.concatenate([random.uniform(-1, 1, (count, 2)), np.zeros((count, 1))], axis=1)
+    return osp.Scene.from_arrays(
+        means, np.tile([1.0, 0, -1, 0], (count, 1)), np.full((count, 2), 0.1), np.full(count, 0.9),
+        np.full((count, 1, 3), 1.5),
+    )  # fmt: skip
+
+
+@pytest.fixture
+def viewer(scene: osp.Scene) -> Iterator[osp.Viewer]:
+    with osp.view(scene, open_browser=False, background="white") as found:
+        yield found
+
+
+def get(url: str, path: str, host: str | None = None) -> tuple[int, str, bytes]:
+    parts = urlsplit(url)
+    connection = http.client.HTTPConnection(parts.hostname or "", parts.port)
+    connection.request("GET", path, headers={} if host is None else {"Host": host})
+    answer = connection.getresponse()
+    return answer.status, answer.headers.get("Content-Type", ""), answer.read()
+
+
+def test_page_scene_and_scripts_are_served(viewer: osp.Viewer, scene: osp.Scene, tmp_path: Path) -> None:
+    status, kind, page = get(viewer.url, "/")
+    assert (status, kind) == (200, "text/html; charset=utf-8")
+    assert b'data-scene="/scene.ply"' in page and b'data-background="white"' in page
+    _, _, ply = get(viewer.url, "/scene.ply")
+    (tmp_path / "again.ply").write_bytes(ply)
+    np.testing.assert_array_equal(osp.load(tmp_path / "again.ply").means, scene.means)
+    assert get(viewer.url, "/static/viewer/page.js")[:2] == (200, "text/javascript")
+    assert json.loads(get(viewer.url, "/cameras.json")[2]) == {"views": []}
+
+
+@pytest.mark.parametrize(
+    "path", ["/static/../templates/base.html", "/static/%2e%2e/pages.py", "/etc/passwd", "/x"]
+)
+def test_scene_server_other_paths_are_404(viewer: osp.Viewer, path: str) -> None:
+    assert get(viewer.url, path)[0] == 404
+
+
+def test_pages_from_elsewhere_cannot_read_the_scene(viewer: osp.Viewer) -> None:
+    assert get(viewer.url, "/scene.ply", host="rebound.example")[0] == 403
+
+
+def test_scene_server_closed_refuses_connections(scene: osp.Scene) -> None:
+    viewer = osp.view(scene, open_browser=False)
+    url = viewer.url
+    viewer.close()
+    viewer.close()
+    with pytest.raises(OSError, match="refused"):
+        urllib.request.urlopen(url, timeout=5)
+
+
+@pytest.mark.tools
+@pytest.mark.heavy
+def test_browser_draws_the_scene(viewer: osp.Viewer, browse: Browse) -> None:
+    found = browse("scene", viewer.url)
+    assert found["heading"] == "Scene" and found["count"] == "400 Gaussians"
+    assert found["complaints"] == [] and found["shown"]["deviation"] > 2
+
+
+def test_a_port_that_is_taken_leaves_no_folder(
+    scene: osp.Scene, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    with socket.create_server(("127.0.0.1", 0)) as other:
+        with pytest.raises(OSError, match="in use") as failure:  # holds the frames, and the folder with them
+            osp.view(scene, open_browser=False, port=other.getsockname()[1])
+        assert failure.value.errno == errno.EADDRINUSE
+        assert not list(tmp_path.glob("octasplat-view-*"))

@@ -1,0 +1,48 @@
+"""Browsers that are opened for somebody, signed in."""
+
+import os
+import sys
+import tempfile
+import time
+import webbrowser
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from octasplat.workers.client.api import Api
+
+_PAGE = """<!doctype html>
+<meta charset="utf-8"><meta name="referrer" content="no-referrer">
+<meta http-equiv="refresh" content="0; url={link}"><title>octasplat</title>
+"""
+_PAGE_OPEN_SECONDS = 10.0
+
+
+def has_display() -> bool:
+    """Whether somebody sits in front of a display."""
+    found = sys.platform == "darwin" or any(os.environ.get(n) for n in ("DISPLAY", "WAYLAND_DISPLAY"))
+    return found and sys.stdout.isatty()
+
+
+def sign_in_link(api: "Api") -> str:
+    """A link that signs a browser in, once, within five minutes.
+
+    Raises:
+        ServiceError: the service does not make one.
+        Unreachable: nobody answers.
+    """
+    return api.address + str(api.post("/v1/sign-in-links")["path"])
+
+
+def open_signed_in(api: "Api") -> None:
+    """Open the page of a service in a browser.
+
+    The link goes by way of a file that only this user reads: whoever is on the machine sees what programs
+    are started with.
+    """
+    link = sign_in_link(api)
+    with tempfile.TemporaryDirectory(prefix="octasplat-open-") as folder:  # 0700
+        path = Path(folder) / "open.html"
+        path.write_text(_PAGE.format(link=link), encoding="ascii")
+        if webbrowser.open(path.as_uri()):
+            time.sleep(_PAGE_OPEN_SECONDS)

@@ -1,0 +1,77 @@
+"""What ``octasplat demo`` does: the generated scene and its reconstruction, each resumed by itself."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from octasplat.engine.config import ReconstructionConfig, read_config
+from octasplat.engine.dataset.synthetic import SyntheticDatasetConfig, write_synthetic_dataset
+from octasplat.engine.errors import ConfigError
+from octasplat.engine.operations.reconstruct import ReconstructRequest
+from octasplat.engine.run_folder import CONFIG
+from octasplat.engine.stages import counted_stage
+from octasplat.engine.train.preset_names import PresetName
+from octasplat.workers.cli.progress import show_progress
+from octasplat.workers.cli.reconstruction import run_reconstruction
+from octasplat.workers.cli.signals import exit_on_sigterm
+
+DEMO_ASSIGNMENTS: dict[str, tuple[str, ...]] = {"fast": ("iterations=2000",)}
+"""Training settings by preset, chosen so that the demo takes less than three minutes on two cores."""
+
+
+def make_demo_scene(root: Path, size: Mapping[str, int | None], *, quiet: bool) -> None:
+    """Write the generated scene unless it is there.
+
+    Args:
+        root: folder of the scene.
+        size: fields of :class:`GeneratedSceneConfig`; None values take the default.
+        quiet: show no progress.
+
+    Raises:
+        OctasplatError: the folder holds something else or cannot be written, or a size is out of range.
+    """
+    given: dict[str, Any] = {name: value for name, value in size.items() if value is not None}
+    config = SyntheticDatasetConfig(**given)
+    if (root / "generated.json").exists():
+        write_synthetic_dataset(root, config)  # only makes sure that it is the same
+        return
+    with (
+        exit_on_sigterm(),
+        show_progress(quiet=quiet) as listener,
+        counted_stage("generate", listener, config.views) as progress,
+    ):
+        write_synthetic_dataset(root, config, progress)
+
+
+def reconstruct_demo_scene(
+    scene: Path, output: Path, preset: PresetName, *, threads: int, quiet: bool
+) -> Path:
+    """Reconstruct the demo scene, or go on with it, and return the path of the report.
+
+    Raises:
+        Stopped: by a signal, after a checkpoint.
+        OctasplatError: as :func:`octasplat.engine.pipeline.reconstruction` does.
+    """
+    resume = (output / CONFIG).exists()
+    request = ReconstructRequest(
+        source=scene,
+        output=output,
+        resume=resume,
+        preset=preset,
+        assignments=DEMO_ASSIGNMENTS.get(preset, ()),
+    )
+    config = request.config().with_poses_decided(has_model=True)
+    if resume and read_config(output / CONFIG).with_poses_decided(has_model=True) != config:
+        raise ConfigError(
+            f"{output} holds a demo with other settings; delete it or name another folder with -o."
+        )
+    report = output / "report.html"
+    if not (resume and is_complete(output, config)):
+        run_reconstruction(request, threads=threads, quiet=quiet, resumes_automatically=True)
+    return report
+
+
+def is_complete(output: Path, config: ReconstructionConfig) -> bool:
+    """Return whether every file of the run is there."""
+    names = ("scene.ply", "metrics.json", "report.html", *config.exports)
+    return all((output / name).exists() for name in names)

@@ -1,0 +1,45 @@
+"""How long a client waits for a service that is away, and how often it asks."""
+
+import random
+import time
+
+MAX_OUTAGE_SECONDS = 120.0
+"""For so long a service may be away that has answered before, as while it is started again."""
+MAX_FIRST_OUTAGE_SECONDS = 20.0
+"""The same of one that has not: perhaps there is none. A restart takes less."""
+FIRST_PAUSE_SECONDS = 0.3
+MAX_PAUSE_SECONDS = 10.0
+
+
+class Backoff:
+    """Counts the time for which a service is away, over any number of tries; growing pauses lie between them.
+
+    Args:
+        seconds: how long it may be away.
+    """
+
+    def __init__(self, seconds: float) -> None:
+        self.seconds = seconds
+        self._since: float | None = None
+        self._pause = FIRST_PAUSE_SECONDS
+
+    def reset(self) -> None:
+        """The service is there."""
+        self._since, self._pause = None, FIRST_PAUSE_SECONDS
+
+    def wait(self, min_seconds: float = 0.0) -> bool:
+        """The service is away: pause, or False if it was for too long.
+
+        Args:
+            min_seconds: how long it asks to be left alone, s.
+        """
+        now = time.monotonic()
+        self._since = now if self._since is None else self._since
+        left = self._since + self.seconds - now
+        if left <= 0:
+            return False
+        # Not all who wait come back in the same moment.
+        pause = max(self._pause * random.uniform(0.75, 1.25), min_seconds)  # noqa: S311
+        time.sleep(min(pause, MAX_PAUSE_SECONDS, left))
+        self._pause = min(2 * self._pause, MAX_PAUSE_SECONDS)
+        return True

@@ -1,0 +1,96 @@
+"""Who did what: changes that somebody asked for, and who was turned away; kept until it is old."""
+
+import uuid
+from dataclasses import dataclass
+from datetime import datetime
+
+from psycopg.rows import class_row
+
+from octasplat.workers.db.connections import Connection, with_columns
+
+_MAX_CHARACTERS = 500
+
+
+@dataclass(frozen=True)
+class AuditEntry:
+    """Something that was asked for.
+
+    Attributes:
+        id: rises.
+        at: when it was answered.
+        owner: who asked; None is nobody known.
+        token_id: the token that was shown, or that the session was begun with.
+        session_id: the session of a browser.
+        address: where the request came from, or ``command line``.
+        action: method and path, or the command.
+        target: what was made, if something was.
+        status: of the answer; 0 for commands.
+    """
+
+    id: int
+    at: datetime
+    owner: str | None
+    token_id: uuid.UUID | None
+    session_id: uuid.UUID | None
+    address: str
+    action: str
+    target: str | None
+    status: int
+
+
+async def add_entry(
+    connection: Connection,
+    *,
+    address: str,
+    action: str,
+    status: int = 0,
+    owner: str | None = None,
+    token_id: uuid.UUID | None = None,
+    session_id: uuid.UUID | None = None,
+    target: str | None = None,
+) -> None:
+    """Write an entry; see :class:`AuditEntry`."""
+    await connection.execute(
+        """
+        INSERT INTO audit (owner, token_id, session_id, address, action, target, status)
+        VALUES (%s, %s, %s, %s, %s, %s, %s)
+        """,
+        [
+            owner,
+            token_id,
+            session_id,
+            _storable(address),
+            _storable(action),
+            target and _storable(target),
+            status,
+        ],
+    )
+
+
+async def list_entries(connection: Connection, *, before: int | None, limit: int) -> list[AuditEntry]:
+    """Entries, the newest first; those before the entry ``before``, at most ``limit``."""
+    async with connection.cursor(row_factory=class_row(AuditEntry)) as cursor:
+        await cursor.execute(
+            with_columns(
+                """
+            SELECT {} FROM audit WHERE (%(before)s::bigint IS NULL OR id < %(before)s)
+            ORDER BY id DESC LIMIT %(limit)s
+            """,
+                AuditEntry,
+            ),
+            {"before": before, "limit": limit},
+        )
+        return await cursor.fetchall()
+
+
+async def delete_old_entries(connection: Connection, hours: float) -> None:
+    """Let go of entries that are older; 0 keeps them for ever."""
+    if hours > 0:
+        await connection.execute(
+            "DELETE FROM audit WHERE at < now() - make_interval(secs => %s)", [3600 * hours]
+        )
+
+
+def _storable(text: str) -> str:
+    """Bounded, and without what Postgres does not hold."""
+    return text.replace("\0", "\N{REPLACEMENT CHARACTER}")[:_MAX_CHARACTERS]

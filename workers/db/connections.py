@@ -1,0 +1,151 @@
+"""Connections to the database."""
+
+import asyncio
+import functools
+import random
+from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine, Mapping
+from contextlib import asynccontextmanager
+from dataclasses import fields
+from functools import cache
+from typing import Any, LiteralString, ParamSpec, TypeVar
+
+import psycopg
+from psycopg import sql
+from psycopg.rows import DictRow, dict_row
+from psycopg_pool import AsyncConnectionPool
+
+from octasplat.workers.db.errors import DatabaseError
+
+Parameters = ParamSpec("Parameters")
+Outcome = TypeVar("Outcome")
+Connection = psycopg.AsyncConnection[DictRow]
+Pool = AsyncConnectionPool[Connection]
+
+MAX_TRIES = 5
+"""So often is a transaction tried that the database ends because of another."""
+STATEMENT_SECONDS = 60
+"""A statement that takes longer, as it waits for a lock or the database is overwhelmed, is given up."""
+IDLE_SECONDS = 30
+"""A transaction of which nothing is heard for so long is undone; its process is gone or frozen."""
+TRANSACTION_SECONDS = 300
+"""None takes longer. The limits above do not count while a process is frozen between statements that it sends
+without waiting for each one's outcome (a pipeline, as of psycopg's ``executemany``, which is not used for
+that reason); this one does, where the server knows it (PostgreSQL 17)."""
+KEEPALIVES: Mapping[str, int] = {
+    "keepalives": 1,
+    "keepalives_idle": 10,
+    "keepalives_interval": 5,
+    "keepalives_count": 3,
+    "tcp_user_timeout": 25_000,
+}
+"""So that a host that vanished is noticed within half a minute; by itself TCP takes hours."""
+
+
+@cache
+def with_columns(query: LiteralString, row: type[Any], table_name: str = "") -> sql.Composed:
+    """A query with the columns that a row has in the place of its braces.
+
+    They are named, as the next version's tables, with which this one goes on for a while, may have more.
+
+    Args:
+        query: with ``{}`` where the columns belong.
+        row: a dataclass whose fields are named as the columns.
+        table_name: name of the table, where the query has several.
+    """
+    table = (table_name,) if table_name else ()
+    columns = (sql.Identifier(*table, field.name) for field in fields(row))
+    return sql.SQL(query).format(sql.SQL(", ").join(columns))
+
+
+def retry_on_deadlock(
+    action: Callable[Parameters, Awaitable[Outcome]],
+) -> Callable[Parameters, Coroutine[Any, Any, Outcome]]:
+    """A function whose transaction is begun anew where the database ended it in favour of another.
+
+    The function must leave nothing behind but what it did in that transaction.
+    """
+
+    @functools.wraps(action)
+    async def trying(*values: Parameters.args, **named: Parameters.kwargs) -> Outcome:
+        for left in reversed(range(MAX_TRIES)):
+            try:
+                return await action(*values, **named)
+            except (psycopg.errors.DeadlockDetected, psycopg.errors.SerializationFailure):
+                if left == 0:
+                    raise
+                await asyncio.sleep(random.uniform(0.0, 0.1))  # noqa: S311 - only so that twins part
+        raise AssertionError
+
+    return trying
+
+
+@asynccontextmanager
+async def open_pool(conninfo: str, *, max_size: int = 10, wait_seconds: float = 30.0) -> AsyncIterator[Pool]:
+    """A pool of connections for as long as the block runs.
+
+    Args:
+        conninfo: how to connect.
+        max_size: most connections.
+        wait_seconds: how long to wait for a connection before giving up.
+
+    Raises:
+        DatabaseError: the database cannot be reached.
+    """
+    options: dict[str, Any] = {"row_factory": dict_row, "connect_timeout": 10, **KEEPALIVES}
+    pool: Pool = AsyncConnectionPool(
+        conninfo,
+        min_size=1,
+        max_size=max_size,
+        timeout=wait_seconds,
+        open=False,
+        kwargs=options,
+        configure=_set_timeouts,
+        check=AsyncConnectionPool.check_connection,
+        reconnect_timeout=wait_seconds,
+    )
+    try:
+        await pool.open(wait=True, timeout=wait_seconds)
+    except psycopg.OperationalError as error:
+        await pool.close()
+        text = " ".join(str(error).split()).rstrip(".")
+        raise DatabaseError(
+            f"The database cannot be reached ({text}); check DATABASE_URL and that it runs."
+        ) from None
+    try:
+        yield pool
+    finally:
+        await pool.close(timeout=5)
+
+
+async def _set_timeouts(connection: Connection) -> None:
+    """Bound what others may have to wait for this connection; not by options, as a pooler refuses them."""
+    settings = {
+        "statement_timeout": f"{STATEMENT_SECONDS}s",
+        "idle_in_transaction_session_timeout": f"{IDLE_SECONDS}s",
+        "transaction_timeout": f"{TRANSACTION_SECONDS}s",
+        # The server's own view of a client that vanished.
+        "tcp_keepalives_idle": str(KEEPALIVES["keepalives_idle"]),
+        "tcp_keepalives_interval": str(KEEPALIVES["keepalives_interval"]),
+        "tcp_keepalives_count": str(KEEPALIVES["keepalives_count"]),
+    }
+    await connection.set_autocommit(True)
+    await _set_known_settings(connection, settings, is_local=False)
+    await connection.set_autocommit(False)
+
+
+async def extend_timeouts(connection: Connection, seconds: float) -> None:
+    """Let the transaction under way last, and be idle, for so long."""
+    limit = f"{seconds:g}s"
+    names = ("idle_in_transaction_session_timeout", "transaction_timeout")
+    await _set_known_settings(connection, dict.fromkeys(names, limit), is_local=True)
+
+
+async def _set_known_settings(connection: Connection, settings: Mapping[str, str], *, is_local: bool) -> None:
+    """Set what of this the server knows."""
+    await connection.execute(
+        """
+        SELECT set_config(name, value, %s) FROM unnest(%s::text[], %s::text[]) AS given (name, value)
+        WHERE EXISTS (SELECT FROM pg_settings WHERE pg_settings.name = given.name)
+        """,
+        [is_local, list(settings), list(settings.values())],
+    )

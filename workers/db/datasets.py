@@ -1,0 +1,382 @@
+"""Datasets and their files in the tables."""
+
+import uuid
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from datetime import datetime
+from typing import Any
+
+from psycopg.rows import class_row, dict_row
+
+from octasplat.engine.photograph_sizes import Sizes
+from octasplat.workers.db.connections import Connection, with_columns
+from octasplat.workers.db.errors import ConflictError, NotFoundError
+from octasplat.workers.db.ids import new_id
+from octasplat.workers.db.locks import lock_owner
+from octasplat.workers.db.postgres_text import as_json
+from octasplat.workers.db.rows import Dataset, DatasetFile, DatasetHolds
+
+STALE_CHECK_SECONDS = 60
+"""A validation of which nothing was heard for so long counts no more; its process is gone."""
+
+
+async def create_dataset(
+    connection: Connection, owner: str, name: str, holds: DatasetHolds = "photographs"
+) -> Dataset:
+    """A new dataset that takes files."""
+    dataset_id = new_id()
+    await connection.execute(
+        "INSERT INTO datasets (id, owner, name, holds) VALUES (%s, %s, %s, %s)",
+        [dataset_id, owner, name, holds],
+    )
+    dataset = await get_dataset(connection, dataset_id)
+    assert dataset is not None
+    return dataset
+
+
+async def get_dataset(connection: Connection, dataset_id: uuid.UUID, *, lock: bool = False) -> Dataset | None:
+    """The dataset of that id, or None."""
+    query = "SELECT {} FROM datasets WHERE id = %s"
+    async with connection.cursor(row_factory=class_row(Dataset)) as cursor:
+        await cursor.execute(with_columns(f"{query} FOR UPDATE" if lock else query, Dataset), [dataset_id])
+        return await cursor.fetchone()
+
+
+async def list_datasets(
+    connection: Connection, *, owner: str | None = None, before: uuid.UUID | None = None, limit: int = 50
+) -> list[Dataset]:
+    """Datasets, the newest first; ``owner`` None takes everybody's."""
+    async with connection.cursor(row_factory=class_row(Dataset)) as cursor:
+        await cursor.execute(
+            with_columns(
+                """
+            SELECT {} FROM datasets
+            WHERE (%(owner)s::text IS NULL OR owner = %(owner)s)
+              AND (%(before)s::uuid IS NULL OR id < %(before)s)
+            ORDER BY id DESC LIMIT %(limit)s
+            """,
+                Dataset,
+            ),
+            {"owner": owner, "before": before, "limit": limit},
+        )
+        return await cursor.fetchall()
+
+
+async def list_files_by_suffix(
+    connection: Connection, owner: str, suffixes: Sequence[str], *, limit: int
+) -> list[tuple[Dataset, str]]:
+    """Files that options may name, whose names end so, with their committed datasets; the newest first."""
+    async with connection.cursor(row_factory=dict_row) as cursor:
+        await cursor.execute(
+            with_columns(
+                """
+            SELECT f.path AS file_path, {} FROM datasets d JOIN dataset_files f ON f.dataset_id = d.id
+            WHERE d.owner = %s AND d.holds = 'files' AND d.state = 'committed'
+              AND lower(f.path) LIKE ANY(%s)
+            ORDER BY d.id DESC, f.path LIMIT %s
+            """,
+                Dataset,
+                "d",
+            ),
+            [owner, [f"%{ending}" for ending in suffixes], limit],
+        )
+        return [(Dataset(**row), path) for row in await cursor.fetchall() if (path := row.pop("file_path"))]
+
+
+@dataclass(frozen=True)
+class NewFile:
+    """A file that has arrived, see :class:`octasplat.workers.db.rows.DatasetFile`."""
+
+    path: str
+    sha256: str
+    size_bytes: int
+    facts: Mapping[str, Any] = field(default_factory=dict)
+
+
+async def put_files(
+    connection: Connection, dataset_id: uuid.UUID, files: Sequence[NewFile]
+) -> list[DatasetFile]:
+    """Record files that have arrived, each in the place of one of the same path; by path.
+
+    All go in one statement, as the locks of the dataset and its owner are held for as long as it takes.
+
+    Raises:
+        Conflict: the dataset takes no files any more.
+        Missing: there is no such dataset.
+    """
+    async with connection.transaction():
+        await _lock_open_dataset(connection, dataset_id)
+        async with connection.cursor(row_factory=class_row(DatasetFile)) as cursor:
+            await cursor.execute(
+                with_columns(
+                    """
+            INSERT INTO dataset_files (dataset_id, path, sha256, size_bytes, facts)
+            SELECT %s, given.path, given.sha256, given.size_bytes, given.facts
+            FROM unnest(%s::text[], %s::text[], %s::bigint[], %s::jsonb[])
+                AS given (path, sha256, size_bytes, facts) ORDER BY given.path COLLATE "C"
+            ON CONFLICT (dataset_id, path) DO UPDATE
+            SET sha256 = excluded.sha256, size_bytes = excluded.size_bytes, facts = excluded.facts,
+                uploaded_at = now()
+            RETURNING {}
+            """,
+                    DatasetFile,
+                    "dataset_files",
+                ),
+                [
+                    dataset_id,
+                    [file.path for file in files],
+                    [file.sha256 for file in files],
+                    [file.size_bytes for file in files],
+                    [as_json(dict(file.facts)) for file in files],
+                ],
+            )
+            return sorted(await cursor.fetchall(), key=lambda file: file.path)
+
+
+async def put_file(
+    connection: Connection,
+    dataset_id: uuid.UUID,
+    path: str,
+    sha256: str,
+    size_bytes: int,
+    facts: Mapping[str, Any] | None = None,
+) -> DatasetFile:
+    """Record one file; as :func:`put_files`."""
+    [file] = await put_files(connection, dataset_id, [NewFile(path, sha256, size_bytes, facts or {})])
+    return file
+
+
+async def remove_file(connection: Connection, dataset_id: uuid.UUID, path: str) -> bool:
+    """Take a file out of an open dataset; False if there was none.
+
+    Raises:
+        Conflict: the dataset does not change any more.
+        Missing: there is no such dataset.
+    """
+    async with connection.transaction():
+        await _lock_open_dataset(connection, dataset_id)
+        cursor = await connection.execute(
+            "DELETE FROM dataset_files WHERE dataset_id = %s AND path = %s", [dataset_id, path]
+        )
+        return cursor.rowcount > 0
+
+
+async def get_file(connection: Connection, dataset_id: uuid.UUID, path: str) -> DatasetFile | None:
+    """One file of a dataset, or None."""
+    async with connection.cursor(row_factory=class_row(DatasetFile)) as cursor:
+        await cursor.execute(
+            with_columns("SELECT {} FROM dataset_files WHERE dataset_id = %s AND path = %s", DatasetFile),
+            [dataset_id, path],
+        )
+        return await cursor.fetchone()
+
+
+async def files_of(
+    connection: Connection, dataset_id: uuid.UUID, *, after: str = "", limit: int | None = None
+) -> list[DatasetFile]:
+    """Files of a dataset by path; those after the path ``after``, at most ``limit``."""
+    async with connection.cursor(row_factory=class_row(DatasetFile)) as cursor:
+        await cursor.execute(
+            with_columns(
+                """
+            SELECT {} FROM dataset_files WHERE dataset_id = %s AND path COLLATE "C" > %s
+            ORDER BY path COLLATE "C" LIMIT %s
+            """,
+                DatasetFile,
+            ),
+            [dataset_id, after, limit],
+        )
+        return await cursor.fetchall()
+
+
+async def photograph_sizes(connection: Connection, dataset_id: uuid.UUID) -> list[Sizes]:
+    """How many photographs of which size a dataset has, of those whose size is known."""
+    cursor = await connection.execute(
+        """
+        SELECT (facts->>'width_px')::int AS width, (facts->>'height_px')::int AS height, count(*) AS n
+        FROM dataset_files
+        WHERE dataset_id = %s AND path LIKE 'images/%%' AND facts->>'width_px' IS NOT NULL
+            AND facts->>'height_px' IS NOT NULL
+        GROUP BY 1, 2 ORDER BY 3 DESC, 1, 2
+        """,
+        [dataset_id],
+    )
+    return [Sizes(row["width"], row["height"], row["n"]) for row in await cursor.fetchall()]
+
+
+@dataclass(frozen=True)
+class Check:
+    """A validation under way.
+
+    Attributes:
+        dataset: as it was when it began; one that is committed needs none.
+        said_at: when it was said to go on. The row holds one of these times for as long as the dataset is
+            this validation's: one that was silent for long, as its process was frozen, is over.
+    """
+
+    dataset: Dataset
+    said_at: list[datetime] = field(default_factory=list)
+
+
+async def begin_check(connection: Connection, dataset_id: uuid.UUID) -> Check:
+    """Close an open dataset for the time of its validation.
+
+    Raises:
+        Conflict: it is being validated already.
+        Missing: there is no such dataset.
+    """
+    async with connection.transaction():
+        dataset = await get_dataset(connection, dataset_id, lock=True)
+        if dataset is None:
+            raise NotFoundError("dataset")
+        if dataset.state == "checking" and not await _is_check_stale(connection, dataset_id):
+            raise ConflictError("The dataset is being checked already; ask again in a moment.")
+        check = Check(dataset)
+        if dataset.state != "committed":
+            check.said_at.append(await _clock(connection))
+            await connection.execute(
+                "UPDATE datasets SET state = 'checking', used_at = %s, expires_at = NULL WHERE id = %s",
+                [check.said_at[-1], dataset_id],
+            )
+        return check
+
+
+async def renew_check(connection: Connection, check: Check) -> None:
+    """Say that a dataset is still being validated."""
+    before = list(check.said_at)
+    check.said_at.append(await _clock(connection))  # known before it is written, as the answer may be lost
+    await connection.execute(
+        "UPDATE datasets SET used_at = %s WHERE id = %s AND state = 'checking' AND used_at = ANY(%s)",
+        [check.said_at[-1], check.dataset.id, before],
+    )
+
+
+async def reopen_stale_checks(connection: Connection) -> int:
+    """Open datasets again whose validation nobody goes on with; returns how many."""
+    cursor = await connection.execute(
+        """
+        UPDATE datasets SET state = 'open' WHERE id IN (
+            SELECT id FROM datasets WHERE state = 'checking' AND used_at < now() - make_interval(secs => %s)
+            ORDER BY id FOR UPDATE SKIP LOCKED
+        )
+        """,
+        [2 * STALE_CHECK_SECONDS],
+    )
+    return cursor.rowcount
+
+
+async def end_check(
+    connection: Connection,
+    check: Check,
+    *,
+    is_valid: bool,
+    has_poses: bool = False,
+    photographs: int = 0,
+    facts: Mapping[str, Any] | None = None,
+) -> Dataset:
+    """Commit a dataset that was found sound, or open it again for better files.
+
+    Nothing changes where the dataset is not this validation's any more; the row says so.
+
+    Raises:
+        Missing: there is no such dataset any more.
+    """
+    await connection.execute(
+        """
+        UPDATE datasets SET state = CASE WHEN %(sound)s THEN 'committed' ELSE 'open' END,
+            committed_at = CASE WHEN %(sound)s THEN now() END, has_poses = %(poses)s,
+            photographs = %(photographs)s, facts = %(facts)s
+        WHERE id = %(id)s AND state = 'checking' AND used_at = ANY(%(said_at)s)
+        """,
+        {
+            "said_at": check.said_at,
+            "sound": is_valid,
+            "poses": has_poses,
+            "photographs": photographs,
+            "facts": as_json(dict(facts or {})),
+            "id": check.dataset.id,
+        },
+    )
+    dataset = await get_dataset(connection, check.dataset.id)
+    if dataset is None:
+        raise NotFoundError("dataset")
+    return dataset
+
+
+async def change_dataset(
+    connection: Connection, dataset_id: uuid.UUID, *, name: str, pinned: bool
+) -> Dataset:
+    """Rename a dataset, or keep it whatever its age."""
+    await connection.execute(
+        """
+        UPDATE datasets SET name = %(name)s, pinned = %(pinned)s,
+            expires_at = CASE WHEN %(pinned)s THEN NULL ELSE expires_at END
+        WHERE id = %(id)s
+        """,
+        {"name": name, "pinned": pinned, "id": dataset_id},
+    )
+    dataset = await get_dataset(connection, dataset_id)
+    if dataset is None:
+        raise NotFoundError("dataset")
+    return dataset
+
+
+async def delete_dataset(connection: Connection, dataset_id: uuid.UUID) -> None:
+    """Forget a dataset that no job needs; its blobs stay until they are swept.
+
+    Raises:
+        Conflict: jobs were made from it, or it is being validated.
+        Missing: there is no such dataset.
+    """
+    async with connection.transaction():
+        await _lock_owner_of(connection, dataset_id)
+        dataset = await get_dataset(connection, dataset_id, lock=True)
+        if dataset is None:
+            raise NotFoundError("dataset")
+        if dataset.state == "checking" and not await _is_check_stale(connection, dataset_id):
+            raise ConflictError("The dataset is being checked; delete it when that is done.")
+        cursor = await connection.execute(
+            "SELECT count(*) AS n FROM jobs WHERE %s IN (dataset_id, files_id)", [dataset_id]
+        )
+        row = await cursor.fetchone()
+        if row and row["n"]:
+            raise ConflictError(f"{row['n']} jobs were made from this dataset; delete them first.")
+        await connection.execute("DELETE FROM datasets WHERE id = %s", [dataset_id])
+
+
+async def _clock(connection: Connection) -> datetime:
+    """The time by the database's clock."""
+    row = await (await connection.execute("SELECT clock_timestamp() AS at")).fetchone()
+    assert row is not None
+    at: datetime = row["at"]
+    return at
+
+
+async def _is_check_stale(connection: Connection, dataset_id: uuid.UUID) -> bool:
+    """Whether whoever checks was not heard of for so long that it must have gone."""
+    cursor = await connection.execute(
+        "SELECT used_at < now() - make_interval(secs => %s) AS lost FROM datasets WHERE id = %s",
+        [STALE_CHECK_SECONDS, dataset_id],
+    )
+    row = await cursor.fetchone()
+    return bool(row and row["lost"])
+
+
+async def _lock_owner_of(connection: Connection, dataset_id: uuid.UUID) -> None:
+    """Take the owner's lock, before that of the dataset; see :mod:`octasplat.workers.db.locks`."""
+    dataset = await get_dataset(connection, dataset_id)
+    if dataset is None:
+        raise NotFoundError("dataset")
+    await lock_owner(connection, dataset.owner)
+
+
+async def _lock_open_dataset(connection: Connection, dataset_id: uuid.UUID) -> Dataset:
+    await _lock_owner_of(connection, dataset_id)
+    dataset = await get_dataset(connection, dataset_id, lock=True)
+    if dataset is None:
+        raise NotFoundError("dataset")
+    if dataset.state != "open":
+        raise ConflictError(
+            f"The dataset is {dataset.state}, so its files do not change; make a new dataset."
+        )
+    return dataset

@@ -1,0 +1,19 @@
+"""What can go wrong with the database and in its tables, each fit to be shown as it is."""
+
+from octasplat.engine.errors import OctasplatError
+
+
+class DatabaseError(OctasplatError):
+    """The database cannot be started, reached or brought to this version's schema."""
+
+
+class ConflictError(OctasplatError):
+    """The job or dataset is in a state that does not allow what was asked."""
+
+
+class NotFoundError(OctasplatError):
+    """What was asked for is not there, or not any more; ``kind`` names its kind."""
+
+    def __init__(self, kind: str) -> None:
+        super().__init__(f"There is no such {kind}.")
+        self.kind = kind

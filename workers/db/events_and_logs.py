@@ -1,0 +1,77 @@
+"""What happened to jobs and what their programs wrote, as rows that only grow."""
+
+import uuid
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from psycopg.rows import class_row
+
+from octasplat.workers.db.connections import Connection, with_columns
+from octasplat.workers.db.postgres_text import as_json, storable_text
+from octasplat.workers.db.rows import JobEvent, LogLine
+
+CHANNEL = "octasplat_events"
+"""Notifications on this channel carry the id of the job that has a new event."""
+
+
+async def add_event(
+    connection: Connection, job_id: uuid.UUID, attempt: int, kind: str, data: Mapping[str, Any]
+) -> None:
+    """Add an event; whoever listens on :data:`CHANNEL` hears of it when the transaction commits."""
+    await connection.execute(
+        "INSERT INTO job_events (job_id, attempt, kind, data) VALUES (%s, %s, %s, %s)",
+        [job_id, attempt, kind, as_json(dict(data))],
+    )
+
+
+async def add_log_lines(
+    connection: Connection, job_id: uuid.UUID, attempt: int, lines: Sequence[str]
+) -> None:
+    """Add lines to the log of a job."""
+    await connection.execute(
+        """
+        INSERT INTO job_logs (job_id, attempt, text)
+        SELECT %s, %s, line FROM unnest(%s::text[]) WITH ORDINALITY AS given (line, number) ORDER BY number
+        """,
+        [job_id, attempt, [storable_text(line) for line in lines]],
+    )
+
+
+async def trim_log(connection: Connection, job_id: uuid.UUID, max_lines: int) -> None:
+    """Forget all but the newest ``max_lines`` lines of a job's log."""
+    await connection.execute(
+        """
+        DELETE FROM job_logs WHERE job_id = %(job)s AND id <= (
+            SELECT id FROM job_logs WHERE job_id = %(job)s ORDER BY id DESC OFFSET %(keep)s LIMIT 1
+        )
+        """,
+        {"job": job_id, "keep": max_lines},
+    )
+
+
+async def events_after(
+    connection: Connection, job_id: uuid.UUID, after: int = 0, limit: int = 500
+) -> list[JobEvent]:
+    """Events of a job with an id above ``after``, in order."""
+    async with connection.cursor(row_factory=class_row(JobEvent)) as cursor:
+        await cursor.execute(
+            with_columns(
+                "SELECT {} FROM job_events WHERE job_id = %s AND id > %s ORDER BY id LIMIT %s", JobEvent
+            ),
+            [job_id, after, limit],
+        )
+        return await cursor.fetchall()
+
+
+async def log_after(
+    connection: Connection, job_id: uuid.UUID, after: int = 0, limit: int = 1000
+) -> list[LogLine]:
+    """Log lines of a job with an id above ``after``, in order."""
+    async with connection.cursor(row_factory=class_row(LogLine)) as cursor:
+        await cursor.execute(
+            with_columns(
+                "SELECT {} FROM job_logs WHERE job_id = %s AND id > %s ORDER BY id LIMIT %s", LogLine
+            ),
+            [job_id, after, limit],
+        )
+        return await cursor.fetchall()

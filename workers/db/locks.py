@@ -1,0 +1,41 @@
+"""The locks that transactions wait for, and the one order in which they take them.
+
+1. An idempotency key (a row), by which twins of a request wait for each other.
+2. The lock of the store (advisory): shared by who names contents, exclusive for who marks unused ones.
+3. The lock of an owner (advisory): what they have is checked against their quota and counted.
+4. Rows: jobs, then datasets, then whatever belongs to them.
+
+So nobody waits for an advisory lock who has locked a row of a job or a dataset: a heartbeat waits for its
+row only as long as a few statements take. Nothing is asked of the store, or of anything else in the network,
+while one of these locks is held. Triggers of the database take the lock of an owner as well, so whoever
+changes files of datasets, results or checkpoints, or deletes a dataset or a job, takes it first. The tests
+run on a database that refuses any other order (``tests/lock_order_check.py``).
+"""
+
+from octasplat.workers.db.connections import Connection
+
+STORE = 0x73746F72  # "stor"
+ROW_SECONDS = 10
+"""A transaction that has locked a job and falls silent for so long is undone; its process is gone."""
+OWNER = 0x71756F74  # "quot"; the database's triggers know it as well
+
+
+async def lock_store(connection: Connection, *, shared: bool) -> None:
+    """Take the lock of the store until the transaction ends."""
+    name = "pg_advisory_xact_lock_shared" if shared else "pg_advisory_xact_lock"
+    await connection.execute(f"SELECT {name}(%s)".encode(), [STORE])
+
+
+async def lock_owner(connection: Connection, owner: str) -> None:
+    """Take the lock of an owner until the transaction ends; harmless if it is held already."""
+    await connection.execute("SELECT pg_advisory_xact_lock(%s, hashtext(%s))", [OWNER, owner])
+
+
+async def about_to_lock_jobs(connection: Connection) -> None:
+    """Bound the transaction, which is about to lock rows of jobs; called before whatever locks them.
+
+    For all it knows the database would wait hours for a host that vanished. The tests see here that no row
+    of a dataset is locked yet.
+    """
+    limit = "SELECT set_config('idle_in_transaction_session_timeout', %s, true)"
+    await connection.execute(limit, [f"{ROW_SECONDS}s"])

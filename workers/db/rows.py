@@ -1,0 +1,209 @@
+"""The rows of the tables, as they are read."""
+
+import uuid
+from dataclasses import dataclass
+from datetime import datetime
+from typing import Any, Literal
+
+JobState = Literal["queued", "running", "canceling", "succeeded", "failed", "canceled"]
+DatasetState = Literal["open", "checking", "committed"]
+DatasetHolds = Literal["photographs", "files"]
+STATES: tuple[JobState, ...] = ("queued", "running", "canceling", "succeeded", "failed", "canceled")
+TERMINAL: frozenset[str] = frozenset({"succeeded", "failed", "canceled"})
+
+
+@dataclass(frozen=True)
+class Dataset:
+    """Photographs, and perhaps their poses, that jobs work on; or other files that their options name.
+
+    Attributes:
+        id: UUIDv7.
+        owner: whose it is.
+        name: what its owner calls it.
+        state: ``open`` takes files, ``checking`` is being validated, ``committed`` never changes again.
+        has_poses: whether it holds a COLMAP model.
+        photographs: number of images, once committed.
+        facts: what the validation found out.
+        pinned: never removed by retention.
+        created_at: when it was made.
+        committed_at: when it was found sound.
+        used_at: when a job last asked for it.
+        expires_at: when retention may remove it.
+        version: counts changes.
+        holds: photographs, or files that the options of jobs name.
+    """
+
+    id: uuid.UUID
+    owner: str
+    name: str
+    state: DatasetState
+    has_poses: bool
+    photographs: int
+    facts: dict[str, Any]
+    pinned: bool
+    created_at: datetime
+    committed_at: datetime | None
+    used_at: datetime
+    expires_at: datetime | None
+    version: int
+    holds: DatasetHolds = "photographs"
+
+
+@dataclass(frozen=True)
+class DatasetFile:
+    """A file of a dataset: its path there, its content's SHA-256 and size, and what its header says."""
+
+    dataset_id: uuid.UUID
+    path: str
+    sha256: str
+    size_bytes: int
+    facts: dict[str, Any]
+    uploaded_at: datetime
+
+
+@dataclass(frozen=True)
+class Job:
+    """A piece of work and how far it is.
+
+    Attributes:
+        id: UUIDv7.
+        owner: whose it is.
+        kind: name in the table of job kinds.
+        dataset_id: what it works on.
+        source_id: the finished job whose results it works on.
+        label: what its owner calls it.
+        options: every setting, resolved when it was accepted.
+        queue: which workers may take it.
+        priority: higher goes first.
+        slip: its current slip in the queue; others are stale.
+        state: where it is in its life; the last three never change again except by a retry.
+        attempt: counts starts; every write of a worker carries the number it began with.
+        fresh_after: attempts up to this one had other options or are to be forgotten: what they published
+            without getting to say so is not taken for the result.
+        rescues: how often its worker was lost since it was last accepted.
+        stage: what is being done.
+        step: steps of the stage that are done.
+        total_steps: steps of the stage.
+        seconds_left: estimated, of the stage.
+        psnr: of the held-out views: on some of their rays while it trains, of all views once they are
+            measured, dB.
+        training_psnr: running value over the training's own rays, dB.
+        worker: name of the worker that has it.
+        error: why it failed: ``type``, ``message``.
+        checkpoint: manifest of the newest one that is stored.
+        preview: newest preview picture: ``sha256``, ``step`` and ``view``, the photograph it answers to.
+        estimate: what it was reckoned to take when it was accepted, see
+            :class:`octasplat.engine.operations.cost_model.Estimate`.
+        files_id: dataset of the files that its options name.
+        traceparent: W3C trace context of the request.
+        pinned: never removed by retention.
+        created_at: when it was accepted.
+        queued_at: when it was last put into the queue.
+        started_at: when its current attempt began.
+        heartbeat_at: when its worker was last heard of.
+        finished_at: when it came to its end.
+        expires_at: when retention may remove it.
+        version: counts changes but heartbeats.
+    """
+
+    id: uuid.UUID
+    owner: str
+    kind: str
+    dataset_id: uuid.UUID | None
+    source_id: uuid.UUID | None
+    label: str | None
+    options: dict[str, Any]
+    queue: str
+    priority: int
+    slip: int | None
+    state: JobState
+    attempt: int
+    fresh_after: int
+    rescues: int
+    stage: str | None
+    step: int | None
+    total_steps: int | None
+    seconds_left: float | None
+    psnr: float | None
+    training_psnr: float | None
+    worker: str | None
+    error: dict[str, Any] | None
+    checkpoint: dict[str, Any] | None
+    preview: dict[str, Any] | None
+    traceparent: str | None
+    pinned: bool
+    created_at: datetime
+    queued_at: datetime
+    started_at: datetime | None
+    heartbeat_at: datetime | None
+    finished_at: datetime | None
+    expires_at: datetime | None
+    version: int
+    estimate: dict[str, Any] | None = None
+    files_id: uuid.UUID | None = None
+
+    @property
+    def is_over(self) -> bool:
+        """Whether the job is in a terminal state."""
+        return self.state in TERMINAL
+
+
+@dataclass(frozen=True)
+class Artifact:
+    """A result of a job: its name, content and media type."""
+
+    job_id: uuid.UUID
+    name: str
+    sha256: str
+    size_bytes: int
+    media_type: str
+
+
+@dataclass(frozen=True)
+class JobEvent:
+    """Something that happened to a job; ids rise."""
+
+    id: int
+    job_id: uuid.UUID
+    attempt: int
+    kind: str
+    data: dict[str, Any]
+    at: datetime
+
+
+@dataclass(frozen=True)
+class LogLine:
+    """A line that a job's program wrote; ids rise."""
+
+    id: int
+    job_id: uuid.UUID
+    attempt: int
+    text: str
+    at: datetime
+
+
+@dataclass(frozen=True)
+class Token:
+    """An access token, known by the SHA-256 of its secret only."""
+
+    id: uuid.UUID
+    owner: str
+    name: str
+    sha256: str
+    scopes: list[str]
+    created_at: datetime
+    expires_at: datetime | None
+    revoked_at: datetime | None
+
+
+@dataclass(frozen=True)
+class WorkerRow:
+    """A worker that was seen lately."""
+
+    id: uuid.UUID
+    name: str
+    queues: list[str]
+    slots: int
+    facts: dict[str, Any]
+    started_at: datetime
+    seen_at: datetime

@@ -1,0 +1,172 @@
+"""Access tokens; the tables know the SHA-256 of their secrets only."""
+
+import hashlib
+import secrets
+import uuid
+from collections.abc import Sequence
+from typing import Literal
+
+from psycopg.rows import class_row
+
+from octasplat.workers.db.connections import Connection, with_columns
+from octasplat.workers.db.ids import new_id
+from octasplat.workers.db.rows import Token
+
+PREFIX = "octa_"
+SCOPES = ("read", "write", "admin")
+LOCAL_OWNER = "local"
+"""Whose things they are that were made on one's own machine."""
+Origin = Literal["environment", "machine"]
+_LOCK = 0x6F637474  # "octt"
+
+
+def new_secret() -> str:
+    """A fresh secret of 256 random bits."""
+    return PREFIX + secrets.token_urlsafe(32)
+
+
+def hash_secret(secret: str) -> str:
+    """What the table knows of a secret. Secrets are random, so a slow hash would protect nothing more."""
+    return hashlib.sha256(secret.encode()).hexdigest()
+
+
+async def add_token(
+    connection: Connection,
+    secret: str,
+    *,
+    owner: str,
+    name: str,
+    scopes: Sequence[str],
+    hours: float | None = None,
+) -> Token:
+    """Let ``secret`` in; one that is known already keeps its row and gets these rights.
+
+    One that was shut out stays so.
+
+    Args:
+        connection: to the database.
+        secret: what is sent.
+        owner: whose things it shows.
+        name: what to call it.
+        scopes: what it may do.
+        hours: for how long it is valid; None for ever.
+
+    Raises:
+        ValueError: an unknown scope.
+    """
+    unknown = set(scopes) - set(SCOPES)
+    if unknown or not scopes:
+        raise ValueError(f"scopes are {', '.join(SCOPES)}, not {', '.join(sorted(unknown)) or 'none'}")
+    async with connection.cursor(row_factory=class_row(Token)) as cursor:
+        await cursor.execute(
+            with_columns(
+                """
+            INSERT INTO tokens (id, owner, name, sha256, scopes, expires_at)
+            VALUES (%s, %s, %s, %s, %s, now() + make_interval(secs => %s))
+            ON CONFLICT (sha256) DO UPDATE
+            SET owner = excluded.owner, name = excluded.name, scopes = excluded.scopes
+            RETURNING {}
+            """,
+                Token,
+            ),
+            [
+                new_id(),
+                owner,
+                name,
+                hash_secret(secret),
+                list(scopes),
+                None if hours is None else 3600 * hours,
+            ],
+        )
+        token = await cursor.fetchone()
+    assert token is not None
+    return token
+
+
+async def add_environment_token(connection: Connection, secret: str) -> Token:
+    """Let the secret of the environment in, and shut out those that it was before.
+
+    Returns:
+        Its row; one that was shut out stays so, and then nothing is changed.
+    """
+    async with connection.transaction():
+        await connection.execute("SELECT pg_advisory_xact_lock(%s)", [_LOCK])
+        token = await add_token(connection, secret, owner="admin", name="OCTASPLAT_TOKEN", scopes=["admin"])
+        if token.revoked_at is None:
+            await set_origin(connection, token.id, "environment")
+            await connection.execute(
+                """
+                UPDATE tokens SET revoked_at = now() FROM token_origins
+                WHERE token_id = id AND origin = 'environment' AND id <> %s AND revoked_at IS NULL
+                """,
+                [token.id],
+            )
+    return token
+
+
+async def set_origin(connection: Connection, token_id: uuid.UUID, origin: Origin) -> None:
+    """Say that a token was made by a program rather than by somebody."""
+    await connection.execute(
+        "INSERT INTO token_origins (token_id, origin) VALUES (%s, %s) ON CONFLICT DO NOTHING",
+        [token_id, origin],
+    )
+
+
+async def find_token(connection: Connection, secret: str) -> Token | None:
+    """The valid token of that secret, or None."""
+    async with connection.cursor(row_factory=class_row(Token)) as cursor:
+        await cursor.execute(
+            with_columns(
+                """
+            SELECT {} FROM tokens WHERE sha256 = %s AND revoked_at IS NULL
+              AND (expires_at IS NULL OR expires_at > now())
+            """,
+                Token,
+            ),
+            [hash_secret(secret)],
+        )
+        return await cursor.fetchone()
+
+
+async def get_token(connection: Connection, token_id: uuid.UUID) -> Token | None:
+    """The valid token of that id, or None."""
+    async with connection.cursor(row_factory=class_row(Token)) as cursor:
+        await cursor.execute(
+            with_columns(
+                """
+            SELECT {} FROM tokens WHERE id = %s AND revoked_at IS NULL
+              AND (expires_at IS NULL OR expires_at > now())
+            """,
+                Token,
+            ),
+            [token_id],
+        )
+        return await cursor.fetchone()
+
+
+async def list_tokens(connection: Connection) -> list[Token]:
+    """All tokens, the newest first."""
+    async with connection.cursor(row_factory=class_row(Token)) as cursor:
+        await cursor.execute(with_columns("SELECT {} FROM tokens ORDER BY id DESC", Token))
+        return await cursor.fetchall()
+
+
+async def has_any_token(connection: Connection, *, valid_only: bool = True) -> bool:
+    """Whether there is a valid token at all, or with ``valid_only`` False whether there ever was any."""
+    cursor = await connection.execute(
+        """
+        SELECT EXISTS (SELECT 1 FROM tokens WHERE NOT %s OR (revoked_at IS NULL
+                       AND (expires_at IS NULL OR expires_at > now()))) AS any
+        """,
+        [valid_only],
+    )
+    row = await cursor.fetchone()
+    return bool(row and row["any"])
+
+
+async def revoke_token(connection: Connection, token_id: uuid.UUID) -> bool:
+    """Shut a token out, with the sessions that were begun with it; False if there is none that is valid."""
+    cursor = await connection.execute(
+        "UPDATE tokens SET revoked_at = now() WHERE id = %s AND revoked_at IS NULL", [token_id]
+    )
+    return cursor.rowcount > 0

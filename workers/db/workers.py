@@ -1,0 +1,55 @@
+"""Which workers are alive."""
+
+import uuid
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from psycopg.rows import class_row
+
+from octasplat.workers.db.connections import Connection, with_columns
+from octasplat.workers.db.postgres_text import as_json
+from octasplat.workers.db.rows import WorkerRow
+
+
+async def record_worker_heartbeat(
+    connection: Connection,
+    worker_id: uuid.UUID,
+    *,
+    name: str,
+    queues: Sequence[str],
+    slots: int,
+    facts: Mapping[str, Any],
+) -> None:
+    """Say that a worker lives."""
+    await connection.execute(
+        """
+        INSERT INTO workers (id, name, queues, slots, facts) VALUES (%s, %s, %s, %s, %s)
+        ON CONFLICT (id) DO UPDATE SET seen_at = now(), facts = excluded.facts
+        """,
+        [worker_id, name, list(queues), slots, as_json(dict(facts))],
+    )
+
+
+async def remove_worker(connection: Connection, worker_id: uuid.UUID) -> None:
+    """A worker has gone in good order."""
+    await connection.execute("DELETE FROM workers WHERE id = %s", [worker_id])
+
+
+async def remove_stale_workers(connection: Connection, older_than_seconds: float) -> None:
+    """Forget workers that were not seen for that long."""
+    await connection.execute(
+        "DELETE FROM workers WHERE seen_at < now() - make_interval(secs => %s)", [older_than_seconds]
+    )
+
+
+async def live_workers(connection: Connection, stale_seconds: float) -> list[WorkerRow]:
+    """Workers that were seen within ``stale_seconds``, by name."""
+    async with connection.cursor(row_factory=class_row(WorkerRow)) as cursor:
+        await cursor.execute(
+            with_columns(
+                "SELECT {} FROM workers WHERE seen_at > now() - make_interval(secs => %s) ORDER BY name",
+                WorkerRow,
+            ),
+            [stale_seconds],
+        )
+        return await cursor.fetchall()

@@ -1,0 +1,190 @@
+"""The port on Procrastinate."""
+
+import uuid
+from collections.abc import Sequence
+from typing import Any, cast
+
+import procrastinate
+from procrastinate.manager import JobManager
+from procrastinate.worker import Worker
+
+from octasplat.workers.db.connections import Connection, Pool
+from octasplat.workers.queue.protocol import DeliveryCallback
+
+TASK_NAME = "octasplat.run_job"
+_MAX_REQUEUES = 4096
+_FIRST_REQUEUED_ID = -(1 << 62)
+
+
+class ProcrastinateQueue:
+    """A queue of slips in the tables of Procrastinate.
+
+    Args:
+        pool: connections; only :meth:`work` needs it.
+        heartbeat_seconds: how often a worker says that it lives.
+        stale_seconds: after how long without it is taken for dead.
+        poll_seconds: how often to look for slips that no notification told of.
+        listen: whether notifications reach this process; a pooler in transaction mode swallows them.
+    """
+
+    def __init__(
+        self,
+        pool: Pool | None = None,
+        *,
+        heartbeat_seconds: float = 5.0,
+        stale_seconds: float = 20.0,
+        poll_seconds: float = 1.0,
+        listen: bool = True,
+    ) -> None:
+        self._pool = pool
+        self._heartbeat_seconds = heartbeat_seconds
+        self._stale_seconds = stale_seconds
+        self._poll_seconds = poll_seconds
+        self._listen = listen
+        self._manager = JobManager(procrastinate.PsycopgConnector())
+        self._workers: set[Worker] = set()
+        self._stopped = False
+
+    async def enqueue(
+        self,
+        connection: Connection,
+        job_id: uuid.UUID,
+        queue: str,
+        priority: int,
+        *,
+        position_of: int | None = None,
+        delay_seconds: float = 0.0,
+    ) -> int:
+        """Queue a slip; see the port."""
+        if position_of is not None:
+            return await _reenqueue(connection, job_id, queue, priority, position_of, delay_seconds)
+        job = procrastinate.jobs.Job(
+            queue=queue,
+            priority=priority,
+            lock=None,
+            queueing_lock=None,
+            task_name=TASK_NAME,
+            task_kwargs={"job_id": str(job_id)},
+        )
+        slip = (await self._manager.defer_job_async(job, connection=connection)).id
+        assert slip is not None
+        return slip
+
+    async def remove(self, connection: Connection, entry_id: int) -> None:
+        """Take a slip away; see the port."""
+        await connection.execute("DELETE FROM procrastinate_jobs WHERE id = %s", [entry_id])
+
+    async def take_waiting(self, connection: Connection, entry_id: int) -> bool:
+        """Take away a slip that waits; see the port."""
+        cursor = await connection.execute(
+            """
+            DELETE FROM procrastinate_jobs WHERE id = (
+                SELECT id FROM procrastinate_jobs
+                WHERE id = %s AND status = 'todo' AND (scheduled_at IS NULL OR scheduled_at <= now())
+                FOR UPDATE SKIP LOCKED
+            )
+            """,
+            [entry_id],
+        )
+        return cursor.rowcount > 0
+
+    async def orphaned_jobs(self, connection: Connection) -> Sequence[uuid.UUID]:
+        """Queued jobs without a living slip; see the port."""
+        cursor = await connection.execute(
+            """
+            SELECT jobs.id FROM jobs
+            LEFT JOIN procrastinate_jobs slips ON slips.id = jobs.slip AND slips.status IN ('todo', 'doing')
+            LEFT JOIN procrastinate_workers holders ON holders.id = slips.worker_id
+            WHERE jobs.state = 'queued'
+              AND jobs.queued_at < now() - make_interval(secs => %(stale)s)
+              AND (slips.id IS NULL OR slips.status = 'doing' AND
+                   (holders.id IS NULL OR holders.last_heartbeat < now() - make_interval(secs => %(stale)s)))
+            """,
+            {"stale": self._stale_seconds},
+        )
+        return [row["id"] for row in await cursor.fetchall()]
+
+    async def consume(self, queue: str, concurrency: int, deliver: DeliveryCallback) -> None:
+        """Deliver slips; see the port."""
+        assert self._pool is not None
+        connector = procrastinate.PsycopgConnector()
+        await connector.open_async(cast(Any, self._pool))  # its cursors name their own kind of rows
+        app = procrastinate.App(connector=connector)
+
+        async def run_job(context: procrastinate.JobContext, job_id: str) -> None:
+            assert context.job.id is not None
+            await deliver(uuid.UUID(job_id), context.job.id)
+
+        app.task(name=TASK_NAME, pass_context=True)(run_job)
+        worker = Worker(
+            app,
+            queues=[queue],
+            name=queue,
+            concurrency=concurrency,
+            fetch_job_polling_interval=self._poll_seconds,
+            abort_job_polling_interval=60.0,  # jobs are cancelled by their own table
+            listen_notify=self._listen,
+            delete_jobs="always",
+            install_signal_handlers=False,
+            update_heartbeat_interval=self._heartbeat_seconds,
+            stalled_worker_timeout=self._stale_seconds,
+        )
+        self._workers.add(worker)
+        try:
+            if not self._stopped:
+                await worker.run()  # type: ignore[no-untyped-call]
+        finally:
+            self._workers.discard(worker)
+
+    def stop(self) -> None:
+        """Deliver no more; see the port."""
+        self._stopped = True
+        self.pause()
+
+    def pause(self) -> None:
+        """Deliver no more for now; see the port."""
+        for worker in self._workers:
+            worker.stop()  # type: ignore[no-untyped-call]
+
+
+async def _reenqueue(
+    connection: Connection,
+    job_id: uuid.UUID,
+    queue: str,
+    priority: int,
+    position_of: int,
+    delay_seconds: float,
+) -> int:
+    """Queue a slip in the place of an earlier one; Procrastinate's own way numbers them all anew."""
+    cursor = await connection.execute(
+        """
+        INSERT INTO procrastinate_jobs (id, queue_name, task_name, priority, args, scheduled_at)
+        VALUES (%(id)s, %(queue)s, %(task)s, %(priority)s, jsonb_build_object('job_id', %(job)s::text),
+            CASE WHEN %(wait)s > 0 THEN now() + make_interval(secs => %(wait)s) END) RETURNING id
+        """,
+        {
+            "id": requeued_entry_id(position_of),
+            "queue": queue,
+            "task": TASK_NAME,
+            "priority": priority,
+            "job": str(job_id),
+            "wait": delay_seconds,
+        },
+    )
+    row = await cursor.fetchone()
+    assert row is not None
+    return int(row["id"])
+
+
+def requeued_entry_id(entry_id: int) -> int:
+    """The number of a slip that takes the place of ``entry_id``.
+
+    Numbers below zero are for slips that came back: they go before all that never were delivered, and among
+    themselves in the order of the numbers that they had at first. What is counted besides tells the slips of
+    one job apart.
+    """
+    if entry_id < 0:
+        first, returns = divmod(entry_id - _FIRST_REQUEUED_ID, _MAX_REQUEUES)
+    else:
+        first, returns = entry_id, -1
+    return _FIRST_REQUEUED_ID + first * _MAX_REQUEUES + (returns + 1) % _MAX_REQUEUES

@@ -1,0 +1,79 @@
+"""What a queue has to do for us: deliver slips, each naming a job. The truth about jobs is in our own table.
+
+A slip is delivered at least once. One whose worker is lost stays behind; the rescue asks for such slips and
+replaces them. Everything that belongs to a change of a job takes the connection of its transaction.
+"""
+
+import uuid
+from collections.abc import Awaitable, Callable, Sequence
+from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
+
+from octasplat.workers.db.connections import Connection
+
+DeliveryCallback = Callable[[uuid.UUID, int], Awaitable[None]]
+"""Called with the job's id and the slip's number; when it returns the slip is done with."""
+
+
+@dataclass(frozen=True)
+class QueueDepth:
+    """Slips of one queue that wait, and the seconds for which the oldest of them has."""
+
+    queue: str
+    waiting: int
+    oldest_seconds: float
+
+
+@runtime_checkable
+class JobQueue(Protocol):
+    """A queue of slips."""
+
+    async def enqueue(
+        self,
+        connection: Connection,
+        job_id: uuid.UUID,
+        queue: str,
+        priority: int,
+        *,
+        position_of: int | None = None,
+        delay_seconds: float = 0.0,
+    ) -> int:
+        """Queue a slip for a job within the transaction of ``connection``.
+
+        Args:
+            connection: of the transaction.
+            job_id: which job.
+            queue: who may take it.
+            priority: higher goes first; where it is the same, the smaller number does.
+            position_of: an earlier slip of the job whose place in the queue the new one takes: before all that
+                were queued after it. None queues it last.
+            delay_seconds: with ``position_of``, for how long others go before it all the same.
+
+        Returns:
+            The slip's number, which no slip of this job had.
+        """
+        ...
+
+    async def remove(self, connection: Connection, entry_id: int) -> None:
+        """Take a slip away, whether it waits or its worker was lost; harmless if it is gone."""
+        ...
+
+    async def take_waiting(self, connection: Connection, entry_id: int) -> bool:
+        """Take away a slip that could be delivered now; False if it is with somebody, or is yet to wait."""
+        ...
+
+    async def orphaned_jobs(self, connection: Connection) -> Sequence[uuid.UUID]:
+        """Jobs that say they are queued although no slip of theirs waits or is with a live worker."""
+        ...
+
+    async def consume(self, queue: str, concurrency: int, deliver: DeliveryCallback) -> None:
+        """Deliver slips until :meth:`stop` is called or the database is lost; returns when all are done."""
+        ...
+
+    def pause(self) -> None:
+        """Deliver no more slips until :meth:`work` is called again."""
+        ...
+
+    def stop(self) -> None:
+        """Deliver no more slips."""
+        ...

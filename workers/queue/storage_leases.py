@@ -1,0 +1,235 @@
+"""Notes of who stores contents and will name them in a table only afterwards, so that nobody collects them.
+
+A note is there before the first byte is stored. Whoever names the contents does so in a transaction of
+:meth:`StorageLease.naming`, which fails if the note was given up: that of a process that was silent for long counts
+no more.
+
+Contents are removed from the store without a lock, as that may take long. They are marked first, while nobody
+names anything (:func:`marked_for_removal`), and whoever has stored one of them meanwhile waits until it is
+unmarked and then looks whether it is there.
+"""
+
+import asyncio
+import logging
+import time
+import uuid
+from collections.abc import AsyncIterator, Collection
+from contextlib import asynccontextmanager
+from dataclasses import dataclass
+from datetime import datetime
+
+import psycopg
+from psycopg_pool import PoolTimeout
+
+from octasplat.workers.db.connections import Connection, Pool
+from octasplat.workers.db.ids import new_id
+from octasplat.workers.db.locks import STORE, lock_store
+from octasplat.workers.storage.errors import BlobNotFoundError, StorageUnavailableError
+from octasplat.workers.storage.protocol import Storage
+
+logger = logging.getLogger(__name__)
+
+RENEW_SECONDS = 10.0
+"""How often whoever stores says that it still does."""
+LEASE_SECONDS = 45.0
+"""A note of which nothing was heard for so long is given up."""
+MAX_REMOVAL_SECONDS = 300.0
+"""A mark of removal that is older is one that a lost process left behind; it counts no more."""
+MAX_WAIT_SECONDS = 60.0
+"""For so long whoever names contents waits for those that are being removed at this moment."""
+_POLL_SECONDS = 0.2
+_CONNECTION_ERRORS = (psycopg.OperationalError, psycopg.InterfaceError, PoolTimeout, TimeoutError, OSError)
+
+
+@dataclass(frozen=True)
+class StorageLease:
+    """Says that something is being stored.
+
+    Attributes:
+        id: of the row.
+        pool: connections.
+        storage: where.
+        removals: how often contents had been marked for removal before; None if some were just then.
+    """
+
+    id: uuid.UUID
+    pool: Pool
+    storage: Storage
+    removals: int | None
+
+    async def verify(self, contents: Collection[str]) -> int:
+        """Make sure that nothing that was stored under the note has been removed meanwhile.
+
+        Args:
+            contents: the digests of all that was stored.
+
+        Returns:
+            How often contents had been marked for removal when it was looked.
+
+        Raises:
+            StorageUnavailable: the note was given up, or some of it is gone; it is to be stored again.
+        """
+        deadline = time.monotonic() + MAX_WAIT_SECONDS
+        while True:
+            async with self.pool.connection() as connection:
+                await self._check_held(connection, lock=False)
+                removals = await _removal_count(connection)
+                is_removing = await _are_being_removed(connection, contents)
+            if not is_removing:
+                break
+            if time.monotonic() > deadline:
+                raise StorageUnavailableError("Contents are being removed from the store; store them again.")
+            await asyncio.sleep(_POLL_SECONDS)
+        if removals != self.removals:
+            gone = await asyncio.to_thread(_missing, self.storage, contents)
+            if gone:
+                raise StorageUnavailableError(
+                    f"{len(gone)} contents were removed meanwhile; store them again."
+                )
+        return removals
+
+    @asynccontextmanager
+    async def reference(self, contents: Collection[str]) -> AsyncIterator[Connection]:
+        """A transaction that names contents; until it ends none of them is removed.
+
+        Args:
+            contents: their digests.
+
+        Raises:
+            StorageUnavailable: as by :meth:`look`.
+        """
+        while True:
+            looked = await self.verify(contents)
+            async with self.pool.connection() as connection, connection.transaction():
+                await lock_store(connection, shared=True)
+                if await _removal_count(connection) != looked:
+                    continue  # contents were marked in between
+                await self._check_held(connection, lock=True)
+                yield connection
+                return
+
+    async def _check_held(self, connection: Connection, *, lock: bool) -> None:
+        query = "SELECT id FROM storing WHERE id = %s"
+        cursor = await connection.execute(f"{query} FOR KEY SHARE" if lock else query, [self.id])
+        if await cursor.fetchone() is None:
+            raise StorageUnavailableError(
+                "Whoever stored this was silent for too long, so it may be gone; store it again."
+            )
+
+
+@asynccontextmanager
+async def storage_lease(pool: Pool, storage: Storage) -> AsyncIterator[StorageLease]:
+    """A note for as long as the block runs, in which contents are stored and then named."""
+    async with pool.connection() as connection:
+        # Of the version before, removals hold the lock instead of marking what they remove.
+        cursor = await connection.execute("SELECT pg_try_advisory_xact_lock_shared(%s) AS quiet", [STORE])
+        row = await cursor.fetchone()
+        is_quiet = row is not None and row["quiet"] and not await _are_being_removed(connection, None)
+        note = StorageLease(new_id(), pool, storage, await _removal_count(connection) if is_quiet else None)
+        await connection.execute("INSERT INTO storing (id) VALUES (%s)", [note.id])
+    seen = asyncio.create_task(_renew(pool, note))
+    try:
+        yield note
+    finally:
+        seen.cancel()
+        await asyncio.shield(_release(pool, note))
+
+
+@asynccontextmanager
+async def removal_transaction(connection: Connection) -> AsyncIterator[None]:
+    """A transaction in which nobody names contents, for :func:`mark_for_removal`."""
+    async with connection.transaction():
+        await lock_store(connection, shared=False)
+        await connection.execute("SELECT nextval('octasplat_removals')")
+        yield
+
+
+async def mark_for_removal(connection: Connection, contents: Collection[str]) -> None:
+    """Mark contents that nothing names as being removed, in a transaction of :func:`removal_transaction`."""
+    await connection.execute(
+        """
+        INSERT INTO removing_contents (sha256) SELECT unnest(%s::text[])
+        ON CONFLICT (sha256) DO UPDATE SET since = clock_timestamp()
+        """,
+        [sorted(contents)],
+    )
+
+
+async def unmark_for_removal(connection: Connection, contents: Collection[str]) -> None:
+    """Contents are removed, or left after all."""
+    await connection.execute("DELETE FROM removing_contents WHERE sha256 = ANY(%s)", [list(contents)])
+
+
+async def oldest_lease(connection: Connection) -> datetime | None:
+    """When the oldest note in force was made; None if nobody stores anything."""
+    cursor = await connection.execute("SELECT min(began_at) AS began_at FROM storing")
+    row = await cursor.fetchone()
+    return row["began_at"] if row is not None else None
+
+
+async def expire_stale_leases(connection: Connection) -> None:
+    """Give up the notes of processes that are gone; one that is being confirmed stays."""
+    await connection.execute(
+        """
+        DELETE FROM storing WHERE id IN (
+            SELECT id FROM storing WHERE seen_at < clock_timestamp() - make_interval(secs => %s)
+            FOR UPDATE SKIP LOCKED
+        )
+        """,
+        [LEASE_SECONDS],
+    )
+
+
+async def _renew(pool: Pool, lease: StorageLease) -> None:
+    while True:
+        await asyncio.sleep(RENEW_SECONDS)
+        try:
+            async with pool.connection() as connection:
+                await connection.execute(
+                    "UPDATE storing SET seen_at = clock_timestamp() WHERE id = %s", [lease.id]
+                )
+        except _CONNECTION_ERRORS:
+            continue
+        except Exception:
+            logger.exception("a note of what is stored was not renewed and is tried again")
+
+
+async def _release(pool: Pool, lease: StorageLease) -> None:
+    try:
+        async with pool.connection() as connection:
+            await connection.execute("DELETE FROM storing WHERE id = %s", [lease.id])
+    except _CONNECTION_ERRORS as error:
+        logger.info("a note of what is stored stays for a while: %s", error)
+
+
+async def _are_being_removed(connection: Connection, contents: Collection[str] | None) -> bool:
+    """Whether any of these contents, or any at all, are being removed."""
+    cursor = await connection.execute(
+        """
+        SELECT EXISTS (
+            SELECT FROM removing_contents
+            WHERE since > clock_timestamp() - make_interval(secs => %(seconds)s)
+              AND (%(contents)s::text[] IS NULL OR sha256 = ANY(%(contents)s))
+        ) AS found
+        """,
+        {"seconds": MAX_REMOVAL_SECONDS, "contents": None if contents is None else list(contents)},
+    )
+    row = await cursor.fetchone()
+    return row is not None and bool(row["found"])
+
+
+async def _removal_count(connection: Connection) -> int:
+    cursor = await connection.execute("SELECT last_value + is_called::int AS n FROM octasplat_removals")
+    row = await cursor.fetchone()
+    assert row is not None
+    return int(row["n"])
+
+
+def _missing(storage: Storage, contents: Collection[str]) -> list[str]:
+    gone = []
+    for sha256 in contents:
+        try:
+            storage.stat(sha256)
+        except BlobNotFoundError:
+            gone.append(sha256)
+    return gone

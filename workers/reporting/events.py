@@ -1,0 +1,28 @@
+"""The engine's events again, from the kind and the data with which they are told and kept."""
+
+from collections.abc import Mapping
+from typing import Any
+
+from octasplat.engine.events import EVENT_KINDS, Event, StageProgress, TrainingProgress, event_from
+
+EVENT_STREAM_KINDS = frozenset({"progress", *EVENT_KINDS})
+
+
+def decode_event(kind: str, data: Mapping[str, Any]) -> Event | None:
+    """The event; None if it is none of the engine's, or of another version.
+
+    Args:
+        kind: of the event; ``progress`` stands for that of the training and that of any other stage.
+        data: its fields, and perhaps others.
+    """
+    if kind == "progress":
+        kind = TrainingProgress.kind if "iteration" in data else StageProgress.kind
+    if kind == TrainingProgress.kind and "training_psnr" in data:
+        data = {**data, "psnr": data["training_psnr"]}
+    return event_from(kind, data)
+
+
+def encode_training_progress(event: Mapping[str, Any]) -> dict[str, Any]:
+    """A training's progress as the journal keeps it: the PSNR of its own rays is called so."""
+    data = {key: value for key, value in event.items() if key != "kind"}
+    return {**data, "training_psnr": data["psnr"]}

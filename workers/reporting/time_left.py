@@ -1,0 +1,23 @@
+"""How long a stage that counts its steps will still take."""
+
+import time
+
+
+class TimeLeftEstimator:
+    """The time left of a stage, from how fast it has gone since it was first heard of."""
+
+    def __init__(self) -> None:
+        self._first: tuple[float, float] | None = None
+
+    def seconds_left(self, steps_done: float, total_steps: float) -> float | None:
+        """Seconds; None while nothing can be said.
+
+        Args:
+            steps_done: steps, with the share of the one under way.
+            total_steps: steps in all.
+        """
+        now = time.monotonic()
+        if self._first is None or steps_done < self._first[0]:
+            self._first = steps_done, now
+        begun, at = self._first
+        return (now - at) / (steps_done - begun) * (total_steps - steps_done) if steps_done > begun else None

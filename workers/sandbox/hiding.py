@@ -1,0 +1,14 @@
+"""Processes that know secrets: no other process reads their memory, not even of the same user."""
+
+import contextlib
+import resource
+
+from octasplat.workers.sandbox.linux import PR_SET_DUMPABLE, prctl
+
+
+def forbid_memory_access() -> None:
+    """Let no other process of this user read this one's memory and environment, and write none to disk."""
+    with contextlib.suppress(OSError):
+        prctl(PR_SET_DUMPABLE, 0)
+    with contextlib.suppress(ValueError, OSError):
+        resource.setrlimit(resource.RLIMIT_CORE, (0, resource.getrlimit(resource.RLIMIT_CORE)[1]))

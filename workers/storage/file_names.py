@@ -1,0 +1,173 @@
+"""Names of files that came from elsewhere: relative, portable, and none the twin of another.
+
+A name that is odd is refused, never mended, so that what the user sees is what was sent.
+"""
+
+import re
+import unicodedata
+
+from octasplat.engine.errors import DatasetError
+
+MAX_NAME_BYTES = 1000
+MAX_COMPONENT_BYTES = 240
+MAX_DEPTH = 12
+
+_RESERVED_NAMES = re.compile(
+    r"(con|prn|aux|nul|conin\$|conout\$|clock\$|(com|lpt)[0-9\u00b9\u00b2\u00b3]) *(\..*)?",
+    re.IGNORECASE | re.DOTALL,
+)
+_FORBIDDEN_CHARACTERS = frozenset('<>:"|?*')
+
+
+class FileNameError(DatasetError):
+    """A file name that cannot be taken; ``code`` names the reason."""
+
+    def __init__(self, code: str, message: str) -> None:
+        super().__init__(message)
+        self.code = code
+
+
+def check_name(name: str) -> str:
+    """The name itself, if it is a relative path with forward slashes that every system can hold.
+
+    Raises:
+        NameRefused: with the code ``name-empty``, ``name-too-long``, ``name-not-text``, ``name-nul``,
+            ``name-control``, ``name-unc``, ``name-backslash``, ``name-absolute``, ``name-drive``,
+            ``name-character``, ``name-empty-part``, ``name-traversal``, ``name-trailing``, ``name-reserved``
+            or ``name-too-deep``.
+    """
+    if not name:
+        raise FileNameError("name-empty", "A file has an empty name.")
+    shown = quoted_name(name)
+    try:
+        encoded = name.encode("utf-8")
+    except UnicodeEncodeError:
+        raise FileNameError("name-not-text", f"The file name {shown} is not valid Unicode.") from None
+    if len(encoded) > MAX_NAME_BYTES:
+        raise FileNameError("name-too-long", f"The file name {shown} is longer than {MAX_NAME_BYTES} bytes.")
+    if "\0" in name:
+        raise FileNameError("name-nul", f"The file name {shown} contains a NUL character.")
+    # Cf holds the marks that turn the direction of writing, with which a name can look like another.
+    if any(unicodedata.category(letter) in ("Cc", "Cf", "Zl", "Zp") for letter in name):
+        raise FileNameError("name-control", f"The file name {shown} contains invisible characters.")
+    if name.startswith(("\\\\", "//")):
+        raise FileNameError("name-unc", f"The file name {shown} is a network path; names must be relative.")
+    if "\\" in name:
+        raise FileNameError(
+            "name-backslash", f"The file name {shown} contains a backslash; use forward slashes."
+        )
+    if name.startswith("/"):
+        raise FileNameError("name-absolute", f"The file name {shown} is absolute; names must be relative.")
+    if re.match("[A-Za-z]:", name):
+        raise FileNameError(
+            "name-drive", f"The file name {shown} begins with a drive; names must be relative."
+        )
+    if _FORBIDDEN_CHARACTERS & set(name):
+        raise FileNameError(
+            "name-character",
+            f'The file name {shown} contains one of < > : " | ? *, which not every system takes.',
+        )
+    parts = name.split("/")
+    if len(parts) > MAX_DEPTH:
+        raise FileNameError("name-too-deep", f"The file name {shown} has more than {MAX_DEPTH} parts.")
+    for part in parts:
+        _check_component(part, shown)
+    return name
+
+
+def _check_component(component: str, quoted: str) -> None:
+    if not component:
+        raise FileNameError(
+            "name-empty-part", f"The file name {quoted} has an empty part (two slashes, or one at the end)."
+        )
+    if component in (".", ".."):
+        raise FileNameError(
+            "name-traversal",
+            f"The file name {quoted} contains '{component}' as a part, which may lead elsewhere.",
+        )
+    if component.endswith((".", " ")) or component.startswith(" "):
+        raise FileNameError(
+            "name-trailing",
+            f"The file name {quoted} has a part that begins with a space or ends with a dot or a space.",
+        )
+    if _RESERVED_NAMES.fullmatch(component):
+        raise FileNameError(
+            "name-reserved", f"The file name {quoted} contains a name that Windows keeps for devices."
+        )
+    if len(component.encode("utf-8")) > MAX_COMPONENT_BYTES:
+        raise FileNameError(
+            "name-too-long", f"The file name {quoted} has a part longer than {MAX_COMPONENT_BYTES} bytes."
+        )
+
+
+def collision_key(name: str) -> str:
+    """What two names share that some file system takes for one: canonical Unicode without case."""
+    return unicodedata.normalize(
+        "NFC", unicodedata.normalize("NFD", unicodedata.normalize("NFD", name).casefold())
+    )
+
+
+def quoted_name(name: str) -> str:
+    """A name as it can be put into a sentence: quoted, escaped and cut."""
+    text = name if len(name) <= 80 else f"{name[:60]}...{name[-15:]}"
+    return ascii(text) if not text.isprintable() or "\\" in text else f"'{text}'"
+
+
+class NameSet:
+    """Names taken so far; adding one checks it against all the others."""
+
+    def __init__(self) -> None:
+        self._files: dict[str, str] = {}
+        self._folders: dict[str, str] = {}
+
+    def add(self, name: str) -> None:
+        """Take a checked name of a file.
+
+        Raises:
+            NameRefused: ``name-duplicate``, ``name-twin`` (differs in case or in the spelling of accents
+                only), or ``name-conflict`` (a file where another name has a folder).
+        """
+        check_name(name)
+        key = collision_key(name)
+        other = self._files.get(key)
+        if other is not None:
+            if other == name:
+                raise FileNameError("name-duplicate", f"The file name {quoted_name(name)} occurs twice.")
+            raise FileNameError(
+                "name-twin",
+                f"The file names {quoted_name(other)} and {quoted_name(name)} differ only in case or in the "
+                "spelling of accents; some systems take them for one.",
+            )
+        if key in self._folders:
+            raise FileNameError(
+                "name-conflict", f"{quoted_name(name)} is the name of a file and of a folder as well."
+            )
+        self._add_folders(name)
+        self._files[key] = name
+
+    def add_folder(self, name: str) -> None:
+        """Take the name of a folder, without its final slash; repeats are welcome.
+
+        Raises:
+            NameRefused: as by :meth:`add`, but for ``name-duplicate``.
+        """
+        check_name(name)
+        self._add_folders(f"{name}/")
+
+    def _add_folders(self, name: str) -> None:
+        position = name.find("/")
+        while position >= 0:
+            folder = name[:position]
+            key = collision_key(folder)
+            if key in self._files:
+                raise FileNameError(
+                    "name-conflict", f"{quoted_name(folder)} is the name of a file and of a folder as well."
+                )
+            other = self._folders.setdefault(key, folder)
+            if other != folder:
+                raise FileNameError(
+                    "name-twin",
+                    f"The folder names {quoted_name(other)} and {quoted_name(folder)} differ only in case or "
+                    "in the spelling of accents; some systems take them for one.",
+                )
+            position = name.find("/", position + 1)

@@ -1,0 +1,130 @@
+"""Folders in a store: a manifest of names and digests, the files as blobs.
+
+A dataset, a checkpoint and the results of an attempt are such trees. Storing the files is repeatable and
+shows nothing; publishing the manifest is the one step that makes a tree exist.
+"""
+
+from collections.abc import Callable, Iterable
+from pathlib import Path
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from octasplat.workers.storage.errors import StorageError
+from octasplat.workers.storage.file_names import NameSet
+from octasplat.workers.storage.os_errors import translate_os_errors
+from octasplat.workers.storage.protocol import Storage
+
+_PIECE_BYTES = 1 << 20
+
+
+class TreeFile(BaseModel):
+    """One file: its name relative to the tree, with forward slashes, and its content."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    path: str
+    sha256: str = Field(pattern="^[0-9a-f]{64}$")
+    size_bytes: int = Field(ge=0)
+
+
+class Manifest(BaseModel):
+    """The files of a tree, sorted by name, and what the writer wants to say about it."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    format: int = 1
+    files: tuple[TreeFile, ...]
+    about: dict[str, str | int | float | bool | None] = {}
+
+    @property
+    def size_bytes(self) -> int:
+        """Sum over the files; content that occurs twice counts twice."""
+        return sum(file.size_bytes for file in self.files)
+
+    def to_bytes(self) -> bytes:
+        """As it is published; equal manifests give equal bytes."""
+        return self.model_dump_json(indent=1).encode("utf-8")
+
+
+def store_tree(
+    storage: Storage,
+    folder: Path,
+    names: Iterable[str] | None = None,
+    *,
+    metadata: dict[str, str | int | float | bool | None] | None = None,
+    on_stored: Callable[[int], None] | None = None,
+) -> Manifest:
+    """Store the files of ``folder`` as blobs.
+
+    Args:
+        storage: where to.
+        folder: local folder.
+        names: files to store, relative to it; by default all regular files below it. Links are refused.
+        metadata: goes into the manifest.
+        on_stored: told the length of every file stored; it may raise to give up.
+
+    Raises:
+        StorageError: a file cannot be read, is a link, or the store does not take it.
+        NameRefused: a name is not portable.
+    """
+    if names is None:
+        names = (path.relative_to(folder).as_posix() for path in folder.rglob("*") if not path.is_dir())
+    known = NameSet()
+    files: list[TreeFile] = []
+    for name in sorted(names):
+        known.add(name)
+        path = folder / name
+        if path.is_symlink() or not path.is_file():
+            raise StorageError(f"{path} is not a regular file and cannot be stored.")
+        with translate_os_errors(path), path.open("rb") as handle, storage.open_writer() as writer:
+            while piece := handle.read(_PIECE_BYTES):
+                writer.write(piece)
+            blob = writer.commit()
+        files.append(TreeFile(path=name, sha256=blob.sha256, size_bytes=blob.size_bytes))
+        if on_stored is not None:
+            on_stored(blob.size_bytes)
+    return Manifest(files=tuple(files), about=metadata or {})
+
+
+def fetch_tree(storage: Storage, files: Iterable[TreeFile], folder: Path, *, writable: bool = False) -> None:
+    """Put the files of a tree into the new or empty ``folder``.
+
+    Args:
+        storage: where from.
+        files: what, e.g. ``manifest.files``.
+        folder: where to.
+        writable: give every file a copy of its own; otherwise files may be shared with the store and must
+            only be read or replaced, not changed.
+
+    Raises:
+        StorageError: content is missing or damaged, or the disk is full.
+        NameRefused: a name would lead elsewhere.
+    """
+    files = tuple(files)
+    known = NameSet()
+    for file in files:
+        known.add(file.path)
+    with translate_os_errors(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+    for file in files:
+        storage.materialise(file.sha256, folder / file.path, writable=writable)
+
+
+def publish_manifest(storage: Storage, name: str, manifest: Manifest) -> bool:
+    """Publish the manifest of a tree whose files are stored; see :meth:`Storage.publish`."""
+    return storage.publish_document(name, manifest.to_bytes())
+
+
+def read_manifest(storage: Storage, name: str) -> Manifest | None:
+    """The manifest published as ``name``, or None.
+
+    Raises:
+        StorageError: the document is damaged.
+    """
+    document = storage.read_document(name)
+    if document is None:
+        return None
+    try:
+        return Manifest.model_validate_json(document)
+    except ValidationError as error:
+        raise StorageError(f"The document {name} of the store is damaged; run octasplat fsck.") from error

@@ -1,0 +1,33 @@
+"""Copying content out of a store so that damage does not go unnoticed."""
+
+import hashlib
+import os
+from collections.abc import Iterable
+from pathlib import Path
+
+from octasplat.workers.storage.errors import DigestMismatchError
+from octasplat.workers.storage.protocol import Blob
+
+
+def copy_verified(chunks: Iterable[bytes], blob: Blob, target: Path) -> None:
+    """Write ``chunks`` to the new file ``target`` and compare them with ``blob``.
+
+    Raises:
+        FileExistsError: ``target`` is there already.
+        DigestMismatch: the pieces are not the content of ``blob``; ``target`` is removed.
+    """
+    digest = hashlib.sha256()
+    flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
+    fd = os.open(target, flags, 0o600)
+    try:
+        with os.fdopen(fd, "wb") as handle:
+            for piece in chunks:
+                digest.update(piece)
+                handle.write(piece)
+            handle.flush()
+            os.fsync(fd)
+        if digest.hexdigest() != blob.sha256:
+            raise DigestMismatchError(f"The stored content {blob.sha256} is damaged; upload it again.")
+    except BaseException:
+        target.unlink(missing_ok=True)
+        raise

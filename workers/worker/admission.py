@@ -1,0 +1,129 @@
+"""Whether a worker has room for a job, and room made where there is none."""
+
+import asyncio
+import logging
+import time
+import uuid
+
+from octasplat.workers.db.connections import Pool
+from octasplat.workers.db.rows import Job
+from octasplat.workers.db.workers import live_workers
+from octasplat.workers.maintenance.garbage_collection import collect_garbage_now
+from octasplat.workers.queue.job_deadlines import fail_before_start
+from octasplat.workers.queue.jobs import get_job, requeue_job
+from octasplat.workers.queue.protocol import JobQueue
+from octasplat.workers.storage.errors import StorageError
+from octasplat.workers.worker.context import WorkerContext
+from octasplat.workers.worker.heartbeat import DATABASE_ERRORS
+from octasplat.workers.worker.task import NO_SPACE_ERROR
+from octasplat.workers.worker.workspace import sweep_workspaces
+
+logger = logging.getLogger(__name__)
+
+MAX_SPACE_WAIT_SECONDS = 60.0
+"""How long a worker without room keeps a job from others that may have some."""
+MAX_DEFERRAL_SECONDS = 20.0
+"""A job that needs more room than there is now is looked at again after this time at the latest."""
+
+
+class Admission:
+    """Looks for room before jobs are begun.
+
+    Args:
+        name: of the worker.
+        pool: connections.
+        context: the worker.
+    """
+
+    def __init__(self, name: str, pool: Pool, context: WorkerContext) -> None:
+        self._name = name
+        self._pool = pool
+        self._context = context
+        self._is_shortage_logged = False
+
+    async def admit(self, job_id: uuid.UUID, entry_id: int) -> bool:
+        """Whether there is room for a job, waiting a while for it; else the job was left to others.
+
+        Without room for any job the worker waits. A job that needs more than there is waits by itself, and
+        others go before it; one that no worker of its queue could ever have room for has failed.
+        """
+        deadline = time.monotonic() + MAX_SPACE_WAIT_SECONDS
+        while (lacking := await self._context.space_shortage()) is not None:
+            if not self._is_shortage_logged:
+                logger.warning("worker %s takes no jobs: %s", self._name, lacking)
+            self._is_shortage_logged = True
+            await self._free_space()
+            if time.monotonic() > deadline or self._context.draining.is_set():
+                await defer_job(self._pool, self._context.job_queue, job_id, entry_id)
+                return False
+            await asyncio.sleep(self._context.settings.poll_seconds)
+        if self._is_shortage_logged:
+            logger.info("worker %s has room again", self._name)
+        self._is_shortage_logged = False
+        return await self._has_space_for(job_id, entry_id)
+
+    async def free_space_if_short(self) -> None:
+        """Make room if it is lacking."""
+        if await self._context.space_shortage() is not None:
+            await self._free_space()
+
+    async def _has_space_for(self, job_id: uuid.UUID, entry_id: int) -> bool:
+        async with self._pool.connection() as connection:
+            job = await get_job(connection, job_id)
+        needed = int((job.estimate or {}).get("disk_bytes", 0)) if job is not None else 0
+        if job is None or needed <= await self._context.free_bytes():
+            return True
+        await self._free_space()
+        free = await self._context.free_bytes()
+        if needed <= free:
+            return True
+        largest = await self._largest_capacity(job)
+        if largest is not None and needed > largest:
+            message = (
+                f"The job needs at least {needed} bytes of disk for its work, and no worker of the queue "
+                f"{job.queue} has more than {largest}; ask for fewer or smaller images, or add room."
+            )
+            async with self._pool.connection() as connection:
+                await fail_before_start(
+                    connection, job_id, entry_id, {"type": NO_SPACE_ERROR, "message": message}
+                )
+            return False
+        logger.info("job %s needs %d bytes of disk and waits, as there are %d", job_id, needed, free)
+        wait_seconds = min(MAX_DEFERRAL_SECONDS, self._context.settings.full_disk_seconds)
+        await defer_job(self._pool, self._context.job_queue, job_id, entry_id, wait_seconds)
+        return False
+
+    async def _largest_capacity(self, job: Job) -> int | None:
+        """The most room that a living worker of the job's queue could have; None where one does not say."""
+        stale = self._context.settings.stale_seconds
+        async with self._pool.connection() as connection:
+            rooms = [
+                row.facts.get("disk_bytes")
+                for row in await live_workers(connection, stale)
+                if job.queue in row.queues
+            ]
+        try:
+            own = await asyncio.to_thread(self._context.disk_space.capacity_bytes)
+        except StorageError:
+            return None
+        return None if None in rooms else max([own, *map(int, filter(None, rooms))])
+
+    async def _free_space(self) -> None:
+        """Remove what nobody names, and photographs that can be had from the store again."""
+        try:
+            await asyncio.to_thread(sweep_workspaces, self._context.settings.work_folder, 0.0)
+            await collect_garbage_now(self._pool, self._context.storage)
+        except (StorageError, *DATABASE_ERRORS) as error:
+            logger.info("unused contents were not collected: %s", error)
+
+
+async def defer_job(
+    pool: Pool, job_queue: JobQueue, job_id: uuid.UUID, entry_id: int, delay_seconds: float = 0.0
+) -> None:
+    """Leave a job whose slip is being delivered to whoever comes after ``delay_seconds``."""
+    async with pool.connection() as connection, connection.transaction():
+        job = await get_job(connection, job_id, lock=True)
+        if job is not None and job.state == "queued" and job.slip == entry_id:
+            await requeue_job(
+                connection, job_queue, job, keep_entry=True, delay_seconds=delay_seconds, without_event=True
+            )

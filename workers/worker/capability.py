@@ -1,0 +1,58 @@
+"""Whether this version can do a job. Versions run beside each other while a service is brought up to date.
+
+What a worker does not know, a newer one does: the job is left to that one, and nothing is counted against it.
+"""
+
+import uuid
+from typing import Any
+
+from pydantic import ValidationError
+
+from octasplat.engine import versions
+from octasplat.engine.errors import ConfigError
+from octasplat.workers.db.connections import Pool
+from octasplat.workers.db.rows import Job
+from octasplat.workers.db.workers import live_workers
+from octasplat.workers.queue.jobs import get_job
+from octasplat.workers.worker.job_kinds import get_job_kind, job_kinds
+from octasplat.workers.worker.workspace import Checkpoint
+
+
+def version_facts() -> dict[str, Any]:
+    """What a worker says of its version, for others to match with jobs."""
+    return {"kinds": [kind.name for kind in job_kinds()], "results": versions.RESULTS}
+
+
+async def reason_incapable(pool: Pool, job_id: uuid.UUID, stale_seconds: float) -> str | None:
+    """Why a job is left to workers of another version, in a few words, or None.
+
+    Args:
+        pool: connections.
+        job_id: the job.
+        stale_seconds: after how long a worker counts as gone.
+    """
+    async with pool.connection() as connection:
+        job = await get_job(connection, job_id)
+        if job is None:
+            return None
+        if (unknown := _unknown_to_version(job)) is not None:
+            return unknown
+        if job.checkpoint is None or Checkpoint.from_row(job.checkpoint).results == versions.RESULTS:
+            return None
+        made_by = Checkpoint.from_row(job.checkpoint).results
+        for row in await live_workers(connection, stale_seconds):
+            if job.queue in row.queues and row.facts.get("results", 1) == made_by:
+                return f"the worker {row.name} can go on from its checkpoint, which is of another version"
+    return None
+
+
+def _unknown_to_version(job: Job) -> str | None:
+    """What this version does not know of a job."""
+    try:
+        get_job_kind(job.kind).options.model_validate(job.options)
+    except ConfigError:
+        return f"the kind {job.kind} is unknown here"
+    except ValidationError as error:  # it was valid where it was accepted
+        where = ".".join(str(part) for part in error.errors()[0]["loc"])
+        return f"the option {where} means nothing here"
+    return None

@@ -1,0 +1,120 @@
+"""The programs of the kinds that octasplat brings; only a job's own process imports this."""
+
+import json
+import os
+import shutil
+from contextlib import nullcontext
+from pathlib import Path
+
+from octasplat.engine.config import ReconstructionConfig
+from octasplat.engine.errors import CheckpointError, ConfigError
+from octasplat.engine.events import (
+    Event,
+    Noted,
+    StageFinished,
+    StageProgress,
+    Warned,
+    broadcast,
+)
+from octasplat.engine.pipeline import reconstruct as reconstruct_scene
+from octasplat.engine.run_folder import CACHE, CHECKPOINTS, CONFIG, EVENTS, SCENE
+from octasplat.engine.stages import counted_stage, stopping
+from octasplat.engine.writing import write_json
+from octasplat.workers.worker.job_kinds import get_job_kind
+from octasplat.workers.worker.job_kinds.operation_kind import OperationKind
+from octasplat.workers.worker.path_redaction import PathRedactor
+from octasplat.workers.worker.preview import PreviewRenderer
+from octasplat.workers.worker.task import INFO_FILE, Task
+
+REPORT = "report.html"
+
+
+def reconstruct(task: Task) -> None:
+    """Photographs to a scene, its meshes and measurements; goes on from what an earlier attempt left.
+
+    If that is of other settings, as another version may understand the same options, it begins anew.
+    """
+    has_left = (task.run / CONFIG).exists()
+    try:
+        _run_reconstruction(task)
+    except (CheckpointError, ConfigError) as error:
+        if not has_left:
+            raise
+        told = _path_redactor(task).replace_job_paths(str(error))
+        task.progress(Warned(f"What was there cannot be gone on with, so the job begins anew: {told}"))
+        shutil.rmtree(task.run)
+        shutil.rmtree(task.results)
+        _run_reconstruction(task)
+
+
+def _run_reconstruction(task: Task) -> None:
+    assert task.scene is not None
+    config = ReconstructionConfig.model_validate(task.options)
+
+    def publish_finished(event: Event) -> None:
+        # Whatever becomes of the rest, even if this process is killed.
+        if isinstance(event, StageFinished) or (isinstance(event, StageProgress) and event.stage == "export"):
+            _publish_run(task)
+
+    try:
+        reconstruct_scene(
+            task.scene,
+            task.run,
+            config,
+            resume=True,
+            threads=task.threads,
+            progress=stopping(broadcast([task.progress, publish_finished]), task.should_stop),
+            should_stop=task.should_stop,
+            on_step=PreviewRenderer(task.run, config.evaluation_background, task.progress),
+        )
+    finally:
+        _publish_run(task)
+
+
+def _publish_run(task: Task) -> None:
+    """Put all that a run has finished among the results; nothing before there is a scene."""
+    if not (task.run / SCENE).exists():
+        return
+    for path in sorted(task.run.rglob("*")):
+        name = path.relative_to(task.run)
+        hidden = any(part.startswith(".") for part in name.parts)
+        if path.is_file() and not hidden and name.parts[0] not in (CHECKPOINTS, CACHE):
+            _publish_file(task, path, name.as_posix())
+
+
+def run_operation(task: Task) -> None:
+    """What the job's kind says, by the operation of the engine; publishes what it writes."""
+    kind = get_job_kind(task.kind)
+    assert isinstance(kind, OperationKind)
+    options = kind.resolve(task.options)
+    with kind.progress_callback(task) as tell:
+        whole = nullcontext() if kind.reports_stages else counted_stage(kind.stages(options)[0], tell, 0)
+        with whole:
+            result = kind.operation.run(
+                kind.build_request(task), progress=tell, should_stop=task.should_stop, threads=task.threads
+            )
+    for path in result.files:
+        if not path.is_relative_to(task.results):
+            _publish_file(task, path, kind.result_name(path.relative_to(result.folder or task.run)))
+    for line in result.lines():
+        task.progress(Noted(_path_redactor(task).replace_job_paths(line)))
+
+
+def _path_redactor(task: Task) -> PathRedactor:
+    return PathRedactor(task.folder, task.scene.parents[2] if task.scene is not None else task.folder)
+
+
+def _publish_file(task: Task, path: Path, name: str) -> None:
+    """Put a file among the results, without a copy."""
+    target = task.results / name
+    target.parent.mkdir(parents=True, exist_ok=True)
+    target.unlink(missing_ok=True)
+    if name == CONFIG:  # where the photographs lay on this machine is nobody's business
+        content = json.loads(path.read_text(encoding="utf-8"))
+        write_json(target, {**content, "scene": task.title})
+    elif name in (EVENTS, REPORT, INFO_FILE):
+        target.write_text(
+            _path_redactor(task).replace_job_paths(path.read_text(encoding="utf-8")), encoding="utf-8"
+        )
+    else:
+        os.link(path, target)

@@ -1,0 +1,144 @@
+"""What a kind of job is, and the table of them."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, Generic, Literal
+
+from pydantic import BaseModel, ValidationError
+from typing_extensions import TypeVar
+
+from octasplat.engine.errors import ConfigError
+from octasplat.engine.operations.cost_model import Estimate
+from octasplat.engine.photograph_sizes import Sizes
+from octasplat.workers.worker.job_kinds.resource_limits import ResourceDemand
+
+OptionsT = TypeVar("OptionsT", bound=BaseModel, default=Any)
+
+
+Needs = Literal["dataset", "result", "files"]
+
+
+class JobKind(Generic[OptionsT]):
+    """A kind of job; subclasses override what is otherwise for them.
+
+    Args:
+        name: what the API calls it.
+        title: one line for people.
+        needs: what it works on: a committed dataset of photographs, the results of a finished job, or only
+            the files that its options name.
+        options: model of its complete options, as they are kept.
+        user_options: model of the options that users give, whose JSON Schema is published; None for ``options``.
+        program: ``module:function`` that does the work, imported by the job's own process only; it takes a
+            :class:`octasplat.workers.worker.task.Task`.
+        stages: names of its stages, in order.
+        source_files: results of the source job that it reads, if it needs one; those that are missing are
+            left out, but for the first.
+    """
+
+    takes_files = False
+    """Whether options may name files, which are uploaded as a dataset that holds files."""
+    takes_other_photographs = False
+    """Whether a job may name photographs to work on in the place of the source job's."""
+    keeps_world_frame = True
+    """Whether what is made stands where the photographs of the source job show it."""
+    export_option = ""
+    """Where the options name the files of :meth:`exported_files`."""
+
+    def __init__(
+        self,
+        *,
+        name: str,
+        title: str,
+        needs: Needs,
+        options: type[OptionsT],
+        program: str,
+        stages: Sequence[str] = (),
+        source_files: Sequence[str] = (),
+        user_options: type[BaseModel] | None = None,
+    ) -> None:
+        self.name, self.title, self.needs, self.options, self.program = name, title, needs, options, program
+        self.user_options: type[BaseModel] = user_options or options
+        self.source_files = tuple(source_files)
+        self._stages = tuple(stages)
+
+    def resolve(self, values: Mapping[str, Any]) -> OptionsT:
+        """Return complete options from what a user asks for.
+
+        Raises:
+            ValidationError: an option cannot be used.
+            SettingsRefused: likewise, with a sentence for each.
+        """
+        return self.options.model_validate(dict(values))
+
+    def revise(self, options: Mapping[str, Any], changes: Mapping[str, Any]) -> OptionsT:
+        """Return the options of a job that is tried again with changes; raises as :meth:`resolve` does."""
+        return self.resolve({**options, **changes})
+
+    def stages(self, options: OptionsT) -> tuple[str, ...]:
+        """Return the names of its stages, in order."""
+        return self._stages
+
+    def needs_photographs(self, options: OptionsT) -> bool:
+        """Return whether it reads the photographs of the source job as well."""
+        return False
+
+    def for_other_photographs(self, options: OptionsT) -> OptionsT:
+        """Return the options as they are kept where the job names photographs of its own."""
+        return options
+
+    def needs_poses(self, options: OptionsT) -> bool:
+        """Return whether its dataset must hold a COLMAP model."""
+        return False
+
+    def with_poses_known(self, options: OptionsT, has_poses: bool) -> OptionsT:
+        """Return the options as they are kept, given whether the dataset holds a COLMAP model."""
+        return options
+
+    def is_resumable_with(self, old: OptionsT, new: OptionsT) -> bool:
+        """Return whether the work that was done with the first options can go on under the second."""
+        return old == new
+
+    def exported_files(self, options: OptionsT) -> tuple[str, ...]:
+        """Return the names of the files that it writes in formats of their own."""
+        return ()
+
+    def resource_demands(self, options: OptionsT, sizes: Sequence[Sizes]) -> Iterable[ResourceDemand]:
+        """Return what the options ask for that a service may set a ceiling to, for such photographs."""
+        return ()
+
+    def named_files(self, options: OptionsT) -> Iterable[tuple[str, str]]:
+        """Return the files that the options name, each after the place where they do, with dots."""
+        return ()
+
+    def estimate(self, options: OptionsT, sizes: Sequence[Sizes], cores: int) -> Estimate | None:
+        """Return the time and memory that it takes on so many cores; None where nobody knows."""
+        return None
+
+
+_KINDS: dict[str, JobKind[Any]] = {}
+
+
+def register(kind: JobKind[Any]) -> JobKind[Any]:
+    """Add a kind; its name must be new."""
+    if kind.name in _KINDS:
+        raise ValueError(f"a job kind named '{kind.name}' is registered already")
+    _KINDS[kind.name] = kind
+    return kind
+
+
+def job_kinds() -> tuple[JobKind[Any], ...]:
+    """Return all kinds, in the order in which they were registered."""
+    return tuple(_KINDS.values())
+
+
+def get_job_kind(name: str) -> JobKind[Any]:
+    """Return the kind of that name.
+
+    Raises:
+        ConfigError: there is none.
+    """
+    if name not in _KINDS:
+        raise ConfigError(f"There is no job kind '{name}'; choose one of {', '.join(_KINDS)}.")
+    return _KINDS[name]
+
+
+__all__ = ["JobKind", "ValidationError", "get_job_kind", "job_kinds", "register"]

@@ -1,0 +1,245 @@
+"""What becomes of an attempt, as it is written to the database: succeeded, failed, put back."""
+
+import asyncio
+import logging
+from collections.abc import Awaitable, Callable, Sequence
+from typing import Any, TypeVar
+
+import psycopg
+
+from octasplat.engine.errors import OctasplatError
+from octasplat.workers.db.quotas import QuotaExceededError
+from octasplat.workers.queue.attempts import MAX_RECOVERIES, Attempt, ResultFile
+from octasplat.workers.queue.storage_leases import StorageLease, storage_lease
+from octasplat.workers.storage.disk_space import SpaceUsage
+from octasplat.workers.storage.errors import (
+    BlobNotFoundError,
+    DigestMismatchError,
+    StorageError,
+    StorageUnavailableError,
+)
+from octasplat.workers.storage.os_errors import is_disk_full
+from octasplat.workers.worker.context import DatabaseLostError, WorkerContext
+from octasplat.workers.worker.heartbeat import DATABASE_ERRORS, Heartbeat
+from octasplat.workers.worker.reporter import Reporter
+from octasplat.workers.worker.task import NO_SPACE_ERROR
+from octasplat.workers.worker.workspace import Workspace
+
+logger = logging.getLogger(__name__)
+T = TypeVar("T")
+
+MAX_CONTRADICTIONS = 3
+"""So often a verdict is told again that contradicts what others changed at the same time."""
+
+
+class OutcomeWriter:
+    """Writes what becomes of one attempt, again and again while the job is surely ours.
+
+    Every method raises LostDatabase when that time is over, and Fenced when the job has gone on.
+
+    Args:
+        attempt: the claimed job.
+        context: the worker.
+        workspace: of the attempt.
+        reporter: of the attempt.
+        heartbeat: says whether the job is ours.
+        program: of the job; empty where this version does not know its kind.
+    """
+
+    def __init__(
+        self,
+        attempt: Attempt,
+        context: WorkerContext,
+        workspace: Workspace,
+        reporter: Reporter,
+        heartbeat: Heartbeat,
+        program: str,
+    ) -> None:
+        self._attempt = attempt
+        self._context = context
+        self._job = attempt.job
+        self._workspace = workspace
+        self._reporter = reporter
+        self._heartbeat = heartbeat
+        self._program = program
+
+    async def publish(self) -> None:
+        """Store the results and end the job with them."""
+        try:
+            results = await self._store_results()
+        except StorageError as error:
+            await self.handle_error(error)
+            return
+        await self.succeed(results)
+
+    async def succeed(self, results: list[ResultFile]) -> None:
+        """End the job with results that are published."""
+        psnr = await asyncio.to_thread(self._workspace.measured_psnr, results)
+        try:
+            await self._retry_write(lambda: self._attempt.succeed(results, psnr))
+        except QuotaExceededError as error:
+            described = {"type": "quota", "message": f"The results cannot be stored. {error}"}
+            await self._retry_write(lambda: self._attempt.fail(described, discarded=results))
+            await self._withdraw()
+        self._context.host_health.record_success()
+
+    async def fail(self, error: dict[str, Any]) -> None:
+        """End the job with what its program has finished."""
+        try:
+            await self._with_partial_results(lambda results, note: self._attempt.fail(error, results, note))
+        except QuotaExceededError as excess:
+            message = f"{error['message']} What it has finished cannot be stored. {excess}"
+            await self._retry_write(lambda: self._attempt.fail({**error, "message": message}))
+        except StorageError as storage_error:
+            await self.handle_error(storage_error)
+
+    async def fail_refused_value(self, error: psycopg.DataError) -> None:
+        """End the job with the database's refusal of something that was to be written about it."""
+        logger.error("what was to be written about job %s is refused: %s", self._job.id, error)
+        described = {
+            "type": "refused_value",
+            "message": "The job says something that cannot be written down.",
+        }
+        await self._retry_write(lambda: self._attempt.fail(described))
+
+    async def cancel(self) -> None:
+        """End the job as its owner asked."""
+        await self._retry_write(self._attempt.cancel)
+
+    async def requeue(self, reason: str) -> None:
+        """Put the job back for no fault of its own."""
+        await self._retry_write(lambda: self._attempt.requeue(self._context.job_queue, reason))
+
+    async def requeue_or_fail(self, error: dict[str, Any]) -> None:
+        """Put the job back after a failure that may be its own, or end it with what it has finished."""
+        if self._job.rescues >= MAX_RECOVERIES:
+            try:
+                await self._with_partial_results(
+                    lambda results, note: self._requeue_counted(error, results, note)
+                )
+                return
+            except (StorageError, QuotaExceededError) as storage_error:
+                logger.warning("the results there are could not be stored: %s", storage_error)
+        await self._retry_write(lambda: self._requeue_counted(error))
+
+    async def requeue_counted(self, error: dict[str, Any]) -> None:
+        """Put the job back for a reason that may pass."""
+        await self._retry_write(lambda: self._requeue_counted(error))
+
+    async def handle_error(self, error: OctasplatError) -> None:
+        """Put the job back, or end it, after an error around its program."""
+        described = _error_as_dict(error)
+        if isinstance(error, StorageUnavailableError):
+            await self.diagnose_and_requeue(described["message"])
+        elif isinstance(error, StorageError) and not isinstance(
+            error, BlobNotFoundError | DigestMismatchError
+        ):
+            await self.requeue_counted(described)
+        else:
+            await self._retry_write(lambda: self._attempt.fail(described))
+
+    async def diagnose_and_requeue(self, message: str) -> None:
+        """Put the job back after a failure that may be this machine's: it counts only if it is not."""
+        found = await self._context.host_health.diagnose(self._program)
+        if found is None:
+            error = {"type": "crashed", "message": message}
+            await self.requeue_counted(error)
+        else:
+            await self.requeue(f"The worker's machine is at fault, which takes no jobs for now: {found}")
+
+    async def _requeue_counted(
+        self, error: dict[str, Any], results: Sequence[ResultFile] = (), lease: StorageLease | None = None
+    ) -> None:
+        """Put the job back, which counts.
+
+        Where room is lacking, and would be without the job too, that is no fault of the job. One that fills a
+        disk itself is tried again a few times, later and later, as others may have gone by then.
+        """
+        lacking = await self._context.space_shortage()
+        if lacking is None and error["type"] != NO_SPACE_ERROR:
+            await self._attempt.requeue_lost(self._context.job_queue, error, results, lease)
+            return
+        message = f"{error['message']} {lacking or ''}".strip()
+        kept, taken = (
+            self._reporter.checkpoint_bytes,
+            await asyncio.to_thread(self._workspace.peak_used_bytes),
+        )
+        if await self._context.space_shortage(SpaceUsage(taken, kept + taken)) is not None:
+            await self._attempt.requeue(self._context.job_queue, message)
+            return
+        # What it kept goes at the end if the store lacks room with it: nobody else could store anything.
+        crowds = kept > 0 and await self._context.space_shortage(SpaceUsage(taken, taken)) is not None
+        await self._attempt.requeue_lost(
+            self._context.job_queue,
+            {"type": NO_SPACE_ERROR, "message": message},
+            results,
+            lease,
+            delay_seconds=self._context.settings.full_disk_seconds * 4**self._job.rescues,
+            drop_checkpoint=crowds,
+        )
+
+    async def _store_results(self) -> list[ResultFile]:
+        """Store the results and publish their manifest."""
+        while True:
+            try:
+                async with storage_lease(self._attempt.pool, self._context.storage) as note:
+                    manifest = await asyncio.to_thread(self._workspace.store_results)
+                    contents = {file.sha256 for file in manifest.files}
+                    await note.verify(contents)
+                    results = await asyncio.to_thread(self._workspace.publish_results, manifest)
+                    try:
+                        # The manifest names them for whoever collects; nobody did before it was there.
+                        await note.verify(contents)
+                    except StorageUnavailableError:
+                        await asyncio.to_thread(self._workspace.withdraw_results)
+                        raise
+                    return results
+            except DATABASE_ERRORS as error:
+                await self._pause_or_raise(error)
+
+    async def _withdraw(self) -> None:
+        """Nothing names results any more that are not wanted, so that they are collected."""
+        try:
+            await asyncio.to_thread(self._workspace.withdraw_results)
+        except StorageError as error:
+            logger.warning("the results of job %s stay in the store: %s", self._job.id, error)
+
+    async def _with_partial_results(
+        self, write: Callable[[list[ResultFile], StorageLease], Awaitable[None]]
+    ) -> None:
+        """Store what a program has finished and say so."""
+        while True:
+            try:
+                async with storage_lease(self._attempt.pool, self._context.storage) as note:
+                    results = await asyncio.to_thread(self._workspace.store_partial_results)
+                    await write(results, note)
+                    return
+            except DATABASE_ERRORS as error:
+                await self._pause_or_raise(error)
+
+    async def _retry_write(self, write: Callable[[], Awaitable[T]]) -> T:
+        """What ``write`` brings; it is given longer each time, or a slow database would never be told."""
+        settings = self._context.settings
+        seconds = settings.heartbeat_seconds
+        contradicted = 0
+        while True:
+            try:
+                async with asyncio.timeout(seconds):
+                    return await write()
+            except psycopg.IntegrityError as error:  # something was deleted at the same moment
+                contradicted += 1
+                if contradicted > MAX_CONTRADICTIONS:
+                    raise
+                await self._pause_or_raise(error)
+            except DATABASE_ERRORS as error:
+                await self._pause_or_raise(error)
+                seconds = max(seconds, min(2 * seconds, settings.stale_seconds / 3))
+
+    async def _pause_or_raise(self, error: Exception) -> None:
+        if self._heartbeat.is_lost:
+            raise DatabaseLostError(str(error)) from error
+        await asyncio.sleep(self._context.settings.poll_seconds)
+
+
+def _error_as_dict(error: OctasplatError) -> dict[str, Any]:
+    return {"type": NO_SPACE_ERROR if is_disk_full(error) else type(error).__name__, "message": str(error)}

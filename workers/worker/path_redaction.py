@@ -1,0 +1,90 @@
+"""Sentences and log lines without the paths of the machine that wrote them.
+
+Files of a job are named relative to its scene or its result; of any other path little but a name is left.
+"""
+
+import os
+import re
+from collections.abc import Iterable
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from octasplat.workers.worker.task import RUN_FOLDER
+
+# A path begins where no word, address or other path goes on.
+_ABSOLUTE = re.compile(r"""(?<![\w.~/…])(?!(?<=:)//)(?:/+[^\s/"'`:;,()<>|\[\]{}]+)+/?""")
+_KEPT_PATH_PARTS = 2
+
+
+class PathRedactor:
+    """What is called how.
+
+    Args:
+        folder: of an attempt, see :class:`octasplat.workers.worker.task.Task`.
+        work: folder of all work on this machine.
+        others: further folders whose paths are nobody's business, such as that of the store.
+    """
+
+    def __init__(self, folder: Path, work: Path, others: Iterable[Path] = ()) -> None:
+        names: list[tuple[str, str]] = []
+        for root in _path_patterns(folder):
+            # Longer ones first; what lies in the scene or the result is called as it is there.
+            names += [
+                (rf"{root}/{RUN_FOLDER}/", ""),
+                (rf"{root}/{RUN_FOLDER}\b", "the result"),
+                (rf"{root}/", ""),
+                (rf"{root}\b", "the job's folder"),
+            ]
+        for root in _path_patterns(work):
+            names += [
+                (rf"{root}/datasets/[^/\s]+/[^/\s]+/", ""),
+                (rf"{root}/datasets/[^/\s]+/[^/\s\"']+", "the scene"),
+                (rf"{root}\b", "the work folder"),
+            ]
+        names += [(rf"{root}\b", f"…/{other.name}") for other in others for root in _path_patterns(other)]
+        self._names = [(re.compile(pattern), name) for pattern, name in names]
+
+    def redact(self, text: str) -> str:
+        """The text without paths of this machine."""
+        return shorten_absolute_paths(self.replace_job_paths(text)) if "/" in text else text
+
+    def replace_job_paths(self, text: str) -> str:
+        """The text with the files of the job as they are called; other paths are left alone."""
+        for pattern, name in self._names:
+            text = pattern.sub(name, text)
+        return text
+
+
+def shorten_absolute_paths(text: str) -> str:
+    """The text with only the last parts of each absolute path of this machine."""
+    return _ABSOLUTE.sub(_last_parts, text.replace("file://", ""))
+
+
+def redact_json(value: Any, redactor: PathRedactor) -> Any:
+    """A JSON value with all its texts as they are shown."""
+    if isinstance(value, str):
+        return redactor.redact(value)
+    if isinstance(value, dict):
+        return {key: redact_json(item, redactor) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [redact_json(item, redactor) for item in value]
+    return value
+
+
+def _last_parts(match: re.Match[str]) -> str:
+    parts = [part for part in match[0].split("/") if part]
+    if parts[0] not in _top_folders():
+        return match[0]
+    kept = parts[1:][-_KEPT_PATH_PARTS:]
+    return "/".join(["…", *kept]) if kept else "…"
+
+
+@cache
+def _top_folders() -> frozenset[str]:
+    return frozenset(os.listdir("/"))  # noqa: PTH208 - names are all that is asked for
+
+
+def _path_patterns(path: Path) -> list[str]:
+    """The path as it is and with its links followed, as patterns."""
+    return [re.escape(text) for text in dict.fromkeys((str(path.absolute()), os.path.realpath(path)))]

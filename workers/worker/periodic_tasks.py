@@ -1,0 +1,54 @@
+"""What a worker does regularly: watched, done again after any failure, or the worker ends."""
+
+import asyncio
+import logging
+from collections.abc import Awaitable, Callable
+from dataclasses import dataclass
+
+from octasplat.workers.worker.heartbeat import DATABASE_ERRORS
+
+logger = logging.getLogger(__name__)
+
+MAX_FAILURES = 10
+"""So many failures of a chore one after another, for no reason that will pass, end the worker."""
+DEFAULT_TIMEOUT_SECONDS = 600.0
+"""A chore that has not ended after this time, or after ten times its interval, has failed."""
+
+
+@dataclass(frozen=True)
+class PeriodicTask:
+    """Something to be done every ``interval_seconds``; after ``timeout_seconds`` it is given up and done again."""
+
+    action: Callable[[], Awaitable[None]]
+    interval_seconds: float
+    timeout_seconds: float = DEFAULT_TIMEOUT_SECONDS
+
+
+class PeriodicTaskError(Exception):
+    """A chore fails again and again, so that the worker had better be started anew."""
+
+
+async def run_periodically(task: PeriodicTask) -> None:
+    """Do a chore for ever.
+
+    Raises:
+        ChoreFailed: it failed :data:`MAX_FAILURES` times in a row, and not because the database was away.
+    """
+    name = getattr(task.action, "__name__", "a chore").strip("_")
+    failures = 0
+    while True:
+        try:
+            async with asyncio.timeout(max(task.timeout_seconds, 10 * task.interval_seconds)):
+                await task.action()
+            failures = 0
+        except TimeoutError as error:
+            failures += 1
+            logger.error("%s did not end in time and is begun again: %s", name, error)
+        except DATABASE_ERRORS as error:
+            logger.info("%s has to wait: %s", name, error)
+        except Exception as error:
+            failures += 1
+            logger.exception("%s failed and is done again", name)
+            if failures >= MAX_FAILURES:
+                raise PeriodicTaskError(f"{name} failed {failures} times in a row: {error}") from error
+        await asyncio.sleep(task.interval_seconds)

@@ -1,0 +1,247 @@
+"""What a child says, as rows of the database: progress, events, log, checkpoints and pictures.
+
+Hearing never waits for the database. What cannot be written is dropped, but for checkpoints; a verdict at the
+end does not depend on any of it.
+"""
+
+import asyncio
+import contextlib
+import logging
+from collections import deque
+from collections.abc import Sequence
+from typing import Any
+
+import psycopg
+from psycopg_pool import PoolTimeout
+
+from octasplat.engine.events import Warned
+from octasplat.workers.cancellation import cancel_and_wait
+from octasplat.workers.db.quotas import QuotaExceededError
+from octasplat.workers.queue.attempts import Attempt, FencedError
+from octasplat.workers.queue.storage_leases import storage_lease
+from octasplat.workers.reporting.event_lines import EventLines
+from octasplat.workers.reporting.events import decode_event, encode_training_progress
+from octasplat.workers.reporting.time_left import TimeLeftEstimator
+from octasplat.workers.storage.errors import StorageError
+from octasplat.workers.worker.task import RUN_FOLDER
+from octasplat.workers.worker.workspace import Checkpoint, Workspace
+
+logger = logging.getLogger(__name__)
+
+FLUSH_SECONDS = 0.5
+MAX_LOG_LINES = 15_000
+"""Lines of an attempt's libraries."""
+MAX_NOTE_LINES = 4_000
+"""Lines of an attempt on its stages, pace, warnings and errors."""
+PROGRESS_LINE_SECONDS = 30.0
+"""How often the log says how far the job is."""
+_MAX_PENDING_LINES = 2_000
+_MAX_PENDING_EVENTS = 1_000
+_STORED_EVENT_KINDS = ("stage_started", "stage_finished", "held_out_measured", "warning", "run_finished")
+_IGNORED_ERRORS = (psycopg.Error, PoolTimeout, TimeoutError, OSError)
+
+
+class Reporter:
+    """Tells the database what a child says.
+
+    Args:
+        attempt: the job.
+        workspace: where the child writes.
+    """
+
+    def __init__(self, attempt: Attempt, workspace: Workspace) -> None:
+        self._attempt = attempt
+        self._workspace = workspace
+        self._events: deque[tuple[str, dict[str, Any]]] = deque(maxlen=_MAX_PENDING_EVENTS)
+        self._lines: list[str] = []
+        self._log_line_count = 0
+        self._note_count = 0
+        self._progress_lines = EventLines(self.add_note, PROGRESS_LINE_SECONDS)
+        self._progress: dict[str, Any] | None = None
+        self._stage = ""
+        self._stages: tuple[str, ...] = ()
+        self._time_left = TimeLeftEstimator()
+        self._steps = 0
+        self._wanted_checkpoint: tuple[str, int] | None = None
+        self._preview: dict[str, Any] | None = None
+        self._checkpoint: Checkpoint | None = None
+        self._stores_checkpoints = True
+        self._wake = asyncio.Event()
+        self._flushing = asyncio.Lock()
+        self._tasks = [asyncio.create_task(self._flush_forever()), asyncio.create_task(self._store_forever())]
+
+    @property
+    def checkpoint_bytes(self) -> int:
+        """What the newest checkpoint takes in the store."""
+        return sum(file.size_bytes for file in self._checkpoint.files) if self._checkpoint is not None else 0
+
+    def set_stages(self, stages: Sequence[str]) -> None:
+        """Say which stages there will be."""
+        self._stages = tuple(stages)
+        self._events.append(("stages", {"stages": list(stages)}))
+
+    def record_resume(self, checkpoint: Checkpoint) -> None:
+        """Say what the attempt goes on from; only what is beyond it is progress."""
+        self._checkpoint = checkpoint
+        self.add_note(f"Goes on from step {checkpoint.step} of {checkpoint.stage}")
+
+    def log(self, line: str) -> None:
+        """Take a line that the child's libraries wrote."""
+        self._log_line_count += 1
+        if self._log_line_count <= MAX_LOG_LINES:
+            if len(self._lines) < _MAX_PENDING_LINES:
+                self._lines.append(line)
+        elif self._log_line_count == MAX_LOG_LINES + 1:
+            self._lines.append(f"(More than {MAX_LOG_LINES} lines; the rest is left out.)")
+
+    def add_note(self, line: str) -> None:
+        """Put a line into the log that is not lost among those of libraries."""
+        self._note_count += 1
+        if self._note_count <= MAX_NOTE_LINES:
+            self._lines.append(line)
+
+    def on_event(self, event: dict[str, Any]) -> None:
+        """Take an event of the child."""
+        kind = event["kind"]
+        told = decode_event(kind, event)
+        if isinstance(told, Warned):
+            self.add_note(f"Warning: {told.message}")
+        elif told is not None:
+            self._progress_lines(told)
+        elif kind == "error":
+            for line in event.get("cause", ()):
+                self.add_note(str(line))
+        if kind == "stage_started":
+            self._stage, self._time_left = event["stage"], TimeLeftEstimator()
+            self._steps = int(event["total_steps"])
+            self._progress = {"stage": self._stage, "step": 0, "total_steps": self._steps or None}
+        elif kind == "stage_progress":
+            self._on_stage_progress(event)
+        elif kind == "training_progress":
+            self._steps = int(event["total_iterations"])  # which a time decides, and an early end changes
+            self._progress = {
+                "stage": self._stage,
+                "step": event["iteration"],
+                "total_steps": self._steps,
+                "seconds_left": event["seconds_left"],
+                "training_psnr": event["psnr"],
+                "event": encode_training_progress(event),
+            }
+        elif kind == "checkpoint_written":
+            self._want_checkpoint(event["iteration"])
+        elif kind == "stage_finished":
+            # The last step comes before the end in the journal too, and is not lost to the next first one.
+            if self._progress is not None and "event" in self._progress:
+                self._events.append(("progress", self._progress.pop("event")))
+            if event["stage"] in ("poses", "placing", "lenses", "train"):
+                self._want_checkpoint(self._steps if event["stage"] == "train" else 0)
+        elif kind == "preview_written":
+            self._preview = event
+            self._wake.set()
+        if kind in _STORED_EVENT_KINDS:
+            self._events.append((kind, {key: value for key, value in event.items() if key != "kind"}))
+
+    async def finish(self) -> None:
+        """Write everything that is left, the last checkpoint included."""
+        async with self._flushing:  # a flush that is under way would lose what it has taken
+            for task in self._tasks:
+                task.cancel()
+        await cancel_and_wait(self._tasks)
+        with contextlib.suppress(*_IGNORED_ERRORS):
+            await self._flush()
+        await self._store_pending()
+
+    async def close(self) -> None:
+        """Stop, leaving what is left."""
+        await cancel_and_wait(self._tasks)
+
+    def _on_stage_progress(self, event: dict[str, Any]) -> None:
+        step, total = int(event["step"]), int(event["total_steps"])
+        self._progress = {
+            "stage": event["stage"],
+            "step": step,
+            "total_steps": total,
+            "seconds_left": self._time_left.seconds_left(step + float(event.get("part", 0.0)), total),
+            "event": {key: value for key, value in event.items() if key != "kind"},
+        }
+
+    def _want_checkpoint(self, step: int) -> None:
+        self._wanted_checkpoint = (self._stage, step)
+        self._wake.set()
+
+    async def _flush_forever(self) -> None:
+        while True:
+            await asyncio.sleep(FLUSH_SECONDS)
+            try:
+                async with self._flushing:
+                    await self._flush()
+            except FencedError:
+                return
+            except _IGNORED_ERRORS as error:
+                logger.info("progress of job %s was not written: %s", self._attempt.job.id, error)
+            except Exception:
+                logger.exception("progress of job %s was not written", self._attempt.job.id)
+
+    async def _flush(self) -> None:
+        progress, self._progress = self._progress, None
+        events, self._events = tuple(self._events), deque(maxlen=_MAX_PENDING_EVENTS)
+        lines, self._lines = tuple(self._lines), []
+        for kind, data in events:
+            await self._attempt.add_event(kind, data)
+        if progress is not None:
+            await self._attempt.set_progress(**progress)
+        if lines:
+            await self._attempt.add_log_lines(lines)
+
+    async def _store_forever(self) -> None:
+        while True:
+            await self._wake.wait()
+            self._wake.clear()
+            try:
+                await self._store_pending()
+            except FencedError:
+                return
+            except Exception:
+                logger.exception("a checkpoint of job %s was not kept", self._attempt.job.id)
+
+    async def _store_pending(self) -> None:
+        """Store the newest checkpoint and picture, if there are new ones."""
+        wanted, self._wanted_checkpoint = self._wanted_checkpoint, None
+        preview, self._preview = self._preview, None
+        try:
+            if wanted is not None:
+                await self._store_checkpoint(*wanted)
+            if preview is not None:
+                async with storage_lease(self._attempt.pool, self._workspace.storage) as note:
+                    sha256 = await asyncio.to_thread(
+                        self._workspace.store_file, f"{RUN_FOLDER}/{preview['path']}"
+                    )
+                    row = {"sha256": sha256, "step": preview["step"], "view": preview["view"]}
+                    await self._attempt.record_preview(row, note)
+        except asyncio.CancelledError:
+            self._wanted_checkpoint, self._preview = (
+                self._wanted_checkpoint or wanted,
+                self._preview or preview,
+            )
+            raise
+        except (StorageError, *_IGNORED_ERRORS) as error:
+            logger.warning("checkpoint of job %s was not stored: %s", self._attempt.job.id, error)
+            self.add_note(f"Warning: a checkpoint could not be stored: {error}")
+            self._wanted_checkpoint = self._wanted_checkpoint or wanted
+
+    async def _store_checkpoint(self, stage: str, step: int) -> None:
+        if not self._stores_checkpoints:
+            return
+        async with storage_lease(self._attempt.pool, self._workspace.storage) as note:
+            checkpoint = await asyncio.to_thread(self._workspace.store_checkpoint, stage, step)
+            if checkpoint is None:
+                return
+            advances = checkpoint.is_after(self._checkpoint)
+            try:
+                await self._attempt.record_checkpoint(checkpoint.as_row(), is_progress=advances, lease=note)
+            except QuotaExceededError as error:
+                # No more of them, as each would lie in the store for a while although nothing names it.
+                self._stores_checkpoints = False
+                self.add_note(f"Warning: from here on no checkpoints are kept: {error}")
+                return
+            self._checkpoint = checkpoint

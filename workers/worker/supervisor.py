@@ -1,0 +1,366 @@
+"""One attempt at a job: the child at work, the heartbeat beside it, and a verdict at the end."""
+
+import asyncio
+import logging
+import math
+import time
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from enum import Enum
+from pathlib import Path
+from typing import Any, TypeVar
+
+import psycopg
+
+from octasplat.engine import versions
+from octasplat.engine.errors import ConfigError, OctasplatError
+from octasplat.workers.cancellation import cancel_and_wait
+from octasplat.workers.db.datasets import files_of, get_dataset
+from octasplat.workers.queue.attempts import Attempt, FencedError
+from octasplat.workers.queue.job_deadlines import seconds_spent
+from octasplat.workers.queue.jobs import artifacts_of
+from octasplat.workers.sandbox.confinement import MAX_PROCESSES
+from octasplat.workers.storage.errors import (
+    BlobNotFoundError,
+    DigestMismatchError,
+    StorageError,
+    StorageFullError,
+)
+from octasplat.workers.worker.child_process import ChildProcess
+from octasplat.workers.worker.context import DatabaseLostError, WorkerContext
+from octasplat.workers.worker.heartbeat import DATABASE_ERRORS, Heartbeat
+from octasplat.workers.worker.job_kinds import JobKind, get_job_kind
+from octasplat.workers.worker.outcomes import OutcomeWriter
+from octasplat.workers.worker.path_redaction import PathRedactor, redact_json
+from octasplat.workers.worker.reporter import Reporter
+from octasplat.workers.worker.task import EXIT_REFUSED, EXIT_STOPPED, EXIT_UNEXPECTED, NO_SPACE_ERROR
+from octasplat.workers.worker.workspace import Checkpoint, Workspace
+
+logger = logging.getLogger(__name__)
+T = TypeVar("T")
+
+MAX_CANCEL_SECONDS = 10.0
+_WATCH_POOL = ThreadPoolExecutor(1, "watch")
+"""A thread for watching children; the common ones may all be waiting for a store that is cut off as well."""
+
+
+class StopReason(Enum):
+    """Why a child was stopped before its time."""
+
+    FENCED = "the job has gone on without this worker"
+    DATABASE_LOST = "the database was lost"
+    CANCELED = "its owner cancelled it"
+    DRAINING = "its worker is stopping"
+    SILENT = "its program said nothing for too long"
+    TIME_LIMIT = "it ran for longer than allowed"
+    MEMORY_LIMIT = "its program needed more memory than allowed"
+    PROCESS_LIMIT = "it started more processes than allowed"
+    DISK_LIMIT = "its folder took more than allowed"
+    DISK_RESERVE = "it took room that is reserved"
+
+
+class Supervisor:
+    """Runs one attempt.
+
+    Args:
+        attempt: the claimed job.
+        context: the worker.
+        claimed_at: when the claim was asked for, by ``time.monotonic()``.
+
+    """
+
+    def __init__(self, attempt: Attempt, context: WorkerContext, claimed_at: float) -> None:
+        self._workspace = Workspace(context.settings.work_folder, attempt.job, context.storage)
+        others = (Path(context.settings.storage_address), context.settings.data)
+        places = PathRedactor(self._workspace.folder, context.settings.work_folder, others)
+        self._attempt = attempt = replace(
+            attempt, redact=lambda value: redact_json(value, places), quota=context.quota
+        )
+        self._context = context
+        self._settings = context.settings
+        self._job = attempt.job
+        self._reporter = Reporter(attempt, self._workspace)
+        self._child: ChildProcess | None = None
+        self._stop_reason: StopReason | None = None
+        self._kill_at = math.inf
+        self._stop_event = asyncio.Event()
+        self._heartbeat = Heartbeat(attempt, context.settings, claimed_at)
+        self._outcomes = OutcomeWriter(
+            attempt,
+            context,
+            self._workspace,
+            self._reporter,
+            self._heartbeat,
+            _program_of_kind(attempt.job.kind),
+        )
+        self._deadline_at = math.inf
+
+    async def run(self) -> None:
+        """Work until the job is over, handed back or lost.
+
+        Raises:
+            LostDatabase: the database did not answer for too long.
+        """
+        watches = [
+            asyncio.create_task(watch())
+            for watch in (self._run_heartbeat, self._watch_database, self._watch_draining)
+        ]
+        try:
+            await self._work()
+        except FencedError:
+            logger.warning("attempt %d of job %s is over: others have it", self._job.attempt, self._job.id)
+        except psycopg.DataError as error:
+            await self._outcomes.fail_refused_value(error)
+        except DATABASE_ERRORS as error:
+            raise DatabaseLostError(str(error)) from error
+        finally:
+            if self._child is not None:
+                self._child.kill()
+            await cancel_and_wait(watches)
+            await self._reporter.close()
+            await asyncio.to_thread(self._workspace.close)
+            self._context.taken_bytes.pop(self._job.id, None)
+
+    async def _work(self) -> None:
+        try:
+            await asyncio.to_thread(self._workspace.open)
+            earlier = await asyncio.to_thread(self._workspace.find_published_results)
+            if earlier is not None:
+                await self._outcomes.succeed(earlier)
+                return
+            kind = get_job_kind(self._job.kind)
+            task = await self._prepare(kind)
+        except OctasplatError as error:
+            await self._outcomes.handle_error(error)
+            return
+        if self._stop_reason is not None:
+            await self._after_stop(self._stop_reason)
+            return
+        try:
+            self._child = await ChildProcess.start(task, self._reporter.on_event, self._reporter.log)
+        except OSError as error:
+            what = f"The job's program cannot be started ({error.strerror or error})."
+            await self._outcomes.diagnose_and_requeue(what)
+            return
+        code = await self._wait_for_child(self._child)
+        if self._stop_reason not in (StopReason.FENCED, StopReason.DATABASE_LOST):
+            await self._reporter.finish()
+        # A program that was done before it heard of the wish to stop has succeeded.
+        if code == 0 and self._stop_reason in (None, StopReason.CANCELED, StopReason.DRAINING):
+            await self._outcomes.publish()
+        elif self._stop_reason is not None:
+            await self._after_stop(self._stop_reason)
+        elif self._child.is_ready:
+            await self._after_exit(self._child, code)
+        else:
+            said = self._child.error["message"] if self._child.error is not None else f"code {code}"
+            await self._outcomes.diagnose_and_requeue(f"The job's program ended before it began: {said}")
+
+    async def _prepare(self, kind: JobKind) -> dict[str, Any]:
+        """Fill the workspace; returns the child's task."""
+        job, settings = self._job, self._settings
+        options = kind.options.model_validate(job.options)
+        scene, title = None, ""
+        async with self._attempt.pool.connection() as connection:
+            dataset = await get_dataset(connection, job.dataset_id) if job.dataset_id else None
+            files = await files_of(connection, job.dataset_id) if job.dataset_id else []
+            artifacts = await artifacts_of(connection, job.source_id) if job.source_id else []
+            named = await files_of(connection, job.files_id) if job.files_id else []
+            left = 3600 * settings.max_job_hours - await seconds_spent(connection, job)
+        self._deadline_at = time.monotonic() + left
+        checkpoint = None if job.checkpoint is None else Checkpoint.from_row(job.checkpoint)
+        copied = sum(a.size_bytes for a in artifacts if a.name in kind.source_files)
+        copied += sum(file.size_bytes for file in checkpoint.files) if checkpoint is not None else 0
+        await asyncio.to_thread(self._context.disk_space.ensure_workspace, copied)
+        if dataset is not None and (kind.needs == "dataset" or kind.needs_photographs(options)):
+            title = dataset.name
+            scene = await asyncio.to_thread(self._workspace.fetch_dataset, dataset.id, files, dataset.name)
+        if kind.needs == "result":
+            await asyncio.to_thread(self._workspace.fetch_source, artifacts, kind.source_files)
+        if named:
+            await asyncio.to_thread(self._workspace.fetch_files, named)
+        if checkpoint is not None:
+            await self._restore(checkpoint)
+        self._reporter.set_stages(kind.stages(options))
+        return {
+            "program": kind.program,
+            "kind": kind.name,
+            "kind_modules": list(settings.kind_modules),
+            "folder": str(self._workspace.folder),
+            "options": job.options,
+            "scene": str(scene) if scene else None,
+            "title": title,
+            "threads": settings.threads,
+            "hidden": [str(folder) for folder in settings.own_folders],
+            "memory_limit_bytes": self._context.memory_limit_bytes,
+        }
+
+    async def _restore(self, checkpoint: Checkpoint) -> None:
+        if checkpoint.results != versions.RESULTS:
+            self._reporter.add_note(
+                "Warning: the checkpoint is of a version in which the same settings gave other results, so "
+                "the job begins anew."
+            )
+            return
+        try:
+            await asyncio.to_thread(self._workspace.restore, checkpoint)
+        except (BlobNotFoundError, DigestMismatchError) as error:
+            await asyncio.to_thread(self._workspace.discard_run)
+            self._reporter.add_note(
+                f"Warning: the checkpoint cannot be used, so the job begins anew: {error}"
+            )
+            return
+        self._reporter.record_resume(checkpoint)
+        data = {"stage": checkpoint.stage, "step": checkpoint.step, "attempt": checkpoint.attempt}
+        await self._attempt.add_event("resumed", data)
+
+    async def _after_stop(self, reason: StopReason) -> None:
+        if reason is StopReason.FENCED:
+            raise FencedError
+        if reason is StopReason.DATABASE_LOST:
+            raise DatabaseLostError(reason.value)
+        if reason is StopReason.CANCELED:
+            await self._outcomes.cancel()
+        elif reason is StopReason.DRAINING:
+            await self._outcomes.requeue(reason.value)
+        elif reason is StopReason.SILENT:
+            seconds = self._settings.silent_seconds
+            message = f"The job's program said nothing for {seconds:g} s and was stopped."
+            await self._outcomes.requeue_or_fail({"type": "silent", "message": message})
+        elif reason is StopReason.TIME_LIMIT:
+            message = (
+                f"The job ran for {self._settings.max_job_hours:g} hours, as long as it may; ask for fewer "
+                "iterations or rays, or retry it, which goes on from its checkpoint."
+            )
+            await self._outcomes.fail({"type": "time_limit", "message": message})
+        elif reason is StopReason.PROCESS_LIMIT:
+            message = f"The job's program started more than {MAX_PROCESSES} others and was stopped."
+            await self._outcomes.fail({"type": "process_limit", "message": message})
+        elif reason is StopReason.DISK_LIMIT:
+            taken, most = self._workspace.peak_used_bytes(), self._settings.max_workspace_bytes
+            message = f"The job's folder took {taken} bytes, and {most} are allowed; ask for fewer images."
+            await self._outcomes.fail({"type": "disk_limit", "message": message})
+        elif reason is StopReason.DISK_RESERVE:
+            taken = self._workspace.peak_used_bytes()
+            message = f"The job was stopped with {taken} bytes in its folder, as its disk was full."
+            await self._outcomes.requeue_counted({"type": NO_SPACE_ERROR, "message": message})
+        else:
+            limit = (self._context.memory_limit_bytes or 0) / 2**30
+            message = (
+                f"The job needed more than the {limit:.1f} GB of memory that it may use; "
+                "use fewer Gaussians, smaller photographs, or a machine with more."
+            )
+            await self._outcomes.fail({"type": "memory_limit", "message": message})
+
+    async def _after_exit(self, child: ChildProcess, code: int) -> None:
+        if code in (EXIT_REFUSED, EXIT_UNEXPECTED) and child.error is not None:
+            error = child.error
+            # What fails on a full disk may well succeed on another.
+            if error["type"] == NO_SPACE_ERROR or await self._context.space_shortage() is not None:
+                await self._outcomes.requeue_counted(error)
+            else:
+                await self._outcomes.fail(error)
+        elif code == EXIT_STOPPED:
+            # Somebody else asked the child to stop; it wrote what is needed to go on.
+            await self._outcomes.requeue("its program was stopped")
+        else:
+            how = f"by signal {-code}" if code < 0 else f"with exit code {code}"
+            last = f" Its last words: {child.last_log_lines[-1]}" if child.last_log_lines else ""
+            message = f"The job's program ended {how}.{last}"
+            self._context.host_health.record_crash(self._job.id, self._job.owner)
+            await self._outcomes.requeue_or_fail({"type": "crashed", "message": message})
+
+    async def _wait_for_child(self, child: ChildProcess) -> int:
+        """Wait for the child's end, which is brought about if anything asks for it."""
+        exited = asyncio.create_task(child.wait())
+        limits = asyncio.create_task(self._watch_limits(child))
+        asked = False
+        try:
+            while not exited.done():
+                left = self._kill_at - time.monotonic()
+                if left <= 0:
+                    child.kill()
+                    break
+                if self._stop_reason is not None and not asked:
+                    child.request_stop()
+                    asked = True
+                self._stop_event.clear()
+                news = asyncio.create_task(self._stop_event.wait())
+                timeout = left if math.isfinite(left) else None
+                await asyncio.wait({exited, news}, timeout=timeout, return_when=asyncio.FIRST_COMPLETED)
+                news.cancel()
+            return await exited
+        finally:
+            limits.cancel()
+
+    async def _run_heartbeat(self) -> None:
+        """Say that the worker lives, and hear of the wishes of others."""
+        try:
+            await self._heartbeat.run(
+                lambda state: self._stop(StopReason.CANCELED) if state == "canceling" else None
+            )
+        except FencedError:
+            self._stop(StopReason.FENCED)
+
+    async def _watch_database(self) -> None:
+        await self._heartbeat.wait_until_lost()
+        self._stop(StopReason.DATABASE_LOST)
+
+    async def _watch_draining(self) -> None:
+        await self._context.draining.wait()
+        self._stop(StopReason.DRAINING)
+
+    async def _watch_limits(self, child: ChildProcess) -> None:
+        """Stop a child that is silent, late or too big, also one that was asked to stop already."""
+        settings, loop = self._settings, asyncio.get_running_loop()
+        while True:
+            await asyncio.sleep(min(1.0, settings.silent_seconds / 4))
+            if time.monotonic() - child.last_output_at > settings.silent_seconds:
+                self._stop(StopReason.SILENT)
+            if settings.max_job_hours and time.monotonic() > self._deadline_at:
+                self._stop(StopReason.TIME_LIMIT)
+            limit = self._context.memory_limit_bytes
+            if limit is not None and await loop.run_in_executor(_WATCH_POOL, child.memory_bytes) > limit:
+                self._stop(StopReason.MEMORY_LIMIT)
+            if await loop.run_in_executor(_WATCH_POOL, child.process_count) > MAX_PROCESSES:
+                self._stop(StopReason.PROCESS_LIMIT)
+            await self._watch_disk()
+
+    async def _watch_disk(self) -> None:
+        """Stop a child that fills the disk; of several the one that took most."""
+        around, loop = self._context, asyncio.get_running_loop()
+        taken = await loop.run_in_executor(_WATCH_POOL, self._workspace.used_bytes)
+        around.taken_bytes[self._job.id] = taken
+        if 0 < self._settings.max_workspace_bytes < taken:
+            self._stop(StopReason.DISK_LIMIT)
+        try:
+            await loop.run_in_executor(_WATCH_POOL, around.disk_space.ensure_workspace, 0)
+        except StorageFullError:
+            if taken >= max(around.taken_bytes.values()):
+                self._stop(StopReason.DISK_RESERVE)
+        except StorageError as error:
+            logger.info("the disk of job %s was not looked at: %s", self._job.id, error)
+
+    def _stop(self, reason: StopReason) -> None:
+        """The first reason counts, but for the two that forbid writing; of the deadlines the earliest."""
+        if self._stop_reason is None or reason in (StopReason.FENCED, StopReason.DATABASE_LOST):
+            self._stop_reason = reason
+        self._kill_at = min(self._kill_at, self._kill_deadline(reason))
+        self._stop_event.set()
+
+    def _kill_deadline(self, reason: StopReason) -> float:
+        """Until when the child may go on to stop by itself, by ``time.monotonic()``."""
+        now, grace = time.monotonic(), self._settings.grace_seconds
+        if reason is StopReason.DATABASE_LOST:
+            return self._heartbeat.kill_at
+        if reason is StopReason.CANCELED:
+            return now + min(MAX_CANCEL_SECONDS, grace)
+        return now + grace if reason in (StopReason.DRAINING, StopReason.TIME_LIMIT) else now
+
+
+def _program_of_kind(kind: str) -> str:
+    """The program of a kind of jobs; none where this version does not know it."""
+    try:
+        return get_job_kind(kind).program
+    except ConfigError:
+        return ""

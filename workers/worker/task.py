@@ -1,0 +1,77 @@
+"""What the program of a job is given, and how it crosses into the child process."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from octasplat.engine.events import Listener, ignore
+
+RUN_FOLDER, RESULTS_FOLDER, SCENE_FOLDER, FILES_FOLDER = "run", "results", "scene", "files"
+"""Folders of an attempt: the engine's output, what is to be published, photographs, files that are named."""
+
+SCENE_FILE, CONFIG_FILE = "scene.ply", "config.json"
+"""Results that tell a scene, and that it is one of a run."""
+
+FRAMES_FOLDER = "frames"
+"""In the engine's output, images of a render that are done; they are kept for later attempts."""
+
+INFO_FILE = "info.json"
+"""The result that tells what is in a scene."""
+
+NO_SPACE_ERROR = "no_space"
+"""Type of the error of a job that met a full disk, which is no fault of its own."""
+EXIT_REFUSED = 1
+"""The job cannot be done and another try would end the same way; the last line says why."""
+EXIT_UNEXPECTED = 70
+"""A fault of the program."""
+EXIT_STOPPED = 75
+"""Stopped as asked; what is needed to go on is in the folder."""
+
+
+@dataclass(frozen=True)
+class Task:
+    """One job, as its program sees it.
+
+    Attributes:
+        folder: the attempt's own folder; ``folder / RUN`` holds the source job's results, or what an earlier
+            attempt left to go on from.
+        options: complete options, as JSON values.
+        scene: folder of the photographs, or None.
+        title: what the user calls the photographs.
+        threads: to use; 0 means all cores.
+        progress: hears the progress.
+        should_stop: asked now and then; True asks to stop with what is needed to go on.
+        kind: name of the job's kind.
+    """
+
+    folder: Path
+    options: Mapping[str, Any]
+    scene: Path | None = None
+    title: str = ""
+    threads: int = 0
+    progress: Listener = ignore
+    should_stop: Callable[[], bool] = field(default=lambda: False)
+    kind: str = ""
+
+    @property
+    def run(self) -> Path:
+        """The engine's output folder."""
+        return self.folder / RUN_FOLDER
+
+    @property
+    def source(self) -> Path:
+        """The source job's results as a run, or, where they are no whole run, the scene among them."""
+        return self.run if (self.run / CONFIG_FILE).exists() else self.run / SCENE_FILE
+
+    @property
+    def files(self) -> Path:
+        """Folder of the files that the options name, if they name some; they must not be changed."""
+        return self.folder / FILES_FOLDER
+
+    @property
+    def results(self) -> Path:
+        """Folder of the files to publish; made when it is first asked for."""
+        folder = self.folder / RESULTS_FOLDER
+        folder.mkdir(exist_ok=True)
+        return folder

@@ -1,0 +1,389 @@
+"""The process of a worker: takes slips from its queues, supervises attempts, and looks after lost jobs."""
+
+import asyncio
+import contextlib
+import importlib
+import logging
+import os
+import platform
+import signal
+import socket
+import tempfile
+import time
+import uuid
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import psutil
+from procrastinate.exceptions import ConnectorException
+
+from octasplat.engine import __version__
+from octasplat.engine.files import writable_formats
+from octasplat.engine.threads import available_threads
+from octasplat.workers.cancellation import cancel_and_wait
+from octasplat.workers.db.connections import Pool, open_pool
+from octasplat.workers.db.ids import new_id
+from octasplat.workers.db.migrate import wait_for_tables
+from octasplat.workers.db.workers import record_worker_heartbeat, remove_stale_workers, remove_worker
+from octasplat.workers.maintenance.garbage_collection import collect_garbage
+from octasplat.workers.maintenance.retention import forget_old_things, thin_progress_events
+from octasplat.workers.maintenance.webhooks.sender import WebhookSender
+from octasplat.workers.parent_death_signal import die_with_local_service
+from octasplat.workers.queue.attempts import FencedError, claim
+from octasplat.workers.queue.fair_share import choose_job
+from octasplat.workers.queue.job_deadlines import fail_abandoned_jobs
+from octasplat.workers.queue.procrastinate_queue import ProcrastinateQueue
+from octasplat.workers.queue.recovery import StalledAttempts, recover_stalled_jobs
+from octasplat.workers.sandbox.capabilities import log_missing_capabilities, sandbox_capabilities
+from octasplat.workers.sandbox.hiding import forbid_memory_access
+from octasplat.workers.settings import WorkerSettings, worker_connections
+from octasplat.workers.storage.disk_space import DiskSpace
+from octasplat.workers.storage.errors import StorageError
+from octasplat.workers.storage.factory import open_storage
+from octasplat.workers.storage.local import LocalStorage
+from octasplat.workers.worker.admission import Admission, defer_job
+from octasplat.workers.worker.capability import reason_incapable, version_facts
+from octasplat.workers.worker.context import DatabaseLostError, WorkerContext
+from octasplat.workers.worker.heartbeat import DATABASE_ERRORS
+from octasplat.workers.worker.host_health import HostHealth
+from octasplat.workers.worker.memory_limit import memory_limit_bytes
+from octasplat.workers.worker.periodic_tasks import PeriodicTask, PeriodicTaskError, run_periodically
+from octasplat.workers.worker.supervisor import Supervisor
+from octasplat.workers.worker.workspace import sweep_temporary, sweep_workspaces
+
+logger = logging.getLogger(__name__)
+
+RECOVERY_TIMEOUT_SECONDS = 60.0
+"""Looking for lost jobs is begun again after this time, so that nothing that hangs keeps them waiting."""
+SWEEP_SECONDS = 60.0
+STORE_SWEEP_SECONDS = 3600.0
+THIN_EVENTS_SECONDS = 600.0
+STALE_UPLOAD_SECONDS = 86_400.0
+SPACE_CHECK_SECONDS = 5.0
+WORKERS_BACK_SECONDS = 600.0
+"""A queue is taken for abandoned when it has been seen without a worker for so long, however old its jobs."""
+DEFERRAL_POLLS = 3
+"""A job that is left to workers of another version is kept from all for so many looks at the queue ..."""
+MAX_DEFERRAL_SECONDS = 15.0
+"""... and for twice as many each further time, up to this time."""
+EXIT_DATABASE_LOST = 69
+MAX_FORGIVEN_FAILURES = 3
+"""So many failures of workers over one job, one after another, are taken for their own fault."""
+
+
+def make_job_queue(settings: WorkerSettings, pool: Pool | None = None) -> ProcrastinateQueue:
+    """The queue, as the settings say."""
+    return ProcrastinateQueue(
+        pool,
+        heartbeat_seconds=settings.heartbeat_seconds,
+        stale_seconds=settings.stale_seconds,
+        poll_seconds=settings.poll_seconds,
+        listen=settings.listen,
+    )
+
+
+async def run_worker(settings: WorkerSettings, queues: Mapping[str, int], *, name: str | None = None) -> int:
+    """Work until asked to stop.
+
+    Lost jobs are looked after as well, whatever the jobs under way do. With no queues that is all.
+
+    Args:
+        settings: of this worker.
+        queues: names of queues and how many of their jobs may run at once.
+        name: of this worker; by default host and process id.
+
+    Returns:
+        Exit code: 0 after a wish to stop, 69 if the database was lost and the worker should be started again.
+
+    Raises:
+        DatabaseError: the database cannot be reached or is of another version.
+        StorageError: the store cannot be used.
+    """
+    forbid_memory_access()
+    if not die_with_local_service():
+        log_missing_capabilities()
+    settings.checked()
+    for module in settings.kind_modules:
+        importlib.import_module(module)
+    conninfo = settings.conninfo()
+    await asyncio.to_thread(wait_for_tables, conninfo)
+    floor_bytes = settings.floor_bytes // 4  # the rest of it is for what jobs under way have to store
+    storage = await asyncio.to_thread(lambda: open_storage(settings.storage_address, floor_bytes=floor_bytes))
+    name = name or f"{socket.gethostname()}-{os.getpid()}"
+    room = DiskSpace(
+        storage, settings.work_folder, settings.floor_bytes,
+        store_margin_bytes=settings.floor_bytes - floor_bytes, reserve_bytes=floor_bytes,
+        store_folder=storage.root if isinstance(storage, LocalStorage) else None,
+    )  # fmt: skip
+    host = HostHealth(
+        name, settings.work_folder, storage,
+        kind_modules=settings.kind_modules, cooldown_seconds=settings.recover_seconds,
+    )  # fmt: skip
+    slots = sum(queues.values())
+    async with open_pool(
+        conninfo, max_size=worker_connections(queues), wait_seconds=settings.stale_seconds
+    ) as pool:
+        worker = _Worker(
+            settings,
+            pool,
+            WorkerContext(
+                settings,
+                make_job_queue(settings, pool),
+                storage,
+                room,
+                host,
+                asyncio.Event(),
+                memory_limit_bytes(settings.memory_limit_bytes, slots),
+            ),
+            name,
+            queues,
+        )
+        return await worker.run()
+
+
+class _Worker:
+    def __init__(
+        self,
+        settings: WorkerSettings,
+        pool: Pool,
+        context: WorkerContext,
+        name: str,
+        queues: Mapping[str, int],
+    ) -> None:
+        self._settings = settings
+        self._pool = pool
+        self._context = context
+        self._name = name
+        self._queues = queues
+        self._id = new_id()
+        self._is_database_lost = False
+        self._admission = Admission(name, pool, context)
+        self._deferrals: Counter[uuid.UUID] = Counter()
+        # A worker that lives is heard of in between, also where all of this machine stood still.
+        self._stalled = StalledAttempts(1.5 * settings.heartbeat_seconds + settings.poll_seconds)
+        self._abandoned = StalledAttempts(WORKERS_BACK_SECONDS)
+        self._sender = WebhookSender(pool, settings.webhook_hosts)
+
+    async def run(self) -> int:
+        loop = asyncio.get_running_loop()
+        loop.set_exception_handler(_on_unhandled_exception)
+        for number in (signal.SIGTERM, signal.SIGINT):
+            loop.add_signal_handler(number, self._start_draining)
+        settings = self._settings
+        chores = [
+            asyncio.create_task(run_periodically(chore))
+            for chore in (
+                PeriodicTask(
+                    self._send_heartbeat, settings.heartbeat_seconds, max(60.0, settings.stale_seconds)
+                ),
+                PeriodicTask(self._recover_stalled, settings.rescue_seconds, RECOVERY_TIMEOUT_SECONDS),
+                PeriodicTask(self._sweep_workspaces, SWEEP_SECONDS),
+                PeriodicTask(self._sweep_store, STORE_SWEEP_SECONDS),
+                PeriodicTask(self._send_webhooks, settings.poll_seconds),
+                PeriodicTask(self._delete_expired, SWEEP_SECONDS),
+                PeriodicTask(self._thin_events, THIN_EVENTS_SECONDS),
+                PeriodicTask(self._collect_garbage, settings.collect_seconds),
+                PeriodicTask(self._admission.free_space_if_short, SPACE_CHECK_SECONDS),
+            )
+        ]
+        logger.info("worker %s takes %s", self._name, dict(self._queues) or "no jobs, only care of lost ones")
+        try:
+            await self._take_jobs(chores)
+        finally:
+            for outcome in await cancel_and_wait(chores):
+                if isinstance(outcome, PeriodicTaskError):
+                    logger.error("worker %s ends, as %s", self._name, outcome)
+            await self._sender.close()
+        if self._is_database_lost:
+            return EXIT_DATABASE_LOST
+        with contextlib.suppress(*DATABASE_ERRORS):
+            async with asyncio.timeout(5), self._pool.connection() as connection:
+                await remove_worker(connection, self._id)
+        return 0
+
+    async def _take_jobs(self, tasks: Sequence["asyncio.Task[None]"]) -> None:
+        """Take jobs until asked to stop, or all is lost; none while something ails the machine."""
+        host, slips = self._context.host_health, self._context.job_queue
+        left = asyncio.create_task(self._context.draining.wait())
+        while not self._context.draining.is_set() and not self._is_database_lost:
+            host.changed.clear()
+            ails = asyncio.create_task(host.changed.wait())
+            takers = [
+                asyncio.create_task(slips.consume(queue, slots, self._deliver))
+                for queue, slots in self._queues.items()
+            ]
+            await asyncio.wait({left, ails, *tasks, *takers}, return_when=asyncio.FIRST_COMPLETED)
+            # A queue that ends by itself has lost the database; running jobs go on as long as they may. What
+            # a chore did nobody does any more after its end, so that they are handed back.
+            self._is_database_lost = self._is_database_lost or not (
+                self._context.draining.is_set() or host.fault
+            )
+            if any(chore.done() for chore in tasks):
+                self._is_database_lost = True
+                self._context.draining.set()
+            slips.pause()
+            for outcome in await asyncio.gather(*takers, return_exceptions=True):
+                if isinstance(outcome, Exception):
+                    logger.warning("a queue ended: %s", outcome)
+            ails.cancel()
+            while host.fault and not self._context.draining.is_set() and not self._is_database_lost:
+                seconds = self._settings.recover_seconds
+                await asyncio.wait({left, *tasks}, timeout=seconds, return_when=asyncio.FIRST_COMPLETED)
+                if any(chore.done() for chore in tasks) or await host.try_recover():
+                    break
+        left.cancel()
+
+    def _start_draining(self) -> None:
+        logger.info("worker %s stops and hands back its jobs", self._name)
+        self._context.draining.set()
+        self._context.job_queue.stop()
+
+    async def _deliver(self, job_id: uuid.UUID, entry_id: int) -> None:
+        if self._context.draining.is_set():
+            await self._return_to_queue(job_id, entry_id)
+            return
+        if (fault := await self._context.host_health.check_work_folder()) is not None:
+            self._context.host_health.mark_faulty(fault)
+        if self._context.host_health.fault is not None:
+            await self._return_to_queue(job_id, entry_id)
+            return
+        chosen = await choose_job(self._pool, self._context.job_queue, job_id, entry_id)
+        if (
+            chosen is None
+            or await self._defer_if_incapable(*chosen)
+            or not await self._admission.admit(*chosen)
+        ):
+            return
+        job_id, entry_id = chosen
+        since = time.monotonic()
+        attempt = await claim(self._pool, job_id, entry_id, self._name)
+        if attempt is None:
+            return
+        try:
+            await Supervisor(attempt, self._context, since).run()
+        except DatabaseLostError as error:
+            logger.warning("job %s was let go: %s", job_id, error)
+            self._is_database_lost = True
+            self._context.job_queue.stop()
+        except Exception as error:
+            # A fault of this program, or of what it runs on, and not of the job.
+            logger.exception("the attempt at job %s failed in its worker", job_id)
+            self._context.host_health.mark_faulty(
+                f"it cannot look after jobs ({type(error).__name__}: {error})"
+            )
+            with contextlib.suppress(FencedError, *DATABASE_ERRORS):
+                # Not with the error's text, which may differ each time.
+                reason = f"its worker failed ({type(error).__name__})"
+                await attempt.requeue(self._context.job_queue, reason, max_uncounted=MAX_FORGIVEN_FAILURES)
+
+    async def _defer_if_incapable(self, job_id: uuid.UUID, entry_id: int) -> bool:
+        """Whether a job was left to workers of another version."""
+        why = await reason_incapable(self._pool, job_id, self._settings.stale_seconds)
+        if why is None:
+            return False
+        if not self._deferrals[job_id]:
+            logger.warning("worker %s leaves job %s to others: %s", self._name, job_id, why)
+        # Rarer each time, so that however many there are they do not keep it from those that it can do.
+        wait_seconds = DEFERRAL_POLLS * self._settings.poll_seconds * 2 ** min(self._deferrals[job_id], 10)
+        wait_seconds = min(wait_seconds, MAX_DEFERRAL_SECONDS)
+        self._deferrals[job_id] += 1
+        await defer_job(self._pool, self._context.job_queue, job_id, entry_id, wait_seconds)
+        return True
+
+    async def _return_to_queue(self, job_id: uuid.UUID, entry_id: int) -> None:
+        """Leave a job to other workers whose slip came too late to this one."""
+        await defer_job(self._pool, self._context.job_queue, job_id, entry_id)
+
+    async def _send_heartbeat(self) -> None:
+        facts = await asyncio.to_thread(self._facts)
+        async with self._pool.connection() as connection:
+            await record_worker_heartbeat(
+                connection,
+                self._id,
+                name=self._name,
+                queues=list(self._queues),
+                slots=sum(self._queues.values()),
+                facts=facts,
+            )
+
+    def _facts(self) -> dict[str, Any]:
+        memory, room = psutil.virtual_memory(), self._context.disk_space
+        try:
+            disk = {"disk_bytes": room.capacity_bytes(), "disk_free_bytes": room.free_bytes()}
+        except StorageError:
+            disk = {}
+        return {
+            **disk,
+            "host": socket.gethostname(),
+            "pid": os.getpid(),
+            "version": __version__,
+            "python": platform.python_version(),
+            "cores": os.cpu_count(),
+            "threads": self._settings.threads or available_threads(),
+            "formats": list(writable_formats()),
+            "memory_bytes": memory.total,
+            "memory_free_bytes": memory.available,
+            "memory_limit_bytes": self._context.memory_limit_bytes,
+            "ailing": self._context.host_health.fault,
+            "isolation": sandbox_capabilities(),
+            **version_facts(),
+        }
+
+    async def _recover_stalled(self) -> None:
+        await recover_stalled_jobs(
+            self._pool, self._context.job_queue, self._settings.stale_seconds, self._stalled
+        )
+        async with self._pool.connection() as connection:
+            await remove_stale_workers(connection, max(60.0, 3 * self._settings.stale_seconds))
+
+    async def _send_webhooks(self) -> None:
+        await self._sender.start_due()
+
+    async def _delete_expired(self) -> None:
+        """Let go of what is older than it is to be kept."""
+        await forget_old_things(self._pool, self._settings.retention, self._settings.keep_audit_hours)
+        for job_id in await fail_abandoned_jobs(
+            self._pool,
+            self._context.job_queue,
+            stale_seconds=self._settings.stale_seconds,
+            hours=self._settings.absent_queue_hours,
+            suspects=self._abandoned,
+        ):
+            logger.warning("job %s waited too long in a queue that no worker takes", job_id)
+
+    async def _thin_events(self) -> None:
+        async with self._pool.connection() as connection:
+            await thin_progress_events(connection)
+
+    async def _collect_garbage(self) -> None:
+        try:
+            await collect_garbage(
+                self._pool,
+                self._context.storage,
+                unused_seconds=3600 * self._settings.keep_unused_hours,
+                every_seconds=0.9 * self._settings.collect_seconds,
+            )
+        except StorageError as error:
+            logger.info("unused contents were not collected: %s", error)
+
+    async def _sweep_workspaces(self) -> None:
+        await asyncio.to_thread(sweep_workspaces, self._settings.work_folder)
+        await asyncio.to_thread(sweep_temporary, Path(tempfile.gettempdir()), STALE_UPLOAD_SECONDS)
+
+    async def _sweep_store(self) -> None:
+        """Remove what killed uploads left in the store; no upload takes a day."""
+        try:
+            await asyncio.to_thread(self._context.storage.remove_stale_uploads, STALE_UPLOAD_SECONDS)
+        except StorageError as error:
+            logger.info("the store was not swept: %s", error)
+
+
+def _on_unhandled_exception(loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
+    """A delivery that was taken from this worker cannot be signed off any more, which is as it should be."""
+    error = context.get("exception")
+    if isinstance(error, ConnectorException):
+        logger.info("a slip of another attempt was left alone: %s", error.__cause__ or error)
+    else:
+        loop.default_exception_handler(context)

@@ -1,0 +1,395 @@
+"""The folder of an attempt: filled from the store before the work, stored after it. All calls block."""
+
+import contextlib
+import fcntl
+import json
+import math
+import os
+import re
+import shutil
+import stat
+import time
+import uuid
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import IO, Any
+
+from octasplat.engine import versions
+from octasplat.engine.render.resume import RECORD_FILE
+from octasplat.workers.db.rows import Artifact, DatasetFile, Job
+from octasplat.workers.queue.attempts import ResultFile
+from octasplat.workers.storage.errors import StorageError
+from octasplat.workers.storage.os_errors import translate_os_errors
+from octasplat.workers.storage.protocol import Storage
+from octasplat.workers.storage.trees import (
+    Manifest,
+    TreeFile,
+    fetch_tree,
+    publish_manifest,
+    read_manifest,
+    store_tree,
+)
+from octasplat.workers.worker.media_types import media_type
+from octasplat.workers.worker.task import FILES_FOLDER, FRAMES_FOLDER, RESULTS_FOLDER, RUN_FOLDER
+
+POSES_FOLDER = "poses"
+"""Poses that the engine found, in its output folder and among the results."""
+
+_LOCK_FILE = ".lock"
+_CHECKPOINT = re.compile(r"run/checkpoints/iteration_\d+\.npz")
+_CHECKPOINT_FILES = (
+    "run/config.json", "run/held_out.json", "run/views.json", "run/events.jsonl", "run/training.json",
+    "run/plan.json", "run/scene.ply", "run/checkpoints/best.npz",
+)  # fmt: skip
+_MAX_TRIES = 5
+METRICS_FILE = "metrics.json"
+MAX_METRICS_BYTES = 16 << 20
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """What a later attempt goes on from, as the job's row keeps it.
+
+    Attributes:
+        attempt: that made it.
+        stage: of the work.
+        step: of the stage.
+        files: what is needed.
+        results: what the same settings gave in the version that made it, see
+            :data:`octasplat.engine.versions.RESULTS`; versions that did not say so gave the first.
+    """
+
+    attempt: int
+    stage: str
+    step: int
+    files: tuple[TreeFile, ...]
+    results: int = field(default_factory=lambda: versions.RESULTS)
+
+    def as_row(self) -> dict[str, Any]:
+        """As JSON values."""
+        return {
+            "attempt": self.attempt,
+            "stage": self.stage,
+            "step": self.step,
+            "files": [file.model_dump() for file in self.files],
+            "results": self.results,
+        }
+
+    @classmethod
+    def from_row(cls, row: Mapping[str, Any]) -> "Checkpoint":
+        """From JSON values."""
+        files = tuple(TreeFile.model_validate(file) for file in row["files"])
+        return cls(row["attempt"], row["stage"], row["step"], files, row.get("results", 1))
+
+    def is_after(self, other: "Checkpoint | None") -> bool:
+        """Whether the work is further than at ``other``."""
+        order = {"poses": 0, "load": 1, "train": 2, "evaluate": 3, "export": 4}
+        if other is None:
+            return True
+        return (order.get(self.stage, 0), self.step) > (order.get(other.stage, 0), other.step)
+
+
+class Workspace:
+    """The folder of one attempt; nobody else uses it, and it is removed at the end.
+
+    Args:
+        root: folder of all work on this machine.
+        job: the job, claimed.
+        storage: the store.
+    """
+
+    def __init__(self, root: Path, job: Job, storage: Storage) -> None:
+        self._root = root
+        self._job = job
+        self.storage = storage
+        self.folder = root / "attempts" / f"{job.id}.{job.attempt}"
+        self._lock: IO[bytes] | None = None
+        self._dataset_lock: IO[bytes] | None = None
+        self._stored_frames: dict[str, TreeFile] = {}
+        self._peak_used_bytes = 0
+
+    def open(self) -> None:
+        """Make the folder, anew if there is one of that name.
+
+        Raises:
+            StorageError: it cannot be made.
+        """
+        with translate_os_errors(self._root):
+            shutil.rmtree(self.folder, ignore_errors=True)
+            self.folder.mkdir(parents=True, mode=0o700)
+            self._lock = _open_locked(self.folder / _LOCK_FILE)
+
+    def close(self) -> None:
+        """Remove the folder."""
+        shutil.rmtree(self.folder, ignore_errors=True)
+        if self._lock is not None:
+            self._lock.close()
+            self._lock = None
+        if self._dataset_lock is not None:
+            self._dataset_lock.close()
+            self._dataset_lock = None
+
+    def used_bytes(self) -> int:
+        """What the folder takes on its disk, without what it shares with the store."""
+        blocks: dict[int, int] = {}
+        for folder, names, files in os.walk(self.folder):
+            if Path(folder) == self.folder and FILES_FOLDER in names:
+                names.remove(FILES_FOLDER)
+            for name in files:
+                with contextlib.suppress(FileNotFoundError):
+                    facts = os.lstat(os.path.join(folder, name))  # noqa: PTH118 - thousands of them, each second
+                    blocks[facts.st_ino] = facts.st_blocks
+        taken = 512 * sum(blocks.values())
+        self._peak_used_bytes = max(taken, self._peak_used_bytes)
+        return taken
+
+    def peak_used_bytes(self) -> int:
+        """The most that the folder was found to take."""
+        self.used_bytes()
+        return self._peak_used_bytes
+
+    def fetch_dataset(self, dataset_id: uuid.UUID, files: Sequence[DatasetFile], name: str) -> Path:
+        """A folder with the photographs for all attempts on this machine; its files must not be changed."""
+        folder = self._root / "datasets" / str(dataset_id)
+        self._dataset_lock = _lock_dataset_folder(folder)
+        place = folder / (re.sub(r"[^A-Za-z0-9_-]+", "_", name).strip("_")[:60] or "scene")
+        if not place.exists():
+            partial = folder / f".{uuid.uuid4().hex}.partial"
+            try:
+                fetch_tree(self.storage, _tree_files(files), partial)
+                with contextlib.suppress(OSError):  # another attempt was faster
+                    partial.rename(place)
+            finally:
+                shutil.rmtree(partial, ignore_errors=True)
+        os.utime(folder)
+        return place
+
+    def fetch_files(self, files: Sequence[DatasetFile]) -> None:
+        """Files that the options name; they must not be changed."""
+        fetch_tree(self.storage, _tree_files(files), self.folder / FILES_FOLDER)
+
+    def fetch_source(self, artifacts: Sequence[Artifact], names: Sequence[str]) -> None:
+        """Results of the source job into the run folder."""
+        tree = [
+            TreeFile(path=a.name, sha256=a.sha256, size_bytes=a.size_bytes)
+            for a in artifacts
+            if a.name in names
+        ]
+        poses = [
+            TreeFile(path=a.name, sha256=a.sha256, size_bytes=a.size_bytes)
+            for a in artifacts
+            if a.name.startswith(f"{POSES_FOLDER}/")
+        ]
+        fetch_tree(self.storage, [*tree, *poses], self.folder / RUN_FOLDER, writable=True)
+
+    def restore(self, checkpoint: Checkpoint) -> None:
+        """Put back what an earlier attempt kept.
+
+        Raises:
+            StorageError: some of it is gone or damaged.
+        """
+        fetch_tree(self.storage, checkpoint.files, self.folder, writable=True)
+
+    def discard_run(self) -> None:
+        """Forget what was restored."""
+        shutil.rmtree(self.folder / RUN_FOLDER, ignore_errors=True)
+
+    def store_checkpoint(self, stage: str, step: int) -> Checkpoint | None:
+        """Store what is needed to go on from here; None if there is nothing yet."""
+        for _ in range(_MAX_TRIES):
+            names = self._checkpoint_files(stage)
+            if not names:
+                return None
+            try:
+                files = self._store_files(names)
+            except StorageError:
+                # The program replaces files while they are read; whatever else is wrong stays wrong.
+                if all((self.folder / name).exists() for name in names):
+                    raise
+                time.sleep(0.05)
+                continue
+            return Checkpoint(self._job.attempt, stage, step, files)
+        return None
+
+    def store_results(self) -> Manifest:
+        """Store the results, which belong to nothing yet."""
+        return store_tree(
+            self.storage,
+            self.folder / RESULTS_FOLDER,
+            metadata={"job": str(self._job.id), "attempt": self._job.attempt, "kind": self._job.kind},
+        )
+
+    def publish_results(self, manifest: Manifest) -> list[ResultFile]:
+        """Publish the manifest of the stored results; the job's row makes them visible."""
+        if not publish_manifest(self.storage, _results_document(self._job, self._job.attempt), manifest):
+            raise StorageError("Another result was published for this attempt; ask for a retry.")
+        return _result_files(manifest)
+
+    def withdraw_results(self) -> None:
+        """Take back the manifests of this attempt, and of those before it that it would begin with."""
+        for attempt in range(self._job.attempt, self._job.fresh_after, -1):
+            self.storage.remove_document(_results_document(self._job, attempt))
+
+    def store_partial_results(self) -> list[ResultFile]:
+        """Store what results there are of a program that failed; its job's row shows them, nothing else."""
+        folder = self.folder / RESULTS_FOLDER
+        return _result_files(store_tree(self.storage, folder)) if folder.is_dir() else []
+
+    def measured_psnr(self, results: Sequence[ResultFile]) -> float | None:
+        """Mean PSNR over the held-out views, dB, as the results say; None if they do not."""
+        for result in results:
+            if result.name == METRICS_FILE and result.size_bytes <= MAX_METRICS_BYTES:
+                try:
+                    mean = json.loads(b"".join(self.storage.read(result.sha256)))["mean"]["psnr"]
+                except (StorageError, ValueError, TypeError, KeyError):
+                    return None
+                return float(mean) if isinstance(mean, int | float) and math.isfinite(mean) else None
+        return None
+
+    def find_published_results(self) -> list[ResultFile] | None:
+        """Results that an earlier attempt published without getting to say so."""
+        for attempt in range(self._job.attempt - 1, self._job.fresh_after, -1):
+            manifest = read_manifest(self.storage, _results_document(self._job, attempt))
+            if manifest is not None:
+                return _result_files(manifest)
+        return None
+
+    def store_file(self, name: str) -> str:
+        """Store one file of the folder and return its digest."""
+        return store_tree(self.storage, self.folder, [name]).files[0].sha256
+
+    def _store_files(self, names: Sequence[str]) -> tuple[TreeFile, ...]:
+        """Store files; finished frames never change, so that each of them is read once."""
+        new = [name for name in names if name not in self._stored_frames]
+        files = {file.path: file for file in store_tree(self.storage, self.folder, new).files}
+        found = tuple(self._stored_frames.get(name) or files[name] for name in names)
+        record = f"{RUN_FOLDER}/{FRAMES_FOLDER}/{RECORD_FILE}"
+        self._stored_frames |= {
+            n: f for n, f in files.items() if n.startswith(f"{RUN_FOLDER}/{FRAMES_FOLDER}/") and n != record
+        }
+        return found
+
+    def _frame_checkpoint_files(self) -> list[str]:
+        """The record of finished frames, and those that it names."""
+        folder = self.folder / RUN_FOLDER / FRAMES_FOLDER
+        try:
+            rows = [
+                json.loads(line) for line in (folder / RECORD_FILE).read_text(encoding="utf-8").splitlines()
+            ]
+        except (OSError, ValueError):  # none yet, or it is being written
+            return []
+        names = [RECORD_FILE, *(row["file"] for row in rows[1:])]
+        return [f"{RUN_FOLDER}/{FRAMES_FOLDER}/{name}" for name in names if (folder / name).is_file()]
+
+    def _checkpoint_files(self, stage: str) -> list[str]:
+        if stage == "render":
+            return self._frame_checkpoint_files()
+        names = [name for name in _CHECKPOINT_FILES if (self.folder / name).is_file()]
+        poses = [
+            path.relative_to(self.folder).as_posix()
+            for path in sorted((self.folder / RUN_FOLDER / POSES_FOLDER).glob("*"))
+        ]
+        names += poses
+        if "run/scene.ply" in names:  # the training is done, its checkpoints are of no more use
+            return [name for name in names if not name.endswith(".npz")]
+        checkpoints = [
+            path.relative_to(self.folder).as_posix()
+            for path in (self.folder / RUN_FOLDER / "checkpoints").glob("iteration_*.npz")
+        ]
+        newest = max((name for name in checkpoints if _CHECKPOINT.fullmatch(name)), default=None)
+        if newest is not None:
+            return [*names, newest]
+        return names if poses else []
+
+
+def sweep_workspaces(root: Path, dataset_seconds: float = 86_400.0) -> int:
+    """Remove the folders of attempts whose worker is gone, and photographs not used for a while.
+
+    Args:
+        root: folder of all work on this machine.
+        dataset_seconds: how long photographs stay that no attempt uses.
+
+    Returns:
+        Number of folders removed.
+    """
+    removed = 0
+    for folder in (root / "attempts").glob("*"):
+        try:
+            lock = _open_locked(folder / _LOCK_FILE, create=False)
+        except BlockingIOError:
+            continue
+        except OSError:
+            if time.time() - folder.stat().st_mtime < 60:
+                continue  # being made right now
+            shutil.rmtree(folder, ignore_errors=True)
+        else:
+            with lock:
+                shutil.rmtree(folder, ignore_errors=True)
+        removed += 1
+    for folder in (root / "datasets").glob("*"):
+        with contextlib.suppress(OSError):  # in use, or gone already
+            if time.time() - folder.stat().st_mtime < dataset_seconds:
+                continue
+            with (folder / _LOCK_FILE).open("ab") as lock:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                shutil.rmtree(folder, ignore_errors=True)
+            removed += 1
+    return removed
+
+
+def sweep_temporary(folder: Path, older_than_seconds: float) -> int:
+    """Remove folders that killed checks of COLMAP models have left among the temporary files of this machine.
+
+    Args:
+        folder: of temporary files.
+        older_than_seconds: what was changed since may be in use.
+
+    Returns:
+        Number of folders removed.
+    """
+    removed = 0
+    for left in folder.glob("octasplat-model-????????"):
+        with contextlib.suppress(OSError):
+            facts = left.lstat()
+            old = time.time() - facts.st_mtime > older_than_seconds
+            if stat.S_ISDIR(facts.st_mode) and facts.st_uid == os.geteuid() and old:
+                shutil.rmtree(left, ignore_errors=True)
+                removed += 1
+    return removed
+
+
+def _tree_files(files: Sequence[DatasetFile]) -> list[TreeFile]:
+    return [TreeFile(path=f.path, sha256=f.sha256, size_bytes=f.size_bytes) for f in files]
+
+
+def _result_files(manifest: Manifest) -> list[ResultFile]:
+    return [ResultFile(f.path, f.sha256, f.size_bytes, media_type(f.path)) for f in manifest.files]
+
+
+def _results_document(job: Job, attempt: int) -> str:
+    return f"results/{job.id}/{attempt}"
+
+
+def _open_locked(path: Path, *, create: bool = True) -> IO[bytes]:
+    """Open a file and hold its lock, which ends with this process."""
+    handle = path.open("wb" if create else "r+b")
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        handle.close()
+        raise
+    return handle
+
+
+def _lock_dataset_folder(folder: Path) -> IO[bytes]:
+    """Make a folder of photographs and keep it from being swept for as long as the file is open."""
+    while True:
+        folder.mkdir(parents=True, exist_ok=True)
+        with contextlib.suppress(FileNotFoundError):  # swept this moment
+            handle = (folder / _LOCK_FILE).open("ab")
+            fcntl.flock(handle, fcntl.LOCK_SH)
+            with contextlib.suppress(FileNotFoundError):
+                if os.path.samestat(os.fstat(handle.fileno()), (folder / _LOCK_FILE).stat()):
+                    return handle
+            handle.close()
