@@ -48,7 +48,7 @@ def textured(tracer, tmp_path_factory) -> TriangleMesh:
 
 def test_ball_comes_out_closed_round_and_in_its_colours(surface):
     mesh = surface.mesh
-    assert surface.edges.watertight
+    assert surface.edges.is_watertight
     assert edge_report(mesh.faces) == surface.edges
     radii = np.linalg.norm(mesh.vertices_world, axis=1)
     # The tiles are flat and overlap, so that the median hit lies a little under the ball.

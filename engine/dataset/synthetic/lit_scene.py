@@ -111,11 +111,11 @@ class LitScene:
             here = at[mine]
             albedo = thing.material(np.ascontiguousarray(here[:, _XYZ]), np.ascontiguousarray(here[:, _UV]))
             bright = albedo * here[:, _LIGHT]
-            if thing.gloss:
+            if thing.specular:
                 rays = hit[mine]
                 places = origins[rays] + hits.distances[rays, None] * directions[rays]
                 bright += (
-                    np.float32(thing.gloss)
+                    np.float32(thing.specular)
                     * _phong_highlight(places, directions[rays], here[:, _NORMAL])[:, None]
                     * (here[:, _LAMP_SEEN, None] * _SPECULAR_STRENGTH)
                 )

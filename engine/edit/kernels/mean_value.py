@@ -64,14 +64,14 @@ def _angle(sine, cosine):
     """Angles in [0, pi] of vectors whose sines are not negative; both may have any common factor."""
     ahead = abs(cosine)
     beyond = sine > ahead
-    small, large = beyond.where(ahead, sine), beyond.where(sine, ahead)
+    small, large = beyond.select(ahead, sine), beyond.select(sine, ahead)
     # Beyond an eighth of a half turn, what is missing to two eighths.
     steep = small > large * STEEP_LIMIT
-    z = steep.where(small - large, small) / steep.where(small + large, large).larger(TINY_LENGTH)
+    z = steep.select(small - large, small) / steep.select(small + large, large).maximum(TINY_LENGTH)
     angle = _polynomial(ARCTANGENT, z * z) * z
-    angle = steep.where(angle + math.pi / 4, angle)
-    angle = beyond.where(angle * -1.0 + math.pi / 2, angle)
-    return (cosine < 0.0).where(angle * -1.0 + math.pi, angle)
+    angle = steep.select(angle + math.pi / 4, angle)
+    angle = beyond.select(angle * -1.0 + math.pi / 2, angle)
+    return (cosine < 0.0).select(angle * -1.0 + math.pi, angle)
 
 
 def _constant_one(builder):
@@ -159,7 +159,7 @@ class _Triangle:
             shares[0] * normals[0][axis] + shares[1] * normals[1][axis] + shares[2] * normals[2][axis]
             for axis in range(3)
         ]
-        inverse = where.where(_constant_one(builder) / self.volume, 0.0)
+        inverse = where.select(_constant_one(builder) / self.volume, 0.0)
         for k, normal in enumerate(normals):
             row = VectorRows(builder, builder.extract_value(sums, k), DOUBLE8)
             row[0] = row[0] + _dot(mean, normal) * inverse
