@@ -1,6 +1,10 @@
 """What the header of an image tells, apart from what reads it and needs more libraries."""
 
 from dataclasses import dataclass
+from typing import Literal
+
+Storage = Literal["8-bit", "16-bit", "float", "radiance"]
+"""How an image file stores values: integers, numbers of no fixed range, or linear light (EXR, HDR)."""
 
 
 @dataclass(frozen=True)
@@ -13,6 +17,7 @@ class ImageInfo:
         bits: 8, or 16 for all deeper formats, floating point included.
         has_alpha: whether there is an alpha channel.
         orientation: EXIF orientation, 1 if there is none.
+        storage: how values are stored.
     """
 
     width_px: int
@@ -20,3 +25,4 @@ class ImageInfo:
     bits: int
     has_alpha: bool
     orientation: int
+    storage: Storage = "8-bit"

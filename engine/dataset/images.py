@@ -1,18 +1,37 @@
 """Reading photographs and masks, whatever their format, as display values at a working size."""
 
+import struct
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import OpenImageIO as oiio
 from jaxtyping import Float32, UInt8
+from PIL.TiffImagePlugin import ImageFileDirectory_v2
 
 from octasplat.engine.colour import linear_to_srgb
-from octasplat.engine.dataset.image_info import ImageInfo
+from octasplat.engine.dataset.image_info import ImageInfo, Storage
 from octasplat.engine.errors import DatasetError
 from octasplat.engine.threads import one_torch_thread
 
 Pixels = np.ndarray[Any, np.dtype[Any]]
+_FLOATS = (oiio.HALF, oiio.FLOAT, oiio.DOUBLE)
+_EXTRA_SAMPLES = 338
+"""The TIFF tag that says what channels beyond the colours are."""
+
+
+@dataclass(frozen=True)
+class ValueScale:
+    """What stored values of a kind of photographs mean.
+
+    Attributes:
+        full: the stored value of full brightness.
+        is_display: whether values are display values, not linear light.
+    """
+
+    full: float
+    is_display: bool
 
 
 def read_image_info(path: Path) -> ImageInfo:
@@ -21,19 +40,32 @@ def read_image_info(path: Path) -> ImageInfo:
     Raises:
         DatasetError: the file is missing or not an image.
     """
-    source, spec = _open_image(path)
+    source, spec = open_image(path)
     source.close()
     return ImageInfo(
         width_px=spec.width,
         height_px=spec.height,
         bits=8 if spec.format.basetype in (oiio.UINT8, oiio.INT8) else 16,
-        has_alpha=spec.alpha_channel >= 0,
+        has_alpha=alpha_channel_of(spec, path) is not None,
         orientation=spec.get_int_attribute("Orientation", 1),
+        storage=_storage(spec, path),
     )
 
 
+def read_stored_colours(path: Path) -> Float32[np.ndarray, "h w 3"]:
+    """Read the colours of an image in the file's own units, e.g. 0 to 65535 for 16 bits.
+
+    Raises:
+        DatasetError: the file cannot be read to its end.
+    """
+    source, spec = open_image(path)
+    kind = "float" if spec.format.basetype in _FLOATS else "uint16"
+    pixels = read_pixels(source, path, kind)
+    return _colour_channels(pixels, spec, alpha_channel_of(spec, path)).astype(np.float32)
+
+
 def read_photo(
-    path: Path, width_px: int, height_px: int, bits: int
+    path: Path, width_px: int, height_px: int, bits: int, scale: ValueScale | None = None
 ) -> tuple[Pixels, UInt8[np.ndarray, "h w"] | None]:
     """Read a photograph as straight (not premultiplied) display colours.
 
@@ -46,6 +78,7 @@ def read_photo(
         width_px: working width, not more than that of the file.
         height_px: working height, not more than that of the file.
         bits: 8 or 16, the depth of the answer.
+        scale: what the stored values mean, where that is not as the format says.
 
     Returns:
         Colours (height, width, 3) as uint8 or uint16 over their full range, and alpha or None.
@@ -53,13 +86,18 @@ def read_photo(
     Raises:
         DatasetError: the file cannot be read to its end.
     """
-    source, spec = _open_image(path)
-    is_float = spec.format.basetype in (oiio.HALF, oiio.FLOAT, oiio.DOUBLE)
+    source, spec = open_image(path)
+    is_float = spec.format.basetype in _FLOATS
     is_8_bit = spec.format.basetype in (oiio.UINT8, oiio.INT8)
     straight = spec.get_int_attribute("oiio:UnassociatedAlpha", 0) == 1
-    pixels = _read_pixels(source, path, "float" if is_float else "uint8" if is_8_bit else "uint16")
-    rgb = _colour_channels(pixels, spec)
-    alpha = pixels[..., spec.alpha_channel] if spec.alpha_channel >= 0 else None
+    pixels = read_pixels(source, path, "float" if is_float else "uint8" if is_8_bit else "uint16")
+    alpha_channel = alpha_channel_of(spec, path)
+    rgb = _colour_channels(pixels, spec, alpha_channel)
+    alpha = None if alpha_channel is None else pixels[..., alpha_channel]
+    if scale is not None:
+        rgb = np.clip(rgb.astype(np.float32) / np.float32(scale.full), 0.0, None)
+        if not is_float:
+            rgb = _as_bits(rgb, 16)
     resized = (width_px, height_px) != (spec.width, spec.height)
 
     if alpha is None and not is_float:
@@ -74,7 +112,9 @@ def read_photo(
     if coverage is not None and not straight:
         colours = _unpremultiplied(colours, coverage)
     if is_float:
-        colours = linear_to_srgb(np.clip(np.nan_to_num(colours, nan=0.0, posinf=1.0, neginf=0.0), 0.0, 1.0))
+        colours = np.clip(np.nan_to_num(colours, nan=0.0, posinf=1.0, neginf=0.0), 0.0, 1.0)
+        if scale is None or not scale.is_display:
+            colours = linear_to_srgb(colours)
     if resized and coverage is None:
         colours = resize(colours, width_px, height_px)
     elif resized and coverage is not None:
@@ -88,36 +128,6 @@ def read_photo(
         assert alpha is not None
         return _as_bits(rgb, bits), _as_bits(alpha, 8)
     return _as_bits(colours, bits), None if coverage is None else _as_bits(coverage, 8)
-
-
-def read_mask(
-    path: Path, image_size_px: tuple[int, int], width_px: int, height_px: int
-) -> UInt8[np.ndarray, "h w"]:
-    """Read a mask, 255 where the photograph is valid.
-
-    Args:
-        path: the mask file; its first channel counts.
-        image_size_px: width and height of the photograph as stored, which the mask must share.
-        width_px: working width.
-        height_px: working height.
-
-    Raises:
-        DatasetError: the file is not a whole image, has another size than its photograph, or holds no
-            value above 1, i.e. uses 1 for white.
-    """
-    source, spec = _open_image(path)
-    if (spec.width, spec.height) != image_size_px:
-        source.close()
-        raise DatasetError(
-            f"{path} is {spec.width}x{spec.height} but its photograph is "
-            f"{image_size_px[0]}x{image_size_px[1]}; make the mask as large as the photograph."
-        )
-    mask = np.ascontiguousarray(_read_pixels(source, path, "uint8")[..., 0])
-    if mask.max() == 1:
-        raise DatasetError(f"{path} uses the value 1 for valid pixels; store them as white (255).")
-    if (width_px, height_px) != image_size_px:
-        mask = resize(mask[..., None], width_px, height_px, mode="bilinear")[..., 0]
-    return mask
 
 
 def resize(pixels: Pixels, width_px: int, height_px: int, mode: str = "bicubic") -> Pixels:
@@ -134,7 +144,12 @@ def resize(pixels: Pixels, width_px: int, height_px: int, mode: str = "bicubic")
     return np.ascontiguousarray(small[0].permute(1, 2, 0).numpy())
 
 
-def _open_image(path: Path) -> tuple[Any, Any]:
+def open_image(path: Path) -> tuple[Any, Any]:
+    """Open an image; return what reads it and its header.
+
+    Raises:
+        DatasetError: the file is missing or not an image.
+    """
     # By default OpenImageIO multiplies alpha into the colours of formats that store them straight.
     wish = oiio.ImageSpec()
     wish.attribute("oiio:UnassociatedAlpha", 1)
@@ -145,7 +160,12 @@ def _open_image(path: Path) -> tuple[Any, Any]:
     return source, source.spec()
 
 
-def _read_pixels(source: Any, path: Path, kind: str) -> Pixels:
+def read_pixels(source: Any, path: Path, kind: str) -> Pixels:
+    """Read all channels (height, width, channels) of an opened image, converted to ``kind``.
+
+    Raises:
+        DatasetError: the file is damaged or cut short.
+    """
     pixels = source.read_image(kind)
     message = source.geterror()
     source.close()
@@ -162,12 +182,46 @@ def _single_line_message(message: str, path: Path) -> str:
     return f" ({line.rstrip('.')})" if line else ""
 
 
-def _colour_channels(pixels: Pixels, spec: Any) -> Pixels:
+def alpha_channel_of(spec: Any, path: Path) -> int | None:
+    """Return the index of the alpha channel; None where the file does not say that there is one."""
+    found = int(spec.alpha_channel)
+    if found >= spec.nchannels:  # OpenImageIO's header of a GIF counts one too far
+        found = list(spec.channelnames).index("A") if "A" in spec.channelnames else -1
+    if found < 0 or (_is_tiff(spec) and not _has_extra_samples(path)):
+        return None
+    return found
+
+
+def _is_tiff(spec: Any) -> bool:
+    return spec.get_int_attribute("tiff:PhotometricInterpretation", -1) >= 0
+
+
+def _has_extra_samples(path: Path) -> bool:
+    """Whether the TIFF says what its further channels are; OpenImageIO takes a fourth one as alpha anyway."""
+    try:
+        with path.open("rb") as file:
+            head = file.read(8)
+            head += file.read(8) if head[2:4] in (b"\x2b\0", b"\0\x2b") else b""
+            tags = ImageFileDirectory_v2(head)
+            file.seek(tags.next)
+            tags.load(file)
+            return _EXTRA_SAMPLES in tags
+    except (OSError, SyntaxError, ValueError, struct.error):
+        return True
+
+
+def _storage(spec: Any, path: Path) -> Storage:
+    if spec.format.basetype in _FLOATS:
+        return "radiance" if path.suffix.lower() in (".exr", ".hdr", ".rgbe", ".pic") else "float"
+    return "8-bit" if spec.format.basetype in (oiio.UINT8, oiio.INT8) else "16-bit"
+
+
+def _colour_channels(pixels: Pixels, spec: Any, alpha_channel: int | None) -> Pixels:
     names = [name.rsplit(".", 1)[-1].upper() for name in spec.channelnames]
     if all(letter in names for letter in "RGB"):
         picked = [names.index(letter) for letter in "RGB"]
     else:
-        others = [i for i in range(len(names)) if i != spec.alpha_channel]
+        others = [i for i in range(len(names)) if i != alpha_channel]
         picked = others[:3] if len(others) >= 3 and "Y" not in names else [others[0] if others else 0] * 3
     if picked == [0, 1, 2] and pixels.shape[2] == 3:
         return pixels

@@ -1,6 +1,7 @@
 """Matching a COLMAP model with the photographs and masks on disk."""
 
 import os
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +10,9 @@ from jaxtyping import Float64
 from octasplat.engine.dataset.camera import Camera
 from octasplat.engine.dataset.colmap_model import ColmapModel, PosedImage, read_colmap_model
 from octasplat.engine.dataset.image_info import ImageInfo
+from octasplat.engine.dataset.image_names import match_image_names
 from octasplat.engine.dataset.images import read_image_info
+from octasplat.engine.dataset.masks import mask_for, masks_beside
 from octasplat.engine.dataset.model import DatasetModel, DatasetView, Observations
 from octasplat.engine.dataset.views_file import capped_size
 from octasplat.engine.errors import ConfigError, DatasetError
@@ -82,8 +85,10 @@ def load_dataset_model(
     warnings = list(model.warnings)
     if for_training and len(model.points) == 0:
         warnings.append(f"The model in {model.folder} has no 3D points; the start will be random.")
-    paths = _image_paths(image_folder(root), model, warnings, warn_unposed=model_folder is None)
-    masks = _mask_paths(root, [image.name for image in model.images], warnings)
+    images, paths, beside = _find_images(
+        image_folder(root), model, warnings, warn_unposed=model_folder is None
+    )
+    masks = _mask_paths(root, [image.name for image in images], beside, warnings)
     if model_folder is None:
         _warn_of_other_models(model.folder, warnings)
 
@@ -91,7 +96,7 @@ def load_dataset_model(
     infos: list[ImageInfo] = []
     observed_px: list[Float64[np.ndarray, "k 2"]] = []
     camera_indices: dict[Camera, int] = {}
-    for image, path, mask in zip(model.images, paths, masks, strict=True):
+    for image, path, mask in zip(images, paths, masks, strict=True):
         info = read_image_info(path)
         original = model.cameras[image.camera_id]
         _check_size(original, info, image, path)
@@ -120,7 +125,7 @@ def load_dataset_model(
         points=model.points,
         observations=Observations(
             np.repeat(np.arange(len(views)), [len(shown) for shown in observed_px]),
-            np.concatenate([image.observed_point_ids for image in model.images]),
+            np.concatenate([image.observed_point_ids for image in images]),
             np.concatenate(observed_px),
         ),
         warnings=tuple(warnings),
@@ -132,36 +137,51 @@ def image_folder(root: Path) -> Path:
     return root / "images" if (root / "images").is_dir() else root
 
 
-def _image_paths(folder: Path, model: ColmapModel, warnings: list[str], *, warn_unposed: bool) -> list[Path]:
+def _find_images(
+    folder: Path, model: ColmapModel, warnings: list[str], *, warn_unposed: bool
+) -> tuple[list[PosedImage], list[Path], dict[str, Path]]:
+    """Return the images of the model under the names of their files, sorted, the files and masks beside."""
     on_disk = _files_below(folder)
-    paths: list[Path] = []
-    missing: list[str] = []
-    for image in model.images:
-        # Nothing outside images/ is read, whatever a model from elsewhere asks for.
-        path = on_disk.pop(normalised(image.name), None)
-        if path is None:
-            missing.append(image.name)
-        else:
-            paths.append(path)
+    images_on_disk = [name for name, path in on_disk.items() if path.suffix.lower() in IMAGE_SUFFIXES]
+    owners = masks_beside(images_on_disk)
+    names = [image.name for image in model.images]
+    # Nothing outside images/ is read, whatever a model from elsewhere asks for.
+    found = match_image_names(names, on_disk.keys() - (owners.keys() - {normalised(name) for name in names}))
+    missing = [name for name in names if name not in found]
     if missing:
         raise DatasetError(
-            f"{len(missing)} of {len(model.images)} images of the model are not in {folder} "
+            f"{len(missing)} of {len(names)} images of the model are not in {folder} "
             f"({_name_list(missing)}); put them there or run COLMAP without them."
         )
-    unposed = sorted(name for name, path in on_disk.items() if path.suffix.lower() in IMAGE_SUFFIXES)
+    respelt = [name for name in names if normalised(name) != found[name]]
+    if respelt:
+        warnings.append(
+            f"{len(respelt)} images of the model are spelt otherwise in {folder}; "
+            f"{found[respelt[0]]} is taken for {respelt[0]}, for instance."
+        )
+    others = {name: found[name] for name in respelt}
+    images = [replace(image, name=others.get(image.name, image.name)) for image in model.images]
+    images.sort(key=lambda image: image.name)
+    paths = [on_disk[normalised(image.name)] for image in images]
+    posed = set(found.values())
+    unposed = sorted(set(images_on_disk) - posed - owners.keys())
     if unposed and warn_unposed:
         warnings.append(
             f"{len(unposed)} images in {folder} have no pose and are left out ({_name_list(unposed)})."
         )
-    return paths
+    beside = {owner: on_disk[mask] for mask, owner in owners.items() if mask not in posed}
+    return images, paths, beside
 
 
-def _mask_paths(root: Path, names: list[str], warnings: list[str]) -> list[Path | None]:
+def _mask_paths(
+    root: Path, names: list[str], beside: dict[str, Path], warnings: list[str]
+) -> list[Path | None]:
     folder = root / "masks"
-    if not folder.is_dir():
+    if not folder.is_dir() and not beside:
         return [None] * len(names)
     on_disk = _files_below(folder)
-    masks = [on_disk.get(normalised(f"{name}.png")) for name in names]
+    on_disk = {name.casefold(): path for name, path in on_disk.items()} | on_disk
+    masks = [mask_for(normalised(name), on_disk, beside) for name in names]
     without = [name for name, mask in zip(names, masks, strict=True) if mask is None]
     if len(without) == len(names):
         warnings.append(
@@ -169,9 +189,7 @@ def _mask_paths(root: Path, names: list[str], warnings: list[str]) -> list[Path 
             f"({names[0]}.png)."
         )
     elif without:
-        warnings.append(
-            f"{len(without)} images have no mask in {folder} and count whole ({_name_list(without)})."
-        )
+        warnings.append(f"{len(without)} images have no mask and count whole ({_name_list(without)}).")
     return masks
 
 

@@ -19,15 +19,17 @@ from typing import TypedDict
 import numpy as np
 from jaxtyping import Int64
 
-from octasplat.engine.dataset.image_info import ImageInfo
-from octasplat.engine.dataset.images import read_mask, read_photo
+from octasplat.engine.dataset.image_info import ImageInfo, Storage
+from octasplat.engine.dataset.images import ValueScale, read_photo
 from octasplat.engine.dataset.mapped_array import MappedArray
+from octasplat.engine.dataset.masks import MaskSummary, check_masks, read_mask
 from octasplat.engine.dataset.model import DatasetModel, DatasetView
+from octasplat.engine.dataset.value_scale import find_value_scales
 from octasplat.engine.dataset.views_file import FileDigests
 from octasplat.engine.errors import DatasetError, NoSpaceLeft, OutputError
 from octasplat.engine.writing import replacing, write_json
 
-CACHE_VERSION = 2
+CACHE_VERSION = 3
 """Raised whenever the contents of the cache files change for the same photographs."""
 
 DECODING_BYTES = 2 << 30
@@ -200,7 +202,7 @@ def _build_cache(
                 files[name] = os.open(temporary, os.O_RDWR | os.O_CREAT | os.O_TRUNC, 0o666)
                 stack.callback(os.close, files[name])
                 os.posix_fallocate(files[name], 0, size)  # a full disk shows now, not after an hour
-            summaries = _decode_all(model, offsets, bits, files, threads, progress)
+            summaries, warnings = _decode_all(model, offsets, bits, files, threads, progress)
         # Many RGBA files are opaque throughout; their plane would only cost memory traffic.
         transparent = any(summary.is_transparent for summary in summaries)
         for name in ("alpha", "mask"):
@@ -212,8 +214,8 @@ def _build_cache(
         raise OutputError(
             f"The pixel cache cannot be written to {folder} ({error.strerror}); name another folder."
         ) from error
-    black = [view.name for view, summary in zip(model.views, summaries, strict=True) if summary.is_masked_out]
-    warnings = [f"{len(black)} masks hold no valid (white) pixel, e.g. that of {black[0]}."] if black else []
+    masks = [summary.mask for summary in summaries if summary.mask is not None]
+    warnings += check_masks(masks, len(model.views))
     index: _Index = {
         "version": CACHE_VERSION,
         "stamp": stamp,
@@ -231,7 +233,7 @@ def _build_cache(
 class _ViewSummary:
     digests: FileDigests
     is_transparent: bool
-    is_masked_out: bool
+    mask: MaskSummary | None
 
 
 def _decode_all(
@@ -241,15 +243,23 @@ def _decode_all(
     files: dict[str, int],
     threads: int,
     progress: Progress | None,
-) -> list[_ViewSummary]:
+) -> tuple[list[_ViewSummary], list[str]]:
+    """Decode all views into ``files``; return what was found, and warnings."""
+    scales: dict[Storage, ValueScale] = {}
+
     def decode(index: int) -> _ViewSummary:
-        return _decode_view(model.views[index], model.image_infos[index], int(offsets[index]), bits, files)
+        view, info = model.views[index], model.image_infos[index]
+        return _decode_view(view, info, int(offsets[index]), bits, files, scales.get(info.storage))
 
     # Bytes a pixel: as stored, as float32, and a copy of either while channels are rearranged.
     largest = max(36 * info.width_px * info.height_px for info in model.image_infos)
     workers = min(threads if threads > 0 else os.cpu_count() or 1, max(1, DECODING_BYTES // largest))
     summaries: list[_ViewSummary] = []
     with ThreadPoolExecutor(workers) as pool:
+        photographs = [
+            (view.image_path, info) for view, info in zip(model.views, model.image_infos, strict=True)
+        ]
+        scales, warnings = find_value_scales(photographs, pool.map)
         futures = [pool.submit(decode, index) for index in range(len(model.views))]
         try:
             for future in futures:
@@ -258,15 +268,20 @@ def _decode_all(
                     progress(len(summaries), len(futures))
         finally:
             pool.shutdown(cancel_futures=True)
-    return summaries
+    return summaries, list(warnings)
 
 
 def _decode_view(
-    view: DatasetView, info: ImageInfo, offset: int, bits: int, files: dict[str, int]
+    view: DatasetView,
+    info: ImageInfo,
+    offset: int,
+    bits: int,
+    files: dict[str, int],
+    scale: ValueScale | None,
 ) -> _ViewSummary:
     width, height = view.width_px, view.height_px
     digests = _file_digests(view)  # the file is then at hand for the decoder
-    rgb, alpha = read_photo(view.image_path, width, height, bits)
+    rgb, alpha = read_photo(view.image_path, width, height, bits, scale)
     if rgb.shape != (height, width, 3):
         raise DatasetError(
             f"{view.image_path} changed while it was read; leave the scene alone until it is read."
@@ -275,16 +290,16 @@ def _decode_view(
     if "alpha" in files:
         opaque = np.full((height, width), 255, dtype=np.uint8)
         _write_at_offset(files["alpha"], opaque if alpha is None else alpha, offset)
-    mask = None
+    summary = None
     if "mask" in files:
         mask = np.full((height, width), 255, dtype=np.uint8)
         if view.mask_path is not None:
-            mask = read_mask(view.mask_path, (info.width_px, info.height_px), width, height)
+            mask, summary = read_mask(view.mask_path, (info.width_px, info.height_px), width, height)
         _write_at_offset(files["mask"], mask, offset)
     return _ViewSummary(
         digests=digests,
         is_transparent=alpha is not None and int(alpha.min()) < 255,
-        is_masked_out=mask is not None and int(mask.max()) < 128,
+        mask=summary,
     )
 
 

@@ -5,6 +5,7 @@ import os
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
+from octasplat.engine.dataset.masks import masks_beside
 from octasplat.engine.errors import DatasetError
 from octasplat.engine.poses.config import MIN_PHOTOGRAPHS
 from octasplat.engine.results_among import is_results
@@ -16,7 +17,8 @@ def photographs_in(folder: Path) -> list[str]:
     """Names of the photographs that poses can be found for, relative to ``folder``.
 
     Those in folders below count only where ``folder`` is called ``images``; below a bare folder there may be
-    anything, masks and results among it. Results of a run within ``images`` are no photographs either.
+    anything, masks and results among it. Results of a run within ``images`` are no photographs either, nor
+    are masks beside photographs, as ``a_mask.png`` of ``a.jpg``.
 
     Raises:
         DatasetError: there are fewer than three.
@@ -27,6 +29,8 @@ def photographs_in(folder: Path) -> list[str]:
         for path in below
         if path.suffix.lower() in _SUFFIXES and path.is_file() and not path.name.startswith(".")
     )
+    masks = masks_beside(names)
+    names = [name for name in names if name not in masks]
     if len(names) < MIN_PHOTOGRAPHS:
         raise DatasetError(
             f"{folder} holds {len(names)} photographs that poses can be found for (JPEG, PNG, TIFF, BMP); "

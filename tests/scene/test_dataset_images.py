@@ -2,7 +2,8 @@ import numpy as np
 import pytest
 
 from octasplat.engine.colour import linear_to_srgb
-from octasplat.engine.dataset.images import read_image_info, read_mask, read_photo
+from octasplat.engine.dataset.images import read_image_info, read_photo
+from octasplat.engine.dataset.masks import read_mask
 from octasplat.engine.errors import DatasetError
 
 
@@ -148,11 +149,11 @@ def test_a_mask_is_read_and_reduced(tmp_path, save_image):
     mask = np.zeros((24, 32), np.uint8)
     mask[:, 16:] = 255
     save_image(tmp_path / "m.png", mask)
-    np.testing.assert_array_equal(read_mask(tmp_path / "m.png", (32, 24), 32, 24), mask)
-    small = read_mask(tmp_path / "m.png", (32, 24), 8, 6)
+    np.testing.assert_array_equal(read_mask(tmp_path / "m.png", (32, 24), 32, 24)[0], mask)
+    small, _ = read_mask(tmp_path / "m.png", (32, 24), 8, 6)
     assert (small[:, :3] == 0).all() and (small[:, 5:] == 255).all()
     save_image(tmp_path / "rgb.png", np.repeat(mask[..., None], 3, axis=2))
-    np.testing.assert_array_equal(read_mask(tmp_path / "rgb.png", (32, 24), 32, 24), mask)
+    np.testing.assert_array_equal(read_mask(tmp_path / "rgb.png", (32, 24), 32, 24)[0], mask)
 
 
 def test_masks_that_do_not_fit_are_named(tmp_path, save_image):

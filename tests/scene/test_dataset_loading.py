@@ -144,7 +144,7 @@ def test_dataset_unusual_input_warns(tmp_path, make_scene, save_image, coded):
 
 def test_dataset_unmatched_masks_warn(tmp_path, make_scene, save_image):
     root = make_scene(tmp_path)
-    save_image(root / "masks/view_0.png", np.full((24, 32), 255, np.uint8))
+    save_image(root / "masks/mask_0.png", np.full((24, 32), 255, np.uint8))
     scene = load_dataset_model(root)
     assert "view_0.png.png" in scene.warnings[0]
     assert all(view.mask_path is None for view in scene.views)

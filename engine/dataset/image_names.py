@@ -1,0 +1,58 @@
+"""Names of images in a model, matched with the files that are there though they are spelt otherwise.
+
+Models come from other machines: upper and lower case, backslashes, folders before the name and suffixes
+differ. A name is taken for a file only where no other name and no other file could be meant.
+"""
+
+from collections import Counter
+from collections.abc import Callable, Collection, Iterable, Mapping
+from pathlib import PurePosixPath
+
+from octasplat.engine.relative_paths import normalised
+
+
+def match_image_names(names: Iterable[str], files: Collection[str]) -> Mapping[str, str]:
+    """Return the file of each name of a model that has one, as paths below the folder of the images.
+
+    Args:
+        names: of the images of the model, each once.
+        files: paths below the folder of the images, normalised, with forward slashes.
+
+    >>> match_image_names(["A/1.JPG", "2.jpg", "/tmp/3.png"], ["a/1.jpg", "2.jpg", "3.png", "4.png"])
+    {'2.jpg': '2.jpg', 'A/1.JPG': 'a/1.jpg', '/tmp/3.png': '3.png'}
+    """
+    names = list(names)
+    found = {name: normalised(name) for name in names if normalised(name) in files}
+    for spelling in (_slashes, _case, _without_suffix, _last_part, _stem):
+        taken = set(found.values())
+        free = _by_spelling((file for file in files if file not in taken), spelling)
+        wanted = _by_spelling((name for name in names if name not in found), spelling)
+        found |= {name: free[spelt] for spelt, name in wanted.items() if spelt in free}
+    return found
+
+
+def _by_spelling(names: Iterable[str], spelling: Callable[[str], str]) -> dict[str, str]:
+    """Return the names by how they are spelt, without those that are then the same."""
+    pairs = [(spelling(name), name) for name in names]
+    counts = Counter(spelt for spelt, _ in pairs)
+    return {spelt: name for spelt, name in pairs if counts[spelt] == 1}
+
+
+def _slashes(name: str) -> str:
+    return str(PurePosixPath(normalised(name).replace("\\", "/")))
+
+
+def _case(name: str) -> str:
+    return _slashes(name).casefold()
+
+
+def _without_suffix(name: str) -> str:
+    return str(PurePosixPath(_case(name)).with_suffix(""))
+
+
+def _last_part(name: str) -> str:
+    return PurePosixPath(_case(name)).name
+
+
+def _stem(name: str) -> str:
+    return PurePosixPath(_case(name)).stem
