@@ -19,25 +19,20 @@ import uuid
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
 import httpx
 
 from octasplat.workers.client.api import Api, find_address, find_token
+from tests.intake.test_archive import NAMES, STRUCTURES, TWINS, linked_kinds
+from tests.intake.test_dataset import HORRORS
+from tests.intake.test_image_headers import BAD
+from tests.service.test_webhooks import REFUSED_URLS
+from tests.support.model_builder import ColmapModelBuilder, photographs
+from tests.support.zip_builder import ZipMember, build_zip
 
-TESTS = Path(__file__).parents[1] / "tests"
-sys.path[:0] = [str(TESTS), *(str(TESTS / folder) for folder in ("intake", "service", "work", "store"))]
-
-from model_builder import Model, photographs  # noqa: E402
-from test_archive import NAMES, STRUCTURES, TWINS, linked_kinds  # noqa: E402
-from test_dataset import HORRORS  # noqa: E402
-from test_image_headers import BAD  # noqa: E402
-from test_webhooks import test_addresses_that_are_refused as addresses_refused  # noqa: E402
-from zip_builder import Member, build  # noqa: E402
-
-SCENE = {**photographs(), **Model().files()}
+SCENE = {**photographs(), **ColmapModelBuilder().files()}
 SLOW_CLIENTS = 60
 
 
@@ -120,17 +115,25 @@ def archives() -> Iterator[tuple[str, str, bytes]]:
             archive.addfile(link)
     yield "tar with links", "tar", tar.getvalue()
     for kind, (mode, _) in linked_kinds().items():
-        yield "tar with links", kind, build(Member("images/b.jpg", b"/etc/passwd", mode=mode))
+        yield "tar with links", kind, build_zip(ZipMember("images/b.jpg", b"/etc/passwd", mode=mode))
     for name in NAMES:
-        yield "names in archives", ascii(name)[:60], build(Member(name, b"" if name == "/" else b"x", mode=0))
+        yield (
+            "names in archives",
+            ascii(name)[:60],
+            build_zip(ZipMember(name, b"" if name == "/" else b"x", mode=0)),
+        )
     for pair in TWINS:
-        yield "names in archives", ascii(pair), build(*(Member(name, b"x") for name in pair))
+        yield "names in archives", ascii(pair), build_zip(*(ZipMember(name, b"x") for name in pair))
     for name, (make, _) in STRUCTURES.items():
         yield "archives that lie", name, make()
-    yield "archive bombs", "flat", build(Member("images/a.bmp", bytes(100_000_000)))
-    yield "archive bombs", "nested", build(Member("images/b.zip", build(Member("images/a.jpg", b"x"))))
-    many = [Member(f"images/{number}.jpg", b"", method=0) for number in range(60_000)]
-    yield "archive bombs", "60,000 entries of nothing", build(*many)
+    yield "archive bombs", "flat", build_zip(ZipMember("images/a.bmp", bytes(100_000_000)))
+    yield (
+        "archive bombs",
+        "nested",
+        build_zip(ZipMember("images/b.zip", build_zip(ZipMember("images/a.jpg", b"x")))),
+    )
+    many = [ZipMember(f"images/{number}.jpg", b"", method=0) for number in range(60_000)]
+    yield "archive bombs", "60,000 entries of nothing", build_zip(*many)
 
 
 def attack_uploads(attacker: Attacker) -> None:
@@ -167,7 +170,7 @@ def attack_uploads(attacker: Attacker) -> None:
         attacker.outcomes["archives that lie"].wrong.append(f"kept: {kept}")
     address = attacker.dataset(photographs())
     for what, (make, *_) in HORRORS.items():
-        for name in Model().files():
+        for name in ColmapModelBuilder().files():
             attacker.http.delete(f"{address}/files/{name}")
         for name, content in make().files().items():
             attacker.http.put(f"{address}/files/{name}", content=content).raise_for_status()
@@ -176,7 +179,7 @@ def attack_uploads(attacker: Attacker) -> None:
 
 def attack_requests(attacker: Attacker) -> None:
     """Webhooks to inner addresses, bodies, options, ranges."""
-    for url in addresses_refused.pytestmark[0].args[1]:  # type: ignore[attr-defined]
+    for url in REFUSED_URLS:
         attacker.ask("webhooks to inner addresses", url, {422}, "POST", "/v1/webhooks", json={"url": url})
 
     def endless() -> Iterator[bytes]:

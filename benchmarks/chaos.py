@@ -30,9 +30,9 @@ from pathlib import Path
 from typing import Any
 
 import httpx
+
 from benchmarks.chaos_kind import ChainOptions, undisturbed
 from benchmarks.chaos_machine import BLOWS, Blow, Machine, small_disk
-
 from octasplat.engine.dataset.synthetic import SyntheticDatasetConfig, write_synthetic_dataset
 from octasplat.engine.operations.reconstruct import options_from_json
 from octasplat.engine.pipeline import reconstruct

@@ -29,12 +29,12 @@ from typing import Any
 import numpy as np
 import psutil
 import psycopg
-from benchmarks.chaos import Run, make_scene
-from benchmarks.chaos_kind import ChainOptions, undisturbed
-from benchmarks.chaos_machine import ROOT, Machine
 from PIL import Image
 from psycopg import sql
 
+from benchmarks.chaos import Run, make_scene
+from benchmarks.chaos_kind import ChainOptions, undisturbed
+from benchmarks.chaos_machine import ROOT, Machine
 from octasplat.workers.client.upload import list_scene_files, upload_scene
 from octasplat.workers.db.migrate import OWN_COMPONENT, Migration, apply_step
 from octasplat.workers.postgres.embedded import EmbeddedPostgres

@@ -35,7 +35,6 @@ from typing import Any
 from benchmarks.chaos import Run, make_scene, prepare, timeline
 from benchmarks.chaos_machine import ROOT
 from benchmarks.fleet import Fleet, release
-
 from octasplat.workers.client.api import Api
 
 BEFORE = "8a6786e625c3"

@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import BinaryIO
 
 import psutil
-from benchmarks.chaos_machine import FAST, ROOT
 
+from benchmarks.chaos_machine import FAST, ROOT
 from octasplat.workers.postgres.embedded import EmbeddedPostgres
 
 STOP_SECONDS = 60.0

@@ -40,9 +40,7 @@ from octasplat.engine.pathtracing.stage.model import (
 )
 from octasplat.engine.rays import RayBatch
 from octasplat.engine.trace.protocol import TraceSettings
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "light"))
-from light_scenes import camera
+from tests.support.light_scenes import camera
 
 DEPTH = 5
 
@@ -89,7 +87,7 @@ def cloud(count: int) -> FlatGaussians:
 
 def mitsuba_scene(variant: str, size: tuple[int, int], folder: Path, lit: Any) -> Any:
     """The same triangles for Mitsuba."""
-    import test_against_mitsuba as twin
+    from tests.pathtracing import test_against_mitsuba as twin
 
     twin.mi.set_variant(variant)
     white = {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": twin.linear(0.8, 0.8, 0.8)}}
@@ -158,7 +156,7 @@ def mitsuba_work(variant: str, size: tuple[int, int], folder: Path, lit: Stage) 
 
 def beside_mirror(count: int, size: tuple[int, int], repeats: int) -> None:
     """Gaussians and their mirror image, one ray a pixel."""
-    from mitsuba_gaussians import GaussiansBesideMirror
+    from tests.support.mitsuba_gaussians import GaussiansBesideMirror
 
     # Both end a ray where less than a hundredth of it is left, and cut Gaussians off at the same ellipse.
     settings = TraceSettings(q=CHI2_3_99, transmittance_min=0.01, alpha_max=0.9999)

@@ -21,8 +21,8 @@ from typing import Any
 
 import httpx
 import psutil
-from benchmarks.chaos import make_scene
 
+from benchmarks.chaos import make_scene
 from octasplat.workers.client.api import Api, find_address, find_token
 from octasplat.workers.client.upload import upload_scene
 

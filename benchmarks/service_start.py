@@ -19,8 +19,8 @@ from typing import Any
 
 import httpx
 import psutil
-from benchmarks.chaos_machine import ROOT, free_port
 
+from benchmarks.chaos_machine import ROOT, free_port
 from octasplat.workers.postgres.embedded import EmbeddedPostgres
 
 

@@ -11,7 +11,6 @@ the pixels that our picture covers.
 """
 
 import argparse
-import sys
 import time
 from pathlib import Path
 
@@ -30,9 +29,7 @@ from octasplat.engine.render.environment_files import read_environment
 from octasplat.engine.render.image_files import read_image, write_png
 from octasplat.engine.run_folder import CONFIG, ENVIRONMENT, SCENE, run_viewpoints
 from octasplat.engine.surface.depth_cameras import photograph_cameras
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "tools"))
-from lit_surface import in_cycles, in_threejs, view_of
+from tests.support.lit_surface import in_cycles, in_threejs, view_of
 
 Image = Float32[np.ndarray, "h w 3"]
 DEPTH = 6

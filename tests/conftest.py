@@ -10,7 +10,8 @@ import jaxtyping
 import numpy as np
 import pytest
 
-from longest_first import LONGEST_FIRST
+from tests.support import shape_checks
+from tests.support.longest_first import LONGEST_FIRST
 
 if TYPE_CHECKING:
     from octasplat.engine.gaussians.model import FlatGaussians
@@ -36,7 +37,7 @@ def checked_modules() -> list[str]:
     ]
 
 
-jaxtyping.install_import_hook(checked_modules(), "shape_checks.check")
+jaxtyping.install_import_hook(checked_modules(), f"{shape_checks.__name__}.check")
 
 
 def pytest_configure(config: pytest.Config) -> None:

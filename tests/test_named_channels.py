@@ -4,7 +4,6 @@ The constant harmonic of Gaussian k is k, which no operation here changes; so th
 be compared with those that this Gaussian began with.
 """
 
-import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -46,9 +45,7 @@ from octasplat.engine.train.optimiser import Adam
 from octasplat.engine.train.state import TrainState, fresh_state
 from octasplat.engine.train.trainer import Trainer
 from octasplat.workers.cli.main import cli
-
-sys.path.append(str(Path(__file__).parent / "train"))
-from planar_dataset import PlanarDataset, small_config
+from tests.support.planar_dataset import PlanarDataset, small_config
 
 COUNT = 120
 RNG = np.random.default_rng(7)

@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from small_run import RUN_OPTIONS
 
 import octasplat as osp
 from octasplat.engine.dataset.synthetic import SyntheticDatasetConfig, write_synthetic_dataset
@@ -16,6 +15,7 @@ from octasplat.engine.gaussians.frames import frames_from_normals, quaternions_f
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.gaussians.spherical_harmonics import fibonacci_sphere
 from octasplat.engine.render.environment_files import write_environment
+from tests.support.small_run import RUN_OPTIONS
 
 COUNT = 1200
 

@@ -16,7 +16,7 @@ import octasplat.client
 from octasplat.client import JobFailedError, ServiceError, ServiceUnreachableError
 from octasplat.engine.events import Event, StageStarted
 from octasplat.workers.client.api import find_address, find_token
-from postgres_fixtures import short_root
+from tests.support.postgres_fixtures import short_root
 
 __all__ = ["short_root"]
 pytestmark = pytest.mark.heavy

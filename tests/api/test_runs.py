@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from small_run import RUN_OPTIONS
 
 import octasplat as osp
 from octasplat.engine.events import Event, StageFinished, TrainingProgress
+from tests.support.small_run import RUN_OPTIONS
 
 
 def test_run_stopped_by_on_step_resumes_to_same_bytes(

@@ -1,19 +1,16 @@
 """The tracer as a function of torch, against autograd of the reference implementation."""
 
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
-sys.path.append(str(Path(__file__).parents[1] / "trace"))
-from trace_scenes import make_cloud, rays_inwards, relative_error
-
 import octasplat as osp
 from octasplat.engine.gaussians.scene_metadata import SceneMetadata
 from octasplat.engine.rays import RayBatch
 from octasplat.engine.trace.reference import ReferenceParameters, ReferenceResult, trace_reference
+from tests.support.trace_scenes import make_cloud, rays_inwards, relative_error
 
 NAMES = {
     "means": "means_world",

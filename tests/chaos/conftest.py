@@ -1,10 +1,5 @@
-"""Fixtures of the database; the helpers of the workers' tests are known here too."""
+"""Fixtures of the database."""
 
-import sys
-from pathlib import Path
-
-from postgres_fixtures import conninfo, postgres, short_root, template
-
-sys.path.append(str(Path(__file__).parents[1] / "work"))
+from tests.support.postgres_fixtures import conninfo, postgres, short_root, template
 
 __all__ = ["conninfo", "postgres", "short_root", "template"]

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+
 from benchmarks.chaos import IN_FLIGHT, Run, journal_faults, make_scene, prepare, undisturbed_reconstruction
 from benchmarks.chaos_machine import BLOWS, Machine, small_disk
 

@@ -7,9 +7,9 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from worker_harness import ROOT, WorkerHarness
 
 from octasplat.workers.db.locks import ROW_SECONDS
+from tests.support.worker_harness import ROOT, WorkerHarness
 
 pytestmark = pytest.mark.heavy
 

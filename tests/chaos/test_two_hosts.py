@@ -12,16 +12,16 @@ from pathlib import Path
 import boto3
 import psycopg
 import pytest
+from moto.server import ThreadedMotoServer
+from psycopg.conninfo import conninfo_to_dict, make_conninfo
+
 from benchmarks.chaos import journal_faults
 from benchmarks.chaos_kind import ChainOptions, undisturbed
-from moto.server import ThreadedMotoServer
-from namespaces import GATEWAY, NamespaceHost, forward_socket, hosts, missing_requirement
-from psycopg.conninfo import conninfo_to_dict, make_conninfo
-from worker_harness import ROOT, WorkerHarness, child_pids, is_alive
-
 from octasplat.workers.db.locks import OWNER
 from octasplat.workers.settings import WorkerSettings
 from octasplat.workers.storage.factory import open_storage
+from tests.support.namespaces import GATEWAY, NamespaceHost, forward_socket, hosts, missing_requirement
+from tests.support.worker_harness import ROOT, WorkerHarness, child_pids, is_alive
 
 pytestmark = pytest.mark.heavy
 

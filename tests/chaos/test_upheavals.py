@@ -4,6 +4,7 @@ import random
 from pathlib import Path
 
 import pytest
+
 from benchmarks.chaos import Run, make_scene
 from benchmarks.chaos_machine import Machine
 from benchmarks.chaos_upheavals import UPHEAVALS, report, upheave

@@ -8,8 +8,8 @@ import numpy as np
 import psutil
 import pytest
 
-from neighbouring_photographs import write_neighbours
 from octasplat.engine.render.image_files import write_png
+from tests.support.neighbouring_photographs import write_neighbours
 
 pytestmark = pytest.mark.heavy
 

@@ -10,8 +10,8 @@ import pycolmap
 import pytest
 from PIL import Image
 
-from neighbouring_photographs import write_neighbours
 from octasplat.engine.poses.photographs import photographs_in
+from tests.support.neighbouring_photographs import write_neighbours
 
 PATCH_TOO_LARGE = ("--set", "ssim_patch_side=64", "--set", "loss.ssim=0.2", "--max-side", "32")
 """Settings that the photographs rule out, which is known only when they are open."""

@@ -10,9 +10,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from image_in_chroot import ChrootImage, build_image, missing_requirement
 from moto.server import ThreadedMotoServer
-from namespaces import forward_socket
 from psycopg.conninfo import conninfo_to_dict, make_conninfo
 from test_docker_files import compose
 
@@ -21,6 +19,8 @@ from octasplat.workers.client.api import Api
 from octasplat.workers.client.download import download_results
 from octasplat.workers.client.submission import Submission, submit
 from octasplat.workers.client.watch import watch_job
+from tests.support.image_in_chroot import ChrootImage, build_image, missing_requirement
+from tests.support.namespaces import forward_socket
 
 pytestmark = [
     pytest.mark.heavy,

@@ -5,13 +5,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from edit_scenes import assert_same, covariance_errors, covariances, random_turn
 
 from octasplat.engine.edit.selection import in_box, in_sphere, merge_scenes, with_sh_degree
 from octasplat.engine.errors import ConfigError
 from octasplat.engine.gaussians import affine
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.gaussians.spherical_harmonics import sh_basis
+from tests.support.edit_scenes import assert_same, covariance_errors, covariances, random_turn
 
 Make = Callable[..., FlatGaussians]
 

@@ -7,13 +7,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from edit_scenes import assert_same, cube
 
 from octasplat.engine.files import export_scene, read_mesh, read_metadata
 from octasplat.engine.files.gaussian_ply import read_gaussian_ply, write_gaussian_ply
 from octasplat.engine.gaussians.affine import transform_gaussians
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.gaussians.scene_metadata import SceneMetadata
+from tests.support.edit_scenes import assert_same, cube
 
 Make = Callable[..., FlatGaussians]
 

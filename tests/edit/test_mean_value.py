@@ -1,10 +1,10 @@
 """The fast mean-value coordinates against the slow ones."""
 
-import mean_value_reference as twin
 import numpy as np
-from edit_scenes import cube
 
 from octasplat.engine.edit.proxy import MeanValueBinding, Proxy
+from tests.support import mean_value_reference as twin
+from tests.support.edit_scenes import cube
 
 
 def dented_ball(cells: int) -> tuple[np.ndarray, np.ndarray]:

@@ -4,7 +4,13 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from edit_scenes import (
+
+from octasplat.engine.edit.deform import deform, deform_to, deformation_corners
+from octasplat.engine.edit.proxy import MeanValueBinding, NearTriangles, Proxy, bind_corners
+from octasplat.engine.errors import SceneFileError
+from octasplat.engine.gaussians.model import FlatGaussians
+from octasplat.engine.gaussians.spherical_harmonics import sh_basis
+from tests.support.edit_scenes import (
     assert_same,
     bend,
     covariance_errors,
@@ -15,12 +21,6 @@ from edit_scenes import (
     random_turn,
     twist,
 )
-
-from octasplat.engine.edit.deform import deform, deform_to, deformation_corners
-from octasplat.engine.edit.proxy import MeanValueBinding, NearTriangles, Proxy, bind_corners
-from octasplat.engine.errors import SceneFileError
-from octasplat.engine.gaussians.model import FlatGaussians
-from octasplat.engine.gaussians.spherical_harmonics import sh_basis
 
 Make = Callable[..., FlatGaussians]
 SHEAR = np.array([[1.2, 0.3, 0.0], [0.0, 0.8, 0.1], [0.2, 0.0, 1.0]])

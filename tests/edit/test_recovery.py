@@ -6,14 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from edit_scenes import (
-    assert_same,
-    covariance_errors,
-    covariances,
-    moved_covariances,
-    random_turn,
-    twist,
-)
 
 from octasplat.engine.edit.edit_options import MeshToGaussiansOptions
 from octasplat.engine.edit.mesh_to_gaussians import EditReport, recover_gaussians
@@ -22,6 +14,14 @@ from octasplat.engine.files import ExportOptions, ImportedMesh, export_scene, re
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.gaussians.octagon import SIDES
 from octasplat.engine.gaussians.spherical_harmonics import sh_basis
+from tests.support.edit_scenes import (
+    assert_same,
+    covariance_errors,
+    covariances,
+    moved_covariances,
+    random_turn,
+    twist,
+)
 
 Make = Callable[..., FlatGaussians]
 PLY = Path("edited.ply")

@@ -3,8 +3,9 @@ import re
 
 import numpy as np
 import pytest
-from benchmarks.curves import main, read_run
 from PIL import Image
+
+from benchmarks.curves import main, read_run
 
 
 @pytest.fixture

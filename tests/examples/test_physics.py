@@ -1,7 +1,6 @@
 """The physics example: Gaussians ride in a lattice, and what comes out can be filmed."""
 
 import importlib.util
-import sys
 from pathlib import Path
 from types import ModuleType
 
@@ -20,9 +19,9 @@ FOLDER = Path(__file__).resolve().parents[2] / "examples" / "physics"
 
 @pytest.fixture(scope="module", autouse=True)
 def example_path():
-    sys.path.insert(0, str(FOLDER))
-    yield
-    sys.path.remove(str(FOLDER))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(FOLDER)
+        yield
 
 
 def load(name: str) -> ModuleType:

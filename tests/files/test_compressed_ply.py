@@ -3,7 +3,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from cloud_difference import difference
 from scipy.spatial import cKDTree
 
 from octasplat.engine.errors import SceneFileError
@@ -11,6 +10,7 @@ from octasplat.engine.files import export_scene, exporter_for, importer_for, rea
 from octasplat.engine.files.ply_container import PlyWriteElement, write_ply
 from octasplat.engine.gaussians.flattening import GaussianCloud
 from octasplat.engine.gaussians.model import FlatGaussians
+from tests.support.cloud_difference import difference
 
 Make = Callable[..., GaussianCloud]
 CHUNK = 256

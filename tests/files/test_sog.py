@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 import OpenImageIO as oiio
 import pytest
-from cloud_difference import difference
 
 from octasplat.engine.errors import SceneFileError
 from octasplat.engine.files import importer_for, read_scene
 from octasplat.engine.files.gaussian_ply import read_ply_cloud
 from octasplat.engine.gaussians.flattening import GaussianCloud
+from tests.support.cloud_difference import difference
 
 Make = Callable[..., GaussianCloud]
 COUNT, WIDTH = 200, 16

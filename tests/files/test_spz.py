@@ -7,13 +7,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import zstandard
-from cloud_difference import difference
 
 from octasplat.engine.errors import SceneFileError
 from octasplat.engine.files import importer_for, read_scene
 from octasplat.engine.files.gaussian_ply import read_ply_cloud
 from octasplat.engine.gaussians.flattening import GaussianCloud
 from octasplat.engine.gaussians.spherical_harmonics import sh_basis
+from tests.support.cloud_difference import difference
 
 Make = Callable[..., GaussianCloud]
 BITS = 12

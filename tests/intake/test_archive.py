@@ -17,12 +17,12 @@ from pathlib import Path
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from zip_builder import ZipMember, build_zip, deflated
 
 from octasplat.service.intake.archive import ArchiveFile, ArchiveLimits, list_archive, unpack_archive
 from octasplat.service.intake.faults import IntakeError
 from octasplat.workers.storage.local import LocalStorage
 from octasplat.workers.storage.protocol import Blob
+from tests.support.zip_builder import ZipMember, build_zip, deflated
 
 PHOTO = b"\xff\xd8\xff\xe0 not much of a photograph " * 40
 MODEL = struct.pack("<Q", 0x088B1F) + bytes(300)  # a count that looks like gzip

@@ -10,7 +10,15 @@ from pathlib import Path
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from model_builder import (
+
+from octasplat.service.intake.dataset import DatasetFile, DatasetLimits, DatasetSummary, check_dataset
+from octasplat.service.intake.faults import IntakeError, IntakeFault
+from octasplat.service.intake.model_check import ModelLimits, check_model, parser_environment
+from octasplat.service.intake.scene_layout import FileRole
+from octasplat.service.intake.upload_names import check_file_name
+from octasplat.workers.storage.local import LocalStorage
+from octasplat.workers.storage.trees import TreeFile
+from tests.support.model_builder import (
     CameraRecord,
     ColmapModelBuilder,
     ImageRecord,
@@ -20,14 +28,6 @@ from model_builder import (
     rotated_pose,
     store_model,
 )
-
-from octasplat.service.intake.dataset import DatasetFile, DatasetLimits, DatasetSummary, check_dataset
-from octasplat.service.intake.faults import IntakeError, IntakeFault
-from octasplat.service.intake.model_check import ModelLimits, check_model, parser_environment
-from octasplat.service.intake.scene_layout import FileRole
-from octasplat.service.intake.upload_names import check_file_name
-from octasplat.workers.storage.local import LocalStorage
-from octasplat.workers.storage.trees import TreeFile
 
 NAN, INF = float("nan"), float("inf")
 

@@ -11,8 +11,6 @@ from pathlib import Path
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from model_builder import ColmapModelBuilder, photograph, photographs
-from zip_builder import ZipMember, build_zip
 
 from octasplat.service.intake.faults import IntakeError
 from octasplat.service.intake.receive import (
@@ -26,6 +24,8 @@ from octasplat.service.intake.receive import (
 from octasplat.service.intake.spool import SpoolSpace
 from octasplat.workers.storage import ContentTooLargeError, DigestMismatchError, StorageFullError
 from octasplat.workers.storage.local import LocalStorage
+from tests.support.model_builder import ColmapModelBuilder, photograph, photographs
+from tests.support.zip_builder import ZipMember, build_zip
 
 
 async def body(data: bytes, piece: int = 1000) -> AsyncIterator[bytes]:

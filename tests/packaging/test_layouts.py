@@ -5,7 +5,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from environments import (
+
+from tests.support.environments import (
     ROOT,
     Environment,
     build_distribution,

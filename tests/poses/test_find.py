@@ -14,13 +14,13 @@ import pycolmap
 import pytest
 from jaxtyping import Float64
 
-from neighbouring_photographs import write_neighbours
 from octasplat.engine.errors import Cancelled, DatasetError, PosesCrashed
 from octasplat.engine.events import Event, StageFinished, StageProgress, StageStarted, Warned
 from octasplat.engine.poses import find_poses
 from octasplat.engine.poses.find_poses import PosesConfig
 from octasplat.engine.poses.search import PoseSearch
 from octasplat.engine.render.image_files import write_png
+from tests.support.neighbouring_photographs import write_neighbours
 
 pytestmark = pytest.mark.heavy
 

@@ -1,5 +1,5 @@
 """Fixtures of the database."""
 
-from postgres_fixtures import conninfo, postgres, short_root, template
+from tests.support.postgres_fixtures import conninfo, postgres, short_root, template
 
 __all__ = ["conninfo", "postgres", "short_root", "template"]

@@ -2,8 +2,8 @@
 
 import pytest
 
-from postgres_fixtures import add_columns, postgres, short_root, template
-from postgres_fixtures import conninfo as own_conninfo
+from tests.support.postgres_fixtures import add_columns, postgres, short_root, template
+from tests.support.postgres_fixtures import conninfo as own_conninfo
 
 __all__ = ["conninfo", "own_conninfo", "postgres", "short_root", "template"]
 

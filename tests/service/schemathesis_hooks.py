@@ -8,7 +8,6 @@ what came of those before them. ZIP files are scenes, sound ones and ones that l
 import itertools
 import json
 import os
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -16,10 +15,8 @@ import schemathesis
 from hypothesis import strategies as st
 from schemathesis.generation.meta import TestPhase
 
-sys.path.append(str(Path(__file__).parents[1] / "intake"))
-
-from model_builder import ColmapModelBuilder, photographs
-from zip_builder import ZipMember, build_zip
+from tests.support.model_builder import ColmapModelBuilder, photographs
+from tests.support.zip_builder import ZipMember, build_zip
 
 _IDS = json.loads(Path(os.environ["OCTASPLAT_TEST_IDS"]).read_text())
 _USED = {name: itertools.cycle(ids) for name, ids in _IDS["used"].items()}

@@ -10,14 +10,20 @@ from typing import Any
 
 import httpx
 import pytest
-from api_inventory import Operation, operations, undescribed
 from PIL import Image
-from service_harness import claim_job, client_with_token, committed_dataset, running_service, store_content
 
 from octasplat.service.app import create_app
 from octasplat.service.settings import ServiceSettings
 from octasplat.service.state import Service
 from octasplat.workers.queue.attempts import ResultFile
+from tests.support.api_inventory import Operation, operations, undescribed
+from tests.support.service_harness import (
+    claim_job,
+    client_with_token,
+    committed_dataset,
+    running_service,
+    store_content,
+)
 
 OPEN = {"/healthz", "/readyz"}
 """Whoever watches over the service needs no token for these."""

@@ -10,15 +10,19 @@ from typing import Any
 
 import httpx
 import pytest
-from service_harness import claim_job, client_with_token, committed_dataset, running_service, store_content
-from worker_harness import WorkerHarness
 
 from octasplat.service.state import Service
 from octasplat.workers.queue.attempts import ResultFile
-from postgres_fixtures import EmbeddedPostgres, copied_database
-
-sys.path.append(str(Path(__file__).parents[1] / "intake"))
-from model_builder import photograph
+from tests.support.model_builder import photograph
+from tests.support.postgres_fixtures import EmbeddedPostgres, copied_database
+from tests.support.service_harness import (
+    claim_job,
+    client_with_token,
+    committed_dataset,
+    running_service,
+    store_content,
+)
+from tests.support.worker_harness import WorkerHarness
 
 ROOT = Path(__file__).parents[2]
 

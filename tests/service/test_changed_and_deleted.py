@@ -2,7 +2,6 @@
 
 import asyncio
 import logging
-import sys
 import uuid
 from collections.abc import Callable
 from pathlib import Path
@@ -11,12 +10,7 @@ from typing import Any
 import httpx
 import psycopg
 import pytest
-from service_harness import claim_job, committed_dataset, running_service, store_content
-
-sys.path.append(str(Path(__file__).parents[1] / "intake"))
-from model_builder import photograph
 from test_uploads import repr_digest
-from zip_builder import ZipMember, build_zip
 
 from octasplat.engine.errors import ConfigError
 from octasplat.service.actions.submission import submit_job
@@ -28,6 +22,9 @@ from octasplat.workers.db import datasets as rows
 from octasplat.workers.queue.attempts import ResultFile
 from octasplat.workers.queue.jobs import get_job
 from octasplat.workers.settings import load_settings
+from tests.support.model_builder import photograph
+from tests.support.service_harness import claim_job, committed_dataset, running_service, store_content
+from tests.support.zip_builder import ZipMember, build_zip
 
 TOY = {"kind": "toy", "options": {"steps": 1}}
 

@@ -2,26 +2,22 @@
 
 import asyncio
 import hashlib
-import sys
 import threading
 import time
 from pathlib import Path
 
 import httpx
 import pytest
-from service_harness import running_service
-
-from small_disk import small_disk
-
-sys.path.append(str(Path(__file__).parents[1] / "intake"))
-from model_builder import photograph
-from zip_builder import ZipMember, build_zip
 
 from octasplat.service.state import Service
 from octasplat.workers.maintenance import garbage_collection
 from octasplat.workers.maintenance.garbage_collection import collect_garbage_now
 from octasplat.workers.queue import storage_leases
 from octasplat.workers.storage.errors import StorageUnavailableError
+from tests.support.model_builder import photograph
+from tests.support.service_harness import running_service
+from tests.support.small_disk import small_disk
+from tests.support.zip_builder import ZipMember, build_zip
 
 MIB = 1 << 20
 PATIENCE_SECONDS = 180.0

@@ -15,8 +15,8 @@ from octasplat.workers.client.api import Api
 from octasplat.workers.client.upload import upload_scene
 from octasplat.workers.client.watch import watch_job
 
-TOYS = Path(__file__).parents[1] / "work"
-START = "import sys; sys.path.append({toys!r}); from octasplat.workers.cli.main import main; main()"
+ROOT = Path(__file__).parents[2]
+START = "import sys; sys.path.append({root!r}); from octasplat.workers.cli.main import main; main()"
 
 
 @pytest.fixture
@@ -39,13 +39,13 @@ def served(project: Path, short_root: Path, tmp_path: Path) -> Iterator[Api]:
     environment = {
         **os.environ,
         "PYTHONPATH": str(project),
-        "OCTASPLAT_KIND_MODULES": '["toy_kind"]',
+        "OCTASPLAT_KIND_MODULES": '["tests.support.toy_kind"]',
         "OCTASPLAT_FLOOR_BYTES": "0",
         "OCTASPLAT_STORAGE": "a store",  # below the folder that it was started in
         "OMP_NUM_THREADS": "1",
     }
     # As the installed program does it: the folder of the script comes first, not the current one.
-    command = [sys.executable, "-E", "-P", "-c", START.format(toys=str(TOYS)), "serve", "--port", "0"]
+    command = [sys.executable, "-E", "-P", "-c", START.format(root=str(ROOT)), "serve", "--port", "0"]
     with (tmp_path / "log").open("wb") as log:
         process = subprocess.Popen(
             [*command, "--data", str(data)], cwd=project, env=environment, stdout=log, stderr=log
@@ -74,7 +74,9 @@ def test_serve_ignores_modules_in_current_folder(served: Api, project: Path, tmp
 
 
 def test_program_paths_are_independent_of_current_folder(project: Path, tmp_path: Path) -> None:
-    command = python_command("octasplat", "--version", further_modules=("no_such_module", "toy_kind"))
+    command = python_command(
+        "octasplat", "--version", further_modules=("no_such_module", "tests.support.toy_kind")
+    )
     environment = {**os.environ, "PYTHONPATH": str(project)}
     done = subprocess.run(command, cwd=project, env=environment, capture_output=True, text=True, check=False)
     assert (done.returncode, done.stderr) == (0, "") and "octasplat, version" in done.stdout

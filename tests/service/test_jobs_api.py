@@ -9,10 +9,10 @@ from typing import Any
 
 import httpx
 import pytest
-from service_harness import claim_job, committed_dataset, running_service, store_content
 
 from octasplat.service.state import Service
 from octasplat.workers.queue.attempts import ResultFile
+from tests.support.service_harness import claim_job, committed_dataset, running_service, store_content
 
 Conversation = Callable[[httpx.AsyncClient, Service], Awaitable[None]]
 

@@ -9,11 +9,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from benchmarks.chaos_machine import ROOT, Machine
 
-from neighbouring_photographs import write_neighbours
+from benchmarks.chaos_machine import ROOT, Machine
 from octasplat.engine.render.image_files import write_png
 from octasplat.workers.client.api import Api
+from tests.support.neighbouring_photographs import write_neighbours
 
 pytestmark = pytest.mark.heavy
 

@@ -8,13 +8,13 @@ from typing import Any
 
 import httpx
 import pytest
-from service_harness import claim_job, client_with_token, committed_dataset, running_service
 
 from octasplat.service.state import Service
 from octasplat.workers.db.datasets import put_file
 from octasplat.workers.db.locks import lock_owner
 from octasplat.workers.db.workers import record_worker_heartbeat
 from octasplat.workers.queue.attempts import ResultFile
+from tests.support.service_harness import claim_job, client_with_token, committed_dataset, running_service
 
 Conversation = Callable[[httpx.AsyncClient, Service], Awaitable[None]]
 PHOTOGRAPHS = [{"width_px": 269, "height_px": 480, "count": 50}]

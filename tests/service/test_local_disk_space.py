@@ -2,18 +2,15 @@
 
 import asyncio
 import os
-import sys
 from collections.abc import AsyncIterator
 from pathlib import Path
 
 import httpx
-from service_harness import running_service
 
-from small_disk import fill, small_disk
-
-sys.path.append(str(Path(__file__).parents[1] / "intake"))
-from model_builder import photograph
-from zip_builder import ZipMember, build_zip
+from tests.support.model_builder import photograph
+from tests.support.service_harness import running_service
+from tests.support.small_disk import fill, small_disk
+from tests.support.zip_builder import ZipMember, build_zip
 
 MIB = 1 << 20
 

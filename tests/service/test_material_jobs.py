@@ -4,11 +4,11 @@ import asyncio
 from pathlib import Path
 
 import pytest
-from service_harness import committed_dataset, running_service
 from test_stage_jobs import HDR, finished, sent
 
 from octasplat.engine.errors import ConfigError
 from octasplat.workers.client.submission import Derivation, with_environments
+from tests.support.service_harness import committed_dataset, running_service
 
 SHINY = {"environment.hdr": HDR, "scene.ply": b"ply"}
 

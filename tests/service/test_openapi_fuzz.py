@@ -54,8 +54,8 @@ def front_end(conninfo: str, tmp_path: Path) -> Iterator[FrontEnd]:
         "OCTASPLAT_PORT": "0",
         "OCTASPLAT_TOKEN": TOKEN,
         "OCTASPLAT_WRONG_TOKEN_SECONDS": "0",
-        "OCTASPLAT_KIND_MODULES": '["toy_kind"]',
-        "PYTHONPATH": f"{ROOT}{os.pathsep}{ROOT / 'tests' / 'work'}",
+        "OCTASPLAT_KIND_MODULES": '["tests.support.toy_kind"]',
+        "PYTHONPATH": str(ROOT),
     }
     log = tmp_path / "service.log"
     with log.open("wb") as errors:
@@ -124,7 +124,7 @@ def test_fuzzed_requests_cause_no_server_error(front_end: FrontEnd, conninfo: st
         **os.environ,
         "OCTASPLAT_TEST_IDS": str(furnish(conninfo, tmp_path)),
         "SCHEMATHESIS_HOOKS": "schemathesis_hooks",
-        "PYTHONPATH": str(Path(__file__).parent),
+        "PYTHONPATH": os.pathsep.join((str(Path(__file__).parent), str(ROOT))),
     }
     command = [
         sys.executable, "-m", "schemathesis.cli", "run", f"{front_end.address}/openapi.json",

@@ -12,7 +12,6 @@ from typing import Any
 
 import httpx
 import pytest
-from service_harness import claim_job, committed_dataset, running_service
 from test_reconstruction import ROOT, TRAIN, Machine, start
 
 from octasplat.engine.dataset.synthetic import SyntheticDatasetConfig, write_synthetic_dataset
@@ -22,6 +21,7 @@ from octasplat.workers.client.submission import Submission, submit
 from octasplat.workers.client.watch import watch_job
 from octasplat.workers.db.workers import record_worker_heartbeat
 from octasplat.workers.queue.attempts import ResultFile
+from tests.support.service_harness import claim_job, committed_dataset, running_service
 
 Conversation = Callable[[httpx.AsyncClient, Service], Awaitable[None]]
 FORMATS = [exporter.name for exporter in exporters()]

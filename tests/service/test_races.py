@@ -1,22 +1,19 @@
 """Requests that meet each other get an answer that fits, never a fault of the service."""
 
 import asyncio
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import httpx
 import pytest
-from service_harness import claim_job, committed_dataset, running_service, store_content
-
-sys.path.append(str(Path(__file__).parents[1] / "intake"))
-from model_builder import photograph
 
 from octasplat.service.actions import datasets as actions
 from octasplat.service.intake.dataset import DatasetSummary
 from octasplat.service.state import Service
 from octasplat.workers.queue.attempts import ResultFile
+from tests.support.model_builder import photograph
+from tests.support.service_harness import claim_job, committed_dataset, running_service, store_content
 
 ROUNDS = 12
 

@@ -14,7 +14,6 @@ import httpx
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from service_harness import running_service
 from test_reconstruction import ROOT
 from test_stage_jobs import HDR, finished, run, sent  # noqa: F401 (a fixture)
 
@@ -24,6 +23,7 @@ from octasplat.engine.files.gaussian_ply import read_gaussian_ply
 from octasplat.workers.cli.main import cli
 from octasplat.workers.cli.named_files import with_named_files
 from octasplat.workers.client.submission import Derivation
+from tests.support.service_harness import running_service
 
 RUN_FILES = ("scene.ply", "config.json", "held_out.json", "views.json", "training.json")
 CUBE = [(x, y, z) for x in (-9, 9) for y in (-9, 9) for z in (-9, 9)]

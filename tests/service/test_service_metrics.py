@@ -10,12 +10,12 @@ from typing import Any
 import httpx
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
-from service_harness import claim_job, client_with_token, committed_dataset, running_service
 
 from octasplat.service.state import Service
 from octasplat.workers.db.ids import new_id
 from octasplat.workers.db.workers import record_worker_heartbeat
 from octasplat.workers.queue.recovery import StalledAttempts, recover_stalled_jobs
+from tests.support.service_harness import claim_job, client_with_token, committed_dataset, running_service
 
 Conversation = Callable[[httpx.AsyncClient, Service], Awaitable[None]]
 PNG = bytes.fromhex(

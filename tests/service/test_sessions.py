@@ -8,10 +8,10 @@ from typing import Any
 import httpx
 import pytest
 from pydantic import SecretStr
-from service_harness import client_with_token, running_service
 
 from octasplat.engine.errors import ConfigError
 from octasplat.service.state import Service
+from tests.support.service_harness import client_with_token, running_service
 
 Conversation = Callable[[httpx.AsyncClient, Service], Awaitable[None]]
 BEHIND_TLS = {"X-Forwarded-Proto": "https", "X-Forwarded-For": "203.0.113.9"}

@@ -16,7 +16,6 @@ import httpx
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from service_harness import claim_job, committed_dataset, running_service, store_content
 from test_reconstruction import ROOT
 
 from octasplat.engine.dataset.synthetic import SyntheticDatasetConfig, write_synthetic_dataset
@@ -28,6 +27,7 @@ from octasplat.service.state import Service
 from octasplat.workers.cli.main import cli
 from octasplat.workers.db.locks import lock_owner
 from octasplat.workers.queue.attempts import ResultFile
+from tests.support.service_harness import claim_job, committed_dataset, running_service, store_content
 
 TRIANGLE = b"v 0 0 0\nv .3 0 0\nv 0 -.3 0\nf 1 2 3\n"
 HDR = b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 2 +X 2\n" + bytes([128, 128, 128, 128] * 4)

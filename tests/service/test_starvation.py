@@ -7,10 +7,10 @@ from typing import Any
 
 import httpx
 import pytest
-from service_harness import running_service
 
 from octasplat.service.actions import datasets as actions
 from octasplat.service.intake.dataset import DatasetSummary
+from tests.support.service_harness import running_service
 
 PATIENCE_SECONDS = 60.0
 

@@ -10,10 +10,10 @@ import time
 from pathlib import Path
 
 import pytest
-from service_harness import running_service
 
 from octasplat.workers.maintenance import garbage_collection
 from octasplat.workers.queue import storage_leases
+from tests.support.service_harness import running_service
 
 ROOT = Path(__file__).parents[2]
 PATIENCE_SECONDS = 60.0

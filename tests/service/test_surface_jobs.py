@@ -4,10 +4,10 @@ import asyncio
 from pathlib import Path
 
 from click.testing import CliRunner
-from service_harness import running_service
 from test_stage_jobs import finished
 
 from octasplat.workers.cli.main import cli
+from tests.support.service_harness import running_service
 
 
 def test_options_are_refused_with_the_sentence_of_the_command(conninfo: str, tmp_path: Path) -> None:

@@ -21,13 +21,11 @@ import httpx
 import pytest
 from PIL import Image
 
-sys.path.append(str(Path(__file__).parents[1] / "intake"))  # the builders of archives and models
-from model_builder import ColmapModelBuilder, photograph, photographs
-from zip_builder import ZipMember, build_zip
-
 from octasplat.service.app import create_app
 from octasplat.service.settings import ServiceSettings
 from octasplat.workers.storage.local import LocalStorage
+from tests.support.model_builder import ColmapModelBuilder, photograph, photographs
+from tests.support.zip_builder import ZipMember, build_zip
 
 ROOT = Path(__file__).parents[2]
 

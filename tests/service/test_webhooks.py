@@ -12,9 +12,7 @@ from typing import Any
 
 import httpx
 import pytest
-from service_harness import claim_job, client_with_token, committed_dataset, running_service
 from standardwebhooks.webhooks import Webhook, WebhookVerificationError
-from webhook_receiver import WebhookReceiver, receive_webhooks
 
 from octasplat.service.state import Service
 from octasplat.workers.db.connections import open_pool
@@ -28,6 +26,8 @@ from octasplat.workers.maintenance.webhooks.sender import (
     guarded_client,
     send_due,
 )
+from tests.support.service_harness import claim_job, client_with_token, committed_dataset, running_service
+from tests.support.webhook_receiver import WebhookReceiver, receive_webhooks
 
 Conversation = Callable[[httpx.AsyncClient, Service], Awaitable[None]]
 HERE = ("127.0.0.1",)
@@ -241,20 +241,20 @@ def test_two_senders_share_and_a_lost_one_is_replaced(talk: Callable[..., None],
     talk(conversation)
 
 
-@pytest.mark.parametrize(
-    "url",
-    [
-        "http://example.org/", "ftp://example.org/", "https://example.org:22/", "https://u:p@example.org/",
-        "https://example.org/#x", "https://", "https://[::1", "https://exa mple.org/", "javascript:alert(1)",
-        "https://localhost/", "https://printer.local/", "https://intranet/", "https://127.0.0.1/",
-        "https://10.1.2.3/", "https://169.254.169.254/latest", "https://[::ffff:10.0.0.1]/",
-        "https://[fd00::1]/", "https://100.64.0.1/", "https://example.org:99999/", "https://127.0.0.1./",
-        "https://127.1:8443/", "https://0x7f.1/", "https://0x7f.1./", "https://2130706433/", "https://0177.0.0.1/",
-        "https://127.0.0.0x1/", "https://127.0.0.1.../", "https://10.1/", "https://[::127.0.0.1]/",
-        "https://[64:ff9b::10.0.0.1]/", "https://[2002:7f00:1::]/", "https://１２７.0.0.1/", "https://127。0。0。1/",
-        "https://example.1/", "https://example.0x/",
-    ],
-)  # fmt: skip
+REFUSED_URLS = [
+    "http://example.org/", "ftp://example.org/", "https://example.org:22/", "https://u:p@example.org/",
+    "https://example.org/#x", "https://", "https://[::1", "https://exa mple.org/", "javascript:alert(1)",
+    "https://localhost/", "https://printer.local/", "https://intranet/", "https://127.0.0.1/",
+    "https://10.1.2.3/", "https://169.254.169.254/latest", "https://[::ffff:10.0.0.1]/",
+    "https://[fd00::1]/", "https://100.64.0.1/", "https://example.org:99999/", "https://127.0.0.1./",
+    "https://127.1:8443/", "https://0x7f.1/", "https://0x7f.1./", "https://2130706433/", "https://0177.0.0.1/",
+    "https://127.0.0.0x1/", "https://127.0.0.1.../", "https://10.1/", "https://[::127.0.0.1]/",
+    "https://[64:ff9b::10.0.0.1]/", "https://[2002:7f00:1::]/", "https://１２７.0.0.1/", "https://127。0。0。1/",
+    "https://example.1/", "https://example.0x/",
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("url", REFUSED_URLS)
 def test_webhook_internal_addresses_are_refused(url: str) -> None:
     with pytest.raises(AddressRefusedError):
         check_url(url)

@@ -4,7 +4,6 @@ It shades by a channel of the Gaussians, their normals and a lamp that belongs t
 further rays of its own see. So nothing in the loop has to change for a model of materials.
 """
 
-import sys
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -32,10 +31,7 @@ from octasplat.engine.train.config import McmcConfig
 from octasplat.engine.train.iteration import differentiate
 from octasplat.engine.train.state import TrainState, fresh_state
 from octasplat.engine.train.trainer import Trainer
-
-sys.path.append(str(Path(__file__).parents[1] / "train"))
-
-from planar_dataset import PlanarDataset, small_config
+from tests.support.planar_dataset import PlanarDataset, small_config
 
 SHARE = np.float32(0.3)
 ASIDE = np.array([0.2, 0.1, 0.0], np.float32)

@@ -1,6 +1,5 @@
 """The model of materials: its gradients through the tracer, a scene of known light, stopping and going on."""
 
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -27,10 +26,7 @@ from octasplat.engine.train.iteration import differentiate
 from octasplat.engine.train.shading import make_deferred
 from octasplat.engine.train.state import TrainState, fresh_state
 from octasplat.engine.train.trainer import Trainer
-
-sys.path.append(str(Path(__file__).parents[1] / "train"))
-
-from planar_dataset import PlanarDataset, small_config
+from tests.support.planar_dataset import PlanarDataset, small_config
 
 BARE = {
     "learn": True,

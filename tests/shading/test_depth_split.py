@@ -1,10 +1,8 @@
 """Rays that show two surfaces: each is shaded by itself, and gradients go to both."""
 
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
+from test_deferred import BARE, floor, wall
 
 from octasplat.engine.gaussians.model import FlatGaussians, concatenate
 from octasplat.engine.rays import RayBatch
@@ -14,10 +12,6 @@ from octasplat.engine.shading.parted import part
 from octasplat.engine.shading.protocol import Sight
 from octasplat.engine.trace.cpu.tracer import CpuTracer
 from octasplat.engine.trace.protocol import TraceSettings
-
-sys.path.append(str(Path(__file__).parent))
-
-from test_deferred import BARE, floor, wall
 
 DOWN = np.array([[0.0, 0.05, -1.0]]) / np.hypot(1, 0.05)
 RAYS = RayBatch(np.array([[x, 0.0, 1.0] for x in (-0.3, 0.0, 0.3)]), np.repeat(DOWN, 3, axis=0))

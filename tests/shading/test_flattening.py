@@ -1,7 +1,6 @@
 """Training for a surface: normals and depths are held together, by the gradient of the term that is named."""
 
 import math
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -20,10 +19,7 @@ from octasplat.engine.trace.cpu.tracer import CpuTracer
 from octasplat.engine.trace.protocol import TraceResult
 from octasplat.engine.train.state import fresh_state
 from octasplat.engine.train.trainer import Trainer
-
-sys.path.append(str(Path(__file__).parents[1] / "train"))
-
-from planar_dataset import PlanarDataset, small_config
+from tests.support.planar_dataset import PlanarDataset, small_config
 
 SIDE, WINDOWS, LOOSE = 4, 3, 5
 COUNT = LOOSE + WINDOWS * SIDE**2

@@ -1,10 +1,8 @@
 """Reflected rays in pairs, from surface to surface: closed forms."""
 
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
+from test_deferred import BARE, floor, wall
 
 from octasplat.engine.colour import srgb_to_linear
 from octasplat.engine.gaussians.model import concatenate
@@ -25,10 +23,6 @@ from octasplat.engine.shading.protocol import Sight
 from octasplat.engine.shading.reflections import Seen
 from octasplat.engine.shading.split_sum import Surface
 from octasplat.engine.trace.cpu.tracer import CpuTracer
-
-sys.path.append(str(Path(__file__).parent))
-
-from test_deferred import BARE, floor, wall
 
 
 def unit(vectors: np.ndarray) -> np.ndarray:

@@ -1,8 +1,6 @@
 """Split-sum shading against closed forms, brute force, its slow twin and finite differences."""
 
-import sys
 from dataclasses import fields, replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -18,10 +16,7 @@ from octasplat.engine.shading.environment_levels import (
     resampled,
 )
 from octasplat.engine.shading.split_sum import Surface, shade, shade_reverse, split_sum_table
-
-sys.path.append(str(Path(__file__).parent))
-
-from split_sum_reference import reference_split_sum
+from tests.support.split_sum_reference import reference_split_sum
 
 HEIGHT = 16
 FRAME = environment_frame(np.array([0.2, 0.3, 0.9]), 25.0)

@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from surface_shapes import cameras_on_sphere
 
 from octasplat.engine.errors import Cancelled, ConfigError, SceneFileError
 from octasplat.engine.events import StageFinished
@@ -18,6 +17,7 @@ from octasplat.engine.surface.depth_cameras import cameras_around
 from octasplat.engine.surface.extract import ExtractedSurface, extract_levels
 from octasplat.engine.surface.options import ExtractionOptions
 from octasplat.engine.trace.cpu.tracer import CpuTracer
+from tests.support.surface_shapes import cameras_on_sphere
 
 RED, BLUE = (0.9, 0.1, 0.1), (0.1, 0.1, 0.9)
 

@@ -3,7 +3,6 @@
 from functools import partial
 
 import numpy as np
-from surface_shapes import cameras_on_sphere, sphere, volume_of
 
 from octasplat.engine.colour import to_bytes
 from octasplat.engine.geometry.triangle_mesh import TriangleMesh, edge_report
@@ -15,6 +14,7 @@ from octasplat.engine.surface.texture import unwrap
 from octasplat.engine.surface.tsdf_volume import fill_unseen
 from octasplat.engine.surface.vertex_refinement import refine_vertices
 from octasplat.engine.trace.triangle_bvh import TriangleBvh
+from tests.support.surface_shapes import cameras_on_sphere, sphere, volume_of
 
 
 def painted(points_world: np.ndarray) -> np.ndarray:

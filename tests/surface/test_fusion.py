@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from surface_shapes import cameras_on_sphere, sphere_depth
 
 from octasplat.engine.errors import ConfigError
 from octasplat.engine.geometry.triangle_mesh import edge_report
@@ -11,6 +10,7 @@ from octasplat.engine.surface.marching_cubes import marching_cubes
 from octasplat.engine.surface.options import ExtractionOptions
 from octasplat.engine.surface.region import choose_region, focus_point
 from octasplat.engine.surface.tsdf_volume import fuse_depth_maps
+from tests.support.surface_shapes import cameras_on_sphere, sphere_depth
 
 RADIUS = 1.0
 

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 import skimage.measure
 from scipy.spatial import cKDTree
-from surface_shapes import sphere, volume_of, voxel_centres
 
 from octasplat.engine.errors import ConfigError
 from octasplat.engine.geometry.triangle_mesh import edge_report
 from octasplat.engine.surface.marching_cubes import marching_cubes
 from octasplat.engine.surface.marching_cubes_table import EDGES, FACES, case_loops, case_triangles
+from tests.support.surface_shapes import sphere, volume_of, voxel_centres
 
 
 @pytest.mark.parametrize("case", range(256))

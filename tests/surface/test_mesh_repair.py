@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 import trimesh
 from scipy.ndimage import gaussian_filter
-from surface_shapes import sphere, volume_of
 
 from octasplat.engine.geometry.triangle_mesh import TriangleMesh, edge_report
 from octasplat.engine.surface.holes import boundary_loops, fill_holes
 from octasplat.engine.surface.marching_cubes import marching_cubes
 from octasplat.engine.surface.mesh_cleanup import decimate, face_components, keep_largest_components
+from tests.support.surface_shapes import sphere, volume_of
 
 
 def joined(*meshes: TriangleMesh) -> TriangleMesh:

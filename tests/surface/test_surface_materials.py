@@ -5,7 +5,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from surface_shapes import cameras_on_sphere
 
 from octasplat.engine.colour import linear_to_srgb
 from octasplat.engine.files import read_mesh, write_surface
@@ -18,6 +17,7 @@ from octasplat.engine.surface.options import ExtractionOptions
 from octasplat.engine.surface.tangents import vertex_tangents
 from octasplat.engine.surface.texture import TextureLayout
 from octasplat.engine.trace.cpu.tracer import CpuTracer
+from tests.support.surface_shapes import cameras_on_sphere
 
 SIDE = 256
 UP = (0.0, 0.0, 1.0)

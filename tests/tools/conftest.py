@@ -6,7 +6,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from npm_packages import npm_folder
+
+from tests.support.npm_packages import npm_folder
 
 Validate = Callable[[Path], dict[str, Any]]
 

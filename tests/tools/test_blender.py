@@ -6,8 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from blender_python import EXPORT_PATH_SCRIPT, IMPORT_SCRIPT, SCRIPTS, run_blender
-from shell_scene import our_view, psnr_db, shell_cameras, shell_scene, write_shell_cameras
 
 from octasplat.engine.files import ExportOptions, export_scene
 from octasplat.engine.files.ply_container import read_ply
@@ -15,6 +13,8 @@ from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.gaussians.octagon import octagon_corners_world, octagon_radii
 from octasplat.engine.render.image_files import read_image, write_exr
 from octasplat.engine.render.path_file import read_camera_path
+from tests.support.blender_python import EXPORT_PATH_SCRIPT, IMPORT_SCRIPT, SCRIPTS, run_blender
+from tests.support.shell_scene import our_view, psnr_db, shell_cameras, shell_scene, write_shell_cameras
 
 pytestmark = [pytest.mark.tools, pytest.mark.heavy]
 

@@ -8,12 +8,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from blender_python import SCRIPTS, run_blender
-from shell_scene import shell_scene
 
 from octasplat.engine.files import export_scene, read_scene
 from octasplat.engine.gaussians.rows import row_arrays
 from octasplat.engine.render.path_file import read_camera_path
+from tests.support.blender_python import SCRIPTS, run_blender
+from tests.support.shell_scene import shell_scene
 
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples" / "blender"
 PROGRAM = Path(sys.executable).with_name("octasplat")

@@ -6,8 +6,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from blender_python import SCRIPTS, run_blender
-from lit_surface import render_in_cycles, render_in_threejs, view_of
 
 from octasplat.engine.files import write_surface
 from octasplat.engine.gaussians.frames import frames_from_normals, quaternions_from_matrices
@@ -26,6 +24,8 @@ from octasplat.engine.surface.extract import extract_levels
 from octasplat.engine.surface.options import ExtractionOptions
 from octasplat.engine.trace.cpu.tracer import CpuTracer
 from octasplat.engine.trace.protocol import TraceSettings
+from tests.support.blender_python import SCRIPTS, run_blender
+from tests.support.lit_surface import render_in_cycles, render_in_threejs, view_of
 
 pytestmark = [pytest.mark.tools, pytest.mark.heavy]
 

@@ -4,10 +4,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from browser import open_page
 
 from octasplat.engine.evaluate.gallery import ViewImages
 from octasplat.engine.evaluate.report import write_report
+from tests.support.browser import open_page
 
 pytestmark = [pytest.mark.tools, pytest.mark.heavy]
 

@@ -5,13 +5,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from browser import Page, open_page, psnr
-from npm_packages import npm_folder
-from shell_scene import our_view, shell_scene
 
 from octasplat.engine.colour import to_bytes
 from octasplat.engine.files import export_scene
 from octasplat.engine.render.pinhole_camera import PinholeCamera, focal_from_fov
+from tests.support.browser import Page, open_page, psnr
+from tests.support.npm_packages import npm_folder
+from tests.support.shell_scene import our_view, shell_scene
 
 pytestmark = [pytest.mark.tools, pytest.mark.heavy]
 

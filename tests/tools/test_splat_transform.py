@@ -3,21 +3,18 @@
 import os
 import shutil
 import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
-from npm_packages import npm_folder
 
 from octasplat.engine.files import ExportOptions, export_scene, importer_for, read_scene
 from octasplat.engine.files.gaussian_ply import read_ply_cloud
 from octasplat.engine.gaussians.flattening import GaussianCloud
 from octasplat.engine.gaussians.model import FlatGaussians
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "files"))
-from cloud_difference import difference
+from tests.support.cloud_difference import difference
+from tests.support.npm_packages import npm_folder
 
 pytestmark = pytest.mark.tools
 Convert = Callable[..., Path]

@@ -4,14 +4,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from browser import psnr
-from shell_scene import our_view, shell_cameras, shell_scene, write_shell_cameras
-from threejs_example import draw_glb
 
 from octasplat.engine.colour import to_bytes
 from octasplat.engine.files import ExportOptions, export_scene
 from octasplat.engine.gaussians.frames import frames_from_normals, quaternions_from_matrices
 from octasplat.engine.gaussians.model import FlatGaussians
+from tests.support.browser import psnr
+from tests.support.shell_scene import our_view, shell_cameras, shell_scene, write_shell_cameras
+from tests.support.threejs_example import draw_glb
 
 pytestmark = [pytest.mark.tools, pytest.mark.heavy]
 

@@ -3,7 +3,8 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 import torch
-import trace_scenes
+
+from tests.support import trace_scenes
 
 
 @pytest.fixture

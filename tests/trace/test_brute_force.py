@@ -2,11 +2,11 @@
 
 import numpy as np
 import pytest
-from trace_scenes import f32, in_plane, make_cloud, make_tracer, rays_inwards, unit
 
 from octasplat.engine.gaussians.model import FlatGaussians, concatenate
 from octasplat.engine.rays import RayBatch
 from octasplat.engine.trace.cpu.recording import CpuRecording
+from tests.support.trace_scenes import f32, in_plane, make_cloud, make_tracer, rays_inwards, unit
 
 pytestmark = pytest.mark.usefixtures("both_ways")
 

@@ -2,7 +2,13 @@
 
 import numpy as np
 import pytest
-from trace_scenes import (
+
+from octasplat.engine.gaussians.model import FlatGaussians
+from octasplat.engine.rays import RayBatch
+from octasplat.engine.trace.cpu.tracer import CpuTracer
+from octasplat.engine.trace.factory import make_tracer
+from octasplat.engine.trace.protocol import GradientsHandle, Recording, Tracer, TraceSettings
+from tests.support.trace_scenes import (
     OUTPUTS,
     PARAMETERS,
     f32,
@@ -17,12 +23,6 @@ from trace_scenes import (
     scattered,
     unit,
 )
-
-from octasplat.engine.gaussians.model import FlatGaussians
-from octasplat.engine.rays import RayBatch
-from octasplat.engine.trace.cpu.tracer import CpuTracer
-from octasplat.engine.trace.factory import make_tracer
-from octasplat.engine.trace.protocol import GradientsHandle, Recording, Tracer, TraceSettings
 
 TRACERS = ("cpu", "cpu, packets", "cpu, single rays", "reference")
 

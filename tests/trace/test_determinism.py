@@ -8,7 +8,11 @@ from pathlib import Path
 import numba
 import numpy as np
 import pytest
-from trace_scenes import (
+
+from octasplat.engine.gaussians.model import FlatGaussians, concatenate
+from octasplat.engine.rays import RayBatch
+from octasplat.engine.trace.protocol import GaussianGradients, TraceResult
+from tests.support.trace_scenes import (
     f32,
     hit_lists,
     in_plane,
@@ -18,10 +22,6 @@ from trace_scenes import (
     rays_inwards,
     same_bits,
 )
-
-from octasplat.engine.gaussians.model import FlatGaussians, concatenate
-from octasplat.engine.rays import RayBatch
-from octasplat.engine.trace.protocol import GaussianGradients, TraceResult
 
 RAYS = 700
 Scene = tuple[FlatGaussians, np.ndarray, RayBatch]
@@ -71,10 +71,9 @@ SCRIPT = """
 import hashlib, sys
 from dataclasses import fields
 import numpy as np
-sys.path.insert(0, sys.argv[1])
-from trace_scenes import make_cloud, make_tracer, random_gradients, rays_inwards
+from tests.support.trace_scenes import make_cloud, make_tracer, random_gradients, rays_inwards
 rng = np.random.default_rng(5)
-tracer = make_tracer(make_cloud(rng, 1500, degree=1), threads=int(sys.argv[2]))
+tracer = make_tracer(make_cloud(rng, 1500, degree=1), threads=int(sys.argv[1]))
 seen = tracer.trace(rays_inwards(rng, 900), record=True)
 gradients = tracer.backward(seen.hits, random_gradients(rng, 900))
 digest = hashlib.sha256()
@@ -91,7 +90,7 @@ def test_trace_is_bit_identical_across_threads() -> None:
     digests = set()
     for threads in (1, 4):
         done = subprocess.run(
-            [sys.executable, "-c", SCRIPT, str(Path(__file__).parent), str(threads)],
+            [sys.executable, "-c", SCRIPT, str(threads)],
             env={**os.environ, "NUMBA_NUM_THREADS": "4"},
             cwd=Path(__file__).parents[2],
             capture_output=True,

@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
-from trace_scenes import facing_z, make_cloud, make_tracer, random_gradients, rays_inwards
 
 from octasplat.engine.gaussians.model import FlatGaussians, concatenate
 from octasplat.engine.rays import RayBatch
+from tests.support.trace_scenes import facing_z, make_cloud, make_tracer, random_gradients, rays_inwards
 
 
 def assert_sees_nothing(cloud: FlatGaussians, rays: RayBatch) -> None:

@@ -3,7 +3,10 @@
 import numpy as np
 import pytest
 import torch
-from trace_scenes import (
+
+from octasplat.engine.trace.protocol import TraceGradients
+from octasplat.engine.trace.reference import ReferenceParameters, trace_reference
+from tests.support.trace_scenes import (
     OUTPUTS,
     PARAMETERS,
     f32,
@@ -15,9 +18,6 @@ from trace_scenes import (
     reference_loss,
     scattered,
 )
-
-from octasplat.engine.trace.protocol import TraceGradients
-from octasplat.engine.trace.reference import ReferenceParameters, trace_reference
 
 pytestmark = pytest.mark.usefixtures("both_ways")
 

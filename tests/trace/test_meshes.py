@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
-from trace_scenes import f32
 
 from octasplat.engine.rays import RayBatch
 from octasplat.engine.trace.triangle_bvh import TriangleBvh
+from tests.support.trace_scenes import f32
 
 CUBE_CORNERS = f32([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
 QUADS = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]

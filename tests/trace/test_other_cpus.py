@@ -21,8 +21,7 @@ HASWELL = {
 TRAINING = """
 import sys, tempfile
 from pathlib import Path
-sys.path.insert(0, sys.argv[1])
-from planar_dataset import FlatWorld, small_config
+from tests.support.planar_dataset import FlatWorld, small_config
 from octasplat.engine.train.state import fresh_state
 from octasplat.engine.train.trainer import Trainer
 world = FlatWorld()
@@ -40,7 +39,7 @@ for name in ("means_world", "quats_wxyz", "log_scales", "opacity_logits", "sh"):
 def trained(environment: dict[str, str]) -> str:
     """Digest of what a training in a process with these variables ends with."""
     done = subprocess.run(
-        [sys.executable, "-W", "ignore", "-c", TRAINING, str(ROOT / "tests" / "train")],
+        [sys.executable, "-W", "ignore", "-c", TRAINING],
         env={**os.environ, **environment},
         cwd=ROOT,
         capture_output=True,

@@ -4,8 +4,15 @@ from collections.abc import Iterator
 
 import numpy as np
 import pytest
-import trace_scenes
-from trace_scenes import (
+
+from octasplat.engine.gaussians.model import concatenate
+from octasplat.engine.rays import RayBatch
+from octasplat.engine.trace.cpu.packets import MAX_RAYS, find_packets
+from octasplat.engine.trace.cpu.recording import CpuRecording
+from octasplat.engine.trace.cpu.tracer import CpuTracer
+from octasplat.engine.trace.protocol import TraceResult
+from tests.support import trace_scenes
+from tests.support.trace_scenes import (
     assert_matches_reference,
     f32,
     facing_z,
@@ -17,13 +24,6 @@ from trace_scenes import (
     same_bits,
     unit,
 )
-
-from octasplat.engine.gaussians.model import concatenate
-from octasplat.engine.rays import RayBatch
-from octasplat.engine.trace.cpu.packets import MAX_RAYS, find_packets
-from octasplat.engine.trace.cpu.recording import CpuRecording
-from octasplat.engine.trace.cpu.tracer import CpuTracer
-from octasplat.engine.trace.protocol import TraceResult
 
 
 @pytest.fixture(autouse=True)

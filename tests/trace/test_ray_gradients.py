@@ -5,7 +5,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from trace_scenes import (
+
+from octasplat.engine.gaussians.spherical_harmonics import sh_basis, sh_basis_gradients
+from octasplat.engine.rays import AT_INFINITY, RayBatch
+from octasplat.engine.trace.protocol import TraceGradients, TraceSettings
+from octasplat.engine.trace.ray_gradients import ray_gradients
+from octasplat.engine.trace.ray_hits import dominant_gaussians
+from octasplat.engine.trace.reference import ReferenceParameters, trace_reference
+from octasplat.engine.trace.reference_tracer import ReferenceTracer
+from tests.support.trace_scenes import (
     OUTPUTS,
     f32,
     hit_lists,
@@ -15,14 +23,6 @@ from trace_scenes import (
     rays_inwards,
     unit,
 )
-
-from octasplat.engine.gaussians.spherical_harmonics import sh_basis, sh_basis_gradients
-from octasplat.engine.rays import AT_INFINITY, RayBatch
-from octasplat.engine.trace.protocol import TraceGradients, TraceSettings
-from octasplat.engine.trace.ray_gradients import ray_gradients
-from octasplat.engine.trace.ray_hits import dominant_gaussians
-from octasplat.engine.trace.reference import ReferenceParameters, trace_reference
-from octasplat.engine.trace.reference_tracer import ReferenceTracer
 
 STEP = 1e-4
 """Rays are float32: smaller steps would be lost in their rounding."""

@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
-from trace_scenes import f32, unit
 
 from octasplat.engine.rays import ImageRays, RayBatch, joined
+from tests.support.trace_scenes import f32, unit
 
 
 def test_ray_batch_keeps_views_and_scalar_limits(rng: np.random.Generator) -> None:

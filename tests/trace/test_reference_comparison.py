@@ -2,7 +2,13 @@
 
 import numpy as np
 import pytest
-from trace_scenes import (
+
+from octasplat.engine.gaussians.model import FlatGaussians, concatenate
+from octasplat.engine.rays import AT_INFINITY, RayBatch
+from octasplat.engine.trace.cpu.kernels.octagon_hit import HIT_BUFFER_SIZE
+from octasplat.engine.trace.cpu.recording import CpuRecording
+from octasplat.engine.trace.protocol import TraceGradients
+from tests.support.trace_scenes import (
     GRADIENT_TOLERANCE,
     PARAMETERS,
     assert_matches_reference,
@@ -19,12 +25,6 @@ from trace_scenes import (
     scattered,
     unit,
 )
-
-from octasplat.engine.gaussians.model import FlatGaussians, concatenate
-from octasplat.engine.rays import AT_INFINITY, RayBatch
-from octasplat.engine.trace.cpu.kernels.octagon_hit import HIT_BUFFER_SIZE
-from octasplat.engine.trace.cpu.recording import CpuRecording
-from octasplat.engine.trace.protocol import TraceGradients
 
 pytestmark = pytest.mark.usefixtures("both_ways")
 

@@ -4,11 +4,19 @@ from collections.abc import Iterator
 
 import numpy as np
 import pytest
-from trace_scenes import assert_matches_reference, f32, hit_lists, make_cloud, rays_inwards, same_bits, unit
 
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.rays import RayBatch
 from octasplat.engine.trace.cpu.tracer import CpuTracer
+from tests.support.trace_scenes import (
+    assert_matches_reference,
+    f32,
+    hit_lists,
+    make_cloud,
+    rays_inwards,
+    same_bits,
+    unit,
+)
 
 STEPS, MOVE, GROWTH = 25, 0.14, 0.04
 """What training does at most between two builds: moves of so much of a Gaussian's size, growth by so much."""

@@ -5,7 +5,14 @@ import dataclasses
 import numpy as np
 import pytest
 from test_packets import in_packets, tile_rays
-from trace_scenes import (
+
+from octasplat.engine.gaussians.model import FlatGaussians
+from octasplat.engine.rays import RayBatch
+from octasplat.engine.trace.cpu.recording import CpuRecording
+from octasplat.engine.trace.cpu.tracer import CpuTracer
+from octasplat.engine.trace.protocol import TraceGradients, TraceResult
+from octasplat.engine.trace.reference import ReferenceParameters, trace_reference
+from tests.support.trace_scenes import (
     GRADIENT_TOLERANCE,
     OUTPUTS,
     PARAMETERS,
@@ -22,13 +29,6 @@ from trace_scenes import (
     scattered,
     unit,
 )
-
-from octasplat.engine.gaussians.model import FlatGaussians
-from octasplat.engine.rays import RayBatch
-from octasplat.engine.trace.cpu.recording import CpuRecording
-from octasplat.engine.trace.cpu.tracer import CpuTracer
-from octasplat.engine.trace.protocol import TraceGradients, TraceResult
-from octasplat.engine.trace.reference import ReferenceParameters, trace_reference
 
 SEEN = ("rgb_srgb", "transmittance", "depth_sum", "depth_median", "normal_world")
 

@@ -3,7 +3,6 @@
 from pathlib import Path
 
 import numpy as np
-from planar_dataset import random_gaussians
 
 from octasplat.engine.gaussians.rows import row_arrays
 from octasplat.engine.train.averaging import AVERAGE_EVERY, RunningMean
@@ -11,6 +10,7 @@ from octasplat.engine.train.checkpoint import load_checkpoint, save_checkpoint
 from octasplat.engine.train.config import TrainConfig
 from octasplat.engine.train.schedule import Schedule
 from octasplat.engine.train.state import fresh_state
+from tests.support.planar_dataset import random_gaussians
 
 
 def test_mean_of_the_states_that_were_added() -> None:

@@ -4,11 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from planar_dataset import PlanarDataset, small_config
 
 from octasplat.engine.errors import ConfigError
 from octasplat.engine.train.batches import BatchSource
 from octasplat.engine.train.pixel_sampler import PixelSampler
+from tests.support.planar_dataset import PlanarDataset, small_config
 
 SIZES = np.array([[8, 6], [20, 10], [16, 16], [5, 3]], np.int64)
 

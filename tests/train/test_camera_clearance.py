@@ -4,7 +4,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from planar_dataset import PlanarDataset, small_config
 
 from octasplat.engine.dataset.camera import Camera
 from octasplat.engine.dataset.camera_clearance import CameraClearance, camera_clearances
@@ -13,6 +12,7 @@ from octasplat.engine.dataset.view_frusta import ViewFrusta
 from octasplat.engine.gaussians.model import FlatGaussians, concatenate
 from octasplat.engine.train.state import fresh_state
 from octasplat.engine.train.trainer import Trainer
+from tests.support.planar_dataset import PlanarDataset, small_config
 
 WIDE = Camera("OPENCV", (50.0, 50.0, 40.0, 40.0, -0.2, 0.0, 0.0, 0.0), 80, 80)
 PINHOLE = Camera("PINHOLE", (40.0, 40.0, 20.0, 20.0), 40, 40)

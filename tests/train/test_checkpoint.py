@@ -4,7 +4,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from planar_dataset import PlanarDataset
 
 from octasplat.engine.errors import CheckpointError
 from octasplat.engine.gaussians.rows import row_arrays
@@ -18,6 +17,7 @@ from octasplat.engine.train.checkpoint import (
 )
 from octasplat.engine.train.optimiser import Adam
 from octasplat.engine.train.state import TrainState
+from tests.support.planar_dataset import PlanarDataset
 
 
 def make_state(iteration: int = 30, count: int = 12) -> TrainState:

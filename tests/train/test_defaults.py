@@ -4,7 +4,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from planar_dataset import PlanarDataset, small_config
 
 from octasplat.engine.train.config import (
     LossWeights,
@@ -22,6 +21,7 @@ from octasplat.engine.train.schedule import Schedule
 from octasplat.engine.train.shown import shown_share
 from octasplat.engine.train.state import fresh_state
 from octasplat.engine.train.trainer import Trainer
+from tests.support.planar_dataset import PlanarDataset, small_config
 
 
 @pytest.mark.parametrize(

@@ -4,7 +4,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from planar_dataset import PlanarDataset, small_config
 
 from octasplat.engine.errors import Cancelled
 from octasplat.engine.events import CheckpointWritten, Event, TrainingProgress, Warned
@@ -16,6 +15,7 @@ from octasplat.engine.train.early_end import gains_no_more, last_iteration
 from octasplat.engine.train.schedule import Schedule
 from octasplat.engine.train.state import TrainState, fresh_state
 from octasplat.engine.train.trainer import Trainer
+from tests.support.planar_dataset import PlanarDataset, small_config
 
 RISING = [(k, 20 + k / 100) for k in range(0, 1001, 100)]
 

@@ -5,7 +5,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from planar_dataset import PlanarDataset, small_config
 
 from octasplat.engine.dataset.model import Observations
 from octasplat.engine.errors import Cancelled
@@ -21,6 +20,7 @@ from octasplat.engine.train.config import TrainConfig
 from octasplat.engine.train.exposure_changes import exposure_changes, log_brightness, with_exposure_decided
 from octasplat.engine.train.state import TrainState, fresh_state
 from octasplat.engine.train.trainer import Trainer
+from tests.support.planar_dataset import PlanarDataset, small_config
 
 NO_GRADIENTS = GaussianGradients(
     ids=np.zeros(0, np.int32),

@@ -5,7 +5,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from planar_dataset import PlanarDataset, plane_texture, small_config
 
 from octasplat.engine.dataset import Camera
 from octasplat.engine.dataset.model import SparsePoints
@@ -24,6 +23,7 @@ from octasplat.engine.train.first_background import first_background
 from octasplat.engine.train.shading import background_of
 from octasplat.engine.train.state import TrainState, fresh_state
 from octasplat.engine.train.trainer import Trainer
+from tests.support.planar_dataset import PlanarDataset, plane_texture, small_config
 
 
 def sky(directions: np.ndarray) -> np.ndarray:

@@ -3,12 +3,12 @@
 from pathlib import Path
 
 import numpy as np
-from planar_dataset import PlanarDataset, small_config
 from scipy.spatial.distance import cdist
 
 from octasplat.engine.train.floors import ScaleFloor
 from octasplat.engine.train.state import fresh_state
 from octasplat.engine.train.trainer import Trainer
+from tests.support.planar_dataset import PlanarDataset, small_config
 
 
 def test_min_scale_is_enforced(tmp_path: Path) -> None:

@@ -1,10 +1,10 @@
 """Which side of a Gaussian is out: the one from which the training views see it."""
 
 import numpy as np
-from planar_dataset import PlanarDataset
 
 from octasplat.engine.trace.factory import make_tracer
 from octasplat.engine.train.sides import turn_outwards
+from tests.support.planar_dataset import PlanarDataset
 
 
 def test_normals_seen_from_behind_are_flipped() -> None:

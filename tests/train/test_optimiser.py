@@ -6,7 +6,6 @@ from typing import Literal
 import numpy as np
 import pytest
 import torch
-from planar_dataset import random_gaussians
 
 from octasplat.engine.gaussians.frames import rotation_matrices
 from octasplat.engine.gaussians.model import SH_C0, FlatGaussians
@@ -15,6 +14,7 @@ from octasplat.engine.trace.protocol import GaussianGradients
 from octasplat.engine.train.config import LearningRates, LossWeights
 from octasplat.engine.train.initialise import with_first_materials
 from octasplat.engine.train.optimiser import Adam
+from tests.support.planar_dataset import random_gaussians
 
 NAMES = ("means_world", "quats_wxyz", "log_scales", "opacity_logits", "sh")
 NO_LOSS = LossWeights(opacity=0.0, scale=0.0)

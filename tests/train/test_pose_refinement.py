@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from planar_dataset import PlanarDataset, small_config
 from scipy.spatial.transform import Rotation
 
 from octasplat.engine.config import resolve_config
@@ -24,6 +23,7 @@ from octasplat.engine.train.pixel_sampler import view_sizes_px
 from octasplat.engine.train.pose_refinement import RefinedPose
 from octasplat.engine.train.state import TrainState, fresh_state
 from octasplat.engine.train.trainer import Trainer
+from tests.support.planar_dataset import PlanarDataset, small_config
 
 SIDE_PX, FOCAL_PX, DISTANCE = 48, 52.0, 2.0
 WRONG_PX = 0.6

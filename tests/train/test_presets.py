@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from planar_dataset import PlanarDataset, small_config
 
 from octasplat.engine.config import resolve_config
 from octasplat.engine.dataset.synthetic import SyntheticDatasetConfig, write_synthetic_dataset
@@ -21,6 +20,7 @@ from octasplat.engine.train.densify import make_densifier
 from octasplat.engine.train.iteration import Machinery, differentiate, iterate
 from octasplat.engine.train.state import fresh_state
 from octasplat.engine.train.trainer import Trainer
+from tests.support.planar_dataset import PlanarDataset, small_config
 
 
 def held_out_psnr(folder: Path, config: TrainConfig) -> tuple[list[float], Trainer]:

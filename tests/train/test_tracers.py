@@ -4,7 +4,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from planar_dataset import PlanarDataset, small_config
 
 from octasplat.engine.dataset import Dataset
 from octasplat.engine.dataset.synthetic import SyntheticDatasetConfig, write_synthetic_dataset
@@ -14,6 +13,7 @@ from octasplat.engine.train.fingerprint import run_fingerprint
 from octasplat.engine.train.initialise import initial_gaussians
 from octasplat.engine.train.state import TrainState, fresh_state
 from octasplat.engine.train.trainer import Trainer
+from tests.support.planar_dataset import PlanarDataset, small_config
 
 
 def start() -> FlatGaussians:

@@ -5,7 +5,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from planar_dataset import PlanarDataset, small_config
 
 from octasplat.engine.errors import Cancelled, DatasetError, TrainingFailure
 from octasplat.engine.events import CheckpointWritten, Event, HeldOutMeasured, TrainingProgress, Warned
@@ -16,6 +15,7 @@ from octasplat.engine.train.config import McmcConfig, PaperConfig, TrainConfig
 from octasplat.engine.train.shown import shown_share
 from octasplat.engine.train.state import TrainState, fresh_state
 from octasplat.engine.train.trainer import Trainer
+from tests.support.planar_dataset import PlanarDataset, small_config
 
 
 def train(

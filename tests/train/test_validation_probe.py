@@ -4,7 +4,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from planar_dataset import PlanarDataset
 
 from octasplat.engine.errors import TrainingFailure
 from octasplat.engine.gaussians.model import FlatGaussians
@@ -14,6 +13,7 @@ from octasplat.engine.trace.factory import make_tracer
 from octasplat.engine.trace.protocol import Tracer, TraceSettings
 from octasplat.engine.train.probes import Judge, draw_probe, measure
 from octasplat.engine.train.state import fresh_state
+from tests.support.planar_dataset import PlanarDataset
 
 
 class SmallObject(PlanarDataset):

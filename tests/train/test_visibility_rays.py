@@ -4,7 +4,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from planar_dataset import PlanarDataset
 
 from octasplat.engine.dataset.camera import Camera
 from octasplat.engine.dataset.model import Observations, SparsePoints
@@ -15,6 +14,7 @@ from octasplat.engine.train.config import LossWeights, TrainConfig
 from octasplat.engine.train.sight_lines import SightLines, blocked_term
 from octasplat.engine.train.state import fresh_state
 from octasplat.engine.train.trainer import Trainer
+from tests.support.planar_dataset import PlanarDataset
 
 
 class SeenWorld(PlanarDataset):

@@ -15,15 +15,12 @@ from typing import Any
 
 import pytest
 
-sys.path.append(str(Path(__file__).parents[1]))
-sys.path.append(str(Path(__file__).parents[1] / "tools"))
-from browser import PLAYWRIGHT, chromium
-from npm_packages import npm_folder
-from run_replay import RunReplay
-from web_harness import ROOT, Browse, RunningService, StartService
-
 from octasplat.workers.postgres.embedded import EmbeddedPostgres
-from postgres_fixtures import copied_database, postgres, short_root, template
+from tests.support.browser import PLAYWRIGHT, chromium
+from tests.support.npm_packages import npm_folder
+from tests.support.postgres_fixtures import copied_database, postgres, short_root, template
+from tests.support.run_replay import RunReplay
+from tests.support.web_harness import ROOT, Browse, RunningService, StartService
 
 __all__ = ["postgres", "short_root", "template"]
 

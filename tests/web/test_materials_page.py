@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from web_harness import Browse, RunningService
 
 from octasplat.engine.dataset.synthetic import SyntheticDatasetConfig, write_synthetic_dataset
 from octasplat.engine.render.environment_files import write_environment
 from octasplat.workers.cli.main import cli
+from tests.support.web_harness import Browse, RunningService
 
 pytestmark = [pytest.mark.tools, pytest.mark.heavy]
 

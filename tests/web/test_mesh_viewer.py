@@ -1,18 +1,15 @@
 """The viewer of meshes on the web page shows the mesh of a GLB file in its colours."""
 
 import json
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-sys.path.append(str(Path(__file__).parents[1] / "tools"))  # the browser
-from browser import Page, open_page
-
 import octasplat.service.web as service_web
 from octasplat.engine.files.mesh_glb import write_surface
 from octasplat.engine.geometry.triangle_mesh import TriangleMesh
+from tests.support.browser import Page, open_page
 
 pytestmark = [pytest.mark.tools, pytest.mark.heavy]
 

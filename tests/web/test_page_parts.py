@@ -12,7 +12,6 @@ from pathlib import Path
 
 import httpx
 import pytest
-from web_harness import ROOT
 
 from octasplat.service.app import create_app
 from octasplat.service.settings import ServiceSettings
@@ -25,6 +24,7 @@ from octasplat.workers.db.rows import Artifact, DatasetFile
 from octasplat.workers.db.tokens import add_token
 from octasplat.workers.queue.jobs import NewJob, create_job
 from octasplat.workers.queue.procrastinate_queue import ProcrastinateQueue
+from tests.support.web_harness import ROOT
 
 HOSTILE = '"><img src=x onerror=alert(1)>'
 

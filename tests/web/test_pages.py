@@ -11,12 +11,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from web_harness import ROOT, Browse, RunningService, StartService
 
 from octasplat.engine.dataset.synthetic import SyntheticDatasetConfig, write_synthetic_dataset
 from octasplat.engine.pathtracing.stage.stage_file import parse_stage
 from octasplat.engine.render.path_file import read_camera_path
 from octasplat.engine.train.config import preset
+from tests.support.web_harness import ROOT, Browse, RunningService, StartService
 
 pytestmark = [pytest.mark.tools, pytest.mark.heavy]
 

@@ -12,9 +12,9 @@ from urllib.parse import urlsplit
 
 import numpy as np
 import pytest
-from web_harness import Browse
 
 import octasplat as osp
+from tests.support.web_harness import Browse
 
 
 @pytest.fixture

@@ -1,18 +1,11 @@
 """The viewer of the web page draws what our tracer sees."""
 
 import json
-import sys
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-
-sys.path.append(str(Path(__file__).parents[1] / "tools"))  # the browser, and a scene to draw
-sys.path.append(str(Path(__file__).parents[1] / "light"))
-from browser import Page, open_page, psnr
-from light_scenes import shiny_ball
-from shell_scene import our_view, shell_scene
 
 import octasplat.service.web as service_web
 from octasplat.engine.colour import to_bytes
@@ -26,6 +19,9 @@ from octasplat.engine.render.pinhole_camera import PinholeCamera, focal_from_fov
 from octasplat.engine.render.renderer import background_colour, render_rays
 from octasplat.engine.trace.cpu.tracer import CpuTracer
 from octasplat.engine.trace.protocol import TraceSettings
+from tests.support.browser import Page, open_page, psnr
+from tests.support.light_scenes import shiny_ball
+from tests.support.shell_scene import our_view, shell_scene
 
 pytestmark = [pytest.mark.tools, pytest.mark.heavy]
 

@@ -9,7 +9,7 @@ So nobody waits for an advisory lock who has locked a row of a job or a dataset:
 row only as long as a few statements take. Nothing is asked of the store, or of anything else in the network,
 while one of these locks is held. Triggers of the database take the lock of an owner as well, so whoever
 changes files of datasets, results or checkpoints, or deletes a dataset or a job, takes it first. The tests
-run on a database that refuses any other order (``tests/lock_order_check.py``).
+run on a database that refuses any other order (``tests/support/lock_order_check.py``).
 """
 
 from octasplat.workers.db.connections import Connection

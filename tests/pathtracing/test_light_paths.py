@@ -1,0 +1,230 @@
+"""Whole paths against closed forms: furnace, Beer, slabs, mirrors; threads do not change a byte."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from octasplat.engine.errors import ConfigError
+from octasplat.engine.pathtracing.compile_meshes import check_outside_glass, compile_meshes
+from octasplat.engine.pathtracing.path_tracer import PathTracer, PathTracerScene
+from octasplat.engine.pathtracing.stage.model import (
+    Dielectric,
+    Diffuse,
+    DirectionalLight,
+    Environment,
+    Glass,
+    Integrator,
+    Metal,
+    Mirror,
+    PointLight,
+    RectangleLight,
+    Stage,
+    StageMesh,
+)
+from octasplat.engine.render.image_files import write_exr
+from tests.support.light_scenes import camera, film_of, psnr
+
+AHEAD = camera((0, 0, -4), (0, 0, 0), (24, 16), 30)
+WHITE = (1.0, 1.0, 1.0)
+
+
+def white_sky(folder: Path, value: float = 1.0) -> Environment:
+    write_exr(folder / "white.exr", {c: np.full((8, 16), value, np.float32) for c in "RGB"})
+    return Environment(file="white.exr")
+
+
+@pytest.mark.parametrize(
+    "material",
+    [
+        Diffuse(colour_srgb=WHITE),
+        Mirror(),
+        Glass(ior=1.5),
+        Glass(ior=1.5, roughness=0.5),
+        Metal(colour_srgb=WHITE, roughness=0.6),
+        Metal(colour_srgb=WHITE, roughness=0.15),
+        Dielectric(colour_srgb=WHITE, roughness=0.4),
+    ],
+    ids=lambda m: m.kind,
+)
+def test_white_furnace_has_uniform_radiance(material, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
+    ball = StageMesh(shape="sphere", smooth_degrees=180, material=material)
+    numbers = Integrator(samples=64, max_depth=32, roulette_depth=32)
+    stage = Stage(gaussians=(), meshes=(ball,), environment=white_sky(tmp_path), integrator=numbers)
+    picture = film_of(stage, AHEAD, tmp_path).image().rgb_linear
+    assert abs(picture.mean() - 1.0) < 0.01
+    assert np.abs(picture.mean(axis=2) - 1).max() < 0.35
+
+
+def test_dielectric_slab_follows_beer_and_fresnel(tmp_path: Path) -> None:
+    slab = StageMesh(shape="cube", scale=(5, 5, 0.5), material=Glass(ior=1.5, absorption=(0.7, 0.2, 0.0)))
+    numbers = Integrator(samples=1024, max_depth=32, roulette_depth=32, anti_aliasing=False)
+    black = Stage(gaussians=(), meshes=(slab,), integrator=numbers)
+    # Light shines from behind only: a wall there that is its own light.
+    wall = RectangleLight(position=(0, 0, 3), direction=(0, 0, -1), width=20, height=20, radiance=1.0)
+    stage = black.model_copy(update={"lights": (wall,)})
+    straight = camera((0, 0, -4), (0, 0, 0), (8, 8), 0.5)
+    seen = film_of(stage, straight, tmp_path).image().rgb_linear.mean(axis=(0, 1))
+    inside, fresnel = np.exp(-np.array([0.7, 0.2, 0.0])), 0.04
+    through = (1 - fresnel) ** 2 * inside / (1 - (fresnel * inside) ** 2)
+    np.testing.assert_allclose(seen, through, atol=0.004)
+
+
+def test_dielectric_slab_offset_follows_snell(tmp_path: Path) -> None:
+    # Under 45 degrees, thickness 1, index 1.5: the ray comes out parallel, displaced sideways.
+    slab = StageMesh(shape="cube", scale=(20, 20, 0.5), material=Glass(ior=1.5))
+    numbers = Integrator(samples=256, max_depth=3, anti_aliasing=False)
+    angle = np.radians(45.0)
+    sideways = np.sin(angle) * (1 - np.cos(angle) / np.sqrt(1.5**2 - np.sin(angle) ** 2))
+    view = camera((-4, 0, -4), (0, 0, 0), (3, 3), 1e-4)
+    across = sideways / np.cos(angle)  # along x, where the ray meets the plane z = 4
+    for offset, bright in ((-0.06, True), (0.06, False)):
+        # The lamp's right edge lies a little to either side of where the ray arrives.
+        lamp = RectangleLight(
+            position=(4 - across + offset + 1.0, 0, 4),
+            direction=(0, 0, -1),
+            width=2.0,
+            height=1,
+            radiance=1.0,
+        )
+        lit = Stage(gaussians=(), meshes=(slab,), lights=(lamp,), integrator=numbers)
+        seen = film_of(lit, view, tmp_path).image().rgb_linear.mean()
+        assert (seen > 0.8) == bright, (offset, seen)
+
+
+def test_light_inside_glass_is_totally_reflected_beyond_the_critical_angle(tmp_path: Path) -> None:
+    # A prism of two right angles' halves: what enters its short face head-on turns by 90 degrees at the long
+    # one, where it arrives under 45 degrees; asin(1 / 1.5) is 41.8.
+    obj = "v -1 -9 -1\nv 1 -9 -1\nv -1 -9 1\nv -1 9 -1\nv 1 9 -1\nv -1 9 1\n"
+    obj += "f 1 2 3\nf 4 6 5\nf 1 4 5 2\nf 1 3 6 4\nf 2 5 6 3\n"
+    (tmp_path / "prism.obj").write_text(obj)
+    prism = StageMesh(file="prism.obj", smooth_degrees=0, material=Glass(ior=1.5))
+    lamp = RectangleLight(position=(-4, 0, 0), direction=(1, 0, 0), width=9, height=9, radiance=1.0)
+    numbers = Integrator(samples=512, max_depth=16, roulette_depth=16, anti_aliasing=False)
+    stage = Stage(gaussians=(), meshes=(prism,), lights=(lamp,), integrator=numbers)
+    seen = film_of(stage, camera((-0.3, 0, -6), (-0.3, 0, 0), (4, 4), 0.5), tmp_path).image().rgb_linear
+    # In by one face and out by the other with 4 % lost at each; what is reflected at the exit comes back and
+    # leaves towards the camera, where nothing shines.
+    assert abs(seen.mean() - 0.96**2) < 0.01
+
+
+def test_a_rectangle_lights_a_floor_by_its_form_factor(tmp_path: Path) -> None:
+    floor = StageMesh(shape="plane", scale=50, material=Diffuse(colour_srgb=WHITE))
+    lamp = RectangleLight(position=(0, -1, 0), direction=(0, 1, 0), width=1.4, height=2.0, radiance=2.0)
+    numbers = Integrator(samples=4096, max_depth=1, anti_aliasing=False)
+    stage = Stage(gaussians=(), meshes=(floor,), lights=(lamp,), integrator=numbers)
+    under = camera((-3, -1.5, 0), (0, 0, 0), (3, 3), 1e-3)
+    a, b = 0.7, 1.0
+    corner = (
+        a / np.hypot(1, a) * np.arctan(b / np.hypot(1, a))
+        + b / np.hypot(1, b) * np.arctan(a / np.hypot(1, b))
+    ) / (2 * np.pi)
+    seen = film_of(stage, under, tmp_path).image().rgb_linear
+    np.testing.assert_allclose(seen.mean(), 2.0 * 4 * corner, rtol=5e-3)
+
+
+def test_a_mirror_shows_what_a_camera_behind_it_sees(tmp_path: Path) -> None:
+    things = (
+        StageMesh(
+            shape="cube", scale=0.4, position=(0.3, 0.1, -1), material=Diffuse(colour_srgb=(0.9, 0.3, 0.1))
+        ),
+        StageMesh(shape="sphere", scale=0.4, position=(-0.5, -0.2, -1.5), material=Diffuse()),
+    )
+    mirror = StageMesh(
+        shape="plane", rotation_degrees=(90, 0, 0), position=(0, 0, 1), scale=9, material=Mirror()
+    )
+    light = (PointLight(position=(1, -2, -4), intensity=12),)
+    direct_light = Integrator(samples=1, max_depth=1, anti_aliasing=False)
+    one_more = Integrator(samples=1, max_depth=2, anti_aliasing=False)
+    seen_in_mirror = Stage(gaussians=(), meshes=(*things, mirror), lights=light, integrator=one_more)
+    # One stands before the mirror and looks into it, the other as far behind, left for right.
+    through = film_of(seen_in_mirror, camera((0, 0, 0.5), (0, 0, 1), (40, 30), 60), tmp_path)
+    direct = film_of(
+        Stage(gaussians=(), meshes=things, lights=light, integrator=direct_light),
+        camera((0, 0, 1.5), (0, 0, 1), (40, 30), 60),
+        tmp_path,
+    )
+    a, b = through.image().rgb_srgb, direct.image().rgb_srgb[:, ::-1]
+    assert a.max() > 0.2
+    assert psnr(a, b) > 50
+
+
+def test_the_same_bytes_on_any_number_of_threads_and_another_seed_gives_others(tmp_path: Path) -> None:
+    meshes = (
+        StageMesh(shape="plane", scale=3, position=(0, 1, 0)),
+        StageMesh(shape="sphere", smooth_degrees=180, material=Glass()),
+        StageMesh(shape="cube", scale=0.4, position=(1, 0.6, -1), material=Metal(roughness=0.4)),
+    )
+    lamp = RectangleLight(position=(0, -3, -1), direction=(0, 1, 0), width=1, height=1, radiance=9.0)
+    sun = DirectionalLight(direction=(1, 2, 1), irradiance=1.0)
+    stage = Stage(
+        gaussians=(), meshes=meshes, lights=(lamp, sun), environment=white_sky(tmp_path, 0.3),
+        integrator=Integrator(samples=100, max_depth=5, aperture=0.1, focus_distance=3.5),
+    )  # fmt: skip
+    view = camera((0, -0.5, -4), (0, 0, 0), (60, 40), 40)
+    one = film_of(stage, view, tmp_path, threads=1).image(tone="filmic")
+    two = film_of(stage, view, tmp_path, threads=2).image(tone="filmic")
+    assert one.rgb_linear.tobytes() == two.rgb_linear.tobytes()
+    assert one.rgb_srgb.tobytes() == two.rgb_srgb.tobytes()
+    other = stage.model_copy(update={"integrator": stage.integrator.model_copy(update={"seed": 1})})
+    assert film_of(other, view, tmp_path).image().rgb_linear.tobytes() != one.rgb_linear.tobytes()
+
+
+def test_depth_of_field_blurs_what_is_not_in_focus(tmp_path: Path) -> None:
+    edge = StageMesh(
+        shape="cube", position=(-1, 0, 0), scale=(1, 9, 0.001), material=Diffuse(colour_srgb=WHITE)
+    )
+    light = (DirectionalLight(direction=(0, 0, 1), irradiance=3.0),)
+    view = camera((0, 0, -4), (0, 0, 0), (64, 8), 1)
+
+    def edge_width(focus: float) -> float:
+        numbers = Integrator(samples=64, max_depth=1, aperture=0.2, focus_distance=focus)
+        stage = Stage(gaussians=(), meshes=(edge,), lights=light, integrator=numbers)
+        row = film_of(stage, view, tmp_path).image().rgb_linear[4, :, 0]
+        return float(((row > 0.05 * row.max()) & (row < 0.95 * row.max())).sum())
+
+    # Out of focus by half, a point at 4 is as wide as half the lens: 0.1 at 4, which are 11 pixels.
+    assert edge_width(4.0) <= 1
+    assert 6 <= edge_width(8.0 / 3.0) <= 14
+
+
+def test_light_of_a_point_goes_straight_through_a_pane(tmp_path: Path) -> None:
+    floor = StageMesh(shape="plane", position=(0, 1, 0), scale=9, material=Diffuse(colour_srgb=WHITE))
+    pane = StageMesh(
+        shape="cube", scale=(3, 0.5, 3), position=(0, -2, 0), material=Glass(ior=1.5, absorption=(0.5, 0, 0))
+    )
+    sun = DirectionalLight(direction=(0, 1, 0), irradiance=np.pi / 2)
+    numbers = Integrator(samples=1, max_depth=1, anti_aliasing=False)
+    stage = Stage(gaussians=(), meshes=(floor, pane), lights=(sun,), integrator=numbers)
+    seen = film_of(stage, camera((-3, 0.5, 0), (0, 1, 0), (3, 3), 1e-3), tmp_path).image().rgb_linear
+    np.testing.assert_allclose(seen.mean(axis=(0, 1)), 0.5 * 0.96**2 * np.exp([-0.5, 0, 0]), rtol=1e-4)
+
+
+def test_glass_that_is_open_and_a_camera_inside_glass_are_refused(tmp_path: Path) -> None:
+    ball = StageMesh(shape="sphere", material=Glass())
+    meshes = compile_meshes(Stage(gaussians=(), meshes=(ball,)), tmp_path)
+    with pytest.raises(ConfigError, match=r"a\.png: the camera stands inside"):
+        check_outside_glass(meshes, np.array([0.1, 0.2, 0.3], np.float32), "a.png")
+    check_outside_glass(meshes, np.array([0.1, 0.2, 1.3], np.float32), "a.png")
+    check_outside_glass(meshes, np.array([-3, -3, -3], np.float32), "a.png")
+    (tmp_path / "leaf.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
+    with pytest.raises(ConfigError, match=r"leaf\.obj is not closed"):
+        compile_meshes(Stage(meshes=(StageMesh(file="leaf.obj", material=Glass()),)), tmp_path)
+
+
+def test_neither_threads_nor_samples_added_later_change_a_picture_of_meshes() -> None:
+    balls = [
+        StageMesh(shape="sphere", scale=0.6, position=(1.4 * k - 1.4, 0, 0), smooth_degrees=180, material=m)
+        for k, m in enumerate((Glass(), Metal(roughness=0.4), Mirror()))
+    ]
+    floor = StageMesh(shape="plane", position=(0, 0.6, 0), scale=4)
+    lamp = RectangleLight(position=(1, -3, 0), direction=(0, 1, 0), width=1, height=1, radiance=5)
+    lights = (PointLight(position=(0, -3, -2), intensity=9), lamp)
+    numbers = Integrator(samples=12, max_depth=4)
+    stage = Stage(gaussians=(), meshes=(floor, *balls), lights=lights, integrator=numbers)
+    view = camera((0, -1, -4), (0, 0, 0), (64, 48), 50)  # more paths than one thread follows at a time
+    one, two = (film_of(stage, view, threads=threads).image().rgb_linear for threads in (1, 2))
+    np.testing.assert_array_equal(one, two)
+    scene = PathTracerScene(compile_meshes(stage, Path(), threads=2))
+    *_, last = PathTracer(scene, numbers, threads=2).refine(view.rays())
+    np.testing.assert_allclose(last.image().rgb_linear, one, atol=1e-6)

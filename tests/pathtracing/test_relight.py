@@ -1,0 +1,116 @@
+"""``octasplat relight`` on a file of Gaussians with materials."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner, Result
+
+from octasplat.engine.colour import linear_to_srgb
+from octasplat.engine.files.gaussian_ply import write_gaussian_ply
+from octasplat.engine.render.environment_files import write_environment
+from octasplat.engine.render.image_files import read_channels, read_image
+from octasplat.workers.cli.main import cli
+from tests.support.light_scenes import psnr, shiny_ball
+
+SMALL = ("--turntable", "--frames", 2, "--width", 32, "--height", 24, "--threads", 2, "--samples", 16)
+
+
+def relight(*arguments: object) -> Result:
+    return CliRunner().invoke(cli, ["relight", *(str(argument) for argument in arguments)])
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A ball of smooth metal, and maps: white, and red before blue behind."""
+    folder = tmp_path_factory.mktemp("scene")
+    gaussians = shiny_ball(800, 1.0, albedo=(1.0, 1.0, 1.0), metallic=1.0, roughness=0.1)
+    write_gaussian_ply(gaussians, folder / "ball.ply")
+    write_gaussian_ply(gaussians.without_channels(["albedo"]), folder / "plain.ply")
+    write_environment(folder / "white.hdr", np.full((16, 32, 3), 0.5, np.float32))
+    sides = np.zeros((16, 32, 3), np.float32)
+    sides[:, 8:24, 0], sides[:, :8, 2], sides[:, 24:, 2] = 0.5, 0.5, 0.5
+    write_environment(folder / "sides.exr", sides)
+    write_environment(folder / "turned.exr", np.roll(sides, 16, axis=1))
+    return folder
+
+
+@pytest.mark.parametrize("by", ["split-sum", "path"])
+def test_white_light_makes_white_metal_as_bright_as_itself(scene, tmp_path, by):
+    done = relight(
+        scene / "ball.ply",
+        "--environment",
+        scene / "white.hdr",
+        "-o",
+        tmp_path,
+        "--exr",
+        "--integrator",
+        by,
+        *SMALL,
+    )
+    assert done.exit_code == 0, done.output
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["frame_0000.exr", "frame_0001.exr"]
+    image = read_channels(tmp_path / "frame_0000.exr")
+    inside = np.s_[9:15, 13:19]
+    assert image["A"][inside].mean() > 0.98 and image["A"][0, 0] == 0
+    assert image["R"][inside].mean() == pytest.approx(0.5, rel=0.03)
+
+
+def test_several_environments_have_folders_and_a_film(scene, tmp_path):
+    maps = ("--environment", scene / "sides.exr", "--environment", scene / "white.hdr")
+    done = relight(scene / "ball.ply", *maps, "-o", tmp_path / "out", *SMALL, "--background", "environment")
+    assert done.exit_code == 0, done.output
+    names = sorted(str(path.relative_to(tmp_path / "out")) for path in (tmp_path / "out").rglob("*.png"))
+    assert names == [f"{light}/frame_000{k}.png" for light in ("sides", "white") for k in (0, 1)]
+    behind = read_image(tmp_path / "out" / "white" / "frame_0000.png")[0, 0]
+    assert behind == pytest.approx(float(linear_to_srgb(np.array(0.5))), abs=1 / 255)
+    done = relight(scene / "ball.ply", *maps, "-o", tmp_path / "film.mp4", *SMALL, "--spin")
+    assert done.exit_code == 0, done.output
+    assert (tmp_path / "film.mp4").stat().st_size > 500
+
+
+def test_relight_clamp_limits_radiance(scene, tmp_path):
+    """White metal in light of 0.5, or of what is left of it."""
+    for most, left in ((0.2, 0.2), (3, 0.5)):
+        done = relight(
+            scene / "ball.ply", "--environment", scene / "white.hdr", "-o", tmp_path / str(most), "--exr",
+            "--clamp", most, *SMALL,
+        )  # fmt: skip
+        assert done.exit_code == 0, done.output
+        image = read_channels(tmp_path / str(most) / "frame_0000.exr")
+        assert image["G"][9:15, 13:19].mean() == pytest.approx(left, rel=0.03)
+
+
+@pytest.mark.parametrize(("by", "least"), [("split-sum", 60), ("path", 25)])
+def test_relight_rotated_environment_equals_rotated_map(scene, tmp_path, by, least):
+    for name, environment, turn in (("a", "turned.exr", 0), ("b", "sides.exr", 180), ("c", "sides.exr", 0)):
+        done = relight(
+            scene / "ball.ply", "--environment", scene / environment, "--rotate", turn, "-o", tmp_path / name,
+            "--integrator", by, *SMALL,
+        )  # fmt: skip
+        assert done.exit_code == 0, done.output
+    a, b, c = (read_image(tmp_path / name / "frame_0000.png") for name in "abc")
+    assert psnr(a, b) > least and psnr(a, c) < 20
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        (("plain.ply", "white.hdr"), "plain.ply has no materials"),
+        (("ball.ply", "ball.ply"), "HDR or EXR"),
+        (("ball.ply", "missing.hdr"), "missing.hdr"),
+        (("ball.ply", "text.hdr"), "text.hdr: the environment cannot be read"),
+        (("ball.ply", "cut.hdr"), "cut.hdr is damaged"),
+        (("ball.ply", "white.hdr", "other/white.exr"), "two environments"),
+    ],
+)
+def test_relight_unusable_input_is_refused(scene, tmp_path, arguments, told):
+    (scene / "other").mkdir(exist_ok=True)
+    write_environment(scene / "other" / "white.exr", np.full((16, 32, 3), 0.5, np.float32))
+    (scene / "text.hdr").write_text("no picture")
+    (scene / "cut.hdr").write_bytes((scene / "white.hdr").read_bytes()[:-40])
+    maps = [part for name in arguments[1:] for part in ("--environment", scene / name)]
+    done = relight(scene / arguments[0], *maps, "-o", tmp_path / "out", *SMALL)
+    assert done.exit_code == 1
+    assert done.stderr.count("\n") == 1 and told in done.stderr
+    assert not (tmp_path / "out").exists()

@@ -1,0 +1,116 @@
+"""``octasplat stage`` and ``octasplat render --stage`` on a file of Gaussians."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner, Result
+
+from octasplat.engine.files.gaussian_ply import write_gaussian_ply
+from octasplat.engine.gaussians.model import FlatGaussians
+from octasplat.engine.pathtracing.stage.stage_file import read_stage
+from octasplat.engine.render.image_files import read_channels, read_image
+from octasplat.workers.cli.main import cli
+from tests.support.light_scenes import table_with_a_box
+
+
+def octasplat(*arguments: object) -> Result:
+    return CliRunner().invoke(cli, [str(argument) for argument in arguments])
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A table (y = 0, up is -y) with a box on it, as Gaussians."""
+    path = tmp_path_factory.mktemp("scene") / "scene.ply"
+    write_gaussian_ply(table_with_a_box(), path)
+    return path
+
+
+SMALL = ("--turntable", "--frames", 2, "--width", 48, "--height", 36, "--threads", 2)
+
+
+def test_stage_init_without_floor_places_object_in_air(tmp_path: Path) -> None:
+    x, y = np.meshgrid(*[np.linspace(-1, 1, 40, dtype=np.float32)] * 2)
+    count = x.size  # a wall: the normals look along z, up is -y
+    some = FlatGaussians(
+        np.stack([x.ravel(), y.ravel(), np.zeros(count, np.float32)], axis=1),
+        np.tile(np.float32([np.sqrt(0.5), 0, -np.sqrt(0.5), 0]), (count, 1)),
+        np.full((count, 2), -3.5, np.float32), np.full(count, 4.0, np.float32),
+        np.zeros((count, 1, 3), np.float32),
+    )  # fmt: skip
+    write_gaussian_ply(some, tmp_path / "wall.ply")
+    stage = tmp_path / "stage.toml"
+    done = octasplat("stage", "init", tmp_path / "wall.ply", "-o", stage)
+    assert done.exit_code == 0, done.output
+    assert "No floor is to be seen" in stage.read_text()
+    assert read_stage(stage).meshes[0].shape == "sphere"
+
+
+def test_stage_init_object_stands_on_surface_and_renders(scene: Path, tmp_path: Path) -> None:
+    stage = tmp_path / "stage.toml"
+    done = octasplat("stage", "init", scene, "-o", stage)
+    assert done.exit_code == 0 and "up is" in done.output, done.output
+    read = read_stage(stage)
+    ball = read.meshes[0]
+    assert isinstance(ball.scale, float)
+    # It touches the table, and does not stand in the box.
+    assert abs(ball.position[1] + ball.scale) < 0.1 * ball.scale
+    assert max(abs(ball.position[0]), abs(ball.position[2])) > 0.2
+    again = octasplat("stage", "init", scene, "-o", stage)
+    assert again.exit_code == 1 and "is there already" in again.output
+    text = stage.read_text().replace("samples = 16", "samples = 2")
+    stage.write_text(text)
+    plain, staged = tmp_path / "plain", tmp_path / "staged"
+    for more, folder in (((), plain), (("--stage", stage), staged)):
+        done = octasplat("render", scene, "-o", folder, *SMALL, *more)
+        assert done.exit_code == 0, done.output
+    pictures = [read_image(folder / "frame_0000.png") for folder in (plain, staged)]
+    assert 0.01 < (np.abs(pictures[0] - pictures[1]).max(axis=2) > 0.05).mean() < 0.6
+
+
+def test_stage_object_rests_on_surface(scene: Path, tmp_path: Path) -> None:
+    stage = tmp_path / "stage.toml"
+    stage.write_text(
+        "[[gaussians]]\nlight = 'emissive'\n[[meshes]]\nshape = 'cube'\nscale = 0.1\n"
+        "on = { origin = [0.6, -2, 0.5], direction = [0, 1, 0] }\n"
+        "material = { kind = 'diffuse', colour_srgb = [0, 0, 0] }\n[integrator]\nsamples = 1\n"
+    )
+    done = octasplat("render", scene, "-o", tmp_path / "one.exr", "--preview", "--stage", stage, *SMALL)
+    assert done.exit_code == 0, done.output
+    channels = read_channels(tmp_path / "one.exr")
+    assert set(channels) == {"R", "G", "B", "A"} and channels["A"].max() > 0.99
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("colour = 1", "there is no key colour"),
+        ("[environment]\nfile = 'sky.hdr'", "there is no file"),
+        ("[environment]\nfile = 'no_picture.hdr'", "no_picture.hdr"),
+        ("[[meshes]]\nfile = 'leaf.obj'\nmaterial = { kind = 'glass' }", "is not closed"),
+        (
+            "[[meshes]]\nshape = 'sphere'\nscale = 50\nmaterial = { kind = 'glass' }",
+            "the camera stands inside",
+        ),
+        (
+            "[[meshes]]\nshape = 'cube'\non = { origin = [0, -2, 0], direction = [0, -1, 0] }",
+            "the ray meets nothing solid",
+        ),
+        ("[[meshes]]\nshape = 'cube'\non = { view = 'a.jpg', pixel = [1, 1] }", "has no photographs"),
+    ],
+)
+def test_invalid_stage_is_refused_before_rendering(
+    scene: Path, tmp_path: Path, text: str, words: str
+) -> None:
+    (tmp_path / "leaf.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
+    (tmp_path / "no_picture.hdr").write_bytes(b"no picture")
+    stage = tmp_path / "stage.toml"
+    stage.write_text(text + "\n")
+    done = octasplat("render", scene, "-o", tmp_path / "out", "--stage", stage, *SMALL)
+    assert done.exit_code == 1 and words in done.output, done.output
+    assert done.output.count("Error:") == 1 and "Traceback" not in done.output
+    assert not (tmp_path / "out").exists()
+
+
+def test_preview_wants_a_stage_and_one_file(scene: Path, tmp_path: Path) -> None:
+    assert octasplat("render", scene, "-o", tmp_path / "a.png", "--preview").exit_code == 2

@@ -1,0 +1,1 @@
+"""What several tests use: harnesses, made scenes, references, programs to compare with."""

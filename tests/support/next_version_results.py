@@ -1,0 +1,8 @@
+"""A later version, in which the same settings give other results."""
+
+from octasplat.engine import versions
+from tests.support import toy_kind
+
+versions.RESULTS += 1
+
+__all__ = ["toy_kind"]

@@ -1,0 +1,87 @@
+"""A service within the test's own process, and short ways to its tables."""
+
+import uuid
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from pathlib import Path
+from typing import Any
+
+import httpx
+from pydantic import SecretStr
+
+from octasplat.service.app import create_app
+from octasplat.service.settings import ServiceSettings
+from octasplat.service.state import Service
+from octasplat.workers.db.tokens import add_token, new_secret
+from octasplat.workers.queue.attempts import Attempt, claim
+from octasplat.workers.storage.trees import Manifest
+
+
+@asynccontextmanager
+async def running_service(
+    conninfo: str, folder: Path, **settings: Any
+) -> AsyncIterator[tuple[httpx.AsyncClient, Service]]:
+    """A client of a service, and the service."""
+    given = {
+        "data": folder,
+        "storage": str(folder / "store"),
+        "floor_bytes": 0,
+        "database_url": SecretStr(conninfo),
+        "kind_modules": ("tests.support.toy_kind",),
+        "wrong_token_seconds": 0.0,
+        **settings,
+    }
+    app = create_app(ServiceSettings(**given))
+    async with app.router.lifespan_context(app):
+        transport = httpx.ASGITransport(app=app)
+        async with httpx.AsyncClient(transport=transport, base_url="http://localhost:8642") as http:
+            yield http, app.state.service
+
+
+async def committed_dataset(service: Service, owner: str = "local", *, has_poses: bool = True) -> str:
+    """A dataset as if its files had come and been checked."""
+    dataset_id = uuid.uuid4()
+    async with service.pool.connection() as connection:
+        await connection.execute(
+            "INSERT INTO datasets (id, owner, name, state, has_poses, photographs) "
+            "VALUES (%s, %s, 'made', 'committed', %s, 8)",
+            [dataset_id, owner, has_poses],
+        )
+    return str(dataset_id)
+
+
+async def claim_job(service: Service, job: dict[str, Any]) -> Attempt:
+    """The job as a worker has it."""
+    async with service.pool.connection() as connection:
+        cursor = await connection.execute("SELECT slip FROM jobs WHERE id = %s", [job["id"]])
+        row = await cursor.fetchone()
+    assert row is not None
+    attempt = await claim(service.pool, uuid.UUID(job["id"]), row["slip"], "w")
+    assert attempt is not None
+    return attempt
+
+
+async def client_with_token(service: Service, owner: str, *scopes: str) -> dict[str, str]:
+    """Headers with a fresh token."""
+    secret = new_secret()
+    async with service.pool.connection() as connection:
+        await add_token(connection, secret, owner=owner, name=owner, scopes=scopes)
+    service.tokens_checked_at = -1e9
+    return {"Authorization": f"Bearer {secret}"}
+
+
+def store_content(service: Service, content: bytes) -> str:
+    """Put content into the store; returns its digest."""
+    with service.storage.open_writer() as writer:
+        writer.write(content)
+        return writer.commit().sha256
+
+
+__all__ = [
+    "Manifest",
+    "claim_job",
+    "client_with_token",
+    "committed_dataset",
+    "running_service",
+    "store_content",
+]

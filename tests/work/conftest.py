@@ -1,5 +1,0 @@
-"""Fixtures of the database."""
-
-from postgres_fixtures import conninfo, postgres, short_root, template
-
-__all__ = ["conninfo", "postgres", "short_root", "template"]
