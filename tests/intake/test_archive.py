@@ -238,7 +238,9 @@ STRUCTURES: dict[str, tuple[Callable[[], bytes], str]] = {
         "archive-second-name",
     ),
     "second local name": (
-        lambda: build_zip(replace(good(), local_extra=struct.pack("<2HBI", 0x7075, 17, 1, 0) + b"images/x.jpg")),
+        lambda: build_zip(
+            replace(good(), local_extra=struct.pack("<2HBI", 0x7075, 17, 1, 0) + b"images/x.jpg")
+        ),
         "archive-second-name",
     ),
     "descriptor that lies": (
@@ -279,7 +281,9 @@ STRUCTURES: dict[str, tuple[Callable[[], bytes], str]] = {
     "folder with a content": (
         lambda: build_zip(good(), ZipMember("images/x/", b"abcdef", method=0, mode=0)), "archive-mismatch",
     ),
-    "name in another code": (lambda: build_zip(ZipMember(b"images/\x84.jpg", PHOTO, flags=0)), "name-not-text"),
+    "name in another code": (
+        lambda: build_zip(ZipMember(b"images/\x84.jpg", PHOTO, flags=0)), "name-not-text",
+    ),
     "not an archive": (lambda: PHOTO, "archive-damaged"),
     "nothing": (lambda: b"", "archive-damaged"),
 }  # fmt: skip

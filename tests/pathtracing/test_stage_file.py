@@ -140,7 +140,8 @@ def test_the_first_stage_can_be_read_and_so_can_all_that_it_suggests(tmp_path: P
 
 
 def test_reading_stages_needs_neither_torch_nor_numba() -> None:
-    code = "import octasplat.engine.pathtracing.stage.stage_file, sys; assert not {'torch', 'numba'} & set(sys.modules)"
+    module = "octasplat.engine.pathtracing.stage.stage_file"
+    code = f"import {module}, sys; assert not {{'torch', 'numba'}} & set(sys.modules)"
     subprocess.run([sys.executable, "-c", code], check=True)
 
 

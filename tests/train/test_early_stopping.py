@@ -78,7 +78,8 @@ def trained(
 ) -> tuple[FlatGaussians, list[Event], Trainer]:
     world, events = NoisyWorld(), list[Event]()
     trainer = Trainer(
-        world, config, state or fresh_state(world.initial_gaussians(), config.seed), folder=folder, fingerprint="test",
+        world, config, state or fresh_state(world.initial_gaussians(), config.seed),
+        folder=folder, fingerprint="test",
         listener=events.append, threads=threads, should_stop=lambda: trainer.state.iteration == stop_at,
     )  # fmt: skip
     return trainer.run(), events, trainer

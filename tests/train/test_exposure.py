@@ -280,7 +280,8 @@ def test_held_out_photographs_of_an_automatic_camera_are_met(tmp_path: Path) -> 
     assert world.log_gains.std() > 0.08
     config = small_config(iterations=400, exposure=True, lr={"exposure": 0.02})
     trainer = Trainer(
-        world, config, fresh_state(world.initial_gaussians(), config.seed), folder=tmp_path, fingerprint="test",
+        world, config, fresh_state(world.initial_gaussians(), config.seed),
+        folder=tmp_path, fingerprint="test",
         listener=lambda _event: None, threads=1,
     )  # fmt: skip
     trainer.run()

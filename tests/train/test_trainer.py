@@ -125,7 +125,8 @@ def test_stopped_and_resumed_gives_the_same_bits(tmp_path: Path, strategy: McmcC
 def test_trainer_shared_sort_ends_at_configured_share(tmp_path: Path) -> None:
     world, config, orders = PlanarDataset(), small_config(shared_sort_until=0.5), dict[int, str]()
     Trainer(
-        world, config, fresh_state(world.initial_gaussians(), config.seed), folder=tmp_path, fingerprint="test",
+        world, config, fresh_state(world.initial_gaussians(), config.seed),
+        folder=tmp_path, fingerprint="test",
         listener=lambda _event: None, threads=1,
         onlooker=lambda iteration, tracer: orders.update({iteration: tracer.settings.sort}),
     ).run()  # fmt: skip
