@@ -51,9 +51,7 @@ def test_config_with_another_value_of_a_former_setting_is_refused(
         ("fast", True, "2b66c3145d6a01435831ba8d7671c336e6e2fc3c34a7b11cbada04bd5fdaeba5"),
     ],
 )
-def test_digest_of_settings_is_that_of_the_version_that_had_the_former_ones(
-    name: str, materials: bool, digest: str
-) -> None:
+def test_settings_digest_equals_former_version(name: str, materials: bool, digest: str) -> None:
     config = with_materials(preset(name)) if materials else preset(name)
     text = json.dumps(dump_with_former_settings(config))
     assert hashlib.sha256(text.encode()).hexdigest() == digest

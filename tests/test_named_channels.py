@@ -222,7 +222,7 @@ def test_export_to_several_formats_warns_once() -> None:
     assert harmonics.startswith("The formats mesh-ply, glb, splat and obj have one colour")
 
 
-def test_a_scene_without_a_channel_gets_zeros(tmp_path: Path) -> None:
+def test_missing_channel_is_zero(tmp_path: Path) -> None:
     whole = scene()
     result = merge_scenes([whole.without_channels(["albedo"]), whole])
     assert result.channels.widths == {"label": 1, "spectrum": 6, "albedo": 3}

@@ -232,7 +232,7 @@ def stop_after(times: int) -> Callable[[], bool]:
     return lambda: next(asked) >= times
 
 
-def test_resume_refuses_what_is_not_the_same_run(scene: Path, whole_run: Path, tmp_path: Path) -> None:
+def test_resume_of_different_run_is_refused(scene: Path, whole_run: Path, tmp_path: Path) -> None:
     with pytest.raises(OutputError, match="--resume"):
         reconstruct(scene, whole_run, make_config())
     with pytest.raises(ConfigError, match="other settings"):

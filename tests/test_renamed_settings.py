@@ -60,7 +60,7 @@ FORMER_SETS = (
 EXPECTED = ReconstructOptions.model_validate(NEW).config()
 
 
-def test_former_names_in_python_mean_the_same_and_are_told() -> None:
+def test_former_python_names_are_read_with_notice() -> None:
     with collected_notices() as notices:
         request = ReconstructRequest.model_validate({"source": "scene", "output": "nowhere", **FORMER})
         assert run_config(request) == EXPECTED
@@ -78,7 +78,7 @@ def test_former_option_of_a_python_verb_is_read_and_told() -> None:
     assert notices == ["by is called integrator now; former names are read in this version only."]
 
 
-def test_former_names_of_a_command_mean_the_same_and_are_told(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_former_command_options_are_read_with_notice(monkeypatch: pytest.MonkeyPatch) -> None:
     found: list[ReconstructionConfig] = []
 
     def keep(request: ReconstructRequest, **_how: object) -> None:
@@ -102,7 +102,7 @@ def test_former_names_of_a_command_mean_the_same_and_are_told(monkeypatch: pytes
         assert f"{former} is called {new} now" in told
 
 
-def test_former_names_that_are_submitted_mean_the_same_and_are_told(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_former_submitted_options_are_read_with_notice(monkeypatch: pytest.MonkeyPatch) -> None:
     found: list[Any] = []
 
     def keep(_api: object, what: Any, **_how: object) -> dict[str, str]:
@@ -200,7 +200,7 @@ def _models(model: type[BaseModel]) -> list[type[BaseModel]]:
         *(operation.options for operation in operations()),
     ],
 )
-def test_each_former_name_has_a_field_and_is_no_field_itself(model: type[BaseModel]) -> None:
+def test_former_names_map_to_fields(model: type[BaseModel]) -> None:
     names: FormerNames = former_names(model)
     assert not set(names.fields) & set(model.model_fields)
     known = set(model.model_fields)

@@ -53,7 +53,7 @@ def write_run(folder: Path, *assignments: str) -> Path:
 
 
 @pytest.mark.parametrize("model", MODELS)
-def test_every_setting_has_description_unit_and_group(model: type[BaseModel]) -> None:
+def test_settings_have_description_unit_and_group(model: type[BaseModel]) -> None:
     for name, info in model.model_fields.items():
         assert info.description and info.description.endswith("."), name
         if isinstance(info.default, BaseModel):
@@ -101,7 +101,7 @@ def test_unknown_setting_is_refused_and_the_nearest_one_offered(name: str, neare
     assert nearest_name("zzz", [entry.name for entry in settings()]) is None
 
 
-def test_differences_are_those_that_were_set() -> None:
+def test_differences_list_changed_settings() -> None:
     changed = resolve_config("fast", assignments=["lr.quat=0.5", "test_every=4"])
     assert differences(defaults_of(changed), changed) == (
         Difference("test_every", 8, 4),
@@ -110,7 +110,7 @@ def test_differences_are_those_that_were_set() -> None:
     assert differences(changed, changed) == ()
 
 
-def test_differences_name_settings_that_one_side_alone_has() -> None:
+def test_differences_list_one_sided_settings() -> None:
     found = differences(resolve_config("standard"), resolve_config("redisplats"))
     assert Difference("densify.split_scale", None, 0.005) in found
     assert Difference("densify.growth", 0.2, None) in found

@@ -17,7 +17,7 @@ def test_page_of_verbs_is_up_to_date() -> None:
     assert written == verbs_page(), "octasplat verbs --markdown > docs/verbs.md brings it up to date"
 
 
-def test_every_operation_is_a_verb_with_a_command_and_a_python_call() -> None:
+def test_operations_have_command_and_python_call() -> None:
     assert tuple(verb.name for verb in verbs()) == operation_names()
     for verb in verbs():
         assert verb.python, verb.name

@@ -46,7 +46,7 @@ def packages_behind(module: str) -> set[str]:
     return outside - set(sys.stdlib_module_names) - {"octasplat"}
 
 
-def test_every_package_behind_a_reconstruction_is_counted() -> None:
+def test_versions_cover_reconstruction_packages() -> None:
     owners = importlib.metadata.packages_distributions()
     behind = {owners[name][0] for name in packages_behind("octasplat.engine.pipeline")} - HARMLESS
     counted = versions()

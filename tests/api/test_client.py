@@ -119,7 +119,7 @@ def test_files_of_one_name_are_refused() -> None:
         client.derive("job", "relight", files=["a/sky.hdr", "b/sky.hdr"])
 
 
-def test_a_file_that_is_not_there_is_told_before_anything_is_sent(tmp_path: Path) -> None:
+def test_submit_missing_file_is_refused_before_upload(tmp_path: Path) -> None:
     with (
         osp.Client("http://127.0.0.1:9", "token") as client,
         pytest.raises(osp.ConfigError, match=r"sky\.hdr: there is no such file"),

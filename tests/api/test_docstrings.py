@@ -36,7 +36,7 @@ def test_examples_of_the_page_run() -> None:
     assert failed == 0 and count > 20
 
 
-def test_public_names_are_those_that_can_be_imported() -> None:
+def test_public_names_are_importable() -> None:
     assert sorted(octasplat.__all__) == octasplat.__all__ == sorted({"__version__", *octasplat._SOURCES})
     for name in PUBLIC:
         assert getattr(octasplat, name).__doc__, name

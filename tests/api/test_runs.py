@@ -127,7 +127,7 @@ def test_notebook_shows_progress_and_ends_with_lines() -> None:
     assert "Rendered" in shown[-1] and "<progress" not in shown[-1]
 
 
-def test_images_of_a_run_are_written_as_the_operation_says(finished_run: Path, tmp_path: Path) -> None:
+def test_run_images_match_operation_result(finished_run: Path, tmp_path: Path) -> None:
     found = osp.render(osp.Run(finished_run), tmp_path / "views", views="held-out")
     assert found.images == 2 and all(path.is_file() for path in found.files)
     with pytest.raises(TypeError, match="goes with a camera"):
@@ -150,6 +150,6 @@ def test_viewer_of_run_has_cameras(finished_run: Path) -> None:
     assert np.isfinite(centre.fy_px) and 10 < fov < 120
 
 
-def test_empty_settings_are_none_where_a_run_goes_on(photographs: Path, finished_run: Path) -> None:
+def test_resume_ignores_empty_settings(photographs: Path, finished_run: Path) -> None:
     run = osp.reconstruct(photographs, finished_run, resume=True, train={}, assignments=[])
     assert run.is_finished

@@ -97,7 +97,7 @@ def test_gradients_by_rays_are_differences_of_the_loss(name: str) -> None:
     assert np.mean(errors < 5e-3) > 0.9, np.sort(errors)
 
 
-def test_traces_that_wait_for_their_gradients_do_not_disturb_each_other() -> None:
+def test_pending_traces_are_independent() -> None:
     parameters, lines, _ = tensors_and_rays(20, 40)
     first, second = osp.trace(parameters, lines), osp.trace(parameters, lines[:10])
     (first.rgb.sum() + 0 * second.rgb.sum()).backward()
@@ -159,7 +159,7 @@ def test_rays_indexed_by_int_give_one_ray() -> None:
         torch.testing.assert_close(osp.trace(scene, rays[number]).rgb[0], everything.rgb[number])
 
 
-def test_what_is_known_of_a_scene_goes_along_with_its_tensors(scene_file: Path) -> None:
+def test_scene_tensors_keep_metadata(scene_file: Path) -> None:
     scene = osp.Scene(osp.load(scene_file).gaussians, SceneMetadata(turned_beyond=0.5, near_world=0.1))
     tensors = osp.GaussianTensors.of(scene)
     assert tensors.scene().facts == scene.facts

@@ -23,7 +23,7 @@ def test_verbs_are_written_from_the_requests() -> None:
 
 
 @pytest.mark.parametrize("name", operation_names())
-def test_every_operation_is_a_function_of_the_package(name: str) -> None:
+def test_operations_have_package_functions(name: str) -> None:
     function = getattr(osp, PYTHON_NAMES.get(name, name))
     if name != "render":  # which also takes a scene and a camera
         assert function is getattr(octasplat.verbs, PYTHON_NAMES.get(name, name))
@@ -46,7 +46,7 @@ def test_arrays_and_strings_are_taken_where_numbers_and_paths_are(scene_file: Pa
     assert osp.crop(str(scene_file), str(tmp_path / "half.ply"), box=box).kept == 600
 
 
-def test_a_misspelt_option_is_refused_with_the_nearest_name(scene_file: Path, tmp_path: Path) -> None:
+def test_misspelt_option_is_refused_with_nearest_name(scene_file: Path, tmp_path: Path) -> None:
     wrong = {"spere": (0, 0, 0, 1)}
     with pytest.raises(osp.ConfigError, match="crop has no option 'spere'; the nearest is sphere") as found:
         osp.crop(scene_file, tmp_path / "a.ply", **wrong)
@@ -56,7 +56,7 @@ def test_a_misspelt_option_is_refused_with_the_nearest_name(scene_file: Path, tm
         osp.render(scene, scene.camera(), **{"backgroud": "white"})
 
 
-def test_what_a_preset_switches_on_can_be_said_to_be_off() -> None:
+def test_option_can_disable_preset_feature() -> None:
     request = operation("surface").request
     values = {"source": "run", "output": "a.glb", "room": True, "refine_vertices": False, "backdrop": None}
     found = build_request(request, explicit_values(request, values))
@@ -66,7 +66,7 @@ def test_what_a_preset_switches_on_can_be_said_to_be_off() -> None:
 
 
 @pytest.mark.parametrize("verb", ["import_", "export", "surface", "crop"])
-def test_the_scene_that_is_read_is_not_overwritten(verb: str, scene_file: Path, finished_run: Path) -> None:
+def test_output_over_input_scene_is_refused(verb: str, scene_file: Path, finished_run: Path) -> None:
     options = {"where": "opacity > 0.5"} if verb == "crop" else {}
     for scene, output in ((scene_file, scene_file), (finished_run, finished_run / "scene.ply")):
         before = output.read_bytes()
@@ -88,9 +88,7 @@ def test_the_scene_that_is_read_is_not_overwritten(verb: str, scene_file: Path, 
         ("deform", {"proxy": "cage.obj", "deformed": ["bent.obj"]}),
     ],
 )
-def test_work_that_is_asked_to_stop_writes_nothing(
-    verb: str, options: dict[str, Any], in_folder: Path
-) -> None:
+def test_stopped_operation_writes_no_output(verb: str, options: dict[str, Any], in_folder: Path) -> None:
     osp.export("scene.ply", ["mesh.ply"], format="mesh-ply")
     source = "shiny.ply" if verb == "material" else "scene.ply"
     with pytest.raises(osp.Cancelled):
@@ -99,7 +97,7 @@ def test_work_that_is_asked_to_stop_writes_nothing(
     assert not Path("other.ply").exists()
 
 
-def test_a_sequence_tells_its_steps_and_stops_between_them(in_folder: Path) -> None:
+def test_render_sequence_reports_progress_and_stops_between_images(in_folder: Path) -> None:
     events: list[Event] = []
     bent = ["bent.obj", "cage.obj", "bent.obj"]
     with pytest.raises(osp.Cancelled):
@@ -133,13 +131,13 @@ def test_reports_overwrite_no_input(in_folder: Path) -> None:
     assert before == (Path("scene.ply").read_bytes(), Path("mesh.ply").read_bytes())
 
 
-def test_an_export_that_is_whole_is_not_said_to_be_stopped(in_folder: Path) -> None:
+def test_completed_export_is_not_reported_as_stopped(in_folder: Path) -> None:
     asked = iter((False, True))
     osp.export("scene.ply", ["other.ply"], should_stop=lambda: next(asked))
     assert Path("other.ply").exists()
 
 
-def test_split_sum_tells_how_many_samples_it_takes(in_folder: Path) -> None:
+def test_split_sum_reports_sample_count(in_folder: Path) -> None:
     told: list[Event] = []
     one = {"mode": "turntable", "frames": 1, "width_px": 16, "height_px": 16, "progress": told.append}
     osp.relight("shiny.ply", "a.png", environments=["studio.hdr"], samples=5, **one)

@@ -12,7 +12,7 @@ from benchmarks.chaos_upheavals import UPHEAVALS, report, upheave
 pytestmark = pytest.mark.heavy
 
 
-def test_nothing_is_lost_whatever_is_done_to_the_service(short_root: Path, tmp_path: Path) -> None:
+def test_jobs_survive_random_faults(short_root: Path, tmp_path: Path) -> None:
     machine = Machine(short_root / "upheavals", slots=4)
     machine.start()
     folder = short_root / "clients"

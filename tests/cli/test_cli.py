@@ -76,7 +76,7 @@ def test_reconstruct_missing_folder_is_named_in_error(octasplat, tmp_path):
     assert "nowhere" in one_error_line(result)
 
 
-def test_folder_that_is_no_scene(octasplat, tmp_path):
+def test_reconstruct_folder_without_scene_is_refused(octasplat, tmp_path):
     (tmp_path / "empty").mkdir()
     result = octasplat("reconstruct", tmp_path / "empty", "-o", tmp_path / "out")
     assert "empty" in one_error_line(result)
@@ -146,7 +146,7 @@ def test_threads_are_capped_at_the_cores(octasplat, run, monkeypatch):
     assert asked == [available_threads(), 1]
 
 
-def test_evaluate_of_a_folder_that_is_no_run(octasplat, tmp_path):
+def test_evaluate_folder_without_run_is_refused(octasplat, tmp_path):
     assert str(tmp_path) in one_error_line(octasplat("evaluate", tmp_path))
 
 

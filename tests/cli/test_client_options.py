@@ -49,7 +49,7 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[dict]]:
     server.server_close()
 
 
-def test_a_part_of_an_option_leaves_the_rest_of_it(octasplat, asked: list[dict]) -> None:
+def test_nested_assignment_keeps_other_values(octasplat, asked: list[dict]) -> None:
     done = octasplat("retry", "4711", "--set", "stage.integrator.samples=16", "--set", "frames=3")
     assert done.exit_code == 0, done.output
     stage = {"meshes": [{"shape": "sphere"}], "integrator": {"samples": 16}}
@@ -71,13 +71,13 @@ def test_assignments_win_over_the_files_of_a_stage_and_a_path(tmp_path) -> None:
 
 
 @pytest.mark.parametrize("command", [("submit", "photos"), ("derive", "render", "4711")])
-def test_a_folder_for_results_needs_somebody_who_waits(octasplat, asked: list[dict], command) -> None:
+def test_output_folder_requires_wait(octasplat, asked: list[dict], command) -> None:
     refused = octasplat(*command, "-o", "out")
     assert refused.exit_code == 2 and "--wait" in refused.stderr
     assert asked == []
 
 
-def test_json_of_a_job_is_all_that_is_printed(octasplat, asked: list[dict], monkeypatch) -> None:
+def test_json_output_contains_only_job(octasplat, asked: list[dict], monkeypatch) -> None:
     def wait_for(_api, _job_id, listener, _on_note):
         listener(StageFinished("render", 1.0))
         return JOB

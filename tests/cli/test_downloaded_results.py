@@ -159,7 +159,7 @@ def test_downloaded_poses_are_used_for_bare_photographs(results, octasplat, tmp_
 
 
 @pytest.mark.parametrize("command", ["render", "surface"])
-def test_results_of_old_ask_for_the_photographs_by_the_option(results, octasplat, tmp_path, command):
+def test_former_results_require_photographs_option(results, octasplat, tmp_path, command):
     copy = tmp_path / "results"
     shutil.copytree(results.folder, copy)
     (copy / "views.json").unlink()

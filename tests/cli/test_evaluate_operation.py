@@ -21,7 +21,7 @@ def copy(run, tmp_path) -> Path:
     return shutil.copytree(run.output, tmp_path / "run", ignore=shutil.ignore_patterns("on", "cache"))
 
 
-def test_result_holds_the_figures_of_the_metrics_file(copy):
+def test_evaluate_result_equals_metrics_file(copy):
     heard = []
     result = OPERATION.run(EvaluateRequest(source=copy), progress=heard.append, threads=1)
     metrics = json.loads((copy / "metrics.json").read_text())

@@ -87,7 +87,7 @@ def test_evaluate_on_unusable_folder_is_refused(run, octasplat, tmp_path, conten
     assert not (run.output / "on" / "odd").exists()
 
 
-def test_a_file_that_is_no_truth_is_refused(run, octasplat, tmp_path):
+def test_invalid_ground_truth_file_is_refused(run, octasplat, tmp_path):
     name = min(path.name for path in (run.scene / "images").iterdir())
     folder = part_of(run.scene, tmp_path / "odd_truth", {name})
     (folder / "truth.json").write_text('{"answer": 42}')

@@ -111,7 +111,7 @@ def write_thick_gaussians(path, thickness):
     write_ply(path, [PlyWriteElement("vertex", len(rows), rows.dtype, iter([rows]))])
 
 
-def test_the_one_colour_of_a_format_without_harmonics_is_chosen(run, octasplat, tmp_path):
+def test_single_colour_mode_is_applied(run, octasplat, tmp_path):
     colours = {}
     for colour in ("constant", "cameras", "0,0,1"):
         path = tmp_path / f"{colour}.splat"
@@ -151,7 +151,7 @@ def test_for_viewers_is_for_octagon_glb(run, octasplat, tmp_path):
         assert result.exit_code == 2 and "--for-viewers" in result.output
 
 
-def test_a_colour_that_no_format_takes_is_told(run, octasplat, tmp_path):
+def test_unused_colour_option_is_warned_of(run, octasplat, tmp_path):
     told = "colour goes with formats of one colour"
     done = octasplat("export", run.output, tmp_path / "a.spz", "--color", "constant")
     assert done.exit_code == 0 and told in done.stderr

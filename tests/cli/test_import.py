@@ -79,7 +79,7 @@ def test_import_unsupported_names_are_refused(octasplat, flat, tmp_path):
     assert result.exit_code == 1 and "the formats are" in result.stderr
 
 
-def test_a_splat_is_rendered_and_a_run_exported(octasplat, flat, run, tmp_path):
+def test_splat_renders_and_run_exports(octasplat, flat, run, tmp_path):
     write_gaussian_ply(flat, tmp_path / "own.ply")
     assert octasplat("export", tmp_path / "own.ply", tmp_path / "a.spz", "--spz-version", 4).exit_code == 0
     assert (tmp_path / "a.spz").read_bytes()[:4] == b"NGSP"

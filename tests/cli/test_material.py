@@ -55,7 +55,7 @@ def test_material_changes_selected_gaussians_only(shiny_run, changed):
     assert (before.sh[~chosen] == after.sh[~chosen]).all() and (before.sh[chosen] != after.sh[chosen]).any()
 
 
-def test_the_folder_is_a_run_for_every_command(shiny_run, changed, octasplat, tmp_path):
+def test_material_output_folder_is_a_run(shiny_run, changed, octasplat, tmp_path):
     assert not (changed / "metrics.json").exists()
     assert (changed / "environment.hdr").read_bytes() == (shiny_run / "environment.hdr").read_bytes()
     [note] = json.loads((changed / "edits.json").read_text())
@@ -136,7 +136,7 @@ def test_material_change_reverted_restores_appearance(changed, shiny_run, octasp
     assert 0.2 < np.median(gain) < 0.45
 
 
-def test_a_file_is_changed_by_a_mesh_of_which_the_rest_was_deleted(shiny_run, octasplat, tmp_path):
+def test_material_file_follows_partly_deleted_mesh(shiny_run, octasplat, tmp_path):
     scene = shiny_run / "scene.ply"
     export_scene(scene_of(scene), tmp_path / "mesh.ply", format="mesh-ply")
     mesh = read_mesh(tmp_path / "mesh.ply")

@@ -50,7 +50,7 @@ def contents(folder: Path) -> dict[str, bytes]:
 
 @pytest.mark.parametrize("overwrite", [(), ("--overwrite",)], ids=["", "overwrite"])
 @pytest.mark.parametrize("name", READS)
-def test_nothing_that_is_read_is_written(here, octasplat, monkeypatch, name, overwrite):
+def test_output_over_input_is_refused(here, octasplat, monkeypatch, name, overwrite):
     monkeypatch.chdir(here)
     assert octasplat("export", "scene.ply", "mesh.ply", "--format", "mesh-ply").exit_code == 0
     for copy in ("p.obj", "d.ply", "matrix.ply"):
@@ -78,7 +78,7 @@ FOREIGN = {
 
 
 @pytest.mark.parametrize("name", FOREIGN)
-def test_a_file_of_somebody_else_is_replaced_only_if_asked(here, octasplat, monkeypatch, name):
+def test_foreign_file_is_replaced_only_with_overwrite(here, octasplat, monkeypatch, name):
     monkeypatch.chdir(here)
     arguments, place = FOREIGN[name]
     Path(place).parent.mkdir(exist_ok=True)
@@ -97,7 +97,7 @@ def test_a_file_of_somebody_else_is_replaced_only_if_asked(here, octasplat, monk
     assert octasplat(*arguments).exit_code == 1 and Path(place).read_bytes() == NOT_OURS
 
 
-def test_a_texture_of_a_surface_replaces_no_picture_of_somebody_else(here, octasplat, monkeypatch):
+def test_surface_texture_keeps_foreign_image(here, octasplat, monkeypatch):
     monkeypatch.chdir(here)
     Image.new("RGB", (4, 4)).save("chair.png")
     before = Path("chair.png").read_bytes()
@@ -106,7 +106,7 @@ def test_a_texture_of_a_surface_replaces_no_picture_of_somebody_else(here, octas
     assert Path("chair.png").read_bytes() == before and not Path("chair.obj").exists()
 
 
-def test_what_lies_among_the_frames_of_a_film_stays(here, octasplat, monkeypatch):
+def test_foreign_files_among_frames_are_kept(here, octasplat, monkeypatch):
     monkeypatch.chdir(here)
     Path("turn.mp4.frames").mkdir()
     Path("turn.mp4.frames/notes.txt").write_bytes(NOT_OURS)
@@ -120,7 +120,7 @@ def test_what_lies_among_the_frames_of_a_film_stays(here, octasplat, monkeypatch
     assert contents(here / "other.mp4.frames") == {"000001.png": NOT_OURS}
 
 
-def test_one_kind_of_output_is_not_replaced_by_another(here, octasplat, monkeypatch):
+def test_output_of_other_kind_is_kept(here, octasplat, monkeypatch):
     monkeypatch.chdir(here)
     assert octasplat("crop", "scene.ply", "--where", "opacity > 0", "-o", "x.ply").exit_code == 0
     assert octasplat("transform", "scene.ply", "--scale", "2", "-o", "x.ply").exit_code == 0
@@ -128,7 +128,7 @@ def test_one_kind_of_output_is_not_replaced_by_another(here, octasplat, monkeypa
     assert refused.exit_code == 1 and "x.ply is there already" in refused.stderr
 
 
-def test_a_stage_is_for_edits_and_never_replaced_unasked(here, octasplat, monkeypatch):
+def test_stage_file_is_kept_without_overwrite(here, octasplat, monkeypatch):
     monkeypatch.chdir(here)
     stage = ("stage", "init", "scene.ply", "-o", "x.toml")
     assert octasplat(*stage).exit_code == 0

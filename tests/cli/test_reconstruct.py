@@ -32,7 +32,7 @@ def test_reconstruct_writes_all_files(run):
     assert sorted(path.name for path in (run.output / "renders").iterdir()) == held_out
 
 
-def test_metrics_have_their_keys(run):
+def test_metrics_file_has_documented_keys(run):
     metrics = run.metrics()
     assert {"psnr", "ssim", "ms_ssim", "flip"} <= set(metrics["mean"])
     assert metrics["mean"]["psnr"] > 5
@@ -112,7 +112,7 @@ def test_resume_without_run_starts_and_quiet_prints_nothing(scene, octasplat, ti
 
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
-def test_a_signal_stops_with_a_checkpoint_and_resume_completes(
+def test_signal_writes_checkpoint_and_resume_completes(
     scene, start_octasplat, octasplat, tiny, tmp_path, number, code
 ):
     output = tmp_path / "run"

@@ -44,7 +44,7 @@ def posed_copy(scene: Path, tmp_path: Path) -> Path:
     return copy
 
 
-def test_an_unknown_name_to_hold_out_is_refused_before_the_search(noise, octasplat, tmp_path, tiny):
+def test_unknown_test_view_is_refused_before_pose_search(noise, octasplat, tmp_path, tiny):
     output = tmp_path / "out"
     refused = octasplat("reconstruct", noise, "-o", output, "--held-out", "5.jpg", *tiny)
     assert refused.exit_code == 1
@@ -52,7 +52,7 @@ def test_an_unknown_name_to_hold_out_is_refused_before_the_search(noise, octaspl
     assert "features" not in refused.stdout and not output.exists()
 
 
-def test_a_photograph_cut_short_is_refused_before_the_search(noise, octasplat, tmp_path, tiny):
+def test_truncated_photograph_is_refused_before_pose_search(noise, octasplat, tmp_path, tiny):
     whole = (noise / "2.jpg").read_bytes()
     (noise / "2.jpg").write_bytes(whole[: len(whole) // 2])
     refused = octasplat("reconstruct", noise, "-o", tmp_path / "out", *tiny)
@@ -60,13 +60,13 @@ def test_a_photograph_cut_short_is_refused_before_the_search(noise, octasplat, t
     assert "features" not in refused.stdout and not (tmp_path / "out").exists()
 
 
-def test_masks_that_are_not_there_are_refused_before_the_search(noise, octasplat, tmp_path, tiny):
+def test_missing_masks_are_refused_before_pose_search(noise, octasplat, tmp_path, tiny):
     refused = octasplat("reconstruct", noise, "-o", tmp_path / "out", "--masks", "alpha", *tiny)
     assert refused.exit_code == 1 and "--masks alpha" in refused.stderr
     assert "features" not in refused.stdout and not (tmp_path / "out").exists()
 
 
-def test_a_folder_that_a_refused_start_left_is_used_again(scene, octasplat, tmp_path, tiny):
+def test_folder_of_refused_start_is_reused(scene, octasplat, tmp_path, tiny):
     output = tmp_path / "out"
     output.mkdir()
     refused = octasplat("reconstruct", scene, "-o", output, *tiny, *PATCH_TOO_LARGE)
@@ -76,7 +76,7 @@ def test_a_folder_that_a_refused_start_left_is_used_again(scene, octasplat, tmp_
     assert done.exit_code == 0, done.stderr
 
 
-def test_a_folder_with_somebody_elses_cache_is_left_alone(scene, octasplat, tmp_path, tiny):
+def test_foreign_cache_folder_is_kept(scene, octasplat, tmp_path, tiny):
     (tmp_path / "out/cache").mkdir(parents=True)
     (tmp_path / "out/cache/letters.txt").write_text("kept")
     refused = octasplat("reconstruct", scene, "-o", tmp_path / "out", *tiny)
@@ -96,7 +96,7 @@ def test_poses_are_kept_when_the_settings_are_refused(octasplat, tmp_path, tiny)
     assert "features" not in done.stdout and (output / "poses/images.bin").read_bytes() == found
 
 
-def test_a_second_process_is_told_of_the_first(scene, octasplat, start_octasplat, tmp_path, tiny):
+def test_second_process_on_same_run_is_refused(scene, octasplat, start_octasplat, tmp_path, tiny):
     output = tmp_path / "out"
     settings = [*tiny, "--iterations", "100000"]
     first = start_octasplat("reconstruct", scene, "-o", output, *settings)
@@ -114,14 +114,14 @@ def test_a_second_process_is_told_of_the_first(scene, octasplat, start_octasplat
 
 
 @pytest.mark.parametrize(("option", "value"), [("--seed", "0"), ("--test-every", "0")])
-def test_a_zero_is_a_setting_when_a_run_goes_on(scene, octasplat, tmp_path, tiny, option, value):
+def test_resume_treats_zero_as_setting(scene, octasplat, tmp_path, tiny, option, value):
     output = tmp_path / "out"
     assert octasplat("reconstruct", scene, "-o", output, *tiny, "--seed", "5").exit_code == 0
     refused = octasplat("reconstruct", scene, "-o", output, "--resume", *tiny, option, value)
     assert refused.exit_code == 1 and "other settings" in refused.stderr
 
 
-def test_a_run_within_images_goes_on(posed_copy, octasplat, tiny):
+def test_run_inside_images_folder_resumes(posed_copy, octasplat, tiny):
     output = posed_copy / "images/run"
     settings = [*tiny, "--held-out", "0001.png"]
     assert octasplat("reconstruct", posed_copy, "-o", output, *settings).exit_code == 0

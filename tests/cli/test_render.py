@@ -34,7 +34,7 @@ def test_views_and_their_size(run, octasplat, tmp_path, which, count):
     assert read_image(files[0]).shape == (24, 32, 3)
 
 
-def test_small_pictures_are_what_making_large_ones_smaller_gives(run, octasplat, tmp_path):
+def test_antialiased_small_render_equals_downscaled_large(run, octasplat, tmp_path):
     for name, size in (("large", ()), ("small", ("--max-side", 16))):
         assert octasplat("render", run.output, "-o", tmp_path / name, *size).exit_code == 0
     for path in (tmp_path / "small").iterdir():
@@ -83,7 +83,7 @@ def test_exr_has_depth_and_normals(run, octasplat, tmp_path):
     np.testing.assert_allclose(length[seen], 1, atol=1e-3)
 
 
-def test_a_run_and_its_file_give_one_picture(run, octasplat, tmp_path):
+def test_run_and_scene_file_render_same_image(run, octasplat, tmp_path):
     gaussians, _ = read_gaussian_ply(run.output / "scene.ply")
     facts = read_metadata(run.output)
     near = facts.near_world
@@ -140,7 +140,7 @@ def documented_path():
     return example
 
 
-def test_the_documented_camera_path_renders_and_both_of_its_lenses_agree(run, octasplat, tmp_path):
+def test_documented_camera_path_renders_same_with_both_lenses(run, octasplat, tmp_path):
     path = tmp_path / "cameras.json"
     path.write_text(documented_path())
     result = octasplat("render", run.output, "-o", tmp_path / "frames", "--path", path)

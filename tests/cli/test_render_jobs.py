@@ -316,7 +316,7 @@ def test_numbered_images_are_gone_on_with_for_the_same_views_only(run, octasplat
     assert octasplat("render", run.output, *same, "-o", frames, "--resume").exit_code == 0
 
 
-def test_options_that_say_nothing_about_the_cameras_are_told(run, octasplat, tmp_path):
+def test_options_without_effect_on_cameras_are_warned_of(run, octasplat, tmp_path):
     one = ("--turntable", "--frames", 1, *SIZE_WORDS)
     done = octasplat("render", run.output, *one, "--max-side", 16, "--fps", 5, "-o", tmp_path / "one.png")
     assert done.exit_code == 0, done.output
@@ -340,7 +340,7 @@ def test_photographs_beside_a_file_are_refused(run, octasplat, tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_preview_asks_for_the_pixels_of_one_image():
+def test_preview_job_counts_pixels_of_one_image():
     kind = get_job_kind("render")
     stage = {"frames": 9, **SIZE, "format": "png", "stage": STAGE}
     pixels = [

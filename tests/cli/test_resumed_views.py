@@ -42,7 +42,7 @@ def request_of(verb: str, run: Path, output: Path, **given: Any) -> tuple[Any, A
 
 
 @pytest.mark.parametrize("verb", ["render", "relight"])
-def test_other_photographs_between_the_first_and_the_last_are_another_render(shiny_run, tmp_path, verb):
+def test_changed_middle_photograph_starts_new_render(shiny_run, tmp_path, verb):
     names = [view["name"] for view in json.loads((shiny_run / "views.json").read_text())["views"]]
     pattern = tmp_path / "%04d.png"
     module, one = request_of(verb, shiny_run, pattern, photographs=tuple(names[k] for k in (0, 1, 3)))
@@ -53,7 +53,7 @@ def test_other_photographs_between_the_first_and_the_last_are_another_render(shi
 
 
 @pytest.mark.parametrize("verb", ["render", "relight"])
-def test_another_camera_between_the_first_and_the_last_is_another_render(shiny_run, tmp_path, verb):
+def test_changed_middle_camera_starts_new_render(shiny_run, tmp_path, verb):
     def path(middle: float) -> dict[str, Any]:
         poses = [[[1, 0, 0, x], [0, 1, 0, 0], [0, 0, 1, -4], [0, 0, 0, 1]] for x in (0, middle, 1)]
         frames = [{"camera_to_world": pose, "fov_y_degrees": 50} for pose in poses]

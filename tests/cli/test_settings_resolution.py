@@ -200,7 +200,7 @@ def test_materials_settings_resolve_equally_in_all_spellings(options: dict[str, 
     )
 
 
-def test_the_preset_paper_is_refused_with_materials_in_a_sentence() -> None:
+def test_paper_preset_with_materials_is_refused() -> None:
     refused = by_python({"preset": "redisplats", "assignments": ["materials.learn=true"]})
     assert refused == (
         "The preset redisplats is for scenes without materials; with materials choose fast, standard or high."
@@ -222,11 +222,11 @@ def test_the_preset_paper_is_refused_with_materials_in_a_sentence() -> None:
         ),
     ],
 )
-def test_settings_that_cannot_be_used_are_refused_in_a_short_sentence(assignment: str, sentence: str) -> None:
+def test_unusable_settings_are_refused_with_reason(assignment: str, sentence: str) -> None:
     assert by_python({"assignments": ["refine_poses=true", assignment]}) == sentence
 
 
-def test_options_of_a_job_of_the_last_version_are_kept_as_they_are() -> None:
+def test_options_of_previous_version_are_kept() -> None:
     kind = get_job_kind("reconstruct")
     before = (
         ReconstructOptions(preset="standard", assignments=("rays_per_batch=4096",))
@@ -247,7 +247,7 @@ def test_options_of_a_job_of_the_last_version_are_kept_as_they_are() -> None:
     assert kind.revise(paper, {"exports": []}).train.materials.learn
 
 
-def test_materials_that_a_retry_switches_on_bring_their_settings_and_keep_what_was_asked_for() -> None:
+def test_retry_with_materials_adds_their_settings() -> None:
     kind = get_job_kind("reconstruct")
     before = ReconstructOptions(preset="fast", assignments=("rays_per_batch=4096", "seed=7")).config()
     changed = kind.revise(before.model_dump(mode="json"), {"materials": True})

@@ -102,7 +102,7 @@ def test_refusals_are_one_sentence(run, octasplat, tmp_path, monkeypatch, option
         ("--max-triangles", "5k,5000"),
     ],
 )
-def test_options_that_make_no_sense(run, octasplat, tmp_path, bad):
+def test_surface_invalid_options_are_refused(run, octasplat, tmp_path, bad):
     result = octasplat("surface", run.output, "-o", tmp_path / "a.glb", *bad)
     assert result.exit_code == 1 and result.stderr.startswith(f"Error: {bad[0]}: ")
     assert bad[1].split(",")[-1] in result.output

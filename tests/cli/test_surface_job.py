@@ -63,7 +63,7 @@ def test_job_without_photographs_takes_colours_from_the_scene(run, octasplat, tm
     assert heard[-1].message.startswith("Wrote results/surface.glb (")
 
 
-def test_photographs_of_a_scene_that_was_moved_give_no_colours(run, octasplat, tmp_path):
+def test_surface_of_moved_scene_ignores_photographs(run, octasplat, tmp_path):
     moved = tmp_path / "moved"
     assert octasplat("transform", run.output, "-o", moved, "--translate", 1, 0, 0).exit_code == 0
     heard = []

@@ -35,7 +35,7 @@ def shiny(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_a_run_gives_textures_and_its_light(shiny, octasplat, tmp_path):
+def test_surface_of_run_has_textures_and_environment(shiny, octasplat, tmp_path):
     result = octasplat("surface", shiny, "--materials", "-o", tmp_path / "a.glb", *SMALL)
     assert result.exit_code == 0, result.output
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a.glb", "environment.hdr"]
@@ -73,7 +73,7 @@ def test_surface_lit_unusable_input_is_refused(shiny, octasplat, tmp_path, sourc
     assert list(tmp_path.iterdir()) == []
 
 
-def test_octagons_are_lit_where_asked(shiny, octasplat, tmp_path):
+def test_lit_octagon_export(shiny, octasplat, tmp_path):
     result = octasplat("export", shiny, tmp_path / "a.glb", "--materials", "--up", "z", "--chunks", 1)
     assert result.exit_code == 0, result.output
     document = GlbFile(tmp_path / "a.glb").document

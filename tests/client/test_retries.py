@@ -138,7 +138,7 @@ def test_redirect_raises_error_with_target(serve: Callable[..., Front], tmp_path
                 ask()
 
 
-def test_pages_of_others_are_no_answers(serve: Callable[..., Front]) -> None:
+def test_foreign_response_is_not_accepted(serve: Callable[..., Front]) -> None:
     front = serve(lambda *_: as_page(200))
     with Api(front.address) as api, pytest.raises(ServiceError, match=r"text/html.*no octasplat service"):
         api.get("/v1")
@@ -247,7 +247,7 @@ def test_commit_after_interrupted_check_succeeds(serve: Callable[..., Front], tm
         assert upload_files(api, {"a.obj": tmp_path / "a.obj"})["state"] == "committed"
 
 
-def test_a_file_that_is_gone_already_need_not_be_removed(serve: Callable[..., Front], tmp_path: Path) -> None:
+def test_delete_of_missing_file_succeeds(serve: Callable[..., Front], tmp_path: Path) -> None:
     """As when the service ended after it removed the file and before it said so."""
     (tmp_path / "a").write_bytes(b"x")
     there, removals = {"a", "b"}, [0]

@@ -34,7 +34,7 @@ def image_points(count: int = 400) -> np.ndarray:
     return np.random.default_rng(0).random((count, 2)) * [640, 480]
 
 
-def test_every_model_of_colmap_is_covered():
+def test_all_colmap_camera_models_are_covered():
     assert set(CAMERAS) == set(pycolmap.CameraModelId.__members__) - {"INVALID"}
 
 
@@ -86,6 +86,6 @@ def test_pixel_directions_of_no_points_are_empty():
         assert camera(model).directions_cam(np.empty((0, 2))).shape == (0, 3)
 
 
-def test_a_distorted_camera_has_no_pinhole_parameters():
+def test_distorted_camera_has_no_pinhole_parameters():
     with pytest.raises(ValueError, match="OPENCV is not a pinhole"):
         _ = camera("OPENCV").pinhole_params

@@ -74,7 +74,7 @@ def test_linear_light_becomes_display_values(tmp_path, save_image, name, toleran
     np.testing.assert_allclose(rgb, expected, atol=tolerance)  # HDR stores 8 bits of mantissa
 
 
-def test_half_floats_with_values_that_are_not_finite(tmp_path, save_image):
+def test_half_float_image_with_nonfinite_values(tmp_path, save_image):
     save_image(tmp_path / "a.exr", np.array([[[np.nan, np.inf, -np.inf]]], dtype=np.float16))
     assert read(tmp_path / "a.exr")[0].tolist() == [[[0, 65535, 0]]]
 
@@ -136,7 +136,7 @@ def test_transparent_pixels_do_not_bleed_into_colours(tmp_path, save_image):
 
 
 @pytest.mark.parametrize("name", ["a.jpg", "a.png", "a.tif", "a.exr", "a.hdr"])
-def test_photographs_cut_short_are_named(tmp_path, save_image, name, capfd):
+def test_truncated_photograph_is_named(tmp_path, save_image, name, capfd):
     is_float = name[-3:] in ("exr", "hdr")
     save_image(tmp_path / name, noise(60, 80, 3).astype(np.float32) if is_float else noise(60, 80, 3))
     data = (tmp_path / name).read_bytes()
@@ -145,7 +145,7 @@ def test_photographs_cut_short_are_named(tmp_path, save_image, name, capfd):
         read(tmp_path / name)
 
 
-def test_a_mask_is_read_and_reduced(tmp_path, save_image):
+def test_mask_is_read_and_downscaled(tmp_path, save_image):
     mask = np.zeros((24, 32), np.uint8)
     mask[:, 16:] = 255
     save_image(tmp_path / "m.png", mask)
@@ -156,7 +156,7 @@ def test_a_mask_is_read_and_reduced(tmp_path, save_image):
     np.testing.assert_array_equal(read_mask(tmp_path / "rgb.png", (32, 24), 32, 24)[0], mask)
 
 
-def test_masks_that_do_not_fit_are_named(tmp_path, save_image):
+def test_mask_of_wrong_size_is_named(tmp_path, save_image):
     save_image(tmp_path / "m.png", np.zeros((24, 31), np.uint8))
     with pytest.raises(DatasetError, match=r"m\.png is 31x24 but its photograph is 32x24"):
         read_mask(tmp_path / "m.png", (32, 24), 32, 24)

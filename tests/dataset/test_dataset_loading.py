@@ -116,7 +116,7 @@ def test_several_cameras_and_sizes(tmp_path, make_scene, coded):
     assert scene.cameras[2].params == (15.0, 15.5, 8.0, 6.0)
 
 
-def test_the_cap_scales_cameras_by_the_exact_ratios(tmp_path, make_scene):
+def test_max_side_scales_cameras_by_exact_ratio(tmp_path, make_scene):
     scene = load_dataset_model(make_scene(tmp_path), max_side=11)
     assert (scene.views[0].width_px, scene.views[0].height_px) == (11, 8)
     np.testing.assert_allclose(scene.cameras[0].params, (30 * 11 / 32, 31 * 8 / 24, 5.5, 4.0))
@@ -170,7 +170,7 @@ def test_missing_folders_are_named(tmp_path, make_scene):
 
 @pytest.mark.parametrize("text", [False, True], ids=["binary", "text"])
 @pytest.mark.parametrize("part", MODEL_FILES)
-def test_an_incomplete_model_is_named(tmp_path, make_scene, part, text):
+def test_incomplete_model_is_named(tmp_path, make_scene, part, text):
     root = make_scene(tmp_path, text=text)
     name = f"{part}{'.txt' if text else '.bin'}"
     (root / "sparse/0" / name).unlink()
@@ -207,7 +207,7 @@ def test_dataset_huge_record_count_is_refused(tmp_path, make_scene):
         load_dataset_model(root)
 
 
-def test_an_unknown_camera_model_is_named(tmp_path, make_scene):
+def test_unknown_camera_model_is_named(tmp_path, make_scene):
     root = make_scene(tmp_path)
     path = root / "sparse/0/cameras.bin"
     data = bytearray(path.read_bytes())
@@ -323,13 +323,13 @@ def test_dataset_rotated_photograph_is_explained(tmp_path, make_scene, save_imag
 
 
 @pytest.mark.parametrize("content", [b"", b"no image at all"])
-def test_files_that_are_no_images_are_named(tmp_path, make_scene, content):
+def test_non_image_file_is_named(tmp_path, make_scene, content):
     root = make_scene(tmp_path)
     (root / "images/view_3.png").write_bytes(content)
     with pytest.raises(DatasetError, match=r"view_3\.png cannot be read as an image"):
         load_dataset_model(root)
 
 
-def test_the_cap_must_be_positive(tmp_path, make_scene):
+def test_max_side_must_be_positive(tmp_path, make_scene):
     with pytest.raises(ConfigError, match="max_side is 0"):
         load_dataset_model(make_scene(tmp_path), max_side=0)

@@ -82,7 +82,7 @@ def test_dataset_view_equals_sampled_pixels(tmp_path, make_scene, coded):
             np.testing.assert_array_equal(whole.reshape(single.shape), single)
 
 
-def test_pixels_that_do_not_exist_are_refused(tmp_path, make_scene):
+def test_pixel_outside_view_is_refused(tmp_path, make_scene):
     data = Dataset.open(make_scene(tmp_path / "scene"), tmp_path / "cache")
     for view, y, x in [(4, 0, 0), (-1, 0, 0), (0, 24, 0), (0, 0, 32), (0, -1, 0)]:
         arrays = tuple(np.array([0, value]) for value in (view, y, x))
@@ -129,7 +129,7 @@ def test_mixed_depths_and_alpha(tmp_path, make_scene):
     assert (weight == 1).all()
 
 
-def test_alpha_that_is_opaque_throughout_does_not_count(tmp_path, make_scene):
+def test_opaque_alpha_channel_is_ignored(tmp_path, make_scene):
     images = [(f"{i}.png", 0, np.full((24, 32, 4), 255, np.uint8)) for i in range(3)]
     data = Dataset.open(make_scene(tmp_path / "scene", images=images), tmp_path / "cache")
     assert not data.has_alpha
@@ -182,7 +182,7 @@ def test_dataset_black_masks_warn(tmp_path, make_scene, save_image):
         assert any("view_2.png" in warning for warning in data.warnings)
 
 
-def test_masks_follow_the_cap(tmp_path, make_scene, save_image):
+def test_masks_follow_max_side(tmp_path, make_scene, save_image):
     root = make_scene(tmp_path / "scene")
     mask = np.zeros((24, 32), np.uint8)
     mask[:12] = 255
@@ -204,7 +204,7 @@ def test_held_out_names_reach_the_dataset(tmp_path, make_scene):
     assert not (tmp_path / "other").exists()
 
 
-def test_the_extent_comes_from_training_cameras(tmp_path, make_scene):
+def test_extent_uses_training_cameras(tmp_path, make_scene):
     data = Dataset.open(make_scene(tmp_path / "scene"), tmp_path / "cache", test_every=0)
     centres = np.stack([view.origin_world for view in data.views])
     expected = 1.1 * np.linalg.norm(centres - centres.mean(axis=0), axis=1).max()

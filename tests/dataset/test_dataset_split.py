@@ -21,7 +21,7 @@ def points(xyz) -> SparsePoints:
     )
 
 
-def test_every_eighth_view_is_held_out():
+def test_default_split_holds_out_every_eighth_view():
     train, test = split_views(NAMES)
     assert test.tolist() == [0, 8, 16]
     assert sorted([*train, *test]) == list(range(18))
@@ -34,7 +34,7 @@ def test_split_test_every_zero_holds_out_none():
     assert test.tolist() == []
 
 
-def test_a_list_of_names_overrides_the_rule():
+def test_explicit_test_names_override_rule():
     assert split_views(NAMES, held_out=("17.jpg", "03.jpg"))[1].tolist() == [3, 17]
     assert split_views(NAMES, held_out=())[1].tolist() == []
 

@@ -27,7 +27,7 @@ def test_perspective_camera_ignores_points_behind(camera: Camera) -> None:
     assert not is_in_image(way, camera)[way[:, 2] <= 0].any()
 
 
-def test_surfaces_see_all_around_from_a_panorama() -> None:
+def test_surface_cameras_cover_panorama() -> None:
     turn = np.linalg.qr(np.random.default_rng(1).standard_normal((3, 3)))[0]
     turn *= np.sign(np.linalg.det(turn))
     view = PosedView(

@@ -111,7 +111,7 @@ def test_synthetic_scene_writes_all_files(scene: Path) -> None:
     assert [path.name for path in scene.parent.iterdir()] == ["scene"]
 
 
-def test_the_same_settings_give_the_same_bytes(scene: Path, tmp_path: Path) -> None:
+def test_synthetic_dataset_is_deterministic(scene: Path, tmp_path: Path) -> None:
     write_synthetic_dataset(tmp_path / "again", SMALL)
     assert digests(tmp_path / "again") == digests(scene)
     # Both may have been written in the same second, so look for the time of writing itself.
@@ -129,7 +129,7 @@ def test_synthetic_scene_seed_moves_cameras_only(scene: Path, tmp_path: Path) ->
     assert first["images/view_000.png"] != second["images/view_000.png"]
 
 
-def test_the_model_loads_with_tracks_that_fit(scene: Path) -> None:
+def test_synthetic_model_tracks_reproject(scene: Path) -> None:
     model = pycolmap.Reconstruction(str(scene / "sparse" / "0"))
     assert (model.num_cameras(), model.num_reg_images(), model.num_points3D()) == (1, 6, 150)
     assert model.num_rigs() == 1
@@ -203,7 +203,7 @@ def test_depth_and_normals_are_those_of_the_mesh(scene: Path) -> None:
     np.testing.assert_array_equal(mask[rows, columns] == 255, build_still_life().face_is_foreground[hit])
 
 
-def test_the_room_lies_in_its_planes_and_the_objects_on_the_table(scene: Path) -> None:
+def test_synthetic_room_geometry(scene: Path) -> None:
     model = pycolmap.Reconstruction(str(scene / "sparse" / "0"))
     for image in model.images.values():
         stem = Path(image.name).stem
@@ -270,7 +270,7 @@ def test_transparent_photographs_show_the_objects_alone(scene: Path, tmp_path: P
     assert (np.hypot(xyz[:, 0], xyz[:, 1]) < TABLE_RADIUS + 0.01).all()
 
 
-def test_masks_are_written_where_a_reconstruction_looks_if_asked(tmp_path: Path) -> None:
+def test_synthetic_masks_are_written_to_masks_folder(tmp_path: Path) -> None:
     write_synthetic_dataset(tmp_path / "scene", small(views=3, with_masks=True))
     names = sorted(path.name for path in (tmp_path / "scene" / "masks").iterdir())
     assert names == [f"view_{k:03d}.png.png" for k in range(3)]
@@ -343,7 +343,7 @@ def test_closed_things_face_outwards_and_vertex_normals_follow_their_faces() -> 
             assert np.sum(a * np.cross(b, c)) / 6 > 0, thing.name
 
 
-def test_patterns_have_the_shapes_that_they_are_named_for() -> None:
+def test_pattern_images_match_their_names() -> None:
     random = np.random.default_rng(0)
     first, second = random.uniform(-4, 4, (2, 200_000)).astype(np.float32)
     # A regular octagon of apothem r has the area 8 r^2 tan(pi / 8).

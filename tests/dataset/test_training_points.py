@@ -41,7 +41,7 @@ def wall(tmp_path: Path, save_image: Callable[..., None]) -> Path:
     return tmp_path
 
 
-def test_points_that_held_out_views_are_needed_for_are_left_out(wall: Path, tmp_path: Path) -> None:
+def test_points_depending_on_test_views_are_dropped(wall: Path, tmp_path: Path) -> None:
     dataset = Dataset.open(wall, tmp_path / "cache", test_every=8)
     shown_by = np.rint(dataset.points.xyz_world[:, 0] // SPACING).astype(int)
     held_out = set(dataset.test_indices.tolist())
@@ -52,7 +52,7 @@ def test_points_that_held_out_views_are_needed_for_are_left_out(wall: Path, tmp_
     assert len(everything.points) == 20 * (VIEWS - 1)
 
 
-def test_the_near_distance_of_a_long_path_stays_before_the_wall(wall: Path, tmp_path: Path) -> None:
+def test_near_distance_of_long_path(wall: Path, tmp_path: Path) -> None:
     dataset = Dataset.open(wall, tmp_path / "cache", near=0.01)
     assert 0.01 * dataset.extent > 0.8 * AWAY  # which would cut the wall off
     assert dataset.near_world == pytest.approx(0.25 * AWAY, rel=0.15)
@@ -60,7 +60,7 @@ def test_the_near_distance_of_a_long_path_stays_before_the_wall(wall: Path, tmp_
     assert short.near_world == 1e-4 * short.extent
 
 
-def test_a_photograph_that_a_track_names_twice_counts_once() -> None:
+def test_track_counts_each_photograph_once() -> None:
     nothing = np.zeros((2, 3), np.float32)
     points = SparsePoints(
         nothing, nothing, np.full(2, 3, np.int32), np.zeros(2, np.float32), np.array([4, 7])

@@ -46,12 +46,12 @@ def test_names_below_the_photographs_are_read(tmp_path: Path, name: str) -> None
         "a\0b",
     ],
 )
-def test_names_that_lead_elsewhere_are_refused(tmp_path: Path, name: str) -> None:
+def test_view_names_outside_folder_are_refused(tmp_path: Path, name: str) -> None:
     with pytest.raises(ConfigError, match=r"views\.json cannot be read .*no path below"):
         read_views(views_json(tmp_path / "views.json", name))
 
 
-def test_views_that_were_moved_are_of_another_world_and_adjusted_ones_are_not(tmp_path: Path) -> None:
+def test_moved_views_are_in_another_world(tmp_path: Path) -> None:
     record = read_views(views_json(tmp_path / "views.json", "a.jpg"))
     eye, still = np.eye(3), np.zeros(3)
     slightly = np.array([[np.cos(0.02), -np.sin(0.02), 0], [np.sin(0.02), np.cos(0.02), 0], [0, 0, 1]])

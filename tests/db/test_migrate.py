@@ -77,7 +77,7 @@ def test_database_of_an_earlier_queue_ends_the_same(empty: str, conninfo: str) -
     assert fresh - upgraded == set()
 
 
-def test_newer_database_is_gone_on_with_if_it_says_so(empty: str) -> None:
+def test_newer_compatible_database_is_accepted(empty: str) -> None:
     migrate(empty)
     with psycopg.connect(empty) as connection:
         connection.execute("INSERT INTO schema_steps VALUES ('octasplat', '9999_future.sql')")
@@ -93,7 +93,7 @@ def test_newer_database_is_gone_on_with_if_it_says_so(empty: str) -> None:
     assert shape(empty) == before and reach[0] in {step.name for step in all_migrations()}
 
 
-def test_workers_and_commands_that_read_leave_the_tables_alone(empty: str, tmp_path: Path) -> None:
+def test_workers_and_read_commands_do_not_migrate(empty: str, tmp_path: Path) -> None:
     before = shape(empty)
     with pytest.raises(DatabaseError, match="octasplat migrate"):
         wait_for_tables(empty, seconds=0)

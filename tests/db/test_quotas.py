@@ -41,7 +41,7 @@ async def new_job(connection: Connection, owner: str, state: str = "queued") -> 
     return job_id
 
 
-def test_usage_counts_what_an_owner_has(conninfo: str) -> None:
+def test_usage_counts_owner_contents(conninfo: str) -> None:
     async def check() -> None:
         connection = await connect(conninfo)
         mine = await create_dataset(connection, "me", "a")
@@ -141,7 +141,7 @@ def test_quota_command_shows_and_sets_limits(conninfo: str, monkeypatch: pytest.
     assert run(quota_command, ["me", "--jobs", "many"]).exit_code == 2
 
 
-def test_the_pool_is_enough(conninfo: str) -> None:
+def test_connection_pool_is_large_enough(conninfo: str) -> None:
     async def check() -> None:
         async with open_pool(conninfo, max_size=2) as pool, pool.connection() as connection:
             await check_bytes(connection, "me", Quota(max_bytes=0))

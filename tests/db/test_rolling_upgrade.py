@@ -60,7 +60,7 @@ TRUTH = 2 * 100 + 7 + 10
 
 
 @pytest.mark.parametrize("steps", [BEFORE_USAGE, BEFORE_LOCKS])
-def test_an_old_database_is_counted_right(empty: str, steps: list[str]) -> None:
+def test_old_database_usage_is_counted(empty: str, steps: list[str]) -> None:
     migrate(empty, only=steps)
     with psycopg.connect(empty) as connection:
         fill(connection)
@@ -137,7 +137,7 @@ def test_migration_waiting_for_lock_does_not_block_others(
     assert migrate(empty) == ()
 
 
-def test_tables_that_are_held_for_ever_are_named(empty: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_locked_tables_are_named(empty: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(migrating, "LOCK_TIMEOUT_SECONDS", 0.1)
     monkeypatch.setattr(migrating, "MAX_WAIT_SECONDS", 0.5)
     migrate(empty, only=BEFORE_LOCKS)
@@ -152,7 +152,7 @@ def test_tables_that_are_held_for_ever_are_named(empty: str, monkeypatch: pytest
     assert migrate(empty) == (STEPS[-1],)
 
 
-def test_a_backup_holds_no_table_while_contents_are_copied(conninfo: str, tmp_path: Path) -> None:
+def test_backup_locks_no_table_during_copy(conninfo: str, tmp_path: Path) -> None:
     storage = LocalStorage(tmp_path / "store", floor_bytes=0)
     with storage.open_writer() as writer:
         writer.write(b"a photograph")
@@ -174,7 +174,7 @@ def test_a_backup_holds_no_table_while_contents_are_copied(conninfo: str, tmp_pa
     assert create_backup(conninfo, storage, tmp_path / "backup", on_content=upgrade).contents == 1
 
 
-def test_an_archive_of_many_files_is_entered_in_a_moment(conninfo: str) -> None:
+def test_many_file_archive_is_recorded_quickly(conninfo: str) -> None:
     """12,000 of them; others of the same owner wait no longer than that."""
     files = [NewFile(f"images/{n}.jpg", f"{n:064x}", 10, {"width_px": n}) for n in range(12_000)]
 

@@ -56,7 +56,7 @@ def database(conninfo: str) -> Iterator[str]:
         yield make_conninfo(conninfo, host="127.0.0.1", port=port)
 
 
-def test_the_images_work_together(
+def test_images_work_together(
     front_end: ChrootImage, worker: ChrootImage, database: str, tmp_path: Path
 ) -> None:
     store = ThreadedMotoServer(ip_address="127.0.0.1", port=0, verbose=False)

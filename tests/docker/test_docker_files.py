@@ -46,7 +46,7 @@ def test_dockerfile_is_linted() -> None:
     assert (done.returncode, done.stdout) == (0, "")
 
 
-def test_front_end_installs_what_the_project_says() -> None:
+def test_front_end_requirements_match_project() -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     known = {*project["dependencies"], *project["optional-dependencies"]["s3"]}
     lines = (DOCKER / "front-end.txt").read_text().splitlines()
@@ -82,7 +82,7 @@ def test_images_do_not_run_as_root_and_hold_no_secret() -> None:
     assert not re.search(r"(?i)(password|secret|token)\w*[:=] *['\"]?[a-z0-9]{6,}", text.replace("${", "\0"))
 
 
-def test_compose_names_images_that_the_dockerfile_makes() -> None:
+def test_compose_images_exist_in_dockerfile() -> None:
     stages = {stage for stage, _, _ in instructions()}
     services = compose()["services"]
     for name, service in services.items():
@@ -113,7 +113,7 @@ def test_compose_publishes_front_end_on_localhost_only() -> None:
     assert all(port.startswith("127.0.0.1:") for port in published["front-end"])
 
 
-def test_settings_are_ones_that_exist() -> None:
+def test_compose_settings_exist() -> None:
     known = {f"OCTASPLAT_{name.upper()}" for name in ServiceSettings.model_fields}
     used = {
         name

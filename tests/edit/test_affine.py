@@ -55,7 +55,7 @@ def test_transform_inverse_restores_scene(make_scene: Make) -> None:
     np.testing.assert_allclose(back.sh, g.sh, atol=1e-5)
 
 
-def test_a_shift_changes_centres_only(make_scene: Make) -> None:
+def test_translation_changes_centres_only(make_scene: Make) -> None:
     g = make_scene(50)
     result = affine.transform_gaussians(g, affine.translation(np.array([1.0, 2.0, 3.0])))
     np.testing.assert_array_equal(
@@ -83,7 +83,7 @@ def test_rotation_and_scale_matrices_match_known_values() -> None:
 @pytest.mark.parametrize(
     "linear", [np.zeros((3, 3)), np.diag([1.0, 1.0, 0.0]), np.full((3, 3), np.nan)], ids=str
 )
-def test_maps_that_flatten_are_refused(make_scene: Make, linear: np.ndarray) -> None:
+def test_singular_map_is_refused(make_scene: Make, linear: np.ndarray) -> None:
     with pytest.raises(ConfigError):
         affine.transform_gaussians(make_scene(3), matrix_of(linear))
 

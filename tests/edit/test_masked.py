@@ -21,13 +21,13 @@ PHOTOGRAPHS = ["0001.jpg", "left/0001.jpg", "right/0001.jpg", "right/0002.jpg", 
         ("anywhere/9.png", "far/9.jpg"),  # no other has this name
     ],
 )
-def test_a_mask_belongs_to_the_photograph_in_its_own_folder(mask: str, photograph: str) -> None:
+def test_mask_matches_photograph_in_own_folder(mask: str, photograph: str) -> None:
     assert PHOTOGRAPHS[photograph_of_mask(Path(mask), PHOTOGRAPHS)] == photograph
     back = PHOTOGRAPHS[::-1]
     assert back[photograph_of_mask(Path(mask), back)] == photograph
 
 
-def test_masks_that_could_be_of_several_photographs_are_refused() -> None:
+def test_ambiguous_mask_is_refused() -> None:
     with pytest.raises(ConfigError, match=r"may be a mask of left/0001\.jpg and right/0001\.jpg"):
         photograph_of_mask(Path("0001.png"), PHOTOGRAPHS[1:])
     with pytest.raises(ConfigError, match=r"right/0002\.jpg and right/0002\.png"):

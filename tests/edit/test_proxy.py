@@ -42,7 +42,7 @@ def follow(
 
 
 @pytest.mark.parametrize("method", ["nearest", "mvc"])
-def test_a_rigid_motion_with_scale_is_exact(make_scene: Make, method: str) -> None:
+def test_similarity_transform_is_exact(make_scene: Make, method: str) -> None:
     g = make_scene(300)
     turn = random_turn(1)
     proxy = Proxy(*(cube(3) if method == "mvc" else grid(8)))
@@ -51,14 +51,14 @@ def test_a_rigid_motion_with_scale_is_exact(make_scene: Make, method: str) -> No
     assert covariance_errors(result, 1.69 * turn @ covariances(g) @ turn.T).max() < 1e-5
 
 
-def test_every_affine_map_is_exact_in_a_cage(make_scene: Make) -> None:
+def test_affine_map_is_exact_in_cage(make_scene: Make) -> None:
     g = make_scene(300)
     result = follow(g, Proxy(*cube(2)), lambda p: p @ SHEAR.T, method="mvc")
     np.testing.assert_allclose(result.means_world, g.means_world @ SHEAR.T, atol=1e-6)
     assert covariance_errors(result, SHEAR @ covariances(g) @ SHEAR.T).max() < 1e-5
 
 
-def test_every_affine_map_is_exact_on_a_surface(make_scene: Make) -> None:
+def test_affine_map_is_exact_on_surface(make_scene: Make) -> None:
     g = near_the_plane(make_scene, 0.0)
     g.quats_wxyz[:] = [np.sqrt(0.5), 0, np.sqrt(0.5), 0]  # the normal along z
     result = follow(g, Proxy(*grid(8)), lambda p: p @ SHEAR.T)
@@ -66,7 +66,7 @@ def test_every_affine_map_is_exact_on_a_surface(make_scene: Make) -> None:
     assert covariance_errors(result, SHEAR @ covariances(g) @ SHEAR.T).max() < 1e-5
 
 
-def test_a_bent_sheet_is_followed_to_second_order_in_its_cells(make_scene: Make) -> None:
+def test_bent_sheet_error_is_second_order(make_scene: Make) -> None:
     g = near_the_plane(make_scene, 0.05)
     move, derivative = bend(1.0)
     worst, shapes = [], []
@@ -181,7 +181,7 @@ def test_proxy_accepts_arbitrary_map(make_scene: Make) -> None:
     assert report.unmoved == 200
 
 
-def test_points_that_fall_together_keep_their_gaussians_finite(make_scene: Make) -> None:
+def test_coincident_vertices_keep_gaussians_finite(make_scene: Make) -> None:
     g = make_scene(20)
     result, report = deform(g, lambda corners: np.zeros_like(corners) + 3.0)
     assert report.collapsed == 20 and result.is_finite()

@@ -176,7 +176,7 @@ def test_shear_and_stretch_are_exact_by_least_squares_and_not_by_three_points(
     np.testing.assert_allclose(three.means_world, result.means_world, atol=1e-6)
 
 
-def test_a_twist_keeps_the_covariance_by_least_squares(make_scene: Make, exported) -> None:
+def test_twist_covariance_is_least_squares(make_scene: Make, exported) -> None:
     g = make_scene(500)
     move, derivative = twist(1.0)
     mesh = moved(exported(g), move)
@@ -315,7 +315,7 @@ def test_crumpled_octagons_follow_their_surroundings_or_are_dropped(make_scene: 
     assert report.dropped == 3 and len(fewer) == 297
 
 
-def test_octagons_that_flipped_by_themselves_are_found_and_turned_back(make_scene: Make, exported) -> None:
+def test_flipped_octagons_are_restored(make_scene: Make, exported) -> None:
     g = make_scene(400, spread=0.5)
     mesh = exported(g)
     turn = random_turn(2)
@@ -359,7 +359,7 @@ def test_recovery_axes_option_is_used(make_scene: Make, exported) -> None:
     np.testing.assert_allclose(result.means_world, g.means_world * [1, -1, -1], atol=1e-6)
 
 
-def test_meshes_that_cannot_be_matched_are_refused_with_the_reason(make_scene: Make, exported) -> None:
+def test_unmatched_mesh_is_refused_with_reason(make_scene: Make, exported) -> None:
     g = make_scene(50)
     mesh = exported(g)
     nameless = replace(mesh, gid=None, corner=None)

@@ -30,7 +30,7 @@ def run(tmp_path):
     return make
 
 
-def test_curves_are_what_the_run_has_noted(run):
+def test_curves_equal_run_events(run):
     ends = {"metrics": {"mean": {"psnr": 25.5}}, "training": {"training_views": {"psnr": 27.25}}}
     found = read_run(run("a", [20.0, 23.0, 25.0], **ends), "room:now")
     assert (found.panel, found.label) == ("room", "now")

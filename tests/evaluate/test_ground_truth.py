@@ -95,7 +95,7 @@ def measured(folder: Path, image: RenderedImage, rays: ImageRays) -> dict:
     return measures.as_dict()
 
 
-def test_errors_are_what_was_put_in(truth_folder):
+def test_ground_truth_errors_equal_known_offsets(truth_folder):
     image, rays = wall(tilt_degrees=10, depth=4.25, albedo=0.25, roughness=0.5, metallic=0.75)
     found = measured(truth_folder, image, rays)
     mean = found["mean"]
@@ -112,7 +112,7 @@ def test_errors_are_what_was_put_in(truth_folder):
     assert set(mean) - {"albedo_scales"} <= set(found["definitions"])
 
 
-def test_a_scene_without_materials_has_normals_and_depth_alone(truth_folder):
+def test_scene_without_materials_has_only_normals_and_depth(truth_folder):
     image, rays = wall(tilt_degrees=0, depth=4.0, albedo=0.0, roughness=0.0, metallic=0.0)
     mean = measured(truth_folder, replace(image, layers={}), rays)["mean"]
     assert set(mean) == {"normal_mae", "depth_mae", "mask_iou"}
@@ -167,7 +167,7 @@ def test_ground_truth_channel_scale_with_clipped_values_is_found():
     assert best_scales(true / scales, true, display) == pytest.approx(scales, rel=1e-3)
 
 
-def test_an_environment_is_compared_where_the_world_is_the_same():
+def test_environment_is_compared_in_same_world():
     random = np.random.default_rng(1)
     blobs = np.repeat(np.repeat(random.random((4, 8, 3)), 4, axis=0), 4, axis=1).astype(np.float32)
     true = EnvironmentMap(blobs, environment_frame(UP))

@@ -14,7 +14,7 @@ from octasplat.engine.shading.plain import PLAIN
 from octasplat.engine.trace.protocol import TraceSettings
 
 
-def test_photographs_that_differ_in_the_suffix_alone_both_get_a_render(tmp_path):
+def test_same_stem_photographs_get_own_renders(tmp_path):
     import pycolmap
 
     root = tmp_path / "scene"

@@ -129,7 +129,7 @@ def test_flip_of_black_against_white_is_near_one():
     assert metrics.flip(black, 1 - black).mean == pytest.approx(0.967, abs=0.005)
 
 
-def test_identical_images_are_perfect():
+def test_identical_images_have_perfect_scores():
     _, picture = pair(176, 176)
     assert psnr(picture, picture) == np.inf
     assert metrics.ssim_both(picture, picture) == pytest.approx((1.0, 1.0))

@@ -46,7 +46,7 @@ def test_rays_of_a_smaller_picture_are_those_of_a_camera_with_fewer_pixels() -> 
     ]
 
 
-def test_several_rays_a_pixel_show_what_making_the_large_picture_smaller_shows() -> None:
+def test_supersampling_equals_downscaling() -> None:
     tracer = CpuTracer(TraceSettings(), threads=1)
     tracer.build(stripes())
     large = camera(256, 192)

@@ -119,7 +119,7 @@ def test_report_lists_views_worst_first(report):
     assert shown == ["a.jpg"]
 
 
-def test_the_images_are_the_ones_given(report, tmp_path):
+def test_report_embeds_given_images(report, tmp_path):
     page = report(images={"a.jpg": pictures(value=0.25)})
     images = {a["class"]: a for a in page.all("img")}
     decoded = {}
@@ -141,7 +141,7 @@ def test_large_images_are_shrunk(report):
     assert {(a["width"], a["height"]) for a in page.all("img")} == {("800", "320")}
 
 
-def test_every_view_has_a_slider_that_the_keyboard_reaches(report):
+def test_report_sliders_are_keyboard_accessible(report):
     page = report()
     sliders = page.all("input", type="range")
     assert len(sliders) == 3
@@ -191,7 +191,7 @@ def test_figures_settings_and_warnings_are_shown_as_text(report):
         assert text in page.text
 
 
-def test_a_run_without_events_images_and_settings_still_has_a_report(report):
+def test_report_of_incomplete_run(report):
     page = report(events=[], images={}, config={}, metrics={"mean": {"psnr": 20.0}, "views": {}})
     assert page.rows == page.figures == page.all("svg") == []
 
@@ -238,7 +238,7 @@ def test_points_of_a_curve_stand_for_their_values():
     assert value_of(psnr_by_time, psnr_by_time.curves[0], 0) == pytest.approx((2, 11.0), abs=0.02)
 
 
-def test_a_resumed_run_draws_the_later_rows():
+def test_report_of_resumed_run_uses_later_rows():
     rows = [progress(1), progress(2), progress(3, psnr=99.0), progress(3, psnr=13.0), progress(4)]
     chart = training_charts(rows)[0]
     assert [round(value_of(chart, chart.curves[0], k)[1]) for k in range(4)] == [11, 12, 13, 14]

@@ -14,7 +14,7 @@ from octasplat.engine.writing import write_json
 @pytest.mark.parametrize(
     ("trained", "measured"), [("auto", "black"), ("black", "black"), ("white", "white"), ("random", "black")]
 )
-def test_the_default_is_that_of_the_training(trained: str, measured: str) -> None:
+def test_default_background_is_that_of_training(trained: str, measured: str) -> None:
     config = resolve_config("fast", assignments=[f"background={trained}"])
     assert config.evaluation_background == measured
 

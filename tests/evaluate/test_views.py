@@ -64,7 +64,7 @@ def test_foreground_psnr_is_over_covered_valid_pixels():
     assert row.psnr_foreground is None
 
 
-def test_the_summary_is_the_mean_of_views():
+def test_summary_is_mean_of_views():
     rows = [measure_view(view(f"{k}.jpg", error, seed=k)).metrics for k, error in enumerate((0.1, 0.05))]
     summary = summarise(rows)
     for key in ("psnr", "ssim", "ssim_valid", "flip"):
@@ -73,7 +73,7 @@ def test_the_summary_is_the_mean_of_views():
     assert "psnr_foreground" not in summary.mean
 
 
-def test_the_json_has_its_documented_layout():
+def test_evaluation_json_layout():
     alpha = np.ones((30, 40), np.float32)
     rows = [
         measure_view(view("a.jpg", 0.1, alpha=alpha)).metrics,
@@ -103,7 +103,7 @@ def test_the_json_has_its_documented_layout():
     assert content["mean"]["ms_ssim"] == pytest.approx(1.0)
 
 
-def test_a_view_without_valid_pixels_does_not_spoil_the_mean():
+def test_view_without_valid_pixels_is_excluded_from_mean():
     empty = view("b.jpg", weight=np.zeros((30, 40), np.float32))
     rows = [measure_view(one).metrics for one in (view(), empty)]
     summary = summarise(rows)
@@ -126,7 +126,7 @@ def test_mean_psnr_excludes_and_counts_perfect_views():
 
 
 @pytest.mark.parametrize("masked", [0.25, 0.5, 0.9])
-def test_a_mask_makes_an_even_error_look_no_better(masked):
+def test_mask_does_not_change_uniform_error(masked):
     rng = np.random.default_rng(4)
     size = (400, 400)
     reference = np.full((*size, 3), 0.5, np.float32) + rng.normal(0, 0.05, (*size, 3)).astype(np.float32)
@@ -143,7 +143,7 @@ def test_a_mask_makes_an_even_error_look_no_better(masked):
     assert other.flip == pytest.approx(one.flip, rel=0.1)
 
 
-def test_the_interval_holds_the_mean_narrows_with_views_and_repeats():
+def test_confidence_interval_properties():
     rng = np.random.default_rng(0)
     few, many = rng.normal(25, 2, 10).tolist(), rng.normal(25, 2, 200).tolist()
     low, high = bootstrap_interval(few)
@@ -155,7 +155,7 @@ def test_the_interval_holds_the_mean_narrows_with_views_and_repeats():
     assert bootstrap_interval([25.0]) is None
 
 
-def test_sizes_that_differ_are_refused_by_name():
+def test_size_mismatch_is_refused_by_name():
     with pytest.raises(DatasetError, match=r"a\.jpg has 40 x 20 .* 40 x 30"):
         measure_view(view(render=np.zeros((20, 40, 3), np.float32)))
 

@@ -155,7 +155,7 @@ def test_older_files_without_bounds_of_colours(make_cloud: Make, tmp_path: Path)
     np.testing.assert_allclose(back.base_rgb_srgb, 0.5 + SH_C0 * cloud.sh[:, 0], atol=0.502 / 255)
 
 
-def test_files_that_do_not_hold_together(make_cloud: Make, tmp_path: Path) -> None:
+def test_compressed_ply_inconsistent_file_is_refused(make_cloud: Make, tmp_path: Path) -> None:
     path = tmp_path / "a.compressed.ply"
     write_compressed(path, make_cloud(300, 1))
     whole = path.read_bytes()

@@ -35,7 +35,7 @@ def test_exporters_are_discovered() -> None:
         ("a.b.glb", "glb"),
     ],
 )
-def test_the_file_name_chooses_the_format(name: str, format: str) -> None:
+def test_export_format_follows_suffix(name: str, format: str) -> None:
     assert exporter_for(Path("some/where") / name).name == format
 
 
@@ -65,7 +65,7 @@ def test_exporters_return_exactly_written_files(make_scene: Make, tmp_path: Path
 
 
 @pytest.mark.parametrize("name", ALL)
-def test_scenes_that_cannot_be_written_leave_no_file(make_scene: Make, tmp_path: Path, name: str) -> None:
+def test_failed_export_leaves_no_file(make_scene: Make, tmp_path: Path, name: str) -> None:
     scene = make_scene(5)
     empty = scene.select(np.arange(0))
     broken = scene.copy()

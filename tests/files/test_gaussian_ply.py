@@ -210,7 +210,7 @@ def test_infinite_logits_mean_opacity_one_or_zero(make_gaussians: Make, tmp_path
 
 
 @pytest.mark.parametrize("name", ["x", "f_dc_1", "opacity", "scale_1", "rot_3"])
-def test_a_missing_property_is_named(make_gaussians: Make, tmp_path: Path, name: str) -> None:
+def test_missing_property_is_named(make_gaussians: Make, tmp_path: Path, name: str) -> None:
     columns = columns_of(make_gaussians(4))
     del columns[name]
     with pytest.raises(SceneFileError, match=rf"a\.ply: .*lacks the property {name}\."):
@@ -230,9 +230,7 @@ def test_odd_counts_of_harmonics_are_refused(make_gaussians: Make, tmp_path: Pat
 @pytest.mark.parametrize(
     ("name", "what"), [("y", "position"), ("rot_2", "rotation"), ("scale_1", "scale"), ("f_dc_0", "colour")]
 )
-def test_values_that_are_not_finite_are_counted(
-    make_gaussians: Make, tmp_path: Path, name: str, what: str
-) -> None:
+def test_nonfinite_values_are_counted(make_gaussians: Make, tmp_path: Path, name: str, what: str) -> None:
     columns = columns_of(make_gaussians(9))
     columns[name] = columns[name].copy()
     columns[name][[2, 5]] = [np.nan, np.inf]
@@ -240,7 +238,7 @@ def test_values_that_are_not_finite_are_counted(
         read_gaussian_ply(write_columns(tmp_path / "a.ply", columns))
 
 
-def test_a_number_beyond_float32_counts_as_not_finite(make_gaussians: Make, tmp_path: Path) -> None:
+def test_value_beyond_float32_is_nonfinite(make_gaussians: Make, tmp_path: Path) -> None:
     columns = columns_of(make_gaussians(3))
     columns["x"] = np.array([0.0, 1e300, 1.0])
     with pytest.raises(SceneFileError, match="1 of 3 Gaussians have no finite position"):
@@ -353,7 +351,7 @@ def test_unknown_properties_become_channels_where_they_are_wanted(
         read_gaussian_ply(path, channels=("albedo",))
 
 
-def test_channels_that_are_not_finite_are_refused_by_name(make_gaussians: Make, tmp_path: Path) -> None:
+def test_nonfinite_channel_is_refused_by_name(make_gaussians: Make, tmp_path: Path) -> None:
     g = make_gaussians(4)
     label = np.array([0, np.nan, 2, 3], np.float32)
     path = write_columns(tmp_path / "a.ply", {**columns_of(g), "label": label})
@@ -366,9 +364,7 @@ def test_channels_that_are_not_finite_are_refused_by_name(make_gaussians: Make, 
 @pytest.mark.parametrize(
     "comment", ["octasplat_channel albedo 3", "octasplat_channel x 1", "octasplat_channel"]
 )
-def test_comments_that_promise_what_is_not_there_are_passed_over(
-    make_gaussians: Make, tmp_path: Path, comment: str
-) -> None:
+def test_comment_naming_absent_data_is_ignored(make_gaussians: Make, tmp_path: Path, comment: str) -> None:
     write_gaussian_ply(make_gaussians(4), tmp_path / "a.ply")
     content = (tmp_path / "a.ply").read_bytes()
     (tmp_path / "a.ply").write_bytes(content.replace(b"element", f"comment {comment}\nelement".encode(), 1))

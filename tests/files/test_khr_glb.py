@@ -269,7 +269,7 @@ def test_cores_are_the_same_octagons_once_more_and_are_passed_over(make_scene: M
     assert len(read_mesh(tmp_path / "cores.glb")) == len(read_mesh(tmp_path / "plain.glb"))
 
 
-def test_octagons_that_were_edited_are_refused_as_a_scene(make_scene: Make, tmp_path: Path) -> None:
+def test_edited_octagon_glb_is_refused_as_scene(make_scene: Make, tmp_path: Path) -> None:
     export_scene(make_scene(40), tmp_path / "mesh.glb", ExportOptions(chunks=1))
     document, binary = parts(tmp_path / "mesh.glb")
     document["nodes"][1]["scale"] = [1.0, 1.1, 1.0]

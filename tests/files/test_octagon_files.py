@@ -82,7 +82,7 @@ def test_mesh_ply_is_a_scene_with_one_colour_each(make_scene: Make, tmp_path: Pa
     np.testing.assert_allclose(back.base_rgb_srgb, kept.base_rgb_srgb.clip(0, 1), atol=0.51 / 255)
 
 
-def test_mesh_ply_that_was_edited_is_refused_as_a_scene(make_scene: Make, tmp_path: Path) -> None:
+def test_edited_mesh_ply_is_refused_as_scene(make_scene: Make, tmp_path: Path) -> None:
     export_scene(make_scene(40), tmp_path / "mesh.ply")
     header, tables = read_ply(tmp_path / "mesh.ply", ["vertex", "face"])
     data = (tmp_path / "mesh.ply").read_bytes()

@@ -104,7 +104,7 @@ def test_texture_times_vertex_colour_is_the_gaussian(make_scene: Make, tmp_path:
     np.testing.assert_allclose(colour[:, :3], linear, atol=1e-6)
 
 
-def test_linear_filtering_of_the_texture_errs_by_no_more_than_theory_says() -> None:
+def test_texture_filtering_error_is_within_bound() -> None:
     uv = np.random.default_rng(0).uniform(0.02, 0.98, (5000, 2))
     q = 9.21
     exact = np.exp(-0.5 * q * np.sum((2 * uv - 1) ** 2, axis=1))
@@ -199,7 +199,7 @@ def test_octagon_glb_too_large_is_refused_before_writing(
     assert not (tmp_path / "c.glb").exists()
 
 
-def test_a_scene_too_large_for_one_file_goes_into_several(
+def test_large_scene_is_split_into_files(
     make_scene: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     scene = make_scene(5000)

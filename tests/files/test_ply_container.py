@@ -123,7 +123,7 @@ def test_damaged_files_get_one_clear_sentence(tmp_path: Path, content: bytes, me
     assert "damaged.ply" in str(caught.value)
 
 
-def test_files_that_are_not_there_or_cannot_be_written_are_named(tmp_path: Path) -> None:
+def test_missing_or_unwritable_file_is_named(tmp_path: Path) -> None:
     with pytest.raises(SceneFileError, match=r"none\.ply: cannot be read"):
         read_ply_header(tmp_path / "none.ply")
     (tmp_path / "folder.ply").mkdir()

@@ -65,7 +65,7 @@ def test_ply_dialect_discs_match_source_program(dialect: str, tmp_path: Path) ->
     assert scene.opacities[0] == pytest.approx(OPACITY)
 
 
-def test_the_filter_of_gaussian_opacity_fields_is_folded_in(tmp_path: Path) -> None:
+def test_gaussian_opacity_fields_filter_is_applied(tmp_path: Path) -> None:
     filter_3d = 0.04
     path = write_disc(tmp_path / "a.ply", [FIRST, SECOND, NORMAL], [*SIGMAS, 0.03], filter_3D=filter_3d)
     scene, report = read_scene(path, channels="all")
@@ -92,7 +92,7 @@ def test_ply_degree_four_harmonics_are_truncated_with_warning(tmp_path: Path) ->
     assert report.notes == ("Harmonics of degree 4 were left out; degree 3 is the highest here.",)
 
 
-def test_a_number_of_harmonics_of_no_degree_is_refused(tmp_path: Path) -> None:
+def test_invalid_harmonics_count_is_refused(tmp_path: Path) -> None:
     path = write_disc(tmp_path / "a.ply", [NORMAL, FIRST, SECOND], [1e-5, *SIGMAS], rest=30)
     with pytest.raises(SceneFileError, match="30 f_rest"):
         read_scene(path)

@@ -38,7 +38,7 @@ def test_read_scene_detects_format_by_content(gaussians: FlatGaussians, tmp_path
     assert (report.count, report.sh_degree, report.flattened, report.dropped) == (30, 1, 0, 0)
 
 
-def test_the_folder_of_a_run_stands_for_its_scene(gaussians: FlatGaussians, tmp_path: Path) -> None:
+def test_run_folder_is_read_as_scene(gaussians: FlatGaussians, tmp_path: Path) -> None:
     with pytest.raises(SceneFileError, match=r"is a folder without a scene; it should hold scene\.ply"):
         read_scene(tmp_path)
     write_gaussian_ply(gaussians, tmp_path / "scene.ply")
@@ -84,7 +84,7 @@ def test_gaussians_without_finite_values_can_be_left_out(gaussians: FlatGaussian
         read_scene(tmp_path / "a.ply", drop_invalid=True)
 
 
-def test_a_normal_may_be_infinitely_thin(gaussians: FlatGaussians, tmp_path: Path) -> None:
+def test_infinitely_thin_gaussian_is_read(gaussians: FlatGaussians, tmp_path: Path) -> None:
     def read(_path: Path) -> GaussianCloud:
         scales = np.stack([gaussians.log_scales[:, 1], np.full(30, -np.inf), gaussians.log_scales[:, 0]], 1)
         return GaussianCloud(

@@ -139,7 +139,7 @@ def test_bundles_and_folders_are_the_same(make_cloud: Make, tmp_path: Path) -> N
         np.testing.assert_array_equal(zipped.quats_wxyz, plain.quats_wxyz)
 
 
-def test_files_that_do_not_hold_together(make_cloud: Make, tmp_path: Path) -> None:
+def test_sog_inconsistent_file_is_refused(make_cloud: Make, tmp_path: Path) -> None:
     cloud = make_cloud(COUNT, 1)
 
     def refused(match: str, **changes: Any) -> None:
@@ -174,7 +174,7 @@ def test_files_that_do_not_hold_together(make_cloud: Make, tmp_path: Path) -> No
 
 
 @pytest.mark.real
-def test_a_trained_scene_equals_what_the_reference_converter_made_of_it(splats: Path) -> None:
+def test_sog_trained_scene_equals_reference_converter(splats: Path) -> None:
     sog, ply = splats / "playbot_lod3.sog", splats / "playbot_lod3.ply"
     a, b = importer_for(sog).read(sog), read_ply_cloud(ply)
     assert (len(a.means_world), a.sh.shape[1]) == (31000, 9)

@@ -34,7 +34,7 @@ def test_bytes_at_the_ends_are_no_infinite_logits(tmp_path: Path) -> None:
     np.testing.assert_allclose(gaussians.opacities, [0.25 / 255, 1 - 0.25 / 255], atol=1e-6)
 
 
-def test_files_that_are_none(tmp_path: Path) -> None:
+def test_splat_invalid_file_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "a.splat"
     path.write_bytes(row()[:-1])
     with pytest.raises(SceneFileError, match=r"a\.splat: is no \.splat, .*31 bytes"):

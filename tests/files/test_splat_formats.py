@@ -59,7 +59,7 @@ def degrees_apart(a: FlatGaussians, b: FlatGaussians) -> float:
         ("a.usda", "usd"),
     ],
 )
-def test_the_file_name_chooses_the_format(name: str, format: str) -> None:
+def test_splat_format_follows_suffix(name: str, format: str) -> None:
     assert exporter_for(Path(name)).name == format
 
 
@@ -102,7 +102,7 @@ def test_values_come_back_within_half_a_step(
 
 
 @pytest.mark.parametrize("name", ["scene.ply", "scene.spz"])
-def test_writing_what_was_read_gives_the_same_bytes(make_flat: Make, tmp_path: Path, name: str) -> None:
+def test_splat_formats_round_trip_bytes(make_flat: Make, tmp_path: Path, name: str) -> None:
     export_scene(make_flat(500, 2), tmp_path / name)
     again = tmp_path / "again" / name
     export_scene(read_scene(tmp_path / name)[0], again)
@@ -110,7 +110,7 @@ def test_writing_what_was_read_gives_the_same_bytes(make_flat: Make, tmp_path: P
 
 
 @pytest.mark.parametrize("name", [*FORMATS, "scene.usda", "scene.sog"])
-def test_scenes_that_cannot_be_written_leave_no_file(make_flat: Make, tmp_path: Path, name: str) -> None:
+def test_failed_splat_export_leaves_no_file(make_flat: Make, tmp_path: Path, name: str) -> None:
     scene = make_flat(5, 0)
     broken = scene.copy()
     broken.log_scales[1, 1] = np.nan
@@ -140,7 +140,7 @@ def test_min_opacity_leaves_faint_gaussians_out(make_flat: Make, tmp_path: Path,
     np.testing.assert_allclose(back.means_world, scene.means_world[bright], atol=1.3e-4)
 
 
-def test_a_component_of_one_fits_into_a_byte_of_splat(make_flat: Make, tmp_path: Path) -> None:
+def test_splat_quaternion_component_of_one_fits_byte(make_flat: Make, tmp_path: Path) -> None:
     scene = make_flat(4, 0)
     scene.quats_wxyz[:] = np.eye(4, dtype=np.float32)
     export_scene(scene, tmp_path / "a.splat")

@@ -109,7 +109,7 @@ def test_damaged_files_are_refused(make_cloud: Make, tmp_path: Path, version: in
             read_scene(path)
 
 
-def test_headers_that_promise_too_much_are_refused(make_cloud: Make, tmp_path: Path) -> None:
+def test_spz_oversized_header_is_refused(make_cloud: Make, tmp_path: Path) -> None:
     path = tmp_path / "a.spz"
     header, _ = pack(make_cloud(1), 3)
     path.write_bytes(gzip.compress(header[:8] + struct.pack("<I", 2**31) + header[12:] + bytes(50)))
@@ -128,7 +128,7 @@ def test_headers_that_promise_too_much_are_refused(make_cloud: Make, tmp_path: P
 
 
 @pytest.mark.real
-def test_a_trained_scene_agrees_with_its_ply(splats: Path) -> None:
+def test_spz_trained_scene_agrees_with_ply(splats: Path) -> None:
     spz, ply = splats / "biker.spz", splats / "biker.ply"
     a, b = importer_for(spz).read(spz), read_ply_cloud(ply)
     assert len(a.means_world) == 152746

@@ -17,7 +17,7 @@ HALF_TURN = np.diag([1.0, -1.0, -1.0])
 
 
 @pytest.mark.parametrize("name", ["a.usda", "a.usdc", "a.usd", "a.usdz"])
-def test_the_surflets_are_our_gaussians(make_scene: Make, tmp_path: Path, name: str) -> None:
+def test_usd_surflets_equal_gaussians(make_scene: Make, tmp_path: Path, name: str) -> None:
     from pxr import Gf, UsdGeom
 
     scene = make_scene(50)

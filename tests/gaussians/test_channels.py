@@ -45,7 +45,7 @@ def test_numbers_with_a_gap_or_alone_are_names() -> None:
         {"f_rest": 45}, {"a_0": 1, "a_1": 1}, {"a": 2, "a_2": 1}, {"a": 2, "a_0": 1}, {"b": 1, "B": 1},
     ],
 )  # fmt: skip
-def test_names_that_files_could_not_hold_apart_are_refused(widths: dict[str, int]) -> None:
+def test_ambiguous_channel_names_are_refused(widths: dict[str, int]) -> None:
     with pytest.raises(ConfigError, match=r"cannot name a channel|cannot be told apart"):
         some(**widths)
 

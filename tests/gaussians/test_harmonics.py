@@ -19,7 +19,7 @@ def directions(count: int, seed: int = 0) -> np.ndarray:
     return d / np.linalg.norm(d, axis=1, keepdims=True)
 
 
-def test_the_basis_is_the_tracers() -> None:
+def test_harmonics_basis_equals_tracer() -> None:
     d = directions(50)
     expected = np.zeros((50, 16))
     for row, direction in zip(expected, d, strict=True):
@@ -41,7 +41,7 @@ def test_turned_colours_are_the_old_ones_seen_from_turned_directions(degree: int
     np.testing.assert_allclose(new, old, atol=5e-6)
 
 
-def test_a_quarter_turn_about_z_permutes_the_first_band() -> None:
+def test_quarter_turn_permutes_first_band() -> None:
     sh = np.zeros((1, 4, 3), np.float32)
     sh[0, 3] = 1.0  # -x
     turned = rotate_sh(sh, np.array([[[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]]))  # x to y

@@ -26,7 +26,7 @@ def plain(count: int) -> FlatGaussians:
     )
 
 
-def test_a_scene_has_materials_when_it_has_all_three() -> None:
+def test_scene_materials_need_all_three_channels() -> None:
     channels = split_materials(np.linspace(-0.1, 1.1, 20).reshape(4, 5))
     assert channels["albedo"].min() == 0 and channels["roughness"].max() == 1
     whole = plain(4).with_channels(channels)
@@ -39,13 +39,13 @@ def test_a_scene_has_materials_when_it_has_all_three() -> None:
     assert not has_materials(whole.with_channels({"metallic": np.zeros((4, 2), np.float32)}))
 
 
-def test_metals_reflect_their_colour_and_all_else_four_percent() -> None:
+def test_base_reflectance_of_metal_and_dielectric() -> None:
     albedo = np.array([[0.9, 0.5, 0.1]] * 3)
     f0 = f0_linear(albedo, np.array([[0.0], [1.0], [0.5]]))
     np.testing.assert_allclose(f0, [[0.04] * 3, [0.9, 0.5, 0.1], [0.47, 0.27, 0.07]])
 
 
-def test_metal_that_is_not_too_rough_reflects() -> None:
+def test_smooth_metal_is_reflective() -> None:
     values = np.array([[0.5, 0.5, 0.5, 0.9, 0.1], [0.5, 0.5, 0.5, 0.9, 0.9], [0.5, 0.5, 0.5, 0.1, 0.1]])
     scene = plain(3)
     scene.log_scales[0] = np.log(2)  # four times the area

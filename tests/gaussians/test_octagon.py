@@ -49,7 +49,7 @@ def test_corners_of_an_axis_aligned_gaussian_are_those_of_the_paper() -> None:
 
 
 @pytest.mark.parametrize("q", [4.0, CHI2_2_99, CHI2_3_99])
-def test_alpha_at_every_corner_is_the_same_whatever_the_opacity(make_gaussians: Make, q: float) -> None:
+def test_octagon_corner_alpha_is_independent_of_opacity(make_gaussians: Make, q: float) -> None:
     g = make_gaussians(300)
     radii = octagon_radii(g.opacities, q)
     assert (radii > 0).any()

@@ -58,7 +58,7 @@ def test_arrays_by_name_and_back() -> None:
     assert back.notes == () and back.channels.widths == {"label": 1}
 
 
-def test_tables_that_differ_are_not_mixed() -> None:
+def test_mismatched_tables_are_refused() -> None:
     bare = Table(np.zeros((2, 2)), np.zeros(2))
     for mix in (
         lambda: concatenate_rows([table(0, 2), bare]),

@@ -397,12 +397,12 @@ def test_archive_nested_is_refused(local_storage: LocalStorage, name: str) -> No
     assert refusal(build_zip(good(), inner), local_storage) == "archive-nested"
 
 
-def test_contents_that_only_look_nested(local_storage: LocalStorage) -> None:
+def test_gzip_like_model_is_accepted(local_storage: LocalStorage) -> None:
     data = build_zip(good(), ZipMember("sparse/0/points3D.bin", MODEL))
     assert take(data, local_storage)["sparse/0/points3D.bin"] == MODEL
 
 
-def test_refusal_from_the_outside_stops(local_storage: LocalStorage) -> None:
+def test_quota_refusal_stops_reading(local_storage: LocalStorage) -> None:
     data = build_zip(good(), good("images/b.jpg"))
     listing = list_archive(io.BytesIO(data))
     with pytest.raises(RuntimeError, match="quota"):

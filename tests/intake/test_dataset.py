@@ -187,7 +187,7 @@ def test_dataset_fault_list_is_bounded(local_storage: LocalStorage) -> None:
     )
 
 
-def test_files_that_do_not_fit_together(local_storage: LocalStorage) -> None:
+def test_dataset_inconsistent_files_are_refused(local_storage: LocalStorage) -> None:
     small = {**photographs(), "masks/v0.png.png": photograph(9, 9), **ColmapModelBuilder().files()}
     (fault,) = faults_of(local_storage, small)
     assert (fault.code, fault.file) == ("mask-size", "masks/v0.png.png")
@@ -243,7 +243,7 @@ def test_model_child_timeout_is_reported(local_storage: LocalStorage) -> None:
     assert faults[0].code in ("model-timeout", "model-too-few-views", "model-damaged")
 
 
-def test_the_child_knows_no_secrets(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_model_child_environment_has_no_secrets(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("DATABASE_URL", "postgresql://user:password@host/db")
     monkeypatch.setenv("AWS_SECRET_ACCESS_KEY", "secret")
     monkeypatch.setenv("OCTASPLAT_TOKEN", "secret")

@@ -242,7 +242,7 @@ def test_garbage_collection_removes_unreferenced_content_only(within: Any, tmp_p
     within(story)
 
 
-def test_replaced_checkpoints_go_early_but_not_what_others_name(within: Any, tmp_path: Path) -> None:
+def test_replaced_checkpoints_are_deleted_unless_shared(within: Any, tmp_path: Path) -> None:
     storage = LocalStorage(tmp_path / "store", floor_bytes=0)
 
     async def story(pool: Pool, connection: Connection) -> None:
@@ -298,7 +298,7 @@ def test_json_null_checkpoints_do_no_harm(within: Any) -> None:
     within(story)
 
 
-def test_each_expired_job_goes_in_a_transaction_of_its_own(conninfo: str) -> None:
+def test_expired_jobs_are_deleted_in_own_transactions(conninfo: str) -> None:
     """As a worker does it: no row is kept locked while the next owner's lock is waited for."""
 
     async def what() -> None:

@@ -70,7 +70,7 @@ def test_client_talks_to_a_service_with_the_light_packages_only(client: Environm
     assert re.fullmatch(r"octasplat.load needs '\w+', which is not installed; install octasplat, .*", refused)
 
 
-def test_every_module_of_the_client_can_be_imported(client: Environment, tmp_path: Path) -> None:
+def test_client_modules_are_importable(client: Environment, tmp_path: Path) -> None:
     code = (
         "import importlib, pkgutil, octasplat.workers.client as package, octasplat.client\n"
         "for module in pkgutil.iter_modules(package.__path__):\n"
@@ -79,7 +79,7 @@ def test_every_module_of_the_client_can_be_imported(client: Environment, tmp_pat
     assert run((client.python, "-c", code), tmp_path) == ""
 
 
-def test_client_asks_for_what_the_project_asks_for() -> None:
+def test_client_requirements_match_project() -> None:
     whole = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     assert set(PROJECT["dependencies"]) <= set(whole["dependencies"])
     assert PROJECT["requires-python"] == whole["requires-python"]

@@ -130,7 +130,7 @@ def test_values_do_not_change_when_light_and_viewer_are_swapped() -> None:
     np.testing.assert_allclose(there, back, rtol=1e-9)
 
 
-def test_a_smooth_coat_reflects_what_fresnel_says() -> None:
+def test_smooth_coat_reflectance_is_fresnel() -> None:
     table = albedo_table(1.5).directional[0]
     cosines = np.linspace(0, 1, len(table))[2:]
     np.testing.assert_allclose(table[2:], fresnel(cosines, 1.5)[0], atol=2e-3)

@@ -39,7 +39,7 @@ BALLS = tuple(
 )
 
 
-def test_the_layers_make_the_picture_again_and_the_plate_is_the_scene_alone() -> None:
+def test_layers_recompose_image() -> None:
     numbers = Integrator(samples=16, max_depth=5, layers=True)
     lights = (LAMP, PointLight(position=(1, -1, 1), intensity=0.4, adds_light=True))
     stage = Stage(meshes=BALLS, lights=lights, integrator=numbers)
@@ -68,7 +68,7 @@ def test_the_layers_make_the_picture_again_and_the_plate_is_the_scene_alone() ->
     assert not found["things"][free].any() and (found["shadow"][0, 0] == 1).all()
 
 
-def test_layers_are_written_as_channels_that_compositors_know(tmp_path: Path) -> None:
+def test_layers_have_standard_channel_names(tmp_path: Path) -> None:
     write_gaussian_ply(table_with_a_box(), tmp_path / "scene.ply")
     (tmp_path / "stage.toml").write_text(
         "[[meshes]]\nshape = 'sphere'\nscale = 0.2\nposition = [0.5, -0.2, 0.5]\n[integrator]\nsamples = 1\n"
@@ -84,7 +84,7 @@ def test_layers_are_written_as_channels_that_compositors_know(tmp_path: Path) ->
     assert refused.exit_code == 1 and "holds no layers" in refused.output
 
 
-def test_noise_is_taken_away_and_what_has_none_stays() -> None:
+def test_denoiser_keeps_noise_free_pixels() -> None:
     pytest.importorskip("pyoidn")
     floor = StageMesh(shape="plane", scale=2, material=Diffuse())
     stage = Stage(gaussians=(), meshes=(floor, *BALLS), lights=(LAMP,))

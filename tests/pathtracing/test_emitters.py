@@ -73,7 +73,7 @@ def seen(stage: Stage) -> np.ndarray:
     return tracer.render(view.rays()).image().rgb_linear
 
 
-def test_a_new_lamp_adds_its_light_and_the_old_one_only_takes() -> None:
+def test_added_lamp_adds_light_and_trained_light_only_shadows() -> None:
     numbers = Integrator(samples=256, max_depth=1, anti_aliasing=False)
     table = StageGaussians(ambient=0.25)
     plain = seen(Stage(gaussians=(table,), integrator=numbers))

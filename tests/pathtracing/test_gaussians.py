@@ -133,7 +133,7 @@ def test_dielectric_slab_index_one_is_invisible() -> None:
     assert psnr(shown, picture(emissive(), VIEW, some, background=0.2)) > 60
 
 
-def test_a_mirror_shows_what_a_camera_behind_it_sees() -> None:
+def test_mirror_shows_gaussians_of_virtual_camera() -> None:
     some = cloud(300, centre=(0, 0, -1.5))
     mirror = StageMesh(
         shape="plane", rotation_degrees=(90, 0, 0), position=(0, 0, 1), scale=9, material=Mirror()
@@ -150,7 +150,7 @@ def test_a_mirror_shows_what_a_camera_behind_it_sees() -> None:
 
 
 @pytest.mark.parametrize("light", ["directional", "point", "rectangle"])
-def test_an_opaque_wall_of_gaussians_casts_the_shadow_of_a_mesh(light: str) -> None:
+def test_gaussian_wall_shadow_equals_mesh_shadow(light: str) -> None:
     floor = StageMesh(
         shape="plane", position=(0, 1, 0), scale=4, material=Diffuse(colour_srgb=(0.8, 0.8, 0.8))
     )
@@ -235,7 +235,7 @@ def test_relit_gaussians_match_diffuse_wall() -> None:
     assert psnr(picture(lighter, view, screen), plainly(screen, view)) > 50
 
 
-def test_gaussians_light_a_mesh_as_a_wall_of_that_radiance_would(tmp_path: Path) -> None:
+def test_gaussians_light_mesh_as_equivalent_wall(tmp_path: Path) -> None:
     # A matt ball within a bright wall of Gaussians on one side, and the same light as an area light.
     screen = wall(-1.5, 1.0, per_side=120, colour=0.9)
     floor = StageMesh(
@@ -270,7 +270,7 @@ def test_several_scenes_each_in_its_place_and_light(tmp_path: Path) -> None:
     assert shown[:, 26:].max() > 0.1
 
 
-def test_an_environment_that_the_camera_does_not_see_still_shows_in_a_mirror(tmp_path: Path) -> None:
+def test_hidden_environment_is_visible_in_mirror(tmp_path: Path) -> None:
     write_exr(tmp_path / "sky.exr", {c: np.full((8, 16), 0.7, np.float32) for c in "RGB"})
     ball = StageMesh(shape="sphere", scale=0.5, smooth_degrees=180, material=Mirror())
     stage = emissive(ball, environment=Environment(file="sky.exr", visible=False))
@@ -278,7 +278,7 @@ def test_an_environment_that_the_camera_does_not_see_still_shows_in_a_mirror(tmp
     assert shown[0, 0, 0] == 0 and abs(shown[18, 24, 0] - 1.055 * 0.7 ** (1 / 2.4) + 0.055) < 1e-3
 
 
-def test_the_same_bytes_on_any_number_of_threads() -> None:
+def test_gaussian_render_is_independent_of_threads() -> None:
     some = cloud(400)
     meshes = (
         StageMesh(shape="plane", scale=3, position=(0, 0.8, 0)),

@@ -108,7 +108,7 @@ def test_light_inside_glass_is_totally_reflected_beyond_the_critical_angle(tmp_p
     assert abs(seen.mean() - 0.96**2) < 0.01
 
 
-def test_a_rectangle_lights_a_floor_by_its_form_factor(tmp_path: Path) -> None:
+def test_rectangle_light_floor_form_factor(tmp_path: Path) -> None:
     floor = StageMesh(shape="plane", scale=50, material=Diffuse(colour_srgb=WHITE))
     lamp = RectangleLight(position=(0, -1, 0), direction=(0, 1, 0), width=1.4, height=2.0, radiance=2.0)
     numbers = Integrator(samples=4096, max_depth=1, anti_aliasing=False)
@@ -123,7 +123,7 @@ def test_a_rectangle_lights_a_floor_by_its_form_factor(tmp_path: Path) -> None:
     np.testing.assert_allclose(seen.mean(), 2.0 * 4 * corner, rtol=5e-3)
 
 
-def test_a_mirror_shows_what_a_camera_behind_it_sees(tmp_path: Path) -> None:
+def test_mirror_shows_mesh_of_virtual_camera(tmp_path: Path) -> None:
     things = (
         StageMesh(
             shape="cube", scale=0.4, position=(0.3, 0.1, -1), material=Diffuse(colour_srgb=(0.9, 0.3, 0.1))
@@ -149,7 +149,7 @@ def test_a_mirror_shows_what_a_camera_behind_it_sees(tmp_path: Path) -> None:
     assert psnr(a, b) > 50
 
 
-def test_the_same_bytes_on_any_number_of_threads_and_another_seed_gives_others(tmp_path: Path) -> None:
+def test_render_depends_on_seed_not_on_threads(tmp_path: Path) -> None:
     meshes = (
         StageMesh(shape="plane", scale=3, position=(0, 1, 0)),
         StageMesh(shape="sphere", smooth_degrees=180, material=Glass()),
@@ -170,7 +170,7 @@ def test_the_same_bytes_on_any_number_of_threads_and_another_seed_gives_others(t
     assert film_of(other, view, tmp_path).image().rgb_linear.tobytes() != one.rgb_linear.tobytes()
 
 
-def test_depth_of_field_blurs_what_is_not_in_focus(tmp_path: Path) -> None:
+def test_depth_of_field_blurs_out_of_focus_objects(tmp_path: Path) -> None:
     edge = StageMesh(
         shape="cube", position=(-1, 0, 0), scale=(1, 9, 0.001), material=Diffuse(colour_srgb=WHITE)
     )
@@ -200,7 +200,7 @@ def test_light_of_a_point_goes_straight_through_a_pane(tmp_path: Path) -> None:
     np.testing.assert_allclose(seen.mean(axis=(0, 1)), 0.5 * 0.96**2 * np.exp([-0.5, 0, 0]), rtol=1e-4)
 
 
-def test_glass_that_is_open_and_a_camera_inside_glass_are_refused(tmp_path: Path) -> None:
+def test_open_glass_and_camera_inside_glass_are_refused(tmp_path: Path) -> None:
     ball = StageMesh(shape="sphere", material=Glass())
     meshes = compile_meshes(Stage(gaussians=(), meshes=(ball,)), tmp_path)
     with pytest.raises(ConfigError, match=r"a\.png: the camera stands inside"):

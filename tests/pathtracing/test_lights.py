@@ -28,7 +28,7 @@ def stratified(side: int) -> np.ndarray:
     return np.stack([rng.permutation(side * side) / side**2, u.ravel(), v.ravel()], axis=1)
 
 
-def test_a_parallel_rectangle_lights_by_its_form_factor() -> None:
+def test_parallel_rectangle_form_factor() -> None:
     # A corner of a rectangle of sides a, b over a point at distance 1 has this form factor; there are four.
     a, b = 0.7, 1.2
     corner = (
@@ -91,7 +91,7 @@ def patchy() -> np.ndarray:
     return radiance
 
 
-def test_an_environments_density_integrates_to_one_and_its_samples_follow_it() -> None:
+def test_environment_sampling_density() -> None:
     frame = environment_frame(np.array([0.2, -1.0, 0.1]), 37.0)
     lights = build_light_arrays((), UP, EnvironmentMap(patchy(), frame))
     rows, columns = 256, 512

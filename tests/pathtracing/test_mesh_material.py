@@ -147,7 +147,7 @@ def test_glb_material_and_textures_are_read(tmp_path: Path) -> None:
     assert np.abs(found - flat).max() > 0.02
 
 
-def test_a_glb_of_several_materials_in_a_turned_and_mirrored_node(tmp_path: Path) -> None:
+def test_glb_materials_in_mirrored_node(tmp_path: Path) -> None:
     cube = primitive_shape("cube")
     halves = [0] * 6 + [1] * 6
     glass = {"extensions": {"KHR_materials_transmission": {"transmissionFactor": 1},

@@ -19,7 +19,7 @@ def numbers(pixel: int, samples: int, pair: int = 0, seed: int = 1) -> np.ndarra
     return out
 
 
-def test_the_sequence_is_sobols() -> None:
+def test_sequence_equals_sobol() -> None:
     known = qmc.Sobol(2, scramble=False).random(256)
     ours = np.array([digits(np.uint32(k)) for k in range(256)]) / 2.0**32
     # The reference walks in Gray-code order; blocks of 2^k hold the same points.
@@ -27,7 +27,7 @@ def test_the_sequence_is_sobols() -> None:
         assert {tuple(p) for p in ours[:block]} == {tuple(p) for p in known[:block]}
 
 
-def test_every_block_of_samples_is_a_net() -> None:
+def test_sample_blocks_are_digital_nets() -> None:
     for pixel in range(8):
         for pair in (0, 3):
             some = numbers(pixel, 64, pair)

@@ -36,7 +36,7 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.parametrize("by", ["split-sum", "path"])
-def test_white_light_makes_white_metal_as_bright_as_itself(scene, tmp_path, by):
+def test_white_furnace_of_white_metal(scene, tmp_path, by):
     done = relight(
         scene / "ball.ply",
         "--environment",

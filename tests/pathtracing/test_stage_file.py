@@ -117,7 +117,7 @@ def test_missing_files_are_named(tmp_path: Path) -> None:
             read_stage(path)
 
 
-def test_the_first_stage_can_be_read_and_so_can_all_that_it_suggests(tmp_path: Path) -> None:
+def test_starter_stage_and_its_suggestions_are_valid(tmp_path: Path) -> None:
     path = tmp_path / "stage.toml"
     write_stage_template(path, StageLayout((0, -1, 0), (0, 0.5, 0), 2.0, (0.6, 0.8, 0)))
     stage = read_stage(path)
@@ -145,11 +145,11 @@ def test_reading_stages_needs_neither_torch_nor_numba() -> None:
     subprocess.run([sys.executable, "-c", code], check=True)
 
 
-def test_a_stage_has_the_scene_as_trained_colours_in_shadow_by_default() -> None:
+def test_stage_default_scene_mode() -> None:
     assert Stage().gaussians[0].light == "shadowed"
 
 
-def test_the_examples_are_stages(tmp_path: Path) -> None:
+def test_example_stages_are_valid(tmp_path: Path) -> None:
     folder = Path(__file__).resolve().parents[2] / "examples" / "light"
     for path in (*folder.glob("*.toml"), folder / "vase.py"):
         shutil.copy(path, tmp_path)

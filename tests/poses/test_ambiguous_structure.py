@@ -22,7 +22,7 @@ def test_unambiguous_model_has_no_folds() -> None:
 
 
 @pytest.mark.parametrize("second", [8, 3, 1])
-def test_the_pairs_that_hold_the_two_sides_are_found(second: int) -> None:
+def test_ambiguous_pairs_are_found(second: int) -> None:
     rows = [*loop(1, 10), *loop(11, second)]
     false = [(4, 11, 90, 3), (5, 11, 80, 0)]
     true = [(number, 11, 1, 150) for number in (8, 9, 10)]

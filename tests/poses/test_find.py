@@ -122,7 +122,7 @@ def test_find_poses_should_stop_cancels(taken: Photographs, tmp_path: Path) -> N
     assert list(tmp_path.iterdir()) == []
 
 
-def test_the_same_photographs_give_the_same_bytes(taken: Photographs, tmp_path: Path) -> None:
+def test_pose_search_is_deterministic(taken: Photographs, tmp_path: Path) -> None:
     images = tmp_path / "images"
     images.mkdir()
     for number, path in enumerate(sorted((taken.folder).iterdir())[:10]):
@@ -138,7 +138,7 @@ def test_the_same_photographs_give_the_same_bytes(taken: Photographs, tmp_path: 
     assert {name.startswith("view ") for name in centres(tmp_path / "poses1")} == {True}
 
 
-def test_a_result_of_other_photographs_is_refused(taken: Photographs, tmp_path: Path) -> None:
+def test_pose_result_of_other_photographs_is_refused(taken: Photographs, tmp_path: Path) -> None:
     images = tmp_path / "images"
     shutil.copytree(taken.folder, images)
     (tmp_path / "poses").mkdir()
@@ -163,9 +163,7 @@ def unreadable(kind: str, good: Path) -> tuple[str, bytes]:
 
 @pytest.mark.parametrize("kind", ["truncated JPEG", "TIFF of nothing", "TIFF of five channels", "empty file"])
 @pytest.mark.parametrize("place", range(4))
-def test_a_file_that_cannot_be_read_takes_no_number_of_another(
-    taken: Photographs, tmp_path: Path, kind: str, place: int
-) -> None:
+def test_unreadable_file_takes_no_image_id(taken: Photographs, tmp_path: Path, kind: str, place: int) -> None:
     images = tmp_path / "images"
     images.mkdir()
     good = sorted(taken.folder.iterdir())[:3]

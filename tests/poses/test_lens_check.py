@@ -74,7 +74,7 @@ def test_lens_check_flags_shifted_principal_points_only(moved: Path, still: Path
         assert needs_per_view_principal_points(scene, scene.points, scene.observations) is expected
 
 
-def test_the_principal_points_come_out_where_the_pictures_were_moved(moved: Path, tmp_path: Path) -> None:
+def test_shifted_principal_points_are_found(moved: Path, tmp_path: Path) -> None:
     model, found = moved / "sparse" / "0", tmp_path / "found"
     facts = adjust_principal_points(model, found)
     assert facts is not None
@@ -106,7 +106,7 @@ def test_lens_fit_unreadable_model_is_refused(tmp_path: Path) -> None:
     assert not any(tmp_path.iterdir())
 
 
-def test_photographs_that_show_few_points_keep_their_lens(moved: Path, tmp_path: Path) -> None:
+def test_photograph_with_few_points_keeps_lens(moved: Path, tmp_path: Path) -> None:
     model = pycolmap.Reconstruction(str(moved / "sparse" / "0"))
     poor, none = sorted(model.images.values(), key=lambda image: image.name)[4:6]
     for image, left in ((poor, 60), (none, 0)):

@@ -55,7 +55,7 @@ TRUE = looking(np.array([3.0, 2.5, 2.0]))
 WRONG = looking(np.array([-3.0, 1.0, 2.5]))
 
 
-def test_distances_from_a_line_that_is_known() -> None:
+def test_distances_from_known_line() -> None:
     # Two cameras side by side that look the same way: a feature's line in the other is its own row.
     level = np.eye(3)[None], np.array([[-1.0, 0.0, 0.0]])
     rays = np.array([[0.2, 0.1, 1.0], [0.2, 0.1, 1.0], [0.2, 0.1, 1.0]])

@@ -111,7 +111,7 @@ def test_two_starts_at_once_make_one_database(server: EmbeddedPostgres) -> None:
     assert answers[0] == answers[1] and answers[0]
 
 
-def test_socket_path_that_is_too_long_goes_elsewhere(short_root: Path) -> None:
+def test_long_socket_path_is_replaced(short_root: Path) -> None:
     server = EmbeddedPostgres(short_root / ("long" * 25))
     try:
         conninfo = server.start()
@@ -200,7 +200,7 @@ def test_postgres_new_cluster_is_synced_before_rename(
     assert first.endswith(".partial") and not there
 
 
-def test_the_log_does_not_grow_for_ever(server: EmbeddedPostgres, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_database_log_is_bounded(server: EmbeddedPostgres, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(embedded, "MAX_LOG_BYTES", 20_000)
     conninfo = server.start()
     log = server.home / "log"
@@ -232,7 +232,7 @@ def test_connections_grow_with_the_jobs_at_once(short_root: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["a,b", "it's", 'say "$HOME" `x`', "with space"])
-def test_the_data_folder_may_have_any_name(short_root: Path, name: str) -> None:
+def test_data_folder_may_have_any_name(short_root: Path, name: str) -> None:
     server = EmbeddedPostgres(short_root / f"{name} {os.getpid()}")
     try:
         assert answer(server.start(), "SELECT 42") == "42"

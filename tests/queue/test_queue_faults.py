@@ -133,7 +133,7 @@ def test_clock_jump_does_not_recover_live_jobs(conninfo: str) -> None:
     run(conninfo, what)
 
 
-def test_a_worker_lost_before_the_clock_was_set_back_is_missed_all_the_same(conninfo: str) -> None:
+def test_lost_worker_is_detected_after_clock_is_set_back(conninfo: str) -> None:
     async def what(pool: Pool) -> None:
         living, lost = await begun(pool), await begun(pool)
         async with pool.connection() as connection:
@@ -179,7 +179,7 @@ def test_heartbeat_is_not_blocked_by_other_locks(conninfo: str, tmp_path: Path, 
     run(conninfo, what)
 
 
-def test_contents_that_are_being_removed_are_waited_for_without_a_lock(conninfo: str, tmp_path: Path) -> None:
+def test_contents_being_removed_are_awaited_without_lock(conninfo: str, tmp_path: Path) -> None:
     storage = LocalStorage(tmp_path / "store", floor_bytes=0)
 
     def stored(content: bytes) -> str:
@@ -254,7 +254,7 @@ def test_transaction_after_deadlock_is_retried(conninfo: str) -> None:
     run(conninfo, what)
 
 
-def test_the_order_of_locks_is_checked_here(conninfo: str) -> None:
+def test_lock_order_is_checked(conninfo: str) -> None:
     async def what(pool: Pool) -> None:
         attempt = await begun(pool)
         for lock in (lambda c: lock_owner(c, "me"), lambda c: lock_store(c, shared=True)):
@@ -309,7 +309,7 @@ def test_stale_dataset_check_is_reopened(conninfo: str) -> None:
     run(conninfo, what)
 
 
-def test_a_check_that_was_silent_for_long_says_nothing_of_later_files(conninfo: str) -> None:
+def test_stale_storage_check_keeps_later_files(conninfo: str) -> None:
     """Its process was frozen; meanwhile the dataset was opened, changed, and is being checked again."""
 
     async def what(pool: Pool) -> None:

@@ -173,7 +173,7 @@ def test_new_checkpoint_forgives_lost_workers(conninfo: str) -> None:
     run(conninfo, what)
 
 
-def test_lost_job_that_was_to_be_cancelled_is_cancelled(conninfo: str) -> None:
+def test_lost_cancelling_job_is_cancelled(conninfo: str) -> None:
     async def what(pool: Pool) -> None:
         attempt = await claimed(pool)
         async with pool.connection() as connection:

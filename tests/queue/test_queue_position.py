@@ -38,7 +38,7 @@ async def delivered(pool: Pool, count: int) -> list[uuid.UUID]:
     return found
 
 
-def test_interrupted_jobs_go_before_what_was_queued_after_them(conninfo: str) -> None:
+def test_interrupted_jobs_keep_queue_position(conninfo: str) -> None:
     async def what() -> None:
         async with open_pool(conninfo, max_size=6) as pool:
             first, second, third = await made(pool, 3)

@@ -30,7 +30,7 @@ def cameras(count: int) -> list[PinholeCamera]:
     return [PinholeCamera.from_pose(pose, 40, 30, fy_px=40.0) for pose in poses[: count // 4]]
 
 
-def test_the_colour_along_a_direction_is_that_of_the_harmonics() -> None:
+def test_baked_colour_equals_harmonics() -> None:
     gaussians, direction = cloud(20), np.array([1.0, 2.0, -2.0])
     expected = 0.5 + np.einsum("k,nkc->nc", sh_basis(direction / 3, 1), gaussians.sh)
     np.testing.assert_allclose(colours_along(gaussians, direction), np.maximum(expected, 0), atol=1e-6)
@@ -54,7 +54,7 @@ def test_baked_colour_is_mean_over_views() -> None:
 
 
 @pytest.mark.parametrize("threads", [1, 2])
-def test_the_pictures_are_nearer_than_those_of_other_colours(threads: int) -> None:
+def test_baked_colour_is_closest_to_render(threads: int) -> None:
     gaussians, seen = cloud(300), cameras(32)
     tracer = make_tracer(TraceSettings(), threads=threads)
     images = [camera.rays for camera in seen]

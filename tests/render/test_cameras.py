@@ -12,7 +12,7 @@ def camera(**changes):
     return PinholeCamera.from_pose(pose, 8, 6, **({"fy_px": 9.0} | changes))
 
 
-def test_a_ray_projects_back_to_the_centre_of_its_pixel():
+def test_ray_projects_to_pixel_centre():
     one = camera(fx_px=7.0, cx_px=3.2, cy_px=2.9)
     origin, directions = one.rays().origin_world, one.rays().directions_world
     assert directions.shape == (6, 8, 3)
@@ -22,7 +22,7 @@ def test_a_ray_projects_back_to_the_centre_of_its_pixel():
     assert np.allclose(one.project(points), np.stack([x.ravel(), y.ravel()], axis=-1), atol=1e-4)
 
 
-def test_an_unturned_camera_looks_along_z_with_y_down():
+def test_identity_camera_looks_along_z_with_y_down():
     one = PinholeCamera.from_pose(np.eye(4), 2, 2, fy_px=1.0)
     directions = one.rays().directions_world
     assert np.allclose(directions[0, 1] * np.sqrt(1.5), [0.5, -0.5, 1])
@@ -30,7 +30,7 @@ def test_an_unturned_camera_looks_along_z_with_y_down():
     assert np.isnan(one.project(np.array([[0.0, 0, -1]]))).all()
 
 
-def test_the_pose_is_given_back():
+def test_camera_pose_round_trip():
     one = camera()
     again = PinholeCamera.from_pose(one.world_from_cam, 8, 6, fy_px=9.0)
     assert np.allclose(one.centre_world, [1, -2, 3])
@@ -39,6 +39,6 @@ def test_the_pose_is_given_back():
     assert (one.fx_px, one.cx_px, one.cy_px) == (9.0, 4.0, 3.0)
 
 
-def test_a_field_of_view_spans_the_image():
+def test_field_of_view_spans_image():
     assert focal_from_fov(90.0, 200) == pytest.approx(100)
     assert fov_from_focal(focal_from_fov(37.0, 480), 480) == pytest.approx(37)

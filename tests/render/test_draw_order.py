@@ -13,7 +13,7 @@ def test_points_on_a_line_are_ordered_from_far_to_near():
     assert agreement == pytest.approx(1.0)
 
 
-def test_the_majority_decides_and_opposite_viewers_do_not_agree():
+def test_draw_order_follows_majority():
     points = np.array([[0, 0, z] for z in (1.0, 2.0, 3.0, 4.0)])
     front, back = [0, 0, 0.0], [0, 0, 10.0]
     order, _ = shared_depth_order(points, np.array([front, front, back]))

@@ -12,14 +12,14 @@ def picture():
     return np.random.default_rng(1).random((6, 9, 3), dtype=np.float32)
 
 
-def test_a_png_keeps_display_values_to_8_bits(tmp_path, picture):
+def test_png_keeps_display_values_to_8_bits(tmp_path, picture):
     image_files.write_png(tmp_path / "a.png", picture)
     again = image_files.read_image(tmp_path / "a.png")
     assert np.array_equal(to_bytes(again), to_bytes(picture))
     assert [p.name for p in tmp_path.iterdir()] == ["a.png"]
 
 
-def test_a_png_keeps_straight_colours_under_any_alpha(tmp_path, picture):
+def test_png_keeps_straight_colours_under_any_alpha(tmp_path, picture):
     alpha = np.linspace(0, 1, 54, dtype=np.float32).reshape(6, 9)
     image_files.write_png(tmp_path / "a.png", picture, alpha)
     again = image_files.read_image(tmp_path / "a.png")
@@ -28,7 +28,7 @@ def test_a_png_keeps_straight_colours_under_any_alpha(tmp_path, picture):
     assert np.array_equal(to_bytes(again[..., 3]), to_bytes(alpha))
 
 
-def test_an_exr_holds_linear_light_depth_alpha_and_normals(tmp_path, picture):
+def test_exr_holds_linear_light_depth_alpha_and_normals(tmp_path, picture):
     rng = np.random.default_rng(2)
     alpha, depth = rng.random((6, 9), np.float32), rng.random((6, 9), np.float32) * 1e6
     normals = rng.normal(size=(6, 9, 3)).astype(np.float32)
@@ -41,7 +41,7 @@ def test_an_exr_holds_linear_light_depth_alpha_and_normals(tmp_path, picture):
     assert np.allclose(linear_to_srgb(rgb), picture, atol=1e-6)
 
 
-def test_a_half_exr_keeps_depth_in_full(tmp_path, picture):
+def test_half_exr_keeps_full_precision_depth(tmp_path, picture):
     depth = np.full((6, 9), 123456.789, np.float32)
     image_files.write_exr(tmp_path / "a.exr", image_files.exr_layers(picture, depth=depth), half=True)
     again = image_files.read_channels(tmp_path / "a.exr")
@@ -52,7 +52,7 @@ def test_a_half_exr_keeps_depth_in_full(tmp_path, picture):
     assert formats["R"] == "half" and formats["Z"] == "float"
 
 
-def test_the_srgb_curve_has_its_known_points():
+def test_srgb_curve_known_points():
     values = np.array([0, 0.04045, 0.5, 1], np.float32)
     assert srgb_to_linear(values) == pytest.approx([0, 0.0031308, 0.2140411, 1], abs=1e-6)
     assert linear_to_srgb(srgb_to_linear(values)) == pytest.approx(values, abs=1e-6)
@@ -74,7 +74,7 @@ def test_read_image_invalid_file_is_named(tmp_path):
         image_files.read_image(tmp_path / "text.png")
 
 
-def test_a_damaged_image_is_refused_by_name(tmp_path, picture):
+def test_damaged_image_is_refused_by_name(tmp_path, picture):
     path = tmp_path / "cut.png"
     image_files.write_png(path, np.repeat(picture, 30, axis=0))
     path.write_bytes(path.read_bytes()[:400])
@@ -82,7 +82,7 @@ def test_a_damaged_image_is_refused_by_name(tmp_path, picture):
         image_files.read_image(path)
 
 
-def test_an_unwritable_place_is_an_output_error(tmp_path, picture):
+def test_unwritable_path_raises_output_error(tmp_path, picture):
     (tmp_path / "file").write_text("")
     with pytest.raises(OutputError, match=r"a\.png"):
         image_files.write_png(tmp_path / "file" / "a.png", picture)
@@ -90,7 +90,7 @@ def test_an_unwritable_place_is_an_output_error(tmp_path, picture):
         image_files.write_png(tmp_path / "a.unknown", picture)
 
 
-def test_a_transparent_exr_holds_linear_colours_times_alpha():
+def test_transparent_exr_is_premultiplied_linear():
     alpha = np.array([[0.0, 0.1, 0.5, 1.0]], np.float32)
     straight = np.full(1, 0.8, np.float32)
     display = np.repeat((alpha * straight)[..., None], 3, axis=-1)
@@ -103,7 +103,7 @@ def test_a_transparent_exr_holds_linear_colours_times_alpha():
     np.testing.assert_array_equal(opaque["R"], srgb_to_linear(display)[..., 0])
 
 
-def test_a_radiance_picture_is_rounded_to_its_steps(tmp_path):
+def test_radiance_image_is_rounded_to_steps(tmp_path):
     random = np.random.default_rng(1)
     linear = np.exp(random.uniform(-6, 6, (32, 64, 3))).astype(np.float32)
     linear[0, 0] = 0

@@ -21,7 +21,7 @@ def content(**frame):
     return {"width": 40, "height": 30, "frames": [first, first | frame]}
 
 
-def test_a_written_path_reads_back_the_same(path):
+def test_path_file_round_trip(path):
     poses = turntable(np.zeros(3), np.array([0.0, -1, 0]), 2.0, 0.5, 5)
     like = PinholeCamera.from_pose(np.eye(4), 64, 48, fy_px=50.0, fx_px=51.0, cx_px=30.0, cy_px=25.0)
     written = path_from_poses(list(poses), like, 24.0)
@@ -34,7 +34,7 @@ def test_a_written_path_reads_back_the_same(path):
         assert (one.cx_px, one.cy_px) == (30.0, 25.0)
 
 
-def test_a_field_of_view_and_focal_lengths_both_do(path):
+def test_path_accepts_field_of_view_or_focal_lengths(path):
     path.write_text(json.dumps(content(fov_y_degrees=None, fx=11, fy=12)))
     first, second = read_camera_path(path).cameras
     assert (first.fx_px, first.fy_px, first.cx_px, first.cy_px) == pytest.approx((15, 15, 20, 15))
@@ -65,7 +65,7 @@ def test_camera_path_error_names_file_and_field(path, change, message):
         read_camera_path(path)
 
 
-def test_a_file_that_is_missing_or_no_json_is_refused(path):
+def test_missing_or_invalid_path_file_is_refused(path):
     with pytest.raises(ConfigError, match=r"path\.json"):
         read_camera_path(path)
     path.write_text("{")
@@ -127,7 +127,7 @@ def test_lenses_change_between_keys_and_a_closed_path_comes_back(path):
         ({"keys": keys()["keys"][:2], "closed": True}, "at least 3 poses"),
     ],
 )
-def test_keys_that_make_no_path_are_refused(path, change, message):
+def test_invalid_path_keys_are_refused(path, change, message):
     path.write_text(json.dumps(keys(**change)))
     with pytest.raises(ConfigError, match=message) as error:
         read_camera_path(path)

@@ -25,7 +25,7 @@ def keys(count, seed=0):
     return poses
 
 
-def test_a_turntable_looks_at_its_centre_from_one_distance():
+def test_turntable_looks_at_centre_from_constant_distance():
     poses = turntable(CENTRE, UP, 3.0, 1.5, 12)
     assert_rigid(poses)
     for pose in poses:
@@ -39,7 +39,7 @@ def test_a_turntable_looks_at_its_centre_from_one_distance():
     assert np.linalg.norm(offsets, axis=-1) == pytest.approx(np.hypot(3.0, 1.5))
 
 
-def test_a_turntable_turns_in_equal_steps_counter_clockwise_from_its_start():
+def test_turntable_turns_in_equal_steps():
     poses = turntable(np.zeros(3), np.array([0.0, 0, 1]), 2.0, 0.0, 4, start_world=np.array([0.0, 5, 9]))
     assert np.allclose(poses[:, :3, 3], [[0, 2, 0], [-2, 0, 0], [0, -2, 0], [2, 0, 0]], atol=1e-12)
     back = turntable(
@@ -49,7 +49,7 @@ def test_a_turntable_turns_in_equal_steps_counter_clockwise_from_its_start():
 
 
 @pytest.mark.parametrize("closed", [False, True])
-def test_a_path_passes_through_its_key_poses(closed):
+def test_path_passes_through_key_poses(closed):
     path = PosePath(keys(5), closed)
     times = path.key_times
     assert times[0] == 0 and times[-1] == 1 and (np.diff(times) > 0).all()
@@ -70,7 +70,7 @@ def test_camera_path_velocity_is_continuous(closed):
         assert np.allclose(ends[1] - ends[0], ends[3] - ends[2], atol=1e-3 * step * 1e3)
 
 
-def test_an_open_path_starts_and_ends_at_its_keys():
+def test_open_path_starts_and_ends_at_keys():
     poses = interpolate(keys(4), 20)
     assert poses.shape == (20, 4, 4)
     assert np.allclose(poses[[0, -1]], keys(4)[[0, -1]], atol=1e-9)
@@ -85,7 +85,7 @@ def test_camera_path_of_two_poses_is_linear():
     assert np.allclose(middle[:3, :3], half.as_matrix(), atol=1e-9)
 
 
-def test_a_closed_path_through_a_turntable_stays_near_its_circle():
+def test_closed_path_stays_near_turntable_circle():
     poses = interpolate(turntable(CENTRE, UP, 3.0, 1.0, 12), 60, closed=True)
     offsets = poses[:, :3, 3] - CENTRE
     assert np.linalg.norm(offsets, axis=-1) == pytest.approx(np.sqrt(10), rel=2e-3)
@@ -115,7 +115,7 @@ def test_fitting_gives_back_the_turntable_of_its_cameras():
     assert np.allclose(fitted.poses(9), poses, atol=1e-6)
 
 
-def test_a_few_cameras_that_look_elsewhere_do_not_move_the_centre():
+def test_outlier_cameras_do_not_move_centre():
     poses = turntable(CENTRE, UP, 3.0, 1.5, 20)
     unit = UP / np.linalg.norm(UP)
     for stray in (2, 7, 11):

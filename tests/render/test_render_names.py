@@ -7,7 +7,7 @@ def test_render_names_drop_suffix() -> None:
     assert unique_render_names(["a.jpg", "sub/b.png", "c.d.jpeg"]) == ("a", "sub/b", "c.d")
 
 
-def test_names_that_differ_in_the_suffix_keep_it() -> None:
+def test_same_stem_names_keep_suffix() -> None:
     assert unique_render_names(["a.jpg", "a.png", "b.png", "sub/a.png"]) == ("a.jpg", "a.png", "b", "sub/a")
     assert unique_render_names(["a.jpg", "A.png"]) == ("a.jpg", "A.png")
 

@@ -104,7 +104,7 @@ def test_faint_gaussians_do_not_move_the_turntable():
     assert np.linalg.norm(gaussian_turntable(gaussians).centre_world) < 1
 
 
-def test_a_single_gaussian_has_a_turntable():
+def test_single_gaussian_has_turntable():
     table = gaussian_turntable(cloud(np.array([[1.0, 2.0, 3.0]]), 1.0))
     np.testing.assert_allclose(table.centre_world, [1, 2, 3])
     assert table.radius > 0

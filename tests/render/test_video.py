@@ -24,7 +24,7 @@ def read(path, width, height):
     return said, np.frombuffer(done.stdout, np.uint8).reshape(-1, height, width, 3) / 255
 
 
-def test_a_video_shows_the_frames_that_were_written(tmp_path):
+def test_video_contains_written_frames(tmp_path):
     path = tmp_path / "new" / "colours.mp4"
     with VideoWriter(path, fps=10.0, width=64, height=48) as video:
         for colour in COLOURS:

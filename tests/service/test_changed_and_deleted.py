@@ -131,7 +131,7 @@ def test_retry_after_source_deletion_is_refused(talk: Callable[..., None]) -> No
     talk(conversation)
 
 
-def test_content_that_one_has_already_is_no_more_by_a_second_name(talk: Callable[..., None]) -> None:
+def test_same_content_under_second_name_counts_once(talk: Callable[..., None]) -> None:
     content = photograph()
 
     async def conversation(http: httpx.AsyncClient, service: Service) -> None:
@@ -149,7 +149,7 @@ def test_content_that_one_has_already_is_no_more_by_a_second_name(talk: Callable
     talk(conversation, quota_bytes=len(content) + 4)
 
 
-def test_an_archive_may_be_sent_again_within_the_quota(talk: Callable[..., None]) -> None:
+def test_resent_archive_counts_once_in_quota(talk: Callable[..., None]) -> None:
     """As by a client that did not hear the answer."""
     photographs = [photograph(400 + number, 300) for number in range(3)]
     archive = build_zip(ZipMember("images/a.png", photographs[0]), ZipMember("images/b.png", photographs[1]))
@@ -166,7 +166,7 @@ def test_an_archive_may_be_sent_again_within_the_quota(talk: Callable[..., None]
     talk(conversation, quota_bytes=len(photographs[0]) + len(photographs[1]) + 500)
 
 
-def test_an_upload_whose_transaction_is_tried_again_is_counted_once(
+def test_retried_upload_transaction_counts_once(
     talk: Callable[..., None], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     content, left = photograph(), [2]
@@ -188,7 +188,7 @@ def test_an_upload_whose_transaction_is_tried_again_is_counted_once(
     talk(conversation)
 
 
-def test_a_request_that_is_repeated_to_the_next_version_is_the_same(talk: Callable[..., None]) -> None:
+def test_repeated_request_to_next_version_is_idempotent(talk: Callable[..., None]) -> None:
     class LaterJob(NewJob):
         further: str | None = None
 
@@ -206,7 +206,7 @@ def test_a_request_that_is_repeated_to_the_next_version_is_the_same(talk: Callab
     talk(conversation)
 
 
-def test_the_stream_of_a_job_that_is_deleted_ends(
+def test_event_stream_of_deleted_job_ends(
     talk: Callable[..., None], caplog: pytest.LogCaptureFixture
 ) -> None:
     async def conversation(http: httpx.AsyncClient, service: Service) -> None:
@@ -237,9 +237,7 @@ def test_settings_with_several_values_are_written_plainly(monkeypatch: pytest.Mo
 @pytest.mark.parametrize(
     ("name", "text"), [("PROXIES", "nowhere"), ("PROXIES", "[10"), ("KEEP_JOBS_HOURS_BY_KIND", "render=1")]
 )
-def test_settings_that_cannot_be_read_are_named(
-    monkeypatch: pytest.MonkeyPatch, name: str, text: str
-) -> None:
+def test_unreadable_settings_are_named(monkeypatch: pytest.MonkeyPatch, name: str, text: str) -> None:
     monkeypatch.setenv(f"OCTASPLAT_{name}", text)
     with pytest.raises(ConfigError, match=f"(?i){name}"):
         load_settings(ServiceSettings)

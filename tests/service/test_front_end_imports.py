@@ -81,11 +81,11 @@ def run_where_little_is_installed(code: str, *arguments: str) -> None:
     assert done.returncode == 0, done.stderr
 
 
-def test_models_are_checked_without_what_the_front_end_has_not(tmp_path: Path) -> None:
+def test_front_end_checks_models_without_engine_packages(tmp_path: Path) -> None:
     config = SyntheticDatasetConfig(views=4, width_px=48, height_px=36, samples_per_side=1, points=100)
     write_synthetic_dataset(tmp_path / "scene", config)
     run_where_little_is_installed(CHECK, str(tmp_path / "scene"))
 
 
-def test_jobs_are_accepted_without_what_the_front_end_has_not() -> None:
+def test_front_end_accepts_jobs_without_engine_packages() -> None:
     run_where_little_is_installed(ACCEPT)

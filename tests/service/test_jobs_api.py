@@ -337,7 +337,7 @@ def test_log_timeline_and_stream(talk: Callable[..., None]) -> None:
     talk(conversation)
 
 
-def test_the_psnr_is_that_of_held_out_views(talk: Callable[..., None]) -> None:
+def test_job_psnr_is_that_of_test_views(talk: Callable[..., None]) -> None:
     async def conversation(http: httpx.AsyncClient, service: Service) -> None:
         job = await new_job(http, service)
         address = f"/v1/jobs/{job['id']}"

@@ -77,7 +77,7 @@ def test_reconstruct_folder_without_poses_succeeds(
         assert finished == job["stages"]
 
 
-def test_photographs_that_do_not_fit_together_fail_with_the_reason(
+def test_job_with_unrelated_photographs_fails_with_reason(
     machine: Machine, octasplat: Octasplat, tmp_path: Path
 ) -> None:
     images = tmp_path / "noise"

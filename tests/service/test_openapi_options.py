@@ -26,7 +26,7 @@ def fits(document: dict[str, Any], job: dict[str, Any]) -> bool:
     return jsonschema.Draft202012Validator(schema).is_valid(job)
 
 
-def test_every_kind_has_a_schema_of_its_own(document: dict[str, Any]) -> None:
+def test_job_kinds_have_own_schemas(document: dict[str, Any]) -> None:
     mapping = document["components"]["schemas"]["NewJob"]["discriminator"]["mapping"]
     assert set(mapping) == {kind.name for kind in job_kinds()}
 
@@ -54,7 +54,7 @@ def test_options_are_those_of_the_kind(document: dict[str, Any], job: dict[str, 
     assert fits(document, job) is is_valid
 
 
-def test_defaults_that_a_preset_decides_are_left_out(document: dict[str, Any]) -> None:
+def test_preset_defaults_are_omitted_from_schema(document: dict[str, Any]) -> None:
     schemas = document["components"]["schemas"]
     options = schemas["ReconstructOptions"]["properties"]
     assert "default" not in options["train"]["properties"]["rays_per_batch"]

@@ -78,7 +78,7 @@ def test_scene_job_invalid_options_are_refused_before_queueing(conninfo: str, tm
     asyncio.run(conversation())
 
 
-def test_local_files_are_sent_under_names_that_options_get(tmp_path: Path) -> None:
+def test_local_files_are_sent_under_option_names(tmp_path: Path) -> None:
     for name in ("f1.ply", "f10.ply", "f2.ply", "p.obj"):
         (tmp_path / name).write_bytes(b"x")
     given = [("deformed", tmp_path / "f*.ply"), ("proxy", tmp_path / "p.obj")]

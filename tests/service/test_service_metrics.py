@@ -54,7 +54,7 @@ async def new_job(http: httpx.AsyncClient, dataset: str, **more: Any) -> dict[st
     return job
 
 
-def test_numbers_are_those_of_the_tables(talk: Callable[..., None]) -> None:
+def test_metrics_equal_table_counts(talk: Callable[..., None]) -> None:
     async def conversation(http: httpx.AsyncClient, service: Service) -> None:
         before = await read(http)
         assert before["octasplat_queue_depth[cpu]"] == before["octasplat_job_attempts_total"] == 0
@@ -92,7 +92,7 @@ def test_numbers_are_those_of_the_tables(talk: Callable[..., None]) -> None:
     talk(conversation)
 
 
-def test_rescues_and_poison_are_counted_and_outlive_the_job(talk: Callable[..., None]) -> None:
+def test_recovery_counters_outlive_job(talk: Callable[..., None]) -> None:
     async def conversation(http: httpx.AsyncClient, service: Service) -> None:
         job = await new_job(http, await committed_dataset(service))
         for _ in range(4):
@@ -109,7 +109,7 @@ def test_rescues_and_poison_are_counted_and_outlive_the_job(talk: Callable[..., 
     talk(conversation)
 
 
-def test_uploads_and_webhooks_are_counted(talk: Callable[..., None]) -> None:
+def test_upload_and_webhook_counters(talk: Callable[..., None]) -> None:
     async def conversation(http: httpx.AsyncClient, service: Service) -> None:
         dataset = (await http.post("/v1/datasets", json={})).json()["id"]
         answer = await http.put(f"/v1/datasets/{dataset}/files/images/a.png", content=PNG)
@@ -126,7 +126,7 @@ def test_uploads_and_webhooks_are_counted(talk: Callable[..., None]) -> None:
     talk(conversation)
 
 
-def test_metrics_need_a_token_where_there_are_any(talk: Callable[..., None]) -> None:
+def test_metrics_require_token(talk: Callable[..., None]) -> None:
     async def conversation(http: httpx.AsyncClient, service: Service) -> None:
         reader = await client_with_token(service, f"u{uuid.uuid4().hex[:5]}", "read")
         assert (await http.get("/metrics")).status_code == 401

@@ -140,7 +140,7 @@ def test_proxy_headers_of_untrusted_clients_are_ignored(talk: Callable[..., None
         ("forwarded", {"Forwarded": "for=203.0.113.9", "X-Forwarded-Proto": "https"}, "203.0.113.9", False),
     ],
 )  # fmt: skip
-def test_the_nearest_hop_counts(
+def test_forwarded_address_uses_nearest_hop(
     talk: Callable[..., None], dialect: str, headers: dict[str, str], address: str, is_secure: bool
 ) -> None:
     async def conversation(http: httpx.AsyncClient, service: Service) -> None:

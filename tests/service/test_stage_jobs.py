@@ -135,7 +135,7 @@ def test_invalid_stage_problem_names_key(talk: Callable[..., None]) -> None:
     talk(conversation, max_render_paths=10**9)
 
 
-def test_files_are_looked_at_as_they_come(talk: Callable[..., None]) -> None:
+def test_stage_files_are_checked_on_upload(talk: Callable[..., None]) -> None:
     async def conversation(http: httpx.AsyncClient, service: Service) -> None:
         dataset = (await http.post("/v1/datasets", json={"holds": "files"})).json()["id"]
         address = f"/v1/datasets/{dataset}/files/"

@@ -22,7 +22,7 @@ def start(**environment: str) -> "subprocess.CompletedProcess[str]":
     )
 
 
-def test_database_that_is_down(tmp_path: Path) -> None:
+def test_start_with_database_down_is_refused(tmp_path: Path) -> None:
     done = start(DATABASE_URL="postgresql://user:hush@127.0.0.1:9/x", OCTASPLAT_DATA=str(tmp_path))
     assert (done.returncode, done.stdout) == (1, "")
     (line,) = done.stderr.splitlines()
@@ -40,7 +40,9 @@ def test_serve_without_database_is_refused(tmp_path: Path) -> None:
     ("settings", "word"),
     [({"HOST": "0.0.0.0"}, "token"), ({"STORAGE": "/dev/null/store"}, "/dev/null/store")],
 )
-def test_settings_that_do_not_do(conninfo: str, tmp_path: Path, settings: dict[str, str], word: str) -> None:
+def test_start_with_invalid_settings_is_refused(
+    conninfo: str, tmp_path: Path, settings: dict[str, str], word: str
+) -> None:
     given = {f"OCTASPLAT_{name}": value for name, value in settings.items()}
     done = start(DATABASE_URL=conninfo, OCTASPLAT_DATA=str(tmp_path), **given)
     assert done.returncode == 1

@@ -149,7 +149,7 @@ def test_webhook_of_one_job(talk: Callable[..., None]) -> None:
     talk(conversation)
 
 
-def test_is_tried_again_for_a_day_with_the_same_message(talk: Callable[..., None]) -> None:
+def test_webhook_is_retried_for_a_day_with_same_message(talk: Callable[..., None]) -> None:
     assert 23 * 3600 < sum(RETRY_DELAYS_SECONDS) <= 86_400 and list(RETRY_DELAYS_SECONDS) == sorted(
         RETRY_DELAYS_SECONDS
     )
@@ -360,7 +360,7 @@ def test_webhook_connects_to_checked_address(
     talk(conversation, webhook_hosts=(*HERE, "hooks.inner.example"))
 
 
-def test_name_that_leads_inside_is_found_out_when_sending(talk: Callable[..., None]) -> None:
+def test_webhook_to_internal_name_is_refused_when_sending(talk: Callable[..., None]) -> None:
     async def conversation(http: httpx.AsyncClient, service: Service) -> None:
         with receive_webhooks() as receiver:
             hook = await make(http, receiver)
@@ -498,7 +498,7 @@ def test_webhook_slow_name_server_delays_owner_only(monkeypatch: pytest.MonkeyPa
     asyncio.run(talk())
 
 
-def test_messages_of_a_webhook_that_is_paused_for_long_are_given_up(talk: Callable[..., None]) -> None:
+def test_messages_of_paused_webhook_expire(talk: Callable[..., None]) -> None:
     async def conversation(http: httpx.AsyncClient, service: Service) -> None:
         with receive_webhooks() as receiver:
             hooks = [await make(http, receiver) for _ in range(2)]

@@ -41,7 +41,7 @@ def traced(scene: FlatGaussians, model: Deferred) -> tuple[CpuTracer, Sight]:
     return tracer, Sight(RAYS, tracer.trace(RAYS, record=True), tracer, np.zeros(3, np.int64))
 
 
-def test_a_sheet_before_a_floor_has_the_colour_of_each_by_its_share() -> None:
+def test_depth_split_colours_by_coverage() -> None:
     model = model_of(visibility=False)
     alone = [model.develop(traced(scene, model)[1]) for scene in (veil(), ground())]
     through = alone[0].transmittance[:, None]

@@ -119,7 +119,7 @@ def test_tilted_gaussians_lie_down_on_the_plane(tmp_path: Path) -> None:
     assert held < 0.9 * free, (held, free)
 
 
-def test_settings_that_leave_no_neighbours_are_refused() -> None:
+def test_settings_without_neighbours_are_refused() -> None:
     with pytest.raises(ConfigError, match="set ray_patch_rays to 64"):
         resolve_config("fast", assignments=["loss.depth_normal=0.05", "ray_patch_rays=1"])
     resolve_config("fast", assignments=["loss.depth_normal=0.05", "loss.ssim=0.2"])

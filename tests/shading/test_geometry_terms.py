@@ -57,7 +57,7 @@ def penalty(features: np.ndarray, alpha: np.ndarray, metallic: np.ndarray) -> fl
     return total / SIDE**2
 
 
-def test_the_gradient_is_that_of_the_sum_with_the_metals_held() -> None:
+def test_geometry_gradient_with_metals_fixed() -> None:
     rng = np.random.default_rng(0)
     alpha = rng.uniform(0.92, 1.0, SIDE**2).astype(np.float32).astype(np.float64)
     features = (rng.uniform(0, 1, (SIDE**2, 5)) * alpha[:, None]).astype(np.float32).astype(np.float64)
@@ -80,7 +80,7 @@ def test_the_gradient_is_that_of_the_sum_with_the_metals_held() -> None:
 
 
 @pytest.mark.parametrize(("metallic", "times"), [(0.0, 1.0), (0.5, 3.5), (1.0, 11.0)])
-def test_the_albedo_of_metals_is_held_more(metallic: float, times: float) -> None:
+def test_metal_albedo_has_larger_weight(metallic: float, times: float) -> None:
     features = np.full((SIDE**2, 5), 0.5)
     features[:, 3] = metallic
     features[MIDDLE, :3] = 0.7
@@ -98,7 +98,7 @@ def test_geometry_terms_ignore_translucent_pixels() -> None:
     assert (found == 0).all() and (by_alpha == 0).all()
 
 
-def test_normals_of_a_sphere_are_those_that_neighbouring_depths_span() -> None:
+def test_sphere_normals_from_depths() -> None:
     """Windows as the training draws them; the gradient says how far the two are apart."""
     side, windows, focal = 8, 40, 100.0
     sampler = PixelSampler(np.array([0]), np.array([[100, 100]]))

@@ -38,7 +38,7 @@ def test_numbers_are_even_and_follows_from_the_direction_and_the_salt_alone() ->
     assert counts.min() > 130 and counts.max() < 270  # 200 each
 
 
-def test_facets_lie_on_both_sides_as_far_off_as_the_roughness_says() -> None:
+def test_facet_spread_follows_roughness() -> None:
     count = 4000
     way = np.tile(unit(np.array([0.3, 0.1, -1.0])), (count, 1))
     way = unit(way + np.random.default_rng(1).normal(scale=1e-3, size=way.shape))
@@ -117,7 +117,7 @@ def test_three_rays_say_how_the_mean_of_pairs_changes_with_the_roughness() -> No
     np.testing.assert_allclose(found, expected, atol=0.02 * np.abs(expected).max())
 
 
-def test_a_path_goes_from_mirror_to_mirror() -> None:
+def test_reflection_between_mirrors() -> None:
     half = [0.5, 0.5, 0.5, 1, 0.02]
     ground = wall((0, 0, 1), floor(1.5, 0.1), half)
     above = wall((0, 0, 1), floor(1.5, 0.1, above=0.5), half)
@@ -157,14 +157,14 @@ def half_a_row() -> tuple[CpuTracer, ImageRays, Deferred]:
     return tracer, ImageRays.of(np.array([0, 0, 4.0]), unit(ways)), model
 
 
-def test_a_pixel_at_an_outline_is_covered_by_its_share() -> None:
+def test_outline_pixel_coverage() -> None:
     found = pixel_means(*half_a_row(), 2)
     # 64 rays across give 0.650.
     np.testing.assert_allclose(found.alpha[0], [1, 1, 1, 1, 0.65, 0, 0, 0, 0], atol=0.005)
     np.testing.assert_allclose(found.linear[0, :5], 0.5 * (0.8 + 0.04), atol=0.03)
 
 
-def test_pixels_whose_rays_differ_are_asked_for_more() -> None:
+def test_pixels_with_varying_rays_get_more_samples() -> None:
     tracer, image, model = half_a_row()
     found, many = pixel_means(tracer, image, model, 2), pixel_means(tracer, image, model, 4)
     quarters = [(a, b) for a in (-0.25, 0.25) for b in (-0.25, 0.25)]

@@ -45,7 +45,7 @@ def light(rng: np.random.Generator) -> LightLevels:
     return prefilter(HEIGHT).levels(rng.lognormal(0, 0.7, (HEIGHT, 2 * HEIGHT, 3)))
 
 
-def test_the_table_of_smooth_and_of_rough_facets() -> None:
+def test_split_sum_table_limits() -> None:
     table = split_sum_table()
     cosines = np.linspace(0, 1, table.shape[1])[1:]
     # A mirror loses nothing, and Schlick's term is its bias.

@@ -124,7 +124,7 @@ def test_surface_ply_and_obj_round_trip(surface, textured, tmp_path):
     np.testing.assert_allclose(seen.visual.uv[seen.faces], ours, atol=1e-5)
 
 
-def test_files_that_cannot_be(surface, textured, tmp_path):
+def test_extract_unwritable_file_is_refused(surface, textured, tmp_path):
     with pytest.raises(ConfigError, match=r"\.glb, \.ply or \.obj"):
         write_surface(surface.mesh, tmp_path / "a.stl")
     with pytest.raises(ConfigError, match="no texture"):

@@ -99,7 +99,7 @@ def test_unseen_space_is_closed_where_it_is_solid():
     assert rim <= 3 * ends.sum()
 
 
-def test_a_backdrop_stops_every_ray_and_is_one_closed_thing():
+def test_backdrop_is_closed_and_stops_rays():
     mesh = ball()
     both = with_backdrop(mesh, np.zeros(3))
     np.testing.assert_array_equal(both.faces[: len(mesh.faces)], mesh.faces)

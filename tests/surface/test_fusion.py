@@ -37,14 +37,14 @@ def test_sphere_from_all_sides_is_closed_and_exact():
     assert np.sqrt(np.mean((radii - RADIUS) ** 2)) < 0.007
 
 
-def test_region_is_what_the_cameras_surround():
+def test_region_is_volume_inside_camera_ring():
     cameras = cameras_on_sphere(20, 3.0, 16)
     centre, distance = focus_point(cameras)
     np.testing.assert_allclose(centre, 0, atol=1e-6)
     assert distance == pytest.approx(3.0)
 
 
-def test_region_is_what_is_seen_between_the_cameras():
+def test_region_is_visible_volume():
     maps = sphere_maps()
     region = choose_region(maps, ExtractionOptions(resolution=64))
     np.testing.assert_allclose(region.low, -1.1, atol=0.02)  # the ball and a margin

@@ -15,7 +15,7 @@ from tests.support.surface_shapes import sphere, volume_of, voxel_centres
 
 
 @pytest.mark.parametrize("case", range(256))
-def test_each_case_separates_inside_from_outside(case):
+def test_marching_cases_separate_inside_from_outside(case):
     crossed = {k for k, (a, b) in enumerate(EDGES) if (case >> a & 1) != (case >> b & 1)}
     found = case_triangles(case)
     assert {edge for triangle in found for edge in triangle} == crossed

@@ -83,7 +83,7 @@ def test_mesh_repair_open_sheet_gets_back_only_when_closing_all(sheet):
     assert edge_report(both.faces).is_watertight
 
 
-def test_holes_that_touch_in_a_vertex(sheet):
+def test_holes_sharing_a_vertex(sheet):
     # Two missing squares that share one corner: their rim passes it twice.
     corner = [5 * 20 + 5, 6 * 20 + 6]
     gone = np.array(corner + [c + 400 for c in corner])

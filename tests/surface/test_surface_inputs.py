@@ -62,7 +62,7 @@ def test_photographs_of_another_model_are_refused_or_left_out_with_a_word(folder
     assert "Colours are those that the scene shows" in warning and "other names or poses" in warning
 
 
-def test_a_full_disk_is_no_reason_for_other_colours(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_full_disk_stops_cache_of_photographs(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def full(*_arguments: object, **_options: object) -> None:
         raise OutputError("no room")
 

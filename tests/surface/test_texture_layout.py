@@ -12,7 +12,7 @@ SIDE = 512
 
 
 @pytest.mark.parametrize("roughness", [0.0, 0.02, 0.04])
-def test_a_rough_ball_is_cut_into_few_pieces(roughness: float) -> None:
+def test_rough_ball_has_few_charts(roughness: float) -> None:
     """Creases of up to 68 degrees between triangles in the median, as noise of half an edge makes them."""
     ball = trimesh.creation.icosphere(subdivisions=4)
     random = np.random.default_rng(0)

@@ -17,7 +17,7 @@ def rows(*shape: int) -> np.ndarray:
     return RNG.standard_normal(shape).astype(np.float32)
 
 
-def test_each_edge_is_there_once():
+def test_edges_are_unique():
     tetrahedron = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]], np.int32)
     np.testing.assert_array_equal(unique_edges(tetrahedron), [[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]])
     assert unique_edges(tetrahedron[:0]).shape == (0, 2)
@@ -45,7 +45,7 @@ def test_vertex_gather_is_transpose_of_scatter():
     np.testing.assert_allclose(squares.reshape(-1), diagonal, rtol=1e-5)
 
 
-def test_a_ray_that_meets_a_raised_plane_sees_the_colour_beside():
+def test_ray_at_raised_plane_sees_neighbouring_colour():
     """On z = 0 with colour (x, y, 0), raised by h, a ray along d meets (x, y) + h (dx, dy) / dz."""
     vertices = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], np.float32)
     normals = np.tile(np.float32([0, 0, 1]), (3, 1))

@@ -46,7 +46,7 @@ def assert_same_ply(edited: Path, original: Path) -> None:
 
 
 @pytest.mark.parametrize("frame", [0, 1])
-def test_cycles_draws_what_we_draw(scene: FlatGaussians, blend: Path, tmp_path: Path, frame: int) -> None:
+def test_cycles_render_equals_tracer(scene: FlatGaussians, blend: Path, tmp_path: Path, frame: int) -> None:
     image = tmp_path / "cycles.png"
     run_blender(SCRIPTS / "render_blend.py", blend, image, frame + 1)
     assert psnr_db(image, our_view(scene, shell_cameras()[frame])) >= 55.0
@@ -75,7 +75,7 @@ def test_blender_camera_exports_as_path(blend: Path, tmp_path: Path) -> None:
             assert getattr(other, name) == pytest.approx(getattr(one, name), rel=1e-5), name
 
 
-def test_the_script_renders_by_itself_and_finds_a_camera(scene: FlatGaussians, tmp_path: Path) -> None:
+def test_blender_script_renders_alone(scene: FlatGaussians, tmp_path: Path) -> None:
     export_scene(scene, tmp_path / "mesh.ply")
     image = tmp_path / "view.png"
     run_blender(IMPORT_SCRIPT, tmp_path / "mesh.ply", tmp_path / "a.blend", "--samples", 1, "--render", image)
@@ -106,18 +106,18 @@ def test_blender_script_names_unreadable_file(
     assert not (tmp_path / "a.blend").exists()
 
 
-def test_a_mesh_ply_comes_back_bit_for_bit(scene: FlatGaussians, tmp_path: Path) -> None:
+def test_blender_mesh_ply_round_trip(scene: FlatGaussians, tmp_path: Path) -> None:
     export_scene(scene, tmp_path / "a.mesh.ply")
     run_blender(SCRIPTS / "round_trip.py", tmp_path / "a.mesh.ply", tmp_path / "b.ply")
     assert_same_ply(tmp_path / "b.ply", tmp_path / "a.mesh.ply")
 
 
-def test_a_mesh_ply_comes_back_bit_for_bit_through_the_script_too(blend: Path, tmp_path: Path) -> None:
+def test_blender_script_mesh_ply_round_trip(blend: Path, tmp_path: Path) -> None:
     run_blender(SCRIPTS / "round_trip.py", blend, tmp_path / "b.ply")
     assert_same_ply(tmp_path / "b.ply", blend.with_name("scene.mesh.ply"))
 
 
-def test_an_obj_keeps_order_six_decimals_colours_and_texture_coordinates(
+def test_blender_obj_keeps_order_colours_and_texture_coordinates(
     scene: FlatGaussians, tmp_path: Path
 ) -> None:
     export_scene(scene, tmp_path / "a.obj")
@@ -142,7 +142,7 @@ def test_an_obj_keeps_order_six_decimals_colours_and_texture_coordinates(
     np.testing.assert_allclose(uv, expected_uv, atol=2e-6)
 
 
-def test_a_glb_keeps_ids_and_exact_positions(scene: FlatGaussians, tmp_path: Path) -> None:
+def test_blender_glb_keeps_ids_and_exact_positions(scene: FlatGaussians, tmp_path: Path) -> None:
     albedo = np.random.default_rng(0).random((COUNT, 3), np.float32)
     scene = scene.with_channels({"albedo": albedo, "metallic": albedo[:, :1]})  # of several widths
     export_scene(scene, tmp_path / "a.glb", ExportOptions(chunks=2))

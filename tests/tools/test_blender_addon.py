@@ -27,7 +27,7 @@ def packed(folder: Path) -> Path:
     return target
 
 
-def test_the_add_on_is_one_file_that_says_its_licence(tmp_path: Path) -> None:
+def test_addon_is_one_file_with_licence(tmp_path: Path) -> None:
     with zipfile.ZipFile(packed(tmp_path)) as archive:
         assert set(archive.namelist()) >= {"blender_manifest.toml", "__init__.py"}
         manifest = archive.read("blender_manifest.toml").decode()
@@ -36,7 +36,7 @@ def test_the_add_on_is_one_file_that_says_its_licence(tmp_path: Path) -> None:
 
 @pytest.mark.tools
 @pytest.mark.heavy
-def test_a_scene_is_opened_edited_and_saved(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_addon_opens_edits_and_saves_scene(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("BLENDER_USER_RESOURCES", str(tmp_path / "blender"))
     scene = shell_scene(200)
     export_scene(scene, tmp_path / "scene.ply")

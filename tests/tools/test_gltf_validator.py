@@ -50,7 +50,7 @@ KNOWN_FALSE_ERRORS = {"MESH_PRIMITIVE_INVALID_ATTRIBUTE"}
 
 
 @pytest.mark.parametrize("count", [1, 5001])
-def test_splats_are_valid_but_for_names_that_the_validator_does_not_know(
+def test_splat_glb_is_valid_except_unknown_extension(
     validate_glb: Callable[[Path], dict[str, Any]], tmp_path: Path, count: int
 ) -> None:
     random = np.random.default_rng(0)

@@ -16,7 +16,7 @@ MEASURE = """<script>window.result = [document.documentElement, document.querySe
 
 
 @pytest.mark.parametrize("width", [1200, 800])
-def test_the_table_fits_beside_or_below_the_images(tmp_path: Path, width: int) -> None:
+def test_report_table_fits_page(tmp_path: Path, width: int) -> None:
     figures = {"psnr": 25.125, "ssim": 0.9012, "ssim_valid": 0.8912, "ms_ssim": 0.9512, "flip": 0.1012}
     names = [f"a_photograph_with_a_long_name_{number:04}.jpg" for number in range(8)]
     picture = np.full((20, 30, 3), 0.5, np.float32)

@@ -92,7 +92,7 @@ def draw(
         ("scene.spz", np.pi, EXACT, 40.0),
     ],
 )
-def test_spark_draws_what_we_draw(
+def test_spark_render_equals_tracer(
     spark: Path,
     camera: PinholeCamera,
     tmp_path: Path,

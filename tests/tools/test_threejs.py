@@ -30,7 +30,7 @@ def cameras(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.parametrize(("sort", "least_db"), [(True, 45.0), (False, 42.0)])
 @pytest.mark.parametrize("frame", [0, 1])
-def test_threejs_draws_what_we_draw(
+def test_threejs_render_equals_tracer(
     scene: FlatGaussians, cameras: Path, tmp_path: Path, frame: int, sort: bool, least_db: float
 ) -> None:
     export_scene(scene, tmp_path / "scene.glb", ExportOptions(chunks=2))
@@ -67,7 +67,9 @@ def test_threejs_more_chunks_reduce_error(cameras: Path, tmp_path: Path) -> None
     assert figures[1] > figures[0] + 0.3
 
 
-def test_the_opaque_variant_needs_no_order(scene: FlatGaussians, cameras: Path, tmp_path: Path) -> None:
+def test_threejs_opaque_variant_is_order_independent(
+    scene: FlatGaussians, cameras: Path, tmp_path: Path
+) -> None:
     backwards = scene.select(np.arange(len(scene))[::-1])
     images = []
     for number, version in enumerate((scene, backwards)):
@@ -77,7 +79,7 @@ def test_the_opaque_variant_needs_no_order(scene: FlatGaussians, cameras: Path, 
     np.testing.assert_array_equal(images[0], images[1])
 
 
-def test_cores_hide_what_lies_behind_whatever_the_order(cameras: Path, tmp_path: Path) -> None:
+def test_threejs_opaque_cores_hide_background_in_any_order(cameras: Path, tmp_path: Path) -> None:
     # Two opaque discs that face the camera, the near one first, so that the far one is blended over it.
     camera = shell_cameras()[0]
     towards = camera.centre_world / np.linalg.norm(camera.centre_world)

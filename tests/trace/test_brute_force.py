@@ -131,7 +131,7 @@ def test_axis_aligned_planes_and_rays(rng: np.random.Generator) -> None:
     assert assert_same_hits(planes, RayBatch(origins, directions)) > 10_000
 
 
-def test_rays_that_start_among_gaussians(rng: np.random.Generator) -> None:
+def test_rays_starting_inside_cloud(rng: np.random.Generator) -> None:
     cloud = make_cloud(rng, 2000)
     origins = f32(0.5 * rng.normal(size=(500, 3)))
     assert assert_same_hits(cloud, RayBatch(origins, f32(unit(rng.normal(size=(500, 3)))))) > 5000

@@ -151,7 +151,7 @@ def test_harmonics_are_those_of_the_direction_to_the_mean() -> None:
     np.testing.assert_allclose(seen.rgb_srgb / seen.alpha[:, None], [front, front, back, back], atol=1e-6)
 
 
-def test_a_viewer_at_infinity_sees_along_the_ray() -> None:
+def test_viewer_at_infinity_uses_ray_direction() -> None:
     lobe = facing_z([0, 0, 0], opacities=0.5, rgb_srgb=0.5)
     lobe.sh = np.concatenate([lobe.sh, np.zeros((1, 3, 3), np.float32)], axis=1)
     lobe.sh[0, 2] = [0.5, 0.0, -0.5]  # the z lobe

@@ -40,7 +40,7 @@ def test_second_process_finds_the_code_of_the_first(tmp_path: Path) -> None:
     assert "[1 2 0] Counter({" in run_python(SORT, NUMBA_CACHE_DIR=str(tmp_path))
 
 
-def test_another_checkout_with_the_same_sources_finds_the_code(tmp_path: Path) -> None:
+def test_same_sources_in_other_checkout_share_cache(tmp_path: Path) -> None:
     root = Path(compilation.__file__).parents[1]
     for name in ("one", "two"):
         package = tmp_path / name / "octasplat"
@@ -54,7 +54,7 @@ def test_another_checkout_with_the_same_sources_finds_the_code(tmp_path: Path) -
     assert "Counter({" in second
 
 
-def test_changed_source_that_a_kernel_inlines_is_compiled_anew(tmp_path: Path) -> None:
+def test_changed_inlined_source_is_recompiled(tmp_path: Path) -> None:
     package = tmp_path / "octasplat"
     (package / "engine").mkdir(parents=True)
     for name in ("__init__.py", "engine/__init__.py"):
@@ -77,7 +77,7 @@ def test_changed_source_that_a_kernel_inlines_is_compiled_anew(tmp_path: Path) -
 
 
 @pytest.mark.skipif(not hasattr(os, "getuid"), reason="needs users")
-def test_folder_that_cannot_be_written_is_named_and_replaced(tmp_path: Path) -> None:
+def test_unwritable_cache_folder_is_replaced(tmp_path: Path) -> None:
     occupied = tmp_path / "file"
     occupied.write_text("")
     said = run_python(SORT, NUMBA_CACHE_DIR=str(occupied / "kernels"), TMPDIR=str(tmp_path))
@@ -88,7 +88,7 @@ def test_folder_that_cannot_be_written_is_named_and_replaced(tmp_path: Path) -> 
     assert list(private.rglob("*.nbi"))
 
 
-def test_folder_that_others_can_write_is_not_used(tmp_path: Path) -> None:
+def test_world_writable_cache_folder_is_not_used(tmp_path: Path) -> None:
     shared = tmp_path / "shared"
     shared.mkdir()
     shared.chmod(0o777)

@@ -107,7 +107,7 @@ def test_limits_are_open_at_both_ends(tracer: Tracer) -> None:
     np.testing.assert_allclose(tracer.transmittance(rays), [0.5, 0.125, 1, 1, 1], rtol=1e-6)
 
 
-def test_transmittance_is_that_of_all_hits(tracer: Tracer, rng: np.random.Generator) -> None:
+def test_transmittance_includes_all_hits(tracer: Tracer, rng: np.random.Generator) -> None:
     cloud = make_cloud(rng, 400, size=0.2, logits=(-3.0, 1.0))
     tracer.build(cloud)
     rays = mixed_rays(rng)
@@ -128,7 +128,7 @@ def test_transmittance_is_symmetric(tracer: Tracer, rng: np.random.Generator) ->
     assert len(np.unique(there)) > 20
 
 
-def test_a_mirrored_camera_sees_what_lies_before_the_mirror(tracer: Tracer, rng: np.random.Generator) -> None:
+def test_mirrored_camera_respects_mirror_plane(tracer: Tracer, rng: np.random.Generator) -> None:
     # The plane z = -1 mirrors the cloud; a ray reflected there sees as one from the mirror's surface.
     cloud = make_cloud(rng, 300, size=0.15)
     tracer.build(cloud)
@@ -203,7 +203,7 @@ def test_refresh_reads_changed_parameters(tracer: Tracer, rng: np.random.Generat
     assert_like_the_twin(tracer, cloud, rays_inwards(rng, 40), features)
 
 
-def test_a_recording_of_another_build_is_refused(tracer: Tracer, rng: np.random.Generator) -> None:
+def test_recording_of_other_build_is_refused(tracer: Tracer, rng: np.random.Generator) -> None:
     cloud, rays = make_cloud(rng, 20), rays_inwards(rng, 5)
     tracer.build(cloud)
     hits = tracer.trace(rays, record=True).recording

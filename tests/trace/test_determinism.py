@@ -164,7 +164,7 @@ def test_rebuilding_with_another_count(rng: np.random.Generator) -> None:
         same_bits(tracer.trace(rays), make_tracer(cloud).trace(rays))
 
 
-def test_a_tracer_of_one_thread_does_not_hold_back_the_next(rng: np.random.Generator) -> None:
+def test_thread_count_is_per_tracer(rng: np.random.Generator) -> None:
     cloud, rays = make_cloud(rng, 20), rays_inwards(rng, 5)
     everything = make_tracer(cloud).threads
     make_tracer(cloud, threads=1).trace(rays)

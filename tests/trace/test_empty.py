@@ -55,9 +55,7 @@ def test_visible_ones_among_invisible(rng: np.random.Generator) -> None:
 
 @pytest.mark.parametrize("field", ["means_world", "log_scales", "opacity_logits", "quats_wxyz"])
 @pytest.mark.parametrize("value", [np.nan, np.inf])
-def test_gaussian_that_is_no_number_spoils_no_other(
-    rng: np.random.Generator, field: str, value: float
-) -> None:
+def test_nan_gaussian_does_not_affect_others(rng: np.random.Generator, field: str, value: float) -> None:
     if field == "opacity_logits" and value == np.inf:
         pytest.skip("an infinite logit is an opacity of one")
     cloud = make_cloud(rng, 300)

@@ -26,7 +26,7 @@ STEP = 1e-6
 
 
 @pytest.mark.parametrize("output", [*OUTPUTS, None])
-def test_every_parameter_of_a_tiny_scene(output: str | None) -> None:
+def test_gradients_of_all_parameters(output: str | None) -> None:
     rng = np.random.default_rng(3)
     cloud = make_cloud(rng, 6, degree=1, size=0.4, radius=0.3, logits=(-1.5, 2.0))
     features = f32(rng.normal(size=(6, 1)))

@@ -26,7 +26,7 @@ def test_rays_from_the_middle_of_a_cube(cube: TriangleBvh, rng: np.random.Genera
     np.testing.assert_allclose(a + u * (b - a) + v * (c - a), hits.distances[:, None] * directions, atol=1e-6)
 
 
-def test_a_ray_sees_the_same_among_others_as_alone(cube: TriangleBvh, rng: np.random.Generator) -> None:
+def test_mesh_hit_is_independent_of_batch(cube: TriangleBvh, rng: np.random.Generator) -> None:
     rays = RayBatch(f32(rng.normal(0, 3, (43, 3))), f32(rng.normal(size=(43, 3))))
     together, occluded = cube.closest(rays), cube.occluded(rays)
     for k in range(len(rays)):
@@ -36,7 +36,7 @@ def test_a_ray_sees_the_same_among_others_as_alone(cube: TriangleBvh, rng: np.ra
         assert cube.occluded(rays[k : k + 1])[0] == occluded[k] == together.is_hit[k]
 
 
-def test_limits_choose_what_is_met(cube: TriangleBvh) -> None:
+def test_ray_limits_select_hit(cube: TriangleBvh) -> None:
     origins, along = np.array([[0.2, 0.1, -3.0]]), np.tile([[0.0, 0.0, 1.0]], (5, 1))
     t_min = f32([0.0, 2.5, 4.5, 0.0, 2.5])
     t_max = f32([np.inf, np.inf, np.inf, 1.5, 3.5])
@@ -53,7 +53,7 @@ def test_zero_length_ray_hits_no_mesh(cube: TriangleBvh) -> None:
     assert not cube.closest(rays).is_hit[0] and not cube.occluded(rays)[0]
 
 
-def test_a_mesh_without_triangles_is_never_hit() -> None:
+def test_empty_mesh_is_never_hit() -> None:
     empty = TriangleBvh(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32))
     rays = RayBatch(np.zeros((3, 3)), np.eye(3))
     assert not empty.closest(rays).is_hit.any() and not empty.occluded(rays).any()
@@ -64,6 +64,6 @@ def test_mesh_queries_without_rays_are_empty(cube: TriangleBvh) -> None:
     assert len(cube.closest(rays).faces) == 0 and len(cube.occluded(rays)) == 0
 
 
-def test_faces_that_name_no_vertex_are_refused() -> None:
+def test_face_index_out_of_range_is_refused() -> None:
     with pytest.raises(ValueError, match="not among the 8"):
         TriangleBvh(CUBE_CORNERS, np.array([[0, 1, 8]]))

@@ -51,7 +51,7 @@ def trained(environment: dict[str, str]) -> str:
 
 
 @pytest.mark.heavy
-def test_training_ends_with_the_same_bytes_on_an_older_cpu() -> None:
+def test_training_is_bit_identical_on_older_cpu() -> None:
     flags = Path("/proc/cpuinfo").read_text().split() if Path("/proc/cpuinfo").exists() else []
     if not {"avx2", "fma"} <= set(flags):
         pytest.skip("this CPU has no AVX2 with fused multiply-adds")

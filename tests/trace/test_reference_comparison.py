@@ -48,7 +48,7 @@ def test_arbitrary_view_origins_match_reference(rng: np.random.Generator, degree
     assert_matches_reference(make_cloud(rng, 1000, degree=degree), rays)
 
 
-def test_normals_that_keep_their_side(rng: np.random.Generator) -> None:
+def test_reference_one_sided_normals(rng: np.random.Generator) -> None:
     cloud, rays = make_cloud(rng, 1000), rays_inwards(rng, 250)
     ours, _ = assert_matches_reference(cloud, rays, flip_normal_cos=0.4)
     all_turned = make_tracer(cloud).trace(rays)

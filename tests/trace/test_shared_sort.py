@@ -102,7 +102,7 @@ def test_shared_sort_of_crossing_octagons_matches_reference(rng: np.random.Gener
     assert_like_twin_in_order(cloud, rays, ranks_of(one, len(cloud)))
 
 
-def test_a_narrow_packet_keeps_the_order_of_its_rays(rng: np.random.Generator) -> None:
+def test_narrow_packet_keeps_ray_order(rng: np.random.Generator) -> None:
     cloud, rays = make_cloud(rng, 1000), tile_rays(rng, 4, width=1e-5)
     one, each = (make_tracer(cloud, sort=order).trace(rays, record=True) for order in ("packet", "ray"))
     assert hit_lists(one) == hit_lists(each)

@@ -13,7 +13,7 @@ from octasplat.engine.train.state import fresh_state
 from tests.support.planar_dataset import random_gaussians
 
 
-def test_mean_of_the_states_that_were_added() -> None:
+def test_average_of_added_states() -> None:
     states = [random_gaussians(12, seed=seed) for seed in range(5)]
     mean = RunningMean()
     for state in states:
@@ -24,7 +24,7 @@ def test_mean_of_the_states_that_were_added() -> None:
         np.testing.assert_allclose(found, expected, atol=1e-5)
 
 
-def test_the_mean_is_that_of_plain_float32_arithmetic() -> None:
+def test_average_equals_float32_arithmetic() -> None:
     states = [random_gaussians(500, seed=seed, degree=2) for seed in range(4)]
     mean, expected = RunningMean(), states[0].sh.copy()
     for count, state in enumerate(states, start=1):

@@ -103,7 +103,7 @@ def test_default_counts_ignore_empty_pixels(shown: float, gaussians: int, count:
 
 
 @pytest.mark.parametrize("hidden", ["alpha", "weight"])
-def test_the_share_of_pixels_that_show_something(hidden: str) -> None:
+def test_covered_pixel_share(hidden: str) -> None:
     class Half(PlanarDataset):
         def pixels(
             self, view: np.ndarray, y: np.ndarray, x: np.ndarray
@@ -118,7 +118,7 @@ def test_the_share_of_pixels_that_show_something(hidden: str) -> None:
 
 
 @pytest.mark.parametrize(("wanted", "count"), [(0, 7000), (80, 80)])
-def test_the_trainer_knows_its_iterations(tmp_path: Path, wanted: int, count: int) -> None:
+def test_trainer_iterations_default(tmp_path: Path, wanted: int, count: int) -> None:
     world, config = PlanarDataset(), small_config(iterations=wanted)
     state = fresh_state(world.initial_gaussians(), config.seed)
     trainer = Trainer(

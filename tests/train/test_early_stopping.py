@@ -111,7 +111,7 @@ def test_early_stopping_ends_training(short_run: tuple[FlatGaussians, list[Event
     assert len(gaussians) == progress[decided + 40].gaussians
 
 
-def test_the_mean_of_its_last_states_is_exported(
+def test_early_stopped_average_is_exported(
     short_run: tuple[FlatGaussians, list[Event], Trainer], tmp_path: Path
 ) -> None:
     single, _, trainer = trained(tmp_path, config_of(weight_averaging_start=1.0))

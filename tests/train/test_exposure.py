@@ -126,7 +126,7 @@ def test_gradients_agree_with_finite_differences() -> None:
         assert sums[2, column] == pytest.approx(moved, abs=1e-3)
 
 
-def test_views_that_were_not_trained_on_are_developed_as_they_are() -> None:
+def test_untrained_views_keep_exposure() -> None:
     rng = np.random.default_rng(0)
     seen = sight(np.arange(3), rng.random((3, 3), dtype=np.float32), rng.random(3, dtype=np.float32))
     developed = made_exposures(3, rng).develop(replace(seen, view=None))
@@ -169,7 +169,7 @@ def test_uneven_photographs_are_explained_by_their_exposure(tmp_path: Path) -> N
     assert (found.log_gains[world.test_indices] == 0).all()
 
 
-def test_a_resumed_run_has_the_same_exposures(tmp_path: Path) -> None:
+def test_resumed_run_has_same_exposures(tmp_path: Path) -> None:
     config = small_config(exposure=True)
     whole, _ = run(tmp_path / "whole", config)
     parts, _ = run(tmp_path / "parts", config, stop_after=50)
@@ -218,7 +218,7 @@ def test_exposure_of_held_out_view_is_interpolated() -> None:
         assert (exposures.offsets == 0).all()
 
 
-def test_a_held_out_view_is_exposed_by_its_brightness_where_cameras_did_so() -> None:
+def test_test_view_exposure_follows_brightness() -> None:
     """Log gains that fall with the brightness, and jump once, are found."""
     rng = np.random.default_rng(4)
     places, brightness = np.arange(65), rng.uniform(0.2, 0.7, 65)
@@ -275,7 +275,7 @@ class AutomaticWorld(UnevenWorld):
         return rgb * (1 + 0.4 * np.clip(points[:, :1], -1.4, 1.4)).astype(np.float32), alpha, weight
 
 
-def test_held_out_photographs_of_an_automatic_camera_are_met(tmp_path: Path) -> None:
+def test_test_photographs_with_auto_exposure_are_matched(tmp_path: Path) -> None:
     world = AutomaticWorld()
     assert world.log_gains.std() > 0.08
     config = small_config(iterations=400, exposure=True, lr={"exposure": 0.02})
@@ -296,7 +296,7 @@ def test_held_out_photographs_of_an_automatic_camera_are_met(tmp_path: Path) -> 
     assert off[world.test_indices].max() < 0.4 * spread
 
 
-def test_a_view_is_shown_as_exposed_when_it_is_named() -> None:
+def test_named_view_is_rendered_with_its_exposure() -> None:
     rng = np.random.default_rng(0)
     exposures = made_exposures(3, rng)
     views = np.array([1, 1, 1])
@@ -344,7 +344,7 @@ def test_exposure_disabled_learns_nothing(tmp_path: Path) -> None:
     assert trainer.state.shading == {}
 
 
-def test_a_photograph_is_shown_as_the_mean_exposure_has_it() -> None:
+def test_photograph_is_normalised_to_mean_exposure() -> None:
     rng = np.random.default_rng(8)
     exposures = Exposures.known(
         ["a", "b"], {"b": {"log_gains": [0.1, -0.2, 0.3], "offsets": [0.02, 0, -0.05]}}

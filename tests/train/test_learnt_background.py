@@ -179,7 +179,7 @@ def test_background_initialises_from_photographs() -> None:
     np.testing.assert_allclose(again, first.map.colours(above), atol=0.02)
 
 
-def test_the_bytes_do_not_depend_on_threads_or_stops(tmp_path: Path) -> None:
+def test_background_training_is_deterministic(tmp_path: Path) -> None:
     whole, _ = train(tmp_path / "whole", threads=1)
     two, _ = train(tmp_path / "two", threads=2)
     parts, _ = train(tmp_path / "parts", stop_after=50)
@@ -190,7 +190,7 @@ def test_the_bytes_do_not_depend_on_threads_or_stops(tmp_path: Path) -> None:
             assert values.tobytes() == other.state.shading[name].tobytes(), name
 
 
-def test_exposed_with_what_stands_before_it(tmp_path: Path) -> None:
+def test_background_is_exposed_with_foreground(tmp_path: Path) -> None:
     trainer, _ = train(tmp_path, exposure=True)
     assert isinstance(trainer.shading, Exposures) and background_of(trainer.shading) is not None
 

@@ -15,7 +15,7 @@ def patches(seed: int = 0, count: int = 3, side: int = 24) -> tuple[np.ndarray, 
     return render, target
 
 
-def test_ssim_is_that_of_scikit_image() -> None:
+def test_ssim_equals_scikit_image() -> None:
     render, target = patches()
     inner = []
     for x, y in zip(render, target, strict=True):

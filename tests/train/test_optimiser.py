@@ -136,7 +136,7 @@ def test_adam_rotation_step_equals_learning_rate() -> None:
     np.testing.assert_allclose(np.arccos(cosine), 2 * np.arctan(half), rtol=1e-3)
 
 
-def test_gaussians_that_are_not_hit_stay_as_they_are() -> None:
+def test_unhit_gaussians_are_unchanged() -> None:
     rng = np.random.default_rng(1)
     ours = gaussians(20)
     before, adam = ours.copy(), Adam.fresh(ours)

@@ -20,12 +20,12 @@ def believed(xyz_world: np.ndarray, view: list[int], rivalry: float, *, swept: b
     return borne_out(found, evidence, KNOWN).tolist()
 
 
-def test_a_point_beside_something_known_is_right() -> None:
+def test_plane_sweep_point_near_known_depth() -> None:
     assert believed(np.array([[0.25, 0.0, 10.0], [0.35, 0.0, 10.0]]), [0, 0], 0.95) == [True, False]
 
 
 @pytest.mark.parametrize(("views", "right"), [([0, 1, 2, 3], True), ([0, 1, 2, 2], False), ([4] * 4, False)])
-def test_three_other_views_that_found_the_same_place_bear_a_point_out(views: list[int], right: bool) -> None:
+def test_plane_sweep_point_needs_three_agreeing_views(views: list[int], right: bool) -> None:
     same = FAR_OFF + 0.1 * AROUND
     assert believed(same, views, 0.45) == [right] * 4
     assert believed(same, views, 0.6) == [False] * 4

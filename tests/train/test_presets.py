@@ -52,7 +52,7 @@ def test_redisplats_preset_trains_and_densifies(tmp_path: Path) -> None:
     assert len(trainer.state.gaussians) != 300
 
 
-def test_the_gradient_of_ssim_reaches_the_gaussians() -> None:
+def test_ssim_gradient_reaches_gaussians() -> None:
     world = PlanarDataset()
     config = small_config(
         ssim_patch_fraction=1.0, ssim_patch_side=32, loss={"l1": 0.0, "l2": 0.0, "ssim": 1.0}
@@ -109,7 +109,7 @@ def test_ssim_weight_without_patches_is_ignored() -> None:
     assert bare.loss.value == plain.loss.value < both.loss.value
 
 
-def test_gaussians_that_hardly_weigh_keep_still() -> None:
+def test_low_weight_gaussians_do_not_move() -> None:
     world = PlanarDataset()
     config = small_config()
     batch = BatchSource(world, config).draw(np.random.default_rng(0))
@@ -167,7 +167,7 @@ def test_training_with_too_few_views_is_refused(
     assert progress[-1] > 16 > progress[0]
 
 
-def test_settings_that_the_photographs_rule_out_leave_no_output(three_views: Path, tmp_path: Path) -> None:
+def test_settings_unfit_for_photographs_leave_no_output(three_views: Path, tmp_path: Path) -> None:
     config = resolve_config("fast", assignments=["loss.ssim=0.2", "ssim_patch_side=49"])
     with pytest.raises(ConfigError, match="only 48 pixels"):
         reconstruct(three_views, tmp_path / "run", config, threads=1)
@@ -202,6 +202,6 @@ def test_real_scene_reaches_reference_psnr(scenes_root: Path, tmp_path: Path) ->
     assert psnr > 27.7  # 28.1 when this was written
 
 
-def test_the_order_of_a_trace_is_no_setting() -> None:
+def test_trace_order_is_not_a_setting() -> None:
     with pytest.raises(ConfigError, match=r"trace\.sort.*shared_sort_until"):
         resolve_config("fast", assignments=["trace.sort=packet"])

@@ -143,7 +143,7 @@ def test_trainer_resume_of_finished_run_returns_result(tmp_path: Path) -> None:
     assert content(found) == content(expected)
 
 
-def test_damaged_photographs_fail_in_words(tmp_path: Path) -> None:
+def test_damaged_photograph_raises_error(tmp_path: Path) -> None:
     world = PlanarDataset()
     config = small_config()
     state = fresh_state(world.initial_gaussians(), 0)
@@ -152,7 +152,7 @@ def test_damaged_photographs_fail_in_words(tmp_path: Path) -> None:
         train(tmp_path, config, world=world, state=state)
 
 
-def test_parameters_that_are_no_numbers_fail_in_words(tmp_path: Path) -> None:
+def test_nan_parameters_raise_error(tmp_path: Path) -> None:
     world = PlanarDataset()
     state = fresh_state(world.initial_gaussians(), 0)
     state.gaussians.sh[:] = np.nan
@@ -160,13 +160,13 @@ def test_parameters_that_are_no_numbers_fail_in_words(tmp_path: Path) -> None:
         train(tmp_path, small_config(), world=world, state=state)
 
 
-def test_learning_rates_that_scatter_the_scene_fail_in_words(tmp_path: Path) -> None:
+def test_divergent_learning_rate_raises_error(tmp_path: Path) -> None:
     config = small_config(lr={"mean": 1e6, "mean_final": 1e6})
     with pytest.raises(TrainingFailure, match="nothing is exported"):
         train(tmp_path, config)
 
 
-def test_pruning_everything_fails_in_words(tmp_path: Path) -> None:
+def test_pruning_all_gaussians_raises_error(tmp_path: Path) -> None:
     strategy = PaperConfig(start=20, interval=20, prune_opacity=0.999)
     with pytest.raises(TrainingFailure, match="removed every Gaussian"):
         train(tmp_path, small_config(densify=strategy.model_dump()))

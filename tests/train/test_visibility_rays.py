@@ -35,7 +35,7 @@ class SeenWorld(PlanarDataset):
         self.observations = Observations(view, np.tile(ids, count), np.zeros((len(view), 2)))
 
 
-def test_lines_lead_from_training_cameras_to_their_points_but_for_what_is_not_known_of_these() -> None:
+def test_visibility_rays_lead_from_cameras_to_known_points() -> None:
     world = SeenWorld(error_px=2.0)
     lines = SightLines.of(world, 0.0)
     assert len(lines) == 200 * 6  # the seventh view is held out
@@ -54,7 +54,7 @@ def test_lines_lead_from_training_cameras_to_their_points_but_for_what_is_not_kn
     np.testing.assert_allclose(far.ends[row], 0.55 * np.linalg.norm(ways[2]), rtol=1e-5)
 
 
-def test_points_that_few_photographs_show_and_numbers_without_a_point_have_no_lines() -> None:
+def test_rarely_seen_points_have_no_visibility_rays() -> None:
     world = SeenWorld()
     seen = world.observations
     rare = (seen.point == 5) & (seen.view > 2)  # point 0: in views 0 (held out), 1 and 2
@@ -89,7 +89,7 @@ def test_visibility_loss_of_occluders_has_opacity_gradient() -> None:
         assert found.opacity_logits[row] == pytest.approx(slope, rel=0.03)
 
 
-def test_training_takes_a_veil_away_only_where_lines_of_sight_say_so(tmp_path: Path) -> None:
+def test_training_removes_veil_only_along_visibility_rays(tmp_path: Path) -> None:
     world = SeenWorld()
     hidden = {}
     for weight in (0.0, 0.1):

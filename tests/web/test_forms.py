@@ -24,7 +24,7 @@ def leaves(values: dict, prefix: str = "") -> set[str]:
     return found
 
 
-def test_every_setting_has_its_field() -> None:
+def test_settings_have_form_fields() -> None:
     kind = get_job_kind("reconstruct")
     form = options_form(kind)
     for preset in PRESETS:
@@ -72,7 +72,7 @@ OURS = [kind for kind in job_kinds() if kind.program.startswith("octasplat.")]
 
 
 @pytest.mark.parametrize("kind", OURS, ids=lambda kind: kind.name)
-def test_every_kind_has_a_form_whose_fields_are_explained(kind: JobKind) -> None:
+def test_job_kinds_have_forms_with_explained_fields(kind: JobKind) -> None:
     form = options_form(kind)
     names = [f.path for f in chain(form.first, *(s.fields for s in form.more), form.experimental)]
     assert names and len(names) == len(set(names))

@@ -51,7 +51,7 @@ def pages(database: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Cal
     return look
 
 
-def test_every_kind_of_job_has_a_form(pages: Callable[..., tuple[str, str]]) -> None:
+def test_job_kinds_have_form_pages(pages: Callable[..., tuple[str, str]]) -> None:
     job, new = pages(*RESULTS)
     for kind in job_kinds():
         if not kind.program.startswith("octasplat."):  # of another test
@@ -64,7 +64,7 @@ def test_every_kind_of_job_has_a_form(pages: Callable[..., tuple[str, str]]) -> 
             assert f'data-kind="{kind.name}"' in new, kind.name
 
 
-def test_files_that_options_name_are_asked_for(pages: Callable[..., tuple[str, str]]) -> None:
+def test_form_asks_for_files_named_by_options(pages: Callable[..., tuple[str, str]]) -> None:
     job, new = pages(*RESULTS)
     assert 'type="file" multiple required data-path="meshes"' in job
     assert 'type="file" required data-path="file"' in new

@@ -103,7 +103,7 @@ def test_materials_page_offers_layers_relight_and_edit(
     assert found["nameless"] == [] and found["overflow"] <= 0 and found["complaints"] == []
 
 
-def test_a_result_without_materials_has_none_of_it(
+def test_result_without_materials_has_no_materials_page(
     service: RunningService, folder: Path, job: str, tmp_path: Path
 ) -> None:
     dataset = service.request("GET", f"/v1/jobs/{job}")["dataset_id"]

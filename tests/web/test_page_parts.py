@@ -81,7 +81,7 @@ def test_unexpected_stages_are_inserted_in_order(talk: Callable[..., None], data
     talk(conversation)
 
 
-def test_the_policy_allows_no_script_but_ours(talk: Callable[..., None]) -> None:
+def test_content_policy_allows_only_own_scripts(talk: Callable[..., None]) -> None:
     async def conversation(http: httpx.AsyncClient) -> None:
         for path in ("/", "/new", "/sign-in", "/docs", f"/jobs/{uuid.uuid4()}"):
             answer = await http.get(path)
@@ -119,7 +119,7 @@ def test_static_files_are_served_with_headers(talk: Callable[..., None]) -> None
     talk(conversation)
 
 
-def test_the_api_is_described(talk: Callable[..., None]) -> None:
+def test_page_links_api_description(talk: Callable[..., None]) -> None:
     async def conversation(http: httpx.AsyncClient) -> None:
         document = (await http.get("/openapi.json")).json()
         page = (await http.get("/docs")).text
@@ -226,7 +226,7 @@ def artifact(name: str) -> Artifact:
     return Artifact(uuid.uuid4(), name, "0" * 64, 10, "application/octet-stream")
 
 
-def test_every_download_says_what_opens_it() -> None:
+def test_downloads_name_programs_that_open_them() -> None:
     names = [
         "scene.ply",
         "mesh.glb",
@@ -271,7 +271,7 @@ def test_views_are_worst_first_and_odd_figures_do_no_harm() -> None:
     )
 
 
-def test_views_that_differ_in_their_suffix_alone_have_their_own_renders() -> None:
+def test_same_stem_views_have_own_renders() -> None:
     metrics = {"mean": {"psnr": 25.0}, "views": {"s/a.jpg": {"psnr": 1.0}, "s/a.png": {"psnr": 2.0}}}
     names = ["renders/s/a.jpg.png", "renders/s/a.png.png"]
     found = read_measurements(metrics, [artifact(name) for name in names], [])

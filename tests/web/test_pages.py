@@ -106,7 +106,7 @@ def test_upload_page_resumes_after_interruption(flow: Flow) -> None:
     assert facts["complaints"] == []
 
 
-def test_the_form_asks_for_what_was_filled_in(flow: Flow) -> None:
+def test_form_submits_filled_values(flow: Flow) -> None:
     job = flow.service.request("GET", f"/v1/jobs/{flow.job}")
     options = job["options"]
     assert job["label"] == "a still life"

@@ -61,7 +61,7 @@ def test_scene_server_other_paths_are_404(viewer: osp.Viewer, path: str) -> None
     assert get(viewer.url, path)[0] == 404
 
 
-def test_pages_from_elsewhere_cannot_read_the_scene(viewer: osp.Viewer) -> None:
+def test_scene_server_refuses_foreign_origin(viewer: osp.Viewer) -> None:
     assert get(viewer.url, "/scene.ply", host="rebound.example")[0] == 403
 
 
@@ -82,7 +82,7 @@ def test_browser_draws_the_scene(viewer: osp.Viewer, browse: Browse) -> None:
     assert found["complaints"] == [] and found["shown"]["deviation"] > 2
 
 
-def test_a_port_that_is_taken_leaves_no_folder(
+def test_taken_port_leaves_no_folder(
     scene: osp.Scene, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))

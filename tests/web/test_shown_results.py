@@ -21,6 +21,6 @@ def artifact(name: str) -> Artifact:
         ([], None),
     ],
 )
-def test_mesh_that_is_shown(names: list[str], shown: str | None) -> None:
+def test_shown_mesh_choice(names: list[str], shown: str | None) -> None:
     found = viewable_mesh([artifact(name) for name in names])
     assert (found.name if found else None) == shown

@@ -113,7 +113,7 @@ def with_harmonics(scene: FlatGaussians, degree: int) -> FlatGaussians:
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_draws_what_the_tracer_sees(tmp_path: Path, degree: int) -> None:
+def test_viewer_draws_traced_image(tmp_path: Path, degree: int) -> None:
     scene = with_harmonics(shell_scene(), degree)
     camera = camera_at(0.2, -0.3, -4.0)
     page = draw(scene, camera, tmp_path, q=CHI2_2_99, background=(0, 0, 0))
@@ -124,7 +124,7 @@ def test_draws_what_the_tracer_sees(tmp_path: Path, degree: int) -> None:
     assert quality >= 42.0, page.messages
 
 
-def test_the_papers_radius_over_white_from_inside(tmp_path: Path) -> None:
+def test_viewer_with_paper_radius_over_white(tmp_path: Path) -> None:
     """From within the cloud some Gaussians are behind the camera, and the background counts."""
     scene = with_harmonics(shell_scene(500), 1)
     camera = camera_at(0.1, 0.05, 0.0)

@@ -63,7 +63,7 @@ def test_web_cameras_read_poses(binary: bool) -> None:
         assert pose.aspect == pytest.approx(aspect)
 
 
-def test_the_viewer_turns_about_what_the_cameras_look_at() -> None:
+def test_viewer_orbits_camera_focus() -> None:
     poses = read_poses(*model(True), binary=True)
     found = viewer_cameras(poses, ["a folder/view 7.jpg"])
     # Level cameras that look up and down by different angles: their mean up is not up, but what is square to
@@ -111,7 +111,7 @@ def test_hostile_counts_and_names_are_refused() -> None:
         read_poses(io.BytesIO(struct.pack("<QiiQQ", 1, 1, 99, 4, 3)), images, binary=True)
 
 
-def test_poses_that_make_no_sense_are_left_out() -> None:
+def test_invalid_poses_are_omitted() -> None:
     lines = ["1 0 0 0 0 0 0 0 1 zero.jpg", "2 1 0 0 0 nan 0 0 1 nan.jpg", "3 1 0 0 0 0 0 0 9 lost.jpg"]
     text = "\n\n".join([*lines, "4 1 0 0 0 0 0 0 1 good.jpg", ""]).encode()
     poses = read_poses(io.BytesIO(b"1 PINHOLE 4 3 2 2 2 2\n"), io.BytesIO(text), binary=False)

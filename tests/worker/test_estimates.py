@@ -23,7 +23,7 @@ def estimated(preset: str, sizes: Sizes, *, materials: bool = False) -> Estimate
         ("standard", Sizes(400, 400, 100), True, 2343),
     ],
 )
-def test_the_time_is_right_within_a_factor_of_two(
+def test_estimated_time_is_within_factor_two(
     preset: str, sizes: Sizes, materials: bool, took_cpu_seconds: float
 ) -> None:
     found = estimated(preset, sizes, materials=materials).cpu_seconds

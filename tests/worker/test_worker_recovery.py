@@ -196,7 +196,7 @@ def test_silent_program_is_tried_again(bench: WorkerHarness) -> None:
     assert job.error is not None and job.error["type"] == "silent" and "4 times" in job.error["message"]
 
 
-def test_program_that_needs_too_much_memory_is_stopped(bench: WorkerHarness) -> None:
+def test_program_exceeding_memory_limit_is_stopped(bench: WorkerHarness) -> None:
     bench.worker(MEMORY_LIMIT_BYTES=str(400 << 20))
     job_id = bench.submit(options={"steps": 1000, "hog_bytes": 600 << 20})
     job = bench.wait_until_finished(job_id)
@@ -288,7 +288,7 @@ def test_flood_of_log_lines_is_cut(bench: WorkerHarness) -> None:
     assert psutil.Process(worker.pid).memory_info().rss - before < 40 << 20
 
 
-def test_child_knows_no_secrets(bench: WorkerHarness) -> None:
+def test_child_environment_has_no_secrets(bench: WorkerHarness) -> None:
     worker = bench.worker()
     job_id = bench.submit(options={"steps": 100_000})
     bench.wait(job_id, lambda job: job.step is not None)
