@@ -12,8 +12,8 @@ from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from octasplat.engine.errors import Cancelled
-from octasplat.engine.events import CheckpointWritten, StageFinished, StageProgress, StageStarted
+from octasplat.engine.core.errors import Cancelled
+from octasplat.engine.core.events import CheckpointWritten, StageFinished, StageProgress, StageStarted
 from octasplat.workers.worker.job_kinds import JobKind, register
 from octasplat.workers.worker.task import Task
 

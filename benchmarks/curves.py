@@ -25,10 +25,10 @@ from pathlib import Path
 
 import numpy as np
 
+from octasplat.engine.core.events import read_events
 from octasplat.engine.evaluate.curves import Row, training_values
 from octasplat.engine.evaluate.held_out import METRICS
-from octasplat.engine.events import read_events
-from octasplat.engine.run_folder import EVENTS, TRAINING
+from octasplat.engine.runs.run_folder import EVENTS, TRAINING
 
 Values = list[tuple[float, float]]
 HEIGHT_IN, WIDTH_IN, DOTS_AN_INCH = 4.6, 6.4, 130

@@ -22,11 +22,11 @@ import numpy as np
 from numba import carray, cfunc, njit, types
 from tracer_vs_mitsuba import SETTINGS, camera_rays, cloud
 
+from octasplat.engine.core.rays import RayBatch
 from octasplat.engine.files import read_scene
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.gaussians.morton import morton_order
 from octasplat.engine.gaussians.octagon import octagon_radii
-from octasplat.engine.rays import RayBatch
 from octasplat.engine.trace.cpu.kernels.kernel_args import (
     ForwardPass,
     GaussianParameters,

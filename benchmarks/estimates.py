@@ -19,9 +19,9 @@ from pathlib import Path
 import psutil
 from PIL import Image
 
-from octasplat.engine.config import resolve_config
+from octasplat.engine.dataset.image_sizes import Sizes
 from octasplat.engine.operations.cost_model import estimate_reconstruction
-from octasplat.engine.photograph_sizes import Sizes
+from octasplat.engine.runs.config import resolve_config
 
 
 def main() -> None:

@@ -5,7 +5,7 @@ import time
 
 from pydantic import BaseModel, ConfigDict
 
-from octasplat.engine.events import StageProgress, StageStarted
+from octasplat.engine.core.events import StageProgress, StageStarted
 from octasplat.workers.worker.job_kinds import JobKind, register
 from octasplat.workers.worker.task import Task
 

@@ -18,14 +18,14 @@ from pathlib import Path
 import numpy as np
 from tracer_vs_mitsuba import SETTINGS, camera_rays, cloud
 
+from octasplat.engine.core.rays import RayBatch
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.gaussians.morton import morton_order
-from octasplat.engine.rays import RayBatch
 from octasplat.engine.trace.cpu.tracer import CpuTracer
 from octasplat.engine.trace.protocol import TraceGradients
 from octasplat.engine.train.config import McmcConfig, TrainConfig
-from octasplat.engine.train.state import fresh_state
-from octasplat.engine.train.trainer import Trainer
+from octasplat.engine.train.loop.state import fresh_state
+from octasplat.engine.train.loop.trainer import Trainer
 
 SMALLEST = 10_000
 

@@ -23,21 +23,21 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # else CPU time counts thre
 
 import numpy as np
 
-from octasplat.engine.config import resolve_config
+from octasplat.engine.core.threads import use_threads
 from octasplat.engine.dataset import Dataset
-from octasplat.engine.threads import use_threads
+from octasplat.engine.runs.config import resolve_config
 from octasplat.engine.trace.factory import make_tracer
 from octasplat.engine.trace.protocol import Tracer
-from octasplat.engine.train.batches import BatchSource
-from octasplat.engine.train.checkpoint import load_checkpoint, save_checkpoint
 from octasplat.engine.train.config import TrainConfig, in_one_order
 from octasplat.engine.train.densify import make_densifier
-from octasplat.engine.train.initialise import initial_gaussians
-from octasplat.engine.train.iteration import Machinery, iterate
-from octasplat.engine.train.optimiser import Adam
-from octasplat.engine.train.shading import make_shading
-from octasplat.engine.train.state import TrainState, fresh_state
-from octasplat.engine.train.trainer import Trainer
+from octasplat.engine.train.initialization.initial_gaussians import initial_gaussians
+from octasplat.engine.train.loop.checkpoint import load_checkpoint, save_checkpoint
+from octasplat.engine.train.loop.iteration import Machinery, iterate
+from octasplat.engine.train.loop.state import TrainState, fresh_state
+from octasplat.engine.train.loop.trainer import Trainer
+from octasplat.engine.train.optimization.adam import Adam
+from octasplat.engine.train.sampling.batches import BatchSource
+from octasplat.engine.train.shading_factory import make_shading
 
 STAGES = ("batch", "trace", "backward", "Adam", "refresh", "rebuild", "loss and the rest")
 

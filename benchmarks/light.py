@@ -22,6 +22,7 @@ from typing import Any
 
 import numpy as np
 
+from octasplat.engine.core.rays import RayBatch
 from octasplat.engine.gaussians.model import SH_C0, FlatGaussians
 from octasplat.engine.gaussians.octagon import CHI2_3_99
 from octasplat.engine.pathtracing.compile_meshes import CompiledMeshes, compile_meshes
@@ -38,7 +39,6 @@ from octasplat.engine.pathtracing.stage.model import (
     StageGaussians,
     StageMesh,
 )
-from octasplat.engine.rays import RayBatch
 from octasplat.engine.trace.protocol import TraceSettings
 from tests.support.light_scenes import camera
 

@@ -18,10 +18,11 @@ import numba
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int64
 
-from octasplat.engine.colour import linear_to_srgb
+from octasplat.engine.core.color import linear_to_srgb
+from octasplat.engine.core.rays import ImageRays
 from octasplat.engine.dataset import load_dataset_model
-from octasplat.engine.evaluate.truth import ViewTruth, read_truth
-from octasplat.engine.evaluate.truth_metrics import pooled_psnr
+from octasplat.engine.evaluate.ground_truth import ViewTruth, read_truth
+from octasplat.engine.evaluate.ground_truth_metrics import pooled_psnr
 from octasplat.engine.gaussians.channels import unstacked
 from octasplat.engine.gaussians.frames import quaternions_from_matrices
 from octasplat.engine.gaussians.materials import MATERIAL_WIDTHS
@@ -32,7 +33,6 @@ from octasplat.engine.pathtracing.kernels.kernel_args import SurfaceInteractions
 from octasplat.engine.pathtracing.kernels.principled_bsdf import orthonormal_basis
 from octasplat.engine.pathtracing.path_tracer import PathTracer, PathTracerScene
 from octasplat.engine.pathtracing.stage.model import Environment, Integrator, Stage, StageGaussians
-from octasplat.engine.rays import ImageRays
 from octasplat.engine.render.image_files import read_image, write_png
 from octasplat.engine.render.shots import view_shots
 from octasplat.engine.trace.protocol import TraceSettings

@@ -49,9 +49,9 @@ def main() -> None:
     )
     parser.add_argument("--root", type=Path, default=Path(__file__).resolve().parent.parent)
     sys.path.insert(0, str(parser.parse_args().root.resolve() / "src"))
-    from octasplat.engine.config import resolve_config
     from octasplat.engine.dataset.synthetic import SyntheticDatasetConfig, write_synthetic_dataset
     from octasplat.engine.pipeline import reconstruct
+    from octasplat.engine.runs.config import resolve_config
 
     with tempfile.TemporaryDirectory() as folder:
         scene, output = Path(folder) / "scene", Path(folder) / "output"

@@ -17,9 +17,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float32
 
-from octasplat.engine.config import read_config
 from octasplat.engine.dataset import Dataset, load_dataset_model
-from octasplat.engine.evaluate.truth import TRUTH, Truth, read_truth
+from octasplat.engine.evaluate.ground_truth import TRUTH, Truth, read_truth
 from octasplat.engine.files import read_scene
 from octasplat.engine.pathtracing.environment import EnvironmentMap, environment_frame
 from octasplat.engine.pathtracing.relighting.path_relighter import PathRelighter
@@ -27,7 +26,8 @@ from octasplat.engine.pathtracing.relighting.split_sum_relighter import SplitSum
 from octasplat.engine.pathtracing.stage.model import Integrator
 from octasplat.engine.render.environment_files import read_environment
 from octasplat.engine.render.image_files import read_image, write_png
-from octasplat.engine.run_folder import CONFIG, ENVIRONMENT, SCENE, run_viewpoints
+from octasplat.engine.runs.config import read_config
+from octasplat.engine.runs.run_folder import CONFIG, ENVIRONMENT, SCENE, run_viewpoints
 from octasplat.engine.surface.depth_cameras import photograph_cameras
 from tests.support.lit_surface import in_cycles, in_threejs, view_of
 

@@ -20,16 +20,16 @@ from jaxtyping import Float32
 from PIL import Image
 from scipy.ndimage import map_coordinates
 
-from octasplat.engine.colour import composited, linear_to_srgb
-from octasplat.engine.config import read_config
+from octasplat.engine.core.color import composited, linear_to_srgb
+from octasplat.engine.core.rays import ImageRays, RayBatch
 from octasplat.engine.files import read_mesh, read_scene
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.geometry.imported_mesh import ImportedMesh
-from octasplat.engine.rays import ImageRays, RayBatch
 from octasplat.engine.render.image_files import write_png
 from octasplat.engine.render.renderer import background_colour, render_rays
 from octasplat.engine.render.shots import gaussian_turntable, turntable_cameras
-from octasplat.engine.run_folder import CONFIG, SCENE, is_run, open_photographs, photographs_folder
+from octasplat.engine.runs.config import read_config
+from octasplat.engine.runs.run_folder import CONFIG, SCENE, is_run, open_photographs, photographs_folder
 from octasplat.engine.trace.factory import make_tracer
 from octasplat.engine.trace.protocol import Tracer, TraceSettings
 from octasplat.engine.trace.triangle_bvh import TriangleBvh

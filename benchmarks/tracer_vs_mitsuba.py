@@ -20,10 +20,10 @@ import numpy as np
 
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # before OpenMP is loaded, as the command line does
 
+from octasplat.engine.core.rays import RayBatch
 from octasplat.engine.files import read_scene
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.gaussians.octagon import CHI2_3_99, octagon_radii
-from octasplat.engine.rays import RayBatch
 from octasplat.engine.render.renderer import tile_order
 from octasplat.engine.trace.cpu.tracer import CpuTracer
 from octasplat.engine.trace.protocol import GaussianGradients, TraceGradients, TraceResult, TraceSettings

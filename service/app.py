@@ -9,7 +9,7 @@ from contextlib import asynccontextmanager
 from fastapi import FastAPI
 
 from octasplat.engine import __version__
-from octasplat.engine.errors import OctasplatError
+from octasplat.engine.core.errors import OctasplatError
 from octasplat.service.audit_middleware import AuditMiddleware
 from octasplat.service.concurrency_limiter import ConcurrencyLimiter
 from octasplat.service.event_broker import EventBroker

@@ -6,8 +6,8 @@ from typing import Any
 
 from pydantic import BaseModel
 
+from octasplat.engine.dataset.image_sizes import Sizes
 from octasplat.engine.operations.cost_model import Estimate
-from octasplat.engine.photograph_sizes import Sizes
 from octasplat.service.auth import Principal
 from octasplat.service.problems import ProblemError
 from octasplat.service.settings import ServiceSettings

@@ -13,10 +13,10 @@ from psycopg_pool import PoolTimeout
 from pydantic import BaseModel, ConfigDict, ValidationError
 from starlette.exceptions import HTTPException
 
-from octasplat.engine.errors import OctasplatError
+from octasplat.engine.core.errors import OctasplatError
 from octasplat.engine.operations.base import error_text
 from octasplat.engine.pathtracing.stage.stage_file import stage_error_message, stage_key_path
-from octasplat.engine.refusals import SettingsRefused
+from octasplat.engine.settings.refusals import SettingsRefused
 from octasplat.service.intake.faults import IntakeError
 from octasplat.workers.db.errors import ConflictError, NotFoundError
 from octasplat.workers.db.quotas import QuotaExceededError

@@ -12,7 +12,7 @@ import sys
 import uvicorn
 from fastapi import FastAPI
 
-from octasplat.engine.errors import OctasplatError
+from octasplat.engine.core.errors import OctasplatError
 from octasplat.service.app import create_app
 from octasplat.service.settings import ServiceSettings
 from octasplat.workers.logs import log_to_stderr

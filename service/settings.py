@@ -5,7 +5,7 @@ from typing import Annotated
 
 from pydantic import Field, IPvAnyNetwork, SecretStr
 
-from octasplat.engine.errors import ConfigError
+from octasplat.engine.core.errors import ConfigError
 from octasplat.service.intake.dataset import DatasetLimits
 from octasplat.service.intake.model_check import ModelLimits
 from octasplat.service.intake.receive import UploadLimits

@@ -33,7 +33,7 @@ def checked_modules() -> list[str]:
     return [
         ".".join(("octasplat", *file.parts))
         for file in files
-        if not file.name.startswith(("__init__", "kernels")) and "kernels" not in file.parts
+        if not file.name.startswith("__init__") and "kernels" not in file.parts
     ]
 
 

@@ -1,6 +1,6 @@
 import numpy as np
 
-from octasplat.engine.colour import linear_to_srgb, rounded_bytes, srgb_to_linear, to_bytes
+from octasplat.engine.core.color import linear_to_srgb, rounded_bytes, srgb_to_linear, to_bytes
 
 
 def test_known_values_of_the_srgb_curve() -> None:

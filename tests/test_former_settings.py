@@ -6,8 +6,8 @@ import json
 import pytest
 from pydantic import ValidationError
 
-from octasplat.engine.config import ReconstructionConfig
-from octasplat.engine.settings import dump_with_former_settings
+from octasplat.engine.runs.config import ReconstructionConfig
+from octasplat.engine.settings.base import dump_with_former_settings
 from octasplat.engine.train.config import TrainConfig, preset, with_materials
 
 

@@ -32,18 +32,18 @@ from octasplat.engine.gaussians.channels import Channels
 from octasplat.engine.gaussians.model import FlatGaussians, concatenate
 from octasplat.engine.gaussians.morton import morton_order
 from octasplat.engine.gaussians.octagon import SIDES, octagon_triangles
-from octasplat.engine.train.checkpoint import (
+from octasplat.engine.train.config import McmcConfig, PaperConfig
+from octasplat.engine.train.densify import Mcmc, Paper
+from octasplat.engine.train.loop.checkpoint import (
     BestState,
     load_best,
     load_checkpoint,
     save_best,
     save_checkpoint,
 )
-from octasplat.engine.train.config import McmcConfig, PaperConfig
-from octasplat.engine.train.densify import Mcmc, Paper
-from octasplat.engine.train.optimiser import Adam
-from octasplat.engine.train.state import TrainState, fresh_state
-from octasplat.engine.train.trainer import Trainer
+from octasplat.engine.train.loop.state import TrainState, fresh_state
+from octasplat.engine.train.loop.trainer import Trainer
+from octasplat.engine.train.optimization.adam import Adam
 from octasplat.workers.cli.main import cli
 from tests.support.planar_dataset import PlanarDataset, small_config
 

@@ -13,11 +13,11 @@ from pathlib import Path
 import numba
 import pytest
 
-from octasplat.engine.config import ReconstructionConfig, resolve_config
+from octasplat.engine.core.errors import Cancelled, CheckpointError, ConfigError, OutputError, TrainingFailure
+from octasplat.engine.core.events import CheckpointWritten, Event
 from octasplat.engine.dataset.synthetic import SyntheticDatasetConfig, write_synthetic_dataset
-from octasplat.engine.errors import Cancelled, CheckpointError, ConfigError, OutputError, TrainingFailure
-from octasplat.engine.events import CheckpointWritten, Event
 from octasplat.engine.pipeline import reconstruct
+from octasplat.engine.runs.config import ReconstructionConfig, resolve_config
 
 pytestmark = pytest.mark.heavy
 
@@ -25,7 +25,7 @@ ITERATIONS, EVERY = 300, 25
 RUN = """
 import sys
 from pathlib import Path
-from octasplat.engine.config import ReconstructionConfig
+from octasplat.engine.runs.config import ReconstructionConfig
 from octasplat.engine.pipeline import reconstruct
 scene, output, config, threads = sys.argv[1:]
 reconstruct(

@@ -9,18 +9,23 @@ from click.testing import CliRunner
 from pydantic import BaseModel
 
 import octasplat as osp
-from octasplat.engine.config import ReconstructionConfig, former_setting_names, read_config, resolve_config
-from octasplat.engine.errors import ConfigError
+from octasplat.engine.core.errors import ConfigError
 from octasplat.engine.operations.reconstruct import ReconstructOptions, ReconstructRequest, run_config
 from octasplat.engine.operations.registry import operations
-from octasplat.engine.renamed_settings import (
+from octasplat.engine.runs.config import (
+    ReconstructionConfig,
+    former_setting_names,
+    read_config,
+    resolve_config,
+)
+from octasplat.engine.runs.settings_catalog import setting_named
+from octasplat.engine.settings.base import dump_with_former_settings
+from octasplat.engine.settings.renamed_settings import (
     FormerNames,
     RenamedSettingWarning,
     collected_notices,
     former_names,
 )
-from octasplat.engine.settings import dump_with_former_settings
-from octasplat.engine.settings_catalog import setting_named
 from octasplat.engine.train.config import McmcConfig, PaperConfig, TrainConfig
 from octasplat.service.actions.validation import resolve_options
 from octasplat.workers.cli.main import cli

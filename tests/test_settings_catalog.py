@@ -7,19 +7,19 @@ import pytest
 from click.testing import CliRunner, Result
 from pydantic import BaseModel
 
-from octasplat.engine.config import ReconstructionConfig, resolve_config
-from octasplat.engine.errors import ConfigError
-from octasplat.engine.fields import Group, Unit
-from octasplat.engine.nearest_names import nearest_name
+from octasplat.engine.core.errors import ConfigError
 from octasplat.engine.poses import PosesConfig
-from octasplat.engine.settings_catalog import (
+from octasplat.engine.runs.config import ReconstructionConfig, resolve_config
+from octasplat.engine.runs.settings_catalog import (
     Difference,
     defaults_of,
     differences,
     setting_named,
     settings,
 )
-from octasplat.engine.settings_page import settings_page
+from octasplat.engine.runs.settings_page import settings_page
+from octasplat.engine.settings.fields import Group, Unit
+from octasplat.engine.settings.nearest_names import nearest_name
 from octasplat.engine.shading.material_settings import MaterialSettings
 from octasplat.engine.trace.protocol import TraceSettings
 from octasplat.engine.train.config import LearningRates, LossWeights, McmcConfig, PaperConfig, TrainConfig

@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 import torch
 
+from octasplat.engine.core.threads import one_torch_thread, use_threads
 from octasplat.engine.dataset.images import resize
 from octasplat.engine.dataset.synthetic import SyntheticDatasetConfig, write_synthetic_dataset
-from octasplat.engine.threads import one_torch_thread, use_threads
 
 
 @pytest.fixture(autouse=True)

@@ -5,7 +5,7 @@ import importlib.metadata
 import sys
 from pathlib import Path
 
-from octasplat.engine.versions import versions
+from octasplat.engine.core.versions import versions
 
 ROOT = Path(__file__).resolve().parent.parent
 HARMLESS = {"pydantic", "pydantic_core", "jaxtyping", "Jinja2", "pyoidn"}

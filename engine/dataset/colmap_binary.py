@@ -10,7 +10,7 @@ from typing import Any
 
 import pycolmap
 
-from octasplat.engine.errors import DatasetError
+from octasplat.engine.core.errors import DatasetError
 
 
 def check_binary_colmap_model(folder: Path) -> None:

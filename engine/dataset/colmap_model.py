@@ -10,12 +10,12 @@ import numpy as np
 import pycolmap
 from jaxtyping import Float64, Int64
 
+from octasplat.engine.core.errors import DatasetError
 from octasplat.engine.dataset.camera import Camera
 from octasplat.engine.dataset.colmap_binary import check_binary_colmap_model
 from octasplat.engine.dataset.colmap_text import find_text_model_error
 from octasplat.engine.dataset.model import SparsePoints
 from octasplat.engine.dataset.pose_check import check_poses
-from octasplat.engine.errors import DatasetError
 
 MODEL_FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0")
 """Where a scene keeps its model; the first that holds one counts."""

@@ -7,6 +7,8 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float32, Float64, Int, Int64
 
+from octasplat.engine.core.errors import DatasetError
+from octasplat.engine.core.rays import ImageRays, RayBatch
 from octasplat.engine.dataset import kernels_gather
 from octasplat.engine.dataset.camera import Camera
 from octasplat.engine.dataset.camera_clearance import camera_clearances
@@ -24,8 +26,6 @@ from octasplat.engine.dataset.ray_tables import (
 from octasplat.engine.dataset.split import evaluation_split, split_views
 from octasplat.engine.dataset.training_points import training_points
 from octasplat.engine.dataset.views_file import ViewsRecord, views_record
-from octasplat.engine.errors import DatasetError
-from octasplat.engine.rays import ImageRays, RayBatch
 
 MaskUse = Literal["ignore", "alpha"]
 

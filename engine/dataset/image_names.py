@@ -8,7 +8,7 @@ from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Mapping
 from pathlib import PurePosixPath
 
-from octasplat.engine.relative_paths import normalised
+from octasplat.engine.core.relative_paths import normalised
 
 
 def match_image_names(names: Iterable[str], files: Collection[str]) -> Mapping[str, str]:

@@ -10,10 +10,10 @@ import OpenImageIO as oiio
 from jaxtyping import Float32, UInt8
 from PIL.TiffImagePlugin import ImageFileDirectory_v2
 
-from octasplat.engine.colour import linear_to_srgb
+from octasplat.engine.core.color import linear_to_srgb
+from octasplat.engine.core.errors import DatasetError
+from octasplat.engine.core.threads import one_torch_thread
 from octasplat.engine.dataset.image_info import ImageInfo, Storage
-from octasplat.engine.errors import DatasetError
-from octasplat.engine.threads import one_torch_thread
 
 Pixels = np.ndarray[Any, np.dtype[Any]]
 _FLOATS = (oiio.HALF, oiio.FLOAT, oiio.DOUBLE)

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from octasplat.engine.compilation import kernel
+from octasplat.engine.core.compilation import kernel
 
 
 @kernel()

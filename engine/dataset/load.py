@@ -7,6 +7,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float64
 
+from octasplat.engine.core.errors import ConfigError, DatasetError
+from octasplat.engine.core.relative_paths import normalised
 from octasplat.engine.dataset.camera import Camera
 from octasplat.engine.dataset.colmap_model import ColmapModel, PosedImage, read_colmap_model
 from octasplat.engine.dataset.image_info import ImageInfo
@@ -14,10 +16,8 @@ from octasplat.engine.dataset.image_names import match_image_names
 from octasplat.engine.dataset.images import read_image_info
 from octasplat.engine.dataset.masks import mask_for, masks_beside
 from octasplat.engine.dataset.model import DatasetModel, DatasetView, Observations
+from octasplat.engine.dataset.results_among import is_results
 from octasplat.engine.dataset.views_file import capped_size
-from octasplat.engine.errors import ConfigError, DatasetError
-from octasplat.engine.relative_paths import normalised
-from octasplat.engine.results_among import is_results
 
 MIN_VIEWS = 3
 """Fewer photographs than this do not make a scene."""

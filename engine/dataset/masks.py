@@ -7,8 +7,8 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 from jaxtyping import UInt8
 
+from octasplat.engine.core.errors import DatasetError
 from octasplat.engine.dataset.images import alpha_channel_of, open_image, read_pixels, resize
-from octasplat.engine.errors import DatasetError
 
 _VALID = 128
 """The least value of a valid pixel."""

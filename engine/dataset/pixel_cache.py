@@ -19,6 +19,8 @@ from typing import TypedDict
 import numpy as np
 from jaxtyping import Int64
 
+from octasplat.engine.core.errors import DatasetError, NoSpaceLeft, OutputError
+from octasplat.engine.core.writing import replacing, write_json
 from octasplat.engine.dataset.image_info import ImageInfo, Storage
 from octasplat.engine.dataset.images import ValueScale, read_photo
 from octasplat.engine.dataset.mapped_array import MappedArray
@@ -26,8 +28,6 @@ from octasplat.engine.dataset.masks import MaskSummary, check_masks, read_mask
 from octasplat.engine.dataset.model import DatasetModel, DatasetView
 from octasplat.engine.dataset.value_scale import find_value_scales
 from octasplat.engine.dataset.views_file import FileDigests
-from octasplat.engine.errors import DatasetError, NoSpaceLeft, OutputError
-from octasplat.engine.writing import replacing, write_json
 
 CACHE_VERSION = 3
 """Raised whenever the contents of the cache files change for the same photographs."""

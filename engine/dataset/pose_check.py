@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float64
 
+from octasplat.engine.core.errors import DatasetError
 from octasplat.engine.dataset.model import SparsePoints
-from octasplat.engine.errors import DatasetError
 
 FAR_CAMERA_RATIO = 10.0
 """Cameras farther off than this many times what is usual in the scene are told; of ten real scenes none goes

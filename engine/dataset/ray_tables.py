@@ -13,10 +13,10 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float64, Int64
 
+from octasplat.engine.core.errors import OutputError
+from octasplat.engine.core.writing import replacing, write_text
 from octasplat.engine.dataset.camera import ROUND_TRIP_TOLERANCE_PX, Camera
 from octasplat.engine.dataset.mapped_array import MappedArray
-from octasplat.engine.errors import OutputError
-from octasplat.engine.writing import replacing, write_text
 
 MAX_TABLE_BYTES = 4 << 30
 """Cameras whose tables do not fit in here are un-projected at every call."""

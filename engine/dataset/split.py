@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Int64
 
-from octasplat.engine.errors import ConfigError, DatasetError
-from octasplat.engine.relative_paths import normalised
-from octasplat.engine.writing import write_json
+from octasplat.engine.core.errors import ConfigError, DatasetError
+from octasplat.engine.core.relative_paths import normalised
+from octasplat.engine.core.writing import write_json
 
 
 def split_views(

@@ -10,9 +10,9 @@ from pathlib import Path
 
 import numpy as np
 
+from octasplat.engine.core.errors import DatasetError
 from octasplat.engine.dataset.image_info import ImageInfo, Storage
 from octasplat.engine.dataset.images import ValueScale, read_stored_colours
-from octasplat.engine.errors import DatasetError
 
 _FULL_16_BIT = 65535.0
 _INTEGER_RANGES = (255.0, 1023.0, 4095.0, 16383.0, _FULL_16_BIT)

@@ -14,13 +14,13 @@ import numpy as np
 from jaxtyping import Float, Int64
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
 
+from octasplat.engine.core.errors import ConfigError
+from octasplat.engine.core.relative_paths import checked_relative
+from octasplat.engine.core.writing import write_text
 from octasplat.engine.dataset.camera import Camera
 from octasplat.engine.dataset.model import DatasetModel, PosedView, SparsePoints, Viewpoints, scene_extent
 from octasplat.engine.dataset.split import split_views
 from octasplat.engine.dataset.training_points import training_points
-from octasplat.engine.errors import ConfigError
-from octasplat.engine.relative_paths import checked_relative
-from octasplat.engine.writing import write_text
 
 _Finite = Annotated[float, Field(allow_inf_nan=False)]
 _Row = tuple[_Finite, _Finite, _Finite]

@@ -9,13 +9,14 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
+from octasplat.engine.core.errors import OutputError
+from octasplat.engine.core.writing import telling_of_room, write_json
 from octasplat.engine.edit.run_transform import is_similarity, write_transformed_run_files
-from octasplat.engine.errors import OutputError
 from octasplat.engine.files import read_metadata
 from octasplat.engine.files.gaussian_ply import write_gaussian_ply
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.gaussians.scene_metadata import SceneMetadata
-from octasplat.engine.run_folder import (
+from octasplat.engine.runs.run_folder import (
     BACKGROUND,
     CONFIG,
     ENVIRONMENT,
@@ -27,7 +28,6 @@ from octasplat.engine.run_folder import (
     TRAINING,
     VIEWS,
 )
-from octasplat.engine.writing import telling_of_room, write_json
 
 EDITS_FILE = "edits.json"
 """What was changed since the training, first to last."""

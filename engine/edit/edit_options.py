@@ -17,12 +17,12 @@ from pydantic import (
 )
 from pydantic_core import InitErrorDetails, PydanticCustomError
 
-from octasplat.engine.colour import srgb_to_linear
+from octasplat.engine.core.color import srgb_to_linear
+from octasplat.engine.core.errors import ConfigError
 from octasplat.engine.edit.axes import Axes
 from octasplat.engine.edit.filter_expression import MAX_LENGTH, parse_filter
-from octasplat.engine.errors import ConfigError
-from octasplat.engine.fields import Group, Spelling, Unit
 from octasplat.engine.gaussians.materials import MATERIAL_WIDTHS
+from octasplat.engine.settings.fields import Group, Spelling, Unit
 
 _HEX = re.compile(r"#([0-9a-fA-F]{6})")
 

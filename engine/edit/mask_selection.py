@@ -6,15 +6,15 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
-from octasplat.engine.config import read_config
+from octasplat.engine.core.errors import ConfigError, DatasetError
+from octasplat.engine.core.rays import ImageRays, RayBatch
 from octasplat.engine.dataset.model import Viewpoints
-from octasplat.engine.errors import ConfigError, DatasetError
 from octasplat.engine.gaussians.model import FlatGaussians
-from octasplat.engine.rays import ImageRays, RayBatch
 from octasplat.engine.render.image_files import read_image
 from octasplat.engine.render.renderer import tile_order
 from octasplat.engine.render.shots import view_shots
-from octasplat.engine.run_folder import CONFIG, is_run, run_near_world, run_viewpoints
+from octasplat.engine.runs.config import read_config
+from octasplat.engine.runs.run_folder import CONFIG, is_run, run_near_world, run_viewpoints
 from octasplat.engine.trace.factory import make_tracer
 from octasplat.engine.trace.protocol import TraceGradients, Tracer
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Bool, Float64
 
-from octasplat.engine.colour import linear_to_srgb
+from octasplat.engine.core.color import linear_to_srgb
 from octasplat.engine.edit.edit_options import MaterialChange
 from octasplat.engine.gaussians.channels import stack_channels
 from octasplat.engine.gaussians.materials import AMBIENT, MATERIAL_WIDTHS

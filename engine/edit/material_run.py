@@ -5,16 +5,16 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool
 
-from octasplat.engine.config import read_config
+from octasplat.engine.core.errors import ConfigError
 from octasplat.engine.edit.edit_options import MaterialChange, Selection
 from octasplat.engine.edit.material_change import refit_sh, with_materials
-from octasplat.engine.errors import ConfigError
 from octasplat.engine.gaussians.materials import require_materials
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.render.environment_files import read_environment
-from octasplat.engine.run_folder import CONFIG, SCENE, is_run, run_environment
+from octasplat.engine.runs.config import read_config
+from octasplat.engine.runs.run_folder import CONFIG, SCENE, is_run, run_environment
 from octasplat.engine.shading.environment_frame import environment_frame
-from octasplat.engine.shading.learnt_light import LearntLight
+from octasplat.engine.shading.environment_light import LearntLight
 
 
 def change_materials(

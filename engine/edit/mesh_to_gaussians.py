@@ -6,13 +6,13 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float, Float64, Int64
 
+from octasplat.engine.core.errors import SceneFileError
 from octasplat.engine.edit.axes import AXIS_ROTATIONS, default_axes, detect_axes, infer_q
 from octasplat.engine.edit.edit_options import MeshToGaussiansOptions
 from octasplat.engine.edit.neighbors import interpolate_motion, is_flipped, neighbour_rotations
 from octasplat.engine.edit.octagon_fit import MIN_CORNERS, fit_octagons
 from octasplat.engine.edit.octagon_matching import MatchedOctagons, match_octagons
 from octasplat.engine.edit.reports import EditReport
-from octasplat.engine.errors import SceneFileError
 from octasplat.engine.files import ImportedMesh
 from octasplat.engine.gaussians.apply_legs import apply_legs_to, row_blocks
 from octasplat.engine.gaussians.frames import rotation_matrices

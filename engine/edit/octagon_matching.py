@@ -9,8 +9,8 @@ from jaxtyping import Bool, Float, Float64, Int32, Int64
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from octasplat.engine.core.errors import SceneFileError
 from octasplat.engine.edit.octagon_fit import MIN_CORNERS
-from octasplat.engine.errors import SceneFileError
 from octasplat.engine.files import ImportedMesh
 from octasplat.engine.gaussians.apply_legs import row_blocks
 from octasplat.engine.gaussians.octagon import SIDES, corner_directions

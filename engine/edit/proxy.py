@@ -12,10 +12,10 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64, Int32, Int64
 from scipy.spatial import KDTree
 
+from octasplat.engine.core.errors import SceneFileError
 from octasplat.engine.edit.kernels.mean_value import mean_value_weights, winding_numbers
 from octasplat.engine.edit.kernels.proxy import blend, triangle_weights
 from octasplat.engine.edit.mirror_detection import was_mirrored
-from octasplat.engine.errors import SceneFileError
 from octasplat.engine.gaussians.apply_legs import ROWS_PER_BLOCK, row_blocks
 
 Method = Literal["nearest", "mvc"]

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Float32, Float64
 
-from octasplat.engine.config import read_config
+from octasplat.engine.core.writing import write_json
 from octasplat.engine.dataset.views_file import read_views, write_views
 from octasplat.engine.render.environment_files import (
     read_background,
@@ -15,7 +15,8 @@ from octasplat.engine.render.environment_files import (
     write_background,
     write_environment,
 )
-from octasplat.engine.run_folder import (
+from octasplat.engine.runs.config import read_config
+from octasplat.engine.runs.run_folder import (
     BACKGROUND,
     CONFIG,
     ENVIRONMENT,
@@ -26,9 +27,8 @@ from octasplat.engine.run_folder import (
     VIEWS,
     run_scene,
 )
+from octasplat.engine.shading.background import UP_WORLD
 from octasplat.engine.shading.environment_frame import environment_frame
-from octasplat.engine.shading.learnt_background import UP_WORLD
-from octasplat.engine.writing import write_json
 
 _TOLERANCE = 1e-6
 """Of the scale: how far a matrix may be from a similarity, which is what rounding makes of one."""
@@ -124,7 +124,7 @@ def rotate_environment(
         new_frame: those of the result in the new world.
         turn: rotation from the old world to the new one.
     """
-    from octasplat.engine.shading.kernels_map import map_colours
+    from octasplat.engine.shading.kernels.environment_map import map_colours
 
     height = len(values)
     directions = _texel_directions(height) @ new_frame @ turn

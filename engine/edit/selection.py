@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float
 
+from octasplat.engine.core.errors import ConfigError
 from octasplat.engine.edit.axes import infer_q
 from octasplat.engine.edit.edit_options import Selection
 from octasplat.engine.edit.filter_expression import filter_mask
 from octasplat.engine.edit.octagon_matching import match_octagons
-from octasplat.engine.errors import ConfigError
 from octasplat.engine.files import ImportedMesh
 from octasplat.engine.gaussians.channels import merge_widths
 from octasplat.engine.gaussians.model import FlatGaussians, concatenate

@@ -7,14 +7,16 @@ from pathlib import Path
 
 import numba
 
-from octasplat.engine.colour import composited
+from octasplat.engine.core.color import composited
+from octasplat.engine.core.events import Listener, StageProgress, read_events
+from octasplat.engine.core.writing import write_json
 from octasplat.engine.dataset import Dataset
-from octasplat.engine.evaluate.against_truth import TruthMeasures
 from octasplat.engine.evaluate.gallery import ViewImages, WorstAndBest
-from octasplat.engine.evaluate.layers import shown_environment, shown_layers
+from octasplat.engine.evaluate.ground_truth import Truth
+from octasplat.engine.evaluate.ground_truth_measures import TruthMeasures
+from octasplat.engine.evaluate.layer_display import shown_environment, shown_layers
 from octasplat.engine.evaluate.report import write_report
-from octasplat.engine.evaluate.truth import Truth
-from octasplat.engine.evaluate.views import (
+from octasplat.engine.evaluate.view_metrics import (
     MeasuredView,
     RenderedView,
     ViewMetrics,
@@ -22,7 +24,6 @@ from octasplat.engine.evaluate.views import (
     measure_view,
     summarise,
 )
-from octasplat.engine.events import Listener, StageProgress, read_events
 from octasplat.engine.gaussians.materials import ALBEDO
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.pathtracing.environment import EnvironmentMap
@@ -34,8 +35,7 @@ from octasplat.engine.render.supersampling import render_filtered
 from octasplat.engine.shading.protocol import ShadingModel
 from octasplat.engine.trace.factory import make_tracer
 from octasplat.engine.trace.protocol import Tracer, TraceSettings
-from octasplat.engine.train.shading import background_of, exposed_as
-from octasplat.engine.writing import write_json
+from octasplat.engine.train.shading_factory import background_of, exposed_as
 
 SIDE = 2
 """So many rays across a pixel, and as many down, where a shading model shades; else one at its centre."""

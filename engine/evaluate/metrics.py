@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Float, Float32, Float64
 from scipy.ndimage import correlate1d
 
-from octasplat.engine.colour import to_bytes
+from octasplat.engine.core.color import to_bytes
 
 WINDOW = 11
 SIGMA = 1.5

@@ -14,7 +14,8 @@ import numpy as np
 from jaxtyping import Float32
 from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
 
-from octasplat.engine.errors import OutputError
+from octasplat.engine.core.errors import OutputError
+from octasplat.engine.core.writing import write_text
 from octasplat.engine.evaluate.curves import duration, training_charts
 from octasplat.engine.evaluate.gallery import (
     BEST,
@@ -26,9 +27,8 @@ from octasplat.engine.evaluate.gallery import (
     embedded_names,
     magma,
 )
-from octasplat.engine.evaluate.layers import LABELS, shown_environment
+from octasplat.engine.evaluate.layer_display import LABELS, shown_environment
 from octasplat.engine.render.image_files import shrink_to
-from octasplat.engine.writing import write_text
 
 
 @dataclass(frozen=True)

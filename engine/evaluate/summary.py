@@ -5,7 +5,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from octasplat.engine.durations import duration
+from octasplat.engine.core.durations import duration
 
 _METRICS = (
     ("psnr", "PSNR {:.2f} dB"),

@@ -4,7 +4,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Literal
 
-from octasplat.engine.errors import SceneFileError
+from octasplat.engine.core.errors import SceneFileError
 from octasplat.engine.gaussians.channels import group_columns, is_valid_channel_name
 
 ChannelChoice = Literal["own", "all"] | tuple[str, ...]

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from octasplat.engine.errors import Cancelled, NoSpaceLeft, OctasplatError
+from octasplat.engine.core.errors import Cancelled, NoSpaceLeft, OctasplatError
 from octasplat.engine.files.export_options import ExportOptions
 from octasplat.engine.files.registry import Exporter, exporter_for
 from octasplat.engine.files.write_files import export_scene

@@ -4,9 +4,9 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from octasplat.engine.fields import Group, Spelling, Unit
 from octasplat.engine.gaussians.octagon import CHI2_2_99
 from octasplat.engine.gaussians.scene_metadata import UNKNOWN_METADATA, SceneMetadata
+from octasplat.engine.settings.fields import Group, Spelling, Unit
 
 OctagonQ = Annotated[float, Field(gt=0.0, le=100.0)]
 """Chi-square quantile Q of octagons, their squared radius in standard deviations; alpha falls to exp(-Q/2) at

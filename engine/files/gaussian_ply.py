@@ -21,7 +21,7 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float32
 
-from octasplat.engine.errors import ConfigError, SceneFileError
+from octasplat.engine.core.errors import ConfigError, SceneFileError
 from octasplat.engine.files.channel_columns import ChannelChoice, select_channel_columns
 from octasplat.engine.files.encodings import MAX_SH_DEGREE, dropped_sh_message
 from octasplat.engine.files.export_options import ExportOptions

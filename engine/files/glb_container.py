@@ -15,10 +15,10 @@ import numpy as np
 from jaxtyping import Float64
 from numpy.typing import DTypeLike
 
-from octasplat.engine.errors import SceneFileError
+from octasplat.engine.core.errors import SceneFileError
+from octasplat.engine.core.writing import replacing
 from octasplat.engine.gaussians.channels import column_names
 from octasplat.engine.gaussians.frames import quaternions_from_matrices, rotation_matrices
-from octasplat.engine.writing import replacing
 
 MAX_BYTES = 2**32 - 1
 """A GLB states its length in 32 bits."""

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64
 
-from octasplat.engine.errors import SceneFileError
+from octasplat.engine.core.errors import SceneFileError
 from octasplat.engine.files.glb_container import GlbFile
 from octasplat.engine.geometry.mesh_material import FileImage, MeshMaterial
 

@@ -24,8 +24,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32, Int, Int32, UInt8
 
-from octasplat.engine.colour import srgb_to_linear
-from octasplat.engine.errors import ConfigError, SceneFileError
+from octasplat.engine.core.color import srgb_to_linear
+from octasplat.engine.core.errors import ConfigError, SceneFileError
 from octasplat.engine.files import glb_container
 from octasplat.engine.files.export_options import ExportOptions
 from octasplat.engine.files.glb_container import GlbFile, channel_attributes, pad_to_four, write_glb

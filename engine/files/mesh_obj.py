@@ -17,8 +17,9 @@ from typing import IO, Any
 import numpy as np
 from jaxtyping import Float32, Int32, Int64
 
-from octasplat.engine.colour import srgb_to_linear
-from octasplat.engine.errors import SceneFileError
+from octasplat.engine.core.color import srgb_to_linear
+from octasplat.engine.core.errors import SceneFileError
+from octasplat.engine.core.writing import replacing, write_text
 from octasplat.engine.files.export_options import ExportOptions
 from octasplat.engine.files.obj_materials import read_mtl
 from octasplat.engine.files.octagon_batches import BATCH_SIZE, OctagonBatch, OctagonSoup
@@ -35,7 +36,6 @@ from octasplat.engine.geometry.imported_mesh import (
 )
 from octasplat.engine.geometry.mesh_material import MeshMaterial
 from octasplat.engine.geometry.triangle_mesh import TriangleMesh
-from octasplat.engine.writing import replacing, write_text
 
 BLOCK_BYTES = 1 << 22
 NEWLINE, SPACE, TAB = 10, 32, 9  # every other white space lies below the space

@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32, Int, Int64
 
-from octasplat.engine.colour import srgb_to_linear, to_bytes
-from octasplat.engine.errors import SceneFileError
+from octasplat.engine.core.color import srgb_to_linear, to_bytes
+from octasplat.engine.core.errors import SceneFileError
 from octasplat.engine.files.export_options import ExportOptions
 from octasplat.engine.files.gaussian_ply import channel_comments
 from octasplat.engine.files.octagon_batches import BATCH_SIZE, OctagonSoup

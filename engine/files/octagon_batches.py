@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32, Int
 
-from octasplat.engine.errors import SceneFileError
+from octasplat.engine.core.errors import SceneFileError
 from octasplat.engine.files.export_options import ExportOptions
 from octasplat.engine.gaussians.channels import Channels
 from octasplat.engine.gaussians.model import FlatGaussians

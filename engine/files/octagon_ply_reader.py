@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from octasplat.engine.errors import ConfigError, SceneFileError
+from octasplat.engine.core.errors import ConfigError, SceneFileError
 from octasplat.engine.files.channel_columns import ChannelChoice, select_channel_columns
 from octasplat.engine.files.encodings import logits_from_bytes, sh0_from_rgb
 from octasplat.engine.files.gaussian_ply import declared_channels

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32
 
-from octasplat.engine.errors import SceneFileError
+from octasplat.engine.core.errors import SceneFileError
 from octasplat.engine.gaussians.frames import rotation_matrices
 from octasplat.engine.gaussians.octagon import (
     coordinate_rounding_error,

@@ -13,8 +13,8 @@ from typing import IO
 
 import numpy as np
 
-from octasplat.engine.errors import SceneFileError
-from octasplat.engine.writing import replacing
+from octasplat.engine.core.errors import SceneFileError
+from octasplat.engine.core.writing import replacing
 
 SCALAR_TYPES: Mapping[str, str] = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1",

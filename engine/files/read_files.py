@@ -5,8 +5,8 @@ from pathlib import Path
 
 import numpy as np
 
-from octasplat.engine.errors import SceneFileError
-from octasplat.engine.events import Listener, StageFinished, StageStarted, ignore
+from octasplat.engine.core.errors import SceneFileError
+from octasplat.engine.core.events import Listener, StageFinished, StageStarted, ignore
 from octasplat.engine.files.channel_columns import ChannelChoice
 from octasplat.engine.files.gaussian_ply import read_ply_metadata
 from octasplat.engine.files.registry import importer_for, mesh_reader_for

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar, TypeVar
 
-from octasplat.engine.errors import SceneFileError
+from octasplat.engine.core.errors import SceneFileError
 from octasplat.engine.files.channel_columns import ChannelChoice
 from octasplat.engine.files.export_options import ExportOptions
 from octasplat.engine.files.format_table import Entry, FormatTable

@@ -15,7 +15,8 @@ import numpy as np
 from jaxtyping import Float32, UInt8
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from octasplat.engine.errors import SceneFileError
+from octasplat.engine.core.errors import SceneFileError
+from octasplat.engine.core.writing import replacing
 from octasplat.engine.files.encodings import SQRT_HALF, from_smallest_three, logits_from_bytes
 from octasplat.engine.files.export_options import ExportOptions
 from octasplat.engine.files.gaussian_ply import write_gaussian_ply
@@ -24,7 +25,6 @@ from octasplat.engine.files.splat_rows import select_for_export
 from octasplat.engine.files.splat_transform import convert, missing_converter
 from octasplat.engine.gaussians.flattening import GaussianCloud
 from octasplat.engine.gaussians.model import FlatGaussians
-from octasplat.engine.writing import replacing
 
 META_FILE = "meta.json"
 PALETTE_COLUMNS = 64

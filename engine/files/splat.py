@@ -4,15 +4,15 @@ from pathlib import Path
 
 import numpy as np
 
-from octasplat.engine.colour import rounded_bytes
-from octasplat.engine.errors import SceneFileError
+from octasplat.engine.core.color import rounded_bytes
+from octasplat.engine.core.errors import SceneFileError
+from octasplat.engine.core.writing import replacing
 from octasplat.engine.files.encodings import logits_from_bytes, sh0_from_rgb, unit_quats
 from octasplat.engine.files.export_options import ExportOptions
 from octasplat.engine.files.registry import Exporter, Importer, register
 from octasplat.engine.files.splat_rows import check_scales, iterate_blocks, select_for_export
 from octasplat.engine.gaussians.flattening import GaussianCloud
 from octasplat.engine.gaussians.model import FLAT_SCALE, FlatGaussians
-from octasplat.engine.writing import replacing
 
 SPLAT_DTYPE = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("quat_wxyz", "u1", 4)])
 

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from octasplat.engine.errors import SceneFileError
+from octasplat.engine.core.errors import SceneFileError
 from octasplat.engine.files.export_options import ExportOptions
 from octasplat.engine.gaussians.model import FlatGaussians
 

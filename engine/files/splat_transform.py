@@ -5,7 +5,7 @@ import shutil
 import subprocess
 from pathlib import Path
 
-from octasplat.engine.errors import SceneFileError
+from octasplat.engine.core.errors import SceneFileError
 
 PACKAGE = "@playcanvas/splat-transform"
 PROGRAM = "splat-transform"

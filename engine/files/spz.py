@@ -5,8 +5,9 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Float32
 
-from octasplat.engine.colour import rounded_bytes
-from octasplat.engine.errors import SceneFileError
+from octasplat.engine.core.color import rounded_bytes
+from octasplat.engine.core.errors import SceneFileError
+from octasplat.engine.core.writing import replacing
 from octasplat.engine.files.encodings import (
     MAX_SH_DEGREE,
     SQRT_HALF,
@@ -25,7 +26,6 @@ from octasplat.engine.files.splat_rows import iterate_blocks, select_for_export
 from octasplat.engine.files.spz_container import ANTIALIASED, GZIP_MAGIC, MAGIC, SpzFile, read_spz, write_spz
 from octasplat.engine.gaussians.flattening import FLAT_LOG_SCALE, GaussianCloud
 from octasplat.engine.gaussians.model import FlatGaussians
-from octasplat.engine.writing import replacing
 
 COLOUR_SCALE = 0.15
 """Constant harmonics h are written as the byte 255 (0.15 h + 0.5)."""

@@ -13,7 +13,7 @@ from typing import IO
 
 import zstandard
 
-from octasplat.engine.errors import SceneFileError
+from octasplat.engine.core.errors import SceneFileError
 
 MAGIC = b"NGSP"
 GZIP_MAGIC = b"\x1f\x8b"

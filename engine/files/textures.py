@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32, Float64, UInt8
 
-from octasplat.engine.colour import to_bytes
+from octasplat.engine.core.color import to_bytes
 
 RAMP_SIZE_PX = 256
 

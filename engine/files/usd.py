@@ -14,15 +14,15 @@ from typing import Any
 
 import numpy as np
 
-from octasplat.engine.colour import srgb_to_linear
-from octasplat.engine.errors import SceneFileError
+from octasplat.engine.core.color import srgb_to_linear
+from octasplat.engine.core.errors import SceneFileError
+from octasplat.engine.core.writing import replacing
 from octasplat.engine.files.encodings import half_turn_gaussians, unit_quats
 from octasplat.engine.files.export_options import ExportOptions
 from octasplat.engine.files.registry import Exporter, register
 from octasplat.engine.files.splat_rows import check_scales, select_for_export
 from octasplat.engine.gaussians.flattening import rotate_axis_to_first
 from octasplat.engine.gaussians.model import FLAT_SCALE, FlatGaussians
-from octasplat.engine.writing import replacing
 
 ROOT, FIELD = "/octasplat", "/octasplat/gaussians"
 COLOUR_SPACE = "srgb_rec709_scene"

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-from octasplat.engine.errors import ConfigError, SceneFileError
+from octasplat.engine.core.errors import ConfigError, SceneFileError
 from octasplat.engine.files.export_options import ExportOptions
 from octasplat.engine.files.registry import SurfaceWriter, exporter_for, surface_suffixes, surface_writer_for
 from octasplat.engine.gaussians.model import FlatGaussians

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Float64
 
-from octasplat.engine.errors import ConfigError
+from octasplat.engine.core.errors import ConfigError
 from octasplat.engine.gaussians.apply_legs import apply_legs
 from octasplat.engine.gaussians.legs import legs_world
 from octasplat.engine.gaussians.model import FlatGaussians

@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 import numpy as np
 from jaxtyping import Float32
 
-from octasplat.engine.errors import ConfigError
+from octasplat.engine.core.errors import ConfigError
 
 FILL_VALUE = 0.0
 """What Gaussians have that come to a scene from one without the channel."""

@@ -7,7 +7,7 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Bool, Float32, Int
 
-from octasplat.engine.errors import SceneFileError
+from octasplat.engine.core.errors import SceneFileError
 from octasplat.engine.gaussians.channels import Channels, check_row_count
 from octasplat.engine.gaussians.model import FLAT_SCALE, FlatGaussians
 from octasplat.engine.gaussians.rows import select_rows

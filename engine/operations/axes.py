@@ -30,8 +30,8 @@ def light_up(source: Path, name: str | None) -> "Float64[np.ndarray, '3']":
     """
     import numpy as np
 
-    from octasplat.engine.config import read_config
-    from octasplat.engine.run_folder import CONFIG, is_run
+    from octasplat.engine.runs.config import read_config
+    from octasplat.engine.runs.run_folder import CONFIG, is_run
 
     if name is None and is_run(source) and (source / CONFIG).exists():
         return np.array(read_config(source / CONFIG).train.materials.up_world, np.float64)

@@ -9,10 +9,10 @@ from typing import Any, ClassVar, Generic, Protocol, TypeVar, runtime_checkable
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from octasplat.engine import renamed_settings
-from octasplat.engine.errors import Cancelled, ConfigError
-from octasplat.engine.events import Event, Listener, Warned, ignore
-from octasplat.engine.fields import Output, Positional, Source
+from octasplat.engine.core.errors import Cancelled, ConfigError
+from octasplat.engine.core.events import Event, Listener, Warned, ignore
+from octasplat.engine.settings import renamed_settings
+from octasplat.engine.settings.fields import Output, Positional, Source
 
 
 class Options(BaseModel):

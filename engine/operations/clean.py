@@ -6,11 +6,9 @@ from typing import Annotated, ClassVar
 
 from pydantic import Field, model_validator
 
-from octasplat.engine import renamed_settings
+from octasplat.engine.core.errors import ConfigError
+from octasplat.engine.core.events import Listener, ignore
 from octasplat.engine.edit.edit_options import CleanupOptions
-from octasplat.engine.errors import ConfigError
-from octasplat.engine.events import Listener, ignore
-from octasplat.engine.fields import OUTPUT_FLAGS, Spelling
 from octasplat.engine.operations.base import (
     CHANGED_SCENE,
     Operation,
@@ -21,6 +19,8 @@ from octasplat.engine.operations.base import (
     options_of,
     stop_if,
 )
+from octasplat.engine.settings import renamed_settings
+from octasplat.engine.settings.fields import OUTPUT_FLAGS, Spelling
 
 
 class CleanOptions(CleanupOptions, Options):
@@ -94,7 +94,7 @@ def run(
 
     from octasplat.engine.edit.cleaning import clean
     from octasplat.engine.operations.scene_io import check_changed, edit_note, open_scene, write_changed
-    from octasplat.engine.run_folder import is_run, run_near_zones
+    from octasplat.engine.runs.run_folder import is_run, run_near_zones
 
     source: Path = request.source
     if request.output is not None:

@@ -9,12 +9,12 @@ from collections.abc import Sequence
 
 from pydantic import BaseModel, computed_field
 
-from octasplat.engine.config import ReconstructionConfig
-from octasplat.engine.durations import duration
+from octasplat.engine.core.durations import duration
+from octasplat.engine.dataset.image_sizes import Sizes
 from octasplat.engine.operations.relight import RelightOptions
 from octasplat.engine.operations.render import RenderOptions
 from octasplat.engine.operations.render_options import PictureOptions
-from octasplat.engine.photograph_sizes import Sizes
+from octasplat.engine.runs.config import ReconstructionConfig
 from octasplat.engine.train.config import TrainConfig, in_one_order, iteration_count, most_gaussians
 
 _START_CPU_SECONDS = 16.0

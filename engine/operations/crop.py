@@ -5,9 +5,9 @@ from pathlib import Path
 
 from pydantic import model_validator
 
+from octasplat.engine.core.errors import ConfigError
+from octasplat.engine.core.events import Listener, ignore
 from octasplat.engine.edit.edit_options import Selection
-from octasplat.engine.errors import ConfigError
-from octasplat.engine.events import Listener, ignore
 from octasplat.engine.operations.base import (
     Operation,
     Options,

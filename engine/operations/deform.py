@@ -10,11 +10,10 @@ import numpy as np
 from jaxtyping import Float64
 from pydantic import Field, PlainSerializer
 
+from octasplat.engine.core.errors import SceneFileError
+from octasplat.engine.core.events import Listener, ignore
 from octasplat.engine.edit.axes import AXIS_ROTATIONS, Axes
 from octasplat.engine.edit.reports import DeformReport
-from octasplat.engine.errors import SceneFileError
-from octasplat.engine.events import Listener, ignore
-from octasplat.engine.fields import InputFile, Spelling, Unit
 from octasplat.engine.files import ImportedMesh, read_mesh
 from octasplat.engine.operations.base import (
     Operation,
@@ -26,6 +25,7 @@ from octasplat.engine.operations.base import (
 )
 from octasplat.engine.operations.file_patterns import expand_patterns
 from octasplat.engine.operations.sequence_request import SequenceRequest
+from octasplat.engine.settings.fields import InputFile, Spelling, Unit
 
 if TYPE_CHECKING:
     from octasplat.engine.edit.proxy import Binding, Proxy

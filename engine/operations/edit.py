@@ -7,10 +7,9 @@ from typing import Annotated
 
 from pydantic import Field
 
+from octasplat.engine.core.events import Listener, ignore
 from octasplat.engine.edit.edit_options import MeshToGaussiansOptions
 from octasplat.engine.edit.reports import EditReport
-from octasplat.engine.events import Listener, ignore
-from octasplat.engine.fields import InputFile, Spelling
 from octasplat.engine.operations.base import (
     Operation,
     Options,
@@ -22,6 +21,7 @@ from octasplat.engine.operations.base import (
 )
 from octasplat.engine.operations.file_patterns import expand_patterns
 from octasplat.engine.operations.sequence_request import SequenceRequest
+from octasplat.engine.settings.fields import InputFile, Spelling
 
 
 class EditOptions(MeshToGaussiansOptions, Options):

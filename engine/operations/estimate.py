@@ -8,11 +8,11 @@ from typing import Annotated
 
 from pydantic import Field
 
-from octasplat.engine.events import Listener, ignore
-from octasplat.engine.fields import Positional, Spelling, Unit
+from octasplat.engine.core.events import Listener, ignore
+from octasplat.engine.dataset.image_sizes import Sizes
 from octasplat.engine.operations.base import Operation, Request, Result, never_stop
 from octasplat.engine.operations.reconstruct import ReconstructOptions
-from octasplat.engine.photograph_sizes import Sizes
+from octasplat.engine.settings.fields import Positional, Spelling, Unit
 
 
 class EstimateOptions(ReconstructOptions):
@@ -93,8 +93,8 @@ def photograph_sizes(scene: Path) -> list[Sizes]:
     """
     from PIL import Image
 
+    from octasplat.engine.core.errors import DatasetError
     from octasplat.engine.dataset.load import IMAGE_SUFFIXES, image_folder
-    from octasplat.engine.errors import DatasetError
 
     if not scene.is_dir():
         raise DatasetError(f"{scene} is not a folder; name the folder that holds the photographs.")

@@ -7,10 +7,10 @@ from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import BeforeValidator, Field, model_validator
 
-from octasplat.engine import renamed_settings
-from octasplat.engine.events import Listener, ignore
-from octasplat.engine.fields import DatasetFolder, Positional, Spelling
+from octasplat.engine.core.events import Listener, ignore
 from octasplat.engine.operations.base import Operation, Options, Request, Result, never_stop
+from octasplat.engine.settings import renamed_settings
+from octasplat.engine.settings.fields import DatasetFolder, Positional, Spelling
 
 _METRICS, _REPORT, _PICTURES = "metrics.json", "report.html", ("renders", "layers")
 
@@ -150,10 +150,10 @@ def run(
         DatasetError: the photographs cannot be used.
         OutputError: there is no scene yet, or other photographs of that name were measured before.
     """
-    from octasplat.engine.evaluate import runs
+    from octasplat.engine.core.progress import stopping
+    from octasplat.engine.evaluate import run_evaluation
     from octasplat.engine.evaluate.summary import measured_summary, run_summary
-    from octasplat.engine.run_folder import photographs_folder
-    from octasplat.engine.stages import stopping
+    from octasplat.engine.runs.run_folder import photographs_folder
 
     listener = stopping(progress, should_stop, "Stopped while evaluating.")
     if request.scales:
@@ -161,7 +161,7 @@ def run(
     on, dataset = request.other_dataset, request.dataset
     if request.all_views and on is None:
         on, dataset = photographs_folder(request.source, dataset), None
-    metrics = runs.evaluate(
+    metrics = run_evaluation.evaluate(
         request.source,
         scene=dataset,
         on=on,
@@ -182,7 +182,7 @@ def run(
 
 
 def _measure_scales(request: EvaluateRequest, progress: Listener, threads: int) -> EvaluateResult:
-    from octasplat.engine.evaluate.runs import SCALES, evaluate_scales
+    from octasplat.engine.evaluate.run_evaluation import SCALES, evaluate_scales
 
     found = evaluate_scales(
         request.source,
@@ -205,8 +205,8 @@ def _measure_scales(request: EvaluateRequest, progress: Listener, threads: int) 
 
 
 def _exports(run: Path) -> tuple[str, ...]:
-    from octasplat.engine.config import read_config
-    from octasplat.engine.run_folder import CONFIG
+    from octasplat.engine.runs.config import read_config
+    from octasplat.engine.runs.run_folder import CONFIG
 
     return read_config(run / CONFIG).exports
 

@@ -8,15 +8,15 @@ from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 from pydantic import AfterValidator, BeforeValidator, Field, FiniteFloat, model_validator
 
-from octasplat.engine import renamed_settings
-from octasplat.engine.errors import Cancelled, ExportFailed, SceneFileError
-from octasplat.engine.events import Listener, StageProgress, Warned, ignore
-from octasplat.engine.export_names import ExportName
-from octasplat.engine.fields import Group, Positional, Spelling
+from octasplat.engine.core.errors import Cancelled, ExportFailed, SceneFileError
+from octasplat.engine.core.events import Listener, StageProgress, Warned, ignore
 from octasplat.engine.files.export_options import ExportChoices, ExportOptions, OctagonQ
 from octasplat.engine.files.registry import Exporter, exporter_for
 from octasplat.engine.operations.axes import Axis
 from octasplat.engine.operations.base import Operation, Options, Result, SourceRequest, never_stop, stop_if
+from octasplat.engine.runs.export_names import ExportName
+from octasplat.engine.settings import renamed_settings
+from octasplat.engine.settings.fields import Group, Positional, Spelling
 
 if TYPE_CHECKING:
     from octasplat.engine.gaussians.model import FlatGaussians
@@ -257,8 +257,8 @@ class _ExportPreparation:
     @property
     def _training_q(self) -> float | None:
         """What the scene of a run was trained with."""
-        from octasplat.engine.config import read_config
-        from octasplat.engine.run_folder import CONFIG, is_run
+        from octasplat.engine.runs.config import read_config
+        from octasplat.engine.runs.run_folder import CONFIG, is_run
 
         source = self._request.source
         known = is_run(source) and (source / CONFIG).exists()
@@ -269,9 +269,9 @@ class _ExportPreparation:
         """The scene with the constant harmonic only."""
         import numpy as np
 
-        from octasplat.engine.plain_colours import PlainScene
         from octasplat.engine.render.bake_colour import colours_along, with_constant_colour
-        from octasplat.engine.run_folder import is_run
+        from octasplat.engine.runs.baked_scene import PlainScene
+        from octasplat.engine.runs.run_folder import is_run
 
         gaussians, source = self._gaussians, self._request.source
         colour = self._request.color or ("cameras" if is_run(source) else "constant")
@@ -294,7 +294,7 @@ class _ExportPreparation:
         import numpy as np
 
         from octasplat.engine.render.depth_order import MIN_AGREEMENT, shared_depth_order
-        from octasplat.engine.run_folder import CONFIG, is_run, run_viewpoints
+        from octasplat.engine.runs.run_folder import CONFIG, is_run, run_viewpoints
 
         source = self._request.source
         if not (is_run(source) and (source / CONFIG).exists()):

@@ -5,7 +5,7 @@ import re
 from collections.abc import Sequence
 from pathlib import Path
 
-from octasplat.engine.errors import ConfigError
+from octasplat.engine.core.errors import ConfigError
 
 
 def expand_patterns(given: Sequence[Path]) -> tuple[Path, ...]:

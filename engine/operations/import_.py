@@ -6,11 +6,11 @@ from typing import Annotated
 
 from pydantic import BeforeValidator, Field, model_validator
 
-from octasplat.engine.events import Listener, ignore
-from octasplat.engine.fields import InputFile, Positional, Spelling
+from octasplat.engine.core.events import Listener, ignore
 from octasplat.engine.files.channel_columns import ChannelChoice
 from octasplat.engine.gaussians.flattening import ImportReport
 from octasplat.engine.operations.base import Operation, Options, Result, WritingRequest, never_stop, stop_if
+from octasplat.engine.settings.fields import InputFile, Positional, Spelling
 
 
 def read_channels(value: object) -> object:

@@ -9,12 +9,12 @@ from typing import Annotated, Any, ClassVar
 import numpy as np
 from pydantic import Field, InstanceOf
 
-from octasplat.engine import renamed_settings
-from octasplat.engine.evaluate.scene_facts import OPACITY_EDGES, QUANTILES, HitFacts, SceneFacts
-from octasplat.engine.events import Listener, ignore
-from octasplat.engine.fields import DatasetFolder, Source, Spelling
+from octasplat.engine.core.events import Listener, ignore
+from octasplat.engine.evaluate.scene_statistics import OPACITY_EDGES, QUANTILES, HitFacts, SceneFacts
 from octasplat.engine.operations.axes import Axis, axis_named
 from octasplat.engine.operations.base import Operation, Options, Result, WritingRequest, never_stop, stop_if
+from octasplat.engine.settings import renamed_settings
+from octasplat.engine.settings.fields import DatasetFolder, Source, Spelling
 
 _BAR = 24
 
@@ -135,11 +135,11 @@ def run(
         SceneFileError: the scene cannot be read.
         OutputError: there is no scene yet, or a file cannot be written.
     """
+    from octasplat.engine.core.writing import write_json
     from octasplat.engine.operations.render_source import open_stage_scene
     from octasplat.engine.operations.scene_inspection import inspect_scene
     from octasplat.engine.operations.written_files import check_targets
     from octasplat.engine.render.image_files import write_png
-    from octasplat.engine.writing import write_json
 
     source = request.source
     files = tuple(path for path in (request.output, request.picture) if path is not None)

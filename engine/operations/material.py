@@ -5,9 +5,8 @@ from typing import Annotated
 
 from pydantic import Field
 
+from octasplat.engine.core.events import Listener, ignore
 from octasplat.engine.edit.edit_options import MaterialChange, Selection
-from octasplat.engine.events import Listener, ignore
-from octasplat.engine.fields import InputFile, Output, Spelling
 from octasplat.engine.operations.base import (
     Operation,
     Options,
@@ -16,6 +15,7 @@ from octasplat.engine.operations.base import (
     never_stop,
     stop_if,
 )
+from octasplat.engine.settings.fields import InputFile, Output, Spelling
 
 
 class MaterialOptions(Selection, MaterialChange, Options):
@@ -80,7 +80,7 @@ def run(
     from octasplat.engine.files import read_mesh
     from octasplat.engine.gaussians.materials import require_materials
     from octasplat.engine.operations.scene_io import check_changed, open_scene, write_changed
-    from octasplat.engine.run_folder import SCENE, is_run
+    from octasplat.engine.runs.run_folder import SCENE, is_run
 
     source, output = request.source, request.output
     check_changed("material", request, output, [request.mesh, *request.masks])

@@ -6,8 +6,7 @@ from typing import Annotated
 
 from pydantic import Field, model_validator
 
-from octasplat.engine.events import Listener, ignore
-from octasplat.engine.fields import InputFile, Positional
+from octasplat.engine.core.events import Listener, ignore
 from octasplat.engine.operations.base import (
     Operation,
     Options,
@@ -18,6 +17,7 @@ from octasplat.engine.operations.base import (
     options_of,
     stop_if,
 )
+from octasplat.engine.settings.fields import InputFile, Positional
 
 
 class MergeOptions(Options):

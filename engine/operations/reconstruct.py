@@ -7,17 +7,17 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 from pydantic import Field, ValidationError
 
-from octasplat.engine import renamed_settings
-from octasplat.engine.events import Listener, ignore
-from octasplat.engine.fields import ADVANCED, BASIC, PartOf, Positional, Shortcut, Spelling
-from octasplat.engine.nested_options import merged
+from octasplat.engine.core.events import Listener, ignore
 from octasplat.engine.operations.base import Operation, Options, Output, Request, Result, never_stop
-from octasplat.engine.refusals import SettingsRefused, refusals_of
-from octasplat.engine.run_settings import RunSettings
+from octasplat.engine.runs.run_settings import RunSettings
+from octasplat.engine.settings import renamed_settings
+from octasplat.engine.settings.fields import ADVANCED, BASIC, PartOf, Positional, Shortcut, Spelling
+from octasplat.engine.settings.nested_options import merged
+from octasplat.engine.settings.refusals import SettingsRefused, refusals_of
 
 if TYPE_CHECKING:
-    from octasplat.engine.config import ReconstructionConfig
     from octasplat.engine.pipeline import OnStep
+    from octasplat.engine.runs.config import ReconstructionConfig
 
 _CONFIG, _METRICS, _REPORT, _SCENE = "config.json", "metrics.json", "report.html", "scene.ply"
 
@@ -69,7 +69,7 @@ class ReconstructOptions(RunSettings, Options):
         Raises:
             SettingsRefused: a setting is unknown, out of range or contradicts another.
         """
-        from octasplat.engine.config import resolve_config
+        from octasplat.engine.runs.config import resolve_config
 
         settings = {name: getattr(self, name) for name in RunSettings.model_fields if name != "preset"}
         return resolve_config(
@@ -86,7 +86,7 @@ class ReconstructOptions(RunSettings, Options):
         Raises:
             SettingsRefused: a setting is unknown, out of range or contradicts another.
         """
-        from octasplat.engine.config import revise_config
+        from octasplat.engine.runs.config import revise_config
 
         given = self.model_fields_set
         return revise_config(
@@ -148,7 +148,7 @@ class ReconstructResult(Result):
     @property
     def config(self) -> "ReconstructionConfig":
         """All settings of the run."""
-        from octasplat.engine.config import read_config
+        from octasplat.engine.runs.config import read_config
 
         assert self.folder is not None
         return read_config(self.folder / _CONFIG)
@@ -182,7 +182,7 @@ def run_config(request: ReconstructRequest) -> "ReconstructionConfig":
     Raises:
         ConfigError: a setting cannot be used, or the run's settings cannot be read.
     """
-    from octasplat.engine.config import read_config
+    from octasplat.engine.runs.config import read_config
 
     given = request.model_fields_set - {"source", "output", "resume", "exports"}
     given -= {name for name in ("train", "assignments") if not getattr(request, name)}
@@ -214,9 +214,9 @@ def run(
     Raises:
         OctasplatError: as :func:`octasplat.engine.pipeline.reconstruction` does.
     """
+    from octasplat.engine.core.progress import stopping
     from octasplat.engine.evaluate.summary import run_summary
     from octasplat.engine.pipeline import reconstruct
-    from octasplat.engine.stages import stopping
 
     config = run_config(request)
     output = request.output

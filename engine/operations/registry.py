@@ -4,7 +4,7 @@ from functools import cache
 from importlib import import_module
 from typing import Any
 
-from octasplat.engine.errors import ConfigError
+from octasplat.engine.core.errors import ConfigError
 from octasplat.engine.operations.base import Operation
 
 _MODULES = {

@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 from pydantic import Field, model_validator
 
-from octasplat.engine import renamed_settings
-from octasplat.engine.events import Listener, Warned, ignore
-from octasplat.engine.fields import ADVANCED, InputFile, Spelling, Unit
+from octasplat.engine.core.events import Listener, Warned, ignore
 from octasplat.engine.operations.axes import Axis, light_up
 from octasplat.engine.operations.base import Operation, never_stop
 from octasplat.engine.operations.render import RenderResult
 from octasplat.engine.operations.render_options import PictureOptions, PictureRequest
+from octasplat.engine.settings import renamed_settings
+from octasplat.engine.settings.fields import ADVANCED, InputFile, Spelling, Unit
 
 if TYPE_CHECKING:
     from octasplat.engine.dataset import Viewpoints
@@ -148,7 +148,7 @@ def run(
         OctasplatError: the source cannot be read or the output not written.
         Cancelled: it was asked to stop.
     """
-    from octasplat.engine.config import read_config
+    from octasplat.engine.core.progress import stopping
     from octasplat.engine.gaussians.materials import require_materials
     from octasplat.engine.operations.render_source import (
         picture_output,
@@ -162,8 +162,8 @@ def run(
     )
     from octasplat.engine.render.render_digest import render_digest
     from octasplat.engine.render.shots import camera_shots
-    from octasplat.engine.run_folder import CONFIG, SCENE, is_run
-    from octasplat.engine.stages import stopping
+    from octasplat.engine.runs.config import read_config
+    from octasplat.engine.runs.run_folder import CONFIG, SCENE, is_run
 
     tell = stopping(progress, should_stop)
     for told in request.unused():

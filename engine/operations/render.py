@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field, model_validator
 
-from octasplat.engine.events import Listener, Warned, ignore
-from octasplat.engine.fields import ADVANCED, Spelling
+from octasplat.engine.core.events import Listener, Warned, ignore
 from octasplat.engine.operations.base import Operation, Result, never_stop
 from octasplat.engine.operations.render_options import PictureOptions, PictureRequest, check_layers
 from octasplat.engine.pathtracing.stage.model import Stage
 from octasplat.engine.pathtracing.stage.stage_file import read_stage, referenced_files
+from octasplat.engine.settings.fields import ADVANCED, Spelling
 
 if TYPE_CHECKING:
     from octasplat.engine.operations.render_source import RenderSource
@@ -162,6 +162,7 @@ def run(
             of another render where this one is to go on.
         Cancelled: it was asked to stop.
     """
+    from octasplat.engine.core.progress import stopping
     from octasplat.engine.operations.render_source import (
         picture_output,
         read_render_source,
@@ -169,7 +170,6 @@ def run(
         requested_views,
     )
     from octasplat.engine.render.shots import camera_shots
-    from octasplat.engine.stages import stopping
 
     told = "Stopped; the preview is as fine as it was." if request.preview else None
     tell = stopping(progress, should_stop, told)

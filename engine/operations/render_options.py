@@ -5,9 +5,7 @@ from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import BeforeValidator, Field, model_validator
 
-from octasplat.engine import renamed_settings
-from octasplat.engine.errors import ConfigError
-from octasplat.engine.fields import ADVANCED, DatasetFolder, Output, Source, Spelling, Unit
+from octasplat.engine.core.errors import ConfigError
 from octasplat.engine.operations.axes import Axis
 from octasplat.engine.operations.base import Options, WritingRequest
 from octasplat.engine.render.file_names import IMAGE_SUFFIXES, has_number_pattern
@@ -17,6 +15,8 @@ from octasplat.engine.render.path_document import (
     parse_path_text,
     read_path_document,
 )
+from octasplat.engine.settings import renamed_settings
+from octasplat.engine.settings.fields import ADVANCED, DatasetFolder, Output, Source, Spelling, Unit
 
 Mode = Literal["turntable", "views", "path", "camera"]
 Format = Literal["mp4", "png", "exr"]
@@ -253,7 +253,7 @@ class PictureRequest(PictureOptions, WritingRequest):
             raise ValueError("choose one of views, a turntable, a camera path and a single camera")
         if found:
             return found.pop()
-        from octasplat.engine.run_folder import is_run
+        from octasplat.engine.runs.run_folder import is_run
 
         return "views" if is_run(Path(given["source"])) else "turntable"
 
@@ -288,7 +288,7 @@ class PictureRequest(PictureOptions, WritingRequest):
 
     @property
     def _has_views(self) -> bool:
-        from octasplat.engine.run_folder import is_run
+        from octasplat.engine.runs.run_folder import is_run
 
         return is_run(self.source)
 

@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32
 
-from octasplat.engine.config import read_config
+from octasplat.engine.core.errors import ConfigError, OutputError
+from octasplat.engine.core.events import Listener, Warned
+from octasplat.engine.core.relative_paths import normalised
 from octasplat.engine.dataset.model import Viewpoints
 from octasplat.engine.dataset.views_file import SplitViewpoints
-from octasplat.engine.errors import ConfigError, OutputError
-from octasplat.engine.events import Listener, Warned
 from octasplat.engine.files import read_metadata
 from octasplat.engine.files.gaussian_ply import read_gaussian_ply
 from octasplat.engine.gaussians.model import FlatGaussians
@@ -20,7 +20,6 @@ from octasplat.engine.operations.render_options import PictureRequest
 from octasplat.engine.operations.scene_io import open_scene
 from octasplat.engine.operations.written_files import check_targets
 from octasplat.engine.pathtracing.stage_scene import StageScene
-from octasplat.engine.relative_paths import normalised
 from octasplat.engine.render.orbit import (
     Orbit,
     PinholeLens,
@@ -33,8 +32,16 @@ from octasplat.engine.render.path_file import path_cameras
 from octasplat.engine.render.pinhole_camera import PinholeCamera
 from octasplat.engine.render.renderer import background_colour
 from octasplat.engine.render.shots import Shot, gaussian_turntable, view_shots
-from octasplat.engine.run_folder import CONFIG, SCENE, is_run, run_background, run_near_world, run_viewpoints
-from octasplat.engine.shading.learnt_background import LearntBackground
+from octasplat.engine.runs.config import read_config
+from octasplat.engine.runs.run_folder import (
+    CONFIG,
+    SCENE,
+    is_run,
+    run_background,
+    run_near_world,
+    run_viewpoints,
+)
+from octasplat.engine.shading.background import LearntBackground
 from octasplat.engine.trace.protocol import TraceSettings
 
 ANY_SIDE_PX = 1 << 30

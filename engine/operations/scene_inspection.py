@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float32, Float64
 
-from octasplat.engine.evaluate.scene_facts import HitFacts, SceneFacts, hit_facts, scene_facts
+from octasplat.engine.evaluate.scene_statistics import HitFacts, SceneFacts, hit_facts, scene_facts
 from octasplat.engine.pathtracing.stage_scene import StageScene
 from octasplat.engine.render.renderer import render_rays
 from octasplat.engine.render.shots import turntable_cameras

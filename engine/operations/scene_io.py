@@ -8,9 +8,8 @@ import numpy as np
 from jaxtyping import Float
 from pydantic import BaseModel
 
+from octasplat.engine.core.events import Listener, Noted, Warned
 from octasplat.engine.edit.changed_run import check_new_run, write_changed_run
-from octasplat.engine.events import Listener, Noted, Warned
-from octasplat.engine.fields import map_named_files
 from octasplat.engine.files import (
     ExportOptions,
     dropped_on_export,
@@ -24,7 +23,8 @@ from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.gaussians.scene_metadata import SceneMetadata
 from octasplat.engine.operations.base import SourceRequest
 from octasplat.engine.operations.written_files import check_targets
-from octasplat.engine.run_folder import is_run, not_exported
+from octasplat.engine.runs.run_folder import is_run, not_exported
+from octasplat.engine.settings.fields import map_named_files
 
 
 def open_scene(path: Path, progress: Listener, *, drop_invalid: bool = False) -> FlatGaussians:

@@ -5,8 +5,8 @@ from typing import Annotated
 
 from pydantic import Field
 
-from octasplat.engine.fields import OUTPUT_FLAGS, Spelling
 from octasplat.engine.operations.base import CHANGED_SCENE, SourceRequest
+from octasplat.engine.settings.fields import OUTPUT_FLAGS, Spelling
 
 
 class SequenceRequest(SourceRequest):

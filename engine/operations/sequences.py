@@ -4,15 +4,15 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
+from octasplat.engine.core.errors import ConfigError
+from octasplat.engine.core.events import Listener, StageProgress
+from octasplat.engine.core.writing import write_json
 from octasplat.engine.edit.changed_run import check_new_run
-from octasplat.engine.errors import ConfigError
-from octasplat.engine.events import Listener, StageProgress
 from octasplat.engine.files import read_metadata
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.operations.scene_io import check_scenes, is_run_output, write_changed, write_scene
 from octasplat.engine.operations.sequence_request import SequenceRequest
 from octasplat.engine.operations.written_files import check_targets
-from octasplat.engine.writing import write_json
 
 
 def targets_for(output: Path, sources: Sequence[Path]) -> tuple[Path, ...]:

@@ -6,13 +6,13 @@ from typing import ClassVar
 
 from pydantic import Field
 
-from octasplat.engine import renamed_settings
-from octasplat.engine.errors import OutputError
-from octasplat.engine.events import Listener, ignore
-from octasplat.engine.fields import DatasetFolder, Output, Source
+from octasplat.engine.core.errors import OutputError
+from octasplat.engine.core.events import Listener, ignore
 from octasplat.engine.operations.axes import Axis, axis_named
 from octasplat.engine.operations.base import Operation, Options, Result, WritingRequest, never_stop, stop_if
 from octasplat.engine.operations.render_options import Point
+from octasplat.engine.settings import renamed_settings
+from octasplat.engine.settings.fields import DatasetFolder, Output, Source
 
 
 class StageInitOptions(Options):

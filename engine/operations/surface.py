@@ -15,12 +15,12 @@ from pydantic import (
     model_validator,
 )
 
-from octasplat.engine import renamed_settings
-from octasplat.engine.errors import OutputError
-from octasplat.engine.events import Listener, ignore
-from octasplat.engine.fields import DatasetFolder, Output, Source, Spelling
+from octasplat.engine.core.errors import OutputError
+from octasplat.engine.core.events import Listener, ignore
 from octasplat.engine.operations.axes import Axis, light_up
 from octasplat.engine.operations.base import Operation, Options, Result, WritingRequest, never_stop
+from octasplat.engine.settings import renamed_settings
+from octasplat.engine.settings.fields import DatasetFolder, Output, Source, Spelling
 from octasplat.engine.surface.options import ExtractionOptions
 
 if TYPE_CHECKING:
@@ -230,7 +230,7 @@ def run(
     from octasplat.engine.operations.scene_io import open_scene
     from octasplat.engine.operations.surface_inputs import depth_cameras
     from octasplat.engine.operations.written_files import check_targets
-    from octasplat.engine.run_folder import SCENE, is_run
+    from octasplat.engine.runs.run_folder import SCENE, is_run
     from octasplat.engine.shading.environment_frame import environment_frame
     from octasplat.engine.surface.bake_materials import material_features
     from octasplat.engine.surface.extract import extract_levels
@@ -313,7 +313,7 @@ def _light_to_copy(source: Path, output: Path) -> Path | None:
     Raises:
         OutputError: there is another one.
     """
-    from octasplat.engine.run_folder import ENVIRONMENT, is_run
+    from octasplat.engine.runs.run_folder import ENVIRONMENT, is_run
 
     light, place = source / ENVIRONMENT, output.with_name(ENVIRONMENT)
     if not (is_run(source) and light.exists()):
@@ -329,7 +329,7 @@ def _light_to_copy(source: Path, output: Path) -> Path | None:
 
 def _copy_light(light: Path, output: Path) -> Path:
     """Copy the environment beside the output; return its new place."""
-    from octasplat.engine.writing import replacing
+    from octasplat.engine.core.writing import replacing
 
     place = output.with_name(light.name)
     try:

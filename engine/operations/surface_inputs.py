@@ -6,17 +6,17 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import UInt8
 
-from octasplat.engine.colour import to_bytes
-from octasplat.engine.config import read_config
+from octasplat.engine.core.color import to_bytes
+from octasplat.engine.core.errors import DatasetError
+from octasplat.engine.core.events import Listener, Noted, Warned
+from octasplat.engine.core.rays import ImageRays
 from octasplat.engine.dataset import Dataset, load_dataset_model
 from octasplat.engine.dataset.views_file import ViewsRecord, read_views
-from octasplat.engine.errors import DatasetError
-from octasplat.engine.events import Listener, Noted, Warned
 from octasplat.engine.files import read_metadata
 from octasplat.engine.gaussians.model import FlatGaussians
-from octasplat.engine.rays import ImageRays
 from octasplat.engine.render.pinhole_camera import PinholeCamera
-from octasplat.engine.run_folder import (
+from octasplat.engine.runs.config import read_config
+from octasplat.engine.runs.run_folder import (
     CONFIG,
     VIEWS,
     found_model,

@@ -8,8 +8,7 @@ import numpy as np
 from jaxtyping import Float64
 from pydantic import Field, FiniteFloat, model_validator
 
-from octasplat.engine.events import Listener, ignore
-from octasplat.engine.fields import InputFile, Spelling, Unit
+from octasplat.engine.core.events import Listener, ignore
 from octasplat.engine.operations.axes import Axis
 from octasplat.engine.operations.base import (
     Operation,
@@ -20,6 +19,7 @@ from octasplat.engine.operations.base import (
     options_of,
     stop_if,
 )
+from octasplat.engine.settings.fields import InputFile, Spelling, Unit
 
 _Point = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
 

@@ -17,9 +17,9 @@ from pathlib import Path
 
 import platformdirs
 
-from octasplat.engine.errors import ConfigError, OutputError
-from octasplat.engine.results_among import is_results
-from octasplat.engine.run_folder import CONFIG, run_scene
+from octasplat.engine.core.errors import ConfigError, OutputError
+from octasplat.engine.dataset.results_among import is_results
+from octasplat.engine.runs.run_folder import CONFIG, run_scene
 
 RECORD_VARIABLE = "OCTASPLAT_WRITTEN"
 """Names another file for the database."""

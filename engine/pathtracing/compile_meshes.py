@@ -7,8 +7,9 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int32, Int64
 
-from octasplat.engine.colour import srgb_to_linear
-from octasplat.engine.errors import ConfigError
+from octasplat.engine.core.color import srgb_to_linear
+from octasplat.engine.core.errors import ConfigError
+from octasplat.engine.core.rays import RayBatch
 from octasplat.engine.pathtracing.environment import EnvironmentMap, environment_frame
 from octasplat.engine.pathtracing.imported_materials import ImportedMaterial, import_material
 from octasplat.engine.pathtracing.kernels.kernel_args import MaterialArrays, MeshQueries, SurfaceArrays
@@ -41,7 +42,6 @@ from octasplat.engine.pathtracing.stage.model import (
     Stage,
     StageMesh,
 )
-from octasplat.engine.rays import RayBatch
 from octasplat.engine.render.environment_files import read_environment
 from octasplat.engine.trace.triangle_bvh import TriangleBvh
 

@@ -3,7 +3,7 @@
 import numpy as np
 from jaxtyping import Float32
 
-from octasplat.engine.errors import ConfigError
+from octasplat.engine.core.errors import ConfigError
 from octasplat.engine.pathtracing.film import DenoiseFn
 
 

@@ -7,8 +7,9 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float32
 
+from octasplat.engine.core.errors import ConfigError
+from octasplat.engine.core.rays import RayBatch
 from octasplat.engine.edit.selection import merge_scenes
-from octasplat.engine.errors import ConfigError
 from octasplat.engine.gaussians.affine import scaling, transform_gaussians, translation
 from octasplat.engine.gaussians.channels import stack_channels
 from octasplat.engine.gaussians.materials import MATERIAL_WIDTHS, has_materials
@@ -17,7 +18,6 @@ from octasplat.engine.pathtracing.kernels.gaussian_layer import AMBIENT, RELIT, 
 from octasplat.engine.pathtracing.kernels.gaussian_surface import ALBEDO, FEATURE_COUNT, MATERIAL, RAY_OFFSET
 from octasplat.engine.pathtracing.mesh_shapes import rotation_matrix
 from octasplat.engine.pathtracing.stage.model import Stage, StageGaussians
-from octasplat.engine.rays import RayBatch
 from octasplat.engine.trace.facing_normals import face_viewer
 from octasplat.engine.trace.factory import make_tracer
 from octasplat.engine.trace.protocol import Tracer, TraceResult, TraceSettings

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from octasplat.engine.colour import linear_to_srgb
-from octasplat.engine.errors import ConfigError
+from octasplat.engine.core.color import linear_to_srgb
+from octasplat.engine.core.errors import ConfigError
 from octasplat.engine.geometry.mesh_material import FileImage, MeshMaterial
 from octasplat.engine.pathtracing.stage.model import Glass, Material, MetallicRoughness
 

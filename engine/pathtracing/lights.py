@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float32, Float64, Int32, Int64
 
-from octasplat.engine.colour import srgb_to_linear
+from octasplat.engine.core.color import srgb_to_linear
 from octasplat.engine.pathtracing.environment import (
     EnvironmentMap,
     build_environment_sampler,

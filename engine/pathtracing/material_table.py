@@ -8,8 +8,8 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float32
 
-from octasplat.engine.colour import srgb_to_linear
-from octasplat.engine.errors import ConfigError, DatasetError
+from octasplat.engine.core.color import srgb_to_linear
+from octasplat.engine.core.errors import ConfigError, DatasetError
 from octasplat.engine.geometry.mesh_material import FileImage
 from octasplat.engine.pathtracing.bsdf_tables import albedo_table, rough_dielectric_table
 from octasplat.engine.pathtracing.kernels.kernel_args import MaterialArrays

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64, Int32, Int64
 from scipy.spatial.transform import Rotation
 
-from octasplat.engine.errors import ConfigError
+from octasplat.engine.core.errors import ConfigError
 from octasplat.engine.files import read_mesh
 from octasplat.engine.geometry.mesh_material import MeshMaterial
 from octasplat.engine.geometry.triangle_mesh import edge_report

@@ -11,6 +11,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float32, Float64, Int32, Int64
 
+from octasplat.engine.core.rays import ImageRays, RayBatch
+from octasplat.engine.core.threads import use_threads
 from octasplat.engine.pathtracing.compile_meshes import CompiledMeshes, compile_meshes
 from octasplat.engine.pathtracing.denoising import load_denoiser
 from octasplat.engine.pathtracing.film import Film
@@ -36,9 +38,7 @@ from octasplat.engine.pathtracing.kernels.path_surfaces import add_direct_light,
 from octasplat.engine.pathtracing.kernels.shadow_rays import shadow_transmittance
 from octasplat.engine.pathtracing.kernels.trace_paths import trace_paths
 from octasplat.engine.pathtracing.stage.model import Integrator, Stage
-from octasplat.engine.rays import ImageRays, RayBatch
 from octasplat.engine.render.renderer import tile_order
-from octasplat.engine.threads import use_threads
 from octasplat.engine.trace.protocol import Tracer
 
 PATHS_PER_WAVE = 1 << 18

@@ -8,13 +8,13 @@ import numpy as np
 from jaxtyping import Float32, Float64
 from scipy.spatial import cKDTree
 
-from octasplat.engine.errors import ConfigError
+from octasplat.engine.core.errors import ConfigError
+from octasplat.engine.core.rays import RayBatch
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.pathtracing.compile_meshes import load_mesh_shape, mesh_up_axis
 from octasplat.engine.pathtracing.mesh_shapes import transform_points, up_axis_rotation
 from octasplat.engine.pathtracing.stage.model import RestingPlace, Stage
 from octasplat.engine.pathtracing.stage.stage_file import BALL_RADIUS_FRACTION, StageLayout
-from octasplat.engine.rays import RayBatch
 from octasplat.engine.trace.protocol import Tracer
 
 Ray = tuple[Float64[np.ndarray, "3"], Float64[np.ndarray, "3"]]

@@ -6,8 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
-from octasplat.engine.colour import srgb_to_linear
-from octasplat.engine.events import Listener
+from octasplat.engine.core.color import srgb_to_linear
+from octasplat.engine.core.events import Listener
+from octasplat.engine.core.progress import counted_stage
 from octasplat.engine.pathtracing.compile_meshes import CompiledMeshes, check_outside_glass, compile_meshes
 from octasplat.engine.pathtracing.film import StageImage
 from octasplat.engine.pathtracing.gaussian_layers import build_gaussian_layers
@@ -17,7 +18,6 @@ from octasplat.engine.pathtracing.stage_placement import place_resting_meshes
 from octasplat.engine.pathtracing.stage_scene import SIZE_PER_RADIUS, StageScene
 from octasplat.engine.render.image_files import write_exr, write_png
 from octasplat.engine.render.shots import RenderFn, Shot
-from octasplat.engine.stages import counted_stage
 
 
 @dataclass(frozen=True)

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32, Float64
 
+from octasplat.engine.core.errors import ConfigError
 from octasplat.engine.dataset.model import Viewpoints
-from octasplat.engine.errors import ConfigError
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.pathtracing.stage.stage_file import StageLayout
 from octasplat.engine.pathtracing.stage_placement import estimate_stage_layout

@@ -1,11 +1,12 @@
 """The steps before the training: poses are found, and the dataset is opened."""
 
-from octasplat.engine.config import read_config
+from octasplat.engine.core.progress import stage
 from octasplat.engine.dataset import Dataset, write_held_out
 from octasplat.engine.dataset.views_file import write_views
 from octasplat.engine.pipeline.output_folder import write_config
 from octasplat.engine.pipeline.run import ReconstructionRun
-from octasplat.engine.run_folder import (
+from octasplat.engine.runs.config import read_config
+from octasplat.engine.runs.run_folder import (
     CONFIG,
     HELD_OUT,
     VIEWS,
@@ -13,9 +14,8 @@ from octasplat.engine.run_folder import (
     open_photographs,
     run_scene,
 )
-from octasplat.engine.run_poses import find_missing_poses, free_lenses, place_misfits
-from octasplat.engine.stages import stage
-from octasplat.engine.train.batches import BatchSource
+from octasplat.engine.runs.run_poses import find_missing_poses, free_lenses, place_misfits
+from octasplat.engine.train.sampling.batches import BatchSource
 
 
 class FindPoses:

@@ -5,14 +5,14 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from octasplat.engine.config import ReconstructionConfig, read_config
+from octasplat.engine.core.errors import ConfigError, DatasetError, OutputError
+from octasplat.engine.core.relative_paths import normalised
+from octasplat.engine.core.versions import versions
+from octasplat.engine.core.writing import write_json
 from octasplat.engine.dataset.colmap_model import has_colmap_model
-from octasplat.engine.errors import ConfigError, DatasetError, OutputError
 from octasplat.engine.poses.find_poses import read_pose_record
-from octasplat.engine.relative_paths import normalised
-from octasplat.engine.run_folder import CACHE, CONFIG, EVENTS, POSES
-from octasplat.engine.versions import versions
-from octasplat.engine.writing import write_json
+from octasplat.engine.runs.config import ReconstructionConfig, read_config
+from octasplat.engine.runs.run_folder import CACHE, CONFIG, EVENTS, POSES
 
 
 def claim_output(scene: Path, output: Path, config: ReconstructionConfig, resume: bool) -> bool:

@@ -4,10 +4,10 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from octasplat.engine.config import ReconstructionConfig
+from octasplat.engine.core.errors import CheckpointError
+from octasplat.engine.core.events import JsonLinesListener, Listener, RunFinished, broadcast
+from octasplat.engine.core.threads import use_threads
 from octasplat.engine.dataset.views_file import ViewsRecord, read_views
-from octasplat.engine.errors import CheckpointError
-from octasplat.engine.events import JsonLinesListener, Listener, RunFinished, broadcast
 from octasplat.engine.files import check_writable
 from octasplat.engine.pipeline.dataset_steps import FindPoses, OpenDataset
 from octasplat.engine.pipeline.output_folder import claim_output, release_on_refusal
@@ -15,8 +15,8 @@ from octasplat.engine.pipeline.result_steps import EvaluateStep, ExportStep
 from octasplat.engine.pipeline.run import OnStep, ReconstructionRun, run_steps
 from octasplat.engine.pipeline.run_lock import lock_run_folder
 from octasplat.engine.pipeline.train_step import TrainStep
-from octasplat.engine.run_folder import CACHE, EVENTS, SCENE, VIEWS
-from octasplat.engine.threads import use_threads
+from octasplat.engine.runs.config import ReconstructionConfig
+from octasplat.engine.runs.run_folder import CACHE, EVENTS, SCENE, VIEWS
 
 DATASET_STEPS = (FindPoses(), OpenDataset())
 """The steps that may refuse the photographs or the settings."""

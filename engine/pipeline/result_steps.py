@@ -1,15 +1,15 @@
 """The steps after the training: the scene is measured, and written in other formats."""
 
-from octasplat.engine.errors import ExportFailed
-from octasplat.engine.evaluate.runs import measure_run
-from octasplat.engine.events import StageProgress, Warned
+from octasplat.engine.core.errors import ExportFailed
+from octasplat.engine.core.events import StageProgress, Warned
+from octasplat.engine.core.progress import stage
+from octasplat.engine.evaluate.run_evaluation import measure_run
 from octasplat.engine.files import ExportOptions, dropped_on_export, read_metadata
 from octasplat.engine.files.export_batch import export_batch, targets_with_known_format
 from octasplat.engine.files.gaussian_ply import read_gaussian_ply
 from octasplat.engine.pipeline.run import ReconstructionRun
-from octasplat.engine.plain_colours import PlainScene
-from octasplat.engine.run_folder import METRICS, REPORT, SCENE, not_exported
-from octasplat.engine.stages import stage
+from octasplat.engine.runs.baked_scene import PlainScene
+from octasplat.engine.runs.run_folder import METRICS, REPORT, SCENE, not_exported
 
 
 class EvaluateStep:

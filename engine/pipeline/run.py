@@ -6,11 +6,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol, runtime_checkable
 
-from octasplat.engine.config import ReconstructionConfig
+from octasplat.engine.core.errors import Cancelled, ExportFailed
+from octasplat.engine.core.events import Listener
 from octasplat.engine.dataset import Dataset
 from octasplat.engine.dataset.views_file import ViewsRecord
-from octasplat.engine.errors import Cancelled, ExportFailed
-from octasplat.engine.events import Listener
+from octasplat.engine.runs.config import ReconstructionConfig
 from octasplat.engine.shading.protocol import ShadingModel
 from octasplat.engine.trace.protocol import Tracer
 

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from octasplat.engine.errors import OutputError
+from octasplat.engine.core.errors import OutputError
 
 _LOCKED_MESSAGE = frozenset({errno.EAGAIN, errno.EACCES})
 

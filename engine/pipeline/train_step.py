@@ -6,11 +6,13 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float64
 
-from octasplat.engine.config import ReconstructionConfig
+from octasplat.engine.core.events import Listener, Warned
+from octasplat.engine.core.progress import StageClock, stage
+from octasplat.engine.core.threads import use_threads
+from octasplat.engine.core.writing import write_json
 from octasplat.engine.dataset import Dataset
 from octasplat.engine.dataset.camera_clearance import CameraClearance, camera_clearances
 from octasplat.engine.dataset.view_frusta import ViewFrusta
-from octasplat.engine.events import Listener, Warned
 from octasplat.engine.files.gaussian_ply import write_gaussian_ply
 from octasplat.engine.gaussians.materials import reflective_fraction
 from octasplat.engine.gaussians.model import FlatGaussians
@@ -18,7 +20,8 @@ from octasplat.engine.gaussians.scene_metadata import SceneMetadata
 from octasplat.engine.pipeline.run import ReconstructionRun
 from octasplat.engine.render.environment_files import write_background, write_environment
 from octasplat.engine.render.shots import training_pixel_angle
-from octasplat.engine.run_folder import (
+from octasplat.engine.runs.config import ReconstructionConfig
+from octasplat.engine.runs.run_folder import (
     BACKGROUND,
     CHECKPOINTS,
     ENVIRONMENT,
@@ -28,19 +31,16 @@ from octasplat.engine.run_folder import (
     TRAINING,
 )
 from octasplat.engine.shading.protocol import ShadingModel
-from octasplat.engine.stages import StageClock, stage
-from octasplat.engine.threads import use_threads
-from octasplat.engine.train.checkpoint import newest_state
 from octasplat.engine.train.config import TrainConfig, iteration_count
-from octasplat.engine.train.exposure_changes import with_exposure_decided
-from octasplat.engine.train.fingerprint import run_fingerprint
-from octasplat.engine.train.first_state import first_state
-from octasplat.engine.train.floors import ScaleFloor
-from octasplat.engine.train.shading import background_of, deferred_of, exposures_of
-from octasplat.engine.train.shown import shown_share
-from octasplat.engine.train.trainer import Trainer
-from octasplat.engine.train.within import make_plan, read_plan, write_plan
-from octasplat.engine.writing import write_json
+from octasplat.engine.train.initialization.first_state import first_state
+from octasplat.engine.train.loop.checkpoint import newest_state
+from octasplat.engine.train.loop.fingerprint import run_fingerprint
+from octasplat.engine.train.loop.floors import ScaleFloor
+from octasplat.engine.train.loop.time_budget import make_plan, read_plan, write_plan
+from octasplat.engine.train.loop.trainer import Trainer
+from octasplat.engine.train.sampling.shown import shown_share
+from octasplat.engine.train.shading_factory import background_of, deferred_of, exposures_of
+from octasplat.engine.train.views.exposure_changes import with_exposure_decided
 
 MIN_REFLECTIVE_SHARE = 0.01
 """Share of the surface that must reflect for materials and the environment to be more than guesses."""

@@ -11,8 +11,8 @@ import sys
 import threading
 from typing import NoReturn
 
-from octasplat.engine.errors import DatasetError
-from octasplat.engine.events import Event
+from octasplat.engine.core.errors import DatasetError
+from octasplat.engine.core.events import Event
 from octasplat.engine.poses.config import FOUND_FOLDER, PoseSearchRequest
 
 _CRASH_SIGNALS = (signal.SIGSEGV, signal.SIGABRT, signal.SIGBUS, signal.SIGFPE, signal.SIGILL)

@@ -5,8 +5,8 @@ from typing import Annotated
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from octasplat.engine.fields import ADVANCED, Unit
-from octasplat.engine.settings import Settings
+from octasplat.engine.settings.base import Settings
+from octasplat.engine.settings.fields import ADVANCED, Unit
 
 FEATURES, MATCHES, MAPPING_STAGE = "features", "matches", "poses"
 """The stages of the search."""

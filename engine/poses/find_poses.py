@@ -13,9 +13,10 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any
 
-from octasplat.engine.errors import Cancelled, DatasetError, PosesCrashed
-from octasplat.engine.events import Event, Listener, StageProgress, StageStarted, event_from, ignore
-from octasplat.engine.isolated_python import python_command
+from octasplat.engine.core.errors import Cancelled, DatasetError, PosesCrashed
+from octasplat.engine.core.events import Event, Listener, StageProgress, StageStarted, event_from, ignore
+from octasplat.engine.core.isolated_python import python_command
+from octasplat.engine.core.writing import write_json
 from octasplat.engine.poses.config import (
     DEFAULT_CONFIG,
     FOUND_FOLDER,
@@ -25,7 +26,6 @@ from octasplat.engine.poses.config import (
     PoseSearchRequest,
 )
 from octasplat.engine.poses.photographs import photographs_in, photographs_sha256
-from octasplat.engine.writing import write_json
 
 _POLL_SECONDS = 0.5
 _HEARTBEAT_SECONDS = 30.0

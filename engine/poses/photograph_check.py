@@ -5,8 +5,8 @@ from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
+from octasplat.engine.core.errors import DatasetError
 from octasplat.engine.dataset.images import read_image_info, read_photo
-from octasplat.engine.errors import DatasetError
 
 DECODING_BYTES = 2 << 30
 """Memory that decoding threads may take together; one thread always runs."""

@@ -5,10 +5,10 @@ import os
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
+from octasplat.engine.core.errors import DatasetError
 from octasplat.engine.dataset.masks import masks_beside
-from octasplat.engine.errors import DatasetError
+from octasplat.engine.dataset.results_among import is_results
 from octasplat.engine.poses.config import MIN_PHOTOGRAPHS
-from octasplat.engine.results_among import is_results
 
 _SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp"})
 

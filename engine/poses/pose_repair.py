@@ -6,9 +6,10 @@ from typing import Any
 import numpy as np
 import pycolmap
 
+from octasplat.engine.core.errors import DatasetError
+from octasplat.engine.core.events import Listener
+from octasplat.engine.core.writing import write_json
 from octasplat.engine.dataset.images import read_image_info
-from octasplat.engine.errors import DatasetError
-from octasplat.engine.events import Listener
 from octasplat.engine.poses.config import (
     FEATURES,
     FOUND_FOLDER,
@@ -30,7 +31,6 @@ from octasplat.engine.poses.pose_estimation import (
     is_explained_by_pose,
 )
 from octasplat.engine.poses.workspace import link_photographs, progress_stage
-from octasplat.engine.writing import write_json
 
 
 def repair_misplaced(request: PoseSearchRequest, given: GivenModel, progress: Listener) -> None:

@@ -16,11 +16,11 @@ from typing import Any
 import numpy as np
 import pycolmap
 
-from octasplat.engine.events import Listener
+from octasplat.engine.core.events import Listener
+from octasplat.engine.core.writing import write_json
 from octasplat.engine.poses.config import FOUND_FOLDER, LENSES_STAGE, RECORD_FILE, PoseSearchRequest
 from octasplat.engine.poses.lens_check import MIN_OBSERVATIONS
 from octasplat.engine.poses.workspace import progress_stage
-from octasplat.engine.writing import write_json
 
 MIN_GAIN = 0.15
 """The reprojection error must fall by this share, or the given model stays."""

@@ -8,10 +8,11 @@ from typing import Any
 
 import pycolmap
 
+from octasplat.engine.core.errors import DatasetError
+from octasplat.engine.core.events import Listener, Warned
+from octasplat.engine.core.writing import write_json
 from octasplat.engine.dataset.image_info import ImageInfo
 from octasplat.engine.dataset.images import read_image_info
-from octasplat.engine.errors import DatasetError
-from octasplat.engine.events import Listener, Warned
 from octasplat.engine.poses.ambiguous_structure import count_pair_inliers, find_false_pairs, remove_pairs
 from octasplat.engine.poses.config import (
     FEATURES,
@@ -34,7 +35,6 @@ from octasplat.engine.poses.features import (
 from octasplat.engine.poses.incremental_mapping import map_photographs, model_rank
 from octasplat.engine.poses.pairs import Pair, all_pairs, pairs_with
 from octasplat.engine.poses.workspace import link_photographs, progress_stage
-from octasplat.engine.writing import write_json
 
 MIN_RECOMMENDED_SIDE_PX = 480
 """Below this, what COLMAP finds was seen to be wrong without any sign of it."""

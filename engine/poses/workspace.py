@@ -4,8 +4,8 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
-from octasplat.engine.events import Listener
-from octasplat.engine.stages import counted_stage
+from octasplat.engine.core.events import Listener
+from octasplat.engine.core.progress import counted_stage
 
 
 def link_photographs(images: Path, names: Sequence[str], folder: Path) -> tuple[str, ...]:

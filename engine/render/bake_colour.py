@@ -12,10 +12,10 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float, Float32, Float64
 
+from octasplat.engine.core.rays import ImageRays, RayBatch
 from octasplat.engine.gaussians.channels import Channels
 from octasplat.engine.gaussians.model import SH_C0, FlatGaussians
 from octasplat.engine.gaussians.spherical_harmonics import sh_basis
-from octasplat.engine.rays import ImageRays, RayBatch
 from octasplat.engine.render.renderer import tile_order
 from octasplat.engine.trace.protocol import TraceGradients, Tracer
 

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32
 
-from octasplat.engine.colour import linear_to_srgb, srgb_to_linear
-from octasplat.engine.errors import ConfigError, DatasetError
+from octasplat.engine.core.color import linear_to_srgb, srgb_to_linear
+from octasplat.engine.core.errors import ConfigError, DatasetError
 from octasplat.engine.render.image_files import read_image, write_exr, write_rgbe
 
 MAX_PIXELS = 1 << 27

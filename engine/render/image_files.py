@@ -12,9 +12,9 @@ import numpy as np
 import OpenImageIO as oiio
 from jaxtyping import Float32
 
-from octasplat.engine.colour import srgb_to_linear, to_bytes
-from octasplat.engine.errors import DatasetError, OutputError
-from octasplat.engine.writing import replacing
+from octasplat.engine.core.color import srgb_to_linear, to_bytes
+from octasplat.engine.core.errors import DatasetError, OutputError
+from octasplat.engine.core.writing import replacing
 
 _RAW_CONFIG = "oiio:UnassociatedAlpha"
 """Keeps OpenImageIO from multiplying or dividing colours by alpha on its own."""

@@ -4,13 +4,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from octasplat.engine.errors import ConfigError
-from octasplat.engine.events import ImagesKept, Listener
+from octasplat.engine.core.errors import ConfigError
+from octasplat.engine.core.events import ImagesKept, Listener
+from octasplat.engine.core.progress import counted_stage
 from octasplat.engine.render.file_names import IMAGE_SUFFIXES, has_number_pattern
 from octasplat.engine.render.resume import RECORD_FILE, FinishedImages
 from octasplat.engine.render.series import film_files, render_series, render_video
 from octasplat.engine.render.shots import RenderFn, Shot
-from octasplat.engine.stages import counted_stage
 
 
 @dataclass(frozen=True)

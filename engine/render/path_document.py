@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from octasplat.engine.errors import ConfigError
+from octasplat.engine.core.errors import ConfigError
 
 MAX_FRAMES = 100_000
 _RIGID_TOLERANCE = 1e-3

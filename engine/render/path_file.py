@@ -6,11 +6,11 @@ from pathlib import Path
 
 import numpy as np
 
-from octasplat.engine.errors import ConfigError, OutputError
+from octasplat.engine.core.errors import ConfigError, OutputError
+from octasplat.engine.core.writing import write_json
 from octasplat.engine.render.path_document import PathDocument, PathFrame, read_path_document
 from octasplat.engine.render.pinhole_camera import PinholeCamera, focal_from_fov
 from octasplat.engine.render.pose_paths import PosePath
-from octasplat.engine.writing import write_json
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Float64
 
-from octasplat.engine.rays import ImageRays
+from octasplat.engine.core.rays import ImageRays
 
 
 @dataclass(frozen=True)

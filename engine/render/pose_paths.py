@@ -10,7 +10,7 @@ from jaxtyping import Float64
 from scipy.interpolate import CubicHermiteSpline
 from scipy.spatial.transform import Rotation, RotationSpline
 
-from octasplat.engine.errors import ConfigError
+from octasplat.engine.core.errors import ConfigError
 
 _WRAPPED_KEYS = 3
 """How many keys of a closed path are repeated before and after it, so that its ends join smoothly."""

@@ -10,7 +10,7 @@ import numpy as np
 from pydantic import BaseModel
 
 from octasplat.engine import __version__
-from octasplat.engine.settings import Settings, json_by_former_names
+from octasplat.engine.settings.base import Settings, json_by_former_names
 
 
 def render_digest(*parts: Any) -> str:

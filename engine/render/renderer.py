@@ -6,9 +6,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float32, Float64, Int32, Int64
 
+from octasplat.engine.core.hashing import unit_numbers
+from octasplat.engine.core.rays import ImageRays, RayBatch
 from octasplat.engine.gaussians.model import FlatGaussians
-from octasplat.engine.hashing import unit_numbers
-from octasplat.engine.rays import ImageRays, RayBatch
 from octasplat.engine.shading.plain import PLAIN
 from octasplat.engine.shading.protocol import ShadingModel, Sight
 from octasplat.engine.trace import ray_hits

@@ -8,8 +8,8 @@ import hashlib
 import json
 from pathlib import Path
 
-from octasplat.engine.errors import ConfigError, OutputError
-from octasplat.engine.writing import telling_of_room, write_text
+from octasplat.engine.core.errors import ConfigError, OutputError
+from octasplat.engine.core.writing import telling_of_room, write_text
 
 RECORD_FILE = "unfinished.jsonl"
 

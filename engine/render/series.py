@@ -7,12 +7,12 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32
 
-from octasplat.engine.errors import OutputError
+from octasplat.engine.core.errors import OutputError
+from octasplat.engine.core.progress import Count
 from octasplat.engine.render.image_files import read_image
 from octasplat.engine.render.resume import FinishedImages
 from octasplat.engine.render.shots import RenderFn, Shot
 from octasplat.engine.render.video import VideoWriter
-from octasplat.engine.stages import Count
 
 VIDEO_FILE = "film.mp4"
 """Name of a film among its frames while it is written."""

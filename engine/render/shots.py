@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32, Float64, Int64
 
+from octasplat.engine.core.rays import ImageRays
 from octasplat.engine.dataset import Camera, PosedView, Viewpoints
 from octasplat.engine.gaussians.model import FlatGaussians
-from octasplat.engine.rays import ImageRays
 from octasplat.engine.render.file_names import unique_render_names
 from octasplat.engine.render.framing import fitting_distance, visible_bounds
 from octasplat.engine.render.image_files import exr_layers, write_exr, write_png
@@ -43,7 +43,7 @@ class Shot:
 RenderFn = Callable[[Shot, Path, Callable[[float], None]], None]
 """Renders a shot and writes it to a file, whose suffix says the format; told the share that is done.
 
-It raises :class:`octasplat.engine.errors.OutputError` where the file cannot be written.
+It raises :class:`octasplat.engine.core.errors.OutputError` where the file cannot be written.
 """
 
 

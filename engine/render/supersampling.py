@@ -7,8 +7,8 @@ from itertools import product
 import numpy as np
 from jaxtyping import Float32
 
-from octasplat.engine.colour import linear_to_srgb
-from octasplat.engine.rays import ImageRays
+from octasplat.engine.core.color import linear_to_srgb
+from octasplat.engine.core.rays import ImageRays
 from octasplat.engine.render.renderer import (
     RenderedImage,
     background_colour,

@@ -14,9 +14,9 @@ import imageio_ffmpeg
 import numpy as np
 from jaxtyping import Float32
 
-from octasplat.engine.colour import to_bytes
-from octasplat.engine.errors import OutputError
-from octasplat.engine.writing import replacing
+from octasplat.engine.core.color import to_bytes
+from octasplat.engine.core.errors import OutputError
+from octasplat.engine.core.writing import replacing
 
 DEFAULT_CRF = 18
 

@@ -12,22 +12,22 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float32, Float64, Int64
 
-from octasplat.engine.colour import linear_to_srgb, srgb_to_linear
+from octasplat.engine.core.color import linear_to_srgb, srgb_to_linear
+from octasplat.engine.core.rays import RayBatch
 from octasplat.engine.gaussians.channels import stack_channels
 from octasplat.engine.gaussians.materials import AMBIENT, DIFFUSE_INTERREFLECTION, MATERIAL_WIDTHS
 from octasplat.engine.gaussians.model import FlatGaussians
-from octasplat.engine.rays import RayBatch
-from octasplat.engine.shading.ambient import OPEN, ambient_visibility, bounced_light
-from octasplat.engine.shading.buffer import Buffer, Leaving, gather, spread_back
+from octasplat.engine.shading.ambient_occlusion import OPEN, ambient_visibility, bounced_light
+from octasplat.engine.shading.depth_split import Parted, part, whole
 from octasplat.engine.shading.environment_frame import environment_frame
-from octasplat.engine.shading.geometry_terms import neighbour_terms, spread_term
-from octasplat.engine.shading.incoming import ByLobes, ByOneRay, Incoming
-from octasplat.engine.shading.learnt_light import LearntLight
+from octasplat.engine.shading.environment_light import LearntLight
+from octasplat.engine.shading.gbuffer import Buffer, Leaving, gather, spread_back
+from octasplat.engine.shading.geometry_losses import neighbour_terms, spread_term
+from octasplat.engine.shading.gradient_ops import clipped, encoding_slope
+from octasplat.engine.shading.incident_light import ByLobes, ByOneRay, Incoming
 from octasplat.engine.shading.material_settings import ENVIRONMENT_RATE, SEED_MATERIAL, MaterialSettings
-from octasplat.engine.shading.parted import Parted, part, whole
 from octasplat.engine.shading.protocol import Developed, Reversed, Sight
-from octasplat.engine.shading.reflections import Follower
-from octasplat.engine.shading.slopes import clipped, encoding_slope
+from octasplat.engine.shading.reflection_tracing import Follower
 from octasplat.engine.shading.split_sum import Surface, shade, shade_reverse
 from octasplat.engine.trace.protocol import GaussianGradients, TraceGradients, Tracer, TraceResult
 

@@ -12,8 +12,8 @@ import numpy as np
 from jaxtyping import Float, Float32, Float64, Int32, Int64
 from scipy.sparse import csr_matrix
 
-from octasplat.engine.errors import ConfigError
-from octasplat.engine.shading.kernels_levels import lobe_rows, sparse_product
+from octasplat.engine.core.errors import ConfigError
+from octasplat.engine.shading.kernels.environment_levels import lobe_rows, sparse_product
 
 ROUGHNESSES = (0.05, 0.15, 0.3, 0.5, 0.75, 1.0)
 """Perceptual roughness of each level; the first is the map itself."""

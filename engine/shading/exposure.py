@@ -4,7 +4,7 @@ A phone sets its exposure anew for every photograph. Without a model of that, Ga
 different from where each photograph was taken. The scene keeps the exposure that is the mean of all.
 
 Nothing is fitted to views that were not trained on: their exposure is guessed from what they show of the
-scene and from the photographs beside them (:mod:`octasplat.engine.shading.exposure_guess`).
+scene and from the photographs beside them (:mod:`octasplat.engine.shading.exposure_estimation`).
 """
 
 import copy
@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float32, Float64, Int64
 
 from octasplat.engine.gaussians.model import FlatGaussians
-from octasplat.engine.shading.exposure_guess import guessed, times_of
+from octasplat.engine.shading.exposure_estimation import guessed, times_of
 from octasplat.engine.shading.plain import PLAIN
 from octasplat.engine.shading.protocol import Developed, Reversed, ShadingModel, Sight
 from octasplat.engine.trace.protocol import GaussianGradients, Tracer
@@ -98,7 +98,7 @@ class Exposures:
     def guess_others(self, names: Sequence[str], brightness: Float64[np.ndarray, " v"] | None = None) -> None:
         """Give views that were not trained on the exposures that the trained ones suggest.
 
-        See :mod:`octasplat.engine.shading.exposure_guess`.
+        See :mod:`octasplat.engine.shading.exposure_estimation`.
 
         Args:
             names: of all views.

@@ -4,9 +4,9 @@ from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field
 
-from octasplat.engine import renamed_settings
-from octasplat.engine.fields import ADVANCED, EXPERIMENTAL, Unit
-from octasplat.engine.settings import FormerSetting, Settings
+from octasplat.engine.settings import renamed_settings
+from octasplat.engine.settings.base import FormerSetting, Settings
+from octasplat.engine.settings.fields import ADVANCED, EXPERIMENTAL, Unit
 
 SEED_SECOND_STAGE = 0.36
 """Share of the training after which the seed's code begins deferred shading, with materials as at first."""

@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float, Float64, Int32
 
 from octasplat.engine.shading.environment_levels import LightLevels
-from octasplat.engine.shading.kernels_split_sum import (
+from octasplat.engine.shading.kernels.split_sum import (
     TAPS,
     add_to_texels,
     integrate_table,

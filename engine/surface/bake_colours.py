@@ -6,8 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float32, Float64
 
+from octasplat.engine.core.rays import RayBatch
 from octasplat.engine.geometry.triangle_mesh import TriangleMesh
-from octasplat.engine.rays import RayBatch
 from octasplat.engine.render.pinhole_camera import PinholeCamera
 from octasplat.engine.surface.occlusion import Occluder
 from octasplat.engine.trace.protocol import Tracer, TraceResult

@@ -3,7 +3,7 @@
 import numpy as np
 from jaxtyping import Bool, Float32, Float64
 
-from octasplat.engine.colour import linear_to_srgb, to_bytes
+from octasplat.engine.core.color import linear_to_srgb, to_bytes
 from octasplat.engine.gaussians.materials import AMBIENT, MATERIAL_WIDTHS
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.geometry.triangle_mesh import MaterialMaps, TriangleMesh

@@ -13,8 +13,8 @@ import numpy as np
 from jaxtyping import Bool, Float32, Int, Int32, UInt8
 from scipy.sparse import csr_matrix, identity
 
+from octasplat.engine.core.rays import ImageRays
 from octasplat.engine.geometry.triangle_mesh import TriangleMesh, unique_edges
-from octasplat.engine.rays import ImageRays
 from octasplat.engine.surface.least_squares import (
     conjugate_gradients,
     difference_matrix,

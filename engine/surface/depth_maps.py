@@ -10,14 +10,14 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32, UInt8
 
-from octasplat.engine.colour import to_bytes
-from octasplat.engine.rays import ImageRays
+from octasplat.engine.core.color import to_bytes
+from octasplat.engine.core.rays import ImageRays
+from octasplat.engine.core.writing import telling_of_room
 from octasplat.engine.render.pinhole_camera import PinholeCamera
 from octasplat.engine.render.renderer import RenderedImage, render_rays
 from octasplat.engine.surface.colour_fit import Picture
 from octasplat.engine.surface.options import ExtractionOptions
 from octasplat.engine.trace.protocol import Tracer
-from octasplat.engine.writing import telling_of_room
 
 Progress = Callable[[int, int], None]
 EMPTY_ALPHA = 0.05

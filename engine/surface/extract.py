@@ -8,11 +8,11 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64
 from scipy.spatial import cKDTree
 
-from octasplat.engine.colour import to_bytes
-from octasplat.engine.events import Listener, ignore
+from octasplat.engine.core.color import to_bytes
+from octasplat.engine.core.events import Listener, ignore
+from octasplat.engine.core.progress import counted_stage, stopping
 from octasplat.engine.geometry.triangle_mesh import EdgeReport, TriangleMesh, edge_report
 from octasplat.engine.render.pinhole_camera import PinholeCamera
-from octasplat.engine.stages import counted_stage, stopping
 from octasplat.engine.surface.backdrop import with_backdrop
 from octasplat.engine.surface.bake_colours import COLOUR_TARGET, BakeTarget, bake
 from octasplat.engine.surface.bake_materials import MATERIAL_TARGET, with_materials

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from octasplat.engine.errors import ConfigError
+from octasplat.engine.core.errors import ConfigError
 from octasplat.engine.geometry.triangle_mesh import TriangleMesh
 from octasplat.engine.surface.kernels.marching_cubes import (
     count_block_elements,

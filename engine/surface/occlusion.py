@@ -3,8 +3,8 @@
 import numpy as np
 from jaxtyping import Bool, Float
 
+from octasplat.engine.core.rays import RayBatch
 from octasplat.engine.geometry.triangle_mesh import TriangleMesh
-from octasplat.engine.rays import RayBatch
 from octasplat.engine.trace.triangle_bvh import TriangleBvh
 
 OFFSET_RATIO = 1e-3

@@ -4,7 +4,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, field_validator
 
-from octasplat.engine.fields import Group, Spelling, Unit
+from octasplat.engine.settings.fields import Group, Spelling, Unit
 
 Box = tuple[float, float, float, float, float, float]
 _SAID = Spelling(negatable=True)

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float, Float64
 
-from octasplat.engine.errors import ConfigError
+from octasplat.engine.core.errors import ConfigError
 from octasplat.engine.render.pinhole_camera import PinholeCamera
 from octasplat.engine.render.pose_paths import fit_turntable
 from octasplat.engine.surface.depth_maps import DepthMaps

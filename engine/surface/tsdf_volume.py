@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float32, Int32
 
-from octasplat.engine.errors import ConfigError
+from octasplat.engine.core.errors import ConfigError
 from octasplat.engine.surface.depth_maps import DepthMaps, Progress
 from octasplat.engine.surface.kernels.tsdf import (
     NO_BLOCK,

@@ -13,8 +13,8 @@ from jaxtyping import Bool, Float32, Int32, UInt8
 from scipy.ndimage import maximum_filter, minimum_filter
 from scipy.sparse import csr_matrix
 
+from octasplat.engine.core.rays import ImageRays, RayBatch
 from octasplat.engine.geometry.triangle_mesh import TriangleMesh
-from octasplat.engine.rays import ImageRays, RayBatch
 from octasplat.engine.surface.colour_fit import MIN_ALPHA, Picture, Progress, VertexPalette
 from octasplat.engine.surface.kernels.vertex_refinement import (
     apply_jacobian,

@@ -10,7 +10,7 @@ from functools import cache
 import numpy as np
 from jaxtyping import Float, Int
 
-from octasplat.engine.errors import OctasplatError
+from octasplat.engine.core.errors import OctasplatError
 
 _GEOMETRY_TYPE_TRIANGLE, _GEOMETRY_TYPE_USER = 0, 120
 _SCENE_ROBUST = 4

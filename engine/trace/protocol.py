@@ -7,12 +7,12 @@ import numpy as np
 from jaxtyping import Float32, Int32
 from pydantic import Field
 
-from octasplat.engine import renamed_settings
-from octasplat.engine.fields import ADVANCED, EXPERIMENTAL, Unit
+from octasplat.engine.core.rays import RayBatch
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.gaussians.octagon import CHI2_2_99
-from octasplat.engine.rays import RayBatch
-from octasplat.engine.settings import FormerSetting, Settings
+from octasplat.engine.settings import renamed_settings
+from octasplat.engine.settings.base import FormerSetting, Settings
+from octasplat.engine.settings.fields import ADVANCED, EXPERIMENTAL, Unit
 
 
 class TraceSettings(Settings):
@@ -223,7 +223,7 @@ class Tracer(Protocol):
         """Follow rays with unit directions; ``record`` keeps what :meth:`backward` needs.
 
         A Gaussian is seen where ``t_min < t < t_max``, in its colour as the ray's viewer has it (``t_viewer``
-        of :class:`octasplat.engine.rays.RayBatch`).
+        of :class:`octasplat.engine.core.rays.RayBatch`).
         """
         ...
 

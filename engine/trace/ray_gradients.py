@@ -10,9 +10,9 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float32, Float64
 
+from octasplat.engine.core.rays import RayBatch
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.gaussians.spherical_harmonics import sh_basis, sh_basis_gradients
-from octasplat.engine.rays import RayBatch
 from octasplat.engine.trace.protocol import Recording, TraceGradients, TraceSettings
 from octasplat.engine.trace.ray_hits import RayHits, batched_ray_hits
 

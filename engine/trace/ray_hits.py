@@ -6,9 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float64, Int32, Int64
 
+from octasplat.engine.core.rays import RayBatch
 from octasplat.engine.gaussians.frames import rotation_matrices
 from octasplat.engine.gaussians.model import FlatGaussians
-from octasplat.engine.rays import RayBatch
 from octasplat.engine.trace.protocol import Recording, TraceSettings
 
 HITS_PER_BATCH = 1 << 18

@@ -12,9 +12,9 @@ import torch
 from jaxtyping import Int64
 from torch import Tensor
 
+from octasplat.engine.core.rays import RayBatch
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.gaussians.octagon import APOTHEM
-from octasplat.engine.rays import RayBatch
 from octasplat.engine.trace.protocol import TraceSettings
 
 GRAZING_COSINE = 1e-6

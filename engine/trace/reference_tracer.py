@@ -7,8 +7,8 @@ import torch
 from jaxtyping import Float32, Float64, Int32
 from torch import Tensor
 
+from octasplat.engine.core.rays import RayBatch
 from octasplat.engine.gaussians.model import FlatGaussians
-from octasplat.engine.rays import RayBatch
 from octasplat.engine.trace.gradient_sums import drop_low_weight
 from octasplat.engine.trace.protocol import (
     GaussianGradients,

@@ -6,8 +6,8 @@ import numba
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int, Int32
 
-from octasplat.engine.rays import RayBatch
-from octasplat.engine.threads import use_threads
+from octasplat.engine.core.rays import RayBatch
+from octasplat.engine.core.threads import use_threads
 from octasplat.engine.trace.cpu.memory import aligned_empty
 from octasplat.engine.trace.embree import (
     EmbreeDevice,

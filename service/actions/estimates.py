@@ -1,7 +1,7 @@
 """What a job would take, before it is asked for."""
 
+from octasplat.engine.dataset.image_sizes import Sizes
 from octasplat.engine.operations.cost_model import Estimate
-from octasplat.engine.photograph_sizes import Sizes
 from octasplat.service.actions.validation import input_problem, resolve_options, validate_kind
 from octasplat.service.auth import Principal
 from octasplat.service.job_limits import check_job_limits, estimate_job

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from pydantic import ValidationError
 
-from octasplat.engine.errors import ConfigError
+from octasplat.engine.core.errors import ConfigError
 from octasplat.service.actions.access import owned_job
 from octasplat.service.actions.pages import Page, page_of
 from octasplat.service.auth import Principal

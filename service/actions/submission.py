@@ -6,10 +6,10 @@ from typing import Any
 
 from pydantic import BaseModel, ValidationError
 
-from octasplat.engine.errors import ConfigError
+from octasplat.engine.core.errors import ConfigError
 from octasplat.engine.operations.cost_model import Estimate
-from octasplat.engine.refusals import SettingsRefused
-from octasplat.engine.renamed_settings import collected_notices
+from octasplat.engine.settings.refusals import SettingsRefused
+from octasplat.engine.settings.renamed_settings import collected_notices
 from octasplat.service.actions.access import check_not_draining, owned_job
 from octasplat.service.actions.jobs import job_view
 from octasplat.service.actions.named_files import check_named_files

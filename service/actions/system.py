@@ -3,7 +3,7 @@
 import asyncio
 
 from octasplat.engine import __version__
-from octasplat.engine.errors import ConfigError
+from octasplat.engine.core.errors import ConfigError
 from octasplat.engine.files import exporters
 from octasplat.service.auth import Principal
 from octasplat.service.job_limits import limits_by_path

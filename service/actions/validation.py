@@ -5,8 +5,8 @@ from typing import Any
 
 from pydantic import BaseModel, ValidationError
 
-from octasplat.engine.errors import ConfigError
-from octasplat.engine.refusals import SettingsRefused
+from octasplat.engine.core.errors import ConfigError
+from octasplat.engine.settings.refusals import SettingsRefused
 from octasplat.service.problems import ProblemError, options_error
 from octasplat.workers.worker.job_kinds import JobKind, get_job_kind
 

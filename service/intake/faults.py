@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from octasplat.engine.errors import DatasetError
+from octasplat.engine.core.errors import DatasetError
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from pydantic import ValidationError
 
-from octasplat.engine.isolated_python import python_command
+from octasplat.engine.core.isolated_python import python_command
 from octasplat.service.intake.faults import IntakeFault
 from octasplat.service.intake.model_child import MAX_ANSWER_BYTES, ModelAnswer, ModelRequest
 from octasplat.workers.storage.protocol import Storage

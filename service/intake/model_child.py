@@ -83,9 +83,9 @@ def main() -> None:
 
 def check(request: ModelRequest) -> ModelAnswer:
     """Parse the model and list all that is wrong with it."""
+    from octasplat.engine.core.errors import DatasetError
     from octasplat.engine.dataset.colmap_binary import check_binary_colmap_model
     from octasplat.engine.dataset.colmap_model import find_colmap_model_folder, read_colmap_model
-    from octasplat.engine.errors import DatasetError
 
     checker = _ModelChecker(request)
     try:

@@ -6,8 +6,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal, cast
 
-from octasplat.engine.fields import Level
 from octasplat.engine.files import exporters
+from octasplat.engine.settings.fields import Level
 
 Control = Literal[
     "choice", "yes_no", "whole", "number", "text", "document", "list", "numbers", "json", "files",

@@ -13,7 +13,7 @@ from fastapi.responses import RedirectResponse
 from fastapi.routing import APIRoute
 from psycopg_pool import PoolTimeout
 
-from octasplat.engine.errors import OctasplatError
+from octasplat.engine.core.errors import OctasplatError
 from octasplat.service.problems import ProblemError, not_found_error, problem_from_error
 from octasplat.service.web.templating import render_page
 

@@ -20,7 +20,7 @@ from octasplat.engine import __version__
 
 if TYPE_CHECKING:
     from octasplat.client import Client, Job
-    from octasplat.engine.errors import Cancelled, ConfigError, OctasplatError
+    from octasplat.engine.core.errors import Cancelled, ConfigError, OctasplatError
     from octasplat.engine.render.pinhole_camera import PinholeCamera as Camera
     from octasplat.engine.trace.protocol import TraceSettings
     from octasplat.images import Image
@@ -50,13 +50,13 @@ if TYPE_CHECKING:
 
 _SOURCES = {
     "Camera": ("engine.render.pinhole_camera", "PinholeCamera"),
-    "Cancelled": ("engine.errors", "Cancelled"),
+    "Cancelled": ("engine.core.errors", "Cancelled"),
     "Client": ("client", "Client"),
-    "ConfigError": ("engine.errors", "ConfigError"),
+    "ConfigError": ("engine.core.errors", "ConfigError"),
     "GaussianTensors": ("tracing", "GaussianTensors"),
     "Image": ("images", "Image"),
     "Job": ("client", "Job"),
-    "OctasplatError": ("engine.errors", "OctasplatError"),
+    "OctasplatError": ("engine.core.errors", "OctasplatError"),
     "Rays": ("tracing", "Rays"),
     "Run": ("runs", "Run"),
     "Scene": ("scenes", "Scene"),

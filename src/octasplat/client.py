@@ -7,8 +7,8 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Literal, cast
 
-from octasplat.engine.errors import ConfigError
-from octasplat.engine.events import Listener
+from octasplat.engine.core.errors import ConfigError
+from octasplat.engine.core.events import Listener
 from octasplat.notebook import default_progress, table_html
 from octasplat.paths import PathLike
 from octasplat.workers.client import submission

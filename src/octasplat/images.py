@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 from jaxtyping import Float32, Int32
 
-from octasplat.engine.rays import ImageRays
+from octasplat.engine.core.rays import ImageRays
 from octasplat.engine.render.pinhole_camera import PinholeCamera
 from octasplat.operation_calls import names_checked
 from octasplat.paths import PathLike
@@ -91,7 +91,7 @@ class Image:
 
         from PIL import Image as Picture
 
-        from octasplat.engine.colour import to_bytes
+        from octasplat.engine.core.color import to_bytes
 
         memory = BytesIO()
         Picture.fromarray(to_bytes(self.rgb)).save(memory, "PNG")

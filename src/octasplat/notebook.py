@@ -7,7 +7,7 @@ import time
 from collections.abc import Mapping
 from typing import Any
 
-from octasplat.engine.events import (
+from octasplat.engine.core.events import (
     Event,
     Listener,
     Noted,

@@ -9,14 +9,14 @@ from typing import Any, ParamSpec, TypeVar
 
 from pydantic import BaseModel
 
-from octasplat.engine.errors import ConfigError
-from octasplat.engine.events import Listener
-from octasplat.engine.fields import is_negatable
-from octasplat.engine.nearest_names import nearest_name
+from octasplat.engine.core.errors import ConfigError
+from octasplat.engine.core.events import Listener
 from octasplat.engine.operations.base import build_request
 from octasplat.engine.operations.registry import operation
 from octasplat.engine.operations.written_files import remember_written
-from octasplat.engine.renamed_settings import with_new_names
+from octasplat.engine.settings.fields import is_negatable
+from octasplat.engine.settings.nearest_names import nearest_name
+from octasplat.engine.settings.renamed_settings import with_new_names
 from octasplat.notebook import default_progress
 
 P = ParamSpec("P")
@@ -30,7 +30,7 @@ class UnknownOption(ConfigError, TypeError):
 def names_checked(function: Callable[P, R]) -> Callable[P, R]:
     """Return the function, which refuses an option that it does not have and offers the nearest name.
 
-    Names of the last version are read, see :mod:`octasplat.engine.renamed_settings`.
+    Names of the last version are read, see :mod:`octasplat.engine.settings.renamed_settings`.
 
     Raises:
         UnknownOption: when it is called with one.

@@ -6,8 +6,8 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from octasplat.engine.errors import Cancelled, ConfigError
-from octasplat.engine.events import Event, Listener, TrainingProgress
+from octasplat.engine.core.errors import Cancelled, ConfigError
+from octasplat.engine.core.events import Event, Listener, TrainingProgress
 from octasplat.notebook import default_progress, table_html
 from octasplat.operation_calls import explicit_values, run_operation
 from octasplat.paths import PathLike
@@ -112,8 +112,8 @@ class Run:
     @property
     def settings(self) -> Mapping[str, Any]:
         """All settings."""
-        from octasplat.engine.config import ReconstructionConfig
-        from octasplat.engine.renamed_settings import with_new_names
+        from octasplat.engine.runs.config import ReconstructionConfig
+        from octasplat.engine.settings.renamed_settings import with_new_names
 
         path = self.path / _CONFIG
         found: Mapping[str, Any] = _read_json(path).get("reconstruction", {})

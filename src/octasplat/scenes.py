@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Float, Float32, Float64
 
-from octasplat.engine.errors import ConfigError
+from octasplat.engine.core.errors import ConfigError
 from octasplat.engine.gaussians.channels import Channels
 from octasplat.engine.gaussians.flattening import MAX_LOGIT
 from octasplat.engine.gaussians.model import FlatGaussians

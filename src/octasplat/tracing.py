@@ -11,9 +11,9 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.autograd.function import FunctionCtx, once_differentiable
 
+from octasplat.engine.core.rays import RayBatch
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.gaussians.scene_metadata import UNKNOWN_METADATA, SceneMetadata
-from octasplat.engine.rays import RayBatch
 from octasplat.engine.render.pinhole_camera import PinholeCamera
 from octasplat.engine.trace.factory import make_tracer
 from octasplat.engine.trace.protocol import TraceGradients, Tracer, TraceSettings

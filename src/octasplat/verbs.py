@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Literal, TypedDict
 
 from pydantic import BaseModel
 
-from octasplat.engine.events import Listener
+from octasplat.engine.core.events import Listener
 from octasplat.engine.operations.base import never_stop
 from octasplat.operation_calls import names_checked, run_operation
 from octasplat.paths import PathLike

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from octasplat.engine.files.gaussian_ply import write_gaussian_ply
-from octasplat.engine.run_folder import CONFIG, is_run, run_viewpoints
+from octasplat.engine.runs.run_folder import CONFIG, is_run, run_viewpoints
 from octasplat.paths import PathLike
 from octasplat.runs import Run
 from octasplat.scenes import Scene, load

@@ -14,7 +14,7 @@ import pytest
 import octasplat as osp
 import octasplat.client
 from octasplat.client import JobFailedError, ServiceError, ServiceUnreachableError
-from octasplat.engine.events import Event, StageStarted
+from octasplat.engine.core.events import Event, StageStarted
 from octasplat.workers.client.api import find_address, find_token
 from tests.support.postgres_fixtures import short_root
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import octasplat as osp
-from octasplat.engine.events import Event, StageFinished, TrainingProgress
+from octasplat.engine.core.events import Event, StageFinished, TrainingProgress
 from tests.support.small_run import RUN_OPTIONS
 
 
@@ -57,7 +57,7 @@ def test_folder_without_a_run_is_refused(tmp_path: Path) -> None:
 def test_refused_settings_have_the_sentence_of_the_command(
     options: dict[str, Any], photographs: Path, tmp_path: Path
 ) -> None:
-    from octasplat.engine.errors import OctasplatError
+    from octasplat.engine.core.errors import OctasplatError
     from octasplat.engine.operations.reconstruct import options_from_json
 
     with pytest.raises(OctasplatError) as expected:
@@ -103,7 +103,7 @@ def test_notebook_shows_progress_and_ends_with_lines() -> None:
     from IPython.core.interactiveshell import InteractiveShell
     from IPython.utils.capture import capture_output
 
-    from octasplat.engine.events import StageProgress, StageStarted, Warned
+    from octasplat.engine.core.events import StageProgress, StageStarted, Warned
     from octasplat.notebook import NotebookProgress, ProgressLog, default_progress
 
     assert isinstance(default_progress(), ProgressLog)

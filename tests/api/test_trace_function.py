@@ -7,8 +7,8 @@ import pytest
 import torch
 
 import octasplat as osp
+from octasplat.engine.core.rays import RayBatch
 from octasplat.engine.gaussians.scene_metadata import SceneMetadata
-from octasplat.engine.rays import RayBatch
 from octasplat.engine.trace.reference import ReferenceParameters, ReferenceResult, trace_reference
 from tests.support.trace_scenes import make_cloud, rays_inwards, relative_error
 

@@ -11,8 +11,8 @@ from write_verbs import PYTHON_NAMES, VERBS, source
 
 import octasplat as osp
 import octasplat.verbs
-from octasplat.engine.errors import ConfigError
-from octasplat.engine.events import Event, StageProgress, Warned
+from octasplat.engine.core.errors import ConfigError
+from octasplat.engine.core.events import Event, StageProgress, Warned
 from octasplat.engine.operations.base import build_request
 from octasplat.engine.operations.registry import operation, operation_names
 from octasplat.operation_calls import explicit_values

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 import octasplat as osp
-from octasplat.engine.events import TrainingProgress
+from octasplat.engine.core.events import TrainingProgress
 
 
 def stop(step: TrainingProgress) -> bool:

@@ -17,9 +17,9 @@ from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
 from verb_examples import EXAMPLES
 
-from octasplat.engine.fields import Positional, is_negatable
 from octasplat.engine.operations.base import Operation
 from octasplat.engine.operations.registry import operations
+from octasplat.engine.settings.fields import Positional, is_negatable
 
 VERBS = Path(__file__).parents[2] / "src" / "octasplat" / "verbs.py"
 PYTHON_NAMES = {"import": "import_", "stage-init": "stage_init"}
@@ -35,7 +35,7 @@ from typing import TYPE_CHECKING, Any, Literal, TypedDict
 
 from pydantic import BaseModel
 
-from octasplat.engine.events import Listener
+from octasplat.engine.core.events import Listener
 from octasplat.engine.operations.base import never
 from octasplat.operation_calls import names_checked, run_operation
 from octasplat.paths import PathLike

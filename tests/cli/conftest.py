@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 from click.testing import CliRunner, Result
 
-from octasplat.engine.config import resolve_config
 from octasplat.engine.dataset.synthetic import SyntheticDatasetConfig, write_synthetic_dataset
 from octasplat.engine.files.gaussian_ply import read_gaussian_ply, write_gaussian_ply
 from octasplat.engine.gaussians.scene_metadata import SceneMetadata
 from octasplat.engine.render.environment_files import write_environment
+from octasplat.engine.runs.config import resolve_config
 from octasplat.workers.cli.main import cli
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -7,7 +7,7 @@ import numpy as np
 from octasplat.engine.dataset.views_file import read_views
 from octasplat.engine.files.gaussian_ply import read_gaussian_ply, write_gaussian_ply
 from octasplat.engine.gaussians.model import concatenate
-from octasplat.engine.run_folder import run_near_zones
+from octasplat.engine.runs.run_folder import run_near_zones
 
 
 def test_clean_removes_gaussians_near_cameras(run, octasplat, tmp_path):

@@ -8,8 +8,8 @@ import click
 import pytest
 
 from octasplat.engine import __version__
+from octasplat.engine.core.threads import available_threads
 from octasplat.engine.files import exporters
-from octasplat.engine.threads import available_threads
 from octasplat.workers.cli.main import cli
 
 COMMANDS = ("reconstruct", "evaluate", "export", "render", "demo")
@@ -118,7 +118,7 @@ def test_unknown_preset_is_a_usage_error(octasplat, scene, tmp_path):
 
 
 def test_unexpected_error_prints_one_line(octasplat, run, monkeypatch):
-    monkeypatch.setattr("octasplat.engine.evaluate.runs.evaluate", _broken)
+    monkeypatch.setattr("octasplat.engine.evaluate.run_evaluation.evaluate", _broken)
     monkeypatch.delenv("OCTASPLAT_DEBUG", raising=False)
     line = one_error_line(octasplat("evaluate", run.output), code=70)
     assert "ZeroDivisionError" in line and "OCTASPLAT_DEBUG=1" in line
@@ -129,7 +129,7 @@ def test_unexpected_error_prints_one_line(octasplat, run, monkeypatch):
 
 
 def test_interrupted_commands_end_with_130(octasplat, run, monkeypatch):
-    monkeypatch.setattr("octasplat.engine.evaluate.runs.evaluate", _interrupted)
+    monkeypatch.setattr("octasplat.engine.evaluate.run_evaluation.evaluate", _interrupted)
     one_error_line(octasplat("evaluate", run.output), code=130)
 
 
@@ -140,7 +140,7 @@ def test_threads_are_capped_at_the_cores(octasplat, run, monkeypatch):
         asked.append(options["threads"])
         return output / "metrics.json"
 
-    monkeypatch.setattr("octasplat.engine.evaluate.runs.evaluate", evaluate)
+    monkeypatch.setattr("octasplat.engine.evaluate.run_evaluation.evaluate", evaluate)
     assert octasplat("evaluate", run.output, "--threads", "100000").exit_code == 0
     assert octasplat("evaluate", run.output, "--threads", "1").exit_code == 0
     assert asked == [available_threads(), 1]

@@ -7,7 +7,7 @@ from http.server import BaseHTTPRequestHandler, HTTPServer
 
 import pytest
 
-from octasplat.engine.events import StageFinished
+from octasplat.engine.core.events import StageFinished
 from octasplat.workers.client import submission
 from octasplat.workers.client.submission import Derivation, with_camera_path, with_stage
 

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 import trimesh
 
-from octasplat.engine.config import resolve_config
-from octasplat.engine.events import Event, Warned
+from octasplat.engine.core.events import Event, Warned
 from octasplat.engine.render.image_files import read_image
+from octasplat.engine.runs.config import resolve_config
 from octasplat.workers.worker.handlers import reconstruct
 from octasplat.workers.worker.job_kinds import get_job_kind
 from octasplat.workers.worker.task import Task

@@ -6,12 +6,12 @@ import shutil
 import numpy as np
 import pytest
 
-from octasplat.engine.config import read_config
 from octasplat.engine.dataset.views_file import read_views
 from octasplat.engine.edit.run_transform import rotate_environment
 from octasplat.engine.files.gaussian_ply import read_gaussian_ply
 from octasplat.engine.render.environment_files import read_environment, write_background, write_environment
-from octasplat.engine.run_folder import run_near_zones
+from octasplat.engine.runs.config import read_config
+from octasplat.engine.runs.run_folder import run_near_zones
 from octasplat.engine.shading.environment_frame import environment_frame
 
 TURN = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])  # 90 degrees about z

@@ -5,9 +5,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from octasplat.engine.errors import DatasetError
+from octasplat.engine.core.errors import DatasetError
+from octasplat.engine.dataset.image_sizes import Sizes
 from octasplat.engine.operations.estimate import EstimateRequest, run
-from octasplat.engine.photograph_sizes import Sizes
 from octasplat.engine.render.image_files import write_png
 
 

@@ -9,7 +9,7 @@ import OpenImageIO as oiio
 import pytest
 from pydantic import ValidationError
 
-from octasplat.engine.photograph_sizes import Sizes
+from octasplat.engine.dataset.image_sizes import Sizes
 from octasplat.engine.render.environment_files import write_environment
 from octasplat.engine.render.image_files import read_image
 from octasplat.workers.worker.handlers import run_operation

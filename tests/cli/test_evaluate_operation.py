@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from octasplat.engine.errors import Cancelled, ConfigError
-from octasplat.engine.events import StageFinished
+from octasplat.engine.core.errors import Cancelled, ConfigError
+from octasplat.engine.core.events import StageFinished
 from octasplat.engine.operations.base import build_request
 from octasplat.engine.operations.evaluate import OPERATION, EvaluateRequest
 from octasplat.workers.worker.handlers import run_operation

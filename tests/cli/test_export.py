@@ -11,7 +11,7 @@ from octasplat.engine.files import read_scene
 from octasplat.engine.files.gaussian_ply import read_gaussian_ply
 from octasplat.engine.files.ply_container import PlyWriteElement, write_ply
 from octasplat.engine.render.depth_order import MIN_AGREEMENT, shared_depth_order
-from octasplat.engine.run_folder import run_viewpoints
+from octasplat.engine.runs.run_folder import run_viewpoints
 
 
 def test_export_ply_to_glb_writes_mesh(run, octasplat, tmp_path):

@@ -6,7 +6,7 @@ import shutil
 import numpy as np
 import pytest
 
-from octasplat.engine.evaluate.scene_facts import OPACITY_EDGES
+from octasplat.engine.evaluate.scene_statistics import OPACITY_EDGES
 from octasplat.engine.files.gaussian_ply import read_gaussian_ply, write_gaussian_ply
 from octasplat.engine.operations.info import OPERATION, InfoRequest
 from octasplat.engine.render.image_files import read_image

@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 from pydantic import ValidationError
 
-from octasplat.engine.colour import linear_to_srgb
+from octasplat.engine.core.color import linear_to_srgb
 from octasplat.engine.files import export_scene, read_mesh
 from octasplat.engine.files.gaussian_ply import read_gaussian_ply, write_gaussian_ply
 from octasplat.engine.render.environment_files import write_environment

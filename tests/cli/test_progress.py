@@ -7,9 +7,9 @@ import time
 import pytest
 from rich.console import Console
 
-from octasplat.engine.durations import clock, duration
-from octasplat.engine.errors import Cancelled
-from octasplat.engine.events import (
+from octasplat.engine.core.durations import clock, duration
+from octasplat.engine.core.errors import Cancelled
+from octasplat.engine.core.events import (
     HeldOutMeasured,
     StageFinished,
     StageProgress,
@@ -17,7 +17,7 @@ from octasplat.engine.events import (
     TrainingProgress,
     Warned,
 )
-from octasplat.engine.stages import stopping
+from octasplat.engine.core.progress import stopping
 from octasplat.workers.cli.progress import ProgressBars, show_progress
 from octasplat.workers.reporting.event_lines import EventLines
 from octasplat.workers.reporting.wording import format_rate

@@ -9,7 +9,7 @@ import imageio_ffmpeg
 import numpy as np
 import pytest
 
-from octasplat.engine.colour import linear_to_srgb
+from octasplat.engine.core.color import linear_to_srgb
 from octasplat.engine.files import read_metadata
 from octasplat.engine.files.gaussian_ply import read_gaussian_ply, write_gaussian_ply
 from octasplat.engine.render.image_files import read_channels, read_image

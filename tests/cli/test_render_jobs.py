@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from octasplat.engine.errors import Cancelled
-from octasplat.engine.events import CheckpointWritten, Event, ImagesKept, StageProgress
+from octasplat.engine.core.errors import Cancelled
+from octasplat.engine.core.events import CheckpointWritten, Event, ImagesKept, StageProgress
+from octasplat.engine.dataset.image_sizes import Sizes
 from octasplat.engine.operations.registry import operation
 from octasplat.engine.operations.render import RenderRequest
-from octasplat.engine.photograph_sizes import Sizes
 from octasplat.engine.render.environment_files import write_environment
 from octasplat.engine.render.image_files import read_image
-from octasplat.engine.run_folder import run_viewpoints
+from octasplat.engine.runs.run_folder import run_viewpoints
 from octasplat.workers.client.submission import Derivation, with_camera_path
 from octasplat.workers.worker.handlers import run_operation
 from octasplat.workers.worker.job_kinds import get_job_kind

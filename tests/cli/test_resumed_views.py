@@ -8,8 +8,8 @@ from typing import Any
 import pycolmap
 import pytest
 
-from octasplat.engine.errors import Cancelled, ConfigError
-from octasplat.engine.events import Event, ImagesKept
+from octasplat.engine.core.errors import Cancelled, ConfigError
+from octasplat.engine.core.events import Event, ImagesKept
 from octasplat.engine.operations import relight, render
 
 

@@ -10,13 +10,13 @@ from click.testing import CliRunner
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from octasplat.engine.config import ReconstructionConfig, RunSettings
-from octasplat.engine.errors import ConfigError
-from octasplat.engine.nested_options import merged
+from octasplat.engine.core.errors import ConfigError
 from octasplat.engine.operations.base import build_request
 from octasplat.engine.operations.reconstruct import ReconstructOptions, ReconstructRequest, run_config
-from octasplat.engine.settings_catalog import settings as catalog
-from octasplat.engine.train.preset_names import PRESETS
+from octasplat.engine.runs.config import ReconstructionConfig, RunSettings
+from octasplat.engine.runs.settings_catalog import settings as catalog
+from octasplat.engine.settings.nested_options import merged
+from octasplat.engine.train.config.preset_names import PRESETS
 from octasplat.service.actions.validation import resolve_options
 from octasplat.service.problems import ProblemError
 from octasplat.workers.cli.main import cli

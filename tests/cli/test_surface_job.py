@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 from pydantic import ValidationError
 
+from octasplat.engine.dataset.image_sizes import Sizes
 from octasplat.engine.operations.base import first_error
 from octasplat.engine.operations.surface import MATERIAL_DEFAULTS, ROOM_DEFAULTS, SurfaceRequest
-from octasplat.engine.photograph_sizes import Sizes
 from octasplat.workers.worker.handlers import run_operation
 from octasplat.workers.worker.job_kinds import get_job_kind
 from octasplat.workers.worker.task import Task

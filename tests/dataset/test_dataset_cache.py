@@ -9,8 +9,8 @@ import pycolmap
 import pytest
 
 import octasplat
+from octasplat.engine.core.errors import DatasetError, OutputError
 from octasplat.engine.dataset import Dataset
-from octasplat.engine.errors import DatasetError, OutputError
 
 
 def stamps(folder: Path) -> dict[str, int]:

@@ -1,10 +1,10 @@
 import numpy as np
 import pytest
 
-from octasplat.engine.colour import linear_to_srgb
+from octasplat.engine.core.color import linear_to_srgb
+from octasplat.engine.core.errors import DatasetError
 from octasplat.engine.dataset.images import read_image_info, read_photo
 from octasplat.engine.dataset.masks import read_mask
-from octasplat.engine.errors import DatasetError
 
 
 def read(path, width=None, height=None):

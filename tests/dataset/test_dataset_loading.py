@@ -5,8 +5,8 @@ import numpy as np
 import pycolmap
 import pytest
 
+from octasplat.engine.core.errors import ConfigError, DatasetError
 from octasplat.engine.dataset import load_dataset_model
-from octasplat.engine.errors import ConfigError, DatasetError
 
 MODEL_FILES = ["cameras", "images", "points3D"]
 

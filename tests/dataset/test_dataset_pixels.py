@@ -4,8 +4,8 @@ import numpy as np
 import pycolmap
 import pytest
 
+from octasplat.engine.core.errors import DatasetError
 from octasplat.engine.dataset import Dataset
-from octasplat.engine.errors import DatasetError
 
 
 def all_pixels(data: Dataset, view: int):

@@ -3,8 +3,8 @@ import json
 import numpy as np
 import pytest
 
+from octasplat.engine.core.errors import ConfigError, DatasetError
 from octasplat.engine.dataset import SparsePoints, scene_extent, split_views, write_held_out
-from octasplat.engine.errors import ConfigError, DatasetError
 
 NAMES = [f"{i:02d}.jpg" for i in range(18)]
 

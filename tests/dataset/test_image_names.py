@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
+from octasplat.engine.core.errors import DatasetError
 from octasplat.engine.dataset import Dataset, load_dataset_model
 from octasplat.engine.dataset.image_names import match_image_names
-from octasplat.engine.errors import DatasetError
 from octasplat.engine.poses.photographs import photographs_in
 
 

@@ -4,9 +4,9 @@ import numpy as np
 import OpenImageIO as oiio
 import pytest
 
+from octasplat.engine.core.errors import DatasetError
 from octasplat.engine.dataset import Dataset
 from octasplat.engine.dataset.images import read_image_info, read_photo
-from octasplat.engine.errors import DatasetError
 
 
 @pytest.fixture

@@ -8,6 +8,7 @@ import OpenImageIO as oiio
 import pycolmap
 import pytest
 
+from octasplat.engine.core.errors import ConfigError, DatasetError, OutputError
 from octasplat.engine.dataset.synthetic import CAMERA_MODELS, SyntheticDatasetConfig, write_synthetic_dataset
 from octasplat.engine.dataset.synthetic.patterns import (
     cell_noise,
@@ -22,7 +23,6 @@ from octasplat.engine.dataset.synthetic.still_life import (
     TABLE_RADIUS,
     build_still_life,
 )
-from octasplat.engine.errors import ConfigError, DatasetError, OutputError
 
 SMALL = SyntheticDatasetConfig(views=6, width_px=48, height_px=36, samples_per_side=2, points=150)
 

@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from octasplat.engine.core.errors import ConfigError
 from octasplat.engine.dataset.views_file import read_views
-from octasplat.engine.errors import ConfigError
 
 
 def views_json(path: Path, name: str) -> Path:

@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from octasplat.engine.core.errors import ConfigError
 from octasplat.engine.edit.selection import in_box, in_sphere, merge_scenes, with_sh_degree
-from octasplat.engine.errors import ConfigError
 from octasplat.engine.gaussians import affine
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.gaussians.spherical_harmonics import sh_basis

@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from octasplat.engine.core.errors import SceneFileError
 from octasplat.engine.edit.edit_options import MeshToGaussiansOptions
 from octasplat.engine.edit.mesh_to_gaussians import recover_gaussians
-from octasplat.engine.errors import SceneFileError
 from octasplat.engine.files import export_scene, read_mesh
 from octasplat.engine.gaussians.model import FlatGaussians
 from tests.support.edit_scenes import assert_same, covariance_errors, moved_covariances, twist

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from octasplat.engine.core.errors import ConfigError
 from octasplat.engine.edit.filter_expression import filter_mask
-from octasplat.engine.errors import ConfigError
 
 
 @pytest.fixture

@@ -2,8 +2,8 @@ from pathlib import Path
 
 import pytest
 
+from octasplat.engine.core.errors import ConfigError
 from octasplat.engine.edit.mask_selection import photograph_of_mask
-from octasplat.engine.errors import ConfigError
 
 PHOTOGRAPHS = ["0001.jpg", "left/0001.jpg", "right/0001.jpg", "right/0002.jpg", "right/0002.png", "far/9.jpg"]
 

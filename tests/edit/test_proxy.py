@@ -5,9 +5,9 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
+from octasplat.engine.core.errors import SceneFileError
 from octasplat.engine.edit.deform import deform, deform_to, deformation_corners
 from octasplat.engine.edit.proxy import MeanValueBinding, NearTriangles, Proxy, bind_corners
-from octasplat.engine.errors import SceneFileError
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.gaussians.spherical_harmonics import sh_basis
 from tests.support.edit_scenes import (

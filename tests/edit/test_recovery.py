@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from octasplat.engine.core.errors import SceneFileError
 from octasplat.engine.edit.edit_options import MeshToGaussiansOptions
 from octasplat.engine.edit.mesh_to_gaussians import EditReport, recover_gaussians
-from octasplat.engine.errors import SceneFileError
 from octasplat.engine.files import ExportOptions, ImportedMesh, export_scene, read_mesh
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.gaussians.octagon import SIDES

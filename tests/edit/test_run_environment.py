@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from octasplat.engine.render.environment_files import read_environment, write_environment
-from octasplat.engine.run_folder import run_environment
+from octasplat.engine.runs.run_folder import run_environment
 
 
 def test_run_environment_prefers_exact_map(tmp_path: Path) -> None:

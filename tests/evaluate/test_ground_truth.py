@@ -9,11 +9,12 @@ import numpy as np
 import OpenImageIO as oiio
 import pytest
 
-from octasplat.engine.colour import linear_to_srgb
-from octasplat.engine.errors import ConfigError, DatasetError
-from octasplat.engine.evaluate.against_truth import TruthMeasures, relit_measures
-from octasplat.engine.evaluate.truth import find_truth, read_truth
-from octasplat.engine.evaluate.truth_metrics import (
+from octasplat.engine.core.color import linear_to_srgb
+from octasplat.engine.core.errors import ConfigError, DatasetError
+from octasplat.engine.core.rays import ImageRays
+from octasplat.engine.evaluate.ground_truth import find_truth, read_truth
+from octasplat.engine.evaluate.ground_truth_measures import TruthMeasures, relit_measures
+from octasplat.engine.evaluate.ground_truth_metrics import (
     best_scales,
     display,
     environment_errors,
@@ -21,7 +22,6 @@ from octasplat.engine.evaluate.truth_metrics import (
 )
 from octasplat.engine.pathtracing.environment import EnvironmentMap, environment_frame
 from octasplat.engine.pathtracing.relighting.path_relighter import RelitImage
-from octasplat.engine.rays import ImageRays
 from octasplat.engine.render.pinhole_camera import PinholeCamera
 from octasplat.engine.render.renderer import RenderedImage
 

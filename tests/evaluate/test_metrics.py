@@ -5,9 +5,9 @@ from pytorch_msssim import ms_ssim as reference_ms_ssim
 from pytorch_msssim import ssim as reference_ssim
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
-from octasplat.engine.colour import to_bytes
+from octasplat.engine.core.color import to_bytes
+from octasplat.engine.core.psnr import colour_corrected, psnr
 from octasplat.engine.evaluate import metrics
-from octasplat.engine.psnr import colour_corrected, psnr
 
 
 def pair(height, width, seed=0):

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from octasplat.engine.evaluate.scales import blocks, smaller
-from octasplat.engine.evaluate.views import depth_spread
+from octasplat.engine.core.rays import ImageRays
+from octasplat.engine.evaluate.multiscale import blocks, smaller
+from octasplat.engine.evaluate.view_metrics import depth_spread
 from octasplat.engine.gaussians.model import FlatGaussians
-from octasplat.engine.rays import ImageRays
 from octasplat.engine.render.pinhole_camera import PinholeCamera
 from octasplat.engine.render.renderer import render_rays
 from octasplat.engine.render.supersampling import pixel_angle, rays_per_pixel_side, render_averaged

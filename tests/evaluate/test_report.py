@@ -5,7 +5,7 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 
-from octasplat.engine.errors import OutputError
+from octasplat.engine.core.errors import OutputError
 from octasplat.engine.evaluate.curves import duration, training_charts
 from octasplat.engine.evaluate.gallery import ViewImages, WorstAndBest, magma
 from octasplat.engine.evaluate.report import write_report

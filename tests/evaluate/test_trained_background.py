@@ -4,11 +4,11 @@ from pathlib import Path
 
 import pytest
 
-from octasplat.engine.config import ReconstructionConfig, read_config, resolve_config
+from octasplat.engine.core.events import Event, Warned
+from octasplat.engine.core.writing import write_json
 from octasplat.engine.dataset.synthetic import SyntheticDatasetConfig, write_synthetic_dataset
-from octasplat.engine.events import Event, Warned
-from octasplat.engine.run_folder import open_photographs
-from octasplat.engine.writing import write_json
+from octasplat.engine.runs.config import ReconstructionConfig, read_config, resolve_config
+from octasplat.engine.runs.run_folder import open_photographs
 
 
 @pytest.mark.parametrize(

@@ -3,11 +3,11 @@ import json
 import numpy as np
 import pytest
 
-from octasplat.engine.errors import DatasetError
+from octasplat.engine.core.errors import DatasetError
+from octasplat.engine.core.psnr import colour_corrected, psnr
 from octasplat.engine.evaluate import metrics
 from octasplat.engine.evaluate.summary import mean_metrics
-from octasplat.engine.evaluate.views import RenderedView, bootstrap_interval, measure_view, summarise
-from octasplat.engine.psnr import colour_corrected, psnr
+from octasplat.engine.evaluate.view_metrics import RenderedView, bootstrap_interval, measure_view, summarise
 
 
 def view(name="a.jpg", error=0.1, size=(30, 40), seed=0, **changes):

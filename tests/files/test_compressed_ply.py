@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from octasplat.engine.errors import SceneFileError
+from octasplat.engine.core.errors import SceneFileError
 from octasplat.engine.files import export_scene, exporter_for, importer_for, read_scene
 from octasplat.engine.files.ply_container import PlyWriteElement, write_ply
 from octasplat.engine.gaussians.flattening import GaussianCloud

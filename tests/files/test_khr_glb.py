@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from octasplat.engine.colour import srgb_to_linear
-from octasplat.engine.errors import SceneFileError
+from octasplat.engine.core.color import srgb_to_linear
+from octasplat.engine.core.errors import SceneFileError
 from octasplat.engine.files import ExportOptions, export_scene, importer_for, read_mesh, read_scene
 from octasplat.engine.gaussians.frames import rotation_matrices
 from octasplat.engine.gaussians.model import FlatGaussians

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from octasplat.engine.errors import SceneFileError
+from octasplat.engine.core.errors import SceneFileError
 from octasplat.engine.files import mesh_obj, read_mesh
 from octasplat.engine.files.ply_container import COUNT_SUFFIX, PlyWriteElement, list_field, write_ply
 

@@ -7,8 +7,8 @@ import numpy as np
 import OpenImageIO as oiio
 import pytest
 
-from octasplat.engine.colour import srgb_to_linear
-from octasplat.engine.errors import ConfigError, SceneFileError
+from octasplat.engine.core.color import srgb_to_linear
+from octasplat.engine.core.errors import ConfigError, SceneFileError
 from octasplat.engine.files import ExportOptions, export_scene, glb_container
 from octasplat.engine.files.kd_split import kd_split
 from octasplat.engine.files.octagon_glb_layout import OPAQUE_CUTOFF

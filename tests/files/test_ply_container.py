@@ -3,7 +3,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from octasplat.engine.errors import SceneFileError
+from octasplat.engine.core.errors import SceneFileError
 from octasplat.engine.files.ply_container import (
     PlyWriteElement,
     list_field,

@@ -3,8 +3,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from octasplat.engine.errors import SceneFileError
-from octasplat.engine.events import Event, StageFinished, StageStarted
+from octasplat.engine.core.errors import SceneFileError
+from octasplat.engine.core.events import Event, StageFinished, StageStarted
 from octasplat.engine.files import Importer, importer_for, importers, read_scene, register
 from octasplat.engine.files.gaussian_ply import write_gaussian_ply
 from octasplat.engine.gaussians.flattening import GaussianCloud

@@ -4,7 +4,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from octasplat.engine.errors import SceneFileError
+from octasplat.engine.core.errors import SceneFileError
 from octasplat.engine.files import importer_for, read_scene
 
 

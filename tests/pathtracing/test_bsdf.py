@@ -12,7 +12,7 @@ from octasplat.engine.pathtracing.bsdf_tables import (
     fresnel,
     rough_dielectric_table,
 )
-from octasplat.engine.shading.kernels_microfacets import table_value
+from octasplat.engine.shading.kernels.microfacets import table_value
 
 
 @numba.njit

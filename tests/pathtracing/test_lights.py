@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from octasplat.engine.errors import ConfigError
+from octasplat.engine.core.errors import ConfigError
 from octasplat.engine.pathtracing.environment import EnvironmentMap, environment_frame
 from octasplat.engine.pathtracing.lights import build_light_arrays, eval_environment_map, sample_lights
 from octasplat.engine.pathtracing.stage.model import DirectionalLight, PointLight, RectangleLight, SpotLight

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from octasplat.engine.colour import linear_to_srgb
+from octasplat.engine.core.color import linear_to_srgb
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.pathtracing.compile_meshes import compile_meshes
 from octasplat.engine.pathtracing.gaussian_layers import build_gaussian_layers

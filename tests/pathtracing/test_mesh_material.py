@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from octasplat.engine.colour import linear_to_srgb
-from octasplat.engine.errors import OctasplatError
+from octasplat.engine.core.color import linear_to_srgb
+from octasplat.engine.core.errors import OctasplatError
 from octasplat.engine.files import glb_container
 from octasplat.engine.pathtracing.compile_meshes import compile_meshes
 from octasplat.engine.pathtracing.mesh_shapes import MeshShape, primitive_shape

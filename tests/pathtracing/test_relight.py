@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner, Result
 
-from octasplat.engine.colour import linear_to_srgb
+from octasplat.engine.core.color import linear_to_srgb
 from octasplat.engine.files.gaussian_ply import write_gaussian_ply
 from octasplat.engine.render.environment_files import write_environment
 from octasplat.engine.render.image_files import read_channels, read_image

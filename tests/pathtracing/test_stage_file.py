@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from octasplat.engine.errors import ConfigError
+from octasplat.engine.core.errors import ConfigError
 from octasplat.engine.files import read_mesh
 from octasplat.engine.pathtracing.stage.model import (
     Glass,

@@ -14,8 +14,8 @@ import pycolmap
 import pytest
 from jaxtyping import Float64
 
-from octasplat.engine.errors import Cancelled, DatasetError, PosesCrashed
-from octasplat.engine.events import Event, StageFinished, StageProgress, StageStarted, Warned
+from octasplat.engine.core.errors import Cancelled, DatasetError, PosesCrashed
+from octasplat.engine.core.events import Event, StageFinished, StageProgress, StageStarted, Warned
 from octasplat.engine.poses import find_poses
 from octasplat.engine.poses.find_poses import PosesConfig
 from octasplat.engine.poses.search import PoseSearch

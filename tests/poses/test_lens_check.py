@@ -7,13 +7,13 @@ import numpy as np
 import pycolmap
 import pytest
 
-from octasplat.engine.config import resolve_config
+from octasplat.engine.core.errors import Cancelled, DatasetError
+from octasplat.engine.core.events import Event, StageFinished, StageStarted, Warned
 from octasplat.engine.dataset.load import load_dataset_model
 from octasplat.engine.dataset.synthetic import SyntheticDatasetConfig, write_synthetic_dataset
-from octasplat.engine.errors import Cancelled, DatasetError
-from octasplat.engine.events import Event, StageFinished, StageStarted, Warned
 from octasplat.engine.pipeline import reconstruct
 from octasplat.engine.poses import adjust_principal_points, needs_per_view_principal_points
+from octasplat.engine.runs.config import resolve_config
 
 VIEWS = 20
 NOISE_PX = 0.3

@@ -8,12 +8,12 @@ import numpy as np
 import pycolmap
 import pytest
 
-from octasplat.engine.config import resolve_config
+from octasplat.engine.core.errors import Cancelled, DatasetError
+from octasplat.engine.core.events import Event, StageFinished, StageStarted, Warned
 from octasplat.engine.dataset.synthetic import SyntheticDatasetConfig, write_synthetic_dataset
-from octasplat.engine.errors import Cancelled, DatasetError
-from octasplat.engine.events import Event, StageFinished, StageStarted, Warned
 from octasplat.engine.pipeline import reconstruct
 from octasplat.engine.poses import GivenModel, PosesConfig, repair_poses
+from octasplat.engine.runs.config import resolve_config
 
 pytestmark = pytest.mark.heavy
 

@@ -2,8 +2,8 @@ import numpy as np
 import OpenImageIO as oiio
 import pytest
 
-from octasplat.engine.colour import linear_to_srgb, srgb_to_linear, to_bytes
-from octasplat.engine.errors import DatasetError, OutputError
+from octasplat.engine.core.color import linear_to_srgb, srgb_to_linear, to_bytes
+from octasplat.engine.core.errors import DatasetError, OutputError
 from octasplat.engine.render import image_files
 
 

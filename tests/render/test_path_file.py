@@ -3,7 +3,7 @@ import json
 import numpy as np
 import pytest
 
-from octasplat.engine.errors import ConfigError
+from octasplat.engine.core.errors import ConfigError
 from octasplat.engine.render.path_file import CameraPath, path_from_poses, read_camera_path, write_camera_path
 from octasplat.engine.render.pinhole_camera import PinholeCamera
 from octasplat.engine.render.pose_paths import turntable

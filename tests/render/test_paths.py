@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from octasplat.engine.errors import ConfigError
+from octasplat.engine.core.errors import ConfigError
 from octasplat.engine.render.pinhole_camera import PinholeCamera
 from octasplat.engine.render.pose_paths import PosePath, fit_turntable, interpolate, look_at, turntable
 

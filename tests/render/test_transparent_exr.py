@@ -8,7 +8,7 @@ from typing import cast
 import numpy as np
 import pytest
 
-from octasplat.engine.colour import linear_to_srgb, srgb_to_linear
+from octasplat.engine.core.color import linear_to_srgb, srgb_to_linear
 from octasplat.engine.gaussians.model import SH_C0, FlatGaussians
 from octasplat.engine.pathtracing.relighting.path_relighter import Relighter
 from octasplat.engine.pathtracing.relighting.relit_images import RelitRenderFn, ShotLighting

@@ -4,7 +4,7 @@ import imageio_ffmpeg
 import numpy as np
 import pytest
 
-from octasplat.engine.errors import OutputError
+from octasplat.engine.core.errors import OutputError
 from octasplat.engine.render.video import VideoWriter
 
 COLOURS = np.array(

@@ -12,7 +12,7 @@ import psycopg
 import pytest
 from test_uploads import repr_digest
 
-from octasplat.engine.errors import ConfigError
+from octasplat.engine.core.errors import ConfigError
 from octasplat.service.actions.submission import submit_job
 from octasplat.service.auth import Principal
 from octasplat.service.schemas.jobs import NewJob

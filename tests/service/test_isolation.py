@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
+from octasplat.engine.core.isolated_python import python_command
 from octasplat.engine.dataset.synthetic import SyntheticDatasetConfig, write_synthetic_dataset
-from octasplat.engine.isolated_python import python_command
 from octasplat.workers.client.api import Api
 from octasplat.workers.client.upload import upload_scene
 from octasplat.workers.client.watch import watch_job

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 from test_stage_jobs import HDR, finished, sent
 
-from octasplat.engine.errors import ConfigError
+from octasplat.engine.core.errors import ConfigError
 from octasplat.workers.client.submission import Derivation, with_environments
 from tests.support.service_harness import committed_dataset, running_service
 

@@ -17,8 +17,8 @@ from click.testing import CliRunner
 from test_reconstruction import ROOT
 from test_stage_jobs import HDR, finished, run, sent  # noqa: F401 (a fixture)
 
+from octasplat.engine.core.errors import ConfigError
 from octasplat.engine.dataset.views_file import ViewsRecord
-from octasplat.engine.errors import ConfigError
 from octasplat.engine.files.gaussian_ply import read_gaussian_ply
 from octasplat.workers.cli.main import cli
 from octasplat.workers.cli.named_files import with_named_files

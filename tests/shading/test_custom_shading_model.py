@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 from jaxtyping import Float32
 
-from octasplat.engine.errors import Cancelled
-from octasplat.engine.events import Event, HeldOutMeasured
+from octasplat.engine.core.errors import Cancelled
+from octasplat.engine.core.events import Event, HeldOutMeasured
+from octasplat.engine.core.rays import RayBatch
 from octasplat.engine.gaussians.model import FlatGaussians
-from octasplat.engine.rays import RayBatch
 from octasplat.engine.shading.exposure import Exposures
 from octasplat.engine.shading.protocol import Developed, Reversed, ShadingModel, Sight
 from octasplat.engine.trace.cpu.tracer import CpuTracer
@@ -25,12 +25,12 @@ from octasplat.engine.trace.protocol import (
     TraceResult,
     TraceSettings,
 )
-from octasplat.engine.train.batches import Batch, BatchSource
-from octasplat.engine.train.checkpoint import latest_checkpoint, load_checkpoint
 from octasplat.engine.train.config import McmcConfig
-from octasplat.engine.train.iteration import differentiate
-from octasplat.engine.train.state import TrainState, fresh_state
-from octasplat.engine.train.trainer import Trainer
+from octasplat.engine.train.loop.checkpoint import latest_checkpoint, load_checkpoint
+from octasplat.engine.train.loop.iteration import differentiate
+from octasplat.engine.train.loop.state import TrainState, fresh_state
+from octasplat.engine.train.loop.trainer import Trainer
+from octasplat.engine.train.sampling.batches import Batch, BatchSource
 from tests.support.planar_dataset import PlanarDataset, small_config
 
 SHARE = np.float32(0.3)

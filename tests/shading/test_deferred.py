@@ -5,27 +5,27 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from octasplat.engine.errors import Cancelled
-from octasplat.engine.events import Event, HeldOutMeasured
+from octasplat.engine.core.errors import Cancelled
+from octasplat.engine.core.events import Event, HeldOutMeasured
+from octasplat.engine.core.rays import RayBatch
 from octasplat.engine.gaussians.channels import stack_channels
 from octasplat.engine.gaussians.frames import frames_from_normals, quaternions_from_matrices
 from octasplat.engine.gaussians.model import FlatGaussians, concatenate
-from octasplat.engine.rays import RayBatch
-from octasplat.engine.shading.ambient import ambient_visibility, bounced_light
-from octasplat.engine.shading.buffer import Leaving
+from octasplat.engine.shading.ambient_occlusion import ambient_visibility, bounced_light
 from octasplat.engine.shading.deferred import Deferred
+from octasplat.engine.shading.gbuffer import Leaving
 from octasplat.engine.shading.material_settings import MaterialSettings
 from octasplat.engine.shading.protocol import Sight
 from octasplat.engine.trace.cpu.tracer import CpuTracer
 from octasplat.engine.trace.gradient_sums import add_gradients
 from octasplat.engine.trace.protocol import TraceSettings
-from octasplat.engine.train.batches import BatchSource
-from octasplat.engine.train.checkpoint import latest_checkpoint, load_checkpoint
-from octasplat.engine.train.initialise import with_first_materials
-from octasplat.engine.train.iteration import differentiate
-from octasplat.engine.train.shading import make_deferred
-from octasplat.engine.train.state import TrainState, fresh_state
-from octasplat.engine.train.trainer import Trainer
+from octasplat.engine.train.initialization.initial_gaussians import with_first_materials
+from octasplat.engine.train.loop.checkpoint import latest_checkpoint, load_checkpoint
+from octasplat.engine.train.loop.iteration import differentiate
+from octasplat.engine.train.loop.state import TrainState, fresh_state
+from octasplat.engine.train.loop.trainer import Trainer
+from octasplat.engine.train.sampling.batches import BatchSource
+from octasplat.engine.train.shading_factory import make_deferred
 from tests.support.planar_dataset import PlanarDataset, small_config
 
 BARE = {

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from test_deferred import BARE, floor, wall
 
+from octasplat.engine.core.rays import RayBatch
 from octasplat.engine.gaussians.model import FlatGaussians, concatenate
-from octasplat.engine.rays import RayBatch
 from octasplat.engine.shading.deferred import Deferred
+from octasplat.engine.shading.depth_split import part
 from octasplat.engine.shading.material_settings import MaterialSettings
-from octasplat.engine.shading.parted import part
 from octasplat.engine.shading.protocol import Sight
 from octasplat.engine.trace.cpu.tracer import CpuTracer
 from octasplat.engine.trace.protocol import TraceSettings

@@ -7,18 +7,18 @@ import numpy as np
 import pytest
 import torch
 
-from octasplat.engine.config import resolve_config
-from octasplat.engine.errors import ConfigError
+from octasplat.engine.core.errors import ConfigError
+from octasplat.engine.core.rays import RayBatch
 from octasplat.engine.gaussians.model import FlatGaussians
-from octasplat.engine.rays import RayBatch
-from octasplat.engine.shading.flattening import Flattening
+from octasplat.engine.runs.config import resolve_config
+from octasplat.engine.shading.depth_normal_model import Flattening
 from octasplat.engine.shading.plain import PLAIN
 from octasplat.engine.shading.protocol import Sight
-from octasplat.engine.shading.ray_windows import RayWindows
+from octasplat.engine.shading.ray_patches import RayWindows
 from octasplat.engine.trace.cpu.tracer import CpuTracer
 from octasplat.engine.trace.protocol import TraceResult
-from octasplat.engine.train.state import fresh_state
-from octasplat.engine.train.trainer import Trainer
+from octasplat.engine.train.loop.state import fresh_state
+from octasplat.engine.train.loop.trainer import Trainer
 from tests.support.planar_dataset import PlanarDataset, small_config
 
 SIDE, WINDOWS, LOOSE = 4, 3, 5

@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
-from octasplat.engine.rays import RayBatch
-from octasplat.engine.shading.geometry_terms import EDGE, depth_normal_term, smoothness_term
+from octasplat.engine.core.rays import RayBatch
+from octasplat.engine.shading.geometry_losses import EDGE, depth_normal_term, smoothness_term
 from octasplat.engine.shading.protocol import Sight
-from octasplat.engine.shading.ray_windows import RayWindows
+from octasplat.engine.shading.ray_patches import RayWindows
 from octasplat.engine.trace.factory import make_tracer
 from octasplat.engine.trace.protocol import TraceResult, TraceSettings
-from octasplat.engine.train.pixel_sampler import PixelSampler
+from octasplat.engine.train.sampling.pixel_sampler import PixelSampler
 
 SIDE, METAL = 3, 10.0
 WEIGHTS = (0.02, 0.03, 0.04, 0.2, 0.3)

@@ -4,13 +4,15 @@ import numpy as np
 import pytest
 from test_deferred import BARE, floor, wall
 
-from octasplat.engine.colour import srgb_to_linear
+from octasplat.engine.core.color import srgb_to_linear
+from octasplat.engine.core.rays import ImageRays, RayBatch
 from octasplat.engine.gaussians.model import concatenate
-from octasplat.engine.rays import ImageRays, RayBatch
 from octasplat.engine.render.renderer import background_colour, render_rays
 from octasplat.engine.render.supersampling import pixel_means
 from octasplat.engine.shading.deferred import Deferred
-from octasplat.engine.shading.lobe import (
+from octasplat.engine.shading.material_settings import MaterialSettings
+from octasplat.engine.shading.protocol import Sight
+from octasplat.engine.shading.reflection_rays import (
     Widening,
     facets_of,
     numbers_of,
@@ -18,9 +20,7 @@ from octasplat.engine.shading.lobe import (
     pair_slope,
     roughness_slope,
 )
-from octasplat.engine.shading.material_settings import MaterialSettings
-from octasplat.engine.shading.protocol import Sight
-from octasplat.engine.shading.reflections import Seen
+from octasplat.engine.shading.reflection_tracing import Seen
 from octasplat.engine.shading.split_sum import Surface
 from octasplat.engine.trace.cpu.tracer import CpuTracer
 

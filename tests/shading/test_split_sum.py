@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from octasplat.engine.errors import ConfigError
+from octasplat.engine.core.errors import ConfigError
 from octasplat.engine.shading.environment_frame import environment_frame
 from octasplat.engine.shading.environment_levels import (
     ROUGHNESSES,

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from octasplat.engine.errors import ConfigError
+from octasplat.engine.core.errors import ConfigError
 from octasplat.workers.storage import StorageFullError, StorageUnavailableError, open_storage
 from octasplat.workers.storage.local import LocalStorage
 from octasplat.workers.storage.s3 import S3Storage

@@ -1,6 +1,6 @@
 """A later version, in which the same settings give other results."""
 
-from octasplat.engine import versions
+from octasplat.engine.core import versions
 from tests.support import toy_kind
 
 versions.RESULTS += 1

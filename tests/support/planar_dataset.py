@@ -4,11 +4,11 @@ from pathlib import Path
 
 import numpy as np
 
+from octasplat.engine.core.rays import RayBatch
 from octasplat.engine.dataset import DatasetView
 from octasplat.engine.gaussians.model import FlatGaussians
-from octasplat.engine.rays import RayBatch
 from octasplat.engine.train.config import McmcConfig, TrainConfig
-from octasplat.engine.train.initialise import from_points
+from octasplat.engine.train.initialization.initial_gaussians import from_points
 
 EXTENT = 1.0
 

@@ -7,8 +7,8 @@ from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict
 
-from octasplat.engine.errors import Cancelled, DatasetError
-from octasplat.engine.events import CheckpointWritten, StageFinished, StageProgress, StageStarted, Warned
+from octasplat.engine.core.errors import Cancelled, DatasetError
+from octasplat.engine.core.events import CheckpointWritten, StageFinished, StageProgress, StageStarted, Warned
 from octasplat.workers.worker.job_kinds import JobKind, register
 from octasplat.workers.worker.task import Task
 

@@ -5,8 +5,8 @@ from dataclasses import fields
 import numpy as np
 import torch
 
+from octasplat.engine.core.rays import RayBatch
 from octasplat.engine.gaussians.model import FlatGaussians
-from octasplat.engine.rays import RayBatch
 from octasplat.engine.trace.cpu.tracer import CpuTracer
 from octasplat.engine.trace.protocol import GaussianGradients, TraceGradients, TraceResult, TraceSettings
 from octasplat.engine.trace.reference import ReferenceParameters, ReferenceResult, trace_reference

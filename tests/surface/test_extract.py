@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from octasplat.engine.errors import Cancelled, ConfigError, SceneFileError
-from octasplat.engine.events import StageFinished
+from octasplat.engine.core.errors import Cancelled, ConfigError, SceneFileError
+from octasplat.engine.core.events import StageFinished
 from octasplat.engine.files import write_surface
 from octasplat.engine.geometry.triangle_mesh import TriangleMesh, edge_report
 from octasplat.engine.render.image_files import read_image

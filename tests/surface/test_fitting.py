@@ -4,9 +4,9 @@ from functools import partial
 
 import numpy as np
 
-from octasplat.engine.colour import to_bytes
+from octasplat.engine.core.color import to_bytes
+from octasplat.engine.core.rays import RayBatch
 from octasplat.engine.geometry.triangle_mesh import TriangleMesh, edge_report
-from octasplat.engine.rays import RayBatch
 from octasplat.engine.surface.backdrop import with_backdrop
 from octasplat.engine.surface.colour_fit import Picture, TexturePalette, VertexPalette, fit_colours
 from octasplat.engine.surface.marching_cubes import marching_cubes

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from octasplat.engine.errors import ConfigError
+from octasplat.engine.core.errors import ConfigError
 from octasplat.engine.geometry.triangle_mesh import edge_report
 from octasplat.engine.surface.depth_maps import DepthMaps
 from octasplat.engine.surface.marching_cubes import marching_cubes

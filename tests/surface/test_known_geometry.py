@@ -5,7 +5,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from octasplat.engine.config import resolve_config
 from octasplat.engine.dataset import DatasetModel, load_dataset_model
 from octasplat.engine.dataset.synthetic import SyntheticDatasetConfig, write_synthetic_dataset
 from octasplat.engine.dataset.synthetic.still_life import TABLE_RADIUS, build_still_life
@@ -14,7 +13,8 @@ from octasplat.engine.geometry.triangle_mesh import TriangleMesh, edge_report
 from octasplat.engine.pipeline import reconstruct
 from octasplat.engine.render.image_files import read_channels
 from octasplat.engine.render.pinhole_camera import PinholeCamera
-from octasplat.engine.run_folder import SCENE
+from octasplat.engine.runs.config import resolve_config
+from octasplat.engine.runs.run_folder import SCENE
 from octasplat.engine.surface.depth_cameras import photograph_cameras
 from octasplat.engine.surface.depth_maps import DepthMaps
 from octasplat.engine.surface.extract import extract_levels

@@ -7,7 +7,7 @@ import pytest
 import skimage.measure
 from scipy.spatial import cKDTree
 
-from octasplat.engine.errors import ConfigError
+from octasplat.engine.core.errors import ConfigError
 from octasplat.engine.geometry.triangle_mesh import edge_report
 from octasplat.engine.surface.marching_cubes import marching_cubes
 from octasplat.engine.surface.marching_cubes_table import EDGES, FACES, case_loops, case_triangles

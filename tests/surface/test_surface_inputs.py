@@ -7,14 +7,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from octasplat.engine.config import resolve_config
+from octasplat.engine.core.errors import DatasetError, OutputError
+from octasplat.engine.core.events import Event, Noted, Warned
 from octasplat.engine.dataset import Dataset
 from octasplat.engine.dataset.synthetic import SyntheticDatasetConfig, write_synthetic_dataset
 from octasplat.engine.dataset.views_file import read_views, write_views
-from octasplat.engine.errors import DatasetError, OutputError
-from octasplat.engine.events import Event, Noted, Warned
 from octasplat.engine.operations import surface_inputs
 from octasplat.engine.operations.surface_inputs import training_photographs
+from octasplat.engine.runs.config import resolve_config
 
 TURN = np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]])
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from octasplat.engine.colour import linear_to_srgb
+from octasplat.engine.core.color import linear_to_srgb
 from octasplat.engine.files import read_mesh, write_surface
 from octasplat.engine.files.glb_container import GlbFile
 from octasplat.engine.geometry.triangle_mesh import TriangleMesh

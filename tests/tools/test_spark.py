@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from octasplat.engine.colour import to_bytes
+from octasplat.engine.core.color import to_bytes
 from octasplat.engine.files import export_scene
 from octasplat.engine.render.pinhole_camera import PinholeCamera, focal_from_fov
 from tests.support.browser import Page, open_page, psnr

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from octasplat.engine.colour import to_bytes
+from octasplat.engine.core.color import to_bytes
 from octasplat.engine.files import ExportOptions, export_scene
 from octasplat.engine.gaussians.frames import frames_from_normals, quaternions_from_matrices
 from octasplat.engine.gaussians.model import FlatGaussians

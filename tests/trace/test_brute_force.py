@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from octasplat.engine.core.rays import RayBatch
 from octasplat.engine.gaussians.model import FlatGaussians, concatenate
-from octasplat.engine.rays import RayBatch
 from octasplat.engine.trace.cpu.recording import CpuRecording
 from tests.support.trace_scenes import f32, in_plane, make_cloud, make_tracer, rays_inwards, unit
 

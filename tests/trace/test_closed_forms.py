@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
+from octasplat.engine.core.rays import AT_INFINITY, RayBatch
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.gaussians.octagon import octagon_corners_world, octagon_radii
-from octasplat.engine.rays import AT_INFINITY, RayBatch
 from octasplat.engine.trace.protocol import TraceGradients, TraceResult
 from tests.support.trace_scenes import f32, facing_z, make_tracer
 

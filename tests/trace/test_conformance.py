@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from octasplat.engine.core.rays import RayBatch
 from octasplat.engine.gaussians.model import FlatGaussians
-from octasplat.engine.rays import RayBatch
 from octasplat.engine.trace.cpu.tracer import CpuTracer
 from octasplat.engine.trace.factory import make_tracer
 from octasplat.engine.trace.protocol import GradientsHandle, Recording, Tracer, TraceSettings

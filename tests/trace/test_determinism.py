@@ -9,8 +9,8 @@ import numba
 import numpy as np
 import pytest
 
+from octasplat.engine.core.rays import RayBatch
 from octasplat.engine.gaussians.model import FlatGaussians, concatenate
-from octasplat.engine.rays import RayBatch
 from octasplat.engine.trace.protocol import GaussianGradients, TraceResult
 from tests.support.trace_scenes import (
     f32,

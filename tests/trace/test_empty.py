@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from octasplat.engine.core.rays import RayBatch
 from octasplat.engine.gaussians.model import FlatGaussians, concatenate
-from octasplat.engine.rays import RayBatch
 from tests.support.trace_scenes import facing_z, make_cloud, make_tracer, random_gradients, rays_inwards
 
 

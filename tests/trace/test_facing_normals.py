@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from octasplat.engine.core.rays import RayBatch
 from octasplat.engine.gaussians.frames import frames_from_normals, quaternions_from_matrices
-from octasplat.engine.rays import RayBatch
 from octasplat.engine.trace.facing_normals import MIN_VIEW_COSINE, face_viewer
 from tests.support.trace_scenes import f32, facing_z, make_tracer, unit
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from octasplat.engine.rays import RayBatch
+from octasplat.engine.core.rays import RayBatch
 from octasplat.engine.trace.triangle_bvh import TriangleBvh
 from tests.support.trace_scenes import f32
 

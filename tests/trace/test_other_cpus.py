@@ -22,8 +22,8 @@ TRAINING = """
 import sys, tempfile
 from pathlib import Path
 from tests.support.planar_dataset import FlatWorld, small_config
-from octasplat.engine.train.state import fresh_state
-from octasplat.engine.train.trainer import Trainer
+from octasplat.engine.train.loop.state import fresh_state
+from octasplat.engine.train.loop.trainer import Trainer
 world = FlatWorld()
 config = small_config(iterations=60, sh_degree_interval=30, loss={"ssim": 0.2})
 with tempfile.TemporaryDirectory() as folder:

@@ -5,8 +5,8 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
+from octasplat.engine.core.rays import RayBatch
 from octasplat.engine.gaussians.model import concatenate
-from octasplat.engine.rays import RayBatch
 from octasplat.engine.trace.cpu.packets import MAX_RAYS, find_packets
 from octasplat.engine.trace.cpu.recording import CpuRecording
 from octasplat.engine.trace.cpu.tracer import CpuTracer

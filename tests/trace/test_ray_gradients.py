@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 
+from octasplat.engine.core.rays import AT_INFINITY, RayBatch
 from octasplat.engine.gaussians.spherical_harmonics import sh_basis, sh_basis_gradients
-from octasplat.engine.rays import AT_INFINITY, RayBatch
 from octasplat.engine.trace.protocol import TraceGradients, TraceSettings
 from octasplat.engine.trace.ray_gradients import ray_gradients
 from octasplat.engine.trace.ray_hits import dominant_gaussians

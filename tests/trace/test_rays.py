@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from octasplat.engine.rays import ImageRays, RayBatch, joined
+from octasplat.engine.core.rays import ImageRays, RayBatch, joined
 from tests.support.trace_scenes import f32, unit
 
 

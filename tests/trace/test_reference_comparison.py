@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from octasplat.engine.core.rays import AT_INFINITY, RayBatch
 from octasplat.engine.gaussians.model import FlatGaussians, concatenate
-from octasplat.engine.rays import AT_INFINITY, RayBatch
 from octasplat.engine.trace.cpu.kernels.octagon_hit import HIT_BUFFER_SIZE
 from octasplat.engine.trace.cpu.recording import CpuRecording
 from octasplat.engine.trace.protocol import TraceGradients

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from test_packets import in_packets, tile_rays
 
+from octasplat.engine.core.rays import RayBatch
 from octasplat.engine.gaussians.model import FlatGaussians
-from octasplat.engine.rays import RayBatch
 from octasplat.engine.trace.cpu.recording import CpuRecording
 from octasplat.engine.trace.cpu.tracer import CpuTracer
 from octasplat.engine.trace.protocol import TraceGradients, TraceResult

@@ -5,11 +5,11 @@ from pathlib import Path
 import numpy as np
 
 from octasplat.engine.gaussians.rows import row_arrays
-from octasplat.engine.train.averaging import AVERAGE_EVERY, RunningMean
-from octasplat.engine.train.checkpoint import load_checkpoint, save_checkpoint
 from octasplat.engine.train.config import TrainConfig
-from octasplat.engine.train.schedule import Schedule
-from octasplat.engine.train.state import fresh_state
+from octasplat.engine.train.loop.checkpoint import load_checkpoint, save_checkpoint
+from octasplat.engine.train.loop.schedule import Schedule
+from octasplat.engine.train.loop.state import fresh_state
+from octasplat.engine.train.optimization.weight_averaging import AVERAGE_EVERY, RunningMean
 from tests.support.planar_dataset import random_gaussians
 
 

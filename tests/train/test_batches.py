@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from octasplat.engine.errors import ConfigError
-from octasplat.engine.train.batches import BatchSource
-from octasplat.engine.train.pixel_sampler import PixelSampler
+from octasplat.engine.core.errors import ConfigError
+from octasplat.engine.train.sampling.batches import BatchSource
+from octasplat.engine.train.sampling.pixel_sampler import PixelSampler
 from tests.support.planar_dataset import PlanarDataset, small_config
 
 SIZES = np.array([[8, 6], [20, 10], [16, 16], [5, 3]], np.int64)

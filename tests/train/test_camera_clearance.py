@@ -10,8 +10,8 @@ from octasplat.engine.dataset.camera_clearance import CameraClearance, camera_cl
 from octasplat.engine.dataset.model import PosedView, SparsePoints, Viewpoints
 from octasplat.engine.dataset.view_frusta import ViewFrusta
 from octasplat.engine.gaussians.model import FlatGaussians, concatenate
-from octasplat.engine.train.state import fresh_state
-from octasplat.engine.train.trainer import Trainer
+from octasplat.engine.train.loop.state import fresh_state
+from octasplat.engine.train.loop.trainer import Trainer
 from tests.support.planar_dataset import PlanarDataset, small_config
 
 WIDE = Camera("OPENCV", (50.0, 50.0, 40.0, 40.0, -0.2, 0.0, 0.0, 0.0), 80, 80)

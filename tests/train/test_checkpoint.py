@@ -5,9 +5,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from octasplat.engine.errors import CheckpointError
+from octasplat.engine.core.errors import CheckpointError
 from octasplat.engine.gaussians.rows import row_arrays
-from octasplat.engine.train.checkpoint import (
+from octasplat.engine.train.loop.checkpoint import (
     BestState,
     latest_checkpoint,
     load_best,
@@ -15,8 +15,8 @@ from octasplat.engine.train.checkpoint import (
     save_best,
     save_checkpoint,
 )
-from octasplat.engine.train.optimiser import Adam
-from octasplat.engine.train.state import TrainState
+from octasplat.engine.train.loop.state import TrainState
+from octasplat.engine.train.optimization.adam import Adam
 from tests.support.planar_dataset import PlanarDataset
 
 

@@ -16,11 +16,11 @@ from octasplat.engine.train.config import (
     window_side_px,
     with_materials,
 )
-from octasplat.engine.train.preset_names import PRESETS
-from octasplat.engine.train.schedule import Schedule
-from octasplat.engine.train.shown import shown_share
-from octasplat.engine.train.state import fresh_state
-from octasplat.engine.train.trainer import Trainer
+from octasplat.engine.train.config.preset_names import PRESETS
+from octasplat.engine.train.loop.schedule import Schedule
+from octasplat.engine.train.loop.state import fresh_state
+from octasplat.engine.train.loop.trainer import Trainer
+from octasplat.engine.train.sampling.shown import shown_share
 from tests.support.planar_dataset import PlanarDataset, small_config
 
 

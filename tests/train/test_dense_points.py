@@ -13,10 +13,10 @@ from octasplat.engine.dataset import Dataset
 from octasplat.engine.dataset.synthetic import SyntheticDatasetConfig, write_synthetic_dataset
 from octasplat.engine.dataset.synthetic.still_life import build_still_life
 from octasplat.engine.render.image_files import write_png
-from octasplat.engine.train.dense_points import dense_points
-from octasplat.engine.train.exposure_changes import evening_gains
-from octasplat.engine.train.first_background import first_background
-from octasplat.engine.train.lifted_points import LiftedPoints
+from octasplat.engine.train.initialization.initial_background import first_background
+from octasplat.engine.train.initialization.plane_sweep import dense_points
+from octasplat.engine.train.initialization.plane_sweep_points import LiftedPoints
+from octasplat.engine.train.views.exposure_changes import evening_gains
 
 
 @pytest.fixture(scope="module")

@@ -11,7 +11,7 @@ from octasplat.engine.trace.protocol import GaussianGradients
 from octasplat.engine.train.config import McmcConfig, PaperConfig
 from octasplat.engine.train.densify import Densifier, Mcmc, Paper, make_densifier
 from octasplat.engine.train.densify.mcmc import shared_opacity, shared_scale
-from octasplat.engine.train.optimiser import Adam
+from octasplat.engine.train.optimization.adam import Adam
 
 
 def make(opacities: object, scale: float = 0.1) -> FlatGaussians:

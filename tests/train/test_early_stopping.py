@@ -5,16 +5,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from octasplat.engine.errors import Cancelled
-from octasplat.engine.events import CheckpointWritten, Event, TrainingProgress, Warned
+from octasplat.engine.core.errors import Cancelled
+from octasplat.engine.core.events import CheckpointWritten, Event, TrainingProgress, Warned
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.gaussians.rows import row_arrays
-from octasplat.engine.train.checkpoint import latest_checkpoint, load_checkpoint
 from octasplat.engine.train.config import TrainConfig
-from octasplat.engine.train.early_end import gains_no_more, last_iteration
-from octasplat.engine.train.schedule import Schedule
-from octasplat.engine.train.state import TrainState, fresh_state
-from octasplat.engine.train.trainer import Trainer
+from octasplat.engine.train.loop.checkpoint import latest_checkpoint, load_checkpoint
+from octasplat.engine.train.loop.early_end import gains_no_more, last_iteration
+from octasplat.engine.train.loop.schedule import Schedule
+from octasplat.engine.train.loop.state import TrainState, fresh_state
+from octasplat.engine.train.loop.trainer import Trainer
 from tests.support.planar_dataset import PlanarDataset, small_config
 
 RISING = [(k, 20 + k / 100) for k in range(0, 1001, 100)]

@@ -6,20 +6,24 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from octasplat.engine.core.errors import Cancelled
+from octasplat.engine.core.events import Event, HeldOutMeasured
+from octasplat.engine.core.rays import RayBatch
 from octasplat.engine.dataset.model import Observations
-from octasplat.engine.errors import Cancelled
-from octasplat.engine.events import Event, HeldOutMeasured
-from octasplat.engine.rays import RayBatch
 from octasplat.engine.shading.exposure import Exposures
-from octasplat.engine.shading.exposure_guess import times_of
+from octasplat.engine.shading.exposure_estimation import times_of
 from octasplat.engine.shading.protocol import Sight
 from octasplat.engine.trace.cpu.tracer import CpuTracer
 from octasplat.engine.trace.protocol import GaussianGradients, TraceResult
-from octasplat.engine.train.checkpoint import latest_checkpoint, load_checkpoint
 from octasplat.engine.train.config import TrainConfig
-from octasplat.engine.train.exposure_changes import exposure_changes, log_brightness, with_exposure_decided
-from octasplat.engine.train.state import TrainState, fresh_state
-from octasplat.engine.train.trainer import Trainer
+from octasplat.engine.train.loop.checkpoint import latest_checkpoint, load_checkpoint
+from octasplat.engine.train.loop.state import TrainState, fresh_state
+from octasplat.engine.train.loop.trainer import Trainer
+from octasplat.engine.train.views.exposure_changes import (
+    exposure_changes,
+    log_brightness,
+    with_exposure_decided,
+)
 from tests.support.planar_dataset import PlanarDataset, small_config
 
 NO_GRADIENTS = GaussianGradients(

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from octasplat.engine.errors import DatasetError
-from octasplat.engine.train.initialise import from_points, from_rays
+from octasplat.engine.core.errors import DatasetError
+from octasplat.engine.train.initialization.initial_gaussians import from_points, from_rays
 
 CAMERAS = np.array([[0.0, 0.0, -3.0], [1.0, 0.0, -3.0], [0.0, 1.0, -3.0]])
 

@@ -6,23 +6,23 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from octasplat.engine.core.errors import Cancelled, ConfigError
+from octasplat.engine.core.rays import RayBatch
 from octasplat.engine.dataset import Camera
 from octasplat.engine.dataset.model import SparsePoints
-from octasplat.engine.errors import Cancelled, ConfigError
 from octasplat.engine.gaussians.model import FlatGaussians
-from octasplat.engine.rays import RayBatch
 from octasplat.engine.render.environment_files import read_background, write_background
+from octasplat.engine.shading.background import LearntBackground
 from octasplat.engine.shading.exposure import Exposures
-from octasplat.engine.shading.learnt_background import LearntBackground
 from octasplat.engine.shading.protocol import Sight
 from octasplat.engine.trace.cpu.tracer import CpuTracer
 from octasplat.engine.trace.protocol import TraceResult
-from octasplat.engine.train.batches import BatchSource
-from octasplat.engine.train.checkpoint import latest_checkpoint, load_checkpoint
-from octasplat.engine.train.first_background import first_background
-from octasplat.engine.train.shading import background_of
-from octasplat.engine.train.state import TrainState, fresh_state
-from octasplat.engine.train.trainer import Trainer
+from octasplat.engine.train.initialization.initial_background import first_background
+from octasplat.engine.train.loop.checkpoint import latest_checkpoint, load_checkpoint
+from octasplat.engine.train.loop.state import TrainState, fresh_state
+from octasplat.engine.train.loop.trainer import Trainer
+from octasplat.engine.train.sampling.batches import BatchSource
+from octasplat.engine.train.shading_factory import background_of
 from tests.support.planar_dataset import PlanarDataset, plane_texture, small_config
 
 

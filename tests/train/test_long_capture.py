@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
+from octasplat.engine.core.rays import RayBatch
 from octasplat.engine.dataset import Camera, Dataset, PosedView
 from octasplat.engine.dataset.model import Observations, SparsePoints
-from octasplat.engine.rays import RayBatch
-from octasplat.engine.train.dense_points import dense_points
+from octasplat.engine.train.initialization.plane_sweep import dense_points
 
 WIDTH, HEIGHT, FOCAL, AWAY = 80, 60, 50.0, 2.0
 

@@ -5,7 +5,7 @@ import pytest
 import torch
 from skimage.metrics import structural_similarity
 
-from octasplat.engine.train.losses import gaussian_window, pixel_loss, ray_errors, ssim_loss
+from octasplat.engine.train.optimization.losses import gaussian_window, pixel_loss, ray_errors, ssim_loss
 
 
 def patches(seed: int = 0, count: int = 3, side: int = 24) -> tuple[np.ndarray, np.ndarray]:

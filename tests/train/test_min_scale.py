@@ -5,9 +5,9 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.distance import cdist
 
-from octasplat.engine.train.floors import ScaleFloor
-from octasplat.engine.train.state import fresh_state
-from octasplat.engine.train.trainer import Trainer
+from octasplat.engine.train.loop.floors import ScaleFloor
+from octasplat.engine.train.loop.state import fresh_state
+from octasplat.engine.train.loop.trainer import Trainer
 from tests.support.planar_dataset import PlanarDataset, small_config
 
 

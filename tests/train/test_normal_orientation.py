@@ -3,7 +3,7 @@
 import numpy as np
 
 from octasplat.engine.trace.factory import make_tracer
-from octasplat.engine.train.sides import turn_outwards
+from octasplat.engine.train.views.normal_orientation import turn_outwards
 from tests.support.planar_dataset import PlanarDataset
 
 

@@ -12,8 +12,8 @@ from octasplat.engine.gaussians.model import SH_C0, FlatGaussians
 from octasplat.engine.shading.material_settings import MaterialSettings
 from octasplat.engine.trace.protocol import GaussianGradients
 from octasplat.engine.train.config import LearningRates, LossWeights
-from octasplat.engine.train.initialise import with_first_materials
-from octasplat.engine.train.optimiser import Adam
+from octasplat.engine.train.initialization.initial_gaussians import with_first_materials
+from octasplat.engine.train.optimization.adam import Adam
 from tests.support.planar_dataset import random_gaussians
 
 NAMES = ("means_world", "quats_wxyz", "log_scales", "opacity_logits", "sh")

@@ -8,14 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from octasplat.engine.config import resolve_config
+from octasplat.engine.core.errors import Cancelled
+from octasplat.engine.core.events import CheckpointWritten, Event, Warned
 from octasplat.engine.dataset import DatasetView
 from octasplat.engine.dataset.synthetic import SyntheticDatasetConfig, write_synthetic_dataset
-from octasplat.engine.errors import Cancelled
-from octasplat.engine.events import CheckpointWritten, Event, Warned
 from octasplat.engine.pipeline import reconstruct
-from octasplat.engine.train import misfits as misfit_module
-from octasplat.engine.train.misfits import ViewFits, misfits
+from octasplat.engine.runs.config import resolve_config
+from octasplat.engine.train.views import outlier_views as misfit_module
+from octasplat.engine.train.views.outlier_views import ViewFits, misfits
 
 SPOILED = ["view_010.png", "view_025.png"]
 SETTINGS = (

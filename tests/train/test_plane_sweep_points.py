@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from octasplat.engine.train.lifted_points import Evidence, LiftedPoints, borne_out
+from octasplat.engine.train.initialization.plane_sweep_points import Evidence, LiftedPoints, borne_out
 
 KNOWN = np.array([[0.0, 0.0, 10.0]])
 FAR_OFF = np.array([[5.0, 0.0, 10.0]])

@@ -8,21 +8,21 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from octasplat.engine.config import resolve_config
+from octasplat.engine.core.errors import Cancelled, ConfigError
+from octasplat.engine.core.events import Event, HeldOutMeasured, Warned, ignore
+from octasplat.engine.core.rays import RayBatch
 from octasplat.engine.dataset import Camera, DatasetView
 from octasplat.engine.dataset.view_frusta import cam_from_world
-from octasplat.engine.errors import Cancelled, ConfigError
-from octasplat.engine.events import Event, HeldOutMeasured, Warned, ignore
 from octasplat.engine.gaussians.rows import row_arrays
-from octasplat.engine.rays import RayBatch
-from octasplat.engine.train.alignment import Motion, Rendered, aligned, photograph_of
-from octasplat.engine.train.batches import grid_pixels
-from octasplat.engine.train.checkpoint import BestState, latest_checkpoint, load_checkpoint, save_best
-from octasplat.engine.train.corrected_views import corrected, without_common
-from octasplat.engine.train.pixel_sampler import view_sizes_px
-from octasplat.engine.train.pose_refinement import RefinedPose
-from octasplat.engine.train.state import TrainState, fresh_state
-from octasplat.engine.train.trainer import Trainer
+from octasplat.engine.runs.config import resolve_config
+from octasplat.engine.train.loop.checkpoint import BestState, latest_checkpoint, load_checkpoint, save_best
+from octasplat.engine.train.loop.state import TrainState, fresh_state
+from octasplat.engine.train.loop.trainer import Trainer
+from octasplat.engine.train.sampling.batches import grid_pixels
+from octasplat.engine.train.sampling.pixel_sampler import view_sizes_px
+from octasplat.engine.train.views.corrected_views import corrected, without_common
+from octasplat.engine.train.views.image_alignment import Motion, Rendered, aligned, photograph_of
+from octasplat.engine.train.views.pose_refinement import RefinedPose
 from tests.support.planar_dataset import PlanarDataset, small_config
 
 SIDE_PX, FOCAL_PX, DISTANCE = 48, 52.0, 2.0

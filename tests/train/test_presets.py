@@ -7,19 +7,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from octasplat.engine.config import resolve_config
+from octasplat.engine.core.errors import ConfigError
+from octasplat.engine.core.events import Event, HeldOutMeasured, TrainingProgress
 from octasplat.engine.dataset.synthetic import SyntheticDatasetConfig, write_synthetic_dataset
-from octasplat.engine.errors import ConfigError
-from octasplat.engine.events import Event, HeldOutMeasured, TrainingProgress
 from octasplat.engine.pipeline import reconstruct
+from octasplat.engine.runs.config import resolve_config
 from octasplat.engine.shading.plain import PLAIN
 from octasplat.engine.trace.cpu.tracer import CpuTracer
-from octasplat.engine.train.batches import BatchSource
 from octasplat.engine.train.config import LossWeights, TrainConfig, preset
 from octasplat.engine.train.densify import make_densifier
-from octasplat.engine.train.iteration import Machinery, differentiate, iterate
-from octasplat.engine.train.state import fresh_state
-from octasplat.engine.train.trainer import Trainer
+from octasplat.engine.train.loop.iteration import Machinery, differentiate, iterate
+from octasplat.engine.train.loop.state import fresh_state
+from octasplat.engine.train.loop.trainer import Trainer
+from octasplat.engine.train.sampling.batches import BatchSource
 from tests.support.planar_dataset import PlanarDataset, small_config
 
 

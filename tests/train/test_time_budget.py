@@ -5,12 +5,12 @@ from pathlib import Path
 
 import pytest
 
-from octasplat.engine.config import resolve_config
+from octasplat.engine.core.errors import Cancelled
+from octasplat.engine.core.events import CheckpointWritten, Event
 from octasplat.engine.dataset.synthetic import SyntheticDatasetConfig, write_synthetic_dataset
-from octasplat.engine.errors import Cancelled
-from octasplat.engine.events import CheckpointWritten, Event
 from octasplat.engine.pipeline import reconstruct
-from octasplat.engine.train.within import Plan, choose_plan
+from octasplat.engine.runs.config import resolve_config
+from octasplat.engine.train.loop.time_budget import Plan, choose_plan
 
 
 def test_time_budget_larger_buys_more_gaussians() -> None:

@@ -5,14 +5,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from octasplat.engine.core.events import Event, HeldOutMeasured, TrainingProgress
 from octasplat.engine.dataset import Dataset
 from octasplat.engine.dataset.synthetic import SyntheticDatasetConfig, write_synthetic_dataset
-from octasplat.engine.events import Event, HeldOutMeasured, TrainingProgress
 from octasplat.engine.gaussians.model import FlatGaussians
-from octasplat.engine.train.fingerprint import run_fingerprint
-from octasplat.engine.train.initialise import initial_gaussians
-from octasplat.engine.train.state import TrainState, fresh_state
-from octasplat.engine.train.trainer import Trainer
+from octasplat.engine.train.initialization.initial_gaussians import initial_gaussians
+from octasplat.engine.train.loop.fingerprint import run_fingerprint
+from octasplat.engine.train.loop.state import TrainState, fresh_state
+from octasplat.engine.train.loop.trainer import Trainer
 from tests.support.planar_dataset import PlanarDataset, small_config
 
 

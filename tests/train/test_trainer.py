@@ -6,15 +6,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from octasplat.engine.errors import Cancelled, DatasetError, TrainingFailure
-from octasplat.engine.events import CheckpointWritten, Event, HeldOutMeasured, TrainingProgress, Warned
+from octasplat.engine.core.errors import Cancelled, DatasetError, TrainingFailure
+from octasplat.engine.core.events import CheckpointWritten, Event, HeldOutMeasured, TrainingProgress, Warned
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.gaussians.rows import row_arrays
-from octasplat.engine.train.checkpoint import BestState, latest_checkpoint, load_checkpoint, save_best
 from octasplat.engine.train.config import McmcConfig, PaperConfig, TrainConfig
-from octasplat.engine.train.shown import shown_share
-from octasplat.engine.train.state import TrainState, fresh_state
-from octasplat.engine.train.trainer import Trainer
+from octasplat.engine.train.loop.checkpoint import BestState, latest_checkpoint, load_checkpoint, save_best
+from octasplat.engine.train.loop.state import TrainState, fresh_state
+from octasplat.engine.train.loop.trainer import Trainer
+from octasplat.engine.train.sampling.shown import shown_share
 from tests.support.planar_dataset import PlanarDataset, small_config
 
 

@@ -5,14 +5,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from octasplat.engine.errors import TrainingFailure
+from octasplat.engine.core.errors import TrainingFailure
+from octasplat.engine.core.rays import RayBatch
 from octasplat.engine.gaussians.model import FlatGaussians
-from octasplat.engine.rays import RayBatch
 from octasplat.engine.shading.plain import PLAIN
 from octasplat.engine.trace.factory import make_tracer
 from octasplat.engine.trace.protocol import Tracer, TraceSettings
-from octasplat.engine.train.probes import Judge, draw_probe, measure
-from octasplat.engine.train.state import fresh_state
+from octasplat.engine.train.loop.state import fresh_state
+from octasplat.engine.train.loop.validation_probe import Judge, draw_probe, measure
 from tests.support.planar_dataset import PlanarDataset
 
 

@@ -9,11 +9,11 @@ from octasplat.engine.dataset.camera import Camera
 from octasplat.engine.dataset.model import Observations, SparsePoints
 from octasplat.engine.gaussians.model import FlatGaussians, concatenate
 from octasplat.engine.trace.factory import make_tracer
-from octasplat.engine.train.batches import BatchSource
 from octasplat.engine.train.config import LossWeights, TrainConfig
-from octasplat.engine.train.sight_lines import SightLines, blocked_term
-from octasplat.engine.train.state import fresh_state
-from octasplat.engine.train.trainer import Trainer
+from octasplat.engine.train.loop.state import fresh_state
+from octasplat.engine.train.loop.trainer import Trainer
+from octasplat.engine.train.sampling.batches import BatchSource
+from octasplat.engine.train.sampling.visibility_rays import SightLines, blocked_term
 from tests.support.planar_dataset import PlanarDataset
 
 

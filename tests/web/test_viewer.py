@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import octasplat.service.web as service_web
-from octasplat.engine.colour import to_bytes
+from octasplat.engine.core.color import to_bytes
 from octasplat.engine.files.gaussian_ply import write_gaussian_ply
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.gaussians.octagon import CHI2_2_99, CHI2_3_99

@@ -2,9 +2,9 @@
 
 import pytest
 
-from octasplat.engine.config import resolve_config
+from octasplat.engine.dataset.image_sizes import Sizes
 from octasplat.engine.operations.cost_model import Estimate, estimate_reconstruction
-from octasplat.engine.photograph_sizes import Sizes
+from octasplat.engine.runs.config import resolve_config
 
 
 def estimated(preset: str, sizes: Sizes, *, materials: bool = False) -> Estimate:

@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from octasplat.engine.config import ReconstructionConfig
+from octasplat.engine.core.events import Event
+from octasplat.engine.core.rays import ImageRays, RayBatch
 from octasplat.engine.dataset import Dataset
 from octasplat.engine.dataset.synthetic import SyntheticDatasetConfig, write_synthetic_dataset
-from octasplat.engine.events import Event
 from octasplat.engine.operations.reconstruct import options_from_json
 from octasplat.engine.pipeline import OnStep, reconstruct
-from octasplat.engine.rays import ImageRays, RayBatch
+from octasplat.engine.runs.config import ReconstructionConfig
 from octasplat.engine.shading.plain import PLAIN
 from octasplat.engine.shading.protocol import ShadingModel
 from octasplat.engine.trace.protocol import Tracer

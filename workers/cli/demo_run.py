@@ -4,13 +4,13 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from octasplat.engine.config import ReconstructionConfig, read_config
+from octasplat.engine.core.errors import ConfigError
+from octasplat.engine.core.progress import counted_stage
 from octasplat.engine.dataset.synthetic import SyntheticDatasetConfig, write_synthetic_dataset
-from octasplat.engine.errors import ConfigError
 from octasplat.engine.operations.reconstruct import ReconstructRequest
-from octasplat.engine.run_folder import CONFIG
-from octasplat.engine.stages import counted_stage
-from octasplat.engine.train.preset_names import PresetName
+from octasplat.engine.runs.config import ReconstructionConfig, read_config
+from octasplat.engine.runs.run_folder import CONFIG
+from octasplat.engine.train.config.preset_names import PresetName
 from octasplat.workers.cli.progress import show_progress
 from octasplat.workers.cli.reconstruction import run_reconstruction
 from octasplat.workers.cli.signals import exit_on_sigterm

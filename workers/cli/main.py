@@ -15,7 +15,7 @@ from typing import Any, NoReturn, TextIO
 import click
 
 from octasplat.engine import __version__
-from octasplat.engine.errors import OctasplatError
+from octasplat.engine.core.errors import OctasplatError
 from octasplat.workers.cli.signals import StoppedError
 
 # Threads that wait for each other sleep instead of spinning: no slower alone, several times faster on a

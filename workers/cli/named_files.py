@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from octasplat.engine.errors import ConfigError
+from octasplat.engine.core.errors import ConfigError
 from octasplat.engine.operations import operation, operation_names
 from octasplat.engine.operations.file_patterns import expand_patterns
 from octasplat.workers.client.submission import Derivation

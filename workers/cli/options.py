@@ -5,8 +5,8 @@ from typing import Any, TypeVar
 
 import click
 
-from octasplat.engine.errors import ConfigError
-from octasplat.engine.threads import available_threads
+from octasplat.engine.core.errors import ConfigError
+from octasplat.engine.core.threads import available_threads
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -38,7 +38,7 @@ def parse_export_names(text: str | None) -> tuple[str, ...] | None:
     Raises:
         ConfigError: one of them is no name of a result.
     """
-    from octasplat.engine.export_names import check_export_name
+    from octasplat.engine.runs.export_names import check_export_name
 
     if text is None:
         return None

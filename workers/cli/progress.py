@@ -9,8 +9,8 @@ from rich.console import Console, RenderableType
 from rich.progress import BarColumn, Progress, TaskID, TextColumn
 from rich.text import Text
 
-from octasplat.engine.durations import clock
-from octasplat.engine.events import (
+from octasplat.engine.core.durations import clock
+from octasplat.engine.core.events import (
     Event,
     Listener,
     Noted,
@@ -20,7 +20,7 @@ from octasplat.engine.events import (
     TrainingProgress,
     Warned,
 )
-from octasplat.engine.stages import DOING
+from octasplat.engine.core.progress import DOING
 from octasplat.workers.reporting.event_lines import EventLines, ProgressState
 from octasplat.workers.reporting.wording import format_training_state
 

@@ -2,7 +2,7 @@
 
 import click
 
-from octasplat.engine.errors import ExportFailed, NoSpaceLeft
+from octasplat.engine.core.errors import ExportFailed, NoSpaceLeft
 from octasplat.engine.operations.reconstruct import OPERATION, ReconstructRequest, run_config
 from octasplat.workers.cli.request_options import run_operation
 from octasplat.workers.cli.signals import StoppedError

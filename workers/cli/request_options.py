@@ -12,8 +12,7 @@ from pydantic import BaseModel, BeforeValidator
 from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
 
-from octasplat.engine.errors import Cancelled
-from octasplat.engine.fields import Positional, Spelling, is_negatable
+from octasplat.engine.core.errors import Cancelled
 from octasplat.engine.operations.base import (
     ContradictoryRequestError,
     Operation,
@@ -22,7 +21,8 @@ from octasplat.engine.operations.base import (
     never_stop,
 )
 from octasplat.engine.operations.written_files import remember_written
-from octasplat.engine.renamed_settings import former_names, tell_renamed
+from octasplat.engine.settings.fields import Positional, Spelling, is_negatable
+from octasplat.engine.settings.renamed_settings import former_names, tell_renamed
 from octasplat.workers.cli.options import quiet_option, threads_option
 from octasplat.workers.cli.progress import show_progress
 from octasplat.workers.cli.signals import StoppedError, exit_on_sigterm, request_stop_on_signals

@@ -9,7 +9,7 @@ from typing import Any, Self
 
 import httpx
 
-from octasplat.engine.errors import OctasplatError
+from octasplat.engine.core.errors import OctasplatError
 from octasplat.workers.client.backoff import MAX_FIRST_OUTAGE_SECONDS, MAX_OUTAGE_SECONDS, Backoff
 from octasplat.workers.data_folder import ADDRESS_FILE, TOKEN_FILE, default_data_folder
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import httpx
 
-from octasplat.engine.errors import OutputError
+from octasplat.engine.core.errors import OutputError
 from octasplat.workers.client.api import (
     BUSY_STATUSES,
     UNAVAILABLE_STATUSES,

@@ -6,13 +6,13 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-from octasplat.engine.errors import ConfigError, OctasplatError
-from octasplat.engine.events import Listener, Warned, ignore
-from octasplat.engine.nested_options import merged
+from octasplat.engine.core.errors import ConfigError, OctasplatError
+from octasplat.engine.core.events import Listener, Warned, ignore
+from octasplat.engine.core.progress import counted_stage
 from octasplat.engine.pathtracing.stage.sidecar_files import sidecar_files
 from octasplat.engine.pathtracing.stage.stage_file import read_stage, referenced_files, with_renamed_files
 from octasplat.engine.render.path_document import read_path_document
-from octasplat.engine.stages import counted_stage
+from octasplat.engine.settings.nested_options import merged
 from octasplat.workers.client.api import Api
 from octasplat.workers.client.download import download_results
 from octasplat.workers.client.upload import upload_files, upload_scene

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from octasplat.engine.errors import DatasetError
+from octasplat.engine.core.errors import DatasetError
 from octasplat.workers.client.api import Api, ServiceError
 from octasplat.workers.client.backoff import Backoff
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import httpx
 
-from octasplat.engine.events import Listener
+from octasplat.engine.core.events import Listener
 from octasplat.workers.client.api import (
     BUSY_STATUSES,
     UNAVAILABLE_STATUSES,

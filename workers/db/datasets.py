@@ -8,7 +8,7 @@ from typing import Any
 
 from psycopg.rows import class_row, dict_row
 
-from octasplat.engine.photograph_sizes import Sizes
+from octasplat.engine.dataset.image_sizes import Sizes
 from octasplat.workers.db.connections import Connection, with_columns
 from octasplat.workers.db.errors import ConflictError, NotFoundError
 from octasplat.workers.db.ids import new_id

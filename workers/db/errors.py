@@ -1,6 +1,6 @@
 """What can go wrong with the database and in its tables, each fit to be shown as it is."""
 
-from octasplat.engine.errors import OctasplatError
+from octasplat.engine.core.errors import OctasplatError
 
 
 class DatabaseError(OctasplatError):

@@ -12,7 +12,7 @@ from typing import Literal, LiteralString
 
 from psycopg.rows import class_row
 
-from octasplat.engine.errors import OctasplatError
+from octasplat.engine.core.errors import OctasplatError
 from octasplat.workers.db.connections import Connection
 from octasplat.workers.db.locks import lock_owner
 

@@ -22,8 +22,8 @@ import psycopg
 from psycopg import sql
 
 from octasplat.engine import __version__
-from octasplat.engine.errors import OctasplatError
-from octasplat.engine.writing import write_json
+from octasplat.engine.core.errors import OctasplatError
+from octasplat.engine.core.writing import write_json
 from octasplat.workers.db.migrate import OWN_COMPONENT, all_migrations, migrate
 from octasplat.workers.storage.errors import BlobNotFoundError
 from octasplat.workers.storage.local import LocalStorage

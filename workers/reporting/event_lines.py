@@ -3,8 +3,8 @@
 import time
 from collections.abc import Callable
 
-from octasplat.engine.durations import clock, duration
-from octasplat.engine.events import (
+from octasplat.engine.core.durations import clock, duration
+from octasplat.engine.core.events import (
     Event,
     HeldOutMeasured,
     Noted,
@@ -14,7 +14,7 @@ from octasplat.engine.events import (
     TrainingProgress,
     Warned,
 )
-from octasplat.engine.stages import DOING
+from octasplat.engine.core.progress import DOING
 from octasplat.workers.reporting.time_left import TimeLeftEstimator
 from octasplat.workers.reporting.wording import format_training_state
 

@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from typing import Any
 
-from octasplat.engine.events import EVENT_KINDS, Event, StageProgress, TrainingProgress, event_from
+from octasplat.engine.core.events import EVENT_KINDS, Event, StageProgress, TrainingProgress, event_from
 
 EVENT_STREAM_KINDS = frozenset({"progress", *EVENT_KINDS})
 

@@ -1,6 +1,6 @@
 """Numbers and results in the words in which they are shown."""
 
-from octasplat.engine.events import HeldOutMeasured, TrainingProgress
+from octasplat.engine.core.events import HeldOutMeasured, TrainingProgress
 
 
 def format_rate(per_second: float) -> str:

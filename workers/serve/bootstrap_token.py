@@ -12,7 +12,7 @@ from pathlib import Path
 import psycopg
 from psycopg.rows import dict_row
 
-from octasplat.engine.errors import OutputError
+from octasplat.engine.core.errors import OutputError
 from octasplat.workers.db.tokens import (
     LOCAL_OWNER,
     add_token,

@@ -10,10 +10,10 @@ from collections.abc import Awaitable, Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from octasplat.engine.errors import OctasplatError, OutputError
+from octasplat.engine.core.errors import OctasplatError, OutputError
+from octasplat.engine.core.isolated_python import python_command
+from octasplat.engine.core.writing import write_json
 from octasplat.engine.files.splat_transform import PROGRAM_VARIABLE as SPLAT_TRANSFORM
-from octasplat.engine.isolated_python import python_command
-from octasplat.engine.writing import write_json
 from octasplat.workers.cancellation import cancel_and_wait
 from octasplat.workers.data_folder import ADDRESS_FILE, TOKEN_FILE
 from octasplat.workers.db.migrate import migrate

@@ -8,7 +8,7 @@ import signal
 import time
 from collections.abc import Callable, Mapping, Sequence
 
-from octasplat.engine.isolated_python import without_python_variables
+from octasplat.engine.core.isolated_python import without_python_variables
 from octasplat.workers.parent_death_signal import PARENT_PID_VARIABLE
 
 logger = logging.getLogger(__name__)

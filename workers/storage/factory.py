@@ -3,7 +3,7 @@
 from pathlib import Path
 from urllib.parse import parse_qs, urlsplit
 
-from octasplat.engine.errors import ConfigError
+from octasplat.engine.core.errors import ConfigError
 from octasplat.workers.storage.local import DEFAULT_FLOOR_BYTES, LocalStorage
 from octasplat.workers.storage.protocol import Storage
 

@@ -6,7 +6,7 @@ A name that is odd is refused, never mended, so that what the user sees is what 
 import re
 import unicodedata
 
-from octasplat.engine.errors import DatasetError
+from octasplat.engine.core.errors import DatasetError
 
 MAX_NAME_BYTES = 1000
 MAX_COMPONENT_BYTES = 240

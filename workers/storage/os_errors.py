@@ -4,7 +4,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from octasplat.engine.writing import NO_ROOM
+from octasplat.engine.core.writing import NO_ROOM
 from octasplat.workers.storage.errors import StorageFullError, StorageUnavailableError
 
 FREE_SPACE_HINT = "delete datasets or jobs, whose contents then go at once, or add room"

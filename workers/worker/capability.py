@@ -8,8 +8,8 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from octasplat.engine import versions
-from octasplat.engine.errors import ConfigError
+from octasplat.engine.core import versions
+from octasplat.engine.core.errors import ConfigError
 from octasplat.workers.db.connections import Pool
 from octasplat.workers.db.rows import Job
 from octasplat.workers.db.workers import live_workers

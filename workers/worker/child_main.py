@@ -1,6 +1,6 @@
 """The child process of a worker: does one job, tells of it in JSON lines, stops when asked or orphaned.
 
-Run by :func:`octasplat.engine.isolated_python.python_command`. The first line of stdin is the task as JSON; a
+Run by :func:`octasplat.engine.core.isolated_python.python_command`. The first line of stdin is the task as JSON; a
 later line ``stop`` asks to stop with a checkpoint, and its end means that the worker is gone. Events go to
 stdout, one JSON object a line; whatever libraries print goes to stderr, which is the job's log.
 """
@@ -17,8 +17,8 @@ import traceback
 from pathlib import Path
 from typing import Any, NoReturn
 
-from octasplat.engine.errors import Cancelled, OctasplatError
-from octasplat.engine.events import Event
+from octasplat.engine.core.errors import Cancelled, OctasplatError
+from octasplat.engine.core.events import Event
 from octasplat.workers.parent_death_signal import set_parent_death_signal
 from octasplat.workers.sandbox.confinement import confine, set_resource_limits
 from octasplat.workers.storage.os_errors import is_disk_full

@@ -14,8 +14,8 @@ from typing import Any
 
 import psutil
 
+from octasplat.engine.core.isolated_python import python_command
 from octasplat.engine.files.splat_transform import PROGRAM_VARIABLE as SPLAT_TRANSFORM
-from octasplat.engine.isolated_python import python_command
 
 MAX_LINE_BYTES = 1 << 20
 MAX_LAST_LINES = 20

@@ -2,7 +2,7 @@
 
 import time
 
-from octasplat.engine.events import CheckpointWritten, Event, ImagesKept, Listener
+from octasplat.engine.core.events import CheckpointWritten, Event, ImagesKept, Listener
 from octasplat.workers.worker.task import FRAMES_FOLDER
 
 FRAME_CHECKPOINT_SECONDS = 5.0

@@ -6,9 +6,8 @@ import shutil
 from contextlib import nullcontext
 from pathlib import Path
 
-from octasplat.engine.config import ReconstructionConfig
-from octasplat.engine.errors import CheckpointError, ConfigError
-from octasplat.engine.events import (
+from octasplat.engine.core.errors import CheckpointError, ConfigError
+from octasplat.engine.core.events import (
     Event,
     Noted,
     StageFinished,
@@ -16,10 +15,11 @@ from octasplat.engine.events import (
     Warned,
     broadcast,
 )
+from octasplat.engine.core.progress import counted_stage, stopping
+from octasplat.engine.core.writing import write_json
 from octasplat.engine.pipeline import reconstruct as reconstruct_scene
-from octasplat.engine.run_folder import CACHE, CHECKPOINTS, CONFIG, EVENTS, SCENE
-from octasplat.engine.stages import counted_stage, stopping
-from octasplat.engine.writing import write_json
+from octasplat.engine.runs.config import ReconstructionConfig
+from octasplat.engine.runs.run_folder import CACHE, CHECKPOINTS, CONFIG, EVENTS, SCENE
 from octasplat.workers.worker.job_kinds import get_job_kind
 from octasplat.workers.worker.job_kinds.operation_kind import OperationKind
 from octasplat.workers.worker.path_redaction import PathRedactor

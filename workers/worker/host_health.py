@@ -10,7 +10,7 @@ import uuid
 from collections.abc import Sequence
 from pathlib import Path
 
-from octasplat.engine.isolated_python import python_command
+from octasplat.engine.core.isolated_python import python_command
 from octasplat.workers.storage.errors import StorageError, StorageFullError
 from octasplat.workers.storage.os_errors import translate_os_errors
 from octasplat.workers.storage.protocol import Storage

@@ -7,7 +7,7 @@ from typing import Any, TypeVar
 
 import psycopg
 
-from octasplat.engine.errors import OctasplatError
+from octasplat.engine.core.errors import OctasplatError
 from octasplat.workers.db.quotas import QuotaExceededError
 from octasplat.workers.queue.attempts import MAX_RECOVERIES, Attempt, ResultFile
 from octasplat.workers.queue.storage_leases import StorageLease, storage_lease

@@ -8,15 +8,15 @@ from typing import ClassVar
 
 import numpy as np
 
+from octasplat.engine.core.events import Event, Listener
+from octasplat.engine.core.rays import ImageRays
 from octasplat.engine.dataset import Dataset
-from octasplat.engine.events import Event, Listener
-from octasplat.engine.rays import ImageRays
 from octasplat.engine.render.image_files import write_png
 from octasplat.engine.render.renderer import background_colour, render_rays
 from octasplat.engine.shading.plain import PLAIN
 from octasplat.engine.shading.protocol import ShadingModel
 from octasplat.engine.trace.protocol import Tracer
-from octasplat.engine.train.shading import background_of
+from octasplat.engine.train.shading_factory import background_of
 
 MAX_SIDE_PX = 320
 MIN_SIDE_PX = 96

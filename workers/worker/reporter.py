@@ -14,7 +14,7 @@ from typing import Any
 import psycopg
 from psycopg_pool import PoolTimeout
 
-from octasplat.engine.events import Warned
+from octasplat.engine.core.events import Warned
 from octasplat.workers.cancellation import cancel_and_wait
 from octasplat.workers.db.quotas import QuotaExceededError
 from octasplat.workers.queue.attempts import Attempt, FencedError

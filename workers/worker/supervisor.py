@@ -12,8 +12,8 @@ from typing import Any, TypeVar
 
 import psycopg
 
-from octasplat.engine import versions
-from octasplat.engine.errors import ConfigError, OctasplatError
+from octasplat.engine.core import versions
+from octasplat.engine.core.errors import ConfigError, OctasplatError
 from octasplat.workers.cancellation import cancel_and_wait
 from octasplat.workers.db.datasets import files_of, get_dataset
 from octasplat.workers.queue.attempts import Attempt, FencedError

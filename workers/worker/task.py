@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from octasplat.engine.events import Listener, ignore
+from octasplat.engine.core.events import Listener, ignore
 
 RUN_FOLDER, RESULTS_FOLDER, SCENE_FOLDER, FILES_FOLDER = "run", "results", "scene", "files"
 """Folders of an attempt: the engine's output, what is to be published, photographs, files that are named."""

@@ -20,8 +20,8 @@ import psutil
 from procrastinate.exceptions import ConnectorException
 
 from octasplat.engine import __version__
+from octasplat.engine.core.threads import available_threads
 from octasplat.engine.files import writable_formats
-from octasplat.engine.threads import available_threads
 from octasplat.workers.cancellation import cancel_and_wait
 from octasplat.workers.db.connections import Pool, open_pool
 from octasplat.workers.db.ids import new_id

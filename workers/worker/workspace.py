@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO, Any
 
-from octasplat.engine import versions
+from octasplat.engine.core import versions
 from octasplat.engine.render.resume import RECORD_FILE
 from octasplat.workers.db.rows import Artifact, DatasetFile, Job
 from octasplat.workers.queue.attempts import ResultFile
@@ -57,7 +57,7 @@ class Checkpoint:
         step: of the stage.
         files: what is needed.
         results: what the same settings gave in the version that made it, see
-            :data:`octasplat.engine.versions.RESULTS`; versions that did not say so gave the first.
+            :data:`octasplat.engine.core.versions.RESULTS`; versions that did not say so gave the first.
     """
 
     attempt: int

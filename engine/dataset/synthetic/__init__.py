@@ -21,9 +21,9 @@ import uuid
 from collections.abc import Callable
 from pathlib import Path
 
+from octasplat.engine.core.errors import DatasetError, OutputError
+from octasplat.engine.core.writing import write_json
 from octasplat.engine.dataset.synthetic.config import CAMERA_MODELS, SyntheticDatasetConfig
-from octasplat.engine.errors import DatasetError, OutputError
-from octasplat.engine.writing import write_json
 
 __all__ = ["CAMERA_MODELS", "SyntheticDatasetConfig", "write_synthetic_dataset"]
 

@@ -2,7 +2,7 @@
 
 from dataclasses import asdict, dataclass
 
-from octasplat.engine.errors import ConfigError
+from octasplat.engine.core.errors import ConfigError
 
 CAMERA_MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "OPENCV", "OPENCV_FISHEYE")
 

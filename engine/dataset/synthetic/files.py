@@ -6,7 +6,7 @@ import numpy as np
 import OpenImageIO as oiio
 from jaxtyping import Bool, Float32, Int32, UInt8
 
-from octasplat.engine.errors import OutputError
+from octasplat.engine.core.errors import OutputError
 
 
 def _write_image(path: Path, pixels: np.ndarray, kind: str, channels: tuple[str, ...]) -> None:

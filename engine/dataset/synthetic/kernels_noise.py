@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from octasplat.engine.compilation import device_function, kernel
+from octasplat.engine.core.compilation import device_function, kernel
 
 
 @device_function(inline="always")

@@ -6,10 +6,10 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 from jaxtyping import Float, Float32
 
-from octasplat.engine.colour import linear_to_srgb
+from octasplat.engine.core.color import linear_to_srgb
+from octasplat.engine.core.rays import RayBatch
 from octasplat.engine.dataset.synthetic import kernels_noise
 from octasplat.engine.dataset.synthetic.still_life import StillLife
-from octasplat.engine.rays import RayBatch
 from octasplat.engine.trace.triangle_bvh import TriangleBvh, TriangleHits
 
 # Fixed, so that equal sums are summed alike on every machine.

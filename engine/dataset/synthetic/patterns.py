@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float, Float32, Int, UInt8
 
-from octasplat.engine.colour import srgb_to_linear
+from octasplat.engine.core.color import srgb_to_linear
 from octasplat.engine.dataset.synthetic import kernels_noise
 
 _FONT = {

@@ -6,7 +6,7 @@ import numpy as np
 import pycolmap
 from jaxtyping import Bool, Float, Float32, UInt8
 
-from octasplat.engine.colour import to_bytes
+from octasplat.engine.core.color import to_bytes
 from octasplat.engine.dataset.synthetic.config import SyntheticDatasetConfig
 from octasplat.engine.dataset.synthetic.lit_scene import LitScene
 from octasplat.engine.dataset.synthetic.synthetic_views import SyntheticView, directions_cam

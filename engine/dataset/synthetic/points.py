@@ -6,7 +6,7 @@ import numpy as np
 import pycolmap
 from jaxtyping import Bool, Float, UInt8
 
-from octasplat.engine.colour import to_bytes
+from octasplat.engine.core.color import to_bytes
 from octasplat.engine.dataset.synthetic.config import SyntheticDatasetConfig
 from octasplat.engine.dataset.synthetic.lit_scene import LitScene
 from octasplat.engine.dataset.synthetic.photograph_renderer import rays_world

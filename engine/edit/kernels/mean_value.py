@@ -13,7 +13,7 @@ from numba import prange, types
 from numba.extending import intrinsic
 from numpy.polynomial import Chebyshev, Polynomial
 
-from octasplat.engine.compilation import device_function, kernel
+from octasplat.engine.core.compilation import device_function, kernel
 from octasplat.engine.trace.cpu.kernels.simd_vector import DOUBLE8, LANES, VectorRows, broadcast
 
 GROUPS_PER_TASK = 16

@@ -1,6 +1,6 @@
 """Sums over the paths of each pixel."""
 
-from octasplat.engine.compilation import kernel
+from octasplat.engine.core.compilation import kernel
 
 
 @kernel(_nrt=False, error_model="numpy")

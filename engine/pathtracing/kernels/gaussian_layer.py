@@ -14,7 +14,7 @@ composited as such, into one layer of premultiplied colour g and transmittance T
 
 import math
 
-from octasplat.engine.compilation import kernel
+from octasplat.engine.core.compilation import kernel
 from octasplat.engine.pathtracing.kernels.kernel_args import SAMPLE_PAIRS_PER_BOUNCE
 from octasplat.engine.pathtracing.kernels.lights import (
     INFINITE_DISTANCE,

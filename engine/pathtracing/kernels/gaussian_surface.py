@@ -7,7 +7,7 @@ and else goes on to what is behind; so no light is counted twice, and rays of al
 
 import math
 
-from octasplat.engine.compilation import kernel
+from octasplat.engine.core.compilation import kernel
 from octasplat.engine.pathtracing.kernels.gaussian_layer import MIN_COVERAGE
 from octasplat.engine.pathtracing.kernels.path_surfaces import PATH_ENDED
 from octasplat.engine.pathtracing.kernels.principled_bsdf import BURLEY

@@ -7,7 +7,7 @@ asked most.
 
 import math
 
-from octasplat.engine.compilation import kernel
+from octasplat.engine.core.compilation import kernel
 from octasplat.engine.pathtracing.kernels.principled_bsdf import orthonormal_basis
 from octasplat.engine.pathtracing.kernels.texture import eval_texture
 from octasplat.engine.trace.kernels.native import njit_no_refcount

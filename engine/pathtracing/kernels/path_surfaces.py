@@ -7,7 +7,7 @@ several threads can share the work.
 
 import math
 
-from octasplat.engine.compilation import kernel
+from octasplat.engine.core.compilation import kernel
 from octasplat.engine.pathtracing.kernels.kernel_args import BLOCK_SIZE, SAMPLE_PAIRS_PER_BOUNCE
 from octasplat.engine.pathtracing.kernels.lights import (
     emitter_hit_pdf,
@@ -52,7 +52,7 @@ from octasplat.engine.pathtracing.kernels.surface import (
     reflect,
     shading_normal,
 )
-from octasplat.engine.shading.kernels_microfacets import table_value
+from octasplat.engine.shading.kernels.microfacets import table_value
 from octasplat.engine.trace.kernels.native import njit_no_refcount
 
 PATH_ENDED = -2

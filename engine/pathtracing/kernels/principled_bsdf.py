@@ -4,7 +4,7 @@ Directions are in the frame of the shading normal (z), ``o`` towards the viewer 
 both of unit length. Values are linear and already hold the cosine to the light. Everything is a pure
 function of its arguments.
 
-Microfacets are those of :mod:`octasplat.engine.shading.kernels_microfacets`. Light that facets throw at each
+Microfacets are those of :mod:`octasplat.engine.shading.kernels.microfacets`. Light that facets throw at each
 other: "Practical multiple scattering compensation for microfacet models" (Turquin 2019). The ground under a
 coat takes what the coat leaves, in both directions: "A Microfacet Based Coupled Specular-Matte BRDF Model"
 (Kelemen and Szirmay-Kalos 2001).
@@ -12,7 +12,7 @@ coat takes what the coat leaves, in both directions: "A Microfacet Based Coupled
 
 import math
 
-from octasplat.engine.shading.kernels_microfacets import (
+from octasplat.engine.shading.kernels.microfacets import (
     ggx_density,
     ggx_masking,
     sample_visible_normal,

@@ -5,7 +5,7 @@ import math
 import numpy as np
 from numba import prange
 
-from octasplat.engine.compilation import kernel
+from octasplat.engine.core.compilation import kernel
 from octasplat.engine.pathtracing.kernels.principled_bsdf import (
     MIN_ALPHA,
     fresnel_dielectric,
@@ -13,7 +13,7 @@ from octasplat.engine.pathtracing.kernels.principled_bsdf import (
     principled_sample,
 )
 from octasplat.engine.pathtracing.kernels.sampler import UINT32_TO_UNIT, reverse_bits
-from octasplat.engine.shading.kernels_microfacets import ggx_masking, sample_visible_normal
+from octasplat.engine.shading.kernels.microfacets import ggx_masking, sample_visible_normal
 
 
 @kernel(parallel=True, error_model="numpy")

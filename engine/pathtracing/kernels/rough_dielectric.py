@@ -12,10 +12,10 @@ import math
 import numpy as np
 from numba import prange
 
-from octasplat.engine.compilation import kernel
+from octasplat.engine.core.compilation import kernel
 from octasplat.engine.pathtracing.kernels.principled_bsdf import MIN_ALPHA, fresnel_dielectric
 from octasplat.engine.pathtracing.kernels.sampler import UINT32_TO_UNIT, reverse_bits
-from octasplat.engine.shading.kernels_microfacets import ggx_density, ggx_masking, sample_visible_normal
+from octasplat.engine.shading.kernels.microfacets import ggx_density, ggx_masking, sample_visible_normal
 from octasplat.engine.trace.kernels.native import njit_no_refcount
 
 MIN_GLASS_ROUGHNESS = 0.03

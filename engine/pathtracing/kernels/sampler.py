@@ -8,7 +8,7 @@ cannot matter.
 
 import numpy as np
 
-from octasplat.engine.compilation import kernel
+from octasplat.engine.core.compilation import kernel
 from octasplat.engine.trace.kernels.native import njit_no_refcount
 
 UINT32_TO_UNIT = 2.0**-32

@@ -8,6 +8,7 @@ import math
 
 import numpy as np
 
+from octasplat.engine.core.rays import AT_INFINITY
 from octasplat.engine.pathtracing.kernels.lights import INFINITE_DISTANCE, sample_light, sample_light_index
 from octasplat.engine.pathtracing.kernels.principled_bsdf import (
     orthonormal_basis,
@@ -16,7 +17,6 @@ from octasplat.engine.pathtracing.kernels.principled_bsdf import (
     sample_cosine,
 )
 from octasplat.engine.pathtracing.kernels.surface import normalize
-from octasplat.engine.rays import AT_INFINITY
 from octasplat.engine.trace.kernels.native import njit_no_refcount
 
 FLAG_LOSSLESS = 1

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from octasplat.engine.compilation import kernel
+from octasplat.engine.core.compilation import kernel
 
 
 @kernel(error_model="numpy")

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from octasplat.engine.compilation import kernel
+from octasplat.engine.core.compilation import kernel
 from octasplat.engine.pathtracing.kernels.kernel_args import BLOCK_SIZE
 from octasplat.engine.pathtracing.kernels.path_surfaces import add_direct_light, shade_surfaces, start_paths
 from octasplat.engine.pathtracing.kernels.shadow_rays import shadow_transmittance

@@ -8,7 +8,8 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Float32, Float64
 
-from octasplat.engine.colour import linear_to_srgb
+from octasplat.engine.core.color import linear_to_srgb
+from octasplat.engine.core.rays import ImageRays
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.pathtracing.compile_meshes import compile_meshes
 from octasplat.engine.pathtracing.environment import EnvironmentMap
@@ -16,7 +17,6 @@ from octasplat.engine.pathtracing.gaussian_layers import build_gaussian_layers
 from octasplat.engine.pathtracing.lights import build_light_arrays, eval_environment_map
 from octasplat.engine.pathtracing.path_tracer import PathTracer, PathTracerScene
 from octasplat.engine.pathtracing.stage.model import Integrator, Stage, StageGaussians
-from octasplat.engine.rays import ImageRays
 from octasplat.engine.trace.protocol import TraceSettings
 
 ProgressCallback = Callable[[float], None]

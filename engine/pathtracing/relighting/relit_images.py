@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32, Float64
 
-from octasplat.engine.colour import linear_to_srgb, srgb_to_linear
-from octasplat.engine.errors import ConfigError
+from octasplat.engine.core.color import linear_to_srgb, srgb_to_linear
+from octasplat.engine.core.errors import ConfigError
 from octasplat.engine.pathtracing.environment import EnvironmentMap, environment_frame
 from octasplat.engine.pathtracing.relighting.path_relighter import Relighter, render_environment
 from octasplat.engine.render.environment_files import read_environment

@@ -3,11 +3,11 @@
 import numpy as np
 from jaxtyping import Float32
 
+from octasplat.engine.core.rays import ImageRays
 from octasplat.engine.gaussians.materials import AMBIENT, with_interreflection_channel
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.pathtracing.environment import EnvironmentMap
 from octasplat.engine.pathtracing.relighting.path_relighter import ProgressCallback, RelitImage, no_progress
-from octasplat.engine.rays import ImageRays
 from octasplat.engine.render.supersampling import pixel_means
 from octasplat.engine.shading.deferred import Deferred
 from octasplat.engine.shading.material_settings import MaterialSettings

@@ -8,10 +8,10 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from octasplat.engine.errors import ConfigError
+from octasplat.engine.core.errors import ConfigError
+from octasplat.engine.core.writing import write_text
 from octasplat.engine.pathtracing.stage.model import Stage
 from octasplat.engine.pathtracing.stage.sidecar_files import sidecar_files
-from octasplat.engine.writing import write_text
 
 MAX_STAGE_BYTES = 16 << 20
 TEXTURE_KEYS = ("texture", "metallic_roughness_texture", "normal_texture", "emission_texture")

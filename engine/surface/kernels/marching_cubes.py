@@ -3,7 +3,7 @@
 import numpy as np
 from numba import prange
 
-from octasplat.engine.compilation import device_function, kernel
+from octasplat.engine.core.compilation import device_function, kernel
 
 BLOCK_SIDE = 8
 SIDE = BLOCK_SIDE + 1

@@ -2,7 +2,7 @@
 
 import math
 
-from octasplat.engine.compilation import kernel
+from octasplat.engine.core.compilation import kernel
 
 
 @kernel()

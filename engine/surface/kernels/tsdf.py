@@ -5,7 +5,7 @@ import math
 import numpy as np
 from numba import prange
 
-from octasplat.engine.compilation import device_function, kernel
+from octasplat.engine.core.compilation import device_function, kernel
 
 BLOCK = 8
 VOXELS_PER_BLOCK = BLOCK**3

@@ -5,7 +5,7 @@ import math
 import numpy as np
 from numba import prange
 
-from octasplat.engine.compilation import kernel
+from octasplat.engine.core.compilation import kernel
 
 MIN_COSINE = 0.15
 """Pixels that see a triangle more from the side say nothing of where it lies."""

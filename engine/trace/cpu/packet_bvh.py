@@ -6,7 +6,7 @@ Their layout is described in :mod:`octasplat.engine.trace.cpu.kernels.packet_bvh
 import numpy as np
 from jaxtyping import Float32, Int32
 
-from octasplat.engine.compilation import run_ranges
+from octasplat.engine.core.compilation import run_ranges
 from octasplat.engine.trace.cpu.kernels.packet_bvh import (
     BOX_ROWS,
     INVALID_KEY,

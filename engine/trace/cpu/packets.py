@@ -5,8 +5,8 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float32, Int32, Int64
 
-from octasplat.engine.compilation import run_on_threads, run_ranges
-from octasplat.engine.rays import RayBatch
+from octasplat.engine.core.compilation import run_on_threads, run_ranges
+from octasplat.engine.core.rays import RayBatch
 from octasplat.engine.trace.cpu.kernels.kernel_args import (
     ForwardPass,
     GaussianParameters,

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Int32, Int64
 
-from octasplat.engine.rays import RayBatch
+from octasplat.engine.core.rays import RayBatch
 from octasplat.engine.trace.cpu.kernels.kernel_args import HitArrays, PacketHits, SharedSortHits, TraceLimits
 from octasplat.engine.trace.cpu.kernels.rays import first_hit_index
 

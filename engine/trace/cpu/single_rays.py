@@ -3,7 +3,7 @@
 import numpy as np
 from jaxtyping import Float32, Int64
 
-from octasplat.engine.compilation import run_on_threads, run_ranges
+from octasplat.engine.core.compilation import run_on_threads, run_ranges
 from octasplat.engine.trace.cpu.kernels.kernel_args import (
     ForwardPass,
     GaussianParameters,

@@ -4,10 +4,10 @@ import numba
 import numpy as np
 from jaxtyping import Float32, Int32, Int64
 
-from octasplat.engine.compilation import run_ranges
+from octasplat.engine.core.compilation import run_ranges
+from octasplat.engine.core.rays import RayBatch
+from octasplat.engine.core.threads import use_threads
 from octasplat.engine.gaussians.model import FlatGaussians
-from octasplat.engine.rays import RayBatch
-from octasplat.engine.threads import use_threads
 from octasplat.engine.trace.cpu.kernels.kernel_args import (
     ForwardPass,
     GaussianParameters,

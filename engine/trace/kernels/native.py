@@ -8,7 +8,7 @@ from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-from octasplat.engine.compilation import device_function
+from octasplat.engine.core.compilation import device_function
 
 CACHE_LINE_BYTES = 64
 """Bytes of a cache line."""

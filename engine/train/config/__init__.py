@@ -12,6 +12,7 @@ from octasplat.engine.train.config.derived import (
     rebuild_interval,
     window_side_px,
 )
+from octasplat.engine.train.config.learning_rates import LearningRates
 from octasplat.engine.train.config.loss import FOR_SURFACE, LossWeights
 from octasplat.engine.train.config.photographs import (
     BACKGROUND_SMOOTHNESS,
@@ -21,7 +22,6 @@ from octasplat.engine.train.config.photographs import (
     PhotographSettings,
 )
 from octasplat.engine.train.config.presets import preset, with_materials
-from octasplat.engine.train.config.rates import LearningRates
 from octasplat.engine.train.config.train import TrainConfig
 
 __all__ = [

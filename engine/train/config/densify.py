@@ -4,9 +4,9 @@ from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field
 
-from octasplat.engine import renamed_settings
-from octasplat.engine.fields import ADVANCED, EXPERIMENTAL, Unit
-from octasplat.engine.settings import Settings
+from octasplat.engine.settings import renamed_settings
+from octasplat.engine.settings.base import Settings
+from octasplat.engine.settings.fields import ADVANCED, EXPERIMENTAL, Unit
 
 
 class McmcConfig(Settings):
@@ -78,7 +78,7 @@ class McmcConfig(Settings):
 class PaperConfig(Settings):
     """Clone and split by the Adam step of the mean, prune.
 
-    See :mod:`octasplat.engine.train.densify.paper`.
+    See :mod:`octasplat.engine.train.densify.redisplats`.
     """
 
     former_names: ClassVar[renamed_settings.FormerNames] = renamed_settings.DENSIFY

@@ -5,7 +5,7 @@ import math
 from octasplat.engine.train.config.train import TrainConfig
 
 MOST_PLANNED_ITERATIONS = 70_000
-"""Where a time decides their number, see :mod:`octasplat.engine.train.within`."""
+"""Where a time decides their number, see :mod:`octasplat.engine.train.loop.time_budget`."""
 LEAST_THOUSANDS = 5
 """Of iterations, where the photographs decide their number."""
 OWN_ORDER = 3 / 7
@@ -17,7 +17,7 @@ def iteration_count(config: TrainConfig, training_pixels: int, shown: float = 1.
 
     Large scenes learn as long as there is something to see; small ones are done after 7,000 with 7 rays a
     pixel. Rays that have an order of their own take longer, so that there are fewer of them. Where only a
-    share of the pixels shows anything (see :mod:`octasplat.engine.train.shown`), the rays of the others teach
+    share of the pixels shows anything (see :mod:`octasplat.engine.train.sampling.shown`), the rays of the others teach
     little and cost little, and it takes as many more; not with materials.
     """
     each = config.rays_per_pixel

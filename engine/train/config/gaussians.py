@@ -4,8 +4,8 @@ from typing import Annotated
 
 from pydantic import Field
 
-from octasplat.engine.fields import ADVANCED, BASIC, EXPERIMENTAL, Unit
-from octasplat.engine.settings import Settings
+from octasplat.engine.settings.base import Settings
+from octasplat.engine.settings.fields import ADVANCED, BASIC, EXPERIMENTAL, Unit
 
 
 class GaussianSettings(Settings):

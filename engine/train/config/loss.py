@@ -4,9 +4,9 @@ from typing import Annotated, ClassVar
 
 from pydantic import Field
 
-from octasplat.engine import renamed_settings
-from octasplat.engine.fields import ADVANCED, EXPERIMENTAL, Unit
-from octasplat.engine.settings import Settings
+from octasplat.engine.settings import renamed_settings
+from octasplat.engine.settings.base import Settings
+from octasplat.engine.settings.fields import ADVANCED, EXPERIMENTAL, Unit
 
 FOR_SURFACE = 0.05
 """Weight of ``loss.depth_normal`` for scenes of which a surface is to be made, see ``docs/surface.md``."""

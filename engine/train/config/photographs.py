@@ -4,8 +4,8 @@ from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field
 
-from octasplat.engine.fields import ADVANCED, BASIC, Unit
-from octasplat.engine.settings import FormerSetting, Settings
+from octasplat.engine.settings.base import FormerSetting, Settings
+from octasplat.engine.settings.fields import ADVANCED, BASIC, Unit
 
 BACKGROUND_SMOOTHNESS = 0.1
 """Weight of the differences between neighbouring texels of a learnt background."""

@@ -1,13 +1,13 @@
 """The presets: named starting points of the settings of a training."""
 
-from octasplat.engine.errors import ConfigError
+from octasplat.engine.core.errors import ConfigError
 from octasplat.engine.gaussians.octagon import CHI2_3_99
 from octasplat.engine.trace.protocol import TraceSettings
 from octasplat.engine.train.config.densify import McmcConfig, PaperConfig
+from octasplat.engine.train.config.learning_rates import LearningRates
 from octasplat.engine.train.config.loss import LossWeights
-from octasplat.engine.train.config.rates import LearningRates
+from octasplat.engine.train.config.preset_names import PRESETS
 from octasplat.engine.train.config.train import TrainConfig
-from octasplat.engine.train.preset_names import PRESETS
 
 TURNED_BEYOND = 0.5
 """Cosine beyond which normals that point away are turned, where materials are learnt."""

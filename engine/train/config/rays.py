@@ -5,8 +5,8 @@ from typing import Annotated
 
 from pydantic import Field, field_validator
 
-from octasplat.engine.fields import ADVANCED, BASIC, Unit
-from octasplat.engine.settings import Settings
+from octasplat.engine.settings.base import Settings
+from octasplat.engine.settings.fields import ADVANCED, BASIC, Unit
 
 
 class RaySettings(Settings):

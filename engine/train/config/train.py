@@ -8,15 +8,15 @@ from typing import Annotated, ClassVar
 
 from pydantic import Field, model_validator
 
-from octasplat.engine import renamed_settings
-from octasplat.engine.fields import ADVANCED, EXPERIMENTAL, Unit
+from octasplat.engine.settings import renamed_settings
+from octasplat.engine.settings.fields import ADVANCED, EXPERIMENTAL, Unit
 from octasplat.engine.shading.material_settings import MaterialSettings
 from octasplat.engine.trace.protocol import TraceSettings
 from octasplat.engine.train.config.densify import McmcConfig, PaperConfig
 from octasplat.engine.train.config.gaussians import GaussianSettings
+from octasplat.engine.train.config.learning_rates import LearningRates
 from octasplat.engine.train.config.loss import LossWeights
 from octasplat.engine.train.config.photographs import PhotographSettings
-from octasplat.engine.train.config.rates import LearningRates
 from octasplat.engine.train.config.rays import RaySettings
 
 

@@ -2,8 +2,8 @@
 
 from octasplat.engine.train.config import McmcConfig, PaperConfig
 from octasplat.engine.train.densify.mcmc import Mcmc
-from octasplat.engine.train.densify.paper import Paper
 from octasplat.engine.train.densify.protocol import Densifier
+from octasplat.engine.train.densify.redisplats import Paper
 
 __all__ = ["Densifier", "Mcmc", "Paper", "make_densifier"]
 

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float32, Float64, Int64
 from octasplat.engine.gaussians.model import FlatGaussians, concatenate
 from octasplat.engine.trace.protocol import GaussianGradients
 from octasplat.engine.train.config import McmcConfig
-from octasplat.engine.train.optimiser import Adam
+from octasplat.engine.train.optimization.adam import Adam
 
 MAX_COPIES = 32
 

@@ -7,7 +7,7 @@ from jaxtyping import Float32, Int64
 
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.trace.protocol import GaussianGradients
-from octasplat.engine.train.optimiser import Adam
+from octasplat.engine.train.optimization.adam import Adam
 
 
 @runtime_checkable

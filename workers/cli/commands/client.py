@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
-from octasplat.engine.errors import ConfigError
+from octasplat.engine.core.errors import ConfigError
 from octasplat.engine.operations.reconstruct import ReconstructOptions
-from octasplat.engine.renamed_settings import tell_renamed
+from octasplat.engine.settings.renamed_settings import tell_renamed
 from octasplat.workers.cli.options import exports_option, parse_export_names, quiet_option
 from octasplat.workers.cli.request_options import request_from_options, request_options
 

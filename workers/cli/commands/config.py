@@ -8,7 +8,7 @@ from typing import Any, get_args
 
 import click
 
-from octasplat.engine.fields import Level
+from octasplat.engine.settings.fields import Level
 
 _json_option = click.option("--json", "as_json", is_flag=True, help="Write JSON.")
 
@@ -25,8 +25,8 @@ def config() -> None:
 @_json_option
 def list_settings(everything: bool, group: str | None, markdown: bool, as_json: bool) -> None:
     """List the settings, those that most people need unless asked for others."""
-    from octasplat.engine.settings_catalog import settings, value_text
-    from octasplat.engine.settings_page import settings_page
+    from octasplat.engine.runs.settings_catalog import settings, value_text
+    from octasplat.engine.runs.settings_page import settings_page
 
     if markdown:
         click.echo(settings_page(), nl=False)
@@ -49,7 +49,7 @@ def list_settings(everything: bool, group: str | None, markdown: bool, as_json: 
 @_json_option
 def explain(name: str, as_json: bool) -> None:
     """Explain the setting NAME, such as lr.mean: what it does, its unit, range and defaults."""
-    from octasplat.engine.settings_catalog import setting_named, value_text
+    from octasplat.engine.runs.settings_catalog import setting_named, value_text
 
     entry = setting_named(name)
     if as_json:
@@ -76,9 +76,9 @@ def explain(name: str, as_json: bool) -> None:
 @_json_option
 def diff(run: Path, other: Path | None, as_json: bool) -> None:
     """Tell in which settings RUN differs from the defaults of its preset, or RUN2 from RUN."""
-    from octasplat.engine.config import read_config
-    from octasplat.engine.run_folder import CONFIG
-    from octasplat.engine.settings_catalog import defaults_of, differences, value_text
+    from octasplat.engine.runs.config import read_config
+    from octasplat.engine.runs.run_folder import CONFIG
+    from octasplat.engine.runs.settings_catalog import defaults_of, differences, value_text
 
     first = read_config(run / CONFIG)
     before, after = (defaults_of(first), first) if other is None else (first, read_config(other / CONFIG))

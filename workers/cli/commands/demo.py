@@ -6,10 +6,10 @@ from typing import Annotated, Any, ClassVar
 import click
 from pydantic import Field
 
-from octasplat.engine import renamed_settings
-from octasplat.engine.fields import Output, Spelling, Unit
 from octasplat.engine.operations.base import Request
-from octasplat.engine.train.preset_names import PresetName
+from octasplat.engine.settings import renamed_settings
+from octasplat.engine.settings.fields import Output, Spelling, Unit
+from octasplat.engine.train.config.preset_names import PresetName
 from octasplat.workers.cli.browser import has_display
 from octasplat.workers.cli.options import quiet_option, threads_option
 from octasplat.workers.cli.request_options import request_from_options, request_options

@@ -37,7 +37,7 @@ def serve(
     import contextlib
     import threading
 
-    from octasplat.engine.errors import OctasplatError
+    from octasplat.engine.core.errors import OctasplatError
     from octasplat.workers.cli.browser import has_display, open_signed_in
     from octasplat.workers.cli.commands.worker import parse_queues
     from octasplat.workers.client.api import Api

@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 from psycopg.rows import class_row
 
-from octasplat.engine.errors import OctasplatError
+from octasplat.engine.core.errors import OctasplatError
 from octasplat.workers.db.connections import Connection, with_columns
 from octasplat.workers.db.errors import NotFoundError
 from octasplat.workers.db.ids import new_id

@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from octasplat.engine.config import ReconstructionConfig
+from octasplat.engine.dataset.image_sizes import Sizes
 from octasplat.engine.operations.base import Options
 from octasplat.engine.operations.clean import OPERATION as CLEAN
 from octasplat.engine.operations.cost_model import (
@@ -25,7 +25,7 @@ from octasplat.engine.operations.relight import OPERATION as RELIGHT
 from octasplat.engine.operations.render import OPERATION as RENDER
 from octasplat.engine.operations.stage_init import OPERATION as STAGE_INIT
 from octasplat.engine.operations.transform import OPERATION as TRANSFORM
-from octasplat.engine.photograph_sizes import Sizes
+from octasplat.engine.runs.config import ReconstructionConfig
 from octasplat.engine.train.config import MOST_PLANNED_ITERATIONS, iteration_count, most_gaussians
 from octasplat.workers.worker.job_kinds.image_kinds import RelightKind, RenderKind
 from octasplat.workers.worker.job_kinds.operation_kind import OperationKind

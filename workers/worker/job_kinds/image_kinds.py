@@ -5,8 +5,10 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from octasplat.engine.errors import Cancelled
-from octasplat.engine.events import Listener
+from octasplat.engine.core.errors import Cancelled
+from octasplat.engine.core.events import Listener
+from octasplat.engine.core.progress import stopping
+from octasplat.engine.dataset.image_sizes import Sizes
 from octasplat.engine.operations.base import Operation
 from octasplat.engine.operations.cost_model import (
     Estimate,
@@ -18,8 +20,6 @@ from octasplat.engine.operations.cost_model import (
 from octasplat.engine.operations.relight import RelightOptions
 from octasplat.engine.operations.render import RenderOptions
 from octasplat.engine.pathtracing.stage.stage_file import referenced_files
-from octasplat.engine.photograph_sizes import Sizes
-from octasplat.engine.stages import stopping
 from octasplat.workers.storage.file_names import check_name
 from octasplat.workers.worker.frame_checkpoints import FrameCheckpoints
 from octasplat.workers.worker.job_kinds.operation_kind import OperationKind

@@ -7,10 +7,10 @@ from typing import Any
 
 from pydantic import BaseModel
 
-from octasplat.engine.events import Listener
-from octasplat.engine.fields import map_named_files, named_files, takes_files
+from octasplat.engine.core.events import Listener
+from octasplat.engine.core.progress import stopping
 from octasplat.engine.operations.base import Operation, Options, Request
-from octasplat.engine.stages import stopping
+from octasplat.engine.settings.fields import map_named_files, named_files, takes_files
 from octasplat.workers.storage.file_names import check_name
 from octasplat.workers.worker.job_kinds.registry import JobKind, Needs
 from octasplat.workers.worker.task import SCENE_FILE, Task

@@ -6,9 +6,9 @@ from typing import Any, Generic, Literal
 from pydantic import BaseModel, ValidationError
 from typing_extensions import TypeVar
 
-from octasplat.engine.errors import ConfigError
+from octasplat.engine.core.errors import ConfigError
+from octasplat.engine.dataset.image_sizes import Sizes
 from octasplat.engine.operations.cost_model import Estimate
-from octasplat.engine.photograph_sizes import Sizes
 from octasplat.workers.worker.job_kinds.resource_limits import ResourceDemand
 
 OptionsT = TypeVar("OptionsT", bound=BaseModel, default=Any)

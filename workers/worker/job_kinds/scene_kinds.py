@@ -3,11 +3,11 @@
 from collections.abc import Sequence
 from typing import Any
 
+from octasplat.engine.dataset.image_sizes import Sizes
 from octasplat.engine.operations.base import Operation, Options
 from octasplat.engine.operations.export import OPERATION as EXPORT
 from octasplat.engine.operations.export import ExportJobOptions
 from octasplat.engine.operations.import_ import OPERATION as IMPORT
-from octasplat.engine.photograph_sizes import Sizes
 from octasplat.workers.worker.job_kinds.operation_kind import OperationKind
 from octasplat.workers.worker.job_kinds.resource_limits import ResourceDemand
 from octasplat.workers.worker.task import CONFIG_FILE, SCENE_FILE, Task

@@ -6,11 +6,11 @@ from typing import Any, Literal
 
 from pydantic import Field, model_validator
 
-from octasplat.engine.errors import ConfigError
+from octasplat.engine.core.errors import ConfigError
+from octasplat.engine.dataset.image_sizes import Sizes
 from octasplat.engine.files import check_surface_path
 from octasplat.engine.operations.base import Options
 from octasplat.engine.operations.surface import OPERATION, SurfaceOptions
-from octasplat.engine.photograph_sizes import Sizes
 from octasplat.workers.worker.job_kinds.operation_kind import OperationKind
 from octasplat.workers.worker.job_kinds.resource_limits import ResourceDemand
 from octasplat.workers.worker.task import Task

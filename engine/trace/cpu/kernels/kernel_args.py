@@ -13,13 +13,13 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float32, Float64, Int32, Int64, UInt64
 
+from octasplat.engine.core.rays import RayBatch
 from octasplat.engine.gaussians.model import FlatGaussians
-from octasplat.engine.rays import RayBatch
 from octasplat.engine.trace.protocol import TraceSettings
 
 
 class RayArrays(NamedTuple):
-    """A :class:`octasplat.engine.rays.RayBatch`; a single origin, limit or viewer stands for all."""
+    """A :class:`octasplat.engine.core.rays.RayBatch`; a single origin, limit or viewer stands for all."""
 
     origins: Float32[np.ndarray, "#r 3"]
     directions: Float32[np.ndarray, "r 3"]

@@ -10,7 +10,7 @@ import math
 import numpy as np
 from numba import carray, cfunc, types
 
-from octasplat.engine.compilation import device_function
+from octasplat.engine.core.compilation import device_function
 from octasplat.engine.trace.kernels.native import (
     float32_pointer,
     float64_pointer,

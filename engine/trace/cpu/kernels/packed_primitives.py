@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from octasplat.engine.compilation import device_function, kernel
+from octasplat.engine.core.compilation import device_function, kernel
 from octasplat.engine.trace.cpu.kernels.octagon_hit import (
     AXIS_U,
     AXIS_V,

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float32, Float64, Int32, Int64
 
-from octasplat.engine.compilation import device_function, kernel
+from octasplat.engine.core.compilation import device_function, kernel
 from octasplat.engine.trace.cpu.kernels.packed_primitives import rotation_columns
 from octasplat.engine.trace.cpu.kernels.packet_bvh import WIDTH
 from octasplat.engine.trace.cpu.kernels.packet_candidates import PREFETCH_DISTANCE, PRIMITIVE_BYTES

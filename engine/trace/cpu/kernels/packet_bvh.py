@@ -10,7 +10,7 @@ import math
 
 import numpy as np
 
-from octasplat.engine.compilation import device_function, kernel
+from octasplat.engine.core.compilation import device_function, kernel
 from octasplat.engine.gaussians.morton_bits import spread_bits
 from octasplat.engine.trace.cpu.kernels.octagon_hit import AXIS_U, AXIS_V, COS_22, INNER_RADIUS, MEAN
 

@@ -39,7 +39,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float32, Float64, Int32, UInt64
 
-from octasplat.engine.compilation import device_function, kernel
+from octasplat.engine.core.compilation import device_function, kernel
 from octasplat.engine.trace.cpu.kernels.octagon_hit import (
     AXIS_U,
     AXIS_V,

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float32, Float64, Int64, UInt64
 
-from octasplat.engine.compilation import device_function, kernel
+from octasplat.engine.core.compilation import device_function, kernel
 from octasplat.engine.trace.cpu.kernels.octagon_hit import MEAN, NORMAL
 from octasplat.engine.trace.cpu.kernels.packet_bvh import WIDTH
 from octasplat.engine.trace.cpu.kernels.packet_candidates import (

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float32, Float64, Int32, Int64, UInt64
 
-from octasplat.engine.compilation import device_function
+from octasplat.engine.core.compilation import device_function
 from octasplat.engine.trace.cpu.kernels.packet_bvh import BOX_ROWS, LEAF_ROWS, WIDTH
 from octasplat.engine.trace.cpu.kernels.ray_mask import (
     BINS,

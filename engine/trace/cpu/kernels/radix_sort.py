@@ -7,7 +7,7 @@ the packets' hierarchy.
 import numpy as np
 from jaxtyping import Int, Int32, Int64, Shaped
 
-from octasplat.engine.compilation import kernel, run_ranges
+from octasplat.engine.core.compilation import kernel, run_ranges
 
 DIGIT_BITS = 11
 BUCKETS = 1 << DIGIT_BITS

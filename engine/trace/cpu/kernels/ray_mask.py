@@ -10,7 +10,7 @@ import numpy as np
 from numba import types
 from numba.extending import intrinsic
 
-from octasplat.engine.compilation import device_function
+from octasplat.engine.core.compilation import device_function
 from octasplat.engine.trace.cpu.kernels.rays import ray_slopes
 from octasplat.engine.trace.cpu.kernels.simd_vector import (
     FLOAT8,

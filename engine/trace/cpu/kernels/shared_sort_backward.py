@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float32
 
-from octasplat.engine.compilation import kernel
+from octasplat.engine.core.compilation import kernel
 from octasplat.engine.trace.cpu.kernels.packet_backward import PACKET, RED, ROW_WORDS, W
 from octasplat.engine.trace.cpu.kernels.shared_sort import allocate_aligned_rows, group_lanes, write_ray_rows
 from octasplat.engine.trace.cpu.kernels.simd16 import (

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float32, Int32
 
-from octasplat.engine.compilation import kernel
+from octasplat.engine.core.compilation import kernel
 from octasplat.engine.gaussians.model import SH_C0
 from octasplat.engine.trace.cpu.kernels.octagon_hit import MEAN, NORMAL, OPACITY
 from octasplat.engine.trace.cpu.kernels.packed_primitives import rotation_columns

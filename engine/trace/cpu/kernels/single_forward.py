@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float32, UInt64
 
-from octasplat.engine.compilation import kernel
+from octasplat.engine.core.compilation import kernel
 from octasplat.engine.trace.cpu.kernels.composite import Hit, composite, init_ray_state, write_ray_outputs
 from octasplat.engine.trace.cpu.kernels.octagon_hit import (
     ALPHA_MAX,

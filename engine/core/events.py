@@ -1,0 +1,226 @@
+"""Typed progress events, written as JSON lines and shown by whoever listens.
+
+The engine emits; a progress bar, ``events.jsonl`` and later the web page listen. This module imports
+neither torch nor numba, so that a front end can use it.
+"""
+
+import json
+import time
+from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
+from dataclasses import MISSING, asdict, dataclass, fields
+from pathlib import Path
+from typing import IO, Any, ClassVar
+
+from octasplat.engine.core.writing import telling_of_room
+
+
+@dataclass(frozen=True)
+class Event:
+    """Base of all events; ``kind`` names the event in ``events.jsonl``."""
+
+    kind: ClassVar[str] = "event"
+
+    def as_dict(self) -> dict[str, object]:
+        """The event as JSON-ready values, its kind included."""
+        return {"kind": self.kind, **asdict(self)}
+
+
+@dataclass(frozen=True)
+class StageStarted(Event):
+    """A stage of a job begins; a reconstruction has ``load``, ``train``, ``evaluate`` and ``export``."""
+
+    kind: ClassVar[str] = "stage_started"
+    stage: str
+    total_steps: int = 0
+
+
+@dataclass(frozen=True)
+class StageProgress(Event):
+    """Step ``step`` of a stage that counts its steps is done, and the share ``part`` of the next one."""
+
+    kind: ClassVar[str] = "stage_progress"
+    stage: str
+    step: int
+    total_steps: int
+    part: float = 0.0
+
+
+@dataclass(frozen=True)
+class StageFinished(Event):
+    """A stage ended after ``seconds``."""
+
+    kind: ClassVar[str] = "stage_finished"
+    stage: str
+    seconds: float
+
+
+@dataclass(frozen=True)
+class TrainingProgress(Event):
+    """State of the training after ``iteration``; ``psnr`` is the running value over training rays, in dB."""
+
+    kind: ClassVar[str] = "training_progress"
+    iteration: int
+    total_iterations: int
+    loss: float
+    psnr: float
+    gaussians: int
+    rays_per_second: float
+    hits_per_ray: float
+    seconds: float
+    seconds_left: float
+
+
+@dataclass(frozen=True)
+class HeldOutMeasured(Event):
+    """PSNR of rays spread over the held-out views at ``iteration``, their errors pooled, in dB."""
+
+    kind: ClassVar[str] = "held_out_measured"
+    iteration: int
+    psnr: float
+    gaussians: int
+    seconds: float
+
+
+@dataclass(frozen=True)
+class CheckpointWritten(Event):
+    """A checkpoint of ``iteration``, or of so many images of a render, is safe on disk at ``path``."""
+
+    kind: ClassVar[str] = "checkpoint_written"
+    iteration: int
+    path: str
+
+
+@dataclass(frozen=True)
+class ImagesKept(Event):
+    """So many images of a render are safe on disk; a render that is stopped goes on with the others."""
+
+    kind: ClassVar[str] = "images_kept"
+    count: int
+
+
+@dataclass(frozen=True)
+class Warned(Event):
+    """Something the user should know, in one sentence; the work goes on."""
+
+    kind: ClassVar[str] = "warning"
+    message: str
+
+
+@dataclass(frozen=True)
+class Noted(Event):
+    """Something worth a line of the log, in one sentence, that needs no attention."""
+
+    kind: ClassVar[str] = "note"
+    message: str
+
+
+@dataclass(frozen=True)
+class RunFinished(Event):
+    """The whole job is done; ``outputs`` are paths relative to the output folder."""
+
+    kind: ClassVar[str] = "run_finished"
+    outputs: tuple[str, ...]
+    seconds: float
+
+
+EVENT_KINDS: dict[str, type[Event]] = {
+    event.kind: event
+    for event in (
+        StageStarted,
+        StageProgress,
+        StageFinished,
+        TrainingProgress,
+        HeldOutMeasured,
+        CheckpointWritten,
+        Warned,
+        Noted,
+    )
+}
+
+Listener = Callable[[Event], None]
+
+
+def event_from(kind: str, content: Mapping[str, Any]) -> Event | None:
+    """The event that was written as JSON; None if there is no such kind, or it lacks something."""
+    model = EVENT_KINDS.get(kind)
+    if model is None or not {f.name for f in fields(model) if f.default is MISSING} <= content.keys():
+        return None
+    return model(**{field.name: content[field.name] for field in fields(model) if field.name in content})
+
+
+def ignore(_event: Event) -> None:
+    """A listener that listens to nothing."""
+
+
+def broadcast(listeners: Iterable[Listener]) -> Listener:
+    """One listener that passes every event on to ``listeners``, in order."""
+    targets = tuple(listeners)
+
+    def send(event: Event) -> None:
+        for listener in targets:
+            listener(event)
+
+    return send
+
+
+def read_events(path: Path) -> list[dict[str, object]]:
+    """Rows of an event file, none where there is no file; a last line that a kill cut short is left out."""
+    rows = []
+    if path.exists():
+        for line in path.read_text(encoding="utf-8").splitlines():
+            try:
+                rows.append(json.loads(line))
+            except ValueError:
+                continue
+    return rows
+
+
+class JsonLinesListener:
+    """Appends each event, stamped with Unix time in seconds, as one line to a file.
+
+    Args:
+        path: the file.
+        hold: leave the file as it is, and keep the events, until :meth:`release` is called.
+    """
+
+    def __init__(self, path: Path, *, hold: bool = False) -> None:
+        self._path = path
+        self._held: list[str] = []
+        self._file: IO[str] | None = None
+        if not hold:
+            self.release()
+
+    def release(self) -> None:
+        """Write what was held, and from now on each event at once."""
+        if self._file is not None:
+            return
+        self._path.parent.mkdir(parents=True, exist_ok=True)
+        self._file = self._path.open("a", encoding="utf-8")
+        if self._file.tell() and not self._path.read_bytes().endswith(b"\n"):
+            self._file.write("\n")  # a kill cut the last line short; the next event begins a new one
+        self._write("".join(self._held))
+
+    def __call__(self, event: Event) -> None:
+        """Write ``event`` and flush, so that a reader beside the run sees whole lines.
+
+        Raises:
+            NoSpaceLeft: there is no room for it.
+        """
+        line = json.dumps({"time": round(time.time(), 3), **event.as_dict()}) + "\n"
+        if self._file is None:
+            self._held.append(line)
+        else:
+            self._write(line)
+
+    def close(self) -> None:
+        """Close the file; the listener must not be called afterwards."""
+        if self._file is not None:
+            with suppress(OSError):  # what could not be written was told when it was to be
+                self._file.close()
+
+    def _write(self, text: str) -> None:
+        assert self._file is not None
+        with telling_of_room(self._path):
+            self._file.write(text)
+            self._file.flush()

@@ -1,0 +1,71 @@
+"""Programs of ours in processes that import nothing from the current folder or ``PYTHONPATH``.
+
+``python -m module`` looks in the current folder first, where anything may lie that is called as what we use.
+What is started here runs with ``-E -P`` instead, finds the very packages that the starting process runs, and
+where somebody asked for modules by name, those. This file is also what is run; it imports nothing of ours.
+"""
+
+import importlib.util
+import os
+import runpy
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+ROOT = Path(__file__).absolute().parents[3]
+"""Folder that the package is imported from: ``src`` of a checkout, or where a wheel was unpacked."""
+_FLAGS = ("-E", "-P")
+"""Neither variables such as PYTHONPATH nor the current folder; a user's own installation stays."""
+
+
+def python_command(module: str, *arguments: str, further_modules: Sequence[str] = ()) -> tuple[str, ...]:
+    """The command that runs a module of ours in a process of its own, in whatever folder that starts.
+
+    Args:
+        module: what ``python -m`` would be told.
+        arguments: of the program.
+        further_modules: modules that are to be found as this process finds them. Their folders are searched
+            last, so that nothing in them takes the place of anything else.
+    """
+    later = os.pathsep.join(dict.fromkeys(filter(None, map(_folder_of, further_modules))))
+    return (
+        sys.executable,
+        *_FLAGS,
+        str(Path(__file__).absolute()),
+        str(ROOT),
+        later,
+        "-m",
+        module,
+        *arguments,
+    )
+
+
+def without_python_variables(environment: Mapping[str, str]) -> dict[str, str]:
+    """The environment without what steers Python, for processes whose own children are Python as well."""
+    return {name: value for name, value in environment.items() if not name.startswith("PYTHON")}
+
+
+def _folder_of(module: str) -> str:
+    """The folder from which a module is imported, or nothing where there is no such module or folder."""
+    try:
+        spec = importlib.util.find_spec(module)
+    except (ImportError, ValueError):
+        return ""
+    if spec is None or spec.origin is None or not Path(spec.origin).is_file():
+        return ""
+    path = Path(spec.origin).absolute()
+    path = path.parent if spec.submodule_search_locations is not None else path
+    return str(path.parents[module.count(".")])
+
+
+def _run() -> None:
+    first, later, _, module = sys.argv[1:5]
+    if not any(Path(folder).exists() and Path(folder).samefile(first) for folder in sys.path):
+        sys.path.insert(0, first)
+    sys.path += filter(None, later.split(os.pathsep))
+    sys.argv[1:5] = []
+    runpy.run_module(module, run_name="__main__", alter_sys=True)
+
+
+if __name__ == "__main__":
+    _run()

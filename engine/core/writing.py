@@ -1,0 +1,61 @@
+"""Writing files so that a reader never sees half of one, and a full disk is told with the file's name."""
+
+import errno
+import json
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from octasplat.engine.core.errors import NoSpaceLeft
+
+NO_ROOM = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
+"""Errors of the system that mean a full disk, a spent quota, or a limit on the size of files."""
+
+
+@contextmanager
+def telling_of_room(path: Path) -> Iterator[None]:
+    """Inside the block ``path`` is written, which the system's own errors do not say.
+
+    Raises:
+        NoSpaceLeft: there is no room for it.
+    """
+    try:
+        yield
+    except OSError as error:
+        if error.errno not in NO_ROOM:
+            raise
+        raise NoSpaceLeft(f"{path} cannot be written ({error.strerror}); free space there.") from error
+
+
+@contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """Yield a temporary path beside ``path`` that takes its place when the block ends without an error.
+
+    The temporary name keeps the suffix of ``path``, so that writers which look at it work as usual. On an
+    error the temporary file is removed and ``path`` is left as it was.
+
+    Raises:
+        NoSpaceLeft: there is no room for it.
+    """
+    with telling_of_room(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        temporary = path.with_name(f".{path.stem}.{os.getpid()}.partial{path.suffix}")
+        try:
+            yield temporary
+            with temporary.open("rb") as handle:
+                os.fsync(handle.fileno())
+            temporary.replace(path)
+        finally:
+            temporary.unlink(missing_ok=True)
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write ``text`` as UTF-8 to ``path``, atomically."""
+    with replacing(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+
+
+def write_json(path: Path, value: object) -> None:
+    """Write ``value`` as indented JSON to ``path``, atomically."""
+    write_text(path, json.dumps(value, indent=2) + "\n")

@@ -1,0 +1,257 @@
+"""``truth.json``: what is known of a rendered scene, read and checked; docs/materials.md tells the format.
+
+It lies beside the scene, or beside the folder of the views whose truth it is.
+"""
+
+import re
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from typing import Annotated
+
+import numpy as np
+import OpenImageIO as oiio
+from jaxtyping import Bool, Float32, Float64
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from octasplat.engine.core.color import srgb_to_linear
+from octasplat.engine.core.errors import ConfigError, DatasetError
+from octasplat.engine.core.relative_paths import checked_relative
+from octasplat.engine.render.image_files import read_image, shrink_to
+
+TRUTH = "truth.json"
+_FORMULA = re.compile(r"\bv(?:/(\d+(?:\.\d+)?))?(?:\*(\d+(?:\.\d+)?))?([+-]\d+(?:\.\d+)?)?(?![\w*/+])")
+_AXES = {f"{sign}{name}": k for k, name in enumerate("xyz") for sign in ("+", "-", "")}
+
+
+def _formula(text: str) -> str:
+    if _FORMULA.search(text) is None:
+        raise ValueError("tells no formula of the stored value v, as v/255 or v/65535*8.0")
+    return text
+
+
+_Path = Annotated[str, AfterValidator(checked_relative)]
+_Formula = Annotated[str, AfterValidator(_formula)]
+
+
+class _Part(BaseModel):
+    """Further keys are for people to read."""
+
+    model_config = ConfigDict(frozen=True, extra="ignore")
+
+
+class _World(_Part):
+    up: str = "+z"
+
+    @model_validator(mode="after")
+    def _is_an_axis(self) -> "_World":
+        if self.up not in _AXES:
+            raise ValueError("up is one of +x, -x, +y, -y, +z, -z")
+        return self
+
+
+class _Environment(_Part):
+    train: _Path | None = None
+    relight: tuple[_Path, ...] = ()
+    folder: _Path = "env"
+
+
+class _Maps(_Part):
+    folder: _Path = "test"
+    truth_views: Annotated[tuple[_Path, ...], Field(min_length=1)]
+    normal: _Formula | None = None
+    depth: _Formula | None = None
+    albedo: str | None = None
+    roughness: _Formula | None = None
+    metallic: _Formula | None = None
+
+
+class _Relight(_Part):
+    folders: tuple[_Path, ...] = ()
+    views: tuple[_Path, ...] = ()
+
+
+class TruthFile(_Part):
+    """The keys of ``truth.json`` that are read.
+
+    Attributes:
+        name: of the scene.
+        world: which way is up.
+        environment: names of the maps, the one of the photographs and those of relit pictures.
+        test: maps of the truth by view.
+        relight: pictures under other light.
+    """
+
+    name: str = ""
+    world: _World = _World()
+    environment: _Environment = _Environment()
+    test: _Maps
+    relight: _Relight = _Relight()
+
+
+@dataclass(frozen=True)
+class ViewTruth:
+    """What is known of one view; None where it is not.
+
+    Attributes:
+        mask: where the scene is seen.
+        normal_world: unit vectors that face the camera, 0 outside the mask.
+        depth_z: along the camera's axis, world units, 0 outside the mask.
+        albedo_linear: base colour.
+        roughness: perceptual.
+        metallic: share of the metal.
+    """
+
+    mask: Bool[np.ndarray, "h w"]
+    normal_world: Float32[np.ndarray, "h w 3"] | None = None
+    depth_z: Float32[np.ndarray, "h w"] | None = None
+    albedo_linear: Float32[np.ndarray, "h w 3"] | None = None
+    roughness: Float32[np.ndarray, "h w"] | None = None
+    metallic: Float32[np.ndarray, "h w"] | None = None
+
+
+@dataclass(frozen=True)
+class Truth:
+    """A truth file and the folders beside it.
+
+    Attributes:
+        path: of ``truth.json``.
+        content: its keys.
+    """
+
+    path: Path
+    content: TruthFile
+
+    @property
+    def views(self) -> tuple[str, ...]:
+        """Names of the views with maps."""
+        return self.content.test.truth_views
+
+    @property
+    def up_world(self) -> Float64[np.ndarray, "3"]:
+        """Which way is up."""
+        up = self.content.world.up
+        return (-1.0 if up.startswith("-") else 1.0) * np.eye(3)[_AXES[up]]
+
+    @property
+    def environment(self) -> Path | None:
+        """The map that lit the photographs."""
+        train = self.content.environment.train
+        return None if train is None else self._map(train)
+
+    @property
+    def relit(self) -> tuple[tuple[Path, Path], ...]:
+        """Folders of pictures under other light, each with its map."""
+        root = self.path.parent
+        return tuple(
+            (root / folder, self._map(PurePosixPath(folder).name)) for folder in self.content.relight.folders
+        )
+
+    def relit_picture(self, folder: Path, name: str, max_side_px: int) -> Float32[np.ndarray, "h w 4"]:
+        """Display colours times coverage, and coverage, of a view under other light, shrunk to a side.
+
+        Raises:
+            DatasetError: the picture is missing or damaged, or has no alpha.
+        """
+        image = read_image(folder / name)
+        if image.shape[2] != 4:
+            raise DatasetError(f"{folder / name} has no alpha, which tells the scene from what is behind it.")
+        image[..., :3] *= image[..., 3:]
+        return shrink_to(image, max_side_px)
+
+    def view(self, name: str, size: tuple[int, int]) -> ViewTruth:
+        """The maps of a view.
+
+        Args:
+            name: of the view.
+            size: height and width to have them at: those of the maps, or smaller ones in the same
+                proportion, for which the nearest pixels are taken.
+
+        Raises:
+            DatasetError: a map that truth.json tells of is missing, damaged, or of another shape.
+        """
+        maps = self.content.test
+        mask = self._image("mask", name, size)[..., 0] > 0.5
+        scalars = {
+            kind: None if text is None else _decoded(self._image(kind, name, size)[..., 0], text)
+            for kind, text in (
+                ("depth", maps.depth),
+                ("roughness", maps.roughness),
+                ("metallic", maps.metallic),
+            )
+        }
+        normal = albedo = None
+        if maps.normal is not None:
+            normal = _decoded(self._image("normal", name, size)[..., :3], maps.normal)
+            normal /= np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-12)
+            normal[~mask] = 0.0
+        if maps.albedo is not None:
+            albedo = srgb_to_linear(_unit(self._image("albedo", name, size)[..., :3]))
+        return ViewTruth(mask, normal, scalars["depth"], albedo, scalars["roughness"], scalars["metallic"])
+
+    def _map(self, name: str) -> Path:
+        return self.path.parent / self.content.environment.folder / f"{name}.hdr"
+
+    def _image(self, kind: str, name: str, size: tuple[int, int]) -> Float64[np.ndarray, "h w c"]:
+        """The stored integers of a map."""
+        path = self.path.parent / self.content.test.folder / kind / name
+        image = read_image(path)
+        height, width = image.shape[:2]
+        if abs(height * size[1] - width * size[0]) > max(height, width) or height < size[0]:
+            raise DatasetError(
+                f"{path} has {width} x {height} pixels, which does not suit the view's {size[1]} x {size[0]}."
+            )
+        rows = ((np.arange(size[0]) + 0.5) * height / size[0]).astype(int)
+        columns = ((np.arange(size[1]) + 0.5) * width / size[1]).astype(int)
+        return image[rows[:, None], columns].astype(np.float64) * _steps(path)
+
+
+def find_truth(folder: Path) -> Truth | None:
+    """The truth of the views of a folder, in it or beside it; None without one.
+
+    Raises:
+        ConfigError: the file is no truth in this format.
+    """
+    inside, beside = folder / TRUTH, folder.resolve().parent / TRUTH
+    if inside.is_file():
+        return read_truth(inside)
+    if beside.is_file():
+        truth = read_truth(beside)
+        if beside.parent / truth.content.test.folder == folder.resolve():
+            return truth
+    return None
+
+
+def read_truth(path: Path) -> Truth:
+    """Read and check a truth file; the maps are read when they are asked for.
+
+    Raises:
+        ConfigError: the file is missing, damaged, or says something that is not understood.
+    """
+    try:
+        return Truth(path, TruthFile.model_validate_json(path.read_bytes()))
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(str(part) for part in first["loc"]) or "content"
+        raise ConfigError(f"{path}: {where}: {first['msg'].removeprefix('Value error, ')}.") from None
+    except OSError as error:
+        raise ConfigError(f"{path} cannot be read ({error.strerror}).") from None
+
+
+def _decoded(stored: Float64[np.ndarray, "*shape"], text: str) -> Float32[np.ndarray, "*shape"]:
+    """Values by the formula in a sentence: v over a number, times one, plus one."""
+    match = _FORMULA.search(text)
+    assert match is not None
+    by, times, plus = (
+        float(group) if group else neutral for group, neutral in zip(match.groups(), (1, 1, 0), strict=True)
+    )
+    return (stored / by * times + plus).astype(np.float32)
+
+
+def _unit(stored: Float64[np.ndarray, "*shape"]) -> Float32[np.ndarray, "*shape"]:
+    return (stored / 255.0).astype(np.float32)
+
+
+def _steps(path: Path) -> float:
+    """How many steps the file's integers have from 0 to 1; 1 for floats."""
+    kind = oiio.ImageBuf(str(path)).spec().format.basetype
+    return {oiio.UINT8: 255.0, oiio.UINT16: 65535.0}.get(kind, 1.0)

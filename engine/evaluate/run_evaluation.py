@@ -1,0 +1,325 @@
+"""The scene of a run measured: on the photographs that it held out, or on those of another folder."""
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from octasplat.engine.core.errors import ConfigError, DatasetError, OutputError
+from octasplat.engine.core.events import Listener, StageProgress, Warned
+from octasplat.engine.core.progress import counted_stage, stage
+from octasplat.engine.core.threads import use_threads
+from octasplat.engine.core.versions import versions
+from octasplat.engine.core.writing import write_json
+from octasplat.engine.dataset import Dataset
+from octasplat.engine.dataset.views_file import read_views, write_views
+from octasplat.engine.evaluate.ground_truth import Truth, find_truth
+from octasplat.engine.evaluate.held_out import evaluate_held_out
+from octasplat.engine.evaluate.multiscale import measure_scales
+from octasplat.engine.files import read_metadata
+from octasplat.engine.files.gaussian_ply import read_gaussian_ply
+from octasplat.engine.gaussians.materials import has_materials
+from octasplat.engine.pathtracing.environment import EnvironmentMap, environment_frame
+from octasplat.engine.pathtracing.relighting.split_sum_relighter import SplitSumRelighter
+from octasplat.engine.poses.find_poses import read_pose_record
+from octasplat.engine.render.environment_files import read_background, read_environment
+from octasplat.engine.render.renderer import background_colour
+from octasplat.engine.runs.config import ReconstructionConfig, read_config
+from octasplat.engine.runs.run_folder import (
+    BACKGROUND,
+    CACHE,
+    CONFIG,
+    ON,
+    POSES,
+    SCENE,
+    TRAINING,
+    VIEWS,
+    found_model,
+    open_photographs,
+    photographs_folder,
+    run_environment,
+    run_exposures,
+)
+from octasplat.engine.shading.protocol import ShadingModel
+from octasplat.engine.trace.factory import make_tracer
+from octasplat.engine.train.config import TrainConfig
+from octasplat.engine.train.shading_factory import background_of, deferred_of, exposures_of, make_shading
+
+SCALES = "scales.json"
+GUESSED = "held-out views are shown as exposed as their brightness and the views beside them suggest"
+NOTED_BY_TRAINING = ("planned_iterations", "training_views", "taken_near")
+RAYS_ACROSS = (1, 2, 4)
+"""Rays across a pixel with which smaller sizes are measured."""
+
+
+def evaluate(
+    output: Path,
+    *,
+    scene: Path | None = None,
+    on: Path | None = None,
+    background: Literal["black", "white"] | None = None,
+    threads: int = 0,
+    listener: Listener = lambda _event: None,
+) -> Path:
+    """Measure the scene of a finished run again and write its metrics, renders and report anew.
+
+    Args:
+        output: folder of the run.
+        scene: where the photographs are now; None takes the folder that the run was made from.
+        on: other photographs of the same scene in the same world, with a COLMAP model of their own; all of
+            them are measured, into a folder of their name in ``output / "on"``, and the run's own results
+            stay as they are.
+        background: behind the scene; None takes that of the run.
+        threads: for everything; 0 means all cores.
+        listener: hears the progress.
+
+    Returns:
+        The path of ``metrics.json``.
+
+    Raises:
+        ConfigError: ``output`` is no run.
+        DatasetError: the photographs cannot be used.
+        OutputError: there is no scene yet, or other photographs of that name were measured before.
+    """
+    use_threads(threads)
+    config = _finished(output, background)
+    if on is not None:
+        return _evaluate_on(on, output, config, threads, listener)
+    dataset = _photographs(output, config, scene, threads, listener)
+    _check_world(output, dataset, photographs_folder(output, scene))
+    if (output / VIEWS).exists():
+        difference = read_views(output / VIEWS).difference(dataset.views_record)
+        if difference is not None:
+            listener(Warned(f"{output} was made from other photographs or another model ({difference})."))
+    with stage("evaluate", listener, len(dataset.test_indices)):
+        measure_run(dataset, output, config, threads, listener)
+    return output / "metrics.json"
+
+
+def evaluate_scales(
+    output: Path,
+    scales: Sequence[int],
+    *,
+    scene: Path | None = None,
+    background: Literal["black", "white"] | None = None,
+    threads: int = 0,
+    listener: Listener = lambda _event: None,
+) -> dict[str, dict[str, float]]:
+    """Measure a finished run at smaller sizes and write ``scales.json``.
+
+    See :mod:`octasplat.engine.evaluate.multiscale`.
+
+    Args:
+        output: folder of the run.
+        scales: by how much pixels are larger than those of the training.
+        scene: where the photographs are now; None takes the folder that the run was made from.
+        background: behind the scene; None takes that of the run.
+        threads: for everything; 0 means all cores.
+        listener: hears the progress.
+
+    Returns:
+        Mean PSNR of the held-out views, by scale and by rays a pixel.
+
+    Raises:
+        ConfigError: ``output`` is no run.
+        DatasetError: the photographs cannot be used.
+        OutputError: there is no scene yet.
+    """
+    use_threads(threads)
+    config = _finished(output, background)
+    dataset = _photographs(output, config, scene, threads, listener)
+    _check_world(output, dataset, photographs_folder(output, scene))
+    gaussians, _ = read_gaussian_ply(output / SCENE)
+    extent = _extent_world(output, dataset)
+    shading = finished_shading(output, config.train, dataset, extent)
+    tracer = make_tracer(config.train.trace, threads=threads)
+    tracer.build(gaussians, shading.features(gaussians))
+    with counted_stage("evaluate", listener, len(dataset.test_indices)) as progress:
+        found = measure_scales(
+            dataset,
+            tracer,
+            shading,
+            background_colour(config.evaluation_background),
+            scales,
+            RAYS_ACROSS,
+            on_view=lambda done: progress(done, len(dataset.test_indices)),
+        )
+    write_json(output / SCALES, found)
+    return found
+
+
+def _finished(output: Path, background: Literal["black", "white"] | None) -> ReconstructionConfig:
+    """Return the settings of a run that has a scene, to be measured with that background."""
+    config = read_config(output / CONFIG)
+    if background is not None:
+        config = config.model_copy(update={"evaluation_background": background})
+    if not (output / SCENE).exists():
+        raise OutputError(
+            f"{output} holds no {SCENE} yet; finish the run with: octasplat reconstruct --resume."
+        )
+    return config
+
+
+def _photographs(
+    output: Path, config: ReconstructionConfig, scene: Path | None, threads: int, listener: Listener
+) -> Dataset:
+    return open_photographs(
+        photographs_folder(output, scene),
+        output,
+        config,
+        threads,
+        listener,
+        model_folder=found_model(output),
+    )
+
+
+def _check_world(output: Path, dataset: Dataset, folder: Path) -> None:
+    """Refuse photographs whose model stands in another world than the scene, as after a transform.
+
+    Raises:
+        DatasetError: it does.
+    """
+    if (output / VIEWS).exists() and read_views(output / VIEWS).is_of_another_world(dataset.views_record):
+        raise DatasetError(
+            f"The photographs in {folder} have other poses than the scene of {output} was made or moved "
+            "with; name a folder whose model stands in the same world."
+        )
+
+
+def _extent_world(output: Path, dataset: Dataset) -> float:
+    """The extent that the scene was trained with, whichever photographs measure it."""
+    return read_views(output / VIEWS).extent_world if (output / VIEWS).exists() else dataset.extent
+
+
+def measure_run(
+    dataset: Dataset,
+    output: Path,
+    config: ReconstructionConfig,
+    threads: int,
+    tell: Listener,
+    into: Path | None = None,
+) -> None:
+    """Measure the scene of ``output``; the results go ``into`` another folder or that one."""
+    truth = _truth(dataset, tell, needed=into is not None)
+    gaussians, _ = read_gaussian_ply(output / SCENE)
+    extent = _extent_world(output, dataset)
+    environment = _environment(output, config.train)
+    relighter = None
+    if truth is not None and truth.relit and environment is not None and has_materials(gaussians):
+        relighter = SplitSumRelighter(
+            gaussians, config.train.trace, config.train.materials, extent_world=extent, threads=threads
+        )
+    training = json.loads((output / TRAINING).read_text(encoding="utf-8"))
+    evaluate_held_out(
+        dataset,
+        gaussians,
+        into or output,
+        settings=config.train.trace,
+        shading=finished_shading(output, config.train, dataset, extent, exposed=into is None),
+        background=config.evaluation_background,
+        run={
+            "gaussians": len(gaussians),
+            "iterations": training["iterations"],
+            "seconds": training["seconds"],
+            "seed": config.train.seed,
+            "resolution": {"max_side": config.max_side},
+            "background": config.evaluation_background,
+            "versions": versions(),
+            **{key: training[key] for key in NOTED_BY_TRAINING if key in training},
+            **_placed(output),
+            **({"exposure": GUESSED} if "exposures" in training and into is None else {}),
+        },
+        config=json.loads((output / CONFIG).read_text(encoding="utf-8")),
+        threads=threads,
+        tell=tell,
+        truth=truth,
+        environment=environment,
+        relighter=relighter,
+    )
+
+
+def _truth(dataset: Dataset, tell: Listener, *, needed: bool) -> Truth | None:
+    """What is known of the photographs; a file that is none is told, and refused where it is ``needed``."""
+    try:
+        return find_truth(dataset.root)
+    except ConfigError as error:
+        if needed:
+            raise
+        tell(Warned(f"{error} Nothing is measured against it."))
+        return None
+
+
+def finished_shading(
+    output: Path, config: TrainConfig, dataset: Dataset, extent_world: float, *, exposed: bool = True
+) -> ShadingModel:
+    """The shading model of a finished run, with what it left: environment, background and exposures.
+
+    Args:
+        output: folder of the run.
+        config: its settings.
+        dataset: photographs.
+        extent_world: of the scene.
+        exposed: whether the photographs are those of the run, whose exposures are known or guessed.
+
+    Raises:
+        ConfigError: the run learnt one of these and its file is missing or damaged.
+    """
+    known = run_exposures(output)
+    decided = config.model_copy(update={"exposure": known is not None})
+    shading = make_shading(decided, len(dataset.views), extent_world)
+    if (deferred := deferred_of(shading)) is not None:
+        deferred.light.put(read_environment(run_environment(output)))
+    if (background := background_of(shading)) is not None:
+        background.put(read_background(output / BACKGROUND))
+    if exposed and known is not None and (exposures := exposures_of(shading)) is not None:
+        exposures.take([view.name for view in dataset.views], known)
+    return shading
+
+
+def _environment(output: Path, config: TrainConfig) -> EnvironmentMap | None:
+    """The map that a run with materials has learnt."""
+    if not run_environment(output).exists():
+        return None
+    up = np.array(config.materials.up_world, np.float64)
+    return EnvironmentMap(read_environment(run_environment(output)), environment_frame(up))
+
+
+def _evaluate_on(
+    on: Path, output: Path, config: ReconstructionConfig, threads: int, listener: Listener
+) -> Path:
+    """Measure other photographs into a folder of their own."""
+    name = on.resolve().name
+    into = output / ON / name
+    find_truth(on)  # complains before anything is written
+    dataset = Dataset.open_for_evaluation(
+        on,
+        output / CACHE / ON / name,
+        near_world=read_metadata(output).near_world,
+        max_side=config.max_side,
+        masks=config.masks,
+        threads=threads,
+        progress=lambda done, total: listener(StageProgress("load", done, total)),
+    )
+    for warning in dataset.warnings:
+        listener(Warned(warning))
+    _check_world(output, dataset, on)
+    if (into / VIEWS).exists():
+        difference = read_views(into / VIEWS).difference(dataset.views_record)
+        if difference is not None:
+            raise OutputError(
+                f"{into} holds the measures of other photographs than {on} has ({difference}); delete or "
+                "rename that folder."
+            )
+    with stage("evaluate", listener, len(dataset.test_indices)):
+        write_views(into / VIEWS, dataset.views_record)
+        measure_run(dataset, output, config, threads, listener, into)
+    return into / "metrics.json"
+
+
+def _placed(output: Path) -> dict[str, object]:
+    """How many photographs have poses, which were placed anew, and whether lenses were adjusted."""
+    record = read_pose_record(output / POSES)
+    known = {name: record[name] for name in ("placed", "photographs", "moved", "lenses") if name in record}
+    return {"poses": known} if known else {}

@@ -1,0 +1,316 @@
+"""The settings of a reconstruction, and how they follow from what is asked for.
+
+Imports neither torch nor numba.
+"""
+
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from functools import cache
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, Field, TypeAdapter, ValidationError, model_validator
+
+from octasplat.engine.core.errors import ConfigError
+from octasplat.engine.runs.run_settings import RunSettings
+from octasplat.engine.settings.base import Settings
+from octasplat.engine.settings.fields import ADVANCED
+from octasplat.engine.settings.nested_options import merged
+from octasplat.engine.settings.refusals import (
+    Refusal,
+    SettingsRefused,
+    refusals_of,
+    submodels,
+    unknown_setting,
+)
+from octasplat.engine.settings.renamed_settings import former_names, with_new_names
+from octasplat.engine.train.config import TrainConfig, preset, with_materials
+from octasplat.engine.train.config.preset_names import PRESETS, PRESETS_WITH_MATERIALS
+
+
+class ReconstructionConfig(RunSettings):
+    """Everything that decides what a reconstruction gives; the number of threads does not."""
+
+    train: TrainConfig = Field(TrainConfig(), description="The settings of the training.")
+    evaluation_background: Annotated[Literal["black", "white"], ADVANCED] = Field(
+        "black", description="What lies behind renders and photographs with alpha when they are compared."
+    )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _measured_as_trained(cls, values: Any) -> Any:
+        if not isinstance(values, Mapping):
+            return values
+        values = with_new_names((cls,), values)
+        if values.get("evaluation_background") is not None:
+            return values
+        train = values.get("train", {})
+        behind = train.get("background") if isinstance(train, Mapping) else train.background
+        return {**values, "evaluation_background": "white" if behind == "white" else "black"}
+
+    def background_mismatch(self, has_alpha: bool) -> str | None:
+        """Return a sentence where views are measured on another background than they were trained on.
+
+        Args:
+            has_alpha: whether the photographs have alpha, so that they have no background of their own.
+        """
+        shown = self.evaluation_background
+        trained = self.train.background if self.train.background != "auto" else "black"
+        if has_alpha or trained not in ("black", "white") or trained == shown:
+            return None
+        return (
+            f"The scene is trained on {trained} and measured on {shown}, which shows where it does "
+            "not cover a photograph; leave the background of the evaluation out."
+        )
+
+    def with_poses_decided(self, has_model: bool) -> "ReconstructionConfig":
+        """Return the same with ``poses`` as they come out for a dataset with or without a COLMAP model."""
+        if self.poses != "missing":
+            return self
+        return self.model_copy(update={"poses": "given" if has_model else "auto"})
+
+
+def resolve_config(
+    preset_name: str = "standard",
+    *,
+    materials: bool = False,
+    settings: Mapping[str, object] | None = None,
+    train: Mapping[str, Any] | None = None,
+    assignments: Sequence[str] = (),
+) -> ReconstructionConfig:
+    """Return the configuration that a preset, settings and assignments mean; later ones win.
+
+    Whatever switches materials on, the flag, ``train`` or an assignment, means the same: the preset with
+    materials, see :func:`octasplat.engine.train.config.with_materials`, and what else is given on top.
+
+    Args:
+        preset_name: one of :data:`octasplat.engine.train.config.preset_names.PRESETS`.
+        materials: learn materials and the environment.
+        settings: fields of :class:`RunSettings`; None values are left at their defaults.
+        train: some settings of the training, nested as in :class:`ReconstructionConfig`.
+        assignments: of any setting, values as JSON: ``lr.mean=2e-4``, which is
+            ``train.lr.mean=2e-4``, or ``test_every=4``.
+
+    Raises:
+        SettingsRefused: an unknown name, a value out of range, or settings that contradict each other.
+    """
+    given = {key: value for key, value in (settings or {}).items() if value is not None}
+    values, changes = _collected({**given, "preset": preset_name}, materials or None, train, assignments)
+    base = _base(values["preset"], _learns_materials(changes))
+    return _validated({**values, "train": merged(base, changes)})
+
+
+def revise_config(
+    before: Mapping[str, Any],
+    *,
+    materials: bool | None = None,
+    settings: Mapping[str, object] | None = None,
+    train: Mapping[str, Any] | None = None,
+    assignments: Sequence[str] = (),
+) -> ReconstructionConfig:
+    """Return a configuration with changes; another preset brings its own settings of the training.
+
+    Where the changes switch materials on or off, the rest of what that means comes with it, but for the
+    settings that differ from those of the preset.
+
+    Args:
+        before: the configuration, as JSON.
+        materials: as for :func:`resolve_config`; None leaves them as they are.
+        settings: fields of :class:`RunSettings`; those that are not there stay as they are.
+        train: as for :func:`resolve_config`.
+        assignments: as for :func:`resolve_config`.
+
+    Raises:
+        SettingsRefused: an unknown name, a value out of range, or settings that contradict each other.
+    """
+    before = with_new_names((ReconstructionConfig,), before)
+    values, changes = _collected(settings or {}, materials, train, assignments)
+    values = {**before, **values}
+    kept: Mapping[str, Any] = before.get("train", {})
+    learnt = _learns_materials(kept)
+    if values.get("preset") != before.get("preset"):
+        kept = {}
+    elif _learns_materials(merged(kept, changes)) == learnt:
+        return _validated({**values, "train": merged(kept, changes)})
+    else:
+        kept = _differences(_base(before.get("preset"), learnt), kept)
+        kept.get("materials", {}).pop("learn", None)
+    asked = merged(kept, changes)
+    base = _base(values.get("preset"), _learns_materials(asked))
+    return _validated({**values, "train": merged(base, asked)})
+
+
+def read_config(path: Path) -> ReconstructionConfig:
+    """Return the configuration part of a run's ``config.json``.
+
+    Raises:
+        ConfigError: the file is missing, damaged, or of another version.
+    """
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+        return _validated(
+            with_new_names((ReconstructionConfig,), content["reconstruction"], source=str(path))
+        )
+    except SettingsRefused as error:
+        raise ConfigError(f"{path} is not a configuration of this version: {error}") from None
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise ConfigError(
+            f"{path} cannot be read ({error}); name the folder of a finished or stopped run."
+        ) from None
+
+
+def _collected(
+    settings: Mapping[str, object],
+    materials: bool | None,
+    train: Mapping[str, Any] | None,
+    assignments: Sequence[str],
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    """The fields of :class:`RunSettings` and the nested settings of the training that are asked for."""
+    values = with_new_names((RunSettings,), settings)
+    changes: dict[str, Any] = {} if materials is None else {"materials": {"learn": materials}}
+    if train:
+        train = with_new_names((TrainConfig,), train)
+        _check_names(train)
+        changes = merged(changes, train)
+    for assignment in assignments:
+        path, value = _read_assignment(assignment)
+        for name in reversed(path):
+            value = {name: value}
+        value = with_new_names((RunSettings, TrainConfig), value)
+        if RunSettings.model_fields.keys() & value:
+            values |= value
+            continue
+        _check_names(value)
+        changes = merged(changes, value)
+    return values, changes
+
+
+def _validated(values: Mapping[str, Any]) -> ReconstructionConfig:
+    try:
+        return ReconstructionConfig.model_validate(dict(values))
+    except ValidationError as error:
+        raise SettingsRefused(refusals_of(error, ReconstructionConfig)) from None
+
+
+def _read_assignment(assignment: str) -> tuple[list[str], Any]:
+    """The path and the value that an assignment names; the value is JSON, or else the text itself."""
+    name, equals, text = (part.strip() for part in assignment.partition("="))
+    if not equals or not name:
+        sentence = f"{assignment}: write an assignment as name=value, e.g. lr.mean=2e-4."
+        raise SettingsRefused([Refusal(("assignments",), "assignment", sentence)])
+    try:
+        value = json.loads(text)
+    except ValueError:
+        value = text
+    path = name.split(".")
+    return path[1:] if path[0] == "train" and len(path) > 1 else path, value
+
+
+def _base(preset_name: object, materials: bool) -> dict[str, Any]:
+    """The settings of a preset's training; none where there is no such preset, which validation refuses."""
+    if preset_name not in PRESETS:
+        return {}
+    if materials and preset_name not in PRESETS_WITH_MATERIALS:
+        *others, last = PRESETS_WITH_MATERIALS
+        sentence = (
+            f"The preset {preset_name} is for scenes without materials; with materials choose "
+            f"{', '.join(others)} or {last}."
+        )
+        raise SettingsRefused([Refusal(("preset",), "materials", sentence)])
+    chosen = preset(str(preset_name))
+    return (with_materials(chosen) if materials else chosen).model_dump()
+
+
+def _learns_materials(train: Mapping[str, Any]) -> bool:
+    """Whether these settings of a training switch materials on, in whichever way they say so."""
+    materials = train.get("materials")
+    try:
+        return isinstance(materials, Mapping) and _BOOL.validate_python(materials.get("learn", False))
+    except ValidationError:
+        return False
+
+
+_BOOL = TypeAdapter(bool)
+
+
+def _differences(base: Mapping[str, Any], values: Mapping[str, Any]) -> dict[str, Any]:
+    """The values that are not those of ``base``, section by section."""
+    found: dict[str, Any] = {}
+    for key, value in values.items():
+        old = base.get(key)
+        if isinstance(value, Mapping) and isinstance(old, Mapping) and value.get("kind") == old.get("kind"):
+            if inner := _differences(old, value):
+                found[key] = inner
+        elif value != (list(old) if isinstance(old, tuple) else old):
+            found[key] = value
+    return found
+
+
+def _check_names(train: Mapping[str, Any]) -> None:
+    """Refuse settings of the training that there are not, with the nearest name.
+
+    Raises:
+        SettingsRefused: some are unknown.
+    """
+    unknown = list(_unknown((TrainConfig,), train, ("train",)))
+    if unknown:
+        raise SettingsRefused(
+            [unknown_setting(path, _setting_names(), former=former_setting_names()) for path in unknown]
+        )
+
+
+def _unknown(
+    models: Sequence[type[BaseModel]], values: Mapping[str, Any], path: tuple[str, ...]
+) -> Iterator[tuple[str, ...]]:
+    """The paths of the values that none of ``models`` has."""
+    for key, value in values.items():
+        place = (*path, str(key))
+        infos = [model.model_fields[key] for model in models if key in model.model_fields]
+        if not infos:
+            former = (model.former_settings for model in models if issubclass(model, Settings))
+            if not any(key in names for names in former):
+                yield from _leaves(value, place)
+        elif isinstance(value, Mapping):
+            inner = tuple(model for info in infos for model in submodels(info.annotation))
+            yield from _unknown(inner, value, place)
+
+
+def _leaves(value: object, path: tuple[str, ...]) -> Iterator[tuple[str, ...]]:
+    if isinstance(value, Mapping) and value:
+        for key, inner in value.items():
+            yield from _leaves(inner, (*path, str(key)))
+    else:
+        yield path
+
+
+@cache
+def _setting_names() -> tuple[str, ...]:
+    """The names of all settings, with dots."""
+    return (*RunSettings.model_fields, *dict.fromkeys(_names_in((TrainConfig,), "")))
+
+
+def _names_in(models: Sequence[type[BaseModel]], prefix: str) -> Iterator[str]:
+    for model in models:
+        for name, info in model.model_fields.items():
+            inner = submodels(info.annotation)
+            if inner:
+                yield from _names_in(inner, f"{prefix}{name}.")
+            else:
+                yield prefix + name
+
+
+@cache
+def former_setting_names() -> Mapping[str, str]:
+    """Return the names of all settings of the training, with dots, by those of the last version."""
+    return dict(_former_in((TrainConfig,), "", ""))
+
+
+def _former_in(models: Sequence[type[BaseModel]], before: str, after: str) -> Iterator[tuple[str, str]]:
+    for model in models:
+        former = {new: old for old, new in former_names(model).fields.items()}
+        for name, info in model.model_fields.items():
+            old = former.get(name, name)
+            if inner := submodels(info.annotation):
+                yield from _former_in(inner, f"{before}{old}.", f"{after}{name}.")
+            elif (before, old) != (after, name):
+                yield before + old, after + name

@@ -1,0 +1,212 @@
+"""The folder of a run: the names of its files, and what its photographs are and were taken from."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from octasplat.engine.core.errors import ConfigError, DatasetError
+from octasplat.engine.core.events import Listener, StageProgress, Warned
+from octasplat.engine.dataset import Dataset, load_dataset_model
+from octasplat.engine.dataset.camera_clearance import CameraClearance
+from octasplat.engine.dataset.views_file import SplitViewpoints, ViewsRecord, read_views, scene_viewpoints
+from octasplat.engine.files import read_metadata
+from octasplat.engine.render.environment_files import read_background
+from octasplat.engine.runs.config import ReconstructionConfig, read_config
+from octasplat.engine.shading.background import LearntBackground
+from octasplat.engine.shading.exposure import ExposuresByName
+
+CONFIG, EVENTS, HELD_OUT, SCENE, TRAINING, VIEWS = (
+    "config.json", "events.jsonl", "held_out.json", "scene.ply", "training.json", "views.json",
+)  # fmt: skip
+METRICS, REPORT = "metrics.json", "report.html"
+CHECKPOINTS, CACHE, POSES = "checkpoints", "cache", "poses"
+PLAN = "plan.json"
+ENVIRONMENT, EXACT_ENVIRONMENT = "environment.hdr", "environment.exr"
+"""The learnt light, for programs that show it and as it was learnt: an HDR has one exponent for all channels
+of a pixel, so that a dark channel beside a bright one is coarse."""
+BACKGROUND = "background.exr"
+ON = "on"
+"""Below it are the measures on photographs of other folders, a folder each."""
+
+
+def is_run(source: Path) -> bool:
+    """Whether a command was given the folder of a run, not a file or the folder of an unpacked SOG."""
+    return source.is_dir() and not (source / "meta.json").exists()
+
+
+def run_scene(output: Path) -> Path:
+    """The scene folder that a run was made from.
+
+    Raises:
+        ConfigError: ``output`` is no run.
+    """
+    try:
+        return Path(json.loads((output / CONFIG).read_text(encoding="utf-8"))["scene"])
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise ConfigError(f"{output / CONFIG} cannot be read ({error}); name the folder of a run.") from None
+
+
+def photographs_folder(output: Path, scene: Path | None = None) -> Path:
+    """The folder of a run's photographs: ``scene`` if given, or else where they were.
+
+    Raises:
+        ConfigError: ``output`` is no run.
+        DatasetError: they are not there any more, or were never on this machine.
+    """
+    if scene is not None:
+        return scene
+    noted = run_scene(output)
+    if noted.is_absolute() and noted.is_dir():
+        return noted
+    raise DatasetError(
+        f"The photographs that {output} was made from ({noted}) are not on this machine; "
+        "say where they are with --dataset FOLDER."
+    )
+
+
+def run_viewpoints(
+    output: Path, *, scene: Path | None = None, max_side: int | None = None
+) -> SplitViewpoints:
+    """Where the photographs of a run were taken from; the photographs themselves are not needed.
+
+    Args:
+        output: folder of the run.
+        scene: photographs whose cameras to take instead of those that the run keeps.
+        max_side: cap on the longer side of the views, px; None takes the run's.
+
+    Raises:
+        ConfigError: ``output`` is no run.
+        DatasetError: the run keeps no cameras, as runs of old, and the photographs cannot be used.
+    """
+    config = read_config(output / CONFIG)
+    max_side = max_side or config.max_side
+    if scene is None and (output / VIEWS).exists():
+        return read_views(output / VIEWS).viewpoints(max_side)
+    photographs = load_dataset_model(
+        photographs_folder(output, scene), max_side=max_side, model_folder=found_model(output)
+    )
+    return scene_viewpoints(photographs, config.test_every, config.held_out)
+
+
+def run_near_world(output: Path, viewpoints: SplitViewpoints) -> float:
+    """Return the distance from a camera at which anything of a run's scene is seen, as in its training.
+
+    Args:
+        output: folder of the run.
+        viewpoints: of the run; they stand in where its scene does not say, as scenes of old.
+
+    Raises:
+        ConfigError: ``output`` is no run.
+    """
+    noted = read_metadata(output / SCENE).near_world if (output / SCENE).exists() else 0.0
+    return noted if noted > 0 else read_config(output / CONFIG).train.near * viewpoints.extent
+
+
+def run_near_zones(output: Path, share: float) -> CameraClearance | None:
+    """Where nothing of a run's scene should stand, see :mod:`octasplat.engine.dataset.camera_clearance`.
+
+    Args:
+        output: folder of the run.
+        share: of the distance at which the sparse points around each camera begin.
+
+    Returns:
+        None where the run does not know these distances, as runs of old, or keeps no cameras.
+    """
+    try:
+        known = json.loads((output / TRAINING).read_text(encoding="utf-8"))["nearest_world"]
+        scene = read_views(output / VIEWS).viewpoints(None)
+        radii = np.array([share * float(known.get(view.name, 0.0)) for view in scene.views])
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, ConfigError):
+        return None
+    return CameraClearance.from_views(scene, radii, scene.train_indices)
+
+
+def run_exposures(output: Path) -> ExposuresByName | None:
+    """The exposures of the views that a finished run has learnt, if it has."""
+    try:
+        known: ExposuresByName | None = json.loads((output / TRAINING).read_text("utf-8")).get("exposures")
+    except (OSError, ValueError, AttributeError):
+        return None
+    return known
+
+
+def run_environment(output: Path) -> Path:
+    """Return the file of the light that a run has learnt; runs of old have the HDR only, others none."""
+    exact = output / EXACT_ENVIRONMENT
+    return exact if exact.exists() else output / ENVIRONMENT
+
+
+def run_background(output: Path) -> LearntBackground | None:
+    """The background that a finished run has learnt, if it has.
+
+    Raises:
+        ConfigError: ``output`` is no run, or the background is missing or damaged.
+    """
+    if read_config(output / CONFIG).train.background != "learnt":
+        return None
+    return LearntBackground.of(read_background(output / BACKGROUND))
+
+
+def not_exported(output: Path) -> str | None:
+    """A sentence on what a run has learnt that no other file carries, or None."""
+    if not (output / CONFIG).exists() or read_config(output / CONFIG).train.background != "learnt":
+        return None
+    return (
+        f"What is infinitely far away is a map of its own, {output / BACKGROUND}, and in no other file; "
+        "give it to the program that shows them as its environment, with -y up."
+    )
+
+
+def found_model(output: Path) -> Path | None:
+    """The folder of the poses that were found for the photographs of a run, if they had to be."""
+    for folder in (output / POSES, output / POSES / "sparse" / "0"):
+        if any((folder / f"cameras{suffix}").is_file() for suffix in (".bin", ".txt")):
+            return folder
+    return None
+
+
+def open_photographs(
+    scene: Path,
+    output: Path,
+    config: ReconstructionConfig,
+    threads: int,
+    tell: Listener,
+    *,
+    model_folder: Path | None = None,
+    accept: Callable[[ViewsRecord], None] | None = None,
+) -> Dataset:
+    """The photographs of a run as its settings say, ready to train on or to be measured.
+
+    Args:
+        scene: folder of the photographs.
+        output: folder of the run, which holds the cache.
+        config: of the run.
+        threads: for decoding; 0 takes all cores.
+        tell: hears the progress and what is odd but usable.
+        model_folder: of poses that were found, see :func:`found_model`.
+        accept: told what was found before anything is written; to refuse it, it raises.
+
+    Raises:
+        DatasetError: the photographs cannot be used.
+        OutputError: the cache cannot be written.
+    """
+    dataset = Dataset.open(
+        scene,
+        output / CACHE,
+        max_side=config.max_side,
+        test_every=config.test_every,
+        held_out=config.held_out,
+        masks=config.masks,
+        model_folder=model_folder,
+        accept=accept,
+        near=config.train.near,
+        threads=threads,
+        progress=lambda done, total: tell(StageProgress("load", done, total)),
+    )
+    for warning in dataset.warnings:
+        tell(Warned(warning))
+    if (mismatch := config.background_mismatch(dataset.has_alpha)) is not None:
+        tell(Warned(mismatch))
+    return dataset

@@ -1,0 +1,169 @@
+"""Poses of a run: found where there are none, and checked where they are given."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+from octasplat.engine.core.errors import DatasetError, PosesCrashed
+from octasplat.engine.core.events import Listener, StageProgress, Warned
+from octasplat.engine.core.progress import stage
+from octasplat.engine.dataset import Dataset, split_views
+from octasplat.engine.dataset.colmap_model import find_colmap_model_folder, has_colmap_model
+from octasplat.engine.dataset.load import image_folder
+from octasplat.engine.poses import (
+    GivenModel,
+    adjust_principal_points,
+    find_poses,
+    needs_per_view_principal_points,
+    repair_poses,
+)
+from octasplat.engine.poses.find_poses import read_pose_record
+from octasplat.engine.poses.photograph_check import check_photographs_decode
+from octasplat.engine.poses.photographs import photographs_in
+from octasplat.engine.runs.config import ReconstructionConfig
+from octasplat.engine.runs.run_folder import POSES, found_model
+from octasplat.engine.train.config import iteration_count
+from octasplat.engine.train.views.doubts import ITERATIONS as CHECK_ITERATIONS
+from octasplat.engine.train.views.doubts import doubtful_views
+
+CHECKED_FROM, CHECKED_FROM_MINUTES = 1000, 10.0
+"""Given poses are checked before a training of so many iterations, or of so many minutes."""
+
+
+def find_missing_poses(
+    scene: Path,
+    output: Path,
+    config: ReconstructionConfig,
+    threads: int,
+    tell: Listener,
+    should_stop: Callable[[], bool],
+) -> None:
+    """Find the poses of a run's photographs, if that is asked for and not done yet.
+
+    Raises:
+        DatasetError: there are no photographs, or their poses cannot be found.
+        PosesCrashed: COLMAP died.
+        Cancelled: stopped as asked.
+    """
+    if config.poses == "given" or (config.poses == "missing" and has_colmap_model(scene)):
+        return
+    if not scene.is_dir():
+        raise DatasetError(f"{scene} is not a folder; name the folder that holds the photographs.")
+    folder = image_folder(scene)
+    if not (output / POSES).is_dir():
+        _refuse_before_search(scene, folder, config, threads)
+    find_poses(folder, output / POSES, threads=threads, progress=tell, should_stop=should_stop)
+
+
+def _refuse_before_search(scene: Path, folder: Path, config: ReconstructionConfig, threads: int) -> None:
+    """Refuse photographs and settings that the dataset would refuse after the search, which takes long."""
+    names = photographs_in(folder)
+    split_views(names, config.test_every, config.held_out, source_name="photographs")
+    if config.masks == "alpha" and not (scene / "masks").is_dir():
+        raise DatasetError(
+            f"Masks are to be the alpha, but there is no folder {scene / 'masks'}; put them there (as "
+            f"{names[0]}.png) or leave --masks alpha out."
+        )
+    check_photographs_decode(folder, names, threads=threads)
+
+
+def place_misfits(
+    dataset: Dataset,
+    output: Path,
+    config: ReconstructionConfig,
+    threads: int,
+    tell: Listener,
+    should_stop: Callable[[], bool],
+) -> bool:
+    """Place photographs of a given model anew that stand in the wrong place; whether there are any.
+
+    Photographs that a short training shows to be in doubt (stage ``check``) are matched with the others;
+    those that are moved have their poses from the model in the run's ``poses/`` from then on.
+
+    Raises:
+        Cancelled: stopped as asked.
+    """
+    is_long = _is_long(dataset, config)
+    if not (config.train.repair_poses and is_long) or found_model(output) is not None:
+        return False
+    with stage("check", tell, CHECK_ITERATIONS):
+        doubtful = doubtful_views(
+            dataset,
+            background=config.train.background,
+            seed=config.train.seed,
+            threads=threads,
+            should_stop=should_stop,
+            progress=lambda done: tell(StageProgress("check", done, CHECK_ITERATIONS)),
+        )
+    if len(doubtful) == 0:
+        return False
+    images = image_folder(dataset.root)
+    given = GivenModel(
+        model=find_colmap_model_folder(dataset.root),
+        names=tuple(view.name for view in dataset.views),
+        doubtful=tuple(doubtful.tolist()),
+    )
+    files = [view.image_path.relative_to(images).as_posix() for view in dataset.views]
+    names = [dataset.views[k].name for k in doubtful.tolist()]
+    try:
+        moved = repair_poses(
+            images, files, given, output / POSES, threads=threads, progress=tell, should_stop=should_stop
+        )
+    except (DatasetError, PosesCrashed) as error:
+        tell(Warned(f"The poses of {', '.join(names)} are in doubt, and stay as they are: {error}"))
+        return False
+    if moved:
+        which = "This photograph" if len(moved) == 1 else f"These {len(moved)} photographs"
+        tell(
+            Warned(
+                f"{which} did not stand where matches with the others say: {', '.join(moved)}. The training "
+                "takes the poses that follow from the matches; repair_poses=false leaves given poses alone."
+            )
+        )
+    return bool(moved)
+
+
+def free_lenses(
+    dataset: Dataset,
+    output: Path,
+    config: ReconstructionConfig,
+    tell: Listener,
+    should_stop: Callable[[], bool],
+) -> bool:
+    """Give each photograph a principal point of its own if the lens moved; whether it did.
+
+    The model is then the one in the run's ``poses/``; see :mod:`octasplat.engine.poses.lens_check` for what
+    is asked first, which takes no time worth a stage.
+
+    Raises:
+        Cancelled: stopped as asked.
+    """
+    if not (config.train.per_view_principal_point and _is_long(dataset, config)):
+        return False
+    if "lenses" in read_pose_record(output / POSES):
+        return False
+    if not needs_per_view_principal_points(dataset.viewpoints, dataset.points, dataset.observations):
+        return False
+    model = found_model(output) or find_colmap_model_folder(dataset.root)
+    try:
+        facts = adjust_principal_points(model, output / POSES, progress=tell, should_stop=should_stop)
+    except (DatasetError, PosesCrashed) as error:
+        tell(Warned(f"The lens seems to have moved between the photographs, but stays as it is: {error}"))
+        return False
+    if facts is None:
+        return False
+    before, after = facts["reprojection_px_before"], facts["reprojection_px"]
+    tell(
+        Warned(
+            "The lens moved between the photographs, as stabilised ones do: each has a principal point of "
+            f"its own, {facts['shift_px_median']:.1f} px from the given one in the middle, and the sparse "
+            f"points fit to {after:.2f} px instead of {before:.2f}; "
+            f"per_view_principal_point=false leaves lenses alone."
+        )
+    )
+    return True
+
+
+def _is_long(dataset: Dataset, config: ReconstructionConfig) -> bool:
+    if config.minutes is not None:
+        return config.minutes >= CHECKED_FROM_MINUTES
+    return iteration_count(config.train, dataset.train_pixel_count) >= CHECKED_FROM

@@ -1,0 +1,74 @@
+"""What decides a reconstruction beside its training; imports nothing heavy."""
+
+from collections.abc import Mapping
+from typing import Annotated, Any, ClassVar, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from octasplat.engine.runs.export_names import ExportNames
+from octasplat.engine.settings import renamed_settings
+from octasplat.engine.settings.fields import ADVANCED, BASIC, Spelling, Unit
+from octasplat.engine.train.config.preset_names import PresetName
+
+
+class RunSettings(BaseModel):
+    """What decides a reconstruction beside the settings of its training."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    former_names: ClassVar[renamed_settings.FormerNames] = renamed_settings.RUN
+
+    preset: Annotated[PresetName, BASIC] = Field(
+        "standard",
+        description="Where the settings of the training come from: fast is a first look, standard is "
+        "better, high is better yet and takes about three times as many iterations, redisplats has "
+        "the published settings.",
+    )
+    max_side: Annotated[int | None, Unit("px"), BASIC] = Field(
+        None,
+        ge=16,
+        description="Longest side to which photographs are shrunk; by default they keep their size. Set it "
+        "for a quick try, or where memory is short.",
+    )
+    test_every: Annotated[int, Unit("views"), BASIC] = Field(
+        8,
+        ge=0,
+        description="Every how-manieth view by name is held out to be measured; 0 holds out none, so that "
+        "all are trained on.",
+    )
+    held_out: Annotated[tuple[str, ...] | None, Spelling(metavar="NAME"), ADVANCED] = Field(
+        None, description="Names of the views to hold out instead of every how-manieth."
+    )
+    poses: Annotated[Literal["given", "auto", "missing"], BASIC] = Field(
+        "missing",
+        description="Where the poses of the cameras come from: given takes the COLMAP model of the dataset "
+        "(photographs far from where matches put them are moved, see repair_poses); auto finds the poses, "
+        "by COLMAP's features, matching and mapping; missing does so only where the dataset holds no model.",
+    )
+    masks: Annotated[Literal["ignore", "alpha"], ADVANCED] = Field(
+        "ignore",
+        description="What masks mean: ignore leaves masked pixels out of the loss, alpha takes the mask as "
+        "the alpha, for objects that are cut out.",
+    )
+    evaluation_background: Annotated[Literal["black", "white"] | None, ADVANCED] = Field(
+        None,
+        description="What lies behind renders and photographs with alpha when they are compared; by default "
+        "that of the training: white where train.background is white, else black.",
+    )
+    minutes: Annotated[float | None, Unit("minutes"), BASIC] = Field(
+        None,
+        ge=0.1,
+        le=100_000,
+        description="Time in which the training is to end, which decides its iterations and Gaussians by the "
+        "pace of the machine that begins it; by default the other settings do.",
+    )
+    exports: Annotated[ExportNames, Spelling(metavar="NAMES"), BASIC] = Field(
+        ("mesh.ply", "mesh.obj", "mesh.glb"),
+        max_length=100,
+        description="Files to write besides scene.ply; their names say the format.",
+    )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _by_new_names(cls, given: Any) -> Any:
+        return renamed_settings.with_new_names((cls,), given) if isinstance(given, Mapping) else given

@@ -1,0 +1,225 @@
+"""The catalog of settings: name, type, unit, range, default by preset, group and description of each.
+
+Imports neither torch nor numba.
+"""
+
+import types
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache
+from typing import Annotated, Any, Literal, Union, get_args, get_origin
+
+import annotated_types
+from pydantic import BaseModel
+from pydantic.fields import FieldInfo
+
+from octasplat.engine.core.errors import ConfigError
+from octasplat.engine.runs.config import ReconstructionConfig, former_setting_names, resolve_config
+from octasplat.engine.settings.fields import Group, Level, Unit
+from octasplat.engine.settings.refusals import SettingsRefused, unknown_setting
+from octasplat.engine.train.config.preset_names import PRESETS, PRESETS_WITH_MATERIALS
+
+MATERIALS = "+materials"
+"""What is added to the name of a preset where materials are learnt with it."""
+_ABSENT = object()
+
+
+@dataclass(frozen=True)
+class Setting:
+    """A setting.
+
+    Attributes:
+        name: with dots, as ``--set`` takes it.
+        type: type of its values, or the values themselves, in words.
+        unit: unit of a number; empty for what is no quantity.
+        range: interval or other condition on its values, in words; empty where all are allowed.
+        group: how many users need it.
+        description: what it does, and when to touch it.
+        defaults: value by preset, where the preset has the setting; ``+materials`` after the name of a preset
+            stands for its values where materials are learnt.
+    """
+
+    name: str
+    type: str
+    unit: str
+    range: str
+    group: Level
+    description: str
+    defaults: Mapping[str, object]
+
+    @property
+    def default(self) -> object:
+        """The value in the preset ``standard``, or else in the first that has the setting."""
+        return self.defaults.get("standard", next(iter(self.defaults.values()), None))
+
+    @property
+    def exceptions(self) -> Mapping[str, object]:
+        """The values by preset that differ from the default."""
+        return {name: value for name, value in self.defaults.items() if value != self.default}
+
+
+@dataclass(frozen=True)
+class Difference:
+    """A setting that has another value in one configuration than in the other.
+
+    Attributes:
+        name: of the setting.
+        before: value in the first configuration, None where it has no such setting.
+        after: value in the second one, likewise.
+    """
+
+    name: str
+    before: object
+    after: object
+
+
+@cache
+def settings() -> tuple[Setting, ...]:
+    """Return all settings of a reconstruction, in the order of its configuration."""
+    values = {
+        name + (MATERIALS if materials else ""): setting_values(resolve_config(name, materials=materials))
+        for name in PRESETS
+        for materials in (False, True)
+        if not materials or name in PRESETS_WITH_MATERIALS
+    }
+    found: dict[str, Setting] = {}
+    for name, info in _walk(ReconstructionConfig, ""):
+        defaults = {key: value[name] for key, value in values.items() if name in value}
+        if name == "preset":
+            defaults = {"standard": "standard"}
+        found.setdefault(name, _setting(name, info, defaults))
+    return tuple(found.values())
+
+
+def setting_named(name: str) -> Setting:
+    """Return the setting of that name, which may begin with ``train.``.
+
+    Raises:
+        ConfigError: there is none; the sentence offers the nearest one.
+    """
+    wanted = name.removeprefix("train.")
+    names = [setting.name for setting in settings()]
+    for setting in settings():
+        if setting.name == wanted:
+            return setting
+    inside = [known for known in names if known.startswith(f"{wanted}.")]
+    if inside:
+        raise ConfigError(f"{name} is a group of settings: {', '.join(inside)}.")
+    raise SettingsRefused([unknown_setting(wanted.split("."), names, former=former_setting_names())])
+
+
+def setting_values(config: ReconstructionConfig) -> dict[str, object]:
+    """Return the JSON value of each setting by its name."""
+    return dict(_flattened(config.model_dump(mode="json"), ""))
+
+
+def differences(before: ReconstructionConfig, after: ReconstructionConfig) -> tuple[Difference, ...]:
+    """Return the settings whose values differ, in the order of the catalog."""
+    first, second = setting_values(before), setting_values(after)
+    names = [setting.name for setting in settings()]
+    return tuple(
+        Difference(name, first.get(name), second.get(name))
+        for name in names
+        if first.get(name, _ABSENT) != second.get(name, _ABSENT)
+    )
+
+
+def defaults_of(config: ReconstructionConfig) -> ReconstructionConfig:
+    """Return the defaults that a configuration began from: its preset's, with or without materials."""
+    return resolve_config(config.preset, materials=config.train.materials.learn)
+
+
+def value_text(value: object) -> str:
+    """Return a value as users write it."""
+    if value is None:
+        return "none"
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, list | tuple):
+        return "[" + ", ".join(map(value_text, value)) + "]"
+    return f"{value:.6g}" if isinstance(value, float) else str(value)
+
+
+def _walk(model: type[BaseModel], prefix: str) -> Iterator[tuple[str, FieldInfo]]:
+    for name, info in model.model_fields.items():
+        path = f"{prefix}{name}".removeprefix("train.")
+        models = [part for part in _parts(info.annotation) if _is_model(part)]
+        if not models:
+            yield path, info
+        for inner in models:
+            yield from _walk(inner, f"{prefix}{name}.")
+
+
+def _setting(name: str, info: FieldInfo, defaults: Mapping[str, object]) -> Setting:
+    group: Level = next((mark.level for mark in info.metadata if isinstance(mark, Group)), "advanced")
+    unit = next((mark.symbol for mark in info.metadata if isinstance(mark, Unit)), "")
+    kind = _type_text(info.annotation)
+    if name == "densify.kind":
+        kind = " or ".join(dict.fromkeys(str(value) for value in defaults.values()))
+    return Setting(name, kind, unit, _range_text(info.metadata), group, info.description or "", defaults)
+
+
+def _parts(annotation: Any) -> tuple[Any, ...]:
+    """The alternatives of an annotation, without marks."""
+    if get_origin(annotation) is Annotated:
+        return _parts(get_args(annotation)[0])
+    if get_origin(annotation) in (Union, types.UnionType):
+        return tuple(part for option in get_args(annotation) for part in _parts(option))
+    return (annotation,)
+
+
+def _is_model(annotation: Any) -> bool:
+    return isinstance(annotation, type) and issubclass(annotation, BaseModel)
+
+
+_TYPE_NAMES: Mapping[Any, str] = {
+    bool: "true or false",
+    int: "whole number",
+    float: "number",
+    str: "text",
+    type(None): "none",
+}
+
+
+def _type_text(annotation: Any) -> str:
+    texts: list[str] = []
+    for part in _parts(annotation):
+        if get_origin(part) is Literal:
+            texts += map(str, get_args(part))
+        elif get_origin(part) is tuple:
+            inner = get_args(part)
+            if inner[-1] is Ellipsis:
+                texts.append(f"list of {_type_text(inner[0])}")
+            else:
+                texts.append(f"{len(inner)} numbers")
+        else:
+            texts.append(_TYPE_NAMES.get(part, str(part)))
+    return " or ".join(texts)
+
+
+def _range_text(marks: Sequence[Any]) -> str:
+    texts = []
+    for mark in marks:
+        match mark:
+            case annotated_types.Ge(ge=bound):
+                texts.append(f"at least {value_text(bound)}")
+            case annotated_types.Gt(gt=bound):
+                texts.append(f"more than {value_text(bound)}")
+            case annotated_types.Le(le=bound):
+                texts.append(f"at most {value_text(bound)}")
+            case annotated_types.Lt(lt=bound):
+                texts.append(f"less than {value_text(bound)}")
+            case annotated_types.MultipleOf(multiple_of=factor):
+                texts.append(f"a multiple of {value_text(factor)}")
+            case _:
+                pass
+    return ", ".join(texts)
+
+
+def _flattened(values: Mapping[str, Any], prefix: str) -> Iterator[tuple[str, object]]:
+    for name, value in values.items():
+        path = f"{prefix}{name}"
+        if isinstance(value, Mapping):
+            yield from _flattened(value, f"{path}.")
+        else:
+            yield path.removeprefix("train."), value

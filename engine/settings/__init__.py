@@ -1,0 +1,1 @@
+"""Models of settings: their base, marks of fields, former names, and refusals."""

@@ -1,0 +1,133 @@
+"""Why settings cannot be used: one short sentence for each, the same wherever they were given."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Annotated, Any, Union, get_args, get_origin
+
+from pydantic import BaseModel, ValidationError
+
+from octasplat.engine.core.errors import ConfigError
+from octasplat.engine.settings.nearest_names import nearest_name
+
+_LONGEST_VALUE = 60
+"""Characters of a refused value that a sentence shows; what is longer is in the user's own words anyway."""
+
+
+@dataclass(frozen=True)
+class Refusal:
+    """A setting that cannot be used.
+
+    Attributes:
+        path: where it is in the model.
+        code: what ails it, for programs, as pydantic names it.
+        sentence: names it and says what it must be.
+    """
+
+    path: tuple[str | int, ...]
+    code: str
+    sentence: str
+
+
+class SettingsRefused(ConfigError):
+    """Settings that cannot be used; the text is the first one's sentence."""
+
+    def __init__(self, refusals: Sequence[Refusal]) -> None:
+        super().__init__(refusals[0].sentence)
+        self.refusals = tuple(refusals)
+
+
+def refusals_of(error: ValidationError, model: type[BaseModel]) -> list[Refusal]:
+    """Return what a validation by ``model`` refused, each setting once, in order."""
+    found: dict[tuple[str | int, ...], Refusal] = {}
+    for fault in error.errors(include_url=False):
+        if fault["type"] == "extra_forbidden":
+            refusal = _unknown(model, fault["loc"])
+        else:
+            path, _, _ = _path_in(model, fault["loc"])
+            refusal = Refusal(path, fault["type"], _sentence(path, fault))
+        found.setdefault(refusal.path, refusal)
+    return list(found.values())
+
+
+def unknown_setting(
+    path: Sequence[str | int],
+    known: Iterable[str],
+    of_kind: str = "",
+    former: Mapping[str, str] = MappingProxyType({}),
+) -> Refusal:
+    """Return the refusal of a setting that there is not; it offers the nearest of those that are known.
+
+    Args:
+        path: where it is.
+        known: names of settings.
+        of_kind: the kind of section that it is in, where there are several.
+        former: names of settings by those of the last version; near one of these, its new name is offered.
+    """
+    name = setting_name(path)
+    nearest = nearest_name(name, [*known, *former])
+    nearest = former.get(nearest, nearest) if nearest else None
+    help_text = f"; the nearest is {nearest}." if nearest else "; octasplat config list --all lists them."
+    if of_kind:
+        help_text = f" where the kind is {of_kind}{help_text}"
+    return Refusal(tuple(path), "unknown_setting", f"There is no setting '{name}'{help_text}")
+
+
+def setting_name(path: Sequence[str | int]) -> str:
+    """Return the name by which users set what is at ``path``; those of the training need no ``train.``.
+
+    >>> setting_name(("train", "lr", "quat")), setting_name(("test_every",))
+    ('lr.quat', 'test_every')
+    """
+    return ".".join(map(str, path[1:] if path[0] == "train" and len(path) > 1 else path))
+
+
+def submodels(annotation: Any) -> tuple[type[BaseModel], ...]:
+    """Return the models among the alternatives of an annotation."""
+    if get_origin(annotation) is Annotated:
+        return submodels(get_args(annotation)[0])
+    if get_origin(annotation) is Union or hasattr(annotation, "__args__"):
+        return tuple(model for part in get_args(annotation) for model in submodels(part))
+    return (annotation,) if isinstance(annotation, type) and issubclass(annotation, BaseModel) else ()
+
+
+def _sentence(path: Sequence[str | int], fault: Mapping[str, Any]) -> str:
+    is_ours = fault["type"] == "value_error"
+    name = "" if is_ours and tuple(path) == ("train",) else setting_name(path)
+    message = str(fault["msg"]).removeprefix("Value error, ").removesuffix(".")
+    value = fault.get("input")
+    shown = not is_ours and (isinstance(value, str | int | float | bool) or value is None)
+    told = f" (it is {value!r})" if shown and len(repr(value)) <= _LONGEST_VALUE else ""
+    return f"{name}: {message}{told}." if name else f"{message}."
+
+
+def _unknown(model: type[BaseModel], place: Sequence[str | int]) -> Refusal:
+    """The refusal of a field that a model has not."""
+    path, models, kind = _path_in(model, place[:-1])
+    if kind:
+        models = tuple(inner for inner in models if inner.model_fields["kind"].default == kind)
+    prefix = f"{setting_name(path)}." if path else ""
+    known = [f"{prefix}{name}" for inner in models for name in inner.model_fields]
+    return unknown_setting((*path, place[-1]), known, kind)
+
+
+def _path_in(
+    model: type[BaseModel], place: Sequence[str | int]
+) -> tuple[tuple[str | int, ...], tuple[type[BaseModel], ...], str]:
+    """The path of a setting without what pydantic adds where a value may be of several types.
+
+    Returns:
+        The path, the models of what is there, and the kind where there are several.
+    """
+    path: list[str | int] = []
+    models: tuple[type[BaseModel], ...] = (model,)
+    kind = ""
+    for part in place:
+        infos = [inner.model_fields[part] for inner in models if part in inner.model_fields]
+        if infos:
+            models, kind = submodels(infos[0].annotation), ""
+        elif len(models) > 1:
+            kind = str(part)
+        if infos or isinstance(part, int):
+            path.append(part)
+    return tuple(path), models, kind

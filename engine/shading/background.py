@@ -1,0 +1,166 @@
+"""What is infinitely far away: a map of colours in all directions, learnt behind the Gaussians.
+
+The sky has no depth: Gaussians that are to show it stand somewhere in the air, and every photograph that was
+not trained on sees them from the side. Here what shines through them all is a map's colour instead. As
+everywhere these are display values, mixed as such.
+"""
+
+from collections.abc import Mapping
+
+import numpy as np
+from jaxtyping import Float32, Float64, Int64
+
+from octasplat.engine.gaussians.model import FlatGaussians
+from octasplat.engine.shading.adam_map import adam_change, unevenness
+from octasplat.engine.shading.environment_frame import environment_frame
+from octasplat.engine.shading.environment_levels import solid_angles
+from octasplat.engine.shading.kernels.environment_map import add_to_texels, map_colours
+from octasplat.engine.shading.plain import PLAIN
+from octasplat.engine.shading.protocol import Developed, Reversed, ShadingModel, Sight
+from octasplat.engine.trace.protocol import GaussianGradients, Tracer
+
+UP_WORLD = (0.0, -1.0, 0.0)
+"""Up in maps, about right for most worlds that COLMAP makes; it only says how the picture of a map lies."""
+EVERY = 8
+"""Iterations between two steps, each for the gradients of all of them: a map has more texels than rays."""
+_STATE = ("rgb_srgb", "first", "second", "sums", "steps")
+
+
+class LearntBackground:
+    """Puts a map behind what another model develops.
+
+    Follows :class:`octasplat.engine.shading.protocol.ShadingModel`.
+
+    Args:
+        height: texels from up to down; there are twice as many around.
+        rate: size of a step at the beginning, display values.
+        decay: what is left of that at the end; it falls exponentially.
+        even_weight: of differences between neighbouring texels.
+        inner: the model that develops what is nearer.
+
+    Attributes:
+        rgb_srgb: the map, display values; rows from up to down, the middle column is forward.
+        first: first moments of Adam; ``second`` holds the second ones.
+        sums: gradients by the texels since the last step.
+        steps: iterations so far.
+        frame: right, up and forward of the map in the world, as rows.
+        inner: the model that develops what is nearer.
+    """
+
+    name = "background"
+
+    def __init__(
+        self,
+        height: int,
+        *,
+        rate: float = 0.0,
+        decay: float = 1.0,
+        even_weight: float = 0.0,
+        inner: ShadingModel = PLAIN,
+    ) -> None:
+        shape = (height, 2 * height, 3)
+        self.rgb_srgb: Float32[np.ndarray, "h w 3"] = np.full(shape, 0.5, np.float32)
+        self.first: Float32[np.ndarray, "h w 3"] = np.zeros(shape, np.float32)
+        self.second: Float32[np.ndarray, "h w 3"] = np.zeros(shape, np.float32)
+        self.sums: Float64[np.ndarray, "h w 3"] = np.zeros(shape)
+        self.steps: Int64[np.ndarray, " 1"] = np.zeros(1, np.int64)
+        self.frame: Float64[np.ndarray, "3 3"] = environment_frame(np.array(UP_WORLD))
+        self._rate = rate
+        self._decay = decay
+        self._even_weight = even_weight
+        self.inner = inner
+
+    @classmethod
+    def of(cls, rgb_srgb: Float32[np.ndarray, "h w 3"], inner: ShadingModel = PLAIN) -> "LearntBackground":
+        """A finished map behind a model."""
+        background = cls(len(rgb_srgb), inner=inner)
+        background.put(rgb_srgb)
+        return background
+
+    def put(self, rgb_srgb: Float32[np.ndarray, "h w 3"]) -> None:
+        """Take another map of this size instead."""
+        assert rgb_srgb.shape == self.rgb_srgb.shape, "a map of another size"
+        self.rgb_srgb = np.clip(rgb_srgb, 0, 1).astype(np.float32)
+
+    def colours(self, directions_world: Float32[np.ndarray, "r 3"]) -> Float32[np.ndarray, "r 3"]:
+        """Display colours of unit directions, bilinear between texels."""
+        height = len(self.rgb_srgb)
+        colours = np.empty((len(directions_world), 3), np.float32)
+        map_colours(self.rgb_srgb.reshape(-1, 3), height, self.frame, directions_world, colours)
+        return colours
+
+    def features(self, gaussians: FlatGaussians) -> Float32[np.ndarray, "n f"] | None:
+        """Those of the model inside."""
+        return self.inner.features(gaussians)
+
+    def settle(self, gaussians: FlatGaussians, tracer: Tracer, *, progress: float) -> None:
+        """The model inside looks around."""
+        self.inner.settle(gaussians, tracer, progress=progress)
+
+    def develop(self, sight: Sight) -> Developed:
+        """The colours of the model inside, with the map's where they let it through; nothing is left open."""
+        inner = self.inner.develop(sight)
+        behind = self.colours(sight.rays.directions_world)
+        rgb = inner.rgb_srgb + inner.transmittance[:, None] * behind
+        return Developed(rgb, np.zeros_like(inner.transmittance), (inner, behind), inner.layers)
+
+    def reverse(
+        self,
+        sight: Sight,
+        developed: Developed,
+        by_rgb: Float32[np.ndarray, "r 3"],
+        by_transmittance: Float32[np.ndarray, " r"],
+    ) -> Reversed:
+        """Gradients by what the model inside developed, and by the map's colours in the rays' directions."""
+        assert isinstance(developed.kept, tuple)
+        inner, behind = developed.kept
+        through = (by_rgb * behind).sum(axis=1, dtype=np.float32)
+        below = self.inner.reverse(sight, inner, by_rgb, through)
+        own = {
+            "background.directions": sight.rays.directions_world,
+            "background.by_colours": inner.transmittance[:, None] * by_rgb,
+        }
+        return Reversed(below.seen, below.further, {**below.parameters, **own})
+
+    def add(self, parameters: Mapping[str, np.ndarray]) -> None:
+        """Add what :meth:`reverse` found to the sums over the texels."""
+        add_to_texels(
+            self.rgb_srgb.reshape(-1, 3),
+            len(self.sums),
+            self.frame,
+            parameters["background.directions"],
+            parameters["background.by_colours"],
+            self.sums.reshape(-1, 3),
+        )
+
+    def step(
+        self,
+        gaussians: FlatGaussians,
+        gradients: GaussianGradients,
+        parameters: Mapping[str, np.ndarray],
+        *,
+        progress: float,
+    ) -> None:
+        """Count an iteration, and take a step of Adam if it is time; colours stay what a screen can show."""
+        self.inner.step(gaussians, gradients, parameters, progress=progress)
+        self.add(parameters)
+        self.steps += 1
+        if self.steps[0] % EVERY:
+            return
+        shares = solid_angles(len(self.sums))[:, None, None] / (4 * np.pi)
+        gradient = self.sums / EVERY + self._even_weight * shares * unevenness(self.rgb_srgb)
+        self.sums[:] = 0
+        count = int(self.steps[0]) // EVERY
+        self.first, self.second, change = adam_change(self.first, self.second, gradient, count)
+        rate = self._rate * self._decay**progress
+        self.rgb_srgb = np.clip(self.rgb_srgb - rate * change, 0, 1).astype(np.float32)
+
+    def state(self) -> dict[str, np.ndarray]:
+        """The map, moments and sums, and what the model inside keeps."""
+        return {**self.inner.state(), **{f"background.{name}": getattr(self, name) for name in _STATE}}
+
+    def restore(self, state: Mapping[str, np.ndarray]) -> None:
+        """Take them back."""
+        self.inner.restore(state)
+        for name in _STATE:
+            setattr(self, name, state[f"background.{name}"].copy())

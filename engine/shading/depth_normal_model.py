@@ -1,0 +1,52 @@
+"""A model whose scene is to become one surface: normals agree with depths, whatever colours say.
+
+Each Gaussian is flat and has a normal; what the depths of neighbouring rays span has one, too. Photographs
+alone let the two differ, so that a surface made of the depths is rough. Follows the depth-normal consistency
+of "2D Gaussian Splatting for Geometrically Accurate Radiance Fields" (https://arxiv.org/abs/2403.17888), with
+neighbours in a window of a batch where that has neighbouring pixels.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Float32
+
+from octasplat.engine.shading.geometry_losses import depth_normal_term
+from octasplat.engine.shading.plain import Plain
+from octasplat.engine.shading.protocol import Developed, Reversed, Sight
+
+
+class Flattening(Plain):
+    """Develops as the plain model, and holds normals and depths together.
+
+    The term is one minus the cosine between a ray's blended normal and that of the points of three
+    neighbouring rays, a mean over the rays.
+
+    Args:
+        weight: of the term.
+    """
+
+    name = "flattening"
+
+    def __init__(self, weight: float) -> None:
+        self._weight = weight
+
+    def reverse(
+        self,
+        sight: Sight,
+        developed: Developed,
+        by_rgb: Float32[np.ndarray, "r 3"],
+        by_transmittance: Float32[np.ndarray, " r"],
+    ) -> Reversed:
+        """The gradients of the plain model, and those of the term by alphas, depths and normals."""
+        plain = super().reverse(sight, developed, by_rgb, by_transmittance)
+        count = len(by_rgb)
+        by_alpha, by_normal, by_depth = np.zeros(count), np.zeros((count, 3)), np.zeros(count)
+        depth_normal_term(sight, self._weight, by_alpha, by_normal, by_depth)
+        seen = replace(
+            plain.seen,
+            transmittance=(by_transmittance - by_alpha).astype(np.float32),
+            depth_sum=by_depth.astype(np.float32),
+            normal_world=by_normal.astype(np.float32),
+        )
+        return replace(plain, seen=seen)

@@ -1,0 +1,171 @@
+"""Terms of the loss that hold normals, depths and materials together, by their gradients alone.
+
+Batches of training rays come in windows (:mod:`octasplat.engine.shading.ray_patches`): square grids of rays
+with one random pixel of each cell. Neighbours in a window are neighbours on the surface, so that differences
+between them mean something.
+"""
+
+import numpy as np
+from jaxtyping import Bool, Float64
+
+from octasplat.engine.shading.gbuffer import Buffer
+from octasplat.engine.shading.material_settings import MaterialSettings
+from octasplat.engine.shading.protocol import Sight
+
+OPAQUE = 0.9
+"""Accumulated alpha from which on a ray shows a surface."""
+STEEPEST = 0.15
+"""Neighbours that span a surface seen at a smaller cosine lie on two surfaces."""
+SMOOTH = 0.9
+"""Cosine from which on the normals of neighbours count as those of one smooth surface."""
+_ALL, _FROM, _TO = slice(None), slice(1, None), slice(None, -1)
+_NEIGHBOURS = (((_ALL, _ALL, _FROM), (_ALL, _ALL, _TO)), ((_ALL, _FROM), (_ALL, _TO)))
+"""The two of each pair of neighbours in a grid of rays, across and down."""
+EDGE = 0.02
+"""Difference of materials at which their smoothness turns from a square to a straight line."""
+
+
+def spread_term(
+    buffer: Buffer,
+    weight: float,
+    by_alpha: Float64[np.ndarray, " r"],
+    by_normal: Float64[np.ndarray, "r 3"],
+) -> None:
+    """Half of the sum of w |n - N|^2 over a ray's Gaussians, N the direction of the blended normal.
+
+    That is the accumulated alpha minus the length of the blended normal: it needs no neighbours.
+    """
+    by_alpha[buffer.which] += weight
+    by_normal[buffer.which] -= weight * buffer.faced.blended_world
+
+
+def neighbour_terms(
+    sight: Sight,
+    settings: MaterialSettings,
+    by_features: Float64[np.ndarray, "r f"],
+    by_alpha: Float64[np.ndarray, " r"],
+    by_normal: Float64[np.ndarray, "r 3"],
+    by_depth: Float64[np.ndarray, " r"],
+) -> None:
+    """Add the gradients of all terms that hold neighbouring rays together: normals, depths, materials."""
+    if settings.depth_normal_weight > 0:
+        depth_normal_term(sight, settings.depth_normal_weight, by_alpha, by_normal, by_depth)
+    if settings.smooth_normal_weight > 0:
+        smooth_normal_term(sight, settings.smooth_normal_weight, by_normal)
+    if max(settings.smooth_weights) > 0:
+        smoothness_term(sight, settings.smooth_weights, settings.smooth_metal, by_features, by_alpha)
+
+
+def depth_normal_term(
+    sight: Sight,
+    weight: float,
+    by_alpha: Float64[np.ndarray, " r"],
+    by_normal: Float64[np.ndarray, "r 3"],
+    by_depth: Float64[np.ndarray, " r"],
+) -> None:
+    """One minus the cosine between the blended normal and that of the points of three neighbouring rays."""
+    windows = sight.windows
+    if windows is None:
+        return
+    some = windows.rays
+    seen, rays = sight.seen, sight.rays
+    alpha = 1.0 - seen.transmittance[some].astype(np.float64)
+    solid = np.maximum(alpha, 1e-6)
+    depth = seen.depth_sum[some] / solid
+    directions = rays.directions_world[some].astype(np.float64)
+    origins = rays.origins_world if len(rays.origins_world) == 1 else rays.origins_world[some]
+    points = windows.grid(origins + depth[:, None] * directions)
+    middle, right, below = points[:, :-1, :-1], points[:, :-1, 1:], points[:, 1:, :-1]
+    a, b = right - middle, below - middle
+    cross = np.cross(a, b)
+    length = np.maximum(np.linalg.norm(cross, axis=-1, keepdims=True), 1e-12)
+    towards = -windows.grid(directions)[:, :-1, :-1]
+    turned = np.where((cross * towards).sum(axis=-1, keepdims=True) < 0, -1.0, 1.0)
+    spanned = turned * cross / length
+    sums = windows.grid(seen.normal_world[some].astype(np.float64))[:, :-1, :-1]
+    normal_length = np.maximum(np.linalg.norm(sums, axis=-1, keepdims=True), 1e-9)
+    normal = sums / normal_length
+    opaque = windows.grid(alpha) > OPAQUE
+    counted = opaque[:, :-1, :-1] & opaque[:, :-1, 1:] & opaque[:, 1:, :-1]
+    counted &= (spanned * towards).sum(axis=-1) > STEEPEST
+    share = np.where(counted, weight / len(seen.transmittance), 0.0)[..., None]
+    cosine = (spanned * normal).sum(axis=-1, keepdims=True)
+    by_sums = -share * (spanned - cosine * normal) / normal_length
+    by_cross = -share * turned * (normal - cosine * spanned) / length
+    by_a, by_b = np.cross(b, by_cross), np.cross(by_cross, a)
+    by_points = np.zeros_like(points)
+    by_points[:, :-1, 1:] += by_a
+    by_points[:, 1:, :-1] += by_b
+    by_points[:, :-1, :-1] -= by_a + by_b
+    along = (windows.flat(by_points) * directions).sum(axis=1)
+    by_depth[some] += along / solid
+    by_alpha[some] -= along * depth / solid
+    whole = np.zeros_like(points)
+    whole[:, :-1, :-1] = by_sums
+    by_normal[some] += windows.flat(whole)
+
+
+def smooth_normal_term(sight: Sight, weight: float, by_normal: Float64[np.ndarray, "r 3"]) -> None:
+    """One minus the cosine between the normals of neighbouring rays, where these show one smooth surface.
+
+    A surface that is bent evenly has no gradient from it.
+    """
+    windows = sight.windows
+    if windows is None:
+        return
+    some = windows.rays
+    sums = windows.grid(sight.seen.normal_world[some].astype(np.float64))
+    length = np.maximum(np.linalg.norm(sums, axis=-1, keepdims=True), 1e-9)
+    normal = sums / length
+    opaque = windows.grid(sight.seen.transmittance[some]) < 1 - OPAQUE
+    gradient = np.zeros_like(normal)
+    for one, other in _NEIGHBOURS:
+        cosine = (normal[one] * normal[other]).sum(axis=-1, keepdims=True)
+        counted = (opaque[one] & opaque[other])[..., None] & (cosine > SMOOTH)
+        share = np.where(counted, weight / len(sight.seen.transmittance), 0.0)
+        gradient[one] -= share * (normal[other] - cosine * normal[one])
+        gradient[other] -= share * (normal[one] - cosine * normal[other])
+    by_normal[some] += windows.flat(gradient / length)
+
+
+def smoothness_term(
+    sight: Sight,
+    weights: tuple[float, ...],
+    metal: float,
+    by_features: Float64[np.ndarray, "r f"],
+    by_alpha: Float64[np.ndarray, " r"],
+) -> None:
+    """Differences of materials between neighbouring rays: their size, rounded off near zero.
+
+    Each of the five columns of materials has its weight. That of the albedo is 1 + ``metal`` times as large
+    between two metals, in between by the square of the smaller metallic: what reflections do not explain yet
+    would else be painted on. Metallic itself gets no gradient from that.
+    """
+    windows = sight.windows
+    if windows is None:
+        return
+    some = windows.rays
+    alpha = 1.0 - sight.seen.transmittance[some].astype(np.float64)
+    solid = np.maximum(alpha, 1e-6)[:, None]
+    flat = sight.seen.features[some, :5] / solid
+    material = windows.grid(flat)
+    opaque = windows.grid(alpha) > OPAQUE
+    gradient = np.zeros_like(material)
+    share = np.array(weights) / len(sight.seen.transmittance)
+    for one, other in _NEIGHBOURS:
+        difference = material[one] - material[other]
+        slope = difference / np.sqrt(difference**2 + EDGE**2)
+        slope = _where(opaque[one] & opaque[other], slope) * share
+        both = np.clip(np.minimum(material[one][..., 3:4], material[other][..., 3:4]), 0, 1)
+        slope[..., :3] *= 1 + metal * both**2
+        gradient[one] += slope
+        gradient[other] -= slope
+    by_flat = windows.flat(gradient)
+    by_features[some, :5] += by_flat / solid
+    by_alpha[some] -= (by_flat * flat).sum(axis=1) / solid[:, 0]
+
+
+def _where(
+    mask: Bool[np.ndarray, "*shape"], values: Float64[np.ndarray, "*shape 5"]
+) -> Float64[np.ndarray, "*shape 5"]:
+    return np.where(mask[..., None], values, 0.0)

@@ -1,0 +1,260 @@
+"""Split-sum shading of pixels, its gradients, and the table of the BRDF's half.
+
+Everything is a pure function of its arguments in float64; :mod:`octasplat.engine.shading.split_sum` has the
+formula.
+"""
+
+import math
+
+from numba import prange
+
+from octasplat.engine.core.compilation import device_function, kernel
+from octasplat.engine.shading.kernels.environment_levels import look_up
+from octasplat.engine.shading.kernels.microfacets import ggx_masking, sample_visible_normal, schlick_weight
+
+TAPS = 12
+"""Texels that a pixel asks: four each of two levels of the lobe and of the irradiance."""
+LEAST_COSINE = 1e-3
+F0 = 0.04
+
+
+@kernel(parallel=True, error_model="numpy")
+def integrate_table(samples, table):
+    """Scale and bias of F0 that one bounce off GGX facets of a white environment sends back.
+
+    Rows are roughness 0 to 1, columns the cosine to the viewer 0 to 1; visible normals are sampled by the
+    points of Hammersley.
+    """
+    rows, columns = table.shape[:2]
+    for cell in prange(rows * columns):
+        row, column = cell // columns, cell % columns
+        roughness = row / (rows - 1)
+        alpha = max(roughness * roughness, 1e-4)
+        o_z = max(column / (columns - 1), LEAST_COSINE)
+        o_x = math.sqrt(max(1.0 - o_z * o_z, 0.0))
+        scale = bias = 0.0
+        for k in range(samples):
+            v, half, bits = 0.0, 0.5, k
+            while bits > 0:
+                v += half * (bits & 1)
+                bits >>= 1
+                half *= 0.5
+            h_x, _, h_z = sample_visible_normal(o_x, 0.0, o_z, alpha, (k + 0.5) / samples, v)
+            cos_d = o_x * h_x + o_z * h_z
+            i_z = 2.0 * cos_d * h_z - o_z
+            if i_z > 0.0:
+                masking = ggx_masking(i_z, alpha)
+                weight = schlick_weight(cos_d)
+                scale += (1.0 - weight) * masking
+                bias += weight * masking
+        table[row, column, 0], table[row, column, 1] = scale / samples, bias / samples
+
+
+@device_function(error_model="numpy")
+def table_slopes(table, cosine, roughness):
+    """Both values of the table, and their slopes by cosine and by roughness."""
+    rows, columns = table.shape[:2]
+    y = min(max(roughness, 0.0), 1.0) * (rows - 1)
+    x = min(max(cosine, 0.0), 1.0) * (columns - 1)
+    j, i = min(int(y), rows - 2), min(int(x), columns - 2)
+    y, x = y - j, x - i
+    a0, b0, c0, d0 = table[j, i, 0], table[j, i + 1, 0], table[j + 1, i, 0], table[j + 1, i + 1, 0]
+    a1, b1, c1, d1 = table[j, i, 1], table[j, i + 1, 1], table[j + 1, i, 1], table[j + 1, i + 1, 1]
+    scale = (a0 * (1 - x) + b0 * x) * (1 - y) + (c0 * (1 - x) + d0 * x) * y
+    bias = (a1 * (1 - x) + b1 * x) * (1 - y) + (c1 * (1 - x) + d1 * x) * y
+    by_cos0 = ((b0 - a0) * (1 - y) + (d0 - c0) * y) * (columns - 1)
+    by_cos1 = ((b1 - a1) * (1 - y) + (d1 - c1) * y) * (columns - 1)
+    by_rough0 = ((c0 - a0) * (1 - x) + (d0 - b0) * x) * (rows - 1)
+    by_rough1 = ((c1 - a1) * (1 - x) + (d1 - b1) * x) * (rows - 1)
+    return scale, bias, by_cos0, by_cos1, by_rough0, by_rough1
+
+
+@device_function(error_model="numpy")
+def mix(texels, a, b, c, d, x, y, channel):
+    """Bilinear value of four texels."""
+    top = texels[a, channel] * (1.0 - x) + texels[b, channel] * x
+    bottom = texels[c, channel] * (1.0 - x) + texels[d, channel] * x
+    return top * (1.0 - y) + bottom * y
+
+
+@device_function(error_model="numpy")
+def mix_slopes(texels, a, b, c, d, x, y, channel):
+    """Slopes of that by the two fractions."""
+    p, q, r, s = texels[a, channel], texels[b, channel], texels[c, channel], texels[d, channel]
+    return (q - p) * (1.0 - y) + (s - r) * y, (r - p) * (1.0 - x) + (s - q) * x
+
+
+@device_function(error_model="numpy")
+def level_of(roughnesses, roughness):
+    """The level below a roughness, how far it is to the next, and the slope of that."""
+    last = len(roughnesses) - 1
+    if roughness <= roughnesses[0]:
+        return 0, 0.0, 0.0
+    for level in range(last):
+        if roughness < roughnesses[level + 1]:
+            gap = roughnesses[level + 1] - roughnesses[level]
+            return level, (roughness - roughnesses[level]) / gap, 1.0 / gap
+    return last - 1, 1.0, 0.0
+
+
+@device_function(error_model="numpy")
+def shade_pixel(p, material, normal, direction, visibility, indirect, ambient, bounced, light, table, rgb):
+    """Linear colour of one pixel."""
+    texels, offsets, heights, roughnesses = light.texels, light.offsets, light.heights, light.roughnesses
+    n_x, n_y, n_z = normal[p, 0], normal[p, 1], normal[p, 2]
+    cosine = -(direction[p, 0] * n_x + direction[p, 1] * n_y + direction[p, 2] * n_z)
+    r_x = direction[p, 0] + 2.0 * cosine * n_x
+    r_y = direction[p, 1] + 2.0 * cosine * n_y
+    r_z = direction[p, 2] + 2.0 * cosine * n_z
+    metallic, roughness = material[p, 3], material[p, 4]
+    scale, bias, _, _, _, _ = table_slopes(table, max(cosine, LEAST_COSINE), roughness)
+    level, between, _ = level_of(roughnesses, roughness)
+    a, b, c, d, x, y, _, _, _ = look_up(texels, offsets[level], heights[level], r_x, r_y, r_z)
+    e, f, g, h, u, v, _, _, _ = look_up(texels, offsets[level + 1], heights[level + 1], r_x, r_y, r_z)
+    last = len(heights) - 1
+    i, j, k, l, s, t, _, _, _ = look_up(texels, offsets[last], heights[last], n_x, n_y, n_z)
+    for channel in range(3):
+        albedo = material[p, channel]
+        f0 = F0 * (1.0 - metallic) + metallic * albedo
+        sharp = mix(texels, a, b, c, d, x, y, channel)
+        blurred = mix(texels, e, f, g, h, u, v, channel)
+        seen = visibility[p] * (sharp * (1.0 - between) + blurred * between) + indirect[p, channel]
+        lit = ambient[p] * mix(texels, i, j, k, l, s, t, channel) + bounced[p, channel]
+        rgb[p, channel] = (f0 * scale + bias) * seen + (1.0 - metallic) * albedo * lit
+
+
+@kernel(parallel=True, error_model="numpy")
+def shade_pixels(
+    material, normal, direction, visibility, indirect, ambient, bounced, light, table, rgb
+):  # fmt: skip
+    """:func:`shade_pixel` for all pixels; directions and normals are in the map's frame."""
+    for p in prange(len(rgb)):
+        shade_pixel(p, material, normal, direction, visibility, indirect, ambient, bounced, light, table, rgb)
+
+
+@device_function(error_model="numpy")
+def look_back(texels, taps, weights, p, place, offset, height, x, y, z, share):
+    """Write the four texels of a look-up and their weights times ``share``; the nine of :func:`look_up`."""
+    found = look_up(texels, offset, height, x, y, z)
+    a, b, c, d, u, v, _, _, _ = found
+    taps[p, place], taps[p, place + 1], taps[p, place + 2], taps[p, place + 3] = a, b, c, d
+    weights[p, place] = share * (1.0 - u) * (1.0 - v)
+    weights[p, place + 1] = share * u * (1.0 - v)
+    weights[p, place + 2] = share * (1.0 - u) * v
+    weights[p, place + 3] = share * u * v
+    return found
+
+
+@device_function(error_model="numpy")
+def direction_slope(texels, found, channel):
+    """Slope of a looked-up value by the direction."""
+    a, b, c, d, u, v, column_x, column_z, row_y = found
+    by_u, by_v = mix_slopes(texels, a, b, c, d, u, v, channel)
+    return by_u * column_x, by_v * row_y, by_u * column_z
+
+
+@device_function(error_model="numpy")
+def reverse_pixel(
+    p, material, normal, direction, visibility, indirect, ambient, bounced, light, table, blur, by_rgb, out
+):
+    """Gradients of one pixel; see :class:`octasplat.engine.shading.split_sum.ShadeGradients`."""
+    texels, offsets, heights, roughnesses = light.texels, light.offsets, light.heights, light.roughnesses
+    n_x, n_y, n_z = normal[p, 0], normal[p, 1], normal[p, 2]
+    d_x, d_y, d_z = direction[p, 0], direction[p, 1], direction[p, 2]
+    cosine = -(d_x * n_x + d_y * n_y + d_z * n_z)
+    r_x, r_y, r_z = d_x + 2.0 * cosine * n_x, d_y + 2.0 * cosine * n_y, d_z + 2.0 * cosine * n_z
+    metallic, roughness = material[p, 3], material[p, 4]
+    seen_cosine = max(cosine, LEAST_COSINE)
+    scale, bias, cos0, cos1, rough0, rough1 = table_slopes(table, seen_cosine, roughness)
+    level, between, by_between = level_of(roughnesses, roughness)
+    taps, weights = out.taps, out.weights
+    near = look_back(
+        texels, taps, weights, p, 0, offsets[level], heights[level], r_x, r_y, r_z,
+        visibility[p] * (1.0 - between),
+    )  # fmt: skip
+    far = look_back(
+        texels, taps, weights, p, 4, offsets[level + 1], heights[level + 1], r_x, r_y, r_z,
+        visibility[p] * between,
+    )  # fmt: skip
+    last = len(heights) - 1
+    facing = look_back(texels, taps, weights, p, 8, offsets[last], heights[last], n_x, n_y, n_z, ambient[p])
+    slope, slope_between, slope_near, slope_far = level, between, near, far
+    if blur > roughness:  # the direction is led by a blurred level
+        slope, slope_between, _ = level_of(roughnesses, blur)
+        slope_near = look_up(texels, offsets[slope], heights[slope], r_x, r_y, r_z)
+        slope_far = look_up(texels, offsets[slope + 1], heights[slope + 1], r_x, r_y, r_z)
+    by_metallic = by_roughness = by_cosine = by_visibility = by_ambient = 0.0
+    gr_x = gr_y = gr_z = gn_x = gn_y = gn_z = 0.0
+    for channel in range(3):
+        gradient = by_rgb[p, channel]
+        albedo = material[p, channel]
+        f0 = F0 * (1.0 - metallic) + metallic * albedo
+        factor = f0 * scale + bias
+        sharp = mix(texels, near[0], near[1], near[2], near[3], near[4], near[5], channel)
+        blurred = mix(texels, far[0], far[1], far[2], far[3], far[4], far[5], channel)
+        around = sharp * (1.0 - between) + blurred * between
+        out.around[p, channel] = around
+        irradiance = mix(texels, facing[0], facing[1], facing[2], facing[3], facing[4], facing[5], channel)
+        seen = visibility[p] * around + indirect[p, channel]
+        lit = ambient[p] * irradiance + bounced[p, channel]
+        matt = (1.0 - metallic) * albedo
+        out.material[p, channel] = gradient * (metallic * scale * seen + (1.0 - metallic) * lit)
+        by_metallic += gradient * ((albedo - F0) * scale * seen - albedo * lit)
+        by_factor = gradient * seen
+        by_cosine += by_factor * (f0 * cos0 + cos1)
+        by_roughness += by_factor * (f0 * rough0 + rough1)
+        by_roughness += gradient * factor * visibility[p] * (blurred - sharp) * by_between
+        by_visibility += gradient * factor * around
+        by_ambient += gradient * matt * irradiance
+        out.indirect[p, channel] = gradient * factor
+        out.bounced[p, channel] = gradient * matt
+        out.specular[p, channel] = gradient * factor
+        out.diffuse[p, channel] = gradient * matt
+        share = gradient * factor * visibility[p]
+        s_x, s_y, s_z = direction_slope(texels, slope_near, channel)
+        t_x, t_y, t_z = direction_slope(texels, slope_far, channel)
+        gr_x += share * (s_x * (1.0 - slope_between) + t_x * slope_between)
+        gr_y += share * (s_y * (1.0 - slope_between) + t_y * slope_between)
+        gr_z += share * (s_z * (1.0 - slope_between) + t_z * slope_between)
+        share = gradient * matt * ambient[p]
+        s_x, s_y, s_z = direction_slope(texels, facing, channel)
+        gn_x += share * s_x
+        gn_y += share * s_y
+        gn_z += share * s_z
+    if cosine < LEAST_COSINE:
+        by_cosine = 0.0
+    along = n_x * gr_x + n_y * gr_y + n_z * gr_z
+    out.reflected[p, 0] = 2.0 * (cosine * gr_x - along * d_x)
+    out.reflected[p, 1] = 2.0 * (cosine * gr_y - along * d_y)
+    out.reflected[p, 2] = 2.0 * (cosine * gr_z - along * d_z)
+    out.normal[p, 0] = gn_x - by_cosine * d_x
+    out.normal[p, 1] = gn_y - by_cosine * d_y
+    out.normal[p, 2] = gn_z - by_cosine * d_z
+    out.material[p, 3], out.material[p, 4] = by_metallic, by_roughness
+    out.visibility[p], out.ambient[p] = by_visibility, by_ambient
+
+
+@kernel(parallel=True, error_model="numpy")
+def reverse_pixels(
+    material, normal, direction, visibility, indirect, ambient, bounced, light, table, blur, by_rgb, out
+):
+    """:func:`reverse_pixel` for all pixels."""
+    for p in prange(len(by_rgb)):
+        reverse_pixel(
+            p, material, normal, direction, visibility, indirect, ambient, bounced, light, table, blur,
+            by_rgb, out,
+        )  # fmt: skip
+
+
+@kernel(error_model="numpy")
+def add_to_texels(taps, weights, specular, diffuse, by_texels):
+    """Add each pixel's shares to the texels that it asked, pixel after pixel."""
+    for p in range(len(taps)):
+        for k in range(TAPS):
+            weight = weights[p, k]
+            if weight == 0.0:
+                continue
+            texel = taps[p, k]
+            for channel in range(3):
+                gradient = specular[p, channel] if k < 8 else diffuse[p, channel]
+                by_texels[texel, channel] += weight * gradient

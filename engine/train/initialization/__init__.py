@@ -1,0 +1,1 @@
+"""The Gaussians, the background and the materials that a training begins with."""

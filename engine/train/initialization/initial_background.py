@@ -1,0 +1,160 @@
+"""What a learnt background begins with: what photographs show in each direction where nothing is near.
+
+A direction is the same piece of sky in every photograph that looks there, from wherever it was taken. Where
+no sparse points project around, the median of what the photographs show is taken for what is far away;
+elsewhere the median of all, so that gaps in the scene are about as bright as what is beside them.
+"""
+
+from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+from jaxtyping import Bool, Float32, Float64, Int64
+from scipy.ndimage import distance_transform_edt, gaussian_filter
+from scipy.spatial import cKDTree
+
+from octasplat.engine.dataset import Camera
+from octasplat.engine.dataset.model import SparsePoints
+from octasplat.engine.dataset.view_frusta import cam_from_world, is_in_image
+from octasplat.engine.shading.background import LearntBackground
+from octasplat.engine.train.sampling.pixel_sampler import TrainingData
+
+ROWS = 64
+"""Of the first map; finer ones are interpolated."""
+EMPTY_SHARE = 0.05
+"""A pixel farther than this share of the picture's longer side from all points is one of nothing near."""
+LEAST_VIEWS = 2
+"""So many photographs must show nothing near in a direction."""
+MOST_POINTS = 50_000
+"""Of more points, evenly spaced ones are looked at."""
+MOST_VIEWS = 96
+"""Of more photographs, evenly spaced ones are looked at."""
+SOFT_TEXELS = (2.0, 6.0)
+"""How softly what no photograph shows goes on from what is known, down and across."""
+
+
+@runtime_checkable
+class MappedPhotographs(TrainingData, Protocol):
+    """Photographs with their sparse model (see :class:`octasplat.engine.dataset.Dataset`)."""
+
+    cameras: tuple[Camera, ...]
+    points: SparsePoints
+
+
+@dataclass(frozen=True, eq=False)
+class FirstBackground:
+    """A map to begin from.
+
+    Attributes:
+        map: of ``ROWS`` rows.
+        up_world: about which way is up, of any length.
+    """
+
+    map: LearntBackground
+    up_world: Float64[np.ndarray, "3"]
+
+    def may_show(self, directions_world: Float64[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
+        """Whether directions are above the horizon, where what is far away is."""
+        return np.asarray(_cosines(directions_world, self.up_world) > 0)
+
+    def enlarged(self, height: int) -> Float32[np.ndarray, "h w 3"]:
+        """The map with so many rows."""
+        directions = _directions(LearntBackground(height))
+        return self.map.colours(directions.astype(np.float32)).reshape(height, 2 * height, 3)
+
+
+def first_background(dataset: MappedPhotographs) -> FirstBackground:
+    """The first map of the photographs that are trained on."""
+    background = LearntBackground(ROWS)
+    directions = _directions(background)
+    train = dataset.train_indices
+    chosen = train[np.unique(np.linspace(0, len(train) - 1, MOST_VIEWS).astype(np.int64))]
+    step = max(1, -(-len(dataset.points) // MOST_POINTS))
+    points = dataset.points.xyz_world[::step].astype(np.float64)
+    seen = [_seen(dataset, index, directions, points) for index in chosen.tolist()]
+    texel, rgb, empty = (np.concatenate(parts) for parts in zip(*seen, strict=True))
+    count = 2 * ROWS * ROWS
+    shown, shown_by = _medians(texel, rgb, count)
+    far, far_by = _medians(texel[empty], rgb[empty], count)
+    # Floors have no points either, close to the camera.
+    found = FirstBackground(background, _up_world(dataset))
+    is_far = (far_by >= LEAST_VIEWS) & found.may_show(directions)
+    known = is_far | (shown_by > 0)
+    colours = np.where(is_far[:, None], far, shown).reshape(ROWS, 2 * ROWS, 3)
+    background.put(_filled(colours, known.reshape(ROWS, 2 * ROWS)))
+    return found
+
+
+def _directions(background: LearntBackground) -> Float64[np.ndarray, "t 3"]:
+    """The middle of each texel as a world direction."""
+    height, width = background.rgb_srgb.shape[:2]
+    polar = np.pi * (np.arange(height)[:, None] + 0.5) / height
+    around = 2 * np.pi * ((np.arange(width) + 0.5) / width - 0.5)
+    parts = np.sin(polar) * np.sin(around), np.cos(polar) + 0 * around, np.sin(polar) * np.cos(around)
+    return np.asarray(
+        sum(part.reshape(-1, 1) * axis for part, axis in zip(parts, background.frame, strict=True))
+    )
+
+
+def _up_world(dataset: MappedPhotographs) -> Float64[np.ndarray, "3"]:
+    """About which way is up: the mean of the views' upper edges."""
+    return -np.mean([dataset.views[i].rotation_cam_from_world[1] for i in dataset.train_indices], axis=0)
+
+
+def _cosines(
+    directions: Float64[np.ndarray, "n 3"], axis: Float64[np.ndarray, "3"]
+) -> Float64[np.ndarray, " n"]:
+    """Products with an axis, added up column by column: the same bits on any number of threads."""
+    return np.asarray(sum(directions[:, k] * axis[k] for k in range(3)))
+
+
+def _seen(
+    dataset: MappedPhotographs,
+    index: int,
+    directions: Float64[np.ndarray, "t 3"],
+    points: Float64[np.ndarray, "n 3"],
+) -> tuple[Int64[np.ndarray, " k"], Float32[np.ndarray, "k 3"], Bool[np.ndarray, " k"]]:
+    """The texels that a view shows, the colours that it shows there, and whether nothing near is beside."""
+    view = dataset.views[index]
+    camera = dataset.cameras[view.camera_index]
+    in_cam = np.stack([_cosines(directions, axis) for axis in view.rotation_cam_from_world], axis=1)
+    texel = np.flatnonzero(is_in_image(in_cam, camera))
+    pixels_px = camera.project(in_cam[texel]).reshape(-1, 2)
+    x = np.clip(pixels_px[:, 0].astype(np.int64), 0, view.width_px - 1)
+    y = np.clip(pixels_px[:, 1].astype(np.int64), 0, view.height_px - 1)
+    rgb, _, weight = dataset.pixels(np.full(len(texel), index), y, x)
+    points_cam = cam_from_world(points, view)
+    points_px = camera.project(points_cam[is_in_image(points_cam, camera)]).reshape(-1, 2)
+    empty = np.ones(len(texel), np.bool_)
+    if len(points_px):
+        reach = EMPTY_SHARE * max(view.width_px, view.height_px)
+        empty = cKDTree(points_px).query(pixels_px, distance_upper_bound=reach)[0] > reach
+    valid = weight > 0
+    return texel[valid], rgb[valid], empty[valid]
+
+
+def _medians(
+    texel: Int64[np.ndarray, " k"], rgb: Float32[np.ndarray, "k 3"], count: int
+) -> tuple[Float32[np.ndarray, "t 3"], Int64[np.ndarray, " t"]]:
+    """The lower median of each channel of each texel's colours, and how many there are."""
+    found = np.bincount(texel, minlength=count)
+    medians = np.zeros((count, 3), np.float32)
+    middle = np.cumsum(found) - found + np.maximum(found - 1, 0) // 2
+    for channel in range(3):
+        values = rgb[np.lexsort((rgb[:, channel], texel)), channel]
+        medians[found > 0, channel] = values[middle[found > 0]]
+    return medians, found
+
+
+def _filled(
+    colours: Float32[np.ndarray, "h w 3"], known: Bool[np.ndarray, "h w"]
+) -> Float32[np.ndarray, "h w 3"]:
+    """The map with what is not known taken, blurred, from the nearest texel that is; its sides meet."""
+    if not known.any():
+        return np.full_like(colours, 0.5)
+    width = colours.shape[1]
+    around = np.tile(known, (1, 3))
+    row, column = distance_transform_edt(~around, return_distances=False, return_indices=True)
+    nearest = colours[row, column % width][:, width : 2 * width]
+    soft = gaussian_filter(nearest, (*SOFT_TEXELS, 0), mode=("nearest", "wrap", "nearest"))
+    return np.where(known[..., None], nearest, soft)

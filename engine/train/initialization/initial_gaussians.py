@@ -1,0 +1,194 @@
+"""The first Gaussians: flat ones on the points of the model, or random ones in the cameras' view.
+
+After "GaMeS: Mesh-Based Adapting and Modification of Gaussian Splatting" (https://arxiv.org/abs/2402.01459),
+from which "REdiSplats: Ray Tracing for Editable Gaussian Splatting" (https://arxiv.org/abs/2503.12284,
+section 4.2) begins too.
+"""
+
+import numpy as np
+from jaxtyping import Float32, Float64
+from scipy.spatial import cKDTree
+
+from octasplat.engine.core.errors import DatasetError
+from octasplat.engine.dataset import Dataset
+from octasplat.engine.gaussians.frames import frames_from_normals, quaternions_from_matrices
+from octasplat.engine.gaussians.materials import AMBIENT, DIFFUSE_INTERREFLECTION, MATERIAL_WIDTHS
+from octasplat.engine.gaussians.model import SH_C0, FlatGaussians
+from octasplat.engine.shading.material_settings import (
+    FIRST_ALBEDO,
+    FIRST_METALLIC,
+    FIRST_ROUGHNESS,
+    MaterialSettings,
+)
+from octasplat.engine.train.config import TrainConfig, most_gaussians
+from octasplat.engine.train.initialization.initial_background import FirstBackground
+from octasplat.engine.train.initialization.plane_sweep import dense_points
+from octasplat.engine.train.sampling.shown import shown_share
+from octasplat.engine.train.views.exposure_changes import evening_gains
+
+MIN_POINTS = 50
+"""Fewer sparse points than this are no use to begin from; random ones are taken."""
+NEIGHBOURS = 3
+MAX_ANGLE = 0.3
+"""Largest scale as seen from the nearest camera, in radians."""
+SWEPT_ANGLE = 0.015
+"""That of points at depths that no other point suggested: where these are wrong, they hide little."""
+FARTHEST = 50.0
+"""Points farther from the cameras than this many extents are matching errors."""
+
+
+def initial_gaussians(
+    dataset: Dataset, config: TrainConfig, *, threads: int = 1, behind: FirstBackground | None = None
+) -> FlatGaussians:
+    """The first Gaussians: on the sparse points, or on random rays where there are too few of them.
+
+    Pixels that show what is ``behind`` everything are not lifted.
+    """
+    rng = np.random.Generator(np.random.PCG64([config.seed, 2]))
+    points = dataset.points
+    most_of_all = most_gaussians(config, dataset.train_pixel_count, shown_share(dataset))
+    limit = min(config.initial_points, most_of_all)
+    if len(points.xyz_world) >= MIN_POINTS:
+        centres = np.stack([dataset.views[i].origin_world for i in dataset.train_indices])
+        xyz, rgb = points.xyz_world, points.rgb_srgb
+        most = np.full(len(xyz), MAX_ANGLE)
+        if config.plane_sweep_init and len(xyz) < limit:
+            gains = evening_gains(dataset) if config.exposure is True else None
+            more = dense_points(
+                dataset, limit - len(xyz), rng,
+                threads=threads, behind=behind, gains=gains, unseen=config.plane_sweep_unseen,
+            )  # fmt: skip
+            xyz, rgb = np.concatenate([xyz, more.xyz_world]), np.concatenate([rgb, more.rgb_srgb])
+            most = np.concatenate([most, np.where(more.swept, SWEPT_ANGLE, MAX_ANGLE)])
+        return from_points(
+            xyz,
+            rgb,
+            centres,
+            extent=dataset.extent,
+            limit=limit,
+            opacity=config.initial_opacity,
+            rng=rng,
+            plane_points=config.normal_neighbors,
+            most_angles=most,
+        )
+    view, y, x = dataset.sample_pixels(rng, limit)
+    rays = dataset.rays(view, y, x)
+    rgb, alpha, weight = dataset.pixels(view, y, x)
+    seen = (weight > 0) & (alpha > 0)
+    return from_rays(
+        rays.origins_world[seen],
+        rays.directions_world[seen],
+        rgb[seen],
+        extent=dataset.extent,
+        opacity=config.initial_opacity,
+        rng=rng,
+    )
+
+
+def with_first_materials(gaussians: FlatGaussians, settings: MaterialSettings) -> FlatGaussians:
+    """The same Gaussians with the materials that a training begins with, all alike."""
+    values = (FIRST_ALBEDO,) * 3, (FIRST_METALLIC,), (FIRST_ROUGHNESS,)
+    first = dict(zip(MATERIAL_WIDTHS, values, strict=True)) | {AMBIENT: (1.0,)}
+    if settings.recipe == "split_sum" and settings.diffuse_interreflection:
+        first[DIFFUSE_INTERREFLECTION] = (0.0,) * 3
+    return gaussians.with_channels(
+        {name: np.tile(np.array(value, np.float32), (len(gaussians), 1)) for name, value in first.items()}
+    )
+
+
+def from_points(
+    xyz_world: Float32[np.ndarray, "n 3"],
+    rgb_srgb: Float32[np.ndarray, "n 3"],
+    camera_centres_world: Float64[np.ndarray, "c 3"],
+    *,
+    extent: float,
+    limit: int,
+    opacity: float,
+    rng: np.random.Generator,
+    plane_points: int = 8,
+    most_angles: Float64[np.ndarray, " n"] | None = None,
+) -> FlatGaussians:
+    """Flat Gaussians on sparse points.
+
+    The scales are the mean distance to the three nearest points; the normal is that of the plane through
+    the ``plane_points`` nearest where they lie on one, else it looks at the cameras. More than ``limit``
+    points are thinned at random. ``most_angles`` are the largest scales as seen from the nearest camera,
+    radians; None for ``MAX_ANGLE``.
+    """
+    centre = np.median(camera_centres_world, axis=0)
+    far = np.linalg.norm(xyz_world - centre, axis=1) > FARTHEST * extent
+    keep = np.flatnonzero(~far & np.isfinite(xyz_world).all(axis=1))
+    if len(keep) > limit:
+        keep = np.sort(rng.choice(keep, limit, replace=False))
+    points = xyz_world[keep].astype(np.float64)
+    count = len(points)
+    if count == 0:
+        raise DatasetError(
+            "No point of the sparse model lies near the cameras; check the model, or delete its points."
+        )
+    tree = cKDTree(points)
+    wanted = min(count, plane_points + 1)
+    distances, neighbours = tree.query(points, wanted)
+    distances, neighbours = distances.reshape(count, wanted), neighbours.reshape(count, wanted)
+    nearest = distances[:, 1 : NEIGHBOURS + 1] if wanted > 1 else np.full((count, 1), 0.01 * extent)
+    spacing = nearest.mean(axis=1)
+    spacing = np.clip(
+        spacing, 1e-5 * extent, 0.2 * extent * np.maximum(1.0, _distance(points, centre) / extent)
+    )
+    # One point alone in front of a camera would hide everything.
+    to_camera = cKDTree(camera_centres_world).query(points)[0]
+    most = MAX_ANGLE if most_angles is None else most_angles[keep]
+    spacing = np.minimum(spacing, np.maximum(most * to_camera, 1e-5 * extent))
+    normals = _unit(centre - points)
+    if wanted == plane_points + 1:
+        around = points[neighbours]
+        around = around - around.mean(axis=1, keepdims=True)
+        values, vectors = np.linalg.eigh(np.einsum("nki,nkj->nij", around, around))
+        planar = values[:, 0] < 0.1 * values[:, 1]
+        normals[planar] = vectors[planar, :, 0]
+    return _assemble(points, normals, spacing, rgb_srgb[keep], opacity)
+
+
+def from_rays(
+    origins_world: Float32[np.ndarray, "n 3"],
+    directions_world: Float32[np.ndarray, "n 3"],
+    rgb_srgb: Float32[np.ndarray, "n 3"],
+    *,
+    extent: float,
+    opacity: float,
+    rng: np.random.Generator,
+) -> FlatGaussians:
+    """Random flat Gaussians in the cameras' frustums: one on each ray, log-uniform in depth, facing it."""
+    if len(origins_world) == 0:
+        raise DatasetError("The masks or the alpha leave no pixel to begin from; check masks/ and --masks.")
+    depths = extent * np.exp(rng.uniform(np.log(0.3), np.log(5.0), len(origins_world)))
+    points = origins_world.astype(np.float64) + depths[:, None] * directions_world
+    distances = cKDTree(points).query(points, min(len(points), NEIGHBOURS + 1))[0].reshape(len(points), -1)
+    spacing = np.clip(
+        distances[:, 1:].mean(axis=1) if len(points) > 1 else 0.05 * extent, 1e-4 * extent, extent
+    )
+    return _assemble(
+        points, -directions_world.astype(np.float64), np.broadcast_to(spacing, len(points)), rgb_srgb, opacity
+    )
+
+
+def _assemble(
+    points: np.ndarray, normals: np.ndarray, spacing: np.ndarray, rgb_srgb: np.ndarray, opacity: float
+) -> FlatGaussians:
+    count = len(points)
+    return FlatGaussians(
+        means_world=points.astype(np.float32),
+        quats_wxyz=quaternions_from_matrices(frames_from_normals(normals)).astype(np.float32),
+        log_scales=np.repeat(np.log(spacing)[:, None], 2, axis=1).astype(np.float32),
+        opacity_logits=np.full(count, np.log(opacity / (1 - opacity)), np.float32),
+        sh=((rgb_srgb - 0.5) / SH_C0).astype(np.float32)[:, None, :],
+    )
+
+
+def _unit(vectors: np.ndarray) -> np.ndarray:
+    length = np.linalg.norm(vectors, axis=-1, keepdims=True)
+    return np.where(length > 0, vectors / np.where(length > 0, length, 1.0), np.array([0.0, 0.0, 1.0]))
+
+
+def _distance(points: np.ndarray, centre: np.ndarray) -> np.ndarray:
+    return np.asarray(np.linalg.norm(points - centre, axis=1))

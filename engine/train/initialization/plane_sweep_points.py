@@ -1,0 +1,104 @@
+"""Points lifted from pixels, and which of those at swept depths are to be believed.
+
+How they are found is told by :mod:`octasplat.engine.train.initialization.plane_sweep`.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float32, Float64, Int64
+from scipy.spatial import cKDTree
+
+BESIDE = 0.03
+"""Something known nearer than that, as a share of the distance to the own camera, bears a point out."""
+SAME_PLACE, WITNESSES, CLEAR = 0.04, 3, 0.5
+"""So do pixels of so many other views that were lifted to within the first share of that distance, where the
+own pixel matches clearly: its rivalry is below the last."""
+
+
+@dataclass(frozen=True, eq=False)
+class LiftedPoints:
+    """Points from pixels.
+
+    Attributes:
+        xyz_world: where they are.
+        rgb_srgb: display colours.
+        swept: whether no point around suggested the depth; more of these are wrong.
+    """
+
+    xyz_world: Float32[np.ndarray, "n 3"]
+    rgb_srgb: Float32[np.ndarray, "n 3"]
+    swept: Bool[np.ndarray, " n"]
+
+    def __len__(self) -> int:
+        return len(self.xyz_world)
+
+    def __getitem__(self, which: np.ndarray) -> "LiftedPoints":
+        """Some of them, by number or by a mask."""
+        return LiftedPoints(self.xyz_world[which], self.rgb_srgb[which], self.swept[which])
+
+    @classmethod
+    def joined(cls, parts: Sequence["LiftedPoints"]) -> "LiftedPoints":
+        """One part after the other; none of no parts."""
+        nothing = np.empty((0, 3), np.float32)
+        parts = [cls(nothing, nothing, np.empty(0, np.bool_)), *parts]
+        return cls(
+            np.concatenate([part.xyz_world for part in parts]),
+            np.concatenate([part.rgb_srgb for part in parts]),
+            np.concatenate([part.swept for part in parts]),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Evidence:
+    """What tells whether to believe points: whose pixels they were, and how clearly these matched.
+
+    ``view`` is one of the dataset's, and ``distance`` that to its camera. Of swept depths, ``rivalry`` is the
+    cost over that of the best other more than one step away: near 0 where only one depth matches.
+    """
+
+    view: Int64[np.ndarray, " n"]
+    distance: Float64[np.ndarray, " n"]
+    rivalry: Float64[np.ndarray, " n"]
+
+    def __getitem__(self, which: np.ndarray) -> "Evidence":
+        return Evidence(*(row[which] for row in vars(self).values()))
+
+    @classmethod
+    def joined(cls, parts: Sequence["Evidence"]) -> "Evidence":
+        """One part after the other."""
+        columns = zip(*(vars(part).values() for part in parts), strict=True)
+        return cls(*(np.concatenate(column) for column in columns))
+
+
+def borne_out(
+    found: LiftedPoints,
+    evidence: Evidence,
+    known: Float64[np.ndarray, "k 3"],
+) -> Bool[np.ndarray, " n"]:
+    """Of points at swept depths, whether something else says that they are right; of others, false.
+
+    Args:
+        found: points of all training views.
+        evidence: of the same points.
+        known: points found before, or known from elsewhere.
+    """
+    right = np.zeros(len(found), np.bool_)
+    swept = np.flatnonzero(found.swept)
+    if not len(swept):
+        return right
+    xyz, seen = found.xyz_world[swept].astype(np.float64), evidence[swept]
+    beside, _ = cKDTree(known).query(xyz)
+    same_place = _witnesses(xyz, seen) >= WITNESSES
+    right[swept] = (beside < BESIDE * seen.distance) | (same_place & (seen.rivalry < CLEAR))
+    return right
+
+
+def _witnesses(xyz_world: Float64[np.ndarray, "n 3"], seen: Evidence) -> Int64[np.ndarray, " n"]:
+    """How many other views have a point at the same place as each."""
+    near = cKDTree(xyz_world).query_ball_point(xyz_world, SAME_PLACE * seen.distance)
+    mine = np.repeat(np.arange(len(near)), [len(others) for others in near])
+    views = seen.view[np.concatenate(near).astype(np.int64)]
+    pairs = np.unique(np.stack([mine, views], axis=1)[views != seen.view[mine]], axis=0)
+    return np.bincount(pairs[:, 0], minlength=len(near))

@@ -1,0 +1,312 @@
+"""Adam on the Gaussians that were hit, all parameter groups in one pass."""
+
+import math
+
+import llvmlite.ir as ir
+import numpy as np
+from numba import types
+from numba.core import cgutils
+from numba.extending import intrinsic
+
+from octasplat.engine.core.compilation import device_function, kernel
+from octasplat.engine.trace.kernels.native import float32_pointer, njit_no_refcount, prefetch_bytes
+
+LANES = 16
+GEOMETRY = 3 + 4 + 2 + 1
+"""Columns of mean, quaternion, scales and opacity."""
+CHUNK = 512
+"""Gaussians that a thread takes at a time."""
+AHEAD = 8
+"""Gaussians between asking for their moments and harmonics and taking their step: rows of those that were hit
+are too far apart for the processor to foresee.
+"""
+LEAST_SHARE = 1e-3
+"""Numbers between 0 and 1 stay this far from both, so that they can come back."""
+
+
+@device_function()
+def _update(
+    value, gradient, first, second, row, column, rate, correction1, correction2, beta1, beta2, epsilon
+):
+    m = beta1 * np.float64(first[row, column]) + (1.0 - beta1) * gradient
+    v = beta2 * np.float64(second[row, column]) + (1.0 - beta2) * gradient * gradient
+    first[row, column] = m
+    second[row, column] = v
+    return value - rate * (m * correction1) / (math.sqrt(v * correction2) + epsilon)
+
+
+@intrinsic
+def step_lanes(typingctx, values, gradients, rates, first, second, numbers):
+    """One step for sixteen float32 at each address, in float32.
+
+    ``numbers`` are what both moments are multiplied by, both betas, one minus each, and epsilon.
+    """
+    address, single = types.uintp, types.float32
+    signature = types.void(*(address,) * 5, types.UniTuple(single, 7))
+
+    def codegen(context, builder, sig, args):
+        *places, numbers = args
+        kind = ir.VectorType(ir.FloatType(), LANES)
+        lanes = ir.VectorType(ir.IntType(32), LANES)
+        root = cgutils.get_or_insert_function(
+            builder.module, ir.FunctionType(kind, [kind]), f"llvm.sqrt.v{LANES}f32"
+        )
+
+        def everywhere(scalar, vector):
+            one = builder.insert_element(ir.Constant(vector, ir.Undefined), scalar, _word(0))
+            return builder.shuffle_vector(
+                one, ir.Constant(vector, ir.Undefined), ir.Constant(lanes, [0] * LANES)
+            )
+
+        def times(a, b):
+            return builder.fmul(a, b, flags=("contract",))
+
+        numbers = [everywhere(number, kind) for number in cgutils.unpack_tuple(builder, numbers)]
+        correction1, correction2, beta1, beta2, rest1, rest2, epsilon = numbers
+        places = [builder.inttoptr(place, kind.as_pointer()) for place in places]
+        value, gradient, rate, m, v = (builder.load(at, align=4) for at in places)
+        m = builder.fadd(times(beta1, m), times(rest1, gradient), flags=("contract",))
+        v = builder.fadd(times(beta2, v), times(times(rest2, gradient), gradient), flags=("contract",))
+        below = builder.fadd(builder.call(root, [times(v, correction2)]), epsilon)
+        step = builder.fdiv(times(rate, times(m, correction1)), below)
+        for found, at in ((builder.fsub(value, step), 0), (m, 3), (v, 4)):
+            builder.store(found, places[at], align=4)
+        return context.get_dummy_value()
+
+    return signature, codegen
+
+
+def _word(value):
+    return ir.Constant(ir.IntType(32), value)
+
+
+@njit_no_refcount()
+def copy_few(source, target, count):
+    """Copy so many float32 from one address to another."""
+    read, write = float32_pointer(source), float32_pointer(target)
+    for k in range(count):
+        write[k] = read[k]
+
+
+@njit_no_refcount()
+def step_few(values, gradients, rates, first, second, count, room, numbers):
+    """:func:`step_lanes` for the first ``count`` alone, within ``room`` for 64 float32.
+
+    Storing some lanes of a vector is slow on processors with AVX2 alone.
+    """
+    line = LANES * 4
+    copy_few(values, room, count)
+    copy_few(gradients, room + line, count)
+    copy_few(first, room + 2 * line, count)
+    copy_few(second, room + 3 * line, count)
+    step_lanes(room, room + line, rates, room + 2 * line, room + 3 * line, numbers)
+    copy_few(room, values, count)
+    copy_few(room + 2 * line, first, count)
+    copy_few(room + 3 * line, second, count)
+
+
+@njit_no_refcount(fastmath={"contract"})
+def own_axes_of(i, quats, room):
+    """The axes of Gaussian ``i`` as rows of ``room``: the normal and the two in its plane."""
+    w, x, y, z = (
+        np.float64(quats[i, 0]), np.float64(quats[i, 1]), np.float64(quats[i, 2]), np.float64(quats[i, 3]),
+    )  # fmt: skip
+    s = 2.0 / (w * w + x * x + y * y + z * z)
+    room[0, 0], room[0, 1], room[0, 2] = 1.0 - s * (y * y + z * z), s * (x * y + w * z), s * (x * z - w * y)
+    room[1, 0], room[1, 1], room[1, 2] = s * (x * y - w * z), 1.0 - s * (x * x + z * z), s * (y * z + w * x)
+    room[2, 0], room[2, 1], room[2, 2] = s * (x * z + w * y), s * (y * z - w * x), 1.0 - s * (x * x + y * y)
+
+
+@njit_no_refcount(fastmath={"contract"})
+def by_own_turns(k, i, quats, g_quats, out):
+    """Gradient of Gaussian ``i`` by turns around its own axes: by d of its quaternion times (1, d)."""
+    w, x, y, z = quats[i, 0], quats[i, 1], quats[i, 2], quats[i, 3]
+    a, b, c, d = g_quats[k, 0], g_quats[k, 1], g_quats[k, 2], g_quats[k, 3]
+    out[3] = 0.0
+    out[4] = -a * x + b * w + c * z - d * y
+    out[5] = -a * y - b * z + c * w + d * x
+    out[6] = -a * z + b * y - c * x + d * w
+
+
+@njit_no_refcount(fastmath={"contract"})
+def turn(i, quats, by):
+    """Replace the quaternion of Gaussian ``i`` by that times (1, ``by[4:7]``), of length 1."""
+    w, x, y, z = (
+        np.float64(quats[i, 0]), np.float64(quats[i, 1]), np.float64(quats[i, 2]), np.float64(quats[i, 3]),
+    )  # fmt: skip
+    a, b, c = np.float64(by[4]), np.float64(by[5]), np.float64(by[6])
+    share = 1.0 / math.sqrt((w * w + x * x + y * y + z * z) * (1.0 + a * a + b * b + c * c))
+    quats[i, 0] = (w - x * a - y * b - z * c) * share
+    quats[i, 1] = (x + w * a + y * c - z * b) * share
+    quats[i, 2] = (y + w * b + z * a - x * c) * share
+    quats[i, 3] = (z + w * c + x * b - y * a) * share
+
+
+@njit_no_refcount(fastmath={"contract"})
+def step_gaussian(k, i, room, state, gaussian, gradients, rates, regular, corrections):
+    """One step of Gaussian ``i``, row ``k`` of the gradients; see :func:`adam_step`."""
+    first, second, numbers = state
+    means, quats, log_scales, logits, sh = gaussian
+    g_means, g_quats, g_log_scales, g_logits, g_sh = gradients
+    rate_mean, mean_by_size, own_axes, rate_quat, rate_log_scale, rate_opacity, rates_sh, mean_steps = rates
+    opacity_weight, scale_weight, min_log_scale, max_log_scale = regular
+    values, by_values, by_rates, axes = room[0], room[1], room[2], room[3:6]
+    few_at = room[6:].ctypes.data
+    scale_0, scale_1 = math.exp(np.float64(log_scales[i, 0])), math.exp(np.float64(log_scales[i, 1]))
+    rate = rate_mean
+    if mean_by_size:
+        rate *= math.sqrt(scale_0 * scale_1)
+    for axis in range(3):
+        values[axis], by_values[axis], by_rates[axis] = 0.0, g_means[k, axis], rate  # the step alone
+    for axis in range(4):
+        values[3 + axis], by_values[3 + axis], by_rates[3 + axis] = (
+            quats[i, axis], g_quats[k, axis], rate_quat,
+        )  # fmt: skip
+    for axis in range(2):
+        values[7 + axis], by_rates[7 + axis] = log_scales[i, axis], rate_log_scale
+    by_values[7] = g_log_scales[k, 0] + scale_weight * scale_0
+    by_values[8] = g_log_scales[k, 1] + scale_weight * scale_1
+    if own_axes:
+        own_axes_of(i, quats, axes)
+        for axis in range(3):
+            by_values[axis] = (
+                axes[axis, 0] * g_means[k, 0] + axes[axis, 1] * g_means[k, 1] + axes[axis, 2] * g_means[k, 2]
+            )
+            values[4 + axis] = 0.0
+        by_own_turns(k, i, quats, g_quats, by_values)
+    opacity = 0.0
+    if opacity_weight != 0.0:
+        opacity = 1.0 / (1.0 + math.exp(-np.float64(logits[i])))
+    values[9], by_rates[9] = logits[i], rate_opacity
+    by_values[9] = g_logits[k] + opacity_weight * opacity * (1.0 - opacity)
+    first_at = first.ctypes.data + i * first.shape[1] * 4
+    second_at = second.ctypes.data + i * second.shape[1] * 4
+    values_at, by_values_at, by_rates_at = values.ctypes.data, by_values.ctypes.data, by_rates.ctypes.data
+    step_few(values_at, by_values_at, by_rates_at, first_at, second_at, GEOMETRY, few_at, numbers)
+    columns = sh.shape[1] * 3
+    for column in range(0, columns, LANES):
+        sh_at = sh.ctypes.data + (i * columns + column) * 4
+        by_sh_at = g_sh.ctypes.data + (k * columns + column) * 4
+        rates_at = rates_sh.ctypes.data + column * 4
+        sh_first_at = first_at + (GEOMETRY + column) * 4
+        sh_second_at = second_at + (GEOMETRY + column) * 4
+        left = columns - column
+        if left >= LANES:
+            step_lanes(sh_at, by_sh_at, rates_at, sh_first_at, sh_second_at, numbers)
+        else:
+            step_few(sh_at, by_sh_at, rates_at, sh_first_at, sh_second_at, left, few_at, numbers)
+    if own_axes:
+        turn(i, quats, values)
+        for axis in range(3):
+            mean_steps[k, axis] = (
+                axes[0, axis] * values[0] + axes[1, axis] * values[1] + axes[2, axis] * values[2]
+            )
+    else:
+        for axis in range(4):
+            quats[i, axis] = values[3 + axis]
+        for axis in range(3):
+            mean_steps[k, axis] = values[axis]
+    for axis in range(3):
+        means[i, axis] += mean_steps[k, axis]
+    for axis in range(2):
+        log_scales[i, axis] = min(max(np.float64(values[7 + axis]), min_log_scale), max_log_scale)
+    logits[i] = values[9]
+
+
+@njit_no_refcount(fastmath={"contract"})
+def step_chunk(begin, end, ids, steps, powers, room, state, gaussian, gradients, rates, regular, corrections):
+    """:func:`step_gaussian` for rows ``begin`` to ``end``."""
+    first, second, beta1, beta2, epsilon = state
+    sh = gaussian[4]
+    moments_bytes, sh_bytes = first.shape[1] * 4, sh.shape[1] * 12
+    for k in range(begin, end):
+        if k + AHEAD < end:
+            ahead = ids[k + AHEAD]
+            prefetch_bytes(first.ctypes.data + ahead * moments_bytes, moments_bytes)
+            prefetch_bytes(second.ctypes.data + ahead * moments_bytes, moments_bytes)
+            prefetch_bytes(sh.ctypes.data + ahead * sh_bytes, sh_bytes)
+        i = ids[k]
+        steps[i] += 1
+        c1, c2 = 1.0 / (1.0 - powers[0, steps[i]]), 1.0 / (1.0 - powers[1, steps[i]])
+        corrections[k, 0], corrections[k, 1] = c1, c2
+        numbers = (
+            np.float32(c1), np.float32(c2), np.float32(beta1), np.float32(beta2),
+            np.float32(1.0 - beta1), np.float32(1.0 - beta2), np.float32(epsilon),
+        )  # fmt: skip
+        step_gaussian(k, i, room, (first, second, numbers), gaussian, gradients, rates, regular, corrections)
+
+
+@kernel()
+def adam_step(
+    first_chunk, last_chunk,
+    ids, steps, powers, first, second,
+    means, quats, log_scales, logits, sh,
+    g_means, g_quats, g_log_scales, g_logits, g_sh,
+    rate_mean, mean_by_size, own_axes, rate_quat, rate_log_scale, rate_opacity, rates_sh,
+    opacity_weight, scale_weight, min_log_scale, max_log_scale,
+    beta1, beta2, epsilon, mean_steps, corrections,
+):  # fmt: skip
+    """One step for the Gaussians ``ids`` of some chunks of :data:`CHUNK` each.
+
+    Each Gaussian has its own step count for the bias correction.
+
+    ``powers`` are those of ``beta1`` and ``beta2``, for as many steps as any has taken and one more.
+    ``rate_mean`` is in world units or, where ``mean_by_size``, in units of the Gaussian's size: the geometric
+    mean of its two scales. With ``own_axes`` means and quaternions are stepped along and around the
+    Gaussian's normal and the two axes in its plane, each with moments of its own; the first column of the
+    quaternion's is then unused. ``rates_sh`` are those of the harmonics' coefficients, one after the other,
+    in whole vectors of ``LANES``.
+
+    ``opacity_weight`` and ``scale_weight`` add the gradients of their regularisers. ``mean_steps`` receives
+    each mean's step, world units, and ``corrections`` what both moments are multiplied by.
+    """
+    count = len(ids)
+    for chunk in range(first_chunk, last_chunk):
+        room = np.zeros((10, LANES), np.float32)
+        step_chunk(
+            chunk * CHUNK, min(count, (chunk + 1) * CHUNK), ids, steps, powers, room,
+            (first, second, beta1, beta2, epsilon),
+            (means, quats, log_scales, logits, sh),
+            (g_means, g_quats, g_log_scales, g_logits, g_sh),
+            (
+                rate_mean, mean_by_size, own_axes, rate_quat, rate_log_scale, rate_opacity, rates_sh,
+                mean_steps,
+            ),
+            (opacity_weight, scale_weight, min_log_scale, max_log_scale),
+            corrections,
+        )  # fmt: skip
+
+
+@kernel()
+def adam_shares(
+    first_row,
+    last_row,
+    ids,
+    corrections,
+    first,
+    second,
+    column,
+    values,
+    g_values,
+    rate,
+    beta1,
+    beta2,
+    epsilon,
+):
+    """One step for numbers in (0, 1) of the Gaussians ``ids``, taken by their logits.
+
+    Their moments begin at ``column``; ``corrections`` are those of :func:`adam_step`. A ``rate`` of 0 changes
+    nothing.
+    """
+    for k in range(first_row, last_row):
+        i = ids[k]
+        c1, c2 = corrections[k, 0], corrections[k, 1]
+        for place in range(values.shape[1]):
+            value = min(max(np.float64(values[i, place]), LEAST_SHARE), 1.0 - LEAST_SHARE)
+            gradient = np.float64(g_values[k, place]) * value * (1.0 - value)
+            logit = _update(
+                math.log(value / (1.0 - value)), gradient,
+                first, second, i, column + place, rate, c1, c2, beta1, beta2, epsilon,
+            )  # fmt: skip
+            value = 1.0 / (1.0 + math.exp(-logit))
+            values[i, place] = min(max(value, LEAST_SHARE), 1.0 - LEAST_SHARE)

@@ -1,0 +1,36 @@
+"""The pixels' loss and its gradient in one pass."""
+
+import numpy as np
+
+from octasplat.engine.core.compilation import kernel
+from octasplat.engine.trace.kernels.native import njit_no_refcount
+
+CHUNKS = 64
+"""Parts whose sums are added up one after the other: the same on any number of threads."""
+
+
+@njit_no_refcount()
+def _part(first, last, render, target, weight, l1, l2, gradient, sums):
+    absolute = squared = 0.0
+    for r in range(first, last):
+        for channel in range(3):
+            difference = render[r, channel] - target[r, channel]
+            absolute += abs(difference) * weight[r]
+            squared += difference * difference * weight[r]
+            slope = l2 * difference
+            if difference > np.float32(0.0):
+                slope += l1
+            elif difference < np.float32(0.0):
+                slope -= l1
+            gradient[r, channel] = slope * weight[r]
+    sums[0], sums[1] = absolute, squared
+
+
+@kernel(error_model="numpy")
+def pixel_terms(first, last, render, target, weight, l1, l2, gradient, sums):
+    """Write ``gradient`` = (l1 sign(d) + l2 d) weight, d = render - target, and ``sums`` of |d| and d^2."""
+    count, chunks = len(render), len(sums)
+    for c in range(first, last):
+        _part(
+            c * count // chunks, (c + 1) * count // chunks, render, target, weight, l1, l2, gradient, sums[c]
+        )

@@ -1,0 +1,202 @@
+"""Checkpoints: everything that the rest of a run depends on, in one file, written whole or not at all."""
+
+import json
+import struct
+import zipfile
+import zlib
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float64
+
+from octasplat.engine.core.errors import CheckpointError, DamagedCheckpoint
+from octasplat.engine.core.events import Listener, Warned
+from octasplat.engine.core.writing import replacing
+from octasplat.engine.gaussians.model import FlatGaussians
+from octasplat.engine.gaussians.rows import from_row_arrays, row_arrays
+from octasplat.engine.train.loop.state import TrainState
+from octasplat.engine.train.optimization.adam import Adam
+from octasplat.engine.train.optimization.weight_averaging import RunningMean
+
+FORMAT = 6
+KEEP = 2
+_PREFIX = "iteration_"
+_GROUPS = ("gaussians", "adam", "average", "densifier", "shading", "poses")
+# What reading a damaged archive may raise; a flipped bit can ask for encryption or a lengthy array.
+_DAMAGE = (
+    OSError, KeyError, ValueError, TypeError, AttributeError, EOFError, RuntimeError, MemoryError,
+    OverflowError, struct.error, zlib.error, zipfile.BadZipFile,
+)  # fmt: skip
+
+
+def checkpoint_path(folder: Path, iteration: int) -> Path:
+    """Where the checkpoint of ``iteration`` lies."""
+    return folder / f"{_PREFIX}{iteration:07d}.npz"
+
+
+def latest_checkpoint(folder: Path) -> Path | None:
+    """The newest checkpoint of a run, or None."""
+    return max(folder.glob(f"{_PREFIX}*.npz"), default=None)
+
+
+def save_checkpoint(state: TrainState, folder: Path, fingerprint: str) -> Path:
+    """Write the state and remove all but the newest checkpoints.
+
+    Args:
+        state: what to keep.
+        folder: the run's checkpoint folder.
+        fingerprint: names the configuration and data that the state belongs to.
+    """
+    path = checkpoint_path(folder, state.iteration)
+    meta = {
+        "format": FORMAT,
+        "fingerprint": fingerprint,
+        "iteration": state.iteration,
+        "rng": state.rng.bit_generator.state,
+        "seconds": state.seconds,
+        "running_mse": state.running_mse,
+        "best_psnr": state.best_psnr if np.isfinite(state.best_psnr) else None,
+        "best_iteration": state.best_iteration,
+        "left_out": state.left_out.tolist(),
+        "probed": state.probed,
+        "hastened_after": state.hastened_after,
+        "taken_near": state.taken_near,
+        "averaged": state.average.count,
+    }
+    arrays: dict[str, Any] = {
+        f"gaussians.{name}": array for name, array in row_arrays(state.gaussians).items()
+    }
+    arrays |= {f"adam.{name}": array for name, array in row_arrays(state.adam).items()}
+    if state.average.gaussians is not None:
+        arrays |= {f"average.{name}": array for name, array in row_arrays(state.average.gaussians).items()}
+    arrays |= {f"densifier.{name}": value for name, value in state.densifier.items()}
+    arrays |= {f"shading.{name}": value for name, value in state.shading.items()}
+    if len(state.pose_corrections):
+        arrays["poses.corrections"] = state.pose_corrections
+    meta["arrays"] = sorted(arrays)
+    with replacing(path) as temporary:
+        np.savez(temporary, meta=np.array(json.dumps(meta)), **arrays)
+    for left in folder.glob(".*.partial.npz"):  # of runs that were killed while they wrote
+        left.unlink()
+    for old in sorted(folder.glob(f"{_PREFIX}*.npz"))[:-KEEP]:
+        old.unlink()
+    return path
+
+
+def load_checkpoint(path: Path, fingerprint: str) -> TrainState:
+    """Read a checkpoint back.
+
+    Raises:
+        DamagedCheckpoint: the file cannot be read.
+        CheckpointError: it belongs to another configuration or other photographs.
+    """
+    try:
+        arrays = _read_arrays(path)
+        meta = json.loads(str(arrays.pop("meta")))
+        if meta.get("format") != FORMAT or meta["fingerprint"] != fingerprint:
+            raise CheckpointError(
+                f"{path} belongs to other settings or other photographs; "
+                "give the settings it was made with, or choose another output folder."
+            )
+        if sorted(arrays) != meta["arrays"]:
+            raise ValueError("arrays are missing")
+        groups = _grouped(arrays)
+    except _DAMAGE as error:
+        raise DamagedCheckpoint(
+            f"{path} is damaged ({error}); delete it to go on from the one before it."
+        ) from None
+    rng = np.random.Generator(np.random.PCG64())
+    rng.bit_generator.state = meta["rng"]
+    mean = from_row_arrays(FlatGaussians, groups["average"]) if groups["average"] else None
+    return TrainState(
+        iteration=meta["iteration"],
+        gaussians=from_row_arrays(FlatGaussians, groups["gaussians"]),
+        adam=from_row_arrays(Adam, groups["adam"]),
+        rng=rng,
+        densifier=groups["densifier"],
+        shading=groups["shading"],
+        seconds=meta["seconds"],
+        running_mse=meta["running_mse"],
+        best_psnr=-np.inf if meta["best_psnr"] is None else meta["best_psnr"],
+        best_iteration=meta["best_iteration"],
+        left_out=np.array(meta["left_out"], np.int64),
+        probed=[(iteration, psnr) for iteration, psnr in meta["probed"]],
+        hastened_after=meta["hastened_after"],
+        taken_near=meta["taken_near"],
+        pose_corrections=groups["poses"].get("corrections", np.zeros((0, 6))),
+        average=RunningMean(mean, meta["averaged"]),
+    )
+
+
+def newest_state(folder: Path, fingerprint: str, tell: Listener) -> TrainState | None:
+    """The newest checkpoint, if there is any; a damaged one is passed over for the one before.
+
+    Raises:
+        CheckpointError: it belongs to another configuration or other photographs.
+    """
+    while (path := latest_checkpoint(folder)) is not None:
+        try:
+            return load_checkpoint(path, fingerprint)
+        except DamagedCheckpoint as error:
+            tell(Warned(str(error)))
+            path.unlink()
+    return None
+
+
+@dataclass(frozen=True)
+class BestState:
+    """What did best so far.
+
+    Attributes:
+        gaussians: the Gaussians.
+        shading: state of the shading model then.
+        pose_corrections: of all views then, as in the training's state; no rows where poses are not refined.
+    """
+
+    gaussians: FlatGaussians
+    shading: Mapping[str, np.ndarray]
+    pose_corrections: Float64[np.ndarray, "v 6"] = field(default_factory=lambda: np.zeros((0, 6)))
+
+
+def save_best(best: BestState, folder: Path) -> None:
+    """Write the state that did best so far to ``best.npz``."""
+    arrays: dict[str, Any] = {
+        f"gaussians.{name}": array for name, array in row_arrays(best.gaussians).items()
+    }
+    arrays |= {f"shading.{name}": value for name, value in best.shading.items()}
+    arrays["poses.corrections"] = best.pose_corrections
+    with replacing(folder / "best.npz") as temporary:
+        np.savez(temporary, **arrays)
+
+
+def load_best(folder: Path) -> BestState:
+    """Read what :func:`save_best` wrote.
+
+    Raises:
+        CheckpointError: the file is missing or damaged.
+    """
+    path = folder / "best.npz"
+    try:
+        groups = _grouped(_read_arrays(path))
+        gaussians = from_row_arrays(FlatGaussians, groups["gaussians"])
+        return BestState(gaussians, groups["shading"], groups["poses"]["corrections"])
+    except _DAMAGE as error:
+        raise CheckpointError(f"{path} cannot be read ({error}); train again without --resume.") from None
+
+
+def _grouped(arrays: Mapping[str, np.ndarray]) -> dict[str, dict[str, np.ndarray]]:
+    """Arrays by what comes before the first dot of their names, then by the rest."""
+    groups: dict[str, dict[str, np.ndarray]] = {name: {} for name in _GROUPS}
+    for name, array in arrays.items():
+        group, _, key = name.partition(".")
+        groups[group][key] = array
+    return groups
+
+
+def _read_arrays(path: Path) -> dict[str, np.ndarray]:
+    # Opened here, because numpy leaves a file open that turns out to be no archive.
+    with path.open("rb") as handle, np.load(handle, allow_pickle=False) as archive:
+        return {name: archive[name] for name in archive.files}

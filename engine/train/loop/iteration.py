@@ -1,0 +1,142 @@
+"""One iteration: a batch is traced, developed and compared; gradients go back; everything takes a step.
+
+batch -> trace -> develop -> loss -> reverse -> backward -> steps of the Gaussians and of the shading
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from octasplat.engine.core.errors import TrainingFailure
+from octasplat.engine.shading.protocol import ShadingModel, Sight
+from octasplat.engine.trace.gradient_sums import add_gradients, drop_low_weight
+from octasplat.engine.trace.protocol import GaussianGradients, Tracer
+from octasplat.engine.train.config import LossWeights, TrainConfig
+from octasplat.engine.train.densify import Densifier
+from octasplat.engine.train.loop.state import TrainState
+from octasplat.engine.train.optimization.losses import BatchLoss, batch_loss, ray_errors
+from octasplat.engine.train.sampling.batches import Batch
+from octasplat.engine.train.sampling.visibility_rays import blocked_term
+
+RUNNING = 0.98
+"""Weight of the past in the smoothed squared error."""
+
+
+@dataclass(frozen=True)
+class Machinery:
+    """What works on the state."""
+
+    tracer: Tracer
+    shading: ShadingModel
+    densifier: Densifier
+
+
+@dataclass(frozen=True)
+class Differentiated:
+    """A loss on one batch with its gradients.
+
+    Attributes:
+        loss: the loss on the developed colours.
+        gaussians: gradients by the Gaussians' parameters.
+        shading: gradients by the shading model's own parameters.
+        hits_per_ray: mean number of Gaussians on a ray.
+    """
+
+    loss: BatchLoss
+    gaussians: GaussianGradients
+    shading: Mapping[str, np.ndarray]
+    hits_per_ray: float
+
+
+def differentiate(
+    batch: Batch,
+    tracer: Tracer,
+    shading: ShadingModel,
+    weights: LossWeights,
+    *,
+    progress: float,
+    with_errors: bool = False,
+    least_weight: float = 0.0,
+) -> Differentiated:
+    """The loss of the Gaussians that ``tracer`` holds, and its gradients; changes nothing.
+
+    Args:
+        batch: rays and what the photographs show there.
+        tracer: built around the Gaussians.
+        shading: makes photographs of what is traced.
+        weights: of the loss terms.
+        progress: share of the training that is done.
+        with_errors: share the rays' errors out to their Gaussians.
+        least_weight: Gaussians whose weights over all rays add up to less get no gradients.
+    """
+    seen = tracer.trace(batch.rays, record=True)
+    assert seen.recording is not None
+    sight = Sight(batch.rays, seen, tracer, batch.view, progress, windows=batch.windows)
+    developed = shading.develop(sight)
+    render = developed.over(batch.background_srgb)
+    loss = batch_loss(render, batch, weights)
+    back = shading.reverse(sight, developed, loss.gradient, loss.gradient @ batch.background_srgb)
+    by_seen = back.seen
+    if with_errors:
+        by_seen = replace(by_seen, ray_errors=ray_errors(render, batch.target_srgb, batch.weight))
+    recorded = [(seen.recording, by_seen), *back.further]
+    if batch.sight_lines is not None:
+        recorded.append(blocked_term(batch.sight_lines, tracer, weights.free_space))
+    least = least_weight if len(recorded) == 1 else 0.0  # what several say has to be added up first
+    parts = [tracer.backward(hits, by, min_blend_weight=least).numpy() for hits, by in recorded]
+    return Differentiated(
+        loss=loss,
+        gaussians=drop_low_weight(add_gradients(parts), least_weight),
+        shading=back.parameters,
+        hits_per_ray=float(seen.hit_counts.mean()),
+    )
+
+
+def iterate(
+    state: TrainState,
+    batch: Batch,
+    machinery: Machinery,
+    config: TrainConfig,
+    *,
+    progress: float,
+    extent: float,
+) -> Differentiated:
+    """One step downhill; changes ``state`` and tells the tracer of it.
+
+    Args:
+        state: Gaussians and their optimiser.
+        batch: what to look at.
+        machinery: the tracer, built around the state's Gaussians, and what else takes part.
+        config: rates and weights.
+        progress: 0 at the first iteration, 1 at the last.
+        extent: scene extent, world units.
+
+    Returns:
+        What was found before the step.
+
+    Raises:
+        TrainingFailure: the loss is no number.
+    """
+    tracer, shading = machinery.tracer, machinery.shading
+    densifier = machinery.densifier
+    found = differentiate(
+        batch, tracer, shading, config.loss,
+        progress=progress, with_errors=densifier.wants_errors, least_weight=config.min_blend_weight,
+    )  # fmt: skip
+    if not np.isfinite(found.loss.value):
+        raise TrainingFailure(
+            f"The loss became {found.loss.value} at iteration {state.iteration + 1}; lower the learning "
+            "rates (--set lr.mean=...) or look for damaged photographs. The last checkpoint is kept."
+        )
+    gradients = found.gaussians
+    moved = state.adam.step(
+        state.gaussians, gradients, config.lr, config.loss, progress=progress, extent=extent
+    )
+    shading.step(state.gaussians, gradients, found.shading, progress=progress)
+    tracer.refresh(gradients.ids)
+    densifier.observe(len(state.gaussians), gradients, moved)
+    state.iteration += 1
+    keep = min(RUNNING, 1 - 1 / state.iteration)
+    state.running_mse = keep * state.running_mse + (1 - keep) * found.loss.squared_error
+    return found

@@ -1,0 +1,147 @@
+"""When what happens in a training, and how long it has taken: no state but the clock's."""
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+
+from octasplat.engine.train.config import (
+    MISFITS_AFTER,
+    TrainConfig,
+    in_one_order,
+    iteration_count,
+    rebuild_interval,
+)
+from octasplat.engine.train.loop.early_end import last_iteration
+from octasplat.engine.train.optimization.weight_averaging import AVERAGE_EVERY
+
+EVENT_EVERY = 10
+POSES_FROM, POSES_UNTIL, POSE_ROUNDS = 0.3, 0.8, 12
+"""Shares of the iterations between which poses are refined, and about how often."""
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """What is due before and after each iteration; iterations are counted from 1, 0 is the start.
+
+    A run may stop, and goes on, only where its hierarchy is built anew in any case: so a resumed run traces
+    the same boxes as one that was never stopped.
+
+    Attributes:
+        config: the settings.
+        iterations: of the whole training.
+        hastened_after: where it was decided to end early, None where it was not.
+        planned: iterations that there were to be before that.
+    """
+
+    config: TrainConfig
+    iterations: int
+    hastened_after: int | None = None
+    planned: int = 0
+
+    @classmethod
+    def of(cls, config: TrainConfig, training_pixels: int, shown: float = 1.0) -> "Schedule":
+        """The schedule for so many pixels in the training views, of which a share shows anything."""
+        return cls(config, iteration_count(config, training_pixels, shown))
+
+    def hastened(self, done: int) -> "Schedule":
+        """The schedule of a training for which it is decided after ``done`` iterations to end early.
+
+        Nothing is added any more, and what depends on the progress goes on from where it is, only faster.
+        """
+        sooner = last_iteration(done, self.iterations)
+        return replace(self, iterations=sooner, hastened_after=done, planned=self.iterations)
+
+    def ends(self, done: int) -> bool:
+        """Whether all iterations are done."""
+        return done == self.iterations
+
+    def measures(self, done: int) -> bool:
+        """Whether the state after ``done`` iterations is measured and kept as a checkpoint."""
+        every = self.config.rebuild_every
+        every *= -(-self.config.checkpoint_every // every)
+        return done % every == 0 or self.ends(done)
+
+    def judges_views(self, done: int) -> bool:
+        """Whether views that do not fit are looked for after ``done`` iterations, for the rest of the run."""
+        since = MISFITS_AFTER * self.iterations
+        return self.measures(done) and since <= done < self.iterations
+
+    def refines_poses(self, done: int) -> bool:
+        """Whether the poses of training views are refined after ``done`` iterations."""
+        if not self.config.refine_poses or not POSES_FROM <= done / self.iterations <= POSES_UNTIL:
+            return False
+        every = self.config.rebuild_every
+        rebuilds = self.iterations * (POSES_UNTIL - POSES_FROM) / POSE_ROUNDS / every
+        return done % (every * max(1, round(rebuilds))) == 0
+
+    def averages(self, done: int) -> bool:
+        """Whether the state after ``done`` iterations counts in the mean that is exported."""
+        return self.is_late(done) and (done % AVERAGE_EVERY == 0 or self.ends(done))
+
+    def is_late(self, done: int) -> bool:
+        """Whether states are averaged by then."""
+        return max(self.config.weight_averaging_start * self.iterations, self.hastened_after or 0) < done
+
+    def in_one_order(self, done: int) -> bool:
+        """Whether the rays of a window composite in one order in the next iteration."""
+        return in_one_order(self.config) and self.progress(done) < self.config.shared_sort_until
+
+    def settles_sides(self, done: int) -> bool:
+        """Whether Gaussians whose outer side is in are turned over: until states are averaged."""
+        sided = self.config.trace.flip_normal_cos > 0 and self.config.materials.learn
+        return sided and self.measures(done) and done <= self.config.weight_averaging_start * self.iterations
+
+    def rebuilds(self, done: int, gaussians: int) -> bool:
+        """Whether the hierarchy of so many Gaussians is built anew, which is where a run may stop."""
+        due = done % rebuild_interval(self.config, gaussians) == 0
+        return due or self.measures(done) or self.refines_poses(done)
+
+    def tells(self, done: int) -> bool:
+        """Whether listeners hear of the progress."""
+        return done % EVENT_EVERY == 0 or self.ends(done)
+
+    def sh_degree(self, done: int) -> int:
+        """Degree of the harmonics, raised step by step."""
+        return min(self.config.sh_degree, done // self.config.sh_degree_interval)
+
+    def may_densify(self, done: int) -> bool:
+        """Whether the fitting of the first Gaussians is over, and the last phase of a short one not begun."""
+        return done >= self.config.densify_from_iter and self.hastened_after is None
+
+    def progress(self, done: int) -> float:
+        """Share of the training that is done, which is that of the iterations unless it ends early."""
+        if self.hastened_after is None:
+            return done / self.iterations
+        before = self.hastened_after / self.planned
+        return before + (1 - before) * (done - self.hastened_after) / (self.iterations - self.hastened_after)
+
+
+class Stopwatch:
+    """Training time, that of earlier processes included; stands still while a state is measured and kept.
+
+    Args:
+        before_s: what earlier processes took.
+    """
+
+    def __init__(self, before_s: float) -> None:
+        self._before_s = before_s
+        self._kept_s = before_s
+        self._since = time.perf_counter()
+
+    @property
+    def seconds(self) -> float:
+        """Time so far."""
+        return self._kept_s + time.perf_counter() - self._since
+
+    @property
+    def seconds_here(self) -> float:
+        """Time in this process."""
+        return self.seconds - self._before_s
+
+    @contextmanager
+    def held(self) -> Iterator[float]:
+        """Let the watch stand still, and give the time it shows."""
+        self._kept_s = self.seconds
+        yield self._kept_s
+        self._since = time.perf_counter()

@@ -1,0 +1,70 @@
+"""The state of a training: everything that the rest of a run depends on."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from jaxtyping import Float64, Int64
+
+from octasplat.engine.gaussians.model import FlatGaussians
+from octasplat.engine.train.optimization.adam import Adam
+from octasplat.engine.train.optimization.weight_averaging import RunningMean
+
+
+@dataclass
+class TrainState:
+    """The state before iteration ``iteration`` (0 at the start).
+
+    Attributes:
+        iteration: iterations done.
+        gaussians: parameters.
+        adam: optimiser state.
+        rng: the generator that draws batches and everything else that is random.
+        densifier: what the densification strategy has observed, as of the last checkpoint.
+        shading: parameters and optimiser state of the shading model, as of the last checkpoint.
+        seconds: training time so far, with the making of the first Gaussians, without measuring.
+        running_mse: smoothed squared error of the training rays.
+        best_psnr: best probe so far, dB; the Gaussians that reached it are in ``best.npz``.
+        best_iteration: when that was.
+        left_out: training views that are left out from here on.
+        average: the mean of the last states, where they are averaged.
+        pose_corrections: of all views, where poses are refined: the rotation vectors (rad) and shifts (world
+            units) by which the points of their cameras move.
+        probed: iterations and training rays' probe after them, dB.
+        hastened_after: where it was decided to end early, None where it was not.
+        taken_near: Gaussians taken away so far for being too near to a camera.
+    """
+
+    iteration: int
+    gaussians: FlatGaussians
+    adam: Adam
+    rng: np.random.Generator
+    densifier: dict[str, np.ndarray] = field(default_factory=dict)
+    shading: dict[str, np.ndarray] = field(default_factory=dict)
+    seconds: float = 0.0
+    running_mse: float = 0.0
+    best_psnr: float = -np.inf
+    best_iteration: int = 0
+    left_out: Int64[np.ndarray, " m"] = field(default_factory=lambda: np.zeros(0, np.int64))
+    probed: list[tuple[int, float]] = field(default_factory=list)
+    hastened_after: int | None = None
+    taken_near: int = 0
+    pose_corrections: Float64[np.ndarray, "v 6"] = field(default_factory=lambda: np.zeros((0, 6)))
+    average: RunningMean = field(default_factory=RunningMean)
+
+    def raise_degree(self, degree: int) -> None:
+        """Give the colours harmonics up to ``degree``, zero at first, if they have less."""
+        if degree > self.gaussians.sh_degree:
+            count = (degree + 1) ** 2
+            extra = count - self.gaussians.sh.shape[1]
+            self.gaussians.sh = np.pad(self.gaussians.sh, ((0, 0), (0, extra), (0, 0)))
+            self.adam = self.adam.widen(count)
+
+
+def fresh_state(gaussians: FlatGaussians, seed: int) -> TrainState:
+    """The state before the first iteration."""
+    return TrainState(
+        iteration=0,
+        gaussians=gaussians,
+        adam=Adam.fresh(gaussians),
+        rng=np.random.Generator(np.random.PCG64([seed, 0])),
+    )

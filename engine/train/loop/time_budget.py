@@ -1,0 +1,164 @@
+"""Iterations and Gaussians for a training that is to end within a time, from the pace of this machine.
+
+A few iterations are trained and thrown away to see how long one takes; then the numbers are chosen and
+written down, so that a run that goes on later, at whatever pace, trains what it began.
+"""
+
+import tempfile
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from octasplat.engine.core.errors import Cancelled, ConfigError
+from octasplat.engine.core.writing import write_text
+from octasplat.engine.dataset import Dataset
+from octasplat.engine.gaussians.model import FlatGaussians
+from octasplat.engine.trace.protocol import Tracer
+from octasplat.engine.train.config import MOST_PLANNED_ITERATIONS, TrainConfig, in_one_order, most_gaussians
+from octasplat.engine.train.loop.state import fresh_state
+from octasplat.engine.train.loop.trainer import Trainer
+from octasplat.engine.train.sampling.shown import shown_share
+
+WARM, TIMED = 10, 50
+"""Iterations before the clock starts, as kernels compile and caches fill, and those that it counts."""
+USED_SHARE = 0.8
+"""Of the time; the rest is for checkpoints, probes, and a machine that becomes slower."""
+COST_POWER = 0.8
+"""Power of the number of Gaussians by which an iteration takes longer, see ``docs/experiments.md``."""
+ITERATIONS_A_GAUSSIAN = 1 / 20
+"""About as in ``standard``: 10,000 iterations for 185,000 Gaussians, 20,000 for 400,000."""
+OWN_ORDER_PACE = 1.7
+"""Times as long as in one order takes an iteration whose rays have an order of their own each, see there."""
+LEAST_ITERATIONS, LEAST_GAUSSIANS = 100, 2_000
+
+
+class Plan(BaseModel):
+    """What was chosen, and from what.
+
+    Attributes:
+        iterations: of the training.
+        max_gaussians: of the training.
+        seconds_an_iteration: as measured, and reckoned for the part that takes longer.
+        gaussians: so many there were then.
+        seconds: that the iterations were given.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    iterations: int = Field(ge=1)
+    max_gaussians: int = Field(ge=1)
+    seconds_an_iteration: float = Field(gt=0)
+    gaussians: int = Field(ge=1)
+    seconds: float
+
+    def applied(self, config: TrainConfig) -> TrainConfig:
+        """The settings with the numbers of the plan."""
+        return config.model_copy(update={"iterations": self.iterations, "max_gaussians": self.max_gaussians})
+
+
+def choose_plan(seconds: float, seconds_an_iteration: float, gaussians: int, most: int) -> Plan:
+    """As many Gaussians as there is time to train well, and all the iterations that they leave time for.
+
+    Args:
+        seconds: for the iterations.
+        seconds_an_iteration: measured with ``gaussians`` Gaussians.
+        gaussians: see there.
+        most: no more Gaussians than this, as the photographs hold no more down.
+    """
+    one = seconds_an_iteration / gaussians**COST_POWER  # an iteration takes one * count ** COST_POWER
+    wanted = (seconds / (one * ITERATIONS_A_GAUSSIAN)) ** (1 / (1 + COST_POWER)) if seconds > 0 else 0.0
+    count = min(most, max(LEAST_GAUSSIANS, round(wanted)))
+    iterations = round(seconds / (one * count**COST_POWER))
+    return Plan(
+        iterations=min(MOST_PLANNED_ITERATIONS, max(LEAST_ITERATIONS, iterations)),
+        max_gaussians=count,
+        seconds_an_iteration=seconds_an_iteration,
+        gaussians=gaussians,
+        seconds=seconds,
+    )
+
+
+def make_plan(
+    dataset: Dataset,
+    config: TrainConfig,
+    first: FlatGaussians,
+    *,
+    seconds: float,
+    threads: int,
+    should_stop: Callable[[], bool] = lambda: False,
+) -> Plan:
+    """Measure the pace and choose.
+
+    Args:
+        dataset: the photographs.
+        config: the settings but for what is chosen.
+        first: Gaussians to begin from; they stay as they are.
+        seconds: that the training may take from now on, this included.
+        threads: of the training.
+        should_stop: asked between iterations.
+
+    Raises:
+        Cancelled: stopped as asked.
+    """
+    began = time.perf_counter()
+    pace_s = _seconds_an_iteration(dataset, config, first, threads, should_stop)
+    if in_one_order(config):  # as the trial was, and the first part of the training is
+        pace_s *= config.shared_sort_until + OWN_ORDER_PACE * (1 - config.shared_sort_until)
+    left_s = USED_SHARE * (seconds - (time.perf_counter() - began))
+    most = most_gaussians(config, dataset.train_pixel_count, shown_share(dataset))
+    return choose_plan(left_s, pace_s, len(first), most)
+
+
+def write_plan(path: Path, plan: Plan) -> None:
+    """Write a plan, atomically."""
+    write_text(path, plan.model_dump_json(indent=1) + "\n")
+
+
+def read_plan(path: Path) -> Plan:
+    """Read a plan.
+
+    Raises:
+        ConfigError: the file is damaged.
+    """
+    try:
+        return Plan.model_validate_json(path.read_bytes())
+    except (OSError, ValidationError) as error:
+        raise ConfigError(
+            f"{path} cannot be read ({type(error).__name__}); train again in another folder."
+        ) from None
+
+
+def _seconds_an_iteration(
+    dataset: Dataset,
+    config: TrainConfig,
+    first: FlatGaussians,
+    threads: int,
+    should_stop: Callable[[], bool],
+) -> float:
+    times: list[float] = []
+
+    def note(_iteration: int, _tracer: Tracer) -> None:
+        times.append(time.perf_counter())
+
+    enough = WARM + TIMED
+    trial = config.model_copy(
+        update={"iterations": 100 * enough, "densify_from_iter": 100 * enough, "probe_rays": 256}
+    )
+    with tempfile.TemporaryDirectory() as folder, suppress(Cancelled):
+        Trainer(
+            dataset,
+            trial,
+            fresh_state(first.select(slice(None)), config.seed),
+            folder=Path(folder),
+            fingerprint="",
+            listener=lambda _event: None,
+            threads=threads,
+            should_stop=lambda: len(times) >= enough or should_stop(),
+            onlooker=note,
+        ).run()
+    if should_stop():
+        raise Cancelled("Stopped before the training; the same command with --resume goes on.")
+    return (times[-1] - times[WARM - 1]) / (len(times) - WARM)

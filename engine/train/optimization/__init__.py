@@ -1,0 +1,1 @@
+"""Losses, the optimizer and the mean of its last states."""

@@ -1,0 +1,129 @@
+"""Losses on a batch of rays, with their gradients written out (no autograd on the hot path)."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float32
+from scipy.ndimage import correlate1d
+
+from octasplat.engine.core.compilation import run_ranges
+from octasplat.engine.core.threads import threads_in_use
+from octasplat.engine.train.config import LossWeights
+from octasplat.engine.train.kernels.losses import CHUNKS, pixel_terms
+from octasplat.engine.train.sampling.batches import Batch
+
+C1, C2 = 0.01**2, 0.03**2
+WINDOW, SIGMA = 11, 1.5
+
+
+def gaussian_window() -> Float32[np.ndarray, " w"]:
+    """The normalised 11-tap Gaussian window (sigma 1.5) of SSIM."""
+    x = np.arange(WINDOW) - WINDOW // 2
+    window = np.exp(-(x**2) / (2 * SIGMA**2))
+    return (window / window.sum()).astype(np.float32)
+
+
+def _filter(images: Float32[np.ndarray, "p h w c"]) -> Float32[np.ndarray, "p h w c"]:
+    window = gaussian_window()
+    rows = correlate1d(images, window, axis=1, mode="constant")
+    return correlate1d(rows, window, axis=2, mode="constant")
+
+
+def ssim_loss(
+    render: Float32[np.ndarray, "p h w 3"], target: Float32[np.ndarray, "p h w 3"]
+) -> tuple[float, Float32[np.ndarray, "p h w 3"]]:
+    """1 - SSIM over the patches' interior, where windows are whole, and its gradient by ``render``.
+
+    The formula of "Image Quality Assessment: From Error Visibility to Structural Similarity"
+    (https://doi.org/10.1109/TIP.2003.819861) with its 11 x 11 Gaussian window; the mean is over patches,
+    interior pixels and channels.
+    """
+    x, y = render, target
+    mu_x, mu_y = _filter(x), _filter(y)
+    var_x = _filter(x * x) - mu_x * mu_x
+    var_y = _filter(y * y) - mu_y * mu_y
+    cov = _filter(x * y) - mu_x * mu_y
+    a1, a2 = 2 * mu_x * mu_y + np.float32(C1), 2 * cov + np.float32(C2)
+    b1, b2 = mu_x * mu_x + mu_y * mu_y + np.float32(C1), var_x + var_y + np.float32(C2)
+    ssim = a1 * a2 / (b1 * b2)
+    edge = WINDOW // 2
+    inner = np.zeros((*x.shape[:3], 1), np.float32)
+    inner[:, edge:-edge, edge:-edge] = 1.0
+    count = float(inner.sum()) * x.shape[-1]
+    loss = 1.0 - float((ssim * inner).sum(dtype=np.float64)) / count
+    weight = -inner / np.float32(count)
+    # Through the mean, the variance of x and the covariance; a symmetric window is its own adjoint.
+    d_var = weight * -ssim / b2
+    d_cov = weight * 2 * a1 / (b1 * b2)
+    d_mu = weight * (2 * mu_y * a2 / (b1 * b2) - ssim * 2 * mu_x / b1)
+    gradient = _filter(d_mu - 2 * mu_x * d_var - mu_y * d_cov) + 2 * x * _filter(d_var) + y * _filter(d_cov)
+    return loss, gradient.astype(np.float32)
+
+
+@dataclass(frozen=True)
+class BatchLoss:
+    """A loss and its gradient by the rendered colours.
+
+    Attributes:
+        value: the loss.
+        gradient: by the colours.
+        squared_error: mean over the rays of non-zero weight and the channels.
+    """
+
+    value: float
+    gradient: Float32[np.ndarray, "r 3"]
+    squared_error: float
+
+
+def batch_loss(render: Float32[np.ndarray, "r 3"], batch: Batch, weights: LossWeights) -> BatchLoss:
+    """All terms by the rendered colours: those of the pixels, and SSIM where the batch has patches."""
+    target = batch.target_srgb
+    pixel = pixel_loss(render, target, batch.weight, l1=weights.l1, l2=weights.l2)
+    if not batch.patches or weights.ssim == 0:
+        return pixel
+    structure, by_patches = _patch_term(render, target, batch)
+    gradient = pixel.gradient.copy()
+    gradient[-len(by_patches) :] += np.float32(weights.ssim) * by_patches
+    return BatchLoss(pixel.value + weights.ssim * structure, gradient, pixel.squared_error)
+
+
+def ray_errors(
+    render: Float32[np.ndarray, "r 3"],
+    target: Float32[np.ndarray, "r 3"],
+    weight: Float32[np.ndarray, " r"],
+) -> Float32[np.ndarray, " r"]:
+    """Each ray's mean absolute error, 0 without weight, for densification."""
+    return np.asarray((np.abs(render - target) * weight[:, None]).mean(axis=1, dtype=np.float32))
+
+
+def _patch_term(
+    render: Float32[np.ndarray, "r 3"], target: Float32[np.ndarray, "r 3"], batch: Batch
+) -> tuple[float, Float32[np.ndarray, "p 3"]]:
+    """1 - SSIM of the batch's patches and its gradient; masked pixels take the photograph's colour."""
+    count = batch.patches * batch.side**2
+    shape = (batch.patches, batch.side, batch.side, 3)
+    weight = batch.weight[-count:, None]
+    shown = target[-count:]
+    mixed = render[-count:] * weight + shown * (1 - weight)
+    value, gradient = ssim_loss(mixed.reshape(shape), shown.reshape(shape))
+    return value, gradient.reshape(-1, 3) * weight
+
+
+def pixel_loss(
+    render: Float32[np.ndarray, "r 3"],
+    target: Float32[np.ndarray, "r 3"],
+    weight: Float32[np.ndarray, " r"],
+    *,
+    l1: float,
+    l2: float,
+) -> BatchLoss:
+    """L1 and squared error, averaged over the rays of non-zero weight and the channels."""
+    valid = max(float(weight.sum(dtype=np.float64)), 1.0)
+    gradient, sums = np.empty(render.shape, np.float32), np.empty((CHUNKS, 2))
+    run_ranges(
+        pixel_terms, threads_in_use(), CHUNKS,
+        render, target, weight, np.float32(l1 / (3 * valid)), np.float32(2 * l2 / (3 * valid)),
+        gradient, sums, grain=1,
+    )  # fmt: skip
+    absolute, squared = sums.sum(axis=0) / (3 * valid)
+    return BatchLoss(float(l1 * absolute + l2 * squared), gradient, float(squared))

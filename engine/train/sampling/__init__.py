@@ -1,0 +1,1 @@
+"""Rays and pixels that are drawn from the photographs."""

@@ -1,0 +1,202 @@
+"""Batches of rays: random pixels over all training views, mixed with square patches for SSIM."""
+
+import math
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from jaxtyping import Float32, Int64
+
+from octasplat.engine.core.color import composited
+from octasplat.engine.core.errors import ConfigError
+from octasplat.engine.core.rays import RayBatch
+from octasplat.engine.shading.ray_patches import RayWindows
+from octasplat.engine.train.config import (
+    SIGHT_LINE_MARGIN,
+    Background,
+    TrainConfig,
+    most_gaussians,
+    window_side_px,
+)
+from octasplat.engine.train.sampling.pixel_sampler import PixelSampler, TrainingData, view_sizes_px
+from octasplat.engine.train.sampling.shown import shown_share
+from octasplat.engine.train.sampling.visibility_rays import PhotographsOfPoints, SightLines
+
+TILE_PX = 8
+
+
+@dataclass(frozen=True)
+class Batch:
+    """Rays and what the photographs show there.
+
+    The last ``patches * side * side`` rays are patches, row-major one after another. ``windows`` says
+    which of the others stand in windows. ``background_srgb`` lies
+    behind both the Gaussians and photographs with alpha. ``sight_lines`` end before points that views show.
+    """
+
+    rays: RayBatch
+    rgb_srgb: Float32[np.ndarray, "r 3"]
+    alpha: Float32[np.ndarray, " r"]
+    weight: Float32[np.ndarray, " r"]
+    view: Int64[np.ndarray, " r"]
+    patches: int
+    side: int
+    background_srgb: Float32[np.ndarray, "3"]
+    sight_lines: RayBatch | None = None
+    windows: RayWindows | None = None
+
+    @cached_property
+    def target_srgb(self) -> Float32[np.ndarray, "r 3"]:
+        """The photographs' colours over the background."""
+        return composited(self.rgb_srgb, self.alpha, self.background_srgb)
+
+
+class BatchSource:
+    """Draws the batches of a training.
+
+    A batch has ``config.rays_per_batch`` rays. Where the loss has an SSIM term, about
+    ``config.ssim_patch_fraction`` of them come as patches; the others come in windows, as far as that goes,
+    and singly where a window is one ray.
+
+    Args:
+        dataset: the photographs.
+        config: sizes and shares.
+
+    Raises:
+        ConfigError: the SSIM term would have no patch, or a background is to be learnt where none is shown.
+    """
+
+    def __init__(self, dataset: TrainingData, config: TrainConfig) -> None:
+        if config.background == "learnt" and dataset.has_alpha:
+            raise ConfigError(
+                "These photographs have alpha, so that they show no background; leave background=learnt out."
+            )
+        self._dataset = dataset
+        self._config = config
+        self.sampler = PixelSampler(dataset.train_indices, view_sizes_px(dataset))
+        pixels, shown = self.sampler.pixel_count, shown_share(dataset)
+        self._window_side_px = window_side_px(
+            config, self.sampler.longest_side_px, pixels * shown / most_gaussians(config, pixels, shown)
+        )
+        self._patches = self._patch_count()
+        self._lines: SightLines | None = None
+        if config.loss.free_space > 0 and isinstance(dataset, PhotographsOfPoints) and len(dataset.points):
+            self._lines = SightLines.of(dataset, SIGHT_LINE_MARGIN)
+
+    def leave_out(self, views: Int64[np.ndarray, " m"]) -> None:
+        """Draw nothing of these views any more."""
+        kept = np.setdiff1d(self._dataset.train_indices, views)
+        self.sampler = PixelSampler(kept, view_sizes_px(self._dataset))
+        if self._lines is not None:
+            self._lines = self._lines.without(views)
+
+    def draw(self, rng: np.random.Generator, turn: int = 0) -> Batch:
+        """The next batch, after ``turn`` others."""
+        config, sampler, side = self._config, self.sampler, self._config.ssim_patch_side
+        loose = config.rays_per_batch - self._patches * side**2
+        windows = loose // config.ray_patch_rays if config.ray_patch_rays > 1 else 0
+        single = loose - windows * config.ray_patch_rays
+        drawn, grids = [sampler.pixels(rng, single)], None
+        if windows:
+            grids = RayWindows(single, windows, math.isqrt(config.ray_patch_rays))
+            drawn.append(
+                sampler.windows(
+                    rng, windows, rays=config.ray_patch_rays, side=self._window_side_px, turn=turn
+                )
+            )
+        if self._patches:
+            drawn.append(sampler.patches(rng, self._patches, side))
+        view, y, x = (np.concatenate(parts) for parts in zip(*drawn, strict=True))
+        rays = self._dataset.rays(view, y, x)
+        rgb, alpha, weight = self._dataset.pixels(view, y, x)
+        background = self._background(rng)
+        lines = None
+        if self._lines is not None and len(self._lines):
+            lines = self._lines.draw(
+                rng, max(1, round(config.visibility_ray_fraction * config.rays_per_batch))
+            )
+        batch = Batch(rays, rgb, alpha, weight, view, self._patches, side, background, lines, grids)
+        _ = batch.target_srgb  # worked out here, as the next batch is drawn beside the iteration
+        return batch
+
+    def _patch_count(self) -> int:
+        config, side = self._config, self._config.ssim_patch_side
+        if config.loss.ssim == 0:
+            return 0
+        smallest = self.sampler.smallest_side_px
+        if smallest < side:
+            raise ConfigError(
+                f"loss.ssim compares patches of {side} x {side} pixels, but a training view is only "
+                f"{smallest} pixels wide or high; lower ssim_patch_side (16 at least), or set loss.ssim to 0."
+            )
+        count = min(
+            round(config.rays_per_batch * config.ssim_patch_fraction / side**2),
+            config.rays_per_batch // side**2,
+        )
+        if count == 0:
+            raise ConfigError(
+                f"loss.ssim compares patches of {side} x {side} pixels, but a share of "
+                f"{config.ssim_patch_fraction:g} of {config.rays_per_batch} rays makes none; raise "
+                "rays_per_batch or "
+                "ssim_patch_fraction, or set loss.ssim to 0."
+            )
+        return count
+
+    def _background(self, rng: np.random.Generator) -> Float32[np.ndarray, "3"]:
+        name: Background = self._config.background
+        if name == "auto":
+            name = "random" if self._dataset.has_alpha else "black"
+        if name == "random":
+            return rng.random(3, dtype=np.float32)
+        return still_background(name)
+
+
+class DrawnAhead:
+    """Draws batches, the next one beside whatever else goes on if it is asked for early.
+
+    The generator is drawn from in the order of the batches either way, so that they are the same ones.
+
+    Args:
+        source: where batches come from.
+    """
+
+    def __init__(self, source: BatchSource) -> None:
+        self._source = source
+        self._worker = ThreadPoolExecutor(1, thread_name_prefix="batch")
+        self._next: Future[Batch] | None = None
+
+    def __enter__(self) -> "DrawnAhead":
+        return self
+
+    def __exit__(self, *_error: object) -> None:
+        self._worker.shutdown()
+
+    def begin(self, rng: np.random.Generator, turn: int) -> None:
+        """Begin the next batch; until :meth:`draw` gives it nothing else may draw from ``rng``."""
+        self._next = self._worker.submit(self._source.draw, rng, turn)
+
+    def draw(self, rng: np.random.Generator, turn: int) -> Batch:
+        """The batch after ``turn`` others, begun or not."""
+        begun, self._next = self._next, None
+        return self._source.draw(rng, turn) if begun is None else begun.result()
+
+
+def still_background(background: Background) -> Float32[np.ndarray, "3"]:
+    """Return the colour behind everything when views are compared: white if asked for, else black."""
+    return np.full(3, 1.0 if background == "white" else 0.0, np.float32)
+
+
+def grid_pixels(
+    indices: Int64[np.ndarray, " v"], sizes_px: Int64[np.ndarray, "n 2"], tiles: int
+) -> tuple[Int64[np.ndarray, " r"], Int64[np.ndarray, " r"], Int64[np.ndarray, " r"]]:
+    """Pixels (view, y, x) evenly over each view, ``tiles * TILE_PX`` each way, in tiles of neighbours."""
+    side = tiles * TILE_PX
+    shape = (tiles, tiles, TILE_PX, TILE_PX)
+    tile_y, tile_x, y, x = np.unravel_index(np.arange(side * side), shape)
+    down, across = tile_y * TILE_PX + y + 0.5, tile_x * TILE_PX + x + 0.5
+    width, height = sizes_px[indices].T
+    rows = (down * height[:, None] / side).astype(np.int64)
+    columns = (across * width[:, None] / side).astype(np.int64)
+    view = np.broadcast_to(indices[:, None], rows.shape)
+    return view.reshape(-1), rows.reshape(-1), columns.reshape(-1)

@@ -1,0 +1,153 @@
+"""What training asks of a dataset, and pixels drawn from its views: scattered, in windows, or in patches."""
+
+import math
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+from jaxtyping import Float32, Int64
+
+from octasplat.engine.core.rays import RayBatch
+from octasplat.engine.dataset import DatasetView
+from octasplat.engine.shading.ray_patches import z_order
+
+GOLDEN = (math.sqrt(5) - 1) / 2
+"""Its multiples fill the unit interval evenly, however many there are."""
+
+
+@runtime_checkable
+class Pixels(Protocol):
+    """What training needs of a dataset (see :class:`octasplat.engine.dataset.Dataset`)."""
+
+    def rays(
+        self, view: Int64[np.ndarray, " r"], y: Int64[np.ndarray, " r"], x: Int64[np.ndarray, " r"]
+    ) -> RayBatch:
+        """Unit rays of pixels, world frame."""
+        ...
+
+    def pixels(
+        self, view: Int64[np.ndarray, " r"], y: Int64[np.ndarray, " r"], x: Int64[np.ndarray, " r"]
+    ) -> tuple[Float32[np.ndarray, "r 3"], Float32[np.ndarray, " r"], Float32[np.ndarray, " r"]]:
+        """Straight display colour, alpha, and weight (0 where masked) of pixels."""
+        ...
+
+
+@runtime_checkable
+class TrainingData(Pixels, Protocol):
+    """The photographs: pixel access, the views and the split.
+
+    See :class:`octasplat.engine.dataset.Dataset`.
+    """
+
+    views: tuple[DatasetView, ...]
+    train_indices: Int64[np.ndarray, " t"]
+    test_indices: Int64[np.ndarray, " h"]
+    has_alpha: bool
+    extent: float
+
+
+class PixelSampler:
+    """Draws pixels uniformly over all pixels of the given views.
+
+    Args:
+        view_indices: the views to draw from.
+        sizes_px: width and height of every view of the dataset, by view index.
+    """
+
+    def __init__(self, view_indices: Int64[np.ndarray, " v"], sizes_px: Int64[np.ndarray, "n 2"]) -> None:
+        self._views = view_indices
+        self._sizes = sizes_px[view_indices]
+        self._ends = np.cumsum(self._sizes[:, 0] * self._sizes[:, 1])
+
+    @property
+    def pixel_count(self) -> int:
+        """Number of pixels in all views."""
+        return int(self._ends[-1])
+
+    @property
+    def smallest_side_px(self) -> int:
+        """Shortest side of any view."""
+        return int(self._sizes.min())
+
+    @property
+    def longest_side_px(self) -> int:
+        """Longest side of any view."""
+        return int(self._sizes.max())
+
+    def pixels(
+        self, rng: np.random.Generator, count: int
+    ) -> tuple[Int64[np.ndarray, " r"], Int64[np.ndarray, " r"], Int64[np.ndarray, " r"]]:
+        """``count`` pixels as (view, y, x), repeated ones too, sorted by view and row."""
+        flat = np.sort(rng.integers(0, self.pixel_count, count))
+        which = np.searchsorted(self._ends, flat, side="right")
+        width, height = self._sizes[which].T
+        local = flat - (self._ends[which] - width * height)
+        return self._views[which], local // width, local % width
+
+    def windows(
+        self, rng: np.random.Generator, count: int, *, rays: int, side: int, turn: int = 0
+    ) -> tuple[Int64[np.ndarray, " r"], Int64[np.ndarray, " r"], Int64[np.ndarray, " r"]]:
+        """``rays`` pixels (a square number) in each of ``count`` windows of about ``side`` x ``side`` pixels.
+
+        A window is a grid of cells, one random pixel in each, in the order of
+        :class:`octasplat.engine.shading.ray_patches.RayWindows`. What sticks out of its view
+        is folded back, so that every pixel is about as likely as any other. Windows are spread over views and
+        within them, and those of one ``turn`` after the other over what those before have left.
+        """
+        cells = math.isqrt(rays)
+        cell = max(1, round(side / cells))
+        which, x, y = self._spread(rng, count, cell * cells, turn)
+        width, height = self._sizes[which].T
+        rows, columns = z_order(cells)
+        left, top = x - cell * cells // 2, y - cell * cells // 2
+        y = top[:, None] + rows * cell + rng.integers(0, cell, (count, rays))
+        x = left[:, None] + columns * cell + rng.integers(0, cell, (count, rays))
+        view = np.broadcast_to(self._views[which][:, None], x.shape)
+        return view.reshape(-1), _fold(y, height[:, None]).reshape(-1), _fold(x, width[:, None]).reshape(-1)
+
+    def _spread(
+        self, rng: np.random.Generator, count: int, side: int, turn: int
+    ) -> tuple[Int64[np.ndarray, " c"], Int64[np.ndarray, " c"], Int64[np.ndarray, " c"]]:
+        """``count`` pixels as (place of the view among those drawn from, x, y), in strata.
+
+        All views lie end to end, each as a way to and fro through tiles of about ``side`` x ``side`` pixels;
+        steps of one length lead along it, each to a random pixel of the tile there. Each turn begins the
+        golden section of a step further on, so that all tiles are seen equally often.
+        """
+        at = (np.arange(count) + turn * GOLDEN % 1.0) * (self.pixel_count / count)
+        which = np.searchsorted(self._ends, at, side="right")
+        width, height = self._sizes[which].T
+        share = (at - (self._ends[which] - width * height)) / (width * height)
+        columns = np.maximum(1, np.rint(width / side).astype(np.int64))
+        rows = np.maximum(1, np.rint(height / side).astype(np.int64))
+        row, column = np.divmod((share * columns * rows).astype(np.int64), columns)
+        column = np.where(row % 2 == 1, columns - 1 - column, column)
+        x = (column + rng.random(count)) * (width / columns)
+        y = (row + rng.random(count)) * (height / rows)
+        return which, x.astype(np.int64), y.astype(np.int64)
+
+    def patches(
+        self, rng: np.random.Generator, count: int, side: int
+    ) -> tuple[Int64[np.ndarray, " r"], Int64[np.ndarray, " r"], Int64[np.ndarray, " r"]]:
+        """``count`` patches of ``side`` x ``side`` pixels as (view, y, x), row-major, inside the views."""
+        areas = np.diff(self._ends, prepend=0)
+        which = rng.choice(len(self._views), size=count, p=areas / areas.sum())
+        width, height = self._sizes[which].T
+        left = rng.integers(0, width - side + 1)
+        top = rng.integers(0, height - side + 1)
+        shape = (count, side, side)
+        rows, columns = np.arange(side)[None, :, None], np.arange(side)[None, None, :]
+        view = np.broadcast_to(self._views[which][:, None, None], shape)
+        y = np.broadcast_to(top[:, None, None] + rows, shape)
+        x = np.broadcast_to(left[:, None, None] + columns, shape)
+        return view.reshape(-1), y.reshape(-1), x.reshape(-1)
+
+
+def _fold(position: Int64[np.ndarray, "w r"], size: Int64[np.ndarray, "w 1"]) -> Int64[np.ndarray, "w r"]:
+    """Positions mirrored at 0 and ``size`` until they lie between."""
+    period = np.mod(position, 2 * size)
+    return np.minimum(period, 2 * size - 1 - period)
+
+
+def view_sizes_px(dataset: TrainingData) -> Int64[np.ndarray, "n 2"]:
+    """Width and height of every view."""
+    return np.array([[view.width_px, view.height_px] for view in dataset.views], np.int64)

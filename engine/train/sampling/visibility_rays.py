@@ -1,0 +1,116 @@
+"""What photographs see of the sparse points: nothing stands between a camera and a point that it shows.
+
+A point was matched in each photograph of its track, so the way there is free. Haze and floaters that
+photographs leave undecided, and whatever fills the gap under a thing that stands on a mirror, are in the way
+of such points. Lines of sight are traced beside the rays of each batch, almost as far as their points,
+and what hides these costs.
+"""
+
+from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+from jaxtyping import Float64, Int64
+
+from octasplat.engine.core.rays import RayBatch
+from octasplat.engine.dataset.camera import Camera
+from octasplat.engine.dataset.model import DatasetView, Observations, SparsePoints
+from octasplat.engine.trace.protocol import Recording, TraceGradients, Tracer
+
+LEAST_TRACK = 3
+"""Points in fewer training views may be wrong matches."""
+DEVIATIONS = 3.0
+"""Sight ends so many standard deviations of its depth before a point."""
+LEAST_ERROR_PX = 0.5
+"""No point is placed better than that."""
+
+
+@runtime_checkable
+class PhotographsOfPoints(Protocol):
+    """Photographs with the points that they show, and where these lie.
+
+    See :class:`octasplat.engine.dataset.Dataset`.
+    """
+
+    views: tuple[DatasetView, ...]
+    cameras: tuple[Camera, ...]
+    train_indices: Int64[np.ndarray, " t"]
+    points: SparsePoints
+    observations: Observations
+
+
+@dataclass(frozen=True)
+class SightLines:
+    """Ways from training cameras to the points that they show.
+
+    Attributes:
+        starts_world: the cameras.
+        directions_world: unit vectors.
+        ends: where each way ends, world units from the camera.
+        view: index of the camera's view.
+    """
+
+    starts_world: Float64[np.ndarray, "k 3"]
+    directions_world: Float64[np.ndarray, "k 3"]
+    ends: Float64[np.ndarray, " k"]
+    view: Int64[np.ndarray, " k"]
+
+    def __len__(self) -> int:
+        return len(self.ends)
+
+    @classmethod
+    def of(cls, dataset: PhotographsOfPoints, margin: float) -> "SightLines":
+        """Those of the training views.
+
+        The depth of a point along one ray of its track is known to
+        ``error / sqrt(sum over the other rays of sin^2 of the angle between)``, with the reprojection error
+        at its distance; each way ends three of these before the point, or ``margin`` of the distance. Poses
+        are those of the model, also where they are refined; errors count as pixels of the working size, so
+        that sight ends the sooner before points of photographs that were made smaller.
+        """
+        seen, points = dataset.observations, dataset.points
+        row = np.searchsorted(points.ids, seen.point)
+        row = np.minimum(row, len(points) - 1)
+        keep = np.isin(seen.view, dataset.train_indices) & (points.ids[row] == seen.point)
+        row, view = row[keep], seen.view[keep]
+        origins = np.stack([each.origin_world for each in dataset.views])
+        way = points.xyz_world[row].astype(np.float64) - origins[view]
+        distance = np.linalg.norm(way, axis=1)
+        direction = way / np.maximum(distance, 1e-12)[:, None]
+        outer = np.zeros((len(points), 3, 3))
+        np.add.at(outer, row, direction[:, :, None] * direction[:, None, :])
+        track = np.bincount(row, minlength=len(points))
+        along = np.einsum(
+            "ki,kij,kj->k", direction, outer[row], direction
+        )  # sum of squared cosines, itself 1
+        sharpness = np.sqrt(np.maximum(track[row] - along, 1e-12))
+        pixel_rad = np.array([dataset.cameras[each.camera_index].pixel_angle_rad for each in dataset.views])[
+            view
+        ]
+        error_px = np.maximum(points.errors_px[row], LEAST_ERROR_PX)
+        deviation = error_px * pixel_rad * distance / sharpness
+        ends = distance - np.maximum(DEVIATIONS * deviation, margin * distance)
+        good = (track[row] >= LEAST_TRACK) & (ends > 0.5 * distance)
+        return cls(origins[view[good]], direction[good], ends[good], view[good])
+
+    def without(self, views: Int64[np.ndarray, " m"]) -> "SightLines":
+        """Those of other views."""
+        kept = ~np.isin(self.view, views)
+        return SightLines(
+            self.starts_world[kept], self.directions_world[kept], self.ends[kept], self.view[kept]
+        )
+
+    def draw(self, rng: np.random.Generator, count: int) -> RayBatch:
+        """Any ``count`` of them, neighbours in the order of the views."""
+        chosen = np.sort(rng.integers(0, len(self), count))
+        return RayBatch(self.starts_world[chosen], self.directions_world[chosen], t_max=self.ends[chosen])
+
+
+def blocked_term(lines: RayBatch, tracer: Tracer, weight: float) -> tuple[Recording, TraceGradients]:
+    """What was traced along lines of sight, and gradients of ``weight`` times their mean hidden share."""
+    seen = tracer.trace(lines, record=True)
+    assert seen.recording is not None
+    none = np.zeros_like(seen.rgb_srgb)
+    return seen.recording, TraceGradients(
+        none, transmittance=np.full(len(lines), -weight / len(lines), np.float32)
+    )

@@ -1,0 +1,1 @@
+"""Photographs one by one: their poses, exposures, and how well they fit."""

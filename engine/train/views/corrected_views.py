@@ -1,0 +1,148 @@
+"""Photographs whose poses are corrected, and the part of such corrections that moves the scene as a whole."""
+
+from dataclasses import replace
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+from jaxtyping import Bool, Float64, Int64
+from scipy.spatial.transform import Rotation
+
+from octasplat.engine.core.rays import RayBatch
+from octasplat.engine.dataset import Camera, DatasetView
+from octasplat.engine.train.sampling.pixel_sampler import TrainingData
+from octasplat.engine.train.views.image_alignment import Motion
+
+ROUNDS = 3
+"""The common part is found for small angles, and again for what that leaves."""
+
+
+@runtime_checkable
+class PosedPhotographs(TrainingData, Protocol):
+    """Photographs with their cameras (see :class:`octasplat.engine.dataset.Dataset`)."""
+
+    cameras: tuple[Camera, ...]
+
+
+class CorrectedViews:
+    """The same photographs seen from corrected poses; follows :class:`PosedPhotographs`.
+
+    Views of no correction keep every bit of their rays.
+
+    Args:
+        given: the photographs as they are.
+
+    Attributes:
+        given: those.
+        views: with the poses as they are corrected.
+    """
+
+    def __init__(self, given: PosedPhotographs) -> None:
+        self.given = given
+        self.views: tuple[DatasetView, ...] = given.views
+        self.cameras = given.cameras
+        self.train_indices: Int64[np.ndarray, " t"] = given.train_indices
+        self.test_indices: Int64[np.ndarray, " h"] = given.test_indices
+        self.has_alpha = given.has_alpha
+        self.extent = given.extent
+        self.put(np.zeros((len(given.views), 6)))
+
+    def put(self, corrections: Float64[np.ndarray, "v 6"]) -> None:
+        """Correct all views: the rotation vector and shift by which each camera's points move."""
+        self.views = tuple(
+            corrected(view, Motion.of(numbers)) if numbers.any() else view
+            for view, numbers in zip(self.given.views, corrections, strict=True)
+        )
+        pairs = list(zip(self.views, self.given.views, strict=True))
+        self._moved: Bool[np.ndarray, " v"] = np.asarray(corrections.any(axis=1))
+        self._turns_world = np.stack(
+            [now.rotation_cam_from_world.T @ given.rotation_cam_from_world for now, given in pairs]
+        )
+        self._origins_world = np.stack([now.origin_world for now, _ in pairs]).astype(np.float32)
+
+    def rays(
+        self, view: Int64[np.ndarray, " r"], y: Int64[np.ndarray, " r"], x: Int64[np.ndarray, " r"]
+    ) -> RayBatch:
+        """Unit rays of pixels, world frame."""
+        rays = self.given.rays(view, y, x)
+        moved = self._moved[view]
+        if not moved.any():
+            return rays
+        turned = np.einsum("nij,nj->ni", self._turns_world[view], rays.directions_world)
+        return replace(
+            rays,
+            origins_world=np.where(moved[:, None], self._origins_world[view], rays.origins_world),
+            directions_world=np.where(moved[:, None], turned, rays.directions_world),
+        )
+
+    def pixels(
+        self, view: Int64[np.ndarray, " r"], y: Int64[np.ndarray, " r"], x: Int64[np.ndarray, " r"]
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Those of the photographs."""
+        return self.given.pixels(view, y, x)
+
+
+def corrected(view: DatasetView, motion: Motion) -> DatasetView:
+    """A view whose camera's points have moved."""
+    rotation = motion.rotation @ view.rotation_cam_from_world
+    return replace(
+        view,
+        rotation_cam_from_world=rotation,
+        translation_cam_from_world=motion.rotation @ view.translation_cam_from_world + motion.shift_cam,
+    )
+
+
+def without_common(
+    corrections: Float64[np.ndarray, "v 6"], dataset: PosedPhotographs, used: Int64[np.ndarray, " t"]
+) -> Float64[np.ndarray, "v 6"]:
+    """The corrections without what they have in common: a turn, a shift and a scale of the whole scene.
+
+    Photographs do not tell where the scene as a whole is, and views that were held out keep their places in
+    it. Views of no correction have a say in what is common, but stay.
+
+    Args:
+        corrections: see :meth:`CorrectedViews.put`.
+        dataset: the photographs with their given poses.
+        used: views that could be corrected.
+    """
+    given = [dataset.views[i] for i in used.tolist()]
+    places = np.stack([view.origin_world for view in given])
+    middle = places.mean(axis=0)
+    found = corrections.copy()
+    for _ in range(ROUNDS):
+        now = [corrected(v, Motion.of(found[i])) for v, i in zip(given, used.tolist(), strict=True)]
+        turn, shift, growth = _common(given, now, middle, dataset.extent)
+        back = Rotation.from_rotvec(-turn).as_matrix()
+        for old, new, index in zip(given, now, used.tolist(), strict=True):
+            if not corrections[index].any():
+                continue
+            rotation = new.rotation_cam_from_world @ back.T
+            origin = middle + back @ (new.origin_world - middle - shift) / (1 + growth)
+            relative = rotation @ old.rotation_cam_from_world.T
+            moved = Motion(relative, -rotation @ origin - relative @ old.translation_cam_from_world)
+            found[index] = moved.numbers
+    return found
+
+
+def _common(
+    given: list[DatasetView], now: list[DatasetView], middle: Float64[np.ndarray, "3"], extent: float
+) -> tuple[Float64[np.ndarray, "3"], Float64[np.ndarray, "3"], float]:
+    """The small turn (rad) about ``middle``, shift and relative growth nearest to all views' motions.
+
+    Least squares of what is left of the turns, in rad, and of the shifts, of the extent.
+    """
+    slopes = np.zeros((len(given), 6, 7))
+    wanted = np.zeros((len(given), 6))
+    for k, (old, new) in enumerate(zip(given, now, strict=True)):
+        turned = new.rotation_cam_from_world.T @ old.rotation_cam_from_world
+        wanted[k, :3] = Rotation.from_matrix(turned).as_rotvec()
+        wanted[k, 3:] = (new.origin_world - old.origin_world) / extent
+        slopes[k, :3, :3] = np.eye(3)
+        slopes[k, 3:, 3:6] = np.eye(3) / extent
+        place = old.origin_world - middle
+        slopes[k, 3:, :3] = np.cross(np.eye(3), place).T / extent
+        slopes[k, 3:, 6] = place / extent
+    curvature = np.einsum("vik,vil->kl", slopes, slopes)
+    diagonal = curvature.diagonal()
+    ridge = np.diag(1e-9 * diagonal + 1e-12)
+    common = np.linalg.solve(curvature + ridge, np.einsum("vik,vi->k", slopes, wanted))
+    return common[:3], common[3:6], float(common[6])

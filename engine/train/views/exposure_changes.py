@@ -1,0 +1,99 @@
+"""Whether the exposure changes from photograph to photograph, as the points that they share show it."""
+
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+from jaxtyping import Float32, Float64, Int64
+
+from octasplat.engine.dataset.model import Observations
+from octasplat.engine.train.config import TrainConfig
+from octasplat.engine.train.sampling.pixel_sampler import TrainingData
+
+DARKEST, BRIGHTEST = 0.1, 0.95
+"""Display values beyond which a brightness says little."""
+LEAST_POINTS = 30
+"""A photograph that shows fewer points says nothing."""
+ROUNDS = 8
+CHANGES = 0.05
+"""Standard deviation of the photographs' log brightness from which on exposure makes a difference."""
+
+
+@runtime_checkable
+class TrackedPhotographs(TrainingData, Protocol):
+    """Photographs with the points that they show (see :class:`octasplat.engine.dataset.Dataset`)."""
+
+    observations: Observations
+
+
+def log_brightness(dataset: TrackedPhotographs) -> Float64[np.ndarray, " v"]:
+    """How much brighter each training view shows the points that it shares with others, as a logarithm.
+
+    Medians over points and over views by turns, so that highlights and wrong matches do not count. The middle
+    view has 0; views that share too few points, and those held out, are not-a-number.
+    """
+    count = len(dataset.views)
+    brightness = np.full(count, np.nan)
+    seen = dataset.observations
+    rows = np.flatnonzero(np.isin(seen.view, dataset.train_indices))
+    if len(rows) == 0:
+        return brightness
+    view = seen.view[rows]
+    _, point = np.unique(seen.point[rows], return_inverse=True)
+    sizes = np.array([[v.width_px, v.height_px] for v in dataset.views], np.int64)[view]
+    x, y = np.clip(seen.xy_px[rows].astype(np.int64), 0, sizes - 1).T
+    rgb, _, weight = dataset.pixels(view, np.ascontiguousarray(y), np.ascontiguousarray(x))
+    shown = rgb.mean(axis=1, dtype=np.float64)
+    valid = (weight > 0) & (shown > DARKEST) & (shown < BRIGHTEST)
+    view, point, levels = view[valid], point[valid], np.log(shown[valid])
+    views = np.zeros(count)
+    for _ in range(ROUNDS):
+        points = _medians(levels - views[view], point, int(point.max(initial=0)) + 1)
+        views = _medians(levels - points[point], view, count)
+    known = np.bincount(view, minlength=count) >= LEAST_POINTS
+    if known.any():
+        brightness[known] = views[known] - np.median(views[known])
+    return brightness
+
+
+def evening_gains(dataset: TrackedPhotographs) -> Float32[np.ndarray, " v"]:
+    """Factors on the display colours of each view that make all about as bright; 1 where none is known."""
+    brightness = log_brightness(dataset)
+    return np.exp(-np.where(np.isfinite(brightness), brightness, 0.0)).astype(np.float32)
+
+
+def exposure_changes(brightness: Float64[np.ndarray, " v"]) -> str | None:
+    """That the exposure changes so much that it makes a difference, in a sentence; None if it does not."""
+    known = brightness[np.isfinite(brightness)]
+    if len(known) < 2 or float(known.std()) < CHANGES:
+        return None
+    return (
+        f"The exposure changes from photograph to photograph: the same things are shown up to "
+        f"{np.exp(known.max() - known.min()):.1f} times as bright."
+    )
+
+
+def with_exposure_decided(config: TrainConfig, dataset: TrackedPhotographs) -> tuple[TrainConfig, str | None]:
+    """The configuration with ``exposure`` no longer ``auto``, and why it is learnt where that decided so.
+
+    Materials learn one light for all photographs, and what shines, or was cut out, looks brighter from here
+    than from there by itself: for these, ``auto`` learns no exposure.
+    """
+    if config.exposure != "auto":
+        return config, None
+    steady = config.materials.learn or dataset.has_alpha
+    reason = None if steady else exposure_changes(log_brightness(dataset))
+    return config.model_copy(update={"exposure": reason is not None}), reason
+
+
+def _medians(
+    values: Float64[np.ndarray, " k"], group: Int64[np.ndarray, " k"], count: int
+) -> Float64[np.ndarray, " g"]:
+    """The median of each group's values; 0 where there are none."""
+    order = np.lexsort((values, group))
+    sizes = np.bincount(group, minlength=count)
+    starts = np.cumsum(sizes) - sizes
+    some = sizes > 0
+    sorted_values, found = values[order], np.zeros(count)
+    low, high = (starts + (sizes - 1) // 2)[some], (starts + sizes // 2)[some]
+    found[some] = (sorted_values[low] + sorted_values[high]) / 2
+    return found

@@ -1,0 +1,222 @@
+"""How well each photograph fits the scene, and those that do not fit what the others show.
+
+A photograph whose pose is wrong is rendered as something else, whether it was trained on or not, while its
+neighbours are rendered well.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float32, Float64, Int64
+
+from octasplat.engine.core.color import composited
+from octasplat.engine.core.psnr import colour_corrected, psnr
+from octasplat.engine.dataset import DatasetView
+from octasplat.engine.shading.protocol import ShadingModel
+from octasplat.engine.trace.protocol import Tracer
+from octasplat.engine.train.sampling.pixel_sampler import TrainingData
+from octasplat.engine.train.views.view_grids import shown_on_grids
+
+TILES = 3
+"""So many tiles each way of a view are measured, see :func:`octasplat.engine.train.sampling.batches.grid_pixels`."""
+LEAST_VIEWS = 6
+"""Among fewer views nobody can say which of them is odd."""
+NEIGHBOURS = 8
+DISTANCES_AT_ONCE = 1 << 22
+"""Distances between views are found in blocks of so many; 2,048 views fit into one."""
+MOST_DB = 100.0
+"""A view that is shown without an error counts as so many."""
+FAR_BELOW_DB, FAR_BELOW_SIGMAS = 3.0, 5.0
+"""A view that is so much worse than those around it, also in robust standard deviations, is misplaced."""
+MOST_LEFT_OUT = 0.25
+"""No larger share of the training views is left out."""
+
+
+@dataclass(frozen=True, eq=False)
+class ViewFits:
+    """How well views are rendered, each on a fixed grid of its pixels.
+
+    Attributes:
+        indices: the views.
+        psnr: dB; not-a-number where a mask leaves nothing.
+        psnr_colour_corrected: dB, after the gain and offset of each channel that fit best.
+    """
+
+    indices: Int64[np.ndarray, " v"]
+    psnr: Float64[np.ndarray, " v"]
+    psnr_colour_corrected: Float64[np.ndarray, " v"]
+
+
+def view_fits(
+    dataset: TrainingData,
+    indices: Int64[np.ndarray, " v"],
+    background_srgb: Float32[np.ndarray, "3"],
+    tracer: Tracer,
+    shading: ShadingModel,
+) -> ViewFits:
+    """Measure the Gaussians that ``tracer`` holds on the views ``indices``; changes nothing."""
+    plain, corrected = [], []
+    for grids in shown_on_grids(
+        dataset, indices, background_srgb, tracer, shading, tiles=TILES, exposed=True
+    ):
+        rgb, alpha, weight = dataset.pixels(*grids.pixels)
+        target = composited(rgb, alpha, background_srgb).reshape(grids.rgb_srgb.shape)
+        counts = (weight > 0).astype(np.float32).reshape(len(target), -1)
+        for shown, photograph, valid in zip(grids.rgb_srgb, target, counts, strict=True):
+            plain.append(psnr(shown, photograph, valid))
+            corrected.append(psnr(colour_corrected(shown, photograph, valid), photograph, valid))
+    return ViewFits(indices, *(np.minimum(values, MOST_DB) for values in (plain, corrected)))
+
+
+def misfits(
+    fits: ViewFits,
+    views: Sequence[DatasetView],
+    train_indices: Int64[np.ndarray, " t"],
+    sigmas: float = FAR_BELOW_SIGMAS,
+) -> Int64[np.ndarray, " m"]:
+    """The views that are rendered far worse than the training views around them, worst first.
+
+    Each is compared with the middle of its neighbours, so that a part of the scene that is hard to learn is
+    not taken for wrong poses; how much that difference varies among the training views says what is far.
+    Held-out views are as a rule worse than their neighbours and are taken as such. Exposure does not count.
+
+    Args:
+        fits: of views, training views among them.
+        views: all views of the dataset.
+        train_indices: views that are trained on.
+        sigmas: how many robust standard deviations are far.
+    """
+    known = np.isfinite(fits.psnr_colour_corrected)
+    indices, psnr = fits.indices[known], fits.psnr_colour_corrected[known]
+    trained = np.isin(indices, train_indices)
+    if int(trained.sum()) < LEAST_VIEWS:
+        return np.zeros(0, np.int64)
+    low = np.zeros(len(indices), np.bool_)
+    below = np.zeros(len(indices))
+    for _ in range(2):  # the second time without those that the first found as neighbours
+        above = psnr - _around(indices, psnr, trained & ~low, views)
+        usual = float(np.median(above[trained]))
+        sigma = 1.4826 * float(np.median(np.abs(above[trained] - usual)))
+        below = usual - above
+        if not trained.all():
+            below[~trained] -= max(0.0, float(np.median(below[~trained])))
+        low = below > max(FAR_BELOW_DB, sigmas * sigma)
+    worst_first = np.argsort(-below, kind="stable")
+    return indices[worst_first[low[worst_first]]]
+
+
+def _around(
+    indices: Int64[np.ndarray, " v"],
+    psnr: Float64[np.ndarray, " v"],
+    counts: Bool[np.ndarray, " v"],
+    views: Sequence[DatasetView],
+) -> Float64[np.ndarray, " v"]:
+    """Return the middle of the PSNR of the nearest views of each among those that count, dB.
+
+    Near are views from near places that look the same way. Of many views only a block of distances is held
+    at once, and the usual distance is that of evenly spaced views from all others.
+    """
+    origins = np.stack([views[i].origin_world for i in indices.tolist()])
+    forward = np.stack([views[i].rotation_cam_from_world[2] for i in indices.tolist()])
+    total = len(origins)
+    rows = max(1, DISTANCES_AT_ONCE // total)
+    some = np.unique(np.linspace(0, total - 1, min(rows, total)).astype(np.int64))
+    usual = max(float(np.median(_apart(origins[some], origins))), 1e-12)
+    others = min(NEIGHBOURS, int(counts.sum()) - 1)
+    result = np.empty(total)
+    for start in range(0, total, rows):
+        part = slice(start, start + rows)
+        away = _apart(origins[part], origins) / usual + (1 - forward[part] @ forward.T)
+        away[:, ~counts] = np.inf
+        away[np.arange(len(away)), np.arange(total)[part]] = np.inf
+        nearest = np.argsort(away, axis=1, kind="stable")[:, :others]
+        result[part] = np.median(psnr[nearest], axis=1)
+    return result
+
+
+def _apart(
+    some: Float64[np.ndarray, "s 3"], others: Float64[np.ndarray, "v 3"]
+) -> Float64[np.ndarray, "s v"]:
+    return np.asarray(np.linalg.norm(some[:, None] - others, axis=2))
+
+
+@dataclass(frozen=True)
+class TrainingViews:
+    """How the training ended for its views, see :class:`ViewFits`.
+
+    Attributes:
+        psnr: dB, by name, of the views that were trained on to the end.
+        misfits: names of views that do not fit the others, worst first, held-out ones and those left out too.
+        left_out: names of those that were left out of the training.
+    """
+
+    psnr: dict[str, float]
+    misfits: tuple[str, ...]
+    left_out: tuple[str, ...]
+
+    def as_dict(self) -> dict[str, object]:
+        """JSON-ready, with the mean and the worst view."""
+        known = {name: round(value, 4) for name, value in self.psnr.items() if np.isfinite(value)}
+        worst = min(known, key=lambda name: known[name], default=None)
+        return {
+            "psnr": float(np.mean(list(known.values()))) if known else None,
+            "worst": worst,
+            "worst_psnr": None if worst is None else known[worst],
+            "misfits": list(self.misfits),
+            "left_out": list(self.left_out),
+            "views": known,
+        }
+
+    def complaint(self) -> str | None:
+        """What the user should know."""
+        loose = [name for name in self.misfits if name not in self.left_out]
+        if not loose:
+            return None
+        which = "This photograph does" if len(loose) == 1 else f"These {len(loose)} photographs do"
+        its = "its pose" if len(loose) == 1 else "their poses"
+        return (
+            f"{which} not fit the others; {its} may be wrong, or the picture blurred: {', '.join(loose)}. "
+            "Given poses that are wrong come right with the setting repair_poses, or where all are found "
+            "anew (--poses auto); exclude_outlier_views trains without such photographs."
+        )
+
+
+class ViewJudge:
+    """Looks for views that do not fit.
+
+    Args:
+        dataset: the photographs.
+        background_srgb: what is behind them.
+    """
+
+    def __init__(self, dataset: TrainingData, background_srgb: Float32[np.ndarray, "3"]) -> None:
+        self._dataset = dataset
+        self._background_srgb = background_srgb
+
+    def misfits(
+        self, tracer: Tracer, shading: ShadingModel, left_out: Int64[np.ndarray, " k"]
+    ) -> Int64[np.ndarray, " m"]:
+        """Training views to leave out besides others, as the Gaussians that ``tracer`` holds show them."""
+        train = self._dataset.train_indices
+        used = np.setdiff1d(train, left_out)
+        fits = view_fits(self._dataset, used, self._background_srgb, tracer, shading)
+        room = int(MOST_LEFT_OUT * len(train)) - len(left_out)
+        return np.sort(misfits(fits, self._dataset.views, used)[: max(0, room)])
+
+    def conclude(
+        self, tracer: Tracer, shading: ShadingModel, left_out: Int64[np.ndarray, " m"]
+    ) -> TrainingViews:
+        """How well the finished Gaussians, which ``tracer`` holds, show the views."""
+        dataset = self._dataset
+        used = np.setdiff1d(dataset.train_indices, left_out)
+        indices = np.concatenate([used, dataset.test_indices])
+        fits = view_fits(dataset, indices, self._background_srgb, tracer, shading)
+        found = misfits(fits, dataset.views, used)
+        names = [view.name for view in dataset.views]
+        psnr = dict(zip(fits.indices.tolist(), fits.psnr.tolist(), strict=True))
+        return TrainingViews(
+            psnr={names[i]: psnr[i] for i in used.tolist()},
+            misfits=tuple(names[i] for i in [*found.tolist(), *left_out.tolist()]),
+            left_out=tuple(names[i] for i in left_out.tolist()),
+        )

@@ -1,0 +1,159 @@
+"""Small corrections of the training views' poses, learnt while the Gaussians are.
+
+Between iterations each training view is aligned with what the Gaussians show from there (see
+:mod:`octasplat.engine.train.views.image_alignment`); rays are then made from the corrected poses, and both come nearer by
+turns. What all corrections have in common is taken out, so that held-out views, which keep the poses that are
+given, stay in their places. Poses that are wrong by more than some pixels are not found: steps are small, and
+nothing is looked for. The first Gaussians, near zones, floors on scales, meshes and renders "as the
+photographs" use the poses that are given, and so do later commands; ``training.json`` has the corrected ones.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float32, Float64, Int64
+
+from octasplat.engine.dataset.view_frusta import rotate_vectors
+from octasplat.engine.shading.protocol import ShadingModel, Sight
+from octasplat.engine.trace.protocol import Tracer
+from octasplat.engine.train.sampling.batches import grid_pixels
+from octasplat.engine.train.sampling.pixel_sampler import view_sizes_px
+from octasplat.engine.train.views.corrected_views import CorrectedViews, PosedPhotographs, without_common
+from octasplat.engine.train.views.image_alignment import Motion, Rendered, aligned, photograph_of
+
+TILES = 5
+"""So many tiles each way of a view are aligned, see :func:`octasplat.engine.train.sampling.batches.grid_pixels`."""
+VIEWS_AT_ONCE = 32
+TAKEN = 0.5
+"""Share of a motion that is taken: what the Gaussians get wrong for the moment is averaged out."""
+OPAQUE = 0.7
+"""Least accumulated alpha of a ray that is taken to meet the surface."""
+
+
+@dataclass(frozen=True)
+class RefinedPose:
+    """A pose after the training, in the frame of the one that was given.
+
+    Attributes:
+        rotation_cam_from_world: rows of the corrected rotation.
+        translation_cam_from_world: world units.
+        turned_deg: by how much the camera was turned.
+        shifted_world: by how much its centre was moved.
+        moved_px: by how much the middle one of its points moves in the picture; None where there are none.
+    """
+
+    rotation_cam_from_world: list[list[float]]
+    translation_cam_from_world: list[float]
+    turned_deg: float
+    shifted_world: float
+    moved_px: float | None
+
+
+@dataclass(frozen=True)
+class RefinedPoses:
+    """The poses of training views whose poses were corrected, by name, among so many that were trained on."""
+
+    views: dict[str, RefinedPose]
+    of: int
+
+    def as_dict(self) -> dict[str, dict[str, object]]:
+        """JSON-ready, by name."""
+        return {name: dict(vars(pose)) for name, pose in self.views.items()}
+
+    def sentence(self) -> str:
+        """What the user should know."""
+        sizes = {name: pose.moved_px for name, pose in self.views.items() if pose.moved_px is not None}
+        middle = float(np.median(list(sizes.values()))) if sizes else 0.0
+        if not sizes:
+            return f"The poses of all {self.of} training views stayed as they were given."
+        largest = max(sizes, key=lambda name: sizes[name])
+        return (
+            f"The poses of {len(self.views)} of {self.of} training views were corrected, by {middle:.2f} px "
+            f"in the middle and {sizes[largest]:.2f} px at most ({largest})."
+        )
+
+
+class PoseRefiner:
+    """Aligns the training views.
+
+    Args:
+        dataset: the photographs with the poses that are given.
+        background_srgb: what is behind them.
+
+    Attributes:
+        dataset: the photographs as they are to be trained on.
+    """
+
+    def __init__(self, dataset: PosedPhotographs, background_srgb: Float32[np.ndarray, "3"]) -> None:
+        self.dataset = CorrectedViews(dataset)
+        self._background_srgb = background_srgb
+
+    def refine(
+        self,
+        corrections: Float64[np.ndarray, "v 6"],
+        tracer: Tracer,
+        shading: ShadingModel,
+        left_out: Int64[np.ndarray, " m"],
+    ) -> Float64[np.ndarray, "v 6"]:
+        """The corrections after one more alignment of the views with the Gaussians that ``tracer`` holds.
+
+        Views that show too little, or agree no better afterwards, stay as they are, and so do those left out.
+        """
+        dataset, found = self.dataset, corrections.copy()
+        used = np.setdiff1d(dataset.train_indices, left_out)
+        for index, rendered in self._rendered(used, tracer, shading):
+            view = dataset.views[index]
+            size_px = (view.width_px, view.height_px)
+            photograph = photograph_of(dataset, index, size_px, self._background_srgb)
+            motion = aligned(rendered, photograph, dataset.cameras[view.camera_index])
+            if motion is not None:
+                found[index] = motion.share(TAKEN).after(Motion.of(found[index])).numbers
+        found = without_common(found, dataset.given, used)
+        dataset.put(found)
+        return found
+
+    def conclude(
+        self,
+        corrections: Float64[np.ndarray, "v 6"],
+        tracer: Tracer,
+        shading: ShadingModel,
+        left_out: Int64[np.ndarray, " m"],
+    ) -> RefinedPoses:
+        """The corrected poses, and how much they differ in the pictures of the finished Gaussians."""
+        dataset, found = self.dataset, {}
+        used = np.setdiff1d(dataset.train_indices, left_out)
+        moved = used[corrections[used].any(axis=1)]
+        for index, rendered in self._rendered(moved, tracer, shading):
+            view, given = dataset.views[index], dataset.given.views[index]
+            camera, motion = dataset.cameras[view.camera_index], Motion.of(corrections[index])
+            points = rendered.points_cam
+            away = np.linalg.norm(camera.project(points) - camera.project(motion.undone(points)), axis=1)
+            away = away[np.isfinite(away)]
+            found[view.name] = RefinedPose(
+                rotation_cam_from_world=view.rotation_cam_from_world.tolist(),
+                translation_cam_from_world=view.translation_cam_from_world.tolist(),
+                turned_deg=float(np.degrees(np.linalg.norm(corrections[index, :3]))),
+                shifted_world=float(np.linalg.norm(view.origin_world - given.origin_world)),
+                moved_px=float(np.median(away)) if len(away) else None,
+            )
+        return RefinedPoses(found, len(used))
+
+    def _rendered(
+        self, indices: Int64[np.ndarray, " v"], tracer: Tracer, shading: ShadingModel
+    ) -> Iterator[tuple[int, Rendered]]:
+        """Each view with what the Gaussians show of a grid of its pixels, where they show a surface."""
+        dataset = self.dataset
+        for start in range(0, len(indices), VIEWS_AT_ONCE):
+            some = indices[start : start + VIEWS_AT_ONCE]
+            view, y, x = grid_pixels(some, view_sizes_px(dataset), TILES)
+            rays = dataset.rays(view, y, x)
+            seen = tracer.trace(rays)
+            developed = shading.develop(Sight(rays, seen, tracer, view))
+            rgb = np.clip(developed.over(self._background_srgb), 0, 1)
+            met = (seen.depth_median > 0) & (seen.alpha >= OPAQUE)
+            points_world = seen.depth_median[:, None].astype(np.float64) * rays.directions_world
+            for index in some.tolist():
+                chosen = met & (view == index)
+                points = rotate_vectors(points_world[chosen], dataset.views[index].rotation_cam_from_world)
+                yield index, Rendered(points, rgb[chosen].astype(np.float64))
