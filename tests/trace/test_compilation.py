@@ -41,7 +41,7 @@ def test_second_process_finds_the_code_of_the_first(tmp_path: Path) -> None:
 
 
 def test_same_sources_in_other_checkout_share_cache(tmp_path: Path) -> None:
-    root = Path(compilation.__file__).parents[1]
+    root = Path(compilation.__file__).parents[2]
     for name in ("one", "two"):
         package = tmp_path / name / "octasplat"
         package.mkdir(parents=True)
