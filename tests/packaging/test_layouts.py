@@ -17,7 +17,7 @@ from tests.support.environments import (
     share_packages,
 )
 
-VERSION = re.search(r'^version = "(.*)"', (ROOT / "pyproject.toml").read_text(), re.M)[1]  # type: ignore[index]
+VERSION = re.search(r'^__version__ = "(.*)"', (ROOT / "engine" / "__init__.py").read_text(), re.M)[1]  # type: ignore[index]
 CODE = """
 import sys
 sys.path.remove("")
@@ -64,7 +64,7 @@ def install_as_docker_does(environment: Environment, project: Path) -> None:
     """Copy what the Dockerfile copies into an empty folder, and install from there."""
     dockerfile = (ROOT / "docker" / "Dockerfile").read_text().partition("AS front-end")[2]
     dockerfile = dockerfile.partition("FROM base")[0]
-    assert "RUN pip install --no-deps ." in dockerfile
+    assert "RUN pip install --no-deps --no-build-isolation ." in dockerfile
     folder = project.parent / "docker"
     folder.mkdir()
     for line in re.findall(r"^COPY (.*)$", dockerfile, re.M):
