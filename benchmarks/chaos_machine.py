@@ -271,8 +271,3 @@ BLOWS: tuple[Blow, ...] = (
     kill_child, freeze_worker, kill_front_end, kill_database, fill_disk, kill_worker, cut_power, freeze_child,
     kill_backend, freeze_database, freeze_front_end, restart_all,
 )  # fmt: skip
-
-
-def address_of(data: Path) -> str:
-    """Where a service says that it is."""
-    return str(json.loads((data / "serve.json").read_text())["url"])

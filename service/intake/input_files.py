@@ -16,6 +16,8 @@ from octasplat.workers.storage.protocol import Storage
 
 MAX_FILES = 1000
 MAX_TEXT_LINE_BYTES = 1 << 16
+"""Longest line of a text file; programs read such files line by line into memory."""
+_CHUNK_BYTES = 1 << 20
 _MAGIC_NUMBERS = {".glb": b"glTF", ".ply": b"ply"}
 _UNCHECKED_SUFFIXES = frozenset({".splat", ".spz"})
 """Nothing in their first bytes says what they are; whoever reads them says so."""
@@ -57,6 +59,9 @@ def check_input_content(storage: Storage, name: str, sha256: str, limits: ImageL
             what = "text" if suffix in _TEXT_SUFFIXES else f"{suffix[1:].upper()} file"
             detail = f"{quoted_name(name)} is no {what} by its content; send the file anew."
             raise IntakeError(IntakeFault("file-kind", detail, name))
+        if suffix in _TEXT_SUFFIXES and _has_long_line(file):
+            detail = f"{quoted_name(name)} has a line of more than {MAX_TEXT_LINE_BYTES:,} bytes; write it in lines."
+            raise IntakeError(IntakeFault("file-kind", detail, name))
     return None
 
 
@@ -67,6 +72,18 @@ def _matches_suffix(file: BinaryIO, suffix: str) -> bool:
     if suffix in _TEXT_SUFFIXES:
         return b"\0" not in head
     return head.startswith(_MAGIC_NUMBERS.get(suffix, b""))
+
+
+def _has_long_line(file: BinaryIO) -> bool:
+    file.seek(0)
+    begun = 0  # bytes of the line that the last chunk ended in
+    while chunk := file.read(_CHUNK_BYTES):
+        first, *others = chunk.splitlines(keepends=False)
+        lengths = [begun + len(first), *map(len, others)]
+        if max(lengths) > MAX_TEXT_LINE_BYTES:
+            return True
+        begun = 0 if chunk.endswith((b"\n", b"\r")) else lengths[-1]
+    return False
 
 
 def check_input_files(files: Sequence[DatasetFile]) -> dict[str, Any]:

@@ -14,7 +14,9 @@ PAPER_LINK = re.compile(
 AUTHORS_AND_YEAR = re.compile(
     r"\b((?:Van )?[A-Z][\w-]{2,}(?:,? (?:and |et al\.?)?(?:[A-Z][\w-]+)?)*?),? \(?((?:19|20)\d\d)\b(?!-)"
 )
-QUOTED_PAPER = re.compile(r"[\"“]([A-Z][^\"“”]{12,130})[\"”],? (?:\((?:https?:|[A-Z])|https?:|(?:19|20)\d\d\))")
+QUOTED_PAPER = re.compile(
+    r"[\"“]([A-Z][^\"“”]{12,130})[\"”],? (?:\((?:https?:|[A-Z])|https?:|(?:19|20)\d\d\))"
+)
 NO_AUTHORS = {"June", "July", "May", "Eq", "Since", "January", "November", "Blender", "Python", "Embree"}
 
 
@@ -47,7 +49,9 @@ def test_entries_have_title_authors_year_and_link(entries: dict[str, dict[str, s
         assert entry["url"].startswith("http"), key
         assert entry["year"] in key, key
         for place in re.findall(r"\b(?:engine|workers|service)/[\w/]+(?:\.py)?", entry["note"]):
-            assert (ROOT / place).exists(), f"{key}: {place} is gone; name the module that follows the paper now"
+            assert (ROOT / place).exists(), (
+                f"{key}: {place} is gone; name the module that follows the paper now"
+            )
     assert len({entry["title"].lower() for entry in entries.values()}) == len(entries)
 
 
@@ -64,7 +68,11 @@ def test_links_of_papers_are_in_the_bibliography(entries: dict[str, dict[str, st
 
 
 def test_authors_and_years_are_in_the_bibliography(entries: dict[str, dict[str, str]]) -> None:
-    known = {(word, entry["year"]) for entry in entries.values() for word in re.findall(r"\w[\w-]+", entry["author"])}
+    known = {
+        (word, entry["year"])
+        for entry in entries.values()
+        for word in re.findall(r"\w[\w-]+", entry["author"])
+    }
     missing, found = [], 0
     for path in sources():
         for authors, year in AUTHORS_AND_YEAR.findall(prose(path)):

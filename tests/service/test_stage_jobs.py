@@ -143,6 +143,7 @@ def test_stage_files_are_checked_on_upload(talk: Callable[..., None]) -> None:
             ("sky.hdr", b"no picture", "image-kind"),
             ("thing.glb", TRIANGLE, "file-kind"),
             ("thing.obj", b"\0\1\2", "file-kind"),
+            ("thing.obj", b"v 0 0 0\n# " + b"x" * 70_000 + b"\n", "file-kind"),
             ("..%2Fthing.obj", TRIANGLE, "name-traversal"),
             ("thing.exe", b"MZ", "name-unexpected"),
         ]:

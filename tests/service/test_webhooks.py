@@ -15,7 +15,7 @@ import pytest
 from standardwebhooks.webhooks import Webhook, WebhookVerificationError
 
 from octasplat.service.state import Service
-from octasplat.workers.db.connections import open_pool
+from octasplat.workers.db.connections import Pool, open_pool
 from octasplat.workers.maintenance.webhooks import addresses
 from octasplat.workers.maintenance.webhooks.addresses import AddressRefusedError, check_url
 from octasplat.workers.maintenance.webhooks.guarded_transport import OWNER_EXTENSION
@@ -24,7 +24,6 @@ from octasplat.workers.maintenance.webhooks.sender import (
     MAX_PER_OWNER,
     WebhookSender,
     guarded_client,
-    send_due,
 )
 from tests.support.service_harness import claim_job, client_with_token, committed_dataset, running_service
 from tests.support.webhook_receiver import WebhookReceiver, receive_webhooks
@@ -32,6 +31,19 @@ from tests.support.webhook_receiver import WebhookReceiver, receive_webhooks
 Conversation = Callable[[httpx.AsyncClient, Service], Awaitable[None]]
 HERE = ("127.0.0.1",)
 SECRET = "whsec_" + base64.b64encode(b"0123456789abcdef01234567").decode()
+
+
+async def send_due(pool: Pool, allowed_hosts: tuple[str, ...] = ()) -> int:
+    """Send what is due, until nothing is; returns how many messages, whether they arrived or not."""
+    sender = WebhookSender(pool, allowed_hosts)
+    begun = 0
+    try:
+        while (due := await sender.start_due()) or sender.sent_count < begun:
+            begun += due
+            await sender.wait()
+        return sender.sent_count
+    finally:
+        await sender.close()
 
 
 @pytest.fixture

@@ -58,8 +58,3 @@ def exports_option(command: F) -> F:
         metavar="NAMES",
         help="Files to write besides scene.ply, e.g. mesh.glb,scene.spz; see octasplat export --help.",
     )(command)
-
-
-def background_option(help_text: str) -> Callable[[F], F]:
-    """``--background black|white``."""
-    return click.option("--background", type=click.Choice(["black", "white"]), default=None, help=help_text)

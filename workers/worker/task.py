@@ -7,8 +7,8 @@ from typing import Any
 
 from octasplat.engine.core.events import Listener, ignore
 
-RUN_FOLDER, RESULTS_FOLDER, SCENE_FOLDER, FILES_FOLDER = "run", "results", "scene", "files"
-"""Folders of an attempt: the engine's output, what is to be published, photographs, files that are named."""
+RUN_FOLDER, RESULTS_FOLDER, FILES_FOLDER = "run", "results", "files"
+"""Folders of an attempt: the engine's output, what is to be published, files that are named."""
 
 SCENE_FILE, CONFIG_FILE = "scene.ply", "config.json"
 """Results that tell a scene, and that it is one of a run."""

@@ -57,11 +57,6 @@ class WebhookSender:
             task.add_done_callback(self._tasks.discard)
         return len(taken)
 
-    @property
-    def is_busy(self) -> bool:
-        """Whether messages are under way."""
-        return bool(self._tasks)
-
     async def wait(self) -> None:
         """Until one of the messages under way is settled."""
         if self._tasks:
@@ -88,17 +83,6 @@ class WebhookSender:
             self._in_flight[endpoint.owner] -= 1
             if not self._in_flight[endpoint.owner]:
                 del self._in_flight[endpoint.owner]
-
-
-async def send_due(pool: Pool, allowed_hosts: tuple[str, ...] = ()) -> int:
-    """Send what is due, until nothing is; returns how many messages, whether they arrived or not."""
-    sender = WebhookSender(pool, allowed_hosts)
-    try:
-        while await sender.start_due() or sender.is_busy:
-            await sender.wait()
-        return sender.sent_count
-    finally:
-        await sender.close()
 
 
 def guarded_client(allowed_hosts: tuple[str, ...] = ()) -> httpx.AsyncClient:
