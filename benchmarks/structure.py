@@ -2,7 +2,7 @@
 
     python -m benchmarks.structure                      # this tree
     python -m benchmarks.structure --root ELSEWHERE     # another checkout
-    python -m benchmarks.structure --drawing            # Mermaid, as docs/architecture.md has it
+    python -m benchmarks.structure --write              # the marked parts of docs/architecture.md
 
 An arrow says "imports". Folders in a circle, and arrows from engine to workers or from workers to service,
 are told and make the exit status 1.
@@ -20,8 +20,9 @@ import grimp
 import networkx as nx
 
 PACKAGES = ("engine", "workers", "service")
-EVERYBODY = frozenset({"errors", "events", "colour", "rays", "threads"})
-"""Small modules that any other may use; they would hide the rest of the drawing."""
+EVERYBODY = frozenset({"core"})
+"""What any other may use; it would hide the rest of the drawing."""
+PAGE = Path("docs") / "architecture.md"
 
 
 def room_of(module: str) -> str | None:
@@ -59,19 +60,48 @@ def upwards(edges: Iterable[tuple[str, str]]) -> list[tuple[str, str]]:
     return [(a, b) for a, b in edges if level[a.split(".")[0]] < level[b.split(".")[0]]]
 
 
-def drawing(edges: Counter[tuple[str, str]]) -> str:
-    """Mermaid text: a frame for each package, an arrow for each pair of folders."""
-    lines = ["flowchart LR"]
+def drawing(graph: grimp.ImportGraph) -> str:
+    """Mermaid text: a frame for each package, an arrow for each pair of folders; single modules are left out."""
+    edges = {
+        (here, there)
+        for here, there in arrows(graph)
+        if graph.find_children(f"octasplat.{here}") and graph.find_children(f"octasplat.{there}")
+    }
+    lines = ["```mermaid", "flowchart LR"]
     rooms = sorted({room for edge in edges for room in edge})
     for package in reversed(PACKAGES):
         lines.append(f"  subgraph {package}")
         lines += [f"    {room}[{room.split('.')[1]}]" for room in rooms if room.split(".")[0] == package]
         lines.append("  end")
     # What reaches a folder by way of another one as well is left out: the drawing is about the order.
-    whole = nx.DiGraph(list(edges))
+    whole = nx.DiGraph(sorted(edges))
     shown = whole if circles(edges) else nx.transitive_reduction(whole)
     lines += [f"  {here} --> {there}" for here, there in sorted(shown.edges)]
+    return "\n".join([*lines, "```"])
+
+
+def folders(root: Path) -> str:
+    """Table of the folders with the first line of what their packages say of themselves."""
+    lines = ["| Folder | What |", "|---|---|"]
+    for package in PACKAGES:
+        for path in sorted((root / package).glob("*/__init__.py")):
+            text = ast.get_docstring(ast.parse(path.read_text(encoding="utf-8"))) or ""
+            if text:
+                lines.append(f"| `{path.parent.relative_to(root).as_posix()}/` | {text.splitlines()[0]} |")
     return "\n".join(lines)
+
+
+def written_page(root: Path, graph: grimp.ImportGraph) -> str:
+    """Text of docs/architecture.md, its marked parts made anew."""
+    text = (root / PAGE).read_text(encoding="utf-8")
+    for name, part in (("folders", folders(root)), ("drawing", drawing(graph))):
+        begin, end = f"<!-- {name}: by python -m benchmarks.structure --write -->", f"<!-- end of {name} -->"
+        before, found, rest = text.partition(begin)
+        _, closed, after = rest.partition(end)
+        if not found or not closed:
+            raise SystemExit(f"{PAGE} has no part between '{begin}' and '{end}'.")
+        text = f"{before}{begin}\n\n{part}\n\n{end}{after}"
+    return text
 
 
 def sources(root: Path) -> Iterator[Path]:
@@ -139,12 +169,13 @@ def main() -> int:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--root", type=Path, default=Path(__file__).resolve().parent.parent)
-    parser.add_argument("--drawing", action="store_true")
+    parser.add_argument("--write", action="store_true", help=f"bring {PAGE} up to date")
     arguments = parser.parse_args()
     sys.path.insert(0, str(arguments.root.resolve() / "src"))
     graph = grimp.build_graph("octasplat", cache_dir=None)
-    if arguments.drawing:
-        print(drawing(arrows(graph)))
+    if arguments.write:
+        page = written_page(arguments.root, graph)
+        (arguments.root / PAGE).write_text(page, encoding="utf-8")
         return 0
     return 0 if report(arguments.root, graph) else 1
 
