@@ -23,7 +23,7 @@ NO_AUTHORS = {"June", "July", "May", "Eq", "Since", "January", "November", "Blen
 def sources() -> list[Path]:
     """Return the modules and pages in which papers are named."""
     modules = [path for name in ("engine", "workers", "service") for path in (ROOT / name).rglob("*.py")]
-    package = [path for path in (ROOT / "src" / "octasplat").glob("*.py")]
+    package = list((ROOT / "src" / "octasplat").glob("*.py"))
     pages = [path for path in (ROOT / "docs").rglob("*.md") if path.name != "experiments.md"]
     return sorted([*modules, *package, *pages, ROOT / "README.md"])
 
