@@ -33,7 +33,7 @@ def run(command: Iterable[object], cwd: Path) -> str:
 def copy_project(target: Path) -> Path:
     """Return a copy of what distributions are built from, links as links."""
     target.mkdir()
-    unwanted = shutil.ignore_patterns("__pycache__", "*.nbi", "*.nbc", "*.egg-info")
+    unwanted = shutil.ignore_patterns("__pycache__", "*.nbi", "*.nbc", "*.egg-info", "build")
     for name in FOLDERS:
         shutil.copytree(ROOT / name, target / name, symlinks=True, ignore=unwanted)
     for name in FILES:
