@@ -9,9 +9,9 @@ from jaxtyping import Float32, Float64, Int, Int64
 
 from octasplat.engine.core.errors import DatasetError
 from octasplat.engine.core.rays import ImageRays, RayBatch
-from octasplat.engine.dataset import kernels_gather
 from octasplat.engine.dataset.camera import Camera
 from octasplat.engine.dataset.camera_clearance import camera_clearances
+from octasplat.engine.dataset.kernels import gather
 from octasplat.engine.dataset.load import load_dataset_model
 from octasplat.engine.dataset.model import DatasetModel, DatasetView, Observations, SparsePoints, Viewpoints
 from octasplat.engine.dataset.pixel_cache import PixelCache, file_digests, open_pixel_cache
@@ -239,7 +239,7 @@ class Dataset:
         view, y, x = _as_int64(view), _as_int64(y), _as_int64(x)
         origins = np.empty((len(view), 3), dtype=np.float32)
         directions = np.empty((len(view), 3), dtype=np.float32)
-        bad = kernels_gather.gather_rays(
+        bad = gather.gather_rays(
             view, y, x, self._view_sizes, self._view_camera, self._rotations_world_from_cam, self._origins_world,
             self._pinhole_params, self._ray_tables.offsets, self._ray_tables.values.values, origins, directions,
         )  # fmt: skip
@@ -261,7 +261,7 @@ class Dataset:
         alpha = np.empty(len(view), dtype=np.float32)
         weight = np.empty(len(view), dtype=np.float32)
         values = self._cache.rgb.values
-        bad = kernels_gather.gather_pixels(
+        bad = gather.gather_pixels(
             view, y, x, self._view_sizes, self._view_camera, self._cache.offsets, self._ray_tables.offsets,
             self._ray_tables.values.values, values, np.float32(np.iinfo(values.dtype).max),
             self._cache.alpha.values, self._cache.mask.values, self._mask_is_alpha, rgb, alpha, weight,

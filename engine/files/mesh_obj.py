@@ -128,7 +128,7 @@ def _read_materials(path: Path, parts: _ObjParts, count: int) -> dict[str, Any]:
         for start, name in parts.material_uses:
             numbers[start:] = known[name]
         missing = MeshMaterial("", unsupported=("no entry in an MTL file",))
-        looks["material_numbers"] = numbers
+        looks["material_indices"] = numbers
         looks["materials"] = tuple(materials.get(name, replace(missing, name=name)) for name in known)
     return looks
 

@@ -8,7 +8,7 @@ from jaxtyping import Float, Float32
 
 from octasplat.engine.core.color import linear_to_srgb
 from octasplat.engine.core.rays import RayBatch
-from octasplat.engine.dataset.synthetic import kernels_noise
+from octasplat.engine.dataset.synthetic.kernels import noise
 from octasplat.engine.dataset.synthetic.still_life import StillLife
 from octasplat.engine.trace.triangle_bvh import TriangleBvh, TriangleHits
 
@@ -103,7 +103,7 @@ class LitScene:
         faces = hits.faces[hit]
         at = np.empty((len(hit), self._attributes.shape[1]), np.float32)
         u, v = np.ascontiguousarray(hits.barycentrics[hit].T)
-        kernels_noise.interpolate_attributes(self._attributes, self.still_life.faces, faces, u, v, at)
+        noise.interpolate_attributes(self._attributes, self.still_life.faces, faces, u, v, at)
         kinds = self.still_life.face_object[faces]
         for kind in np.unique(kinds):
             thing = self.still_life.objects[kind]

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float, Float32, Int, UInt8
 
 from octasplat.engine.core.color import srgb_to_linear
-from octasplat.engine.dataset.synthetic import kernels_noise
+from octasplat.engine.dataset.synthetic.kernels import noise
 
 _FONT = {
     "A": "01110 10001 10001 11111 10001 10001 10001",
@@ -64,7 +64,7 @@ def gradient_noise(
 ) -> Float32[np.ndarray, " n"]:
     """Fractal gradient noise, one cell of the coarsest octave a unit."""
     out = np.empty(len(points), np.float32)
-    kernels_noise.fractal_noise(np.ascontiguousarray(points), octaves, seed, out)
+    noise.fractal_noise(np.ascontiguousarray(points), octaves, seed, out)
     return out
 
 
@@ -74,7 +74,7 @@ def cell_noise(
     """A random number in [0, 1) for the integer cell that (first, second) lies in."""
     cells = np.stack([np.floor(first), np.floor(second), np.zeros_like(first)], axis=1).astype(np.int32)
     out = np.empty(len(cells), np.float32)
-    kernels_noise.hash_cells(cells, seed, out)
+    noise.hash_cells(cells, seed, out)
     return out
 
 
