@@ -8,8 +8,8 @@ from pathlib import Path
 from octasplat.engine.core.versions import versions
 
 ROOT = Path(__file__).resolve().parent.parent
-HARMLESS = {"pydantic", "pydantic_core", "jaxtyping", "Jinja2", "pyoidn"}
-"""Checks of values and types, the layout of the report, the denoiser of stages: no figure comes from them."""
+HARMLESS = {"pydantic", "pydantic_core", "jaxtyping", "Jinja2", "pyoidn", "platformdirs"}
+"""Checks of values and types, the layout of the report, the denoiser of stages, places of folders: no figure comes from them."""
 
 
 def imported_names(module: str) -> set[str]:

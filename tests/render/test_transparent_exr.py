@@ -62,7 +62,7 @@ def relighter() -> Callable[[np.ndarray], Relighter]:
             return linear_to_srgb(linear) * coverage[..., None] + background * (1 - coverage[..., None])
 
         image = SimpleNamespace(linear=linear, coverage=coverage, over=over)
-        return cast(Relighter, SimpleNamespace(put=lambda _map: None, render=lambda _rays, _part: image))
+        return cast(Relighter, SimpleNamespace(set_environment=lambda _map: None, render=lambda _rays, _part: image))
 
     return make
 
