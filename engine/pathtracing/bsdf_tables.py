@@ -8,11 +8,15 @@ from dataclasses import dataclass
 from functools import lru_cache
 from typing import Literal
 
+import numba
 import numpy as np
 from jaxtyping import Float64
 
+from octasplat.engine.core.compilation import run_ranges
+from octasplat.engine.pathtracing.kernels.kernel_args import AlbedoTables
 from octasplat.engine.pathtracing.kernels.principled_bsdf import BURLEY, COUPLED
 from octasplat.engine.pathtracing.kernels.principled_bsdf_arrays import (
+    BsdfArrays,
     fresnel_values,
     integrate_albedo,
     principled_eval_array,
@@ -46,7 +50,10 @@ class AlbedoTable:
 def albedo_table(ior: float | None) -> AlbedoTable:
     """The table of a dielectric's surface, or of facets that reflect everything where ``ior`` is None."""
     table = np.empty((TABLE_ROUGHNESSES, TABLE_COSINES))
-    integrate_albedo(0.0 if ior is None else ior, TABLE_SAMPLES, table)
+    run_ranges(
+        integrate_albedo, numba.get_num_threads(), len(table),
+        0.0 if ior is None else ior, TABLE_SAMPLES, table, grain=1,
+    )  # fmt: skip
     cosines = np.linspace(0.0, 1.0, TABLE_COSINES)
     # The table is linear between its columns; Simpson's rule is exact for that times the cosine.
     middles = 0.5 * (cosines[1:] + cosines[:-1])
@@ -66,7 +73,9 @@ def rough_dielectric_table(eta: float) -> AlbedoTable:
         eta: index of refraction on the far side over that on the near side.
     """
     table = np.empty((TABLE_ROUGHNESSES, TABLE_COSINES))
-    integrate_rough_dielectric(eta, TABLE_SAMPLES, table)
+    run_ranges(
+        integrate_rough_dielectric, numba.get_num_threads(), len(table), eta, TABLE_SAMPLES, table, grain=1
+    )
     return AlbedoTable(table, np.ones((TABLE_ROUGHNESSES, 2)))
 
 
@@ -87,7 +96,9 @@ class RoughGlass:
     ) -> tuple[Float64[np.ndarray, " n"], Float64[np.ndarray, " n"]]:
         """Values of basic radiance times the cosine to the light, and the density of :meth:`sample`."""
         values, pdf = np.empty((2, len(to_viewer)))
-        rough_dielectric_eval_array(to_viewer, to_light, self.eta, self.roughness**2, values, pdf)
+        rough_dielectric_eval_array(
+            0, len(values), to_viewer, to_light, self.eta, self.roughness**2, values, pdf
+        )
         return values, pdf
 
     def sample(
@@ -95,7 +106,9 @@ class RoughGlass:
     ) -> Float64[np.ndarray, "n 3"]:
         """Directions to the light from three numbers in [0, 1) each."""
         to_light = np.empty((len(to_viewer), 3))
-        rough_dielectric_sample_array(to_viewer, self.eta, self.roughness**2, uniform, to_light)
+        rough_dielectric_sample_array(
+            0, len(to_light), to_viewer, self.eta, self.roughness**2, uniform, to_light
+        )
         return to_light
 
 
@@ -125,11 +138,8 @@ class OpaqueMaterial:
         """Values times the cosine to the light, and the density of :meth:`sample` over solid angle."""
         values, pdf = np.empty((len(to_viewer), 3)), np.empty(len(to_viewer))
         coat = albedo_table(self.ior)
-        principled_eval_array(
-            to_viewer, to_light, self.colours_linear, self.metallic, self.roughness, self.ior,
-            BURLEY if self.ground == "burley" else COUPLED, self.multiple_scattering,
-            albedo_table(None).directional, coat.directional, coat.mean, values, pdf,
-        )  # fmt: skip
+        tables = AlbedoTables(albedo_table(None).directional, coat.directional, coat.mean)
+        principled_eval_array(0, len(values), to_viewer, to_light, self._arrays(), tables, values, pdf)
         return values, pdf
 
     def sample(
@@ -138,10 +148,14 @@ class OpaqueMaterial:
         """Directions to the light from three numbers in [0, 1) each; some lie below the surface."""
         to_light = np.empty((len(to_viewer), 3))
         coat = albedo_table(self.ior).directional
-        principled_sample_array(
-            to_viewer, self.colours_linear, self.metallic, self.roughness, coat, uniform, to_light
-        )
+        principled_sample_array(0, len(to_light), to_viewer, self._arrays(), coat, uniform, to_light)
         return to_light
+
+    def _arrays(self) -> BsdfArrays:
+        substrate = BURLEY if self.ground == "burley" else COUPLED
+        return BsdfArrays(
+            self.colours_linear, self.metallic, self.roughness, self.ior, substrate, self.multiple_scattering
+        )
 
 
 def fresnel(

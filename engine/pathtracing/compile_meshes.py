@@ -12,11 +12,15 @@ from octasplat.engine.core.errors import ConfigError
 from octasplat.engine.core.rays import RayBatch
 from octasplat.engine.pathtracing.environment import EnvironmentMap, environment_frame
 from octasplat.engine.pathtracing.imported_materials import ImportedMaterial, import_material
-from octasplat.engine.pathtracing.kernels.kernel_args import MaterialArrays, MeshQueries, SurfaceArrays
+from octasplat.engine.pathtracing.kernels.kernel_args import (
+    LightArrays,
+    MaterialArrays,
+    MeshQueries,
+    SurfaceArrays,
+)
 from octasplat.engine.pathtracing.kernels.surface import GLASS
 from octasplat.engine.pathtracing.lights import (
     EmissiveMesh,
-    LightArrays,
     build_light_arrays,
     rectangle_sides,
     triangle_areas,

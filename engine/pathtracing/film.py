@@ -1,8 +1,8 @@
 """What paths gathered, pixel by pixel, and the picture that it makes.
 
 A pixel has a front layer of Gaussians (premultiplied display colour, transmittance, and the factor that the
-stage's lights give to it) and linear light behind it; see :mod:`octasplat.engine.pathtracing.kernels.gaussian_layer` for the
-reason.
+stage's lights give to it) and linear light behind it; see
+:mod:`octasplat.engine.pathtracing.kernels.gaussian_layer` for the reason.
 
 Gaussians with materials that the camera sees are a part of the pixel of their own, encoded by itself, so that
 their edges blend in display values as photographs with alpha do.

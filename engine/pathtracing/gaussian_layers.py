@@ -33,7 +33,8 @@ class GaussianLayers:
     """Gaussians, with features that say how they take light.
 
     Attributes:
-        tracer: all Gaussians, with the features of :mod:`octasplat.engine.pathtracing.kernels.gaussian_layer`.
+        tracer: all Gaussians, with the features of
+            :mod:`octasplat.engine.pathtracing.kernels.gaussian_layer`.
         min_transmittance: transmittance at which a ray counts as ended.
         mesh_shadow_tracer: those that cast shadows on meshes; None where none do.
         gaussian_shadow_tracer: those that cast shadows on Gaussians.

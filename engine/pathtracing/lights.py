@@ -13,7 +13,7 @@ from octasplat.engine.pathtracing.environment import (
     build_environment_sampler,
     mean_irradiance,
 )
-from octasplat.engine.pathtracing.kernels.lights import (
+from octasplat.engine.pathtracing.kernels.kernel_args import (
     DIRECTIONAL,
     ENVIRONMENT,
     MESH,
@@ -21,9 +21,9 @@ from octasplat.engine.pathtracing.kernels.lights import (
     RECTANGLE,
     SPHERE,
     SPOT,
-    eval_environment_array,
-    light_samples,
+    LightArrays,
 )
+from octasplat.engine.pathtracing.kernels.lights import eval_environment_array, light_samples
 from octasplat.engine.pathtracing.stage.model import (
     DirectionalLight,
     Light,
@@ -48,66 +48,6 @@ class EmissiveMesh:
     corner_uv: Float32[np.ndarray, "f 3 2"]
     rgb_linear: Float64[np.ndarray, "3"]
     texture: int = -1
-
-
-class LightArrays(NamedTuple):
-    """``l`` lights: those of the stage, shining meshes, and the environment where there is one.
-
-    Attributes:
-        kinds: which of the kinds of :mod:`octasplat.engine.pathtracing.kernels.lights`.
-        positions_world: of points and spots; centres of rectangles, balls and meshes.
-        axes: unit vectors: the way that the light goes, or a rectangle faces.
-        rgb_linear: intensity, irradiance or radiance; of the environment pi times its mean radiance.
-        sides_u: one side of a rectangle.
-        sides_v: the other side.
-        areas: of rectangles and meshes; of balls that of their disc.
-        cosines: of a spot's outer and inner angle.
-        is_hittable: whether rays meet the light, so that it counts for those too.
-        adds_light: whether the light is added to shadowed Gaussians.
-        any_adds_light: whether any is.
-        textures: of meshes, -1 for none.
-        mesh_rows: of meshes: first and last row of their sums, and first triangle.
-        mesh_cdf: cumulative shares of the triangles' areas, from 0 to 1 for each mesh.
-        mesh_corners_world: of the triangles of all meshes.
-        mesh_uv: likewise.
-        texels_linear: see :class:`octasplat.engine.pathtracing.kernels.kernel_args.MaterialArrays`, as the next one.
-        texture_sizes: first texel, height and width of each.
-        environment_linear: the map, one black pixel without one.
-        environment_row_cdf: see :class:`octasplat.engine.pathtracing.environment.EnvironmentSampler`, as the next two.
-        environment_column_cdf: cumulative shares within each row.
-        environment_probabilities: share of each pixel.
-        environment_frame: rows are right, up, forward of the map.
-    """
-
-    kinds: Int32[np.ndarray, " l"]
-    positions_world: Float64[np.ndarray, "l 3"]
-    axes: Float64[np.ndarray, "l 3"]
-    rgb_linear: Float64[np.ndarray, "l 3"]
-    sides_u: Float64[np.ndarray, "l 3"]
-    sides_v: Float64[np.ndarray, "l 3"]
-    areas: Float64[np.ndarray, " l"]
-    cosines: Float64[np.ndarray, "l 2"]
-    is_hittable: Int32[np.ndarray, " l"]
-    adds_light: Int32[np.ndarray, " l"]
-    any_adds_light: bool
-    textures: Int32[np.ndarray, " l"]
-    mesh_rows: Int64[np.ndarray, "l 3"]
-    mesh_cdf: Float64[np.ndarray, " s"]
-    mesh_corners_world: Float32[np.ndarray, "f 3 3"]
-    mesh_uv: Float32[np.ndarray, "f 3 2"]
-    texels_linear: Float32[np.ndarray, "x 3"]
-    texture_sizes: Int64[np.ndarray, "k 3"]
-    environment_linear: Float32[np.ndarray, "h w 3"]
-    environment_row_cdf: Float64[np.ndarray, " h1"]
-    environment_column_cdf: Float64[np.ndarray, "h w1"]
-    environment_probabilities: Float64[np.ndarray, "h w"]
-    environment_frame: Float64[np.ndarray, "3 3"]
-
-    @property
-    def environment_id(self) -> int:
-        """The environment's place among the lights, -1 without one."""
-        count = len(self.kinds)
-        return count - 1 if count and self.kinds[-1] == ENVIRONMENT else -1
 
 
 def build_light_arrays(

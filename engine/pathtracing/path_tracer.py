@@ -26,8 +26,13 @@ from octasplat.engine.pathtracing.kernels.kernel_args import (
     BLOCK_SIZE,
     CameraRays,
     IntegratorParameters,
+    LayerArrays,
+    MeshHits,
+    MeshScene,
     PathArrays,
+    PathBlock,
     PathScratch,
+    PathStart,
     ShadowRayArrays,
     SurfaceInteractions,
     allocate_path_scratch,
@@ -191,9 +196,7 @@ class PathTracer:
         batches: list["_Batch"],
     ) -> Iterator[None]:
         """Follow paths among meshes alone, a batch a thread; yields before each batch that is waited for."""
-        meshes = self._scene.meshes
-        given = (meshes.queries, meshes.surfaces, meshes.materials, meshes.lights)
-        environment = meshes.lights.environment_id
+        scene, queries = self._mesh_scene, self._scene.meshes.queries
         free: Queue[_Workspace] = Queue()
         for scratch in self._scratches:
             free.put(_Workspace.allocate(scratch))
@@ -202,10 +205,10 @@ class PathTracer:
             room = free.get()
             try:
                 paths = room.paths(len(batch.pixels) * batch.paths_per_pixel)
+                start = batch.start(camera_rays, order)
                 trace_paths(
-                    len(paths.keys), room.scratch, camera_rays, self._integrator, batch.first_pixel, batch.paths_per_pixel,
-                    batch.first_sample, order, t_min, INFINITE_T_MAX, paths, room.active, room.distances, room.faces,
-                    room.barycentrics, *given, environment, room.shadows, room.transmittance,
+                    len(paths.keys), room.scratch, self._integrator, start, scene, queries,
+                    t_min, INFINITE_T_MAX, paths, room.block,
                 )  # fmt: skip
                 film.add(paths, batch.pixels)
             finally:
@@ -232,10 +235,8 @@ class PathTracer:
         for batch in batches:
             yield
             paths = allocate_paths(len(batch.pixels) * batch.paths_per_pixel)
-            self._run_kernel(
-                start_paths, len(paths.keys), camera_rays, self._integrator, batch.first_pixel, batch.paths_per_pixel, batch.first_sample,
-                order, paths,
-            )  # fmt: skip
+            start = batch.start(camera_rays, order)
+            self._run_kernel(start_paths, len(paths.keys), self._integrator, start, paths)
             self._trace_paths(paths, t_min)
             film.add(paths, batch.pixels)
 
@@ -259,8 +260,8 @@ class PathTracer:
         count = len(interactions.points_world)
         paths, shadows = allocate_paths(count), allocate_shadow_rays(count)
         self._run_kernel(
-            start_paths_at_surfaces, count, interactions, pixels, samples, self._integrator, meshes.materials, meshes.lights,
-            paths, shadows,
+            start_paths_at_surfaces, count, interactions, pixels, samples, self._integrator,
+            meshes.materials, meshes.lights, paths, shadows,
         )  # fmt: skip
         every = np.arange(count, dtype=np.int32)
         self._add_surface_light(paths, every, shadows, None if layers is None else layers.tracer)
@@ -278,8 +279,7 @@ class PathTracer:
 
         ``active`` are those that are left after they ``first_depth`` so many surfaces; None stands for all.
         """
-        meshes, layers = self._scene.meshes, self._scene.layers
-        environment = meshes.lights.environment_id
+        meshes, layers, scene = self._scene.meshes, self._scene.layers, self._mesh_scene
         active = np.arange(len(paths.keys), dtype=np.int32) if active is None else active
         for depth in range(first_depth, self._integrator.max_depth + 1):
             rays = RayBatch(
@@ -292,32 +292,36 @@ class PathTracer:
             shadows = allocate_shadow_rays(len(active))
             if layers is not None:
                 seen = layers.trace(rays, hits.distances)
+                layer = LayerArrays(
+                    seen.rgb_srgb, seen.transmittance, seen.depth_median, seen.depth_sum, seen.normal_world,
+                    seen.features,
+                )  # fmt: skip
                 if layers.has_material_surfaces:
                     self._run_kernel(
-                        intersect_gaussian_surfaces, len(active), paths, active, depth, hits.faces, seen.rgb_srgb,
-                        seen.transmittance, seen.depth_median, seen.depth_sum, seen.normal_world,
-                        seen.features, meshes.materials, meshes.lights, self._integrator, layers.min_transmittance,
-                        shadows,
+                        intersect_gaussian_surfaces, len(active), paths, active, depth, hits.faces, layer,
+                        scene, self._integrator, layers.min_transmittance, shadows,
                     )  # fmt: skip
                     self._add_surface_light(paths, active, shadows, layers.tracer)
                 self._run_kernel(
-                    intersect_gaussian_layers, len(active), paths, active, depth, hits.distances, hits.faces,
-                    seen.rgb_srgb, seen.transmittance, seen.depth_median, seen.depth_sum, seen.normal_world,
-                    seen.features, meshes.lights, environment, self._integrator, meshes.materials.absorption,
-                    layers.min_transmittance, shadows,
+                    intersect_gaussian_layers, len(active), paths, active, depth, hits.faces, layer,
+                    scene, self._integrator, layers.min_transmittance, shadows,
                 )  # fmt: skip
                 self._add_layer_light(paths, active, shadows, layers)
+            met = MeshHits(hits.distances, hits.faces, hits.barycentrics)
             self._run_kernel(
-                shade_surfaces, len(active),
-                paths, active, depth, hits.distances, hits.faces, hits.barycentrics,
-                meshes.surfaces, meshes.materials, meshes.lights, environment, self._integrator, shadows,
-            )  # fmt: skip
+                shade_surfaces, len(active), paths, active, depth, met, scene, self._integrator, shadows
+            )
             self._add_surface_light(
                 paths, active, shadows, None if layers is None else layers.mesh_shadow_tracer
             )
             active = active[paths.is_alive[active]]
             if len(active) == 0:
                 return
+
+    @property
+    def _mesh_scene(self) -> MeshScene:
+        meshes = self._scene.meshes
+        return MeshScene(meshes.surfaces, meshes.materials, meshes.lights, meshes.lights.environment_id)
 
     def _shadow_transmittance(
         self, shadows: ShadowRayArrays, *, passes_rough_glass: bool = False
@@ -369,8 +373,8 @@ class PathTracer:
                     _shadow_ray_batch(shadows, asked[needed], layers.shadow_bias)
                 )
         self._run_kernel(
-            add_layer_light, len(asked), paths, active[asked], shadows.radiance_linear[asked], shadows.occluded_radiance_linear[asked],
-            share, through[0], through[1],
+            add_layer_light, len(asked), paths, active[asked], shadows.radiance_linear[asked],
+            shadows.occluded_radiance_linear[asked], share, through[0], through[1],
         )  # fmt: skip
 
     def _run_kernel(self, kernel: Callable[..., None], rows: int, *arguments: object) -> None:
@@ -387,12 +391,16 @@ class PathTracer:
 
 
 class _Batch(NamedTuple):
-    """Paths that are followed together: ``paths_per_pixel`` of the pixels from place ``first_pixel`` on in their order."""
+    """Paths that are followed together: of the pixels from place ``first_pixel`` on in their order."""
 
     first_pixel: int
     pixels: Int64[np.ndarray, " n"]
     paths_per_pixel: int
     first_sample: int
+
+    def start(self, camera_rays: CameraRays, order: Int64[np.ndarray, " n"]) -> PathStart:
+        """What kernels begin the paths from; ``order`` is that of the pixels."""
+        return PathStart(camera_rays, order, self.first_pixel, self.paths_per_pixel, self.first_sample)
 
 
 @dataclass(frozen=True)
@@ -401,20 +409,19 @@ class _Workspace:
 
     scratch: PathScratch
     all_paths: PathArrays
-    shadows: ShadowRayArrays
-    active: Int32[np.ndarray, " b"]
-    distances: Float32[np.ndarray, " b"]
-    faces: Int32[np.ndarray, " b"]
-    barycentrics: Float32[np.ndarray, "b 2"]
-    transmittance: Float32[np.ndarray, "b 3"]
+    block: PathBlock
 
     @classmethod
     def allocate(cls, scratch: PathScratch) -> "_Workspace":
-        return cls(
-            scratch, allocate_paths(PATHS_PER_THREAD), allocate_shadow_rays(BLOCK_SIZE), np.empty(BLOCK_SIZE, np.int32),
-            np.empty(BLOCK_SIZE, np.float32), np.empty(BLOCK_SIZE, np.int32), np.empty((BLOCK_SIZE, 2), np.float32),
+        hits = MeshHits(
+            np.empty(BLOCK_SIZE, np.float32), np.empty(BLOCK_SIZE, np.int32),
+            np.empty((BLOCK_SIZE, 2), np.float32),
+        )  # fmt: skip
+        block = PathBlock(
+            np.empty(BLOCK_SIZE, np.int32), hits, allocate_shadow_rays(BLOCK_SIZE),
             np.empty((BLOCK_SIZE, 3), np.float32),
         )  # fmt: skip
+        return cls(scratch, allocate_paths(PATHS_PER_THREAD), block)
 
     def paths(self, count: int) -> PathArrays:
         """The first so many paths."""

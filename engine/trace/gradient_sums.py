@@ -28,7 +28,10 @@ def add_gradients(parts: Sequence[GaussianGradients]) -> GaussianGradients:
 
 
 def drop_low_weight(gradients: GaussianGradients, min_blend_weight: float) -> GaussianGradients:
-    """Those of the Gaussians whose weights add up to ``min_blend_weight`` or more; of all, the same object."""
+    """Those of the Gaussians whose weights add up to ``min_blend_weight`` or more.
+
+    Of all, the same object.
+    """
     enough = gradients.weight_sums >= min_blend_weight
     if enough.all():
         return gradients

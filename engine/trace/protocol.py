@@ -192,9 +192,10 @@ class GradientsHandle(Protocol):
 class Tracer(Protocol):
     """Traces rays through a set of flat Gaussians and differentiates what they see.
 
-    Rays and outputs are numpy arrays: an iteration has about a megabyte of them, and losses and shading work
-    on them here. What has the size of the Gaussians or of their hits is opaque: recordings are only handed
-    back, and gradients are read through :meth:`GradientsHandle.numpy`. So a tracer may keep the parameters on a
+    Rays and outputs are numpy arrays: an iteration has about a megabyte of them, and losses and shading
+    work on them here. What has the size of the Gaussians or of their hits is opaque: recordings are only
+    handed back, and gradients are read through :meth:`GradientsHandle.numpy`. So a tracer may keep the
+    parameters on a
     device: it uploads them in :meth:`build` and the changed rows in :meth:`refresh`, and leaves its gradients
     where they are, for an optimiser beside them or until somebody asks. (Not chosen: one learner with trace,
     step and download, which would take optimiser, densification and checkpoints into every tracer.)
@@ -239,7 +240,8 @@ class Tracer(Protocol):
     ) -> GradientsHandle:
         """Gradients of the parameters for the rays of a recording of this tracer since its last build.
 
-        Gaussians whose weights alpha T on all these rays add up to less than ``min_blend_weight`` are left out.
+        Gaussians whose weights alpha T on all these rays add up to less than ``min_blend_weight`` are left
+        out.
 
         Raises:
             ValueError: the recording is another tracer's, or older than the last build.

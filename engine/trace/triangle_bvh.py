@@ -6,8 +6,8 @@ import numba
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int, Int32
 
+from octasplat.engine.core.compilation import run_ranges
 from octasplat.engine.core.rays import RayBatch
-from octasplat.engine.core.threads import use_threads
 from octasplat.engine.trace.cpu.memory import aligned_empty
 from octasplat.engine.trace.embree import (
     EmbreeDevice,
@@ -19,13 +19,11 @@ from octasplat.engine.trace.kernels.triangles import (
     LANES,
     SCRATCH_ROWS,
     EmbreeQuery,
-    any_hits,
-    any_hits_parallel,
-    closest_hits,
-    closest_hits_parallel,
+    TriangleHitArrays,
+    TriangleRays,
+    write_any_hits,
+    write_closest_hits,
 )
-
-CHUNKS_PER_THREAD = 16
 
 
 @dataclass(frozen=True)
@@ -59,7 +57,7 @@ class TriangleBvh:
         threads: threads for building and tracing; 0 takes all that numba has. With 1 the methods may be
             called from several threads at once.
 
-    >>> corner = TriangleScene(np.eye(3, dtype=np.float32), np.array([[0, 1, 2]]))
+    >>> corner = TriangleBvh(np.eye(3, dtype=np.float32), np.array([[0, 1, 2]]))
     >>> towards = np.full((1, 3), 2.0, np.float32)
     >>> float(corner.closest(RayBatch(np.zeros((1, 3)), towards)).distances[0] * 6)
     1.0
@@ -86,28 +84,24 @@ class TriangleBvh:
     def closest(self, rays: RayBatch) -> TriangleHits:
         """The nearest triangle between ``t_min`` and ``t_max`` of each ray."""
         count = len(rays)
-        distances, faces = np.empty(count, np.float32), np.empty(count, np.int32)
-        barycentrics = np.empty((count, 2), np.float32)
-        query = (self.closest_query, *_ray_arrays(rays), _ALL_RAYS)
-        if self._threads == 1:
-            closest_hits(
-                *query, 0, count, False, allocate_embree_scratch(1)[0], distances, faces, barycentrics
-            )
-        else:
-            use_threads(self._threads)
-            closest_hits_parallel(*query, self._allocate_scratch(count), distances, faces, barycentrics)
-        return TriangleHits(distances, faces, barycentrics)
+        out = TriangleHitArrays(
+            np.empty(count, np.float32), np.empty(count, np.int32), np.empty((count, 2), np.float32)
+        )
+        scratch = self._allocate_scratch(count)
+        run_ranges(
+            write_closest_hits, self._threads, len(scratch),
+            self.closest_query, _ray_arrays(rays), scratch, out, grain=1,
+        )  # fmt: skip
+        return TriangleHits(*out)
 
     def occluded(self, rays: RayBatch) -> Bool[np.ndarray, " r"]:
         """Whether any triangle lies between ``t_min`` and ``t_max`` of each ray; cheaper than the first."""
-        count = len(rays)
-        found = np.empty(count, np.bool_)
-        query = (self.any_query, *_ray_arrays(rays), _ALL_RAYS)
-        if self._threads == 1:
-            any_hits(*query, 0, count, allocate_embree_scratch(1)[0], found)
-        else:
-            use_threads(self._threads)
-            any_hits_parallel(*query, self._allocate_scratch(count), found)
+        found = np.empty(len(rays), np.bool_)
+        scratch = self._allocate_scratch(len(rays))
+        run_ranges(
+            write_any_hits, self._threads, len(scratch),
+            self.any_query, _ray_arrays(rays), scratch, found, grain=1,
+        )  # fmt: skip
         return found
 
     @property
@@ -121,7 +115,7 @@ class TriangleBvh:
         return EmbreeQuery(occluded8_address(), self._scene.handle)
 
     def _allocate_scratch(self, rays: int) -> Float32[np.ndarray, "c w"]:
-        return allocate_embree_scratch(max(1, min(rays, CHUNKS_PER_THREAD * self._threads)))
+        return allocate_embree_scratch(max(1, min(rays, self._threads)))
 
 
 _ALL_RAYS = np.empty(0, np.int32)
@@ -132,5 +126,5 @@ def allocate_embree_scratch(chunks: int) -> Float32[np.ndarray, "c w"]:
     return aligned_empty((chunks, SCRATCH_ROWS * LANES))
 
 
-def _ray_arrays(rays: RayBatch) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    return rays.origins_world, rays.directions_world, rays.t_min, rays.t_max
+def _ray_arrays(rays: RayBatch) -> TriangleRays:
+    return TriangleRays(rays.origins_world, rays.directions_world, rays.t_min, rays.t_max, _ALL_RAYS)

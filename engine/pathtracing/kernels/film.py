@@ -1,13 +1,23 @@
 """Sums over the paths of each pixel."""
 
+import numpy as np
+from jaxtyping import Float32, Float64, Int64
+
 from octasplat.engine.core.compilation import kernel
 
 
 @kernel(_nrt=False, error_model="numpy")
-def accumulate_pixels(values, factors, paths_per_pixel, pixels, sums):
-    """Add to the rows ``pixels`` of ``sums`` those of ``values``, ``paths_per_pixel`` a pixel, times ``factors``.
+def accumulate_pixels(
+    values: Float32[np.ndarray, "p c"],
+    factors: Float32[np.ndarray, " p"],
+    paths_per_pixel: int,
+    pixels: Int64[np.ndarray, " i"],
+    sums: Float64[np.ndarray, "n c"],
+) -> None:
+    """Add the values of the paths of each pixel to the rows ``pixels`` of ``sums``.
 
-    All is summed in float64, one after the other. Without factors (no rows at all) values count as they are.
+    ``values`` has ``paths_per_pixel`` rows a pixel, which count ``factors`` times. All is summed in
+    float64, one after the other. Without factors (no rows at all) values count as they are.
     """
     for i in range(len(pixels)):
         for channel in range(values.shape[1]):

@@ -14,8 +14,22 @@ composited as such, into one layer of premultiplied colour g and transmittance T
 
 import math
 
+import numpy as np
+from jaxtyping import Float32, Float64, Int32
+
 from octasplat.engine.core.compilation import kernel
-from octasplat.engine.pathtracing.kernels.kernel_args import SAMPLE_PAIRS_PER_BOUNCE
+from octasplat.engine.pathtracing.kernels.kernel_args import (
+    SAMPLE_PAIRS_PER_BOUNCE,
+    IntegratorParameters,
+    LayerArrays,
+    LightQuery,
+    MeshScene,
+    PathArrays,
+    PathScratch,
+    Rgb,
+    ShadowRayArrays,
+    Vec3,
+)
 from octasplat.engine.pathtracing.kernels.lights import (
     INFINITE_DISTANCE,
     additive_light_probability,
@@ -45,7 +59,7 @@ SHADOWED, RELIT, AMBIENT = 0, 1, 2
 
 
 @njit_no_refcount(forceinline=True)
-def encode_srgb(linear):
+def encode_srgb(linear: float) -> float:
     """The display value of a linear one (IEC 61966-2-1), also beyond 1."""
     if linear <= 0.0031308:
         return 12.92 * max(linear, 0.0)
@@ -53,92 +67,149 @@ def encode_srgb(linear):
 
 
 @njit_no_refcount(forceinline=True)
-def decode_srgb(display):
+def decode_srgb(display: float) -> float:
     """The linear value of a display value, also beyond 1."""
     if display <= 0.04045:
         return max(display, 0.0) / 12.92
     return ((display + 0.055) / 1.055) ** 2.4
 
 
+@njit_no_refcount(forceinline=True)
+def _layer_distance(layer: LayerArrays, k: int, share: float) -> float:
+    """Return where a layer of coverage ``share`` lies.
+
+    The mean distance is smoother than the median, but lies in the air where the layer is two surfaces.
+    """
+    distance = layer.depth_sum[k] / share
+    median = layer.depth_median[k]
+    if abs(distance - median) > SINGLE_SURFACE_TOLERANCE * median and median > 0.0:
+        distance = median
+    return distance
+
+
+@njit_no_refcount(forceinline=True)
+def _layer_throughput(
+    paths: PathArrays,
+    p: int,
+    layer: LayerArrays,
+    k: int,
+    share: float,
+    distance: float,
+    absorption: Float64[np.ndarray, "m 3"],
+) -> Rgb:
+    """Return what one unit of a layer's light counts: of its coverage on clear paths, else of its color."""
+    if paths.flags[p] & FLAG_LOSSLESS != 0:
+        g_r = g_g = g_b = paths.transmittance[p] * share
+        return g_r, g_g, g_b
+    w = paths.throughput[p]
+    g_r = w[0] * share * decode_srgb(layer.rgb[k, 0] / share)
+    g_g = w[1] * share * decode_srgb(layer.rgb[k, 1] / share)
+    g_b = w[2] * share * decode_srgb(layer.rgb[k, 2] / share)
+    if paths.medium_ids[p] >= 0:
+        medium = absorption[paths.medium_ids[p]]
+        g_r *= math.exp(-medium[0] * distance)
+        g_g *= math.exp(-medium[1] * distance)
+        g_b *= math.exp(-medium[2] * distance)
+    return g_r, g_g, g_b
+
+
+@njit_no_refcount(forceinline=True)
+def _query_layer_light(
+    paths: PathArrays,
+    p: int,
+    first_pair: int,
+    point: Vec3,
+    normal: Vec3,
+    weight: Rgb,
+    shadowed: float,
+    relit: float,
+    query: LightQuery,
+) -> None:
+    """Ask a light at a layer.
+
+    ``weight`` is what one unit of the layer's light counts, ``shadowed`` the share of it that shadows take,
+    and ``relit`` the share that the lights give.
+    """
+    lights, shadows, k = query.lights, query.shadows, query.k
+    (x, y, z), (g_r, g_g, g_b) = point, weight
+    _, pick = uniform_pair(paths.keys[p], paths.samples[p], first_pair + LIGHT_CHOICE_SAMPLE)
+    l, chance = sample_light_index(lights, x, y, z, pick)
+    if l < 0:
+        return
+    u, v = uniform_pair(paths.keys[p], paths.samples[p], first_pair + LAYER_LIGHT_SAMPLE)
+    w_x, w_y, w_z, reach, l_r, l_g, l_b, pdf = sample_light(lights, l, x, y, z, u, v)
+    n_x, n_y, n_z = normalize(normal[0], normal[1], normal[2])
+    cosine = max(n_x * w_x + n_y * w_y + n_z * w_z, 0.0)
+    taking = relit + (shadowed if lights.adds_light[l] else 0.0)
+    factor = taking * cosine / (math.pi * chance * (pdf if pdf > 0.0 else 1.0))
+    shadows.radiance_linear[k, 0] = g_r * l_r * factor
+    shadows.radiance_linear[k, 1] = g_g * l_g * factor
+    shadows.radiance_linear[k, 2] = g_b * l_b * factor
+    if shadowed > MIN_COVERAGE and not lights.adds_light[l]:
+        # Only among the lights that take something is the shadow a mean.
+        losing = shadowed / max(1.0 - additive_light_probability(lights, x, y, z), 1e-6)
+        shadows.occluded_radiance_linear[k, 0] = -g_r * losing
+        shadows.occluded_radiance_linear[k, 1] = -g_g * losing
+        shadows.occluded_radiance_linear[k, 2] = -g_b * losing
+    shadows.origins_world[k, 0], shadows.origins_world[k, 1], shadows.origins_world[k, 2] = x, y, z
+    shadows.directions_world[k, 0] = w_x
+    shadows.directions_world[k, 1] = w_y
+    shadows.directions_world[k, 2] = w_z
+    shadows.passes_glass[k] = True
+    shadows.t_max[k] = reach * SHADOW_RAY_SCALE if reach < INFINITE_DISTANCE else math.inf
+
+
 @kernel(_nrt=False, error_model="numpy")
 def intersect_gaussian_layers(
-    first, last, scratch, paths, active, depth, distances, faces,
-    rgb, transmittance, depth_median, depth_sum, normals, features,
-    lights, environment, integrator, absorption, min_transmittance, shadows,
-):  # fmt: skip
+    first: int,
+    last: int,
+    scratch: PathScratch,
+    paths: PathArrays,
+    active: Int32[np.ndarray, " n"],
+    depth: int,
+    faces: Int32[np.ndarray, " n"],
+    layer: LayerArrays,
+    scene: MeshScene,
+    integrator: IntegratorParameters,
+    min_transmittance: float,
+    shadows: ShadowRayArrays,
+) -> None:
     """Put the layers of Gaussians in front of the surfaces ``faces`` onto the paths ``active``.
 
-    ``shadows`` gets what the layers ask of lights. A ray of which less than ``min_transmittance`` is left ends: its
-    face becomes :data:`ENDED`.
+    ``shadows`` gets what the layers ask of lights. A ray of which less than ``min_transmittance`` is left
+    ends: its face becomes :data:`PATH_ENDED`.
     """
+    lights, absorption = scene.lights, scene.materials.absorption
     for k in range(first, last):
         p = active[k]
         for channel in range(3):
             shadows.radiance_linear[k, channel] = shadows.occluded_radiance_linear[k, channel] = 0.0
-        left = float(transmittance[k])
+        left = float(layer.transmittance[k])
         share = 1.0 - left
         if share <= MIN_COVERAGE:
             continue
         d, o = paths.directions_world[p], paths.origins_world[p]
         clear = paths.flags[p] & FLAG_LOSSLESS != 0
-        shadowed, relit = features[k, SHADOWED] / share, features[k, RELIT] / share
-        base = 1.0 - relit + features[k, AMBIENT] / share
-        # The mean distance is smoother than the median, but lies in the air where the layer is two surfaces.
-        distance = depth_sum[k] / share
-        if (
-            abs(distance - depth_median[k]) > SINGLE_SURFACE_TOLERANCE * depth_median[k]
-            and depth_median[k] > 0.0
-        ):
-            distance = depth_median[k]
-        b_r, b_g, b_b = eval_background(lights, environment, integrator, paths.flags[p], d[0], d[1], d[2])
-        # --- what one unit of the layer's light counts, and how its colour is lit ---
-        if clear:
-            g_r = g_g = g_b = paths.transmittance[p] * share
-        else:
-            w = paths.throughput[p]
-            g_r = w[0] * share * decode_srgb(rgb[k, 0] / share)
-            g_g = w[1] * share * decode_srgb(rgb[k, 1] / share)
-            g_b = w[2] * share * decode_srgb(rgb[k, 2] / share)
-            if paths.medium_ids[p] >= 0:
-                medium = absorption[paths.medium_ids[p]]
-                g_r *= math.exp(-medium[0] * distance)
-                g_g *= math.exp(-medium[1] * distance)
-                g_b *= math.exp(-medium[2] * distance)
+        features = layer.features[k]
+        shadowed, relit = features[SHADOWED] / share, features[RELIT] / share
+        base = 1.0 - relit + features[AMBIENT] / share
+        distance = _layer_distance(layer, k, share)
+        b_r, b_g, b_b = eval_background(
+            lights, scene.environment, integrator, paths.flags[p], d[0], d[1], d[2]
+        )
+        # --- what one unit of the layer's light counts, and how its color is lit ---
+        g_r, g_g, g_b = _layer_throughput(paths, p, layer, k, share, distance, absorption)
         lit_by_stage = shadowed > MIN_COVERAGE or relit > MIN_COVERAGE
         if lit_by_stage and len(lights.kinds):
-            x, y, z = o[0] + distance * d[0], o[1] + distance * d[1], o[2] + distance * d[2]
+            point = o[0] + distance * d[0], o[1] + distance * d[1], o[2] + distance * d[2]
             first_pair = CAMERA_SAMPLE_PAIRS + depth * SAMPLE_PAIRS_PER_BOUNCE
-            _, pick = uniform_pair(paths.keys[p], paths.samples[p], first_pair + LIGHT_CHOICE_SAMPLE)
-            l, chance = sample_light_index(lights, x, y, z, pick)
-            if l >= 0:
-                u, v = uniform_pair(paths.keys[p], paths.samples[p], first_pair + LAYER_LIGHT_SAMPLE)
-                w_x, w_y, w_z, reach, l_r, l_g, l_b, pdf = sample_light(lights, l, x, y, z, u, v)
-                n_x, n_y, n_z = normalize(normals[k, 0], normals[k, 1], normals[k, 2])
-                cosine = max(n_x * w_x + n_y * w_y + n_z * w_z, 0.0)
-                taking = relit + (shadowed if lights.adds_light[l] else 0.0)
-                factor = taking * cosine / (math.pi * chance * (pdf if pdf > 0.0 else 1.0))
-                shadows.radiance_linear[k, 0] = g_r * l_r * factor
-                shadows.radiance_linear[k, 1] = g_g * l_g * factor
-                shadows.radiance_linear[k, 2] = g_b * l_b * factor
-                if shadowed > MIN_COVERAGE and not lights.adds_light[l]:
-                    # Only among the lights that take something is the shadow a mean.
-                    losing = shadowed / max(1.0 - additive_light_probability(lights, x, y, z), 1e-6)
-                    shadows.occluded_radiance_linear[k, 0] = -g_r * losing
-                    shadows.occluded_radiance_linear[k, 1] = -g_g * losing
-                    shadows.occluded_radiance_linear[k, 2] = -g_b * losing
-                shadows.origins_world[k, 0], shadows.origins_world[k, 1], shadows.origins_world[k, 2] = (
-                    x,
-                    y,
-                    z,
-                )
-                shadows.directions_world[k, 0] = w_x
-                shadows.directions_world[k, 1] = w_y
-                shadows.directions_world[k, 2] = w_z
-                shadows.passes_glass[k] = True
-                shadows.t_max[k] = reach * SHADOW_RAY_SCALE if reach < INFINITE_DISTANCE else math.inf
+            normal = layer.normals[k, 0], layer.normals[k, 1], layer.normals[k, 2]
+            query = LightQuery(lights, integrator, shadows, k)
+            _query_layer_light(paths, p, first_pair, point, normal, (g_r, g_g, g_b), shadowed, relit, query)
+        # --- clear paths: layers are composited in display values ---
         if clear:
             for channel in range(3):
-                paths.layer_srgb[p, channel] += paths.transmittance[p] * rgb[k, channel]
+                paths.layer_srgb[p, channel] += paths.transmittance[p] * layer.rgb[k, channel]
             paths.shading_factor[p, 0] += g_r * base
             paths.shading_factor[p, 1] += g_g * base
             paths.shading_factor[p, 2] += g_b * base
@@ -149,14 +220,15 @@ def intersect_gaussian_layers(
                 paths.radiance_linear[p, 2] = b_b
                 paths.is_alive[p], faces[k] = False, PATH_ENDED
             continue
+        # --- other paths: the layer's linear radiance, over what is behind it where that is known ---
         known = faces[k] < 0 and paths.pdf[p] == 0.0 and not lit_by_stage and paths.medium_ids[p] < 0
         if known:
-            w = paths.throughput[p]
+            w, rgb = paths.throughput[p], layer.rgb[k]
             add_radiance(
                 paths, p,
-                w[0] * (decode_srgb(rgb[k, 0] + left * encode_srgb(b_r)) - left * b_r),
-                w[1] * (decode_srgb(rgb[k, 1] + left * encode_srgb(b_g)) - left * b_g),
-                w[2] * (decode_srgb(rgb[k, 2] + left * encode_srgb(b_b)) - left * b_b),
+                w[0] * (decode_srgb(rgb[0] + left * encode_srgb(b_r)) - left * b_r),
+                w[1] * (decode_srgb(rgb[1] + left * encode_srgb(b_g)) - left * b_g),
+                w[2] * (decode_srgb(rgb[2] + left * encode_srgb(b_b)) - left * b_b),
                 integrator.clamp,
             )  # fmt: skip
         else:
@@ -169,21 +241,22 @@ def intersect_gaussian_layers(
 
 @kernel(_nrt=False, error_model="numpy")
 def add_layer_light(
-    first,
-    last,
-    scratch,
-    paths,
-    active,
-    radiance,
-    occluded_radiance,
-    mesh_transmittance,
-    caster_transmittance,
-    other_transmittance,
-):
+    first: int,
+    last: int,
+    scratch: PathScratch,
+    paths: PathArrays,
+    active: Int32[np.ndarray, " n"],
+    radiance: Float32[np.ndarray, "n 3"],
+    occluded_radiance: Float32[np.ndarray, "n 3"],
+    mesh_transmittance: Float32[np.ndarray, "n 3"],
+    caster_transmittance: Float32[np.ndarray, " n"],
+    other_transmittance: Float32[np.ndarray, " n"],
+) -> None:
     """Add what shadow rays of layers brought.
 
-    ``mesh_transmittance`` is the share in each channel that meshes let through, ``caster_transmittance`` and ``other_transmittance``
-    are transmittances of the Gaussians that cast shadows on Gaussians and of those that do not.
+    ``mesh_transmittance`` is the share in each channel that meshes let through, ``caster_transmittance``
+    and ``other_transmittance`` are transmittances of the Gaussians that cast shadows on Gaussians and of
+    those that do not.
     """
     for k in range(first, last):
         p = active[k]

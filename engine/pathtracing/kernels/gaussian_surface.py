@@ -7,9 +7,27 @@ and else goes on to what is behind; so no light is counted twice, and rays of al
 
 import math
 
+import numpy as np
+from jaxtyping import Int32, Int64
+
 from octasplat.engine.core.compilation import kernel
 from octasplat.engine.pathtracing.kernels.gaussian_layer import MIN_COVERAGE
-from octasplat.engine.pathtracing.kernels.path_surfaces import PATH_ENDED
+from octasplat.engine.pathtracing.kernels.kernel_args import (
+    AlbedoTables,
+    Bsdf,
+    IntegratorParameters,
+    LayerArrays,
+    LightArrays,
+    LightQuery,
+    MaterialArrays,
+    MeshScene,
+    PathArrays,
+    PathSamples,
+    PathScratch,
+    ShadowRayArrays,
+    SurfaceInteractions,
+)
+from octasplat.engine.pathtracing.kernels.path_surfaces import PATH_ENDED, survives_roulette
 from octasplat.engine.pathtracing.kernels.principled_bsdf import BURLEY
 from octasplat.engine.pathtracing.kernels.sampler import pixel_key, uniform_pair
 from octasplat.engine.pathtracing.kernels.scatter import (
@@ -37,7 +55,7 @@ FIRST_PAIR, PAIRS_PER_BOUNCE = 1 << 12, 5
 
 
 @njit_no_refcount(forceinline=True)
-def _draw_samples(paths, p, pair, random_numbers):
+def _draw_samples(paths: PathArrays, p: int, pair: int, random_numbers: Float64[np.ndarray, "d 2 b"]) -> None:
     """The numbers of :func:`scatter`, into the first column."""
     key, sample = paths.keys[p], paths.samples[p]
     for place in (LOBE_SAMPLE, DIRECTION_SAMPLE, LIGHT_CHOICE_SAMPLE, LIGHT_POSITION_SAMPLE):
@@ -46,21 +64,34 @@ def _draw_samples(paths, p, pair, random_numbers):
 
 @kernel(_nrt=False, error_model="numpy")
 def intersect_gaussian_surfaces(
-    first, last, scratch, paths, active, depth, faces, rgb, transmittance, depth_median, depth_sum, normals,
-    features, materials, lights, integrator, min_transmittance, shadows,
-):  # fmt: skip
+    first: int,
+    last: int,
+    scratch: PathScratch,
+    paths: PathArrays,
+    active: Int32[np.ndarray, " n"],
+    depth: int,
+    faces: Int32[np.ndarray, " n"],
+    layer: LayerArrays,
+    scene: MeshScene,
+    integrator: IntegratorParameters,
+    min_transmittance: float,
+    shadows: ShadowRayArrays,
+) -> None:
     """Let paths meet the Gaussians with materials on their rays, or take these away from what was seen.
 
-    A path that meets them goes on from there: its face becomes :data:`ENDED`, and nothing of the layer is
-    left. ``shadows`` gets what it asks of lights.
+    A path that meets them goes on from there: its face becomes :data:`PATH_ENDED`, and nothing of the layer
+    is left. ``shadows`` gets what it asks of lights.
     """
-    numbers = scratch.random_numbers
+    materials, lights = scene.materials, scene.lights
+    rgb, transmittance, features = layer.rgb, layer.transmittance, layer.features
+    depth_median, depth_sum, normals = layer.depth_median, layer.depth_sum, layer.normals
+    samples = PathSamples(scratch.random_numbers, 0)
+    tables = AlbedoTables(materials.ggx_albedo, materials.coat_albedo[0], materials.coat_mean_albedo[0])
     for k in range(first, last):
         p = active[k]
         shadows.radiance_linear[k, 0] = shadows.radiance_linear[k, 1] = shadows.radiance_linear[k, 2] = 0.0
-        left = float(transmittance[k])
+        left, chance = float(transmittance[k]), float(features[k, MATERIAL])
         share = 1.0 - left
-        chance = float(features[k, MATERIAL])
         if chance <= MIN_COVERAGE:
             continue
         if left < min_transmittance:  # the tracer stopped looking here
@@ -76,6 +107,7 @@ def intersect_gaussian_surfaces(
                 features[k, channel] *= rest
             depth_sum[k] *= rest
             continue
+        # --- the path goes on from their surface ---
         # Not the mean: the little that shines through to a far side would pull it below the surface.
         distance = depth_median[k] if depth_median[k] > 0.0 else depth_sum[k] / share
         transmittance[k] = 1.0
@@ -87,38 +119,48 @@ def intersect_gaussian_surfaces(
             medium = materials.absorption[paths.medium_ids[p]]
             for channel in range(3):
                 paths.throughput[p, channel] *= math.exp(-medium[channel] * distance)
-        if depth >= integrator.roulette_depth:
-            w = paths.throughput[p]
-            stay = min(max(w[0], w[1], w[2]), 0.95)
-            if roulette >= stay:
-                paths.is_alive[p] = False
-                continue
-            for channel in range(3):
-                paths.throughput[p, channel] /= stay
+        if depth >= integrator.roulette_depth and not survives_roulette(paths, p, roulette):
+            continue
         if paths.flags[p] & FLAG_CAMERA_RAY:
             paths.flags[p] |= FLAG_GAUSSIAN_SURFACE
-        _draw_samples(paths, p, pair + 1, numbers)
+        _draw_samples(paths, p, pair + 1, samples.random_numbers)
         o, d = paths.origins_world[p], paths.directions_world[p]
         n_x, n_y, n_z = normalize(normals[k, 0], normals[k, 1], normals[k, 2])
         part = 1.0 / float(features[k, MATERIAL])
         lift = features[k, RAY_OFFSET] * part
-        scatter_path(
-            k, p, 0, numbers, paths, False,
-            o[0] + distance * d[0] + lift * n_x, o[1] + distance * d[1] + lift * n_y,
-            o[2] + distance * d[2] + lift * n_z, n_x, n_y, n_z, n_x, n_y, n_z,
-            min(features[k, ALBEDO] * part, 1.0), min(features[k, ALBEDO + 1] * part, 1.0),
-            min(features[k, ALBEDO + 2] * part, 1.0), min(features[k, METALLIC] * part, 1.0),
-            min(features[k, ROUGHNESS] * part, 1.0), IOR, BURLEY, False,
-            materials.ggx_albedo, materials.coat_albedo[0], materials.coat_mean_albedo[0], lights, integrator, shadows,
-        )  # fmt: skip
+        point = (
+            o[0] + distance * d[0] + lift * n_x,
+            o[1] + distance * d[1] + lift * n_y,
+            o[2] + distance * d[2] + lift * n_z,
+        )
+        color = (
+            min(features[k, ALBEDO] * part, 1.0),
+            min(features[k, ALBEDO + 1] * part, 1.0),
+            min(features[k, ALBEDO + 2] * part, 1.0),
+        )
+        metallic, roughness = min(features[k, METALLIC] * part, 1.0), min(features[k, ROUGHNESS] * part, 1.0)
+        bsdf = Bsdf(color, metallic, roughness, IOR, BURLEY, False)
+        normal, query = (n_x, n_y, n_z), LightQuery(lights, integrator, shadows, k)
+        scatter_path(p, samples, paths, False, point, normal, normal, bsdf, tables, query)
 
 
 @kernel(_nrt=False, error_model="numpy")
 def start_paths_at_surfaces(
-    first, last, scratch, interactions, pixels, samples, integrator, materials, lights, paths, shadows
-):
+    first: int,
+    last: int,
+    scratch: PathScratch,
+    interactions: SurfaceInteractions,
+    pixels: Int64[np.ndarray, " n"],
+    samples: Int64[np.ndarray, " n"],
+    integrator: IntegratorParameters,
+    materials: MaterialArrays,
+    lights: LightArrays,
+    paths: PathArrays,
+    shadows: ShadowRayArrays,
+) -> None:
     """Paths that begin at points of surfaces, as if the camera's rays had met them there."""
-    numbers = scratch.random_numbers
+    column = PathSamples(scratch.random_numbers, 0)
+    tables = AlbedoTables(materials.ggx_albedo, materials.coat_albedo[0], materials.coat_mean_albedo[0])
     for k in range(first, last):
         paths.keys[k], paths.samples[k] = pixel_key(integrator.seed, pixels[k]), samples[k]
         for channel in range(3):
@@ -132,16 +174,17 @@ def start_paths_at_surfaces(
         paths.transmittance[k], paths.coverage[k], paths.mesh_visibility[k] = 1.0, 1.0, 0.0
         paths.pdf[k], paths.t_view_origin[k], paths.medium_ids[k] = 0.0, 0.0, -1
         paths.flags[k], paths.is_alive[k] = FLAG_GAUSSIAN_SURFACE, True
-        _draw_samples(paths, k, FIRST_PAIR + 1, numbers)
+        _draw_samples(paths, k, FIRST_PAIR + 1, scratch.random_numbers)
         point, n, material = (
             interactions.points_world[k],
             interactions.normals_world[k],
             interactions.materials[k],
         )
-        n_x, n_y, n_z = float(n[0]), float(n[1]), float(n[2])
-        scatter_path(
-            k, k, 0, numbers, paths, False, float(point[0]), float(point[1]), float(point[2]),
-            n_x, n_y, n_z, n_x, n_y, n_z, float(material[0]), float(material[1]), float(material[2]),
-            float(material[3]), float(material[4]), IOR, BURLEY, False,
-            materials.ggx_albedo, materials.coat_albedo[0], materials.coat_mean_albedo[0], lights, integrator, shadows,
-        )  # fmt: skip
+        normal = float(n[0]), float(n[1]), float(n[2])
+        color = float(material[0]), float(material[1]), float(material[2])
+        bsdf = Bsdf(color, float(material[3]), float(material[4]), IOR, BURLEY, False)
+        origin, query = (
+            (float(point[0]), float(point[1]), float(point[2])),
+            LightQuery(lights, integrator, shadows, k),
+        )
+        scatter_path(k, column, paths, False, origin, normal, normal, bsdf, tables, query)

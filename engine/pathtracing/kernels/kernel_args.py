@@ -1,6 +1,6 @@
 """What the path tracer's kernels read and write, as named tuples of arrays."""
 
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int32, Int64, UInt32
@@ -10,6 +10,12 @@ from octasplat.engine.trace.triangle_bvh import allocate_embree_scratch
 
 BLOCK_SIZE = 1024
 """Rows that a thread works on at a time: few enough for the nearest cache."""
+Vec3: TypeAlias = tuple[float, float, float]
+"""A point or a direction."""
+Rgb: TypeAlias = tuple[float, float, float]
+"""Linear red, green and blue."""
+POINT, SPOT, DIRECTIONAL, RECTANGLE, ENVIRONMENT, SPHERE, MESH = 0, 1, 2, 3, 4, 5, 6
+"""Kinds of lights."""
 SAMPLE_PAIRS_PER_BOUNCE = 5
 """Pairs of uniform numbers that a path uses at each surface."""
 
@@ -80,6 +86,67 @@ class MaterialArrays(NamedTuple):
     texture_sizes: Int64[np.ndarray, "k 3"]
 
 
+class LightArrays(NamedTuple):
+    """``l`` lights: those of the stage, shining meshes, and the environment where there is one.
+
+    Attributes:
+        kinds: which of the kinds of :mod:`octasplat.engine.pathtracing.kernels.lights`.
+        positions_world: of points and spots; centres of rectangles, balls and meshes.
+        axes: unit vectors: the way that the light goes, or a rectangle faces.
+        rgb_linear: intensity, irradiance or radiance; of the environment pi times its mean radiance.
+        sides_u: one side of a rectangle.
+        sides_v: the other side.
+        areas: of rectangles and meshes; of balls that of their disc.
+        cosines: of a spot's outer and inner angle.
+        is_hittable: whether rays meet the light, so that it counts for those too.
+        adds_light: whether the light is added to shadowed Gaussians.
+        any_adds_light: whether any is.
+        textures: of meshes, -1 for none.
+        mesh_rows: of meshes: first and last row of their sums, and first triangle.
+        mesh_cdf: cumulative shares of the triangles' areas, from 0 to 1 for each mesh.
+        mesh_corners_world: of the triangles of all meshes.
+        mesh_uv: likewise.
+        texels_linear: see :class:`MaterialArrays`, as the next one.
+        texture_sizes: first texel, height and width of each.
+        environment_linear: the map, one black pixel without one.
+        environment_row_cdf: see :class:`octasplat.engine.pathtracing.environment.EnvironmentSampler`, as
+            the next two.
+        environment_column_cdf: cumulative shares within each row.
+        environment_probabilities: share of each pixel.
+        environment_frame: rows are right, up, forward of the map.
+    """
+
+    kinds: Int32[np.ndarray, " l"]
+    positions_world: Float64[np.ndarray, "l 3"]
+    axes: Float64[np.ndarray, "l 3"]
+    rgb_linear: Float64[np.ndarray, "l 3"]
+    sides_u: Float64[np.ndarray, "l 3"]
+    sides_v: Float64[np.ndarray, "l 3"]
+    areas: Float64[np.ndarray, " l"]
+    cosines: Float64[np.ndarray, "l 2"]
+    is_hittable: Int32[np.ndarray, " l"]
+    adds_light: Int32[np.ndarray, " l"]
+    any_adds_light: bool
+    textures: Int32[np.ndarray, " l"]
+    mesh_rows: Int64[np.ndarray, "l 3"]
+    mesh_cdf: Float64[np.ndarray, " s"]
+    mesh_corners_world: Float32[np.ndarray, "f 3 3"]
+    mesh_uv: Float32[np.ndarray, "f 3 2"]
+    texels_linear: Float32[np.ndarray, "x 3"]
+    texture_sizes: Int64[np.ndarray, "k 3"]
+    environment_linear: Float32[np.ndarray, "h w 3"]
+    environment_row_cdf: Float64[np.ndarray, " h1"]
+    environment_column_cdf: Float64[np.ndarray, "h w1"]
+    environment_probabilities: Float64[np.ndarray, "h w"]
+    environment_frame: Float64[np.ndarray, "3 3"]
+
+    @property
+    def environment_id(self) -> int:
+        """The environment's place among the lights, -1 without one."""
+        count = len(self.kinds)
+        return count - 1 if count and self.kinds[-1] == ENVIRONMENT else -1
+
+
 class PathArrays(NamedTuple):
     """``p`` paths from the camera: what they have gathered, and where they go on.
 
@@ -92,9 +159,11 @@ class PathArrays(NamedTuple):
         radiance_linear: light of the surfaces and surroundings behind the first layer.
         layer_srgb: display colours of the Gaussians of the first layer, premultiplied.
         transmittance: what the first layer lets through.
-        shading_factor: sum over the first layer of coverage times the factor that the stage's lights give to it.
+        shading_factor: sum over the first layer of coverage times the factor that the stage's lights give
+            to it.
         coverage: 1 less what is seen of the background behind everything.
-        mesh_visibility: what the Gaussians let through of the first mesh that the camera's ray meets; 0 without one.
+        mesh_visibility: what the Gaussians let through of the first mesh that the camera's ray meets; 0
+            without one.
         albedo_linear: colour of that mesh, white where it mirrors or lets through, times the same share.
         normals_world: its shading normal times the same share.
         pdf: of the last direction over solid angle; 0 for the camera, mirrors and glass.
@@ -132,8 +201,10 @@ class ShadowRayArrays(NamedTuple):
         directions_world: unit vectors to the lights.
         t_max: up to where something may be in the way.
         radiance_linear: what is added where the way is free, times the transmittance of what is in it.
-        occluded_radiance_linear: what is added (it is negative) where a mesh is in the way of light that would have come.
-        passes_glass: whether glass in the way lets light straight through, as no path could find it otherwise.
+        occluded_radiance_linear: what is added (it is negative) where a mesh is in the way of light that
+            would have come.
+        passes_glass: whether glass in the way lets light straight through, as no path could find it
+            otherwise.
     """
 
     origins_world: Float32[np.ndarray, "n 3"]
@@ -160,6 +231,88 @@ class SurfaceInteractions(NamedTuple):
     materials: Float32[np.ndarray, "n 5"]
 
 
+class MeshScene(NamedTuple):
+    """The meshes of a stage, what they are made of, and the lights.
+
+    Attributes:
+        surfaces: the triangles.
+        materials: theirs.
+        lights: all lights.
+        environment: number of the light that is the environment, -1 without one.
+    """
+
+    surfaces: SurfaceArrays
+    materials: MaterialArrays
+    lights: LightArrays
+    environment: int
+
+
+class MeshHits(NamedTuple):
+    """What ``n`` rays meet first of the meshes.
+
+    Attributes:
+        distances: infinite where a ray meets nothing.
+        faces: -1 where a ray meets nothing.
+        barycentrics: weights of the second and third corner.
+    """
+
+    distances: Float32[np.ndarray, " n"]
+    faces: Int32[np.ndarray, " n"]
+    barycentrics: Float32[np.ndarray, "n 2"]
+
+
+class LayerArrays(NamedTuple):
+    """What ``n`` rays see of Gaussians: arrays of a :class:`octasplat.engine.trace.protocol.TraceResult`."""
+
+    rgb: Float32[np.ndarray, "n 3"]
+    transmittance: Float32[np.ndarray, " n"]
+    depth_median: Float32[np.ndarray, " n"]
+    depth_sum: Float32[np.ndarray, " n"]
+    normals: Float32[np.ndarray, "n 3"]
+    features: Float32[np.ndarray, "n f"]
+
+
+class Bsdf(NamedTuple):
+    """The mixture of dielectric and metal at a point.
+
+    Attributes:
+        rgb: linear base color.
+        metallic: share of the metal.
+        roughness: perceptual.
+        ior: index of refraction of the dielectric.
+        substrate: how the ground shares light with the coat.
+        energy_compensation: whether light that facets throw at each other is kept.
+    """
+
+    rgb: Rgb
+    metallic: float
+    roughness: float
+    ior: float
+    substrate: int
+    energy_compensation: bool
+
+
+class AlbedoTables(NamedTuple):
+    """How much one bounce sends back, by roughness and cosine.
+
+    Attributes:
+        ggx_albedo: of a colorless metal.
+        coat_albedo: of the dielectric's surface.
+        coat_mean_albedo: the cosine-weighted mean of ``coat_albedo`` over all directions.
+    """
+
+    ggx_albedo: Float64[np.ndarray, "a c"]
+    coat_albedo: Float64[np.ndarray, "a c"]
+    coat_mean_albedo: Float64[np.ndarray, "a 2"]
+
+
+class PathSamples(NamedTuple):
+    """Uniform numbers of one path at a surface: column ``n`` of pairs."""
+
+    random_numbers: Float64[np.ndarray, "d 2 b"]
+    n: int
+
+
 class MeshQueries(NamedTuple):
     """What kernels ask Embree about the meshes of a stage.
 
@@ -176,6 +329,30 @@ class MeshQueries(NamedTuple):
     any_hit_opaque: EmbreeQuery
     closest_hit_glass: EmbreeQuery
     glass_faces: Int64[np.ndarray, " g"]
+
+
+class IntegratorParameters(NamedTuple):
+    """The numbers of an integrator that the kernels read.
+
+    See :class:`octasplat.engine.pathtracing.stage.model.Integrator`.
+    """
+
+    seed: int
+    max_depth: int
+    roulette_depth: int
+    clamp: float
+    anti_aliasing: bool
+    environment_visible: bool
+    background_linear: Float64[np.ndarray, "3"]
+
+
+class LightQuery(NamedTuple):
+    """Where a surface asks a light: row ``k`` of the shadow rays."""
+
+    lights: LightArrays
+    integrator: IntegratorParameters
+    shadows: ShadowRayArrays
+    k: int
 
 
 class PathScratch(NamedTuple):
@@ -224,19 +401,33 @@ class CameraRays(NamedTuple):
     focus_distance: float
 
 
-class IntegratorParameters(NamedTuple):
-    """The numbers of an integrator that the kernels read.
+class PathStart(NamedTuple):
+    """Which paths begin: ``paths_per_pixel`` of the pixels ``pixel_order[first_pixel]`` and on.
 
-    See :class:`octasplat.engine.pathtracing.stage.model.Integrator`.
+    They are numbered from ``first_sample`` on.
     """
 
-    seed: int
-    max_depth: int
-    roulette_depth: int
-    clamp: float
-    anti_aliasing: bool
-    environment_visible: bool
-    background_linear: Float64[np.ndarray, "3"]
+    camera_rays: CameraRays
+    pixel_order: Int64[np.ndarray, " n"]
+    first_pixel: int
+    paths_per_pixel: int
+    first_sample: int
+
+
+class PathBlock(NamedTuple):
+    """What one thread follows a block of paths with.
+
+    Attributes:
+        active: which paths are left.
+        hits: what they meet.
+        shadows: what they ask of lights.
+        transmittance: what meshes let through of it.
+    """
+
+    active: Int32[np.ndarray, " b"]
+    hits: MeshHits
+    shadows: ShadowRayArrays
+    transmittance: Float32[np.ndarray, "b 3"]
 
 
 def allocate_paths(count: int) -> PathArrays:
@@ -269,7 +460,8 @@ def allocate_path_scratch(threads: int) -> list[PathScratch]:
             allocate_embree_scratch(1)[0], np.empty(BLOCK_SIZE, np.uint32), np.empty(BLOCK_SIZE, np.int32),
             np.empty((SAMPLE_PAIRS_PER_BOUNCE - 1, 2, BLOCK_SIZE)), np.empty(BLOCK_SIZE, np.int32),
             np.empty(BLOCK_SIZE, np.float32), np.empty(BLOCK_SIZE, np.bool_),
-            np.empty(BLOCK_SIZE, np.float32), np.empty(BLOCK_SIZE, np.int32), np.empty((BLOCK_SIZE, 2), np.float32),
+            np.empty(BLOCK_SIZE, np.float32), np.empty(BLOCK_SIZE, np.int32),
+            np.empty((BLOCK_SIZE, 2), np.float32),
         )
         for _ in range(threads)
     ]  # fmt: skip

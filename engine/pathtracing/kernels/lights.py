@@ -1,29 +1,40 @@
-"""Compiled functions of lights: which one to ask, a way to it, and how likely that way was.
+"""Compiled functions of lights: which one to ask, a direction to it, and how likely that direction was.
 
-``lights`` is :class:`octasplat.engine.pathtracing.lights.LightArrays`; p is the point that is lit. Weights of
+p is the point that is lit. Weights of
 lights at a point are what they would bring to a surface that faces them, so that the nearest and strongest is
 asked most.
 """
 
 import math
 
+import numpy as np
+from jaxtyping import Float32, Float64, Int64
+
 from octasplat.engine.core.compilation import kernel
+from octasplat.engine.pathtracing.kernels.kernel_args import (
+    DIRECTIONAL,
+    ENVIRONMENT,
+    MESH,
+    RECTANGLE,
+    SPHERE,
+    SPOT,
+    LightArrays,
+)
 from octasplat.engine.pathtracing.kernels.principled_bsdf import orthonormal_basis
 from octasplat.engine.pathtracing.kernels.texture import eval_texture
 from octasplat.engine.trace.kernels.native import njit_no_refcount
 
-POINT, SPOT, DIRECTIONAL, RECTANGLE, ENVIRONMENT, SPHERE, MESH = 0, 1, 2, 3, 4, 5, 6
 INFINITE_DISTANCE = 1e30
 
 
 @njit_no_refcount(forceinline=True)
-def luminance(red, green, blue):
+def luminance(red: float, green: float, blue: float) -> float:
     """Of linear Rec. 709 values."""
     return 0.2126 * red + 0.7152 * green + 0.0722 * blue
 
 
 @njit_no_refcount(forceinline=True)
-def _spot_falloff(lights, l, way_x, way_y, way_z):
+def _spot_falloff(lights: LightArrays, l: int, way_x: float, way_y: float, way_z: float) -> float:
     """How much of a spot's intensity goes a way (a unit vector from the light)."""
     axis = lights.axes[l]
     cosine = axis[0] * way_x + axis[1] * way_y + axis[2] * way_z
@@ -33,7 +44,7 @@ def _spot_falloff(lights, l, way_x, way_y, way_z):
 
 
 @njit_no_refcount(forceinline=True)
-def light_importance(lights, l, p_x, p_y, p_z):
+def light_importance(lights: LightArrays, l: int, p_x: float, p_y: float, p_z: float) -> float:
     """About the irradiance that a light gives to a surface at p that faces it; 0 only where it gives none."""
     power = luminance(lights.rgb_linear[l, 0], lights.rgb_linear[l, 1], lights.rgb_linear[l, 2])
     kind = lights.kinds[l]
@@ -59,7 +70,9 @@ def light_importance(lights, l, p_x, p_y, p_z):
 
 
 @njit_no_refcount(forceinline=True)
-def sample_light_index(lights, p_x, p_y, p_z, u):
+def sample_light_index(
+    lights: LightArrays, p_x: float, p_y: float, p_z: float, u: float
+) -> tuple[int, float]:
     """A light and the probability with which it is asked at p; -1 where none shines."""
     count = len(lights.kinds)
     if count == 1:
@@ -81,7 +94,7 @@ def sample_light_index(lights, p_x, p_y, p_z, u):
 
 
 @njit_no_refcount(forceinline=True)
-def light_probability(lights, light_id, p_x, p_y, p_z):
+def light_probability(lights: LightArrays, light_id: int, p_x: float, p_y: float, p_z: float) -> float:
     """The probability with which :func:`sample_light_index` asks the light ``light_id`` at p."""
     total, own = 0.0, 0.0
     for l in range(len(lights.kinds)):
@@ -93,7 +106,7 @@ def light_probability(lights, light_id, p_x, p_y, p_z):
 
 
 @njit_no_refcount()
-def additive_light_probability(lights, p_x, p_y, p_z):
+def additive_light_probability(lights: LightArrays, p_x: float, p_y: float, p_z: float) -> float:
     """The probability with which :func:`sample_light_index` asks at p one of the lights that add theirs."""
     if not lights.any_adds_light:
         return 0.0
@@ -107,7 +120,7 @@ def additive_light_probability(lights, p_x, p_y, p_z):
 
 
 @njit_no_refcount()
-def eval_emission(lights, l, u, v):
+def eval_emission(lights: LightArrays, l: int, u: float, v: float) -> tuple[float, float, float]:
     """Linear radiance of a shining surface at texture coordinates."""
     rgb = lights.rgb_linear[l]
     if lights.textures[l] < 0:
@@ -117,7 +130,9 @@ def eval_emission(lights, l, u, v):
 
 
 @njit_no_refcount()
-def emitter_hit_pdf(lights, l, o, distance, cosine):
+def emitter_hit_pdf(
+    lights: LightArrays, l: int, o: Float32[np.ndarray, "3"], distance: float, cosine: float
+) -> float:
     """Density over solid angle with which :func:`sample_light` gives from o the place that a ray met.
 
     ``distance`` is that of the place and ``cosine`` the cosine there.
@@ -135,14 +150,16 @@ def emitter_hit_pdf(lights, l, o, distance, cosine):
 
 
 @njit_no_refcount()
-def _one_minus_cosine(squared_sine):
+def _one_minus_cosine(squared_sine: float) -> float:
     """1 less the cosine of an angle below 90 degrees, without losing digits where it is small."""
     squared_sine = min(squared_sine, 1.0)
     return max(squared_sine / (1.0 + math.sqrt(1.0 - squared_sine)), 1e-12)
 
 
 @njit_no_refcount()
-def _sample_sphere(lights, l, p_x, p_y, p_z, u, v):
+def _sample_sphere(
+    lights: LightArrays, l: int, p_x: float, p_y: float, p_z: float, u: float, v: float
+) -> tuple[float, float, float, float, float, float, float, float]:
     """A way from p to a ball of light, evenly over the solid angle that it fills."""
     way_x = lights.positions_world[l, 0] - p_x
     way_y = lights.positions_world[l, 1] - p_y
@@ -172,7 +189,9 @@ def _sample_sphere(lights, l, p_x, p_y, p_z, u, v):
 
 
 @njit_no_refcount()
-def _sample_mesh(lights, l, p_x, p_y, p_z, u, v):
+def _sample_mesh(
+    lights: LightArrays, l: int, p_x: float, p_y: float, p_z: float, u: float, v: float
+) -> tuple[float, float, float, float, float, float, float, float]:
     """A way from p to a shining mesh, evenly over its area."""
     first, last = lights.mesh_rows[l, 0], lights.mesh_rows[l, 1]
     row, u = _sample_cdf(lights.mesh_cdf[first : last + 1], u)
@@ -211,7 +230,9 @@ def _sample_mesh(lights, l, p_x, p_y, p_z, u, v):
 
 
 @njit_no_refcount(forceinline=True)
-def sample_light(lights, l, p_x, p_y, p_z, u, v):
+def sample_light(
+    lights: LightArrays, l: int, p_x: float, p_y: float, p_z: float, u: float, v: float
+) -> tuple[float, float, float, float, float, float, float, float]:
     """A way from p to a light: unit direction, distance, linear radiance, density over solid angle.
 
     A density of 0 marks light that comes from one direction only: in place of radiance there is irradiance.
@@ -253,7 +274,7 @@ def sample_light(lights, l, p_x, p_y, p_z, u, v):
 
 
 @njit_no_refcount(forceinline=True)
-def _environment_uv(lights, d_x, d_y, d_z):
+def _environment_uv(lights: LightArrays, d_x: float, d_y: float, d_z: float) -> tuple[float, float, float]:
     """Where a direction lies in the map, (u, v) from 0 to 1, and the sine of its angle to up."""
     frame = lights.environment_frame
     right = frame[0, 0] * d_x + frame[0, 1] * d_y + frame[0, 2] * d_z
@@ -264,7 +285,7 @@ def _environment_uv(lights, d_x, d_y, d_z):
 
 
 @njit_no_refcount(forceinline=True)
-def eval_environment(lights, d_x, d_y, d_z):
+def eval_environment(lights: LightArrays, d_x: float, d_y: float, d_z: float) -> tuple[float, float, float]:
     """Linear radiance from a direction: bilinear between the map's pixels, round at its sides."""
     radiance = lights.environment_linear
     height, width, _ = radiance.shape
@@ -297,7 +318,7 @@ def eval_environment(lights, d_x, d_y, d_z):
 
 
 @njit_no_refcount(forceinline=True)
-def environment_pdf(lights, d_x, d_y, d_z):
+def environment_pdf(lights: LightArrays, d_x: float, d_y: float, d_z: float) -> float:
     """Density over solid angle with which :func:`sample_environment` gives a direction."""
     shares = lights.environment_probabilities
     height, width = shares.shape
@@ -307,7 +328,7 @@ def environment_pdf(lights, d_x, d_y, d_z):
 
 
 @njit_no_refcount(forceinline=True)
-def _sample_cdf(cdf, u):
+def _sample_cdf(cdf: Float64[np.ndarray, " c"], u: float) -> tuple[int, float]:
     """The step of a cumulative sum from 0 to 1 in which u lies, and how far in."""
     low, high = 0, len(cdf) - 1
     while high - low > 1:
@@ -321,7 +342,7 @@ def _sample_cdf(cdf, u):
 
 
 @njit_no_refcount(forceinline=True)
-def sample_environment(lights, u, v):
+def sample_environment(lights: LightArrays, u: float, v: float) -> tuple[float, float, float, float]:
     """A direction, likelier where the map is brighter, and its density over solid angle."""
     height, width = lights.environment_probabilities.shape
     j, down = _sample_cdf(lights.environment_row_cdf, v)
@@ -341,7 +362,12 @@ def sample_environment(lights, u, v):
 
 
 @kernel(error_model="numpy")
-def eval_environment_array(lights, directions, radiance, pdf):
+def eval_environment_array(
+    lights: LightArrays,
+    directions: Float64[np.ndarray, "n 3"],
+    radiance: Float64[np.ndarray, "n 3"],
+    pdf: Float64[np.ndarray, " n"],
+) -> None:
     """Radiance and density of rows of directions."""
     for n in range(len(directions)):
         d = directions[n]
@@ -350,7 +376,16 @@ def eval_environment_array(lights, directions, radiance, pdf):
 
 
 @kernel(error_model="numpy")
-def light_samples(lights, points, numbers, directions, distances, radiance, density, lights_asked):
+def light_samples(
+    lights: LightArrays,
+    points: Float64[np.ndarray, "n 3"],
+    numbers: Float64[np.ndarray, "n 3"],
+    directions: Float64[np.ndarray, "n 3"],
+    distances: Float64[np.ndarray, " n"],
+    radiance: Float64[np.ndarray, "n 3"],
+    density: Float64[np.ndarray, " n"],
+    lights_asked: Int64[np.ndarray, " n"],
+) -> None:
     """:func:`sample_light_index` and :func:`sample_light` at rows of points with three uniform numbers each.
 
     ``density`` and, of light that comes from one direction only, ``radiance`` hold the choice of the light.

@@ -7,8 +7,29 @@ several threads can share the work.
 
 import math
 
+import numpy as np
+from jaxtyping import Float32, Int32
+
 from octasplat.engine.core.compilation import kernel
-from octasplat.engine.pathtracing.kernels.kernel_args import BLOCK_SIZE, SAMPLE_PAIRS_PER_BOUNCE
+from octasplat.engine.pathtracing.kernels.kernel_args import (
+    BLOCK_SIZE,
+    SAMPLE_PAIRS_PER_BOUNCE,
+    AlbedoTables,
+    Bsdf,
+    IntegratorParameters,
+    LightArrays,
+    LightQuery,
+    MaterialArrays,
+    MeshHits,
+    MeshScene,
+    PathArrays,
+    PathSamples,
+    PathScratch,
+    PathStart,
+    Rgb,
+    ShadowRayArrays,
+    Vec3,
+)
 from octasplat.engine.pathtracing.kernels.lights import (
     emitter_hit_pdf,
     environment_pdf,
@@ -34,6 +55,7 @@ from octasplat.engine.pathtracing.kernels.scatter import (
     LIGHT_POSITION_SAMPLE,
     LOBE_SAMPLE,
     queue_shadow_ray,
+    sample_pair,
     scatter_path,
     spawn_ray,
 )
@@ -47,6 +69,7 @@ from octasplat.engine.pathtracing.kernels.surface import (
     eval_vertex_color,
     face_normal,
     interpolate_corners,
+    interpolate_uv,
     normalize,
     offset_ray_origin,
     reflect,
@@ -61,109 +84,118 @@ CAMERA_SAMPLE_PAIRS = 2
 
 
 @njit_no_refcount(forceinline=True)
-def _camera_samples(
-    scratch, integrator, first_pixel, paths_per_pixel, first_sample, pixel_order, place, number, count
-):
-    """Keys, sample numbers and the camera's uniform numbers of ``count`` paths, at most a block of them."""
+def _fill_camera_samples(
+    scratch: PathScratch, seed: int, start: PathStart, place: int, number: int, count: int
+) -> None:
+    """Write keys, sample numbers and the camera's uniform numbers of ``count`` paths, at most a block.
+
+    The first of them is number ``number`` of the pixel at ``place``.
+    """
     count = min(count, BLOCK_SIZE)
-    key = pixel_key(integrator.seed, pixel_order[first_pixel + place])
+    key = pixel_key(seed, start.pixel_order[start.first_pixel + place])
     for n in range(count):
-        if number == paths_per_pixel:
+        if number == start.paths_per_pixel:
             place, number = place + 1, 0
-            key = pixel_key(integrator.seed, pixel_order[first_pixel + place])
-        scratch.keys[n], scratch.samples[n] = key, first_sample + number
+            key = pixel_key(seed, start.pixel_order[start.first_pixel + place])
+        scratch.keys[n], scratch.samples[n] = key, start.first_sample + number
         number += 1
     fill_pairs(scratch.keys, scratch.samples, count, 0, scratch.random_numbers[:CAMERA_SAMPLE_PAIRS])
 
 
+@njit_no_refcount(forceinline=True)
+def _pixel_direction(directions: Float32[np.ndarray, "h w 3"], y: int, x: int, u: float, v: float) -> Vec3:
+    """Return the direction through (u, v) of a pixel, by the slopes between its neighbours."""
+    height, width, _ = directions.shape
+    centre = directions[y, x]
+    left, right = max(x - 1, 0), min(x + 1, width - 1)
+    high, low = max(y - 1, 0), min(y + 1, height - 1)
+    along = (u - 0.5) / max(right - left, 1)
+    down = (v - 0.5) / max(low - high, 1)
+    a, b = directions[y, left], directions[y, right]
+    c, d = directions[high, x], directions[low, x]
+    d_x, d_y, d_z = float(centre[0]), float(centre[1]), float(centre[2])
+    d_x += along * (b[0] - a[0]) + down * (d[0] - c[0])
+    d_y += along * (b[1] - a[1]) + down * (d[1] - c[1])
+    d_z += along * (b[2] - a[2]) + down * (d[2] - c[2])
+    return normalize(d_x, d_y, d_z)
+
+
+@njit_no_refcount(forceinline=True)
+def _reset_path(paths: PathArrays, k: int, origin: Vec3, direction: Vec3) -> None:
+    """Begin a path at the camera."""
+    paths.origins_world[k, 0], paths.origins_world[k, 1], paths.origins_world[k, 2] = origin
+    paths.directions_world[k, 0], paths.directions_world[k, 1], paths.directions_world[k, 2] = direction
+    for channel in range(3):
+        paths.throughput[k, channel], paths.radiance_linear[k, channel] = 1.0, 0.0
+        paths.layer_srgb[k, channel], paths.shading_factor[k, channel] = 0.0, 0.0
+        paths.albedo_linear[k, channel], paths.normals_world[k, channel] = 0.0, 0.0
+    paths.transmittance[k], paths.coverage[k], paths.mesh_visibility[k] = 1.0, 1.0, 0.0
+    paths.pdf[k], paths.t_view_origin[k], paths.medium_ids[k] = 0.0, 0.0, -1
+    paths.flags[k], paths.is_alive[k] = FLAG_LOSSLESS | FLAG_CAMERA_RAY, True
+
+
 @kernel(_nrt=False, error_model="numpy")
 def start_paths(
-    first,
-    last,
-    scratch,
-    camera_rays,
-    integrator,
-    first_pixel,
-    paths_per_pixel,
-    first_sample,
-    pixel_order,
-    paths,
-):
-    """Paths of pixels ``pixel_order[first_pixel]`` and on, ``paths_per_pixel`` to each, numbered from ``first_sample``.
+    first: int,
+    last: int,
+    scratch: PathScratch,
+    integrator: IntegratorParameters,
+    start: PathStart,
+    paths: PathArrays,
+) -> None:
+    """Begin the paths ``first`` to ``last`` of those that ``start`` describes.
 
     Beside a pixel's centre the direction follows the slopes between the neighbours, which is right for any
     lens to the second order in a pixel.
     """
-    height, width, _ = camera_rays.directions_world.shape
-    across_x, across_y, across_z, up_x, up_y, up_z = orthonormal_basis(
-        camera_rays.axis[0], camera_rays.axis[1], camera_rays.axis[2]
-    )
-    numbers = scratch.random_numbers
-    place, number = first // paths_per_pixel, first % paths_per_pixel - 1
-    pixel = pixel_order[first_pixel + place]
+    camera, numbers = start.camera_rays, scratch.random_numbers
+    directions, axis = camera.directions_world, camera.axis
+    width = directions.shape[1]
+    across_x, across_y, across_z, up_x, up_y, up_z = orthonormal_basis(axis[0], axis[1], axis[2])
+    # --- the pixel: its place in the order, the number of the path in it, row and column ---
+    place, number = first // start.paths_per_pixel, first % start.paths_per_pixel - 1
+    pixel = start.pixel_order[start.first_pixel + place]
     y, x = pixel // width, pixel % width
     for k in range(first, last):
         n = (k - first) % BLOCK_SIZE
         number += 1
-        if number == paths_per_pixel:
+        if number == start.paths_per_pixel:
             place, number = place + 1, 0
         if n == 0:
-            _camera_samples(
-                scratch,
-                integrator,
-                first_pixel,
-                paths_per_pixel,
-                first_sample,
-                pixel_order,
-                place,
-                number,
-                last - k,
-            )
+            _fill_camera_samples(scratch, integrator.seed, start, place, number, last - k)
         if n == 0 or number == 0:
-            pixel = pixel_order[first_pixel + place]
+            pixel = start.pixel_order[start.first_pixel + place]
             y, x = pixel // width, pixel % width
         paths.keys[k], paths.samples[k] = scratch.keys[n], scratch.samples[n]
-        centre = camera_rays.directions_world[y, x]
+        # --- a place in the pixel ---
+        centre = directions[y, x]
         d_x, d_y, d_z = float(centre[0]), float(centre[1]), float(centre[2])
         if integrator.anti_aliasing:
-            u, v = numbers[0, 0, n], numbers[0, 1, n]
-            left, right = max(x - 1, 0), min(x + 1, width - 1)
-            high, low = max(y - 1, 0), min(y + 1, height - 1)
-            along = (u - 0.5) / max(right - left, 1)
-            down = (v - 0.5) / max(low - high, 1)
-            a, b = camera_rays.directions_world[y, left], camera_rays.directions_world[y, right]
-            c, d = camera_rays.directions_world[high, x], camera_rays.directions_world[low, x]
-            d_x += along * (b[0] - a[0]) + down * (d[0] - c[0])
-            d_y += along * (b[1] - a[1]) + down * (d[1] - c[1])
-            d_z += along * (b[2] - a[2]) + down * (d[2] - c[2])
-            d_x, d_y, d_z = normalize(d_x, d_y, d_z)
-        o_x, o_y, o_z = camera_rays.origin_world[0], camera_rays.origin_world[1], camera_rays.origin_world[2]
-        if camera_rays.aperture > 0.0:
+            d_x, d_y, d_z = _pixel_direction(directions, y, x, numbers[0, 0, n], numbers[0, 1, n])
+        # --- a place on the lens ---
+        o_x, o_y, o_z = camera.origin_world[0], camera.origin_world[1], camera.origin_world[2]
+        if camera.aperture > 0.0:
             u, v = numbers[1, 0, n], numbers[1, 1, n]
-            radius, angle = 0.5 * camera_rays.aperture * math.sqrt(u), 2.0 * math.pi * v
+            radius, angle = 0.5 * camera.aperture * math.sqrt(u), 2.0 * math.pi * v
             a, b = radius * math.cos(angle), radius * math.sin(angle)
             l_x, l_y, l_z = a * across_x + b * up_x, a * across_y + b * up_y, a * across_z + b * up_z
-            forward = d_x * camera_rays.axis[0] + d_y * camera_rays.axis[1] + d_z * camera_rays.axis[2]
-            t = camera_rays.focus_distance / max(forward, 1e-6)
+            forward = d_x * axis[0] + d_y * axis[1] + d_z * axis[2]
+            t = camera.focus_distance / max(forward, 1e-6)
             o_x, o_y, o_z = o_x + l_x, o_y + l_y, o_z + l_z
             d_x, d_y, d_z = normalize(t * d_x - l_x, t * d_y - l_y, t * d_z - l_z)
-        paths.origins_world[k, 0], paths.origins_world[k, 1], paths.origins_world[k, 2] = o_x, o_y, o_z
-        paths.directions_world[k, 0], paths.directions_world[k, 1], paths.directions_world[k, 2] = (
-            d_x,
-            d_y,
-            d_z,
-        )
-        for channel in range(3):
-            paths.throughput[k, channel], paths.radiance_linear[k, channel] = 1.0, 0.0
-            paths.layer_srgb[k, channel], paths.shading_factor[k, channel] = 0.0, 0.0
-            paths.albedo_linear[k, channel], paths.normals_world[k, channel] = 0.0, 0.0
-        paths.transmittance[k], paths.coverage[k], paths.mesh_visibility[k] = 1.0, 1.0, 0.0
-        paths.pdf[k], paths.t_view_origin[k], paths.medium_ids[k] = 0.0, 0.0, -1
-        paths.flags[k], paths.is_alive[k] = FLAG_LOSSLESS | FLAG_CAMERA_RAY, True
+        _reset_path(paths, k, (o_x, o_y, o_z), (d_x, d_y, d_z))
 
 
 @njit_no_refcount(forceinline=True)
-def eval_background(lights, environment, integrator, flags, d_x, d_y, d_z):
+def eval_background(
+    lights: LightArrays,
+    environment: int,
+    integrator: IntegratorParameters,
+    flags: int,
+    d_x: float,
+    d_y: float,
+    d_z: float,
+) -> tuple[float, float, float]:
     """Linear radiance from behind everything; ``environment`` is the number of that light or -1."""
     if environment >= 0 and (integrator.environment_visible or not flags & FLAG_CAMERA_RAY):
         return eval_environment(lights, d_x, d_y, d_z)
@@ -172,7 +204,7 @@ def eval_background(lights, environment, integrator, flags, d_x, d_y, d_z):
 
 
 @njit_no_refcount(forceinline=True)
-def add_radiance(paths, p, red, green, blue, clamp):
+def add_radiance(paths: PathArrays, p: int, red: float, green: float, blue: float, clamp: float) -> None:
     """Add light to a path, no more than ``clamp`` of it where it comes by way of scattering."""
     if paths.flags[p] & FLAG_SCATTERED:
         most = max(red, green, blue)
@@ -184,7 +216,9 @@ def add_radiance(paths, p, red, green, blue, clamp):
 
 
 @njit_no_refcount(forceinline=True)
-def _shade_miss(paths, p, lights, environment, integrator):
+def _shade_miss(
+    paths: PathArrays, p: int, lights: LightArrays, environment: int, integrator: IntegratorParameters
+) -> None:
     """A path ends behind everything."""
     d = paths.directions_world[p]
     red, green, blue = eval_background(lights, environment, integrator, paths.flags[p], d[0], d[1], d[2])
@@ -202,7 +236,17 @@ def _shade_miss(paths, p, lights, environment, integrator):
 
 
 @njit_no_refcount(forceinline=True)
-def _shade_emitter(paths, p, lights, l, distance, cosine, u, v, integrator):
+def _shade_emitter(
+    paths: PathArrays,
+    p: int,
+    lights: LightArrays,
+    l: int,
+    distance: float,
+    cosine: float,
+    u: float,
+    v: float,
+    integrator: IntegratorParameters,
+) -> None:
     """A path meets a shining surface; ``cosine`` is the cosine to its front, (u, v) the place on a mesh."""
     if cosine <= 0.0:
         return
@@ -217,8 +261,12 @@ def _shade_emitter(paths, p, lights, l, distance, cosine, u, v, integrator):
 
 
 @njit_no_refcount(forceinline=True)
-def _scatter_mirror(paths, p, x, y, z, n_x, n_y, n_z, s_x, s_y, s_z, red, green, blue):
+def _scatter_mirror(
+    paths: PathArrays, p: int, point: Vec3, normal: Vec3, shading_normal: Vec3, reflectance: Rgb
+) -> None:
     """Reflect a path."""
+    (x, y, z), (n_x, n_y, n_z), (s_x, s_y, s_z) = point, normal, shading_normal
+    red, green, blue = reflectance
     d = paths.directions_world[p]
     r_x, r_y, r_z = reflect(d[0], d[1], d[2], s_x, s_y, s_z)
     if r_x * n_x + r_y * n_y + r_z * n_z <= 0.0:
@@ -234,8 +282,19 @@ def _scatter_mirror(paths, p, x, y, z, n_x, n_y, n_z, s_x, s_y, s_z, red, green,
 
 
 @njit_no_refcount(forceinline=True)
-def _scatter_smooth_glass(paths, p, materials, m, is_entering, x, y, z, n_x, n_y, n_z, s_x, s_y, s_z, choice):
+def _scatter_smooth_glass(
+    paths: PathArrays,
+    p: int,
+    materials: MaterialArrays,
+    m: int,
+    is_entering: bool,
+    point: Vec3,
+    normal: Vec3,
+    shading_normal: Vec3,
+    choice: float,
+) -> None:
     """Reflect a path at glass or let it through, by chance as Fresnel says."""
+    (x, y, z), (n_x, n_y, n_z), (s_x, s_y, s_z) = point, normal, shading_normal
     d = paths.directions_world[p]
     eta = materials.iors[m] if is_entering else 1.0 / materials.iors[m]
     cosine = -(d[0] * s_x + d[1] * s_y + d[2] * s_z)
@@ -243,7 +302,7 @@ def _scatter_smooth_glass(paths, p, materials, m, is_entering, x, y, z, n_x, n_y
     if share < 1.0 and eta != 1.0:
         paths.flags[p] &= ~FLAG_LOSSLESS
     if eta != 1.0 and choice < share:
-        _scatter_mirror(paths, p, x, y, z, n_x, n_y, n_z, s_x, s_y, s_z, 1.0, 1.0, 1.0)
+        _scatter_mirror(paths, p, point, normal, shading_normal, (1.0, 1.0, 1.0))
         return
     tint = materials.colours_linear[m]
     plain = tint[0] == 1.0 and tint[1] == 1.0 and tint[2] == 1.0
@@ -263,7 +322,15 @@ def _scatter_smooth_glass(paths, p, materials, m, is_entering, x, y, z, n_x, n_y
 
 
 @njit_no_refcount(forceinline=True)
-def _fill_samples(scratch, paths, active, faces, first, last, first_pair):
+def _fill_samples(
+    scratch: PathScratch,
+    paths: PathArrays,
+    active: Int32[np.ndarray, " n"],
+    faces: Int32[np.ndarray, " n"],
+    first: int,
+    last: int,
+    first_pair: int,
+) -> None:
     """The uniform numbers of those of the rows ``first`` to ``last``, at most a block, that meet a face."""
     count = 0
     for k in range(first, last):
@@ -275,7 +342,9 @@ def _fill_samples(scratch, paths, active, faces, first, last, first_pair):
 
 
 @njit_no_refcount(forceinline=True)
-def _write_denoiser_guides(paths, p, red, green, blue, n_x, n_y, n_z):
+def _write_denoiser_guides(
+    paths: PathArrays, p: int, red: float, green: float, blue: float, n_x: float, n_y: float, n_z: float
+) -> None:
     """Note colour and normal of the first mesh that the camera's ray meets, as far as it is seen."""
     share = paths.mesh_visibility[p]
     paths.albedo_linear[p, 0] = share * red
@@ -286,33 +355,50 @@ def _write_denoiser_guides(paths, p, red, green, blue, n_x, n_y, n_z):
     paths.normals_world[p, 2] = share * n_z
 
 
+@njit_no_refcount(forceinline=True)
+def _rough_glass_gain(materials: MaterialArrays, m: int, is_entering: bool, o_z: float) -> float:
+    """Return the factor that makes up for the light that one bounce loses."""
+    if not materials.energy_compensation[m]:
+        return 1.0
+    table = materials.coat_tables[m] + (0 if is_entering else 1)
+    return 1.0 / table_value(materials.coat_albedo[table], o_z, materials.roughness[m])
+
+
 @njit_no_refcount()
 def _scatter_rough_glass(
-    paths, p, k, materials, m, is_entering, x, y, z, n_x, n_y, n_z, s_x, s_y, s_z, choice,
-    lights, integrator, shadows, random_numbers, n,
-):  # fmt: skip
-    """What lights send to rough glass, and a way on that its facets reflect or refract."""
+    paths: PathArrays,
+    p: int,
+    materials: MaterialArrays,
+    m: int,
+    is_entering: bool,
+    point: Vec3,
+    normal: Vec3,
+    shading_normal: Vec3,
+    samples: PathSamples,
+    query: LightQuery,
+) -> None:
+    """Ask a light at rough glass, and send the path on as the facets reflect or refract it."""
+    (x, y, z), (n_x, n_y, n_z), (s_x, s_y, s_z) = point, normal, shading_normal
+    lights, shadows, k = query.lights, query.shadows, query.k
     d = paths.directions_world[p]
     eta = materials.iors[m] if is_entering else 1.0 / materials.iors[m]
     tint, roughness = materials.colours_linear[m], materials.roughness[m]
     alpha = roughness * roughness
+    # --- the direction to the viewer, in the frame of the shading normal ---
     a_x, a_y, a_z, b_x, b_y, b_z = orthonormal_basis(s_x, s_y, s_z)
     o_x = -(d[0] * a_x + d[1] * a_y + d[2] * a_z)
     o_y = -(d[0] * b_x + d[1] * b_y + d[2] * b_z)
     o_z = -(d[0] * s_x + d[1] * s_y + d[2] * s_z)
-    gain = 1.0
-    if materials.energy_compensation[m]:
-        gain = 1.0 / table_value(
-            materials.coat_albedo[materials.coat_tables[m] + (0 if is_entering else 1)], o_z, roughness
-        )
-    front_x, front_y, front_z = offset_ray_origin(x, y, z, n_x, n_y, n_z)
-    back_x, back_y, back_z = offset_ray_origin(x, y, z, -n_x, -n_y, -n_z)
+    gain = _rough_glass_gain(materials, m, is_entering, o_z)
+    front = offset_ray_origin(x, y, z, n_x, n_y, n_z)
+    back = offset_ray_origin(x, y, z, -n_x, -n_y, -n_z)
+    # --- a sample of a light ---
     w = paths.throughput[p]
-    clamp = integrator.clamp if paths.flags[p] & FLAG_SCATTERED else math.inf
+    clamp = query.integrator.clamp if paths.flags[p] & FLAG_SCATTERED else math.inf
     if len(lights.kinds):
-        l, share = sample_light_index(lights, x, y, z, random_numbers[LIGHT_CHOICE_SAMPLE, 0, n])
+        l, share = sample_light_index(lights, x, y, z, sample_pair(samples, LIGHT_CHOICE_SAMPLE)[0])
         if l >= 0:
-            u, v = random_numbers[LIGHT_POSITION_SAMPLE, 0, n], random_numbers[LIGHT_POSITION_SAMPLE, 1, n]
+            u, v = sample_pair(samples, LIGHT_POSITION_SAMPLE)
             w_x, w_y, w_z, distance, l_r, l_g, l_b, l_pdf = sample_light(lights, l, x, y, z, u, v)
             i_z = w_x * s_x + w_y * s_y + w_z * s_z
             if i_z * (w_x * n_x + w_y * n_y + w_z * n_z) > 0.0 and l_r + l_g + l_b > 0.0:
@@ -327,15 +413,17 @@ def _scatter_rough_glass(
                     factor = gain * value / (l_pdf + pdf if lights.is_hittable[l] else l_pdf)
                 if value > 0.0:
                     through = i_z < 0.0
-                    queue_shadow_ray(
-                        shadows, k,
-                        back_x if through else front_x, back_y if through else front_y,
-                        back_z if through else front_z, w_x, w_y, w_z, distance,
+                    radiance = (
                         w[0] * l_r * factor * (tint[0] if through else 1.0),
                         w[1] * l_g * factor * (tint[1] if through else 1.0),
-                        w[2] * l_b * factor * (tint[2] if through else 1.0), clamp,
-                    )  # fmt: skip
-    u, v = random_numbers[DIRECTION_SAMPLE, 0, n], random_numbers[DIRECTION_SAMPLE, 1, n]
+                        w[2] * l_b * factor * (tint[2] if through else 1.0),
+                    )
+                    queue_shadow_ray(
+                        shadows, k, back if through else front, (w_x, w_y, w_z), distance, radiance, clamp
+                    )
+    # --- a sample of the BSDF ---
+    u, v = sample_pair(samples, DIRECTION_SAMPLE)
+    choice = sample_pair(samples, LOBE_SAMPLE)[0]
     i_x, i_y, i_z = rough_dielectric_sample(o_x, o_y, o_z, eta, alpha, choice, u, v)
     value, pdf = rough_dielectric_eval(o_x, o_y, o_z, i_x, i_y, i_z, eta, alpha)
     w_x = i_x * a_x + i_y * b_x + i_z * s_x
@@ -344,6 +432,7 @@ def _scatter_rough_glass(
     if not pdf > 0.0 or i_z * (w_x * n_x + w_y * n_y + w_z * n_z) <= 0.0:
         paths.is_alive[p] = False
         return
+    # --- the path goes on ---
     through = i_z < 0.0
     for channel in range(3):
         paths.throughput[p, channel] *= gain * value / pdf * (tint[channel] if through else 1.0)
@@ -351,53 +440,122 @@ def _scatter_rough_glass(
     w_x, w_y, w_z = normalize(w_x, w_y, w_z)
     if through:
         paths.medium_ids[p] = m if is_entering else -1
-        spawn_ray(paths, p, back_x, back_y, back_z, w_x, w_y, w_z, pdf)
-    else:
-        spawn_ray(paths, p, front_x, front_y, front_z, w_x, w_y, w_z, pdf)
+    x, y, z = back if through else front
+    spawn_ray(paths, p, x, y, z, w_x, w_y, w_z, pdf)
+
+
+@njit_no_refcount(forceinline=True)
+def survives_roulette(paths: PathArrays, p: int, roulette: float) -> bool:
+    """End a path by chance, the likelier the less its light still counts; tell whether it goes on."""
+    w = paths.throughput[p]
+    stay = min(max(w[0], w[1], w[2]), 0.95)
+    if roulette >= stay:
+        paths.is_alive[p] = False
+        return False
+    for channel in range(3):
+        paths.throughput[p, channel] /= stay
+    return True
+
+
+@njit_no_refcount(forceinline=True)
+def _scatter_at_material(
+    paths: PathArrays,
+    p: int,
+    scene: MeshScene,
+    face: int,
+    weights: Vec3,
+    is_front: bool,
+    point: Vec3,
+    normal: Vec3,
+    shading_normal: Vec3,
+    is_guide: bool,
+    samples: PathSamples,
+    query: LightQuery,
+) -> None:
+    """Send a path on by the material of a face, and ask a light where that scatters.
+
+    ``weights`` are those of the corners; ``is_guide`` tells whether color and normal guide the denoiser.
+    """
+    surfaces, materials = scene.surfaces, scene.materials
+    a, b, c = weights
+    m = surfaces.material_ids[face]
+    kind = materials.kinds[m]
+    # --- glass ---
+    if kind == GLASS and materials.roughness[m] >= MIN_GLASS_ROUGHNESS and materials.iors[m] != 1.0:
+        _scatter_rough_glass(paths, p, materials, m, is_front, point, normal, shading_normal, samples, query)
+        return
+    if kind == GLASS:
+        choice = sample_pair(samples, LOBE_SAMPLE)[0]
+        _scatter_smooth_glass(paths, p, materials, m, is_front, point, normal, shading_normal, choice)
+        return
+    # --- the material's numbers, textures looked up ---
+    uv = surfaces.corner_uv[face]
+    u_t, v_t = interpolate_uv(uv, a, b, c)
+    red, green, blue, metallic, roughness = eval_material(materials, m, u_t, v_t)
+    if materials.uses_vertex_color[m]:
+        t_r, t_g, t_b = eval_vertex_color(surfaces, face, a, b, c)
+        red, green, blue = red * t_r, green * t_g, blue * t_b
+    if kind == MIRROR:
+        _scatter_mirror(paths, p, point, normal, shading_normal, (red, green, blue))
+        return
+    d = paths.directions_world[p]
+    (x, y, z), (n_x, n_y, n_z) = point, normal
+    origin = offset_ray_origin(x, y, z, n_x, n_y, n_z)
+    s_x, s_y, s_z = eval_normal_map(
+        materials, m, surfaces.corners_world[face], uv, (u_t, v_t), normal, shading_normal,
+        (float(d[0]), float(d[1]), float(d[2])),
+    )  # fmt: skip
+    if is_guide:
+        _write_denoiser_guides(paths, p, red, green, blue, s_x, s_y, s_z)
+    table = materials.coat_tables[m]
+    bsdf = Bsdf(
+        (red, green, blue), metallic, roughness,
+        materials.iors[m], materials.substrates[m], materials.energy_compensation[m] != 0,
+    )  # fmt: skip
+    tables = AlbedoTables(
+        materials.ggx_albedo, materials.coat_albedo[table], materials.coat_mean_albedo[table]
+    )
+    scatter_path(p, samples, paths, kind == DIFFUSE, origin, normal, (s_x, s_y, s_z), bsdf, tables, query)
 
 
 @kernel(_nrt=False, error_model="numpy")
 def shade_surfaces(
-    first,
-    last,
-    scratch,
-    paths,
-    active,
-    depth,
-    distances,
-    faces,
-    barycentrics,
-    surfaces,
-    materials,
-    lights,
-    environment,
-    integrator,
-    shadows,
-):
-    """What the paths ``active`` find at the end of their rays; ``depth`` counts the surfaces met before.
+    first: int,
+    last: int,
+    scratch: PathScratch,
+    paths: PathArrays,
+    active: Int32[np.ndarray, " n"],
+    depth: int,
+    hits: MeshHits,
+    scene: MeshScene,
+    integrator: IntegratorParameters,
+    shadows: ShadowRayArrays,
+) -> None:
+    """Shade what the paths ``active`` find at the end of their rays; ``depth`` surfaces were met before.
 
     Adds light that they run into, turns them to where they go on, and writes what they ask of lights into
     ``shadows``, a row a ray. Paths that end are not alive any more.
     """
-    numbers = scratch.random_numbers
+    surfaces, materials, lights = scene.surfaces, scene.materials, scene.lights
     first_pair = CAMERA_SAMPLE_PAIRS + depth * SAMPLE_PAIRS_PER_BOUNCE
     n = 0
     for k in range(first, last):
         if (k - first) % BLOCK_SIZE == 0:
-            _fill_samples(scratch, paths, active, faces, k, min(k + BLOCK_SIZE, last), first_pair)
+            _fill_samples(scratch, paths, active, hits.faces, k, min(k + BLOCK_SIZE, last), first_pair)
             n = -1
-        p = active[k]
-        face = faces[k]
+        p, face = active[k], hits.faces[k]
         shadows.radiance_linear[k, 0] = shadows.radiance_linear[k, 1] = shadows.radiance_linear[k, 2] = 0.0
+        # --- nothing was met ---
         if face == PATH_ENDED:
             continue
         if face < 0:
-            _shade_miss(paths, p, lights, environment, integrator)
+            _shade_miss(paths, p, lights, scene.environment, integrator)
             paths.is_alive[p] = False
             continue
         n += 1
+        # --- the point: weights a, b, c of the corners, the face's normal, the medium up to there ---
         d = paths.directions_world[p]
-        b, c = float(barycentrics[k, 0]), float(barycentrics[k, 1])
+        b, c = float(hits.barycentrics[k, 0]), float(hits.barycentrics[k, 1])
         a = 1.0 - b - c
         n_x, n_y, n_z = face_normal(surfaces.corners_world[face])
         facing = -(d[0] * n_x + d[1] * n_y + d[2] * n_z)
@@ -406,78 +564,52 @@ def shade_surfaces(
         if paths.medium_ids[p] >= 0:
             medium = materials.absorption[paths.medium_ids[p]]
             for channel in range(3):
-                paths.throughput[p, channel] *= math.exp(-medium[channel] * distances[k])
-        first_thing = paths.flags[p] & FLAG_CAMERA_RAY != 0 and paths.mesh_visibility[p] == 0.0
-        if first_thing:
+                paths.throughput[p, channel] *= math.exp(-medium[channel] * hits.distances[k])
+        is_guide = paths.flags[p] & FLAG_CAMERA_RAY != 0 and paths.mesh_visibility[p] == 0.0
+        if is_guide:
             paths.mesh_visibility[p] = paths.transmittance[p]
             _write_denoiser_guides(paths, p, 1.0, 1.0, 1.0, n_x, n_y, n_z)
-        uv = surfaces.corner_uv[face]
-        u_t = a * uv[0, 0] + b * uv[1, 0] + c * uv[2, 0]
-        v_t = a * uv[0, 1] + b * uv[1, 1] + c * uv[2, 1]
+        # --- light that the surface sends by itself ---
+        l = materials.light_ids[m]
         if kind == EMITTER:
-            _shade_emitter(
-                paths, p, lights, materials.light_ids[m], distances[k], facing, 0.0, 0.0, integrator
-            )
-        elif materials.light_ids[m] >= 0:
-            _shade_emitter(
-                paths, p, lights, materials.light_ids[m], distances[k], abs(facing), u_t, v_t, integrator
-            )
+            _shade_emitter(paths, p, lights, l, hits.distances[k], facing, 0.0, 0.0, integrator)
+        elif l >= 0:
+            u_t, v_t = interpolate_uv(surfaces.corner_uv[face], a, b, c)
+            _shade_emitter(paths, p, lights, l, hits.distances[k], abs(facing), u_t, v_t, integrator)
         if kind == EMITTER or depth >= integrator.max_depth:
             paths.is_alive[p] = False
             continue
-        x, y, z = interpolate_corners(surfaces.corners_world[face], a, b, c)
+        # --- the way on ---
+        point = interpolate_corners(surfaces.corners_world[face], a, b, c)
         if facing < 0.0:
             n_x, n_y, n_z = -n_x, -n_y, -n_z
         s_x, s_y, s_z = shading_normal(
             surfaces.corner_normals[face], a, b, c, n_x, n_y, n_z, d[0], d[1], d[2]
         )
-        if first_thing:
+        if is_guide:
             _write_denoiser_guides(paths, p, 1.0, 1.0, 1.0, s_x, s_y, s_z)
-        choice, roulette = numbers[LOBE_SAMPLE, 0, n], numbers[LOBE_SAMPLE, 1, n]
-        if depth >= integrator.roulette_depth:
-            w = paths.throughput[p]
-            stay = min(max(w[0], w[1], w[2]), 0.95)
-            if roulette >= stay:
-                paths.is_alive[p] = False
-                continue
-            for channel in range(3):
-                paths.throughput[p, channel] /= stay
-        if kind == GLASS and materials.roughness[m] >= MIN_GLASS_ROUGHNESS and materials.iors[m] != 1.0:
-            _scatter_rough_glass(
-                paths, p, k, materials, m, facing >= 0.0, x, y, z, n_x, n_y, n_z, s_x, s_y, s_z, choice,
-                lights, integrator, shadows, numbers, n,
-            )  # fmt: skip
+        samples = PathSamples(scratch.random_numbers, n)
+        if depth >= integrator.roulette_depth and not survives_roulette(
+            paths, p, sample_pair(samples, LOBE_SAMPLE)[1]
+        ):
             continue
-        if kind == GLASS:
-            _scatter_smooth_glass(
-                paths, p, materials, m, facing >= 0.0, x, y, z, n_x, n_y, n_z, s_x, s_y, s_z, choice
-            )
-            continue
-        red, green, blue, metallic, roughness = eval_material(materials, m, u_t, v_t)
-        if materials.uses_vertex_color[m]:
-            t_r, t_g, t_b = eval_vertex_color(surfaces, face, a, b, c)
-            red, green, blue = red * t_r, green * t_g, blue * t_b
-        if kind == MIRROR:
-            _scatter_mirror(paths, p, x, y, z, n_x, n_y, n_z, s_x, s_y, s_z, red, green, blue)
-            continue
-        x, y, z = offset_ray_origin(x, y, z, n_x, n_y, n_z)
-        s_x, s_y, s_z = eval_normal_map(
-            materials, m, surfaces.corners_world[face], uv, u_t, v_t,
-            n_x, n_y, n_z, s_x, s_y, s_z, d[0], d[1], d[2],
-        )  # fmt: skip
-        if first_thing:
-            _write_denoiser_guides(paths, p, red, green, blue, s_x, s_y, s_z)
-        scatter_path(
-            k, p, n, numbers, paths, kind == DIFFUSE, x, y, z, n_x, n_y, n_z, s_x, s_y, s_z,
-            red, green, blue, metallic, roughness,
-            materials.iors[m], materials.substrates[m], materials.energy_compensation[m] != 0,
-            materials.ggx_albedo, materials.coat_albedo[materials.coat_tables[m]], materials.coat_mean_albedo[materials.coat_tables[m]],
-            lights, integrator, shadows,
+        query = LightQuery(lights, integrator, shadows, k)
+        _scatter_at_material(
+            paths, p, scene, face, (a, b, c), facing >= 0.0, point, (n_x, n_y, n_z), (s_x, s_y, s_z),
+            is_guide, samples, query,
         )  # fmt: skip
 
 
 @kernel(_nrt=False, error_model="numpy")
-def add_direct_light(first, last, scratch, paths, active, radiance, transmittance):
+def add_direct_light(
+    first: int,
+    last: int,
+    scratch: PathScratch,
+    paths: PathArrays,
+    active: Int32[np.ndarray, " n"],
+    radiance: Float32[np.ndarray, "n 3"],
+    transmittance: Float32[np.ndarray, "n 3"],
+) -> None:
     """Add what shadow rays brought: ``radiance`` times the share of it that got through."""
     for k in range(first, last):
         if transmittance[k, 0] + transmittance[k, 1] + transmittance[k, 2] > 0.0:

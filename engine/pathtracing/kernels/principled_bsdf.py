@@ -12,6 +12,10 @@ coat takes what the coat leaves, in both directions: "A Microfacet Based Coupled
 
 import math
 
+import numpy as np
+from jaxtyping import Float64
+
+from octasplat.engine.pathtracing.kernels.kernel_args import AlbedoTables, Bsdf, Vec3
 from octasplat.engine.shading.kernels.microfacets import (
     ggx_density,
     ggx_masking,
@@ -26,7 +30,7 @@ COUPLED, BURLEY = 0, 1
 
 
 @njit_no_refcount(forceinline=True)
-def fresnel_dielectric(cos_o, eta):
+def fresnel_dielectric(cos_o: float, eta: float) -> tuple[float, float]:
     """Share of unpolarised light that a smooth surface reflects, and the cosine of the refracted ray.
 
     ``eta`` is the index of refraction on the other side over that on the side of ``cos_o`` >= 0. Where all
@@ -42,15 +46,16 @@ def fresnel_dielectric(cos_o, eta):
 
 
 @njit_no_refcount(forceinline=True)
-def sample_cosine(u, v):
+def sample_cosine(u: float, v: float) -> tuple[float, float, float]:
     """A direction over the hemisphere, as dense as its cosine; its density is cosine / pi."""
     radius, angle = math.sqrt(u), 2.0 * math.pi * v
     return radius * math.cos(angle), radius * math.sin(angle), math.sqrt(max(1.0 - u, 0.0))
 
 
 @njit_no_refcount(forceinline=True)
-def specular_probability(o_z, red, green, blue, metallic, roughness, coat_albedo):
-    """Probability with which a sample goes to the specular lobe rather than to the ground."""
+def specular_probability(o_z: float, bsdf: Bsdf, coat_albedo: Float64[np.ndarray, "a c"]) -> float:
+    """Return the probability with which a sample goes to the specular lobe rather than to the ground."""
+    (red, green, blue), metallic, roughness = bsdf.rgb, bsdf.metallic, bsdf.roughness
     if metallic >= 1.0:
         return 1.0
     sheen = table_value(coat_albedo, o_z, roughness)
@@ -62,15 +67,11 @@ def specular_probability(o_z, red, green, blue, metallic, roughness, coat_albedo
 
 
 @njit_no_refcount(forceinline=True)
-def principled_eval(
-    o_x, o_y, o_z, i_x, i_y, i_z, red, green, blue, metallic, roughness, ior, substrate, energy_compensation,
-    ggx_albedo, coat_albedo, coat_mean_albedo,
-):  # fmt: skip
-    """Value times cosine (three channels) and density of the mixture of dielectric and metal.
-
-    ``ggx_albedo`` is the table of how much a colourless metal sends back in one bounce, ``coat_albedo`` that of the
-    dielectric's surface, ``coat_mean_albedo`` the cosine-weighted mean of ``coat_albedo`` over all directions.
-    """
+def principled_eval(o: Vec3, i: Vec3, bsdf: Bsdf, tables: AlbedoTables) -> tuple[float, float, float, float]:
+    """Return value times cosine (three channels) and density of the mixture of dielectric and metal."""
+    o_x, o_y, o_z = o
+    i_x, i_y, i_z = i
+    (red, green, blue), metallic, roughness = bsdf.rgb, bsdf.metallic, bsdf.roughness
     if o_z <= 0.0 or i_z <= 0.0:
         return 0.0, 0.0, 0.0, 0.0
     alpha = max(roughness * roughness, MIN_ALPHA)
@@ -81,29 +82,29 @@ def principled_eval(
     masking_o, masking_i = ggx_masking(o_z, alpha), ggx_masking(i_z, alpha)
     density = ggx_density(h_z, alpha) / (4.0 * o_z)  # with the cosine to the light divided out
     specular = density * masking_o * masking_i
-    fresnel, _ = fresnel_dielectric(cos_d, ior)
+    fresnel, _ = fresnel_dielectric(cos_d, bsdf.ior)
     weight = schlick_weight(cos_d)
     loss = 0.0
-    if energy_compensation and metallic > 0.0:
-        loss = 1.0 / table_value(ggx_albedo, o_z, roughness) - 1.0
+    if bsdf.energy_compensation and metallic > 0.0:
+        loss = 1.0 / table_value(tables.ggx_albedo, o_z, roughness) - 1.0
     plain = (1.0 - metallic) * fresnel
     f_r = specular * (plain + metallic * (red + (1.0 - red) * weight) * (1.0 + red * loss))
     f_g = specular * (plain + metallic * (green + (1.0 - green) * weight) * (1.0 + green * loss))
     f_b = specular * (plain + metallic * (blue + (1.0 - blue) * weight) * (1.0 + blue * loss))
-    share = specular_probability(o_z, red, green, blue, metallic, roughness, coat_albedo)
+    share = specular_probability(o_z, bsdf, tables.coat_albedo)
     if metallic < 1.0:
         ground = (1.0 - metallic) * i_z / math.pi
-        if substrate == BURLEY:
+        if bsdf.substrate == BURLEY:
             at_o, at_i = schlick_weight(o_z), schlick_weight(i_z)
             retro = 2.0 * roughness * cos_d * cos_d
             ground *= (1.0 - 0.5 * at_o) * (1.0 - 0.5 * at_i) + retro * (
                 at_o + at_i + at_o * at_i * (retro - 1.0)
             )
         else:
-            left = 1.0 - table_value(coat_mean_albedo, 0.0, roughness)
+            left = 1.0 - table_value(tables.coat_mean_albedo, 0.0, roughness)
             ground *= (
-                (1.0 - table_value(coat_albedo, o_z, roughness))
-                * (1.0 - table_value(coat_albedo, i_z, roughness))
+                (1.0 - table_value(tables.coat_albedo, o_z, roughness))
+                * (1.0 - table_value(tables.coat_albedo, i_z, roughness))
                 / left
             )
         f_r += ground * red
@@ -114,19 +115,22 @@ def principled_eval(
 
 
 @njit_no_refcount(forceinline=True)
-def principled_sample(o_x, o_y, o_z, red, green, blue, metallic, roughness, coat_albedo, choice, u, v):
-    """A direction to the light, as dense as :func:`principled_eval` says; worth 0 below the surface."""
-    share = specular_probability(o_z, red, green, blue, metallic, roughness, coat_albedo)
+def principled_sample(
+    o: Vec3, bsdf: Bsdf, coat_albedo: Float64[np.ndarray, "a c"], choice: float, u: float, v: float
+) -> Vec3:
+    """Draw a direction to the light, as dense as :func:`principled_eval` says; worth 0 below the surface."""
+    o_x, o_y, o_z = o
+    share = specular_probability(o_z, bsdf, coat_albedo)
     if choice >= share:
         return sample_cosine(u, v)
-    alpha = max(roughness * roughness, MIN_ALPHA)
+    alpha = max(bsdf.roughness * bsdf.roughness, MIN_ALPHA)
     h_x, h_y, h_z = sample_visible_normal(o_x, o_y, o_z, alpha, u, v)
     twice = 2.0 * (o_x * h_x + o_y * h_y + o_z * h_z)
     return twice * h_x - o_x, twice * h_y - o_y, twice * h_z - o_z
 
 
 @njit_no_refcount(forceinline=True)
-def orthonormal_basis(n_x, n_y, n_z):
+def orthonormal_basis(n_x: float, n_y: float, n_z: float) -> tuple[float, float, float, float, float, float]:
     """Two unit vectors that make a right-handed frame with the unit vector n as its third axis.
 
     "Building an Orthonormal Basis, Revisited" (Duff et al. 2017, https://jcgt.org/published/0006/01/01/).

@@ -1,11 +1,13 @@
 """The materials' functions over arrays, and the tables that they need, integrated."""
 
 import math
+from typing import NamedTuple
 
 import numpy as np
-from numba import prange
+from jaxtyping import Float64
 
 from octasplat.engine.core.compilation import kernel
+from octasplat.engine.pathtracing.kernels.kernel_args import AlbedoTables, Bsdf
 from octasplat.engine.pathtracing.kernels.principled_bsdf import (
     MIN_ALPHA,
     fresnel_dielectric,
@@ -16,15 +18,32 @@ from octasplat.engine.pathtracing.kernels.sampler import UINT32_TO_UNIT, reverse
 from octasplat.engine.shading.kernels.microfacets import ggx_masking, sample_visible_normal
 
 
-@kernel(parallel=True, error_model="numpy")
-def integrate_albedo(ior, samples, table):
-    """Share of light from each direction that one bounce off facets sends back, into ``table``.
+class BsdfArrays(NamedTuple):
+    """Materials of ``n`` points, as in :class:`octasplat.engine.pathtracing.kernels.kernel_args.Bsdf`.
 
-    Rows are roughness and columns the cosine, both from 0 to 1. ``ior`` 0 stands for facets that reflect
-    everything.
+    A single index of refraction, substrate and choice of compensation stands for all.
+    """
+
+    rgb: Float64[np.ndarray, "n 3"]
+    metallic: Float64[np.ndarray, " n"]
+    roughness: Float64[np.ndarray, " n"]
+    ior: float
+    substrate: int
+    energy_compensation: bool
+
+
+@kernel(_nrt=False, error_model="numpy")
+def integrate_albedo(
+    first: int, last: int, ior: float, samples: int, table: Float64[np.ndarray, "a c"]
+) -> None:
+    """Integrate the share of light from each direction that one bounce off facets sends back.
+
+    Writes the rows ``first`` to ``last`` of ``table``. Rows are roughness and columns the cosine, both from
+    0 to
+    1. ``ior`` 0 stands for facets that reflect everything.
     """
     rows, columns = table.shape
-    for j in prange(rows):
+    for j in range(first, last):
         roughness = j / (rows - 1)
         alpha = max(roughness * roughness, MIN_ALPHA)
         for i in range(columns):
@@ -44,42 +63,58 @@ def integrate_albedo(ior, samples, table):
             table[j, i] = total / samples
 
 
-@kernel(parallel=True, error_model="numpy")
+@kernel(_nrt=False, error_model="numpy")
 def principled_eval_array(
-    o,
-    i,
-    colours,
-    metallic,
-    roughness,
-    ior,
-    substrate,
-    energy_compensation,
-    ggx_albedo,
-    coat_albedo,
-    coat_mean_albedo,
-    f,
-    pdf,
-):
-    """:func:`opaque_value` of rows of arguments, into ``f`` and ``pdf``."""
-    for n in prange(len(o)):
-        f[n, 0], f[n, 1], f[n, 2], pdf[n] = principled_eval(
-            o[n, 0], o[n, 1], o[n, 2], i[n, 0], i[n, 1], i[n, 2], colours[n, 0], colours[n, 1], colours[n, 2],
-            metallic[n], roughness[n], ior, substrate, energy_compensation, ggx_albedo, coat_albedo, coat_mean_albedo,
+    first: int,
+    last: int,
+    o: Float64[np.ndarray, "n 3"],
+    i: Float64[np.ndarray, "n 3"],
+    bsdf: BsdfArrays,
+    tables: AlbedoTables,
+    f: Float64[np.ndarray, "n 3"],
+    pdf: Float64[np.ndarray, " n"],
+) -> None:
+    """Write :func:`principled_eval` of the rows ``first`` to ``last`` to ``f`` and ``pdf``."""
+    rgb = bsdf.rgb
+    for n in range(first, last):
+        here = Bsdf(
+            (rgb[n, 0], rgb[n, 1], rgb[n, 2]), bsdf.metallic[n], bsdf.roughness[n],
+            bsdf.ior, bsdf.substrate, bsdf.energy_compensation,
         )  # fmt: skip
+        to_viewer, to_light = (o[n, 0], o[n, 1], o[n, 2]), (i[n, 0], i[n, 1], i[n, 2])
+        f[n, 0], f[n, 1], f[n, 2], pdf[n] = principled_eval(to_viewer, to_light, here, tables)
 
 
-@kernel(parallel=True, error_model="numpy")
-def principled_sample_array(o, colours, metallic, roughness, coat_albedo, random_numbers, i):
-    """:func:`opaque_sample` of rows of arguments; ``random_numbers`` are three uniform ones a row."""
-    for n in prange(len(o)):
+@kernel(_nrt=False, error_model="numpy")
+def principled_sample_array(
+    first: int,
+    last: int,
+    o: Float64[np.ndarray, "n 3"],
+    bsdf: BsdfArrays,
+    coat_albedo: Float64[np.ndarray, "a c"],
+    random_numbers: Float64[np.ndarray, "n 3"],
+    i: Float64[np.ndarray, "n 3"],
+) -> None:
+    """Write :func:`principled_sample` of the rows ``first`` to ``last`` to ``i``."""
+    rgb = bsdf.rgb
+    for n in range(first, last):
+        here = Bsdf(
+            (rgb[n, 0], rgb[n, 1], rgb[n, 2]), bsdf.metallic[n], bsdf.roughness[n],
+            bsdf.ior, bsdf.substrate, bsdf.energy_compensation,
+        )  # fmt: skip
         i[n, 0], i[n, 1], i[n, 2] = principled_sample(
-            o[n, 0], o[n, 1], o[n, 2], colours[n, 0], colours[n, 1], colours[n, 2], metallic[n], roughness[n],
-            coat_albedo, random_numbers[n, 0], random_numbers[n, 1], random_numbers[n, 2],
+            (o[n, 0], o[n, 1], o[n, 2]), here, coat_albedo,
+            random_numbers[n, 0], random_numbers[n, 1], random_numbers[n, 2],
         )  # fmt: skip
 
 
 @kernel(error_model="numpy")
-def fresnel_values(cosines, eta, reflected, cos_t):
-    """:func:`fresnel_dielectric` of rows of cosines."""
+def fresnel_values(
+    cosines: Float64[np.ndarray, " n"],
+    eta: float,
+    reflected: Float64[np.ndarray, " n"],
+    cos_t: Float64[np.ndarray, " n"],
+) -> None:
+    """Write :func:`fresnel_dielectric` of rows of cosines."""
     for n in range(len(cosines)):
         reflected[n], cos_t[n] = fresnel_dielectric(cosines[n], eta)

@@ -10,7 +10,7 @@ functions of their arguments.
 import math
 
 import numpy as np
-from numba import prange
+from jaxtyping import Float64
 
 from octasplat.engine.core.compilation import kernel
 from octasplat.engine.pathtracing.kernels.principled_bsdf import MIN_ALPHA, fresnel_dielectric
@@ -23,7 +23,9 @@ MIN_GLASS_ROUGHNESS = 0.03
 
 
 @njit_no_refcount()
-def rough_dielectric_eval(o_x, o_y, o_z, i_x, i_y, i_z, eta, alpha):
+def rough_dielectric_eval(
+    o_x: float, o_y: float, o_z: float, i_x: float, i_y: float, i_z: float, eta: float, alpha: float
+) -> tuple[float, float]:
     """Value times cosine, and the density of :func:`rough_dielectric_sample` over solid angle."""
     if o_z <= 0.0 or i_z == 0.0:
         return 0.0, 0.0
@@ -50,10 +52,12 @@ def rough_dielectric_eval(o_x, o_y, o_z, i_x, i_y, i_z, eta, alpha):
 
 
 @njit_no_refcount()
-def rough_dielectric_sample(o_x, o_y, o_z, eta, alpha, choice, u, v):
-    """A direction to the light, as dense as :func:`rough_dielectric_eval` says, or no direction at all (zeros).
+def rough_dielectric_sample(
+    o_x: float, o_y: float, o_z: float, eta: float, alpha: float, choice: float, u: float, v: float
+) -> tuple[float, float, float]:
+    """Draw a direction to the light, as dense as :func:`rough_dielectric_eval` says.
 
-    What facets reflect downwards or refract upwards is not to be taken for the other.
+    It may be no direction at all (zeros). What facets reflect downwards or refract upwards is not to be taken for the other.
     """
     h_x, h_y, h_z = sample_visible_normal(o_x, o_y, o_z, alpha, u, v)
     cos_o = o_x * h_x + o_y * h_y + o_z * h_z
@@ -66,14 +70,17 @@ def rough_dielectric_sample(o_x, o_y, o_z, eta, alpha, choice, u, v):
     return (along * h_x - o_x / eta, along * h_y - o_y / eta, down) if down < 0.0 else (0.0, 0.0, 0.0)
 
 
-@kernel(parallel=True, error_model="numpy")
-def integrate_rough_dielectric(eta, samples, table):
-    """Share of light from each direction that one bounce off or through facets keeps, into ``table``.
+@kernel(_nrt=False, error_model="numpy")
+def integrate_rough_dielectric(
+    first: int, last: int, eta: float, samples: int, table: Float64[np.ndarray, "a c"]
+) -> None:
+    """Integrate the share of light from each direction that one bounce off or through facets keeps.
 
-    Rows are roughness and columns the cosine, both from 0 to 1.
+    Writes the rows ``first`` to ``last`` of ``table``. Rows are roughness and columns the cosine, both from
+    0 to 1.
     """
     rows, columns = table.shape
-    for j in prange(rows):
+    for j in range(first, last):
         roughness = j / (rows - 1)
         alpha = max(roughness * roughness, MIN_ALPHA)
         for i in range(columns):
@@ -94,19 +101,36 @@ def integrate_rough_dielectric(eta, samples, table):
             table[j, i] = total / samples
 
 
-@kernel(parallel=True, error_model="numpy")
-def rough_dielectric_eval_array(o, i, eta, alpha, values, pdf):
-    """:func:`rough_dielectric_eval` of rows of directions."""
-    for n in prange(len(o)):
+@kernel(_nrt=False, error_model="numpy")
+def rough_dielectric_eval_array(
+    first: int,
+    last: int,
+    o: Float64[np.ndarray, "n 3"],
+    i: Float64[np.ndarray, "n 3"],
+    eta: float,
+    alpha: float,
+    values: Float64[np.ndarray, " n"],
+    pdf: Float64[np.ndarray, " n"],
+) -> None:
+    """Write :func:`rough_dielectric_eval` of the rows ``first`` to ``last``."""
+    for n in range(first, last):
         values[n], pdf[n] = rough_dielectric_eval(
             o[n, 0], o[n, 1], o[n, 2], i[n, 0], i[n, 1], i[n, 2], eta, alpha
         )
 
 
-@kernel(parallel=True, error_model="numpy")
-def rough_dielectric_sample_array(o, eta, alpha, random_numbers, i):
-    """:func:`rough_dielectric_sample` of rows of directions; ``random_numbers`` are three uniform ones a row."""
-    for n in prange(len(o)):
+@kernel(_nrt=False, error_model="numpy")
+def rough_dielectric_sample_array(
+    first: int,
+    last: int,
+    o: Float64[np.ndarray, "n 3"],
+    eta: float,
+    alpha: float,
+    random_numbers: Float64[np.ndarray, "n 3"],
+    i: Float64[np.ndarray, "n 3"],
+) -> None:
+    """Write :func:`rough_dielectric_sample` of the rows ``first`` to ``last``."""
+    for n in range(first, last):
         i[n, 0], i[n, 1], i[n, 2] = rough_dielectric_sample(
             o[n, 0],
             o[n, 1],

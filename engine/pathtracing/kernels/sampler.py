@@ -7,6 +7,7 @@ cannot matter.
 """
 
 import numpy as np
+from jaxtyping import Float64, Int32, Int64, UInt32
 
 from octasplat.engine.core.compilation import kernel
 from octasplat.engine.trace.kernels.native import njit_no_refcount
@@ -16,7 +17,7 @@ ONE_MINUS_EPSILON = 1.0 - 2.0**-24
 
 
 @njit_no_refcount(inline="always")
-def hash_uint32(x):
+def hash_uint32(x: np.uint32) -> np.uint32:
     """32 well mixed bits of a uint32."""
     x = np.uint32(x)
     x = np.uint32((x ^ (x >> np.uint32(16))) * np.uint32(0x7FEB352D))
@@ -25,7 +26,7 @@ def hash_uint32(x):
 
 
 @njit_no_refcount()
-def reverse_bits(x):
+def reverse_bits(x: np.uint32) -> np.uint32:
     """The bits of a uint32 in the opposite order."""
     x = np.uint32(x)
     x = np.uint32((x << np.uint32(16)) | (x >> np.uint32(16)))
@@ -44,7 +45,7 @@ def reverse_bits(x):
 
 
 @njit_no_refcount()
-def _laine_karras_permutation(x, seed):
+def _laine_karras_permutation(x: np.uint32, seed: np.uint32) -> np.uint32:
     """Change each bit by a hash of the bits below it (Laine and Karras)."""
     x = np.uint32(x + seed)
     x = np.uint32(x ^ np.uint32(x * np.uint32(0x6C50B47C)))
@@ -54,7 +55,7 @@ def _laine_karras_permutation(x, seed):
 
 
 @njit_no_refcount()
-def sobol_reversed_bits(index):
+def sobol_reversed_bits(index: np.uint32) -> tuple[np.uint32, np.uint32]:
     """The first two dimensions of Sobol's sequence as 32 binary digits behind the point, the last one first.
 
     So they are what is to be scrambled next. The first is the index itself, the second Pascal's triangle
@@ -68,13 +69,13 @@ def sobol_reversed_bits(index):
 
 
 @njit_no_refcount()
-def pixel_key(seed, pixel):
+def pixel_key(seed: int, pixel: int) -> np.uint32:
     """What the numbers of a pixel begin from."""
     return hash_uint32(np.uint32(hash_uint32(np.uint32(seed)) + np.uint32(0x9E3779B9) * np.uint32(pixel)))
 
 
 @njit_no_refcount()
-def uniform_pair(key, sample, pair):
+def uniform_pair(key: np.uint32, sample: int, pair: int) -> tuple[float, float]:
     """Two numbers in [0, 1) for number ``sample`` (below 65,536) in the pair of dimensions ``pair``."""
     seed = hash_uint32(np.uint32(key + np.uint32(0x85EBCA6B) * np.uint32(pair + 1)))
     # The order is scrambled within its 16 bits, so that the first 2^k samples stay a whole block.
@@ -90,14 +91,27 @@ def uniform_pair(key, sample, pair):
 
 
 @kernel()
-def fill_uniform(seed, pixels, samples, pair, out):
+def fill_uniform(
+    seed: int,
+    pixels: Int64[np.ndarray, " n"],
+    samples: Int64[np.ndarray, " n"],
+    pair: int,
+    out: Float64[np.ndarray, "n 2"],
+) -> None:
     """The numbers of many (pixel, sample), for tests and for what draws them outside of the kernels."""
     for i in range(len(pixels)):
         out[i, 0], out[i, 1] = uniform_pair(pixel_key(seed, pixels[i]), samples[i], pair)
 
 
 @njit_no_refcount()
-def _fill_pair(keys, samples, count, pair, first, second):
+def _fill_pair(
+    keys: UInt32[np.ndarray, " p"],
+    samples: Int32[np.ndarray, " p"],
+    count: int,
+    pair: int,
+    first: Float64[np.ndarray, " p"],
+    second: Float64[np.ndarray, " p"],
+) -> None:
     """A pair of numbers of each path; without a branch, so that the compiler does many paths at a time."""
     for k in range(count):
         u, v = uniform_pair(keys[k], samples[k], pair)
@@ -106,7 +120,13 @@ def _fill_pair(keys, samples, count, pair, first, second):
 
 
 @njit_no_refcount()
-def fill_pairs(keys, samples, count, first, out):
+def fill_pairs(
+    keys: UInt32[np.ndarray, " p"],
+    samples: Int32[np.ndarray, " p"],
+    count: int,
+    first: int,
+    out: Float64[np.ndarray, "d 2 p"],
+) -> None:
     """:func:`uniform_pair` of ``count`` paths in the pairs of dimensions from ``first`` on.
 
     ``out`` (pairs, 2, count or more) gets them.

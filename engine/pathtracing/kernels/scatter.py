@@ -9,6 +9,16 @@ import math
 import numpy as np
 
 from octasplat.engine.core.rays import AT_INFINITY
+from octasplat.engine.pathtracing.kernels.kernel_args import (
+    AlbedoTables,
+    Bsdf,
+    LightQuery,
+    PathArrays,
+    PathSamples,
+    Rgb,
+    ShadowRayArrays,
+    Vec3,
+)
 from octasplat.engine.pathtracing.kernels.lights import INFINITE_DISTANCE, sample_light, sample_light_index
 from octasplat.engine.pathtracing.kernels.principled_bsdf import (
     orthonormal_basis,
@@ -34,7 +44,9 @@ SHADOW_RAY_SCALE = 1.0 - 1e-4
 
 
 @njit_no_refcount(forceinline=True)
-def spawn_ray(paths, p, x, y, z, d_x, d_y, d_z, pdf):
+def spawn_ray(
+    paths: PathArrays, p: int, x: float, y: float, z: float, d_x: float, d_y: float, d_z: float, pdf: float
+) -> None:
     """Send a path on; its viewer is left behind, and lost where the path has been scattered."""
     o = paths.origins_world[p]
     if pdf > 0.0:
@@ -47,8 +59,17 @@ def spawn_ray(paths, p, x, y, z, d_x, d_y, d_z, pdf):
 
 
 @njit_no_refcount(forceinline=True)
-def queue_shadow_ray(shadows, k, x, y, z, w_x, w_y, w_z, distance, red, green, blue, clamp):
+def queue_shadow_ray(
+    shadows: ShadowRayArrays,
+    k: int,
+    origin: Vec3,
+    direction: Vec3,
+    distance: float,
+    radiance: Rgb,
+    clamp: float,
+) -> None:
     """Ask a light: what it brings if nothing is in its way, no more than ``clamp``."""
+    (x, y, z), (w_x, w_y, w_z), (red, green, blue) = origin, direction, radiance
     most = max(red, green, blue)
     if most > clamp:
         red, green, blue = red * clamp / most, green * clamp / most, blue * clamp / most
@@ -65,80 +86,85 @@ def queue_shadow_ray(shadows, k, x, y, z, w_x, w_y, w_z, distance, red, green, b
 
 
 @njit_no_refcount(forceinline=True)
-def scatter_path(
-    k, p, n, random_numbers, paths, is_diffuse, x, y, z, n_x, n_y, n_z, s_x, s_y, s_z, red, green, blue, metallic,
-    roughness, ior, substrate, energy_compensation, ggx_albedo, coat_albedo, coat_mean_albedo, lights, integrator, shadows,
-):  # fmt: skip
-    """Ask a light, into row ``k`` of ``shadows``, and send path ``p`` on from a point off its surface.
+def sample_pair(samples: PathSamples, pair: int) -> tuple[float, float]:
+    """Return a pair of uniform numbers of a path."""
+    return samples.random_numbers[pair, 0, samples.n], samples.random_numbers[pair, 1, samples.n]
 
-    Column ``n`` of ``random_numbers`` holds pairs of uniform ones. The normal n is the surface's own, s the one that
-    it is shaded by; a ``is_diffuse`` surface has a colour alone.
+
+@njit_no_refcount(forceinline=True)
+def surface_eval(
+    o: Vec3, i: Vec3, is_diffuse: bool, bsdf: Bsdf, tables: AlbedoTables
+) -> tuple[float, float, float, float]:
+    """Return value times cosine and density of a surface that scatters."""
+    if is_diffuse:
+        red, green, blue = bsdf.rgb
+        pdf = i[2] / math.pi
+        return red * pdf, green * pdf, blue * pdf, pdf
+    return principled_eval(o, i, bsdf, tables)
+
+
+@njit_no_refcount(forceinline=True)
+def scatter_path(
+    p: int,
+    samples: PathSamples,
+    paths: PathArrays,
+    is_diffuse: bool,
+    point: Vec3,
+    normal: Vec3,
+    shading_normal: Vec3,
+    bsdf: Bsdf,
+    tables: AlbedoTables,
+    query: LightQuery,
+) -> None:
+    """Ask a light, and send path ``p`` on from a point off its surface.
+
+    ``normal`` is the surface's own, ``shading_normal`` the one that it is shaded by; a surface that
+    ``is_diffuse`` has a color alone.
     """
+    (x, y, z), (n_x, n_y, n_z), (s_x, s_y, s_z) = point, normal, shading_normal
+    lights, shadows, k = query.lights, query.shadows, query.k
     d = paths.directions_world[p]
+    # --- the direction to the viewer, in the frame of the shading normal ---
     a_x, a_y, a_z, b_x, b_y, b_z = orthonormal_basis(s_x, s_y, s_z)
-    o_x = -(d[0] * a_x + d[1] * a_y + d[2] * a_z)
-    o_y = -(d[0] * b_x + d[1] * b_y + d[2] * b_z)
-    o_z = -(d[0] * s_x + d[1] * s_y + d[2] * s_z)
+    o = (
+        -(d[0] * a_x + d[1] * a_y + d[2] * a_z),
+        -(d[0] * b_x + d[1] * b_y + d[2] * b_z),
+        -(d[0] * s_x + d[1] * s_y + d[2] * s_z),
+    )
+    # --- a sample of a light ---
     if len(lights.kinds):
-        l, share = sample_light_index(lights, x, y, z, random_numbers[LIGHT_CHOICE_SAMPLE, 0, n])
+        l, share = sample_light_index(lights, x, y, z, sample_pair(samples, LIGHT_CHOICE_SAMPLE)[0])
         if l >= 0:
-            u, v = random_numbers[LIGHT_POSITION_SAMPLE, 0, n], random_numbers[LIGHT_POSITION_SAMPLE, 1, n]
+            u, v = sample_pair(samples, LIGHT_POSITION_SAMPLE)
             w_x, w_y, w_z, distance, l_r, l_g, l_b, l_pdf = sample_light(lights, l, x, y, z, u, v)
             i_z = w_x * s_x + w_y * s_y + w_z * s_z
             if i_z > 0.0 and w_x * n_x + w_y * n_y + w_z * n_z > 0.0 and l_r + l_g + l_b > 0.0:
-                if is_diffuse:
-                    pdf = i_z / math.pi
-                    f_r, f_g, f_b = red * pdf, green * pdf, blue * pdf
-                else:
-                    f_r, f_g, f_b, pdf = principled_eval(
-                        o_x, o_y, o_z,
-                        w_x * a_x + w_y * a_y + w_z * a_z, w_x * b_x + w_y * b_y + w_z * b_z, i_z,
-                        red, green, blue, metallic, roughness, ior, substrate, energy_compensation,
-                        ggx_albedo, coat_albedo, coat_mean_albedo,
-                    )  # fmt: skip
+                i = w_x * a_x + w_y * a_y + w_z * a_z, w_x * b_x + w_y * b_y + w_z * b_z, i_z
+                f_r, f_g, f_b, pdf = surface_eval(o, i, is_diffuse, bsdf, tables)
                 factor = 1.0 / share
                 shadows.passes_glass[k] = l_pdf == 0.0
                 if l_pdf > 0.0:
                     l_pdf *= share
                     factor = 1.0 / (l_pdf + pdf) if lights.is_hittable[l] else 1.0 / l_pdf
                 w = paths.throughput[p]
-                l_r, l_g, l_b = (
-                    w[0] * f_r * l_r * factor,
-                    w[1] * f_g * l_g * factor,
-                    w[2] * f_b * l_b * factor,
-                )
-                clamp = integrator.clamp if paths.flags[p] & FLAG_SCATTERED else np.inf
-                queue_shadow_ray(shadows, k, x, y, z, w_x, w_y, w_z, distance, l_r, l_g, l_b, clamp)
-    u, v = random_numbers[DIRECTION_SAMPLE, 0, n], random_numbers[DIRECTION_SAMPLE, 1, n]
+                radiance = w[0] * f_r * l_r * factor, w[1] * f_g * l_g * factor, w[2] * f_b * l_b * factor
+                clamp = query.integrator.clamp if paths.flags[p] & FLAG_SCATTERED else np.inf
+                queue_shadow_ray(shadows, k, point, (w_x, w_y, w_z), distance, radiance, clamp)
+    # --- a sample of the BSDF ---
+    u, v = sample_pair(samples, DIRECTION_SAMPLE)
     if is_diffuse:
         i_x, i_y, i_z = sample_cosine(u, v)
-        pdf = i_z / math.pi
-        f_r, f_g, f_b = red * pdf, green * pdf, blue * pdf
     else:
-        i_x, i_y, i_z = principled_sample(
-            o_x,
-            o_y,
-            o_z,
-            red,
-            green,
-            blue,
-            metallic,
-            roughness,
-            coat_albedo,
-            random_numbers[LOBE_SAMPLE, 0, n],
-            u,
-            v,
-        )
-        f_r, f_g, f_b, pdf = principled_eval(
-            o_x, o_y, o_z, i_x, i_y, i_z, red, green, blue, metallic, roughness, ior, substrate, energy_compensation,
-            ggx_albedo, coat_albedo, coat_mean_albedo,
-        )  # fmt: skip
+        choice = sample_pair(samples, LOBE_SAMPLE)[0]
+        i_x, i_y, i_z = principled_sample(o, bsdf, tables.coat_albedo, choice, u, v)
+    f_r, f_g, f_b, pdf = surface_eval(o, (i_x, i_y, i_z), is_diffuse, bsdf, tables)
     w_x = i_x * a_x + i_y * b_x + i_z * s_x
     w_y = i_x * a_y + i_y * b_y + i_z * s_y
     w_z = i_x * a_z + i_y * b_z + i_z * s_z
     if not pdf > 0.0 or w_x * n_x + w_y * n_y + w_z * n_z <= 0.0 or f_r + f_g + f_b <= 0.0:
         paths.is_alive[p] = False
         return
+    # --- the path goes on ---
     paths.throughput[p, 0] *= f_r / pdf
     paths.throughput[p, 1] *= f_g / pdf
     paths.throughput[p, 2] *= f_b / pdf

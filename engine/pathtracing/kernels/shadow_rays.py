@@ -3,14 +3,28 @@
 import math
 
 import numpy as np
+from jaxtyping import Float32, Int32
 
 from octasplat.engine.core.compilation import kernel
-from octasplat.engine.pathtracing.kernels.kernel_args import BLOCK_SIZE
+from octasplat.engine.pathtracing.kernels.kernel_args import (
+    BLOCK_SIZE,
+    MaterialArrays,
+    MeshQueries,
+    PathScratch,
+    ShadowRayArrays,
+    SurfaceArrays,
+)
 from octasplat.engine.pathtracing.kernels.principled_bsdf import fresnel_dielectric
 from octasplat.engine.pathtracing.kernels.rough_dielectric import MIN_GLASS_ROUGHNESS
 from octasplat.engine.pathtracing.kernels.surface import face_normal
 from octasplat.engine.trace.kernels.native import njit_no_refcount
-from octasplat.engine.trace.kernels.triangles import any_hits, closest_hits
+from octasplat.engine.trace.kernels.triangles import (
+    EmbreeQuery,
+    TriangleHitArrays,
+    TriangleRays,
+    any_hits,
+    closest_hits,
+)
 
 MAX_GLASS_SURFACES = 16
 RESTART_SCALE = np.float32(1 + 1e-6)
@@ -18,7 +32,9 @@ RESTART_OFFSET = np.float32(1e-7)
 
 
 @njit_no_refcount(forceinline=True)
-def _select_shadow_rays(shadows, first, last, passes_glass, rows):
+def _select_shadow_rays(
+    shadows: ShadowRayArrays, first: int, last: int, passes_glass: bool, rows: Int32[np.ndarray, " b"]
+) -> int:
     """The rows of shadow rays that bring anything, the straight ones or the others, and how many."""
     count = 0
     for k in range(first, last):
@@ -39,13 +55,19 @@ def _select_shadow_rays(shadows, first, last, passes_glass, rows):
 
 
 @njit_no_refcount(forceinline=True)
-def _trace_occlusion(query, shadows, scratch, count, transmittance):
+def _trace_occlusion(
+    query: EmbreeQuery,
+    shadows: ShadowRayArrays,
+    scratch: PathScratch,
+    count: int,
+    transmittance: Float32[np.ndarray, "n 3"],
+) -> int:
     """Take the light from those of the first ``count`` rows that something is in the way of."""
     scratch.t_starts[0] = 0.0
-    any_hits(
-        query, shadows.origins_world, shadows.directions_world, scratch.t_starts[:1], shadows.t_max,
-        scratch.rows, 0, count, scratch.embree, scratch.is_occluded,
-    )  # fmt: skip
+    rays = TriangleRays(
+        shadows.origins_world, shadows.directions_world, scratch.t_starts[:1], shadows.t_max, scratch.rows
+    )
+    any_hits(query, rays, 0, count, scratch.embree, scratch.is_occluded)
     left = 0
     for i in range(count):
         k = scratch.rows[i]
@@ -59,18 +81,27 @@ def _trace_occlusion(query, shadows, scratch, count, transmittance):
 
 @njit_no_refcount(forceinline=True)
 def _trace_glass(
-    queries, surfaces, materials, shadows, first, scratch, count, passes_rough_glass, transmittance
-):
+    queries: MeshQueries,
+    surfaces: SurfaceArrays,
+    materials: MaterialArrays,
+    shadows: ShadowRayArrays,
+    first: int,
+    scratch: PathScratch,
+    count: int,
+    passes_rough_glass: bool,
+    transmittance: Float32[np.ndarray, "n 3"],
+) -> None:
     """Take what Fresnel, tint and Beer take from ``count`` rows on their way straight through glass."""
     for k in range(BLOCK_SIZE):
         scratch.t_starts[k] = 0.0
+    # Starts are kept by the row's place in the block.
+    rays = TriangleRays(
+        shadows.origins_world[first:], shadows.directions_world[first:], scratch.t_starts,
+        shadows.t_max[first:], scratch.rows,
+    )  # fmt: skip
+    met = TriangleHitArrays(scratch.distances, scratch.faces, scratch.barycentrics)
     for _ in range(MAX_GLASS_SURFACES):
-        # Starts are kept by the row's place in the block.
-        closest_hits(
-            queries.closest_hit_glass, shadows.origins_world[first:], shadows.directions_world[first:],
-            scratch.t_starts, shadows.t_max[first:], scratch.rows, 0, count, False, scratch.embree,
-            scratch.distances, scratch.faces, scratch.barycentrics,
-        )  # fmt: skip
+        closest_hits(queries.closest_hit_glass, rays, 0, count, False, scratch.embree, met)
         left = 0
         for i in range(count):
             if scratch.faces[i] < 0:
@@ -106,15 +137,23 @@ def _trace_glass(
 
 @kernel(_nrt=False, error_model="numpy")
 def shadow_transmittance(
-    first, last, scratch, queries, surfaces, materials, shadows, passes_rough_glass, transmittance
-):
+    first: int,
+    last: int,
+    scratch: PathScratch,
+    queries: MeshQueries,
+    surfaces: SurfaceArrays,
+    materials: MaterialArrays,
+    shadows: ShadowRayArrays,
+    passes_rough_glass: bool,
+    transmittance: Float32[np.ndarray, "n 3"],
+) -> None:
     """The share of light that meshes let through on each ray, in each channel: 0 or 1, but for glass.
 
     It is 0, too, for rays that bring nothing. Where a ray is marked so, light goes straight through glass,
     less what Fresnel, tint and Beer take. Paths find light that glass bends only where a lamp has an extent
     and the lit point sends paths on; everywhere else glass would cast the shadow of a stone. Rough glass
-    sends paths on from its own surface, which find such light; only where none are sent (``passes_rough_glass``)
-    does it let light through as if it were smooth.
+    sends paths on from its own surface, which find such light; only where none are sent
+    (``passes_rough_glass``) does it let light through as if it were smooth.
     """
     for start in range(first, last, BLOCK_SIZE):
         end = min(start + BLOCK_SIZE, last)

@@ -3,12 +3,19 @@
 import math
 
 import numpy as np
+from jaxtyping import Float32, Float64, Int64
 
 from octasplat.engine.core.compilation import kernel
 
 
 @kernel(error_model="numpy")
-def smooth_normals(corners, order, starts, min_cosine, normals):
+def smooth_normals(
+    corners: Float64[np.ndarray, "f 3 3"],
+    order: Int64[np.ndarray, " c"],
+    starts: Int64[np.ndarray, " q1"],
+    min_cosine: float,
+    normals: Float32[np.ndarray, "f 3 3"],
+) -> None:
     """Mean normal, weighted by angle, of the faces round a corner that are turned from its own by little.
 
     ``order`` lists corners (3 * face + place) so that those of one point lie together, point q from

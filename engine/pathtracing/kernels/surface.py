@@ -2,6 +2,10 @@
 
 import math
 
+import numpy as np
+from jaxtyping import Float32
+
+from octasplat.engine.pathtracing.kernels.kernel_args import MaterialArrays, SurfaceArrays, Vec3
 from octasplat.engine.pathtracing.kernels.texture import eval_texture
 from octasplat.engine.trace.kernels.native import njit_no_refcount
 
@@ -10,7 +14,9 @@ RAY_OFFSET_SCALE = 5e-6
 
 
 @njit_no_refcount(forceinline=True)
-def interpolate_corners(corners, a, b, c):
+def interpolate_corners(
+    corners: Float32[np.ndarray, "3 3"], a: float, b: float, c: float
+) -> tuple[float, float, float]:
     """The point with weights a, b, c of the corners."""
     return (
         a * corners[0, 0] + b * corners[1, 0] + c * corners[2, 0],
@@ -20,14 +26,25 @@ def interpolate_corners(corners, a, b, c):
 
 
 @njit_no_refcount(forceinline=True)
-def normalize(x, y, z):
+def interpolate_uv(
+    corner_uv: Float32[np.ndarray, "3 2"], a: float, b: float, c: float
+) -> tuple[float, float]:
+    """Return the texture coordinates with weights a, b, c of the corners."""
+    return (
+        a * corner_uv[0, 0] + b * corner_uv[1, 0] + c * corner_uv[2, 0],
+        a * corner_uv[0, 1] + b * corner_uv[1, 1] + c * corner_uv[2, 1],
+    )
+
+
+@njit_no_refcount(forceinline=True)
+def normalize(x: float, y: float, z: float) -> tuple[float, float, float]:
     """The vector with length 1."""
     length = max(math.sqrt(x * x + y * y + z * z), 1e-30)
     return x / length, y / length, z / length
 
 
 @njit_no_refcount(forceinline=True)
-def face_normal(corners):
+def face_normal(corners: Float32[np.ndarray, "3 3"]) -> tuple[float, float, float]:
     """Unit normal of a triangle, on the side from which its corners run anticlockwise."""
     u_x, u_y, u_z = (
         float(corners[1, 0]) - corners[0, 0],
@@ -43,14 +60,18 @@ def face_normal(corners):
 
 
 @njit_no_refcount(forceinline=True)
-def offset_ray_origin(p_x, p_y, p_z, n_x, n_y, n_z):
+def offset_ray_origin(
+    p_x: float, p_y: float, p_z: float, n_x: float, n_y: float, n_z: float
+) -> tuple[float, float, float]:
     """The point a little off a surface along n, so that rounding does not put it behind the surface."""
     step = RAY_OFFSET_SCALE * max(abs(p_x), abs(p_y), abs(p_z), 1e-3)
     return p_x + step * n_x, p_y + step * n_y, p_z + step * n_z
 
 
 @njit_no_refcount(forceinline=True)
-def eval_material(materials, m, u, v):
+def eval_material(
+    materials: MaterialArrays, m: int, u: float, v: float
+) -> tuple[float, float, float, float, float]:
     """Base colour, metallic and roughness of material ``m`` at texture coordinates."""
     red, green, blue = (
         materials.colours_linear[m, 0],
@@ -70,7 +91,9 @@ def eval_material(materials, m, u, v):
 
 
 @njit_no_refcount(forceinline=True)
-def eval_vertex_color(surfaces, face, a, b, c):
+def eval_vertex_color(
+    surfaces: SurfaceArrays, face: int, a: float, b: float, c: float
+) -> tuple[float, float, float]:
     """The colour of the corners of a face at a place, white where no mesh has colours of its own."""
     if len(surfaces.corner_rgb_linear) == 0:
         return 1.0, 1.0, 1.0
@@ -78,12 +101,23 @@ def eval_vertex_color(surfaces, face, a, b, c):
 
 
 @njit_no_refcount(forceinline=True)
-def eval_normal_map(materials, m, corners, uv, u, v, n_x, n_y, n_z, s_x, s_y, s_z, d_x, d_y, d_z):
-    """The shading normal s turned as the normal texture says; n is the face's, on the viewer's side.
+def eval_normal_map(
+    materials: MaterialArrays,
+    m: int,
+    corners: Float32[np.ndarray, "3 3"],
+    corner_uv: Float32[np.ndarray, "3 2"],
+    texture_uv: tuple[float, float],
+    normal: Vec3,
+    shading_normal: Vec3,
+    direction: Vec3,
+) -> Vec3:
+    """Turn the shading normal s as the normal texture says; ``normal`` is the face's, on the viewer's side.
 
     The frame follows the texture coordinates of the face: x where u grows, y where v shrinks, as v counts
     downwards. s stays where the face has none, or where the viewer would see the new one from behind.
     """
+    (u, v), uv = texture_uv, corner_uv
+    (n_x, n_y, n_z), (s_x, s_y, s_z), (d_x, d_y, d_z) = normal, shading_normal, direction
     texture = materials.normal_textures[m]
     if texture < 0:
         return s_x, s_y, s_z
@@ -128,7 +162,18 @@ def eval_normal_map(materials, m, corners, uv, u, v, n_x, n_y, n_z, s_x, s_y, s_
 
 
 @njit_no_refcount(forceinline=True)
-def shading_normal(normals, a, b, c, n_x, n_y, n_z, d_x, d_y, d_z):
+def shading_normal(
+    normals: Float32[np.ndarray, "3 3"],
+    a: float,
+    b: float,
+    c: float,
+    n_x: float,
+    n_y: float,
+    n_z: float,
+    d_x: float,
+    d_y: float,
+    d_z: float,
+) -> tuple[float, float, float]:
     """The interpolated normal on the side of n; n itself where the viewer would see it from behind."""
     s_x, s_y, s_z = interpolate_corners(normals, a, b, c)
     s_x, s_y, s_z = normalize(s_x, s_y, s_z)
@@ -140,7 +185,9 @@ def shading_normal(normals, a, b, c, n_x, n_y, n_z, d_x, d_y, d_z):
 
 
 @njit_no_refcount(forceinline=True)
-def reflect(d_x, d_y, d_z, n_x, n_y, n_z):
+def reflect(
+    d_x: float, d_y: float, d_z: float, n_x: float, n_y: float, n_z: float
+) -> tuple[float, float, float]:
     """The direction d after a mirror with the normal n."""
     twice = 2.0 * (d_x * n_x + d_y * n_y + d_z * n_z)
     return d_x - twice * n_x, d_y - twice * n_y, d_z - twice * n_z

@@ -2,11 +2,14 @@
 
 import math
 
+from octasplat.engine.pathtracing.kernels.kernel_args import LightArrays, MaterialArrays
 from octasplat.engine.trace.kernels.native import njit_no_refcount
 
 
 @njit_no_refcount(forceinline=True)
-def eval_texture(materials, texture, u, v):
+def eval_texture(
+    materials: LightArrays | MaterialArrays, texture: int, u: float, v: float
+) -> tuple[float, float, float]:
     """Bilinear linear value of a texture that repeats."""
     first, height, width = (
         materials.texture_sizes[texture, 0],

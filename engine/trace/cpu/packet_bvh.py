@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float32, Int32
 
 from octasplat.engine.core.compilation import run_ranges
+from octasplat.engine.trace.cpu.kernels.kernel_args import BvhArrays
 from octasplat.engine.trace.cpu.kernels.packet_bvh import (
     BOX_ROWS,
     INVALID_KEY,
@@ -20,7 +21,6 @@ from octasplat.engine.trace.cpu.kernels.packet_bvh import (
     write_leaves,
     write_upper_levels,
 )
-from octasplat.engine.trace.cpu.kernels.packet_traversal import BvhArrays
 from octasplat.engine.trace.cpu.kernels.radix_sort import stable_argsort
 from octasplat.engine.trace.cpu.memory import aligned_empty
 

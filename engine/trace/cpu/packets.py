@@ -21,6 +21,7 @@ from octasplat.engine.trace.cpu.kernels.kernel_args import (
 from octasplat.engine.trace.cpu.kernels.packet_backward import (
     GEOMETRY_WORDS,
     ROW_WORDS,
+    BackwardPass,
     MomentRows,
     backward_packets,
     reduce_packets,
@@ -229,7 +230,7 @@ class PacketTracer:
         out = empty_gradients(len(which), basis_count, feature_count)
         run_on_threads(
             reduce_packets, self._threads,
-            rays, packets, parameters, scene, self._limits, by_gaussian, which, rows,
+            BackwardPass(rays, packets, parameters, scene, self._limits), by_gaussian, which, rows,
             REDUCE_CHUNKS_PER_THREAD * self._threads, np.zeros(1, np.int64), gradient_arrays(out),
         )  # fmt: skip
         return out

@@ -80,7 +80,8 @@ class SingleRayTracer:
         """Follow the rays ``ray_indices``, in ascending order."""
         run_on_threads(
             trace_rays, self._threads,
-            self._ray_query(intersect1_address()), forward, ray_indices, _rays_per_chunk(ray_indices), np.zeros(1, np.int64),
+            self._ray_query(intersect1_address()), forward, ray_indices, _rays_per_chunk(ray_indices),
+            np.zeros(1, np.int64),
         )  # fmt: skip
 
     def write_transmittance(
@@ -93,8 +94,8 @@ class SingleRayTracer:
         """Write the transmittance of the rays ``ray_indices``."""
         run_on_threads(
             write_ray_transmittance, self._threads,
-            self._ray_query(occluded1_address()), rays, scene, self._limits, ray_indices, _rays_per_chunk(ray_indices),
-            np.zeros(1, np.int64), transmittance,
+            self._ray_query(occluded1_address()), rays, scene, self._limits, ray_indices,
+            _rays_per_chunk(ray_indices), np.zeros(1, np.int64), transmittance,
         )  # fmt: skip
 
     def backward(

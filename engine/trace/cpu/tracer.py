@@ -55,14 +55,15 @@ class CpuTracer:
     one way form packets; the others are followed one by one
     (:func:`octasplat.engine.trace.cpu.packets.find_packets`).
 
-    A hierarchy only says which octagons to test, the test and the distance come from the parameters, and hits
-    are ordered by (float32 distance, id). So neither the shape of a hierarchy nor the number of threads
-    changes a result. Single rays test in float64; packets in float32 in a frame of their own
-    (:mod:`octasplat.engine.trace.cpu.kernels.packet_candidates`), so that the two agree but for that rounding, which is
-    largest for needles and for octagons seen edge on. Where ``settings.order`` is ``packet``, the rays of a
-    packet composite in one order (:mod:`octasplat.engine.trace.cpu.kernels.shared_sort`), unless Gaussians have
-    features or there is a second phase. Memory per Gaussian: a record of 64 B, 48 B of the packets' hierarchy
-    and a box of 24 B; Embree's hierarchy over the boxes is built when single rays first want it.
+    A hierarchy only says which octagons to test, the test and the distance come from the parameters, and
+    hits are ordered by (float32 distance, id). So neither the shape of a hierarchy nor the number of
+    threads changes a result. Single rays test in float64; packets in float32 in a frame of their own
+    (:mod:`octasplat.engine.trace.cpu.kernels.packet_candidates`), so that the two agree but for that
+    rounding, which is largest for needles and for octagons seen edge on. Where ``settings.order`` is
+    ``packet``, the rays of a packet composite in one order
+    (:mod:`octasplat.engine.trace.cpu.kernels.shared_sort`), unless Gaussians have features or there is a
+    second phase. Memory per Gaussian: a record of 64 B, 48 B of the packets' hierarchy and a box of 24 B;
+    Embree's hierarchy over the boxes is built when single rays first want it.
 
     Not done: no gradient through octagon edges or visibility, and in one order none by depths and normals.
 

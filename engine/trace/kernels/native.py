@@ -1,15 +1,28 @@
 """Numba's tools: kernels that count no references, raw memory, native functions, and a shared counter."""
 
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Sequence
+from typing import Any, TypeAlias
 
 import llvmlite.ir as ir
 from numba import types
 from numba.core import cgutils
+from numba.core.base import BaseContext
+from numba.core.typing import Context as TypingContext
+from numba.core.typing.templates import Signature
 from numba.extending import intrinsic
 
 from octasplat.engine.core.compilation import device_function
 
+Address: TypeAlias = int
+"""An address in memory, numba's ``uintp``."""
+Intrinsic: TypeAlias = tuple[
+    Signature, Callable[[BaseContext, ir.IRBuilder, Signature, Sequence[ir.Value]], ir.Value]
+]
+"""What a function marked ``@intrinsic`` returns: the types of a call, and what writes its code.
+
+Its parameters are annotated with the values that kernels pass. The function itself is given their numba
+types.
+"""
 CACHE_LINE_BYTES = 64
 """Bytes of a cache line."""
 
@@ -23,12 +36,14 @@ def njit_no_refcount(**options: Any) -> Callable[[Any], Any]:
     return device_function(_nrt=False, error_model="numpy", **options)
 
 
-def _pointer_cast(element):
+def _pointer_cast(element: types.Type) -> Any:
     @intrinsic
-    def cast(typingctx, address):
+    def cast(typingctx: TypingContext, address: Address) -> Intrinsic:
         signature = types.CPointer(element)(types.uintp)
 
-        def codegen(context, builder, sig, args):
+        def codegen(
+            context: BaseContext, builder: ir.IRBuilder, sig: Signature, args: Sequence[ir.Value]
+        ) -> ir.Value:
             return builder.inttoptr(args[0], context.get_value_type(sig.return_type))
 
         return signature, codegen
@@ -42,7 +57,7 @@ float64_pointer = _pointer_cast(types.float64)
 uint64_pointer = _pointer_cast(types.uint64)
 
 
-def _call_address(context, builder, args):
+def _call_address(context: BaseContext, builder: ir.IRBuilder, args: Sequence[ir.Value]) -> ir.Value:
     """Call the address ``args[0]`` with the others as pointers."""
     pointer = ir.IntType(8).as_pointer()
     function_type = ir.FunctionType(ir.VoidType(), [pointer] * (len(args) - 1))
@@ -52,36 +67,51 @@ def _call_address(context, builder, args):
 
 
 @intrinsic
-def call_with_three_pointers(typingctx, function, first, second, third):
+def call_with_three_pointers(
+    typingctx: TypingContext, function: Address, first: Address, second: Address, third: Address
+) -> Intrinsic:
     """Call ``void function(void*, void*, void*)`` at a run-time address."""
     signature = types.void(types.uintp, types.uintp, types.uintp, types.uintp)
 
-    def codegen(context, builder, sig, args):
+    def codegen(
+        context: BaseContext, builder: ir.IRBuilder, sig: Signature, args: Sequence[ir.Value]
+    ) -> ir.Value:
         return _call_address(context, builder, args)
 
     return signature, codegen
 
 
 @intrinsic
-def call_with_four_pointers(typingctx, function, first, second, third, fourth):
+def call_with_four_pointers(
+    typingctx: TypingContext,
+    function: Address,
+    first: Address,
+    second: Address,
+    third: Address,
+    fourth: Address,
+) -> Intrinsic:
     """Call ``void function(void*, void*, void*, void*)`` at a run-time address."""
     signature = types.void(types.uintp, types.uintp, types.uintp, types.uintp, types.uintp)
 
-    def codegen(context, builder, sig, args):
+    def codegen(
+        context: BaseContext, builder: ir.IRBuilder, sig: Signature, args: Sequence[ir.Value]
+    ) -> ir.Value:
         return _call_address(context, builder, args)
 
     return signature, codegen
 
 
 @intrinsic
-def atomic_fetch_add(typingctx, address, count):
+def atomic_fetch_add(typingctx: TypingContext, address: Address, count: int) -> Intrinsic:
     """Add ``count`` to the int64 at ``address`` as one indivisible step and return its value before.
 
     Threads take their chunks of work from such a counter, so that none waits while there is work left.
     """
     signature = types.int64(types.uintp, types.int64)
 
-    def codegen(context, builder, sig, args):
+    def codegen(
+        context: BaseContext, builder: ir.IRBuilder, sig: Signature, args: Sequence[ir.Value]
+    ) -> ir.Value:
         pointer = builder.inttoptr(args[0], ir.IntType(64).as_pointer())
         return builder.atomic_rmw("add", pointer, args[1], "monotonic")
 
@@ -89,17 +119,19 @@ def atomic_fetch_add(typingctx, address, count):
 
 
 @njit_no_refcount(forceinline=True)
-def atomic_fetch_next(address):
+def atomic_fetch_next(address: int) -> int:
     """:func:`atomic_fetch_add` of one."""
     return atomic_fetch_add(address, 1)
 
 
 @intrinsic
-def prefetch(typingctx, address):
+def prefetch(typingctx: TypingContext, address: Address) -> Intrinsic:
     """Ask for the cache line at ``address``, which is read some dozen operations later."""
     signature = types.void(types.uintp)
 
-    def codegen(context, builder, sig, args):
+    def codegen(
+        context: BaseContext, builder: ir.IRBuilder, sig: Signature, args: Sequence[ir.Value]
+    ) -> ir.Value:
         pointer = ir.IntType(8).as_pointer()
         i32 = ir.IntType(32)
         function_type = ir.FunctionType(ir.VoidType(), [pointer, i32, i32, i32])
@@ -112,7 +144,7 @@ def prefetch(typingctx, address):
 
 
 @njit_no_refcount(forceinline=True)
-def prefetch_bytes(address, size):
+def prefetch_bytes(address: int, size: int) -> None:
     """:func:`prefetch` for all lines of so many bytes."""
     for line in range(address // CACHE_LINE_BYTES * CACHE_LINE_BYTES, address + size, CACHE_LINE_BYTES):
         prefetch(line)

@@ -6,10 +6,10 @@ Embree gives each ray of eight what it would give that ray alone.
 from typing import NamedTuple
 
 import numpy as np
-from numba import prange
+from jaxtyping import Bool, Float32, Int32
 
 from octasplat.engine.core.compilation import kernel
-from octasplat.engine.trace.kernels.native import call_with_four_pointers, njit_no_refcount
+from octasplat.engine.trace.kernels.native import Address, call_with_four_pointers, njit_no_refcount
 
 LANES = 8
 # --- RTCRayHit8: a row of eight 32-bit words each ---
@@ -26,92 +26,144 @@ INVALID_ID = -1
 class EmbreeQuery(NamedTuple):
     """Addresses of a function of Embree for eight rays, and of the scene that it is to search."""
 
-    function: int
-    scene: int
+    function: Address
+    scene: Address
+
+
+class TriangleRays(NamedTuple):
+    """Rays to be searched along; a single origin or limit stands for all.
+
+    ``ray_indices`` has the ray of each row of the results, and no entries where they are the same.
+    """
+
+    origins: Float32[np.ndarray, "#r 3"]
+    directions: Float32[np.ndarray, "r 3"]
+    t_min: Float32[np.ndarray, "#r"]
+    t_max: Float32[np.ndarray, "#r"]
+    ray_indices: Int32[np.ndarray, " q"]
+
+
+class TriangleHitArrays(NamedTuple):
+    """First hits, to be written: the face is -1 and the distance infinite where a ray meets nothing."""
+
+    distances: Float32[np.ndarray, " q"]
+    faces: Int32[np.ndarray, " q"]
+    barycentrics: Float32[np.ndarray, "q 2"]
 
 
 @njit_no_refcount()
-def _query_rays8(query, origins, directions, t_min, t_max, ray_indices, first, last, is_coherent, scratch):
-    """Search along rays ``first`` and the next ones before ``last``; a single origin or limit stands for all."""
-    whole = scratch.view(np.int32)
+def _query_rays8(
+    query: EmbreeQuery,
+    rays: TriangleRays,
+    first: int,
+    last: int,
+    is_coherent: bool,
+    scratch: Float32[np.ndarray, " w"],
+) -> None:
+    """Search along the rays of row ``first`` and the next ones before ``last``, eight at most."""
+    words = scratch.view(np.int32)
+    # --- the rays, a lane each ---
     for lane in range(LANES):
-        at = min(first + lane, last - 1)
-        r = ray_indices[at] if len(ray_indices) else at
-        o = r if len(origins) > 1 else 0
+        row = min(first + lane, last - 1)
+        r = rays.ray_indices[row] if len(rays.ray_indices) else row
+        o = r if len(rays.origins) > 1 else 0
         for axis in range(3):
-            scratch[(ORIGIN + axis) * LANES + lane] = origins[o, axis]
-            scratch[(DIRECTION + axis) * LANES + lane] = directions[r, axis]
-        near, far = t_min[r if len(t_min) > 1 else 0], t_max[r if len(t_max) > 1 else 0]
+            scratch[(ORIGIN + axis) * LANES + lane] = rays.origins[o, axis]
+            scratch[(DIRECTION + axis) * LANES + lane] = rays.directions[r, axis]
+        near = rays.t_min[r if len(rays.t_min) > 1 else 0]
+        far = rays.t_max[r if len(rays.t_max) > 1 else 0]
         scratch[T_NEAR * LANES + lane] = near
         scratch[T_FAR * LANES + lane] = far
         scratch[TIME * LANES + lane] = np.float32(0.0)
-        whole[MASK * LANES + lane] = -1
-        whole[ID * LANES + lane] = 0
-        whole[FLAGS * LANES + lane] = 0
-        whole[FACE * LANES + lane] = INVALID_ID
-        whole[GEOMETRY * LANES + lane] = INVALID_ID
-        whole[INSTANCE * LANES + lane] = INVALID_ID
-        whole[VALID * LANES + lane] = -1 if first + lane < last and near <= far else 0
-    whole[ARGUMENTS * LANES] = RTC_RAY_QUERY_FLAG_COHERENT if is_coherent else 0
-    whole[ARGUMENTS * LANES + 1] = RTC_FEATURE_FLAG_ALL
+        words[MASK * LANES + lane] = -1
+        words[ID * LANES + lane] = 0
+        words[FLAGS * LANES + lane] = 0
+        words[FACE * LANES + lane] = INVALID_ID
+        words[GEOMETRY * LANES + lane] = INVALID_ID
+        words[INSTANCE * LANES + lane] = INVALID_ID
+        words[VALID * LANES + lane] = -1 if first + lane < last and near <= far else 0
+    # --- RTCIntersectArguments ---
+    words[ARGUMENTS * LANES] = RTC_RAY_QUERY_FLAG_COHERENT if is_coherent else 0
+    words[ARGUMENTS * LANES + 1] = RTC_FEATURE_FLAG_ALL
     for word in range(2, 8):
-        whole[ARGUMENTS * LANES + word] = 0
+        words[ARGUMENTS * LANES + word] = 0
     address = scratch.ctypes.data
     call_with_four_pointers(
         query.function, address + 4 * VALID * LANES, query.scene, address, address + 4 * ARGUMENTS * LANES
     )
 
 
-@kernel(_nrt=False, error_model="numpy")
+@njit_no_refcount()
 def closest_hits(
-    query, origins, directions, t_min, t_max, ray_indices, first, last, is_coherent, scratch,
-    distances, faces, barycentrics,
-):  # fmt: skip
-    """The first triangle on each ray; rows ``first`` to ``last`` of the results get it.
+    query: EmbreeQuery,
+    rays: TriangleRays,
+    first: int,
+    last: int,
+    is_coherent: bool,
+    scratch: Float32[np.ndarray, " w"],
+    out: TriangleHitArrays,
+) -> None:
+    """Find the first triangle on each of the rays of rows ``first`` to ``last``.
 
-    ``ray_indices`` says the ray of each row and is empty where they are the same; ``is_coherent`` whether neighbours
-    go about one way. ``scratch`` is one thread's own 26 rows of 8 words, which begin on a cache line.
+    ``is_coherent`` tells whether neighbours have about one direction. ``scratch`` is one thread's own
+    :data:`SCRATCH_ROWS` rows of 8 words, which begin on a cache line.
     """
-    whole = scratch.view(np.int32)
+    words = scratch.view(np.int32)
     for k in range(first, last, LANES):
-        _query_rays8(query, origins, directions, t_min, t_max, ray_indices, k, last, is_coherent, scratch)
+        _query_rays8(query, rays, k, last, is_coherent, scratch)
         for lane in range(min(LANES, last - k)):
-            face = whole[FACE * LANES + lane]
-            faces[k + lane] = face
+            face = words[FACE * LANES + lane]
             hit = face != INVALID_ID
-            distances[k + lane] = scratch[T_FAR * LANES + lane] if hit else np.float32(np.inf)
-            barycentrics[k + lane, 0] = scratch[U * LANES + lane] if hit else np.float32(0.0)
-            barycentrics[k + lane, 1] = scratch[V * LANES + lane] if hit else np.float32(0.0)
+            out.faces[k + lane] = face
+            out.distances[k + lane] = scratch[T_FAR * LANES + lane] if hit else np.float32(np.inf)
+            out.barycentrics[k + lane, 0] = scratch[U * LANES + lane] if hit else np.float32(0.0)
+            out.barycentrics[k + lane, 1] = scratch[V * LANES + lane] if hit else np.float32(0.0)
 
 
-@kernel(_nrt=False, error_model="numpy")
-def any_hits(query, origins, directions, t_min, t_max, ray_indices, first, last, scratch, occluded):
-    """Whether any triangle lies on each ray; see :func:`closest_hits`."""
+@njit_no_refcount()
+def any_hits(
+    query: EmbreeQuery,
+    rays: TriangleRays,
+    first: int,
+    last: int,
+    scratch: Float32[np.ndarray, " w"],
+    occluded: Bool[np.ndarray, " q"],
+) -> None:
+    """Find whether any triangle lies on each of the rays of rows ``first`` to ``last``."""
     for k in range(first, last, LANES):
-        _query_rays8(query, origins, directions, t_min, t_max, ray_indices, k, last, False, scratch)
+        _query_rays8(query, rays, k, last, False, scratch)
         for lane in range(min(LANES, last - k)):
             occluded[k + lane] = scratch[T_FAR * LANES + lane] == -np.inf
 
 
-@kernel(parallel=True, error_model="numpy")
-def closest_hits_parallel(
-    query, origins, directions, t_min, t_max, ray_indices, scratch, distances, faces, barycentrics
-):
-    """:func:`closest_hits` on all rays and several threads; ``scratch`` has a row for each chunk of them."""
-    count, chunks = len(directions), len(scratch)
-    for c in prange(chunks):
-        closest_hits(
-            query, origins, directions, t_min, t_max, ray_indices, c * count // chunks, (c + 1) * count // chunks,
-            False, scratch[c], distances, faces, barycentrics,
-        )  # fmt: skip
+@kernel(_nrt=False, error_model="numpy")
+def write_closest_hits(
+    first: int,
+    last: int,
+    query: EmbreeQuery,
+    rays: TriangleRays,
+    scratch: Float32[np.ndarray, "c w"],
+    out: TriangleHitArrays,
+) -> None:
+    """Find the first triangle on each of the rays of the chunks ``first`` to ``last``.
+
+    ``scratch`` has a row for each of the chunks into which all rays are cut.
+    """
+    count, chunks = len(rays.directions), len(scratch)
+    for c in range(first, last):
+        closest_hits(query, rays, c * count // chunks, (c + 1) * count // chunks, False, scratch[c], out)
 
 
-@kernel(parallel=True, error_model="numpy")
-def any_hits_parallel(query, origins, directions, t_min, t_max, ray_indices, scratch, occluded):
-    """:func:`any_hits` on all rays and several threads."""
-    count, chunks = len(directions), len(scratch)
-    for c in prange(chunks):
-        any_hits(
-            query, origins, directions, t_min, t_max, ray_indices, c * count // chunks, (c + 1) * count // chunks,
-            scratch[c], occluded,
-        )  # fmt: skip
+@kernel(_nrt=False, error_model="numpy")
+def write_any_hits(
+    first: int,
+    last: int,
+    query: EmbreeQuery,
+    rays: TriangleRays,
+    scratch: Float32[np.ndarray, "c w"],
+    occluded: Bool[np.ndarray, " q"],
+) -> None:
+    """Find whether any triangle lies on each of the rays of the chunks ``first`` to ``last``."""
+    count, chunks = len(rays.directions), len(scratch)
+    for c in range(first, last):
+        any_hits(query, rays, c * count // chunks, (c + 1) * count // chunks, scratch[c], occluded)

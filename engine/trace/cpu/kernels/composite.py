@@ -3,7 +3,9 @@
 from typing import NamedTuple
 
 import numpy as np
+from jaxtyping import Float64
 
+from octasplat.engine.trace.cpu.kernels.kernel_args import ForwardPass
 from octasplat.engine.trace.cpu.kernels.octagon_hit import MEAN
 from octasplat.engine.trace.cpu.kernels.rays import facing_sign, ray_t_view_origin
 from octasplat.engine.trace.cpu.kernels.spherical_harmonics import eval_color, eval_ray_view_basis
@@ -27,7 +29,7 @@ class RayState(NamedTuple):
     normal_x: float
     normal_y: float
     normal_z: float
-    depth_median: float
+    depth_median: float | np.float32
     hit_count: int
     next_hit_index: int
 
@@ -44,7 +46,7 @@ class Hit(NamedTuple):
 
 
 @njit_no_refcount(forceinline=True)
-def init_ray_state(forward, r, first_hit_index):
+def init_ray_state(forward: ForwardPass, r: int, first_hit_index: int) -> RayState:
     """Ray ``r`` before its first hit; its hits will be stored from ``first_hit_index`` on."""
     for f in range(forward.scene.features.shape[1]):
         forward.out.features[r, f] = np.float32(0.0)
@@ -54,7 +56,15 @@ def init_ray_state(forward, r, first_hit_index):
 
 
 @njit_no_refcount(forceinline=True, fastmath={"contract"})
-def composite(state, hit, forward, r, origin, direction, basis):
+def composite(
+    state: RayState,
+    hit: Hit,
+    forward: ForwardPass,
+    r: int,
+    origin: tuple[float, float, float],
+    direction: tuple[float, float, float],
+    basis: Float64[np.ndarray, " k"],
+) -> tuple[RayState, bool]:
     """The ray ``r`` behind ``hit``, and whether it ends there.
 
     The hit is stored if the pass is recording. ``basis`` is room for harmonics.
@@ -105,7 +115,7 @@ def composite(state, hit, forward, r, origin, direction, basis):
 
 
 @njit_no_refcount(forceinline=True)
-def write_ray_outputs(state, forward, r):
+def write_ray_outputs(state: RayState, forward: ForwardPass, r: int) -> None:
     """Write the outputs of ray ``r``."""
     out = forward.out
     out.counts[r] = state.hit_count

@@ -133,8 +133,8 @@ class SharedSortHits(NamedTuple):
 
     Packet p has met ``counts[p]`` Gaussians, front to back from place ``starts[p]`` on: their ``ids``; the
     ``ray_masks`` of the rays that met them; and the ``packet_primitives`` of
-    :mod:`octasplat.engine.trace.cpu.kernels.simd16`. ``frames`` are the packets' axes, e and f; ``transmittance`` is
-    the transmittance in the end of each ray.
+    :mod:`octasplat.engine.trace.cpu.kernels.simd16`. ``frames`` are the packets' axes, e and f;
+    ``transmittance`` is the transmittance in the end of each ray.
     """
 
     ids: Int32[np.ndarray, " h"]
@@ -191,3 +191,71 @@ class GaussianSegments(NamedTuple):
     order: Int32[np.ndarray, " e"]
     ids: Int32[np.ndarray, " e"]
     starts: Int64[np.ndarray, " s1"]
+
+
+class BvhArrays(NamedTuple):
+    """The hierarchy; :mod:`octasplat.engine.trace.cpu.kernels.packet_bvh` says how it is laid out."""
+
+    nodes: Float32[np.ndarray, "m 6 8"]
+    level_starts: Int64[np.ndarray, " l"]
+    leaf_blocks: Float32[np.ndarray, "b 9 8"]
+    order: Int32[np.ndarray, " k"]
+
+
+class Frustum(NamedTuple):
+    """The pyramid around the rays of a packet.
+
+    ``planes`` are inward normals, their positive and their negative parts; ``frame`` the axis, two
+    directions across it, the range of slopes and bins per slope, and ``frame_float32`` the same in float32;
+    ``prefix_masks`` the bits of the rays in the bins before each, along either slope.
+    """
+
+    planes: Float32[np.ndarray, "5 9"]
+    frame: Float64[np.ndarray, "15"]
+    frame_float32: Float32[np.ndarray, "15"]
+    prefix_masks: UInt64[np.ndarray, "2 65"]
+
+
+class TraversalScratch(NamedTuple):
+    """Memory of a walk: waiting nodes and blocks, bins and distances of a block, and buckets for sorting."""
+
+    stack: Int64[np.ndarray, " s"]
+    block_queue: Int64[np.ndarray, " w"]
+    bins: Int32[np.ndarray, "4 8"]
+    distances: Float32[np.ndarray, "2 8"]
+    histogram: Int32[np.ndarray, "256"]
+
+
+class Candidates(NamedTuple):
+    """The candidates of a packet, ``c`` at most.
+
+    As they are found: ``curve_indices``, the place on the curve; ``keys``, the likely distance in the upper
+    half and the number in the lower; ``min_distances``, the least distance; ``cells``, where in the cross
+    section; ``ray_masks``, the bits of the rays. In order: ``ids``; ``min_distance_after``, where a chunk
+    begins, the least distance of what follows; ``block_ray_masks``, the bits of the rays that may meet any
+    of a block's eight, and the same by ray, ``ray_block_masks``; ``blocks``, what is tested; ``slots``, the
+    number under which the packet met it, or -1; ``color_normals``, what it shows, by that number.
+
+    What one ray has met, in the order in which it was tested: ``hit_keys``, the distance in the upper half
+    and the place in this order in the lower, which are then sorted; ``alphas``, ``opacities``, ``us`` and
+    ``vs``; and ``hit_candidates``, which candidates they are.
+    """
+
+    curve_indices: Int32[np.ndarray, " c"]
+    keys: UInt64[np.ndarray, " c"]
+    min_distances: Float32[np.ndarray, " c"]
+    cells: Int32[np.ndarray, " c"]
+    ray_masks: UInt64[np.ndarray, " c"]
+    ids: Int32[np.ndarray, " c"]
+    min_distance_after: Float32[np.ndarray, " c1"]
+    block_ray_masks: UInt64[np.ndarray, " b"]
+    ray_block_masks: UInt64[np.ndarray, "w 64"]
+    blocks: Float32[np.ndarray, "b 12 8"]
+    slots: Int32[np.ndarray, " c"]
+    color_normals: Float64[np.ndarray, "c 8"]
+    hit_keys: UInt64[np.ndarray, " c8"]
+    alphas: Float32[np.ndarray, " c8"]
+    opacities: Float32[np.ndarray, " c8"]
+    us: Float32[np.ndarray, " c8"]
+    vs: Float32[np.ndarray, " c8"]
+    hit_candidates: Int32[np.ndarray, " c8"]

@@ -8,10 +8,12 @@ precision and the order of hits does not depend on how the hierarchy was walked.
 import math
 
 import numpy as np
+from jaxtyping import Float32, Float64, Int32
 from numba import carray, cfunc, types
 
 from octasplat.engine.core.compilation import device_function
 from octasplat.engine.trace.kernels.native import (
+    Address,
     float32_pointer,
     float64_pointer,
     int32_pointer,
@@ -45,7 +47,14 @@ COS_22, SIN_22 = math.cos(math.pi / 8), math.sin(math.pi / 8)
 
 
 @device_function(fastmath={"contract"})
-def insert_hit(context_i32, context_f32, context_f64, t, gaussian_id, alpha):
+def insert_hit(
+    context_i32: Int32[np.ndarray, " words"],
+    context_f32: Float32[np.ndarray, " words"],
+    context_f64: Float64[np.ndarray, " words2"],
+    t: float,
+    gaussian_id: int,
+    alpha: float,
+) -> int:
     """Insert by (t, id) into the sorted buffer; drop hits that lie behind the ray's end. Return new count."""
     count = context_i32[COUNT]
     if count == HIT_BUFFER_SIZE:
@@ -79,7 +88,9 @@ def insert_hit(context_i32, context_f32, context_f64, t, gaussian_id, alpha):
 
 
 @device_function(forceinline=True, fastmath={"contract"})
-def intersect_plane(primitive, context_f64):
+def intersect_plane(
+    primitive: Float32[np.ndarray, "16"], context_f64: Float64[np.ndarray, " words2"]
+) -> tuple[float, bool]:
     """Distance along the ray at which it meets the Gaussian's plane; infinite where it runs inside it.
 
     And whether it meets it from behind.
@@ -99,7 +110,9 @@ def intersect_plane(primitive, context_f64):
 
 
 @device_function(forceinline=True, fastmath={"contract"})
-def eval_octagon(primitive, context_f64, distance):
+def eval_octagon(
+    primitive: Float32[np.ndarray, "16"], context_f64: Float64[np.ndarray, " words2"], distance: float
+) -> tuple[float, float, bool]:
     """Where the ray meets the plane, in standard deviations, and whether that is inside the octagon."""
     x = context_f64[RAY_F64] - primitive[MEAN] + distance * context_f64[RAY_F64 + 3]
     y = context_f64[RAY_F64 + 1] - primitive[MEAN + 1] + distance * context_f64[RAY_F64 + 4]
@@ -112,13 +125,15 @@ def eval_octagon(primitive, context_f64, distance):
 
 
 @device_function(forceinline=True, fastmath={"contract"})
-def eval_alpha(primitive, context_f64, u, v):
+def eval_alpha(
+    primitive: Float32[np.ndarray, "16"], context_f64: Float64[np.ndarray, " words2"], u: float, v: float
+) -> np.float32:
     """Alpha of the Gaussian at u, v, rounded to float32."""
     return np.float32(min(primitive[OPACITY] * math.exp(-0.5 * (u * u + v * v)), context_f64[ALPHA_MAX]))
 
 
 @cfunc(types.void(types.CPointer(types.uint64)), cache=True, fastmath={"contract"})
-def intersect_octagon(arguments):
+def intersect_octagon(arguments: Address) -> None:
     """RTCIntersectFunctionN for one ray: exact plane hit, octagon test, alpha, insertion."""
     words = carray(arguments, 6)
     gaussian = np.int64(words[2] & np.uint64(0xFFFFFFFF))
@@ -157,7 +172,7 @@ def intersect_octagon(arguments):
 
 
 @cfunc(types.void(types.CPointer(types.uint64)), cache=True, fastmath={"contract"})
-def attenuate_by_octagon(arguments):
+def attenuate_by_octagon(arguments: Address) -> None:
     """RTCOccludedFunctionN for one ray: takes the ray's transmittance along until too little is left."""
     words = carray(arguments, 6)
     gaussian = np.int64(words[2] & np.uint64(0xFFFFFFFF))
@@ -181,7 +196,7 @@ def attenuate_by_octagon(arguments):
 
 
 @cfunc(types.void(types.CPointer(types.uint64)), cache=True)
-def octagon_bounds(arguments):
+def octagon_bounds(arguments: Address) -> None:
     """RTCBoundsFunction: copy the prepared box of a Gaussian."""
     words = carray(arguments, 3)
     gaussian = np.uint64(words[1] & np.uint64(0xFFFFFFFF))

@@ -3,6 +3,7 @@
 import math
 
 import numpy as np
+from jaxtyping import Bool, Float32, Int32
 
 from octasplat.engine.core.compilation import device_function, kernel
 from octasplat.engine.trace.cpu.kernels.octagon_hit import (
@@ -17,7 +18,9 @@ from octasplat.engine.trace.cpu.kernels.octagon_hit import (
 
 
 @device_function(_nrt=False, error_model="numpy")
-def rotation_columns(q0, q1, q2, q3):
+def rotation_columns(
+    q0: float, q1: float, q2: float, q3: float
+) -> tuple[tuple[float, float, float], tuple[float, float, float], tuple[float, float, float]]:
     """Columns r1, r2, r3 of the rotation of a quaternion (w, x, y, z) of any length, float64."""
     scale = 1.0 / math.sqrt(q0 * q0 + q1 * q1 + q2 * q2 + q3 * q3)
     w, x, y, z = q0 * scale, q1 * scale, q2 * scale, q3 * scale
@@ -29,7 +32,7 @@ def rotation_columns(q0, q1, q2, q3):
 
 
 @device_function(_nrt=False, error_model="numpy")
-def opacity_and_radius(logit, q):
+def opacity_and_radius(logit: float, q: float) -> tuple[float, float]:
     """Opacity, and the octagon's corner radius in standard deviations."""
     # without overflow at either end
     part = math.exp(-abs(logit))
@@ -38,7 +41,13 @@ def opacity_and_radius(logit, q):
 
 
 @device_function(_nrt=False, error_model="numpy")
-def ellipse_semi_axes(i, quats, log_scales, logits, q):
+def ellipse_semi_axes(
+    i: int,
+    quats: Float32[np.ndarray, "n 4"],
+    log_scales: Float32[np.ndarray, "n 2"],
+    logits: Float32[np.ndarray, " n"],
+    q: float,
+) -> tuple[float, float, tuple[float, float, float], tuple[float, float, float]]:
     """Corner radii in world units along r2 and r3, and those axes."""
     _r1, r2, r3 = rotation_columns(
         np.float64(quats[i, 0]), np.float64(quats[i, 1]), np.float64(quats[i, 2]), np.float64(quats[i, 3])
@@ -49,7 +58,15 @@ def ellipse_semi_axes(i, quats, log_scales, logits, q):
 
 
 @device_function(_nrt=False, error_model="numpy")
-def pack_primitive(primitives, i, means, quats, log_scales, logits, q):
+def pack_primitive(
+    primitives: Float32[np.ndarray, "n 16"],
+    i: int,
+    means: Float32[np.ndarray, "n 3"],
+    quats: Float32[np.ndarray, "n 4"],
+    log_scales: Float32[np.ndarray, "n 2"],
+    logits: Float32[np.ndarray, " n"],
+    q: float,
+) -> None:
     """Record of one Gaussian."""
     r1, r2, r3 = rotation_columns(
         np.float64(quats[i, 0]), np.float64(quats[i, 1]), np.float64(quats[i, 2]), np.float64(quats[i, 3])
@@ -67,14 +84,32 @@ def pack_primitive(primitives, i, means, quats, log_scales, logits, q):
 
 
 @kernel(_nrt=False, error_model="numpy")
-def pack_primitives(first, last, primitives, means, quats, log_scales, logits, q):
+def pack_primitives(
+    first: int,
+    last: int,
+    primitives: Float32[np.ndarray, "n 16"],
+    means: Float32[np.ndarray, "n 3"],
+    quats: Float32[np.ndarray, "n 4"],
+    log_scales: Float32[np.ndarray, "n 2"],
+    logits: Float32[np.ndarray, " n"],
+    q: float,
+) -> None:
     """All records."""
     for i in range(first, last):
         pack_primitive(primitives, i, means, quats, log_scales, logits, q)
 
 
 @device_function(_nrt=False, error_model="numpy")
-def write_box(box, i, means, quats, log_scales, logits, q, padding):
+def write_box(
+    box: Float32[np.ndarray, "6"],
+    i: int,
+    means: Float32[np.ndarray, "n 3"],
+    quats: Float32[np.ndarray, "n 4"],
+    log_scales: Float32[np.ndarray, "n 2"],
+    logits: Float32[np.ndarray, " n"],
+    q: float,
+    padding: float,
+) -> None:
     """Box of one octagon's ellipse enlarged by the fraction ``padding`` of its size.
 
     A Gaussian without an octagon gets a box turned inside out, which Embree leaves out of its hierarchy.
@@ -93,14 +128,36 @@ def write_box(box, i, means, quats, log_scales, logits, q, padding):
 
 
 @kernel(_nrt=False, error_model="numpy")
-def write_boxes(first, last, boxes, means, quats, log_scales, logits, q, padding):
+def write_boxes(
+    first: int,
+    last: int,
+    boxes: Float32[np.ndarray, "n 6"],
+    means: Float32[np.ndarray, "n 3"],
+    quats: Float32[np.ndarray, "n 4"],
+    log_scales: Float32[np.ndarray, "n 2"],
+    logits: Float32[np.ndarray, " n"],
+    q: float,
+    padding: float,
+) -> None:
     """Boxes of all octagons, see :func:`write_box`."""
     for i in range(first, last):
         write_box(boxes[i], i, means, quats, log_scales, logits, q, padding)
 
 
 @kernel(error_model="numpy")
-def refit_outgrown_boxes(first, last, outgrown, boxes, ids, means, quats, log_scales, logits, q, padding):
+def refit_outgrown_boxes(
+    first: int,
+    last: int,
+    outgrown: Bool[np.ndarray, " u"],
+    boxes: Float32[np.ndarray, "n 6"],
+    ids: Int32[np.ndarray, " u"],
+    means: Float32[np.ndarray, "n 3"],
+    quats: Float32[np.ndarray, "n 4"],
+    log_scales: Float32[np.ndarray, "n 2"],
+    logits: Float32[np.ndarray, " n"],
+    q: float,
+    padding: float,
+) -> None:
     """Give those of ``ids`` that have left their box a new one, and mark them in ``outgrown``.
 
     The new box is larger by ``padding`` and by four times what the Gaussian stuck out, so that one that goes
@@ -123,7 +180,17 @@ def refit_outgrown_boxes(first, last, outgrown, boxes, ids, means, quats, log_sc
 
 
 @kernel(_nrt=False, error_model="numpy")
-def repack_primitives(first, last, primitives, ids, means, quats, log_scales, logits, q):
+def repack_primitives(
+    first: int,
+    last: int,
+    primitives: Float32[np.ndarray, "n 16"],
+    ids: Int32[np.ndarray, " u"],
+    means: Float32[np.ndarray, "n 3"],
+    quats: Float32[np.ndarray, "n 4"],
+    log_scales: Float32[np.ndarray, "n 2"],
+    logits: Float32[np.ndarray, " n"],
+    q: float,
+) -> None:
     """Records of the Gaussians ``ids`` from their changed parameters."""
     for k in range(first, last):
         pack_primitive(primitives, ids[k], means, quats, log_scales, logits, q)

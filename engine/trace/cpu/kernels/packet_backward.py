@@ -10,23 +10,39 @@ and the sums of tau, tau u and tau v over the rays follow from the moments of h 
 degree 3.
 """
 
-import math
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float32, Float64, Int32, Int64
 
 from octasplat.engine.core.compilation import device_function, kernel
+from octasplat.engine.trace.cpu.kernels.kernel_args import (
+    GaussianGradientArrays,
+    GaussianParameters,
+    GaussianSegments,
+    HitArrays,
+    OutputGradientArrays,
+    PackedScene,
+    PacketHits,
+    RayArrays,
+    TraceLimits,
+)
 from octasplat.engine.trace.cpu.kernels.packed_primitives import rotation_columns
 from octasplat.engine.trace.cpu.kernels.packet_bvh import WIDTH
 from octasplat.engine.trace.cpu.kernels.packet_candidates import PREFETCH_DISTANCE, PRIMITIVE_BYTES
 from octasplat.engine.trace.cpu.kernels.rays import facing_sign, first_hit_index, ray_origin
 from octasplat.engine.trace.cpu.kernels.simd8_backward import (
+    HitGradients8,
+    Hits8,
     accumulate_row,
     backward_hits8,
     transmittance_before8,
 )
-from octasplat.engine.trace.cpu.kernels.single_backward import GaussianMoments, write_geometry_gradients
+from octasplat.engine.trace.cpu.kernels.single_backward import (
+    GaussianMoments,
+    gaussian_frame,
+    write_geometry_gradients,
+)
 from octasplat.engine.trace.cpu.kernels.spherical_harmonics import (
     accumulate_sh_gradient,
     eval_view_basis,
@@ -77,7 +93,7 @@ class PacketBackwardScratch(NamedTuple):
 
 
 @device_function(error_model="numpy")
-def allocate_backward_scratch(max_hits, slots):
+def allocate_backward_scratch(max_hits: int, slots: int) -> PacketBackwardScratch:
     """Memory for packets, one after another."""
     return PacketBackwardScratch(
         np.empty(max_hits + WIDTH, np.float64),
@@ -90,7 +106,17 @@ def allocate_backward_scratch(max_hits, slots):
 
 
 @njit_no_refcount(fastmath={"contract"})
-def init_moment_rows(packet, scratch, rays, packets, packet_hits, parameters, limits, output_gradients, rows):
+def init_moment_rows(
+    packet: int,
+    scratch: PacketBackwardScratch,
+    rays: RayArrays,
+    packets: Int64[np.ndarray, "p 2"],
+    packet_hits: PacketHits,
+    parameters: GaussianParameters,
+    limits: TraceLimits,
+    output_gradients: OutputGradientArrays,
+    rows: MomentRows,
+) -> None:
     """Rows of zeros for the Gaussians of a packet, and their normals where those have a gradient."""
     first, slots = packets[packet, 0], packet_hits.slot_counts[packet]
     slot_base, base = first_hit_index(first, limits), rows.firsts[packet]
@@ -115,10 +141,65 @@ def init_moment_rows(packet, scratch, rays, packets, packet_hits, parameters, li
                 scratch.normals[slot, axis] = side * r1[axis]
 
 
+@njit_no_refcount(forceinline=True, fastmath={"contract"})
+def add_geometry_row(
+    row: Float32[np.ndarray, "6"],
+    gt: float,
+    u: float,
+    v: float,
+    weight: float,
+    normal_gradient: tuple[float, float, float],
+) -> None:
+    """Add a hit at u, v to the sums for depths and normals; ``gt`` is dL/dt times the distance t."""
+    row[GT] += gt
+    row[GTU] += gt * u
+    row[GTV] += gt * v
+    row[N_0] += weight * normal_gradient[0]
+    row[N_1] += weight * normal_gradient[1]
+    row[N_2] += weight * normal_gradient[2]
+
+
+@njit_no_refcount(forceinline=True)
+def write_transmittance(
+    alphas: Float32[np.ndarray, " h"],
+    start: int,
+    count: int,
+    wants_median: bool,
+    transmittance: Float64[np.ndarray, " h"],
+) -> tuple[float, int]:
+    """Write the transmittance before each of the ``count`` hits from ``start`` on, and behind the last.
+
+    Returns:
+        That behind the last, and which hit is at the median depth; -1 for none, or where it is not wanted.
+    """
+    t, median = 1.0, -1
+    for begin in range(0, count, WIDTH):
+        t = transmittance_before8(
+            alphas.ctypes.data + (start + begin) * 4, min(WIDTH, count - begin), t,
+            transmittance.ctypes.data + begin * 8,
+        )  # fmt: skip
+    transmittance[count] = t
+    if wants_median:
+        for k in range(count):
+            if transmittance[k] > 0.5 and transmittance[k + 1] <= 0.5:
+                median = k
+    return t, median
+
+
 @njit_no_refcount(fastmath={"contract"})
 def backward_ray_in_packet(
-    r, slot_base, first_row, scratch, hits, packet_hits, counts, features, limits, output_gradients, rows
-):
+    r: int,
+    slot_base: int,
+    first_row: int,
+    scratch: PacketBackwardScratch,
+    hits: HitArrays,
+    packet_hits: PacketHits,
+    counts: Int32[np.ndarray, " r"],
+    features: Float32[np.ndarray, "n f"],
+    limits: TraceLimits,
+    output_gradients: OutputGradientArrays,
+    rows: MomentRows,
+) -> None:
     """Add the hits of ray ``r`` to the rows of its packet, which begin at ``first_row``.
 
     dL/dalpha_k = <g, T_k c_k - (C - prefix_k)/(1 - alpha_k)> for every channel, the part behind summed from
@@ -128,13 +209,8 @@ def backward_ray_in_packet(
     weights, shares, by_ray = scratch.weights, scratch.log_alpha_gradients, scratch.ray_gradients
     feature_count = features.shape[1]
     count, start = counts[r], hits.starts[r]
-    t, median = 1.0, -1
-    for begin in range(0, count, WIDTH):
-        t = transmittance_before8(
-            hits.alphas.ctypes.data + (start + begin) * 4, min(WIDTH, count - begin), t,
-            through.ctypes.data + begin * 8,
-        )  # fmt: skip
-    through[count] = t
+    # --- front to back: the transmittance before each hit, and the hit at the median depth ---
+    t, median = write_transmittance(hits.alphas, start, count, output_gradients.has_geometry, through)
     gn0 = gn1 = gn2 = gd = gm = 0.0
     if output_gradients.has_geometry:
         gd, gm = np.float64(output_gradients.depth_sum[r]), np.float64(output_gradients.depth_median[r])
@@ -143,14 +219,16 @@ def backward_ray_in_packet(
             np.float64(output_gradients.normal[r, 1]),
             np.float64(output_gradients.normal[r, 2]),
         )
-        for k in range(count):
-            if through[k] > 0.5 and through[k + 1] <= 0.5:
-                median = k
+    # --- what the ray counts for in the rows of its hits ---
     by_ray[W - 8], by_ray[ERROR - 8] = np.float32(1.0), output_gradients.ray_errors[r]
     by_ray[RED - 8], by_ray[GREEN - 8], by_ray[BLUE - 8] = (
         output_gradients.rgb[r, 0],
         output_gradients.rgb[r, 1],
         output_gradients.rgb[r, 2],
+    )
+    # --- back to front, eight hits at a time ---
+    out = HitGradients8(
+        rows.sums.ctypes.data + first_row * (ROW_WORDS * 4), weights.ctypes.data, shares.ctypes.data
     )
     behind = np.float64(output_gradients.transmittance[r]) * t
     for begin in range((count - 1) // WIDTH * WIDTH, -1, -WIDTH):
@@ -169,11 +247,13 @@ def backward_ray_in_packet(
                     )
                 values[k] = value
         behind = backward_hits8(
-            hits.alphas.ctypes.data + e * 4, through.ctypes.data + begin * 8, values.ctypes.data,
-            packet_hits.slots.ctypes.data + e * 4, packet_hits.us.ctypes.data + e * 4, packet_hits.vs.ctypes.data + e * 4,
-            packet_hits.slot_rgb.ctypes.data + slot_base * 12, n, behind, np.float32(limits.alpha_max),
-            by_ray.ctypes.data, rows.sums.ctypes.data + first_row * (ROW_WORDS * 4), weights.ctypes.data,
-            shares.ctypes.data,
+            Hits8(
+                hits.alphas.ctypes.data + e * 4, through.ctypes.data + begin * 8,
+                packet_hits.slots.ctypes.data + e * 4, packet_hits.us.ctypes.data + e * 4,
+                packet_hits.vs.ctypes.data + e * 4,
+            ),
+            values.ctypes.data, packet_hits.slot_rgb.ctypes.data + slot_base * 12, n, behind,
+            np.float32(limits.alpha_max), by_ray.ctypes.data, out,
         )  # fmt: skip
         if not (output_gradients.has_geometry or feature_count > 0):
             continue
@@ -182,31 +262,26 @@ def backward_ray_in_packet(
             if output_gradients.has_geometry:
                 u, v, weight = packet_hits.us[e + k], packet_hits.vs[e + k], np.float64(weights[k])
                 gt = (gd * weight + (gm if begin + k == median else 0.0)) * hits.distances[e + k]
-                rows.geometry[row, GT] += gt
-                rows.geometry[row, GTU] += gt * u
-                rows.geometry[row, GTV] += gt * v
-                rows.geometry[row, N_0] += weight * gn0
-                rows.geometry[row, N_1] += weight * gn1
-                rows.geometry[row, N_2] += weight * gn2
+                add_geometry_row(rows.geometry[row], gt, u, v, weight, (gn0, gn1, gn2))
             for f in range(feature_count):
                 rows.features[row, f] += weights[k] * output_gradients.features[r, f]
 
 
 @njit_no_refcount(fastmath={"contract"})
 def backward_packet(
-    packet,
-    scratch,
-    rays,
-    packets,
-    hits,
-    packet_hits,
-    counts,
-    parameters,
-    features,
-    limits,
-    output_gradients,
-    rows,
-):
+    packet: int,
+    scratch: PacketBackwardScratch,
+    rays: RayArrays,
+    packets: Int64[np.ndarray, "p 2"],
+    hits: HitArrays,
+    packet_hits: PacketHits,
+    counts: Int32[np.ndarray, " r"],
+    parameters: GaussianParameters,
+    features: Float32[np.ndarray, "n f"],
+    limits: TraceLimits,
+    output_gradients: OutputGradientArrays,
+    rows: MomentRows,
+) -> None:
     """Write the rows of one packet, the rays ``packets[packet, 0]`` to ``packets[packet, 1]``."""
     first, last, slots = packets[packet, 0], packets[packet, 1], packet_hits.slot_counts[packet]
     slot_base, base = first_hit_index(first, limits), rows.firsts[packet]
@@ -237,8 +312,18 @@ def backward_packet(
 
 @kernel(error_model="numpy")
 def backward_packets(
-    rays, packets, hits, packet_hits, counts, parameters, features, limits, output_gradients, counter, rows
-):
+    rays: RayArrays,
+    packets: Int64[np.ndarray, "p 2"],
+    hits: HitArrays,
+    packet_hits: PacketHits,
+    counts: Int32[np.ndarray, " r"],
+    parameters: GaussianParameters,
+    features: Float32[np.ndarray, "n f"],
+    limits: TraceLimits,
+    output_gradients: OutputGradientArrays,
+    counter: Int64[np.ndarray, "1"],
+    rows: MomentRows,
+) -> None:
     """Replay packets until the ``counter`` has passed the last."""
     memory = allocate_backward_scratch(limits.max_hits, INITIAL_SLOTS)
     while True:
@@ -265,7 +350,13 @@ def backward_packets(
 
 
 @kernel(_nrt=False, error_model="numpy")
-def reduce_weights(first, last, gaussian_segments, weights, out):
+def reduce_weights(
+    first: int,
+    last: int,
+    gaussian_segments: GaussianSegments,
+    weights: Float32[np.ndarray, " e"],
+    out: Float32[np.ndarray, " s"],
+) -> None:
     """Sum the ``weights`` of the rows of each of the Gaussians ``first`` to ``last`` that were hit."""
     for segment in range(first, last):
         total = 0.0
@@ -274,113 +365,154 @@ def reduce_weights(first, last, gaussian_segments, weights, out):
         out[segment] = total
 
 
+class BackwardPass(NamedTuple):
+    """A backward pass over packets: their rays, and the Gaussians as parameters and as packed."""
+
+    rays: RayArrays
+    packets: Int64[np.ndarray, "p 2"]
+    parameters: GaussianParameters
+    scene: PackedScene
+    limits: TraceLimits
+
+
+class ReduceScratch(NamedTuple):
+    """Memory of a thread: sums of a Gaussian's rows, of those with one origin, and harmonics."""
+
+    sums: Float64[np.ndarray, "16"]
+    origin_sums: Float64[np.ndarray, "16"]
+    basis: Float64[np.ndarray, "16"]
+
+
+@njit_no_refcount(forceinline=True)
+def packet_origin(
+    row: int, words: Int32[np.ndarray, "e 16"], backward: BackwardPass
+) -> tuple[float, float, float]:
+    """Return the origin of the packet that a row is of."""
+    return ray_origin(backward.rays, backward.packets[words[row, PACKET], 0])
+
+
+@njit_no_refcount(forceinline=True)
+def sum_rows_of_origin(
+    k: int,
+    end: int,
+    origin: tuple[float, float, float],
+    order: Int32[np.ndarray, " e"],
+    backward: BackwardPass,
+    rows: MomentRows,
+    origin_sums: Float64[np.ndarray, "16"],
+    features: Float32[np.ndarray, " f"],
+) -> tuple[int, tuple[float, float, float], tuple[float, float, float]]:
+    """Sum the rows ``order[k:end]`` up to the first one of another origin.
+
+    Returns:
+        The place of that one; sums of g_t t times 1, u and v; and of the gradient of the turned normal.
+    """
+    words, with_geometry = rows.sums.view(np.int32), rows.geometry.shape[1] > 0
+    origin_sums[:] = 0.0
+    gt = gtu = gtv = t0 = t1 = t2 = 0.0
+    while True:
+        if k + PREFETCH_DISTANCE < len(order):
+            prefetch(rows.sums.ctypes.data + order[k + PREFETCH_DISTANCE] * (ROW_WORDS * 4))
+        row = order[k]
+        accumulate_row(origin_sums.ctypes.data, rows.sums[row].ctypes.data)
+        if with_geometry:
+            by_t = rows.geometry[row]
+            gt, gtu, gtv = gt + by_t[GT], gtu + by_t[GTU], gtv + by_t[GTV]
+            t0, t1, t2 = t0 + by_t[N_0], t1 + by_t[N_1], t2 + by_t[N_2]
+        for f in range(len(features)):
+            features[f] += rows.features[row, f]
+        k += 1
+        if k == end or packet_origin(order[k], words, backward) != origin:
+            break
+    return k, (gt, gtu, gtv), (t0, t1, t2)
+
+
 @njit_no_refcount(fastmath={"contract"})
 def reduce_packets_chunk(
-    first,
-    last,
-    rays,
-    packets,
-    parameters,
-    scene,
-    limits,
-    gaussian_segments,
-    segment_indices,
-    rows,
-    out,
-    sums,
-    origin_sums,
-    basis,
-):
-    """Sum the rows of the Gaussians ``segment_indices[first:last]`` in packet order; the sums become gradients.
+    first: int,
+    last: int,
+    backward: BackwardPass,
+    segments: GaussianSegments,
+    segment_indices: Int64[np.ndarray, " s"],
+    rows: MomentRows,
+    out: GaussianGradientArrays,
+    scratch: ReduceScratch,
+) -> None:
+    """Sum the rows of the Gaussians ``segment_indices[first:last]`` and write the gradients that follow.
 
-    ``sums`` and ``origin_sums`` are room for one row each, ``basis`` for harmonics. The frame is taken in float64
-    from the raw parameters: float32 axes would cost needles digits.
+    Rows are summed in the order of the packets. The frame is taken in float64 from the raw parameters:
+    float32 axes would cost needles digits.
     """
-    order, starts = gaussian_segments.order, gaussian_segments.starts
+    order, starts = segments.order, segments.starts
+    parameters, scene, limits = backward.parameters, backward.scene, backward.limits
     means, quats, log_scales = parameters.means, parameters.quats, parameters.log_scales
-    basis_count, feature_count = out.sh.shape[1], out.features.shape[1]
+    sums, here, basis = scratch.sums, scratch.origin_sums, scratch.basis
+    basis_count = out.sh.shape[1]
     words = rows.sums.view(np.int32)
     with_geometry = rows.geometry.shape[1] > 0
     sh_bytes = scene.sh.shape[1] * 12
     for place in range(first, last):
         if place + PREFETCH_DISTANCE < last:
-            ahead = gaussian_segments.ids[starts[segment_indices[place + PREFETCH_DISTANCE]]]
+            ahead = segments.ids[starts[segment_indices[place + PREFETCH_DISTANCE]]]
             prefetch(scene.primitives.ctypes.data + ahead * PRIMITIVE_BYTES)
             prefetch_bytes(scene.sh.ctypes.data + ahead * sh_bytes, sh_bytes)
         segment = segment_indices[place]
-        i = gaussian_segments.ids[starts[segment]]
+        i = segments.ids[starts[segment]]
         sums[:] = 0.0
         out.sh[place, :, :] = np.float32(0.0)
-        for f in range(feature_count):
-            out.features[place, f] = np.float32(0.0)
-        r1, r2, r3 = rotation_columns(
-            np.float64(quats[i, 0]), np.float64(quats[i, 1]),
-            np.float64(quats[i, 2]), np.float64(quats[i, 3]),
-        )  # fmt: skip
-        s2, s3 = math.exp(np.float64(log_scales[i, 0])), math.exp(np.float64(log_scales[i, 1]))
+        out.features[place, :] = np.float32(0.0)
+        # --- the Gaussian's frame ---
+        r1, r2, r3, s2, s3 = gaussian_frame(i, quats, log_scales)
         per_s2, per_s3 = 1.0 / s2, 1.0 / s3
+        # --- sums over all rows: tau and its moments, dL by the normal, dL by the mean through the color ---
         tau = tau_u = tau_v = n0 = n1 = n2 = m0 = m1 = m2 = 0.0
         k, end = starts[segment], starts[segment + 1]
         while k < end:  # rows with one origin, such as those of one picture, become gradients together
-            ox, oy, oz = ray_origin(rays, packets[words[order[k], PACKET], 0])
-            origin_sums[:] = 0.0
-            gt = gtu = gtv = t0 = t1 = t2 = 0.0
-            while True:
-                if k + PREFETCH_DISTANCE < len(order):
-                    prefetch(rows.sums.ctypes.data + order[k + PREFETCH_DISTANCE] * (ROW_WORDS * 4))
-                row = order[k]
-                accumulate_row(origin_sums.ctypes.data, rows.sums[row].ctypes.data)
-                if with_geometry:
-                    by_t = rows.geometry[row]
-                    gt, gtu, gtv = gt + by_t[GT], gtu + by_t[GTU], gtv + by_t[GTV]
-                    t0, t1, t2 = t0 + by_t[N_0], t1 + by_t[N_1], t2 + by_t[N_2]
-                for f in range(feature_count):
-                    out.features[place, f] += rows.features[row, f]
-                k += 1
-                if k == end or ray_origin(rays, packets[words[order[k], PACKET], 0]) != (ox, oy, oz):
-                    break
-            sums += origin_sums
-            x, y, z = means[i, 0] - ox, means[i, 1] - oy, means[i, 2] - oz
+            origin = packet_origin(order[k], words, backward)
+            k, (gt, gtu, gtv), (t0, t1, t2) = sum_rows_of_origin(
+                k, end, origin, order, backward, rows, here, out.features[place]
+            )
+            sums += here
+            # --- tau, tau u and tau v from the moments of h (module docstring) ---
+            x, y, z = means[i, 0] - origin[0], means[i, 1] - origin[1], means[i, 2] - origin[2]
             inverse = 1.0 / (x * r1[0] + y * r1[1] + z * r1[2])
             xa = (x * r2[0] + y * r2[1] + z * r2[2]) * per_s2
             xb = (x * r3[0] + y * r3[1] + z * r3[2]) * per_s3
             if with_geometry:  # the gradient of the turned normal, turned back
                 side = facing_sign((x, y, z), r1, limits)
                 n0, n1, n2 = n0 + side * t0, n1 + side * t1, n2 + side * t2
-            hu, hv, huu, huv, hvv = (
-                origin_sums[HU],
-                origin_sums[HV],
-                origin_sums[HUU],
-                origin_sums[HUV],
-                origin_sums[HVV],
-            )
+            hu, hv, huu, huv, hvv = here[HU], here[HV], here[HUU], here[HUV], here[HVV]
             tau += (gt - huu - xa * hu - hvv - xb * hv) * inverse
-            tau_u += (gtu - origin_sums[HUUU] - xa * huu - xb * huv) * inverse
-            tau_v += (gtv - origin_sums[HVVV] - xa * huv - xb * hvv) * inverse
-            by_colour = origin_sums[RED], origin_sums[GREEN], origin_sums[BLUE]
+            tau_u += (gtu - here[HUUU] - xa * huu - xb * huv) * inverse
+            tau_v += (gtv - here[HVVV] - xa * huv - xb * hvv) * inverse
+            # --- harmonics, and the mean through the direction of view ---
+            by_color = here[RED], here[GREEN], here[BLUE]
             view = eval_view_basis(basis, basis_count, x, y, z)
-            accumulate_sh_gradient(out.sh, place, basis, basis_count, by_colour)
+            accumulate_sh_gradient(out.sh, place, basis, basis_count, by_color)
             if basis_count > 1:
-                write_basis_gradient(basis, scene.sh, i, basis_count, by_colour)
+                write_basis_gradient(basis, scene.sh, i, basis_count, by_color)
                 by_x, by_y, by_z = mean_gradient(basis, basis_count, view)
                 m0, m1, m2 = m0 + by_x, m1 + by_y, m2 + by_z
-        out.ids[place] = i
         moments = GaussianMoments(
             sums[H], sums[HU], sums[HV], sums[HUU], sums[HUV], sums[HVV],
             tau, tau_u, tau_v, n0, n1, n2, m0, m1, m2,
         )  # fmt: skip
-        frame = r1, r2, r3, s2, s3
-        write_geometry_gradients(place, i, frame, parameters.quats, scene.primitives, moments, out)
-        out.weights[place] = sums[W]
-        out.errors[place] = sums[ERROR]
-        out.counts[place] = np.int32(sums[COUNT])
+        write_geometry_gradients(place, i, (r1, r2, r3, s2, s3), quats, scene.primitives, moments, out)
+        out.ids[place], out.weights[place] = i, sums[W]
+        out.errors[place], out.counts[place] = sums[ERROR], np.int32(sums[COUNT])
 
 
 @kernel(error_model="numpy")
 def reduce_packets(
-    rays, packets, parameters, scene, limits, gaussian_segments, segment_indices, rows, chunks, counter, out
-):
-    """:func:`reduce_packets_chunk` on the Gaussians that are numbers ``segment_indices`` of those that were hit.
+    backward: BackwardPass,
+    segments: GaussianSegments,
+    segment_indices: Int64[np.ndarray, " s"],
+    rows: MomentRows,
+    chunks: int,
+    counter: Int64[np.ndarray, "1"],
+    out: GaussianGradientArrays,
+) -> None:
+    """Sum the rows of the Gaussians that are numbers ``segment_indices`` of those that were hit.
 
     Takes one of ``chunks`` parts after the other until the ``counter`` has passed the last.
     """
@@ -390,8 +522,7 @@ def reduce_packets(
         if chunk >= chunks:
             break
         first, last = chunk * per_chunk, min(len(segment_indices), (chunk + 1) * per_chunk)
-        sums, here = np.empty(ROW_WORDS, np.float64), np.empty(ROW_WORDS, np.float64)
-        reduce_packets_chunk(
-            first, last, rays, packets, parameters, scene, limits, gaussian_segments, segment_indices, rows, out, sums, here,
-            np.empty(16, np.float64),
-        )  # fmt: skip
+        scratch = ReduceScratch(
+            np.empty(ROW_WORDS, np.float64), np.empty(ROW_WORDS, np.float64), np.empty(16, np.float64)
+        )
+        reduce_packets_chunk(first, last, backward, segments, segment_indices, rows, out, scratch)

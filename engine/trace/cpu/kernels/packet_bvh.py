@@ -9,6 +9,7 @@ ray wants.
 import math
 
 import numpy as np
+from jaxtyping import Bool, Float32, Float64, Int32, Int64, UInt64
 
 from octasplat.engine.core.compilation import device_function, kernel
 from octasplat.engine.gaussians.morton_bits import spread_bits
@@ -35,7 +36,14 @@ _spread_bits = device_function(_nrt=False, error_model="numpy")(spread_bits)
 
 
 @kernel(_nrt=False, error_model="numpy")
-def morton_keys(first, last, primitives, low, inverse_cell, keys):
+def morton_keys(
+    first: int,
+    last: int,
+    primitives: Float32[np.ndarray, "n 16"],
+    low: Float64[np.ndarray, "3"],
+    inverse_cell: float,
+    keys: UInt64[np.ndarray, " n"],
+) -> None:
     """Keys along a Z-order curve, by size class first: factors of four, the large ones in front.
 
     Without the classes one large Gaussian would blow up its small neighbours' box. One that has no octagon
@@ -61,7 +69,9 @@ def morton_keys(first, last, primitives, low, inverse_cell, keys):
 
 
 @device_function(_nrt=False, error_model="numpy")
-def write_leaf(blocks, slot, primitives, i):
+def write_leaf(
+    blocks: Float32[np.ndarray, "b 9 8"], slot: int, primitives: Float32[np.ndarray, "n 16"], i: int
+) -> None:
     """Mean and legs of Gaussian ``i`` into its lane; a vanished octagon gets legs that are not a number."""
     block, lane = slot // WIDTH, slot % WIDTH
     radius = np.float64(primitives[i, INNER_RADIUS]) / COS_22 * AXIS_MARGIN
@@ -79,7 +89,9 @@ def write_leaf(blocks, slot, primitives, i):
 
 
 @device_function(_nrt=False, error_model="numpy")
-def write_block_box(blocks, b, nodes):
+def write_block_box(
+    blocks: Float32[np.ndarray, "b 9 8"], b: int, nodes: Float32[np.ndarray, "m 6 8"]
+) -> None:
     """The box of block ``b`` at level 0, around the ellipses that have not vanished."""
     lo0 = lo1 = lo2 = np.inf
     hi0 = hi1 = hi2 = -np.inf
@@ -115,7 +127,15 @@ def write_block_box(blocks, b, nodes):
 
 
 @kernel(_nrt=False, error_model="numpy")
-def write_leaves(first, last, blocks, slots, primitives, order, nodes):
+def write_leaves(
+    first: int,
+    last: int,
+    blocks: Float32[np.ndarray, "b 9 8"],
+    slots: Int32[np.ndarray, " n"],
+    primitives: Float32[np.ndarray, "n 16"],
+    order: Int32[np.ndarray, " n"],
+    nodes: Float32[np.ndarray, "m 6 8"],
+) -> None:
     """Blocks in curve order, each Gaussian's place in them, and the boxes of the blocks (level 0)."""
     count = len(order)
     for b in range(first, last):
@@ -131,7 +151,7 @@ def write_leaves(first, last, blocks, slots, primitives, order, nodes):
 
 
 @device_function(_nrt=False, error_model="numpy")
-def write_node_box(nodes, child, parent, lane):
+def write_node_box(nodes: Float32[np.ndarray, "m 6 8"], child: int, parent: int, lane: int) -> None:
     """Box ``lane`` of ``parent``, around the eight boxes of ``child``."""
     for row in range(3):
         low, high = nodes[child, row, 0], nodes[child, 3 + row, 0]
@@ -141,7 +161,7 @@ def write_node_box(nodes, child, parent, lane):
 
 
 @kernel(_nrt=False, error_model="numpy")
-def write_upper_levels(nodes, level_starts):
+def write_upper_levels(nodes: Float32[np.ndarray, "m 6 8"], level_starts: Int64[np.ndarray, " l"]) -> None:
     """Boxes of every level above the first; node k of a level bounds box k of the next."""
     for level in range(1, len(level_starts) - 1):
         below, here = level_starts[level - 1], level_starts[level]
@@ -150,7 +170,15 @@ def write_upper_levels(nodes, level_starts):
 
 
 @kernel(_nrt=False, error_model="numpy")
-def update_leaves(first, last, blocks, slots, primitives, ids, dirty):
+def update_leaves(
+    first: int,
+    last: int,
+    blocks: Float32[np.ndarray, "b 9 8"],
+    slots: Int32[np.ndarray, " n"],
+    primitives: Float32[np.ndarray, "n 16"],
+    ids: Int32[np.ndarray, " u"],
+    dirty: Bool[np.ndarray, " b"],
+) -> None:
     """Rewrite the lanes of Gaussians whose records changed, and note the blocks that they lie in."""
     for k in range(first, last):
         slot = slots[ids[k]]
@@ -160,7 +188,13 @@ def update_leaves(first, last, blocks, slots, primitives, ids, dirty):
 
 
 @kernel(_nrt=False, error_model="numpy")
-def refit_blocks(first, last, blocks, dirty, nodes):
+def refit_blocks(
+    first: int,
+    last: int,
+    blocks: Float32[np.ndarray, "b 9 8"],
+    dirty: Bool[np.ndarray, " b"],
+    nodes: Float32[np.ndarray, "m 6 8"],
+) -> None:
     """The boxes of the blocks that were touched, and of no others."""
     for b in range(first, last):
         if dirty[b]:

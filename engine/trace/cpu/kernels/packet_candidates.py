@@ -34,12 +34,18 @@ octagons, at distances that differ in the last digits of float32; and edge on, w
 uncertain as the record's normal, by up to a slope times 4e-7 over the cosine.
 """
 
-from typing import NamedTuple
-
 import numpy as np
-from jaxtyping import Float32, Float64, Int32, UInt64
+from jaxtyping import Float32, Float64, Int64
 
 from octasplat.engine.core.compilation import device_function, kernel
+from octasplat.engine.trace.cpu.kernels.kernel_args import (
+    BvhArrays,
+    Candidates,
+    Frustum,
+    PackedScene,
+    RayArrays,
+    TraversalScratch,
+)
 from octasplat.engine.trace.cpu.kernels.octagon_hit import (
     AXIS_U,
     AXIS_V,
@@ -73,43 +79,8 @@ INITIAL_CAPACITY = 512
 """Candidates that a thread has room for at first; a packet that has more makes it grow."""
 
 
-class Candidates(NamedTuple):
-    """The candidates of a packet, ``c`` at most.
-
-    As they are found: ``curve_indices``, the place on the curve; ``keys``, the likely distance in the upper half and
-    the number in the lower; ``min_distances``, the least distance; ``cells``, where in the cross section; ``ray_masks``,
-    the bits of the rays. In order: ``ids``; ``min_distance_after``, where a chunk begins, the least distance of what
-    follows; ``block_ray_masks``, the bits of the rays that may meet any of a block's eight, and the same by ray,
-    ``ray_block_masks``; ``blocks``, what is tested; ``slots``, the number under which the packet met it, or -1;
-    ``color_normals``, what it shows, by that number.
-
-    What one ray has met, in the order in which it was tested: ``hit_keys``, the distance in the upper half
-    and the place in this order in the lower, which are then sorted; ``alphas``, ``opacities``, ``us`` and
-    ``vs``; and ``hit_candidates``, which candidates they are.
-    """
-
-    curve_indices: Int32[np.ndarray, " c"]
-    keys: UInt64[np.ndarray, " c"]
-    min_distances: Float32[np.ndarray, " c"]
-    cells: Int32[np.ndarray, " c"]
-    ray_masks: UInt64[np.ndarray, " c"]
-    ids: Int32[np.ndarray, " c"]
-    min_distance_after: Float32[np.ndarray, " c1"]
-    block_ray_masks: UInt64[np.ndarray, " b"]
-    ray_block_masks: UInt64[np.ndarray, "w 64"]
-    blocks: Float32[np.ndarray, "b 12 8"]
-    slots: Int32[np.ndarray, " c"]
-    color_normals: Float64[np.ndarray, "c 8"]
-    hit_keys: UInt64[np.ndarray, " c8"]
-    alphas: Float32[np.ndarray, " c8"]
-    opacities: Float32[np.ndarray, " c8"]
-    us: Float32[np.ndarray, " c8"]
-    vs: Float32[np.ndarray, " c8"]
-    hit_candidates: Int32[np.ndarray, " c8"]
-
-
 @device_function(error_model="numpy")
-def allocate_aligned_float64(count):
+def allocate_aligned_float64(count: int) -> Float64[np.ndarray, " count"]:
     """Room for doubles from a line on, else each vector of eight would lie in two."""
     raw = np.empty(count + CACHE_LINE_BYTES // 8, np.float64)
     first = (CACHE_LINE_BYTES - raw.ctypes.data % CACHE_LINE_BYTES) % CACHE_LINE_BYTES // 8
@@ -117,7 +88,7 @@ def allocate_aligned_float64(count):
 
 
 @device_function(error_model="numpy")
-def allocate_candidates(capacity):
+def allocate_candidates(capacity: int) -> Candidates:
     """Room for so many candidates, a multiple of eight."""
     return Candidates(
         np.empty(capacity, np.int32),
@@ -144,7 +115,13 @@ def allocate_candidates(capacity):
 
 
 @kernel()
-def find_packet_starts(origins, directions, max_rays, min_cosine, starts):
+def find_packet_starts(
+    origins: Float32[np.ndarray, "#r 3"],
+    directions: Float32[np.ndarray, "r 3"],
+    max_rays: int,
+    min_cosine: float,
+    starts: Int64[np.ndarray, " r1"],
+) -> int:
     """First ray of each packet: neighbours in the array that share an origin and look about one way.
 
     Returns the number of packets; ``starts`` has room for one more than there are rays.
@@ -174,7 +151,15 @@ def find_packet_starts(origins, directions, max_rays, min_cosine, starts):
 
 
 @device_function(error_model="numpy")
-def find_candidates(rays, first, last, bvh, frustum, traversal, candidates):
+def find_candidates(
+    rays: RayArrays,
+    first: int,
+    last: int,
+    bvh: BvhArrays,
+    frustum: Frustum,
+    traversal: TraversalScratch,
+    candidates: Candidates,
+) -> tuple[Candidates, int]:
     """Candidates of the packet of rays ``first`` to ``last``, and how many; room grows as needed."""
     write_frustum(rays, first, last, frustum)
     one_end = len(rays.t_max) == 1
@@ -191,7 +176,15 @@ def find_candidates(rays, first, last, bvh, frustum, traversal, candidates):
 
 
 @njit_no_refcount(forceinline=True, fastmath={"contract"})
-def write_in_packet_frame(block, row, lane, frame, x, y, z):
+def write_in_packet_frame(
+    block: Float32[np.ndarray, "12 lanes"],
+    row: int,
+    lane: int,
+    frame: Float64[np.ndarray, "15"],
+    x: float,
+    y: float,
+    z: float,
+) -> None:
     """A vector along the axis, e and f of a packet's ``frame``, as three rows of a lane."""
     for axis in range(3):
         k = 3 * axis
@@ -199,7 +192,13 @@ def write_in_packet_frame(block, row, lane, frame, x, y, z):
 
 
 @njit_no_refcount(forceinline=True, fastmath={"contract"})
-def write_packet_primitive(block, lane, primitive, origin, frame):
+def write_packet_primitive(
+    block: Float32[np.ndarray, "12 lanes"],
+    lane: int,
+    primitive: Float32[np.ndarray, "16"],
+    origin: tuple[float, float, float],
+    frame: Float64[np.ndarray, "15"],
+) -> None:
     """One Gaussian's row, as a column of ``block``, for rays from one origin.
 
     Differences and turns into the packet's ``frame`` are taken in float64, and only what comes of them is
@@ -225,7 +224,14 @@ def write_packet_primitive(block, lane, primitive, origin, frame):
 
 
 @njit_no_refcount(fastmath={"contract"})
-def write_candidate_blocks(candidates, count, scene, origin, frame, prefetch_sh):
+def write_candidate_blocks(
+    candidates: Candidates,
+    count: int,
+    scene: PackedScene,
+    origin: tuple[float, float, float],
+    frame: Float64[np.ndarray, "15"],
+    prefetch_sh: bool,
+) -> None:
     """Rows of the candidates for rays from one origin; the last block is filled with lanes that never hit.
 
     Harmonics are asked for if hits will be ``prefetch_sh``.

@@ -3,9 +3,19 @@
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float32, Float64, Int64, UInt64
+from jaxtyping import Float32, Float64, Int32, Int64, UInt64
 
 from octasplat.engine.core.compilation import device_function, kernel
+from octasplat.engine.trace.cpu.kernels.kernel_args import (
+    BvhArrays,
+    Candidates,
+    ForwardPass,
+    OutputArrays,
+    PackedScene,
+    PacketHits,
+    RayArrays,
+    TraceLimits,
+)
 from octasplat.engine.trace.cpu.kernels.octagon_hit import MEAN, NORMAL
 from octasplat.engine.trace.cpu.kernels.packet_bvh import WIDTH
 from octasplat.engine.trace.cpu.kernels.packet_candidates import (
@@ -30,6 +40,10 @@ from octasplat.engine.trace.cpu.kernels.rays import (
     ray_slopes,
 )
 from octasplat.engine.trace.cpu.kernels.simd8 import (
+    HitBuffer,
+    HitStore,
+    HitTables,
+    PacketRay,
     accumulate_color_normals,
     composite8,
     eval_alphas8,
@@ -41,6 +55,7 @@ from octasplat.engine.trace.cpu.kernels.simd8 import (
 from octasplat.engine.trace.cpu.kernels.simd_vector import float32_bits, float32_from_bits, lowest_bit
 from octasplat.engine.trace.cpu.kernels.spherical_harmonics import eval_color, eval_view_basis
 from octasplat.engine.trace.kernels.native import (
+    Address,
     atomic_fetch_next,
     njit_no_refcount,
     prefetch,
@@ -71,8 +86,24 @@ class RayScratch(NamedTuple):
     slots: Int64[np.ndarray, "8"]
 
 
+class PacketTrace(NamedTuple):
+    """A packet whose rays are followed: its candidates in order, and what it keeps of its hits.
+
+    The Gaussians that it meets are listed from ``slot_base`` on. ``origin`` is that of its rays, and
+    ``frame`` its axis, e and f.
+    """
+
+    forward: ForwardPass
+    candidates: Candidates
+    candidate_count: int
+    hits: PacketHits
+    slot_base: int
+    origin: tuple[float, float, float]
+    frame: Float64[np.ndarray, "15"]
+
+
 @device_function(error_model="numpy")
-def allocate_ray_scratch():
+def allocate_ray_scratch() -> RayScratch:
     """Memory for rays, one after another."""
     return RayScratch(
         np.empty(16, np.float64),
@@ -88,7 +119,7 @@ def allocate_ray_scratch():
 
 
 @njit_no_refcount()
-def sort_ties_by_id(candidates, first, last):
+def sort_ties_by_id(candidates: Candidates, first: int, last: int) -> None:
     """Order the hits ``first`` to ``last``, which are sorted by distance, by id where they share one."""
     pending, numbers, ids = candidates.hit_keys, candidates.hit_candidates, candidates.ids
     for i in range(first + 1, last):
@@ -108,7 +139,7 @@ def sort_ties_by_id(candidates, first, last):
 
 
 @njit_no_refcount()
-def sort_hits(candidates, rank_buffer, first, last):
+def sort_hits(candidates: Candidates, rank_buffer: UInt64[np.ndarray, "104"], first: int, last: int) -> None:
     """Sort the hits ``first`` to ``last`` of a ray by distance, and by id where they share one."""
     if last - first <= RANK_SORT_MAX:
         if rank_sort(candidates.hit_keys.ctypes.data + first * 8, last - first, rank_buffer.ctypes.data):
@@ -126,15 +157,28 @@ def sort_hits(candidates, rank_buffer, first, last):
 
 
 @njit_no_refcount(forceinline=True)
-def intersect_blocks(candidates, ray_bit, first, slopes, limits, hit_count):
+def intersect_blocks(
+    candidates: Candidates,
+    ray_bit: int,
+    first: int,
+    slopes: tuple[float, float, float],
+    limits: tuple[float, float],
+    hit_count: int,
+) -> int:
     """Test the ``BLOCKS_PER_CHUNK`` blocks from ``first`` on that the packet's ray ``ray_bit`` may meet.
 
     Returns how many hits there are then; ``hit_count`` are known already. The blocks' bits lie in one word.
     """
-    a, b, per_axis = np.float32(slopes[0]), np.float32(slopes[1]), np.float32(slopes[2])
-    t_min, t_max = limits
+    ray = PacketRay(
+        np.float32(slopes[0]), np.float32(slopes[1]), np.float32(slopes[2]),
+        np.float32(limits[0]), np.float32(limits[1]),
+    )  # fmt: skip
     c = candidates
-    rows_at = c.blocks.ctypes.data
+    hits = HitBuffer(
+        c.hit_keys.ctypes.data, c.alphas.ctypes.data, c.opacities.ctypes.data, c.us.ctypes.data,
+        c.vs.ctypes.data, c.hit_candidates.ctypes.data,
+    )  # fmt: skip
+    blocks_at = c.blocks.ctypes.data
     bits = (
         c.ray_block_masks[first // MASK_BITS, ray_bit] >> np.uint64(first % MASK_BITS)
     ) & CHUNK_BLOCKS_MASK
@@ -143,15 +187,13 @@ def intersect_blocks(candidates, ray_bit, first, slopes, limits, hit_count):
         block = first + lowest_bit(bits)
         bits &= bits - 1
         hit_count += intersect_block8(
-            rows_at + block * CANDIDATE_BLOCK_BYTES, a, b, per_axis, t_min, t_max, block * WIDTH, hit_count,
-            c.hit_keys.ctypes.data, c.alphas.ctypes.data, c.opacities.ctypes.data, c.us.ctypes.data,
-            c.vs.ctypes.data, c.hit_candidates.ctypes.data,
-        )  # fmt: skip
+            blocks_at + block * CANDIDATE_BLOCK_BYTES, ray, block * WIDTH, hit_count, hits
+        )
     return hit_count
 
 
 @njit_no_refcount(forceinline=True)
-def eval_alphas(candidates, first, last, alpha_max):
+def eval_alphas(candidates: Candidates, first: int, last: int, alpha_max: float) -> None:
     """Alphas of the hits ``first`` to ``last`` of a ray."""
     for place in range(first, last, WIDTH):
         eval_alphas8(
@@ -160,7 +202,9 @@ def eval_alphas(candidates, first, last, alpha_max):
 
 
 @njit_no_refcount(forceinline=True)
-def prefetch_colors(new_hits, candidate_indices, ids, scene):
+def prefetch_colors(
+    new_hits: int, candidate_indices: Int64[np.ndarray, "8"], ids: Int32[np.ndarray, " c"], scene: PackedScene
+) -> None:
     """Ask for what the hits ``new_hits`` show at once, so that memory is not waited for one by one."""
     sh_at, sh_bytes = scene.sh.ctypes.data, scene.sh.shape[1] * 12
     while new_hits != 0:
@@ -171,7 +215,14 @@ def prefetch_colors(new_hits, candidate_indices, ids, scene):
 
 
 @njit_no_refcount(fastmath={"contract"})
-def eval_color_normal(color_normal, i, scene, limits, origin, basis):
+def eval_color_normal(
+    color_normal: Float64[np.ndarray, "8"],
+    i: int,
+    scene: PackedScene,
+    limits: TraceLimits,
+    origin: tuple[float, float, float],
+    basis: Float64[np.ndarray, " k"],
+) -> None:
     """What Gaussian ``i`` shows to rays from ``origin``."""
     record = scene.primitives[i]
     x, y, z = record[MEAN] - origin[0], record[MEAN + 1] - origin[1], record[MEAN + 2] - origin[2]
@@ -183,44 +234,130 @@ def eval_color_normal(color_normal, i, scene, limits, origin, basis):
     color_normal[4], color_normal[5], color_normal[6] = side * n0, side * n1, side * n2
 
 
+@njit_no_refcount(forceinline=True)
+def find_ray_end(
+    bits: int,
+    count: int,
+    last_phase: bool,
+    stop_below: float,
+    eps2: float,
+    transmittance_after: Float64[np.ndarray, "8"],
+) -> tuple[int, bool, bool, float]:
+    """Find where a ray ends among ``count`` hits; ``bits`` are those behind which too little is left.
+
+    The second phase begins where too little is left, and ends where its own part of it is (Algorithm 1 of
+    RaySplats).
+
+    Returns:
+        How many hits are taken, whether the ray ends with the last of them, whether the last phase has begun,
+        and the transmittance below which that ends.
+    """
+    taken, stop = count, False
+    if bits & ((1 << count) - 1) != 0:
+        last = lowest_bit(bits)
+        if not last_phase:
+            last_phase = True
+            stop_below = transmittance_after[last] * eps2
+            last += 1
+            while last < count and transmittance_after[last] >= stop_below:
+                last += 1
+        if last < count:
+            taken, stop = last + 1, True
+    return taken, stop, last_phase, stop_below
+
+
+@njit_no_refcount(forceinline=True)
+def fill_slots(
+    new_hits: int,
+    slot_count: int,
+    packet: PacketTrace,
+    scratch: RayScratch,
+) -> int:
+    """Give the hits ``new_hits`` a slot of their packet each, with its colour and normal.
+
+    Returns:
+        The number of slots.
+    """
+    candidates, ids, forward = packet.candidates, packet.candidates.ids, packet.forward
+    if new_hits & (new_hits - 1) != 0:
+        prefetch_colors(new_hits, scratch.candidate_indices, ids, forward.scene)
+    while new_hits != 0:
+        k = lowest_bit(new_hits)
+        new_hits &= new_hits - 1
+        number = scratch.candidate_indices[k]
+        scratch.slots[k] = candidates.slots[number] = slot_count
+        shown = candidates.color_normals[slot_count]
+        eval_color_normal(shown, ids[number], forward.scene, forward.limits, packet.origin, scratch.basis)
+        if forward.is_recording:
+            packet.hits.slot_ids[packet.slot_base + slot_count] = ids[number]
+            for channel in range(3):
+                packet.hits.slot_rgb[packet.slot_base + slot_count, channel] = shown[channel]
+        slot_count += 1
+    return slot_count
+
+
+@njit_no_refcount(forceinline=True)
+def store_hits(
+    keys_at: Address, count: int, first_hit: int, packet: PacketTrace, scratch: RayScratch
+) -> None:
+    """Keep the first ``count`` of eight hits from place ``first_hit`` on for the backward pass."""
+    candidates, hits, packet_hits = packet.candidates, packet.forward.hits, packet.hits
+    tables = HitTables(candidates.us.ctypes.data, candidates.vs.ctypes.data)
+    out = HitStore(
+        hits.alphas.ctypes.data, hits.distances.ctypes.data, packet_hits.us.ctypes.data,
+        packet_hits.vs.ctypes.data, packet_hits.slots.ctypes.data,
+    )  # fmt: skip
+    store_hits8(keys_at, count, scratch.alphas.ctypes.data, scratch.slots.ctypes.data, tables, first_hit, out)
+
+
+@njit_no_refcount(forceinline=True)
+def write_ray_sums(
+    r: int, count: int, transmittance: float, median: float, scratch: RayScratch, out: OutputArrays
+) -> None:
+    """Write the outputs of ray ``r``, which has ``count`` hits, but for the features."""
+    out.counts[r] = count
+    out.transmittance[r] = transmittance
+    depth = 0.0
+    for k in range(WIDTH):
+        depth += scratch.depth_sums[k]
+    out.depth_sum[r] = depth
+    out.depth_median[r] = median
+    for axis in range(3):
+        out.rgb[r, axis] = scratch.sums[axis]
+        out.normal[r, axis] = scratch.sums[4 + axis]
+
+
 @njit_no_refcount(fastmath={"contract"})
 def trace_ray(
-    r,
-    ray_bit,
-    first_hit,
-    slot_count,
-    slot_base,
-    origin,
-    frame,
-    forward,
-    candidates,
-    count,
-    packet_hits,
-    scratch,
-):
+    r: int, ray_bit: int, first_hit: int, slot_count: int, packet: PacketTrace, scratch: RayScratch
+) -> tuple[int, int]:
     """Follow ray ``r``, which is ray ``ray_bit`` of its packet; its hits are stored from ``first_hit`` on.
 
-    Returns the place behind its last hit, and the number of Gaussians that the packet has met, so far
-    ``slot_count``, which ``packet_hits`` lists from ``slot_base`` on.
+    Returns:
+        The place behind its last hit, and the number of Gaussians that the packet has met, so far
+        ``slot_count``.
     """
-    limits, hits, out, features = forward.limits, forward.hits, forward.out, forward.scene.features
-    pending, ids = candidates.hit_keys, candidates.ids
-    slot_of, shown = candidates.slots, candidates.color_normals
-    feature_count, recording = features.shape[1], forward.is_recording
-    slopes, span = ray_slopes(forward.rays, r, frame), ray_limits(forward.rays, r)
-    if recording:
-        hits.starts[r] = first_hit
+    forward, candidates, count = packet.forward, packet.candidates, packet.candidate_count
+    limits, out, features = forward.limits, forward.out, forward.scene.features
+    keys, ids = candidates.hit_keys, candidates.ids
+    slopes, span = ray_slopes(forward.rays, r, packet.frame), ray_limits(forward.rays, r)
+    feature_count = features.shape[1]
+    if forward.is_recording:
+        forward.hits.starts[r] = first_hit
     scratch.sums[:] = 0.0
     scratch.depth_sums[:] = 0.0
     for f in range(feature_count):
         out.features[r, f] = np.float32(0.0)
-    # The second phase begins where too little is left, and ends where its own part of it is (Algorithm 1).
+    # --- the ray so far: transmittance, where its phase ends, median depth, hits composited ---
     t, stop_below, last_phase = 1.0, limits.eps1, limits.eps2 > 1.0
     median = np.float32(0.0)
-    found = head = tail = b0 = 0
+    found = 0
+    # Hits head to tail have been met and wait; b0 is the next block to be tested.
+    head = tail = b0 = 0
     block_count = (count + WIDTH - 1) // WIDTH
     stop = False
     while b0 < block_count and not stop:
+        # --- meet the Gaussians of the next chunk, and sort what waits ---
         b1 = min(b0 + BLOCKS_PER_CHUNK, block_count)
         known = tail
         tail = intersect_blocks(candidates, ray_bit, b0, slopes, span, tail)
@@ -230,90 +367,59 @@ def trace_ray(
         # What follows lies no nearer than this.
         nearest = candidates.min_distance_after[min(b1 * WIDTH, count)]
         safe = np.uint64(float32_bits(nearest)) << HIGH_WORD_SHIFT
-        while not stop and head < tail and pending[head] < safe:
-            keys_at = pending.ctypes.data + head * 8
+        # --- composite the hits that no later chunk comes before, eight at a time ---
+        while not stop and head < tail and keys[head] < safe:
+            keys_at = keys.ctypes.data + head * 8
             bits = composite8(
                 keys_at, min(tail - head, limits.max_hits - found), safe, candidates.alphas.ctypes.data, t,
                 stop_below, scratch.alphas.ctypes.data, scratch.weights.ctypes.data,
                 scratch.transmittance_after.ctypes.data,
             )  # fmt: skip
-            taken = n = bits >> (2 * WIDTH)
-            if bits & ((1 << n) - 1) != 0:
-                last = lowest_bit(bits)
-                if not last_phase:
-                    last_phase = True
-                    stop_below = scratch.transmittance_after[last] * limits.eps2
-                    last += 1
-                    while last < n and scratch.transmittance_after[last] >= stop_below:
-                        last += 1
-                if last < n:
-                    taken, stop = last + 1, True
+            taken, stop, last_phase, stop_below = find_ray_end(
+                bits, bits >> (2 * WIDTH), last_phase, stop_below, limits.eps2, scratch.transmittance_after
+            )
             if t > 0.5:
                 halves = (bits >> WIDTH) & ((1 << taken) - 1)
                 if halves != 0:
-                    median = float32_from_bits(
-                        np.uint32(pending[head + lowest_bit(halves)] >> HIGH_WORD_SHIFT)
-                    )
+                    median = float32_from_bits(np.uint32(keys[head + lowest_bit(halves)] >> HIGH_WORD_SHIFT))
             new = lookup_slots8(
-                keys_at, taken, candidates.hit_candidates.ctypes.data, slot_of.ctypes.data,
+                keys_at, taken, candidates.hit_candidates.ctypes.data, candidates.slots.ctypes.data,
                 scratch.weights.ctypes.data, scratch.candidate_indices.ctypes.data, scratch.slots.ctypes.data,
                 scratch.depth_sums.ctypes.data,
             )  # fmt: skip
-            if new & (new - 1) != 0:
-                prefetch_colors(new, scratch.candidate_indices, ids, forward.scene)
-            while new != 0:
-                k = lowest_bit(new)
-                new &= new - 1
-                number = scratch.candidate_indices[k]
-                scratch.slots[k] = slot_of[number] = slot_count
-                eval_color_normal(
-                    shown[slot_count], ids[number], forward.scene, limits, origin, scratch.basis
-                )
-                if recording:
-                    packet_hits.slot_ids[slot_base + slot_count] = ids[number]
-                    for channel in range(3):
-                        packet_hits.slot_rgb[slot_base + slot_count, channel] = shown[slot_count, channel]
-                slot_count += 1
+            slot_count = fill_slots(new, slot_count, packet, scratch)
             for f in range(feature_count):
                 for k in range(taken):
                     out.features[r, f] += np.float32(
                         scratch.weights[k] * features[ids[scratch.candidate_indices[k]], f]
                     )
             accumulate_color_normals(
-                scratch.sums.ctypes.data, shown.ctypes.data, scratch.slots.ctypes.data,
+                scratch.sums.ctypes.data, candidates.color_normals.ctypes.data, scratch.slots.ctypes.data,
                 scratch.weights.ctypes.data, taken,
             )  # fmt: skip
-            if recording:
-                store_hits8(
-                    keys_at, taken, scratch.alphas.ctypes.data, scratch.slots.ctypes.data,
-                    candidates.us.ctypes.data, candidates.vs.ctypes.data, first_hit, hits.alphas.ctypes.data,
-                    hits.distances.ctypes.data, packet_hits.us.ctypes.data, packet_hits.vs.ctypes.data,
-                    packet_hits.slots.ctypes.data,
-                )  # fmt: skip
+            if forward.is_recording:
+                store_hits(keys_at, taken, first_hit, packet, scratch)
             t = scratch.transmittance_after[taken - 1]
             head, first_hit, found = head + taken, first_hit + taken, found + taken
             stop = stop or found >= limits.max_hits
         b0 = b1
         stop = stop or nearest >= span[1]
-    out.counts[r] = found
-    out.transmittance[r] = t
-    depth = 0.0
-    for k in range(WIDTH):
-        depth += scratch.depth_sums[k]
-    out.depth_sum[r] = depth
-    out.depth_median[r] = median
-    for axis in range(3):
-        out.rgb[r, axis] = scratch.sums[axis]
-        out.normal[r, axis] = scratch.sums[4 + axis]
+    write_ray_sums(r, found, t, median, scratch, out)
     return first_hit, slot_count
 
 
 @kernel(error_model="numpy")
-def trace_packets(forward, packets, bvh, packet_hits, counter):
+def trace_packets(
+    forward: ForwardPass,
+    packets: Int64[np.ndarray, "p 2"],
+    bvh: BvhArrays,
+    packet_hits: PacketHits,
+    counter: Int64[np.ndarray, "1"],
+) -> None:
     """Trace packets of rays ``packets[p, 0]`` to ``packets[p, 1]`` until the ``counter`` has passed the last.
 
-    Packet p's hits are stored from the first place of its first ray on, and ``packet_hits`` beside them. A ray's
-    result depends on its packet alone, so it is the same for every number of threads.
+    Packet p's hits are stored from the first place of its first ray on, and ``packet_hits`` beside them. A
+    ray's result depends on its packet alone, so it is the same for every number of threads.
     """
     pyramid, walk, scratch = allocate_frustum(), allocate_traversal(), allocate_ray_scratch()
     candidates = allocate_candidates(INITIAL_CAPACITY)
@@ -328,18 +434,24 @@ def trace_packets(forward, packets, bvh, packet_hits, counter):
         write_candidate_blocks(candidates, count, forward.scene, origin, pyramid.frame, True)
         candidates.slots[:count] = -1
         slots = 0
-        place = slot_base = first_hit_index(first, forward.limits)
+        place = first_hit_index(first, forward.limits)
+        state = PacketTrace(forward, candidates, count, packet_hits, place, origin, pyramid.frame)
         for r in range(first, last):
-            place, slots = trace_ray(
-                r, r - first, place, slots, slot_base, origin, pyramid.frame, forward, candidates, count,
-                packet_hits, scratch,
-            )  # fmt: skip
+            place, slots = trace_ray(r, r - first, place, slots, state, scratch)
         if forward.is_recording:
             packet_hits.slot_counts[packet] = slots
 
 
 @njit_no_refcount(fastmath={"contract"})
-def ray_transmittance(r, ray_bit, rays, frame, candidates, count, limits):
+def ray_transmittance(
+    r: int,
+    ray_bit: int,
+    rays: RayArrays,
+    frame: Float64[np.ndarray, "15"],
+    candidates: Candidates,
+    count: int,
+    limits: TraceLimits,
+) -> float:
     """What the candidates leave of ray ``r``, ray ``ray_bit`` of its packet; 0 where that is below eps1."""
     slopes, span = ray_slopes(rays, r, frame), ray_limits(rays, r)
     block_count = (count + WIDTH - 1) // WIDTH
@@ -355,7 +467,15 @@ def ray_transmittance(r, ray_bit, rays, frame, candidates, count, limits):
 
 
 @kernel(error_model="numpy")
-def packet_transmittance(rays, scene, limits, packets, bvh, counter, transmittance):
+def packet_transmittance(
+    rays: RayArrays,
+    scene: PackedScene,
+    limits: TraceLimits,
+    packets: Int64[np.ndarray, "p 2"],
+    bvh: BvhArrays,
+    counter: Int64[np.ndarray, "1"],
+    transmittance: Float32[np.ndarray, " r"],
+) -> None:
     """The transmittance of rays alone: nothing is sorted, no colour is read."""
     pyramid, walk = allocate_frustum(), allocate_traversal()
     candidates = allocate_candidates(INITIAL_CAPACITY)

@@ -1,7 +1,9 @@
 """The order in which a packet's candidates are tested."""
 
 import numpy as np
+from jaxtyping import Int32, UInt64
 
+from octasplat.engine.trace.cpu.kernels.kernel_args import Candidates
 from octasplat.engine.trace.cpu.kernels.packet_bvh import WIDTH
 from octasplat.engine.trace.cpu.kernels.packet_candidates import CHUNK, MASK_BITS
 from octasplat.engine.trace.cpu.kernels.ray_mask import CELLS
@@ -12,7 +14,9 @@ INSERTION_SORT_MAX = 48
 
 
 @njit_no_refcount(fastmath={"contract"})
-def sort_candidates(candidates, count, order, histogram):
+def sort_candidates(
+    candidates: Candidates, count: int, order: Int32[np.ndarray, " n"], histogram: Int32[np.ndarray, "256"]
+) -> None:
     """Order the candidates in chunks by distance, within a chunk by the rays that may meet them."""
     keys, bounds, cells, near = (
         candidates.keys,
@@ -47,7 +51,7 @@ def sort_candidates(candidates, count, order, histogram):
 
 
 @njit_no_refcount(forceinline=True)
-def sort_by_distance(candidates, count, histogram):
+def sort_by_distance(candidates: Candidates, count: int, histogram: Int32[np.ndarray, "256"]) -> None:
     """Sort the keys of the candidates."""
     if count > INSERTION_SORT_MAX:
         radix_sort_keys(candidates.keys, candidates.hit_keys, count, histogram)
@@ -56,7 +60,7 @@ def sort_by_distance(candidates, count, histogram):
 
 
 @njit_no_refcount()
-def copy_candidates_unsorted(candidates, count, order):
+def copy_candidates_unsorted(candidates: Candidates, count: int, order: Int32[np.ndarray, " n"]) -> None:
     """Leave the candidates in the order in which they were found, where none is needed."""
     for b in range((count + WIDTH - 1) // WIDTH):
         candidates.block_ray_masks[b] = 0
@@ -67,7 +71,7 @@ def copy_candidates_unsorted(candidates, count, order):
 
 
 @njit_no_refcount()
-def transpose_ray_masks(candidates, count):
+def transpose_ray_masks(candidates: Candidates, count: int) -> None:
     """The blocks of each ray from the rays of each block: squares of 64 bits are turned over.
 
     Halves of a square change places, then quarters within the halves, down to single bits.
@@ -91,7 +95,7 @@ def transpose_ray_masks(candidates, count):
 
 
 @njit_no_refcount()
-def insertion_sort(keys, count):
+def insertion_sort(keys: UInt64[np.ndarray, " c"], count: int) -> None:
     """Sort a few keys in place."""
     for i in range(1, count):
         key = keys[i]
@@ -103,7 +107,12 @@ def insertion_sort(keys, count):
 
 
 @njit_no_refcount()
-def radix_sort_keys(keys, scratch, count, histogram):
+def radix_sort_keys(
+    keys: UInt64[np.ndarray, " c"],
+    scratch: UInt64[np.ndarray, " c"],
+    count: int,
+    histogram: Int32[np.ndarray, "256"],
+) -> None:
     """Sort in place by the upper bits of the keys' distances, then by the rest.
 
     Two passes over the 16 bits below the distances' common upper bits leave so little disorder that the

@@ -5,12 +5,18 @@ beside the pyramid, but nothing that a ray meets is left out.
 """
 
 import math
-from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float32, Float64, Int32, Int64, UInt64
+from jaxtyping import Float32
 
 from octasplat.engine.core.compilation import device_function
+from octasplat.engine.trace.cpu.kernels.kernel_args import (
+    BvhArrays,
+    Candidates,
+    Frustum,
+    RayArrays,
+    TraversalScratch,
+)
 from octasplat.engine.trace.cpu.kernels.packet_bvh import BOX_ROWS, LEAF_ROWS, WIDTH
 from octasplat.engine.trace.cpu.kernels.ray_mask import (
     BINS,
@@ -39,41 +45,8 @@ SLOPE_MARGIN = 1e-9
 """The pyramid is wider than its rays by this, which covers the rounding of slopes in float64."""
 
 
-class BvhArrays(NamedTuple):
-    """The hierarchy; :mod:`octasplat.engine.trace.cpu.kernels.packet_bvh` says how it is laid out."""
-
-    nodes: Float32[np.ndarray, "m 6 8"]
-    level_starts: Int64[np.ndarray, " l"]
-    leaf_blocks: Float32[np.ndarray, "b 9 8"]
-    order: Int32[np.ndarray, " k"]
-
-
-class Frustum(NamedTuple):
-    """The pyramid around the rays of a packet.
-
-    ``planes`` are inward normals, their positive and their negative parts; ``frame`` the axis, two directions
-    across it, the range of slopes and bins per slope, and ``frame_float32`` the same in float32; ``prefix_masks`` the bits
-    of the rays in the bins before each, along either slope.
-    """
-
-    planes: Float32[np.ndarray, "5 9"]
-    frame: Float64[np.ndarray, "15"]
-    frame_float32: Float32[np.ndarray, "15"]
-    prefix_masks: UInt64[np.ndarray, "2 65"]
-
-
-class TraversalScratch(NamedTuple):
-    """Memory of a walk: waiting nodes and blocks, bins and distances of a block, and buckets for sorting."""
-
-    stack: Int64[np.ndarray, " s"]
-    block_queue: Int64[np.ndarray, " w"]
-    bins: Int32[np.ndarray, "4 8"]
-    distances: Float32[np.ndarray, "2 8"]
-    histogram: Int32[np.ndarray, "256"]
-
-
 @device_function(error_model="numpy")
-def allocate_frustum():
+def allocate_frustum() -> Frustum:
     """Room for a pyramid."""
     return Frustum(
         np.empty((FRUSTUM_PLANES, PLANE_WORDS), np.float32),
@@ -84,7 +57,7 @@ def allocate_frustum():
 
 
 @device_function(error_model="numpy")
-def allocate_traversal():
+def allocate_traversal() -> TraversalScratch:
     """Memory for walks, one after another."""
     return TraversalScratch(
         np.empty(STACK_WORDS, np.int64),
@@ -96,7 +69,7 @@ def allocate_traversal():
 
 
 @njit_no_refcount(forceinline=True)
-def write_plane(plane, x, y, z):
+def write_plane(plane: Float32[np.ndarray, "9"], x: float, y: float, z: float) -> None:
     """A normal, its positive parts, which take a high corner, and its negative ones, which take a low."""
     plane[0], plane[1], plane[2] = x, y, z
     plane[3], plane[4], plane[5] = max(x, 0.0), max(y, 0.0), max(z, 0.0)
@@ -104,7 +77,7 @@ def write_plane(plane, x, y, z):
 
 
 @njit_no_refcount()
-def write_frustum(rays, first, last, frustum):
+def write_frustum(rays: RayArrays, first: int, last: int, frustum: Frustum) -> None:
     """The pyramid around rays ``first`` to ``last``."""
     planes, frame, directions = frustum.planes, frustum.frame, rays.directions
     x = y = z = 0.0
@@ -144,7 +117,14 @@ def write_frustum(rays, first, last, frustum):
 
 
 @njit_no_refcount(fastmath={"contract"})
-def gather_candidates(bvh, frustum, origin, t_max, traversal, candidates):
+def gather_candidates(
+    bvh: BvhArrays,
+    frustum: Frustum,
+    origin: tuple[float, float, float],
+    t_max: float,
+    traversal: TraversalScratch,
+    candidates: Candidates,
+) -> int:
     """The Gaussians whose ellipse a ray of the pyramid may meet before ``t_max``; returns how many.
 
     Only as many as there is room for are written. Blocks are asked for when their box is reached, and tested
@@ -182,8 +162,20 @@ def gather_candidates(bvh, frustum, origin, t_max, traversal, candidates):
 
 
 @njit_no_refcount(fastmath={"contract"})
-def test_blocks(bvh, frustum, origin, t_max, traversal, count, candidates, candidate_count):
-    """Append the candidates of the ``count`` blocks that wait to the ``candidate_count`` so far; returns the sum."""
+def test_blocks(
+    bvh: BvhArrays,
+    frustum: Frustum,
+    origin: tuple[float, float, float],
+    t_max: float,
+    traversal: TraversalScratch,
+    count: int,
+    candidates: Candidates,
+    candidate_count: int,
+) -> int:
+    """Append the candidates of the ``count`` blocks that wait to the ``candidate_count`` so far.
+
+    Returns the sum.
+    """
     ox, oy, oz = np.float32(origin[0]), np.float32(origin[1]), np.float32(origin[2])
     bins, distances, room = traversal.bins, traversal.distances, len(candidates.curve_indices)
     planes_at, frame_at = frustum.planes.ctypes.data, frustum.frame_float32.ctypes.data

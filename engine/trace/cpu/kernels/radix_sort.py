@@ -18,7 +18,13 @@ SEGMENT_CHUNKS = 64
 
 
 @kernel(_nrt=False)
-def _count_digits(first, last, keys, shift, histograms):
+def _count_digits(
+    first: int,
+    last: int,
+    keys: Int[np.ndarray, " e"],
+    shift: int,
+    histograms: Int64[np.ndarray, "chunks buckets"],
+) -> None:
     """Write the histogram of a digit for each of the chunks ``first`` to ``last``."""
     count = len(keys)
     per = (count + len(histograms) - 1) // len(histograms)
@@ -29,7 +35,7 @@ def _count_digits(first, last, keys, shift, histograms):
 
 
 @kernel(_nrt=False)
-def _add_up(histograms):
+def _add_up(histograms: Int64[np.ndarray, "chunks buckets"]) -> None:
     """Replace each count by the place of its first key."""
     total = 0
     for b in range(BUCKETS):
@@ -40,7 +46,16 @@ def _add_up(histograms):
 
 
 @kernel(_nrt=False)
-def _scatter(first, last, keys, order, shift, keys_out, order_out, histograms):
+def _scatter(
+    first: int,
+    last: int,
+    keys: Int[np.ndarray, " e"],
+    order: Int32[np.ndarray, " e"],
+    shift: int,
+    keys_out: Int[np.ndarray, " e"],
+    order_out: Int32[np.ndarray, " e"],
+    histograms: Int64[np.ndarray, "chunks buckets"],
+) -> None:
     """Move the keys of the chunks ``first`` to ``last`` to their places."""
     count = len(keys)
     per = (count + len(histograms) - 1) // len(histograms)
@@ -54,7 +69,9 @@ def _scatter(first, last, keys, order, shift, keys_out, order_out, histograms):
 
 
 @kernel(_nrt=False)
-def _count_segments(first, last, keys, firsts):
+def _count_segments(
+    first: int, last: int, keys: Int32[np.ndarray, " e"], firsts: Int64[np.ndarray, " chunks"]
+) -> None:
     """Write how many segments begin in each of the chunks ``first`` to ``last``."""
     count, chunks = len(keys), len(firsts)
     for c in range(first, last):
@@ -66,7 +83,13 @@ def _count_segments(first, last, keys, firsts):
 
 
 @kernel(_nrt=False)
-def _write_segments(first, last, keys, starts, firsts):
+def _write_segments(
+    first: int,
+    last: int,
+    keys: Int32[np.ndarray, " e"],
+    starts: Int64[np.ndarray, " s1"],
+    firsts: Int64[np.ndarray, " chunks"],
+) -> None:
     """Write where the segments of the chunks ``first`` to ``last`` begin; ``firsts`` are their numbers."""
     count, chunks = len(keys), len(firsts)
     for c in range(first, last):

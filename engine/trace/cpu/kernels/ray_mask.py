@@ -5,22 +5,31 @@ candidate's ellipse, seen from the packet's origin, lies between two values of a
 between them are found by a table over bins of a and b.
 """
 
+from collections.abc import Sequence
+
 import llvmlite.ir as ir
 import numpy as np
+from jaxtyping import Float64, Int32, UInt64
 from numba import types
+from numba.core.base import BaseContext
+from numba.core.typing import Context as TypingContext
+from numba.core.typing.templates import Signature
 from numba.extending import intrinsic
 
 from octasplat.engine.core.compilation import device_function
+from octasplat.engine.trace.cpu.kernels.kernel_args import RayArrays
 from octasplat.engine.trace.cpu.kernels.rays import ray_slopes
 from octasplat.engine.trace.cpu.kernels.simd_vector import (
     FLOAT8,
     I64,
     LANES,
     ROUNDING_MARGIN,
+    Vector,
     VectorRows,
     broadcast,
     sum_abs,
 )
+from octasplat.engine.trace.kernels.native import Address, Intrinsic
 
 BINS = 64
 CELL_GRID = 8
@@ -31,8 +40,17 @@ FRAME_WORDS = 15
 
 
 @device_function(error_model="numpy")
-def write_ray_bins(rays, first, last, frame, prefix_masks):
-    """Bins per slope into the frame, and the bits of the rays in bins before i into ``prefix_masks[axis, i]``."""
+def write_ray_bins(
+    rays: RayArrays,
+    first: int,
+    last: int,
+    frame: Float64[np.ndarray, "15"],
+    prefix_masks: UInt64[np.ndarray, "2 65"],
+) -> None:
+    """Write the bins per slope into the frame, and which rays lie in the bins before each.
+
+    ``prefix_masks[axis, i]`` gets the bits of the rays in the bins before i.
+    """
     frame[13] = BINS / (frame[10] - frame[9])
     frame[14] = BINS / (frame[12] - frame[11])
     prefix_masks[:] = 0
@@ -47,8 +65,47 @@ def write_ray_bins(rays, first, last, frame, prefix_masks):
         prefix_masks[1, i + 1] |= prefix_masks[1, i]
 
 
+def _distances(
+    m: Sequence[Vector], u: Sequence[Vector], v: Sequence[Vector], f: Sequence[Vector]
+) -> tuple[Vector, Vector]:
+    """Return the least distance at which rays can meet ellipses, and that at which most do.
+
+    Args:
+        m: their middles, from the packet's origin.
+        u: one of their legs.
+        v: the other.
+        f: the packet's frame.
+    """
+    middle, u_axis, v_axis = dot(m, f[0:3]), dot(u, f[0:3]), dot(v, f[0:3])
+    far, size = sum_abs(m), sum_abs([*u, *v])
+    # The plane's depth along the axis is largest and least at the pyramid's edges, if it meets all four.
+    n = [u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]]
+    height, on_axis = dot(m, n), dot(n, f[0:3])
+    on_e, on_f = dot(n, f[3:6]), dot(n, f[6:9])
+    behind = height < 0.0
+    height, on_axis, on_e, on_f = (behind.select(0.0 - term, term) for term in (height, on_axis, on_e, on_f))
+    unsure = sum_abs(n) * ROUNDING_MARGIN
+    steepest = on_axis + (f[9] * on_e).maximum(f[10] * on_e) + (f[11] * on_f).maximum(f[12] * on_f)
+    steepest = steepest + unsure
+    reach = (u_axis * u_axis + v_axis * v_axis).sqrt()
+    near = middle - reach - (far + size) * ROUNDING_MARGIN
+    least = (steepest > 0.0).select(near.maximum((height - far * unsure) / steepest), near)
+    likely = (on_axis > 0.0).select(height / on_axis, middle)
+    likely = likely.maximum(near).minimum(middle + reach)
+    return least.maximum(0.0), likely.maximum(0.0)
+
+
 @intrinsic
-def ellipse_bins(typingctx, block, frame, ox, oy, oz, bins, distances):
+def ellipse_bins(
+    typingctx: TypingContext,
+    block: Address,
+    frame: Address,
+    ox: float,
+    oy: float,
+    oz: float,
+    bins: Address,
+    distances: Address,
+) -> Intrinsic:
     """Outlines and distances of the eight ellipses of a block of leaves, seen from o; all float32.
 
     Writes the first and last bin along a, then along b, as rows of eight int32 to ``bins``, and two rows to
@@ -59,7 +116,9 @@ def ellipse_bins(typingctx, block, frame, ox, oy, oz, bins, distances):
     single, address = types.float32, types.uintp
     signature = types.int64(address, address, single, single, single, address, address)
 
-    def codegen(context, builder, sig, args):
+    def codegen(
+        context: BaseContext, builder: ir.IRBuilder, sig: Signature, args: Sequence[ir.Value]
+    ) -> ir.Value:
         block, frame, ox, oy, oz, bins, distances = args
         rows = VectorRows(builder, block, FLOAT8)
         words = builder.inttoptr(frame, ir.FloatType().as_pointer())
@@ -95,37 +154,22 @@ def ellipse_bins(typingctx, block, frame, ox, oy, oz, bins, distances):
             first, last = in_front.select(first, 0.0), in_front.select(last, BINS - 1.0)
             out[2 * axis] = first.maximum(0.0).minimum(BINS - 1.0).to_int32()
             out[2 * axis + 1] = last.maximum(0.0).minimum(BINS - 1.0).to_int32()
-        # The plane's depth along the axis is largest and least at the pyramid's edges, if it meets all four.
-        n = [u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]]
-        height, on_axis = dot(m, n), dot(n, f[0:3])
-        on_e, on_f = dot(n, f[3:6]), dot(n, f[6:9])
-        behind = height < 0.0
-        height, on_axis, on_e, on_f = (
-            behind.select(0.0 - term, term) for term in (height, on_axis, on_e, on_f)
-        )
-        unsure = sum_abs(n) * ROUNDING_MARGIN
-        steepest = on_axis + (f[9] * on_e).maximum(f[10] * on_e) + (f[11] * on_f).maximum(f[12] * on_f)
-        steepest = steepest + unsure
-        reach = reach2.sqrt()
-        near = middle - reach - (far + size) * ROUNDING_MARGIN
-        least = (steepest > 0.0).select(near.maximum((height - far * unsure) / steepest), near)
-        likely = (on_axis > 0.0).select(height / on_axis, middle)
-        likely = likely.maximum(near).minimum(middle + reach)
         out = VectorRows(builder, distances, FLOAT8)
-        out[0] = least.maximum(0.0)
-        out[1] = likely.maximum(0.0)
+        out[0], out[1] = _distances(m, u, v, f)
         return (reach2 >= 0.0).to_bitmask()
 
     return signature, codegen
 
 
-def dot(a, b):
+def dot(a: Sequence[Vector], b: Sequence[Vector]) -> Vector:
     """Sum of products."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 @device_function(error_model="numpy")
-def rays_in_bins(bins, lane, prefix_masks):
+def rays_in_bins(
+    bins: Int32[np.ndarray, "4 8"], lane: int, prefix_masks: UInt64[np.ndarray, "2 65"]
+) -> tuple[int, int]:
     """Bits of the rays in the bins of one lane, and the cell of their middle."""
     i0, i1, j0, j1 = bins[0, lane], bins[1, lane], bins[2, lane], bins[3, lane]
     mask = prefix_masks[0, i1 + 1] & ~prefix_masks[0, i0] & prefix_masks[1, j1 + 1] & ~prefix_masks[1, j0]

@@ -3,7 +3,9 @@
 import math
 
 import numpy as np
+from jaxtyping import Float32, Float64
 
+from octasplat.engine.trace.cpu.kernels.kernel_args import RayArrays, TraceLimits
 from octasplat.engine.trace.kernels.native import njit_no_refcount
 
 HIT_PADDING = 8
@@ -11,14 +13,14 @@ HIT_PADDING = 8
 
 
 @njit_no_refcount(forceinline=True)
-def ray_origin(rays, r):
+def ray_origin(rays: RayArrays, r: int) -> tuple[float, float, float]:
     """Origin of ray ``r`` in float64."""
     o = r if len(rays.origins) > 1 else 0
     return np.float64(rays.origins[o, 0]), np.float64(rays.origins[o, 1]), np.float64(rays.origins[o, 2])
 
 
 @njit_no_refcount(forceinline=True)
-def ray_direction(rays, r):
+def ray_direction(rays: RayArrays, r: int) -> tuple[float, float, float]:
     """Direction of ray ``r`` in float64."""
     return (
         np.float64(rays.directions[r, 0]),
@@ -28,7 +30,7 @@ def ray_direction(rays, r):
 
 
 @njit_no_refcount(forceinline=True)
-def ray_slopes(rays, r, frame):
+def ray_slopes(rays: RayArrays, r: int, frame: Float64[np.ndarray, "15"]) -> tuple[float, float, float]:
     """Slopes a and b of ray ``r`` in a packet's ``frame``, and its length over its way along the axis.
 
     The frame begins with the axis, e and f; the direction is axis + a e + b f over the third number.
@@ -43,25 +45,25 @@ def ray_slopes(rays, r, frame):
 
 
 @njit_no_refcount(forceinline=True)
-def primitive_vector(primitive, offset):
+def primitive_vector(primitive: Float32[np.ndarray, "16"], offset: int) -> tuple[float, float, float]:
     """Three numbers of a record in float64."""
     return np.float64(primitive[offset]), np.float64(primitive[offset + 1]), np.float64(primitive[offset + 2])
 
 
 @njit_no_refcount(forceinline=True)
-def ray_limits(rays, r):
+def ray_limits(rays: RayArrays, r: int) -> tuple[float, float]:
     """Between which distances ray ``r`` sees; a single limit stands for all rays."""
     return rays.t_min[r if len(rays.t_min) > 1 else 0], rays.t_max[r if len(rays.t_max) > 1 else 0]
 
 
 @njit_no_refcount(forceinline=True)
-def ray_t_view_origin(rays, r):
+def ray_t_view_origin(rays: RayArrays, r: int) -> float:
     """Where on ray ``r`` its viewer stands; a single one stands for all rays."""
     return np.float64(rays.t_view_origin[r if len(rays.t_view_origin) > 1 else 0])
 
 
 @njit_no_refcount(forceinline=True)
-def ray_t_backface_cull(rays, r, limits):
+def ray_t_backface_cull(rays: RayArrays, r: int, limits: TraceLimits) -> np.float32:
     """Up to where ray ``r`` passes what it would meet from behind; a single distance stands for all rays."""
     if limits.flip_normal_cos == 0.0:  # normals have no side
         return np.float32(0.0)
@@ -69,7 +71,9 @@ def ray_t_backface_cull(rays, r, limits):
 
 
 @njit_no_refcount(forceinline=True)
-def facing_sign(to_mean, normal, limits):
+def facing_sign(
+    to_mean: tuple[float, float, float], normal: tuple[float, float, float], limits: TraceLimits
+) -> float:
     """1, or -1 where ``normal`` is turned to the viewer.
 
     See :class:`octasplat.engine.trace.protocol.TraceSettings`.
@@ -86,6 +90,6 @@ def facing_sign(to_mean, normal, limits):
 
 
 @njit_no_refcount(forceinline=True)
-def first_hit_index(r, limits):
+def first_hit_index(r: int, limits: TraceLimits) -> int:
     """Where the hits of ray ``r`` may be stored from: each ray before it has room for its own."""
     return r * (limits.max_hits + HIT_PADDING)

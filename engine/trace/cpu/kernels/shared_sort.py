@@ -3,8 +3,8 @@ r"""Packets whose rays see their Gaussians in one order, for training.
 A ray's own order of hits is exact, and most of what a hit costs: each ray tests, sorts and keeps its own.
 Rays of a small packet meet much the same Gaussians in much the same order. Here the candidates of a packet
 are sorted once, by the distance at which its axis meets them (the first steps of
-:mod:`octasplat.engine.trace.cpu.kernels.packet_candidates`), and all of its rays composite them in that order, sixteen
-rays at a time (:mod:`octasplat.engine.trace.cpu.kernels.simd16`), until none has light left:
+:mod:`octasplat.engine.trace.cpu.kernels.packet_candidates`), and all of its rays composite them in that
+order, sixteen rays at a time (:mod:`octasplat.engine.trace.cpu.kernels.simd16`), until none has light left:
 
     for each candidate, front to back        rays of the packet, sixteen to a vector
         alphas of the rays that may meet it   [. . a a a . . .]   octagon, distance and limits as ever
@@ -24,9 +24,17 @@ this is used.
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float32, Float64, Int32, UInt64
+from jaxtyping import Float32, Float64, Int32, Int64, UInt64
 
 from octasplat.engine.core.compilation import device_function, kernel
+from octasplat.engine.trace.cpu.kernels.kernel_args import (
+    BvhArrays,
+    Candidates,
+    ForwardPass,
+    OutputArrays,
+    RayArrays,
+    SharedSortHits,
+)
 from octasplat.engine.trace.cpu.kernels.packet_candidates import (
     COLOR_NORMAL_WORDS,
     INITIAL_CAPACITY,
@@ -79,7 +87,8 @@ CANDIDATE_MASK = np.uint64(0xFFFFFFFF)
 class PacketScratch(NamedTuple):
     """Memory of a thread for a packet: rows of the sixteen-ray kernels, and what it meets.
 
-    ``hit_ids``, ``hit_masks`` and ``packet_primitives`` have room for as many Gaussians as there are candidates.
+    ``hit_ids``, ``hit_masks`` and ``packet_primitives`` have room for as many Gaussians as there are
+    candidates.
     """
 
     ray_rows: Float32[np.ndarray, "5 64"]
@@ -94,13 +103,13 @@ class PacketScratch(NamedTuple):
 
 
 @device_function(error_model="numpy")
-def allocate_aligned_rows(rows, lanes):
+def allocate_aligned_rows(rows: int, lanes: int) -> Float32[np.ndarray, "rows lanes"]:
     """Rows of so many float32, a multiple of sixteen, on cache lines."""
     return allocate_aligned_float64(rows * lanes // 2).view(np.float32).reshape((rows, lanes))
 
 
 @device_function(error_model="numpy")
-def allocate_packet_scratch(capacity):
+def allocate_packet_scratch(capacity: int) -> PacketScratch:
     """Memory for packets of up to ``capacity`` candidates, one after another."""
     return PacketScratch(
         allocate_aligned_rows(RAY_ROWS, PACKET_RAYS),
@@ -118,7 +127,13 @@ def allocate_packet_scratch(capacity):
 
 
 @njit_no_refcount(fastmath={"contract"})
-def write_ray_rows(rays, first, last, frame, rows):
+def write_ray_rows(
+    rays: RayArrays,
+    first: int,
+    last: int,
+    frame: Float64[np.ndarray, "15"],
+    rows: Float32[np.ndarray, "5 64"],
+) -> None:
     """The rays ``first`` to ``last``, at most 64, in their packet's frame; lanes behind them see nothing."""
     for r in range(first, last):
         k = r - first
@@ -130,13 +145,23 @@ def write_ray_rows(rays, first, last, frame, rows):
 
 
 @njit_no_refcount(forceinline=True)
-def group_lanes(ray_mask, group):
+def group_lanes(ray_mask: int, group: int) -> np.int64:
     """Those of a group of rays."""
     return np.int64((ray_mask >> np.uint64(GROUP_SIZE * group)) & GROUP_MASK)
 
 
 @njit_no_refcount(fastmath={"contract"})
-def trace_packet_shared_sort(first, last, origin, frame, forward, order, candidates, count, scratch):
+def trace_packet_shared_sort(
+    first: int,
+    last: int,
+    origin: tuple[float, float, float],
+    frame: Float64[np.ndarray, "15"],
+    forward: ForwardPass,
+    order: Int32[np.ndarray, " n"],
+    candidates: Candidates,
+    count: int,
+    scratch: PacketScratch,
+) -> int:
     """Let the rays ``first`` to ``last`` see the sorted candidates; returns how many were met."""
     scene, limits, seen = forward.scene, forward.limits, scratch.state_rows
     keys, found, masks = candidates.keys, candidates.curve_indices, candidates.ray_masks
@@ -193,7 +218,9 @@ def trace_packet_shared_sort(first, last, origin, frame, forward, order, candida
 
 
 @njit_no_refcount()
-def write_packet_outputs(first, last, state_rows, out):
+def write_packet_outputs(
+    first: int, last: int, state_rows: Float32[np.ndarray, "10 64"], out: OutputArrays
+) -> None:
     """What the rays ``first`` to ``last`` have seen."""
     for r in range(first, last):
         k = r - first
@@ -205,7 +232,14 @@ def write_packet_outputs(first, last, state_rows, out):
 
 
 @njit_no_refcount()
-def store_packet_hits(packet, hit_count, frame, scratch, packet_hits, start):
+def store_packet_hits(
+    packet: int,
+    hit_count: int,
+    frame: Float64[np.ndarray, "15"],
+    scratch: PacketScratch,
+    packet_hits: SharedSortHits,
+    start: int,
+) -> None:
     """Keep what a packet has met from place ``start`` on."""
     packet_hits.starts[packet], packet_hits.counts[packet] = start, hit_count
     for k in range(9):
@@ -220,11 +254,18 @@ def store_packet_hits(packet, hit_count, frame, scratch, packet_hits, start):
 
 
 @kernel(error_model="numpy")
-def trace_packets_shared_sort(forward, packets, bvh, packet_hits, counter, hit_counter):
+def trace_packets_shared_sort(
+    forward: ForwardPass,
+    packets: Int64[np.ndarray, "p 2"],
+    bvh: BvhArrays,
+    packet_hits: SharedSortHits,
+    counter: Int64[np.ndarray, "1"],
+    hit_counter: Int64[np.ndarray, "1"],
+) -> None:
     """Trace packets until the ``counter`` has passed the last.
 
-    What they meet is kept where ``hit_counter``, a counter too, says; where that is beyond the room of ``packet_hits``
-    it is only counted.
+    What they meet is kept where ``hit_counter``, a counter too, says; where that is beyond the room of
+    ``packet_hits`` it is only counted.
     """
     pyramid, walk = allocate_frustum(), allocate_traversal()
     candidates, view = allocate_candidates(INITIAL_CAPACITY), allocate_packet_scratch(INITIAL_CAPACITY)

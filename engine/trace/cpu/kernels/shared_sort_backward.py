@@ -8,10 +8,16 @@ they have left in the end; float32 is enough, as what lies behind is summed from
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float32
+from jaxtyping import Float32, Int64
 
 from octasplat.engine.core.compilation import kernel
-from octasplat.engine.trace.cpu.kernels.packet_backward import PACKET, RED, ROW_WORDS, W
+from octasplat.engine.trace.cpu.kernels.kernel_args import (
+    OutputGradientArrays,
+    RayArrays,
+    SharedSortHits,
+    TraceLimits,
+)
+from octasplat.engine.trace.cpu.kernels.packet_backward import PACKET, RED, ROW_WORDS, MomentRows, W
 from octasplat.engine.trace.cpu.kernels.shared_sort import allocate_aligned_rows, group_lanes, write_ray_rows
 from octasplat.engine.trace.cpu.kernels.simd16 import (
     BACKWARD_ROWS,
@@ -41,7 +47,16 @@ class SharedSortBackwardScratch(NamedTuple):
 
 
 @njit_no_refcount(fastmath={"contract"})
-def backward_packet_shared_sort(packet, rays, packets, packet_hits, limits, output_gradients, rows, scratch):
+def backward_packet_shared_sort(
+    packet: int,
+    rays: RayArrays,
+    packets: Int64[np.ndarray, "p 2"],
+    packet_hits: SharedSortHits,
+    limits: TraceLimits,
+    output_gradients: OutputGradientArrays,
+    rows: MomentRows,
+    scratch: SharedSortBackwardScratch,
+) -> None:
     """Write the rows of one packet."""
     first, last = packets[packet, 0], packets[packet, 1]
     start, base, back = packet_hits.starts[packet], rows.firsts[packet], scratch.backward_rows
@@ -75,7 +90,15 @@ def backward_packet_shared_sort(packet, rays, packets, packet_hits, limits, outp
 
 
 @kernel(error_model="numpy")
-def backward_packets_shared_sort(rays, packets, packet_hits, limits, output_gradients, counter, rows):
+def backward_packets_shared_sort(
+    rays: RayArrays,
+    packets: Int64[np.ndarray, "p 2"],
+    packet_hits: SharedSortHits,
+    limits: TraceLimits,
+    output_gradients: OutputGradientArrays,
+    counter: Int64[np.ndarray, "1"],
+    rows: MomentRows,
+) -> None:
     """Replay packets until the ``counter`` has passed the last."""
     view = SharedSortBackwardScratch(
         allocate_aligned_rows(RAY_ROWS, PACKET_RAYS),

@@ -6,12 +6,18 @@ seen so far, and what goes back along them. A Gaussian is a line of sixteen numb
 change a result.
 """
 
+from collections.abc import Callable, Sequence
+
 import llvmlite.ir as ir
 from numba import types
+from numba.core.base import BaseContext
+from numba.core.typing import Context as TypingContext
+from numba.core.typing.templates import Signature
 from numba.extending import intrinsic
 
 from octasplat.engine.trace.cpu.kernels.simd8 import A_X, ALPHA_0, B_X, INNER_RADIUS_ROW, N_0, N_X
 from octasplat.engine.trace.cpu.kernels.simd_vector import I64, Vector, VectorRows, broadcast, exp_float32
+from octasplat.engine.trace.kernels.native import Address, Intrinsic
 
 GROUP_SIZE = 16
 GROUPS = 4
@@ -45,27 +51,27 @@ A row of :mod:`octasplat.engine.trace.cpu.kernels.packet_backward` begins so.
 """
 
 
-def _group_rows(builder, address, group):
+def _group_rows(builder: ir.IRBuilder, address: ir.Value, group: ir.Value) -> VectorRows:
     """Rows of 64 numbers, of which a group's sixteen."""
     offset = builder.mul(group, ir.Constant(I64, GROUP_SIZE * 4))
     return VectorRows(builder, builder.add(address, offset), FLOAT16, row_bytes=PACKET_RAYS * 4)
 
 
-def _word_loader(builder, address):
+def _word_loader(builder: ir.IRBuilder, address: ir.Value) -> Callable[[int], Vector]:
     """Reads one number of an array into all lanes."""
     words = builder.inttoptr(address, FLOAT.as_pointer())
     return lambda k: broadcast(builder, builder.load(builder.gep(words, [ir.Constant(I64, k)])), GROUP_SIZE)
 
 
-def _mask_lanes(builder, mask, vector):
+def _mask_lanes(builder: ir.IRBuilder, mask: ir.Value, vector: Vector) -> Vector:
     """The lanes of a mask; zero in the others."""
     return Vector(builder, builder.select(mask, vector.value, ZEROS))
 
 
-def _plane_uv(rays, primitive):
+def _plane_uv(rays: VectorRows, primitive: Callable[[int], Vector]) -> tuple[Vector, Vector, Vector, Vector]:
     """u, v, the cosine times the length over the way along the axis, and one over that."""
 
-    def along(row):
+    def along(row: int) -> Vector:
         return primitive(row + 2) * rays[SLOPE_B] + (primitive(row + 1) * rays[SLOPE_A] + primitive(row))
 
     slant = along(N_X)
@@ -73,7 +79,9 @@ def _plane_uv(rays, primitive):
     return along(A_X) * inverse, along(B_X) * inverse, slant, inverse
 
 
-def _eval_alpha(builder, u, v, primitive, alpha_max):
+def _eval_alpha(
+    builder: ir.IRBuilder, u: Vector, v: Vector, primitive: Callable[[int], Vector], alpha_max: ir.Value
+) -> Vector:
     power = (u * u + v * v) * -0.5
     return (primitive(ALPHA_0) * exp_float32(builder, power)).minimum(
         broadcast(builder, alpha_max, GROUP_SIZE)
@@ -82,8 +90,16 @@ def _eval_alpha(builder, u, v, primitive, alpha_max):
 
 @intrinsic
 def intersect_group16(
-    typingctx, primitive, rays, state_rows, hit_rows, group, min_transmittance, alpha_max, max_hits
-):
+    typingctx: TypingContext,
+    primitive: Address,
+    rays: Address,
+    state_rows: Address,
+    hit_rows: Address,
+    group: int,
+    min_transmittance: float,
+    alpha_max: float,
+    max_hits: float,
+) -> Intrinsic:
     """Test a group of rays against a Gaussian; bit k: its ray k meets the octagon and goes on till there.
 
     Writes their alphas (0 for the others) and distances to ``hit_rows``. A ray goes on while it has
@@ -92,7 +108,9 @@ def intersect_group16(
     address, single = types.uintp, types.float32
     signature = types.int64(*(address,) * 4, types.int64, single, single, single)
 
-    def codegen(context, builder, sig, args):
+    def codegen(
+        context: BaseContext, builder: ir.IRBuilder, sig: Signature, args: Sequence[ir.Value]
+    ) -> ir.Value:
         line, rays, seen, met, group, least_left, alpha_max, most_hits = args
         line = _word_loader(builder, line)
         rays, seen, met = (_group_rows(builder, at, group) for at in (rays, seen, met))
@@ -112,7 +130,16 @@ def intersect_group16(
 
 
 @intrinsic
-def composite_group16(typingctx, primitive, normal, state_rows, hit_rows, group, ray_mask, min_transmittance):
+def composite_group16(
+    typingctx: TypingContext,
+    primitive: Address,
+    normal: Address,
+    state_rows: Address,
+    hit_rows: Address,
+    group: int,
+    ray_mask: int,
+    min_transmittance: float,
+) -> Intrinsic:
     """Show a Gaussian to those rays of a group, the ``ray_mask``, that have ``hit_rows`` it.
 
     ``normal`` are three numbers, turned. Bit k of the result: ray k has ``min_transmittance`` behind it.
@@ -120,7 +147,9 @@ def composite_group16(typingctx, primitive, normal, state_rows, hit_rows, group,
     address, word = types.uintp, types.int64
     signature = word(*(address,) * 4, word, word, types.float32)
 
-    def codegen(context, builder, sig, args):
+    def codegen(
+        context: BaseContext, builder: ir.IRBuilder, sig: Signature, args: Sequence[ir.Value]
+    ) -> ir.Value:
         line, normal, seen, met, group, bits, least_left = args
         line, normal = _word_loader(builder, line), _word_loader(builder, normal)
         seen, met = _group_rows(builder, seen, group), _group_rows(builder, met, group)
@@ -142,7 +171,16 @@ def composite_group16(typingctx, primitive, normal, state_rows, hit_rows, group,
 
 
 @intrinsic
-def backward_group16(typingctx, primitive, rays, backward_rows, moments, group, ray_mask, alpha_max):
+def backward_group16(
+    typingctx: TypingContext,
+    primitive: Address,
+    rays: Address,
+    backward_rows: Address,
+    moments: Address,
+    group: int,
+    ray_mask: int,
+    alpha_max: float,
+) -> Intrinsic:
     """Go back before a Gaussian that those rays of a group, the ``ray_mask``, have met.
 
     With h = dL/d ln(alpha) adds to the ``moments``, rows of sixteen, lane by lane: h times 1, u, v, u^2, u v,
@@ -153,7 +191,9 @@ def backward_group16(typingctx, primitive, rays, backward_rows, moments, group, 
     address, word = types.uintp, types.int64
     signature = types.void(*(address,) * 4, word, word, types.float32)
 
-    def codegen(context, builder, sig, args):
+    def codegen(
+        context: BaseContext, builder: ir.IRBuilder, sig: Signature, args: Sequence[ir.Value]
+    ) -> ir.Value:
         line, rays, back, moments, group, bits, alpha_max = args
         line = _word_loader(builder, line)
         rays, back = _group_rows(builder, rays, group), _group_rows(builder, back, group)
@@ -183,21 +223,30 @@ def backward_group16(typingctx, primitive, rays, backward_rows, moments, group, 
 
 
 @intrinsic
-def reduce_moments(typingctx, moments, row):
+def reduce_moments(typingctx: TypingContext, moments: Address, row: Address) -> Intrinsic:
     """Write the sums over the lanes of all :data:`MOMENTS`, and two zeros, to sixteen numbers.
 
     Two rows become one by adding halves, the lanes of either row beside each other, until a lane is a row.
     """
     signature = types.void(types.uintp, types.uintp)
 
-    def codegen(context, builder, sig, args):
+    def codegen(
+        context: BaseContext, builder: ir.IRBuilder, sig: Signature, args: Sequence[ir.Value]
+    ) -> ir.Value:
         moments = VectorRows(builder, args[0], FLOAT16)
         rows = [moments[k].value if k < MOMENTS else ZEROS for k in range(GROUP_SIZE)]
         size = GROUP_SIZE  # lanes of each of the rows that share a vector
         while len(rows) > 1:
             count, half = len(rows) // 2, size // 2
 
-            def halves(first, begin, size=size, half=half, count=count, rows=rows):
+            def halves(
+                first: int,
+                begin: int,
+                size: int = size,
+                half: int = half,
+                count: int = count,
+                rows: list[ir.Value] = rows,
+            ) -> ir.Value:
                 places = [
                     (group % 2) * GROUP_SIZE + group // 2 * size + begin + lane
                     for group in range(GROUP_SIZE // half)

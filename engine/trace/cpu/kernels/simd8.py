@@ -6,9 +6,16 @@ write up to eight values where fewer count, so that arrays have room for eight m
 compiler to change a result.
 """
 
+from collections.abc import Sequence
+from typing import NamedTuple
+
 import llvmlite.ir as ir
+import numpy as np
 from numba import types
 from numba.core import cgutils
+from numba.core.base import BaseContext
+from numba.core.typing import Context as TypingContext
+from numba.core.typing.templates import Signature
 from numba.extending import intrinsic
 
 from octasplat.engine.trace.cpu.kernels.simd_ops import (
@@ -40,6 +47,7 @@ from octasplat.engine.trace.cpu.kernels.simd_vector import (
     broadcast,
     exp_float32,
 )
+from octasplat.engine.trace.kernels.native import Address, Intrinsic
 
 N_X, A_X, B_X, N_0, INNER_RADIUS_ROW, ALPHA_0 = 0, 3, 6, 9, 10, 11
 ROWS = 12
@@ -49,41 +57,73 @@ N, A and B are along their packet's axis, e and f, where a ray is d = c (1, a, b
 """
 
 
+class PacketRay(NamedTuple):
+    """A ray in its packet's frame, float32: the axis plus ``a`` e plus ``b`` f, over ``per_axis``."""
+
+    a: np.float32
+    b: np.float32
+    per_axis: np.float32
+    t_min: np.float32
+    t_max: np.float32
+
+
+class HitBuffer(NamedTuple):
+    """Where the hits of a ray are kept: addresses of uint64 keys, float32 numbers and int32 candidates."""
+
+    keys: Address
+    exponents: Address
+    opacities: Address
+    us: Address
+    vs: Address
+    candidate_indices: Address
+
+
+class HitTables(NamedTuple):
+    """Addresses of the float32 u and v of a packet's hits, which keys point into."""
+
+    us: Address
+    vs: Address
+
+
+class HitStore(NamedTuple):
+    """Addresses of the arrays in which hits are kept for the backward pass, 32 bits a number."""
+
+    alphas: Address
+    distances: Address
+    us: Address
+    vs: Address
+    slots: Address
+
+
 @intrinsic
 def intersect_block8(
-    typingctx,
-    block,
-    a,
-    b,
-    per_axis,
-    t_min,
-    t_max,
-    first_candidate,
-    hit_count,
-    keys,
-    exponents,
-    opacities,
-    us,
-    vs,
-    candidate_indices,
-):
+    typingctx: TypingContext,
+    block: Address,
+    ray: PacketRay,
+    first_candidate: int,
+    hit_count: int,
+    hits: HitBuffer,
+) -> Intrinsic:
     """Test the eight candidates of a block, from ``first_candidate`` on; how many octagons the ray meets.
 
-    The ray has the slopes ``a`` and ``b`` in its packet's frame and is ``per_axis`` times as long as its way
-    along the axis. Of each octagon that it meets between the two distances writes from place ``hit_count`` on,
-    without gaps: a key, the float32 distance in the upper half and the place in the lower (uint64); and as
-    32-bit words the exponent -(u^2 + v^2)/2, the opacity, u, v and the number of the candidate. A ray that
-    makes a cosine below 1e-6 with the normal runs inside the plane and meets nothing.
+    The ray has the slopes ``a`` and ``b`` in its packet's frame and is ``per_axis`` times as long as its
+    way along the axis. Of each octagon that it meets between the two distances writes from place
+    ``hit_count`` on, without gaps: a key, the float32 distance in the upper half and the place in the lower
+    (uint64); and as 32-bit words the exponent -(u^2 + v^2)/2, the opacity, u, v and the number of the
+    candidate. A ray that makes a cosine below 1e-6 with the normal runs inside the plane and meets nothing.
     """
-    single, address = types.float32, types.uintp
-    signature = types.int64(address, *(single,) * 5, types.int64, types.int64, *(address,) * 6)
+    signature = types.int64(types.uintp, ray, types.int64, types.int64, hits)
 
-    def codegen(context, builder, sig, args):
-        block, a, b, per_axis, t_min, t_max, first, tail, keys, powers, opacities, us, vs, numbers = args
+    def codegen(
+        context: BaseContext, builder: ir.IRBuilder, sig: Signature, args: Sequence[ir.Value]
+    ) -> ir.Value:
+        block, ray, first, tail, hits = args
+        a, b, per_axis, t_min, t_max = cgutils.unpack_tuple(builder, ray)
+        keys, powers, opacities, us, vs, numbers = cgutils.unpack_tuple(builder, hits)
         rows = VectorRows(builder, block, FLOAT8)
         a, b, per_axis, t_min, t_max = (broadcast(builder, value) for value in (a, b, per_axis, t_min, t_max))
 
-        def along(row):
+        def along(row: int) -> Vector:
             return rows[row + 2] * b + (rows[row + 1] * a + rows[row])
 
         slant = along(N_X)  # the cosine times per_axis, as (1, a, b) is longer than the ray
@@ -114,14 +154,18 @@ def intersect_block8(
 
 
 @intrinsic
-def eval_alphas8(typingctx, exponents, opacities, first, alpha_max):
+def eval_alphas8(
+    typingctx: TypingContext, exponents: Address, opacities: Address, first: int, alpha_max: float
+) -> Intrinsic:
     """Eight exponents from ``first`` on become alphas: opacity exp(power), at most the max; all float32.
 
     The exponential is right to a relative 1e-7 for |power| < 87.
     """
     signature = types.void(types.uintp, types.uintp, types.int64, types.float32)
 
-    def codegen(context, builder, sig, args):
+    def codegen(
+        context: BaseContext, builder: ir.IRBuilder, sig: Signature, args: Sequence[ir.Value]
+    ) -> ir.Value:
         powers, opacities, place, alpha_max = args
         at = element_address(builder, powers, place, 4)
         opacity = VectorRows(builder, element_address(builder, opacities, place, 4), FLOAT8)[0]
@@ -133,7 +177,7 @@ def eval_alphas8(typingctx, exponents, opacities, first, alpha_max):
 
 
 @intrinsic
-def rank_sort(typingctx, keys, count, sorted_keys):
+def rank_sort(typingctx: TypingContext, keys: Address, count: int, sorted_keys: Address) -> Intrinsic:
     """Sort ``count`` different keys (uint64) in place: each goes behind as many as are smaller than it.
 
     That takes as many steps as pairs, but no branch that the processor could guess wrongly. Both arrays have
@@ -141,7 +185,9 @@ def rank_sort(typingctx, keys, count, sorted_keys):
     """
     signature = types.boolean(types.uintp, types.int64, types.uintp)
 
-    def codegen(context, builder, sig, args):
+    def codegen(
+        context: BaseContext, builder: ir.IRBuilder, sig: Signature, args: Sequence[ir.Value]
+    ) -> ir.Value:
         keys, count, sorted_keys = args
         zeros = ir.Constant(LONG8, [0] * LANES)
         last = builder.sub(count, ir.Constant(I64, 1))
@@ -190,29 +236,32 @@ def rank_sort(typingctx, keys, count, sorted_keys):
 
 @intrinsic
 def composite8(
-    typingctx,
-    keys,
-    max_count,
-    safe_key,
-    alpha_table,
-    transmittance,
-    min_transmittance,
-    alphas,
-    weights,
-    transmittance_after,
-):
-    """Weights of the next of a ray's sorted hits, eight at the most, before which the transmittance is ``transmittance``.
+    typingctx: TypingContext,
+    keys: Address,
+    max_count: int,
+    safe_key: Address,
+    alpha_table: Address,
+    transmittance: float,
+    min_transmittance: float,
+    alphas: Address,
+    weights: Address,
+    transmittance_after: Address,
+) -> Intrinsic:
+    """Composite the next of a ray's sorted hits, eight at the most.
 
-    Counts those of the first ``max_count`` of the ``keys`` that are below ``safe_key``. Writes their alphas, read from
-    ``alpha_table`` at the places in the keys, to ``alphas`` (both float32), alpha T to ``weights``, and the
-    transmittance behind each to ``transmittance_after``; what lies beyond them changes nothing. The result has the bits of
-    those behind which it is below ``min_transmittance``; eight bits higher of those behind which it is one half or
-    less; and their number from bit 16 on.
+    ``transmittance`` is what is left before them. Counts those of the first ``max_count`` of the ``keys``
+    that are below ``safe_key``. Writes their alphas, read from ``alpha_table`` at the places in the keys,
+    to ``alphas`` (both float32), alpha T to ``weights``, and the transmittance behind each to
+    ``transmittance_after``; what lies beyond them changes nothing. The result has the bits of those behind
+    which it is below ``min_transmittance``; eight bits higher of those behind which it is one half or less;
+    and their number from bit 16 on.
     """
     address, double, word = types.uintp, types.float64, types.int64
     signature = word(address, word, types.uint64, address, double, double, address, address, address)
 
-    def codegen(context, builder, sig, args):
+    def codegen(
+        context: BaseContext, builder: ir.IRBuilder, sig: Signature, args: Sequence[ir.Value]
+    ) -> ir.Value:
         keys, most, safe, known_alphas, t, stop_below, alphas, weights, after = args
         key = load(builder, keys, LONG8)
         valid = builder.icmp_unsigned("<", key, splat(builder, safe, I64))
@@ -238,17 +287,28 @@ def composite8(
 
 @intrinsic
 def lookup_slots8(
-    typingctx, keys, count, candidate_table, slot_table, weights, candidate_indices, slots, depth_sums
-):
+    typingctx: TypingContext,
+    keys: Address,
+    count: int,
+    candidate_table: Address,
+    slot_table: Address,
+    weights: Address,
+    candidate_indices: Address,
+    slots: Address,
+    depth_sums: Address,
+) -> Intrinsic:
     """Which candidates the first ``count`` of eight hits are, and under which slots their packet knows them.
 
-    Writes ``candidate_indices``, read from ``candidate_table`` at the places in the keys, and ``slots``, both int64;
-    adds weights times distances to the eight ``depth_sums``. Bit k of the result: hit k has no slot yet.
+    Writes ``candidate_indices``, read from ``candidate_table`` at the places in the keys, and ``slots``,
+    both int64; adds weights times distances to the eight ``depth_sums``. Bit k of the result: hit k has no
+    slot yet.
     """
     address, word = types.uintp, types.int64
     signature = word(address, word, *(address,) * 6)
 
-    def codegen(context, builder, sig, args):
+    def codegen(
+        context: BaseContext, builder: ir.IRBuilder, sig: Signature, args: Sequence[ir.Value]
+    ) -> ir.Value:
         keys, count, known_numbers, slot_of, weights, numbers, slots, depths = args
         key = load(builder, keys, LONG8)
         valid = first_lanes_mask(builder, count)
@@ -268,18 +328,27 @@ def lookup_slots8(
 
 @intrinsic
 def store_hits8(
-    typingctx, keys, count, alphas, slots, u_table, v_table, first_hit,
-    out_alphas, out_distances, out_us, out_vs, out_slots,
-):  # fmt: skip
+    typingctx: TypingContext,
+    keys: Address,
+    count: int,
+    alphas: Address,
+    slots: Address,
+    tables: HitTables,
+    first_hit: int,
+    out: HitStore,
+) -> Intrinsic:
     """Store ``count`` of eight hits from ``first_hit`` on, 32 bits a number; what follows them is undefined.
 
     u and v are read from where the keys say.
     """
     address, word = types.uintp, types.int64
-    signature = types.void(address, word, *(address,) * 4, word, *(address,) * 5)
+    signature = types.void(address, word, address, address, tables, word, out)
 
-    def codegen(context, builder, sig, args):
-        keys, count, alphas, slots, known_us, known_vs, place, *kept = args
+    def codegen(
+        context: BaseContext, builder: ir.IRBuilder, sig: Signature, args: Sequence[ir.Value]
+    ) -> ir.Value:
+        keys, count, alphas, slots, tables, place, out = args
+        known_us, known_vs = cgutils.unpack_tuple(builder, tables)
         key = load(builder, keys, LONG8)
         where = key_indices(builder, key, first_lanes_mask(builder, count))
         values = (
@@ -289,7 +358,7 @@ def store_hits8(
             gather(builder, known_vs, where, FLOAT8),
             builder.trunc(load(builder, slots, LONG8), INT8),
         )
-        for value, array in zip(values, kept, strict=True):
+        for value, array in zip(values, cgutils.unpack_tuple(builder, out), strict=True):
             store(builder, value, element_address(builder, array, place, 4))
         return context.get_dummy_value()
 
@@ -297,14 +366,23 @@ def store_hits8(
 
 
 @intrinsic
-def accumulate_color_normals(typingctx, sums, color_normals, slots, weights, count):
+def accumulate_color_normals(
+    typingctx: TypingContext,
+    sums: Address,
+    color_normals: Address,
+    slots: Address,
+    weights: Address,
+    count: int,
+) -> Intrinsic:
     """Add to the eight ``sums`` what ``count`` Gaussians show, times their weights, one after the other.
 
     Row s of ``color_normals``, eight doubles, is what the one in slot s shows; ``slots`` are int64.
     """
     signature = types.void(types.uintp, types.uintp, types.uintp, types.uintp, types.int64)
 
-    def codegen(context, builder, sig, args):
+    def codegen(
+        context: BaseContext, builder: ir.IRBuilder, sig: Signature, args: Sequence[ir.Value]
+    ) -> ir.Value:
         sums, shown, slots, weights, count = args
         slots = builder.inttoptr(slots, I64.as_pointer())
         weights = builder.inttoptr(weights, DOUBLE.as_pointer())

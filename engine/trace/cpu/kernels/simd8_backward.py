@@ -3,9 +3,15 @@
 See :mod:`octasplat.engine.trace.cpu.kernels.simd8`.
 """
 
+from collections.abc import Sequence
+from typing import NamedTuple
+
 import llvmlite.ir as ir
 from numba import types
 from numba.core import cgutils
+from numba.core.base import BaseContext
+from numba.core.typing import Context as TypingContext
+from numba.core.typing.templates import Signature
 from numba.extending import intrinsic
 
 from octasplat.engine.trace.cpu.kernels.simd_ops import (
@@ -33,18 +39,23 @@ from octasplat.engine.trace.cpu.kernels.simd_vector import (
     VectorRows,
     broadcast,
 )
+from octasplat.engine.trace.kernels.native import Address, Intrinsic
 
 
 @intrinsic
-def transmittance_before8(typingctx, alphas, count, transmittance, transmittance_before):
-    """Write what is left before each of ``count`` of eight hits with float32 ``alphas``, ``transmittance`` at first.
+def transmittance_before8(
+    typingctx: TypingContext, alphas: Address, count: int, transmittance: float, transmittance_before: Address
+) -> Intrinsic:
+    """Write the transmittance before each of ``count`` of eight hits with float32 ``alphas``.
 
-    Returns what is left behind the last of them.
+    ``transmittance`` is that before the first. Returns that behind the last.
     """
     address, double = types.uintp, types.float64
     signature = double(address, types.int64, double, address)
 
-    def codegen(context, builder, sig, args):
+    def codegen(
+        context: BaseContext, builder: ir.IRBuilder, sig: Signature, args: Sequence[ir.Value]
+    ) -> ir.Value:
         alphas, count, t, through = args
         alpha = keep_first_lanes(builder, VectorRows(builder, alphas, FLOAT8)[0].to_float64(), count)
         product = prefix_scan(builder, 1.0 - alpha, lambda a, b: a * b, 1.0)
@@ -54,30 +65,62 @@ def transmittance_before8(typingctx, alphas, count, transmittance, transmittance
     return signature, codegen
 
 
+class Hits8(NamedTuple):
+    """Addresses of eight hits: float32 alphas, u and v, float64 transmittance before each, int32 slots."""
+
+    alphas: Address
+    transmittance_before: Address
+    slots: Address
+    us: Address
+    vs: Address
+
+
+class HitGradients8(NamedTuple):
+    """Addresses that gradients of hits go to: the rows of the slots, and eight float32 each of two kinds."""
+
+    rows: Address
+    weights: Address
+    log_alpha_gradients: Address
+
+
 @intrinsic
 def backward_hits8(
-    typingctx, alphas, transmittance_before, weight_gradients, slots, us, vs, slot_rgb, count, gradient_behind, alpha_max, ray_gradients, rows,
-    weights, log_alpha_gradients,
-):  # fmt: skip
-    """Backwards through ``count`` of eight hits: what they add to the rows of their Gaussians.
+    typingctx: TypingContext,
+    hits: Hits8,
+    weight_gradients: Address,
+    slot_rgb: Address,
+    count: int,
+    gradient_behind: float,
+    alpha_max: float,
+    ray_gradients: Address,
+    out: HitGradients8,
+) -> Intrinsic:
+    """Go backwards through ``count`` of eight hits and add to the rows of their Gaussians.
 
-    Args are the float32 alphas, the transmittance before each, dL by a weight of one of each but for what its
-    colour does to that, int32 slots, u and v, the float32 colours of the slots, dL by what lies behind the
-    last, the alpha (float32) that was clamped and has no gradient, and eight float32 of the ray: 1, 0, its
-    error, dL by its colour, 0, 0. Row s at ``rows`` is that of slot s, sixteen float32.
+    Args:
+        typingctx: numba's.
+        hits: the hits.
+        weight_gradients: dL by a weight of one of each hit, float64, but for what its colour does to that.
+        slot_rgb: float32 colours of the slots.
+        count: how many of the eight there are.
+        gradient_behind: dL by what lies behind the last.
+        alpha_max: the alpha (float32) that was clamped and has no gradient.
+        ray_gradients: eight float32 of the ray: 1, 0, its error, dL by its colour, 0, 0.
+        out: row s at ``rows`` is that of slot s, sixteen float32.
 
     Of each hit, with h = dL/d ln(alpha), adds to the first eight the moments h (1, u, v, u^2, u v, v^2,
     u (u^2 + v^2), v (u^2 + v^2)), and to the others its weight times the eight of the ray, but for the second
     of them, which counts. Writes weights and h, float32; returns dL by what lies behind the hit before.
     """
     address, double = types.uintp, types.float64
-    signature = double(
-        *(address,) * 7, types.int64, double, types.float32, address, address, address, address
-    )
+    signature = double(hits, address, address, types.int64, double, types.float32, address, out)
 
-    def codegen(context, builder, sig, args):
-        alphas, through, values, slots, us, vs, slot_rgb, count, behind, alpha_max, by_ray, rows = args[:12]
-        weights, shares = args[12:]
+    def codegen(
+        context: BaseContext, builder: ir.IRBuilder, sig: Signature, args: Sequence[ir.Value]
+    ) -> ir.Value:
+        hits, values, slot_rgb, count, behind, alpha_max, by_ray, out = args
+        alphas, through, slots, us, vs = cgutils.unpack_tuple(builder, hits)
+        rows, weights, shares = cgutils.unpack_tuple(builder, out)
         valid = first_lanes_mask(builder, count)
         slot = builder.sext(load(builder, slots, INT8), LONG8)
         slot = builder.select(valid, slot, ir.Constant(LONG8, [0] * LANES))
@@ -111,11 +154,13 @@ def backward_hits8(
 
 
 @intrinsic
-def accumulate_row(typingctx, sums, row):
+def accumulate_row(typingctx: TypingContext, sums: Address, row: Address) -> Intrinsic:
     """Add a row of sixteen float32 to sixteen doubles."""
     signature = types.void(types.uintp, types.uintp)
 
-    def codegen(context, builder, sig, args):
+    def codegen(
+        context: BaseContext, builder: ir.IRBuilder, sig: Signature, args: Sequence[ir.Value]
+    ) -> ir.Value:
         total, added = VectorRows(builder, args[0], DOUBLE8), VectorRows(builder, args[1], FLOAT8)
         for half in range(2):
             total[half] = total[half] + added[half].to_float64()
@@ -124,13 +169,23 @@ def accumulate_row(typingctx, sums, row):
     return signature, codegen
 
 
-def _accumulate_moments(builder, h, u, v, weights, ray_gradients, slots, rows, count):
+def _accumulate_moments(
+    builder: ir.IRBuilder,
+    h: ir.Value,
+    u: ir.Value,
+    v: ir.Value,
+    weights: ir.Value,
+    ray_gradients: ir.Value,
+    slots: ir.Value,
+    rows: ir.Value,
+    count: ir.Value,
+) -> None:
     """The rows' part of :func:`backward_hits8`."""
 
-    def times(a, b):
+    def times(a: ir.Value, b: ir.Value) -> ir.Value:
         return builder.fmul(a, b, flags=("contract",))
 
-    def plus(a, b):
+    def plus(a: ir.Value, b: ir.Value) -> ir.Value:
         return builder.fadd(a, b, flags=("contract",))
 
     hu, hv, square = times(h, u), times(h, v), plus(times(u, u), times(v, v))
@@ -154,10 +209,10 @@ def _accumulate_moments(builder, h, u, v, weights, ray_gradients, slots, rows, c
         store(builder, added, at)
 
 
-def _transpose8(builder, rows):
+def _transpose8(builder: ir.IRBuilder, rows: Sequence[ir.Value]) -> list[ir.Value]:
     """Eight vectors of eight float32, rows and columns exchanged."""
 
-    def mixed(a, b, order):
+    def mixed(a: ir.Value, b: ir.Value, order: list[int]) -> ir.Value:
         return builder.shuffle_vector(a, b, ir.Constant(INT8, order))
 
     pairs = [

@@ -1,7 +1,10 @@
 """What vectors of eight are made with: constants, lanes that move, and arrays at an address."""
 
+from collections.abc import Callable
+
 import llvmlite.ir as ir
 from numba.core import cgutils
+from numba.core.base import BaseContext
 
 from octasplat.engine.trace.cpu.kernels.simd_vector import DOUBLE8, FLOAT8, I64, LANES, Vector
 
@@ -11,14 +14,20 @@ INT8, MASK8 = ir.VectorType(I32, LANES), ir.VectorType(I1, LANES)
 LONG8 = ir.VectorType(I64, LANES)
 
 
-def prefix_scan(builder, vector, combine, neutral, reverse=False):
+def prefix_scan(
+    builder: ir.IRBuilder,
+    vector: Vector,
+    combine: Callable[[Vector, Vector], Vector],
+    neutral: float,
+    reverse: bool = False,
+) -> Vector:
     """Each lane with all before it, or behind it, combined in three steps."""
     for step in (1, 2, 4):
         vector = combine(vector, shift_lanes(builder, vector, -step if reverse else step, neutral))
     return vector
 
 
-def shift_lanes(builder, vector, offset_lanes, fill_value):
+def shift_lanes(builder: ir.IRBuilder, vector: Vector, offset_lanes: int, fill_value: float) -> Vector:
     """Lane k moves to lane k + ``offset_lanes``; ``fill_value`` comes in."""
     fill = ir.Constant(vector.value.type, [float(fill_value)] * LANES)
     places = [k - offset_lanes if 0 <= k - offset_lanes < LANES else LANES for k in range(LANES)]
@@ -26,38 +35,38 @@ def shift_lanes(builder, vector, offset_lanes, fill_value):
     return Vector(builder, builder.shuffle_vector(vector.value, fill, order))
 
 
-def splat(builder, scalar, kind):
+def splat(builder: ir.IRBuilder, scalar: ir.Value, kind: ir.Type) -> ir.Value:
     """A vector of eight times ``scalar``."""
     vector = ir.VectorType(kind, LANES)
     one = builder.insert_element(ir.Constant(vector, ir.Undefined), scalar, ir.Constant(I32, 0))
     return builder.shuffle_vector(one, ir.Constant(vector, ir.Undefined), ir.Constant(INT8, [0] * LANES))
 
 
-def keep_first_lanes(builder, vector, count):
+def keep_first_lanes(builder: ir.IRBuilder, vector: Vector, count: ir.Value) -> Vector:
     """The first ``count`` lanes; zero in the others."""
     valid = first_lanes_mask(builder, count)
     return Vector(builder, builder.select(valid, vector.value, ir.Constant(vector.value.type, [0.0] * LANES)))
 
 
-def first_lanes_mask(builder, count):
+def first_lanes_mask(builder: ir.IRBuilder, count: ir.Value) -> ir.Value:
     """Truth for the first ``count`` lanes."""
     lanes = ir.Constant(LONG8, list(range(LANES)))
     return builder.icmp_signed("<", lanes, splat(builder, count, I64))
 
 
-def key_indices(builder, key, valid):
+def key_indices(builder: ir.IRBuilder, key: ir.Value, valid: ir.Value) -> ir.Value:
     """The lower halves of the keys, 0 where they are not valid."""
     lower = builder.and_(key, ir.Constant(LONG8, [0xFFFFFFFF] * LANES))
     return builder.select(valid, lower, ir.Constant(LONG8, [0] * LANES))
 
 
-def key_distances(builder, key):
+def key_distances(builder: ir.IRBuilder, key: ir.Value) -> ir.Value:
     """The upper halves of the keys, float32."""
     upper = builder.lshr(key, ir.Constant(LONG8, [32] * LANES))
     return builder.bitcast(builder.trunc(upper, INT8), FLOAT8)
 
 
-def gather(builder, address, indices, kind):
+def gather(builder: ir.IRBuilder, address: ir.Value, indices: ir.Value, kind: ir.Type) -> ir.Value:
     """Eight elements of ``kind`` at places of an array."""
     element = kind.element
     size, name = {FLOAT: (4, "f32"), DOUBLE: (8, "f64"), I32: (4, "i32")}[element]
@@ -72,12 +81,12 @@ def gather(builder, address, indices, kind):
     return builder.call(function, [where, ir.Constant(I32, 4), mask, ir.Constant(kind, ir.Undefined)])
 
 
-def load(builder, address, kind):
+def load(builder: ir.IRBuilder, address: ir.Value, kind: ir.Type) -> ir.Value:
     """A vector of that kind from an address."""
     return builder.load(builder.inttoptr(address, kind.as_pointer()), align=4)
 
 
-def has_avx2_permute(context):
+def has_avx2_permute(context: BaseContext) -> bool:
     """Whether lanes without gaps are to be made by AVX2's moves, see :class:`CompressedStore`."""
     features = context.codegen().magic_tuple()[2].split(",")
     return "+avx2" in features and "+avx512f" not in features
@@ -91,7 +100,7 @@ class CompressedStore:
     masks.
     """
 
-    def __init__(self, context, builder, mask):
+    def __init__(self, context: BaseContext, builder: ir.IRBuilder, mask: ir.Value) -> None:
         self.builder, self.mask = builder, mask
         self.bits = builder.zext(builder.bitcast(mask, ir.IntType(LANES)), I64)
         self.use_permute = has_avx2_permute(context)
@@ -100,17 +109,17 @@ class CompressedStore:
             self.low_bits = builder.and_(self.bits, ir.Constant(I64, 15))
             self.high_bits = builder.lshr(self.bits, ir.Constant(I64, 4))
 
-    def count(self):
+    def count(self) -> ir.Value:
         """How many lanes there are in the mask."""
         return self.builder.ctpop(self.bits)
 
-    def compress(self, value):
+    def compress(self, value: ir.Value) -> ir.Value:
         """Eight lanes of 32 bits."""
         if not self.use_permute:
             return self._compress_avx512(value)
         return self._permute(value, self.permutation)
 
-    def compress_store(self, value, address):
+    def compress_store(self, value: ir.Value, address: ir.Value) -> None:
         """Store eight lanes of 32 or 64 bits."""
         builder = self.builder
         if not self.use_permute or value.type.element is not DOUBLE:
@@ -126,7 +135,7 @@ class CompressedStore:
             store(builder, builder.bitcast(moved, four), address)
             address = element_address(builder, address, builder.ctpop(bits), 8)
 
-    def _compress_avx512(self, value):
+    def _compress_avx512(self, value: ir.Value) -> ir.Value:
         element = {FLOAT: "f32", DOUBLE: "f64", I32: "i32"}[value.type.element]
         kind = ir.FunctionType(value.type, [value.type, MASK8, value.type])
         function = cgutils.get_or_insert_function(
@@ -134,14 +143,14 @@ class CompressedStore:
         )
         return self.builder.call(function, [value, self.mask, ir.Constant(value.type, ir.Undefined)])
 
-    def _permute(self, value, permutation):
+    def _permute(self, value: ir.Value, permutation: ir.Value) -> ir.Value:
         builder = self.builder
         kind = ir.FunctionType(INT8, [INT8, INT8])
         function = cgutils.get_or_insert_function(builder.module, kind, "llvm.x86.avx2.permd")
         moved = builder.call(function, [builder.bitcast(value, INT8), permutation])
         return builder.bitcast(moved, value.type)
 
-    def _load_permutation(self, lanes, bits):
+    def _load_permutation(self, lanes: int, bits: ir.Value) -> ir.Value:
         """Where each lane comes from, from a table over the masks of so many lanes."""
         builder, words = self.builder, LANES // lanes
         rows = []
@@ -154,11 +163,11 @@ class CompressedStore:
         return builder.load(builder.gep(at, [ir.Constant(I64, 0), bits]), align=4)
 
 
-def element_address(builder, address, index, size):
+def element_address(builder: ir.IRBuilder, address: ir.Value, index: ir.Value, size: int) -> ir.Value:
     """The address of an element of an array."""
     return builder.add(address, builder.mul(index, ir.Constant(I64, size)))
 
 
-def store(builder, value, address):
+def store(builder: ir.IRBuilder, value: ir.Value, address: ir.Value) -> None:
     """Store a vector at an address."""
     builder.store(value, builder.inttoptr(address, value.type.as_pointer()), align=4)

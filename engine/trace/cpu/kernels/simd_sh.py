@@ -1,10 +1,16 @@
 """All sixteen harmonics of three channels at a time, four harmonics to a vector of twelve float32."""
 
+from collections.abc import Sequence
+
 import llvmlite.ir as ir
 from numba import types
+from numba.core.base import BaseContext
+from numba.core.typing import Context as TypingContext
+from numba.core.typing.templates import Signature
 from numba.extending import intrinsic
 
 from octasplat.engine.trace.cpu.kernels.simd_vector import DOUBLE8, FLOAT8, I64, Vector, VectorRows
+from octasplat.engine.trace.kernels.native import Address, Intrinsic
 
 HARMONICS, CHANNELS = 16, 3
 SH_VECTORS = 4
@@ -13,15 +19,15 @@ FLOAT, DOUBLE, I32 = ir.FloatType(), ir.DoubleType(), ir.IntType(32)
 FLOAT12, FLOAT4, DOUBLE4 = (ir.VectorType(kind, n) for kind, n in ((FLOAT, 12), (FLOAT, 4), (DOUBLE, 4)))
 
 
-def _shuffle_mask(lanes):
+def _shuffle_mask(lanes: list[int]) -> ir.Value:
     return ir.Constant(ir.VectorType(I32, len(lanes)), lanes)
 
 
-def _shuffle(builder, vector, lanes):
+def _shuffle(builder: ir.IRBuilder, vector: ir.Value, lanes: list[int]) -> ir.Value:
     return builder.shuffle_vector(vector, ir.Constant(vector.type, ir.Undefined), _shuffle_mask(lanes))
 
 
-def _load_basis(builder, basis):
+def _load_basis(builder: ir.IRBuilder, basis: ir.Value) -> list[Vector]:
     """Sixteen doubles, as four vectors in which each stands three times."""
     rows = VectorRows(builder, basis, DOUBLE8)
     low, high = (builder.fptrunc(rows[k].value, FLOAT8) for k in range(2))
@@ -32,7 +38,7 @@ def _load_basis(builder, basis):
     ]
 
 
-def _tile_channels(builder, rgb):
+def _tile_channels(builder: ir.IRBuilder, rgb: Sequence[ir.Value]) -> Vector:
     """Three doubles, four times over."""
     vector = ir.Constant(FLOAT4, [0.0] * 4)
     for channel, value in enumerate(rgb):
@@ -41,19 +47,22 @@ def _tile_channels(builder, rgb):
 
 
 @intrinsic
-def eval_sh16(typingctx, sh, basis):
+def eval_sh16(typingctx: TypingContext, sh: Address, basis: Address) -> Intrinsic:
     """Sums over the harmonics of ``sh`` (16 x 3 float32) times ``basis`` (16 doubles), three doubles."""
     signature = types.UniTuple(types.float64, CHANNELS)(types.uintp, types.uintp)
 
-    def codegen(context, builder, sig, args):
-        rows, total = VectorRows(builder, args[0], FLOAT12), None
-        for four, harmonic in enumerate(_load_basis(builder, args[1])):
-            product = rows[four] * harmonic
-            total = product if total is None else rows[four] * harmonic + total
-        found = None
-        for first in range(0, 12, CHANNELS):
-            part = Vector(builder, _shuffle(builder, total.value, [first, first + 1, first + 2, first]))
-            found = part if found is None else found + part
+    def codegen(
+        context: BaseContext, builder: ir.IRBuilder, sig: Signature, args: Sequence[ir.Value]
+    ) -> ir.Value:
+        rows, basis = VectorRows(builder, args[0], FLOAT12), _load_basis(builder, args[1])
+        total = rows[0] * basis[0]
+        for four in range(1, SH_VECTORS):
+            total = rows[four] * basis[four] + total
+        parts = [
+            Vector(builder, _shuffle(builder, total.value, [first, first + 1, first + 2, first]))
+            for first in range(0, 12, CHANNELS)
+        ]
+        found = parts[0] + parts[1] + parts[2] + parts[3]
         values = [
             builder.fpext(builder.extract_element(found.value, ir.Constant(I32, k)), DOUBLE)
             for k in range(CHANNELS)
@@ -64,11 +73,15 @@ def eval_sh16(typingctx, sh, basis):
 
 
 @intrinsic
-def accumulate_sh16(typingctx, sh, basis, red, green, blue):
+def accumulate_sh16(
+    typingctx: TypingContext, sh: Address, basis: Address, red: float, green: float, blue: float
+) -> Intrinsic:
     """Add to ``sh`` (16 x 3 float32) the ``basis`` (16 doubles) times three channels."""
     signature = types.void(types.uintp, types.uintp, *(types.float64,) * CHANNELS)
 
-    def codegen(context, builder, sig, args):
+    def codegen(
+        context: BaseContext, builder: ir.IRBuilder, sig: Signature, args: Sequence[ir.Value]
+    ) -> ir.Value:
         rows, channels = VectorRows(builder, args[0], FLOAT12), _tile_channels(builder, args[2:])
         for four, harmonic in enumerate(_load_basis(builder, args[1])):
             rows[four] = harmonic * channels + rows[four]
@@ -78,11 +91,15 @@ def accumulate_sh16(typingctx, sh, basis, red, green, blue):
 
 
 @intrinsic
-def write_basis_gradient16(typingctx, values, sh, red, green, blue):
+def write_basis_gradient16(
+    typingctx: TypingContext, values: Address, sh: Address, red: float, green: float, blue: float
+) -> Intrinsic:
     """Write the sums over three channels of ``sh`` (16 x 3 float32) times those, sixteen doubles."""
     signature = types.void(types.uintp, types.uintp, *(types.float64,) * CHANNELS)
 
-    def codegen(context, builder, sig, args):
+    def codegen(
+        context: BaseContext, builder: ir.IRBuilder, sig: Signature, args: Sequence[ir.Value]
+    ) -> ir.Value:
         rows, channels = VectorRows(builder, args[1], FLOAT12), _tile_channels(builder, args[2:])
         for four in range(SH_VECTORS):
             product = (rows[four] * channels).value

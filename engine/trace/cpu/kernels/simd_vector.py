@@ -5,10 +5,18 @@ of AVX2, or of eight doubles, which the compiler maps to whatever the processor 
 change a result.
 """
 
+from collections.abc import Sequence
+from typing import Any
+
 import llvmlite.ir as ir
 from numba import types
 from numba.core import cgutils
+from numba.core.base import BaseContext
+from numba.core.typing import Context as TypingContext
+from numba.core.typing.templates import Signature
 from numba.extending import intrinsic
+
+from octasplat.engine.trace.kernels.native import Address, Intrinsic
 
 LANES = 8
 I64 = ir.IntType(64)
@@ -25,54 +33,54 @@ thirty roundings, while a sum of three products with differences and normals has
 class Vector:
     """A vector value with the operators that the formulas need; numbers become lanes of its own type."""
 
-    def __init__(self, builder, value):
+    def __init__(self, builder: ir.IRBuilder, value: ir.Value) -> None:
         self.builder, self.value = builder, value
 
-    def _operand(self, other):
+    def _operand(self, other: "Vector | float") -> ir.Value:
         if isinstance(other, Vector):
             return other.value
         return ir.Constant(self.value.type, [float(other)] * self.value.type.count)
 
-    def __add__(self, other):
+    def __add__(self, other: "Vector | float") -> "Vector":
         return Vector(self.builder, self.builder.fadd(self.value, self._operand(other), flags=("contract",)))
 
-    def __sub__(self, other):
+    def __sub__(self, other: "Vector | float") -> "Vector":
         return Vector(self.builder, self.builder.fsub(self.value, self._operand(other), flags=("contract",)))
 
-    def __mul__(self, other):
+    def __mul__(self, other: "Vector | float") -> "Vector":
         return Vector(self.builder, self.builder.fmul(self.value, self._operand(other), flags=("contract",)))
 
-    def __truediv__(self, other):
+    def __truediv__(self, other: "Vector | float") -> "Vector":
         return Vector(self.builder, self.builder.fdiv(self.value, self._operand(other)))
 
-    def __rtruediv__(self, other):
+    def __rtruediv__(self, other: "Vector | float") -> "Vector":
         return Vector(self.builder, self.builder.fdiv(self._operand(other), self.value))
 
-    def __rsub__(self, other):
+    def __rsub__(self, other: "Vector | float") -> "Vector":
         return Vector(self.builder, self.builder.fsub(self._operand(other), self.value, flags=("contract",)))
 
-    def _compare(self, operator, other):
+    def _compare(self, operator: str, other: "Vector | float") -> "Vector":
         return Vector(self.builder, self.builder.fcmp_ordered(operator, self.value, self._operand(other)))
 
-    def __le__(self, other):
+    def __le__(self, other: "Vector | float") -> "Vector":
         return self._compare("<=", other)
 
-    def __lt__(self, other):
+    def __lt__(self, other: "Vector | float") -> "Vector":
         return self._compare("<", other)
 
-    def __ge__(self, other):
+    def __ge__(self, other: "Vector | float") -> "Vector":
         return self._compare(">=", other)
 
-    def __gt__(self, other):
+    def __gt__(self, other: "Vector | float") -> "Vector":
         return self._compare(">", other)
 
-    def __and__(self, other):
+    def __and__(self, other: "Vector") -> "Vector":
         return Vector(self.builder, self.builder.and_(self.value, other.value))
 
-    def __invert__(self):
+    def __invert__(self) -> "Vector":
         return Vector(self.builder, self.builder.not_(self.value))
 
-    def __abs__(self):
+    def __abs__(self) -> "Vector":
         kind = self.value.type
         width = 64 if kind.element == DOUBLE8.element else 32
         integers = ir.VectorType(ir.IntType(width), kind.count)
@@ -80,41 +88,42 @@ class Vector:
         bits = self.builder.and_(self.builder.bitcast(self.value, integers), no_sign)
         return Vector(self.builder, self.builder.bitcast(bits, self.value.type))
 
-    def maximum(self, other):
+    def maximum(self, other: "Vector | float") -> "Vector":
         """The larger of two lanes; the second where they cannot be compared."""
         return Vector(
             self.builder, self.builder.select((self > other).value, self.value, self._operand(other))
         )
 
-    def minimum(self, other):
+    def minimum(self, other: "Vector | float") -> "Vector":
         """The smaller of two lanes; the second where they cannot be compared."""
         return Vector(
             self.builder, self.builder.select((self < other).value, self.value, self._operand(other))
         )
 
-    def select(self, if_true, if_false):
+    def select(self, if_true: "Vector | float", if_false: "Vector | float") -> "Vector":
         """Lanes of ``if_true`` where this comparison holds, else those of ``if_false``."""
-        lanes = if_true if isinstance(if_true, Vector) else if_false  # at least one of the two is a vector
+        lanes = if_true if isinstance(if_true, Vector) else if_false
+        assert isinstance(lanes, Vector), "one of the two must be a vector"
         return Vector(
             self.builder, self.builder.select(self.value, lanes._operand(if_true), lanes._operand(if_false))
         )
 
-    def sqrt(self):
+    def sqrt(self) -> "Vector":
         """Square roots."""
         kind = self.value.type
         name = "llvm.sqrt.v8f64" if kind == DOUBLE8 else "llvm.sqrt.v8f32"
         function = cgutils.get_or_insert_function(self.builder.module, ir.FunctionType(kind, [kind]), name)
         return Vector(self.builder, self.builder.call(function, [self.value]))
 
-    def to_float64(self):
+    def to_float64(self) -> "Vector":
         """The same numbers of float32 lanes as doubles."""
         return Vector(self.builder, self.builder.fpext(self.value, DOUBLE8))
 
-    def to_int32(self):
+    def to_int32(self) -> "Vector":
         """Towards zero, as int32; the lanes must fit."""
         return Vector(self.builder, self.builder.fptosi(self.value, ir.VectorType(ir.IntType(32), LANES)))
 
-    def to_bitmask(self):
+    def to_bitmask(self) -> ir.Value:
         """Truth of the lanes as the low bits of an int64."""
         return self.builder.zext(self.builder.bitcast(self.value, ir.IntType(self.value.type.count)), I64)
 
@@ -122,13 +131,15 @@ class Vector:
 class VectorRows:
     """Loads and stores rows of lanes at an address, ``row_bytes`` apart: without gaps unless told."""
 
-    def __init__(self, builder, address, element, row_bytes=0):
+    def __init__(
+        self, builder: ir.IRBuilder, address: ir.Value, element: ir.Type, row_bytes: int = 0
+    ) -> None:
         self.builder = builder
         self.element = element
         self.address = address
         self.row_bytes = row_bytes or element.count * (8 if element == DOUBLE8 else 4)
 
-    def _pointer(self, row):
+    def _pointer(self, row: int | ir.Value) -> ir.Value:
         offset = (
             ir.Constant(I64, row * self.row_bytes)
             if isinstance(row, int)
@@ -137,14 +148,14 @@ class VectorRows:
         address = self.builder.add(self.address, offset)
         return self.builder.inttoptr(address, self.element.as_pointer())
 
-    def __getitem__(self, row):
+    def __getitem__(self, row: int | ir.Value) -> Vector:
         return Vector(self.builder, self.builder.load(self._pointer(row), align=4))
 
-    def __setitem__(self, row, vector):
+    def __setitem__(self, row: int | ir.Value, vector: Vector) -> None:
         self.builder.store(vector.value, self._pointer(row), align=4)
 
 
-def broadcast(builder, scalar, lanes=LANES):
+def broadcast(builder: ir.IRBuilder, scalar: ir.Value, lanes: int = LANES) -> Vector:
     """A vector of so many times the same float32 or double."""
     nothing = ir.Constant(ir.VectorType(scalar.type, lanes), ir.Undefined)
     one = builder.insert_element(nothing, scalar, ir.Constant(ir.IntType(32), 0))
@@ -152,7 +163,7 @@ def broadcast(builder, scalar, lanes=LANES):
     return Vector(builder, builder.shuffle_vector(one, nothing, zeros))
 
 
-def exp_float32(builder, x):
+def exp_float32(builder: ir.IRBuilder, x: Vector) -> Vector:
     """Exponentials of float32: 2^n times a polynomial of what is left, at most half of ln 2.
 
     Right to a relative 1e-7 for |x| < 87. The polynomial and ln 2 in two parts, the first of which times n is
@@ -172,7 +183,7 @@ def exp_float32(builder, x):
     return p * Vector(builder, builder.bitcast(bits, x.value.type))
 
 
-def sum_abs(vectors):
+def sum_abs(vectors: Sequence[Vector]) -> Vector:
     """Sum of the magnitudes of several vectors."""
     total = abs(vectors[0])
     for vector in vectors[1:]:
@@ -181,7 +192,9 @@ def sum_abs(vectors):
 
 
 @intrinsic
-def boxes_in_frustum(typingctx, node, planes, ox, oy, oz):
+def boxes_in_frustum(
+    typingctx: TypingContext, node: Address, planes: Address, ox: float, oy: float, oz: float
+) -> Intrinsic:
     """Bit k: box k of a node reaches into the pyramid with apex o and the five inward ``planes``.
 
     Row s of the planes is a normal, its positive parts and its negative ones, float32. A box turned inside
@@ -189,12 +202,14 @@ def boxes_in_frustum(typingctx, node, planes, ox, oy, oz):
     """
     signature = types.int64(types.uintp, types.uintp, *(types.float32,) * 3)
 
-    def codegen(context, builder, sig, args):
+    def codegen(
+        context: BaseContext, builder: ir.IRBuilder, sig: Signature, args: Sequence[ir.Value]
+    ) -> ir.Value:
         rows = VectorRows(builder, args[0], FLOAT8)
         o = [broadcast(builder, component) for component in args[2:]]
         low, high = ([rows[first + axis] - o[axis] for axis in range(3)] for first in (0, 3))
         room = sum_abs([abs(a).maximum(abs(b)) for a, b in zip(low, high, strict=True)]) * ROUNDING_MARGIN
-        inside = None
+        inside: Vector | None = None
         for side in range(FRUSTUM_PLANES):
             distance = room
             for axis in range(3):  # that of the corner farthest along the normal
@@ -202,13 +217,16 @@ def boxes_in_frustum(typingctx, node, planes, ox, oy, oz):
                 distance = distance + low[axis] * _plane_component(builder, args[1], side, 6 + axis)
             here = distance >= 0.0
             inside = here if inside is None else inside & here
+        assert inside is not None
         return inside.to_bitmask()
 
     return signature, codegen
 
 
 @intrinsic
-def ellipses_in_frustum(typingctx, block, planes, ox, oy, oz):
+def ellipses_in_frustum(
+    typingctx: TypingContext, block: Address, planes: Address, ox: float, oy: float, oz: float
+) -> Intrinsic:
     """Bit k: ellipse k of a block of leaves reaches into the pyramid; see :func:`boxes_in_frustum`.
 
     Its farthest point inwards along a normal lies sqrt(u^2 + v^2) beyond its centre, u and v being its legs
@@ -216,12 +234,14 @@ def ellipses_in_frustum(typingctx, block, planes, ox, oy, oz):
     """
     signature = types.int64(types.uintp, types.uintp, *(types.float32,) * 3)
 
-    def codegen(context, builder, sig, args):
+    def codegen(
+        context: BaseContext, builder: ir.IRBuilder, sig: Signature, args: Sequence[ir.Value]
+    ) -> ir.Value:
         rows = VectorRows(builder, args[0], FLOAT8)
         centre = [rows[axis] - broadcast(builder, args[2 + axis]) for axis in range(3)]
         legs = [rows[3 + k] for k in range(6)]
         room = sum_abs([*centre, *legs]) * ROUNDING_MARGIN
-        inside = None
+        inside: Vector | None = None
         for side in range(FRUSTUM_PLANES):
             n = [_plane_component(builder, args[1], side, axis) for axis in range(3)]
             height = centre[0] * n[0] + centre[1] * n[1] + centre[2] * n[2] + room
@@ -229,12 +249,13 @@ def ellipses_in_frustum(typingctx, block, planes, ox, oy, oz):
             v = legs[3] * n[0] + legs[4] * n[1] + legs[5] * n[2]
             outside = (height < 0.0) & (height * height > u * u + v * v)
             inside = ~outside if inside is None else inside & ~outside
+        assert inside is not None
         return inside.to_bitmask()
 
     return signature, codegen
 
 
-def _plane_component(builder, planes, side, column):
+def _plane_component(builder: ir.IRBuilder, planes: ir.Value, side: int, column: int) -> Vector:
     """One number of a normal's row in all lanes."""
     words = builder.inttoptr(planes, ir.FloatType().as_pointer())
     place = ir.Constant(I64, side * PLANE_WORDS + column)
@@ -242,22 +263,26 @@ def _plane_component(builder, planes, side, column):
 
 
 @intrinsic
-def lowest_bit(typingctx, mask):
+def lowest_bit(typingctx: TypingContext, mask: int) -> Intrinsic:
     """Place of the lowest bit that is set; ``mask`` must not be zero."""
     signature = types.int64(types.int64)
 
-    def codegen(context, builder, sig, args):
+    def codegen(
+        context: BaseContext, builder: ir.IRBuilder, sig: Signature, args: Sequence[ir.Value]
+    ) -> ir.Value:
         return builder.cttz(args[0], ir.Constant(ir.IntType(1), 1))
 
     return signature, codegen
 
 
-def _reinterpret(source, target):
+def _reinterpret(source: types.Type, target: types.Type) -> Any:
     @intrinsic
-    def reinterpret(typingctx, value):
+    def reinterpret(typingctx: TypingContext, value: float) -> Intrinsic:
         signature = target(source)
 
-        def codegen(context, builder, sig, args):
+        def codegen(
+            context: BaseContext, builder: ir.IRBuilder, sig: Signature, args: Sequence[ir.Value]
+        ) -> ir.Value:
             return builder.bitcast(args[0], context.get_value_type(target))
 
         return signature, codegen

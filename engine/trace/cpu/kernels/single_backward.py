@@ -9,10 +9,20 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float32, Int32
+from jaxtyping import Float32, Float64, Int32, Int64
 
 from octasplat.engine.core.compilation import kernel
 from octasplat.engine.gaussians.model import SH_C0
+from octasplat.engine.trace.cpu.kernels.kernel_args import (
+    GaussianGradientArrays,
+    GaussianParameters,
+    GaussianSegments,
+    HitArrays,
+    OutputGradientArrays,
+    PackedScene,
+    RayArrays,
+    TraceLimits,
+)
 from octasplat.engine.trace.cpu.kernels.octagon_hit import MEAN, NORMAL, OPACITY
 from octasplat.engine.trace.cpu.kernels.packed_primitives import rotation_columns
 from octasplat.engine.trace.cpu.kernels.rays import (
@@ -72,7 +82,17 @@ class GaussianMoments(NamedTuple):
 
 
 @njit_no_refcount(forceinline=True, fastmath={"contract"})
-def backward_ray(r, first, rays, hits, counts, scene, limits, output_gradients, hit_gradients):
+def backward_ray(
+    r: int,
+    first: int,
+    rays: RayArrays,
+    hits: HitArrays,
+    counts: Int32[np.ndarray, " r"],
+    scene: PackedScene,
+    limits: TraceLimits,
+    output_gradients: OutputGradientArrays,
+    hit_gradients: HitGradients,
+) -> None:
     """dL/dalpha_k = <g, T_k c_k - (C - prefix_k)/(1 - alpha_k)> of the hits of ray ``r``, for every channel.
 
     They go to ``hit_gradients`` from ``first`` on.
@@ -143,9 +163,22 @@ def backward_ray(r, first, rays, hits, counts, scene, limits, output_gradients, 
 
 @kernel(error_model="numpy")
 def backward_rays(
-    first, last, rays, ray_indices, offsets, hits, counts, scene, limits, output_gradients, hit_gradients
-):
-    """:func:`backward_ray` on the rays ``ray_indices``; ``offsets`` are the places of their hits in ``hit_gradients``."""
+    first: int,
+    last: int,
+    rays: RayArrays,
+    ray_indices: Int64[np.ndarray, " i"],
+    offsets: Int64[np.ndarray, " i"],
+    hits: HitArrays,
+    counts: Int32[np.ndarray, " r"],
+    scene: PackedScene,
+    limits: TraceLimits,
+    output_gradients: OutputGradientArrays,
+    hit_gradients: HitGradients,
+) -> None:
+    """:func:`backward_ray` on the rays ``ray_indices``.
+
+    ``offsets`` are the places of their hits in ``hit_gradients``.
+    """
     for s in range(first, last):
         backward_ray(
             ray_indices[s], offsets[s], rays, hits, counts, scene, limits, output_gradients, hit_gradients
@@ -153,7 +186,17 @@ def backward_rays(
 
 
 @njit_no_refcount(forceinline=True, fastmath={"contract"})
-def write_geometry_gradients(segment, i, frame, quats, primitives, moments, out):
+def write_geometry_gradients(
+    segment: int,
+    i: int,
+    frame: tuple[
+        tuple[float, float, float], tuple[float, float, float], tuple[float, float, float], float, float
+    ],
+    quats: Float32[np.ndarray, "n 4"],
+    primitives: Float32[np.ndarray, "n 16"],
+    moments: GaussianMoments,
+    out: GaussianGradientArrays,
+) -> None:
     """Gradients of one Gaussian's raw geometry from its sums over rays.
 
     In the Gaussian's own frame, with u, v the hit in standard deviations, tau = dL/dt through the point
@@ -190,99 +233,153 @@ def write_geometry_gradients(segment, i, frame, quats, primitives, moments, out)
     out.logits[segment] = moments.h * (1.0 - np.float64(primitives[i, OPACITY]))
 
 
+@njit_no_refcount(forceinline=True)
+def gaussian_frame(
+    i: int, quats: Float32[np.ndarray, "n 4"], log_scales: Float32[np.ndarray, "n 2"]
+) -> tuple[tuple[float, float, float], tuple[float, float, float], tuple[float, float, float], float, float]:
+    """Return r1, r2, r3, s2 and s3 of Gaussian ``i`` in float64."""
+    r1, r2, r3 = rotation_columns(
+        np.float64(quats[i, 0]), np.float64(quats[i, 1]), np.float64(quats[i, 2]), np.float64(quats[i, 3])
+    )
+    s2, s3 = math.exp(np.float64(log_scales[i, 0])), math.exp(np.float64(log_scales[i, 1]))
+    return r1, r2, r3, s2, s3
+
+
+@njit_no_refcount(forceinline=True, fastmath={"contract"})
+def hit_in_frame(
+    h: float,
+    g_t: float,
+    from_mean: tuple[float, float, float],
+    direction: tuple[float, float, float],
+    normal: tuple[float, float, float],
+    axis_u: tuple[float, float, float],
+    axis_v: tuple[float, float, float],
+) -> tuple[float, float, float]:
+    """Return u, v and tau of a hit.
+
+    ``from_mean`` leads from the Gaussian's mean to the ray's origin; the axes are r2 / s2 and r3 / s3;
+    ``h`` is dL/d ln(alpha) and ``g_t`` dL/dt.
+    """
+    x, y, z = from_mean
+    d0, d1, d2 = direction
+    n0, n1, n2 = normal
+    a0, a1, a2 = axis_u
+    b0, b1, b2 = axis_v
+    inverse = 1.0 / (d0 * n0 + d1 * n1 + d2 * n2)
+    t = -(x * n0 + y * n1 + z * n2) * inverse
+    x += t * d0
+    y += t * d1
+    z += t * d2
+    u = x * a0 + y * a1 + z * a2
+    v = x * b0 + y * b1 + z * b2
+    tau = g_t - h * u * (a0 * d0 + a1 * d1 + a2 * d2) - h * v * (b0 * d0 + b1 * d1 + b2 * d2)
+    tau *= inverse
+    return u, v, tau
+
+
+@njit_no_refcount(forceinline=True)
+def hit_color_gradient(
+    flags: int, r: int, weight: float, rgb: Float32[np.ndarray, "r 3"]
+) -> tuple[float, float, float]:
+    """Return dL by the color of a hit of ray ``r``; a channel that was clamped at zero has none."""
+    red = 0.0 if flags & RED_CLAMPED else weight * rgb[r, 0]
+    green = 0.0 if flags & GREEN_CLAMPED else weight * rgb[r, 1]
+    blue = 0.0 if flags & BLUE_CLAMPED else weight * rgb[r, 2]
+    return red, green, blue
+
+
+@njit_no_refcount(forceinline=True, fastmath={"contract"})
+def add_sh_gradient(
+    sh_sum: Float64[np.ndarray, "16 3"],
+    basis: Float64[np.ndarray, "16"],
+    count: int,
+    color_gradient: tuple[float, float, float],
+) -> None:
+    """Add dL by the first ``count`` harmonics."""
+    for j in range(count):
+        sh_sum[j, 0] += basis[j] * color_gradient[0]
+        sh_sum[j, 1] += basis[j] * color_gradient[1]
+        sh_sum[j, 2] += basis[j] * color_gradient[2]
+
+
+@njit_no_refcount(forceinline=True)
+def write_color_gradients(
+    segment: int,
+    sh_sum: Float64[np.ndarray, "16 3"],
+    feature_sum: Float64[np.ndarray, " f"],
+    out: GaussianGradientArrays,
+) -> None:
+    """Write a Gaussian's gradients by its harmonics and features; of degree 0 the sum lacks the harmonic."""
+    factor = SH_C0 if out.sh.shape[1] == 1 else 1.0
+    for j in range(out.sh.shape[1]):
+        for channel in range(3):
+            out.sh[segment, j, channel] = sh_sum[j, channel] * factor
+    for f in range(out.features.shape[1]):
+        out.features[segment, f] = feature_sum[f]
+
+
 @njit_no_refcount(fastmath={"contract"})
 def reduce_hits_chunk(
-    first,
-    last,
-    scratch,
-    rays,
-    parameters,
-    scene,
-    limits,
-    gaussian_segments,
-    hit_gradients,
-    output_gradients,
-    out,
-):
-    """Gradients of the Gaussians ``first`` to ``last`` of the sorted hits.
+    first: int,
+    last: int,
+    scratch: tuple[Float64[np.ndarray, "16"], Float64[np.ndarray, "16 3"], Float64[np.ndarray, " f"]],
+    rays: RayArrays,
+    parameters: GaussianParameters,
+    scene: PackedScene,
+    limits: TraceLimits,
+    gaussian_segments: GaussianSegments,
+    hit_gradients: HitGradients,
+    output_gradients: OutputGradientArrays,
+    out: GaussianGradientArrays,
+) -> None:
+    """Write the gradients of the Gaussians ``first`` to ``last`` of the sorted hits.
 
-    In the Gaussian's own frame, with u, v the hit in standard deviations, tau = dL/dt through the point and
-    c = <d, r1>: dL/dm = S(h u)/s2 r2 + S(h v)/s3 r3 + S(tau/c) r1, dL/dln s = S(h u^2), S(h v^2), and the
-    frame turns by the torque S r_i x dL/dr_i. The term through t (plane hit) is in tau.
+    ``scratch`` has room for the harmonics, their gradients and those of the features.
     """
     basis, sh_sum, feature_sum = scratch
     order, starts = gaussian_segments.order, gaussian_segments.starts
     means, quats, log_scales = parameters.means, parameters.quats, parameters.log_scales
-    basis_count = out.sh.shape[1]
-    feature_count = out.features.shape[1]
+    basis_count, feature_count = out.sh.shape[1], out.features.shape[1]
     for segment in range(first, last):
         i = gaussian_segments.ids[starts[segment]]
-        # The frame in float64 from the raw parameters: the record's float32 axes would cost needles digits.
-        q0, q1, q2, q3 = (
-            np.float64(quats[i, 0]), np.float64(quats[i, 1]), np.float64(quats[i, 2]), np.float64(quats[i, 3])
-        )  # fmt: skip
-        r1, r2, r3 = rotation_columns(q0, q1, q2, q3)
-        s2, s3 = math.exp(np.float64(log_scales[i, 0])), math.exp(np.float64(log_scales[i, 1]))
+        # --- the frame, in float64 from the raw parameters: float32 axes would cost needles digits ---
+        r1, r2, r3, s2, s3 = gaussian_frame(i, quats, log_scales)
         inv_s2, inv_s3 = 1.0 / s2, 1.0 / s3
-        m0, m1, m2 = np.float64(means[i, 0]), np.float64(means[i, 1]), np.float64(means[i, 2])
-        n0, n1, n2 = r1
-        a0, a1, a2 = r2[0] * inv_s2, r2[1] * inv_s2, r2[2] * inv_s2
-        b0, b1, b2 = r3[0] * inv_s3, r3[1] * inv_s3, r3[2] * inv_s3
-        s_h = s_hu = s_hv = s_huu = s_hvv = s_huv = 0.0
-        s_tau = s_tau_u = s_tau_v = 0.0
-        s_n0 = s_n1 = s_n2 = s_w = s_error = s_m0 = s_m1 = s_m2 = 0.0
+        mean_x, mean_y, mean_z = np.float64(means[i, 0]), np.float64(means[i, 1]), np.float64(means[i, 2])
+        axis_u = r2[0] * inv_s2, r2[1] * inv_s2, r2[2] * inv_s2
+        axis_v = r3[0] * inv_s3, r3[1] * inv_s3, r3[2] * inv_s3
+        # --- sums over its hits, as in GaussianMoments; then of weights and errors ---
+        s_h = s_hu = s_hv = s_huu = s_hvv = s_huv = s_tau = s_tau_u = s_tau_v = 0.0
+        s_n0 = s_n1 = s_n2 = s_m0 = s_m1 = s_m2 = 0.0
+        s_w = s_error = 0.0
         sh_sum[:basis_count] = 0.0
         feature_sum[:] = 0.0
         for k in range(starts[segment], starts[segment + 1]):
             e = order[k]
             r = hit_gradients.ray_flags[e] & RAY_ID_MASK
-            h = np.float64(hit_gradients.h_alpha[e])
-            w = np.float64(hit_gradients.weights[e])
-            d0, d1, d2 = ray_direction(rays, r)
-            o0, o1, o2 = ray_origin(rays, r)
-            x, y, z = o0 - m0, o1 - m1, o2 - m2
+            h, w = np.float64(hit_gradients.h_alpha[e]), np.float64(hit_gradients.weights[e])
+            direction, origin = ray_direction(rays, r), ray_origin(rays, r)
+            x, y, z = origin[0] - mean_x, origin[1] - mean_y, origin[2] - mean_z
             to_mean = -x, -y, -z
-            inverse = 1.0 / (d0 * n0 + d1 * n1 + d2 * n2)
-            t = -(x * n0 + y * n1 + z * n2) * inverse
-            x += t * d0
-            y += t * d1
-            z += t * d2
-            u = x * a0 + y * a1 + z * a2
-            v = x * b0 + y * b1 + z * b2
-            hu, hv = h * u, h * v
-            tau = (
-                np.float64(hit_gradients.g_t[e])
-                - hu * (a0 * d0 + a1 * d1 + a2 * d2)
-                - hv * (b0 * d0 + b1 * d1 + b2 * d2)
+            u, v, tau = hit_in_frame(
+                h, np.float64(hit_gradients.g_t[e]), (x, y, z), direction, r1, axis_u, axis_v
             )
-            tau *= inverse
-            s_h += h
-            s_hu += hu
-            s_hv += hv
+            hu, hv = h * u, h * v
+            s_h, s_hu, s_hv = s_h + h, s_hu + hu, s_hv + hv
             s_huu += hu * u
             s_hvv += hv * v
             s_huv += hu * v
-            s_tau += tau
-            s_tau_u += tau * u
-            s_tau_v += tau * v
+            s_tau, s_tau_u, s_tau_v = s_tau + tau, s_tau_u + tau * u, s_tau_v + tau * v
             s_w += w
             s_error += w * output_gradients.ray_errors[r]
-            gr = 0.0 if hit_gradients.ray_flags[e] & RED_CLAMPED else w * output_gradients.rgb[r, 0]
-            gg = 0.0 if hit_gradients.ray_flags[e] & GREEN_CLAMPED else w * output_gradients.rgb[r, 1]
-            gb = 0.0 if hit_gradients.ray_flags[e] & BLUE_CLAMPED else w * output_gradients.rgb[r, 2]
-            if basis_count == 1:
-                sh_sum[0, 0] += gr
-                sh_sum[0, 1] += gg
-                sh_sum[0, 2] += gb
+            by_color = hit_color_gradient(hit_gradients.ray_flags[e], r, w, output_gradients.rgb)
+            if basis_count == 1:  # the value of the basis comes in the end
+                for channel in range(3):
+                    sh_sum[0, channel] += by_color[channel]
             else:
-                view = eval_ray_view_basis(
-                    basis, basis_count, to_mean, (d0, d1, d2), ray_t_view_origin(rays, r)
-                )
-                for j in range(basis_count):
-                    sh_sum[j, 0] += basis[j] * gr
-                    sh_sum[j, 1] += basis[j] * gg
-                    sh_sum[j, 2] += basis[j] * gb
-                write_basis_gradient(basis, scene.sh, i, basis_count, (gr, gg, gb))
+                view = eval_ray_view_basis(basis, basis_count, to_mean, direction, ray_t_view_origin(rays, r))
+                add_sh_gradient(sh_sum, basis, basis_count, by_color)
+                write_basis_gradient(basis, scene.sh, i, basis_count, by_color)
                 m_x, m_y, m_z = mean_gradient(basis, basis_count, view)
                 s_m0, s_m1, s_m2 = s_m0 + m_x, s_m1 + m_y, s_m2 + m_z
             if output_gradients.has_geometry:
@@ -292,35 +389,29 @@ def reduce_hits_chunk(
                 s_n2 += facing * output_gradients.normal[r, 2]
             for f in range(feature_count):
                 feature_sum[f] += w * output_gradients.features[r, f]
+        # --- the gradients ---
         moments = GaussianMoments(
             s_h, s_hu, s_hv, s_huu, s_huv, s_hvv, s_tau, s_tau_u, s_tau_v, s_n0, s_n1, s_n2, s_m0, s_m1, s_m2
         )
         write_geometry_gradients(segment, i, (r1, r2, r3, s2, s3), quats, scene.primitives, moments, out)
-        for j in range(basis_count):
-            for channel in range(3):
-                # degree 0 skips the basis in the loop above
-                out.sh[segment, j, channel] = sh_sum[j, channel] * (SH_C0 if basis_count == 1 else 1.0)
-        for f in range(feature_count):
-            out.features[segment, f] = feature_sum[f]
-        out.ids[segment] = i
-        out.weights[segment] = s_w
-        out.errors[segment] = s_error
+        write_color_gradients(segment, sh_sum, feature_sum, out)
+        out.ids[segment], out.weights[segment], out.errors[segment] = i, s_w, s_error
         out.counts[segment] = starts[segment + 1] - starts[segment]
 
 
 @kernel(fastmath={"contract"}, error_model="numpy")
 def reduce_hits(
-    rays,
-    parameters,
-    scene,
-    limits,
-    gaussian_segments,
-    chunk_bounds,
-    counter,
-    hit_gradients,
-    output_gradients,
-    out,
-):
+    rays: RayArrays,
+    parameters: GaussianParameters,
+    scene: PackedScene,
+    limits: TraceLimits,
+    gaussian_segments: GaussianSegments,
+    chunk_bounds: Int64[np.ndarray, " c1"],
+    counter: Int64[np.ndarray, "1"],
+    hit_gradients: HitGradients,
+    output_gradients: OutputGradientArrays,
+    out: GaussianGradientArrays,
+) -> None:
     """Sum the hits of each Gaussian and turn the sums into gradients of its raw parameters.
 
     Chunk c has the Gaussians ``chunk_bounds[c]`` to ``chunk_bounds[c + 1]``; ``counter`` holds one zero.

@@ -3,10 +3,11 @@
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float32, UInt64
+from jaxtyping import Float32, Float64, Int32, Int64, UInt64
 
 from octasplat.engine.core.compilation import kernel
 from octasplat.engine.trace.cpu.kernels.composite import Hit, composite, init_ray_state, write_ray_outputs
+from octasplat.engine.trace.cpu.kernels.kernel_args import ForwardPass, PackedScene, RayArrays, TraceLimits
 from octasplat.engine.trace.cpu.kernels.octagon_hit import (
     ALPHA_MAX,
     BUFFER_FULL,
@@ -57,7 +58,15 @@ class EmbreeRayQuery(NamedTuple):
 
 
 @njit_no_refcount()
-def chunk_context(embree, chunk):
+def chunk_context(
+    embree: EmbreeRayQuery, chunk: int
+) -> tuple[
+    Float32[np.ndarray, " words"],
+    Int32[np.ndarray, " words"],
+    Float32[np.ndarray, " words"],
+    Int32[np.ndarray, " words"],
+    Float64[np.ndarray, " words"],
+]:
     """The ray of a chunk and its context, as words of each type."""
     ray = embree.scratch[chunk]
     context = ray[RAY_WORDS:]
@@ -65,7 +74,15 @@ def chunk_context(embree, chunk):
 
 
 @njit_no_refcount()
-def write_ray_query(ray, ray_i32, context_i32, origin, direction, t_near, t_far):
+def write_ray_query(
+    ray: Float32[np.ndarray, " words"],
+    ray_i32: Int32[np.ndarray, " words"],
+    context_i32: Int32[np.ndarray, " words"],
+    origin: tuple[float, float, float],
+    direction: tuple[float, float, float],
+    t_near: float,
+    t_far: float,
+) -> None:
     """The ray and the start of its context as Embree wants them."""
     for axis in range(3):
         ray[axis] = origin[axis]
@@ -77,7 +94,14 @@ def write_ray_query(ray, ray_i32, context_i32, origin, direction, t_near, t_far)
 
 
 @njit_no_refcount(fastmath={"contract"})
-def trace_rays_worker(embree, forward, ray_indices, rays_per_chunk, counter, basis):
+def trace_rays_worker(
+    embree: EmbreeRayQuery,
+    forward: ForwardPass,
+    ray_indices: Int64[np.ndarray, " i"],
+    rays_per_chunk: int,
+    counter: Int64[np.ndarray, "1"],
+    basis: Float64[np.ndarray, " k"],
+) -> None:
     """Trace the rays ``ray_indices``, in ascending order, until the ``counter`` has passed the last chunk.
 
     The hits of ray r are stored from ``first_place(r)`` on, or behind those of ray r - 1 where its chunk has
@@ -143,13 +167,28 @@ def trace_rays_worker(embree, forward, ray_indices, rays_per_chunk, counter, bas
 
 
 @kernel(error_model="numpy")
-def trace_rays(embree, forward, ray_indices, rays_per_chunk, counter):
+def trace_rays(
+    embree: EmbreeRayQuery,
+    forward: ForwardPass,
+    ray_indices: Int64[np.ndarray, " i"],
+    rays_per_chunk: int,
+    counter: Int64[np.ndarray, "1"],
+) -> None:
     """:func:`trace_rays_worker` with room for the harmonics."""
     trace_rays_worker(embree, forward, ray_indices, rays_per_chunk, counter, np.empty(16, np.float64))
 
 
 @kernel(_nrt=False, error_model="numpy", fastmath={"contract"})
-def write_ray_transmittance(embree, rays, scene, limits, ray_indices, rays_per_chunk, counter, transmittance):
+def write_ray_transmittance(
+    embree: EmbreeRayQuery,
+    rays: RayArrays,
+    scene: PackedScene,
+    limits: TraceLimits,
+    ray_indices: Int64[np.ndarray, " i"],
+    rays_per_chunk: int,
+    counter: Int64[np.ndarray, "1"],
+    transmittance: Float32[np.ndarray, " r"],
+) -> None:
     """The transmittance alone of the rays ``ray_indices``, 0 where it falls below eps1."""
     chunk_count = (len(ray_indices) + rays_per_chunk - 1) // rays_per_chunk
     while True:

@@ -6,6 +6,7 @@ A Gaussian has one colour for all rays with one viewer, that in the direction fr
 import math
 
 import numpy as np
+from jaxtyping import Float32, Float64
 
 from octasplat.engine.gaussians.model import SH_C0
 from octasplat.engine.gaussians.spherical_harmonics import SH_C1, SH_C2, SH_C3
@@ -22,7 +23,7 @@ SH_BYTES = HARMONICS * CHANNELS * 4
 
 
 @njit_no_refcount()
-def eval_sh_basis(basis, count, x, y, z):
+def eval_sh_basis(basis: Float64[np.ndarray, " k"], count: int, x: float, y: float, z: float) -> None:
     """Values of the first ``count`` (1, 4, 9 or 16) harmonics at the unit direction (x, y, z)."""
     basis[0] = SH_C0
     if count > 1:
@@ -47,7 +48,9 @@ def eval_sh_basis(basis, count, x, y, z):
 
 
 @njit_no_refcount(forceinline=True)
-def eval_color(sh, i, basis):
+def eval_color(
+    sh: Float32[np.ndarray, "n k 3"], i: int, basis: Float64[np.ndarray, " k"]
+) -> tuple[float, float, float]:
     """Display colour max(0, 1/2 + sum_k sh[i, k] basis[k]) of Gaussian ``i``, three float64."""
     if sh.shape[1] == HARMONICS:
         red, green, blue = eval_sh16(sh.ctypes.data + i * SH_BYTES, basis.ctypes.data)
@@ -61,7 +64,13 @@ def eval_color(sh, i, basis):
 
 
 @njit_no_refcount(forceinline=True, fastmath={"contract"})
-def accumulate_sh_gradient(gradients, i, basis, count, color_gradient):
+def accumulate_sh_gradient(
+    gradients: Float32[np.ndarray, "u k 3"],
+    i: int,
+    basis: Float64[np.ndarray, " k"],
+    count: int,
+    color_gradient: tuple[float, float, float],
+) -> None:
     """Add the gradient by the first ``count`` harmonics to row ``i``."""
     if count == HARMONICS:
         accumulate_sh16(gradients.ctypes.data + i * SH_BYTES, basis.ctypes.data, *color_gradient)
@@ -72,7 +81,9 @@ def accumulate_sh_gradient(gradients, i, basis, count, color_gradient):
 
 
 @njit_no_refcount(forceinline=True, fastmath={"contract"})
-def eval_view_basis(basis, count, x, y, z):
+def eval_view_basis(
+    basis: Float64[np.ndarray, " k"], count: int, x: float, y: float, z: float
+) -> tuple[float, float, float, float]:
     """The first ``count`` harmonics for a mean at (x, y, z) from the viewer.
 
     Returns the direction there, and one over the distance. A mean at the viewer has the direction zero.
@@ -85,8 +96,17 @@ def eval_view_basis(basis, count, x, y, z):
 
 
 @njit_no_refcount(forceinline=True, fastmath={"contract"})
-def eval_ray_view_basis(basis, count, to_mean, direction, t_view_origin):
-    """:func:`eval_view_basis` for a ray, ``to_mean`` from its origin; no slope where its viewer is at infinity."""
+def eval_ray_view_basis(
+    basis: Float64[np.ndarray, " k"],
+    count: int,
+    to_mean: tuple[float, float, float],
+    direction: tuple[float, float, float],
+    t_view_origin: float,
+) -> tuple[float, float, float, float]:
+    """:func:`eval_view_basis` for a ray, ``to_mean`` from its origin.
+
+    No slope where its viewer is at infinity.
+    """
     x, y, z = to_mean
     if math.isinf(t_view_origin):
         x, y, z = direction
@@ -102,7 +122,13 @@ def eval_ray_view_basis(basis, count, to_mean, direction, t_view_origin):
 
 
 @njit_no_refcount(forceinline=True, fastmath={"contract"})
-def write_basis_gradient(values, sh, i, count, color_gradient):
+def write_basis_gradient(
+    values: Float64[np.ndarray, " k"],
+    sh: Float32[np.ndarray, "n k 3"],
+    i: int,
+    count: int,
+    color_gradient: tuple[float, float, float],
+) -> None:
     """Gradients by the values of the first ``count`` harmonics of Gaussian ``i``."""
     if count == HARMONICS:
         write_basis_gradient16(values.ctypes.data, sh.ctypes.data + i * SH_BYTES, *color_gradient)
@@ -116,11 +142,14 @@ def write_basis_gradient(values, sh, i, count, color_gradient):
 
 
 @njit_no_refcount(fastmath={"contract"})
-def mean_gradient(basis_gradient, count, view):
+def mean_gradient(
+    basis_gradient: Float64[np.ndarray, " k"], count: int, view: tuple[float, float, float, float]
+) -> tuple[float, float, float]:
     """Gradient by a Gaussian's mean, through the direction in which its colour is seen.
 
-    ``basis_gradient`` are the gradients by the values of its harmonics; ``view`` is that direction and one over the
-    distance, as :func:`eval_view_basis` gives them; 0 for a viewer at infinity, where the mean changes nothing.
+    ``basis_gradient`` are the gradients by the values of its harmonics; ``view`` is that direction and one
+    over the distance, as :func:`eval_view_basis` gives them; 0 for a viewer at infinity, where the mean
+    changes nothing.
     """
     x, y, z, scale = view
 
