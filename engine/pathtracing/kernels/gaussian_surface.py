@@ -8,7 +8,7 @@ and else goes on to what is behind; so no light is counted twice, and rays of al
 import math
 
 import numpy as np
-from jaxtyping import Int32, Int64
+from jaxtyping import Float64, Int32, Int64
 
 from octasplat.engine.core.compilation import kernel
 from octasplat.engine.pathtracing.kernels.gaussian_layer import MIN_COVERAGE

@@ -57,7 +57,8 @@ def rough_dielectric_sample(
 ) -> tuple[float, float, float]:
     """Draw a direction to the light, as dense as :func:`rough_dielectric_eval` says.
 
-    It may be no direction at all (zeros). What facets reflect downwards or refract upwards is not to be taken for the other.
+    It may be no direction at all (zeros). What facets reflect downwards or refract upwards is not to be taken
+    for the other.
     """
     h_x, h_y, h_z = sample_visible_normal(o_x, o_y, o_z, alpha, u, v)
     cos_o = o_x * h_x + o_y * h_y + o_z * h_z
