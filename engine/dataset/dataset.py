@@ -225,6 +225,11 @@ class Dataset:
         """Number of pixels of all training views, those of weight 0 included."""
         return int(self._train_pixels[-1])
 
+    @property
+    def _view_arrays(self) -> gather.ViewArrays:
+        tables = self._ray_tables
+        return gather.ViewArrays(self._view_sizes, self._view_camera, tables.offsets, tables.values.values)
+
     def rays(
         self, view: Int[np.ndarray, " n"], y: Int[np.ndarray, " n"], x: Int[np.ndarray, " n"]
     ) -> RayBatch:
@@ -240,8 +245,8 @@ class Dataset:
         origins = np.empty((len(view), 3), dtype=np.float32)
         directions = np.empty((len(view), 3), dtype=np.float32)
         bad = gather.gather_rays(
-            view, y, x, self._view_sizes, self._view_camera, self._rotations_world_from_cam, self._origins_world,
-            self._pinhole_params, self._ray_tables.offsets, self._ray_tables.values.values, origins, directions,
+            gather.PixelIndices(view, y, x), self._view_arrays,
+            self._rotations_world_from_cam, self._origins_world, self._pinhole_params, origins, directions,
         )  # fmt: skip
         self._raise_for_pixels(bad, view, y, x)
         if self._has_no_table.any():
@@ -262,9 +267,12 @@ class Dataset:
         weight = np.empty(len(view), dtype=np.float32)
         values = self._cache.rgb.values
         bad = gather.gather_pixels(
-            view, y, x, self._view_sizes, self._view_camera, self._cache.offsets, self._ray_tables.offsets,
-            self._ray_tables.values.values, values, np.float32(np.iinfo(values.dtype).max),
-            self._cache.alpha.values, self._cache.mask.values, self._mask_is_alpha, rgb, alpha, weight,
+            gather.PixelIndices(view, y, x), self._view_arrays,
+            gather.PixelPlanes(
+                self._cache.offsets, values, np.float32(np.iinfo(values.dtype).max),
+                self._cache.alpha.values, self._cache.mask.values, self._mask_is_alpha,
+            ),
+            rgb, alpha, weight,
         )  # fmt: skip
         self._raise_for_pixels(bad, view, y, x)
         if self._has_invalid_rays.any():

@@ -11,7 +11,7 @@ from octasplat.engine.gaussians.channels import stack_channels
 from octasplat.engine.gaussians.materials import AMBIENT, MATERIAL_WIDTHS
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.gaussians.spherical_harmonics import fibonacci_sphere, sh_basis
-from octasplat.engine.shading.environment_levels import LightLevels
+from octasplat.engine.shading.kernels.environment_levels import LightLevels
 from octasplat.engine.shading.split_sum import Surface, shade
 
 _ROWS_PER_BLOCK = 1 << 14

@@ -12,8 +12,10 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64, Int32, Int64
 from scipy.spatial import KDTree
 
+from octasplat.engine.core.compilation import run_ranges
 from octasplat.engine.core.errors import SceneFileError
-from octasplat.engine.edit.kernels.mean_value import mean_value_weights, winding_numbers
+from octasplat.engine.core.threads import threads_in_use
+from octasplat.engine.edit.kernels.mean_value import POINTS_PER_TASK, mean_value_weights, winding_numbers
 from octasplat.engine.edit.kernels.proxy import blend, triangle_weights
 from octasplat.engine.edit.mirror_detection import was_mirrored
 from octasplat.engine.gaussians.apply_legs import ROWS_PER_BLOCK, row_blocks
@@ -162,7 +164,8 @@ class NearestBinding:
             corners = self._corners[block]
             ties = self._bind_corners(corners)[0] if stored is None else stored
             points, places = np.ascontiguousarray(corners.reshape(-1, 3)), np.empty((corners.size // 3, 3))
-            blend(
+            run_ranges(
+                blend, threads_in_use(), len(points),
                 points, ties.starts, ties.triangles, ties.weights, derivatives, self._centres, moved_centres,
                 places,
             )  # fmt: skip
@@ -200,7 +203,10 @@ class MeanValueBinding:
         self._proxy = proxy
         self._corners = corners_world
         winding = np.zeros(len(corners_world), np.int64)
-        winding_numbers(corners_world.mean(axis=1), proxy.vertices_world, proxy.triangles, winding)
+        run_ranges(
+            winding_numbers, threads_in_use(), -(-len(winding) // POINTS_PER_TASK),
+            corners_world.mean(axis=1), proxy.vertices_world, proxy.triangles, winding, grain=1,
+        )  # fmt: skip
         inside = (winding != 0).astype(np.float64)
         self._influence = np.repeat(inside[:, None], corners_world.shape[1], axis=1)
         if reach_world is not None and reach_world > 0:
@@ -247,9 +253,10 @@ class MeanValueBinding:
         points = self._corners[rows].reshape(-1, 3)
         weights = np.empty((len(points), len(self._proxy.vertices_world)))
         proxy = self._proxy
-        mean_value_weights(
+        run_ranges(
+            mean_value_weights, threads_in_use(), -(-len(points) // POINTS_PER_TASK),
             points, proxy.vertices_world, proxy.triangles, self._edges, self._opposite, proxy.diagonal,
-            weights,
+            weights, grain=1,
         )  # fmt: skip
         return weights
 
@@ -279,7 +286,10 @@ class NearTriangles:
         chosen = np.zeros(candidates.shape, np.int32)
         weights = np.zeros(candidates.shape, np.float32)
         distances = np.zeros(len(points))
-        triangle_weights(points, self._corners, candidates, apart, self._spacing, chosen, weights, distances)
+        run_ranges(
+            triangle_weights, threads_in_use(), len(points),
+            points, self._corners, candidates, apart, self._spacing, chosen, weights, distances,
+        )  # fmt: skip
         return chosen, weights, distances
 
     def _candidates(

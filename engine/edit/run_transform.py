@@ -129,9 +129,8 @@ def rotate_environment(
     height = len(values)
     directions = _texel_directions(height) @ new_frame @ turn
     turned = np.empty((2 * height * height, 3), np.float32)
-    map_colours(
-        np.ascontiguousarray(values).reshape(-1, 3), height, old_frame, directions.astype(np.float32), turned
-    )
+    texels = np.ascontiguousarray(values).reshape(-1, 3)
+    map_colours(0, len(turned), texels, height, old_frame, directions.astype(np.float32), turned)
     return turned.reshape(height, 2 * height, 3)
 
 

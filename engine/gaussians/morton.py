@@ -3,7 +3,7 @@
 import numpy as np
 from jaxtyping import Float, Int64, UInt64
 
-from octasplat.engine.gaussians.morton_bits import spread_bits
+from octasplat.engine.gaussians.kernels.morton_bits import spread_bits
 
 _BITS = 21
 

@@ -10,6 +10,8 @@ from collections.abc import Mapping
 import numpy as np
 from jaxtyping import Float32, Float64, Int64
 
+from octasplat.engine.core.compilation import run_ranges
+from octasplat.engine.core.threads import threads_in_use
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.shading.adam_map import adam_change, unevenness
 from octasplat.engine.shading.environment_frame import environment_frame
@@ -86,7 +88,10 @@ class LearntBackground:
         """Display colours of unit directions, bilinear between texels."""
         height = len(self.rgb_srgb)
         colours = np.empty((len(directions_world), 3), np.float32)
-        map_colours(self.rgb_srgb.reshape(-1, 3), height, self.frame, directions_world, colours)
+        run_ranges(
+            map_colours, threads_in_use(), len(colours),
+            self.rgb_srgb.reshape(-1, 3), height, self.frame, directions_world, colours,
+        )  # fmt: skip
         return colours
 
     def features(self, gaussians: FlatGaussians) -> Float32[np.ndarray, "n f"] | None:

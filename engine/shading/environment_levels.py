@@ -6,14 +6,15 @@ over pi. Since the maps are fixed and linear, gradients go back by their transpo
 
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Float32, Float64, Int32, Int64
 from scipy.sparse import csr_matrix
 
+from octasplat.engine.core.compilation import run_ranges
 from octasplat.engine.core.errors import ConfigError
-from octasplat.engine.shading.kernels.environment_levels import lobe_rows, sparse_product
+from octasplat.engine.core.threads import threads_in_use
+from octasplat.engine.shading.kernels.environment_levels import LightLevels, lobe_rows, sparse_product
 
 ROUGHNESSES = (0.05, 0.15, 0.3, 0.5, 0.75, 1.0)
 """Perceptual roughness of each level; the first is the map itself."""
@@ -25,22 +26,6 @@ _LEAST = (0.0, 3e-3, 3e-3, 1e-3, 1e-3, 1e-3, 0.0)
 LEAST_HEIGHT = 16
 
 
-class LightLevels(NamedTuple):
-    """All levels one after another, as kernels take them.
-
-    Attributes:
-        texels: linear radiance.
-        offsets: first texel of each level; the irradiance comes last.
-        heights: rows of each level.
-        roughnesses: of each level but the last.
-    """
-
-    texels: Float32[np.ndarray, "t 3"]
-    offsets: Int64[np.ndarray, " l"]
-    heights: Int64[np.ndarray, " l"]
-    roughnesses: Float64[np.ndarray, " l1"]
-
-
 @dataclass(frozen=True)
 class _Rows:
     starts: Int64[np.ndarray, " r1"]
@@ -48,7 +33,10 @@ class _Rows:
     weights: Float32[np.ndarray, " k"]
 
     def times(self, values: Float[np.ndarray, "c 3"], out: Float[np.ndarray, "r 3"]) -> None:
-        sparse_product(self.starts, self.columns, self.weights, values, out)
+        run_ranges(
+            sparse_product, threads_in_use(), len(self.starts) - 1,
+            self.starts, self.columns, self.weights, values, out,
+        )  # fmt: skip
 
     def transposed(self, columns: int) -> "_Rows":
         shape = (len(self.starts) - 1, columns)
@@ -165,7 +153,10 @@ def _doubled(gradients: Float64[np.ndarray, "s 3"]) -> Float64[np.ndarray, "t 3"
 def _lobes(height: int, source: int, alpha: float, least: float) -> _Rows:
     starts = np.empty(2 * height * height + 1, np.int64)
     nothing = np.empty(0, np.int32), np.empty(0, np.float32)
-    lobe_rows(height, source, alpha, least, starts, *nothing, True)
+    lobe = (height, source, alpha, least, starts)
+    run_ranges(lobe_rows, threads_in_use(), len(starts) - 1, *lobe, *nothing, True)
+    starts[0] = 0
+    np.cumsum(starts, out=starts)
     columns, weights = np.empty(starts[-1], np.int32), np.empty(starts[-1], np.float32)
-    lobe_rows(height, source, alpha, least, starts, columns, weights, False)
+    run_ranges(lobe_rows, threads_in_use(), len(starts) - 1, *lobe, columns, weights, False)
     return _Rows(starts, columns, weights)

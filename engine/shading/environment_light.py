@@ -6,7 +6,8 @@ import numpy as np
 from jaxtyping import Float32, Float64, Int64
 
 from octasplat.engine.shading.adam_map import adam_change, unevenness
-from octasplat.engine.shading.environment_levels import LightLevels, prefilter, resampled, solid_angles
+from octasplat.engine.shading.environment_levels import prefilter, resampled, solid_angles
+from octasplat.engine.shading.kernels.environment_levels import LightLevels
 from octasplat.engine.shading.material_settings import ENVIRONMENT_EVERY
 
 FIRST_RADIANCE = 0.5

@@ -13,8 +13,8 @@ from jaxtyping import Float64
 
 from octasplat.engine.core.rays import RayBatch
 from octasplat.engine.shading.depth_split import Parted, part, whole
-from octasplat.engine.shading.environment_levels import LightLevels
 from octasplat.engine.shading.gbuffer import Buffer, Leaving, gather, reflected_rays, spread_back
+from octasplat.engine.shading.kernels.environment_levels import LightLevels
 from octasplat.engine.shading.split_sum import Surface, shade, shade_reverse
 from octasplat.engine.trace.protocol import Recording, TraceGradients, Tracer, TraceResult
 

@@ -15,9 +15,13 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Float64, Int32
 
-from octasplat.engine.shading.environment_levels import LightLevels
+from octasplat.engine.core.compilation import run_ranges
+from octasplat.engine.core.threads import threads_in_use
+from octasplat.engine.shading.kernels.environment_levels import LightLevels
 from octasplat.engine.shading.kernels.split_sum import (
     TAPS,
+    GradientArrays,
+    SurfaceArrays,
     add_to_texels,
     integrate_table,
     reverse_pixels,
@@ -33,7 +37,14 @@ TABLE_SAMPLES = 512
 def split_sum_table() -> Float64[np.ndarray, "a c 2"]:
     """Scale A and bias B of F0: rows are roughness 0 to 1, columns the cosine to the viewer 0 to 1."""
     table = np.empty((TABLE_ROUGHNESSES, TABLE_COSINES, 2))
-    integrate_table(TABLE_SAMPLES, table)
+    run_ranges(
+        integrate_table,
+        threads_in_use(),
+        TABLE_ROUGHNESSES * TABLE_COSINES,
+        TABLE_SAMPLES,
+        table,
+        grain=TABLE_COSINES,
+    )
     return table
 
 
@@ -129,7 +140,10 @@ def shade(
         frame: its right, up and forward in the world, as rows.
     """
     rgb = np.empty((len(surface.material), 3))
-    shade_pixels(*_arguments(surface, frame), light, split_sum_table(), rgb)
+    run_ranges(
+        shade_pixels, threads_in_use(), len(rgb),
+        _surface_arrays(surface, frame), light, split_sum_table(), rgb,
+    )  # fmt: skip
     return rgb
 
 
@@ -161,12 +175,16 @@ def shade_reverse(
         for name in ShadeGradients._fields
     }
     out = ShadeGradients(**arrays)
-    reverse_pixels(*_arguments(surface, frame), light, split_sum_table(), blur, by_rgb, out)
+    run_ranges(
+        reverse_pixels, threads_in_use(), count,
+        _surface_arrays(surface, frame), light, split_sum_table(), blur, by_rgb,
+        GradientArrays(*out),
+    )  # fmt: skip
     return out._replace(normal=out.normal @ frame, reflected=out.reflected @ frame)
 
 
-def _arguments(surface: Surface, frame: Float64[np.ndarray, "3 3"]) -> tuple[np.ndarray, ...]:
-    return (
+def _surface_arrays(surface: Surface, frame: Float64[np.ndarray, "3 3"]) -> SurfaceArrays:
+    return SurfaceArrays(
         surface.material,
         np.ascontiguousarray(surface.normal_world @ frame.T),
         np.ascontiguousarray(surface.direction_world @ frame.T),

@@ -2,15 +2,18 @@
 
 import numpy as np
 
+from octasplat.engine.core.compilation import run_ranges
 from octasplat.engine.core.errors import ConfigError
+from octasplat.engine.core.threads import threads_in_use
 from octasplat.engine.geometry.triangle_mesh import TriangleMesh
 from octasplat.engine.surface.kernels.marching_cubes import (
+    VolumeArrays,
     count_block_elements,
     place_triangles,
     place_vertices,
 )
 from octasplat.engine.surface.marching_cubes_table import EDGES, marching_table
-from octasplat.engine.surface.tsdf_volume import TsdfVolume
+from octasplat.engine.surface.tsdf_volume import BLOCKS_PER_THREAD, TsdfVolume
 
 
 def marching_cubes(volume: TsdfVolume, min_weight: float) -> TriangleMesh:
@@ -25,10 +28,16 @@ def marching_cubes(volume: TsdfVolume, min_weight: float) -> TriangleMesh:
     edge_table, triangle_counts = marching_table()
     edge_corners = np.array(EDGES, np.int32)
     count = len(volume.blocks)
-    of_volume = (volume.table, volume.blocks, volume.values, volume.weights, np.float32(min_weight))
+    arrays = VolumeArrays(
+        volume.table, volume.blocks, volume.values, volume.weights, float(np.float32(min_weight))
+    )
+    threads = threads_in_use()
     crossed = np.empty(volume.values.shape, np.uint8)
     vertex_counts, face_counts = np.empty(count, np.int64), np.empty(count, np.int64)
-    count_block_elements(*of_volume, triangle_counts, crossed, vertex_counts, face_counts)
+    run_ranges(
+        count_block_elements, threads, count,
+        arrays, triangle_counts, crossed, vertex_counts, face_counts, grain=BLOCKS_PER_THREAD,
+    )  # fmt: skip
     if face_counts.sum() == 0:
         raise ConfigError(
             "No surface was found in the region to mesh; name another with --bounds, or ask for less "
@@ -40,9 +49,16 @@ def marching_cubes(volume: TsdfVolume, min_weight: float) -> TriangleMesh:
     face_starts = np.cumsum(face_counts) - face_counts
     first = np.empty(volume.values.shape, np.int32)
     points = np.empty((int(vertex_counts.sum()), 3), np.float32)
-    place_vertices(*of_volume, crossed, vertex_starts, first, points)
+    run_ranges(
+        place_vertices, threads, count,
+        arrays, crossed, vertex_starts, first, points, grain=BLOCKS_PER_THREAD,
+    )  # fmt: skip
     faces = np.empty((int(face_counts.sum()), 3), np.int32)
-    place_triangles(*of_volume, edge_corners, edge_table, triangle_counts, crossed, first, face_starts, faces)
+    run_ranges(
+        place_triangles, threads, count, arrays,
+        edge_corners, edge_table, triangle_counts, crossed, first, face_starts, faces,
+        grain=BLOCKS_PER_THREAD,
+    )  # fmt: skip
     world = volume.region.world_from_grid(points).astype(np.float32)
     # Only the vertices that a cell with all its corners uses.
     return TriangleMesh(world, faces).select_faces(np.arange(len(faces)))

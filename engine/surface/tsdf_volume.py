@@ -5,12 +5,17 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float32, Int32
 
+from octasplat.engine.core.compilation import run_ranges
 from octasplat.engine.core.errors import ConfigError
+from octasplat.engine.core.threads import threads_in_use
 from octasplat.engine.surface.depth_maps import DepthMaps, Progress
 from octasplat.engine.surface.kernels.tsdf import (
     NO_BLOCK,
     TILE,
     VOXELS_PER_BLOCK,
+    DepthMap,
+    DepthView,
+    VoxelGrid,
     fuse_view,
     mark_blocks,
     tile_ranges,
@@ -18,6 +23,8 @@ from octasplat.engine.surface.kernels.tsdf import (
 from octasplat.engine.surface.options import ExtractionOptions
 from octasplat.engine.surface.region import NO_SURFACE_MESSAGE, Region
 
+ROWS_PER_THREAD, BLOCKS_PER_THREAD = 16, 16
+"""Rows of a depth map, and blocks of voxels, that are worth a thread."""
 BYTES_PER_BLOCK = VOXELS_PER_BLOCK * (4 + 4 + 4 + 1)
 """Distance and weight, and what marching cubes adds: the first vertex of each voxel and its crossed edges."""
 
@@ -64,10 +71,22 @@ def fuse_depth_maps(
     """
     total = 2 * len(maps.cameras)
     marks = np.zeros(region.blocks, np.uint8)
-    space = (region.low, region.voxel, region.contracted, region.centre_world, region.radius)
+    grid = VoxelGrid(
+        region.low, region.voxel, region.contracted, region.centre_world, region.radius, region.truncation
+    )
+    threads = threads_in_use()
     progress(0, total)
-    for number, (lens, distances) in enumerate(zip(_intrinsics(maps), maps.distances, strict=True)):
-        mark_blocks(np.asarray(distances), *lens, *space, region.truncation, marks)
+    for number, (view, distances) in enumerate(zip(_views(maps), maps.distances, strict=True)):
+        run_ranges(
+            mark_blocks,
+            threads,
+            len(distances),
+            np.asarray(distances),
+            view,
+            grid,
+            marks,
+            grain=ROWS_PER_THREAD,
+        )
         progress(number + 1, total)
     blocks = np.argwhere(marks).astype(np.int32)
     _check_size(len(blocks), options)
@@ -75,15 +94,16 @@ def fuse_depth_maps(
     table[tuple(blocks.T)] = np.arange(len(blocks), dtype=np.int32)
     values = np.zeros((len(blocks), VOXELS_PER_BLOCK), np.float32)
     weights = np.zeros((len(blocks), VOXELS_PER_BLOCK), np.float32)
-    for number, (lens, distances, cosines) in enumerate(
-        zip(_intrinsics(maps), maps.distances, maps.cosines, strict=True)
+    for number, (view, distances, cosines) in enumerate(
+        zip(_views(maps), maps.distances, maps.cosines, strict=True)
     ):
         tiles = (-(-distances.shape[0] // TILE), -(-distances.shape[1] // TILE))
         nearest, farthest = np.empty(tiles, np.float32), np.empty(tiles, np.float32)
         tile_ranges(np.asarray(distances), nearest, farthest)
-        fuse_view(
-            np.asarray(distances), np.asarray(cosines), nearest, farthest, *lens, *space,
-            region.truncation, blocks, values, weights,
+        depths = DepthMap(np.asarray(distances), np.asarray(cosines), nearest, farthest)
+        run_ranges(
+            fuse_view, threads, len(blocks), depths, view, grid, blocks, values, weights,
+            grain=BLOCKS_PER_THREAD,
         )  # fmt: skip
         progress(len(maps.cameras) + number + 1, total)
     return TsdfVolume(region, table, blocks, values, weights)
@@ -96,9 +116,10 @@ def fill_unseen(volume: TsdfVolume, min_weight: float) -> None:
     volume.weights[unseen] = min_weight
 
 
-def _intrinsics(maps: DepthMaps) -> list[tuple[float, float, float, float, np.ndarray, np.ndarray]]:
+def _views(maps: DepthMaps) -> list[DepthView]:
     return [
-        (c.fx_px, c.fy_px, c.cx_px, c.cy_px, c.rotation_cam_from_world, c.centre_world) for c in maps.cameras
+        DepthView(c.fx_px, c.fy_px, c.cx_px, c.cy_px, c.rotation_cam_from_world, c.centre_world)
+        for c in maps.cameras
     ]
 
 

@@ -13,7 +13,9 @@ from jaxtyping import Bool, Float32, Int32, UInt8
 from scipy.ndimage import maximum_filter, minimum_filter
 from scipy.sparse import csr_matrix
 
+from octasplat.engine.core.compilation import run_ranges
 from octasplat.engine.core.rays import ImageRays, RayBatch
+from octasplat.engine.core.threads import threads_in_use
 from octasplat.engine.geometry.triangle_mesh import TriangleMesh
 from octasplat.engine.surface.colour_fit import MIN_ALPHA, Picture, Progress, VertexPalette
 from octasplat.engine.surface.kernels.vertex_refinement import (
@@ -147,7 +149,8 @@ def _step(
     rgb = rgb + x[:, :3]
     normals = mesh.vertex_normals()
     change, lifts = np.empty_like(sight.weights), np.empty_like(sight.weights)
-    linearise(
+    run_ranges(
+        linearise, threads_in_use(), len(corners),
         mesh.vertices_world, normals, size, rgb, corners, sight.weights,
         sight.directions_world, sight.steady, change, lifts,
     )  # fmt: skip
@@ -170,7 +173,10 @@ class _PixelJacobian:
 
     def apply(self, values: Float32[np.ndarray, "n 4"]) -> Float32[np.ndarray, "p 3"]:
         pixels = np.empty_like(self.change)
-        apply_jacobian(self.corners, self.weights, self.lifts, self.change, values, pixels)
+        run_ranges(
+            apply_jacobian, threads_in_use(), len(pixels),
+            self.corners, self.weights, self.lifts, self.change, values, pixels,
+        )  # fmt: skip
         return pixels
 
     def apply_transpose(self, pixels: Float32[np.ndarray, "p 3"], count: int) -> Float32[np.ndarray, "n 4"]:

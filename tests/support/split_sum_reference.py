@@ -3,7 +3,7 @@
 import numpy as np
 import torch
 
-from octasplat.engine.shading.environment_levels import LightLevels
+from octasplat.engine.shading.kernels.environment_levels import LightLevels
 from octasplat.engine.shading.split_sum import split_sum_table
 
 

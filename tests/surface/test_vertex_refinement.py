@@ -31,7 +31,7 @@ def test_vertex_gather_is_transpose_of_scatter():
 
     def pixels_of(values: np.ndarray) -> np.ndarray:
         pixels = np.empty((7, 3), np.float32)
-        apply_jacobian(corners, weights, lifts, change, values, pixels)
+        apply_jacobian(0, len(corners), corners, weights, lifts, change, values, pixels)
         return pixels
 
     units = np.eye(20, dtype=np.float32).reshape(20, 5, 4)
@@ -56,6 +56,8 @@ def test_ray_at_raised_plane_sees_neighbouring_colour():
     sizes = np.full(3, 0.5, np.float32)
     change, lifts = np.empty((3, 3), np.float32), np.empty((3, 3), np.float32)
     linearise(
+        0,
+        len(corners),
         vertices,
         normals,
         sizes,

@@ -1,41 +1,76 @@
 """Compiled gathers over the mapped pixels and ray tables."""
 
 import math
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
+from jaxtyping import Float32, Float64, Int64, UInt, UInt8
 
 from octasplat.engine.core.compilation import kernel
 
 
+class PixelIndices(NamedTuple):
+    """Pixels of views: the view, row and column of each."""
+
+    view: Int64[np.ndarray, " n"]
+    y: Int64[np.ndarray, " n"]
+    x: Int64[np.ndarray, " n"]
+
+
+class ViewArrays(NamedTuple):
+    """Views of a dataset.
+
+    Attributes:
+        sizes: width and height of each.
+        cameras: camera of each.
+        camera_tables: first pixel of each camera's table of directions, -1 for a pinhole, -2 for neither.
+        table: camera-frame directions of all tables; not a number where a pixel has no ray.
+    """
+
+    sizes: Int64[np.ndarray, "v 2"]
+    cameras: Int64[np.ndarray, " v"]
+    camera_tables: Int64[np.ndarray, " c"]
+    table: Float32[np.ndarray, " t"]
+
+
+class PixelPlanes(NamedTuple):
+    """Photographs and masks of all views, one view after another.
+
+    Attributes:
+        offsets: first pixel of each view.
+        rgb: colours.
+        rgb_full: the value of full brightness.
+        alpha: alpha, or empty.
+        mask: masks, or empty.
+        mask_is_alpha: whether the mask multiplies alpha instead of deciding the weight.
+    """
+
+    offsets: Int64[np.ndarray, " v"]
+    rgb: UInt[np.ndarray, " p3"]
+    rgb_full: np.float32
+    alpha: UInt8[np.ndarray, " p"]
+    mask: UInt8[np.ndarray, " p"]
+    mask_is_alpha: bool
+
+
 @kernel()
 def gather_rays(
-    view: Any,
-    y: Any,
-    x: Any,
-    view_size: Any,
-    view_camera: Any,
-    rotations_world_from_cam: Any,
-    origins_world: Any,
-    camera_pinhole: Any,
-    camera_table: Any,
-    table: Any,
-    origins: Any,
-    directions: Any,
+    pixels: PixelIndices,
+    views: ViewArrays,
+    rotations_world_from_cam: Float64[np.ndarray, "v 3 3"],
+    origins_world: Float32[np.ndarray, "v 3"],
+    camera_pinhole: Float64[np.ndarray, "c 4"],
+    origins: Float32[np.ndarray, "n 3"],
+    directions: Float32[np.ndarray, "n 3"],
 ) -> int:
-    """Write the world rays of n pixels to ``origins`` and ``directions``, both (n, 3) float32.
+    """Write the world rays of pixels to ``origins`` and ``directions``.
 
     Args:
-        view: view of each pixel, (n,) int64.
-        y: row of each pixel, (n,) int64.
-        x: column of each pixel, (n,) int64.
-        view_size: width and height of each view, (v, 2) int64.
-        view_camera: camera of each view, (v,) int64.
-        rotations_world_from_cam: (v, 3, 3) float64.
-        origins_world: (v, 3) float32.
-        camera_pinhole: fx, fy, cx, cy of each camera, (c, 4) float64; used where it is a pinhole.
-        camera_table: first pixel of each camera's table, -1 for a pinhole, -2 for neither, (c,) int64.
-        table: camera-frame directions, flat float32.
+        pixels: the pixels.
+        views: what they belong to.
+        rotations_world_from_cam: of the views.
+        origins_world: centres of their cameras.
+        camera_pinhole: fx, fy, cx, cy of each camera; used where it is a pinhole.
         origins: receives the ray origins.
         directions: receives unit directions. Pixels without a ray, and those of cameras with neither
             formula nor table, look along the axis of the camera.
@@ -43,6 +78,8 @@ def gather_rays(
     Returns:
         The first index whose pixel does not exist, or -1.
     """
+    view, y, x = pixels
+    view_size, view_camera, camera_table, table = views
     for i in range(view.shape[0]):
         v = view[i]
         if (
@@ -77,39 +114,19 @@ def gather_rays(
 
 @kernel()
 def gather_pixels(
-    view: Any,
-    y: Any,
-    x: Any,
-    view_size: Any,
-    view_camera: Any,
-    view_offset: Any,
-    camera_table: Any,
-    table: Any,
-    rgb: Any,
-    rgb_full: Any,
-    alpha: Any,
-    mask: Any,
-    mask_is_alpha: Any,
-    rgb_out: Any,
-    alpha_out: Any,
-    weight_out: Any,
+    pixels: PixelIndices,
+    views: ViewArrays,
+    planes: PixelPlanes,
+    rgb_out: Float32[np.ndarray, "n 3"],
+    alpha_out: Float32[np.ndarray, " n"],
+    weight_out: Float32[np.ndarray, " n"],
 ) -> int:
-    """Write colours (n, 3), alpha (n,) and weights (n,) of n pixels to the three last arguments.
+    """Write colours, alpha and weights of pixels.
 
     Args:
-        view: view of each pixel, (n,) int64.
-        y: row of each pixel, (n,) int64.
-        x: column of each pixel, (n,) int64.
-        view_size: width and height of each view, (v, 2) int64.
-        view_camera: camera of each view, (v,) int64.
-        view_offset: first pixel of each view in the planes, int64.
-        camera_table: see :func:`gather_rays`.
-        table: see :func:`gather_rays`.
-        rgb: colours of all views, flat uint8 or uint16.
-        rgb_full: the value of full brightness, float32.
-        alpha: alpha of all views, flat uint8, or empty.
-        mask: masks of all views, flat uint8, or empty.
-        mask_is_alpha: whether the mask multiplies alpha instead of deciding the weight.
+        pixels: the pixels.
+        views: what they belong to.
+        planes: the photographs.
         rgb_out: receives display colours in [0, 1].
         alpha_out: receives alpha in [0, 1].
         weight_out: receives 1, or 0 where the pixel does not count.
@@ -117,6 +134,9 @@ def gather_pixels(
     Returns:
         The first index whose pixel does not exist, or -1.
     """
+    view, y, x = pixels
+    view_size, view_camera, camera_table, table = views
+    view_offset, rgb, rgb_full, alpha, mask, mask_is_alpha = planes
     byte = np.float32(255.0)
     one = np.float32(1.0)
     zero = np.float32(0.0)

@@ -6,17 +6,24 @@ points in the plane of a triangle.
 """
 
 import math
+from collections.abc import Callable, Sequence
 
 import llvmlite.ir as ir
 import numpy as np
-from numba import prange, types
+from jaxtyping import Float64, Int, Int64
+from numba import types
+from numba.core.base import BaseContext
+from numba.core.typing import Context as TypingContext
+from numba.core.typing.templates import Signature
 from numba.extending import intrinsic
 from numpy.polynomial import Chebyshev, Polynomial
 
 from octasplat.engine.core.compilation import device_function, kernel
-from octasplat.engine.trace.cpu.kernels.simd_vector import DOUBLE8, LANES, VectorRows, broadcast
+from octasplat.engine.trace.cpu.kernels.simd_vector import DOUBLE8, LANES, Vector, VectorRows, broadcast
+from octasplat.engine.trace.kernels.native import Address, Intrinsic
 
-GROUPS_PER_TASK = 16
+POINTS_PER_TASK = 16 * LANES
+"""Points that a thread takes at a time."""
 FLAT_TOLERANCE = 1e-9
 """A point lies in the plane of a triangle if its unit vectors to the corners span less than this, as a share
 of what those to the last two do."""
@@ -30,18 +37,20 @@ POINT_ROWS, VERTEX_ROWS = 3, 4
 their distance. Of edges it is half the angle that they are seen under over its sine."""
 
 
-def _arctangent(squared):
+def _arctangent(squared: Float64[np.ndarray, " n"]) -> Float64[np.ndarray, " n"]:
     root = np.sqrt(np.maximum(squared, TINY_LENGTH))
     return np.arctan(root) / root
 
 
-def _half_angle_over_sine(missing):
+def _half_angle_over_sine(missing: Float64[np.ndarray, " n"]) -> Float64[np.ndarray, " n"]:
     # By half the angle, whose sine is known to all digits.
     half = np.arcsin(np.sqrt(np.maximum(missing, TINY_LENGTH) / 2))
     return half / np.sin(2 * half)
 
 
-def _fit_polynomial(function, degree: int, end: float) -> list[float]:
+def _fit_polynomial(
+    function: Callable[[Float64[np.ndarray, " n"]], Float64[np.ndarray, " n"]], degree: int, end: float
+) -> list[float]:
     """Coefficients of a polynomial that is a function from 0 to ``end``, to rounding."""
     fitted = Chebyshev.interpolate(function, degree, domain=[0.0, end])
     return [float(value) for value in fitted.convert(kind=Polynomial).coef]
@@ -53,14 +62,14 @@ NARROW = _fit_polynomial(_half_angle_over_sine, 17, 1.0 - WIDE_ANGLE)
 """Of half an angle over its sine, by what its cosine lacks of 1."""
 
 
-def _polynomial(coefficients, x):
+def _polynomial(coefficients: Sequence[float], x: Vector) -> Vector:
     value = x * coefficients[-1] + coefficients[-2]
     for coefficient in coefficients[-3::-1]:
         value = value * x + coefficient
     return value
 
 
-def _angle(sine, cosine):
+def _angle(sine: Vector, cosine: Vector) -> Vector:
     """Angles in [0, pi] of vectors whose sines are not negative; both may have any common factor."""
     ahead = abs(cosine)
     beyond = sine > ahead
@@ -74,24 +83,28 @@ def _angle(sine, cosine):
     return (cosine < 0.0).select(angle * -1.0 + math.pi, angle)
 
 
-def _constant_one(builder):
+def _constant_one(builder: ir.IRBuilder) -> Vector:
     return broadcast(builder, ir.Constant(ir.DoubleType(), 1.0))
 
 
-def _cross(a, b):
+def _cross(a: Sequence[Vector], b: Sequence[Vector]) -> list[Vector]:
     return [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
 
 
-def _dot(a, b):
+def _dot(a: Sequence[Vector], b: Sequence[Vector]) -> Vector:
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 @intrinsic
-def vertex_rows(typingctx, points, x, y, z, near, vertex):
+def vertex_rows(
+    typingctx: TypingContext, points: Address, x: float, y: float, z: float, near: float, vertex: Address
+) -> Intrinsic:
     """Write the rows of a vertex as seen from the points; bit k: point k is nearer to it than ``near``."""
     signature = types.int64(types.uintp, *[types.float64] * 4, types.uintp)
 
-    def codegen(context, builder, sig, args):
+    def codegen(
+        context: BaseContext, builder: ir.IRBuilder, sig: Signature, args: Sequence[ir.Value]
+    ) -> ir.Value:
         seen_from, rows = (VectorRows(builder, address, DOUBLE8) for address in (args[0], args[5]))
         way = [broadcast(builder, args[1 + axis]) - seen_from[axis] for axis in range(3)]
         length = _dot(way, way).sqrt()
@@ -105,14 +118,16 @@ def vertex_rows(typingctx, points, x, y, z, near, vertex):
 
 
 @intrinsic
-def edge_rows(typingctx, a, b, edge):
+def edge_rows(typingctx: TypingContext, a: Address, b: Address, edge: Address) -> Intrinsic:
     """Write the row of the edge between two vertices; bit k: point k sees it under a wide angle.
 
     Then the row is not right; :func:`edge_rows_wide` writes it.
     """
     signature = types.int64(types.uintp, types.uintp, types.uintp)
 
-    def codegen(context, builder, sig, args):
+    def codegen(
+        context: BaseContext, builder: ir.IRBuilder, sig: Signature, args: Sequence[ir.Value]
+    ) -> ir.Value:
         a, b = (_unit(builder, address) for address in args[:2])
         cosine = _dot(a, b)
         VectorRows(builder, args[2], DOUBLE8)[0] = _polynomial(NARROW, cosine * -1.0 + 1.0)
@@ -122,11 +137,13 @@ def edge_rows(typingctx, a, b, edge):
 
 
 @intrinsic
-def edge_rows_wide(typingctx, a, b, edge):
+def edge_rows_wide(typingctx: TypingContext, a: Address, b: Address, edge: Address) -> Intrinsic:
     """Write the row of the edge between two vertices, whatever its angle."""
     signature = types.void(types.uintp, types.uintp, types.uintp)
 
-    def codegen(context, builder, sig, args):
+    def codegen(
+        context: BaseContext, builder: ir.IRBuilder, sig: Signature, args: Sequence[ir.Value]
+    ) -> ir.Value:
         a, b = (_unit(builder, address) for address in args[:2])
         across = _cross(a, b)
         sine = _dot(across, across).sqrt()
@@ -137,7 +154,7 @@ def edge_rows_wide(typingctx, a, b, edge):
     return signature, codegen
 
 
-def _unit(builder, address):
+def _unit(builder: ir.IRBuilder, address: ir.Value) -> list[Vector]:
     rows = VectorRows(builder, address, DOUBLE8)
     return [rows[axis] for axis in range(3)]
 
@@ -145,14 +162,14 @@ def _unit(builder, address):
 class _Triangle:
     """A triangle as seen from the points."""
 
-    def __init__(self, builder, corners, edges):
+    def __init__(self, builder: ir.IRBuilder, corners: ir.Value, edges: ir.Value) -> None:
         self._builder = builder
         self.units = [_unit(builder, builder.extract_value(corners, k)) for k in range(3)]
         self.normals = [_cross(self.units[(k + 1) % 3], self.units[(k + 2) % 3]) for k in range(3)]
         self.volume = _dot(self.units[0], self.normals[0])
         self._shares = [VectorRows(builder, builder.extract_value(edges, k), DOUBLE8)[0] for k in range(3)]
 
-    def add(self, where, sums):
+    def add(self, where: Vector, sums: ir.Value) -> None:
         """Add the components of the mean vector to the sums of the corners."""
         builder, normals, shares = self._builder, self.normals, self._shares
         mean = [
@@ -169,14 +186,21 @@ THREE_CORNERS = types.UniTuple(types.uintp, 3)
 
 
 @intrinsic
-def add_means(typingctx, corners, edges, sums):
+def add_means(
+    typingctx: TypingContext,
+    corners: tuple[Address, Address, Address],
+    edges: tuple[Address, Address, Address],
+    sums: tuple[Address, Address, Address],
+) -> Intrinsic:
     """Add what a triangle counts for its corners to their sums; bit k: not for point k, to which it is flat.
 
     All three arguments hold three addresses, of edge k that of the one opposite of corner k.
     """
     signature = types.int64(THREE_CORNERS, THREE_CORNERS, THREE_CORNERS)
 
-    def codegen(context, builder, sig, args):
+    def codegen(
+        context: BaseContext, builder: ir.IRBuilder, sig: Signature, args: Sequence[ir.Value]
+    ) -> ir.Value:
         triangle = _Triangle(builder, *args[:2])
         solid = abs(triangle.volume) > FLAT_TOLERANCE
         triangle.add(solid, args[2])
@@ -186,11 +210,18 @@ def add_means(typingctx, corners, edges, sums):
 
 
 @intrinsic
-def add_flat_means(typingctx, corners, edges, sums):
+def add_flat_means(
+    typingctx: TypingContext,
+    corners: tuple[Address, Address, Address],
+    edges: tuple[Address, Address, Address],
+    sums: tuple[Address, Address, Address],
+) -> Intrinsic:
     """Add what :func:`add_means` has left out; bit k: point k lies on the triangle."""
     signature = types.int64(THREE_CORNERS, THREE_CORNERS, THREE_CORNERS)
 
-    def codegen(context, builder, sig, args):
+    def codegen(
+        context: BaseContext, builder: ir.IRBuilder, sig: Signature, args: Sequence[ir.Value]
+    ) -> ir.Value:
         triangle = _Triangle(builder, *args[:2])
         u, sines = triangle.units, [_dot(normal, normal).sqrt() for normal in triangle.normals]
         size = abs(triangle.volume)
@@ -206,11 +237,15 @@ def add_flat_means(typingctx, corners, edges, sums):
 
 
 @intrinsic
-def add_solid_angle(typingctx, corners, total):
+def add_solid_angle(
+    typingctx: TypingContext, corners: tuple[Address, Address, Address], total: Address
+) -> Intrinsic:
     """Add half the solid angle of a triangle (Van Oosterom and Strackee 1983) to a row."""
     signature = types.void(THREE_CORNERS, types.uintp)
 
-    def codegen(context, builder, sig, args):
+    def codegen(
+        context: BaseContext, builder: ir.IRBuilder, sig: Signature, args: Sequence[ir.Value]
+    ) -> ir.Value:
         a, b, c = (_unit(builder, builder.extract_value(args[0], k)) for k in range(3))
         volume = _dot(a, _cross(b, c))
         angle = _angle(abs(volume), _dot(a, b) + _dot(b, c) + _dot(c, a) + 1.0)
@@ -222,7 +257,14 @@ def add_solid_angle(typingctx, corners, total):
 
 
 @device_function(error_model="numpy")
-def _gather(points, first, vertices, near, rows, seen):
+def _gather(
+    points: Float64[np.ndarray, "p 3"],
+    first: int,
+    vertices: Float64[np.ndarray, "v 3"],
+    near: float,
+    rows: Float64[np.ndarray, "3 8"],
+    seen: Float64[np.ndarray, "s 8"],
+) -> int:
     """Eight points from ``first`` on (the last one again where there are fewer), and the vertices from there.
 
     Returns the bits of points that are nearer to a vertex than ``near``.
@@ -238,19 +280,34 @@ def _gather(points, first, vertices, near, rows, seen):
     return met
 
 
-@kernel(parallel=True, error_model="numpy")
-def winding_numbers(points, vertices, triangles, result):
-    """How often a closed mesh winds round each point: the sum of its triangles' solid angles over 4 pi."""
-    chunks = -(-len(points) // (GROUPS_PER_TASK * LANES))
-    for chunk in prange(chunks):
-        _winding_block(points, vertices, triangles, chunk * GROUPS_PER_TASK * LANES, result)
+@kernel(error_model="numpy")
+def winding_numbers(
+    first_task: int,
+    last_task: int,
+    points: Float64[np.ndarray, "p 3"],
+    vertices: Float64[np.ndarray, "v 3"],
+    triangles: Int[np.ndarray, "t 3"],
+    result: Int64[np.ndarray, " p"],
+) -> None:
+    """Write how often a closed mesh winds round each point: its triangles' solid angles over 4 pi.
+
+    A task has :data:`POINTS_PER_TASK` points.
+    """
+    for chunk in range(first_task, last_task):
+        _winding_block(points, vertices, triangles, chunk * POINTS_PER_TASK, result)
 
 
 @device_function(error_model="numpy")
-def _winding_block(points, vertices, triangles, start, result):
+def _winding_block(
+    points: Float64[np.ndarray, "p 3"],
+    vertices: Float64[np.ndarray, "v 3"],
+    triangles: Int[np.ndarray, "t 3"],
+    start: int,
+    result: Int64[np.ndarray, " p"],
+) -> None:
     rows, total = np.empty((POINT_ROWS, LANES)), np.empty((1, LANES))
     seen = np.empty((len(vertices) * VERTEX_ROWS, LANES))
-    for first in range(start, min(start + GROUPS_PER_TASK * LANES, len(points)), LANES):
+    for first in range(start, min(start + POINTS_PER_TASK, len(points)), LANES):
         _gather(points, first, vertices, 0.0, rows, seen)
         total[:] = 0.0
         at, step = seen.ctypes.data, VERTEX_ROWS * LANES * 8
@@ -263,23 +320,41 @@ def _winding_block(points, vertices, triangles, start, result):
             result[first + lane] = np.int64(np.rint(total[0, lane] / TURN))
 
 
-@kernel(parallel=True, error_model="numpy")
-def mean_value_weights(points, vertices, triangles, edges, opposite, size, weights):
-    """Mean-value coordinates of points in a closed triangle mesh (Ju, Schaefer, Warren 2005).
+@kernel(error_model="numpy")
+def mean_value_weights(
+    first_task: int,
+    last_task: int,
+    points: Float64[np.ndarray, "p 3"],
+    vertices: Float64[np.ndarray, "v 3"],
+    triangles: Int[np.ndarray, "t 3"],
+    edges: Int[np.ndarray, "e 2"],
+    opposite: Int[np.ndarray, "t 3"],
+    size: float,
+    weights: Float64[np.ndarray, "p v"],
+) -> None:
+    """Write mean-value coordinates of points in a closed triangle mesh (Ju, Schaefer, Warren 2005).
 
     The weights of a triangle are the components of its mean vector, half the sum of its angles times the unit
     normals of the three planes through the point and an edge, along the directions of its corners. ``size``
     is a length of the mesh, against which nearness is judged. ``opposite`` names the edge opposite of each
     corner of each triangle.
     """
-    chunks = -(-len(points) // (GROUPS_PER_TASK * LANES))
-    for chunk in prange(chunks):
-        start = chunk * GROUPS_PER_TASK * LANES
+    for chunk in range(first_task, last_task):
+        start = chunk * POINTS_PER_TASK
         _weights_block(points, vertices, triangles, edges, opposite, 1e-9 * size, start, weights)
 
 
 @device_function(error_model="numpy")
-def _weights_block(points, vertices, triangles, edges, opposite, near, start, weights):
+def _weights_block(
+    points: Float64[np.ndarray, "p 3"],
+    vertices: Float64[np.ndarray, "v 3"],
+    triangles: Int[np.ndarray, "t 3"],
+    edges: Int[np.ndarray, "e 2"],
+    opposite: Int[np.ndarray, "t 3"],
+    near: float,
+    start: int,
+    weights: Float64[np.ndarray, "p v"],
+) -> None:
     count = len(vertices)
     rows = np.empty((POINT_ROWS, LANES))
     # Of vertices, then of edges; one array, as numba frees what only its address is used of.
@@ -287,7 +362,7 @@ def _weights_block(points, vertices, triangles, edges, opposite, near, start, we
     row, step = LANES * 8, VERTEX_ROWS * LANES * 8
     at, counted = seen.ctypes.data, sums.ctypes.data
     beside = at + count * step
-    for first in range(start, min(start + GROUPS_PER_TASK * LANES, len(points)), LANES):
+    for first in range(start, min(start + POINTS_PER_TASK, len(points)), LANES):
         special = _gather(points, first, vertices, near, rows, seen)
         for e in range(len(edges)):
             a, b = np.uintp(at + edges[e, 0] * step), np.uintp(at + edges[e, 1] * step)
@@ -317,8 +392,17 @@ def _weights_block(points, vertices, triangles, edges, opposite, near, start, we
 
 
 @device_function(error_model="numpy")
-def _boundary_coordinates(point, vertices, triangles, near, row):
-    """Coordinates of a point that is one of the vertices, or else lies on a triangle: the first one's."""
+def _boundary_coordinates(
+    point: Float64[np.ndarray, "3"],
+    vertices: Float64[np.ndarray, "v 3"],
+    triangles: Int[np.ndarray, "t 3"],
+    near: float,
+    row: Float64[np.ndarray, " v"],
+) -> None:
+    """Write the coordinates of a point that is one of the vertices, or else lies on a triangle.
+
+    The first one's.
+    """
     row[:] = 0.0
     way = np.empty((3, 3))
     lengths, areas = np.empty(3), np.empty(3)

@@ -3,14 +3,22 @@
 import math
 
 import numpy as np
-from numba import prange
+from jaxtyping import Float32, Float64, Int32, Int64
 
-from octasplat.engine.core.compilation import kernel
+from octasplat.engine.core.compilation import device_function, kernel
 
 
-@kernel()
-def point_triangle_distance(point, a, b, c):
-    """Distance of a point from a triangle (the regions of Ericson, Real-Time Collision Detection, 5.1.5)."""
+@device_function()
+def point_triangle_distance(
+    point: Float64[np.ndarray, "3"],
+    a: Float64[np.ndarray, "3"],
+    b: Float64[np.ndarray, "3"],
+    c: Float64[np.ndarray, "3"],
+) -> float:
+    """Return the distance of a point from a triangle.
+
+    The regions are those of "Real-Time Collision Detection" (Ericson 2005), 5.1.5.
+    """
     ab0, ab1, ab2 = b[0] - a[0], b[1] - a[1], b[2] - a[2]
     ac0, ac1, ac2 = c[0] - a[0], c[1] - a[1], c[2] - a[2]
     p0, p1, p2 = point[0] - a[0], point[1] - a[1], point[2] - a[2]
@@ -46,20 +54,31 @@ def point_triangle_distance(point, a, b, c):
     return math.sqrt(x * x + y * y + z * z)
 
 
-@kernel(parallel=True)
-def triangle_weights(points, corners, candidates, sample_distances, falloff, chosen, weights, distances):
-    """Nearest triangles of each point among ``candidates`` and smooth weights for them.
+@kernel()
+def triangle_weights(
+    first: int,
+    last: int,
+    points: Float64[np.ndarray, "p 3"],
+    corners: Float64[np.ndarray, "t 3 3"],
+    candidates: Int64[np.ndarray, "p k"],
+    sample_distances: Float64[np.ndarray, "p k"],
+    falloff: float,
+    chosen: Int32[np.ndarray, "p k"],
+    weights: Float32[np.ndarray, "p k"],
+    distances: Float64[np.ndarray, " p"],
+) -> None:
+    """Write the nearest triangles of each point among ``candidates`` and smooth weights for them.
 
     The weight falls from 1 at the nearest triangle's distance to 0 at ``falloff`` more, and to 0 at the last
     of the candidates, which came in order of ``sample_distances``; both with zero slope at the end. So it
     changes smoothly as a point moves and as candidates come and go. Unused places have weight 0.
     """
     width = candidates.shape[1]
-    for i in prange(points.shape[0]):
+    for i in range(first, last):
         found = np.empty(width, np.int64)
         far = np.empty(width)
         fade = np.empty(width)
-        last = max(sample_distances[i, width - 1], 1e-300)
+        farthest = max(sample_distances[i, width - 1], 1e-300)
         count = 0
         least = np.inf
         for k in range(width):
@@ -76,7 +95,7 @@ def triangle_weights(points, corners, candidates, sample_distances, falloff, cho
             )
             found[count] = triangle
             far[count] = d
-            share = sample_distances[i, k] / last  # the triangle's nearest sample, as they are in order
+            share = sample_distances[i, k] / farthest  # the triangle's nearest sample, as they are in order
             fade[count] = (1.0 - share * share) ** 2
             count += 1
             least = min(least, d)
@@ -95,13 +114,24 @@ def triangle_weights(points, corners, candidates, sample_distances, falloff, cho
         distances[i] = least
 
 
-@kernel(parallel=True)
-def blend(points, starts, triangles, weights, derivatives, centres, moved_centres, result):
-    """Result = mean over the triangles t of each point, by their weights, of F_t (x - c_t) + c'_t.
+@kernel()
+def blend(
+    first: int,
+    last: int,
+    points: Float64[np.ndarray, "p 3"],
+    starts: Int64[np.ndarray, " p1"],
+    triangles: Int32[np.ndarray, " k"],
+    weights: Float32[np.ndarray, " k"],
+    derivatives: Float64[np.ndarray, "t 3 3"],
+    centres: Float64[np.ndarray, "t 3"],
+    moved_centres: Float64[np.ndarray, "t 3"],
+    result: Float64[np.ndarray, "p 3"],
+) -> None:
+    """Write the mean over the triangles t of each point, by their weights, of F_t (x - c_t) + c'_t.
 
     The triangles of point i stand from ``starts[i]`` to ``starts[i + 1]``; a point without any stays.
     """
-    for i in prange(points.shape[0]):
+    for i in range(first, last):
         x = y = z = total = 0.0
         for k in range(starts[i], starts[i + 1]):
             weight = np.float64(weights[k])

@@ -5,9 +5,10 @@ wide as it is high. Directions here are in the map's own frame: right, up, forwa
 """
 
 import math
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
-from numba import prange
+from jaxtyping import Float, Float32, Float64, Int32, Int64
 
 from octasplat.engine.core.compilation import device_function, kernel
 from octasplat.engine.shading.kernels.microfacets import ggx_density
@@ -16,8 +17,28 @@ LEAST_SQUARE = 1e-6
 """Nearer than this to a pole, a longitude has no slope."""
 
 
+Lookup: TypeAlias = tuple[int, int, int, int, float, float, float, float, float]
+"""Where a direction lies in a level, see :func:`look_up`."""
+
+
+class LightLevels(NamedTuple):
+    """All levels one after another, as kernels take them.
+
+    Attributes:
+        texels: linear radiance.
+        offsets: first texel of each level; the irradiance comes last.
+        heights: rows of each level.
+        roughnesses: of each level but the last.
+    """
+
+    texels: Float32[np.ndarray, "t 3"]
+    offsets: Int64[np.ndarray, " l"]
+    heights: Int64[np.ndarray, " l"]
+    roughnesses: Float64[np.ndarray, " l1"]
+
+
 @device_function(error_model="numpy", inline="always")
-def texel_direction(row, column, height):
+def texel_direction(row: int, column: int, height: int) -> tuple[float, float, float]:
     """The middle of a texel."""
     polar = math.pi * (row + 0.5) / height
     longitude = math.pi * ((column + 0.5) / height - 1.0)
@@ -26,7 +47,7 @@ def texel_direction(row, column, height):
 
 
 @device_function(error_model="numpy")
-def lobe_weight(cosine, alpha):
+def lobe_weight(cosine: float, alpha: float) -> float:
     """What a rough mirror that looks along its normal takes from a direction of that cosine to it.
 
     GGX's density of the half vector times the cosine; pure cosine where ``alpha`` is negative.
@@ -38,33 +59,54 @@ def lobe_weight(cosine, alpha):
     return ggx_density(math.sqrt(0.5 * (1.0 + cosine)), alpha) * cosine
 
 
-@kernel(parallel=True, error_model="numpy")
-def lobe_rows(height, source_height, alpha, least, starts, columns, weights, counting):
-    """Each texel of a level as a weighted mean of texels of a map, in compressed sparse rows.
+@device_function(error_model="numpy")
+def lobe_reach(alpha: float, least_weight: float) -> float:
+    """Return the angle at which a lobe's weight falls below the least one."""
+    if alpha < 0.0:
+        return math.pi / 2
+    reach = 0.0
+    while reach < math.pi / 2 and lobe_weight(math.cos(reach), alpha) > least_weight:
+        reach += 0.002
+    return reach
+
+
+@kernel(error_model="numpy")
+def lobe_rows(
+    first_row: int,
+    last_row: int,
+    height: int,
+    source_height: int,
+    alpha: float,
+    least: float,
+    starts: Int64[np.ndarray, " r1"],
+    columns: Int32[np.ndarray, " k"],
+    weights: Float32[np.ndarray, " k"],
+    counting: bool,
+) -> None:
+    """Write each texel of a level as a weighted mean of texels of a map, in compressed sparse rows.
 
     Args:
+        first_row: the first texel of the level that is written.
+        last_row: the one behind the last.
         height: rows of the level.
         source_height: rows of the map that it is made from.
         alpha: GGX's; negative for irradiance over pi.
         least: share of the largest weight below which a texel is left out.
-        starts: where each row begins; it is written if ``counting``, and else read.
+        starts: where each row begins; if ``counting``, its length is written to the place behind, else it is
+            read.
         columns: receives the numbers of the texels.
         weights: receives their weights; they add up to 1.
         counting: whether only ``starts`` is wanted.
     """
     least_weight = least * lobe_weight(1.0, alpha)
-    reach = math.pi / 2  # angle at which the weight falls below the least one
-    if alpha >= 0.0:
-        reach = 0.0
-        while reach < math.pi / 2 and lobe_weight(math.cos(reach), alpha) > least_weight:
-            reach += 0.002
+    reach = lobe_reach(alpha, least_weight)
     texel = math.pi / source_height
+    # --- directions of the map's texels ---
     sources = np.empty((source_height, 2 * source_height, 3))
     for j in range(source_height):
         for i in range(2 * source_height):
             sources[j, i] = texel_direction(j, i, source_height)
-    starts[0] = 0
-    for number in prange(2 * height * height):
+    for number in range(first_row, last_row):
         row, column = number // (2 * height), number % (2 * height)
         polar = math.pi * (row + 0.5) / height
         top = max(0, int((polar - reach) / texel - 1.0))
@@ -91,15 +133,23 @@ def lobe_rows(height, source_height, alpha, least, starts, columns, weights, cou
         else:
             for k in range(first, place):
                 weights[k] /= total
-    if counting:
-        for number in range(2 * height * height):
-            starts[number + 1] += starts[number]
 
 
-@kernel(parallel=True, error_model="numpy")
-def sparse_product(starts, columns, weights, values, out):
-    """``out`` = the sparse rows times ``values``, three channels; each sum in the order of its row."""
-    for row in prange(len(starts) - 1):
+@kernel(_nrt=False, error_model="numpy")
+def sparse_product(
+    first: int,
+    last: int,
+    starts: Int64[np.ndarray, " r1"],
+    columns: Int32[np.ndarray, " k"],
+    weights: Float32[np.ndarray, " k"],
+    values: Float[np.ndarray, "c 3"],
+    out: Float[np.ndarray, "r 3"],
+) -> None:
+    """Write the sparse rows ``first`` to ``last`` times ``values``, three channels, to ``out``.
+
+    Each sum is taken in the order of its row.
+    """
+    for row in range(first, last):
         red = green = blue = 0.0
         for k in range(starts[row], starts[row + 1]):
             column, weight = columns[k], weights[k]
@@ -110,7 +160,9 @@ def sparse_product(starts, columns, weights, values, out):
 
 
 @device_function(error_model="numpy")
-def look_up(texels, offset, height, x, y, z):
+def look_up(
+    texels: Float[np.ndarray, "t 3"], offset: int, height: int, x: float, y: float, z: float
+) -> Lookup:
     """Bilinear value of a level at a unit direction.
 
     Returns:

@@ -7,18 +7,21 @@ https://arxiv.org/abs/2306.05044).
 
 import math
 
+import numpy as np
+from jaxtyping import Float64
+
 from octasplat.engine.trace.kernels.native import njit_no_refcount
 
 
 @njit_no_refcount(forceinline=True)
-def schlick_weight(cosine):
+def schlick_weight(cosine: float) -> float:
     """(1 - cosine) to the power of 5."""
     x = min(max(1.0 - cosine, 0.0), 1.0)
     return x * x * x * x * x
 
 
 @njit_no_refcount(forceinline=True)
-def ggx_density(cos_h, alpha):
+def ggx_density(cos_h: float, alpha: float) -> float:
     """The microfacet distribution D at a half vector of that cosine."""
     a2 = alpha * alpha
     x = cos_h * cos_h * (a2 - 1.0) + 1.0
@@ -26,14 +29,16 @@ def ggx_density(cos_h, alpha):
 
 
 @njit_no_refcount(forceinline=True)
-def ggx_masking(cosine, alpha):
+def ggx_masking(cosine: float, alpha: float) -> float:
     """Smith's G1: the share of the facets that face a direction and are seen from it."""
     c2 = cosine * cosine
     return 2.0 / (1.0 + math.sqrt(1.0 + alpha * alpha * max(1.0 - c2, 0.0) / max(c2, 1e-12)))
 
 
 @njit_no_refcount(forceinline=True)
-def sample_visible_normal(o_x, o_y, o_z, alpha, u, v):
+def sample_visible_normal(
+    o_x: float, o_y: float, o_z: float, alpha: float, u: float, v: float
+) -> tuple[float, float, float]:
     """A normal of GGX as it is seen from ``o`` (o_z > 0)."""
     x, y, z = alpha * o_x, alpha * o_y, o_z
     length = math.sqrt(x * x + y * y + z * z)
@@ -48,7 +53,7 @@ def sample_visible_normal(o_x, o_y, o_z, alpha, u, v):
 
 
 @njit_no_refcount(forceinline=True)
-def table_value(table, cosine, roughness):
+def table_value(table: Float64[np.ndarray, "a c"], cosine: float, roughness: float) -> float:
     """Bilinear value of a table over (roughness, cosine), both from 0 to 1."""
     rows, columns = table.shape
     y = min(max(roughness, 0.0), 1.0) * (rows - 1)

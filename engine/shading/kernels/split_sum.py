@@ -5,11 +5,13 @@ formula.
 """
 
 import math
+from typing import NamedTuple
 
-from numba import prange
+import numpy as np
+from jaxtyping import Float, Float64, Int32
 
 from octasplat.engine.core.compilation import device_function, kernel
-from octasplat.engine.shading.kernels.environment_levels import look_up
+from octasplat.engine.shading.kernels.environment_levels import LightLevels, Lookup, look_up
 from octasplat.engine.shading.kernels.microfacets import ggx_masking, sample_visible_normal, schlick_weight
 
 TAPS = 12
@@ -18,15 +20,47 @@ LEAST_COSINE = 1e-3
 F0 = 0.04
 
 
-@kernel(parallel=True, error_model="numpy")
-def integrate_table(samples, table):
-    """Scale and bias of F0 that one bounce off GGX facets of a white environment sends back.
+class SurfaceArrays(NamedTuple):
+    """Points that are shaded; directions and normals are in the map's frame.
 
-    Rows are roughness 0 to 1, columns the cosine to the viewer 0 to 1; visible normals are sampled by the
-    points of Hammersley.
+    Fields as in :class:`octasplat.engine.shading.split_sum.Surface`.
+    """
+
+    material: Float64[np.ndarray, "p 5"]
+    normal: Float64[np.ndarray, "p 3"]
+    direction: Float64[np.ndarray, "p 3"]
+    visibility: Float64[np.ndarray, " p"]
+    indirect: Float64[np.ndarray, "p 3"]
+    ambient: Float64[np.ndarray, " p"]
+    bounced: Float64[np.ndarray, "p 3"]
+
+
+class GradientArrays(NamedTuple):
+    """The arrays of a :class:`octasplat.engine.shading.split_sum.ShadeGradients`, to be written."""
+
+    material: Float64[np.ndarray, "p 5"]
+    normal: Float64[np.ndarray, "p 3"]
+    reflected: Float64[np.ndarray, "p 3"]
+    visibility: Float64[np.ndarray, " p"]
+    indirect: Float64[np.ndarray, "p 3"]
+    ambient: Float64[np.ndarray, " p"]
+    bounced: Float64[np.ndarray, "p 3"]
+    specular: Float64[np.ndarray, "p 3"]
+    diffuse: Float64[np.ndarray, "p 3"]
+    around: Float64[np.ndarray, "p 3"]
+    taps: Int32[np.ndarray, "p 12"]
+    weights: Float64[np.ndarray, "p 12"]
+
+
+@kernel(_nrt=False, error_model="numpy")
+def integrate_table(first: int, last: int, samples: int, table: Float64[np.ndarray, "a c 2"]) -> None:
+    """Integrate scale and bias of F0 that one bounce off GGX facets of a white environment sends back.
+
+    Writes the cells ``first`` to ``last``, row after row. Rows are roughness 0 to 1, columns the cosine to
+    the viewer 0 to 1; visible normals are sampled by the points of Hammersley.
     """
     rows, columns = table.shape[:2]
-    for cell in prange(rows * columns):
+    for cell in range(first, last):
         row, column = cell // columns, cell % columns
         roughness = row / (rows - 1)
         alpha = max(roughness * roughness, 1e-4)
@@ -51,7 +85,9 @@ def integrate_table(samples, table):
 
 
 @device_function(error_model="numpy")
-def table_slopes(table, cosine, roughness):
+def table_slopes(
+    table: Float64[np.ndarray, "a c 2"], cosine: float, roughness: float
+) -> tuple[float, float, float, float, float, float]:
     """Both values of the table, and their slopes by cosine and by roughness."""
     rows, columns = table.shape[:2]
     y = min(max(roughness, 0.0), 1.0) * (rows - 1)
@@ -70,7 +106,9 @@ def table_slopes(table, cosine, roughness):
 
 
 @device_function(error_model="numpy")
-def mix(texels, a, b, c, d, x, y, channel):
+def mix(
+    texels: Float[np.ndarray, "t 3"], a: int, b: int, c: int, d: int, x: float, y: float, channel: int
+) -> float:
     """Bilinear value of four texels."""
     top = texels[a, channel] * (1.0 - x) + texels[b, channel] * x
     bottom = texels[c, channel] * (1.0 - x) + texels[d, channel] * x
@@ -78,14 +116,16 @@ def mix(texels, a, b, c, d, x, y, channel):
 
 
 @device_function(error_model="numpy")
-def mix_slopes(texels, a, b, c, d, x, y, channel):
+def mix_slopes(
+    texels: Float[np.ndarray, "t 3"], a: int, b: int, c: int, d: int, x: float, y: float, channel: int
+) -> tuple[float, float]:
     """Slopes of that by the two fractions."""
     p, q, r, s = texels[a, channel], texels[b, channel], texels[c, channel], texels[d, channel]
     return (q - p) * (1.0 - y) + (s - r) * y, (r - p) * (1.0 - x) + (s - q) * x
 
 
 @device_function(error_model="numpy")
-def level_of(roughnesses, roughness):
+def level_of(roughnesses: Float64[np.ndarray, " l"], roughness: float) -> tuple[int, float, float]:
     """The level below a roughness, how far it is to the next, and the slope of that."""
     last = len(roughnesses) - 1
     if roughness <= roughnesses[0]:
@@ -98,8 +138,15 @@ def level_of(roughnesses, roughness):
 
 
 @device_function(error_model="numpy")
-def shade_pixel(p, material, normal, direction, visibility, indirect, ambient, bounced, light, table, rgb):
-    """Linear colour of one pixel."""
+def shade_pixel(
+    p: int,
+    surface: SurfaceArrays,
+    light: LightLevels,
+    table: Float64[np.ndarray, "a c 2"],
+    rgb: Float64[np.ndarray, "p 3"],
+) -> None:
+    """Write the linear colour of one pixel."""
+    material, normal, direction, visibility, indirect, ambient, bounced = surface
     texels, offsets, heights, roughnesses = light.texels, light.offsets, light.heights, light.roughnesses
     n_x, n_y, n_z = normal[p, 0], normal[p, 1], normal[p, 2]
     cosine = -(direction[p, 0] * n_x + direction[p, 1] * n_y + direction[p, 2] * n_z)
@@ -123,19 +170,38 @@ def shade_pixel(p, material, normal, direction, visibility, indirect, ambient, b
         rgb[p, channel] = (f0 * scale + bias) * seen + (1.0 - metallic) * albedo * lit
 
 
-@kernel(parallel=True, error_model="numpy")
+@kernel(_nrt=False, error_model="numpy")
 def shade_pixels(
-    material, normal, direction, visibility, indirect, ambient, bounced, light, table, rgb
-):  # fmt: skip
-    """:func:`shade_pixel` for all pixels; directions and normals are in the map's frame."""
-    for p in prange(len(rgb)):
-        shade_pixel(p, material, normal, direction, visibility, indirect, ambient, bounced, light, table, rgb)
+    first: int,
+    last: int,
+    surface: SurfaceArrays,
+    light: LightLevels,
+    table: Float64[np.ndarray, "a c 2"],
+    rgb: Float64[np.ndarray, "p 3"],
+) -> None:
+    """Write the linear colours of the pixels ``first`` to ``last``."""
+    for p in range(first, last):
+        shade_pixel(p, surface, light, table, rgb)
 
 
 @device_function(error_model="numpy")
-def look_back(texels, taps, weights, p, place, offset, height, x, y, z, share):
-    """Write the four texels of a look-up and their weights times ``share``; the nine of :func:`look_up`."""
-    found = look_up(texels, offset, height, x, y, z)
+def look_back(
+    out: GradientArrays,
+    p: int,
+    place: int,
+    light: LightLevels,
+    level: int,
+    direction: tuple[float, float, float],
+    share: float,
+) -> Lookup:
+    """Write the four texels of a look-up in a level, from ``place`` on, and their weights times ``share``.
+
+    Returns:
+        What :func:`look_up` does.
+    """
+    taps, weights = out.taps, out.weights
+    x, y, z = direction
+    found = look_up(light.texels, light.offsets[level], light.heights[level], x, y, z)
     a, b, c, d, u, v, _, _, _ = found
     taps[p, place], taps[p, place + 1], taps[p, place + 2], taps[p, place + 3] = a, b, c, d
     weights[p, place] = share * (1.0 - u) * (1.0 - v)
@@ -146,7 +212,9 @@ def look_back(texels, taps, weights, p, place, offset, height, x, y, z, share):
 
 
 @device_function(error_model="numpy")
-def direction_slope(texels, found, channel):
+def direction_slope(
+    texels: Float[np.ndarray, "t 3"], found: Lookup, channel: int
+) -> tuple[float, float, float]:
     """Slope of a looked-up value by the direction."""
     a, b, c, d, u, v, column_x, column_z, row_y = found
     by_u, by_v = mix_slopes(texels, a, b, c, d, u, v, channel)
@@ -155,9 +223,16 @@ def direction_slope(texels, found, channel):
 
 @device_function(error_model="numpy")
 def reverse_pixel(
-    p, material, normal, direction, visibility, indirect, ambient, bounced, light, table, blur, by_rgb, out
-):
-    """Gradients of one pixel; see :class:`octasplat.engine.shading.split_sum.ShadeGradients`."""
+    p: int,
+    surface: SurfaceArrays,
+    light: LightLevels,
+    table: Float64[np.ndarray, "a c 2"],
+    blur: float,
+    by_rgb: Float64[np.ndarray, "p 3"],
+    out: GradientArrays,
+) -> None:
+    """Write the gradients of one pixel; see :class:`octasplat.engine.shading.split_sum.ShadeGradients`."""
+    material, normal, direction, visibility, indirect, ambient, bounced = surface
     texels, offsets, heights, roughnesses = light.texels, light.offsets, light.heights, light.roughnesses
     n_x, n_y, n_z = normal[p, 0], normal[p, 1], normal[p, 2]
     d_x, d_y, d_z = direction[p, 0], direction[p, 1], direction[p, 2]
@@ -167,27 +242,21 @@ def reverse_pixel(
     seen_cosine = max(cosine, LEAST_COSINE)
     scale, bias, cos0, cos1, rough0, rough1 = table_slopes(table, seen_cosine, roughness)
     level, between, by_between = level_of(roughnesses, roughness)
-    taps, weights = out.taps, out.weights
-    near = look_back(
-        texels, taps, weights, p, 0, offsets[level], heights[level], r_x, r_y, r_z,
-        visibility[p] * (1.0 - between),
-    )  # fmt: skip
-    far = look_back(
-        texels, taps, weights, p, 4, offsets[level + 1], heights[level + 1], r_x, r_y, r_z,
-        visibility[p] * between,
-    )  # fmt: skip
-    last = len(heights) - 1
-    facing = look_back(texels, taps, weights, p, 8, offsets[last], heights[last], n_x, n_y, n_z, ambient[p])
+    # --- what the pixel sees: two levels of the lobe, and the irradiance ---
+    reflected = r_x, r_y, r_z
+    near = look_back(out, p, 0, light, level, reflected, visibility[p] * (1.0 - between))
+    far = look_back(out, p, 4, light, level + 1, reflected, visibility[p] * between)
+    facing = look_back(out, p, 8, light, len(heights) - 1, (n_x, n_y, n_z), ambient[p])
     slope, slope_between, slope_near, slope_far = level, between, near, far
     if blur > roughness:  # the direction is led by a blurred level
         slope, slope_between, _ = level_of(roughnesses, blur)
         slope_near = look_up(texels, offsets[slope], heights[slope], r_x, r_y, r_z)
         slope_far = look_up(texels, offsets[slope + 1], heights[slope + 1], r_x, r_y, r_z)
+    # --- sums over the channels; gr is dL by the reflected direction, gn by the normal ---
     by_metallic = by_roughness = by_cosine = by_visibility = by_ambient = 0.0
     gr_x = gr_y = gr_z = gn_x = gn_y = gn_z = 0.0
     for channel in range(3):
-        gradient = by_rgb[p, channel]
-        albedo = material[p, channel]
+        gradient, albedo = by_rgb[p, channel], material[p, channel]
         f0 = F0 * (1.0 - metallic) + metallic * albedo
         factor = f0 * scale + bias
         sharp = mix(texels, near[0], near[1], near[2], near[3], near[4], near[5], channel)
@@ -206,10 +275,8 @@ def reverse_pixel(
         by_roughness += gradient * factor * visibility[p] * (blurred - sharp) * by_between
         by_visibility += gradient * factor * around
         by_ambient += gradient * matt * irradiance
-        out.indirect[p, channel] = gradient * factor
-        out.bounced[p, channel] = gradient * matt
-        out.specular[p, channel] = gradient * factor
-        out.diffuse[p, channel] = gradient * matt
+        out.indirect[p, channel] = out.specular[p, channel] = gradient * factor
+        out.bounced[p, channel] = out.diffuse[p, channel] = gradient * matt
         share = gradient * factor * visibility[p]
         s_x, s_y, s_z = direction_slope(texels, slope_near, channel)
         t_x, t_y, t_z = direction_slope(texels, slope_far, channel)
@@ -221,6 +288,7 @@ def reverse_pixel(
         gn_x += share * s_x
         gn_y += share * s_y
         gn_z += share * s_z
+    # --- the rest of the gradients ---
     if cosine < LEAST_COSINE:
         by_cosine = 0.0
     along = n_x * gr_x + n_y * gr_y + n_z * gr_z
@@ -234,20 +302,30 @@ def reverse_pixel(
     out.visibility[p], out.ambient[p] = by_visibility, by_ambient
 
 
-@kernel(parallel=True, error_model="numpy")
+@kernel(_nrt=False, error_model="numpy")
 def reverse_pixels(
-    material, normal, direction, visibility, indirect, ambient, bounced, light, table, blur, by_rgb, out
-):
-    """:func:`reverse_pixel` for all pixels."""
-    for p in prange(len(by_rgb)):
-        reverse_pixel(
-            p, material, normal, direction, visibility, indirect, ambient, bounced, light, table, blur,
-            by_rgb, out,
-        )  # fmt: skip
+    first: int,
+    last: int,
+    surface: SurfaceArrays,
+    light: LightLevels,
+    table: Float64[np.ndarray, "a c 2"],
+    blur: float,
+    by_rgb: Float64[np.ndarray, "p 3"],
+    out: GradientArrays,
+) -> None:
+    """Write the gradients of the pixels ``first`` to ``last``."""
+    for p in range(first, last):
+        reverse_pixel(p, surface, light, table, blur, by_rgb, out)
 
 
 @kernel(error_model="numpy")
-def add_to_texels(taps, weights, specular, diffuse, by_texels):
+def add_to_texels(
+    taps: Int32[np.ndarray, "p 12"],
+    weights: Float64[np.ndarray, "p 12"],
+    specular: Float64[np.ndarray, "p 3"],
+    diffuse: Float64[np.ndarray, "p 3"],
+    by_texels: Float64[np.ndarray, "t 3"],
+) -> None:
     """Add each pixel's shares to the texels that it asked, pixel after pixel."""
     for p in range(len(taps)):
         for k in range(TAPS):

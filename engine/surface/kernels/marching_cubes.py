@@ -1,7 +1,13 @@
-"""Marching cubes over blocks of voxels; vertices are shared across blocks by the edges they lie on."""
+"""Marching cubes over blocks of voxels; vertices are shared across blocks by the edges they lie on.
+
+"Marching Cubes: A High Resolution 3D Surface Construction Algorithm" (Lorensen and Cline 1987). Elements are
+counted first, so that each block knows where its own go; then vertices are placed, then triangles.
+"""
+
+from typing import NamedTuple
 
 import numpy as np
-from numba import prange
+from jaxtyping import Float32, Int8, Int32, Int64, UInt8
 
 from octasplat.engine.core.compilation import device_function, kernel
 
@@ -11,8 +17,28 @@ SIDE = BLOCK_SIDE + 1
 CELLS = SIDE**3
 
 
+class VolumeArrays(NamedTuple):
+    """A sparse volume of signed distances.
+
+    Attributes:
+        table: row of each block of the grid in the other arrays, -1 for none.
+        blocks: place of each block in the grid.
+        values: signed distances, positive in front of the surface.
+        weights: how sure they are.
+        min_weight: below which they count for nothing.
+    """
+
+    table: Int32[np.ndarray, "bx by bz"]
+    blocks: Int32[np.ndarray, "b 3"]
+    values: Float32[np.ndarray, "b 512"]
+    weights: Float32[np.ndarray, "b 512"]
+    min_weight: float
+
+
 @device_function()
-def neighbour(table, blocks, b, x, y, z):
+def neighbour(
+    table: Int32[np.ndarray, "bx by bz"], blocks: Int32[np.ndarray, "b 3"], b: int, x: int, y: int, z: int
+) -> tuple[int, int]:
     """Row of the block that holds voxel (x, y, z) counted from block ``b``, and the voxel's place in it."""
     bx, by, bz = (
         blocks[b, 0] + x // BLOCK_SIDE,
@@ -26,27 +52,27 @@ def neighbour(table, blocks, b, x, y, z):
 
 
 @device_function()
-def gather_block_values(table, blocks, b, values, weights, min_weight, out):
-    """The 9^3 values that the cells of a block need; not-a-number where too little is known."""
+def gather_block_values(volume: VolumeArrays, b: int, out: Float32[np.ndarray, "729"]) -> None:
+    """Write the 9^3 values that the cells of a block need; not-a-number where too little is known."""
     for x in range(SIDE):
         for y in range(SIDE):
             for z in range(SIDE):
-                row, place = neighbour(table, blocks, b, x, y, z)
-                if row >= 0 and weights[row, place] >= min_weight:
-                    out[(x * SIDE + y) * SIDE + z] = values[row, place]
+                row, place = neighbour(volume.table, volume.blocks, b, x, y, z)
+                if row >= 0 and volume.weights[row, place] >= volume.min_weight:
+                    out[(x * SIDE + y) * SIDE + z] = volume.values[row, place]
                 else:
                     out[(x * SIDE + y) * SIDE + z] = np.nan
 
 
 @device_function()
-def corner_offset(corner):
-    """Place of a cell's corner among the 9^3 values, from the cell's first corner."""
+def corner_offset(corner: int) -> int:
+    """Return the place of a cell's corner among the 9^3 values, from the cell's first corner."""
     return ((corner & 1) * SIDE + (corner >> 1 & 1)) * SIDE + (corner >> 2 & 1)
 
 
 @device_function()
-def cube_case(near, at):
-    """Which corners of the cell lie inside, as bits; 0 where one of them is unknown."""
+def cube_case(near: Float32[np.ndarray, "729"], at: int) -> int:
+    """Return which corners of the cell lie inside, as bits; 0 where one of them is unknown."""
     case = 0
     for corner in range(8):
         value = near[at + corner_offset(corner)]
@@ -57,18 +83,25 @@ def cube_case(near, at):
     return case
 
 
-@kernel(parallel=True)
+@kernel()
 def count_block_elements(
-    table, blocks, values, weights, min_weight, triangle_counts, crossed, vertices, triangles
-):
-    """How many vertices and triangles each block owns; ``crossed`` gets a bit for each axis of a voxel.
+    first_block: int,
+    last_block: int,
+    volume: VolumeArrays,
+    triangle_counts: Int32[np.ndarray, "256"],
+    crossed: UInt8[np.ndarray, "b 512"],
+    vertices: Int64[np.ndarray, " b"],
+    triangles: Int64[np.ndarray, " b"],
+) -> None:
+    """Count the vertices and triangles of each of the blocks ``first_block`` to ``last_block``.
 
-    A voxel owns the edges that leave it along +x, +y and +z. Edges that no cell uses count as well; their
-    vertices are dropped later.
+    ``crossed`` gets a bit for each axis of a voxel whose edge the surface crosses. A voxel owns the edges
+    that leave it along +x, +y and +z. Edges that no cell uses count as well; their vertices are dropped
+    later.
     """
-    for b in prange(len(blocks)):
+    for b in range(first_block, last_block):
         near = np.empty(CELLS, np.float32)
-        gather_block_values(table, blocks, b, values, weights, min_weight, near)
+        gather_block_values(volume, b, near)
         vertex_count, triangle_count = 0, 0
         for x in range(BLOCK_SIDE):
             for y in range(BLOCK_SIDE):
@@ -87,15 +120,24 @@ def count_block_elements(
         vertices[b], triangles[b] = vertex_count, triangle_count
 
 
-@kernel(parallel=True)
-def place_vertices(table, blocks, values, weights, min_weight, crossed, starts, first, points):
-    """Vertices where values change sign along edges, in voxels from the grid's first voxel centre.
+@kernel()
+def place_vertices(
+    first_block: int,
+    last_block: int,
+    volume: VolumeArrays,
+    crossed: UInt8[np.ndarray, "b 512"],
+    starts: Int64[np.ndarray, " b"],
+    first: Int32[np.ndarray, "b 512"],
+    points: Float32[np.ndarray, "v 3"],
+) -> None:
+    """Place vertices where values change sign along edges, in voxels from the grid's first voxel centre.
 
     ``first`` gets the number of each voxel's first vertex.
     """
-    for b in prange(len(blocks)):
+    blocks = volume.blocks
+    for b in range(first_block, last_block):
         near = np.empty(CELLS, np.float32)
-        gather_block_values(table, blocks, b, values, weights, min_weight, near)
+        gather_block_values(volume, b, near)
         number = starts[b]
         for x in range(BLOCK_SIDE):
             for y in range(BLOCK_SIDE):
@@ -115,15 +157,23 @@ def place_vertices(table, blocks, values, weights, min_weight, crossed, starts, 
                             number += 1
 
 
-@kernel(parallel=True)
+@kernel()
 def place_triangles(
-    table, blocks, values, weights, min_weight, edge_corners, edge_table, triangle_counts,
-    crossed, first, starts, faces,
-):  # fmt: skip
-    """Triangles of all cells, in the order of the blocks."""
-    for b in prange(len(blocks)):
+    first_block: int,
+    last_block: int,
+    volume: VolumeArrays,
+    edge_corners: Int32[np.ndarray, "12 2"],
+    edge_table: Int8[np.ndarray, "256 _"],
+    triangle_counts: Int32[np.ndarray, "256"],
+    crossed: UInt8[np.ndarray, "b 512"],
+    first: Int32[np.ndarray, "b 512"],
+    starts: Int64[np.ndarray, " b"],
+    faces: Int32[np.ndarray, "f 3"],
+) -> None:
+    """Place the triangles of the cells, in the order of the blocks ``first_block`` to ``last_block``."""
+    for b in range(first_block, last_block):
         near = np.empty(CELLS, np.float32)
-        gather_block_values(table, blocks, b, values, weights, min_weight, near)
+        gather_block_values(volume, b, near)
         number = starts[b]
         for x in range(BLOCK_SIDE):
             for y in range(BLOCK_SIDE):
@@ -137,7 +187,12 @@ def place_triangles(
                         low = edge_corners[edge, 0]
                         axis = edge // 4
                         row, place = neighbour(
-                            table, blocks, b, x + (low & 1), y + (low >> 1 & 1), z + (low >> 2 & 1)
+                            volume.table,
+                            volume.blocks,
+                            b,
+                            x + (low & 1),
+                            y + (low >> 1 & 1),
+                            z + (low >> 2 & 1),
                         )
                         vertex = first[row, place]
                         for before in range(axis):

@@ -2,12 +2,20 @@
 
 import math
 
+import numpy as np
+from jaxtyping import Float32, Float64, Int, Int32
+
 from octasplat.engine.core.compilation import kernel
 
 
 @kernel()
-def rasterise(xy, faces, owner, weights):
-    """Number of the triangle at each pixel's centre, and the weights of its second and third corner.
+def rasterise(
+    xy: Float64[np.ndarray, "v 2"],
+    faces: Int[np.ndarray, "f 3"],
+    owner: Int32[np.ndarray, "h w"],
+    weights: Float32[np.ndarray, "h w 2"],
+) -> None:
+    """Write which triangle each pixel's centre lies in, and the weights of its second and third corner.
 
     Pixels that a triangle touches only with a part of their area, their centre being outside of every
     triangle, get the nearest point of it: bilinear look-ups reach them.

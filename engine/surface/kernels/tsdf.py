@@ -1,9 +1,16 @@
-"""Depth maps into blocks of voxels: which blocks a surface passes, and the fused signed distances."""
+"""Fuse depth maps into blocks of voxels.
+
+First the blocks that a surface passes are found, then signed distances are averaged in them: "A Volumetric
+Method for Building Complex Models from Range Images" (Curless and Levoy 1996). Space around the unit ball
+may be
+contracted: "Mip-NeRF 360: Unbounded Anti-Aliased Neural Radiance Fields" (Barron et al. 2022), Eq. 10.
+"""
 
 import math
+from typing import NamedTuple
 
 import numpy as np
-from numba import prange
+from jaxtyping import Float32, Float64, Int32, UInt8
 
 from octasplat.engine.core.compilation import device_function, kernel
 
@@ -18,9 +25,37 @@ MARGIN_VOXELS = 2.0
 """Blocks are taken this far around a band, so that cells at its rim find all of their corners."""
 
 
+class DepthView(NamedTuple):
+    """A camera of depth maps: focal lengths and principal point, pixels, and its pose.
+
+    ``rotation`` takes world to camera directions, ``centre`` is in world units.
+    """
+
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    rotation: Float64[np.ndarray, "3 3"]
+    centre: Float64[np.ndarray, "3"]
+
+
+class VoxelGrid(NamedTuple):
+    """Where voxels lie: from ``low`` on, ``voxel`` apart, in units of ``radius`` around ``middle``.
+
+    With ``contracted`` space outside of the unit ball is contracted. ``truncation`` is in voxels.
+    """
+
+    low: Float64[np.ndarray, "3"]
+    voxel: float
+    contracted: bool
+    middle: Float64[np.ndarray, "3"]
+    radius: float
+    truncation: float
+
+
 @device_function()
-def contract(x, y, z):
-    """Contracted position of a point in units of the unit ball."""
+def contract(x: float, y: float, z: float) -> tuple[float, float, float]:
+    """Return the contracted position of a point in units of the unit ball."""
     length = math.sqrt(x * x + y * y + z * z)
     if length <= 1.0:
         return x, y, z
@@ -29,7 +64,7 @@ def contract(x, y, z):
 
 
 @device_function()
-def expand(x, y, z):
+def expand(x: float, y: float, z: float) -> tuple[float, float, float, float]:
     """The way back from :func:`contract`, and how much lengths grow on it, at most (1 inside the ball).
 
     Points on and beyond the rim of contracted space, which stand for infinity, give a stretch of 0.
@@ -44,17 +79,24 @@ def expand(x, y, z):
     return x * factor, y * factor, z * factor, world * world
 
 
-@kernel(parallel=True)
+@kernel()
 def mark_blocks(
-    distances, fx, fy, cx, cy, rotation, centre, low, voxel, contracted, middle, radius, truncation, marks
-):  # fmt: skip
-    """Set ``marks`` of the blocks within ``truncation`` voxels (along the ray) of a depth map's points.
+    first_row: int,
+    last_row: int,
+    distances: Float32[np.ndarray, "h w"],
+    view: DepthView,
+    grid: VoxelGrid,
+    marks: UInt8[np.ndarray, "bx by bz"],
+) -> None:
+    """Set ``marks`` of the blocks within the truncation (along the ray) of a depth map's points.
 
-    ``rotation`` takes world to camera directions. Threads may set one mark twice, which is harmless.
+    Takes the rows ``first_row`` to ``last_row``. Threads may set one mark twice, which is harmless.
     """
-    height, width = distances.shape
+    fx, fy, cx, cy, rotation, centre = view
+    low, voxel, contracted, middle, radius, truncation = grid
+    width = distances.shape[1]
     nx, ny, nz = marks.shape
-    for row in prange(height):
+    for row in range(first_row, last_row):
         for column in range(width):
             distance = np.float64(distances[row, column])
             if distance <= 0.0 or not math.isfinite(distance):
@@ -64,12 +106,14 @@ def mark_blocks(
             wx = (rotation[0, 0] * dx + rotation[1, 0] * dy + rotation[2, 0]) * scale
             wy = (rotation[0, 1] * dx + rotation[1, 1] * dy + rotation[2, 1]) * scale
             wz = (rotation[0, 2] * dx + rotation[1, 2] * dy + rotation[2, 2]) * scale
+            # --- the length of a voxel there ---
             step = voxel * radius
             if contracted:
                 px = (centre[0] + wx * distance - middle[0]) / radius
                 py = (centre[1] + wy * distance - middle[1]) / radius
                 pz = (centre[2] + wz * distance - middle[2]) / radius
                 step *= max(1.0, px * px + py * py + pz * pz)
+            # --- points along the ray, half a block apart ---
             reach = truncation * step
             stride = 0.5 * BLOCK * step
             steps = math.ceil(2.0 * reach / stride)
@@ -96,7 +140,13 @@ def mark_blocks(
 
 
 @device_function()
-def depth_at(distances, cosines, u, v, jump):
+def depth_at(
+    distances: Float32[np.ndarray, "h w"],
+    cosines: Float32[np.ndarray, "h w"],
+    u: float,
+    v: float,
+    jump: float,
+) -> tuple[float, float]:
     """Distance and cosine at an image point: bilinear on one surface, else of the pixel itself.
 
     Four pixels lie on one surface where all are known and differ by no more than ``jump``.
@@ -117,7 +167,11 @@ def depth_at(distances, cosines, u, v, jump):
 
 
 @kernel()
-def tile_ranges(distances, nearest, farthest):
+def tile_ranges(
+    distances: Float32[np.ndarray, "h w"],
+    nearest: Float32[np.ndarray, "th tw"],
+    farthest: Float32[np.ndarray, "th tw"],
+) -> None:
     """Least and largest distance in each tile of 16 x 16 pixels; unknown ones count as 0."""
     height, width = distances.shape
     nearest[:], farthest[:] = np.inf, 0.0
@@ -130,12 +184,21 @@ def tile_ranges(distances, nearest, farthest):
 
 @device_function()
 def classify_block(
-    ox, oy, oz, half, band, fx, fy, cx, cy, rotation, width, height, nearest, farthest
-):  # fmt: skip
-    """Where a block lies whose centre is (ox, oy, oz) from the camera: ``BLOCK_BEHIND``, ``BLOCK_IN_FRONT`` or ``BLOCK_NEAR``.
+    offset: tuple[float, float, float],
+    half: float,
+    band: float,
+    view: DepthView,
+    width: int,
+    height: int,
+    nearest: Float32[np.ndarray, "th tw"],
+    farthest: Float32[np.ndarray, "th tw"],
+) -> int:
+    """Return ``BLOCK_BEHIND``, ``BLOCK_IN_FRONT`` or ``BLOCK_NEAR`` for a block.
 
-    ``half`` is the radius of a ball around it.
+    ``offset`` leads from the camera to its centre, and ``half`` is the radius of a ball around it.
     """
+    fx, fy, cx, cy, rotation, _centre = view
+    ox, oy, oz = offset
     z = rotation[2, 0] * ox + rotation[2, 1] * oy + rotation[2, 2] * oz
     if z + half <= 0.0:
         return BLOCK_BEHIND
@@ -166,27 +229,67 @@ def classify_block(
     return BLOCK_NEAR
 
 
-@kernel(parallel=True)
+class DepthMap(NamedTuple):
+    """A depth map: distances along rays, cosines of surfaces to them, and the range in each tile."""
+
+    distances: Float32[np.ndarray, "h w"]
+    cosines: Float32[np.ndarray, "h w"]
+    nearest: Float32[np.ndarray, "th tw"]
+    farthest: Float32[np.ndarray, "th tw"]
+
+
+@device_function()
+def surface_band(
+    share: float,
+    offset: tuple[float, float, float],
+    band: float,
+    centre: Float64[np.ndarray, "3"],
+    grid: VoxelGrid,
+) -> float:
+    """Return the truncation behind a near surface: that of the surface, however coarse the voxels here.
+
+    The surface lies at ``share`` of the ``offset`` from the camera; ``band`` is the truncation at the voxel.
+    """
+    middle, radius = grid.middle, grid.radius
+    px = (centre[0] + share * offset[0] - middle[0]) / radius
+    py = (centre[1] + share * offset[1] - middle[1]) / radius
+    pz = (centre[2] + share * offset[2] - middle[2]) / radius
+    there = max(1.0, px * px + py * py + pz * pz)
+    return min(band, grid.truncation * grid.voxel * radius * there)
+
+
+@kernel()
 def fuse_view(
-    distances, cosines, nearest, farthest, fx, fy, cx, cy, rotation, centre,
-    low, voxel, contracted, middle, radius, truncation, blocks, values, weights,
-):  # fmt: skip
+    first: int,
+    last: int,
+    maps: DepthMap,
+    view: DepthView,
+    grid: VoxelGrid,
+    blocks: Int32[np.ndarray, "b 3"],
+    values: Float32[np.ndarray, "b 512"],
+    weights: Float32[np.ndarray, "b 512"],
+) -> None:
     """Add one depth map to the running means of signed distances, in units of the truncation.
 
-    Positive in front of the surface, negative behind. The distance along the ray times the cosine is the
-    distance to the tangent plane; the weight is the cosine too, as oblique depths are the less certain.
+    Takes the blocks ``first`` to ``last``. Positive in front of the surface, negative behind. The distance
+    along the ray times the cosine is the distance to the tangent plane; the weight is the cosine too, as
+    oblique depths are the less certain.
     """
+    distances, cosines, nearest, farthest = maps
+    fx, fy, cx, cy, rotation, centre = view
+    low, voxel, contracted, middle, radius, truncation = grid
     height, width = distances.shape
-    for b in prange(len(blocks)):
+    for b in range(first, last):
         base_x, base_y, base_z = blocks[b, 0] * BLOCK, blocks[b, 1] * BLOCK, blocks[b, 2] * BLOCK
         if not contracted:
-            lies = classify_block(
+            # --- blocks that the map tells nothing or one thing of ---
+            offset = (
                 low[0] + (base_x + 0.5 * BLOCK) * voxel - centre[0],
                 low[1] + (base_y + 0.5 * BLOCK) * voxel - centre[1],
                 low[2] + (base_z + 0.5 * BLOCK) * voxel - centre[2],
-                0.5 * BLOCK * voxel * math.sqrt(3.0), truncation * voxel,
-                fx, fy, cx, cy, rotation, width, height, nearest, farthest,
-            )  # fmt: skip
+            )
+            half = 0.5 * BLOCK * voxel * math.sqrt(3.0)
+            lies = classify_block(offset, half, truncation * voxel, view, width, height, nearest, farthest)
             if lies == BLOCK_BEHIND:
                 continue
             if lies == BLOCK_IN_FRONT:
@@ -219,16 +322,11 @@ def fuse_view(
             distance, cosine = depth_at(distances, cosines, u, v, band)
             if distance <= 0.0:
                 continue
+            # --- the signed distance along the ray ---
             length = math.sqrt(ox * ox + oy * oy + oz * oz)
             along = distance - length
             if contracted and along < 0.0:
-                # Behind a near surface the band is that of the surface, however coarse the voxels here.
-                share = distance / length
-                px = (centre[0] + share * ox - middle[0]) / radius
-                py = (centre[1] + share * oy - middle[1]) / radius
-                pz = (centre[2] + share * oz - middle[2]) / radius
-                there = max(1.0, px * px + py * py + pz * pz)
-                band = min(band, truncation * voxel * radius * there)
+                band = surface_band(distance / length, (ox, oy, oz), band, centre, grid)
             if along < -band:
                 continue
             value = along * cosine / band

@@ -3,7 +3,7 @@
 import math
 
 import numpy as np
-from numba import prange
+from jaxtyping import Bool, Float, Float32, Int32
 
 from octasplat.engine.core.compilation import kernel
 
@@ -11,14 +11,27 @@ MIN_COSINE = 0.15
 """Pixels that see a triangle more from the side say nothing of where it lies."""
 
 
-@kernel(parallel=True)
-def linearise(vertices, normals, sizes, rgb, corners, weights, directions, steady, change, lifts):
-    """How each pixel's colour changes as its triangle moves by one along its normal, and who moves it.
+@kernel()
+def linearise(
+    first: int,
+    last: int,
+    vertices: Float32[np.ndarray, "n 3"],
+    normals: Float[np.ndarray, "n 3"],
+    sizes: Float[np.ndarray, " n"],
+    rgb: Float32[np.ndarray, "n 3"],
+    corners: Int32[np.ndarray, "p 3"],
+    weights: Float32[np.ndarray, "p 3"],
+    directions: Float32[np.ndarray, "p 3"],
+    steady: Bool[np.ndarray, " p"],
+    change: Float32[np.ndarray, "p 3"],
+    lifts: Float32[np.ndarray, "p 3"],
+) -> None:
+    """Write how each pixel's colour changes as its triangle moves by one along its normal, and who moves it.
 
     The point that the ray meets then moves along the ray by one over the cosine, and with it the colour. A
     vertex moves by its ``sizes`` along its own normal; ``lifts`` is by how much that moves the triangle.
     """
-    for p in prange(len(corners)):
+    for p in range(first, last):
         i, j, k = corners[p, 0], corners[p, 1], corners[p, 2]
         ax, ay, az = np.float64(vertices[i, 0]), np.float64(vertices[i, 1]), np.float64(vertices[i, 2])
         ux, uy, uz = vertices[j, 0] - ax, vertices[j, 1] - ay, vertices[j, 2] - az
@@ -35,17 +48,26 @@ def linearise(vertices, normals, sizes, rgb, corners, weights, directions, stead
         cosine = nx * dx + ny * dy + nz * dz
         if not steady[p] or abs(cosine) <= MIN_COSINE:
             continue
-        first = ((vy * nz - vz * ny) * dx + (vz * nx - vx * nz) * dy + (vx * ny - vy * nx) * dz) / area
-        second = ((ny * uz - nz * uy) * dx + (nz * ux - nx * uz) * dy + (nx * uy - ny * ux) * dz) / area
+        by_u = ((vy * nz - vz * ny) * dx + (vz * nx - vx * nz) * dy + (vx * ny - vy * nx) * dz) / area
+        by_v = ((ny * uz - nz * uy) * dx + (nz * ux - nx * uz) * dy + (nx * uy - ny * ux) * dz) / area
         for c in range(3):
-            step = (rgb[j, c] - rgb[i, c]) * first + (rgb[k, c] - rgb[i, c]) * second
+            step = (rgb[j, c] - rgb[i, c]) * by_u + (rgb[k, c] - rgb[i, c]) * by_v
             change[p, c] = step / cosine
 
 
-@kernel(parallel=True)
-def apply_jacobian(corners, weights, lifts, change, values, pixels):
-    """Colours of pixels for ``values`` of vertices: red, green, blue and how far they move."""
-    for p in prange(len(corners)):
+@kernel()
+def apply_jacobian(
+    first: int,
+    last: int,
+    corners: Int32[np.ndarray, "p 3"],
+    weights: Float32[np.ndarray, "p 3"],
+    lifts: Float32[np.ndarray, "p 3"],
+    change: Float32[np.ndarray, "p 3"],
+    values: Float32[np.ndarray, "n 4"],
+    pixels: Float32[np.ndarray, "p 3"],
+) -> None:
+    """Write the colours of pixels for ``values`` of vertices: red, green, blue and how far they move."""
+    for p in range(first, last):
         red = green = blue = moved = np.float32(0.0)
         for c in range(3):
             i, weight = corners[p, c], weights[p, c]
@@ -59,8 +81,15 @@ def apply_jacobian(corners, weights, lifts, change, values, pixels):
 
 
 @kernel()
-def apply_jacobian_transpose(corners, weights, lifts, change, pixels, values):
-    """The transpose of :func:`apply_jacobian`, added to ``values``; one thread, so that sums have one order."""
+def apply_jacobian_transpose(
+    corners: Int32[np.ndarray, "p 3"],
+    weights: Float32[np.ndarray, "p 3"],
+    lifts: Float32[np.ndarray, "p 3"],
+    change: Float32[np.ndarray, "p 3"],
+    pixels: Float32[np.ndarray, "p 3"],
+    values: Float32[np.ndarray, "n 4"],
+) -> None:
+    """Add the transpose of :func:`apply_jacobian` to ``values``; one thread, so that sums have one order."""
     for p in range(len(corners)):
         red, green, blue = pixels[p, 0], pixels[p, 1], pixels[p, 2]
         moved = change[p, 0] * red + change[p, 1] * green + change[p, 2] * blue
@@ -73,8 +102,18 @@ def apply_jacobian_transpose(corners, weights, lifts, change, pixels, values):
 
 
 @kernel()
-def jacobian_diagonal(corners, weights, lifts, change, sure, values):
-    """The diagonal of :func:`apply_jacobian_transpose` after :func:`apply_jacobian`, pixels weighted by ``sure``, added to ``values``."""
+def jacobian_diagonal(
+    corners: Int32[np.ndarray, "p 3"],
+    weights: Float32[np.ndarray, "p 3"],
+    lifts: Float32[np.ndarray, "p 3"],
+    change: Float32[np.ndarray, "p 3"],
+    sure: Float32[np.ndarray, " p"],
+    values: Float32[np.ndarray, "n 4"],
+) -> None:
+    """Add the diagonal of the normal equations to ``values``.
+
+    That is :func:`apply_jacobian_transpose` after :func:`apply_jacobian`, pixels weighted by ``sure``.
+    """
     for p in range(len(corners)):
         strength = change[p, 0] ** 2 + change[p, 1] ** 2 + change[p, 2] ** 2
         for c in range(3):

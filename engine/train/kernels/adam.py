@@ -1,15 +1,30 @@
-"""Adam on the Gaussians that were hit, all parameter groups in one pass."""
+"""Adam on the Gaussians that were hit, all parameter groups in one pass.
+
+"Adam: A Method for Stochastic Optimization" (Kingma and Ba 2015), with a step count for each Gaussian.
+"""
 
 import math
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import llvmlite.ir as ir
 import numpy as np
+from jaxtyping import Float32, Float64, Int32
 from numba import types
 from numba.core import cgutils
+from numba.core.base import BaseContext
+from numba.core.typing import Context as TypingContext
+from numba.core.typing.templates import Signature
 from numba.extending import intrinsic
 
 from octasplat.engine.core.compilation import device_function, kernel
-from octasplat.engine.trace.kernels.native import float32_pointer, njit_no_refcount, prefetch_bytes
+from octasplat.engine.trace.kernels.native import (
+    Address,
+    Intrinsic,
+    float32_pointer,
+    njit_no_refcount,
+    prefetch_bytes,
+)
 
 LANES = 16
 GEOMETRY = 3 + 4 + 2 + 1
@@ -24,10 +39,96 @@ LEAST_SHARE = 1e-3
 """Numbers between 0 and 1 stay this far from both, so that they can come back."""
 
 
+class AdamMoments(NamedTuple):
+    """First and second moments of ``c`` columns of parameters, and what they decay by."""
+
+    first: Float32[np.ndarray, "n c"]
+    second: Float32[np.ndarray, "n c"]
+    beta1: float
+    beta2: float
+    epsilon: float
+
+
+class ParameterArrays(NamedTuple):
+    """The trained parameters of the Gaussians."""
+
+    means: Float32[np.ndarray, "n 3"]
+    quats: Float32[np.ndarray, "n 4"]
+    log_scales: Float32[np.ndarray, "n 2"]
+    logits: Float32[np.ndarray, " n"]
+    sh: Float32[np.ndarray, "n k 3"]
+
+
+class ParameterGradients(NamedTuple):
+    """Their gradients, a row for each Gaussian that was hit."""
+
+    means: Float32[np.ndarray, "u 3"]
+    quats: Float32[np.ndarray, "u 4"]
+    log_scales: Float32[np.ndarray, "u 2"]
+    logits: Float32[np.ndarray, " u"]
+    sh: Float32[np.ndarray, "u k 3"]
+
+
+class StepRates(NamedTuple):
+    """How far a step goes.
+
+    Attributes:
+        mean: in world units or, where ``mean_by_size``, in units of the Gaussian's size: the geometric mean
+            of
+            its two scales.
+        mean_by_size: see ``mean``.
+        own_axes: means and quaternions are stepped along and around the Gaussian's normal and the two axes in
+            its plane, each with moments of its own; the first column of the quaternion's is then unused.
+        quat: of the quaternion.
+        log_scale: of the logarithms of the scales.
+        opacity: of the logit of the opacity.
+        sh: of the harmonics' coefficients, one after the other, in whole vectors of ``LANES``.
+    """
+
+    mean: float
+    mean_by_size: bool
+    own_axes: bool
+    quat: float
+    log_scale: float
+    opacity: float
+    sh: Float32[np.ndarray, " c"]
+
+
+class Regularization(NamedTuple):
+    """Weights of the regularisers of opacity and scale, and the limits of the log scales."""
+
+    opacity_weight: float
+    scale_weight: float
+    min_log_scale: float
+    max_log_scale: float
+
+
+class BiasCorrection(NamedTuple):
+    """Each Gaussian has its own step count for the bias correction.
+
+    Attributes:
+        steps: of each Gaussian so far.
+        powers: of both betas, for as many steps as any has taken and one more.
+        corrections: receives what both moments are multiplied by.
+    """
+
+    steps: Int32[np.ndarray, " n"]
+    powers: Float64[np.ndarray, "2 s"]
+    corrections: Float64[np.ndarray, "u 2"]
+
+
 @device_function()
 def _update(
-    value, gradient, first, second, row, column, rate, correction1, correction2, beta1, beta2, epsilon
-):
+    value: float,
+    gradient: float,
+    moments: AdamMoments,
+    row: int,
+    column: int,
+    rate: float,
+    correction1: float,
+    correction2: float,
+) -> float:
+    first, second, beta1, beta2, epsilon = moments
     m = beta1 * np.float64(first[row, column]) + (1.0 - beta1) * gradient
     v = beta2 * np.float64(second[row, column]) + (1.0 - beta2) * gradient * gradient
     first[row, column] = m
@@ -36,7 +137,15 @@ def _update(
 
 
 @intrinsic
-def step_lanes(typingctx, values, gradients, rates, first, second, numbers):
+def step_lanes(
+    typingctx: TypingContext,
+    values: Address,
+    gradients: Address,
+    rates: Address,
+    first: Address,
+    second: Address,
+    numbers: tuple[float, ...],
+) -> Intrinsic:
     """One step for sixteen float32 at each address, in float32.
 
     ``numbers`` are what both moments are multiplied by, both betas, one minus each, and epsilon.
@@ -44,7 +153,9 @@ def step_lanes(typingctx, values, gradients, rates, first, second, numbers):
     address, single = types.uintp, types.float32
     signature = types.void(*(address,) * 5, types.UniTuple(single, 7))
 
-    def codegen(context, builder, sig, args):
+    def codegen(
+        context: BaseContext, builder: ir.IRBuilder, sig: Signature, args: Sequence[ir.Value]
+    ) -> ir.Value:
         *places, numbers = args
         kind = ir.VectorType(ir.FloatType(), LANES)
         lanes = ir.VectorType(ir.IntType(32), LANES)
@@ -52,13 +163,13 @@ def step_lanes(typingctx, values, gradients, rates, first, second, numbers):
             builder.module, ir.FunctionType(kind, [kind]), f"llvm.sqrt.v{LANES}f32"
         )
 
-        def everywhere(scalar, vector):
+        def everywhere(scalar: ir.Value, vector: ir.Type) -> ir.Value:
             one = builder.insert_element(ir.Constant(vector, ir.Undefined), scalar, _word(0))
             return builder.shuffle_vector(
                 one, ir.Constant(vector, ir.Undefined), ir.Constant(lanes, [0] * LANES)
             )
 
-        def times(a, b):
+        def times(a: ir.Value, b: ir.Value) -> ir.Value:
             return builder.fmul(a, b, flags=("contract",))
 
         numbers = [everywhere(number, kind) for number in cgutils.unpack_tuple(builder, numbers)]
@@ -76,12 +187,12 @@ def step_lanes(typingctx, values, gradients, rates, first, second, numbers):
     return signature, codegen
 
 
-def _word(value):
+def _word(value: int) -> ir.Value:
     return ir.Constant(ir.IntType(32), value)
 
 
 @njit_no_refcount()
-def copy_few(source, target, count):
+def copy_few(source: Address, target: Address, count: int) -> None:
     """Copy so many float32 from one address to another."""
     read, write = float32_pointer(source), float32_pointer(target)
     for k in range(count):
@@ -89,7 +200,16 @@ def copy_few(source, target, count):
 
 
 @njit_no_refcount()
-def step_few(values, gradients, rates, first, second, count, room, numbers):
+def step_few(
+    values: Address,
+    gradients: Address,
+    rates: Address,
+    first: Address,
+    second: Address,
+    count: int,
+    room: Address,
+    numbers: tuple[float, ...],
+) -> None:
     """:func:`step_lanes` for the first ``count`` alone, within ``room`` for 64 float32.
 
     Storing some lanes of a vector is slow on processors with AVX2 alone.
@@ -106,7 +226,7 @@ def step_few(values, gradients, rates, first, second, count, room, numbers):
 
 
 @njit_no_refcount(fastmath={"contract"})
-def own_axes_of(i, quats, room):
+def own_axes_of(i: int, quats: Float32[np.ndarray, "n 4"], room: Float32[np.ndarray, "3 16"]) -> None:
     """The axes of Gaussian ``i`` as rows of ``room``: the normal and the two in its plane."""
     w, x, y, z = (
         np.float64(quats[i, 0]), np.float64(quats[i, 1]), np.float64(quats[i, 2]), np.float64(quats[i, 3]),
@@ -118,7 +238,13 @@ def own_axes_of(i, quats, room):
 
 
 @njit_no_refcount(fastmath={"contract"})
-def by_own_turns(k, i, quats, g_quats, out):
+def by_own_turns(
+    k: int,
+    i: int,
+    quats: Float32[np.ndarray, "n 4"],
+    g_quats: Float32[np.ndarray, "u 4"],
+    out: Float32[np.ndarray, "16"],
+) -> None:
     """Gradient of Gaussian ``i`` by turns around its own axes: by d of its quaternion times (1, d)."""
     w, x, y, z = quats[i, 0], quats[i, 1], quats[i, 2], quats[i, 3]
     a, b, c, d = g_quats[k, 0], g_quats[k, 1], g_quats[k, 2], g_quats[k, 3]
@@ -129,7 +255,7 @@ def by_own_turns(k, i, quats, g_quats, out):
 
 
 @njit_no_refcount(fastmath={"contract"})
-def turn(i, quats, by):
+def turn(i: int, quats: Float32[np.ndarray, "n 4"], by: Float32[np.ndarray, "16"]) -> None:
     """Replace the quaternion of Gaussian ``i`` by that times (1, ``by[4:7]``), of length 1."""
     w, x, y, z = (
         np.float64(quats[i, 0]), np.float64(quats[i, 1]), np.float64(quats[i, 2]), np.float64(quats[i, 3]),
@@ -143,46 +269,19 @@ def turn(i, quats, by):
 
 
 @njit_no_refcount(fastmath={"contract"})
-def step_gaussian(k, i, room, state, gaussian, gradients, rates, regular, corrections):
-    """One step of Gaussian ``i``, row ``k`` of the gradients; see :func:`adam_step`."""
-    first, second, numbers = state
-    means, quats, log_scales, logits, sh = gaussian
-    g_means, g_quats, g_log_scales, g_logits, g_sh = gradients
-    rate_mean, mean_by_size, own_axes, rate_quat, rate_log_scale, rate_opacity, rates_sh, mean_steps = rates
-    opacity_weight, scale_weight, min_log_scale, max_log_scale = regular
-    values, by_values, by_rates, axes = room[0], room[1], room[2], room[3:6]
-    few_at = room[6:].ctypes.data
-    scale_0, scale_1 = math.exp(np.float64(log_scales[i, 0])), math.exp(np.float64(log_scales[i, 1]))
-    rate = rate_mean
-    if mean_by_size:
-        rate *= math.sqrt(scale_0 * scale_1)
-    for axis in range(3):
-        values[axis], by_values[axis], by_rates[axis] = 0.0, g_means[k, axis], rate  # the step alone
-    for axis in range(4):
-        values[3 + axis], by_values[3 + axis], by_rates[3 + axis] = (
-            quats[i, axis], g_quats[k, axis], rate_quat,
-        )  # fmt: skip
-    for axis in range(2):
-        values[7 + axis], by_rates[7 + axis] = log_scales[i, axis], rate_log_scale
-    by_values[7] = g_log_scales[k, 0] + scale_weight * scale_0
-    by_values[8] = g_log_scales[k, 1] + scale_weight * scale_1
-    if own_axes:
-        own_axes_of(i, quats, axes)
-        for axis in range(3):
-            by_values[axis] = (
-                axes[axis, 0] * g_means[k, 0] + axes[axis, 1] * g_means[k, 1] + axes[axis, 2] * g_means[k, 2]
-            )
-            values[4 + axis] = 0.0
-        by_own_turns(k, i, quats, g_quats, by_values)
-    opacity = 0.0
-    if opacity_weight != 0.0:
-        opacity = 1.0 / (1.0 + math.exp(-np.float64(logits[i])))
-    values[9], by_rates[9] = logits[i], rate_opacity
-    by_values[9] = g_logits[k] + opacity_weight * opacity * (1.0 - opacity)
-    first_at = first.ctypes.data + i * first.shape[1] * 4
-    second_at = second.ctypes.data + i * second.shape[1] * 4
-    values_at, by_values_at, by_rates_at = values.ctypes.data, by_values.ctypes.data, by_rates.ctypes.data
-    step_few(values_at, by_values_at, by_rates_at, first_at, second_at, GEOMETRY, few_at, numbers)
+def step_sh(
+    k: int,
+    i: int,
+    moments: AdamMoments,
+    sh: Float32[np.ndarray, "n k 3"],
+    g_sh: Float32[np.ndarray, "u k 3"],
+    rates_sh: Float32[np.ndarray, " c"],
+    few_at: Address,
+    numbers: tuple[float, ...],
+) -> None:
+    """Step the harmonics of Gaussian ``i``, row ``k`` of the gradients; ``few_at`` is room for 64 float32."""
+    first_at = moments.first.ctypes.data + i * moments.first.shape[1] * 4
+    second_at = moments.second.ctypes.data + i * moments.second.shape[1] * 4
     columns = sh.shape[1] * 3
     for column in range(0, columns, LANES):
         sh_at = sh.ctypes.data + (i * columns + column) * 4
@@ -195,7 +294,61 @@ def step_gaussian(k, i, room, state, gaussian, gradients, rates, regular, correc
             step_lanes(sh_at, by_sh_at, rates_at, sh_first_at, sh_second_at, numbers)
         else:
             step_few(sh_at, by_sh_at, rates_at, sh_first_at, sh_second_at, left, few_at, numbers)
-    if own_axes:
+
+
+@njit_no_refcount(fastmath={"contract"})
+def step_gaussian(
+    k: int,
+    i: int,
+    room: Float32[np.ndarray, "10 16"],
+    moments: AdamMoments,
+    numbers: tuple[float, ...],
+    gaussians: ParameterArrays,
+    gradients: ParameterGradients,
+    rates: StepRates,
+    regular: Regularization,
+    mean_steps: Float32[np.ndarray, "u 3"],
+) -> None:
+    """Take one step of Gaussian ``i``, row ``k`` of the gradients; see :func:`adam_step`."""
+    means, quats, log_scales, logits, sh = gaussians
+    g_means, g_quats, g_log_scales, g_logits, g_sh = gradients
+    # --- values, gradients and rates of the geometry, a row each ---
+    values, by_values, by_rates, axes = room[0], room[1], room[2], room[3:6]
+    few_at = room[6:].ctypes.data
+    scale_0, scale_1 = math.exp(np.float64(log_scales[i, 0])), math.exp(np.float64(log_scales[i, 1]))
+    rate = rates.mean
+    if rates.mean_by_size:
+        rate *= math.sqrt(scale_0 * scale_1)
+    for axis in range(3):
+        values[axis], by_values[axis], by_rates[axis] = 0.0, g_means[k, axis], rate  # the step alone
+    for axis in range(4):
+        values[3 + axis], by_values[3 + axis], by_rates[3 + axis] = (
+            quats[i, axis], g_quats[k, axis], rates.quat,
+        )  # fmt: skip
+    for axis in range(2):
+        values[7 + axis], by_rates[7 + axis] = log_scales[i, axis], rates.log_scale
+    by_values[7] = g_log_scales[k, 0] + regular.scale_weight * scale_0
+    by_values[8] = g_log_scales[k, 1] + regular.scale_weight * scale_1
+    if rates.own_axes:
+        own_axes_of(i, quats, axes)
+        for axis in range(3):
+            by_values[axis] = (
+                axes[axis, 0] * g_means[k, 0] + axes[axis, 1] * g_means[k, 1] + axes[axis, 2] * g_means[k, 2]
+            )
+            values[4 + axis] = 0.0
+        by_own_turns(k, i, quats, g_quats, by_values)
+    opacity = 0.0
+    if regular.opacity_weight != 0.0:
+        opacity = 1.0 / (1.0 + math.exp(-np.float64(logits[i])))
+    values[9], by_rates[9] = logits[i], rates.opacity
+    by_values[9] = g_logits[k] + regular.opacity_weight * opacity * (1.0 - opacity)
+    first_at = moments.first.ctypes.data + i * moments.first.shape[1] * 4
+    second_at = moments.second.ctypes.data + i * moments.second.shape[1] * 4
+    values_at, by_values_at, by_rates_at = values.ctypes.data, by_values.ctypes.data, by_rates.ctypes.data
+    step_few(values_at, by_values_at, by_rates_at, first_at, second_at, GEOMETRY, few_at, numbers)
+    step_sh(k, i, moments, sh, g_sh, rates.sh, few_at, numbers)
+    # --- the new parameters ---
+    if rates.own_axes:
         turn(i, quats, values)
         for axis in range(3):
             mean_steps[k, axis] = (
@@ -209,15 +362,30 @@ def step_gaussian(k, i, room, state, gaussian, gradients, rates, regular, correc
     for axis in range(3):
         means[i, axis] += mean_steps[k, axis]
     for axis in range(2):
-        log_scales[i, axis] = min(max(np.float64(values[7 + axis]), min_log_scale), max_log_scale)
+        log_scales[i, axis] = min(
+            max(np.float64(values[7 + axis]), regular.min_log_scale), regular.max_log_scale
+        )
     logits[i] = values[9]
 
 
 @njit_no_refcount(fastmath={"contract"})
-def step_chunk(begin, end, ids, steps, powers, room, state, gaussian, gradients, rates, regular, corrections):
-    """:func:`step_gaussian` for rows ``begin`` to ``end``."""
-    first, second, beta1, beta2, epsilon = state
-    sh = gaussian[4]
+def step_chunk(
+    begin: int,
+    end: int,
+    ids: Int32[np.ndarray, " u"],
+    bias: BiasCorrection,
+    room: Float32[np.ndarray, "10 16"],
+    moments: AdamMoments,
+    gaussians: ParameterArrays,
+    gradients: ParameterGradients,
+    rates: StepRates,
+    regular: Regularization,
+    mean_steps: Float32[np.ndarray, "u 3"],
+) -> None:
+    """Take one step of the Gaussians of rows ``begin`` to ``end``."""
+    first, second, beta1, beta2, epsilon = moments
+    steps, powers, corrections = bias
+    sh = gaussians.sh
     moments_bytes, sh_bytes = first.shape[1] * 4, sh.shape[1] * 12
     for k in range(begin, end):
         if k + AHEAD < end:
@@ -233,67 +401,48 @@ def step_chunk(begin, end, ids, steps, powers, room, state, gaussian, gradients,
             np.float32(c1), np.float32(c2), np.float32(beta1), np.float32(beta2),
             np.float32(1.0 - beta1), np.float32(1.0 - beta2), np.float32(epsilon),
         )  # fmt: skip
-        step_gaussian(k, i, room, (first, second, numbers), gaussian, gradients, rates, regular, corrections)
+        step_gaussian(k, i, room, moments, numbers, gaussians, gradients, rates, regular, mean_steps)
 
 
 @kernel()
 def adam_step(
-    first_chunk, last_chunk,
-    ids, steps, powers, first, second,
-    means, quats, log_scales, logits, sh,
-    g_means, g_quats, g_log_scales, g_logits, g_sh,
-    rate_mean, mean_by_size, own_axes, rate_quat, rate_log_scale, rate_opacity, rates_sh,
-    opacity_weight, scale_weight, min_log_scale, max_log_scale,
-    beta1, beta2, epsilon, mean_steps, corrections,
-):  # fmt: skip
-    """One step for the Gaussians ``ids`` of some chunks of :data:`CHUNK` each.
+    first_chunk: int,
+    last_chunk: int,
+    ids: Int32[np.ndarray, " u"],
+    bias: BiasCorrection,
+    moments: AdamMoments,
+    gaussians: ParameterArrays,
+    gradients: ParameterGradients,
+    rates: StepRates,
+    regular: Regularization,
+    mean_steps: Float32[np.ndarray, "u 3"],
+) -> None:
+    """Take one step for the Gaussians ``ids`` of some chunks of :data:`CHUNK` each.
 
-    Each Gaussian has its own step count for the bias correction.
-
-    ``powers`` are those of ``beta1`` and ``beta2``, for as many steps as any has taken and one more.
-    ``rate_mean`` is in world units or, where ``mean_by_size``, in units of the Gaussian's size: the geometric
-    mean of its two scales. With ``own_axes`` means and quaternions are stepped along and around the
-    Gaussian's normal and the two axes in its plane, each with moments of its own; the first column of the
-    quaternion's is then unused. ``rates_sh`` are those of the harmonics' coefficients, one after the other,
-    in whole vectors of ``LANES``.
-
-    ``opacity_weight`` and ``scale_weight`` add the gradients of their regularisers. ``mean_steps`` receives
-    each mean's step, world units, and ``corrections`` what both moments are multiplied by.
+    ``regular`` adds the gradients of the regularisers. ``mean_steps`` receives each mean's step, world units.
     """
     count = len(ids)
     for chunk in range(first_chunk, last_chunk):
         room = np.zeros((10, LANES), np.float32)
         step_chunk(
-            chunk * CHUNK, min(count, (chunk + 1) * CHUNK), ids, steps, powers, room,
-            (first, second, beta1, beta2, epsilon),
-            (means, quats, log_scales, logits, sh),
-            (g_means, g_quats, g_log_scales, g_logits, g_sh),
-            (
-                rate_mean, mean_by_size, own_axes, rate_quat, rate_log_scale, rate_opacity, rates_sh,
-                mean_steps,
-            ),
-            (opacity_weight, scale_weight, min_log_scale, max_log_scale),
-            corrections,
+            chunk * CHUNK, min(count, (chunk + 1) * CHUNK), ids, bias, room, moments, gaussians, gradients,
+            rates, regular, mean_steps,
         )  # fmt: skip
 
 
 @kernel()
 def adam_shares(
-    first_row,
-    last_row,
-    ids,
-    corrections,
-    first,
-    second,
-    column,
-    values,
-    g_values,
-    rate,
-    beta1,
-    beta2,
-    epsilon,
-):
-    """One step for numbers in (0, 1) of the Gaussians ``ids``, taken by their logits.
+    first_row: int,
+    last_row: int,
+    ids: Int32[np.ndarray, " u"],
+    corrections: Float64[np.ndarray, "u 2"],
+    moments: AdamMoments,
+    column: int,
+    values: Float32[np.ndarray, "n w"],
+    g_values: Float32[np.ndarray, "u w"],
+    rate: float,
+) -> None:
+    """Take one step for numbers in (0, 1) of the Gaussians ``ids``, taken by their logits.
 
     Their moments begin at ``column``; ``corrections`` are those of :func:`adam_step`. A ``rate`` of 0 changes
     nothing.
@@ -305,8 +454,7 @@ def adam_shares(
             value = min(max(np.float64(values[i, place]), LEAST_SHARE), 1.0 - LEAST_SHARE)
             gradient = np.float64(g_values[k, place]) * value * (1.0 - value)
             logit = _update(
-                math.log(value / (1.0 - value)), gradient,
-                first, second, i, column + place, rate, c1, c2, beta1, beta2, epsilon,
-            )  # fmt: skip
+                math.log(value / (1.0 - value)), gradient, moments, i, column + place, rate, c1, c2
+            )
             value = 1.0 / (1.0 + math.exp(-logit))
             values[i, place] = min(max(value, LEAST_SHARE), 1.0 - LEAST_SHARE)

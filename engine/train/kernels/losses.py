@@ -1,6 +1,7 @@
 """The pixels' loss and its gradient in one pass."""
 
 import numpy as np
+from jaxtyping import Float32, Float64
 
 from octasplat.engine.core.compilation import kernel
 from octasplat.engine.trace.kernels.native import njit_no_refcount
@@ -10,7 +11,17 @@ CHUNKS = 64
 
 
 @njit_no_refcount()
-def _part(first, last, render, target, weight, l1, l2, gradient, sums):
+def _part(
+    first: int,
+    last: int,
+    render: Float32[np.ndarray, "r 3"],
+    target: Float32[np.ndarray, "r 3"],
+    weight: Float32[np.ndarray, " r"],
+    l1: np.float32,
+    l2: np.float32,
+    gradient: Float32[np.ndarray, "r 3"],
+    sums: Float64[np.ndarray, "2"],
+) -> None:
     absolute = squared = 0.0
     for r in range(first, last):
         for channel in range(3):
@@ -27,7 +38,17 @@ def _part(first, last, render, target, weight, l1, l2, gradient, sums):
 
 
 @kernel(error_model="numpy")
-def pixel_terms(first, last, render, target, weight, l1, l2, gradient, sums):
+def pixel_terms(
+    first: int,
+    last: int,
+    render: Float32[np.ndarray, "r 3"],
+    target: Float32[np.ndarray, "r 3"],
+    weight: Float32[np.ndarray, " r"],
+    l1: np.float32,
+    l2: np.float32,
+    gradient: Float32[np.ndarray, "r 3"],
+    sums: Float64[np.ndarray, "chunks 2"],
+) -> None:
     """Write ``gradient`` = (l1 sign(d) + l2 d) weight, d = render - target, and ``sums`` of |d| and d^2."""
     count, chunks = len(render), len(sums)
     for c in range(first, last):

@@ -1,13 +1,20 @@
 """How much small patches of photographs differ."""
 
 import numpy as np
+from jaxtyping import Float, Float32, Int64
 
 from octasplat.engine.core.compilation import kernel
 
 
 @kernel(error_model="numpy")
-def patch_differences(ours, theirs, rows, level_weight, costs):
-    """Difference of each patch ``theirs[k]`` from ``ours[rows[k]]``, written to ``costs[k]``.
+def patch_differences(
+    ours: Float32[np.ndarray, "a p 3"],
+    theirs: Float32[np.ndarray, "k p 3"],
+    rows: Int64[np.ndarray, " k"],
+    level_weight: float,
+    costs: Float[np.ndarray, " k"],
+) -> None:
+    """Write the difference of each patch ``theirs[k]`` from ``ours[rows[k]]``, written to ``costs[k]``.
 
     Patches are pixels of three channels. Mean absolute difference, once the mean of each channel is taken
     out, and ``level_weight`` times that of these means.

@@ -15,7 +15,19 @@ from octasplat.engine.gaussians.model import SH_C0, FlatGaussians
 from octasplat.engine.gaussians.rows import concatenate_rows, row_arrays, select_rows
 from octasplat.engine.trace.protocol import GaussianGradients
 from octasplat.engine.train.config import LearningRates, LossWeights
-from octasplat.engine.train.kernels.adam import CHUNK, GEOMETRY, LANES, adam_shares, adam_step
+from octasplat.engine.train.kernels.adam import (
+    CHUNK,
+    GEOMETRY,
+    LANES,
+    AdamMoments,
+    BiasCorrection,
+    ParameterArrays,
+    ParameterGradients,
+    Regularization,
+    StepRates,
+    adam_shares,
+    adam_step,
+)
 
 BETA1, BETA2, EPSILON = 0.9, 0.999, 1e-15
 
@@ -103,21 +115,30 @@ class Adam:
         vectors = -(-3 * gaussians.sh.shape[1] // LANES)
         rates_sh = np.full(vectors * LANES, colour * rates.sh_rest_ratio, np.float32)
         rates_sh[:3] = colour
+        powers = _powers(1 << (int(self.steps.max(initial=0)) + 1).bit_length())
         run_ranges(
             adam_step, threads_in_use(), -(-len(gradients.ids) // CHUNK),
-            gradients.ids, self.steps, _powers(1 << (int(self.steps.max(initial=0)) + 1).bit_length()),
-            self.first, self.second,
-            gaussians.means_world, gaussians.quats_wxyz, gaussians.log_scales,
-            gaussians.opacity_logits, gaussians.sh,
-            gradients.means_world, gradients.quats_wxyz, gradients.log_scales,
-            gradients.opacity_logits, gradients.sh,
-            mean_unit * rates.mean * (rates.mean_final / rates.mean) ** progress, rates.mean_unit == "size",
-            rates.axes == "own",
-            rates.quat * decay, rates.log_scale * decay, rates.opacity * decay,
-            rates_sh,
-            loss.opacity / hit, loss.scale / (2 * hit * extent),
-            float(np.log(1e-6 * extent)), float(np.log(10.0 * extent)),
-            BETA1, BETA2, EPSILON, moved, corrections, grain=1,
+            gradients.ids,
+            BiasCorrection(self.steps, powers, corrections),
+            AdamMoments(self.first, self.second, BETA1, BETA2, EPSILON),
+            ParameterArrays(
+                gaussians.means_world, gaussians.quats_wxyz, gaussians.log_scales,
+                gaussians.opacity_logits, gaussians.sh,
+            ),
+            ParameterGradients(
+                gradients.means_world, gradients.quats_wxyz, gradients.log_scales,
+                gradients.opacity_logits, gradients.sh,
+            ),
+            StepRates(
+                mean_unit * rates.mean * (rates.mean_final / rates.mean) ** progress,
+                rates.mean_unit == "size", rates.axes == "own",
+                rates.quat * decay, rates.log_scale * decay, rates.opacity * decay, rates_sh,
+            ),
+            Regularization(
+                loss.opacity / hit, loss.scale / (2 * hit * extent),
+                float(np.log(1e-6 * extent)), float(np.log(10.0 * extent)),
+            ),
+            moved, grain=1,
         )  # fmt: skip
         self._step_channels(gaussians, gradients, rates, decay, corrections)
         return moved
@@ -138,8 +159,9 @@ class Adam:
             if rate > 0:
                 run_ranges(
                     adam_shares, threads_in_use(), len(gradients.ids),
-                    gradients.ids, corrections, self.channel_first, self.channel_second, column, values,
-                    gradients.features[:, column : column + width], rate * decay, BETA1, BETA2, EPSILON,
+                    gradients.ids, corrections,
+                    AdamMoments(self.channel_first, self.channel_second, BETA1, BETA2, EPSILON),
+                    column, values, gradients.features[:, column : column + width], rate * decay,
                 )  # fmt: skip
             column += width
 

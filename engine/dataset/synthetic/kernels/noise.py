@@ -1,13 +1,14 @@
 """Compiled inner loops of the generated scene: gradient noise, and interpolation on triangles."""
 
 import numpy as np
+from jaxtyping import Float32, Int
 
 from octasplat.engine.core.compilation import device_function, kernel
 
 
 @device_function(inline="always")
-def _hash(x, y, z, seed):  # type: ignore[no-untyped-def]
-    """32 well mixed bits of an integer lattice point."""
+def _hash(x: int, y: int, z: int, seed: int) -> np.uint32:
+    """Return 32 well mixed bits of an integer lattice point."""
     h = np.uint32(x) * np.uint32(0x8DA6B343) ^ np.uint32(y) * np.uint32(0xD8163841)
     h = np.uint32(h) ^ np.uint32(z) * np.uint32(0xCB1AB31F) ^ np.uint32(seed) * np.uint32(0x9E3779B1)
     h = np.uint32(h)
@@ -17,8 +18,8 @@ def _hash(x, y, z, seed):  # type: ignore[no-untyped-def]
 
 
 @kernel()
-def hash_cells(cells, seed, out):  # type: ignore[no-untyped-def]
-    """A number in [0, 1) of every integer cell (n, 3), into ``out`` (n,)."""
+def hash_cells(cells: Int[np.ndarray, "n 3"], seed: int, out: Float32[np.ndarray, " n"]) -> None:
+    """Write a number in [0, 1) of every integer cell (n, 3), into ``out`` (n,)."""
     for i in range(cells.shape[0]):
         out[i] = np.float32(_hash(cells[i, 0], cells[i, 1], cells[i, 2], seed) >> np.uint32(8)) / np.float32(
             1 << 24
@@ -26,8 +27,8 @@ def hash_cells(cells, seed, out):  # type: ignore[no-untyped-def]
 
 
 @device_function(inline="always")
-def _gradient_dot(h, dx, dy, dz):  # type: ignore[no-untyped-def]
-    """Height at an offset from a lattice point, on the plane that the hash gives to that point."""
+def _gradient_dot(h: np.uint32, dx: np.float32, dy: np.float32, dz: np.float32) -> np.float32:
+    """Return the height at an offset from a lattice point, on the plane that the hash gives to that point."""
     scale = np.float32(1.0 / 511.5)
     gx = np.float32(h & np.uint32(1023)) * scale - np.float32(1)
     gy = np.float32((h >> np.uint32(10)) & np.uint32(1023)) * scale - np.float32(1)
@@ -36,8 +37,10 @@ def _gradient_dot(h, dx, dy, dz):  # type: ignore[no-untyped-def]
 
 
 @kernel()
-def fractal_noise(points, octaves, seed, out):  # type: ignore[no-untyped-def]
-    """Sum of ``octaves`` gradient noises, each twice as fine and half as strong, into ``out`` (n,)."""
+def fractal_noise(
+    points: Float32[np.ndarray, "n 3"], octaves: int, seed: int, out: Float32[np.ndarray, " n"]
+) -> None:
+    """Write the sum of ``octaves`` gradient noises, each twice as fine and half as strong."""
     one = np.float32(1)
     for i in range(points.shape[0]):
         total = np.float32(0)
@@ -69,8 +72,15 @@ def fractal_noise(points, octaves, seed, out):  # type: ignore[no-untyped-def]
 
 
 @kernel()
-def interpolate_attributes(attributes, faces, face_ids, u, v, out):  # type: ignore[no-untyped-def]
-    """Vertex attributes (vertices, k) at barycentric coordinates (u, v) on faces, into ``out`` (n, k)."""
+def interpolate_attributes(
+    attributes: Float32[np.ndarray, "v k"],
+    faces: Int[np.ndarray, "f 3"],
+    face_ids: Int[np.ndarray, " n"],
+    u: Float32[np.ndarray, " n"],
+    v: Float32[np.ndarray, " n"],
+    out: Float32[np.ndarray, "n k"],
+) -> None:
+    """Interpolate vertex attributes (vertices, k) at barycentric coordinates (u, v) on faces."""
     width = attributes.shape[1]
     for i in range(face_ids.shape[0]):
         a, b, c = faces[face_ids[i], 0], faces[face_ids[i], 1], faces[face_ids[i], 2]

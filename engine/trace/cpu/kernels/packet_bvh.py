@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int32, Int64, UInt64
 
 from octasplat.engine.core.compilation import device_function, kernel
-from octasplat.engine.gaussians.morton_bits import spread_bits
+from octasplat.engine.gaussians.kernels.morton_bits import spread_bits
 from octasplat.engine.trace.cpu.kernels.octagon_hit import AXIS_U, AXIS_V, COS_22, INNER_RADIUS, MEAN
 
 WIDTH = 8

@@ -5,7 +5,7 @@ from jaxtyping import UInt64
 
 
 def spread_bits(bits: UInt64[np.ndarray, " n"]) -> UInt64[np.ndarray, " n"]:
-    """Two zero bits between each of the low 21 bits; numba compiles this for single numbers."""
+    """Put two zero bits between each of the low 21 bits; numba compiles this for single numbers."""
     x = bits
     for shift, mask in (
         (32, 0x1F00000000FFFF),

@@ -1,0 +1,1 @@
+"""Functions that numba compiles for kernels of other folders."""
