@@ -30,7 +30,7 @@ SORT = """
     logging.basicConfig()
     import numpy as np
     from octasplat.engine.trace.cpu.kernels import radix_sort as kernels_sort
-    order, keys = kernels_sort.stable_order(np.array([3, 1, 2], np.int32), 2, 1)
+    order, keys = kernels_sort.stable_argsort(np.array([3, 1, 2], np.int32), 2, 1)
     print(order, kernels_sort._scatter.stats.cache_hits)
 """
 
@@ -98,7 +98,7 @@ def test_world_writable_cache_folder_is_not_used(tmp_path: Path) -> None:
 
 
 def test_device_function_called_from_python_raises() -> None:
-    with pytest.raises(KeyError, match="write_basis is called by kernels only"):
+    with pytest.raises(KeyError, match="eval_sh_basis is called by kernels only"):
         eval_sh_basis(np.zeros(16), 16, 0.0, 0.0, 1.0)
 
 

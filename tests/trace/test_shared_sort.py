@@ -144,11 +144,11 @@ def test_shared_sort_is_bit_identical_across_threads(rng: np.random.Generator) -
             seen = tracer.trace(rays, record=True)
             assert seen.recording is not None
             gradients.append(tracer.backward(seen.recording, given))
-            results.append(dataclasses.replace(seen, hits=None))
+            results.append(dataclasses.replace(seen, recording=None))
     for k in range(1, 4):
         same_bits(results[0], results[k])
         same_bits(gradients[0], gradients[k])
-    same_bits(results[0], dataclasses.replace(make_tracer(cloud, sort="packet").trace(rays), hits=None))
+    same_bits(results[0], dataclasses.replace(make_tracer(cloud, sort="packet").trace(rays), recording=None))
 
 
 def test_recordings_live_side_by_side(rng: np.random.Generator) -> None:

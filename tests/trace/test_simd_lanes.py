@@ -16,7 +16,14 @@ from octasplat.engine.trace.cpu.kernels.simd_ops import DOUBLE8, INT8, MASK8, Co
 from octasplat.engine.trace.cpu.kernels.simd_vector import boxes_in_frustum, ellipses_in_frustum
 
 ADDRESS, DOUBLE, SINGLE, WORD = types.uintp, types.float64, types.float32, types.int64
-MEET = (ADDRESS, *(SINGLE,) * 5, WORD, WORD, *(ADDRESS,) * 6)
+
+
+def named(cls: type, member: types.Type = ADDRESS) -> types.Type:
+    """Return the type of a named tuple whose members are alike."""
+    return types.NamedUniTuple(member, len(cls._fields), cls)
+
+
+MEET = (ADDRESS, named(simd8.PacketRay, SINGLE), WORD, WORD, named(simd8.HitBuffer))
 KERNELS = {
     "intersect_block8": (simd8.intersect_block8, MEET),
     "eval_alphas8": (simd8.eval_alphas8, (ADDRESS, ADDRESS, WORD, SINGLE)),
@@ -26,12 +33,24 @@ KERNELS = {
         (ADDRESS, WORD, types.uint64, ADDRESS, DOUBLE, DOUBLE, ADDRESS, ADDRESS, ADDRESS),
     ),
     "lookup_slots8": (simd8.lookup_slots8, (ADDRESS, WORD, *(ADDRESS,) * 6)),
-    "store_hits8": (simd8.store_hits8, (ADDRESS, WORD, *(ADDRESS,) * 4, WORD, *(ADDRESS,) * 5)),
+    "store_hits8": (
+        simd8.store_hits8,
+        (ADDRESS, WORD, ADDRESS, ADDRESS, named(simd8.HitTables), WORD, named(simd8.HitStore)),
+    ),
     "accumulate_color_normals": (simd8.accumulate_color_normals, (ADDRESS,) * 4 + (WORD,)),
     "transmittance_before8": (simd8_backward.transmittance_before8, (ADDRESS, WORD, DOUBLE, ADDRESS)),
     "backward_hits8": (
         simd8_backward.backward_hits8,
-        (*(ADDRESS,) * 7, WORD, DOUBLE, SINGLE, *(ADDRESS,) * 4),
+        (
+            named(simd8_backward.Hits8),
+            ADDRESS,
+            ADDRESS,
+            WORD,
+            DOUBLE,
+            SINGLE,
+            ADDRESS,
+            named(simd8_backward.HitGradients8),
+        ),
     ),
     "accumulate_row": (simd8_backward.accumulate_row, (ADDRESS, ADDRESS)),
     "intersect_group16": (simd16.intersect_group16, (*(ADDRESS,) * 4, WORD, *(SINGLE,) * 3)),

@@ -167,7 +167,8 @@ class PathArrays(NamedTuple):
         albedo_linear: colour of that mesh, white where it mirrors or lets through, times the same share.
         normals_world: its shading normal times the same share.
         pdf: of the last direction over solid angle; 0 for the camera, mirrors and glass.
-        t_view_origin: where on the next ray its viewer stands, see :class:`octasplat.engine.core.rays.RayBatch`.
+        t_view_origin: where on the next ray its viewer stands, see
+            :class:`octasplat.engine.core.rays.RayBatch`.
         medium_ids: material that the path is in, -1 for air.
         flags: bits of :mod:`octasplat.engine.pathtracing.kernels.path_surfaces`.
         is_alive: whether the path goes on.
