@@ -6,25 +6,33 @@ This package knows nothing of Gaussians. :class:`Dataset` is what training and e
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from octasplat.engine.dataset.camera import Camera
-from octasplat.engine.dataset.model import (
-    DatasetModel,
-    DatasetView,
-    PosedView,
-    SparsePoints,
-    Viewpoints,
-    scene_extent,
-)
-from octasplat.engine.dataset.split import split_views, write_held_out
-
 if TYPE_CHECKING:
+    from octasplat.engine.dataset.camera import Camera
     from octasplat.engine.dataset.dataset import Dataset
     from octasplat.engine.dataset.load import load_dataset_model
+    from octasplat.engine.dataset.model import (
+        DatasetModel,
+        DatasetView,
+        PosedView,
+        SparsePoints,
+        Viewpoints,
+        scene_extent,
+    )
+    from octasplat.engine.dataset.split import split_views, write_held_out
 
-# Compilers and image libraries come with these; whoever only checks a COLMAP model has neither.
+# Compilers, COLMAP and image libraries come with these; whoever only asks for sizes of images needs none.
 _LAZY_EXPORTS = {
-    "Dataset": "octasplat.engine.dataset.dataset",
-    "load_dataset_model": "octasplat.engine.dataset.load",
+    "Camera": "camera",
+    "Dataset": "dataset",
+    "DatasetModel": "model",
+    "DatasetView": "model",
+    "PosedView": "model",
+    "SparsePoints": "model",
+    "Viewpoints": "model",
+    "load_dataset_model": "load",
+    "scene_extent": "model",
+    "split_views": "split",
+    "write_held_out": "split",
 }
 
 __all__ = [
@@ -44,5 +52,5 @@ __all__ = [
 
 def __getattr__(name: str) -> Any:
     if name in _LAZY_EXPORTS:
-        return getattr(import_module(_LAZY_EXPORTS[name]), name)
+        return getattr(import_module(f"{__name__}.{_LAZY_EXPORTS[name]}"), name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -20,7 +20,7 @@ GZIP_MAGIC = b"\x1f\x8b"
 VERSIONS = (2, 3, 4)
 MAX_DEGREE = 4
 GZIP_LEVEL, ZSTD_LEVEL = 6, 9
-ANTIALIASED, HAS_EXTENSIONS = 1, 2
+ANTIALIASED = 1
 _HEADER = struct.Struct("<4sIIBBBB")
 _HEADER_V4 = struct.Struct("<4sIIBBBBI12x")
 _TOC_ENTRY = struct.Struct("<QQ")
@@ -39,7 +39,7 @@ class SpzFile:
         count: number of Gaussians.
         sh_degree: 0 to 4.
         fractional_bits: of the 24-bit fixed-point positions.
-        flags: ``ANTIALIASED`` and ``HAS_EXTENSIONS``.
+        flags: bits, of which ``ANTIALIASED`` is one.
         streams: the six attributes, packed.
     """
 

@@ -78,11 +78,6 @@ class PoseSearch:
         self._one_camera = self._has_one_size()
         self._warn_of_small_photographs()
 
-    @property
-    def numbered_names(self) -> tuple[str, ...]:
-        """The photographs that are searched, in the order in which COLMAP numbers them."""
-        return self._names
-
     def run(self, found: Path) -> None:
         """Search, a second time if photographs are left out, and write the best model.
 

@@ -4,7 +4,6 @@ Every material takes positions (n, 3) in the object's own frame, in metres, and 
 (n, 3) in linear light.
 """
 
-from collections.abc import Callable
 
 import numpy as np
 from jaxtyping import Float32
@@ -29,7 +28,6 @@ from octasplat.engine.dataset.synthetic.patterns import (
 TexturePoints = Float32[np.ndarray, "n 3"]
 UvCoordinates = Float32[np.ndarray, "n 2"]
 Colours = Float32[np.ndarray, "n 3"]
-AlbedoFn = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
 
 def _wood_grain(xyz: TexturePoints, light: str, dark: str, seed: int) -> Colours:
