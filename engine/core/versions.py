@@ -11,6 +11,7 @@ PACKAGES = (
     "numba",
     "numpy",
     "OpenImageIO",  # decodes photographs
+    "pillow",  # reads the tags that tell what their values mean
     "pycolmap",  # undistorts rays
     "scipy",
     "torch",  # shrinks photographs

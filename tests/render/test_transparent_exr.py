@@ -61,7 +61,7 @@ def relighter() -> Callable[[np.ndarray], Relighter]:
         def over(background: np.ndarray) -> np.ndarray:
             return linear_to_srgb(linear) * coverage[..., None] + background * (1 - coverage[..., None])
 
-        image = SimpleNamespace(linear=linear, coverage=coverage, over=over)
+        image = SimpleNamespace(linear=linear, coverage=coverage, composite_over=over)
         return cast(Relighter, SimpleNamespace(set_environment=lambda _map: None, render=lambda _rays, _part: image))
 
     return make

@@ -61,7 +61,7 @@ def test_ball_comes_out_closed_round_and_in_its_colours(surface):
 
 
 def test_expected_depth_is_there_to_choose(tracer, surface, tmp_path):
-    other = extracted(tracer, tmp_path, depth="expected").mesh
+    other = extracted(tracer, tmp_path, depth_mode="expected").mesh
     assert edge_report(other.faces).is_watertight
     assert len(other.vertices_world) != len(surface.mesh.vertices_world) or not np.array_equal(
         other.vertices_world, surface.mesh.vertices_world
