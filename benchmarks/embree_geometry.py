@@ -49,7 +49,7 @@ INSTANCE, REFIT, FLOAT3X4_COLUMN_MAJOR = 121, 3, 0x9234
 SH_STEP = 1 / 4096
 THICKNESS = 1e-6
 
-meet = njit(intersect_octagon._pyfunc, fastmath={"contract"})
+meet = njit(intersect_octagon.function, fastmath={"contract"})
 
 
 @cfunc(types.void(types.CPointer(types.uint64)), fastmath={"contract"})

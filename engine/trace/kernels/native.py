@@ -1,10 +1,11 @@
 """Numba's tools: kernels that count no references, raw memory, native functions, and a shared counter."""
 
 from collections.abc import Callable, Sequence
+from functools import cached_property
 from typing import Any, TypeAlias
 
 import llvmlite.ir as ir
-from numba import types
+from numba import cfunc, types
 from numba.core import cgutils
 from numba.core.base import BaseContext
 from numba.core.typing import Context as TypingContext
@@ -34,6 +35,35 @@ def njit_no_refcount(**options: Any) -> Callable[[Any], Any]:
     takes longer than the work of a hit.
     """
     return device_function(_nrt=False, error_model="numpy", **options)
+
+
+class NativeCallback:
+    """A function that native code calls; it is compiled when its address is first asked for.
+
+    Args:
+        function: takes what ``signature`` says.
+        signature: numba's.
+        options: as of ``numba.cfunc``.
+    """
+
+    def __init__(self, function: Callable[..., None], signature: Signature, options: dict[str, Any]) -> None:
+        self.function = function
+        self._signature = signature
+        self._options = options
+
+    @cached_property
+    def _compiled(self) -> Any:
+        return cfunc(self._signature, cache=True, **self._options)(self.function)
+
+    @property
+    def address(self) -> Address:
+        """Its address, good while this lives."""
+        return int(self._compiled.address)
+
+
+def native_callback(signature: Signature, **options: Any) -> Callable[[Callable[..., None]], NativeCallback]:
+    """Return a decorator that makes a :class:`NativeCallback`; options as of ``numba.cfunc``."""
+    return lambda function: NativeCallback(function, signature, options)
 
 
 def _pointer_cast(element: types.Type) -> Any:

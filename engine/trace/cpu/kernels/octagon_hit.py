@@ -9,7 +9,7 @@ import math
 
 import numpy as np
 from jaxtyping import Float32, Float64, Int32
-from numba import carray, cfunc, types
+from numba import carray, types
 
 from octasplat.engine.core.compilation import device_function
 from octasplat.engine.trace.kernels.native import (
@@ -17,6 +17,7 @@ from octasplat.engine.trace.kernels.native import (
     float32_pointer,
     float64_pointer,
     int32_pointer,
+    native_callback,
     uint64_pointer,
 )
 
@@ -132,7 +133,7 @@ def eval_alpha(
     return np.float32(min(primitive[OPACITY] * math.exp(-0.5 * (u * u + v * v)), context_f64[ALPHA_MAX]))
 
 
-@cfunc(types.void(types.CPointer(types.uint64)), cache=True, fastmath={"contract"})
+@native_callback(types.void(types.CPointer(types.uint64)), fastmath={"contract"})
 def intersect_octagon(arguments: Address) -> None:
     """RTCIntersectFunctionN for one ray: exact plane hit, octagon test, alpha, insertion."""
     words = carray(arguments, 6)
@@ -171,7 +172,7 @@ def intersect_octagon(arguments: Address) -> None:
         ray[RAY_TFAR] = context_f32[HIT_T + count - 1] * np.float32(1.000001)
 
 
-@cfunc(types.void(types.CPointer(types.uint64)), cache=True, fastmath={"contract"})
+@native_callback(types.void(types.CPointer(types.uint64)), fastmath={"contract"})
 def attenuate_by_octagon(arguments: Address) -> None:
     """RTCOccludedFunctionN for one ray: takes the ray's transmittance along until too little is left."""
     words = carray(arguments, 6)
@@ -195,7 +196,7 @@ def attenuate_by_octagon(arguments: Address) -> None:
             ray[RAY_TFAR] = -np.inf  # Embree: a hit, go no further
 
 
-@cfunc(types.void(types.CPointer(types.uint64)), cache=True)
+@native_callback(types.void(types.CPointer(types.uint64)))
 def octagon_bounds(arguments: Address) -> None:
     """RTCBoundsFunction: copy the prepared box of a Gaussian."""
     words = carray(arguments, 3)
