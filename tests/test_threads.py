@@ -78,10 +78,10 @@ def test_single_thread_build_leaves_no_running_threads() -> None:
     script = """
 import time
 import numpy as np
-from octasplat.engine.trace.embree import Device, MeshScene
+from octasplat.engine.trace.embree import EmbreeDevice, EmbreeTriangleScene
 corners = np.random.default_rng(0).normal(size=(3000, 3)).astype(np.float32)
 faces = np.arange(3000, dtype=np.uint32).reshape(-1, 3)
-scenes = [MeshScene(Device(1), corners, faces) for _ in range(4)]
+scenes = [EmbreeTriangleScene(EmbreeDevice(1), corners, faces) for _ in range(4)]
 before = time.process_time()
 time.sleep(1)
 print(time.process_time() - before)

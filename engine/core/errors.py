@@ -1,49 +1,87 @@
 """The exceptions that users see: one clear sentence each, naming the file and what to do."""
 
+import re
+from typing import Any, ClassVar
+
 
 class OctasplatError(Exception):
-    """Base of every error that is the user's to mend; its text is one sentence fit to print as it is."""
+    """Base of every error that the user can correct; its text is one sentence fit to print as it is.
+
+    Attributes:
+        error_type: what a job that fails so publishes as its ``error.type``, in snake case. It is part of the
+            API: a class whose name changes keeps it. A subclass without its own takes it from its name.
+    """
+
+    error_type: ClassVar[str] = "octasplat_error"
+
+    def __init_subclass__(cls, **options: Any) -> None:
+        """Give a class without its own ``error_type`` the one that its name spells."""
+        super().__init_subclass__(**options)
+        if "error_type" not in vars(cls):
+            cls.error_type = re.sub(r"(?<!^)(?=[A-Z])", "_", cls.__name__).lower()
 
 
 class DatasetError(OctasplatError):
     """The photographs, masks or the COLMAP model cannot be used."""
 
+    error_type = "dataset_error"
+
 
 class PosesCrashed(OctasplatError):
     """COLMAP died while it looked for poses."""
+
+    error_type = "poses_crashed"
 
 
 class SceneFileError(OctasplatError):
     """A file of Gaussians or of a mesh cannot be read or written."""
 
+    error_type = "scene_file_error"
+
 
 class ExportFailed(OctasplatError):
     """Some of the files that were asked for could not be written; everything else is there."""
+
+    error_type = "export_failed"
 
 
 class ConfigError(OctasplatError):
     """A setting is unknown, out of range or contradicts another."""
 
+    error_type = "config_error"
+
 
 class OutputError(OctasplatError):
     """The output folder cannot be used as asked (it holds another run, or cannot be written)."""
+
+    error_type = "output_error"
 
 
 class NoSpaceLeft(OutputError):
     """A file cannot be written because its disk is full; what was there before is whole."""
 
+    error_type = "no_space_left"
+
 
 class CheckpointError(OctasplatError):
     """A checkpoint is missing, damaged or belongs to another configuration."""
+
+    error_type = "checkpoint_error"
 
 
 class DamagedCheckpoint(CheckpointError):
     """A checkpoint file cannot be read; the one before it may be sound."""
 
+    error_type = "damaged_checkpoint"
+
 
 class TrainingFailure(OctasplatError):
     """Training collapsed (not-a-number, an empty scene, a scene that covers nothing); nothing is exported."""
 
+    error_type = "training_failure"
+
 
 class Cancelled(OctasplatError):
     """The run was asked to stop; a checkpoint was written and ``--resume`` goes on from it."""
+
+    error_type = "cancelled"

@@ -173,6 +173,8 @@ def options_of(model: type[OptionsT], request: Options) -> OptionsT:
 class ContradictoryRequestError(ConfigError):
     """What is asked for is not complete, or contradicts itself."""
 
+    error_type = "contradictory_request"
+
 
 def build_request(
     model: type[ModelT], values: Mapping[str, Any], place: Callable[[str], str] = lambda path: path

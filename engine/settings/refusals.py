@@ -32,6 +32,8 @@ class Refusal:
 class SettingsRefused(ConfigError):
     """Settings that cannot be used; the text is the first one's sentence."""
 
+    error_type = "settings_refused"
+
     def __init__(self, refusals: Sequence[Refusal]) -> None:
         super().__init__(refusals[0].sentence)
         self.refusals = tuple(refusals)

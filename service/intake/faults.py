@@ -35,6 +35,8 @@ class IntakeFault:
 class IntakeError(DatasetError):
     """Something from outside is refused; ``faults`` say why, the text is that of the first."""
 
+    error_type = "intake_refused"
+
     def __init__(self, *faults: IntakeFault) -> None:
         super().__init__(faults[0].detail)
         self.faults = faults

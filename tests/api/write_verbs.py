@@ -36,10 +36,10 @@ from typing import TYPE_CHECKING, Any, Literal, TypedDict
 from pydantic import BaseModel
 
 from octasplat.engine.core.events import Listener
-from octasplat.engine.operations.base import never
+from octasplat.engine.operations.base import never_stop
 from octasplat.operation_calls import names_checked, run_operation
 from octasplat.paths import PathLike
-from octasplat.runs import OnStep, Run, reconstruct_into
+from octasplat.runs import OnStep, Run, reconstruct_run
 
 if TYPE_CHECKING:
 {imports}
@@ -51,7 +51,7 @@ ON_STEP_ARGUMENT = (
 )
 LAST_PARAMETERS = (
     "progress: Listener | None = None",
-    "should_stop: Callable[[], bool] = never",
+    "should_stop: Callable[[], bool] = never_stop",
     "threads: int = 0",
 )
 LAST_ARGUMENTS = (
@@ -152,7 +152,7 @@ def function(verb: "Operation[Any, Any]") -> str:
     values = "{" + ", ".join(f'"{name}": {name}' for name in fields) + "}"
     call = f'run_operation("{verb.name}", {values}, progress, should_stop, threads)'
     if verb.name == "reconstruct":
-        call = f"reconstruct_into({values}, on_step, progress, should_stop, threads)"
+        call = f"reconstruct_run({values}, on_step, progress, should_stop, threads)"
     return (
         f'@names_checked\ndef {PYTHON_NAMES.get(verb.name, verb.name)}(\n    {signature},\n) -> "{result}":\n'
         f'    """{verb.title}\n\n    Args:\n{wrapped}\n\n    Raises:\n'

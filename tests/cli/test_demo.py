@@ -50,7 +50,7 @@ def test_demo_signal_leaves_no_partial_scene(start_octasplat, tmp_path, number, 
 
 STOPPED_AT_ONCE = """
 import os, pathlib, signal, sys
-from octasplat.workers.cli.demo_run import make_scene
+from octasplat.workers.cli.demo_run import make_demo_scene
 
 made = pathlib.Path.mkdir
 
@@ -60,7 +60,7 @@ def mkdir(path, *given, **named):
         os.kill(os.getpid(), signal.SIGTERM)
 
 pathlib.Path.mkdir = mkdir
-make_scene(pathlib.Path(sys.argv[1]), {"views": 4}, quiet=True)
+make_demo_scene(pathlib.Path(sys.argv[1]), {"views": 4}, quiet=True)
 """
 
 

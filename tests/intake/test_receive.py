@@ -174,8 +174,7 @@ def test_receive_without_disk_space_is_refused(tmp_path: Path) -> None:
 MEMORY = """
 import asyncio, resource, sys
 from pathlib import Path
-from octasplat.service.intake.spool import Spool
-from octasplat.service.intake.receive import receive
+from octasplat.service.intake.receive import receive_body
 from octasplat.workers.storage.local import LocalStorage
 
 async def body(megabytes):
@@ -184,9 +183,9 @@ async def body(megabytes):
         yield piece
 
 storage = LocalStorage(Path(sys.argv[1]), floor_bytes=0)
-asyncio.run(receive(body(4), storage.begin()))
+asyncio.run(receive_body(body(4), storage.open_writer()))
 before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-blob = asyncio.run(receive(body(int(sys.argv[2])), storage.begin()))
+blob = asyncio.run(receive_body(body(int(sys.argv[2])), storage.open_writer()))
 after = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 print(blob.size_bytes, after - before)
 """

@@ -61,14 +61,14 @@ ACCEPT = (
     + """
 from octasplat.engine.files import exporters
 from octasplat.service.web.forms import options_form
-from octasplat.workers.worker.job_kinds import job_kinds, kind_named
+from octasplat.workers.worker.job_kinds import get_job_kind, job_kinds
 assert exporters()
 for kind in job_kinds():
     options_form(kind)
     kind.options.model_json_schema()
 files = ["a.glb", "b.ply", "c.obj", "d.spz", "e.sog", "f.splat", "g.usdz", "h.splats.glb"]
 for name, asked in (("reconstruct", {"exports": files}), ("export", {"files": files})):
-    kind_named(name).resolve(asked)
+    get_job_kind(name).resolve(asked)
 """
 )
 

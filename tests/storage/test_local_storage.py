@@ -119,11 +119,11 @@ from octasplat.workers.storage.local import LocalStorage
 storage = LocalStorage(Path(sys.argv[1]), floor_bytes=0)
 number = 0
 while True:
-    with storage.begin() as writer:
+    with storage.open_writer() as writer:
         for _ in range(8):
             writer.write(number.to_bytes(8, "big") * 8192)
         blob = writer.commit()
-    storage.publish(f"done/{number}", blob.sha256.encode())
+    storage.publish_document(f"done/{number}", blob.sha256.encode())
     print(number, flush=True)
     number += 1
 """

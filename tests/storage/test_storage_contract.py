@@ -289,7 +289,7 @@ from octasplat.workers.storage import open_storage
 storage = open_storage(sys.argv[1], floor_bytes=0)
 
 def put(megabytes, start):
-    with storage.begin() as writer:
+    with storage.open_writer() as writer:
         for number in range(megabytes):
             writer.write((start + number).to_bytes(8, "big") * (1 << 17))
         return writer.commit()

@@ -61,10 +61,11 @@ class WorkerHarness:
         self, *, queues: str = "cpu", name: str = "w", root: Path = ROOT, **settings: str
     ) -> "subprocess.Popen[bytes]":
         """Start a worker in a process, of the version in the folder ``root``."""
-        former = [] if (root / "src").exists() else [root / "tests" / "work"]  # until 0.1
+        # The toy of the release before lies elsewhere.
+        folders = (root / "src", root) if root == ROOT else (root / "src", root, root / "tests" / "work")
         given = {
             **FAST,
-            **({"KIND_MODULES": '["toy_kind"]'} if former else {}),
+            **({} if root == ROOT else {"KIND_MODULES": '["toy_kind"]'}),
             "STALE_SECONDS": str(self.stale_seconds),
             "STORAGE": str(self.folder / "store"),
             "WORK": str(self.folder / f"work-{name}"),
@@ -74,15 +75,12 @@ class WorkerHarness:
             **os.environ,
             **{f"OCTASPLAT_{key}": value for key, value in given.items()},
             "DATABASE_URL": self.conninfo,
-            "PYTHONPATH": os.pathsep.join(
-                map(str, (root / "src", root, root / "tests" / "work")[: 3 if former else 2])
-            ),
+            "PYTHONPATH": os.pathsep.join(map(str, folders)),
             "OMP_NUM_THREADS": "1",
             "NUMBA_NUM_THREADS": "2",
             "A_SECRET_TOKEN": "must not reach the child",
         }
-        package = "workers" if former else "octasplat"
-        command = [sys.executable, "-m", package, "worker", "--queues", queues, "--name", name]
+        command = [sys.executable, "-m", "octasplat", "worker", "--queues", queues, "--name", name]
         with (self.folder / f"{name}.log").open("ab") as log:
             process = subprocess.Popen(command, env=environment, cwd=root, stderr=log)
         self.processes.append(process)

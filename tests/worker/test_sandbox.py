@@ -21,8 +21,8 @@ READER = """
 import json, os, socket, subprocess, sys
 from pathlib import Path
 from octasplat.workers.sandbox.confinement import confine
-confine(hidden=[Path(sys.argv[1])], read=[Path(sys.argv[1]) / "open"], may_start_processes=False,
-        elsewhere_reads_only=True)
+confine(hidden=[Path(sys.argv[1])], readable=[Path(sys.argv[1]) / "open"], may_start_processes=False,
+        is_read_only_elsewhere=True)
 import numpy
 tries = dict(
     shut=lambda: Path(sys.argv[1], "shut").read_text(),
@@ -39,9 +39,9 @@ for name, attempt in tries.items():
 print(json.dumps(found))
 """
 WITHOUT_LANDLOCK = """
-from octasplat.workers.sandbox import filters
-filters._DENIED = {"landlock_create_ruleset": (444, 444)}
-filters.filter_calls(may_start_processes=True)
+from octasplat.workers.sandbox import seccomp
+seccomp._DENIED = {"landlock_create_ruleset": (444, 444)}
+seccomp.install_seccomp_filter(may_start_processes=True)
 from octasplat.workers.cli.main import main
 main()
 """

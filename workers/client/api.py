@@ -34,6 +34,8 @@ class ServiceError(OctasplatError):
 class ServiceUnreachableError(OctasplatError):
     """The service does not answer, or a proxy in front of it says so."""
 
+    error_type = "unreachable"
+
 
 def find_address(environment: Mapping[str, str], data: Path | None = None) -> str:
     """Where the service is: as the environment says, or where ``octasplat serve`` of this machine is."""

@@ -23,6 +23,8 @@ from octasplat.workers.storage.file_names import FileNameError, check_name
 class JobFailedError(OctasplatError):
     """The job ended without a result."""
 
+    error_type = "job_failed"
+
 
 @dataclass(frozen=True)
 class Submission:

@@ -10,9 +10,13 @@ class DatabaseError(OctasplatError):
 class ConflictError(OctasplatError):
     """The job or dataset is in a state that does not allow what was asked."""
 
+    error_type = "conflict"
+
 
 class NotFoundError(OctasplatError):
     """What was asked for is not there, or not any more; ``kind`` names its kind."""
+
+    error_type = "missing"
 
     def __init__(self, kind: str) -> None:
         super().__init__(f"There is no such {kind}.")

@@ -20,6 +20,8 @@ from octasplat.workers.db.locks import lock_owner
 class QuotaExceededError(OctasplatError):
     """An owner has as much as allowed; ``resource`` says of what."""
 
+    error_type = "quota_exceeded"
+
     def __init__(self, resource: Literal["bytes", "datasets", "jobs"], message: str) -> None:
         super().__init__(message)
         self.resource = resource

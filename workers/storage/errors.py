@@ -10,13 +10,19 @@ class StorageError(OctasplatError):
 class StorageFullError(StorageError):
     """There is no room, or what is left is kept free on purpose; HTTP status 507."""
 
+    error_type = "storage_full"
+
 
 class StorageUnavailableError(StorageError):
     """The store does not answer or refuses the service; later it may work."""
 
+    error_type = "storage_unavailable"
+
 
 class DigestMismatchError(StorageError):
     """The bytes that came are not those that were announced."""
+
+    error_type = "digest_mismatch"
 
 
 class ContentTooLargeError(StorageError):
@@ -25,6 +31,8 @@ class ContentTooLargeError(StorageError):
     ``max_bytes`` is the limit, None where more came than were announced.
     """
 
+    error_type = "too_large"
+
     def __init__(self, message: str, max_bytes: int | None = None) -> None:
         super().__init__(message)
         self.max_bytes = max_bytes
@@ -32,3 +40,5 @@ class ContentTooLargeError(StorageError):
 
 class BlobNotFoundError(StorageError):
     """The store does not hold the content that was asked for."""
+
+    error_type = "blob_missing"

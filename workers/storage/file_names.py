@@ -22,6 +22,8 @@ _FORBIDDEN_CHARACTERS = frozenset('<>:"|?*')
 class FileNameError(DatasetError):
     """A file name that cannot be taken; ``code`` names the reason."""
 
+    error_type = "name_refused"
+
     def __init__(self, code: str, message: str) -> None:
         super().__init__(message)
         self.code = code

@@ -92,7 +92,7 @@ def _run_task(task: dict[str, Any], events: _EventStream, stop: threading.Event)
         events.write({"kind": "stopped", "message": str(error)})
         return EXIT_STOPPED
     except OctasplatError as error:
-        kind = NO_SPACE_ERROR if is_disk_full(error) else _snake_case(type(error).__name__)
+        kind = NO_SPACE_ERROR if is_disk_full(error) else error.error_type
         events.write({"kind": "error", "type": kind, "message": str(error), "cause": _cause_lines(error)})
         return EXIT_REFUSED
     except MemoryError:
@@ -151,10 +151,6 @@ def _enter_sandbox(task: dict[str, Any]) -> None:
         may_start_processes=True,
         is_read_only_elsewhere=False,
     )
-
-
-def _snake_case(name: str) -> str:
-    return "".join(f"_{c.lower()}" if c.isupper() else c for c in name).lstrip("_")
 
 
 if __name__ == "__main__":

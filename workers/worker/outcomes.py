@@ -242,4 +242,4 @@ class OutcomeWriter:
 
 
 def _error_as_dict(error: OctasplatError) -> dict[str, Any]:
-    return {"type": NO_SPACE_ERROR if is_disk_full(error) else type(error).__name__, "message": str(error)}
+    return {"type": NO_SPACE_ERROR if is_disk_full(error) else error.error_type, "message": str(error)}

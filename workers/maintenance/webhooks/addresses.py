@@ -18,6 +18,8 @@ _NUMERIC_LABEL = re.compile(r"[0-9]+|0[xX][0-9a-fA-F]*")
 class AddressRefusedError(OctasplatError):
     """Messages are not sent to such an address."""
 
+    error_type = "address_refused"
+
 
 def check_url(url: str, allowed_hosts: tuple[str, ...] = ()) -> str:
     """The address itself, if messages may be sent there; a host name is looked up when sending, not here.

@@ -29,6 +29,8 @@ MAX_ENDPOINTS_OF_JOB = 5
 class TooManyEndpointsError(OctasplatError):
     """An owner has as many endpoints as allowed."""
 
+    error_type = "too_many_endpoints"
+
 
 @dataclass(frozen=True)
 class Endpoint:
