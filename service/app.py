@@ -60,7 +60,7 @@ Errors are problem documents (RFC 9457).
 
 
 def create_app(settings: ServiceSettings | None = None) -> FastAPI:
-    """The application.
+    """Return the application.
 
     Args:
         settings: by default those of the environment.

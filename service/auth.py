@@ -1,6 +1,6 @@
-"""Who asks, and what they may do: tokens with scopes, sessions begun with one, or nobody in particular.
+"""Authentication and rights: tokens with scopes, sessions begun with one, or anonymous access.
 
-Nobody in particular is whoever sits at this machine while there never was a token; see :func:`_allows_anonymous`.
+Requests from this machine need no token while there never was one; see :func:`_allows_anonymous`.
 """
 
 import time
@@ -54,7 +54,7 @@ class Principal:
     session_id: uuid.UUID | None = None
 
     def may(self, scope: Scope) -> bool:
-        """Whether they may do what needs ``scope``."""
+        """Return whether they may do what needs ``scope``."""
         return bool(self.scopes & _SUFFICIENT_SCOPES[scope])
 
     @property
@@ -63,7 +63,7 @@ class Principal:
         return None if self.may("admin") else self.owner
 
     def may_see(self, owner: str) -> bool:
-        """Whether something of ``owner`` is theirs to see."""
+        """Return whether something of ``owner`` is theirs to see."""
         return self.may("admin") or owner == self.owner
 
 
@@ -76,8 +76,8 @@ async def authenticate(
     """Who asks.
 
     Raises:
-        Problem: 401 without a valid token or session where one is needed, 403 for what came by way of a proxy
-            where none is needed, 429 after too many wrong tokens.
+        ProblemError: 401 without a valid token or session where one is needed, 403 for what came through a
+            proxy where none is needed, 429 after too many wrong tokens.
     """
     who = None
     if bearer is not None:
@@ -103,10 +103,10 @@ async def authenticate(
 
 
 async def authenticate_token(request: Request, service: Service, secret: str) -> Token | None:
-    """The valid token of that secret, or after a while None.
+    """Return the valid token of that secret, or after a while None.
 
     Raises:
-        Problem: 429 while too many wrong ones of the same address wait for their answer.
+        ProblemError: 429 while too many wrong ones of the same address wait for their answer.
     """
     address = client_address(request)
     with service.login_throttle.attempt(address, secret) as is_looked_at:
@@ -124,12 +124,12 @@ async def authenticate_token(request: Request, service: Service, secret: str) ->
 
 
 def client_address(request: Request) -> str:
-    """Where a request comes from, as a trusted proxy says if there is one."""
+    """Return where a request comes from, as a trusted proxy says if there is one."""
     return request.client.host if request.client is not None else "unknown"
 
 
 def session_secret(request: Request) -> str | None:
-    """What the cookie of a browser holds; where there is TLS, only that of this very host counts."""
+    """Return what the cookie of a browser holds; where there is TLS, only that of this very host counts."""
     return request.cookies.get(SECURE_COOKIE if request.url.scheme == "https" else COOKIE)
 
 
@@ -160,7 +160,7 @@ Admin = Annotated[Principal, Depends(_RequireScope("admin"))]
 
 
 async def _allows_anonymous(service: Service) -> bool:
-    """Whether whoever reaches the service may use it: from this machine, before there was any token.
+    """Return whether whoever reaches the service may use it: from this machine, before there was any token.
 
     Tokens that have expired or were shut out count: that the last of them has ended opens nothing.
     """

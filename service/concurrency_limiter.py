@@ -32,7 +32,7 @@ class ConcurrencyLimiter:
         """For as long as the block runs, one of those that are done.
 
         Raises:
-            Problem: 429, with too many there.
+            ProblemError: 429, with too many there.
         """
         if self._owners.total() >= self._max_admitted or self._owners[owner] >= self._max_per_owner:
             detail = f"Too many {self._noun} wait; repeat the request in a moment."

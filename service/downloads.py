@@ -29,7 +29,7 @@ def send_blob(
     name: str,
     inline: bool = False,
 ) -> Response:
-    """An answer with stored content.
+    """Return an answer with stored content.
 
     Content never changes under its digest, which makes the ETag. What an address leads to may change, as
     results do by a retry, so that a browser asks each time whether it is still that. What came from users or
@@ -46,7 +46,7 @@ def send_blob(
         inline: show rather than save.
 
     Raises:
-        Problem: 416 for a range that is not there.
+        ProblemError: 416 for a range that is not there.
         StorageError: the store does not have it.
     """
     etag = f'"{sha256}"'
@@ -95,7 +95,7 @@ def _remote_response(
 
 
 def _disposition(name: str, inline: bool) -> str:
-    """The header of RFC 6266."""
+    """Return the header of RFC 6266."""
     last = PurePosixPath(name).name
     plain = re.sub(r"[^A-Za-z0-9._ -]", "_", last)
     kind = "inline" if inline else "attachment"

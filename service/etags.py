@@ -6,7 +6,7 @@ from octasplat.service.problems import ProblemError
 
 
 def etag_matches(header: str | None, etag: str) -> bool:
-    """Whether a header ``If-Match`` or ``If-None-Match`` names ``etag``; weak marks do not matter here."""
+    """Return whether ``If-Match`` or ``If-None-Match`` names ``etag``; weak marks are ignored."""
     if header is None:
         return False
     named = [part.strip().removeprefix("W/") for part in header.split(",")]
@@ -17,7 +17,7 @@ def check_precondition(request: Request, etag: str) -> None:
     """Refuse a change of something that has changed since it was seen.
 
     Raises:
-        Problem: 412.
+        ProblemError: 412.
     """
     header = request.headers.get("if-match")
     if header is not None and not etag_matches(header, etag):

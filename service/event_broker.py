@@ -47,7 +47,7 @@ class EventBroker:
 
     @contextlib.contextmanager
     def subscribe(self, job_id: uuid.UUID) -> Iterator[asyncio.Event]:
-        """An event that is set whenever the job has something new, until the block ends."""
+        """Yield an event that is set whenever the job has something new, until the block ends."""
         event = asyncio.Event()
         self._subscribers.setdefault(job_id, set()).add(event)
         try:

@@ -44,7 +44,7 @@ class SpaceEvictor:
             size_bytes: how much will come, if it is known.
 
         Raises:
-            StorageFull: it does not fit even without all that nobody names.
+            StorageFullError: it does not fit even without all that nobody names.
         """
         try:
             await run_in_pool(ThreadPurpose.UPLOADS, self._storage.ensure_space, size_bytes or 0)

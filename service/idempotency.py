@@ -12,7 +12,7 @@ from octasplat.workers.db.connections import Connection
 
 
 def fingerprint(*parts: Any) -> str:
-    """Names the content of a request."""
+    """Return names the content of a request."""
     return hashlib.sha256(json.dumps(parts, sort_keys=True, default=str).encode()).hexdigest()
 
 
@@ -38,7 +38,7 @@ async def create_once(
         The id, and whether it was made now.
 
     Raises:
-        Problem: 422 if the key was used for another request.
+        ProblemError: 422 if the key was used for another request.
     """
     if key is None:
         return await create(), True

@@ -23,7 +23,7 @@ def check_job_limits(
     """Refuse options that ask for too much.
 
     Raises:
-        Problem: 422, with each such option and its ceiling.
+        ProblemError: 422, with each such option and its ceiling.
     """
     found = exceeded_limits(kind.resource_demands(options, sizes), settings.ceilings)
     # What it takes on disk follows from the others, so that it is told only if none of them is too much.
@@ -45,7 +45,7 @@ def check_priority(who: Principal, priority: int, settings: ServiceSettings) -> 
     """Keep high priorities for administrators.
 
     Raises:
-        Problem: 422.
+        ProblemError: 422.
     """
     if priority <= settings.max_priority or who.may("admin"):
         return
@@ -58,7 +58,7 @@ def check_priority(who: Principal, priority: int, settings: ServiceSettings) -> 
 
 
 def limits_by_path(kind: JobKind, settings: ServiceSettings) -> dict[str, int]:
-    """What each option may ask for, of those that say it themselves."""
+    """Return what each option may ask for, of those that say it themselves."""
     try:
         options = kind.resolve({})
     except ValueError:  # something has to be given
@@ -78,7 +78,7 @@ def limits_by_path(kind: JobKind, settings: ServiceSettings) -> dict[str, int]:
 def estimate_job(
     kind: JobKind, options: BaseModel, sizes: Sequence[Sizes], workers: Sequence[WorkerRow]
 ) -> Estimate | None:
-    """What a job will take on the best of ``workers``, or where there are none on a machine as this one.
+    """Estimate a job on the best of ``workers``, or on a machine like this one if there are none.
 
     None where nobody knows, as without any photographs whose sizes are known.
     """
@@ -90,7 +90,7 @@ def estimate_job(
 def limit_notes(
     estimate: Mapping[str, Any] | None, workers: Sequence[WorkerRow], settings: ServiceSettings
 ) -> list[str]:
-    """What the owner of a job should know that is likely to meet a limit, in sentences."""
+    """Return what the owner of a job should know that is likely to meet a limit, in sentences."""
     if estimate is None:
         return []
     known = Estimate.model_validate(dict(estimate))

@@ -90,7 +90,7 @@ def _digest(secret: str) -> bytes:
 
 
 def _client_key(address: str) -> str:
-    """What one guesser has for certain: an IPv4 address, or 64 bits of IPv6."""
+    """Return what one guesser has for certain: an IPv4 address, or 64 bits of IPv6."""
     try:
         parsed = ipaddress.ip_address(address)
     except ValueError:

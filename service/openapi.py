@@ -67,7 +67,7 @@ def add_option_schemas(schemas: dict[str, Any]) -> None:
 def _new_job_schema(
     name: str, plain: dict[str, Any], kind: JobKind[Any], options: dict[str, Any]
 ) -> dict[str, Any]:
-    """The schema of a new job of one kind."""
+    """Return the schema of a new job of one kind."""
     properties = dict(plain["properties"])
     properties["kind"] = {"type": "string", "const": kind.name, "title": "Kind", "default": kind.name}
     properties["options"] = {**options, "description": f"See GET /v1/options/{kind.name}."}
@@ -85,7 +85,7 @@ def _new_job_schema(
 
 
 def _schemas_with_presets(definitions: dict[str, Any]) -> set[str]:
-    """The names of the schemas below options that have a preset: their defaults are the preset's."""
+    """Return the names of the schemas below options that have a preset: their defaults are the preset's."""
     found: set[str] = set()
     waiting = [
         reference
@@ -109,7 +109,7 @@ def _references(schema: object) -> list[str]:
 
 
 def _without_client_defaults(schema: dict[str, Any], *, keeps_defaults: bool) -> dict[str, Any]:
-    """The schema without defaults that generated clients would take for what the user wants.
+    """Return the schema without defaults that generated clients would take for what the user wants.
 
     They send the defaults that they know. Those that a preset decides must stay away, and generators refuse
     defaults that are objects, whose fields have their own.

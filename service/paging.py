@@ -14,15 +14,15 @@ Cursor = Annotated[str | None, Query(max_length=2000, description="`next` of the
 
 
 def encode_cursor(key: str) -> str:
-    """A cursor that stands for a place in a list."""
+    """Return a cursor that stands for a place in a list."""
     return base64.urlsafe_b64encode(key.encode()).decode().rstrip("=")
 
 
 def decode_cursor(cursor: str | None) -> str | None:
-    """The place that a cursor stands for.
+    """Return the place that a cursor stands for.
 
     Raises:
-        Problem: 422 if it is none of ours.
+        ProblemError: 422 if it is none of ours.
     """
     if cursor is None:
         return None
@@ -56,7 +56,7 @@ def decode_number_cursor(cursor: str | None) -> int | None:
 
 
 def set_next_link(request: Request, response: Response, next_key: str | None) -> str | None:
-    """The cursor of the next part, which the header ``Link`` names as well; None at the end."""
+    """Return the cursor of the next part, which the header ``Link`` names as well; None at the end."""
     if next_key is None:
         return None
     cursor = encode_cursor(next_key)

@@ -93,7 +93,7 @@ class ProblemError(Exception):
             self.headers["Retry-After"] = str(retry_seconds)
 
     def response(self) -> JSONResponse:
-        """The answer."""
+        """Return the answer."""
         content: dict[str, Any] = {
             "type": TYPE_PREFIX + self.code,
             "title": HTTPStatus(self.status).phrase,
@@ -140,7 +140,7 @@ def add_problem_handlers(app: FastAPI) -> None:
 
 
 def problem_from_error(error: OctasplatError) -> ProblemError:
-    """How an error of ours is answered."""
+    """Return how an error of ours is answered."""
     detail, again = str(error), RETRY_SECONDS
     if isinstance(error, IntakeError):
         status = 408 if error.code == "upload-stalled" else 422
@@ -248,6 +248,6 @@ def _fault(prefix: str, fault: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _pointer(prefix: str, path: Iterable[str | int]) -> str:
-    """A JSON pointer into the request."""
+    """Return a JSON pointer into the request."""
     escaped = (str(part).replace("~", "~0").replace("/", "~1") for part in path)
     return f"#{prefix}" + "".join(f"/{part}" for part in escaped)

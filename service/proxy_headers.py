@@ -70,12 +70,12 @@ class ProxyHeadersMiddleware:
 
 
 def passed_through_proxy(headers: Headers) -> bool:
-    """Whether a request has headers that proxies write and nobody else."""
+    """Return whether a request has headers that proxies write and nobody else."""
     return any(name in PROXY_HEADER_NAMES for name in headers)
 
 
 def _parse_x_forwarded(headers: Headers) -> list[dict[str, str]]:
-    """The hops, the client's first; a scheme or host that is said once is the client's."""
+    """Return the hops, the client's first; a scheme or host that is said once is the client's."""
     lists = {key: _header_values(headers, f"x-forwarded-{key}") for key in ("for", "proto", "host")}
     count = max(len(values) for values in lists.values())
     hops: list[dict[str, str]] = [{} for _ in range(count)]
@@ -89,7 +89,7 @@ def _parse_x_forwarded(headers: Headers) -> list[dict[str, str]]:
 
 
 def _parse_forwarded(headers: Headers) -> list[dict[str, str]]:
-    """The hops of ``Forwarded`` (RFC 7239), the client's first."""
+    """Return the hops of ``Forwarded`` (RFC 7239), the client's first."""
     return [
         {key.lower(): value.strip('"') for key, value in _PAIR.findall(element)}
         for element in _header_values(headers, "forwarded")
@@ -101,7 +101,7 @@ def _header_values(headers: Headers, name: str) -> list[str]:
 
 
 def _parse_host_address(text: str) -> str | None:
-    """The address in ``192.0.2.1``, ``192.0.2.1:4711``, ``2001:db8::1`` or ``[2001:db8::1]:4711``."""
+    """Return the address in ``192.0.2.1``, ``192.0.2.1:4711``, ``2001:db8::1`` or ``[2001:db8::1]:4711``."""
     if text.startswith("["):
         text = text[1:].partition("]")[0]
     elif text.count(":") == 1:

@@ -14,12 +14,12 @@ from octasplat.workers.worker.job_kinds import JobKind
 
 
 async def live_workers_of_queue(connection: Connection, queue: str, stale_seconds: float) -> list[WorkerRow]:
-    """The living workers that take jobs from a queue."""
+    """Return the living workers that take jobs from a queue."""
     return [row for row in await live_workers(connection, stale_seconds) if queue in row.queues]
 
 
 def unwritable_formats(workers: Sequence[WorkerRow]) -> dict[str, str]:
-    """Formats that none of ``workers`` can write, with what they need.
+    """Return formats that none of ``workers`` can write, with what they need.
 
     Without workers there are none: nobody can say what those that come will be able to write.
     """
@@ -36,7 +36,7 @@ def check_formats_writable(
     """Refuse files that no living worker of the queue can write.
 
     Raises:
-        Problem: 422, with the place of each such file.
+        ProblemError: 422, with the place of each such file.
     """
     lacking = unwritable_formats(workers)
     faults = [
@@ -55,7 +55,7 @@ def check_formats_writable(
 def queued_job_notes(
     kind: JobKind, options: BaseModel, queue: str, workers: Sequence[WorkerRow]
 ) -> list[str]:
-    """What the owner of a job that waits should know, in sentences."""
+    """Return what the owner of a job that waits should know, in sentences."""
     if workers:
         takers = [row for row in workers if kind.name in row.facts.get("kinds", (kind.name,))]
         if takers:

@@ -106,11 +106,11 @@ class ServiceSettings(WorkerSettings):
         return found if self.max_workspace_bytes else {**found, "workspace_bytes": 1 << 62}
 
     def upload_limits(self) -> UploadLimits:
-        """What the intake takes."""
+        """Return what the intake takes."""
         return UploadLimits(max_file_bytes=self.max_upload_bytes, max_archive_bytes=self.max_archive_bytes)
 
     def dataset_limits(self) -> DatasetLimits:
-        """What the check of a dataset may take, and see."""
+        """Return what the check of a dataset may take, and see."""
         return DatasetLimits(model=ModelLimits(hidden=self.own_folders))
 
     def spool(self) -> SpoolSpace:

@@ -63,7 +63,7 @@ class Service:
 
 
 def get_service(request: Request) -> Service:
-    """The service that a request has reached."""
+    """Return the service that a request has reached."""
     service: Service = request.app.state.service
     return service
 

@@ -19,11 +19,11 @@ class ThreadPurpose(Enum):
     UNPACKING = auto()
     """Reading archives that have come."""
     CHECKS = auto()
-    """Checking datasets; how many at once is bounded further, see :class:`octasplat.service.concurrency_limiter.ConcurrencyLimiter`."""
+    """Checking datasets; :mod:`octasplat.service.concurrency_limiter` bounds how many at once."""
     DOWNLOADS = auto()
     """Looking up what is read."""
     STORE_CHECKS = auto()
-    """Asking how the store fares."""
+    """Checking the state of the store."""
 
 
 _POOL_SIZES = {

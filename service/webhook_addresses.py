@@ -9,7 +9,7 @@ def check_webhook_address(service: Service, url: str, pointer: str = "#/url") ->
     """Refuse an address that messages are not sent to.
 
     Raises:
-        Problem: 422.
+        ProblemError: 422.
     """
     try:
         check_url(url, service.settings.webhook_hosts)

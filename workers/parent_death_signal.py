@@ -10,7 +10,7 @@ PARENT_PID_VARIABLE = "OCTASPLAT_PARENT_PID"
 
 
 def set_parent_death_signal(parent_pid: int, signal_: signal.Signals) -> None:
-    """Ask Linux to send this process ``signal_`` when its parent dies; ends it at once if that has happened."""
+    """Ask Linux to send this process ``signal_`` when its parent dies, or now if it has died already."""
     with contextlib.suppress(OSError):
         prctl(PR_SET_PDEATHSIG, signal_)
     if os.getppid() != parent_pid:
@@ -18,7 +18,7 @@ def set_parent_death_signal(parent_pid: int, signal_: signal.Signals) -> None:
 
 
 def die_with_local_service() -> bool:
-    """As :func:`set_parent_death_signal`, in good order, if ``octasplat serve`` has started this; returns whether it has."""
+    """Ask for SIGTERM when ``octasplat serve`` dies; return whether it started this process."""
     parent = os.environ.pop(PARENT_PID_VARIABLE, "")
     if parent.isdigit():
         set_parent_death_signal(int(parent), signal.SIGTERM)

@@ -18,7 +18,7 @@ PREFIX = "OCTASPLAT_"
 
 
 def _split_commas(value: object) -> object:
-    """The parts of a text such as ``a,b`` or ``["a", "b"]``; anything else as it is."""
+    """Return the parts of a text such as ``a,b`` or ``["a", "b"]``; anything else as it is."""
     if not isinstance(value, str):
         return value
     if value.lstrip().startswith("["):
@@ -152,7 +152,7 @@ class WorkerSettings(BaseSettings):
         )
 
     def conninfo(self) -> str:
-        """How to connect to the database.
+        """Return how to connect to the database.
 
         Raises:
             DatabaseError: no address was given and no private database was started.
@@ -162,7 +162,7 @@ class WorkerSettings(BaseSettings):
         return EmbeddedPostgres(self.data.absolute()).conninfo()
 
     def checked(self) -> "WorkerSettings":
-        """The settings themselves, if they fit together.
+        """Return the settings themselves, if they fit together.
 
         Raises:
             ConfigError: they do not.
@@ -177,12 +177,12 @@ class WorkerSettings(BaseSettings):
 
 
 def worker_connections(queues: Mapping[str, int]) -> int:
-    """The most connections of a worker that takes so many jobs at once from these queues."""
+    """Return the most connections of a worker that takes so many jobs at once from these queues."""
     return 6 + 4 * sum(queues.values())
 
 
 def load_settings(model: type[SettingsT], *, data: Path | None = None, **changes: object) -> SettingsT:
-    """Settings from the environment, with what a command line says on top.
+    """Return settings from the environment, with what a command line says on top.
 
     Args:
         model: which settings.

@@ -16,10 +16,10 @@ _RETRY_SECONDS = 10
 
 
 async def owned_job(connection: Connection, who: Principal, job_id: uuid.UUID, *, lock: bool = False) -> Job:
-    """The job, if it is the asker's to see.
+    """Return the job, if it is the asker's to see.
 
     Raises:
-        Problem: 404.
+        ProblemError: 404.
     """
     job = await get_job(connection, job_id, lock=lock)
     if job is None or not who.may_see(job.owner):
@@ -36,10 +36,10 @@ async def read_job(service: Service, who: Principal, job_id: uuid.UUID) -> Job:
 async def owned_dataset(
     connection: Connection, who: Principal, dataset_id: uuid.UUID, *, lock: bool = False
 ) -> Dataset:
-    """The dataset, if it is the asker's to see.
+    """Return the dataset, if it is the asker's to see.
 
     Raises:
-        Problem: 404.
+        ProblemError: 404.
     """
     dataset = await get_dataset(connection, dataset_id, lock=lock)
     if dataset is None or not who.may_see(dataset.owner):
@@ -48,11 +48,11 @@ async def owned_dataset(
 
 
 async def open_dataset(connection: Connection, who: Principal, dataset_id: uuid.UUID) -> Dataset:
-    """The dataset, if it is the asker's and still takes files.
+    """Return the dataset, if it is the asker's and still takes files.
 
     Raises:
-        Problem: 404.
-        Conflict: it is committed, or being checked.
+        ProblemError: 404.
+        ConflictError: it is committed, or being checked.
     """
     dataset = await owned_dataset(connection, who, dataset_id)
     if dataset.state != "open":
@@ -63,10 +63,10 @@ async def open_dataset(connection: Connection, who: Principal, dataset_id: uuid.
 
 
 async def owned_webhook(connection: Connection, who: Principal, webhook_id: uuid.UUID) -> Endpoint:
-    """The webhook, if it is the asker's to see.
+    """Return the webhook, if it is the asker's to see.
 
     Raises:
-        Problem: 404.
+        ProblemError: 404.
     """
     endpoint = await get_endpoint(connection, webhook_id)
     if endpoint is None or not who.may_see(endpoint.owner):
@@ -75,10 +75,10 @@ async def owned_webhook(connection: Connection, who: Principal, webhook_id: uuid
 
 
 def check_searchable_name(name: str, kind: str) -> str:
-    """A name to look for.
+    """Return a name to look for.
 
     Raises:
-        Problem: 404, as nothing has a name that the database cannot hold.
+        ProblemError: 404, as nothing has a name that the database cannot hold.
     """
     if "\0" in name:
         raise not_found_error(kind)
@@ -89,7 +89,7 @@ def check_not_draining(service: Service) -> None:
     """Take nothing on that may not be finished.
 
     Raises:
-        Problem: 503.
+        ProblemError: 503.
     """
     if service.is_draining:
         raise ProblemError(503, "draining", "The service is about to stop.", retry_seconds=_RETRY_SECONDS)

@@ -13,10 +13,10 @@ from octasplat.workers.storage.protocol import Blob
 
 
 async def list_artifacts(service: Service, who: Principal, job_id: uuid.UUID) -> list[Artifact]:
-    """The results of a job.
+    """Return the results of a job.
 
     Raises:
-        Problem: 404.
+        ProblemError: 404.
     """
     async with service.pool.connection() as connection:
         await owned_job(connection, who, job_id)
@@ -26,10 +26,10 @@ async def list_artifacts(service: Service, who: Principal, job_id: uuid.UUID) ->
 async def get_artifact(
     service: Service, who: Principal, job_id: uuid.UUID, name: str, *, kind: str = "result"
 ) -> Artifact:
-    """A result of a job; without one the problem says that there is no such ``kind``.
+    """Return a result of a job; without one the problem says that there is no such ``kind``.
 
     Raises:
-        Problem: 404.
+        ProblemError: 404.
     """
     async with service.pool.connection() as connection:
         await owned_job(connection, who, job_id)
@@ -40,10 +40,10 @@ async def get_artifact(
 
 
 async def get_preview(service: Service, who: Principal, job_id: uuid.UUID) -> Blob:
-    """The newest picture of the scene in the making, a PNG.
+    """Return the newest picture of the scene in the making, a PNG.
 
     Raises:
-        Problem: 404.
+        ProblemError: 404.
         StorageError: the store does not have it.
     """
     job = await read_job(service, who, job_id)

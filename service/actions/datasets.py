@@ -38,8 +38,8 @@ async def create_dataset(
     """Make a dataset; the same request with the same ``idempotency_key`` makes nothing new.
 
     Raises:
-        Problem: 422 if the key was used for another request.
-        QuotaExceeded: the asker has too many.
+        ProblemError: 422 if the key was used for another request.
+        QuotaExceededError: the asker has too many.
     """
     async with service.pool.connection() as connection, connection.transaction():
 
@@ -70,10 +70,10 @@ async def list_files_by_suffix(
 
 
 async def get_dataset(service: Service, who: Principal, dataset_id: uuid.UUID) -> Dataset:
-    """A dataset.
+    """Return a dataset.
 
     Raises:
-        Problem: 404.
+        ProblemError: 404.
     """
     async with service.pool.connection() as connection:
         return await owned_dataset(connection, who, dataset_id)
@@ -86,7 +86,7 @@ async def change_dataset(
     """Rename a dataset, or keep it whatever its age.
 
     Raises:
-        Problem: 404.
+        ProblemError: 404.
     """
     async with service.pool.connection() as connection, connection.transaction():
         dataset = await owned_dataset(connection, who, dataset_id, lock=True)
@@ -103,8 +103,8 @@ async def delete_dataset(service: Service, who: Principal, dataset_id: uuid.UUID
     """Delete a dataset.
 
     Raises:
-        Problem: 404.
-        Conflict: a job needs it.
+        ProblemError: 404.
+        ConflictError: a job needs it.
     """
     async with service.pool.connection() as connection:
         await owned_dataset(connection, who, dataset_id)
@@ -116,9 +116,9 @@ async def commit_dataset(service: Service, who: Principal, dataset_id: uuid.UUID
     """Check a dataset; one that is sound never changes again.
 
     Raises:
-        Problem: 404; 429 with too many that wait to be checked.
-        Conflict: it is being checked.
-        IntakeRefused: it is not sound.
+        ProblemError: 404; 429 with too many that wait to be checked.
+        ConflictError: it is being checked.
+        IntakeError: it is not sound.
     """
     async with service.pool.connection() as connection:
         owner = (await owned_dataset(connection, who, dataset_id)).owner

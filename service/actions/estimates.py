@@ -14,10 +14,10 @@ from octasplat.workers.queue.jobs import get_job
 
 
 async def estimate(service: Service, who: Principal, new: NewEstimate) -> Estimate | None:
-    """What a job would take, checked as if it were made; None where nobody knows.
+    """Return what a job would take, checked as if it were made; None where nobody knows.
 
     Raises:
-        Problem: 422.
+        ProblemError: 422.
     """
     kind = validate_kind(new.kind)
     options = resolve_options(kind, new.options)

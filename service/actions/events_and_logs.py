@@ -23,7 +23,7 @@ async def read_log(
     """Lines of a job's log, after the one with the id ``after``.
 
     Raises:
-        Problem: 404.
+        ProblemError: 404.
     """
     await read_job(service, who, job_id)
     async with service.pool.connection() as connection:
@@ -33,10 +33,10 @@ async def read_log(
 async def read_events(
     service: Service, who: Principal, job_id: uuid.UUID, *, after: int, limit: int
 ) -> list[JobEvent]:
-    """What happened to a job, after the event with the id ``after``.
+    """Return what happened to a job, after the event with the id ``after``.
 
     Raises:
-        Problem: 404.
+        ProblemError: 404.
     """
     await read_job(service, who, job_id)
     async with service.pool.connection() as connection:
@@ -46,12 +46,12 @@ async def read_events(
 async def follow_events(
     service: Service, who: Principal, job_id: uuid.UUID, *, after: int
 ) -> AsyncGenerator[JobEvent | None, None] | None:
-    """What happens to a job until it is over, as it happens; None where everything was told already.
+    """Return what happens to a job until it is over, as it happens; None where everything was told already.
 
     In the place of an event comes None as a sign of life, where nothing has happened for a while.
 
     Raises:
-        Problem: 404, or 503 with too many who listen.
+        ProblemError: 404, or 503 with too many who listen.
     """
     job = await read_job(service, who, job_id)
     if service.event_broker.subscriber_count >= service.settings.max_streams:

@@ -77,10 +77,10 @@ async def list_jobs(
 
 
 async def get_job(service: Service, who: Principal, job_id: uuid.UUID) -> JobWithView:
-    """A job.
+    """Return a job.
 
     Raises:
-        Problem: 404.
+        ProblemError: 404.
     """
     async with service.pool.connection() as connection:
         job = await owned_job(connection, who, job_id)
@@ -105,7 +105,7 @@ async def change_job(
         check: sees the job as it is, while nobody else can change it, and raises to leave it so.
 
     Raises:
-        Problem: 404.
+        ProblemError: 404.
     """
     async with service.pool.connection() as connection, connection.transaction():
         job = await owned_job(connection, who, job_id, lock=True)
@@ -125,8 +125,8 @@ async def cancel_job(service: Service, who: Principal, job_id: uuid.UUID) -> Job
     """Ask a job to stop.
 
     Raises:
-        Problem: 404.
-        Conflict: it is over.
+        ProblemError: 404.
+        ConflictError: it is over.
     """
     async with service.pool.connection() as connection:
         await owned_job(connection, who, job_id)
@@ -145,8 +145,8 @@ async def delete_job(service: Service, who: Principal, job_id: uuid.UUID, *, can
         cancel: stop it first if it is not over.
 
     Raises:
-        Problem: 404; 409 while it still stops.
-        Conflict: it is not over.
+        ProblemError: 404; 409 while it still stops.
+        ConflictError: it is not over.
     """
     async with service.pool.connection() as connection:
         job = await owned_job(connection, who, job_id)
@@ -161,7 +161,7 @@ async def delete_job(service: Service, who: Principal, job_id: uuid.UUID, *, can
 
 
 def stages_of(job: Job) -> list[str]:
-    """Names of the stages of a job, in order."""
+    """Return names of the stages of a job, in order."""
     try:
         kind = get_job_kind(job.kind)
         return list(kind.stages(kind.options.model_validate(job.options)))
@@ -170,7 +170,7 @@ def stages_of(job: Job) -> list[str]:
 
 
 async def job_view(connection: Connection, service: Service, job: Job) -> JobView:
-    """A job as it is shown alone: with its place in the queue, and what to know while it waits."""
+    """Return a job as it is shown alone: with its place in the queue, and what to know while it waits."""
     notes: list[str] = []
     if job.state == "queued":
         with suppress(ConfigError, ValidationError):  # of another version

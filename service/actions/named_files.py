@@ -26,7 +26,7 @@ async def check_named_files(
         files_id: the dataset that is to hold the files.
 
     Raises:
-        Problem: 422, with the place of each such name; 409 if the dataset is not committed.
+        ProblemError: 422, with the place of each such name; 409 if the dataset is not committed.
     """
     names = list(kind.named_files(options))
     sent: set[str] = set()

@@ -21,6 +21,6 @@ class Page(Generic[Row]):
 
 
 def page_of(rows_found: Sequence[Row], limit: int, key_of: Callable[[Row], object]) -> Page[Row]:
-    """The first ``limit`` of what was found; that there is more shows in one entry too many."""
+    """Return the first ``limit`` of what was found; that there is more shows in one entry too many."""
     rows = list(rows_found[:limit])
     return Page(rows, str(key_of(rows[-1])) if len(rows_found) > limit else None)

@@ -71,8 +71,8 @@ async def submit_job(
         traceparent: what the job's log is to name (W3C Trace Context).
 
     Raises:
-        Problem: 409, 422, or 503 if the service is about to stop.
-        QuotaExceeded: the asker has too many jobs.
+        ProblemError: 409, 422, or 503 if the service is about to stop.
+        QuotaExceededError: the asker has too many jobs.
     """
     check_not_draining(service)
     kind = validate_kind(request.kind)
@@ -112,9 +112,9 @@ async def retry_job(
         idempotency_key: the same request with it does nothing more.
 
     Raises:
-        Problem: 404, 409 or 422.
-        Conflict: it waits, runs or has succeeded.
-        QuotaExceeded: its owner has too many jobs.
+        ProblemError: 404, 409 or 422.
+        ConflictError: it waits, runs or has succeeded.
+        QuotaExceededError: its owner has too many jobs.
     """
     async with service.pool.connection() as connection, connection.transaction():
         owner = (await owned_job(connection, who, job_id)).owner
@@ -181,7 +181,7 @@ async def _create_job(
 
 
 async def _check_inputs(connection: Connection, who: Principal, requested: _RequestedJob) -> _JobInputs:
-    """What the job works on, checked."""
+    """Return what the job works on, checked."""
     needed = {"result": _check_source, "dataset": _check_dataset, "files": _check_files}[requested.kind.needs]
     inputs = await needed(connection, who, requested)
     files_id = requested.new.files_id
@@ -241,7 +241,7 @@ async def _check_dataset(connection: Connection, who: Principal, requested: _Req
 
 
 async def _get_photographs(connection: Connection, who: Principal, dataset_id: uuid.UUID) -> Dataset:
-    """A dataset of photographs that is ready."""
+    """Return a dataset of photographs that is ready."""
     dataset = await get_dataset(connection, dataset_id, lock=True)
     if dataset is None or not who.may_see(dataset.owner):
         raise input_problem("dataset_id", "There is no such dataset.")
@@ -257,7 +257,7 @@ async def _get_photographs(connection: Connection, who: Principal, dataset_id: u
 async def _revised_options(
     connection: Connection, service: Service, who: Principal, job: Job, request: RetryRequest
 ) -> tuple[dict[str, Any] | None, dict[str, Any] | None]:
-    """The options of a job that is tried again, checked, and their estimate; None leaves them as they are."""
+    """Return the checked options of a retried job and their estimate; None leaves them as they are."""
     workers = await live_workers_of_queue(connection, job.queue, service.settings.stale_seconds)
     try:
         kind = get_job_kind(job.kind)
@@ -293,5 +293,5 @@ async def _revised_options(
 
 
 def _estimate_as_json(estimate: Estimate | None) -> dict[str, Any] | None:
-    """An estimate as the table keeps it."""
+    """Return an estimate as the table keeps it."""
     return None if estimate is None else estimate.model_dump(mode="json")

@@ -25,7 +25,7 @@ STORAGE_TIMEOUT_SECONDS = 3.0
 
 
 def list_kinds(service: Service) -> list[KindView]:
-    """The kinds of jobs with their options."""
+    """Return the kinds of jobs with their options."""
     return [_kind_view(kind, service) for kind in job_kinds()]
 
 
@@ -33,7 +33,7 @@ def get_kind(service: Service, name: str) -> KindView:
     """One kind of job with its options.
 
     Raises:
-        Problem: 404.
+        ProblemError: 404.
     """
     try:
         return _kind_view(get_job_kind(name), service)
@@ -59,13 +59,13 @@ def describe(service: Service, who: Principal) -> InfoView:
 
 
 async def list_live_workers(service: Service) -> list[WorkerRow]:
-    """The workers that have been heard of lately."""
+    """Return the workers that have been heard of lately."""
     async with service.pool.connection() as connection:
         return await live_workers(connection, service.settings.stale_seconds)
 
 
 async def list_queues(service: Service) -> QueueList:
-    """What waits, what runs, and who works."""
+    """Return what waits, what runs, and who works."""
     async with service.pool.connection() as connection:
         depths = {depth.queue: depth for depth in await queue_depths(connection)}
         running = await running_by_queue(connection)
@@ -91,7 +91,7 @@ async def list_queues(service: Service) -> QueueList:
 
 
 async def check_readiness(service: Service) -> dict[str, str]:
-    """Whether requests can be served, part by part: ``ok``, or what ails it."""
+    """Return whether requests can be served, part by part: ``ok``, or what ails it."""
     return {
         "database": await _check_database(service),
         "storage": await _check_storage(service),
@@ -100,7 +100,7 @@ async def check_readiness(service: Service) -> dict[str, str]:
 
 
 async def render_metrics(service: Service) -> bytes:
-    """How the service fares, in the format of Prometheus."""
+    """Return how the service fares, in the format of Prometheus."""
     async with service.pool.connection() as connection:
         numbers = await read_service_stats(connection, service.settings.stale_seconds)
     free_bytes = await run_in_pool(ThreadPurpose.STORE_CHECKS, _free_bytes, service)
@@ -126,7 +126,7 @@ async def _check_database(service: Service) -> str:
 
 
 async def _check_storage(service: Service) -> str:
-    """Looked at once for all who ask meanwhile; a store that hangs takes no more than one thread."""
+    """Check the store once for all concurrent requests; a store that hangs takes one thread only."""
     if service.storage_check is None or service.storage_check.done():
         service.storage_check = asyncio.ensure_future(
             run_in_pool(ThreadPurpose.STORE_CHECKS, _storage_state, service)

@@ -12,7 +12,7 @@ from octasplat.workers.db.sessions import add_link
 
 
 async def list_tokens(service: Service) -> list[Token]:
-    """All tokens, without their secrets."""
+    """Return all tokens, without their secrets."""
     async with service.pool.connection() as connection:
         return await rows.list_tokens(connection)
 
@@ -37,7 +37,7 @@ async def revoke_token(service: Service, token_id: uuid.UUID) -> None:
     """Shut a token out.
 
     Raises:
-        Problem: 404.
+        ProblemError: 404.
     """
     async with service.pool.connection() as connection:
         if not await rows.revoke_token(connection, token_id):
@@ -49,7 +49,7 @@ async def create_sign_in_link(service: Service, who: Principal) -> SignInLink:
     """Make a link that signs in once.
 
     Raises:
-        Problem: 409 where nobody needs to sign in.
+        ProblemError: 409 where nobody needs to sign in.
     """
     if who.token_id is None:
         raise ProblemError(409, "no-token", "There are no tokens, so nobody has to sign in.")

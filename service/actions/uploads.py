@@ -73,10 +73,10 @@ class StoredArchive:
 async def list_files(
     service: Service, who: Principal, dataset_id: uuid.UUID, *, after: str, limit: int
 ) -> Page[DatasetFile]:
-    """The files that have arrived, by name, from the one after ``after``.
+    """Return the files that have arrived, by name, from the one after ``after``.
 
     Raises:
-        Problem: 404.
+        ProblemError: 404.
     """
     async with service.pool.connection() as connection:
         await owned_dataset(connection, who, dataset_id)
@@ -85,10 +85,10 @@ async def list_files(
 
 
 async def get_file(service: Service, who: Principal, dataset_id: uuid.UUID, path: str) -> DatasetFile:
-    """A file of a dataset.
+    """Return a file of a dataset.
 
     Raises:
-        Problem: 404.
+        ProblemError: 404.
     """
     async with service.pool.connection() as connection:
         await owned_dataset(connection, who, dataset_id)
@@ -103,8 +103,8 @@ async def remove_file(service: Service, who: Principal, dataset_id: uuid.UUID, p
     """Take a file out of an open dataset.
 
     Raises:
-        Problem: 404.
-        Conflict: the dataset is not open.
+        ProblemError: 404.
+        ConflictError: the dataset is not open.
     """
     async with service.pool.connection() as connection:
         await open_dataset(connection, who, dataset_id)
@@ -119,10 +119,10 @@ async def put_file(
     """Put a file into an open dataset. One that is there with the announced digest is not read.
 
     Raises:
-        Problem: 404, or 503 if the service is about to stop.
-        Conflict: the dataset is not open.
-        IntakeRefused: the name or the content is refused.
-        QuotaExceeded: its owner may not store as much.
+        ProblemError: 404, or 503 if the service is about to stop.
+        ConflictError: the dataset is not open.
+        IntakeError: the name or the content is refused.
+        QuotaExceededError: its owner may not store as much.
         StorageError: it is not as announced, or there is no room.
     """
     check_not_draining(service)
@@ -164,10 +164,10 @@ async def put_archive(
     """Put the files of a ZIP file into an open dataset, beside those that are there.
 
     Raises:
-        Problem: 404, or 503 if the service is about to stop.
-        Conflict: the dataset is not open.
-        IntakeRefused: the archive, or a name or a content in it, is refused.
-        QuotaExceeded: its owner may not store as much.
+        ProblemError: 404, or 503 if the service is about to stop.
+        ConflictError: the dataset is not open.
+        IntakeError: the archive, or a name or a content in it, is refused.
+        QuotaExceededError: its owner may not store as much.
         StorageError: it is not as announced, or there is no room.
     """
     check_not_draining(service)
@@ -201,7 +201,7 @@ async def put_archive(
 
 
 def _is_stored(storage: Storage, file: DatasetFile) -> bool:
-    """Whether the store holds the content of a file, as far as can be seen without reading it."""
+    """Return whether the store holds the content of a file, as far as can be seen without reading it."""
     try:
         return storage.stat(file.sha256).size_bytes == file.size_bytes
     except BlobNotFoundError:
@@ -209,7 +209,7 @@ def _is_stored(storage: Storage, file: DatasetFile) -> bool:
 
 
 def _content_check_for(dataset: Dataset, path: str) -> ContentCheck:
-    """What looks at the content of a file whose name is taken; raises IntakeRefused where it is not."""
+    """Return the content check for an accepted file name."""
     if dataset.holds == "files":
         check_input_name(path)
         return check_input_content
@@ -218,7 +218,7 @@ def _content_check_for(dataset: Dataset, path: str) -> ContentCheck:
 
 
 async def _limited_by_quota(receive: Callable[[], Awaitable[ReceivedT]], bytes_left: int | None) -> ReceivedT:
-    """What an upload brings; ``bytes_left``, where that is what stopped it, is what its owner may still store."""
+    """Run ``receive``; if it exceeds ``bytes_left``, raise the owner's quota error."""
     try:
         return await receive()
     except ContentTooLargeError as error:

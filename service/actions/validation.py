@@ -12,10 +12,10 @@ from octasplat.workers.worker.job_kinds import JobKind, get_job_kind
 
 
 def validate_kind(name: str) -> JobKind:
-    """The kind of that name.
+    """Return the kind of that name.
 
     Raises:
-        Problem: 422.
+        ProblemError: 422.
     """
     try:
         return get_job_kind(name)
@@ -29,7 +29,7 @@ def resolve_options(kind: JobKind, values: Mapping[str, Any]) -> BaseModel:
     """Complete options.
 
     Raises:
-        Problem: 422.
+        ProblemError: 422.
     """
     try:
         return kind.options.model_validate(kind.resolve(values).model_dump(mode="json"))
@@ -38,5 +38,5 @@ def resolve_options(kind: JobKind, values: Mapping[str, Any]) -> BaseModel:
 
 
 def input_problem(name: str, detail: str) -> ProblemError:
-    """What a job is to work on is not there, or does not fit its kind."""
+    """Return what a job is to work on is not there, or does not fit its kind."""
     return ProblemError(422, "input", detail, errors=[{"pointer": f"#/{name}", "detail": detail}])

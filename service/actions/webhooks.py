@@ -30,7 +30,7 @@ async def create_webhook(service: Service, who: Principal, new: NewWebhook) -> C
     """Be told of the asker's jobs, or of one job.
 
     Raises:
-        Problem: 404, or 422 for an address that messages are not sent to.
+        ProblemError: 404, or 422 for an address that messages are not sent to.
     """
     check_webhook_address(service, new.url)
     secret = new.secret or new_secret()
@@ -57,10 +57,10 @@ async def list_webhooks(
 
 
 async def get_webhook(service: Service, who: Principal, webhook_id: uuid.UUID) -> Endpoint:
-    """A webhook.
+    """Return a webhook.
 
     Raises:
-        Problem: 404.
+        ProblemError: 404.
     """
     async with service.pool.connection() as connection:
         return await owned_webhook(connection, who, webhook_id)
@@ -73,7 +73,7 @@ async def change_webhook(
     """Change a webhook, pause it, or enable it again.
 
     Raises:
-        Problem: 404, or 422 for an address that messages are not sent to.
+        ProblemError: 404, or 422 for an address that messages are not sent to.
     """
     if change.url is not None:
         check_webhook_address(service, change.url)
@@ -87,7 +87,7 @@ async def delete_webhook(service: Service, who: Principal, webhook_id: uuid.UUID
     """Delete a webhook with its messages.
 
     Raises:
-        Problem: 404.
+        ProblemError: 404.
     """
     async with service.pool.connection() as connection:
         await owned_webhook(connection, who, webhook_id)
@@ -98,7 +98,7 @@ async def send_test(service: Service, who: Principal, webhook_id: uuid.UUID) -> 
     """Send a message that says nothing.
 
     Raises:
-        Problem: 404, or 409 if the webhook is disabled.
+        ProblemError: 404, or 409 if the webhook is disabled.
     """
     async with service.pool.connection() as connection:
         endpoint = _check_enabled(await owned_webhook(connection, who, webhook_id))
@@ -109,10 +109,10 @@ async def send_test(service: Service, who: Principal, webhook_id: uuid.UUID) -> 
 async def list_deliveries(
     service: Service, who: Principal, webhook_id: uuid.UUID, limit: int
 ) -> list[Delivery]:
-    """The newest messages and what became of them.
+    """Return the newest messages and what became of them.
 
     Raises:
-        Problem: 404.
+        ProblemError: 404.
     """
     async with service.pool.connection() as connection:
         await owned_webhook(connection, who, webhook_id)
@@ -126,7 +126,7 @@ async def redeliver(
     """Send a message once more, with the same id and content.
 
     Raises:
-        Problem: 404, or 409 if the webhook is disabled.
+        ProblemError: 404, or 409 if the webhook is disabled.
     """
     async with service.pool.connection() as connection, connection.transaction():
         _check_enabled(await owned_webhook(connection, who, webhook_id))

@@ -100,7 +100,7 @@ def list_archive(file: BinaryIO, limits: ArchiveLimits = ArchiveLimits()) -> Arc
         limits: what it may ask for.
 
     Raises:
-        IntakeRefused: with one of the codes ``archive-...`` or ``name-...``.
+        IntakeError: with one of the codes ``archive-...`` or ``name-...``.
     """
     file.seek(0)
     kind = archive_type(file.read(512))
@@ -145,7 +145,7 @@ def unpack_archive(
         on_file: told what was stored; it may raise to refuse it. Nothing counts before this function returns.
 
     Raises:
-        IntakeRefused: a content is not what the archive announces, or is an archive itself.
+        IntakeError: a content is not what the archive announces, or is an archive itself.
         StorageError: the store does not take it.
     """
     for entry in listing.files:
@@ -156,7 +156,7 @@ def unpack_archive(
 
 
 def archive_type(head: bytes) -> str | None:
-    """The kind of archive or compressed file that begins with ``head`` (512 bytes), or None."""
+    """Return the kind of archive or compressed file that begins with ``head`` (512 bytes), or None."""
     for magic, position, kind in _MAGIC_NUMBERS:
         if head[position : position + len(magic)] == magic:
             return kind

@@ -87,7 +87,7 @@ def check_file_content(
     """Check a stored file before it is entered into a dataset; the header of an image, else None.
 
     Raises:
-        IntakeRefused: the header is refused, or the file was cut off.
+        IntakeError: the header is refused, or the file was cut off.
         StorageError: the content cannot be had.
     """
     if file_role(name) is FileRole.MODEL:
@@ -109,7 +109,7 @@ def check_dataset(
         limits: what it may ask for.
 
     Raises:
-        IntakeRefused: with all faults that were found.
+        IntakeError: with all faults that were found.
         StorageError: contents cannot be had.
     """
     faults: list[IntakeFault] = []

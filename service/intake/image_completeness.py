@@ -35,7 +35,7 @@ def check_complete(file: BinaryIO, name: str, kind: str) -> None:
         kind: of the image.
 
     Raises:
-        IntakeRefused: ``image-cut-off``.
+        IntakeError: ``image-cut-off``.
     """
     size_bytes = file.seek(0, io.SEEK_END)
     file.seek(0)
@@ -51,7 +51,7 @@ def check_complete(file: BinaryIO, name: str, kind: str) -> None:
 
 
 def _is_jpeg_complete(file: BinaryIO, size_bytes: int) -> bool:
-    """An end mark follows the first scan. Within a scan the two bytes of the mark occur nowhere else."""
+    """Return whether an end marker follows the first scan; its bytes cannot occur within a scan."""
     start = _first_scan_offset(file)
     file.seek(max(start, size_bytes - _TAIL_BYTES))
     if b"\xff\xd9" in file.read(_TAIL_BYTES):
@@ -70,7 +70,7 @@ def _is_jpeg_complete(file: BinaryIO, size_bytes: int) -> bool:
 
 
 def _first_scan_offset(file: BinaryIO) -> int:
-    """Where the data of the first scan begin."""
+    """Return where the data of the first scan begin."""
     file.seek(2)
     marked = False
     for _ in range(_MAX_SEGMENTS):
@@ -87,7 +87,7 @@ def _first_scan_offset(file: BinaryIO) -> int:
 
 
 def _is_png_complete(file: BinaryIO, size_bytes: int) -> bool:
-    """The end chunk is there."""
+    """Return whether the end chunk is there."""
     file.seek(max(0, size_bytes - 12))
     if file.read(12)[4:8] == b"IEND":
         return True
@@ -101,7 +101,7 @@ def _is_png_complete(file: BinaryIO, size_bytes: int) -> bool:
 
 
 def _is_webp_complete(file: BinaryIO, size_bytes: int) -> bool:
-    """The container is as long as it says; the last byte may be padding that was left away."""
+    """Return whether the container has its stated length; the last padding byte may be missing."""
     (length,) = struct.unpack_from("<I", file.read(8), 4)
     return bool(size_bytes >= 8 + length - 1)
 
@@ -119,7 +119,7 @@ def _is_bmp_complete(file: BinaryIO, size_bytes: int) -> bool:
 
 
 def _is_tiff_complete(file: BinaryIO, size_bytes: int) -> bool:
-    """All strips or tiles of the first page lie within the file."""
+    """Return all strips or tiles of the first page lie within the file."""
     order = "<" if file.read(2) == b"II" else ">"
     (version,) = unpack_struct(file, f"{order}H")
     big = version == 43
@@ -142,7 +142,7 @@ def _is_tiff_complete(file: BinaryIO, size_bytes: int) -> bool:
 
 
 def _tiff_values(file: BinaryIO, layout: str, number: int, inline: bytes, address: str) -> tuple[int, ...]:
-    """The values of a field, which stand in the field itself if they fit."""
+    """Return the values of a field, which stand in the field itself if they fit."""
     order, letter = layout[0], layout[1]
     length = struct.calcsize(layout) * number
     if length <= len(inline):
@@ -155,7 +155,7 @@ def _tiff_values(file: BinaryIO, layout: str, number: int, inline: bytes, addres
 
 
 def _is_exr_complete(file: BinaryIO, size_bytes: int) -> bool:
-    """All blocks of rows lie within the file, where it has one part without tiles."""
+    """Return all blocks of rows lie within the file, where it has one part without tiles."""
     _, flags = unpack_struct(file, "<2I")
     if flags & (0x200 | 0x800 | 0x1000):
         return True
@@ -186,5 +186,10 @@ def _assume_complete(_file: BinaryIO, _size_bytes: int) -> bool:
 
 
 _CHECKS: dict[str, Callable[[BinaryIO, int], bool]] = {
-    "JPEG": _is_jpeg_complete, "PNG": _is_png_complete, "WebP": _is_webp_complete, "BMP": _is_bmp_complete, "TIFF": _is_tiff_complete, "EXR": _is_exr_complete,
-}  # fmt: skip
+    "JPEG": _is_jpeg_complete,
+    "PNG": _is_png_complete,
+    "WebP": _is_webp_complete,
+    "BMP": _is_bmp_complete,
+    "TIFF": _is_tiff_complete,
+    "EXR": _is_exr_complete,
+}

@@ -72,7 +72,7 @@ def read_image_header(file: BinaryIO, name: str, limits: ImageLimits = ImageLimi
         limits: what is taken.
 
     Raises:
-        IntakeRefused: ``image-kind``, ``image-damaged``, ``image-header-too-long``, ``image-animated``,
+        IntakeError: ``image-kind``, ``image-damaged``, ``image-header-too-long``, ``image-animated``,
             ``image-too-many-pixels`` or ``image-too-long-side``.
     """
     shown = quoted_name(name)
@@ -115,7 +115,7 @@ def read_image_header(file: BinaryIO, name: str, limits: ImageLimits = ImageLimi
 
 
 def image_type(head: bytes) -> str | None:
-    """The kind of image that begins with ``head`` (32 bytes), or None."""
+    """Return the kind of image that begins with ``head`` (32 bytes), or None."""
     if head.startswith(b"RIFF") and head[8:12] == b"WEBP":
         return "WebP"
     for magic, kind in (
@@ -186,7 +186,7 @@ def _pillow_reader(reader: Callable[[Any], ImageFile.ImageFile]) -> Callable[[An
 
 
 def unpack_struct(file: Any, layout: str) -> tuple[Any, ...]:
-    """The next values of a file, by their layout as of :mod:`struct`."""
+    """Return the next values of a file, by their layout as of :mod:`struct`."""
     return struct.unpack(layout, file.read(struct.calcsize(layout)))
 
 
@@ -251,7 +251,7 @@ def _read_exr_size(file: Any) -> tuple[int, int, int]:
 
 
 def read_null_terminated(file: Any) -> bytes:
-    """A text that ends with a zero, of at most 255 bytes."""
+    """Return a text that ends with a zero, of at most 255 bytes."""
     text = bytearray()
     while (letter := file.read(1)) != b"\0":
         text += letter

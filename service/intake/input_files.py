@@ -31,7 +31,7 @@ def check_input_name(name: str) -> None:
     """Look at a file's name.
 
     Raises:
-        IntakeRefused: ``name-...``; ``name-unexpected``, as nothing reads such files.
+        IntakeError: ``name-...``; ``name-unexpected``, as nothing reads such files.
     """
     FileNames().add(name)
     if is_ignored_file(name) or PurePosixPath(name).suffix.lower() not in ALLOWED_SUFFIXES:
@@ -46,7 +46,7 @@ def check_input_content(storage: Storage, name: str, sha256: str, limits: ImageL
     """Look at the first bytes of a stored file; the header of an image, else None.
 
     Raises:
-        IntakeRefused: it is not what its name says, or was cut off.
+        IntakeError: it is not what its name says, or was cut off.
         StorageError: the content cannot be had.
     """
     suffix = PurePosixPath(name).suffix.lower()
@@ -90,7 +90,7 @@ def check_input_files(files: Sequence[DatasetFile]) -> dict[str, Any]:
     """Look at all files together; returns what is to be told of them.
 
     Raises:
-        IntakeRefused: there are none or too many, or two have names that some systems take for one.
+        IntakeError: there are none or too many, or two have names that some systems take for one.
     """
     if not 1 <= len(files) <= MAX_FILES:
         detail = f"There are {len(files)} files; 1 to {MAX_FILES} are taken."

@@ -121,7 +121,7 @@ def _run_model_child(request: ModelRequest, limits: ModelLimits) -> ModelAnswer:
 
 
 def parser_environment() -> dict[str, str]:
-    """What a child that parses foreign bytes may know: how to find libraries, and no secrets."""
+    """Return what a child that parses foreign bytes may know: how to find libraries, and no secrets."""
     kept = {name: os.environ[name] for name in _LIBRARY_VARIABLES if name in os.environ}
     return {**kept, "OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1", "PYTHONDONTWRITEBYTECODE": "1"}
 

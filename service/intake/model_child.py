@@ -106,7 +106,7 @@ def check(request: ModelRequest) -> ModelAnswer:
 
 
 def _load_reconstruction(folder: Path) -> Any:
-    """The model as pycolmap reads it, or None where it does not; the engine then says why."""
+    """Return the model as pycolmap reads it, or None where it does not; the engine then says why."""
     import pycolmap
 
     try:
@@ -130,7 +130,7 @@ class _ModelChecker:
             self.faults.append(IntakeFault(code, detail, _model_file(model_file, self.request)))
 
     def check_images(self, reconstruction: Any) -> None:
-        """Names against the photographs, and poses."""
+        """Check the images' names against the photographs, and their poses."""
         import numpy as np
 
         known: set[str] = set()
@@ -208,7 +208,7 @@ class _ModelChecker:
                 )
 
     def summary(self, model: "ColmapModel") -> ModelAnswer:
-        """The answer for a model without faults."""
+        """Return the answer for a model without faults."""
         posed = {unicodedata.normalize("NFC", image.name) for image in model.images}
         warnings = [_without_root(warning, self.request.root) for warning in model.warnings]
         unposed = len(self._sizes) - len(posed)
@@ -231,7 +231,7 @@ def _image_name(image: Any, image_id: int) -> str:
 
 
 def has_same_aspect(camera_px: tuple[int, int], image_px: tuple[int, int]) -> bool:
-    """Whether an image is that of the camera but for its scale, to a pixel, as the engine demands."""
+    """Return whether an image is that of the camera but for its scale, to a pixel, as the engine demands."""
     expected_height = camera_px[1] * image_px[0] / camera_px[0]
     expected_width = camera_px[0] * image_px[1] / camera_px[1]
     return min(abs(expected_height - image_px[1]), abs(expected_width - image_px[0])) <= 1
@@ -250,7 +250,7 @@ def _file_in_sentence(sentence: str, request: ModelRequest) -> str | None:
 
 
 def _without_root(sentence: str, root: Path) -> str:
-    """The sentence without the folder of this machine that the model was put into."""
+    """Return the sentence without the folder of this machine that the model was put into."""
     return sentence.replace(f"{root}/", "").replace(str(root), "the dataset")
 
 

@@ -79,10 +79,10 @@ ContentCheck = Callable[[Storage, str, str, ImageLimits], ImageHeader | None]
 
 
 def parse_digest(repr_digest: str | None) -> str | None:
-    """The SHA-256, in hexadecimal digits, of a header ``Repr-Digest`` (RFC 9530); None without the header.
+    """Return the SHA-256, in hexadecimal, of a ``Repr-Digest`` header (RFC 9530); None without it.
 
     Raises:
-        IntakeRefused: ``digest-malformed``.
+        IntakeError: ``digest-malformed``.
     """
     if repr_digest is None:
         return None
@@ -102,7 +102,7 @@ def parse_digest(repr_digest: str | None) -> str | None:
 
 
 def format_digest(sha256: str) -> str:
-    """The header ``Repr-Digest`` of a SHA-256 in hexadecimal digits."""
+    """Return the header ``Repr-Digest`` of a SHA-256 in hexadecimal digits."""
     return f"sha-256=:{base64.b64encode(bytes.fromhex(sha256)).decode()}:"
 
 
@@ -117,7 +117,7 @@ async def receive_body(
         idle_seconds: silence after which the upload is given up.
 
     Raises:
-        IntakeRefused: ``upload-stalled``.
+        IntakeError: ``upload-stalled``.
         StorageError: the content is not as announced, too large, or there is no room.
     """
     pending = bytearray()
@@ -168,7 +168,7 @@ async def receive_file(
         check: looks at the content.
 
     Raises:
-        IntakeRefused: the header of the image is refused, or nothing came for too long.
+        IntakeError: the header of the image is refused, or nothing came for too long.
         StorageError: as by :func:`receive_body`.
     """
     most = limits.max_file_bytes if max_bytes is None else min(limits.max_file_bytes, max_bytes)
@@ -202,7 +202,7 @@ async def receive_archive(
         max_bytes: what the contents may have together, e.g. what a quota leaves.
 
     Raises:
-        IntakeRefused: the archive or a file in it is refused.
+        IntakeError: the archive or a file in it is refused.
         StorageError: as by :func:`receive_body`.
     """
     most = limits.max_archive_bytes if max_bytes is None else min(limits.max_archive_bytes, max_bytes)
@@ -218,7 +218,7 @@ async def receive_archive(
 
 
 def header_facts(header: ImageHeader | None) -> dict[str, str | int | None]:
-    """What the table keeps of the header of an image."""
+    """Return what the table keeps of the header of an image."""
     if header is None:
         return {}
     facts: dict[str, str | int | None] = {
@@ -292,4 +292,4 @@ class _SpoolWriter(VerifyingWriter):
             self._file.flush()
 
     def _discard(self) -> None:
-        """The file goes when it is closed."""
+        """Close the file, which removes it."""

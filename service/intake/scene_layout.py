@@ -32,7 +32,7 @@ class FileRole(Enum):
 
 
 def file_role(name: str) -> FileRole:
-    """What the file ``name``, relative to the scene, is."""
+    """Return what the file ``name``, relative to the scene, is."""
     if is_ignored_file(name):
         return FileRole.OTHER
     if _MODEL_FILE.fullmatch(name):
@@ -44,12 +44,12 @@ def file_role(name: str) -> FileRole:
 
 
 def is_ignored_file(name: str) -> bool:
-    """Whether a file is one that file managers leave behind, or hidden."""
+    """Return whether a file is one that file managers leave behind, or hidden."""
     return _IGNORED_FILE.search(name) is not None
 
 
 def common_folder(names: Sequence[str]) -> str:
-    """The folder, with its slash, around all of ``names``; empty where there is none or it is a scene's."""
+    """Return the folder around all of ``names``, with its slash; empty if none or a scene's own."""
     tops = {name.partition("/")[0] if "/" in name else "" for name in names}
     if len(tops) != 1:
         return ""

@@ -28,7 +28,7 @@ class SpoolSpace:
         """Set so much aside, until it is given back.
 
         Raises:
-            StorageFull: there is not as much.
+            StorageFullError: there is not as much.
         """
         with self._lock:
             if self._max_bytes is not None and self._reserved_bytes + size_bytes > self._max_bytes:

@@ -10,10 +10,10 @@ from octasplat.workers.storage.file_names import FileNameError, NameSet, check_n
 
 
 def check_file_name(name: str) -> FileRole:
-    """What a file of that name is in a dataset.
+    """Return what a file of that name is in a dataset.
 
     Raises:
-        IntakeRefused: the name is refused (``name-...``), or is that of no part of a scene
+        IntakeError: the name is refused (``name-...``), or is that of no part of a scene
             (``name-unexpected``).
     """
     try:
@@ -24,10 +24,10 @@ def check_file_name(name: str) -> FileRole:
 
 
 def check_scene_file(name: str) -> FileRole:
-    """What a file of that name, which is checked, is in a scene.
+    """Return what a file of that name, which is checked, is in a scene.
 
     Raises:
-        IntakeRefused: ``name-unexpected``, as it is no part of one.
+        IntakeError: ``name-unexpected``, as it is no part of one.
     """
     part = file_role(name)
     if part is FileRole.OTHER:
@@ -52,7 +52,7 @@ class FileNames:
         """Take the name of a file, or that of a folder, which ends with a slash.
 
         Raises:
-            IntakeRefused: ``name-...``.
+            IntakeError: ``name-...``.
         """
         try:
             if name.endswith("/"):

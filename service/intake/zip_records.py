@@ -66,13 +66,13 @@ def raise_intake_error(code: str, detail: str, name: str | None = None) -> NoRet
     """Refuse the archive.
 
     Raises:
-        IntakeRefused: always.
+        IntakeError: always.
     """
     raise IntakeError(IntakeFault(code, detail, name))
 
 
 def read_records(file: BinaryIO, *, max_entries: int, max_directory_bytes: int) -> list[ZipEntry]:
-    """All entries of a ZIP file in the order of their data.
+    """Return all entries of a ZIP file in the order of their data.
 
     Args:
         file: seekable.
@@ -80,7 +80,7 @@ def read_records(file: BinaryIO, *, max_entries: int, max_directory_bytes: int) 
         max_directory_bytes: a longer central directory is refused before it is read.
 
     Raises:
-        IntakeRefused: with a code that begins with ``archive-`` or ``name-``.
+        IntakeError: with a code that begins with ``archive-`` or ``name-``.
     """
     length = file.seek(0, os.SEEK_END)
     end = _read_end(file, length)
@@ -177,7 +177,7 @@ def _read_end_64(file: BinaryIO, where: int, must_end: int, short: tuple[int, in
 
 
 def _central_entries(directory: bytes, count: int) -> list[tuple[ZipEntry, bytes]]:
-    """Records without ``data_start``, with their names as bytes."""
+    """Return records without ``data_start``, with their names as bytes."""
     entries: list[tuple[ZipEntry, bytes]] = []
     position = 0
     for _ in range(count):

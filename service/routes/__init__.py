@@ -6,7 +6,7 @@ from octasplat.service.problems import MEDIA_TYPE, ProblemDocument
 
 
 def problem_responses(*statuses: int) -> dict[int | str, dict[str, Any]]:
-    """How errors of these statuses are described in OpenAPI; 400, 401, 429 and 503 are everywhere."""
+    """Return how errors of these statuses are described in OpenAPI; 400, 401, 429 and 503 are everywhere."""
     content = {MEDIA_TYPE: {"schema": {"$ref": "#/components/schemas/ProblemDocument"}}}
     names = {
         400: "Malformed", 401: "No valid token", 403: "The token's scope does not suffice",

@@ -18,7 +18,7 @@ router = APIRouter(prefix="/v1/jobs", tags=["results"])
 
 @router.get("/{job_id}/artifacts", responses=problem_responses(404))
 async def list_artifacts(job_id: uuid.UUID, who: Reader, service: ServiceDep) -> ArtifactList:
-    """The results of a job; none before it has succeeded."""
+    """Return the results of a job; none before it has succeeded."""
     found = await actions.list_artifacts(service, who, job_id)
     return ArtifactList(artifacts=[ArtifactView.from_row(row) for row in found])
 
@@ -34,7 +34,7 @@ async def get_artifact_content(
     request: Request,
     inline: Annotated[bool, Query(description="Show it in the browser rather than save it.")] = False,
 ) -> Response:  # fmt: skip
-    """A result; `Range` and `If-Range` let a download go on."""
+    """Return a result; `Range` and `If-Range` let a download go on."""
     row = await actions.get_artifact(service, who, job_id, name)
     return await run_in_pool(
         ThreadPurpose.DOWNLOADS,
@@ -56,7 +56,7 @@ async def get_artifact_content(
     response_class=Response,
 )
 async def get_preview(job_id: uuid.UUID, who: Reader, service: ServiceDep, request: Request) -> Response:
-    """The newest picture of the scene in the making."""
+    """Return the newest picture of the scene in the making."""
     blob = await actions.get_preview(service, who, job_id)
     response = await run_in_pool(
         ThreadPurpose.DOWNLOADS,

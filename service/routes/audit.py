@@ -17,7 +17,7 @@ async def get_audit(
     _who: Admin, service: ServiceDep, request: Request, response: Response, limit: Limit = 50,
     cursor: Cursor = None,
 ) -> AuditPage:  # fmt: skip
-    """Changes that were asked for, by whom and with what outcome, the newest first.
+    """List requested changes, by whom and with what outcome, the newest first.
 
     Single files of datasets are not listed, their commits are; of wrong tokens the first of each address.
     """

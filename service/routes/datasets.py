@@ -61,7 +61,7 @@ async def list_datasets(
 
 @router.get("/{dataset_id}", responses=problem_responses(404))
 async def get_dataset(dataset_id: uuid.UUID, who: Reader, service: ServiceDep) -> DatasetView:
-    """A dataset."""
+    """Return a dataset."""
     return DatasetView.from_row(await actions.get_dataset(service, who, dataset_id))
 
 
@@ -84,7 +84,7 @@ async def list_files(
     dataset_id: uuid.UUID, who: Reader, service: ServiceDep, request: Request, response: Response,
     limit: Annotated[int, Query(ge=1, le=5000)] = 1000, cursor: Cursor = None,
 ) -> FilePage:  # fmt: skip
-    """The files that have arrived, by name; whoever resumes an upload sends only the others."""
+    """Return the files that have arrived, by name; whoever resumes an upload sends only the others."""
     after = decode_cursor(cursor) or ""
     part = await uploads.list_files(service, who, dataset_id, after=after, limit=limit)
     following = set_next_link(request, response, part.next_key)
@@ -120,7 +120,7 @@ async def put_file(
 async def get_file(
     dataset_id: uuid.UUID, path: FilePath, who: Reader, service: ServiceDep, request: Request
 ) -> Response:
-    """The content of a file."""
+    """Return the content of a file."""
     row = await uploads.get_file(service, who, dataset_id, path)
     return await run_in_pool(
         ThreadPurpose.DOWNLOADS,
@@ -169,7 +169,7 @@ def _upload(request: Request, digest: str | None) -> uploads.Upload:
 
 
 async def _body(request: Request) -> AsyncIterator[bytes]:
-    """The body of a request; one that breaks off is nobody's fault and leaves nothing."""
+    """Yield the body of a request; one that breaks off is nobody's fault and leaves nothing."""
     try:
         async for piece in request.stream():
             yield piece

@@ -27,7 +27,7 @@ async def read_log(
     job_id: uuid.UUID, who: Reader, service: ServiceDep, after: After = 0,
     limit: Annotated[int, Query(ge=1, le=5000)] = 1000,
 ) -> LogPage:  # fmt: skip
-    """What the job did when: stages, pace, warnings, errors with their cause, and what its program wrote."""
+    """Return the job's log: stages, pace, warnings, errors with their cause, and the program's output."""
     lines = await actions.read_log(service, who, job_id, after=after, limit=limit)
     return LogPage(lines=[LogLineView.from_row(row) for row in lines], next=lines[-1].id if lines else after)
 
@@ -37,7 +37,7 @@ async def read_timeline(
     job_id: uuid.UUID, who: Reader, service: ServiceDep, after: After = 0,
     limit: Annotated[int, Query(ge=1, le=5000)] = 1000,
 ) -> EventPage:  # fmt: skip
-    """What happened to the job, as a list; `/events` is the same as a stream."""
+    """Return what happened to the job, as a list; `/events` is the same as a stream."""
     events = await actions.read_events(service, who, job_id, after=after, limit=limit)
     return EventPage(
         events=[EventView.from_row(row) for row in events], next=events[-1].id if events else after
@@ -58,7 +58,7 @@ async def stream_events(
     last_event_id: Annotated[str | None, Header(max_length=40)] = None,
     after: After = 0,
 ) -> Response:  # fmt: skip
-    """What happens to the job, as it happens; after a break `Last-Event-ID` says what was heard last."""
+    """Stream the job's events; after a break, `Last-Event-ID` names the last one received."""
     if last_event_id is not None and last_event_id.isdecimal():
         after = min(int(last_event_id), (1 << 62) - 1)
     events = await actions.follow_events(service, who, job_id, after=after)

@@ -56,7 +56,7 @@ async def list_jobs(
 async def get_job(
     job_id: uuid.UUID, who: Reader, service: ServiceDep, request: Request, response: Response
 ) -> JobView:
-    """A job. Polling with `If-None-Match` costs next to nothing."""
+    """Return a job. Polling with `If-None-Match` costs next to nothing."""
     job = await actions.get_job(service, who, job_id)
     headers = {"ETag": _etag(job), "Cache-Control": "no-cache"}
     if etag_matches(request.headers.get("if-none-match"), headers["ETag"]):

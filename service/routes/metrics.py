@@ -17,6 +17,6 @@ router = APIRouter(tags=["health"])
     response_class=Response,
 )
 async def get_metrics(_who: Reader, service: ServiceDep) -> Response:
-    """How the service fares, in the format of Prometheus."""
+    """Return how the service fares, in the format of Prometheus."""
     text = await render_metrics(service)
     return Response(text, headers={"Content-Type": CONTENT_TYPE_LATEST, "Cache-Control": "no-store"})

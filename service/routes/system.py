@@ -18,7 +18,7 @@ health_router = APIRouter(tags=["health"])
 
 @router.get("/options", responses=problem_responses())
 async def list_options(_who: Reader, service: ServiceDep) -> KindList:
-    """The kinds of jobs with their options as JSON Schema."""
+    """Return the kinds of jobs with their options as JSON Schema."""
     return KindList(kinds=actions.list_kinds(service))
 
 
@@ -36,13 +36,13 @@ async def get_info(who: Reader, service: ServiceDep) -> InfoView:
 
 @router.get("/queues", responses=problem_responses())
 async def list_queues(_who: Reader, service: ServiceDep) -> QueueList:
-    """What waits, what runs, and who works."""
+    """Return what waits, what runs, and who works."""
     return await actions.list_queues(service)
 
 
 @router.get("/tokens", responses=problem_responses())
 async def get_tokens(_who: Admin, service: ServiceDep) -> TokenList:
-    """All tokens, without their secrets."""
+    """Return all tokens, without their secrets."""
     return TokenList(tokens=[TokenView.from_row(row) for row in await tokens.list_tokens(service)])
 
 
@@ -68,13 +68,13 @@ async def make_link(who: Writer, service: ServiceDep) -> SignInLink:
 
 @health_router.get("/healthz")
 async def healthz() -> Health:
-    """Whether the process lives; touches nothing."""
+    """Return whether the process lives; touches nothing."""
     return Health(status="ok")
 
 
 @health_router.get("/readyz", responses={503: {"model": Health, "description": "Not ready"}})
 async def readyz(service: ServiceDep, response: Response) -> Health:
-    """Whether requests can be served: the database answers and fits, and the disk has room."""
+    """Return whether requests can be served: the database answers and fits, and the disk has room."""
     checks = await actions.check_readiness(service)
     ready = all(state == "ok" for state in checks.values())
     if not ready:

@@ -51,7 +51,7 @@ async def list_webhooks(
 
 @router.get("/{webhook_id}", responses=problem_responses(404))
 async def get_webhook(webhook_id: uuid.UUID, who: Reader, service: ServiceDep) -> WebhookView:
-    """A webhook, without its secret."""
+    """Return a webhook, without its secret."""
     return WebhookView.from_row(await actions.get_webhook(service, who, webhook_id))
 
 
@@ -80,7 +80,7 @@ async def list_deliveries(
     webhook_id: uuid.UUID, who: Reader, service: ServiceDep,
     limit: Annotated[int, Query(ge=1, le=200)] = 50,
 ) -> DeliveryList:  # fmt: skip
-    """The newest messages and what became of them; they are kept for 30 days."""
+    """Return the newest messages and what became of them; they are kept for 30 days."""
     found = await actions.list_deliveries(service, who, webhook_id, limit)
     return DeliveryList(deliveries=[DeliveryView.from_row(row) for row in found])
 

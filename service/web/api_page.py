@@ -56,13 +56,13 @@ class OperationGroup:
 
 @router.get("/docs")
 async def show_api(request: Request) -> Response:
-    """The API."""
+    """Return the API."""
     document = request.app.openapi()
     return render_page(request, "api.html", groups=operation_groups(document), info=document["info"])
 
 
 def operation_groups(document: Mapping[str, Any]) -> list[OperationGroup]:
-    """All operations of an OpenAPI document, by their first tag."""
+    """Return all operations of an OpenAPI document, by their first tag."""
     groups: dict[str, OperationGroup] = {}
     for path, item in document["paths"].items():
         for method in _METHODS:
@@ -97,7 +97,7 @@ def _operation(method: str, path: str, operation: Mapping[str, Any]) -> ApiOpera
 
 
 def _type_text(schema: Mapping[str, Any]) -> str:
-    """The type of a parameter in a word or two."""
+    """Return the type of a parameter in a word or two."""
     if "anyOf" in schema:
         return " or ".join(_type_text(option) for option in schema["anyOf"] if option.get("type") != "null")
     if "enum" in schema:

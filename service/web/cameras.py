@@ -50,7 +50,7 @@ class PhotographPose:
 
 
 def read_poses(cameras: IO[bytes], images: IO[bytes], *, binary: bool) -> list[PhotographPose]:
-    """The posed photographs of a model, by name.
+    """Return the posed photographs of a model, by name.
 
     Args:
         cameras: ``cameras.bin`` or ``cameras.txt``.
@@ -58,7 +58,7 @@ def read_poses(cameras: IO[bytes], images: IO[bytes], *, binary: bool) -> list[P
         binary: which of the two.
 
     Raises:
-        CamerasUnreadable: the files are cut short or hold something else.
+        CamerasUnreadableError: the files are cut short or hold something else.
     """
     try:
         optics = _binary_optics(cameras) if binary else _text_optics(cameras)
@@ -70,7 +70,7 @@ def read_poses(cameras: IO[bytes], images: IO[bytes], *, binary: bool) -> list[P
 
 
 def read_view_poses(content: Mapping[str, Any]) -> list[PhotographPose]:
-    """The posed photographs of a run's ``views.json``, by name; none where it holds something else."""
+    """Return the posed photographs of a run's ``views.json``, by name; none where it holds something else."""
     try:
         poses = [_pose_of_view(view, content["cameras"]) for view in content["views"][:MAX_CAMERAS]]
     except (KeyError, IndexError, TypeError, ValueError):
@@ -91,7 +91,7 @@ def _pose_of_view(view: Mapping[str, Any], cameras: Sequence[Mapping[str, Any]])
 
 
 def viewer_cameras(poses: list[PhotographPose], held_out: Iterable[str] = ()) -> dict[str, object]:
-    """What the viewer needs: the up direction, a point to look at, and the views, as JSON values.
+    """Return what the viewer needs: the up direction, a point to look at, and the views, as JSON values.
 
     The point is the one nearest to all their optical axes; it
     is pulled before the cameras where these look the same way and share no such point.
@@ -136,7 +136,7 @@ def viewer_cameras(poses: list[PhotographPose], held_out: Iterable[str] = ()) ->
 
 
 def _estimate_up(rotations_cam_from_world: Float64[np.ndarray, "n 3 3"]) -> Float64[np.ndarray, " 3"]:
-    """The direction against gravity.
+    """Return the direction against gravity.
 
     People tilt cameras up and down but seldom roll them, so it is the direction that is closest to square to
     what all cameras have to their right; a little of their mean up decides where that leaves a choice.

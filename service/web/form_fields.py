@@ -188,7 +188,7 @@ def _form_field(
 
 
 def _control_for(name: str, schema: Mapping[str, Any]) -> tuple[Control, Sequence[str]]:
-    """How a value is asked for, and the values to choose from."""
+    """Return how a value is asked for, and the values to choose from."""
     if "enum" in schema:
         return "choice", [str(value) for value in schema["enum"]]
     if "anyOf" in schema:
@@ -215,7 +215,7 @@ def _control_of_array(name: str, schema: Mapping[str, Any]) -> Control:
 
 
 def _control_of_several(options: Sequence[Mapping[str, Any]]) -> tuple[Control, Sequence[str]]:
-    """How one of several types is asked for: by a choice where all values are known, else as text."""
+    """Return how one of several types is asked for: by a choice where all values are known, else as text."""
     values: list[str] = []
     for option in options:
         if option.get("type") == "null":
@@ -245,7 +245,7 @@ def _file_choices() -> tuple[Choice, ...]:
 
 
 def _resolve_reference(root: Mapping[str, Any], schema: Mapping[str, Any]) -> Mapping[str, Any]:
-    """The schema with its reference followed, and with the null of an optional value left out."""
+    """Return the schema with its reference followed, and with the null of an optional value left out."""
     if "$ref" in schema:
         target: Mapping[str, Any] = root["$defs"][schema["$ref"].rpartition("/")[2]]
         return {**target, **{key: value for key, value in schema.items() if key != "$ref"}}
@@ -261,7 +261,7 @@ _MISSING = object()
 
 
 def _value_at(values: Mapping[str, Any], path: str) -> Any:
-    """The value at a dotted path."""
+    """Return the value at a dotted path."""
     found: Any = values
     for part in path.split("."):
         if not isinstance(found, Mapping) or part not in found:

@@ -6,7 +6,7 @@ _UNITS = ("B", "kB", "MB", "GB", "TB")
 
 
 def format_size(count: int) -> str:
-    """A number of bytes, in decimal units."""
+    """Return a number of bytes, in decimal units."""
     value = float(count)
     for unit in _UNITS:
         if value < 999.5 or unit == _UNITS[-1]:
@@ -17,7 +17,7 @@ def format_size(count: int) -> str:
 
 
 def format_duration(seconds: float) -> str:
-    """A length of time, by its two largest units."""
+    """Return a length of time, by its two largest units."""
     whole = max(0, round(seconds))
     if whole < 60:
         return f"{whole} s"
@@ -32,12 +32,12 @@ def format_duration(seconds: float) -> str:
 
 
 def format_thousands(value: int) -> str:
-    """A whole number with narrow spaces between its thousands."""
+    """Return a whole number with narrow spaces between its thousands."""
     return f"{value:,}".replace(",", "\N{NARROW NO-BREAK SPACE}")
 
 
 def format_age(moment: datetime, now: datetime | None = None) -> str:
-    """How long ago something was, roughly."""
+    """Return how long ago something was, roughly."""
     seconds = ((now or datetime.now(UTC)) - moment).total_seconds()
     if seconds < 45:
         return "just now"

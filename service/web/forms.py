@@ -106,7 +106,7 @@ def _section_title(path: str) -> str:
 
 
 def _preset_values(schema: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
-    """The training settings of each preset, if the kind has presets."""
+    """Return the training settings of each preset, if the kind has presets."""
     if "preset" not in schema["properties"]:
         return {}
     return {name: {"train": preset(name).model_dump(mode="json")} for name in PRESETS}

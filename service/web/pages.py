@@ -71,7 +71,7 @@ _REPORT_POLICY = (
 async def show_jobs(
     request: Request, who: Reader, service: ServiceDep, show: StateFilter = "all", cursor: Cursor = None
 ) -> Response:
-    """The list of jobs."""
+    """Return the list of jobs."""
     values = await _job_list_context(service, who, show, cursor)
     return render_page(request, "jobs.html", who, **values)
 
@@ -80,13 +80,13 @@ async def show_jobs(
 async def show_job_list(
     request: Request, who: Reader, service: ServiceDep, show: StateFilter = "all", cursor: Cursor = None
 ) -> Response:
-    """The list alone."""
+    """Return the list alone."""
     return render_page(request, "_jobs.html", who, **await _job_list_context(service, who, show, cursor))
 
 
 @router.get("/jobs/{job_id}")
 async def show_job(request: Request, job_id: uuid.UUID, who: Reader, service: ServiceDep) -> Response:
-    """A job: how it fares, and its result once it has one."""
+    """Return a job: how it fares, and its result once it has one."""
     detail = await job_detail(service, who, job_id)
     artifacts = await list_artifacts(service, who, job_id)
     photographs = await photographs_of(service, who, job_id)
@@ -135,13 +135,13 @@ async def show_job(request: Request, job_id: uuid.UUID, who: Reader, service: Se
 
 @router.get("/parts/jobs/{job_id}")
 async def show_job_status(request: Request, job_id: uuid.UUID, who: Reader, service: ServiceDep) -> Response:
-    """How a job fares."""
+    """Return how a job fares."""
     return render_page(request, "_status.html", who, detail=await job_detail(service, who, job_id))
 
 
 @router.get("/jobs/{job_id}/report")
 async def show_report(request: Request, job_id: uuid.UUID, who: Reader, service: ServiceDep) -> Response:
-    """The report of a job as a page."""
+    """Return the report of a job as a page."""
     row = await get_artifact(service, who, job_id, REPORT, kind="report")
     response = await run_in_pool(
         ThreadPurpose.DOWNLOADS,
@@ -156,7 +156,7 @@ async def show_report(request: Request, job_id: uuid.UUID, who: Reader, service:
 
 @router.get("/jobs/{job_id}/cameras.json")
 async def get_cameras(job_id: uuid.UUID, who: Reader, service: ServiceDep) -> JSONResponse:
-    """Where the photographs of a job were taken, for the viewer."""
+    """Return where the photographs of a job were taken, for the viewer."""
     artifacts = await list_artifacts(service, who, job_id)
     files = await photographs_of(service, who, job_id)
     held_out = next((row for row in artifacts if row.name == HELD_OUT), None)
@@ -221,7 +221,7 @@ async def delete(request: Request, job_id: uuid.UUID, who: Writer, service: Serv
 
 
 async def _updated_page(request: Request, job_id: uuid.UUID, who: Principal, service: Service) -> Response:
-    """What has changed on the page that asked."""
+    """Return what has changed on the page that asked."""
     if not is_htmx_request(request):
         return redirect(request, f"/jobs/{job_id}")
     if request.query_params.get("in") == "list":
@@ -257,7 +257,7 @@ def _config_value(config: dict[str, object], *keys: str) -> object:
 
 
 def _up_world(config: dict[str, object]) -> str:
-    """The axis about which the light of a result lies, as JSON."""
+    """Return the axis about which the light of a result lies, as JSON."""
     found = _config_value(config, "reconstruction", "train", "materials", "up_world")
     known = isinstance(found, list) and len(found) == 3 and all(isinstance(x, int | float) for x in found)
     return json.dumps(found if known else [0, 0, 1])
@@ -276,7 +276,7 @@ def _octagon_q(config: dict[str, object]) -> float | None:
 def _cameras(
     service: Service, artifacts: list[Artifact], files: list[DatasetFile], held_out: Artifact | None
 ) -> dict[str, object]:
-    """The cameras of the poses that the job found, or else of its dataset; none where there is no model."""
+    """Return the cameras of the job's poses, else of its dataset; none without a model."""
     found = {PurePosixPath(row.name).name: row.sha256 for row in artifacts if row.name.startswith("poses/")}
     if not found:
         found = {name: row.sha256 for name, row in _model_files(files).items()}

@@ -48,7 +48,7 @@ class RelightForm:
 async def relight_form(
     service: Service, who: Principal, artifacts: Sequence[Artifact], held_out: Sequence[str]
 ) -> RelightForm | None:
-    """The form for a job's result; None where it has no materials, or the asker may queue nothing."""
+    """Return the form for a job's result; None where it has no materials, or the asker may queue nothing."""
     names = {row.name for row in artifacts}
     if not who.may("write") or not names.issuperset(get_job_kind("relight").source_files):
         return None

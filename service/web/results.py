@@ -114,13 +114,13 @@ class DownloadGroup:
 
 
 def read_json(storage: Storage, row: Artifact | None) -> dict[str, Any]:
-    """The content of a small JSON result; empty if it cannot be had."""
+    """Return the content of a small JSON result; empty if it cannot be had."""
     content = _read_json(storage, row)
     return content if isinstance(content, dict) else {}
 
 
 def read_names(storage: Storage, row: Artifact | None) -> list[str]:
-    """The names in a small JSON result; none if it cannot be had."""
+    """Return the names in a small JSON result; none if it cannot be had."""
     content = _read_json(storage, row)
     return [str(name) for name in content] if isinstance(content, list) else []
 
@@ -148,7 +148,7 @@ def _read_text(storage: Hashable, sha256: str) -> bytes:
 def read_measurements(
     metrics: Mapping[str, Any], artifacts: Sequence[Artifact], photographs: Sequence[DatasetFile]
 ) -> Measurements | None:
-    """The figures of a result, the worst view first; None if there are none."""
+    """Return the figures of a result, the worst view first; None if there are none."""
     mean = _mapping(metrics.get("mean"))
     rows = {str(name): _mapping(row) for name, row in _mapping(metrics.get("views")).items()}
     if not mean:
@@ -191,7 +191,7 @@ def read_measurements(
 
 
 def mean_psnr(metrics: Mapping[str, Any]) -> float | None:
-    """The mean PSNR of the held-out views, dB."""
+    """Return the mean PSNR of the held-out views, dB."""
     return _number(_mapping(metrics.get("mean")).get("psnr"))
 
 
@@ -202,7 +202,7 @@ def viewable_mesh(artifacts: Sequence[Artifact]) -> Artifact | None:
 
 
 def download_groups(artifacts: Sequence[Artifact]) -> list[DownloadGroup]:
-    """The results by what they are for."""
+    """Return the results by what they are for."""
     groups = {title: DownloadGroup(title, [], folded) for title, folded in _GROUPS.items()}
     for row in sorted(artifacts, key=lambda row: (_sort_rank(row.name), row.name)):
         group, opens_in = _group_and_use(row.name)

@@ -25,7 +25,7 @@ class PageRoute(APIRoute):
     """A route whose errors are pages, or, for parts of pages, a notice on the page that asked."""
 
     def get_route_handler(self) -> Handler:
-        """The handler with its errors caught."""
+        """Return the handler with its errors caught."""
         inner = super().get_route_handler()
 
         async def handler(request: Request) -> Response:
@@ -46,7 +46,7 @@ class PageRoute(APIRoute):
 
 
 def is_htmx_request(request: Request) -> bool:
-    """Whether htmx asks, to change a part of a page."""
+    """Return whether htmx asks, to change a part of a page."""
     return request.headers.get("hx-request") == "true"
 
 

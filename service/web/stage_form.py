@@ -50,7 +50,7 @@ def stage_form(
     photographs: Sequence[DatasetFile],
     settings: ServiceSettings,
 ) -> StageForm | None:
-    """The form for a job's result; None where it has no scene or no picture to place things in."""
+    """Return the form for a job's result; None where it has no scene or no picture to place things in."""
     names = {row.name for row in artifacts}
     if measured is None or not names.issuperset(REQUIRED_RESULTS):
         return None

@@ -36,7 +36,7 @@ STATE_LABELS = {
 def render_page(
     request: Request, template: str, who: Principal | None = None, *, status: int = 200, **values: object
 ) -> HTMLResponse:
-    """A rendered template.
+    """Return a rendered template.
 
     Args:
         request: what it answers.
@@ -87,7 +87,7 @@ def _environment() -> Any:
 
 
 def short_id(job_id: uuid.UUID) -> str:
-    """The end of an id; its beginning is the time, which many share."""
+    """Return the end of an id; its beginning is the time, which many share."""
     return str(job_id)[-6:]
 
 

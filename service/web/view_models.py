@@ -73,14 +73,14 @@ class JobDetail:
 async def list_job_rows(
     service: Service, who: Principal, state_filter: str, before: uuid.UUID | None, limit: int
 ) -> Page[JobRow]:
-    """The newest jobs, of one kind of state."""
+    """Return the newest jobs, of one kind of state."""
     part = await list_jobs(service, who, JobFilter(STATE_FILTERS[state_filter]), before=before, limit=limit)
     async with service.pool.connection() as connection:
         return Page(await _job_rows(service, connection, part.rows), part.next_key)
 
 
 async def job_counts(service: Service, who: Principal) -> dict[str, int]:
-    """How many jobs there are of each kind of state."""
+    """Return how many jobs there are of each kind of state."""
     async with service.pool.connection() as connection:
         cursor = await connection.execute(
             """
@@ -97,10 +97,10 @@ async def job_counts(service: Service, who: Principal) -> dict[str, int]:
 
 
 async def job_detail(service: Service, who: Principal, job_id: uuid.UUID) -> JobDetail:
-    """A job with what has happened to it.
+    """Return a job with what has happened to it.
 
     Raises:
-        Problem: 404.
+        ProblemError: 404.
     """
     async with service.pool.connection() as connection:
         job = await owned_job(connection, who, job_id)
@@ -136,10 +136,10 @@ async def job_detail(service: Service, who: Principal, job_id: uuid.UUID) -> Job
 
 
 async def photographs_of(service: Service, who: Principal, job_id: uuid.UUID) -> list[DatasetFile]:
-    """The files of the dataset that a job works on; none if it is gone.
+    """Return the files of the dataset that a job works on; none if it is gone.
 
     Raises:
-        Problem: 404.
+        ProblemError: 404.
     """
     async with service.pool.connection() as connection:
         job = await owned_job(connection, who, job_id)
@@ -218,7 +218,7 @@ async def _dataset_names(connection: Connection, jobs: Sequence[Job]) -> dict[uu
 
 
 async def _gaussian_counts(connection: Connection, ids: list[uuid.UUID]) -> dict[uuid.UUID, int]:
-    """The newest number of Gaussians that each job has told."""
+    """Return the newest number of Gaussians that each job has told."""
     cursor = await connection.execute(
         """
         SELECT wanted.id, (
@@ -237,7 +237,7 @@ async def _gaussian_counts(connection: Connection, ids: list[uuid.UUID]) -> dict
 async def _first_artifacts(
     connection: Connection, ids: list[uuid.UUID], like: str
 ) -> dict[uuid.UUID, Artifact]:
-    """The first result of each job whose name fits."""
+    """Return the first result of each job whose name fits."""
     async with connection.cursor(row_factory=class_row(Artifact)) as cursor:
         await cursor.execute(
             """

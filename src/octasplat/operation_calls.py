@@ -98,7 +98,7 @@ def explicit_values(model: type[BaseModel], values: Mapping[str, Any]) -> dict[s
 
 
 def _to_plain_value(value: Any) -> Any:
-    """The value with paths of any kind as such, and arrays as lists."""
+    """Return the value with paths of any kind as such, and arrays as lists."""
     if isinstance(value, os.PathLike):
         return Path(value)
     if hasattr(value, "tolist"):

@@ -278,5 +278,5 @@ def _as_flat_gaussians(
 
 
 def _as_float32(tensor: Tensor) -> np.ndarray:
-    """The tensor's values as the tracer takes them, not copied where they are that."""
+    """Return the tensor's values as the tracer takes them, not copied where they are that."""
     return np.require(tensor.detach().cpu().to(torch.float32).numpy(), np.float32, ["C", "W"])

@@ -102,7 +102,7 @@ def view(
 
 
 def _run_cameras(run: Path) -> Mapping[str, Any]:
-    """Where the photographs of a run were taken, for the page."""
+    """Return where the photographs of a run were taken, for the page."""
     viewpoints = run_viewpoints(run)
     poses = []
     for shot in viewpoints.views:

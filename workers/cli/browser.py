@@ -19,17 +19,17 @@ _PAGE_OPEN_SECONDS = 10.0
 
 
 def has_display() -> bool:
-    """Whether somebody sits in front of a display."""
+    """Return whether somebody sits in front of a display."""
     found = sys.platform == "darwin" or any(os.environ.get(n) for n in ("DISPLAY", "WAYLAND_DISPLAY"))
     return found and sys.stdout.isatty()
 
 
 def sign_in_link(api: "Api") -> str:
-    """A link that signs a browser in, once, within five minutes.
+    """Return a link that signs a browser in, once, within five minutes.
 
     Raises:
         ServiceError: the service does not make one.
-        Unreachable: nobody answers.
+        ServiceUnreachableError: nobody answers.
     """
     return api.address + str(api.post("/v1/sign-in-links")["path"])
 

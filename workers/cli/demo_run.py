@@ -49,7 +49,7 @@ def reconstruct_demo_scene(
     """Reconstruct the demo scene, or go on with it, and return the path of the report.
 
     Raises:
-        Stopped: by a signal, after a checkpoint.
+        StoppedError: by a signal, after a checkpoint.
         OctasplatError: as :func:`octasplat.engine.pipeline.reconstruction` does.
     """
     resume = (output / CONFIG).exists()

@@ -12,7 +12,7 @@ from octasplat.workers.storage.file_names import FileNameError, check_name
 
 
 def with_named_files(derivation: Derivation, files_by_option: Sequence[tuple[str, Path]]) -> Derivation:
-    """The same with files for options that name some, such as ``("meshes", Path("edited.ply"))``.
+    """Return the same with files for options that name some, such as ``("meshes", Path("edited.ply"))``.
 
     An option that takes several gets all that are given for it, and patterns such as ``frames/*.ply`` stand
     for their matches.
@@ -34,7 +34,7 @@ def with_named_files(derivation: Derivation, files_by_option: Sequence[tuple[str
 
 
 def _upload_name(path: Path, files: dict[str, Path]) -> str:
-    """A name for a file among those that are sent, which it is added to."""
+    """Return a name for a file among those that are sent, which it is added to."""
     if not path.is_file():
         raise ConfigError(f"{path}: there is no such file.")
     try:
@@ -48,7 +48,7 @@ def _upload_name(path: Path, files: dict[str, Path]) -> str:
 
 
 def _is_list_option(kind: str, option: str) -> bool:
-    """Whether an option of a verb is a list; one of another kind is taken for one that is not."""
+    """Return whether an option of a verb is a list; one of another kind is taken for one that is not."""
     if kind not in operation_names():
         return False
     schema = operation(kind).options.model_json_schema()["properties"].get(option, {})

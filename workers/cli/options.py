@@ -52,7 +52,7 @@ def parse_export_names(text: str | None) -> tuple[str, ...] | None:
 
 
 def exports_option(command: F) -> F:
-    """``--exports``."""
+    """Add the option ``--exports``."""
     return click.option(
         "--exports",
         metavar="NAMES",

@@ -43,7 +43,7 @@ class _ProgressWithDetail(Progress):
         )
 
     def get_renderables(self) -> Iterable[RenderableType]:
-        """The bars of the running stage and the details."""
+        """Return the bars of the running stage and the details."""
         yield self.make_tasks_table(self.tasks)
         if self._should_stop():
             yield Text(_STOPPING_TEXT, style="yellow")
@@ -107,7 +107,7 @@ class ProgressBars:
 def show_progress(
     *, quiet: bool = False, should_stop: Callable[[], bool] = lambda: False
 ) -> Iterator[Listener]:
-    """A listener that shows events for as long as the block runs.
+    """Yield a listener that shows events for as long as the block runs.
 
     Args:
         quiet: show warnings only.

@@ -13,10 +13,10 @@ def run_reconstruction(
 ) -> None:
     """Reconstruct, show the progress, and at the end what was reached.
 
-    With ``resumes_automatically`` a user who stops is not told of ``--resume``, which the command does not have.
+    With ``resumes_automatically`` the message on a stop leaves out ``--resume``, which the command lacks.
 
     Raises:
-        Stopped: by SIGINT or SIGTERM, after a checkpoint.
+        StoppedError: by SIGINT or SIGTERM, after a checkpoint.
         ExportFailed: some files could not be written; what there is was shown.
         OctasplatError: as :func:`octasplat.engine.pipeline.reconstruction` does.
     """

@@ -47,7 +47,7 @@ def download_results(
 
 
 def submit_and_wait(api: Api, request: Submission | Derivation, output: Path, *, quiet: bool = False) -> None:
-    """All of it, and a summary at the end."""
+    """Submit, wait, download, and print a summary."""
     job = (
         derive(api, request, quiet=quiet)
         if isinstance(request, Derivation)
@@ -71,7 +71,7 @@ def submit_and_wait(api: Api, request: Submission | Derivation, output: Path, *,
 
 
 def _print_notes(job: dict[str, Any], *, quiet: bool) -> None:
-    """What to know of a job that was queued."""
+    """Print the notes of a queued job."""
     if not quiet and job.get("estimate"):
         click.echo(f"Estimate: {job['estimate']['text']}, within a factor of two.", err=True)
     for note in job.get("notes", ()):
@@ -79,7 +79,7 @@ def _print_notes(job: dict[str, Any], *, quiet: bool) -> None:
 
 
 def run_demo(api: Api, output: Path = DEMO_OUTPUT) -> None:
-    """The way of a user through the service, on a scene that octasplat makes itself.
+    """Reconstruct the demo scene through the service.
 
     Args:
         api: the service.

@@ -120,7 +120,7 @@ def run_operation(
 
     Raises:
         OctasplatError: as the operation does.
-        Stopped: a signal asked to stop.
+        StoppedError: a signal asked to stop.
     """
     if is_stoppable:
         with request_stop_on_signals() as should_stop:
@@ -258,7 +258,7 @@ def _is_parsed_from_text(info: FieldInfo) -> bool:
 
 
 def _may_repeat(info: FieldInfo) -> bool:
-    """Whether the option may be given several times, so that none at all is an empty tuple."""
+    """Return whether the option may be given several times, so that none at all is an empty tuple."""
     return _spelling(info).repeated or (
         not _is_parsed_from_text(info) and _is_sequence(_strip_optional(info.annotation)[0])
     )
@@ -291,7 +291,7 @@ def _metavar(annotation: Any) -> str | None:
 
 
 def _strip_optional(annotation: Any) -> tuple[Any, bool]:
-    """The annotation without None and marks, and whether None was in it."""
+    """Return the annotation without None and marks, and whether None was in it."""
     if get_origin(annotation) is Annotated:
         return _strip_optional(get_args(annotation)[0])
     if get_origin(annotation) in (Union, types.UnionType):
@@ -340,7 +340,7 @@ def _click_type(annotation: Any, info: FieldInfo | None) -> Any:
 
 
 def _literal_values(annotation: Any) -> tuple[Any, ...]:
-    """The values of a literal type, or of a union of such; none where it is something else."""
+    """Return the values of a literal type, or of a union of such; none where it is something else."""
     if get_origin(annotation) is Literal:
         return get_args(annotation)
     if get_origin(annotation) in (Union, types.UnionType):

@@ -27,7 +27,7 @@ class StopFlag:
         self.signal_number: int | None = None
 
     def __call__(self) -> bool:
-        """True once a signal came."""
+        """Return whether a signal came."""
         return self.signal_number is not None
 
     @property

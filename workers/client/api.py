@@ -38,14 +38,14 @@ class ServiceUnreachableError(OctasplatError):
 
 
 def find_address(environment: Mapping[str, str], data: Path | None = None) -> str:
-    """Where the service is: as the environment says, or where ``octasplat serve`` of this machine is."""
+    """Return the service's address: that of the environment, or of this machine's ``octasplat serve``."""
     if environment.get(SERVER_VARIABLE):
         return environment[SERVER_VARIABLE].rstrip("/")
     return _local_address(data or _data_folder(environment)) or DEFAULT_ADDRESS
 
 
 def find_token(environment: Mapping[str, str], address: str, data: Path | None = None) -> str | None:
-    """What to show the service: the environment's token, or that of ``octasplat serve`` of this machine.
+    """Return the token: that of the environment, or of this machine's ``octasplat serve``.
 
     The latter is for that service alone; no other address is ever sent it.
     """
@@ -65,7 +65,7 @@ def _data_folder(environment: Mapping[str, str]) -> Path:
 
 
 def _local_address(folder: Path) -> str | None:
-    """Where ``octasplat serve`` on that data folder is, if it runs."""
+    """Return where ``octasplat serve`` on that data folder is, if it runs."""
     try:
         content = json.loads((folder / ADDRESS_FILE).read_text(encoding="utf-8"))
         return str(content["url"]).rstrip("/")
@@ -99,7 +99,7 @@ class Api:
 
     @classmethod
     def local(cls, data: Path) -> Self:
-        """The service that ``octasplat serve`` runs on a data folder of one's own."""
+        """Return the service that ``octasplat serve`` runs on a data folder of one's own."""
         address = _local_address(data) or DEFAULT_ADDRESS
         return cls(address, find_token({}, address, data))
 
@@ -116,20 +116,20 @@ class Api:
         self._http.close()
 
     def get(self, path: str, **query: Any) -> Any:
-        """The JSON of a GET."""
+        """Return the JSON of a GET."""
         return _json(self.request("GET", path, params=query or None))
 
     def post(self, path: str, body: Any = None, *, key: str | None = None) -> Any:
-        """The JSON of a POST; with a key, which is made if not given, it is safe to try again."""
+        """Return the JSON of a POST; with a key, which is made if not given, it is safe to try again."""
         headers = {"Idempotency-Key": key or uuid.uuid4().hex}
         return _json(self.request("POST", path, json=body, headers=headers))
 
     def request(self, method: str, path: str, **arguments: Any) -> httpx.Response:
-        """A request, tried again while the service is away or busy; bodies must be given as content or JSON.
+        """Send a request, again while the service is away or busy; bodies must be content or JSON.
 
         Raises:
             ServiceError: it was refused.
-            Unreachable: nobody answers.
+            ServiceUnreachableError: nobody answers.
         """
         patience = self.new_backoff()
         while True:
@@ -152,11 +152,11 @@ class Api:
         return Backoff(MAX_OUTAGE_SECONDS if self._has_answered else MAX_FIRST_OUTAGE_SECONDS)
 
     def stream(self, method: str, path: str, **arguments: Any) -> Any:
-        """A streamed answer, as a context; the caller checks it with :meth:`raise_for_stream_status`."""
+        """Stream an answer, as a context; the caller checks it with :meth:`raise_for_stream_status`."""
         return self._http.stream(method, path, **arguments)
 
     def iterate_pages(self, path: str, name: str, **query: Any) -> Iterator[dict[str, Any]]:
-        """All entries of a list that comes in parts."""
+        """Yield all entries of a list that comes in parts."""
         cursor: str | None = None
         while True:
             page = self.get(path, **query, **({} if cursor is None else {"cursor": cursor}))
@@ -170,7 +170,7 @@ class Api:
 
         Raises:
             ServiceError: it is not.
-            Unreachable: a proxy says that the service is away.
+            ServiceUnreachableError: a proxy says that the service is away.
         """
         if not response.is_success:
             response.read()
@@ -178,7 +178,7 @@ class Api:
         self._has_answered = True
 
     def unreachable_error(self, error: Exception | str) -> ServiceUnreachableError:
-        """What to tell when nobody answers."""
+        """Return what to tell when nobody answers."""
         reason = str(error) or type(error).__name__
         return ServiceUnreachableError(
             f"No service answers at {self.address} ({reason}); start one with octasplat serve, or "
@@ -186,7 +186,7 @@ class Api:
         )
 
     def _raise_for_status(self, response: httpx.Response) -> httpx.Response:
-        """The answer itself, if it is good."""
+        """Return the answer itself, if it is good."""
         if response.is_success:
             return response
         if response.status_code in UNAVAILABLE_STATUSES and not _is_from_service(response):
@@ -195,7 +195,7 @@ class Api:
 
 
 def _is_from_service(response: httpx.Response) -> bool:
-    """Whether an answer comes from the service itself, and not from a proxy in front of it."""
+    """Return whether an answer comes from the service itself, and not from a proxy in front of it."""
     return response.is_success or response.headers.get("content-type", "").startswith(PROBLEM_MEDIA_TYPE)
 
 
@@ -212,11 +212,11 @@ def _json(response: httpx.Response) -> Any:
 
 
 def _service_error(response: httpx.Response) -> ServiceError:
-    """What the service, or whoever answered for it, refuses."""
+    """Return what the service, or whoever answered for it, refuses."""
     if response.is_redirect:
         return ServiceError(
-            f"{response.request.url} is redirected to {response.headers['location']}; set {SERVER_VARIABLE} to the "
-            "address of the service itself.",
+            f"{response.request.url} is redirected to {response.headers['location']}; set {SERVER_VARIABLE} "
+            "to the address of the service itself.",
             response.status_code,
         )
     try:
@@ -234,7 +234,7 @@ def _service_error(response: httpx.Response) -> ServiceError:
 
 
 def _error_text(error: Mapping[str, Any]) -> str:
-    """What is wrong, with the option that it is about."""
+    """Return what is wrong, with the option that it is about."""
     detail = str(error["detail"])
     option = str(error.get("pointer", "")).partition("#/options/")[2].replace("/", ".")
     return f"{option}: {detail}" if option and option.rpartition(".")[2] not in detail else detail

@@ -24,11 +24,11 @@ class Backoff:
         self._pause = FIRST_PAUSE_SECONDS
 
     def reset(self) -> None:
-        """The service is there."""
+        """Forget earlier failures, as the service has answered."""
         self._since, self._pause = None, FIRST_PAUSE_SECONDS
 
     def wait(self, min_seconds: float = 0.0) -> bool:
-        """The service is away: pause, or False if it was for too long.
+        """Return the service is away: pause, or False if it was for too long.
 
         Args:
             min_seconds: how long it asks to be left alone, s.

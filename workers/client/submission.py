@@ -93,7 +93,7 @@ class Derivation:
 
 
 def with_stage(derivation: Derivation, stage: Path) -> Derivation:
-    """The same with a stage and the files that it names; options that say otherwise win.
+    """Return the same with a stage and the files that it names; options that say otherwise win.
 
     Files that lie elsewhere than in or below the stage's folder, or whose names a service does not take, are
     sent under other ones.
@@ -131,7 +131,7 @@ def with_camera_path(derivation: Derivation, path: Path) -> Derivation:
 
 
 def with_environments(derivation: Derivation, maps: Sequence[Path]) -> Derivation:
-    """The same with maps of light, which are sent under their own names, or plain ones where those are odd.
+    """Add environment maps, sent under their own names, or plain ones where those are not valid.
 
     Raises:
         ConfigError: one is not there, or two have one name.
@@ -162,7 +162,7 @@ def derive(api: Api, derivation: Derivation, on_event: Listener = ignore) -> dic
     Raises:
         ConfigError: a file is not there.
         ServiceError: something is refused.
-        Unreachable: the service does not answer.
+        ServiceUnreachableError: the service does not answer.
     """
     for path in derivation.files.values():
         if not path.is_file():
@@ -200,7 +200,7 @@ def wait_for_job(
         on_note: told in a sentence when another worker takes the job over.
 
     Raises:
-        JobFailed: it failed or was cancelled.
+        JobFailedError: it failed or was cancelled.
     """
 
     def on_state(event: dict[str, Any]) -> None:
@@ -236,7 +236,7 @@ def download_job(
 
 
 def _upload_if_needed(api: Api, scene: Path, on_event: Listener) -> str:
-    """The dataset of these photographs, sent if that is not done yet."""
+    """Return the dataset of these photographs, sent if that is not done yet."""
     dataset_id = _parse_id(str(scene))
     if dataset_id is not None:
         return dataset_id

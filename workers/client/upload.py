@@ -35,7 +35,7 @@ class LocalFile:
 
 
 def list_scene_files(scene: Path) -> list[LocalFile]:
-    """The files of a scene folder that belong to a dataset, by name; a bare folder of pictures will do.
+    """Return the files of a scene folder, or a bare folder of photographs, that belong to a dataset.
 
     Raises:
         DatasetError: it is no folder, or holds no photographs.
@@ -134,7 +134,7 @@ def _commit(api: Api, dataset: dict[str, Any]) -> dict[str, Any]:
 def _find_or_create_dataset(
     api: Api, name: str, files: Iterable[LocalFile], holds: str = "photographs"
 ) -> dict[str, Any]:
-    """The dataset that was made for just these files, or a new one."""
+    """Return the dataset that was made for just these files, or a new one."""
     digest = hashlib.sha256(f"{holds}\0{name}".encode() if holds == "files" else name.encode())
     for file in files:
         facts = file.path.stat()

@@ -39,7 +39,8 @@ def watch_job(
 
     Raises:
         ServiceError: there is no such job.
-        Unreachable: the service was away for too long, see :mod:`octasplat.workers.client.backoff`.
+        ServiceUnreachableError: the service was away for too long, see
+            :mod:`octasplat.workers.client.backoff`.
     """
     last = "0"
     patience = Backoff(MAX_OUTAGE_SECONDS)

@@ -43,7 +43,7 @@ KEEPALIVES: Mapping[str, int] = {
 
 @cache
 def with_columns(query: LiteralString, row: type[Any], table_name: str = "") -> sql.Composed:
-    """A query with the columns that a row has in the place of its braces.
+    """Return a query with the columns that a row has in the place of its braces.
 
     They are named, as the next version's tables, with which this one goes on for a while, may have more.
 
@@ -60,7 +60,7 @@ def with_columns(query: LiteralString, row: type[Any], table_name: str = "") -> 
 def retry_on_deadlock(
     action: Callable[Parameters, Awaitable[Outcome]],
 ) -> Callable[Parameters, Coroutine[Any, Any, Outcome]]:
-    """A function whose transaction is begun anew where the database ended it in favour of another.
+    """Return a function whose transaction is begun anew where the database ended it in favour of another.
 
     The function must leave nothing behind but what it did in that transaction.
     """
@@ -81,7 +81,7 @@ def retry_on_deadlock(
 
 @asynccontextmanager
 async def open_pool(conninfo: str, *, max_size: int = 10, wait_seconds: float = 30.0) -> AsyncIterator[Pool]:
-    """A pool of connections for as long as the block runs.
+    """Yield a pool of connections for as long as the block runs.
 
     Args:
         conninfo: how to connect.

@@ -23,7 +23,7 @@ STALE_CHECK_SECONDS = 60
 async def create_dataset(
     connection: Connection, owner: str, name: str, holds: DatasetHolds = "photographs"
 ) -> Dataset:
-    """A new dataset that takes files."""
+    """Return a new dataset that takes files."""
     dataset_id = new_id()
     await connection.execute(
         "INSERT INTO datasets (id, owner, name, holds) VALUES (%s, %s, %s, %s)",
@@ -35,7 +35,7 @@ async def create_dataset(
 
 
 async def get_dataset(connection: Connection, dataset_id: uuid.UUID, *, lock: bool = False) -> Dataset | None:
-    """The dataset of that id, or None."""
+    """Return the dataset of that id, or None."""
     query = "SELECT {} FROM datasets WHERE id = %s"
     async with connection.cursor(row_factory=class_row(Dataset)) as cursor:
         await cursor.execute(with_columns(f"{query} FOR UPDATE" if lock else query, Dataset), [dataset_id])
@@ -101,8 +101,8 @@ async def put_files(
     All go in one statement, as the locks of the dataset and its owner are held for as long as it takes.
 
     Raises:
-        Conflict: the dataset takes no files any more.
-        Missing: there is no such dataset.
+        ConflictError: the dataset takes no files any more.
+        NotFoundError: there is no such dataset.
     """
     async with connection.transaction():
         await _lock_open_dataset(connection, dataset_id)
@@ -150,8 +150,8 @@ async def remove_file(connection: Connection, dataset_id: uuid.UUID, path: str) 
     """Take a file out of an open dataset; False if there was none.
 
     Raises:
-        Conflict: the dataset does not change any more.
-        Missing: there is no such dataset.
+        ConflictError: the dataset does not change any more.
+        NotFoundError: there is no such dataset.
     """
     async with connection.transaction():
         await _lock_open_dataset(connection, dataset_id)
@@ -190,7 +190,7 @@ async def files_of(
 
 
 async def photograph_sizes(connection: Connection, dataset_id: uuid.UUID) -> list[Sizes]:
-    """How many photographs of which size a dataset has, of those whose size is known."""
+    """Return how many photographs of which size a dataset has, of those whose size is known."""
     cursor = await connection.execute(
         """
         SELECT (facts->>'width_px')::int AS width, (facts->>'height_px')::int AS height, count(*) AS n
@@ -222,8 +222,8 @@ async def begin_check(connection: Connection, dataset_id: uuid.UUID) -> Check:
     """Close an open dataset for the time of its validation.
 
     Raises:
-        Conflict: it is being validated already.
-        Missing: there is no such dataset.
+        ConflictError: it is being validated already.
+        NotFoundError: there is no such dataset.
     """
     async with connection.transaction():
         dataset = await get_dataset(connection, dataset_id, lock=True)
@@ -279,7 +279,7 @@ async def end_check(
     Nothing changes where the dataset is not this validation's any more; the row says so.
 
     Raises:
-        Missing: there is no such dataset any more.
+        NotFoundError: there is no such dataset any more.
     """
     await connection.execute(
         """
@@ -325,8 +325,8 @@ async def delete_dataset(connection: Connection, dataset_id: uuid.UUID) -> None:
     """Forget a dataset that no job needs; its blobs stay until they are swept.
 
     Raises:
-        Conflict: jobs were made from it, or it is being validated.
-        Missing: there is no such dataset.
+        ConflictError: jobs were made from it, or it is being validated.
+        NotFoundError: there is no such dataset.
     """
     async with connection.transaction():
         await _lock_owner_of(connection, dataset_id)
@@ -345,7 +345,7 @@ async def delete_dataset(connection: Connection, dataset_id: uuid.UUID) -> None:
 
 
 async def _clock(connection: Connection) -> datetime:
-    """The time by the database's clock."""
+    """Return the time by the database's clock."""
     row = await (await connection.execute("SELECT clock_timestamp() AS at")).fetchone()
     assert row is not None
     at: datetime = row["at"]
@@ -353,7 +353,7 @@ async def _clock(connection: Connection) -> datetime:
 
 
 async def _is_check_stale(connection: Connection, dataset_id: uuid.UUID) -> bool:
-    """Whether whoever checks was not heard of for so long that it must have gone."""
+    """Return whether whoever checks was not heard of for so long that it must have gone."""
     cursor = await connection.execute(
         "SELECT used_at < now() - make_interval(secs => %s) AS lost FROM datasets WHERE id = %s",
         [STALE_CHECK_SECONDS, dataset_id],

@@ -6,7 +6,7 @@ import uuid
 
 
 def new_id() -> uuid.UUID:
-    """A fresh UUIDv7: 48 bits of Unix time in ms, 12 bits of the fraction of it, 62 random bits."""
+    """Return a fresh UUIDv7: 48 bits of Unix time in ms, 12 bits of the fraction of it, 62 random bits."""
     nanoseconds = time.time_ns()
     milliseconds, rest = divmod(nanoseconds, 1_000_000)
     fraction = rest * 4096 // 1_000_000

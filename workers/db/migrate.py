@@ -147,12 +147,12 @@ def wait_for_tables(conninfo: str, seconds: float = MAX_WAIT_SECONDS) -> None:
 
 
 def missing_migrations(applied: set[tuple[str, str]]) -> list[str]:
-    """Names of this version's steps that are not among ``applied``, which are (component, name)."""
+    """Return names of this version's steps that are not among ``applied``, which are (component, name)."""
     return [step.name for step in all_migrations() if (step.component, step.name) not in applied]
 
 
 def all_migrations() -> tuple[Migration, ...]:
-    """Every step of this version, in order."""
+    """Return every step of this version, in order."""
     return (
         *queue_migrations(),
         *_read_migrations(OWN_COMPONENT, resources.files("octasplat.workers.db") / "migrations"),
@@ -160,7 +160,7 @@ def all_migrations() -> tuple[Migration, ...]:
 
 
 def queue_migrations() -> tuple[Migration, ...]:
-    """The steps of the queue's library."""
+    """Return the steps of the queue's library."""
     return tuple(_read_migrations(QUEUE_COMPONENT, resources.files("procrastinate.sql") / "migrations"))
 
 
@@ -195,7 +195,7 @@ def _apply_missing(connection: psycopg.Connection, only: Collection[str] | None)
 
 
 def _is_newer(connection: psycopg.Connection, applied: set[tuple[str, str]]) -> bool:
-    """Whether a newer version made the tables.
+    """Return whether a newer version made the tables.
 
     Raises:
         DatabaseError: one whose tables this version may not use.
@@ -221,7 +221,7 @@ def _is_newer(connection: psycopg.Connection, applied: set[tuple[str, str]]) -> 
 
 
 def _missing_in_database(conninfo: str) -> list[str]:
-    """Steps that a database lacks."""
+    """Return steps that a database lacks."""
     try:
         with psycopg.connect(conninfo, autocommit=True, connect_timeout=10) as connection:
             if connection.execute("SELECT to_regclass('schema_steps') IS NULL").fetchone() == (True,):
@@ -241,7 +241,7 @@ def _unreachable(error: psycopg.Error) -> DatabaseError:
 
 
 def _create_queue_schema(connection: psycopg.Connection) -> Iterator[str]:
-    """The queue's schema as it is now, which stands for all of its steps."""
+    """Yield the queue's schema as it is now, which stands for all of its steps."""
     schema = (resources.files("procrastinate.sql") / "schema.sql").read_text(encoding="utf-8")
     with connection.transaction():
         connection.execute(schema)

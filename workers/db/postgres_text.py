@@ -15,12 +15,12 @@ _REPLACEMENT = "\N{REPLACEMENT CHARACTER}"
 
 
 def storable_text(text: str) -> str:
-    """The text with a replacement character for each one that Postgres refuses."""
+    """Return the text with a replacement character for each one that Postgres refuses."""
     return _REFUSED.sub(_REPLACEMENT, text)
 
 
 def storable(value: Any) -> Any:
-    """A JSON value that Postgres takes: cleaned texts and keys, and null for NaN and infinities."""
+    """Return a JSON value that Postgres takes: cleaned texts and keys, and null for NaN and infinities."""
     if isinstance(value, str):
         return storable_text(value)
     if isinstance(value, float):
@@ -33,10 +33,10 @@ def storable(value: Any) -> Any:
 
 
 def as_json(value: Any) -> Jsonb:
-    """A value for a column of JSON."""
+    """Return a value for a column of JSON."""
     return Jsonb(storable(value))
 
 
 def as_json_or_null(value: Any | None) -> Jsonb | None:
-    """The same where None stands for SQL's NULL."""
+    """Return the same where None stands for SQL's NULL."""
     return None if value is None else as_json(value)

@@ -43,7 +43,7 @@ class Quota:
     max_jobs: int | None = None
 
     def with_defaults(self, default: "Quota") -> "Quota":
-        """These limits, and where there is none that of ``default``."""
+        """Return these limits, and where there is none that of ``default``."""
         return Quota(
             default.max_bytes if self.max_bytes is None else self.max_bytes,
             default.max_datasets if self.max_datasets is None else self.max_datasets,
@@ -64,7 +64,7 @@ NO_QUOTA = Quota()
 
 
 async def quota_of(connection: Connection, owner: str, default: Quota = NO_QUOTA) -> Quota:
-    """The limits of an owner."""
+    """Return the limits of an owner."""
     async with connection.cursor(row_factory=class_row(Quota)) as cursor:
         await cursor.execute("SELECT max_bytes, max_datasets, max_jobs FROM quotas WHERE owner = %s", [owner])
         return (await cursor.fetchone() or NO_QUOTA).with_defaults(default)
@@ -83,7 +83,7 @@ async def set_quota(connection: Connection, owner: str, quota: Quota) -> None:
 
 
 async def usage_of(connection: Connection, owner: str) -> Usage:
-    """What an owner has."""
+    """Return what an owner has."""
     async with connection.cursor(row_factory=class_row(Usage)) as cursor:
         await cursor.execute(
             """
@@ -101,7 +101,7 @@ async def usage_of(connection: Connection, owner: str) -> Usage:
 
 
 async def bytes_left(connection: Connection, owner: str, default: Quota = NO_QUOTA) -> int | None:
-    """How many bytes more an owner may store, at least 0; None without a limit. Takes no lock."""
+    """Return how many bytes more an owner may store, at least 0; None without a limit. Takes no lock."""
     quota = await quota_of(connection, owner, default)
     if quota.max_bytes is None:
         return None
@@ -127,7 +127,7 @@ async def recount(connection: Connection) -> list[Recounted]:
 
 
 async def owned_bytes(connection: Connection, owner: str, sha256: str) -> int:
-    """What of an owner's bytes is content of that digest; 0 if they do not have it."""
+    """Return what of an owner's bytes is content of that digest; 0 if they do not have it."""
     query = """
         SELECT coalesce(sum(size_bytes), 0)::bigint AS n FROM owner_contents WHERE owner = %s AND sha256 = %s
         """
@@ -138,7 +138,7 @@ async def check_bytes(connection: Connection, owner: str, default: Quota = NO_QU
     """Refuse what was just entered in this transaction if it is too much.
 
     Raises:
-        QuotaExceeded: the owner has more bytes than allowed; the transaction must be rolled back.
+        QuotaExceededError: the owner has more bytes than allowed; the transaction must be rolled back.
     """
     quota = await _locked_quota(connection, owner, default)
     if quota.max_bytes is None:
@@ -155,7 +155,7 @@ async def check_new_dataset(connection: Connection, owner: str, default: Quota =
     """Before a dataset is made in this transaction.
 
     Raises:
-        QuotaExceeded: the owner has as many as allowed.
+        QuotaExceededError: the owner has as many as allowed.
     """
     quota = await _locked_quota(connection, owner, default)
     if quota.max_datasets is None:
@@ -171,7 +171,7 @@ async def check_new_job(connection: Connection, owner: str, default: Quota = NO_
     """Before a job is made, or queued again, in this transaction.
 
     Raises:
-        QuotaExceeded: as many as allowed are not over yet.
+        QuotaExceededError: as many as allowed are not over yet.
     """
     quota = await _locked_quota(connection, owner, default)
     if quota.max_jobs is None:

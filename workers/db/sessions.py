@@ -41,7 +41,7 @@ async def begin_session(connection: Connection, token: Token, hours: float) -> t
 
 
 async def find_session(connection: Connection, secret: str) -> Session | None:
-    """The session of that secret, or None; whether its token is still valid is another question."""
+    """Return the session of that secret, or None; whether its token is still valid is another question."""
     async with connection.cursor(row_factory=class_row(Session)) as cursor:
         await cursor.execute(
             with_columns(
@@ -62,7 +62,7 @@ async def end_session(connection: Connection, secret: str) -> None:
 
 
 async def add_link(connection: Connection, token_id: uuid.UUID) -> str:
-    """The secret of a link that signs in once, with the rights of a token, within :data:`LINK_SECONDS`."""
+    """Add a link that signs in once within :data:`LINK_SECONDS`; return its secret."""
     secret = secrets.token_urlsafe(32)
     await connection.execute(
         """
@@ -75,7 +75,7 @@ async def add_link(connection: Connection, token_id: uuid.UUID) -> str:
 
 
 async def use_link(connection: Connection, secret: str) -> uuid.UUID | None:
-    """The token that a link stands for, this once; None if it was used, is too old, or never was one."""
+    """Use a link and return its token; None if it was used, has expired, or never existed."""
     cursor = await connection.execute(
         "DELETE FROM sign_in_links WHERE sha256 = %s RETURNING token_id, expires_at > now() AS fresh",
         [hash_secret(secret)],

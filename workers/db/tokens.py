@@ -21,12 +21,12 @@ _LOCK = 0x6F637474  # "octt"
 
 
 def new_secret() -> str:
-    """A fresh secret of 256 random bits."""
+    """Return a fresh secret of 256 random bits."""
     return PREFIX + secrets.token_urlsafe(32)
 
 
 def hash_secret(secret: str) -> str:
-    """What the table knows of a secret. Secrets are random, so a slow hash would protect nothing more."""
+    """Hash a secret for the table; secrets are random, so a slow hash would add no protection."""
     return hashlib.sha256(secret.encode()).hexdigest()
 
 
@@ -113,7 +113,7 @@ async def set_origin(connection: Connection, token_id: uuid.UUID, origin: Origin
 
 
 async def find_token(connection: Connection, secret: str) -> Token | None:
-    """The valid token of that secret, or None."""
+    """Return the valid token of that secret, or None."""
     async with connection.cursor(row_factory=class_row(Token)) as cursor:
         await cursor.execute(
             with_columns(
@@ -129,7 +129,7 @@ async def find_token(connection: Connection, secret: str) -> Token | None:
 
 
 async def get_token(connection: Connection, token_id: uuid.UUID) -> Token | None:
-    """The valid token of that id, or None."""
+    """Return the valid token of that id, or None."""
     async with connection.cursor(row_factory=class_row(Token)) as cursor:
         await cursor.execute(
             with_columns(
@@ -145,14 +145,14 @@ async def get_token(connection: Connection, token_id: uuid.UUID) -> Token | None
 
 
 async def list_tokens(connection: Connection) -> list[Token]:
-    """All tokens, the newest first."""
+    """Return all tokens, the newest first."""
     async with connection.cursor(row_factory=class_row(Token)) as cursor:
         await cursor.execute(with_columns("SELECT {} FROM tokens ORDER BY id DESC", Token))
         return await cursor.fetchall()
 
 
 async def has_any_token(connection: Connection, *, valid_only: bool = True) -> bool:
-    """Whether there is a valid token at all, or with ``valid_only`` False whether there ever was any."""
+    """Return whether there is any valid token; with ``valid_only`` False, whether there ever was one."""
     cursor = await connection.execute(
         """
         SELECT EXISTS (SELECT 1 FROM tokens WHERE NOT %s OR (revoked_at IS NULL

@@ -31,7 +31,7 @@ async def record_worker_heartbeat(
 
 
 async def remove_worker(connection: Connection, worker_id: uuid.UUID) -> None:
-    """A worker has gone in good order."""
+    """Remove a worker that has shut down."""
     await connection.execute("DELETE FROM workers WHERE id = %s", [worker_id])
 
 

@@ -102,7 +102,7 @@ async def collect_garbage_now(
 
 @asynccontextmanager
 async def _collection_turn(pool: Pool, storage: Storage, every_seconds: float) -> AsyncIterator[bool]:
-    """Whether it is time and nobody else collects, which then holds for as long as the block runs."""
+    """Yield whether it is time and nobody else collects, which then holds for as long as the block runs."""
     async with pool.connection() as connection, connection.transaction():
         cursor = await connection.execute(
             """
@@ -127,7 +127,7 @@ async def _collection_turn(pool: Pool, storage: Storage, every_seconds: float) -
 
 
 def _is_own_store(storage: Storage, installation: bytes) -> bool:
-    """Whether the store is this database's; one that is nobody's becomes so."""
+    """Return whether the store is this database's; one that is nobody's becomes so."""
     # Read first, as a full store takes not even this.
     known = storage.read_document(INSTALLATION_DOCUMENT)
     return (
@@ -195,8 +195,8 @@ async def _remove(
     """Remove contents, some at a time, each marked before, while nobody could name it.
 
     Whoever stored one of them once more in this very moment waits until it is unmarked and then looks whether
-    it is there, see :meth:`octasplat.workers.queue.storage_leases.StorageLease.look`; or has named it before, and then it
-    stays. The store is asked without any lock, as its answers may take long.
+    it is there, see :meth:`octasplat.workers.queue.storage_leases.StorageLease.verify`; or has named it
+    before, and then it stays. The store is asked without any lock, as its answers may take long.
     """
     removed = RemovedContents()
     for start in range(0, len(contents), BATCH_SIZE):

@@ -145,8 +145,8 @@ async def thin_progress_events(connection: Connection, max_events: int = MAX_PRO
 
     Args:
         connection: to the database.
-        max_events: a journal with more than twice as many events of progress keeps about so many, the first and the
-            newest among them.
+        max_events: a job with more than twice as many progress events keeps about so many, the first and
+            the newest among them.
 
     Returns:
         Number of events that were forgotten.

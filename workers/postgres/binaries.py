@@ -29,7 +29,7 @@ class PostgresBinaries:
 
 
 def find_binaries(major: int | None = None) -> PostgresBinaries:
-    """The Postgres to use: that of the wheel first, then those of the machine, newest first.
+    """Return the Postgres to use: that of the wheel first, then those of the machine, newest first.
 
     Args:
         major: the version that an existing cluster needs; None takes the best there is.

@@ -77,7 +77,7 @@ class EmbeddedPostgres:
         return self.home / "cluster"
 
     def conninfo(self) -> str:
-        """How to connect; the password is part of it.
+        """Return how to connect; the password is part of it.
 
         Raises:
             DatabaseError: the database was never started here.
@@ -98,7 +98,7 @@ class EmbeddedPostgres:
         )
 
     def is_running(self) -> bool:
-        """Whether the server answers."""
+        """Return whether the server answers."""
         try:
             with psycopg.connect(self.conninfo(), connect_timeout=5):
                 return True
@@ -162,7 +162,7 @@ class EmbeddedPostgres:
             ) from None
 
     def _socket_folder(self) -> Path:
-        """Where the socket is: where the server that runs has put it, else always in the same place."""
+        """Return the socket's folder: that of the running server, else always the same."""
         folder = (self.home / "run").resolve()
         if (told := self._running_socket_folder()) is not None:
             return told
@@ -175,7 +175,7 @@ class EmbeddedPostgres:
         return Path("/tmp") / f"octasplat-{digest}"  # noqa: S108
 
     def _running_socket_folder(self) -> Path | None:
-        """The folder that a server which runs has written down beside its number."""
+        """Return the folder that a server which runs has written down beside its number."""
         pid_file = self.cluster / "postmaster.pid"
         try:
             line = pid_file.read_text(encoding="utf-8", errors="surrogateescape").split("\n")[4]
@@ -213,8 +213,8 @@ class EmbeddedPostgres:
         try:
             user.chown(given)
             self._run_program(
-                binaries, user, "initdb", "-D", ".", "-U", DATABASE_NAME, f"--pwfile={given}", "--auth=scram-sha-256",
-                "--encoding=UTF8", "--locale=C", "--no-sync", cwd=partial,
+                binaries, user, "initdb", "-D", ".", "-U", DATABASE_NAME, f"--pwfile={given}",
+                "--auth=scram-sha-256", "--encoding=UTF8", "--locale=C", "--no-sync", cwd=partial,
             )  # fmt: skip
             if user.switches:
                 os.chown(given, os.geteuid(), os.getegid())
@@ -330,7 +330,7 @@ class EmbeddedPostgres:
             raise DatabaseError(f"{program} failed: {text[-600:]}")
 
     def is_alive(self) -> bool:
-        """Whether the server's process lives; cheaper than asking it, as :meth:`is_running` does."""
+        """Return whether the server's process lives; cheaper than asking it, as :meth:`is_running` does."""
         return is_postgres_running(self.cluster / "postmaster.pid")
 
     @contextlib.contextmanager
@@ -355,7 +355,7 @@ def sync_file_system(folder: Path) -> bool:
 
 
 def is_postgres_running(pid_file: Path) -> bool:
-    """Whether the number in a pid file is that of a living Postgres."""
+    """Return whether the number in a pid file is that of a living Postgres."""
     try:
         process = psutil.Process(int(pid_file.read_text(encoding="utf-8").split("\n", 1)[0]))
         return process.status() != psutil.STATUS_ZOMBIE and "postgres" in process.name()

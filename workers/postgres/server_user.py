@@ -33,7 +33,7 @@ class ServerUser:
 
 
 def server_user() -> ServerUser:
-    """This user, or for root the first that exists of octasplat, postgres and nobody.
+    """Return this user, or for root the first that exists of octasplat, postgres and nobody.
 
     Raises:
         DatabaseError: the user id has no name, which Postgres insists on.
@@ -78,7 +78,7 @@ def check_reachable(folder: Path, user: ServerUser) -> None:
 
 
 def reachable_binaries(binaries: PostgresBinaries, user: ServerUser, copy_folder: Path) -> PostgresBinaries:
-    """Binaries that the server's user may run: a copy in ``copy_folder`` where the own ones are out of reach."""
+    """Return binaries that ``user`` may run: a copy in ``copy_folder`` if it cannot reach the originals."""
     above = (binaries.folder, *binaries.folder.parents)
     if not user.switches or all(_can_traverse(folder, user) for folder in above):
         return binaries

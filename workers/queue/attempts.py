@@ -64,7 +64,7 @@ class Attempt:
             return job.state
 
     async def read_state(self) -> str:
-        """The state, without saying anything."""
+        """Return the state, without saying anything."""
         async with self.pool.connection() as connection:
             job = await get_job(connection, self.job.id)
         self._check_fence(job)
@@ -112,8 +112,8 @@ class Attempt:
         """Record a stored checkpoint; one that advances forgives the job the workers it has lost.
 
         Raises:
-            StorageUnavailable: ``lease``, under which it was stored, was given up.
-            QuotaExceeded: the job's owner may not store as much.
+            StorageUnavailableError: ``lease``, under which it was stored, was given up.
+            QuotaExceededError: the job's owner may not store as much.
         """
         contents = {file["sha256"] for file in manifest.get("files", ())}
         async with self._fenced_transaction(lease, contents, changes_usage=True) as (connection, job):
@@ -143,7 +143,7 @@ class Attempt:
             psnr: mean over the held-out views, dB, if they were measured.
 
         Raises:
-            QuotaExceeded: the job's owner may not store as much.
+            QuotaExceededError: the job's owner may not store as much.
         """
         async with self._fenced_transaction(changes_usage=True) as (connection, job):
             if psnr is not None:
@@ -169,8 +169,8 @@ class Attempt:
             discarded: results that are stored and will not be named, so that they go soon.
 
         Raises:
-            StorageUnavailable: ``lease``, under which they were stored, was given up.
-            QuotaExceeded: the job's owner may not store as much.
+            StorageUnavailableError: ``lease``, under which they were stored, was given up.
+            QuotaExceededError: the job's owner may not store as much.
         """
         async with self._fenced_transaction(lease, _digests(results), changes_usage=bool(results)) as (
             connection,
@@ -222,7 +222,7 @@ class Attempt:
         delay_seconds: float = 0.0,
         drop_checkpoint: bool = False,
     ) -> None:
-        """The attempt was lost without its worker's intent: another try, or the end if there were enough.
+        """Requeue a job whose attempt was lost, or fail it after too many attempts.
 
         Args:
             job_queue: the queue.
@@ -233,8 +233,8 @@ class Attempt:
             drop_checkpoint: at the end; then a retry begins anew.
 
         Raises:
-            StorageUnavailable: as by :meth:`fail`.
-            QuotaExceeded: as by :meth:`fail`.
+            StorageUnavailableError: as by :meth:`fail`.
+            QuotaExceededError: as by :meth:`fail`.
         """
         counts = drop_checkpoint or bool(results)
         async with self._fenced_transaction(lease, _digests(results), changes_usage=counts) as (
@@ -259,13 +259,13 @@ class Attempt:
         *,
         changes_usage: bool = False,
     ) -> AsyncIterator[tuple[Connection, Job]]:
-        """A transaction that holds the job's lock, if the attempt is still the job's.
+        """Yield a transaction that holds the job's lock, if the attempt is still the job's.
 
         Args:
             lease: under which contents were stored that the transaction names.
             contents: their digests.
-            changes_usage: whether it changes what the owner stores; the owner's lock is taken before the job's, see
-                :mod:`octasplat.workers.db.locks`.
+            changes_usage: whether it changes what the owner stores; the owner's lock is taken before the
+                job's, see :mod:`octasplat.workers.db.locks`.
         """
         named = _transaction(self.pool) if lease is None else lease.reference(contents)
         async with named as connection:
@@ -282,7 +282,7 @@ class Attempt:
 
 
 async def _count_requeues(connection: Connection, job: Job, reason: str) -> int:
-    """How often a job was handed back for a reason since it came any further or was accepted."""
+    """Return how often a job was handed back for a reason since it came any further or was accepted."""
     cursor = await connection.execute(
         """
         SELECT count(*) AS n FROM job_events

@@ -19,7 +19,7 @@ _MAX_CANDIDATES = 30
 async def choose_job(
     pool: Pool, job_queue: JobQueue, job_id: uuid.UUID, entry_id: int
 ) -> tuple[uuid.UUID, int] | None:
-    """Which job to begin when a slip is delivered, and its slip; None if the slip is stale.
+    """Return which job to begin when a slip is delivered, and its slip; None if the slip is stale.
 
     If that is another job than the slip's, the latter goes back to its place.
     """
@@ -35,7 +35,7 @@ async def choose_job(
 
 
 async def _next_fair_job(connection: Connection, job_queue: JobQueue, job: Job) -> Job | None:
-    """The job that goes before ``job``, its slip taken out of the queue; None if none does."""
+    """Return the job that goes before ``job``, its slip taken out of the queue; None if none does."""
     cursor = await connection.execute(
         """
         SELECT jobs.id FROM jobs

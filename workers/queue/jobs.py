@@ -63,7 +63,7 @@ async def create_job(connection: Connection, job_queue: JobQueue, new: NewJob) -
 
 
 async def get_job(connection: Connection, job_id: uuid.UUID, *, lock: bool = False) -> Job | None:
-    """The job of that id, or None; with ``lock`` nobody else changes it until the transaction ends."""
+    """Return the job of that id, or None; with ``lock`` nobody else changes it until the transaction ends."""
     query = "SELECT {} FROM jobs WHERE id = %s FOR UPDATE" if lock else "SELECT {} FROM jobs WHERE id = %s"
     if lock:
         await about_to_lock_jobs(connection)
@@ -124,7 +124,7 @@ async def list_jobs(
 
 
 async def queue_position(connection: Connection, job: Job) -> int | None:
-    """How many jobs go before a queued job in its queue, if owners take turns; None for any other."""
+    """Return how many jobs go before a queued job in its queue, if owners take turns; None for any other."""
     if job.state != "queued":
         return None
     cursor = await connection.execute(
@@ -152,8 +152,8 @@ async def cancel_job(connection: Connection, job_queue: JobQueue, job_id: uuid.U
     """Cancel a job: at once while it is queued, by its worker when it runs; may be repeated.
 
     Raises:
-        Conflict: it succeeded or failed already.
-        Missing: there is no such job.
+        ConflictError: it succeeded or failed already.
+        NotFoundError: there is no such job.
     """
     async with connection.transaction():
         job = await _get_job_or_raise(connection, job_id, lock=True)
@@ -192,8 +192,8 @@ async def retry_job(
         estimate: with them, what the job will take.
 
     Raises:
-        Conflict: it is neither failed nor cancelled.
-        Missing: there is no such job.
+        ConflictError: it is neither failed nor cancelled.
+        NotFoundError: there is no such job.
     """
     async with connection.transaction():
         await lock_owner(connection, (await _get_job_or_raise(connection, job_id)).owner)
@@ -281,8 +281,8 @@ async def delete_job(connection: Connection, job_id: uuid.UUID) -> None:
     """Forget a finished job; its blobs stay until they are swept.
 
     Raises:
-        Conflict: it is not over, or other jobs work on its results.
-        Missing: there is no such job.
+        ConflictError: it is not over, or other jobs work on its results.
+        NotFoundError: there is no such job.
     """
     async with connection.transaction():
         await lock_owner(connection, (await _get_job_or_raise(connection, job_id)).owner)
@@ -304,7 +304,7 @@ async def delete_job(connection: Connection, job_id: uuid.UUID) -> None:
 
 
 async def artifacts_of(connection: Connection, job_id: uuid.UUID) -> list[Artifact]:
-    """The results of a job, by name."""
+    """Return the results of a job, by name."""
     async with connection.cursor(row_factory=class_row(Artifact)) as cursor:
         await cursor.execute(
             with_columns("SELECT {} FROM artifacts WHERE job_id = %s ORDER BY name", Artifact), [job_id]
@@ -322,7 +322,7 @@ async def get_artifact(connection: Connection, job_id: uuid.UUID, name: str) -> 
 
 
 async def queue_depths(connection: Connection) -> list[QueueDepth]:
-    """How much waits in each queue that has something waiting."""
+    """Return how much waits in each queue that has something waiting."""
     cursor = await connection.execute(
         """
         SELECT queue, count(*) AS waiting,
@@ -334,7 +334,7 @@ async def queue_depths(connection: Connection) -> list[QueueDepth]:
 
 
 async def running_by_queue(connection: Connection) -> dict[str, int]:
-    """Number of jobs that run, by queue."""
+    """Return number of jobs that run, by queue."""
     cursor = await connection.execute(
         "SELECT queue, count(*) AS n FROM jobs WHERE state IN ('running', 'canceling') GROUP BY queue"
     )

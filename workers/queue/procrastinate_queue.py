@@ -177,7 +177,7 @@ async def _reenqueue(
 
 
 def requeued_entry_id(entry_id: int) -> int:
-    """The number of a slip that takes the place of ``entry_id``.
+    """Return the number of a slip that takes the place of ``entry_id``.
 
     Numbers below zero are for slips that came back: they go before all that never were delivered, and among
     themselves in the order of the numbers that they had at first. What is counted besides tells the slips of

@@ -45,7 +45,7 @@ class JobQueue(Protocol):
             job_id: which job.
             queue: who may take it.
             priority: higher goes first; where it is the same, the smaller number does.
-            position_of: an earlier slip of the job whose place in the queue the new one takes: before all that
+            position_of: an earlier queue entry of the job, whose place the new one takes: before all that
                 were queued after it. None queues it last.
             delay_seconds: with ``position_of``, for how long others go before it all the same.
 

@@ -34,7 +34,7 @@ class StalledAttempts:
         self._since: dict[tuple[uuid.UUID, int, datetime | None], float] = {}
 
     def confirm(self, stale: Sequence[Job]) -> list[Job]:
-        """Those of the silent that did not change since they were seen first, long enough ago."""
+        """Return those of the silent that did not change since they were seen first, long enough ago."""
         now = time.monotonic()
         found = {(job.id, job.attempt, job.heartbeat_at): job for job in stale}
         self._since = {key: self._since.get(key, now) for key in found}

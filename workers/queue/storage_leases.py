@@ -1,8 +1,8 @@
 """Notes of who stores contents and will name them in a table only afterwards, so that nobody collects them.
 
-A note is there before the first byte is stored. Whoever names the contents does so in a transaction of
-:meth:`StorageLease.naming`, which fails if the note was given up: that of a process that was silent for long counts
-no more.
+A lease exists before the first byte is stored. A process names the contents in a transaction of
+:meth:`StorageLease.reference`, which fails if the lease has expired: that of a process that was silent for
+long no longer counts.
 
 Contents are removed from the store without a lock, as that may take long. They are marked first, while nobody
 names anything (:func:`marked_for_removal`), and whoever has stored one of them meanwhile waits until it is
@@ -67,7 +67,7 @@ class StorageLease:
             How often contents had been marked for removal when it was looked.
 
         Raises:
-            StorageUnavailable: the note was given up, or some of it is gone; it is to be stored again.
+            StorageUnavailableError: the note was given up, or some of it is gone; it is to be stored again.
         """
         deadline = time.monotonic() + MAX_WAIT_SECONDS
         while True:
@@ -90,13 +90,13 @@ class StorageLease:
 
     @asynccontextmanager
     async def reference(self, contents: Collection[str]) -> AsyncIterator[Connection]:
-        """A transaction that names contents; until it ends none of them is removed.
+        """Yield a transaction that names contents; until it ends none of them is removed.
 
         Args:
             contents: their digests.
 
         Raises:
-            StorageUnavailable: as by :meth:`look`.
+            StorageUnavailableError: as by :meth:`look`.
         """
         while True:
             looked = await self.verify(contents)
@@ -119,7 +119,7 @@ class StorageLease:
 
 @asynccontextmanager
 async def storage_lease(pool: Pool, storage: Storage) -> AsyncIterator[StorageLease]:
-    """A note for as long as the block runs, in which contents are stored and then named."""
+    """Yield a note for as long as the block runs, in which contents are stored and then named."""
     async with pool.connection() as connection:
         # Of the version before, removals hold the lock instead of marking what they remove.
         cursor = await connection.execute("SELECT pg_try_advisory_xact_lock_shared(%s) AS quiet", [STORE])
@@ -137,7 +137,7 @@ async def storage_lease(pool: Pool, storage: Storage) -> AsyncIterator[StorageLe
 
 @asynccontextmanager
 async def removal_transaction(connection: Connection) -> AsyncIterator[None]:
-    """A transaction in which nobody names contents, for :func:`mark_for_removal`."""
+    """Yield a transaction in which nobody names contents, for :func:`mark_for_removal`."""
     async with connection.transaction():
         await lock_store(connection, shared=False)
         await connection.execute("SELECT nextval('octasplat_removals')")
@@ -203,7 +203,7 @@ async def _release(pool: Pool, lease: StorageLease) -> None:
 
 
 async def _are_being_removed(connection: Connection, contents: Collection[str] | None) -> bool:
-    """Whether any of these contents, or any at all, are being removed."""
+    """Return whether any of these contents, or any at all, are being removed."""
     cursor = await connection.execute(
         """
         SELECT EXISTS (

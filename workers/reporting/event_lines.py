@@ -72,7 +72,7 @@ class ProgressState:
             self.held_out = event
 
     def finished_line(self, event: StageFinished) -> str:
-        """What the stage did and how long it took, as a line."""
+        """Return what the stage did and how long it took, as a line."""
         verb, what = _STAGE_RESULTS.get(event.stage, (f"Finished {event.stage}", "step"))
         if event.stage == "poses":  # some may be left out
             count = f" {self.step:,} of {self.total:,} photographs"

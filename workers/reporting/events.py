@@ -9,7 +9,7 @@ EVENT_STREAM_KINDS = frozenset({"progress", *EVENT_KINDS})
 
 
 def decode_event(kind: str, data: Mapping[str, Any]) -> Event | None:
-    """The event; None if it is none of the engine's, or of another version.
+    """Return the event; None if it is none of the engine's, or of another version.
 
     Args:
         kind: of the event; ``progress`` stands for that of the training and that of any other stage.
@@ -23,6 +23,6 @@ def decode_event(kind: str, data: Mapping[str, Any]) -> Event | None:
 
 
 def encode_training_progress(event: Mapping[str, Any]) -> dict[str, Any]:
-    """A training's progress as the journal keeps it: the PSNR of its own rays is called so."""
+    """Return a training's progress as the journal keeps it: the PSNR of its own rays is called so."""
     data = {key: value for key, value in event.items() if key != "kind"}
     return {**data, "training_psnr": data["psnr"]}

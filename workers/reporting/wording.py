@@ -4,14 +4,14 @@ from octasplat.engine.core.events import HeldOutMeasured, TrainingProgress
 
 
 def format_rate(per_second: float) -> str:
-    """A rate with its thousands shortened: ``870``, ``310k``, ``1.25M``."""
+    """Return a rate with its thousands shortened: ``870``, ``310k``, ``1.25M``."""
     if per_second >= 999_500:
         return f"{per_second / 1e6:.2f}M"
     return f"{per_second / 1e3:.0f}k" if per_second >= 1000 else f"{per_second:.0f}"
 
 
 def format_training_state(event: TrainingProgress, held_out: HeldOutMeasured | None) -> str:
-    """How far the training has come, but for its iterations and the time left."""
+    """Return how far the training has come, but for its iterations and the time left."""
     parts = [f"training {event.psnr:.1f} dB"]
     if held_out is not None:
         parts.append(f"held out {held_out.psnr:.1f} dB")

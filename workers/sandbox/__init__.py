@@ -2,6 +2,6 @@
 
 Parents hide what they know from their children (:mod:`octasplat.workers.sandbox.hiding`). Children that
 read what others have made give up the network, what watches over other processes, and the folders of the
-service, for good (:mod:`octasplat.workers.sandbox.confinement`); :mod:`octasplat.workers.sandbox.capabilities`
-says what a machine can do.
+service, for good (:mod:`octasplat.workers.sandbox.confinement`). What a machine supports is found by
+:mod:`octasplat.workers.sandbox.capabilities`.
 """

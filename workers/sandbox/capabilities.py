@@ -11,7 +11,7 @@ logger = logging.getLogger(__name__)
 
 
 def sandbox_capabilities() -> dict[str, str | None]:
-    """What isolates the programs of jobs and the readers of models here, by subject; None is nothing."""
+    """Return, by subject, what isolates jobs and model readers on this machine; None for nothing."""
     is_filtered, version = has_seccomp(), landlock_version()
     return {
         "environment": "scrubbed",

@@ -40,7 +40,8 @@ def confine(
     """Give up rights, for good; whatever the kernel does not take part in is left.
 
     Args:
-        hidden: folders that cannot be opened, see :func:`octasplat.workers.sandbox.landlock.restrict_folders`.
+        hidden: folders that cannot be opened, see
+            :func:`octasplat.workers.sandbox.landlock.restrict_folders`.
         writable: what can be written all the same.
         readable: what can be read all the same.
         may_start_processes: whether other programs can be started, which have no more rights.

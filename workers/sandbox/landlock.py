@@ -35,7 +35,7 @@ class _PathBeneathRule(ctypes.Structure):
 
 
 def landlock_version() -> int:
-    """Which version of Landlock the kernel has; 0 for none that is of use."""
+    """Return which version of Landlock the kernel has; 0 for none that is of use."""
     try:
         version = syscall(_CREATE, ctypes.c_void_p(None), ctypes.c_size_t(0), ctypes.c_uint32(_VERSION))
     except OSError:
@@ -87,7 +87,7 @@ def restrict_folders(
 
 
 def _paths_without_hidden(folder: Path, hidden: set[Path]) -> Iterator[Path]:
-    """The largest folders and files below ``folder`` that hold nothing hidden."""
+    """Yield the largest folders and files below ``folder`` that hold nothing hidden."""
     if folder in hidden:
         return
     if not any(path.is_relative_to(folder) for path in hidden):

@@ -53,7 +53,7 @@ class _Program(ctypes.Structure):
 
 
 def has_seccomp() -> bool:
-    """Whether this kernel takes filters, and this type of processor is known here."""
+    """Return whether this kernel takes filters, and this type of processor is known here."""
     if platform.machine() not in _ARCHES:
         return False
     try:

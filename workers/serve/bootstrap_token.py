@@ -50,7 +50,7 @@ async def ensure_bootstrap_token(conninfo: str, path: Path) -> None:
 
 
 def _read_token(path: Path) -> tuple[str, bool]:
-    """The secret that a file holds, if any, and whether nobody else could read it."""
+    """Return the secret that a file holds, if any, and whether nobody else could read it."""
     try:
         facts = path.lstat()
         is_ours = (

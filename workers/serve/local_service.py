@@ -86,7 +86,7 @@ async def serve(options: ServeOptions, on_ready: Callable[[str], Awaitable[None]
 
 
 def connections_needed(options: ServeOptions) -> int:
-    """What the processes of this machine may use, and some for commands and workers elsewhere."""
+    """Return what the processes of this machine may use, and some for commands and workers elsewhere."""
     front = options.settings.pool_size + 1
     workers = [worker_connections({}), *([worker_connections(options.queues)] if options.queues else [])]
     return max(MIN_CONNECTIONS, front + sum(workers) + SPARE_CONNECTIONS)

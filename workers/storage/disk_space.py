@@ -31,8 +31,8 @@ class DiskSpace:
         storage: the store, which keeps a floor of its own.
         work: folder of the work under way, or its nearest parent that exists.
         floor_bytes: room on the disk of ``work`` below which no job is begun.
-        store_margin_bytes: room in the store, above the floor of its own, below which no job is begun; what is
-            between the two is left to the jobs under way.
+        store_margin_bytes: room in the store, above its own floor, below which no job is begun; what is
+            between the two is left to the running jobs.
         reserve_bytes: room on the disk of ``work`` that no job takes, not even one under way: that of the
             database, which is often on the same.
         store_folder: where the store is a folder.
@@ -52,7 +52,7 @@ class DiskSpace:
             excluding: as if this were not there.
 
         Raises:
-            StorageUnavailable: a disk does not answer.
+            StorageUnavailableError: a disk does not answer.
         """
         if self._shares_disk():
             excluding = SpaceUsage(
@@ -73,16 +73,16 @@ class DiskSpace:
         """Room for jobs on the fuller of the disks.
 
         Raises:
-            StorageUnavailable: a disk does not answer.
+            StorageUnavailableError: a disk does not answer.
         """
         stored, free = self.storage.free_bytes(), self._free_work_bytes()
         return free if stored is None else min(free, stored)
 
     def capacity_bytes(self) -> int:
-        """What the disk of ``work`` has above the floor when nothing but the system is on it.
+        """Return what the disk of ``work`` has above the floor when nothing but the system is on it.
 
         Raises:
-            StorageUnavailable: the disk does not answer.
+            StorageUnavailableError: the disk does not answer.
         """
         facts = self._work_statvfs()
         return max(0, facts.f_blocks * facts.f_frsize - self.floor_bytes)
@@ -91,8 +91,8 @@ class DiskSpace:
         """Refuse what would take from the reserve on the disk of ``work``.
 
         Raises:
-            StorageFull: it would.
-            StorageUnavailable: the disk does not answer.
+            StorageFullError: it would.
+            StorageUnavailableError: the disk does not answer.
         """
         if size_bytes > (left := self._free_work_bytes() - self.reserve_bytes):
             raise StorageFullError(
@@ -119,7 +119,7 @@ class DiskSpace:
 
 
 def _nearest_existing(folder: Path) -> Path:
-    """The folder or its nearest parent that exists."""
+    """Return the folder or its nearest parent that exists."""
     place = folder.absolute()
     while not place.exists():
         place = place.parent

@@ -19,7 +19,7 @@ def open_storage(address: str | Path, *, floor_bytes: int = DEFAULT_FLOOR_BYTES)
 
     Raises:
         ConfigError: the address cannot be understood or what it needs is not installed.
-        StorageUnavailable: the folder cannot be used.
+        StorageUnavailableError: the folder cannot be used.
     """
     if isinstance(address, Path) or "://" not in address:
         return LocalStorage(Path(address).absolute(), floor_bytes=floor_bytes)

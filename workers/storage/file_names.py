@@ -30,10 +30,10 @@ class FileNameError(DatasetError):
 
 
 def check_name(name: str) -> str:
-    """The name itself, if it is a relative path with forward slashes that every system can hold.
+    """Return the name itself, if it is a relative path with forward slashes that every system can hold.
 
     Raises:
-        NameRefused: with the code ``name-empty``, ``name-too-long``, ``name-not-text``, ``name-nul``,
+        FileNameError: with the code ``name-empty``, ``name-too-long``, ``name-not-text``, ``name-nul``,
             ``name-control``, ``name-unc``, ``name-backslash``, ``name-absolute``, ``name-drive``,
             ``name-character``, ``name-empty-part``, ``name-traversal``, ``name-trailing``, ``name-reserved``
             or ``name-too-deep``.
@@ -103,14 +103,14 @@ def _check_component(component: str, quoted: str) -> None:
 
 
 def collision_key(name: str) -> str:
-    """What two names share that some file system takes for one: canonical Unicode without case."""
+    """Return what two names share that some file system takes for one: canonical Unicode without case."""
     return unicodedata.normalize(
         "NFC", unicodedata.normalize("NFD", unicodedata.normalize("NFD", name).casefold())
     )
 
 
 def quoted_name(name: str) -> str:
-    """A name as it can be put into a sentence: quoted, escaped and cut."""
+    """Return a name as it can be put into a sentence: quoted, escaped and cut."""
     text = name if len(name) <= 80 else f"{name[:60]}...{name[-15:]}"
     return ascii(text) if not text.isprintable() or "\\" in text else f"'{text}'"
 
@@ -126,7 +126,7 @@ class NameSet:
         """Take a checked name of a file.
 
         Raises:
-            NameRefused: ``name-duplicate``, ``name-twin`` (differs in case or in the spelling of accents
+            FileNameError: ``name-duplicate``, ``name-twin`` (differs in case or in the spelling of accents
                 only), or ``name-conflict`` (a file where another name has a folder).
         """
         check_name(name)
@@ -151,7 +151,7 @@ class NameSet:
         """Take the name of a folder, without its final slash; repeats are welcome.
 
         Raises:
-            NameRefused: as by :meth:`add`, but for ``name-duplicate``.
+            FileNameError: as by :meth:`add`, but for ``name-duplicate``.
         """
         check_name(name)
         self._add_folders(f"{name}/")

@@ -48,7 +48,7 @@ class LocalStorage:
         floor_bytes: room on the disk that writing never takes.
 
     Raises:
-        StorageUnavailable: the folder cannot be made or used.
+        StorageUnavailableError: the folder cannot be made or used.
     """
 
     def __init__(self, root: Path, *, floor_bytes: int = DEFAULT_FLOOR_BYTES) -> None:
@@ -74,7 +74,7 @@ class LocalStorage:
         return LocalWriter(self, sha256, size_bytes, max_bytes)
 
     def stat(self, sha256: str) -> Blob:
-        """The blob of that digest; see the protocol."""
+        """Return the blob of that digest; see the protocol."""
         fd = self._open_blob(sha256)
         try:
             return Blob(sha256, os.fstat(fd).st_size)
@@ -82,7 +82,7 @@ class LocalStorage:
             os.close(fd)
 
     def open(self, sha256: str) -> BinaryIO:
-        """The content as a file; see the protocol."""
+        """Return the content as a file; see the protocol."""
         return os.fdopen(self._open_blob(sha256), "rb")
 
     def read(self, sha256: str, start: int = 0, stop: int | None = None) -> Iterator[bytes]:
@@ -91,7 +91,7 @@ class LocalStorage:
         return self._chunks(sha256, start, stop)
 
     def local_path(self, sha256: str) -> Path | None:
-        """The blob's own file; see the protocol."""
+        """Return the blob's own file; see the protocol."""
         self.stat(sha256)
         return self.root / "blobs" / sha256[:2] / sha256
 
@@ -150,7 +150,7 @@ class LocalStorage:
                 self._remove_staged(aside)
 
     def list_blobs(self) -> Iterator[StoredBlob]:
-        """All blobs; see the protocol."""
+        """Yield all blobs; see the protocol."""
         for folder in _list_folder(self._blobs_fd, "."):
             for name in _list_folder(self._blobs_fd, folder):
                 with suppress(FileNotFoundError):
@@ -195,7 +195,7 @@ class LocalStorage:
         return True
 
     def read_document(self, name: str) -> bytes | None:
-        """The document of that name; see the protocol."""
+        """Return the document of that name; see the protocol."""
         check_document_name(name)
         with translate_os_errors(self.root):
             try:
@@ -206,7 +206,7 @@ class LocalStorage:
                 return handle.read()
 
     def list_documents(self, prefix: str = "") -> Iterator[str]:
-        """Names of documents; see the protocol."""
+        """Yield names of documents; see the protocol."""
         for folder, _, files, _ in os.fwalk(".", dir_fd=self._documents_fd):
             for file in files:
                 name = f"{folder}/{file}".removeprefix("./")
@@ -243,7 +243,7 @@ class LocalStorage:
             )
 
     def check(self) -> None:
-        """Whether the folder is still there and can be written; see the protocol."""
+        """Check that the folder exists and can be written; see the protocol."""
         with translate_os_errors(self.root):
             # A disk that was unmounted leaves another folder in its place, or none.
             if not os.path.samestat(self.root.stat(), os.fstat(self._root_fd)):

@@ -11,7 +11,7 @@ FREE_SPACE_HINT = "delete datasets or jobs, whose contents then go at once, or a
 
 
 def is_disk_full(error: BaseException | None) -> bool:
-    """Whether an error, or what it came from, is that there was no room on a disk."""
+    """Return whether an error, or what it came from, is that there was no room on a disk."""
     for _ in range(20):
         if error is None:
             return False
@@ -26,8 +26,8 @@ def translate_os_errors(path: Path) -> Iterator[None]:
     """Turn the errors of the operating system, met while using ``path``, into those of a store.
 
     Raises:
-        StorageFull: the disk is full.
-        StorageUnavailable: everything else.
+        StorageFullError: the disk is full.
+        StorageUnavailableError: everything else.
     """
     try:
         yield

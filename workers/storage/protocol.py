@@ -48,9 +48,9 @@ class BlobWriter(Protocol):
         """Take the next bytes.
 
         Raises:
-            TooLarge: more than announced or allowed.
-            StorageFull: no room is left.
-            StorageUnavailable: the store does not answer.
+            ContentTooLargeError: more than announced or allowed.
+            StorageFullError: no room is left.
+            StorageUnavailableError: the store does not answer.
         """
         ...
 
@@ -58,9 +58,9 @@ class BlobWriter(Protocol):
         """Make the content visible, durably.
 
         Raises:
-            DigestMismatch: digest or length are not as announced; nothing is stored.
-            StorageFull: no room is left.
-            StorageUnavailable: the store does not answer.
+            DigestMismatchError: digest or length are not as announced; nothing is stored.
+            StorageFullError: no room is left.
+            StorageUnavailableError: the store does not answer.
         """
         ...
 
@@ -88,24 +88,24 @@ class Storage(Protocol):
             max_bytes: length at which it is refused.
 
         Raises:
-            StorageFull: ``size_bytes`` do not fit.
-            TooLarge: ``size_bytes`` is above ``max_bytes``.
+            StorageFullError: ``size_bytes`` do not fit.
+            ContentTooLargeError: ``size_bytes`` is above ``max_bytes``.
         """
         ...
 
     def stat(self, sha256: str) -> Blob:
-        """The blob of that digest.
+        """Return the blob of that digest.
 
         Raises:
-            BlobMissing: there is none.
+            BlobNotFoundError: there is none.
         """
         ...
 
     def open(self, sha256: str) -> BinaryIO:
-        """The content as a seekable file.
+        """Return the content as a seekable file.
 
         Raises:
-            BlobMissing: there is none.
+            BlobNotFoundError: there is none.
         """
         ...
 
@@ -113,15 +113,15 @@ class Storage(Protocol):
         """Bytes ``start`` to ``stop`` of the content, in pieces.
 
         Raises:
-            BlobMissing: there is none.
+            BlobNotFoundError: there is none.
         """
         ...
 
     def local_path(self, sha256: str) -> Path | None:
-        """Where the content lies as a file of this machine, to be read only; None for a remote store.
+        """Return where the content lies as a file of this machine, to be read only; None for a remote store.
 
         Raises:
-            BlobMissing: there is none.
+            BlobNotFoundError: there is none.
         """
         ...
 
@@ -135,9 +135,9 @@ class Storage(Protocol):
                 changed in place.
 
         Raises:
-            BlobMissing: there is none.
-            DigestMismatch: the stored bytes are damaged (only noticed where they are copied).
-            StorageFull: no room is left at ``target``.
+            BlobNotFoundError: there is none.
+            DigestMismatchError: the stored bytes are damaged (only noticed where they are copied).
+            StorageFullError: no room is left at ``target``.
         """
         ...
 
@@ -154,7 +154,7 @@ class Storage(Protocol):
         ...
 
     def list_blobs(self) -> Iterator[StoredBlob]:
-        """All blobs, in no order."""
+        """Return all blobs, in no order."""
         ...
 
     def publish_document(self, name: str, document: bytes) -> bool:
@@ -167,11 +167,11 @@ class Storage(Protocol):
         ...
 
     def read_document(self, name: str) -> bytes | None:
-        """The document of that name, or None."""
+        """Return the document of that name, or None."""
         ...
 
     def list_documents(self, prefix: str = "") -> Iterator[str]:
-        """Names of the documents that begin with ``prefix``, in no order."""
+        """Return names of the documents that begin with ``prefix``, in no order."""
         ...
 
     def remove_document(self, name: str) -> bool:
@@ -182,7 +182,7 @@ class Storage(Protocol):
         """Refuse early what would not fit.
 
         Raises:
-            StorageFull: ``size_bytes`` more would go below the floor.
+            StorageFullError: ``size_bytes`` more would go below the floor.
         """
         ...
 
@@ -191,10 +191,10 @@ class Storage(Protocol):
         ...
 
     def check(self) -> None:
-        """Whether the store can be used now.
+        """Check that the store can be used now.
 
         Raises:
-            StorageUnavailable: it is not there, does not answer, or refuses the service.
+            StorageUnavailableError: it is not there, does not answer, or refuses the service.
         """
         ...
 
@@ -204,7 +204,7 @@ class Storage(Protocol):
 
 
 def check_sha256(sha256: str) -> str:
-    """The digest itself, if it is one.
+    """Return the digest itself, if it is one.
 
     Raises:
         ValueError: it is not 64 lower-case hexadecimal digits.
@@ -215,7 +215,7 @@ def check_sha256(sha256: str) -> str:
 
 
 def check_document_name(name: str) -> str:
-    """The name itself, if a document can have it.
+    """Return the name itself, if a document can have it.
 
     Raises:
         ValueError: it is not made of parts like ``a-z0-9._-`` joined by ``/``.

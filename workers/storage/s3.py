@@ -96,14 +96,14 @@ class S3Storage:
         return S3Writer(self, sha256, size_bytes, max_bytes)
 
     def stat(self, sha256: str) -> Blob:
-        """The blob of that digest; see the protocol."""
+        """Return the blob of that digest; see the protocol."""
         key = self._blob_key(sha256)
         with self._translate_errors(sha256):
             facts = self.client.head_object(Bucket=self.bucket, Key=key)
         return Blob(sha256, facts["ContentLength"])
 
     def open(self, sha256: str) -> BinaryIO:
-        """The content as a seekable file, read ahead by 256 KiB; see the protocol."""
+        """Return the content as a seekable file, read ahead by 256 KiB; see the protocol."""
         return io.BufferedReader(_RangeReader(self, self.stat(sha256)), 256 << 10)
 
     def read(self, sha256: str, start: int = 0, stop: int | None = None) -> Iterator[bytes]:
@@ -148,7 +148,7 @@ class S3Storage:
         return True
 
     def list_blobs(self) -> Iterator[StoredBlob]:
-        """All blobs; see the protocol."""
+        """Yield all blobs; see the protocol."""
         for item in self._list("blobs/"):
             name = item["Key"].rpartition("/")[2]
             if SHA256.fullmatch(name):
@@ -174,7 +174,7 @@ class S3Storage:
         return self.read_document(name) == document
 
     def read_document(self, name: str) -> bytes | None:
-        """The document of that name; see the protocol."""
+        """Return the document of that name; see the protocol."""
         key = self._document_key(name)
         try:
             with self._translate_errors(name):
@@ -183,7 +183,7 @@ class S3Storage:
             return None
 
     def list_documents(self, prefix: str = "") -> Iterator[str]:
-        """Names of documents; see the protocol."""
+        """Yield names of documents; see the protocol."""
         for item in self._list(f"documents/{prefix}"):
             yield item["Key"].removeprefix(f"{self.prefix}documents/")
 
@@ -199,13 +199,13 @@ class S3Storage:
         return True
 
     def ensure_space(self, size_bytes: int) -> None:
-        """Does nothing, as a bucket has no known end; see the protocol."""
+        """Do nothing, as a bucket has no known capacity; see the protocol."""
 
     def free_bytes(self) -> None:
         """None; see the protocol."""
 
     def check(self) -> None:
-        """Whether the bucket answers; see the protocol."""
+        """Check that the bucket answers; see the protocol."""
         with self._translate_errors("the bucket itself"):
             try:
                 self.client.list_objects_v2(Bucket=self.bucket, Prefix=self.prefix, MaxKeys=1)

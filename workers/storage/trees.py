@@ -65,7 +65,7 @@ def store_tree(
 
     Raises:
         StorageError: a file cannot be read, is a link, or the store does not take it.
-        NameRefused: a name is not portable.
+        FileNameError: a name is not portable.
     """
     if names is None:
         names = (path.relative_to(folder).as_posix() for path in folder.rglob("*") if not path.is_dir())
@@ -98,7 +98,7 @@ def fetch_tree(storage: Storage, files: Iterable[TreeFile], folder: Path, *, wri
 
     Raises:
         StorageError: content is missing or damaged, or the disk is full.
-        NameRefused: a name would lead elsewhere.
+        FileNameError: a name would lead elsewhere.
     """
     files = tuple(files)
     known = NameSet()
@@ -116,7 +116,7 @@ def publish_manifest(storage: Storage, name: str, manifest: Manifest) -> bool:
 
 
 def read_manifest(storage: Storage, name: str) -> Manifest | None:
-    """The manifest published as ``name``, or None.
+    """Return the manifest published as ``name``, or None.
 
     Raises:
         StorageError: the document is damaged.

@@ -14,7 +14,7 @@ def copy_verified(chunks: Iterable[bytes], blob: Blob, target: Path) -> None:
 
     Raises:
         FileExistsError: ``target`` is there already.
-        DigestMismatch: the pieces are not the content of ``blob``; ``target`` is removed.
+        DigestMismatchError: the pieces are not the content of ``blob``; ``target`` is removed.
     """
     digest = hashlib.sha256()
     flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC

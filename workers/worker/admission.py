@@ -42,7 +42,7 @@ class Admission:
         self._is_shortage_logged = False
 
     async def admit(self, job_id: uuid.UUID, entry_id: int) -> bool:
-        """Whether there is room for a job, waiting a while for it; else the job was left to others.
+        """Return whether there is room for a job, waiting a while for it; else the job was left to others.
 
         Without room for any job the worker waits. A job that needs more than there is waits by itself, and
         others go before it; one that no worker of its queue could ever have room for has failed.
@@ -94,7 +94,7 @@ class Admission:
         return False
 
     async def _largest_capacity(self, job: Job) -> int | None:
-        """The most room that a living worker of the job's queue could have; None where one does not say."""
+        """Return the largest capacity of the queue's live workers; None if one does not report it."""
         stale = self._context.settings.stale_seconds
         async with self._pool.connection() as connection:
             rooms = [

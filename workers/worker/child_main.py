@@ -111,7 +111,7 @@ def _run_task(task: dict[str, Any], events: _EventStream, stop: threading.Event)
 
 
 def _cause_lines(error: BaseException) -> list[str]:
-    """What an error came from, a line each."""
+    """Return what an error came from, a line each."""
     found: list[str] = []
     while len(found) < MAX_CAUSE_LINES:
         inner = error.__cause__ or (None if error.__suppress_context__ else error.__context__)
@@ -130,7 +130,7 @@ def _watch_stdin(stop: threading.Event) -> None:
 
 
 def _raise_oom_score() -> None:
-    """Where memory runs out, the system shall end this process rather than the database."""
+    """Let the system kill this process rather than the database when memory runs out."""
     with contextlib.suppress(OSError):
         Path("/proc/self/oom_score_adj").write_text(str(OOM_SCORE_ADJUSTMENT), encoding="ascii")
 

@@ -28,7 +28,7 @@ _PASSED_VARIABLES = re.compile(
 
 
 def child_environment(environment: Mapping[str, str]) -> dict[str, str]:
-    """What a job's process may know of this one's environment: no password, key or token among it."""
+    """Return what a job's process may know of this one's environment: no password, key or token among it."""
     passed = {name: value for name, value in environment.items() if _PASSED_VARIABLES.fullmatch(name)}
     # Threads that wait for each other sleep instead of spinning, as in the command line.
     passed.setdefault("OMP_WAIT_POLICY", "PASSIVE")
@@ -36,7 +36,7 @@ def child_environment(environment: Mapping[str, str]) -> dict[str, str]:
 
 
 def _with_absolute_paths(environment: dict[str, str]) -> dict[str, str]:
-    """The same for a process in another folder."""
+    """Return the same for a process in another folder."""
     named = environment.get(SPLAT_TRANSFORM)
     return environment if not named else {**environment, SPLAT_TRANSFORM: str(Path(named).absolute())}
 
@@ -132,7 +132,7 @@ class ChildProcess:
         return total
 
     def process_count(self) -> int:
-        """Number of processes that the child has started and that live."""
+        """Return number of processes that the child has started and that live."""
         with contextlib.suppress(psutil.Error):
             return len(psutil.Process(self._process.pid).children(recursive=True))
         return 0

@@ -47,7 +47,7 @@ class WorkerContext:
         return Quota(max_bytes=self.settings.quota_bytes)
 
     async def space_shortage(self, excluding: SpaceUsage = NO_USAGE) -> str | None:
-        """What lacks room for jobs, in a sentence, or None."""
+        """Return what lacks room for jobs, in a sentence, or None."""
         try:
             return await asyncio.to_thread(self.disk_space.shortage, excluding)
         except StorageError as error:

@@ -83,7 +83,7 @@ def _publish_run(task: Task) -> None:
 
 
 def run_operation(task: Task) -> None:
-    """What the job's kind says, by the operation of the engine; publishes what it writes."""
+    """Run the operation of the job's kind and publish its files."""
     kind = get_job_kind(task.kind)
     assert isinstance(kind, OperationKind)
     options = kind.resolve(task.options)

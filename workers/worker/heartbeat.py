@@ -51,7 +51,7 @@ class Heartbeat:
         """Say that the worker lives, for ever, and tell ``on_state`` the job's state.
 
         Raises:
-            Fenced: the job has gone on without this worker.
+            FencedError: the job has gone on without this worker.
         """
         settings = self._settings
         while True:

@@ -56,7 +56,7 @@ class HostHealth:
         self.changed = asyncio.Event()
 
     def record_crash(self, job_id: uuid.UUID, owner: str) -> None:
-        """The program of a job ended as no program should."""
+        """Record that the program of a job crashed."""
         self._crashed_jobs[job_id] = owner
         if (
             len(self._crashed_jobs) >= MAX_CRASHES
@@ -68,7 +68,7 @@ class HostHealth:
             )
 
     def record_success(self) -> None:
-        """A job came to its end here."""
+        """Record that a job finished here."""
         self._crashed_jobs.clear()
 
     def mark_faulty(self, fault: str) -> None:
@@ -79,7 +79,7 @@ class HostHealth:
         self.changed.set()
 
     async def check_work_folder(self) -> str | None:
-        """What is wrong with the folder of the work, in a sentence, or None; to be asked before every job."""
+        """Check the work folder before a job; return what is wrong in a sentence, or None."""
         try:
             await asyncio.to_thread(self._write_probe_file)
         except StorageFullError:
@@ -89,7 +89,7 @@ class HostHealth:
         return None
 
     async def diagnose(self, program: str) -> str | None:
-        """What is wrong with this machine, asked after a failure that may be its fault: a sentence, or None.
+        """Check the machine after a failure; return what is wrong in a sentence, or None.
 
         Args:
             program: of the job that failed.
@@ -103,7 +103,7 @@ class HostHealth:
         return found
 
     async def try_recover(self) -> bool:
-        """Whether jobs can be taken again; what is wrong is said in :attr:`fault`."""
+        """Return whether jobs can be taken again; what is wrong is said in :attr:`fault`."""
         if time.monotonic() < self._cooldown_until:
             return False
         found = await self.check_work_folder() or await self._check_store()
@@ -133,7 +133,7 @@ class HostHealth:
         return None
 
     async def _probe_program(self, program: str) -> str | None:
-        """Whether a process starts and can import the program of a job."""
+        """Return whether a process starts and can import the program of a job."""
         try:
             process = await asyncio.create_subprocess_exec(
                 *python_command("octasplat.workers.worker.child_main", further_modules=self._kind_modules),

@@ -22,6 +22,6 @@ _MEDIA_TYPES = {
 
 
 def media_type(name: str) -> str:
-    """The media type of a file of that name."""
+    """Return the media type of a file of that name."""
     suffix = PurePosixPath(name).suffix.lower()
     return _MEDIA_TYPES.get(suffix) or mimetypes.guess_type(name)[0] or "application/octet-stream"

@@ -13,7 +13,7 @@ _CGROUP_FILES = (
 
 
 def memory_limit_bytes(requested_bytes: int | None, slots: int) -> int | None:
-    """The limit of each job's program; None means that there is none.
+    """Return the limit of each job's program; None means that there is none.
 
     Args:
         requested_bytes: what the settings say: a limit, 0 for none, or None for a share.

@@ -35,7 +35,7 @@ MAX_CONTRADICTIONS = 3
 class OutcomeWriter:
     """Writes what becomes of one attempt, again and again while the job is surely ours.
 
-    Every method raises LostDatabase when that time is over, and Fenced when the job has gone on.
+    Every method raises DatabaseLostError when that time is over, and FencedError when the job has gone on.
 
     Args:
         attempt: the claimed job.
@@ -218,7 +218,7 @@ class OutcomeWriter:
                 await self._pause_or_raise(error)
 
     async def _retry_write(self, write: Callable[[], Awaitable[T]]) -> T:
-        """What ``write`` brings; it is given longer each time, or a slow database would never be told."""
+        """Call ``write`` until it succeeds, with a longer timeout each time for slow databases."""
         settings = self._context.settings
         seconds = settings.heartbeat_seconds
         contradicted = 0

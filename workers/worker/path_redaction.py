@@ -46,23 +46,23 @@ class PathRedactor:
         self._names = [(re.compile(pattern), name) for pattern, name in names]
 
     def redact(self, text: str) -> str:
-        """The text without paths of this machine."""
+        """Return the text without paths of this machine."""
         return shorten_absolute_paths(self.replace_job_paths(text)) if "/" in text else text
 
     def replace_job_paths(self, text: str) -> str:
-        """The text with the files of the job as they are called; other paths are left alone."""
+        """Return the text with the files of the job as they are called; other paths are left alone."""
         for pattern, name in self._names:
             text = pattern.sub(name, text)
         return text
 
 
 def shorten_absolute_paths(text: str) -> str:
-    """The text with only the last parts of each absolute path of this machine."""
+    """Return the text with only the last parts of each absolute path of this machine."""
     return _ABSOLUTE.sub(_last_parts, text.replace("file://", ""))
 
 
 def redact_json(value: Any, redactor: PathRedactor) -> Any:
-    """A JSON value with all its texts as they are shown."""
+    """Return a JSON value with all its texts as they are shown."""
     if isinstance(value, str):
         return redactor.redact(value)
     if isinstance(value, dict):
@@ -86,5 +86,5 @@ def _top_folders() -> frozenset[str]:
 
 
 def _path_patterns(path: Path) -> list[str]:
-    """The path as it is and with its links followed, as patterns."""
+    """Return the path as it is and with its links followed, as patterns."""
     return [re.escape(text) for text in dict.fromkeys((str(path.absolute()), os.path.realpath(path)))]

@@ -17,7 +17,7 @@ DEFAULT_TIMEOUT_SECONDS = 600.0
 
 @dataclass(frozen=True)
 class PeriodicTask:
-    """Something to be done every ``interval_seconds``; after ``timeout_seconds`` it is given up and done again."""
+    """An action to run every ``interval_seconds``; after ``timeout_seconds`` it is stopped and run again."""
 
     action: Callable[[], Awaitable[None]]
     interval_seconds: float
@@ -25,16 +25,16 @@ class PeriodicTask:
 
 
 class PeriodicTaskError(Exception):
-    """A chore fails again and again, so that the worker had better be started anew."""
+    """A periodic task fails again and again, so that the worker should be restarted."""
 
 
 async def run_periodically(task: PeriodicTask) -> None:
-    """Do a chore for ever.
+    """Run a task for ever.
 
     Raises:
-        ChoreFailed: it failed :data:`MAX_FAILURES` times in a row, and not because the database was away.
+        PeriodicTaskError: it failed :data:`MAX_FAILURES` times in a row, and not for want of the database.
     """
-    name = getattr(task.action, "__name__", "a chore").strip("_")
+    name = getattr(task.action, "__name__", "a periodic task").strip("_")
     failures = 0
     while True:
         try:

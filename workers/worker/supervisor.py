@@ -99,7 +99,7 @@ class Supervisor:
         """Work until the job is over, handed back or lost.
 
         Raises:
-            LostDatabase: the database did not answer for too long.
+            DatabaseLostError: the database did not answer for too long.
         """
         watches = [
             asyncio.create_task(watch())
@@ -342,7 +342,7 @@ class Supervisor:
             logger.info("the disk of job %s was not looked at: %s", self._job.id, error)
 
     def _stop(self, reason: StopReason) -> None:
-        """The first reason counts, but for the two that forbid writing; of the deadlines the earliest."""
+        """Stop the child for ``reason``; the first counts, but for those that forbid writing."""
         if self._stop_reason is None or reason in (StopReason.FENCED, StopReason.DATABASE_LOST):
             self._stop_reason = reason
         self._kill_at = min(self._kill_at, self._kill_deadline(reason))
@@ -359,7 +359,7 @@ class Supervisor:
 
 
 def _program_of_kind(kind: str) -> str:
-    """The program of a kind of jobs; none where this version does not know it."""
+    """Return the program of a kind of jobs; none where this version does not know it."""
     try:
         return get_job_kind(kind).program
     except ConfigError:

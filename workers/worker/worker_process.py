@@ -74,7 +74,7 @@ MAX_FORGIVEN_FAILURES = 3
 
 
 def make_job_queue(settings: WorkerSettings, pool: Pool | None = None) -> ProcrastinateQueue:
-    """The queue, as the settings say."""
+    """Return the queue, as the settings say."""
     return ProcrastinateQueue(
         pool,
         heartbeat_seconds=settings.heartbeat_seconds,
@@ -279,7 +279,7 @@ class _Worker:
                 await attempt.requeue(self._context.job_queue, reason, max_uncounted=MAX_FORGIVEN_FAILURES)
 
     async def _defer_if_incapable(self, job_id: uuid.UUID, entry_id: int) -> bool:
-        """Whether a job was left to workers of another version."""
+        """Return whether a job was left to workers of another version."""
         why = await reason_incapable(self._pool, job_id, self._settings.stale_seconds)
         if why is None:
             return False
@@ -381,7 +381,7 @@ class _Worker:
 
 
 def _on_unhandled_exception(loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
-    """A delivery that was taken from this worker cannot be signed off any more, which is as it should be."""
+    """Ignore that a queue entry taken from this worker cannot be signed off any more."""
     error = context.get("exception")
     if isinstance(error, ConnectorException):
         logger.info("a slip of another attempt was left alone: %s", error.__cause__ or error)

@@ -83,7 +83,7 @@ class Checkpoint:
         return cls(row["attempt"], row["stage"], row["step"], files, row.get("results", 1))
 
     def is_after(self, other: "Checkpoint | None") -> bool:
-        """Whether the work is further than at ``other``."""
+        """Return whether the work is further than at ``other``."""
         order = {"poses": 0, "load": 1, "train": 2, "evaluate": 3, "export": 4}
         if other is None:
             return True
@@ -131,7 +131,7 @@ class Workspace:
             self._dataset_lock = None
 
     def used_bytes(self) -> int:
-        """What the folder takes on its disk, without what it shares with the store."""
+        """Return what the folder takes on its disk, without what it shares with the store."""
         blocks: dict[int, int] = {}
         for folder, names, files in os.walk(self.folder):
             if Path(folder) == self.folder and FILES_FOLDER in names:
@@ -145,12 +145,12 @@ class Workspace:
         return taken
 
     def peak_used_bytes(self) -> int:
-        """The most that the folder was found to take."""
+        """Return the most that the folder was found to take."""
         self.used_bytes()
         return self._peak_used_bytes
 
     def fetch_dataset(self, dataset_id: uuid.UUID, files: Sequence[DatasetFile], name: str) -> Path:
-        """A folder with the photographs for all attempts on this machine; its files must not be changed."""
+        """Fetch the photographs into a folder shared by all attempts here; its files must not be changed."""
         folder = self._root / "datasets" / str(dataset_id)
         self._dataset_lock = _lock_dataset_folder(folder)
         place = folder / (re.sub(r"[^A-Za-z0-9_-]+", "_", name).strip("_")[:60] or "scene")
@@ -271,7 +271,7 @@ class Workspace:
         return found
 
     def _frame_checkpoint_files(self) -> list[str]:
-        """The record of finished frames, and those that it names."""
+        """Return the record of finished frames, and those that it names."""
         folder = self.folder / RUN_FOLDER / FRAMES_FOLDER
         try:
             rows = [

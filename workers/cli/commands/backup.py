@@ -61,7 +61,7 @@ def restore(folder: Path, data: Path | None) -> None:
 
 @contextlib.contextmanager
 def _database_connection(settings: "WorkerSettings", *, exclusive: bool = False) -> Iterator[str]:
-    """How to connect; the private database is started for as long as the block runs if it does not run."""
+    """Yield the connection string; start the private database for the block if it does not run."""
     from octasplat.workers.postgres.embedded import EmbeddedPostgres
     from octasplat.workers.serve.local_service import lock_data_folder
 

@@ -47,7 +47,7 @@ def set_option(command: F) -> F:
 
 @contextmanager
 def connected(server: str | None) -> Iterator["Api"]:
-    """The service that the user means; the token is no option, as others on a machine see those."""
+    """Yield the service that the user means; the token is no option, as others on a machine see those."""
     from octasplat.workers.client.api import Api, find_address, find_token
 
     address = server or find_address(os.environ)
@@ -322,7 +322,7 @@ def _check_output(output: Path | None, *, wait: bool) -> None:
 
 
 def _changed_options(given: dict[str, Any], job: dict[str, Any]) -> dict[str, Any]:
-    """What is to be otherwise in the options of a job."""
+    """Return what is to be otherwise in the options of a job."""
     exports = parse_export_names(given["exports"])
     options: dict[str, Any] = {} if exports is None else {"exports": list(exports)}
     if job["kind"] != "reconstruct":
@@ -335,7 +335,7 @@ def _changed_options(given: dict[str, Any], job: dict[str, Any]) -> dict[str, An
 
 
 def _parse_file_option(text: str) -> tuple[str, Path]:
-    """What ``--file`` says: the option, and the file."""
+    """Return what ``--file`` says: the option, and the file."""
     name, equals, path = text.partition("=")
     if not equals or not path:
         raise ConfigError(f"--file {text}: write it as option=path, e.g. meshes=edited.ply.")
@@ -343,7 +343,7 @@ def _parse_file_option(text: str) -> tuple[str, Path]:
 
 
 def _with_assignments(options: dict[str, Any], assignments: tuple[str, ...]) -> dict[str, Any]:
-    """The options with ``--set`` on top."""
+    """Return the options with ``--set`` on top."""
     for assignment in assignments:
         name, equals, text = assignment.partition("=")
         if not equals:
@@ -374,17 +374,17 @@ def _get_job(api: "Api", job_id: str) -> dict[str, Any]:
 
 
 def _decibels(job: dict[str, Any]) -> str:
-    """The PSNR over held-out views."""
+    """Return the PSNR over held-out views."""
     return "" if job["psnr"] is None else f"{job['psnr']:.2f} dB"
 
 
 def _local_time(at: str) -> str:
-    """A time of the service as this machine's clock shows it."""
+    """Return a time of the service as this machine's clock shows it."""
     return datetime.fromisoformat(at).astimezone().strftime("%H:%M:%S")
 
 
 def _progress_text(job: dict[str, Any]) -> str:
-    """How far a job is, in a few words."""
+    """Return how far a job is, in a few words."""
     if job["state"] == "queued":
         ahead = job["queue_position"]
         return f"{ahead} before it" if ahead else ""

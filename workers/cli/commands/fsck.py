@@ -44,7 +44,7 @@ def fsck(data: Path | None, verify: bool, as_json: bool, recount: bool) -> None:
 
 
 def report_lines(report: "Report") -> list[str]:
-    """The report for people."""
+    """Return the report for people."""
     lines = [
         f"{finding.kind}: {finding.where}: {finding.detail} ({finding.sha256})"
         for finding in report.findings[:_MAX_SHOWN_FINDINGS]

@@ -89,7 +89,7 @@ async def _add_audit_entry(connection: "Connection", action: str, target: str) -
 
 
 def _local_user_name() -> str:
-    """The name of whoever gives the command, on this machine."""
+    """Return the name of whoever gives the command, on this machine."""
     try:
         return getpass.getuser()
     except (OSError, KeyError):  # no name

@@ -22,7 +22,7 @@ class AddressRefusedError(OctasplatError):
 
 
 def check_url(url: str, allowed_hosts: tuple[str, ...] = ()) -> str:
-    """The address itself, if messages may be sent there; a host name is looked up when sending, not here.
+    """Return the URL if messages may be sent there; a host name is looked up when sending, not here.
 
     Args:
         url: the address.
@@ -30,7 +30,7 @@ def check_url(url: str, allowed_hosts: tuple[str, ...] = ()) -> str:
             TLS nor a usual port.
 
     Raises:
-        AddressRefused: it is none, or leads where it must not.
+        AddressRefusedError: it is none, or leads where it must not.
     """
     try:
         parts = urlsplit(url)
@@ -57,12 +57,12 @@ def check_url(url: str, allowed_hosts: tuple[str, ...] = ()) -> str:
 
 
 def is_allowed(host: str, allowed_hosts: tuple[str, ...]) -> bool:
-    """Whether a host may be an inner one."""
+    """Return whether a host may be an inner one."""
     return host.lower().rstrip(".") in {name.lower() for name in allowed_hosts}
 
 
 def parse_address(text: str) -> IPAddress:
-    """A numeric address, also with the zone of a link.
+    """Return a numeric address, also with the zone of a link.
 
     Raises:
         ValueError: it is none.
@@ -71,7 +71,7 @@ def parse_address(text: str) -> IPAddress:
 
 
 def is_public(address: IPAddress) -> bool:
-    """Whether an address is one of the public network, also where it stands for an IPv4 address."""
+    """Return whether an address is one of the public network, also where it stands for an IPv4 address."""
     if isinstance(address, ipaddress.IPv6Address):
         embedded = address.ipv4_mapped or address.sixtofour
         if embedded is None and any(address in network for network in _IPV4_EMBEDDING_NETWORKS):
@@ -82,7 +82,7 @@ def is_public(address: IPAddress) -> bool:
 
 
 def _is_internal(host: str) -> bool:
-    """Whether it is surely an inner one; what a name leads to is only known when it is looked up."""
+    """Return whether it is surely an inner one; what a name leads to is only known when it is looked up."""
     # Full-width digits and dots are plain ones to whoever looks the name up.
     name = unicodedata.normalize("NFKC", host).replace("\N{IDEOGRAPHIC FULL STOP}", ".").lower().rstrip(".")
     try:

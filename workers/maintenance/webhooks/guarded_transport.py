@@ -46,7 +46,7 @@ class GuardedTransport(httpx.AsyncBaseTransport):
         """Send a request.
 
         Raises:
-            AddressRefused: the host leads, or may lead, into a network that messages are not sent to.
+            AddressRefusedError: the host leads, or may lead, into a network that messages are not sent to.
             httpx.ConnectError: it has no address, or none that answers.
         """
         host = request.url.raw_host.decode("ascii")
@@ -72,7 +72,7 @@ class GuardedTransport(httpx.AsyncBaseTransport):
         await self._inner.aclose()
 
     async def _resolve_checked(self, host: str, port: int, owner: str) -> list[IPAddress]:
-        """The addresses of a host, all of them fit to connect to."""
+        """Return the addresses of a host, all of them fit to connect to."""
         try:
             found = await asyncio.wrap_future(self._look_up(host, port, owner))
         except (OSError, UnicodeError) as error:

@@ -104,7 +104,7 @@ async def add_endpoint(
     """Make an endpoint.
 
     Raises:
-        TooManyEndpoints: the owner has enough.
+        TooManyEndpointsError: the owner has enough.
     """
     async with connection.transaction(), connection.cursor(row_factory=class_row(Endpoint)) as cursor:
         await lock_owner(connection, owner)
@@ -132,7 +132,7 @@ async def add_endpoint(
 
 
 async def get_endpoint(connection: Connection, endpoint_id: uuid.UUID) -> Endpoint | None:
-    """The endpoint of that id, or None."""
+    """Return the endpoint of that id, or None."""
     async with connection.cursor(row_factory=class_row(Endpoint)) as cursor:
         await cursor.execute(
             with_columns("SELECT {} FROM webhook_endpoints WHERE id = %s", Endpoint), [endpoint_id]
@@ -183,7 +183,7 @@ async def change_endpoint(
     """Change what is given; None leaves a value as it is.
 
     Raises:
-        Missing: there is no such endpoint.
+        NotFoundError: there is no such endpoint.
     """
     await connection.execute(
         """
@@ -237,7 +237,7 @@ async def add_delivery(
 async def get_delivery(
     connection: Connection, endpoint_id: uuid.UUID, delivery_id: uuid.UUID
 ) -> Delivery | None:
-    """A message to an endpoint, or None."""
+    """Return a message to an endpoint, or None."""
     async with connection.cursor(row_factory=class_row(Delivery)) as cursor:
         await cursor.execute(
             with_columns("SELECT {} FROM webhook_deliveries WHERE id = %s AND endpoint_id = %s", Delivery),
@@ -247,7 +247,7 @@ async def get_delivery(
 
 
 async def list_deliveries(connection: Connection, endpoint_id: uuid.UUID, limit: int) -> list[Delivery]:
-    """The newest messages to an endpoint."""
+    """Return the newest messages to an endpoint."""
     async with connection.cursor(row_factory=class_row(Delivery)) as cursor:
         await cursor.execute(
             with_columns(
@@ -265,7 +265,7 @@ async def redeliver(connection: Connection, delivery_id: uuid.UUID) -> Delivery:
     """Put a message into the queue once more, with all its tries; its id and body stay.
 
     Raises:
-        Missing: there is no such message.
+        NotFoundError: there is no such message.
     """
     async with connection.cursor(row_factory=class_row(Delivery)) as cursor:
         await cursor.execute(

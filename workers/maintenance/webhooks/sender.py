@@ -86,7 +86,7 @@ class WebhookSender:
 
 
 def guarded_client(allowed_hosts: tuple[str, ...] = ()) -> httpx.AsyncClient:
-    """A client that connects to addresses of the public network only, and to what ``allowed_hosts`` names."""
+    """Return a client that connects to public addresses and to those in ``allowed_hosts`` only."""
     # No proxy of the environment, as it would be the proxy that looks names up.
     inner = httpx.AsyncHTTPTransport(trust_env=False, limits=httpx.Limits(max_keepalive_connections=0))
     return httpx.AsyncClient(

@@ -16,12 +16,12 @@ _MIN_BYTES, _MAX_BYTES = 24, 64
 
 
 def new_secret() -> str:
-    """A fresh secret of 256 random bits."""
+    """Return a fresh secret of 256 random bits."""
     return PREFIX + base64.b64encode(secrets.token_bytes(32)).decode("ascii")
 
 
 def check_secret(secret: str) -> str:
-    """The secret itself, if it is one by the standard.
+    """Return the secret itself, if it is one by the standard.
 
     Raises:
         ValueError: it is not ``whsec_`` and the base64 of 24 to 64 bytes.

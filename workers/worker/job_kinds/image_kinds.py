@@ -78,7 +78,7 @@ class RenderKind(ImageKind):
         """Return where a job reads and writes, the stage's files among them.
 
         Raises:
-            NameRefused: the stage names a file outside of the job's folder.
+            FileNameError: the stage names a file outside of the job's folder.
         """
         for _, name in self.named_files(options):
             check_name(name)  # as the service did

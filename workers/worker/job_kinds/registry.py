@@ -26,7 +26,8 @@ class JobKind(Generic[OptionsT]):
         needs: what it works on: a committed dataset of photographs, the results of a finished job, or only
             the files that its options name.
         options: model of its complete options, as they are kept.
-        user_options: model of the options that users give, whose JSON Schema is published; None for ``options``.
+        user_options: model of the options that users give, whose JSON Schema is published; by default
+            ``options``.
         program: ``module:function`` that does the work, imported by the job's own process only; it takes a
             :class:`octasplat.workers.worker.task.Task`.
         stages: names of its stages, in order.

@@ -49,7 +49,7 @@ class ExceededLimit:
 
 
 def exceeded_limits(demands: Iterable[ResourceDemand], limits: Mapping[str, int]) -> list[ExceededLimit]:
-    """The demands above their ceilings."""
+    """Return the demands above their ceilings."""
     return [
         ExceededLimit(demand, limits[demand.resource])
         for demand in demands
