@@ -4,11 +4,11 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from octasplat.engine.core.refusals import SettingsRefused
 
 from octasplat.engine.core import errors as engine_errors
 from octasplat.engine.core.errors import OctasplatError
 from octasplat.engine.operations.base import ContradictoryRequestError
+from octasplat.engine.settings.refusals import SettingsRefused
 from octasplat.workers.db.datasets import create_dataset, put_file
 from octasplat.workers.db.quotas import QuotaExceededError
 from octasplat.workers.storage import errors as storage_errors

@@ -122,7 +122,7 @@ def test_versions_with_other_results_are_not_mixed(bench: WorkerHarness) -> None
 def test_previous_release_works_beside_current(
     postgres: EmbeddedPostgres, previous: Path, tmp_path: Path
 ) -> None:
-    """Each goes on with what the other began, if their results are the same; the earlier front end answers."""
+    """Each resumes what the other began if their results are the same; the earlier front end answers."""
     with copied_database(postgres, "template0") as conninfo:
         bench = WorkerHarness(conninfo, tmp_path, stale_seconds=STALE_SECONDS)
         environment = {**os.environ, "DATABASE_URL": conninfo, "PYTHONPATH": str(previous / "src")}
