@@ -1,8 +1,8 @@
 """The child process of a worker: does one job, tells of it in JSON lines, stops when asked or orphaned.
 
-Run by :func:`octasplat.engine.core.isolated_python.python_command`. The first line of stdin is the task as JSON;
-a later line ``stop`` asks to stop with a checkpoint, and its end means that the worker is gone. Events go to
-stdout, one JSON object a line; whatever libraries print goes to stderr, which is the job's log.
+Run by :func:`octasplat.engine.core.isolated_python.python_command`. The first line of stdin is the task
+(JSON); a later line ``stop`` asks for a checkpoint and a stop. If stdin ends, the worker has died. Events
+go to stdout, one JSON object a line; whatever libraries print goes to stderr, which is the job's log.
 """
 
 import contextlib
