@@ -60,7 +60,7 @@ SHADOWED, RELIT, AMBIENT = 0, 1, 2
 
 @njit_no_refcount(forceinline=True)
 def encode_srgb(linear: float) -> float:
-    """The display value of a linear one (IEC 61966-2-1), also beyond 1."""
+    """Return the display value of a linear one (IEC 61966-2-1), also beyond 1."""
     if linear <= 0.0031308:
         return 12.92 * max(linear, 0.0)
     return 1.055 * linear ** (1.0 / 2.4) - 0.055
@@ -68,7 +68,7 @@ def encode_srgb(linear: float) -> float:
 
 @njit_no_refcount(forceinline=True)
 def decode_srgb(display: float) -> float:
-    """The linear value of a display value, also beyond 1."""
+    """Return the linear value of a display value, also beyond 1."""
     if display <= 0.04045:
         return max(display, 0.0) / 12.92
     return ((display + 0.055) / 1.055) ** 2.4

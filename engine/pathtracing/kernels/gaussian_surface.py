@@ -56,7 +56,7 @@ FIRST_PAIR, PAIRS_PER_BOUNCE = 1 << 12, 5
 
 @njit_no_refcount(forceinline=True)
 def _draw_samples(paths: PathArrays, p: int, pair: int, random_numbers: Float64[np.ndarray, "d 2 b"]) -> None:
-    """The numbers of :func:`scatter`, into the first column."""
+    """Write the numbers of :func:`scatter`, into the first column."""
     key, sample = paths.keys[p], paths.samples[p]
     for place in (LOBE_SAMPLE, DIRECTION_SAMPLE, LIGHT_CHOICE_SAMPLE, LIGHT_POSITION_SAMPLE):
         random_numbers[place, 0, 0], random_numbers[place, 1, 0] = uniform_pair(key, sample, pair + place)

@@ -142,7 +142,7 @@ class LightArrays(NamedTuple):
 
     @property
     def environment_id(self) -> int:
-        """The environment's place among the lights, -1 without one."""
+        """Return the environment's place among the lights, -1 without one."""
         count = len(self.kinds)
         return count - 1 if count and self.kinds[-1] == ENVIRONMENT else -1
 
@@ -455,7 +455,7 @@ def allocate_shadow_rays(count: int) -> ShadowRayArrays:
 
 
 def allocate_path_scratch(threads: int) -> list[PathScratch]:
-    """Memory for the kernels of so many threads."""
+    """Return memory for the kernels of so many threads."""
     return [
         PathScratch(
             allocate_embree_scratch(1)[0], np.empty(BLOCK_SIZE, np.uint32), np.empty(BLOCK_SIZE, np.int32),

@@ -35,7 +35,7 @@ def luminance(red: float, green: float, blue: float) -> float:
 
 @njit_no_refcount(forceinline=True)
 def _spot_falloff(lights: LightArrays, l: int, way_x: float, way_y: float, way_z: float) -> float:
-    """How much of a spot's intensity goes a way (a unit vector from the light)."""
+    """Return how much of a spot's intensity goes a way (a unit vector from the light)."""
     axis = lights.axes[l]
     cosine = axis[0] * way_x + axis[1] * way_y + axis[2] * way_z
     outer, inner = lights.cosines[l, 0], lights.cosines[l, 1]
@@ -73,7 +73,7 @@ def light_importance(lights: LightArrays, l: int, p_x: float, p_y: float, p_z: f
 def sample_light_index(
     lights: LightArrays, p_x: float, p_y: float, p_z: float, u: float
 ) -> tuple[int, float]:
-    """A light and the probability with which it is asked at p; -1 where none shines."""
+    """Return a light and the probability with which it is asked at p; -1 where none shines."""
     count = len(lights.kinds)
     if count == 1:
         return (0, 1.0) if light_importance(lights, 0, p_x, p_y, p_z) > 0.0 else (-1, 0.0)
@@ -95,7 +95,7 @@ def sample_light_index(
 
 @njit_no_refcount(forceinline=True)
 def light_probability(lights: LightArrays, light_id: int, p_x: float, p_y: float, p_z: float) -> float:
-    """The probability with which :func:`sample_light_index` asks the light ``light_id`` at p."""
+    """Return the probability with which :func:`sample_light_index` asks the light ``light_id`` at p."""
     total, own = 0.0, 0.0
     for l in range(len(lights.kinds)):
         weight = light_importance(lights, l, p_x, p_y, p_z)
@@ -107,7 +107,7 @@ def light_probability(lights: LightArrays, light_id: int, p_x: float, p_y: float
 
 @njit_no_refcount()
 def additive_light_probability(lights: LightArrays, p_x: float, p_y: float, p_z: float) -> float:
-    """The probability with which :func:`sample_light_index` asks at p one of the lights that add theirs."""
+    """Return the probability with which one of the lights that add theirs is asked at p."""
     if not lights.any_adds_light:
         return 0.0
     total, adding = 0.0, 0.0
@@ -121,7 +121,7 @@ def additive_light_probability(lights: LightArrays, p_x: float, p_y: float, p_z:
 
 @njit_no_refcount()
 def eval_emission(lights: LightArrays, l: int, u: float, v: float) -> tuple[float, float, float]:
-    """Linear radiance of a shining surface at texture coordinates."""
+    """Return linear radiance of a shining surface at texture coordinates."""
     rgb = lights.rgb_linear[l]
     if lights.textures[l] < 0:
         return rgb[0], rgb[1], rgb[2]
@@ -133,7 +133,7 @@ def eval_emission(lights: LightArrays, l: int, u: float, v: float) -> tuple[floa
 def emitter_hit_pdf(
     lights: LightArrays, l: int, o: Float32[np.ndarray, "3"], distance: float, cosine: float
 ) -> float:
-    """Density over solid angle with which :func:`sample_light` gives from o the place that a ray met.
+    """Return density over solid angle with which :func:`sample_light` gives from o the place that a ray met.
 
     ``distance`` is that of the place and ``cosine`` the cosine there.
     """
@@ -160,7 +160,7 @@ def _one_minus_cosine(squared_sine: float) -> float:
 def _sample_sphere(
     lights: LightArrays, l: int, p_x: float, p_y: float, p_z: float, u: float, v: float
 ) -> tuple[float, float, float, float, float, float, float, float]:
-    """A way from p to a ball of light, evenly over the solid angle that it fills."""
+    """Return a way from p to a ball of light, evenly over the solid angle that it fills."""
     way_x = lights.positions_world[l, 0] - p_x
     way_y = lights.positions_world[l, 1] - p_y
     way_z = lights.positions_world[l, 2] - p_z
@@ -192,7 +192,7 @@ def _sample_sphere(
 def _sample_mesh(
     lights: LightArrays, l: int, p_x: float, p_y: float, p_z: float, u: float, v: float
 ) -> tuple[float, float, float, float, float, float, float, float]:
-    """A way from p to a shining mesh, evenly over its area."""
+    """Return a way from p to a shining mesh, evenly over its area."""
     first, last = lights.mesh_rows[l, 0], lights.mesh_rows[l, 1]
     row, u = _sample_cdf(lights.mesh_cdf[first : last + 1], u)
     face = lights.mesh_rows[l, 2] + row
@@ -233,7 +233,7 @@ def _sample_mesh(
 def sample_light(
     lights: LightArrays, l: int, p_x: float, p_y: float, p_z: float, u: float, v: float
 ) -> tuple[float, float, float, float, float, float, float, float]:
-    """A way from p to a light: unit direction, distance, linear radiance, density over solid angle.
+    """Return a way from p to a light: unit direction, distance, linear radiance, density over solid angle.
 
     A density of 0 marks light that comes from one direction only: in place of radiance there is irradiance.
     """
@@ -275,7 +275,7 @@ def sample_light(
 
 @njit_no_refcount(forceinline=True)
 def _environment_uv(lights: LightArrays, d_x: float, d_y: float, d_z: float) -> tuple[float, float, float]:
-    """Where a direction lies in the map, (u, v) from 0 to 1, and the sine of its angle to up."""
+    """Return where a direction lies in the map, (u, v) from 0 to 1, and the sine of its angle to up."""
     frame = lights.environment_frame
     right = frame[0, 0] * d_x + frame[0, 1] * d_y + frame[0, 2] * d_z
     up = frame[1, 0] * d_x + frame[1, 1] * d_y + frame[1, 2] * d_z
@@ -286,7 +286,7 @@ def _environment_uv(lights: LightArrays, d_x: float, d_y: float, d_z: float) -> 
 
 @njit_no_refcount(forceinline=True)
 def eval_environment(lights: LightArrays, d_x: float, d_y: float, d_z: float) -> tuple[float, float, float]:
-    """Linear radiance from a direction: bilinear between the map's pixels, round at its sides."""
+    """Return linear radiance from a direction: bilinear between the map's pixels, round at its sides."""
     radiance = lights.environment_linear
     height, width, _ = radiance.shape
     u, v, _ = _environment_uv(lights, d_x, d_y, d_z)
@@ -319,7 +319,7 @@ def eval_environment(lights: LightArrays, d_x: float, d_y: float, d_z: float) ->
 
 @njit_no_refcount(forceinline=True)
 def environment_pdf(lights: LightArrays, d_x: float, d_y: float, d_z: float) -> float:
-    """Density over solid angle with which :func:`sample_environment` gives a direction."""
+    """Return density over solid angle with which :func:`sample_environment` gives a direction."""
     shares = lights.environment_probabilities
     height, width = shares.shape
     u, v, sine = _environment_uv(lights, d_x, d_y, d_z)
@@ -329,7 +329,7 @@ def environment_pdf(lights: LightArrays, d_x: float, d_y: float, d_z: float) -> 
 
 @njit_no_refcount(forceinline=True)
 def _sample_cdf(cdf: Float64[np.ndarray, " c"], u: float) -> tuple[int, float]:
-    """The step of a cumulative sum from 0 to 1 in which u lies, and how far in."""
+    """Return the step of a cumulative sum from 0 to 1 in which u lies, and how far in."""
     low, high = 0, len(cdf) - 1
     while high - low > 1:
         middle = (low + high) // 2
@@ -343,7 +343,7 @@ def _sample_cdf(cdf: Float64[np.ndarray, " c"], u: float) -> tuple[int, float]:
 
 @njit_no_refcount(forceinline=True)
 def sample_environment(lights: LightArrays, u: float, v: float) -> tuple[float, float, float, float]:
-    """A direction, likelier where the map is brighter, and its density over solid angle."""
+    """Return a direction, likelier where the map is brighter, and its density over solid angle."""
     height, width = lights.environment_probabilities.shape
     j, down = _sample_cdf(lights.environment_row_cdf, v)
     i, across = _sample_cdf(lights.environment_column_cdf[j], u)
@@ -368,7 +368,7 @@ def eval_environment_array(
     radiance: Float64[np.ndarray, "n 3"],
     pdf: Float64[np.ndarray, " n"],
 ) -> None:
-    """Radiance and density of rows of directions."""
+    """Write radiance and density of rows of directions."""
     for n in range(len(directions)):
         d = directions[n]
         radiance[n, 0], radiance[n, 1], radiance[n, 2] = eval_environment(lights, d[0], d[1], d[2])

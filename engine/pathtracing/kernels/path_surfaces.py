@@ -196,7 +196,7 @@ def eval_background(
     d_y: float,
     d_z: float,
 ) -> tuple[float, float, float]:
-    """Linear radiance from behind everything; ``environment`` is the number of that light or -1."""
+    """Return linear radiance from behind everything; ``environment`` is the number of that light or -1."""
     if environment >= 0 and (integrator.environment_visible or not flags & FLAG_CAMERA_RAY):
         return eval_environment(lights, d_x, d_y, d_z)
     background = integrator.background_linear
@@ -219,7 +219,7 @@ def add_radiance(paths: PathArrays, p: int, red: float, green: float, blue: floa
 def _shade_miss(
     paths: PathArrays, p: int, lights: LightArrays, environment: int, integrator: IntegratorParameters
 ) -> None:
-    """A path ends behind everything."""
+    """End a path behind everything."""
     d = paths.directions_world[p]
     red, green, blue = eval_background(lights, environment, integrator, paths.flags[p], d[0], d[1], d[2])
     share = 1.0
@@ -247,7 +247,7 @@ def _shade_emitter(
     v: float,
     integrator: IntegratorParameters,
 ) -> None:
-    """A path meets a shining surface; ``cosine`` is the cosine to its front, (u, v) the place on a mesh."""
+    """Add the light of a shining surface; ``cosine`` is that to its front, (u, v) the place on a mesh."""
     if cosine <= 0.0:
         return
     share = 1.0
@@ -331,7 +331,7 @@ def _fill_samples(
     last: int,
     first_pair: int,
 ) -> None:
-    """The uniform numbers of those of the rows ``first`` to ``last``, at most a block, that meet a face."""
+    """Fill in the numbers of those of the rows ``first`` to ``last``, at most a block, that meet a face."""
     count = 0
     for k in range(first, last):
         if faces[k] >= 0:

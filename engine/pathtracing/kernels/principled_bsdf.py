@@ -31,7 +31,7 @@ COUPLED, BURLEY = 0, 1
 
 @njit_no_refcount(forceinline=True)
 def fresnel_dielectric(cos_o: float, eta: float) -> tuple[float, float]:
-    """Share of unpolarised light that a smooth surface reflects, and the cosine of the refracted ray.
+    """Return share of unpolarised light that a smooth surface reflects, and the cosine of the refracted ray.
 
     ``eta`` is the index of refraction on the other side over that on the side of ``cos_o`` >= 0. Where all
     is reflected the share is 1 and the cosine 0.
@@ -47,7 +47,7 @@ def fresnel_dielectric(cos_o: float, eta: float) -> tuple[float, float]:
 
 @njit_no_refcount(forceinline=True)
 def sample_cosine(u: float, v: float) -> tuple[float, float, float]:
-    """A direction over the hemisphere, as dense as its cosine; its density is cosine / pi."""
+    """Return a direction over the hemisphere, as dense as its cosine; its density is cosine / pi."""
     radius, angle = math.sqrt(u), 2.0 * math.pi * v
     return radius * math.cos(angle), radius * math.sin(angle), math.sqrt(max(1.0 - u, 0.0))
 

@@ -27,7 +27,7 @@ def hash_uint32(x: np.uint32) -> np.uint32:
 
 @njit_no_refcount()
 def reverse_bits(x: np.uint32) -> np.uint32:
-    """The bits of a uint32 in the opposite order."""
+    """Return the bits of a uint32 in the opposite order."""
     x = np.uint32(x)
     x = np.uint32((x << np.uint32(16)) | (x >> np.uint32(16)))
     x = np.uint32(
@@ -56,7 +56,7 @@ def _laine_karras_permutation(x: np.uint32, seed: np.uint32) -> np.uint32:
 
 @njit_no_refcount()
 def sobol_reversed_bits(index: np.uint32) -> tuple[np.uint32, np.uint32]:
-    """The first two dimensions of Sobol's sequence as 32 binary digits behind the point, the last one first.
+    """Return two dimensions of Sobol's sequence as 32 binary digits behind the point, the last one first.
 
     So they are what is to be scrambled next. The first is the index itself, the second Pascal's triangle
     modulo 2 on it, as a product of sparse matrices; the index is below 65,536.
@@ -70,7 +70,7 @@ def sobol_reversed_bits(index: np.uint32) -> tuple[np.uint32, np.uint32]:
 
 @njit_no_refcount()
 def pixel_key(seed: int, pixel: int) -> np.uint32:
-    """What the numbers of a pixel begin from."""
+    """Return what the numbers of a pixel begin from."""
     return hash_uint32(np.uint32(hash_uint32(np.uint32(seed)) + np.uint32(0x9E3779B9) * np.uint32(pixel)))
 
 
@@ -98,7 +98,7 @@ def fill_uniform(
     pair: int,
     out: Float64[np.ndarray, "n 2"],
 ) -> None:
-    """The numbers of many (pixel, sample), for tests and for what draws them outside of the kernels."""
+    """Write the numbers of many (pixel, sample), for tests and for what draws them outside of the kernels."""
     for i in range(len(pixels)):
         out[i, 0], out[i, 1] = uniform_pair(pixel_key(seed, pixels[i]), samples[i], pair)
 
@@ -112,7 +112,7 @@ def _fill_pair(
     first: Float64[np.ndarray, " p"],
     second: Float64[np.ndarray, " p"],
 ) -> None:
-    """A pair of numbers of each path; without a branch, so that the compiler does many paths at a time."""
+    """Write a pair of each path; without a branch, so that the compiler does many paths at a time."""
     for k in range(count):
         u, v = uniform_pair(keys[k], samples[k], pair)
         first[k] = u

@@ -35,7 +35,7 @@ RESTART_OFFSET = np.float32(1e-7)
 def _select_shadow_rays(
     shadows: ShadowRayArrays, first: int, last: int, passes_glass: bool, rows: Int32[np.ndarray, " b"]
 ) -> int:
-    """The rows of shadow rays that bring anything, the straight ones or the others, and how many."""
+    """Return the rows of shadow rays that bring anything, the straight ones or the others, and how many."""
     count = 0
     for k in range(first, last):
         brings = (
@@ -147,7 +147,7 @@ def shadow_transmittance(
     passes_rough_glass: bool,
     transmittance: Float32[np.ndarray, "n 3"],
 ) -> None:
-    """The share of light that meshes let through on each ray, in each channel: 0 or 1, but for glass.
+    """Write the share of light that meshes let through on each ray, in each channel: 0 or 1, but for glass.
 
     It is 0, too, for rays that bring nothing. Where a ray is marked so, light goes straight through glass,
     less what Fresnel, tint and Beer take. Paths find light that glass bends only where a lamp has an extent

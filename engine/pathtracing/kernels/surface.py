@@ -17,7 +17,7 @@ RAY_OFFSET_SCALE = 5e-6
 def interpolate_corners(
     corners: Float32[np.ndarray, "3 3"], a: float, b: float, c: float
 ) -> tuple[float, float, float]:
-    """The point with weights a, b, c of the corners."""
+    """Return the point with weights a, b, c of the corners."""
     return (
         a * corners[0, 0] + b * corners[1, 0] + c * corners[2, 0],
         a * corners[0, 1] + b * corners[1, 1] + c * corners[2, 1],
@@ -38,14 +38,14 @@ def interpolate_uv(
 
 @njit_no_refcount(forceinline=True)
 def normalize(x: float, y: float, z: float) -> tuple[float, float, float]:
-    """The vector with length 1."""
+    """Return the vector with length 1."""
     length = max(math.sqrt(x * x + y * y + z * z), 1e-30)
     return x / length, y / length, z / length
 
 
 @njit_no_refcount(forceinline=True)
 def face_normal(corners: Float32[np.ndarray, "3 3"]) -> tuple[float, float, float]:
-    """Unit normal of a triangle, on the side from which its corners run anticlockwise."""
+    """Return unit normal of a triangle, on the side from which its corners run anticlockwise."""
     u_x, u_y, u_z = (
         float(corners[1, 0]) - corners[0, 0],
         float(corners[1, 1]) - corners[0, 1],
@@ -63,7 +63,7 @@ def face_normal(corners: Float32[np.ndarray, "3 3"]) -> tuple[float, float, floa
 def offset_ray_origin(
     p_x: float, p_y: float, p_z: float, n_x: float, n_y: float, n_z: float
 ) -> tuple[float, float, float]:
-    """The point a little off a surface along n, so that rounding does not put it behind the surface."""
+    """Move a point a little off a surface along n, so that rounding does not put it behind the surface."""
     step = RAY_OFFSET_SCALE * max(abs(p_x), abs(p_y), abs(p_z), 1e-3)
     return p_x + step * n_x, p_y + step * n_y, p_z + step * n_z
 
@@ -72,7 +72,7 @@ def offset_ray_origin(
 def eval_material(
     materials: MaterialArrays, m: int, u: float, v: float
 ) -> tuple[float, float, float, float, float]:
-    """Base colour, metallic and roughness of material ``m`` at texture coordinates."""
+    """Return base colour, metallic and roughness of material ``m`` at texture coordinates."""
     red, green, blue = (
         materials.colours_linear[m, 0],
         materials.colours_linear[m, 1],
@@ -94,7 +94,7 @@ def eval_material(
 def eval_vertex_color(
     surfaces: SurfaceArrays, face: int, a: float, b: float, c: float
 ) -> tuple[float, float, float]:
-    """The colour of the corners of a face at a place, white where no mesh has colours of its own."""
+    """Return the colour of the corners of a face at a place, white where no mesh has colours of its own."""
     if len(surfaces.corner_rgb_linear) == 0:
         return 1.0, 1.0, 1.0
     return interpolate_corners(surfaces.corner_rgb_linear[face], a, b, c)
@@ -174,7 +174,7 @@ def shading_normal(
     d_y: float,
     d_z: float,
 ) -> tuple[float, float, float]:
-    """The interpolated normal on the side of n; n itself where the viewer would see it from behind."""
+    """Return the interpolated normal on the side of n; n itself where the viewer would see it from behind."""
     s_x, s_y, s_z = interpolate_corners(normals, a, b, c)
     s_x, s_y, s_z = normalize(s_x, s_y, s_z)
     if s_x * n_x + s_y * n_y + s_z * n_z < 0.0:
@@ -188,6 +188,6 @@ def shading_normal(
 def reflect(
     d_x: float, d_y: float, d_z: float, n_x: float, n_y: float, n_z: float
 ) -> tuple[float, float, float]:
-    """The direction d after a mirror with the normal n."""
+    """Return the direction d after a mirror with the normal n."""
     twice = 2.0 * (d_x * n_x + d_y * n_y + d_z * n_z)
     return d_x - twice * n_x, d_y - twice * n_y, d_z - twice * n_z

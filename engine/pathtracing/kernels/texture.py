@@ -10,7 +10,7 @@ from octasplat.engine.trace.kernels.native import njit_no_refcount
 def eval_texture(
     materials: LightArrays | MaterialArrays, texture: int, u: float, v: float
 ) -> tuple[float, float, float]:
-    """Bilinear linear value of a texture that repeats."""
+    """Return bilinear linear value of a texture that repeats."""
     first, height, width = (
         materials.texture_sizes[texture, 0],
         materials.texture_sizes[texture, 1],

@@ -39,7 +39,7 @@ class LightLevels(NamedTuple):
 
 @device_function(error_model="numpy", inline="always")
 def texel_direction(row: int, column: int, height: int) -> tuple[float, float, float]:
-    """The middle of a texel."""
+    """Return the middle of a texel."""
     polar = math.pi * (row + 0.5) / height
     longitude = math.pi * ((column + 0.5) / height - 1.0)
     ring = math.sin(polar)
@@ -48,7 +48,7 @@ def texel_direction(row: int, column: int, height: int) -> tuple[float, float, f
 
 @device_function(error_model="numpy")
 def lobe_weight(cosine: float, alpha: float) -> float:
-    """What a rough mirror that looks along its normal takes from a direction of that cosine to it.
+    """Return what a rough mirror that looks along its normal takes from a direction of that cosine to it.
 
     GGX's density of the half vector times the cosine; pure cosine where ``alpha`` is negative.
     """
@@ -163,7 +163,7 @@ def sparse_product(
 def look_up(
     texels: Float[np.ndarray, "t 3"], offset: int, height: int, x: float, y: float, z: float
 ) -> Lookup:
-    """Bilinear value of a level at a unit direction.
+    """Return bilinear value of a level at a unit direction.
 
     Returns:
         Numbers of the four texels, the two fractions between them, and the slopes of these by the direction:

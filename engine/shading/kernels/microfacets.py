@@ -22,7 +22,7 @@ def schlick_weight(cosine: float) -> float:
 
 @njit_no_refcount(forceinline=True)
 def ggx_density(cos_h: float, alpha: float) -> float:
-    """The microfacet distribution D at a half vector of that cosine."""
+    """Return the microfacet distribution D at a half vector of that cosine."""
     a2 = alpha * alpha
     x = cos_h * cos_h * (a2 - 1.0) + 1.0
     return a2 / (math.pi * x * x)
@@ -39,7 +39,7 @@ def ggx_masking(cosine: float, alpha: float) -> float:
 def sample_visible_normal(
     o_x: float, o_y: float, o_z: float, alpha: float, u: float, v: float
 ) -> tuple[float, float, float]:
-    """A normal of GGX as it is seen from ``o`` (o_z > 0)."""
+    """Return a normal of GGX as it is seen from ``o`` (o_z > 0)."""
     x, y, z = alpha * o_x, alpha * o_y, o_z
     length = math.sqrt(x * x + y * y + z * z)
     x, y, z = x / length, y / length, z / length
@@ -54,7 +54,7 @@ def sample_visible_normal(
 
 @njit_no_refcount(forceinline=True)
 def table_value(table: Float64[np.ndarray, "a c"], cosine: float, roughness: float) -> float:
-    """Bilinear value of a table over (roughness, cosine), both from 0 to 1."""
+    """Return bilinear value of a table over (roughness, cosine), both from 0 to 1."""
     rows, columns = table.shape
     y = min(max(roughness, 0.0), 1.0) * (rows - 1)
     x = min(max(cosine, 0.0), 1.0) * (columns - 1)

@@ -88,7 +88,7 @@ def integrate_table(first: int, last: int, samples: int, table: Float64[np.ndarr
 def table_slopes(
     table: Float64[np.ndarray, "a c 2"], cosine: float, roughness: float
 ) -> tuple[float, float, float, float, float, float]:
-    """Both values of the table, and their slopes by cosine and by roughness."""
+    """Return both values of the table, and their slopes by cosine and by roughness."""
     rows, columns = table.shape[:2]
     y = min(max(roughness, 0.0), 1.0) * (rows - 1)
     x = min(max(cosine, 0.0), 1.0) * (columns - 1)
@@ -109,7 +109,7 @@ def table_slopes(
 def mix(
     texels: Float[np.ndarray, "t 3"], a: int, b: int, c: int, d: int, x: float, y: float, channel: int
 ) -> float:
-    """Bilinear value of four texels."""
+    """Return bilinear value of four texels."""
     top = texels[a, channel] * (1.0 - x) + texels[b, channel] * x
     bottom = texels[c, channel] * (1.0 - x) + texels[d, channel] * x
     return top * (1.0 - y) + bottom * y
@@ -119,14 +119,14 @@ def mix(
 def mix_slopes(
     texels: Float[np.ndarray, "t 3"], a: int, b: int, c: int, d: int, x: float, y: float, channel: int
 ) -> tuple[float, float]:
-    """Slopes of that by the two fractions."""
+    """Return slopes of that by the two fractions."""
     p, q, r, s = texels[a, channel], texels[b, channel], texels[c, channel], texels[d, channel]
     return (q - p) * (1.0 - y) + (s - r) * y, (r - p) * (1.0 - x) + (s - q) * x
 
 
 @device_function(error_model="numpy")
 def level_of(roughnesses: Float64[np.ndarray, " l"], roughness: float) -> tuple[int, float, float]:
-    """The level below a roughness, how far it is to the next, and the slope of that."""
+    """Return the level below a roughness, how far it is to the next, and the slope of that."""
     last = len(roughnesses) - 1
     if roughness <= roughnesses[0]:
         return 0, 0.0, 0.0
@@ -215,7 +215,7 @@ def look_back(
 def direction_slope(
     texels: Float[np.ndarray, "t 3"], found: Lookup, channel: int
 ) -> tuple[float, float, float]:
-    """Slope of a looked-up value by the direction."""
+    """Return slope of a looked-up value by the direction."""
     a, b, c, d, u, v, column_x, column_z, row_y = found
     by_u, by_v = mix_slopes(texels, a, b, c, d, u, v, channel)
     return by_u * column_x, by_v * row_y, by_u * column_z

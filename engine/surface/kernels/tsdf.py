@@ -65,7 +65,7 @@ def contract(x: float, y: float, z: float) -> tuple[float, float, float]:
 
 @device_function()
 def expand(x: float, y: float, z: float) -> tuple[float, float, float, float]:
-    """The way back from :func:`contract`, and how much lengths grow on it, at most (1 inside the ball).
+    """Undo :func:`contract`, and tell how much lengths grow on it, at most (1 inside the ball).
 
     Points on and beyond the rim of contracted space, which stand for infinity, give a stretch of 0.
     """
@@ -147,7 +147,7 @@ def depth_at(
     v: float,
     jump: float,
 ) -> tuple[float, float]:
-    """Distance and cosine at an image point: bilinear on one surface, else of the pixel itself.
+    """Return distance and cosine at an image point: bilinear on one surface, else of the pixel itself.
 
     Four pixels lie on one surface where all are known and differ by no more than ``jump``.
     """

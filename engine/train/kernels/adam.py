@@ -227,7 +227,7 @@ def step_few(
 
 @njit_no_refcount(fastmath={"contract"})
 def own_axes_of(i: int, quats: Float32[np.ndarray, "n 4"], room: Float32[np.ndarray, "3 16"]) -> None:
-    """The axes of Gaussian ``i`` as rows of ``room``: the normal and the two in its plane."""
+    """Write the axes of Gaussian ``i`` as rows of ``room``: the normal and the two in its plane."""
     w, x, y, z = (
         np.float64(quats[i, 0]), np.float64(quats[i, 1]), np.float64(quats[i, 2]), np.float64(quats[i, 3]),
     )  # fmt: skip

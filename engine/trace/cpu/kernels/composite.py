@@ -65,7 +65,7 @@ def composite(
     direction: tuple[float, float, float],
     basis: Float64[np.ndarray, " k"],
 ) -> tuple[RayState, bool]:
-    """The ray ``r`` behind ``hit``, and whether it ends there.
+    """Return the ray ``r`` behind ``hit``, and whether it ends there.
 
     The hit is stored if the pass is recording. ``basis`` is room for harmonics.
     """

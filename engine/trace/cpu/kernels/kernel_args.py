@@ -30,7 +30,7 @@ class RayArrays(NamedTuple):
 
     @classmethod
     def from_batch(cls, rays: RayBatch) -> "RayArrays":
-        """The arrays of ``rays``, not copied."""
+        """Return the arrays of ``rays``, not copied."""
         return cls(*rays.arrays)
 
 
@@ -58,7 +58,7 @@ class GaussianParameters(NamedTuple):
 
     @classmethod
     def from_gaussians(cls, gaussians: FlatGaussians) -> "GaussianParameters":
-        """The arrays of ``gaussians``, not copied."""
+        """Return the arrays of ``gaussians``, not copied."""
         return cls(
             gaussians.means_world, gaussians.quats_wxyz, gaussians.log_scales, gaussians.opacity_logits
         )
@@ -75,7 +75,7 @@ class TraceLimits(NamedTuple):
 
     @classmethod
     def from_settings(cls, settings: TraceSettings) -> "TraceLimits":
-        """The limits among ``settings``."""
+        """Return the limits among ``settings``."""
         eps2 = settings.second_phase_min
         return cls(
             settings.transmittance_min,

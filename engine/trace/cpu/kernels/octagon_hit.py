@@ -92,7 +92,7 @@ def insert_hit(
 def intersect_plane(
     primitive: Float32[np.ndarray, "16"], context_f64: Float64[np.ndarray, " words2"]
 ) -> tuple[float, bool]:
-    """Distance along the ray at which it meets the Gaussian's plane; infinite where it runs inside it.
+    """Return distance along the ray at which it meets the Gaussian's plane; infinite where it runs inside it.
 
     And whether it meets it from behind.
     """

@@ -21,7 +21,7 @@ from octasplat.engine.trace.cpu.kernels.octagon_hit import (
 def rotation_columns(
     q0: float, q1: float, q2: float, q3: float
 ) -> tuple[tuple[float, float, float], tuple[float, float, float], tuple[float, float, float]]:
-    """Columns r1, r2, r3 of the rotation of a quaternion (w, x, y, z) of any length, float64."""
+    """Return columns r1, r2, r3 of the rotation of a quaternion (w, x, y, z) of any length, float64."""
     scale = 1.0 / math.sqrt(q0 * q0 + q1 * q1 + q2 * q2 + q3 * q3)
     w, x, y, z = q0 * scale, q1 * scale, q2 * scale, q3 * scale
     return (
@@ -48,7 +48,7 @@ def ellipse_semi_axes(
     logits: Float32[np.ndarray, " n"],
     q: float,
 ) -> tuple[float, float, tuple[float, float, float], tuple[float, float, float]]:
-    """Corner radii in world units along r2 and r3, and those axes."""
+    """Return corner radii in world units along r2 and r3, and those axes."""
     _r1, r2, r3 = rotation_columns(
         np.float64(quats[i, 0]), np.float64(quats[i, 1]), np.float64(quats[i, 2]), np.float64(quats[i, 3])
     )
@@ -110,7 +110,7 @@ def write_box(
     q: float,
     padding: float,
 ) -> None:
-    """Box of one octagon's ellipse enlarged by the fraction ``padding`` of its size.
+    """Write box of one octagon's ellipse enlarged by the fraction ``padding`` of its size.
 
     A Gaussian without an octagon gets a box turned inside out, which Embree leaves out of its hierarchy.
     """
@@ -139,7 +139,7 @@ def write_boxes(
     q: float,
     padding: float,
 ) -> None:
-    """Boxes of all octagons, see :func:`write_box`."""
+    """Write boxes of all octagons, see :func:`write_box`."""
     for i in range(first, last):
         write_box(boxes[i], i, means, quats, log_scales, logits, q, padding)
 
@@ -191,6 +191,6 @@ def repack_primitives(
     logits: Float32[np.ndarray, " n"],
     q: float,
 ) -> None:
-    """Records of the Gaussians ``ids`` from their changed parameters."""
+    """Write records of the Gaussians ``ids`` from their changed parameters."""
     for k in range(first, last):
         pack_primitive(primitives, ids[k], means, quats, log_scales, logits, q)

@@ -94,7 +94,7 @@ class PacketBackwardScratch(NamedTuple):
 
 @device_function(error_model="numpy")
 def allocate_backward_scratch(max_hits: int, slots: int) -> PacketBackwardScratch:
-    """Memory for packets, one after another."""
+    """Return memory for packets, one after another."""
     return PacketBackwardScratch(
         np.empty(max_hits + WIDTH, np.float64),
         np.empty((slots, 3), np.float64),

@@ -92,7 +92,7 @@ def write_leaf(
 def write_block_box(
     blocks: Float32[np.ndarray, "b 9 8"], b: int, nodes: Float32[np.ndarray, "m 6 8"]
 ) -> None:
-    """The box of block ``b`` at level 0, around the ellipses that have not vanished."""
+    """Write the box of block ``b`` at level 0, around the ellipses that have not vanished."""
     lo0 = lo1 = lo2 = np.inf
     hi0 = hi1 = hi2 = -np.inf
     for lane in range(WIDTH):
@@ -136,7 +136,7 @@ def write_leaves(
     order: Int32[np.ndarray, " n"],
     nodes: Float32[np.ndarray, "m 6 8"],
 ) -> None:
-    """Blocks in curve order, each Gaussian's place in them, and the boxes of the blocks (level 0)."""
+    """Write blocks in curve order, each Gaussian's place in them, and the boxes of the blocks (level 0)."""
     count = len(order)
     for b in range(first, last):
         for lane in range(WIDTH):
@@ -152,7 +152,7 @@ def write_leaves(
 
 @device_function(_nrt=False, error_model="numpy")
 def write_node_box(nodes: Float32[np.ndarray, "m 6 8"], child: int, parent: int, lane: int) -> None:
-    """Box ``lane`` of ``parent``, around the eight boxes of ``child``."""
+    """Write box ``lane`` of ``parent``, around the eight boxes of ``child``."""
     for row in range(3):
         low, high = nodes[child, row, 0], nodes[child, 3 + row, 0]
         for other in range(1, WIDTH):
@@ -162,7 +162,7 @@ def write_node_box(nodes: Float32[np.ndarray, "m 6 8"], child: int, parent: int,
 
 @kernel(_nrt=False, error_model="numpy")
 def write_upper_levels(nodes: Float32[np.ndarray, "m 6 8"], level_starts: Int64[np.ndarray, " l"]) -> None:
-    """Boxes of every level above the first; node k of a level bounds box k of the next."""
+    """Write boxes of every level above the first; node k of a level bounds box k of the next."""
     for level in range(1, len(level_starts) - 1):
         below, here = level_starts[level - 1], level_starts[level]
         for k in range(here - below):
@@ -195,7 +195,7 @@ def refit_blocks(
     dirty: Bool[np.ndarray, " b"],
     nodes: Float32[np.ndarray, "m 6 8"],
 ) -> None:
-    """The boxes of the blocks that were touched, and of no others."""
+    """Write the boxes of the blocks that were touched, and of no others."""
     for b in range(first, last):
         if dirty[b]:
             write_block_box(blocks, b, nodes)

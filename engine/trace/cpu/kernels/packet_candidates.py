@@ -81,7 +81,7 @@ INITIAL_CAPACITY = 512
 
 @device_function(error_model="numpy")
 def allocate_aligned_float64(count: int) -> Float64[np.ndarray, " count"]:
-    """Room for doubles from a line on, else each vector of eight would lie in two."""
+    """Return room for doubles from a line on, else each vector of eight would lie in two."""
     raw = np.empty(count + CACHE_LINE_BYTES // 8, np.float64)
     first = (CACHE_LINE_BYTES - raw.ctypes.data % CACHE_LINE_BYTES) % CACHE_LINE_BYTES // 8
     return raw[first : first + count]
@@ -89,7 +89,7 @@ def allocate_aligned_float64(count: int) -> Float64[np.ndarray, " count"]:
 
 @device_function(error_model="numpy")
 def allocate_candidates(capacity: int) -> Candidates:
-    """Room for so many candidates, a multiple of eight."""
+    """Return room for so many candidates, a multiple of eight."""
     return Candidates(
         np.empty(capacity, np.int32),
         np.empty(capacity, np.uint64),
@@ -185,7 +185,7 @@ def write_in_packet_frame(
     y: float,
     z: float,
 ) -> None:
-    """A vector along the axis, e and f of a packet's ``frame``, as three rows of a lane."""
+    """Write a vector along the axis, e and f of a packet's ``frame``, as three rows of a lane."""
     for axis in range(3):
         k = 3 * axis
         block[row + axis, lane] = np.float32(x * frame[k] + y * frame[k + 1] + z * frame[k + 2])

@@ -104,7 +104,7 @@ class PacketTrace(NamedTuple):
 
 @device_function(error_model="numpy")
 def allocate_ray_scratch() -> RayScratch:
-    """Memory for rays, one after another."""
+    """Return memory for rays, one after another."""
     return RayScratch(
         np.empty(16, np.float64),
         np.empty(RANK_SORT_MAX + WIDTH, np.uint64),
@@ -194,7 +194,7 @@ def intersect_blocks(
 
 @njit_no_refcount(forceinline=True)
 def eval_alphas(candidates: Candidates, first: int, last: int, alpha_max: float) -> None:
-    """Alphas of the hits ``first`` to ``last`` of a ray."""
+    """Write alphas of the hits ``first`` to ``last`` of a ray."""
     for place in range(first, last, WIDTH):
         eval_alphas8(
             candidates.alphas.ctypes.data, candidates.opacities.ctypes.data, place, np.float32(alpha_max)
@@ -223,7 +223,7 @@ def eval_color_normal(
     origin: tuple[float, float, float],
     basis: Float64[np.ndarray, " k"],
 ) -> None:
-    """What Gaussian ``i`` shows to rays from ``origin``."""
+    """Write what Gaussian ``i`` shows to rays from ``origin``."""
     record = scene.primitives[i]
     x, y, z = record[MEAN] - origin[0], record[MEAN + 1] - origin[1], record[MEAN + 2] - origin[2]
     n0, n1, n2 = primitive_vector(record, NORMAL)
@@ -452,7 +452,7 @@ def ray_transmittance(
     count: int,
     limits: TraceLimits,
 ) -> float:
-    """What the candidates leave of ray ``r``, ray ``ray_bit`` of its packet; 0 where that is below eps1."""
+    """Return what candidates leave of ray ``r``, ray ``ray_bit`` of its packet; 0 where it is below eps1."""
     slopes, span = ray_slopes(rays, r, frame), ray_limits(rays, r)
     block_count = (count + WIDTH - 1) // WIDTH
     left = 1.0
@@ -476,7 +476,7 @@ def packet_transmittance(
     counter: Int64[np.ndarray, "1"],
     transmittance: Float32[np.ndarray, " r"],
 ) -> None:
-    """The transmittance of rays alone: nothing is sorted, no colour is read."""
+    """Write the transmittance of rays alone: nothing is sorted, no colour is read."""
     pyramid, walk = allocate_frustum(), allocate_traversal()
     candidates = allocate_candidates(INITIAL_CAPACITY)
     while True:

@@ -72,7 +72,7 @@ def copy_candidates_unsorted(candidates: Candidates, count: int, order: Int32[np
 
 @njit_no_refcount()
 def transpose_ray_masks(candidates: Candidates, count: int) -> None:
-    """The blocks of each ray from the rays of each block: squares of 64 bits are turned over.
+    """Write the blocks of each ray from the rays of each block: squares of 64 bits are turned over.
 
     Halves of a square change places, then quarters within the halves, down to single bits.
     """

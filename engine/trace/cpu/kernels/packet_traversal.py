@@ -47,7 +47,7 @@ SLOPE_MARGIN = 1e-9
 
 @device_function(error_model="numpy")
 def allocate_frustum() -> Frustum:
-    """Room for a pyramid."""
+    """Return room for a pyramid."""
     return Frustum(
         np.empty((FRUSTUM_PLANES, PLANE_WORDS), np.float32),
         np.empty(FRAME_WORDS, np.float64),
@@ -58,7 +58,7 @@ def allocate_frustum() -> Frustum:
 
 @device_function(error_model="numpy")
 def allocate_traversal() -> TraversalScratch:
-    """Memory for walks, one after another."""
+    """Return memory for walks, one after another."""
     return TraversalScratch(
         np.empty(STACK_WORDS, np.int64),
         np.empty(BLOCK_QUEUE_SIZE, np.int64),
@@ -70,7 +70,7 @@ def allocate_traversal() -> TraversalScratch:
 
 @njit_no_refcount(forceinline=True)
 def write_plane(plane: Float32[np.ndarray, "9"], x: float, y: float, z: float) -> None:
-    """A normal, its positive parts, which take a high corner, and its negative ones, which take a low."""
+    """Write a normal, its positive parts, which take a high corner, and its negative ones."""
     plane[0], plane[1], plane[2] = x, y, z
     plane[3], plane[4], plane[5] = max(x, 0.0), max(y, 0.0), max(z, 0.0)
     plane[6], plane[7], plane[8] = min(x, 0.0), min(y, 0.0), min(z, 0.0)
@@ -78,7 +78,7 @@ def write_plane(plane: Float32[np.ndarray, "9"], x: float, y: float, z: float) -
 
 @njit_no_refcount()
 def write_frustum(rays: RayArrays, first: int, last: int, frustum: Frustum) -> None:
-    """The pyramid around rays ``first`` to ``last``."""
+    """Write the pyramid around rays ``first`` to ``last``."""
     planes, frame, directions = frustum.planes, frustum.frame, rays.directions
     x = y = z = 0.0
     for r in range(first, last):
@@ -125,7 +125,7 @@ def gather_candidates(
     traversal: TraversalScratch,
     candidates: Candidates,
 ) -> int:
-    """The Gaussians whose ellipse a ray of the pyramid may meet before ``t_max``; returns how many.
+    """Gather the Gaussians whose ellipse a ray of the pyramid may meet before ``t_max``; return how many.
 
     Only as many as there is room for are written. Blocks are asked for when their box is reached, and tested
     when many wait.

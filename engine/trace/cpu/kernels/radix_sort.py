@@ -103,7 +103,7 @@ def _write_segments(
 def stable_argsort(
     keys: Shaped[np.ndarray, " e"], bits: int, threads: int
 ) -> tuple[Int32[np.ndarray, " e"], Shaped[np.ndarray, " e"]]:
-    """The order that sorts ``keys``, in which equal ones stay as they are, and the sorted keys.
+    """Return the order that sorts ``keys``, in which equal ones stay as they are, and the sorted keys.
 
     The result does not depend on ``threads``.
 

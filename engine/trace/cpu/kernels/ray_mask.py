@@ -170,7 +170,7 @@ def dot(a: Sequence[Vector], b: Sequence[Vector]) -> Vector:
 def rays_in_bins(
     bins: Int32[np.ndarray, "4 8"], lane: int, prefix_masks: UInt64[np.ndarray, "2 65"]
 ) -> tuple[int, int]:
-    """Bits of the rays in the bins of one lane, and the cell of their middle."""
+    """Return bits of the rays in the bins of one lane, and the cell of their middle."""
     i0, i1, j0, j1 = bins[0, lane], bins[1, lane], bins[2, lane], bins[3, lane]
     mask = prefix_masks[0, i1 + 1] & ~prefix_masks[0, i0] & prefix_masks[1, j1 + 1] & ~prefix_masks[1, j0]
     i, j = (i0 + i1) * CELL_GRID // (2 * BINS), (j0 + j1) * CELL_GRID // (2 * BINS)

@@ -14,14 +14,14 @@ HIT_PADDING = 8
 
 @njit_no_refcount(forceinline=True)
 def ray_origin(rays: RayArrays, r: int) -> tuple[float, float, float]:
-    """Origin of ray ``r`` in float64."""
+    """Return origin of ray ``r`` in float64."""
     o = r if len(rays.origins) > 1 else 0
     return np.float64(rays.origins[o, 0]), np.float64(rays.origins[o, 1]), np.float64(rays.origins[o, 2])
 
 
 @njit_no_refcount(forceinline=True)
 def ray_direction(rays: RayArrays, r: int) -> tuple[float, float, float]:
-    """Direction of ray ``r`` in float64."""
+    """Return direction of ray ``r`` in float64."""
     return (
         np.float64(rays.directions[r, 0]),
         np.float64(rays.directions[r, 1]),
@@ -31,7 +31,7 @@ def ray_direction(rays: RayArrays, r: int) -> tuple[float, float, float]:
 
 @njit_no_refcount(forceinline=True)
 def ray_slopes(rays: RayArrays, r: int, frame: Float64[np.ndarray, "15"]) -> tuple[float, float, float]:
-    """Slopes a and b of ray ``r`` in a packet's ``frame``, and its length over its way along the axis.
+    """Return slopes a and b of ray ``r`` in a packet's ``frame``, and its length over its way along the axis.
 
     The frame begins with the axis, e and f; the direction is axis + a e + b f over the third number.
     """
@@ -52,13 +52,13 @@ def primitive_vector(primitive: Float32[np.ndarray, "16"], offset: int) -> tuple
 
 @njit_no_refcount(forceinline=True)
 def ray_limits(rays: RayArrays, r: int) -> tuple[float, float]:
-    """Between which distances ray ``r`` sees; a single limit stands for all rays."""
+    """Return between which distances ray ``r`` sees; a single limit stands for all rays."""
     return rays.t_min[r if len(rays.t_min) > 1 else 0], rays.t_max[r if len(rays.t_max) > 1 else 0]
 
 
 @njit_no_refcount(forceinline=True)
 def ray_t_view_origin(rays: RayArrays, r: int) -> float:
-    """Where on ray ``r`` its viewer stands; a single one stands for all rays."""
+    """Return where on ray ``r`` its viewer stands; a single one stands for all rays."""
     return np.float64(rays.t_view_origin[r if len(rays.t_view_origin) > 1 else 0])
 
 
@@ -91,5 +91,5 @@ def facing_sign(
 
 @njit_no_refcount(forceinline=True)
 def first_hit_index(r: int, limits: TraceLimits) -> int:
-    """Where the hits of ray ``r`` may be stored from: each ray before it has room for its own."""
+    """Return where the hits of ray ``r`` may be stored from: each ray before it has room for its own."""
     return r * (limits.max_hits + HIT_PADDING)

@@ -110,7 +110,7 @@ def allocate_aligned_rows(rows: int, lanes: int) -> Float32[np.ndarray, "rows la
 
 @device_function(error_model="numpy")
 def allocate_packet_scratch(capacity: int) -> PacketScratch:
-    """Memory for packets of up to ``capacity`` candidates, one after another."""
+    """Return memory for packets of up to ``capacity`` candidates, one after another."""
     return PacketScratch(
         allocate_aligned_rows(RAY_ROWS, PACKET_RAYS),
         allocate_aligned_rows(STATE_ROWS, PACKET_RAYS),
@@ -134,7 +134,7 @@ def write_ray_rows(
     frame: Float64[np.ndarray, "15"],
     rows: Float32[np.ndarray, "5 64"],
 ) -> None:
-    """The rays ``first`` to ``last``, at most 64, in their packet's frame; lanes behind them see nothing."""
+    """Write the rays ``first`` to ``last``, at most 64, in their packet's frame; other lanes see nothing."""
     for r in range(first, last):
         k = r - first
         rows[SLOPE_A, k], rows[SLOPE_B, k], rows[PER_AXIS, k] = ray_slopes(rays, r, frame)
@@ -221,7 +221,7 @@ def trace_packet_shared_sort(
 def write_packet_outputs(
     first: int, last: int, state_rows: Float32[np.ndarray, "10 64"], out: OutputArrays
 ) -> None:
-    """What the rays ``first`` to ``last`` have seen."""
+    """Write what the rays ``first`` to ``last`` have seen."""
     for r in range(first, last):
         k = r - first
         out.counts[r] = np.int32(state_rows[COUNT, k])

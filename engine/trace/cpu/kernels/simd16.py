@@ -58,13 +58,13 @@ def _group_rows(builder: ir.IRBuilder, address: ir.Value, group: ir.Value) -> Ve
 
 
 def _word_loader(builder: ir.IRBuilder, address: ir.Value) -> Callable[[int], Vector]:
-    """Reads one number of an array into all lanes."""
+    """Return a function that reads one number of an array into all lanes."""
     words = builder.inttoptr(address, FLOAT.as_pointer())
     return lambda k: broadcast(builder, builder.load(builder.gep(words, [ir.Constant(I64, k)])), GROUP_SIZE)
 
 
 def _mask_lanes(builder: ir.IRBuilder, mask: ir.Value, vector: Vector) -> Vector:
-    """The lanes of a mask; zero in the others."""
+    """Return the lanes of a mask; zero in the others."""
     return Vector(builder, builder.select(mask, vector.value, ZEROS))
 
 

@@ -180,7 +180,7 @@ def _accumulate_moments(
     rows: ir.Value,
     count: ir.Value,
 ) -> None:
-    """The rows' part of :func:`backward_hits8`."""
+    """Write the rows' part of :func:`backward_hits8`."""
 
     def times(a: ir.Value, b: ir.Value) -> ir.Value:
         return builder.fmul(a, b, flags=("contract",))

@@ -36,32 +36,32 @@ def shift_lanes(builder: ir.IRBuilder, vector: Vector, offset_lanes: int, fill_v
 
 
 def splat(builder: ir.IRBuilder, scalar: ir.Value, kind: ir.Type) -> ir.Value:
-    """A vector of eight times ``scalar``."""
+    """Return a vector of eight times ``scalar``."""
     vector = ir.VectorType(kind, LANES)
     one = builder.insert_element(ir.Constant(vector, ir.Undefined), scalar, ir.Constant(I32, 0))
     return builder.shuffle_vector(one, ir.Constant(vector, ir.Undefined), ir.Constant(INT8, [0] * LANES))
 
 
 def keep_first_lanes(builder: ir.IRBuilder, vector: Vector, count: ir.Value) -> Vector:
-    """The first ``count`` lanes; zero in the others."""
+    """Return the first ``count`` lanes; zero in the others."""
     valid = first_lanes_mask(builder, count)
     return Vector(builder, builder.select(valid, vector.value, ir.Constant(vector.value.type, [0.0] * LANES)))
 
 
 def first_lanes_mask(builder: ir.IRBuilder, count: ir.Value) -> ir.Value:
-    """Truth for the first ``count`` lanes."""
+    """Return truth for the first ``count`` lanes."""
     lanes = ir.Constant(LONG8, list(range(LANES)))
     return builder.icmp_signed("<", lanes, splat(builder, count, I64))
 
 
 def key_indices(builder: ir.IRBuilder, key: ir.Value, valid: ir.Value) -> ir.Value:
-    """The lower halves of the keys, 0 where they are not valid."""
+    """Return the lower halves of the keys, 0 where they are not valid."""
     lower = builder.and_(key, ir.Constant(LONG8, [0xFFFFFFFF] * LANES))
     return builder.select(valid, lower, ir.Constant(LONG8, [0] * LANES))
 
 
 def key_distances(builder: ir.IRBuilder, key: ir.Value) -> ir.Value:
-    """The upper halves of the keys, float32."""
+    """Return the upper halves of the keys, float32."""
     upper = builder.lshr(key, ir.Constant(LONG8, [32] * LANES))
     return builder.bitcast(builder.trunc(upper, INT8), FLOAT8)
 
@@ -82,12 +82,12 @@ def gather(builder: ir.IRBuilder, address: ir.Value, indices: ir.Value, kind: ir
 
 
 def load(builder: ir.IRBuilder, address: ir.Value, kind: ir.Type) -> ir.Value:
-    """A vector of that kind from an address."""
+    """Return a vector of that kind from an address."""
     return builder.load(builder.inttoptr(address, kind.as_pointer()), align=4)
 
 
 def has_avx2_permute(context: BaseContext) -> bool:
-    """Whether lanes without gaps are to be made by AVX2's moves, see :class:`CompressedStore`."""
+    """Return whether lanes without gaps are to be made by AVX2's moves, see :class:`CompressedStore`."""
     features = context.codegen().magic_tuple()[2].split(",")
     return "+avx2" in features and "+avx512f" not in features
 
@@ -110,7 +110,7 @@ class CompressedStore:
             self.high_bits = builder.lshr(self.bits, ir.Constant(I64, 4))
 
     def count(self) -> ir.Value:
-        """How many lanes there are in the mask."""
+        """Return how many lanes there are in the mask."""
         return self.builder.ctpop(self.bits)
 
     def compress(self, value: ir.Value) -> ir.Value:
@@ -151,7 +151,7 @@ class CompressedStore:
         return builder.bitcast(moved, value.type)
 
     def _load_permutation(self, lanes: int, bits: ir.Value) -> ir.Value:
-        """Where each lane comes from, from a table over the masks of so many lanes."""
+        """Return where each lane comes from, from a table over the masks of so many lanes."""
         builder, words = self.builder, LANES // lanes
         rows = []
         for mask in range(1 << lanes):
@@ -164,7 +164,7 @@ class CompressedStore:
 
 
 def element_address(builder: ir.IRBuilder, address: ir.Value, index: ir.Value, size: int) -> ir.Value:
-    """The address of an element of an array."""
+    """Return the address of an element of an array."""
     return builder.add(address, builder.mul(index, ir.Constant(I64, size)))
 
 

@@ -48,7 +48,7 @@ def _tile_channels(builder: ir.IRBuilder, rgb: Sequence[ir.Value]) -> Vector:
 
 @intrinsic
 def eval_sh16(typingctx: TypingContext, sh: Address, basis: Address) -> Intrinsic:
-    """Sums over the harmonics of ``sh`` (16 x 3 float32) times ``basis`` (16 doubles), three doubles."""
+    """Sum over the harmonics of ``sh`` (16 x 3 float32) times ``basis`` (16 doubles), three doubles."""
     signature = types.UniTuple(types.float64, CHANNELS)(types.uintp, types.uintp)
 
     def codegen(

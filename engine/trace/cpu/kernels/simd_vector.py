@@ -89,13 +89,13 @@ class Vector:
         return Vector(self.builder, self.builder.bitcast(bits, self.value.type))
 
     def maximum(self, other: "Vector | float") -> "Vector":
-        """The larger of two lanes; the second where they cannot be compared."""
+        """Return the larger of two lanes; the second where they cannot be compared."""
         return Vector(
             self.builder, self.builder.select((self > other).value, self.value, self._operand(other))
         )
 
     def minimum(self, other: "Vector | float") -> "Vector":
-        """The smaller of two lanes; the second where they cannot be compared."""
+        """Return the smaller of two lanes; the second where they cannot be compared."""
         return Vector(
             self.builder, self.builder.select((self < other).value, self.value, self._operand(other))
         )
@@ -109,14 +109,14 @@ class Vector:
         )
 
     def sqrt(self) -> "Vector":
-        """Square roots."""
+        """Return square roots."""
         kind = self.value.type
         name = "llvm.sqrt.v8f64" if kind == DOUBLE8 else "llvm.sqrt.v8f32"
         function = cgutils.get_or_insert_function(self.builder.module, ir.FunctionType(kind, [kind]), name)
         return Vector(self.builder, self.builder.call(function, [self.value]))
 
     def to_float64(self) -> "Vector":
-        """The same numbers of float32 lanes as doubles."""
+        """Return the same numbers of float32 lanes as doubles."""
         return Vector(self.builder, self.builder.fpext(self.value, DOUBLE8))
 
     def to_int32(self) -> "Vector":
@@ -124,7 +124,7 @@ class Vector:
         return Vector(self.builder, self.builder.fptosi(self.value, ir.VectorType(ir.IntType(32), LANES)))
 
     def to_bitmask(self) -> ir.Value:
-        """Truth of the lanes as the low bits of an int64."""
+        """Return truth of the lanes as the low bits of an int64."""
         return self.builder.zext(self.builder.bitcast(self.value, ir.IntType(self.value.type.count)), I64)
 
 
@@ -156,7 +156,7 @@ class VectorRows:
 
 
 def broadcast(builder: ir.IRBuilder, scalar: ir.Value, lanes: int = LANES) -> Vector:
-    """A vector of so many times the same float32 or double."""
+    """Return a vector of so many times the same float32 or double."""
     nothing = ir.Constant(ir.VectorType(scalar.type, lanes), ir.Undefined)
     one = builder.insert_element(nothing, scalar, ir.Constant(ir.IntType(32), 0))
     zeros = ir.Constant(ir.VectorType(ir.IntType(32), lanes), [0] * lanes)
@@ -164,7 +164,7 @@ def broadcast(builder: ir.IRBuilder, scalar: ir.Value, lanes: int = LANES) -> Ve
 
 
 def exp_float32(builder: ir.IRBuilder, x: Vector) -> Vector:
-    """Exponentials of float32: 2^n times a polynomial of what is left, at most half of ln 2.
+    """Return exponentials of float32: 2^n times a polynomial of what is left, at most half of ln 2.
 
     Right to a relative 1e-7 for |x| < 87. The polynomial and ln 2 in two parts, the first of which times n is
     exact, are those of Cephes' expf (https://www.netlib.org/cephes/).
@@ -264,7 +264,7 @@ def _plane_component(builder: ir.IRBuilder, planes: ir.Value, side: int, column:
 
 @intrinsic
 def lowest_bit(typingctx: TypingContext, mask: int) -> Intrinsic:
-    """Place of the lowest bit that is set; ``mask`` must not be zero."""
+    """Return place of the lowest bit that is set; ``mask`` must not be zero."""
     signature = types.int64(types.int64)
 
     def codegen(

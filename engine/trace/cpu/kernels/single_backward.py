@@ -197,7 +197,7 @@ def write_geometry_gradients(
     moments: GaussianMoments,
     out: GaussianGradientArrays,
 ) -> None:
-    """Gradients of one Gaussian's raw geometry from its sums over rays.
+    """Write gradients of one Gaussian's raw geometry from its sums over rays.
 
     In the Gaussian's own frame, with u, v the hit in standard deviations, tau = dL/dt through the point
     over <d, r1>: dL/dm = S(h u)/s2 r2 + S(h v)/s3 r3 + S(tau) r1, dL/dln s = S(h u^2), S(h v^2), and the

@@ -67,7 +67,7 @@ def chunk_context(
     Int32[np.ndarray, " words"],
     Float64[np.ndarray, " words"],
 ]:
-    """The ray of a chunk and its context, as words of each type."""
+    """Return the ray of a chunk and its context, as words of each type."""
     ray = embree.scratch[chunk]
     context = ray[RAY_WORDS:]
     return ray, ray.view(np.int32), context, context.view(np.int32), context.view(np.float64)
@@ -83,7 +83,7 @@ def write_ray_query(
     t_near: float,
     t_far: float,
 ) -> None:
-    """The ray and the start of its context as Embree wants them."""
+    """Write the ray and the start of its context as Embree wants them."""
     for axis in range(3):
         ray[axis] = origin[axis]
         ray[4 + axis] = direction[axis]
@@ -189,7 +189,7 @@ def write_ray_transmittance(
     counter: Int64[np.ndarray, "1"],
     transmittance: Float32[np.ndarray, " r"],
 ) -> None:
-    """The transmittance alone of the rays ``ray_indices``, 0 where it falls below eps1."""
+    """Write the transmittance alone of the rays ``ray_indices``, 0 where it falls below eps1."""
     chunk_count = (len(ray_indices) + rays_per_chunk - 1) // rays_per_chunk
     while True:
         chunk = atomic_fetch_next(counter.ctypes.data)

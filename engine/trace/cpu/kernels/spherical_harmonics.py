@@ -24,7 +24,7 @@ SH_BYTES = HARMONICS * CHANNELS * 4
 
 @njit_no_refcount()
 def eval_sh_basis(basis: Float64[np.ndarray, " k"], count: int, x: float, y: float, z: float) -> None:
-    """Values of the first ``count`` (1, 4, 9 or 16) harmonics at the unit direction (x, y, z)."""
+    """Write values of the first ``count`` (1, 4, 9 or 16) harmonics at the unit direction (x, y, z)."""
     basis[0] = SH_C0
     if count > 1:
         basis[1] = -SH_C1 * y
@@ -51,7 +51,7 @@ def eval_sh_basis(basis: Float64[np.ndarray, " k"], count: int, x: float, y: flo
 def eval_color(
     sh: Float32[np.ndarray, "n k 3"], i: int, basis: Float64[np.ndarray, " k"]
 ) -> tuple[float, float, float]:
-    """Display colour max(0, 1/2 + sum_k sh[i, k] basis[k]) of Gaussian ``i``, three float64."""
+    """Return display colour max(0, 1/2 + sum_k sh[i, k] basis[k]) of Gaussian ``i``, three float64."""
     if sh.shape[1] == HARMONICS:
         red, green, blue = eval_sh16(sh.ctypes.data + i * SH_BYTES, basis.ctypes.data)
         return max(0.5 + red, 0.0), max(0.5 + green, 0.0), max(0.5 + blue, 0.0)
@@ -84,7 +84,7 @@ def accumulate_sh_gradient(
 def eval_view_basis(
     basis: Float64[np.ndarray, " k"], count: int, x: float, y: float, z: float
 ) -> tuple[float, float, float, float]:
-    """The first ``count`` harmonics for a mean at (x, y, z) from the viewer.
+    """Write the first ``count`` harmonics for a mean at (x, y, z) from the viewer.
 
     Returns the direction there, and one over the distance. A mean at the viewer has the direction zero.
     """
@@ -129,7 +129,7 @@ def write_basis_gradient(
     count: int,
     color_gradient: tuple[float, float, float],
 ) -> None:
-    """Gradients by the values of the first ``count`` harmonics of Gaussian ``i``."""
+    """Write gradients by the values of the first ``count`` harmonics of Gaussian ``i``."""
     if count == HARMONICS:
         write_basis_gradient16(values.ctypes.data, sh.ctypes.data + i * SH_BYTES, *color_gradient)
         return
