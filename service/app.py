@@ -21,7 +21,7 @@ from octasplat.service.middleware import (
     SameOriginMiddleware,
     SecurityHeadersMiddleware,
 )
-from octasplat.service.openapi import extend_openapi
+from octasplat.service.openapi import extend_openapi, operation_id
 from octasplat.service.problems import add_problem_handlers
 from octasplat.service.proxy_headers import ProxyHeadersMiddleware
 from octasplat.service.routes import (
@@ -90,6 +90,7 @@ def create_app(settings: ServiceSettings | None = None) -> FastAPI:
         summary="A reconstruction service",
         description=DESCRIPTION,
         lifespan=lifespan,
+        generate_unique_id_function=operation_id,
         docs_url=None,  # the pages have their own, which needs nothing from elsewhere
         redoc_url=None,
         license_info={"name": "Apache-2.0", "identifier": "Apache-2.0"},

@@ -3,6 +3,7 @@
 from typing import Any
 
 from fastapi import FastAPI
+from fastapi.routing import APIRoute
 from pydantic.json_schema import models_json_schema
 
 from octasplat.service.problems import ProblemDocument
@@ -10,6 +11,12 @@ from octasplat.workers.worker.job_kinds import JobKind, job_kinds
 
 _REF = "#/components/schemas/"
 _DEFAULT_KIND = "reconstruct"
+
+
+def operation_id(route: APIRoute) -> str:
+    """Return the operation id of a route: its function's name in camel case, as ``createJob``."""
+    first, *others = route.name.split("_")
+    return first + "".join(word.title() for word in others)
 
 
 def extend_openapi(app: FastAPI) -> None:

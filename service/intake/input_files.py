@@ -60,7 +60,7 @@ def check_input_content(storage: Storage, name: str, sha256: str, limits: ImageL
             detail = f"{quoted_name(name)} is no {what} by its content; send the file anew."
             raise IntakeError(IntakeFault("file-kind", detail, name))
         if suffix in _TEXT_SUFFIXES and _has_long_line(file):
-            detail = f"{quoted_name(name)} has a line of more than {MAX_TEXT_LINE_BYTES:,} bytes; write it in lines."
+            detail = f"{quoted_name(name)} has a line of more than {MAX_TEXT_LINE_BYTES:,} bytes; split it."
             raise IntakeError(IntakeFault("file-kind", detail, name))
     return None
 

@@ -13,7 +13,7 @@ router = APIRouter(prefix="/v1/audit", tags=["service"])
 
 
 @router.get("", responses=problem_responses())
-async def get_audit(
+async def list_audit_entries(
     _who: Admin, service: ServiceDep, request: Request, response: Response, limit: Limit = 50,
     cursor: Cursor = None,
 ) -> AuditPage:  # fmt: skip

@@ -157,7 +157,7 @@ async def put_archive(
 
 
 @router.post("/{dataset_id}/commit", responses=problem_responses(404, 409))
-async def commit(dataset_id: uuid.UUID, who: Writer, service: ServiceDep) -> DatasetView:
+async def commit_dataset(dataset_id: uuid.UUID, who: Writer, service: ServiceDep) -> DatasetView:
     """Check the dataset; if it is sound it never changes again and jobs can use it, else see `errors`."""
     return DatasetView.from_row(await actions.commit_dataset(service, who, dataset_id))
 

@@ -41,13 +41,13 @@ async def list_queues(_who: Reader, service: ServiceDep) -> QueueList:
 
 
 @router.get("/tokens", responses=problem_responses())
-async def get_tokens(_who: Admin, service: ServiceDep) -> TokenList:
+async def list_tokens(_who: Admin, service: ServiceDep) -> TokenList:
     """Return all tokens, without their secrets."""
     return TokenList(tokens=[TokenView.from_row(row) for row in await tokens.list_tokens(service)])
 
 
 @router.post("/tokens", status_code=201, responses=problem_responses())
-async def make_token(new: NewToken, _who: Admin, service: ServiceDep, response: Response) -> MadeToken:
+async def create_token(new: NewToken, _who: Admin, service: ServiceDep, response: Response) -> MadeToken:
     """Make a token. From the first one on, nobody gets in without."""
     made = await tokens.create_token(service, new)
     response.headers["Location"] = f"/v1/tokens/{made.id}"
@@ -61,7 +61,7 @@ async def delete_token(token_id: uuid.UUID, _who: Admin, service: ServiceDep) ->
 
 
 @router.post("/sign-in-links", status_code=201, responses=problem_responses(409))
-async def make_link(who: Writer, service: ServiceDep) -> SignInLink:
+async def create_sign_in_link(who: Writer, service: ServiceDep) -> SignInLink:
     """Make a link that signs a browser in with your token, once, within five minutes."""
     return await tokens.create_sign_in_link(service, who)
 

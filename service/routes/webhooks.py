@@ -88,7 +88,7 @@ async def list_deliveries(
 @router.post(
     "/{webhook_id}/deliveries/{delivery_id}/redeliver", status_code=202, responses=problem_responses(404, 409)
 )
-async def redeliver(
+async def resend_delivery(
     webhook_id: uuid.UUID, delivery_id: uuid.UUID, who: Writer, service: ServiceDep
 ) -> DeliveryView:
     """Send a message once more, with the same id and content."""
