@@ -54,6 +54,7 @@ def write_run(folder: Path, *assignments: str) -> Path:
 
 @pytest.mark.parametrize("model", MODELS)
 def test_settings_have_description_unit_and_group(model: type[BaseModel]) -> None:
+    assert model.model_fields
     for name, info in model.model_fields.items():
         assert info.description and info.description.endswith("."), name
         if isinstance(info.default, BaseModel):

@@ -37,6 +37,7 @@ def test_examples_of_the_page_run() -> None:
 
 
 def test_public_names_are_importable() -> None:
+    assert len(MODULES) > 5
     assert sorted(octasplat.__all__) == octasplat.__all__ == sorted({"__version__", *octasplat._SOURCES})
     for name in PUBLIC:
         assert getattr(octasplat, name).__doc__, name

@@ -61,7 +61,9 @@ def test_export_opaque_unsupported_format_is_refused(run, octasplat, tmp_path):
 def test_export_obj_prints_all_written_files(run, octasplat, tmp_path):
     result = octasplat("export", run.output / "scene.ply", tmp_path / "scene.obj", "--q", 4)
     assert result.exit_code == 0, result.output
-    for path in tmp_path.iterdir():
+    paths = list(tmp_path.iterdir())
+    assert tmp_path / "scene.obj" in paths
+    for path in paths:
         assert str(path) in result.stdout
 
 

@@ -37,7 +37,9 @@ def test_views_and_their_size(run, octasplat, tmp_path, which, count):
 def test_antialiased_small_render_equals_downscaled_large(run, octasplat, tmp_path):
     for name, size in (("large", ()), ("small", ("--max-side", 16))):
         assert octasplat("render", run.output, "-o", tmp_path / name, *size).exit_code == 0
-    for path in (tmp_path / "small").iterdir():
+    paths = list((tmp_path / "small").iterdir())
+    assert paths
+    for path in paths:
         large, small = read_image(tmp_path / "large" / path.name), read_image(path)
         wanted = large.reshape(12, large.shape[0] // 12, 16, large.shape[1] // 16, 3).mean(axis=(1, 3))
         assert np.abs(small - wanted).mean() < 1 / 255

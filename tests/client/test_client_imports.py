@@ -19,7 +19,9 @@ def test_client_loads_no_cli_or_heavy_modules() -> None:
 
 
 def test_client_modules_do_not_print() -> None:
-    for path in sorted((ROOT / "workers" / "client").glob("*.py")):
+    paths = sorted((ROOT / "workers" / "client").glob("*.py"))
+    assert paths
+    for path in paths:
         for node in ast.walk(ast.parse(path.read_text())):
             if isinstance(node, ast.Import | ast.ImportFrom):
                 names = {alias.name for alias in node.names} | {getattr(node, "module", None) or ""}

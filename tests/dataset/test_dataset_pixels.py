@@ -70,6 +70,7 @@ def test_tables_and_direct_rays_agree(tmp_path, make_scene, coded):
 
 def test_dataset_view_equals_sampled_pixels(tmp_path, make_scene, coded):
     data = Dataset.open(mixed_scene(make_scene, tmp_path / "scene", coded), tmp_path / "cache")
+    assert len(data.views) >= 3
     for index, view in enumerate(data.views):
         shape = (view.height_px, view.width_px)
         pixels = all_pixels(data, index)

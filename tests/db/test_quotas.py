@@ -41,52 +41,46 @@ async def new_job(connection: Connection, owner: str, state: str = "queued") -> 
     return job_id
 
 
-def test_usage_counts_owner_contents(conninfo: str) -> None:
-    async def check() -> None:
-        connection = await connect(conninfo)
-        mine = await create_dataset(connection, "me", "a")
-        other = await create_dataset(connection, "other", "b")
-        await put_file(connection, mine.id, "images/a.jpg", "a" * 64, 100)
-        await put_file(connection, mine.id, "images/copy.jpg", "a" * 64, 100)
-        await put_file(connection, mine.id, "images/b.jpg", "b" * 64, 10)
-        await put_file(connection, other.id, "images/c.jpg", "c" * 64, 1000)
-        done = await new_job(connection, "me", "succeeded")
-        await new_job(connection, "me", "running")
-        async with connection.transaction():
-            await lock_owner(connection, "me")
-            await connection.execute(
-                "INSERT INTO artifacts (job_id, name, sha256, size_bytes, media_type) "
-                "VALUES (%s, 'x', %s, 7, '')",
-                [done, "d" * 64],
-            )
-        assert await usage_of(connection, "me") == Usage(bytes=117, datasets=1, jobs=1)
-        assert await usage_of(connection, "nobody") == Usage(0, 0, 0)
-        assert await bytes_left(connection, "me") is None
-        assert await bytes_left(connection, "me", Quota(max_bytes=120)) == 3
-        assert await bytes_left(connection, "me", Quota(max_bytes=50)) == 0
-        await connection.close()
-
-    asyncio.run(check())
+async def test_usage_counts_owner_contents(conninfo: str) -> None:
+    connection = await connect(conninfo)
+    mine = await create_dataset(connection, "me", "a")
+    other = await create_dataset(connection, "other", "b")
+    await put_file(connection, mine.id, "images/a.jpg", "a" * 64, 100)
+    await put_file(connection, mine.id, "images/copy.jpg", "a" * 64, 100)
+    await put_file(connection, mine.id, "images/b.jpg", "b" * 64, 10)
+    await put_file(connection, other.id, "images/c.jpg", "c" * 64, 1000)
+    done = await new_job(connection, "me", "succeeded")
+    await new_job(connection, "me", "running")
+    async with connection.transaction():
+        await lock_owner(connection, "me")
+        await connection.execute(
+            "INSERT INTO artifacts (job_id, name, sha256, size_bytes, media_type) "
+            "VALUES (%s, 'x', %s, 7, '')",
+            [done, "d" * 64],
+        )
+    assert await usage_of(connection, "me") == Usage(bytes=117, datasets=1, jobs=1)
+    assert await usage_of(connection, "nobody") == Usage(0, 0, 0)
+    assert await bytes_left(connection, "me") is None
+    assert await bytes_left(connection, "me", Quota(max_bytes=120)) == 3
+    assert await bytes_left(connection, "me", Quota(max_bytes=50)) == 0
+    await connection.close()
 
 
-def test_owner_quota_overrides_settings(conninfo: str) -> None:
-    async def check() -> None:
-        connection = await connect(conninfo)
-        default = Quota(10, 20, 30)
-        assert await quota_of(connection, "me", default) == default
-        await set_quota(connection, "me", Quota(max_datasets=5))
-        await set_quota(connection, "me", Quota(max_jobs=0))
-        assert await quota_of(connection, "me", default) == Quota(10, 20, 0)
-        with pytest.raises(QuotaExceededError) as caught:
-            await check_new_job(connection, "me", default)
-        assert caught.value.resource == "jobs"
-        await check_new_job(connection, "other", default)
-        await connection.close()
-
-    asyncio.run(check())
+async def test_owner_quota_overrides_settings(conninfo: str) -> None:
+    connection = await connect(conninfo)
+    default = Quota(10, 20, 30)
+    assert await quota_of(connection, "me", default) == default
+    await set_quota(connection, "me", Quota(max_datasets=5))
+    await set_quota(connection, "me", Quota(max_jobs=0))
+    assert await quota_of(connection, "me", default) == Quota(10, 20, 0)
+    with pytest.raises(QuotaExceededError) as caught:
+        await check_new_job(connection, "me", default)
+    assert caught.value.resource == "jobs"
+    await check_new_job(connection, "other", default)
+    await connection.close()
 
 
-def test_concurrent_requests_respect_quota(conninfo: str) -> None:
+async def test_concurrent_requests_respect_quota(conninfo: str) -> None:
     quota = Quota(max_bytes=1000, max_datasets=3)
 
     async def make_dataset(number: int) -> bool:
@@ -115,18 +109,15 @@ def test_concurrent_requests_respect_quota(conninfo: str) -> None:
             await connection.close()
         return True
 
-    async def check() -> None:
-        made = await asyncio.gather(*(make_dataset(number) for number in range(10)))
-        assert sum(made) == 3
-        connection = await connect(conninfo)
-        cursor = await connection.execute("SELECT id FROM datasets")
-        ids = [row["id"] for row in await cursor.fetchall()]
-        stored = await asyncio.gather(*(upload(ids[number % 3], number) for number in range(10)))
-        assert sum(stored) == 3
-        assert (await usage_of(connection, "me")).bytes == 900
-        await connection.close()
-
-    asyncio.run(check())
+    made = await asyncio.gather(*(make_dataset(number) for number in range(10)))
+    assert sum(made) == 3
+    connection = await connect(conninfo)
+    cursor = await connection.execute("SELECT id FROM datasets")
+    ids = [row["id"] for row in await cursor.fetchall()]
+    stored = await asyncio.gather(*(upload(ids[number % 3], number) for number in range(10)))
+    assert sum(stored) == 3
+    assert (await usage_of(connection, "me")).bytes == 900
+    await connection.close()
 
 
 def test_quota_command_shows_and_sets_limits(conninfo: str, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -141,15 +132,14 @@ def test_quota_command_shows_and_sets_limits(conninfo: str, monkeypatch: pytest.
     assert run(quota_command, ["me", "--jobs", "many"]).exit_code == 2
 
 
-def test_connection_pool_is_large_enough(conninfo: str) -> None:
-    async def check() -> None:
-        async with open_pool(conninfo, max_size=2) as pool, pool.connection() as connection:
-            await check_bytes(connection, "me", Quota(max_bytes=0))
+async def test_connection_pool_is_large_enough(conninfo: str) -> None:
+    async with open_pool(conninfo, max_size=2) as pool, pool.connection() as connection:
+        await check_bytes(connection, "me", Quota(max_bytes=0))
+        stats = pool.get_stats()
+    assert stats["pool_size"] == 1 and not stats.get("requests_errors")  # no second connection was asked for
 
-    asyncio.run(check())
 
-
-def test_usage_count_matches_distinct_contents(conninfo: str) -> None:
+async def test_usage_count_matches_distinct_contents(conninfo: str) -> None:
     """Whatever comes, is replaced and goes, in any order, the count is that of all distinct contents."""
     truth = """
         SELECT coalesce(sum(size_bytes), 0)::bigint AS n FROM (
@@ -167,42 +157,39 @@ def test_usage_count_matches_distinct_contents(conninfo: str) -> None:
         number = random.randrange(12)
         return f"{number:064x}", 10 * number + 1
 
-    async def check() -> None:
-        connection = await connect(conninfo)
-        datasets = [(await create_dataset(connection, "me", str(n))).id for n in range(3)]
-        jobs = [await new_job(connection, "me", "succeeded") for _ in range(3)]
-        seen = set()
-        for _ in range(150):
-            sha256, size_bytes = content()
-            async with connection.transaction():
-                await lock_owner(connection, "me")
-                match random.randrange(6):
-                    case 0 | 1:
-                        path = f"images/{random.randrange(4)}.jpg"
-                        await put_file(connection, random.choice(datasets), path, sha256, size_bytes)
-                    case 2:
-                        await connection.execute(
-                            "INSERT INTO artifacts VALUES (%s, %s, %s, %s, '') ON CONFLICT DO NOTHING",
-                            [random.choice(jobs), str(random.randrange(3)), sha256, size_bytes],
-                        )
-                    case 3:
-                        files = [{"path": str(n), "sha256": s, "size_bytes": b} for n, (s, b) in
-                                 enumerate(content() for _ in range(3))]  # fmt: skip
-                        kept = Jsonb({"files": files}) if random.random() < 0.7 else None
-                        query = "UPDATE jobs SET checkpoint = %s WHERE id = %s"
-                        await connection.execute(query, [kept, random.choice(jobs)])
-                    case 4:
-                        gone = datasets.pop(random.randrange(3))
-                        await connection.execute("DELETE FROM datasets WHERE id = %s", [gone])
-                        datasets.append((await create_dataset(connection, "me", "again")).id)
-                    case 5:
-                        gone = jobs.pop(random.randrange(3))
-                        await connection.execute("DELETE FROM jobs WHERE id = %s", [gone])
-                        jobs.append(await new_job(connection, "me", "succeeded"))
-            row = await (await connection.execute(truth)).fetchone()
-            assert row is not None and (await usage_of(connection, "me")).bytes == row["n"]
-            seen.add(row["n"])
-        assert len(seen) > 30
-        await connection.close()
-
-    asyncio.run(check())
+    connection = await connect(conninfo)
+    datasets = [(await create_dataset(connection, "me", str(n))).id for n in range(3)]
+    jobs = [await new_job(connection, "me", "succeeded") for _ in range(3)]
+    seen = set()
+    for _ in range(150):
+        sha256, size_bytes = content()
+        async with connection.transaction():
+            await lock_owner(connection, "me")
+            match random.randrange(6):
+                case 0 | 1:
+                    path = f"images/{random.randrange(4)}.jpg"
+                    await put_file(connection, random.choice(datasets), path, sha256, size_bytes)
+                case 2:
+                    await connection.execute(
+                        "INSERT INTO artifacts VALUES (%s, %s, %s, %s, '') ON CONFLICT DO NOTHING",
+                        [random.choice(jobs), str(random.randrange(3)), sha256, size_bytes],
+                    )
+                case 3:
+                    files = [{"path": str(n), "sha256": s, "size_bytes": b} for n, (s, b) in
+                             enumerate(content() for _ in range(3))]  # fmt: skip
+                    kept = Jsonb({"files": files}) if random.random() < 0.7 else None
+                    query = "UPDATE jobs SET checkpoint = %s WHERE id = %s"
+                    await connection.execute(query, [kept, random.choice(jobs)])
+                case 4:
+                    gone = datasets.pop(random.randrange(3))
+                    await connection.execute("DELETE FROM datasets WHERE id = %s", [gone])
+                    datasets.append((await create_dataset(connection, "me", "again")).id)
+                case 5:
+                    gone = jobs.pop(random.randrange(3))
+                    await connection.execute("DELETE FROM jobs WHERE id = %s", [gone])
+                    jobs.append(await new_job(connection, "me", "succeeded"))
+        row = await (await connection.execute(truth)).fetchone()
+        assert row is not None and (await usage_of(connection, "me")).bytes == row["n"]
+        seen.add(row["n"])
+    assert len(seen) > 30
+    await connection.close()

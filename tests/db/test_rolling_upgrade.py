@@ -1,6 +1,5 @@
 """Tables are brought up to date while others use them, and what was miscounted is counted anew."""
 
-import asyncio
 import threading
 import time
 import uuid
@@ -152,46 +151,38 @@ def test_locked_tables_are_named(empty: str, monkeypatch: pytest.MonkeyPatch) ->
     assert migrate(empty) == (STEPS[-1],)
 
 
-def test_backup_locks_no_table_during_copy(conninfo: str, tmp_path: Path) -> None:
+async def test_backup_locks_no_table_during_copy(conninfo: str, tmp_path: Path) -> None:
     storage = LocalStorage(tmp_path / "store", floor_bytes=0)
     with storage.open_writer() as writer:
         writer.write(b"a photograph")
         blob = writer.commit()
-
-    async def enter() -> None:
-        async with open_pool(conninfo) as pool:
-            async with pool.connection() as connection:
-                dataset = await create_dataset(connection, "me", "a")
-            async with pool.connection() as connection:
-                await put_files(connection, dataset.id, [NewFile("images/a.jpg", blob.sha256, 12)])
 
     def upgrade(_done: int, _count: int) -> None:
         with psycopg.connect(conninfo) as connection:
             connection.execute("SET lock_timeout = '2s'")
             connection.execute("ALTER TABLE datasets ADD COLUMN further text")
 
-    asyncio.run(enter())
+    async with open_pool(conninfo) as pool:
+        async with pool.connection() as connection:
+            dataset = await create_dataset(connection, "me", "a")
+        async with pool.connection() as connection:
+            await put_files(connection, dataset.id, [NewFile("images/a.jpg", blob.sha256, 12)])
     assert create_backup(conninfo, storage, tmp_path / "backup", on_content=upgrade).contents == 1
 
 
-def test_many_file_archive_is_recorded_quickly(conninfo: str) -> None:
+async def test_many_file_archive_is_recorded_quickly(conninfo: str) -> None:
     """12,000 of them; others of the same owner wait no longer than that."""
     files = [NewFile(f"images/{n}.jpg", f"{n:064x}", 10, {"width_px": n}) for n in range(12_000)]
 
-    async def enter() -> float:
-        async with open_pool(conninfo) as pool:
+    async with open_pool(conninfo) as pool:
+        async with pool.connection() as connection:
+            dataset = await create_dataset(connection, "me", "a")
+        for again in range(2):
+            began = time.monotonic()
             async with pool.connection() as connection:
-                dataset = await create_dataset(connection, "me", "a")
-            for again in range(2):
-                began = time.monotonic()
-                async with pool.connection() as connection:
-                    rows = await put_files(connection, dataset.id, files)
-                took = time.monotonic() - began
-                assert len(rows) == 12_000 and rows[0].path == "images/0.jpg", again
-            with psycopg.connect(conninfo) as connection:
-                assert usage(connection) == 120_000
-        return took
-
-    took = asyncio.run(enter())
-
+                rows = await put_files(connection, dataset.id, files)
+            took = time.monotonic() - began
+            assert len(rows) == 12_000 and rows[0].path == "images/0.jpg", again
+        with psycopg.connect(conninfo) as connection:
+            assert usage(connection) == 120_000
     assert took < 12  # it was 24 s for as many on an idle machine

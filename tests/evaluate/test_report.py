@@ -271,7 +271,9 @@ def test_duration_is_formatted(seconds, text):
 
 
 def test_axes_have_labelled_ticks_inside_the_plot():
-    for chart in training_charts(EVENTS):
+    charts = training_charts(EVENTS)
+    assert charts
+    for chart in charts:
         assert 2 <= len(chart.x_ticks) <= 8
         assert 2 <= len(chart.y_ticks) <= 12
         assert all(52 <= tick.at <= 408 for tick in chart.x_ticks)

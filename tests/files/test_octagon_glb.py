@@ -181,7 +181,9 @@ def test_root_node_turns_y_down_into_y_up(make_scene: Make, tmp_path: Path) -> N
 
 def test_octagon_glb_ids_option_omits_ids(make_scene: Make, tmp_path: Path) -> None:
     export_scene(make_scene(600), tmp_path / "a.glb", ExportOptions(ids=False))
-    for arrays in Glb(tmp_path / "a.glb").primitives():
+    primitives = Glb(tmp_path / "a.glb").primitives()
+    assert primitives
+    for arrays in primitives:
         assert set(arrays) == {"POSITION", "COLOR_0", "TEXCOORD_0", "indices"}
 
 

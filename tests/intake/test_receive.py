@@ -98,23 +98,20 @@ def test_receive_stalled_upload_is_refused(local_storage: LocalStorage) -> None:
     assert local_storage.remove_stale_uploads(-60) == 0
 
 
-def test_receive_disconnected_client_stores_nothing(local_storage: LocalStorage) -> None:
-    async def leave() -> None:
-        arrived = asyncio.Event()
+async def test_receive_disconnected_client_stores_nothing(local_storage: LocalStorage) -> None:
+    arrived = asyncio.Event()
 
-        async def endless() -> AsyncIterator[bytes]:
-            while True:
-                yield bytes(1 << 20)
-                arrived.set()
-                await asyncio.sleep(0.001)
+    async def endless() -> AsyncIterator[bytes]:
+        while True:
+            yield bytes(1 << 20)
+            arrived.set()
+            await asyncio.sleep(0.001)
 
-        task = asyncio.create_task(receive_body(endless(), local_storage.open_writer()))
-        await arrived.wait()
-        task.cancel()
-        with pytest.raises(asyncio.CancelledError):
-            await task
-
-    asyncio.run(leave())
+    task = asyncio.create_task(receive_body(endless(), local_storage.open_writer()))
+    await arrived.wait()
+    task.cancel()
+    with pytest.raises(asyncio.CancelledError):
+        await task
     assert local_storage.remove_stale_uploads(-60) == 0
     assert list(local_storage.list_blobs()) == []
 

@@ -1,12 +1,12 @@
 """What is old goes when it was told to go, and nothing else; the store loses what nothing names."""
 
-import asyncio
 import os
 import time
 import uuid
-from collections.abc import Awaitable, Callable
+from collections.abc import AsyncIterator
+from contextlib import AbstractAsyncContextManager, asynccontextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import pytest
 from psycopg.types.json import Jsonb
@@ -39,17 +39,21 @@ KEEP = Retention(jobs_hours=100, jobs_hours_by_kind={"render": 1, "export": 0}, 
 SLIPS = ProcrastinateQueue()
 
 
+class ConnectDatabase(Protocol):
+    """Opens a pool and takes a connection that commits each statement."""
+
+    def __call__(self) -> AbstractAsyncContextManager[tuple[Pool, Connection]]: ...
+
+
 @pytest.fixture
-def within(conninfo: str) -> Callable[[Callable[[Pool, Connection], Awaitable[None]]], None]:
-    def run(what: Callable[[Pool, Connection], Awaitable[None]]) -> None:
-        async def whole() -> None:
-            async with open_pool(conninfo) as pool, pool.connection() as connection:
-                await connection.set_autocommit(True)
-                await what(pool, connection)
+def connect_database(conninfo: str) -> ConnectDatabase:
+    @asynccontextmanager
+    async def connect() -> AsyncIterator[tuple[Pool, Connection]]:
+        async with open_pool(conninfo) as pool, pool.connection() as connection:
+            await connection.set_autocommit(True)
+            yield pool, connection
 
-        asyncio.run(whole())
-
-    return run
+    return connect
 
 
 async def finished(connection: Connection, pool: Pool, kind: str = "x", **fields: Any) -> Job:
@@ -78,8 +82,8 @@ async def hours_left(connection: Connection, table: str, row_id: uuid.UUID) -> f
     return left
 
 
-def test_retention_per_kind_overrides_default(within: Any) -> None:
-    async def story(pool: Pool, connection: Connection) -> None:
+async def test_retention_per_kind_overrides_default(connect_database: ConnectDatabase) -> None:
+    async with connect_database() as (pool, connection):
         plain, render, export = [await finished(connection, pool, k) for k in ("x", "render", "export")]
         pinned = await finished(connection, pool)
         await change_job(connection, pinned.id, label=None, pinned=True)
@@ -94,31 +98,25 @@ def test_retention_per_kind_overrides_default(within: Any) -> None:
         assert (await existing(connection, plain.id)).version == version
         assert await delete_expired(connection) == DeletedCounts(0, 0)
 
-    within(story)
 
-
-def test_retention_default_keeps_finished_jobs(within: Any) -> None:
-    async def story(pool: Pool, connection: Connection) -> None:
+async def test_retention_default_keeps_finished_jobs(connect_database: ConnectDatabase) -> None:
+    async with connect_database() as (pool, connection):
         job = await finished(connection, pool)
         await connection.execute("UPDATE jobs SET finished_at = now() - interval '9 years'")
         await update_expiry_times(connection, Retention())
         assert await hours_left(connection, "jobs", job.id) is None
 
-    within(story)
 
-
-def test_retention_gives_notice_before_expiry(within: Any) -> None:
-    async def story(pool: Pool, connection: Connection) -> None:
+async def test_retention_gives_notice_before_expiry(connect_database: ConnectDatabase) -> None:
+    async with connect_database() as (pool, connection):
         job = await finished(connection, pool)
         await connection.execute("UPDATE jobs SET finished_at = now() - interval '9 years'")
         await update_expiry_times(connection, KEEP)
         assert await hours_left(connection, "jobs", job.id) == pytest.approx(24, abs=0.1)
 
-    within(story)
 
-
-def test_retention_pin_and_retry_clear_expiry(within: Any) -> None:
-    async def story(pool: Pool, connection: Connection) -> None:
+async def test_retention_pin_and_retry_clear_expiry(connect_database: ConnectDatabase) -> None:
+    async with connect_database() as (pool, connection):
         pinned, retried, left = [await finished(connection, pool) for _ in range(3)]
         await update_expiry_times(connection, KEEP)
         await connection.execute("UPDATE jobs SET expires_at = now() - interval '1 second'")
@@ -132,11 +130,9 @@ def test_retention_pin_and_retry_clear_expiry(within: Any) -> None:
         await update_expiry_times(connection, KEEP)
         assert (await hours_left(connection, "jobs", pinned.id) or 0) > 1
 
-    within(story)
 
-
-def test_source_of_an_unfinished_job_waits(within: Any) -> None:
-    async def story(pool: Pool, connection: Connection) -> None:
+async def test_source_of_an_unfinished_job_waits(connect_database: ConnectDatabase) -> None:
+    async with connect_database() as (pool, connection):
         source = await finished(connection, pool)
         await create_job(connection, SLIPS, NewJob("me", "x", {}, "cpu", source_id=source.id))
         await connection.execute(
@@ -145,11 +141,9 @@ def test_source_of_an_unfinished_job_waits(within: Any) -> None:
         assert await delete_expired(connection) == DeletedCounts(0, 0)
         assert await get_job(connection, source.id) is not None
 
-    within(story)
 
-
-def test_datasets_go_when_no_job_needs_them(within: Any) -> None:
-    async def story(pool: Pool, connection: Connection) -> None:
+async def test_datasets_go_when_no_job_needs_them(connect_database: ConnectDatabase) -> None:
+    async with connect_database() as (pool, connection):
         used, unused, pinned, fresh = [await create_dataset(connection, "me", "d") for _ in range(4)]
         await connection.execute("UPDATE datasets SET state = 'committed' WHERE id <> %s", [fresh.id])
         await change_dataset(connection, pinned.id, name="d", pinned=True)
@@ -170,11 +164,9 @@ def test_datasets_go_when_no_job_needs_them(within: Any) -> None:
         for dataset in (used, pinned, fresh):
             assert await get_dataset(connection, dataset.id) is not None
 
-    within(story)
 
-
-def test_retention_running_upload_keeps_open_dataset(within: Any) -> None:
-    async def story(_pool: Pool, connection: Connection) -> None:
+async def test_retention_running_upload_keeps_open_dataset(connect_database: ConnectDatabase) -> None:
+    async with connect_database() as (_pool, connection):
         keep = Retention(open_datasets_hours=10)
         dataset = await create_dataset(connection, "me", "d")
         await connection.execute("UPDATE datasets SET used_at = now() - interval '9 hours'")
@@ -183,8 +175,6 @@ def test_retention_running_upload_keeps_open_dataset(within: Any) -> None:
         await put_file(connection, dataset.id, "images/a.jpg", "a" * 64, 1)
         await update_expiry_times(connection, keep)
         assert await hours_left(connection, "datasets", dataset.id) == pytest.approx(10, abs=0.1)
-
-    within(story)
 
 
 def put(storage: LocalStorage, content: str, age_seconds: float = LONG_AGO) -> str:
@@ -214,10 +204,12 @@ def checkpoint(*digests: str) -> dict[str, Any]:
     return {"attempt": 1, "stage": "train", "step": 1, "files": files}
 
 
-def test_garbage_collection_removes_unreferenced_content_only(within: Any, tmp_path: Path) -> None:
+async def test_garbage_collection_removes_unreferenced_content_only(
+    connect_database: ConnectDatabase, tmp_path: Path
+) -> None:
     storage = LocalStorage(tmp_path / "store", floor_bytes=0)
 
-    async def story(pool: Pool, connection: Connection) -> None:
+    async with connect_database() as (pool, connection):
         unused, young = put(storage, "unused"), put(storage, "young", age_seconds=DAY / 2)
         photo, result, state, preview = [
             put(storage, name) for name in ("photo", "result", "state", "preview")
@@ -239,13 +231,13 @@ def test_garbage_collection_removes_unreferenced_content_only(within: Any, tmp_p
         assert held(storage) == {young, photo, result, state, preview, unsaid} and unused not in held(storage)
         assert list(storage.list_documents("results/")) == [f"results/{going.job.id}/1"]
 
-    within(story)
 
-
-def test_replaced_checkpoints_are_deleted_unless_shared(within: Any, tmp_path: Path) -> None:
+async def test_replaced_checkpoints_are_deleted_unless_shared(
+    connect_database: ConnectDatabase, tmp_path: Path
+) -> None:
     storage = LocalStorage(tmp_path / "store", floor_bytes=0)
 
-    async def story(pool: Pool, connection: Connection) -> None:
+    async with connect_database() as (pool, connection):
         first, both, second, shared = [
             put(storage, name, age_seconds=3600) for name in ("first", "both", "second", "shared")
         ]
@@ -266,13 +258,13 @@ def test_replaced_checkpoints_are_deleted_unless_shared(within: Any, tmp_path: P
         assert held(storage) == {shared}
         assert [a.sha256 for a in await artifacts_of(connection, other.job.id)] == [shared]
 
-    within(story)
 
-
-def test_garbage_collection_skips_store_of_other_database(within: Any, tmp_path: Path) -> None:
+async def test_garbage_collection_skips_store_of_other_database(
+    connect_database: ConnectDatabase, tmp_path: Path
+) -> None:
     storage = LocalStorage(tmp_path / "store", floor_bytes=0)
 
-    async def story(pool: Pool, connection: Connection) -> None:
+    async with connect_database() as (pool, _):
         unused = put(storage, "unused")
         storage.publish_document("installation", b"another")
         assert await collect_garbage(pool, storage, unused_seconds=DAY) is None
@@ -283,11 +275,9 @@ def test_garbage_collection_skips_store_of_other_database(within: Any, tmp_path:
         assert await collect_garbage(pool, storage, unused_seconds=DAY, every_seconds=60) is None
         assert len(held(storage)) == 1
 
-    within(story)
 
-
-def test_json_null_checkpoints_do_no_harm(within: Any) -> None:
-    async def story(pool: Pool, connection: Connection) -> None:
+async def test_json_null_checkpoints_do_no_harm(connect_database: ConnectDatabase) -> None:
+    async with connect_database() as (pool, connection):
         attempt = await running(connection, pool)
         for value in ({}, {"files": []}, {"stage": "poses"}):
             await connection.execute("UPDATE jobs SET checkpoint = %s", [Jsonb(value)])
@@ -295,35 +285,30 @@ def test_json_null_checkpoints_do_no_harm(within: Any) -> None:
         cursor = await connection.execute("SELECT count(*) AS n FROM replaced_contents")
         assert (await cursor.fetchone()) == {"n": 0}
 
-    within(story)
 
-
-def test_expired_jobs_are_deleted_in_own_transactions(conninfo: str) -> None:
+async def test_expired_jobs_are_deleted_in_own_transactions(conninfo: str) -> None:
     """As a worker does it: no row is kept locked while the next owner's lock is waited for."""
 
-    async def what() -> None:
-        async with open_pool(conninfo) as pool:
-            async with pool.connection() as connection:
-                jobs = [await create_job(connection, SLIPS, NewJob(who, "x", {}, "cpu")) for who in "abcc"]
-                checked = await create_dataset(connection, "a", "checked")
-                old = [await create_dataset(connection, who, "old") for who in "ab"]
-                await begin_check(connection, checked.id)
-            for job in jobs:
-                assert job.slip is not None
-                attempt = await claim(pool, job.id, job.slip, "w")
-                assert attempt is not None
-                await attempt.fail({"type": "x", "message": "x"})
-            async with pool.connection() as connection:
-                past = "now() - interval '1 hour'"
-                await connection.execute(f"UPDATE jobs SET expires_at = {past}".encode())
-                await connection.execute(f"UPDATE datasets SET used_at = {past}".encode())
-                query = f"UPDATE datasets SET expires_at = {past} WHERE id = ANY(%s)"
-                await connection.execute(query.encode(), [[dataset.id for dataset in old]])
-            await forget_old_things(pool, KEEP, 1.0)
-            async with pool.connection() as connection:
-                assert [await get_job(connection, job.id) for job in jobs] == [None] * 4
-                assert [await get_dataset(connection, dataset.id) for dataset in old] == [None] * 2
-                left = await get_dataset(connection, checked.id)
-            assert left is not None and left.state == "open"
-
-    asyncio.run(what())
+    async with open_pool(conninfo) as pool:
+        async with pool.connection() as connection:
+            jobs = [await create_job(connection, SLIPS, NewJob(who, "x", {}, "cpu")) for who in "abcc"]
+            checked = await create_dataset(connection, "a", "checked")
+            old = [await create_dataset(connection, who, "old") for who in "ab"]
+            await begin_check(connection, checked.id)
+        for job in jobs:
+            assert job.slip is not None
+            attempt = await claim(pool, job.id, job.slip, "w")
+            assert attempt is not None
+            await attempt.fail({"type": "x", "message": "x"})
+        async with pool.connection() as connection:
+            past = "now() - interval '1 hour'"
+            await connection.execute(f"UPDATE jobs SET expires_at = {past}".encode())
+            await connection.execute(f"UPDATE datasets SET used_at = {past}".encode())
+            query = f"UPDATE datasets SET expires_at = {past} WHERE id = ANY(%s)"
+            await connection.execute(query.encode(), [[dataset.id for dataset in old]])
+        await forget_old_things(pool, KEEP, 1.0)
+        async with pool.connection() as connection:
+            assert [await get_job(connection, job.id) for job in jobs] == [None] * 4
+            assert [await get_dataset(connection, dataset.id) for dataset in old] == [None] * 2
+            left = await get_dataset(connection, checked.id)
+        assert left is not None and left.state == "open"

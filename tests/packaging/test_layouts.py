@@ -67,7 +67,9 @@ def install_as_docker_does(environment: Environment, project: Path) -> None:
     assert "RUN pip install --no-deps --no-build-isolation ." in dockerfile
     folder = project.parent / "docker"
     folder.mkdir()
-    for line in re.findall(r"^COPY (.*)$", dockerfile, re.M):
+    copied = re.findall(r"^COPY (.*)$", dockerfile, re.M)
+    assert copied
+    for line in copied:
         *sources, _ = line.split()
         for source in sources:
             if (project / source).exists():  # but for what only lists dependencies

@@ -63,29 +63,27 @@ async def fetched(pool: Pool, job_id: uuid.UUID) -> Job:
     return job
 
 
-def test_create_job_rolled_back_leaves_no_rows(conninfo: str) -> None:
+async def test_create_job_rolled_back_leaves_no_rows(conninfo: str) -> None:
     class Regret(Exception):
         pass
 
-    async def what(pool: Pool) -> None:
-        async with pool.connection() as connection, connection.transaction():
+    with pytest.raises(Regret):
+        async with (
+            open_pool(conninfo, max_size=4) as pool,
+            pool.connection() as connection,
+            connection.transaction(),
+        ):
             await create_job(connection, SLIPS, NEW)
             raise Regret
-
-    with pytest.raises(Regret):
-        run(conninfo, what)
     assert (count(conninfo, "jobs"), count(conninfo, "procrastinate_jobs")) == (0, 0)
 
-    async def good(pool: Pool) -> None:
-        async with pool.connection() as connection:
-            await create_job(connection, SLIPS, NEW)
-
-    run(conninfo, good)
+    async with open_pool(conninfo, max_size=4) as pool, pool.connection() as connection:
+        await create_job(connection, SLIPS, NEW)
     assert (count(conninfo, "jobs"), count(conninfo, "procrastinate_jobs")) == (1, 1)
 
 
-def test_claim_with_stale_entry_returns_none(conninfo: str) -> None:
-    async def what(pool: Pool) -> None:
+async def test_claim_with_stale_entry_returns_none(conninfo: str) -> None:
+    async with open_pool(conninfo, max_size=4) as pool:
         attempt = await claimed(pool)
         slip = attempt.job.slip
         assert slip is not None
@@ -98,11 +96,9 @@ def test_claim_with_stale_entry_returns_none(conninfo: str) -> None:
         assert second is not None and second.job.attempt == 2
         assert await claim(pool, new_id(), 1, "w") is None
 
-    run(conninfo, what)
 
-
-def test_fenced_attempt_cannot_write(conninfo: str) -> None:
-    async def what(pool: Pool) -> None:
+async def test_fenced_attempt_cannot_write(conninfo: str) -> None:
+    async with open_pool(conninfo, max_size=4) as pool:
         ghost = await claimed(pool)
         await ghost.requeue(SLIPS, "test")
         job = await fetched(pool, ghost.job.id)
@@ -132,11 +128,9 @@ def test_fenced_attempt_cannot_write(conninfo: str) -> None:
         async with pool.connection() as connection:
             assert [artifact.name for artifact in await artifacts_of(connection, job.id)] == ["a"]
 
-    run(conninfo, what)
 
-
-def test_lost_jobs_are_rescued_three_times_then_failed(conninfo: str) -> None:
-    async def what(pool: Pool) -> None:
+async def test_lost_jobs_are_rescued_three_times_then_failed(conninfo: str) -> None:
+    async with open_pool(conninfo, max_size=4) as pool:
         attempt = await claimed(pool)
         job_id = attempt.job.id
         for rescues in (1, 2, 3):
@@ -151,13 +145,11 @@ def test_lost_jobs_are_rescued_three_times_then_failed(conninfo: str) -> None:
         job = await fetched(pool, job_id)
         assert job.state == "failed" and job.error is not None and "4 times" in job.error["message"]
         assert job.slip is None
-
-    run(conninfo, what)
     assert count(conninfo, "procrastinate_jobs") == 0
 
 
-def test_new_checkpoint_forgives_lost_workers(conninfo: str) -> None:
-    async def what(pool: Pool) -> None:
+async def test_new_checkpoint_forgives_lost_workers(conninfo: str) -> None:
+    async with open_pool(conninfo, max_size=4) as pool:
         attempt = await claimed(pool)
         await make_old(pool, attempt.job.id)
         await recover_stalled_jobs(pool, SLIPS, 5, StalledAttempts(0.0))
@@ -170,11 +162,9 @@ def test_new_checkpoint_forgives_lost_workers(conninfo: str) -> None:
         await second.record_checkpoint({"stage": "train", "step": 6}, is_progress=True)
         assert (await fetched(pool, job.id)).rescues == 0
 
-    run(conninfo, what)
 
-
-def test_lost_cancelling_job_is_cancelled(conninfo: str) -> None:
-    async def what(pool: Pool) -> None:
+async def test_lost_cancelling_job_is_cancelled(conninfo: str) -> None:
+    async with open_pool(conninfo, max_size=4) as pool:
         attempt = await claimed(pool)
         async with pool.connection() as connection:
             await cancel_job(connection, SLIPS, attempt.job.id)
@@ -182,11 +172,9 @@ def test_lost_cancelling_job_is_cancelled(conninfo: str) -> None:
         await recover_stalled_jobs(pool, SLIPS, 5, StalledAttempts(0.0))
         assert (await fetched(pool, attempt.job.id)).state == "canceled"
 
-    run(conninfo, what)
 
-
-def test_queued_job_without_entry_is_requeued(conninfo: str) -> None:
-    async def what(pool: Pool) -> None:
+async def test_queued_job_without_entry_is_requeued(conninfo: str) -> None:
+    async with open_pool(conninfo, max_size=4) as pool:
         async with pool.connection() as connection:
             gone, stuck, fine = [await create_job(connection, SLIPS, NEW) for _ in range(3)]
             await connection.execute("UPDATE jobs SET queued_at = now() - interval '1 hour'")
@@ -199,13 +187,11 @@ def test_queued_job_without_entry_is_requeued(conninfo: str) -> None:
         after = [await fetched(pool, job.id) for job in (gone, stuck, fine)]
         assert [job.state for job in after] == ["queued"] * 3
         assert after[0].slip != gone.slip and after[1].slip != stuck.slip and after[2].slip == fine.slip
-
-    run(conninfo, what)
     assert count(conninfo, "procrastinate_jobs") == 3
 
 
-def test_finished_job_state_changes_are_refused(conninfo: str) -> None:
-    async def what(pool: Pool) -> None:
+async def test_finished_job_state_changes_are_refused(conninfo: str) -> None:
+    async with open_pool(conninfo, max_size=4) as pool:
         attempt = await claimed(pool)
         await attempt.succeed([])
         async with pool.connection() as connection:
@@ -221,29 +207,24 @@ def test_finished_job_state_changes_are_refused(conninfo: str) -> None:
             with pytest.raises(NotFoundError):
                 await cancel_job(connection, SLIPS, attempt.job.id)
 
-    run(conninfo, what)
 
-
-def test_list_pages_and_filters(conninfo: str) -> None:
-    async def what(pool: Pool) -> None:
-        async with pool.connection() as connection:
-            made = [
-                await create_job(connection, SLIPS, NewJob("me", "toy", {}, "cpu", label=f"l{n % 2}"))
-                for n in range(6)
-            ]
-            other = await create_job(connection, SLIPS, NewJob("you", "toy", {}, "cpu"))
-            await cancel_job(connection, SLIPS, made[0].id)
-            first = await list_jobs(connection, owner="me", limit=4)
-            rest = await list_jobs(connection, owner="me", limit=4, before=first[-1].id)
-            assert [job.id for job in (*first, *rest)] == [job.id for job in reversed(made)]
-            assert [job.id for job in await list_jobs(connection, owner="you")] == [other.id]
-            assert len(await list_jobs(connection)) == 7
-            assert len(await list_jobs(connection, owner="me", label="l1")) == 3
-            assert [j.id for j in await list_jobs(connection, states=["canceled"])] == [made[0].id]
-            assert await queue_position(connection, made[1]) == 0
-            assert await queue_position(connection, other) == 1  # owners take turns
-
-    run(conninfo, what)
+async def test_list_pages_and_filters(conninfo: str) -> None:
+    async with open_pool(conninfo, max_size=4) as pool, pool.connection() as connection:
+        made = [
+            await create_job(connection, SLIPS, NewJob("me", "toy", {}, "cpu", label=f"l{n % 2}"))
+            for n in range(6)
+        ]
+        other = await create_job(connection, SLIPS, NewJob("you", "toy", {}, "cpu"))
+        await cancel_job(connection, SLIPS, made[0].id)
+        first = await list_jobs(connection, owner="me", limit=4)
+        rest = await list_jobs(connection, owner="me", limit=4, before=first[-1].id)
+        assert [job.id for job in (*first, *rest)] == [job.id for job in reversed(made)]
+        assert [job.id for job in await list_jobs(connection, owner="you")] == [other.id]
+        assert len(await list_jobs(connection)) == 7
+        assert len(await list_jobs(connection, owner="me", label="l1")) == 3
+        assert [j.id for j in await list_jobs(connection, states=["canceled"])] == [made[0].id]
+        assert await queue_position(connection, made[1]) == 0
+        assert await queue_position(connection, other) == 1  # owners take turns
 
 
 def test_ids_sort_by_time() -> None:

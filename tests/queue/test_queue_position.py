@@ -38,59 +38,51 @@ async def delivered(pool: Pool, count: int) -> list[uuid.UUID]:
     return found
 
 
-def test_interrupted_jobs_keep_queue_position(conninfo: str) -> None:
-    async def what() -> None:
-        async with open_pool(conninfo, max_size=6) as pool:
-            first, second, third = await made(pool, 3)
-            [urgent] = await made(pool, 1, priority=5)
-            attempts = []
-            for job in (first, second, third):
-                assert job.slip is not None
-                attempts.append(await claim(pool, job.id, job.slip, "w"))
-            tiny = await made(pool, 20)
-            # In another order than they were queued in, one of them by the rescue of a lost worker.
-            for attempt in (attempts[2], attempts[1]):
+async def test_interrupted_jobs_keep_queue_position(conninfo: str) -> None:
+    async with open_pool(conninfo, max_size=6) as pool:
+        first, second, third = await made(pool, 3)
+        [urgent] = await made(pool, 1, priority=5)
+        attempts = []
+        for job in (first, second, third):
+            assert job.slip is not None
+            attempts.append(await claim(pool, job.id, job.slip, "w"))
+        tiny = await made(pool, 20)
+        # In another order than they were queued in, one of them by the rescue of a lost worker.
+        for attempt in (attempts[2], attempts[1]):
+            assert attempt is not None
+            await attempt.requeue(SLIPS, "its worker is stopping")
+        async with pool.connection() as connection:
+            await connection.execute(
+                "UPDATE jobs SET heartbeat_at = now() - interval '1 minute' WHERE id = %s", [first.id]
+            )
+        assert await recover_stalled_jobs(pool, SLIPS, 5, StalledAttempts(0.0)) == 1
+        async with pool.connection() as connection:
+            again = await get_job(connection, second.id)
+            assert again is not None and await queue_position(connection, again) == 2
+            # What was cancelled and is asked for again is a new wish, and goes last.
+            await cancel_job(connection, SLIPS, tiny[0].id)
+        async with pool.connection() as connection:
+            await retry_job(connection, SLIPS, tiny[0].id, from_start=False)
+        expected = [urgent, first, second, third, *tiny[1:], tiny[0]]
+        assert await delivered(pool, len(expected)) == [job.id for job in expected]
+
+
+async def test_requeued_job_gets_fresh_entry_ids(conninfo: str) -> None:
+    async with open_pool(conninfo, max_size=6) as pool:
+        jobs = await made(pool, 2)
+        known = set()
+        for _ in range(5):
+            for job in jobs[::-1]:
+                async with pool.connection() as connection:
+                    now = await get_job(connection, job.id)
+                assert now is not None and now.slip is not None and now.slip not in known
+                known.add(now.slip)
+                attempt = await claim(pool, now.id, now.slip, "w")
                 assert attempt is not None
-                await attempt.hand_back(SLIPS, "its worker is stopping")
-            async with pool.connection() as connection:
-                await connection.execute(
-                    "UPDATE jobs SET heartbeat_at = now() - interval '1 minute' WHERE id = %s", [first.id]
-                )
-            assert await recover_stalled_jobs(pool, SLIPS, 5, StalledAttempts(0.0)) == 1
-            async with pool.connection() as connection:
-                again = await get_job(connection, second.id)
-                assert again is not None and await queue_position(connection, again) == 2
-                # What was cancelled and is asked for again is a new wish, and goes last.
-                await cancel_job(connection, SLIPS, tiny[0].id)
-            async with pool.connection() as connection:
-                await retry_job(connection, SLIPS, tiny[0].id, from_start=False)
-            expected = [urgent, first, second, third, *tiny[1:], tiny[0]]
-            assert await delivered(pool, len(expected)) == [job.id for job in expected]
-
-    asyncio.run(what())
-
-
-def test_requeued_job_gets_fresh_entry_ids(conninfo: str) -> None:
-    async def what() -> None:
-        async with open_pool(conninfo, max_size=6) as pool:
-            jobs = await made(pool, 2)
-            known = set()
-            for _ in range(5):
-                for job in jobs[::-1]:
-                    async with pool.connection() as connection:
-                        now = await get_job(connection, job.id)
-                    assert now is not None and now.slip is not None and now.slip not in known
-                    known.add(now.slip)
-                    attempt = await claim(pool, now.id, now.slip, "w")
-                    assert attempt is not None
-                    await attempt.requeue(SLIPS, "its worker is stopping")
-            async with pool.connection() as connection:  # the slips that were used up
-                await connection.execute(
-                    "DELETE FROM procrastinate_jobs WHERE id NOT IN (SELECT slip FROM jobs)"
-                )
-            assert await delivered(pool, 2) == [job.id for job in jobs]
-
-    asyncio.run(what())
+                await attempt.requeue(SLIPS, "its worker is stopping")
+        async with pool.connection() as connection:  # the slips that were used up
+            await connection.execute("DELETE FROM procrastinate_jobs WHERE id NOT IN (SELECT slip FROM jobs)")
+        assert await delivered(pool, 2) == [job.id for job in jobs]
 
 
 def test_requeued_entry_ids_keep_order() -> None:

@@ -1,35 +1,18 @@
 """Who gets in: tokens, scopes, owners, hosts, origins; test_access_matrix asks at every route."""
 
-import asyncio
-from collections.abc import Awaitable, Callable
-from pathlib import Path
-from typing import Any
-
-import httpx
 import pytest
 from pydantic import SecretStr
 
 from octasplat.engine.core.errors import ConfigError
-from octasplat.service.state import Service
-from tests.support.service_harness import client_with_token, committed_dataset, running_service
-
-Conversation = Callable[[httpx.AsyncClient, Service], Awaitable[None]]
-
-
-@pytest.fixture
-def talk(conninfo: str, tmp_path: Path) -> Callable[..., None]:
-    def run(conversation: Conversation, **settings: Any) -> None:
-        async def whole() -> None:
-            async with running_service(conninfo, tmp_path, **settings) as (http, service):
-                await conversation(http, service)
-
-        asyncio.run(whole())
-
-    return run
+from tests.support.service_harness import (
+    ConnectService,
+    client_with_token,
+    committed_dataset,
+)
 
 
-def test_lists_and_inputs_are_limited_to_owner(talk: Callable[..., None]) -> None:
-    async def conversation(http: httpx.AsyncClient, service: Service) -> None:
+async def test_lists_and_inputs_are_limited_to_owner(connect_service: ConnectService) -> None:
+    async with connect_service() as (http, service):
         mine = await client_with_token(service, "me", "write")
         stranger = await client_with_token(service, "stranger", "write")
         taken = {"kind": "toy", "dataset_id": await committed_dataset(service, "me")}
@@ -41,11 +24,11 @@ def test_lists_and_inputs_are_limited_to_owner(talk: Callable[..., None]) -> Non
         admin = await client_with_token(service, "boss", "admin")
         assert len((await http.get("/v1/jobs", headers=admin)).json()["jobs"]) == 1
 
-    talk(conversation)
 
-
-def test_tokenless_service_accepts_local_same_origin_requests_only(talk: Callable[..., None]) -> None:
-    async def conversation(http: httpx.AsyncClient, service: Service) -> None:
+async def test_tokenless_service_accepts_local_same_origin_requests_only(
+    connect_service: ConnectService,
+) -> None:
+    async with connect_service() as (http, _):
         assert (await http.get("/v1/jobs")).status_code == 200
         for host in ("evil.example", "127.0.0.1.evil.example", "", "evil.example:8642"):
             assert (await http.get("/v1/jobs", headers={"Host": host})).status_code == 421
@@ -64,11 +47,9 @@ def test_tokenless_service_accepts_local_same_origin_requests_only(talk: Callabl
         answer = await http.get("/v1/info")
         assert answer.headers["X-Content-Type-Options"] == "nosniff"
 
-    talk(conversation)
 
-
-def test_first_token_ends_anonymous_access(talk: Callable[..., None]) -> None:
-    async def conversation(http: httpx.AsyncClient, service: Service) -> None:
+async def test_first_token_ends_anonymous_access(connect_service: ConnectService) -> None:
+    async with connect_service() as (http, service):
         new = {"name": "n", "owner": "me", "scopes": ["admin"]}
         made = (await http.post("/v1/tokens", json=new)).json()
         assert (await http.get("/v1/jobs")).status_code == 401
@@ -84,25 +65,19 @@ def test_first_token_ends_anonymous_access(talk: Callable[..., None]) -> None:
         service.invalidate_token_state()
         assert (await http.get("/v1/jobs")).status_code == 401  # that the last has ended opens nothing
 
-    talk(conversation)
 
-
-def test_token_of_the_environment_is_let_in(talk: Callable[..., None]) -> None:
-    async def conversation(http: httpx.AsyncClient, service: Service) -> None:
+async def test_token_of_the_environment_is_let_in(connect_service: ConnectService) -> None:
+    async with connect_service(host="0.0.0.0", token=SecretStr("from-the-environment")) as (http, _):
         assert (await http.get("/v1/jobs")).status_code == 401
         headers = {"Authorization": "Bearer from-the-environment", "Host": "anything.example"}
         assert (await http.get("/v1/tokens", headers=headers)).status_code == 200
 
-    talk(conversation, host="0.0.0.0", token=SecretStr("from-the-environment"))
 
-
-def test_public_address_without_a_token_is_refused(conninfo: str, tmp_path: Path) -> None:
-    async def start(host: str) -> None:
-        async with running_service(conninfo, tmp_path, host=host):
-            pass
-
+async def test_public_address_without_a_token_is_refused(connect_service: ConnectService) -> None:
     for host in ("0.0.0.0", "::", "192.0.2.7", "example.org"):
         with pytest.raises(ConfigError, match="token"):
-            asyncio.run(start(host))
+            async with connect_service(host=host):
+                pass
     for host in ("127.0.0.1", "127.8.8.8", "::1", "localhost"):
-        asyncio.run(start(host))
+        async with connect_service(host=host):
+            pass

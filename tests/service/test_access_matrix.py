@@ -1,11 +1,9 @@
 """Every route x no token, a stranger's token, a read-only token. New routes are found by themselves."""
 
-import asyncio
 import io
 import re
 import uuid
-from collections.abc import Awaitable, Callable
-from pathlib import Path
+from collections.abc import AsyncIterator
 from typing import Any
 
 import httpx
@@ -18,10 +16,10 @@ from octasplat.service.state import Service
 from octasplat.workers.queue.attempts import ResultFile
 from tests.support.api_inventory import Operation, operations, undescribed
 from tests.support.service_harness import (
+    ConnectService,
     claim_job,
     client_with_token,
     committed_dataset,
-    running_service,
     store_content,
 )
 
@@ -125,112 +123,91 @@ def _is_about_now(operation: Operation) -> bool:
 
 
 @pytest.fixture
-def stage(conninfo: str, tmp_path: Path) -> Callable[[Callable[[Stage], Awaitable[None]]], None]:
-    def run(play: Callable[[Stage], Awaitable[None]]) -> None:
-        async def whole() -> None:
-            async with running_service(conninfo, tmp_path) as (http, service):
-                stage = Stage(http, service)
-                await stage.set()
-                await play(stage)
-
-        asyncio.run(whole())
-
-    return run
+async def stage(connect_service: ConnectService) -> AsyncIterator[Stage]:
+    async with connect_service() as (http, service):
+        stage = Stage(http, service)
+        await stage.set()
+        yield stage
 
 
-Play = Callable[[Callable[[Stage], Awaitable[None]]], None]
-
-
-def test_request_without_token_is_refused_on_every_route(stage: Play) -> None:
-    async def play(stage: Stage) -> None:
-        before = await stage.everything()
-        for operation in operations(APP):
-            address, body = await stage.address(operation.path), stage.body(operation)
-            if operation.path in OPEN:
-                assert (await stage.http.request(operation.method, address)).status_code == 200
-                continue
-            wrong: tuple[dict[str, str], ...] = (
-                {},
-                {"Authorization": "Bearer octa_x"},
-                {"Authorization": "Bearer "},
-                {"Authorization": "Basic eDp5"},
-                {"Cookie": "octasplat_session=octa_x"},
-            )
-            for headers in wrong:
-                answer = await stage.http.request(operation.method, address, headers=headers, **body)
-                assert answer.status_code == 401, f"{operation.name} {headers}: {answer.text}"
-                assert answer.headers["WWW-Authenticate"].startswith("Bearer"), operation.name
-                assert answer.headers["content-type"] == "application/problem+json", operation.name
-        assert await stage.everything() == before
-
-    stage(play)
-
-
-def test_other_owner_cannot_read_or_change(stage: Play) -> None:
-    async def play(stage: Stage) -> None:
-        before = await stage.everything()
-        for operation in operations(APP):
-            address, body = await stage.address(operation.path), stage.body(operation)
-            headers = stage.headers["stranger"]
+async def test_request_without_token_is_refused_on_every_route(stage: Stage) -> None:
+    before = await stage.everything()
+    for operation in operations(APP):
+        address, body = await stage.address(operation.path), stage.body(operation)
+        if operation.path in OPEN:
+            assert (await stage.http.request(operation.method, address)).status_code == 200
+            continue
+        wrong: tuple[dict[str, str], ...] = (
+            {},
+            {"Authorization": "Bearer octa_x"},
+            {"Authorization": "Bearer "},
+            {"Authorization": "Basic eDp5"},
+            {"Cookie": "octasplat_session=octa_x"},
+        )
+        for headers in wrong:
             answer = await stage.http.request(operation.method, address, headers=headers, **body)
-            what = f"{operation.name}: {answer.status_code} {answer.text}"
-            if operation.path.startswith(ADMIN):
-                assert answer.status_code == 403, what
-            elif re.search(r"\{\w+_id\}", operation.path):
-                assert answer.status_code == 404, what
-                unknown = re.sub(r"[0-9a-f]{8}-[0-9a-f-]{27}", str(uuid.uuid4()), address)
-                other = await stage.http.request(operation.method, unknown, headers=headers, **body)
-                assert other.json() == answer.json(), f"{what} differs from {other.text}"
-            elif not operation.changes:
-                assert answer.status_code == 200, what
-            assert not any(each in answer.text for each in stage.mine), what
-        assert await stage.everything() == before
-
-    stage(play)
+            assert answer.status_code == 401, f"{operation.name} {headers}: {answer.text}"
+            assert answer.headers["WWW-Authenticate"].startswith("Bearer"), operation.name
+            assert answer.headers["content-type"] == "application/problem+json", operation.name
+    assert await stage.everything() == before
 
 
-def test_read_scope_cannot_change(stage: Play) -> None:
-    async def play(stage: Stage) -> None:
-        before = await stage.everything()
-        for operation in operations(APP):
-            address, body = await stage.address(operation.path), stage.body(operation)
-            headers = stage.headers["reader"]
-            answer = await stage.http.request(operation.method, address, headers=headers, **body)
-            what = f"{operation.name}: {answer.status_code} {answer.text}"
-            if (operation.changes and operation.path not in OPEN) or operation.path.startswith(ADMIN):
-                assert answer.status_code == 403, what
-                assert answer.json()["type"].endswith(":scope"), what
-            else:
-                assert answer.status_code == 200, what
-        assert await stage.everything() == before
+async def test_other_owner_cannot_read_or_change(stage: Stage) -> None:
+    before = await stage.everything()
+    for operation in operations(APP):
+        address, body = await stage.address(operation.path), stage.body(operation)
+        headers = stage.headers["stranger"]
+        answer = await stage.http.request(operation.method, address, headers=headers, **body)
+        what = f"{operation.name}: {answer.status_code} {answer.text}"
+        if operation.path.startswith(ADMIN):
+            assert answer.status_code == 403, what
+        elif re.search(r"\{\w+_id\}", operation.path):
+            assert answer.status_code == 404, what
+            unknown = re.sub(r"[0-9a-f]{8}-[0-9a-f-]{27}", str(uuid.uuid4()), address)
+            other = await stage.http.request(operation.method, unknown, headers=headers, **body)
+            assert other.json() == answer.json(), f"{what} differs from {other.text}"
+        elif not operation.changes:
+            assert answer.status_code == 200, what
+        assert not any(each in answer.text for each in stage.mine), what
+    assert await stage.everything() == before
 
-    stage(play)
+
+async def test_read_scope_cannot_change(stage: Stage) -> None:
+    before = await stage.everything()
+    for operation in operations(APP):
+        address, body = await stage.address(operation.path), stage.body(operation)
+        headers = stage.headers["reader"]
+        answer = await stage.http.request(operation.method, address, headers=headers, **body)
+        what = f"{operation.name}: {answer.status_code} {answer.text}"
+        if (operation.changes and operation.path not in OPEN) or operation.path.startswith(ADMIN):
+            assert answer.status_code == 403, what
+            assert answer.json()["type"].endswith(":scope"), what
+        else:
+            assert answer.status_code == 200, what
+    assert await stage.everything() == before
 
 
-def test_undocumented_routes_require_token(stage: Play) -> None:
+async def test_undocumented_routes_require_token(stage: Stage) -> None:
     routes = undescribed(APP)
     assert ("GET", "/jobs/{job_id}") in routes and ("HEAD", "/v1/jobs/{job_id}/artifacts/{name}") in routes
 
-    async def play(stage: Stage) -> None:
-        before = await stage.everything()
-        for method, path in routes:
-            if path in OPEN_PAGES:
-                continue
-            address = await stage.address(path)
-            nobody = await stage.http.request(method, address)
-            what = f"{method} {path}"
-            assert nobody.status_code in (303, 401), f"{what}: {nobody.status_code}"
-            if nobody.status_code == 303:
-                assert nobody.headers["Location"].startswith("/sign-in"), what
-            headers = {**stage.headers["stranger"], "Origin": "http://localhost:8642"}
-            other = await stage.http.request(method, address, headers=headers)
-            if "_id}" in path:
-                assert other.status_code == 404, f"{what}: {other.status_code} {other.text}"
-            assert not any(each in other.text for each in stage.mine), what
-            headers = {**stage.headers["reader"], "Origin": "http://localhost:8642"}
-            reader = await stage.http.request(method, address, headers=headers)
-            if method not in ("GET", "HEAD"):
-                assert reader.status_code == 403, f"{what}: {reader.status_code} {reader.text}"
-        assert await stage.everything() == before
-
-    stage(play)
+    before = await stage.everything()
+    for method, path in routes:
+        if path in OPEN_PAGES:
+            continue
+        address = await stage.address(path)
+        nobody = await stage.http.request(method, address)
+        what = f"{method} {path}"
+        assert nobody.status_code in (303, 401), f"{what}: {nobody.status_code}"
+        if nobody.status_code == 303:
+            assert nobody.headers["Location"].startswith("/sign-in"), what
+        headers = {**stage.headers["stranger"], "Origin": "http://localhost:8642"}
+        other = await stage.http.request(method, address, headers=headers)
+        if "_id}" in path:
+            assert other.status_code == 404, f"{what}: {other.status_code} {other.text}"
+        assert not any(each in other.text for each in stage.mine), what
+        headers = {**stage.headers["reader"], "Origin": "http://localhost:8642"}
+        reader = await stage.http.request(method, address, headers=headers)
+        if method not in ("GET", "HEAD"):
+            assert reader.status_code == 403, f"{what}: {reader.status_code} {reader.text}"
+    assert await stage.everything() == before

@@ -39,7 +39,19 @@ def octasplat(conninfo: str, data: Path, *arguments: object) -> "subprocess.Comp
     return subprocess.run(command, env=environment, cwd=ROOT, capture_output=True, text=True, check=False)
 
 
-def test_restored_service_continues_jobs(
+def finish_jobs(bench: WorkerHarness, jobs: list[str]) -> None:
+    """Let a worker do the jobs of a restored service."""
+    try:
+        bench.worker(STALE_SECONDS="10")
+        for job in jobs:
+            row = bench.wait_until_finished(uuid.UUID(job))
+            assert (row.state, row.rescues) == ("succeeded", 0)
+            assert bench.results(row.id)["sum.txt"] == b"6"
+    finally:
+        bench.close()
+
+
+async def test_restored_service_continues_jobs(
     conninfo: str, postgres: EmbeddedPostgres, template: str, tmp_path: Path
 ) -> None:
     backup, here, there = tmp_path / "backup", tmp_path / "here", tmp_path / "there"
@@ -79,11 +91,8 @@ def test_restored_service_continues_jobs(
         new = (await http.post("/v1/jobs", json={**body, "options": {"steps": 3, "seconds": 0.0}})).json()
         made["jobs"].append(new["id"])
 
-    async def talk(database: str, folder: Path, conversation: Any) -> None:
-        async with running_service(database, folder) as (http, service):
-            await conversation(http, service)
-
-    asyncio.run(talk(conninfo, here, before))
+    async with running_service(conninfo, here) as (http, service):
+        await before(http, service)
     assert made["usage"][1] == 1
     with copied_database(postgres, "template1") as elsewhere:
         restored = octasplat(elsewhere, there, "restore", backup)
@@ -91,16 +100,9 @@ def test_restored_service_continues_jobs(
         again = octasplat(elsewhere, there, "restore", backup)
         assert again.returncode == 1 and "not empty" in again.stderr and again.stderr.count("\n") == 1
         assert octasplat(elsewhere, there, "fsck").returncode == 0
-        asyncio.run(talk(elsewhere, there, after))
-        bench = WorkerHarness(elsewhere, there)
-        try:
-            bench.worker(STALE_SECONDS="10")
-            for job in made["jobs"][1:]:
-                row = bench.wait_until_finished(uuid.UUID(job))
-                assert (row.state, row.rescues) == ("succeeded", 0)
-                assert bench.results(row.id)["sum.txt"] == b"6"
-        finally:
-            bench.close()
+        async with running_service(elsewhere, there) as (http, service):
+            await after(http, service)
+        await asyncio.to_thread(finish_jobs, WorkerHarness(elsewhere, there), made["jobs"][1:])
 
 
 @pytest.mark.parametrize("folder", ["nothing", "other"])

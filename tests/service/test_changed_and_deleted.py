@@ -3,8 +3,6 @@
 import asyncio
 import logging
 import uuid
-from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import httpx
@@ -23,22 +21,15 @@ from octasplat.workers.queue.attempts import ResultFile
 from octasplat.workers.queue.jobs import get_job
 from octasplat.workers.settings import load_settings
 from tests.support.model_builder import photograph
-from tests.support.service_harness import claim_job, committed_dataset, running_service, store_content
+from tests.support.service_harness import (
+    ConnectService,
+    claim_job,
+    committed_dataset,
+    store_content,
+)
 from tests.support.zip_builder import ZipMember, build_zip
 
 TOY = {"kind": "toy", "options": {"steps": 1}}
-
-
-@pytest.fixture
-def talk(conninfo: str, tmp_path: Path) -> Callable[..., None]:
-    def run(conversation: Any, **settings: Any) -> None:
-        async def whole() -> None:
-            async with running_service(conninfo, tmp_path, **settings) as (http, service):
-                await conversation(http, service)
-
-        asyncio.run(whole())
-
-    return run
 
 
 async def new_job(http: httpx.AsyncClient, **body: Any) -> dict[str, Any]:
@@ -52,8 +43,10 @@ def result(service: Service, content: bytes, name: str = "scene.ply") -> ResultF
     return ResultFile(name, store_content(service, content), len(content), "application/octet-stream")
 
 
-def test_requests_of_one_owner_with_a_quota_do_not_stop_each_other(talk: Callable[..., None]) -> None:
-    async def conversation(http: httpx.AsyncClient, service: Service) -> None:
+async def test_requests_of_one_owner_with_a_quota_do_not_stop_each_other(
+    connect_service: ConnectService,
+) -> None:
+    async with connect_service(quota_bytes=1 << 30, quota_jobs=1000, quota_datasets=1000) as (http, service):
         shared = await committed_dataset(service)
         source = await new_job(http, dataset_id=shared)
         await (await claim_job(service, source)).succeed([result(service, b"ply")])
@@ -78,11 +71,9 @@ def test_requests_of_one_owner_with_a_quota_do_not_stop_each_other(talk: Callabl
             answer.text for answer in answers if answer.status_code not in (200, 201, 202, 204)
         ]
 
-    talk(conversation, quota_bytes=1 << 30, quota_jobs=1000, quota_datasets=1000)
 
-
-def test_downloads_are_revalidated(talk: Callable[..., None]) -> None:
-    async def conversation(http: httpx.AsyncClient, service: Service) -> None:
+async def test_downloads_are_revalidated(connect_service: ConnectService) -> None:
+    async with connect_service() as (http, service):
         job = await new_job(http, dataset_id=await committed_dataset(service))
         address = f"/v1/jobs/{job['id']}/artifacts/scene.ply"
         error = {"type": "x", "message": "x"}
@@ -96,11 +87,9 @@ def test_downloads_are_revalidated(talk: Callable[..., None]) -> None:
         new = await http.get(address, headers=seen)
         assert (new.status_code, new.content) == (200, b"new")
 
-    talk(conversation)
 
-
-def test_lost_content_is_restored_by_new_upload(talk: Callable[..., None]) -> None:
-    async def conversation(http: httpx.AsyncClient, service: Service) -> None:
+async def test_lost_content_is_restored_by_new_upload(connect_service: ConnectService) -> None:
+    async with connect_service() as (http, service):
         dataset = (await http.post("/v1/datasets", json={"name": "d"})).headers["Location"]
         address, content = f"{dataset}/files/images/a.png", photograph()
         file = (await http.put(address, content=content)).json()
@@ -114,11 +103,9 @@ def test_lost_content_is_restored_by_new_upload(talk: Callable[..., None]) -> No
             assert (await http.get(address)).content == content
         assert (await http.put(address, content=content, headers=headers)).status_code == 200
 
-    talk(conversation)
 
-
-def test_retry_after_source_deletion_is_refused(talk: Callable[..., None]) -> None:
-    async def conversation(http: httpx.AsyncClient, service: Service) -> None:
+async def test_retry_after_source_deletion_is_refused(connect_service: ConnectService) -> None:
+    async with connect_service() as (http, service):
         source = await new_job(http, dataset_id=await committed_dataset(service))
         await (await claim_job(service, source)).succeed([result(service, b"ply")])
         job = await new_job(http, kind="export", source_id=source["id"], options={"files": ["a.glb"]})
@@ -128,13 +115,11 @@ def test_retry_after_source_deletion_is_refused(talk: Callable[..., None]) -> No
         assert answer.status_code == 409 and "was deleted" in answer.json()["detail"]
         assert (await http.get(f"/v1/jobs/{job['id']}")).json()["state"] == "failed"
 
-    talk(conversation)
 
-
-def test_same_content_under_second_name_counts_once(talk: Callable[..., None]) -> None:
+async def test_same_content_under_second_name_counts_once(connect_service: ConnectService) -> None:
     content = photograph()
 
-    async def conversation(http: httpx.AsyncClient, service: Service) -> None:
+    async with connect_service(quota_bytes=len(content) + 4) as (http, _):
         dataset = (await http.post("/v1/datasets", json={"name": "d"})).headers["Location"]
         headers = repr_digest(content)
         answers = [
@@ -146,15 +131,16 @@ def test_same_content_under_second_name_counts_once(talk: Callable[..., None]) -
         answer = await http.put(f"{dataset}/files/images/c.png", content=other, headers=repr_digest(other))
         assert answer.status_code == 413
 
-    talk(conversation, quota_bytes=len(content) + 4)
 
-
-def test_resent_archive_counts_once_in_quota(talk: Callable[..., None]) -> None:
+async def test_resent_archive_counts_once_in_quota(connect_service: ConnectService) -> None:
     """As by a client that did not hear the answer."""
     photographs = [photograph(400 + number, 300) for number in range(3)]
     archive = build_zip(ZipMember("images/a.png", photographs[0]), ZipMember("images/b.png", photographs[1]))
 
-    async def conversation(http: httpx.AsyncClient, service: Service) -> None:
+    async with connect_service(quota_bytes=len(photographs[0]) + len(photographs[1]) + 500) as (
+        http,
+        _,
+    ):
         dataset = (await http.post("/v1/datasets", json={"name": "d"})).headers["Location"]
         answers = [await http.put(f"{dataset}/archive", content=archive) for _ in range(2)]
         assert [answer.status_code for answer in answers] == [200, 200], answers[1].text
@@ -163,11 +149,9 @@ def test_resent_archive_counts_once_in_quota(talk: Callable[..., None]) -> None:
         assert refused.status_code == 413, refused.text
         assert len((await http.get(f"{dataset}/files")).json()["files"]) == 2
 
-    talk(conversation, quota_bytes=len(photographs[0]) + len(photographs[1]) + 500)
 
-
-def test_retried_upload_transaction_counts_once(
-    talk: Callable[..., None], monkeypatch: pytest.MonkeyPatch
+async def test_retried_upload_transaction_counts_once(
+    connect_service: ConnectService, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     content, left = photograph(), [2]
     put_files = rows.put_files
@@ -180,19 +164,17 @@ def test_retried_upload_transaction_counts_once(
 
     monkeypatch.setattr(rows, "put_files", deadlocked)
 
-    async def conversation(http: httpx.AsyncClient, service: Service) -> None:
+    async with connect_service() as (http, service):
         dataset = (await http.post("/v1/datasets", json={"name": "d"})).headers["Location"]
         assert (await http.put(f"{dataset}/files/images/a.png", content=content)).status_code == 201
         assert left == [0] and service.metrics.upload_bytes._value.get() == len(content)
 
-    talk(conversation)
 
-
-def test_repeated_request_to_next_version_is_idempotent(talk: Callable[..., None]) -> None:
+async def test_repeated_request_to_next_version_is_idempotent(connect_service: ConnectService) -> None:
     class LaterJob(NewJob):
         further: str | None = None
 
-    async def conversation(http: httpx.AsyncClient, service: Service) -> None:
+    async with connect_service() as (http, service):
         dataset = await committed_dataset(service)
         asked = {**TOY, "dataset_id": dataset}
         first = await http.post("/v1/jobs", json=asked, headers={"Idempotency-Key": "k"})
@@ -203,25 +185,21 @@ def test_repeated_request_to_next_version_is_idempotent(talk: Callable[..., None
         again = await submit_job(service, who, LaterJob.model_validate(asked), idempotency_key="k")
         assert str(again.id) == first.json()["id"]
 
-    talk(conversation)
 
-
-def test_event_stream_of_deleted_job_ends(
-    talk: Callable[..., None], caplog: pytest.LogCaptureFixture
+async def test_event_stream_of_deleted_job_ends(
+    connect_service: ConnectService, caplog: pytest.LogCaptureFixture
 ) -> None:
-    async def conversation(http: httpx.AsyncClient, service: Service) -> None:
-        job = await new_job(http, dataset_id=await committed_dataset(service))
-        stream = asyncio.create_task(http.get(f"/v1/jobs/{job['id']}/events"))
-        while not service.event_broker.subscriber_count:
-            await asyncio.sleep(0.02)
-        async with service.pool.connection() as connection:
-            await connection.execute("DELETE FROM jobs WHERE id = %s", [uuid.UUID(job["id"])])
-        answer = await asyncio.wait_for(stream, 60)
-        assert answer.status_code == 200 and '"state": "queued"' in answer.text
-        assert not service.event_broker.subscriber_count
-
     with caplog.at_level(logging.ERROR):
-        talk(conversation, ping_seconds=0.2)
+        async with connect_service(ping_seconds=0.2) as (http, service):
+            job = await new_job(http, dataset_id=await committed_dataset(service))
+            stream = asyncio.create_task(http.get(f"/v1/jobs/{job['id']}/events"))
+            while not service.event_broker.subscriber_count:
+                await asyncio.sleep(0.02)
+            async with service.pool.connection() as connection:
+                await connection.execute("DELETE FROM jobs WHERE id = %s", [uuid.UUID(job["id"])])
+            answer = await asyncio.wait_for(stream, 60)
+            assert answer.status_code == 200 and '"state": "queued"' in answer.text
+            assert not service.event_broker.subscriber_count
     assert not caplog.records
 
 

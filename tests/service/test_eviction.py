@@ -45,8 +45,8 @@ async def until_taken(http: httpx.AsyncClient, address: str, content: bytes) -> 
     assert answer.status_code == 201, answer.text
 
 
-def test_deletion_frees_space_for_next_upload(conninfo: str, tmp_path: Path) -> None:
-    async def story(folder: Path) -> None:
+async def test_deletion_frees_space_for_next_upload(conninfo: str, tmp_path: Path) -> None:
+    with small_disk(tmp_path / "disk", 16) as folder:
         async with running_service(conninfo, tmp_path, storage=str(folder / "store")) as (http, service):
             first, second, third = [await new_dataset(http) for _ in range(3)]
             files = {name: picture(6 * MIB, name) for name in ("a", "b", "c")}
@@ -61,14 +61,11 @@ def test_deletion_frees_space_for_next_upload(conninfo: str, tmp_path: Path) -> 
             await until_taken(http, f"{third}/files/images/c.png", files["c"])
             assert held(service) == {hashlib.sha256(files[name]).hexdigest() for name in ("b", "c")}
 
-    with small_disk(tmp_path / "disk", 16) as folder:
-        asyncio.run(story(folder))
 
-
-def test_deletion_frees_space_on_low_disk(conninfo: str, tmp_path: Path) -> None:
+async def test_deletion_frees_space_on_low_disk(conninfo: str, tmp_path: Path) -> None:
     """Nobody uploads anything, and what an archive that broke off has left goes as well."""
 
-    async def story(folder: Path) -> None:
+    with small_disk(tmp_path / "disk", 16) as folder:
         settings = {"storage": str(folder / "store"), "floor_bytes": 4 * MIB}
         async with running_service(conninfo, tmp_path, **settings) as (http, service):
             dataset = await new_dataset(http)
@@ -88,9 +85,6 @@ def test_deletion_frees_space_on_low_disk(conninfo: str, tmp_path: Path) -> None
                 await asyncio.sleep(0.1)
             assert (await http.get(f"{dataset}/files/images/b.png")).content == picture(5 * MIB, "b")
 
-    with small_disk(tmp_path / "disk", 16) as folder:
-        asyncio.run(story(folder))
-
 
 @pytest.fixture
 def sharp(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -101,7 +95,7 @@ def sharp(monkeypatch: pytest.MonkeyPatch) -> None:
     )  # file times have the resolution of a tick
 
 
-def test_garbage_collection_spares_contents_of_running_uploads(
+async def test_garbage_collection_spares_contents_of_running_uploads(
     conninfo: str, tmp_path: Path, sharp: None
 ) -> None:
     """Archives with the same contents, again and again, while others delete them and all is collected."""
@@ -120,95 +114,86 @@ def test_garbage_collection_spares_contents_of_running_uploads(
             count += 1
         return count
 
-    async def story() -> None:
-        async with running_service(conninfo, tmp_path) as (http, service):
-            over = asyncio.Event()
-            uploads = [asyncio.create_task(upload(http, over)) for _ in range(3)]
-            removed = 0
-            deadline = time.monotonic() + PATIENCE_SECONDS
-            while removed < 20 and time.monotonic() < deadline:
-                found = await collect_garbage_now(service.pool, service.storage, every_seconds=0.0)
-                removed += found.blobs if found is not None else 0
-                if any(task.done() for task in uploads):
-                    break
-            over.set()
-            assert min(await asyncio.gather(*uploads)) > 0 and removed >= 20
-            await collect_garbage_now(service.pool, service.storage, every_seconds=0.0)
-            async with service.pool.connection() as connection:
-                assert await storage_leases.oldest_lease(connection) is None
-
-    asyncio.run(story())
+    async with running_service(conninfo, tmp_path) as (http, service):
+        over = asyncio.Event()
+        uploads = [asyncio.create_task(upload(http, over)) for _ in range(3)]
+        removed = 0
+        deadline = time.monotonic() + PATIENCE_SECONDS
+        while removed < 20 and time.monotonic() < deadline:
+            found = await collect_garbage_now(service.pool, service.storage, every_seconds=0.0)
+            removed += found.blobs if found is not None else 0
+            if any(task.done() for task in uploads):
+                break
+        over.set()
+        assert min(await asyncio.gather(*uploads)) > 0 and removed >= 20
+        await collect_garbage_now(service.pool, service.storage, every_seconds=0.0)
+        async with service.pool.connection() as connection:
+            assert await storage_leases.oldest_lease(connection) is None
 
 
-def test_storage_lease_protects_contents_until_expired(conninfo: str, tmp_path: Path, sharp: None) -> None:
+async def test_storage_lease_protects_contents_until_expired(
+    conninfo: str, tmp_path: Path, sharp: None
+) -> None:
     def store(service: Service, content: bytes) -> str:
         with service.storage.open_writer() as writer:
             writer.write(content)
             return writer.commit().sha256
 
-    async def story() -> None:
-        async with running_service(conninfo, tmp_path) as (_, service):
-            pool, storage = service.pool, service.storage
-            old = store(service, b"stored before and named by nobody")
-            await asyncio.sleep(0.2)
-            async with storage_leases.storage_lease(pool, storage):
-                young = store(service, b"about to be named")
-                removed = await collect_garbage_now(pool, storage, every_seconds=0.0)
-                assert removed is not None and held(service) == {young} and old not in held(service)
-            async with storage_leases.storage_lease(pool, storage) as note:
-                store(service, b"about to be named")
-                async with pool.connection() as connection:
-                    await connection.execute("UPDATE storing SET seen_at = now() - interval '1 hour'")
-                # A note that is being confirmed is not given up, however old.
-                async with note.reference([young]):
-                    await collect_garbage_now(pool, storage, every_seconds=0.0)
-                    assert held(service) == {young}
+    async with running_service(conninfo, tmp_path) as (_, service):
+        pool, storage = service.pool, service.storage
+        old = store(service, b"stored before and named by nobody")
+        await asyncio.sleep(0.2)
+        async with storage_leases.storage_lease(pool, storage):
+            young = store(service, b"about to be named")
+            removed = await collect_garbage_now(pool, storage, every_seconds=0.0)
+            assert removed is not None and held(service) == {young} and old not in held(service)
+        async with storage_leases.storage_lease(pool, storage) as note:
+            store(service, b"about to be named")
+            async with pool.connection() as connection:
+                await connection.execute("UPDATE storing SET seen_at = now() - interval '1 hour'")
+            # A note that is being confirmed is not given up, however old.
+            async with note.reference([young]):
                 await collect_garbage_now(pool, storage, every_seconds=0.0)
-                assert not held(service)
-                with pytest.raises(StorageUnavailableError, match="silent for too long"):
-                    async with note.reference([young]):
-                        pass
+                assert held(service) == {young}
+            await collect_garbage_now(pool, storage, every_seconds=0.0)
+            assert not held(service)
+            with pytest.raises(StorageUnavailableError, match="silent for too long"):
+                async with note.reference([young]):
+                    pass
 
-    asyncio.run(story())
 
-
-def test_content_stored_during_removal_is_kept(
+async def test_content_stored_during_removal_is_kept(
     conninfo: str, tmp_path: Path, sharp: None, s3_address: str, s3_bucket: str
 ) -> None:
     """A bucket removes what was looked at a moment before; whoever stores it in that moment hears of it."""
     content = picture(2000, "a")
 
-    async def story() -> None:
-        address = f"s3://{s3_bucket}/x?endpoint_url={s3_address}"
-        async with running_service(conninfo, tmp_path, storage=address) as (http, service):
-            with service.storage.open_writer() as writer:
-                writer.write(content)
-                writer.commit()
-            await asyncio.sleep(1.1)  # the times of a bucket are whole seconds
-            loop, looked, go_on = asyncio.get_running_loop(), asyncio.Event(), threading.Event()
-            client = service.storage.client  # type: ignore[attr-defined]
-            delete = client.delete_object
+    address = f"s3://{s3_bucket}/x?endpoint_url={s3_address}"
+    async with running_service(conninfo, tmp_path, storage=address) as (http, service):
+        with service.storage.open_writer() as writer:
+            writer.write(content)
+            writer.commit()
+        await asyncio.sleep(1.1)  # the times of a bucket are whole seconds
+        loop, looked, go_on = asyncio.get_running_loop(), asyncio.Event(), threading.Event()
+        client = service.storage.client  # type: ignore[attr-defined]
+        delete = client.delete_object
 
-            def slowly(**given: object) -> object:
-                loop.call_soon_threadsafe(looked.set)
-                assert go_on.wait(PATIENCE_SECONDS)
-                return delete(**given)
+        def slowly(**given: object) -> object:
+            loop.call_soon_threadsafe(looked.set)
+            assert go_on.wait(PATIENCE_SECONDS)
+            return delete(**given)
 
-            client.delete_object = slowly
-            removing = asyncio.create_task(
-                collect_garbage_now(service.pool, service.storage, every_seconds=0.0)
-            )
-            await looked.wait()
-            address = f"{await new_dataset(http)}/files/images/a.png"
-            put = asyncio.create_task(http.put(address, content=content))
-            await asyncio.sleep(0.3)
-            go_on.set()
-            assert (removed := await removing) is not None and removed.blobs == 1
-            answer = await put
-            while answer.status_code == 503:
-                assert "Retry-After" in answer.headers
-                answer = await http.put(address, content=content)
-            assert answer.status_code == 201, answer.text
-            assert (await http.get(address)).content == content
-
-    asyncio.run(story())
+        client.delete_object = slowly
+        removing = asyncio.create_task(collect_garbage_now(service.pool, service.storage, every_seconds=0.0))
+        await looked.wait()
+        address = f"{await new_dataset(http)}/files/images/a.png"
+        put = asyncio.create_task(http.put(address, content=content))
+        await asyncio.sleep(0.3)
+        go_on.set()
+        assert (removed := await removing) is not None and removed.blobs == 1
+        answer = await put
+        while answer.status_code == 503:
+            assert "Retry-After" in answer.headers
+            answer = await http.put(address, content=content)
+        assert answer.status_code == 201, answer.text
+        assert (await http.get(address)).content == content

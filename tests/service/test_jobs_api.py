@@ -3,8 +3,7 @@
 import asyncio
 import json
 import uuid
-from collections.abc import AsyncIterator, Awaitable, Callable
-from pathlib import Path
+from collections.abc import AsyncIterator
 from typing import Any
 
 import httpx
@@ -12,21 +11,12 @@ import pytest
 
 from octasplat.service.state import Service
 from octasplat.workers.queue.attempts import ResultFile
-from tests.support.service_harness import claim_job, committed_dataset, running_service, store_content
-
-Conversation = Callable[[httpx.AsyncClient, Service], Awaitable[None]]
-
-
-@pytest.fixture
-def talk(conninfo: str, tmp_path: Path) -> Callable[..., None]:
-    def run(conversation: Conversation, **settings: Any) -> None:
-        async def whole() -> None:
-            async with running_service(conninfo, tmp_path, **settings) as (http, service):
-                await conversation(http, service)
-
-        asyncio.run(whole())
-
-    return run
+from tests.support.service_harness import (
+    ConnectService,
+    claim_job,
+    committed_dataset,
+    store_content,
+)
 
 
 async def new_job(http: httpx.AsyncClient, service: Service, **body: Any) -> dict[str, Any]:
@@ -45,8 +35,10 @@ def is_problem(answer: httpx.Response, status: int, code: str) -> bool:
     return answer.json()["status"] == status and answer.json()["detail"].endswith((".", "!"))
 
 
-def test_former_names_of_options_are_read_and_noted_in_the_answer(talk: Callable[..., None]) -> None:
-    async def conversation(http: httpx.AsyncClient, service: Service) -> None:
+async def test_former_names_of_options_are_read_and_noted_in_the_answer(
+    connect_service: ConnectService,
+) -> None:
+    async with connect_service() as (http, service):
         dataset = await committed_dataset(service)
         former = {"preset": "paper", "train": {"rates": {"quat": 0.5}, "rays": 512}}
         job = (await http.post("/v1/jobs", json={"dataset_id": dataset, "options": former})).json()
@@ -57,11 +49,9 @@ def test_former_names_of_options_are_read_and_noted_in_the_answer(talk: Callable
         assert notes and set(job["notes"]) - set(same["notes"]) >= set(notes)
         assert not [note for note in same["notes"] if "is called" in note]
 
-    talk(conversation)
 
-
-def test_job_is_accepted_with_every_setting(talk: Callable[..., None]) -> None:
-    async def conversation(http: httpx.AsyncClient, service: Service) -> None:
+async def test_job_is_accepted_with_every_setting(connect_service: ConnectService) -> None:
+    async with connect_service() as (http, service):
         dataset = await committed_dataset(service)
         options = {"preset": "fast", "train": {"iterations": 70}}
         answer = await http.post("/v1/jobs", json={"dataset_id": dataset, "options": options, "label": "a"})
@@ -76,8 +66,6 @@ def test_job_is_accepted_with_every_setting(talk: Callable[..., None]) -> None:
         assert uuid.UUID(job["id"]).version == 7
         found = await http.get(answer.headers["Location"])
         assert found.json() == job
-
-    talk(conversation)
 
 
 @pytest.mark.parametrize(
@@ -100,21 +88,19 @@ def test_job_is_accepted_with_every_setting(talk: Callable[..., None]) -> None:
         ({"kind": "export", "options": {"files": ["a.glb"]}}, 422, "input", "#/source_id"),
     ],
 )
-def test_create_job_invalid_request_is_refused(
-    talk: Callable[..., None], body: dict[str, Any], status: int, code: str, pointer: str
+async def test_create_job_invalid_request_is_refused(
+    connect_service: ConnectService, body: dict[str, Any], status: int, code: str, pointer: str
 ) -> None:
-    async def conversation(http: httpx.AsyncClient, service: Service) -> None:
+    async with connect_service() as (http, service):
         dataset = await committed_dataset(service)
         answer = await http.post("/v1/jobs", json={"dataset_id": dataset, **body})
         assert is_problem(answer, status, code)
         assert pointer in [error["pointer"] for error in answer.json()["errors"]]
         assert (await http.get("/v1/jobs")).json()["jobs"] == []
 
-    talk(conversation)
 
-
-def test_dataset_must_be_committed_and_have_poses(talk: Callable[..., None]) -> None:
-    async def conversation(http: httpx.AsyncClient, service: Service) -> None:
+async def test_dataset_must_be_committed_and_have_poses(connect_service: ConnectService) -> None:
+    async with connect_service() as (http, service):
         made = (await http.post("/v1/datasets", json={"name": "x"})).json()
         assert is_problem(await http.post("/v1/jobs", json={"dataset_id": made["id"]}), 409, "dataset-open")
         without = await committed_dataset(service, has_poses=False)
@@ -125,22 +111,18 @@ def test_dataset_must_be_committed_and_have_poses(talk: Callable[..., None]) -> 
         assert answer.status_code == 202
         assert answer.json()["stages"][:4] == ["features", "matches", "poses", "load"]
 
-    talk(conversation)
 
-
-def test_poses_are_found_only_where_they_are_missing(talk: Callable[..., None]) -> None:
-    async def conversation(http: httpx.AsyncClient, service: Service) -> None:
+async def test_poses_are_found_only_where_they_are_missing(connect_service: ConnectService) -> None:
+    async with connect_service() as (http, service):
         for has_poses, kept, first in ((True, "given", "load"), (False, "auto", "features")):
             dataset = await committed_dataset(service, has_poses=has_poses)
             asked = {"dataset_id": dataset, "options": {}}
             job = (await http.post("/v1/jobs", json=asked)).json()
             assert (job["options"]["poses"], job["stages"][0]) == (kept, first)
 
-    talk(conversation)
 
-
-def test_idempotency_key_makes_one_job(talk: Callable[..., None]) -> None:
-    async def conversation(http: httpx.AsyncClient, service: Service) -> None:
+async def test_idempotency_key_makes_one_job(connect_service: ConnectService) -> None:
+    async with connect_service() as (http, service):
         body = {"kind": "toy", "dataset_id": await committed_dataset(service)}
         headers = {"Idempotency-Key": "once"}
         answers = await asyncio.gather(*(http.post("/v1/jobs", json=body, headers=headers) for _ in range(6)))
@@ -154,11 +136,9 @@ def test_idempotency_key_makes_one_job(talk: Callable[..., None]) -> None:
         # What was refused has made nothing, so the key is free.
         assert (await http.post("/v1/jobs", json=body, headers=refused)).status_code == 202
 
-    talk(conversation)
 
-
-def test_polling_is_cheap_and_changes_are_guarded(talk: Callable[..., None]) -> None:
-    async def conversation(http: httpx.AsyncClient, service: Service) -> None:
+async def test_polling_is_cheap_and_changes_are_guarded(connect_service: ConnectService) -> None:
+    async with connect_service() as (http, service):
         job = await new_job(http, service)
         address = f"/v1/jobs/{job['id']}"
         first = await http.get(address)
@@ -179,11 +159,9 @@ def test_polling_is_cheap_and_changes_are_guarded(talk: Callable[..., None]) -> 
         )
         assert (fresh.json()["label"], fresh.json()["pinned"]) == ("x", True)
 
-    talk(conversation)
 
-
-def test_job_can_be_cancelled_retried_and_deleted(talk: Callable[..., None]) -> None:
-    async def conversation(http: httpx.AsyncClient, service: Service) -> None:
+async def test_job_can_be_cancelled_retried_and_deleted(connect_service: ConnectService) -> None:
+    async with connect_service() as (http, service):
         job = await new_job(http, service)
         address = f"/v1/jobs/{job['id']}"
         assert is_problem(await http.delete(address), 409, "conflict")
@@ -204,11 +182,9 @@ def test_job_can_be_cancelled_retried_and_deleted(talk: Callable[..., None]) -> 
         assert (await http.delete(address, params={"cancel": True})).status_code == 204
         assert is_problem(await http.get(address), 404, "not-found")
 
-    talk(conversation)
 
-
-def test_job_list_is_paginated(talk: Callable[..., None]) -> None:
-    async def conversation(http: httpx.AsyncClient, service: Service) -> None:
+async def test_job_list_is_paginated(connect_service: ConnectService) -> None:
+    async with connect_service() as (http, service):
         made = [(await new_job(http, service, label=f"l{n}"))["id"] for n in range(5)]
         address, found = "/v1/jobs?limit=2", []
         while address:
@@ -224,11 +200,9 @@ def test_job_list_is_paginated(talk: Callable[..., None]) -> None:
         assert is_problem(await http.get("/v1/jobs?state=odd"), 422, "request")
         assert is_problem(await http.get("/v1/jobs?limit=0"), 422, "request")
 
-    talk(conversation)
 
-
-def test_results_in_ranges_with_digest(talk: Callable[..., None]) -> None:
-    async def conversation(http: httpx.AsyncClient, service: Service) -> None:
+async def test_results_in_ranges_with_digest(connect_service: ConnectService) -> None:
+    async with connect_service() as (http, service):
         job = await new_job(http, service)
         attempt = await claim_job(service, job)
         content = bytes(range(256)) * 20
@@ -273,11 +247,9 @@ def test_results_in_ranges_with_digest(talk: Callable[..., None]) -> None:
         service.storage.delete(sha256)
         assert is_problem(await http.get(f"{address}/mesh.glb"), 410, "content-gone")
 
-    talk(conversation)
 
-
-def test_export_of_a_finished_job(talk: Callable[..., None]) -> None:
-    async def conversation(http: httpx.AsyncClient, service: Service) -> None:
+async def test_export_of_a_finished_job(connect_service: ConnectService) -> None:
+    async with connect_service() as (http, service):
         source = await new_job(http, service)
         body = {"kind": "export", "source_id": source["id"], "options": {"files": ["a.glb"]}}
         assert is_problem(await http.post("/v1/jobs", json=body), 409, "source")
@@ -290,8 +262,6 @@ def test_export_of_a_finished_job(talk: Callable[..., None]) -> None:
         assert is_problem(await http.delete(f"/v1/jobs/{source['id']}"), 409, "conflict")
         await http.post(f"/v1/jobs/{answer.json()['id']}/cancel")
         assert (await http.delete(f"/v1/jobs/{source['id']}")).status_code == 204
-
-    talk(conversation)
 
 
 async def events_of(response: httpx.Response) -> AsyncIterator[tuple[str, str, dict[str, Any]]]:
@@ -309,8 +279,8 @@ async def events_of(response: httpx.Response) -> AsyncIterator[tuple[str, str, d
             data = ""
 
 
-def test_log_timeline_and_stream(talk: Callable[..., None]) -> None:
-    async def conversation(http: httpx.AsyncClient, service: Service) -> None:
+async def test_log_timeline_and_stream(connect_service: ConnectService) -> None:
+    async with connect_service() as (http, service):
         job = await new_job(http, service)
         attempt = await claim_job(service, job)
         await attempt.add_log_lines([f"line {n}" for n in range(5)])
@@ -334,11 +304,9 @@ def test_log_timeline_and_stream(talk: Callable[..., None]) -> None:
         done = await http.get(f"/v1/jobs/{job['id']}/events", headers={"Last-Event-ID": heard[-1][1]})
         assert done.status_code == 204
 
-    talk(conversation)
 
-
-def test_job_psnr_is_that_of_test_views(talk: Callable[..., None]) -> None:
-    async def conversation(http: httpx.AsyncClient, service: Service) -> None:
+async def test_job_psnr_is_that_of_test_views(connect_service: ConnectService) -> None:
+    async with connect_service() as (http, service):
         job = await new_job(http, service)
         address = f"/v1/jobs/{job['id']}"
         attempt = await claim_job(service, job)
@@ -362,11 +330,9 @@ def test_job_psnr_is_that_of_test_views(talk: Callable[..., None]) -> None:
         await attempt.succeed([], 28.56)
         assert await figures() == (28.56, 34.0)
 
-    talk(conversation)
 
-
-def test_info_describes_service(talk: Callable[..., None]) -> None:
-    async def conversation(http: httpx.AsyncClient, service: Service) -> None:
+async def test_info_describes_service(connect_service: ConnectService) -> None:
+    async with connect_service() as (http, service):
         info = (await http.get("/v1/info")).json()
         assert {"reconstruct", "evaluate", "export", "render", "toy"} <= set(info["kinds"])
         assert "glb" in [form["name"] for form in info["formats"]] and info["needs_token"] is False
@@ -383,11 +349,9 @@ def test_info_describes_service(talk: Callable[..., None]) -> None:
         ready = await http.get("/readyz")
         assert (ready.status_code, ready.json()["checks"]["database"]) == (503, "outdated")
 
-    talk(conversation)
 
-
-def test_document_has_examples_and_describes_errors(talk: Callable[..., None]) -> None:
-    async def conversation(http: httpx.AsyncClient, service: Service) -> None:
+async def test_document_has_examples_and_describes_errors(connect_service: ConnectService) -> None:
+    async with connect_service() as (http, _):
         document = (await http.get("/openapi.json")).json()
         assert document["openapi"].startswith("3.1")
         schemas = document["components"]["schemas"]
@@ -398,11 +362,9 @@ def test_document_has_examples_and_describes_errors(talk: Callable[..., None]) -
         assert "application/problem+json" in create["responses"]["422"]["content"]
         assert any(p["name"].lower() == "idempotency-key" for p in create["parameters"])
 
-    talk(conversation)
 
-
-def test_long_bodies_and_odd_ones(talk: Callable[..., None]) -> None:
-    async def conversation(http: httpx.AsyncClient, service: Service) -> None:
+async def test_long_bodies_and_odd_ones(connect_service: ConnectService) -> None:
+    async with connect_service() as (http, _):
         assert is_problem(await http.post("/v1/jobs", content=b"x" * 2_000_000), 413, "too-large")
 
         async def endless() -> AsyncIterator[bytes]:
@@ -414,15 +376,11 @@ def test_long_bodies_and_odd_ones(talk: Callable[..., None]) -> None:
         assert is_problem(await http.post("/nowhere"), 404, "not-found")
         assert is_problem(await http.put("/v1/info"), 405, "method-not-allowed")
 
-    talk(conversation)
 
-
-def test_lost_database_is_503(talk: Callable[..., None], conninfo: str) -> None:
-    async def conversation(http: httpx.AsyncClient, service: Service) -> None:
+async def test_lost_database_is_503(connect_service: ConnectService, conninfo: str) -> None:
+    async with connect_service() as (http, service):
         await service.pool.close()
         answer = await http.get("/v1/jobs")
         assert is_problem(answer, 503, "database") and answer.headers["Retry-After"]
         assert (await http.get("/healthz")).status_code == 200
         assert (await http.get("/readyz")).json()["checks"]["database"] == "unreachable"
-
-    talk(conversation)

@@ -1,9 +1,6 @@
 """Ceilings, priorities, estimates, and queues that nobody takes, over HTTP."""
 
-import asyncio
 import uuid
-from collections.abc import Awaitable, Callable
-from pathlib import Path
 from typing import Any
 
 import httpx
@@ -14,22 +11,14 @@ from octasplat.workers.db.datasets import put_file
 from octasplat.workers.db.locks import lock_owner
 from octasplat.workers.db.workers import record_worker_heartbeat
 from octasplat.workers.queue.attempts import ResultFile
-from tests.support.service_harness import claim_job, client_with_token, committed_dataset, running_service
+from tests.support.service_harness import (
+    ConnectService,
+    claim_job,
+    client_with_token,
+    committed_dataset,
+)
 
-Conversation = Callable[[httpx.AsyncClient, Service], Awaitable[None]]
 PHOTOGRAPHS = [{"width_px": 269, "height_px": 480, "count": 50}]
-
-
-@pytest.fixture
-def talk(conninfo: str, tmp_path: Path) -> Callable[..., None]:
-    def run(conversation: Conversation, **settings: Any) -> None:
-        async def whole() -> None:
-            async with running_service(conninfo, tmp_path, **settings) as (http, service):
-                await conversation(http, service)
-
-        asyncio.run(whole())
-
-    return run
 
 
 async def photographed_dataset(service: Service, width_px: int, height_px: int, count: int) -> str:
@@ -63,19 +52,17 @@ def ceiling(answer: httpx.Response) -> tuple[str, int]:
         ({"exports": [f"{n}.glb" for n in range(21)]}, "#/options/exports", 20),
     ],
 )
-def test_too_much_is_refused_with_the_ceiling(
-    talk: Callable[..., None], options: dict[str, Any], pointer: str, allowed: int
+async def test_too_much_is_refused_with_the_ceiling(
+    connect_service: ConnectService, options: dict[str, Any], pointer: str, allowed: int
 ) -> None:
-    async def conversation(http: httpx.AsyncClient, service: Service) -> None:
+    async with connect_service() as (http, service):
         body = {"dataset_id": await committed_dataset(service), "options": options}
         assert ceiling(await http.post("/v1/jobs", json=body)) == (pointer, allowed)
         assert ceiling(await http.post("/v1/estimates", json={"options": options})) == (pointer, allowed)
 
-    talk(conversation)
 
-
-def test_job_limits_apply_to_retries_and_renders(talk: Callable[..., None]) -> None:
-    async def conversation(http: httpx.AsyncClient, service: Service) -> None:
+async def test_job_limits_apply_to_retries_and_renders(connect_service: ConnectService) -> None:
+    async with connect_service(max_iterations=50, max_render_pixels=19_999) as (http, service):
         dataset = await photographed_dataset(service, 100, 50, 4)
         body = {"dataset_id": dataset, "options": {"train": {"iterations": 51}}}
         assert ceiling(await http.post("/v1/jobs", json=body)) == ("#/options/train/iterations", 50)
@@ -99,11 +86,9 @@ def test_job_limits_apply_to_retries_and_renders(talk: Callable[..., None]) -> N
         render["options"] = {"mode": "views", "format": "png", "max_side": 99}
         assert (await http.post("/v1/jobs", json=render)).status_code == 202
 
-    talk(conversation, max_iterations=50, max_render_pixels=19_999)
 
-
-def test_high_priorities_are_for_administrators(talk: Callable[..., None]) -> None:
-    async def conversation(http: httpx.AsyncClient, service: Service) -> None:
+async def test_high_priorities_are_for_administrators(connect_service: ConnectService) -> None:
+    async with connect_service() as (http, service):
         writer = await client_with_token(service, "me", "write")
         admin = await client_with_token(service, "boss", "admin")
         mine = {"kind": "toy", "dataset_id": await committed_dataset(service, "me")}
@@ -118,11 +103,9 @@ def test_high_priorities_are_for_administrators(talk: Callable[..., None]) -> No
             if status == 422:
                 assert ceiling(answer) == ("#/priority", 10)
 
-    talk(conversation)
 
-
-def test_job_estimate_before_and_at_creation_match(talk: Callable[..., None]) -> None:
-    async def conversation(http: httpx.AsyncClient, service: Service) -> None:
+async def test_job_estimate_before_and_at_creation_match(connect_service: ConnectService) -> None:
+    async with connect_service() as (http, service):
         async with service.pool.connection() as connection:
             facts = {"threads": 4, "memory_limit_bytes": 100_000_000}
             await record_worker_heartbeat(
@@ -166,13 +149,11 @@ def test_job_estimate_before_and_at_creation_match(talk: Callable[..., None]) ->
             answer = await http.post("/v1/estimates", json={name: thing}, headers=stranger)
             assert answer.status_code == 422 and answer.json()["errors"][0]["pointer"] == f"#/{name}"
 
-    talk(conversation)
 
-
-def test_job_exceeding_workspace_limit_is_refused(talk: Callable[..., None]) -> None:
+async def test_job_exceeding_workspace_limit_is_refused(connect_service: ConnectService) -> None:
     """Within the ceiling of pixels, and still more than a job's folder may take."""
 
-    async def conversation(http: httpx.AsyncClient, service: Service) -> None:
+    async with connect_service(max_workspace_bytes=4 << 30) as (http, service):
         dataset = await photographed_dataset(service, 64, 48, 3)
         job = (await http.post("/v1/jobs", json={"dataset_id": dataset, "kind": "reconstruct"})).json()
         attempt = await claim_job(service, job)
@@ -183,5 +164,3 @@ def test_job_exceeding_workspace_limit_is_refused(talk: Callable[..., None]) -> 
         body["options"]["format"] = "png"
         answer = await http.post("/v1/jobs", json=body)
         assert answer.status_code == 202 and answer.json()["estimate"]["disk_bytes"] > 4e8, answer.text
-
-    talk(conversation, max_workspace_bytes=4 << 30)

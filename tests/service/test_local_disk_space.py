@@ -19,10 +19,10 @@ async def new_dataset(http: httpx.AsyncClient) -> str:
     return str((await http.post("/v1/datasets", json={"name": "d"})).headers["Location"])
 
 
-def test_archive_spool_space_is_limited(conninfo: str, tmp_path: Path) -> None:
+async def test_archive_spool_space_is_limited(conninfo: str, tmp_path: Path) -> None:
     archive = build_zip(*(ZipMember(f"images/{n}.png", photograph() + os.urandom(MIB)) for n in range(3)))
 
-    async def story(disk: Path) -> None:
+    with small_disk(tmp_path / "disk", 16) as disk:
         settings = {"work": disk, "max_spool_bytes": 5 * MIB, "storage": str(tmp_path / "elsewhere")}
         async with running_service(conninfo, tmp_path, **settings) as (http, _):
             first, second = await new_dataset(http), await new_dataset(http)
@@ -49,40 +49,31 @@ def test_archive_spool_space_is_limited(conninfo: str, tmp_path: Path) -> None:
             answer = await http.put(f"{await new_dataset(http)}/archive", content=archive)
             assert answer.status_code == 507 and "disk for archives" in answer.json()["detail"], answer.text
 
-    with small_disk(tmp_path / "disk", 16) as folder:
-        asyncio.run(story(folder))
+
+async def test_unreachable_store_is_not_ready(conninfo: str, tmp_path: Path) -> None:
+    async with running_service(conninfo, tmp_path) as (http, _):
+        assert (await http.get("/readyz")).json()["checks"]["storage"] == "ok"
+        store = tmp_path / "store"
+        store.rename(tmp_path / "away")
+        answer = await http.get("/readyz")
+        assert (answer.status_code, answer.json()["checks"]["storage"]) == (503, "unreachable")
+        store.mkdir()  # as where a disk was mounted
+        assert (await http.get("/readyz")).json()["checks"]["storage"] == "unreachable"
+        store.rmdir()
+        (tmp_path / "away").rename(store)
+        assert (await http.get("/readyz")).status_code == 200
 
 
-def test_unreachable_store_is_not_ready(conninfo: str, tmp_path: Path) -> None:
-    async def story() -> None:
-        async with running_service(conninfo, tmp_path) as (http, _):
-            assert (await http.get("/readyz")).json()["checks"]["storage"] == "ok"
-            store = tmp_path / "store"
-            store.rename(tmp_path / "away")
-            answer = await http.get("/readyz")
-            assert (answer.status_code, answer.json()["checks"]["storage"]) == (503, "unreachable")
-            store.mkdir()  # as where a disk was mounted
-            assert (await http.get("/readyz")).json()["checks"]["storage"] == "unreachable"
-            store.rmdir()
-            (tmp_path / "away").rename(store)
-            assert (await http.get("/readyz")).status_code == 200
-
-    asyncio.run(story())
-
-
-def test_unreachable_bucket_is_not_ready(
+async def test_unreachable_bucket_is_not_ready(
     conninfo: str, tmp_path: Path, s3_address: str, s3_bucket: str
 ) -> None:
-    async def story() -> None:
-        for address in (
-            f"s3://nowhere/x?endpoint_url={s3_address}",
-            "s3://b/x?endpoint_url=http://127.0.0.1:9",
-        ):
-            async with running_service(conninfo, tmp_path, storage=address) as (http, _):
-                answer = await http.get("/readyz")
-                assert (answer.status_code, answer.json()["checks"]["storage"]) == (503, "unreachable")
-        address = f"s3://{s3_bucket}/x?endpoint_url={s3_address}"
+    for address in (
+        f"s3://nowhere/x?endpoint_url={s3_address}",
+        "s3://b/x?endpoint_url=http://127.0.0.1:9",
+    ):
         async with running_service(conninfo, tmp_path, storage=address) as (http, _):
-            assert (await http.get("/readyz")).status_code == 200
-
-    asyncio.run(story())
+            answer = await http.get("/readyz")
+            assert (answer.status_code, answer.json()["checks"]["storage"]) == (503, "unreachable")
+    address = f"s3://{s3_bucket}/x?endpoint_url={s3_address}"
+    async with running_service(conninfo, tmp_path, storage=address) as (http, _):
+        assert (await http.get("/readyz")).status_code == 200

@@ -1,16 +1,14 @@
 """What cannot be written is refused when it is asked for, and costs nothing of what can."""
 
-import asyncio
 import json
 import os
 import subprocess
 import sys
 import uuid
-from collections.abc import Awaitable, Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import httpx
 import pytest
 from test_reconstruction import ROOT, TRAIN, Machine, start
 
@@ -21,22 +19,9 @@ from octasplat.workers.client.submission import Submission, submit
 from octasplat.workers.client.watch import watch_job
 from octasplat.workers.db.workers import record_worker_heartbeat
 from octasplat.workers.queue.attempts import ResultFile
-from tests.support.service_harness import claim_job, committed_dataset, running_service
+from tests.support.service_harness import ConnectService, claim_job, committed_dataset
 
-Conversation = Callable[[httpx.AsyncClient, Service], Awaitable[None]]
 FORMATS = [exporter.name for exporter in exporters()]
-
-
-@pytest.fixture
-def talk(conninfo: str, tmp_path: Path) -> Callable[[Conversation], None]:
-    def run(conversation: Conversation) -> None:
-        async def whole() -> None:
-            async with running_service(conninfo, tmp_path) as (http, service):
-                await conversation(http, service)
-
-        asyncio.run(whole())
-
-    return run
 
 
 async def worker_lives(service: Service, *lacking: str, queue: str = "cpu") -> None:
@@ -47,8 +32,8 @@ async def worker_lives(service: Service, *lacking: str, queue: str = "cpu") -> N
         )
 
 
-def test_create_job_unwritable_format_is_refused(talk: Callable[[Conversation], None]) -> None:
-    async def conversation(http: httpx.AsyncClient, service: Service) -> None:
+async def test_create_job_unwritable_format_is_refused(connect_service: ConnectService) -> None:
+    async with connect_service() as (http, service):
         dataset = await committed_dataset(service)
         body = {"dataset_id": dataset, "options": {"exports": ["mesh.glb", "scene.sog"]}}
         early = await http.post("/v1/jobs", json=body)  # nobody is there who could say
@@ -74,11 +59,9 @@ def test_create_job_unwritable_format_is_refused(talk: Callable[[Conversation], 
         elsewhere = {**body, "queue": "large", "options": {"exports": ["scene.usdz"]}}
         assert (await http.post("/v1/jobs", json=elsewhere)).status_code == 202  # nobody is there
 
-    talk(conversation)
 
-
-def test_retry_with_other_options(talk: Callable[[Conversation], None]) -> None:
-    async def conversation(http: httpx.AsyncClient, service: Service) -> None:
+async def test_retry_with_other_options(connect_service: ConnectService) -> None:
+    async with connect_service() as (http, service):
         await worker_lives(service, "sog")
         body = {"dataset_id": await committed_dataset(service), "options": {"preset": "fast"}}
         job = (await http.post("/v1/jobs", json=body)).json()
@@ -120,8 +103,6 @@ def test_retry_with_other_options(talk: Callable[[Conversation], None]) -> None:
         now = (await http.post(f"{address}/retry", json=other)).json()
         assert now["options"]["train"]["max_gaussians_auto"] == 400_000 != cap
         assert now["options"]["exports"] == ["b.splat"]
-
-    talk(conversation)
 
 
 @pytest.fixture

@@ -1,9 +1,6 @@
 """Requests that meet each other get an answer that fits, never a fault of the service."""
 
 import asyncio
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any
 
 import httpx
 import pytest
@@ -13,21 +10,14 @@ from octasplat.service.intake.dataset import DatasetSummary
 from octasplat.service.state import Service
 from octasplat.workers.queue.attempts import ResultFile
 from tests.support.model_builder import photograph
-from tests.support.service_harness import claim_job, committed_dataset, running_service, store_content
+from tests.support.service_harness import (
+    ConnectService,
+    claim_job,
+    committed_dataset,
+    store_content,
+)
 
 ROUNDS = 12
-
-
-@pytest.fixture
-def talk(conninfo: str, tmp_path: Path) -> Callable[..., None]:
-    def run(conversation: Any, **settings: Any) -> None:
-        async def whole() -> None:
-            async with running_service(conninfo, tmp_path, **settings) as (http, service):
-                await conversation(http, service)
-
-        asyncio.run(whole())
-
-    return run
 
 
 async def new_dataset(http: httpx.AsyncClient) -> str:
@@ -38,8 +28,8 @@ def statuses(answers: list[httpx.Response]) -> list[int]:
     return sorted(answer.status_code for answer in answers)
 
 
-def test_deletions_and_uploads_at_once(talk: Callable[..., None]) -> None:
-    async def conversation(http: httpx.AsyncClient, service: Service) -> None:
+async def test_deletions_and_uploads_at_once(connect_service: ConnectService) -> None:
+    async with connect_service() as (http, _):
         for _ in range(ROUNDS):
             dataset = await new_dataset(http)
             address = f"{dataset}/files/images/a.png"
@@ -55,13 +45,11 @@ def test_deletions_and_uploads_at_once(talk: Callable[..., None]) -> None:
             assert {answer.status_code for answer in answers} <= {200, 201, 204, 404, 409}, answers
             assert 204 in {answer.status_code for answer in answers}
 
-    talk(conversation)
 
-
-def test_dataset_deletion_during_check_is_refused(
-    talk: Callable[..., None], monkeypatch: pytest.MonkeyPatch
+async def test_dataset_deletion_during_check_is_refused(
+    connect_service: ConnectService, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    async def conversation(http: httpx.AsyncClient, _: Service) -> None:
+    async with connect_service() as (http, _):
         dataset = await new_dataset(http)
         loop, begun, go_on = asyncio.get_running_loop(), asyncio.Event(), asyncio.Event()
 
@@ -78,11 +66,9 @@ def test_dataset_deletion_during_check_is_refused(
         assert (await commit).status_code == 200
         assert (await http.delete(dataset)).status_code == 204
 
-    talk(conversation)
 
-
-def test_concurrent_job_deletions_succeed_once(talk: Callable[..., None]) -> None:
-    async def conversation(http: httpx.AsyncClient, service: Service) -> None:
+async def test_concurrent_job_deletions_succeed_once(connect_service: ConnectService) -> None:
+    async with connect_service() as (http, service):
         dataset = await committed_dataset(service)
         for _ in range(ROUNDS):
             job = (await http.post("/v1/jobs", json={"dataset_id": dataset, "kind": "toy"})).json()
@@ -97,10 +83,10 @@ def test_concurrent_job_deletions_succeed_once(talk: Callable[..., None]) -> Non
             again = await http.delete(address)
             assert again.status_code in (204, 404)
 
-    talk(conversation)
 
-
-def test_ranges_with_thousands_of_digits(talk: Callable[..., None], s3_address: str, s3_bucket: str) -> None:
+async def test_ranges_with_thousands_of_digits(
+    connect_service: ConnectService, s3_address: str, s3_bucket: str
+) -> None:
     async def conversation(http: httpx.AsyncClient, service: Service) -> None:
         dataset = await committed_dataset(service)
         job = (await http.post("/v1/jobs", json={"dataset_id": dataset, "kind": "toy"})).json()
@@ -113,5 +99,7 @@ def test_ranges_with_thousands_of_digits(talk: Callable[..., None], s3_address: 
             assert answer.status_code in (200, 206, 400, 416)
         assert (await http.get(address, headers={"Range": "bytes=2-4"})).content == b"234"
 
-    talk(conversation, storage=f"s3://{s3_bucket}/some?endpoint_url={s3_address}")
-    talk(conversation)
+    async with connect_service(storage=f"s3://{s3_bucket}/some?endpoint_url={s3_address}") as (http, service):
+        await conversation(http, service)
+    async with connect_service() as (http, service):
+        await conversation(http, service)

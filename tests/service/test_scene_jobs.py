@@ -38,44 +38,41 @@ def octasplat(*arguments: object) -> None:
     assert done.exit_code == 0, done.output
 
 
-def test_scene_job_invalid_options_are_refused_before_queueing(conninfo: str, tmp_path: Path) -> None:
-    async def conversation() -> None:
-        async with running_service(conninfo, tmp_path) as (http, service):
-            source = await finished(http, service, {"scene.ply": b"ply"})
-            files = await sent(http, {"a.ply": b"ply\n", "sky.hdr": HDR, "turn.txt": b"1 0 0 0"})
-            on = {"source_id": source, "files_id": files}
-            for body, pointer, words in (
-                ({"kind": "import", "options": {"file": "a.ply"}}, "#/files_id", "works on files_id"),
-                ({"kind": "import", "options": {"file": "a.ply"}, **on}, "#/source_id", "files_id alone"),
-                (
-                    {"kind": "import", "options": {"file": "b.ply"}, "files_id": files},
-                    "#/options/file",
-                    "there is no file 'b.ply'",
-                ),
-                ({"kind": "edit", "options": {}, **on}, "#/options/meshes", "required"),
-                ({"kind": "edit", "options": {"meshes": ["c.ply"]}, **on}, "#/options/meshes/0", "'c.ply'"),
-                ({"kind": "deform", "options": {"proxy": "p.obj", "deformed": ["a.ply"]}, **on},
-                 "#/options/proxy", "'p.obj'"),
-                ({"kind": "merge", "options": {}, **on}, "#/options/", "at least two scenes"),
-                ({"kind": "transform", "options": {}, **on}, "#/options/", "Say what to do"),
-                ({"kind": "transform", "options": {"matrix": "no.txt"}, **on}, "#/options/matrix", "no.txt"),
-                ({"kind": "crop", "options": {}, "source_id": source}, "#/options/", "Say what to keep"),
-                ({"kind": "crop", "options": {"where": "x > 0"}, **on}, "#/files_id", "take no files"),
-                ({"kind": "export", "options": {"files": ["a.obj"], "opaque": True}, "source_id": source},
-                 "#/options/", "opaque is for GLB"),
-            ):  # fmt: skip
-                refused = await http.post("/v1/jobs", json=body)
-                assert refused.status_code == 422, (body, refused.text)
-                [fault] = refused.json()["errors"]
-                assert fault["pointer"] == pointer and words in fault["detail"], fault
-            made = await http.post(
-                "/v1/jobs", json={"kind": "transform", "options": {"matrix": "turn.txt"}, **on}
-            )
-            assert made.status_code == 202 and made.json()["dataset_id"] is None
-            kinds = {kind["name"]: kind["needs"] for kind in (await http.get("/v1/options")).json()["kinds"]}
-            assert kinds["import"] == "files" and kinds["edit"] == "result"
-
-    asyncio.run(conversation())
+async def test_scene_job_invalid_options_are_refused_before_queueing(conninfo: str, tmp_path: Path) -> None:
+    async with running_service(conninfo, tmp_path) as (http, service):
+        source = await finished(http, service, {"scene.ply": b"ply"})
+        files = await sent(http, {"a.ply": b"ply\n", "sky.hdr": HDR, "turn.txt": b"1 0 0 0"})
+        on = {"source_id": source, "files_id": files}
+        for body, pointer, words in (
+            ({"kind": "import", "options": {"file": "a.ply"}}, "#/files_id", "works on files_id"),
+            ({"kind": "import", "options": {"file": "a.ply"}, **on}, "#/source_id", "files_id alone"),
+            (
+                {"kind": "import", "options": {"file": "b.ply"}, "files_id": files},
+                "#/options/file",
+                "there is no file 'b.ply'",
+            ),
+            ({"kind": "edit", "options": {}, **on}, "#/options/meshes", "required"),
+            ({"kind": "edit", "options": {"meshes": ["c.ply"]}, **on}, "#/options/meshes/0", "'c.ply'"),
+            ({"kind": "deform", "options": {"proxy": "p.obj", "deformed": ["a.ply"]}, **on},
+             "#/options/proxy", "'p.obj'"),
+            ({"kind": "merge", "options": {}, **on}, "#/options/", "at least two scenes"),
+            ({"kind": "transform", "options": {}, **on}, "#/options/", "Say what to do"),
+            ({"kind": "transform", "options": {"matrix": "no.txt"}, **on}, "#/options/matrix", "no.txt"),
+            ({"kind": "crop", "options": {}, "source_id": source}, "#/options/", "Say what to keep"),
+            ({"kind": "crop", "options": {"where": "x > 0"}, **on}, "#/files_id", "take no files"),
+            ({"kind": "export", "options": {"files": ["a.obj"], "opaque": True}, "source_id": source},
+             "#/options/", "opaque is for GLB"),
+        ):  # fmt: skip
+            refused = await http.post("/v1/jobs", json=body)
+            assert refused.status_code == 422, (body, refused.text)
+            [fault] = refused.json()["errors"]
+            assert fault["pointer"] == pointer and words in fault["detail"], fault
+        made = await http.post(
+            "/v1/jobs", json={"kind": "transform", "options": {"matrix": "turn.txt"}, **on}
+        )
+        assert made.status_code == 202 and made.json()["dataset_id"] is None
+        kinds = {kind["name"]: kind["needs"] for kind in (await http.get("/v1/options")).json()["kinds"]}
+        assert kinds["import"] == "files" and kinds["edit"] == "result"
 
 
 def test_local_files_are_sent_under_option_names(tmp_path: Path) -> None:
@@ -143,7 +140,7 @@ class Jobs:
 
 
 @pytest.mark.heavy
-def test_jobs_give_the_scenes_of_the_commands(
+async def test_jobs_give_the_scenes_of_the_commands(
     conninfo: str,
     tmp_path: Path,
     run: Path,  # noqa: F811
@@ -170,76 +167,71 @@ def test_jobs_give_the_scenes_of_the_commands(
     deformed = ("--proxy", tmp_path / "c.obj", "--deformed", tmp_path / "d.obj", "--reach", "inf")
     octasplat("deform", source, *deformed, "-o", tmp_path / "deform.ply")
 
-    async def conversation() -> None:
-        async with running_service(conninfo, tmp_path, kind_modules=()) as (http, service):
-            jobs = Jobs(http)
-            whole = await finished(http, service, {name: (source / name).read_bytes() for name in RUN_FILES})
+    async with running_service(conninfo, tmp_path, kind_modules=()) as (http, service):
+        jobs = Jobs(http)
+        whole = await finished(http, service, {name: (source / name).read_bytes() for name in RUN_FILES})
 
-            crop = await jobs.make("crop", {"where": "x > 0"}, whole)
-            assert await jobs.read(crop, "scene.ply") == (tmp_path / "crop" / "scene.ply").read_bytes()
-            assert await jobs.names(crop) == {*RUN_FILES, "edits.json"}
-            edits = json.loads(await jobs.read(crop, "edits.json"))
-            assert edits == [{"operation": "crop", "where": "x > 0", "gaussians": right}]
+        crop = await jobs.make("crop", {"where": "x > 0"}, whole)
+        assert await jobs.read(crop, "scene.ply") == (tmp_path / "crop" / "scene.ply").read_bytes()
+        assert await jobs.names(crop) == {*RUN_FILES, "edits.json"}
+        edits = json.loads(await jobs.read(crop, "edits.json"))
+        assert edits == [{"operation": "crop", "where": "x > 0", "gaussians": right}]
 
-            turn = {"rotate": [["z", 90]], "translate": [1, 2, 3]}
-            moved = await jobs.make("transform", turn, crop)
-            assert await jobs.read(moved, "scene.ply") == (tmp_path / "moved" / "scene.ply").read_bytes()
-            means = read_gaussian_ply(tmp_path / "moved" / "scene.ply")[0].means_world
-            x, y, z = before.means_world[before.means_world[:, 0] > 0].T
-            np.testing.assert_allclose(means, np.stack([1 - y, 2 + x, 3 + z], axis=1), atol=1e-6)
-            views = [
-                ViewsRecord.model_validate_json(await jobs.read(job, "views.json")) for job in (crop, moved)
-            ]
-            (x, y, z), seen = (
-                np.stack([view.origin_world for view in record.viewpoints(None).views]).T for record in views
-            )
-            np.testing.assert_allclose(seen, np.stack([1 - y, 2 + x, 3 + z]), atol=1e-9)
-            assert [edit["operation"] for edit in json.loads(await jobs.read(moved, "edits.json"))] == [
-                "crop", "transform",
-            ]  # fmt: skip
-            shown = (await http.get(f"/jobs/{moved}/cameras.json")).json()["views"]
-            assert len(shown) == len(views[1].views)  # the viewer has them where the scene is now
-            places = {view["name"]: view["position"] for view in shown}
-            for view in views[1].viewpoints(None).views:
-                np.testing.assert_allclose(places[view.name], view.origin_world, atol=1e-5)
-            refused = await http.post("/v1/jobs", json={"kind": "evaluate", "source_id": moved})
-            assert refused.status_code == 422 and refused.json()["errors"][0]["pointer"] == "#/source_id"
+        turn = {"rotate": [["z", 90]], "translate": [1, 2, 3]}
+        moved = await jobs.make("transform", turn, crop)
+        assert await jobs.read(moved, "scene.ply") == (tmp_path / "moved" / "scene.ply").read_bytes()
+        means = read_gaussian_ply(tmp_path / "moved" / "scene.ply")[0].means_world
+        x, y, z = before.means_world[before.means_world[:, 0] > 0].T
+        np.testing.assert_allclose(means, np.stack([1 - y, 2 + x, 3 + z], axis=1), atol=1e-6)
+        views = [ViewsRecord.model_validate_json(await jobs.read(job, "views.json")) for job in (crop, moved)]
+        (x, y, z), seen = (
+            np.stack([view.origin_world for view in record.viewpoints(None).views]).T for record in views
+        )
+        np.testing.assert_allclose(seen, np.stack([1 - y, 2 + x, 3 + z]), atol=1e-9)
+        assert [edit["operation"] for edit in json.loads(await jobs.read(moved, "edits.json"))] == [
+            "crop", "transform",
+        ]  # fmt: skip
+        shown = (await http.get(f"/jobs/{moved}/cameras.json")).json()["views"]
+        assert len(shown) == len(views[1].views)  # the viewer has them where the scene is now
+        places = {view["name"]: view["position"] for view in shown}
+        for view in views[1].viewpoints(None).views:
+            np.testing.assert_allclose(places[view.name], view.origin_world, atol=1e-5)
+        refused = await http.post("/v1/jobs", json={"kind": "evaluate", "source_id": moved})
+        assert refused.status_code == 422 and refused.json()["errors"][0]["pointer"] == "#/source_id"
 
-            mirrored = await jobs.make("transform", {"scale": -1}, whole)
-            assert await jobs.names(mirrored) == {"scene.ply", "edits.json"}
+        mirrored = await jobs.make("transform", {"scale": -1}, whole)
+        assert await jobs.names(mirrored) == {"scene.ply", "edits.json"}
 
-            edit = await jobs.make(
-                "edit", {"meshes": ["m.ply"]}, whole, m__ply=(tmp_path / "mesh.ply").read_bytes()
-            )
-            assert await jobs.read(edit, "scene.ply") == scene.read_bytes()
-            assert "config.json" in await jobs.names(edit)
-            asked = {"proxy": "c.obj", "deformed": ["d.obj"], "reach": "inf"}
-            meshes = {
-                "c__obj": (tmp_path / "c.obj").read_bytes(),
-                "d__obj": (tmp_path / "d.obj").read_bytes(),
-            }
-            deform = await jobs.make("deform", asked, whole, **meshes)
-            assert await jobs.read(deform, "scene.ply") == (tmp_path / "deform.ply").read_bytes()
-            lifted = read_gaussian_ply(tmp_path / "deform.ply")[0].means_world
-            np.testing.assert_allclose(lifted, before.means_world + np.float32([0, 0, 1]), atol=1e-5)
+        edit = await jobs.make(
+            "edit", {"meshes": ["m.ply"]}, whole, m__ply=(tmp_path / "mesh.ply").read_bytes()
+        )
+        assert await jobs.read(edit, "scene.ply") == scene.read_bytes()
+        assert "config.json" in await jobs.names(edit)
+        asked = {"proxy": "c.obj", "deformed": ["d.obj"], "reach": "inf"}
+        meshes = {
+            "c__obj": (tmp_path / "c.obj").read_bytes(),
+            "d__obj": (tmp_path / "d.obj").read_bytes(),
+        }
+        deform = await jobs.make("deform", asked, whole, **meshes)
+        assert await jobs.read(deform, "scene.ply") == (tmp_path / "deform.ply").read_bytes()
+        lifted = read_gaussian_ply(tmp_path / "deform.ply")[0].means_world
+        np.testing.assert_allclose(lifted, before.means_world + np.float32([0, 0, 1]), atol=1e-5)
 
-            both = await jobs.make("merge", {"scenes": ["other.ply"]}, crop, other__ply=scene.read_bytes())
-            (tmp_path / "both.ply").write_bytes(await jobs.read(both, "scene.ply"))
-            assert len(read_gaussian_ply(tmp_path / "both.ply")[0]) == right + count
+        both = await jobs.make("merge", {"scenes": ["other.ply"]}, crop, other__ply=scene.read_bytes())
+        (tmp_path / "both.ply").write_bytes(await jobs.read(both, "scene.ply"))
+        assert len(read_gaussian_ply(tmp_path / "both.ply")[0]) == right + count
 
-            clean = await jobs.make("clean", {"min_opacity": 0.3}, whole)
-            assert await jobs.read(clean, "scene.ply") == (tmp_path / "clean.ply").read_bytes()
+        clean = await jobs.make("clean", {"min_opacity": 0.3}, whole)
+        assert await jobs.read(clean, "scene.ply") == (tmp_path / "clean.ply").read_bytes()
 
-            options = {"files": ["b.glb"], "for_viewers": True}
-            export = await jobs.make("export", options, crop)
-            assert await jobs.read(export, "b.glb") == (tmp_path / "b.glb").read_bytes()
+        options = {"files": ["b.glb"], "for_viewers": True}
+        export = await jobs.make("export", options, crop)
+        assert await jobs.read(export, "b.glb") == (tmp_path / "b.glb").read_bytes()
 
-            splat = (tmp_path / "a.splat").read_bytes()
-            imported = await jobs.make("import", {"file": "a.splat"}, None, a__splat=splat)
-            assert await jobs.read(imported, "scene.ply") == (tmp_path / "imported.ply").read_bytes()
-            part = await jobs.make("crop", {"where": "x > 0"}, imported)  # a bare scene gives a bare scene
-            assert await jobs.names(part) == {"scene.ply"}
-            page = await http.get(f"/jobs/{imported}")
-            assert page.status_code == 200 and "scene.ply" in page.text
-
-    asyncio.run(conversation())
+        splat = (tmp_path / "a.splat").read_bytes()
+        imported = await jobs.make("import", {"file": "a.splat"}, None, a__splat=splat)
+        assert await jobs.read(imported, "scene.ply") == (tmp_path / "imported.ply").read_bytes()
+        part = await jobs.make("crop", {"where": "x > 0"}, imported)  # a bare scene gives a bare scene
+        assert await jobs.names(part) == {"scene.ply"}
+        page = await http.get(f"/jobs/{imported}")
+        assert page.status_code == 200 and "scene.ply" in page.text

@@ -1,39 +1,26 @@
 """What monitoring sees: true numbers, counters that never fall, and no ids."""
 
-import asyncio
 import re
 import uuid
-from collections.abc import Awaitable, Callable
-from pathlib import Path
 from typing import Any
 
 import httpx
-import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
-from octasplat.service.state import Service
 from octasplat.workers.db.ids import new_id
 from octasplat.workers.db.workers import record_worker_heartbeat
 from octasplat.workers.queue.recovery import StalledAttempts, recover_stalled_jobs
-from tests.support.service_harness import claim_job, client_with_token, committed_dataset, running_service
+from tests.support.service_harness import (
+    ConnectService,
+    claim_job,
+    client_with_token,
+    committed_dataset,
+)
 
-Conversation = Callable[[httpx.AsyncClient, Service], Awaitable[None]]
 PNG = bytes.fromhex(
     "89504e470d0a1a0a0000000d4948445200000001000000010802000000907753de0000000c49444154789c63f8cfc000000301010018dd8d"
     "b00000000049454e44ae426082"
 )
-
-
-@pytest.fixture
-def talk(conninfo: str, tmp_path: Path) -> Callable[..., None]:
-    def run(conversation: Conversation, **settings: Any) -> None:
-        async def whole() -> None:
-            async with running_service(conninfo, tmp_path, **settings) as (http, service):
-                await conversation(http, service)
-
-        asyncio.run(whole())
-
-    return run
 
 
 async def read(http: httpx.AsyncClient, **headers: str) -> dict[str, float]:
@@ -54,8 +41,8 @@ async def new_job(http: httpx.AsyncClient, dataset: str, **more: Any) -> dict[st
     return job
 
 
-def test_metrics_equal_table_counts(talk: Callable[..., None]) -> None:
-    async def conversation(http: httpx.AsyncClient, service: Service) -> None:
+async def test_metrics_equal_table_counts(connect_service: ConnectService) -> None:
+    async with connect_service() as (http, service):
         before = await read(http)
         assert before["octasplat_queue_depth[cpu]"] == before["octasplat_job_attempts_total"] == 0
         assert "octasplat_job_heartbeat_age_seconds" not in before and before["octasplat_workers"] == 0
@@ -89,11 +76,9 @@ def test_metrics_equal_table_counts(talk: Callable[..., None]) -> None:
         await first.cancel()
         assert (await read(http))["octasplat_jobs_finished_total[canceled]"] == 1
 
-    talk(conversation)
 
-
-def test_recovery_counters_outlive_job(talk: Callable[..., None]) -> None:
-    async def conversation(http: httpx.AsyncClient, service: Service) -> None:
+async def test_recovery_counters_outlive_job(connect_service: ConnectService) -> None:
+    async with connect_service() as (http, service):
         job = await new_job(http, await committed_dataset(service))
         for _ in range(4):
             await claim_job(service, job)
@@ -106,11 +91,9 @@ def test_recovery_counters_outlive_job(talk: Callable[..., None]) -> None:
         assert (seen["octasplat_job_attempts_total"], seen["octasplat_job_rescues_total"]) == (4, 3)
         assert seen["octasplat_job_poisoned_total"] == seen["octasplat_jobs_finished_total[failed]"] == 1
 
-    talk(conversation)
 
-
-def test_upload_and_webhook_counters(talk: Callable[..., None]) -> None:
-    async def conversation(http: httpx.AsyncClient, service: Service) -> None:
+async def test_upload_and_webhook_counters(connect_service: ConnectService) -> None:
+    async with connect_service() as (http, _):
         dataset = (await http.post("/v1/datasets", json={})).json()["id"]
         answer = await http.put(f"/v1/datasets/{dataset}/files/images/a.png", content=PNG)
         assert answer.status_code == 201, answer.text
@@ -123,13 +106,9 @@ def test_upload_and_webhook_counters(talk: Callable[..., None]) -> None:
             0,
         )
 
-    talk(conversation)
 
-
-def test_metrics_require_token(talk: Callable[..., None]) -> None:
-    async def conversation(http: httpx.AsyncClient, service: Service) -> None:
+async def test_metrics_require_token(connect_service: ConnectService) -> None:
+    async with connect_service() as (http, service):
         reader = await client_with_token(service, f"u{uuid.uuid4().hex[:5]}", "read")
         assert (await http.get("/metrics")).status_code == 401
         assert await read(http, **reader)
-
-    talk(conversation)

@@ -1,8 +1,6 @@
 """Secrets end when they should, and whose word about a client counts."""
 
 import asyncio
-from collections.abc import Awaitable, Callable
-from pathlib import Path
 from typing import Any
 
 import httpx
@@ -10,23 +8,9 @@ import pytest
 from pydantic import SecretStr
 
 from octasplat.engine.core.errors import ConfigError
-from octasplat.service.state import Service
-from tests.support.service_harness import client_with_token, running_service
+from tests.support.service_harness import ConnectService, client_with_token
 
-Conversation = Callable[[httpx.AsyncClient, Service], Awaitable[None]]
 BEHIND_TLS = {"X-Forwarded-Proto": "https", "X-Forwarded-For": "203.0.113.9"}
-
-
-@pytest.fixture
-def talk(conninfo: str, tmp_path: Path) -> Callable[..., None]:
-    def run(conversation: Conversation, **settings: Any) -> None:
-        async def whole() -> None:
-            async with running_service(conninfo, tmp_path, **settings) as (http, service):
-                await conversation(http, service)
-
-        asyncio.run(whole())
-
-    return run
 
 
 async def sign_in(http: httpx.AsyncClient, secret: str, **headers: str) -> tuple[str, dict[str, str]]:
@@ -47,8 +31,8 @@ async def audit(http: httpx.AsyncClient, headers: dict[str, str]) -> list[dict[s
     return entries
 
 
-def test_session_cookie_does_not_contain_token(talk: Callable[..., None]) -> None:
-    async def conversation(http: httpx.AsyncClient, service: Service) -> None:
+async def test_session_cookie_does_not_contain_token(connect_service: ConnectService) -> None:
+    async with connect_service() as (http, service):
         bearer = await client_with_token(service, "me", "admin")
         secret = bearer["Authorization"].split()[1]
         line, mine = await sign_in(http, secret)
@@ -65,11 +49,9 @@ def test_session_cookie_does_not_contain_token(talk: Callable[..., None]) -> Non
         assert (await http.delete(f"/v1/tokens/{token['id']}", headers=bearer)).status_code == 204
         assert await status(http, other) == 401
 
-    talk(conversation)
 
-
-def test_sessions_and_tokens_run_out(talk: Callable[..., None]) -> None:
-    async def conversation(http: httpx.AsyncClient, service: Service) -> None:
+async def test_sessions_and_tokens_run_out(connect_service: ConnectService) -> None:
+    async with connect_service(session_hours=0.5) as (http, service):
         boss = await client_with_token(service, "boss", "admin")
         new = {"name": "n", "owner": "me", "scopes": ["write"], "hours": 1}
         made = (await http.post("/v1/tokens", json=new, headers=boss)).json()
@@ -82,22 +64,20 @@ def test_sessions_and_tokens_run_out(talk: Callable[..., None]) -> None:
                 await connection.execute(f"UPDATE {table} SET expires_at = expires_at - interval '3601 s'")
         assert [await status(http, who) for who in (bearer, mine, short, boss)] == [401, 401, 401, 200]
 
-    talk(conversation, session_hours=0.5)
 
-
-def test_environment_token_change_revokes_previous(conninfo: str, tmp_path: Path) -> None:
+async def test_environment_token_change_revokes_previous(connect_service: ConnectService) -> None:
     async def start(secret: str) -> dict[str, int]:
-        async with running_service(conninfo, tmp_path, token=SecretStr(secret)) as (http, _):
+        async with connect_service(token=SecretStr(secret)) as (http, _):
             return {s: await status(http, {"Authorization": f"Bearer {s}"}) for s in ("first", "second")}
 
-    assert asyncio.run(start("first")) == {"first": 200, "second": 401}
-    assert asyncio.run(start("first")) == {"first": 200, "second": 401}
-    assert asyncio.run(start("second")) == {"first": 401, "second": 200}
-    assert asyncio.run(start("first")) == {"first": 401, "second": 200}  # and it does not come back
+    assert await start("first") == {"first": 200, "second": 401}
+    assert await start("first") == {"first": 200, "second": 401}
+    assert await start("second") == {"first": 401, "second": 200}
+    assert await start("first") == {"first": 401, "second": 200}  # and it does not come back
 
 
-def test_cookies_behind_trusted_tls_proxy_are_secure(talk: Callable[..., None]) -> None:
-    async def conversation(http: httpx.AsyncClient, service: Service) -> None:
+async def test_cookies_behind_trusted_tls_proxy_are_secure(connect_service: ConnectService) -> None:
+    async with connect_service(proxies=("127.0.0.0/8",), token=SecretStr("another")) as (http, service):
         secret = (await client_with_token(service, "me", "admin"))["Authorization"].split()[1]
         line, mine = await sign_in(http, secret, **BEHIND_TLS)
         assert line.startswith("__Host-") and "; Secure" in line and "Domain" not in line
@@ -113,18 +93,14 @@ def test_cookies_behind_trusted_tls_proxy_are_secure(talk: Callable[..., None]) 
             "203.0.113.9",
         )
 
-    talk(conversation, proxies=("127.0.0.0/8",), token=SecretStr("another"))
 
-
-def test_proxy_headers_of_untrusted_clients_are_ignored(talk: Callable[..., None]) -> None:
-    async def conversation(http: httpx.AsyncClient, service: Service) -> None:
+async def test_proxy_headers_of_untrusted_clients_are_ignored(connect_service: ConnectService) -> None:
+    async with connect_service(proxies=("10.0.0.1",), token=SecretStr("another")) as (http, service):
         secret = (await client_with_token(service, "me", "admin"))["Authorization"].split()[1]
         for headers in (BEHIND_TLS, {"Forwarded": "for=203.0.113.9;proto=https"}):
             line, mine = await sign_in(http, secret, **headers)
             assert not line.startswith("__Host-") and "Secure" not in line
             assert (await audit(http, mine))[0]["address"] == "127.0.0.1"
-
-    talk(conversation, proxies=("10.0.0.1",), token=SecretStr("another"))
 
 
 @pytest.mark.parametrize(
@@ -140,37 +116,31 @@ def test_proxy_headers_of_untrusted_clients_are_ignored(talk: Callable[..., None
         ("forwarded", {"Forwarded": "for=203.0.113.9", "X-Forwarded-Proto": "https"}, "203.0.113.9", False),
     ],
 )  # fmt: skip
-def test_forwarded_address_uses_nearest_hop(
-    talk: Callable[..., None], dialect: str, headers: dict[str, str], address: str, is_secure: bool
+async def test_forwarded_address_uses_nearest_hop(
+    connect_service: ConnectService, dialect: str, headers: dict[str, str], address: str, is_secure: bool
 ) -> None:
-    async def conversation(http: httpx.AsyncClient, service: Service) -> None:
+    async with connect_service(
+        proxies=("127.0.0.1", "10.0.0.0/8"), proxy_headers=dialect, token=SecretStr("another")
+    ) as (http, service):
         secret = (await client_with_token(service, "me", "admin"))["Authorization"].split()[1]
         line, mine = await sign_in(http, secret, **headers)
         assert ("; Secure" in line) == is_secure
         assert (await audit(http, mine))[0]["address"] == address
 
-    talk(
-        conversation,
-        proxies=("127.0.0.1", "10.0.0.0/8"),
-        proxy_headers=dialect,
-        token=SecretStr("another"),
-    )
 
-
-def test_proxied_request_without_tokens_is_refused(talk: Callable[..., None]) -> None:
-    async def conversation(http: httpx.AsyncClient, _service: Service) -> None:
+async def test_proxied_request_without_tokens_is_refused(connect_service: ConnectService) -> None:
+    async with connect_service() as (http, _):
         assert await status(http, {}) == 200
         for headers in (BEHIND_TLS, {"Forwarded": "for=203.0.113.9"}, {"X-Real-IP": "203.0.113.9"}):
             answer = await http.get("/v1/jobs", headers=headers)
             assert answer.status_code == 403 and answer.json()["type"].endswith(":open-behind-proxy")
-
-    talk(conversation)
     with pytest.raises(ConfigError, match="token"):
-        talk(conversation, proxies=("127.0.0.1",))
+        async with connect_service(proxies=("127.0.0.1",)):
+            pass
 
 
-def test_wrong_tokens_are_throttled_per_address(talk: Callable[..., None]) -> None:
-    async def conversation(http: httpx.AsyncClient, service: Service) -> None:
+async def test_wrong_tokens_are_throttled_per_address(connect_service: ConnectService) -> None:
+    async with connect_service(wrong_token_seconds=60.0) as (http, service):
         mine = await client_with_token(service, "me", "admin")
         assert await status(http, mine) == 200
         pending: set[asyncio.Task[httpx.Response]] = set()
@@ -186,11 +156,9 @@ def test_wrong_tokens_are_throttled_per_address(talk: Callable[..., None]) -> No
         for task in pending:
             task.cancel()
 
-    talk(conversation, wrong_token_seconds=60.0)
 
-
-def test_audit_log_records_changes(talk: Callable[..., None]) -> None:
-    async def conversation(http: httpx.AsyncClient, service: Service) -> None:
+async def test_audit_log_records_changes(connect_service: ConnectService) -> None:
+    async with connect_service() as (http, service):
         boss = await client_with_token(service, "boss", "admin")
         mine = await client_with_token(service, "me", "read")
         new = {"name": "n", "owner": "me", "scopes": ["write"]}
@@ -212,11 +180,9 @@ def test_audit_log_records_changes(talk: Callable[..., None]) -> None:
         assert [e["action"] for e in rest["entries"]] == ["POST /v1/tokens"] and rest["next"] is None
         assert made["token"] not in str(first) + str(rest)
 
-    talk(conversation)
 
-
-def test_sign_in_link_works_once(talk: Callable[..., None]) -> None:
-    async def conversation(http: httpx.AsyncClient, service: Service) -> None:
+async def test_sign_in_link_works_once(connect_service: ConnectService) -> None:
+    async with connect_service() as (http, service):
         mine = await client_with_token(service, "me", "write")
         path = (await http.post("/v1/sign-in-links", headers=mine)).json()["path"]
         assert (await http.head(path)).status_code == 405  # looking at it does not use it up
@@ -227,5 +193,3 @@ def test_sign_in_link_works_once(talk: Callable[..., None]) -> None:
         assert (await http.get("/v1/info", headers=cookie)).json()["owner"] == "me"
         again = await http.get(path)
         assert again.status_code == 403 and "set-cookie" not in again.headers
-
-    talk(conversation)

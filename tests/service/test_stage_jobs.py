@@ -8,7 +8,7 @@ import subprocess
 import sys
 import time
 import uuid
-from collections.abc import Awaitable, Callable
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -27,23 +27,16 @@ from octasplat.service.state import Service
 from octasplat.workers.cli.main import cli
 from octasplat.workers.db.locks import lock_owner
 from octasplat.workers.queue.attempts import ResultFile
-from tests.support.service_harness import claim_job, committed_dataset, running_service, store_content
+from tests.support.service_harness import (
+    ConnectService,
+    claim_job,
+    committed_dataset,
+    running_service,
+    store_content,
+)
 
 TRIANGLE = b"v 0 0 0\nv .3 0 0\nv 0 -.3 0\nf 1 2 3\n"
 HDR = b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 2 +X 2\n" + bytes([128, 128, 128, 128] * 4)
-Conversation = Callable[[httpx.AsyncClient, Service], Awaitable[None]]
-
-
-@pytest.fixture
-def talk(conninfo: str, tmp_path: Path) -> Callable[..., None]:
-    def run(conversation: Conversation, **settings: Any) -> None:
-        async def whole() -> None:
-            async with running_service(conninfo, tmp_path, **settings) as (http, service):
-                await conversation(http, service)
-
-        asyncio.run(whole())
-
-    return run
 
 
 async def finished(http: httpx.AsyncClient, service: Service, files: dict[str, bytes]) -> str:
@@ -109,8 +102,8 @@ BAD = [
 ]  # fmt: skip
 
 
-def test_invalid_stage_problem_names_key(talk: Callable[..., None]) -> None:
-    async def conversation(http: httpx.AsyncClient, service: Service) -> None:
+async def test_invalid_stage_problem_names_key(connect_service: ConnectService) -> None:
+    async with connect_service(max_render_paths=10**9) as (http, service):
         source = await finished(http, service, {"scene.ply": b"ply"})
         files = await sent(http, {"thing.obj": TRIANGLE})
         body: dict[str, Any] = {"kind": "render", "source_id": source, "files_id": files}
@@ -132,11 +125,9 @@ def test_invalid_stage_problem_names_key(talk: Callable[..., None]) -> None:
         assert (too_long.status_code, too_long.json()["type"]) == (413, "urn:octasplat:problem:too-large")
         assert (await http.get("/v1/jobs", params={"kind": "render"})).json()["jobs"] == []
 
-    talk(conversation, max_render_paths=10**9)
 
-
-def test_stage_files_are_checked_on_upload(talk: Callable[..., None]) -> None:
-    async def conversation(http: httpx.AsyncClient, service: Service) -> None:
+async def test_stage_files_are_checked_on_upload(connect_service: ConnectService) -> None:
+    async with connect_service() as (http, service):
         dataset = (await http.post("/v1/datasets", json={"holds": "files"})).json()["id"]
         address = f"/v1/datasets/{dataset}/files/"
         for name, content, kind in [
@@ -174,8 +165,6 @@ def test_stage_files_are_checked_on_upload(talk: Callable[..., None]) -> None:
         plain = await http.post("/v1/jobs", json={"kind": "render", "source_id": source})
         assert made.json()["estimate"]["cpu_seconds"] > 2 * plain.json()["estimate"]["cpu_seconds"]
         assert (await http.delete(f"/v1/datasets/{dataset}")).status_code == 409
-
-    talk(conversation)
 
 
 STAGE = """
@@ -222,7 +211,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.heavy
-def test_killed_render_job_resumes_to_command_bytes(conninfo: str, tmp_path: Path, run: Path) -> None:
+async def test_killed_render_job_resumes_to_command_bytes(conninfo: str, tmp_path: Path, run: Path) -> None:
     from octasplat.workers.client.submission import Derivation, with_stage
 
     stage = run / "stages" / "stage.toml"
@@ -249,7 +238,7 @@ def test_killed_render_job_resumes_to_command_bytes(conninfo: str, tmp_path: Pat
             )
         )  # fmt: skip
 
-    async def conversation() -> None:
+    try:
         async with running_service(conninfo, tmp_path, kind_modules=()) as (http, service):
             names = ("scene.ply", "config.json", "held_out.json", "views.json")
             source = await finished(
@@ -282,9 +271,6 @@ def test_killed_render_job_resumes_to_command_bytes(conninfo: str, tmp_path: Pat
             assert any(line.startswith("Goes on from step ") and "of render" in line for line in log), log
             film = (await http.get(f"{address}/artifacts/turntable.mp4")).content
             assert film == (tmp_path / "film.mp4").read_bytes()
-
-    try:
-        asyncio.run(conversation())
     finally:
         for process in workers:
             process.kill()

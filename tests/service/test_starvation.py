@@ -2,7 +2,6 @@
 
 import asyncio
 import threading
-from pathlib import Path
 from typing import Any
 
 import httpx
@@ -10,7 +9,7 @@ import pytest
 
 from octasplat.service.actions import datasets as actions
 from octasplat.service.intake.dataset import DatasetSummary
-from tests.support.service_harness import running_service
+from tests.support.service_harness import ConnectService
 
 PATIENCE_SECONDS = 60.0
 
@@ -35,10 +34,11 @@ def slow_checks(monkeypatch: pytest.MonkeyPatch) -> Any:
     return most
 
 
-def test_dataset_checks_do_not_block_other_requests(conninfo: str, tmp_path: Path, slow_checks: Any) -> None:
-    async def whole() -> None:
-        settings = {"max_checks": 2, "max_waiting_checks": 16}
-        async with running_service(conninfo, tmp_path, **settings) as (http, _):
+async def test_dataset_checks_do_not_block_other_requests(
+    connect_service: ConnectService, slow_checks: Any
+) -> None:
+    async with asyncio.timeout(PATIENCE_SECONDS):
+        async with connect_service(max_checks=2, max_waiting_checks=16) as (http, _):
             addresses = [await new_dataset(http) for _ in range(13)]
             commits = {asyncio.create_task(http.post(f"{address}/commit")) for address in addresses}
             while sum(task.done() for task in commits) < 4:  # nine of eighteen places are one owner's
@@ -53,5 +53,3 @@ def test_dataset_checks_do_not_block_other_requests(conninfo: str, tmp_path: Pat
             slow_checks["release"].set()
             done = [task.result().status_code for task in (await asyncio.wait(commits))[0]]
             assert sorted(done) == [200] * 9 + [429] * 4 and slow_checks["most"] == 2
-
-    asyncio.run(asyncio.wait_for(whole(), PATIENCE_SECONDS))

@@ -19,7 +19,7 @@ ROOT = Path(__file__).parents[2]
 PATIENCE_SECONDS = 60.0
 
 
-def test_vanished_front_end_lease_expires(
+async def test_vanished_front_end_lease_expires(
     conninfo: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """What it stored counts as about to be named for a while only; at most a minute as set."""
@@ -41,32 +41,29 @@ def test_vanished_front_end_lease_expires(
         with process.stdout as said:
             host, _, port = said.readline().strip().removeprefix("http://").rpartition(":")
 
-        async def story() -> None:
-            async with running_service(conninfo, tmp_path) as (http, service):
-                dataset = (await http.post("/v1/datasets", json={"name": "d"})).headers["Location"]
-                with socket.create_connection((host, int(port))) as connection:
-                    connection.sendall(
-                        f"PUT {dataset}/files/images/a.png HTTP/1.1\r\nHost: localhost\r\n"
-                        "Content-Length: 1000\r\n\r\nhalf".encode()
+        async with running_service(conninfo, tmp_path) as (http, service):
+            dataset = (await http.post("/v1/datasets", json={"name": "d"})).headers["Location"]
+            with socket.create_connection((host, int(port))) as connection:
+                connection.sendall(
+                    f"PUT {dataset}/files/images/a.png HTTP/1.1\r\nHost: localhost\r\n"
+                    "Content-Length: 1000\r\n\r\nhalf".encode()
+                )
+                deadline = time.monotonic() + PATIENCE_SECONDS
+                while await _note(service) is None:
+                    assert time.monotonic() < deadline
+                    await asyncio.sleep(0.02)
+                process.send_signal(signal.SIGSTOP)
+                with service.storage.open_writer() as writer:
+                    writer.write(b"named by nobody")
+                    writer.commit()
+                assert (await http.delete(dataset)).status_code == 204
+                while list(service.storage.list_blobs()) or await _note(service) is not None:
+                    await garbage_collection.collect_garbage_now(
+                        service.pool, service.storage, every_seconds=0.0
                     )
-                    deadline = time.monotonic() + PATIENCE_SECONDS
-                    while await _note(service) is None:
-                        assert time.monotonic() < deadline
-                        await asyncio.sleep(0.02)
-                    process.send_signal(signal.SIGSTOP)
-                    with service.storage.open_writer() as writer:
-                        writer.write(b"named by nobody")
-                        writer.commit()
-                    assert (await http.delete(dataset)).status_code == 204
-                    while list(service.storage.list_blobs()) or await _note(service) is not None:
-                        await garbage_collection.collect_garbage_now(
-                            service.pool, service.storage, every_seconds=0.0
-                        )
-                        assert time.monotonic() < deadline
-                        await asyncio.sleep(0.1)
-                    assert await _note(service) is None
-
-        asyncio.run(story())
+                    assert time.monotonic() < deadline
+                    await asyncio.sleep(0.1)
+                assert await _note(service) is None
     finally:
         process.kill()
         process.wait(10)

@@ -9,12 +9,12 @@ import pytest
 from octasplat.workers.serve.supervised_process import SupervisedProcess, kill_after_timeout
 
 
-def test_supervised_process_start_failure_is_logged_and_retried(
+async def test_supervised_process_start_failure_is_logged_and_retried(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     program = tmp_path / "program"
 
-    async def keep() -> int | None:
+    with caplog.at_level(logging.ERROR):
         child = SupervisedProcess("the program", (str(program),), {})
         kept = asyncio.create_task(child.supervise())
         async with asyncio.timeout(120):
@@ -28,19 +28,18 @@ def test_supervised_process_start_failure_is_logged_and_retried(
                 await asyncio.sleep(0.02)
         child.stop()
         await kept
-        return refused
-
-    with caplog.at_level(logging.ERROR):
-        assert asyncio.run(keep()) == 127
+    assert refused == 127
     assert f"the program cannot be started: [Errno 2] No such file or directory: '{program}'" in caplog.text
 
 
-def test_supervised_process_ignoring_stop_is_killed(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+async def test_supervised_process_ignoring_stop_is_killed(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     deaf, ready = tmp_path / "deaf", tmp_path / "ready"
     deaf.write_text(f"#!/bin/sh\ntrap '' TERM\ntouch {ready}\nwhile :; do sleep 0.1; done\n")
     deaf.chmod(0o700)
 
-    async def keep() -> list[int | None]:
+    with caplog.at_level(logging.WARNING):
         children = [
             SupervisedProcess("the deaf one", (str(deaf),), {}),
             SupervisedProcess("the other", ("sleep", "600"), {}),
@@ -52,8 +51,5 @@ def test_supervised_process_ignoring_stop_is_killed(tmp_path: Path, caplog: pyte
             for child in children:
                 child.stop()
             await kill_after_timeout(children, kept, 1.0)
-        return [child.last_exit_code for child in children]
-
-    with caplog.at_level(logging.WARNING):
-        assert asyncio.run(keep()) == [-9, -15]
+    assert [child.last_exit_code for child in children] == [-9, -15]
     assert caplog.messages == ["the deaf one does not end and is killed"]

@@ -1,6 +1,5 @@
 """Uploads through the API: every horror has its problem document, quotas and full disks too."""
 
-import asyncio
 import base64
 import hashlib
 import io
@@ -11,8 +10,7 @@ import socket as socket_module
 import subprocess
 import sys
 import time
-from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
-from contextlib import asynccontextmanager
+from collections.abc import AsyncIterator, Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -21,43 +19,12 @@ import httpx
 import pytest
 from PIL import Image
 
-from octasplat.service.app import create_app
-from octasplat.service.settings import ServiceSettings
 from octasplat.workers.storage.local import LocalStorage
 from tests.support.model_builder import ColmapModelBuilder, photograph, photographs
+from tests.support.service_harness import ConnectService
 from tests.support.zip_builder import ZipMember, build_zip
 
 ROOT = Path(__file__).parents[2]
-
-
-@asynccontextmanager
-async def client(
-    conninfo: str, folder: Path, monkeypatch: pytest.MonkeyPatch, **settings: Any
-) -> AsyncIterator[httpx.AsyncClient]:
-    monkeypatch.setenv("DATABASE_URL", conninfo)
-    given = {"data": folder, "storage": str(folder / "store"), "floor_bytes": 0, **settings}
-    app = create_app(ServiceSettings(**given))
-    async with app.router.lifespan_context(app):
-        transport = httpx.ASGITransport(app=app)
-        async with httpx.AsyncClient(transport=transport, base_url="http://localhost:8642") as http:
-            yield http
-
-
-Talk = Callable[[Callable[[httpx.AsyncClient], Awaitable[None]]], None]
-
-
-@pytest.fixture
-def talk(conninfo: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
-    """Runs a conversation with the service."""
-
-    def run(conversation: Callable[[httpx.AsyncClient], Awaitable[None]], **settings: Any) -> None:
-        async def whole() -> None:
-            async with client(conninfo, tmp_path, monkeypatch, **settings) as http:
-                await conversation(http)
-
-        asyncio.run(whole())
-
-    return run
 
 
 async def new_dataset(http: httpx.AsyncClient) -> str:
@@ -79,8 +46,8 @@ def assert_problem(answer: httpx.Response, status: int, code: str) -> dict[str, 
     return problem
 
 
-def test_upload_single_files_and_commit(talk: Talk, tmp_path: Path) -> None:
-    async def conversation(http: httpx.AsyncClient) -> None:
+async def test_upload_single_files_and_commit(connect_service: ConnectService, tmp_path: Path) -> None:
+    async with connect_service() as (http, _):
         dataset = await new_dataset(http)
         files = {**photographs(), **ColmapModelBuilder().files()}
         for name, data in files.items():
@@ -98,26 +65,22 @@ def test_upload_single_files_and_commit(talk: Talk, tmp_path: Path) -> None:
         assert committed.status_code == 200 and committed.json()["state"] == "committed", committed.text
         late = await http.put(f"{dataset}/files/images/late.png", content=photograph())
         assert_problem(late, 409, "conflict")
-
-    talk(conversation)
     assert not list((tmp_path / "store" / "staging").iterdir())
 
 
-def test_upload_archive_and_commit(talk: Talk, tmp_path: Path) -> None:
+async def test_upload_archive_and_commit(connect_service: ConnectService, tmp_path: Path) -> None:
     files = {**photographs(), **ColmapModelBuilder().files()}
     data = build_zip(
         *(ZipMember(f"fox/{name}", content) for name, content in files.items()), ZipMember("fox/x.md", b"x")
     )
 
-    async def conversation(http: httpx.AsyncClient) -> None:
+    async with connect_service() as (http, _):
         dataset = await new_dataset(http)
         answer = await http.put(f"{dataset}/archive", content=data, headers=repr_digest(data))
         assert answer.status_code == 200, answer.text
         assert {file["path"] for file in answer.json()["files"]} == set(files)
         assert answer.json()["left_out"] == ["fox/x.md"]
         assert (await http.post(f"{dataset}/commit")).status_code == 200
-
-    talk(conversation)
 
 
 ARCHIVES = {
@@ -141,21 +104,21 @@ ARCHIVES = {
 
 
 @pytest.mark.parametrize("code", ARCHIVES)
-def test_upload_hostile_archive_is_refused(talk: Talk, tmp_path: Path, code: str) -> None:
-    async def conversation(http: httpx.AsyncClient) -> None:
+async def test_upload_hostile_archive_is_refused(
+    connect_service: ConnectService, tmp_path: Path, code: str
+) -> None:
+    async with connect_service() as (http, _):
         dataset = await new_dataset(http)
         problem = assert_problem(await http.put(f"{dataset}/archive", content=ARCHIVES[code]()), 422, code)
         assert problem["errors"][0]["code"] == code
         assert (await http.get(f"{dataset}/files")).json()["files"] == []
-
-    talk(conversation)
     inside = {path.name for path in tmp_path.rglob("*") if path.is_file()}
     assert not any("evil" in name for name in inside)
     assert not list((tmp_path / "store" / "staging").iterdir())
 
 
-def test_hostile_names_and_contents_of_single_files(talk: Talk) -> None:
-    async def conversation(http: httpx.AsyncClient) -> None:
+async def test_hostile_names_and_contents_of_single_files(connect_service: ConnectService) -> None:
+    async with connect_service() as (http, _):
         dataset = await new_dataset(http)
         for path, content, status, code in (
             ("images/..%2f..%2fevil.png", photograph(), 422, "name-traversal"),
@@ -184,8 +147,6 @@ def test_hostile_names_and_contents_of_single_files(talk: Talk) -> None:
             answer = await http.post("/v1/datasets", content=json.dumps({"name": name}))
             assert answer.status_code == 422, answer.text
 
-    talk(conversation)
-
 
 MODELS = {
     "name-traversal": lambda: ColmapModelBuilder().with_image(name="../../../../etc/passwd"),
@@ -197,8 +158,8 @@ MODELS = {
 }
 
 
-def test_upload_hostile_model_lists_faults_and_can_be_replaced(talk: Talk) -> None:
-    async def conversation(http: httpx.AsyncClient) -> None:
+async def test_upload_hostile_model_lists_faults_and_can_be_replaced(connect_service: ConnectService) -> None:
+    async with connect_service() as (http, _):
         dataset = await new_dataset(http)
         for name, data in photographs().items():
             await http.put(f"{dataset}/files/{name}", content=data)
@@ -213,11 +174,9 @@ def test_upload_hostile_model_lists_faults_and_can_be_replaced(talk: Talk) -> No
             await http.put(f"{dataset}/files/{name}", content=data)
         assert (await http.post(f"{dataset}/commit")).status_code == 200
 
-    talk(conversation)
 
-
-def test_upload_too_long_is_refused(talk: Talk) -> None:
-    async def conversation(http: httpx.AsyncClient) -> None:
+async def test_upload_too_long_is_refused(connect_service: ConnectService) -> None:
+    async with connect_service(max_upload_bytes=4000, max_archive_bytes=8000) as (http, _):
         dataset = await new_dataset(http)
         answer = await http.put(f"{dataset}/files/images/a.png", content=bytes(5000))
         assert_problem(answer, 413, "too-large")
@@ -230,13 +189,11 @@ def test_upload_too_long_is_refused(talk: Talk) -> None:
         assert_problem(answer, 413, "too-large")
         assert_problem(await http.put(f"{dataset}/archive", content=bytes(9000)), 413, "too-large")
 
-    talk(conversation, max_upload_bytes=4000, max_archive_bytes=8000)
 
-
-def test_upload_beyond_quota_is_refused(talk: Talk) -> None:
+async def test_upload_beyond_quota_is_refused(connect_service: ConnectService) -> None:
     size = len(photograph())
 
-    async def conversation(http: httpx.AsyncClient) -> None:
+    async with connect_service(quota_bytes=2 * size + 50, quota_datasets=2) as (http, _):
         dataset = await new_dataset(http)
         first = photograph(32, 24)
         assert (await http.put(f"{dataset}/files/images/a.png", content=first)).status_code == 201
@@ -262,11 +219,9 @@ def test_upload_beyond_quota_is_refused(talk: Talk) -> None:
         used = sum(file["size_bytes"] for file in (await http.get(f"{dataset}/files")).json()["files"])
         assert used <= 2 * size + 50
 
-    talk(conversation, quota_bytes=2 * size + 50, quota_datasets=2)
 
-
-def test_jobs_have_a_quota(talk: Talk) -> None:
-    async def conversation(http: httpx.AsyncClient) -> None:
+async def test_jobs_have_a_quota(connect_service: ConnectService) -> None:
+    async with connect_service(quota_jobs=2) as (http, _):
         dataset = await new_dataset(http)
         for name, data in {**photographs(), **ColmapModelBuilder().files()}.items():
             await http.put(f"{dataset}/files/{name}", content=data)
@@ -278,10 +233,8 @@ def test_jobs_have_a_quota(talk: Talk) -> None:
         await http.post(f"{answers[0].headers['Location']}/cancel")
         assert (await http.post("/v1/jobs", json=body)).status_code == 202
 
-    talk(conversation, quota_jobs=2)
 
-
-def test_upload_truncated_photograph_is_named(talk: Talk) -> None:
+async def test_upload_truncated_photograph_is_named(connect_service: ConnectService) -> None:
     picture = io.BytesIO()
     Image.effect_noise((160, 120), 80).convert("RGB").save(picture, "JPEG")
     cut = picture.getvalue()[: len(picture.getvalue()) * 3 // 4]
@@ -289,7 +242,7 @@ def test_upload_truncated_photograph_is_named(talk: Talk) -> None:
         *(ZipMember(name, data) for name, data in {**photographs(), "images/v0.jpg": cut}.items())
     )
 
-    async def conversation(http: httpx.AsyncClient) -> None:
+    async with connect_service() as (http, _):
         dataset = await new_dataset(http)
         for path, content in (("files/images/v0.jpg", cut), ("archive", archive)):
             problem = assert_problem(
@@ -301,19 +254,15 @@ def test_upload_truncated_photograph_is_named(talk: Talk) -> None:
         whole = await http.put(f"{dataset}/files/images/v0.jpg", content=picture.getvalue())
         assert whole.status_code == 201
 
-    talk(conversation)
 
-
-def test_upload_on_low_disk_is_refused(talk: Talk) -> None:
-    async def conversation(http: httpx.AsyncClient) -> None:
+async def test_upload_on_low_disk_is_refused(connect_service: ConnectService) -> None:
+    async with connect_service(floor_bytes=1 << 60) as (http, _):
         dataset = await new_dataset(http)
         for path in ("files/images/a.png", "archive"):
             answer = await http.put(f"{dataset}/{path}", content=photograph())
             assert_problem(answer, 507, "storage-full")
             assert "Retry-After" in answer.headers
             assert str(Path.home()) not in answer.text and "/tmp" not in answer.text
-
-    talk(conversation, floor_bytes=1 << 60)
 
 
 SERVER = """

@@ -5,8 +5,9 @@ import base64
 import socket
 import threading
 import uuid
-from collections.abc import Awaitable, Callable, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -25,10 +26,15 @@ from octasplat.workers.maintenance.webhooks.sender import (
     WebhookSender,
     guarded_client,
 )
-from tests.support.service_harness import claim_job, client_with_token, committed_dataset, running_service
+from tests.support.service_harness import (
+    ConnectService,
+    claim_job,
+    client_with_token,
+    committed_dataset,
+    running_service,
+)
 from tests.support.webhook_receiver import WebhookReceiver, receive_webhooks
 
-Conversation = Callable[[httpx.AsyncClient, Service], Awaitable[None]]
 HERE = ("127.0.0.1",)
 SECRET = "whsec_" + base64.b64encode(b"0123456789abcdef01234567").decode()
 
@@ -47,18 +53,9 @@ async def send_due(pool: Pool, allowed_hosts: tuple[str, ...] = ()) -> int:
 
 
 @pytest.fixture
-def talk(conninfo: str, tmp_path: Path) -> Callable[..., None]:
-    def run(conversation: Conversation, **settings: Any) -> None:
-        async def whole() -> None:
-            async with running_service(conninfo, tmp_path, **{"webhook_hosts": HERE, **settings}) as (
-                http,
-                service,
-            ):
-                await conversation(http, service)
-
-        asyncio.run(whole())
-
-    return run
+def connect_service(conninfo: str, tmp_path: Path) -> ConnectService:
+    """A service that may send to this machine."""
+    return partial(running_service, conninfo, tmp_path, webhook_hosts=HERE)
 
 
 async def make(http: httpx.AsyncClient, receiver: WebhookReceiver, **more: Any) -> dict[str, Any]:
@@ -89,8 +86,8 @@ async def make_due(service: Service) -> None:
         await connection.execute("UPDATE webhook_deliveries SET due_at = now() WHERE state = 'pending'")
 
 
-def test_webhook_of_finished_job_is_signed_and_minimal(talk: Callable[..., None]) -> None:
-    async def conversation(http: httpx.AsyncClient, service: Service) -> None:
+async def test_webhook_of_finished_job_is_signed_and_minimal(connect_service: ConnectService) -> None:
+    async with connect_service() as (http, service):
         with receive_webhooks() as receiver:
             hook = await make(http, receiver)
             job = await new_job(http, service, label="fox")
@@ -114,11 +111,9 @@ def test_webhook_of_finished_job_is_signed_and_minimal(talk: Callable[..., None]
         assert (told["state"], told["status"], told["tries"], told["due_at"]) == ("delivered", 204, 1, None)
         assert told["message_id"] == headers["webhook-id"] and told["payload"] == heard
 
-    talk(conversation)
 
-
-def test_webhook_of_rolled_back_change_is_not_sent(talk: Callable[..., None]) -> None:
-    async def conversation(http: httpx.AsyncClient, service: Service) -> None:
+async def test_webhook_of_rolled_back_change_is_not_sent(connect_service: ConnectService) -> None:
+    async with connect_service() as (http, service):
         with receive_webhooks() as receiver:
             hook = await make(http, receiver, events=["job.canceling"])
             attempt = await claim_job(service, await new_job(http, service))
@@ -135,11 +130,9 @@ def test_webhook_of_rolled_back_change_is_not_sent(talk: Callable[..., None]) ->
             assert (await http.post(f"/v1/jobs/{attempt.job.id}/cancel")).status_code == 202
             assert [told["kind"] for told in await deliveries(http, hook)] == ["job.canceling"]
 
-    talk(conversation)
 
-
-def test_webhook_of_one_job(talk: Callable[..., None]) -> None:
-    async def conversation(http: httpx.AsyncClient, service: Service) -> None:
+async def test_webhook_of_one_job(connect_service: ConnectService) -> None:
+    async with connect_service() as (http, service):
         with receive_webhooks() as receiver:
             hook = {"url": receiver.url, "secret": SECRET}
             job = await new_job(http, service, webhook=hook)
@@ -158,15 +151,13 @@ def test_webhook_of_one_job(talk: Callable[..., None]) -> None:
             assert (await http.delete(f"/v1/jobs/{job['id']}")).status_code == 204
             assert (await http.get("/v1/webhooks")).json()["webhooks"] == []
 
-    talk(conversation)
 
-
-def test_webhook_is_retried_for_a_day_with_same_message(talk: Callable[..., None]) -> None:
+async def test_webhook_is_retried_for_a_day_with_same_message(connect_service: ConnectService) -> None:
     assert 23 * 3600 < sum(RETRY_DELAYS_SECONDS) <= 86_400 and list(RETRY_DELAYS_SECONDS) == sorted(
         RETRY_DELAYS_SECONDS
     )
 
-    async def conversation(http: httpx.AsyncClient, service: Service) -> None:
+    async with connect_service() as (http, service):
         with receive_webhooks(500) as receiver:
             hook = await make(http, receiver)
             assert (await http.post(f"/v1/webhooks/{hook['id']}/test")).status_code == 202
@@ -194,11 +185,9 @@ def test_webhook_is_retried_for_a_day_with_same_message(talk: Callable[..., None
             for _, headers, body in receiver.received:
                 assert Webhook(hook["secret"]).verify(body, headers)["type"] == "webhook.test"
 
-    talk(conversation)
 
-
-def test_webhook_answering_410_is_disabled(talk: Callable[..., None]) -> None:
-    async def conversation(http: httpx.AsyncClient, service: Service) -> None:
+async def test_webhook_answering_410_is_disabled(connect_service: ConnectService) -> None:
+    async with connect_service() as (http, service):
         with receive_webhooks(500, 410, 204) as receiver:
             hook = await make(http, receiver)
             address = f"/v1/webhooks/{hook['id']}"
@@ -219,11 +208,9 @@ def test_webhook_answering_410_is_disabled(talk: Callable[..., None]) -> None:
             await http.post(f"{address}/test")
             assert await send_due(service.pool, HERE) == 1 and len(receiver.received) == 3
 
-    talk(conversation)
 
-
-def test_redirects_are_not_followed(talk: Callable[..., None]) -> None:
-    async def conversation(http: httpx.AsyncClient, service: Service) -> None:
+async def test_redirects_are_not_followed(connect_service: ConnectService) -> None:
+    async with connect_service() as (http, service):
         with receive_webhooks(307) as receiver:
             hook = await make(http, receiver)
             await http.post(f"/v1/webhooks/{hook['id']}/test")
@@ -231,11 +218,11 @@ def test_redirects_are_not_followed(talk: Callable[..., None]) -> None:
             assert [path for path, _, _ in receiver.received] == ["/hook"]
             assert (await deliveries(http, hook))[0]["status"] == 307
 
-    talk(conversation)
 
-
-def test_two_senders_share_and_a_lost_one_is_replaced(talk: Callable[..., None], conninfo: str) -> None:
-    async def conversation(http: httpx.AsyncClient, service: Service) -> None:
+async def test_two_senders_share_and_a_lost_one_is_replaced(
+    connect_service: ConnectService, conninfo: str
+) -> None:
+    async with connect_service() as (http, service):
         with receive_webhooks() as receiver:
             hook = await make(http, receiver)
             for _ in range(30):
@@ -249,8 +236,6 @@ def test_two_senders_share_and_a_lost_one_is_replaced(talk: Callable[..., None],
             await make_due(service)
             assert await send_due(service.pool, HERE) == 5
             assert len({headers["webhook-id"] for _, headers, _ in receiver.received}) == 30
-
-    talk(conversation)
 
 
 REFUSED_URLS = [
@@ -287,16 +272,12 @@ def test_webhook_valid_addresses_are_accepted() -> None:
      "100.64.0.1", "169.254.169.254", "[fd00::1]", "224.0.0.1", "0.0.0.0", "127.1", "0x7f.1",
      "[::127.0.0.1]", "127。0。0。1"],
 )  # fmt: skip
-def test_connections_into_inner_networks_are_not_made(host: str, allowed: tuple[str, ...]) -> None:
+async def test_connections_into_inner_networks_are_not_made(host: str, allowed: tuple[str, ...]) -> None:
     """Not even to see whether there is somebody: what is asked is the same for a port that is open."""
     with listening() as (port, accepted):
-
-        async def try_it() -> None:
-            async with guarded_client(allowed) as client:
-                with pytest.raises(AddressRefusedError):
-                    await client.post(f"http://{host}:{port}/hook", content=b"x")
-
-        asyncio.run(try_it())
+        async with guarded_client(allowed) as client:
+            with pytest.raises(AddressRefusedError):
+                await client.post(f"http://{host}:{port}/hook", content=b"x")
         assert accepted() == 0
 
 
@@ -336,10 +317,10 @@ class Names:
 
 
 @pytest.mark.parametrize("found", ["127.0.0.1", "93.184.216.34 127.0.0.1", "::ffff:127.0.0.1"])
-def test_webhook_name_resolving_to_internal_address_is_refused(
-    talk: Callable[..., None], monkeypatch: pytest.MonkeyPatch, found: str
+async def test_webhook_name_resolving_to_internal_address_is_refused(
+    connect_service: ConnectService, monkeypatch: pytest.MonkeyPatch, found: str
 ) -> None:
-    async def conversation(http: httpx.AsyncClient, service: Service) -> None:
+    async with connect_service() as (http, service):
         with listening() as (port, accepted):
             monkeypatch.setattr(addresses, "PORTS", (port,))
             names = Names(monkeypatch, hooks=[found])
@@ -351,13 +332,11 @@ def test_webhook_name_resolving_to_internal_address_is_refused(
             assert told["state"] == "pending" and "network" in told["error"]
             assert names.asked == ["hooks.example.org"] and accepted() == 0
 
-    talk(conversation)
 
-
-def test_webhook_connects_to_checked_address(
-    talk: Callable[..., None], monkeypatch: pytest.MonkeyPatch
+async def test_webhook_connects_to_checked_address(
+    connect_service: ConnectService, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    async def conversation(http: httpx.AsyncClient, service: Service) -> None:
+    async with connect_service(webhook_hosts=(*HERE, "hooks.inner.example")) as (http, service):
         with receive_webhooks() as receiver:
             # The second answer comes too late for anybody to use it; 127.0.0.2 does not answer at all.
             names = Names(monkeypatch, hooks=["127.0.0.2 127.0.0.1", "127.0.0.3"])
@@ -369,11 +348,9 @@ def test_webhook_connects_to_checked_address(
             assert names.asked == ["hooks.inner.example"]
             assert Webhook(hook["secret"]).verify(body, headers)["type"] == "webhook.test"
 
-    talk(conversation, webhook_hosts=(*HERE, "hooks.inner.example"))
 
-
-def test_webhook_to_internal_name_is_refused_when_sending(talk: Callable[..., None]) -> None:
-    async def conversation(http: httpx.AsyncClient, service: Service) -> None:
+async def test_webhook_to_internal_name_is_refused_when_sending(connect_service: ConnectService) -> None:
+    async with connect_service() as (http, service):
         with receive_webhooks() as receiver:
             hook = await make(http, receiver)
             await http.post(f"/v1/webhooks/{hook['id']}/test")
@@ -382,11 +359,9 @@ def test_webhook_to_internal_name_is_refused_when_sending(talk: Callable[..., No
             (told,) = await deliveries(http, hook)
             assert told["state"] == "pending" and "network" in told["error"] and told["status"] is None
 
-    talk(conversation)
 
-
-def test_webhooks_are_visible_to_owner_only(talk: Callable[..., None]) -> None:
-    async def conversation(http: httpx.AsyncClient, service: Service) -> None:
+async def test_webhooks_are_visible_to_owner_only(connect_service: ConnectService) -> None:
+    async with connect_service() as (http, service):
         mine = await client_with_token(service, "me", "write")
         other = await client_with_token(service, "stranger", "write")
         with receive_webhooks() as receiver:
@@ -414,8 +389,6 @@ def test_webhooks_are_visible_to_owner_only(talk: Callable[..., None]) -> None:
             assert (await http.delete(address, headers=mine)).status_code == 204
             assert (await http.get(address, headers=mine)).status_code == 404
 
-    talk(conversation)
-
 
 @pytest.mark.parametrize(
     ("body", "pointer"),
@@ -427,30 +400,26 @@ def test_webhooks_are_visible_to_owner_only(talk: Callable[..., None]) -> None:
         ({"url": "https://example.org", "events": ["job.exploded"]}, "#/events/0"),
     ],
 )
-def test_webhook_invalid_request_is_refused(
-    talk: Callable[..., None], body: dict[str, Any], pointer: str
+async def test_webhook_invalid_request_is_refused(
+    connect_service: ConnectService, body: dict[str, Any], pointer: str
 ) -> None:
-    async def conversation(http: httpx.AsyncClient, _service: Service) -> None:
+    async with connect_service() as (http, _):
         answer = await http.post("/v1/webhooks", json=body)
         assert answer.status_code == 422
         assert answer.json()["errors"][0]["pointer"] == pointer
 
-    talk(conversation)
 
-
-def test_webhook_count_is_limited(talk: Callable[..., None]) -> None:
-    async def conversation(http: httpx.AsyncClient, _service: Service) -> None:
+async def test_webhook_count_is_limited(connect_service: ConnectService) -> None:
+    async with connect_service() as (http, _):
         body = {"url": "https://example.org/hook"}
         statuses = [(await http.post("/v1/webhooks", json=body)).status_code for _ in range(51)]
         assert statuses == [201] * 50 + [422]
 
-    talk(conversation)
 
-
-def test_webhook_slow_receiver_does_not_delay_other_owners(talk: Callable[..., None]) -> None:
+async def test_webhook_slow_receiver_does_not_delay_other_owners(connect_service: ConnectService) -> None:
     """One whose address takes connections and never answers, and one whose address answers."""
 
-    async def conversation(http: httpx.AsyncClient, service: Service) -> None:
+    async with connect_service() as (http, service):
         slow, quick = (
             await client_with_token(service, "slow", "write"),
             await client_with_token(service, "quick", "write"),
@@ -476,10 +445,8 @@ def test_webhook_slow_receiver_does_not_delay_other_owners(talk: Callable[..., N
             finally:
                 await sender.close()
 
-    talk(conversation)
 
-
-def test_webhook_slow_name_server_delays_owner_only(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_webhook_slow_name_server_delays_owner_only(monkeypatch: pytest.MonkeyPatch) -> None:
     go_on = threading.Event()
     ask = socket.getaddrinfo
 
@@ -497,21 +464,18 @@ def test_webhook_slow_name_server_delays_owner_only(monkeypatch: pytest.MonkeyPa
             return type(error)
         raise AssertionError
 
-    async def talk() -> None:
-        async with guarded_client() as client:
-            slow = [asyncio.create_task(ask_for(client, "me", f"slow{n}.example.org")) for n in range(5)]
-            await asyncio.sleep(0.2)
-            async with asyncio.timeout(20):
-                assert await ask_for(client, "me", "slow9.example.org") is httpx.ConnectError
-                assert await ask_for(client, "you", "fast.example.org") is AddressRefusedError
-            go_on.set()
-            assert set(await asyncio.gather(*slow)) == {AddressRefusedError}
-
-    asyncio.run(talk())
+    async with guarded_client() as client:
+        slow = [asyncio.create_task(ask_for(client, "me", f"slow{n}.example.org")) for n in range(5)]
+        await asyncio.sleep(0.2)
+        async with asyncio.timeout(20):
+            assert await ask_for(client, "me", "slow9.example.org") is httpx.ConnectError
+            assert await ask_for(client, "you", "fast.example.org") is AddressRefusedError
+        go_on.set()
+        assert set(await asyncio.gather(*slow)) == {AddressRefusedError}
 
 
-def test_messages_of_paused_webhook_expire(talk: Callable[..., None]) -> None:
-    async def conversation(http: httpx.AsyncClient, service: Service) -> None:
+async def test_messages_of_paused_webhook_expire(connect_service: ConnectService) -> None:
+    async with connect_service() as (http, service):
         with receive_webhooks() as receiver:
             hooks = [await make(http, receiver) for _ in range(2)]
             for hook in hooks:
@@ -523,5 +487,3 @@ def test_messages_of_paused_webhook_expire(talk: Callable[..., None]) -> None:
             paused, active = [(await deliveries(http, hook))[0] for hook in hooks]
             assert paused["state"] == "failed" and "paused" in paused["error"]
             assert active["state"] == "pending"
-
-    talk(conversation)

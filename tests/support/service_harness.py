@@ -2,9 +2,9 @@
 
 import uuid
 from collections.abc import AsyncIterator
-from contextlib import asynccontextmanager
+from contextlib import AbstractAsyncContextManager, asynccontextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import httpx
 from pydantic import SecretStr
@@ -36,6 +36,12 @@ async def running_service(
         transport = httpx.ASGITransport(app=app)
         async with httpx.AsyncClient(transport=transport, base_url="http://localhost:8642") as http:
             yield http, app.state.service
+
+
+class ConnectService(Protocol):
+    """Starts a service on the database and folder of a test, with settings of its own."""
+
+    def __call__(self, **settings: Any) -> AbstractAsyncContextManager[tuple[httpx.AsyncClient, Service]]: ...
 
 
 async def committed_dataset(service: Service, owner: str = "local", *, has_poses: bool = True) -> str:
@@ -78,6 +84,7 @@ def store_content(service: Service, content: bytes) -> str:
 
 
 __all__ = [
+    "ConnectService",
     "Manifest",
     "claim_job",
     "client_with_token",

@@ -82,6 +82,7 @@ def test_visibility_loss_of_occluders_has_opacity_gradient() -> None:
         other.build(changed, np.zeros((40, 0), np.float32))
         return 0.3 * float((1 - other.transmittance(lines).astype(np.float64)).mean())
 
+    assert len(found.opacity_logits) >= 3
     for row in np.argsort(-np.abs(found.opacity_logits))[:3]:
         step = np.zeros(40)
         step[found.ids[row]] = 0.02

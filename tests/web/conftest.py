@@ -10,6 +10,7 @@ import time
 import urllib.error
 import urllib.request
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,7 @@ from tests.support.browser import PLAYWRIGHT, chromium
 from tests.support.npm_packages import npm_folder
 from tests.support.postgres_fixtures import copied_database, postgres, short_root, template
 from tests.support.run_replay import RunReplay
+from tests.support.service_harness import ConnectService, running_service
 from tests.support.web_harness import ROOT, Browse, RunningService, StartService
 
 __all__ = ["postgres", "short_root", "template"]
@@ -30,6 +32,12 @@ def database(postgres: EmbeddedPostgres, template: str) -> Iterator[str]:
     """A database for the tests of one module."""
     with copied_database(postgres, template) as copied:
         yield copied
+
+
+@pytest.fixture
+def connect_service(database: str, tmp_path: Path) -> ConnectService:
+    """A service in this process for as long as ``async with`` lasts, with a client of it."""
+    return partial(running_service, database, tmp_path)
 
 
 @pytest.fixture(scope="module")

@@ -7,10 +7,11 @@ from pathlib import Path
 
 import httpx
 import pytest
-from test_page_parts import client, make_job
+from test_page_parts import make_job
 
 from octasplat.workers.db.connections import open_pool
 from octasplat.workers.worker.job_kinds import job_kinds
+from tests.support.service_harness import running_service
 
 RESULTS = (
     "scene.ply", "config.json", "held_out.json", "views.json", "training.json", "events.jsonl",
@@ -41,7 +42,7 @@ def pages(database: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Cal
     def look(*names: str) -> tuple[str, str]:
         async def ask() -> tuple[str, str]:
             job_id = await finished(*names)
-            async with client(database, tmp_path, monkeypatch) as http:
+            async with running_service(database, tmp_path) as (http, _):
                 answers: list[httpx.Response] = [await http.get(path) for path in (f"/jobs/{job_id}", "/new")]
                 assert [answer.status_code for answer in answers] == [200, 200]
                 return answers[0].text, answers[1].text

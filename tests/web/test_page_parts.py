@@ -1,20 +1,13 @@
 """Pages without a browser: headers, errors as pages, owners, escaping, words."""
 
-import asyncio
 import datetime
 import re
 import subprocess
 import sys
 import uuid
-from collections.abc import AsyncIterator, Awaitable, Callable
-from contextlib import asynccontextmanager
-from pathlib import Path
 
-import httpx
 import pytest
 
-from octasplat.service.app import create_app
-from octasplat.service.settings import ServiceSettings
 from octasplat.service.web import formatting
 from octasplat.service.web.results import download_groups, read_measurements
 from octasplat.service.web.routing import safe_local_path
@@ -24,35 +17,10 @@ from octasplat.workers.db.rows import Artifact, DatasetFile
 from octasplat.workers.db.tokens import add_token
 from octasplat.workers.queue.jobs import NewJob, create_job
 from octasplat.workers.queue.procrastinate_queue import ProcrastinateQueue
+from tests.support.service_harness import ConnectService
 from tests.support.web_harness import ROOT
 
 HOSTILE = '"><img src=x onerror=alert(1)>'
-
-
-@asynccontextmanager
-async def client(
-    database: str, folder: Path, monkeypatch: pytest.MonkeyPatch
-) -> AsyncIterator[httpx.AsyncClient]:
-    monkeypatch.setenv("DATABASE_URL", database)
-    app = create_app(ServiceSettings(data=folder, storage=str(folder / "store"), floor_bytes=0))
-    async with app.router.lifespan_context(app):
-        transport = httpx.ASGITransport(app=app)
-        async with httpx.AsyncClient(transport=transport, base_url="http://localhost:8642") as http:
-            yield http
-
-
-@pytest.fixture
-def talk(database: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
-    """Runs a conversation with the service."""
-
-    def run(conversation: Callable[[httpx.AsyncClient], Awaitable[None]]) -> None:
-        async def whole() -> None:
-            async with client(database, tmp_path, monkeypatch) as http:
-                await conversation(http)
-
-        asyncio.run(whole())
-
-    return run
 
 
 async def make_job(database: str, **values: object) -> uuid.UUID:
@@ -61,8 +29,10 @@ async def make_job(database: str, **values: object) -> uuid.UUID:
         return (await create_job(connection, ProcrastinateQueue(), NewJob(**fields))).id
 
 
-def test_unexpected_stages_are_inserted_in_order(talk: Callable[..., None], database: str) -> None:
-    async def conversation(http: httpx.AsyncClient) -> None:
+async def test_unexpected_stages_are_inserted_in_order(
+    connect_service: ConnectService, database: str
+) -> None:
+    async with connect_service() as (http, _):
         job_id = await make_job(database, options={"poses": "given"})
         async with open_pool(database, max_size=1, wait_seconds=10) as pool, pool.connection() as connection:
             await connection.execute(
@@ -78,11 +48,9 @@ def test_unexpected_stages_are_inserted_in_order(talk: Callable[..., None], data
         wanted = [*(("done", name) for name in done), ("now", "matches"), *(("later", n) for n in later)]
         assert stages == wanted
 
-    talk(conversation)
 
-
-def test_content_policy_allows_only_own_scripts(talk: Callable[..., None]) -> None:
-    async def conversation(http: httpx.AsyncClient) -> None:
+async def test_content_policy_allows_only_own_scripts(connect_service: ConnectService) -> None:
+    async with connect_service() as (http, _):
         for path in ("/", "/new", "/sign-in", "/docs", f"/jobs/{uuid.uuid4()}"):
             answer = await http.get(path)
             assert answer.headers["content-type"].startswith("text/html")
@@ -98,13 +66,13 @@ def test_content_policy_allows_only_own_scripts(talk: Callable[..., None]) -> No
             assert not re.search(r"\s(style|on[a-z]+)=", answer.text)
             assert not re.search(r'(src|href)="(https?:)?//', answer.text)
 
-    talk(conversation)
 
-
-def test_static_files_are_served_with_headers(talk: Callable[..., None]) -> None:
-    async def conversation(http: httpx.AsyncClient) -> None:
+async def test_static_files_are_served_with_headers(connect_service: ConnectService) -> None:
+    async with connect_service() as (http, _):
         page = (await http.get("/")).text
-        for path in re.findall(r'(?:src|href)="(/static/[^"]+)"', page):
+        paths = re.findall(r'(?:src|href)="(/static/[^"]+)"', page)
+        assert paths
+        for path in paths:
             assert (await http.get(path)).status_code == 200, path
         answer = await http.get("/static/vendor/three.js")
         assert answer.headers["content-type"].startswith("text/javascript")
@@ -116,22 +84,19 @@ def test_static_files_are_served_with_headers(talk: Callable[..., None]) -> None
         for path in ("/static/../pages.py", "/static/%2e%2e/pages.py", "/static/nothing.js"):
             assert (await http.get(path)).status_code == 404
 
-    talk(conversation)
 
-
-def test_page_links_api_description(talk: Callable[..., None]) -> None:
-    async def conversation(http: httpx.AsyncClient) -> None:
+async def test_page_links_api_description(connect_service: ConnectService) -> None:
+    async with connect_service() as (http, _):
         document = (await http.get("/openapi.json")).json()
         page = (await http.get("/docs")).text
+        assert document["paths"]
         for path, item in document["paths"].items():
             assert f"<code>{path}</code>" in page, path
             assert "/docs" not in path and item
 
-    talk(conversation)
 
-
-def test_errors_are_pages_or_notices(talk: Callable[..., None], database: str) -> None:
-    async def conversation(http: httpx.AsyncClient) -> None:
+async def test_errors_are_pages_or_notices(connect_service: ConnectService, database: str) -> None:
+    async with connect_service() as (http, _):
         for path in (f"/jobs/{uuid.uuid4()}", "/jobs/nonsense", f"/jobs/{uuid.uuid4()}/report"):
             answer = await http.get(path)
             assert answer.status_code == 404 and "There is no such" in answer.text
@@ -148,21 +113,17 @@ def test_errors_are_pages_or_notices(talk: Callable[..., None], database: str) -
         foreign = await http.post(f"/jobs/{job}/cancel", headers={"Origin": "https://evil.example"})
         assert foreign.status_code == 403
 
-    talk(conversation)
 
-
-def test_names_of_users_are_text(talk: Callable[..., None], database: str) -> None:
-    async def conversation(http: httpx.AsyncClient) -> None:
+async def test_names_of_users_are_text(connect_service: ConnectService, database: str) -> None:
+    async with connect_service() as (http, _):
         job = await make_job(database, label=HOSTILE)
         for path in ("/", f"/jobs/{job}", f"/parts/jobs/{job}", "/parts/jobs"):
             text = (await http.get(path)).text
             assert HOSTILE not in text and "&#34;&gt;&lt;img" in text
 
-    talk(conversation)
 
-
-def test_job_list_shows_own_jobs_only(talk: Callable[..., None], database: str) -> None:
-    async def conversation(http: httpx.AsyncClient) -> None:
+async def test_job_list_shows_own_jobs_only(connect_service: ConnectService, database: str) -> None:
+    async with connect_service() as (http, _):
         job = await make_job(database, owner="ann", label="of ann")
         async with open_pool(database, max_size=1, wait_seconds=10) as pool, pool.connection() as connection:
             for owner, scope in (("ann", "write"), ("bob", "write"), ("eve", "read")):
@@ -189,8 +150,6 @@ def test_job_list_shows_own_jobs_only(talk: Callable[..., None], database: str) 
         assert unknown.status_code == 303 and unknown.headers["location"] == "/sign-in?next=/new"
         part = await http.get("/parts/jobs", headers={"HX-Request": "true"})
         assert part.status_code == 200 and part.headers["hx-redirect"].startswith("/sign-in")
-
-    talk(conversation)
 
 
 def test_pages_do_not_slow_down_start() -> None:

@@ -8,7 +8,7 @@ from octasplat.workers import cancellation
 from octasplat.workers.cancellation import cancel_and_wait
 
 
-def test_cancel_and_wait_repeats_lost_cancellation(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_cancel_and_wait_repeats_lost_cancellation(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(cancellation, "RECANCEL_SECONDS", 0.05)
     lost = 0
 
@@ -31,13 +31,10 @@ def test_cancel_and_wait_repeats_lost_cancellation(monkeypatch: pytest.MonkeyPat
     async def returns() -> None:
         return
 
-    async def ended_by() -> list[BaseException | None]:
-        tasks = [asyncio.create_task(work()) for work in (deaf, fails, returns)]
-        await asyncio.sleep(0)
-        async with asyncio.timeout(60):
-            return await cancel_and_wait(tasks)
-
-    first, second, third = asyncio.run(ended_by())
+    tasks = [asyncio.create_task(work()) for work in (deaf, fails, returns)]
+    await asyncio.sleep(0)
+    async with asyncio.timeout(60):
+        first, second, third = await cancel_and_wait(tasks)
     assert lost == 2 and isinstance(first, asyncio.CancelledError)
     assert isinstance(second, ValueError) and third is None
-    assert asyncio.run(cancel_and_wait([])) == []
+    assert await cancel_and_wait([]) == []

@@ -99,25 +99,21 @@ def test_progress_events_are_thinned(bench: WorkerHarness) -> None:
 
 
 @pytest.mark.parametrize("where", ["between statements", "between statements sent together"])
-def test_frozen_transaction_is_ended_by_timeout(conninfo: str, where: str) -> None:
+async def test_frozen_transaction_is_ended_by_timeout(conninfo: str, where: str) -> None:
     assert max(IDLE_SECONDS, STATEMENT_SECONDS) <= 60
 
-    async def put() -> None:
-        async with open_pool(conninfo) as pool, pool.connection() as connection:
-            await put_file(connection, dataset.id, "images/a.png", "a" * 64, 1)
-
-    async def make() -> None:
-        nonlocal dataset
-        async with open_pool(conninfo) as pool, pool.connection() as connection:
-            dataset = await create_dataset(connection, "me", "d")
-
-    dataset = None  # type: ignore[var-annotated]
-    asyncio.run(make())
+    async with open_pool(conninfo) as pool, pool.connection() as connection:
+        dataset = await create_dataset(connection, "me", "d")
     command = [sys.executable, "-c", FROZEN, conninfo, str(dataset.id), where]
     process = subprocess.Popen(command, cwd=ROOT, env={**os.environ, "PYTHONPATH": str(ROOT)})
     try:
         assert os.waitpid(process.pid, os.WUNTRACED)[1] == 0x7F | signal.SIGSTOP << 8
-        asyncio.run(asyncio.wait_for(put(), MAX_WAIT_SECONDS))
+        async with (
+            asyncio.timeout(MAX_WAIT_SECONDS),
+            open_pool(conninfo) as pool,
+            pool.connection() as connection,
+        ):
+            await put_file(connection, dataset.id, "images/a.png", "a" * 64, 1)
     finally:
         process.kill()
         process.wait(10)

@@ -28,29 +28,28 @@ class SlowJournal:
         await asyncio.sleep(0)
 
 
-def test_reporter_finish_during_flush_writes_each_line_once(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_reporter_finish_during_flush_writes_each_line_once(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(reporter, "FLUSH_SECONDS", 0.01)
 
-    async def job() -> list[str]:
-        journal = SlowJournal()
-        child = Reporter(journal, workspace=None)  # type: ignore[arg-type]
-        for stage in ("load", "evaluate", "export"):
-            child.on_event({"kind": "stage_started", "stage": stage, "total_steps": 0})
-            child.on_event({"kind": "stage_finished", "stage": stage, "seconds": 1.0})
-        await journal.telling.wait()  # the first event is being written, five more were taken
-        child.on_event({"kind": "run_finished", "outputs": [], "seconds": 3.0})
-        await child.finish()
-        return journal.told
+    journal = SlowJournal()
+    child = Reporter(journal, workspace=None)  # type: ignore[arg-type]
+    for stage in ("load", "evaluate", "export"):
+        child.on_event({"kind": "stage_started", "stage": stage, "total_steps": 0})
+        child.on_event({"kind": "stage_finished", "stage": stage, "seconds": 1.0})
+    await journal.telling.wait()  # the first event is being written, five more were taken
+    child.on_event({"kind": "run_finished", "outputs": [], "seconds": 3.0})
+    await child.finish()
+    told = journal.told
 
     stages = [
         f"stage_{what} {stage}"
         for stage in ("load", "evaluate", "export")
         for what in ("started", "finished")
     ]
-    assert asyncio.run(job()) == [*stages, "run_finished"]
+    assert told == [*stages, "run_finished"]
 
 
-def test_reporter_logs_progress_at_intervals(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_reporter_logs_progress_at_intervals(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(reporter, "PROGRESS_LINE_SECONDS", 0.0)
 
     class Log(SlowJournal):
@@ -61,26 +60,25 @@ def test_reporter_logs_progress_at_intervals(monkeypatch: pytest.MonkeyPatch) ->
         async def log(self, lines: tuple[str, ...]) -> None:
             self.lines += lines
 
-    async def job() -> list[str]:
-        journal = Log()
-        child = Reporter(journal, workspace=None)  # type: ignore[arg-type]
-        child.on_event({"kind": "stage_started", "stage": "train", "total_steps": 900})
-        progress = {
-            "iteration": 450, "total_iterations": 900, "loss": 0.1, "psnr": 24.13, "gaussians": 32000,
-            "rays_per_second": 310_400, "hits_per_ray": 5.0, "seconds": 41.0, "seconds_left": 41.0,
-        }  # fmt: skip
-        measured = {"iteration": 450, "psnr": 23.04, "gaussians": 32000, "seconds": 41.0}
-        child.on_event({"kind": "held_out_measured", **measured})
-        child.on_event({"kind": "training_progress", **progress})
-        child.on_event({"kind": "warning", "message": "It rains."})
-        for number in range(3 * reporter.MAX_LOG_LINES):
-            child.log(f"noise {number}")
-        child.on_event({"kind": "error", "type": "x", "message": "x", "cause": ["Caused by rain"]})
-        await child.finish()
-        return [line for line in journal.lines if "noise" not in line and "(More" not in line]
+    journal = Log()
+    child = Reporter(journal, workspace=None)  # type: ignore[arg-type]
+    child.on_event({"kind": "stage_started", "stage": "train", "total_steps": 900})
+    progress = {
+        "iteration": 450, "total_iterations": 900, "loss": 0.1, "psnr": 24.13, "gaussians": 32000,
+        "rays_per_second": 310_400, "hits_per_ray": 5.0, "seconds": 41.0, "seconds_left": 41.0,
+    }  # fmt: skip
+    measured = {"iteration": 450, "psnr": 23.04, "gaussians": 32000, "seconds": 41.0}
+    child.on_event({"kind": "held_out_measured", **measured})
+    child.on_event({"kind": "training_progress", **progress})
+    child.on_event({"kind": "warning", "message": "It rains."})
+    for number in range(3 * reporter.MAX_LOG_LINES):
+        child.log(f"noise {number}")
+    child.on_event({"kind": "error", "type": "x", "message": "x", "cause": ["Caused by rain"]})
+    await child.finish()
+    told = [line for line in journal.lines if "noise" not in line and "(More" not in line]
 
     state = "training 24.1 dB, held out 23.0 dB, 32,000 Gaussians, 310k rays/s"
-    assert asyncio.run(job()) == [
+    assert told == [
         "Training",
         f"  450/900: {state}, 0:41 left",
         "Warning: It rains.",
