@@ -1,7 +1,6 @@
 """A running ``octasplat serve`` and everything that can be done to it."""
 
 import contextlib
-import json
 import os
 import random
 import signal

@@ -61,7 +61,9 @@ def upwards(edges: Iterable[tuple[str, str]]) -> list[tuple[str, str]]:
 
 
 def drawing(graph: grimp.ImportGraph) -> str:
-    """Mermaid text: a frame for each package, an arrow for each pair of folders; single modules are left out."""
+    """Mermaid text: a frame for each package, an arrow for each pair of folders; single modules are left
+    out.
+    """
     edges = {
         (here, there)
         for here, there in arrows(graph)

@@ -29,7 +29,7 @@ from octasplat.engine.render.image_files import read_image, write_png
 from octasplat.engine.runs.config import read_config
 from octasplat.engine.runs.run_folder import CONFIG, ENVIRONMENT, SCENE, run_viewpoints
 from octasplat.engine.surface.depth_cameras import photograph_cameras
-from tests.support.lit_surface import in_cycles, in_threejs, view_of
+from tests.support.lit_surface import render_in_cycles, render_in_threejs, view_of
 
 Image = Float32[np.ndarray, "h w 3"]
 DEPTH = 6
@@ -116,9 +116,9 @@ def main() -> None:
                 for program, ours in (("Cycles", "path"), ("three.js", "split sum")):
                     start, label = time.perf_counter(), f"{glb.name} in {program}"
                     if program == "Cycles":
-                        seen = in_cycles(glb, light, view, asked.samples)
+                        seen = render_in_cycles(glb, light, view, asked.samples)
                     else:
-                        seen = in_threejs(glb, light, view)
+                        seen = render_in_threejs(glb, light, view)
                     took[label] = time.perf_counter() - start
                     pictures[label] = np.clip(seen, 0, 1)
                     table.add(label, pictures[label], ours, pictures[ours], mask)

@@ -22,7 +22,7 @@ from octasplat.workers.db.events_and_logs import events_after, log_after
 from octasplat.workers.db.locks import lock_owner, lock_store
 from octasplat.workers.db.rows import Job
 from octasplat.workers.maintenance.webhooks.rows import add_endpoint, delete_endpoint
-from octasplat.workers.queue.attempts import Attempt, ResultFile, claim
+from octasplat.workers.queue.attempts import Attempt, FencedError, ResultFile, claim
 from octasplat.workers.queue.jobs import NewJob, change_job, create_job, get_job
 from octasplat.workers.queue.procrastinate_queue import ProcrastinateQueue
 from octasplat.workers.queue.recovery import StalledAttempts, recover_stalled_jobs

@@ -62,7 +62,8 @@ def relighter() -> Callable[[np.ndarray], Relighter]:
             return linear_to_srgb(linear) * coverage[..., None] + background * (1 - coverage[..., None])
 
         image = SimpleNamespace(linear=linear, coverage=coverage, composite_over=over)
-        return cast(Relighter, SimpleNamespace(set_environment=lambda _map: None, render=lambda _rays, _part: image))
+        relighter = SimpleNamespace(set_environment=lambda _map: None, render=lambda _rays, _part: image)
+        return cast(Relighter, relighter)
 
     return make
 

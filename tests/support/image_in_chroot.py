@@ -16,7 +16,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import psutil
-from test_docker_files import ROOT, instructions
+
+from tests.docker.test_docker_files import ROOT, instructions
 
 KEPT = re.compile(r"PIP_\w+|SSL_CERT_\w+|https?_proxy|no_proxy", re.IGNORECASE)
 """How this machine reaches the network."""

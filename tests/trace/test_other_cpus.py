@@ -21,10 +21,10 @@ HASWELL = {
 TRAINING = """
 import sys, tempfile
 from pathlib import Path
-from tests.support.planar_dataset import FlatWorld, small_config
+from tests.support.planar_dataset import PlanarDataset, small_config
 from octasplat.engine.train.loop.state import fresh_state
 from octasplat.engine.train.loop.trainer import Trainer
-world = FlatWorld()
+world = PlanarDataset()
 config = small_config(iterations=60, sh_degree_interval=30, loss={"ssim": 0.2})
 with tempfile.TemporaryDirectory() as folder:
     trained = Trainer(
