@@ -9,7 +9,7 @@ from octasplat.engine.core.versions import versions
 
 ROOT = Path(__file__).resolve().parent.parent
 HARMLESS = {"pydantic", "pydantic_core", "jaxtyping", "Jinja2", "pyoidn", "platformdirs"}
-"""Checks of values, the layout of the report, the denoiser of stages, places of folders: no figure is theirs."""
+"""Checks of values, layout of the report, denoiser of stages, places of folders: no figure is theirs."""
 
 
 def imported_names(module: str) -> set[str]:
