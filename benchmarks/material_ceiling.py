@@ -23,7 +23,6 @@ from octasplat.engine.core.rays import ImageRays
 from octasplat.engine.dataset import load_dataset_model
 from octasplat.engine.evaluate.ground_truth import ViewTruth, read_truth
 from octasplat.engine.evaluate.ground_truth_metrics import pooled_psnr
-from octasplat.engine.gaussians.channels import unstacked
 from octasplat.engine.gaussians.frames import quaternions_from_matrices
 from octasplat.engine.gaussians.materials import MATERIAL_WIDTHS
 from octasplat.engine.gaussians.model import FlatGaussians
@@ -131,7 +130,9 @@ def gaussians_on(
         np.full(len(mean), 7.0, np.float32),
         np.zeros((len(mean), 1, 3), np.float32),
     )
-    return scene.with_channels(unstacked(mean[:, 6:].astype(np.float32), MATERIAL_WIDTHS))
+    ends = np.cumsum(list(MATERIAL_WIDTHS.values()))[:-1]
+    materials = np.split(mean[:, 6:].astype(np.float32), ends, axis=1)
+    return scene.with_channels(dict(zip(MATERIAL_WIDTHS, map(np.ascontiguousarray, materials), strict=True)))
 
 
 def tracer_under(

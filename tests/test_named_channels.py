@@ -17,7 +17,7 @@ from octasplat.engine.edit.cleaning import clean
 from octasplat.engine.edit.deform import deform
 from octasplat.engine.edit.edit_options import CleanupOptions
 from octasplat.engine.edit.mesh_to_gaussians import recover_gaussians
-from octasplat.engine.edit.selection import in_box, merge_scenes, with_sh_degree
+from octasplat.engine.edit.selection import in_box
 from octasplat.engine.files import (
     dropped_on_export,
     export_scene,
@@ -29,6 +29,7 @@ from octasplat.engine.files import (
 from octasplat.engine.files.encodings import half_turn_gaussians
 from octasplat.engine.gaussians.affine import rotation, transform_gaussians, translation
 from octasplat.engine.gaussians.channels import Channels
+from octasplat.engine.gaussians.merge import merge_scenes, with_sh_degree
 from octasplat.engine.gaussians.model import FlatGaussians, concatenate
 from octasplat.engine.gaussians.morton import morton_order
 from octasplat.engine.gaussians.octagon import SIDES, octagon_triangles

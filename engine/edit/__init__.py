@@ -1,1 +1,1 @@
-"""Scenes changed after training: meshes edited elsewhere, proxies that drive a scene, selection, clean-up."""
+"""Edits of trained scenes: meshes edited elsewhere, proxies that deform a scene, selection and clean-up."""

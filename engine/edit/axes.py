@@ -1,4 +1,4 @@
-"""Axes that a mesh lost on its way through an editor, and the quantile Q of its octagons.
+"""Axes that a mesh format or an editor changed, and the octagons' Q.
 
 glTF and (by custom) OBJ have y up, Blender has z up. A mesh that goes in and out by the same format comes
 back as it was, one that changes format comes back turned by a multiple of 90 degrees about x.
@@ -28,7 +28,7 @@ Q_TOLERANCE = 1e-3
 
 
 def default_axes(path: Path) -> Axes:
-    """How our own exporter writes this kind of file: the GLB's root node turns the scene by 180 degrees."""
+    """Return the rotation of an exported file: that of the root node for GLB (180 degrees)."""
     return "x180" if path.suffix.lower() == ".glb" else "x0"
 
 
@@ -38,7 +38,7 @@ def detect_axes(
     present: Bool[np.ndarray, "n 8"],
     unedited_world: Float[np.ndarray, "n 8 3"],
 ) -> Axes:
-    """The turn that brings most vertices back to where they were, by median distance to the unedited ones."""
+    """Return the rotation that brings most vertices back to their exported places, by median distance."""
     edited, unedited = corners[present], unedited_world[present].astype(np.float64)
     if len(edited) == 0:
         return usual
@@ -51,7 +51,7 @@ def detect_axes(
 
 
 def infer_q(mesh: ImportedMesh, opacities: Float[np.ndarray, " n"], default: float) -> float:
-    """The Q of the export: as the file states it, else from the octagons' radii or textures, else a default.
+    """Return the Q of an export: as the file states it, else estimated from its octagons, else a default.
 
     A radius is sqrt(Q + 2 ln a) for opacity a, and the texture coordinates hold radius / sqrt(Q).
     """
@@ -78,7 +78,7 @@ def infer_q(mesh: ImportedMesh, opacities: Float[np.ndarray, " n"], default: flo
 
 
 def _snap_q(q: float) -> float:
-    """The number that somebody chose, where rounding in the file left it a little off."""
+    """Return the nearest round value of Q, where rounding in the file left it a little off."""
     for chosen in (CHI2_2_99, CHI2_3_99, round(q, 2)):
         if abs(q - chosen) <= Q_TOLERANCE * q:
             return chosen

@@ -1,4 +1,4 @@
-"""A finished run with another scene: the folder of a run again, but for what was measured of the first."""
+"""Folders of finished runs with a changed scene, without the measurements of the original."""
 
 import json
 import os
@@ -36,7 +36,7 @@ _COPIED_FILES = (CONFIG, EVENTS, HELD_OUT, TRAINING, VIEWS, ENVIRONMENT, EXACT_E
 
 
 def check_new_run(target: Path) -> None:
-    """Make sure that a folder is free.
+    """Check that a folder does not exist or is empty.
 
     Raises:
         OutputError: it is not.
@@ -54,7 +54,7 @@ def write_changed_run(
     facts: SceneMetadata | None = None,
     matrix: Float[np.ndarray, "4 4"] | None = None,
 ) -> tuple[str, ...]:
-    """Write a folder like that of a run with another scene in it, all at once.
+    """Write a run's folder with a changed scene, atomically.
 
     What was measured, rendered and exported of the run does not come along, nor do checkpoints. Of a scene
     that was moved the cameras and the learnt light are moved along, or left out where that cannot be.

@@ -1,4 +1,4 @@
-"""Gaussians that a user would rather not see: faint, oversized, too near to a camera, and floaters."""
+"""Removal of Gaussians that disturb: faint, oversized, too near to a camera, or floaters."""
 
 import numpy as np
 from jaxtyping import Bool
@@ -19,7 +19,7 @@ Gaussian does not hold everything together."""
 def clean(
     gaussians: FlatGaussians, options: CleanupOptions, near_zones: CameraClearance | None = None
 ) -> tuple[Bool[np.ndarray, " n"], CleanReport]:
-    """Which Gaussians stay, and why the others do not.
+    """Return a mask of the Gaussians to keep, and counts of the others by reason.
 
     Floaters are looked for among those that pass the thresholds and lie outside of ``near_zones``.
     """
@@ -53,7 +53,7 @@ def clean(
 
 
 def linked_groups(gaussians: FlatGaussians, link: float, neighbours: int) -> tuple[np.ndarray, np.ndarray]:
-    """Groups of Gaussians that hang together: the group of each, and the sizes of the groups.
+    """Return the connected group of each Gaussian, and the groups' sizes.
 
     What counts as near is measured by the Gaussians' own sizes, so that a coarse background holds together as
     well as a fine foreground.

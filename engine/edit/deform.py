@@ -1,4 +1,4 @@
-"""Scenes under any deformation of space: octagon corners in, corners out, Gaussians recovered from them.
+"""Scenes under any deformation of space, evaluated at octagon corners.
 
 This is where a physics engine comes in: it needs to move points, nothing else.
 """
@@ -23,7 +23,7 @@ CornerMap = Callable[[Float64[np.ndarray, "n 8 3"]], Float[np.ndarray, "n 8 3"]]
 
 
 def deformation_corners(gaussians: FlatGaussians) -> Float64[np.ndarray, "n 8 3"]:
-    """The points of each Gaussian that a deformation is asked about, world frame.
+    """Return the points of each Gaussian at which a deformation is evaluated, world frame.
 
     An octagon of radius sqrt(2) standard deviations, whatever the opacity; its mean is the centre.
     """
@@ -39,7 +39,7 @@ def deformation_corners(gaussians: FlatGaussians) -> Float64[np.ndarray, "n 8 3"
 def deform(
     gaussians: FlatGaussians, corner_map: CornerMap, mirrored: bool = False
 ) -> tuple[FlatGaussians, DeformReport]:
-    """The scene under ``corner_map``, any function that takes and returns points of shape (n, 8, 3).
+    """Return the scene under ``corner_map``, any function of points of shape (n, 8, 3).
 
     Points that it returns exactly as they were leave their Gaussian as it was, bit for bit.
 
@@ -61,7 +61,7 @@ def deform_to(
     moved_world: Float[np.ndarray, "n 8 3"],
     mirrored: bool | Bool[np.ndarray, " n"] = False,
 ) -> tuple[FlatGaussians, DeformReport]:
-    """The scene with its :func:`deformation_corners` moved from ``corners_world`` to ``moved_world``.
+    """Return the scene with its :func:`deformation_corners` moved from ``corners_world`` to ``moved_world``.
 
     Args:
         gaussians: the scene.

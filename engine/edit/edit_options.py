@@ -1,4 +1,4 @@
-"""What may be asked of an edit: which Gaussians are meant, and what becomes of their materials."""
+"""Options of edits: which Gaussians are selected, and how their materials change."""
 
 import re
 from collections.abc import Callable
@@ -32,7 +32,7 @@ _Sphere = tuple[FiniteFloat, FiniteFloat, FiniteFloat, FiniteFloat]
 
 
 class Selection(BaseModel):
-    """Which Gaussians are meant: those for which all that is given holds."""
+    """Which Gaussians are selected: those for which all given conditions hold."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -63,7 +63,7 @@ class Selection(BaseModel):
 
 
 def read_colour(value: object) -> object:
-    """Linear values of a text: ``#rrggbb`` has display values, ``r,g,b`` linear ones.
+    """Return linear values of a text: ``#rrggbb`` has display values, ``r,g,b`` linear ones.
 
     Anything else is given back as it is. Raises ValueError where a text is neither.
     """
@@ -125,12 +125,12 @@ class _ChannelValues(BaseModel):
             raise ValidationError.from_exception_data(cls.__name__, lines) from None
 
     def set_values(self) -> dict[str, Any]:
-        """What is not left as it is, by channel."""
+        """Return the values that are given, by channel."""
         return {name: value for name in MATERIAL_WIDTHS if (value := getattr(self, name)) is not None}
 
 
 class MaterialValues(_ChannelValues):
-    """Values that materials get."""
+    """Values that materials are set to."""
 
     albedo: _Colour | None = Field(
         None,
@@ -141,7 +141,7 @@ class MaterialValues(_ChannelValues):
 
 
 class MaterialFactors(_ChannelValues):
-    """Factors that materials are multiplied by; what comes out is kept within 0 and 1."""
+    """Factors that materials are multiplied by; the products are clamped to [0, 1]."""
 
     albedo: _Factor | None = Field(None, description="Of the linear base colour.")
     metallic: _Factor | None = Field(None, description="From 0, below 1 less metallic.")
@@ -149,7 +149,7 @@ class MaterialFactors(_ChannelValues):
 
 
 class MaterialChange(BaseModel):
-    """What becomes of materials."""
+    """Changes of materials."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 

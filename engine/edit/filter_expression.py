@@ -1,4 +1,4 @@
-"""Gaussians chosen by what they are: comparisons of their numbers, joined by and, or and not.
+"""Filter expressions: comparisons of the Gaussians' values, joined by and, or and not.
 
     metallic > 0.5 and not (roughness > 0.3 or z < 0)
 
@@ -33,7 +33,7 @@ _ADVICE = "compare numbers of the Gaussians, as in: metallic > 0.5 and not z < 0
 
 
 def expression_variables(gaussians: FlatGaussians) -> dict[str, Float[np.ndarray, " n"]]:
-    """What an expression may name, one number a Gaussian each.
+    """Return the variables of an expression, one number per Gaussian each.
 
     Centres are ``x``, ``y``, ``z`` in world units, ``opacity`` is in (0, 1), and channels are called as in
     files (``metallic``, ``label_0``), but for ``albedo.r``, ``albedo.g`` and ``albedo.b``, which are linear.
@@ -48,7 +48,7 @@ def expression_variables(gaussians: FlatGaussians) -> dict[str, Float[np.ndarray
 
 
 def parse_filter(text: str) -> ast.expr:
-    """The expression in a text.
+    """Return the syntax tree of an expression.
 
     Raises:
         ConfigError: the text is none, or does more than compare and join.
@@ -64,7 +64,7 @@ def parse_filter(text: str) -> ast.expr:
 
 
 def filter_mask(gaussians: FlatGaussians, text: str) -> Bool[np.ndarray, " n"]:
-    """Which Gaussians an expression holds for.
+    """Return a mask of the Gaussians for which an expression holds.
 
     Raises:
         ConfigError: the text is no expression, or names what the scene does not have.
@@ -80,7 +80,7 @@ def filter_mask(gaussians: FlatGaussians, text: str) -> Bool[np.ndarray, " n"]:
 
 
 def _check(text: str, node: ast.expr) -> None:
-    """Make sure that a node is one of those that :func:`_evaluate_condition` knows."""
+    """Check that a node is one of those that :func:`_evaluate_condition` supports."""
     if isinstance(node, ast.BoolOp):
         for part in node.values:
             _check(text, part)

@@ -1,4 +1,4 @@
-"""Gaussians chosen in pictures: those that show where masks are white."""
+"""Selection of Gaussians by masks of photographs."""
 
 from collections.abc import Iterable, Sequence
 from pathlib import Path, PurePosixPath
@@ -24,7 +24,7 @@ MASK_THRESHOLD = 0.5
 def select_by_masks(
     source: Path, gaussians: FlatGaussians, masks: Sequence[Path], *, threads: int = 0
 ) -> Bool[np.ndarray, " n"]:
-    """Which Gaussians of a run show where masks of its photographs are white.
+    """Return a mask of a run's Gaussians that are visible where masks of its photographs are white.
 
     Args:
         source: folder of the run.
@@ -49,7 +49,7 @@ def select_by_masks(
 def mostly_inside(
     tracer: Tracer, count: int, views: Iterable[tuple[ImageRays, Bool[np.ndarray, "h w"]]]
 ) -> Bool[np.ndarray, " n"]:
-    """Gaussians of which more shows inside masks than outside, in all views together.
+    """Return the Gaussians whose blending weight inside masks exceeds that outside, over all views.
 
     Args:
         tracer: with the scene built.
@@ -66,7 +66,7 @@ def mostly_inside(
 
 
 def _blend_weights(tracer: Tracer, rays: RayBatch, count: int) -> Float64[np.ndarray, " n"]:
-    """How much of each Gaussian rays see."""
+    """Return the summed blending weight of each Gaussian over rays."""
     sums = np.zeros(count)
     if len(rays):
         seen = tracer.trace(rays, record=True)
@@ -115,7 +115,7 @@ def photograph_of_mask(mask: Path, photographs: Sequence[str]) -> int:
 
 
 def _mask(path: Path, image: ImageRays) -> Bool[np.ndarray, "h w"]:
-    """Which pixels of an image of rays lie where a mask is white."""
+    """Return which pixels of an image of rays lie where a mask is white."""
     try:
         mask = read_image(path)[..., 0]
     except DatasetError as error:
@@ -128,5 +128,5 @@ def _mask(path: Path, image: ImageRays) -> Bool[np.ndarray, "h w"]:
 
 
 def _resampled_centres(size: int, there: int) -> Int64[np.ndarray, " p"]:
-    """Places in a row of ``size`` pixels of the middles of ``there`` pixels."""
+    """Return the positions, in a row of ``size`` pixels, of the centres of ``there`` pixels."""
     return ((np.arange(there) + 0.5) * size / there).astype(np.int64)

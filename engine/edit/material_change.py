@@ -1,4 +1,4 @@
-"""Materials of chosen Gaussians changed, and harmonics that show it."""
+"""Changed materials of selected Gaussians, and harmonics refitted to them."""
 
 from dataclasses import replace
 
@@ -22,7 +22,7 @@ _DIRECTIONS = 64
 def with_materials(
     gaussians: FlatGaussians, chosen: Bool[np.ndarray, " n"], change: MaterialChange
 ) -> FlatGaussians:
-    """The scene, which has materials, with those of the chosen Gaussians changed and all else shared."""
+    """Return the scene with the materials of the selected Gaussians changed; other arrays are shared."""
     values, factors = change.set.set_values(), change.scale.set_values()
     changed = {name: gaussians.channels[name].copy() for name in (*values, *factors)}
     for name, value in values.items():
@@ -39,7 +39,7 @@ def refit_sh(
     light: LightLevels,
     frame: Float64[np.ndarray, "3 3"],
 ) -> FlatGaussians:
-    """The changed scene with harmonics that show the change, for whoever draws harmonics.
+    """Return the changed scene with harmonics refitted to its materials, for renderers of harmonics.
 
     To those of each chosen Gaussian is added by how much its split sum differs between the two materials, in
     display values and from all directions, as nearly as its harmonics can say it. Its share of the light
@@ -70,7 +70,7 @@ def _shaded_colours(
     light: LightLevels,
     frame: Float64[np.ndarray, "3 3"],
 ) -> Float64[np.ndarray, "n d 3"]:
-    """Display colours of Gaussians as they are seen along directions."""
+    """Return the display colours of Gaussians seen along directions."""
     count, views = len(gaussians), len(directions_world)
     directions = np.tile(directions_world, (count, 1))
     normals = np.repeat(gaussians.rotations[:, :, 0].astype(np.float64), views, axis=0)

@@ -1,4 +1,4 @@
-"""The scene of a finished run with other materials."""
+"""Material changes of a finished run's scene."""
 
 from pathlib import Path
 
@@ -20,7 +20,7 @@ from octasplat.engine.shading.environment_light import LearntLight
 def change_materials(
     source: Path, gaussians: FlatGaussians, chosen: Bool[np.ndarray, " n"], change: MaterialChange
 ) -> FlatGaussians:
-    """The scene of a run or file with the materials of the chosen Gaussians changed.
+    """Return the scene of a run or file with the materials of the selected Gaussians changed.
 
     Where it is that of a run which learnt its environment, harmonics follow.
 
@@ -49,7 +49,7 @@ def change_materials(
 
 
 def has_known_light(source: Path) -> bool:
-    """Whether the harmonics of a scene show its materials in a light that is known."""
+    """Return whether the light is known in which a scene's harmonics show its materials."""
     if not is_run(source) or not run_environment(source).exists():
         return False
     return (
@@ -60,7 +60,7 @@ def has_known_light(source: Path) -> bool:
 def edit_note(
     change: MaterialChange, selection: Selection, chosen: Bool[np.ndarray, " n"]
 ) -> dict[str, object]:
-    """Return a change in a few words of JSON, for ``edits.json``."""
+    """Return a short description of a change as JSON, for ``edits.json``."""
     asked, where = set(MaterialChange.model_fields), set(Selection.model_fields)
     return {
         **change.model_dump(mode="json", exclude_defaults=True, include=asked),

@@ -49,7 +49,7 @@ class _RecoveredParameters:
 def recover_gaussians(
     gaussians: FlatGaussians, mesh: ImportedMesh, path: Path, options: MeshToGaussiansOptions | None = None
 ) -> tuple[FlatGaussians, EditReport]:
-    """The scene as an edit of its octagon mesh left it.
+    """Return the scene that an edited octagon mesh describes.
 
     Gaussians of which no corner moved keep every bit. Of the others the centre, frame and scales follow the
     corners, the harmonics turn with the surface, and opacity stays.
@@ -100,7 +100,7 @@ def recover_gaussians(
 def _mean_displacements(
     geometry: FlatGaussians, octagons: MatchedOctagons, radii: Float[np.ndarray, " n"]
 ) -> Float64[np.ndarray, " m"]:
-    """How far each octagon is from where it was exported, as the mean over its corners, world units."""
+    """Return the mean displacement of each octagon's corners since the export, world units."""
     result = np.empty(len(octagons))
     for block in row_blocks(len(octagons)):
         gids = octagons.gids[block]
@@ -171,7 +171,7 @@ def _torn_octagons(
     radii: Float[np.ndarray, " m"],
     rounding: Float64[np.ndarray, " m"],
 ) -> tuple[Bool[np.ndarray, " m"], Bool[np.ndarray, "m 8"]]:
-    """Octagons that a selection of vertices went through, and which of their corners moved.
+    """Return octagons of which only some corners were moved, and which corners those are.
 
     Those of a smooth deformation that ends on them are none: their corners move by less than their size.
     """
@@ -188,7 +188,7 @@ def _three_point(
     radii: Float[np.ndarray, " m"],
     old: FlatGaussians,
 ) -> tuple[Float64[np.ndarray, "m 3"], Float64[np.ndarray, "m 3 2"], Bool[np.ndarray, " m"]]:
-    """The paper's rule: centre from corners 2 and 6, axes from 0 and 2 by Gram-Schmidt."""
+    """Recover by the paper's rule: centre from corners 2 and 6, axes from 0 and 2 by Gram-Schmidt."""
     means, quats, log_scales, good = frames_from_octagons(corners, radii.astype(np.float64))
     legs = rotation_matrices(quats)[:, :, 1:] * np.exp(log_scales)[:, None, :]
     enough = present[:, 0] & present[:, 2] & present[:, 6]
@@ -204,7 +204,7 @@ def _normal_signs(
     asked: Bool[np.ndarray, " m"],
     octagons: MatchedOctagons,
 ) -> tuple[Float64[np.ndarray, " m"], Bool[np.ndarray, " m"], Bool[np.ndarray, " m"]]:
-    """Signs of the normals, and which Gaussians flipped or were mirrored, judged by their neighbours.
+    """Return the normals' signs and which Gaussians flipped or were mirrored, judged by their neighbours.
 
     Originals are judged among originals. Copies are judged among copies, unless a Gaussian was copied more
     than once, where neighbours may belong to different copies.
@@ -242,7 +242,7 @@ def _assemble(
     options: MeshToGaussiansOptions,
     report: EditReport,
 ) -> FlatGaussians:
-    """The result in the order of the scene, copies last."""
+    """Return the recovered Gaussians in the order of the scene, copies last."""
     originals = np.flatnonzero(~octagons.is_copy)
     gids = octagons.gids
     absent = np.ones(len(gaussians), dtype=bool)

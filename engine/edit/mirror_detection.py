@@ -1,4 +1,4 @@
-"""Whether a proxy was mirrored: where vertices went does not say which side of a surface is which."""
+"""Detection of mirrored proxies: the moved vertices alone do not say which side of a surface is which."""
 
 import numpy as np
 from jaxtyping import Float64, Int64
@@ -17,7 +17,7 @@ def was_mirrored(
     triangles: Int64[np.ndarray, "t 3"],
     closed: bool,
 ) -> bool:
-    """Whether the deformation of a mesh mirrors the space around it.
+    """Return whether the deformation of a mesh mirrors the space around it.
 
     A closed mesh was mirrored if its inside came out: the signed volume changed its sign. An open one can be
     pushed through itself like a bowl, which mirrors nothing; it counts as mirrored only where one affine map
@@ -50,6 +50,6 @@ def was_mirrored(
 
 
 def signed_volume(vertices_world: Float64[np.ndarray, "v 3"], triangles: Int64[np.ndarray, "t 3"]) -> float:
-    """Volume inside a closed mesh, cubic world units; negative where its triangles face inwards."""
+    """Return the volume inside a closed mesh, cubic world units; negative if its triangles face inwards."""
     a, b, c = (vertices_world - vertices_world.mean(axis=0))[triangles].transpose(1, 0, 2)
     return float(np.einsum("ti,ti->", a, np.cross(b, c)) / 6.0)

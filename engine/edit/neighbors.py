@@ -1,4 +1,4 @@
-"""What a Gaussian's neighbours did: to judge octagons that flipped, and to move those without corners."""
+"""Motion of neighbouring Gaussians: to judge flipped octagons, and to move those without corners."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -41,7 +41,7 @@ def neighbour_rotations(
     new_means: Float64[np.ndarray, "n 3"],
     asked: Int64[np.ndarray, " m"],
 ) -> Float64[np.ndarray, "m 3 3"]:
-    """Orthogonal matrices that best take each asked Gaussian's old neighbours to the new ones (Kabsch).
+    """Return the orthogonal matrices that best map each Gaussian's old neighbours to the new ones (Kabsch).
 
     Zero where there are too few neighbours, where they moved in no common way, or where the Gaussian itself
     went another way, as at the rim of a part that was moved. Neighbours that lie in a
@@ -65,7 +65,7 @@ def neighbour_rotations(
 def _orthogonal_fits(
     old: Float64[np.ndarray, "m k 3"], new: Float64[np.ndarray, "m k 3"], planar_sign: float
 ) -> Float64[np.ndarray, "m 3 3"]:
-    """Rotations or reflections from old to new points; ``planar_sign`` says which where either would do."""
+    """Return rotations or reflections from old to new points; ``planar_sign`` decides for planar sets."""
     old = old - old.mean(axis=1, keepdims=True)
     new = new - new.mean(axis=1, keepdims=True)
     u, spread, vt = np.linalg.svd(np.einsum("nki,nkj->nij", new, old))
@@ -82,7 +82,7 @@ def _orthogonal_fits(
 def _strays(
     old: Float64[np.ndarray, "m k 3"], new: Float64[np.ndarray, "m k 3"], turns: Float64[np.ndarray, "m 3 3"]
 ) -> Bool[np.ndarray, " m"]:
-    """Gaussians, first of their neighbours, that went elsewhere than these: at the rim of what was moved."""
+    """Return Gaussians whose nearest neighbours moved differently: the rim of what was moved."""
     around_old, around_new = old[:, 1:].mean(axis=1), new[:, 1:].mean(axis=1)
     reach_old = np.sqrt(np.mean(np.sum((old[:, 1:] - around_old[:, None]) ** 2, axis=2), axis=1))
     reach_new = np.sqrt(np.mean(np.sum((new[:, 1:] - around_new[:, None]) ** 2, axis=2), axis=1))
@@ -102,7 +102,7 @@ def is_flipped(
     old_normals: Float64[np.ndarray, "m 3"],
     new_normals: Float64[np.ndarray, "m 3"],
 ) -> tuple[Bool[np.ndarray, " m"], Bool[np.ndarray, " m"]]:
-    """Octagons whose surface faces the other way than their surroundings say; where ``turns`` is zero, none.
+    """Return which octagons face the other way than their neighbours; none where ``turns`` is zero.
 
     Returns:
         Which octagons flipped (alone), and which belong to a part of the scene that was mirrored as a whole,
@@ -123,7 +123,7 @@ def interpolate_motion(
     unmoved: Bool[np.ndarray, " n"],
     deleted_means: Float64[np.ndarray, "d 3"],
 ) -> CarriedGaussians:
-    """Move points as the weighted affine maps of their nearest known Gaussians say.
+    """Move points by the weighted affine maps of their nearest known Gaussians.
 
     Args:
         points: old centres of those without readable corners.
@@ -162,7 +162,7 @@ def interpolate_motion(
 
 
 def _weights(distances: Float[np.ndarray, "u k"]) -> Float[np.ndarray, "u k"]:
-    """Weights that fall to zero at the last neighbour, so that neighbours come and go without a jump."""
+    """Return weights that fall to zero at the last neighbour, so that they are continuous."""
     reach = distances[:, -1:] * (1 + 1e-6) + 1e-30
     weights = (1 - distances / reach) ** 2 + 1e-12
     result: np.ndarray = weights / weights.sum(axis=1, keepdims=True)

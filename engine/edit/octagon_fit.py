@@ -1,4 +1,4 @@
-"""Affine maps fitted to the moved corners of octagons, whichever corners are still there."""
+"""Affine maps fitted to the moved corners of octagons, by any corners that are left."""
 
 from dataclasses import dataclass
 
@@ -15,7 +15,7 @@ MIN_CORNERS = 3
 
 @dataclass(frozen=True)
 class OctagonFit:
-    """What moved corners say about each Gaussian.
+    """The fitted map of each Gaussian.
 
     Attributes:
         means_world: new centres.
@@ -37,7 +37,7 @@ def fit_octagons(
     present: Bool[np.ndarray, "n 8"],
     radii: Float[np.ndarray, " n"],
 ) -> OctagonFit:
-    """Least-squares affine map of each octagon's corners.
+    """Return the least-squares affine map of each octagon's corners.
 
     Works on the moves of the corners, new minus old, so that the rounding of the old ones cancels and a
     corner that stayed says exactly that.
@@ -72,7 +72,7 @@ def fit_octagons(
 
 
 def largest_scale(legs: Float64[np.ndarray, "n 3 2"]) -> Float64[np.ndarray, " n"]:
-    """The larger singular value of each pair of legs."""
+    """Return the larger singular value of each pair of legs."""
     gram = legs.transpose(0, 2, 1) @ legs
     mean = (gram[:, 0, 0] + gram[:, 1, 1]) / 2
     spread = np.hypot((gram[:, 0, 0] - gram[:, 1, 1]) / 2, gram[:, 0, 1])

@@ -1,4 +1,4 @@
-"""Which vertex of an edited mesh is which corner of which Gaussian."""
+"""Matching of an edited mesh's vertices to the octagon corners of Gaussians."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -49,7 +49,7 @@ class MatchedOctagons:
         return len(self.gids)
 
     def prefer_nearest(self, distances: Float[np.ndarray, " m"]) -> "MatchedOctagons":
-        """Of several octagons of one Gaussian, the one with the least of ``distances`` is the original."""
+        """Return the octagons with the least of ``distances`` as the original of each Gaussian."""
         order = np.lexsort((distances, self.gids))
         gids = self.gids[order]
         is_copy = np.concatenate([[False], gids[1:] == gids[:-1]])
@@ -120,7 +120,7 @@ def _match_by_ids(
 def _unite_split_vertices(
     vertices: Int64[np.ndarray, " k"], keys: Int64[np.ndarray, " k"], positions: Float64[np.ndarray, "v 3"]
 ) -> tuple[Int64[np.ndarray, " u"], Int64[np.ndarray, " u"], Int32[np.ndarray, " v"]]:
-    """Vertices that share corner and place are one: GLB splits them where normals or seams differ.
+    """Unite vertices of one corner and place: GLB splits them where normals or seams differ.
 
     Returns:
         Keys of the united vertices in order, one vertex for each, and the united vertex of each vertex (-1:
@@ -147,7 +147,7 @@ def _unite_split_vertices(
 def _instances(
     keys: Int64[np.ndarray, " u"], node_of_vertex: np.ndarray, triangles: Int64[np.ndarray, "t 3"]
 ) -> Int64[np.ndarray, " u"]:
-    """A number for the octagon that each united vertex is part of.
+    """Return a number for the octagon that each united vertex is part of.
 
     All vertices of a Gaussian are one octagon, unless some corner is there twice: then each connected part is
     an octagon of its own, which is what duplicating in an editor makes.
@@ -176,7 +176,7 @@ def _assemble(
     vertices: Int64[np.ndarray, " u"],
     instance: Int64[np.ndarray, " u"],
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, int]:
-    """Octagons in order of Gaussian, then the most complete first, and the number of ambiguous corners."""
+    """Return octagons by Gaussian, the most complete first, and the number of ambiguous corners."""
     if (instance[1:] >= instance[:-1]).all():  # no need to sort
         numbers = np.zeros(len(instance), np.int64)
         numbers[1:] = np.cumsum(instance[1:] != instance[:-1])
@@ -233,7 +233,7 @@ def _match_by_order(
 
 
 def _is_uv_in_order(mesh: ImportedMesh, radii: np.ndarray, all_radii: np.ndarray) -> bool:
-    """Whether the texture coordinates are those of octagons in this order; a mesh without them passes."""
+    """Return whether the texture coordinates are those of octagons in this order, or absent."""
     if mesh.uv is None:
         return True
     seen = mesh.uv.reshape(-1, SIDES, 2)
@@ -257,7 +257,7 @@ def _is_uv_in_order(mesh: ImportedMesh, radii: np.ndarray, all_radii: np.ndarray
 def _uv_pairs(
     seen: Float[np.ndarray, "m 8 2"], radii: Float[np.ndarray, " m"], flip: float
 ) -> Iterator[tuple[Float64[np.ndarray, "k 2"], Float64[np.ndarray, "k 2"]]]:
-    """Texture coordinates about their middle, block by block: expected, up to a factor, and seen."""
+    """Return texture coordinates about their centre, block by block: expected up to a factor, and found."""
     for block in row_blocks(len(seen)):
         here = seen[block].astype(np.float64) - 0.5
         wanted = radii[block, None, None] * corner_directions() * np.array([1.0, flip])

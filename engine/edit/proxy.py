@@ -1,4 +1,4 @@
-"""Coarse meshes that drive a scene: every octagon corner is bound to a proxy and follows its deformation.
+"""Proxies: coarse meshes to which octagon corners are bound, and whose deformation these follow.
 
 Two ways. *Nearest*: a corner follows the affine maps of the triangles around the nearest one, blended with
 smooth weights; made for open surfaces such as a cloth or a hull. *Mean value*: a corner is a smooth
@@ -46,7 +46,7 @@ class Proxy:
     mirrored_override: bool | None = None
 
     def __post_init__(self) -> None:
-        """Leave out triangles without area."""
+        """Drop triangles without area."""
         corners = self.vertices_world[self.triangles]
         area = np.linalg.norm(_area_vectors(corners), axis=-1)
         object.__setattr__(self, "triangles", self.triangles[area > 1e-14 * max(self.diagonal, 1e-300) ** 2])
@@ -59,13 +59,13 @@ class Proxy:
         return float(np.linalg.norm(np.ptp(self.vertices_world, axis=0)))
 
     def is_mirrored(self, vertices_world: Float64[np.ndarray, "v 3"]) -> bool:
-        """Whether moving the vertices to ``vertices_world`` mirrors the space around the mesh."""
+        """Return whether moving the vertices to ``vertices_world`` mirrors the space around the mesh."""
         if self.mirrored_override is not None:
             return self.mirrored_override
         return was_mirrored(self.vertices_world, vertices_world, self.triangles, self.is_closed())
 
     def is_closed(self) -> bool:
-        """Whether every edge has two triangles, which run along it in opposite directions."""
+        """Return whether every edge has two triangles, which run along it in opposite directions."""
         edges = self.triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
         codes = edges[:, 0] * len(self.vertices_world) + edges[:, 1]
         back = edges[:, 1] * len(self.vertices_world) + edges[:, 0]
@@ -78,15 +78,15 @@ class Binding(Protocol):
 
     @property
     def moving_mask(self) -> Bool[np.ndarray, " n"]:
-        """Which Gaussians the proxy moves at all."""
+        """Return a mask of the Gaussians that the proxy moves at all."""
         ...
 
     def deform(self, vertices_world: Float64[np.ndarray, "v 3"]) -> Float64[np.ndarray, "n 8 3"]:
-        """Where the corners are once the proxy's vertices are at ``vertices_world``."""
+        """Return the corners for the proxy's vertices at ``vertices_world``."""
         ...
 
     def mirrored_mask(self, vertices_world: Float64[np.ndarray, "v 3"]) -> Bool[np.ndarray, " n"]:
-        """Around which Gaussians space was mirrored then."""
+        """Return a mask of the Gaussians around which that deformation mirrors space."""
         ...
 
 
@@ -148,12 +148,12 @@ class NearestBinding:
 
     @property
     def moving_mask(self) -> Bool[np.ndarray, " n"]:
-        """Which Gaussians have a corner within reach."""
+        """Return a mask of the Gaussians with a corner within reach."""
         result: np.ndarray = self._influence.max(axis=1) > 0
         return result
 
     def deform(self, vertices_world: Float64[np.ndarray, "v 3"]) -> Float64[np.ndarray, "n 8 3"]:
-        """Corners after the proxy's vertices moved."""
+        """Return the corners for the proxy's vertices at ``vertices_world``."""
         moved = _check_vertices(vertices_world, self._proxy)[self._proxy.triangles]
         rest = self._proxy.vertices_world[self._proxy.triangles]
         side = -1.0 if self._proxy.is_mirrored(vertices_world) else 1.0
@@ -173,13 +173,13 @@ class NearestBinding:
         return result
 
     def mirrored_mask(self, vertices_world: Float64[np.ndarray, "v 3"]) -> Bool[np.ndarray, " n"]:
-        """Which Gaussians follow the proxy more than not, if it was mirrored."""
+        """Return the Gaussians that follow the proxy by more than half, if it was mirrored."""
         return _mirrored_followers(self._influence, self._proxy.is_mirrored(vertices_world))
 
     def _bind_corners(
         self, corners_world: Float64[np.ndarray, "n 8 3"]
     ) -> tuple[_TriangleWeights, Float64[np.ndarray, "n 8"]]:
-        """What moves these corners, and how much they follow it."""
+        """Return the triangles that move corners, and the corners' influence in [0, 1]."""
         chosen, weights, distances = self._near.query(corners_world.reshape(-1, 3))
         influence = _smooth_falloff(distances, self._reach)
         used = (weights > 0) & (influence > 0)[:, None]
@@ -225,12 +225,12 @@ class MeanValueBinding:
 
     @property
     def moving_mask(self) -> Bool[np.ndarray, " n"]:
-        """Which Gaussians lie in the cage or within reach of it."""
+        """Return a mask of the Gaussians in the cage or within reach of it."""
         result: np.ndarray = self._influence.max(axis=1) > 0
         return result
 
     def deform(self, vertices_world: Float64[np.ndarray, "v 3"]) -> Float64[np.ndarray, "n 8 3"]:
-        """Corners after the cage's vertices moved."""
+        """Return the corners for the cage's vertices at ``vertices_world``."""
         shifts = _check_vertices(vertices_world, self._proxy) - self._proxy.vertices_world
         result = self._corners.copy()
         for number, block in enumerate(self._blocks()):
@@ -242,14 +242,14 @@ class MeanValueBinding:
         return result
 
     def mirrored_mask(self, vertices_world: Float64[np.ndarray, "v 3"]) -> Bool[np.ndarray, " n"]:
-        """Which Gaussians follow the cage more than not, if it was mirrored."""
+        """Return the Gaussians that follow the cage by more than half, if it was mirrored."""
         return _mirrored_followers(self._influence, self._proxy.is_mirrored(vertices_world))
 
     def _blocks(self) -> list[slice]:
         return list(row_blocks(len(self._rows), self._rows_at_once))
 
     def _coordinates(self, rows: Int64[np.ndarray, " r"]) -> Float64[np.ndarray, "p v"]:
-        """The coordinates of the corners of some Gaussians."""
+        """Return the mean-value coordinates of the corners of some Gaussians."""
         points = self._corners[rows].reshape(-1, 3)
         weights = np.empty((len(points), len(self._proxy.vertices_world)))
         proxy = self._proxy
@@ -262,7 +262,7 @@ class MeanValueBinding:
 
 
 class NearTriangles:
-    """Finds the triangles near points.
+    """Search for the triangles near points.
 
     Candidates come from samples spread over the triangles, one on a triangle of usual size, so that a large
     one is found from everywhere on it. Triangles so large that this would take too many samples have coarser
@@ -280,7 +280,7 @@ class NearTriangles:
     def query(
         self, points: Float64[np.ndarray, "p 3"]
     ) -> tuple[Int32[np.ndarray, "p k"], Float32[np.ndarray, "p k"], Float64[np.ndarray, " p"]]:
-        """Triangles near each point with smooth weights, and the distance to the nearest one."""
+        """Return the triangles near each point with smooth weights, and the distance to the nearest one."""
         points = np.ascontiguousarray(points)
         apart, candidates = self._candidates(points)
         chosen = np.zeros(candidates.shape, np.int32)
@@ -295,7 +295,7 @@ class NearTriangles:
     def _candidates(
         self, points: Float64[np.ndarray, "p 3"]
     ) -> tuple[Float64[np.ndarray, "p k"], Int64[np.ndarray, "p k"]]:
-        """Distances that count for the samples nearest to each point, ascending, and their triangles."""
+        """Return ascending distances to the samples nearest to each point, and the samples' triangles."""
         found = [each.nearest(points) for each in self._classes]
         if len(found) == 1:
             return found[0]
@@ -306,7 +306,7 @@ class NearTriangles:
 
 @dataclass(frozen=True)
 class _SizeClass:
-    """Samples of triangles of like size.
+    """Samples of triangles of similar size.
 
     Attributes:
         tree: of the samples.
@@ -321,7 +321,7 @@ class _SizeClass:
     def nearest(
         self, points: Float64[np.ndarray, "p 3"]
     ) -> tuple[Float64[np.ndarray, "p k"], Int64[np.ndarray, "p k"]]:
-        """Distances that count for the samples nearest to each point, ascending, and their triangles."""
+        """Return ascending distances to the samples nearest to each point, and the samples' triangles."""
         count = min(CANDIDATES, len(self.owners))
         apart, near = self.tree.query(points, k=count, workers=-1)
         apart = np.maximum(apart.reshape(-1, count) - self.coarser, 0.0) if self.coarser else apart
@@ -331,7 +331,7 @@ class _SizeClass:
 def _size_classes(
     corners: Float64[np.ndarray, "t 3 3"], longest: Float64[np.ndarray, " t"], spacing: float
 ) -> tuple[_SizeClass, ...]:
-    """Return triangles of usual size, all of one class, and larger ones by powers of two."""
+    """Return triangles of usual size as one class, and larger ones by powers of two."""
     wanted = longest / (2.0 * spacing)
     octave = np.ceil(np.log2(np.maximum(wanted / MAX_SUBDIVISIONS, 1.0))).astype(np.int64)
     classes = []
@@ -347,7 +347,7 @@ def _size_classes(
 def _spread_samples(
     corners: Float64[np.ndarray, "t 3 3"], cuts: Int64[np.ndarray, " t"]
 ) -> tuple[Float64[np.ndarray, "s 3"], Int64[np.ndarray, " s"]]:
-    """Return points spread over triangles whose edges are cut into so many parts, and their triangles."""
+    """Return points spread over triangles whose edges are cut into ``cuts`` parts, and their triangles."""
     samples, owners = [], []
     for cut in np.unique(cuts):
         rows = np.flatnonzero(cuts == cut)
@@ -363,7 +363,7 @@ def _spread_samples(
 def _edges(
     triangles: Int64[np.ndarray, "t 3"],
 ) -> tuple[Int64[np.ndarray, "e 2"], Int64[np.ndarray, "t 3"]]:
-    """Each edge once, and the number of the edge opposite of each corner of each triangle."""
+    """Return each edge once, and the edge opposite to each corner of each triangle."""
     both = np.sort(triangles[:, [1, 2, 2, 0, 0, 1]].reshape(-1, 2), axis=1)
     size = int(both.max()) + 1
     keys, number = np.unique(both[:, 0] * size + both[:, 1], return_inverse=True)
@@ -371,20 +371,20 @@ def _edges(
 
 
 def _area_vectors(corners: Float[np.ndarray, "t 3 3"]) -> Float[np.ndarray, "t 3"]:
-    """Normals as long as twice the area."""
+    """Return normals whose length is twice the triangle's area."""
     result: np.ndarray = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     return result
 
 
 def _triangle_frames(corners: Float64[np.ndarray, "t 3 3"]) -> Float64[np.ndarray, "t 3 3"]:
-    """Columns: two edges and the unit normal."""
+    """Return matrices whose columns are two edges and the unit normal."""
     return _moved_frames(corners, corners, 1.0)
 
 
 def _moved_frames(
     corners: Float64[np.ndarray, "t 3 3"], rest: Float64[np.ndarray, "t 3 3"], side: float
 ) -> Float64[np.ndarray, "t 3 3"]:
-    """Columns: two edges, and the normal stretched by the root of the change in area, on ``side`` 1 or -1."""
+    """Return frames as columns: two edges, and the normal times ``side`` and the root of the area ratio."""
     vectors, area = _area_vectors(corners), np.linalg.norm(_area_vectors(rest), axis=-1)
     now = np.linalg.norm(vectors, axis=-1)
     normals = side * vectors / np.maximum(np.sqrt(now * area), 1e-300)[:, None]
@@ -393,7 +393,7 @@ def _moved_frames(
 
 
 def _smooth_falloff(distances: Float64[np.ndarray, " p"], reach: float) -> Float64[np.ndarray, " p"]:
-    """1 up to ``reach``, 0 from twice that on, smooth in between."""
+    """Return 1 up to ``reach``, 0 from twice that on, and a smooth transition between."""
     if np.isinf(reach):
         return np.ones_like(distances)
     t = np.clip(2.0 - distances / max(reach, 1e-300), 0.0, 1.0)
@@ -406,14 +406,14 @@ def _blend_corners(
     moved: Float64[np.ndarray, "n 8 3"],
     influence: Float64[np.ndarray, "n 8"],
 ) -> Float64[np.ndarray, "n 8 3"]:
-    """Corners that follow by their influence; those with none stay exactly."""
+    """Return corners blended by their influence; those with none stay exactly."""
     share = influence[:, :, None]
     result: np.ndarray = np.where(share > 0, rest + share * (moved - rest), rest)
     return result
 
 
 def _mirrored_followers(influence: Float64[np.ndarray, "n 8"], mirrored: bool) -> Bool[np.ndarray, " n"]:
-    """Gaussians that follow a mirrored proxy by more than half, where the blend is a mirroring, too."""
+    """Return Gaussians that follow a mirrored proxy by more than half and whose blend mirrors, too."""
     result: np.ndarray = (influence.mean(axis=1) > 0.5) & mirrored
     return result
 

@@ -1,4 +1,4 @@
-"""What edits tell of themselves, in numbers."""
+"""Reports of edits: counts of what was found and done."""
 
 from dataclasses import dataclass
 
@@ -8,7 +8,7 @@ from octasplat.engine.gaussians.octagon import CHI2_2_99
 
 @dataclass
 class EditReport:
-    """What was found in an edited mesh and what became of it; all numbers count Gaussians unless they say.
+    """Counts of an edited mesh; all are numbers of Gaussians unless they say otherwise.
 
     Attributes:
         scene_size: in the unedited scene.
@@ -67,7 +67,7 @@ class EditReport:
 
 @dataclass(frozen=True)
 class DeformReport:
-    """What a deformation did.
+    """Counts and figures of a deformation.
 
     Attributes:
         moved: Gaussians with new parameters.
@@ -91,7 +91,7 @@ class DeformReport:
 
 @dataclass(frozen=True)
 class CleanReport:
-    """How many Gaussians were removed, each counted for the first reason that holds.
+    """Counts of the removed Gaussians, each by the first reason that holds.
 
     Attributes:
         faint: below the least opacity.

@@ -1,4 +1,4 @@
-"""What a run knows of its world, in another world: cameras and learnt light moved along with the scene."""
+"""Transforms of a run's world: cameras and learnt light moved along with the scene."""
 
 import json
 import shutil
@@ -35,7 +35,7 @@ _TOLERANCE = 1e-6
 
 
 def is_similarity(matrix: Float[np.ndarray, "4 4"]) -> bool:
-    """Return whether an affine map only moves, turns and scales evenly: cameras can follow it."""
+    """Return whether an affine map consists of rotation, translation and uniform scale, as cameras need."""
     linear = np.asarray(matrix, np.float64)[:3, :3]
     scale = _scale_of(matrix)
     return scale > 0 and bool(
@@ -46,7 +46,7 @@ def is_similarity(matrix: Float[np.ndarray, "4 4"]) -> bool:
 def write_transformed_run_files(
     source: Path, target: Path, matrix: Float[np.ndarray, "4 4"]
 ) -> tuple[str, ...]:
-    """Write the files of a run that are about its world for the world that ``matrix`` makes of it.
+    """Write the files of a run that depend on its world, transformed by ``matrix``.
 
     Poses of COLMAP are left out, as ``views.json`` has them, and so is the way to the photographs, whose
     model is in the old world.
@@ -79,7 +79,7 @@ def write_transformed_run_files(
 
 
 def _write_light(source: Path, target: Path, turn: Float64[np.ndarray, "3 3"]) -> list[str]:
-    """Write the settings and the maps; returns what is told of them."""
+    """Write the light's settings and maps; return notes on them."""
     config = read_config(source / CONFIG)
     up = np.array(config.train.materials.up_world, np.float64)
     new_up = turn @ up
@@ -116,7 +116,7 @@ def rotate_environment(
     new_frame: Float64[np.ndarray, "3 3"],
     turn: Float64[np.ndarray, "3 3"],
 ) -> Float32[np.ndarray, "h w 3"]:
-    """Return a map of all directions, equirectangular, after what is around was turned; bilinear.
+    """Return an equirectangular map after the environment was rotated; bilinear.
 
     Args:
         values: the map.
@@ -135,7 +135,7 @@ def rotate_environment(
 
 
 def _texel_directions(height: int) -> Float64[np.ndarray, "t 3"]:
-    """Unit directions of the middles of texels, as right, up and forward of the map."""
+    """Return unit directions of the texel centres in the map's right, up and forward axes."""
     down = np.pi * (np.arange(height) + 0.5) / height
     round_ = np.pi * ((np.arange(2 * height) + 0.5) / height - 1.0)
     down, round_ = (part.ravel() for part in np.meshgrid(down, round_, indexing="ij"))
@@ -147,7 +147,7 @@ def _scale_of(matrix: Float[np.ndarray, "4 4"]) -> float:
 
 
 def _rotation_of(matrix: Float[np.ndarray, "4 4"]) -> Float64[np.ndarray, "3 3"]:
-    """The rotation of a similarity, without what rounding added."""
+    """Return the rotation of a similarity, without rounding errors."""
     u, _, vt = np.linalg.svd(np.asarray(matrix, np.float64)[:3, :3])
     turn: Float64[np.ndarray, "3 3"] = u @ vt
     near = np.round(turn)

@@ -1,7 +1,5 @@
-"""Parts of a scene, and scenes put together."""
+"""Masks of selected Gaussians: by boxes, spheres, meshes, masks and expressions."""
 
-from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,13 +11,12 @@ from octasplat.engine.edit.edit_options import Selection
 from octasplat.engine.edit.filter_expression import filter_mask
 from octasplat.engine.edit.octagon_matching import match_octagons
 from octasplat.engine.files import ImportedMesh
-from octasplat.engine.gaussians.channels import merge_widths
-from octasplat.engine.gaussians.model import FlatGaussians, concatenate
+from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.gaussians.octagon import CHI2_2_99, octagon_radii
 
 
 def selection_mask(gaussians: FlatGaussians, selection: Selection) -> Bool[np.ndarray, " n"]:
-    """Which of a scene are meant.
+    """Return a mask of the Gaussians that a selection holds for.
 
     Raises:
         ConfigError: the expression names what the scene does not have, or a box or sphere is none.
@@ -37,7 +34,7 @@ def selection_mask(gaussians: FlatGaussians, selection: Selection) -> Bool[np.nd
 def in_box(
     gaussians: FlatGaussians, low_world: Float[np.ndarray, "3"], high_world: Float[np.ndarray, "3"]
 ) -> Bool[np.ndarray, " n"]:
-    """Which centres lie in a box along the world's axes, its sides included.
+    """Return which centres lie in a box along the world's axes, its faces included.
 
     Raises:
         ConfigError: some side has a negative length.
@@ -53,7 +50,7 @@ def in_box(
 def in_sphere(
     gaussians: FlatGaussians, centre_world: Float[np.ndarray, "3"], radius_world: float
 ) -> Bool[np.ndarray, " n"]:
-    """Which centres lie in a sphere.
+    """Return which centres lie in a sphere.
 
     Raises:
         ConfigError: the radius is not positive.
@@ -66,7 +63,7 @@ def in_sphere(
 
 
 def in_mesh(gaussians: FlatGaussians, mesh: ImportedMesh, path: Path) -> Bool[np.ndarray, " n"]:
-    """Which Gaussians have their octagon in a mesh that was exported from the scene, wherever it lies now.
+    """Return which Gaussians have their octagon in a mesh exported from the scene, wherever it lies now.
 
     Args:
         gaussians: the scene.
@@ -83,36 +80,3 @@ def in_mesh(gaussians: FlatGaussians, mesh: ImportedMesh, path: Path) -> Bool[np
     chosen = np.zeros(len(gaussians), dtype=bool)
     chosen[octagons.gids] = True
     return chosen
-
-
-def with_sh_degree(gaussians: FlatGaussians, degree: int) -> FlatGaussians:
-    """The same Gaussians with harmonics of ``degree``: the missing ones zero, those beyond left out."""
-    count = (degree + 1) ** 2
-    own = min(count, gaussians.sh.shape[1])
-    result = gaussians.copy()
-    result.sh = np.zeros((len(gaussians), count, 3), dtype=np.float32)
-    result.sh[:, :own] = gaussians.sh[:, :own]
-    return result
-
-
-def merge_scenes(scenes: Sequence[FlatGaussians], sh_degree: int | None = None) -> FlatGaussians:
-    """All Gaussians of ``scenes``, in order, with harmonics of one degree.
-
-    The result has the channels of all scenes; Gaussians of a scene without one have 0 there
-    (:data:`octasplat.engine.gaussians.channels.FILL_VALUE`).
-
-    Args:
-        scenes: at least one.
-        sh_degree: of the result; None takes the highest among the scenes, so that nothing is lost.
-
-    Raises:
-        ConfigError: two scenes have a channel of one name and different widths.
-    """
-    degree = max(scene.sh_degree for scene in scenes) if sh_degree is None else sh_degree
-    widths = merge_widths(scene.channels for scene in scenes)
-    return concatenate(
-        [
-            replace(with_sh_degree(scene, degree), channels=scene.channels.with_filled(widths, len(scene)))
-            for scene in scenes
-        ]
-    )

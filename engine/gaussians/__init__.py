@@ -1,1 +1,1 @@
-"""Flat Gaussians, their frames and octagons, and the PLY file that holds them."""
+"""Flat Gaussians: parameters, frames, octagons, channels and transforms."""

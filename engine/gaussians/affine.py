@@ -1,4 +1,4 @@
-"""Whole scenes moved, turned, scaled or sheared, in closed form."""
+"""Affine transforms of whole scenes, in closed form."""
 
 from pathlib import Path
 
@@ -18,7 +18,7 @@ AXES: dict[str, Float64[np.ndarray, "3"]] = {
 
 
 def transform_gaussians(gaussians: FlatGaussians, matrix: Float[np.ndarray, "4 4"]) -> FlatGaussians:
-    """The scene under the affine map x -> M x + t, harmonics turned along (mirrored too, where M mirrors).
+    """Return the scene under the affine map x -> M x + t, its harmonics rotated, and mirrored if M mirrors.
 
     Covariances are exact for any invertible M. A map without rotation and scale leaves frames, scales and
     colours untouched.
@@ -46,24 +46,24 @@ def transform_gaussians(gaussians: FlatGaussians, matrix: Float[np.ndarray, "4 4
 
 
 def mean_scale(matrix: Float[np.ndarray, "4 4"]) -> float:
-    """How much longer an affine map makes things: the cube root of what it does to volumes."""
+    """Return the mean scale of an affine map: the cube root of its volume factor."""
     return float(np.cbrt(abs(np.linalg.det(np.asarray(matrix, np.float64)[:3, :3]))))
 
 
 def translation(offset_world: Float[np.ndarray, "3"]) -> Float64[np.ndarray, "4 4"]:
-    """Matrix that moves by ``offset_world``."""
+    """Return the matrix of a translation."""
     matrix = np.eye(4)
     matrix[:3, 3] = offset_world
     return matrix
 
 
 def scaling(factors: Float[np.ndarray, "3"]) -> Float64[np.ndarray, "4 4"]:
-    """Matrix that scales along the world's axes."""
+    """Return the matrix of a scale along the world's axes."""
     return np.diag([*np.asarray(factors, np.float64), 1.0])
 
 
 def rotation(axis_world: Float[np.ndarray, "3"], degrees: float) -> Float64[np.ndarray, "4 4"]:
-    """Matrix that turns about an axis through the origin, counter-clockwise seen from the axis' tip."""
+    """Return the matrix of a rotation about an axis through the origin, counter-clockwise from its tip."""
     axis = np.asarray(axis_world, np.float64)
     length = float(np.linalg.norm(axis))
     if not np.isfinite(length) or length == 0.0:
@@ -82,7 +82,7 @@ def rotation(axis_world: Float[np.ndarray, "3"], degrees: float) -> Float64[np.n
 
 
 def between_axes(old_up: str, new_up: str) -> Float64[np.ndarray, "4 4"]:
-    """The shortest rotation that brings one axis (``x``, ``-x``, ... ``-z``) to another."""
+    """Return the shortest rotation that brings one axis (``x``, ``-x``, ... ``-z``) to another."""
     old, new = AXES[old_up], AXES[new_up]
     if np.array_equal(old, new):
         return np.eye(4)
@@ -94,13 +94,13 @@ def between_axes(old_up: str, new_up: str) -> Float64[np.ndarray, "4 4"]:
 def conjugate_by_point(
     matrix: Float[np.ndarray, "4 4"], point_world: Float[np.ndarray, "3"]
 ) -> Float64[np.ndarray, "4 4"]:
-    """The same map with ``point_world`` in the place of the origin."""
+    """Return the same map with ``point_world`` in the place of the origin."""
     result: np.ndarray = translation(point_world) @ matrix @ translation(-np.asarray(point_world))
     return result
 
 
 def read_matrix(path: Path) -> Float64[np.ndarray, "4 4"]:
-    """A 4 x 4 or 3 x 4 matrix from a text file, row by row; commas and brackets are passed over.
+    """Read a 4 x 4 or 3 x 4 matrix from a text file, row by row; commas and brackets are ignored.
 
     Raises:
         ConfigError: the file cannot be read or holds something else.

@@ -1,4 +1,4 @@
-"""Gaussians with new centres and legs, block by block: large scenes need little memory beside themselves."""
+"""Replacement of the Gaussians' centres and legs, block by block to save memory."""
 
 from collections.abc import Iterator
 
@@ -14,7 +14,7 @@ ROWS_PER_BLOCK = 1 << 15
 
 
 def row_blocks(count: int, rows_at_once: int = ROWS_PER_BLOCK) -> Iterator[slice]:
-    """Slices that cover ``count`` rows in order."""
+    """Yield slices that cover ``count`` rows in order."""
     for start in range(0, count, rows_at_once):
         yield slice(start, min(start + rows_at_once, count))
 
@@ -27,7 +27,7 @@ def apply_legs(
     unmoved: Bool[np.ndarray, " n"],
     turn: Float64[np.ndarray, "3 3"] | None = None,
 ) -> FlatGaussians:
-    """Gaussians with new centres and legs, and harmonics turned along; ``unmoved`` ones keep every bit.
+    """Return Gaussians with new centres, legs and rotated harmonics; ``unmoved`` ones stay bit for bit.
 
     The harmonics turn as the surface does, or all by ``turn`` where the whole map is known. A Gaussian whose
     new legs have no area at all keeps its old frame, scales and colour.
@@ -53,7 +53,7 @@ def apply_legs_to(
     normal_signs: Float64[np.ndarray, " n"],
     turn: Float64[np.ndarray, "3 3"] | None = None,
 ) -> None:
-    """As :func:`apply_legs`, but in place and for ``rows`` only; all arrays have a row for every Gaussian."""
+    """Apply new centres and legs in place to ``rows``; all arrays have a row for every Gaussian."""
     for block in row_blocks(len(rows)):
         chosen = rows[block]
         gaussians.means_world[chosen] = means_world[chosen].astype(np.float32)

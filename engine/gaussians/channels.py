@@ -1,4 +1,4 @@
-"""Named channels: whatever else is known of each Gaussian, as albedo, roughness or a label.
+"""Named channels: further data per Gaussian, such as albedo, roughness or a label.
 
 A channel has a name and f numbers a Gaussian. Every number is a scalar: where a scene is moved, turned or
 mirrored, channels stay as they are, so directions do not belong into one. Which channels a scene has is set
@@ -65,15 +65,15 @@ class Channels(Mapping[str, np.ndarray]):
 
     @property
     def widths(self) -> dict[str, int]:
-        """Numbers a Gaussian of each channel."""
+        """Return the width (numbers per Gaussian) of each channel."""
         return {name: array.shape[1] for name, array in self._arrays.items()}
 
     def map(self, function: Callable[[np.ndarray], np.ndarray]) -> "Channels":
-        """The same channels with ``function`` applied to each array."""
+        """Return the channels with ``function`` applied to each array."""
         return Channels({name: function(array) for name, array in self._arrays.items()})
 
     def with_filled(self, widths: Mapping[str, int], count: int) -> "Channels":
-        """The channels of ``widths``, in that order, of ``count`` Gaussians; what is missing is ``FILL_VALUE``."""
+        """Return the channels of ``widths`` in that order; missing ones hold ``FILL_VALUE``."""
         return Channels(
             {
                 name: self._arrays[name]
@@ -85,7 +85,7 @@ class Channels(Mapping[str, np.ndarray]):
 
 
 def check_row_count(channels: Channels, count: int) -> None:
-    """Make sure that channels have ``count`` rows.
+    """Check that channels have ``count`` rows.
 
     Raises:
         ValueError: they have not.
@@ -96,7 +96,7 @@ def check_row_count(channels: Channels, count: int) -> None:
 
 
 def merge_widths(sets: Iterable[Channels]) -> dict[str, int]:
-    """The channels that any of ``sets`` has, with their widths.
+    """Return the channels that any of ``sets`` has, with their widths.
 
     Raises:
         ConfigError: two have a channel of one name and different widths.
@@ -113,7 +113,7 @@ def merge_widths(sets: Iterable[Channels]) -> dict[str, int]:
 
 
 def stack_channels(channels: Channels, names: Sequence[str] | None = None) -> Float32[np.ndarray, "n f"]:
-    """Channels side by side, as a tracer takes its features; :func:`unstacked` is the way back.
+    """Return channels side by side, as a tracer takes its features.
 
     Args:
         channels: at least one.
@@ -122,30 +122,13 @@ def stack_channels(channels: Channels, names: Sequence[str] | None = None) -> Fl
     return np.concatenate([channels[name] for name in names or channels], axis=1)
 
 
-def unstacked(features: Float32[np.ndarray, "n f"], widths: Mapping[str, int]) -> Channels:
-    """The channels of :func:`stack_channels`, of Gaussians or of rays, copied.
-
-    Raises:
-        ValueError: the widths do not add up to the number of features.
-    """
-    if sum(widths.values()) != features.shape[1]:
-        raise ValueError(f"{features.shape[1]} features are not {dict(widths)}")
-    ends = np.cumsum(list(widths.values()))
-    return Channels(
-        {
-            name: features[:, end - width : end].copy()
-            for (name, width), end in zip(widths.items(), ends.tolist(), strict=True)
-        }
-    )
-
-
 def column_names(name: str, width: int) -> tuple[str, ...]:
-    """What files call the numbers of a channel: ``metallic``, or ``albedo_0``, ``albedo_1``, ``albedo_2``."""
+    """Return a channel's column names in files: ``metallic``, or ``albedo_0``, ``albedo_1``, ``albedo_2``."""
     return (name,) if width == 1 else tuple(f"{name}_{place}" for place in range(width))
 
 
 def group_columns(columns: Iterable[str]) -> dict[str, tuple[str, ...]]:
-    """The way back: names that are numbered from 0 without a gap, two at least, are one channel."""
+    """Group column names to channels: names numbered from 0 without a gap, two at least, are one channel."""
     found = list(columns)
     numbered: dict[str, set[int]] = {}
     for column in found:
@@ -163,14 +146,14 @@ def group_columns(columns: Iterable[str]) -> dict[str, tuple[str, ...]]:
 
 
 def is_valid_channel_name(name: str, columns: Iterable[str]) -> bool:
-    """Whether a channel may have this name and these columns, as far as they alone are concerned."""
+    """Return whether a channel may have this name and these columns, other channels aside."""
     return bool(_NAME.fullmatch(name)) and not any(
         RESERVED_COLUMNS.fullmatch(text) for text in (name, *columns)
     )
 
 
 def check_channel_names(widths: Mapping[str, int]) -> None:
-    """Make sure that files can hold these channels apart, from each other and from what else they hold.
+    """Check that files can tell these channels from each other and from other columns.
 
     Raises:
         ConfigError: they cannot.

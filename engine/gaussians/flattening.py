@@ -1,4 +1,4 @@
-"""From the three-dimensional Gaussians of other programs to flat ones, and what that loses."""
+"""Flattening of three-dimensional Gaussians of other programs, and its losses."""
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -25,7 +25,7 @@ _CYCLIC_ROTATIONS = np.array([[1, 0, 0, 0], [0.5, 0.5, 0.5, 0.5], [0.5, -0.5, -0
 
 @dataclass(frozen=True)
 class GaussianCloud:
-    """Gaussians as a file holds them, flat or not; values may be anything, even not finite.
+    """Gaussians as stored in a file, flat or not; values may be anything, even not finite.
 
     Attributes:
         means_world: centres, world units.
@@ -52,13 +52,13 @@ class GaussianCloud:
     normal_axis: Literal[0, 2] | None = None
 
     def __post_init__(self) -> None:
-        """Make sure that channels have as many rows as there are Gaussians."""
+        """Check that channels have as many rows as there are Gaussians."""
         check_row_count(self.channels, len(self.means_world))
 
 
 @dataclass(frozen=True)
 class ImportReport:
-    """What reading a file of Gaussians found, and what it lost.
+    """Counts of what reading a file of Gaussians found and dropped.
 
     Attributes:
         count: number of Gaussians read.
@@ -142,7 +142,7 @@ def flatten(
 
 
 def _valid_mask(cloud: GaussianCloud, path: Path, drop_invalid: bool) -> Bool[np.ndarray, " n"]:
-    """Which Gaussians can be used; raises for the others unless they may be dropped."""
+    """Return which Gaussians are valid; raises for the others unless they may be dropped."""
     scales = cloud.log_scales
     ordered = np.sort(scales, axis=1)  # not-a-number comes last
     # A normal may be infinitely thin; nothing else may be infinite.
@@ -178,7 +178,7 @@ def _valid_mask(cloud: GaussianCloud, path: Path, drop_invalid: bool) -> Bool[np
 def _flatten_smallest_axis(
     quats_wxyz: Float32[np.ndarray, "n 4"], log_scales: Float32[np.ndarray, "n 3"], flat_log_scale: np.float32
 ) -> tuple[Float32[np.ndarray, "n 4"], Float32[np.ndarray, "n 2"], Float32[np.ndarray, " m"]]:
-    """Make the smallest axis the normal; also the thickness ratio of those that were not flat already.
+    """Make the smallest axis the normal; also return the thickness ratio of those not flat already.
 
     Axis 0 wins ties, and always where it holds the flat scale, so that our own files stay as they are.
     """
@@ -195,7 +195,7 @@ def _flatten_smallest_axis(
 def rotate_axis_to_first(
     quats_wxyz: Float32[np.ndarray, "n 4"], axis: Int[np.ndarray, " n"]
 ) -> Float32[np.ndarray, "n 4"]:
-    """Quaternions of R P_axis, whose first column is column ``axis`` of R and the others follow cyclically.
+    """Return quaternions of R P_axis, whose first column is column ``axis`` of R, the others cyclically.
 
     Those of axis 0 keep every bit, and no length changes.
     """

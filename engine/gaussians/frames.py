@@ -5,7 +5,7 @@ from jaxtyping import Float
 
 
 def rotation_matrices(quats_wxyz: Float[np.ndarray, "n 4"]) -> Float[np.ndarray, "n 3 3"]:
-    """Rotation matrices of quaternions that need not be of unit length.
+    """Return rotation matrices of quaternions that need not be of unit length.
 
     Computed in float64 and returned in the input's precision.
     """
@@ -23,7 +23,7 @@ def rotation_matrices(quats_wxyz: Float[np.ndarray, "n 4"]) -> Float[np.ndarray,
 
 
 def quaternions_from_matrices(rotations: Float[np.ndarray, "n 3 3"]) -> Float[np.ndarray, "n 4"]:
-    """Unit quaternions (w, x, y, z) with w >= 0 of proper rotation matrices.
+    """Return unit quaternions (w, x, y, z) with w >= 0 of proper rotation matrices.
 
     The largest of the four components is found first and the others follow from it, which is stable for
     every rotation.
@@ -51,7 +51,7 @@ def quaternions_from_matrices(rotations: Float[np.ndarray, "n 3 3"]) -> Float[np
 
 
 def frames_from_normals(normals: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3 3"]:
-    """Right-handed frames whose first column is the given unit normal; the in-plane axes are arbitrary."""
+    """Return right-handed frames whose first column is the unit normal; in-plane axes are arbitrary."""
     n = normals.astype(np.float64)
     helper = np.eye(3)[np.argmin(np.abs(n), axis=-1)]
     r2 = np.cross(helper, n)

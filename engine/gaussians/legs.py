@@ -1,4 +1,4 @@
-"""What a deformation does to a flat Gaussian: new legs to frame and scales, and the turn of its surface.
+"""Legs, the scaled in-plane axes of a flat Gaussian, under deformations.
 
 The *legs* of a Gaussian are the columns s2 r2 and s3 r3, so that its covariance is legs legs^T. A deformation
 whose derivative is F takes them to F legs, which in general are neither orthogonal nor of the old length.
@@ -15,7 +15,7 @@ MIN_LEG_RATIO = 1e-12
 
 
 def legs_world(gaussians: FlatGaussians) -> Float64[np.ndarray, "n 3 2"]:
-    """Legs s2 r2 and s3 r3 as columns, world frame."""
+    """Return the legs s2 r2 and s3 r3 as columns, world frame."""
     rotations = rotation_matrices(gaussians.quats_wxyz.astype(np.float64))
     result: np.ndarray = rotations[:, :, 1:] * np.exp(gaussians.log_scales.astype(np.float64))[:, None, :]
     return result
@@ -24,7 +24,7 @@ def legs_world(gaussians: FlatGaussians) -> Float64[np.ndarray, "n 3 2"]:
 def frames_from_skewed_legs(
     legs: Float64[np.ndarray, "n 3 2"], normal_signs: Float64[np.ndarray, " n"]
 ) -> tuple[Float64[np.ndarray, "n 4"], Float64[np.ndarray, "n 2"]]:
-    """Quaternions and log scales with the covariance legs legs^T: the singular value decomposition of legs.
+    """Return quaternions and log scales of the covariance legs legs^T, by singular value decomposition.
 
     One Jacobi rotation by at most 45 degrees makes the two columns orthogonal, which is exact for two columns
     and moves the axes as little as possible, so that an animation shows no jumps of the frame.
@@ -60,7 +60,7 @@ def frames_from_skewed_legs(
 def surface_rotations(
     gaussians: FlatGaussians, new_legs: Float64[np.ndarray, "n 3 2"], normal_signs: Float64[np.ndarray, " n"]
 ) -> Float64[np.ndarray, "n 3 3"]:
-    """Orthogonal matrices O: how each Gaussian's surface was turned, whatever its stretch and shear.
+    """Return orthogonal matrices O by which each Gaussian's surface was rotated, stretch and shear aside.
 
     The polar factor of the derivative within the surface, completed by the normal. Where ``normal_signs`` is
     -1 the normal lies on the other side of the surface, and O is a reflection.
@@ -77,7 +77,7 @@ def surface_rotations(
 def surface_derivatives(
     gaussians: FlatGaussians, new_legs: Float64[np.ndarray, "n 3 2"]
 ) -> Float64[np.ndarray, "n 3 2"]:
-    """Images of the unit axes r2 and r3."""
+    """Return the images of the unit axes r2 and r3."""
     result: np.ndarray = new_legs * np.exp(-gaussians.log_scales.astype(np.float64))[:, None, :]
     return result
 
@@ -85,7 +85,7 @@ def surface_derivatives(
 def volume_derivatives(
     gaussians: FlatGaussians, new_legs: Float64[np.ndarray, "n 3 2"], normal_signs: Float64[np.ndarray, " n"]
 ) -> Float64[np.ndarray, "n 3 3"]:
-    """Derivatives in space, world to world: the surface's, and along its normal the mean stretch of it.
+    """Return derivatives in space, world to world: the surface's, and its mean stretch along the normal.
 
     A surface says nothing of what happens beside it; this choice is exact where the map is a rotation with a
     uniform scale.
@@ -100,7 +100,7 @@ def volume_derivatives(
 
 
 def has_area(legs: Float[np.ndarray, "n 3 2"], rounding: Float[np.ndarray, " n"]) -> np.ndarray:
-    """Whether legs are finite and span an area beyond the rounding (a length, world) of their end points."""
+    """Return whether legs are finite and span more area than rounding (a length, world) explains."""
     finite = np.isfinite(legs).all(axis=(1, 2)) & np.isfinite(rounding)
     safe = np.where(finite[:, None, None], legs, 0.0).astype(np.float64)
     area = np.linalg.norm(np.cross(safe[:, :, 0], safe[:, :, 1]), axis=-1)
@@ -111,7 +111,7 @@ def has_area(legs: Float[np.ndarray, "n 3 2"], rounding: Float[np.ndarray, " n"]
 
 
 def _polar_factors(tangents: Float64[np.ndarray, "n 3 2"]) -> Float64[np.ndarray, "n 3 2"]:
-    """Nearest matrices with orthonormal columns, F (F^T F)^(-1/2), by the closed root of a 2 x 2 matrix."""
+    """Return the nearest matrices with orthonormal columns, F (F^T F)^(-1/2), in closed form."""
     scale = np.maximum(np.abs(tangents).max(axis=(1, 2), keepdims=True), np.finfo(np.float64).tiny)
     f = tangents / scale
     gram = f.transpose(0, 2, 1) @ f

@@ -1,4 +1,4 @@
-"""Materials of Gaussians: what the named channels that make one mean, and whether a scene has them.
+"""Materials of Gaussians: the named channels of a material, and whether a scene has them.
 
 A material is that of "Physically Based Shading at Disney" (Burley 2012,
 https://media.disneyanimation.com/uploads/production/publication_asset/48/asset/s2012_pbs_disney_brdf_notes_v3.pdf)
@@ -10,10 +10,8 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
 
 from octasplat.engine.core.errors import ConfigError
-from octasplat.engine.gaussians.channels import Channels
 from octasplat.engine.gaussians.model import FlatGaussians
 
 ALBEDO, METALLIC, ROUGHNESS = "albedo", "metallic", "roughness"
@@ -32,13 +30,13 @@ DIELECTRIC_F0 = 0.04
 
 
 def has_materials(gaussians: FlatGaussians) -> bool:
-    """Whether a scene has all three channels of a material, each of its width."""
+    """Return whether a scene has all three channels of a material, each of its width."""
     widths = gaussians.channels.widths
     return all(widths.get(name) == width for name, width in MATERIAL_WIDTHS.items())
 
 
 def require_materials(gaussians: FlatGaussians, path: Path) -> None:
-    """Make sure that a scene has materials.
+    """Check that a scene has materials.
 
     Args:
         gaussians: the scene.
@@ -54,23 +52,8 @@ def require_materials(gaussians: FlatGaussians, path: Path) -> None:
         )
 
 
-def f0_linear(
-    albedo_linear: Float[np.ndarray, "*n 3"], metallic: Float[np.ndarray, "*n 1"]
-) -> Float[np.ndarray, "*n 3"]:
-    """What a surface reflects head-on: 0.04 (1 - metallic) + metallic * albedo."""
-    return DIELECTRIC_F0 * (1 - metallic) + metallic * albedo_linear
-
-
-def split_materials(features: Float[np.ndarray, "n 5"]) -> Channels:
-    """The channels of a material from their columns side by side, copied, as float32 in [0, 1]."""
-    clipped = np.clip(features, 0.0, 1.0).astype(np.float32)
-    return Channels({ALBEDO: clipped[:, :3], METALLIC: clipped[:, 3:4], ROUGHNESS: clipped[:, 4:5]}).map(
-        np.ascontiguousarray
-    )
-
-
 def reflective_fraction(gaussians: FlatGaussians) -> float:
-    """Share of a scene's surface, by area times opacity, that is metal which shows its surroundings.
+    """Return the fraction of a scene's surface, by area times opacity, that is smooth metal.
 
     Where there is next to none, nothing says how bright the environment is, nor what is metal.
     """
@@ -81,7 +64,7 @@ def reflective_fraction(gaussians: FlatGaussians) -> float:
 
 
 def with_interreflection_channel(gaussians: FlatGaussians) -> FlatGaussians:
-    """The same scene with channels of its own for the light that surfaces send each other, black at first.
+    """Return the scene with a channel for light between surfaces, zero at first.
 
     A scene whose ambient visibility is not known stays without, as nothing says where that light arrives.
     """

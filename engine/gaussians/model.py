@@ -1,4 +1,4 @@
-"""A set of flat Gaussians as plain arrays."""
+"""Flat Gaussians as plain arrays."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -47,7 +47,7 @@ class FlatGaussians:
     channels: Channels = field(default_factory=Channels)
 
     def __post_init__(self) -> None:
-        """Make sure that channels have as many rows as there are Gaussians."""
+        """Check that channels have as many rows as there are Gaussians."""
         check_row_count(self.channels, len(self))
 
     def __len__(self) -> int:
@@ -55,36 +55,36 @@ class FlatGaussians:
 
     @property
     def sh_degree(self) -> int:
-        """Degree of the spherical harmonics, 0 to 3."""
+        """Return the degree of the spherical harmonics, 0 to 3."""
         return int(np.sqrt(self.sh.shape[1])) - 1
 
     @property
     def scales(self) -> Float32[np.ndarray, "n 2"]:
-        """Standard deviations s2, s3, world units."""
+        """Return the standard deviations s2, s3, world units."""
         return np.exp(self.log_scales)
 
     @property
     def opacities(self) -> Float32[np.ndarray, " n"]:
-        """Opacities in (0, 1)."""
+        """Return the opacities in (0, 1)."""
         decay = np.exp(-np.abs(self.opacity_logits.astype(np.float64)))  # never overflows
         return (np.where(self.opacity_logits >= 0, 1.0, decay) / (1.0 + decay)).astype(np.float32)
 
     @property
     def rotations(self) -> Float32[np.ndarray, "n 3 3"]:
-        """Rotation matrices; columns are r1 (the normal), r2 and r3."""
+        """Return the rotation matrices; columns are r1 (the normal), r2 and r3."""
         return rotation_matrices(self.quats_wxyz)
 
     @property
     def base_rgb_srgb(self) -> Float32[np.ndarray, "n 3"]:
-        """Colour of the constant harmonic alone, 1/2 + C0 sh[0], clipped below at 0; display values."""
+        """Return the constant harmonic's display colour, 1/2 + C0 sh[0], clipped below at 0."""
         return np.maximum(0.5 + np.float32(SH_C0) * self.sh[:, 0], 0.0).astype(np.float32)
 
     def select(self, index: RowIndex) -> "FlatGaussians":
-        """The Gaussians at ``index`` (integers, a mask or a slice), copied."""
+        """Return a copy of the Gaussians at ``index`` (integers, a mask or a slice)."""
         return select_rows(self, index)
 
     def view(self, part: slice) -> "FlatGaussians":
-        """The Gaussians of a slice, not copied."""
+        """Return the Gaussians of a slice, not copied."""
         return map_rows(self, lambda array: array[part])
 
     def put(self, index: RowIndex, others: "FlatGaussians") -> None:
@@ -92,11 +92,11 @@ class FlatGaussians:
         overwrite_rows(self, index, others)
 
     def with_base_color_only(self) -> "FlatGaussians":
-        """The same Gaussians, not copied, with the constant colour only and no channels."""
+        """Return the Gaussians, not copied, with the constant colour only and no channels."""
         return replace(self, sh=self.sh[:, :1], channels=Channels())
 
     def with_channels(self, channels: Mapping[str, np.ndarray]) -> "FlatGaussians":
-        """The same Gaussians, not copied, with ``channels`` added, or replaced where the name is taken.
+        """Return the Gaussians, not copied, with ``channels`` added or replaced.
 
         Args:
             channels: float32 arrays of shape (n, f), not copied either.
@@ -108,18 +108,18 @@ class FlatGaussians:
         return replace(self, channels=Channels({**self.channels, **channels}))
 
     def without_channels(self, names: Sequence[str]) -> "FlatGaussians":
-        """The same Gaussians, not copied, without the channels ``names``."""
+        """Return the Gaussians, not copied, without the channels ``names``."""
         return replace(self, channels=Channels({n: a for n, a in self.channels.items() if n not in names}))
 
     def copy(self) -> "FlatGaussians":
-        """An independent copy."""
+        """Return an independent copy."""
         return map_rows(self, lambda array: array.copy())
 
     def is_finite(self) -> bool:
-        """Whether every parameter is a finite number."""
+        """Return whether every parameter is a finite number."""
         return all(bool(np.isfinite(array).all()) for array in row_arrays(self).values())
 
 
 def concatenate(parts: list[FlatGaussians]) -> FlatGaussians:
-    """All Gaussians of ``parts``, in order; the parts share their harmonics' degree and their channels."""
+    """Return all Gaussians of ``parts``, in order; the parts have the same degree and channels."""
     return concatenate_rows(parts)

@@ -1,4 +1,4 @@
-"""Spatial order: Gaussians that are near each other in space lie near each other in memory."""
+"""Spatial order of Gaussians along a Z-order curve, for locality in memory."""
 
 import numpy as np
 from jaxtyping import Float, Int64, UInt64
@@ -9,7 +9,7 @@ _BITS = 21
 
 
 def morton_codes(points: Float[np.ndarray, "n 3"]) -> UInt64[np.ndarray, " n"]:
-    """63-bit Z-order codes of points in the box of their central 98 %; points outside are clamped to it."""
+    """Return 63-bit Z-order codes of points in their central 98 % box; points outside are clamped to it."""
     if len(points) == 0:
         return np.zeros(0, np.uint64)
     low, high = np.quantile(points, [0.01, 0.99], axis=0)
@@ -23,5 +23,5 @@ def morton_codes(points: Float[np.ndarray, "n 3"]) -> UInt64[np.ndarray, " n"]:
 
 
 def morton_order(points: Float[np.ndarray, "n 3"]) -> Int64[np.ndarray, " n"]:
-    """Indices that sort points along the Z-order curve; equal codes keep their order."""
+    """Return indices that sort points along the Z-order curve; equal codes keep their order."""
     return np.argsort(morton_codes(points), kind="stable")

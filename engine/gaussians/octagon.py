@@ -1,4 +1,4 @@
-"""The octagon of a flat Gaussian, its opacity-adapted radius, and the way back.
+"""Octagons of flat Gaussians, their opacity-adapted radius, and the inverse conversion.
 
 "The paper" is "REdiSplats: Ray Tracing for Editable Gaussian Splatting" (https://arxiv.org/abs/2503.12284).
 """
@@ -21,7 +21,7 @@ FAN_TRIANGLES = np.array([[0, k, k + 1] for k in range(1, SIDES - 1)], dtype=np.
 
 
 def octagon_radii(opacities: Float[np.ndarray, " n"], q: float = CHI2_2_99) -> Float[np.ndarray, " n"]:
-    """Radius of each octagon's corners in standard deviations, sqrt(max(0, Q - 2 ln(1/a))).
+    """Return each octagon's corner radius in standard deviations, sqrt(max(0, Q - 2 ln(1/a))).
 
     At that radius alpha falls to exp(-Q/2), whatever the opacity a. A Gaussian fainter than that has
     radius 0 and no octagon.
@@ -33,7 +33,7 @@ def octagon_radii(opacities: Float[np.ndarray, " n"], q: float = CHI2_2_99) -> F
 
 
 def corner_directions() -> Float[np.ndarray, "8 2"]:
-    """Unit corner positions (cos, sin)(2 pi k / 8) in the (r2, r3) plane."""
+    """Return unit corner positions (cos, sin)(2 pi k / 8) in the (r2, r3) plane."""
     angles = 2.0 * np.pi * np.arange(SIDES) / SIDES
     return np.stack([np.cos(angles), np.sin(angles)], axis=-1)
 
@@ -41,7 +41,7 @@ def corner_directions() -> Float[np.ndarray, "8 2"]:
 def octagon_corners_world(
     gaussians: FlatGaussians, radii: Float[np.ndarray, " n"]
 ) -> Float32[np.ndarray, "n 8 3"]:
-    """Corners P_k = m + radius (s2 cos(2 pi k/8) r2 + s3 sin(2 pi k/8) r3), world frame (paper Eq. 6)."""
+    """Return corners P_k = m + radius (s2 cos(2 pi k/8) r2 + s3 sin(2 pi k/8) r3), world frame (Eq. 6)."""
     rotations = gaussians.rotations.astype(np.float64)
     legs = rotations[:, :, 1:] * gaussians.scales.astype(np.float64)[:, None, :] * radii[:, None, None]
     corners = gaussians.means_world[:, None, :].astype(np.float64) + np.einsum(
@@ -51,7 +51,7 @@ def octagon_corners_world(
 
 
 def octagon_triangles(count: int) -> Int[np.ndarray, "m 3"]:
-    """Vertex indices of the fan triangles (0,1,2)...(0,6,7) of ``count`` octagons, one after another."""
+    """Return the fan triangles (0,1,2)...(0,6,7) of ``count`` octagons, in sequence."""
     return (np.arange(count)[:, None, None] * SIDES + FAN_TRIANGLES).reshape(-1, 3)
 
 
@@ -60,7 +60,7 @@ def frames_from_octagons(
 ) -> tuple[
     Float[np.ndarray, "n 3"], Float[np.ndarray, "n 4"], Float[np.ndarray, "n 2"], Bool[np.ndarray, " n"]
 ]:
-    """The paper's way back (section 3.3): centre from corners 2 and 6, axes from corners 0 and 2.
+    """Recover Gaussians (paper section 3.3): centre from corners 2 and 6, axes from corners 0 and 2.
 
     r2 and s2 come from corner 0, r3 by Gram-Schmidt from corner 2, r1 = r2 x r3. ``radii`` are those the
     octagons were made with. Shear is dropped: an octagon that an edit has sheared comes back orthogonal.
@@ -85,7 +85,7 @@ def frames_from_octagons(
 
 
 def coordinate_rounding_error(points_world: Float[np.ndarray, "n k 3"]) -> Float[np.ndarray, " n"]:
-    """Length by which the difference of two of a row's points may be off, as coordinates are rounded."""
+    """Return the length by which differences of a row's points may be off, as coordinates are rounded."""
     largest = np.abs(points_world.astype(np.float64)).max(axis=(1, 2))
     return 2.0 * float(np.finfo(points_world.dtype).eps) * largest
 
@@ -93,7 +93,7 @@ def coordinate_rounding_error(points_world: Float[np.ndarray, "n k 3"]) -> Float
 def frames_from_semi_axes(
     semi_axes_world: Float[np.ndarray, "n 2 3"], rounding: Float[np.ndarray, " n"]
 ) -> tuple[Float[np.ndarray, "n 4"], Float[np.ndarray, "n 2"], Bool[np.ndarray, " n"]]:
-    """Quaternions and lengths of in-plane legs, the second leg made orthogonal to the first (Gram-Schmidt).
+    """Return quaternions and lengths of in-plane legs, the second made orthogonal (Gram-Schmidt).
 
     The mask is False, the rotation the identity and the lengths 1 where a leg is not finite or not longer
     than ``rounding``.

@@ -1,4 +1,4 @@
-"""Tables with a row a Gaussian: what is done to one of their arrays is done to all.
+"""Row tables, dataclasses of arrays with one row per Gaussian, and operations on all their arrays.
 
 A table is a dataclass whose fields are arrays with a row for every Gaussian, named channels, or things that
 have no rows. No operation lists fields, so that none can forget one.
@@ -26,7 +26,7 @@ TableT = TypeVar("TableT", bound=RowTable)
 
 
 def row_arrays(table: RowTable) -> dict[str, np.ndarray]:
-    """Every array of a table by the name of its field; a channel is called ``channels.<name>``."""
+    """Return every array of a table by its field's name; a channel is called ``channels.<name>``."""
     arrays: dict[str, np.ndarray] = {}
     for field in fields(table):
         value = getattr(table, field.name)
@@ -38,7 +38,7 @@ def row_arrays(table: RowTable) -> dict[str, np.ndarray]:
 
 
 def from_row_arrays(kind: Callable[..., TableT], arrays: Mapping[str, np.ndarray]) -> TableT:
-    """A table made of the arrays that :func:`row_arrays` gave; everything else has its default."""
+    """Return a table of the arrays that :func:`row_arrays` returned; other fields have their defaults."""
     values: dict[str, Any] = {}
     channels: dict[str, dict[str, np.ndarray]] = {}
     for name, array in arrays.items():
@@ -51,7 +51,7 @@ def from_row_arrays(kind: Callable[..., TableT], arrays: Mapping[str, np.ndarray
 
 
 def map_rows(table: TableT, function: Callable[[np.ndarray], np.ndarray]) -> TableT:
-    """The table with ``function`` applied to each array; what has no rows is kept."""
+    """Return the table with ``function`` applied to each array; other fields are kept."""
     changes: dict[str, Any] = {}
     for field in fields(table):
         value = getattr(table, field.name)
@@ -63,7 +63,7 @@ def map_rows(table: TableT, function: Callable[[np.ndarray], np.ndarray]) -> Tab
 
 
 def select_rows(table: TableT, index: RowIndex) -> TableT:
-    """The rows at ``index`` (integers, a mask or a slice), copied."""
+    """Return a copy of the rows at ``index`` (integers, a mask or a slice)."""
     return map_rows(table, lambda array: array[index].copy())
 
 
@@ -80,7 +80,7 @@ def overwrite_rows(table: RowTable, index: RowIndex, other: RowTable) -> None:
 
 
 def concatenate_rows(parts: Sequence[TableT]) -> TableT:
-    """All rows of ``parts``, in order; what has no rows is taken from the first.
+    """Return all rows of ``parts``, in order; other fields are those of the first.
 
     Raises:
         ValueError: the parts do not have the same arrays.

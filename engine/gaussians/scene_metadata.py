@@ -1,4 +1,4 @@
-"""What a scene's picture needs beside its Gaussians, so that one file is one picture through every edit."""
+"""Metadata of a scene that rendering needs besides the Gaussians, kept through edits."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -22,7 +22,7 @@ class SceneMetadata:
     turned_beyond: float = 0.0
 
     def scaled(self, factor: float) -> "SceneMetadata":
-        """The facts of the scene made so many times as large."""
+        """Return the metadata of the scene scaled by ``factor``."""
         return replace(self, near_world=self.near_world * factor)
 
 
@@ -30,7 +30,7 @@ UNKNOWN_METADATA = SceneMetadata()
 
 
 def merge_metadata(scenes: Sequence[tuple[FlatGaussians, SceneMetadata]]) -> SceneMetadata:
-    """The facts of scenes put together: what holds for each of them.
+    """Return the metadata of merged scenes: what holds for each of them.
 
     Whether normals have a side is for those to say that have materials, as no others are lit by them.
     """

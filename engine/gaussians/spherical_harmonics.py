@@ -1,4 +1,4 @@
-"""Spherical harmonics that turn with their Gaussian.
+"""Real spherical harmonics, and their rotation with a Gaussian.
 
 Within one degree the harmonics span a space that every rotation, and every reflection, maps onto itself. So
 the matrix that turns coefficients follows from sampling: the turned function takes, at a direction d, the
@@ -31,15 +31,20 @@ SH_C2 = (
     _normalization(15, 4) / 2,
 )
 SH_C3 = (
-    -_normalization(35, 32), _normalization(105, 4), -_normalization(21, 32), _normalization(7, 16), -_normalization(21, 32), _normalization(105, 4) / 2,
     -_normalization(35, 32),
-)  # fmt: skip
+    _normalization(105, 4),
+    -_normalization(21, 32),
+    _normalization(7, 16),
+    -_normalization(21, 32),
+    _normalization(105, 4) / 2,
+    -_normalization(35, 32),
+)
 """Factors of the harmonics of degree 1, 2 and 3, in order."""
 _GOLDEN_ANGLE = np.pi * (3.0 - np.sqrt(5.0))
 
 
 def sh_basis(directions: Float[np.ndarray, "*n 3"], degree: int) -> Float[np.ndarray, "*n k"]:
-    """Real harmonics of degree 0 to ``degree`` (at most 3) at unit directions, signs and order of 3DGS."""
+    """Return real harmonics of degree 0 to ``degree`` (at most 3) at unit directions, signs as in 3DGS."""
     x, y, z = np.moveaxis(directions, -1, 0)
     xx, yy, zz = x * x, y * y, z * z
     c1, c2, c3 = SH_C1, SH_C2, SH_C3
@@ -55,7 +60,7 @@ def sh_basis(directions: Float[np.ndarray, "*n 3"], degree: int) -> Float[np.nda
 
 
 def sh_basis_gradients(directions: Float[np.ndarray, "*n 3"], degree: int) -> Float[np.ndarray, "*n k 3"]:
-    """Derivatives of the polynomials of :func:`sh_basis` by x, y and z, at unit directions.
+    """Return derivatives of :func:`sh_basis`'s polynomials by x, y and z, at unit directions.
 
     They are those of a function in space: on the sphere, only what is tangential to it counts.
     """
@@ -80,7 +85,7 @@ def sh_basis_gradients(directions: Float[np.ndarray, "*n 3"], degree: int) -> Fl
 def rotate_sh(
     sh: Float32[np.ndarray, "n k 3"], rotations: Float[np.ndarray, "n 3 3"]
 ) -> Float32[np.ndarray, "n k 3"]:
-    """Coefficients of the colours after each Gaussian was turned: new(d) = old(O^T d).
+    """Return coefficients after each Gaussian was rotated: new(d) = old(O^T d).
 
     Args:
         sh: coefficients of degree 0 to 3, coefficient-major.
@@ -102,7 +107,7 @@ def rotate_sh(
 def sh_rotation_matrices(
     rotations: Float[np.ndarray, "n 3 3"], degree: int
 ) -> list[Float[np.ndarray, "n m m"]]:
-    """Matrices that turn the coefficients of degree 1, 2, ... ``degree``; orthogonal like ``rotations``."""
+    """Return orthogonal matrices that rotate the coefficients of degree 1 to ``degree``."""
     samples, inverses = _sample_directions()
     values = sh_basis(np.einsum("nij,si->nsj", rotations.astype(np.float64), samples), degree)
     return [
@@ -112,7 +117,7 @@ def sh_rotation_matrices(
 
 
 def fibonacci_sphere(count: int) -> Float[np.ndarray, "s 3"]:
-    """Unit directions spread evenly all around (Fibonacci's spiral)."""
+    """Return unit directions spread evenly over the sphere (Fibonacci spiral)."""
     z = 1 - 2 * (np.arange(count) + 0.5) / count
     angle = _GOLDEN_ANGLE * np.arange(count)
     ring = np.sqrt(1 - z * z)
@@ -121,7 +126,7 @@ def fibonacci_sphere(count: int) -> Float[np.ndarray, "s 3"]:
 
 @cache
 def _sample_directions() -> tuple[Float[np.ndarray, "s 3"], dict[int, Float[np.ndarray, "m s"]]]:
-    """Directions spread over the sphere, and for each degree the way from values there to coefficients."""
+    """Return directions over the sphere, and for each degree the map from values there to coefficients."""
     directions = fibonacci_sphere(SAMPLE_DIRECTIONS)
     basis = sh_basis(directions, 3)
     return directions, {band: np.linalg.pinv(basis[:, band**2 : (band + 1) ** 2]) for band in (1, 2, 3)}

@@ -1,4 +1,4 @@
-"""Meshes that come back from an editor, or that drive a scene, whatever file they were in."""
+"""Imported meshes, from an editor or as a proxy, of any file format."""
 
 from dataclasses import dataclass
 
@@ -10,7 +10,7 @@ from octasplat.engine.geometry.mesh_material import MeshMaterial
 
 @dataclass(frozen=True)
 class ImportedMesh:
-    """A triangle mesh, and what else of an octagon mesh survived its way.
+    """A triangle mesh, and the octagon attributes that survived the editor.
 
     Attributes:
         vertices: positions as the file gives them, with the transforms of glTF nodes applied; which axes they
@@ -52,7 +52,7 @@ class ImportedMesh:
 
 
 def flip_v(uv: Float32[np.ndarray, "v 2"]) -> Float32[np.ndarray, "v 2"]:
-    """Texture coordinates counted from the upper left, where a file counts them from the lower left."""
+    """Return texture coordinates with v counted from the top, where a file counts from the bottom."""
     return uv * np.array([1, -1], np.float32) + np.array([0, 1], np.float32)
 
 

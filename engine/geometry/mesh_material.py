@@ -1,11 +1,9 @@
-"""What a mesh file says of how its surfaces look, in glTF's terms, whatever file it was."""
+"""Materials of mesh files, in glTF's terms, of any file format."""
 
 from dataclasses import dataclass
 from pathlib import Path
 
 from octasplat.engine.core.errors import SceneFileError
-
-MAX_IMAGE_BYTES = 1 << 30
 
 
 @dataclass(frozen=True)
@@ -63,7 +61,7 @@ class MeshMaterial:
 
 
 def resolve_image(mesh: Path, name: str) -> FileImage:
-    """The image that a mesh file names, which must lie in the mesh's folder or below.
+    """Return the image that a mesh file names, which must lie in the mesh's folder or below.
 
     Programs like to write where an image was on another computer; then one of the same name beside the mesh
     is taken.

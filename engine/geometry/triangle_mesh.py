@@ -1,4 +1,4 @@
-"""A triangle mesh with colours, and what is measured on it."""
+"""A triangle mesh with colours, and measurements of it."""
 
 from dataclasses import dataclass, replace
 
@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float32, Float64, Int32, Int64, UInt8
 
 @dataclass(frozen=True)
 class MaterialMaps:
-    """What a surface to be lit has beside its base colour: images that lie as its texture does.
+    """Material textures of a lit surface besides its base colour, in the same layout.
 
     Attributes:
         occlusion_roughness_metallic: in red the share of the light from all around that arrives, roughness
@@ -51,18 +51,18 @@ class TriangleMesh:
 
     @property
     def face_corners_world(self) -> Float64[np.ndarray, "m 3 3"]:
-        """Positions of the corners of each triangle."""
+        """Return the positions of each triangle's corners."""
         return self.vertices_world.astype(np.float64)[self.faces]
 
     @property
     def face_areas(self) -> Float64[np.ndarray, " m"]:
-        """Area of each triangle, square world units."""
+        """Return the area of each triangle, square world units."""
         corners = self.face_corners_world
         across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         return np.asarray(0.5 * np.linalg.norm(across, axis=1))
 
     def vertex_normals(self) -> Float32[np.ndarray, "n 3"]:
-        """The normals given, or area-weighted unit normals, outwards.
+        """Return the given normals, or area-weighted unit normals, outwards.
 
         (0, 0, 1) where a vertex has no triangle with an area.
         """
@@ -84,7 +84,7 @@ class TriangleMesh:
         return unit.astype(np.float32)
 
     def select_faces(self, index: Bool[np.ndarray, " m"] | Int64[np.ndarray, " k"]) -> "TriangleMesh":
-        """The triangles at ``index`` and the vertices that these use; of a mesh without materials."""
+        """Return the triangles at ``index`` with their vertices, of a mesh without materials."""
         faces = self.faces[index]
         used = np.zeros(len(self.vertices_world), dtype=bool)
         used[faces.reshape(-1)] = True
@@ -101,7 +101,7 @@ class TriangleMesh:
 
 @dataclass(frozen=True)
 class EdgeReport:
-    """How the triangles of a mesh hang together.
+    """Counts of edges by how triangles share them.
 
     Attributes:
         open_edges: edges with one triangle; a watertight mesh has none.
@@ -115,12 +115,12 @@ class EdgeReport:
 
     @property
     def is_watertight(self) -> bool:
-        """Whether every edge has two triangles that wind alike."""
+        """Return whether every edge has two consistently wound triangles."""
         return self.open_edges == 0 and self.non_manifold_edges == 0 and self.inconsistent_edges == 0
 
 
 def edge_report(faces: Int32[np.ndarray, "m 3"]) -> EdgeReport:
-    """Count the edges that are open, crowded or twisted."""
+    """Count the open, crowded (more than two triangles) and inconsistently wound edges."""
     directed = directed_edges(faces)
     ordered = np.sort(directed, axis=1)
     forward = directed[:, 0] < directed[:, 1]
@@ -135,12 +135,12 @@ def edge_report(faces: Int32[np.ndarray, "m 3"]) -> EdgeReport:
 
 
 def directed_edges(faces: Int32[np.ndarray, "m 3"]) -> Int32[np.ndarray, "e 2"]:
-    """The three edges of each triangle in its winding, triangle by triangle."""
+    """Return the three edges of each triangle in its winding, triangle by triangle."""
     return np.ascontiguousarray(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2))
 
 
 def unique_edges(faces: Int32[np.ndarray, "m 3"]) -> Int32[np.ndarray, "e 2"]:
-    """The ends of each edge, the lower number first, each edge once and in order."""
+    """Return the ends of each edge, the lower number first, each edge once and in order."""
     ends = np.sort(directed_edges(faces), axis=1)
     # One number an edge, as sorting rows takes ten times as long.
     size = int(ends.max(initial=0)) + 1

@@ -1,4 +1,4 @@
-"""What can be done, one module a verb: a typed request, and ``run``, which does it.
+"""Operations, one module per verb: a typed request, and ``run``, which executes it.
 
 A request is the only place where an option is defined. The options of the command, the type of the job, the
 form of the page, the OpenAPI schema and the Python call are all made from it. Requests import neither torch

@@ -19,7 +19,7 @@ def axis_named(name: str) -> "Float64[np.ndarray, '3']":
 
 
 def light_up(source: Path, name: str | None) -> "Float64[np.ndarray, '3']":
-    """Return the direction in the world that is up for the light on a scene with materials.
+    """Return the up direction, world frame, for the light on a scene with materials.
 
     Args:
         source: folder of a run, or a file of Gaussians.

@@ -1,4 +1,4 @@
-"""What the requests, results and operations of all verbs have in common."""
+"""Base classes of all operations' requests and results."""
 
 import re
 from collections.abc import Callable, Mapping
@@ -33,7 +33,7 @@ class Request(Options):
 
 
 class WritingRequest(Request):
-    """Base of requests that write files where their users say; see ``written_files`` for what is replaced."""
+    """Base of requests that write files; see ``written_files`` for what may be replaced."""
 
     overwrite: bool = Field(
         False,
@@ -104,13 +104,13 @@ ModelT = TypeVar("ModelT", bound=BaseModel)
 
 
 def never_stop() -> bool:
-    """Return False: nobody asks to stop."""
+    """Return False: no stop is requested."""
     return False
 
 
 @runtime_checkable
 class Run(Protocol[RequestT_contra, ResultT_co]):
-    """The function that does a request."""
+    """The function that executes a request."""
 
     def __call__(
         self,
@@ -121,7 +121,7 @@ class Run(Protocol[RequestT_contra, ResultT_co]):
         should_stop: Callable[[], bool] = never_stop,
         threads: int = 0,
     ) -> ResultT_co:
-        """Do what ``request`` says.
+        """Execute ``request``.
 
         Args:
             request: what to do.
@@ -136,7 +136,7 @@ class Run(Protocol[RequestT_contra, ResultT_co]):
 
 @dataclass(frozen=True)
 class Operation(Generic[RequestT, ResultT_co]):
-    """A verb.
+    """A verb with its request, options and function.
 
     Attributes:
         name: the verb, as the command and the job type are called.
@@ -154,7 +154,7 @@ class Operation(Generic[RequestT, ResultT_co]):
 
 
 def stop_if(should_stop: Callable[[], bool]) -> None:
-    """End quick work that is asked to stop before its next file is written.
+    """Raise ``Cancelled`` if a stop is requested, before the next file is written.
 
     Raises:
         Cancelled: it is.
@@ -171,7 +171,7 @@ def options_of(model: type[OptionsT], request: Options) -> OptionsT:
 
 
 class ContradictoryRequestError(ConfigError):
-    """What is asked for is not complete, or contradicts itself."""
+    """The request is incomplete or contradicts itself."""
 
     error_type = "contradictory_request"
 
@@ -217,7 +217,7 @@ def error_text(message: str, place: Callable[[str], str] = lambda path: path) ->
 
 
 def emit_warning(progress: Listener, message: str) -> None:
-    """Tell a warning: something that the user should know; the work goes on."""
+    """Emit a warning; the work goes on."""
     progress(Warned(message))
 
 

@@ -1,4 +1,4 @@
-"""``clean``: remove what nobody wants to see of a scene."""
+"""``clean``: remove Gaussians that disturb the scene."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -54,7 +54,7 @@ class CleanRequest(CleanOptions, SourceRequest):
 
 
 class CleanResult(ScenesWritten):
-    """What was removed, each Gaussian counted for the first reason that holds.
+    """Counts of the removed Gaussians, each by the first reason that holds.
 
     Attributes:
         count: number of Gaussians of the source.
@@ -84,7 +84,7 @@ def run(
     should_stop: Callable[[], bool] = never_stop,
     threads: int = 0,
 ) -> CleanResult:
-    """Remove what nobody wants to see; see :class:`octasplat.engine.operations.base.Run`.
+    """Remove disturbing Gaussians; see :class:`octasplat.engine.operations.base.Run`.
 
     Raises:
         ConfigError: nothing would be left.

@@ -1,4 +1,4 @@
-"""How long a job will take and how much memory, before it is begun; for people, and for ceilings.
+"""Cost model: time and memory of a job before it starts, for users and for limits.
 
 The figures come from runs on photographed scenes (``docs/experiments.md``); ``benchmarks/estimates.py``
 compares anew. What the photographs show decides as much as how many they are, so that an estimate is right
@@ -62,7 +62,7 @@ _TYPICAL_RENDER_GAUSSIANS = 100_000
 
 
 class Estimate(BaseModel):
-    """What a job will take, within a factor of two.
+    """The estimated cost of a job, within a factor of two.
 
     Attributes:
         cpu_seconds: of all cores together, without finding poses.
@@ -83,7 +83,7 @@ class Estimate(BaseModel):
     @computed_field  # type: ignore[prop-decorator]
     @property
     def text(self) -> str:
-        """The same in words."""
+        """Return the estimate in words."""
         cores = f"{self.cores} core{'s' if self.cores > 1 else ''}"
         poses = ", besides the time to find the poses" if self.finds_poses else ""
         return (
@@ -94,7 +94,7 @@ class Estimate(BaseModel):
 def estimate_reconstruction(
     options: ReconstructionConfig, photographs: Sequence[Sizes], cores: int
 ) -> Estimate:
-    """The estimate of a reconstruction of these photographs, on a machine of so many cores."""
+    """Return the estimate of a reconstruction of these photographs on this number of cores."""
     train = options.train
     shrunk = [_capped_sizes(sizes, options.max_side) for sizes in photographs]
     count = sum(sizes.count for sizes in shrunk)
@@ -128,7 +128,7 @@ def estimate_reconstruction(
 
 
 def reconstruction_bytes(options: ReconstructionConfig, photographs: Sequence[Sizes]) -> int:
-    """The least that the folder of a reconstruction takes: decoded photographs, and one checkpoint."""
+    """Return the minimal size of a reconstruction's folder: decoded photographs and one checkpoint."""
     shrunk = [_capped_sizes(sizes, options.max_side) for sizes in photographs]
     pixels = sum(sizes.width_px * sizes.height_px * sizes.count for sizes in shrunk)
     gaussians = _gaussians(options.train, training_pixels(options, photographs))
@@ -136,12 +136,12 @@ def reconstruction_bytes(options: ReconstructionConfig, photographs: Sequence[Si
 
 
 def image_bytes(options: PictureOptions, photographs: Sequence[Sizes], turns: int = 1) -> int:
-    """The least that the images of a render take, in each of so many environments."""
+    """Return the minimal size of a render's images, for each of ``turns`` environments."""
     return round(_IMAGE_PIXEL_BYTES[options.format] * rendered_pixels(options, photographs) * turns)
 
 
 def training_pixels(options: ReconstructionConfig, photographs: Sequence[Sizes]) -> int:
-    """Pixels of the views that a reconstruction trains on, all of the photographs having poses."""
+    """Return the pixels of a reconstruction's training views, if all photographs have poses."""
     shrunk = [_capped_sizes(sizes, options.max_side) for sizes in photographs]
     count = sum(sizes.count for sizes in shrunk)
     pixels = sum(sizes.width_px * sizes.height_px * sizes.count for sizes in shrunk)
@@ -149,7 +149,7 @@ def training_pixels(options: ReconstructionConfig, photographs: Sequence[Sizes])
 
 
 def estimate_render(options: RenderOptions, photographs: Sequence[Sizes], cores: int) -> Estimate:
-    """The estimate of new views; of views, all photographs are reckoned with."""
+    """Return the estimate of new views; for views of photographs, all are counted."""
     pixels = rendered_pixels(options, photographs)
     each = _RENDER_CPU_SECONDS_PER_PIXEL
     if options.stage is not None:
@@ -160,7 +160,7 @@ def estimate_render(options: RenderOptions, photographs: Sequence[Sizes], cores:
 
 
 def estimate_relight(options: RelightOptions, photographs: Sequence[Sizes], cores: int) -> Estimate:
-    """The estimate of a scene in other light; a ray of the split sum counts as a path."""
+    """Return the estimate of relighting; a ray of the split sum counts as a path."""
     each = _PATH_CPU_SECONDS * options.samples_per_pixel * len(options.environments)
     cpu_seconds = _RENDER_START_CPU_SECONDS + each * rendered_pixels(options, photographs)
     memory = _START_BYTES + _gaussian_bytes(2) * _TYPICAL_RENDER_GAUSSIANS
@@ -169,7 +169,7 @@ def estimate_relight(options: RelightOptions, photographs: Sequence[Sizes], core
 
 
 def rendered_pixels(options: PictureOptions, photographs: Sequence[Sizes]) -> int:
-    """Pixels of all images together that a render makes at most; a preview is one image."""
+    """Return the largest number of pixels of all images of a render; a preview is one image."""
     is_preview = isinstance(options, RenderOptions) and options.preview
     if options.mode == "path" and options.camera_path is not None:
         path = options.camera_path
@@ -227,7 +227,7 @@ def _ray_cpu_seconds(train: TrainConfig, gaussians: int) -> float:
 
 
 def _gaussian_bytes(sh_degree: int) -> int:
-    """Parameters, gradients, two moments and the mean of the last states as float32, and the hierarchy.
+    """Return the bytes per Gaussian: float32 parameters, gradients, two moments and mean, and hierarchy.
 
     789 for degree 2 were measured before there was that mean, which adds 148.
     """
@@ -235,5 +235,5 @@ def _gaussian_bytes(sh_degree: int) -> int:
 
 
 def _checkpoint_bytes(sh_degree: int) -> int:
-    """Parameters and two moments as float32."""
+    """Return the bytes per Gaussian of float32 parameters and two moments."""
     return 12 * (10 + 3 * (sh_degree + 1) ** 2)

@@ -37,7 +37,7 @@ _Length = Annotated[
 
 
 class DeformOptions(Options):
-    """Which mesh moves the scene, and what of it."""
+    """Which mesh deforms the scene, and which parts of it."""
 
     proxy: InputFile = Field(
         description="The mesh at rest (.ply, .obj or .glb), lying on or around what is to move."
@@ -175,7 +175,7 @@ def _rotate_mesh(mesh: ImportedMesh, axes: Axes) -> Float64[np.ndarray, "v 3"]:
 
 
 def _has_same_faces(one: ImportedMesh, other: ImportedMesh) -> bool:
-    """Whether the same vertices make triangles; programs may have turned over those of a mirrored mesh."""
+    """Return whether the same vertices make triangles; some programs flip those of a mirrored mesh."""
     if one.triangles.shape != other.triangles.shape:
         return False
     if np.array_equal(one.triangles, other.triangles):
@@ -185,7 +185,7 @@ def _has_same_faces(one: ImportedMesh, other: ImportedMesh) -> bool:
 
 
 def _report_text(path: Path, report: DeformReport) -> list[str]:
-    """A report in words."""
+    """Return a report in words."""
     lines = [
         f"{path}: {report.moved:,} Gaussians moved; distance from an affine map, in standard deviations: "
         f"median {report.residual_median:.2g}, 95th percentile {report.residual_p95:.2g}, "

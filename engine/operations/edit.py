@@ -94,7 +94,7 @@ def run(
 
 
 def _warn_about_axes(path: Path, report: EditReport, progress: Listener) -> None:
-    """Tell if a mesh seems to have been turned on its way."""
+    """Warn if a mesh seems to have been rotated between export and import."""
     if report.axes != report.axes_usual:
         emit_warning(
             progress,
@@ -114,7 +114,7 @@ def _warn_about_torn(report: EditReport, progress: Listener) -> None:
 
 
 def _report_text(path: Path, report: EditReport) -> list[str]:
-    """A report in words; what did not happen is left out."""
+    """Return a report in words, without counts of zero."""
     lines = [
         f"{path}: {report.moved:,} Gaussians moved, {report.unmoved:,} did not "
         f"(vertices found by {report.matched_by})."

@@ -1,4 +1,4 @@
-"""``estimate``: what a reconstruction will take, before it is begun."""
+"""``estimate``: the cost of a reconstruction, before it starts."""
 
 import os
 from collections import Counter
@@ -16,7 +16,7 @@ from octasplat.engine.settings.fields import Positional, Spelling, Unit
 
 
 class EstimateOptions(ReconstructOptions):
-    """How photographs are to become a scene, and on how many cores."""
+    """Options of the reconstruction to estimate, and the number of cores."""
 
     cores: Annotated[int, Unit("cores"), Spelling(metavar="N")] = Field(
         0, ge=0, description="Cores of the machine to reckon with; 0 takes those of this one."
@@ -33,7 +33,7 @@ class EstimateRequest(EstimateOptions, Request):
 
 
 class EstimateResult(Result):
-    """What a reconstruction will take, within a factor of two.
+    """The cost of a reconstruction, within a factor of two.
 
     Attributes:
         photographs: number of photographs of each size.

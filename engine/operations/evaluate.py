@@ -87,7 +87,7 @@ class EvaluateRequest(EvaluateOptions, Request):
 
 
 class EvaluateResult(Result):
-    """Figures of merit of the measured views.
+    """Metrics of the measured views.
 
     Attributes:
         metrics: all figures by name, as ``metrics.json`` holds them; empty where ``scales`` were measured.
@@ -103,7 +103,7 @@ class EvaluateResult(Result):
 
     @property
     def psnr(self) -> float | None:
-        """Mean PSNR of the views in dB; None where there were none."""
+        """Return the mean PSNR of the views in dB; None if there were none."""
         return self._mean("psnr")
 
     @property
@@ -113,22 +113,22 @@ class EvaluateResult(Result):
 
     @property
     def ms_ssim(self) -> float | None:
-        """Mean structural similarity at several scales; None for images that are too small for it."""
+        """Return the mean multi-scale structural similarity; None for images too small for it."""
         return self._mean("ms_ssim")
 
     @property
     def flip(self) -> float | None:
-        """Mean perceived difference (FLIP); lower is better."""
+        """Return the mean perceived difference (FLIP); lower is better."""
         return self._mean("flip")
 
     @property
     def views(self) -> Mapping[str, Mapping[str, float | None]]:
-        """The figures of each view, by the name of its photograph."""
+        """Return the metrics of each view, by the name of its photograph."""
         found: Mapping[str, Mapping[str, float | None]] = self.metrics.get("views", {})
         return found
 
     def lines(self) -> tuple[str, ...]:
-        """Return what was measured and where it is shown."""
+        """Return the metrics and the report's place in sentences."""
         return self.summary
 
     def _mean(self, name: str) -> float | None:

@@ -1,6 +1,7 @@
 """``export``: Gaussians to meshes and other formats."""
 
 import math
+import os
 from collections.abc import Callable
 from functools import cached_property
 from pathlib import Path
@@ -36,6 +37,11 @@ def read_direction(value: object) -> object:
     return x, y, z
 
 
+def _several_paths(value: object) -> object:
+    """Return a single path as a tuple of one; anything else as it is."""
+    return (value,) if isinstance(value, str | os.PathLike) else value
+
+
 _Colour = Literal["cameras", "constant"] | tuple[FiniteFloat, FiniteFloat, FiniteFloat]
 
 
@@ -46,7 +52,7 @@ def _with_direction(colour: _Colour | None) -> _Colour | None:
 
 
 class _ExportFields(ExportChoices, Options):
-    """What the options of a job and those of the command have in common."""
+    """Options that export jobs and the export command share."""
 
     former_names: ClassVar[renamed_settings.FormerNames] = renamed_settings.EXPORT
 
@@ -106,7 +112,7 @@ class _ExportFields(ExportChoices, Options):
 
 
 def _format_name(target: Path, asked: str | None) -> str | None:
-    """The name of the format; None where there is none, which is complained of later."""
+    """Return the name of the format; None if there is none, which is reported later."""
     try:
         return exporter_for(target, asked).name
     except SceneFileError:
@@ -132,9 +138,11 @@ class ExportRequest(_ExportFields, SourceRequest):
     *.ply and *.mesh.ply do, the longer pattern wins.
     """
 
-    files: Annotated[tuple[Path, ...], Positional("OUT")] = Field(
-        min_length=1, description="Files to write; their names say the formats."
-    )
+    files: Annotated[
+        tuple[Path, ...],
+        BeforeValidator(_several_paths, json_schema_input_type=tuple[Path, ...] | Path),
+        Positional("OUT"),
+    ] = Field(min_length=1, description="Files to write; their names say the formats.")
     format: Annotated[str | None, Spelling(metavar="NAME")] = Field(
         None, description="The format, if OUT's name does not say it."
     )
@@ -208,7 +216,7 @@ def run(
 
 
 class _ExportPreparation:
-    """What is written in each format: the scene, and how."""
+    """The scene and the options for each format."""
 
     def __init__(
         self,
@@ -256,7 +264,7 @@ class _ExportPreparation:
 
     @property
     def _training_q(self) -> float | None:
-        """What the scene of a run was trained with."""
+        """Return the Q that the scene of a run was trained with."""
         from octasplat.engine.runs.config import read_config
         from octasplat.engine.runs.run_folder import CONFIG, is_run
 
@@ -266,7 +274,7 @@ class _ExportPreparation:
 
     @cached_property
     def _baked_colour(self) -> "FlatGaussians":
-        """The scene with the constant harmonic only."""
+        """Return the scene with constant colours."""
         import numpy as np
 
         from octasplat.engine.render.bake_colour import colours_along, with_constant_colour
@@ -290,7 +298,7 @@ class _ExportPreparation:
     def _in_depth_order(
         self, gaussians: "FlatGaussians", options: ExportOptions
     ) -> "tuple[FlatGaussians, ExportOptions]":
-        """In one chunk and in the order of most photographs' cameras, where these agree; else as it was."""
+        """Return the scene in one chunk, in the order of most cameras; unchanged where these disagree."""
         import numpy as np
 
         from octasplat.engine.render.depth_order import MIN_AGREEMENT, shared_depth_order

@@ -1,4 +1,4 @@
-"""Files that are named one by one or by patterns."""
+"""Files given by name or by pattern."""
 
 import glob
 import re
@@ -9,7 +9,7 @@ from octasplat.engine.core.errors import ConfigError
 
 
 def expand_patterns(given: Sequence[Path]) -> tuple[Path, ...]:
-    """Return the files that are named one by one or by patterns such as ``frames/*.ply``.
+    """Return the files that are given by names or by patterns such as ``frames/*.ply``.
 
     The matches of a pattern are in the order of the numbers in their names.
 
@@ -29,7 +29,7 @@ def expand_patterns(given: Sequence[Path]) -> tuple[Path, ...]:
 
 
 def _natural_sort_key(name: str) -> list[tuple[int, int, str]]:
-    """A sort key in which 10 comes after 9."""
+    """Return a sort key in which 10 comes after 9."""
     return [
         (0, int(part), "") if part.isdigit() else (1, 0, part) for part in re.split(r"(\d+)", name) if part
     ]

@@ -1,4 +1,4 @@
-"""``import``: scenes of other programs to our own PLY."""
+"""``import``: scenes of other programs to octasplat's PLY."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -64,7 +64,7 @@ class ImportRequest(ImportOptions, WritingRequest):
 
 
 class ImportResult(Result):
-    """The scene.
+    """The imported scene.
 
     Attributes:
         report: what reading found and lost.

@@ -1,4 +1,4 @@
-"""``info``: what is in a scene."""
+"""``info``: facts on a scene."""
 
 from collections.abc import Callable
 from dataclasses import asdict
@@ -20,7 +20,7 @@ _BAR = 24
 
 
 class InfoOptions(Options):
-    """How a scene is looked at."""
+    """Options of looking at a scene."""
 
     up: Axis | None = Field(None, description="The axis of a file that points up.  [default: -y]")
 
@@ -48,7 +48,7 @@ class InfoRequest(InfoOptions, WritingRequest):
 
 
 class InfoResult(Result):
-    """What is in a scene.
+    """Facts on a scene.
 
     Attributes:
         source: the file or the folder of the run.
@@ -127,7 +127,7 @@ def run(
     should_stop: Callable[[], bool] = never_stop,
     threads: int = 0,
 ) -> InfoResult:
-    """Look at a scene; see :class:`octasplat.engine.operations.base.Run`.
+    """Collect facts on a scene; see :class:`octasplat.engine.operations.base.Run`.
 
     Raises:
         ConfigError: the cameras of the photographs share no centre or no up direction, or a file to write is

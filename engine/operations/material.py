@@ -1,4 +1,4 @@
-"""``material``: other materials for chosen Gaussians."""
+"""``material``: change the materials of selected Gaussians."""
 
 from collections.abc import Callable
 from typing import Annotated
@@ -19,7 +19,7 @@ from octasplat.engine.settings.fields import InputFile, Output, Spelling
 
 
 class MaterialOptions(Selection, MaterialChange, Options):
-    """What becomes of the materials of which Gaussians: those for which all that is given holds."""
+    """How materials change, and of which Gaussians: those for which all given conditions hold."""
 
     mesh: Annotated[InputFile | None, Spelling(metavar="MESH")] = Field(
         None,
@@ -49,7 +49,7 @@ class MaterialRequest(MaterialOptions, SceneRequest):
 
 
 class MaterialResult(ScenesWritten):
-    """The scene with other materials.
+    """The scene with changed materials.
 
     Attributes:
         changed: number of Gaussians that were changed.

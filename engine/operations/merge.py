@@ -21,7 +21,7 @@ from octasplat.engine.settings.fields import InputFile, Positional
 
 
 class MergeOptions(Options):
-    """Which scenes to put to the first one."""
+    """Which scenes are merged with the first one."""
 
     scenes: Annotated[tuple[InputFile, ...], Positional("IN")] = Field(
         (), max_length=100, description="The other scenes: files of any format, each in the same frame."
@@ -48,7 +48,7 @@ class MergeRequest(MergeOptions, SceneRequest):
 
 
 class MergeResult(ScenesWritten):
-    """The scene of all.
+    """The merged scene.
 
     Attributes:
         counts: number of Gaussians of each scene, the first one first.
@@ -64,13 +64,13 @@ def run(
     should_stop: Callable[[], bool] = never_stop,
     threads: int = 0,
 ) -> MergeResult:
-    """Put scenes together; see :class:`octasplat.engine.operations.base.Run`.
+    """Merge scenes; see :class:`octasplat.engine.operations.base.Run`.
 
     Raises:
         SceneFileError: a scene cannot be read, or the result not be written.
     """
-    from octasplat.engine.edit.selection import merge_scenes
     from octasplat.engine.files import read_metadata
+    from octasplat.engine.gaussians.merge import merge_scenes
     from octasplat.engine.gaussians.scene_metadata import merge_metadata
     from octasplat.engine.operations.scene_io import check_changed, edit_note, open_scene, write_changed
 

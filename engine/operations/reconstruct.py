@@ -23,7 +23,7 @@ _CONFIG, _METRICS, _REPORT, _SCENE = "config.json", "metrics.json", "report.html
 
 
 class ReconstructOptions(RunSettings, Options):
-    """How photographs become a scene: a preset, and what is to be otherwise."""
+    """How photographs become a scene: a preset, and settings that differ from it."""
 
     former_names: ClassVar[renamed_settings.FormerNames] = renamed_settings.RECONSTRUCT
 
@@ -81,7 +81,7 @@ class ReconstructOptions(RunSettings, Options):
         )
 
     def revised(self, before: Mapping[str, Any]) -> "ReconstructionConfig":
-        """Return a complete configuration, given as JSON, with those options on top that were given.
+        """Return a complete configuration, given as JSON, overridden by the options that were given.
 
         Raises:
             SettingsRefused: a setting is unknown, out of range or contradicts another.
@@ -98,7 +98,7 @@ class ReconstructOptions(RunSettings, Options):
         )
 
     def _training(self) -> dict[str, Any]:
-        """The settings of the training that are asked for by name, nested."""
+        """Return the training's settings that the options name, nested."""
         from octasplat.engine.train.config import FOR_SURFACE
 
         names = {name: info.metadata for name, info in ReconstructOptions.model_fields.items()}
@@ -147,7 +147,7 @@ class ReconstructResult(Result):
 
     @property
     def config(self) -> "ReconstructionConfig":
-        """All settings of the run."""
+        """Return all settings of the run."""
         from octasplat.engine.runs.config import read_config
 
         assert self.folder is not None
@@ -160,7 +160,7 @@ class ReconstructResult(Result):
         return None if value is None else float(value)
 
     def lines(self) -> tuple[str, ...]:
-        """Return what was reached and where it is shown."""
+        """Return the PSNR and the report's place in sentences."""
         return self.summary
 
 
@@ -177,7 +177,7 @@ def options_from_json(asked: Mapping[str, Any]) -> ReconstructOptions:
 
 
 def run_config(request: ReconstructRequest) -> "ReconstructionConfig":
-    """Return the configuration of a run: that of the request or, to go on without options, the run's own.
+    """Return the configuration of a run: that of the request or, to resume without options, the run's own.
 
     Raises:
         ConfigError: a setting cannot be used, or the run's settings cannot be read.

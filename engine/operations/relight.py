@@ -1,4 +1,4 @@
-"""``relight``: a scene with materials in other light."""
+"""``relight``: a scene with materials under other environments."""
 
 import math
 from collections.abc import Callable
@@ -28,7 +28,7 @@ Angle = Annotated[float, Field(allow_inf_nan=False)]
 
 
 class RelightOptions(PictureOptions):
-    """A scene with materials in other light, as images or a video."""
+    """A scene with materials under other environments, as images or a video."""
 
     former_names: ClassVar[renamed_settings.FormerNames] = renamed_settings.RELIGHT
 
@@ -74,21 +74,21 @@ class RelightOptions(PictureOptions):
 
     @property
     def samples_per_pixel(self) -> int:
-        """Rays or paths per pixel under one environment."""
+        """Return the rays or paths per pixel under one environment."""
         return self.samples or (PATHS if self.integrator == "path" else SPLIT_SUM_RAYS)
 
     @property
     def is_single(self) -> bool:
-        """Whether there is one image, whatever the scene."""
+        """Return whether there is one image, whatever the scene."""
         return super().is_single and len(self.environments) == 1
 
     @property
     def rays_across(self) -> int:
-        """Rays across a pixel of split-sum."""
+        """Return the split sum's rays across a pixel."""
         return math.isqrt(self.samples_per_pixel)
 
     def unused(self) -> tuple[str, ...]:
-        """Return a sentence for what was given and says nothing about such images."""
+        """Return a sentence about given options that have no effect on such images."""
         told = super().unused()
         if self.integrator == "split-sum" and self.rays_across**2 != self.samples_per_pixel:
             told += (
@@ -130,7 +130,7 @@ class RelightRequest(RelightOptions, PictureRequest):
 
 
 class RelightResult(RenderResult):
-    """The pictures that were written."""
+    """The images that were written."""
 
 
 def run(
@@ -140,7 +140,7 @@ def run(
     should_stop: Callable[[], bool] = never_stop,
     threads: int = 0,
 ) -> RelightResult:
-    """Show a scene in other light; see :class:`octasplat.engine.operations.base.Run`.
+    """Relight a scene; see :class:`octasplat.engine.operations.base.Run`.
 
     Raises:
         ConfigError: the scene has no materials, or an environment cannot be used; or there are images of

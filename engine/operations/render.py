@@ -28,7 +28,7 @@ STAGE_LACKS_BACKGROUND = (
 
 
 def parse_stage_text(value: object) -> object:
-    """Return what a TOML text says; anything else as it is. Raises ValueError where it is no TOML."""
+    """Return the content of a TOML text; any other value as it is. Raises ValueError for invalid TOML."""
     if not isinstance(value, str):
         return value
     try:
@@ -82,7 +82,7 @@ class RenderOptions(PictureOptions):
 
     @property
     def staged(self) -> Stage | None:
-        """The stage, with what the options say of its integrator."""
+        """Return the stage, with its integrator's settings replaced by the options."""
         if self.stage is None:
             return None
         asked = {name: True for name in ("layers", "denoise") if getattr(self, name)}
@@ -134,7 +134,7 @@ class RenderRequest(RenderOptions, PictureRequest):
 
 
 class RenderResult(Result):
-    """The pictures that were written.
+    """The images that were written.
 
     Attributes:
         images: number of images that were rendered, those of a video among them.
@@ -189,7 +189,7 @@ def run(
 
 
 def _stage_files(request: RenderRequest) -> list[Path]:
-    """Return the files that the stage brings."""
+    """Return the files that the stage refers to."""
     if request.stage is None:
         return []
     return [request.stage_folder / name for _, name in referenced_files(request.stage)]

@@ -1,4 +1,4 @@
-"""Options that all renders have in common: which cameras, and what kind of pictures."""
+"""Options that all renders share: cameras and image formats."""
 
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
@@ -29,7 +29,7 @@ MAX_SIDE_PX = 16384
 
 
 class PictureOptions(Options):
-    """Which cameras see the scene, and what kind of pictures are made of it."""
+    """Which cameras see the scene, and which images are made of it."""
 
     mode: Annotated[Mode, Spelling(hidden=True)] = Field(
         "turntable",
@@ -133,12 +133,12 @@ class PictureOptions(Options):
 
     @property
     def is_single(self) -> bool:
-        """Whether there is one camera, whatever the scene."""
+        """Return whether there is one camera, whatever the scene."""
         return self.mode == "camera" or (self.mode == "turntable" and self.frame_count == 1)
 
     @property
     def frame_count(self) -> int:
-        """Number of images of a turntable, of a camera path or of a single camera; views not counted."""
+        """Return the number of images of a turntable, camera path or single camera; views not counted."""
         if self.mode == "camera":
             return 1
         if self.mode == "path" and self.camera_path is not None:
@@ -147,13 +147,13 @@ class PictureOptions(Options):
 
     @property
     def frame_rate(self) -> float:
-        """Images per second."""
+        """Return the images per second."""
         if self.fps is None and self.mode == "path" and self.camera_path is not None:
             return self.camera_path.fps
         return self.fps or DEFAULT_FPS
 
     def unused(self) -> tuple[str, ...]:
-        """Return a sentence for each option that was given and says nothing about such images."""
+        """Return a sentence for each given option that has no effect on such images."""
         rules = {
             "max_side": ("The longer side", "views of photographs", self.mode == "views"),
             "seconds": ("The duration of a turn", "a turntable", self.mode == "turntable"),
@@ -201,7 +201,7 @@ class PictureOptions(Options):
 
 
 class PictureRequest(PictureOptions, WritingRequest):
-    """A render with the scene that is read and the place where pictures are written.
+    """A render with the scene to read and the place to write images.
 
     Where they are not given, the format is that of the output's name, and the mode that of the cameras that
     are given: else the views of a run, or a turntable of a file.
@@ -294,7 +294,7 @@ class PictureRequest(PictureOptions, WritingRequest):
 
 
 def check_layers(output: Path) -> None:
-    """Refuse names of files that cannot hold the layers of a stage.
+    """Check that the output's format can hold the layers of a stage.
 
     Raises:
         ConfigError: the name is that of a PNG or of a video.

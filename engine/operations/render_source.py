@@ -1,4 +1,4 @@
-"""The scene that a render shows, with what a run knows beside it, and the cameras that are asked for."""
+"""The scene that a render shows, a run's data for it, and the requested cameras."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -76,7 +76,7 @@ class RenderSource:
 
     @property
     def extent_world(self) -> float:
-        """Radius of the cameras, or of a turntable that fits."""
+        """Return the radius of the cameras, or of a turntable that fits."""
         if self.viewpoints is not None:
             return self.viewpoints.extent
         return gaussian_turntable(self.gaussians).radius
@@ -134,7 +134,7 @@ def read_render_source(
 
 
 def requested_cameras(request: PictureRequest, source: RenderSource) -> tuple[PinholeCamera, ...] | None:
-    """Return the cameras of a turntable, of a path or of a single image; None for the photographs' views.
+    """Return the cameras of a turntable, path or single image; None for the photographs' views.
 
     Raises:
         ConfigError: a camera cannot stand or look as asked, or the path cannot be used.
@@ -164,7 +164,7 @@ def requested_cameras(request: PictureRequest, source: RenderSource) -> tuple[Pi
 
 
 def requested_views(request: PictureRequest, source: RenderSource) -> tuple[Shot, ...]:
-    """Return the views of a run's photographs that are asked for.
+    """Return the requested views of a run's photographs.
 
     Raises:
         ConfigError: there is no such photograph, or no run.
@@ -196,7 +196,7 @@ def requested_views(request: PictureRequest, source: RenderSource) -> tuple[Shot
 def picture_output(
     verb: str, request: PictureRequest, shots: Sequence[Shot], inputs: Sequence[Path | None]
 ) -> RenderOutput:
-    """Return where pictures go, after a check that none replaces what is read or what is somebody else's.
+    """Return where images are written, after a check that no input or foreign file is replaced.
 
     Args:
         verb: what makes the pictures.
@@ -225,7 +225,7 @@ def stage_scene(
     *,
     threads: int = 0,
 ) -> StageScene:
-    """Return the scene as a stage is put into it.
+    """Return the scene for a stage.
 
     Args:
         source: the scene, with the cameras at full size.
@@ -249,7 +249,7 @@ def stage_scene(
 def open_stage_scene(
     source: Path, progress: Listener, *, dataset: Path | None = None, threads: int = 0
 ) -> StageScene:
-    """Read a run or a file as the scene that a stage is put into.
+    """Read a run or a file as the scene for a stage.
 
     Args:
         source: the folder of a run, or a file.

@@ -17,7 +17,7 @@ PICTURE_SIDE_PX = 160
 
 @dataclass(frozen=True)
 class SceneInspection:
-    """What is known of a scene.
+    """Facts on a scene.
 
     Attributes:
         scene: on its Gaussians.
@@ -35,7 +35,7 @@ class SceneInspection:
 
 
 def inspect_scene(scene: StageScene, up_world: Float64[np.ndarray, "3"] | None) -> SceneInspection:
-    """Look at a scene; ``up_world`` is what the user says of a file.
+    """Inspect a scene; ``up_world`` is the up direction that the user states for a file.
 
     Raises:
         ConfigError: the cameras of the photographs share no centre or no up direction.

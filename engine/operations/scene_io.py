@@ -1,4 +1,4 @@
-"""Scenes that operations read and write, with a word on what reading or writing loses."""
+"""Reading and writing of operations' scenes, with warnings about what a format drops."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -46,7 +46,7 @@ def open_scene(path: Path, progress: Listener, *, drop_invalid: bool = False) ->
 
 
 def report_dropped_on_import(path: Path, report: ImportReport, progress: Listener) -> None:
-    """Tell what reading ``path`` lost: warnings for what changes the look, notes for the rest."""
+    """Report what reading ``path`` dropped: warnings for what changes the look, notes for the rest."""
     if report.dropped:
         progress(Noted(f"{path}: {report.dropped:,} Gaussians without finite values were left out."))
     if report.saturated:
@@ -95,7 +95,7 @@ def check_scenes(
 def write_scene(
     gaussians: FlatGaussians, facts: SceneMetadata, target: Path, progress: Listener, *, warn: bool = True
 ) -> str:
-    """Write a scene in the format of its name; return a sentence that says so.
+    """Write a scene in the format of its name; return a sentence about it.
 
     Args:
         gaussians: the scene.
@@ -116,7 +116,7 @@ def write_scene(
 
 
 def is_run_output(source: Path, output: Path) -> bool:
-    """Return whether a changed scene is written as the folder of a run: it is of one, no file is named."""
+    """Return whether a changed scene is written as a run's folder: it is a run's, and no file is named."""
     return is_run(source) and not output.suffix
 
 
@@ -167,7 +167,7 @@ def write_changed(
     facts: SceneMetadata | None = None,
     matrix: Float[np.ndarray, "4 4"] | None = None,
 ) -> WrittenScene:
-    """Write the changed scene of ``source``: a file, or a run's folder with what of the run stays valid.
+    """Write the changed scene of ``source``: a file, or a run's folder with the files that stay valid.
 
     Args:
         source: the scene that was changed, a file or a run's folder.
@@ -189,7 +189,7 @@ def write_changed(
 
 
 def edit_note(name: str, options: BaseModel, **counts: int) -> dict[str, object]:
-    """Return what was done in a few words of JSON, for ``edits.json``; of files the names only.
+    """Return a short description of an edit as JSON, for ``edits.json``; files by name only.
 
     Args:
         name: the verb.

@@ -1,4 +1,4 @@
-"""What requests that make a scene, or a sequence of scenes, of meshes have in common."""
+"""Base of requests that make a scene, or a sequence of scenes, from meshes."""
 
 from pathlib import Path
 from typing import Annotated

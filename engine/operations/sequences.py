@@ -1,4 +1,4 @@
-"""Sequences: many meshes that are read one after another, and a scene that is written for each."""
+"""Sequences: many meshes read in turn, and a scene written for each."""
 
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
@@ -47,7 +47,7 @@ def targets_for(output: Path, sources: Sequence[Path]) -> tuple[Path, ...]:
 
 
 class SceneSequence:
-    """The scenes that are written for the meshes of a sequence, or the one scene of one mesh.
+    """Writer of a scene for each mesh of a sequence, or of one scene for one mesh.
 
     Args:
         verb: what writes them.
@@ -91,7 +91,7 @@ class SceneSequence:
     def write(
         self, number: int, gaussians: FlatGaussians, progress: Listener, note: Mapping[str, object]
     ) -> str:
-        """Write the scene of the mesh with this number; return a sentence that says so."""
+        """Write the scene of the mesh with this number; return a sentence about it."""
         target = self._targets[number]
         if self._is_run:
             counted = {**note, "gaussians": len(gaussians)}
@@ -102,14 +102,14 @@ class SceneSequence:
         return write_scene(gaussians, read_metadata(self._source), target, progress, warn=number == 0)
 
     def tell(self, number: int, progress: Listener) -> None:
-        """Tell that the scene of the mesh with this number is written, where there are several."""
+        """Report that the scene of the mesh with this number is written, if there are several."""
         if len(self._targets) > 1:
             progress(StageProgress("edit", number + 1, len(self._targets)))
 
     def write_report(
         self, meshes: Sequence[Mapping[str, object]], reports: Iterable[Mapping[str, object]]
     ) -> None:
-        """Write the counts of all meshes, if anybody asks for them."""
+        """Write the counts of all meshes, if a report is requested."""
         if self._report is None:
             return
         if not self._is_run:

@@ -1,4 +1,4 @@
-"""``stage init``: the first stage of a scene, to start from."""
+"""``stage init``: a first stage of a scene, to be edited."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -16,7 +16,7 @@ from octasplat.engine.settings.fields import DatasetFolder, Output, Source
 
 
 class StageInitOptions(Options):
-    """What a first stage is fitted to, beside the scene itself."""
+    """What a first stage is fitted to, besides the scene."""
 
     up: Axis | None = Field(
         None, description="The axis of a file that points up; a run knows its own.  [default: -y]"
@@ -24,7 +24,7 @@ class StageInitOptions(Options):
 
 
 class StageInitRequest(StageInitOptions, WritingRequest):
-    """Write a stage that fits a scene, the folder of a run or a file of Gaussians, to start from.
+    """Write a stage that fits a scene, the folder of a run or a file of Gaussians, to be edited.
 
     It knows what is up, has a glass ball on what seems to be the floor, and a light from where the scene's
     own seems to come. What else there is stands in it as comments.
@@ -53,7 +53,7 @@ class StageInitResult(Result):
     has_floor: bool
 
     def lines(self) -> tuple[str, ...]:
-        """Return a sentence that says where the stage is and what is up."""
+        """Return a sentence with the stage's place and up direction."""
         return (f"Wrote {self.files[0]}; up is {' '.join(f'{x:.3g}' for x in self.up)}.",)
 
 

@@ -123,7 +123,7 @@ class SurfaceOptions(ExtractionOptions, Options):
 
     @property
     def levels(self) -> Mapping[str, int]:
-        """The number of triangles of each level of detail, by its name; none keeps all triangles."""
+        """Return the number of triangles of each level of detail, by its name; None keeps all triangles."""
         return {text: _triangles(text) for text in self.max_triangles}
 
 
@@ -151,7 +151,7 @@ class SurfaceRequest(SurfaceOptions, WritingRequest):
 
     @property
     def outputs(self) -> tuple[Path, ...]:
-        """The file of each level of detail."""
+        """Return the file of each level of detail."""
         if len(self.levels) < 2:
             return (self.output,)
         stem, suffix = self.output.stem, self.output.suffix
@@ -159,7 +159,7 @@ class SurfaceRequest(SurfaceOptions, WritingRequest):
 
 
 class SurfaceLevel(Result):
-    """One mesh.
+    """The mesh of one level of detail.
 
     Attributes:
         files: the mesh, and the textures that lie beside it.
@@ -181,7 +181,7 @@ class SurfaceLevel(Result):
     volume_bytes: int
 
     def lines(self) -> tuple[str, ...]:
-        """Return what the mesh is like, and its files with their sizes."""
+        """Return facts on the mesh, and its files with their sizes."""
         closed = "watertight" if self.is_watertight else f"{self.open_edges:,} open edges"
         voxel = f"{self.voxel_world:.3g}{' at the centre' if self.is_contracted else ''}"
         holes = f", {self.holes_closed:,} holes closed" if self.holes_closed else ""
@@ -193,7 +193,7 @@ class SurfaceLevel(Result):
 
 
 class SurfaceResult(Result):
-    """The meshes, in the order of the levels of detail, and the light beside them if they are lit.
+    """The meshes in the order of the levels of detail, and the environment beside them if they are lit.
 
     Attributes:
         levels: the meshes.
@@ -204,7 +204,7 @@ class SurfaceResult(Result):
     environment: Path | None = None
 
     def lines(self) -> tuple[str, ...]:
-        """Return what the meshes are like, and all files with their sizes."""
+        """Return facts on the meshes, and all files with their sizes."""
         light = () if self.environment is None else _file_lines((self.environment,))
         return (*(line for level in self.levels for line in level.lines()), *light)
 

@@ -1,4 +1,4 @@
-"""What ``surface`` looks from and at: cameras, and the photographs of a run."""
+"""Inputs of ``surface``: cameras, and the photographs of a run."""
 
 from functools import partial
 from pathlib import Path
@@ -66,7 +66,7 @@ def depth_cameras(
 def training_photographs(
     source: Path, dataset: Path | None, threads: int, progress: Listener, *, copy: Path | None = None
 ) -> tuple[Picture, ...]:
-    """Return the training photographs of a run, all as exposed as the scene.
+    """Return the training photographs of a run, normalised to the scene's exposure.
 
     Args:
         source: the folder of a run, or a file of Gaussians, which has none.
@@ -111,7 +111,7 @@ def training_photographs(
 
 
 def _check_same_poses(source: Path, folder: Path, found: ViewsRecord) -> None:
-    """Make sure that photographs have the poses that a run was made with, as far as it keeps them.
+    """Check that photographs have the poses that a run was made with, as far as it keeps them.
 
     Raises:
         DatasetError: they have not.

@@ -1,4 +1,4 @@
-"""``transform``: a scene moved, turned, scaled."""
+"""``transform``: move, rotate and scale a scene."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -25,7 +25,7 @@ _Point = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
 
 
 class TransformOptions(Options):
-    """What to do, in this order: matrix, up, scale, rotate as often as given, translate."""
+    """The transforms, applied in this order: matrix, up, scale, rotate (repeatable), translate."""
 
     matrix: Annotated[InputFile | None, Spelling(metavar="FILE")] = Field(
         None,
@@ -59,7 +59,7 @@ class TransformOptions(Options):
         return self
 
     def world_map(self) -> Float64[np.ndarray, "4 4"]:
-        """Return the matrix from the old world to the new one.
+        """Return the 4 x 4 matrix from the old world to the new one.
 
         Raises:
             ConfigError: the file of the matrix cannot be read.
@@ -90,7 +90,7 @@ class TransformRequest(TransformOptions, SceneRequest):
 
 
 class TransformResult(ScenesWritten):
-    """The moved scene.
+    """The transformed scene.
 
     Attributes:
         matrix: the affine map from the old world to the new one, row by row.

@@ -1,4 +1,4 @@
-"""What may be written where: nothing that is read is replaced, nor anything that octasplat did not write.
+"""Guard of written files: inputs and files that octasplat did not write are not replaced.
 
 This is the one guard of all verbs. A new file is always written. A file that is there is replaced if
 octasplat wrote it on this machine as the same kind of output (a scene, pictures, a surface, ...) and nobody
@@ -76,7 +76,7 @@ def check_targets(
 
 
 def remember_written(verb: str, files: Iterable[Path]) -> None:
-    """Remember files that a verb has written, which it may replace when it is asked again."""
+    """Record files that a verb has written, which it may replace later."""
     rows = []
     for file in files if verb != _FOR_EDITS else ():
         with suppress(OSError):
@@ -103,7 +103,7 @@ class _Read:
                 self._add_dataset(place, whole=True)
 
     def place_of(self, target: Path) -> str | None:
-        """Return None where a file is not read, else words for the folder that it belongs to, if any."""
+        """Return None for a file that is not read, else words for the input folder it belongs to, if any."""
         place = target.resolve()
         if place in self._files:
             return self._files[place]
@@ -137,7 +137,7 @@ def _is_ours(file: Path, known: _UNCHANGED_SINCE) -> bool:
 
 
 def _known(verb: str, files: Sequence[Path]) -> _UNCHANGED_SINCE:
-    """Return size and time of those files that are known as output of a verb's kind, as they were then."""
+    """Return recorded size and time of the files that are output of the verb's kind."""
     found: _UNCHANGED_SINCE = {}
     with suppress(OSError, sqlite3.Error), _database() as database:
         for file in files:

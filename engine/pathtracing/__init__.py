@@ -1,1 +1,1 @@
-"""Light in a scene: stages of meshes, lights and Gaussians, their materials, and the path tracer for them."""
+"""Path tracing of stages: meshes, lights and Gaussians with materials."""

@@ -1,4 +1,4 @@
-"""From a stage to the arrays that paths are traced through."""
+"""Compilation of a stage's meshes, lights and materials to arrays for path tracing."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -55,7 +55,7 @@ WarnCallback = Callable[[str], None]
 
 @dataclass(frozen=True)
 class CompiledMeshes:
-    """The meshes, lights and surroundings of a stage, ready to be traced.
+    """The meshes, lights and environment of a stage, ready to be traced.
 
     Attributes:
         surfaces: all triangles, those of visible lights included.
@@ -79,7 +79,7 @@ class CompiledMeshes:
 
     @property
     def queries(self) -> MeshQueries:
-        """What kernels ask Embree; good while this lives."""
+        """Return the kernels' Embree queries; valid while this object lives."""
         if self.obstacles is None or self.glass is None or self.glass_faces is None:
             every = self.triangles.any_query
             no_glass = self.triangles.closest_query._replace(scene=0)
@@ -90,14 +90,14 @@ class CompiledMeshes:
         )  # fmt: skip
 
     def with_lights(self, lights: LightArrays) -> "CompiledMeshes":
-        """The same meshes in other light, their environment unseen by the camera."""
+        """Return the same meshes with other lights and an environment that the camera does not see."""
         return replace(self, lights=lights, environment_visible=False)
 
 
 def compile_meshes(
     stage: Stage, folder: Path, *, threads: int = 0, warn: WarnCallback = lambda _sentence: None
 ) -> CompiledMeshes:
-    """Read and place everything of a stage but its Gaussians.
+    """Read and place everything of a stage except its Gaussians.
 
     Args:
         stage: whose meshes have no place in the scene left to be found (``on``).
@@ -147,7 +147,7 @@ def compile_meshes(
 
 @dataclass
 class _MeshBuilder:
-    """Triangles of a stage as they come; ``light_count`` counts the stage's own lights."""
+    """Accumulator of a stage's triangles; ``light_count`` counts the stage's own lights."""
 
     table: MaterialTable
     light_count: int
@@ -231,7 +231,7 @@ def _add_mesh(
 def _face_materials(
     mesh: StageMesh, name: str, shape: MeshShape, warn: WarnCallback
 ) -> list[tuple[Bool[np.ndarray, " f"], ImportedMaterial]]:
-    """Which faces of a mesh have which material: the stage's, or else the file's."""
+    """Return the material of each face: the stage's, or else the file's."""
     if mesh.material is not None:
         return [(np.ones(len(shape.faces), bool), ImportedMaterial(mesh.material, {}))]
     numbers = shape.material_numbers
@@ -260,7 +260,7 @@ def _face_materials(
 
 
 def check_outside_glass(meshes: CompiledMeshes, origin_world: Float32[np.ndarray, "3"], camera: str) -> None:
-    """Refuse a camera within a mesh of glass, from where refraction would go wrong.
+    """Check that a camera is not inside a mesh of glass, where refraction would be wrong.
 
     Raises:
         ConfigError: the camera, which is called ``camera``, stands in glass.
@@ -286,14 +286,14 @@ def check_outside_glass(meshes: CompiledMeshes, origin_world: Float32[np.ndarray
 
 
 def mesh_up_axis(mesh: StageMesh) -> str:
-    """The axis of a mesh's own frame that is turned to the stage's up."""
+    """Return the axis of a mesh's own frame that is rotated to the stage's up."""
     if mesh.up_axis is not None:
         return mesh.up_axis
     return "y" if mesh.shape is not None or (mesh.file or "").lower().endswith(".glb") else "world"
 
 
 def load_mesh_shape(mesh: StageMesh, number: int, folder: Path) -> MeshShape:
-    """The triangles of mesh ``number`` before it is placed, with what its file says of its looks.
+    """Return the triangles of mesh ``number`` before placement, with its file's materials.
 
     Raises:
         ConfigError: it is of glass and not closed.
@@ -315,7 +315,7 @@ def load_mesh_shape(mesh: StageMesh, number: int, folder: Path) -> MeshShape:
 
 
 def _light_triangles(light: Light, up_world: Float64[np.ndarray, "3"]) -> Float32[np.ndarray, "f 3 3"] | None:
-    """The triangles of a light that is seen; None of one that is not."""
+    """Return the triangles of a visible light; None of an invisible one."""
     if isinstance(light, PointLight) and light.radius > 0.0 and light.visible:
         ball = primitive_shape("sphere")
         corners = ball.vertices[ball.faces] * light.radius + np.array(light.position)

@@ -1,4 +1,4 @@
-"""Noise taken from pictures by Open Image Denoise (https://www.openimagedenoise.org), where installed."""
+"""Denoising by Open Image Denoise (https://www.openimagedenoise.org), if installed."""
 
 import numpy as np
 from jaxtyping import Float32
@@ -8,7 +8,7 @@ from octasplat.engine.pathtracing.film import DenoiseFn
 
 
 def load_denoiser() -> DenoiseFn:
-    """What takes noise from linear images.
+    """Return the function that denoises linear images.
 
     Raises:
         ConfigError: Open Image Denoise is not installed.

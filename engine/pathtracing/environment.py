@@ -1,4 +1,4 @@
-"""Environment maps: equirectangular images of linear radiance, turned, and sampled by their brightness."""
+"""Environment maps: equirectangular linear radiance, rotated, and sampled by luminance."""
 
 from dataclasses import dataclass
 
@@ -12,7 +12,7 @@ _LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 
 @dataclass(frozen=True)
 class EnvironmentMap:
-    """Light from all around.
+    """Distant light from all directions.
 
     Attributes:
         radiance_linear: rows from up to down; the middle column is forward, to its right lies right.
@@ -25,7 +25,7 @@ class EnvironmentMap:
 
 @dataclass(frozen=True)
 class EnvironmentSampler:
-    """Cumulative sums over a map, to draw its pixels by how much light they bring.
+    """Cumulative distribution over a map's texels, by luminance times solid angle.
 
     Attributes:
         row_cdf: cumulative share of the rows, from 0 to 1.
@@ -39,7 +39,7 @@ class EnvironmentSampler:
 
 
 def build_environment_sampler(radiance_linear: Float32[np.ndarray, "h w 3"]) -> EnvironmentSampler:
-    """Sums over the luminance of each pixel and its neighbours, times its solid angle.
+    """Return the cumulative sums of a map's luminance times solid angle, filtered over neighbours.
 
     The neighbours count since radiance is bilinear between pixels: none with light may have the share 0.
     """
@@ -59,7 +59,7 @@ def build_environment_sampler(radiance_linear: Float32[np.ndarray, "h w 3"]) -> 
 
 
 def mean_irradiance(radiance_linear: Float32[np.ndarray, "h w 3"]) -> Float64[np.ndarray, "3"]:
-    """Pi times the mean radiance over all directions: about the irradiance on a surface that faces it."""
+    """Return pi times the mean radiance: about the irradiance of a surface that faces the light."""
     height = len(radiance_linear)
     edges = np.cos(np.arange(height + 1) / height * np.pi)
     bands = (edges[:-1] - edges[1:]) / 2

@@ -1,15 +1,16 @@
-"""What paths gathered, pixel by pixel, and the picture that it makes.
+"""The film: sums over paths per pixel, and the image that they make.
 
 A pixel has a front layer of Gaussians (premultiplied display colour, transmittance, and the factor that the
-stage's lights give to it) and linear light behind it; see
-:mod:`octasplat.engine.pathtracing.kernels.gaussian_layer` for the reason.
+stage's lights give to it) and linear light behind it; for the reason see
+:mod:`octasplat.engine.pathtracing.kernels.gaussian_layer`.
 
-Gaussians with materials that the camera sees are a part of the pixel of their own, encoded by itself, so that
-their edges blend in display values as photographs with alpha do.
+Visible Gaussians with materials are summed and encoded separately, so that their edges blend in display
+values as photographs with alpha do.
 
-A compositor's layers are so made that ``background * shadow`` under ``things`` is the picture again. Things
-and scene meet in display values in the picture, but in linear ones in a compositor: where a pixel is covered
-in part, the alpha of the things is the larger one that this takes, so that nothing becomes negative.
+The compositing layers are such that ``background * shadow`` under ``things`` (the stage's meshes) is the
+image again. Meshes and scene are blended in display values in the image, but in linear ones in a compositor:
+in a partly covered pixel, the alpha of the meshes is increased by what this takes, so that no value is
+negative.
 """
 
 import copy
@@ -38,7 +39,7 @@ _DARK = 1e-6
 
 @dataclass(frozen=True)
 class StageImage:
-    """One picture of a stage.
+    """One image of a stage.
 
     Attributes:
         rgb_srgb: display values after exposure and tone curve, clipped to [0, 1].
@@ -87,7 +88,7 @@ class Film:
         pixels: Int64[np.ndarray, " n"],
         path_factors: Float32[np.ndarray, " p"] | None = None,
     ) -> None:
-        """Add finished paths, equally many to each of ``pixels``, those of one pixel beside each other.
+        """Add finished paths, equally many for each of ``pixels``, those of one pixel consecutive.
 
         Args:
             paths: to add.
@@ -127,7 +128,7 @@ class Film:
             self._without_meshes.add(paths, pixels, (paths.mesh_visibility == 0.0).astype(np.float32))
 
     def gaussian_surface(self) -> tuple[Float32[np.ndarray, "h w 3"], Float32[np.ndarray, "h w"]]:
-        """Mean linear radiance of the Gaussians with materials that the camera sees, and their coverage."""
+        """Return the mean linear radiance of the visible Gaussians with materials, and their coverage."""
         linear = _safe_divide(self._front_light, self._front[:, None])
         coverage = self._front / np.maximum(self._samples, 1)
         return linear.astype(np.float32).reshape(*self._shape, 3), coverage.astype(np.float32).reshape(
@@ -135,7 +136,7 @@ class Film:
         )
 
     def image(self, *, exposure: float = 0.0, tone: ToneCurve = "none") -> StageImage:
-        """The picture of all paths so far; ``exposure`` is in stops."""
+        """Return the image of all paths so far; ``exposure`` is in stops."""
         linear = self._linear()
         shown = linear_to_srgb(apply_tone_curve(linear * 2.0**exposure, tone))
         return StageImage(
@@ -146,7 +147,7 @@ class Film:
         )
 
     def denoised(self, denoise: DenoiseFn) -> "Film":
-        """The film with less noise in what light brings; the Gaussians' own colours stay as they are."""
+        """Return the film with its lit part denoised; the Gaussians' own colours stay as they are."""
         film = copy.copy(self)
         count = np.maximum(self._samples, 1)[:, None]
         if self._mesh_visibility.any():
@@ -164,7 +165,7 @@ class Film:
         return film
 
     def _linear(self, *, lit: bool = True) -> Float64[np.ndarray, "n 3"]:
-        """Linear values; not ``lit`` shows the Gaussians as trained."""
+        """Return linear values; without ``lit`` those of the Gaussians as trained."""
         count = np.maximum(self._samples, 1)[:, None]
         through, front = self._transmittance[:, None] / count, self._front[:, None] / count
         covered = np.maximum(1.0 - through - front, 0.0)
@@ -210,7 +211,7 @@ class Film:
 
 
 def apply_tone_curve(linear: Float64[np.ndarray, "n 3"], tone: ToneCurve) -> Float64[np.ndarray, "n 3"]:
-    """Linear values brought into [0, 1] by a tone curve.
+    """Return linear values mapped to [0, 1] by a tone curve.
 
     ``reinhard`` divides by 1 plus luminance ("Photographic Tone Reproduction", Reinhard et al. 2002);
     ``filmic`` is a fit of ACES' reference curve (https://knarkowicz.wordpress.com, "ACES Filmic Tone Mapping

@@ -1,4 +1,4 @@
-"""The Gaussians of a stage as the path tracer sees them: layers on rays, and what they keep off."""
+"""Gaussians in the path tracer: layers along rays, and their shadows."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -9,10 +9,10 @@ from jaxtyping import Bool, Float32
 
 from octasplat.engine.core.errors import ConfigError
 from octasplat.engine.core.rays import RayBatch
-from octasplat.engine.edit.selection import merge_scenes
 from octasplat.engine.gaussians.affine import scaling, transform_gaussians, translation
 from octasplat.engine.gaussians.channels import stack_channels
 from octasplat.engine.gaussians.materials import MATERIAL_WIDTHS, has_materials
+from octasplat.engine.gaussians.merge import merge_scenes
 from octasplat.engine.gaussians.model import SH_C0, FlatGaussians
 from octasplat.engine.pathtracing.kernels.gaussian_layer import AMBIENT, RELIT, SHADOWED
 from octasplat.engine.pathtracing.kernels.gaussian_surface import ALBEDO, FEATURE_COUNT, MATERIAL, RAY_OFFSET
@@ -30,10 +30,10 @@ RAY_OFFSET_FRACTION = 0.5
 
 @dataclass(frozen=True)
 class GaussianLayers:
-    """Gaussians, with features that say how they take light.
+    """Gaussian scenes, with features that say how they receive light.
 
     Attributes:
-        tracer: all Gaussians, with the features of
+        tracer: all Gaussians, with features as in
             :mod:`octasplat.engine.pathtracing.kernels.gaussian_layer`.
         min_transmittance: transmittance at which a ray counts as ended.
         mesh_shadow_tracer: those that cast shadows on meshes; None where none do.
@@ -53,7 +53,7 @@ class GaussianLayers:
     has_material_surfaces: bool = False
 
     def trace(self, rays: RayBatch, t_max: Float32[np.ndarray, " r"]) -> TraceResult:
-        """What lies on rays up to a distance each."""
+        """Return the Gaussians' radiance and transmittance along rays up to a distance each."""
         seen = self.tracer.trace(rays.up_to(t_max))
         if self.tracer.settings.flip_normal_cos > 0:
             normals = face_viewer(seen.normal_world, rays.directions_world)
@@ -71,7 +71,7 @@ def build_gaussian_layers(
     size: float,
     threads: int = 0,
 ) -> GaussianLayers | None:
-    """The Gaussian scenes of a stage, placed, joined and ready to be traced; None where it has none.
+    """Return the Gaussian scenes of a stage, placed, merged and ready to be traced; None without any.
 
     Args:
         stage: what to read.
@@ -128,7 +128,7 @@ def build_gaussian_layers(
 
 
 def place_gaussians(gaussians: FlatGaussians, placement: StageGaussians) -> FlatGaussians:
-    """Gaussians scaled, turned and moved; the very same ones where nothing is to be done."""
+    """Return Gaussians scaled, rotated and moved; the same object for an identity placement."""
     assert isinstance(placement.scale, float | int)
     if placement.scale == 1.0 and not any(placement.rotation_degrees) and not any(placement.position):
         return gaussians
@@ -160,7 +160,7 @@ def _material_features(gaussians: FlatGaussians, scene: StageGaussians) -> Float
 
 
 def _without_color(gaussians: FlatGaussians) -> FlatGaussians:
-    """The same Gaussians without a colour of their own."""
+    """Return the Gaussians with zero radiance of their own."""
     sh = np.zeros((len(gaussians), 1, 3), np.float32)
     sh[:, 0] = -1.0 / SH_C0
     return replace(gaussians, sh=sh)

@@ -1,4 +1,4 @@
-"""Materials that mesh files bring along, as materials of a stage."""
+"""Conversion of mesh files' materials to a stage's materials."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -31,7 +31,7 @@ class ImportedMaterial:
 def import_material(
     source: MeshMaterial, is_closed: Callable[[], bool], scale: float, warn: Callable[[str], None]
 ) -> ImportedMaterial:
-    """What a file's material is on a stage.
+    """Return the stage's material for that of a mesh file.
 
     Args:
         source: the file's.

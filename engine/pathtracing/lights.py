@@ -1,4 +1,4 @@
-"""Lights of a stage as arrays that the kernels read."""
+"""Lights of a stage as arrays for the kernels."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -23,7 +23,7 @@ from octasplat.engine.pathtracing.kernels.kernel_args import (
     SPOT,
     LightArrays,
 )
-from octasplat.engine.pathtracing.kernels.lights import eval_environment_array, light_samples
+from octasplat.engine.pathtracing.kernels.lights import eval_environment_array
 from octasplat.engine.pathtracing.stage.model import (
     DirectionalLight,
     Light,
@@ -35,7 +35,7 @@ from octasplat.engine.pathtracing.stage.model import (
 
 @dataclass(frozen=True)
 class EmissiveMesh:
-    """Triangles that shine alike.
+    """Triangles of equal emission.
 
     Attributes:
         corners_world: of each.
@@ -58,7 +58,7 @@ def build_light_arrays(
     texels_linear: Float32[np.ndarray, "x 3"] | None = None,
     texture_sizes: Int64[np.ndarray, "k 3"] | None = None,
 ) -> LightArrays:
-    """Arrays of lights, meshes that shine, and the environment, in this order.
+    """Return arrays of the lights, emissive meshes and the environment, in this order.
 
     Args:
         lights: of the stage.
@@ -121,7 +121,7 @@ def build_light_arrays(
 
 
 def triangle_areas(corners: Float32[np.ndarray, "f 3 3"]) -> Float64[np.ndarray, " f"]:
-    """Areas of triangles."""
+    """Return the areas of triangles."""
     sides = (corners[:, 1:] - corners[:, :1]).astype(np.float64)
     areas: np.ndarray = 0.5 * np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1)
     return areas
@@ -130,7 +130,7 @@ def triangle_areas(corners: Float32[np.ndarray, "f 3 3"]) -> Float64[np.ndarray,
 def rectangle_sides(
     light: RectangleLight, up_world: Float64[np.ndarray, "3"]
 ) -> tuple[Float64[np.ndarray, "3"], Float64[np.ndarray, "3"]]:
-    """The level side of a rectangle and the other, as vectors; their cross product is the way it faces."""
+    """Return a rectangle's level side and its other one; their cross product points where it shines."""
     facing = np.array(light.direction) / np.linalg.norm(light.direction)
     level = np.cross(up_world / np.linalg.norm(up_world), facing)
     if np.linalg.norm(level) < 1e-6:  # facing up or down: any level direction will do, the same each time
@@ -142,37 +142,7 @@ def rectangle_sides(
 def eval_environment_map(
     lights: LightArrays, directions_world: Float64[np.ndarray, "n 3"]
 ) -> tuple[Float64[np.ndarray, "n 3"], Float64[np.ndarray, " n"]]:
-    """Linear radiance from unit directions, and the density with which they are sampled."""
+    """Return linear radiance from unit directions, and the density of sampling these."""
     radiance, density = np.empty((len(directions_world), 3)), np.empty(len(directions_world))
     eval_environment_array(lights, directions_world, radiance, density)
     return radiance, density
-
-
-class LightSamples(NamedTuple):
-    """Ways to lights from ``n`` points; see :func:`sample_lights`."""
-
-    directions_world: Float64[np.ndarray, "n 3"]
-    distances: Float64[np.ndarray, " n"]
-    radiance_linear: Float64[np.ndarray, "n 3"]
-    density: Float64[np.ndarray, " n"]
-    lights: Int32[np.ndarray, " n"]
-
-
-def sample_lights(
-    lights: LightArrays, points_world: Float64[np.ndarray, "n 3"], uniform: Float64[np.ndarray, "n 3"]
-) -> LightSamples:
-    """A way from each point to one of the lights, which are asked by what they bring.
-
-    The irradiance of a surface is the mean of radiance times cosine over density; where the density is 0,
-    light comes from one direction only and ``radiance`` is irradiance already.
-    """
-    count = len(points_world)
-    out = LightSamples(
-        np.zeros((count, 3)),
-        np.zeros(count),
-        np.zeros((count, 3)),
-        np.zeros(count),
-        np.zeros(count, np.int32),
-    )
-    light_samples(lights, points_world, uniform, out[0], out[1], out[2], out[3], out[4])
-    return out

@@ -1,4 +1,4 @@
-"""All materials of a stage as rows, with their tables and textures."""
+"""All materials of a stage as table rows, with albedo tables and textures."""
 
 import tempfile
 from collections.abc import Mapping
@@ -53,7 +53,7 @@ _DEFAULTS: dict[str, np.ndarray] = {
 
 
 class MaterialTable:
-    """Rows of materials as they come.
+    """Accumulator of materials as rows.
 
     Args:
         folder: where the names of images are relative to.
@@ -75,7 +75,7 @@ class MaterialTable:
         uses_vertex_color: bool,
         images: Mapping[str, FileImage],
     ) -> int:
-        """The row of a material.
+        """Add a material and return its row.
 
         Args:
             material: what to add.
@@ -129,19 +129,19 @@ class MaterialTable:
         return len(self._rows) - 1
 
     def add_light(self, light_id: int) -> int:
-        """The row of the surface of a light."""
+        """Add the surface of a light and return its row."""
         self._rows.append({"kinds": EMITTER, "light_ids": light_id})
         return len(self._rows) - 1
 
     def set_emissive(self, row: int, light_id: int) -> int:
-        """Make a row the surface of a light as well; returns the texture of its light, -1 for none."""
+        """Make a row emissive as well; return the texture of its emission, -1 for none."""
         self._rows[row]["light_ids"] = light_id
         texture = self._rows[row]["emission"]
         assert isinstance(texture, int)
         return texture
 
     def arrays(self) -> MaterialArrays:
-        """All rows as arrays."""
+        """Return all rows as arrays."""
         count = len(self._rows)
         columns = {
             name: np.array([row.get(name, default) for row in self._rows], default.dtype).reshape(
@@ -169,14 +169,14 @@ class MaterialTable:
         )
 
     def _albedo_table_id(self, kind: str, ior: float) -> int:
-        """The number of a table; that of light that leaves rough glass comes right after its own."""
+        """Return the index of a table; a rough dielectric's table for leaving light follows its own."""
         if kind == "coat" and (kind, ior) in self._albedo_tables:
             return self._albedo_tables.index((kind, ior))
         self._albedo_tables.append((kind, ior))
         return len(self._albedo_tables) - 1
 
     def _texture_id(self, image: FileImage, use: TextureUse, has_uv: bool, label: str) -> int:
-        """The number of a texture; display values are made linear, unless the image holds linear ones."""
+        """Return the index of a texture, converted to linear unless the image is linear already."""
         if not has_uv:
             raise ConfigError(f"{label}: {image.name} needs texture coordinates, which the mesh lacks.")
         if (image, use) not in self._textures:
@@ -200,7 +200,7 @@ class MaterialTable:
 
 
 def _read_pixels(image: FileImage) -> Float32[np.ndarray, "h w c"]:
-    """The pixels of an image, from where it lies."""
+    """Return the pixels of an image, from memory or from its file."""
     if image.path is not None:
         return read_image(image.path)
     with tempfile.TemporaryDirectory(prefix="octasplat-") as folder:

@@ -1,4 +1,4 @@
-"""Meshes of a stage: simple shapes, files, their place in the world, and normals that look round."""
+"""Meshes of a stage: primitives, files, placement, and smooth normals."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,7 +21,7 @@ WELD_TOLERANCE = 1e-6
 
 @dataclass(frozen=True)
 class MeshShape:
-    """Triangles in a frame of their own.
+    """Triangles in their own frame.
 
     Attributes:
         vertices: positions.
@@ -44,12 +44,12 @@ class MeshShape:
 
 
 def primitive_shape(name: str) -> MeshShape:
-    """A ``sphere`` of radius 1, a ``cube`` from -1 to 1, or a ``plane`` from -1 to 1 whose normal is y."""
+    """Return a ``sphere`` of radius 1, a ``cube`` from -1 to 1, or a ``plane`` from -1 to 1 with normal y."""
     return {"sphere": _sphere, "cube": _cube, "plane": _plane}[name]()
 
 
 def read_shape(path: Path) -> MeshShape:
-    """The triangles of a mesh file with what it says of their looks.
+    """Return the triangles of a mesh file with its materials.
 
     Raises:
         SceneFileError: the file cannot be read.
@@ -70,7 +70,7 @@ def read_shape(path: Path) -> MeshShape:
 
 
 def rotation_matrix(degrees: tuple[float, float, float]) -> Float64[np.ndarray, "3 3"]:
-    """Turns about the fixed axes x, then y, then z."""
+    """Return the rotation about the fixed axes x, then y, then z."""
     matrix = np.eye(3)
     for axis, angle in enumerate(np.radians(degrees)):
         turn = np.eye(3)
@@ -82,7 +82,7 @@ def rotation_matrix(degrees: tuple[float, float, float]) -> Float64[np.ndarray, 
 
 
 def align_axis_to_up(axis: str, up_world: Float64[np.ndarray, "3"]) -> Float64[np.ndarray, "3 3"]:
-    """The shortest turn that takes an axis (``y``, ``-z``, ...) to a direction; ``world`` turns nothing.
+    """Return the shortest rotation of an axis (``y``, ``-z``, ...) to up; the identity for ``world``.
 
     Opposite directions turn about x, or about y where the axis is x: glTF's y to COLMAP's -y is the half
     turn about x that the project's own GLB files are written with.
@@ -103,7 +103,7 @@ def align_axis_to_up(axis: str, up_world: Float64[np.ndarray, "3"]) -> Float64[n
 def up_axis_rotation(
     axis: str, degrees: float, up_world: Float64[np.ndarray, "3"]
 ) -> Float64[np.ndarray, "3 3"]:
-    """The turn of :func:`align_axis_to_up`, and then one about up, anticlockwise seen from above."""
+    """Return :func:`align_axis_to_up` followed by a rotation about up, anticlockwise seen from above."""
     up = up_world / np.linalg.norm(up_world)
     return np.asarray(
         Rotation.from_rotvec(np.radians(degrees) * up).as_matrix() @ align_axis_to_up(axis, up_world)
@@ -115,7 +115,7 @@ def transform_points(
     placement: Transformed,
     rotation: Float64[np.ndarray, "3 3"] | None = None,
 ) -> Float64[np.ndarray, "n 3"]:
-    """Points scaled along their own axes, turned by a matrix to the world's, turned as stated, and moved."""
+    """Return points scaled along their own axes, rotated, and translated to the world."""
     whole = rotation_matrix(placement.rotation_degrees) @ (np.eye(3) if rotation is None else rotation)
     return points * np.array(placement.scale) @ whole.T + np.array(placement.position)
 
@@ -123,7 +123,7 @@ def transform_points(
 def transform_normals(
     normals: Float64[np.ndarray, "n 3"], placement: Transformed, rotation: Float64[np.ndarray, "3 3"]
 ) -> Float32[np.ndarray, "n 3"]:
-    """Normals of points that are :func:`transform_points`, unit vectors; NaN where one has no length."""
+    """Return unit normals of points transformed by :func:`transform_points`; NaN for those of no length."""
     turned = normals / np.array(placement.scale) @ (rotation_matrix(placement.rotation_degrees) @ rotation).T
     lengths = np.linalg.norm(turned, axis=1, keepdims=True)
     return np.asarray((turned / np.where(lengths > 1e-12, lengths, np.nan)).astype(np.float32))
@@ -132,7 +132,7 @@ def transform_normals(
 def corner_normals(
     corners_world: Float[np.ndarray, "f 3 3"], smooth_degrees: float
 ) -> Float32[np.ndarray, "f 3 3"]:
-    """Normals at the corners of faces: those of neighbours across edges up to an angle are averaged."""
+    """Return normals at face corners, averaged across edges of less than an angle."""
     points = corners_world.reshape(-1, 3).astype(np.float64)
     size = max(float(np.ptp(points, axis=0).max(initial=0.0)), 1e-30)
     _, owner = np.unique(
@@ -148,7 +148,7 @@ def corner_normals(
 
 
 def count_open_edges(shape: MeshShape, face_mask: Bool[np.ndarray, " f"] | None = None) -> int:
-    """Edges that are not shared by two faces that wind alike, of all faces or of some; closed means none.
+    """Return the number of edges not shared by two consistently wound faces; a closed mesh has none.
 
     Vertices that lie in one place count as one, as in files that repeat them for normals and textures.
     """
@@ -163,7 +163,7 @@ def count_open_edges(shape: MeshShape, face_mask: Bool[np.ndarray, " f"] | None 
 
 
 def _sphere() -> MeshShape:
-    """An icosahedron whose triangles are cut into four again and again."""
+    """Return an icosahedron subdivided several times and projected to the unit sphere."""
     golden = (1 + 5**0.5) / 2
     around = np.array([[-1, golden, 0], [1, golden, 0], [-1, -golden, 0], [1, -golden, 0]])
     vertices = np.concatenate([around, np.roll(around, 1, axis=1), np.roll(around, 2, axis=1)])

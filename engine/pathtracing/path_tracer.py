@@ -1,4 +1,4 @@
-"""The path tracer: waves of rays through meshes and Gaussians, from surface to surface."""
+"""The path tracer: wavefronts of rays through meshes and Gaussians, bounce by bounce."""
 
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -75,7 +75,7 @@ class PathTracerScene:
 
 
 class PathTracer:
-    """Traces paths through a scene of meshes, lights and Gaussians.
+    """Path tracer of a scene of meshes, lights and Gaussians.
 
     A path is a pure function of the seed, its pixel and its number, so that the number of threads changes
     nothing.
@@ -118,7 +118,7 @@ class PathTracer:
         image: ImageRays,
         progress: ProgressCallback = lambda _done, _total: None,
     ) -> Film:
-        """All samples of a picture.
+        """Return a film with all samples of an image.
 
         Args:
             image: rays through the centres of its pixels.
@@ -129,7 +129,7 @@ class PathTracer:
         return self._denoise_film(film)
 
     def refine(self, image: ImageRays) -> Iterator[Film]:
-        """The same film again and again, each time with about twice as many samples, until it has all."""
+        """Yield one film repeatedly, with about twice as many samples each time, until it has all."""
         film = self._make_film(image)
         done = 0
         while done < self._settings.samples:
@@ -202,17 +202,17 @@ class PathTracer:
             free.put(_Workspace.allocate(scratch))
 
         def work(batch: _Batch) -> None:
-            room = free.get()
+            workspace = free.get()
             try:
-                paths = room.paths(len(batch.pixels) * batch.paths_per_pixel)
+                paths = workspace.paths(len(batch.pixels) * batch.paths_per_pixel)
                 start = batch.start(camera_rays, order)
                 trace_paths(
-                    len(paths.keys), room.scratch, self._integrator, start, scene, queries,
-                    t_min, INFINITE_T_MAX, paths, room.block,
+                    len(paths.keys), workspace.scratch, self._integrator, start, scene, queries,
+                    t_min, INFINITE_T_MAX, paths, workspace.block,
                 )  # fmt: skip
                 film.add(paths, batch.pixels)
             finally:
-                free.put(room)
+                free.put(workspace)
 
         tasks = [self._pool.submit(work, batch) for batch in batches]
         try:
@@ -231,7 +231,7 @@ class PathTracer:
         t_min: Float32[np.ndarray, "1"],
         batches: list["_Batch"],
     ) -> Iterator[None]:
-        """Follow paths among Gaussians, all threads on one batch; yields before each."""
+        """Trace paths among Gaussians, all threads on one batch; yield before each."""
         for batch in batches:
             yield
             paths = allocate_paths(len(batch.pixels) * batch.paths_per_pixel)
@@ -246,7 +246,7 @@ class PathTracer:
         pixels: Int64[np.ndarray, " n"],
         samples: Int64[np.ndarray, " n"],
     ) -> Float32[np.ndarray, "n 3"]:
-        """What points of surfaces send to who sees them, each by one path: linear, unbiased.
+        """Return the radiance that surface points send to their viewers, one path each: linear, unbiased.
 
         The surface of a point is not part of the scene unless that holds it too.
 
@@ -275,9 +275,9 @@ class PathTracer:
         active: Int32[np.ndarray, " n"] | None = None,
         first_depth: int = 0,
     ) -> None:
-        """Follow paths to their ends; the camera sees nothing nearer than ``t_min``.
+        """Trace paths to their ends; the camera sees nothing nearer than ``t_min``.
 
-        ``active`` are those that are left after they ``first_depth`` so many surfaces; None stands for all.
+        ``active`` are those that are left after ``first_depth`` bounces; None stands for all.
         """
         meshes, layers, scene = self._scene.meshes, self._scene.layers, self._mesh_scene
         active = np.arange(len(paths.keys), dtype=np.int32) if active is None else active
@@ -326,7 +326,7 @@ class PathTracer:
     def _shadow_transmittance(
         self, shadows: ShadowRayArrays, *, passes_rough_glass: bool = False
     ) -> Float32[np.ndarray, "n 3"]:
-        """The share of light that meshes let through on each ray."""
+        """Return the transmittance of meshes along each shadow ray."""
         meshes, share = self._scene.meshes, np.empty_like(shadows.radiance_linear)
         self._run_kernel(
             shadow_transmittance, len(share), meshes.queries, meshes.surfaces, meshes.materials, shadows,
@@ -356,7 +356,7 @@ class PathTracer:
         shadows: ShadowRayArrays,
         layers: GaussianLayers,
     ) -> None:
-        """Add the light that reaches layers of Gaussians, and take what meshes keep off them."""
+        """Add the light that reaches layers of Gaussians, less what meshes shadow."""
         asked = np.flatnonzero(
             shadows.radiance_linear.any(axis=1) | shadows.occluded_radiance_linear.any(axis=1)
         )
@@ -378,7 +378,7 @@ class PathTracer:
         )  # fmt: skip
 
     def _run_kernel(self, kernel: Callable[..., None], rows: int, *arguments: object) -> None:
-        """Let all threads work on the rows of a kernel. Numba's own loops cannot write to named tuples."""
+        """Run a kernel over rows on all threads. Numba's own loops cannot write to named tuples."""
         parts = max(1, min(self._threads, rows // MIN_ROWS_PER_THREAD))
         cuts = [rows * part // parts for part in range(parts + 1)]
         work = zip(pairwise(cuts), self._scratches, strict=False)
@@ -405,7 +405,7 @@ class _Batch(NamedTuple):
 
 @dataclass(frozen=True)
 class _Workspace:
-    """Where one thread keeps the paths that it follows, taken once as fresh memory costs time."""
+    """Buffers for one thread's paths, allocated once, as fresh memory costs time."""
 
     scratch: PathScratch
     all_paths: PathArrays
@@ -424,19 +424,19 @@ class _Workspace:
         return cls(scratch, allocate_paths(PATHS_PER_THREAD), block)
 
     def paths(self, count: int) -> PathArrays:
-        """The first so many paths."""
+        """Return views of the first ``count`` paths."""
         return PathArrays(*(values[:count] for values in self.all_paths))
 
 
 def _shadow_ray_batch(
     shadows: ShadowRayArrays, rows: Int64[np.ndarray, " n"], t_min: float = 0.0
 ) -> RayBatch:
-    """Some of the shadow rays."""
+    """Return some of the shadow rays as a batch."""
     return RayBatch(shadows.origins_world[rows], shadows.directions_world[rows], t_min, shadows.t_max[rows])
 
 
 def _optical_axis(directions_world: Float32[np.ndarray, "h w 3"]) -> Float64[np.ndarray, "3"]:
-    """The direction through the middle of the picture."""
+    """Return the direction through the image's centre."""
     height, width = directions_world.shape[:2]
     middle = directions_world[(height - 1) // 2 : height // 2 + 1, (width - 1) // 2 : width // 2 + 1]
     axis = middle.reshape(-1, 3).mean(axis=0, dtype=np.float64)

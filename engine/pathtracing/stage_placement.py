@@ -1,4 +1,4 @@
-"""Where things go in a scene: where one can stand, what a pixel shows, where the light comes from."""
+"""Placement in a scene: its floor, the surface under a pixel, and the main light's direction."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -33,7 +33,7 @@ HANGING_FRACTIONS = (0.2, 0.3, 0.4, 0.5, 0.6)
 def place_resting_meshes(
     stage: Stage, tracer: Tracer | None, ray_of_pixel: RayOfPixel, folder: Path
 ) -> Stage:
-    """The stage with the meshes that rest ``on`` something moved there.
+    """Return the stage with the meshes that rest ``on`` something moved there.
 
     Raises:
         ConfigError: the stage has no Gaussians, a ray meets nothing, or a photograph is not known.
@@ -62,7 +62,7 @@ def place_resting_meshes(
 def _resting_point(
     rest: RestingPlace, tracer: Tracer, ray_of_pixel: RayOfPixel, key: str
 ) -> Float64[np.ndarray, "3"]:
-    """The point of the Gaussians on which something comes to rest."""
+    """Return the point of the Gaussians on which a mesh rests."""
     if rest.view is not None and rest.pixel is not None:
         origin, direction = ray_of_pixel(rest.view, rest.pixel)
         what = f"pixel {rest.pixel[0]:g}, {rest.pixel[1]:g} of {rest.view}"
@@ -84,7 +84,7 @@ def estimate_stage_layout(
     size: float,
     cameras_world: Float64[np.ndarray, "c 3"],
 ) -> StageLayout:
-    """What a first stage is fitted to.
+    """Return the layout of a first stage: up, floor, size and light.
 
     Args:
         gaussians: of the scene.
@@ -133,7 +133,7 @@ def level_fraction(
     height: float,
     size: float,
 ) -> float:
-    """Share of the surface about a height that looks up."""
+    """Return the fraction of the surface about a height whose normals point up."""
     near = np.abs(heights - height) < 0.05 * size
     return float(area[near & (cosines > LEVEL_COSINE)].sum() / max(area[near].sum(), 1e-30))
 
@@ -145,7 +145,7 @@ def _find_floor(
     up: Float64[np.ndarray, "3"],
     size: float,
 ) -> tuple[Float64[np.ndarray, "s 3"], Float64[np.ndarray, "k 3"]]:
-    """Spots on the height at which most of the level surface lies, and the points that stand on it."""
+    """Return points at the height of most level surface, and the points that rest on it."""
     heights = points @ up
     level = cosines > LEVEL_COSINE
     if not level.any():
@@ -168,7 +168,7 @@ def _estimate_light_direction(
     area: Float64[np.ndarray, " n"],
     up: Float64[np.ndarray, "3"],
 ) -> Float64[np.ndarray, "3"]:
-    """The direction in which surfaces look that are brighter than others, no lower than 30 degrees."""
+    """Return the mean normal of bright surfaces, at least 30 degrees above the horizon."""
     bright = rgb_srgb.astype(np.float64).mean(axis=1)
     matrix = np.concatenate([np.ones((len(bright), 1)), normals], axis=1)
     weights = np.sqrt(np.minimum(area, np.quantile(area, 0.95)))

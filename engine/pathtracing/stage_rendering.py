@@ -1,4 +1,4 @@
-"""Pictures and films of a stage."""
+"""Images and videos of a stage."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -34,11 +34,11 @@ class StageRenderer:
 
     @property
     def render_fn(self) -> RenderFn:
-        """What renders a shot to a file."""
+        """Return the function that renders a shot to a file."""
         return stage_render_fn(self.tracer, self.settings)
 
     def preview(self, shot: Shot, output: Path, progress: Listener) -> None:
-        """Render one shot to a file, finer and finer.
+        """Render one shot to a file, progressively.
 
         Raises:
             OutputError: it cannot be written.
@@ -76,7 +76,7 @@ def compile_stage(stage: Stage, scene: StageScene, shots: Sequence[Shot]) -> Sta
 
 
 def stage_render_fn(tracer: PathTracer, settings: Integrator) -> RenderFn:
-    """What renders a shot of a stage to a file.
+    """Return the function that renders a shot of a stage to a file.
 
     ``.exr`` gets the linear picture before exposure and tone curve as R, G, B, and alpha as A; anything else
     gets 8-bit display values.
@@ -94,7 +94,7 @@ def stage_render_fn(tracer: PathTracer, settings: Integrator) -> RenderFn:
 
 
 def check_cameras_outside_glass(meshes: CompiledMeshes, shots: Sequence[Shot]) -> None:
-    """Look at all cameras before anything is rendered.
+    """Check all cameras before anything is rendered.
 
     Raises:
         ConfigError: one stands in glass.
@@ -110,7 +110,7 @@ def render_preview(
     path: Path,
     progress: Callable[[int, int], None] = lambda _done, _total: None,
 ) -> None:
-    """Render one shot and write it again each time that it has become about twice as fine.
+    """Render one shot and rewrite it each time that its samples have about doubled.
 
     The last picture is the very one that :func:`stage_render_fn` makes, but for rounding.
 
@@ -127,7 +127,7 @@ def render_preview(
 
 
 def write_stage_image(path: Path, image: StageImage) -> None:
-    """Write a picture: linear channels, alpha and a compositor's layers for ``.exr``, else display values.
+    """Write an image: linear channels, alpha and compositing layers for ``.exr``, else display values.
 
     Raises:
         OutputError: the file cannot be written.

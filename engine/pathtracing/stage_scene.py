@@ -1,4 +1,4 @@
-"""The scene that a stage is put into, and the first stage of a scene."""
+"""The scene for a stage, and the first stage of a scene."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -25,7 +25,7 @@ LAYOUT_CAMERAS = 12
 
 @dataclass(frozen=True)
 class StageScene:
-    """The scene that a stage is put into.
+    """The scene for a stage.
 
     Attributes:
         gaussians: of the scene.
@@ -48,7 +48,7 @@ class StageScene:
     warn: Callable[[str], None] = lambda _sentence: None
 
     def turntable(self, up_world: Float64[np.ndarray, "3"] | None = None) -> Turntable:
-        """Return a circle round what the scene shows."""
+        """Return a circle around the visible scene."""
         if self.photographs is None:
             return gaussian_turntable(self.gaussians, up_world=up_world)
         return turntable_of_views(self.photographs)
@@ -76,7 +76,7 @@ class StageScene:
 
 
 def first_stage_layout(scene: StageScene, up_world: Float64[np.ndarray, "3"] | None) -> StageLayout:
-    """Return what a first stage of the scene is fitted to: up, the floor, its size and its light.
+    """Return the layout of the scene's first stage: up, floor, size and light.
 
     Args:
         scene: the scene.

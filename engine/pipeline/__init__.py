@@ -1,4 +1,4 @@
-"""The main job, from photographs to a measured scene and its meshes.
+"""The reconstruction job, from photographs to a measured scene and its meshes.
 
 Each step leaves its result on disk and is skipped when the result is there, so that a run that was stopped
 or killed goes on where it was.

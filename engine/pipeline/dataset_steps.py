@@ -1,4 +1,4 @@
-"""The steps before the training: poses are found, and the dataset is opened."""
+"""Steps before the training: pose search, and opening of the dataset."""
 
 from octasplat.engine.core.progress import stage
 from octasplat.engine.dataset import Dataset, write_held_out
@@ -19,21 +19,21 @@ from octasplat.engine.train.sampling.batches import BatchSource
 
 
 class FindPoses:
-    """Find the poses of the photographs, where that is asked for; goes on where it was stopped."""
+    """Find the poses of the photographs, if requested; resumes an interrupted search."""
 
     is_needed_later = True
 
     def is_done(self, run: ReconstructionRun) -> bool:
-        """Return False: what is there is looked at by the search itself."""
+        """Return False: the search itself checks what exists."""
         return False
 
     def __call__(self, run: ReconstructionRun) -> None:
-        """Find them."""
+        """Find the poses."""
         find_missing_poses(run.scene, run.output, run.config, run.threads, run.progress, run.should_stop)
 
 
 class OpenDataset:
-    """Open the photographs with their poses; those of a new run are mended first."""
+    """Open the photographs with their poses; those of a new run are repaired first."""
 
     is_needed_later = True
 
@@ -42,7 +42,7 @@ class OpenDataset:
         return False
 
     def __call__(self, run: ReconstructionRun) -> None:
-        """Open them, and write down which they are."""
+        """Open the photographs, and record which they are."""
         output = run.output
         run.dataset = _load_dataset(run)
         if run.recorded is None:
@@ -56,7 +56,7 @@ class OpenDataset:
 
 
 def _repair_poses(run: ReconstructionRun) -> None:
-    """Mend poses and lenses that the photographs contradict; loads them anew where the model changed."""
+    """Repair poses and lenses that contradict the photographs; reload the model if it changed."""
     if place_misfits(run.dataset, run.output, run.config, run.threads, run.progress, run.should_stop):
         run.dataset = _load_dataset(run)
     if free_lenses(run.dataset, run.output, run.config, run.progress, run.should_stop):

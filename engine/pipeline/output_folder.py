@@ -1,4 +1,4 @@
-"""The folder of a run: claimed before the work, and freed again where the work cannot begin."""
+"""The folder of a run: claimed before the work, and released if the work is refused."""
 
 import shutil
 from collections.abc import Iterator
@@ -16,7 +16,7 @@ from octasplat.engine.runs.run_folder import CACHE, CONFIG, EVENTS, POSES
 
 
 def claim_output(scene: Path, output: Path, config: ReconstructionConfig, resume: bool) -> bool:
-    """Create the folder and its ``config.json``, or make sure that it is the run to go on with.
+    """Create the folder and its ``config.json``, or check that it is the run to resume.
 
     Returns:
         Whether the run is new.
@@ -52,7 +52,7 @@ def claim_output(scene: Path, output: Path, config: ReconstructionConfig, resume
 
 @contextmanager
 def release_on_refusal(output: Path, *, is_new: bool, is_made: bool) -> Iterator[None]:
-    """Free the folder of a new run if its photographs or settings are refused, for the corrected command.
+    """Release the folder of a new run if its photographs or settings are refused, for the corrected command.
 
     The decoded photographs stay, and poses that were found: the corrected command goes on with them.
 
@@ -76,7 +76,7 @@ def release_on_refusal(output: Path, *, is_new: bool, is_made: bool) -> Iterator
 
 
 def _is_unclaimed(output: Path, finds_poses: bool) -> bool:
-    """Return whether a folder holds nothing, or only what a start that was refused has left."""
+    """Return whether a folder is empty, or holds only the remains of a refused start."""
     for path in output.iterdir():
         if path.name == CACHE and path.is_dir():
             if not all(file.suffix in (".bin", ".json") for file in path.iterdir()):
@@ -90,12 +90,12 @@ def _is_unclaimed(output: Path, finds_poses: bool) -> bool:
 
 
 def _is_from_pose_search(poses: Path) -> bool:
-    """Return whether poses are those of a search, which says of which photographs they are."""
+    """Return whether poses are those of a search, which records its photographs."""
     return "photographs_sha256" in read_pose_record(poses)
 
 
 def write_config(scene: Path, output: Path, config: ReconstructionConfig) -> None:
-    """Write ``config.json``: where the photographs are, all settings, and the versions of what computes."""
+    """Write ``config.json``: the photographs' place, all settings, and the versions of the software."""
     content = {
         "scene": str(scene.resolve()),
         "reconstruction": config.model_dump(mode="json"),
@@ -105,7 +105,7 @@ def write_config(scene: Path, output: Path, config: ReconstructionConfig) -> Non
 
 
 def _check_settings(scene: Path, output: Path, config: ReconstructionConfig) -> None:
-    """Refuse settings that are not the run's, but for the files to export."""
+    """Check that settings are the run's own, apart from the files to export."""
     is_posed = has_colmap_model(scene)
     before = read_config(output / CONFIG).model_copy(update={"exports": config.exports})
     if _comparable(before, is_posed) != _comparable(config, is_posed):
@@ -116,6 +116,6 @@ def _check_settings(scene: Path, output: Path, config: ReconstructionConfig) -> 
 
 
 def _comparable(config: ReconstructionConfig, is_posed: bool) -> ReconstructionConfig:
-    """Return settings in which what means the same is the same."""
+    """Return settings normalised, so that equal meanings compare equal."""
     held_out = None if config.held_out is None else tuple(sorted(map(normalised, config.held_out)))
     return config.with_poses_decided(is_posed).model_copy(update={"held_out": held_out})

@@ -1,4 +1,4 @@
-"""The main job as a list of steps."""
+"""The reconstruction job as a list of steps."""
 
 import time
 from collections.abc import Callable
@@ -76,7 +76,7 @@ def reconstruct(
 
 
 def _run_all_steps(run: ReconstructionRun, *, is_new: bool, is_made: bool) -> None:
-    """Do all steps of a run whose folder is claimed."""
+    """Execute all steps of a run whose folder is claimed."""
     began, output = time.perf_counter(), run.output
     recorded = read_views(output / VIEWS) if (output / VIEWS).exists() else None
     events = JsonLinesListener(output / EVENTS, hold=recorded is not None)
@@ -95,7 +95,7 @@ def _run_all_steps(run: ReconstructionRun, *, is_new: bool, is_made: bool) -> No
 
 
 def _result_names(output: Path) -> tuple[str, ...]:
-    """The names of what is in the folder of a run, but for its cache."""
+    """Return the names in the folder of a run, except its cache."""
     names = (path.name for path in output.iterdir())
     return tuple(sorted(name for name in names if name != CACHE and not name.startswith(".")))
 
@@ -103,7 +103,7 @@ def _result_names(output: Path) -> tuple[str, ...]:
 def _require_same_dataset(
     recorded: ViewsRecord, scene: Path, output: Path, events: JsonLinesListener
 ) -> Callable[[ViewsRecord], None]:
-    """What lets a run go on with its own photographs only; until then nothing has been written."""
+    """Return a check that a run resumes with its own photographs only; nothing is written before it."""
 
     def accept(found: ViewsRecord) -> None:
         if (difference := recorded.difference(found)) is not None:

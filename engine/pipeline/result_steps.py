@@ -1,4 +1,4 @@
-"""The steps after the training: the scene is measured, and written in other formats."""
+"""Steps after the training: evaluation, and export to other formats."""
 
 from octasplat.engine.core.errors import ExportFailed
 from octasplat.engine.core.events import StageProgress, Warned
@@ -18,26 +18,26 @@ class EvaluateStep:
     is_needed_later = False
 
     def is_done(self, run: ReconstructionRun) -> bool:
-        """Return whether the measurements and the report are there."""
+        """Return whether the measurements and the report exist."""
         return (run.output / METRICS).exists() and (run.output / REPORT).exists()
 
     def __call__(self, run: ReconstructionRun) -> None:
-        """Measure them."""
+        """Measure the views."""
         with stage("evaluate", run.progress, len(run.dataset.test_indices)):
             measure_run(run.dataset, run.output, run.config, run.threads, run.progress)
 
 
 class ExportStep:
-    """Write the files that are missing, all that can be written."""
+    """Write the missing export files, as many as can be written."""
 
     is_needed_later = True
 
     def is_done(self, run: ReconstructionRun) -> bool:
-        """Return False: the stage is told even if all files are there."""
+        """Return False: the step is reported even if all files exist."""
         return False
 
     def __call__(self, run: ReconstructionRun) -> None:
-        """Write them.
+        """Write the files.
 
         Raises:
             ExportFailed: some could not be written.
@@ -50,7 +50,7 @@ class ExportStep:
 
 
 def _export(run: ReconstructionRun, names: list[str]) -> str | None:
-    """Write files; returns what could not be written and why."""
+    """Write files; return which could not be written, and why."""
     output, progress = run.output, run.progress
     gaussians, _ = read_gaussian_ply(output / SCENE)
     if (left_out := not_exported(output)) is not None:

@@ -1,4 +1,4 @@
-"""A run, and the steps that it consists of."""
+"""A run, and its steps."""
 
 from collections.abc import Callable, Sequence
 from contextlib import suppress
@@ -20,7 +20,7 @@ OnStep = Callable[[int, Dataset, Tracer, ShadingModel], None]
 
 @dataclass
 class ReconstructionRun:
-    """What the steps of a run share.
+    """State that the steps of a run share.
 
     Attributes:
         scene: folder of the photographs.
@@ -48,7 +48,7 @@ class ReconstructionRun:
 
     @property
     def dataset(self) -> Dataset:
-        """The photographs, which a step has opened."""
+        """Return the photographs, which a step has opened."""
         assert self._dataset is not None, "a step asks for the photographs before they are open"
         return self._dataset
 
@@ -68,14 +68,14 @@ class Step(Protocol):
     is_needed_later: bool
 
     def is_done(self, run: ReconstructionRun) -> bool:
-        """Return whether its result is there."""
+        """Return whether the step's result exists."""
 
     def __call__(self, run: ReconstructionRun) -> None:
-        """Make its result."""
+        """Produce the step's result."""
 
 
 def run_steps(steps: Sequence[Step], run: ReconstructionRun) -> None:
-    """Do all steps whose results are missing; if one fails without which the others can go on, they do.
+    """Execute all steps whose results are missing; if an optional one fails, the others still run.
 
     Raises:
         OctasplatError: as the step that failed first does.

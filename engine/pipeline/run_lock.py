@@ -1,4 +1,4 @@
-"""One process at a time works in the folder of a run."""
+"""Lock of a run's folder, for one process at a time."""
 
 import errno
 import fcntl
@@ -14,7 +14,7 @@ _LOCKED_MESSAGE = frozenset({errno.EAGAIN, errno.EACCES})
 
 @contextmanager
 def lock_run_folder(output: Path) -> Iterator[None]:
-    """Hold the folder of a run until the block ends; the end of the process frees it, too.
+    """Lock the folder of a run until the block or the process ends.
 
     A file system that has no locks goes without.
 

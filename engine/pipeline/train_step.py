@@ -1,4 +1,4 @@
-"""The step that trains: its result is the scene, and what the training learnt beside it."""
+"""The training step: its result is the scene, and what the training learnt beside it."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -47,12 +47,12 @@ MIN_REFLECTIVE_SHARE = 0.01
 
 
 class TrainStep:
-    """Train the scene; goes on from the newest checkpoint."""
+    """Train the scene; resumes from the newest checkpoint."""
 
     is_needed_later = True
 
     def is_done(self, run: ReconstructionRun) -> bool:
-        """Return whether the scene is there."""
+        """Return whether the scene exists."""
         return (run.output / SCENE).exists()
 
     def __call__(self, run: ReconstructionRun) -> None:
@@ -89,7 +89,7 @@ def _trainer(
     nearest_world: Float64[np.ndarray, " views"],
     clock: StageClock,
 ) -> Trainer:
-    """The training as it begins, or as its newest checkpoint left it."""
+    """Return the training from its start, or from its newest checkpoint."""
     dataset, progress, folder = run.dataset, run.progress, run.output / CHECKPOINTS
     config, exposure_changes = with_exposure_decided(config, dataset)
     fingerprint = run_fingerprint(dataset, config)
@@ -127,7 +127,7 @@ def _trainer(
 def _write_learnt_light(
     shading: ShadingModel, gaussians: FlatGaussians, output: Path, progress: Listener
 ) -> None:
-    """Write the environment and the background that were learnt, if they were."""
+    """Write the learnt environment and background, if there are any."""
     if (deferred := deferred_of(shading)) is not None:
         for name in (EXACT_ENVIRONMENT, ENVIRONMENT):
             write_environment(output / name, deferred.light.radiance_linear)
@@ -151,7 +151,7 @@ def _write_training_record(
     *,
     keeps_near_free: bool,
 ) -> None:
-    """Write what later steps and commands need to know of a training that is over."""
+    """Write the facts on a finished training that later steps and commands need."""
     record: dict[str, object] = {"seconds": clock.stop(), "iterations": trainer.state.iteration}
     if trainer.schedule.hastened_after is not None:
         record["planned_iterations"] = trainer.schedule.planned
@@ -184,7 +184,7 @@ def _plan_settings(
     should_stop: Callable[[], bool],
     clock: StageClock,
 ) -> TrainConfig:
-    """The settings of the training; those that the time decides are written down the first time."""
+    """Return the training's settings; those chosen by the time budget are recorded the first time."""
     config = settings.train
     if settings.minutes is None:
         return config

@@ -1,1 +1,1 @@
-"""New views of a scene: cameras, the paths they follow, and the images and videos they leave."""
+"""New views of a scene: cameras, camera paths, images and videos."""

@@ -1,4 +1,4 @@
-"""The one colour of each Gaussian, for files that have no place for colours that change with the direction.
+"""One colour per Gaussian, for formats without view-dependent colours.
 
 What a ray shows is linear in the colours of the Gaussians: W c, where W holds their weights along the rays.
 So the colours that come nearest to the pictures of the whole scene, taken from given cameras, are a
@@ -26,14 +26,14 @@ REGULARISATION = 0.02
 
 
 def with_constant_colour(gaussians: FlatGaussians, rgb_srgb: Float32[np.ndarray, "n 3"]) -> FlatGaussians:
-    """The same Gaussians with these colours from every direction."""
+    """Return the Gaussians with these colours from every direction."""
     return replace(gaussians, sh=((rgb_srgb - np.float32(0.5)) / np.float32(SH_C0))[:, None])
 
 
 def colours_along(
     gaussians: FlatGaussians, direction_world: Float64[np.ndarray, "3"]
 ) -> Float32[np.ndarray, "n 3"]:
-    """Display colours as a camera sees them that looks along a direction of any length from far away."""
+    """Return the display colours seen by a distant camera that looks along a direction of any length."""
     length = np.linalg.norm(direction_world)
     return _evaluate_colours(gaussians, (direction_world / length)[None])
 
@@ -46,7 +46,7 @@ def fit_colours_to_cameras(
     steps: int = CG_ITERATIONS,
     on_pass: Callable[[int, int], None] = lambda _done, _total: None,
 ) -> Float32[np.ndarray, "n 3"]:
-    """The colours with which the cameras see what they see of the scene with its harmonics, by least squares.
+    """Return the constant colours that reproduce the cameras' images best, by least squares.
 
     Small images do: each needs one trace and one backward pass a step.
 
@@ -118,7 +118,7 @@ def _conjugate_gradients(
     steps: int,
     on_pass: Callable[[int, int], None],
 ) -> Float64[np.ndarray, "n 3"]:
-    """Steps towards the minimum of |W c - y|^2 + HELD |c - start|^2, each channel on its own."""
+    """Take steps towards the minimum of |W c - y|^2 + HELD |c - start|^2, each channel on its own."""
     scale = (weights + REGULARISATION)[:, None]
     colours = start.copy()
     rest = -normal(colours, targets)

@@ -1,4 +1,4 @@
-"""One order to draw a scene in, for viewers that do not sort."""
+"""One depth order of a scene for many cameras, for viewers that do not sort."""
 
 import numpy as np
 from jaxtyping import Float, Float64, Int64
@@ -12,7 +12,7 @@ photographed from one side, 0.11 for an object from all around."""
 def shared_depth_order(
     points_world: Float[np.ndarray, "n 3"], viewers_world: Float64[np.ndarray, "v 3"]
 ) -> tuple[Int64[np.ndarray, " n"], float]:
-    """The order from far to near that most viewers would agree with.
+    """Return the far-to-near order that agrees best with most viewers.
 
     Points are ordered by the mean of their ranks by distance from each viewer (Borda 1781).
 

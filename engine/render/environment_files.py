@@ -16,7 +16,7 @@ MAX_PIXELS = 1 << 27
 
 
 def read_environment(path: Path) -> Float32[np.ndarray, "h w 3"]:
-    """The linear radiance of an HDR or EXR image; a single channel stands for all three.
+    """Return the linear radiance of an HDR or EXR image; a single channel stands for all three.
 
     Raises:
         ConfigError: the file is no such image, or holds values that are negative or not finite.
@@ -61,7 +61,7 @@ def write_background(path: Path, rgb_srgb: Float32[np.ndarray, "h w 3"]) -> None
 
 
 def read_background(path: Path) -> Float32[np.ndarray, "h w 3"]:
-    """The display values of a learnt background.
+    """Return the display values of a learnt background.
 
     Raises:
         ConfigError: the file is no such map.

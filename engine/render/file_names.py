@@ -1,4 +1,4 @@
-"""Names of the images that are rendered for photographs."""
+"""File names of rendered images."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -9,7 +9,7 @@ IMAGE_SUFFIXES = (".png", ".exr")
 
 
 def unique_render_names(photographs: Sequence[str]) -> tuple[str, ...]:
-    """For each photograph's relative path the path of its render, without a suffix; no two are the same.
+    """Return for each photograph's relative path the unique path of its render, without a suffix.
 
     ``sub/a.jpg`` becomes ``sub/a``; beside another ``sub/a.png`` both keep what tells them apart. Upper and
     lower case count as the same, as they do in the file systems of some users.
@@ -25,7 +25,7 @@ def unique_render_names(photographs: Sequence[str]) -> tuple[str, ...]:
 
 
 def has_number_pattern(pattern: Path) -> bool:
-    """Whether a file name has one place for a number, as ``frame_%04d.png``."""
+    """Return whether a file name has one place for a number, as ``frame_%04d.png``."""
     try:
         return bool(pattern.name % 0 != pattern.name % 1)
     except (TypeError, ValueError):

@@ -1,4 +1,4 @@
-"""How much of a scene of bare Gaussians is seen, and from how far away all of it fits into an image."""
+"""Visible bounds of a scene, and the camera distance at which they fit into an image."""
 
 from dataclasses import dataclass
 
@@ -20,7 +20,7 @@ _RING = 64
 
 @dataclass(frozen=True)
 class VisibleBounds:
-    """An upright cylinder around what is seen.
+    """An upright bounding cylinder of the visible part of a scene.
 
     Attributes:
         centre_world: its middle.
@@ -36,7 +36,7 @@ class VisibleBounds:
 
 
 def visible_bounds(gaussians: FlatGaussians, up_world: Float64[np.ndarray, "3"]) -> VisibleBounds:
-    """A robust cylinder around the solid Gaussians: surroundings far away and strays do not count.
+    """Return a robust cylinder around the opaque Gaussians; distant surroundings and outliers do not count.
 
     Args:
         gaussians: at least one.
@@ -67,7 +67,7 @@ def visible_bounds(gaussians: FlatGaussians, up_world: Float64[np.ndarray, "3"])
 
 
 def core_gaussians(gaussians: FlatGaussians) -> Bool[np.ndarray, " n"]:
-    """The Gaussians that are not faint and that do not lie far outside of where most are; at least one."""
+    """Return the Gaussians that are neither faint nor far outside of most others; at least one."""
     opacities = gaussians.opacities
     solid = opacities >= min(_MIN_OPACITY, 0.5 * float(opacities.max()))
     points = gaussians.means_world.astype(np.float64)
@@ -80,7 +80,7 @@ def core_gaussians(gaussians: FlatGaussians) -> Bool[np.ndarray, " n"]:
 def fitting_distance(
     bounds: VisibleBounds, elevation_degrees: float, fov_y_degrees: float, aspect: float
 ) -> float:
-    """How far from the middle a camera has to stand so that the cylinder fits into its image, with a margin.
+    """Return the camera's distance at which the cylinder fits into its image, with a margin.
 
     Args:
         bounds: the cylinder.
@@ -104,7 +104,7 @@ def fitting_distance(
 def _robust_range(
     values: Float64[np.ndarray, " n"], reach: Float64[np.ndarray, " n"], weights: Float64[np.ndarray, " n"]
 ) -> tuple[float, float]:
-    """Between which values all but the tails lie, each value reaching out by a standard deviation."""
+    """Return the range of all values but the tails, each value extended by a standard deviation."""
     low, high = values - reach, values + reach
     return _weighted_quantile(low, weights, _TAIL_QUANTILE), _weighted_quantile(
         high, weights, 1 - _TAIL_QUANTILE

@@ -1,4 +1,4 @@
-"""Reading and writing images: 8-bit PNG for looking, OpenEXR for further work.
+"""Image files: 8-bit PNG and WebP for display, OpenEXR and RGBE for further processing.
 
 Colours in memory are display values (sRGB-encoded) in [0, 1]. A PNG keeps them as they are. An EXR holds, as
 its readers expect, linear light: ``exr_layers`` converts.
@@ -30,7 +30,7 @@ def exr_layers(
     normals_world: Float32[np.ndarray, "h w 3"] | None = None,
     transparent: bool = False,
 ) -> dict[str, Float32[np.ndarray, "h w"]]:
-    """A render as named EXR channels.
+    """Return a render as named EXR channels.
 
     Args:
         rgb_srgb: The render, composited on display values; it becomes linear R, G, B as displayed, that is,
@@ -135,28 +135,33 @@ def write_rgbe(path: Path, rgb_linear: Float32[np.ndarray, "h w 3"]) -> None:
 
 
 def read_image(path: Path) -> Float32[np.ndarray, "h w c"]:
-    """An image with all its channels, as stored: 8- and 16-bit values scaled to [0, 1], floats unchanged.
+    """Return an image with all its channels, as stored: 8- and 16-bit values scaled to [0, 1], floats as is.
 
     Alpha is neither multiplied in nor divided out.
 
     Raises:
         DatasetError: The file is missing, damaged or of no known format.
     """
-    return _read(path)[0]
-
-
-def read_channels(path: Path) -> dict[str, Float32[np.ndarray, "h w"]]:
-    """The channels of an image by name (``R``, ``G``, ``B``, ``A``, ``Z``, ``N.x``, ...), as stored.
-
-    Raises:
-        DatasetError: The file is missing, damaged or of no known format.
-    """
-    pixels, names = _read(path)
-    return {name: np.ascontiguousarray(pixels[..., k]) for k, name in enumerate(names)}
+    if not path.is_file():
+        raise DatasetError(f"There is no image {path}.")
+    config = oiio.ImageSpec()
+    config.attribute(_RAW_CONFIG, 1)
+    source = oiio.ImageInput.open(str(path), config)
+    if source is None:
+        raise DatasetError(f"Cannot read {path} as an image: {oiio.geterror()}.")
+    try:
+        spec = source.spec()
+        pixels = source.read_image(0, 0, 0, spec.nchannels, oiio.FLOAT)
+        if pixels is None:
+            raise DatasetError(f"The image {path} is damaged: {source.geterror()}.")
+        shape = (spec.height, spec.width, spec.nchannels)
+        return np.asarray(pixels, dtype=np.float32).reshape(shape)
+    finally:
+        source.close()
 
 
 def shrink_to(image: Float32[np.ndarray, "h w c"], max_side_px: int) -> Float32[np.ndarray, "a b c"]:
-    """The image shrunk, by a filter that does not alias, to at most ``max_side_px``; never enlarged."""
+    """Return the image, shrunk with antialiasing to at most ``max_side_px``; never enlarged."""
     height, width, channels = image.shape
     scale = max_side_px / max(height, width)
     if scale >= 1:
@@ -182,22 +187,3 @@ def _write(path: Path, spec: Any, pixels: np.ndarray) -> None:
                 raise OutputError(f"Cannot write {path}: {output.geterror() or 'the disk may be full'}.")
     except OSError as error:
         raise OutputError(f"Cannot write {path}: {error.strerror or error}.") from error
-
-
-def _read(path: Path) -> tuple[Float32[np.ndarray, "h w c"], tuple[str, ...]]:
-    if not path.is_file():
-        raise DatasetError(f"There is no image {path}.")
-    config = oiio.ImageSpec()
-    config.attribute(_RAW_CONFIG, 1)
-    source = oiio.ImageInput.open(str(path), config)
-    if source is None:
-        raise DatasetError(f"Cannot read {path} as an image: {oiio.geterror()}.")
-    try:
-        spec = source.spec()
-        pixels = source.read_image(0, 0, 0, spec.nchannels, oiio.FLOAT)
-        if pixels is None:
-            raise DatasetError(f"The image {path} is damaged: {source.geterror()}.")
-        shape = (spec.height, spec.width, spec.nchannels)
-        return np.asarray(pixels, dtype=np.float32).reshape(shape), tuple(spec.channelnames)
-    finally:
-        source.close()

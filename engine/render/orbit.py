@@ -1,4 +1,4 @@
-"""Cameras that go round a scene, and single ones that look at it."""
+"""Cameras on a circle around a scene, and single cameras that look at it."""
 
 from dataclasses import dataclass, replace
 
@@ -36,7 +36,7 @@ class PinholeLens:
 
 @dataclass(frozen=True)
 class Orbit:
-    """A circle round a scene on which cameras stand, looking at its middle.
+    """A circle of cameras around a scene, which look at its centre.
 
     Attributes:
         target_world: what is looked at; None for the middle of the scene.

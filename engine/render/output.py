@@ -1,4 +1,4 @@
-"""Where the images of a render go: files of their own or a film, and what of them an earlier try has left."""
+"""Output of a render: image files or a video, and the resumption of an interrupted one."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,7 +15,7 @@ from octasplat.engine.render.shots import RenderFn, Shot
 
 @dataclass(frozen=True)
 class ResumeOptions:
-    """How a render goes on with the images of an earlier one that was stopped.
+    """How a render treats the images of an interrupted earlier one.
 
     Attributes:
         resume: go on with them; else they are refused.
@@ -30,7 +30,7 @@ class ResumeOptions:
 
 @dataclass(frozen=True)
 class RenderOutput:
-    """Images or a film to write.
+    """Images or a video to write.
 
     Attributes:
         path: a folder, an image, a pattern such as ``frame_%04d.png``, or a film (``.mp4``).
@@ -46,21 +46,21 @@ class RenderOutput:
 
     @property
     def is_video(self) -> bool:
-        """Whether it is a film."""
+        """Return whether the output is a video."""
         return self.path.suffix.lower() == ".mp4"
 
     @property
     def is_image_name(self) -> bool:
-        """Whether the path names images rather than a folder or a film."""
+        """Return whether the path names images rather than a folder or a video."""
         return self.path.suffix.lower() in IMAGE_SUFFIXES
 
     @property
     def folder(self) -> Path:
-        """The folder in which the files lie."""
+        """Return the folder that the files are written to."""
         return self.path.parent if self.is_video or self.is_image_name else self.path
 
     def check_count(self, images: int) -> None:
-        """Refuse the name of one image where there are several.
+        """Check that one image name is not given for several images.
 
         Raises:
             ConfigError: they would all be one file.
@@ -80,7 +80,7 @@ class RenderOutput:
         return ([shot.name for shot in shots],) if self.is_image_name else ()
 
     def files_of(self, shots: Sequence[Shot]) -> tuple[Path, ...]:
-        """Return all files that are written for shots: images, or a film and its frames."""
+        """Return all files that are written for shots: images, or a video and its frames."""
         if self.is_video:
             return (self.path, *film_files(self._frames_folder, len(shots)))
         return tuple(self.path_for(number, shot) for number, shot in enumerate(shots))
@@ -90,7 +90,7 @@ class RenderOutput:
         return self.resumption.frames_folder or self.path.with_name(f"{self.path.name}.frames")
 
     def finished_images(self, identity: str) -> FinishedImages:
-        """Return what there is already of images that look as ``identity`` says.
+        """Return the finished images of an earlier render with this identity.
 
         Raises:
             ConfigError: there are images of another render, or of one that is not to be gone on with.
@@ -102,7 +102,7 @@ class RenderOutput:
 
     @property
     def has_begun(self) -> bool:
-        """Whether an unfinished series lies there."""
+        """Return whether there is an unfinished series."""
         return self._record.exists()
 
     @property
@@ -114,7 +114,7 @@ class RenderOutput:
     def write(
         self, shots: tuple[Shot, ...], render_fn: RenderFn, finished: FinishedImages, progress: Listener
     ) -> tuple[Path, ...]:
-        """Render the shots that are not kept yet, write all, and return the files.
+        """Render the shots that are not finished yet, write all, and return the files.
 
         Raises:
             OutputError: a file cannot be written.

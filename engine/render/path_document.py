@@ -1,4 +1,4 @@
-"""What a camera path file says, checked; see ``docs/cameras.md``. Imports no numpy, as clients use it."""
+"""Camera path files, parsed and validated; see ``docs/cameras.md``. Imports no numpy, as clients use it."""
 
 import json
 import math
@@ -45,7 +45,7 @@ class PathFrame(BaseModel):
 
 
 def _is_pose(matrix: tuple[_Row, _Row, _Row, _Row]) -> bool:
-    """Whether it is a rotation, a translation and a last row of 0 0 0 1; without numpy, for clients."""
+    """Return whether a matrix is a rigid pose with the last row 0 0 0 1; without numpy, for clients."""
     x, y, z = ([row[k] for row in matrix[:3]] for k in range(3))
     across = [x[1] * y[2] - x[2] * y[1], x[2] * y[0] - x[0] * y[2], x[0] * y[1] - x[1] * y[0]]
     axes = (x, y, z)
@@ -62,7 +62,7 @@ def _is_pose(matrix: tuple[_Row, _Row, _Row, _Row]) -> bool:
 
 
 class PathDocument(BaseModel):
-    """The content of a camera path file: every camera, or keys between which cameras are made.
+    """The content of a camera path file: all cameras, or key cameras to interpolate.
 
     Attributes:
         width: of all images, px.
@@ -104,7 +104,7 @@ class PathDocument(BaseModel):
 
     @property
     def frame_count(self) -> int:
-        """Number of images."""
+        """Return the number of images."""
         if self.frames is not None:
             return len(self.frames)
         assert self.seconds is not None
@@ -112,7 +112,7 @@ class PathDocument(BaseModel):
 
 
 def read_path_document(path: Path) -> PathDocument:
-    """Read what a camera path file says.
+    """Read and validate a camera path file.
 
     Raises:
         ConfigError: the file is missing or not as described; the message names the field.
@@ -128,7 +128,7 @@ def read_path_document(path: Path) -> PathDocument:
 
 
 def parse_path_text(value: object) -> object:
-    """Return what a JSON text says; anything else as it is. Raises ValueError where it is no JSON."""
+    """Return the content of a JSON text; any other value as it is."""
     if not isinstance(value, str):
         return value
     try:
@@ -138,7 +138,7 @@ def parse_path_text(value: object) -> object:
 
 
 def _first_error(error: ValidationError) -> str:
-    """The first fault, as ``frames[3].fx: Input should be ...``."""
+    """Return the first error, as ``frames[3].fx: Input should be ...``."""
     details = error.errors()[0]
     place = ""
     for part in details["loc"]:

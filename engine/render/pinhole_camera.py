@@ -48,7 +48,7 @@ class PinholeCamera:
         cx_px: float | None = None,
         cy_px: float | None = None,
     ) -> "PinholeCamera":
-        """A camera at a pose (camera-to-world matrix); square pixels and a centred axis unless given."""
+        """Return a camera at a pose (camera-to-world matrix)."""
         rotation = world_from_cam[:3, :3].T
         return cls(
             width_px=width_px,
@@ -90,19 +90,19 @@ class PinholeCamera:
 
     @property
     def centre_world(self) -> Float64[np.ndarray, "3"]:
-        """Where the camera stands."""
+        """Return the camera's centre, world frame."""
         return np.asarray(-self.rotation_cam_from_world.T @ self.translation_cam_from_world)
 
     @property
     def world_from_cam(self) -> Float64[np.ndarray, "4 4"]:
-        """The camera-to-world matrix."""
+        """Return the camera-to-world matrix."""
         pose = np.eye(4)
         pose[:3, :3] = self.rotation_cam_from_world.T
         pose[:3, 3] = self.centre_world
         return pose
 
     def rays(self) -> ImageRays:
-        """The unit rays through the pixels' centres."""
+        """Return the unit rays through the pixels' centres."""
         x = (np.arange(self.width_px) + 0.5 - self.cx_px) / self.fx_px
         y = (np.arange(self.height_px) + 0.5 - self.cy_px) / self.fy_px
         directions_cam = np.empty((self.height_px, self.width_px, 3))
@@ -114,7 +114,7 @@ class PinholeCamera:
         return ImageRays.of(self.centre_world, directions_world, self.near_world)
 
     def project(self, points_world: Float[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 2"]:
-        """Pixel coordinates of points; not-a-number for those not in front of the camera."""
+        """Return the pixel coordinates of points; NaN for those not in front of the camera."""
         points_cam = points_world @ self.rotation_cam_from_world.T + self.translation_cam_from_world
         depth = np.where(points_cam[:, 2] > 0, points_cam[:, 2], np.nan)
         across = self.fx_px * points_cam[:, 0] / depth + self.cx_px
@@ -122,10 +122,5 @@ class PinholeCamera:
 
 
 def focal_from_fov(fov_degrees: float, side_px: int) -> float:
-    """The focal length in pixels at which ``side_px`` pixels span the angle ``fov_degrees``."""
+    """Return the focal length in pixels at which ``side_px`` pixels span ``fov_degrees``."""
     return side_px / (2 * math.tan(math.radians(fov_degrees) / 2))
-
-
-def fov_from_focal(focal_px: float, side_px: int) -> float:
-    """The angle in degrees that ``side_px`` pixels span at a focal length."""
-    return math.degrees(2 * math.atan(side_px / (2 * focal_px)))

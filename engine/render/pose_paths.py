@@ -1,4 +1,4 @@
-"""Paths for cameras: round an object, or smoothly through given poses.
+"""Camera paths: around an object, or smoothly through given poses.
 
 Poses are camera-to-world matrices in float64; cameras look along +z, x right, y down.
 """
@@ -18,7 +18,7 @@ _WRAPPED_KEYS = 3
 
 @dataclass(frozen=True)
 class Turntable:
-    """A circle round an axis from which a camera looks at a point.
+    """A circle around an axis from which a camera looks at a point.
 
     Attributes:
         centre_world: The point looked at.
@@ -35,7 +35,7 @@ class Turntable:
     start_world: Float64[np.ndarray, "3"] | None = None
 
     def poses(self, frames: int) -> Float64[np.ndarray, "frames 4 4"]:
-        """One turn in equal steps; see ``turntable``."""
+        """Return one turn in equal steps; see :func:`turntable`."""
         return turntable(
             self.centre_world, self.up_world, self.radius, self.height, frames, start_world=self.start_world
         )
@@ -46,7 +46,7 @@ def look_at(
     target_world: Float64[np.ndarray, "3"],
     up_world: Float64[np.ndarray, "3"],
 ) -> Float64[np.ndarray, "4 4"]:
-    """The pose of a camera that looks at a target and holds ``up_world`` upright in its image.
+    """Return the pose of a camera that looks at a target and holds ``up_world`` upright in its image.
 
     Raises:
         ConfigError: The camera stands in its target, or looks along the up direction.
@@ -75,7 +75,7 @@ def turntable(
     start_world: Float64[np.ndarray, "3"] | None = None,
     turns: float = 1.0,
 ) -> Float64[np.ndarray, "frames 4 4"]:
-    """Poses on a circle, all looking at its axis' ``centre_world``; the last step leads back to the first.
+    """Return poses on a circle, all looking at its axis' ``centre_world``; the last step closes the circle.
 
     Args:
         centre_world: The point looked at.
@@ -115,7 +115,7 @@ def fit_turntable(
     camera_forwards: Float64[np.ndarray, "n 3"],
     camera_ups: Float64[np.ndarray, "n 3"],
 ) -> Turntable:
-    """The circle that goes round what the cameras look at, about where they stand.
+    """Return the circle around what the cameras look at, at their typical distance and height.
 
     The centre is the point nearest to all viewing axes, by least squares with weights that fall with the
     distance, so that a few cameras that look elsewhere do not move it. Up is the mean of the cameras' up
@@ -162,7 +162,7 @@ class PosePath:
 
     @property
     def key_times(self) -> Float64[np.ndarray, "m"]:
-        """When each key is passed, from 0 to 1; a closed path passes the first key again at 1."""
+        """Return the times of the keys, from 0 to 1; a closed path passes the first key again at 1."""
         positions = self.poses[:, :3, 3]
         if self.closed:
             positions = np.concatenate([positions, positions[:1]])
@@ -173,7 +173,7 @@ class PosePath:
         return np.asarray(times / times[-1])
 
     def poses_at(self, times: Float64[np.ndarray, "k"]) -> Float64[np.ndarray, "k 4 4"]:
-        """The poses at times from 0 to 1."""
+        """Return the poses at times from 0 to 1."""
         key_times, order = self.key_times, np.arange(len(self.poses))
         if self.closed:
             # A few keys from the other end make the joint as smooth as the rest.
@@ -193,7 +193,7 @@ class PosePath:
 def interpolate(
     poses: Float64[np.ndarray, "n 4 4"], frames: int, *, closed: bool = False
 ) -> Float64[np.ndarray, "frames 4 4"]:
-    """Poses in equal steps of time along a smooth path through key poses.
+    """Return poses in equal time steps along a smooth path through key poses.
 
     An open path starts at the first key and ends at the last; a closed one leads back to the first, which is
     not repeated at the end.
@@ -209,7 +209,7 @@ def interpolate(
 def _tangents(
     times: Float64[np.ndarray, "n"], positions: Float64[np.ndarray, "n 3"]
 ) -> Float64[np.ndarray, "n 3"]:
-    """Catmull-Rom velocities at uneven times: of the parabola through each key and its neighbours."""
+    """Return Catmull-Rom velocities at uneven times: of the parabola through each key and its neighbours."""
     spans = np.diff(times)[:, None]
     slopes = np.diff(positions, axis=0) / spans
     if len(slopes) == 1:
@@ -221,7 +221,7 @@ def _tangents(
 def _nearest_to_axes(
     centres: Float64[np.ndarray, "n 3"], forwards: Float64[np.ndarray, "n 3"]
 ) -> Float64[np.ndarray, "3"]:
-    """The point of the least sum of distances to lines, by reweighted least squares."""
+    """Return the point with the least sum of distances to lines, by reweighted least squares."""
     across = np.eye(3) - forwards[:, :, None] * forwards[:, None, :]
     projected = np.einsum("nij,nj->ni", across, centres)
     extent = float(np.linalg.norm(np.ptp(centres, axis=0)))

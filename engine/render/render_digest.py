@@ -1,4 +1,4 @@
-"""What decides how a render looks, as one digest."""
+"""Digest of all inputs that decide how a render looks."""
 
 import hashlib
 from collections.abc import Mapping, Sequence
@@ -14,7 +14,7 @@ from octasplat.engine.settings.base import Settings, json_by_former_names
 
 
 def render_digest(*parts: Any) -> str:
-    """A digest of values: numbers, texts, arrays, models, dataclasses, and lists or mappings of them.
+    """Return a digest of values: numbers, texts, arrays, models, dataclasses, and lists or mappings of them.
 
     Paths count by the content of their files and not by their names, so that the same things elsewhere are
     the same; those within a dataclass say where it came from and do not count. The version of octasplat does.
@@ -26,7 +26,7 @@ def render_digest(*parts: Any) -> str:
 
 
 def _update_digest(digest: "hashlib._Hash", value: Any) -> None:
-    """Every value begins with its type and ends with a length, so that no two run into each other."""
+    """Add a value, with its type first and its length last, so that no two values run into each other."""
     digest.update(type(value).__name__.encode() + b"\0")
     if isinstance(value, np.ndarray):
         digest.update(f"{value.dtype.str}{value.shape}".encode())

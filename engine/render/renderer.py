@@ -1,4 +1,4 @@
-"""Whole images from a tracer, a band of rows at a time."""
+"""Full images from a tracer, in bands of rows."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
@@ -54,7 +54,7 @@ def render_rays(
     shading: ShadingModel = PLAIN,
     sample: int = 0,
 ) -> RenderedImage:
-    """Trace an image and develop it; directions have unit length.
+    """Trace and shade an image; directions have unit length.
 
     Where ``shading`` has features, ``tracer`` must have been built with them. ``sample`` numbers pictures of
     which the mean will be taken, so that what the model draws at random is evenly spread over them.
@@ -96,7 +96,7 @@ def shade_layer(
     layer: str,
     sample: int,
 ) -> tuple[Float32[np.ndarray, "p f"], Float32[np.ndarray, " p"]]:
-    """What a layer of the shading shows at some pixels of an image, and their alpha.
+    """Return the color and alpha of a shading model's layer at some pixels of an image.
 
     Args:
         tracer: as for :func:`render_rays`.
@@ -120,7 +120,7 @@ def shade_layer(
 def front_normals(
     tracer: Tracer, image: ImageRays, depth_median: Float32[np.ndarray, "h w"]
 ) -> Float32[np.ndarray, "h w 3"]:
-    """Unit normals of the surface in front, turned to the viewer; 0 where nothing was met.
+    """Return unit normals of the front surface, facing the viewer; 0 where nothing was hit.
 
     Where a thing ends before another, the mean normal along a ray is of both. Here rays end just behind the
     depth at which half of their light is gone, so that it is of the first.
@@ -142,7 +142,7 @@ def front_normals(
 def dominant_gaussians(
     tracer: Tracer, gaussians: FlatGaussians, image: ImageRays
 ) -> Int32[np.ndarray, "h w"]:
-    """Return the number of the Gaussian that weighs most on the ray of each pixel, -1 where it met none.
+    """Return the Gaussian with the largest weight on each pixel's ray, -1 where it hit none.
 
     Args:
         tracer: built around ``gaussians``.
@@ -161,7 +161,7 @@ def dominant_gaussians(
 def _row_bands(
     image: ImageRays, rays_at_once: int = RAYS_PER_BATCH
 ) -> Iterator[tuple[slice, Int64[np.ndarray, " r"], RayBatch]]:
-    """The rows of an image a band at a time, the numbers of the band's pixels in tiles, and their rays."""
+    """Yield bands of an image: its rows, the pixels' numbers in tiles, and their rays."""
     height, width = image.height_px, image.width_px
     rows = max(1, rays_at_once // (width * TILE_SIZE)) * TILE_SIZE
     for top in range(0, height, rows):
@@ -171,14 +171,14 @@ def _row_bands(
 
 
 def tile_order(height: int, width: int) -> Int64[np.ndarray, " r"]:
-    """Row-major numbers of an image's pixels, tile after tile."""
+    """Return row-major numbers of an image's pixels, tile after tile."""
     y, x = np.divmod(np.arange(height * width), width)
     across = -(-width // TILE_SIZE)
     return np.argsort((y // TILE_SIZE) * across + x // TILE_SIZE, kind="stable")
 
 
 def pixel_jitter(pixels: Int64[np.ndarray, " r"], sample: int) -> Float64[np.ndarray, "2 r"]:
-    """Two numbers in [0, 1) for each pixel; those of following samples fill the gaps that are left.
+    """Return two numbers in [0, 1) for each pixel, a low-discrepancy sequence over the samples.
 
     Steps of the plastic number's powers, from a place of the pixel's own: "The Unreasonable Effectiveness of
     Quasirandom Sequences" (Roberts 2018, https://extremelearning.com.au).
@@ -187,5 +187,5 @@ def pixel_jitter(pixels: Int64[np.ndarray, " r"], sample: int) -> Float64[np.nda
 
 
 def background_colour(name: str) -> Float32[np.ndarray, "3"]:
-    """The colour called ``black`` or ``white``."""
+    """Return the colour called ``black`` or ``white``."""
     return np.full(3, 1.0 if name == "white" else 0.0, np.float32)

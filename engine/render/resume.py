@@ -1,4 +1,4 @@
-"""Images of a series that are done, so that a series that was stopped goes on with the others.
+"""Record of a series' finished images, by which an interrupted series is resumed.
 
 Beside the images a file says, a line each, what they are images of and which of them are whole. It is there
 only while the series is unfinished. An image counts if its line is there and its content is as it says.
@@ -39,16 +39,16 @@ class FinishedImages:
         self._digests = self._read(resume, or_anew)
 
     def __len__(self) -> int:
-        """How many images the record names."""
+        """Return the number of images that the record names."""
         return len(self._digests)
 
     def is_finished(self, path: Path) -> bool:
-        """Whether an image is done and its file as it was written."""
+        """Return whether an image is finished and its file unchanged."""
         digest = self._digests.get(self._name(path))
         return digest is not None and path.is_file() and _sha256(path) == digest
 
     def add(self, path: Path) -> None:
-        """Remember that an image is done; its file is written.
+        """Record that an image is finished; its file is written.
 
         Raises:
             NoSpaceLeft: there is no room for the record.
@@ -65,7 +65,7 @@ class FinishedImages:
         self._digests[name] = digest
 
     def remove_record(self) -> None:
-        """Forget the record: all images are done."""
+        """Remove the record, as all images are finished."""
         self.record.unlink(missing_ok=True)
 
     def _name(self, path: Path) -> str:
@@ -112,7 +112,7 @@ class FinishedImages:
         return {}
 
     def _remove_partial(self) -> None:
-        """Remove files that a process which was killed did not write to their ends."""
+        """Remove files that a killed process did not complete."""
         for partial in self.folder.rglob(".*.partial.*"):
             partial.unlink(missing_ok=True)
 

@@ -1,4 +1,4 @@
-"""Series of images, to files of their own or to a film: one way for scenes alone and for those on a stage."""
+"""Series of images, written as files of their own or as a video."""
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
@@ -30,7 +30,7 @@ def render_series(
     progress: Count,
     on_finished: OnFinished = lambda _count: None,
 ) -> tuple[Path, ...]:
-    """Render each shot to a file of its own, but for those that are there already; returns the files.
+    """Render each shot to a file of its own, skip finished ones, and return the files.
 
     Args:
         shots: what to render.
@@ -49,7 +49,7 @@ def render_series(
 
 
 def film_files(folder: Path, count: int) -> tuple[Path, ...]:
-    """Return the files of a film's frames, and of the film among them while it is written."""
+    """Return the files of a video's frames, and of the video among them while it is written."""
     return (*(folder / f"{number:06d}.png" for number in range(count)), folder / VIDEO_FILE)
 
 
@@ -62,10 +62,10 @@ def render_video(
     progress: Count,
     on_finished: OnFinished = lambda _count: None,
 ) -> None:
-    """Render shots of one image size as the frames of a film.
+    """Render shots of one image size as the frames of a video.
 
-    The frames are kept as PNG files, which lose nothing that the film has, in the folder of ``finished``, until
-    the film is whole; then they go, and the folder unless it holds something else.
+    The frames are stored as PNG files, as exact as the video, in the folder of ``finished`` until the video is
+    complete; then they are removed, and the folder if it is empty.
 
     Raises:
         OutputError: a file cannot be written.

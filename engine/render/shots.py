@@ -1,4 +1,4 @@
-"""What is rendered of a scene: its photographs' views, turntables and paths, each image a shot."""
+"""Shots, the images to render of a scene: its photographs' views, turntables and camera paths."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -50,7 +50,7 @@ It raises :class:`octasplat.engine.core.errors.OutputError` where the file canno
 def view_shots(
     viewpoints: Viewpoints, indices: Int64[np.ndarray, " n"], near_world: float = 0.0
 ) -> tuple[Shot, ...]:
-    """The views of photographs, with their lenses, named like them; nothing nearer than ``near_world``."""
+    """Return the views of photographs with their lenses and names; rays start at ``near_world``."""
     names = unique_render_names([view.name for view in viewpoints.views])
     views = [(names[index], viewpoints.views[index]) for index in indices]
     return tuple(
@@ -60,7 +60,7 @@ def view_shots(
 
 
 def camera_shots(cameras: Sequence[PinholeCamera]) -> tuple[Shot, ...]:
-    """Views of cameras one after another, named ``frame_0000`` and so on."""
+    """Return the views of cameras in sequence, named ``frame_0000`` and so on."""
     return tuple(Shot(f"frame_{number:04d}", camera.rays) for number, camera in enumerate(cameras))
 
 
@@ -71,7 +71,7 @@ def turntable_cameras(
     height_px: int,
     fov_y_degrees: float = DEFAULT_FOV_Y_DEGREES,
 ) -> tuple[PinholeCamera, ...]:
-    """One turn of a turntable as cameras.
+    """Return one turn of a turntable as cameras.
 
     Raises:
         ConfigError: there are no frames.
@@ -83,7 +83,7 @@ def turntable_cameras(
 
 
 def turntable_of_views(viewpoints: Viewpoints) -> Turntable:
-    """The turntable that fits where the photographs were taken.
+    """Return the turntable that fits the photographs' cameras.
 
     Raises:
         ConfigError: the cameras share no centre or no up direction.
@@ -94,7 +94,7 @@ def turntable_of_views(viewpoints: Viewpoints) -> Turntable:
 
 
 def fov_y_of_views(viewpoints: Viewpoints) -> float:
-    """The angle from the top to the bottom of the first photograph, kept within what a pinhole shows well."""
+    """Return the first photograph's vertical field of view in degrees, clamped to a pinhole's range."""
     camera = viewpoints.cameras[viewpoints.views[0].camera_index]
     middle = camera.width_px / 2
     edges = camera.directions_cam(np.array([[middle, 0.0], [middle, float(camera.height_px)]]))
@@ -114,7 +114,7 @@ def gaussian_turntable(
     aspect: float = 1.0,
     elevation_degrees: float = ELEVATION_DEGREES,
 ) -> Turntable:
-    """A turntable for a scene of which nothing but its Gaussians is known: all that is seen of it fits.
+    """Return a turntable that shows all visible Gaussians of a scene without cameras.
 
     Args:
         gaussians: the scene.
@@ -139,7 +139,7 @@ def scene_render_fn(
     trained_rad: float = 0.0,
     shading: ShadingModel = PLAIN,
 ) -> RenderFn:
-    """What renders a shot of a scene to a file.
+    """Return the function that renders a shot of a scene to a file.
 
     ``.exr`` gets linear R, G, B, alpha A, the expected distance Z (0 where nothing is) and the world normal
     N.x, N.y, N.z; anything else gets 8-bit display colours.
@@ -176,12 +176,12 @@ def scene_render_fn(
 
 
 def training_pixel_angle(viewpoints: Viewpoints) -> float:
-    """The angle of a pixel in the middle of the first view of a training."""
+    """Return the angle of the central pixel of the first training view, in radians."""
     return viewpoints.cameras[viewpoints.views[0].camera_index].pixel_angle_rad
 
 
 def _view_rays(view: PosedView, camera: Camera, near_world: float) -> ImageRays:
-    """All rays of a view; pixels that the camera cannot un-project look along its axis."""
+    """Return all rays of a view; pixels that the camera cannot un-project look along its axis."""
     width, height = view.width_px, view.height_px
     directions_world = np.empty((height, width, 3), np.float32)
     rows = max(1, _ROWS_PER_BLOCK // width)

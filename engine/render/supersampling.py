@@ -1,4 +1,4 @@
-"""Pictures of what is sharper than a pixel: several rays through each, their light averaged."""
+"""Supersampling: several rays per pixel, averaged in linear light or in display values."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -47,7 +47,7 @@ def pixel_means(
     side: int,
     part: Callable[[float], None] = lambda _share: None,
 ) -> PixelMeans:
-    """Trace ``side`` x ``side`` rays a pixel, evenly spread, through a scene whose shading gives radiance.
+    """Trace ``side`` x ``side`` rays per pixel, evenly spread, through a scene whose shading gives radiance.
 
     Where these differ, at edges and where facets are drawn, as many again across and down take their place.
 
@@ -84,7 +84,7 @@ def pixel_means(
 
 
 def pixel_angle(image: ImageRays) -> float:
-    """The angle of a pixel in the middle of an image, from its centre to its neighbour's; 0 of one pixel."""
+    """Return the angle of an image's central pixel, to its neighbour's centre; 0 for a single pixel."""
     ways = image.directions_world.astype(np.float64)
     row, column = image.height_px // 2, image.width_px // 2
     if image.width_px > 1:
@@ -97,7 +97,7 @@ def pixel_angle(image: ImageRays) -> float:
 
 
 def rays_per_pixel_side(image: ImageRays, trained_rad: float) -> int:
-    """So many rays across a pixel that they lie about as close as the training's, ``MAX_RAYS_PER_SIDE`` at most.
+    """Return the rays across a pixel at the training's spacing, ``MAX_RAYS_PER_SIDE`` at most.
 
     Args:
         image: rays through the centres of the pixels.
@@ -115,7 +115,7 @@ def render_averaged(
     shading: ShadingModel,
     side: int,
 ) -> RenderedImage:
-    """An image whose display colours and alpha are means over ``side`` x ``side`` rays a pixel.
+    """Return an image whose display colours and alpha are means over ``side`` x ``side`` rays per pixel.
 
     That is what making a larger picture smaller gives. Everything else is that of the pixels' centres.
     """
@@ -139,7 +139,7 @@ def render_filtered(
     shading: ShadingModel,
     side: int,
 ) -> RenderedImage:
-    """An image whose colours and alpha are those that a photograph's pixels collect.
+    """Return an image whose colours and alpha are filtered as a photograph's pixels collect them.
 
     Everything else is that of the centres of the pixels.
     """
@@ -153,6 +153,6 @@ def render_filtered(
 
 
 def _offsets(side: int) -> list[tuple[float, float]]:
-    """Places of ``side`` x ``side`` rays in a pixel, across and down from its centre, row by row."""
+    """Return places of ``side`` x ``side`` rays in a pixel, across and down from its centre, row by row."""
     steps = [((k + 0.5) / side - 0.5) for k in range(side)]
     return [(across, down) for down, across in product(steps, steps)]

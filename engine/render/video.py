@@ -1,4 +1,4 @@
-"""Videos from frames, by the ffmpeg program that the imageio-ffmpeg package carries.
+"""Videos from frames, by the ffmpeg program in the imageio-ffmpeg package.
 
 ffmpeg runs as a program of its own; frames go to it through a pipe as they are made.
 """
@@ -22,7 +22,7 @@ DEFAULT_CRF = 18
 
 
 class VideoWriter:
-    """Writes frames of display values to an H.264 video that players everywhere show (yuv420p, BT.709).
+    """Writer of display values as an H.264 video that common players show (yuv420p, BT.709).
 
     Use it as a context manager. The file appears under its name only when the block ends without an error.
     Odd widths and heights, which the format does not allow, gain a copy of the last column or row.
@@ -99,7 +99,7 @@ class VideoWriter:
         error: BaseException | None,
         traceback: TracebackType | None,
     ) -> None:
-        """Finish the video, or remove what there is of it if the block failed.
+        """Finish the video, or remove the incomplete file if the block failed.
 
         Raises:
             OutputError: ffmpeg failed, or there were no frames.
@@ -133,7 +133,7 @@ class VideoWriter:
         return process.wait()
 
     def _command(self, target: Path) -> list[str]:
-        """The program and its arguments: raw RGB in, H.264 out, its colours' meaning stated in the file."""
+        """Return ffmpeg's arguments: raw RGB in, H.264 out, with the colour space stated in the file."""
         size = f"{self._width + self._width % 2}x{self._height + self._height % 2}"
         return [
             imageio_ffmpeg.get_ffmpeg_exe(), "-y", "-loglevel", "error",
@@ -145,7 +145,7 @@ class VideoWriter:
         ]  # fmt: skip
 
     def _reason(self) -> str:
-        """The last thing ffmpeg said."""
+        """Return the last line of ffmpeg's error output."""
         if self._messages is None:
             return "ffmpeg stopped"
         self._messages.seek(0)

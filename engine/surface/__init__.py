@@ -1,4 +1,4 @@
-"""One triangle mesh of a scene: depth maps that the tracer renders, fused into a signed distance volume.
+"""Surface meshes of scenes: traced depth maps, fused into a truncated signed distance volume.
 
 cameras -> depth maps -> sparse volume -> marching cubes -> clean-up -> decimation -> colours -> file
 """

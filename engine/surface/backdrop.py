@@ -1,4 +1,4 @@
-"""A sphere around a mesh that shows, wherever the mesh has a gap, what the scene shows there."""
+"""A backdrop sphere around a mesh, which shows the scene wherever the mesh has a gap."""
 
 import numpy as np
 from jaxtyping import Float64
@@ -10,7 +10,7 @@ RADIUS_FACTOR = 1.05
 
 
 def with_backdrop(mesh: TriangleMesh, centre_world: Float64[np.ndarray, "3"]) -> TriangleMesh:
-    """The mesh and a closed sphere around all of it that is seen from inside; to be done before colours.
+    """Return the mesh with a closed sphere around it that is seen from inside; to be called before colouring.
 
     Args:
         mesh: without colours.

@@ -1,4 +1,4 @@
-"""Colours and materials of surface points, as the cameras that see them best see them."""
+"""Colours and materials of surface points, baked from the cameras that see them best."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -23,7 +23,7 @@ MIN_ALPHA = 0.25
 
 @dataclass(frozen=True)
 class BakeTarget:
-    """What is wanted of rays.
+    """What is read from traced rays.
 
     Attributes:
         width: how many numbers.
@@ -49,7 +49,7 @@ def bake(
     tolerance: float,
     progress: Progress = lambda _done, _total: None,
 ) -> tuple[Float32[np.ndarray, "n c"], Bool[np.ndarray, " n"]]:
-    """Trace the scene along the rays from the best cameras to points on its surface.
+    """Trace the scene from the best cameras to points on its surface and average what they see.
 
     The best cameras of a point are those that have it in their image, unhidden by the mesh, and look at it
     most squarely and from nearby. What they see is averaged with the squares of that measure as weights.
@@ -90,7 +90,7 @@ def _best_cameras(
     occluder: Occluder,
     tolerance: float,
 ) -> tuple[np.ndarray, Float32[np.ndarray, "n k"]]:
-    """Numbers of the best cameras of each point and their weights, 0 where there are fewer."""
+    """Return the best cameras of each point and their weights, 0 where there are fewer."""
     count = len(points)
     choice = np.zeros((count, VIEWS_PER_POINT), np.int32)
     weights = np.zeros((count, VIEWS_PER_POINT), np.float32)

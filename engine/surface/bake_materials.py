@@ -18,7 +18,7 @@ surface by a normal that looks away from the viewer shows black."""
 
 
 def material_features(gaussians: FlatGaussians) -> Float32[np.ndarray, "n 6"]:
-    """The channels of the materials side by side, as a tracer takes them for :data:`MATERIAL_TARGET`.
+    """Return the materials' channels side by side, as a tracer takes them for :data:`MATERIAL_TARGET`.
 
     The last is the share of the light from all around that arrives, all of it where the scene does not say.
     """
@@ -44,7 +44,7 @@ def with_materials(
     known: Bool[np.ndarray, " n"],
     light_frame: Float64[np.ndarray, "3 3"],
 ) -> TriangleMesh:
-    """The laid-out mesh with its materials.
+    """Return the unwrapped mesh with baked material textures.
 
     Args:
         layout: of the texture.
@@ -78,7 +78,7 @@ def _normals(
     surface_world: Float64[np.ndarray, "n 3"],
     known: Bool[np.ndarray, " n"],
 ) -> Float64[np.ndarray, "n 3"]:
-    """Unit normals that lean no farther from the surface than is of use."""
+    """Return unit normals, limited in their angle to the surface's."""
     length = np.linalg.norm(blended_world, axis=1, keepdims=True)
     normals = np.where(
         known[:, None] & (length > 1e-3), blended_world / np.maximum(length, 1e-3), surface_world

@@ -1,4 +1,4 @@
-"""Colours of a surface fitted to pictures of the scene, so that its own pictures differ from them least.
+"""Colours of a surface mesh, fitted to renders of the scene by least squares.
 
 What a pixel shows is a mean of the colours at a few points of the surface, its vertices or the pixels of its
 texture. So all pixels of all pictures make one sparse linear system, solved by least squares.
@@ -38,49 +38,49 @@ RAYS_PER_BATCH = 1 << 20
 
 @runtime_checkable
 class Palette(Protocol):
-    """The points of a surface that have colours of their own."""
+    """The coloured points of a surface: vertices or texels."""
 
     @property
     def mesh(self) -> TriangleMesh:
-        """The surface."""
+        """Return the surface."""
 
     @property
     def neighbours(self) -> Int[np.ndarray, "e 2"]:
-        """Numbers of points side by side, each pair once."""
+        """Return the pairs of neighbouring points, each once."""
 
     def shares(
         self, faces: Int32[np.ndarray, " r"], weights: Float32[np.ndarray, "r 3"]
     ) -> tuple[Int[np.ndarray, "r k"], Float32[np.ndarray, "r k"]]:
-        """Numbers of the points whose colours are seen at places of triangles, and their shares."""
+        """Return the points, and their interpolation weights, that color places on triangles."""
 
 
 @dataclass(frozen=True)
 class VertexPalette:
-    """Every vertex of a mesh has a colour, and triangles go from one to the other."""
+    """Colours at a mesh's vertices, interpolated over triangles."""
 
     mesh: TriangleMesh
 
     @property
     def neighbours(self) -> Int[np.ndarray, "e 2"]:
-        """Both ends of each edge."""
+        """Return both ends of each edge."""
         return unique_edges(self.mesh.faces)
 
     def shares(
         self, faces: Int32[np.ndarray, " r"], weights: Float32[np.ndarray, "r 3"]
     ) -> tuple[Int[np.ndarray, "r k"], Float32[np.ndarray, "r k"]]:
-        """The triangles' corners."""
+        """Return the triangles' corners with the barycentric weights."""
         return self.mesh.faces[faces], weights
 
 
 @dataclass(frozen=True)
 class TexturePalette:
-    """Every pixel of a texture that shows surface has a colour; between them a viewer interpolates."""
+    """Colours at the texels that show surface, interpolated bilinearly."""
 
     layout: TextureLayout
 
     @property
     def mesh(self) -> TriangleMesh:
-        """The mesh cut open."""
+        """Return the unwrapped mesh."""
         return self.layout.mesh
 
     @cached_property
@@ -92,7 +92,7 @@ class TexturePalette:
 
     @property
     def neighbours(self) -> Int[np.ndarray, "e 2"]:
-        """Pixels side by side or one above the other."""
+        """Return horizontally and vertically neighbouring texels."""
         numbers = self._numbers
         pairs = np.concatenate(
             [
@@ -105,7 +105,7 @@ class TexturePalette:
     def shares(
         self, faces: Int32[np.ndarray, " r"], weights: Float32[np.ndarray, "r 3"]
     ) -> tuple[Int[np.ndarray, "r k"], Float32[np.ndarray, "r k"]]:
-        """The four pixels around each place, as far as they show surface."""
+        """Return the four texels around each place, as far as they show surface."""
         mesh, side = self.mesh, self.layout.side_px
         assert mesh.uv is not None
         at = (weights[:, :, None] * mesh.uv[mesh.faces[faces]]).sum(axis=1) * side - 0.5
@@ -134,7 +134,7 @@ def fit_colours(
     pictures: Sequence[Picture],
     progress: Progress = lambda _done, _total: None,
 ) -> tuple[Float32[np.ndarray, "n 3"], Bool[np.ndarray, " n"]]:
-    """Colours with which the surface looks as like the pictures as it can.
+    """Return the colours with which the surface's renders match the scene's best.
 
     Corrections of ``start_srgb`` are sought, by conjugate gradients on the normal equations with a few steps;
     a correction that differs from its neighbours' costs a little, so that what lies between the pixels
@@ -160,7 +160,7 @@ def fit_colours(
 def _normal_equations(
     points: Palette, start_srgb: Float32[np.ndarray, "n 3"], pictures: Sequence[Picture], progress: Progress
 ) -> tuple[csr_matrix, Float32[np.ndarray, "n 3"]]:
-    """Matrix and right side: summed squares of the shares, and what the pixels lack."""
+    """Return the matrix and right side: summed products of the shares, and the pixels' residuals."""
     count = len(start_srgb)
     scene = TriangleBvh(points.mesh.vertices_world, points.mesh.faces)
     normal = csr_matrix((count, count), dtype=np.float32)
@@ -184,7 +184,7 @@ def _normal_equations(
 def _equations(
     scene: TriangleBvh, points: Palette, rays: ImageRays, rgba: UInt8[np.ndarray, "h w 4"]
 ) -> tuple[Int[np.ndarray, "r k"], Float32[np.ndarray, "r k"], Float32[np.ndarray, "r 3"]]:
-    """Points and their shares in each pixel that shows nothing but surface, and scene, and its colour."""
+    """Return points and shares of each pixel that shows only surface in both, and its colour."""
     seen = rgba.reshape(-1, 4).astype(np.float32) / 255
     samples = [scene.closest(rays.shifted(*offset).rays) for offset in SAMPLES_PER_PIXEL]
     used = np.flatnonzero(np.all([hits.is_hit for hits in samples], axis=0) & (seen[:, 3] >= MIN_ALPHA))

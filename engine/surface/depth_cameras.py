@@ -1,4 +1,4 @@
-"""The cameras that depth is rendered from: pinholes where photographs were taken, or all around a scene."""
+"""Cameras for depth maps: pinholes in the photographs' places, or all around a scene."""
 
 import numpy as np
 from jaxtyping import Float64, Int64
@@ -27,7 +27,7 @@ AROUND_FOV_DEGREES = 50.0
 def photograph_cameras(
     viewpoints: Viewpoints, indices: Int64[np.ndarray, " n"], max_side: int, near_world: float = 0.0
 ) -> tuple[PinholeCamera, ...]:
-    """Pinhole cameras in place of those of photographs, their images no larger than ``max_side``.
+    """Return pinhole cameras in place of the photographs', images no larger than ``max_side``.
 
     They see nothing nearer than ``near_world``.
 
@@ -48,7 +48,7 @@ def photograph_cameras(
 def cameras_around(
     gaussians: FlatGaussians, max_side: int, count: int = AROUND_COUNT
 ) -> tuple[PinholeCamera, ...]:
-    """Square cameras spread evenly over a sphere, for a scene of which nothing but its Gaussians is known.
+    """Return square cameras spread over a sphere, for a scene of which only Gaussians are known.
 
     The sphere lies around their median weighted by opacity, so far out that four fifths of all opacity fit
     into an image. Right for an object; what surrounds the viewer (a room) has to be seen from inside.
@@ -72,7 +72,7 @@ def cameras_around(
 
 
 def _across(direction: Float64[np.ndarray, "3"]) -> Float64[np.ndarray, "3"]:
-    """An axis that is not along ``direction``."""
+    """Return an axis that is not along ``direction``."""
     return np.eye(3)[int(np.argmin(np.abs(direction)))]
 
 

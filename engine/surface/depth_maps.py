@@ -1,4 +1,4 @@
-"""Depth maps and colours of a scene, rendered by the tracer and kept in a temporary file."""
+"""Depth maps and colours of a scene, rendered by the tracer into a temporary file."""
 
 import os
 import tempfile
@@ -49,7 +49,7 @@ def render_depth_maps(
     folder: Path,
     progress: Progress = lambda _done, _total: None,
 ) -> tuple[DepthMaps, tuple[Picture, ...]]:
-    """Render depth maps and colours from ``cameras`` into a file in ``folder``, 12 bytes a pixel.
+    """Render depth maps and colours from ``cameras`` into a file in ``folder``, 12 bytes per pixel.
 
     The file has no name, so that nothing is left of it whatever happens.
 

@@ -1,4 +1,4 @@
-"""From Gaussians and cameras to one coloured triangle mesh."""
+"""Extraction of one coloured triangle mesh from Gaussians and cameras."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -66,9 +66,9 @@ def extract_levels(
     listener: Listener = ignore,
     should_stop: Callable[[], bool] = lambda: False,
 ) -> tuple[ExtractedSurface, ...]:
-    """Return one surface in several levels of detail: what is fused once is decimated to each and coloured.
+    """Return one surface in several levels of detail, fused once, then decimated and coloured for each.
 
-    Each is what it is alone.
+    Each level is the same as when it is extracted alone.
 
     Args:
         tracer: with the scene built.
@@ -76,12 +76,14 @@ def extract_levels(
         options: all settings.
         levels: at most so many triangles; None keeps all.
         scratch: folder for a temporary file of 12 bytes for every pixel of the depth maps.
-        light_frame: bake materials, which the tracer then has as its first features
-            (:func:`octasplat.engine.surface.bake_materials.material_features`), for light with these rows right,
-            up and forward in the world; None bakes colours. Needs a texture.
+        light_frame: rows are the light's right, up and forward axes, world frame. Materials are baked, which
+            the tracer must have as its first features
+            (:func:`octasplat.engine.surface.bake_materials.material_features`), and a texture is needed; None
+            bakes colours.
         photographs: what colours are fitted to; without any, what the scene shows from ``cameras``.
-        listener: hears the stages ``depth``, ``fusing``, ``meshing``, ``settling`` and ``decimating`` (if
-            asked), ``unwrapping`` (with a texture), ``colouring`` and ``fitting`` (of colours).
+        listener: receives the events of the stages ``depth``, ``fusing``, ``meshing``, ``settling`` and
+            ``decimating`` (if requested), ``unwrapping`` (with a texture), ``colouring`` and ``fitting`` (of
+            colours).
         should_stop: asked now and then.
 
     Raises:
@@ -138,7 +140,7 @@ def _bake_colours(
     light_frame: Float64[np.ndarray, "3 3"] | None,
     tell: Listener,
 ) -> TriangleMesh:
-    """The mesh with colours in its vertices, or with textures."""
+    """Return the mesh with colours at its vertices, or with textures."""
     tolerance = TOLERANCE_VOXELS * region.voxel_world
 
     def look_at(
@@ -174,7 +176,7 @@ def _bake_colours(
 def _decimate_levels(
     mesh: TriangleMesh, options: ExtractionOptions, levels: Sequence[int | None], tell: Listener
 ) -> list[TriangleMesh]:
-    """The mesh with at most so many triangles, for each level."""
+    """Return the mesh for each level, with at most its number of triangles."""
     if all(level is None for level in levels):
         return [mesh] * len(levels)
     meshes = []
@@ -193,7 +195,7 @@ def _keep_components(mesh: TriangleMesh, options: ExtractionOptions) -> Triangle
 def _fill_unseen(
     points: Float32[np.ndarray, "n 3"], baked: Float32[np.ndarray, "n c"], seen: Bool[np.ndarray, " n"]
 ) -> Float32[np.ndarray, "n c"]:
-    """What was baked, with that of points that nobody sees taken from the nearest that somebody does."""
+    """Return baked values; points that no camera sees take those of the nearest seen point."""
     if seen.all() or not seen.any():
         return baked
     _, nearest = cKDTree(points[seen]).query(points[~seen])

@@ -1,4 +1,4 @@
-"""Holes in a mesh: their rims, and triangles that close them."""
+"""Holes in a mesh: their boundary loops, and triangles that close them."""
 
 import heapq
 
@@ -11,7 +11,7 @@ BoundaryLoop = list[int]
 
 
 def boundary_loops(faces: Int32[np.ndarray, "m 3"]) -> list[BoundaryLoop]:
-    """The closed rims of a mesh: vertex numbers along which triangles to close the hole would wind.
+    """Return the closed boundary loops of a mesh, in the winding of triangles that would close them.
 
     A rim that passes a vertex twice is cut there into simple ones.
     """
@@ -90,7 +90,7 @@ def fill_holes(mesh: TriangleMesh, max_rim: float | None) -> tuple[TriangleMesh,
 def _isolated_faces(
     faces: Int32[np.ndarray, "m 3"], edge_keys: Int64[np.ndarray, " e"]
 ) -> set[frozenset[int]]:
-    """The corners of triangles without neighbours: their own rims, which their like would close."""
+    """Return the corners of triangles without neighbours, whose boundary is their own."""
     _, place, uses = np.unique(edge_keys, return_inverse=True, return_counts=True)
     alone = (uses[place.reshape(-1)] == 1).reshape(-1, 3).all(axis=1)
     return {frozenset(face) for face in faces[alone].tolist()}
@@ -99,7 +99,7 @@ def _isolated_faces(
 def _ear_clip(
     rim: BoundaryLoop, points: Float64[np.ndarray, "n 3"], taken: set[int], count: int
 ) -> list[tuple[int, int, int]] | None:
-    """Triangles that close a rim, or None where they would need an edge that is there already.
+    """Return triangles that close a loop, or None if they would need an existing edge.
 
     The edges drawn are added to ``taken``.
     """

@@ -10,13 +10,13 @@ from scipy.sparse import coo_matrix, csr_matrix, diags
 def interpolation_matrix(
     shares: Float32[np.ndarray, "r k"], numbers: Int[np.ndarray, "r k"], count: int
 ) -> csr_matrix:
-    """The matrix that takes values of ``count`` points to means of ``k`` of them."""
+    """Return the matrix that maps values of ``count`` points to weighted means of ``k`` of them."""
     starts = np.arange(len(shares) + 1, dtype=np.int64) * shares.shape[1]
     return csr_matrix((shares.reshape(-1), numbers.reshape(-1), starts), (len(shares), count))
 
 
 def difference_matrix(pairs: Int[np.ndarray, "e 2"], count: int) -> csr_matrix:
-    """The matrix D for which x D x is the sum of the squared differences between neighbours."""
+    """Return the matrix D for which x D x is the sum of squared differences between neighbours."""
     ones = np.ones(len(pairs), np.float32)
     beside = coo_matrix((ones, tuple(pairs.T)), (count, count)).tocsr()
     beside = beside + beside.T
@@ -31,7 +31,7 @@ def conjugate_gradients(
     *,
     coupled: bool = False,
 ) -> Float32[np.ndarray, "n c"]:
-    """An approximate solution of ``times(x) = wanted`` (Hestenes and Stiefel 1952), from x = 0.
+    """Solve a positive definite linear system approximately by conjugate gradients, from x = 0.
 
     SciPy's takes one column at a time, and its products are added up in an order that depends on the threads.
 

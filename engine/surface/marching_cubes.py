@@ -17,7 +17,7 @@ from octasplat.engine.surface.tsdf_volume import BLOCKS_PER_THREAD, TsdfVolume
 
 
 def marching_cubes(volume: TsdfVolume, min_weight: float) -> TriangleMesh:
-    """The triangles where the signed distance is zero, as seen from where it is positive.
+    """Return the triangles of the zero level set, wound as seen from positive distances.
 
     Cells with a corner that has collected less than ``min_weight`` are left out, which leaves holes where
     nothing was seen. Elsewhere the mesh is closed: vertices are shared, and every edge has two triangles.

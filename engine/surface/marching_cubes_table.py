@@ -1,4 +1,4 @@
-"""The table of marching cubes, worked out rather than copied.
+"""The case table of marching cubes, computed from the cell's geometry.
 
 Corner c of a cell lies at (c & 1, c >> 1 & 1, c >> 2 & 1); edge 4 a + k runs along axis a. A case is the set
 of corners inside the surface. On each face of the cell the surface cuts off every run of inside corners by
@@ -17,7 +17,7 @@ _Triangles = list[tuple[int, int, int]]
 
 
 def _edges() -> tuple[tuple[int, int], ...]:
-    """The two corners of each edge, the lower first."""
+    """Return the two corners of each edge, the lower first."""
     found = []
     for axis in range(3):
         found += [(c, c | 1 << axis) for c in range(8) if not c >> axis & 1]
@@ -26,11 +26,10 @@ def _edges() -> tuple[tuple[int, int], ...]:
 
 EDGES = _edges()
 """Corners of the twelve edges."""
-EDGE_AXIS = tuple(edge // 4 for edge in range(12))
 
 
 def _faces() -> tuple[tuple[int, ...], ...]:
-    """The four corners of each face, anticlockwise as seen from outside the cell."""
+    """Return the four corners of each face, anticlockwise as seen from outside the cell."""
     found: list[tuple[int, ...]] = []
     for axis in range(3):
         first, second = 1 << (axis + 1) % 3, 1 << (axis + 2) % 3
@@ -53,7 +52,7 @@ _FACES_OF_EDGES = _faces_of_edges()
 
 
 def case_loops(case: int) -> list[_Loop]:
-    """The closed loops of crossed edges of a case, anticlockwise as seen from outside the surface."""
+    """Return the closed loops of crossed edges of a case, anticlockwise as seen from outside."""
     number = {frozenset(edge): k for k, edge in enumerate(EDGES)}
     after: dict[int, int] = {}
     for face in FACES:
@@ -90,7 +89,7 @@ def _triangulations(loop: _Loop) -> list[_Triangles]:
 
 
 def case_triangles(case: int) -> _Triangles:
-    """The triangles of a case as triples of edges.
+    """Return the triangles of a case as triples of edges.
 
     No diagonal joins two edges of one face: the neighbouring cell could draw the same one.
     """
@@ -113,7 +112,7 @@ def _share_a_face(first: int, second: int) -> bool:
 
 @cache
 def marching_table() -> tuple[Int8[np.ndarray, "256 t"], Int32[np.ndarray, " 256"]]:
-    """For each case, the edges of its triangles one after another, and how many triangles there are."""
+    """Return the edges of each case's triangles in sequence, and each case's number of triangles."""
     every = [case_triangles(case) for case in range(256)]
     counts = np.array([len(found) for found in every], np.int32)
     table = np.full((256, 3 * int(counts.max())), -1, np.int8)

@@ -1,4 +1,4 @@
-"""Small parts removed, and decimation."""
+"""Removal of small components, and decimation."""
 
 import numpy as np
 from jaxtyping import Bool, Float64, Int32, Int64
@@ -12,7 +12,7 @@ MANIFOLD_ROUNDS = 5
 
 
 def face_components(mesh: TriangleMesh) -> Int32[np.ndarray, " m"]:
-    """The number of the connected part that each triangle belongs to.
+    """Return the connected component of each triangle.
 
     Parts hang together at edges: where two only touch at a vertex, they are two.
     """
@@ -30,7 +30,7 @@ def face_components(mesh: TriangleMesh) -> Int32[np.ndarray, " m"]:
 def keep_largest_components(
     mesh: TriangleMesh, *, keep: int | None = None, min_share: float = 0.0
 ) -> TriangleMesh:
-    """The ``keep`` largest connected parts by area, or those of at least ``min_share`` of the largest's."""
+    """Return the ``keep`` largest components by area, without those below ``min_share`` of the largest."""
     part = face_components(mesh)
     areas: Float64[np.ndarray, " p"] = np.bincount(part, mesh.face_areas)
     if keep is not None:
@@ -42,7 +42,7 @@ def keep_largest_components(
 
 
 def decimate(mesh: TriangleMesh, max_triangles: int) -> TriangleMesh:
-    """At most ``max_triangles`` triangles, by collapsing the edges that matter least (quadric error).
+    """Return a mesh of at most ``max_triangles`` triangles, by quadric edge collapse.
 
     Colours are not carried over; bake them afterwards. A watertight mesh stays watertight. Closing what the
     collapse tangled can add a handful of triangles back, so that a few more than asked for may come out.
@@ -64,7 +64,7 @@ def decimate(mesh: TriangleMesh, max_triangles: int) -> TriangleMesh:
 
 
 def _make_manifold(mesh: TriangleMesh, *, closed: bool) -> TriangleMesh:
-    """The mesh without triangles at edges that are crowded or twisted; what that opens is closed again.
+    """Return the mesh without triangles at non-manifold edges; the resulting holes are closed again.
 
     Collapsing edges now and then folds a thin part onto itself, down to two triangles back to back.
     """
@@ -78,7 +78,7 @@ def _make_manifold(mesh: TriangleMesh, *, closed: bool) -> TriangleMesh:
 
 
 def _is_manifold_face(faces: Int32[np.ndarray, "m 3"]) -> Bool[np.ndarray, " m"]:
-    """Which triangles have three corners that no other has, and edges along which no other winds alike."""
+    """Return which triangles have three distinct corners and edges that no other winds alike."""
     edges = directed_edges(faces).astype(np.int64)
     size = int(faces.max(initial=0)) + 1
     # An edge used twice in one direction is crowded or twisted.
@@ -91,6 +91,6 @@ def _is_manifold_face(faces: Int32[np.ndarray, "m 3"]) -> Bool[np.ndarray, " m"]
 
 
 def _is_unique(keys: Int64[np.ndarray, " k"]) -> Bool[np.ndarray, " k"]:
-    """Which keys are there once."""
+    """Return which keys occur once."""
     _, place, uses = np.unique(keys, return_inverse=True, return_counts=True)
     return np.asarray(uses[place.reshape(-1)] == 1)

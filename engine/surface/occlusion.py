@@ -1,4 +1,4 @@
-"""What can be seen past a mesh."""
+"""Visibility of points past a mesh."""
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -12,7 +12,7 @@ OFFSET_RATIO = 1e-3
 
 
 class Occluder:
-    """A mesh that hides what is behind it."""
+    """A mesh that hides what lies behind it."""
 
     def __init__(self, mesh: TriangleMesh) -> None:
         self._scene = TriangleBvh(mesh.vertices_world, mesh.faces)
@@ -23,7 +23,7 @@ class Occluder:
         viewers_world: Float[np.ndarray, "n 3"],
         tolerance: float = 0.0,
     ) -> Bool[np.ndarray, " n"]:
-        """Whether nothing lies between each point and its viewer.
+        """Return whether nothing lies between each point and its viewer.
 
         Args:
             points_world: the points, on the mesh or off it.

@@ -1,4 +1,4 @@
-"""What a surface is extracted with."""
+"""Settings of surface extraction."""
 
 from typing import Annotated, Any, Literal
 

@@ -1,4 +1,4 @@
-"""The part of space that is fused, and its grid of voxels."""
+"""The region of space that is fused, and its voxel grid."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -61,11 +61,11 @@ class Region:
 
     @property
     def voxel_world(self) -> float:
-        """Side of a voxel in world units, at the centre if contracted."""
+        """Return the side of a voxel in world units; at the centre if contracted."""
         return self.voxel * self.radius
 
     def world_from_grid(self, points: Float[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 3"]:
-        """World positions of points given in voxels from the first voxel's centre."""
+        """Return world positions of points in voxel coordinates, whose origin is the first voxel's centre."""
         at = self.low + (points.astype(np.float64) + 0.5) * self.voxel
         if not self.contracted:
             return at
@@ -76,7 +76,7 @@ class Region:
 
 
 def choose_region(maps: DepthMaps, options: ExtractionOptions) -> Region:
-    """The region that the options ask for, or what is seen of the space that the cameras stand around.
+    """Return the region that the options ask for, or the visible space that the cameras surround.
 
     That space is a cube around the point nearest to all viewing axes, as far to each side as the cameras are
     away from it in the median; of it, the box that holds the depths seen.
@@ -104,14 +104,14 @@ def choose_region(maps: DepthMaps, options: ExtractionOptions) -> Region:
 
 
 def _pixel_width(cameras: Sequence[PinholeCamera]) -> float:
-    """Width of a pixel at distance 1, in the median."""
+    """Return the median width of a pixel at distance 1."""
     return float(np.median([1.0 / camera.fx_px for camera in cameras]))
 
 
 def _depth_bounds(
     maps: DepthMaps, low: Float64[np.ndarray, "3"], high: Float64[np.ndarray, "3"]
 ) -> tuple[Float64[np.ndarray, "3"], Float64[np.ndarray, "3"]]:
-    """The box of the depths within a cube, but for stray ones, and a margin."""
+    """Return the box of the depths within a cube, without outliers, and with a margin."""
     found = []
     for camera, distances in zip(maps.cameras, maps.distances, strict=True):
         step = max(1, max(distances.shape) // SAMPLES_PER_SIDE)
@@ -129,7 +129,7 @@ def _depth_bounds(
 
 
 def focus_point(cameras: Sequence[PinholeCamera]) -> tuple[Float64[np.ndarray, "3"], float]:
-    """The point that the cameras look at, and their median distance to it.
+    """Return the point that the cameras look at, and their median distance to it.
 
     Raises:
         ConfigError: there is no such point.
@@ -153,7 +153,7 @@ def _make_grid(
     pixel: float,
     options: ExtractionOptions,
 ) -> Region:
-    """The grid over a box that is seen from a distance, where a pixel is ``pixel`` wide."""
+    """Return the grid over a box seen from ``distance``, where a pixel is ``pixel`` wide."""
     side = float((high - low).max())
     voxel = options.voxel or max(side / (options.resolution or RESOLUTION), PIXELS_PER_VOXEL * pixel)
     blocks = np.maximum(1, np.ceil((high - low) / (voxel * BLOCK) - 1e-6)).astype(int)

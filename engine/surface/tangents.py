@@ -1,4 +1,4 @@
-"""Tangents along a texture, as programs agree on them for normal maps.
+"""Texture tangents of a mesh, as renderers compute them for normal maps.
 
 After "Simulation of Wrinkled Surfaces Revisited" (Mikkelsen 2008,
 http://image.diku.dk/projects/media/morten.mikkelsen.08.pdf), the default of glTF and Blender: at each vertex
@@ -13,7 +13,7 @@ from octasplat.engine.geometry.triangle_mesh import TriangleMesh
 
 
 def vertex_tangents(mesh: TriangleMesh) -> Float32[np.ndarray, "n 4"]:
-    """Tangents of a mesh with texture coordinates.
+    """Return the tangents of a mesh with texture coordinates.
 
     Args:
         mesh: cut open at its seams. A vertex at which triangles that lie mirrored in the texture meet others
@@ -57,7 +57,7 @@ def world_to_tangent(
     normals_world: Float64[np.ndarray, "n 3"],
     tangents: Float64[np.ndarray, "n 4"],
 ) -> Float64[np.ndarray, "n 3"]:
-    """Unit vectors along tangent, bitangent and normal of a surface, the three taken between its vertices.
+    """Return unit vectors in the tangent frame of a surface, interpolated between its vertices.
 
     Args:
         wanted_world: unit vectors.
@@ -82,6 +82,6 @@ def _perpendicular_part(
 
 
 def _unit(vectors: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 3"]:
-    """Vectors of length 1; those without a length stay so."""
+    """Return vectors of length 1; those of length 0 stay so."""
     length = np.linalg.norm(vectors, axis=1, keepdims=True)
     return np.divide(vectors, length, out=np.zeros_like(vectors), where=length > 1e-30)

@@ -1,4 +1,4 @@
-"""A mesh cut open and laid out in a square image, and the surface points of the image's pixels."""
+"""UV unwrapping of a mesh into a square texture, and the surface points of its texels."""
 
 from dataclasses import dataclass
 
@@ -18,7 +18,7 @@ SMOOTHING_STEPS = (0.5, -0.53)
 
 @dataclass(frozen=True)
 class TextureLayout:
-    """Where the surface lies in its texture.
+    """The layout of a surface in its texture.
 
     Attributes:
         mesh: the mesh cut along the seams, with texture coordinates.
@@ -37,22 +37,22 @@ class TextureLayout:
     weights: Float64[np.ndarray, "n 3"]
 
     def interpolate(self, of_vertices: Float32[np.ndarray, "v c"]) -> Float64[np.ndarray, "n c"]:
-        """What belongs to vertices, at the pixels' middles."""
+        """Return vertex attributes, interpolated at the texels' centres."""
         return np.asarray(sum(self.weights[:, k, None] * of_vertices[self.corners[:, k]] for k in range(3)))
 
     @property
     def points_world(self) -> Float32[np.ndarray, "n 3"]:
-        """The surface points in the pixels' middles."""
+        """Return the surface points at the texels' centres."""
         return self.interpolate(self.mesh.vertices_world).astype(np.float32)
 
     @property
     def normals_world(self) -> Float32[np.ndarray, "n 3"]:
-        """The unit normals there."""
+        """Return the unit normals at the texels' centres."""
         bent = self.interpolate(self.mesh.vertex_normals())
         return (bent / np.maximum(np.linalg.norm(bent, axis=1, keepdims=True), 1e-12)).astype(np.float32)
 
     def image(self, values: Float32[np.ndarray, "n c"]) -> Float32[np.ndarray, "h w c"]:
-        """The values of pixels that show surface as an image; the others copy their nearest."""
+        """Return texel values as an image; texels without surface copy their nearest."""
         shape = (self.side_px, self.side_px)
         image = np.zeros((*shape, values.shape[1]), np.float32)
         known = np.zeros(shape, dtype=bool)
@@ -97,7 +97,7 @@ def unwrap(mesh: TriangleMesh, side_px: int) -> TextureLayout:
 
 
 def smooth_mesh(mesh: TriangleMesh) -> TriangleMesh:
-    """The mesh without its roughness, as large as it was.
+    """Return the smoothed mesh, its size preserved.
 
     "A signal processing approach to fair surface design" (Taubin 1995,
     https://doi.org/10.1145/218380.218473).

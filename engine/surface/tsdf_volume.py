@@ -110,7 +110,7 @@ def fuse_depth_maps(
 
 
 def fill_unseen(volume: TsdfVolume, min_weight: float) -> None:
-    """Take voxels that collected less than ``min_weight`` for the inside of things, in place."""
+    """Set voxels of less weight than ``min_weight`` to the inside of the surface, in place."""
     unseen = volume.weights < min_weight
     volume.values[unseen] = -1.0
     volume.weights[unseen] = min_weight

@@ -1,4 +1,4 @@
-"""Vertices moved along their normals to where the pictures of a surface agree.
+"""Refinement of vertices along their normals, by photo-consistency of a surface's renders.
 
 If a surface lies too near or too far, each picture paints it a little beside the others. What a pixel shows
 changes, to the first order, with the colours around and with how far the surface moves, so both are solved
@@ -46,7 +46,7 @@ MAX_DISPLACEMENT_PX = 2.0
 
 @dataclass(frozen=True)
 class _VisiblePixels:
-    """What the pixels of all pictures see; one row for each that sees surface."""
+    """Surface points that the pixels of all pictures see; one row for each such pixel."""
 
     faces: Int32[np.ndarray, " p"]
     weights: Float32[np.ndarray, "p 3"]
@@ -59,7 +59,7 @@ class _VisiblePixels:
 def refine_vertices(
     mesh: TriangleMesh, pictures: Sequence[Picture], progress: Progress = lambda _done, _total: None
 ) -> TriangleMesh:
-    """The mesh with its vertices where the pictures agree better; to be done before colours.
+    """Return the mesh with vertices where the pictures agree better; to be called before colouring.
 
     Args:
         mesh: near the right place.
@@ -81,7 +81,7 @@ def refine_vertices(
 def _downsample(
     rays: ImageRays, rgba: UInt8[np.ndarray, "h w 4"]
 ) -> tuple[ImageRays, Float32[np.ndarray, "_h _w 4"]]:
-    """Means of blocks of pixels."""
+    """Return means of blocks of pixels."""
     side = max(1, round(max(rgba.shape[:2]) / SIDE_PX))
     side = min(side, *rgba.shape[:2])
     height, width = rgba.shape[0] // side, rgba.shape[1] // side
@@ -132,7 +132,7 @@ def _step(
     pictures: Sequence[tuple[ImageRays, np.ndarray]],
     apart: csr_matrix,
 ) -> tuple[TriangleMesh, Float32[np.ndarray, "n 3"]]:
-    """One step; displacements are counted in pixels of the pictures, at each vertex's distance."""
+    """Take one step; displacements are in pixels of the pictures at each vertex's distance."""
     sight = _visible_pixels(mesh, pictures)
     count, corners = len(rgb), mesh.faces[sight.faces]
     size = _pixel_sizes(sight, corners, count)
@@ -198,7 +198,7 @@ def _solve_step(
     apart: csr_matrix,
     rounds: int,
 ) -> Float32[np.ndarray, "n 4"]:
-    """Corrections of colours, and displacements, with which the pixels are most like those wanted."""
+    """Return corrections of colours and displacements that fit the pixels best."""
     count, now = len(rgb), _colours_and_displacements(rgb)
     smooth = np.array([COLOUR_SMOOTHNESS] * 3 + [SMOOTHNESS], np.float32)
 
@@ -217,14 +217,14 @@ def _solve_step(
 
 
 def _colours_and_displacements(rgb: Float32[np.ndarray, "n 3"]) -> Float32[np.ndarray, "n 4"]:
-    """Colours, and vertices where they are."""
+    """Return start values: the colours, and zero displacements."""
     return np.concatenate([rgb, np.zeros_like(rgb[:, :1])], axis=1)
 
 
 def _pixel_sizes(
     sight: _VisiblePixels, corners: Int32[np.ndarray, "p 3"], count: int
 ) -> Float32[np.ndarray, " n"]:
-    """Width of a pixel at each vertex, world units; where no picture sees one, the median."""
+    """Return the width of a pixel at each vertex, world units; the median where no picture sees it."""
     sums = np.bincount(corners.reshape(-1), np.repeat(sight.size_world, 3), minlength=count)
     uses = np.bincount(corners.reshape(-1), minlength=count)
     middle = float(np.median(sight.size_world)) if len(corners) else 0.0

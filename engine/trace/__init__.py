@@ -1,1 +1,1 @@
-"""Rays through flat Gaussians: the protocol, the tracer for CPUs, its slow twin; and rays through meshes."""
+"""Ray tracing of flat Gaussians (protocol, CPU tracer, reference implementation) and of triangle meshes."""

@@ -1,4 +1,4 @@
-"""The few functions of Embree that the tracers need, taken from the library inside the embreex wheel.
+"""Bindings of the Embree functions that the tracers need, from the library in the embreex wheel.
 
 Nothing is compiled at install: the wheel's extension module links Embree, so that its symbols resolve
 through the loaded module.
@@ -53,7 +53,7 @@ class EmbreeError(OctasplatError):
 
 @cache
 def load_library() -> ctypes.CDLL:
-    """The loaded Embree with argument types set.
+    """Return the loaded Embree with argument types set.
 
     Raises:
         EmbreeError: the embreex package carries no Embree 4.
@@ -74,25 +74,25 @@ def load_library() -> ctypes.CDLL:
 
 @cache
 def intersect1_address() -> int:
-    """Address of rtcIntersect1, passed to kernels at run time so that they can be cached on disk."""
+    """Return the address of rtcIntersect1, passed to kernels at run time so that they can be cached."""
     return _address("rtcIntersect1")
 
 
 @cache
 def occluded1_address() -> int:
-    """Address of rtcOccluded1, which stops at the first hit that it comes across."""
+    """Return the address of rtcOccluded1, which stops at any hit."""
     return _address("rtcOccluded1")
 
 
 @cache
 def intersect8_address() -> int:
-    """Address of rtcIntersect8, for eight rays through triangles."""
+    """Return the address of rtcIntersect8, for eight rays through triangles."""
     return _address("rtcIntersect8")
 
 
 @cache
 def occluded8_address() -> int:
-    """Address of rtcOccluded8."""
+    """Return the address of rtcOccluded8."""
     return _address("rtcOccluded8")
 
 
@@ -114,7 +114,7 @@ class EmbreeDevice:
             )
 
     def check(self, action: str) -> None:
-        """Raise if the last calls failed.
+        """Raise an error if the last calls failed.
 
         Raises:
             EmbreeError: naming what was being done.
@@ -129,7 +129,7 @@ class EmbreeDevice:
 
 
 class _EmbreeScene:
-    """A bounding-volume hierarchy over one geometry; ``handle`` is what rays are sent through."""
+    """A bounding-volume hierarchy over one geometry; rays are traced through its ``handle``."""
 
     def __init__(self, device: EmbreeDevice, quality: int) -> None:
         self._device, self._quality = device, quality
@@ -158,7 +158,7 @@ class _EmbreeScene:
 
 
 class EmbreeBoxScene(_EmbreeScene):
-    """A hierarchy over boxes whose content a callback intersects.
+    """A hierarchy over boxes that a callback intersects.
 
     The callbacks' addresses and ``boxes_address`` (n rows of lower and upper corner, six float32) must
     stay valid for the life of the scene.
@@ -187,7 +187,7 @@ class EmbreeBoxScene(_EmbreeScene):
 
 
 class EmbreeTriangleScene(_EmbreeScene):
-    """A hierarchy over triangles, which Embree itself intersects; the arrays are copied."""
+    """A hierarchy over triangles, which Embree intersects; the arrays are copied."""
 
     def __init__(
         self,

@@ -1,4 +1,4 @@
-"""Blended normals made to face the viewer.
+"""Blended normals, flipped to face the viewer.
 
 Where normals keep their side (``turned_beyond`` of :class:`octasplat.engine.trace.protocol.TraceSettings`),
 the blend of a ray that grazes an outline may point a little away from the viewer. No surface that is seen
@@ -34,7 +34,7 @@ class FacedNormals(NamedTuple):
     def backward(
         self, normal_gradient: Float64[np.ndarray, "r 3"], directions_world: Float[np.ndarray, "r 3"]
     ) -> Float64[np.ndarray, "r 3"]:
-        """Gradients by the sums that were given to :func:`face_viewer`, from those by the unit normals."""
+        """Return gradients by :func:`face_viewer`'s sums, from those by the unit normals."""
         by_laid = (
             normal_gradient
             - (normal_gradient * self.normal_world).sum(axis=1, keepdims=True) * self.normal_world
@@ -49,7 +49,7 @@ class FacedNormals(NamedTuple):
 def face_viewer(
     normal_sums_world: Float[np.ndarray, "r 3"], directions_world: Float[np.ndarray, "r 3"]
 ) -> FacedNormals:
-    """Unit normals that face the viewer, from normals summed along rays with unit directions.
+    """Return unit normals that face the viewer, from normals summed along rays of unit directions.
 
     A sum of nothing stays 0.
     """

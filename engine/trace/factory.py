@@ -1,4 +1,4 @@
-"""The one place where tracers are made."""
+"""Factory of tracers."""
 
 from octasplat.engine.trace.protocol import Tracer, TraceSettings
 
@@ -10,7 +10,7 @@ def make_tracer(
     box_padding: float = 0.0,
     build_quality: int = 1,
 ) -> Tracer:
-    """The tracer that ``settings`` name.
+    """Return the tracer that ``settings`` name.
 
     Args:
         settings: which tracer, and where rays are cut off.

@@ -1,4 +1,4 @@
-"""Gradients of several recordings of the same Gaussians, added up, and those of Gaussians that matter."""
+"""Sums of gradients over several recordings, and their restriction to relevant Gaussians."""
 
 from collections.abc import Sequence
 from dataclasses import fields
@@ -9,7 +9,7 @@ from octasplat.engine.trace.protocol import GaussianGradients
 
 
 def add_gradients(parts: Sequence[GaussianGradients]) -> GaussianGradients:
-    """The sum of at least one, for all Gaussians that any of them met; a single one is returned as it is."""
+    """Return the sum of at least one, for all Gaussians that any of them hit; a single one as it is."""
     if len(parts) == 1:
         return parts[0]
     met = np.zeros(1 + max(int(part.ids.max(initial=-1)) for part in parts), bool)
@@ -28,10 +28,7 @@ def add_gradients(parts: Sequence[GaussianGradients]) -> GaussianGradients:
 
 
 def drop_low_weight(gradients: GaussianGradients, min_blend_weight: float) -> GaussianGradients:
-    """Those of the Gaussians whose weights add up to ``min_blend_weight`` or more.
-
-    Of all, the same object.
-    """
+    """Return the gradients of Gaussians of at least ``min_blend_weight``; the same object if that is all."""
     enough = gradients.weight_sums >= min_blend_weight
     if enough.all():
         return gradients

@@ -1,4 +1,4 @@
-"""What a tracer is: settings, what it returns, and the small protocol that every tracer follows."""
+"""The tracer protocol: settings, results, gradients, and the methods that every tracer has."""
 
 from dataclasses import dataclass
 from typing import Annotated, ClassVar, Literal, Protocol, runtime_checkable
@@ -16,7 +16,7 @@ from octasplat.engine.settings.fields import ADVANCED, EXPERIMENTAL, Unit
 
 
 class TraceSettings(Settings):
-    """Which tracer, and how it cuts rays off. Where a ray begins is a matter of the ray."""
+    """Which tracer, and its limits. Where a ray begins is a property of the ray."""
 
     former_names: ClassVar[renamed_settings.FormerNames] = renamed_settings.TRACE
 
@@ -105,30 +105,30 @@ class TraceResult:
 
     @property
     def alpha(self) -> Float32[np.ndarray, " r"]:
-        """Accumulated alpha in [0, 1]."""
+        """Return the accumulated alpha in [0, 1]."""
         return np.float32(1.0) - self.transmittance
 
     @property
     def expected_depth(self) -> Float32[np.ndarray, " r"]:
-        """Weighted mean distance, 0 where the ray met nothing."""
+        """Return the weighted mean distance, 0 where the ray hit nothing."""
         alpha = self.alpha
         return np.divide(self.depth_sum, alpha, out=np.zeros_like(alpha), where=alpha > 1e-8)
 
 
 @runtime_checkable
 class Recording(Protocol):
-    """The Gaussians of each ray, front to back, as its tracer keeps them.
+    """The Gaussians that each ray hit, front to back, as its tracer stores them.
 
     A recording owns its memory: any number may live at once, and each may be differentiated in any order, as
     long as the parameters are those it was made with.
     """
 
     def ids_of_ray(self, ray: int) -> Int32[np.ndarray, " k"]:
-        """Ids of the Gaussians of one ray, front to back."""
+        """Return the ids of one ray's Gaussians, front to back."""
         ...
 
     def ids_by_ray(self) -> tuple[Int32[np.ndarray, " r"], Int32[np.ndarray, " h"]]:
-        """Hits of each ray, and the ids of all hits, ray by ray and front to back."""
+        """Return the hit count of each ray, and the ids of all hits, ray by ray and front to back."""
         ...
 
 
@@ -149,7 +149,7 @@ class TraceGradients:
 
     @property
     def has_geometry(self) -> bool:
-        """Whether depth or normals have a gradient."""
+        """Return whether depth or normals have a gradient."""
         return any(x is not None for x in (self.depth_sum, self.depth_median, self.normal_world))
 
 
@@ -175,30 +175,29 @@ class GaussianGradients:
     hit_counts: Int32[np.ndarray, " u"]
 
     def numpy(self) -> "GaussianGradients":
-        """These themselves, as :class:`GradientsHandle` asks for."""
+        """Return this object, as :class:`GradientsHandle` requires."""
         return self
 
 
 @runtime_checkable
 class GradientsHandle(Protocol):
-    """Gradients of the parameters, wherever their tracer keeps them."""
+    """Gradients of the parameters, in whatever memory their tracer stores them."""
 
     def numpy(self) -> GaussianGradients:
-        """The gradients as arrays of this process; a copy if they live elsewhere."""
+        """Return the gradients as numpy arrays; a copy if they are stored elsewhere."""
         ...
 
 
 @runtime_checkable
 class Tracer(Protocol):
-    """Traces rays through a set of flat Gaussians and differentiates what they see.
+    """Tracer of rays through flat Gaussians that also differentiates its outputs.
 
-    Rays and outputs are numpy arrays: an iteration has about a megabyte of them, and losses and shading
-    work on them here. What has the size of the Gaussians or of their hits is opaque: recordings are only
-    handed back, and gradients are read through :meth:`GradientsHandle.numpy`. So a tracer may keep the
-    parameters on a
-    device: it uploads them in :meth:`build` and the changed rows in :meth:`refresh`, and leaves its gradients
-    where they are, for an optimiser beside them or until somebody asks. (Not chosen: one learner with trace,
-    step and download, which would take optimiser, densification and checkpoints into every tracer.)
+    Rays and outputs are numpy arrays: an iteration has about a megabyte of them, and losses and shading work
+    on them here. Data of the size of the Gaussians or of their hits is opaque: recordings are only passed
+    back, and gradients are read through :meth:`GradientsHandle.numpy`. So a tracer may store the parameters on a
+    device: it uploads them in :meth:`build` and the changed rows in :meth:`refresh`, and its gradients stay
+    there, for an optimiser on the same device or until they are read. (Not chosen: a learner with trace, step
+    and download, which would duplicate optimiser, densification and checkpoints in every tracer.)
 
     A tracer is used by one thread at a time.
     """
@@ -206,7 +205,7 @@ class Tracer(Protocol):
     settings: TraceSettings
 
     def build(self, gaussians: FlatGaussians, features: Float32[np.ndarray, "n f"] | None = None) -> None:
-        """Take over ``gaussians`` and ``features`` and build the acceleration structure around them.
+        """Keep ``gaussians`` and ``features`` and build the acceleration structure around them.
 
         Earlier recordings can no longer be differentiated.
         """
@@ -221,7 +220,7 @@ class Tracer(Protocol):
         ...
 
     def trace(self, rays: RayBatch, *, record: bool = False) -> TraceResult:
-        """Follow rays with unit directions; ``record`` keeps what :meth:`backward` needs.
+        """Trace rays of unit directions; ``record`` stores what :meth:`backward` needs.
 
         A Gaussian is seen where ``t_min < t < t_max``, in its colour as the ray's viewer has it (``t_viewer``
         of :class:`octasplat.engine.core.rays.RayBatch`).
@@ -229,7 +228,7 @@ class Tracer(Protocol):
         ...
 
     def transmittance(self, rays: RayBatch) -> Float32[np.ndarray, " r"]:
-        """What light is left along each ray between its limits, for shadows: no order, no colour.
+        """Return the transmittance along each ray between its limits, for shadows: no order, no colour.
 
         It is 0 where less than ``transmittance_min`` is left, whatever ``max_hits`` and the second phase say.
         """
@@ -238,10 +237,10 @@ class Tracer(Protocol):
     def backward(
         self, recording: Recording, gradients: TraceGradients, *, min_blend_weight: float = 0.0
     ) -> GradientsHandle:
-        """Gradients of the parameters for the rays of a recording of this tracer since its last build.
+        """Return gradients of the parameters for a recording of this tracer since its last build.
 
-        Gaussians whose weights alpha T on all these rays add up to less than ``min_blend_weight`` are left
-        out.
+        Gaussians whose blending weights alpha T over these rays sum to less than ``min_blend_weight`` are
+        left out.
 
         Raises:
             ValueError: the recording is another tracer's, or older than the last build.

@@ -1,4 +1,4 @@
-"""Gradients of what rays see by their origins and directions, in closed form from the recorded hits.
+"""Gradients of traced outputs by the rays' origins and directions, in closed form from recorded hits.
 
 A ray o + t d meets the plane of a Gaussian with mean m and normal r1 at t = <m - o, r1> / <d, r1>. The hit
 p = o + t d moves with o and d directly and through t, with dt/do = -r1 / <d, r1> and dt/dd = t dt/do. So the
@@ -19,7 +19,7 @@ from octasplat.engine.trace.ray_hits import RayHits, batched_ray_hits
 
 @dataclass(frozen=True)
 class RayGradients:
-    """Gradients of a loss by rays, a row each, also where one origin stands for all rays."""
+    """Gradients of a loss by rays, one row per ray, also if all rays share one origin."""
 
     origins_world: Float32[np.ndarray, "r 3"]
     directions_world: Float32[np.ndarray, "r 3"]
@@ -92,7 +92,7 @@ def _hit_gradients(
     settings: TraceSettings,
     features: Float32[np.ndarray, "n f"] | None,
 ) -> tuple[Float64[np.ndarray, "h 3"], Float64[np.ndarray, "h 3"]]:
-    """Gradients by the origin and direction of each hit's ray, of this hit alone."""
+    """Return gradients by the origin and direction of each hit's ray, of this hit alone."""
     ray, ids = hits.ray_ids, hits.ids
     directions = rays.directions_world.astype(np.float64)[ray]
     normals, weight = hits.frames[:, :, 0], hits.weight

@@ -1,4 +1,4 @@
-"""The recorded hits of rays as flat arrays, evaluated again in float64: one row for each ray and Gaussian."""
+"""Recorded hits as flat arrays, evaluated again in float64: one row per ray and Gaussian."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -49,22 +49,22 @@ class RayHits:
 
     @property
     def weight(self) -> Float64[np.ndarray, " h"]:
-        """Share of each hit in what its ray sees, alpha T."""
+        """Return the blending weight of each hit, alpha T."""
         return self.alpha * self.transmittance
 
     def sums_in_front(self, values: Float64[np.ndarray, " h"]) -> Float64[np.ndarray, " h"]:
-        """Sum of ``values`` over the hits in front of each hit on its ray."""
+        """Return the sum of ``values`` over the hits in front of each hit on its ray."""
         return _segmented_exclusive_cumsum(values, self.counts)
 
     def sums_per_ray(self, values: Float64[np.ndarray, " h"]) -> Float64[np.ndarray, " r"]:
-        """Sum of ``values`` over each ray."""
+        """Return the sum of ``values`` over each ray."""
         return np.bincount(self.ray_ids, values, minlength=len(self.counts))
 
 
 def batched_ray_hits(
     gaussians: FlatGaussians, rays: RayBatch, recording: Recording, settings: TraceSettings
 ) -> Iterator[tuple[slice, RayHits]]:
-    """Yield the hits of consecutive rays, and which rays these are; memory stays bounded.
+    """Yield the hits of consecutive rays with the rays' slice, in batches of bounded memory.
 
     Args:
         gaussians: with the parameters that the recording was made with.
@@ -87,7 +87,7 @@ def batched_ray_hits(
 def dominant_gaussians(
     gaussians: FlatGaussians, rays: RayBatch, recording: Recording, settings: TraceSettings
 ) -> Int32[np.ndarray, " r"]:
-    """Return the number of the Gaussian that weighs most on each ray, -1 where it met none.
+    """Return the Gaussian with the largest weight on each ray, -1 where it hit none.
 
     Of equal weights the one in front counts. The arguments are those of :func:`batched_ray_hits`.
     """

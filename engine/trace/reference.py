@@ -1,4 +1,4 @@
-"""The slow twin: the same rays through the same Gaussians in plain float64 torch, written to be read.
+"""The reference implementation: the same rays and Gaussians in plain float64 torch, written for readability.
 
 Every Gaussian is tested against every ray, so it is for a few thousand of each at most. It is the judge of
 the fast tracer's values and, through autograd, of its gradients. Symbols are the paper's: m the mean,
@@ -35,7 +35,7 @@ class ReferenceParameters:
     def from_gaussians(
         cls, gaussians: FlatGaussians, features: np.ndarray | None = None
     ) -> "ReferenceParameters":
-        """Leaves with the values of ``gaussians``."""
+        """Return leaves with the values of ``gaussians``."""
         extra = np.zeros((len(gaussians), 0)) if features is None else features
         arrays = (
             gaussians.means_world,
@@ -62,7 +62,7 @@ class ReferenceResult:
 
 
 def rotation_matrices(quats_wxyz: Tensor) -> Tensor:
-    """Rotation matrices (n, 3, 3) of quaternions of any length."""
+    """Return rotation matrices (n, 3, 3) of quaternions of any length."""
     w, x, y, z = (quats_wxyz / quats_wxyz.norm(dim=-1, keepdim=True)).unbind(-1)
     rows = [
         1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
@@ -73,7 +73,7 @@ def rotation_matrices(quats_wxyz: Tensor) -> Tensor:
 
 
 def sh_basis(directions: Tensor, count: int) -> Tensor:
-    """Real spherical harmonics (r, count) of unit directions, 3DGS signs and order, by their polynomials."""
+    """Return real spherical harmonics (r, count) of unit directions, 3DGS signs and order."""
     x, y, z = directions.unbind(-1)
     pi = np.pi
     functions = [torch.full_like(x, 0.5 / pi**0.5)]
@@ -109,7 +109,7 @@ def trace_reference(
     settings: TraceSettings,
     ranks: Int64[np.ndarray, "r n"] | None = None,
 ) -> ReferenceResult:
-    """Every ray against every Gaussian; see :class:`TraceSettings` for where rays end.
+    """Trace every ray against every Gaussian; see :class:`TraceSettings` for where rays end.
 
     Hits are composited by distance or, where ``ranks`` are given, in the order of those.
     """
@@ -181,7 +181,7 @@ def trace_reference(
 
 
 def _hit_count(alphas: Tensor, settings: TraceSettings) -> int:
-    """Number of hits that count: the two thresholds of the paper's Algorithm 1, or the single one."""
+    """Return the number of hits that count: by the paper's Algorithm 1 (two thresholds) or by one."""
     t1, t2, second_phase = 1.0, 1.0, False
     for k, alpha in enumerate(alphas.tolist()):
         t1 *= 1 - alpha

@@ -1,4 +1,4 @@
-"""The slow twin as a tracer, which any part of the engine can run on, if the scene is small."""
+"""The reference implementation behind the tracer protocol, for small scenes."""
 
 from dataclasses import dataclass
 
@@ -34,11 +34,11 @@ class ReferenceRecording:
     build_id: object
 
     def ids_of_ray(self, ray: int) -> Int32[np.ndarray, " k"]:
-        """Ids of the Gaussians of one ray, front to back."""
+        """Return the ids of one ray's Gaussians, front to back."""
         return self.ids[ray].astype(np.int32)
 
     def ids_by_ray(self) -> tuple[Int32[np.ndarray, " r"], Int32[np.ndarray, " h"]]:
-        """Hits of each ray, and the ids of all hits, ray by ray and front to back."""
+        """Return the hit count of each ray, and the ids of all hits, ray by ray and front to back."""
         counts = np.array([len(ids) for ids in self.ids], np.int32)
         return counts, np.concatenate([np.empty(0, np.int32), *self.ids]).astype(np.int32)
 
@@ -60,16 +60,16 @@ class ReferenceTracer:
         self._build_id = object()
 
     def build(self, gaussians: FlatGaussians, features: Float32[np.ndarray, "n f"] | None = None) -> None:
-        """Take over ``gaussians``; there is nothing to build."""
+        """Keep ``gaussians``; there is nothing to build."""
         self._features = np.empty((len(gaussians), 0), np.float32) if features is None else features
         self._gaussians = gaussians
         self._build_id = object()
 
     def refresh(self, ids: Int32[np.ndarray, " u"] | None = None) -> None:
-        """Nothing to do: parameters are read at each trace."""
+        """Do nothing: parameters are read at each trace."""
 
     def trace(self, rays: RayBatch, *, record: bool = False) -> TraceResult:
-        """Follow rays; see the protocol."""
+        """Trace rays; see the protocol."""
         parameters = self._parameters()
         with torch.no_grad():
             parts = [trace_reference(parameters, rays[piece], self.settings) for piece in self._batches(rays)]
@@ -87,7 +87,7 @@ class ReferenceTracer:
         return TraceResult(**found, hit_counts=counts, recording=hits)
 
     def transmittance(self, rays: RayBatch) -> Float32[np.ndarray, " r"]:
-        """What light is left along each ray; see the protocol."""
+        """Return the transmittance along each ray; see the protocol."""
         parameters = self._parameters()
         unlimited = self.settings.model_copy(
             update={"transmittance_min": 0.0, "second_phase_min": None, "max_hits": 2**31}
@@ -102,7 +102,7 @@ class ReferenceTracer:
     def backward(
         self, recording: Recording, gradients: TraceGradients, *, min_blend_weight: float = 0.0
     ) -> GaussianGradients:
-        """Gradients of the raw parameters by autograd; see the protocol."""
+        """Return gradients of the raw parameters by autograd; see the protocol."""
         if not isinstance(recording, ReferenceRecording) or recording.build_id is not self._build_id:
             raise ValueError("the recording is not of this tracer, or older than its last build")
         parameters = self._parameters()
@@ -146,7 +146,7 @@ class ReferenceTracer:
 
 
 def _loss(result: ReferenceResult, gradients: TraceGradients, batch: slice) -> Tensor:
-    """The scalar whose gradients by the outputs are ``gradients``."""
+    """Return the scalar whose gradients by the outputs are ``gradients``."""
     loss = torch.zeros((), dtype=torch.float64)
     for name in _OUTPUTS:
         given = getattr(gradients, name)
@@ -158,7 +158,7 @@ def _loss(result: ReferenceResult, gradients: TraceGradients, batch: slice) -> T
 
 
 def _leaf_gradients(loss: Tensor, leaves: list[Tensor]) -> list[Float64[np.ndarray, "..."]]:
-    """Gradients of ``loss``, zero where it does not depend on a leaf."""
+    """Return gradients of ``loss``, zero where it does not depend on a leaf."""
     if not loss.requires_grad:
         return [np.zeros(leaf.shape) for leaf in leaves]
     found = torch.autograd.grad(loss, leaves, retain_graph=True, allow_unused=True)

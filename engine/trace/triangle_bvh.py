@@ -1,4 +1,4 @@
-"""Rays through triangle meshes, by Embree: what a ray meets first, and whether it meets anything."""
+"""Rays through triangle meshes, by Embree: first hits and occlusion."""
 
 from dataclasses import dataclass
 
@@ -42,12 +42,12 @@ class TriangleHits:
 
     @property
     def is_hit(self) -> Bool[np.ndarray, " r"]:
-        """Whether each ray meets anything."""
+        """Return whether each ray hits anything."""
         return self.faces >= 0
 
 
 class TriangleBvh:
-    """A mesh that rays can be sent through; both sides of a triangle are hit.
+    """Hierarchy of a triangle mesh; both sides of a triangle are hit.
 
     Directions may have any length. A ray's result depends on the ray and the mesh alone.
 
@@ -82,7 +82,7 @@ class TriangleBvh:
         self._scene = EmbreeTriangleScene(EmbreeDevice(self._threads), vertices_world, faces)
 
     def closest(self, rays: RayBatch) -> TriangleHits:
-        """The nearest triangle between ``t_min`` and ``t_max`` of each ray."""
+        """Return the nearest triangle between ``t_min`` and ``t_max`` of each ray."""
         count = len(rays)
         out = TriangleHitArrays(
             np.empty(count, np.float32), np.empty(count, np.int32), np.empty((count, 2), np.float32)
@@ -106,12 +106,12 @@ class TriangleBvh:
 
     @property
     def closest_query(self) -> EmbreeQuery:
-        """What :func:`~octasplat.engine.trace.kernels.triangles.closest_hits` asks; good while this lives."""
+        """Return the query for kernels' first hits; valid while this object lives."""
         return EmbreeQuery(intersect8_address(), self._scene.handle)
 
     @property
     def any_query(self) -> EmbreeQuery:
-        """What :func:`octasplat.engine.trace.kernels.triangles.any_hits` is to ask; good while this lives."""
+        """Return the query for kernels' occlusion tests; valid while this object lives."""
         return EmbreeQuery(occluded8_address(), self._scene.handle)
 
     def _allocate_scratch(self, rays: int) -> Float32[np.ndarray, "c w"]:
@@ -122,7 +122,7 @@ _ALL_RAYS = np.empty(0, np.int32)
 
 
 def allocate_embree_scratch(chunks: int) -> Float32[np.ndarray, "c w"]:
-    """Memory in which kernels ask Embree, a row for each that runs at the same time."""
+    """Return buffers for Embree calls in kernels, one row per parallel call."""
     return aligned_empty((chunks, SCRATCH_ROWS * LANES))
 
 

@@ -11,9 +11,9 @@ from scipy.ndimage import binary_fill_holes, distance_transform_edt
 
 from octasplat.engine.edit.deform import deform_to, deformation_corners
 from octasplat.engine.edit.kernels.mean_value import winding_numbers
+from octasplat.engine.evaluate.surface_metrics import distances_to_surface, sample_surface
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.geometry.triangle_mesh import TriangleMesh
-from octasplat.engine.surface.surface_metrics import distances_to_surface, sample_surface
 
 CORNERS = np.array([[k >> 2 & 1, k >> 1 & 1, k & 1] for k in range(8)])
 """Corner k of a cell, in cells from its least corner."""

@@ -937,7 +937,7 @@ def stage_init(
 @names_checked
 def export(
     source: PathLike,
-    files: Sequence[PathLike],
+    files: Sequence[PathLike] | PathLike,
     *,
     overwrite: bool = False,
     min_opacity: float | None = None,

@@ -137,6 +137,12 @@ def test_completed_export_is_not_reported_as_stopped(in_folder: Path) -> None:
     assert Path("other.ply").exists()
 
 
+def test_export_accepts_a_single_path(in_folder: Path) -> None:
+    assert osp.export("scene.ply", "one.glb").files == (Path("one.glb"),)
+    assert osp.export("scene.ply", Path("two.spz")).files == (Path("two.spz"),)
+    assert Path("one.glb").exists() and Path("two.spz").exists()
+
+
 def test_split_sum_reports_sample_count(in_folder: Path) -> None:
     told: list[Event] = []
     one = {"mode": "turntable", "frames": 1, "width_px": 16, "height_px": 16, "progress": told.append}

@@ -12,7 +12,8 @@ import pytest
 from octasplat.engine.core.color import linear_to_srgb
 from octasplat.engine.files import read_metadata
 from octasplat.engine.files.gaussian_ply import read_gaussian_ply, write_gaussian_ply
-from octasplat.engine.render.image_files import read_channels, read_image
+from octasplat.engine.render.image_files import read_image
+from tests.support.image_channels import read_channels
 
 SIZE = ("--width", 32, "--height", 24)
 

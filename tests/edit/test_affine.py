@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 from octasplat.engine.core.errors import ConfigError
-from octasplat.engine.edit.selection import in_box, in_sphere, merge_scenes, with_sh_degree
+from octasplat.engine.edit.selection import in_box, in_sphere
 from octasplat.engine.gaussians import affine
+from octasplat.engine.gaussians.merge import merge_scenes, with_sh_degree
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.gaussians.spherical_harmonics import sh_basis
 from tests.support.edit_scenes import assert_same, covariance_errors, covariances, random_turn

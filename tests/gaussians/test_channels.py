@@ -10,7 +10,6 @@ from octasplat.engine.gaussians.channels import (
     group_columns,
     merge_widths,
     stack_channels,
-    unstacked,
 )
 from octasplat.engine.gaussians.model import FlatGaussians, concatenate
 
@@ -63,20 +62,17 @@ def test_rows_must_be_as_many_as_gaussians(make_gaussians: Make) -> None:
         make_gaussians(5).with_channels(some(3, label=1))
 
 
-def test_features_of_a_tracer_and_back() -> None:
+def test_stacked_channels_are_side_by_side_in_order() -> None:
     channels = some(albedo=3, metallic=1, label=2)
     features = stack_channels(channels)
     assert features.shape == (4, 6)
-    back = unstacked(features, channels.widths)
-    assert list(back) == list(channels)
-    for name, array in channels.items():
-        np.testing.assert_array_equal(back[name], array)
+    np.testing.assert_array_equal(
+        features, np.hstack([channels["albedo"], channels["metallic"], channels["label"]])
+    )
     np.testing.assert_array_equal(
         stack_channels(channels, ["metallic", "albedo"]),
         np.hstack([channels["metallic"], channels["albedo"]]),
     )
-    with pytest.raises(ValueError, match="6 features"):
-        unstacked(features, {"albedo": 3})
 
 
 def test_channels_are_set_replaced_and_taken_away(make_gaussians: Make) -> None:

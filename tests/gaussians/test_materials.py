@@ -7,11 +7,9 @@ import pytest
 
 from octasplat.engine.core.errors import ConfigError
 from octasplat.engine.gaussians.materials import (
-    f0_linear,
     has_materials,
     reflective_fraction,
     require_materials,
-    split_materials,
 )
 from octasplat.engine.gaussians.model import FlatGaussians
 
@@ -26,9 +24,15 @@ def plain(count: int) -> FlatGaussians:
     )
 
 
+def materials(values: np.ndarray) -> dict[str, np.ndarray]:
+    """Channels of materials from albedo, metallic and roughness side by side, shape (n, 5)."""
+    columns = values.astype(np.float32)
+    parts = {"albedo": columns[:, :3], "metallic": columns[:, 3:4], "roughness": columns[:, 4:5]}
+    return {name: np.ascontiguousarray(part) for name, part in parts.items()}
+
+
 def test_scene_materials_need_all_three_channels() -> None:
-    channels = split_materials(np.linspace(-0.1, 1.1, 20).reshape(4, 5))
-    assert channels["albedo"].min() == 0 and channels["roughness"].max() == 1
+    channels = materials(np.linspace(0.0, 1.0, 20).reshape(4, 5))
     whole = plain(4).with_channels(channels)
     require_materials(whole, Path("scene.ply"))
     for name in channels:
@@ -39,14 +43,8 @@ def test_scene_materials_need_all_three_channels() -> None:
     assert not has_materials(whole.with_channels({"metallic": np.zeros((4, 2), np.float32)}))
 
 
-def test_base_reflectance_of_metal_and_dielectric() -> None:
-    albedo = np.array([[0.9, 0.5, 0.1]] * 3)
-    f0 = f0_linear(albedo, np.array([[0.0], [1.0], [0.5]]))
-    np.testing.assert_allclose(f0, [[0.04] * 3, [0.9, 0.5, 0.1], [0.47, 0.27, 0.07]])
-
-
 def test_smooth_metal_is_reflective() -> None:
     values = np.array([[0.5, 0.5, 0.5, 0.9, 0.1], [0.5, 0.5, 0.5, 0.9, 0.9], [0.5, 0.5, 0.5, 0.1, 0.1]])
     scene = plain(3)
     scene.log_scales[0] = np.log(2)  # four times the area
-    assert reflective_fraction(scene.with_channels(split_materials(values))) == pytest.approx(4 / 6)
+    assert reflective_fraction(scene.with_channels(materials(values))) == pytest.approx(4 / 6)

@@ -5,14 +5,9 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from octasplat.engine.pathtracing.bsdf_tables import (
-    OpaqueMaterial,
-    RoughGlass,
-    albedo_table,
-    fresnel,
-    rough_dielectric_table,
-)
+from octasplat.engine.pathtracing.bsdf_tables import albedo_table, rough_dielectric_table
 from octasplat.engine.shading.kernels.microfacets import table_value
+from tests.support.bsdf_arrays import OpaqueMaterial, RoughGlass, fresnel
 
 
 @numba.njit

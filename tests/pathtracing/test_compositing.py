@@ -20,9 +20,9 @@ from octasplat.engine.pathtracing.stage.model import (
     Stage,
     StageMesh,
 )
-from octasplat.engine.render.image_files import read_channels
 from octasplat.engine.trace.protocol import TraceSettings
 from octasplat.workers.cli.main import cli
+from tests.support.image_channels import read_channels
 from tests.support.light_scenes import camera, film_of, psnr, table_with_a_box
 
 VIEW = camera((0.9, -1.0, -1.2), (0, -0.1, 0), (48, 36), 45)

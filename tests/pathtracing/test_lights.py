@@ -8,10 +8,11 @@ from scipy.stats import chi2
 
 from octasplat.engine.core.errors import ConfigError
 from octasplat.engine.pathtracing.environment import EnvironmentMap, environment_frame
-from octasplat.engine.pathtracing.lights import build_light_arrays, eval_environment_map, sample_lights
+from octasplat.engine.pathtracing.lights import build_light_arrays, eval_environment_map
 from octasplat.engine.pathtracing.stage.model import DirectionalLight, PointLight, RectangleLight, SpotLight
 from octasplat.engine.render.environment_files import read_environment, write_environment
 from octasplat.engine.render.image_files import write_exr
+from tests.support.light_samples import sample_lights
 
 UP = np.array([0.0, 0.0, 1.0])
 

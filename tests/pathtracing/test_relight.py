@@ -9,8 +9,9 @@ from click.testing import CliRunner, Result
 from octasplat.engine.core.color import linear_to_srgb
 from octasplat.engine.files.gaussian_ply import write_gaussian_ply
 from octasplat.engine.render.environment_files import write_environment
-from octasplat.engine.render.image_files import read_channels, read_image
+from octasplat.engine.render.image_files import read_image
 from octasplat.workers.cli.main import cli
+from tests.support.image_channels import read_channels
 from tests.support.light_scenes import psnr, shiny_ball
 
 SMALL = ("--turntable", "--frames", 2, "--width", 32, "--height", 24, "--threads", 2, "--samples", 16)

@@ -9,8 +9,9 @@ from click.testing import CliRunner, Result
 from octasplat.engine.files.gaussian_ply import write_gaussian_ply
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.pathtracing.stage.stage_file import read_stage
-from octasplat.engine.render.image_files import read_channels, read_image
+from octasplat.engine.render.image_files import read_image
 from octasplat.workers.cli.main import cli
+from tests.support.image_channels import read_channels
 from tests.support.light_scenes import table_with_a_box
 
 

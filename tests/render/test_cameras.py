@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from octasplat.engine.render.pinhole_camera import PinholeCamera, focal_from_fov, fov_from_focal
+from octasplat.engine.render.pinhole_camera import PinholeCamera, focal_from_fov
 
 
 def camera(**changes):
@@ -41,4 +41,4 @@ def test_camera_pose_round_trip():
 
 def test_field_of_view_spans_image():
     assert focal_from_fov(90.0, 200) == pytest.approx(100)
-    assert fov_from_focal(focal_from_fov(37.0, 480), 480) == pytest.approx(37)
+    assert focal_from_fov(60.0, 200) == pytest.approx(100 * np.sqrt(3))

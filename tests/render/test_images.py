@@ -5,6 +5,7 @@ import pytest
 from octasplat.engine.core.color import linear_to_srgb, srgb_to_linear, to_bytes
 from octasplat.engine.core.errors import DatasetError, OutputError
 from octasplat.engine.render import image_files
+from tests.support.image_channels import read_channels
 
 
 @pytest.fixture
@@ -34,7 +35,7 @@ def test_exr_holds_linear_light_depth_alpha_and_normals(tmp_path, picture):
     normals = rng.normal(size=(6, 9, 3)).astype(np.float32)
     layers = image_files.exr_layers(picture, alpha=alpha, depth=depth, normals_world=normals)
     image_files.write_exr(tmp_path / "a.exr", layers)
-    again = image_files.read_channels(tmp_path / "a.exr")
+    again = read_channels(tmp_path / "a.exr")
     assert set(again) == {"R", "G", "B", "A", "Z", "N.x", "N.y", "N.z"}
     assert all(np.array_equal(again[name], layers[name]) for name in layers)
     rgb = np.stack([again[c] for c in "RGB"], axis=-1)
@@ -44,7 +45,7 @@ def test_exr_holds_linear_light_depth_alpha_and_normals(tmp_path, picture):
 def test_half_exr_keeps_full_precision_depth(tmp_path, picture):
     depth = np.full((6, 9), 123456.789, np.float32)
     image_files.write_exr(tmp_path / "a.exr", image_files.exr_layers(picture, depth=depth), half=True)
-    again = image_files.read_channels(tmp_path / "a.exr")
+    again = read_channels(tmp_path / "a.exr")
     assert np.array_equal(again["Z"], depth)
     assert np.allclose(again["R"], srgb_to_linear(picture)[..., 0], rtol=1e-3)
     spec = oiio.ImageInput.open(str(tmp_path / "a.exr")).spec()

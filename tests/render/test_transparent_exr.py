@@ -12,12 +12,12 @@ from octasplat.engine.core.color import linear_to_srgb, srgb_to_linear
 from octasplat.engine.gaussians.model import SH_C0, FlatGaussians
 from octasplat.engine.pathtracing.relighting.path_relighter import Relighter
 from octasplat.engine.pathtracing.relighting.relit_images import RelitRenderFn, ShotLighting
-from octasplat.engine.render.image_files import read_channels
 from octasplat.engine.render.pinhole_camera import PinholeCamera
 from octasplat.engine.render.pose_paths import look_at
 from octasplat.engine.render.shots import Shot, scene_render_fn
 from octasplat.engine.trace.factory import make_tracer
 from octasplat.engine.trace.protocol import TraceSettings
+from tests.support.image_channels import read_channels
 
 RGB_SRGB = np.array([0.9, 0.5, 0.2], np.float32)
 

@@ -12,11 +12,12 @@ from octasplat.engine.gaussians.frames import (
 )
 from octasplat.engine.gaussians.model import SH_C0, FlatGaussians
 from octasplat.engine.render.image_files import read_image
-from octasplat.engine.render.path_file import CameraPath, write_camera_path
+from octasplat.engine.render.path_file import CameraPath
 from octasplat.engine.render.pinhole_camera import PinholeCamera
 from octasplat.engine.render.renderer import background_colour, render_rays
 from octasplat.engine.trace.cpu.tracer import CpuTracer
 from octasplat.engine.trace.protocol import TraceSettings
+from tests.support.camera_paths import write_camera_path
 
 WIDTH_PX, HEIGHT_PX = 256, 192
 

@@ -5,14 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from octasplat.engine.geometry.triangle_mesh import TriangleMesh
-from octasplat.engine.surface.occlusion import Occluder
-from octasplat.engine.surface.surface_metrics import (
+from octasplat.engine.evaluate.surface_metrics import (
     distances_to_surface,
     point_triangle_distances,
     sample_surface,
     surface_metrics,
 )
+from octasplat.engine.geometry.triangle_mesh import TriangleMesh
+from octasplat.engine.surface.occlusion import Occluder
 
 
 def test_distance_to_each_part_of_a_triangle():

@@ -8,10 +8,15 @@ import pytest
 from octasplat.engine.dataset import DatasetModel, load_dataset_model
 from octasplat.engine.dataset.synthetic import SyntheticDatasetConfig, write_synthetic_dataset
 from octasplat.engine.dataset.synthetic.still_life import TABLE_RADIUS, build_still_life
+from octasplat.engine.evaluate.surface_metrics import (
+    SurfaceMetrics,
+    distances_to_surface,
+    sample_surface,
+    surface_metrics,
+)
 from octasplat.engine.files.gaussian_ply import read_gaussian_ply
 from octasplat.engine.geometry.triangle_mesh import TriangleMesh, edge_report
 from octasplat.engine.pipeline import reconstruct
-from octasplat.engine.render.image_files import read_channels
 from octasplat.engine.render.pinhole_camera import PinholeCamera
 from octasplat.engine.runs.config import resolve_config
 from octasplat.engine.runs.run_folder import SCENE
@@ -22,14 +27,9 @@ from octasplat.engine.surface.marching_cubes import marching_cubes
 from octasplat.engine.surface.occlusion import Occluder
 from octasplat.engine.surface.options import ExtractionOptions
 from octasplat.engine.surface.region import choose_region
-from octasplat.engine.surface.surface_metrics import (
-    SurfaceMetrics,
-    distances_to_surface,
-    sample_surface,
-    surface_metrics,
-)
 from octasplat.engine.surface.tsdf_volume import fuse_depth_maps
 from octasplat.engine.trace.cpu.tracer import CpuTracer
+from tests.support.image_channels import read_channels
 
 MIN_VIEWS = 3
 """Only what so many cameras see can be asked for."""

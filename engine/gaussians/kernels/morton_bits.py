@@ -1,4 +1,4 @@
-"""Bits of Z-order codes, for arrays as it is and, compiled, for single numbers."""
+"""Bit spreading for Z-order codes, for arrays and, compiled, for single numbers."""
 
 import numpy as np
 from jaxtyping import UInt64

@@ -1,1 +1,1 @@
-"""A scene with materials in another light: path traced or by the split sum."""
+"""Relighting of scenes with materials: by path tracing or by the split sum."""

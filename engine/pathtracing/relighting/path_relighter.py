@@ -1,4 +1,4 @@
-"""Scenes with materials in another light: what a camera sees of them under an environment."""
+"""Relighting by path tracing: a camera's images under an environment."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -23,12 +23,12 @@ ProgressCallback = Callable[[float], None]
 
 
 def no_progress(_share: float) -> None:
-    """Tell nobody."""
+    """Ignore progress."""
 
 
 @dataclass(frozen=True)
 class RelitImage:
-    """One picture, in front of nothing yet.
+    """One relit image, without a background.
 
     Attributes:
         linear: radiance of what is seen of the scene, not multiplied by its coverage, without upper limit.
@@ -41,26 +41,26 @@ class RelitImage:
     def composite_over(
         self, background_srgb: Float32[np.ndarray, "3"] | Float32[np.ndarray, "h w 3"]
     ) -> Float32[np.ndarray, "h w 3"]:
-        """Display values over a background, composited as such; beyond 1 where there is more light."""
+        """Return display values over a background, composited in display space; bright light exceeds 1."""
         covered = self.coverage[..., None]
         return np.asarray(covered * linear_to_srgb(self.linear) + (1 - covered) * background_srgb, np.float32)
 
 
 @runtime_checkable
 class Relighter(Protocol):
-    """Shows a scene in the light of an environment."""
+    """Renderer of a scene under an environment."""
 
     def set_environment(self, environment: EnvironmentMap) -> None:
-        """Take this environment from now on."""
+        """Use this environment from now on."""
         ...
 
     def render(self, image: ImageRays, progress: ProgressCallback = no_progress) -> RelitImage:
-        """What a camera sees; ``progress`` is told the share that is done."""
+        """Return the camera's image; ``progress`` is called with the fraction done."""
         ...
 
 
 class PathRelighter:
-    """By paths of light: right up to noise, with all shadows and inter-reflection.
+    """Relighting by path tracing: correct up to noise, with all shadows and interreflection.
 
     Args:
         gaussians: a scene with materials.
@@ -82,7 +82,7 @@ class PathRelighter:
         self._tracer: PathTracer | None = None
 
     def set_environment(self, environment: EnvironmentMap) -> None:
-        """Take this environment from now on."""
+        """Use this environment from now on."""
         lights = build_light_arrays((), environment.frame[1], environment)
         meshes = self._meshes.with_lights(lights)
         self._tracer = PathTracer(
@@ -90,14 +90,14 @@ class PathRelighter:
         )
 
     def render(self, image: ImageRays, progress: ProgressCallback = no_progress) -> RelitImage:
-        """What a camera sees; ``progress`` is told the share that is done."""
+        """Return the camera's image; ``progress`` is called with the fraction done."""
         assert self._tracer is not None, "an environment must be put first"
         film = self._tracer.render(image, lambda done, of: progress(done / of))
         return RelitImage(*film.gaussian_surface())
 
 
 def render_environment(environment: EnvironmentMap, image: ImageRays) -> Float32[np.ndarray, "h w 3"]:
-    """Display values of the environment itself behind the pixels of a picture."""
+    """Return display values of the environment behind an image's pixels."""
     lights = build_light_arrays((), environment.frame[1], environment)
     directions: Float64[np.ndarray, "n 3"] = image.directions_world.reshape(-1, 3).astype(np.float64)
     radiance, _ = eval_environment_map(lights, directions)

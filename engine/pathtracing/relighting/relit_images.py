@@ -1,4 +1,4 @@
-"""Pictures of a scene under one or several environments, each shot in the light that is its own."""
+"""Images of a scene under one or several environments, each shot with its own lighting."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -21,7 +21,7 @@ RadianceMap = Float32[np.ndarray, "h w 3"]
 
 @dataclass(frozen=True)
 class ShotLighting:
-    """The light on one shot.
+    """The lighting of one shot.
 
     Attributes:
         environment: name of the map.
@@ -76,7 +76,7 @@ def lit_shots(
 
 @dataclass
 class RelitRenderFn:
-    """What renders a shot in its light to a file.
+    """Render function of shots under their lighting.
 
     ``.exr`` gets linear R, G, B and alpha A, anything else 8-bit display values.
 

@@ -1,4 +1,4 @@
-"""Scenes with materials in another light by the split sum: fast, as they were learnt."""
+"""Relighting by the split sum: fast, with the shading of the training."""
 
 import numpy as np
 from jaxtyping import Float32
@@ -19,7 +19,7 @@ ENVIRONMENT_HEIGHT_PX = 256
 
 
 class SplitSumRelighter:
-    """Deferred shading with traced visibility; what a reflected ray meets is shaded by the split sum itself.
+    """Deferred shading with traced visibility; reflected hits are shaded by the split sum, too.
 
     Follows :class:`octasplat.engine.pathtracing.relighting.path_relighter.Relighter`.
 
@@ -61,7 +61,7 @@ class SplitSumRelighter:
         self._radiance: Float32[np.ndarray, "h w 3"] | None = None
 
     def set_environment(self, environment: EnvironmentMap) -> None:
-        """Take this environment from now on."""
+        """Use this environment from now on."""
         other = self._radiance is not environment.radiance_linear
         if other:
             self._shading.light.put(environment.radiance_linear)
@@ -72,7 +72,7 @@ class SplitSumRelighter:
                 self._shading.bounce(self._gaussians, self._all, self._ambient_visibility, self._tracer)
 
     def render(self, image: ImageRays, progress: ProgressCallback = no_progress) -> RelitImage:
-        """What a camera sees; ``progress`` is told the share that is done."""
+        """Return the camera's image; ``progress`` is called with the fraction done."""
         assert self._radiance is not None, "an environment must be put first"
         found = pixel_means(self._tracer, image, self._shading, self._rays_across_pixel, progress)
         return RelitImage(found.linear, found.alpha)

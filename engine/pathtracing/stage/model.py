@@ -1,4 +1,4 @@
-"""What a stage is: meshes, lights, an environment and Gaussian scenes that are rendered together.
+"""The stage's data model: meshes, lights, an environment and Gaussian scenes that are rendered together.
 
 Positions and lengths are in world units, angles in degrees. Colours of materials and lights are display
 (sRGB-encoded) values in [0, 1] and turned into linear ones for the transport of light; strengths of lights
@@ -24,13 +24,13 @@ WHITE = (1.0, 1.0, 1.0)
 
 
 class StageModel(BaseModel):
-    """Base of everything in a stage: unknown keys are refused, and nothing changes afterwards."""
+    """Base of all stage models: unknown keys are refused, and instances are immutable."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
 
 class NormalMapped(StageModel):
-    """A surface whose normals an image may change.
+    """A surface with an optional normal map.
 
     Attributes:
         normal_texture: image file of normals in the frame of the texture coordinates: x to the right of the
@@ -43,7 +43,7 @@ class NormalMapped(StageModel):
 
 
 class Emissive(StageModel):
-    """A surface that may shine by itself, on both sides.
+    """A surface that may emit light, on both sides.
 
     Attributes:
         emission: linear radiance of its own light, the same in all directions; 0 for none.
@@ -57,7 +57,7 @@ class Emissive(StageModel):
 
 
 class Diffuse(NormalMapped, Emissive):
-    """A matt surface that sends light evenly everywhere.
+    """A diffuse (Lambertian) surface.
 
     Attributes:
         colour_srgb: share of the light that it sends back.
@@ -77,7 +77,7 @@ class Mirror(StageModel):
 
 
 class Glass(StageModel):
-    """Clear or frosted glass, for closed meshes.
+    """Clear or rough glass, for closed meshes.
 
     Attributes:
         ior: index of refraction; that of the surroundings is 1.
@@ -111,7 +111,7 @@ class Metal(NormalMapped):
 
 
 class Dielectric(NormalMapped, Emissive):
-    """A coloured ground under a clear coat with a microfacet surface, such as plastic or glaze.
+    """A coloured substrate under a clear coat with a microfacet surface, such as plastic or glaze.
 
     Attributes:
         colour_srgb: of the ground.
@@ -161,7 +161,7 @@ Material = Annotated[
 
 
 class Transformed(StageModel):
-    """Something with a place in the world: scaled first, then turned, then moved.
+    """Something with a placement in the world: scaled first, then rotated, then translated.
 
     Attributes:
         position: where its origin comes to lie.
@@ -175,7 +175,7 @@ class Transformed(StageModel):
 
 
 class RestingPlace(StageModel):
-    """A place on a surface of the Gaussians on which a mesh comes to stand.
+    """A place on the Gaussians' surface on which a mesh rests.
 
     Either a pixel of a photograph or a ray; where it meets the scene (the distance at which half of the
     light is gone), the mesh's lowest point comes to lie, its middle above it.
@@ -204,7 +204,7 @@ class RestingPlace(StageModel):
 
 
 class StageMesh(Transformed):
-    """A mesh from a file, or a simple shape.
+    """A mesh from a file, or a primitive shape.
 
     Attributes:
         file: OBJ, PLY or GLB.
@@ -236,7 +236,7 @@ class StageMesh(Transformed):
 
 
 class LightModel(StageModel):
-    """What all lights have.
+    """Settings that all lights have.
 
     Attributes:
         colour_srgb: of the light.
@@ -249,7 +249,7 @@ class LightModel(StageModel):
 
 
 class PointLight(LightModel):
-    """Light from one point, or from a ball, to everywhere.
+    """Light from a point, or from a sphere, in all directions.
 
     Attributes:
         intensity: linear radiant intensity; at distance d it gives the irradiance intensity / d squared.
@@ -266,7 +266,7 @@ class PointLight(LightModel):
 
 
 class SpotLight(LightModel):
-    """Light from one point into a cone.
+    """Light from a point into a cone.
 
     Attributes:
         direction: of the cone's axis.
@@ -311,7 +311,7 @@ class DirectionalLight(LightModel):
 
 
 class RectangleLight(LightModel):
-    """A shining rectangle; its back is black.
+    """A rectangular emitter; its back is black.
 
     Attributes:
         position: its centre.
@@ -341,7 +341,7 @@ Light = Annotated[PointLight | SpotLight | DirectionalLight | RectangleLight, Fi
 
 
 class Environment(StageModel):
-    """Light from all around.
+    """Distant light from all directions.
 
     Attributes:
         file: equirectangular HDR or EXR image of linear radiance, the stage's up at its top.
@@ -357,7 +357,7 @@ class Environment(StageModel):
 
 
 class StageGaussians(Transformed):
-    """A scene of Gaussians and how it takes part in the light.
+    """A scene of Gaussians and how it interacts with light.
 
     Attributes:
         file: splat file of any format; None for the scene that is rendered. Its scale is one number.
@@ -388,7 +388,7 @@ class StageGaussians(Transformed):
 
 
 class Integrator(StageModel):
-    """How the picture is computed.
+    """Settings of the path tracer.
 
     Attributes:
         samples: paths a pixel.

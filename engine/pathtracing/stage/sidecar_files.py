@@ -1,4 +1,4 @@
-"""Files that a mesh file needs beside it. Imports neither torch nor numba."""
+"""Files that a mesh file refers to. Imports neither torch nor numba."""
 
 from collections.abc import Iterable, Iterator
 from pathlib import Path
@@ -8,7 +8,7 @@ IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".
 
 
 def sidecar_files(mesh: Path) -> tuple[str, ...]:
-    """Names, relative to the mesh's folder, of files there that the mesh comes with.
+    """Return the files in the mesh's folder that belong to it, relative to that folder.
 
     Those are the MTL files whose names an OBJ mentions and the images whose names these mention, in the
     folder itself and in those right below it; any other mesh has none. Rather one too many than one too few:
@@ -24,7 +24,7 @@ def sidecar_files(mesh: Path) -> tuple[str, ...]:
 
 
 def _referenced_files(folder: Path, suffixes: Iterable[str], texts: Iterable[Path]) -> tuple[str, ...]:
-    """The files of these kinds whose names a text mentions, by name."""
+    """Return the files of these suffixes whose names occur in a text, by name."""
     said = b"\n".join(path.read_bytes() for path in texts).replace(b"\\", b"/")
     return tuple(name for name in sorted(_files_with_suffix(folder, suffixes)) if name.encode() in said)
 

@@ -1,4 +1,4 @@
-"""Stage files: TOML read and checked, and a commented one written. Imports neither torch nor numba."""
+"""Stage files: TOML read and validated, and a commented template written. Imports neither torch nor numba."""
 
 import tomllib
 from collections.abc import Iterator, Mapping, Sequence
@@ -19,7 +19,7 @@ TEXTURE_KEYS = ("texture", "metallic_roughness_texture", "normal_texture", "emis
 
 
 def read_stage(path: Path) -> Stage:
-    """The stage of a TOML file, with the names of its files made relative to the file's folder.
+    """Return the stage of a TOML file, its files' names made relative to the file's folder.
 
     Raises:
         ConfigError: no such file, no TOML, an unknown key, a value out of range, or a file that it names
@@ -39,7 +39,7 @@ def read_stage(path: Path) -> Stage:
 
 
 def parse_stage(text: str, name: str) -> Stage:
-    """The stage of a TOML text; ``name`` is what errors call it.
+    """Return the stage of a TOML text; ``name`` is what errors call it.
 
     Raises:
         ConfigError: no TOML, an unknown key, or a value out of range.
@@ -53,7 +53,7 @@ def parse_stage(text: str, name: str) -> Stage:
 
 
 def referenced_files(stage: Stage) -> Iterator[tuple[str, str]]:
-    """The key and the name of every file that a stage names."""
+    """Return the key and the name of every file that a stage names."""
     if stage.environment is not None:
         yield "environment.file", stage.environment.file
     for number, scene in enumerate(stage.gaussians):
@@ -69,7 +69,7 @@ def referenced_files(stage: Stage) -> Iterator[tuple[str, str]]:
 
 
 def stage_identity(stage: Stage, folder: Path) -> tuple[object, ...]:
-    """Return what of a stage decides how a picture looks: itself, and the files that it brings.
+    """Return what of a stage decides how an image looks: the stage, and the files that it names.
 
     Args:
         stage: the stage.
@@ -80,7 +80,7 @@ def stage_identity(stage: Stage, folder: Path) -> tuple[object, ...]:
 
 
 def with_renamed_files(stage: Stage, names: Mapping[str, str]) -> Stage:
-    """The stage with its files under other names, by those that they have."""
+    """Return the stage with its files under other names, keyed by their present ones."""
     content = stage.model_dump(mode="json")
     for key, name in referenced_files(stage):
         *path, last = key.replace("[", ".").replace("]", "").split(".")
@@ -97,7 +97,7 @@ BALL_RADIUS_FRACTION = 0.12
 
 @dataclass(frozen=True)
 class StageLayout:
-    """What a first stage of a scene is fitted to.
+    """Positions and sizes to which a first stage of a scene is fitted.
 
     Attributes:
         up: the direction that is up, a unit vector.
@@ -115,7 +115,7 @@ class StageLayout:
 
 
 def write_stage_template(path: Path, layout: StageLayout) -> None:
-    """Write a commented stage for a scene: a ball on the floor, a light, and more to uncomment.
+    """Write a commented stage for a scene: a ball on the floor, a light, and commented-out examples.
 
     Raises:
         OSError: the file cannot be written.
@@ -148,13 +148,13 @@ def _format_vector(values: tuple[float, ...]) -> str:
 
 
 def _error_message(error: ValidationError) -> str:
-    """The first thing that is wrong, with the key as one would look for it in the file."""
+    """Return the first error, with its key as written in the file."""
     first = error.errors()[0]
     return stage_error_message(first["type"], stage_key_path(first["loc"]), first["msg"], first.get("input"))
 
 
 def stage_key_path(location: Sequence[int | str]) -> tuple[int | str, ...]:
-    """Where pydantic finds a fault in a stage, as the keys of the file.
+    """Return the keys of a stage file at which pydantic found an error.
 
     The kinds of a union stand in the location too, but are no keys.
     """
@@ -162,7 +162,7 @@ def stage_key_path(location: Sequence[int | str]) -> tuple[int | str, ...]:
 
 
 def stage_error_message(kind: str, keys: Sequence[int | str], message: str, value: object) -> str:
-    """One of pydantic's faults as a sentence.
+    """Return one of pydantic's errors as a sentence.
 
     Args:
         kind: of the fault, as pydantic calls it.

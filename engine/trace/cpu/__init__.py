@@ -1,4 +1,4 @@
-"""The tracer for any CPU: packets of neighbouring rays, and Embree for rays that come alone.
+"""The tracer for any CPU: packets of neighbouring rays, and single rays through Embree.
 
 It is in :mod:`octasplat.engine.trace.cpu.tracer`, and not loaded for those that take no more than its
 vectors.

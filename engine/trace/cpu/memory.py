@@ -1,4 +1,4 @@
-"""Memory that the tracer's kernels fill."""
+"""Buffers that the tracer's kernels fill."""
 
 import math
 import weakref
@@ -18,7 +18,7 @@ from octasplat.engine.trace.protocol import GaussianGradients, TraceGradients, T
 
 
 def aligned_empty(shape: tuple[int, ...]) -> Float32[np.ndarray, "..."]:
-    """Uninitialised float32 array whose memory starts on a cache line."""
+    """Return an uninitialised float32 array aligned to a cache line."""
     return _aligned_bytes(int(np.prod(shape)) * 4).view(np.float32).reshape(shape)
 
 
@@ -29,7 +29,7 @@ def _aligned_bytes(size: int) -> UInt8[np.ndarray, " b"]:
 
 
 class ArrayPool:
-    """Hands out arrays whose memory is used again once nobody holds any array over it.
+    """Pool of arrays whose memory is reused once no array refers to it.
 
     Fresh pages for large arrays would cost as much as the work done in them. An array, its slices and views
     keep their memory; when the last of them is gone, the memory returns here. So a recording owns what it
@@ -40,7 +40,7 @@ class ArrayPool:
         self._free: list[np.ndarray] = []
 
     def empty(self, *specs: tuple[tuple[int, ...], DTypeLike]) -> list[np.ndarray]:
-        """Uninitialised arrays of such shapes and types, each from a cache line on.
+        """Return uninitialised arrays of these shapes and types, each aligned to a cache line.
 
         They lie in one block, which returns when the last of them is gone; pages are only taken when they are
         written to.
@@ -73,7 +73,7 @@ _MAX_FREE_BLOCKS = 32
 
 
 class _BlockLease:
-    """What arrays over a block refer to, so that the end of the last of them is the end of this."""
+    """Owner of a block's arrays, which returns the block to its pool when the last of them is freed."""
 
     def __init__(self, block: np.ndarray) -> None:
         self.__array_interface__ = block.__array_interface__
@@ -86,7 +86,7 @@ def _return_block(pool: "weakref.ref[ArrayPool]", block: np.ndarray) -> None:
 
 
 def empty_result(rays: int, features: int) -> TraceResult:
-    """Uninitialised outputs of ``rays`` rays."""
+    """Return uninitialised outputs of ``rays`` rays."""
     return TraceResult(
         rgb_srgb=np.empty((rays, 3), np.float32),
         transmittance=np.empty(rays, np.float32),
@@ -99,7 +99,7 @@ def empty_result(rays: int, features: int) -> TraceResult:
 
 
 def empty_gradients(gaussians: int, basis_count: int, features: int) -> GaussianGradients:
-    """Uninitialised gradients of ``gaussians`` Gaussians that were hit."""
+    """Return uninitialised gradients of ``gaussians`` Gaussians that were hit."""
     return GaussianGradients(
         ids=np.empty(gaussians, np.int32),
         means_world=np.empty((gaussians, 3), np.float32),
@@ -115,7 +115,7 @@ def empty_gradients(gaussians: int, basis_count: int, features: int) -> Gaussian
 
 
 def gradient_arrays(gradients: GaussianGradients) -> GaussianGradientArrays:
-    """The arrays of ``gradients`` as kernels take them."""
+    """Return the arrays of ``gradients`` as kernels take them."""
     g = gradients
     return GaussianGradientArrays(
         g.ids, g.means_world, g.quats_wxyz, g.log_scales, g.opacity_logits, g.sh, g.features, g.weight_sums,
@@ -124,7 +124,7 @@ def gradient_arrays(gradients: GaussianGradients) -> GaussianGradientArrays:
 
 
 def output_arrays(result: TraceResult) -> OutputArrays:
-    """The arrays of ``result`` as kernels take them."""
+    """Return the arrays of ``result`` as kernels take them."""
     r = result
     return OutputArrays(
         r.rgb_srgb, r.transmittance, r.depth_sum, r.depth_median, r.normal_world, r.features, r.hit_counts
@@ -132,7 +132,7 @@ def output_arrays(result: TraceResult) -> OutputArrays:
 
 
 def output_gradient_arrays(gradients: TraceGradients, rays: int, features: int) -> OutputGradientArrays:
-    """``gradients`` as kernels take them, zero where there is none."""
+    """Return ``gradients`` as kernels take them, zeros for None."""
     g = gradients
     return OutputGradientArrays(
         contiguous_float32(g.rgb_srgb),
@@ -147,10 +147,10 @@ def output_gradient_arrays(gradients: TraceGradients, rays: int, features: int) 
 
 
 def contiguous_float32(array: np.ndarray) -> np.ndarray:
-    """``array`` as contiguous float32, itself where it is that already."""
+    """Return ``array`` as contiguous float32, itself if it is that already."""
     return np.ascontiguousarray(array, dtype=np.float32)
 
 
 def zeros_if_none(array: np.ndarray | None, shape: tuple[int, ...]) -> np.ndarray:
-    """``array``, or zeros where there is none."""
+    """Return ``array``, or zeros if it is None."""
     return np.zeros(shape, np.float32) if array is None else contiguous_float32(array)

@@ -1,4 +1,4 @@
-"""The packets' hierarchy as arrays.
+"""The bounding-volume hierarchy of packet tracing, as arrays.
 
 Their layout is described in :mod:`octasplat.engine.trace.cpu.kernels.packet_bvh`.
 """
@@ -28,7 +28,7 @@ _GRID_SAMPLE = 4096
 
 
 class PacketBvh:
-    """Eight boxes a node over blocks of eight Gaussians along a Z-order curve.
+    """Hierarchy of eight boxes per node over blocks of eight Gaussians along a Z-order curve.
 
     Args:
         primitives: of all Gaussians; those that are not finite are left out.
@@ -65,7 +65,7 @@ class PacketBvh:
         self._threads = threads
 
     def refresh(self, primitives: Float32[np.ndarray, "n 16"], ids: Int32[np.ndarray, " u"]) -> None:
-        """Take the changed records of ``ids`` over, and refit the boxes around them.
+        """Copy the changed records of ``ids``, and refit the boxes around them.
 
         The boxes are then those of a new build along the old curve.
         """
@@ -76,7 +76,7 @@ class PacketBvh:
 
 
 def _curve_grid(means_world: Float32[np.ndarray, "n 3"]) -> tuple[np.ndarray, float]:
-    """Origin and cell size of the curve's grid: the box of the central 98 % with room around it."""
+    """Return origin and cell size of the curve's grid: the central 98 % of the means' box, padded."""
     sample = means_world[:: max(1, len(means_world) // _GRID_SAMPLE)].astype(np.float64)
     sample = sample[np.isfinite(sample).all(axis=1)]
     if len(sample) == 0:

@@ -1,4 +1,4 @@
-"""Rays that come in packets: neighbours with one origin, such as the pixels of a tile."""
+"""Packets: neighbouring rays of one origin, such as the pixels of a tile, traced together."""
 
 from typing import Literal
 
@@ -57,7 +57,7 @@ PacketMode = Literal["auto", "always", "never"]
 def find_packets(
     rays: RayBatch, mode: PacketMode = "auto", *, needs_color: bool = True
 ) -> tuple[Int64[np.ndarray, "p 2"], Int64[np.ndarray, " s"]]:
-    """Which rays go in packets, and which alone.
+    """Split rays into packets and single rays.
 
     A group are neighbours in the batch that share an origin, to the bit, and look about one way. Each is
     judged by its own size, but few small ones go as packets, too. A packet sees a Gaussian in one colour, so
@@ -87,7 +87,7 @@ def find_packets(
 
 
 class PacketTracer:
-    """Walks the hierarchy once a packet, then tests its candidates eight at a time against each ray.
+    """Tracer that traverses the hierarchy once per packet, then tests candidates eight at a time per ray.
 
     Args:
         limits: where rays end.
@@ -107,14 +107,14 @@ class PacketTracer:
         self._bvh = PacketBvh(primitives, self._threads)
 
     def refresh(self, primitives: Float32[np.ndarray, "n 16"], ids: Int32[np.ndarray, " u"]) -> None:
-        """Take changed records over, and refit the hierarchy."""
+        """Copy changed records, and refit the hierarchy."""
         assert self._bvh is not None, "build first"
         self._bvh.refresh(primitives, ids)
 
     def allocate_hits(
         self, packets: Int64[np.ndarray, "p 2"], rays: int, *, is_recording: bool
     ) -> PacketHits:
-        """Memory for what packets keep of their hits."""
+        """Return buffers for the recorded hits of packets."""
         places = rays * (self._limits.max_hits + HIT_PADDING) if is_recording and len(packets) else 0
         numbers, whole = ((places,), np.float32), ((places,), np.int32)
         us, vs, slots, slot_ids, slot_rgb = self._pool.empty(
@@ -123,7 +123,7 @@ class PacketTracer:
         return PacketHits(us, vs, slots, slot_ids, slot_rgb, slot_counts=np.zeros(len(packets), np.int32))
 
     def trace(self, forward: ForwardPass, packets: Int64[np.ndarray, "p 2"], packet_hits: PacketHits) -> None:
-        """Follow the rays of the packets."""
+        """Trace the rays of the packets."""
         assert self._bvh is not None, "build first"
         run_on_threads(
             trace_packets,
@@ -138,7 +138,7 @@ class PacketTracer:
     def trace_shared_sort(
         self, forward: ForwardPass, packets: Int64[np.ndarray, "p 2"], rays: int
     ) -> SharedSortHits:
-        """Follow the rays of the packets, those of a packet through its Gaussians in one order.
+        """Trace the rays of the packets, all rays of a packet in one depth order.
 
         How many a packet will meet is not known before, so that what has no room is traced again.
         """
@@ -183,7 +183,7 @@ class PacketTracer:
         parameters: GaussianParameters,
         min_blend_weight: float,
     ) -> GaussianGradients:
-        """Gradients of the raw parameters: summed within each packet, then over packets in their order.
+        """Return gradients of the raw parameters, summed within each packet, then in packet order.
 
         Gaussians whose weights add up to less than ``min_blend_weight`` are left out before the sums.
         """

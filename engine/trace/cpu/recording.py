@@ -1,4 +1,4 @@
-"""What a recording trace of the CPU keeps."""
+"""Recorded hits of the CPU tracer."""
 
 from dataclasses import dataclass
 
@@ -35,12 +35,12 @@ class CpuRecording:
     build_id: object
 
     def hit_slice(self, ray: int) -> slice:
-        """Where the arrays of ``hits`` have those of one ray."""
+        """Return the slice of one ray in the arrays of ``hits``."""
         start = int(self.hits.starts[ray])
         return slice(start, start + int(self.counts[ray]))
 
     def ids_of_ray(self, ray: int) -> Int32[np.ndarray, " k"]:
-        """Ids of the Gaussians of one ray, front to back."""
+        """Return the ids of one ray's Gaussians, front to back."""
         packet = int(np.searchsorted(self.packets[:, 0], ray, side="right")) - 1
         if packet < 0 or ray >= self.packets[packet, 1]:
             return self.hits.ids[self.hit_slice(ray)]
@@ -54,7 +54,7 @@ class CpuRecording:
         return self.packet_hits.slot_ids[first + self.packet_hits.slots[self.hit_slice(ray)]]
 
     def ids_by_ray(self) -> tuple[Int32[np.ndarray, " r"], Int32[np.ndarray, " h"]]:
-        """Hits of each ray, and the ids of all hits, ray by ray and front to back."""
+        """Return the hit count of each ray, and the ids of all hits, ray by ray and front to back."""
         if isinstance(self.packet_hits, SharedSortHits):
             rows = [self.ids_of_ray(ray) for ray in range(len(self.counts))]
             return self.counts, np.concatenate([np.empty(0, np.int32), *rows])

@@ -1,4 +1,4 @@
-"""Rays that come alone: Embree walks the boxes, numba evaluates the octagons."""
+"""Single rays: Embree traverses the boxes, numba kernels evaluate the octagons."""
 
 import numpy as np
 from jaxtyping import Float32, Int64
@@ -41,7 +41,7 @@ _RTC_FEATURE_FLAG_ALL = 0xFFFFFFFF
 
 
 class SingleRayTracer:
-    """Follows each ray by itself through an Embree hierarchy of the Gaussians' boxes.
+    """Tracer of individual rays through an Embree hierarchy of the Gaussians' boxes.
 
     Args:
         limits: where rays end.
@@ -77,7 +77,7 @@ class SingleRayTracer:
         )
 
     def trace(self, forward: ForwardPass, ray_indices: Int64[np.ndarray, " s"]) -> None:
-        """Follow the rays ``ray_indices``, in ascending order."""
+        """Trace the rays ``ray_indices``, in ascending order."""
         run_on_threads(
             trace_rays, self._threads,
             self._ray_query(intersect1_address()), forward, ray_indices, _rays_per_chunk(ray_indices),
@@ -105,7 +105,7 @@ class SingleRayTracer:
         scene: PackedScene,
         parameters: GaussianParameters,
     ) -> GaussianGradients:
-        """Gradients of the raw parameters, hits sorted by Gaussian and summed in ray order."""
+        """Return gradients of the raw parameters, hits sorted by Gaussian and summed in ray order."""
         rays, which = RayArrays.from_batch(recording.rays), recording.single_rays
         offsets = np.concatenate([[0], np.cumsum(recording.counts[which], dtype=np.int64)])
         total = int(offsets[-1])

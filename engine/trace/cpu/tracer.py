@@ -1,4 +1,4 @@
-"""The tracer that runs on any CPU: packets of neighbouring rays, and Embree for rays that come alone."""
+"""The CPU tracer: packets of neighbouring rays, and Embree for single rays."""
 
 import numba
 import numpy as np
@@ -49,23 +49,22 @@ MAX_RAYS_PER_TRACE = 1 << 28
 
 
 class CpuTracer:
-    """Flat Gaussians for a CPU; follows :class:`octasplat.engine.trace.protocol.Tracer`.
+    """Tracer of flat Gaussians on a CPU; implements :class:`octasplat.engine.trace.protocol.Tracer`.
 
-    Rays that lie beside each other in the batch, share their origin, have their viewer there and look about
-    one way form packets; the others are followed one by one
-    (:func:`octasplat.engine.trace.cpu.packets.find_packets`).
+    Rays that are adjacent in the batch, share their origin and viewer and have similar directions form
+    packets; the others are traced one by one (:func:`octasplat.engine.trace.cpu.packets.find_packets`).
 
-    A hierarchy only says which octagons to test, the test and the distance come from the parameters, and
-    hits are ordered by (float32 distance, id). So neither the shape of a hierarchy nor the number of
-    threads changes a result. Single rays test in float64; packets in float32 in a frame of their own
-    (:mod:`octasplat.engine.trace.cpu.kernels.packet_candidates`), so that the two agree but for that
-    rounding, which is largest for needles and for octagons seen edge on. Where ``settings.order`` is
-    ``packet``, the rays of a packet composite in one order
-    (:mod:`octasplat.engine.trace.cpu.kernels.shared_sort`), unless Gaussians have features or there is a
-    second phase. Memory per Gaussian: a record of 64 B, 48 B of the packets' hierarchy and a box of 24 B;
-    Embree's hierarchy over the boxes is built when single rays first want it.
+    A hierarchy only says which octagons to test; test and distance depend on the parameters only, and
+    hits are ordered by (float32 distance, id). So neither the shape of a hierarchy nor the number of threads
+    changes a result. Single rays are tested in float64, packets in float32 in a local frame
+    (:mod:`octasplat.engine.trace.cpu.kernels.packet_candidates`): they agree up to that rounding, which is
+    largest for thin octagons and for those seen edge-on. If ``settings.sort`` is ``packet``, the rays of a
+    packet are composited in one shared order (:mod:`octasplat.engine.trace.cpu.kernels.shared_sort`), unless
+    Gaussians have features or there is a second phase. Memory per Gaussian: a record of 64 B, 48 B of the
+    packets' hierarchy and a box of 24 B; Embree's hierarchy over the boxes is built on demand.
 
-    Not done: no gradient through octagon edges or visibility, and in one order none by depths and normals.
+    There is no gradient through octagon edges or visibility, and with a shared order none by depths and
+    normals.
 
     Args:
         settings: where rays are cut off.
@@ -101,7 +100,7 @@ class CpuTracer:
         self._build_id = object()
 
     def build(self, gaussians: FlatGaussians, features: Float32[np.ndarray, "n f"] | None = None) -> None:
-        """Take over ``gaussians`` (kept by reference) and build the hierarchy around them."""
+        """Keep ``gaussians`` by reference and build the hierarchy around them."""
         use_threads(self.threads)
         count = len(gaussians)
         if len(self._primitives) != count:
@@ -139,7 +138,7 @@ class CpuTracer:
             self._is_single_built = not outgrown.any()
 
     def trace(self, rays: RayBatch, *, record: bool = False) -> TraceResult:
-        """Follow rays; see the protocol. Directions must have unit length."""
+        """Trace rays of unit directions; see the protocol."""
         packets, alone = self._split_packets(rays, needs_color=True)
         count = len(rays)
         result = empty_result(count, self._features.shape[1])
@@ -164,7 +163,7 @@ class CpuTracer:
         return result
 
     def transmittance(self, rays: RayBatch) -> Float32[np.ndarray, " r"]:
-        """What light is left along each ray; see the protocol."""
+        """Return the transmittance along each ray; see the protocol."""
         packets, alone = self._split_packets(rays, needs_color=False)
         left = np.empty(len(rays), np.float32)
         if len(packets):
@@ -180,7 +179,7 @@ class CpuTracer:
     def backward(
         self, recording: Recording, gradients: TraceGradients, *, min_blend_weight: float = 0.0
     ) -> GaussianGradients:
-        """Gradients of the raw parameters; see the protocol."""
+        """Return gradients of the raw parameters; see the protocol."""
         if not isinstance(recording, CpuRecording) or recording.build_id is not self._build_id:
             raise ValueError("the recording is not of this tracer, or older than its last build")
         assert self._gaussians is not None
@@ -212,7 +211,7 @@ class CpuTracer:
     def _split_packets(
         self, rays: RayBatch, *, needs_color: bool
     ) -> tuple[Int64[np.ndarray, "p 2"], Int64[np.ndarray, " s"]]:
-        """Packets and single rays of a batch, with what they need ready."""
+        """Return the packets and single rays of a batch, with their buffers allocated."""
         assert len(rays) < MAX_RAYS_PER_TRACE
         use_threads(self.threads)
         packets, alone = find_packets(rays, self._packet_mode, needs_color=needs_color)
@@ -228,7 +227,7 @@ class CpuTracer:
         return packets, alone
 
     def _allocate_hits(self, rays: int) -> HitArrays:
-        """Memory for the hits of so many recorded rays."""
+        """Return buffers for the hits of ``rays`` recorded rays."""
         places = rays * (self._limits.max_hits + HIT_PADDING)
         numbers = ((places,), np.float32)
         ids, alphas, distances, rgb = self._pool.empty(
