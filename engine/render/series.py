@@ -64,8 +64,8 @@ def render_video(
 ) -> None:
     """Render shots of one image size as the frames of a video.
 
-    The frames are stored as PNG files, as exact as the video, in the folder of ``finished`` until the video is
-    complete; then they are removed, and the folder if it is empty.
+    The frames are stored as PNG files, as exact as the video, in the folder of ``finished`` until the video
+    is complete; then they are removed, and the folder if it is empty.
 
     Raises:
         OutputError: a file cannot be written.

@@ -194,10 +194,10 @@ class Tracer(Protocol):
 
     Rays and outputs are numpy arrays: an iteration has about a megabyte of them, and losses and shading work
     on them here. Data of the size of the Gaussians or of their hits is opaque: recordings are only passed
-    back, and gradients are read through :meth:`GradientsHandle.numpy`. So a tracer may store the parameters on a
-    device: it uploads them in :meth:`build` and the changed rows in :meth:`refresh`, and its gradients stay
-    there, for an optimiser on the same device or until they are read. (Not chosen: a learner with trace, step
-    and download, which would duplicate optimiser, densification and checkpoints in every tracer.)
+    back, and gradients are read through :meth:`GradientsHandle.numpy`. So a tracer may store the parameters
+    on a device: it uploads them in :meth:`build` and the changed rows in :meth:`refresh`, and its gradients
+    stay there, for an optimiser on the same device or until they are read. (Not chosen: a learner with trace,
+    step and download, which would duplicate optimiser, densification and checkpoints in every tracer.)
 
     A tracer is used by one thread at a time.
     """
