@@ -195,7 +195,7 @@ class PathTracer:
         t_min: Float32[np.ndarray, "1"],
         batches: list["_Batch"],
     ) -> Iterator[None]:
-        """Follow paths among meshes alone, a batch a thread; yields before each batch that is waited for."""
+        """Trace paths among meshes only, a batch per thread; yield before each batch that is awaited."""
         scene, queries = self._mesh_scene, self._scene.meshes.queries
         free: Queue[_Workspace] = Queue()
         for scratch in self._scratches:
@@ -391,7 +391,7 @@ class PathTracer:
 
 
 class _Batch(NamedTuple):
-    """Paths that are followed together: of the pixels from place ``first_pixel`` on in their order."""
+    """Paths traced together: ``paths_per_pixel`` for each pixel from ``first_pixel`` of their order on."""
 
     first_pixel: int
     pixels: Int64[np.ndarray, " n"]

@@ -95,7 +95,7 @@ class TriangleBvh:
         return TriangleHits(*out)
 
     def occluded(self, rays: RayBatch) -> Bool[np.ndarray, " r"]:
-        """Whether any triangle lies between ``t_min`` and ``t_max`` of each ray; cheaper than the first."""
+        """Return whether any triangle lies between ``t_min`` and ``t_max``; cheaper than :meth:`closest`."""
         found = np.empty(len(rays), np.bool_)
         scratch = self._allocate_scratch(len(rays))
         run_ranges(

@@ -4,7 +4,6 @@ Every material takes positions (n, 3) in the object's own frame, in metres, and 
 (n, 3) in linear light.
 """
 
-
 import numpy as np
 from jaxtyping import Float32
 
