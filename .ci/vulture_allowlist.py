@@ -47,3 +47,6 @@ NORMAL_1
 NORMAL_2
 GRAD_BLUE
 GRAD_GREEN
+# typed by the annotations of kernels, which numba reads itself
+camera_tables
+exponents
