@@ -50,3 +50,13 @@ GRAD_GREEN
 # typed by the annotations of kernels, which numba reads itself
 camera_tables
 exponents
+# tests call kernels of single rays and samples over arrays, and read paths of cameras back
+light_samples
+principled_eval_array
+principled_sample_array
+fresnel_values
+rough_dielectric_eval_array
+rough_dielectric_sample_array
+fill_uniform
+read_camera_path
+DIELECTRIC_F0
