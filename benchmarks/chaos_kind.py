@@ -12,8 +12,8 @@ from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from octasplat.engine.core.errors import Cancelled
-from octasplat.engine.core.events import CheckpointWritten, StageFinished, StageProgress, StageStarted
+from octasplat.engine.core.errors import CancelledError
+from octasplat.engine.core.events import CheckpointWritten, PhaseFinished, PhaseProgress, PhaseStarted
 from octasplat.workers.worker.job_kinds import JobKind, register
 from octasplat.workers.worker.task import Task
 
@@ -76,16 +76,16 @@ def run(task: Task) -> None:
     else:
         kept = json.loads(newest.read_text())
         step, state = kept["step"], bytes.fromhex(kept["state"])
-    task.progress(StageStarted("train", options.steps))
+    task.progress(PhaseStarted("train", options.steps))
     while step < options.steps:
         time.sleep(options.seconds)
         shut = options.gate and step == options.steps - 1 and not Path(options.gate).exists()
         if shut and not task.should_stop():
-            task.progress(StageProgress("train", step, options.steps))
+            task.progress(PhaseProgress("train", step, options.steps))
             continue
         step += 1
         state = link(state, step)
-        task.progress(StageProgress("train", step, options.steps))
+        task.progress(PhaseProgress("train", step, options.steps))
         stop = task.should_stop()
         if stop or step % EVERY == 0:
             path = checkpoints / f"iteration_{step:07d}.npz"
@@ -96,8 +96,8 @@ def run(task: Task) -> None:
             path.with_suffix(".tmp").replace(path)
             task.progress(CheckpointWritten(step, str(path)))
         if stop and step < options.steps:
-            raise Cancelled("stopped")
-    task.progress(StageFinished("train", 0.0))
+            raise CancelledError("stopped")
+    task.progress(PhaseFinished("train", 0.0))
     (task.results / "chain.bin").write_bytes(result_of(state))
 
 

@@ -19,7 +19,7 @@ from pathlib import Path
 import psutil
 from PIL import Image
 
-from octasplat.engine.dataset.image_sizes import Sizes
+from octasplat.engine.dataset.image_sizes import ImageSizes
 from octasplat.engine.operations.cost_model import estimate_reconstruction
 from octasplat.engine.runs.config import resolve_config
 
@@ -35,7 +35,7 @@ def main() -> None:
         options.preset, settings={"max_side": options.max_side}, assignments=options.assignments
     )
     found = Counter(Image.open(path).size for path in sorted((options.scene / "images").iterdir()))
-    sizes = [Sizes(width, height, count) for (width, height), count in found.items()]
+    sizes = [ImageSizes(width, height, count) for (width, height), count in found.items()]
     cores = len(os.sched_getaffinity(0))
     expected = estimate_reconstruction(config, sizes, cores)
     command = [sys.executable, "-m", "octasplat", "reconstruct", str(options.scene), "--quiet"]

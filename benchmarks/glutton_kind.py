@@ -5,7 +5,7 @@ import time
 
 from pydantic import BaseModel, ConfigDict
 
-from octasplat.engine.core.events import StageProgress, StageStarted
+from octasplat.engine.core.events import PhaseProgress, PhaseStarted
 from octasplat.workers.worker.job_kinds import JobKind, register
 from octasplat.workers.worker.task import Task
 
@@ -21,12 +21,12 @@ class GluttonOptions(BaseModel):
 
 def run(task: Task) -> None:
     """Write, and tell of it, until there is no room."""
-    task.progress(StageStarted("train", MOST_PIECES))
+    task.progress(PhaseStarted("train", MOST_PIECES))
     task.run.mkdir(parents=True, exist_ok=True)
     with (task.run / "glutton").open("wb", buffering=0) as handle:
         for number in range(MOST_PIECES):
             handle.write(os.urandom(PIECE_BYTES))
-            task.progress(StageProgress("train", number + 1, MOST_PIECES))
+            task.progress(PhaseProgress("train", number + 1, MOST_PIECES))
             time.sleep(0.005)
 
 

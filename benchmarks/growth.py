@@ -24,7 +24,7 @@ from octasplat.engine.gaussians.morton import morton_order
 from octasplat.engine.trace.cpu.tracer import CpuTracer
 from octasplat.engine.trace.protocol import TraceGradients
 from octasplat.engine.train.config import McmcConfig, TrainConfig
-from octasplat.engine.train.loop.state import fresh_state
+from octasplat.engine.train.loop.state import initial_state
 from octasplat.engine.train.loop.trainer import Trainer
 
 SMALLEST = 10_000
@@ -109,8 +109,8 @@ def milliseconds_an_iteration(gaussians: FlatGaussians, iterations: int = 50, sh
 
     with tempfile.TemporaryDirectory() as folder:
         Trainer(
-            CloudPhotographs(), config, fresh_state(gaussians, 0),
-            folder=Path(folder), fingerprint="growth", listener=listen, threads=2,
+            CloudPhotographs(), config, initial_state(gaussians, 0),
+            folder=Path(folder), fingerprint="growth", progress=listen, threads=2,
         ).run()  # fmt: skip
     (first, began), (last, ended) = marks[0], marks[-1]
     return 1e3 * (ended - began) / (last - first)

@@ -28,12 +28,12 @@ from octasplat.engine.dataset import Dataset
 from octasplat.engine.runs.config import resolve_config
 from octasplat.engine.trace.factory import make_tracer
 from octasplat.engine.trace.protocol import Tracer
-from octasplat.engine.train.config import TrainConfig, in_one_order
+from octasplat.engine.train.config import TrainConfig, uses_shared_sort
 from octasplat.engine.train.densify import make_densifier
 from octasplat.engine.train.initialization.initial_gaussians import initial_gaussians
 from octasplat.engine.train.loop.checkpoint import load_checkpoint, save_checkpoint
-from octasplat.engine.train.loop.iteration import Machinery, iterate
-from octasplat.engine.train.loop.state import TrainState, fresh_state
+from octasplat.engine.train.loop.iteration import TrainComponents, train_step
+from octasplat.engine.train.loop.state import TrainState, initial_state
 from octasplat.engine.train.loop.trainer import Trainer
 from octasplat.engine.train.optimization.adam import Adam
 from octasplat.engine.train.sampling.batches import BatchSource
@@ -79,11 +79,11 @@ class TimedTracer:
 
 def made(dataset: Dataset, config: TrainConfig, path: Path, iterations: int) -> None:
     """A checkpoint of a training after so many iterations."""
-    state = fresh_state(initial_gaussians(dataset, config, threads=2), config.seed)
+    state = initial_state(initial_gaussians(dataset, config, threads=2), config.seed)
     with tempfile.TemporaryDirectory() as folder:
         Trainer(
             dataset, config.model_copy(update={"iterations": iterations}), state,
-            folder=Path(folder), fingerprint="iteration", listener=lambda _event: None,
+            folder=Path(folder), fingerprint="iteration", progress=lambda _event: None,
         ).run()  # fmt: skip
         shutil.move(save_checkpoint(state, Path(folder), "iteration"), path)
 
@@ -94,13 +94,13 @@ def spent(
     """Medians by stage of wall, CPU and own CPU time, seconds; hits a ray; Gaussians hit."""
     use_threads(threads)
     clock = Clock()
-    settings = config.trace.model_copy(update={"sort": "packet" if in_one_order(config) else "ray"})
+    settings = config.trace.model_copy(update={"sort": "packet" if uses_shared_sort(config) else "ray"})
     tracer = TimedTracer(make_tracer(settings, threads=threads, box_padding=config.box_padding), clock)
     densifier = make_densifier(config.densify, iterations=iterations, max_gaussians=len(state.gaussians))
-    machinery = Machinery(tracer, make_shading(config, len(dataset.views), dataset.extent), densifier)
+    machinery = TrainComponents(tracer, make_shading(config, len(dataset.views), dataset.extent), densifier)
     batches = BatchSource(dataset, config)
     draw = clock.timed("batch", batches.draw)
-    step = clock.timed("iterate", iterate)
+    step = clock.timed("iterate", train_step)
     hits, met = [], []
     adam_step = Adam.step
     Adam.step = clock.timed("Adam", adam_step)  # type: ignore[method-assign]

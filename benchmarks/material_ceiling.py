@@ -21,7 +21,7 @@ from jaxtyping import Bool, Float32, Float64, Int64
 from octasplat.engine.core.color import linear_to_srgb
 from octasplat.engine.core.rays import ImageRays
 from octasplat.engine.dataset import load_dataset_model
-from octasplat.engine.evaluate.ground_truth import ViewTruth, read_truth
+from octasplat.engine.evaluate.ground_truth import ViewGroundTruth, read_ground_truth
 from octasplat.engine.evaluate.ground_truth_metrics import pooled_psnr
 from octasplat.engine.gaussians.frames import quaternions_from_matrices
 from octasplat.engine.gaussians.materials import MATERIAL_WIDTHS
@@ -57,7 +57,7 @@ PATHS = 1 << 18
 class Buffer:
     """The true maps of a view, and points of its surfaces anywhere in its pixels."""
 
-    def __init__(self, known: ViewTruth, rays: ImageRays, axis_world: Float64[np.ndarray, "3"]) -> None:
+    def __init__(self, known: ViewGroundTruth, rays: ImageRays, axis_world: Float64[np.ndarray, "3"]) -> None:
         assert known.depth_z is not None and known.normal_world is not None
         assert known.albedo_linear is not None and known.metallic is not None and known.roughness is not None
         self.mask = known.mask
@@ -205,7 +205,7 @@ def main() -> None:
     parser.add_argument("--gaussians", action="store_true", help="camera rays meet the Gaussians too")
     parser.add_argument("--pictures", type=Path, help="write pictures there")
     given = parser.parse_args()
-    truth = read_truth(given.scene / "truth.json")
+    truth = read_ground_truth(given.scene / "truth.json")
     viewpoints = load_dataset_model(given.scene / "test", min_views=1, for_training=False)
     shots = view_shots(viewpoints, np.arange(len(viewpoints.views)))
     buffers = {}
@@ -223,7 +223,7 @@ def main() -> None:
     chosen = [name for name in names if name in relit] if given.relit else names
     chosen = chosen[:: max(1, len(chosen) // given.views)][: given.views]
     lights = [(given.scene / "test" / "images", truth.environment)]
-    lights += list(truth.relit) if given.relit else []
+    lights += list(truth.relit_folders) if given.relit else []
     settings = Integrator(
         samples=given.samples, max_depth=given.max_bounces, roulette_depth=given.max_bounces
     )

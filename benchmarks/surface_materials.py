@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Bool, Float32
 
 from octasplat.engine.dataset import Dataset, load_dataset_model
-from octasplat.engine.evaluate.ground_truth import TRUTH, Truth, read_truth
+from octasplat.engine.evaluate.ground_truth import GROUND_TRUTH_FILE, GroundTruth, read_ground_truth
 from octasplat.engine.files import read_scene
 from octasplat.engine.pathtracing.environment import EnvironmentMap, environment_frame
 from octasplat.engine.pathtracing.relighting.path_relighter import PathRelighter
@@ -27,7 +27,7 @@ from octasplat.engine.pathtracing.stage.model import Integrator
 from octasplat.engine.render.environment_files import read_environment
 from octasplat.engine.render.image_files import read_image, write_png
 from octasplat.engine.runs.config import read_config
-from octasplat.engine.runs.run_folder import CONFIG, ENVIRONMENT, SCENE, run_viewpoints
+from octasplat.engine.runs.run_folder import CONFIG, ENVIRONMENT_HDR, SCENE, run_viewpoints
 from octasplat.engine.surface.depth_cameras import photograph_cameras
 from tests.support.lit_surface import render_in_cycles, render_in_threejs, view_of
 
@@ -57,16 +57,16 @@ class Table:
 
 
 def true_picture(
-    truth: Truth | None, photographs: Dataset, light: Path, run: Path, number: int, side: int
+    truth: GroundTruth | None, photographs: Dataset, light: Path, run: Path, number: int, side: int
 ) -> Image | None:
     """What is known of a view under a light, over black."""
     view = photographs.views[number]
-    if light == run / ENVIRONMENT:
+    if light == run / ENVIRONMENT_HDR:
         image = read_image(view.image_path)
         return image[..., :3] * image[..., 3:] if image.shape[2] == 4 else image[..., :3]
-    for folder, path in truth.relit if truth else ():
+    for folder, path in truth.relit_folders if truth else ():
         if path.stem == light.stem:
-            return truth.relit_picture(folder, view.name, side)[..., :3]
+            return truth.relit_image(folder, view.name, side)[..., :3]
     return None
 
 
@@ -92,14 +92,16 @@ def main() -> None:
         "split sum": SplitSumRelighter(gaussians, trace, config.train.materials, extent_world=extent),
     }
     places = [
-        path for path in (asked.other_dataset / TRUTH, asked.other_dataset.parent / TRUTH) if path.is_file()
+        path
+        for path in (asked.other_dataset / GROUND_TRUTH_FILE, asked.other_dataset.parent / GROUND_TRUTH_FILE)
+        if path.is_file()
     ]
-    truth = read_truth(places[0]) if places else None
+    truth = read_ground_truth(places[0]) if places else None
     photographs = load_dataset_model(folder, max_side=asked.max_side, min_views=1, for_training=False)
     names = [view.name for view in photographs.views]
     wanted = [name for name in (truth.content.relight.views if truth else names) if name in names]
 
-    for light in (asked.run / ENVIRONMENT, *asked.environment):
+    for light in (asked.run / ENVIRONMENT_HDR, *asked.environment):
         environment = EnvironmentMap(read_environment(light), frame)
         for relighter in by.values():
             relighter.put(environment)

@@ -20,7 +20,7 @@ from jaxtyping import Float32
 from PIL import Image
 from scipy.ndimage import map_coordinates
 
-from octasplat.engine.core.color import composited, linear_to_srgb
+from octasplat.engine.core.color import composite_over, linear_to_srgb
 from octasplat.engine.core.rays import ImageRays, RayBatch
 from octasplat.engine.files import read_mesh, read_scene
 from octasplat.engine.gaussians.model import FlatGaussians
@@ -29,7 +29,7 @@ from octasplat.engine.render.image_files import write_png
 from octasplat.engine.render.renderer import background_colour, render_rays
 from octasplat.engine.render.shots import gaussian_turntable, turntable_cameras
 from octasplat.engine.runs.config import read_config
-from octasplat.engine.runs.run_folder import CONFIG, SCENE, is_run, open_photographs, photographs_folder
+from octasplat.engine.runs.run_folder import CONFIG, SCENE, is_run, open_run_dataset, photographs_folder
 from octasplat.engine.trace.factory import make_tracer
 from octasplat.engine.trace.protocol import Tracer, TraceSettings
 from octasplat.engine.trace.triangle_bvh import TriangleBvh
@@ -99,13 +99,13 @@ def views_of(
             black,
         )
     config = read_config(source / CONFIG)
-    dataset = open_photographs(photographs_folder(source), source, config, 0, lambda _event: None)
+    dataset = open_run_dataset(photographs_folder(source), source, config, 0, lambda _event: None)
     colour = background_colour(config.evaluation_background)
     found: list[tuple[str, ImageRays, Picture | None]] = []
     for index in dataset.test_indices:
         rgb, alpha, _ = dataset.view_image(int(index))
         rays = dataset.view_rays(int(index))
-        found.append((Path(dataset.views[index].name).stem, rays, composited(rgb, alpha, colour)))
+        found.append((Path(dataset.views[index].name).stem, rays, composite_over(rgb, alpha, colour)))
     return found, config.train.trace, colour
 
 

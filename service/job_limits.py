@@ -6,7 +6,7 @@ from typing import Any
 
 from pydantic import BaseModel
 
-from octasplat.engine.dataset.image_sizes import Sizes
+from octasplat.engine.dataset.image_sizes import ImageSizes
 from octasplat.engine.operations.cost_model import Estimate
 from octasplat.service.auth import Principal
 from octasplat.service.problems import ProblemError
@@ -18,7 +18,7 @@ from octasplat.workers.worker.job_kinds.resource_limits import exceeded_limits
 
 
 def check_job_limits(
-    kind: JobKind, options: BaseModel, sizes: Sequence[Sizes], settings: ServiceSettings
+    kind: JobKind, options: BaseModel, sizes: Sequence[ImageSizes], settings: ServiceSettings
 ) -> None:
     """Refuse options that ask for too much.
 
@@ -76,7 +76,7 @@ def limits_by_path(kind: JobKind, settings: ServiceSettings) -> dict[str, int]:
 
 
 def estimate_job(
-    kind: JobKind, options: BaseModel, sizes: Sequence[Sizes], workers: Sequence[WorkerRow]
+    kind: JobKind, options: BaseModel, sizes: Sequence[ImageSizes], workers: Sequence[WorkerRow]
 ) -> Estimate | None:
     """Estimate a job on the best of ``workers``, or on a machine like this one if there are none.
 

@@ -1,6 +1,6 @@
 import numpy as np
 
-from octasplat.engine.core.color import linear_to_srgb, rounded_bytes, srgb_to_linear, to_bytes
+from octasplat.engine.core.color import linear_to_srgb, round_to_bytes, srgb_to_linear, to_bytes
 
 
 def test_known_values_of_the_srgb_curve() -> None:
@@ -24,6 +24,6 @@ def test_bytes_are_rounded_and_clipped() -> None:
 
 def test_halves_are_rounded_to_the_even_step() -> None:
     halves = (np.arange(8) + 0.5).astype(np.float32)
-    np.testing.assert_array_equal(rounded_bytes(halves), [0, 2, 2, 4, 4, 6, 6, 8])
-    np.testing.assert_array_equal(to_bytes(halves / np.float64(255)), rounded_bytes(halves))
-    np.testing.assert_array_equal(rounded_bytes(np.array([-3.0, 255.4, 300.0])), [0, 255, 255])
+    np.testing.assert_array_equal(round_to_bytes(halves), [0, 2, 2, 4, 4, 6, 6, 8])
+    np.testing.assert_array_equal(to_bytes(halves / np.float64(255)), round_to_bytes(halves))
+    np.testing.assert_array_equal(round_to_bytes(np.array([-3.0, 255.4, 300.0])), [0, 255, 255])

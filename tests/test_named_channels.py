@@ -33,8 +33,8 @@ from octasplat.engine.gaussians.merge import merge_scenes, with_sh_degree
 from octasplat.engine.gaussians.model import FlatGaussians, concatenate
 from octasplat.engine.gaussians.morton import morton_order
 from octasplat.engine.gaussians.octagon import SIDES, octagon_triangles
-from octasplat.engine.train.config import McmcConfig, PaperConfig
-from octasplat.engine.train.densify import Mcmc, Paper
+from octasplat.engine.train.config import McmcConfig, RedisplatsConfig
+from octasplat.engine.train.densify import McmcDensifier, RedisplatsDensifier
 from octasplat.engine.train.loop.checkpoint import (
     BestState,
     load_best,
@@ -42,7 +42,7 @@ from octasplat.engine.train.loop.checkpoint import (
     save_best,
     save_checkpoint,
 )
-from octasplat.engine.train.loop.state import TrainState, fresh_state
+from octasplat.engine.train.loop.state import TrainState, initial_state
 from octasplat.engine.train.loop.trainer import Trainer
 from octasplat.engine.train.optimization.adam import Adam
 from octasplat.workers.cli.main import cli
@@ -89,8 +89,8 @@ def put(g: FlatGaussians, _folder: Path) -> FlatGaussians:
     return g
 
 
-def densified(densifier: Mcmc | Paper, g: FlatGaussians) -> FlatGaussians:
-    result, adam = densifier.apply(g, Adam.fresh(g), np.random.default_rng(0), extent=1.0)
+def densified(densifier: McmcDensifier | RedisplatsDensifier, g: FlatGaussians) -> FlatGaussians:
+    result, adam = densifier.apply(g, Adam.zeros(g), np.random.default_rng(0), extent=1.0)
     assert len(adam.first) == len(result) != COUNT
     return result
 
@@ -98,13 +98,13 @@ def densified(densifier: Mcmc | Paper, g: FlatGaussians) -> FlatGaussians:
 def mcmc(g: FlatGaussians, _folder: Path) -> FlatGaussians:
     g.opacity_logits[::5] = -12.0  # dead ones move to others and take their channels over
     moved = g.sh[::5, 0, 0].copy()
-    result = densified(Mcmc(McmcConfig(growth=0.3), iterations=100, max_gaussians=1000), g)
+    result = densified(McmcDensifier(McmcConfig(growth=0.3), iterations=100, max_gaussians=1000), g)
     assert (result.sh[:COUNT:5, 0, 0] != moved).all()
     return result
 
 
 def paper(g: FlatGaussians, _folder: Path) -> FlatGaussians:
-    densifier = Paper(PaperConfig(), iterations=100, max_gaussians=1000)
+    densifier = RedisplatsDensifier(RedisplatsConfig(), iterations=100, max_gaussians=1000)
     steps = np.zeros((COUNT, 3), np.float32)
     steps[::3] = 1.0
     densifier.restore({"steps": steps})
@@ -113,7 +113,7 @@ def paper(g: FlatGaussians, _folder: Path) -> FlatGaussians:
 
 
 def state_of(g: FlatGaussians) -> TrainState:
-    return TrainState(3, g, Adam.fresh(g), np.random.default_rng(0), {})
+    return TrainState(3, g, Adam.zeros(g), np.random.default_rng(0), {})
 
 
 def best(g: FlatGaussians, folder: Path) -> FlatGaussians:
@@ -242,7 +242,7 @@ def test_training_takes_channels_along(tmp_path: Path) -> None:
     config = small_config(iterations=60)
     config = config.model_copy(update={"lr": config.lr.model_copy(update={"quat": 0.0})})
     trainer = Trainer(
-        world, config, fresh_state(first, 0), folder=tmp_path, fingerprint="", listener=lambda _event: None,
+        world, config, initial_state(first, 0), folder=tmp_path, fingerprint="", progress=lambda _event: None,
         threads=1,
     )  # fmt: skip
     result = trainer.run()

@@ -13,7 +13,13 @@ from pathlib import Path
 import numba
 import pytest
 
-from octasplat.engine.core.errors import Cancelled, CheckpointError, ConfigError, OutputError, TrainingFailure
+from octasplat.engine.core.errors import (
+    CancelledError,
+    CheckpointError,
+    ConfigError,
+    OutputError,
+    TrainingError,
+)
 from octasplat.engine.core.events import CheckpointWritten, Event
 from octasplat.engine.dataset.synthetic import SyntheticDatasetConfig, write_synthetic_dataset
 from octasplat.engine.pipeline import reconstruct
@@ -207,7 +213,7 @@ def test_pipeline_stopped_run_resumes_to_same_bytes(scene: Path, whole_run: Path
                 scene, run, make_config(), resume=True, threads=1, progress=seen.append, should_stop=stop_soon
             )
             break
-        except Cancelled:
+        except CancelledError:
             assert not (run / "scene.ply").exists()
             rounds += 1
     assert rounds >= 2
@@ -218,7 +224,7 @@ def test_pipeline_stopped_run_resumes_to_same_bytes(scene: Path, whole_run: Path
 
 def test_damaged_checkpoint_is_passed_over(scene: Path, whole_run: Path, tmp_path: Path) -> None:
     run = tmp_path / "run"
-    with pytest.raises(Cancelled):
+    with pytest.raises(CancelledError):
         reconstruct(scene, run, make_config(), threads=1, should_stop=stop_after(5))
     newest = max((run / "checkpoints").glob("iteration_*.npz"))
     newest.write_bytes(newest.read_bytes()[:1000])
@@ -253,7 +259,7 @@ def test_checkpoints_of_other_photographs_are_refused_and_kept(
     scene: Path, tmp_path: Path, folder: str
 ) -> None:
     run = tmp_path / folder / "run"
-    with pytest.raises(Cancelled):
+    with pytest.raises(CancelledError):
         reconstruct(scene, run, make_config(), threads=1, should_stop=stop_after(3))
     before = sorted(path.name for path in (run / "checkpoints").iterdir())
     other = tmp_path / "other"
@@ -270,7 +276,7 @@ def test_checkpoints_of_other_photographs_are_refused_and_kept(
 def test_failed_training_writes_no_exports(scene: Path, tmp_path: Path) -> None:
     run = tmp_path / "run"
     config = make_config(**{"lr.mean": 1e6, "lr.mean_final": 1e6})
-    with pytest.raises(TrainingFailure):
+    with pytest.raises(TrainingError):
         reconstruct(scene, run, config, threads=1)
     names = {path.name for path in run.iterdir()}
     assert not names & {"scene.ply", "mesh.ply", "mesh.obj", "mesh.glb", "metrics.json", "report.html"}

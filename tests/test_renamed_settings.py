@@ -18,15 +18,15 @@ from octasplat.engine.runs.config import (
     read_config,
     resolve_config,
 )
-from octasplat.engine.runs.settings_catalog import setting_named
+from octasplat.engine.runs.settings_catalog import find_setting
 from octasplat.engine.settings.base import dump_with_former_settings
 from octasplat.engine.settings.renamed_settings import (
     FormerNames,
     RenamedSettingWarning,
-    collected_notices,
+    collect_notices,
     former_names,
 )
-from octasplat.engine.train.config import McmcConfig, PaperConfig, TrainConfig
+from octasplat.engine.train.config import McmcConfig, RedisplatsConfig, TrainConfig
 from octasplat.service.actions.validation import resolve_options
 from octasplat.workers.cli.main import cli
 from octasplat.workers.worker.job_kinds import get_job_kind
@@ -66,7 +66,7 @@ EXPECTED = ReconstructOptions.model_validate(NEW).config()
 
 
 def test_former_python_names_are_read_with_notice() -> None:
-    with collected_notices() as notices:
+    with collect_notices() as notices:
         request = ReconstructRequest.model_validate({"source": "scene", "output": "nowhere", **FORMER})
         assert run_config(request) == EXPECTED
     told = " ".join(notices)
@@ -78,7 +78,7 @@ def test_former_python_names_are_read_with_notice() -> None:
 
 def test_former_option_of_a_python_verb_is_read_and_told() -> None:
     refused = "a.png: an environment is an HDR or EXR image"
-    with collected_notices() as notices, pytest.raises(ConfigError, match=refused):
+    with collect_notices() as notices, pytest.raises(ConfigError, match=refused):
         osp.relight("run", "out", environments=["a.png"], by="path")  # type: ignore[call-arg]
     assert notices == ["by is called integrator now; former names are read in this version only."]
 
@@ -92,7 +92,7 @@ def test_former_command_options_are_read_with_notice(monkeypatch: pytest.MonkeyP
     monkeypatch.setattr("octasplat.workers.cli.reconstruction.run_reconstruction", keep)
     sets = [part for text in FORMER_SETS for part in ("--set", text)]
     arguments = ["reconstruct", "scene", "-o", "nowhere", "--preset", "paper", "--background", "white", *sets]
-    with collected_notices() as notices:
+    with collect_notices() as notices:
         done = CliRunner().invoke(cli, arguments)
     assert done.exit_code == 0, done.stderr
     assert found == [EXPECTED]
@@ -117,7 +117,7 @@ def test_former_submitted_options_are_read_with_notice(monkeypatch: pytest.Monke
     monkeypatch.setattr("octasplat.workers.cli.remote_jobs.submit", keep)
     sets = [part for text in FORMER_SETS[1:] for part in ("--set", text)]
     arguments = ["submit", "scene", "--server", "http://127.0.0.1:9", "--preset", "paper"]
-    with collected_notices() as notices:
+    with collect_notices() as notices:
         done = CliRunner().invoke(cli, [*arguments, "--background", "white", "--rays", "512", *sets])
     assert done.exit_code == 0, done.stderr
     assert found == [EXPECTED]
@@ -126,7 +126,7 @@ def test_former_submitted_options_are_read_with_notice(monkeypatch: pytest.Monke
 
 def test_former_names_in_the_options_of_a_job_mean_the_same() -> None:
     kind = get_job_kind("reconstruct")
-    with collected_notices() as notices:
+    with collect_notices() as notices:
         assert resolve_options(kind, FORMER) == EXPECTED
     assert notices
     stored = EXPECTED.model_dump(mode="json")
@@ -140,12 +140,12 @@ def test_former_names_in_the_options_of_a_job_mean_the_same() -> None:
 
 def test_former_names_of_a_derived_job_are_read_and_the_later_one_counts() -> None:
     kind, before = get_job_kind("relight"), {"environments": ["a.hdr"], "by": "path", "depth": 3}
-    with collected_notices() as notices:
+    with collect_notices() as notices:
         options = kind.resolve(before)
         assert kind.revise(before, {"max_bounces": 4}).max_bounces == 4
     assert (options.integrator, options.max_bounces) == ("path", 3)
     assert "by is called integrator now, depth is called max_bounces now; former" in notices[0]
-    with collected_notices():
+    with collect_notices():
         assert get_job_kind("surface").resolve({"texture_side": 256, "settle": True}).refine_vertices
         assert (
             get_job_kind("export").resolve({"files": ["a.glb"], "texture_size": 64}).falloff_texture_size
@@ -158,7 +158,7 @@ def test_configuration_of_a_run_of_the_last_version_is_read_with_one_notice(tmp_
     content |= {"evaluate_background": content.pop("evaluation_background"), "preset": "paper"}
     content["train"] = dump_with_former_settings(EXPECTED.train)
     (tmp_path / "config.json").write_text(json.dumps({"reconstruction": content}), encoding="utf-8")
-    with collected_notices() as notices:
+    with collect_notices() as notices:
         assert read_config(tmp_path / "config.json") == EXPECTED
     assert len(notices) == 1
     assert notices[0].startswith(f"{tmp_path / 'config.json'}: preset=paper is called preset=redisplats now")
@@ -200,7 +200,7 @@ def _models(model: type[BaseModel]) -> list[type[BaseModel]]:
     [
         *_models(TrainConfig),
         McmcConfig,
-        PaperConfig,
+        RedisplatsConfig,
         *(operation.request for operation in operations()),
         *(operation.options for operation in operations()),
     ],
@@ -226,4 +226,4 @@ def test_unknown_name_near_a_former_one_is_answered_with_the_new_name() -> None:
 
 def test_former_setting_names_lead_to_settings() -> None:
     assert former_setting_names()["rates.calm_after"] == "lr.scale_after"
-    assert all(setting_named(new).name == new for new in former_setting_names().values())
+    assert all(find_setting(new).name == new for new in former_setting_names().values())

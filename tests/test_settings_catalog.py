@@ -12,17 +12,23 @@ from octasplat.engine.poses import PosesConfig
 from octasplat.engine.runs.config import ReconstructionConfig, resolve_config
 from octasplat.engine.runs.settings_catalog import (
     Difference,
-    defaults_of,
-    differences,
-    setting_named,
-    settings,
+    all_settings,
+    default_values,
+    find_setting,
+    setting_differences,
 )
 from octasplat.engine.runs.settings_page import settings_page
 from octasplat.engine.settings.fields import Group, Unit
 from octasplat.engine.settings.nearest_names import nearest_name
 from octasplat.engine.shading.material_settings import MaterialSettings
 from octasplat.engine.trace.protocol import TraceSettings
-from octasplat.engine.train.config import LearningRates, LossWeights, McmcConfig, PaperConfig, TrainConfig
+from octasplat.engine.train.config import (
+    LearningRates,
+    LossWeights,
+    McmcConfig,
+    RedisplatsConfig,
+    TrainConfig,
+)
 from octasplat.workers.cli.main import cli
 
 MODELS = (
@@ -31,7 +37,7 @@ MODELS = (
     LearningRates,
     LossWeights,
     McmcConfig,
-    PaperConfig,
+    RedisplatsConfig,
     TraceSettings,
     MaterialSettings,
     PosesConfig,
@@ -71,21 +77,21 @@ def test_units_and_groups_are_in_the_schema() -> None:
 
 
 def test_catalog_entry_of_a_setting_with_a_known_answer() -> None:
-    entry = setting_named("train.trace.max_hits")
+    entry = find_setting("train.trace.max_hits")
     assert (entry.name, entry.type, entry.unit) == ("trace.max_hits", "whole number", "Gaussians per ray")
     assert entry.range == "at least 1, at most 4096"
     assert entry.default == 512 and not entry.exceptions
 
 
 def test_catalog_has_defaults_by_preset_and_with_materials() -> None:
-    exceptions = setting_named("rays_per_batch").exceptions
-    assert setting_named("rays_per_batch").default == 16_384
+    exceptions = find_setting("rays_per_batch").exceptions
+    assert find_setting("rays_per_batch").default == 16_384
     assert exceptions["redisplats"] == 8192 and exceptions["standard+materials"] == 8192
-    assert setting_named("densify.split_scale").defaults == {"redisplats": 0.005}
+    assert find_setting("densify.split_scale").defaults == {"redisplats": 0.005}
 
 
 def test_catalog_has_every_setting_once() -> None:
-    names = [entry.name for entry in settings()]
+    names = [entry.name for entry in all_settings()]
     assert len(names) == len(set(names))
     assert {"seed", "materials.learn", "densify.kind", "test_every"} <= set(names)
     assert not any(name.startswith("train") for name in names)
@@ -96,23 +102,23 @@ def test_catalog_has_every_setting_once() -> None:
 )
 def test_unknown_setting_is_refused_and_the_nearest_one_offered(name: str, nearest: str) -> None:
     with pytest.raises(ConfigError, match=f"the nearest is {nearest}"):
-        setting_named(name)
+        find_setting(name)
     with pytest.raises(ConfigError, match=f"the nearest is {nearest}"):
         resolve_config(assignments=[f"{name}=1"])
-    assert nearest_name("zzz", [entry.name for entry in settings()]) is None
+    assert nearest_name("zzz", [entry.name for entry in all_settings()]) is None
 
 
 def test_differences_list_changed_settings() -> None:
     changed = resolve_config("fast", assignments=["lr.quat=0.5", "test_every=4"])
-    assert differences(defaults_of(changed), changed) == (
+    assert setting_differences(default_values(changed), changed) == (
         Difference("test_every", 8, 4),
         Difference("lr.quat", 0.015, 0.5),
     )
-    assert differences(changed, changed) == ()
+    assert setting_differences(changed, changed) == ()
 
 
 def test_differences_list_one_sided_settings() -> None:
-    found = differences(resolve_config("standard"), resolve_config("redisplats"))
+    found = setting_differences(resolve_config("standard"), resolve_config("redisplats"))
     assert Difference("densify.split_scale", None, 0.005) in found
     assert Difference("densify.growth", 0.2, None) in found
 
@@ -125,7 +131,7 @@ def test_config_list_shows_the_basic_settings_and_all_on_request() -> None:
     basic = json.loads(config_command("list", "--json").stdout)
     assert {entry["group"] for entry in basic} == {"basic"}
     everything = json.loads(config_command("list", "--all", "--json").stdout)
-    assert len(everything) == len(settings()) > len(basic)
+    assert len(everything) == len(all_settings()) > len(basic)
     assert "error_power" in config_command("list", "--group", "experimental").stdout
 
 

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import torch
 
-from octasplat.engine.core.threads import one_torch_thread, use_threads
+from octasplat.engine.core.threads import limit_torch_threads, use_threads
 from octasplat.engine.dataset.images import resize
 from octasplat.engine.dataset.synthetic import SyntheticDatasetConfig, write_synthetic_dataset
 
@@ -49,7 +49,7 @@ def test_photographs_are_resized_on_the_calling_thread_alone(monkeypatch: pytest
 
 def test_torch_gets_its_threads_back_after_a_failure() -> None:
     torch.set_num_threads(2)
-    with pytest.raises(ValueError, match="no"), one_torch_thread():
+    with pytest.raises(ValueError, match="no"), limit_torch_threads():
         assert torch.get_num_threads() == 1
         raise ValueError("no")
     assert torch.get_num_threads() == 2

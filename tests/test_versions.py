@@ -5,7 +5,7 @@ import importlib.metadata
 import sys
 from pathlib import Path
 
-from octasplat.engine.core.versions import versions
+from octasplat.engine.core.versions import package_versions
 
 ROOT = Path(__file__).resolve().parent.parent
 HARMLESS = {"pydantic", "pydantic_core", "jaxtyping", "Jinja2", "pyoidn", "platformdirs"}
@@ -49,7 +49,7 @@ def packages_behind(module: str) -> set[str]:
 def test_versions_cover_reconstruction_packages() -> None:
     owners = importlib.metadata.packages_distributions()
     behind = {owners[name][0] for name in packages_behind("octasplat.engine.pipeline")} - HARMLESS
-    counted = versions()
+    counted = package_versions()
     assert behind >= {"torch", "numba", "pycolmap"}
     assert not behind - set(counted)
     assert counted["torch"] == importlib.metadata.version("torch")

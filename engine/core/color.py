@@ -20,15 +20,15 @@ def linear_to_srgb(linear: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, "*s
 
 def to_bytes(values: Float[np.ndarray, "*shape"]) -> UInt8[np.ndarray, "*shape"]:
     """Values in [0, 1], clipped and rounded to the nearest of 256 steps (halves to even)."""
-    return rounded_bytes(values * 255.0)
+    return round_to_bytes(values * 255.0)
 
 
-def rounded_bytes(steps: Float[np.ndarray, "*shape"]) -> UInt8[np.ndarray, "*shape"]:
+def round_to_bytes(steps: Float[np.ndarray, "*shape"]) -> UInt8[np.ndarray, "*shape"]:
     """Values in units of one byte step, clipped to 0 ... 255 and rounded (halves to even)."""
     return np.rint(np.clip(steps, 0.0, 255.0)).astype(np.uint8)
 
 
-def composited(
+def composite_over(
     rgb_srgb: Float[np.ndarray, "*pixels 3"],
     alpha: Float[np.ndarray, "*pixels"],
     background_srgb: Float[np.ndarray, "3"],

@@ -1,17 +1,17 @@
 """Spans of time in words."""
 
 
-def clock(seconds: float) -> str:
+def format_clock(seconds: float) -> str:
     """Return a duration as ``1:23`` or ``1:02:03``."""
     minutes, rest = divmod(max(0, round(seconds)), 60)
     hours, minutes = divmod(minutes, 60)
     return f"{hours}:{minutes:02}:{rest:02}" if hours else f"{minutes}:{rest:02}"
 
 
-def duration(seconds: float) -> str:
+def format_duration(seconds: float) -> str:
     """Return a duration in words: ``0.8 s``, ``42 s``, ``3:05 min``, ``1:02:03 h``."""
     if seconds < 9.95:
         return f"{seconds:.1f} s"
     if seconds < 59.5:
         return f"{seconds:.0f} s"
-    return f"{clock(seconds)} {'h' if seconds >= 3599.5 else 'min'}"
+    return f"{format_clock(seconds)} {'h' if seconds >= 3599.5 else 'min'}"

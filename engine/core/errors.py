@@ -27,7 +27,7 @@ class DatasetError(OctasplatError):
     error_type = "dataset_error"
 
 
-class PosesCrashed(OctasplatError):
+class ColmapCrashError(OctasplatError):
     """COLMAP died while it looked for poses."""
 
     error_type = "poses_crashed"
@@ -39,7 +39,7 @@ class SceneFileError(OctasplatError):
     error_type = "scene_file_error"
 
 
-class ExportFailed(OctasplatError):
+class ExportError(OctasplatError):
     """Some of the files that were asked for could not be written; everything else is there."""
 
     error_type = "export_failed"
@@ -57,7 +57,7 @@ class OutputError(OctasplatError):
     error_type = "output_error"
 
 
-class NoSpaceLeft(OutputError):
+class DiskFullError(OutputError):
     """A file cannot be written because its disk is full; what was there before is whole."""
 
     error_type = "no_space_left"
@@ -69,19 +69,19 @@ class CheckpointError(OctasplatError):
     error_type = "checkpoint_error"
 
 
-class DamagedCheckpoint(CheckpointError):
+class DamagedCheckpointError(CheckpointError):
     """A checkpoint file cannot be read; the one before it may be sound."""
 
     error_type = "damaged_checkpoint"
 
 
-class TrainingFailure(OctasplatError):
+class TrainingError(OctasplatError):
     """Training collapsed (not-a-number, an empty scene, a scene that covers nothing); nothing is exported."""
 
     error_type = "training_failure"
 
 
-class Cancelled(OctasplatError):
+class CancelledError(OctasplatError):
     """The run was asked to stop; a checkpoint was written and ``--resume`` goes on from it."""
 
     error_type = "cancelled"

@@ -12,7 +12,7 @@ from dataclasses import MISSING, asdict, dataclass, fields
 from pathlib import Path
 from typing import IO, Any, ClassVar
 
-from octasplat.engine.core.writing import telling_of_room
+from octasplat.engine.core.writing import report_disk_full
 
 
 @dataclass(frozen=True)
@@ -27,7 +27,7 @@ class Event:
 
 
 @dataclass(frozen=True)
-class StageStarted(Event):
+class PhaseStarted(Event):
     """A stage of a job begins; a reconstruction has ``load``, ``train``, ``evaluate`` and ``export``."""
 
     kind: ClassVar[str] = "stage_started"
@@ -36,7 +36,7 @@ class StageStarted(Event):
 
 
 @dataclass(frozen=True)
-class StageProgress(Event):
+class PhaseProgress(Event):
     """Step ``step`` of a stage that counts its steps is done, and the share ``part`` of the next one."""
 
     kind: ClassVar[str] = "stage_progress"
@@ -47,7 +47,7 @@ class StageProgress(Event):
 
 
 @dataclass(frozen=True)
-class StageFinished(Event):
+class PhaseFinished(Event):
     """A stage ended after ``seconds``."""
 
     kind: ClassVar[str] = "stage_finished"
@@ -92,7 +92,7 @@ class CheckpointWritten(Event):
 
 
 @dataclass(frozen=True)
-class ImagesKept(Event):
+class ImagesSaved(Event):
     """So many images of a render are safe on disk; a render that is stopped goes on with the others."""
 
     kind: ClassVar[str] = "images_kept"
@@ -127,9 +127,9 @@ class RunFinished(Event):
 EVENT_KINDS: dict[str, type[Event]] = {
     event.kind: event
     for event in (
-        StageStarted,
-        StageProgress,
-        StageFinished,
+        PhaseStarted,
+        PhaseProgress,
+        PhaseFinished,
         TrainingProgress,
         HeldOutMeasured,
         CheckpointWritten,
@@ -138,10 +138,10 @@ EVENT_KINDS: dict[str, type[Event]] = {
     )
 }
 
-Listener = Callable[[Event], None]
+EventListener = Callable[[Event], None]
 
 
-def event_from(kind: str, content: Mapping[str, Any]) -> Event | None:
+def parse_event(kind: str, content: Mapping[str, Any]) -> Event | None:
     """The event that was written as JSON; None if there is no such kind, or it lacks something."""
     model = EVENT_KINDS.get(kind)
     if model is None or not {f.name for f in fields(model) if f.default is MISSING} <= content.keys():
@@ -149,11 +149,11 @@ def event_from(kind: str, content: Mapping[str, Any]) -> Event | None:
     return model(**{field.name: content[field.name] for field in fields(model) if field.name in content})
 
 
-def ignore(_event: Event) -> None:
+def ignore_events(_event: Event) -> None:
     """A listener that listens to nothing."""
 
 
-def broadcast(listeners: Iterable[Listener]) -> Listener:
+def broadcast(listeners: Iterable[EventListener]) -> EventListener:
     """One listener that passes every event on to ``listeners``, in order."""
     targets = tuple(listeners)
 
@@ -176,7 +176,7 @@ def read_events(path: Path) -> list[dict[str, object]]:
     return rows
 
 
-class JsonLinesListener:
+class JsonLinesWriter:
     """Appends each event, stamped with Unix time in seconds, as one line to a file.
 
     Args:
@@ -221,6 +221,6 @@ class JsonLinesListener:
 
     def _write(self, text: str) -> None:
         assert self._file is not None
-        with telling_of_room(self._path):
+        with report_disk_full(self._path):
             self._file.write(text)
             self._file.flush()

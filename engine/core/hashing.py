@@ -4,15 +4,15 @@ import numpy as np
 from jaxtyping import Float64, UInt64
 
 
-def unit_numbers(*keys: UInt64[np.ndarray, " n"]) -> Float64[np.ndarray, "2 n"]:
+def hashed_uniforms(*keys: UInt64[np.ndarray, " n"]) -> Float64[np.ndarray, "2 n"]:
     """Two numbers in [0, 1) for each row of keys."""
-    state = mixed(keys[0])
+    state = splitmix64(keys[0])
     for key in keys[1:]:
-        state = mixed(state + key)
-    return np.stack([(x >> np.uint64(11)) * 2.0**-53 for x in (state, mixed(state))])
+        state = splitmix64(state + key)
+    return np.stack([(x >> np.uint64(11)) * 2.0**-53 for x in (state, splitmix64(state))])
 
 
-def mixed(x: UInt64[np.ndarray, " n"]) -> UInt64[np.ndarray, " n"]:
+def splitmix64(x: UInt64[np.ndarray, " n"]) -> UInt64[np.ndarray, " n"]:
     """A step of SplitMix64, "Fast Splittable Pseudorandom Number Generators" (Steele et al. 2014)."""
     x = x + np.uint64(0x9E3779B97F4A7C15)
     x = (x ^ (x >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)

@@ -40,7 +40,7 @@ def python_command(module: str, *arguments: str, further_modules: Sequence[str] 
     )
 
 
-def without_python_variables(environment: Mapping[str, str]) -> dict[str, str]:
+def drop_python_variables(environment: Mapping[str, str]) -> dict[str, str]:
     """The environment without what steers Python, for processes whose own children are Python as well."""
     return {name: value for name, value in environment.items() if not name.startswith("PYTHON")}
 

@@ -5,10 +5,10 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Protocol, runtime_checkable
 
-from octasplat.engine.core.errors import Cancelled
-from octasplat.engine.core.events import Event, Listener, StageFinished, StageProgress, StageStarted
+from octasplat.engine.core.errors import CancelledError
+from octasplat.engine.core.events import Event, EventListener, PhaseFinished, PhaseProgress, PhaseStarted
 
-DOING = {
+PHASE_TITLES = {
     "load": "Loading",
     "train": "Training",
     "evaluate": "Evaluating",
@@ -37,7 +37,7 @@ DOING = {
 """What is being done at a stage, in a word or two."""
 
 
-class StageClock:
+class PhaseClock:
     """The time of a stage, with that of runs before this one that were stopped in it."""
 
     def __init__(self) -> None:
@@ -59,16 +59,16 @@ class StageClock:
 
 
 @contextmanager
-def stage(name: str, tell: Listener, steps: int = 0) -> Iterator[StageClock]:
+def phase(name: str, progress: EventListener, steps: int = 0) -> Iterator[PhaseClock]:
     """Announce a stage; yields its clock, which is stopped at the end if it was not before."""
-    tell(StageStarted(name, steps))
-    clock = StageClock()
+    progress(PhaseStarted(name, steps))
+    clock = PhaseClock()
     yield clock
-    tell(StageFinished(name, clock.stop()))
+    progress(PhaseFinished(name, clock.stop()))
 
 
 @runtime_checkable
-class Count(Protocol):
+class ProgressCallback(Protocol):
     """Told how many steps of a stage are done, of how many, and what share of the next one."""
 
     def __call__(self, done: int, total: int, part: float = 0.0) -> None:
@@ -76,28 +76,30 @@ class Count(Protocol):
 
 
 @contextmanager
-def counted_stage(name: str, tell: Listener, steps: int = 0) -> Iterator[Count]:
+def counted_phase(name: str, progress: EventListener, steps: int = 0) -> Iterator[ProgressCallback]:
     """Announce a stage that counts; yields its progress callback."""
 
     def count(done: int, total: int, part: float = 0.0) -> None:
-        tell(StageProgress(name, done, total, part))
+        progress(PhaseProgress(name, done, total, part))
 
-    with stage(name, tell, steps):
+    with phase(name, progress, steps):
         yield count
 
 
-def stopping(listener: Listener, should_stop: Callable[[], bool], message: str | None = None) -> Listener:
-    """``listener``, but stopping the work at its next event if so asked; training does it by itself.
+def stop_when_asked(
+    progress: EventListener, should_stop: Callable[[], bool], message: str | None = None
+) -> EventListener:
+    """``progress``, but stopping the work at its next event if so asked; training does it by itself.
 
-    The returned listener raises :class:`octasplat.engine.core.errors.Cancelled` with ``message``, or one that
+    The returned listener raises :class:`octasplat.engine.core.errors.CancelledError` with ``message``, or one that
     names the stage.
     """
 
     def listen(event: Event) -> None:
-        listener(event)
-        if isinstance(event, StageProgress) and should_stop():
-            doing = DOING.get(event.stage, event.stage).lower()
+        progress(event)
+        if isinstance(event, PhaseProgress) and should_stop():
+            doing = PHASE_TITLES.get(event.stage, event.stage).lower()
             told = f"Stopped while {doing}; the same command with --resume goes on."
-            raise Cancelled(message or told)
+            raise CancelledError(message or told)
 
     return listen

@@ -30,7 +30,7 @@ def psnr(
     return float("inf") if error == 0 else float(-10.0 * np.log10(error))
 
 
-def colour_corrected(
+def fit_color(
     render: Float32[np.ndarray, "*shape 3"],
     reference: Float32[np.ndarray, "*shape 3"],
     weight: Float32[np.ndarray, "*shape"],

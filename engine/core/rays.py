@@ -17,10 +17,10 @@ class RayBatch:
     Distances count from the origin, in lengths of the direction. The origin need not be where a ray starts:
     rays that seem to come from one point share it as their origin, whatever lies between, and ``t_min`` says
     where each begins. So a camera's rays behind a plane mirror have the mirrored camera as their origin and
-    begin at the mirror (:meth:`mirrored`), and the ways between a point light and many points are rays from
+    begin at the mirror (:meth:`reflect`), and the ways between a point light and many points are rays from
     the light that end at the points (:meth:`between`). Tracers follow neighbours with one origin together.
 
-    ``t_viewer`` says where on each ray its viewer stands. Colours that depend on the direction are those in
+    ``t_view_origin`` says where on each ray its viewer stands. Colours that depend on the direction are those in
     the direction from there to a Gaussian's mean, as in programs that draw splats. A camera's viewer is the
     origin (0). Rays that go on from a surface have none there: so close to it the direction to a mean would
     be any. Behind a mirror or clear glass the viewer stands as far back as the way has been long (below 0),
@@ -28,7 +28,7 @@ class RayBatch:
     (``AT_INFINITY``), and the direction is the ray's own.
 
     Rays that leave a surface of Gaussians may have some of these in their way, as the surface is as thick as
-    their noise. Up to ``t_leaves`` a ray passes all Gaussians that it would meet from behind, which is how it
+    their noise. Up to ``t_backface_cull`` a ray passes all Gaussians that it would meet from behind, which is how it
     meets those of the surface that it leaves. Tracers for normals without a side know no behind.
 
     Origins, limits and viewers have one row a ray, or a single one that stands for all.
@@ -42,8 +42,8 @@ class RayBatch:
     directions_world: Float32[np.ndarray, "r 3"]
     t_min: Float32[np.ndarray, "#r"]
     t_max: Float32[np.ndarray, "#r"]
-    t_viewer: Float32[np.ndarray, "#r"]
-    t_leaves: Float32[np.ndarray, "#r"]
+    t_view_origin: Float32[np.ndarray, "#r"]
+    t_backface_cull: Float32[np.ndarray, "#r"]
 
     def __init__(
         self,
@@ -51,16 +51,16 @@ class RayBatch:
         directions_world: Float[np.ndarray, "r 3"],
         t_min: Float[np.ndarray, "#r"] | float = 0.0,
         t_max: Float[np.ndarray, "#r"] | float = np.inf,
-        t_viewer: Float[np.ndarray, "#r"] | float = 0.0,
-        t_leaves: Float[np.ndarray, "#r"] | float = 0.0,
+        t_view_origin: Float[np.ndarray, "#r"] | float = 0.0,
+        t_backface_cull: Float[np.ndarray, "#r"] | float = 0.0,
     ) -> None:
         """Rays through ``directions_world``; a ``t_min`` below 0 counts as 0."""
         object.__setattr__(self, "origins_world", _for_kernels(origins_world))
         object.__setattr__(self, "directions_world", _for_kernels(directions_world))
         object.__setattr__(self, "t_min", _for_kernels(np.maximum(np.atleast_1d(t_min), 0)))
         object.__setattr__(self, "t_max", _for_kernels(np.atleast_1d(t_max)))
-        object.__setattr__(self, "t_viewer", _for_kernels(np.atleast_1d(t_viewer)))
-        object.__setattr__(self, "t_leaves", _for_kernels(np.atleast_1d(t_leaves)))
+        object.__setattr__(self, "t_viewer", _for_kernels(np.atleast_1d(t_view_origin)))
+        object.__setattr__(self, "t_leaves", _for_kernels(np.atleast_1d(t_backface_cull)))
 
     @classmethod
     def between(
@@ -90,10 +90,10 @@ class RayBatch:
     def arrays(self) -> tuple[Float32[np.ndarray, "#r *c"], ...]:
         """What they are made of, in order."""
         return (
-            self.origins_world, self.directions_world, self.t_min, self.t_max, self.t_viewer, self.t_leaves
+            self.origins_world, self.directions_world, self.t_min, self.t_max, self.t_view_origin, self.t_backface_cull
         )  # fmt: skip
 
-    def up_to(self, t_max: Float[np.ndarray, "#r"] | float) -> "RayBatch":
+    def with_t_max(self, t_max: Float[np.ndarray, "#r"] | float) -> "RayBatch":
         """These rays with another end."""
         return replace(self, t_max=np.atleast_1d(t_max))
 
@@ -102,7 +102,7 @@ class RayBatch:
         """Where each ray begins: the point at ``t_min``."""
         return np.asarray(self.origins_world + self.t_min[:, None] * self.directions_world)
 
-    def mirrored(
+    def reflect(
         self,
         point_world: Float[np.ndarray, "3"],
         normal_world: Float[np.ndarray, "3"],
@@ -124,11 +124,16 @@ class RayBatch:
         origins -= 2 * ((origins - point_world) @ normal)[:, None] * normal
         directions -= 2 * (directions @ normal)[:, None] * normal
         return RayBatch(
-            origins, directions, np.maximum(t_mirror, self.t_min), self.t_max, self.t_viewer, self.t_leaves
+            origins,
+            directions,
+            np.maximum(t_mirror, self.t_min),
+            self.t_max,
+            self.t_view_origin,
+            self.t_backface_cull,
         )
 
 
-def joined(first: RayBatch, second: RayBatch) -> RayBatch:
+def concatenate_rays(first: RayBatch, second: RayBatch) -> RayBatch:
     """One batch after the other; what stands for all rays of both goes on doing so."""
 
     def both(one: np.ndarray, other: np.ndarray) -> np.ndarray:
@@ -151,7 +156,7 @@ class ImageRays:
     width_px: int
 
     @classmethod
-    def of(
+    def from_directions(
         cls,
         origin_world: Float[np.ndarray, "3"],
         directions_world: Float[np.ndarray, "h w 3"],
@@ -171,7 +176,7 @@ class ImageRays:
             if ways.shape[axis] > 1:
                 ways = ways + offset * np.gradient(self.directions_world.astype(np.float64), axis=axis)
         ways /= np.linalg.norm(ways, axis=2, keepdims=True)
-        return ImageRays.of(self.origin_world, ways, float(self.rays.t_min[0]))
+        return ImageRays.from_directions(self.origin_world, ways, float(self.rays.t_min[0]))
 
     @property
     def origin_world(self) -> Float32[np.ndarray, "3"]:

@@ -4,7 +4,7 @@ import unicodedata
 from pathlib import PurePosixPath, PureWindowsPath
 
 
-def checked_relative(name: str) -> str:
+def check_relative_path(name: str) -> str:
     """Return a relative path that stays below its folder on every system.
 
     Raises:
@@ -21,6 +21,6 @@ def checked_relative(name: str) -> str:
     return name
 
 
-def normalised(name: str) -> str:
+def normalize_name(name: str) -> str:
     """Return a file name in the one spelling (NFC) in which names from two machines are compared."""
     return unicodedata.normalize("NFC", name)

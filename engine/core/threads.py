@@ -35,7 +35,7 @@ def threads_in_use() -> int:
 
 
 @contextmanager
-def one_torch_thread() -> Iterator[None]:
+def limit_torch_threads() -> Iterator[None]:
     """Keep torch to the calling thread, where several photographs are worked on side by side already."""
     import torch  # here, as it takes a second and most work needs none of it
 

@@ -19,11 +19,11 @@ PACKAGES = (
 )
 
 
-RESULTS = 2
+RESULTS_VERSION = 2
 """Raised whenever the same settings give other results than before: what was begun under one number is begun
 anew under another, rather than gone on with."""
 
 
-def versions() -> dict[str, str]:
+def package_versions() -> dict[str, str]:
     """Version of the project and of each package that it computes with, by name."""
     return {"octasplat": __version__, **{name: importlib.metadata.version(name) for name in PACKAGES}}

@@ -7,14 +7,14 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from octasplat.engine.core.errors import NoSpaceLeft
+from octasplat.engine.core.errors import DiskFullError
 
-NO_ROOM = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
+DISK_FULL_ERRORS = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
 """Errors of the system that mean a full disk, a spent quota, or a limit on the size of files."""
 
 
 @contextmanager
-def telling_of_room(path: Path) -> Iterator[None]:
+def report_disk_full(path: Path) -> Iterator[None]:
     """Inside the block ``path`` is written, which the system's own errors do not say.
 
     Raises:
@@ -23,13 +23,13 @@ def telling_of_room(path: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        if error.errno not in NO_ROOM:
+        if error.errno not in DISK_FULL_ERRORS:
             raise
-        raise NoSpaceLeft(f"{path} cannot be written ({error.strerror}); free space there.") from error
+        raise DiskFullError(f"{path} cannot be written ({error.strerror}); free space there.") from error
 
 
 @contextmanager
-def replacing(path: Path) -> Iterator[Path]:
+def atomic_replace(path: Path) -> Iterator[Path]:
     """Yield a temporary path beside ``path`` that takes its place when the block ends without an error.
 
     The temporary name keeps the suffix of ``path``, so that writers which look at it work as usual. On an
@@ -38,7 +38,7 @@ def replacing(path: Path) -> Iterator[Path]:
     Raises:
         NoSpaceLeft: there is no room for it.
     """
-    with telling_of_room(path):
+    with report_disk_full(path):
         path.parent.mkdir(parents=True, exist_ok=True)
         temporary = path.with_name(f".{path.stem}.{os.getpid()}.partial{path.suffix}")
         try:
@@ -52,7 +52,7 @@ def replacing(path: Path) -> Iterator[Path]:
 
 def write_text(path: Path, text: str) -> None:
     """Write ``text`` as UTF-8 to ``path``, atomically."""
-    with replacing(path) as temporary:
+    with atomic_replace(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
 
 

@@ -8,7 +8,7 @@ from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Mapping
 from pathlib import PurePosixPath
 
-from octasplat.engine.core.relative_paths import normalised
+from octasplat.engine.core.relative_paths import normalize_name
 
 
 def match_image_names(names: Iterable[str], files: Collection[str]) -> Mapping[str, str]:
@@ -22,7 +22,7 @@ def match_image_names(names: Iterable[str], files: Collection[str]) -> Mapping[s
     {'2.jpg': '2.jpg', 'A/1.JPG': 'a/1.jpg', '/tmp/3.png': '3.png'}
     """
     names = list(names)
-    found = {name: normalised(name) for name in names if normalised(name) in files}
+    found = {name: normalize_name(name) for name in names if normalize_name(name) in files}
     for spelling in (_slashes, _case, _without_suffix, _last_part, _stem):
         taken = set(found.values())
         free = _by_spelling((file for file in files if file not in taken), spelling)
@@ -39,7 +39,7 @@ def _by_spelling(names: Iterable[str], spelling: Callable[[str], str]) -> dict[s
 
 
 def _slashes(name: str) -> str:
-    return str(PurePosixPath(normalised(name).replace("\\", "/")))
+    return str(PurePosixPath(normalize_name(name).replace("\\", "/")))
 
 
 def _case(name: str) -> str:

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 
 @dataclass(frozen=True)
-class Sizes:
+class ImageSizes:
     """Photographs of one size: width and height in px, and how many there are."""
 
     width_px: int

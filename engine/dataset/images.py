@@ -12,7 +12,7 @@ from PIL.TiffImagePlugin import ImageFileDirectory_v2
 
 from octasplat.engine.core.color import linear_to_srgb
 from octasplat.engine.core.errors import DatasetError
-from octasplat.engine.core.threads import one_torch_thread
+from octasplat.engine.core.threads import limit_torch_threads
 from octasplat.engine.dataset.image_info import ImageInfo, Storage
 
 Pixels = np.ndarray[Any, np.dtype[Any]]
@@ -139,7 +139,7 @@ def resize(pixels: Pixels, width_px: int, height_px: int, mode: str = "bicubic")
     import torch  # here, so that reading a model alone does not wait for it
 
     planes = torch.from_numpy(np.ascontiguousarray(pixels)).permute(2, 0, 1)[None]
-    with torch.no_grad(), one_torch_thread():
+    with torch.no_grad(), limit_torch_threads():
         small = torch.nn.functional.interpolate(planes, (height_px, width_px), mode=mode, antialias=True)
     return np.ascontiguousarray(small[0].permute(1, 2, 0).numpy())
 

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from octasplat.engine.core.errors import ConfigError, DatasetError
-from octasplat.engine.core.relative_paths import normalised
+from octasplat.engine.core.relative_paths import normalize_name
 from octasplat.engine.dataset.camera import Camera
 from octasplat.engine.dataset.colmap_model import ColmapModel, PosedImage, read_colmap_model
 from octasplat.engine.dataset.image_info import ImageInfo
@@ -16,7 +16,7 @@ from octasplat.engine.dataset.image_names import match_image_names
 from octasplat.engine.dataset.images import read_image_info
 from octasplat.engine.dataset.masks import mask_for, masks_beside
 from octasplat.engine.dataset.model import DatasetModel, DatasetView, Observations
-from octasplat.engine.dataset.results_among import is_results
+from octasplat.engine.dataset.results_among import is_run_folder
 from octasplat.engine.dataset.views_file import capped_size
 
 MIN_VIEWS = 3
@@ -146,14 +146,16 @@ def _find_images(
     owners = masks_beside(images_on_disk)
     names = [image.name for image in model.images]
     # Nothing outside images/ is read, whatever a model from elsewhere asks for.
-    found = match_image_names(names, on_disk.keys() - (owners.keys() - {normalised(name) for name in names}))
+    found = match_image_names(
+        names, on_disk.keys() - (owners.keys() - {normalize_name(name) for name in names})
+    )
     missing = [name for name in names if name not in found]
     if missing:
         raise DatasetError(
             f"{len(missing)} of {len(names)} images of the model are not in {folder} "
             f"({_name_list(missing)}); put them there or run COLMAP without them."
         )
-    respelt = [name for name in names if normalised(name) != found[name]]
+    respelt = [name for name in names if normalize_name(name) != found[name]]
     if respelt:
         warnings.append(
             f"{len(respelt)} images of the model are spelt otherwise in {folder}; "
@@ -162,7 +164,7 @@ def _find_images(
     others = {name: found[name] for name in respelt}
     images = [replace(image, name=others.get(image.name, image.name)) for image in model.images]
     images.sort(key=lambda image: image.name)
-    paths = [on_disk[normalised(image.name)] for image in images]
+    paths = [on_disk[normalize_name(image.name)] for image in images]
     posed = set(found.values())
     unposed = sorted(set(images_on_disk) - posed - owners.keys())
     if unposed and warn_unposed:
@@ -181,7 +183,7 @@ def _mask_paths(
         return [None] * len(names)
     on_disk = _files_below(folder)
     on_disk = {name.casefold(): path for name, path in on_disk.items()} | on_disk
-    masks = [mask_for(normalised(name), on_disk, beside) for name in names]
+    masks = [mask_for(normalize_name(name), on_disk, beside) for name in names]
     without = [name for name, mask in zip(names, masks, strict=True) if mask is None]
     if len(without) == len(names):
         warnings.append(
@@ -198,13 +200,13 @@ def _files_below(folder: Path) -> dict[str, Path]:
     files: dict[str, Path] = {}
     for parent, folders, names in os.walk(folder, followlinks=True):
         folders[:] = sorted(
-            name for name in folders if not name.startswith(".") and not is_results(Path(parent) / name)
+            name for name in folders if not name.startswith(".") and not is_run_folder(Path(parent) / name)
         )
         for name in sorted(names):
             if not name.startswith("."):
                 path = Path(parent) / name
                 # File systems differ in how they spell an umlaut; models come from other machines.
-                files[normalised(path.relative_to(folder).as_posix())] = path
+                files[normalize_name(path.relative_to(folder).as_posix())] = path
     return files
 
 

@@ -19,8 +19,8 @@ from typing import TypedDict
 import numpy as np
 from jaxtyping import Int64
 
-from octasplat.engine.core.errors import DatasetError, NoSpaceLeft, OutputError
-from octasplat.engine.core.writing import replacing, write_json
+from octasplat.engine.core.errors import DatasetError, DiskFullError, OutputError
+from octasplat.engine.core.writing import atomic_replace, write_json
 from octasplat.engine.dataset.image_info import ImageInfo, Storage
 from octasplat.engine.dataset.images import ValueScale, read_photo
 from octasplat.engine.dataset.mapped_array import MappedArray
@@ -198,7 +198,7 @@ def _build_cache(
         with ExitStack() as stack:
             files: dict[str, int] = {}
             for name, size in planes.items():
-                temporary = stack.enter_context(replacing(folder / f"{name}.bin"))
+                temporary = stack.enter_context(atomic_replace(folder / f"{name}.bin"))
                 files[name] = os.open(temporary, os.O_RDWR | os.O_CREAT | os.O_TRUNC, 0o666)
                 stack.callback(os.close, files[name])
                 os.posix_fallocate(files[name], 0, size)  # a full disk shows now, not after an hour
@@ -208,8 +208,8 @@ def _build_cache(
         for name in ("alpha", "mask"):
             if name not in planes or (name == "alpha" and not transparent):
                 (folder / f"{name}.bin").unlink(missing_ok=True)
-    except NoSpaceLeft as error:
-        raise NoSpaceLeft(f"{error} The pixel cache takes {sum(planes.values()) / 1e6:,.1f} MB.") from error
+    except DiskFullError as error:
+        raise DiskFullError(f"{error} The pixel cache takes {sum(planes.values()) / 1e6:,.1f} MB.") from error
     except OSError as error:
         raise OutputError(
             f"The pixel cache cannot be written to {folder} ({error.strerror}); name another folder."

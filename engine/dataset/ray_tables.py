@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float64, Int64
 
 from octasplat.engine.core.errors import OutputError
-from octasplat.engine.core.writing import replacing, write_text
+from octasplat.engine.core.writing import atomic_replace, write_text
 from octasplat.engine.dataset.camera import ROUND_TRIP_TOLERANCE_PX, Camera
 from octasplat.engine.dataset.mapped_array import MappedArray
 
@@ -75,7 +75,7 @@ def open_ray_tables(cameras: Sequence[Camera], folder: Path, max_bytes: int = MA
         try:
             folder.mkdir(parents=True, exist_ok=True)
             index_file.unlink(missing_ok=True)
-            with replacing(table) as temporary, temporary.open("wb") as handle:
+            with atomic_replace(table) as temporary, temporary.open("wb") as handle:
                 for camera in tabled:
                     for start in range(0, camera.height_px, rows_per_block(camera.width_px)):
                         stop = min(start + rows_per_block(camera.width_px), camera.height_px)

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Int64
 
 from octasplat.engine.core.errors import ConfigError, DatasetError
-from octasplat.engine.core.relative_paths import normalised
+from octasplat.engine.core.relative_paths import normalize_name
 from octasplat.engine.core.writing import write_json
 
 
@@ -33,14 +33,14 @@ def split_views(
     if test_every < 0:
         raise ConfigError(f"test_every is {test_every}; it must be 0 (hold out none) or more.")
     if held_out is not None:
-        chosen = set(map(normalised, held_out))
-        unknown = sorted(chosen - set(map(normalised, names)))
+        chosen = set(map(normalize_name, held_out))
+        unknown = sorted(chosen - set(map(normalize_name, names)))
         if unknown:
             raise DatasetError(
                 f"{len(unknown)} of the images to hold out are not in the {source_name} "
                 f"({', '.join(unknown[:3])}); give names as they stand there."
             )
-        is_test = np.array([normalised(name) in chosen for name in names], dtype=bool)
+        is_test = np.array([normalize_name(name) in chosen for name in names], dtype=bool)
     else:
         is_test = np.arange(len(names)) % test_every == 0 if test_every else np.zeros(len(names), dtype=bool)
     if is_test.all():

@@ -15,7 +15,7 @@ from jaxtyping import Float, Int64
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from octasplat.engine.core.errors import ConfigError
-from octasplat.engine.core.relative_paths import checked_relative
+from octasplat.engine.core.relative_paths import check_relative_path
 from octasplat.engine.core.writing import write_text
 from octasplat.engine.dataset.camera import Camera
 from octasplat.engine.dataset.model import DatasetModel, PosedView, SparsePoints, Viewpoints, scene_extent
@@ -68,7 +68,7 @@ class _CameraEntry(_FrozenModel):
 
 
 class _ViewEntry(_FrozenModel):
-    name: Annotated[str, AfterValidator(checked_relative)]
+    name: Annotated[str, AfterValidator(check_relative_path)]
     camera: Annotated[int, Field(ge=0)]
     rotation_cam_from_world: tuple[_Row, _Row, _Row]
     translation_cam_from_world: _Row

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from octasplat.engine.core.errors import OutputError
-from octasplat.engine.core.writing import telling_of_room, write_json
+from octasplat.engine.core.writing import report_disk_full, write_json
 from octasplat.engine.edit.run_transform import is_similarity, write_transformed_run_files
 from octasplat.engine.files import read_metadata
 from octasplat.engine.files.gaussian_ply import write_gaussian_ply
@@ -19,9 +19,9 @@ from octasplat.engine.gaussians.scene_metadata import SceneMetadata
 from octasplat.engine.runs.run_folder import (
     BACKGROUND,
     CONFIG,
-    ENVIRONMENT,
+    ENVIRONMENT_EXR,
+    ENVIRONMENT_HDR,
     EVENTS,
-    EXACT_ENVIRONMENT,
     HELD_OUT,
     POSES,
     SCENE,
@@ -31,7 +31,7 @@ from octasplat.engine.runs.run_folder import (
 
 EDITS_FILE = "edits.json"
 """What was changed since the training, first to last."""
-_COPIED_FILES = (CONFIG, EVENTS, HELD_OUT, TRAINING, VIEWS, ENVIRONMENT, EXACT_ENVIRONMENT, BACKGROUND)
+_COPIED_FILES = (CONFIG, EVENTS, HELD_OUT, TRAINING, VIEWS, ENVIRONMENT_HDR, ENVIRONMENT_EXR, BACKGROUND)
 """What is as true of the scene after it was changed where it stands."""
 
 
@@ -78,7 +78,7 @@ def write_changed_run(
     partial = target.with_name(f".{target.name}.{os.getpid()}.partial")
     told: tuple[str, ...] = ()
     try:
-        with telling_of_room(target):
+        with report_disk_full(target):
             partial.mkdir(parents=True)
             if matrix is None:
                 _copy(source, partial)

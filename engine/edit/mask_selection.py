@@ -14,7 +14,7 @@ from octasplat.engine.render.image_files import read_image
 from octasplat.engine.render.renderer import tile_order
 from octasplat.engine.render.shots import view_shots
 from octasplat.engine.runs.config import read_config
-from octasplat.engine.runs.run_folder import CONFIG, is_run, run_near_world, run_viewpoints
+from octasplat.engine.runs.run_folder import CONFIG, is_run, run_min_view_distance, run_viewpoints
 from octasplat.engine.trace.factory import make_tracer
 from octasplat.engine.trace.protocol import TraceGradients, Tracer
 
@@ -39,7 +39,7 @@ def select_by_masks(
     if not is_run(source):
         raise ConfigError(f"{source}: masks need the folder of a run, which knows its cameras.")
     config, viewpoints = read_config(source / CONFIG), run_viewpoints(source)
-    near_world = run_near_world(source, viewpoints)
+    near_world = run_min_view_distance(source, viewpoints)
     tracer = make_tracer(config.train.trace, threads=threads)
     tracer.build(gaussians)
     views = ((_rays(viewpoints, path, near_world), path) for path in masks)

@@ -11,8 +11,8 @@ from octasplat.engine.gaussians.channels import stack_channels
 from octasplat.engine.gaussians.materials import AMBIENT, MATERIAL_WIDTHS
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.gaussians.spherical_harmonics import fibonacci_sphere, sh_basis
-from octasplat.engine.shading.kernels.environment_levels import LightLevels
-from octasplat.engine.shading.split_sum import Surface, shade
+from octasplat.engine.shading.kernels.environment_levels import EnvironmentLevels
+from octasplat.engine.shading.split_sum import SurfacePoints, shade
 
 _ROWS_PER_BLOCK = 1 << 14
 _DIRECTIONS = 64
@@ -36,7 +36,7 @@ def refit_sh(
     before: FlatGaussians,
     after: FlatGaussians,
     chosen: Bool[np.ndarray, " n"],
-    light: LightLevels,
+    light: EnvironmentLevels,
     frame: Float64[np.ndarray, "3 3"],
 ) -> FlatGaussians:
     """Return the changed scene with harmonics refitted to its materials, for renderers of harmonics.
@@ -67,7 +67,7 @@ def refit_sh(
 def _shaded_colours(
     gaussians: FlatGaussians,
     directions_world: Float64[np.ndarray, "d 3"],
-    light: LightLevels,
+    light: EnvironmentLevels,
     frame: Float64[np.ndarray, "3 3"],
 ) -> Float64[np.ndarray, "n d 3"]:
     """Return the display colours of Gaussians seen along directions."""
@@ -76,7 +76,7 @@ def _shaded_colours(
     normals = np.repeat(gaussians.rotations[:, :, 0].astype(np.float64), views, axis=0)
     normals *= np.where((normals * directions).sum(axis=1) > 0, -1.0, 1.0)[:, None]
     material = np.repeat(stack_channels(gaussians.channels, list(MATERIAL_WIDTHS)), views, axis=0)
-    surface = Surface.alone(material, normals, directions)
+    surface = SurfacePoints.unoccluded(material, normals, directions)
     if AMBIENT in gaussians.channels:
         seen = np.repeat(gaussians.channels[AMBIENT][:, 0].astype(np.float64), views)
         surface = replace(surface, visibility=seen, ambient=seen)

@@ -14,7 +14,7 @@ from octasplat.engine.render.environment_files import read_environment
 from octasplat.engine.runs.config import read_config
 from octasplat.engine.runs.run_folder import CONFIG, SCENE, is_run, run_environment
 from octasplat.engine.shading.environment_frame import environment_frame
-from octasplat.engine.shading.environment_light import LearntLight
+from octasplat.engine.shading.environment_light import EnvironmentLight
 
 
 def change_materials(
@@ -42,8 +42,8 @@ def change_materials(
     if not has_known_light(source):
         return changed
     settings = read_config(source / CONFIG).train.materials
-    light = LearntLight(settings.environment_height)
-    light.put(read_environment(run_environment(source)))
+    light = EnvironmentLight(settings.environment_height)
+    light.set_radiance(read_environment(run_environment(source)))
     frame = environment_frame(np.array(settings.up_world, np.float64))
     return refit_sh(gaussians, changed, chosen, light.levels, frame)
 

@@ -19,13 +19,13 @@ from octasplat.engine.runs.config import read_config
 from octasplat.engine.runs.run_folder import (
     BACKGROUND,
     CONFIG,
-    ENVIRONMENT,
+    ENVIRONMENT_EXR,
+    ENVIRONMENT_HDR,
     EVENTS,
-    EXACT_ENVIRONMENT,
     HELD_OUT,
     TRAINING,
     VIEWS,
-    run_scene,
+    dataset_folder_of_run,
 )
 from octasplat.engine.shading.background import UP_WORLD
 from octasplat.engine.shading.environment_frame import environment_frame
@@ -84,15 +84,15 @@ def _write_light(source: Path, target: Path, turn: Float64[np.ndarray, "3 3"]) -
     up = np.array(config.train.materials.up_world, np.float64)
     new_up = turn @ up
     content = json.loads((source / CONFIG).read_text(encoding="utf-8"))
-    content["scene"] = run_scene(source).name
+    content["scene"] = dataset_folder_of_run(source).name
     if not _is_identity(turn):
         content["reconstruction"]["train"]["materials"]["up_world"] = new_up.tolist()
     write_json(target / CONFIG, content)
     told = []
     below = environment_frame(np.array(UP_WORLD))
     for name, old_frame, new_frame in (
-        (EXACT_ENVIRONMENT, environment_frame(up), environment_frame(new_up)),
-        (ENVIRONMENT, environment_frame(up), environment_frame(new_up)),
+        (ENVIRONMENT_EXR, environment_frame(up), environment_frame(new_up)),
+        (ENVIRONMENT_HDR, environment_frame(up), environment_frame(new_up)),
         (BACKGROUND, below, below),
     ):
         if not (source / name).exists():
@@ -101,7 +101,7 @@ def _write_light(source: Path, target: Path, turn: Float64[np.ndarray, "3 3"]) -
             shutil.copyfile(source / name, target / name)
             continue
         told.append(f"{name} was turned with the scene, which makes it a little softer.")
-        if name in (ENVIRONMENT, EXACT_ENVIRONMENT):
+        if name in (ENVIRONMENT_HDR, ENVIRONMENT_EXR):
             radiance = read_environment(source / name)
             write_environment(target / name, rotate_environment(radiance, old_frame, new_frame, turn))
         else:

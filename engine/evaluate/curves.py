@@ -16,7 +16,7 @@ Row = Mapping[str, object]
 class Tick:
     """A labelled position along an axis, in SVG units."""
 
-    at: float
+    position: float
     label: str
 
 
@@ -99,7 +99,7 @@ def training_charts(events: Sequence[Row]) -> list[Chart]:
     for x_key, x_label in (("iteration", "iteration"), ("seconds", "training time")):
         for title, unit, logarithmic, sources in _CHARTS:
             lines = [
-                (source, _thinned(training_values(events, source.kind, source.key, x_key)))
+                (source, _subsample(training_values(events, source.kind, source.key, x_key)))
                 for source in sources
             ]
             lines = [(source, values) for source, values in lines if values]
@@ -133,7 +133,7 @@ def training_values(
     return [latest[iteration] for iteration in sorted(latest)]
 
 
-def duration(seconds: float) -> str:
+def format_axis_duration(seconds: float) -> str:
     """A time span for people: ``8.2 s``, ``4 min 10 s``, ``2 h 05 min``."""
     if seconds < 60:
         return f"{seconds:.1f} s" if 0 < seconds < 10 else f"{seconds:.0f} s"
@@ -143,7 +143,7 @@ def duration(seconds: float) -> str:
     return f"{minutes // 60} h {minutes % 60:02d} min" if minutes % 60 else f"{minutes // 60} h"
 
 
-def short_number(value: float) -> str:
+def format_axis_number(value: float) -> str:
     """A number for an axis: ``1500`` as ``1.5 k``, ``2000000`` as ``2 M``."""
     for size, suffix in ((1e9, " G"), (1e6, " M"), (1e3, " k")):
         if abs(value) >= size:
@@ -151,7 +151,7 @@ def short_number(value: float) -> str:
     return f"{value:.4g}"
 
 
-def _thinned(values: list[tuple[float, float]]) -> list[tuple[float, float]]:
+def _subsample(values: list[tuple[float, float]]) -> list[tuple[float, float]]:
     step = max(1, math.ceil(len(values) / MAX_POINTS))
     return values[::step] + ([values[-1]] if values and (len(values) - 1) % step else [])
 
@@ -169,8 +169,8 @@ def _chart(
         lines = [(source, [(x, math.log10(y)) for x, y in values]) for source, values in lines]
     xs = [x for _, values in lines for x, _ in values]
     ys = [y for _, values in lines for _, y in values]
-    x_low, x_high = _opened(min(0.0, *xs), max(xs))
-    y_low, y_high = _opened(min(ys), max(ys))
+    x_low, x_high = _padded_range(min(0.0, *xs), max(xs))
+    y_low, y_high = _padded_range(min(ys), max(ys))
     if title == "Gaussians":
         y_low = 0.0
     margin = 0.05 * (y_high - y_low)
@@ -183,13 +183,13 @@ def _chart(
         return round(HEIGHT - BOTTOM - (y - y_low) / (y_high - y_low) * (HEIGHT - TOP - BOTTOM), 2)
 
     if x_key == "seconds":
-        x_ticks = [Tick(across(x), duration(x)) for x in _time_steps(x_low, x_high)]
+        x_ticks = [Tick(across(x), format_axis_duration(x)) for x in _time_ticks(x_low, x_high)]
     else:
-        x_ticks = [Tick(across(x), short_number(x)) for x in _steps(x_low, x_high, 5)]
+        x_ticks = [Tick(across(x), format_axis_number(x)) for x in _linear_ticks(x_low, x_high, 5)]
     if logarithmic:
-        y_ticks = [Tick(up(y), f"{10**y:.2g}") for y in _log_steps(y_low, y_high)]
+        y_ticks = [Tick(up(y), f"{10**y:.2g}") for y in _log_ticks(y_low, y_high)]
     else:
-        y_ticks = [Tick(up(y), short_number(y)) for y in _steps(y_low, y_high, 5)]
+        y_ticks = [Tick(up(y), format_axis_number(y)) for y in _linear_ticks(y_low, y_high, 5)]
     curves = tuple(
         Curve(source.label, source.style, tuple((across(x), up(y)) for x, y in values))
         for source, values in lines
@@ -200,7 +200,7 @@ def _chart(
     )  # fmt: skip
 
 
-def _opened(low: float, high: float) -> tuple[float, float]:
+def _padded_range(low: float, high: float) -> tuple[float, float]:
     """A range with some width, so that a single value can be drawn."""
     if high > low:
         return low, high
@@ -208,7 +208,7 @@ def _opened(low: float, high: float) -> tuple[float, float]:
     return low - half, high + half
 
 
-def _steps(low: float, high: float, about: int) -> list[float]:
+def _linear_ticks(low: float, high: float, about: int) -> list[float]:
     """Round numbers within a range, ``about`` of them."""
     raw = (high - low) / about
     power = 10.0 ** math.floor(math.log10(raw))
@@ -217,16 +217,16 @@ def _steps(low: float, high: float, about: int) -> list[float]:
     return [k * step for k in range(first, math.floor(high / step + 1e-9) + 1)]
 
 
-def _time_steps(low: float, high: float) -> list[float]:
+def _time_ticks(low: float, high: float) -> list[float]:
     """Whole seconds, minutes or hours within a range."""
     round_spans = (1, 2, 5, 10, 20, 30, 60, 120, 300, 600, 1200, 1800, 3600, 7200, 14400, 28800, 86400)
     step = next((span for span in round_spans if (high - low) / span <= 5), None)
     if step is None or high - low < 3:
-        return _steps(low, high, 4)
+        return _linear_ticks(low, high, 4)
     return [float(k * step) for k in range(math.ceil(low / step), math.floor(high / step) + 1)]
 
 
-def _log_steps(low: float, high: float) -> list[float]:
+def _log_ticks(low: float, high: float) -> list[float]:
     """Logarithms of 1, 2 and 5 times the powers of ten within a range; fewer where it is wide."""
     factors = (1,) if high - low > 2.5 else (1, 2, 5) if high - low > 0.5 else (1, 1.5, 2, 3, 4, 5, 6, 8)
     powers = range(math.floor(low), math.ceil(high) + 1)

@@ -12,10 +12,10 @@ from jaxtyping import Float32
 
 from octasplat.engine.render.image_files import shrink_to, write_webp
 
-WORST = 12
-BEST = 4
+WORST_COUNT = 12
+BEST_COUNT = 4
 MAX_SIDE_PX = 800
-QUALITY = 85
+WEBP_QUALITY = 85
 
 MAGMA = np.array(
     [
@@ -39,7 +39,7 @@ class ViewImages:
     flip_map: Float32[np.ndarray, "h w"]
     layers: Mapping[str, Float32[np.ndarray, "h w 3"]] = field(default_factory=dict)
 
-    def shrunk(self, max_side_px: int = MAX_SIDE_PX) -> "ViewImages":
+    def downscale(self, max_side_px: int = MAX_SIDE_PX) -> "ViewImages":
         """The same at most ``max_side_px`` wide and high."""
         return ViewImages(
             shrink_to(self.photograph, max_side_px),
@@ -49,10 +49,10 @@ class ViewImages:
         )
 
 
-class WorstAndBest(Mapping[str, ViewImages]):
+class WorstAndBestViews(Mapping[str, ViewImages]):
     """Keeps the images of the views that the report embeds, shrunk, while views pass by one by one."""
 
-    def __init__(self, worst: int = WORST, best: int = BEST) -> None:
+    def __init__(self, worst: int = WORST_COUNT, best: int = BEST_COUNT) -> None:
         """Keep ``worst`` views of the lowest and ``best`` of the highest PSNR."""
         self._worst, self._best = worst, best
         self._order: list[tuple[float, str]] = []
@@ -67,7 +67,7 @@ class WorstAndBest(Mapping[str, ViewImages]):
         if full and place == self._worst:
             return
         self._order.insert(place, entry)
-        self._images[name] = images.shrunk()
+        self._images[name] = images.downscale()
         if full:
             _, dropped = self._order.pop(self._worst)
             del self._images[dropped]
@@ -85,7 +85,7 @@ class WorstAndBest(Mapping[str, ViewImages]):
 def embedded_names(worst_first: list[str], images: Mapping[str, ViewImages]) -> list[str]:
     """The views to embed: all that have images, or the 12 worst and 4 best of them when there are more."""
     known = [name for name in worst_first if name in images]
-    return known if len(known) <= WORST + BEST else [*known[:WORST], *known[-BEST:]]
+    return known if len(known) <= WORST_COUNT + BEST_COUNT else [*known[:WORST_COUNT], *known[-BEST_COUNT:]]
 
 
 def magma(values: Float32[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w 3"]:
@@ -94,9 +94,9 @@ def magma(values: Float32[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w 3"]:
     return np.stack([np.interp(values, steps, MAGMA[:, k]) for k in range(3)], axis=-1).astype(np.float32)
 
 
-def data_uri(image: Float32[np.ndarray, "h w 3"]) -> str:
+def webp_data_uri(image: Float32[np.ndarray, "h w 3"]) -> str:
     """The image as a WebP data URI, for a page without other files."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "image.webp"
-        write_webp(path, image, quality=QUALITY)
+        write_webp(path, image, quality=WEBP_QUALITY)
         return "data:image/webp;base64," + base64.b64encode(path.read_bytes()).decode("ascii")

@@ -15,10 +15,10 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationErr
 
 from octasplat.engine.core.color import srgb_to_linear
 from octasplat.engine.core.errors import ConfigError, DatasetError
-from octasplat.engine.core.relative_paths import checked_relative
+from octasplat.engine.core.relative_paths import check_relative_path
 from octasplat.engine.render.image_files import read_image, shrink_to
 
-TRUTH = "truth.json"
+GROUND_TRUTH_FILE = "truth.json"
 _FORMULA = re.compile(r"\bv(?:/(\d+(?:\.\d+)?))?(?:\*(\d+(?:\.\d+)?))?([+-]\d+(?:\.\d+)?)?(?![\w*/+])")
 _AXES = {f"{sign}{name}": k for k, name in enumerate("xyz") for sign in ("+", "-", "")}
 
@@ -29,7 +29,7 @@ def _formula(text: str) -> str:
     return text
 
 
-_Path = Annotated[str, AfterValidator(checked_relative)]
+_Path = Annotated[str, AfterValidator(check_relative_path)]
 _Formula = Annotated[str, AfterValidator(_formula)]
 
 
@@ -70,7 +70,7 @@ class _Relight(_Part):
     views: tuple[_Path, ...] = ()
 
 
-class TruthFile(_Part):
+class GroundTruthFile(_Part):
     """The keys of ``truth.json`` that are read.
 
     Attributes:
@@ -89,7 +89,7 @@ class TruthFile(_Part):
 
 
 @dataclass(frozen=True)
-class ViewTruth:
+class ViewGroundTruth:
     """What is known of one view; None where it is not.
 
     Attributes:
@@ -110,7 +110,7 @@ class ViewTruth:
 
 
 @dataclass(frozen=True)
-class Truth:
+class GroundTruth:
     """A truth file and the folders beside it.
 
     Attributes:
@@ -119,7 +119,7 @@ class Truth:
     """
 
     path: Path
-    content: TruthFile
+    content: GroundTruthFile
 
     @property
     def views(self) -> tuple[str, ...]:
@@ -139,14 +139,14 @@ class Truth:
         return None if train is None else self._map(train)
 
     @property
-    def relit(self) -> tuple[tuple[Path, Path], ...]:
+    def relit_folders(self) -> tuple[tuple[Path, Path], ...]:
         """Folders of pictures under other light, each with its map."""
         root = self.path.parent
         return tuple(
             (root / folder, self._map(PurePosixPath(folder).name)) for folder in self.content.relight.folders
         )
 
-    def relit_picture(self, folder: Path, name: str, max_side_px: int) -> Float32[np.ndarray, "h w 4"]:
+    def relit_image(self, folder: Path, name: str, max_side_px: int) -> Float32[np.ndarray, "h w 4"]:
         """Display colours times coverage, and coverage, of a view under other light, shrunk to a side.
 
         Raises:
@@ -158,7 +158,7 @@ class Truth:
         image[..., :3] *= image[..., 3:]
         return shrink_to(image, max_side_px)
 
-    def view(self, name: str, size: tuple[int, int]) -> ViewTruth:
+    def view(self, name: str, size: tuple[int, int]) -> ViewGroundTruth:
         """The maps of a view.
 
         Args:
@@ -172,7 +172,7 @@ class Truth:
         maps = self.content.test
         mask = self._image("mask", name, size)[..., 0] > 0.5
         scalars = {
-            kind: None if text is None else _decoded(self._image(kind, name, size)[..., 0], text)
+            kind: None if text is None else _decode(self._image(kind, name, size)[..., 0], text)
             for kind, text in (
                 ("depth", maps.depth),
                 ("roughness", maps.roughness),
@@ -181,12 +181,14 @@ class Truth:
         }
         normal = albedo = None
         if maps.normal is not None:
-            normal = _decoded(self._image("normal", name, size)[..., :3], maps.normal)
+            normal = _decode(self._image("normal", name, size)[..., :3], maps.normal)
             normal /= np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-12)
             normal[~mask] = 0.0
         if maps.albedo is not None:
             albedo = srgb_to_linear(_unit(self._image("albedo", name, size)[..., :3]))
-        return ViewTruth(mask, normal, scalars["depth"], albedo, scalars["roughness"], scalars["metallic"])
+        return ViewGroundTruth(
+            mask, normal, scalars["depth"], albedo, scalars["roughness"], scalars["metallic"]
+        )
 
     def _map(self, name: str) -> Path:
         return self.path.parent / self.content.environment.folder / f"{name}.hdr"
@@ -202,33 +204,33 @@ class Truth:
             )
         rows = ((np.arange(size[0]) + 0.5) * height / size[0]).astype(int)
         columns = ((np.arange(size[1]) + 0.5) * width / size[1]).astype(int)
-        return image[rows[:, None], columns].astype(np.float64) * _steps(path)
+        return image[rows[:, None], columns].astype(np.float64) * _integer_steps(path)
 
 
-def find_truth(folder: Path) -> Truth | None:
+def find_ground_truth(folder: Path) -> GroundTruth | None:
     """The truth of the views of a folder, in it or beside it; None without one.
 
     Raises:
         ConfigError: the file is no truth in this format.
     """
-    inside, beside = folder / TRUTH, folder.resolve().parent / TRUTH
+    inside, beside = folder / GROUND_TRUTH_FILE, folder.resolve().parent / GROUND_TRUTH_FILE
     if inside.is_file():
-        return read_truth(inside)
+        return read_ground_truth(inside)
     if beside.is_file():
-        truth = read_truth(beside)
+        truth = read_ground_truth(beside)
         if beside.parent / truth.content.test.folder == folder.resolve():
             return truth
     return None
 
 
-def read_truth(path: Path) -> Truth:
+def read_ground_truth(path: Path) -> GroundTruth:
     """Read and check a truth file; the maps are read when they are asked for.
 
     Raises:
         ConfigError: the file is missing, damaged, or says something that is not understood.
     """
     try:
-        return Truth(path, TruthFile.model_validate_json(path.read_bytes()))
+        return GroundTruth(path, GroundTruthFile.model_validate_json(path.read_bytes()))
     except ValidationError as error:
         first = error.errors()[0]
         where = ".".join(str(part) for part in first["loc"]) or "content"
@@ -237,7 +239,7 @@ def read_truth(path: Path) -> Truth:
         raise ConfigError(f"{path} cannot be read ({error.strerror}).") from None
 
 
-def _decoded(stored: Float64[np.ndarray, "*shape"], text: str) -> Float32[np.ndarray, "*shape"]:
+def _decode(stored: Float64[np.ndarray, "*shape"], text: str) -> Float32[np.ndarray, "*shape"]:
     """Values by the formula in a sentence: v over a number, times one, plus one."""
     match = _FORMULA.search(text)
     assert match is not None
@@ -251,7 +253,7 @@ def _unit(stored: Float64[np.ndarray, "*shape"]) -> Float32[np.ndarray, "*shape"
     return (stored / 255.0).astype(np.float32)
 
 
-def _steps(path: Path) -> float:
+def _integer_steps(path: Path) -> float:
     """How many steps the file's integers have from 0 to 1; 1 for floats."""
     kind = oiio.ImageBuf(str(path)).spec().format.basetype
     return {oiio.UINT8: 255.0, oiio.UINT16: 65535.0}.get(kind, 1.0)

@@ -7,20 +7,20 @@ import numpy as np
 from jaxtyping import Bool, Float32
 
 from octasplat.engine.core.color import srgb_to_linear
-from octasplat.engine.core.events import Listener, StageProgress, Warned
+from octasplat.engine.core.events import EventListener, PhaseProgress, Warned
 from octasplat.engine.core.rays import ImageRays
 from octasplat.engine.dataset import Dataset
-from octasplat.engine.evaluate.ground_truth import Truth, ViewTruth
+from octasplat.engine.evaluate.ground_truth import GroundTruth, ViewGroundTruth
 from octasplat.engine.evaluate.ground_truth_metrics import (
-    TRUTH_DEFINITIONS,
-    best_scales,
-    depth_along_axis,
-    display,
+    GROUND_TRUTH_DEFINITIONS,
     environment_errors,
+    finite_mean,
+    fit_channel_scales,
     intersection_over_union,
-    mean_of,
-    normal_errors_degrees,
+    normal_angles_degrees,
     pooled_psnr,
+    to_display,
+    z_depth,
 )
 from octasplat.engine.gaussians.materials import ALBEDO, METALLIC, ROUGHNESS
 from octasplat.engine.pathtracing.environment import EnvironmentMap, environment_frame
@@ -33,7 +33,7 @@ _DECIMALS = 6
 
 
 @dataclass
-class TruthMeasures:
+class GroundTruthMeasures:
     """Gathers measures while views pass by one by one.
 
     Attributes:
@@ -42,7 +42,7 @@ class TruthMeasures:
         light: means of the environment and of pictures in other light.
     """
 
-    truth: Truth
+    truth: GroundTruth
     rows: dict[str, dict[str, float]] = field(default_factory=dict)
     light: dict[str, object] = field(default_factory=dict)
     _albedo: list[Float32[np.ndarray, "n 3"]] = field(default_factory=list)
@@ -69,7 +69,11 @@ class TruthMeasures:
             self._add_materials(name, image, known)
 
     def add_light(
-        self, dataset: Dataset, environment: EnvironmentMap, relighter: Relighter | None, tell: Listener
+        self,
+        dataset: Dataset,
+        environment: EnvironmentMap,
+        relighter: Relighter | None,
+        progress: EventListener,
     ) -> None:
         """Measure the environment, and the scene in other light.
 
@@ -77,7 +81,7 @@ class TruthMeasures:
             dataset: with the views that were relit.
             environment: that of the scene.
             relighter: shows the scene; None measures no pictures.
-            tell: hears the progress.
+            progress: hears the progress.
 
         Raises:
             ConfigError: a map of the truth cannot be used.
@@ -85,7 +89,7 @@ class TruthMeasures:
         """
         frame = environment_frame(self.truth.up_world)
         if self.truth.environment is not None and not self.truth.environment.is_file():
-            tell(Warned(f"{self.truth.path} names {self.truth.environment}, which is not there."))
+            progress(Warned(f"{self.truth.path} names {self.truth.environment}, which is not there."))
         elif self.truth.environment is not None:
             true = EnvironmentMap(read_environment(self.truth.environment), frame)
             raw, scaled, scales = environment_errors(environment, true)
@@ -99,33 +103,33 @@ class TruthMeasures:
         if relighter is None or not self.rows or not wanted:
             return
         pictures, true_pictures, labels = [], [], []
-        for folder, path in self.truth.relit:
+        for folder, path in self.truth.relit_folders:
             relighter.set_environment(EnvironmentMap(read_environment(path), frame))
             for name in wanted:
                 rays = dataset.view_rays(names[name])
                 pictures.append(relighter.render(rays))
                 side = max(rays.height_px, rays.width_px)
-                true_pictures.append(self.truth.relit_picture(folder, name, side))
+                true_pictures.append(self.truth.relit_image(folder, name, side))
                 labels.append((folder.name, name))
-                tell(StageProgress("evaluate", len(labels), len(wanted) * len(self.truth.relit)))
+                progress(PhaseProgress("evaluate", len(labels), len(wanted) * len(self.truth.relit_folders)))
         if pictures:
-            self.light |= relit_measures(pictures, true_pictures, labels)
+            self.light |= measure_relit(pictures, true_pictures, labels)
 
     def as_dict(self) -> dict[str, object]:
         """The measures as ``metrics.json`` holds them: by view, and their means."""
-        keys = [key for key in TRUTH_DEFINITIONS if any(key in row for row in self.rows.values())]
+        keys = [key for key in GROUND_TRUTH_DEFINITIONS if any(key in row for row in self.rows.values())]
         mean: dict[str, object] = {
-            key: mean_of([row[key] for row in self.rows.values() if key in row]) for key in keys
+            key: finite_mean([row[key] for row in self.rows.values() if key in row]) for key in keys
         }
         if self._albedo:
             mean |= self._albedo_mean()
         return {
             "mean": {**mean, **self.light},
             "views": {name: _rounded(row) for name, row in self.rows.items()},
-            "definitions": dict(TRUTH_DEFINITIONS),
+            "definitions": dict(GROUND_TRUTH_DEFINITIONS),
         }
 
-    def _add_materials(self, name: str, image: RenderedImage, known: ViewTruth) -> None:
+    def _add_materials(self, name: str, image: RenderedImage, known: ViewGroundTruth) -> None:
         for channel, true in ((ROUGHNESS, known.roughness), (METALLIC, known.metallic)):
             if true is not None and channel in image.layers:
                 errors = np.abs(image.layers[channel][known.mask, 0] - true[known.mask])
@@ -136,27 +140,27 @@ class TruthMeasures:
 
     def _albedo_mean(self) -> dict[str, object]:
         found, true = np.concatenate(self._albedo), np.concatenate(self._true_albedo)
-        scales = best_scales(found, true, display)
-        shown, wanted = display(found.astype(np.float64)), display(true.astype(np.float64))
+        scales = fit_channel_scales(found, true, to_display)
+        shown, wanted = to_display(found.astype(np.float64)), to_display(true.astype(np.float64))
         return {
             "albedo_psnr": pooled_psnr(shown, wanted),
-            "albedo_psnr_scaled": pooled_psnr(display(found * scales), wanted),
+            "albedo_psnr_scaled": pooled_psnr(to_display(found * scales), wanted),
             "albedo_scales": [round(float(scale), _DECIMALS) for scale in scales],
         }
 
 
 def _geometry(
-    image: RenderedImage, known: ViewTruth, rays: ImageRays, axis_world: np.ndarray
+    image: RenderedImage, known: ViewGroundTruth, rays: ImageRays, axis_world: np.ndarray
 ) -> dict[str, float]:
     mask = known.mask
     covered: Bool[np.ndarray, "h w"] = image.alpha >= COVERED
     row = {"mask_iou": intersection_over_union(covered, mask)}
     if known.normal_world is not None and mask.any():
-        errors = normal_errors_degrees(image.normal_world[mask], known.normal_world[mask])
+        errors = normal_angles_degrees(image.normal_world[mask], known.normal_world[mask])
         row["normal_mae"] = float(errors.mean())
     both = covered & mask
     if known.depth_z is not None and both.any():
-        along = depth_along_axis(image.depth, rays.directions_world, axis_world)
+        along = z_depth(image.depth, rays.directions_world, axis_world)
         row["depth_mae"] = float(np.abs(along - known.depth_z)[both].mean())
     return row
 
@@ -165,7 +169,7 @@ def _rounded(row: Mapping[str, float]) -> dict[str, float]:
     return {key: round(value, _DECIMALS) for key, value in row.items()}
 
 
-def relit_measures(
+def measure_relit(
     pictures: Sequence[RelitImage],
     true_srgb: Sequence[Float32[np.ndarray, "h w 4"]],
     names: Sequence[tuple[str, str]],
@@ -182,17 +186,17 @@ def relit_measures(
     """
     wanted = [image[..., :3] for image in true_srgb]
     inside = [image[..., 3] > COVERED for image in true_srgb]
-    scales = best_scales(
+    scales = fit_channel_scales(
         np.concatenate([picture.linear[mask] for picture, mask in zip(pictures, inside, strict=True)]),
         np.concatenate([srgb_to_linear(w[mask]) for w, mask in zip(wanted, inside, strict=True)]),
-        display,
+        to_display,
     )
     raw: dict[str, list[float]] = {}
     scaled: dict[str, list[float]] = {}
     for (folder, _), picture, target in zip(names, pictures, wanted, strict=True):
         flat = target.reshape(-1, 3)
         for values, factor in ((raw, np.ones(3)), (scaled, scales)):
-            shown = picture.coverage[..., None] * display(picture.linear * factor)
+            shown = picture.coverage[..., None] * to_display(picture.linear * factor)
             values.setdefault(folder, []).append(pooled_psnr(shown.reshape(-1, 3), flat))
     return {
         "relight_psnr": float(np.mean([value for values in raw.values() for value in values])),

@@ -17,7 +17,7 @@ MOST_FITTED = 200_000
 
 Curve = Callable[[Float64[np.ndarray, "*shape"]], Float64[np.ndarray, "*shape"]]
 
-TRUTH_DEFINITIONS: dict[str, str] = {
+GROUND_TRUTH_DEFINITIONS: dict[str, str] = {
     "normal_mae": "degrees; mean angle between the rendered normal, that of the surface in front (what lies "
     "behind half of the light does not count), and the true one over the true mask; where "
     "nothing is rendered it counts 90",
@@ -40,7 +40,7 @@ TRUTH_DEFINITIONS: dict[str, str] = {
 """What each key of the truth's part of ``metrics.json`` means."""
 
 
-def normal_errors_degrees(
+def normal_angles_degrees(
     normal_world: Float[np.ndarray, "*n 3"], true_world: Float[np.ndarray, "*n 3"]
 ) -> Float64[np.ndarray, "*n"]:
     """Angles between unit vectors; 90 where the first is 0."""
@@ -56,12 +56,12 @@ def intersection_over_union(one: Bool[np.ndarray, "h w"], other: Bool[np.ndarray
     return float((one & other).sum()) / either if either else 1.0
 
 
-def display(linear: Float64[np.ndarray, "*shape"]) -> Float64[np.ndarray, "*shape"]:
+def to_display(linear: Float64[np.ndarray, "*shape"]) -> Float64[np.ndarray, "*shape"]:
     """Display values of linear ones, cut to [0, 1]."""
     return linear_to_srgb(np.clip(linear, 0.0, 1.0))
 
 
-def compressed(linear: Float64[np.ndarray, "*shape"]) -> Float64[np.ndarray, "*shape"]:
+def compress_radiance(linear: Float64[np.ndarray, "*shape"]) -> Float64[np.ndarray, "*shape"]:
     """Radiance without an upper limit brought below 1: x / (1 + x)."""
     return linear / (1.0 + linear)
 
@@ -77,7 +77,7 @@ def pooled_psnr(
     return float("inf") if error == 0 else float(-10.0 * np.log10(error))
 
 
-def best_scales(
+def fit_channel_scales(
     linear: Float[np.ndarray, "n 3"],
     true_linear: Float[np.ndarray, "n 3"],
     curve: Curve,
@@ -128,21 +128,21 @@ def environment_errors(
     found, _ = eval_environment_map(lights, directions)
     wanted = true.radiance_linear.reshape(-1, 3).astype(np.float64)
     weights = np.repeat(np.sin(polar), width)
-    scales = best_scales(found, wanted, compressed, weights)
+    scales = fit_channel_scales(found, wanted, compress_radiance, weights)
     return (
-        pooled_psnr(compressed(found), compressed(wanted), weights),
-        pooled_psnr(compressed(found * scales), compressed(wanted), weights),
+        pooled_psnr(compress_radiance(found), compress_radiance(wanted), weights),
+        pooled_psnr(compress_radiance(found * scales), compress_radiance(wanted), weights),
         scales,
     )
 
 
-def mean_of(values: Sequence[float]) -> float | None:
+def finite_mean(values: Sequence[float]) -> float | None:
     """Return the mean of the numbers that are finite; None where none is."""
     finite = [value for value in values if np.isfinite(value)]
     return float(np.mean(finite)) if finite else None
 
 
-def depth_along_axis(
+def z_depth(
     depth: Float32[np.ndarray, "h w"],
     directions_world: Float32[np.ndarray, "h w 3"],
     axis_world: Float64[np.ndarray, "3"],

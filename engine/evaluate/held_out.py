@@ -7,14 +7,14 @@ from pathlib import Path
 
 import numba
 
-from octasplat.engine.core.color import composited
-from octasplat.engine.core.events import Listener, StageProgress, read_events
+from octasplat.engine.core.color import composite_over
+from octasplat.engine.core.events import EventListener, PhaseProgress, read_events
 from octasplat.engine.core.writing import write_json
 from octasplat.engine.dataset import Dataset
-from octasplat.engine.evaluate.gallery import ViewImages, WorstAndBest
-from octasplat.engine.evaluate.ground_truth import Truth
-from octasplat.engine.evaluate.ground_truth_measures import TruthMeasures
-from octasplat.engine.evaluate.layer_display import shown_environment, shown_layers
+from octasplat.engine.evaluate.gallery import ViewImages, WorstAndBestViews
+from octasplat.engine.evaluate.ground_truth import GroundTruth
+from octasplat.engine.evaluate.ground_truth_measures import GroundTruthMeasures
+from octasplat.engine.evaluate.layer_display import display_environment, display_layers
 from octasplat.engine.evaluate.report import write_report
 from octasplat.engine.evaluate.view_metrics import (
     MeasuredView,
@@ -22,7 +22,7 @@ from octasplat.engine.evaluate.view_metrics import (
     ViewMetrics,
     depth_spread,
     measure_view,
-    summarise,
+    summarize_views,
 )
 from octasplat.engine.gaussians.materials import ALBEDO
 from octasplat.engine.gaussians.model import FlatGaussians
@@ -35,7 +35,7 @@ from octasplat.engine.render.supersampling import render_filtered
 from octasplat.engine.shading.protocol import ShadingModel
 from octasplat.engine.trace.factory import make_tracer
 from octasplat.engine.trace.protocol import Tracer, TraceSettings
-from octasplat.engine.train.shading_factory import background_of, exposed_as
+from octasplat.engine.train.shading_factory import find_background, shading_for_view
 
 SIDE = 2
 """So many rays across a pixel, and as many down, where a shading model shades; else one at its centre."""
@@ -53,8 +53,8 @@ def evaluate_held_out(
     run: Mapping[str, object],
     config: Mapping[str, object],
     threads: int,
-    tell: Listener,
-    truth: Truth | None = None,
+    progress: EventListener,
+    truth: GroundTruth | None = None,
     environment: EnvironmentMap | None = None,
     relighter: Relighter | None = None,
 ) -> None:
@@ -71,16 +71,16 @@ def evaluate_held_out(
         run: facts about the run that join the metrics.
         config: shown in the report.
         threads: for rendering and measuring; 0 means all cores.
-        tell: hears the progress.
+        progress: hears the progress.
         truth: of the scene, whose measures then join the metrics as ``truth``.
         environment: the map that the scene was learnt with.
         relighter: shows the scene in other light, for what the truth knows of that.
     """
     tracer = make_tracer(settings, threads=threads)
     tracer.build(gaussians, shading.features(gaussians))
-    measures = None if truth is None else TruthMeasures(truth)
+    measures = None if truth is None else GroundTruthMeasures(truth)
     rows: list[ViewMetrics] = []
-    images = WorstAndBest()
+    images = WorstAndBestViews()
     total = len(dataset.test_indices)
     photographs = [view.name for view in dataset.views]
     names = dict(zip(photographs, unique_render_names(photographs), strict=True))
@@ -97,15 +97,15 @@ def evaluate_held_out(
             measured.metrics.psnr,
             ViewImages(view.reference, view.render, measured.flip_map, view.layers),
         )
-        tell(StageProgress("evaluate", len(rows), total))
+        progress(PhaseProgress("evaluate", len(rows), total))
     if measures is not None and environment is not None:
-        measures.add_light(dataset, environment, relighter, tell)
+        measures.add_light(dataset, environment, relighter, progress)
     if measures is not None and (measures.rows or measures.light):
         run = {**run, "truth": measures.as_dict()}
     if environment is not None:
-        write_png(output / LAYERS / "environment.png", shown_environment(environment.radiance_linear))
-    behind = background_of(shading)
-    metrics = summarise(rows).as_dict(run)
+        write_png(output / LAYERS / "environment.png", display_environment(environment.radiance_linear))
+    behind = find_background(shading)
+    metrics = summarize_views(rows).as_dict(run)
     write_json(output / METRICS, metrics)
     write_report(
         output / REPORT,
@@ -124,25 +124,25 @@ def _rendered(
     tracer: Tracer,
     shading: ShadingModel,
     background: str,
-    measures: TruthMeasures | None,
+    measures: GroundTruthMeasures | None,
 ) -> Iterator[RenderedView]:
     colour = background_colour(background)
     for index in dataset.test_indices:
         rgb, alpha, weight = dataset.view_image(int(index))
         rays = dataset.view_rays(int(index))
-        image = render_filtered(tracer, rays, colour, exposed_as(shading, int(index)), SIDE)
+        image = render_filtered(tracer, rays, colour, shading_for_view(shading, int(index)), SIDE)
         if measures is not None:
             image = replace(image, normal_world=front_normals(tracer, rays, image.depth_median))
             view = dataset.views[index]
             measures.add(view.name, image, rays, view.rotation_cam_from_world[2])
-        reference = composited(rgb, alpha, colour)
+        reference = composite_over(rgb, alpha, colour)
         yield RenderedView(
             dataset.views[index].name,
             image.rgb_srgb,
             reference,
             weight,
             alpha if dataset.has_alpha else None,
-            shown_layers(image),
+            display_layers(image),
             depth_spread(image.depth, image.depth_median, weight),
         )
 

@@ -8,8 +8,8 @@ from jaxtyping import Float32
 from octasplat.engine.core.color import linear_to_srgb
 from octasplat.engine.render.renderer import RenderedImage
 
-COVERED = 0.5
-FAR_GREY = 0.15
+MIN_ALPHA = 0.5
+FAR_GRAY = 0.15
 LABELS: Mapping[str, str] = {
     "normal": "Normal",
     "depth": "Depth",
@@ -22,35 +22,35 @@ LABELS: Mapping[str, str] = {
 """Layers by name, in the order in which they are offered."""
 
 
-def shown_layers(image: RenderedImage) -> dict[str, Float32[np.ndarray, "h w 3"]]:
+def display_layers(image: RenderedImage) -> dict[str, Float32[np.ndarray, "h w 3"]]:
     """The layers of a picture as display values, black where nothing is.
 
     World normals go from -1 to 1 as colours from 0 to 1; what is near is bright, from the nearest to the
     farthest that is seen; albedo and indirect light are encoded, and everything else is shown as it is.
     """
     alpha = image.alpha[..., None]
-    shown = {"normal": (image.normal_world + 1) / 2 * alpha, "depth": _grey(_nearness(image)) * alpha}
+    shown = {"normal": (image.normal_world + 1) / 2 * alpha, "depth": _to_gray(_depth_to_gray(image)) * alpha}
     for name in LABELS:
         if name in image.layers:
             values = np.clip(image.layers[name], 0.0, 1.0)
-            encoded = linear_to_srgb(values) if values.shape[2] == 3 else _grey(values[..., 0])
+            encoded = linear_to_srgb(values) if values.shape[2] == 3 else _to_gray(values[..., 0])
             shown[name] = encoded * alpha
     return {name: values.astype(np.float32) for name, values in shown.items()}
 
 
-def shown_environment(radiance_linear: Float32[np.ndarray, "h w 3"]) -> Float32[np.ndarray, "h w 3"]:
+def display_environment(radiance_linear: Float32[np.ndarray, "h w 3"]) -> Float32[np.ndarray, "h w 3"]:
     """A map as display values, its brightest parts brought below white by x / (1 + x)."""
     return linear_to_srgb(radiance_linear / (1 + radiance_linear))
 
 
-def _nearness(image: RenderedImage) -> Float32[np.ndarray, "h w"]:
-    seen = image.depth[image.alpha >= COVERED]
+def _depth_to_gray(image: RenderedImage) -> Float32[np.ndarray, "h w"]:
+    seen = image.depth[image.alpha >= MIN_ALPHA]
     if len(seen) == 0:
         return np.zeros_like(image.depth)
     near, far = np.quantile(seen, (0.01, 0.99))
     place = np.clip((image.depth - near) / max(far - near, 1e-9), 0, 1)
-    return np.asarray(1 - (1 - FAR_GREY) * place, np.float32)
+    return np.asarray(1 - (1 - FAR_GRAY) * place, np.float32)
 
 
-def _grey(values: Float32[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w 3"]:
+def _to_gray(values: Float32[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w 3"]:
     return np.repeat(values[..., None], 3, axis=2)

@@ -20,10 +20,10 @@ from scipy.ndimage import correlate1d
 
 from octasplat.engine.core.color import to_bytes
 
-WINDOW = 11
-SIGMA = 1.5
-C1 = 0.01**2
-C2 = 0.03**2
+SSIM_WINDOW = 11
+SSIM_SIGMA = 1.5
+SSIM_C1 = 0.01**2
+SSIM_C2 = 0.03**2
 MS_SSIM_WEIGHTS = (0.0448, 0.2856, 0.3001, 0.2363, 0.1333)
 PIXELS_PER_DEGREE = 67.0
 
@@ -58,12 +58,12 @@ class FlipError(NamedTuple):
     mean: float
 
 
-def rounded_to_8_bits(image: Float32[np.ndarray, "h w 3"]) -> Float32[np.ndarray, "h w 3"]:
+def quantize_8_bit(image: Float32[np.ndarray, "h w 3"]) -> Float32[np.ndarray, "h w 3"]:
     """The image as it would come back from an 8-bit file."""
     return to_bytes(image).astype(np.float32) / np.float32(255.0)
 
 
-def filled_outside(
+def fill_invalid(
     render: Float32[np.ndarray, "h w 3"],
     reference: Float32[np.ndarray, "h w 3"],
     weight: Float32[np.ndarray, "h w"],
@@ -132,7 +132,7 @@ def ms_ssim(
         The index, or ``None`` when the smaller side is 160 pixels or less, too small for the fifth scale, or
         when no window counts at some scale.
     """
-    if min(render.shape[:2]) <= (WINDOW - 1) * 2 ** (len(MS_SSIM_WEIGHTS) - 1):
+    if min(render.shape[:2]) <= (SSIM_WINDOW - 1) * 2 ** (len(MS_SSIM_WEIGHTS) - 1):
         return None
     x, y = render.astype(np.float64), reference.astype(np.float64)
     counts = np.ones((*render.shape[:2], 1)) if weight is None else weight[..., None].astype(np.float64)
@@ -174,8 +174,8 @@ def flip(
 
 
 def _gaussian_window() -> Float64[np.ndarray, "taps"]:
-    offsets = np.arange(WINDOW) - WINDOW // 2
-    window = np.exp(-np.square(offsets) / (2 * SIGMA**2))
+    offsets = np.arange(SSIM_WINDOW) - SSIM_WINDOW // 2
+    window = np.exp(-np.square(offsets) / (2 * SSIM_SIGMA**2))
     return np.asarray(window / window.sum())
 
 
@@ -194,8 +194,8 @@ def _similarity(
     variance_x = _blurred(x * x) - mean_x * mean_x
     variance_y = _blurred(y * y) - mean_y * mean_y
     covariance = _blurred(x * y) - mean_x * mean_y
-    luminance = (2 * mean_x * mean_y + C1) / (mean_x * mean_x + mean_y * mean_y + C1)
-    structure = (2 * covariance + C2) / (variance_x + variance_y + C2)
+    luminance = (2 * mean_x * mean_y + SSIM_C1) / (mean_x * mean_x + mean_y * mean_y + SSIM_C1)
+    structure = (2 * covariance + SSIM_C2) / (variance_x + variance_y + SSIM_C2)
     return luminance, structure
 
 
@@ -210,7 +210,7 @@ def _means(
 
 
 def _inner(values: Float[np.ndarray, "h w *c"]) -> Float[np.ndarray, "a b *c"]:
-    reach = WINDOW // 2
+    reach = SSIM_WINDOW // 2
     return values[reach : values.shape[0] - reach, reach : values.shape[1] - reach]
 
 

@@ -9,18 +9,18 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from jaxtyping import Float32
 
-from octasplat.engine.core.color import composited
+from octasplat.engine.core.color import composite_over
 from octasplat.engine.core.psnr import psnr
 from octasplat.engine.core.rays import ImageRays
 from octasplat.engine.dataset import Dataset
-from octasplat.engine.evaluate.metrics import rounded_to_8_bits
+from octasplat.engine.evaluate.metrics import quantize_8_bit
 from octasplat.engine.render.supersampling import render_averaged
 from octasplat.engine.shading.protocol import ShadingModel
 from octasplat.engine.trace.protocol import Tracer
-from octasplat.engine.train.shading_factory import exposed_as
+from octasplat.engine.train.shading_factory import shading_for_view
 
 
-def measure_scales(
+def measure_multiscale(
     dataset: Dataset,
     tracer: Tracer,
     shading: ShadingModel,
@@ -46,16 +46,16 @@ def measure_scales(
     found: dict[str, dict[str, list[float]]] = {}
     for done, index in enumerate(dataset.test_indices.tolist(), start=1):
         rgb, alpha, weight = dataset.view_image(index)
-        photograph = composited(rgb, alpha, background_srgb)
-        rays, shown = dataset.view_rays(index), exposed_as(shading, index)
+        photograph = composite_over(rgb, alpha, background_srgb)
+        rays, shown = dataset.view_rays(index), shading_for_view(shading, index)
         for scale in scales:
             if min(weight.shape) < scale:
                 continue
-            counts = (blocks(weight[..., None], scale)[..., 0] == 1).astype(np.float32)
-            small = rounded_to_8_bits(blocks(photograph, scale))
+            counts = (block_means(weight[..., None], scale)[..., 0] == 1).astype(np.float32)
+            small = quantize_8_bit(block_means(photograph, scale))
             for across in rays_across:
-                image = render_averaged(tracer, smaller(rays, scale), background_srgb, shown, across)
-                value = psnr(rounded_to_8_bits(image.rgb_srgb), small, counts)
+                image = render_averaged(tracer, downscale_rays(rays, scale), background_srgb, shown, across)
+                value = psnr(quantize_8_bit(image.rgb_srgb), small, counts)
                 if np.isfinite(value):
                     row = found.setdefault(f"1/{scale}", {})
                     row.setdefault(str(across * across), []).append(value)
@@ -65,7 +65,7 @@ def measure_scales(
     }
 
 
-def blocks(image: Float32[np.ndarray, "h w c"], side: int) -> Float32[np.ndarray, "h2 w2 c"]:
+def block_means(image: Float32[np.ndarray, "h w c"], side: int) -> Float32[np.ndarray, "h2 w2 c"]:
     """Means over blocks of ``side`` x ``side`` pixels; what makes no whole block is left out."""
     height, width = image.shape[0] // side, image.shape[1] // side
     cut = image[: height * side, : width * side].astype(np.float64)
@@ -73,10 +73,10 @@ def blocks(image: Float32[np.ndarray, "h w c"], side: int) -> Float32[np.ndarray
     return means.astype(np.float32)
 
 
-def smaller(rays: ImageRays, side: int) -> ImageRays:
-    """The rays through the middles of blocks of ``side`` x ``side`` pixels, see :func:`blocks`."""
+def downscale_rays(rays: ImageRays, side: int) -> ImageRays:
+    """The rays through the middles of blocks of ``side`` x ``side`` pixels, see :func:`block_means`."""
     if side == 1:
         return rays
-    ways = blocks(rays.directions_world, side).astype(np.float64)
+    ways = block_means(rays.directions_world, side).astype(np.float64)
     ways /= np.linalg.norm(ways, axis=2, keepdims=True)
-    return ImageRays.of(rays.origin_world, ways.astype(np.float32), float(rays.rays.t_min[0]))
+    return ImageRays.from_directions(rays.origin_world, ways.astype(np.float32), float(rays.rays.t_min[0]))

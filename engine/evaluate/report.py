@@ -16,18 +16,18 @@ from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescap
 
 from octasplat.engine.core.errors import OutputError
 from octasplat.engine.core.writing import write_text
-from octasplat.engine.evaluate.curves import duration, training_charts
+from octasplat.engine.evaluate.curves import format_axis_duration, training_charts
 from octasplat.engine.evaluate.gallery import (
-    BEST,
+    BEST_COUNT,
     MAGMA,
     MAX_SIDE_PX,
-    WORST,
+    WORST_COUNT,
     ViewImages,
-    data_uri,
     embedded_names,
     magma,
+    webp_data_uri,
 )
-from octasplat.engine.evaluate.layer_display import LABELS, shown_environment
+from octasplat.engine.evaluate.layer_display import LABELS, display_environment
 from octasplat.engine.render.image_files import shrink_to
 
 
@@ -52,7 +52,7 @@ COLUMNS = (
     Column("depth_spread", "Spread", 3, False),
 )
 
-EXPOSURE_MATTERS_DB = 0.3
+MIN_EXPOSURE_GAIN_DB = 0.3
 _LABELS = {"photograph": "Photograph", "render": "Render", "flip": "FLIP error map"}
 _TRUTH_TILES = (
     ("normal_mae", "Normals", 2, "degrees"),
@@ -137,18 +137,19 @@ def _content(
         "title": title,
         "tiles": _tiles(mean, columns, interval, metrics),
         "facts": _facts(metrics, len(views)),
-        "stages": _stages(events),
+        "stages": _phase_times(events),
         "charts": training_charts(events),
         "columns": columns,
         "rows": _rows(worst_first, views, columns, embedded),
         "figures": [_figure(name, views[name], images[name]) for name in embedded],
         "left_out": len(views) - len(embedded),
-        "thinned": len(embedded) < len(views) and embedded == [*worst_first[:WORST], *worst_first[-BEST:]],
-        "worst": WORST,
-        "best": BEST,
+        "thinned": len(embedded) < len(views)
+        and embedded == [*worst_first[:WORST_COUNT], *worst_first[-BEST_COUNT:]],
+        "worst": WORST_COUNT,
+        "best": BEST_COUNT,
         "magma": [f"rgb({r} {g} {b})" for r, g, b in (MAGMA * 255).round().astype(int).tolist()],
-        "settings": _flattened(config),
-        "versions": _flattened(_mapping(metrics.get("versions"))),
+        "settings": _flatten_settings(config),
+        "versions": _flatten_settings(_mapping(metrics.get("versions"))),
         "definitions": [
             *_mapping(metrics.get("definitions")).items(),
             *_mapping(_mapping(metrics.get("truth")).get("definitions")).items(),
@@ -160,14 +161,14 @@ def _content(
 def _map(rgb_srgb: Float32[np.ndarray, "h w 3"]) -> dict[str, object]:
     """The map's picture and size."""
     height, width = rgb_srgb.shape[:2]
-    return {"uri": data_uri(shrink_to(rgb_srgb, MAX_SIDE_PX)), "width": width, "height": height}
+    return {"uri": webp_data_uri(shrink_to(rgb_srgb, MAX_SIDE_PX)), "width": width, "height": height}
 
 
 def _environment(radiance_linear: Float32[np.ndarray, "h w 3"]) -> dict[str, object]:
     """The map's picture, size and brightest value."""
     return {
-        **_map(shown_environment(radiance_linear)),
-        "brightest": _shown(float(radiance_linear.max()), 1),
+        **_map(display_environment(radiance_linear)),
+        "brightest": _format_value(float(radiance_linear.max()), 1),
     }
 
 
@@ -175,7 +176,7 @@ def _columns(mean: Mapping[str, object]) -> list[Column]:
     """The metrics that were measured; that without the exposure only where exposure makes a difference."""
     columns = [column for column in COLUMNS if column.key in mean]
     plain, corrected = (_number(mean.get(key), math.nan) for key in ("psnr", "psnr_colour_corrected"))
-    if corrected - plain >= EXPOSURE_MATTERS_DB:
+    if corrected - plain >= MIN_EXPOSURE_GAIN_DB:
         return columns
     return [column for column in columns if column.key != "psnr_colour_corrected"]
 
@@ -189,34 +190,43 @@ def _tiles(
         if column.key != "ssim_valid":
             note = _NOTES.get(column.key, "")
             if column.key == "psnr" and isinstance(interval, list | tuple):
-                low, high = (_shown(bound, 2) for bound in interval)
+                low, high = (_format_value(bound, 2) for bound in interval)
                 note = f"95 % interval {low} – {high}"
             unit = "dB" if column.key.startswith("psnr") else ""
-            value = _shown(mean[column.key], column.decimals)
+            value = _format_value(mean[column.key], column.decimals)
             tiles.append({"label": column.heading, "value": value, "unit": unit, "note": note})
     trained = _mapping(metrics.get("training_views"))
     if trained.get("psnr") is not None:
-        note = f"worst {_shown(trained.get('worst_psnr'), 2)} dB: {trained.get('worst')}"
+        note = f"worst {_format_value(trained.get('worst_psnr'), 2)} dB: {trained.get('worst')}"
         if left := trained.get("left_out"):
             note += f"; {len(left) if isinstance(left, list) else 0} left out"
         tiles.append(
-            {"label": "Training views", "value": _shown(trained["psnr"], 2), "unit": "dB", "note": note}
+            {
+                "label": "Training views",
+                "value": _format_value(trained["psnr"], 2),
+                "unit": "dB",
+                "note": note,
+            }
         )
     known = _mapping(_mapping(metrics.get("truth")).get("mean"))
     for key, label, decimals, unit in _TRUTH_TILES:
         if known.get(key) is not None:
             note = "against the truth" + (", one factor a channel" if key.endswith("_scaled") else "")
-            tiles.append({"label": label, "value": _shown(known[key], decimals), "unit": unit, "note": note})
+            tiles.append(
+                {"label": label, "value": _format_value(known[key], decimals), "unit": unit, "note": note}
+            )
     gaussians = metrics.get("gaussians")
     if isinstance(gaussians, int):
-        tiles.append({"label": "Gaussians", "value": _thousands(gaussians), "unit": "", "note": ""})
+        tiles.append({"label": "Gaussians", "value": _format_thousands(gaussians), "unit": "", "note": ""})
     seconds = metrics.get("seconds")
     if isinstance(seconds, int | float):
         iterations, planned = metrics.get("iterations"), metrics.get("planned_iterations")
-        note = f"{_thousands(iterations)} iterations" if isinstance(iterations, int) else ""
+        note = f"{_format_thousands(iterations)} iterations" if isinstance(iterations, int) else ""
         if note and isinstance(planned, int):
-            note += f" of {_thousands(planned)}, as no more was gained"
-        tiles.append({"label": "Time", "value": duration(float(seconds)), "unit": "", "note": note})
+            note += f" of {_format_thousands(planned)}, as no more was gained"
+        tiles.append(
+            {"label": "Time", "value": format_axis_duration(float(seconds)), "unit": "", "note": note}
+        )
     return tiles
 
 
@@ -226,18 +236,20 @@ def _facts(metrics: Mapping[str, object], views: int) -> list[str]:
     resolution = metrics.get("resolution")
     if isinstance(resolution, Mapping):
         known = {key: value for key, value in resolution.items() if value is not None}
-        shown = ", ".join(f"{key.replace('_', ' ')} {value}" for key, value in _flattened(known))
+        shown = ", ".join(f"{key.replace('_', ' ')} {value}" for key, value in _flatten_settings(known))
         facts.append(f"resolution: {shown or 'that of the photographs'}")
     elif resolution is not None:
         facts.append(f"resolution {resolution}")
     if metrics.get("seed") is not None:
         facts.append(f"seed {metrics['seed']}")
     if taken := metrics.get("taken_near"):
-        facts.append(f"{_thousands(int(_number(taken, 0)))} Gaussians too near to a camera were taken away")
+        facts.append(
+            f"{_format_thousands(int(_number(taken, 0)))} Gaussians too near to a camera were taken away"
+        )
     return facts
 
 
-def _stages(events: Sequence[Mapping[str, object]]) -> list[dict[str, object]]:
+def _phase_times(events: Sequence[Mapping[str, object]]) -> list[dict[str, object]]:
     """Where the time went: the last finish of each stage, with its share of the whole."""
     spent = {
         str(row.get("stage")): _number(row.get("seconds"), 0.0)
@@ -248,7 +260,7 @@ def _stages(events: Sequence[Mapping[str, object]]) -> list[dict[str, object]]:
     if total <= 0:
         return []
     return [
-        {"name": name, "time": duration(seconds), "share": round(100 * seconds / total, 2)}
+        {"name": name, "time": format_axis_duration(seconds), "share": round(100 * seconds / total, 2)}
         for name, seconds in spent.items()
     ]
 
@@ -269,7 +281,7 @@ def _rows(
         view = views[name]
         share = 100.0 if not math.isfinite(psnr) or high == low else 100 * (psnr - low) / (high - low)
         cells = [
-            {"value": view.get(column.key), "text": _shown(view.get(column.key), column.decimals)}
+            {"value": view.get(column.key), "text": _format_value(view.get(column.key), column.decimals)}
             for column in columns
         ]
         size = f"{view['width']} × {view['height']}" if "width" in view and "height" in view else "–"
@@ -289,34 +301,34 @@ def _rows(
 
 def _figure(name: str, view: Mapping[str, object], images: ViewImages) -> dict[str, object]:
     """The three pictures of a view, and what is written under them."""
-    small = images.shrunk()
+    small = images.downscale()
     height, width = small.flip_map.shape
     summary = " · ".join(
-        f"{column.heading} {_shown(view[column.key], column.decimals)}"
+        f"{column.heading} {_format_value(view[column.key], column.decimals)}"
         for column in COLUMNS
         if view.get(column.key) is not None and column.key in ("psnr", "ssim", "flip")
     )
     return {
         "name": name,
         "summary": summary,
-        "psnr": _shown(view.get("psnr"), 2),
+        "psnr": _format_value(view.get("psnr"), 2),
         "width": width,
         "height": height,
         "layers": [
-            ("photograph", data_uri(small.photograph)),
-            ("render", data_uri(small.render)),
-            ("flip", data_uri(magma(small.flip_map))),
-            *((layer, data_uri(picture)) for layer, picture in small.layers.items() if layer in LABELS),
+            ("photograph", webp_data_uri(small.photograph)),
+            ("render", webp_data_uri(small.render)),
+            ("flip", webp_data_uri(magma(small.flip_map))),
+            *((layer, webp_data_uri(picture)) for layer, picture in small.layers.items() if layer in LABELS),
         ],
     }
 
 
-def _flattened(values: Mapping[str, object], prefix: str = "") -> list[tuple[str, str]]:
+def _flatten_settings(values: Mapping[str, object], prefix: str = "") -> list[tuple[str, str]]:
     """Nested settings as dotted names and short texts."""
     rows: list[tuple[str, str]] = []
     for key, value in values.items():
         if isinstance(value, Mapping):
-            rows += _flattened(value, f"{prefix}{key}.")
+            rows += _flatten_settings(value, f"{prefix}{key}.")
         else:
             rows.append(
                 (f"{prefix}{key}", value if isinstance(value, str) else json.dumps(value, default=str))
@@ -332,9 +344,9 @@ def _number(value: object, otherwise: float) -> float:
     return float(value) if isinstance(value, int | float) and not isinstance(value, bool) else otherwise
 
 
-def _shown(value: object, decimals: int) -> str:
+def _format_value(value: object, decimals: int) -> str:
     return f"{value:.{decimals}f}" if isinstance(value, int | float) and math.isfinite(value) else "–"
 
 
-def _thousands(value: int) -> str:
+def _format_thousands(value: int) -> str:
     return f"{value:,}".replace(",", "\u202f")

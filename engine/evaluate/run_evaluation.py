@@ -8,16 +8,16 @@ from typing import Literal
 import numpy as np
 
 from octasplat.engine.core.errors import ConfigError, DatasetError, OutputError
-from octasplat.engine.core.events import Listener, StageProgress, Warned
-from octasplat.engine.core.progress import counted_stage, stage
+from octasplat.engine.core.events import EventListener, PhaseProgress, Warned
+from octasplat.engine.core.progress import counted_phase, phase
 from octasplat.engine.core.threads import use_threads
-from octasplat.engine.core.versions import versions
+from octasplat.engine.core.versions import package_versions
 from octasplat.engine.core.writing import write_json
 from octasplat.engine.dataset import Dataset
 from octasplat.engine.dataset.views_file import read_views, write_views
-from octasplat.engine.evaluate.ground_truth import Truth, find_truth
+from octasplat.engine.evaluate.ground_truth import GroundTruth, find_ground_truth
 from octasplat.engine.evaluate.held_out import evaluate_held_out
-from octasplat.engine.evaluate.multiscale import measure_scales
+from octasplat.engine.evaluate.multiscale import measure_multiscale
 from octasplat.engine.files import read_metadata
 from octasplat.engine.files.gaussian_ply import read_gaussian_ply
 from octasplat.engine.gaussians.materials import has_materials
@@ -31,13 +31,13 @@ from octasplat.engine.runs.run_folder import (
     BACKGROUND,
     CACHE,
     CONFIG,
-    ON,
+    EVALUATIONS,
     POSES,
     SCENE,
     TRAINING,
     VIEWS,
-    found_model,
-    open_photographs,
+    found_model_folder,
+    open_run_dataset,
     photographs_folder,
     run_environment,
     run_exposures,
@@ -45,11 +45,18 @@ from octasplat.engine.runs.run_folder import (
 from octasplat.engine.shading.protocol import ShadingModel
 from octasplat.engine.trace.factory import make_tracer
 from octasplat.engine.train.config import TrainConfig
-from octasplat.engine.train.shading_factory import background_of, deferred_of, exposures_of, make_shading
+from octasplat.engine.train.shading_factory import (
+    find_background,
+    find_deferred,
+    find_exposures,
+    make_shading,
+)
 
 SCALES = "scales.json"
-GUESSED = "held-out views are shown as exposed as their brightness and the views beside them suggest"
-NOTED_BY_TRAINING = ("planned_iterations", "training_views", "taken_near")
+ESTIMATED_EXPOSURE_NOTE = (
+    "held-out views are shown as exposed as their brightness and the views beside them suggest"
+)
+TRAINING_KEYS = ("planned_iterations", "training_views", "taken_near")
 RAYS_ACROSS = (1, 2, 4)
 """Rays across a pixel with which smaller sizes are measured."""
 
@@ -61,7 +68,7 @@ def evaluate(
     on: Path | None = None,
     background: Literal["black", "white"] | None = None,
     threads: int = 0,
-    listener: Listener = lambda _event: None,
+    progress: EventListener = lambda _event: None,
 ) -> Path:
     """Measure the scene of a finished run again and write its metrics, renders and report anew.
 
@@ -73,7 +80,7 @@ def evaluate(
             stay as they are.
         background: behind the scene; None takes that of the run.
         threads: for everything; 0 means all cores.
-        listener: hears the progress.
+        progress: hears the progress.
 
     Returns:
         The path of ``metrics.json``.
@@ -84,17 +91,17 @@ def evaluate(
         OutputError: there is no scene yet, or other photographs of that name were measured before.
     """
     use_threads(threads)
-    config = _finished(output, background)
+    config = _finished_config(output, background)
     if on is not None:
-        return _evaluate_on(on, output, config, threads, listener)
-    dataset = _photographs(output, config, scene, threads, listener)
-    _check_world(output, dataset, photographs_folder(output, scene))
+        return _evaluate_on(on, output, config, threads, progress)
+    dataset = _open_photographs(output, config, scene, threads, progress)
+    _check_coordinates(output, dataset, photographs_folder(output, scene))
     if (output / VIEWS).exists():
         difference = read_views(output / VIEWS).difference(dataset.views_record)
         if difference is not None:
-            listener(Warned(f"{output} was made from other photographs or another model ({difference})."))
-    with stage("evaluate", listener, len(dataset.test_indices)):
-        measure_run(dataset, output, config, threads, listener)
+            progress(Warned(f"{output} was made from other photographs or another model ({difference})."))
+    with phase("evaluate", progress, len(dataset.test_indices)):
+        measure_run(dataset, output, config, threads, progress)
     return output / "metrics.json"
 
 
@@ -105,7 +112,7 @@ def evaluate_scales(
     scene: Path | None = None,
     background: Literal["black", "white"] | None = None,
     threads: int = 0,
-    listener: Listener = lambda _event: None,
+    listener: EventListener = lambda _event: None,
 ) -> dict[str, dict[str, float]]:
     """Measure a finished run at smaller sizes and write ``scales.json``.
 
@@ -128,16 +135,16 @@ def evaluate_scales(
         OutputError: there is no scene yet.
     """
     use_threads(threads)
-    config = _finished(output, background)
-    dataset = _photographs(output, config, scene, threads, listener)
-    _check_world(output, dataset, photographs_folder(output, scene))
+    config = _finished_config(output, background)
+    dataset = _open_photographs(output, config, scene, threads, listener)
+    _check_coordinates(output, dataset, photographs_folder(output, scene))
     gaussians, _ = read_gaussian_ply(output / SCENE)
     extent = _extent_world(output, dataset)
     shading = finished_shading(output, config.train, dataset, extent)
     tracer = make_tracer(config.train.trace, threads=threads)
     tracer.build(gaussians, shading.features(gaussians))
-    with counted_stage("evaluate", listener, len(dataset.test_indices)) as progress:
-        found = measure_scales(
+    with counted_phase("evaluate", listener, len(dataset.test_indices)) as progress:
+        found = measure_multiscale(
             dataset,
             tracer,
             shading,
@@ -150,7 +157,7 @@ def evaluate_scales(
     return found
 
 
-def _finished(output: Path, background: Literal["black", "white"] | None) -> ReconstructionConfig:
+def _finished_config(output: Path, background: Literal["black", "white"] | None) -> ReconstructionConfig:
     """Return the settings of a run that has a scene, to be measured with that background."""
     config = read_config(output / CONFIG)
     if background is not None:
@@ -162,20 +169,20 @@ def _finished(output: Path, background: Literal["black", "white"] | None) -> Rec
     return config
 
 
-def _photographs(
-    output: Path, config: ReconstructionConfig, scene: Path | None, threads: int, listener: Listener
+def _open_photographs(
+    output: Path, config: ReconstructionConfig, scene: Path | None, threads: int, progress: EventListener
 ) -> Dataset:
-    return open_photographs(
+    return open_run_dataset(
         photographs_folder(output, scene),
         output,
         config,
         threads,
-        listener,
-        model_folder=found_model(output),
+        progress,
+        model_folder=found_model_folder(output),
     )
 
 
-def _check_world(output: Path, dataset: Dataset, folder: Path) -> None:
+def _check_coordinates(output: Path, dataset: Dataset, folder: Path) -> None:
     """Refuse photographs whose model stands in another world than the scene, as after a transform.
 
     Raises:
@@ -198,16 +205,16 @@ def measure_run(
     output: Path,
     config: ReconstructionConfig,
     threads: int,
-    tell: Listener,
+    progress: EventListener,
     into: Path | None = None,
 ) -> None:
     """Measure the scene of ``output``; the results go ``into`` another folder or that one."""
-    truth = _truth(dataset, tell, needed=into is not None)
+    truth = _find_ground_truth(dataset, progress, needed=into is not None)
     gaussians, _ = read_gaussian_ply(output / SCENE)
     extent = _extent_world(output, dataset)
     environment = _environment(output, config.train)
     relighter = None
-    if truth is not None and truth.relit and environment is not None and has_materials(gaussians):
+    if truth is not None and truth.relit_folders and environment is not None and has_materials(gaussians):
         relighter = SplitSumRelighter(
             gaussians, config.train.trace, config.train.materials, extent_world=extent, threads=threads
         )
@@ -226,28 +233,28 @@ def measure_run(
             "seed": config.train.seed,
             "resolution": {"max_side": config.max_side},
             "background": config.evaluation_background,
-            "versions": versions(),
-            **{key: training[key] for key in NOTED_BY_TRAINING if key in training},
-            **_placed(output),
-            **({"exposure": GUESSED} if "exposures" in training and into is None else {}),
+            "versions": package_versions(),
+            **{key: training[key] for key in TRAINING_KEYS if key in training},
+            **_pose_facts(output),
+            **({"exposure": ESTIMATED_EXPOSURE_NOTE} if "exposures" in training and into is None else {}),
         },
         config=json.loads((output / CONFIG).read_text(encoding="utf-8")),
         threads=threads,
-        tell=tell,
+        progress=progress,
         truth=truth,
         environment=environment,
         relighter=relighter,
     )
 
 
-def _truth(dataset: Dataset, tell: Listener, *, needed: bool) -> Truth | None:
+def _find_ground_truth(dataset: Dataset, progress: EventListener, *, needed: bool) -> GroundTruth | None:
     """What is known of the photographs; a file that is none is told, and refused where it is ``needed``."""
     try:
-        return find_truth(dataset.root)
+        return find_ground_truth(dataset.root)
     except ConfigError as error:
         if needed:
             raise
-        tell(Warned(f"{error} Nothing is measured against it."))
+        progress(Warned(f"{error} Nothing is measured against it."))
         return None
 
 
@@ -269,12 +276,12 @@ def finished_shading(
     known = run_exposures(output)
     decided = config.model_copy(update={"exposure": known is not None})
     shading = make_shading(decided, len(dataset.views), extent_world)
-    if (deferred := deferred_of(shading)) is not None:
-        deferred.light.put(read_environment(run_environment(output)))
-    if (background := background_of(shading)) is not None:
-        background.put(read_background(output / BACKGROUND))
-    if exposed and known is not None and (exposures := exposures_of(shading)) is not None:
-        exposures.take([view.name for view in dataset.views], known)
+    if (deferred := find_deferred(shading)) is not None:
+        deferred.light.set_radiance(read_environment(run_environment(output)))
+    if (background := find_background(shading)) is not None:
+        background.set_map(read_background(output / BACKGROUND))
+    if exposed and known is not None and (exposures := find_exposures(shading)) is not None:
+        exposures.load_known([view.name for view in dataset.views], known)
     return shading
 
 
@@ -287,24 +294,24 @@ def _environment(output: Path, config: TrainConfig) -> EnvironmentMap | None:
 
 
 def _evaluate_on(
-    on: Path, output: Path, config: ReconstructionConfig, threads: int, listener: Listener
+    on: Path, output: Path, config: ReconstructionConfig, threads: int, progress: EventListener
 ) -> Path:
     """Measure other photographs into a folder of their own."""
     name = on.resolve().name
-    into = output / ON / name
-    find_truth(on)  # complains before anything is written
+    into = output / EVALUATIONS / name
+    find_ground_truth(on)  # complains before anything is written
     dataset = Dataset.open_for_evaluation(
         on,
-        output / CACHE / ON / name,
+        output / CACHE / EVALUATIONS / name,
         near_world=read_metadata(output).near_world,
         max_side=config.max_side,
         masks=config.masks,
         threads=threads,
-        progress=lambda done, total: listener(StageProgress("load", done, total)),
+        progress=lambda done, total: progress(PhaseProgress("load", done, total)),
     )
     for warning in dataset.warnings:
-        listener(Warned(warning))
-    _check_world(output, dataset, on)
+        progress(Warned(warning))
+    _check_coordinates(output, dataset, on)
     if (into / VIEWS).exists():
         difference = read_views(into / VIEWS).difference(dataset.views_record)
         if difference is not None:
@@ -312,13 +319,13 @@ def _evaluate_on(
                 f"{into} holds the measures of other photographs than {on} has ({difference}); delete or "
                 "rename that folder."
             )
-    with stage("evaluate", listener, len(dataset.test_indices)):
+    with phase("evaluate", progress, len(dataset.test_indices)):
         write_views(into / VIEWS, dataset.views_record)
-        measure_run(dataset, output, config, threads, listener, into)
+        measure_run(dataset, output, config, threads, progress, into)
     return into / "metrics.json"
 
 
-def _placed(output: Path) -> dict[str, object]:
+def _pose_facts(output: Path) -> dict[str, object]:
     """How many photographs have poses, which were placed anew, and whether lenses were adjusted."""
     record = read_pose_record(output / POSES)
     known = {name: record[name] for name in ("placed", "photographs", "moved", "lenses") if name in record}

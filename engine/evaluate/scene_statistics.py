@@ -25,7 +25,7 @@ class Box:
 
 
 @dataclass(frozen=True)
-class SceneFacts:
+class SceneStatistics:
     """Facts on the Gaussians alone.
 
     Attributes:
@@ -54,7 +54,7 @@ class SceneFacts:
 
 
 @dataclass(frozen=True)
-class HitFacts:
+class HitStatistics:
     """Gaussians that rays meet before little light is left.
 
     Attributes:
@@ -68,13 +68,13 @@ class HitFacts:
     share: float
 
 
-def scene_facts(gaussians: FlatGaussians, up_world: Float64[np.ndarray, "3"]) -> SceneFacts:
+def scene_statistics(gaussians: FlatGaussians, up_world: Float64[np.ndarray, "3"]) -> SceneStatistics:
     """The facts on a scene of at least one Gaussian; ``up_world`` is the axis of the cylinder."""
     scales = gaussians.scales.astype(np.float64)
     larger = scales.max(axis=1)
     counts, _ = np.histogram(gaussians.opacities, bins=np.array(OPACITY_EDGES))
     size = sum(array.nbytes for array in row_arrays(gaussians).values())
-    return SceneFacts(
+    return SceneStatistics(
         count=len(gaussians),
         sh_degree=gaussians.sh_degree,
         channels=gaussians.channels.widths,
@@ -88,13 +88,13 @@ def scene_facts(gaussians: FlatGaussians, up_world: Float64[np.ndarray, "3"]) ->
     )
 
 
-def hit_facts(tracer: Tracer, image: ImageRays) -> HitFacts:
+def hit_statistics(tracer: Tracer, image: ImageRays) -> HitStatistics:
     """How many Gaussians the rays of an image meet; ``tracer`` has the scene built."""
     hits = tracer.trace(image.rays[tile_order(image.height_px, image.width_px)]).hit_counts
     some = hits[hits > 0]
     if len(some) == 0:
-        return HitFacts(0.0, 0.0, 0.0)
-    return HitFacts(float(some.mean()), float(np.quantile(some, 0.95)), len(some) / len(hits))
+        return HitStatistics(0.0, 0.0, 0.0)
+    return HitStatistics(float(some.mean()), float(np.quantile(some, 0.95)), len(some) / len(hits))
 
 
 def _box(points: np.ndarray) -> Box:

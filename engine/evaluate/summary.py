@@ -5,7 +5,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from octasplat.engine.core.durations import duration
+from octasplat.engine.core.durations import format_duration
 
 _METRICS = (
     ("psnr", "PSNR {:.2f} dB"),
@@ -26,7 +26,7 @@ _TRUTH = (
 )
 
 
-def mean_metrics(metrics: dict[str, Any]) -> str:
+def format_mean_metrics(metrics: dict[str, Any]) -> str:
     """Return a line on the held-out views from the content of ``metrics.json``."""
     count = len(metrics["views"])
     if count == 0:
@@ -38,19 +38,19 @@ def mean_metrics(metrics: dict[str, Any]) -> str:
     return f"Mean over {count} held-out view{'s' if count > 1 else ''}{without}: {', '.join(known)}"
 
 
-def measured_summary(path: Path) -> list[str]:
+def summarize_evaluation(path: Path) -> list[str]:
     """Return lines on what was measured on other photographs into ``path``, and where it is shown."""
     metrics: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
     known = metrics.get("truth", {}).get("mean", {})
     told = [form.format(known[key]) for key, form in _TRUTH if known.get(key) is not None]
     return [
-        mean_metrics(metrics),
+        format_mean_metrics(metrics),
         *([f"Against the truth: {', '.join(told)}"] if told else []),
         f"{'Report:':8}{path.with_name('report.html')}",
     ]
 
 
-def run_summary(output: Path, exports: Iterable[str]) -> list[str]:
+def summarize_run(output: Path, exports: Iterable[str]) -> list[str]:
     """Return lines on what a finished run in ``output`` reached and where its files are."""
     metrics: dict[str, Any] = json.loads((output / "metrics.json").read_text(encoding="utf-8"))
     files = [("Report", "report.html"), ("Scene", "scene.ply"), *(("Mesh", name) for name in exports)]
@@ -60,10 +60,10 @@ def run_summary(output: Path, exports: Iterable[str]) -> list[str]:
         *([f"Poses found for {placed} of {poses['photographs']} photographs"] if placed else []),
         *([f"Placed {moved} photograph{'s' if moved > 1 else ''} anew"] if moved else []),
         *(["Adjusted the lens of each photograph"] if poses.get("lenses") else []),
-        mean_metrics(metrics),
+        format_mean_metrics(metrics),
         *_training_views(metrics.get("training_views") or {}),
         f"{metrics['gaussians']:,} Gaussians after {metrics['iterations']:,} iterations, "
-        f"trained in {duration(metrics['seconds'])}",
+        f"trained in {format_duration(metrics['seconds'])}",
         *(f"{label + ':':8}{output / name}" for label, name in files if (output / name).exists()),
     ]
 

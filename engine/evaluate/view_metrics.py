@@ -10,21 +10,21 @@ import numpy as np
 from jaxtyping import Float32
 
 from octasplat.engine.core.errors import DatasetError
-from octasplat.engine.core.psnr import colour_corrected, psnr
+from octasplat.engine.core.psnr import fit_color, psnr
 from octasplat.engine.evaluate.metrics import (
     DEFINITIONS,
-    filled_outside,
+    fill_invalid,
     flip,
     ms_ssim,
-    rounded_to_8_bits,
+    quantize_8_bit,
     ssim_both,
 )
 
 FOREGROUND_ALPHA = 0.5
 BOOTSTRAP_DRAWS = 2000
-OPTIONAL = ("psnr_foreground", "depth_spread")
+OPTIONAL_METRICS = ("psnr_foreground", "depth_spread")
 """Metrics that are left out where no view has them."""
-SPREAD = 0.1
+DEPTH_SPREAD_MIN = 0.1
 """Share of the depth by which mean and median differ where there is more than a surface."""
 
 
@@ -107,7 +107,7 @@ class Metrics:
         views = {}
         for view in self.views:
             row = {key: _finite(value) for key, value in asdict(view).items() if key != "name"}
-            for key in OPTIONAL:
+            for key in OPTIONAL_METRICS:
                 if key not in self.mean:
                     del row[key]
             views[view.name] = row
@@ -138,9 +138,9 @@ def measure_view(view: RenderedView) -> MeasuredView:
         )
     if not np.isfinite(view.render).all():
         raise DatasetError(f"The render of {view.name} has pixels that are no number.")
-    reference = rounded_to_8_bits(view.reference)
-    render = rounded_to_8_bits(view.render)
-    filled = filled_outside(render, reference, view.weight)
+    reference = quantize_8_bit(view.reference)
+    render = quantize_8_bit(view.render)
+    filled = fill_invalid(render, reference, view.weight)
     padded, valid = ssim_both(filled, reference, view.weight)
     flip_map, mean_flip = flip(filled, reference, view.weight)
     height, width = view.weight.shape
@@ -149,7 +149,7 @@ def measure_view(view: RenderedView) -> MeasuredView:
         width=width,
         height=height,
         psnr=psnr(render, reference, view.weight),
-        psnr_colour_corrected=psnr(colour_corrected(render, reference, view.weight), reference, view.weight),
+        psnr_colour_corrected=psnr(fit_color(render, reference, view.weight), reference, view.weight),
         ssim=_known(padded),
         ssim_valid=_known(valid),
         ms_ssim=ms_ssim(filled, reference, view.weight),
@@ -178,11 +178,11 @@ def depth_spread(
     covered = (depth_median > 0) if weight is None else (depth_median > 0) & (weight > 0)
     if not covered.any():
         return None
-    apart = np.abs(depth - depth_median) > SPREAD * depth_median
+    apart = np.abs(depth - depth_median) > DEPTH_SPREAD_MIN * depth_median
     return float(np.average(apart[covered], weights=None if weight is None else weight[covered]))
 
 
-def summarise(views: Iterable[ViewMetrics]) -> Metrics:
+def summarize_views(views: Iterable[ViewMetrics]) -> Metrics:
     """Return means over views, each metric over those of which it is finite.
 
     Raises:
@@ -194,7 +194,7 @@ def summarise(views: Iterable[ViewMetrics]) -> Metrics:
         twice = next(name for name in names if names.count(name) > 1)
         raise DatasetError(f"Two measured views are named {twice}; names must differ.")
     keys = ["psnr", "psnr_colour_corrected", "ssim", "ssim_valid", "ms_ssim", "flip"]
-    keys += [key for key in OPTIONAL if any(getattr(row, key) is not None for row in rows)]
+    keys += [key for key in OPTIONAL_METRICS if any(getattr(row, key) is not None for row in rows)]
     finite = {key: [value for row in rows if _is_finite(value := getattr(row, key))] for key in keys}
     mean = {key: sum(values) / len(values) if values else None for key, values in finite.items()}
     left_out = {key: len(rows) - len(values) for key, values in finite.items() if len(values) < len(rows)}

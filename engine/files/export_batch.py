@@ -3,7 +3,7 @@
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from octasplat.engine.core.errors import Cancelled, NoSpaceLeft, OctasplatError
+from octasplat.engine.core.errors import CancelledError, DiskFullError, OctasplatError
 from octasplat.engine.files.export_options import ExportOptions
 from octasplat.engine.files.registry import Exporter, exporter_for
 from octasplat.engine.files.write_files import export_scene
@@ -37,7 +37,7 @@ def export_batch(
         try:
             gaussians, options = prepare(exporter_for(target, format))
             written += export_scene(gaussians, target, options, format)
-        except (NoSpaceLeft, Cancelled):
+        except (DiskFullError, CancelledError):
             raise  # the others would find no room either, and whoever makes room goes on from here
         except OctasplatError as error:
             failed.append(str(error).replace(f"{target}", target.name).rstrip("."))

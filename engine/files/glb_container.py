@@ -16,7 +16,7 @@ from jaxtyping import Float64
 from numpy.typing import DTypeLike
 
 from octasplat.engine.core.errors import SceneFileError
-from octasplat.engine.core.writing import replacing
+from octasplat.engine.core.writing import atomic_replace
 from octasplat.engine.gaussians.channels import column_names
 from octasplat.engine.gaussians.frames import quaternions_from_matrices, rotation_matrices
 
@@ -257,7 +257,7 @@ def write_glb(
     Raises:
         OSError: the file cannot be written.
     """
-    with replacing(path) as temporary, temporary.open("wb") as handle:
+    with atomic_replace(path) as temporary, temporary.open("wb") as handle:
         handle.write(struct.pack("<4sII", b"glTF", 2, glb_size(json_room, length)))
         handle.write(struct.pack("<I4s", json_room, b"JSON"))
         json_start = handle.tell()

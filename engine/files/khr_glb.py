@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float32, Float64
 
-from octasplat.engine.core.color import linear_to_srgb, rounded_bytes, srgb_to_linear
+from octasplat.engine.core.color import linear_to_srgb, round_to_bytes, srgb_to_linear
 from octasplat.engine.core.errors import ConfigError, SceneFileError
 from octasplat.engine.files import glb_container
 from octasplat.engine.files.channel_columns import ChannelChoice, select_channel_columns
@@ -198,7 +198,9 @@ class _Attribute:
 def _colours(some: FlatGaussians) -> np.ndarray:
     """The fallback of readers that see points only: linear RGB of the constant harmonic, and opacity."""
     linear = srgb_to_linear(np.clip(some.base_rgb_srgb, 0.0, 1.0))
-    return rounded_bytes(np.concatenate([linear, some.opacities[:, None]], axis=1).astype(np.float64) * 255.0)
+    return round_to_bytes(
+        np.concatenate([linear, some.opacities[:, None]], axis=1).astype(np.float64) * 255.0
+    )
 
 
 def _scales(some: FlatGaussians) -> np.ndarray:

@@ -19,7 +19,7 @@ from jaxtyping import Float32, Int32, Int64
 
 from octasplat.engine.core.color import srgb_to_linear
 from octasplat.engine.core.errors import SceneFileError
-from octasplat.engine.core.writing import replacing, write_text
+from octasplat.engine.core.writing import atomic_replace, write_text
 from octasplat.engine.files.export_options import ExportOptions
 from octasplat.engine.files.obj_materials import read_mtl
 from octasplat.engine.files.octagon_batches import BATCH_SIZE, OctagonBatch, OctagonSoup
@@ -334,10 +334,10 @@ def write_octagons(gaussians: FlatGaussians, path: Path, options: ExportOptions)
     """
     soup = OctagonSoup(gaussians, path, options)
     material, texture = _octagon_files(path)
-    with replacing(texture) as temporary:
+    with atomic_replace(texture) as temporary:
         temporary.write_bytes(grey_png(options.falloff_texture_size, options.q))
     write_text(material, f"{_material(MATERIAL)}map_d {texture.name}\n")
-    with replacing(path) as temporary, temporary.open("wb") as handle:
+    with atomic_replace(path) as temporary, temporary.open("wb") as handle:
         for text in _octagon_lines(soup, material.name):
             handle.write(text.encode())
     return path, material, texture
@@ -381,12 +381,12 @@ def write_surface(mesh: TriangleMesh, path: Path) -> tuple[Path, ...]:
     head, files = "# octasplat surface\n", [path]
     if mesh.texture_srgb is not None:
         material, image = _surface_files(path)
-        with replacing(image) as temporary:
+        with atomic_replace(image) as temporary:
             temporary.write_bytes(png_bytes(mesh.texture_srgb))
         write_text(material, f"{_material('surface')}map_Kd {image.name}\n")
         head += f"mtllib {material.name}\nusemtl surface\n"
         files += [material, image]
-    with replacing(path) as temporary, temporary.open("w", encoding="utf-8") as handle:
+    with atomic_replace(path) as temporary, temporary.open("w", encoding="utf-8") as handle:
         handle.write(head)
         vertices = (
             mesh.vertices_world if mesh.rgb_srgb is None else np.hstack([mesh.vertices_world, mesh.rgb_srgb])

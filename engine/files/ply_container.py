@@ -14,7 +14,7 @@ from typing import IO
 import numpy as np
 
 from octasplat.engine.core.errors import SceneFileError
-from octasplat.engine.core.writing import replacing
+from octasplat.engine.core.writing import atomic_replace
 
 SCALAR_TYPES: Mapping[str, str] = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1",
@@ -345,7 +345,7 @@ def write_ply(path: Path, elements: Sequence[PlyWriteElement], comments: Sequenc
     for element in elements:
         lines += [f"element {element.name} {element.count}", *_property_lines(element.dtype)]
     try:
-        with replacing(path) as temporary, temporary.open("wb") as handle:
+        with atomic_replace(path) as temporary, temporary.open("wb") as handle:
             handle.write("\n".join([*lines, "end_header", ""]).encode())
             for element in elements:
                 written = 0

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from octasplat.engine.core.errors import SceneFileError
-from octasplat.engine.core.events import Listener, StageFinished, StageStarted, ignore
+from octasplat.engine.core.events import EventListener, PhaseFinished, PhaseStarted, ignore_events
 from octasplat.engine.files.channel_columns import ChannelChoice
 from octasplat.engine.files.gaussian_ply import read_ply_metadata
 from octasplat.engine.files.registry import importer_for, mesh_reader_for
@@ -25,7 +25,7 @@ def read_scene(
     *,
     drop_invalid: bool = False,
     channels: ChannelChoice = "own",
-    progress: Listener = ignore,
+    progress: EventListener = ignore_events,
 ) -> tuple[FlatGaussians, ImportReport]:
     """Read the Gaussians of a file of any known format, or of the folder of a run, and flatten them.
 
@@ -45,7 +45,7 @@ def read_scene(
     """
     source = _scene_file(path)
     importer = importer_for(source, format)
-    progress(StageStarted("read"))
+    progress(PhaseStarted("read"))
     began = time.monotonic()
     if importer.read_channels is not None:
         cloud = importer.read_channels(source, channels)
@@ -54,7 +54,7 @@ def read_scene(
     else:
         cloud = importer.read(source)
     scene = flatten(cloud, source, drop_invalid=drop_invalid)
-    progress(StageFinished("read", time.monotonic() - began))
+    progress(PhaseFinished("read", time.monotonic() - began))
     return scene
 
 

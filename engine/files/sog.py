@@ -16,7 +16,7 @@ from jaxtyping import Float32, UInt8
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from octasplat.engine.core.errors import SceneFileError
-from octasplat.engine.core.writing import replacing
+from octasplat.engine.core.writing import atomic_replace
 from octasplat.engine.files.encodings import SQRT_HALF, from_smallest_three, logits_from_bytes
 from octasplat.engine.files.export_options import ExportOptions
 from octasplat.engine.files.gaussian_ply import write_gaussian_ply
@@ -250,7 +250,7 @@ def write(gaussians: FlatGaussians, path: Path, options: ExportOptions) -> tuple
         OSError: the file cannot be written.
     """
     scene = select_for_export(gaussians, path, options)
-    with tempfile.TemporaryDirectory(prefix="octasplat-") as folder, replacing(path) as temporary:
+    with tempfile.TemporaryDirectory(prefix="octasplat-") as folder, atomic_replace(path) as temporary:
         source, target = Path(folder) / "scene.ply", Path(folder) / "scene.sog"
         write_gaussian_ply(scene, source)
         try:

@@ -4,9 +4,9 @@ from pathlib import Path
 
 import numpy as np
 
-from octasplat.engine.core.color import rounded_bytes
+from octasplat.engine.core.color import round_to_bytes
 from octasplat.engine.core.errors import SceneFileError
-from octasplat.engine.core.writing import replacing
+from octasplat.engine.core.writing import atomic_replace
 from octasplat.engine.files.encodings import logits_from_bytes, sh0_from_rgb, unit_quats
 from octasplat.engine.files.export_options import ExportOptions
 from octasplat.engine.files.registry import Exporter, Importer, register
@@ -52,7 +52,7 @@ def write(gaussians: FlatGaussians, path: Path, options: ExportOptions) -> tuple
     """
     gaussians = select_for_export(gaussians, path, options)
     check_scales(gaussians, path)
-    with replacing(path) as temporary, temporary.open("wb") as handle:
+    with atomic_replace(path) as temporary, temporary.open("wb") as handle:
         for block in iterate_blocks(gaussians):
             handle.write(_rows(block).data)
     return (path,)
@@ -63,12 +63,12 @@ def _rows(some: FlatGaussians) -> np.ndarray:
     rows["mean"] = some.means_world
     rows["scale"][:, 0] = FLAT_SCALE
     rows["scale"][:, 1:] = some.scales
-    rows["rgba"][:, :3] = rounded_bytes(some.base_rgb_srgb.astype(np.float64) * 255.0)
-    rows["rgba"][:, 3] = rounded_bytes(some.opacities.astype(np.float64) * 255.0)
+    rows["rgba"][:, :3] = round_to_bytes(some.base_rgb_srgb.astype(np.float64) * 255.0)
+    rows["rgba"][:, 3] = round_to_bytes(some.opacities.astype(np.float64) * 255.0)
     unit = unit_quats(some.quats_wxyz)
     # A byte reaches from -1 to 127/128, so a component near 1 is written as its negative.
     largest = np.take_along_axis(unit, np.argmax(np.abs(unit), axis=1)[:, None], axis=1)
-    rows["quat_wxyz"] = rounded_bytes(np.where(largest > 0, -unit, unit) * 128.0 + 128.0)
+    rows["quat_wxyz"] = round_to_bytes(np.where(largest > 0, -unit, unit) * 128.0 + 128.0)
     return rows
 
 

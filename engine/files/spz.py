@@ -5,9 +5,9 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Float32
 
-from octasplat.engine.core.color import rounded_bytes
+from octasplat.engine.core.color import round_to_bytes
 from octasplat.engine.core.errors import SceneFileError
-from octasplat.engine.core.writing import replacing
+from octasplat.engine.core.writing import atomic_replace
 from octasplat.engine.files.encodings import (
     MAX_SH_DEGREE,
     SQRT_HALF,
@@ -110,7 +110,7 @@ def write(gaussians: FlatGaussians, path: Path, options: ExportOptions) -> tuple
             stream += data
     packed = tuple(bytes(stream) for stream in streams)
     file = SpzFile(options.spz_version, len(scene), scene.sh_degree, bits, 0, packed)
-    with replacing(path) as temporary:
+    with atomic_replace(path) as temporary:
         write_spz(temporary, file)
     return (path,)
 
@@ -120,9 +120,9 @@ def _pack_block(scene: FlatGaussians, bits: int) -> tuple[bytes, ...]:
     log_scales = np.concatenate([np.full((len(scene), 1), FLAT_LOG_SCALE), scene.log_scales], axis=1)
     return (
         _pack_positions(scene.means_world.astype(np.float64) * (1 << bits)),
-        rounded_bytes(scene.opacities.astype(np.float64) * 255.0).tobytes(),
-        rounded_bytes((scene.sh[:, 0].astype(np.float64) * COLOUR_SCALE + 0.5) * 255.0).tobytes(),
-        rounded_bytes((log_scales.astype(np.float64) + LOG_SCALE_OFFSET) * LOG_SCALE_STEPS).tobytes(),
+        round_to_bytes(scene.opacities.astype(np.float64) * 255.0).tobytes(),
+        round_to_bytes((scene.sh[:, 0].astype(np.float64) * COLOUR_SCALE + 0.5) * 255.0).tobytes(),
+        round_to_bytes((log_scales.astype(np.float64) + LOG_SCALE_OFFSET) * LOG_SCALE_STEPS).tobytes(),
         _pack_rotations(scene),
         _pack_sh(scene),
     )
@@ -159,7 +159,7 @@ def _pack_sh(scene: FlatGaussians) -> bytes:
     steps = np.full((scene.sh.shape[1] - 1, 1), SH_STEPS[1], dtype=np.float64)
     steps[:3] = SH_STEPS[0]
     bins = np.rint(scene.sh[:, 1:].astype(np.float64) * 128.0 / steps)
-    return rounded_bytes(bins * steps + 128.0).tobytes()
+    return round_to_bytes(bins * steps + 128.0).tobytes()
 
 
 def _recognises(head: bytes) -> bool:

@@ -16,7 +16,7 @@ import numpy as np
 
 from octasplat.engine.core.color import srgb_to_linear
 from octasplat.engine.core.errors import SceneFileError
-from octasplat.engine.core.writing import replacing
+from octasplat.engine.core.writing import atomic_replace
 from octasplat.engine.files.encodings import half_turn_gaussians, unit_quats
 from octasplat.engine.files.export_options import ExportOptions
 from octasplat.engine.files.registry import Exporter, register
@@ -48,7 +48,7 @@ def write(gaussians: FlatGaussians, path: Path, options: ExportOptions) -> tuple
     check_scales(scene, path)
     pxr = _usd(path)
     suffix = ".usdc" if path.suffix.lower() in (".usdz", ".usd") else path.suffix.lower()
-    with tempfile.TemporaryDirectory(prefix="octasplat-") as folder, replacing(path) as temporary:
+    with tempfile.TemporaryDirectory(prefix="octasplat-") as folder, atomic_replace(path) as temporary:
         layer = Path(folder) / f"scene{suffix}"
         _write_stage(pxr, scene, layer)
         if path.suffix.lower() == ".usdz":

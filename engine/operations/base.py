@@ -9,8 +9,8 @@ from typing import Any, ClassVar, Generic, Protocol, TypeVar, runtime_checkable
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from octasplat.engine.core.errors import Cancelled, ConfigError
-from octasplat.engine.core.events import Event, Listener, Warned, ignore
+from octasplat.engine.core.errors import CancelledError, ConfigError
+from octasplat.engine.core.events import Event, EventListener, Warned, ignore_events
 from octasplat.engine.settings import renamed_settings
 from octasplat.engine.settings.fields import Output, Positional, Source
 
@@ -25,7 +25,7 @@ class Options(BaseModel):
     @model_validator(mode="before")
     @classmethod
     def _by_new_names(cls, given: Any) -> Any:
-        return renamed_settings.with_new_names((cls,), given) if isinstance(given, Mapping) else given
+        return renamed_settings.translate_names((cls,), given) if isinstance(given, Mapping) else given
 
 
 class Request(Options):
@@ -117,7 +117,7 @@ class Run(Protocol[RequestT_contra, ResultT_co]):
         request: RequestT_contra,
         /,
         *,
-        progress: Listener = ignore,
+        progress: EventListener = ignore_events,
         should_stop: Callable[[], bool] = never_stop,
         threads: int = 0,
     ) -> ResultT_co:
@@ -126,7 +126,7 @@ class Run(Protocol[RequestT_contra, ResultT_co]):
         Args:
             request: what to do.
             progress: called with each event; warnings are events, too.
-            should_stop: asked now and then; True ends the work with ``Cancelled``.
+            should_stop: asked now and then; True ends the work with ``CancelledError``.
             threads: number of threads; 0 means all cores. It never changes the result.
 
         Raises:
@@ -157,10 +157,10 @@ def stop_if(should_stop: Callable[[], bool]) -> None:
     """Raise ``Cancelled`` if a stop is requested, before the next file is written.
 
     Raises:
-        Cancelled: it is.
+        CancelledError: it is.
     """
     if should_stop():
-        raise Cancelled("Stopped; files that were not written yet are not.")
+        raise CancelledError("Stopped; files that were not written yet are not.")
 
 
 def options_of(model: type[OptionsT], request: Options) -> OptionsT:
@@ -216,7 +216,7 @@ def error_text(message: str, place: Callable[[str], str] = lambda path: path) ->
     return re.sub(r"`([\w.]+)`", lambda match: place(match[1]), told)
 
 
-def emit_warning(progress: Listener, message: str) -> None:
+def emit_warning(progress: EventListener, message: str) -> None:
     """Emit a warning; the work goes on."""
     progress(Warned(message))
 
@@ -225,7 +225,7 @@ __all__ = [
     "CHANGED_SCENE",
     "ContradictoryRequestError",
     "Event",
-    "Listener",
+    "EventListener",
     "Operation",
     "Options",
     "Output",
@@ -241,7 +241,7 @@ __all__ = [
     "emit_warning",
     "error_text",
     "first_error",
-    "ignore",
+    "ignore_events",
     "never_stop",
     "options_of",
     "stop_if",

@@ -7,7 +7,7 @@ from typing import Annotated, ClassVar
 from pydantic import Field, model_validator
 
 from octasplat.engine.core.errors import ConfigError
-from octasplat.engine.core.events import Listener, ignore
+from octasplat.engine.core.events import EventListener, ignore_events
 from octasplat.engine.edit.edit_options import CleanupOptions
 from octasplat.engine.operations.base import (
     CHANGED_SCENE,
@@ -80,7 +80,7 @@ class CleanResult(ScenesWritten):
 def run(
     request: CleanRequest,
     *,
-    progress: Listener = ignore,
+    progress: EventListener = ignore_events,
     should_stop: Callable[[], bool] = never_stop,
     threads: int = 0,
 ) -> CleanResult:
@@ -94,14 +94,14 @@ def run(
 
     from octasplat.engine.edit.cleaning import clean
     from octasplat.engine.operations.scene_io import check_changed, edit_note, open_scene, write_changed
-    from octasplat.engine.runs.run_folder import is_run, run_near_zones
+    from octasplat.engine.runs.run_folder import is_run, run_camera_clearance
 
     source: Path = request.source
     if request.output is not None:
         check_changed("clean", request, request.output)
     gaussians = open_scene(source, progress)
     share = request.camera_clearance
-    zones = run_near_zones(source, share) if share > 0 and is_run(source) else None
+    zones = run_camera_clearance(source, share) if share > 0 and is_run(source) else None
     keep, report = clean(gaussians, request, zones)
     told = (
         f"{source}: {len(gaussians):,} Gaussians; {report.faint:,} too faint, {report.small:,} too small, "

@@ -9,13 +9,13 @@ from collections.abc import Sequence
 
 from pydantic import BaseModel, computed_field
 
-from octasplat.engine.core.durations import duration
-from octasplat.engine.dataset.image_sizes import Sizes
+from octasplat.engine.core.durations import format_duration
+from octasplat.engine.dataset.image_sizes import ImageSizes
 from octasplat.engine.operations.relight import RelightOptions
 from octasplat.engine.operations.render import RenderOptions
 from octasplat.engine.operations.render_options import PictureOptions
 from octasplat.engine.runs.config import ReconstructionConfig
-from octasplat.engine.train.config import TrainConfig, in_one_order, iteration_count, most_gaussians
+from octasplat.engine.train.config import TrainConfig, iteration_count, max_gaussian_count, uses_shared_sort
 
 _START_CPU_SECONDS = 16.0
 _LOAD_CPU_SECONDS_PER_PIXEL = 1.0e-7
@@ -86,13 +86,11 @@ class Estimate(BaseModel):
         """Return the estimate in words."""
         cores = f"{self.cores} core{'s' if self.cores > 1 else ''}"
         poses = ", besides the time to find the poses" if self.finds_poses else ""
-        return (
-            f"about {duration(self.seconds)} on {cores} and {self.memory_bytes / 1e9:.1f} GB of memory{poses}"
-        )
+        return f"about {format_duration(self.seconds)} on {cores} and {self.memory_bytes / 1e9:.1f} GB of memory{poses}"
 
 
 def estimate_reconstruction(
-    options: ReconstructionConfig, photographs: Sequence[Sizes], cores: int
+    options: ReconstructionConfig, photographs: Sequence[ImageSizes], cores: int
 ) -> Estimate:
     """Return the estimate of a reconstruction of these photographs on this number of cores."""
     train = options.train
@@ -127,7 +125,7 @@ def estimate_reconstruction(
     return _estimate(cpu_seconds, memory, cores, finds_poses=options.poses == "auto", disk_bytes=disk)
 
 
-def reconstruction_bytes(options: ReconstructionConfig, photographs: Sequence[Sizes]) -> int:
+def reconstruction_bytes(options: ReconstructionConfig, photographs: Sequence[ImageSizes]) -> int:
     """Return the minimal size of a reconstruction's folder: decoded photographs and one checkpoint."""
     shrunk = [_capped_sizes(sizes, options.max_side) for sizes in photographs]
     pixels = sum(sizes.width_px * sizes.height_px * sizes.count for sizes in shrunk)
@@ -135,12 +133,12 @@ def reconstruction_bytes(options: ReconstructionConfig, photographs: Sequence[Si
     return _CACHED_PIXEL_BYTES * pixels + _checkpoint_bytes(options.train.sh_degree) * gaussians
 
 
-def image_bytes(options: PictureOptions, photographs: Sequence[Sizes], turns: int = 1) -> int:
+def image_bytes(options: PictureOptions, photographs: Sequence[ImageSizes], turns: int = 1) -> int:
     """Return the minimal size of a render's images, for each of ``turns`` environments."""
     return round(_IMAGE_PIXEL_BYTES[options.format] * rendered_pixels(options, photographs) * turns)
 
 
-def training_pixels(options: ReconstructionConfig, photographs: Sequence[Sizes]) -> int:
+def training_pixels(options: ReconstructionConfig, photographs: Sequence[ImageSizes]) -> int:
     """Return the pixels of a reconstruction's training views, if all photographs have poses."""
     shrunk = [_capped_sizes(sizes, options.max_side) for sizes in photographs]
     count = sum(sizes.count for sizes in shrunk)
@@ -148,7 +146,7 @@ def training_pixels(options: ReconstructionConfig, photographs: Sequence[Sizes])
     return round(pixels * (1 - _held_out(options, count) / max(count, 1)))
 
 
-def estimate_render(options: RenderOptions, photographs: Sequence[Sizes], cores: int) -> Estimate:
+def estimate_render(options: RenderOptions, photographs: Sequence[ImageSizes], cores: int) -> Estimate:
     """Return the estimate of new views; for views of photographs, all are counted."""
     pixels = rendered_pixels(options, photographs)
     each = _RENDER_CPU_SECONDS_PER_PIXEL
@@ -159,7 +157,7 @@ def estimate_render(options: RenderOptions, photographs: Sequence[Sizes], cores:
     return _estimate(cpu_seconds, memory, cores, disk_bytes=image_bytes(options, photographs))
 
 
-def estimate_relight(options: RelightOptions, photographs: Sequence[Sizes], cores: int) -> Estimate:
+def estimate_relight(options: RelightOptions, photographs: Sequence[ImageSizes], cores: int) -> Estimate:
     """Return the estimate of relighting; a ray of the split sum counts as a path."""
     each = _PATH_CPU_SECONDS * options.samples_per_pixel * len(options.environments)
     cpu_seconds = _RENDER_START_CPU_SECONDS + each * rendered_pixels(options, photographs)
@@ -168,7 +166,7 @@ def estimate_relight(options: RelightOptions, photographs: Sequence[Sizes], core
     return _estimate(cpu_seconds, memory, cores, disk_bytes=disk)
 
 
-def rendered_pixels(options: PictureOptions, photographs: Sequence[Sizes]) -> int:
+def rendered_pixels(options: PictureOptions, photographs: Sequence[ImageSizes]) -> int:
     """Return the largest number of pixels of all images of a render; a preview is one image."""
     is_preview = isinstance(options, RenderOptions) and options.preview
     if options.mode == "path" and options.camera_path is not None:
@@ -196,12 +194,14 @@ def _estimate(
     )
 
 
-def _capped_sizes(sizes: Sizes, max_side: int | None) -> Sizes:
+def _capped_sizes(sizes: ImageSizes, max_side: int | None) -> ImageSizes:
     longest = max(sizes.width_px, sizes.height_px)
     if max_side is None or longest <= max_side:
         return sizes
     scale = max_side / longest
-    return Sizes(max(1, round(sizes.width_px * scale)), max(1, round(sizes.height_px * scale)), sizes.count)
+    return ImageSizes(
+        max(1, round(sizes.width_px * scale)), max(1, round(sizes.height_px * scale)), sizes.count
+    )
 
 
 def _held_out(options: ReconstructionConfig, count: int) -> int:
@@ -211,7 +211,7 @@ def _held_out(options: ReconstructionConfig, count: int) -> int:
 
 
 def _gaussians(train: TrainConfig, trained_on: int) -> int:
-    most = most_gaussians(train, trained_on)
+    most = max_gaussian_count(train, trained_on)
     return min(most, _PAPER_GAUSSIANS) if train.densify.kind == "redisplats" else most
 
 
@@ -222,7 +222,7 @@ def _ray_cpu_seconds(train: TrainConfig, gaussians: int) -> float:
         return float(_MATERIAL_RAY_CPU_SECONDS * (gaussians / _MATERIAL_GAUSSIANS) ** _FAR_RAY_POWER)
     near, far = min(gaussians, _FITTED_GAUSSIANS) / 1e5, max(gaussians / _FITTED_GAUSSIANS, 1.0)
     seconds = max(_RAY_CPU_SECONDS * near**_RAY_POWER * far**_FAR_RAY_POWER, _LEAST_RAY_CPU_SECONDS)
-    saved = _SHARED_SORT_SAVING * train.shared_sort_until if in_one_order(train) else 0.0
+    saved = _SHARED_SORT_SAVING * train.shared_sort_until if uses_shared_sort(train) else 0.0
     return float(seconds * (1 - saved))
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 from pydantic import model_validator
 
 from octasplat.engine.core.errors import ConfigError
-from octasplat.engine.core.events import Listener, ignore
+from octasplat.engine.core.events import EventListener, ignore_events
 from octasplat.engine.edit.edit_options import Selection
 from octasplat.engine.operations.base import (
     Operation,
@@ -51,7 +51,7 @@ class CropResult(ScenesWritten):
 def run(
     request: CropRequest,
     *,
-    progress: Listener = ignore,
+    progress: EventListener = ignore_events,
     should_stop: Callable[[], bool] = never_stop,
     threads: int = 0,
 ) -> CropResult:

@@ -11,7 +11,7 @@ from jaxtyping import Float64
 from pydantic import Field, PlainSerializer
 
 from octasplat.engine.core.errors import SceneFileError
-from octasplat.engine.core.events import Listener, ignore
+from octasplat.engine.core.events import EventListener, ignore_events
 from octasplat.engine.edit.axes import AXIS_ROTATIONS, Axes
 from octasplat.engine.edit.reports import DeformReport
 from octasplat.engine.files import ImportedMesh, read_mesh
@@ -91,7 +91,7 @@ class DeformResult(ScenesWritten):
 def run(
     request: DeformRequest,
     *,
-    progress: Listener = ignore,
+    progress: EventListener = ignore_events,
     should_stop: Callable[[], bool] = never_stop,
     threads: int = 0,
 ) -> DeformResult:

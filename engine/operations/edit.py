@@ -7,7 +7,7 @@ from typing import Annotated
 
 from pydantic import Field
 
-from octasplat.engine.core.events import Listener, ignore
+from octasplat.engine.core.events import EventListener, ignore_events
 from octasplat.engine.edit.edit_options import MeshToGaussiansOptions
 from octasplat.engine.edit.reports import EditReport
 from octasplat.engine.operations.base import (
@@ -56,7 +56,7 @@ class EditResult(ScenesWritten):
 def run(
     request: EditRequest,
     *,
-    progress: Listener = ignore,
+    progress: EventListener = ignore_events,
     should_stop: Callable[[], bool] = never_stop,
     threads: int = 0,
 ) -> EditResult:
@@ -93,7 +93,7 @@ def run(
     return EditResult(files=frames.files, folder=frames.folder, notes=tuple(notes), reports=tuple(reports))
 
 
-def _warn_about_axes(path: Path, report: EditReport, progress: Listener) -> None:
+def _warn_about_axes(path: Path, report: EditReport, progress: EventListener) -> None:
     """Warn if a mesh seems to have been rotated between export and import."""
     if report.axes != report.axes_usual:
         emit_warning(
@@ -104,7 +104,7 @@ def _warn_about_axes(path: Path, report: EditReport, progress: Listener) -> None
         )
 
 
-def _warn_about_torn(report: EditReport, progress: Listener) -> None:
+def _warn_about_torn(report: EditReport, progress: EventListener) -> None:
     if report.partial > report.snapped:
         emit_warning(
             progress,

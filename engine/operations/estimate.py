@@ -8,8 +8,8 @@ from typing import Annotated
 
 from pydantic import Field
 
-from octasplat.engine.core.events import Listener, ignore
-from octasplat.engine.dataset.image_sizes import Sizes
+from octasplat.engine.core.events import EventListener, ignore_events
+from octasplat.engine.dataset.image_sizes import ImageSizes
 from octasplat.engine.operations.base import Operation, Request, Result, never_stop
 from octasplat.engine.operations.reconstruct import ReconstructOptions
 from octasplat.engine.settings.fields import Positional, Spelling, Unit
@@ -46,7 +46,7 @@ class EstimateResult(Result):
         text: the same in words.
     """
 
-    photographs: tuple[Sizes, ...]
+    photographs: tuple[ImageSizes, ...]
     cpu_seconds: float
     seconds: float
     cores: int
@@ -65,7 +65,7 @@ class EstimateResult(Result):
 def run(
     request: EstimateRequest,
     *,
-    progress: Listener = ignore,
+    progress: EventListener = ignore_events,
     should_stop: Callable[[], bool] = never_stop,
     threads: int = 0,
 ) -> EstimateResult:
@@ -85,7 +85,7 @@ def run(
     return EstimateResult(photographs=tuple(sizes), **found.model_dump())
 
 
-def photograph_sizes(scene: Path) -> list[Sizes]:
+def photograph_sizes(scene: Path) -> list[ImageSizes]:
     """Return the sizes of the photographs in a folder, read from their headers.
 
     Raises:
@@ -109,7 +109,7 @@ def photograph_sizes(scene: Path) -> list[Sizes]:
             raise DatasetError(f"{path} cannot be read ({error}); replace or remove it.") from None
     if not counts:
         raise DatasetError(f"{folder} holds no photographs; name the folder that does.")
-    return [Sizes(width, height, count) for (width, height), count in counts.items()]
+    return [ImageSizes(width, height, count) for (width, height), count in counts.items()]
 
 
 OPERATION = Operation(

@@ -7,7 +7,7 @@ from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import BeforeValidator, Field, model_validator
 
-from octasplat.engine.core.events import Listener, ignore
+from octasplat.engine.core.events import EventListener, ignore_events
 from octasplat.engine.operations.base import Operation, Options, Request, Result, never_stop
 from octasplat.engine.settings import renamed_settings
 from octasplat.engine.settings.fields import DatasetFolder, Positional, Spelling
@@ -139,7 +139,7 @@ class EvaluateResult(Result):
 def run(
     request: EvaluateRequest,
     *,
-    progress: Listener = ignore,
+    progress: EventListener = ignore_events,
     should_stop: Callable[[], bool] = never_stop,
     threads: int = 0,
 ) -> EvaluateResult:
@@ -150,12 +150,12 @@ def run(
         DatasetError: the photographs cannot be used.
         OutputError: there is no scene yet, or other photographs of that name were measured before.
     """
-    from octasplat.engine.core.progress import stopping
+    from octasplat.engine.core.progress import stop_when_asked
     from octasplat.engine.evaluate import run_evaluation
-    from octasplat.engine.evaluate.summary import measured_summary, run_summary
+    from octasplat.engine.evaluate.summary import summarize_evaluation, summarize_run
     from octasplat.engine.runs.run_folder import photographs_folder
 
-    listener = stopping(progress, should_stop, "Stopped while evaluating.")
+    listener = stop_when_asked(progress, should_stop, "Stopped while evaluating.")
     if request.scales:
         return _measure_scales(request, listener, threads)
     on, dataset = request.other_dataset, request.dataset
@@ -167,10 +167,10 @@ def run(
         on=on,
         background=request.evaluation_background,
         threads=threads,
-        listener=listener,
+        progress=listener,
     )
     folder = metrics.parent
-    summary = measured_summary(metrics) if on is not None else run_summary(folder, _exports(folder))
+    summary = summarize_evaluation(metrics) if on is not None else summarize_run(folder, _exports(folder))
     pictures = [path for name in _PICTURES for path in sorted((folder / name).rglob("*.png"))]
     return EvaluateResult(
         files=(metrics, folder / _REPORT, *pictures),
@@ -181,7 +181,7 @@ def run(
     )
 
 
-def _measure_scales(request: EvaluateRequest, progress: Listener, threads: int) -> EvaluateResult:
+def _measure_scales(request: EvaluateRequest, progress: EventListener, threads: int) -> EvaluateResult:
     from octasplat.engine.evaluate.run_evaluation import SCALES, evaluate_scales
 
     found = evaluate_scales(

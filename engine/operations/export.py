@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 from pydantic import AfterValidator, BeforeValidator, Field, FiniteFloat, model_validator
 
-from octasplat.engine.core.errors import Cancelled, ExportFailed, SceneFileError
-from octasplat.engine.core.events import Listener, StageProgress, Warned, ignore
+from octasplat.engine.core.errors import CancelledError, ExportError, SceneFileError
+from octasplat.engine.core.events import EventListener, PhaseProgress, Warned, ignore_events
 from octasplat.engine.files.export_options import ExportChoices, ExportOptions, OctagonQ
 from octasplat.engine.files.registry import Exporter, exporter_for
 from octasplat.engine.operations.axes import Axis
@@ -167,7 +167,7 @@ class ExportResult(Result):
 def run(
     request: ExportRequest,
     *,
-    progress: Listener = ignore,
+    progress: EventListener = ignore_events,
     should_stop: Callable[[], bool] = never_stop,
     threads: int = 0,
 ) -> ExportResult:
@@ -202,16 +202,16 @@ def run(
 
     def step(done: int) -> None:
         if done < count and should_stop():  # after the last file there is nothing to stop
-            raise Cancelled("The export was stopped.")
+            raise CancelledError("The export was stopped.")
         if count > 1:  # one file needs no counting
-            progress(StageProgress("export", done, count))
+            progress(PhaseProgress("export", done, count))
 
     stop_if(should_stop)
     forms = _ExportPreparation(request, gaussians, lambda: step(0), progress, threads)
     files, failed = export_batch(request.files, forms.prepare, on_done=step, format=request.format)
     if failed is not None:
         remember_written("export", files)  # for the same command, once the others can be written
-        raise ExportFailed(failed)
+        raise ExportError(failed)
     return ExportResult(files=files)
 
 
@@ -223,7 +223,7 @@ class _ExportPreparation:
         request: ExportRequest,
         gaussians: "FlatGaussians",
         on_pass: Callable[[], None],
-        progress: Listener,
+        progress: EventListener,
         threads: int,
     ) -> None:
         self._request, self._gaussians = request, gaussians
@@ -278,7 +278,7 @@ class _ExportPreparation:
         import numpy as np
 
         from octasplat.engine.render.bake_colour import colours_along, with_constant_colour
-        from octasplat.engine.runs.baked_scene import PlainScene
+        from octasplat.engine.runs.baked_scene import BakedScene
         from octasplat.engine.runs.run_folder import is_run
 
         gaussians, source = self._gaussians, self._request.source
@@ -286,7 +286,7 @@ class _ExportPreparation:
         if colour == "constant" or gaussians.sh_degree == 0:
             return gaussians
         if colour == "cameras":
-            return PlainScene(
+            return BakedScene(
                 gaussians,
                 source if is_run(source) else None,
                 threads=self._threads,

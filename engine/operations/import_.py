@@ -6,7 +6,7 @@ from typing import Annotated
 
 from pydantic import BeforeValidator, Field, model_validator
 
-from octasplat.engine.core.events import Listener, ignore
+from octasplat.engine.core.events import EventListener, ignore_events
 from octasplat.engine.files.channel_columns import ChannelChoice
 from octasplat.engine.gaussians.flattening import ImportReport
 from octasplat.engine.operations.base import Operation, Options, Result, WritingRequest, never_stop, stop_if
@@ -96,7 +96,7 @@ class ImportResult(Result):
 def run(
     request: ImportRequest,
     *,
-    progress: Listener = ignore,
+    progress: EventListener = ignore_events,
     should_stop: Callable[[], bool] = never_stop,
     threads: int = 0,
 ) -> ImportResult:

@@ -9,8 +9,13 @@ from typing import Annotated, Any, ClassVar
 import numpy as np
 from pydantic import Field, InstanceOf
 
-from octasplat.engine.core.events import Listener, ignore
-from octasplat.engine.evaluate.scene_statistics import OPACITY_EDGES, QUANTILES, HitFacts, SceneFacts
+from octasplat.engine.core.events import EventListener, ignore_events
+from octasplat.engine.evaluate.scene_statistics import (
+    OPACITY_EDGES,
+    QUANTILES,
+    HitStatistics,
+    SceneStatistics,
+)
 from octasplat.engine.operations.axes import Axis, axis_named
 from octasplat.engine.operations.base import Operation, Options, Result, WritingRequest, never_stop, stop_if
 from octasplat.engine.settings import renamed_settings
@@ -65,8 +70,8 @@ class InfoResult(Result):
     size_bytes: int | None
     photographs: int | None
     up_world: tuple[float, float, float]
-    scene: InstanceOf[SceneFacts]
-    hits: InstanceOf[HitFacts]
+    scene: InstanceOf[SceneStatistics]
+    hits: InstanceOf[HitStatistics]
     picture_srgb: InstanceOf[np.ndarray] = Field(repr=False)
 
     def facts(self) -> dict[str, Any]:
@@ -123,7 +128,7 @@ class InfoResult(Result):
 def run(
     request: InfoRequest,
     *,
-    progress: Listener = ignore,
+    progress: EventListener = ignore_events,
     should_stop: Callable[[], bool] = never_stop,
     threads: int = 0,
 ) -> InfoResult:

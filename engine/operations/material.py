@@ -5,7 +5,7 @@ from typing import Annotated
 
 from pydantic import Field
 
-from octasplat.engine.core.events import Listener, ignore
+from octasplat.engine.core.events import EventListener, ignore_events
 from octasplat.engine.edit.edit_options import MaterialChange, Selection
 from octasplat.engine.operations.base import (
     Operation,
@@ -63,7 +63,7 @@ class MaterialResult(ScenesWritten):
 def run(
     request: MaterialRequest,
     *,
-    progress: Listener = ignore,
+    progress: EventListener = ignore_events,
     should_stop: Callable[[], bool] = never_stop,
     threads: int = 0,
 ) -> MaterialResult:

@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 from pydantic import Field, ValidationError
 
-from octasplat.engine.core.events import Listener, ignore
+from octasplat.engine.core.events import EventListener, ignore_events
 from octasplat.engine.operations.base import Operation, Options, Output, Request, Result, never_stop
 from octasplat.engine.runs.run_settings import RunSettings
 from octasplat.engine.settings import renamed_settings
-from octasplat.engine.settings.fields import ADVANCED, BASIC, PartOf, Positional, Shortcut, Spelling
-from octasplat.engine.settings.nested_options import merged
-from octasplat.engine.settings.refusals import SettingsRefused, refusals_of
+from octasplat.engine.settings.fields import ADVANCED, BASIC, PartialOf, Positional, Shortcut, Spelling
+from octasplat.engine.settings.nested_options import merge_options
+from octasplat.engine.settings.refusals import SettingsRefused, refusals_from
 
 if TYPE_CHECKING:
     from octasplat.engine.pipeline import OnStep
@@ -52,7 +52,7 @@ class ReconstructOptions(RunSettings, Options):
         None, description="Seed of everything random.  [default: 0]"
     )
     train: Annotated[
-        dict[str, Any], PartOf("octasplat.engine.train.config:TrainConfig"), Spelling(hidden=True)
+        dict[str, Any], PartialOf("octasplat.engine.train.config:TrainConfig"), Spelling(hidden=True)
     ] = Field(
         default_factory=dict,
         description="Settings of the training that are to be otherwise than the preset's.",
@@ -99,7 +99,7 @@ class ReconstructOptions(RunSettings, Options):
 
     def _training(self) -> dict[str, Any]:
         """Return the training's settings that the options name, nested."""
-        from octasplat.engine.train.config import FOR_SURFACE
+        from octasplat.engine.train.config import SURFACE_DEPTH_NORMAL_WEIGHT
 
         names = {name: info.metadata for name, info in ReconstructOptions.model_fields.items()}
         shortcuts: dict[str, Any] = {
@@ -109,8 +109,8 @@ class ReconstructOptions(RunSettings, Options):
             if isinstance(mark, Shortcut) and getattr(self, name) is not None
         }
         if self.for_surface:
-            shortcuts["loss"] = {"depth_normal": FOR_SURFACE}
-        return merged(self.train, shortcuts)
+            shortcuts["loss"] = {"depth_normal": SURFACE_DEPTH_NORMAL_WEIGHT}
+        return merge_options(self.train, shortcuts)
 
 
 class ReconstructRequest(ReconstructOptions, Request):
@@ -173,7 +173,7 @@ def options_from_json(asked: Mapping[str, Any]) -> ReconstructOptions:
     try:
         return ReconstructOptions.model_validate(dict(asked))
     except ValidationError as error:
-        raise SettingsRefused(refusals_of(error, ReconstructOptions)) from None
+        raise SettingsRefused(refusals_from(error, ReconstructOptions)) from None
 
 
 def run_config(request: ReconstructRequest) -> "ReconstructionConfig":
@@ -197,7 +197,7 @@ def run_config(request: ReconstructRequest) -> "ReconstructionConfig":
 def run(
     request: ReconstructRequest,
     *,
-    progress: Listener = ignore,
+    progress: EventListener = ignore_events,
     should_stop: Callable[[], bool] = never_stop,
     threads: int = 0,
     on_step: "OnStep | None" = None,
@@ -214,8 +214,8 @@ def run(
     Raises:
         OctasplatError: as :func:`octasplat.engine.pipeline.reconstruction` does.
     """
-    from octasplat.engine.core.progress import stopping
-    from octasplat.engine.evaluate.summary import run_summary
+    from octasplat.engine.core.progress import stop_when_asked
+    from octasplat.engine.evaluate.summary import summarize_run
     from octasplat.engine.pipeline import reconstruct
 
     config = run_config(request)
@@ -226,7 +226,7 @@ def run(
         config,
         resume=request.resume,
         threads=threads,
-        progress=stopping(progress, should_stop),
+        progress=stop_when_asked(progress, should_stop),
         should_stop=should_stop,
         on_step=on_step,
     )
@@ -236,7 +236,7 @@ def run(
         metrics=json.loads((output / _METRICS).read_text(encoding="utf-8")),
         scene=output / _SCENE,
         report=output / _REPORT,
-        summary=tuple(run_summary(output, config.exports)),
+        summary=tuple(summarize_run(output, config.exports)),
     )
 
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 from pydantic import Field, model_validator
 
-from octasplat.engine.core.events import Listener, Warned, ignore
+from octasplat.engine.core.events import EventListener, Warned, ignore_events
 from octasplat.engine.operations.axes import Axis, light_up
 from octasplat.engine.operations.base import Operation, never_stop
 from octasplat.engine.operations.render import RenderResult
@@ -136,7 +136,7 @@ class RelightResult(RenderResult):
 def run(
     request: RelightRequest,
     *,
-    progress: Listener = ignore,
+    progress: EventListener = ignore_events,
     should_stop: Callable[[], bool] = never_stop,
     threads: int = 0,
 ) -> RelightResult:
@@ -146,9 +146,9 @@ def run(
         ConfigError: the scene has no materials, or an environment cannot be used; or there are images of
             another render where this one is to go on.
         OctasplatError: the source cannot be read or the output not written.
-        Cancelled: it was asked to stop.
+        CancelledError: it was asked to stop.
     """
-    from octasplat.engine.core.progress import stopping
+    from octasplat.engine.core.progress import stop_when_asked
     from octasplat.engine.gaussians.materials import require_materials
     from octasplat.engine.operations.render_source import (
         picture_output,
@@ -165,7 +165,7 @@ def run(
     from octasplat.engine.runs.config import read_config
     from octasplat.engine.runs.run_folder import CONFIG, SCENE, is_run
 
-    tell = stopping(progress, should_stop)
+    tell = stop_when_asked(progress, should_stop)
     for told in request.unused():
         tell(Warned(told))
     of_run = is_run(request.source)

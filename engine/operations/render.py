@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field, model_validator
 
-from octasplat.engine.core.events import Listener, Warned, ignore
+from octasplat.engine.core.events import EventListener, Warned, ignore_events
 from octasplat.engine.operations.base import Operation, Result, never_stop
 from octasplat.engine.operations.render_options import PictureOptions, PictureRequest, check_layers
 from octasplat.engine.pathtracing.stage.model import Stage
@@ -151,7 +151,7 @@ class RenderResult(Result):
 def run(
     request: RenderRequest,
     *,
-    progress: Listener = ignore,
+    progress: EventListener = ignore_events,
     should_stop: Callable[[], bool] = never_stop,
     threads: int = 0,
 ) -> RenderResult:
@@ -160,9 +160,9 @@ def run(
     Raises:
         OctasplatError: the scene or the stage cannot be used, or the output not written; or there are images
             of another render where this one is to go on.
-        Cancelled: it was asked to stop.
+        CancelledError: it was asked to stop.
     """
-    from octasplat.engine.core.progress import stopping
+    from octasplat.engine.core.progress import stop_when_asked
     from octasplat.engine.operations.render_source import (
         picture_output,
         read_render_source,
@@ -172,7 +172,7 @@ def run(
     from octasplat.engine.render.shots import camera_shots
 
     told = "Stopped; the preview is as fine as it was." if request.preview else None
-    tell = stopping(progress, should_stop, told)
+    tell = stop_when_asked(progress, should_stop, told)
     for unused in request.unused():
         tell(Warned(unused))
     max_side = request.max_side or (PREVIEW_SIDE_PX if request.preview else None)
@@ -201,13 +201,13 @@ def _render_plain(
     cameras: "tuple[PinholeCamera, ...] | None",
     shots: "tuple[Shot, ...]",
     output: "RenderOutput",
-    progress: Listener,
+    progress: EventListener,
     threads: int,
 ) -> tuple[Path, ...]:
     from octasplat.engine.render.render_digest import render_digest
     from octasplat.engine.render.renderer import background_colour
     from octasplat.engine.render.shots import scene_render_fn
-    from octasplat.engine.shading.plain import PLAIN
+    from octasplat.engine.shading.plain import PLAIN_SHADING
     from octasplat.engine.trace.factory import make_tracer
 
     transparent = request.background == "transparent"
@@ -223,7 +223,11 @@ def _render_plain(
     tracer = make_tracer(source.settings, threads=threads, build_quality=2)
     tracer.build(source.gaussians)
     paint = scene_render_fn(
-        tracer, background, transparent=transparent, trained_rad=source.trained_rad, shading=learnt or PLAIN
+        tracer,
+        background,
+        transparent=transparent,
+        trained_rad=source.trained_rad,
+        shading=learnt or PLAIN_SHADING,
     )
     return output.write(shots, paint, kept, progress)
 
@@ -234,7 +238,7 @@ def _render_on_stage(
     cameras: "tuple[PinholeCamera, ...] | None",
     shots: "tuple[Shot, ...]",
     output: "RenderOutput",
-    progress: Listener,
+    progress: EventListener,
     threads: int,
 ) -> tuple[Path, ...]:
     from octasplat.engine.operations.render_source import stage_scene

@@ -234,7 +234,7 @@ class PictureRequest(PictureOptions, WritingRequest):
     def _complete(cls, values: Any) -> Any:
         if not isinstance(values, dict) or "output" not in values or "source" not in values:
             return values
-        given = renamed_settings.with_new_names((cls,), values)
+        given = renamed_settings.translate_names((cls,), values)
         given = {name: value for name, value in given.items() if value is not None}
         if "path_file" in given and "camera_path" not in given:
             given["camera_path"] = read_path_document(Path(given["path_file"]))

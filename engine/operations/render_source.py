@@ -8,8 +8,8 @@ import numpy as np
 from jaxtyping import Float32
 
 from octasplat.engine.core.errors import ConfigError, OutputError
-from octasplat.engine.core.events import Listener, Warned
-from octasplat.engine.core.relative_paths import normalised
+from octasplat.engine.core.events import EventListener, Warned
+from octasplat.engine.core.relative_paths import normalize_name
 from octasplat.engine.dataset.model import Viewpoints
 from octasplat.engine.dataset.views_file import SplitViewpoints
 from octasplat.engine.files import read_metadata
@@ -38,10 +38,10 @@ from octasplat.engine.runs.run_folder import (
     SCENE,
     is_run,
     run_background,
-    run_near_world,
+    run_min_view_distance,
     run_viewpoints,
 )
-from octasplat.engine.shading.background import LearntBackground
+from octasplat.engine.shading.background import LearnedBackground
 from octasplat.engine.trace.protocol import TraceSettings
 
 ANY_SIDE_PX = 1 << 30
@@ -71,7 +71,7 @@ class RenderSource:
     viewpoints: SplitViewpoints | None = None
     max_side: int | None = None
     trained_rad: float = 0.0
-    learnt: LearntBackground | None = None
+    learnt: LearnedBackground | None = None
     photographs: Viewpoints | None = None
 
     @property
@@ -84,7 +84,7 @@ class RenderSource:
 
 def read_render_source(
     source: Path,
-    progress: Listener,
+    progress: EventListener,
     *,
     dataset: Path | None = None,
     max_side: int | None = None,
@@ -123,7 +123,7 @@ def read_render_source(
     return RenderSource(
         read_gaussian_ply(source / SCENE)[0],
         config.train.trace,
-        run_near_world(source, viewpoints),
+        run_min_view_distance(source, viewpoints),
         config.evaluation_background,
         viewpoints,
         config.max_side,
@@ -174,13 +174,13 @@ def requested_views(request: PictureRequest, source: RenderSource) -> tuple[Shot
     if viewpoints is None:
         raise ConfigError(f"{request.source}: a file has no photographs; choose a turntable, or cameras.")
     if request.photographs is not None:
-        numbers = {normalised(view.name): number for number, view in enumerate(viewpoints.views)}
-        missing = [name for name in request.photographs if normalised(name) not in numbers]
+        numbers = {normalize_name(view.name): number for number, view in enumerate(viewpoints.views)}
+        missing = [name for name in request.photographs if normalize_name(name) not in numbers]
         if missing:
             raise ConfigError(f"{missing[0]}: the run has no photograph of this name.")
         return view_shots(
             viewpoints,
-            np.array([numbers[normalised(name)] for name in request.photographs]),
+            np.array([numbers[normalize_name(name)] for name in request.photographs]),
             source.near_world,
         )
     indices = {
@@ -221,7 +221,7 @@ def stage_scene(
     source: RenderSource,
     folder: Path,
     background_srgb: Float32[np.ndarray, "3"],
-    progress: Listener,
+    progress: EventListener,
     *,
     threads: int = 0,
 ) -> StageScene:
@@ -247,7 +247,7 @@ def stage_scene(
 
 
 def open_stage_scene(
-    source: Path, progress: Listener, *, dataset: Path | None = None, threads: int = 0
+    source: Path, progress: EventListener, *, dataset: Path | None = None, threads: int = 0
 ) -> StageScene:
     """Read a run or a file as the scene for a stage.
 

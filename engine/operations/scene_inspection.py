@@ -5,7 +5,12 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float32, Float64
 
-from octasplat.engine.evaluate.scene_statistics import HitFacts, SceneFacts, hit_facts, scene_facts
+from octasplat.engine.evaluate.scene_statistics import (
+    HitStatistics,
+    SceneStatistics,
+    hit_statistics,
+    scene_statistics,
+)
 from octasplat.engine.pathtracing.stage_scene import StageScene
 from octasplat.engine.render.renderer import render_rays
 from octasplat.engine.render.shots import turntable_cameras
@@ -27,8 +32,8 @@ class SceneInspection:
         photographs: how many; None of a file.
     """
 
-    scene: SceneFacts
-    hits: HitFacts
+    scene: SceneStatistics
+    hits: HitStatistics
     up_world: Float64[np.ndarray, "3"]
     picture_srgb: Float32[np.ndarray, "h w 3"]
     photographs: int | None
@@ -50,8 +55,8 @@ def inspect_scene(scene: StageScene, up_world: Float64[np.ndarray, "3"] | None) 
     tracer.build(scene.gaussians)
     picture = render_rays(tracer, image, scene.background_srgb)
     return SceneInspection(
-        scene_facts(scene.gaussians, table.up_world),
-        hit_facts(tracer, image),
+        scene_statistics(scene.gaussians, table.up_world),
+        hit_statistics(tracer, image),
         table.up_world,
         picture.rgb_srgb,
         None if scene.photographs is None else len(scene.photographs.views),

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 from pydantic import BaseModel
 
-from octasplat.engine.core.events import Listener, Noted, Warned
+from octasplat.engine.core.events import EventListener, Noted, Warned
 from octasplat.engine.edit.changed_run import check_new_run, write_changed_run
 from octasplat.engine.files import (
     ExportOptions,
@@ -23,11 +23,11 @@ from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.gaussians.scene_metadata import SceneMetadata
 from octasplat.engine.operations.base import SourceRequest
 from octasplat.engine.operations.written_files import check_targets
-from octasplat.engine.runs.run_folder import is_run, not_exported
+from octasplat.engine.runs.run_folder import is_run, unexported_parts
 from octasplat.engine.settings.fields import map_named_files
 
 
-def open_scene(path: Path, progress: Listener, *, drop_invalid: bool = False) -> FlatGaussians:
+def open_scene(path: Path, progress: EventListener, *, drop_invalid: bool = False) -> FlatGaussians:
     """Return the Gaussians of a file of any format or of a run's folder.
 
     Args:
@@ -40,12 +40,12 @@ def open_scene(path: Path, progress: Listener, *, drop_invalid: bool = False) ->
     """
     gaussians, report = read_scene(path, drop_invalid=drop_invalid)
     report_dropped_on_import(path, report, progress)
-    if is_run(path) and (left_out := not_exported(path)) is not None:
+    if is_run(path) and (left_out := unexported_parts(path)) is not None:
         progress(Warned(left_out))
     return gaussians
 
 
-def report_dropped_on_import(path: Path, report: ImportReport, progress: Listener) -> None:
+def report_dropped_on_import(path: Path, report: ImportReport, progress: EventListener) -> None:
     """Report what reading ``path`` dropped: warnings for what changes the look, notes for the rest."""
     if report.dropped:
         progress(Noted(f"{path}: {report.dropped:,} Gaussians without finite values were left out."))
@@ -93,7 +93,12 @@ def check_scenes(
 
 
 def write_scene(
-    gaussians: FlatGaussians, facts: SceneMetadata, target: Path, progress: Listener, *, warn: bool = True
+    gaussians: FlatGaussians,
+    facts: SceneMetadata,
+    target: Path,
+    progress: EventListener,
+    *,
+    warn: bool = True,
 ) -> str:
     """Write a scene in the format of its name; return a sentence about it.
 
@@ -161,7 +166,7 @@ def write_changed(
     source: Path,
     gaussians: FlatGaussians,
     output: Path,
-    progress: Listener,
+    progress: EventListener,
     *,
     note: Mapping[str, object],
     facts: SceneMetadata | None = None,

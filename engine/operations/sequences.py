@@ -5,7 +5,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 from octasplat.engine.core.errors import ConfigError
-from octasplat.engine.core.events import Listener, StageProgress
+from octasplat.engine.core.events import EventListener, PhaseProgress
 from octasplat.engine.core.writing import write_json
 from octasplat.engine.edit.changed_run import check_new_run
 from octasplat.engine.files import read_metadata
@@ -89,7 +89,7 @@ class SceneSequence:
         self.folder: Path | None = None
 
     def write(
-        self, number: int, gaussians: FlatGaussians, progress: Listener, note: Mapping[str, object]
+        self, number: int, gaussians: FlatGaussians, progress: EventListener, note: Mapping[str, object]
     ) -> str:
         """Write the scene of the mesh with this number; return a sentence about it."""
         target = self._targets[number]
@@ -101,10 +101,10 @@ class SceneSequence:
         self.files = (*self.files, target)
         return write_scene(gaussians, read_metadata(self._source), target, progress, warn=number == 0)
 
-    def tell(self, number: int, progress: Listener) -> None:
+    def tell(self, number: int, progress: EventListener) -> None:
         """Report that the scene of the mesh with this number is written, if there are several."""
         if len(self._targets) > 1:
-            progress(StageProgress("edit", number + 1, len(self._targets)))
+            progress(PhaseProgress("edit", number + 1, len(self._targets)))
 
     def write_report(
         self, meshes: Sequence[Mapping[str, object]], reports: Iterable[Mapping[str, object]]

@@ -7,7 +7,7 @@ from typing import ClassVar
 from pydantic import Field
 
 from octasplat.engine.core.errors import OutputError
-from octasplat.engine.core.events import Listener, ignore
+from octasplat.engine.core.events import EventListener, ignore_events
 from octasplat.engine.operations.axes import Axis, axis_named
 from octasplat.engine.operations.base import Operation, Options, Result, WritingRequest, never_stop, stop_if
 from octasplat.engine.operations.render_options import Point
@@ -60,7 +60,7 @@ class StageInitResult(Result):
 def run(
     request: StageInitRequest,
     *,
-    progress: Listener = ignore,
+    progress: EventListener = ignore_events,
     should_stop: Callable[[], bool] = never_stop,
     threads: int = 0,
 ) -> StageInitResult:

@@ -16,7 +16,7 @@ from pydantic import (
 )
 
 from octasplat.engine.core.errors import OutputError
-from octasplat.engine.core.events import Listener, ignore
+from octasplat.engine.core.events import EventListener, ignore_events
 from octasplat.engine.operations.axes import Axis, light_up
 from octasplat.engine.operations.base import Operation, Options, Result, WritingRequest, never_stop
 from octasplat.engine.settings import renamed_settings
@@ -109,7 +109,7 @@ class SurfaceOptions(ExtractionOptions, Options):
     def _with_presets(cls, given: Any) -> Any:
         if not isinstance(given, Mapping):
             return given
-        given = renamed_settings.with_new_names((cls,), given)
+        given = renamed_settings.translate_names((cls,), given)
         room = ROOM_DEFAULTS if _is_on(given.get("room", False)) else {}
         materials = MATERIAL_DEFAULTS if _is_on(given.get("materials", False)) else {}
         return {**room, **materials, **given}
@@ -212,7 +212,7 @@ class SurfaceResult(Result):
 def run(
     request: SurfaceRequest,
     *,
-    progress: Listener = ignore,
+    progress: EventListener = ignore_events,
     should_stop: Callable[[], bool] = never_stop,
     threads: int = 0,
 ) -> SurfaceResult:
@@ -223,7 +223,7 @@ def run(
             too large.
         OutputError: the source has no scene yet, or the place of the output cannot be used.
         SceneFileError: the scene cannot be read, or the mesh not be written.
-        Cancelled: stopped as asked; nothing was written.
+        CancelledError: stopped as asked; nothing was written.
     """
     from octasplat.engine.files import check_surface_path, surface_files, write_surface
     from octasplat.engine.gaussians.materials import require_materials
@@ -282,7 +282,7 @@ def run(
     return SurfaceResult(files=files, folder=output.parent, levels=levels, environment=environment)
 
 
-def _photographs(request: SurfaceRequest, threads: int, progress: Listener) -> "tuple[Picture, ...]":
+def _photographs(request: SurfaceRequest, threads: int, progress: EventListener) -> "tuple[Picture, ...]":
     from octasplat.engine.operations.surface_inputs import training_photographs
 
     if not request.fit:
@@ -313,9 +313,9 @@ def _light_to_copy(source: Path, output: Path) -> Path | None:
     Raises:
         OutputError: there is another one.
     """
-    from octasplat.engine.runs.run_folder import ENVIRONMENT, is_run
+    from octasplat.engine.runs.run_folder import ENVIRONMENT_HDR, is_run
 
-    light, place = source / ENVIRONMENT, output.with_name(ENVIRONMENT)
+    light, place = source / ENVIRONMENT_HDR, output.with_name(ENVIRONMENT_HDR)
     if not (is_run(source) and light.exists()):
         return None
     if not place.exists():
@@ -329,11 +329,11 @@ def _light_to_copy(source: Path, output: Path) -> Path | None:
 
 def _copy_light(light: Path, output: Path) -> Path:
     """Copy the environment beside the output; return its new place."""
-    from octasplat.engine.core.writing import replacing
+    from octasplat.engine.core.writing import atomic_replace
 
     place = output.with_name(light.name)
     try:
-        with replacing(place) as temporary:
+        with atomic_replace(place) as temporary:
             shutil.copyfile(light, temporary)
     except OSError as error:
         raise OutputError(f"{place} cannot be written ({error.strerror or error}).") from None

@@ -8,7 +8,7 @@ from jaxtyping import UInt8
 
 from octasplat.engine.core.color import to_bytes
 from octasplat.engine.core.errors import DatasetError
-from octasplat.engine.core.events import Listener, Noted, Warned
+from octasplat.engine.core.events import EventListener, Noted, Warned
 from octasplat.engine.core.rays import ImageRays
 from octasplat.engine.dataset import Dataset, load_dataset_model
 from octasplat.engine.dataset.views_file import ViewsRecord, read_views
@@ -19,15 +19,15 @@ from octasplat.engine.runs.config import read_config
 from octasplat.engine.runs.run_folder import (
     CONFIG,
     VIEWS,
-    found_model,
+    found_model_folder,
     is_run,
-    open_photographs,
+    open_run_dataset,
     photographs_folder,
     run_exposures,
-    run_near_world,
+    run_min_view_distance,
     run_viewpoints,
 )
-from octasplat.engine.shading.exposure import Exposures
+from octasplat.engine.shading.exposure import ExposureModel
 from octasplat.engine.surface.colour_fit import Picture
 from octasplat.engine.surface.depth_cameras import cameras_around, photograph_cameras
 from octasplat.engine.trace.protocol import TraceSettings
@@ -52,7 +52,7 @@ def depth_cameras(
     if is_run(source) and (source / CONFIG).exists():
         seen = run_viewpoints(source, scene=dataset)
         settings = read_config(source / CONFIG).train.trace
-        near_world = run_near_world(source, seen)
+        near_world = run_min_view_distance(source, seen)
         return photograph_cameras(seen, seen.train_indices, side_px, near_world), settings
     facts = read_metadata(source)
     settings = TraceSettings(flip_normal_cos=facts.turned_beyond)
@@ -64,7 +64,7 @@ def depth_cameras(
 
 
 def training_photographs(
-    source: Path, dataset: Path | None, threads: int, progress: Listener, *, copy: Path | None = None
+    source: Path, dataset: Path | None, threads: int, progress: EventListener, *, copy: Path | None = None
 ) -> tuple[Picture, ...]:
     """Return the training photographs of a run, normalised to the scene's exposure.
 
@@ -90,13 +90,13 @@ def training_photographs(
         return ()
     instead = "Colours are those that the scene shows, not those of photographs"
     try:
-        folder, model = photographs_folder(source, dataset or copy), found_model(source)
+        folder, model = photographs_folder(source, dataset or copy), found_model_folder(source)
     except DatasetError as error:
         progress(Noted(f"{instead}. {error}"))
         return ()
     try:
         accept = partial(_check_same_poses, source, folder)
-        opened = open_photographs(
+        opened = open_run_dataset(
             folder, source, config, threads, progress, model_folder=model, accept=accept
         )
     except DatasetError as error:
@@ -106,7 +106,7 @@ def training_photographs(
         return ()
     exposures = None
     if (known := run_exposures(source)) is not None:
-        exposures = Exposures.known([view.name for view in opened.views], known)
+        exposures = ExposureModel.from_known([view.name for view in opened.views], known)
     return tuple(partial(_photograph, opened, exposures, index) for index in opened.train_indices.tolist())
 
 
@@ -124,10 +124,10 @@ def _check_same_poses(source: Path, folder: Path, found: ViewsRecord) -> None:
 
 
 def _photograph(
-    dataset: Dataset, exposures: Exposures | None, index: int
+    dataset: Dataset, exposures: ExposureModel | None, index: int
 ) -> tuple[ImageRays, UInt8[np.ndarray, "h w 4"]]:
     rgb, alpha, weight = dataset.view_image(index)
     if exposures is not None:
-        rgb = exposures.undone(rgb, index)
+        rgb = exposures.remove_exposure(rgb, index)
     solid = (alpha * weight)[..., None]
     return dataset.view_rays(index), to_bytes(np.concatenate([rgb * solid, solid], axis=2))

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float64
 from pydantic import Field, FiniteFloat, model_validator
 
-from octasplat.engine.core.events import Listener, ignore
+from octasplat.engine.core.events import EventListener, ignore_events
 from octasplat.engine.operations.axes import Axis
 from octasplat.engine.operations.base import (
     Operation,
@@ -104,7 +104,7 @@ class TransformResult(ScenesWritten):
 def run(
     request: TransformRequest,
     *,
-    progress: Listener = ignore,
+    progress: EventListener = ignore_events,
     should_stop: Callable[[], bool] = never_stop,
     threads: int = 0,
 ) -> TransformResult:

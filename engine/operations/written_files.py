@@ -18,8 +18,8 @@ from pathlib import Path
 import platformdirs
 
 from octasplat.engine.core.errors import ConfigError, OutputError
-from octasplat.engine.dataset.results_among import is_results
-from octasplat.engine.runs.run_folder import CONFIG, run_scene
+from octasplat.engine.dataset.results_among import is_run_folder
+from octasplat.engine.runs.run_folder import CONFIG, dataset_folder_of_run
 
 RECORD_VARIABLE = "OCTASPLAT_WRITTEN"
 """Names another file for the database."""
@@ -109,7 +109,7 @@ class _Read:
             return self._files[place]
         for folder in self._folders:
             parents = place.parents[: len(place.parts) - len(folder.parts)]
-            if place.is_relative_to(folder) and not any(map(is_results, parents[:-1])):
+            if place.is_relative_to(folder) and not any(map(is_run_folder, parents[:-1])):
                 return f" in {folder}"
         return None
 
@@ -117,7 +117,7 @@ class _Read:
         self._files |= {(run / name).resolve(): f" in {run}" for name in _RUN_FILES}
         self._folders += [(run / name).resolve() for name in _RUN_FOLDERS]
         with suppress(ConfigError):  # it holds another config.json
-            photographs = run_scene(run)
+            photographs = dataset_folder_of_run(run)
             if photographs.is_absolute() and photographs.is_dir():
                 self._add_dataset(photographs.resolve(), whole=False)
 

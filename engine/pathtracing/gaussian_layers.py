@@ -54,7 +54,7 @@ class GaussianLayers:
 
     def trace(self, rays: RayBatch, t_max: Float32[np.ndarray, " r"]) -> TraceResult:
         """Return the Gaussians' radiance and transmittance along rays up to a distance each."""
-        seen = self.tracer.trace(rays.up_to(t_max))
+        seen = self.tracer.trace(rays.with_t_max(t_max))
         if self.tracer.settings.flip_normal_cos > 0:
             normals = face_viewer(seen.normal_world, rays.directions_world)
             seen.normal_world = normals.normal_world.astype(np.float32)

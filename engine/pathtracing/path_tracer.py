@@ -286,7 +286,7 @@ class PathTracer:
                 paths.origins_world if depth == 0 else paths.origins_world[active],
                 paths.directions_world if depth == 0 else paths.directions_world[active],
                 t_min if depth == 0 else 0.0,
-                t_viewer=0.0 if depth == 0 else paths.t_view_origin[active],
+                t_view_origin=0.0 if depth == 0 else paths.t_view_origin[active],
             )
             hits = meshes.triangles.closest(rays)
             shadows = allocate_shadow_rays(len(active))

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from octasplat.engine.core.color import srgb_to_linear
-from octasplat.engine.core.events import Listener
-from octasplat.engine.core.progress import counted_stage
+from octasplat.engine.core.events import EventListener
+from octasplat.engine.core.progress import counted_phase
 from octasplat.engine.pathtracing.compile_meshes import CompiledMeshes, check_outside_glass, compile_meshes
 from octasplat.engine.pathtracing.film import StageImage
 from octasplat.engine.pathtracing.gaussian_layers import build_gaussian_layers
@@ -37,13 +37,13 @@ class StageRenderer:
         """Return the function that renders a shot to a file."""
         return stage_render_fn(self.tracer, self.settings)
 
-    def preview(self, shot: Shot, output: Path, progress: Listener) -> None:
+    def preview(self, shot: Shot, output: Path, progress: EventListener) -> None:
         """Render one shot to a file, progressively.
 
         Raises:
             OutputError: it cannot be written.
         """
-        with counted_stage("render", progress) as count:
+        with counted_phase("render", progress) as count:
             render_preview(self.tracer, self.settings, shot, output, lambda done, of: count(0, 1, done / of))
             count(1, 1)
 

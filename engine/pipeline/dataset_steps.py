@@ -1,6 +1,6 @@
 """Steps before the training: pose search, and opening of the dataset."""
 
-from octasplat.engine.core.progress import stage
+from octasplat.engine.core.progress import phase
 from octasplat.engine.dataset import Dataset, write_held_out
 from octasplat.engine.dataset.views_file import write_views
 from octasplat.engine.pipeline.output_folder import write_config
@@ -10,11 +10,11 @@ from octasplat.engine.runs.run_folder import (
     CONFIG,
     HELD_OUT,
     VIEWS,
-    found_model,
-    open_photographs,
-    run_scene,
+    dataset_folder_of_run,
+    found_model_folder,
+    open_run_dataset,
 )
-from octasplat.engine.runs.run_poses import find_missing_poses, free_lenses, place_misfits
+from octasplat.engine.runs.run_poses import estimate_principal_points, find_missing_poses, repair_run_poses
 from octasplat.engine.train.sampling.batches import BatchSource
 
 
@@ -50,7 +50,7 @@ class OpenDataset:
             write_views(output / VIEWS, run.dataset.views_record)
         held_out = [run.dataset.views[i].name for i in run.dataset.test_indices]
         write_held_out(output / HELD_OUT, held_out)
-        if run_scene(output) != run.scene.resolve() or read_config(output / CONFIG) != run.config:
+        if dataset_folder_of_run(output) != run.scene.resolve() or read_config(output / CONFIG) != run.config:
             # The photographs have moved, or other files are wanted.
             write_config(run.scene, output, run.config)
 
@@ -59,19 +59,19 @@ def _repair_poses(run: ReconstructionRun) -> None:
     """Repair poses and lenses that contradict the photographs; reload the model if it changed."""
     if place_misfits(run.dataset, run.output, run.config, run.threads, run.progress, run.should_stop):
         run.dataset = _load_dataset(run)
-    if free_lenses(run.dataset, run.output, run.config, run.progress, run.should_stop):
+    if estimate_principal_points(run.dataset, run.output, run.config, run.progress, run.should_stop):
         run.dataset = _load_dataset(run)
 
 
 def _load_dataset(run: ReconstructionRun) -> Dataset:
-    with stage("load", run.progress):
-        dataset = open_photographs(
+    with phase("load", run.progress):
+        dataset = open_run_dataset(
             run.scene,
             run.output,
             run.config,
             run.threads,
             run.progress,
-            model_folder=found_model(run.output),
+            model_folder=found_model_folder(run.output),
             accept=run.accept,
         )
         BatchSource(dataset, run.config.train)  # refuses settings that do not suit the photographs

@@ -6,8 +6,8 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from octasplat.engine.core.errors import ConfigError, DatasetError, OutputError
-from octasplat.engine.core.relative_paths import normalised
-from octasplat.engine.core.versions import versions
+from octasplat.engine.core.relative_paths import normalize_name
+from octasplat.engine.core.versions import package_versions
 from octasplat.engine.core.writing import write_json
 from octasplat.engine.dataset.colmap_model import has_colmap_model
 from octasplat.engine.poses.find_poses import read_pose_record
@@ -99,7 +99,7 @@ def write_config(scene: Path, output: Path, config: ReconstructionConfig) -> Non
     content = {
         "scene": str(scene.resolve()),
         "reconstruction": config.model_dump(mode="json"),
-        "versions": versions(),
+        "versions": package_versions(),
     }
     write_json(output / CONFIG, content)
 
@@ -116,6 +116,6 @@ def _check_settings(scene: Path, output: Path, config: ReconstructionConfig) -> 
 
 
 def _comparable(config: ReconstructionConfig, is_posed: bool) -> ReconstructionConfig:
-    """Return settings normalised, so that equal meanings compare equal."""
-    held_out = None if config.held_out is None else tuple(sorted(map(normalised, config.held_out)))
+    """Return settings normalize_name, so that equal meanings compare equal."""
+    held_out = None if config.held_out is None else tuple(sorted(map(normalize_name, config.held_out)))
     return config.with_poses_decided(is_posed).model_copy(update={"held_out": held_out})

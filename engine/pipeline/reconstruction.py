@@ -5,7 +5,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from octasplat.engine.core.errors import CheckpointError
-from octasplat.engine.core.events import JsonLinesListener, Listener, RunFinished, broadcast
+from octasplat.engine.core.events import EventListener, JsonLinesWriter, RunFinished, broadcast
 from octasplat.engine.core.threads import use_threads
 from octasplat.engine.dataset.views_file import ViewsRecord, read_views
 from octasplat.engine.files import check_writable
@@ -30,7 +30,7 @@ def reconstruct(
     *,
     resume: bool = False,
     threads: int = 0,
-    progress: Listener = lambda _event: None,
+    progress: EventListener = lambda _event: None,
     should_stop: Callable[[], bool] = lambda: False,
     on_step: OnStep | None = None,
 ) -> Path:
@@ -60,7 +60,7 @@ def reconstruct(
         CheckpointError: with ``resume``, other photographs or another model than the run's.
         TrainingFailure: training collapsed.
         ExportFailed: some of ``exports`` could not be written; all the rest is there.
-        Cancelled: stopped as asked.
+        CancelledError: stopped as asked.
     """
     if not (output / SCENE).exists():
         check_writable(config.exports)
@@ -79,7 +79,7 @@ def _run_all_steps(run: ReconstructionRun, *, is_new: bool, is_made: bool) -> No
     """Execute all steps of a run whose folder is claimed."""
     began, output = time.perf_counter(), run.output
     recorded = read_views(output / VIEWS) if (output / VIEWS).exists() else None
-    events = JsonLinesListener(output / EVENTS, hold=recorded is not None)
+    events = JsonLinesWriter(output / EVENTS, hold=recorded is not None)
     tell = broadcast([events, run.progress])
     run.progress, run.recorded = tell, recorded
     if recorded is not None:
@@ -101,7 +101,7 @@ def _result_names(output: Path) -> tuple[str, ...]:
 
 
 def _require_same_dataset(
-    recorded: ViewsRecord, scene: Path, output: Path, events: JsonLinesListener
+    recorded: ViewsRecord, scene: Path, output: Path, events: JsonLinesWriter
 ) -> Callable[[ViewsRecord], None]:
     """Return a check that a run resumes with its own photographs only; nothing is written before it."""
 

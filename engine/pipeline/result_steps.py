@@ -1,15 +1,15 @@
 """Steps after the training: evaluation, and export to other formats."""
 
-from octasplat.engine.core.errors import ExportFailed
-from octasplat.engine.core.events import StageProgress, Warned
-from octasplat.engine.core.progress import stage
+from octasplat.engine.core.errors import ExportError
+from octasplat.engine.core.events import PhaseProgress, Warned
+from octasplat.engine.core.progress import phase
 from octasplat.engine.evaluate.run_evaluation import measure_run
 from octasplat.engine.files import ExportOptions, dropped_on_export, read_metadata
 from octasplat.engine.files.export_batch import export_batch, targets_with_known_format
 from octasplat.engine.files.gaussian_ply import read_gaussian_ply
 from octasplat.engine.pipeline.run import ReconstructionRun
-from octasplat.engine.runs.baked_scene import PlainScene
-from octasplat.engine.runs.run_folder import METRICS, REPORT, SCENE, not_exported
+from octasplat.engine.runs.baked_scene import BakedScene
+from octasplat.engine.runs.run_folder import METRICS, REPORT, SCENE, unexported_parts
 
 
 class EvaluateStep:
@@ -23,7 +23,7 @@ class EvaluateStep:
 
     def __call__(self, run: ReconstructionRun) -> None:
         """Measure the views."""
-        with stage("evaluate", run.progress, len(run.dataset.test_indices)):
+        with phase("evaluate", run.progress, len(run.dataset.test_indices)):
             measure_run(run.dataset, run.output, run.config, run.threads, run.progress)
 
 
@@ -42,25 +42,25 @@ class ExportStep:
         Raises:
             ExportFailed: some could not be written.
         """
-        with stage("export", run.progress, len(run.config.exports)):
+        with phase("export", run.progress, len(run.config.exports)):
             missing = [name for name in run.config.exports if not (run.output / name).exists()]
             failed = _export(run, missing) if missing else None
         if failed is not None:
-            raise ExportFailed(f"{failed} Everything else is there.")
+            raise ExportError(f"{failed} Everything else is there.")
 
 
 def _export(run: ReconstructionRun, names: list[str]) -> str | None:
     """Write files; return which could not be written, and why."""
     output, progress = run.output, run.progress
     gaussians, _ = read_gaussian_ply(output / SCENE)
-    if (left_out := not_exported(output)) is not None:
+    if (left_out := unexported_parts(output)) is not None:
         progress(Warned(left_out))
     options = ExportOptions(q=run.config.train.trace.q, facts=read_metadata(output))
-    plain = PlainScene(
+    plain = BakedScene(
         gaussians,
         output,
         threads=run.threads,
-        on_pass=lambda _done, _total: progress(StageProgress("export", 0, len(names))),
+        on_pass=lambda _done, _total: progress(PhaseProgress("export", 0, len(names))),
         on_unknown=lambda text: progress(Warned(text)),
     )
     targets = [output / name for name in names]
@@ -69,6 +69,6 @@ def _export(run: ReconstructionRun, names: list[str]) -> str | None:
     _, failed = export_batch(
         targets,
         lambda exporter: (gaussians if exporter.holds_harmonics else plain.gaussians, options),
-        on_done=lambda done: progress(StageProgress("export", done, len(names))),
+        on_done=lambda done: progress(PhaseProgress("export", done, len(names))),
     )
     return failed

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol, runtime_checkable
 
-from octasplat.engine.core.errors import Cancelled, ExportFailed
-from octasplat.engine.core.events import Listener
+from octasplat.engine.core.errors import CancelledError, ExportError
+from octasplat.engine.core.events import EventListener
 from octasplat.engine.dataset import Dataset
 from octasplat.engine.dataset.views_file import ViewsRecord
 from octasplat.engine.runs.config import ReconstructionConfig
@@ -39,7 +39,7 @@ class ReconstructionRun:
     output: Path
     config: ReconstructionConfig
     threads: int
-    progress: Listener
+    progress: EventListener
     should_stop: Callable[[], bool]
     on_step: OnStep | None = None
     recorded: ViewsRecord | None = None
@@ -84,10 +84,10 @@ def run_steps(steps: Sequence[Step], run: ReconstructionRun) -> None:
         try:
             if not step.is_done(run):
                 step(run)
-        except Cancelled:
+        except CancelledError:
             raise
         except Exception:
             if not step.is_needed_later:
-                with suppress(ExportFailed):
+                with suppress(ExportError):
                     run_steps(steps[place + 1 :], run)
             raise

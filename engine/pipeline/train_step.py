@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float64
 
-from octasplat.engine.core.events import Listener, Warned
-from octasplat.engine.core.progress import StageClock, stage
+from octasplat.engine.core.events import EventListener, Warned
+from octasplat.engine.core.progress import PhaseClock, phase
 from octasplat.engine.core.threads import use_threads
 from octasplat.engine.core.writing import write_json
 from octasplat.engine.dataset import Dataset
@@ -24,23 +24,23 @@ from octasplat.engine.runs.config import ReconstructionConfig
 from octasplat.engine.runs.run_folder import (
     BACKGROUND,
     CHECKPOINTS,
-    ENVIRONMENT,
-    EXACT_ENVIRONMENT,
+    ENVIRONMENT_EXR,
+    ENVIRONMENT_HDR,
     PLAN,
     SCENE,
     TRAINING,
 )
 from octasplat.engine.shading.protocol import ShadingModel
 from octasplat.engine.train.config import TrainConfig, iteration_count
-from octasplat.engine.train.initialization.first_state import first_state
-from octasplat.engine.train.loop.checkpoint import newest_state
+from octasplat.engine.train.initialization.first_state import initial_scene
+from octasplat.engine.train.loop.checkpoint import load_latest_checkpoint
 from octasplat.engine.train.loop.fingerprint import run_fingerprint
-from octasplat.engine.train.loop.floors import ScaleFloor
+from octasplat.engine.train.loop.floors import MinScale
 from octasplat.engine.train.loop.time_budget import make_plan, read_plan, write_plan
 from octasplat.engine.train.loop.trainer import Trainer
-from octasplat.engine.train.sampling.shown import shown_share
-from octasplat.engine.train.shading_factory import background_of, deferred_of, exposures_of
-from octasplat.engine.train.views.exposure_changes import with_exposure_decided
+from octasplat.engine.train.sampling.shown import valid_pixel_fraction
+from octasplat.engine.train.shading_factory import find_background, find_deferred, find_exposures
+from octasplat.engine.train.views.exposure_changes import resolve_exposure
 
 MIN_REFLECTIVE_SHARE = 0.01
 """Share of the surface that must reflect for materials and the environment to be more than guesses."""
@@ -60,8 +60,8 @@ class TrainStep:
         dataset, config = run.dataset, run.config
         steps = 0
         if not config.minutes:
-            steps = iteration_count(config.train, dataset.train_pixel_count, shown_share(dataset))
-        with stage("train", run.progress, steps) as clock:
+            steps = iteration_count(config.train, dataset.train_pixel_count, valid_pixel_fraction(dataset))
+        with phase("train", run.progress, steps) as clock:
             gaussians = _train(run, clock)
             facts = SceneMetadata(
                 near_world=dataset.near_world,
@@ -71,7 +71,7 @@ class TrainStep:
             write_gaussian_ply(gaussians, run.output / SCENE, facts=facts)
 
 
-def _train(run: ReconstructionRun, clock: StageClock) -> FlatGaussians:
+def _train(run: ReconstructionRun, clock: PhaseClock) -> FlatGaussians:
     config = _plan_settings(run.dataset, run.output, run.config, run.threads, run.should_stop, clock)
     nearest_world = camera_clearances(run.dataset.viewpoints, run.dataset.points)
     trainer = _trainer(run, config, nearest_world, clock)
@@ -87,15 +87,15 @@ def _trainer(
     run: ReconstructionRun,
     config: TrainConfig,
     nearest_world: Float64[np.ndarray, " views"],
-    clock: StageClock,
+    clock: PhaseClock,
 ) -> Trainer:
     """Return the training from its start, or from its newest checkpoint."""
     dataset, progress, folder = run.dataset, run.progress, run.output / CHECKPOINTS
-    config, exposure_changes = with_exposure_decided(config, dataset)
+    config, exposure_changes = resolve_exposure(config, dataset)
     fingerprint = run_fingerprint(dataset, config)
-    state = newest_state(folder, fingerprint, progress)
+    state = load_latest_checkpoint(folder, fingerprint, progress)
     if state is None:
-        state = first_state(dataset, config, threads=use_threads(run.threads))
+        state = initial_scene(dataset, config, threads=use_threads(run.threads))
         if exposure_changes is not None:
             progress(Warned(f"{exposure_changes} That is learnt; exposure=false leaves it out."))
         state.seconds = clock.seconds()
@@ -111,13 +111,13 @@ def _trainer(
         state,
         folder=folder,
         fingerprint=fingerprint,
-        listener=progress,
+        progress=progress,
         threads=run.threads,
         should_stop=run.should_stop,
         scale_floor=_scale_floor(dataset, config),
-        near_zones=zones if config.camera_clearance > 0 else None,
-        seen_space=seen if config.materials.clears_unseen else None,
-        onlooker=None
+        camera_clearance=zones if config.camera_clearance > 0 else None,
+        view_frusta=seen if config.materials.prunes_unseen else None,
+        on_step=None
         if (on_step := run.on_step) is None
         else lambda done, tracer: on_step(done, dataset, tracer, trainer.shading),
     )
@@ -125,11 +125,11 @@ def _trainer(
 
 
 def _write_learnt_light(
-    shading: ShadingModel, gaussians: FlatGaussians, output: Path, progress: Listener
+    shading: ShadingModel, gaussians: FlatGaussians, output: Path, progress: EventListener
 ) -> None:
     """Write the learnt environment and background, if there are any."""
-    if (deferred := deferred_of(shading)) is not None:
-        for name in (EXACT_ENVIRONMENT, ENVIRONMENT):
+    if (deferred := find_deferred(shading)) is not None:
+        for name in (ENVIRONMENT_EXR, ENVIRONMENT_HDR):
             write_environment(output / name, deferred.light.radiance_linear)
         if reflective_fraction(gaussians) < MIN_REFLECTIVE_SHARE:
             progress(
@@ -138,7 +138,7 @@ def _write_learnt_light(
                     "environment are guesses, and relighting will show it."
                 )
             )
-    if (background := background_of(shading)) is not None:
+    if (background := find_background(shading)) is not None:
         write_background(output / BACKGROUND, background.rgb_srgb)
 
 
@@ -146,34 +146,34 @@ def _write_training_record(
     trainer: Trainer,
     dataset: Dataset,
     nearest_world: Float64[np.ndarray, " views"],
-    clock: StageClock,
+    clock: PhaseClock,
     output: Path,
     *,
     keeps_near_free: bool,
 ) -> None:
     """Write the facts on a finished training that later steps and commands need."""
     record: dict[str, object] = {"seconds": clock.stop(), "iterations": trainer.state.iteration}
-    if trainer.schedule.hastened_after is not None:
-        record["planned_iterations"] = trainer.schedule.planned
+    if trainer.schedule.early_stop_at is not None:
+        record["planned_iterations"] = trainer.schedule.planned_iterations
     if trainer.views is not None:
         record["training_views"] = trainer.views.as_dict()
     if trainer.poses is not None:
         record["poses"] = trainer.poses.as_dict()
-    if (exposures := exposures_of(trainer.shading)) is not None:
+    if (exposures := find_exposures(trainer.shading)) is not None:
         record["exposures"] = exposures.as_dict([view.name for view in dataset.views])
     if keeps_near_free:
-        record["taken_near"] = trainer.state.taken_near
+        record["taken_near"] = trainer.state.pruned_near_cameras
     distances = dict(zip((view.name for view in dataset.views), nearest_world.tolist(), strict=True))
     record["nearest_world"] = {name: distance for name, distance in distances.items() if distance > 0}
     write_json(output / TRAINING, record)
 
 
-def _scale_floor(dataset: Dataset, config: TrainConfig) -> ScaleFloor | None:
+def _scale_floor(dataset: Dataset, config: TrainConfig) -> MinScale | None:
     if config.min_scale_px == 0:
         return None
     pixel_rad = training_pixel_angle(dataset.viewpoints)
     origins = np.stack([dataset.views[i].origin_world for i in dataset.train_indices.tolist()])
-    return ScaleFloor(origins, config.min_scale_px * pixel_rad)
+    return MinScale(origins, config.min_scale_px * pixel_rad)
 
 
 def _plan_settings(
@@ -182,15 +182,15 @@ def _plan_settings(
     settings: ReconstructionConfig,
     threads: int,
     should_stop: Callable[[], bool],
-    clock: StageClock,
+    clock: PhaseClock,
 ) -> TrainConfig:
     """Return the training's settings; those chosen by the time budget are recorded the first time."""
     config = settings.train
     if settings.minutes is None:
         return config
     if not (output / PLAN).exists():
-        first = first_state(dataset, config, threads=use_threads(threads)).gaussians
+        first = initial_scene(dataset, config, threads=use_threads(threads)).gaussians
         left = 60 * settings.minutes - 2 * clock.seconds()  # the first Gaussians are made once more
         plan = make_plan(dataset, config, first, seconds=left, threads=threads, should_stop=should_stop)
         write_plan(output / PLAN, plan)
-    return read_plan(output / PLAN).applied(config)
+    return read_plan(output / PLAN).apply_to(config)

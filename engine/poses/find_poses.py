@@ -13,8 +13,15 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any
 
-from octasplat.engine.core.errors import Cancelled, DatasetError, PosesCrashed
-from octasplat.engine.core.events import Event, Listener, StageProgress, StageStarted, event_from, ignore
+from octasplat.engine.core.errors import CancelledError, ColmapCrashError, DatasetError
+from octasplat.engine.core.events import (
+    Event,
+    EventListener,
+    PhaseProgress,
+    PhaseStarted,
+    ignore_events,
+    parse_event,
+)
 from octasplat.engine.core.isolated_python import python_command
 from octasplat.engine.core.writing import write_json
 from octasplat.engine.poses.config import (
@@ -39,7 +46,7 @@ def find_poses(
     *,
     config: PosesConfig = DEFAULT_CONFIG,
     threads: int = 0,
-    progress: Listener = ignore,
+    progress: EventListener = ignore_events,
     should_stop: Callable[[], bool] = lambda: False,
 ) -> None:
     """Find where photographs were taken, and a sparse point cloud.
@@ -62,7 +69,7 @@ def find_poses(
         DatasetError: too few photographs, or they do not fit together; the text says what to do. Also if the
             result that is there is of other photographs.
         PosesCrashed: COLMAP died.
-        Cancelled: stopped as asked.
+        CancelledError: stopped as asked.
     """
     names = photographs_in(images)
     sha256 = photographs_sha256(images, names)
@@ -91,7 +98,7 @@ def repair_poses(
     *,
     config: PosesConfig = DEFAULT_CONFIG,
     threads: int = 0,
-    progress: Listener = ignore,
+    progress: EventListener = ignore_events,
     should_stop: Callable[[], bool] = lambda: False,
 ) -> tuple[str, ...]:
     """Move photographs of a model that do not stand where their matches with the others say.
@@ -116,7 +123,7 @@ def repair_poses(
     Raises:
         DatasetError: COLMAP refuses to work with the photographs or the model.
         PosesCrashed: COLMAP died.
-        Cancelled: stopped as asked.
+        CancelledError: stopped as asked.
     """
     with _work_folder(output) as work:
         request = PoseSearchRequest(
@@ -139,7 +146,7 @@ def adjust_principal_points(
     output: Path,
     *,
     config: PosesConfig = DEFAULT_CONFIG,
-    progress: Listener = ignore,
+    progress: EventListener = ignore_events,
     should_stop: Callable[[], bool] = lambda: False,
 ) -> dict[str, float] | None:
     """Give each photograph of a model a principal point of its own, where that explains far more.
@@ -162,7 +169,7 @@ def adjust_principal_points(
     Raises:
         DatasetError: COLMAP refuses to work with the model.
         PosesCrashed: COLMAP died.
-        Cancelled: stopped as asked.
+        CancelledError: stopped as asked.
     """
     before = read_pose_record(output)
     with _work_folder(output) as work:
@@ -209,7 +216,7 @@ class _ColmapProcess:
     """One process of COLMAP's, and what it says."""
 
     def __init__(
-        self, request: PoseSearchRequest, progress: Listener, should_stop: Callable[[], bool]
+        self, request: PoseSearchRequest, progress: EventListener, should_stop: Callable[[], bool]
     ) -> None:
         self._request = request
         self._progress = progress
@@ -224,7 +231,7 @@ class _ColmapProcess:
         """Wait for the result, telling of the progress and hearing of the wish to stop meanwhile.
 
         Raises:
-            Cancelled: stopped as asked.
+            CancelledError: stopped as asked.
             DatasetError: as the process says.
             PosesCrashed: it said nothing and died.
         """
@@ -240,13 +247,13 @@ class _ColmapProcess:
         if self._error is not None:
             raise DatasetError(self._error)
         if not self._is_done:
-            raise PosesCrashed(_crash_message(code, self._stage, log))
+            raise ColmapCrashError(_crash_message(code, self._stage, log))
 
     def _read_chunk(self, pipe: int) -> bytes:
         """What the process says next; nothing at its end."""
         while True:
             if self._should_stop():
-                raise Cancelled(
+                raise CancelledError(
                     "Stopped while finding poses; the same command with --resume begins them again."
                 )
             if select.select([pipe], [], [], _POLL_SECONDS)[0]:
@@ -264,13 +271,13 @@ class _ColmapProcess:
             self._is_done = True
         elif kind == "error":
             self._error = content["message"]
-        elif (event := event_from(kind, content)) is not None:
+        elif (event := parse_event(kind, content)) is not None:
             self._forward_event(event)
 
     def _forward_event(self, event: Event) -> None:
-        if isinstance(event, StageStarted):
+        if isinstance(event, PhaseStarted):
             self._stage = event.stage
-        self._last_progress = event if isinstance(event, StageProgress) else None
+        self._last_progress = event if isinstance(event, PhaseProgress) else None
         self._last_event_time = time.monotonic()
         self._progress(event)
 

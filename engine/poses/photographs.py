@@ -7,7 +7,7 @@ from pathlib import Path
 
 from octasplat.engine.core.errors import DatasetError
 from octasplat.engine.dataset.masks import masks_beside
-from octasplat.engine.dataset.results_among import is_results
+from octasplat.engine.dataset.results_among import is_run_folder
 from octasplat.engine.poses.config import MIN_PHOTOGRAPHS
 
 _SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp"})
@@ -41,7 +41,7 @@ def photographs_in(folder: Path) -> list[str]:
 
 def _files_below(folder: Path) -> Iterator[Path]:
     for parent, folders, names in os.walk(folder):
-        folders[:] = [name for name in folders if not is_results(Path(parent) / name)]
+        folders[:] = [name for name in folders if not is_run_folder(Path(parent) / name)]
         yield from (Path(parent) / name for name in names)
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pycolmap
 
 from octasplat.engine.core.errors import DatasetError
-from octasplat.engine.core.events import Listener
+from octasplat.engine.core.events import EventListener
 from octasplat.engine.core.writing import write_json
 from octasplat.engine.dataset.images import read_image_info
 from octasplat.engine.poses.config import (
@@ -33,7 +33,7 @@ from octasplat.engine.poses.pose_estimation import (
 from octasplat.engine.poses.workspace import link_photographs, progress_stage
 
 
-def repair_misplaced(request: PoseSearchRequest, given: GivenModel, progress: Listener) -> None:
+def repair_misplaced(request: PoseSearchRequest, given: GivenModel, progress: EventListener) -> None:
     """Write the model with the photographs moved that stand in the wrong place, and the names of these.
 
     Few others are asked first, from all around: not those nearby, as the pose may have been made by false
@@ -76,7 +76,7 @@ class _PoseVerifier:
         images: of the model, by photograph.
     """
 
-    def __init__(self, request: PoseSearchRequest, given: GivenModel, progress: Listener) -> None:
+    def __init__(self, request: PoseSearchRequest, given: GivenModel, progress: EventListener) -> None:
         self.model: Any = pycolmap.Reconstruction(given.model)
         by_name = {image.name: image for image in self.model.images.values()}
         self.images: dict[int, Any] = {k: by_name[name] for k, name in enumerate(given.names)}

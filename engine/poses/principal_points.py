@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import pycolmap
 
-from octasplat.engine.core.events import Listener
+from octasplat.engine.core.events import EventListener
 from octasplat.engine.core.writing import write_json
 from octasplat.engine.poses.config import FOUND_FOLDER, LENSES_STAGE, RECORD_FILE, PoseSearchRequest
 from octasplat.engine.poses.lens_check import MIN_OBSERVATIONS
@@ -32,7 +32,9 @@ _ITERATIONS = 3
 _MAX_SOLVER_STEPS = 50
 
 
-def write_per_view_principal_points(request: PoseSearchRequest, folder: Path, progress: Listener) -> None:
+def write_per_view_principal_points(
+    request: PoseSearchRequest, folder: Path, progress: EventListener
+) -> None:
     """Write the model with a lens for each photograph, where that explains far more, and what it is worth.
 
     Args:

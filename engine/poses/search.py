@@ -9,7 +9,7 @@ from typing import Any
 import pycolmap
 
 from octasplat.engine.core.errors import DatasetError
-from octasplat.engine.core.events import Listener, Warned
+from octasplat.engine.core.events import EventListener, Warned
 from octasplat.engine.core.writing import write_json
 from octasplat.engine.dataset.image_info import ImageInfo
 from octasplat.engine.dataset.images import read_image_info
@@ -61,7 +61,7 @@ class PoseSearch:
         work: Path,
         config: PosesConfig,
         threads: int,
-        progress: Listener,
+        progress: EventListener,
     ) -> None:
         self._images = images
         self._all_names = tuple(names)

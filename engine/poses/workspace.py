@@ -4,8 +4,8 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
-from octasplat.engine.core.events import Listener
-from octasplat.engine.core.progress import counted_stage
+from octasplat.engine.core.events import EventListener
+from octasplat.engine.core.progress import counted_phase
 
 
 def link_photographs(images: Path, names: Sequence[str], folder: Path) -> tuple[str, ...]:
@@ -21,7 +21,7 @@ def link_photographs(images: Path, names: Sequence[str], folder: Path) -> tuple[
 
 
 @contextmanager
-def progress_stage(name: str, steps: int, progress: Listener) -> Iterator[Callable[[int], None]]:
+def progress_stage(name: str, steps: int, progress: EventListener) -> Iterator[Callable[[int], None]]:
     """A stage whose steps are known beforehand; yields what is to be told how many are done."""
-    with counted_stage(name, progress, steps) as count:
+    with counted_phase(name, progress, steps) as count:
         yield lambda done: count(done, steps)

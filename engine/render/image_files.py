@@ -14,7 +14,7 @@ from jaxtyping import Float32
 
 from octasplat.engine.core.color import srgb_to_linear, to_bytes
 from octasplat.engine.core.errors import DatasetError, OutputError
-from octasplat.engine.core.writing import replacing
+from octasplat.engine.core.writing import atomic_replace
 
 _RAW_CONFIG = "oiio:UnassociatedAlpha"
 """Keeps OpenImageIO from multiplying or dividing colours by alpha on its own."""
@@ -177,7 +177,7 @@ def _write(path: Path, spec: Any, pixels: np.ndarray) -> None:
     # Not called by its type, an ImageSpec: the tests' type checker would keep that beyond OpenImageIO's end.
     spec.attribute(_RAW_CONFIG, 1)
     try:
-        with replacing(path) as temporary:
+        with atomic_replace(path) as temporary:
             output = oiio.ImageOutput.create(str(temporary))
             if output is None:
                 raise OutputError(f"Cannot write {path}: {oiio.geterror() or 'unknown image format'}.")

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from octasplat.engine.core.errors import ConfigError
-from octasplat.engine.core.events import ImagesKept, Listener
-from octasplat.engine.core.progress import counted_stage
+from octasplat.engine.core.events import EventListener, ImagesSaved
+from octasplat.engine.core.progress import counted_phase
 from octasplat.engine.render.file_names import IMAGE_SUFFIXES, has_number_pattern
 from octasplat.engine.render.resume import RECORD_FILE, FinishedImages
 from octasplat.engine.render.series import film_files, render_series, render_video
@@ -112,7 +112,7 @@ class RenderOutput:
         return (self._frames_folder if self.is_video else self.path) / RECORD_FILE
 
     def write(
-        self, shots: tuple[Shot, ...], render_fn: RenderFn, finished: FinishedImages, progress: Listener
+        self, shots: tuple[Shot, ...], render_fn: RenderFn, finished: FinishedImages, progress: EventListener
     ) -> tuple[Path, ...]:
         """Render the shots that are not finished yet, write all, and return the files.
 
@@ -121,9 +121,9 @@ class RenderOutput:
         """
 
         def on_kept(count: int) -> None:
-            progress(ImagesKept(count))
+            progress(ImagesSaved(count))
 
-        with counted_stage("render", progress) as count:
+        with counted_phase("render", progress) as count:
             if self.is_video:
                 render_video(shots, self.path, self.fps, render_fn, finished, count, on_kept)
                 return (self.path,)

@@ -6,11 +6,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float32, Float64, Int32, Int64
 
-from octasplat.engine.core.hashing import unit_numbers
+from octasplat.engine.core.hashing import hashed_uniforms
 from octasplat.engine.core.rays import ImageRays, RayBatch
 from octasplat.engine.gaussians.model import FlatGaussians
-from octasplat.engine.shading.plain import PLAIN
-from octasplat.engine.shading.protocol import ShadingModel, Sight
+from octasplat.engine.shading.plain import PLAIN_SHADING
+from octasplat.engine.shading.protocol import ShadingModel, TracedRays
 from octasplat.engine.trace import ray_hits
 from octasplat.engine.trace.facing_normals import face_viewer
 from octasplat.engine.trace.protocol import Tracer
@@ -51,7 +51,7 @@ def render_rays(
     tracer: Tracer,
     image: ImageRays,
     background: Float32[np.ndarray, "3"],
-    shading: ShadingModel = PLAIN,
+    shading: ShadingModel = PLAIN_SHADING,
     sample: int = 0,
 ) -> RenderedImage:
     """Trace and shade an image; directions have unit length.
@@ -72,8 +72,8 @@ def render_rays(
     for band, order, rays in _row_bands(image):
         seen = tracer.trace(rays)
         dither = pixel_jitter(band.start * width + order, sample)
-        developed = shading.develop(Sight(rays, seen, tracer, dither=dither))
-        rgb = developed.over(background)
+        developed = shading.shade(TracedRays(rays, seen, tracer, dither=dither))
+        rgb = developed.composite_over(background)
         for name, values in developed.layers.items():
             layers.setdefault(name, np.empty((height, width, values.shape[1]), np.float32))
         for part, values in (
@@ -111,7 +111,7 @@ def shade_layer(
         chosen = pixels[start : start + RAYS_PER_BATCH]
         rays = image.rays[chosen]
         seen = tracer.trace(rays)
-        developed = shading.develop(Sight(rays, seen, tracer, dither=pixel_jitter(chosen, sample)))
+        developed = shading.shade(TracedRays(rays, seen, tracer, dither=pixel_jitter(chosen, sample)))
         found.append(developed.layers[layer])
         alphas.append(seen.alpha)
     return np.concatenate(found), np.concatenate(alphas)
@@ -183,7 +183,7 @@ def pixel_jitter(pixels: Int64[np.ndarray, " r"], sample: int) -> Float64[np.nda
     Steps of the plastic number's powers, from a place of the pixel's own: "The Unreasonable Effectiveness of
     Quasirandom Sequences" (Roberts 2018, https://extremelearning.com.au).
     """
-    return (unit_numbers(pixels.astype(np.uint64)) + sample * STEPS[:, None]) % 1.0
+    return (hashed_uniforms(pixels.astype(np.uint64)) + sample * STEPS[:, None]) % 1.0
 
 
 def background_colour(name: str) -> Float32[np.ndarray, "3"]:

@@ -9,7 +9,7 @@ import json
 from pathlib import Path
 
 from octasplat.engine.core.errors import ConfigError, OutputError
-from octasplat.engine.core.writing import telling_of_room, write_text
+from octasplat.engine.core.writing import report_disk_full, write_text
 
 RECORD_FILE = "unfinished.jsonl"
 
@@ -58,7 +58,7 @@ class FinishedImages:
         lines = [] if self._digests else [{"identity": self._identity}]
         text = "".join(json.dumps(line) + "\n" for line in [*lines, {"file": name, "sha256": digest}])
         try:
-            with telling_of_room(self.record), self.record.open("a" if self._digests else "w") as file:
+            with report_disk_full(self.record), self.record.open("a" if self._digests else "w") as file:
                 file.write(text)
         except OSError as error:
             raise OutputError(f"{self.record} cannot be written ({error.strerror or error}).") from error

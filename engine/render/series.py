@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float32
 
 from octasplat.engine.core.errors import OutputError
-from octasplat.engine.core.progress import Count
+from octasplat.engine.core.progress import ProgressCallback
 from octasplat.engine.render.image_files import read_image
 from octasplat.engine.render.resume import FinishedImages
 from octasplat.engine.render.shots import RenderFn, Shot
@@ -27,7 +27,7 @@ def render_series(
     file_of: Callable[[int, Shot], Path],
     render_fn: RenderFn,
     finished: FinishedImages,
-    progress: Count,
+    progress: ProgressCallback,
     on_finished: OnFinished = lambda _count: None,
 ) -> tuple[Path, ...]:
     """Render each shot to a file of its own, skip finished ones, and return the files.
@@ -59,7 +59,7 @@ def render_video(
     fps: float,
     render_fn: RenderFn,
     finished: FinishedImages,
-    progress: Count,
+    progress: ProgressCallback,
     on_finished: OnFinished = lambda _count: None,
 ) -> None:
     """Render shots of one image size as the frames of a video.
@@ -97,7 +97,7 @@ def _render_missing(
     file_of: Callable[[int, Shot], Path],
     render_fn: RenderFn,
     finished: FinishedImages,
-    progress: Count,
+    progress: ProgressCallback,
     on_finished: OnFinished,
 ) -> Iterator[Path]:
     whole = len(shots)

@@ -17,7 +17,7 @@ from octasplat.engine.render.image_files import exr_layers, write_exr, write_png
 from octasplat.engine.render.pinhole_camera import PinholeCamera, focal_from_fov
 from octasplat.engine.render.pose_paths import Turntable, fit_turntable
 from octasplat.engine.render.supersampling import rays_per_pixel_side, render_averaged
-from octasplat.engine.shading.plain import PLAIN
+from octasplat.engine.shading.plain import PLAIN_SHADING
 from octasplat.engine.shading.protocol import ShadingModel
 from octasplat.engine.trace.protocol import Tracer
 
@@ -137,7 +137,7 @@ def scene_render_fn(
     *,
     transparent: bool = False,
     trained_rad: float = 0.0,
-    shading: ShadingModel = PLAIN,
+    shading: ShadingModel = PLAIN_SHADING,
 ) -> RenderFn:
     """Return the function that renders a shot of a scene to a file.
 
@@ -191,4 +191,4 @@ def _view_rays(view: PosedView, camera: Camera, near_world: float) -> ImageRays:
         directions[np.isnan(directions).any(axis=1)] = (0.0, 0.0, 1.0)
         world = directions @ view.rotation_cam_from_world
         directions_world[top : top + rows] = world.reshape(-1, width, 3)
-    return ImageRays.of(view.origin_world, directions_world, near_world)
+    return ImageRays.from_directions(view.origin_world, directions_world, near_world)

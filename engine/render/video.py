@@ -16,7 +16,7 @@ from jaxtyping import Float32
 
 from octasplat.engine.core.color import to_bytes
 from octasplat.engine.core.errors import OutputError
-from octasplat.engine.core.writing import replacing
+from octasplat.engine.core.writing import atomic_replace
 
 DEFAULT_CRF = 18
 
@@ -58,7 +58,7 @@ class VideoWriter:
         """
         try:
             with ExitStack() as stack:
-                temporary = stack.enter_context(replacing(self._path))
+                temporary = stack.enter_context(atomic_replace(self._path))
                 # A file rather than a pipe, which would have to be emptied lest ffmpeg wait.
                 self._messages = stack.enter_context(tempfile.TemporaryFile())
                 self._process = subprocess.Popen(  # noqa: S603

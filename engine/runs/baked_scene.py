@@ -13,7 +13,7 @@ from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.render.bake_colour import fit_colours_to_cameras, with_constant_colour
 from octasplat.engine.render.shots import view_shots
 from octasplat.engine.runs.config import read_config
-from octasplat.engine.runs.run_folder import CONFIG, run_near_world, run_viewpoints
+from octasplat.engine.runs.run_folder import CONFIG, run_min_view_distance, run_viewpoints
 from octasplat.engine.surface.depth_cameras import cameras_around
 from octasplat.engine.trace.factory import make_tracer
 from octasplat.engine.trace.protocol import TraceSettings
@@ -22,7 +22,7 @@ SIDE_PX = 160
 MAX_VIEWS = 48
 
 
-class PlainScene:
+class BakedScene:
     """A scene of which the one colour of each Gaussian is found when somebody asks, and once.
 
     Args:
@@ -68,7 +68,7 @@ class PlainScene:
 def _of_run(run: Path) -> tuple[TraceSettings, Sequence[Callable[[], ImageRays]]]:
     config = read_config(run / CONFIG)
     viewpoints = run_viewpoints(run, max_side=SIDE_PX)
-    near = run_near_world(run, viewpoints)
+    near = run_min_view_distance(run, viewpoints)
     shots = view_shots(viewpoints, _some(viewpoints.train_indices), near)
     return config.train.trace, [shot.rays for shot in shots]
 

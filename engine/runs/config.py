@@ -15,15 +15,15 @@ from octasplat.engine.core.errors import ConfigError
 from octasplat.engine.runs.run_settings import RunSettings
 from octasplat.engine.settings.base import Settings
 from octasplat.engine.settings.fields import ADVANCED
-from octasplat.engine.settings.nested_options import merged
+from octasplat.engine.settings.nested_options import merge_options
 from octasplat.engine.settings.refusals import (
     Refusal,
     SettingsRefused,
-    refusals_of,
+    refusals_from,
+    refuse_unknown_setting,
     submodels,
-    unknown_setting,
 )
-from octasplat.engine.settings.renamed_settings import former_names, with_new_names
+from octasplat.engine.settings.renamed_settings import former_names, translate_names
 from octasplat.engine.train.config import TrainConfig, preset, with_materials
 from octasplat.engine.train.config.preset_names import PRESETS, PRESETS_WITH_MATERIALS
 
@@ -41,7 +41,7 @@ class ReconstructionConfig(RunSettings):
     def _measured_as_trained(cls, values: Any) -> Any:
         if not isinstance(values, Mapping):
             return values
-        values = with_new_names((cls,), values)
+        values = translate_names((cls,), values)
         if values.get("evaluation_background") is not None:
             return values
         train = values.get("train", {})
@@ -97,7 +97,7 @@ def resolve_config(
     given = {key: value for key, value in (settings or {}).items() if value is not None}
     values, changes = _collected({**given, "preset": preset_name}, materials or None, train, assignments)
     base = _base(values["preset"], _learns_materials(changes))
-    return _validated({**values, "train": merged(base, changes)})
+    return _validated({**values, "train": merge_options(base, changes)})
 
 
 def revise_config(
@@ -123,21 +123,21 @@ def revise_config(
     Raises:
         SettingsRefused: an unknown name, a value out of range, or settings that contradict each other.
     """
-    before = with_new_names((ReconstructionConfig,), before)
+    before = translate_names((ReconstructionConfig,), before)
     values, changes = _collected(settings or {}, materials, train, assignments)
     values = {**before, **values}
     kept: Mapping[str, Any] = before.get("train", {})
     learnt = _learns_materials(kept)
     if values.get("preset") != before.get("preset"):
         kept = {}
-    elif _learns_materials(merged(kept, changes)) == learnt:
-        return _validated({**values, "train": merged(kept, changes)})
+    elif _learns_materials(merge_options(kept, changes)) == learnt:
+        return _validated({**values, "train": merge_options(kept, changes)})
     else:
         kept = _differences(_base(before.get("preset"), learnt), kept)
         kept.get("materials", {}).pop("learn", None)
-    asked = merged(kept, changes)
+    asked = merge_options(kept, changes)
     base = _base(values.get("preset"), _learns_materials(asked))
-    return _validated({**values, "train": merged(base, asked)})
+    return _validated({**values, "train": merge_options(base, asked)})
 
 
 def read_config(path: Path) -> ReconstructionConfig:
@@ -149,7 +149,7 @@ def read_config(path: Path) -> ReconstructionConfig:
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
         return _validated(
-            with_new_names((ReconstructionConfig,), content["reconstruction"], source=str(path))
+            translate_names((ReconstructionConfig,), content["reconstruction"], source=str(path))
         )
     except SettingsRefused as error:
         raise ConfigError(f"{path} is not a configuration of this version: {error}") from None
@@ -166,22 +166,22 @@ def _collected(
     assignments: Sequence[str],
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     """The fields of :class:`RunSettings` and the nested settings of the training that are asked for."""
-    values = with_new_names((RunSettings,), settings)
+    values = translate_names((RunSettings,), settings)
     changes: dict[str, Any] = {} if materials is None else {"materials": {"learn": materials}}
     if train:
-        train = with_new_names((TrainConfig,), train)
+        train = translate_names((TrainConfig,), train)
         _check_names(train)
-        changes = merged(changes, train)
+        changes = merge_options(changes, train)
     for assignment in assignments:
         path, value = _read_assignment(assignment)
         for name in reversed(path):
             value = {name: value}
-        value = with_new_names((RunSettings, TrainConfig), value)
+        value = translate_names((RunSettings, TrainConfig), value)
         if RunSettings.model_fields.keys() & value:
             values |= value
             continue
         _check_names(value)
-        changes = merged(changes, value)
+        changes = merge_options(changes, value)
     return values, changes
 
 
@@ -189,7 +189,7 @@ def _validated(values: Mapping[str, Any]) -> ReconstructionConfig:
     try:
         return ReconstructionConfig.model_validate(dict(values))
     except ValidationError as error:
-        raise SettingsRefused(refusals_of(error, ReconstructionConfig)) from None
+        raise SettingsRefused(refusals_from(error, ReconstructionConfig)) from None
 
 
 def _read_assignment(assignment: str) -> tuple[list[str], Any]:
@@ -255,7 +255,10 @@ def _check_names(train: Mapping[str, Any]) -> None:
     unknown = list(_unknown((TrainConfig,), train, ("train",)))
     if unknown:
         raise SettingsRefused(
-            [unknown_setting(path, _setting_names(), former=former_setting_names()) for path in unknown]
+            [
+                refuse_unknown_setting(path, _setting_names(), former=former_setting_names())
+                for path in unknown
+            ]
         )
 
 

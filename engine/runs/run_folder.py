@@ -7,14 +7,14 @@ from pathlib import Path
 import numpy as np
 
 from octasplat.engine.core.errors import ConfigError, DatasetError
-from octasplat.engine.core.events import Listener, StageProgress, Warned
+from octasplat.engine.core.events import EventListener, PhaseProgress, Warned
 from octasplat.engine.dataset import Dataset, load_dataset_model
 from octasplat.engine.dataset.camera_clearance import CameraClearance
 from octasplat.engine.dataset.views_file import SplitViewpoints, ViewsRecord, read_views, scene_viewpoints
 from octasplat.engine.files import read_metadata
 from octasplat.engine.render.environment_files import read_background
 from octasplat.engine.runs.config import ReconstructionConfig, read_config
-from octasplat.engine.shading.background import LearntBackground
+from octasplat.engine.shading.background import LearnedBackground
 from octasplat.engine.shading.exposure import ExposuresByName
 
 CONFIG, EVENTS, HELD_OUT, SCENE, TRAINING, VIEWS = (
@@ -23,11 +23,11 @@ CONFIG, EVENTS, HELD_OUT, SCENE, TRAINING, VIEWS = (
 METRICS, REPORT = "metrics.json", "report.html"
 CHECKPOINTS, CACHE, POSES = "checkpoints", "cache", "poses"
 PLAN = "plan.json"
-ENVIRONMENT, EXACT_ENVIRONMENT = "environment.hdr", "environment.exr"
+ENVIRONMENT_HDR, ENVIRONMENT_EXR = "environment.hdr", "environment.exr"
 """The learnt light, for programs that show it and as it was learnt: an HDR has one exponent for all channels
 of a pixel, so that a dark channel beside a bright one is coarse."""
 BACKGROUND = "background.exr"
-ON = "on"
+EVALUATIONS = "on"
 """Below it are the measures on photographs of other folders, a folder each."""
 
 
@@ -36,7 +36,7 @@ def is_run(source: Path) -> bool:
     return source.is_dir() and not (source / "meta.json").exists()
 
 
-def run_scene(output: Path) -> Path:
+def dataset_folder_of_run(output: Path) -> Path:
     """The scene folder that a run was made from.
 
     Raises:
@@ -57,7 +57,7 @@ def photographs_folder(output: Path, scene: Path | None = None) -> Path:
     """
     if scene is not None:
         return scene
-    noted = run_scene(output)
+    noted = dataset_folder_of_run(output)
     if noted.is_absolute() and noted.is_dir():
         return noted
     raise DatasetError(
@@ -85,12 +85,12 @@ def run_viewpoints(
     if scene is None and (output / VIEWS).exists():
         return read_views(output / VIEWS).viewpoints(max_side)
     photographs = load_dataset_model(
-        photographs_folder(output, scene), max_side=max_side, model_folder=found_model(output)
+        photographs_folder(output, scene), max_side=max_side, model_folder=found_model_folder(output)
     )
     return scene_viewpoints(photographs, config.test_every, config.held_out)
 
 
-def run_near_world(output: Path, viewpoints: SplitViewpoints) -> float:
+def run_min_view_distance(output: Path, viewpoints: SplitViewpoints) -> float:
     """Return the distance from a camera at which anything of a run's scene is seen, as in its training.
 
     Args:
@@ -104,7 +104,7 @@ def run_near_world(output: Path, viewpoints: SplitViewpoints) -> float:
     return noted if noted > 0 else read_config(output / CONFIG).train.near * viewpoints.extent
 
 
-def run_near_zones(output: Path, share: float) -> CameraClearance | None:
+def run_camera_clearance(output: Path, share: float) -> CameraClearance | None:
     """Where nothing of a run's scene should stand, see :mod:`octasplat.engine.dataset.camera_clearance`.
 
     Args:
@@ -134,11 +134,11 @@ def run_exposures(output: Path) -> ExposuresByName | None:
 
 def run_environment(output: Path) -> Path:
     """Return the file of the light that a run has learnt; runs of old have the HDR only, others none."""
-    exact = output / EXACT_ENVIRONMENT
-    return exact if exact.exists() else output / ENVIRONMENT
+    exact = output / ENVIRONMENT_EXR
+    return exact if exact.exists() else output / ENVIRONMENT_HDR
 
 
-def run_background(output: Path) -> LearntBackground | None:
+def run_background(output: Path) -> LearnedBackground | None:
     """The background that a finished run has learnt, if it has.
 
     Raises:
@@ -146,10 +146,10 @@ def run_background(output: Path) -> LearntBackground | None:
     """
     if read_config(output / CONFIG).train.background != "learnt":
         return None
-    return LearntBackground.of(read_background(output / BACKGROUND))
+    return LearnedBackground.from_map(read_background(output / BACKGROUND))
 
 
-def not_exported(output: Path) -> str | None:
+def unexported_parts(output: Path) -> str | None:
     """A sentence on what a run has learnt that no other file carries, or None."""
     if not (output / CONFIG).exists() or read_config(output / CONFIG).train.background != "learnt":
         return None
@@ -159,7 +159,7 @@ def not_exported(output: Path) -> str | None:
     )
 
 
-def found_model(output: Path) -> Path | None:
+def found_model_folder(output: Path) -> Path | None:
     """The folder of the poses that were found for the photographs of a run, if they had to be."""
     for folder in (output / POSES, output / POSES / "sparse" / "0"):
         if any((folder / f"cameras{suffix}").is_file() for suffix in (".bin", ".txt")):
@@ -167,12 +167,12 @@ def found_model(output: Path) -> Path | None:
     return None
 
 
-def open_photographs(
+def open_run_dataset(
     scene: Path,
     output: Path,
     config: ReconstructionConfig,
     threads: int,
-    tell: Listener,
+    progress: EventListener,
     *,
     model_folder: Path | None = None,
     accept: Callable[[ViewsRecord], None] | None = None,
@@ -184,8 +184,8 @@ def open_photographs(
         output: folder of the run, which holds the cache.
         config: of the run.
         threads: for decoding; 0 takes all cores.
-        tell: hears the progress and what is odd but usable.
-        model_folder: of poses that were found, see :func:`found_model`.
+        progress: hears the progress and what is odd but usable.
+        model_folder: of poses that were found, see :func:`found_model_folder`.
         accept: told what was found before anything is written; to refuse it, it raises.
 
     Raises:
@@ -203,10 +203,10 @@ def open_photographs(
         accept=accept,
         near=config.train.near,
         threads=threads,
-        progress=lambda done, total: tell(StageProgress("load", done, total)),
+        progress=lambda done, total: progress(PhaseProgress("load", done, total)),
     )
     for warning in dataset.warnings:
-        tell(Warned(warning))
+        progress(Warned(warning))
     if (mismatch := config.background_mismatch(dataset.has_alpha)) is not None:
-        tell(Warned(mismatch))
+        progress(Warned(mismatch))
     return dataset

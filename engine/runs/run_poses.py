@@ -3,9 +3,9 @@
 from collections.abc import Callable
 from pathlib import Path
 
-from octasplat.engine.core.errors import DatasetError, PosesCrashed
-from octasplat.engine.core.events import Listener, StageProgress, Warned
-from octasplat.engine.core.progress import stage
+from octasplat.engine.core.errors import ColmapCrashError, DatasetError
+from octasplat.engine.core.events import EventListener, PhaseProgress, Warned
+from octasplat.engine.core.progress import phase
 from octasplat.engine.dataset import Dataset, split_views
 from octasplat.engine.dataset.colmap_model import find_colmap_model_folder, has_colmap_model
 from octasplat.engine.dataset.load import image_folder
@@ -20,10 +20,10 @@ from octasplat.engine.poses.find_poses import read_pose_record
 from octasplat.engine.poses.photograph_check import check_photographs_decode
 from octasplat.engine.poses.photographs import photographs_in
 from octasplat.engine.runs.config import ReconstructionConfig
-from octasplat.engine.runs.run_folder import POSES, found_model
+from octasplat.engine.runs.run_folder import POSES, found_model_folder
 from octasplat.engine.train.config import iteration_count
-from octasplat.engine.train.views.doubts import ITERATIONS as CHECK_ITERATIONS
-from octasplat.engine.train.views.doubts import doubtful_views
+from octasplat.engine.train.views.doubts import PROBE_ITERATIONS as CHECK_ITERATIONS
+from octasplat.engine.train.views.doubts import find_misplaced_views
 
 CHECKED_FROM, CHECKED_FROM_MINUTES = 1000, 10.0
 """Given poses are checked before a training of so many iterations, or of so many minutes."""
@@ -34,7 +34,7 @@ def find_missing_poses(
     output: Path,
     config: ReconstructionConfig,
     threads: int,
-    tell: Listener,
+    progress: EventListener,
     should_stop: Callable[[], bool],
 ) -> None:
     """Find the poses of a run's photographs, if that is asked for and not done yet.
@@ -42,7 +42,7 @@ def find_missing_poses(
     Raises:
         DatasetError: there are no photographs, or their poses cannot be found.
         PosesCrashed: COLMAP died.
-        Cancelled: stopped as asked.
+        CancelledError: stopped as asked.
     """
     if config.poses == "given" or (config.poses == "missing" and has_colmap_model(scene)):
         return
@@ -51,7 +51,7 @@ def find_missing_poses(
     folder = image_folder(scene)
     if not (output / POSES).is_dir():
         _refuse_before_search(scene, folder, config, threads)
-    find_poses(folder, output / POSES, threads=threads, progress=tell, should_stop=should_stop)
+    find_poses(folder, output / POSES, threads=threads, progress=progress, should_stop=should_stop)
 
 
 def _refuse_before_search(scene: Path, folder: Path, config: ReconstructionConfig, threads: int) -> None:
@@ -66,12 +66,12 @@ def _refuse_before_search(scene: Path, folder: Path, config: ReconstructionConfi
     check_photographs_decode(folder, names, threads=threads)
 
 
-def place_misfits(
+def repair_run_poses(
     dataset: Dataset,
     output: Path,
     config: ReconstructionConfig,
     threads: int,
-    tell: Listener,
+    progress: EventListener,
     should_stop: Callable[[], bool],
 ) -> bool:
     """Place photographs of a given model anew that stand in the wrong place; whether there are any.
@@ -80,19 +80,19 @@ def place_misfits(
     those that are moved have their poses from the model in the run's ``poses/`` from then on.
 
     Raises:
-        Cancelled: stopped as asked.
+        CancelledError: stopped as asked.
     """
     is_long = _is_long(dataset, config)
-    if not (config.train.repair_poses and is_long) or found_model(output) is not None:
+    if not (config.train.repair_poses and is_long) or found_model_folder(output) is not None:
         return False
-    with stage("check", tell, CHECK_ITERATIONS):
-        doubtful = doubtful_views(
+    with phase("check", progress, CHECK_ITERATIONS):
+        doubtful = find_misplaced_views(
             dataset,
             background=config.train.background,
             seed=config.train.seed,
             threads=threads,
             should_stop=should_stop,
-            progress=lambda done: tell(StageProgress("check", done, CHECK_ITERATIONS)),
+            progress=lambda done: progress(PhaseProgress("check", done, CHECK_ITERATIONS)),
         )
     if len(doubtful) == 0:
         return False
@@ -106,14 +106,14 @@ def place_misfits(
     names = [dataset.views[k].name for k in doubtful.tolist()]
     try:
         moved = repair_poses(
-            images, files, given, output / POSES, threads=threads, progress=tell, should_stop=should_stop
+            images, files, given, output / POSES, threads=threads, progress=progress, should_stop=should_stop
         )
-    except (DatasetError, PosesCrashed) as error:
-        tell(Warned(f"The poses of {', '.join(names)} are in doubt, and stay as they are: {error}"))
+    except (DatasetError, ColmapCrashError) as error:
+        progress(Warned(f"The poses of {', '.join(names)} are in doubt, and stay as they are: {error}"))
         return False
     if moved:
         which = "This photograph" if len(moved) == 1 else f"These {len(moved)} photographs"
-        tell(
+        progress(
             Warned(
                 f"{which} did not stand where matches with the others say: {', '.join(moved)}. The training "
                 "takes the poses that follow from the matches; repair_poses=false leaves given poses alone."
@@ -122,11 +122,11 @@ def place_misfits(
     return bool(moved)
 
 
-def free_lenses(
+def estimate_principal_points(
     dataset: Dataset,
     output: Path,
     config: ReconstructionConfig,
-    tell: Listener,
+    progress: EventListener,
     should_stop: Callable[[], bool],
 ) -> bool:
     """Give each photograph a principal point of its own if the lens moved; whether it did.
@@ -135,7 +135,7 @@ def free_lenses(
     is asked first, which takes no time worth a stage.
 
     Raises:
-        Cancelled: stopped as asked.
+        CancelledError: stopped as asked.
     """
     if not (config.train.per_view_principal_point and _is_long(dataset, config)):
         return False
@@ -143,16 +143,16 @@ def free_lenses(
         return False
     if not needs_per_view_principal_points(dataset.viewpoints, dataset.points, dataset.observations):
         return False
-    model = found_model(output) or find_colmap_model_folder(dataset.root)
+    model = found_model_folder(output) or find_colmap_model_folder(dataset.root)
     try:
-        facts = adjust_principal_points(model, output / POSES, progress=tell, should_stop=should_stop)
-    except (DatasetError, PosesCrashed) as error:
-        tell(Warned(f"The lens seems to have moved between the photographs, but stays as it is: {error}"))
+        facts = adjust_principal_points(model, output / POSES, progress=progress, should_stop=should_stop)
+    except (DatasetError, ColmapCrashError) as error:
+        progress(Warned(f"The lens seems to have moved between the photographs, but stays as it is: {error}"))
         return False
     if facts is None:
         return False
     before, after = facts["reprojection_px_before"], facts["reprojection_px"]
-    tell(
+    progress(
         Warned(
             "The lens moved between the photographs, as stabilised ones do: each has a principal point of "
             f"its own, {facts['shift_px_median']:.1f} px from the given one in the middle, and the sparse "

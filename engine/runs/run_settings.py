@@ -71,4 +71,4 @@ class RunSettings(BaseModel):
     @model_validator(mode="before")
     @classmethod
     def _by_new_names(cls, given: Any) -> Any:
-        return renamed_settings.with_new_names((cls,), given) if isinstance(given, Mapping) else given
+        return renamed_settings.translate_names((cls,), given) if isinstance(given, Mapping) else given

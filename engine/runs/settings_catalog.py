@@ -15,8 +15,8 @@ from pydantic.fields import FieldInfo
 
 from octasplat.engine.core.errors import ConfigError
 from octasplat.engine.runs.config import ReconstructionConfig, former_setting_names, resolve_config
-from octasplat.engine.settings.fields import Group, Level, Unit
-from octasplat.engine.settings.refusals import SettingsRefused, unknown_setting
+from octasplat.engine.settings.fields import Group, SettingLevel, Unit
+from octasplat.engine.settings.refusals import SettingsRefused, refuse_unknown_setting
 from octasplat.engine.train.config.preset_names import PRESETS, PRESETS_WITH_MATERIALS
 
 MATERIALS = "+materials"
@@ -43,7 +43,7 @@ class Setting:
     type: str
     unit: str
     range: str
-    group: Level
+    group: SettingLevel
     description: str
     defaults: Mapping[str, object]
 
@@ -74,7 +74,7 @@ class Difference:
 
 
 @cache
-def settings() -> tuple[Setting, ...]:
+def all_settings() -> tuple[Setting, ...]:
     """Return all settings of a reconstruction, in the order of its configuration."""
     values = {
         name + (MATERIALS if materials else ""): setting_values(resolve_config(name, materials=materials))
@@ -91,21 +91,21 @@ def settings() -> tuple[Setting, ...]:
     return tuple(found.values())
 
 
-def setting_named(name: str) -> Setting:
+def find_setting(name: str) -> Setting:
     """Return the setting of that name, which may begin with ``train.``.
 
     Raises:
         ConfigError: there is none; the sentence offers the nearest one.
     """
     wanted = name.removeprefix("train.")
-    names = [setting.name for setting in settings()]
-    for setting in settings():
+    names = [setting.name for setting in all_settings()]
+    for setting in all_settings():
         if setting.name == wanted:
             return setting
     inside = [known for known in names if known.startswith(f"{wanted}.")]
     if inside:
         raise ConfigError(f"{name} is a group of settings: {', '.join(inside)}.")
-    raise SettingsRefused([unknown_setting(wanted.split("."), names, former=former_setting_names())])
+    raise SettingsRefused([refuse_unknown_setting(wanted.split("."), names, former=former_setting_names())])
 
 
 def setting_values(config: ReconstructionConfig) -> dict[str, object]:
@@ -113,10 +113,10 @@ def setting_values(config: ReconstructionConfig) -> dict[str, object]:
     return dict(_flattened(config.model_dump(mode="json"), ""))
 
 
-def differences(before: ReconstructionConfig, after: ReconstructionConfig) -> tuple[Difference, ...]:
+def setting_differences(before: ReconstructionConfig, after: ReconstructionConfig) -> tuple[Difference, ...]:
     """Return the settings whose values differ, in the order of the catalog."""
     first, second = setting_values(before), setting_values(after)
-    names = [setting.name for setting in settings()]
+    names = [setting.name for setting in all_settings()]
     return tuple(
         Difference(name, first.get(name), second.get(name))
         for name in names
@@ -124,19 +124,19 @@ def differences(before: ReconstructionConfig, after: ReconstructionConfig) -> tu
     )
 
 
-def defaults_of(config: ReconstructionConfig) -> ReconstructionConfig:
+def default_values(config: ReconstructionConfig) -> ReconstructionConfig:
     """Return the defaults that a configuration began from: its preset's, with or without materials."""
     return resolve_config(config.preset, materials=config.train.materials.learn)
 
 
-def value_text(value: object) -> str:
+def format_value(value: object) -> str:
     """Return a value as users write it."""
     if value is None:
         return "none"
     if isinstance(value, bool):
         return "true" if value else "false"
     if isinstance(value, list | tuple):
-        return "[" + ", ".join(map(value_text, value)) + "]"
+        return "[" + ", ".join(map(format_value, value)) + "]"
     return f"{value:.6g}" if isinstance(value, float) else str(value)
 
 
@@ -151,7 +151,7 @@ def _walk(model: type[BaseModel], prefix: str) -> Iterator[tuple[str, FieldInfo]
 
 
 def _setting(name: str, info: FieldInfo, defaults: Mapping[str, object]) -> Setting:
-    group: Level = next((mark.level for mark in info.metadata if isinstance(mark, Group)), "advanced")
+    group: SettingLevel = next((mark.level for mark in info.metadata if isinstance(mark, Group)), "advanced")
     unit = next((mark.symbol for mark in info.metadata if isinstance(mark, Unit)), "")
     kind = _type_text(info.annotation)
     if name == "densify.kind":
@@ -202,15 +202,15 @@ def _range_text(marks: Sequence[Any]) -> str:
     for mark in marks:
         match mark:
             case annotated_types.Ge(ge=bound):
-                texts.append(f"at least {value_text(bound)}")
+                texts.append(f"at least {format_value(bound)}")
             case annotated_types.Gt(gt=bound):
-                texts.append(f"more than {value_text(bound)}")
+                texts.append(f"more than {format_value(bound)}")
             case annotated_types.Le(le=bound):
-                texts.append(f"at most {value_text(bound)}")
+                texts.append(f"at most {format_value(bound)}")
             case annotated_types.Lt(lt=bound):
-                texts.append(f"less than {value_text(bound)}")
+                texts.append(f"less than {format_value(bound)}")
             case annotated_types.MultipleOf(multiple_of=factor):
-                texts.append(f"a multiple of {value_text(factor)}")
+                texts.append(f"a multiple of {format_value(factor)}")
             case _:
                 pass
     return ", ".join(texts)

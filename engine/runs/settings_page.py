@@ -1,7 +1,7 @@
 """The page of the documentation that lists all settings, made from their catalog."""
 
-from octasplat.engine.runs.settings_catalog import MATERIALS, Setting, settings, value_text
-from octasplat.engine.settings.fields import Level
+from octasplat.engine.runs.settings_catalog import MATERIALS, Setting, all_settings, format_value
+from octasplat.engine.settings.fields import SettingLevel
 
 _INTRODUCTION = f"""# Settings
 
@@ -12,7 +12,7 @@ All settings of a reconstruction; this page is written by `octasplat config list
 Defaults are those of the preset `standard`; other presets are named where they differ, \
 `{MATERIALS}` where materials are learnt with them.
 """
-_TITLES: tuple[tuple[Level, str], ...] = (
+_TITLES: tuple[tuple[SettingLevel, str], ...] = (
     ("basic", "Basic: what most people set"),
     ("advanced", "Advanced: for scenes with which the defaults have trouble"),
     ("experimental", "Experimental: off, or for comparisons with published methods"),
@@ -24,7 +24,7 @@ def settings_page() -> str:
     """Return ``docs/settings.md``: all settings by group, as Markdown."""
     lines = [_INTRODUCTION]
     for level, title in _TITLES:
-        rows = (_columns(entry) for entry in settings() if entry.group == level)
+        rows = (_columns(entry) for entry in all_settings() if entry.group == level)
         lines += [f"## {title}", "", *_HEAD]
         lines += ["| " + " | ".join(map(_cell, row)) + " |" for row in rows]
         lines.append("")
@@ -39,9 +39,9 @@ def _columns(entry: Setting) -> tuple[str, ...]:
 def _defaults_text(entry: Setting) -> str:
     others: dict[str, list[str]] = {}
     for name, value in entry.exceptions.items():
-        others.setdefault(value_text(value), []).append(name)
+        others.setdefault(format_value(value), []).append(name)
     rest = "; ".join(f"{', '.join(names)}: {value}" for value, names in others.items())
-    return value_text(entry.default) + (f" ({rest})" if rest else "")
+    return format_value(entry.default) + (f" ({rest})" if rest else "")
 
 
 def _cell(text: str) -> str:

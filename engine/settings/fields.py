@@ -11,7 +11,7 @@ from pydantic.fields import FieldInfo
 from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema
 
-Level = Literal["basic", "advanced", "experimental"]
+SettingLevel = Literal["basic", "advanced", "experimental"]
 
 
 class _InSchema:
@@ -41,7 +41,7 @@ class Unit(_InSchema):
 class Group(_InSchema):
     """How many users need a setting; forms and documents begin with the basic ones."""
 
-    level: Level
+    level: SettingLevel
 
     def schema_entries(self) -> Mapping[str, object]:
         """Return what stands in the schema."""
@@ -52,7 +52,7 @@ BASIC, ADVANCED, EXPERIMENTAL = Group("basic"), Group("advanced"), Group("experi
 
 
 @dataclass(frozen=True)
-class PartOf:
+class PartialOf:
     """Mark of a nested mapping that has some of the fields of a model; its schema is the model's.
 
     Attributes:
@@ -132,14 +132,14 @@ DatasetFolder = Annotated[Path | None, Spelling(("--dataset",), metavar="FOLDER"
 """The folder of a run's photographs; a job that needs them has its own."""
 
 
-def named_files(options: BaseModel) -> Iterator[tuple[str, Path]]:
+def iter_named_files(options: BaseModel) -> Iterator[tuple[str, Path]]:
     """Yield each file that the options name, after the place where they do, with dots."""
     for name, info in type(options).model_fields.items():
         annotation = Annotated[info.annotation, *info.metadata] if info.metadata else info.annotation
         yield from _files_in(annotation, getattr(options, name), name)
 
 
-def takes_files(model: type[BaseModel]) -> bool:
+def accepts_files(model: type[BaseModel]) -> bool:
     """Return whether options of this class can name files."""
     return any(
         _has_files(Annotated[info.annotation, *info.metadata] if info.metadata else info.annotation)

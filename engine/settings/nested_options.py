@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from typing import Any
 
 
-def merged(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
+def merge_options(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
     """Return ``base`` with the values of ``over``, section by section; another kind of section begins anew.
 
     >>> merged({"rates": {"quat": 1, "mean": 2}}, {"rates": {"quat": 3}})
@@ -15,7 +15,7 @@ def merged(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
         old = result.get(key)
         if isinstance(old, Mapping) and isinstance(value, Mapping):
             is_same = "kind" not in old or value.get("kind", old["kind"]) == old["kind"]
-            result[key] = merged(old, value) if is_same else value
+            result[key] = merge_options(old, value) if is_same else value
         else:
             result[key] = value
     return result

@@ -39,7 +39,7 @@ class SettingsRefused(ConfigError):
         self.refusals = tuple(refusals)
 
 
-def refusals_of(error: ValidationError, model: type[BaseModel]) -> list[Refusal]:
+def refusals_from(error: ValidationError, model: type[BaseModel]) -> list[Refusal]:
     """Return what a validation by ``model`` refused, each setting once, in order."""
     found: dict[tuple[str | int, ...], Refusal] = {}
     for fault in error.errors(include_url=False):
@@ -52,7 +52,7 @@ def refusals_of(error: ValidationError, model: type[BaseModel]) -> list[Refusal]
     return list(found.values())
 
 
-def unknown_setting(
+def refuse_unknown_setting(
     path: Sequence[str | int],
     known: Iterable[str],
     of_kind: str = "",
@@ -110,7 +110,7 @@ def _unknown(model: type[BaseModel], place: Sequence[str | int]) -> Refusal:
         models = tuple(inner for inner in models if inner.model_fields["kind"].default == kind)
     prefix = f"{setting_name(path)}." if path else ""
     known = [f"{prefix}{name}" for inner in models for name in inner.model_fields]
-    return unknown_setting((*path, place[-1]), known, kind)
+    return refuse_unknown_setting((*path, place[-1]), known, kind)
 
 
 def _path_in(

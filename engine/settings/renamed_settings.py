@@ -1,6 +1,6 @@
 """Settings and options that had other names in the last version, which this version still reads.
 
-A model names its part of the tables as ``former_names``; :func:`with_new_names` is the only reader of them.
+A model names its part of the tables as ``former_names``; :func:`translate_names` is the only reader of them.
 The next version drops this module.
 """
 
@@ -131,7 +131,7 @@ def former_names(model: type[BaseModel]) -> FormerNames:
     return found
 
 
-def with_new_names(
+def translate_names(
     models: Iterable[type[BaseModel]], values: Mapping[str, Any], prefix: str = "", source: str = ""
 ) -> dict[str, Any]:
     """Return nested values by the names of this version, and tell which had those of the last one.
@@ -147,11 +147,11 @@ def with_new_names(
     renamed: dict[str, str] = {}
     result = _renamed(tuple(models), values, prefix, prefix, renamed)
     if renamed:
-        tell_renamed(renamed, source)
+        notify_renamed(renamed, source)
     return result
 
 
-def tell_renamed(renamed: Mapping[str, str], source: str = "") -> None:
+def notify_renamed(renamed: Mapping[str, str], source: str = "") -> None:
     """Tell that names of the last version were read: a warning, or a notice where those are collected."""
     shown = list(renamed.items())[:_SHOWN]
     told = ", ".join(f"{old} is called {new} now" for old, new in shown)
@@ -165,7 +165,7 @@ def tell_renamed(renamed: Mapping[str, str], source: str = "") -> None:
 
 
 @contextmanager
-def collected_notices() -> Iterator[list[str]]:
+def collect_notices() -> Iterator[list[str]]:
     """Yield a list to which notices go instead of being warnings, for answers that carry them."""
     notices: list[str] = []
     token = _collected.set(notices)

@@ -8,15 +8,15 @@ from jaxtyping import Float, Float32, Float64, Int64
 from octasplat.engine.core.rays import RayBatch
 from octasplat.engine.gaussians.frames import rotation_matrices
 from octasplat.engine.gaussians.model import FlatGaussians
-from octasplat.engine.shading.gbuffer import Leaving
+from octasplat.engine.shading.gbuffer import RayOffset
 from octasplat.engine.trace.protocol import Tracer
 
 _GOLDEN_ANGLE = np.pi * (3.0 - np.sqrt(5.0))
-RAYS_AT_ONCE = 1 << 18
-OPEN = 0.98
+MAX_RAYS_PER_TRACE = 1 << 18
+UNOCCLUDED = 0.98
 """Share of the light from all around from which on nothing else is asked for."""
 
-Radiance = Callable[[RayBatch], Float64[np.ndarray, "r 3"]]
+RadianceFn = Callable[[RayBatch], Float64[np.ndarray, "r 3"]]
 """Linear radiance of what rays meet, times the share of it that hides the rest."""
 
 
@@ -26,8 +26,8 @@ def ambient_visibility(
     tracer: Tracer,
     *,
     rays: int,
-    leaving: Leaving,
-    sided: bool = False,
+    offset: RayOffset,
+    one_sided: bool = False,
 ) -> tuple[Float32[np.ndarray, " u"], Float32[np.ndarray, " u"]]:
     """Mean transmittance over the hemisphere, weighted by the cosine, of the outer side.
 
@@ -39,29 +39,29 @@ def ambient_visibility(
         ids: which of them.
         tracer: built around all of them.
         rays: for each side of each.
-        leaving: how rays leave it.
-        sided: whether normals point outwards.
+        offset: how rays leave it.
+        one_sided: whether normals point outwards.
 
     Returns:
         That, and the side: 1 where the normal looks, else -1.
     """
-    sides = [1.0] if sided else [1.0, -1.0]
+    sides = [1.0] if one_sided else [1.0, -1.0]
     seen = np.empty((len(sides), len(ids)), np.float32)
-    for part in _parts(len(ids), rays):
+    for part in _ray_chunks(len(ids), rays):
         for number, side in enumerate(sides):
-            fan = _fan_rays(gaussians, ids[part], np.full(len(ids[part]), side), rays, leaving)
+            fan = _hemisphere_rays(gaussians, ids[part], np.full(len(ids[part]), side), rays, offset)
             seen[number, part] = tracer.transmittance(fan).reshape(-1, rays).mean(axis=1)
     return seen.max(axis=0), np.array(sides, np.float32)[seen.argmax(axis=0)]
 
 
-def bounced_light(
+def diffuse_interreflection(
     gaussians: FlatGaussians,
     ids: Int64[np.ndarray, " u"],
     side: Float32[np.ndarray, " u"],
-    radiance: Radiance,
+    radiance: RadianceFn,
     *,
     rays: int,
-    leaving: Leaving,
+    offset: RayOffset,
 ) -> Float32[np.ndarray, "u 3"]:
     """Irradiance over pi that the other Gaussians send to one side of each: the mean over the same rays.
 
@@ -71,37 +71,37 @@ def bounced_light(
         side: of :func:`ambient_visibility`.
         radiance: what comes from where it is not clear.
         rays: for each.
-        leaving: how rays leave it.
+        offset: how rays leave it.
     """
     out = np.empty((len(ids), 3), np.float32)
-    for part in _parts(len(ids), rays):
-        light = radiance(_fan_rays(gaussians, ids[part], side[part], rays, leaving))
+    for part in _ray_chunks(len(ids), rays):
+        light = radiance(_hemisphere_rays(gaussians, ids[part], side[part], rays, offset))
         out[part] = light.reshape(-1, rays, 3).mean(axis=1)
     return out
 
 
-def _parts(count: int, rays: int) -> list[slice]:
-    step = max(1, RAYS_AT_ONCE // rays)
+def _ray_chunks(count: int, rays: int) -> list[slice]:
+    step = max(1, MAX_RAYS_PER_TRACE // rays)
     return [slice(first, first + step) for first in range(0, count, step)]
 
 
-def _fan_rays(
+def _hemisphere_rays(
     gaussians: FlatGaussians,
     ids: Int64[np.ndarray, " u"],
     side: Float[np.ndarray, " u"],
     rays: int,
-    leaving: Leaving,
+    offset: RayOffset,
 ) -> RayBatch:
     """The fan over one side of each, begun a little above."""
     frames = rotation_matrices(gaussians.quats_wxyz[ids])
     frames = frames * np.stack([side, np.ones_like(side), np.ones_like(side)], axis=1)[:, None, :]
-    ways = np.einsum("nij,kj->nki", frames, cosine_fan(rays))
-    starts = np.repeat(gaussians.means_world[ids] + leaving.gap_world * frames[:, :, 0], rays, axis=0)
-    reaches = np.repeat(np.where(side > 0, leaving.reach_world, 0.0), rays)
-    return RayBatch(starts, ways.reshape(-1, 3), leaving.gap_world, t_leaves=reaches)
+    ways = np.einsum("nij,kj->nki", frames, cosine_hemisphere(rays))
+    starts = np.repeat(gaussians.means_world[ids] + offset.bias_world * frames[:, :, 0], rays, axis=0)
+    reaches = np.repeat(np.where(side > 0, offset.backface_cull_world, 0.0), rays)
+    return RayBatch(starts, ways.reshape(-1, 3), offset.bias_world, t_backface_cull=reaches)
 
 
-def cosine_fan(rays: int) -> Float64[np.ndarray, "k 3"]:
+def cosine_hemisphere(rays: int) -> Float64[np.ndarray, "k 3"]:
     """Directions about the first axis, as dense as the cosine to it; the same each time."""
     square = (np.arange(rays) + 0.5) / rays
     angle = _GOLDEN_ANGLE * np.arange(rays)

@@ -13,22 +13,22 @@ from jaxtyping import Float32, Float64, Int64
 from octasplat.engine.core.compilation import run_ranges
 from octasplat.engine.core.threads import threads_in_use
 from octasplat.engine.gaussians.model import FlatGaussians
-from octasplat.engine.shading.adam_map import adam_change, unevenness
+from octasplat.engine.shading.adam_map import adam_update, smoothness_gradient
 from octasplat.engine.shading.environment_frame import environment_frame
 from octasplat.engine.shading.environment_levels import solid_angles
 from octasplat.engine.shading.kernels.environment_map import add_to_texels, map_colours
-from octasplat.engine.shading.plain import PLAIN
-from octasplat.engine.shading.protocol import Developed, Reversed, ShadingModel, Sight
+from octasplat.engine.shading.plain import PLAIN_SHADING
+from octasplat.engine.shading.protocol import ShadedRays, ShadingGradients, ShadingModel, TracedRays
 from octasplat.engine.trace.protocol import GaussianGradients, Tracer
 
 UP_WORLD = (0.0, -1.0, 0.0)
 """Up in maps, about right for most worlds that COLMAP makes; it only says how the picture of a map lies."""
-EVERY = 8
+STEP_INTERVAL = 8
 """Iterations between two steps, each for the gradients of all of them: a map has more texels than rays."""
 _STATE = ("rgb_srgb", "first", "second", "sums", "steps")
 
 
-class LearntBackground:
+class LearnedBackground:
     """Puts a map behind what another model develops.
 
     Follows :class:`octasplat.engine.shading.protocol.ShadingModel`.
@@ -37,7 +37,7 @@ class LearntBackground:
         height: texels from up to down; there are twice as many around.
         rate: size of a step at the beginning, display values.
         decay: what is left of that at the end; it falls exponentially.
-        even_weight: of differences between neighbouring texels.
+        smoothness_weight: of differences between neighbouring texels.
         inner: the model that develops what is nearer.
 
     Attributes:
@@ -57,8 +57,8 @@ class LearntBackground:
         *,
         rate: float = 0.0,
         decay: float = 1.0,
-        even_weight: float = 0.0,
-        inner: ShadingModel = PLAIN,
+        smoothness_weight: float = 0.0,
+        inner: ShadingModel = PLAIN_SHADING,
     ) -> None:
         shape = (height, 2 * height, 3)
         self.rgb_srgb: Float32[np.ndarray, "h w 3"] = np.full(shape, 0.5, np.float32)
@@ -69,22 +69,24 @@ class LearntBackground:
         self.frame: Float64[np.ndarray, "3 3"] = environment_frame(np.array(UP_WORLD))
         self._rate = rate
         self._decay = decay
-        self._even_weight = even_weight
+        self._smoothness_weight = smoothness_weight
         self.inner = inner
 
     @classmethod
-    def of(cls, rgb_srgb: Float32[np.ndarray, "h w 3"], inner: ShadingModel = PLAIN) -> "LearntBackground":
+    def from_map(
+        cls, rgb_srgb: Float32[np.ndarray, "h w 3"], inner: ShadingModel = PLAIN_SHADING
+    ) -> "LearnedBackground":
         """A finished map behind a model."""
         background = cls(len(rgb_srgb), inner=inner)
-        background.put(rgb_srgb)
+        background.set_map(rgb_srgb)
         return background
 
-    def put(self, rgb_srgb: Float32[np.ndarray, "h w 3"]) -> None:
+    def set_map(self, rgb_srgb: Float32[np.ndarray, "h w 3"]) -> None:
         """Take another map of this size instead."""
         assert rgb_srgb.shape == self.rgb_srgb.shape, "a map of another size"
         self.rgb_srgb = np.clip(rgb_srgb, 0, 1).astype(np.float32)
 
-    def colours(self, directions_world: Float32[np.ndarray, "r 3"]) -> Float32[np.ndarray, "r 3"]:
+    def lookup(self, directions_world: Float32[np.ndarray, "r 3"]) -> Float32[np.ndarray, "r 3"]:
         """Display colours of unit directions, bilinear between texels."""
         height = len(self.rgb_srgb)
         colours = np.empty((len(directions_world), 3), np.float32)
@@ -98,37 +100,37 @@ class LearntBackground:
         """Those of the model inside."""
         return self.inner.features(gaussians)
 
-    def settle(self, gaussians: FlatGaussians, tracer: Tracer, *, progress: float) -> None:
+    def on_rebuild(self, gaussians: FlatGaussians, tracer: Tracer, *, training_progress: float) -> None:
         """The model inside looks around."""
-        self.inner.settle(gaussians, tracer, progress=progress)
+        self.inner.on_rebuild(gaussians, tracer, training_progress=training_progress)
 
-    def develop(self, sight: Sight) -> Developed:
+    def shade(self, traced: TracedRays) -> ShadedRays:
         """The colours of the model inside, with the map's where they let it through; nothing is left open."""
-        inner = self.inner.develop(sight)
-        behind = self.colours(sight.rays.directions_world)
+        inner = self.inner.shade(traced)
+        behind = self.lookup(traced.rays.directions_world)
         rgb = inner.rgb_srgb + inner.transmittance[:, None] * behind
-        return Developed(rgb, np.zeros_like(inner.transmittance), (inner, behind), inner.layers)
+        return ShadedRays(rgb, np.zeros_like(inner.transmittance), (inner, behind), inner.layers)
 
-    def reverse(
+    def backward(
         self,
-        sight: Sight,
-        developed: Developed,
+        traced: TracedRays,
+        shaded: ShadedRays,
         by_rgb: Float32[np.ndarray, "r 3"],
         by_transmittance: Float32[np.ndarray, " r"],
-    ) -> Reversed:
+    ) -> ShadingGradients:
         """Gradients by what the model inside developed, and by the map's colours in the rays' directions."""
-        assert isinstance(developed.kept, tuple)
-        inner, behind = developed.kept
+        assert isinstance(shaded.ctx, tuple)
+        inner, behind = shaded.ctx
         through = (by_rgb * behind).sum(axis=1, dtype=np.float32)
-        below = self.inner.reverse(sight, inner, by_rgb, through)
+        below = self.inner.backward(traced, inner, by_rgb, through)
         own = {
-            "background.directions": sight.rays.directions_world,
+            "background.directions": traced.rays.directions_world,
             "background.by_colours": inner.transmittance[:, None] * by_rgb,
         }
-        return Reversed(below.seen, below.further, {**below.parameters, **own})
+        return ShadingGradients(below.trace, below.recorded_traces, {**below.parameters, **own})
 
-    def add(self, parameters: Mapping[str, np.ndarray]) -> None:
-        """Add what :meth:`reverse` found to the sums over the texels."""
+    def accumulate(self, parameters: Mapping[str, np.ndarray]) -> None:
+        """Add what :meth:`backward` found to the sums over the texels."""
         add_to_texels(
             self.rgb_srgb.reshape(-1, 3),
             len(self.sums),
@@ -144,20 +146,22 @@ class LearntBackground:
         gradients: GaussianGradients,
         parameters: Mapping[str, np.ndarray],
         *,
-        progress: float,
+        training_progress: float,
     ) -> None:
         """Count an iteration, and take a step of Adam if it is time; colours stay what a screen can show."""
-        self.inner.step(gaussians, gradients, parameters, progress=progress)
-        self.add(parameters)
+        self.inner.step(gaussians, gradients, parameters, training_progress=training_progress)
+        self.accumulate(parameters)
         self.steps += 1
-        if self.steps[0] % EVERY:
+        if self.steps[0] % STEP_INTERVAL:
             return
         shares = solid_angles(len(self.sums))[:, None, None] / (4 * np.pi)
-        gradient = self.sums / EVERY + self._even_weight * shares * unevenness(self.rgb_srgb)
+        gradient = self.sums / STEP_INTERVAL + self._smoothness_weight * shares * smoothness_gradient(
+            self.rgb_srgb
+        )
         self.sums[:] = 0
-        count = int(self.steps[0]) // EVERY
-        self.first, self.second, change = adam_change(self.first, self.second, gradient, count)
-        rate = self._rate * self._decay**progress
+        count = int(self.steps[0]) // STEP_INTERVAL
+        self.first, self.second, change = adam_update(self.first, self.second, gradient, count)
+        rate = self._rate * self._decay**training_progress
         self.rgb_srgb = np.clip(self.rgb_srgb - rate * change, 0, 1).astype(np.float32)
 
     def state(self) -> dict[str, np.ndarray]:

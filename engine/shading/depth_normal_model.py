@@ -11,12 +11,12 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float32
 
-from octasplat.engine.shading.geometry_losses import depth_normal_term
-from octasplat.engine.shading.plain import Plain
-from octasplat.engine.shading.protocol import Developed, Reversed, Sight
+from octasplat.engine.shading.geometry_losses import add_depth_normal_gradient
+from octasplat.engine.shading.plain import PlainShading
+from octasplat.engine.shading.protocol import ShadedRays, ShadingGradients, TracedRays
 
 
-class Flattening(Plain):
+class DepthNormalShading(PlainShading):
     """Develops as the plain model, and holds normals and depths together.
 
     The term is one minus the cosine between a ray's blended normal and that of the points of three
@@ -31,22 +31,22 @@ class Flattening(Plain):
     def __init__(self, weight: float) -> None:
         self._weight = weight
 
-    def reverse(
+    def backward(
         self,
-        sight: Sight,
-        developed: Developed,
+        traced: TracedRays,
+        shaded: ShadedRays,
         by_rgb: Float32[np.ndarray, "r 3"],
         by_transmittance: Float32[np.ndarray, " r"],
-    ) -> Reversed:
+    ) -> ShadingGradients:
         """The gradients of the plain model, and those of the term by alphas, depths and normals."""
-        plain = super().reverse(sight, developed, by_rgb, by_transmittance)
+        plain = super().backward(traced, shaded, by_rgb, by_transmittance)
         count = len(by_rgb)
         by_alpha, by_normal, by_depth = np.zeros(count), np.zeros((count, 3)), np.zeros(count)
-        depth_normal_term(sight, self._weight, by_alpha, by_normal, by_depth)
+        add_depth_normal_gradient(traced, self._weight, by_alpha, by_normal, by_depth)
         seen = replace(
-            plain.seen,
+            plain.trace,
             transmittance=(by_transmittance - by_alpha).astype(np.float32),
             depth_sum=by_depth.astype(np.float32),
             normal_world=by_normal.astype(np.float32),
         )
-        return replace(plain, seen=seen)
+        return replace(plain, trace=seen)

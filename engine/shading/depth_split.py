@@ -11,90 +11,92 @@ from dataclasses import dataclass, field, fields
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int64, Shaped
 
-from octasplat.engine.core.rays import RayBatch, joined
+from octasplat.engine.core.rays import RayBatch, concatenate_rays
 from octasplat.engine.trace.protocol import Recording, TraceGradients, Tracer, TraceResult
 
-LEAST_SHARE = 0.05
+MIN_FRACTION = 0.05
 """Of the light of a ray that each of two surfaces takes at least."""
 
 
 @dataclass(frozen=True)
-class Parted:
+class DepthSplit:
     """What rays show, one surface at a time: ``l`` parts of ``r`` rays.
 
-    The first ``r`` parts are the rays as they were, those of ``two`` without their front; then come the
+    The first ``r`` parts are the rays as they were, those of ``split_ids`` without their front; then come the
     fronts. The transmittance of a part is one minus what it adds to the ray's accumulated alpha.
 
     Attributes:
         rays: of the parts.
-        seen: by each part alone.
-        two: numbers of the rays that show two surfaces.
+        results: by each part alone.
+        split_ids: numbers of the rays that show two surfaces.
         front: recording of what was traced for the fronts; None if nothing was, or nothing is recorded.
         traced: which of that are fronts; the others turned out to show one surface.
     """
 
     rays: RayBatch
-    seen: TraceResult
-    two: Int64[np.ndarray, " f"]
+    results: TraceResult
+    split_ids: Int64[np.ndarray, " f"]
     front: Recording | None = None
     traced: Bool[np.ndarray, " t"] = field(default_factory=lambda: np.zeros(0, bool))
 
-    def joined(self, values: Float[np.ndarray, "l c"]) -> Float[np.ndarray, "r c"]:
+    def sum_layers(self, values: Float[np.ndarray, "l c"]) -> Float[np.ndarray, "r c"]:
         """Sums over the parts of each ray."""
-        count = len(values) - len(self.two)
+        count = len(values) - len(self.split_ids)
         out = values[:count].copy()
-        out[self.two] += values[count:]
+        out[self.split_ids] += values[count:]
         return out
 
-    def each(self, values: Shaped[np.ndarray, "r *c"]) -> Shaped[np.ndarray, "l *c"]:
+    def expand(self, values: Shaped[np.ndarray, "r *c"]) -> Shaped[np.ndarray, "l *c"]:
         """The value of its ray for each part."""
-        return np.concatenate([values, values[self.two]]) if len(self.two) else values
+        return np.concatenate([values, values[self.split_ids]]) if len(self.split_ids) else values
 
-    def back(
-        self, by_parts: TraceGradients
+    def backward(
+        self, by_layers: TraceGradients
     ) -> tuple[TraceGradients, tuple[tuple[Recording, TraceGradients], ...]]:
         """Gradients by the whole rays and by the fronts, from those by the parts."""
-        if not len(self.two):
-            return by_parts, ()
-        count = len(by_parts.rgb_srgb) - len(self.two)
+        if not len(self.split_ids):
+            return by_layers, ()
+        count = len(by_layers.rgb_srgb) - len(self.split_ids)
         of_rays, of_fronts = {}, {}
         for name in (entry.name for entry in fields(TraceGradients)):
-            value = getattr(by_parts, name)
+            value = getattr(by_layers, name)
             if value is not None:
                 of_rays[name] = value[:count]
                 of_fronts[name] = np.zeros((len(self.traced), *value.shape[1:]), value.dtype)
-                of_fronts[name][self.traced] = value[count:] - value[self.two]
+                of_fronts[name][self.traced] = value[count:] - value[self.split_ids]
         fronts = () if self.front is None else ((self.front, TraceGradients(**of_fronts)),)
         return TraceGradients(**of_rays), fronts
 
 
-def whole(rays: RayBatch, seen: TraceResult) -> Parted:
+def no_split(rays: RayBatch, result: TraceResult) -> DepthSplit:
     """Rays as they are."""
-    return Parted(rays, seen, np.empty(0, np.int64))
+    return DepthSplit(rays, result, np.empty(0, np.int64))
 
 
-def part(rays: RayBatch, seen: TraceResult, tracer: Tracer, *, apart_world: float, record: bool) -> Parted:
-    """Part the rays whose mean depth is farther than ``apart_world`` from the median.
+def split_by_depth(
+    rays: RayBatch, result: TraceResult, tracer: Tracer, *, min_separation_world: float, record: bool
+) -> DepthSplit:
+    """Part the rays whose mean depth is farther than ``min_separation_world`` from the median.
 
     Args:
         rays: with unit directions.
-        seen: along them.
+        result: along them.
         tracer: that saw it.
-        apart_world: see there.
+        min_separation_world: see there.
         record: whether there will be a way back.
     """
-    mean = seen.expected_depth
-    far = (np.abs(mean - seen.depth_median) > apart_world) & (seen.depth_median > 0)
+    mean = result.expected_depth
+    far = (np.abs(mean - result.depth_median) > min_separation_world) & (result.depth_median > 0)
     two = np.flatnonzero(far)
     if not len(two):
-        return whole(rays, seen)
+        return no_split(rays, result)
     ends = np.minimum(np.broadcast_to(rays.t_max, len(rays))[two], mean[two])
-    front_rays = rays[two].up_to(ends)
+    front_rays = rays[two].with_t_max(ends)
     front = tracer.trace(front_rays, record=record)
-    kept = (front.alpha > LEAST_SHARE) & (seen.alpha[two] - front.alpha > LEAST_SHARE)
+    kept = (front.alpha > MIN_FRACTION) & (result.alpha[two] - front.alpha > MIN_FRACTION)
     two = two[kept]
     if not len(two):
-        return whole(rays, seen)
+        return no_split(rays, result)
 
     def divided(sums: Float32[np.ndarray, "r *c"], ahead: Float32[np.ndarray, "t *c"]) -> np.ndarray:
         rest = sums.copy()
@@ -105,12 +107,12 @@ def part(rays: RayBatch, seen: TraceResult, tracer: Tracer, *, apart_world: floa
         return np.concatenate([values, ahead[kept]])
 
     parts = TraceResult(
-        rgb_srgb=divided(seen.rgb_srgb, front.rgb_srgb),
-        transmittance=1 - divided(seen.alpha, front.alpha),
-        depth_sum=divided(seen.depth_sum, front.depth_sum),
-        depth_median=listed(seen.depth_median, front.depth_median),
-        normal_world=divided(seen.normal_world, front.normal_world),
-        features=divided(seen.features, front.features),
-        hit_counts=listed(seen.hit_counts, front.hit_counts),
+        rgb_srgb=divided(result.rgb_srgb, front.rgb_srgb),
+        transmittance=1 - divided(result.alpha, front.alpha),
+        depth_sum=divided(result.depth_sum, front.depth_sum),
+        depth_median=listed(result.depth_median, front.depth_median),
+        normal_world=divided(result.normal_world, front.normal_world),
+        features=divided(result.features, front.features),
+        hit_counts=listed(result.hit_counts, front.hit_counts),
     )
-    return Parted(joined(rays, front_rays[kept]), parts, two, front.recording, kept)
+    return DepthSplit(concatenate_rays(rays, front_rays[kept]), parts, two, front.recording, kept)

@@ -14,7 +14,7 @@ from scipy.sparse import csr_matrix
 from octasplat.engine.core.compilation import run_ranges
 from octasplat.engine.core.errors import ConfigError
 from octasplat.engine.core.threads import threads_in_use
-from octasplat.engine.shading.kernels.environment_levels import LightLevels, lobe_rows, sparse_product
+from octasplat.engine.shading.kernels.environment_levels import EnvironmentLevels, lobe_rows, sparse_product
 
 ROUGHNESSES = (0.05, 0.15, 0.3, 0.5, 0.75, 1.0)
 """Perceptual roughness of each level; the first is the map itself."""
@@ -23,31 +23,31 @@ _SOURCES = (0, 1, 2, 2, 3, 3, 3)
 """How often each level, and the map that it is made from, is halved; the last is the irradiance."""
 _LEAST = (0.0, 3e-3, 3e-3, 1e-3, 1e-3, 1e-3, 0.0)
 """Share of a lobe's largest weight below which a texel is left out."""
-LEAST_HEIGHT = 16
+MIN_HEIGHT = 16
 
 
 @dataclass(frozen=True)
-class _Rows:
+class _SparseRows:
     starts: Int64[np.ndarray, " r1"]
     columns: Int32[np.ndarray, " k"]
     weights: Float32[np.ndarray, " k"]
 
-    def times(self, values: Float[np.ndarray, "c 3"], out: Float[np.ndarray, "r 3"]) -> None:
+    def multiply(self, values: Float[np.ndarray, "c 3"], out: Float[np.ndarray, "r 3"]) -> None:
         run_ranges(
             sparse_product, threads_in_use(), len(self.starts) - 1,
             self.starts, self.columns, self.weights, values, out,
         )  # fmt: skip
 
-    def transposed(self, columns: int) -> "_Rows":
+    def transpose(self, columns: int) -> "_SparseRows":
         shape = (len(self.starts) - 1, columns)
         turned = csr_matrix((self.weights, self.columns, self.starts), shape).T.tocsr()
         turned.sort_indices()
-        return _Rows(
+        return _SparseRows(
             turned.indptr.astype(np.int64), turned.indices.astype(np.int32), turned.data.astype(np.float32)
         )
 
 
-class Prefilter:
+class EnvironmentPrefilter:
     """The linear maps for an environment of ``height`` x 2 ``height`` texels.
 
     Raises:
@@ -55,52 +55,52 @@ class Prefilter:
     """
 
     def __init__(self, height: int) -> None:
-        if height % 8 or height < LEAST_HEIGHT:
+        if height % 8 or height < MIN_HEIGHT:
             raise ConfigError(f"An environment has {height} rows; make that a multiple of 8, 16 at least.")
         self.height = height
         self.heights = np.array([height >> halving for halving in _HALVINGS], np.int64)
         self.offsets = np.concatenate([[0], np.cumsum(2 * self.heights**2)])
-        self._maps: list[_Rows] = []
+        self._maps: list[_SparseRows] = []
         for level in range(1, len(_HALVINGS)):
             alpha = ROUGHNESSES[level] ** 2 if level < len(ROUGHNESSES) else -1.0
             source = height >> _SOURCES[level]
-            self._maps.append(_lobes(int(self.heights[level]), source, alpha, _LEAST[level]))
+            self._maps.append(_lobe_matrix(int(self.heights[level]), source, alpha, _LEAST[level]))
 
     @cached_property
-    def _turned(self) -> list[_Rows]:
+    def _turned(self) -> list[_SparseRows]:
         """The transposes, which only those need who learn."""
         sources = [self.height >> halving for halving in _SOURCES[1:]]
-        return [rows.transposed(2 * s * s) for rows, s in zip(self._maps, sources, strict=True)]
+        return [rows.transpose(2 * s * s) for rows, s in zip(self._maps, sources, strict=True)]
 
-    def levels(self, radiance_linear: Float[np.ndarray, "h w 3"]) -> LightLevels:
+    def levels(self, radiance_linear: Float[np.ndarray, "h w 3"]) -> EnvironmentLevels:
         """All levels of an environment."""
         texels = np.empty((int(self.offsets[-1]), 3), np.float32)
         halved = [np.ascontiguousarray(radiance_linear.reshape(-1, 3), np.float32)]
         for _ in range(max(_SOURCES)):
-            halved.append(_halved(halved[-1]))
+            halved.append(_halve(halved[-1]))
         texels[: self.offsets[1]] = halved[0]
         for level, rows in enumerate(self._maps, start=1):
-            rows.times(halved[_SOURCES[level]], texels[self.offsets[level] : self.offsets[level + 1]])
-        return LightLevels(texels, self.offsets[:-1], self.heights, np.array(ROUGHNESSES))
+            rows.multiply(halved[_SOURCES[level]], texels[self.offsets[level] : self.offsets[level + 1]])
+        return EnvironmentLevels(texels, self.offsets[:-1], self.heights, np.array(ROUGHNESSES))
 
-    def transposed(self, by_texels: Float64[np.ndarray, "t 3"]) -> Float64[np.ndarray, "h w 3"]:
+    def backward(self, by_texels: Float64[np.ndarray, "t 3"]) -> Float64[np.ndarray, "h w 3"]:
         """Gradients by the environment's texels from those by the texels of all its levels."""
         sizes = [2 * (self.height >> halving) ** 2 for halving in range(max(_SOURCES) + 1)]
         sums = [np.zeros((size, 3)) for size in sizes]
         sums[0] += by_texels[: self.offsets[1]]
         for level, turned in enumerate(self._turned, start=1):
             part = np.empty_like(sums[_SOURCES[level]])
-            turned.times(by_texels[self.offsets[level] : self.offsets[level + 1]], part)
+            turned.multiply(by_texels[self.offsets[level] : self.offsets[level + 1]], part)
             sums[_SOURCES[level]] += part
         for halving in range(max(_SOURCES), 0, -1):
-            sums[halving - 1] += _doubled(sums[halving])
+            sums[halving - 1] += _halve_backward(sums[halving])
         return sums[0].reshape(self.height, 2 * self.height, 3)
 
 
 @lru_cache(maxsize=4)
-def prefilter(height: int) -> Prefilter:
+def prefilter_for(height: int) -> EnvironmentPrefilter:
     """The maps for environments of so many rows, made once."""
-    return Prefilter(height)
+    return EnvironmentPrefilter(height)
 
 
 def solid_angles(height: int) -> Float64[np.ndarray, " h"]:
@@ -109,48 +109,50 @@ def solid_angles(height: int) -> Float64[np.ndarray, " h"]:
     return (edges[:-1] - edges[1:]) * np.pi / height
 
 
-def resampled(radiance_linear: Float[np.ndarray, "h w 3"], height: int) -> Float32[np.ndarray, "a b 3"]:
+def resample_environment(
+    radiance_linear: Float[np.ndarray, "h w 3"], height: int
+) -> Float32[np.ndarray, "a b 3"]:
     """An environment in ``height`` x 2 ``height`` texels: means by solid angle where they are fewer."""
     rows, columns = radiance_linear.shape[:2]
     if (rows, columns) == (height, 2 * height):
         return radiance_linear.astype(np.float32)
     angles = solid_angles(rows)
-    down = _overlaps(rows, height) * angles
+    down = _interval_overlaps(rows, height) * angles
     down /= down.sum(axis=1, keepdims=True)
-    across = _overlaps(columns, 2 * height)
+    across = _interval_overlaps(columns, 2 * height)
     across /= across.sum(axis=1, keepdims=True)
     return np.einsum("ai,bj,ijc->abc", down, across, radiance_linear, optimize=True).astype(np.float32)
 
 
-def _overlaps(old: int, new: int) -> Float64[np.ndarray, "n o"]:
+def _interval_overlaps(old: int, new: int) -> Float64[np.ndarray, "n o"]:
     """How much of each old cell lies in each new one, where both divide the same length."""
     low = np.maximum(np.arange(new)[:, None] / new, np.arange(old) / old)
     high = np.minimum(np.arange(1, new + 1)[:, None] / new, np.arange(1, old + 1) / old)
     return np.maximum(high - low, 0.0)
 
 
-def _shares(height: int) -> Float64[np.ndarray, "h2 2"]:
+def _row_fractions(height: int) -> Float64[np.ndarray, "h2 2"]:
     """Share of the upper and of the lower row in each pair of them."""
     angles = solid_angles(height).reshape(-1, 2)
     return angles / angles.sum(axis=1, keepdims=True)
 
 
-def _halved(texels: Float[np.ndarray, "t 3"]) -> Float[np.ndarray, "s 3"]:
+def _halve(texels: Float[np.ndarray, "t 3"]) -> Float[np.ndarray, "s 3"]:
     height = int(np.sqrt(len(texels) // 2))
     pairs = texels.reshape(height // 2, 2, height, 2, 3).mean(axis=3)
-    shares = _shares(height)
+    shares = _row_fractions(height)
     mixed = pairs[:, 0] * shares[:, :1, None] + pairs[:, 1] * shares[:, 1:, None]
     return mixed.reshape(-1, 3).astype(texels.dtype)
 
 
-def _doubled(gradients: Float64[np.ndarray, "s 3"]) -> Float64[np.ndarray, "t 3"]:
-    """The transpose of :func:`_halved`."""
+def _halve_backward(gradients: Float64[np.ndarray, "s 3"]) -> Float64[np.ndarray, "t 3"]:
+    """The transpose of :func:`_halve`."""
     half = int(np.sqrt(len(gradients) // 2))
-    rows = gradients.reshape(half, 1, 2 * half, 1, 3) * (_shares(2 * half) / 2)[:, :, None, None, None]
+    rows = gradients.reshape(half, 1, 2 * half, 1, 3) * (_row_fractions(2 * half) / 2)[:, :, None, None, None]
     return np.broadcast_to(rows, (half, 2, 2 * half, 2, 3)).reshape(-1, 3)
 
 
-def _lobes(height: int, source: int, alpha: float, least: float) -> _Rows:
+def _lobe_matrix(height: int, source: int, alpha: float, least: float) -> _SparseRows:
     starts = np.empty(2 * height * height + 1, np.int64)
     nothing = np.empty(0, np.int32), np.empty(0, np.float32)
     lobe = (height, source, alpha, least, starts)
@@ -159,4 +161,4 @@ def _lobes(height: int, source: int, alpha: float, least: float) -> _Rows:
     np.cumsum(starts, out=starts)
     columns, weights = np.empty(starts[-1], np.int32), np.empty(starts[-1], np.float32)
     run_ranges(lobe_rows, threads_in_use(), len(starts) - 1, *lobe, columns, weights, False)
-    return _Rows(starts, columns, weights)
+    return _SparseRows(starts, columns, weights)

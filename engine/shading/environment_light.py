@@ -5,17 +5,17 @@ from collections.abc import Mapping
 import numpy as np
 from jaxtyping import Float32, Float64, Int64
 
-from octasplat.engine.shading.adam_map import adam_change, unevenness
-from octasplat.engine.shading.environment_levels import prefilter, resampled, solid_angles
-from octasplat.engine.shading.kernels.environment_levels import LightLevels
+from octasplat.engine.shading.adam_map import adam_update, smoothness_gradient
+from octasplat.engine.shading.environment_levels import prefilter_for, resample_environment, solid_angles
+from octasplat.engine.shading.kernels.environment_levels import EnvironmentLevels
 from octasplat.engine.shading.material_settings import ENVIRONMENT_EVERY
 
-FIRST_RADIANCE = 0.5
+INITIAL_RADIANCE = 0.5
 _DARKEST, _BRIGHTEST = np.log(1e-4), np.log(1e4)
 _STATE = ("log_radiance", "first", "second", "sums", "steps")
 
 
-class LearntLight:
+class EnvironmentLight:
     """The environment of a scene.
 
     It takes a step only every few iterations, for the gradients of all of them, since making the levels of
@@ -28,7 +28,7 @@ class LearntLight:
         height: texels from up to down; there are twice as many around.
         hdr: whether the radiance may be more than 1.
         white_weight: weight of the distance of the colours to grey.
-        even_weight: weight of differences between neighbouring texels.
+        smoothness_weight: weight of differences between neighbouring texels.
 
     Attributes:
         log_radiance: logarithm of the linear radiance.
@@ -38,22 +38,22 @@ class LearntLight:
     """
 
     def __init__(
-        self, height: int, *, hdr: bool = True, white_weight: float = 0.0, even_weight: float = 0.0
+        self, height: int, *, hdr: bool = True, white_weight: float = 0.0, smoothness_weight: float = 0.0
     ) -> None:
         self._brightest = _BRIGHTEST if hdr else 0.0
-        self._white_weight, self._even_weight = white_weight, even_weight
-        self._prefilter = prefilter(height)
+        self._white_weight, self._smoothness_weight = white_weight, smoothness_weight
+        self._prefilter = prefilter_for(height)
         shape = (height, 2 * height, 3)
-        self.log_radiance: Float32[np.ndarray, "h w 3"] = np.full(shape, np.log(FIRST_RADIANCE), np.float32)
+        self.log_radiance: Float32[np.ndarray, "h w 3"] = np.full(shape, np.log(INITIAL_RADIANCE), np.float32)
         self.first: Float32[np.ndarray, "h w 3"] = np.zeros(shape, np.float32)
         self.second: Float32[np.ndarray, "h w 3"] = np.zeros(shape, np.float32)
         self.sums: Float64[np.ndarray, "t 3"] = np.zeros((int(self._prefilter.offsets[-1]), 3))
         self.steps: Int64[np.ndarray, " 1"] = np.zeros(1, np.int64)
-        self._levels: LightLevels | None = None
+        self._levels: EnvironmentLevels | None = None
 
-    def start_over(self) -> None:
+    def reset(self) -> None:
         """Forget all that was learnt."""
-        self.log_radiance[:] = np.log(FIRST_RADIANCE)
+        self.log_radiance[:] = np.log(INITIAL_RADIANCE)
         for sums in (self.first, self.second, self.sums, self.steps):
             sums[:] = 0
         self._levels = None
@@ -63,14 +63,14 @@ class LearntLight:
         """The environment."""
         return np.exp(self.log_radiance)
 
-    def put(self, radiance_linear: Float32[np.ndarray, "h w 3"]) -> None:
+    def set_radiance(self, radiance_linear: Float32[np.ndarray, "h w 3"]) -> None:
         """Take another environment instead, of any size."""
-        radiance = resampled(radiance_linear, self._prefilter.height)
+        radiance = resample_environment(radiance_linear, self._prefilter.height)
         self.log_radiance = np.log(np.maximum(radiance, np.exp(_DARKEST))).astype(np.float32)
         self._levels = None
 
     @property
-    def levels(self) -> LightLevels:
+    def levels(self) -> EnvironmentLevels:
         """Its levels, made when they are asked for after a change."""
         if self._levels is None:
             self._levels = self._prefilter.levels(self.radiance_linear)
@@ -82,20 +82,20 @@ class LearntLight:
         self.steps += 1
         if self.steps[0] % ENVIRONMENT_EVERY:
             return
-        gradient = self._prefilter.transposed(self.sums) * self.radiance_linear + self._priors()
+        gradient = self._prefilter.backward(self.sums) * self.radiance_linear + self._prior_gradients()
         self.sums[:] = 0
         count = self.steps[0] // ENVIRONMENT_EVERY
-        self.first, self.second, change = adam_change(self.first, self.second, gradient, int(count))
+        self.first, self.second, change = adam_update(self.first, self.second, gradient, int(count))
         radiance = np.clip(self.log_radiance - rate * change, _DARKEST, self._brightest)
         self.log_radiance = radiance.astype(np.float32)
         self._levels = None
 
-    def _priors(self) -> Float64[np.ndarray, "h w 3"]:
+    def _prior_gradients(self) -> Float64[np.ndarray, "h w 3"]:
         """Gradients of: light is about white, and about as bright as that beside it."""
         x = self.log_radiance.astype(np.float64)
         angles = solid_angles(len(x))[:, None, None] / (4 * np.pi)
         white = x - x.mean(axis=2, keepdims=True)
-        return angles * (self._white_weight * white + self._even_weight * unevenness(x))
+        return angles * (self._white_weight * white + self._smoothness_weight * smoothness_gradient(x))
 
     def state(self) -> dict[str, np.ndarray]:
         """Radiance, moments and sums."""

@@ -14,9 +14,9 @@ import numpy as np
 from jaxtyping import Float32, Float64, Int64
 
 from octasplat.engine.gaussians.model import FlatGaussians
-from octasplat.engine.shading.exposure_estimation import guessed, times_of
-from octasplat.engine.shading.plain import PLAIN
-from octasplat.engine.shading.protocol import Developed, Reversed, ShadingModel, Sight
+from octasplat.engine.shading.exposure_estimation import estimate_values, times_from_names
+from octasplat.engine.shading.plain import PLAIN_SHADING
+from octasplat.engine.shading.protocol import ShadedRays, ShadingGradients, ShadingModel, TracedRays
 from octasplat.engine.trace.protocol import GaussianGradients, Tracer
 
 BETA1, BETA2, EPSILON = 0.9, 0.99, 1e-15
@@ -25,7 +25,7 @@ ExposuresByName = Mapping[str, Mapping[str, Sequence[float]]]
 _STATE = ("log_gains", "offsets", "first", "second", "steps")
 
 
-class Exposures:
+class ExposureModel:
     """Of each view and channel: shown colour = exp(log_gain) * developed colour + offset.
 
     Follows :class:`octasplat.engine.shading.protocol.ShadingModel`. What is seen by no view has the mean
@@ -47,7 +47,9 @@ class Exposures:
 
     name = "exposure"
 
-    def __init__(self, views: int, *, rate: float, decay: float = 1.0, inner: ShadingModel = PLAIN) -> None:
+    def __init__(
+        self, views: int, *, rate: float, decay: float = 1.0, inner: ShadingModel = PLAIN_SHADING
+    ) -> None:
         self.log_gains: Float32[np.ndarray, "v 3"] = np.zeros((views, 3), np.float32)
         self.offsets: Float32[np.ndarray, "v 3"] = np.zeros((views, 3), np.float32)
         self.first: Float32[np.ndarray, "v 6"] = np.zeros((views, 6), np.float32)
@@ -55,47 +57,51 @@ class Exposures:
         self.steps: Int64[np.ndarray, " v"] = np.zeros(views, np.int64)
         self._rate = rate
         self._decay = decay
-        self._shown_as: int | None = None
+        self._fixed_view: int | None = None
         self.inner = inner
 
     @classmethod
-    def known(cls, names: Sequence[str], known: ExposuresByName) -> "Exposures":
+    def from_known(cls, names: Sequence[str], known: ExposuresByName) -> "ExposureModel":
         """Those of views with these names that a finished training has left; not to be trained."""
         exposures = cls(len(names), rate=0.0)
-        exposures.take(names, known)
+        exposures.load_known(names, known)
         return exposures
 
     def features(self, gaussians: FlatGaussians) -> Float32[np.ndarray, "n f"] | None:
         """Those of the model inside."""
         return self.inner.features(gaussians)
 
-    def settle(self, gaussians: FlatGaussians, tracer: Tracer, *, progress: float) -> None:
+    def on_rebuild(self, gaussians: FlatGaussians, tracer: Tracer, *, training_progress: float) -> None:
         """The model inside looks around."""
-        self.inner.settle(gaussians, tracer, progress=progress)
+        self.inner.on_rebuild(gaussians, tracer, training_progress=training_progress)
 
-    def develop(self, sight: Sight) -> Developed:
+    def shade(self, traced: TracedRays) -> ShadedRays:
         """Colours as the rays' views show them; others have the mean exposure, or that of one view."""
-        inner = self.inner.develop(sight)
-        view = sight.view if self._shown_as is None else self._shown_as
+        inner = self.inner.shade(traced)
+        view = traced.view if self._fixed_view is None else self._fixed_view
         if view is None:
             return inner
         gains, offsets = np.exp(self.log_gains)[view], self.offsets[view]
         alpha = np.float32(1) - inner.transmittance
         rgb = gains * inner.rgb_srgb + offsets * alpha[:, None]
-        return Developed(rgb, inner.transmittance, inner, inner.layers)
+        return ShadedRays(rgb, inner.transmittance, inner, inner.layers)
 
-    def shown_as(self, view: int) -> "Exposures":
+    def for_view(self, view: int) -> "ExposureModel":
         """The same model, which exposes everything as a view is; it shares the arrays and is not trained."""
         other = copy.copy(self)
-        other._shown_as = view
+        other._fixed_view = view
         return other
 
-    def undone(self, rgb_srgb: Float32[np.ndarray, "h w 3"], view: int) -> Float32[np.ndarray, "h w 3"]:
+    def remove_exposure(
+        self, rgb_srgb: Float32[np.ndarray, "h w 3"], view: int
+    ) -> Float32[np.ndarray, "h w 3"]:
         """Straight display colours of a view's photograph as the mean exposure shows them, within [0, 1]."""
         shown = (rgb_srgb - self.offsets[view]) / np.exp(self.log_gains[view])
         return np.asarray(np.clip(shown, 0, 1), np.float32)
 
-    def guess_others(self, names: Sequence[str], brightness: Float64[np.ndarray, " v"] | None = None) -> None:
+    def estimate_untrained(
+        self, names: Sequence[str], brightness: Float64[np.ndarray, " v"] | None = None
+    ) -> None:
         """Give views that were not trained on the exposures that the trained ones suggest.
 
         See :mod:`octasplat.engine.shading.exposure_estimation`.
@@ -105,30 +111,32 @@ class Exposures:
             brightness: of all views, as the mean exposure shows the scene; None where that is not known.
         """
         trained, others = np.flatnonzero(self.steps > 0), np.flatnonzero(self.steps == 0)
-        times = times_of(names)
+        times = times_from_names(names)
         for values in (self.log_gains, self.offsets):
             known = values[trained].astype(np.float64)
-            values[others] = guessed(known, trained, others, times, brightness)
+            values[others] = estimate_values(known, trained, others, times, brightness)
 
-    def reverse(
+    def backward(
         self,
-        sight: Sight,
-        developed: Developed,
+        traced: TracedRays,
+        shaded: ShadedRays,
         by_rgb: Float32[np.ndarray, "r 3"],
         by_transmittance: Float32[np.ndarray, " r"],
-    ) -> Reversed:
+    ) -> ShadingGradients:
         """Gradients by what the model inside developed, and of each used view's log gains and offsets."""
-        view, inner = sight.view, developed.kept
-        assert view is not None and isinstance(inner, Developed), "only views of the training are learnt from"
+        view, inner = traced.view, shaded.ctx
+        assert view is not None and isinstance(inner, ShadedRays), (
+            "only views of the training are learnt from"
+        )
         gains = np.exp(self.log_gains)[view]
         used, place = np.unique(view, return_inverse=True)
         alpha = np.float32(1) - inner.transmittance
         terms = np.concatenate([by_rgb * gains * inner.rgb_srgb, by_rgb * alpha[:, None]], axis=1)
         sums = np.stack([np.bincount(place, terms[:, c], len(used)) for c in range(6)], axis=1)
         by_alpha = (by_rgb * self.offsets[view]).sum(axis=1)
-        below = self.inner.reverse(sight, inner, by_rgb * gains, by_transmittance - by_alpha)
+        below = self.inner.backward(traced, inner, by_rgb * gains, by_transmittance - by_alpha)
         own = {"exposure.views": used, "exposure.sums": sums}
-        return Reversed(below.seen, below.further, {**below.parameters, **own})
+        return ShadingGradients(below.trace, below.recorded_traces, {**below.parameters, **own})
 
     def step(
         self,
@@ -136,10 +144,10 @@ class Exposures:
         gradients: GaussianGradients,
         parameters: Mapping[str, np.ndarray],
         *,
-        progress: float,
+        training_progress: float,
     ) -> None:
         """One step of Adam for the views of the batch, then the mean over all views so far is taken out."""
-        self.inner.step(gaussians, gradients, parameters, progress=progress)
+        self.inner.step(gaussians, gradients, parameters, training_progress=training_progress)
         used, sums = parameters["exposure.views"], parameters["exposure.sums"]
         self.steps[used] += 1
         steps = self.steps[used, None]
@@ -147,7 +155,7 @@ class Exposures:
         self.second[used] = BETA2 * self.second[used] + (1 - BETA2) * sums**2
         mean = self.first[used] / (1 - BETA1**steps)
         size = np.sqrt(self.second[used] / (1 - BETA2**steps)) + EPSILON
-        change = (self._rate * self._decay**progress * mean / size).astype(np.float32)
+        change = (self._rate * self._decay**training_progress * mean / size).astype(np.float32)
         self.log_gains[used] -= change[:, :3]
         self.offsets[used] -= change[:, 3:]
         seen = self.steps > 0
@@ -159,7 +167,7 @@ class Exposures:
         rows = zip(names, self.log_gains.tolist(), self.offsets.tolist(), strict=True)
         return {name: {"log_gains": gains, "offsets": offsets} for name, gains, offsets in rows}
 
-    def take(self, names: Sequence[str], known: ExposuresByName) -> None:
+    def load_known(self, names: Sequence[str], known: ExposuresByName) -> None:
         """Take the exposures of the views that are known by their names."""
         for number, name in enumerate(names):
             if name in known:

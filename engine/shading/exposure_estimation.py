@@ -13,13 +13,13 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float64, Int64
 
-LEAST_VIEWS = 4
+MIN_VIEWS = 4
 """From fewer nothing is guessed."""
-LEAST_FOR_LINE = 8
+MIN_VIEWS_FOR_LINE = 8
 """From fewer no line over the brightness is drawn."""
 
 
-def times_of(names: Sequence[str]) -> Float64[np.ndarray, " v"]:
+def times_from_names(names: Sequence[str]) -> Float64[np.ndarray, " v"]:
     """When photographs were taken, in any unit: the last numbers of their names, as of the frames of a film.
 
     Their places in the list where these do not ascend.
@@ -32,7 +32,7 @@ def times_of(names: Sequence[str]) -> Float64[np.ndarray, " v"]:
     return np.arange(len(names), dtype=np.float64)
 
 
-def guessed(
+def estimate_values(
     known: Float64[np.ndarray, "k c"],
     trained: Int64[np.ndarray, " k"],
     others: Int64[np.ndarray, " m"],
@@ -45,51 +45,51 @@ def guessed(
         known: values of the trained views, whose mean is about 0.
         trained: their numbers, ascending.
         others: numbers of the views to guess.
-        times: of all views, ascending, see :func:`times_of`.
+        times: of all views, ascending, see :func:`times_from_names`.
         brightness: of all views as the mean exposure shows the scene; None where that is not known.
     """
-    if len(trained) < LEAST_VIEWS:
+    if len(trained) < MIN_VIEWS:
         return np.zeros((len(others), known.shape[1]))
     ours, theirs = times[trained], times[others]
-    if brightness is None or len(trained) < LEAST_FOR_LINE:
-        return _beside(known, ours, theirs)[0]
+    if brightness is None or len(trained) < MIN_VIEWS_FOR_LINE:
+        return _neighbor_mean(known, ours, theirs)[0]
     light = brightness[trained], brightness[others]
-    ways = [way(known, ours, theirs, *light) for way in (_line_then_beside, _beside_then_line)]
+    ways = [way(known, ours, theirs, *light) for way in (_line_then_neighbors, _neighbors_then_line)]
     shares = np.array([1 / (np.square(left).mean() + 1e-12) for _, left in ways])
     shares /= shares.sum()
     return shares[0] * ways[0][0] + shares[1] * ways[1][0]
 
 
-Way = tuple[Float64[np.ndarray, "m c"], Float64[np.ndarray, "i c"]]
+Estimator = tuple[Float64[np.ndarray, "m c"], Float64[np.ndarray, "i c"]]
 """What is said of the other views, and what is left of each trained one when it is left out."""
 
 
-def _line_then_beside(
+def _line_then_neighbors(
     known: Float64[np.ndarray, "k c"],
     ours: Float64[np.ndarray, " k"],
     theirs: Float64[np.ndarray, " m"],
     our_brightness: Float64[np.ndarray, " k"],
     their_brightness: Float64[np.ndarray, " m"],
-) -> Way:
+) -> Estimator:
     """What the line over the brightness says, and what is left of the views before and after."""
     middle, height = our_brightness.mean(), known.mean(axis=0)
     slopes, left_out, trust = _slopes(our_brightness - middle, known, height)
     rest = known - trust * (our_brightness - middle)[:, None] * slopes
-    found, left = _beside(rest, ours, theirs)
+    found, left = _neighbor_mean(rest, ours, theirs)
     missed = trust * ((our_brightness - middle)[:, None] * slopes - left_out)[1:-1]
     return trust * (their_brightness - middle)[:, None] * slopes + found, left + missed
 
 
-def _beside_then_line(
+def _neighbors_then_line(
     known: Float64[np.ndarray, "k c"],
     ours: Float64[np.ndarray, " k"],
     theirs: Float64[np.ndarray, " m"],
     our_brightness: Float64[np.ndarray, " k"],
     their_brightness: Float64[np.ndarray, " m"],
-) -> Way:
+) -> Estimator:
     """What the views before and after say, and a line over how much brighter than these a view is."""
-    found, left = _beside(known, ours, theirs)
-    brighter = our_brightness[1:-1] - _between(our_brightness[:, None], ours)[:, 0]
+    found, left = _neighbor_mean(known, ours, theirs)
+    brighter = our_brightness[1:-1] - _leave_one_out_neighbors(our_brightness[:, None], ours)[:, 0]
     slopes, left_out, trust = _slopes(brighter, left)
     their_brighter = their_brightness - np.interp(theirs, ours, our_brightness)
     return found + trust * their_brighter[:, None] * slopes, left - trust * left_out
@@ -112,20 +112,20 @@ def _slopes(
     if height is not None:
         fitted, reach = fitted + height, reach + 1 / len(brightness)
     left_out = known - (known - fitted) / np.maximum(1 - reach[:, None], 1e-6)
-    return slopes, left_out, _trust(left_out, known)
+    return slopes, left_out, _shrinkage(left_out, known)
 
 
-def _beside(
+def _neighbor_mean(
     known: Float64[np.ndarray, "k c"], ours: Float64[np.ndarray, " k"], theirs: Float64[np.ndarray, " m"]
-) -> Way:
+) -> Estimator:
     """The mean of the trained views before and after, by how near they are, as far as it is to be trusted."""
     near = np.stack([np.interp(theirs, ours, channel) for channel in known.T], axis=1)
-    between = _between(known, ours)
-    trust = _trust(between, known[1:-1])
+    between = _leave_one_out_neighbors(known, ours)
+    trust = _shrinkage(between, known[1:-1])
     return trust * near, known[1:-1] - trust * between
 
 
-def _between(
+def _leave_one_out_neighbors(
     known: Float64[np.ndarray, "k c"], ours: Float64[np.ndarray, " k"]
 ) -> Float64[np.ndarray, "i c"]:
     """What the views before and after each say of it, of all but the first and the last."""
@@ -133,7 +133,7 @@ def _between(
     return known[:-2] + share[:, None] * (known[2:] - known[:-2])
 
 
-def _trust(said: Float64[np.ndarray, "k c"], known: Float64[np.ndarray, "k c"]) -> float:
+def _shrinkage(said: Float64[np.ndarray, "k c"], known: Float64[np.ndarray, "k c"]) -> float:
     """The factor between 0 and 1 with which what is said comes nearest to what is known."""
     scale = float((said**2).sum())
     return min(max(float((said * known).sum()) / scale, 0.0), 1.0) if scale > 0 else 0.0

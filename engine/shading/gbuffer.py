@@ -7,60 +7,62 @@ import numpy as np
 from jaxtyping import Float64, Int64
 
 from octasplat.engine.core.rays import AT_INFINITY, RayBatch
-from octasplat.engine.shading.split_sum import Surface
+from octasplat.engine.shading.split_sum import SurfacePoints
 from octasplat.engine.trace.facing_normals import FacedNormals, face_viewer
 from octasplat.engine.trace.protocol import TraceResult
 
-LEAST_RISE = 0.01
+MIN_COSINE = 0.01
 """Cosine to the normal that reflected rays have at least."""
-LEAST_ALPHA = 0.02
+MIN_ALPHA = 0.02
 """Rays that met less show nothing that could be shaded."""
 
 
-class Leaving(NamedTuple):
+class RayOffset(NamedTuple):
     """How rays leave a surface of Gaussians.
 
     Attributes:
-        gap_world: distance from it at which they begin.
-        reach_world: distance up to which they pass what they would meet from behind.
+        bias_world: distance from it at which they begin.
+        backface_cull_world: distance up to which they pass what they would meet from behind.
     """
 
-    gap_world: float
-    reach_world: float = 0.0
+    bias_world: float
+    backface_cull_world: float = 0.0
 
 
 @dataclass(frozen=True)
-class Buffer:
+class GBuffer:
     """What was blended along the rays that met something.
 
     Attributes:
-        which: numbers of these rays.
+        ray_ids: numbers of these rays.
         alpha: what each met.
         depth: mean distance, lengths of the direction.
-        faced: the blended normals.
+        facing_normals: the blended normals.
         surface: materials, normals and directions, not yet dimmed by anything.
     """
 
-    which: Int64[np.ndarray, " p"]
+    ray_ids: Int64[np.ndarray, " p"]
     alpha: Float64[np.ndarray, " p"]
     depth: Float64[np.ndarray, " p"]
-    faced: FacedNormals
-    surface: Surface
+    facing_normals: FacedNormals
+    surface: SurfacePoints
 
 
-def gather(rays: RayBatch, seen: TraceResult) -> Buffer:
+def build_gbuffer(rays: RayBatch, result: TraceResult) -> GBuffer:
     """The buffer of a trace whose first features are materials."""
-    alpha = 1.0 - seen.transmittance.astype(np.float64)
-    which = np.flatnonzero(alpha > LEAST_ALPHA)
+    alpha = 1.0 - result.transmittance.astype(np.float64)
+    which = np.flatnonzero(alpha > MIN_ALPHA)
     alpha = alpha[which]
     directions = rays.directions_world[which]
-    normals = face_viewer(seen.normal_world[which], directions)
-    surface = Surface.alone(seen.features[which, :5] / alpha[:, None], normals.normal_world, directions)
-    return Buffer(which, alpha, seen.depth_sum[which] / alpha, normals, surface)
+    normals = face_viewer(result.normal_world[which], directions)
+    surface = SurfacePoints.unoccluded(
+        result.features[which, :5] / alpha[:, None], normals.normal_world, directions
+    )
+    return GBuffer(which, alpha, result.depth_sum[which] / alpha, normals, surface)
 
 
-def spread_back(
-    buffer: Buffer,
+def backward_gbuffer(
+    gbuffer: GBuffer,
     by_material: Float64[np.ndarray, "p 5"],
     by_unit_normal: Float64[np.ndarray, "p 3"],
     by_features: Float64[np.ndarray, "r f"],
@@ -68,35 +70,37 @@ def spread_back(
     by_normal: Float64[np.ndarray, "r 3"],
 ) -> None:
     """Add gradients by a buffer's materials and unit normals to those by what was blended."""
-    which, surface = buffer.which, buffer.surface
-    by_features[which, :5] += by_material / buffer.alpha[:, None]
-    by_alpha[which] -= (by_material * surface.material).sum(axis=1) / buffer.alpha
-    by_normal[which] += buffer.faced.backward(by_unit_normal, surface.direction_world)
+    which, surface = gbuffer.ray_ids, gbuffer.surface
+    by_features[which, :5] += by_material / gbuffer.alpha[:, None]
+    by_alpha[which] -= (by_material * surface.material).sum(axis=1) / gbuffer.alpha
+    by_normal[which] += gbuffer.facing_normals.backward(by_unit_normal, surface.direction_world)
 
 
 def reflected_rays(
     rays: RayBatch,
-    buffer: Buffer,
-    leaving: Leaving,
+    gbuffer: GBuffer,
+    offset: RayOffset,
     facets_world: Float64[np.ndarray, "p 3"] | None = None,
 ) -> RayBatch:
     """Rays from the points of a buffer along their reflected directions, begun a little off the surface.
 
     Args:
         rays: that the buffer was gathered along.
-        buffer: of ``p`` points.
-        leaving: how far off, and how they get away from there.
+        gbuffer: of ``p`` points.
+        offset: how far off, and how they get away from there.
         facets_world: unit normals to be mirrored at instead of the surface's; where that leads below the
             surface, the ray leaves along it.
     """
-    which, normals = buffer.which, buffer.surface.normal_world
+    which, normals = gbuffer.ray_ids, gbuffer.surface.normal_world
     origins = rays.origins_world if len(rays.origins_world) == 1 else rays.origins_world[which]
     directions = rays.directions_world[which].astype(np.float64)
-    gap_world = leaving.gap_world
-    points = origins + buffer.depth[:, None] * directions + gap_world * normals
+    gap_world = offset.bias_world
+    points = origins + gbuffer.depth[:, None] * directions + gap_world * normals
     facets = normals if facets_world is None else facets_world
     mirrored = directions - 2 * (directions * facets).sum(axis=1, keepdims=True) * facets
     rise = (mirrored * normals).sum(axis=1, keepdims=True)
-    mirrored += np.maximum(LEAST_RISE - rise, 0.0) * normals
+    mirrored += np.maximum(MIN_COSINE - rise, 0.0) * normals
     mirrored /= np.linalg.norm(mirrored, axis=1, keepdims=True)
-    return RayBatch(points, mirrored, gap_world, t_viewer=AT_INFINITY, t_leaves=leaving.reach_world)
+    return RayBatch(
+        points, mirrored, gap_world, t_view_origin=AT_INFINITY, t_backface_cull=offset.backface_cull_world
+    )

@@ -8,25 +8,25 @@ between them mean something.
 import numpy as np
 from jaxtyping import Bool, Float64
 
-from octasplat.engine.shading.gbuffer import Buffer
+from octasplat.engine.shading.gbuffer import GBuffer
 from octasplat.engine.shading.material_settings import MaterialSettings
-from octasplat.engine.shading.protocol import Sight
+from octasplat.engine.shading.protocol import TracedRays
 
-OPAQUE = 0.9
+MIN_ALPHA = 0.9
 """Accumulated alpha from which on a ray shows a surface."""
-STEEPEST = 0.15
+MIN_VIEW_COSINE = 0.15
 """Neighbours that span a surface seen at a smaller cosine lie on two surfaces."""
-SMOOTH = 0.9
+MIN_NORMAL_COSINE = 0.9
 """Cosine from which on the normals of neighbours count as those of one smooth surface."""
 _ALL, _FROM, _TO = slice(None), slice(1, None), slice(None, -1)
-_NEIGHBOURS = (((_ALL, _ALL, _FROM), (_ALL, _ALL, _TO)), ((_ALL, _FROM), (_ALL, _TO)))
+_NEIGHBOR_SLICES = (((_ALL, _ALL, _FROM), (_ALL, _ALL, _TO)), ((_ALL, _FROM), (_ALL, _TO)))
 """The two of each pair of neighbours in a grid of rays, across and down."""
-EDGE = 0.02
+HUBER_DELTA = 0.02
 """Difference of materials at which their smoothness turns from a square to a straight line."""
 
 
-def spread_term(
-    buffer: Buffer,
+def normal_spread_gradient(
+    gbuffer: GBuffer,
     weight: float,
     by_alpha: Float64[np.ndarray, " r"],
     by_normal: Float64[np.ndarray, "r 3"],
@@ -35,12 +35,12 @@ def spread_term(
 
     That is the accumulated alpha minus the length of the blended normal: it needs no neighbours.
     """
-    by_alpha[buffer.which] += weight
-    by_normal[buffer.which] -= weight * buffer.faced.blended_world
+    by_alpha[gbuffer.ray_ids] += weight
+    by_normal[gbuffer.ray_ids] -= weight * gbuffer.facing_normals.blended_world
 
 
-def neighbour_terms(
-    sight: Sight,
+def add_patch_gradients(
+    traced: TracedRays,
     settings: MaterialSettings,
     by_features: Float64[np.ndarray, "r f"],
     by_alpha: Float64[np.ndarray, " r"],
@@ -49,26 +49,28 @@ def neighbour_terms(
 ) -> None:
     """Add the gradients of all terms that hold neighbouring rays together: normals, depths, materials."""
     if settings.depth_normal_weight > 0:
-        depth_normal_term(sight, settings.depth_normal_weight, by_alpha, by_normal, by_depth)
+        add_depth_normal_gradient(traced, settings.depth_normal_weight, by_alpha, by_normal, by_depth)
     if settings.smooth_normal_weight > 0:
-        smooth_normal_term(sight, settings.smooth_normal_weight, by_normal)
+        add_normal_smoothness_gradient(traced, settings.smooth_normal_weight, by_normal)
     if max(settings.smooth_weights) > 0:
-        smoothness_term(sight, settings.smooth_weights, settings.smooth_metal, by_features, by_alpha)
+        add_material_smoothness_gradient(
+            traced, settings.smooth_weights, settings.smooth_metal, by_features, by_alpha
+        )
 
 
-def depth_normal_term(
-    sight: Sight,
+def add_depth_normal_gradient(
+    traced: TracedRays,
     weight: float,
     by_alpha: Float64[np.ndarray, " r"],
     by_normal: Float64[np.ndarray, "r 3"],
     by_depth: Float64[np.ndarray, " r"],
 ) -> None:
     """One minus the cosine between the blended normal and that of the points of three neighbouring rays."""
-    windows = sight.windows
+    windows = traced.ray_patches
     if windows is None:
         return
     some = windows.rays
-    seen, rays = sight.seen, sight.rays
+    seen, rays = traced.result, traced.rays
     alpha = 1.0 - seen.transmittance[some].astype(np.float64)
     solid = np.maximum(alpha, 1e-6)
     depth = seen.depth_sum[some] / solid
@@ -85,9 +87,9 @@ def depth_normal_term(
     sums = windows.grid(seen.normal_world[some].astype(np.float64))[:, :-1, :-1]
     normal_length = np.maximum(np.linalg.norm(sums, axis=-1, keepdims=True), 1e-9)
     normal = sums / normal_length
-    opaque = windows.grid(alpha) > OPAQUE
+    opaque = windows.grid(alpha) > MIN_ALPHA
     counted = opaque[:, :-1, :-1] & opaque[:, :-1, 1:] & opaque[:, 1:, :-1]
-    counted &= (spanned * towards).sum(axis=-1) > STEEPEST
+    counted &= (spanned * towards).sum(axis=-1) > MIN_VIEW_COSINE
     share = np.where(counted, weight / len(seen.transmittance), 0.0)[..., None]
     cosine = (spanned * normal).sum(axis=-1, keepdims=True)
     by_sums = -share * (spanned - cosine * normal) / normal_length
@@ -97,39 +99,41 @@ def depth_normal_term(
     by_points[:, :-1, 1:] += by_a
     by_points[:, 1:, :-1] += by_b
     by_points[:, :-1, :-1] -= by_a + by_b
-    along = (windows.flat(by_points) * directions).sum(axis=1)
+    along = (windows.flatten(by_points) * directions).sum(axis=1)
     by_depth[some] += along / solid
     by_alpha[some] -= along * depth / solid
     whole = np.zeros_like(points)
     whole[:, :-1, :-1] = by_sums
-    by_normal[some] += windows.flat(whole)
+    by_normal[some] += windows.flatten(whole)
 
 
-def smooth_normal_term(sight: Sight, weight: float, by_normal: Float64[np.ndarray, "r 3"]) -> None:
+def add_normal_smoothness_gradient(
+    traced: TracedRays, weight: float, by_normal: Float64[np.ndarray, "r 3"]
+) -> None:
     """One minus the cosine between the normals of neighbouring rays, where these show one smooth surface.
 
     A surface that is bent evenly has no gradient from it.
     """
-    windows = sight.windows
+    windows = traced.ray_patches
     if windows is None:
         return
     some = windows.rays
-    sums = windows.grid(sight.seen.normal_world[some].astype(np.float64))
+    sums = windows.grid(traced.result.normal_world[some].astype(np.float64))
     length = np.maximum(np.linalg.norm(sums, axis=-1, keepdims=True), 1e-9)
     normal = sums / length
-    opaque = windows.grid(sight.seen.transmittance[some]) < 1 - OPAQUE
+    opaque = windows.grid(traced.result.transmittance[some]) < 1 - MIN_ALPHA
     gradient = np.zeros_like(normal)
-    for one, other in _NEIGHBOURS:
+    for one, other in _NEIGHBOR_SLICES:
         cosine = (normal[one] * normal[other]).sum(axis=-1, keepdims=True)
-        counted = (opaque[one] & opaque[other])[..., None] & (cosine > SMOOTH)
-        share = np.where(counted, weight / len(sight.seen.transmittance), 0.0)
+        counted = (opaque[one] & opaque[other])[..., None] & (cosine > MIN_NORMAL_COSINE)
+        share = np.where(counted, weight / len(traced.result.transmittance), 0.0)
         gradient[one] -= share * (normal[other] - cosine * normal[one])
         gradient[other] -= share * (normal[one] - cosine * normal[other])
-    by_normal[some] += windows.flat(gradient / length)
+    by_normal[some] += windows.flatten(gradient / length)
 
 
-def smoothness_term(
-    sight: Sight,
+def add_material_smoothness_gradient(
+    traced: TracedRays,
     weights: tuple[float, ...],
     metal: float,
     by_features: Float64[np.ndarray, "r f"],
@@ -141,26 +145,26 @@ def smoothness_term(
     between two metals, in between by the square of the smaller metallic: what reflections do not explain yet
     would else be painted on. Metallic itself gets no gradient from that.
     """
-    windows = sight.windows
+    windows = traced.ray_patches
     if windows is None:
         return
     some = windows.rays
-    alpha = 1.0 - sight.seen.transmittance[some].astype(np.float64)
+    alpha = 1.0 - traced.result.transmittance[some].astype(np.float64)
     solid = np.maximum(alpha, 1e-6)[:, None]
-    flat = sight.seen.features[some, :5] / solid
+    flat = traced.result.features[some, :5] / solid
     material = windows.grid(flat)
-    opaque = windows.grid(alpha) > OPAQUE
+    opaque = windows.grid(alpha) > MIN_ALPHA
     gradient = np.zeros_like(material)
-    share = np.array(weights) / len(sight.seen.transmittance)
-    for one, other in _NEIGHBOURS:
+    share = np.array(weights) / len(traced.result.transmittance)
+    for one, other in _NEIGHBOR_SLICES:
         difference = material[one] - material[other]
-        slope = difference / np.sqrt(difference**2 + EDGE**2)
+        slope = difference / np.sqrt(difference**2 + HUBER_DELTA**2)
         slope = _where(opaque[one] & opaque[other], slope) * share
         both = np.clip(np.minimum(material[one][..., 3:4], material[other][..., 3:4]), 0, 1)
         slope[..., :3] *= 1 + metal * both**2
         gradient[one] += slope
         gradient[other] -= slope
-    by_flat = windows.flat(gradient)
+    by_flat = windows.flatten(gradient)
     by_features[some, :5] += by_flat / solid
     by_alpha[some] -= (by_flat * flat).sum(axis=1) / solid[:, 0]
 

@@ -4,20 +4,22 @@ import numpy as np
 from jaxtyping import Float64
 
 
-def clipped(gradients: Float64[np.ndarray, "p 3"], most: float) -> Float64[np.ndarray, "p 3"]:
-    """Gradients no longer than ``most`` times the median of those that are not 0; 0 leaves them alone.
+def clip_gradients(
+    gradients: Float64[np.ndarray, "p 3"], max_median_ratio: float
+) -> Float64[np.ndarray, "p 3"]:
+    """Gradients no longer than ``max_median_ratio`` times the median of those that are not 0; 0 leaves them alone.
 
     One pixel that looks into a mirror in a mirror says more loudly than a hundred others where to turn, and
     is as likely to be wrong.
     """
     lengths = np.linalg.norm(gradients, axis=1)
-    if most == 0 or not (lengths > 0).any():
+    if max_median_ratio == 0 or not (lengths > 0).any():
         return gradients
-    longest = most * float(np.median(lengths[lengths > 0]))
+    longest = max_median_ratio * float(np.median(lengths[lengths > 0]))
     return gradients * np.minimum(1.0, longest / np.maximum(lengths, 1e-30))[:, None]
 
 
-def encoding_slope(linear: Float64[np.ndarray, "*shape"]) -> Float64[np.ndarray, "*shape"]:
+def srgb_derivative(linear: Float64[np.ndarray, "*shape"]) -> Float64[np.ndarray, "*shape"]:
     """Slope of the display values by the linear ones; beyond white that at white, so that light can fall."""
     x = np.clip(linear, 0.0, 1.0)
     return np.where(x <= 0.0031308, 12.92, (1.055 / 2.4) * np.maximum(x, 0.0031308) ** (1 / 2.4 - 1))

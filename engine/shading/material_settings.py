@@ -8,23 +8,23 @@ from octasplat.engine.settings import renamed_settings
 from octasplat.engine.settings.base import FormerSetting, Settings
 from octasplat.engine.settings.fields import ADVANCED, EXPERIMENTAL, Unit
 
-SEED_SECOND_STAGE = 0.36
+REF_GAUSSIAN_DEFERRED_FROM = 0.36
 """Share of the training after which the seed's code begins deferred shading, with materials as at first."""
-SEED_REACH = 10.0
+REF_GAUSSIAN_RAY_LENGTH = 10.0
 """World units within which the seed's code looks for what hides the environment."""
-SEED_MATERIAL = (0.5, 0.5, 0.5, 0.01, 0.1)
+REF_GAUSSIAN_MATERIAL = (0.5, 0.5, 0.5, 0.01, 0.1)
 """Albedo, metallic and roughness that it begins deferred shading with."""
 ENVIRONMENT_EVERY = 4
 """Iterations between two steps of the environment, for each of which all its levels are filtered."""
 ENVIRONMENT_RATE = 0.03
 """First size of a step of the environment's log radiance."""
-HAND_OVER = (0.0, 0.02)
+SHADING_RAMP = (0.0, 0.02)
 """Shares of the training when shading begins to replace the harmonics' colours, and when it has."""
 PROPAGATION_EVERY = 0.06
 """Share of the training between two times that normals are handed on to neighbours."""
 PROPAGATION_UNTIL = 0.4
 """Share of the training at which that ends."""
-FIRST_ALBEDO, FIRST_METALLIC, FIRST_ROUGHNESS = 0.5, 0.5, 0.3
+INITIAL_ALBEDO, INITIAL_METALLIC, INITIAL_ROUGHNESS = 0.5, 0.5, 0.3
 """Materials that all Gaussians begin with: in the middle, and smooth enough to show what they reflect."""
 Recipe = Literal["split_sum", "ref_gaussian"]
 
@@ -220,17 +220,17 @@ class MaterialSettings(Settings):
     former_settings: ClassVar = {
         "secondary_share": FormerSetting(1),
         "environment_every": FormerSetting(ENVIRONMENT_EVERY, after="environment_height"),
-        "hand_over": FormerSetting(list(HAND_OVER), after="environment_every"),
+        "hand_over": FormerSetting(list(SHADING_RAMP), after="environment_every"),
         "propagation_every": FormerSetting(PROPAGATION_EVERY, after="normal_propagation"),
         "propagation_until": FormerSetting(PROPAGATION_UNTIL, after="propagation_every"),
         "environment_rate": FormerSetting(ENVIRONMENT_RATE, after="propagation_until"),
-        "first_albedo": FormerSetting(FIRST_ALBEDO, after="environment_rate"),
-        "first_metallic": FormerSetting(FIRST_METALLIC, after="first_albedo"),
-        "first_roughness": FormerSetting(FIRST_ROUGHNESS, after="first_metallic"),
+        "first_albedo": FormerSetting(INITIAL_ALBEDO, after="environment_rate"),
+        "first_metallic": FormerSetting(INITIAL_METALLIC, after="first_albedo"),
+        "first_roughness": FormerSetting(INITIAL_ROUGHNESS, after="first_metallic"),
     }
 
     @property
-    def clears_unseen(self) -> bool:
+    def prunes_unseen(self) -> bool:
         """Whether Gaussians that lie in no photograph are taken away; the seed lets them be."""
         return self.learn and self.prune_unseen and self.recipe != "ref_gaussian"
 
@@ -239,23 +239,23 @@ class MaterialSettings(Settings):
         """Of the smoothness of each column of materials."""
         return (self.smooth_weight,) * 3 + (self.smooth_gloss_weight,) * 2
 
-    def is_seed_deferred(self, progress: float) -> bool:
+    def is_ref_gaussian_deferred(self, training_progress: float) -> bool:
         """Whether the seed's second stage has begun."""
-        return self.recipe == "ref_gaussian" and progress >= SEED_SECOND_STAGE
+        return self.recipe == "ref_gaussian" and training_progress >= REF_GAUSSIAN_DEFERRED_FROM
 
-    def handed_over(self, progress: float) -> float:
+    def shading_ramp(self, training_progress: float) -> float:
         """Share of the picture that is shaded, not taken from the harmonics."""
-        begin, end = HAND_OVER
-        if progress >= end:
+        begin, end = SHADING_RAMP
+        if training_progress >= end:
             return 1.0
-        return max(progress - begin, 0.0) / (end - begin)
+        return max(training_progress - begin, 0.0) / (end - begin)
 
-    def blurred(self, progress: float) -> float:
+    def blur_roughness(self, training_progress: float) -> float:
         """Roughness of the level that leads reflected directions."""
-        return self.blur * max(0.0, 1.0 - progress / self.blur_until) if self.blur_until > 0 else 0.0
+        return self.blur * max(0.0, 1.0 - training_progress / self.blur_until) if self.blur_until > 0 else 0.0
 
-    def least_slope(self, progress: float) -> float:
+    def min_facet_slope(self, training_progress: float) -> float:
         """Tangent of the least angle between a normal and its facets."""
         first, last = self.reflection_ray_slope
-        share = min(progress / self.blur_until, 1.0) if self.blur_until > 0 else 1.0
+        share = min(training_progress / self.blur_until, 1.0) if self.blur_until > 0 else 1.0
         return first * (last / first) ** share

@@ -6,11 +6,11 @@ import numpy as np
 from jaxtyping import Float32
 
 from octasplat.engine.gaussians.model import FlatGaussians
-from octasplat.engine.shading.protocol import Developed, Reversed, Sight
+from octasplat.engine.shading.protocol import ShadedRays, ShadingGradients, TracedRays
 from octasplat.engine.trace.protocol import GaussianGradients, TraceGradients, Tracer
 
 
-class Plain:
+class PlainShading:
     """Changes nothing and learns nothing; follows :class:`octasplat.engine.shading.protocol.ShadingModel`."""
 
     name = "plain"
@@ -18,22 +18,22 @@ class Plain:
     def features(self, gaussians: FlatGaussians) -> None:
         """No features."""
 
-    def settle(self, gaussians: FlatGaussians, tracer: Tracer, *, progress: float) -> None:
+    def on_rebuild(self, gaussians: FlatGaussians, tracer: Tracer, *, training_progress: float) -> None:
         """Nothing to see."""
 
-    def develop(self, sight: Sight) -> Developed:
+    def shade(self, traced: TracedRays) -> ShadedRays:
         """What was seen."""
-        return Developed(sight.seen.rgb_srgb, sight.seen.transmittance)
+        return ShadedRays(traced.result.rgb_srgb, traced.result.transmittance)
 
-    def reverse(
+    def backward(
         self,
-        sight: Sight,
-        developed: Developed,
+        traced: TracedRays,
+        shaded: ShadedRays,
         by_rgb: Float32[np.ndarray, "r 3"],
         by_transmittance: Float32[np.ndarray, " r"],
-    ) -> Reversed:
+    ) -> ShadingGradients:
         """The same gradients."""
-        return Reversed(TraceGradients(rgb_srgb=by_rgb, transmittance=by_transmittance))
+        return ShadingGradients(TraceGradients(rgb_srgb=by_rgb, transmittance=by_transmittance))
 
     def step(
         self,
@@ -41,7 +41,7 @@ class Plain:
         gradients: GaussianGradients,
         parameters: Mapping[str, np.ndarray],
         *,
-        progress: float,
+        training_progress: float,
     ) -> None:
         """Nothing to do."""
 
@@ -53,5 +53,5 @@ class Plain:
         """Nothing to take back."""
 
 
-PLAIN = Plain()
+PLAIN_SHADING = PlainShading()
 """The one that all can share, since it has no state."""

@@ -16,52 +16,52 @@ from jaxtyping import Float32, Float64, Int64
 
 from octasplat.engine.core.rays import RayBatch
 from octasplat.engine.gaussians.model import FlatGaussians
-from octasplat.engine.shading.ray_patches import RayWindows
+from octasplat.engine.shading.ray_patches import RayPatches
 from octasplat.engine.trace.protocol import GaussianGradients, Recording, TraceGradients, Tracer, TraceResult
 
 
 @dataclass(frozen=True)
-class Sight:
+class TracedRays:
     """What is to be shaded.
 
     Attributes:
         rays: the rays.
-        seen: what the tracer saw along them.
+        result: what the tracer saw along them.
         tracer: for further rays, mirrored ones say, through the same Gaussians.
         view: number of each ray's training view; None for views that were not trained on.
-        progress: share of the training that is done; 1 for a finished scene.
+        training_progress: share of the training that is done; 1 for a finished scene.
         dither: two numbers in [0, 1) for each ray, for models that draw anything at random; they are evenly
             spread over the rays of a pixel. None: models find some by themselves.
-        windows: those of the rays that stand in windows of neighbours; None if none do.
+        ray_patches: those of the rays that stand in windows of neighbours; None if none do.
     """
 
     rays: RayBatch
-    seen: TraceResult
+    result: TraceResult
     tracer: Tracer
     view: Int64[np.ndarray, " r"] | None = None
-    progress: float = 1.0
+    training_progress: float = 1.0
     dither: Float64[np.ndarray, "2 r"] | None = None
-    windows: RayWindows | None = None
+    ray_patches: RayPatches | None = None
 
 
 @dataclass(frozen=True)
-class Developed:
+class ShadedRays:
     """Colours as a photograph shows them, in front of no background yet.
 
     Attributes:
         rgb_srgb: display colour, premultiplied by 1 - ``transmittance``.
         transmittance: share of the background that shines through; 0 where a model brings its own.
-        kept: whatever the model needs to :meth:`ShadingModel.reverse` this.
+        ctx: whatever the model needs to :meth:`ShadingModel.backward` this.
         layers: what else can be looked at, by name, a row a ray, 0 where there is nothing; only for views
             that were not trained on.
     """
 
     rgb_srgb: Float32[np.ndarray, "r 3"]
     transmittance: Float32[np.ndarray, " r"]
-    kept: object = None
+    ctx: object = None
     layers: Mapping[str, Float32[np.ndarray, "r _"]] = field(default_factory=dict)
 
-    def over(self, background_srgb: Float32[np.ndarray, "3"]) -> Float32[np.ndarray, "r 3"]:
+    def composite_over(self, background_srgb: Float32[np.ndarray, "3"]) -> Float32[np.ndarray, "r 3"]:
         """Display colours in front of a background."""
         if not background_srgb.any():
             return self.rgb_srgb.copy()
@@ -69,18 +69,18 @@ class Developed:
 
 
 @dataclass(frozen=True)
-class Reversed:
-    """Gradients of a loss by all that went into :meth:`ShadingModel.develop`.
+class ShadingGradients:
+    """Gradients of a loss by all that went into :meth:`ShadingModel.shade`.
 
     Attributes:
-        seen: by the outputs of the sight's own trace.
-        further: by those of the traces that the model recorded itself.
+        trace: by the outputs of the sight's own trace.
+        recorded_traces: by those of the traces that the model recorded itself.
         parameters: by the model's own parameters, in whatever form its ``step`` wants them; names begin
             with the model's.
     """
 
-    seen: TraceGradients
-    further: tuple[tuple[Recording, TraceGradients], ...] = ()
+    trace: TraceGradients
+    recorded_traces: tuple[tuple[Recording, TraceGradients], ...] = ()
     parameters: Mapping[str, np.ndarray] = field(default_factory=dict)
 
 
@@ -101,27 +101,27 @@ class ShadingModel(Protocol):
         """
         ...
 
-    def settle(self, gaussians: FlatGaussians, tracer: Tracer, *, progress: float) -> None:
+    def on_rebuild(self, gaussians: FlatGaussians, tracer: Tracer, *, training_progress: float) -> None:
         """Look around in the scene of which ``tracer`` has just built the hierarchy.
 
         Channels of the Gaussians, and the features, may be changed: to what follows from their geometry,
-        ``progress`` and :meth:`state` alone, and no further by a second call with the same ``progress``, so
+        ``training_progress`` and :meth:`state` alone, and no further by a second call with the same ``training_progress``, so
         that a training that goes on finds the same.
         """
         ...
 
-    def develop(self, sight: Sight) -> Developed:
-        """What photographs show of ``sight``; depends on nothing else but the model's parameters."""
+    def shade(self, traced: TracedRays) -> ShadedRays:
+        """What photographs show of ``traced``; depends on nothing else but the model's parameters."""
         ...
 
-    def reverse(
+    def backward(
         self,
-        sight: Sight,
-        developed: Developed,
+        traced: TracedRays,
+        shaded: ShadedRays,
         by_rgb: Float32[np.ndarray, "r 3"],
         by_transmittance: Float32[np.ndarray, " r"],
-    ) -> Reversed:
-        """Gradients by what went into ``developed`` from those by what came out; changes nothing."""
+    ) -> ShadingGradients:
+        """Gradients by what went into ``shaded`` from those by what came out; changes nothing."""
         ...
 
     def step(
@@ -130,15 +130,15 @@ class ShadingModel(Protocol):
         gradients: GaussianGradients,
         parameters: Mapping[str, np.ndarray],
         *,
-        progress: float,
+        training_progress: float,
     ) -> None:
         """One step of the optimiser for the model's own parameters.
 
         Args:
             gaussians: those traced, after their own step.
             gradients: by the Gaussians' parameters and features, those of all traces added up.
-            parameters: what :meth:`reverse` found.
-            progress: 0 at the first iteration, 1 at the last.
+            parameters: what :meth:`backward` found.
+            training_progress: 0 at the first iteration, 1 at the last.
         """
         ...
 

@@ -2,7 +2,7 @@
 
 A window is a grid of cells, one ray in each. Rays of a window stand along a Z-order curve, so that those side
 by side in the batch are close together, as the tracer's packets want them. What compares neighbours needs
-rows and columns instead: :meth:`RayWindows.grid` and :meth:`RayWindows.flat` change between the two.
+rows and columns instead: :meth:`RayPatches.grid` and :meth:`RayPatches.flat` change between the two.
 """
 
 from dataclasses import dataclass
@@ -13,7 +13,7 @@ from jaxtyping import Float64, Int64, Shaped
 
 
 @lru_cache(maxsize=8)
-def z_order(side: int) -> tuple[Int64[np.ndarray, " c"], Int64[np.ndarray, " c"]]:
+def morton_cells(side: int) -> tuple[Int64[np.ndarray, " c"], Int64[np.ndarray, " c"]]:
     """Return row and column of each cell of a square of ``side`` x ``side`` cells, along a Z-order curve.
 
     >>> [(int(row), int(column)) for row, column in zip(*z_order(2))]
@@ -28,7 +28,7 @@ def z_order(side: int) -> tuple[Int64[np.ndarray, " c"], Int64[np.ndarray, " c"]
 
 
 @dataclass(frozen=True)
-class RayWindows:
+class RayPatches:
     """Windows among the rays of a batch, one after another.
 
     Attributes:
@@ -48,12 +48,12 @@ class RayWindows:
 
     def grid(self, values: Shaped[np.ndarray, "c ..."]) -> Shaped[np.ndarray, "w s s ..."]:
         """Return values of the windows' rays by window, row and column."""
-        rows, columns = z_order(self.side)
+        rows, columns = morton_cells(self.side)
         grid = np.empty((self.count, self.side, self.side, *values.shape[1:]), values.dtype)
         grid[:, rows, columns] = values.reshape(self.count, self.side**2, *values.shape[1:])
         return grid
 
-    def flat(self, grid: Float64[np.ndarray, "w s s ..."]) -> Float64[np.ndarray, "c ..."]:
+    def flatten(self, grid: Float64[np.ndarray, "w s s ..."]) -> Float64[np.ndarray, "c ..."]:
         """Return values by window, row and column in the order of the windows' rays."""
-        rows, columns = z_order(self.side)
+        rows, columns = morton_cells(self.side)
         return grid[:, rows, columns].reshape(-1, *grid.shape[3:])

@@ -15,20 +15,20 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
-from octasplat.engine.core.hashing import unit_numbers
-from octasplat.engine.core.rays import RayBatch, joined
-from octasplat.engine.shading.gbuffer import Buffer, reflected_rays
-from octasplat.engine.shading.reflection_tracing import Follower, Mirrored, Seen
-from octasplat.engine.shading.split_sum import Surface
+from octasplat.engine.core.hashing import hashed_uniforms
+from octasplat.engine.core.rays import RayBatch, concatenate_rays
+from octasplat.engine.shading.gbuffer import GBuffer, reflected_rays
+from octasplat.engine.shading.reflection_tracing import IncidentLight, ReflectedRays, ReflectionTracer
+from octasplat.engine.shading.split_sum import SurfacePoints
 
-STEEPEST_FACET = 0.9
+MAX_FACET_SLOPE = 0.9
 """Share of GGX's facets that are sampled; the others are steeper than these."""
-LEAST_ROUGHNESS = 0.02
+MIN_ROUGHNESS = 0.02
 """Slopes by the roughness are those of surfaces at least so rough."""
 
 
 @dataclass(frozen=True)
-class Facets:
+class FacetPair:
     """Two facets beside each normal, ``p`` points.
 
     Attributes:
@@ -45,116 +45,124 @@ class Facets:
         return steep / np.sqrt(1 + self.slope**2)[:, None]
 
 
-def facets_of(surface: Surface, numbers: Float64[np.ndarray, "2 p"], *, least_slope: float) -> Facets:
-    """Facets by GGX's distribution, at least ``least_slope`` steep, from two even numbers in [0, 1) each."""
+def sample_facets(
+    surface: SurfacePoints, numbers: Float64[np.ndarray, "2 p"], *, min_slope: float
+) -> FacetPair:
+    """Facets by GGX's distribution, at least ``min_slope`` steep, from two even numbers in [0, 1) each."""
     u, v = numbers
     alpha = surface.material[:, 4] ** 2
-    u = u * STEEPEST_FACET
-    slope = np.maximum(alpha * np.sqrt(u / (1 - u)), least_slope)
+    u = u * MAX_FACET_SLOPE
+    slope = np.maximum(alpha * np.sqrt(u / (1 - u)), min_slope)
     n = surface.normal_world
     across = np.where(np.abs(n[:, 2:]) < 0.9, [[0.0, 0.0, 1.0]], [[1.0, 0.0, 0.0]])
     first = np.cross(across, n)
     first /= np.linalg.norm(first, axis=1, keepdims=True)
     angle = np.pi * v[:, None]  # half way around, as each facet has one on the other side
-    return Facets(np.cos(angle) * first + np.sin(angle) * np.cross(n, first), slope)
+    return FacetPair(np.cos(angle) * first + np.sin(angle) * np.cross(n, first), slope)
 
 
-def numbers_of(directions: Float64[np.ndarray, "p 3"], salt: int) -> Float64[np.ndarray, "2 p"]:
+def direction_uniforms(directions: Float64[np.ndarray, "p 3"], salt: int) -> Float64[np.ndarray, "2 p"]:
     """Two numbers in [0, 1) for each direction that follow from it and the salt alone."""
     bits = np.ascontiguousarray(directions, np.float64).view(np.uint64)
-    return unit_numbers(bits[:, 0] + np.uint64(salt), bits[:, 1], bits[:, 2])
+    return hashed_uniforms(bits[:, 0] + np.uint64(salt), bits[:, 1], bits[:, 2])
 
 
 @dataclass(frozen=True)
-class Lobe:
+class ReflectionRayPairs:
     """What the lobes of a buffer's points see.
 
     Attributes:
         facets: that the two rays of each point were mirrored at.
-        mirrored: these rays, those of one side and then those of the other.
+        reflected: these rays, those of one side and then those of the other.
     """
 
-    facets: Facets
-    mirrored: Mirrored
+    facets: FacetPair
+    reflected: ReflectedRays
 
     @property
-    def seen(self) -> Seen:
+    def incident(self) -> IncidentLight:
         """The mean of the two rays of each point."""
-        return pair_mean(self.mirrored.seen)
+        return mean_of_pairs(self.reflected.incident)
 
 
-class Widening(NamedTuple):
+class RoughnessProbe(NamedTuple):
     """What changes as lobes widen, at ``w`` of the points of a buffer.
 
     Attributes:
-        points: their numbers.
+        point_ids: their numbers.
         change: mean of the pair less the ray in its middle.
     """
 
-    points: Int64[np.ndarray, " w"]
-    change: Seen
+    point_ids: Int64[np.ndarray, " w"]
+    change: IncidentLight
 
 
-def look(
+def trace_ray_pairs(
     rays: RayBatch,
-    buffer: Buffer,
-    follower: Follower,
+    gbuffer: GBuffer,
+    reflection_tracer: ReflectionTracer,
     numbers: Float64[np.ndarray, "2 p"],
     *,
-    least_slope: float,
+    min_slope: float,
     record: bool,
-) -> Lobe:
+) -> ReflectionRayPairs:
     """Send two rays from each point of a buffer, mirrored at its facets.
 
     Args:
         rays: that the buffer was gathered along.
-        buffer: of ``p`` points.
-        follower: of reflected rays.
-        numbers: see :func:`facets_of`.
-        least_slope: likewise.
+        gbuffer: of ``p`` points.
+        reflection_tracer: of reflected rays.
+        numbers: see :func:`sample_facets`.
+        min_slope: likewise.
         record: whether there will be a way back.
     """
-    facets = facets_of(buffer.surface, numbers, least_slope=least_slope)
+    facets = sample_facets(gbuffer.surface, numbers, min_slope=min_slope)
     one, other = (
-        reflected_rays(rays, buffer, follower.leaving, facets.normals(buffer.surface.normal_world, sign))
+        reflected_rays(
+            rays, gbuffer, reflection_tracer.offset, facets.normals(gbuffer.surface.normal_world, sign)
+        )
         for sign in (1.0, -1.0)
     )
-    return Lobe(facets, follower.follow(joined(one, other), record=record))
+    return ReflectionRayPairs(facets, reflection_tracer.trace(concatenate_rays(one, other), record=record))
 
 
-def widening(
+def probe_roughness(
     rays: RayBatch,
-    buffer: Buffer,
-    follower: Follower,
-    lobe: Lobe,
+    gbuffer: GBuffer,
+    reflection_tracer: ReflectionTracer,
+    pairs: ReflectionRayPairs,
     drawn: Bool[np.ndarray, " p"],
     *,
-    least_slope: float,
-) -> Widening:
+    min_slope: float,
+) -> RoughnessProbe:
     """Send a third ray from the points that were drawn, where facets are as steep as the roughness says."""
-    points = np.flatnonzero(drawn & (lobe.facets.slope > least_slope))
-    middle = follower.follow(reflected_rays(rays, buffer, follower.leaving)[points], record=False).seen
-    return Widening(points, Seen(*(mean[points] - own for mean, own in zip(lobe.seen, middle, strict=True))))
+    points = np.flatnonzero(drawn & (pairs.facets.slope > min_slope))
+    middle = reflection_tracer.trace(
+        reflected_rays(rays, gbuffer, reflection_tracer.offset)[points], record=False
+    ).incident
+    return RoughnessProbe(
+        points, IncidentLight(*(mean[points] - own for mean, own in zip(pairs.incident, middle, strict=True)))
+    )
 
 
-def pair_mean(seen: Seen) -> Seen:
+def mean_of_pairs(seen: IncidentLight) -> IncidentLight:
     """What the lobe sees: the mean of the two rays of each point."""
     half = len(seen.visibility) // 2
-    return Seen(
+    return IncidentLight(
         (seen.visibility[:half] + seen.visibility[half:]) / 2,
         (seen.light_linear[:half] + seen.light_linear[half:]) / 2,
     )
 
 
-def by_each(by_mean: Seen) -> Seen:
+def backward_mean(by_mean: IncidentLight) -> IncidentLight:
     """Gradients by what each of two rays saw, from those by their mean."""
     visibility, light = by_mean.visibility / 2, by_mean.light_linear / 2
-    return Seen(np.concatenate([visibility, visibility]), np.concatenate([light, light]))
+    return IncidentLight(np.concatenate([visibility, visibility]), np.concatenate([light, light]))
 
 
-def pair_slope(
-    seen: Seen,
-    facets: Facets,
+def backward_normals(
+    seen: IncidentLight,
+    facets: FacetPair,
     around_linear: Float64[np.ndarray, "p 3"],
     by_incoming: Float64[np.ndarray, "p 3"],
 ) -> Float64[np.ndarray, "p 3"]:
@@ -176,8 +184,8 @@ def pair_slope(
     return along[:, None] * facets.tangent_world
 
 
-def roughness_slope(
-    found: Widening,
+def backward_roughness(
+    found: RoughnessProbe,
     roughness: Float64[np.ndarray, " w"],
     around_linear: Float64[np.ndarray, "w 3"],
     by_incoming: Float64[np.ndarray, "w 3"],
@@ -197,4 +205,4 @@ def roughness_slope(
         by_incoming: gradient by the light that comes in there.
     """
     change = found.change.light_linear + found.change.visibility[:, None] * around_linear
-    return np.asarray(4 * (by_incoming * change).sum(axis=1) / np.maximum(roughness, LEAST_ROUGHNESS))
+    return np.asarray(4 * (by_incoming * change).sum(axis=1) / np.maximum(roughness, MIN_ROUGHNESS))

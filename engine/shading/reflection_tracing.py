@@ -12,14 +12,20 @@ import numpy as np
 from jaxtyping import Float64
 
 from octasplat.engine.core.rays import RayBatch
-from octasplat.engine.shading.depth_split import Parted, part, whole
-from octasplat.engine.shading.gbuffer import Buffer, Leaving, gather, reflected_rays, spread_back
-from octasplat.engine.shading.kernels.environment_levels import LightLevels
-from octasplat.engine.shading.split_sum import Surface, shade, shade_reverse
+from octasplat.engine.shading.depth_split import DepthSplit, no_split, split_by_depth
+from octasplat.engine.shading.gbuffer import (
+    GBuffer,
+    RayOffset,
+    backward_gbuffer,
+    build_gbuffer,
+    reflected_rays,
+)
+from octasplat.engine.shading.kernels.environment_levels import EnvironmentLevels
+from octasplat.engine.shading.split_sum import SurfacePoints, shade, shade_backward
 from octasplat.engine.trace.protocol import Recording, TraceGradients, Tracer, TraceResult
 
 
-class Seen(NamedTuple):
+class IncidentLight(NamedTuple):
     """What a reflected ray saw, ``s`` of them.
 
     Attributes:
@@ -32,76 +38,78 @@ class Seen(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Mirrored:
+class ReflectedRays:
     """Reflected rays and what became of them.
 
     Attributes:
         trace: what they met.
-        parted: that, one surface at a time.
-        buffer: what was blended along those that met something.
+        depth_split: that, one surface at a time.
+        gbuffer: what was blended along those that met something.
         surface: the points of that, with what further rays say of them.
         linear: their radiance.
-        further: the rays from there on.
+        next_bounce: the rays from there on.
     """
 
     trace: TraceResult
-    parted: Parted
-    buffer: Buffer
-    surface: Surface
+    depth_split: DepthSplit
+    gbuffer: GBuffer
+    surface: SurfacePoints
     linear: Float64[np.ndarray, "q 3"]
-    further: "Mirrored | None"
+    next_bounce: "ReflectedRays | None"
 
     @property
-    def seen(self) -> Seen:
+    def incident(self) -> IncidentLight:
         """What each ray saw."""
-        light = np.zeros((len(self.parted.rays), 3))
-        light[self.buffer.which] = self.buffer.alpha[:, None] * self.linear
-        return Seen(self.trace.transmittance.astype(np.float64), self.parted.joined(light))
+        light = np.zeros((len(self.depth_split.rays), 3))
+        light[self.gbuffer.ray_ids] = self.gbuffer.alpha[:, None] * self.linear
+        return IncidentLight(self.trace.transmittance.astype(np.float64), self.depth_split.sum_layers(light))
 
 
 @dataclass(frozen=True)
-class Follower:
+class ReflectionTracer:
     """Follows reflected rays, and goes their ways back.
 
     Attributes:
         tracer: built around the Gaussians, with materials as features.
         light: the environment's levels.
         frame: its right, up and forward in the world, as rows.
-        dimmed: the surface of a buffer with its ambient visibility.
-        surfaces: on a path, at least 1; the last one sees nothing but the environment.
-        leaving: how rays leave a surface.
-        apart_world: see :func:`octasplat.engine.shading.depth_split.part`; 0 parts nothing.
+        with_ambient: the surface of a buffer with its ambient visibility.
+        max_bounces: on a path, at least 1; the last one sees nothing but the environment.
+        offset: how rays leave a surface.
+        min_separation_world: see :func:`octasplat.engine.shading.depth_split.split_by_depth`; 0 parts nothing.
     """
 
     tracer: Tracer
-    light: LightLevels
+    light: EnvironmentLevels
     frame: Float64[np.ndarray, "3 3"]
-    dimmed: Callable[[TraceResult, Buffer], Surface]
-    surfaces: int
-    leaving: Leaving
-    apart_world: float
+    with_ambient: Callable[[TraceResult, GBuffer], SurfacePoints]
+    max_bounces: int
+    offset: RayOffset
+    min_separation_world: float
 
-    def follow(self, rays: RayBatch, *, record: bool) -> Mirrored:
+    def trace(self, rays: RayBatch, *, record: bool) -> ReflectedRays:
         """What becomes of reflected rays; ``record`` says whether there will be a way back."""
         trace = self.tracer.trace(rays, record=record)
-        parted = whole(rays, trace)
-        if self.apart_world > 0:
-            parted = part(rays, trace, self.tracer, apart_world=self.apart_world, record=record)
-        buffer = gather(parted.rays, parted.seen)
-        surface, further = self.dimmed(parted.seen, buffer), None
-        if self.surfaces > 1 and len(buffer.which):
-            onward = reflected_rays(parted.rays, buffer, self.leaving)
-            further = replace(self, surfaces=self.surfaces - 1).follow(onward, record=record)
-            seen = further.seen
+        parted = no_split(rays, trace)
+        if self.min_separation_world > 0:
+            parted = split_by_depth(
+                rays, trace, self.tracer, min_separation_world=self.min_separation_world, record=record
+            )
+        buffer = build_gbuffer(parted.rays, parted.results)
+        surface, further = self.with_ambient(parted.results, buffer), None
+        if self.max_bounces > 1 and len(buffer.ray_ids):
+            onward = reflected_rays(parted.rays, buffer, self.offset)
+            further = replace(self, max_bounces=self.max_bounces - 1).trace(onward, record=record)
+            seen = further.incident
             surface = replace(surface, visibility=seen.visibility, indirect_linear=seen.light_linear)
-        return Mirrored(trace, parted, buffer, surface, shade(surface, self.light, self.frame), further)
+        return ReflectedRays(trace, parted, buffer, surface, shade(surface, self.light, self.frame), further)
 
 
-def follow_back(
-    mirrored: Mirrored,
-    light: LightLevels,
+def backward_reflections(
+    reflected: ReflectedRays,
+    light: EnvironmentLevels,
     frame: Float64[np.ndarray, "3 3"],
-    by_seen: Seen,
+    by_incident: IncidentLight,
     by_texels: Float64[np.ndarray, "t 3"],
 ) -> tuple[tuple[Recording, TraceGradients], ...]:
     """Gradients by the materials of all that was met, and by how much of it there is.
@@ -109,30 +117,30 @@ def follow_back(
     So what only a mirror shows takes its shape from there. None by its normals, none by where it was met.
 
     Args:
-        mirrored: what rays met.
-        light: see :class:`Follower`.
+        reflected: what rays met.
+        light: see :class:`ReflectionTracer`.
         frame: likewise.
-        by_seen: gradients by what each ray saw.
+        by_incident: gradients by what each ray saw.
         by_texels: those by the texels are added to this.
     """
-    buffer, trace, parted = mirrored.buffer, mirrored.trace, mirrored.parted
+    buffer, trace, parted = reflected.gbuffer, reflected.trace, reflected.depth_split
     assert trace.recording is not None
-    which, count = buffer.which, len(parted.rays)
-    by_light = parted.each(by_seen.light_linear)[which]
-    back = shade_reverse(mirrored.surface, light, frame, by_light * buffer.alpha[:, None])
-    by_texels += back.texels(len(by_texels))
-    by_alpha = -parted.each(by_seen.visibility)
-    by_alpha[which] += (by_light * mirrored.linear).sum(axis=1)
+    which, count = buffer.ray_ids, len(parted.rays)
+    by_light = parted.expand(by_incident.light_linear)[which]
+    back = shade_backward(reflected.surface, light, frame, by_light * buffer.alpha[:, None])
+    by_texels += back.sum_texels(len(by_texels))
+    by_alpha = -parted.expand(by_incident.visibility)
+    by_alpha[which] += (by_light * reflected.linear).sum(axis=1)
     by_features, nothing = np.zeros((count, trace.features.shape[1])), np.zeros((count, 3))
-    spread_back(buffer, back.material, np.zeros_like(back.normal), by_features, by_alpha, nothing)
+    backward_gbuffer(buffer, back.material, np.zeros_like(back.normal), by_features, by_alpha, nothing)
     own = TraceGradients(
         rgb_srgb=nothing.astype(np.float32),
         transmittance=-by_alpha.astype(np.float32),
         features=by_features.astype(np.float32),
     )
-    by_whole, fronts = parted.back(own)
+    by_whole, fronts = parted.backward(own)
     found = ((trace.recording, by_whole), *fronts)
-    if mirrored.further is None:
+    if reflected.next_bounce is None:
         return found
-    by_further = Seen(back.visibility, back.indirect)
-    return found + follow_back(mirrored.further, light, frame, by_further, by_texels)
+    by_further = IncidentLight(back.visibility, back.indirect)
+    return found + backward_reflections(reflected.next_bounce, light, frame, by_further, by_texels)

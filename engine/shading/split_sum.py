@@ -17,7 +17,7 @@ from jaxtyping import Float, Float64, Int32
 
 from octasplat.engine.core.compilation import run_ranges
 from octasplat.engine.core.threads import threads_in_use
-from octasplat.engine.shading.kernels.environment_levels import LightLevels
+from octasplat.engine.shading.kernels.environment_levels import EnvironmentLevels
 from octasplat.engine.shading.kernels.split_sum import (
     TAPS,
     GradientArrays,
@@ -49,7 +49,7 @@ def split_sum_table() -> Float64[np.ndarray, "a c 2"]:
 
 
 @dataclass(frozen=True)
-class Surface:
+class SurfacePoints:
     """What is shaded, ``p`` points of it.
 
     Attributes:
@@ -71,12 +71,12 @@ class Surface:
     bounced_linear: Float64[np.ndarray, "p 3"]
 
     @classmethod
-    def alone(
+    def unoccluded(
         cls,
         material: Float[np.ndarray, "p 5"],
         normal_world: Float[np.ndarray, "p 3"],
         direction_world: Float[np.ndarray, "p 3"],
-    ) -> "Surface":
+    ) -> "SurfacePoints":
         """Points that nothing hides from the environment."""
         count = len(material)
         nothing = np.zeros((count, 3))
@@ -122,7 +122,7 @@ class ShadeGradients(NamedTuple):
     taps: Int32[np.ndarray, "p 12"]
     weights: Float64[np.ndarray, "p 12"]
 
-    def texels(self, count: int) -> Float64[np.ndarray, "t 3"]:
+    def sum_texels(self, count: int) -> Float64[np.ndarray, "t 3"]:
         """Gradients by the texels of all levels, summed pixel after pixel."""
         sums = np.zeros((count, 3))
         add_to_texels(self.taps, self.weights, self.specular, self.diffuse, sums)
@@ -130,7 +130,7 @@ class ShadeGradients(NamedTuple):
 
 
 def shade(
-    surface: Surface, light: LightLevels, frame: Float64[np.ndarray, "3 3"]
+    surface: SurfacePoints, light: EnvironmentLevels, frame: Float64[np.ndarray, "3 3"]
 ) -> Float64[np.ndarray, "p 3"]:
     """Linear colours.
 
@@ -147,9 +147,9 @@ def shade(
     return rgb
 
 
-def shade_reverse(
-    surface: Surface,
-    light: LightLevels,
+def shade_backward(
+    surface: SurfacePoints,
+    light: EnvironmentLevels,
     frame: Float64[np.ndarray, "3 3"],
     by_rgb: Float64[np.ndarray, "p 3"],
     *,
@@ -183,7 +183,7 @@ def shade_reverse(
     return out._replace(normal=out.normal @ frame, reflected=out.reflected @ frame)
 
 
-def _surface_arrays(surface: Surface, frame: Float64[np.ndarray, "3 3"]) -> SurfaceArrays:
+def _surface_arrays(surface: SurfacePoints, frame: Float64[np.ndarray, "3 3"]) -> SurfaceArrays:
     return SurfaceArrays(
         surface.material,
         np.ascontiguousarray(surface.normal_world @ frame.T),

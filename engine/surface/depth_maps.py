@@ -12,7 +12,7 @@ from jaxtyping import Float32, UInt8
 
 from octasplat.engine.core.color import to_bytes
 from octasplat.engine.core.rays import ImageRays
-from octasplat.engine.core.writing import telling_of_room
+from octasplat.engine.core.writing import report_disk_full
 from octasplat.engine.render.pinhole_camera import PinholeCamera
 from octasplat.engine.render.renderer import RenderedImage, render_rays
 from octasplat.engine.surface.colour_fit import Picture
@@ -57,7 +57,7 @@ def render_depth_maps(
         NoSpaceLeft: there is no room for it.
     """
     sizes = [camera.width_px * camera.height_px for camera in cameras]
-    with telling_of_room(folder), tempfile.TemporaryFile(dir=folder) as handle:
+    with report_disk_full(folder), tempfile.TemporaryFile(dir=folder) as handle:
         # Not a file with holes: a full disk would end the program when they are filled.
         os.posix_fallocate(handle.fileno(), 0, max(12, 12 * sum(sizes)))
         stored = np.memmap(handle, dtype=np.float32, mode="r+", shape=(3 * sum(sizes),))

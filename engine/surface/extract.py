@@ -9,8 +9,8 @@ from jaxtyping import Bool, Float32, Float64
 from scipy.spatial import cKDTree
 
 from octasplat.engine.core.color import to_bytes
-from octasplat.engine.core.events import Listener, ignore
-from octasplat.engine.core.progress import counted_stage, stopping
+from octasplat.engine.core.events import EventListener, ignore_events
+from octasplat.engine.core.progress import counted_phase, stop_when_asked
 from octasplat.engine.geometry.triangle_mesh import EdgeReport, TriangleMesh, edge_report
 from octasplat.engine.render.pinhole_camera import PinholeCamera
 from octasplat.engine.surface.backdrop import with_backdrop
@@ -63,7 +63,7 @@ def extract_levels(
     scratch: Path,
     light_frame: Float64[np.ndarray, "3 3"] | None = None,
     photographs: Sequence[Picture] = (),
-    listener: Listener = ignore,
+    listener: EventListener = ignore_events,
     should_stop: Callable[[], bool] = lambda: False,
 ) -> tuple[ExtractedSurface, ...]:
     """Return one surface in several levels of detail, fused once, then decimated and coloured for each.
@@ -88,22 +88,22 @@ def extract_levels(
 
     Raises:
         ConfigError: the region cannot be found, is empty or takes too much memory.
-        Cancelled: stopped as asked.
+        CancelledError: stopped as asked.
     """
-    tell = stopping(listener, should_stop, "Stopped; no surface was written.")
+    tell = stop_when_asked(listener, should_stop, "Stopped; no surface was written.")
     if not options.unbounded and options.bounds is None:
         focus_point(cameras)  # complain before the long work
-    with counted_stage("depth", tell, len(cameras)) as progress:
+    with counted_phase("depth", tell, len(cameras)) as progress:
         maps, renders = render_depth_maps(tracer, cameras, options, scratch, progress)
     region = choose_region(maps, options)
-    with counted_stage("fusing", tell, 2 * len(cameras)) as progress:
+    with counted_phase("fusing", tell, 2 * len(cameras)) as progress:
         volume: TsdfVolume | None = fuse_depth_maps(maps, region, options, progress)
     del maps
     assert volume is not None
     if options.unseen == "solid":
         fill_unseen(volume, options.min_weight)
     volume_bytes = len(volume.blocks) * BYTES_PER_BLOCK
-    with counted_stage("meshing", tell, 3) as progress:
+    with counted_phase("meshing", tell, 3) as progress:
         mesh = marching_cubes(volume, options.min_weight)
         volume, found = None, len(mesh.faces)
         progress(1, 3)
@@ -113,7 +113,7 @@ def extract_levels(
         mesh, closed = fill_holes(mesh, max_rim) if max_rim is None or max_rim > 0 else (mesh, 0)
         progress(3, 3)
     if options.refine_vertices:  # while triangles are small enough to show what the pictures do
-        with counted_stage("settling", tell, 0) as progress:
+        with counted_phase("settling", tell, 0) as progress:
             mesh = refine_vertices(mesh, photographs or renders, progress)
     meshes = _decimate_levels(mesh, options, levels, tell)
     del mesh
@@ -138,7 +138,7 @@ def _bake_colours(
     mesh: TriangleMesh,
     region: Region,
     light_frame: Float64[np.ndarray, "3 3"] | None,
-    tell: Listener,
+    tell: EventListener,
 ) -> TriangleMesh:
     """Return the mesh with colours at its vertices, or with textures."""
     tolerance = TOLERANCE_VOXELS * region.voxel_world
@@ -146,7 +146,7 @@ def _bake_colours(
     def look_at(
         points: Points, normals: Points, look: BakeTarget
     ) -> tuple[np.ndarray, Bool[np.ndarray, " n"]]:
-        with counted_stage("colouring", tell, 0) as progress:
+        with counted_phase("colouring", tell, 0) as progress:
             baked, seen = bake(points, normals, mesh, cameras, tracer, look, tolerance, progress)
             return _fill_unseen(points, baked, seen), seen
 
@@ -157,14 +157,14 @@ def _bake_colours(
             rgb = np.full((len(points), 3), 0.5, np.float32)
         if not options.fit:
             return rgb
-        with counted_stage("fitting", tell, 0) as progress:
+        with counted_phase("fitting", tell, 0) as progress:
             return _fill_unseen(points, *fit_colours(palette, rgb, photographs or renders, progress))
 
     if options.texture_size is None:
         assert light_frame is None, "materials need a texture"
         rgb = colours(VertexPalette(mesh), mesh.vertices_world, mesh.vertex_normals())
         return replace(mesh, rgb_srgb=rgb)
-    with counted_stage("unwrapping", tell, 0):
+    with counted_phase("unwrapping", tell, 0):
         layout = unwrap(mesh, options.texture_size)
     points, normals = layout.points_world, layout.normals_world
     if light_frame is not None:
@@ -174,13 +174,13 @@ def _bake_colours(
 
 
 def _decimate_levels(
-    mesh: TriangleMesh, options: ExtractionOptions, levels: Sequence[int | None], tell: Listener
+    mesh: TriangleMesh, options: ExtractionOptions, levels: Sequence[int | None], tell: EventListener
 ) -> list[TriangleMesh]:
     """Return the mesh for each level, with at most its number of triangles."""
     if all(level is None for level in levels):
         return [mesh] * len(levels)
     meshes = []
-    with counted_stage("decimating", tell, len(levels)) as progress:
+    with counted_phase("decimating", tell, len(levels)) as progress:
         for done, level in enumerate(levels, 1):
             # Thin parts may come apart.
             meshes.append(mesh if level is None else _keep_components(decimate(mesh, level), options))

@@ -92,7 +92,7 @@ def _downsample(
 
     ways = blocks(rays.directions_world)
     ways /= np.linalg.norm(ways, axis=2, keepdims=True)
-    return ImageRays.of(rays.origin_world, ways, float(rays.rays.t_min[0])), blocks(rgba) / 255
+    return ImageRays.from_directions(rays.origin_world, ways, float(rays.rays.t_min[0])), blocks(rgba) / 255
 
 
 def _visible_pixels(mesh: TriangleMesh, pictures: Sequence[tuple[ImageRays, np.ndarray]]) -> _VisiblePixels:

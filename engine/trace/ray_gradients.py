@@ -98,7 +98,7 @@ def _hit_gradients(
     normals, weight = hits.frames[:, :, 0], hits.weight
 
     # --- colour, and the direction in which it is seen ---
-    viewers = np.broadcast_to(rays.t_viewer, len(rays)).astype(np.float64)[ray]
+    viewers = np.broadcast_to(rays.t_view_origin, len(rays)).astype(np.float64)[ray]
     is_near = np.isfinite(viewers)
     to_viewer = np.where(is_near, viewers, 0.0)[:, None]
     view = np.where(is_near[:, None], hits.to_mean - to_viewer * directions, directions)

@@ -117,7 +117,7 @@ def trace_reference(
     d = torch.tensor(rays.directions_world, dtype=torch.float64)
     o = torch.tensor(rays.origins_world, dtype=torch.float64).expand_as(d)
     t_min, t_max = (torch.tensor(limit).expand(len(d))[:, None] for limit in (rays.t_min, rays.t_max))
-    viewers = torch.tensor(rays.t_viewer, dtype=torch.float64).expand(len(d))
+    viewers = torch.tensor(rays.t_view_origin, dtype=torch.float64).expand(len(d))
     frames = rotation_matrices(p.quats_wxyz)
     r1, r2, r3 = frames.unbind(-1)
     s2, s3 = p.log_scales.exp().unbind(-1)
@@ -139,7 +139,7 @@ def trace_reference(
     au, av = u.detach().abs(), v.detach().abs()
     inside = torch.maximum(au * cos + av * sin, au * sin + av * cos) <= inner_radius
     t32 = t.detach().float()
-    leaves = torch.tensor(rays.t_leaves).expand(len(d))[:, None]
+    leaves = torch.tensor(rays.t_backface_cull).expand(len(d))[:, None]
     left_behind = (cosine > 0) & (t32 < leaves) & (settings.flip_normal_cos > 0)
     hit = inside & ~grazing & (t32 > t_min) & (t32 < t_max) & (inner_radius > 0) & ~left_behind
 

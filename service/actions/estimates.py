@@ -1,6 +1,6 @@
 """What a job would take, before it is asked for."""
 
-from octasplat.engine.dataset.image_sizes import Sizes
+from octasplat.engine.dataset.image_sizes import ImageSizes
 from octasplat.engine.operations.cost_model import Estimate
 from octasplat.service.actions.validation import input_problem, resolve_options, validate_kind
 from octasplat.service.auth import Principal
@@ -22,14 +22,14 @@ async def estimate(service: Service, who: Principal, new: NewEstimate) -> Estima
     kind = validate_kind(new.kind)
     options = resolve_options(kind, new.options)
     async with service.pool.connection() as connection:
-        sizes = [Sizes(group.width_px, group.height_px, group.count) for group in new.photographs]
+        sizes = [ImageSizes(group.width_px, group.height_px, group.count) for group in new.photographs]
         sizes += await _sizes_of(connection, who, new)
         workers = await live_workers_of_queue(connection, new.queue, service.settings.stale_seconds)
     check_job_limits(kind, options, sizes, service.settings)
     return estimate_job(kind, options, sizes, workers)
 
 
-async def _sizes_of(connection: Connection, who: Principal, new: NewEstimate) -> list[Sizes]:
+async def _sizes_of(connection: Connection, who: Principal, new: NewEstimate) -> list[ImageSizes]:
     """Sizes of the photographs of a dataset, or of the one that a job worked on."""
     dataset_id = new.dataset_id
     if new.source_id is not None:

@@ -9,7 +9,7 @@ from pydantic import BaseModel, ValidationError
 from octasplat.engine.core.errors import ConfigError
 from octasplat.engine.operations.cost_model import Estimate
 from octasplat.engine.settings.refusals import SettingsRefused
-from octasplat.engine.settings.renamed_settings import collected_notices
+from octasplat.engine.settings.renamed_settings import collect_notices
 from octasplat.service.actions.access import check_not_draining, owned_job
 from octasplat.service.actions.jobs import job_view
 from octasplat.service.actions.named_files import check_named_files
@@ -76,7 +76,7 @@ async def submit_job(
     """
     check_not_draining(service)
     kind = validate_kind(request.kind)
-    with collected_notices() as notices:
+    with collect_notices() as notices:
         asked = _RequestedJob(request, kind, resolve_options(kind, request.options), traceparent)
     check_priority(who, request.priority, service.settings)
     if request.webhook is not None:
@@ -137,7 +137,7 @@ async def retry_job(
         named = fingerprint(
             "retry", str(job_id), request.start, *([request.options] if request.options else [])
         )
-        with collected_notices() as notices:
+        with collect_notices() as notices:
             await create_once(connection, who, idempotency_key, named, make)
         view = await job_view(connection, service, await owned_job(connection, who, job_id))
         return view.model_copy(update={"notes": [*view.notes, *notices]})

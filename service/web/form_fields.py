@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal, cast
 
 from octasplat.engine.files import exporters
-from octasplat.engine.settings.fields import Level
+from octasplat.engine.settings.fields import SettingLevel
 
 Control = Literal[
     "choice", "yes_no", "whole", "number", "text", "document", "list", "numbers", "json", "files",
@@ -90,7 +90,7 @@ class FormField:
     control: Control
     help: str
     unit: str = ""
-    group: Level = "basic"
+    group: SettingLevel = "basic"
     choices: tuple[Choice, ...] = ()
     default: str = ""
     defaults: str = ""
@@ -177,7 +177,7 @@ def _form_field(
         control=control,
         help=_help_sentence(schema.get("description", "")),
         unit=schema.get("unit", ""),
-        group=cast(Level, schema.get("group", "basic")),
+        group=cast(SettingLevel, schema.get("group", "basic")),
         choices=choices,
         default=_display_text(default),
         defaults=_defaults_json(by_preset) if len(set(map(_display_text, by_preset.values()))) > 1 else "",

@@ -20,7 +20,7 @@ from octasplat.engine import __version__
 
 if TYPE_CHECKING:
     from octasplat.client import Client, Job
-    from octasplat.engine.core.errors import Cancelled, ConfigError, OctasplatError
+    from octasplat.engine.core.errors import CancelledError, ConfigError, OctasplatError
     from octasplat.engine.render.pinhole_camera import PinholeCamera as Camera
     from octasplat.engine.trace.protocol import TraceSettings
     from octasplat.images import Image
@@ -50,7 +50,7 @@ if TYPE_CHECKING:
 
 _SOURCES = {
     "Camera": ("engine.render.pinhole_camera", "PinholeCamera"),
-    "Cancelled": ("engine.core.errors", "Cancelled"),
+    "CancelledError": ("engine.core.errors", "CancelledError"),
     "Client": ("client", "Client"),
     "ConfigError": ("engine.core.errors", "ConfigError"),
     "GaussianTensors": ("tracing", "GaussianTensors"),
@@ -89,7 +89,7 @@ _SOURCES = {
 
 __all__ = [
     "Camera",
-    "Cancelled",
+    "CancelledError",
     "Client",
     "ConfigError",
     "GaussianTensors",

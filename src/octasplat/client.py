@@ -8,7 +8,7 @@ from types import TracebackType
 from typing import Any, Literal, cast
 
 from octasplat.engine.core.errors import ConfigError
-from octasplat.engine.core.events import Listener
+from octasplat.engine.core.events import EventListener
 from octasplat.notebook import default_progress, table_html
 from octasplat.paths import PathLike
 from octasplat.workers.client import submission
@@ -74,7 +74,7 @@ class Client:
         label: str | None = None,
         queue: str = "cpu",
         priority: int = 0,
-        progress: Listener | None = None,
+        progress: EventListener | None = None,
         **options: Any,
     ) -> "Job":
         """Send photographs and queue their reconstruction; photographs that are there are not sent again.
@@ -105,7 +105,7 @@ class Client:
         label: str | None = None,
         queue: str = "cpu",
         priority: int = 0,
-        progress: Listener | None = None,
+        progress: EventListener | None = None,
         **options: Any,
     ) -> "Job":
         """Queue a job on the results of a finished one, such as a render, or on files alone.
@@ -209,7 +209,7 @@ class Job:
         return self
 
     def wait(
-        self, *, progress: Listener | None = None, on_note: Callable[[str], None] = lambda _note: None
+        self, *, progress: EventListener | None = None, on_note: Callable[[str], None] = lambda _note: None
     ) -> "Job":
         """Wait until the job is over, and return the job itself.
 
@@ -254,7 +254,9 @@ class Job:
         found = self._api.get(f"/v1/jobs/{self.id}/artifacts")["artifacts"]
         return tuple(Result(artifact["name"], artifact["size_bytes"]) for artifact in found)
 
-    def download(self, folder: PathLike, *names: str, progress: Listener | None = None) -> tuple[Path, ...]:
+    def download(
+        self, folder: PathLike, *names: str, progress: EventListener | None = None
+    ) -> tuple[Path, ...]:
         """Save the results in a folder and return the files; files that are there are not sent again.
 
         Args:

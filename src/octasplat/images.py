@@ -116,14 +116,16 @@ def render_view(
     """
     from octasplat.engine.render.renderer import background_colour
     from octasplat.engine.render.supersampling import rays_per_pixel_side, render_averaged
-    from octasplat.engine.shading.plain import PLAIN
+    from octasplat.engine.shading.plain import PLAIN_SHADING
 
     behind = (
         background_colour(background) if isinstance(background, str) else np.array(background, np.float32)
     )
     rays = camera.rays()
     tracer = _build_tracer(scene, threads)
-    seen = render_averaged(tracer, rays, behind, PLAIN, rays_per_pixel_side(rays, scene.facts.pixel_rad))
+    seen = render_averaged(
+        tracer, rays, behind, PLAIN_SHADING, rays_per_pixel_side(rays, scene.facts.pixel_rad)
+    )
     return Image(seen.rgb_srgb, seen.depth, seen.normal_world, seen.alpha, scene, rays, threads)
 
 

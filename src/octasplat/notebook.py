@@ -9,10 +9,10 @@ from typing import Any
 
 from octasplat.engine.core.events import (
     Event,
-    Listener,
+    EventListener,
     Noted,
-    StageFinished,
-    StageProgress,
+    PhaseFinished,
+    PhaseProgress,
     TrainingProgress,
     Warned,
 )
@@ -33,7 +33,7 @@ def log_event(event: Event) -> None:
         LOGGER.debug("%s", event)
 
 
-def default_progress() -> Listener:
+def default_progress() -> EventListener:
     """Return what shows events where nobody says how: in the cell of a notebook, or else in the log."""
     return NotebookProgress() if in_notebook() else ProgressLog()
 
@@ -76,14 +76,14 @@ class NotebookProgress:
     def __call__(self, event: Event) -> None:
         """Show ``event``."""
         self._stage(event)
-        if isinstance(event, StageProgress):
+        if isinstance(event, PhaseProgress):
             self._share = (event.step + event.part) / event.total_steps if event.total_steps else None
         elif isinstance(event, TrainingProgress):
             self._share = event.iteration / event.total_iterations
-        elif isinstance(event, StageFinished):
+        elif isinstance(event, PhaseFinished):
             self._share = None
         now = time.monotonic()
-        if now >= self._next or isinstance(event, StageFinished | Warned):
+        if now >= self._next or isinstance(event, PhaseFinished | Warned):
             self._next = now + UPDATE_INTERVAL_SECONDS
             self._update()
 

@@ -10,13 +10,13 @@ from typing import Any, ParamSpec, TypeVar
 from pydantic import BaseModel
 
 from octasplat.engine.core.errors import ConfigError
-from octasplat.engine.core.events import Listener
+from octasplat.engine.core.events import EventListener
 from octasplat.engine.operations.base import build_request
 from octasplat.engine.operations.registry import operation
 from octasplat.engine.operations.written_files import remember_written
 from octasplat.engine.settings.fields import is_negatable
 from octasplat.engine.settings.nearest_names import nearest_name
-from octasplat.engine.settings.renamed_settings import with_new_names
+from octasplat.engine.settings.renamed_settings import translate_names
 from octasplat.notebook import default_progress
 
 P = ParamSpec("P")
@@ -42,7 +42,7 @@ def names_checked(function: Callable[P, R]) -> Callable[P, R]:
         former = [name for name in options if name not in names]
         if former and function.__module__ == "octasplat.verbs":
             request = operation(function.__name__.rstrip("_").replace("_", "-")).request
-            renamed = with_new_names((request,), {name: options.pop(name) for name in former})
+            renamed = translate_names((request,), {name: options.pop(name) for name in former})
             options.update(renamed)
         for name in options:
             if name not in names:
@@ -57,7 +57,7 @@ def names_checked(function: Callable[P, R]) -> Callable[P, R]:
 def run_operation(
     name: str,
     values: Mapping[str, Any],
-    progress: Listener | None,
+    progress: EventListener | None,
     should_stop: Callable[[], bool],
     threads: int,
 ) -> Any:
@@ -67,7 +67,7 @@ def run_operation(
         name: of the operation.
         values: those of its request by field; for what counts as given see :func:`explicit_values`.
         progress: told the events; None logs them, or shows them in a notebook.
-        should_stop: asked now and then; True ends the work with ``Cancelled``.
+        should_stop: asked now and then; True ends the work with ``CancelledError``.
         threads: 0 takes all cores.
 
     Raises:

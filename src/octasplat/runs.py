@@ -6,8 +6,8 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from octasplat.engine.core.errors import Cancelled, ConfigError
-from octasplat.engine.core.events import Event, Listener, TrainingProgress
+from octasplat.engine.core.errors import CancelledError, ConfigError
+from octasplat.engine.core.events import Event, EventListener, TrainingProgress
 from octasplat.notebook import default_progress, table_html
 from octasplat.operation_calls import explicit_values, run_operation
 from octasplat.paths import PathLike
@@ -23,14 +23,14 @@ OnStep = Callable[[TrainingProgress], bool | None]
 def reconstruct_run(
     values: Mapping[str, Any],
     on_step: OnStep | None,
-    progress: Listener | None,
+    progress: EventListener | None,
     should_stop: Callable[[], bool],
     threads: int,
 ) -> "Run":
     """Do the request of a reconstruction; where ``on_step`` returns False, return the unfinished run.
 
     Raises:
-        Cancelled: ``should_stop`` returned True.
+        CancelledError: ``should_stop`` returned True.
         OctasplatError: as the operation does.
     """
     from octasplat.engine.operations.reconstruct import (
@@ -55,7 +55,7 @@ def reconstruct_run(
 
     try:
         run_operation("reconstruct", values, listen, lambda: stopped or should_stop(), threads)
-    except Cancelled:
+    except CancelledError:
         if not stopped:
             raise
     return Run(values["output"])
@@ -113,11 +113,11 @@ class Run:
     def settings(self) -> Mapping[str, Any]:
         """All settings."""
         from octasplat.engine.runs.config import ReconstructionConfig
-        from octasplat.engine.settings.renamed_settings import with_new_names
+        from octasplat.engine.settings.renamed_settings import translate_names
 
         path = self.path / _CONFIG
         found: Mapping[str, Any] = _read_json(path).get("reconstruction", {})
-        return with_new_names((ReconstructionConfig,), found, source=str(path))
+        return translate_names((ReconstructionConfig,), found, source=str(path))
 
     @property
     def training(self) -> Mapping[str, Any]:

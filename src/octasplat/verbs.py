@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Literal, TypedDict
 
 from pydantic import BaseModel
 
-from octasplat.engine.core.events import Listener
+from octasplat.engine.core.events import EventListener
 from octasplat.engine.operations.base import never_stop
 from octasplat.operation_calls import names_checked, run_operation
 from octasplat.paths import PathLike
@@ -66,7 +66,7 @@ class RenderArguments(TypedDict, total=False):
     denoise: bool
     stage_file: PathLike | None
     stage_folder: PathLike | None
-    progress: Listener | None
+    progress: EventListener | None
     should_stop: Callable[[], bool]
     threads: int
 
@@ -96,7 +96,7 @@ def reconstruct(
     assignments: Sequence[str] | None = None,
     resume: bool = False,
     on_step: OnStep | None = None,
-    progress: Listener | None = None,
+    progress: EventListener | None = None,
     should_stop: Callable[[], bool] = never_stop,
     threads: int = 0,
 ) -> "Run":
@@ -143,7 +143,7 @@ def reconstruct(
             after a checkpoint, and the run that is returned is unfinished. With ``resume=True`` another
             call goes on.
         progress: told each event; by default they are logged, or shown in a notebook.
-        should_stop: asked now and then; True ends the work with ``Cancelled``.
+        should_stop: asked now and then; True ends the work with ``CancelledError``.
         threads: number of threads; 0 takes all cores. The result does not depend on it.
 
     Raises:
@@ -214,7 +214,7 @@ def estimate(
     train: Mapping[str, Any] | None = None,
     assignments: Sequence[str] | None = None,
     cores: int | None = None,
-    progress: Listener | None = None,
+    progress: EventListener | None = None,
     should_stop: Callable[[], bool] = never_stop,
     threads: int = 0,
 ) -> "EstimateResult":
@@ -256,7 +256,7 @@ def estimate(
             config list shows them.
         cores: Cores of the machine to reckon with; 0 takes those of this one. Default: 0.
         progress: told each event; by default they are logged, or shown in a notebook.
-        should_stop: asked now and then; True ends the work with ``Cancelled``.
+        should_stop: asked now and then; True ends the work with ``CancelledError``.
         threads: number of threads; 0 takes all cores. The result does not depend on it.
 
     Raises:
@@ -306,7 +306,7 @@ def evaluate(
     evaluation_background: Literal["black", "white"] | None = None,
     dataset: PathLike | None = None,
     other_dataset: PathLike | None = None,
-    progress: Listener | None = None,
+    progress: EventListener | None = None,
     should_stop: Callable[[], bool] = never_stop,
     threads: int = 0,
 ) -> "EvaluateResult":
@@ -324,7 +324,7 @@ def evaluate(
         other_dataset: Measure all photographs of another folder instead (images/ and sparse/0 in the
             same world as the run's); the results go to OUT/on/<its name>.
         progress: told each event; by default they are logged, or shown in a notebook.
-        should_stop: asked now and then; True ends the work with ``Cancelled``.
+        should_stop: asked now and then; True ends the work with ``CancelledError``.
         threads: number of threads; 0 takes all cores. The result does not depend on it.
 
     Raises:
@@ -360,7 +360,7 @@ def info(
     up: Literal["x", "-x", "y", "-y", "z", "-z"] | None = None,
     dataset: PathLike | None = None,
     picture: PathLike | None = None,
-    progress: Listener | None = None,
+    progress: EventListener | None = None,
     should_stop: Callable[[], bool] = never_stop,
     threads: int = 0,
 ) -> "InfoResult":
@@ -375,7 +375,7 @@ def info(
         dataset: Take the cameras of the photographs in this folder. [default: those the run keeps]
         picture: Write a small picture of the scene, too.
         progress: told each event; by default they are logged, or shown in a notebook.
-        should_stop: asked now and then; True ends the work with ``Cancelled``.
+        should_stop: asked now and then; True ends the work with ``CancelledError``.
         threads: number of threads; 0 takes all cores. The result does not depend on it.
 
     Raises:
@@ -432,7 +432,7 @@ def surface(
     up: Literal["x", "-x", "y", "-y", "z", "-z"] | None = None,
     dataset: PathLike | None = None,
     photographs: PathLike | None = None,
-    progress: Listener | None = None,
+    progress: EventListener | None = None,
     should_stop: Callable[[], bool] = never_stop,
     threads: int = 0,
 ) -> "SurfaceResult":
@@ -482,7 +482,7 @@ def surface(
         photographs: A copy of the photographs that the run was made from, for colours alone; left out
             if it has other poses.
         progress: told each event; by default they are logged, or shown in a notebook.
-        should_stop: asked now and then; True ends the work with ``Cancelled``.
+        should_stop: asked now and then; True ends the work with ``CancelledError``.
         threads: number of threads; 0 takes all cores. The result does not depend on it.
 
     Raises:
@@ -544,7 +544,7 @@ def material(
     inverse: bool = False,
     mesh: PathLike | None = None,
     masks: Sequence[PathLike] | None = None,
-    progress: Listener | None = None,
+    progress: EventListener | None = None,
     should_stop: Callable[[], bool] = never_stop,
     threads: int = 0,
 ) -> "MaterialResult":
@@ -568,7 +568,7 @@ def material(
         masks: Those that show where this image is white; it has the name of one of the run's
             photographs. Several say together what is meant.
         progress: told each event; by default they are logged, or shown in a notebook.
-        should_stop: asked now and then; True ends the work with ``Cancelled``.
+        should_stop: asked now and then; True ends the work with ``CancelledError``.
         threads: number of threads; 0 takes all cores. The result does not depend on it.
 
     Raises:
@@ -634,7 +634,7 @@ def render(
     denoise: bool = False,
     stage_file: PathLike | None = None,
     stage_folder: PathLike | None = None,
-    progress: Listener | None = None,
+    progress: EventListener | None = None,
     should_stop: Callable[[], bool] = never_stop,
     threads: int = 0,
 ) -> "RenderResult":
@@ -689,7 +689,7 @@ def render(
         stage_folder: Where the names of the stage's files are relative to. [default: the folder of the
             stage file]
         progress: told each event; by default they are logged, or shown in a notebook.
-        should_stop: asked now and then; True ends the work with ``Cancelled``.
+        should_stop: asked now and then; True ends the work with ``CancelledError``.
         threads: number of threads; 0 takes all cores. The result does not depend on it.
 
     Raises:
@@ -781,7 +781,7 @@ def relight(
     spin: bool = False,
     background: Literal["black", "white", "transparent", "environment"] | None = None,
     other_dataset: PathLike | None = None,
-    progress: Listener | None = None,
+    progress: EventListener | None = None,
     should_stop: Callable[[], bool] = never_stop,
     threads: int = 0,
 ) -> "RelightResult":
@@ -837,7 +837,7 @@ def relight(
             evaluation, or black]
         other_dataset: Render the views of the photographs of another folder (images/ and sparse/0).
         progress: told each event; by default they are logged, or shown in a notebook.
-        should_stop: asked now and then; True ends the work with ``Cancelled``.
+        should_stop: asked now and then; True ends the work with ``CancelledError``.
         threads: number of threads; 0 takes all cores. The result does not depend on it.
 
     Raises:
@@ -901,7 +901,7 @@ def stage_init(
     overwrite: bool = False,
     up: Literal["x", "-x", "y", "-y", "z", "-z"] | None = None,
     dataset: PathLike | None = None,
-    progress: Listener | None = None,
+    progress: EventListener | None = None,
     should_stop: Callable[[], bool] = never_stop,
     threads: int = 0,
 ) -> "StageInitResult":
@@ -915,7 +915,7 @@ def stage_init(
         up: The axis of a file that points up; a run knows its own. [default: -y]
         dataset: Take the cameras of the photographs in this folder. [default: those that the run keeps]
         progress: told each event; by default they are logged, or shown in a notebook.
-        should_stop: asked now and then; True ends the work with ``Cancelled``.
+        should_stop: asked now and then; True ends the work with ``CancelledError``.
         threads: number of threads; 0 takes all cores. The result does not depend on it.
 
     Raises:
@@ -953,7 +953,7 @@ def export(
     materials: bool = False,
     up: Literal["x", "-x", "y", "-y", "z", "-z"] | None = None,
     format: str | None = None,
-    progress: Listener | None = None,
+    progress: EventListener | None = None,
     should_stop: Callable[[], bool] = never_stop,
     threads: int = 0,
 ) -> "ExportResult":
@@ -985,7 +985,7 @@ def export(
         up: With materials: the axis that points up. [default: the run's, of a file -y]
         format: The format, if OUT's name does not say it.
         progress: told each event; by default they are logged, or shown in a notebook.
-        should_stop: asked now and then; True ends the work with ``Cancelled``.
+        should_stop: asked now and then; True ends the work with ``CancelledError``.
         threads: number of threads; 0 takes all cores. The result does not depend on it.
 
     Raises:
@@ -1031,7 +1031,7 @@ def import_(
     drop_invalid: bool = False,
     sh_degree: int | None = None,
     channels: Literal["own", "all"] | Sequence[str] | str | None = None,
-    progress: Listener | None = None,
+    progress: EventListener | None = None,
     should_stop: Callable[[], bool] = never_stop,
     threads: int = 0,
 ) -> "ImportResult":
@@ -1048,7 +1048,7 @@ def import_(
         channels: Further numbers of each Gaussian to keep, as albedo,metallic; all for whatever is
             there; own for those that octasplat wrote. Default: own.
         progress: told each event; by default they are logged, or shown in a notebook.
-        should_stop: asked now and then; True ends the work with ``Cancelled``.
+        should_stop: asked now and then; True ends the work with ``CancelledError``.
         threads: number of threads; 0 takes all cores. The result does not depend on it.
 
     Raises:
@@ -1091,7 +1091,7 @@ def edit(
     min_opacity: float | None = None,
     max_residual: float | None = None,
     whole_octagons: bool = False,
-    progress: Listener | None = None,
+    progress: EventListener | None = None,
     should_stop: Callable[[], bool] = never_stop,
     threads: int = 0,
 ) -> "EditResult":
@@ -1123,7 +1123,7 @@ def edit(
         whole_octagons: Octagons of which only some corners moved move as a whole, or not at all if most
             stayed.
         progress: told each event; by default they are logged, or shown in a notebook.
-        should_stop: asked now and then; True ends the work with ``Cancelled``.
+        should_stop: asked now and then; True ends the work with ``CancelledError``.
         threads: number of threads; 0 takes all cores. The result does not depend on it.
 
     Raises:
@@ -1168,7 +1168,7 @@ def deform(
     reach: float | None = None,
     axes: Literal["x0", "x90", "x180", "x270"] | None = None,
     mirrored: Literal["auto", "yes", "no"] | None = None,
-    progress: Listener | None = None,
+    progress: EventListener | None = None,
     should_stop: Callable[[], bool] = never_stop,
     threads: int = 0,
 ) -> "DeformResult":
@@ -1194,7 +1194,7 @@ def deform(
         mirrored: Whether the deformed mesh was mirrored; auto looks at it, which a flat mesh cannot
             show. Default: auto.
         progress: told each event; by default they are logged, or shown in a notebook.
-        should_stop: asked now and then; True ends the work with ``Cancelled``.
+        should_stop: asked now and then; True ends the work with ``CancelledError``.
         threads: number of threads; 0 takes all cores. The result does not depend on it.
 
     Raises:
@@ -1236,7 +1236,7 @@ def transform(
     rotate: Sequence[Sequence[Literal["x", "y", "z"] | float]] | None = None,
     translate: Sequence[float] | None = None,
     about: Sequence[float] | None = None,
-    progress: Listener | None = None,
+    progress: EventListener | None = None,
     should_stop: Callable[[], bool] = never_stop,
     threads: int = 0,
 ) -> "TransformResult":
@@ -1256,7 +1256,7 @@ def transform(
         translate: Move.
         about: The point that up, scale and rotate leave where it is. Default: (0.0, 0.0, 0.0).
         progress: told each event; by default they are logged, or shown in a notebook.
-        should_stop: asked now and then; True ends the work with ``Cancelled``.
+        should_stop: asked now and then; True ends the work with ``CancelledError``.
         threads: number of threads; 0 takes all cores. The result does not depend on it.
 
     Raises:
@@ -1295,7 +1295,7 @@ def crop(
     box: Sequence[float] | None = None,
     sphere: Sequence[float] | None = None,
     inverse: bool = False,
-    progress: Listener | None = None,
+    progress: EventListener | None = None,
     should_stop: Callable[[], bool] = never_stop,
     threads: int = 0,
 ) -> "CropResult":
@@ -1313,7 +1313,7 @@ def crop(
         sphere: Centre and radius of a sphere that their centres lie in.
         inverse: Take the other Gaussians instead.
         progress: told each event; by default they are logged, or shown in a notebook.
-        should_stop: asked now and then; True ends the work with ``Cancelled``.
+        should_stop: asked now and then; True ends the work with ``CancelledError``.
         threads: number of threads; 0 takes all cores. The result does not depend on it.
 
     Raises:
@@ -1349,7 +1349,7 @@ def merge(
     *,
     overwrite: bool = False,
     sh_degree: int | None = None,
-    progress: Listener | None = None,
+    progress: EventListener | None = None,
     should_stop: Callable[[], bool] = never_stop,
     threads: int = 0,
 ) -> "MergeResult":
@@ -1364,7 +1364,7 @@ def merge(
             command or were changed since. What is read is never replaced.
         sh_degree: Degree of the colours' harmonics. [default: the highest among the scenes]
         progress: told each event; by default they are logged, or shown in a notebook.
-        should_stop: asked now and then; True ends the work with ``Cancelled``.
+        should_stop: asked now and then; True ends the work with ``CancelledError``.
         threads: number of threads; 0 takes all cores. The result does not depend on it.
 
     Raises:
@@ -1404,7 +1404,7 @@ def clean(
     neighbors: int | None = None,
     camera_clearance: float | None = None,
     dry_run: bool = False,
-    progress: Listener | None = None,
+    progress: EventListener | None = None,
     should_stop: Callable[[], bool] = never_stop,
     threads: int = 0,
 ) -> "CleanResult":
@@ -1429,7 +1429,7 @@ def clean(
             of the distance at which the sparse points around it begin; 0 for none. Default: 0.25.
         dry_run: Only count.
         progress: told each event; by default they are logged, or shown in a notebook.
-        should_stop: asked now and then; True ends the work with ``Cancelled``.
+        should_stop: asked now and then; True ends the work with ``CancelledError``.
         threads: number of threads; 0 takes all cores. The result does not depend on it.
 
     Raises:

@@ -14,7 +14,7 @@ import pytest
 import octasplat as osp
 import octasplat.client
 from octasplat.client import JobFailedError, ServiceError, ServiceUnreachableError
-from octasplat.engine.core.events import Event, StageStarted
+from octasplat.engine.core.events import Event, PhaseStarted
 from octasplat.workers.client.api import find_address, find_token
 from tests.support.postgres_fixtures import short_root
 
@@ -67,7 +67,7 @@ def test_client_submit_and_download_round_trip(service: Service, photographs: Pa
         job = client.submit(photographs, label="a trial", progress=events.append, **SMALL)
         assert (job.kind, job.label) == ("reconstruct", "a trial")
         assert job.wait(progress=events.append).state == "succeeded"
-        stages = [event.stage for event in events if isinstance(event, StageStarted)]
+        stages = [event.stage for event in events if isinstance(event, PhaseStarted)]
         assert stages[0] == "upload" and {"train", "evaluate", "export"} <= set(stages)
         assert {"scene.ply", "metrics.json", "mesh.ply"} <= {result.name for result in job.results()}
         run = osp.Run(job.download(tmp_path / "out", progress=events.append)[0].parent)

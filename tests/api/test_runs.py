@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import octasplat as osp
-from octasplat.engine.core.events import Event, StageFinished, TrainingProgress
+from octasplat.engine.core.events import Event, PhaseFinished, TrainingProgress
 from tests.support.small_run import RUN_OPTIONS
 
 
@@ -32,7 +32,7 @@ def test_run_stopped_by_on_step_resumes_to_same_bytes(
 
 
 def test_should_stop_raises_and_on_step_does_not(photographs: Path, tmp_path: Path) -> None:
-    with pytest.raises(osp.Cancelled):
+    with pytest.raises(osp.CancelledError):
         osp.reconstruct(photographs, tmp_path / "run", **RUN_OPTIONS, should_stop=lambda: True)
 
 
@@ -103,7 +103,7 @@ def test_notebook_shows_progress_and_ends_with_lines() -> None:
     from IPython.core.interactiveshell import InteractiveShell
     from IPython.utils.capture import capture_output
 
-    from octasplat.engine.core.events import StageProgress, StageStarted, Warned
+    from octasplat.engine.core.events import PhaseProgress, PhaseStarted, Warned
     from octasplat.notebook import NotebookProgress, ProgressLog, default_progress
 
     assert isinstance(default_progress(), ProgressLog)
@@ -113,8 +113,8 @@ def test_notebook_shows_progress_and_ends_with_lines() -> None:
         listener = default_progress()
         assert isinstance(listener, NotebookProgress)
         events: list[Event] = [
-            StageStarted("render", 4), StageProgress("render", 1, 4), Warned("a < b"),
-            StageFinished("render", 2.0),
+            PhaseStarted("render", 4), PhaseProgress("render", 1, 4), Warned("a < b"),
+            PhaseFinished("render", 2.0),
         ]  # fmt: skip
         with capture_output() as captured:
             for event in events:

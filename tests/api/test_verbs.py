@@ -12,7 +12,7 @@ from write_verbs import PYTHON_NAMES, VERBS, source
 import octasplat as osp
 import octasplat.verbs
 from octasplat.engine.core.errors import ConfigError
-from octasplat.engine.core.events import Event, StageProgress, Warned
+from octasplat.engine.core.events import Event, PhaseProgress, Warned
 from octasplat.engine.operations.base import build_request
 from octasplat.engine.operations.registry import operation, operation_names
 from octasplat.operation_calls import explicit_values
@@ -91,7 +91,7 @@ def test_output_over_input_scene_is_refused(verb: str, scene_file: Path, finishe
 def test_stopped_operation_writes_no_output(verb: str, options: dict[str, Any], in_folder: Path) -> None:
     osp.export("scene.ply", ["mesh.ply"], format="mesh-ply")
     source = "shiny.ply" if verb == "material" else "scene.ply"
-    with pytest.raises(osp.Cancelled):
+    with pytest.raises(osp.CancelledError):
         output = ["other.ply"] if verb == "export" else "other.ply"
         getattr(osp, verb)(source, output, should_stop=lambda: True, **options)
     assert not Path("other.ply").exists()
@@ -100,12 +100,12 @@ def test_stopped_operation_writes_no_output(verb: str, options: dict[str, Any], 
 def test_render_sequence_reports_progress_and_stops_between_images(in_folder: Path) -> None:
     events: list[Event] = []
     bent = ["bent.obj", "cage.obj", "bent.obj"]
-    with pytest.raises(osp.Cancelled):
+    with pytest.raises(osp.CancelledError):
         osp.deform(
             "scene.ply", "%d.ply", proxy="cage.obj", deformed=bent, progress=events.append,
             should_stop=lambda: len(events) == 2,
         )  # fmt: skip
-    assert events == [StageProgress("edit", 1, 3), StageProgress("edit", 2, 3)]
+    assert events == [PhaseProgress("edit", 1, 3), PhaseProgress("edit", 2, 3)]
     assert Path("1.ply").exists() and not Path("2.ply").exists()
 
 

@@ -35,7 +35,7 @@ from typing import TYPE_CHECKING, Any, Literal, TypedDict
 
 from pydantic import BaseModel
 
-from octasplat.engine.core.events import Listener
+from octasplat.engine.core.events import EventListener
 from octasplat.engine.operations.base import never_stop
 from octasplat.operation_calls import names_checked, run_operation
 from octasplat.paths import PathLike
@@ -50,7 +50,7 @@ ON_STEP_ARGUMENT = (
     "checkpoint, and the run that is returned is unfinished. With ``resume=True`` another call goes on."
 )
 LAST_PARAMETERS = (
-    "progress: Listener | None = None",
+    "progress: EventListener | None = None",
     "should_stop: Callable[[], bool] = never_stop",
     "threads: int = 0",
 )

@@ -7,13 +7,13 @@ import numpy as np
 from octasplat.engine.dataset.views_file import read_views
 from octasplat.engine.files.gaussian_ply import read_gaussian_ply, write_gaussian_ply
 from octasplat.engine.gaussians.model import concatenate
-from octasplat.engine.runs.run_folder import run_near_zones
+from octasplat.engine.runs.run_folder import run_camera_clearance
 
 
 def test_clean_removes_gaussians_near_cameras(run, octasplat, tmp_path):
     shutil.copytree(run.output, tmp_path / "run", ignore=shutil.ignore_patterns("cache"))
     scene, _ = read_gaussian_ply(run.output / "scene.ply")
-    zones = run_near_zones(run.output, 0.25)
+    zones = run_camera_clearance(run.output, 0.25)
     assert zones is not None and (zones.radii > 0).any()
     view = int(np.argmax(zones.radii))
     cloud = scene.select(np.arange(40))

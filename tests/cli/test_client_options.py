@@ -7,7 +7,7 @@ from http.server import BaseHTTPRequestHandler, HTTPServer
 
 import pytest
 
-from octasplat.engine.core.events import StageFinished
+from octasplat.engine.core.events import PhaseFinished
 from octasplat.workers.client import submission
 from octasplat.workers.client.submission import Derivation, with_camera_path, with_stage
 
@@ -79,7 +79,7 @@ def test_output_folder_requires_wait(octasplat, asked: list[dict], command) -> N
 
 def test_json_output_contains_only_job(octasplat, asked: list[dict], monkeypatch) -> None:
     def wait_for(_api, _job_id, listener, _on_note):
-        listener(StageFinished("render", 1.0))
+        listener(PhaseFinished("render", 1.0))
         return JOB
 
     monkeypatch.setattr(submission, "wait_for_job", wait_for)

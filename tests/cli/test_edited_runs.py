@@ -11,7 +11,7 @@ from octasplat.engine.edit.run_transform import rotate_environment
 from octasplat.engine.files.gaussian_ply import read_gaussian_ply
 from octasplat.engine.render.environment_files import read_environment, write_background, write_environment
 from octasplat.engine.runs.config import read_config
-from octasplat.engine.runs.run_folder import run_near_zones
+from octasplat.engine.runs.run_folder import run_camera_clearance
 from octasplat.engine.shading.environment_frame import environment_frame
 
 TURN = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])  # 90 degrees about z
@@ -50,7 +50,7 @@ def test_transformed_run_keeps_relative_cameras(shiny_run, octasplat, tmp_path):
         seen_from(shiny_run, old.views), seen_from(tmp_path / "moved", new.views), strict=True
     ):
         np.testing.assert_allclose(after, 2 * before, atol=1e-4)
-    zones = [run_near_zones(run, 0.25) for run in (shiny_run, tmp_path / "moved")]
+    zones = [run_camera_clearance(run, 0.25) for run in (shiny_run, tmp_path / "moved")]
     assert zones[0] is not None and zones[1] is not None
     np.testing.assert_allclose(zones[1].radii, 2 * zones[0].radii, rtol=1e-6)
     # Light: up is turned along, and what stood in a direction stands in the turned one.

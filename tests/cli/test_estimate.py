@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from octasplat.engine.core.errors import DatasetError
-from octasplat.engine.dataset.image_sizes import Sizes
+from octasplat.engine.dataset.image_sizes import ImageSizes
 from octasplat.engine.operations.estimate import EstimateRequest, run
 from octasplat.engine.render.image_files import write_png
 
@@ -24,7 +24,7 @@ def test_estimate_counts_photographs_and_follows_the_options(photographs: Path) 
     fast, standard = (
         run(EstimateRequest(source=photographs, preset=name, cores=2)) for name in ("fast", "standard")
     )
-    assert fast.photographs == (Sizes(40, 30, 10),)
+    assert fast.photographs == (ImageSizes(40, 30, 10),)
     assert fast.cores == 2 and fast.finds_poses and "find the poses" in fast.text
     assert fast.cpu_seconds < standard.cpu_seconds
     longer = run(

@@ -9,7 +9,7 @@ import OpenImageIO as oiio
 import pytest
 from pydantic import ValidationError
 
-from octasplat.engine.dataset.image_sizes import Sizes
+from octasplat.engine.dataset.image_sizes import ImageSizes
 from octasplat.engine.render.environment_files import write_environment
 from octasplat.engine.render.image_files import read_image
 from octasplat.workers.worker.handlers import run_operation
@@ -99,7 +99,7 @@ def test_relight_job_uses_uploaded_files(shiny_run, scene_with_truth, tmp_path):
     asked = {"environments": ["maps/day.hdr", "maps/dim.hdr"], "mode": "views", "format": "png", "samples": 1}
     options = kind.resolve(asked)
     assert [name for _, name in kind.named_files(options)] == asked["environments"]
-    size = Sizes(64, 48, 8)
+    size = ImageSizes(64, 48, 8)
     assert {demand.resource: demand.amount for demand in kind.resource_demands(options, [size])} == {
         "render_pixels": 2 * 8 * 64 * 48, "render_paths": 2 * 8 * 64 * 48,
         "workspace_bytes": round(0.4 * 2 * 8 * 64 * 48),

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from octasplat.engine.core.errors import Cancelled, ConfigError
-from octasplat.engine.core.events import StageFinished
+from octasplat.engine.core.errors import CancelledError, ConfigError
+from octasplat.engine.core.events import PhaseFinished
 from octasplat.engine.operations.base import build_request
 from octasplat.engine.operations.evaluate import OPERATION, EvaluateRequest
 from octasplat.workers.worker.handlers import run_operation
@@ -31,7 +31,7 @@ def test_evaluate_result_equals_metrics_file(copy):
     assert result.files[0] == copy / "metrics.json" and result.report == copy / "report.html"
     assert {path.name for path in result.files} >= {f"{Path(name).stem}.png" for name in result.views}
     assert any(f"PSNR {result.psnr:.2f} dB" in line for line in result.lines())
-    assert [event.stage for event in heard if isinstance(event, StageFinished)] == ["evaluate"]
+    assert [event.stage for event in heard if isinstance(event, PhaseFinished)] == ["evaluate"]
 
 
 def test_smaller_sizes_are_the_same_by_command_and_job(copy, run, octasplat, tmp_path):
@@ -59,7 +59,7 @@ def test_evaluate_all_views_with_other_background(copy, run, octasplat):
 
 
 def test_evaluate_should_stop_cancels(copy):
-    with pytest.raises(Cancelled, match="Stopped while evaluating"):
+    with pytest.raises(CancelledError, match="Stopped while evaluating"):
         OPERATION.run(EvaluateRequest(source=copy), should_stop=lambda: True, threads=1)
 
 

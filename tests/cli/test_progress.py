@@ -7,17 +7,17 @@ import time
 import pytest
 from rich.console import Console
 
-from octasplat.engine.core.durations import clock, duration
-from octasplat.engine.core.errors import Cancelled
+from octasplat.engine.core.durations import format_clock, format_duration
+from octasplat.engine.core.errors import CancelledError
 from octasplat.engine.core.events import (
     HeldOutMeasured,
-    StageFinished,
-    StageProgress,
-    StageStarted,
+    PhaseFinished,
+    PhaseProgress,
+    PhaseStarted,
     TrainingProgress,
     Warned,
 )
-from octasplat.engine.core.progress import stopping
+from octasplat.engine.core.progress import stop_when_asked
 from octasplat.workers.cli.progress import ProgressBars, show_progress
 from octasplat.workers.reporting.event_lines import EventLines
 from octasplat.workers.reporting.wording import format_rate
@@ -33,7 +33,7 @@ STATE = "training 24.1 dB, held out 23.0 dB, 32,000 Gaussians, 310k rays/s"
 def test_plain_lines_show_training_state():
     lines = []
     show = EventLines(lines.append, interval_seconds=0.0)
-    for event in (StageStarted("train", 1500), HELD_OUT, TRAINING, StageFinished("train", 83.4)):
+    for event in (PhaseStarted("train", 1500), HELD_OUT, TRAINING, PhaseFinished("train", 83.4)):
         show(event)
     assert lines == [
         "Training",
@@ -45,10 +45,10 @@ def test_plain_lines_show_training_state():
 def test_plain_lines_are_rate_limited():
     lines = []
     show = EventLines(lines.append, interval_seconds=0.2)
-    show(StageStarted("load", 100))
+    show(PhaseStarted("load", 100))
     end = time.monotonic() + 0.5
     while time.monotonic() < end:
-        show(StageProgress("load", 7, 100))
+        show(PhaseProgress("load", 7, 100))
     assert lines == ["Loading", "  7/100", "  7/100"]
 
 
@@ -69,7 +69,7 @@ def test_bar_fits_a_narrow_terminal_and_shows_everything(terminal):
     console, written = terminal
     display = ProgressBars(console, lambda: False)
     with display.bars:
-        for event in (StageStarted("train", 1500), HELD_OUT, TRAINING):
+        for event in (PhaseStarted("train", 1500), HELD_OUT, TRAINING):
             display(event)
         display.bars.refresh()
     text = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", written.getvalue())
@@ -83,7 +83,7 @@ def test_progress_bar_leaves_line_per_stage_and_shows_stop(terminal):
     stop = []
     display = ProgressBars(console, lambda: bool(stop))
     with display.bars:
-        for event in (StageStarted("load"), StageProgress("load", 4, 4), StageFinished("load", 0.25)):
+        for event in (PhaseStarted("load"), PhaseProgress("load", 4, 4), PhaseFinished("load", 0.25)):
             display(event)
         assert "Loaded 4 photographs in 0.2 s\n" in written.getvalue()
         display(Warned("[red]The sky is green."))
@@ -96,26 +96,26 @@ def test_progress_bar_leaves_line_per_stage_and_shows_stop(terminal):
 
 def test_should_stop_between_steps_cancels():
     heard, stop = [], []
-    listen = stopping(heard.append, lambda: bool(stop))
-    listen(StageProgress("export", 1, 3))
+    listen = stop_when_asked(heard.append, lambda: bool(stop))
+    listen(PhaseProgress("export", 1, 3))
     stop.append(1)
     listen(TRAINING)  # training writes a checkpoint and stops by itself
-    with pytest.raises(Cancelled, match="exporting"):
-        listen(StageProgress("export", 2, 3))
+    with pytest.raises(CancelledError, match="exporting"):
+        listen(PhaseProgress("export", 2, 3))
     assert len(heard) == 3
 
 
 @pytest.mark.parametrize(
     ("shown", "expected"),
     [
-        (clock(83.2), "1:23"),
-        (clock(3723), "1:02:03"),
-        (clock(-0.3), "0:00"),
-        (duration(0.84), "0.8 s"),
-        (duration(42.3), "42 s"),
-        (duration(59.7), "1:00 min"),
-        (duration(185), "3:05 min"),
-        (duration(3723), "1:02:03 h"),
+        (format_clock(83.2), "1:23"),
+        (format_clock(3723), "1:02:03"),
+        (format_clock(-0.3), "0:00"),
+        (format_duration(0.84), "0.8 s"),
+        (format_duration(42.3), "42 s"),
+        (format_duration(59.7), "1:00 min"),
+        (format_duration(185), "3:05 min"),
+        (format_duration(3723), "1:02:03 h"),
         (format_rate(870), "870"),
         (format_rate(310_400), "310k"),
         (format_rate(1_254_000), "1.25M"),

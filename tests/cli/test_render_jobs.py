@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from octasplat.engine.core.errors import Cancelled
-from octasplat.engine.core.events import CheckpointWritten, Event, ImagesKept, StageProgress
-from octasplat.engine.dataset.image_sizes import Sizes
+from octasplat.engine.core.errors import CancelledError
+from octasplat.engine.core.events import CheckpointWritten, Event, ImagesSaved, PhaseProgress
+from octasplat.engine.dataset.image_sizes import ImageSizes
 from octasplat.engine.operations.registry import operation
 from octasplat.engine.operations.render import RenderRequest
 from octasplat.engine.render.environment_files import write_environment
@@ -196,16 +196,16 @@ def test_stopped_render_job_resumes_from_stored_frames(run, octasplat, tmp_path)
     heard: list[Event] = []
 
     def two_are_done() -> bool:
-        return any(isinstance(event, StageProgress) and event.step >= 2 for event in heard)
+        return any(isinstance(event, PhaseProgress) and event.step >= 2 for event in heard)
 
-    with pytest.raises(Cancelled):
+    with pytest.raises(CancelledError):
         run_operation(
             Task(first, options, threads=1, kind="render", progress=heard.append, should_stop=two_are_done)
         )
     # At once after the first one, and at the end; that one is done is not told to anybody else.
     stored = [event for event in heard if isinstance(event, CheckpointWritten)]
     assert [(event.iteration, event.path) for event in stored] == [(1, "frames"), (2, "frames")]
-    assert not any(isinstance(event, ImagesKept) for event in heard)
+    assert not any(isinstance(event, ImagesSaved) for event in heard)
     frames = first / "run" / "frames"
     rows = [json.loads(line) for line in (frames / "unfinished.jsonl").read_text().splitlines()]
     assert [row["file"] for row in rows[1:]] == ["000000.png", "000001.png"]
@@ -216,7 +216,7 @@ def test_stopped_render_job_resumes_from_stored_frames(run, octasplat, tmp_path)
     rendered: list[int] = []
 
     def listen(event: Event) -> None:
-        if isinstance(event, StageProgress) and event.part == 0:
+        if isinstance(event, PhaseProgress) and event.part == 0:
             rendered.append(event.step)
         path = second / "run" / "frames" / "000000.png"
         assert not path.exists() or path.stat().st_mtime_ns == before
@@ -281,7 +281,7 @@ def test_contradictory_options_are_refused(options, words):
 
 
 def test_pixels_of_each_mode_are_counted_before_the_work(tmp_path):
-    kind, sizes = get_job_kind("render"), [Sizes(100, 50, 4)]
+    kind, sizes = get_job_kind("render"), [ImageSizes(100, 50, 4)]
 
     def pixels(options: dict) -> tuple[str, float]:
         found = kind.resource_demands(kind.resolve(options), sizes)
@@ -302,11 +302,11 @@ def test_pixels_of_each_mode_are_counted_before_the_work(tmp_path):
 def test_numbered_images_are_gone_on_with_for_the_same_views_only(run, octasplat, tmp_path):
     frames, images = tmp_path / "%04d.png", []
     names = [view.name for view in run_viewpoints(run.output).views][:4]
-    with pytest.raises(Cancelled):
+    with pytest.raises(CancelledError):
         operation("render").run(
             RenderRequest(source=run.output, output=frames, photographs=names[:3]),
             progress=images.append,
-            should_stop=lambda: len([event for event in images if isinstance(event, StageProgress)]) > 1,
+            should_stop=lambda: len([event for event in images if isinstance(event, PhaseProgress)]) > 1,
         )
     assert (tmp_path / "0000.png").exists()
     others = [word for name in names[1:] for word in ("--photograph", name)]

@@ -8,8 +8,8 @@ from typing import Any
 import pycolmap
 import pytest
 
-from octasplat.engine.core.errors import Cancelled, ConfigError
-from octasplat.engine.core.events import Event, ImagesKept
+from octasplat.engine.core.errors import CancelledError, ConfigError
+from octasplat.engine.core.events import Event, ImagesSaved
 from octasplat.engine.operations import relight, render
 
 
@@ -18,10 +18,10 @@ def stopped_after_one(verb: Any, request: Any) -> None:
     kept: list[Event] = []
 
     def hear(event: Event) -> None:
-        if isinstance(event, ImagesKept):
+        if isinstance(event, ImagesSaved):
             kept.append(event)
 
-    with pytest.raises(Cancelled):
+    with pytest.raises(CancelledError):
         verb.run(request, progress=hear, should_stop=lambda: bool(kept), threads=1)
 
 

@@ -14,8 +14,8 @@ from octasplat.engine.core.errors import ConfigError
 from octasplat.engine.operations.base import build_request
 from octasplat.engine.operations.reconstruct import ReconstructOptions, ReconstructRequest, run_config
 from octasplat.engine.runs.config import ReconstructionConfig, RunSettings
-from octasplat.engine.runs.settings_catalog import settings as catalog
-from octasplat.engine.settings.nested_options import merged
+from octasplat.engine.runs.settings_catalog import all_settings as catalog
+from octasplat.engine.settings.nested_options import merge_options
 from octasplat.engine.train.config.preset_names import PRESETS
 from octasplat.service.actions.validation import resolve_options
 from octasplat.service.problems import ProblemError
@@ -174,7 +174,7 @@ def _nested(preset: str, materials: bool, given: list[str]) -> dict[str, Any]:
             continue
         for part in reversed(name.removeprefix("train.").split(".")):
             value = {part: value}
-        options["train"] = merged(options["train"], value)
+        options["train"] = merge_options(options["train"], value)
     return {key: value for key, value in options.items() if value is not None or key == "train"}
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from pydantic import ValidationError
 
-from octasplat.engine.dataset.image_sizes import Sizes
+from octasplat.engine.dataset.image_sizes import ImageSizes
 from octasplat.engine.operations.base import first_error
 from octasplat.engine.operations.surface import MATERIAL_DEFAULTS, ROOM_DEFAULTS, SurfaceRequest
 from octasplat.workers.worker.handlers import run_operation
@@ -157,7 +157,7 @@ def test_maps_and_levels_of_a_surface_have_ceilings():
     options = kind.resolve({"depth_side": 8000, "texture_size": 4096, "max_triangles": "5k,50k"})
     amounts = {
         (found.path, found.resource): found.amount
-        for found in kind.resource_demands(options, [Sizes(400, 300, 10)])
+        for found in kind.resource_demands(options, [ImageSizes(400, 300, 10)])
     }
     assert amounts == {
         ("depth_side", "side_px"): 8000,

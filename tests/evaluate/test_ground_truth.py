@@ -12,13 +12,13 @@ import pytest
 from octasplat.engine.core.color import linear_to_srgb
 from octasplat.engine.core.errors import ConfigError, DatasetError
 from octasplat.engine.core.rays import ImageRays
-from octasplat.engine.evaluate.ground_truth import find_truth, read_truth
-from octasplat.engine.evaluate.ground_truth_measures import TruthMeasures, relit_measures
+from octasplat.engine.evaluate.ground_truth import find_ground_truth, read_ground_truth
+from octasplat.engine.evaluate.ground_truth_measures import GroundTruthMeasures, measure_relit
 from octasplat.engine.evaluate.ground_truth_metrics import (
-    best_scales,
-    display,
     environment_errors,
-    normal_errors_degrees,
+    fit_channel_scales,
+    normal_angles_degrees,
+    to_display,
 )
 from octasplat.engine.pathtracing.environment import EnvironmentMap, environment_frame
 from octasplat.engine.pathtracing.relighting.path_relighter import RelitImage
@@ -87,9 +87,9 @@ def wall(*, tilt_degrees: float, depth: float, albedo: float, roughness: float, 
 
 
 def measured(folder: Path, image: RenderedImage, rays: ImageRays) -> dict:
-    truth = find_truth(folder)
+    truth = find_ground_truth(folder)
     assert truth is not None
-    measures = TruthMeasures(truth)
+    measures = GroundTruthMeasures(truth)
     measures.add("a.png", image, rays, np.array([0.0, 0.0, 1.0]))
     measures.add("unknown.png", image, rays, np.array([0.0, 0.0, 1.0]))
     return measures.as_dict()
@@ -121,11 +121,11 @@ def test_scene_without_materials_has_only_normals_and_depth(truth_folder):
 
 def test_normal_error_of_missing_normal_is_90_degrees():
     true = np.tile([0.0, 0.6, 0.8], (2, 1))
-    assert normal_errors_degrees(np.array([[0.0, 0, 0], [0, -0.6, -0.8]]), true) == pytest.approx([90, 180])
+    assert normal_angles_degrees(np.array([[0.0, 0, 0], [0, -0.6, -0.8]]), true) == pytest.approx([90, 180])
 
 
 def test_smaller_pictures_take_the_nearest_pixels_and_other_shapes_are_refused(truth_folder):
-    truth = find_truth(truth_folder)
+    truth = find_ground_truth(truth_folder)
     small = truth.view("a.png", (SIDE // 2, SIDE // 2))
     assert (small.mask[:, : SIDE // 4]).all() and not small.mask[:, SIDE // 4 :].any()
     with pytest.raises(DatasetError, match=r"a\.png has 8 x 8"):
@@ -133,13 +133,13 @@ def test_smaller_pictures_take_the_nearest_pixels_and_other_shapes_are_refused(t
 
 
 def test_truth_is_found_in_or_beside_a_folder(truth_folder, tmp_path):
-    assert find_truth(truth_folder).path == tmp_path / "truth.json"
-    assert find_truth(tmp_path).path == tmp_path / "truth.json"
+    assert find_ground_truth(truth_folder).path == tmp_path / "truth.json"
+    assert find_ground_truth(tmp_path).path == tmp_path / "truth.json"
     (tmp_path / "images").mkdir()
-    assert find_truth(tmp_path / "images") is None
-    truth = find_truth(truth_folder)
+    assert find_ground_truth(tmp_path / "images") is None
+    truth = find_ground_truth(truth_folder)
     assert truth.environment == tmp_path / "env" / "day.hdr"
-    assert truth.relit == ((tmp_path / "relight" / "night", tmp_path / "env" / "night.hdr"),)
+    assert truth.relit_folders == ((tmp_path / "relight" / "night", tmp_path / "env" / "night.hdr"),)
     assert truth.up_world.tolist() == UP.tolist()
 
 
@@ -156,7 +156,7 @@ def test_truth_is_found_in_or_beside_a_folder(truth_folder, tmp_path):
 def test_ground_truth_unknown_format_is_refused(tmp_path, change, told):
     (tmp_path / "truth.json").write_text(json.dumps({**TEXT, **change}))
     with pytest.raises(ConfigError) as error:
-        read_truth(tmp_path / "truth.json")
+        read_ground_truth(tmp_path / "truth.json")
     assert str(tmp_path / "truth.json") in str(error.value) and told in str(error.value)
 
 
@@ -164,7 +164,7 @@ def test_ground_truth_channel_scale_with_clipped_values_is_found():
     random = np.random.default_rng(0)
     true = random.random((500, 3)) * 1.4
     scales = np.array([0.25, 1.0, 3.0])
-    assert best_scales(true / scales, true, display) == pytest.approx(scales, rel=1e-3)
+    assert fit_channel_scales(true / scales, true, to_display) == pytest.approx(scales, rel=1e-3)
 
 
 def test_environment_is_compared_in_same_world():
@@ -186,10 +186,10 @@ def test_relit_pictures_share_one_factor_a_channel():
     linear = [random.random((6, 6, 3)) * 0.5 for _ in range(4)]
     names = [("day", "a"), ("day", "b"), ("night", "a"), ("night", "b")]
     alpha = np.ones((6, 6, 1))
-    true = [np.concatenate([display(image), alpha], axis=-1).astype(np.float32) for image in linear]
+    true = [np.concatenate([to_display(image), alpha], axis=-1).astype(np.float32) for image in linear]
     whole = np.ones((6, 6), np.float32)
     dark = [RelitImage((image * [0.5, 0.25, 1.0]).astype(np.float32), whole) for image in linear]
-    found = relit_measures(dark, true, names)
+    found = measure_relit(dark, true, names)
     assert found["relight_scales"] == pytest.approx([2, 4, 1], rel=1e-3)
     assert found["relight_psnr"] < 25 and found["relight_psnr_scaled"] > 60
     assert set(found["relight"]) == {"day", "night"} and found["relight"]["day"]["views"] == 2

@@ -10,7 +10,7 @@ from octasplat.engine.dataset.synthetic import SyntheticDatasetConfig, write_syn
 from octasplat.engine.evaluate.held_out import evaluate_held_out
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.render.image_files import read_image, write_png
-from octasplat.engine.shading.plain import PLAIN
+from octasplat.engine.shading.plain import PLAIN_SHADING
 from octasplat.engine.trace.protocol import TraceSettings
 
 
@@ -44,12 +44,12 @@ def test_same_stem_photographs_get_own_renders(tmp_path):
         grey,
         output,
         settings=TraceSettings(),
-        shading=PLAIN,
+        shading=PLAIN_SHADING,
         background="black",
         run={},
         config={},
         threads=1,
-        tell=lambda _event: None,
+        progress=lambda _event: None,
     )
     assert sorted(path.name for path in (output / "renders").iterdir()) == ["a.png.png", "a.tif.png"]
     assert sorted(json.loads((output / "metrics.json").read_text())["views"]) == held_out

@@ -6,7 +6,7 @@ from pytorch_msssim import ssim as reference_ssim
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
 from octasplat.engine.core.color import to_bytes
-from octasplat.engine.core.psnr import colour_corrected, psnr
+from octasplat.engine.core.psnr import fit_color, psnr
 from octasplat.engine.evaluate import metrics
 
 
@@ -57,14 +57,14 @@ def test_colour_correction_undoes_gain_and_offset_where_pixels_count():
     weight = np.ones((30, 41), np.float32)
     weight[:, :10] = 0
     render[:, :10] = 0.9
-    corrected = colour_corrected(render, reference, weight)
+    corrected = fit_color(render, reference, weight)
     np.testing.assert_allclose(corrected[:, 10:], reference[:, 10:], atol=1e-6)
     assert psnr(corrected, reference, weight) > 100
 
 
 def test_colour_correction_agrees_with_numpys_least_squares():
     render, reference = pair(30, 41)
-    corrected = colour_corrected(render, reference, np.ones((30, 41), np.float32))
+    corrected = fit_color(render, reference, np.ones((30, 41), np.float32))
     for channel in range(3):
         x, y = render[..., channel].ravel().astype(float), reference[..., channel].ravel()
         expected = np.clip(np.polyval(np.polyfit(x, y, 1), x), 0, 1)
@@ -73,8 +73,8 @@ def test_colour_correction_agrees_with_numpys_least_squares():
 
 def test_colour_correction_constant_or_empty_image():
     grey, target = np.full((4, 5, 3), 0.5, np.float32), np.full((4, 5, 3), 0.25, np.float32)
-    np.testing.assert_allclose(colour_corrected(grey, target, np.ones((4, 5), np.float32)), target)
-    assert (colour_corrected(grey, target, np.zeros((4, 5), np.float32)) == grey).all()
+    np.testing.assert_allclose(fit_color(grey, target, np.ones((4, 5), np.float32)), target)
+    assert (fit_color(grey, target, np.zeros((4, 5), np.float32)) == grey).all()
 
 
 @pytest.mark.parametrize("size", [(40, 51), (11, 11), (7, 30)])
@@ -153,7 +153,7 @@ def test_masked_errors_do_not_change_metrics_after_fill():
     weight[:10] = 0
     render = reference.copy()
     render[:10] = 0
-    filled = metrics.filled_outside(render, reference, weight)
+    filled = metrics.fill_invalid(render, reference, weight)
     assert metrics.ssim(filled, reference) == pytest.approx(1.0)
     assert metrics.ssim(render, reference) < 0.9
 
@@ -161,4 +161,4 @@ def test_masked_errors_do_not_change_metrics_after_fill():
 def test_rounding_to_8_bits_goes_to_the_nearest_step_and_clips():
     values = np.array([[[-0.2, 0.5, 1.3], [0.4 / 255, 0.6 / 255, 254.4 / 255]]], np.float32)
     assert to_bytes(values).tolist() == [[[0, 128, 255], [0, 1, 254]]]
-    assert np.array_equal(metrics.rounded_to_8_bits(values), to_bytes(values) / np.float32(255))
+    assert np.array_equal(metrics.quantize_8_bit(values), to_bytes(values) / np.float32(255))

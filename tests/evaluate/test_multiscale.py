@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 
 from octasplat.engine.core.rays import ImageRays
-from octasplat.engine.evaluate.multiscale import blocks, smaller
+from octasplat.engine.evaluate.multiscale import block_means, downscale_rays
 from octasplat.engine.evaluate.view_metrics import depth_spread
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.render.pinhole_camera import PinholeCamera
 from octasplat.engine.render.renderer import render_rays
 from octasplat.engine.render.supersampling import pixel_angle, rays_per_pixel_side, render_averaged
-from octasplat.engine.shading.plain import PLAIN
+from octasplat.engine.shading.plain import PLAIN_SHADING
 from octasplat.engine.trace.cpu.tracer import CpuTracer
 from octasplat.engine.trace.protocol import TraceSettings
 
@@ -38,9 +38,9 @@ def stripes() -> FlatGaussians:
 
 def test_rays_of_a_smaller_picture_are_those_of_a_camera_with_fewer_pixels() -> None:
     np.testing.assert_allclose(
-        smaller(camera(64, 48), 4).directions_world, camera(16, 12).directions_world, rtol=0, atol=3e-4
+        downscale_rays(camera(64, 48), 4).directions_world, camera(16, 12).directions_world, rtol=0, atol=3e-4
     )
-    assert blocks(np.arange(35, dtype=np.float32).reshape(5, 7, 1), 2)[..., 0].tolist() == [
+    assert block_means(np.arange(35, dtype=np.float32).reshape(5, 7, 1), 2)[..., 0].tolist() == [
         [4.0, 6.0, 8.0],
         [18.0, 20.0, 22.0],
     ]
@@ -50,9 +50,14 @@ def test_supersampling_equals_downscaling() -> None:
     tracer = CpuTracer(TraceSettings(), threads=1)
     tracer.build(stripes())
     large = camera(256, 192)
-    wanted = blocks(render_rays(tracer, large, BLACK).rgb_srgb, 8)
+    wanted = block_means(render_rays(tracer, large, BLACK).rgb_srgb, 8)
     errors = [
-        float(np.abs(render_averaged(tracer, smaller(large, 8), BLACK, PLAIN, side).rgb_srgb - wanted).mean())
+        float(
+            np.abs(
+                render_averaged(tracer, downscale_rays(large, 8), BLACK, PLAIN_SHADING, side).rgb_srgb
+                - wanted
+            ).mean()
+        )
         for side in (1, 4, 8)
     ]
     assert errors[2] < 0.01 < errors[0]

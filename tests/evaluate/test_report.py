@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from octasplat.engine.core.errors import OutputError
-from octasplat.engine.evaluate.curves import duration, training_charts
-from octasplat.engine.evaluate.gallery import ViewImages, WorstAndBest, magma
+from octasplat.engine.evaluate.curves import format_axis_duration, training_charts
+from octasplat.engine.evaluate.gallery import ViewImages, WorstAndBestViews, magma
 from octasplat.engine.evaluate.report import write_report
 from octasplat.engine.render.image_files import read_image
 
@@ -152,7 +152,7 @@ def test_report_sliders_are_keyboard_accessible(report):
 
 def test_report_many_views_embeds_worst_and_best(report):
     psnr = {f"{k:02d}.jpg": float(k) for k in range(30)}
-    gallery = WorstAndBest()
+    gallery = WorstAndBestViews()
     for name in np.random.default_rng(0).permutation(sorted(psnr)).tolist():
         gallery.offer(name, psnr[name], pictures())
     page = report(metrics=metrics_of(psnr), images=gallery)
@@ -267,7 +267,7 @@ def test_long_curves_are_thinned_to_their_last_point_and_odd_rows_left_out():
     ],
 )
 def test_duration_is_formatted(seconds, text):
-    assert duration(seconds) == text
+    assert format_axis_duration(seconds) == text
 
 
 def test_axes_have_labelled_ticks_inside_the_plot():
@@ -276,8 +276,8 @@ def test_axes_have_labelled_ticks_inside_the_plot():
     for chart in charts:
         assert 2 <= len(chart.x_ticks) <= 8
         assert 2 <= len(chart.y_ticks) <= 12
-        assert all(52 <= tick.at <= 408 for tick in chart.x_ticks)
-        assert all(12 <= tick.at <= 206 for tick in chart.y_ticks)
+        assert all(52 <= tick.position <= 408 for tick in chart.x_ticks)
+        assert all(12 <= tick.position <= 206 for tick in chart.y_ticks)
         assert len({tick.label for tick in chart.x_ticks}) == len(chart.x_ticks)
 
 

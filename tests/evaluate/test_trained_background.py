@@ -8,7 +8,7 @@ from octasplat.engine.core.events import Event, Warned
 from octasplat.engine.core.writing import write_json
 from octasplat.engine.dataset.synthetic import SyntheticDatasetConfig, write_synthetic_dataset
 from octasplat.engine.runs.config import ReconstructionConfig, read_config, resolve_config
-from octasplat.engine.runs.run_folder import open_photographs
+from octasplat.engine.runs.run_folder import open_run_dataset
 
 
 @pytest.mark.parametrize(
@@ -35,7 +35,7 @@ def test_background_mismatch_without_alpha_warns(tmp_path: Path) -> None:
     def told(**settings: str) -> list[str]:
         events: list[Event] = []
         resolved = resolve_config("fast", settings=settings, assignments=["background=white"])
-        open_photographs(tmp_path / "scene", tmp_path / "run", resolved, 1, events.append)
+        open_run_dataset(tmp_path / "scene", tmp_path / "run", resolved, 1, events.append)
         return [event.message for event in events if isinstance(event, Warned)]
 
     assert not any("measured on" in message for message in told())

@@ -4,10 +4,15 @@ import numpy as np
 import pytest
 
 from octasplat.engine.core.errors import DatasetError
-from octasplat.engine.core.psnr import colour_corrected, psnr
+from octasplat.engine.core.psnr import fit_color, psnr
 from octasplat.engine.evaluate import metrics
-from octasplat.engine.evaluate.summary import mean_metrics
-from octasplat.engine.evaluate.view_metrics import RenderedView, bootstrap_interval, measure_view, summarise
+from octasplat.engine.evaluate.summary import format_mean_metrics
+from octasplat.engine.evaluate.view_metrics import (
+    RenderedView,
+    bootstrap_interval,
+    measure_view,
+    summarize_views,
+)
 
 
 def view(name="a.jpg", error=0.1, size=(30, 40), seed=0, **changes):
@@ -21,9 +26,9 @@ def view(name="a.jpg", error=0.1, size=(30, 40), seed=0, **changes):
 def test_metrics_are_those_of_the_images_rounded_to_8_bits():
     one = view(error=0.1003)
     row, flip_map = measure_view(one)
-    render, reference = (metrics.rounded_to_8_bits(image) for image in (one.render, one.reference))
+    render, reference = (metrics.quantize_8_bit(image) for image in (one.render, one.reference))
     assert row.psnr == psnr(render, reference)
-    corrected = colour_corrected(render, reference, one.weight)
+    corrected = fit_color(render, reference, one.weight)
     assert row.psnr_colour_corrected == psnr(corrected, reference)
     assert row.ssim == metrics.ssim(render, reference)
     assert row.ssim_valid == metrics.ssim_valid(render, reference)
@@ -66,7 +71,7 @@ def test_foreground_psnr_is_over_covered_valid_pixels():
 
 def test_summary_is_mean_of_views():
     rows = [measure_view(view(f"{k}.jpg", error, seed=k)).metrics for k, error in enumerate((0.1, 0.05))]
-    summary = summarise(rows)
+    summary = summarize_views(rows)
     for key in ("psnr", "ssim", "ssim_valid", "flip"):
         assert summary.mean[key] == pytest.approx(np.mean([getattr(row, key) for row in rows]))
     assert summary.mean["ms_ssim"] is None
@@ -87,7 +92,7 @@ def test_evaluation_json_layout():
         "seed": 0,
         "versions": {},
     }
-    content = summarise(rows).as_dict(run)
+    content = summarize_views(rows).as_dict(run)
     assert json.loads(json.dumps(content, allow_nan=False)) == content
     keys = {"psnr", "psnr_colour_corrected", "ssim", "ssim_valid", "ms_ssim", "flip", "psnr_foreground"}
     assert set(content) == {"mean", "mean_left_out", "mean_psnr_ci95", "views", "definitions", *run}
@@ -106,7 +111,7 @@ def test_evaluation_json_layout():
 def test_view_without_valid_pixels_is_excluded_from_mean():
     empty = view("b.jpg", weight=np.zeros((30, 40), np.float32))
     rows = [measure_view(one).metrics for one in (view(), empty)]
-    summary = summarise(rows)
+    summary = summarize_views(rows)
     for key in ("psnr", "ssim", "ssim_valid", "flip"):
         assert summary.mean[key] == getattr(rows[0], key)
         assert summary.left_out[key] == 1
@@ -115,12 +120,12 @@ def test_view_without_valid_pixels_is_excluded_from_mean():
 
 def test_mean_psnr_excludes_and_counts_perfect_views():
     rows = [measure_view(one).metrics for one in (view("a.jpg"), view("b.jpg", 0.0), view("c.jpg", 0.05))]
-    summary = summarise(rows)
+    summary = summarize_views(rows)
     assert summary.mean["psnr"] == pytest.approx((rows[0].psnr + rows[2].psnr) / 2)
     assert summary.left_out == {"psnr": 1, "psnr_colour_corrected": 1, "ms_ssim": 3}
     content = summary.as_dict({})
     assert content["views"]["b.jpg"]["psnr"] is None and content["mean"]["psnr"] is not None
-    assert mean_metrics(content).startswith(
+    assert format_mean_metrics(content).startswith(
         "Mean over 3 held-out views (1 perfect or wholly masked left out)"
     )
 
@@ -168,4 +173,4 @@ def test_metrics_non_finite_render_is_refused():
 def test_two_views_of_one_name_are_refused():
     row = measure_view(view()).metrics
     with pytest.raises(DatasetError, match=r"a\.jpg"):
-        summarise([row, row])
+        summarize_views([row, row])

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from octasplat.engine.core.errors import SceneFileError
-from octasplat.engine.core.events import Event, StageFinished, StageStarted
+from octasplat.engine.core.events import Event, PhaseFinished, PhaseStarted
 from octasplat.engine.files import Importer, importer_for, importers, read_scene, register
 from octasplat.engine.files.gaussian_ply import write_gaussian_ply
 from octasplat.engine.gaussians.flattening import GaussianCloud
@@ -61,7 +61,7 @@ def test_read_scene_reports_progress_events(gaussians: FlatGaussians, tmp_path: 
     write_gaussian_ply(gaussians, tmp_path / "a.ply")
     events: list[Event] = []
     read_scene(tmp_path / "a.ply", progress=events.append)
-    assert [type(event) for event in events] == [StageStarted, StageFinished]
+    assert [type(event) for event in events] == [PhaseStarted, PhaseFinished]
 
 
 def test_gaussians_without_finite_values_can_be_left_out(gaussians: FlatGaussians, tmp_path: Path) -> None:

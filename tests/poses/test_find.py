@@ -14,8 +14,8 @@ import pycolmap
 import pytest
 from jaxtyping import Float64
 
-from octasplat.engine.core.errors import Cancelled, DatasetError, PosesCrashed
-from octasplat.engine.core.events import Event, StageFinished, StageProgress, StageStarted, Warned
+from octasplat.engine.core.errors import CancelledError, ColmapCrashError, DatasetError
+from octasplat.engine.core.events import Event, PhaseFinished, PhaseProgress, PhaseStarted, Warned
 from octasplat.engine.poses import find_poses
 from octasplat.engine.poses.find_poses import PosesConfig
 from octasplat.engine.poses.search import PoseSearch
@@ -71,13 +71,13 @@ def test_poses_are_those_of_the_cameras(taken: Photographs, tmp_path: Path) -> N
     # Of so few pixels; the focal length is found with them, which processors round differently.
     assert np.median(errors) < 0.03 * np.linalg.norm(b - b.mean(0), axis=1).mean()
     wanted = [("features", COUNT), ("matches", COUNT * (COUNT - 1) // 2), ("poses", COUNT)]
-    begun = [event for event in events if isinstance(event, StageStarted)]
+    begun = [event for event in events if isinstance(event, PhaseStarted)]
     assert [(event.stage, event.total_steps) for event in begun] == wanted
-    assert [event.stage for event in events if isinstance(event, StageFinished)] == [
+    assert [event.stage for event in events if isinstance(event, PhaseFinished)] == [
         name for name, _ in wanted
     ]
     for stage, total in wanted:
-        steps = [e.step for e in events if isinstance(e, StageProgress) and e.stage == stage]
+        steps = [e.step for e in events if isinstance(e, PhaseProgress) and e.stage == stage]
         assert steps == sorted(steps) and steps[-1] == (len(found) if stage == "poses" else total)
     record = json.loads((model / "poses.json").read_text())
     assert (record["placed"], record["photographs"]) == (len(found), COUNT)
@@ -117,7 +117,7 @@ def test_find_poses_too_few_registered_is_refused(taken: Photographs, tmp_path: 
 
 def test_find_poses_should_stop_cancels(taken: Photographs, tmp_path: Path) -> None:
     asked = iter(range(1000))
-    with pytest.raises(Cancelled):
+    with pytest.raises(CancelledError):
         find_poses(taken.folder, tmp_path / "out", threads=1, should_stop=lambda: next(asked) >= 1)
     assert list(tmp_path.iterdir()) == []
 
@@ -204,11 +204,13 @@ def test_poses_go_to_the_photographs_they_are_of(taken: Photographs, tmp_path: P
 
 def test_find_poses_colmap_crash_is_reported(taken: Photographs, tmp_path: Path) -> None:
     def kill(event: Event) -> None:
-        if isinstance(event, StageStarted) and event.stage == "features":
+        if isinstance(event, PhaseStarted) and event.stage == "features":
             (child,) = psutil.Process().children()
             child.send_signal(signal.SIGSEGV)
 
-    with pytest.raises(PosesCrashed, match=r"SIGSEGV while looking for features.*run the same command again"):
+    with pytest.raises(
+        ColmapCrashError, match=r"SIGSEGV while looking for features.*run the same command again"
+    ):
         find_poses(taken.folder, tmp_path / "poses", threads=1, progress=kill)
     assert list(tmp_path.iterdir()) == []
 

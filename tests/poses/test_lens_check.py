@@ -7,8 +7,8 @@ import numpy as np
 import pycolmap
 import pytest
 
-from octasplat.engine.core.errors import Cancelled, DatasetError
-from octasplat.engine.core.events import Event, StageFinished, StageStarted, Warned
+from octasplat.engine.core.errors import CancelledError, DatasetError
+from octasplat.engine.core.events import Event, PhaseFinished, PhaseStarted, Warned
 from octasplat.engine.dataset.load import load_dataset_model
 from octasplat.engine.dataset.synthetic import SyntheticDatasetConfig, write_synthetic_dataset
 from octasplat.engine.pipeline import reconstruct
@@ -134,16 +134,16 @@ def test_lens_fit_runs_during_reconstruction_and_resumes(moved: Path, tmp_path: 
     begun: list[str] = []
 
     def note(event: Event) -> None:
-        if isinstance(event, StageStarted):
+        if isinstance(event, PhaseStarted):
             begun.append(event.stage)
 
-    with pytest.raises(Cancelled, match="--resume"):
+    with pytest.raises(CancelledError, match="--resume"):
         reconstruct(
             moved, output, config, resume=True, progress=note, should_stop=lambda: begun[-1:] == ["lenses"]
         )
     assert not (output / "poses").exists()
     reconstruct(moved, output, config, resume=True, progress=events.append)
-    stages = [event.stage for event in events if isinstance(event, StageFinished)]
+    stages = [event.stage for event in events if isinstance(event, PhaseFinished)]
     assert stages == ["load", "lenses", "load", "train", "evaluate", "export"]
     assert any("lens moved" in event.message for event in events if isinstance(event, Warned))
     metrics = json.loads((output / "metrics.json").read_text())
@@ -155,7 +155,7 @@ def test_lens_fit_runs_during_reconstruction_and_resumes(moved: Path, tmp_path: 
     config = resolve_config(
         "fast", settings={"exports": ()}, assignments=[*SETTINGS, "per_view_principal_point=false"]
     )
-    with pytest.raises(Cancelled):
+    with pytest.raises(CancelledError):
         reconstruct(
             moved, tmp_path / "given", config, progress=note, should_stop=lambda: begun[-1:] == ["train"]
         )

@@ -8,8 +8,8 @@ import numpy as np
 import pycolmap
 import pytest
 
-from octasplat.engine.core.errors import Cancelled, DatasetError
-from octasplat.engine.core.events import Event, StageFinished, StageStarted, Warned
+from octasplat.engine.core.errors import CancelledError, DatasetError
+from octasplat.engine.core.events import Event, PhaseFinished, PhaseStarted, Warned
 from octasplat.engine.dataset.synthetic import SyntheticDatasetConfig, write_synthetic_dataset
 from octasplat.engine.pipeline import reconstruct
 from octasplat.engine.poses import GivenModel, PosesConfig, repair_poses
@@ -70,7 +70,7 @@ def test_pose_repair_moves_contradicted_photographs(scene: Path, tmp_path: Path)
     moved = repair_poses(scene / "images", names, given, found, threads=2, progress=events.append)
     assert moved == SWAPPED
     assert_swapped(before, poses(found))
-    begun = [(event.stage, event.total_steps) for event in events if isinstance(event, StageStarted)]
+    begun = [(event.stage, event.total_steps) for event in events if isinstance(event, PhaseStarted)]
     assert begun == [("features", VIEWS), ("matches", 3 * (VIEWS - 3)), ("placing", 2)]
     observed = pycolmap.Reconstruction(str(found))
     for image in observed.images.values():
@@ -104,10 +104,10 @@ def stages_until(last: str, scene: Path, output: Path, *settings: str) -> list[s
     begun: list[str] = []
 
     def note(event: Event) -> None:
-        if isinstance(event, StageStarted):
+        if isinstance(event, PhaseStarted):
             begun.append(event.stage)
 
-    with pytest.raises(Cancelled, match="--resume"):
+    with pytest.raises(CancelledError, match="--resume"):
         reconstruct(
             scene, output, config, resume=True, progress=note, should_stop=lambda: begun[-1:] == [last]
         )
@@ -122,7 +122,7 @@ def test_pose_repair_runs_during_reconstruction(scene: Path, tmp_path: Path) -> 
     events: list[Event] = []
     config = resolve_config("fast", settings={"exports": ()}, assignments=SETTINGS)
     reconstruct(scene, output, config, resume=True, progress=events.append)
-    stages = [event.stage for event in events if isinstance(event, StageFinished)]
+    stages = [event.stage for event in events if isinstance(event, PhaseFinished)]
     assert stages == ["load", *asked, "load", "train", "evaluate", "export"]
     told = [event.message for event in events if isinstance(event, Warned)]
     assert any("did not stand where" in text and all(name in text for name in SWAPPED) for text in told)

@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 from jaxtyping import Float32
 
-from octasplat.engine.core.errors import Cancelled
+from octasplat.engine.core.errors import CancelledError
 from octasplat.engine.core.events import Event, HeldOutMeasured
 from octasplat.engine.core.rays import RayBatch
 from octasplat.engine.gaussians.model import FlatGaussians
-from octasplat.engine.shading.exposure import Exposures
-from octasplat.engine.shading.protocol import Developed, Reversed, ShadingModel, Sight
+from octasplat.engine.shading.exposure import ExposureModel
+from octasplat.engine.shading.protocol import ShadedRays, ShadingGradients, ShadingModel, TracedRays
 from octasplat.engine.trace.cpu.tracer import CpuTracer
 from octasplat.engine.trace.protocol import (
     GaussianGradients,
@@ -27,8 +27,8 @@ from octasplat.engine.trace.protocol import (
 )
 from octasplat.engine.train.config import McmcConfig
 from octasplat.engine.train.loop.checkpoint import latest_checkpoint, load_checkpoint
-from octasplat.engine.train.loop.iteration import differentiate
-from octasplat.engine.train.loop.state import TrainState, fresh_state
+from octasplat.engine.train.loop.iteration import loss_and_gradients
+from octasplat.engine.train.loop.state import TrainState, initial_state
 from octasplat.engine.train.loop.trainer import Trainer
 from octasplat.engine.train.sampling.batches import Batch, BatchSource
 from tests.support.planar_dataset import PlanarDataset, small_config
@@ -50,33 +50,33 @@ class Lamp:
         assert len(gaussians) == len(self.albedo)
         return self.albedo
 
-    def settle(self, gaussians: FlatGaussians, tracer: Tracer, *, progress: float) -> None:
-        self.settled = progress
+    def on_rebuild(self, gaussians: FlatGaussians, tracer: Tracer, *, training_progress: float) -> None:
+        self.settled = training_progress
 
-    def _facing(self, sight: Sight) -> Float32[np.ndarray, "r 1"]:
-        return (1 - (sight.seen.normal_world * sight.rays.directions_world).sum(axis=1))[:, None] / 2
+    def _facing(self, traced: TracedRays) -> Float32[np.ndarray, "r 1"]:
+        return (1 - (traced.result.normal_world * traced.rays.directions_world).sum(axis=1))[:, None] / 2
 
-    def develop(self, sight: Sight) -> Developed:
-        rays = RayBatch(sight.rays.origins_world + ASIDE, sight.rays.directions_world, sight.rays.t_min)
-        beside = sight.tracer.trace(rays, record=True)
-        rgb = sight.seen.features * self.lamp * self._facing(sight) + SHARE * beside.rgb_srgb
-        return Developed(rgb, sight.seen.transmittance, beside)
+    def shade(self, traced: TracedRays) -> ShadedRays:
+        rays = RayBatch(traced.rays.origins_world + ASIDE, traced.rays.directions_world, traced.rays.t_min)
+        beside = traced.tracer.trace(rays, record=True)
+        rgb = traced.result.features * self.lamp * self._facing(traced) + SHARE * beside.rgb_srgb
+        return ShadedRays(rgb, traced.result.transmittance, beside)
 
-    def reverse(
-        self, sight: Sight, developed: Developed, by_rgb: np.ndarray, by_transmittance: np.ndarray
-    ) -> Reversed:
-        beside = developed.kept
+    def backward(
+        self, traced: TracedRays, shaded: ShadedRays, by_rgb: np.ndarray, by_transmittance: np.ndarray
+    ) -> ShadingGradients:
+        beside = shaded.ctx
         assert isinstance(beside, TraceResult) and beside.recording is not None
-        facing, features = self._facing(sight), sight.seen.features
+        facing, features = self._facing(traced), traced.result.features
         by_facing = (by_rgb * features * self.lamp).sum(axis=1, keepdims=True)
-        return Reversed(
+        return ShadingGradients(
             TraceGradients(
                 rgb_srgb=np.zeros_like(by_rgb),
                 transmittance=by_transmittance,
                 features=by_rgb * self.lamp * facing,
-                normal_world=-by_facing / 2 * sight.rays.directions_world,
+                normal_world=-by_facing / 2 * traced.rays.directions_world,
             ),
-            further=((beside.recording, TraceGradients(rgb_srgb=SHARE * by_rgb)),),
+            recorded_traces=((beside.recording, TraceGradients(rgb_srgb=SHARE * by_rgb)),),
             parameters={"lamp.lamp": (by_rgb * features * facing).sum(axis=0)},
         )
 
@@ -86,9 +86,9 @@ class Lamp:
         gradients: GaussianGradients,
         parameters: Mapping[str, np.ndarray],
         *,
-        progress: float,
+        training_progress: float,
     ) -> None:
-        assert 0 <= self.settled <= progress < 1
+        assert 0 <= self.settled <= training_progress < 1
         self.lamp -= np.float32(0.1) * parameters["lamp.lamp"]
         self.albedo[gradients.ids] -= np.float32(10) * gradients.features
 
@@ -115,7 +115,7 @@ def test_gradients_of_several_traces_agree_with_finite_differences() -> None:
     rng = np.random.default_rng(5)
     gaussians, lamp, batch = made(rng)
     # Exposures around it, so that models can be put into each other.
-    model = Exposures(7, rate=0.01, inner=lamp)
+    model = ExposureModel(7, rate=0.01, inner=lamp)
     model.log_gains[:] = rng.normal(0, 0.2, (7, 3))
     # Octagons so wide that Gaussians have faded at their edges, through which no gradient goes.
     tracer = CpuTracer(TraceSettings(q=30.0, transmittance_min=1e-6), threads=1)
@@ -123,7 +123,7 @@ def test_gradients_of_several_traces_agree_with_finite_differences() -> None:
 
     def look() -> tuple[float, dict[str, np.ndarray]]:
         tracer.build(gaussians, model.features(gaussians))
-        found = differentiate(batch, tracer, model, weights, progress=0.5)
+        found = loss_and_gradients(batch, tracer, model, weights, training_progress=0.5)
         whole = {"lamp": found.shading["lamp.lamp"]}
         for name, like in (
             ("features", lamp.albedo),
@@ -156,17 +156,17 @@ def train(folder: Path, *, stop_after: int | None = None) -> tuple[Lamp, TrainSt
     """Train the lamp; with ``stop_after``, stop there and go on from the checkpoint with a fresh model."""
     world, events = PlanarDataset(), list[Event]()
     config = small_config(densify=McmcConfig(start=10_000).model_dump(), sh_degree=0)
-    state = fresh_state(world.initial_gaussians(opacity=0.6), config.seed)
+    state = initial_state(world.initial_gaussians(opacity=0.6), config.seed)
 
     def trainer(state: TrainState, last: float) -> tuple[Trainer, Lamp]:
         model = Lamp(state.gaussians)
         return Trainer(
-            world, config, state, folder=folder, fingerprint="test", listener=events.append, threads=1,
+            world, config, state, folder=folder, fingerprint="test", progress=events.append, threads=1,
             should_stop=lambda: state.iteration >= last, shading=model,
         ), model  # fmt: skip
 
     if stop_after is not None:
-        with pytest.raises(Cancelled):
+        with pytest.raises(CancelledError):
             trainer(state, stop_after)[0].run()
         path = latest_checkpoint(folder)
         assert path is not None

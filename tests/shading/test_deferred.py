@@ -5,27 +5,27 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from octasplat.engine.core.errors import Cancelled
+from octasplat.engine.core.errors import CancelledError
 from octasplat.engine.core.events import Event, HeldOutMeasured
 from octasplat.engine.core.rays import RayBatch
 from octasplat.engine.gaussians.channels import stack_channels
 from octasplat.engine.gaussians.frames import frames_from_normals, quaternions_from_matrices
 from octasplat.engine.gaussians.model import FlatGaussians, concatenate
-from octasplat.engine.shading.ambient_occlusion import ambient_visibility, bounced_light
-from octasplat.engine.shading.deferred import Deferred
-from octasplat.engine.shading.gbuffer import Leaving
+from octasplat.engine.shading.ambient_occlusion import ambient_visibility, diffuse_interreflection
+from octasplat.engine.shading.deferred import DeferredShading
+from octasplat.engine.shading.gbuffer import RayOffset
 from octasplat.engine.shading.material_settings import MaterialSettings
-from octasplat.engine.shading.protocol import Sight
+from octasplat.engine.shading.protocol import TracedRays
 from octasplat.engine.trace.cpu.tracer import CpuTracer
 from octasplat.engine.trace.gradient_sums import add_gradients
 from octasplat.engine.trace.protocol import TraceSettings
-from octasplat.engine.train.initialization.initial_gaussians import with_first_materials
+from octasplat.engine.train.initialization.initial_gaussians import add_initial_materials
 from octasplat.engine.train.loop.checkpoint import latest_checkpoint, load_checkpoint
-from octasplat.engine.train.loop.iteration import differentiate
-from octasplat.engine.train.loop.state import TrainState, fresh_state
+from octasplat.engine.train.loop.iteration import loss_and_gradients
+from octasplat.engine.train.loop.state import TrainState, initial_state
 from octasplat.engine.train.loop.trainer import Trainer
 from octasplat.engine.train.sampling.batches import BatchSource
-from octasplat.engine.train.shading_factory import make_deferred
+from octasplat.engine.train.shading_factory import make_deferred_shading
 from tests.support.planar_dataset import PlanarDataset, small_config
 
 BARE = {
@@ -54,7 +54,7 @@ def wall(normal: tuple[float, float, float], points: np.ndarray, material: list[
         np.full(count, 5.0, np.float32),
         np.zeros((count, 1, 3), np.float32),
     )
-    gaussians = with_first_materials(gaussians, MaterialSettings())
+    gaussians = add_initial_materials(gaussians, MaterialSettings())
     for name, values in {
         "albedo": material[:3],
         "metallic": material[3:4],
@@ -76,11 +76,11 @@ def test_gradients_agree_with_finite_differences(indirect: str) -> None:
     settings = MaterialSettings(
         **BARE, indirect=indirect, blur=0.0, ambient_occlusion=False, roughness_probe_fraction=0.0
     )
-    gaussians = with_first_materials(world.initial_gaussians(opacity=0.6), settings)
+    gaussians = add_initial_materials(world.initial_gaussians(opacity=0.6), settings)
     gaussians.means_world[:, 2] = rng.permutation(np.linspace(-0.4, 0.4, len(gaussians)))
     for values in gaussians.channels.values():
         values[:] = rng.uniform(0.2, 0.8, values.shape)
-    model = Deferred(settings, extent_world=1.0)
+    model = DeferredShading(settings, extent_world=1.0)
     model.light.log_radiance[:] = rng.normal(-1, 0.4, model.light.log_radiance.shape)
     tracer = CpuTracer(TraceSettings(q=30.0, transmittance_min=1e-6), threads=1)
     config = small_config(loss={"l1": 0.0, "l2": 1.0})
@@ -88,8 +88,8 @@ def test_gradients_agree_with_finite_differences(indirect: str) -> None:
 
     def look() -> tuple[float, dict[str, np.ndarray]]:
         tracer.build(gaussians, model.features(gaussians))
-        found = differentiate(batch, tracer, model, config.loss, progress=1.0)
-        by_light = model.light._prefilter.transposed(found.shading["materials.texels"])
+        found = loss_and_gradients(batch, tracer, model, config.loss, training_progress=1.0)
+        by_light = model.light._prefilter.backward(found.shading["materials.texels"])
         whole = {"light": by_light * model.light.radiance_linear}
         features = np.zeros((len(gaussians), 9))
         features[found.gaussians.ids] = found.gaussians.features
@@ -121,8 +121,8 @@ def test_deferred_reflected_gaussians_have_opacity_gradients() -> None:
     settings = MaterialSettings(
         **BARE, blur=0.0, ambient_occlusion=False, reflection_ray_slope=(1e-3, 1e-3), ray_bias=0.01
     )
-    model = Deferred(settings, extent_world=1.0)
-    model.light.put(np.full((16, 32, 3), 0.5, np.float32))
+    model = DeferredShading(settings, extent_world=1.0)
+    model.light.set_radiance(np.full((16, 32, 3), 0.5, np.float32))
     x, y = (values.ravel() for values in np.meshgrid(*[np.linspace(-0.2, 0.2, 9)] * 2))
     ways = np.stack([0.2 * x, 0.2 * y, np.full(len(x), -1.0)], axis=1)
     ways /= np.linalg.norm(ways, axis=1, keepdims=True)
@@ -134,11 +134,11 @@ def test_deferred_reflected_gaussians_have_opacity_gradients() -> None:
         tracer.build(scene, model.features(scene))
         seen = tracer.trace(rays, record=True)
         assert seen.recording is not None
-        sight = Sight(rays, seen, tracer, np.zeros(len(rays), np.int64))
-        developed = model.develop(sight)
+        sight = TracedRays(rays, seen, tracer, np.zeros(len(rays), np.int64))
+        developed = model.shade(sight)
         error = developed.rgb_srgb - target
-        back = model.reverse(sight, developed, 2 * error, np.zeros(len(rays), np.float32))
-        recorded = [(seen.recording, back.seen), *back.further]
+        back = model.backward(sight, developed, 2 * error, np.zeros(len(rays), np.float32))
+        recorded = [(seen.recording, back.trace), *back.recorded_traces]
         found = add_gradients([tracer.backward(hits, by).numpy() for hits, by in recorded])
         whole = np.zeros(len(scene))
         whole[found.ids] = found.opacity_logits
@@ -157,11 +157,11 @@ def test_deferred_roughness_gradient_follows_reflection_sharpness() -> None:
     rough = wall((0, 0, 1), floor(0.8, 0.1), [0.9, 0.9, 0.9, 1.0, 0.35])
     lid = wall((0, 0, 1), floor(0.25, 0.1, above=0.6), [0.4, 0.4, 0.4, 0.0, 1.0])
     scene = concatenate([rough, lid])
-    model = Deferred(
+    model = DeferredShading(
         MaterialSettings(**BARE, ambient_occlusion=False, roughness_probe_fraction=1.0, ray_bias=0.01),
         extent_world=1.0,
     )
-    model.light.put(np.full((16, 32, 3), 0.2, np.float32))
+    model.light.set_radiance(np.full((16, 32, 3), 0.2, np.float32))
     rng = np.random.default_rng(2)
     ways = np.concatenate([rng.uniform(-0.05, 0.05, (3000, 2)), np.full((3000, 1), -1.0)], axis=1)
     ways /= np.linalg.norm(ways, axis=1, keepdims=True)
@@ -174,10 +174,10 @@ def test_deferred_roughness_gradient_follows_reflection_sharpness() -> None:
         tracer.build(scene, model.features(scene))
         seen = tracer.trace(rays, record=True)
         assert seen.recording is not None
-        sight = Sight(rays, seen, tracer, np.zeros(3000, np.int64))
-        developed = model.develop(sight)
-        back = model.reverse(sight, developed, ones, np.zeros(3000, np.float32))
-        found = tracer.backward(seen.recording, back.seen).numpy()
+        sight = TracedRays(rays, seen, tracer, np.zeros(3000, np.int64))
+        developed = model.shade(sight)
+        back = model.backward(sight, developed, ones, np.zeros(3000, np.float32))
+        found = tracer.backward(seen.recording, back.trace).numpy()
         return float(developed.rgb_srgb.sum(dtype=np.float64)), float(found.features[:, 4].sum())
 
     _, found = look()
@@ -196,10 +196,10 @@ def test_deferred_mirror_reflects_gaussians_and_environment() -> None:
     mirror = wall((0, 0, 1), floor(1.0, 0.1), [1, 1, 1, 1, 0.05])
     red = wall((0, 0, 1), floor(1.0, 0.1, above=1.0), [1, 0, 0, 0.0, 1.0])
     settings = MaterialSettings(**BARE, up_world=(0, 0, 1))
-    model = Deferred(settings, extent_world=1.0)
+    model = DeferredShading(settings, extent_world=1.0)
     radiance = np.full((16, 32, 3), 0.05, np.float32)
     radiance[:8] = 0.5  # the upper half
-    model.light.put(radiance)
+    model.light.set_radiance(radiance)
     down = np.array([[0.0, 0.05, -1.0]]) / np.hypot(1, 0.05)
     rays = RayBatch(np.array([[0, 0, 0.5]]), down)
     # The red wall's lower side: matt, lit by the lower half, and four percent of gloss.
@@ -209,7 +209,7 @@ def test_deferred_mirror_reflects_gaussians_and_environment() -> None:
     ):
         tracer = CpuTracer(threads=1)
         tracer.build(scene, model.features(scene))
-        shown = model.develop(Sight(rays, tracer.trace(rays), tracer)).rgb_srgb[0]
+        shown = model.shade(TracedRays(rays, tracer.trace(rays), tracer)).rgb_srgb[0]
         linear = np.where(shown <= 0.04045, shown / 12.92, ((shown + 0.055) / 1.055) ** 2.4)
         np.testing.assert_allclose(linear, expected, atol=0.012)
 
@@ -223,13 +223,13 @@ def test_deferred_reflection_rays_skip_own_surface() -> None:
     rays = RayBatch(np.array([[-0.3, 0, 0.4]]), down)
     seen = []
     for leaves in (0.0, 0.1):
-        model = Deferred(
+        model = DeferredShading(
             MaterialSettings(**BARE, ray_bias=1e-3, backface_cull_distance=leaves), extent_world=1.0
         )
-        model.light.put(np.full((16, 32, 3), 0.5, np.float32))
+        model.light.set_radiance(np.full((16, 32, 3), 0.5, np.float32))
         tracer = CpuTracer(TraceSettings(flip_normal_cos=0.5), threads=1)
         tracer.build(mirror, model.features(mirror))
-        seen.append(model.develop(Sight(rays, tracer.trace(rays), tracer)).layers["visibility"][0, 0])
+        seen.append(model.shade(TracedRays(rays, tracer.trace(rays), tracer)).layers["visibility"][0, 0])
     assert seen[0] < 0.9
     assert seen[1] > 0.99
 
@@ -244,10 +244,10 @@ def test_ambient_visibility_under_a_lid_is_its_form_factor() -> None:
     tracer = CpuTracer(threads=1)
     tracer.build(both)
     one = np.array([0])
-    found, side = ambient_visibility(both, one, tracer, rays=2000, leaving=Leaving(0.01))
-    bounced = bounced_light(
+    found, side = ambient_visibility(both, one, tracer, rays=2000, offset=RayOffset(0.01))
+    bounced = diffuse_interreflection(
         both, one, side, lambda rays: (1 - tracer.transmittance(rays))[:, None] * np.array([[3.0, 2.0, 1.0]]),
-        rays=2000, leaving=Leaving(0.01),
+        rays=2000, offset=RayOffset(0.01),
     )  # fmt: skip
     # A lid that shines evenly sends what it hides.
     np.testing.assert_allclose(bounced[0], (1 - found[0]) * np.array([3, 2, 1]), rtol=1e-4)
@@ -258,30 +258,32 @@ def test_ambient_visibility_under_a_lid_is_its_form_factor() -> None:
 @pytest.mark.parametrize("rebuilds", [128, 100, 64, 20])
 def test_ambient_visibility_updates_every_gaussian(rebuilds: int, monkeypatch: pytest.MonkeyPatch) -> None:
     settings = MaterialSettings(learn=True, ambient_occlusion_rebuilds=20, secondary_from=0.0)
-    gaussians = with_first_materials(wall((0, 0, 1), floor(2, 0.25), [0.5, 0.5, 0.5, 0, 0.5]), settings)
+    gaussians = add_initial_materials(wall((0, 0, 1), floor(2, 0.25), [0.5, 0.5, 0.5, 0, 0.5]), settings)
     looked: list[np.ndarray] = []
 
-    def look_around(model: Deferred, gaussians: FlatGaussians, ids: np.ndarray, tracer: object) -> np.ndarray:
+    def look_around(
+        model: DeferredShading, gaussians: FlatGaussians, ids: np.ndarray, tracer: object
+    ) -> np.ndarray:
         looked.append(ids)
         return np.ones(len(ids), np.float32)
 
-    monkeypatch.setattr(Deferred, "look_around", look_around)
-    monkeypatch.setattr(Deferred, "bounce", lambda *_: None)
-    model, tracer = Deferred(settings, extent_world=1.0), CpuTracer(TraceSettings())
+    monkeypatch.setattr(DeferredShading, "measure_ambient_occlusion", look_around)
+    monkeypatch.setattr(DeferredShading, "measure_diffuse_interreflection", lambda *_: None)
+    model, tracer = DeferredShading(settings, extent_world=1.0), CpuTracer(TraceSettings())
     for turn in range(20):
-        model.settle(gaussians, tracer, progress=turn / rebuilds)
+        model.on_rebuild(gaussians, tracer, training_progress=turn / rebuilds)
         if turn == 7:  # stopped and gone on with
-            again = Deferred(settings, extent_world=1.0)
+            again = DeferredShading(settings, extent_world=1.0)
             again.restore(model.state())
             model = again
-            model.settle(gaussians, tracer, progress=turn / rebuilds)
+            model.on_rebuild(gaussians, tracer, training_progress=turn / rebuilds)
             np.testing.assert_array_equal(looked.pop(), looked[-1])
     assert sorted(np.concatenate(looked).tolist()) == list(range(len(gaussians)))
 
 
 def train(
     folder: Path, *, stop_after: int | None = None, threads: int = 1, recipe: str = "split_sum"
-) -> tuple[Deferred, TrainState, list[float]]:
+) -> tuple[DeferredShading, TrainState, list[float]]:
     """Train materials; with ``stop_after``, stop there and go on from the checkpoint with a fresh model."""
     world, events = PlanarDataset(), list[Event]()
     materials = {
@@ -298,18 +300,18 @@ def train(
         iterations=72,
         trace={"flip_normal_cos": 0.0 if recipe == "ref_gaussian" else 0.5},
     )
-    first = with_first_materials(world.initial_gaussians(opacity=0.6), config.materials)
-    state = fresh_state(first, config.seed)
+    first = add_initial_materials(world.initial_gaussians(opacity=0.6), config.materials)
+    state = initial_state(first, config.seed)
 
-    def trainer(state: TrainState, last: float) -> tuple[Trainer, Deferred]:
-        model = make_deferred(config, world.extent)
+    def trainer(state: TrainState, last: float) -> tuple[Trainer, DeferredShading]:
+        model = make_deferred_shading(config, world.extent)
         return Trainer(
-            world, config, state, folder=folder, fingerprint="test", listener=events.append, threads=threads,
+            world, config, state, folder=folder, fingerprint="test", progress=events.append, threads=threads,
             should_stop=lambda: state.iteration >= last, shading=model,
         ), model  # fmt: skip
 
     if stop_after is not None:
-        with pytest.raises(Cancelled):
+        with pytest.raises(CancelledError):
             trainer(state, stop_after)[0].run()
         path = latest_checkpoint(folder)
         assert path is not None

@@ -11,13 +11,13 @@ from octasplat.engine.core.errors import ConfigError
 from octasplat.engine.core.rays import RayBatch
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.runs.config import resolve_config
-from octasplat.engine.shading.depth_normal_model import Flattening
-from octasplat.engine.shading.plain import PLAIN
-from octasplat.engine.shading.protocol import Sight
-from octasplat.engine.shading.ray_patches import RayWindows
+from octasplat.engine.shading.depth_normal_model import DepthNormalShading
+from octasplat.engine.shading.plain import PLAIN_SHADING
+from octasplat.engine.shading.protocol import TracedRays
+from octasplat.engine.shading.ray_patches import RayPatches
 from octasplat.engine.trace.cpu.tracer import CpuTracer
 from octasplat.engine.trace.protocol import TraceResult
-from octasplat.engine.train.loop.state import fresh_state
+from octasplat.engine.train.loop.state import initial_state
 from octasplat.engine.train.loop.trainer import Trainer
 from tests.support.planar_dataset import PlanarDataset, small_config
 
@@ -27,7 +27,7 @@ CELLS = [0, 1, 4, 5, 2, 3, 6, 7, 8, 9, 12, 13, 10, 11, 14, 15]
 """The cell of each ray of a window, cells counted row by row: along a Z."""
 
 
-def wavy() -> Sight:
+def wavy() -> TracedRays:
     """A few loose rays, then windows on a wavy surface with normals that do not quite fit, and a hole."""
     rng = np.random.default_rng(3)
     x, y = np.meshgrid(np.linspace(-0.3, 0.3, SIDE), np.linspace(-0.3, 0.3, SIDE))
@@ -43,8 +43,8 @@ def wavy() -> Sight:
     narrow = [number.astype(np.float32) for number in (*numbers, np.zeros((COUNT, 0)))]
     seen = TraceResult(*narrow, np.ones(COUNT, np.int32))
     rays = RayBatch(np.zeros((1, 3)), directions)
-    windows = RayWindows(LOOSE, WINDOWS, SIDE)
-    return Sight(rays, seen, CpuTracer(), np.zeros(COUNT, np.int64), windows=windows)
+    windows = RayPatches(LOOSE, WINDOWS, SIDE)
+    return TracedRays(rays, seen, CpuTracer(), np.zeros(COUNT, np.int64), ray_patches=windows)
 
 
 def term(
@@ -71,12 +71,12 @@ def term(
 
 def test_gradients_are_those_of_the_term_and_of_the_model_inside() -> None:
     sight, weight = wavy(), 0.3
-    seen = sight.seen
+    seen = sight.result
     rng = np.random.default_rng(4)
     by_rgb, by_transmittance = rng.normal(size=(COUNT, 3)), rng.normal(size=COUNT)
     by_rgb, by_transmittance = by_rgb.astype(np.float32), by_transmittance.astype(np.float32)
-    model = Flattening(weight)
-    found = model.reverse(sight, model.develop(sight), by_rgb, by_transmittance).seen
+    model = DepthNormalShading(weight)
+    found = model.backward(sight, model.shade(sight), by_rgb, by_transmittance).trace
 
     wide = (seen.alpha, seen.depth_sum, seen.normal_world)
     alpha, depth, normals = (torch.tensor(x.astype(np.float64), requires_grad=True) for x in wide)
@@ -87,7 +87,7 @@ def test_gradients_are_those_of_the_term_and_of_the_model_inside() -> None:
     )
     value.backward()
     assert value > 0.001
-    inside = PLAIN.reverse(sight, PLAIN.develop(sight), by_rgb, by_transmittance).seen
+    inside = PLAIN_SHADING.backward(sight, PLAIN_SHADING.shade(sight), by_rgb, by_transmittance).trace
     assert np.array_equal(found.rgb_srgb, inside.rgb_srgb)
     assert found.depth_sum == pytest.approx(depth.grad.numpy(), abs=1e-5)
     assert found.normal_world == pytest.approx(normals.grad.numpy(), abs=1e-5)
@@ -108,8 +108,8 @@ def test_tilted_gaussians_lie_down_on_the_plane(tmp_path: Path) -> None:
     def off_degrees(weight: float) -> float:
         config = small_config(loss={"depth_normal": weight}, rays_per_batch=2048, ray_patch_rays=16)
         trainer = Trainer(
-            world, config, fresh_state(tilted(world), 0), folder=tmp_path, fingerprint=str(weight),
-            listener=lambda _event: None, threads=1,
+            world, config, initial_state(tilted(world), 0), folder=tmp_path, fingerprint=str(weight),
+            progress=lambda _event: None, threads=1,
         )  # fmt: skip
         trained = trainer.run()
         solid = trained.opacities > 0.5

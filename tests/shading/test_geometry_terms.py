@@ -4,9 +4,13 @@ import numpy as np
 import pytest
 
 from octasplat.engine.core.rays import RayBatch
-from octasplat.engine.shading.geometry_losses import EDGE, depth_normal_term, smoothness_term
-from octasplat.engine.shading.protocol import Sight
-from octasplat.engine.shading.ray_patches import RayWindows
+from octasplat.engine.shading.geometry_losses import (
+    HUBER_DELTA,
+    add_depth_normal_gradient,
+    add_material_smoothness_gradient,
+)
+from octasplat.engine.shading.protocol import TracedRays
+from octasplat.engine.shading.ray_patches import RayPatches
 from octasplat.engine.trace.factory import make_tracer
 from octasplat.engine.trace.protocol import TraceResult, TraceSettings
 from octasplat.engine.train.sampling.pixel_sampler import PixelSampler
@@ -26,7 +30,7 @@ def in_rows(values: np.ndarray) -> np.ndarray:
     return grid
 
 
-def sight(features: np.ndarray, alpha: np.ndarray) -> Sight:
+def sight(features: np.ndarray, alpha: np.ndarray) -> TracedRays:
     count = len(alpha)
     flat, rows = np.zeros(count, np.float32), np.zeros((count, 3), np.float32)
     seen = TraceResult(
@@ -40,7 +44,7 @@ def sight(features: np.ndarray, alpha: np.ndarray) -> Sight:
     )
     rays = RayBatch(np.zeros((1, 3)), np.tile([0.0, 0.0, 1.0], (count, 1)))
     tracer = make_tracer(TraceSettings(), threads=1)
-    return Sight(rays, seen, tracer, np.zeros(count, np.int64), windows=RayWindows(0, 1, SIDE))
+    return TracedRays(rays, seen, tracer, np.zeros(count, np.int64), ray_patches=RayPatches(0, 1, SIDE))
 
 
 def penalty(features: np.ndarray, alpha: np.ndarray, metallic: np.ndarray) -> float:
@@ -51,7 +55,7 @@ def penalty(features: np.ndarray, alpha: np.ndarray, metallic: np.ndarray) -> fl
         ((y, x), (y + down, x + 1 - down))
         for down in (0, 1) for y in range(SIDE - down) for x in range(SIDE - 1 + down)
     ]:  # fmt: skip
-        size = np.sqrt((material[y, x] - material[v, u]) ** 2 + EDGE**2)
+        size = np.sqrt((material[y, x] - material[v, u]) ** 2 + HUBER_DELTA**2)
         size[:3] *= 1 + METAL * min(metal[y, x], metal[v, u]) ** 2
         total += float((size * WEIGHTS).sum())
     return total / SIDE**2
@@ -63,7 +67,7 @@ def test_geometry_gradient_with_metals_fixed() -> None:
     features = (rng.uniform(0, 1, (SIDE**2, 5)) * alpha[:, None]).astype(np.float32).astype(np.float64)
     metallic = features[:, 3] / alpha
     by_features, by_alpha = np.zeros_like(features), np.zeros_like(alpha)
-    smoothness_term(sight(features, alpha), WEIGHTS, METAL, by_features, by_alpha)
+    add_material_smoothness_gradient(sight(features, alpha), WEIGHTS, METAL, by_features, by_alpha)
     step = 1e-4
     for ray in range(SIDE**2):
         for column in range(5):
@@ -85,8 +89,10 @@ def test_metal_albedo_has_larger_weight(metallic: float, times: float) -> None:
     features[:, 3] = metallic
     features[MIDDLE, :3] = 0.7
     found = np.zeros_like(features)
-    smoothness_term(sight(features, np.ones(SIDE**2)), WEIGHTS, METAL, found, np.zeros(SIDE**2))
-    slope = 0.2 / np.hypot(0.2, EDGE) / SIDE**2  # by each of its four neighbours
+    add_material_smoothness_gradient(
+        sight(features, np.ones(SIDE**2)), WEIGHTS, METAL, found, np.zeros(SIDE**2)
+    )
+    slope = 0.2 / np.hypot(0.2, HUBER_DELTA) / SIDE**2  # by each of its four neighbours
     np.testing.assert_allclose(found[MIDDLE, :3], 4 * times * slope * np.array(WEIGHTS[:3]), rtol=1e-5)
     assert (found[:, 3:] == 0).all()
 
@@ -94,7 +100,7 @@ def test_metal_albedo_has_larger_weight(metallic: float, times: float) -> None:
 def test_geometry_terms_ignore_translucent_pixels() -> None:
     features = np.random.default_rng(1).uniform(0, 0.5, (SIDE**2, 5))
     found, by_alpha = np.zeros_like(features), np.zeros(SIDE**2)
-    smoothness_term(sight(features, np.full(SIDE**2, 0.5)), WEIGHTS, METAL, found, by_alpha)
+    add_material_smoothness_gradient(sight(features, np.full(SIDE**2, 0.5)), WEIGHTS, METAL, found, by_alpha)
     assert (found == 0).all() and (by_alpha == 0).all()
 
 
@@ -102,7 +108,7 @@ def test_sphere_normals_from_depths() -> None:
     """Windows as the training draws them; the gradient says how far the two are apart."""
     side, windows, focal = 8, 40, 100.0
     sampler = PixelSampler(np.array([0]), np.array([[100, 100]]))
-    _, y, x = sampler.windows(np.random.default_rng(0), windows, rays=side * side, side=24)
+    _, y, x = sampler.ray_patches(np.random.default_rng(0), windows, rays=side * side, side=24)
     directions = np.stack([(x - 49.5) / focal, (y - 49.5) / focal, np.ones(len(x))], axis=1)
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     along = 3 * directions[:, 2]  # to a sphere of radius 2 around (0, 0, 3)
@@ -111,15 +117,15 @@ def test_sphere_normals_from_depths() -> None:
     count = len(depth)
     numbers = (np.zeros((count, 3)), np.zeros(count), depth, depth, normals, np.zeros((count, 0)))
     seen = TraceResult(*(number.astype(np.float32) for number in numbers), np.ones(count, np.int32))
-    looked_at = Sight(
+    looked_at = TracedRays(
         RayBatch(np.zeros((1, 3)), directions),
         seen,
         make_tracer(TraceSettings(), threads=1),
         np.zeros(count, np.int64),
-        windows=RayWindows(0, windows, side),
+        ray_patches=RayPatches(0, windows, side),
     )
     by_normal = np.zeros((count, 3))
-    depth_normal_term(looked_at, 1.0, np.zeros(count), by_normal, np.zeros(count))
+    add_depth_normal_gradient(looked_at, 1.0, np.zeros(count), by_normal, np.zeros(count))
     sines = np.linalg.norm(by_normal, axis=1) * count
     counted = sines[sines > 0]
     # Cells are 3 pixels, 1.1 degrees of the sphere; in the order of the rays it would be 4 times as much.

@@ -9,19 +9,19 @@ from octasplat.engine.core.rays import ImageRays, RayBatch
 from octasplat.engine.gaussians.model import concatenate
 from octasplat.engine.render.renderer import background_colour, render_rays
 from octasplat.engine.render.supersampling import pixel_means
-from octasplat.engine.shading.deferred import Deferred
+from octasplat.engine.shading.deferred import DeferredShading
 from octasplat.engine.shading.material_settings import MaterialSettings
-from octasplat.engine.shading.protocol import Sight
+from octasplat.engine.shading.protocol import TracedRays
 from octasplat.engine.shading.reflection_rays import (
-    Widening,
-    facets_of,
-    numbers_of,
-    pair_mean,
-    pair_slope,
-    roughness_slope,
+    RoughnessProbe,
+    backward_normals,
+    backward_roughness,
+    direction_uniforms,
+    mean_of_pairs,
+    sample_facets,
 )
-from octasplat.engine.shading.reflection_tracing import Seen
-from octasplat.engine.shading.split_sum import Surface
+from octasplat.engine.shading.reflection_tracing import IncidentLight
+from octasplat.engine.shading.split_sum import SurfacePoints
 from octasplat.engine.trace.cpu.tracer import CpuTracer
 
 
@@ -31,9 +31,9 @@ def unit(vectors: np.ndarray) -> np.ndarray:
 
 def test_numbers_are_even_and_follows_from_the_direction_and_the_salt_alone() -> None:
     ways = unit(np.random.default_rng(0).normal(size=(20_000, 3)))
-    found = numbers_of(ways, 3)
-    np.testing.assert_array_equal(found[:, ::-1], numbers_of(ways[::-1].copy(), 3))
-    assert np.abs(found - numbers_of(ways, 4)).max() > 0.5
+    found = direction_uniforms(ways, 3)
+    np.testing.assert_array_equal(found[:, ::-1], direction_uniforms(ways[::-1].copy(), 3))
+    assert np.abs(found - direction_uniforms(ways, 4)).max() > 0.5
     counts, _, _ = np.histogram2d(*found, bins=10, range=[[0, 1], [0, 1]])
     assert counts.min() > 130 and counts.max() < 270  # 200 each
 
@@ -44,8 +44,8 @@ def test_facet_spread_follows_roughness() -> None:
     way = unit(way + np.random.default_rng(1).normal(scale=1e-3, size=way.shape))
     normal = np.tile([0.0, 0.0, 1.0], (count, 1))
     for roughness, least in ((0.6, 0.001), (0.02, 0.03)):
-        surface = Surface.alone(np.full((count, 5), roughness), normal, way)
-        facets = facets_of(surface, numbers_of(way, 0), least_slope=least)
+        surface = SurfacePoints.unoccluded(np.full((count, 5), roughness), normal, way)
+        facets = sample_facets(surface, direction_uniforms(way, 0), min_slope=least)
         one, other = facets.normals(normal, 1.0), facets.normals(normal, -1.0)
         np.testing.assert_allclose(one[:, :2], -other[:, :2], atol=1e-12)
         np.testing.assert_allclose(np.linalg.norm(one, axis=1), 1)
@@ -59,19 +59,19 @@ def test_reflection_pair_differences_estimate_normal_gradient() -> None:
     rng = np.random.default_rng(2)
     way = np.tile(unit(np.array([0.5, -0.2, -1.0])), (count, 1)) + rng.normal(scale=1e-6, size=(count, 3))
     normal = np.tile(unit(np.array([0.1, 0.2, 1.0])), (count, 1))
-    surface = Surface.alone(np.full((count, 5), 0.1), normal, way)
-    facets = facets_of(surface, numbers_of(way, 0), least_slope=1e-3)
+    surface = SurfacePoints.unoccluded(np.full((count, 5), 0.1), normal, way)
+    facets = sample_facets(surface, direction_uniforms(way, 0), min_slope=1e-3)
     colours, hidden = rng.normal(size=(3, 3)), rng.normal(size=3)
 
-    def seen(facing: np.ndarray) -> Seen:
+    def seen(facing: np.ndarray) -> IncidentLight:
         """Light and visibility that grow evenly with the reflected direction."""
         mirrored = way - 2 * (way * facing).sum(axis=1, keepdims=True) * facing
-        return Seen(mirrored @ hidden, mirrored @ colours)
+        return IncidentLight(mirrored @ hidden, mirrored @ colours)
 
     one, other = (seen(facets.normals(normal, sign)) for sign in (1.0, -1.0))
-    pairs = Seen(*(np.concatenate(both) for both in zip(one, other, strict=True)))
+    pairs = IncidentLight(*(np.concatenate(both) for both in zip(one, other, strict=True)))
     around, by_incoming = np.full((count, 3), 2.0), np.tile([1.0, -0.5, 0.25], (count, 1))
-    found = pair_slope(pairs, facets, around, by_incoming).mean(axis=0)
+    found = backward_normals(pairs, facets, around, by_incoming).mean(axis=0)
 
     def loss(facing: np.ndarray) -> float:
         visibility, light = seen(facing)
@@ -81,7 +81,7 @@ def test_reflection_pair_differences_estimate_normal_gradient() -> None:
     expected = np.array([(loss(normal + h) - loss(normal - h)) / 2e-5 for h in steps])
     expected -= (expected @ normal[0]) * normal[0]
     np.testing.assert_allclose(found, expected, atol=0.03 * np.linalg.norm(expected))
-    np.testing.assert_allclose(pair_mean(pairs).light_linear, seen(normal).light_linear, atol=5e-3)
+    np.testing.assert_allclose(mean_of_pairs(pairs).light_linear, seen(normal).light_linear, atol=5e-3)
 
 
 def test_three_rays_say_how_the_mean_of_pairs_changes_with_the_roughness() -> None:
@@ -89,24 +89,24 @@ def test_three_rays_say_how_the_mean_of_pairs_changes_with_the_roughness() -> No
     rng = np.random.default_rng(4)
     way = np.tile(unit(np.array([0.5, -0.2, -1.0])), (count, 1)) + rng.normal(scale=1e-6, size=(count, 3))
     normal = np.tile(unit(np.array([0.1, 0.2, 1.0])), (count, 1))
-    numbers = numbers_of(way, 0) * np.array([[0.2], [1.0]])  # none far out, where squares are not all
+    numbers = direction_uniforms(way, 0) * np.array([[0.2], [1.0]])  # none far out, where squares are not all
     curves, hidden = rng.normal(size=(3, 3)), rng.normal(size=3)
 
-    def seen(facing: np.ndarray) -> Seen:
+    def seen(facing: np.ndarray) -> IncidentLight:
         """Light and visibility that grow with the square of the reflected direction."""
         mirrored = way - 2 * (way * facing).sum(axis=1, keepdims=True) * facing
-        return Seen(mirrored**2 @ hidden, mirrored**2 @ curves)
+        return IncidentLight(mirrored**2 @ hidden, mirrored**2 @ curves)
 
-    def mean(roughness: float) -> Seen:
-        surface = Surface.alone(np.full((count, 5), roughness), normal, way)
-        facets = facets_of(surface, numbers, least_slope=1e-9)
+    def mean(roughness: float) -> IncidentLight:
+        surface = SurfacePoints.unoccluded(np.full((count, 5), roughness), normal, way)
+        facets = sample_facets(surface, numbers, min_slope=1e-9)
         pair = (seen(facets.normals(normal, sign)) for sign in (1.0, -1.0))
-        return pair_mean(Seen(*(np.concatenate(both) for both in zip(*pair, strict=True))))
+        return mean_of_pairs(IncidentLight(*(np.concatenate(both) for both in zip(*pair, strict=True))))
 
     around, by_incoming = np.full((count, 3), 2.0), np.tile([1.0, -0.5, 0.25], (count, 1))
-    change = Seen(*(a - b for a, b in zip(mean(roughness), seen(normal), strict=True)))
-    three = Widening(np.arange(count), change)
-    found = roughness_slope(three, np.full(count, roughness), around, by_incoming)
+    change = IncidentLight(*(a - b for a, b in zip(mean(roughness), seen(normal), strict=True)))
+    three = RoughnessProbe(np.arange(count), change)
+    found = backward_roughness(three, np.full(count, roughness), around, by_incoming)
 
     def loss(roughness: float) -> np.ndarray:
         visibility, light = mean(roughness)
@@ -132,11 +132,11 @@ def test_reflection_between_mirrors() -> None:
         settings = MaterialSettings(
             **BARE, max_bounces=surfaces, reflection_ray_slope=(1e-3, 1e-3), ray_bias=0.01
         )
-        model = Deferred(settings, extent_world=1.0)
-        model.light.put(radiance)
+        model = DeferredShading(settings, extent_world=1.0)
+        model.light.set_radiance(radiance)
         tracer = CpuTracer(threads=1)
         tracer.build(scene, model.features(scene))
-        found = model.develop(Sight(rays, tracer.trace(rays), tracer)).rgb_srgb[0]
+        found = model.shade(TracedRays(rays, tracer.trace(rays), tracer)).rgb_srgb[0]
         shown[surfaces] = float(srgb_to_linear(found).mean())
     # Ground, lid, ground, and out into the upper half; cut off at the lid, that mirrors the lower half.
     assert shown[1] == pytest.approx(0.1 * 0.5**2, abs=0.01)
@@ -144,17 +144,17 @@ def test_reflection_between_mirrors() -> None:
     assert shown[3] == pytest.approx(shown[2], abs=1e-3)
 
 
-def half_a_row() -> tuple[CpuTracer, ImageRays, Deferred]:
+def half_a_row() -> tuple[CpuTracer, ImageRays, DeferredShading]:
     """Nine pixels before a plate that ends in the fifth."""
     plate = wall((0, 0, 1), floor(2.0, 0.05), [0.8, 0.8, 0.8, 0.0, 1.0])
     plate = plate.select(plate.means_world[:, 0] < -0.12)
-    model = Deferred(MaterialSettings(**BARE), extent_world=1.0)
-    model.light.put(np.full((16, 32, 3), 0.5, np.float32))
+    model = DeferredShading(MaterialSettings(**BARE), extent_world=1.0)
+    model.light.set_radiance(np.full((16, 32, 3), 0.5, np.float32))
     tracer = CpuTracer(threads=1)
     tracer.build(plate, model.features(plate))
     x = np.linspace(-1.6, 1.6, 9)
     ways = np.stack([x, np.zeros(9), np.full(9, -4.0)], axis=1)[None]
-    return tracer, ImageRays.of(np.array([0, 0, 4.0]), unit(ways)), model
+    return tracer, ImageRays.from_directions(np.array([0, 0, 4.0]), unit(ways)), model
 
 
 def test_outline_pixel_coverage() -> None:

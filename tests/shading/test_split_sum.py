@@ -10,12 +10,12 @@ from octasplat.engine.core.errors import ConfigError
 from octasplat.engine.shading.environment_frame import environment_frame
 from octasplat.engine.shading.environment_levels import (
     ROUGHNESSES,
-    LightLevels,
-    Prefilter,
-    prefilter,
-    resampled,
+    EnvironmentLevels,
+    EnvironmentPrefilter,
+    prefilter_for,
+    resample_environment,
 )
-from octasplat.engine.shading.split_sum import Surface, shade, shade_reverse, split_sum_table
+from octasplat.engine.shading.split_sum import SurfacePoints, shade, shade_backward, split_sum_table
 from tests.support.split_sum_reference import reference_split_sum
 
 HEIGHT = 16
@@ -30,19 +30,19 @@ def directions(height: int) -> np.ndarray:
     return np.stack([ring * np.sin(longitude), up, ring * np.cos(longitude)], axis=-1).reshape(-1, 3)
 
 
-def surface(rng: np.random.Generator, count: int) -> Surface:
+def surface(rng: np.random.Generator, count: int) -> SurfacePoints:
     normal, way = (x / np.linalg.norm(x, axis=1)[:, None] for x in rng.normal(size=(2, count, 3)))
     normal *= -np.sign((normal * way).sum(axis=1))[:, None]
     steep = -(normal * way).sum(axis=1) < 0.1
     normal[steep] = -way[steep]
-    return Surface(
+    return SurfacePoints(
         rng.uniform(0.06, 0.95, (count, 5)), normal, way, rng.uniform(0, 1, count),
         rng.uniform(0, 1, (count, 3)), rng.uniform(0, 1, count), rng.uniform(0, 1, (count, 3)),
     )  # fmt: skip
 
 
-def light(rng: np.random.Generator) -> LightLevels:
-    return prefilter(HEIGHT).levels(rng.lognormal(0, 0.7, (HEIGHT, 2 * HEIGHT, 3)))
+def light(rng: np.random.Generator) -> EnvironmentLevels:
+    return prefilter_for(HEIGHT).levels(rng.lognormal(0, 0.7, (HEIGHT, 2 * HEIGHT, 3)))
 
 
 def test_split_sum_table_limits() -> None:
@@ -63,10 +63,10 @@ def test_split_sum_table_limits() -> None:
 
 
 def test_levels_of_even_light_are_even_and_those_of_any_are_lobes() -> None:
-    even = prefilter(HEIGHT).levels(np.full((HEIGHT, 2 * HEIGHT, 3), 2.0))
+    even = prefilter_for(HEIGHT).levels(np.full((HEIGHT, 2 * HEIGHT, 3), 2.0))
     np.testing.assert_allclose(even.texels, 2.0, rtol=1e-5)
     radiance = np.random.default_rng(0).lognormal(0, 1, (32, 64, 3))
-    levels = Prefilter(32).levels(radiance)
+    levels = EnvironmentPrefilter(32).levels(radiance)
     ways = directions(32)
     ring = np.sqrt(1 - ways[:, 1] ** 2)
     for level in (3, 5, 6):  # roughness 0.5 and 1, and the irradiance
@@ -84,10 +84,10 @@ def test_levels_of_even_light_are_even_and_those_of_any_are_lobes() -> None:
 def test_prefilter_backward_is_transpose() -> None:
     rng = np.random.default_rng(1)
     radiance = rng.uniform(0, 1, (HEIGHT, 2 * HEIGHT, 3))
-    levels = prefilter(HEIGHT).levels(radiance)
+    levels = prefilter_for(HEIGHT).levels(radiance)
     gradient = rng.normal(size=levels.texels.shape)
     there = (levels.texels * gradient).sum()
-    assert (prefilter(HEIGHT).transposed(gradient) * radiance).sum() == pytest.approx(there, rel=1e-4)
+    assert (prefilter_for(HEIGHT).backward(gradient) * radiance).sum() == pytest.approx(there, rel=1e-4)
 
 
 def test_split_sum_matches_reference() -> None:
@@ -101,11 +101,11 @@ def test_split_sum_matches_reference() -> None:
     np.testing.assert_allclose(shade(points, levels, FRAME), expected.detach(), rtol=1e-6, atol=1e-9)
     by_rgb = rng.normal(size=expected.shape)
     expected.backward(torch.from_numpy(by_rgb))
-    found = shade_reverse(points, levels, FRAME, by_rgb)
+    found = shade_backward(points, levels, FRAME, by_rgb)
     gradients = [leaf.grad.numpy() for leaf in leaves if leaf.grad is not None]
     material, normal, _direction, visibility, indirect, ambient, bounced, texels = gradients
     np.testing.assert_allclose(found.normal + found.reflected, normal, rtol=1e-5, atol=1e-7)
-    np.testing.assert_allclose(found.texels(len(texels)), texels, rtol=1e-6, atol=1e-9)
+    np.testing.assert_allclose(found.sum_texels(len(texels)), texels, rtol=1e-6, atol=1e-9)
     for name, value in {
         "material": material, "visibility": visibility, "indirect": indirect, "ambient": ambient,
         "bounced": bounced,
@@ -117,7 +117,7 @@ def test_gradients_agree_with_finite_differences() -> None:
     rng = np.random.default_rng(3)
     levels, points = light(rng), surface(rng, 50)
     by_rgb = rng.normal(size=(50, 3))
-    found = shade_reverse(points, levels, FRAME, by_rgb)
+    found = shade_backward(points, levels, FRAME, by_rgb)
     gradients = {
         "material": found.material,
         "normal_world": found.normal + found.reflected,
@@ -139,8 +139,8 @@ def test_gradients_agree_with_finite_differences() -> None:
 def test_split_sum_blur_changes_reflected_direction_only() -> None:
     rng = np.random.default_rng(4)
     levels, points = light(rng), surface(rng, 20)
-    sharp = shade_reverse(points, levels, FRAME, np.ones((20, 3)))
-    led = shade_reverse(points, levels, FRAME, np.ones((20, 3)), blur=0.6)
+    sharp = shade_backward(points, levels, FRAME, np.ones((20, 3)))
+    led = shade_backward(points, levels, FRAME, np.ones((20, 3)), blur=0.6)
     rough = points.material[:, 4] >= 0.6
     np.testing.assert_array_equal(sharp.reflected[rough], led.reflected[rough])
     assert (sharp.reflected[~rough] != led.reflected[~rough]).any(axis=1).all()
@@ -149,10 +149,10 @@ def test_split_sum_blur_changes_reflected_direction_only() -> None:
 
 def test_resampling_keeps_the_light() -> None:
     radiance = np.random.default_rng(5).uniform(0, 1, (64, 128, 3))
-    small = resampled(radiance, 16)
+    small = resample_environment(radiance, 16)
     for map_ in (radiance, small):
         edges = np.cos(np.arange(len(map_) + 1) / len(map_) * np.pi)
         mean = ((edges[:-1] - edges[1:])[:, None] / 2 * map_.mean(axis=1)).sum(axis=0)
         np.testing.assert_allclose(mean, [0.5] * 3, atol=0.01)
     with pytest.raises(ConfigError, match="multiple of 8"):
-        Prefilter(20)
+        EnvironmentPrefilter(20)

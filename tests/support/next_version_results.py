@@ -3,6 +3,6 @@
 from octasplat.engine.core import versions
 from tests.support import toy_kind
 
-versions.RESULTS += 1
+versions.RESULTS_VERSION += 1
 
 __all__ = ["toy_kind"]

@@ -8,7 +8,7 @@ from octasplat.engine.core.rays import RayBatch
 from octasplat.engine.dataset import DatasetView
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.train.config import McmcConfig, TrainConfig
-from octasplat.engine.train.initialization.initial_gaussians import from_points
+from octasplat.engine.train.initialization.initial_gaussians import gaussians_from_points
 
 EXTENT = 1.0
 
@@ -69,7 +69,7 @@ class PlanarDataset:
         rng = np.random.default_rng(1)
         xyz = np.concatenate([rng.uniform(-1.6, 1.6, (count, 2)), np.zeros((count, 1))], axis=1)
         painting = plane_texture(self.detail * xyz[:, 0], self.detail * xyz[:, 1])
-        return from_points(
+        return gaussians_from_points(
             xyz.astype(np.float32),
             painting if painted else np.full((count, 3), 0.5, np.float32),
             self.origins,

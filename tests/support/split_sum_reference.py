@@ -3,7 +3,7 @@
 import numpy as np
 import torch
 
-from octasplat.engine.shading.kernels.environment_levels import LightLevels
+from octasplat.engine.shading.kernels.environment_levels import EnvironmentLevels
 from octasplat.engine.shading.split_sum import split_sum_table
 
 
@@ -44,7 +44,7 @@ def reference_split_sum(
     ambient: torch.Tensor,
     bounced: torch.Tensor,
     texels: torch.Tensor,
-    light: LightLevels,
+    light: EnvironmentLevels,
     frame: np.ndarray,
 ) -> torch.Tensor:
     """Linear colours; ``texels`` stands for those of ``light``."""

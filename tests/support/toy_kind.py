@@ -7,8 +7,8 @@ from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict
 
-from octasplat.engine.core.errors import Cancelled, DatasetError
-from octasplat.engine.core.events import CheckpointWritten, StageFinished, StageProgress, StageStarted, Warned
+from octasplat.engine.core.errors import CancelledError, DatasetError
+from octasplat.engine.core.events import CheckpointWritten, PhaseFinished, PhaseProgress, PhaseStarted, Warned
 from octasplat.workers.worker.job_kinds import JobKind, register
 from octasplat.workers.worker.task import Task
 
@@ -52,7 +52,7 @@ def _hold(task: Task, options: ToyOptions, hog: bytearray) -> None:
             if not told:
                 print("the toy hears and does not heed", flush=True)  # noqa: T201
                 told = True
-        task.progress(StageProgress("train", options.hold_at or 0, options.steps))
+        task.progress(PhaseProgress("train", options.hold_at or 0, options.steps))
         time.sleep(0.05)
     hog.extend(b"x" * options.hog_behind_gate_bytes)
     while options.silent_behind_gate or options.hog_behind_gate_bytes:
@@ -69,9 +69,9 @@ def run(task: Task) -> None:
     if options.tell_paths:
         inner, sheet = task.run / "cache" / "pixels.bin", task.run / "images" / "a b.jpg"
         print(f"[x.cc:12] Cannot open:{inner}, file://{inner}; see https://example.org/home/x")  # noqa: T201
-        task.progress(StageStarted("load", 3))
+        task.progress(PhaseStarted("load", 3))
         task.progress(Warned(f"{sheet} is dark; {__file__} says so."))
-        task.progress(StageFinished("load", 2.0))
+        task.progress(PhaseFinished("load", 2.0))
         try:
             inner.open("rb")
         except OSError as error:
@@ -92,7 +92,7 @@ def run(task: Task) -> None:
     print(f"the toy begins at {step}", flush=True)  # noqa: T201 - as a library might
     for number in range(options.log_lines):
         print(f"line {number} of a library that cannot stop talking")  # noqa: T201
-    task.progress(StageStarted("train", options.steps))
+    task.progress(PhaseStarted("train", options.steps))
     while step < options.steps:
         time.sleep(options.seconds)
         step += 1
@@ -100,7 +100,7 @@ def run(task: Task) -> None:
             os.kill(os.getpid(), signal.SIGSEGV)
         if options.silent_at == step:
             time.sleep(3600)
-        task.progress(StageProgress("train", step, options.steps))
+        task.progress(PhaseProgress("train", step, options.steps))
         if options.hold_at == step:
             _hold(task, options, hog)
         stop = task.should_stop() and not options.deaf
@@ -110,8 +110,8 @@ def run(task: Task) -> None:
             path.with_suffix(".tmp").rename(path)
             task.progress(CheckpointWritten(step, str(path)))
         if stop and step < options.steps:
-            raise Cancelled("stopped")
-    task.progress(StageFinished("train", 1.0))
+            raise CancelledError("stopped")
+    task.progress(PhaseFinished("train", 1.0))
     (task.results / "sum.txt").write_text(str(sum(range(options.steps + 1))))
     if options.result_bytes:
         (task.results / "large.bin").write_bytes(os.urandom(options.result_bytes))

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from octasplat.engine.core.errors import Cancelled, ConfigError, SceneFileError
-from octasplat.engine.core.events import StageFinished
+from octasplat.engine.core.errors import CancelledError, ConfigError, SceneFileError
+from octasplat.engine.core.events import PhaseFinished
 from octasplat.engine.files import write_surface
 from octasplat.engine.geometry.triangle_mesh import TriangleMesh, edge_report
 from octasplat.engine.render.image_files import read_image
@@ -139,11 +139,11 @@ def test_surface_extraction_reports_stages_and_stops_cleanly(tracer, tmp_path):
     cameras = cameras_on_sphere(12, 3.0, 32)
     heard = []
     extract_levels(tracer, cameras, options, scratch=tmp_path, listener=heard.append)
-    finished = [event.stage for event in heard if isinstance(event, StageFinished)]
+    finished = [event.stage for event in heard if isinstance(event, PhaseFinished)]
     assert finished == ["depth", "fusing", "meshing", "colouring", "fitting"]
     for stop_at in range(1, 40, 9):
         asked = iter(range(1000))
-        with pytest.raises(Cancelled):
+        with pytest.raises(CancelledError):
             extract_levels(
                 tracer,
                 cameras,

@@ -66,6 +66,6 @@ def test_full_disk_stops_cache_of_photographs(folder: Path, monkeypatch: pytest.
     def full(*_arguments: object, **_options: object) -> None:
         raise OutputError("no room")
 
-    monkeypatch.setattr(surface_inputs, "open_photographs", full)
+    monkeypatch.setattr(surface_inputs, "open_run_dataset", full)
     with pytest.raises(OutputError, match="no room"):
         training_photographs(folder / "run", None, 1, lambda _event: None)

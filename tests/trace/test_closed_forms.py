@@ -158,7 +158,7 @@ def test_viewer_at_infinity_uses_ray_direction() -> None:
     direction = np.array([0.6, 0.0, 0.8])
     for viewer, z in ((AT_INFINITY, 0.8), (0.0, 1.0), (-5.0, 5 / np.hypot(3, 5))):
         # From (0, 0, -1): the way from the viewer at t < 0 to the mean is (0, 0, 1) - t direction.
-        seen = make_tracer(lobe).trace(RayBatch(f32([[0, 0, -1]]), f32([direction]), t_viewer=viewer))
+        seen = make_tracer(lobe).trace(RayBatch(f32([[0, 0, -1]]), f32([direction]), t_view_origin=viewer))
         swing = 0.4886025119029199 * 0.5 * z
         expected = [0.5 + swing, 0.5, 0.5 - swing]
         np.testing.assert_allclose(seen.rgb_srgb[0] / seen.alpha[0], expected, atol=1e-6)

@@ -134,7 +134,7 @@ def test_mirrored_camera_respects_mirror_plane(tracer: Tracer, rng: np.random.Ge
     tracer.build(cloud)
     camera = RayBatch(np.array([[0.4, 0.2, 2.0]]), unit(rng.normal(size=(30, 3)) * 0.15 + [0, 0, -1]))
     t_mirror = (-1.0 - 2.0) / camera.directions_world[:, 2]
-    mirrored = camera.mirrored(np.array([0.0, 0.0, -1.0]), np.array([0.0, 0.0, 3.0]), t_mirror)
+    mirrored = camera.reflect(np.array([0.0, 0.0, -1.0]), np.array([0.0, 0.0, 3.0]), t_mirror)
     assert mirrored.origins_world.tolist() == [f32([0.4, 0.2, -4.0]).tolist()]
     seen = tracer.trace(mirrored)
     plain = tracer.trace(RayBatch(mirrored.starts_world, mirrored.directions_world))

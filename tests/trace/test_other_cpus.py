@@ -22,13 +22,13 @@ TRAINING = """
 import sys, tempfile
 from pathlib import Path
 from tests.support.planar_dataset import PlanarDataset, small_config
-from octasplat.engine.train.loop.state import fresh_state
+from octasplat.engine.train.loop.state import initial_state
 from octasplat.engine.train.loop.trainer import Trainer
 world = PlanarDataset()
 config = small_config(iterations=60, sh_degree_interval=30, loss={"ssim": 0.2})
 with tempfile.TemporaryDirectory() as folder:
     trained = Trainer(
-        world, config, fresh_state(world.initial_gaussians(), 0),
+        world, config, initial_state(world.initial_gaussians(), 0),
         folder=Path(folder), fingerprint="", listener=lambda event: None, threads=1,
     ).run()
 for name in ("means_world", "quats_wxyz", "log_scales", "opacity_logits", "sh"):

@@ -69,7 +69,7 @@ def test_harmonics_gradient_matches_finite_differences(rng: np.random.Generator)
 def test_ray_gradients_equal_differences_of_the_reference(output: str | None, viewer: float) -> None:
     rng = np.random.default_rng(3)
     cloud = make_cloud(rng, 6, degree=3, size=0.5, radius=0.3, logits=(-1.5, 2.0))
-    rays = replace(rays_inwards(rng, 60), t_viewer=np.full(1, viewer))
+    rays = replace(rays_inwards(rng, 60), t_view_origin=np.full(1, viewer))
     tracer = make_tracer(cloud)
     given = random_gradients(rng, 60)
     if output is not None:

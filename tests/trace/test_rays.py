@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from octasplat.engine.core.rays import ImageRays, RayBatch, joined
+from octasplat.engine.core.rays import ImageRays, RayBatch, concatenate_rays
 from tests.support.trace_scenes import f32, unit
 
 
@@ -18,8 +18,8 @@ def test_ray_batch_keeps_views_and_scalar_limits(rng: np.random.Generator) -> No
 @pytest.mark.parametrize("which", [slice(1, 3), np.array([3, 0]), np.array([True, False, False, True])])
 def test_ray_batch_selection_keeps_limits(rng: np.random.Generator, which: slice | np.ndarray) -> None:
     directions, t_max = f32(rng.normal(size=(4, 3))), f32([1, 2, 3, 4])
-    part = RayBatch(np.ones((1, 3)), directions, 0.5, t_max, -t_max)[which].up_to(t_max[which])
-    np.testing.assert_array_equal(part.t_viewer, -t_max[which])
+    part = RayBatch(np.ones((1, 3)), directions, 0.5, t_max, -t_max)[which].with_t_max(t_max[which])
+    np.testing.assert_array_equal(part.t_view_origin, -t_max[which])
     np.testing.assert_array_equal(part.directions_world, directions[which])
     np.testing.assert_array_equal(part.t_max, t_max[which])
     assert part.origins_world.tolist() == [[1, 1, 1]] and part.t_min.tolist() == [0.5]
@@ -29,13 +29,13 @@ def test_ray_batch_selection_keeps_limits(rng: np.random.Generator, which: slice
 
 def test_ray_batches_join_with_shared_origins(rng: np.random.Generator) -> None:
     directions = f32(rng.normal(size=(5, 3)))
-    both = joined(
+    both = concatenate_rays(
         RayBatch(np.ones((1, 3)), directions[:2], 0.5), RayBatch(np.zeros((1, 3)), directions[2:], 0.5)
     )
     np.testing.assert_array_equal(both.directions_world, directions)
     assert both.origins_world[:, 0].tolist() == [1, 1, 0, 0, 0] and both.t_min.tolist() == [0.5]
     one = RayBatch(np.ones((1, 3)), directions[:1])
-    twice = joined(one, one)
+    twice = concatenate_rays(one, one)
     assert len(twice) == 2 and len(twice.origins_world) == 1
     np.testing.assert_array_equal(twice.directions_world, directions[[0, 0]])
 
@@ -53,20 +53,20 @@ def test_mirrored_rays_of_one_origin_have_one_origin(rng: np.random.Generator) -
     normal, point = unit(rng.normal(size=3)), rng.normal(size=3)
     origin = point + 2.0 * normal
     directions = unit(-normal + 0.3 * rng.normal(size=(20, 3)))
-    camera = RayBatch(np.tile(origin, (20, 1)), directions, 0.1, t_viewer=-0.5)
+    camera = RayBatch(np.tile(origin, (20, 1)), directions, 0.1, t_view_origin=-0.5)
     t_mirror = -2.0 / (directions @ normal)
-    mirrored = camera.mirrored(point, -3.0 * normal, t_mirror)
+    mirrored = camera.reflect(point, -3.0 * normal, t_mirror)
     np.testing.assert_allclose(mirrored.origins_world, np.tile(point - 2.0 * normal, (20, 1)), atol=1e-6)
     assert (mirrored.origins_world == mirrored.origins_world[0]).all()
     meeting = origin + t_mirror[:, None] * directions
-    assert mirrored.t_viewer.tolist() == [-0.5]
+    assert mirrored.t_view_origin.tolist() == [-0.5]
     np.testing.assert_allclose(mirrored.starts_world, meeting, atol=1e-5)
     np.testing.assert_allclose(mirrored.directions_world @ normal, -(directions @ normal), atol=1e-6)
 
 
 def test_rays_of_an_image_are_row_by_row(rng: np.random.Generator) -> None:
     directions = f32(unit(rng.normal(size=(2, 3, 3))))
-    image = ImageRays.of(np.array([1.0, 2.0, 3.0]), directions, 0.25)
+    image = ImageRays.from_directions(np.array([1.0, 2.0, 3.0]), directions, 0.25)
     assert (image.height_px, image.width_px) == (2, 3)
     assert image.origin_world.tolist() == [1, 2, 3] and image.rays.t_min.tolist() == [0.25]
     np.testing.assert_array_equal(image.rays.directions_world[4], directions[1, 1])

@@ -44,7 +44,7 @@ def test_arbitrary_view_origins_match_reference(rng: np.random.Generator, degree
     # Within the cloud, where it matters: some at the origin, some behind it, some infinitely far away.
     inwards = rays_inwards(rng, 120, distance=0.5)
     viewers = rng.choice([0.0, -0.4, -3.0, AT_INFINITY], 120)
-    rays = RayBatch(inwards.origins_world, inwards.directions_world, t_viewer=viewers)
+    rays = RayBatch(inwards.origins_world, inwards.directions_world, t_view_origin=viewers)
     assert_matches_reference(make_cloud(rng, 1000, degree=degree), rays)
 
 
@@ -59,7 +59,7 @@ def test_reference_one_sided_normals(rng: np.random.Generator) -> None:
 def test_rays_from_surface_match_reference(rng: np.random.Generator) -> None:
     inwards = rays_inwards(rng, 120, distance=0.5)
     leaves = rng.choice([0.0, 0.3, np.inf], 120)
-    rays = RayBatch(inwards.origins_world, inwards.directions_world, t_leaves=leaves)
+    rays = RayBatch(inwards.origins_world, inwards.directions_world, t_backface_cull=leaves)
     cloud = make_cloud(rng, 1000)
     ours, _ = assert_matches_reference(cloud, rays, flip_normal_cos=0.5)
     before = make_tracer(cloud).trace(inwards)

@@ -8,14 +8,14 @@ from octasplat.engine.gaussians.rows import row_arrays
 from octasplat.engine.train.config import TrainConfig
 from octasplat.engine.train.loop.checkpoint import load_checkpoint, save_checkpoint
 from octasplat.engine.train.loop.schedule import Schedule
-from octasplat.engine.train.loop.state import fresh_state
-from octasplat.engine.train.optimization.weight_averaging import AVERAGE_EVERY, RunningMean
+from octasplat.engine.train.loop.state import initial_state
+from octasplat.engine.train.optimization.weight_averaging import AVERAGING_INTERVAL, WeightAverage
 from tests.support.planar_dataset import random_gaussians
 
 
 def test_average_of_added_states() -> None:
     states = [random_gaussians(12, seed=seed) for seed in range(5)]
-    mean = RunningMean()
+    mean = WeightAverage()
     for state in states:
         mean.add(state)
     assert mean.gaussians is not None and mean.count == 5
@@ -26,7 +26,7 @@ def test_average_of_added_states() -> None:
 
 def test_average_equals_float32_arithmetic() -> None:
     states = [random_gaussians(500, seed=seed, degree=2) for seed in range(4)]
-    mean, expected = RunningMean(), states[0].sh.copy()
+    mean, expected = WeightAverage(), states[0].sh.copy()
     for count, state in enumerate(states, start=1):
         mean.add(state)
         expected += (state.sh - expected) * np.float32(1.0 / count)
@@ -35,7 +35,7 @@ def test_average_equals_float32_arithmetic() -> None:
 
 
 def test_averaging_restarts_for_new_parameters() -> None:
-    mean = RunningMean()
+    mean = WeightAverage()
     mean.add(random_gaussians(12, seed=0))
     wider = random_gaussians(12, seed=1, degree=1)
     mean.add(wider)
@@ -46,7 +46,7 @@ def test_averaging_restarts_for_new_parameters() -> None:
 
 
 def test_averaging_state_survives_checkpoint(tmp_path: Path) -> None:
-    state = fresh_state(random_gaussians(12, seed=0), seed=0)
+    state = initial_state(random_gaussians(12, seed=0), seed=0)
     assert load_checkpoint(save_checkpoint(state, tmp_path, "x"), "x").average.gaussians is None
     for seed in range(3):
         state.average.add(random_gaussians(12, seed=seed))
@@ -58,7 +58,11 @@ def test_averaging_state_survives_checkpoint(tmp_path: Path) -> None:
 
 def test_averaging_starts_at_configured_iteration() -> None:
     schedule = Schedule(TrainConfig(weight_averaging_start=0.5), 100)
-    assert [k for k in range(1, 101) if schedule.averages(k)] == list(range(60, 101, AVERAGE_EVERY))
-    assert not any(Schedule(TrainConfig(weight_averaging_start=1), 100).averages(k) for k in range(1, 101))
-    assert [k for k in range(1, 101) if schedule.is_late(k)] == list(range(51, 101))
-    assert Schedule(TrainConfig(), 17).averages(17)  # the last one always
+    assert [k for k in range(1, 101) if schedule.is_averaging_due(k)] == list(
+        range(60, 101, AVERAGING_INTERVAL)
+    )
+    assert not any(
+        Schedule(TrainConfig(weight_averaging_start=1), 100).is_averaging_due(k) for k in range(1, 101)
+    )
+    assert [k for k in range(1, 101) if schedule.is_averaging(k)] == list(range(51, 101))
+    assert Schedule(TrainConfig(), 17).is_averaging_due(17)  # the last one always

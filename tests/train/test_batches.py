@@ -32,7 +32,7 @@ def test_pixels_are_uniform_over_the_given_views() -> None:
 def test_windows_are_grids_with_one_pixel_a_cell() -> None:
     sampler = PixelSampler(np.array([1]), np.array([[8, 6], [300, 200]]))
     view, y, x = (
-        a.reshape(400, 16) for a in sampler.windows(np.random.default_rng(0), 400, rays=16, side=20)
+        a.reshape(400, 16) for a in sampler.ray_patches(np.random.default_rng(0), 400, rays=16, side=20)
     )
     assert (view == 1).all()
     # those that are nowhere near the view's edges, where they would be folded
@@ -49,7 +49,7 @@ def test_windows_are_grids_with_one_pixel_a_cell() -> None:
 
 def test_windows_reach_every_pixel_about_as_often() -> None:
     sampler = PixelSampler(np.array([0, 1, 3]), SIZES)
-    view, y, x = sampler.windows(np.random.default_rng(0), 263 * 400 // 16, rays=16, side=8)
+    view, y, x = sampler.ray_patches(np.random.default_rng(0), 263 * 400 // 16, rays=16, side=8)
     tally = np.zeros((4, 10, 20))
     np.add.at(tally, (view, y, x), 1)
     for index in (0, 1, 3):
@@ -64,7 +64,7 @@ def test_windows_of_a_batch_are_spread_over_the_views_and_within_them() -> None:
     sizes = np.array([[60, 40]] * 10)
     sampler = PixelSampler(np.arange(10), sizes)
     for turn in range(5):
-        windows = sampler.windows(np.random.default_rng(turn), 60, rays=16, side=20, turn=turn)
+        windows = sampler.ray_patches(np.random.default_rng(turn), 60, rays=16, side=20, index=turn)
         view, y, x = (a.reshape(60, 16) for a in windows)
         assert (np.bincount(view[:, 0]) == 6).all()
         for index in range(10):  # 3 x 2 tiles: a window in each, but for the seam between two views
@@ -81,7 +81,7 @@ def test_ray_patches_cover_views_evenly() -> None:
     """Drawn at random, of 300 windows on 50 views some would have fewer than three."""
     sampler = PixelSampler(np.arange(50), np.array([[60, 40]] * 50))
     rng = np.random.default_rng(0)
-    views = [sampler.windows(rng, 3, rays=16, side=20, turn=turn)[0][::16] for turn in range(100)]
+    views = [sampler.ray_patches(rng, 3, rays=16, side=20, index=turn)[0][::16] for turn in range(100)]
     tally = np.bincount(np.concatenate(views), minlength=50)
     assert tally.min() >= 5 and tally.max() <= 7
 
@@ -120,7 +120,7 @@ def test_batch_has_its_rays(ssim: float, fraction: float, rays: int, ray_patch_r
     )
     batch = BatchSource(world, config).draw(np.random.default_rng(0))
     assert len(batch.rgb_srgb) == len(batch.rays) == len(batch.alpha) == len(batch.weight) == rays
-    assert abs(batch.patches * 256 - (fraction * rays if ssim else 0)) <= 256
+    assert abs(batch.ssim_patch_count * 256 - (fraction * rays if ssim else 0)) <= 256
     np.testing.assert_allclose(np.linalg.norm(batch.rays.directions_world, axis=1), 1, atol=1e-6)
 
 

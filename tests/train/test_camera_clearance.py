@@ -10,7 +10,7 @@ from octasplat.engine.dataset.camera_clearance import CameraClearance, camera_cl
 from octasplat.engine.dataset.model import PosedView, SparsePoints, Viewpoints
 from octasplat.engine.dataset.view_frusta import ViewFrusta
 from octasplat.engine.gaussians.model import FlatGaussians, concatenate
-from octasplat.engine.train.loop.state import fresh_state
+from octasplat.engine.train.loop.state import initial_state
 from octasplat.engine.train.loop.trainer import Trainer
 from tests.support.planar_dataset import PlanarDataset, small_config
 
@@ -76,15 +76,15 @@ def test_training_prunes_gaussians_near_cameras(tmp_path: Path) -> None:
 
     def trained(near_zones: CameraClearance | None) -> tuple[FlatGaussians, Trainer]:
         trainer = Trainer(
-            world, small_config(), fresh_state(concatenate([world.initial_gaussians(), veil]), 0),
-            folder=tmp_path, fingerprint="test", listener=lambda _event: None, threads=1,
-            near_zones=near_zones,
+            world, small_config(), initial_state(concatenate([world.initial_gaussians(), veil]), 0),
+            folder=tmp_path, fingerprint="test", progress=lambda _event: None, threads=1,
+            camera_clearance=near_zones,
         )  # fmt: skip
         return trainer.run(), trainer
 
     cleared, trainer = trained(zones)
     assert not zones.scaled(1.5).contains(cleared.means_world).any()  # what gathers at the rim neither
-    assert trainer.state.taken_near >= 30
+    assert trainer.state.pruned_near_cameras >= 30
     left, without = trained(None)
     assert zones.contains(left.means_world).any()
     assert trainer.views is not None and without.views is not None
@@ -109,10 +109,10 @@ def test_unseen_gaussians_are_pruned(tmp_path: Path) -> None:
     assert not space.contains(lamps.means_world).any()
 
     def trained(seen_space: ViewFrusta | None) -> FlatGaussians:
-        start = fresh_state(concatenate([world.initial_gaussians(), lamps]), 0)
+        start = initial_state(concatenate([world.initial_gaussians(), lamps]), 0)
         return Trainer(
-            world, small_config(), start, folder=tmp_path, fingerprint="test", listener=lambda _event: None,
-            threads=1, seen_space=seen_space,
+            world, small_config(), start, folder=tmp_path, fingerprint="test", progress=lambda _event: None,
+            threads=1, view_frusta=seen_space,
         ).run()  # fmt: skip
 
     assert space.contains(trained(space).means_world).all()

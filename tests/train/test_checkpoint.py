@@ -23,7 +23,7 @@ from tests.support.planar_dataset import PlanarDataset
 def make_state(iteration: int = 30, count: int = 12) -> TrainState:
     rng = np.random.default_rng(iteration)
     gaussians = PlanarDataset().initial_gaussians(count)
-    adam = Adam.fresh(gaussians)
+    adam = Adam.zeros(gaussians)
     adam.first[:] = rng.normal(size=adam.first.shape)
     adam.steps[:] = 7
     return TrainState(

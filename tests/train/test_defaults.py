@@ -8,19 +8,19 @@ import pytest
 from octasplat.engine.train.config import (
     LossWeights,
     TrainConfig,
-    in_one_order,
     iteration_count,
-    most_gaussians,
+    max_gaussian_count,
     preset,
+    ray_patch_side_px,
     rebuild_interval,
-    window_side_px,
+    uses_shared_sort,
     with_materials,
 )
 from octasplat.engine.train.config.preset_names import PRESETS
 from octasplat.engine.train.loop.schedule import Schedule
-from octasplat.engine.train.loop.state import fresh_state
+from octasplat.engine.train.loop.state import initial_state
 from octasplat.engine.train.loop.trainer import Trainer
-from octasplat.engine.train.sampling.shown import shown_share
+from octasplat.engine.train.sampling.shown import valid_pixel_fraction
 from tests.support.planar_dataset import PlanarDataset, small_config
 
 
@@ -36,8 +36,8 @@ from tests.support.planar_dataset import PlanarDataset, small_config
 )
 def test_default_max_gaussians_scales_with_pixels(pixels: int, counts: tuple[int, ...]) -> None:
     for name, count in zip(PRESETS, counts, strict=True):
-        assert most_gaussians(preset(name), pixels) == count
-        assert most_gaussians(preset(name).model_copy(update={"max_gaussians": 777}), pixels) == 777
+        assert max_gaussian_count(preset(name), pixels) == count
+        assert max_gaussian_count(preset(name).model_copy(update={"max_gaussians": 777}), pixels) == 777
 
 
 @pytest.mark.parametrize(
@@ -54,10 +54,10 @@ def test_default_max_gaussians_scales_with_pixels(pixels: int, counts: tuple[int
 def test_windows_follow_the_gaussians_or_the_views(
     longest_px: int, each_px: float, side_px: int, own_order_px: int
 ) -> None:
-    assert window_side_px(TrainConfig(), longest_px, each_px) == side_px
-    assert window_side_px(TrainConfig(shared_sort_until=0), longest_px, each_px) == own_order_px
-    assert window_side_px(with_materials(TrainConfig()), longest_px, each_px) == own_order_px
-    assert window_side_px(TrainConfig(ray_patch_side=20), longest_px, each_px) == 20
+    assert ray_patch_side_px(TrainConfig(), longest_px, each_px) == side_px
+    assert ray_patch_side_px(TrainConfig(shared_sort_until=0), longest_px, each_px) == own_order_px
+    assert ray_patch_side_px(with_materials(TrainConfig()), longest_px, each_px) == own_order_px
+    assert ray_patch_side_px(TrainConfig(ray_patch_side=20), longest_px, each_px) == 20
 
 
 def test_default_sort_depends_on_trained_parameters() -> None:
@@ -68,10 +68,15 @@ def test_default_sort_depends_on_trained_parameters() -> None:
         TrainConfig(loss=LossWeights(depth_normal=0.05)),
         preset("redisplats"),
     ):
-        assert not in_one_order(config)
-        assert not Schedule.of(config, 10**6).in_one_order(0)
-    schedule = Schedule.of(TrainConfig(), 10**6)
-    assert [schedule.in_one_order(done) for done in (0, 5_599, 5_600, 7_000)] == [True, True, False, False]
+        assert not uses_shared_sort(config)
+        assert not Schedule.from_config(config, 10**6).uses_shared_sort(0)
+    schedule = Schedule.from_config(TrainConfig(), 10**6)
+    assert [schedule.uses_shared_sort(done) for done in (0, 5_599, 5_600, 7_000)] == [
+        True,
+        True,
+        False,
+        False,
+    ]
 
 
 @pytest.mark.parametrize(
@@ -92,7 +97,7 @@ def test_large_scenes_train_longer(pixels: int, count: int) -> None:
     ("shown", "gaussians", "count"), [(1.0, 400_000, 8000), (0.7, 400_000, 11_000), (0.31, 202_533, 23_000)]
 )
 def test_default_counts_ignore_empty_pixels(shown: float, gaussians: int, count: int) -> None:
-    assert most_gaussians(TrainConfig(), 19_600_000, shown) == gaussians
+    assert max_gaussian_count(TrainConfig(), 19_600_000, shown) == gaussians
     assert iteration_count(TrainConfig(), 19_600_000, shown) == count
     assert iteration_count(preset("fast"), 19_600_000, shown) == 2500
     assert iteration_count(with_materials(preset("fast")), 19_600_000) == 1400
@@ -113,16 +118,16 @@ def test_covered_pixel_share(hidden: str) -> None:
             shown[hidden] = np.where(x < 20, 0, shown[hidden])
             return rgb, shown["alpha"], shown["weight"]
 
-    assert shown_share(PlanarDataset()) == 1
-    assert shown_share(Half()) == pytest.approx(0.5, abs=0.01)
+    assert valid_pixel_fraction(PlanarDataset()) == 1
+    assert valid_pixel_fraction(Half()) == pytest.approx(0.5, abs=0.01)
 
 
 @pytest.mark.parametrize(("wanted", "count"), [(0, 7000), (80, 80)])
 def test_trainer_iterations_default(tmp_path: Path, wanted: int, count: int) -> None:
     world, config = PlanarDataset(), small_config(iterations=wanted)
-    state = fresh_state(world.initial_gaussians(), config.seed)
+    state = initial_state(world.initial_gaussians(), config.seed)
     trainer = Trainer(
-        world, config, state, folder=tmp_path, fingerprint="test", listener=lambda _event: None, threads=1
+        world, config, state, folder=tmp_path, fingerprint="test", progress=lambda _event: None, threads=1
     )
     assert trainer.schedule.iterations == count
 

@@ -13,10 +13,10 @@ from octasplat.engine.dataset import Dataset
 from octasplat.engine.dataset.synthetic import SyntheticDatasetConfig, write_synthetic_dataset
 from octasplat.engine.dataset.synthetic.still_life import build_still_life
 from octasplat.engine.render.image_files import write_png
-from octasplat.engine.train.initialization.initial_background import first_background
-from octasplat.engine.train.initialization.plane_sweep import dense_points
-from octasplat.engine.train.initialization.plane_sweep_points import LiftedPoints
-from octasplat.engine.train.views.exposure_changes import evening_gains
+from octasplat.engine.train.initialization.initial_background import estimate_background
+from octasplat.engine.train.initialization.plane_sweep import plane_sweep_points
+from octasplat.engine.train.initialization.plane_sweep_points import PlaneSweepPoints
+from octasplat.engine.train.views.exposure_changes import equalizing_gains
 
 
 @pytest.fixture(scope="module")
@@ -38,13 +38,13 @@ def surface() -> cKDTree:
     return cKDTree(np.einsum("nk,nkc->nc", rng.dirichlet([1, 1, 1], len(chosen)), corners[chosen]))
 
 
-def assert_same(first: LiftedPoints, second: LiftedPoints) -> None:
+def assert_same(first: PlaneSweepPoints, second: PlaneSweepPoints) -> None:
     for name, values in vars(first).items():
         assert np.array_equal(values, getattr(second, name)), name
 
 
 def test_points_lie_on_the_surfaces(dataset: Dataset, surface: cKDTree) -> None:
-    lifted = dense_points(dataset, 3000, np.random.default_rng(0))
+    lifted = plane_sweep_points(dataset, 3000, np.random.default_rng(0))
     xyz, rgb = lifted.xyz_world, lifted.rgb_srgb
     assert 1500 < len(xyz) <= 3000
     assert xyz.dtype == rgb.dtype == np.float32
@@ -55,7 +55,7 @@ def test_points_lie_on_the_surfaces(dataset: Dataset, surface: cKDTree) -> None:
 
 
 def test_points_have_the_colour_of_their_pixels(dataset: Dataset) -> None:
-    lifted = dense_points(dataset, 1000, np.random.default_rng(0))
+    lifted = plane_sweep_points(dataset, 1000, np.random.default_rng(0))
     xyz, rgb = lifted.xyz_world, lifted.rgb_srgb
     best = np.full(len(xyz), np.inf)
     for index in dataset.train_indices:
@@ -89,7 +89,7 @@ def test_dense_points_cover_objects_without_sparse_points(
 ) -> None:
     bare, gone = without_points_of_the_table(dataset, tmp_path)
     assert len(gone) > 200 and len(bare.points) < len(dataset.points) - 200
-    lifted = dense_points(bare, 20_000, np.random.default_rng(0))
+    lifted = plane_sweep_points(bare, 20_000, np.random.default_rng(0))
     near = np.linalg.norm(lifted.xyz_world[:, :2], axis=1) < 1.0
     off, _ = surface.query(lifted.xyz_world.astype(np.float64))
     right = off < 0.1
@@ -103,7 +103,7 @@ def test_dense_points_single_view_option_lifts_pixels(surface: cKDTree, tmp_path
     write_synthetic_dataset(tmp_path / "scene", config)
     few = Dataset.open(tmp_path / "scene", tmp_path / "cache")
     matched, all_of_them = (
-        dense_points(few, 4000, np.random.default_rng(0), unseen=unseen) for unseen in (False, True)
+        plane_sweep_points(few, 4000, np.random.default_rng(0), unseen=unseen) for unseen in (False, True)
     )
     assert len(all_of_them) > 1.4 * len(matched)
     off, _ = surface.query(all_of_them.xyz_world.astype(np.float64))
@@ -118,27 +118,27 @@ def test_dense_matching_with_uneven_exposure(dataset: Dataset, tmp_path: Path) -
         rgb, _, _ = dataset.view_image(index)
         write_png(tmp_path / "scene" / "images" / view.name, rgb * darker[index])
     uneven = Dataset.open(tmp_path / "scene", tmp_path / "cache")
-    gains = evening_gains(uneven)
+    gains = equalizing_gains(uneven)
     even = gains * darker / np.median(gains * darker)
     assert np.abs(np.log(even[uneven.train_indices])).max() < 0.12
-    found = [len(dense_points(uneven, 3000, np.random.default_rng(0), gains=g)) for g in (None, gains)]
+    found = [len(plane_sweep_points(uneven, 3000, np.random.default_rng(0), gains=g)) for g in (None, gains)]
     assert found[1] > 1.1 * found[0]
-    before = len(dense_points(dataset, 3000, np.random.default_rng(0)))
+    before = len(plane_sweep_points(dataset, 3000, np.random.default_rng(0)))
     assert found[1] > 0.9 * before
 
 
 def test_dense_points_are_deterministic_for_seed(dataset: Dataset) -> None:
-    first, second = (dense_points(dataset, 500, np.random.default_rng(3)) for _ in range(2))
+    first, second = (plane_sweep_points(dataset, 500, np.random.default_rng(3)) for _ in range(2))
     assert_same(first, second)
 
 
 def test_dense_points_count_zero_is_empty(dataset: Dataset) -> None:
-    nothing = dense_points(dataset, 0, np.random.default_rng(0))
+    nothing = plane_sweep_points(dataset, 0, np.random.default_rng(0))
     assert len(nothing) == 0 and nothing.xyz_world.shape == nothing.rgb_srgb.shape == (0, 3)
 
 
 def test_dense_points_independent_of_threads(dataset: Dataset) -> None:
-    one, three = (dense_points(dataset, 800, np.random.default_rng(3), threads=n) for n in (1, 3))
+    one, three = (plane_sweep_points(dataset, 800, np.random.default_rng(3), threads=n) for n in (1, 3))
     assert len(one) > 300 and one.swept.any()
     assert_same(one, three)
 
@@ -153,16 +153,18 @@ def test_dense_points_skip_sky(dataset: Dataset, tmp_path: Path) -> None:
     under_sky = Dataset.open(tmp_path / "scene", tmp_path / "cache")
     # As if up were where the cameras look, so that nearly all that they see is above the horizon.
     ahead = np.mean([view.rotation_cam_from_world[2] for view in dataset.views], axis=0)
-    over = replace(first_background(under_sky), up_world=ahead)
+    over = replace(estimate_background(under_sky), up_world=ahead)
     rng = np.random.default_rng
-    lifted = [len(dense_points(under_sky, 500, rng(0), behind=behind)) for behind in (None, over)]
+    lifted = [len(plane_sweep_points(under_sky, 500, rng(0), background=behind)) for behind in (None, over)]
     # What the neighbouring views do not show at infinity, as they look inwards, may still be near.
     assert lifted[0] > 250 and lifted[1] < 0.8 * lifted[0]
 
 
 def test_dense_points_near_surface_with_background_are_lifted(dataset: Dataset) -> None:
-    plain = dense_points(dataset, 1000, np.random.default_rng(0))
-    before = dense_points(dataset, 1000, np.random.default_rng(0), behind=first_background(dataset))
+    plain = plane_sweep_points(dataset, 1000, np.random.default_rng(0))
+    before = plane_sweep_points(
+        dataset, 1000, np.random.default_rng(0), background=estimate_background(dataset)
+    )
     assert len(before) > 0.9 * len(plain)
 
 
@@ -175,5 +177,7 @@ def test_dense_points_compensate_for_empty_pixels(dataset: Dataset, tmp_path: Pa
     for view in dataset.views:
         write_png(masks / f"{view.name}.png", seen)
     masked = Dataset.open(tmp_path / "scene", tmp_path / "cache")
-    whole, part = (len(dense_points(data, 1000, np.random.default_rng(0))) for data in (dataset, masked))
+    whole, part = (
+        len(plane_sweep_points(data, 1000, np.random.default_rng(0))) for data in (dataset, masked)
+    )
     assert part > 0.7 * whole

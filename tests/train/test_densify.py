@@ -8,9 +8,9 @@ from scipy.integrate import quad
 
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.trace.protocol import GaussianGradients
-from octasplat.engine.train.config import McmcConfig, PaperConfig
-from octasplat.engine.train.densify import Densifier, Mcmc, Paper, make_densifier
-from octasplat.engine.train.densify.mcmc import shared_opacity, shared_scale
+from octasplat.engine.train.config import McmcConfig, RedisplatsConfig
+from octasplat.engine.train.densify import Densifier, McmcDensifier, RedisplatsDensifier, make_densifier
+from octasplat.engine.train.densify.mcmc import split_opacity, split_scale_factor
 from octasplat.engine.train.optimization.adam import Adam
 
 
@@ -41,15 +41,15 @@ def seen(count: int, errors: object, steps: object = 0.0) -> tuple[GaussianGradi
     return gradients, np.broadcast_to(np.asarray(steps, np.float32), (count, 3)).copy()
 
 
-def mcmc(cap: int = 1000, **changes: object) -> Mcmc:
-    return Mcmc(McmcConfig(**changes), iterations=1000, max_gaussians=cap)
+def mcmc(cap: int = 1000, **changes: object) -> McmcDensifier:
+    return McmcDensifier(McmcConfig(**changes), iterations=1000, max_gaussians=cap)
 
 
 def apply(
     densifier: Densifier, gaussians: FlatGaussians, seed: int = 0, extent: float = 1.0
 ) -> tuple[FlatGaussians, Adam]:
     after, adam = densifier.apply(
-        gaussians, Adam.fresh(gaussians), np.random.default_rng(seed), extent=extent
+        gaussians, Adam.zeros(gaussians), np.random.default_rng(seed), extent=extent
     )
     assert after.is_finite()
     assert len(adam.steps) == len(adam.first) == len(adam.second) == len(after)
@@ -59,9 +59,9 @@ def apply(
 @pytest.mark.parametrize("copies", [1, 2, 5, 32])
 def test_copies_share_the_opacity_and_the_coverage(copies: int) -> None:
     opacity = np.array([0.05, 0.5, 0.95])
-    shared = shared_opacity(opacity, np.full(3, copies))
+    shared = split_opacity(opacity, np.full(3, copies))
     np.testing.assert_allclose(1 - (1 - shared) ** copies, opacity, rtol=1e-12)
-    factors = shared_scale(opacity, np.full(3, copies))
+    factors = split_scale_factor(opacity, np.full(3, copies))
     for a, one, factor in zip(opacity, shared, factors, strict=True):
         before = quad(lambda x, a=a: a * np.exp(-0.5 * x * x), -12, 12)[0]
         after = quad(
@@ -133,7 +133,7 @@ def test_errors_stay_with_their_gaussians_in_another_order() -> None:
 
 def test_moments_of_the_untouched_stay() -> None:
     gaussians = make([0.5] * 10)
-    adam = Adam.fresh(gaussians)
+    adam = Adam.zeros(gaussians)
     adam.first[:], adam.steps[:] = 1.0, 5
     densifier = mcmc(growth=0.3, error_power=1.0)
     errors = np.zeros(10)
@@ -215,9 +215,9 @@ def test_mcmc_rounds_at_cap_are_less_frequent() -> None:
     config = McmcConfig(start=20, interval=10, stop_fraction=0.85, relocate_low_weight_rounds=4)
     densifier = make_densifier(config, iterations=200, max_gaussians=50)
     densifier.observe(40, *seen(40, 0.0))
-    assert [k for k in range(1, 201) if densifier.due(k)] == list(range(20, 171, 10))
+    assert [k for k in range(1, 201) if densifier.is_due(k)] == list(range(20, 171, 10))
     densifier.observe(50, *seen(50, 0.0))
-    assert [k for k in range(1, 201) if densifier.due(k)] == [50, 100, 150]
+    assert [k for k in range(1, 201) if densifier.is_due(k)] == [50, 100, 150]
 
 
 def test_mcmc_all_dead_or_at_cap_changes_nothing() -> None:
@@ -241,7 +241,7 @@ def test_densify_is_deterministic_for_seed() -> None:
 def test_densify_repeated_stays_finite() -> None:
     gaussians, rng = make(np.random.default_rng(0).uniform(1e-3, 0.999, 30)), np.random.default_rng(3)
     densifier = mcmc(200, growth=0.3)
-    adam = Adam.fresh(gaussians)
+    adam = Adam.zeros(gaussians)
     for _ in range(30):
         densifier.observe(len(gaussians), *seen(len(gaussians), rng.random(len(gaussians)) ** 8))
         gaussians, adam = densifier.apply(gaussians, adam, rng, extent=1.0)
@@ -251,16 +251,16 @@ def test_densify_repeated_stays_finite() -> None:
 
 
 @pytest.mark.parametrize("config", [McmcConfig(start=20, interval=10, stop_fraction=0.5),
-                                    PaperConfig(start=20, interval=10, stop_fraction=0.5)])  # fmt: skip
-def test_densify_runs_at_configured_iterations(config: McmcConfig | PaperConfig) -> None:
+                                    RedisplatsConfig(start=20, interval=10, stop_fraction=0.5)])  # fmt: skip
+def test_densify_runs_at_configured_iterations(config: McmcConfig | RedisplatsConfig) -> None:
     densifier = make_densifier(config, iterations=100, max_gaussians=10)
-    assert [k for k in range(1, 101) if densifier.due(k)] == [20, 30, 40, 50]
+    assert [k for k in range(1, 101) if densifier.is_due(k)] == [20, 30, 40, 50]
 
 
 @pytest.mark.parametrize(
-    "config", [McmcConfig(growth=0.1), PaperConfig(step_threshold=0.01, prune_opacity=0.01)]
+    "config", [McmcConfig(growth=0.1), RedisplatsConfig(step_threshold=0.01, prune_opacity=0.01)]
 )
-def test_state_travels_through_a_checkpoint(config: McmcConfig | PaperConfig) -> None:
+def test_state_travels_through_a_checkpoint(config: McmcConfig | RedisplatsConfig) -> None:
     rng = np.random.default_rng(0)
     first, second = (make_densifier(config, iterations=100, max_gaussians=100) for _ in range(2))
     first.observe(40, *seen(40, rng.random(40), 0.02 * rng.normal(size=(40, 3))))
@@ -270,13 +270,13 @@ def test_state_travels_through_a_checkpoint(config: McmcConfig | PaperConfig) ->
     np.testing.assert_array_equal(results[0].means_world, results[1].means_world)
 
 
-PAPER = PaperConfig(
+PAPER = RedisplatsConfig(
     step_threshold=0.01, split_scale=0.05, prune_opacity=0.1, min_scale=1e-3, max_scale=2.0, split_shrink=1.6
 )
 
 
-def paper(cap: int = 1000) -> Paper:
-    return Paper(PAPER, iterations=1000, max_gaussians=cap)
+def paper(cap: int = 1000) -> RedisplatsDensifier:
+    return RedisplatsDensifier(PAPER, iterations=1000, max_gaussians=cap)
 
 
 def test_clone_split_and_prune_counts() -> None:
@@ -331,7 +331,7 @@ def test_pruning_can_empty_the_scene() -> None:
 
 def test_moments_are_copied_to_both() -> None:
     gaussians = make([0.5] * 4, scale=0.02)
-    adam = Adam.fresh(gaussians)
+    adam = Adam.zeros(gaussians)
     adam.first[:] = np.arange(4)[:, None]
     steps = np.zeros((4, 3))
     steps[2] = 0.1

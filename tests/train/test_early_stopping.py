@@ -5,15 +5,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from octasplat.engine.core.errors import Cancelled
+from octasplat.engine.core.errors import CancelledError
 from octasplat.engine.core.events import CheckpointWritten, Event, TrainingProgress, Warned
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.gaussians.rows import row_arrays
 from octasplat.engine.train.config import TrainConfig
 from octasplat.engine.train.loop.checkpoint import latest_checkpoint, load_checkpoint
-from octasplat.engine.train.loop.early_end import gains_no_more, last_iteration
+from octasplat.engine.train.loop.early_end import early_stop_iteration, has_converged
 from octasplat.engine.train.loop.schedule import Schedule
-from octasplat.engine.train.loop.state import TrainState, fresh_state
+from octasplat.engine.train.loop.state import TrainState, initial_state
 from octasplat.engine.train.loop.trainer import Trainer
 from tests.support.planar_dataset import PlanarDataset, small_config
 
@@ -35,21 +35,23 @@ RISING = [(k, 20 + k / 100) for k in range(0, 1001, 100)]
     ],
 )
 def test_early_stopping_detects_plateau(probed: list[tuple[int, float]], least_db: float, ends: bool) -> None:
-    assert gains_no_more(probed, 1000, least_db) == ends
+    assert has_converged(probed, 1000, least_db) == ends
 
 
 def test_early_stopping_shortened_schedule_ends_training() -> None:
     """Rates go on from where they are to where they were to go, nothing is added, the last states count."""
     whole = Schedule(TrainConfig(), 1000)
-    short = whole.hastened(500)
-    assert short.iterations == last_iteration(500, 1000) == 700
-    shares = [short.progress(k) for k in range(500, 701)]
-    assert shares[0] == whole.progress(500) == 0.5 and shares[-1] == 1 and (np.diff(shares) > 0).all()
+    short = whole.stop_early(500)
+    assert short.iterations == early_stop_iteration(500, 1000) == 700
+    shares = [short.training_progress(k) for k in range(500, 701)]
+    assert (
+        shares[0] == whole.training_progress(500) == 0.5 and shares[-1] == 1 and (np.diff(shares) > 0).all()
+    )
     assert whole.may_densify(510) and not short.may_densify(510)
-    assert [k for k in range(1, 701) if short.averages(k)] == list(range(600, 701, 10))
-    assert short.ends(700) and short.measures(700) and not short.ends(699)
-    assert Schedule(TrainConfig(weight_averaging_start=0.1), 1000).hastened(500).averages(510)
-    assert not Schedule(TrainConfig(weight_averaging_start=0.1), 1000).hastened(500).averages(500)
+    assert [k for k in range(1, 701) if short.is_averaging_due(k)] == list(range(600, 701, 10))
+    assert short.is_finished(700) and short.is_validation_due(700) and not short.is_finished(699)
+    assert Schedule(TrainConfig(weight_averaging_start=0.1), 1000).stop_early(500).is_averaging_due(510)
+    assert not Schedule(TrainConfig(weight_averaging_start=0.1), 1000).stop_early(500).is_averaging_due(500)
 
 
 class NoisyWorld(PlanarDataset):
@@ -78,9 +80,9 @@ def trained(
 ) -> tuple[FlatGaussians, list[Event], Trainer]:
     world, events = NoisyWorld(), list[Event]()
     trainer = Trainer(
-        world, config, state or fresh_state(world.initial_gaussians(), config.seed),
+        world, config, state or initial_state(world.initial_gaussians(), config.seed),
         folder=folder, fingerprint="test",
-        listener=events.append, threads=threads, should_stop=lambda: trainer.state.iteration == stop_at,
+        progress=events.append, threads=threads, should_stop=lambda: trainer.state.iteration == stop_at,
     )  # fmt: skip
     return trainer.run(), events, trainer
 
@@ -96,7 +98,7 @@ def short_run(tmp_path_factory: pytest.TempPathFactory) -> tuple[FlatGaussians, 
 
 def test_early_stopping_ends_training(short_run: tuple[FlatGaussians, list[Event], Trainer]) -> None:
     gaussians, events, trainer = short_run
-    decided = trainer.state.hastened_after
+    decided = trainer.state.early_stop_at
     assert decided is not None and 80 <= decided < 160
     assert trainer.state.iteration == decided + 40 < 200
     told = [event.message for event in events if isinstance(event, Warned)]
@@ -124,9 +126,9 @@ def test_stopped_and_resumed_it_ends_at_the_same_bytes(
     short_run: tuple[FlatGaussians, list[Event], Trainer], tmp_path: Path, after: int
 ) -> None:
     expected, _, whole = short_run
-    assert whole.state.hastened_after is not None
-    with pytest.raises(Cancelled, match=f"of {whole.state.iteration}; "):
-        trained(tmp_path, config_of(), threads=2, stop_at=whole.state.hastened_after + after)
+    assert whole.state.early_stop_at is not None
+    with pytest.raises(CancelledError, match=f"of {whole.state.iteration}; "):
+        trained(tmp_path, config_of(), threads=2, stop_at=whole.state.early_stop_at + after)
     path = latest_checkpoint(tmp_path)
     assert path is not None
     found, events, trainer = trained(tmp_path, config_of(), state=load_checkpoint(path, "test"))
@@ -139,9 +141,9 @@ def test_early_stopping_disabled_runs_all_iterations(
     short_run: tuple[FlatGaussians, list[Event], Trainer], tmp_path: Path
 ) -> None:
     _, events, trainer = trained(tmp_path, config_of(early_stopping_db=0.0))
-    assert trainer.state.iteration == 200 and trainer.state.hastened_after is None
+    assert trainer.state.iteration == 200 and trainer.state.early_stop_at is None
     assert not any(isinstance(event, Warned) for event in events)
-    decided = short_run[2].state.hastened_after
+    decided = short_run[2].state.early_stop_at
     assert decided is not None
     losses = [
         {e.iteration: e.loss for e in run if isinstance(e, TrainingProgress) and e.iteration <= decided}

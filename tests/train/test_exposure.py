@@ -6,23 +6,23 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from octasplat.engine.core.errors import Cancelled
+from octasplat.engine.core.errors import CancelledError
 from octasplat.engine.core.events import Event, HeldOutMeasured
 from octasplat.engine.core.rays import RayBatch
 from octasplat.engine.dataset.model import Observations
-from octasplat.engine.shading.exposure import Exposures
-from octasplat.engine.shading.exposure_estimation import times_of
-from octasplat.engine.shading.protocol import Sight
+from octasplat.engine.shading.exposure import ExposureModel
+from octasplat.engine.shading.exposure_estimation import times_from_names
+from octasplat.engine.shading.protocol import TracedRays
 from octasplat.engine.trace.cpu.tracer import CpuTracer
 from octasplat.engine.trace.protocol import GaussianGradients, TraceResult
 from octasplat.engine.train.config import TrainConfig
 from octasplat.engine.train.loop.checkpoint import latest_checkpoint, load_checkpoint
-from octasplat.engine.train.loop.state import TrainState, fresh_state
+from octasplat.engine.train.loop.state import TrainState, initial_state
 from octasplat.engine.train.loop.trainer import Trainer
 from octasplat.engine.train.views.exposure_changes import (
-    exposure_changes,
-    log_brightness,
-    with_exposure_decided,
+    exposure_change_notice,
+    relative_log_brightness,
+    resolve_exposure,
 )
 from tests.support.planar_dataset import PlanarDataset, small_config
 
@@ -52,16 +52,16 @@ class UnevenWorld(PlanarDataset):
 def run(folder: Path, config: TrainConfig, *, stop_after: int | None = None) -> tuple[Trainer, list[Event]]:
     """Train on the uneven world; with ``stop_after``, stop there and go on from the checkpoint."""
     world, events = UnevenWorld(), list[Event]()
-    state = fresh_state(world.initial_gaussians(), config.seed)
+    state = initial_state(world.initial_gaussians(), config.seed)
 
     def trainer(state: TrainState, last: float) -> Trainer:
         return Trainer(
-            world, config, state, folder=folder, fingerprint="test", listener=events.append, threads=1,
+            world, config, state, folder=folder, fingerprint="test", progress=events.append, threads=1,
             should_stop=lambda: state.iteration >= last,
         )  # fmt: skip
 
     if stop_after is not None:
-        with pytest.raises(Cancelled):
+        with pytest.raises(CancelledError):
             trainer(state, stop_after).run()
         path = latest_checkpoint(folder)
         assert path is not None
@@ -75,18 +75,18 @@ def last_psnr(events: list[Event]) -> float:
     return [event.psnr for event in events if isinstance(event, HeldOutMeasured)][-1]
 
 
-def sight(view: np.ndarray, rgb: np.ndarray, alpha: np.ndarray) -> Sight:
+def sight(view: np.ndarray, rgb: np.ndarray, alpha: np.ndarray) -> TracedRays:
     """A sight of given colours and alphas; Gaussians and rays do not matter to exposures."""
     zeros, three = np.zeros(len(view), np.float32), np.zeros((len(view), 3), np.float32)
     seen = TraceResult(
         rgb_srgb=rgb, transmittance=np.float32(1) - alpha, depth_sum=zeros, depth_median=zeros,
         normal_world=three, features=three[:, :0], hit_counts=np.zeros(len(view), np.int32),
     )  # fmt: skip
-    return Sight(RayBatch(three, three), seen, CpuTracer(), view)
+    return TracedRays(RayBatch(three, three), seen, CpuTracer(), view)
 
 
-def made_exposures(views: int, rng: np.random.Generator) -> Exposures:
-    exposures = Exposures(views, rate=0.02, decay=0.01)
+def made_exposures(views: int, rng: np.random.Generator) -> ExposureModel:
+    exposures = ExposureModel(views, rate=0.02, decay=0.01)
     exposures.log_gains[:] = rng.normal(0, 0.3, (views, 3))
     exposures.offsets[:] = rng.normal(0, 0.1, (views, 3))
     return exposures
@@ -100,24 +100,24 @@ def test_gradients_agree_with_finite_differences() -> None:
     by_rgb = rng.normal(size=(4, 3)).astype(np.float32)
     by_transmittance = rng.normal(size=4).astype(np.float32)
     seen = sight(view, rgb, alpha)
-    found = exposures.reverse(seen, exposures.develop(seen), by_rgb, by_transmittance)
+    found = exposures.backward(seen, exposures.shade(seen), by_rgb, by_transmittance)
 
     def loss(rgb: np.ndarray = rgb, alpha: np.ndarray = alpha) -> float:
-        developed = exposures.develop(sight(view, rgb, alpha))
+        developed = exposures.shade(sight(view, rgb, alpha))
         terms = (developed.rgb_srgb * by_rgb).sum() + developed.transmittance @ by_transmittance
         return float(terms)
 
     step = np.float32(0.5)  # the map is linear, so that a large step is exact
-    assert found.seen.transmittance is not None
+    assert found.trace.transmittance is not None
     for ray in range(4):
         more = alpha.copy()
         more[ray] += step
-        assert -found.seen.transmittance[ray] == pytest.approx((loss(alpha=more) - loss()) / step, abs=1e-5)
+        assert -found.trace.transmittance[ray] == pytest.approx((loss(alpha=more) - loss()) / step, abs=1e-5)
         for channel in range(3):
             brighter = rgb.copy()
             brighter[ray, channel] += step
             moved = (loss(rgb=brighter) - loss()) / step
-            assert found.seen.rgb_srgb[ray, channel] == pytest.approx(moved, abs=1e-5)
+            assert found.trace.rgb_srgb[ray, channel] == pytest.approx(moved, abs=1e-5)
     views, sums = found.parameters["exposure.views"], found.parameters["exposure.sums"]
     assert views.tolist() == [0, 1, 2]
     for column in range(6):
@@ -133,8 +133,8 @@ def test_gradients_agree_with_finite_differences() -> None:
 def test_untrained_views_keep_exposure() -> None:
     rng = np.random.default_rng(0)
     seen = sight(np.arange(3), rng.random((3, 3), dtype=np.float32), rng.random(3, dtype=np.float32))
-    developed = made_exposures(3, rng).develop(replace(seen, view=None))
-    assert developed.rgb_srgb is seen.seen.rgb_srgb and developed.transmittance is seen.seen.transmittance
+    developed = made_exposures(3, rng).shade(replace(seen, view=None))
+    assert developed.rgb_srgb is seen.result.rgb_srgb and developed.transmittance is seen.result.transmittance
 
 
 def test_known_gains_and_offsets_are_found() -> None:
@@ -143,16 +143,16 @@ def test_known_gains_and_offsets_are_found() -> None:
     offsets = rng.normal(0, 0.05, (4, 3))
     log_gains -= log_gains.mean(axis=0)
     offsets -= offsets.mean(axis=0)
-    exposures = Exposures(4, rate=0.02, decay=0.01)
+    exposures = ExposureModel(4, rate=0.02, decay=0.01)
     gaussians, nothing = PlanarDataset().initial_gaussians(1), np.zeros(256, np.float32)
     for iteration in range(2000):
         view = rng.integers(0, 4, 256)
         rgb, alpha = rng.random((256, 3)).astype(np.float32), np.ones(256, np.float32)
         seen = sight(view, rgb, alpha)
-        developed = exposures.develop(seen)
+        developed = exposures.shade(seen)
         error = (developed.rgb_srgb - (np.exp(log_gains[view]) * rgb + offsets[view])).astype(np.float32)
-        found = exposures.reverse(seen, developed, error, nothing)
-        exposures.step(gaussians, NO_GRADIENTS, found.parameters, progress=iteration / 2000)
+        found = exposures.backward(seen, developed, error, nothing)
+        exposures.step(gaussians, NO_GRADIENTS, found.parameters, training_progress=iteration / 2000)
     np.testing.assert_allclose(exposures.log_gains, log_gains, atol=2e-3)
     np.testing.assert_allclose(exposures.offsets, offsets, atol=2e-3)
 
@@ -163,7 +163,7 @@ def test_uneven_photographs_are_explained_by_their_exposure(tmp_path: Path) -> N
     _, plain = run(tmp_path / "plain", small_config(iterations=240))
     assert last_psnr(events) > last_psnr(plain) + 2
     found = trainer.shading
-    assert isinstance(found, Exposures)
+    assert isinstance(found, ExposureModel)
     world = UnevenWorld()
     true = world.log_gains[world.train_indices]
     mid = 0.3  # where offsets and gains are told apart by little, compare what they do to a middle tone
@@ -191,16 +191,16 @@ NAMES = [f"view_{k:03}.png" for k in range(65)]
 def test_exposure_of_held_out_frame_follows_neighbouring_names() -> None:
     """A film of which few frames are kept: the held-out one is like the frame just before it."""
     names = ["take2_0001.jpg", "take2_0002.jpg", "take2_0090.jpg", "take2_0091.jpg", "take2_0180.jpg"]
-    np.testing.assert_array_equal(times_of(names), [1, 2, 90, 91, 180])
+    np.testing.assert_array_equal(times_from_names(names), [1, 2, 90, 91, 180])
     for other in (names[::-1], ["a.jpg", "b2.jpg", "c3.jpg"], ["a1.jpg", "b1.jpg", "c2.jpg"]):
-        np.testing.assert_array_equal(times_of(other), np.arange(len(other)))
+        np.testing.assert_array_equal(times_from_names(other), np.arange(len(other)))
     times = np.sort(np.random.default_rng(2).choice(400, 40, replace=False))
-    exposures = Exposures(40, rate=0.02)
+    exposures = ExposureModel(40, rate=0.02)
     known, trained = np.sin(times / 40)[:, None] * np.ones(3), np.arange(40) % 8 != 0
     exposures.log_gains[trained], exposures.steps[trained] = known[trained], 1
     off = []
     for names in ([f"{time:04}.jpg" for time in times], NAMES[:40]):
-        exposures.guess_others(names)
+        exposures.estimate_untrained(names)
         off.append(np.abs(exposures.log_gains - known)[~trained][1:-1].max())
     assert off[0] < 0.03 < off[1]
 
@@ -209,10 +209,10 @@ def test_exposure_of_held_out_view_is_interpolated() -> None:
     places = np.arange(33)
     smooth, anew = np.sin(places / 5)[:, None] * np.ones(3), np.random.default_rng(0).normal(size=(33, 3))
     for known, told in ((smooth, True), (anew, False)):
-        exposures = Exposures(33, rate=0.02)
+        exposures = ExposureModel(33, rate=0.02)
         trained = places % 8 != 0
         exposures.log_gains[trained], exposures.steps[trained] = known[trained], 1
-        exposures.guess_others(NAMES[:33])
+        exposures.estimate_untrained(NAMES[:33])
         np.testing.assert_array_equal(exposures.log_gains[trained], known[trained].astype(np.float32))
         off = np.abs(exposures.log_gains[~trained] - known[~trained])
         if told:
@@ -231,9 +231,9 @@ def test_test_view_exposure_follows_brightness() -> None:
     known -= known[trained].mean(axis=0)
     off = []
     for shown in (None, brightness):
-        exposures = Exposures(65, rate=0.02)
+        exposures = ExposureModel(65, rate=0.02)
         exposures.log_gains[trained], exposures.steps[trained] = known[trained], 1
-        exposures.guess_others(NAMES[:65], shown)
+        exposures.estimate_untrained(NAMES[:65], shown)
         off.append(np.sqrt(np.mean((exposures.log_gains - known)[~trained] ** 2)))
     assert off[1] < 0.01 < 0.04 < off[0]
 
@@ -245,9 +245,9 @@ def test_exposure_uncorrelated_brightness_keeps_mean() -> None:
     trained = places % 8 != 0
     sizes = []
     for _ in range(20):
-        exposures = Exposures(65, rate=0.02)
+        exposures = ExposureModel(65, rate=0.02)
         exposures.log_gains[trained], exposures.steps[trained] = rng.normal(0, 0.1, (56, 3)), 1
-        exposures.guess_others(NAMES[:65], rng.uniform(0.2, 0.7, 65))
+        exposures.estimate_untrained(NAMES[:65], rng.uniform(0.2, 0.7, 65))
         sizes.append(float(np.abs(exposures.log_gains[~trained]).max()))
     assert np.median(sizes) < 0.04
 
@@ -284,13 +284,13 @@ def test_test_photographs_with_auto_exposure_are_matched(tmp_path: Path) -> None
     assert world.log_gains.std() > 0.08
     config = small_config(iterations=400, exposure=True, lr={"exposure": 0.02})
     trainer = Trainer(
-        world, config, fresh_state(world.initial_gaussians(), config.seed),
+        world, config, initial_state(world.initial_gaussians(), config.seed),
         folder=tmp_path, fingerprint="test",
-        listener=lambda _event: None, threads=1,
+        progress=lambda _event: None, threads=1,
     )  # fmt: skip
     trainer.run()
     found = trainer.shading
-    assert isinstance(found, Exposures)
+    assert isinstance(found, ExposureModel)
     mean = world.log_gains[world.train_indices].mean()
     mid = 0.3
     shown = (np.exp(found.log_gains) * mid + found.offsets).mean(axis=1)
@@ -305,10 +305,10 @@ def test_named_view_is_rendered_with_its_exposure() -> None:
     exposures = made_exposures(3, rng)
     views = np.array([1, 1, 1])
     seen = sight(views, rng.random((3, 3), dtype=np.float32), rng.random(3, dtype=np.float32))
-    shown = exposures.shown_as(1).develop(replace(seen, view=None)).rgb_srgb
-    np.testing.assert_array_equal(shown, exposures.develop(seen).rgb_srgb)
-    again = Exposures(3, rate=0.02)
-    again.take(["a", "b", "c"], {**exposures.as_dict(["a", "b", "x"]), "d": {}})
+    shown = exposures.for_view(1).shade(replace(seen, view=None)).rgb_srgb
+    np.testing.assert_array_equal(shown, exposures.shade(seen).rgb_srgb)
+    again = ExposureModel(3, rate=0.02)
+    again.load_known(["a", "b", "c"], {**exposures.as_dict(["a", "b", "x"]), "d": {}})
     np.testing.assert_array_equal(again.log_gains[:2], exposures.log_gains[:2])
     assert (again.log_gains[2] == 0).all()
 
@@ -324,23 +324,23 @@ def test_changing_brightness_is_noticed() -> None:
         inside = np.flatnonzero(((xy > 0) & (xy < world.side_px)).all(axis=1))
         parts.append((np.full(len(inside), index), inside, xy[inside]))
     world.observations = Observations(*(np.concatenate(column) for column in zip(*parts, strict=True)))
-    found = log_brightness(world)
+    found = relative_log_brightness(world)
     assert np.isnan(found[world.test_indices]).all()
     true = world.log_gains[world.train_indices]
     np.testing.assert_allclose(found[world.train_indices], true - np.median(true), atol=0.08)
     config = small_config()
-    decided, why = with_exposure_decided(config, world)
+    decided, why = resolve_exposure(config, world)
     assert decided.exposure is True and why is not None and "1.9 times" in why
     told = small_config(exposure=False)
-    assert with_exposure_decided(told, world) == (told, None)
+    assert resolve_exposure(told, world) == (told, None)
     materials = config.materials.model_copy(update={"learn": True})
-    decided, why = with_exposure_decided(config.model_copy(update={"materials": materials}), world)
+    decided, why = resolve_exposure(config.model_copy(update={"materials": materials}), world)
     assert decided.exposure is False and why is None
     world.log_gains[:] = 0
-    assert exposure_changes(log_brightness(world)) is None
-    assert with_exposure_decided(config, world)[0].exposure is False
+    assert exposure_change_notice(relative_log_brightness(world)) is None
+    assert resolve_exposure(config, world)[0].exposure is False
     world.observations = Observations(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 2)))
-    assert exposure_changes(log_brightness(world)) is None
+    assert exposure_change_notice(relative_log_brightness(world)) is None
 
 
 def test_exposure_disabled_learns_nothing(tmp_path: Path) -> None:
@@ -350,12 +350,12 @@ def test_exposure_disabled_learns_nothing(tmp_path: Path) -> None:
 
 def test_photograph_is_normalised_to_mean_exposure() -> None:
     rng = np.random.default_rng(8)
-    exposures = Exposures.known(
+    exposures = ExposureModel.from_known(
         ["a", "b"], {"b": {"log_gains": [0.1, -0.2, 0.3], "offsets": [0.02, 0, -0.05]}}
     )
     scene = rng.uniform(0.2, 0.6, (4, 5, 3)).astype(np.float32)
     seen = sight(np.ones(20, np.int64), scene.reshape(-1, 3), np.ones(20, np.float32))
-    photograph = exposures.develop(seen).rgb_srgb.reshape(scene.shape)
+    photograph = exposures.shade(seen).rgb_srgb.reshape(scene.shape)
     assert np.abs(photograph - scene).max() > 0.02
-    np.testing.assert_allclose(exposures.undone(photograph, 1), scene, atol=1e-6)
-    np.testing.assert_array_equal(exposures.undone(scene, 0), scene)
+    np.testing.assert_allclose(exposures.remove_exposure(photograph, 1), scene, atol=1e-6)
+    np.testing.assert_array_equal(exposures.remove_exposure(scene, 0), scene)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from octasplat.engine.core.errors import DatasetError
-from octasplat.engine.train.initialization.initial_gaussians import from_points, from_rays
+from octasplat.engine.train.initialization.initial_gaussians import gaussians_from_points, gaussians_from_rays
 
 CAMERAS = np.array([[0.0, 0.0, -3.0], [1.0, 0.0, -3.0], [0.0, 1.0, -3.0]])
 
@@ -12,7 +12,7 @@ CAMERAS = np.array([[0.0, 0.0, -3.0], [1.0, 0.0, -3.0], [0.0, 1.0, -3.0]])
 def start(xyz: np.ndarray, rgb: object = 0.5, **options: object):
     settings = {"extent": 1.0, "limit": 10_000, "opacity": 0.1, "rng": np.random.default_rng(0), **options}
     colours = np.broadcast_to(np.asarray(rgb, np.float32), (len(xyz), 3)).copy()
-    return from_points(xyz.astype(np.float32), colours, CAMERAS, **settings)
+    return gaussians_from_points(xyz.astype(np.float32), colours, CAMERAS, **settings)
 
 
 def grid(side: int = 12, spacing: float = 0.05) -> np.ndarray:
@@ -90,7 +90,7 @@ def test_random_ones_lie_on_their_rays_and_face_the_camera(count: int) -> None:
     origins = rng.normal(size=(count, 3)).astype(np.float32)
     directions = rng.normal(size=(count, 3))
     directions = (directions / np.linalg.norm(directions, axis=1, keepdims=True)).astype(np.float32)
-    first = from_rays(
+    first = gaussians_from_rays(
         origins, directions, np.full((count, 3), 0.25, np.float32), extent=2.0, opacity=0.1, rng=rng
     )
     away = first.means_world - origins

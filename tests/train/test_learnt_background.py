@@ -6,23 +6,23 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from octasplat.engine.core.errors import Cancelled, ConfigError
+from octasplat.engine.core.errors import CancelledError, ConfigError
 from octasplat.engine.core.rays import RayBatch
 from octasplat.engine.dataset import Camera
 from octasplat.engine.dataset.model import SparsePoints
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.render.environment_files import read_background, write_background
-from octasplat.engine.shading.background import LearntBackground
-from octasplat.engine.shading.exposure import Exposures
-from octasplat.engine.shading.protocol import Sight
+from octasplat.engine.shading.background import LearnedBackground
+from octasplat.engine.shading.exposure import ExposureModel
+from octasplat.engine.shading.protocol import TracedRays
 from octasplat.engine.trace.cpu.tracer import CpuTracer
 from octasplat.engine.trace.protocol import TraceResult
-from octasplat.engine.train.initialization.initial_background import first_background
+from octasplat.engine.train.initialization.initial_background import estimate_background
 from octasplat.engine.train.loop.checkpoint import latest_checkpoint, load_checkpoint
-from octasplat.engine.train.loop.state import TrainState, fresh_state
+from octasplat.engine.train.loop.state import TrainState, initial_state
 from octasplat.engine.train.loop.trainer import Trainer
 from octasplat.engine.train.sampling.batches import BatchSource
-from octasplat.engine.train.shading_factory import background_of
+from octasplat.engine.train.shading_factory import find_background
 from tests.support.planar_dataset import PlanarDataset, plane_texture, small_config
 
 
@@ -74,17 +74,17 @@ class UnderTheSky(PlanarDataset):
         )
 
 
-def sight(directions: np.ndarray, rgb: np.ndarray, transmittance: np.ndarray) -> Sight:
+def sight(directions: np.ndarray, rgb: np.ndarray, transmittance: np.ndarray) -> TracedRays:
     """A sight of given colours and transmittances."""
     zeros, three = np.zeros(len(rgb), np.float32), np.zeros((len(rgb), 3), np.float32)
     seen = TraceResult(
         rgb_srgb=rgb, transmittance=transmittance, depth_sum=zeros, depth_median=zeros, normal_world=three,
         features=three[:, :0], hit_counts=np.zeros(len(rgb), np.int32),
     )  # fmt: skip
-    return Sight(RayBatch(three, directions), seen, CpuTracer(), np.zeros(len(rgb), np.int64))
+    return TracedRays(RayBatch(three, directions), seen, CpuTracer(), np.zeros(len(rgb), np.int64))
 
 
-def some_sight(rng: np.random.Generator, count: int = 5) -> Sight:
+def some_sight(rng: np.random.Generator, count: int = 5) -> TracedRays:
     directions = rng.normal(size=(count, 3))
     directions[0] = (0.0, -1.0, 0.0)  # straight up, where all columns meet
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
@@ -98,16 +98,16 @@ def train(
     """Train on the disc under the sky; with ``stop_after``, stop there and go on from the checkpoint."""
     world = UnderTheSky()
     config = small_config(background="learnt", background_height=16, lr={"background": 0.05}, **changes)
-    state = fresh_state(world.initial_gaussians(), config.seed)
+    state = initial_state(world.initial_gaussians(), config.seed)
 
     def trainer(state: TrainState, last: float) -> Trainer:
         return Trainer(
-            world, config, state, folder=folder, fingerprint="test", listener=lambda _event: None,
+            world, config, state, folder=folder, fingerprint="test", progress=lambda _event: None,
             threads=threads, should_stop=lambda: state.iteration >= last,
         )  # fmt: skip
 
     if stop_after is not None:
-        with pytest.raises(Cancelled):
+        with pytest.raises(CancelledError):
             trainer(state, stop_after).run()
         path = latest_checkpoint(folder)
         assert path is not None
@@ -119,27 +119,27 @@ def train(
 
 def test_gradients_agree_with_finite_differences() -> None:
     rng = np.random.default_rng(0)
-    background = LearntBackground(16)
-    background.put(rng.random((16, 32, 3), dtype=np.float32))
+    background = LearnedBackground(16)
+    background.set_map(rng.random((16, 32, 3), dtype=np.float32))
     before = some_sight(rng)
     by_rgb = rng.normal(size=(5, 3)).astype(np.float32)
     nothing = np.zeros(5, np.float32)
-    found = background.reverse(before, background.develop(before), by_rgb, nothing)
+    found = background.backward(before, background.shade(before), by_rgb, nothing)
 
-    def loss(seen: Sight = before) -> float:
-        developed = background.develop(seen)
+    def loss(seen: TracedRays = before) -> float:
+        developed = background.shade(seen)
         assert (developed.transmittance == 0).all()
         return float((developed.rgb_srgb.astype(np.float64) * by_rgb).sum())
 
     step = np.float32(0.25)  # the map is linear in all of these, so that a large step is exact
-    assert found.seen.transmittance is not None and found.seen.rgb_srgb is not None
-    np.testing.assert_array_equal(found.seen.rgb_srgb, by_rgb)
+    assert found.trace.transmittance is not None and found.trace.rgb_srgb is not None
+    np.testing.assert_array_equal(found.trace.rgb_srgb, by_rgb)
     for ray in range(5):
-        more = before.seen.transmittance.copy()
+        more = before.result.transmittance.copy()
         more[ray] += step
-        moved = (loss(replace(before, seen=replace(before.seen, transmittance=more))) - loss()) / step
-        assert found.seen.transmittance[ray] == pytest.approx(moved, abs=1e-5)
-    background.add(found.parameters)
+        moved = (loss(replace(before, result=replace(before.result, transmittance=more))) - loss()) / step
+        assert found.trace.transmittance[ray] == pytest.approx(moved, abs=1e-5)
+    background.accumulate(found.parameters)
     sums = background.sums
     assert (np.abs(sums).sum(axis=2) > 0).sum() <= 4 * 5
     for row, column, channel in [*np.argwhere(sums != 0)[::7].tolist(), [8, 3, 1]]:
@@ -151,32 +151,32 @@ def test_gradients_agree_with_finite_differences() -> None:
 
 def test_background_recovers_known_sky(tmp_path: Path) -> None:
     trainer, world = train(tmp_path, iterations=240)
-    background = background_of(trainer.shading)
+    background = find_background(trainer.shading)
     assert background is not None
     view = np.repeat(world.train_indices, 40)
     row = np.tile(np.arange(40), len(world.train_indices))
     edge = world.rays(view, row, np.full(len(row), 1)).directions_world
-    np.testing.assert_allclose(background.colours(edge), sky(edge), atol=0.05)
+    np.testing.assert_allclose(background.lookup(edge), sky(edge), atol=0.05)
     assert trainer.views is not None and trainer.views.as_dict()["psnr"] > 27
 
 
 def test_background_initialises_from_photographs() -> None:
     world = UnderTheSky()
-    first = first_background(world)
+    first = estimate_background(world)
     view = np.repeat(world.train_indices, 40)
     column = np.tile(np.arange(40), len(world.train_indices))
     above = world.rays(view, np.full(len(view), 2), column).directions_world
     shown, _, _ = world.pixels(view, np.full(len(view), 2), column)
     open_sky = (shown == sky(above)).all(axis=1)
     above, shown = above[open_sky], shown[open_sky]
-    assert np.abs(first.map.colours(above) - shown).mean() < 0.02
+    assert np.abs(first.map.lookup(above) - shown).mean() < 0.02
     below = world.rays(view, np.full(len(view), 37), column).directions_world
-    assert first.may_show(above.astype(np.float64)).all()
-    assert not first.may_show(below.astype(np.float64)).any()
-    enlarged = first.enlarged(128)
+    assert first.is_above_horizon(above.astype(np.float64)).all()
+    assert not first.is_above_horizon(below.astype(np.float64)).any()
+    enlarged = first.resize(128)
     assert enlarged.shape == (128, 256, 3)
-    again = LearntBackground.of(enlarged).colours(above)
-    np.testing.assert_allclose(again, first.map.colours(above), atol=0.02)
+    again = LearnedBackground.from_map(enlarged).lookup(above)
+    np.testing.assert_allclose(again, first.map.lookup(above), atol=0.02)
 
 
 def test_background_training_is_deterministic(tmp_path: Path) -> None:
@@ -192,7 +192,7 @@ def test_background_training_is_deterministic(tmp_path: Path) -> None:
 
 def test_background_is_exposed_with_foreground(tmp_path: Path) -> None:
     trainer, _ = train(tmp_path, exposure=True)
-    assert isinstance(trainer.shading, Exposures) and background_of(trainer.shading) is not None
+    assert isinstance(trainer.shading, ExposureModel) and find_background(trainer.shading) is not None
 
 
 def test_files_keep_the_colours(tmp_path: Path) -> None:

@@ -6,7 +6,7 @@ import pytest
 from octasplat.engine.core.rays import RayBatch
 from octasplat.engine.dataset import Camera, Dataset, PosedView
 from octasplat.engine.dataset.model import Observations, SparsePoints
-from octasplat.engine.train.initialization.plane_sweep import dense_points
+from octasplat.engine.train.initialization.plane_sweep import plane_sweep_points
 
 WIDTH, HEIGHT, FOCAL, AWAY = 80, 60, 50.0, 2.0
 
@@ -68,7 +68,7 @@ class Wall(Dataset):
 @pytest.mark.parametrize("count", [20, 200])
 def test_pixels_are_lifted_onto_the_wall_however_long_it_is(count: int) -> None:
     wanted = 3 * count
-    lifted = dense_points(Wall(count), wanted, np.random.default_rng(0))
+    lifted = plane_sweep_points(Wall(count), wanted, np.random.default_rng(0))
     assert len(lifted) > 0.8 * wanted
     assert np.median(np.abs(lifted.xyz_world[:, 2])) < 0.05
     along = np.histogram(lifted.xyz_world[:, 0], bins=10, range=(0, count - 1))[0]

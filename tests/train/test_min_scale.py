@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.distance import cdist
 
-from octasplat.engine.train.loop.floors import ScaleFloor
-from octasplat.engine.train.loop.state import fresh_state
+from octasplat.engine.train.loop.floors import MinScale
+from octasplat.engine.train.loop.state import initial_state
 from octasplat.engine.train.loop.trainer import Trainer
 from tests.support.planar_dataset import PlanarDataset, small_config
 
@@ -15,10 +15,10 @@ def test_min_scale_is_enforced(tmp_path: Path) -> None:
     world = PlanarDataset()
     start = world.initial_gaussians()
     start.log_scales[:50] = np.log(1e-4)
-    floor = ScaleFloor(world.origins[world.train_indices], 0.02)
+    floor = MinScale(world.origins[world.train_indices], 0.02)
     trained = Trainer(
-        world, small_config(iterations=40), fresh_state(start, 0), folder=tmp_path, fingerprint="test",
-        listener=lambda _event: None, threads=1, scale_floor=floor,
+        world, small_config(iterations=40), initial_state(start, 0), folder=tmp_path, fingerprint="test",
+        progress=lambda _event: None, threads=1, scale_floor=floor,
     ).run()  # fmt: skip
     away = cdist(trained.means_world, floor.origins_world).min(axis=1)
     assert (trained.scales >= 0.02 * away[:, None] * (1 - 1e-5)).all()

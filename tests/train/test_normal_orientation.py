@@ -3,7 +3,7 @@
 import numpy as np
 
 from octasplat.engine.trace.factory import make_tracer
-from octasplat.engine.train.views.normal_orientation import turn_outwards
+from octasplat.engine.train.views.normal_orientation import orient_normals
 from tests.support.planar_dataset import PlanarDataset
 
 
@@ -18,7 +18,7 @@ def test_normals_seen_from_behind_are_flipped() -> None:
     rays = world.rays(np.zeros(300, np.int64), rng.integers(0, 40, 300), rng.integers(0, 40, 300))
     as_before = tracer.trace(rays)
 
-    turned = turn_outwards(gaussians, world, world.train_indices, tracer)
+    turned = orient_normals(gaussians, world, world.train_indices, tracer)
 
     assert 100 < len(turned) < 200  # about half of 300
     np.testing.assert_allclose(
@@ -33,4 +33,4 @@ def test_normals_seen_from_behind_are_flipped() -> None:
     seen = tracer.trace(rays)
     for name in ("rgb_srgb", "transmittance", "depth_sum", "normal_world"):
         np.testing.assert_allclose(getattr(seen, name), getattr(as_before, name), atol=2e-5)
-    assert len(turn_outwards(gaussians, world, world.train_indices, tracer)) == 0
+    assert len(orient_normals(gaussians, world, world.train_indices, tracer)) == 0

@@ -6,7 +6,7 @@ from octasplat.engine.gaussians.frames import frames_from_normals, quaternions_f
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.shading.material_settings import MaterialSettings
 from octasplat.engine.train.densify.normal_propagation import propagate_normals
-from octasplat.engine.train.initialization.initial_gaussians import with_first_materials
+from octasplat.engine.train.initialization.initial_gaussians import add_initial_materials
 
 
 def scene(points: np.ndarray, normals: np.ndarray) -> FlatGaussians:
@@ -18,7 +18,7 @@ def scene(points: np.ndarray, normals: np.ndarray) -> FlatGaussians:
         np.zeros(count, np.float32),
         np.zeros((count, 1, 3), np.float32),
     )
-    return with_first_materials(gaussians, MaterialSettings())
+    return add_initial_materials(gaussians, MaterialSettings())
 
 
 def angles(gaussians: FlatGaussians, normals: np.ndarray) -> np.ndarray:

@@ -8,14 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from octasplat.engine.core.errors import Cancelled
+from octasplat.engine.core.errors import CancelledError
 from octasplat.engine.core.events import CheckpointWritten, Event, Warned
 from octasplat.engine.dataset import DatasetView
 from octasplat.engine.dataset.synthetic import SyntheticDatasetConfig, write_synthetic_dataset
 from octasplat.engine.pipeline import reconstruct
 from octasplat.engine.runs.config import resolve_config
 from octasplat.engine.train.views import outlier_views as misfit_module
-from octasplat.engine.train.views.outlier_views import ViewFits, misfits
+from octasplat.engine.train.views.outlier_views import ViewPsnr, find_outlier_views
 
 SPOILED = ["view_010.png", "view_025.png"]
 SETTINGS = (
@@ -79,7 +79,7 @@ def test_outlier_views_match_wrong_poses(scene: Path, tmp_path: Path) -> None:
     def stop_behind_it(events: list[Event]) -> bool:
         return any(isinstance(event, CheckpointWritten) and event.iteration == 100 for event in events)
 
-    with pytest.raises(Cancelled):
+    with pytest.raises(CancelledError):
         run(scene, tmp_path / "stopped", "exclude_outlier_views=true", should_stop=stop_behind_it)
     run(scene, tmp_path / "stopped", "exclude_outlier_views=true")
     for name in ("scene.ply", "renders/view_008.png"):
@@ -98,11 +98,11 @@ def test_outlier_views_blockwise_matches_single_pass(monkeypatch: pytest.MonkeyP
     views, count = views_of(200), 200
     psnr = 30 + np.random.default_rng(1).standard_normal(count)
     psnr[[17, 140]] = 12
-    fits = ViewFits(np.arange(count), psnr, psnr)
-    at_once = misfits(fits, views, np.arange(count))
+    fits = ViewPsnr(np.arange(count), psnr, psnr)
+    at_once = find_outlier_views(fits, views, np.arange(count))
     assert sorted(at_once.tolist()) == [17, 140]
-    monkeypatch.setattr(misfit_module, "DISTANCES_AT_ONCE", 1000)
-    np.testing.assert_array_equal(misfits(fits, views, np.arange(count)), at_once)
+    monkeypatch.setattr(misfit_module, "MAX_DISTANCES", 1000)
+    np.testing.assert_array_equal(find_outlier_views(fits, views, np.arange(count)), at_once)
 
 
 def test_memory_grows_with_the_number_of_views_not_its_square() -> None:
@@ -110,7 +110,7 @@ def test_memory_grows_with_the_number_of_views_not_its_square() -> None:
     views, psnr = views_of(count), np.full(count, 30.0)
     psnr[1234] = 12
     tracemalloc.start()
-    found = misfits(ViewFits(np.arange(count), psnr, psnr), views, np.arange(count))
+    found = find_outlier_views(ViewPsnr(np.arange(count), psnr, psnr), views, np.arange(count))
     _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     assert found.tolist() == [1234]

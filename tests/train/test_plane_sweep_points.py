@@ -3,7 +3,11 @@
 import numpy as np
 import pytest
 
-from octasplat.engine.train.initialization.plane_sweep_points import Evidence, LiftedPoints, borne_out
+from octasplat.engine.train.initialization.plane_sweep_points import (
+    MatchEvidence,
+    PlaneSweepPoints,
+    is_confirmed,
+)
 
 KNOWN = np.array([[0.0, 0.0, 10.0]])
 FAR_OFF = np.array([[5.0, 0.0, 10.0]])
@@ -13,11 +17,11 @@ AROUND = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]])
 def believed(xyz_world: np.ndarray, view: list[int], rivalry: float, *, swept: bool = True) -> list[bool]:
     """What is said of points ten away from their cameras."""
     count = len(xyz_world)
-    found = LiftedPoints(
+    found = PlaneSweepPoints(
         xyz_world.astype(np.float32), np.zeros((count, 3), np.float32), np.full(count, swept, np.bool_)
     )
-    evidence = Evidence(np.array(view, np.int64), np.full(count, 10.0), np.full(count, rivalry))
-    return borne_out(found, evidence, KNOWN).tolist()
+    evidence = MatchEvidence(np.array(view, np.int64), np.full(count, 10.0), np.full(count, rivalry))
+    return is_confirmed(found, evidence, KNOWN).tolist()
 
 
 def test_plane_sweep_point_near_known_depth() -> None:

@@ -8,20 +8,25 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from octasplat.engine.core.errors import Cancelled, ConfigError
-from octasplat.engine.core.events import Event, HeldOutMeasured, Warned, ignore
+from octasplat.engine.core.errors import CancelledError, ConfigError
+from octasplat.engine.core.events import Event, HeldOutMeasured, Warned, ignore_events
 from octasplat.engine.core.rays import RayBatch
 from octasplat.engine.dataset import Camera, DatasetView
 from octasplat.engine.dataset.view_frusta import cam_from_world
 from octasplat.engine.gaussians.rows import row_arrays
 from octasplat.engine.runs.config import resolve_config
 from octasplat.engine.train.loop.checkpoint import BestState, latest_checkpoint, load_checkpoint, save_best
-from octasplat.engine.train.loop.state import TrainState, fresh_state
+from octasplat.engine.train.loop.state import TrainState, initial_state
 from octasplat.engine.train.loop.trainer import Trainer
 from octasplat.engine.train.sampling.batches import grid_pixels
 from octasplat.engine.train.sampling.pixel_sampler import view_sizes_px
-from octasplat.engine.train.views.corrected_views import corrected, without_common
-from octasplat.engine.train.views.image_alignment import Motion, Rendered, aligned, photograph_of
+from octasplat.engine.train.views.corrected_views import correct_view, remove_common_motion
+from octasplat.engine.train.views.image_alignment import (
+    RenderedPoints,
+    RigidMotion,
+    align_camera,
+    photograph_spline,
+)
 from octasplat.engine.train.views.pose_refinement import RefinedPose
 from tests.support.planar_dataset import PlanarDataset, small_config
 
@@ -91,10 +96,10 @@ def train(
     trainer = Trainer(
         world,
         config,
-        state or fresh_state(world.initial_gaussians(1000, 0.5, painted=True), config.seed),
+        state or initial_state(world.initial_gaussians(1000, 0.5, painted=True), config.seed),
         folder=folder,
         fingerprint="test",
-        listener=events.append,
+        progress=events.append,
         threads=threads,
         should_stop=should_stop,
     )
@@ -159,10 +164,10 @@ def test_pose_refinement_is_independent_of_exposure() -> None:
         plane = origins - ways * (origins[:, 2:] / ways[:, 2:])
         given = world.views[index]
         shown = 0.7 * world.shown(rays)[0].astype(np.float64) + 0.1
-        look = photograph_of(world, index, (SIDE_PX, SIDE_PX), np.zeros(3, np.float32))
-        motion = aligned(Rendered(cam_from_world(plane, given), shown), look, world.cameras[0])
+        look = photograph_spline(world, index, (SIDE_PX, SIDE_PX), np.zeros(3, np.float32))
+        motion = align_camera(RenderedPoints(cam_from_world(plane, given), shown), look, world.cameras[0])
         assert motion is not None
-        found[given.name] = corrected(given, motion)
+        found[given.name] = correct_view(given, motion)
     assert misplaced_px(found).max() < 0.1
 
 
@@ -177,12 +182,12 @@ def test_pose_refinement_removes_global_motion() -> None:
         rotation = view.rotation_cam_from_world @ turn.T
         relative = rotation @ view.rotation_cam_from_world.T
         shift = -rotation @ origin - relative @ view.translation_cam_from_world
-        corrections[index] = Motion(relative, shift).numbers
-    left = without_common(corrections, world, moving)
+        corrections[index] = RigidMotion(relative, shift).to_vector
+    left = remove_common_motion(corrections, world, moving)
     assert np.abs(corrections[moving]).max(axis=1).min() > 1e-2
     assert np.abs(left).max() < 1e-6
     # One that stays has a say, and stays.
-    left = without_common(corrections, world, world.train_indices)
+    left = remove_common_motion(corrections, world, world.train_indices)
     assert (left[world.train_indices[0]] == 0).all() and (left[world.test_indices] == 0).all()
 
 
@@ -203,7 +208,7 @@ def test_stopped_and_on_other_threads_the_same_bits_come_out(tmp_path: Path) -> 
                 refine_poses=True, iterations=80,
             )  # fmt: skip
             break
-        except Cancelled:
+        except CancelledError:
             stops += 1
             path = latest_checkpoint(tmp_path / "parts")
             assert path is not None
@@ -235,8 +240,8 @@ def test_mirrors_and_photographs_without_cameras_are_refused(tmp_path: Path) -> 
         Trainer(
             world,
             config,
-            fresh_state(world.initial_gaussians(), 0),
+            initial_state(world.initial_gaussians(), 0),
             folder=tmp_path,
             fingerprint="",
-            listener=ignore,
+            progress=ignore_events,
         )

@@ -12,12 +12,12 @@ from octasplat.engine.core.events import Event, HeldOutMeasured, TrainingProgres
 from octasplat.engine.dataset.synthetic import SyntheticDatasetConfig, write_synthetic_dataset
 from octasplat.engine.pipeline import reconstruct
 from octasplat.engine.runs.config import resolve_config
-from octasplat.engine.shading.plain import PLAIN
+from octasplat.engine.shading.plain import PLAIN_SHADING
 from octasplat.engine.trace.cpu.tracer import CpuTracer
 from octasplat.engine.train.config import LossWeights, TrainConfig, preset
 from octasplat.engine.train.densify import make_densifier
-from octasplat.engine.train.loop.iteration import Machinery, differentiate, iterate
-from octasplat.engine.train.loop.state import fresh_state
+from octasplat.engine.train.loop.iteration import TrainComponents, loss_and_gradients, train_step
+from octasplat.engine.train.loop.state import initial_state
 from octasplat.engine.train.loop.trainer import Trainer
 from octasplat.engine.train.sampling.batches import BatchSource
 from tests.support.planar_dataset import PlanarDataset, small_config
@@ -26,8 +26,8 @@ from tests.support.planar_dataset import PlanarDataset, small_config
 def held_out_psnr(folder: Path, config: TrainConfig) -> tuple[list[float], Trainer]:
     world, events = PlanarDataset(), list[Event]()
     trainer = Trainer(
-        world, config, fresh_state(world.initial_gaussians(opacity=config.initial_opacity), config.seed),
-        folder=folder, fingerprint="test", listener=events.append, threads=1,
+        world, config, initial_state(world.initial_gaussians(opacity=config.initial_opacity), config.seed),
+        folder=folder, fingerprint="test", progress=events.append, threads=1,
     )  # fmt: skip
     trainer.run()
     return [event.psnr for event in events if isinstance(event, HeldOutMeasured)], trainer
@@ -65,7 +65,7 @@ def test_ssim_gradient_reaches_gaussians() -> None:
 
     def loss_and_gradients() -> tuple[float, dict[str, np.ndarray]]:
         tracer.build(gaussians)
-        found = differentiate(batch, tracer, PLAIN, config.loss, progress=0.0)
+        found = loss_and_gradients(batch, tracer, PLAIN_SHADING, config.loss, training_progress=0.0)
         whole = {}
         for name in ("sh", "opacity_logits", "log_scales"):
             whole[name] = np.zeros_like(getattr(gaussians, name))
@@ -103,9 +103,11 @@ def test_ssim_weight_without_patches_is_ignored() -> None:
     batch = BatchSource(world, config).draw(np.random.default_rng(0))
     tracer = CpuTracer(threads=1)
     tracer.build(world.initial_gaussians())
-    both = differentiate(batch, tracer, PLAIN, config.loss, progress=0.0)
-    plain = differentiate(batch, tracer, PLAIN, LossWeights(), progress=0.0)
-    bare = differentiate(replace(batch, patches=0), tracer, PLAIN, config.loss, progress=0.0)
+    both = loss_and_gradients(batch, tracer, PLAIN_SHADING, config.loss, training_progress=0.0)
+    plain = loss_and_gradients(batch, tracer, PLAIN_SHADING, LossWeights(), training_progress=0.0)
+    bare = loss_and_gradients(
+        replace(batch, ssim_patch_count=0), tracer, PLAIN_SHADING, config.loss, training_progress=0.0
+    )
     assert bare.loss.value == plain.loss.value < both.loss.value
 
 
@@ -115,19 +117,19 @@ def test_low_weight_gaussians_do_not_move() -> None:
     batch = BatchSource(world, config).draw(np.random.default_rng(0))
     tracer = CpuTracer(config.trace, threads=1)
     tracer.build(world.initial_gaussians(opacity=0.6))
-    weights = differentiate(batch, tracer, PLAIN, config.loss, progress=0.0).gaussians
+    weights = loss_and_gradients(batch, tracer, PLAIN_SHADING, config.loss, training_progress=0.0).gaussians
     least = float(np.median(weights.weight_sums))
     heavy = weights.ids[weights.weight_sums >= least]
-    state = fresh_state(world.initial_gaussians(opacity=0.6), 0)
+    state = initial_state(world.initial_gaussians(opacity=0.6), 0)
     before = state.gaussians.sh.copy()
     tracer.build(state.gaussians)
     densifier = make_densifier(config.densify, iterations=1, max_gaussians=len(before))
-    iterate(
+    train_step(
         state,
         batch,
-        Machinery(tracer, PLAIN, densifier),
+        TrainComponents(tracer, PLAIN_SHADING, densifier),
         config.model_copy(update={"min_blend_weight": least}),
-        progress=0.0,
+        training_progress=0.0,
         extent=world.extent,
     )
     assert 0 < len(heavy) < len(weights.ids)

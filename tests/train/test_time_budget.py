@@ -5,12 +5,12 @@ from pathlib import Path
 
 import pytest
 
-from octasplat.engine.core.errors import Cancelled
+from octasplat.engine.core.errors import CancelledError
 from octasplat.engine.core.events import CheckpointWritten, Event
 from octasplat.engine.dataset.synthetic import SyntheticDatasetConfig, write_synthetic_dataset
 from octasplat.engine.pipeline import reconstruct
 from octasplat.engine.runs.config import resolve_config
-from octasplat.engine.train.loop.time_budget import Plan, choose_plan
+from octasplat.engine.train.loop.time_budget import TimeBudgetPlan, choose_plan
 
 
 def test_time_budget_larger_buys_more_gaussians() -> None:
@@ -46,9 +46,9 @@ def test_time_budget_plan_is_saved_and_reused(tmp_path: Path) -> None:
     def stop() -> bool:
         return sum(isinstance(event, CheckpointWritten) for event in events) >= 2
 
-    with pytest.raises(Cancelled):
+    with pytest.raises(CancelledError):
         reconstruct(scene, output, config, threads=1, progress=events.append, should_stop=stop)
-    plan = Plan.model_validate_json((output / "plan.json").read_text())
+    plan = TimeBudgetPlan.model_validate_json((output / "plan.json").read_text())
     assert plan.seconds < 6 and plan.max_gaussians <= 8 * 48 * 36
     short = plan.model_copy(update={"iterations": 75})  # a plan is what counts, not the pace of today
     (output / "plan.json").write_text(short.model_dump_json())

@@ -11,7 +11,7 @@ from octasplat.engine.dataset.synthetic import SyntheticDatasetConfig, write_syn
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.train.initialization.initial_gaussians import initial_gaussians
 from octasplat.engine.train.loop.fingerprint import run_fingerprint
-from octasplat.engine.train.loop.state import TrainState, fresh_state
+from octasplat.engine.train.loop.state import TrainState, initial_state
 from octasplat.engine.train.loop.trainer import Trainer
 from tests.support.planar_dataset import PlanarDataset, small_config
 
@@ -31,8 +31,8 @@ def train(folder: Path, tracer: str, iterations: int) -> tuple[TrainState, list[
         densify={"kind": "mcmc", "start": 20, "interval": 20, "growth": 0.1},
     )  # fmt: skip
     trainer = Trainer(
-        world, config, fresh_state(start(), 0), folder=folder, fingerprint="test",
-        listener=events.append, threads=1,
+        world, config, initial_state(start(), 0), folder=folder, fingerprint="test",
+        progress=events.append, threads=1,
     )  # fmt: skip
     trainer.run()
     return trainer.state, events
@@ -75,10 +75,10 @@ def test_reference_tracer_trains_synthetic_scene(tmp_path: Path) -> None:
             checkpoint_every=50, initial_points=100, plane_sweep_init=False,
         )  # fmt: skip
         events: list[Event] = []
-        state = fresh_state(initial_gaussians(dataset, config), config.seed)
+        state = initial_state(initial_gaussians(dataset, config), config.seed)
         Trainer(
             dataset, config, state, folder=tmp_path / tracer, fingerprint=run_fingerprint(dataset, config),
-            listener=events.append, threads=1,
+            progress=events.append, threads=1,
         ).run()  # fmt: skip
         psnr = [event.psnr for event in events if isinstance(event, HeldOutMeasured)]
         assert psnr[-1] > psnr[0] + 0.5, tracer

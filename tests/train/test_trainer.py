@@ -6,15 +6,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from octasplat.engine.core.errors import Cancelled, DatasetError, TrainingFailure
+from octasplat.engine.core.errors import CancelledError, DatasetError, TrainingError
 from octasplat.engine.core.events import CheckpointWritten, Event, HeldOutMeasured, TrainingProgress, Warned
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.gaussians.rows import row_arrays
-from octasplat.engine.train.config import McmcConfig, PaperConfig, TrainConfig
+from octasplat.engine.train.config import McmcConfig, RedisplatsConfig, TrainConfig
 from octasplat.engine.train.loop.checkpoint import BestState, latest_checkpoint, load_checkpoint, save_best
-from octasplat.engine.train.loop.state import TrainState, fresh_state
+from octasplat.engine.train.loop.state import TrainState, initial_state
 from octasplat.engine.train.loop.trainer import Trainer
-from octasplat.engine.train.sampling.shown import shown_share
+from octasplat.engine.train.sampling.shown import valid_pixel_fraction
 from tests.support.planar_dataset import PlanarDataset, small_config
 
 
@@ -32,10 +32,10 @@ def train(
     trainer = Trainer(
         world,
         config,
-        state or fresh_state(world.initial_gaussians(), config.seed),
+        state or initial_state(world.initial_gaussians(), config.seed),
         folder=folder,
         fingerprint="test",
-        listener=events.append,
+        progress=events.append,
         threads=threads,
         should_stop=should_stop,
     )
@@ -92,11 +92,13 @@ def test_trainer_seed_changes_result(whole_run: tuple[FlatGaussians, list[Event]
     [
         McmcConfig(start=20, interval=20, growth=0.1),
         McmcConfig(start=20, interval=20, growth=0.1, error_power=1.0),
-        PaperConfig(start=20, interval=20, stop_fraction=0.9, step_threshold=1e-5),
+        RedisplatsConfig(start=20, interval=20, stop_fraction=0.9, step_threshold=1e-5),
     ],
     ids=["mcmc", "mcmc by error", "paper"],
 )
-def test_stopped_and_resumed_gives_the_same_bits(tmp_path: Path, strategy: McmcConfig | PaperConfig) -> None:
+def test_stopped_and_resumed_gives_the_same_bits(
+    tmp_path: Path, strategy: McmcConfig | RedisplatsConfig
+) -> None:
     config = small_config(densify=strategy.model_dump())
     expected, _ = train(tmp_path / "whole", config)
     assert len(expected) != 300
@@ -112,7 +114,7 @@ def test_stopped_and_resumed_gives_the_same_bits(tmp_path: Path, strategy: McmcC
         try:
             found, _ = train(folder, config, state=state, should_stop=stop_now_and_then)
             break
-        except Cancelled as stop:
+        except CancelledError as stop:
             assert "--resume" in str(stop)
         path = latest_checkpoint(folder)
         assert path is not None
@@ -125,10 +127,10 @@ def test_stopped_and_resumed_gives_the_same_bits(tmp_path: Path, strategy: McmcC
 def test_trainer_shared_sort_ends_at_configured_share(tmp_path: Path) -> None:
     world, config, orders = PlanarDataset(), small_config(shared_sort_until=0.5), dict[int, str]()
     Trainer(
-        world, config, fresh_state(world.initial_gaussians(), config.seed),
+        world, config, initial_state(world.initial_gaussians(), config.seed),
         folder=tmp_path, fingerprint="test",
-        listener=lambda _event: None, threads=1,
-        onlooker=lambda iteration, tracer: orders.update({iteration: tracer.settings.sort}),
+        progress=lambda _event: None, threads=1,
+        on_step=lambda iteration, tracer: orders.update({iteration: tracer.settings.sort}),
     ).run()  # fmt: skip
     assert {order for iteration, order in orders.items() if iteration <= 60} == {"packet"}
     assert {order for iteration, order in orders.items() if iteration > 60} == {"ray"}
@@ -146,29 +148,29 @@ def test_trainer_resume_of_finished_run_returns_result(tmp_path: Path) -> None:
 def test_damaged_photograph_raises_error(tmp_path: Path) -> None:
     world = PlanarDataset()
     config = small_config()
-    state = fresh_state(world.initial_gaussians(), 0)
+    state = initial_state(world.initial_gaussians(), 0)
     world.poison = True
-    with pytest.raises(TrainingFailure, match="damaged photographs"):
+    with pytest.raises(TrainingError, match="damaged photographs"):
         train(tmp_path, config, world=world, state=state)
 
 
 def test_nan_parameters_raise_error(tmp_path: Path) -> None:
     world = PlanarDataset()
-    state = fresh_state(world.initial_gaussians(), 0)
+    state = initial_state(world.initial_gaussians(), 0)
     state.gaussians.sh[:] = np.nan
-    with pytest.raises(TrainingFailure):
+    with pytest.raises(TrainingError):
         train(tmp_path, small_config(), world=world, state=state)
 
 
 def test_divergent_learning_rate_raises_error(tmp_path: Path) -> None:
     config = small_config(lr={"mean": 1e6, "mean_final": 1e6})
-    with pytest.raises(TrainingFailure, match="nothing is exported"):
+    with pytest.raises(TrainingError, match="nothing is exported"):
         train(tmp_path, config)
 
 
 def test_pruning_all_gaussians_raises_error(tmp_path: Path) -> None:
-    strategy = PaperConfig(start=20, interval=20, prune_opacity=0.999)
-    with pytest.raises(TrainingFailure, match="removed every Gaussian"):
+    strategy = RedisplatsConfig(start=20, interval=20, prune_opacity=0.999)
+    with pytest.raises(TrainingError, match="removed every Gaussian"):
         train(tmp_path, small_config(densify=strategy.model_dump()))
 
 
@@ -223,4 +225,4 @@ def test_trainer_empty_masks_are_refused_early(tmp_path: Path) -> None:
     assert latest_checkpoint(tmp_path) is None
     world = Masked()
     world.left = (6, 3, 2)
-    assert shown_share(world) > 0
+    assert valid_pixel_fraction(world) > 0

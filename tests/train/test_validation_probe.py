@@ -5,14 +5,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from octasplat.engine.core.errors import TrainingFailure
+from octasplat.engine.core.errors import TrainingError
 from octasplat.engine.core.rays import RayBatch
 from octasplat.engine.gaussians.model import FlatGaussians
-from octasplat.engine.shading.plain import PLAIN
+from octasplat.engine.shading.plain import PLAIN_SHADING
 from octasplat.engine.trace.factory import make_tracer
 from octasplat.engine.trace.protocol import Tracer, TraceSettings
-from octasplat.engine.train.loop.state import fresh_state
-from octasplat.engine.train.loop.validation_probe import Judge, draw_probe, measure
+from octasplat.engine.train.loop.state import initial_state
+from octasplat.engine.train.loop.validation_probe import ValidationProbe, draw_probe, measure_probe
 from tests.support.planar_dataset import PlanarDataset
 
 
@@ -49,10 +49,10 @@ def tracer_of(gaussians: FlatGaussians) -> Tracer:
     return tracer
 
 
-def judge_of(world: PlanarDataset, folder: Path, rays: int) -> Judge:
-    return Judge(
+def judge_of(world: PlanarDataset, folder: Path, rays: int) -> ValidationProbe:
+    return ValidationProbe(
         world, folder, lambda _event: None,
-        rays=rays, background_srgb=np.ones(3, np.float32), step_back_db=0.3, seed=0,
+        rays=rays, background_srgb=np.ones(3, np.float32), best_margin_db=0.3, seed=0,
     )  # fmt: skip
 
 
@@ -65,7 +65,7 @@ def test_views_without_an_error_do_not_raise_the_probe(rng: np.random.Generator)
     world = SmallObject(radius=0.2, count=200)
     # Ten rays a view, most of which meet nothing.
     probe = draw_probe(world, world.train_indices, 2000, np.ones(3, np.float32), rng)
-    psnr, _ = measure(probe, world, tracer_of(disc(0.01)), PLAIN)
+    psnr, _ = measure_probe(probe, world, tracer_of(disc(0.01)), PLAIN_SHADING)
     shown, alpha, _ = world.pixels(probe.view, probe.y, probe.x)
     assert 0.002 < alpha.mean() < 0.05
     truth = -10 * np.log10(((shown * alpha[:, None] - probe.background_srgb * alpha[:, None]) ** 2).mean())
@@ -77,17 +77,17 @@ def test_validation_probe_small_covered_object_is_accepted(radius: float, tmp_pa
     world = SmallObject(radius=radius, count=40, side_px=120)
     gaussians = disc(2 * radius)
     judge = judge_of(world, tmp_path, 20_000)
-    state = fresh_state(gaussians, 0)
+    state = initial_state(gaussians, 0)
     state.iteration = 10
-    judge.inspect(state, tracer_of(gaussians), PLAIN)
-    assert [iteration for iteration, _ in state.probed] == [10]
+    judge.measure(state, tracer_of(gaussians), PLAIN_SHADING)
+    assert [iteration for iteration, _ in state.probes] == [10]
 
 
 def test_validation_probe_low_coverage_is_refused(tmp_path: Path) -> None:
     world = SmallObject(radius=0.5, count=10)
     gaussians = disc(0.01)
     judge = judge_of(world, tmp_path, 5000)
-    state = fresh_state(gaussians, 0)
+    state = initial_state(gaussians, 0)
     state.iteration = 10
-    with pytest.raises(TrainingFailure, match=r"covers only .* % of the photographs, of which .* show"):
-        judge.inspect(state, tracer_of(gaussians), PLAIN)
+    with pytest.raises(TrainingError, match=r"covers only .* % of the photographs, of which .* show"):
+        judge.measure(state, tracer_of(gaussians), PLAIN_SHADING)

@@ -10,10 +10,10 @@ from octasplat.engine.dataset.model import Observations, SparsePoints
 from octasplat.engine.gaussians.model import FlatGaussians, concatenate
 from octasplat.engine.trace.factory import make_tracer
 from octasplat.engine.train.config import LossWeights, TrainConfig
-from octasplat.engine.train.loop.state import fresh_state
+from octasplat.engine.train.loop.state import initial_state
 from octasplat.engine.train.loop.trainer import Trainer
 from octasplat.engine.train.sampling.batches import BatchSource
-from octasplat.engine.train.sampling.visibility_rays import SightLines, blocked_term
+from octasplat.engine.train.sampling.visibility_rays import VisibilityRays, free_space_gradient
 from tests.support.planar_dataset import PlanarDataset
 
 
@@ -37,7 +37,7 @@ class SeenWorld(PlanarDataset):
 
 def test_visibility_rays_lead_from_cameras_to_known_points() -> None:
     world = SeenWorld(error_px=2.0)
-    lines = SightLines.of(world, 0.0)
+    lines = VisibilityRays.from_dataset(world, 0.0)
     assert len(lines) == 200 * 6  # the seventh view is held out
     np.testing.assert_allclose(lines.starts_world[::200], world.origins[world.train_indices], atol=1e-6)
     # One of them by hand: rays to point 11 from all training cameras.
@@ -50,7 +50,7 @@ def test_visibility_rays_lead_from_cameras_to_known_points() -> None:
     row = 2 * 200 + 11
     np.testing.assert_allclose(lines.directions_world[row], units[2], atol=1e-6)
     assert lines.ends[row] == pytest.approx(np.linalg.norm(ways[2]) - 3 * deviation, rel=0.01)
-    far = SightLines.of(world, 0.45)
+    far = VisibilityRays.from_dataset(world, 0.45)
     np.testing.assert_allclose(far.ends[row], 0.55 * np.linalg.norm(ways[2]), rtol=1e-5)
 
 
@@ -61,7 +61,7 @@ def test_rarely_seen_points_have_no_visibility_rays() -> None:
     world.observations = Observations(
         np.append(seen.view[~rare], 3), np.append(seen.point[~rare], 6), np.zeros(((~rare).sum() + 1, 2))
     )
-    assert len(SightLines.of(world, 0.0)) == 199 * 6
+    assert len(VisibilityRays.from_dataset(world, 0.0)) == 199 * 6
 
 
 def test_visibility_loss_of_occluders_has_opacity_gradient() -> None:
@@ -70,8 +70,8 @@ def test_visibility_loss_of_occluders_has_opacity_gradient() -> None:
     veil.means_world[:, 2] = -0.5
     tracer = make_tracer()
     tracer.build(veil, np.zeros((40, 0), np.float32))
-    lines = SightLines.of(world, 0.0).draw(np.random.default_rng(0), 500)
-    hits, by = blocked_term(lines, tracer, 0.3)
+    lines = VisibilityRays.from_dataset(world, 0.0).draw(np.random.default_rng(0), 500)
+    hits, by = free_space_gradient(lines, tracer, 0.3)
     found = tracer.backward(hits, by).numpy()
 
     def cost(logits: np.ndarray) -> float:
@@ -106,14 +106,14 @@ def test_training_removes_veil_only_along_visibility_rays(tmp_path: Path) -> Non
             visibility_ray_fraction=0.25,
             loss=LossWeights(free_space=weight),
         )
-        state = fresh_state(concatenate([start, veil]), seed=0)
+        state = initial_state(concatenate([start, veil]), seed=0)
         trainer = Trainer(
-            world, config, state, folder=tmp_path / str(weight), fingerprint="", listener=lambda event: None
+            world, config, state, folder=tmp_path / str(weight), fingerprint="", progress=lambda event: None
         )
         done = trainer.run()
         tracer = make_tracer()
         tracer.build(done, np.zeros((len(done), 0), np.float32))
-        lines = SightLines.of(world, 0.05).draw(np.random.default_rng(1), 2000)
+        lines = VisibilityRays.from_dataset(world, 0.05).draw(np.random.default_rng(1), 2000)
         hidden[weight] = float(1 - tracer.transmittance(lines).mean())
     assert hidden[0.0] > 0.1
     assert hidden[0.1] < 0.3 * hidden[0.0]
@@ -121,15 +121,15 @@ def test_training_removes_veil_only_along_visibility_rays(tmp_path: Path) -> Non
 
 def test_batches_have_lines_where_they_count_and_none_of_views_left_out() -> None:
     world, rng = SeenWorld(), np.random.default_rng(0)
-    assert BatchSource(world, TrainConfig(rays_per_batch=1024)).draw(rng).sight_lines is None
-    assert BatchSource(PlanarDataset(), _counting(0.1)).draw(rng).sight_lines is None  # shows no points
-    assert BatchSource(SeenWorld(points=0), _counting(0.1)).draw(rng).sight_lines is None
+    assert BatchSource(world, TrainConfig(rays_per_batch=1024)).draw(rng).visibility_rays is None
+    assert BatchSource(PlanarDataset(), _counting(0.1)).draw(rng).visibility_rays is None  # shows no points
+    assert BatchSource(SeenWorld(points=0), _counting(0.1)).draw(rng).visibility_rays is None
     source = BatchSource(world, _counting(0.1))
-    lines = source.draw(rng).sight_lines
+    lines = source.draw(rng).visibility_rays
     assert lines is not None and len(lines) == 102
     assert len(np.unique(lines.origins_world, axis=0)) == 6
-    source.leave_out(np.array([2, 5]))
-    lines = source.draw(rng).sight_lines
+    source.exclude_views(np.array([2, 5]))
+    lines = source.draw(rng).visibility_rays
     assert lines is not None
     assert len(np.unique(lines.origins_world, axis=0)) == 4
 

@@ -2,12 +2,12 @@
 
 import pytest
 
-from octasplat.engine.dataset.image_sizes import Sizes
+from octasplat.engine.dataset.image_sizes import ImageSizes
 from octasplat.engine.operations.cost_model import Estimate, estimate_reconstruction
 from octasplat.engine.runs.config import resolve_config
 
 
-def estimated(preset: str, sizes: Sizes, *, materials: bool = False) -> Estimate:
+def estimated(preset: str, sizes: ImageSizes, *, materials: bool = False) -> Estimate:
     config = resolve_config(preset, materials=materials)
     return estimate_reconstruction(config, [sizes], 1)
 
@@ -15,16 +15,16 @@ def estimated(preset: str, sizes: Sizes, *, materials: bool = False) -> Estimate
 @pytest.mark.parametrize(
     ("preset", "sizes", "materials", "took_cpu_seconds"),
     [
-        ("fast", Sizes(269, 480, 50), False, 109),
-        ("standard", Sizes(269, 480, 50), False, 599),
-        ("fast", Sizes(960, 716, 48), False, 137),
-        ("standard", Sizes(960, 716, 48), False, 1413),
-        ("standard", Sizes(800, 533, 126), False, 1999),
-        ("standard", Sizes(400, 400, 100), True, 2343),
+        ("fast", ImageSizes(269, 480, 50), False, 109),
+        ("standard", ImageSizes(269, 480, 50), False, 599),
+        ("fast", ImageSizes(960, 716, 48), False, 137),
+        ("standard", ImageSizes(960, 716, 48), False, 1413),
+        ("standard", ImageSizes(800, 533, 126), False, 1999),
+        ("standard", ImageSizes(400, 400, 100), True, 2343),
     ],
 )
 def test_estimated_time_is_within_factor_two(
-    preset: str, sizes: Sizes, materials: bool, took_cpu_seconds: float
+    preset: str, sizes: ImageSizes, materials: bool, took_cpu_seconds: float
 ) -> None:
     found = estimated(preset, sizes, materials=materials).cpu_seconds
     assert took_cpu_seconds / 2 < found < took_cpu_seconds * 2
@@ -32,7 +32,7 @@ def test_estimated_time_is_within_factor_two(
 
 def test_materials_take_more_memory_and_time() -> None:
     plain, shiny = (
-        estimated("standard", Sizes(400, 400, 100), materials=materials) for materials in (False, True)
+        estimated("standard", ImageSizes(400, 400, 100), materials=materials) for materials in (False, True)
     )
     assert shiny.memory_bytes == pytest.approx(1.74e9, rel=0.05)  # private memory
     assert shiny.memory_bytes > plain.memory_bytes

@@ -17,7 +17,7 @@ from octasplat.engine.dataset.synthetic import SyntheticDatasetConfig, write_syn
 from octasplat.engine.operations.reconstruct import options_from_json
 from octasplat.engine.pipeline import OnStep, reconstruct
 from octasplat.engine.runs.config import ReconstructionConfig
-from octasplat.engine.shading.plain import PLAIN
+from octasplat.engine.shading.plain import PLAIN_SHADING
 from octasplat.engine.shading.protocol import ShadingModel
 from octasplat.engine.trace.protocol import Tracer
 from octasplat.workers.worker import preview
@@ -111,7 +111,7 @@ def test_previews_shrink_when_slow(
     dataset = SimpleNamespace(views=(view,), test_indices=np.array([0]), rays=rays, near_world=0.0)
     draw: Callable[..., None] = PreviewRenderer(tmp_path, "black", lambda _event: None)
     for iteration in range(4):
-        draw(iteration, dataset, None, PLAIN)
+        draw(iteration, dataset, None, PLAIN_SHADING)
         clock.now += 1000
     with Image.open(tmp_path / preview.PREVIEW_FILE) as picture:
         width, height = picture.size

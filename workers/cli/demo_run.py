@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from octasplat.engine.core.errors import ConfigError
-from octasplat.engine.core.progress import counted_stage
+from octasplat.engine.core.progress import counted_phase
 from octasplat.engine.dataset.synthetic import SyntheticDatasetConfig, write_synthetic_dataset
 from octasplat.engine.operations.reconstruct import ReconstructRequest
 from octasplat.engine.runs.config import ReconstructionConfig, read_config
@@ -38,7 +38,7 @@ def make_demo_scene(root: Path, size: Mapping[str, int | None], *, quiet: bool) 
     with (
         exit_on_sigterm(),
         show_progress(quiet=quiet) as listener,
-        counted_stage("generate", listener, config.views) as progress,
+        counted_phase("generate", listener, config.views) as progress,
     ):
         write_synthetic_dataset(root, config, progress)
 

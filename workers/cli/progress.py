@@ -9,18 +9,18 @@ from rich.console import Console, RenderableType
 from rich.progress import BarColumn, Progress, TaskID, TextColumn
 from rich.text import Text
 
-from octasplat.engine.core.durations import clock
+from octasplat.engine.core.durations import format_clock
 from octasplat.engine.core.events import (
     Event,
-    Listener,
+    EventListener,
     Noted,
-    StageFinished,
-    StageProgress,
-    StageStarted,
+    PhaseFinished,
+    PhaseProgress,
+    PhaseStarted,
     TrainingProgress,
     Warned,
 )
-from octasplat.engine.core.progress import DOING
+from octasplat.engine.core.progress import PHASE_TITLES
 from octasplat.workers.reporting.event_lines import EventLines, ProgressState
 from octasplat.workers.reporting.wording import format_training_state
 
@@ -63,17 +63,20 @@ class ProgressBars:
     def __call__(self, event: Event) -> None:
         """Show ``event``."""
         self._state.update(event)
-        if isinstance(event, StageStarted):
+        if isinstance(event, PhaseStarted):
             self._start_task(event)
-        elif isinstance(event, StageProgress):
+        elif isinstance(event, PhaseProgress):
             left = self._state.seconds_left
             self._advance(
-                event.step, event.total_steps, "" if left is None else f"{clock(left)} left", event.part
+                event.step,
+                event.total_steps,
+                "" if left is None else f"{format_clock(left)} left",
+                event.part,
             )
         elif isinstance(event, TrainingProgress):
             self.bars.detail = format_training_state(event, self._state.held_out)
-            self._advance(event.iteration, event.total_iterations, f"{clock(event.seconds_left)} left")
-        elif isinstance(event, StageFinished):
+            self._advance(event.iteration, event.total_iterations, f"{format_clock(event.seconds_left)} left")
+        elif isinstance(event, PhaseFinished):
             self._end_task()
             self._print(self._state.finished_line(event))
         elif isinstance(event, Warned):
@@ -81,10 +84,10 @@ class ProgressBars:
         elif isinstance(event, Noted):
             self._print(event.message, style="dim")
 
-    def _start_task(self, event: StageStarted) -> None:
+    def _start_task(self, event: PhaseStarted) -> None:
         self._end_task()
         self._task = self.bars.add_task(
-            DOING.get(event.stage, event.stage), total=event.total_steps or None, count="", left=""
+            PHASE_TITLES.get(event.stage, event.stage), total=event.total_steps or None, count="", left=""
         )
 
     def _advance(self, step: int, total: int, time_left: str = "", step_fraction: float = 0.0) -> None:
@@ -106,7 +109,7 @@ class ProgressBars:
 @contextmanager
 def show_progress(
     *, quiet: bool = False, should_stop: Callable[[], bool] = lambda: False
-) -> Iterator[Listener]:
+) -> Iterator[EventListener]:
     """Yield a listener that shows events for as long as the block runs.
 
     Args:

@@ -2,7 +2,7 @@
 
 import click
 
-from octasplat.engine.core.errors import ExportFailed, NoSpaceLeft
+from octasplat.engine.core.errors import DiskFullError, ExportError
 from octasplat.engine.operations.reconstruct import OPERATION, ReconstructRequest, run_config
 from octasplat.workers.cli.request_options import run_operation
 from octasplat.workers.cli.signals import StoppedError
@@ -21,7 +21,7 @@ def run_reconstruction(
         OctasplatError: as :func:`octasplat.engine.pipeline.reconstruction` does.
     """
     import octasplat.engine.pipeline  # noqa: F401 - pycolmap takes SIGTERM when imported, so before we do
-    from octasplat.engine.evaluate.summary import run_summary
+    from octasplat.engine.evaluate.summary import summarize_run
 
     output = request.output
     try:
@@ -30,12 +30,12 @@ def run_reconstruction(
         if resumes_automatically:
             raise StoppedError("Stopped; the same command goes on.", error.exit_code) from None
         raise
-    except NoSpaceLeft as error:
+    except DiskFullError as error:
         how = "" if resumes_automatically else " with --resume"
-        raise NoSpaceLeft(f"{error} Then the same command{how} goes on.") from error
-    except ExportFailed as error:
+        raise DiskFullError(f"{error} Then the same command{how} goes on.") from error
+    except ExportError as error:
         written = [name for name in run_config(request).exports if (output / name).exists()]
-        for line in run_summary(output, written):
+        for line in summarize_run(output, written):
             click.echo(line)
         again = f"Mend that or name others with --exports, and add --resume: {output} goes on from there."
-        raise ExportFailed(f"{error} {again}") from None
+        raise ExportError(f"{error} {again}") from None

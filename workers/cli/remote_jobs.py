@@ -5,7 +5,7 @@ from typing import Any
 
 import click
 
-from octasplat.engine.evaluate.summary import run_summary
+from octasplat.engine.evaluate.summary import summarize_run
 from octasplat.workers.cli.progress import show_progress
 from octasplat.workers.client import submission
 from octasplat.workers.client.api import Api
@@ -66,7 +66,7 @@ def submit_and_wait(api: Api, request: Submission | Derivation, output: Path, *,
         raise
     download_results(api, job["id"], output, quiet=quiet)
     if not quiet and (output / "metrics.json").exists():
-        for line in run_summary(output, job["options"].get("exports", ())):
+        for line in summarize_run(output, job["options"].get("exports", ())):
             click.echo(line)
 
 

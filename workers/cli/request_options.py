@@ -12,7 +12,7 @@ from pydantic import BaseModel, BeforeValidator
 from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
 
-from octasplat.engine.core.errors import Cancelled
+from octasplat.engine.core.errors import CancelledError
 from octasplat.engine.operations.base import (
     ContradictoryRequestError,
     Operation,
@@ -22,7 +22,7 @@ from octasplat.engine.operations.base import (
 )
 from octasplat.engine.operations.written_files import remember_written
 from octasplat.engine.settings.fields import Positional, Spelling, is_negatable
-from octasplat.engine.settings.renamed_settings import former_names, tell_renamed
+from octasplat.engine.settings.renamed_settings import former_names, notify_renamed
 from octasplat.workers.cli.options import quiet_option, threads_option
 from octasplat.workers.cli.progress import show_progress
 from octasplat.workers.cli.signals import StoppedError, exit_on_sigterm, request_stop_on_signals
@@ -129,7 +129,7 @@ def run_operation(
                     result = operation.run(
                         request, progress=progress, should_stop=should_stop, threads=threads
                     )
-            except Cancelled as error:
+            except CancelledError as error:
                 raise StoppedError(str(error), should_stop.exit_code) from None
     else:
         with exit_on_sigterm(), show_progress(quiet=quiet) as progress:
@@ -183,7 +183,7 @@ def _by_new_flags(model: type[BaseModel], given: Mapping[str, Any]) -> dict[str,
         value = values.pop(_former_parameter(flag), None)
         if value is None or value == ():
             continue
-        tell_renamed({flag: option_name(model, name)})
+        notify_renamed({flag: option_name(model, name)})
         values[name] = value
     return values
 

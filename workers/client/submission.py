@@ -7,12 +7,12 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from octasplat.engine.core.errors import ConfigError, OctasplatError
-from octasplat.engine.core.events import Listener, Warned, ignore
-from octasplat.engine.core.progress import counted_stage
+from octasplat.engine.core.events import EventListener, Warned, ignore_events
+from octasplat.engine.core.progress import counted_phase
 from octasplat.engine.pathtracing.stage.sidecar_files import sidecar_files
 from octasplat.engine.pathtracing.stage.stage_file import read_stage, referenced_files, with_renamed_files
 from octasplat.engine.render.path_document import read_path_document
-from octasplat.engine.settings.nested_options import merged
+from octasplat.engine.settings.nested_options import merge_options
 from octasplat.workers.client.api import Api
 from octasplat.workers.client.download import download_results
 from octasplat.workers.client.upload import upload_files, upload_scene
@@ -45,7 +45,7 @@ class Submission:
     priority: int = 0
 
 
-def submit(api: Api, submission: Submission, on_event: Listener = ignore) -> dict[str, Any]:
+def submit(api: Api, submission: Submission, on_event: EventListener = ignore_events) -> dict[str, Any]:
     """Upload what is missing and queue the job; returns the job.
 
     Args:
@@ -114,7 +114,9 @@ def with_stage(derivation: Derivation, stage: Path) -> Derivation:
             files[(PurePosixPath(sent).parent / beside).as_posix()] = path.parent / beside
     stage_options = {"stage": with_renamed_files(read, names).model_dump(mode="json")}
     return replace(
-        derivation, options=merged(stage_options, derivation.options), files={**derivation.files, **files}
+        derivation,
+        options=merge_options(stage_options, derivation.options),
+        files={**derivation.files, **files},
     )
 
 
@@ -127,7 +129,9 @@ def with_camera_path(derivation: Derivation, path: Path) -> Derivation:
         ConfigError: the file cannot be read, or is no camera path.
     """
     document = read_path_document(path).model_dump(mode="json", exclude_none=True)
-    return replace(derivation, options=merged({"mode": "path", "camera_path": document}, derivation.options))
+    return replace(
+        derivation, options=merge_options({"mode": "path", "camera_path": document}, derivation.options)
+    )
 
 
 def with_environments(derivation: Derivation, maps: Sequence[Path]) -> Derivation:
@@ -154,7 +158,7 @@ def with_environments(derivation: Derivation, maps: Sequence[Path]) -> Derivatio
     )
 
 
-def derive(api: Api, derivation: Derivation, on_event: Listener = ignore) -> dict[str, Any]:
+def derive(api: Api, derivation: Derivation, on_event: EventListener = ignore_events) -> dict[str, Any]:
     """Send the files that the options name, and queue a job on the results of another or on them.
 
     Returns the job.
@@ -179,7 +183,7 @@ def derive(api: Api, derivation: Derivation, on_event: Listener = ignore) -> dic
     if derivation.scene is not None:
         body["dataset_id"] = _upload_if_needed(api, derivation.scene, on_event)
     if derivation.files:
-        with counted_stage("upload", on_event) as progress:
+        with counted_phase("upload", on_event) as progress:
             sent = upload_files(
                 api, derivation.files, name="stage", progress=lambda d, t: progress(d >> 10, t >> 10)
             )
@@ -189,7 +193,10 @@ def derive(api: Api, derivation: Derivation, on_event: Listener = ignore) -> dic
 
 
 def wait_for_job(
-    api: Api, job_id: str, on_event: Listener = ignore, on_note: Callable[[str], None] = lambda _note: None
+    api: Api,
+    job_id: str,
+    on_event: EventListener = ignore_events,
+    on_note: Callable[[str], None] = lambda _note: None,
 ) -> dict[str, Any]:
     """Follow a job until it is over; returns it.
 
@@ -221,13 +228,13 @@ def wait_for_job(
 
 
 def download_job(
-    api: Api, job_id: str, folder: Path, names: tuple[str, ...] = (), on_event: Listener = ignore
+    api: Api, job_id: str, folder: Path, names: tuple[str, ...] = (), on_event: EventListener = ignore_events
 ) -> tuple[Path, ...]:
     """Save the results of a job, or only those called ``names``; returns the files.
 
     The stage ``download``, whose steps are kB, is told to ``on_event``.
     """
-    with counted_stage("download", on_event) as progress:
+    with counted_phase("download", on_event) as progress:
         return tuple(
             download_results(
                 api, job_id, folder, names=names, progress=lambda d, t: progress(d >> 10, t >> 10)
@@ -235,12 +242,12 @@ def download_job(
         )
 
 
-def _upload_if_needed(api: Api, scene: Path, on_event: Listener) -> str:
+def _upload_if_needed(api: Api, scene: Path, on_event: EventListener) -> str:
     """Return the dataset of these photographs, sent if that is not done yet."""
     dataset_id = _parse_id(str(scene))
     if dataset_id is not None:
         return dataset_id
-    with counted_stage("upload", on_event) as progress:
+    with counted_phase("upload", on_event) as progress:
         dataset = upload_scene(api, scene, progress=lambda d, t: progress(d >> 10, t >> 10))
     for warning in dataset["facts"].get("warnings", ()):
         on_event(Warned(warning))

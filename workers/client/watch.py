@@ -7,7 +7,7 @@ from typing import Any
 
 import httpx
 
-from octasplat.engine.core.events import Listener
+from octasplat.engine.core.events import EventListener
 from octasplat.workers.client.api import (
     BUSY_STATUSES,
     UNAVAILABLE_STATUSES,
@@ -24,7 +24,7 @@ _BUSY_SECONDS = 2.0
 
 
 def watch_job(
-    api: Api, job_id: str, on_event: Listener, on_state: Callable[[dict[str, Any]], None]
+    api: Api, job_id: str, on_event: EventListener, on_state: Callable[[dict[str, Any]], None]
 ) -> dict[str, Any]:
     """Follow a job to its end, over any break of the connection.
 
@@ -88,7 +88,7 @@ def _read_events(api: Api, job_id: str, last: str) -> Iterator[tuple[str, dict[s
 
 
 def _dispatch(
-    kind: str, data: dict[str, Any], on_event: Listener, on_state: Callable[[dict[str, Any]], None]
+    kind: str, data: dict[str, Any], on_event: EventListener, on_state: Callable[[dict[str, Any]], None]
 ) -> None:
     event = decode_event(kind, data)
     if event is not None:

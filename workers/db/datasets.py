@@ -8,7 +8,7 @@ from typing import Any
 
 from psycopg.rows import class_row, dict_row
 
-from octasplat.engine.dataset.image_sizes import Sizes
+from octasplat.engine.dataset.image_sizes import ImageSizes
 from octasplat.workers.db.connections import Connection, with_columns
 from octasplat.workers.db.errors import ConflictError, NotFoundError
 from octasplat.workers.db.ids import new_id
@@ -189,7 +189,7 @@ async def files_of(
         return await cursor.fetchall()
 
 
-async def photograph_sizes(connection: Connection, dataset_id: uuid.UUID) -> list[Sizes]:
+async def photograph_sizes(connection: Connection, dataset_id: uuid.UUID) -> list[ImageSizes]:
     """Return how many photographs of which size a dataset has, of those whose size is known."""
     cursor = await connection.execute(
         """
@@ -201,7 +201,7 @@ async def photograph_sizes(connection: Connection, dataset_id: uuid.UUID) -> lis
         """,
         [dataset_id],
     )
-    return [Sizes(row["width"], row["height"], row["n"]) for row in await cursor.fetchall()]
+    return [ImageSizes(row["width"], row["height"], row["n"]) for row in await cursor.fetchall()]
 
 
 @dataclass(frozen=True)

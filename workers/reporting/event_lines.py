@@ -3,18 +3,18 @@
 import time
 from collections.abc import Callable
 
-from octasplat.engine.core.durations import clock, duration
+from octasplat.engine.core.durations import format_clock, format_duration
 from octasplat.engine.core.events import (
     Event,
     HeldOutMeasured,
     Noted,
-    StageFinished,
-    StageProgress,
-    StageStarted,
+    PhaseFinished,
+    PhaseProgress,
+    PhaseStarted,
     TrainingProgress,
     Warned,
 )
-from octasplat.engine.core.progress import DOING
+from octasplat.engine.core.progress import PHASE_TITLES
 from octasplat.workers.reporting.time_left import TimeLeftEstimator
 from octasplat.workers.reporting.wording import format_training_state
 
@@ -60,10 +60,10 @@ class ProgressState:
 
     def update(self, event: Event) -> None:
         """Remember what ``event`` tells."""
-        if isinstance(event, StageStarted):
+        if isinstance(event, PhaseStarted):
             self.step, self.total = 0, event.total_steps
             self.seconds_left, self._pace = None, TimeLeftEstimator()
-        elif isinstance(event, StageProgress):
+        elif isinstance(event, PhaseProgress):
             self.step, self.total = event.step, event.total_steps
             self.seconds_left = self._pace.seconds_left(event.step + event.part, event.total_steps)
         elif isinstance(event, TrainingProgress):
@@ -71,7 +71,7 @@ class ProgressState:
         elif isinstance(event, HeldOutMeasured):
             self.held_out = event
 
-    def finished_line(self, event: StageFinished) -> str:
+    def finished_line(self, event: PhaseFinished) -> str:
         """Return what the stage did and how long it took, as a line."""
         verb, what = _STAGE_RESULTS.get(event.stage, (f"Finished {event.stage}", "step"))
         if event.stage == "poses":  # some may be left out
@@ -79,7 +79,7 @@ class ProgressState:
         else:
             plural = "" if self.step == 1 or what == "kB" else "s"
             count = f" {self.step:,} {what}{plural}" if self.step and what else ""
-        line = f"{verb}{count} in {duration(event.seconds)}"
+        line = f"{verb}{count} in {format_duration(event.seconds)}"
         if event.stage == "train" and self.training is not None:
             line += f": {format_training_state(self.training, self.held_out)}"
         return line
@@ -113,22 +113,26 @@ class EventLines:
     def __call__(self, event: Event) -> None:
         """Show ``event``, or leave it out if the last line is only a moment old."""
         self._state.update(event)
-        if isinstance(event, StageStarted):
-            self._write(DOING.get(event.stage, event.stage))
+        if isinstance(event, PhaseStarted):
+            self._write(PHASE_TITLES.get(event.stage, event.stage))
             self._next_at = time.monotonic() + self._interval_seconds
-        elif isinstance(event, StageFinished):
+        elif isinstance(event, PhaseFinished):
             self._write(self._state.finished_line(event))
         elif isinstance(event, Warned):
             self._write_warning(f"Warning: {event.message}")
         elif isinstance(event, Noted):
             self._write_note(event.message)
-        elif isinstance(event, StageProgress | TrainingProgress) and time.monotonic() >= self._next_at:
+        elif isinstance(event, PhaseProgress | TrainingProgress) and time.monotonic() >= self._next_at:
             self._next_at = time.monotonic() + self._interval_seconds
             self._write(self._line(event))
 
-    def _line(self, event: StageProgress | TrainingProgress) -> str:
-        if isinstance(event, StageProgress):
+    def _line(self, event: PhaseProgress | TrainingProgress) -> str:
+        if isinstance(event, PhaseProgress):
             left = self._state.seconds_left
-            return f"  {event.step}/{event.total_steps}" + ("" if left is None else f", {clock(left)} left")
+            return f"  {event.step}/{event.total_steps}" + (
+                "" if left is None else f", {format_clock(left)} left"
+            )
         state = format_training_state(event, self._state.held_out)
-        return f"  {event.iteration}/{event.total_iterations}: {state}, {clock(event.seconds_left)} left"
+        return (
+            f"  {event.iteration}/{event.total_iterations}: {state}, {format_clock(event.seconds_left)} left"
+        )

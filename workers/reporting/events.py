@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from typing import Any
 
-from octasplat.engine.core.events import EVENT_KINDS, Event, StageProgress, TrainingProgress, event_from
+from octasplat.engine.core.events import EVENT_KINDS, Event, PhaseProgress, TrainingProgress, parse_event
 
 EVENT_STREAM_KINDS = frozenset({"progress", *EVENT_KINDS})
 
@@ -16,10 +16,10 @@ def decode_event(kind: str, data: Mapping[str, Any]) -> Event | None:
         data: its fields, and perhaps others.
     """
     if kind == "progress":
-        kind = TrainingProgress.kind if "iteration" in data else StageProgress.kind
+        kind = TrainingProgress.kind if "iteration" in data else PhaseProgress.kind
     if kind == TrainingProgress.kind and "training_psnr" in data:
         data = {**data, "psnr": data["training_psnr"]}
-    return event_from(kind, data)
+    return parse_event(kind, data)
 
 
 def encode_training_progress(event: Mapping[str, Any]) -> dict[str, Any]:

@@ -8,7 +8,7 @@ import signal
 import time
 from collections.abc import Callable, Mapping, Sequence
 
-from octasplat.engine.core.isolated_python import without_python_variables
+from octasplat.engine.core.isolated_python import drop_python_variables
 from octasplat.workers.parent_death_signal import PARENT_PID_VARIABLE
 
 logger = logging.getLogger(__name__)
@@ -40,7 +40,7 @@ class SupervisedProcess:
     ) -> None:
         self.name = name
         self._command = command
-        kept = without_python_variables(os.environ)
+        kept = drop_python_variables(os.environ)
         self._environment = {**kept, **environment, PARENT_PID_VARIABLE: str(os.getpid())}
         self._on_line = on_line
         self._process: asyncio.subprocess.Process | None = None

@@ -4,7 +4,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from octasplat.engine.core.writing import NO_ROOM
+from octasplat.engine.core.writing import DISK_FULL_ERRORS
 from octasplat.workers.storage.errors import StorageFullError, StorageUnavailableError
 
 FREE_SPACE_HINT = "delete datasets or jobs, whose contents then go at once, or add room"
@@ -15,7 +15,9 @@ def is_disk_full(error: BaseException | None) -> bool:
     for _ in range(20):
         if error is None:
             return False
-        if isinstance(error, StorageFullError) or (isinstance(error, OSError) and error.errno in NO_ROOM):
+        if isinstance(error, StorageFullError) or (
+            isinstance(error, OSError) and error.errno in DISK_FULL_ERRORS
+        ):
             return True
         error = error.__cause__ or error.__context__
     return False
@@ -32,7 +34,7 @@ def translate_os_errors(path: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        if error.errno in NO_ROOM:
+        if error.errno in DISK_FULL_ERRORS:
             raise StorageFullError(f"The disk of {path} is full; {FREE_SPACE_HINT}.") from error
         reason = error.strerror or str(error)
         raise StorageUnavailableError(

@@ -20,7 +20,7 @@ from octasplat.workers.worker.workspace import Checkpoint
 
 def version_facts() -> dict[str, Any]:
     """Return what a worker says of its version, for others to match with jobs."""
-    return {"kinds": [kind.name for kind in job_kinds()], "results": versions.RESULTS}
+    return {"kinds": [kind.name for kind in job_kinds()], "results": versions.RESULTS_VERSION}
 
 
 async def reason_incapable(pool: Pool, job_id: uuid.UUID, stale_seconds: float) -> str | None:
@@ -37,7 +37,7 @@ async def reason_incapable(pool: Pool, job_id: uuid.UUID, stale_seconds: float) 
             return None
         if (unknown := _unknown_to_version(job)) is not None:
             return unknown
-        if job.checkpoint is None or Checkpoint.from_row(job.checkpoint).results == versions.RESULTS:
+        if job.checkpoint is None or Checkpoint.from_row(job.checkpoint).results == versions.RESULTS_VERSION:
             return None
         made_by = Checkpoint.from_row(job.checkpoint).results
         for row in await live_workers(connection, stale_seconds):

@@ -17,7 +17,7 @@ import traceback
 from pathlib import Path
 from typing import Any, NoReturn
 
-from octasplat.engine.core.errors import Cancelled, OctasplatError
+from octasplat.engine.core.errors import CancelledError, OctasplatError
 from octasplat.engine.core.events import Event
 from octasplat.workers.parent_death_signal import set_parent_death_signal
 from octasplat.workers.sandbox.confinement import confine, set_resource_limits
@@ -88,7 +88,7 @@ def _run_task(task: dict[str, Any], events: _EventStream, stop: threading.Event)
                 kind=task.get("kind", ""),
             )
         )
-    except Cancelled as error:
+    except CancelledError as error:
         events.write({"kind": "stopped", "message": str(error)})
         return EXIT_STOPPED
     except OctasplatError as error:

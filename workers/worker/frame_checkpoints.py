@@ -2,7 +2,7 @@
 
 import time
 
-from octasplat.engine.core.events import CheckpointWritten, Event, ImagesKept, Listener
+from octasplat.engine.core.events import CheckpointWritten, Event, EventListener, ImagesSaved
 from octasplat.workers.worker.task import FRAMES_FOLDER
 
 FRAME_CHECKPOINT_SECONDS = 5.0
@@ -17,14 +17,14 @@ class FrameCheckpoints:
         progress: hears the other events, and :class:`CheckpointWritten` where frames are to be stored.
     """
 
-    def __init__(self, progress: Listener) -> None:
+    def __init__(self, progress: EventListener) -> None:
         self._listener = progress
         self._count = self._stored = 0
         self._next_at = 0.0
 
     def __call__(self, event: Event) -> None:
         """Take an event."""
-        if not isinstance(event, ImagesKept):
+        if not isinstance(event, ImagesSaved):
             self._listener(event)
             return
         self._count = event.count

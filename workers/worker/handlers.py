@@ -10,12 +10,12 @@ from octasplat.engine.core.errors import CheckpointError, ConfigError
 from octasplat.engine.core.events import (
     Event,
     Noted,
-    StageFinished,
-    StageProgress,
+    PhaseFinished,
+    PhaseProgress,
     Warned,
     broadcast,
 )
-from octasplat.engine.core.progress import counted_stage, stopping
+from octasplat.engine.core.progress import counted_phase, stop_when_asked
 from octasplat.engine.core.writing import write_json
 from octasplat.engine.pipeline import reconstruct as reconstruct_scene
 from octasplat.engine.runs.config import ReconstructionConfig
@@ -53,7 +53,7 @@ def _run_reconstruction(task: Task) -> None:
 
     def publish_finished(event: Event) -> None:
         # Whatever becomes of the rest, even if this process is killed.
-        if isinstance(event, StageFinished) or (isinstance(event, StageProgress) and event.stage == "export"):
+        if isinstance(event, PhaseFinished) or (isinstance(event, PhaseProgress) and event.stage == "export"):
             _publish_run(task)
 
     try:
@@ -63,7 +63,7 @@ def _run_reconstruction(task: Task) -> None:
             config,
             resume=True,
             threads=task.threads,
-            progress=stopping(broadcast([task.progress, publish_finished]), task.should_stop),
+            progress=stop_when_asked(broadcast([task.progress, publish_finished]), task.should_stop),
             should_stop=task.should_stop,
             on_step=PreviewRenderer(task.run, config.evaluation_background, task.progress),
         )
@@ -88,7 +88,7 @@ def run_operation(task: Task) -> None:
     assert isinstance(kind, OperationKind)
     options = kind.resolve(task.options)
     with kind.progress_callback(task) as tell:
-        whole = nullcontext() if kind.reports_stages else counted_stage(kind.stages(options)[0], tell, 0)
+        whole = nullcontext() if kind.reports_stages else counted_phase(kind.stages(options)[0], tell, 0)
         with whole:
             result = kind.operation.run(
                 kind.build_request(task), progress=tell, should_stop=task.should_stop, threads=task.threads

@@ -8,15 +8,15 @@ from typing import ClassVar
 
 import numpy as np
 
-from octasplat.engine.core.events import Event, Listener
+from octasplat.engine.core.events import Event, EventListener
 from octasplat.engine.core.rays import ImageRays
 from octasplat.engine.dataset import Dataset
 from octasplat.engine.render.image_files import write_png
 from octasplat.engine.render.renderer import background_colour, render_rays
-from octasplat.engine.shading.plain import PLAIN
+from octasplat.engine.shading.plain import PLAIN_SHADING
 from octasplat.engine.shading.protocol import ShadingModel
 from octasplat.engine.trace.protocol import Tracer
-from octasplat.engine.train.shading_factory import background_of
+from octasplat.engine.train.shading_factory import find_background
 
 MAX_SIDE_PX = 320
 MIN_SIDE_PX = 96
@@ -50,7 +50,7 @@ class PreviewRenderer:
         progress: told of pictures.
     """
 
-    def __init__(self, run: Path, background: str, progress: Listener) -> None:
+    def __init__(self, run: Path, background: str, progress: EventListener) -> None:
         self._run = run
         self._background = background_colour(background)
         self._listener = progress
@@ -66,7 +66,7 @@ class PreviewRenderer:
         chosen = int((dataset.test_indices if len(dataset.test_indices) else dataset.train_indices)[0])
         rays = grid_rays(dataset, chosen, self._side_px)
         # A learnt background alone: materials would send rays of their own, which takes time.
-        image = render_rays(tracer, rays, self._background, background_of(shading) or PLAIN)
+        image = render_rays(tracer, rays, self._background, find_background(shading) or PLAIN_SHADING)
         write_png(self._run / PREVIEW_FILE, image.rgb_srgb)
         self._listener(PreviewWritten(PREVIEW_FILE, iteration, dataset.views[chosen].name))
         spent = time.monotonic() - began
@@ -94,4 +94,4 @@ def grid_rays(dataset: Dataset, view: int, side_px: int) -> ImageRays:
     yy, xx = np.meshgrid(y, x, indexing="ij")
     directions = dataset.rays(np.full(yy.size, view), yy.ravel(), xx.ravel()).directions_world
     origin_world = dataset.views[view].origin_world
-    return ImageRays.of(origin_world, directions.reshape(rows, columns, 3), dataset.near_world)
+    return ImageRays.from_directions(origin_world, directions.reshape(rows, columns, 3), dataset.near_world)

@@ -196,7 +196,7 @@ class Supervisor:
         }
 
     async def _restore(self, checkpoint: Checkpoint) -> None:
-        if checkpoint.results != versions.RESULTS:
+        if checkpoint.results != versions.RESULTS_VERSION:
             self._reporter.add_note(
                 "Warning: the checkpoint is of a version in which the same settings gave other results, so "
                 "the job begins anew."

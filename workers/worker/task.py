@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from octasplat.engine.core.events import Listener, ignore
+from octasplat.engine.core.events import EventListener, ignore_events
 
 RUN_FOLDER, RESULTS_FOLDER, FILES_FOLDER = "run", "results", "files"
 """Folders of an attempt: the engine's output, what is to be published, files that are named."""
@@ -50,7 +50,7 @@ class Task:
     scene: Path | None = None
     title: str = ""
     threads: int = 0
-    progress: Listener = ignore
+    progress: EventListener = ignore_events
     should_stop: Callable[[], bool] = field(default=lambda: False)
     kind: str = ""
 

@@ -57,14 +57,14 @@ class Checkpoint:
         step: of the stage.
         files: what is needed.
         results: what the same settings gave in the version that made it, see
-            :data:`octasplat.engine.core.versions.RESULTS`; versions that did not say so gave the first.
+            :data:`octasplat.engine.core.versions.RESULTS_VERSION`; versions that did not say so gave the first.
     """
 
     attempt: int
     stage: str
     step: int
     files: tuple[TreeFile, ...]
-    results: int = field(default_factory=lambda: versions.RESULTS)
+    results: int = field(default_factory=lambda: versions.RESULTS_VERSION)
 
     def as_row(self) -> dict[str, Any]:
         """As JSON values."""

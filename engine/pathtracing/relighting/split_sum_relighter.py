@@ -9,7 +9,7 @@ from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.pathtracing.environment import EnvironmentMap
 from octasplat.engine.pathtracing.relighting.path_relighter import ProgressCallback, RelitImage, no_progress
 from octasplat.engine.render.supersampling import pixel_means
-from octasplat.engine.shading.deferred import Deferred
+from octasplat.engine.shading.deferred import DeferredShading
 from octasplat.engine.shading.material_settings import MaterialSettings
 from octasplat.engine.trace.factory import make_tracer
 from octasplat.engine.trace.protocol import TraceSettings
@@ -50,26 +50,32 @@ class SplitSumRelighter:
             "indirect": "shaded",
         }
         shading = (material_settings or MaterialSettings()).model_copy(update=changed)
-        self._shading = Deferred(shading, extent_world=extent_world, sided=settings.flip_normal_cos > 0)
+        self._shading = DeferredShading(
+            shading, extent_world=extent_world, one_sided=settings.flip_normal_cos > 0
+        )
         self._gaussians = with_interreflection_channel(gaussians)
         self._tracer = make_tracer(settings, threads=threads, build_quality=2)
         self._tracer.build(self._gaussians, self._shading.features(self._gaussians))
         self._all = np.arange(len(gaussians))
         self._ambient_visibility: Float32[np.ndarray, " n"] | None = None
         if AMBIENT in gaussians.channels and shading.ambient_occlusion:
-            self._ambient_visibility = self._shading.look_around(self._gaussians, self._all, self._tracer)
+            self._ambient_visibility = self._shading.measure_ambient_occlusion(
+                self._gaussians, self._all, self._tracer
+            )
         self._radiance: Float32[np.ndarray, "h w 3"] | None = None
 
     def set_environment(self, environment: EnvironmentMap) -> None:
         """Use this environment from now on."""
         other = self._radiance is not environment.radiance_linear
         if other:
-            self._shading.light.put(environment.radiance_linear)
+            self._shading.light.set_radiance(environment.radiance_linear)
             self._radiance = environment.radiance_linear
         if other or not np.array_equal(self._shading.frame, environment.frame):
             self._shading.frame = environment.frame
             if self._ambient_visibility is not None:
-                self._shading.bounce(self._gaussians, self._all, self._ambient_visibility, self._tracer)
+                self._shading.measure_diffuse_interreflection(
+                    self._gaussians, self._all, self._ambient_visibility, self._tracer
+                )
 
     def render(self, image: ImageRays, progress: ProgressCallback = no_progress) -> RelitImage:
         """Return the camera's image; ``progress`` is called with the fraction done."""

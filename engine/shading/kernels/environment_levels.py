@@ -21,7 +21,7 @@ Lookup: TypeAlias = tuple[int, int, int, int, float, float, float, float, float]
 """Where a direction lies in a level, see :func:`look_up`."""
 
 
-class LightLevels(NamedTuple):
+class EnvironmentLevels(NamedTuple):
     """All levels one after another, as kernels take them.
 
     Attributes:

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float, Float64, Int32
 
 from octasplat.engine.core.compilation import device_function, kernel
-from octasplat.engine.shading.kernels.environment_levels import LightLevels, Lookup, look_up
+from octasplat.engine.shading.kernels.environment_levels import EnvironmentLevels, Lookup, look_up
 from octasplat.engine.shading.kernels.microfacets import ggx_masking, sample_visible_normal, schlick_weight
 
 TAPS = 12
@@ -141,7 +141,7 @@ def level_of(roughnesses: Float64[np.ndarray, " l"], roughness: float) -> tuple[
 def shade_pixel(
     p: int,
     surface: SurfaceArrays,
-    light: LightLevels,
+    light: EnvironmentLevels,
     table: Float64[np.ndarray, "a c 2"],
     rgb: Float64[np.ndarray, "p 3"],
 ) -> None:
@@ -175,7 +175,7 @@ def shade_pixels(
     first: int,
     last: int,
     surface: SurfaceArrays,
-    light: LightLevels,
+    light: EnvironmentLevels,
     table: Float64[np.ndarray, "a c 2"],
     rgb: Float64[np.ndarray, "p 3"],
 ) -> None:
@@ -189,7 +189,7 @@ def look_back(
     out: GradientArrays,
     p: int,
     place: int,
-    light: LightLevels,
+    light: EnvironmentLevels,
     level: int,
     direction: tuple[float, float, float],
     share: float,
@@ -225,7 +225,7 @@ def direction_slope(
 def reverse_pixel(
     p: int,
     surface: SurfaceArrays,
-    light: LightLevels,
+    light: EnvironmentLevels,
     table: Float64[np.ndarray, "a c 2"],
     blur: float,
     by_rgb: Float64[np.ndarray, "p 3"],
@@ -307,7 +307,7 @@ def reverse_pixels(
     first: int,
     last: int,
     surface: SurfaceArrays,
-    light: LightLevels,
+    light: EnvironmentLevels,
     table: Float64[np.ndarray, "a c 2"],
     blur: float,
     by_rgb: Float64[np.ndarray, "p 3"],

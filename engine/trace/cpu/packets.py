@@ -72,7 +72,12 @@ def find_packets(
         First ray of each packet and the one behind its last; and the rays that go alone.
     """
     count = len(rays)
-    if mode == "never" or count == 0 or (needs_color and rays.t_viewer.any()) or rays.t_leaves.any():
+    if (
+        mode == "never"
+        or count == 0
+        or (needs_color and rays.t_view_origin.any())
+        or rays.t_backface_cull.any()
+    ):
         return np.empty((0, 2), np.int64), np.arange(count)
     starts = np.empty(count + 1, np.int64)
     groups = find_packet_starts(

@@ -3,21 +3,21 @@
 Imports neither torch nor numba.
 """
 
-from octasplat.engine.train.config.densify import McmcConfig, PaperConfig
+from octasplat.engine.train.config.densify import McmcConfig, RedisplatsConfig
 from octasplat.engine.train.config.derived import (
-    MOST_PLANNED_ITERATIONS,
-    in_one_order,
+    MAX_PLANNED_ITERATIONS,
     iteration_count,
-    most_gaussians,
+    max_gaussian_count,
+    ray_patch_side_px,
     rebuild_interval,
-    window_side_px,
+    uses_shared_sort,
 )
 from octasplat.engine.train.config.learning_rates import LearningRates
-from octasplat.engine.train.config.loss import FOR_SURFACE, LossWeights
+from octasplat.engine.train.config.loss import SURFACE_DEPTH_NORMAL_WEIGHT, LossWeights
 from octasplat.engine.train.config.photographs import (
     BACKGROUND_SMOOTHNESS,
-    MISFITS_AFTER,
-    SIGHT_LINE_MARGIN,
+    OUTLIER_VIEWS_FROM,
+    VISIBILITY_RAY_MARGIN,
     Background,
     PhotographSettings,
 )
@@ -26,22 +26,22 @@ from octasplat.engine.train.config.train import TrainConfig
 
 __all__ = [
     "BACKGROUND_SMOOTHNESS",
-    "FOR_SURFACE",
-    "MISFITS_AFTER",
-    "MOST_PLANNED_ITERATIONS",
-    "SIGHT_LINE_MARGIN",
+    "SURFACE_DEPTH_NORMAL_WEIGHT",
+    "OUTLIER_VIEWS_FROM",
+    "MAX_PLANNED_ITERATIONS",
+    "VISIBILITY_RAY_MARGIN",
     "Background",
     "LearningRates",
     "LossWeights",
     "McmcConfig",
-    "PaperConfig",
+    "RedisplatsConfig",
     "PhotographSettings",
     "TrainConfig",
-    "in_one_order",
+    "uses_shared_sort",
     "iteration_count",
-    "most_gaussians",
+    "max_gaussian_count",
     "preset",
     "rebuild_interval",
-    "window_side_px",
+    "ray_patch_side_px",
     "with_materials",
 ]

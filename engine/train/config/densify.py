@@ -75,7 +75,7 @@ class McmcConfig(Settings):
     )
 
 
-class PaperConfig(Settings):
+class RedisplatsConfig(Settings):
     """Clone and split by the Adam step of the mean, prune.
 
     See :mod:`octasplat.engine.train.densify.redisplats`.

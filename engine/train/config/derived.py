@@ -4,15 +4,15 @@ import math
 
 from octasplat.engine.train.config.train import TrainConfig
 
-MOST_PLANNED_ITERATIONS = 70_000
+MAX_PLANNED_ITERATIONS = 70_000
 """Where a time decides their number, see :mod:`octasplat.engine.train.loop.time_budget`."""
-LEAST_THOUSANDS = 5
+MIN_THOUSANDS = 5
 """Of iterations, where the photographs decide their number."""
-OWN_ORDER = 3 / 7
+RAY_SORT_ITERATION_RATIO = 3 / 7
 """Share of the rays that a training has time for where each ray has an order of its own."""
 
 
-def iteration_count(config: TrainConfig, training_pixels: int, shown: float = 1.0) -> int:
+def iteration_count(config: TrainConfig, training_pixels: int, valid_fraction: float = 1.0) -> int:
     """``config.iterations``, or where that is 0 so many rays for each pixel, in whole thousands.
 
     Large scenes learn as long as there is something to see; small ones are done after 7,000 with 7 rays a
@@ -21,19 +21,19 @@ def iteration_count(config: TrainConfig, training_pixels: int, shown: float = 1.
     little and cost little, and it takes as many more; not with materials.
     """
     each = config.rays_per_pixel
-    if in_one_order(config):
-        least = max(LEAST_THOUSANDS, each)
+    if uses_shared_sort(config):
+        least = max(MIN_THOUSANDS, each)
     else:
         if not config.materials.learn:  # which have a number of their own
-            each = max(1, round(OWN_ORDER * each))
-        least = LEAST_THOUSANDS * max(1, each // 3)
+            each = max(1, round(RAY_SORT_ITERATION_RATIO * each))
+        least = MIN_THOUSANDS * max(1, each // 3)
     wanted = max(round(each * training_pixels / config.rays_per_batch / 1000), least)
     if not config.materials.learn:
-        wanted = round(wanted / shown)
+        wanted = round(wanted / valid_fraction)
     return config.iterations or min(wanted, 10 * each // 3) * 1000
 
 
-def most_gaussians(config: TrainConfig, training_pixels: int, shown: float = 1.0) -> int:
+def max_gaussian_count(config: TrainConfig, training_pixels: int, valid_fraction: float = 1.0) -> int:
     """``config.max_gaussians``, or where that is 0 what so many pixels of training views can hold down.
 
     Of those only the share counts that shows anything. More than one for each 10 pixels learn the noise of
@@ -41,12 +41,12 @@ def most_gaussians(config: TrainConfig, training_pixels: int, shown: float = 1.0
     """
     if config.max_gaussians:
         return config.max_gaussians
-    training_pixels = round(training_pixels * shown)
+    training_pixels = round(training_pixels * valid_fraction)
     wanted = max(training_pixels // config.pixels_per_gaussian, min(training_pixels // 10, 10_000), 1)
     return min(wanted, config.max_gaussians_auto)
 
 
-def in_one_order(config: TrainConfig) -> bool:
+def uses_shared_sort(config: TrainConfig) -> bool:
     """Whether the rays of a window composite in one order for a part of the training.
 
     Gradients by depths and normals, and a second phase, want each ray's own.
@@ -55,7 +55,7 @@ def in_one_order(config: TrainConfig) -> bool:
     return config.shared_sort_until > 0 and not by_geometry and config.trace.second_phase_min is None
 
 
-def window_side_px(config: TrainConfig, longest_side_px: int, pixels_a_gaussian: float) -> int:
+def ray_patch_side_px(config: TrainConfig, longest_side_px: int, pixels_a_gaussian: float) -> int:
     """``config.ray_patch_side``, or where that is 0 what suits the Gaussians or the views.
 
     A window is to cover a small angle, so that its rays meet the same Gaussians: what these cost once for all
@@ -64,7 +64,7 @@ def window_side_px(config: TrainConfig, longest_side_px: int, pixels_a_gaussian:
     if config.ray_patch_side:
         return config.ray_patch_side
     widest = max(1, round(longest_side_px / 15))
-    if not in_one_order(config):
+    if not uses_shared_sort(config):
         return widest
     return min(widest, max(1, round(math.sqrt(6 * pixels_a_gaussian))))
 

@@ -103,7 +103,7 @@ class LearningRates(Settings):
         "times as many there are; 0: never. Touch it only when changing mean or quat for long trainings.",
     )
 
-    def calmed(self, iterations: int) -> "LearningRates":
+    def scaled_for(self, iterations: int) -> "LearningRates":
         """Return the rates for a training of so many iterations: with more time, small steps go farther."""
         if self.scale_after == 0 or iterations <= self.scale_after:
             return self
@@ -111,6 +111,6 @@ class LearningRates(Settings):
         mean = min(self.mean, max(share * self.mean, self.mean_final))
         return self.model_copy(update={"mean": mean, "quat": share * self.quat})
 
-    def of_channel(self, name: str) -> float:
+    def channel_rate(self, name: str) -> float:
         """Return the rate of a named channel; 0 where it is not trained."""
         return {ALBEDO: self.albedo, METALLIC: self.metallic, ROUGHNESS: self.roughness}.get(name, 0.0)

@@ -8,7 +8,7 @@ from octasplat.engine.settings import renamed_settings
 from octasplat.engine.settings.base import Settings
 from octasplat.engine.settings.fields import ADVANCED, EXPERIMENTAL, Unit
 
-FOR_SURFACE = 0.05
+SURFACE_DEPTH_NORMAL_WEIGHT = 0.05
 """Weight of ``loss.depth_normal`` for scenes of which a surface is to be made, see ``docs/surface.md``."""
 
 
@@ -62,6 +62,6 @@ class LossWeights(Settings):
         0.0,
         ge=0,
         description="Weight of one minus the cosine between normals and what depths span; not with "
-        f"materials. Set it to {FOR_SURFACE} for scenes of which a surface is to be made; it takes about "
+        f"materials. Set it to {SURFACE_DEPTH_NORMAL_WEIGHT} for scenes of which a surface is to be made; it takes about "
         "twice as long.",
     )

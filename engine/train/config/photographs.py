@@ -9,9 +9,9 @@ from octasplat.engine.settings.fields import ADVANCED, BASIC, Unit
 
 BACKGROUND_SMOOTHNESS = 0.1
 """Weight of the differences between neighbouring texels of a learnt background."""
-MISFITS_AFTER = 0.3
+OUTLIER_VIEWS_FROM = 0.3
 """Share of the iterations after which checkpoints look for views that do not fit: earlier, all misfit."""
-SIGHT_LINE_MARGIN = 0.003
+VISIBILITY_RAY_MARGIN = 0.003
 """Distance before its sparse point at which a line of sight ends, of its length."""
 Background = Literal["auto", "black", "white", "random", "learnt"]
 
@@ -68,6 +68,6 @@ class PhotographSettings(Settings):
 
     former_settings: ClassVar = {
         "background_even": FormerSetting(BACKGROUND_SMOOTHNESS, after="background_height"),
-        "misfits_after": FormerSetting(MISFITS_AFTER, after="per_view_principal_point"),
-        "sight_line_margin": FormerSetting(SIGHT_LINE_MARGIN, after="visibility_ray_fraction"),
+        "misfits_after": FormerSetting(OUTLIER_VIEWS_FROM, after="per_view_principal_point"),
+        "sight_line_margin": FormerSetting(VISIBILITY_RAY_MARGIN, after="visibility_ray_fraction"),
     }

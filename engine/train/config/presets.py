@@ -3,13 +3,13 @@
 from octasplat.engine.core.errors import ConfigError
 from octasplat.engine.gaussians.octagon import CHI2_3_99
 from octasplat.engine.trace.protocol import TraceSettings
-from octasplat.engine.train.config.densify import McmcConfig, PaperConfig
+from octasplat.engine.train.config.densify import McmcConfig, RedisplatsConfig
 from octasplat.engine.train.config.learning_rates import LearningRates
 from octasplat.engine.train.config.loss import LossWeights
 from octasplat.engine.train.config.preset_names import PRESETS
 from octasplat.engine.train.config.train import TrainConfig
 
-TURNED_BEYOND = 0.5
+FLIP_NORMAL_COS = 0.5
 """Cosine beyond which normals that point away are turned, where materials are learnt."""
 
 
@@ -53,7 +53,7 @@ def with_materials(config: TrainConfig) -> TrainConfig:
             "early_stopping_db": 0.0,
             "densify": McmcConfig(copies="area", stop_fraction=0.4, relocate_low_weight_below=0.0),
             "initial_opacity": 0.8,
-            "trace": config.trace.model_copy(update={"flip_normal_cos": TURNED_BEYOND}),
+            "trace": config.trace.model_copy(update={"flip_normal_cos": FLIP_NORMAL_COS}),
             "max_gaussians_auto": min(config.max_gaussians_auto * 4 // 5, 80_000),
         }
     )
@@ -102,7 +102,7 @@ def preset(name: str) -> TrainConfig:
             ),
             loss=LossWeights(l1=0.0, l2=0.8, ssim=0.1),
             trace=TraceSettings(q=CHI2_3_99, transmittance_min=0.01, second_phase_min=0.01),
-            densify=PaperConfig(),
+            densify=RedisplatsConfig(),
         )
     listed = ", ".join(PRESETS)
     raise ConfigError(f"There is no preset called {name!r}; choose {listed}.")

@@ -12,7 +12,7 @@ from octasplat.engine.settings import renamed_settings
 from octasplat.engine.settings.fields import ADVANCED, EXPERIMENTAL, Unit
 from octasplat.engine.shading.material_settings import MaterialSettings
 from octasplat.engine.trace.protocol import TraceSettings
-from octasplat.engine.train.config.densify import McmcConfig, PaperConfig
+from octasplat.engine.train.config.densify import McmcConfig, RedisplatsConfig
 from octasplat.engine.train.config.gaussians import GaussianSettings
 from octasplat.engine.train.config.learning_rates import LearningRates
 from octasplat.engine.train.config.loss import LossWeights
@@ -75,7 +75,7 @@ class TrainConfig(PhotographSettings, GaussianSettings, RaySettings):
         description="Least standard deviation, in pixels of the nearest training camera, against detail that "
         "shimmers from farther away; 0 sets none.",
     )
-    densify: McmcConfig | PaperConfig = Field(
+    densify: McmcConfig | RedisplatsConfig = Field(
         McmcConfig(), discriminator="kind", description="How Gaussians come and go."
     )
     rebuild_every: Annotated[int, Unit("iterations"), ADVANCED] = Field(

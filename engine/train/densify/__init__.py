@@ -1,15 +1,17 @@
 """Strategies that add, move and remove Gaussians while training, behind one protocol."""
 
-from octasplat.engine.train.config import McmcConfig, PaperConfig
-from octasplat.engine.train.densify.mcmc import Mcmc
+from octasplat.engine.train.config import McmcConfig, RedisplatsConfig
+from octasplat.engine.train.densify.mcmc import McmcDensifier
 from octasplat.engine.train.densify.protocol import Densifier
-from octasplat.engine.train.densify.redisplats import Paper
+from octasplat.engine.train.densify.redisplats import RedisplatsDensifier
 
-__all__ = ["Densifier", "Mcmc", "Paper", "make_densifier"]
+__all__ = ["Densifier", "McmcDensifier", "RedisplatsDensifier", "make_densifier"]
 
 
-def make_densifier(config: McmcConfig | PaperConfig, *, iterations: int, max_gaussians: int) -> Densifier:
+def make_densifier(
+    config: McmcConfig | RedisplatsConfig, *, iterations: int, max_gaussians: int
+) -> Densifier:
     """The strategy that ``config`` describes, for so many iterations and at most so many Gaussians."""
     if isinstance(config, McmcConfig):
-        return Mcmc(config, iterations=iterations, max_gaussians=max_gaussians)
-    return Paper(config, iterations=iterations, max_gaussians=max_gaussians)
+        return McmcDensifier(config, iterations=iterations, max_gaussians=max_gaussians)
+    return RedisplatsDensifier(config, iterations=iterations, max_gaussians=max_gaussians)

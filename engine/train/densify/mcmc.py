@@ -16,14 +16,14 @@ from octasplat.engine.train.optimization.adam import Adam
 MAX_COPIES = 32
 
 
-def shared_opacity(
+def split_opacity(
     opacity: Float64[np.ndarray, " n"], copies: Int64[np.ndarray, " n"]
 ) -> Float64[np.ndarray, " n"]:
     """Opacity of each of ``copies`` equal Gaussians that together are as opaque as one was: 1-(1-a)^(1/N)."""
     return 1.0 - (1.0 - opacity) ** (1.0 / copies)
 
 
-def shared_scale(
+def split_scale_factor(
     opacity: Float64[np.ndarray, " n"], copies: Int64[np.ndarray, " n"]
 ) -> Float64[np.ndarray, " n"]:
     """Factor on the scales of ``copies`` coincident Gaussians that keeps the integral of what they cover.
@@ -31,7 +31,7 @@ def shared_scale(
     a / sum_{i=1..N} sum_{k=0..i-1} C(i-1,k) (-1)^k a'^(k+1) / sqrt(k+1), a' = 1-(1-a)^(1/N)
     (the paper's Eq. 9).
     """
-    shared = shared_opacity(opacity, copies)
+    shared = split_opacity(opacity, copies)
     factor = np.ones_like(opacity)
     for n in np.unique(copies):
         which = copies == n
@@ -43,7 +43,7 @@ def shared_scale(
     return factor
 
 
-class Mcmc:
+class McmcDensifier:
     """Moves dead Gaussians to, and adds new ones at, places chosen by opacity and by the error seen there.
 
     A chosen Gaussian and its copies share its opacity and shrink, or keep its opacity and share its area;
@@ -65,7 +65,7 @@ class Mcmc:
         )
         self._errors: Float32[np.ndarray, " n"]
         self._weights: Float32[np.ndarray, " n"]
-        self._begin(0)
+        self._reset_sums(0)
 
     def observe(
         self, count: int, gradients: GaussianGradients, mean_steps_world: Float32[np.ndarray, "u 3"]
@@ -74,13 +74,13 @@ class Mcmc:
         if not self.wants_errors:
             return
         if len(self._errors) != count:
-            self._begin(count)
+            self._reset_sums(count)
         self._errors[gradients.ids] += gradients.error_sums
         self._weights[gradients.ids] += gradients.weight_sums
 
-    def due(self, iteration: int) -> bool:
+    def is_due(self, iteration: int) -> bool:
         """Every ``interval`` iterations between the start and the stop; in rounds once the cap is reached."""
-        every = self._round if self._moves_idle(len(self._errors)) else self._config.interval
+        every = self._round if self._relocates_low_weight(len(self._errors)) else self._config.interval
         return self._config.start <= iteration <= self._stop and iteration % every == 0
 
     def apply(
@@ -91,11 +91,11 @@ class Mcmc:
         opacities = gaussians.opacities.astype(np.float64)
         alive = opacities > config.dead_opacity
         errors, weights = self._errors, self._weights
-        self._begin(count)
+        self._reset_sums(count)
         if not alive.any():
             return gaussians, adam
-        if self._moves_idle(count) and len(weights) == count and errors.any():
-            return self._move(gaussians, adam, alive, errors, weights, rng)
+        if self._relocates_low_weight(count) and len(weights) == count and errors.any():
+            return self._relocate(gaussians, adam, alive, errors, weights, rng)
         score = np.where(alive, opacities, 0.0)
         if config.error_power > 0 and len(errors) == count and errors.any():
             score = np.where(alive, errors.astype(np.float64) ** config.error_power, 0.0)
@@ -105,17 +105,17 @@ class Mcmc:
         if wanted == 0 or score.sum() <= 0:
             return gaussians, adam
         chosen = rng.choice(count, size=wanted, p=score / score.sum())
-        sources, made = self._copies(gaussians, chosen, config.copies == "area", rng)
+        sources, made = self._make_copies(gaussians, chosen, config.copies == "area", rng)
         adam.reset(sources)
         gaussians.put(dead, made.view(slice(len(dead))))
         adam.reset(dead)
         if born == 0:
             return gaussians, adam
         new = made.select(np.arange(len(dead), wanted))
-        self._begin(count + born)
-        return concatenate([gaussians, new]), adam.append(Adam.fresh(new))
+        self._reset_sums(count + born)
+        return concatenate([gaussians, new]), adam.append(Adam.zeros(new))
 
-    def _move(
+    def _relocate(
         self, gaussians: FlatGaussians, adam: Adam, alive: Bool[np.ndarray, " n"],
         errors: Float32[np.ndarray, " n"], weights: Float32[np.ndarray, " n"], rng: np.random.Generator,
     ) -> tuple[FlatGaussians, Adam]:  # fmt: skip
@@ -124,20 +124,20 @@ class Mcmc:
         Drawn without putting back: through a veil before half of the pictures most of the error may be seen,
         and a hundred copies of it would be a wall.
         """
-        alive[self._idle(weights)] = False
+        alive[self._low_weight_ids(weights)] = False
         seen = np.flatnonzero(alive & (errors > 0))
         free = np.flatnonzero(~alive)[: len(seen)]
         if len(free) == 0:
             return gaussians, adam
         late = rng.exponential(size=len(seen)) / errors[seen]  # the first to come of so many, at such rates
         chosen = seen[np.sort(np.argpartition(late, len(free) - 1)[: len(free)])]
-        sources, made = self._copies(gaussians, chosen, True, rng)
+        sources, made = self._make_copies(gaussians, chosen, True, rng)
         adam.reset(sources)
         gaussians.put(free, made)
         adam.reset(free)
         return gaussians, adam
 
-    def _copies(
+    def _make_copies(
         self, gaussians: FlatGaussians, chosen: Int64[np.ndarray, " w"], area: bool, rng: np.random.Generator
     ) -> tuple[Int64[np.ndarray, " s"], FlatGaussians]:
         """Which are chosen, and a scattered copy each time; they share their area or their opacity."""
@@ -148,9 +148,9 @@ class Mcmc:
             shrunk = -0.5 * np.log(copies[sources])
         else:
             a = np.clip(gaussians.opacities[sources].astype(np.float64), 1e-4, 1 - 1e-4)
-            new_a = np.maximum(shared_opacity(a, copies[sources]), self._config.dead_opacity * 1.5)
+            new_a = np.maximum(split_opacity(a, copies[sources]), self._config.dead_opacity * 1.5)
             gaussians.opacity_logits[sources] = np.log(new_a / (1 - new_a))
-            shrunk = np.log(shared_scale(a, copies[sources]))
+            shrunk = np.log(split_scale_factor(a, copies[sources]))
         gaussians.log_scales[sources] += shrunk[:, None].astype(np.float32)
         made = gaussians.select(chosen)
         spread = rng.standard_normal((len(chosen), 2)) * (scales if area else made.scales)
@@ -170,15 +170,15 @@ class Mcmc:
         """Take the sums back."""
         self._errors, self._weights = state["errors"], state["weights"]
 
-    def _begin(self, count: int) -> None:
+    def _reset_sums(self, count: int) -> None:
         """Sums of nothing yet."""
         self._errors, self._weights = np.zeros(count, np.float32), np.zeros(count, np.float32)
 
-    def _moves_idle(self, count: int) -> bool:
+    def _relocates_low_weight(self, count: int) -> bool:
         """Whether that many are all that there may be, and the idle are moved then."""
         return self._config.relocate_low_weight_below > 0 and count >= self._cap
 
-    def _idle(self, weights: Float32[np.ndarray, " n"]) -> Int64[np.ndarray, " m"]:
+    def _low_weight_ids(self, weights: Float32[np.ndarray, " n"]) -> Int64[np.ndarray, " m"]:
         """Those of least weight."""
         most = int(self._config.relocate_low_weight_fraction * len(weights))
         least = np.argsort(weights, kind="stable")[:most]

@@ -19,7 +19,7 @@ from octasplat.engine.gaussians.model import SH_C0, FlatGaussians
 from octasplat.engine.shading.material_settings import (
     PROPAGATION_EVERY,
     PROPAGATION_UNTIL,
-    SEED_SECOND_STAGE,
+    REF_GAUSSIAN_DEFERRED_FROM,
     Recipe,
 )
 from octasplat.engine.trace.protocol import GaussianGradients
@@ -27,18 +27,24 @@ from octasplat.engine.train.densify.protocol import Densifier
 from octasplat.engine.train.optimization.adam import Adam
 
 NEIGHBOURS = 12
-LEAST_COSINE = 0.9
+MIN_COSINE = 0.9
 """Normals farther apart belong to two surfaces."""
-OFF_PLANE = 0.3
+MAX_PLANE_DISTANCE = 0.3
 """Distance from a Gaussian's plane, of that to its neighbours, from which on another surface is likely."""
-UNLIKE = 0.15
+MAX_COLOR_DIFFERENCE = 0.15
 """Difference of albedo or metallic from which on another thing is likely."""
-LEAST_TRUST = 0.1
+MIN_TRUST = 0.1
 """What a matt Gaussian's normal counts against 1 of a perfect mirror's."""
-SEED_OPACITY, SEED_GROWTH, SEED_METALLIC, SEED_ROUGHNESS, SEED_NOISE = 0.9, 1.5, 0.02, 0.01, 0.4
+(
+    REF_GAUSSIAN_OPACITY,
+    REF_GAUSSIAN_GROWTH,
+    REF_GAUSSIAN_METALLIC,
+    REF_GAUSSIAN_ROUGHNESS,
+    REF_GAUSSIAN_NOISE,
+) = 0.9, 1.5, 0.02, 0.01, 0.4
 
 
-class Propagating:
+class NormalPropagation:
     """Another strategy, with propagation now and then, after it.
 
     Args:
@@ -62,21 +68,21 @@ class Propagating:
         """The strategy inside takes note."""
         self._inner.observe(count, gradients, mean_steps_world)
 
-    def due(self, iteration: int) -> bool:
+    def is_due(self, iteration: int) -> bool:
         """When the strategy inside says so, or it is time to propagate."""
         self._iteration = iteration
-        return self._inner.due(iteration) or self._propagates(iteration)
+        return self._inner.is_due(iteration) or self._is_due(iteration)
 
     def apply(
         self, gaussians: FlatGaussians, adam: Adam, rng: np.random.Generator, *, extent: float
     ) -> tuple[FlatGaussians, Adam]:
         """Do what is due."""
         iteration = self._iteration
-        if self._inner.due(iteration):
+        if self._inner.is_due(iteration):
             gaussians, adam = self._inner.apply(gaussians, adam, rng, extent=extent)
-        if self._propagates(iteration) and len(gaussians) > NEIGHBOURS:
+        if self._is_due(iteration) and len(gaussians) > NEIGHBOURS:
             if self._recipe == "ref_gaussian":
-                self._spread(gaussians, rng, progress=iteration / self._total)
+                self._propagate_ref_gaussian(gaussians, rng, training_progress=iteration / self._total)
             else:
                 propagate_normals(gaussians)
         return gaussians, adam
@@ -93,19 +99,21 @@ class Propagating:
         """Take it back."""
         self._inner.restore(state)
 
-    def _propagates(self, iteration: int) -> bool:
+    def _is_due(self, iteration: int) -> bool:
         return iteration <= self._until and iteration % self._every == 0
 
-    def _spread(self, gaussians: FlatGaussians, rng: np.random.Generator, *, progress: float) -> None:
+    def _propagate_ref_gaussian(
+        self, gaussians: FlatGaussians, rng: np.random.Generator, *, training_progress: float
+    ) -> None:
         """What the seed's code does."""
-        raised = np.float32(np.log(SEED_OPACITY / (1 - SEED_OPACITY)))
+        raised = np.float32(np.log(REF_GAUSSIAN_OPACITY / (1 - REF_GAUSSIAN_OPACITY)))
         gaussians.opacity_logits[:] = np.maximum(gaussians.opacity_logits, raised)
-        metallic = gaussians.channels[METALLIC][:, 0] >= SEED_METALLIC
-        smooth = gaussians.channels[ROUGHNESS][:, 0] <= SEED_ROUGHNESS
-        gaussians.log_scales[metallic & smooth] += np.float32(np.log(SEED_GROWTH))
-        if progress >= SEED_SECOND_STAGE:
+        metallic = gaussians.channels[METALLIC][:, 0] >= REF_GAUSSIAN_METALLIC
+        smooth = gaussians.channels[ROUGHNESS][:, 0] <= REF_GAUSSIAN_ROUGHNESS
+        gaussians.log_scales[metallic & smooth] += np.float32(np.log(REF_GAUSSIAN_GROWTH))
+        if training_progress >= REF_GAUSSIAN_DEFERRED_FROM:
             matt = np.flatnonzero(~metallic)
-            noise = rng.uniform(-SEED_NOISE, SEED_NOISE, (len(matt), 3)) / SH_C0
+            noise = rng.uniform(-REF_GAUSSIAN_NOISE, REF_GAUSSIAN_NOISE, (len(matt), 3)) / SH_C0
             gaussians.sh[matt, 0] += noise.astype(np.float32)
 
 
@@ -120,21 +128,24 @@ def propagate_normals(gaussians: FlatGaussians) -> None:
     distances, near = cKDTree(means).query(means, NEIGHBOURS + 1)
     reach = np.maximum(distances[:, NEIGHBOURS // 2], 1e-12)[:, None]
     shown = gaussians.channels[METALLIC][:, 0] * (1 - gaussians.channels[ROUGHNESS][:, 0])
-    trust = gaussians.opacities * (LEAST_TRUST + shown)
+    trust = gaussians.opacities * (MIN_TRUST + shown)
     cosine = np.einsum("ni,nki->nk", normals, normals[near])
-    off = np.einsum("ni,nki->nk", normals, means[near] - means[:, None]) / (OFF_PLANE * reach)
-    looks = np.concatenate([gaussians.channels[ALBEDO], gaussians.channels[METALLIC]], axis=1) / UNLIKE
+    off = np.einsum("ni,nki->nk", normals, means[near] - means[:, None]) / (MAX_PLANE_DISTANCE * reach)
+    looks = (
+        np.concatenate([gaussians.channels[ALBEDO], gaussians.channels[METALLIC]], axis=1)
+        / MAX_COLOR_DIFFERENCE
+    )
     unlike = ((looks[near] - looks[:, None]) ** 2).sum(axis=2)
     weights = trust[near] * np.exp(-0.5 * ((distances / reach) ** 2 + off**2 + unlike))
-    weights = np.where(np.abs(cosine) > LEAST_COSINE, weights, 0.0) * np.sign(cosine)
+    weights = np.where(np.abs(cosine) > MIN_COSINE, weights, 0.0) * np.sign(cosine)
     mean = np.einsum("nk,nki->ni", weights, normals[near])
     length = np.linalg.norm(mean, axis=1, keepdims=True)
     mean = np.where(length > 0, mean / np.maximum(length, 1e-12), normals)
-    turned = np.einsum("nij,njk->nik", _turns(normals, mean), frames)
+    turned = np.einsum("nij,njk->nik", _rotations_between(normals, mean), frames)
     gaussians.quats_wxyz[:] = quaternions_from_matrices(turned).astype(np.float32)
 
 
-def _turns(
+def _rotations_between(
     before: Float64[np.ndarray, "n 3"], after: Float64[np.ndarray, "n 3"]
 ) -> Float64[np.ndarray, "n 3 3"]:
     """The smallest rotations that take unit vectors to others which are not opposite to them."""

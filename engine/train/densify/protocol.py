@@ -26,7 +26,7 @@ class Densifier(Protocol):
         """Take note of one iteration over ``count`` Gaussians."""
         ...
 
-    def due(self, iteration: int) -> bool:
+    def is_due(self, iteration: int) -> bool:
         """Whether :meth:`apply` is to be called after this iteration (counted from 1)."""
         ...
 

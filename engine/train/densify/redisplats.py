@@ -8,11 +8,11 @@ from jaxtyping import Float32, Int64
 
 from octasplat.engine.gaussians.model import FlatGaussians, concatenate
 from octasplat.engine.trace.protocol import GaussianGradients
-from octasplat.engine.train.config import PaperConfig
+from octasplat.engine.train.config import RedisplatsConfig
 from octasplat.engine.train.optimization.adam import Adam
 
 
-class Paper:
+class RedisplatsDensifier:
     """Duplicates a Gaussian whose mean makes a long Adam step at the densification iteration.
 
     A small one is cloned: the copy stays where the mean was before the step. A large one is split in two
@@ -23,7 +23,7 @@ class Paper:
 
     wants_errors = False
 
-    def __init__(self, config: PaperConfig, *, iterations: int, max_gaussians: int) -> None:
+    def __init__(self, config: RedisplatsConfig, *, iterations: int, max_gaussians: int) -> None:
         self._config = config
         self._stop = int(config.stop_fraction * iterations)
         self._cap = max_gaussians
@@ -38,7 +38,7 @@ class Paper:
         self._steps[:] = 0
         self._steps[gradients.ids] = mean_steps_world
 
-    def due(self, iteration: int) -> bool:
+    def is_due(self, iteration: int) -> bool:
         """Every ``interval`` iterations between the start and the stop."""
         return self._config.start <= iteration <= self._stop and iteration % self._config.interval == 0
 

@@ -2,13 +2,13 @@
 
 from octasplat.engine.dataset import Dataset
 from octasplat.engine.train.config import TrainConfig
-from octasplat.engine.train.initialization.initial_background import first_background
-from octasplat.engine.train.initialization.initial_gaussians import initial_gaussians, with_first_materials
-from octasplat.engine.train.loop.state import TrainState, fresh_state
-from octasplat.engine.train.shading_factory import background_of, make_shading
+from octasplat.engine.train.initialization.initial_background import estimate_background
+from octasplat.engine.train.initialization.initial_gaussians import add_initial_materials, initial_gaussians
+from octasplat.engine.train.loop.state import TrainState, initial_state
+from octasplat.engine.train.shading_factory import find_background, make_shading
 
 
-def first_state(dataset: Dataset, config: TrainConfig, *, threads: int = 1) -> TrainState:
+def initial_scene(dataset: Dataset, config: TrainConfig, *, threads: int = 1) -> TrainState:
     """The first Gaussians, their materials and the first background, as far as these are learnt.
 
     Args:
@@ -19,14 +19,14 @@ def first_state(dataset: Dataset, config: TrainConfig, *, threads: int = 1) -> T
     Raises:
         DatasetError: nothing says where Gaussians could begin.
     """
-    behind = first_background(dataset) if config.background == "learnt" else None
-    first = initial_gaussians(dataset, config, threads=threads, behind=behind)
+    behind = estimate_background(dataset) if config.background == "learnt" else None
+    first = initial_gaussians(dataset, config, threads=threads, background=behind)
     if config.materials.learn:
-        first = with_first_materials(first, config.materials)
-    state = fresh_state(first, config.seed)
+        first = add_initial_materials(first, config.materials)
+    state = initial_state(first, config.seed)
     shading = make_shading(config, len(dataset.views), dataset.extent)
-    background = background_of(shading)
+    background = find_background(shading)
     if behind is not None and background is not None:
-        background.put(behind.enlarged(config.background_height))
+        background.set_map(behind.resize(config.background_height))
         state.shading = shading.state()
     return state

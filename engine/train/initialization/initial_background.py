@@ -16,20 +16,20 @@ from scipy.spatial import cKDTree
 from octasplat.engine.dataset import Camera
 from octasplat.engine.dataset.model import SparsePoints
 from octasplat.engine.dataset.view_frusta import cam_from_world, is_in_image
-from octasplat.engine.shading.background import LearntBackground
+from octasplat.engine.shading.background import LearnedBackground
 from octasplat.engine.train.sampling.pixel_sampler import TrainingData
 
 ROWS = 64
 """Of the first map; finer ones are interpolated."""
-EMPTY_SHARE = 0.05
+MIN_EMPTY_FRACTION = 0.05
 """A pixel farther than this share of the picture's longer side from all points is one of nothing near."""
-LEAST_VIEWS = 2
+MIN_VIEWS = 2
 """So many photographs must show nothing near in a direction."""
-MOST_POINTS = 50_000
+MAX_POINTS = 50_000
 """Of more points, evenly spaced ones are looked at."""
-MOST_VIEWS = 96
+MAX_VIEWS = 96
 """Of more photographs, evenly spaced ones are looked at."""
-SOFT_TEXELS = (2.0, 6.0)
+BLUR_TEXELS = (2.0, 6.0)
 """How softly what no photograph shows goes on from what is known, down and across."""
 
 
@@ -42,7 +42,7 @@ class MappedPhotographs(TrainingData, Protocol):
 
 
 @dataclass(frozen=True, eq=False)
-class FirstBackground:
+class InitialBackground:
     """A map to begin from.
 
     Attributes:
@@ -50,42 +50,42 @@ class FirstBackground:
         up_world: about which way is up, of any length.
     """
 
-    map: LearntBackground
+    map: LearnedBackground
     up_world: Float64[np.ndarray, "3"]
 
-    def may_show(self, directions_world: Float64[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
+    def is_above_horizon(self, directions_world: Float64[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
         """Whether directions are above the horizon, where what is far away is."""
         return np.asarray(_cosines(directions_world, self.up_world) > 0)
 
-    def enlarged(self, height: int) -> Float32[np.ndarray, "h w 3"]:
+    def resize(self, height: int) -> Float32[np.ndarray, "h w 3"]:
         """The map with so many rows."""
-        directions = _directions(LearntBackground(height))
-        return self.map.colours(directions.astype(np.float32)).reshape(height, 2 * height, 3)
+        directions = _texel_directions(LearnedBackground(height))
+        return self.map.lookup(directions.astype(np.float32)).reshape(height, 2 * height, 3)
 
 
-def first_background(dataset: MappedPhotographs) -> FirstBackground:
+def estimate_background(dataset: MappedPhotographs) -> InitialBackground:
     """The first map of the photographs that are trained on."""
-    background = LearntBackground(ROWS)
-    directions = _directions(background)
+    background = LearnedBackground(ROWS)
+    directions = _texel_directions(background)
     train = dataset.train_indices
-    chosen = train[np.unique(np.linspace(0, len(train) - 1, MOST_VIEWS).astype(np.int64))]
-    step = max(1, -(-len(dataset.points) // MOST_POINTS))
+    chosen = train[np.unique(np.linspace(0, len(train) - 1, MAX_VIEWS).astype(np.int64))]
+    step = max(1, -(-len(dataset.points) // MAX_POINTS))
     points = dataset.points.xyz_world[::step].astype(np.float64)
-    seen = [_seen(dataset, index, directions, points) for index in chosen.tolist()]
+    seen = [_visible_texels(dataset, index, directions, points) for index in chosen.tolist()]
     texel, rgb, empty = (np.concatenate(parts) for parts in zip(*seen, strict=True))
     count = 2 * ROWS * ROWS
     shown, shown_by = _medians(texel, rgb, count)
     far, far_by = _medians(texel[empty], rgb[empty], count)
     # Floors have no points either, close to the camera.
-    found = FirstBackground(background, _up_world(dataset))
-    is_far = (far_by >= LEAST_VIEWS) & found.may_show(directions)
+    found = InitialBackground(background, _up_world(dataset))
+    is_far = (far_by >= MIN_VIEWS) & found.is_above_horizon(directions)
     known = is_far | (shown_by > 0)
     colours = np.where(is_far[:, None], far, shown).reshape(ROWS, 2 * ROWS, 3)
-    background.put(_filled(colours, known.reshape(ROWS, 2 * ROWS)))
+    background.set_map(_fill_unknown(colours, known.reshape(ROWS, 2 * ROWS)))
     return found
 
 
-def _directions(background: LearntBackground) -> Float64[np.ndarray, "t 3"]:
+def _texel_directions(background: LearnedBackground) -> Float64[np.ndarray, "t 3"]:
     """The middle of each texel as a world direction."""
     height, width = background.rgb_srgb.shape[:2]
     polar = np.pi * (np.arange(height)[:, None] + 0.5) / height
@@ -108,7 +108,7 @@ def _cosines(
     return np.asarray(sum(directions[:, k] * axis[k] for k in range(3)))
 
 
-def _seen(
+def _visible_texels(
     dataset: MappedPhotographs,
     index: int,
     directions: Float64[np.ndarray, "t 3"],
@@ -127,7 +127,7 @@ def _seen(
     points_px = camera.project(points_cam[is_in_image(points_cam, camera)]).reshape(-1, 2)
     empty = np.ones(len(texel), np.bool_)
     if len(points_px):
-        reach = EMPTY_SHARE * max(view.width_px, view.height_px)
+        reach = MIN_EMPTY_FRACTION * max(view.width_px, view.height_px)
         empty = cKDTree(points_px).query(pixels_px, distance_upper_bound=reach)[0] > reach
     valid = weight > 0
     return texel[valid], rgb[valid], empty[valid]
@@ -146,7 +146,7 @@ def _medians(
     return medians, found
 
 
-def _filled(
+def _fill_unknown(
     colours: Float32[np.ndarray, "h w 3"], known: Bool[np.ndarray, "h w"]
 ) -> Float32[np.ndarray, "h w 3"]:
     """The map with what is not known taken, blurred, from the nearest texel that is; its sides meet."""
@@ -156,5 +156,5 @@ def _filled(
     around = np.tile(known, (1, 3))
     row, column = distance_transform_edt(~around, return_distances=False, return_indices=True)
     nearest = colours[row, column % width][:, width : 2 * width]
-    soft = gaussian_filter(nearest, (*SOFT_TEXELS, 0), mode=("nearest", "wrap", "nearest"))
+    soft = gaussian_filter(nearest, (*BLUR_TEXELS, 0), mode=("nearest", "wrap", "nearest"))
     return np.where(known[..., None], nearest, soft)

@@ -15,52 +15,54 @@ from octasplat.engine.gaussians.frames import frames_from_normals, quaternions_f
 from octasplat.engine.gaussians.materials import AMBIENT, DIFFUSE_INTERREFLECTION, MATERIAL_WIDTHS
 from octasplat.engine.gaussians.model import SH_C0, FlatGaussians
 from octasplat.engine.shading.material_settings import (
-    FIRST_ALBEDO,
-    FIRST_METALLIC,
-    FIRST_ROUGHNESS,
+    INITIAL_ALBEDO,
+    INITIAL_METALLIC,
+    INITIAL_ROUGHNESS,
     MaterialSettings,
 )
-from octasplat.engine.train.config import TrainConfig, most_gaussians
-from octasplat.engine.train.initialization.initial_background import FirstBackground
-from octasplat.engine.train.initialization.plane_sweep import dense_points
-from octasplat.engine.train.sampling.shown import shown_share
-from octasplat.engine.train.views.exposure_changes import evening_gains
+from octasplat.engine.train.config import TrainConfig, max_gaussian_count
+from octasplat.engine.train.initialization.initial_background import InitialBackground
+from octasplat.engine.train.initialization.plane_sweep import plane_sweep_points
+from octasplat.engine.train.sampling.shown import valid_pixel_fraction
+from octasplat.engine.train.views.exposure_changes import equalizing_gains
 
 MIN_POINTS = 50
 """Fewer sparse points than this are no use to begin from; random ones are taken."""
 NEIGHBOURS = 3
-MAX_ANGLE = 0.3
+MAX_ANGULAR_SIZE = 0.3
 """Largest scale as seen from the nearest camera, in radians."""
-SWEPT_ANGLE = 0.015
+PLANE_SWEEP_MAX_ANGULAR_SIZE = 0.015
 """That of points at depths that no other point suggested: where these are wrong, they hide little."""
-FARTHEST = 50.0
+MAX_DISTANCE = 50.0
 """Points farther from the cameras than this many extents are matching errors."""
 
 
 def initial_gaussians(
-    dataset: Dataset, config: TrainConfig, *, threads: int = 1, behind: FirstBackground | None = None
+    dataset: Dataset, config: TrainConfig, *, threads: int = 1, background: InitialBackground | None = None
 ) -> FlatGaussians:
     """The first Gaussians: on the sparse points, or on random rays where there are too few of them.
 
-    Pixels that show what is ``behind`` everything are not lifted.
+    Pixels that show what is ``background`` everything are not lifted.
     """
     rng = np.random.Generator(np.random.PCG64([config.seed, 2]))
     points = dataset.points
-    most_of_all = most_gaussians(config, dataset.train_pixel_count, shown_share(dataset))
+    most_of_all = max_gaussian_count(config, dataset.train_pixel_count, valid_pixel_fraction(dataset))
     limit = min(config.initial_points, most_of_all)
     if len(points.xyz_world) >= MIN_POINTS:
         centres = np.stack([dataset.views[i].origin_world for i in dataset.train_indices])
         xyz, rgb = points.xyz_world, points.rgb_srgb
-        most = np.full(len(xyz), MAX_ANGLE)
+        most = np.full(len(xyz), MAX_ANGULAR_SIZE)
         if config.plane_sweep_init and len(xyz) < limit:
-            gains = evening_gains(dataset) if config.exposure is True else None
-            more = dense_points(
+            gains = equalizing_gains(dataset) if config.exposure is True else None
+            more = plane_sweep_points(
                 dataset, limit - len(xyz), rng,
-                threads=threads, behind=behind, gains=gains, unseen=config.plane_sweep_unseen,
+                threads=threads, background=background, gains=gains, unseen=config.plane_sweep_unseen,
             )  # fmt: skip
             xyz, rgb = np.concatenate([xyz, more.xyz_world]), np.concatenate([rgb, more.rgb_srgb])
-            most = np.concatenate([most, np.where(more.swept, SWEPT_ANGLE, MAX_ANGLE)])
-        return from_points(
+            most = np.concatenate(
+                [most, np.where(more.swept, PLANE_SWEEP_MAX_ANGULAR_SIZE, MAX_ANGULAR_SIZE)]
+            )
+        return gaussians_from_points(
             xyz,
             rgb,
             centres,
@@ -75,7 +77,7 @@ def initial_gaussians(
     rays = dataset.rays(view, y, x)
     rgb, alpha, weight = dataset.pixels(view, y, x)
     seen = (weight > 0) & (alpha > 0)
-    return from_rays(
+    return gaussians_from_rays(
         rays.origins_world[seen],
         rays.directions_world[seen],
         rgb[seen],
@@ -85,9 +87,9 @@ def initial_gaussians(
     )
 
 
-def with_first_materials(gaussians: FlatGaussians, settings: MaterialSettings) -> FlatGaussians:
+def add_initial_materials(gaussians: FlatGaussians, settings: MaterialSettings) -> FlatGaussians:
     """The same Gaussians with the materials that a training begins with, all alike."""
-    values = (FIRST_ALBEDO,) * 3, (FIRST_METALLIC,), (FIRST_ROUGHNESS,)
+    values = (INITIAL_ALBEDO,) * 3, (INITIAL_METALLIC,), (INITIAL_ROUGHNESS,)
     first = dict(zip(MATERIAL_WIDTHS, values, strict=True)) | {AMBIENT: (1.0,)}
     if settings.recipe == "split_sum" and settings.diffuse_interreflection:
         first[DIFFUSE_INTERREFLECTION] = (0.0,) * 3
@@ -96,7 +98,7 @@ def with_first_materials(gaussians: FlatGaussians, settings: MaterialSettings) -
     )
 
 
-def from_points(
+def gaussians_from_points(
     xyz_world: Float32[np.ndarray, "n 3"],
     rgb_srgb: Float32[np.ndarray, "n 3"],
     camera_centres_world: Float64[np.ndarray, "c 3"],
@@ -113,10 +115,10 @@ def from_points(
     The scales are the mean distance to the three nearest points; the normal is that of the plane through
     the ``plane_points`` nearest where they lie on one, else it looks at the cameras. More than ``limit``
     points are thinned at random. ``most_angles`` are the largest scales as seen from the nearest camera,
-    radians; None for ``MAX_ANGLE``.
+    radians; None for ``MAX_ANGULAR_SIZE``.
     """
     centre = np.median(camera_centres_world, axis=0)
-    far = np.linalg.norm(xyz_world - centre, axis=1) > FARTHEST * extent
+    far = np.linalg.norm(xyz_world - centre, axis=1) > MAX_DISTANCE * extent
     keep = np.flatnonzero(~far & np.isfinite(xyz_world).all(axis=1))
     if len(keep) > limit:
         keep = np.sort(rng.choice(keep, limit, replace=False))
@@ -137,7 +139,7 @@ def from_points(
     )
     # One point alone in front of a camera would hide everything.
     to_camera = cKDTree(camera_centres_world).query(points)[0]
-    most = MAX_ANGLE if most_angles is None else most_angles[keep]
+    most = MAX_ANGULAR_SIZE if most_angles is None else most_angles[keep]
     spacing = np.minimum(spacing, np.maximum(most * to_camera, 1e-5 * extent))
     normals = _unit(centre - points)
     if wanted == plane_points + 1:
@@ -149,7 +151,7 @@ def from_points(
     return _assemble(points, normals, spacing, rgb_srgb[keep], opacity)
 
 
-def from_rays(
+def gaussians_from_rays(
     origins_world: Float32[np.ndarray, "n 3"],
     directions_world: Float32[np.ndarray, "n 3"],
     rgb_srgb: Float32[np.ndarray, "n 3"],

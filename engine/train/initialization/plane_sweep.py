@@ -24,58 +24,62 @@ from jaxtyping import Bool, Float32, Float64, Int64
 from scipy.spatial import cKDTree
 
 from octasplat.engine.dataset import Dataset
-from octasplat.engine.train.initialization.initial_background import FirstBackground
-from octasplat.engine.train.initialization.plane_sweep_points import Evidence, LiftedPoints, borne_out
+from octasplat.engine.train.initialization.initial_background import InitialBackground
+from octasplat.engine.train.initialization.plane_sweep_points import (
+    MatchEvidence,
+    PlaneSweepPoints,
+    is_confirmed,
+)
 from octasplat.engine.train.kernels.patch_costs import patch_differences
-from octasplat.engine.train.sampling.shown import shown_share
+from octasplat.engine.train.sampling.shown import valid_pixel_fraction
 
-GUESSES = 6
+DEPTH_HYPOTHESES = 6
 """Depths tried for a pixel: those of the nearest points in the image."""
 NEIGHBOURS = 4
 """Views in which a guess is judged; the better half of them counts, since the rest may be hidden."""
 ROUNDS = 3
 STEP_PX = 2
 OFFSETS_PX = STEP_PX * np.array([[x, y] for x in (0, 1, -1) for y in (0, 1, -1)], np.int64)
-SWEPT = 24
+SWEEP_DEPTHS = 24
 """Depths that are tried besides, in equal ratios from near to far, each moved at random within its step."""
-DOUBTFUL = 0.01
+MAX_AMBIGUOUS_COST = 0.01
 """Pixels that match better than that at the depth of a point are not tried at others."""
-CLEARLY = 0.7
+MAX_RIVALRY = 0.7
 """A depth that no point suggests must match so much better."""
-NEAREST, NEAR_SHARE = 10, 0.7
+NEAR_RANK, NEAR_FACTOR = 10, 0.7
 """The sweep begins at this share of the depth of so many nearest points, of which fewer may be wrong."""
-FARTHEST, FAR_SHARE = 0.98, 1.5
+FAR_QUANTILE, FAR_FACTOR = 0.98, 1.5
 """It ends at so many times the depth that this share of the points lies before."""
 MAX_COST = 0.06
 """Mean difference of colour, in display values, above which no guess counts as right."""
-AS_WELL = 0.005
+BACKGROUND_COST_MARGIN = 0.005
 """A pixel that matches infinitely far away about as well as at any guess shows the sky."""
-INFINITY = 1e6
+BACKGROUND_DEPTH = 1e6
 """So many times the largest depth."""
 LEVEL_WEIGHT = 0.3
 """Weight of a difference in brightness against one in texture."""
-LEAST_COSINE = 0.5
+MIN_VIEW_COSINE = 0.5
 """Neighbouring views look less than 60 degrees another way."""
 BASELINE = 0.05
 """Distance of a good neighbouring view, of that to the points: less tells depths badly apart, more shows
 other things."""
-FOR_ONE, MOST_FOR_ONE = 1.6, 10.0
+SAMPLES_PER_POINT, MAX_SAMPLES_PER_POINT = 1.6, 10.0
 """Pixels that show something are drawn for each point; and at the most, with those that show nothing."""
-OWN_SPAN, LEAST_OBSERVED = 4.0, 10
+OBSERVED_SPAN, MIN_OBSERVED = 4.0, 10
 """The points are taken to be as far from a view as their middle is, but within this factor of the median
 distance of those that it is known to show, if these are so many: a long capture has its middle anywhere.
 """
-JURY = 24
+VOTING_VIEWS = 24
 """Views that vote on each point, spread evenly over all, or nearest to its own where few of these look."""
-LEAST_LOOKING = 3
+MIN_VOTERS = 3
 """Jurors that must look towards a point."""
-AGREES = 0.12
+MAX_VOTE_DIFFERENCE = 0.12
 """Largest mean difference of colour, in display values, of a view that agrees."""
-MAJORITY = 0.3
+MIN_VOTE_FRACTION = 0.3
 """Share of the views looking there that must agree: a point in free space hides other things in most."""
-SWEPT_AGREES, SWEPT_MAJORITY = 0.1, 0.4
+SWEEP_MAX_VOTE_DIFFERENCE, SWEEP_MIN_VOTE_FRACTION = 0.1, 0.4
 """The same of points at depths that no other point suggested."""
-BEHIND = 1.2
+OCCLUSION_FACTOR = 1.2
 """Such points beyond so many times the depth that others suggest are wrong: something nearer was known."""
 
 
@@ -112,16 +116,16 @@ class _Patches:
         return _Patches(origin, *(row[which] for row in rows))
 
 
-def dense_points(
+def plane_sweep_points(
     dataset: Dataset,
     count: int,
     rng: np.random.Generator,
     *,
     threads: int = 1,
-    behind: FirstBackground | None = None,
+    background: InitialBackground | None = None,
     gains: Float32[np.ndarray, " v"] | None = None,
     unseen: bool = False,
-) -> LiftedPoints:
+) -> PlaneSweepPoints:
     """About ``count`` points or fewer beside those of the sparse model.
 
     Args:
@@ -129,7 +133,7 @@ def dense_points(
         count: points wanted.
         rng: draws the pixels.
         threads: work on the views side by side, which changes no point.
-        behind: what is behind everything; pixels that show it give no points.
+        background: what is behind everything; pixels that show it give no points.
         gains: factors on the display colours of each view, after which all are exposed alike; None for 1.
         unseen: whether pixels whose place no two neighbouring views show, so that nothing can be matched, are
             lifted, too: to a depth between those of the points around.
@@ -137,36 +141,38 @@ def dense_points(
     photographs = _Photographs(dataset, gains)
     known = dataset.points.xyz_world.astype(np.float64)
     neighbours = _neighbouring_views(dataset, known)
-    lifted = LiftedPoints.joined([])
-    for_one = min(FOR_ONE / shown_share(dataset), MOST_FOR_ONE)
+    lifted = PlaneSweepPoints.concatenate([])
+    for_one = min(SAMPLES_PER_POINT / valid_pixel_fraction(dataset), MAX_SAMPLES_PER_POINT)
     for round_number in range(ROUNDS):
         # Pixels that no guess fits are lost, and those that show nothing: draw some more.
         wanted = round(for_one * (count - len(lifted)) / (ROUNDS - round_number))
-        per_view = rng.multinomial(max(0, wanted), _areas(dataset))
+        per_view = rng.multinomial(max(0, wanted), _view_areas(dataset))
         generators = rng.spawn(len(per_view))  # one a view, so that their order does not matter
         jobs = list(zip(dataset.train_indices.tolist(), per_view.tolist(), generators, strict=True))
 
         def lift(
             job: tuple[int, int, np.random.Generator], known: np.ndarray = known
-        ) -> tuple[LiftedPoints, Evidence]:
+        ) -> tuple[PlaneSweepPoints, MatchEvidence]:
             index, samples, generator = job
-            return _lift(photographs, index, samples, known, neighbours[index], generator, behind, unseen)
+            return _lift_pixels(
+                photographs, index, samples, known, neighbours[index], generator, background, unseen
+            )
 
         with ThreadPoolExecutor(threads) as pool:
             parts = list(pool.map(lift, jobs))
-            found = LiftedPoints.joined([points for points, _ in parts])
-            evidence = Evidence.joined([e for _, e in parts])
-            elected = _elected(photographs, found, evidence.view, pool)
+            found = PlaneSweepPoints.concatenate([points for points, _ in parts])
+            evidence = MatchEvidence.concatenate([e for _, e in parts])
+            elected = _passes_vote(photographs, found, evidence.view, pool)
         found, evidence = found[elected], evidence[elected]
-        found = found[~found.swept | borne_out(found, evidence, known)]
-        lifted = LiftedPoints.joined([lifted, found])
+        found = found[~found.swept | is_confirmed(found, evidence, known)]
+        lifted = PlaneSweepPoints.concatenate([lifted, found])
         known = np.concatenate([known, found.xyz_world])
     if len(lifted) > count:
         lifted = lifted[np.sort(rng.choice(len(lifted), count, replace=False))]
     return lifted
 
 
-def _areas(dataset: Dataset) -> Float64[np.ndarray, " t"]:
+def _view_areas(dataset: Dataset) -> Float64[np.ndarray, " t"]:
     areas = np.array(
         [dataset.views[i].width_px * dataset.views[i].height_px for i in dataset.train_indices], np.float64
     )
@@ -185,9 +191,9 @@ def _neighbouring_views(dataset: Dataset, points: Float64[np.ndarray, "n 3"]) ->
         distance = np.linalg.norm(centres - centres[k], axis=1)
         reach = float(np.linalg.norm(middle - centres[k]))
         if own[index] > 0:
-            reach = min(max(reach, own[index] / OWN_SPAN), own[index] * OWN_SPAN)
+            reach = min(max(reach, own[index] / OBSERVED_SPAN), own[index] * OBSERVED_SPAN)
         wanted = BASELINE * reach
-        usable = (axes @ axes[k] > LEAST_COSINE) & (distance > 0.1 * wanted)
+        usable = (axes @ axes[k] > MIN_VIEW_COSINE) & (distance > 0.1 * wanted)
         unfit = np.abs(np.log(np.maximum(distance, 1e-12) / max(wanted, 1e-12)))
         order = np.argsort(np.where(usable, unfit, np.inf), kind="stable")
         result[index] = [train[j] for j in order[:NEIGHBOURS] if usable[j]]
@@ -206,61 +212,63 @@ def _observed_distances(dataset: Dataset) -> Float64[np.ndarray, " v"]:
     away = np.linalg.norm(points.xyz_world[row].astype(np.float64) - origins[seen.view], axis=1)
     for index in range(len(result)):
         own = away[known & (seen.view == index)]
-        if len(own) >= LEAST_OBSERVED:
+        if len(own) >= MIN_OBSERVED:
             result[index] = np.median(own)
     return result
 
 
-def _lift(
+def _lift_pixels(
     photographs: _Photographs,
     index: int,
     samples: int,
     points: Float64[np.ndarray, "k 3"],
     neighbours: list[int],
     rng: np.random.Generator,
-    behind: FirstBackground | None,
+    behind: InitialBackground | None,
     unseen: bool,
-) -> tuple[LiftedPoints, Evidence]:
+) -> tuple[PlaneSweepPoints, MatchEvidence]:
     """Points for random pixels of one view."""
     dataset = photographs.dataset
-    nothing = LiftedPoints.joined([]), Evidence(np.empty(0, np.int64), np.empty(0), np.empty(0))
+    nothing = PlaneSweepPoints.concatenate([]), MatchEvidence(np.empty(0, np.int64), np.empty(0), np.empty(0))
     projected_px, depths = _project(dataset, index, points)
-    inside = _inside(dataset, index, projected_px) & (depths > 0)
-    if samples == 0 or not neighbours or inside.sum() < GUESSES:
+    inside = _is_inside(dataset, index, projected_px) & (depths > 0)
+    if samples == 0 or not neighbours or inside.sum() < DEPTH_HYPOTHESES:
         return nothing
-    patches = _draw(photographs, index, samples, rng)
+    patches = _draw_patches(photographs, index, samples, rng)
     if len(patches.y) == 0:
         return nothing
     pixels_px = np.stack([patches.x + 0.5, patches.y + 0.5], axis=1)
-    away_px, nearest = cKDTree(projected_px[inside]).query(pixels_px, GUESSES)
+    away_px, nearest = cKDTree(projected_px[inside]).query(pixels_px, DEPTH_HYPOTHESES)
     suggested = depths[inside][nearest]
-    depth, cost = _best(suggested, _costs(photographs, patches, suggested, neighbours))
-    doubtful = np.flatnonzero(cost > DOUBTFUL)
+    depth, cost = _best_hypothesis(suggested, _hypothesis_costs(photographs, patches, suggested, neighbours))
+    doubtful = np.flatnonzero(cost > MAX_AMBIGUOUS_COST)
     more = _sweep(depths[inside], len(doubtful), rng)
-    more_costs = _costs(photographs, patches[doubtful], more, neighbours)
-    other, other_cost = _best(more, more_costs)
+    more_costs = _hypothesis_costs(photographs, patches[doubtful], more, neighbours)
+    other, other_cost = _best_hypothesis(more, more_costs)
     swept = np.zeros(len(depth), np.bool_)
-    swept[doubtful] = other_cost < CLEARLY * np.minimum(cost[doubtful], MAX_COST)
+    swept[doubtful] = other_cost < MAX_RIVALRY * np.minimum(cost[doubtful], MAX_COST)
     chosen = swept[doubtful]
     good = cost < MAX_COST
-    good[swept] = other[chosen] < BEHIND * depth[swept]
+    good[swept] = other[chosen] < OCCLUSION_FACTOR * depth[swept]
     depth[swept], cost[swept] = other[chosen], other_cost[chosen]
     rivalry = np.ones(len(depth))
-    rivalry[swept] = _rivalry(more_costs[chosen])
+    rivalry[swept] = _cost_ratio(more_costs[chosen])
     alone = np.isinf(cost) & unseen
-    depth[alone] = _depths_between(suggested[alone], away_px[alone])
+    depth[alone] = _interpolate_depths(suggested[alone], away_px[alone])
     good |= alone
     if behind is not None:
-        at_infinity = _cost(photographs, patches, np.full(len(depth), INFINITY * depth.max()), neighbours)
-        as_well = alone | (at_infinity < cost + AS_WELL)
-        good &= ~(as_well & behind.may_show(patches.directions_world[:, 0]))
+        at_infinity = _cost(
+            photographs, patches, np.full(len(depth), BACKGROUND_DEPTH * depth.max()), neighbours
+        )
+        as_well = alone | (at_infinity < cost + BACKGROUND_COST_MARGIN)
+        good &= ~(as_well & behind.is_above_horizon(patches.directions_world[:, 0]))
     distance = depth * patches.depth_factors[:, 0]
     xyz = patches.origin_world + distance[:, None] * patches.directions_world[:, 0]
-    lifted = LiftedPoints(xyz.astype(np.float32), patches.rgb_srgb[:, 0], swept)
-    return lifted[good], Evidence(np.full(len(depth), index), distance, rivalry)[good]
+    lifted = PlaneSweepPoints(xyz.astype(np.float32), patches.rgb_srgb[:, 0], swept)
+    return lifted[good], MatchEvidence(np.full(len(depth), index), distance, rivalry)[good]
 
 
-def _costs(
+def _hypothesis_costs(
     photographs: _Photographs,
     patches: _Patches,
     guesses: Float64[np.ndarray, "n g"],
@@ -270,7 +278,7 @@ def _costs(
     return np.stack([_cost(photographs, patches, guess, neighbours) for guess in guesses.T], axis=1)
 
 
-def _best(
+def _best_hypothesis(
     guesses: Float64[np.ndarray, "n g"], costs: Float64[np.ndarray, "n g"]
 ) -> tuple[Float64[np.ndarray, " n"], Float64[np.ndarray, " n"]]:
     """The guess of each patch that matches best, and its cost."""
@@ -278,14 +286,14 @@ def _best(
     return np.take_along_axis(guesses, best, 1)[:, 0], np.take_along_axis(costs, best, 1)[:, 0]
 
 
-def _rivalry(costs: Float64[np.ndarray, "n g"]) -> Float64[np.ndarray, " n"]:
+def _cost_ratio(costs: Float64[np.ndarray, "n g"]) -> Float64[np.ndarray, " n"]:
     """The least cost over the next that is more than one step away; depths are in order."""
     best = np.argmin(costs, axis=1)[:, None]
     beside = np.abs(np.arange(costs.shape[1]) - best) <= 1
     return np.asarray(costs.min(axis=1) / np.maximum(np.where(beside, np.inf, costs).min(axis=1), 1e-12))
 
 
-def _depths_between(
+def _interpolate_depths(
     depths: Float64[np.ndarray, "n g"], away_px: Float64[np.ndarray, "n g"]
 ) -> Float64[np.ndarray, " n"]:
     """Mean depths, in logarithms, weighted by the inverse of the squared distance in the image."""
@@ -298,13 +306,13 @@ def _sweep(
 ) -> Float64[np.ndarray, "n g"]:
     """Depths for ``count`` pixels of a view whose points lie at ``depths``."""
     ordered = np.sort(depths)
-    near = NEAR_SHARE * ordered[min(NEAREST, len(ordered) - 1)]
-    far = FAR_SHARE * ordered[int(FARTHEST * (len(ordered) - 1))]
-    steps = (np.arange(SWEPT) + rng.random((count, SWEPT))) / SWEPT
+    near = NEAR_FACTOR * ordered[min(NEAR_RANK, len(ordered) - 1)]
+    far = FAR_FACTOR * ordered[int(FAR_QUANTILE * (len(ordered) - 1))]
+    steps = (np.arange(SWEEP_DEPTHS) + rng.random((count, SWEEP_DEPTHS))) / SWEEP_DEPTHS
     return np.asarray(near * (far / near) ** steps)
 
 
-def _draw(photographs: _Photographs, index: int, samples: int, rng: np.random.Generator) -> _Patches:
+def _draw_patches(photographs: _Photographs, index: int, samples: int, rng: np.random.Generator) -> _Patches:
     """Random pixels that count, away from the border, with those around them."""
     dataset = photographs.dataset
     view = dataset.views[index]
@@ -341,7 +349,7 @@ def _cost(
     costs = np.full((len(neighbours), count), np.inf)
     for k, other in enumerate(neighbours):
         where_px, depth = _project(dataset, other, points.reshape(-1, 3))
-        shown = (_inside(dataset, other, where_px) & (depth > 0)).reshape(count, offsets)
+        shown = (_is_inside(dataset, other, where_px) & (depth > 0)).reshape(count, offsets)
         inside = np.flatnonzero(shown.all(axis=1))
         if not len(inside):
             continue
@@ -355,15 +363,15 @@ def _cost(
     return np.asarray(used.mean(axis=0))
 
 
-def _elected(
+def _passes_vote(
     photographs: _Photographs,
-    points: LiftedPoints,
+    points: PlaneSweepPoints,
     own_view: Int64[np.ndarray, " n"],
     pool: ThreadPoolExecutor,
 ) -> Bool[np.ndarray, " n"]:
     """Return whether enough of the views that look towards each point show its colour there."""
-    limits = np.where(points.swept, SWEPT_AGREES, AGREES)
-    majority = np.where(points.swept, SWEPT_MAJORITY, MAJORITY)
+    limits = np.where(points.swept, SWEEP_MAX_VOTE_DIFFERENCE, MAX_VOTE_DIFFERENCE)
+    majority = np.where(points.swept, SWEEP_MIN_VOTE_FRACTION, MIN_VOTE_FRACTION)
     agree, looking = np.zeros(len(points), np.int64), np.zeros(len(points), np.int64)
     dataset = photographs.dataset
     train, xyz_world = dataset.train_indices, points.xyz_world.astype(np.float64)
@@ -371,26 +379,26 @@ def _elected(
     def vote(juror: tuple[int, np.ndarray | slice]) -> tuple[np.ndarray, np.ndarray]:
         index, rows = juror
         where_px, depth = _project(dataset, index, xyz_world[rows])
-        inside = np.flatnonzero(_inside(dataset, index, where_px) & (depth > 0))
+        inside = np.flatnonzero(_is_inside(dataset, index, where_px) & (depth > 0))
         pixel = np.floor(where_px[inside]).astype(np.int64)
         rgb, _, _ = photographs.pixels(np.full(len(inside), index), pixel[:, 1], pixel[:, 0])
         which = inside if isinstance(rows, slice) else rows[inside]
         return which, np.abs(rgb - points.rgb_srgb[which]).mean(axis=1) < limits[which]
 
-    jury = train[np.unique(np.linspace(0, len(train) - 1, JURY).astype(np.int64))].tolist()
+    jury = train[np.unique(np.linspace(0, len(train) - 1, VOTING_VIEWS).astype(np.int64))].tolist()
     for which, agrees in pool.map(vote, [(index, slice(None)) for index in jury]):
         looking[which] += 1
         agree[which] += agrees
     if len(jury) < len(train):
-        unseen = np.flatnonzero(looking < LEAST_LOOKING)
+        unseen = np.flatnonzero(looking < MIN_VOTERS)
         looking[unseen] = agree[unseen] = 0
-        for which, agrees in pool.map(vote, _near_jurors(dataset, own_view, unseen)):
+        for which, agrees in pool.map(vote, _voting_views(dataset, own_view, unseen)):
             looking[which] += 1
             agree[which] += agrees
     return np.asarray(agree >= majority * np.maximum(looking, 1))
 
 
-def _near_jurors(
+def _voting_views(
     dataset: Dataset, own_view: Int64[np.ndarray, " n"], rows: Int64[np.ndarray, " k"]
 ) -> list[tuple[int, Int64[np.ndarray, "_"]]]:
     """Return training views and the rows of points that they vote on: those of the nearest other views."""
@@ -399,7 +407,7 @@ def _near_jurors(
     jurors = []
     for index in np.unique(own_view[rows]).tolist():
         away = np.linalg.norm(centres - dataset.views[index].origin_world, axis=1)
-        near = train[np.argsort(away, kind="stable")[: JURY + 1]]
+        near = train[np.argsort(away, kind="stable")[: VOTING_VIEWS + 1]]
         mine = rows[own_view[rows] == index]
         jurors += [(juror, mine) for juror in near.tolist() if juror != index]
     return jurors
@@ -414,7 +422,7 @@ def _project(
     return dataset.cameras[view.camera_index].project(points_cam), points_cam[:, 2]
 
 
-def _inside(dataset: Dataset, index: int, where_px: Float64[np.ndarray, "n 2"]) -> Bool[np.ndarray, " n"]:
+def _is_inside(dataset: Dataset, index: int, where_px: Float64[np.ndarray, "n 2"]) -> Bool[np.ndarray, " n"]:
     view = dataset.views[index]
     x, y = where_px[:, 0], where_px[:, 1]  # what is not-a-number lies nowhere
     with np.errstate(invalid="ignore"):

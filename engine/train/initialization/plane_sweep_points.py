@@ -10,15 +10,15 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int64
 from scipy.spatial import cKDTree
 
-BESIDE = 0.03
+NEAR_SPARSE_POINT = 0.03
 """Something known nearer than that, as a share of the distance to the own camera, bears a point out."""
-SAME_PLACE, WITNESSES, CLEAR = 0.04, 3, 0.5
+SAME_POINT, MIN_CONFIRMATIONS, MAX_RIVALRY = 0.04, 3, 0.5
 """So do pixels of so many other views that were lifted to within the first share of that distance, where the
 own pixel matches clearly: its rivalry is below the last."""
 
 
 @dataclass(frozen=True, eq=False)
-class LiftedPoints:
+class PlaneSweepPoints:
     """Points from pixels.
 
     Attributes:
@@ -34,12 +34,12 @@ class LiftedPoints:
     def __len__(self) -> int:
         return len(self.xyz_world)
 
-    def __getitem__(self, which: np.ndarray) -> "LiftedPoints":
+    def __getitem__(self, which: np.ndarray) -> "PlaneSweepPoints":
         """Some of them, by number or by a mask."""
-        return LiftedPoints(self.xyz_world[which], self.rgb_srgb[which], self.swept[which])
+        return PlaneSweepPoints(self.xyz_world[which], self.rgb_srgb[which], self.swept[which])
 
     @classmethod
-    def joined(cls, parts: Sequence["LiftedPoints"]) -> "LiftedPoints":
+    def concatenate(cls, parts: Sequence["PlaneSweepPoints"]) -> "PlaneSweepPoints":
         """One part after the other; none of no parts."""
         nothing = np.empty((0, 3), np.float32)
         parts = [cls(nothing, nothing, np.empty(0, np.bool_)), *parts]
@@ -51,7 +51,7 @@ class LiftedPoints:
 
 
 @dataclass(frozen=True, eq=False)
-class Evidence:
+class MatchEvidence:
     """What tells whether to believe points: whose pixels they were, and how clearly these matched.
 
     ``view`` is one of the dataset's, and ``distance`` that to its camera. Of swept depths, ``rivalry`` is the
@@ -62,19 +62,19 @@ class Evidence:
     distance: Float64[np.ndarray, " n"]
     rivalry: Float64[np.ndarray, " n"]
 
-    def __getitem__(self, which: np.ndarray) -> "Evidence":
-        return Evidence(*(row[which] for row in vars(self).values()))
+    def __getitem__(self, which: np.ndarray) -> "MatchEvidence":
+        return MatchEvidence(*(row[which] for row in vars(self).values()))
 
     @classmethod
-    def joined(cls, parts: Sequence["Evidence"]) -> "Evidence":
+    def concatenate(cls, parts: Sequence["MatchEvidence"]) -> "MatchEvidence":
         """One part after the other."""
         columns = zip(*(vars(part).values() for part in parts), strict=True)
         return cls(*(np.concatenate(column) for column in columns))
 
 
-def borne_out(
-    found: LiftedPoints,
-    evidence: Evidence,
+def is_confirmed(
+    found: PlaneSweepPoints,
+    evidence: MatchEvidence,
     known: Float64[np.ndarray, "k 3"],
 ) -> Bool[np.ndarray, " n"]:
     """Of points at swept depths, whether something else says that they are right; of others, false.
@@ -90,14 +90,14 @@ def borne_out(
         return right
     xyz, seen = found.xyz_world[swept].astype(np.float64), evidence[swept]
     beside, _ = cKDTree(known).query(xyz)
-    same_place = _witnesses(xyz, seen) >= WITNESSES
-    right[swept] = (beside < BESIDE * seen.distance) | (same_place & (seen.rivalry < CLEAR))
+    same_place = _confirmations(xyz, seen) >= MIN_CONFIRMATIONS
+    right[swept] = (beside < NEAR_SPARSE_POINT * seen.distance) | (same_place & (seen.rivalry < MAX_RIVALRY))
     return right
 
 
-def _witnesses(xyz_world: Float64[np.ndarray, "n 3"], seen: Evidence) -> Int64[np.ndarray, " n"]:
+def _confirmations(xyz_world: Float64[np.ndarray, "n 3"], seen: MatchEvidence) -> Int64[np.ndarray, " n"]:
     """How many other views have a point at the same place as each."""
-    near = cKDTree(xyz_world).query_ball_point(xyz_world, SAME_PLACE * seen.distance)
+    near = cKDTree(xyz_world).query_ball_point(xyz_world, SAME_POINT * seen.distance)
     mine = np.repeat(np.arange(len(near)), [len(others) for others in near])
     views = seen.view[np.concatenate(near).astype(np.int64)]
     pairs = np.unique(np.stack([mine, views], axis=1)[views != seen.view[mine]], axis=0)

@@ -12,17 +12,17 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64
 
-from octasplat.engine.core.errors import CheckpointError, DamagedCheckpoint
-from octasplat.engine.core.events import Listener, Warned
-from octasplat.engine.core.writing import replacing
+from octasplat.engine.core.errors import CheckpointError, DamagedCheckpointError
+from octasplat.engine.core.events import EventListener, Warned
+from octasplat.engine.core.writing import atomic_replace
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.gaussians.rows import from_row_arrays, row_arrays
 from octasplat.engine.train.loop.state import TrainState
 from octasplat.engine.train.optimization.adam import Adam
-from octasplat.engine.train.optimization.weight_averaging import RunningMean
+from octasplat.engine.train.optimization.weight_averaging import WeightAverage
 
-FORMAT = 6
-KEEP = 2
+CHECKPOINT_FORMAT = 6
+KEPT_CHECKPOINTS = 2
 _PREFIX = "iteration_"
 _GROUPS = ("gaussians", "adam", "average", "densifier", "shading", "poses")
 # What reading a damaged archive may raise; a flipped bit can ask for encryption or a lengthy array.
@@ -52,7 +52,7 @@ def save_checkpoint(state: TrainState, folder: Path, fingerprint: str) -> Path:
     """
     path = checkpoint_path(folder, state.iteration)
     meta = {
-        "format": FORMAT,
+        "format": CHECKPOINT_FORMAT,
         "fingerprint": fingerprint,
         "iteration": state.iteration,
         "rng": state.rng.bit_generator.state,
@@ -60,10 +60,10 @@ def save_checkpoint(state: TrainState, folder: Path, fingerprint: str) -> Path:
         "running_mse": state.running_mse,
         "best_psnr": state.best_psnr if np.isfinite(state.best_psnr) else None,
         "best_iteration": state.best_iteration,
-        "left_out": state.left_out.tolist(),
-        "probed": state.probed,
-        "hastened_after": state.hastened_after,
-        "taken_near": state.taken_near,
+        "left_out": state.excluded_views.tolist(),
+        "probed": state.probes,
+        "hastened_after": state.early_stop_at,
+        "taken_near": state.pruned_near_cameras,
         "averaged": state.average.count,
     }
     arrays: dict[str, Any] = {
@@ -77,11 +77,11 @@ def save_checkpoint(state: TrainState, folder: Path, fingerprint: str) -> Path:
     if len(state.pose_corrections):
         arrays["poses.corrections"] = state.pose_corrections
     meta["arrays"] = sorted(arrays)
-    with replacing(path) as temporary:
+    with atomic_replace(path) as temporary:
         np.savez(temporary, meta=np.array(json.dumps(meta)), **arrays)
     for left in folder.glob(".*.partial.npz"):  # of runs that were killed while they wrote
         left.unlink()
-    for old in sorted(folder.glob(f"{_PREFIX}*.npz"))[:-KEEP]:
+    for old in sorted(folder.glob(f"{_PREFIX}*.npz"))[:-KEPT_CHECKPOINTS]:
         old.unlink()
     return path
 
@@ -96,16 +96,16 @@ def load_checkpoint(path: Path, fingerprint: str) -> TrainState:
     try:
         arrays = _read_arrays(path)
         meta = json.loads(str(arrays.pop("meta")))
-        if meta.get("format") != FORMAT or meta["fingerprint"] != fingerprint:
+        if meta.get("format") != CHECKPOINT_FORMAT or meta["fingerprint"] != fingerprint:
             raise CheckpointError(
                 f"{path} belongs to other settings or other photographs; "
                 "give the settings it was made with, or choose another output folder."
             )
         if sorted(arrays) != meta["arrays"]:
             raise ValueError("arrays are missing")
-        groups = _grouped(arrays)
+        groups = _group_arrays(arrays)
     except _DAMAGE as error:
-        raise DamagedCheckpoint(
+        raise DamagedCheckpointError(
             f"{path} is damaged ({error}); delete it to go on from the one before it."
         ) from None
     rng = np.random.Generator(np.random.PCG64())
@@ -122,16 +122,16 @@ def load_checkpoint(path: Path, fingerprint: str) -> TrainState:
         running_mse=meta["running_mse"],
         best_psnr=-np.inf if meta["best_psnr"] is None else meta["best_psnr"],
         best_iteration=meta["best_iteration"],
-        left_out=np.array(meta["left_out"], np.int64),
-        probed=[(iteration, psnr) for iteration, psnr in meta["probed"]],
-        hastened_after=meta["hastened_after"],
-        taken_near=meta["taken_near"],
+        excluded_views=np.array(meta["left_out"], np.int64),
+        probes=[(iteration, psnr) for iteration, psnr in meta["probed"]],
+        early_stop_at=meta["hastened_after"],
+        pruned_near_cameras=meta["taken_near"],
         pose_corrections=groups["poses"].get("corrections", np.zeros((0, 6))),
-        average=RunningMean(mean, meta["averaged"]),
+        average=WeightAverage(mean, meta["averaged"]),
     )
 
 
-def newest_state(folder: Path, fingerprint: str, tell: Listener) -> TrainState | None:
+def load_latest_checkpoint(folder: Path, fingerprint: str, progress: EventListener) -> TrainState | None:
     """The newest checkpoint, if there is any; a damaged one is passed over for the one before.
 
     Raises:
@@ -140,8 +140,8 @@ def newest_state(folder: Path, fingerprint: str, tell: Listener) -> TrainState |
     while (path := latest_checkpoint(folder)) is not None:
         try:
             return load_checkpoint(path, fingerprint)
-        except DamagedCheckpoint as error:
-            tell(Warned(str(error)))
+        except DamagedCheckpointError as error:
+            progress(Warned(str(error)))
             path.unlink()
     return None
 
@@ -168,7 +168,7 @@ def save_best(best: BestState, folder: Path) -> None:
     }
     arrays |= {f"shading.{name}": value for name, value in best.shading.items()}
     arrays["poses.corrections"] = best.pose_corrections
-    with replacing(folder / "best.npz") as temporary:
+    with atomic_replace(folder / "best.npz") as temporary:
         np.savez(temporary, **arrays)
 
 
@@ -180,14 +180,14 @@ def load_best(folder: Path) -> BestState:
     """
     path = folder / "best.npz"
     try:
-        groups = _grouped(_read_arrays(path))
+        groups = _group_arrays(_read_arrays(path))
         gaussians = from_row_arrays(FlatGaussians, groups["gaussians"])
         return BestState(gaussians, groups["shading"], groups["poses"]["corrections"])
     except _DAMAGE as error:
         raise CheckpointError(f"{path} cannot be read ({error}); train again without --resume.") from None
 
 
-def _grouped(arrays: Mapping[str, np.ndarray]) -> dict[str, dict[str, np.ndarray]]:
+def _group_arrays(arrays: Mapping[str, np.ndarray]) -> dict[str, dict[str, np.ndarray]]:
     """Arrays by what comes before the first dot of their names, then by the rest."""
     groups: dict[str, dict[str, np.ndarray]] = {name: {} for name in _GROUPS}
     for name, array in arrays.items():

@@ -14,7 +14,7 @@ from octasplat.engine.gaussians.model import FlatGaussians
 
 
 @dataclass(frozen=True, eq=False)
-class ScaleFloor:
+class MinScale:
     """No standard deviation is smaller than so much of a pixel of the nearest training camera.
 
     Attributes:
@@ -25,7 +25,7 @@ class ScaleFloor:
     origins_world: Float64[np.ndarray, "c 3"]
     angle_rad: float
 
-    def hold(self, gaussians: FlatGaussians) -> None:
+    def apply(self, gaussians: FlatGaussians) -> None:
         """Raise the scales that are smaller, in place."""
         away = cKDTree(self.origins_world).query(gaussians.means_world)[0]
         floor = np.log(np.maximum(self.angle_rad * away, 1e-12)).astype(np.float32)

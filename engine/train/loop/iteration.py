@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from octasplat.engine.core.errors import TrainingFailure
-from octasplat.engine.shading.protocol import ShadingModel, Sight
+from octasplat.engine.core.errors import TrainingError
+from octasplat.engine.shading.protocol import ShadingModel, TracedRays
 from octasplat.engine.trace.gradient_sums import add_gradients, drop_low_weight
 from octasplat.engine.trace.protocol import GaussianGradients, Tracer
 from octasplat.engine.train.config import LossWeights, TrainConfig
@@ -17,14 +17,14 @@ from octasplat.engine.train.densify import Densifier
 from octasplat.engine.train.loop.state import TrainState
 from octasplat.engine.train.optimization.losses import BatchLoss, batch_loss, ray_errors
 from octasplat.engine.train.sampling.batches import Batch
-from octasplat.engine.train.sampling.visibility_rays import blocked_term
+from octasplat.engine.train.sampling.visibility_rays import free_space_gradient
 
-RUNNING = 0.98
+MSE_SMOOTHING = 0.98
 """Weight of the past in the smoothed squared error."""
 
 
 @dataclass(frozen=True)
-class Machinery:
+class TrainComponents:
     """What works on the state."""
 
     tracer: Tracer
@@ -33,7 +33,7 @@ class Machinery:
 
 
 @dataclass(frozen=True)
-class Differentiated:
+class LossGradients:
     """A loss on one batch with its gradients.
 
     Attributes:
@@ -49,16 +49,16 @@ class Differentiated:
     hits_per_ray: float
 
 
-def differentiate(
+def loss_and_gradients(
     batch: Batch,
     tracer: Tracer,
     shading: ShadingModel,
     weights: LossWeights,
     *,
-    progress: float,
+    training_progress: float,
     with_errors: bool = False,
-    least_weight: float = 0.0,
-) -> Differentiated:
+    min_blend_weight: float = 0.0,
+) -> LossGradients:
     """The loss of the Gaussians that ``tracer`` holds, and its gradients; changes nothing.
 
     Args:
@@ -66,50 +66,50 @@ def differentiate(
         tracer: built around the Gaussians.
         shading: makes photographs of what is traced.
         weights: of the loss terms.
-        progress: share of the training that is done.
+        training_progress: share of the training that is done.
         with_errors: share the rays' errors out to their Gaussians.
-        least_weight: Gaussians whose weights over all rays add up to less get no gradients.
+        min_blend_weight: Gaussians whose weights over all rays add up to less get no gradients.
     """
     seen = tracer.trace(batch.rays, record=True)
     assert seen.recording is not None
-    sight = Sight(batch.rays, seen, tracer, batch.view, progress, windows=batch.windows)
-    developed = shading.develop(sight)
-    render = developed.over(batch.background_srgb)
+    sight = TracedRays(batch.rays, seen, tracer, batch.view, training_progress, ray_patches=batch.ray_patches)
+    developed = shading.shade(sight)
+    render = developed.composite_over(batch.background_srgb)
     loss = batch_loss(render, batch, weights)
-    back = shading.reverse(sight, developed, loss.gradient, loss.gradient @ batch.background_srgb)
-    by_seen = back.seen
+    back = shading.backward(sight, developed, loss.gradient, loss.gradient @ batch.background_srgb)
+    by_seen = back.trace
     if with_errors:
         by_seen = replace(by_seen, ray_errors=ray_errors(render, batch.target_srgb, batch.weight))
-    recorded = [(seen.recording, by_seen), *back.further]
-    if batch.sight_lines is not None:
-        recorded.append(blocked_term(batch.sight_lines, tracer, weights.free_space))
-    least = least_weight if len(recorded) == 1 else 0.0  # what several say has to be added up first
+    recorded = [(seen.recording, by_seen), *back.recorded_traces]
+    if batch.visibility_rays is not None:
+        recorded.append(free_space_gradient(batch.visibility_rays, tracer, weights.free_space))
+    least = min_blend_weight if len(recorded) == 1 else 0.0  # what several say has to be added up first
     parts = [tracer.backward(hits, by, min_blend_weight=least).numpy() for hits, by in recorded]
-    return Differentiated(
+    return LossGradients(
         loss=loss,
-        gaussians=drop_low_weight(add_gradients(parts), least_weight),
+        gaussians=drop_low_weight(add_gradients(parts), min_blend_weight),
         shading=back.parameters,
         hits_per_ray=float(seen.hit_counts.mean()),
     )
 
 
-def iterate(
+def train_step(
     state: TrainState,
     batch: Batch,
-    machinery: Machinery,
+    components: TrainComponents,
     config: TrainConfig,
     *,
-    progress: float,
+    training_progress: float,
     extent: float,
-) -> Differentiated:
+) -> LossGradients:
     """One step downhill; changes ``state`` and tells the tracer of it.
 
     Args:
         state: Gaussians and their optimiser.
         batch: what to look at.
-        machinery: the tracer, built around the state's Gaussians, and what else takes part.
+        components: the tracer, built around the state's Gaussians, and what else takes part.
         config: rates and weights.
-        progress: 0 at the first iteration, 1 at the last.
+        training_progress: 0 at the first iteration, 1 at the last.
         extent: scene extent, world units.
 
     Returns:
@@ -118,25 +118,25 @@ def iterate(
     Raises:
         TrainingFailure: the loss is no number.
     """
-    tracer, shading = machinery.tracer, machinery.shading
-    densifier = machinery.densifier
-    found = differentiate(
+    tracer, shading = components.tracer, components.shading
+    densifier = components.densifier
+    found = loss_and_gradients(
         batch, tracer, shading, config.loss,
-        progress=progress, with_errors=densifier.wants_errors, least_weight=config.min_blend_weight,
+        training_progress=training_progress, with_errors=densifier.wants_errors, min_blend_weight=config.min_blend_weight,
     )  # fmt: skip
     if not np.isfinite(found.loss.value):
-        raise TrainingFailure(
+        raise TrainingError(
             f"The loss became {found.loss.value} at iteration {state.iteration + 1}; lower the learning "
             "rates (--set lr.mean=...) or look for damaged photographs. The last checkpoint is kept."
         )
     gradients = found.gaussians
     moved = state.adam.step(
-        state.gaussians, gradients, config.lr, config.loss, progress=progress, extent=extent
+        state.gaussians, gradients, config.lr, config.loss, training_progress=training_progress, extent=extent
     )
-    shading.step(state.gaussians, gradients, found.shading, progress=progress)
+    shading.step(state.gaussians, gradients, found.shading, training_progress=training_progress)
     tracer.refresh(gradients.ids)
     densifier.observe(len(state.gaussians), gradients, moved)
     state.iteration += 1
-    keep = min(RUNNING, 1 - 1 / state.iteration)
+    keep = min(MSE_SMOOTHING, 1 - 1 / state.iteration)
     state.running_mse = keep * state.running_mse + (1 - keep) * found.loss.squared_error
     return found

@@ -6,17 +6,17 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
 from octasplat.engine.train.config import (
-    MISFITS_AFTER,
+    OUTLIER_VIEWS_FROM,
     TrainConfig,
-    in_one_order,
     iteration_count,
     rebuild_interval,
+    uses_shared_sort,
 )
-from octasplat.engine.train.loop.early_end import last_iteration
-from octasplat.engine.train.optimization.weight_averaging import AVERAGE_EVERY
+from octasplat.engine.train.loop.early_end import early_stop_iteration
+from octasplat.engine.train.optimization.weight_averaging import AVERAGING_INTERVAL
 
-EVENT_EVERY = 10
-POSES_FROM, POSES_UNTIL, POSE_ROUNDS = 0.3, 0.8, 12
+EVENT_INTERVAL = 10
+POSE_REFINEMENT_FROM, POSE_REFINEMENT_UNTIL, POSE_REFINEMENTS = 0.3, 0.8, 12
 """Shares of the iterations between which poses are refined, and about how often."""
 
 
@@ -30,76 +30,85 @@ class Schedule:
     Attributes:
         config: the settings.
         iterations: of the whole training.
-        hastened_after: where it was decided to end early, None where it was not.
-        planned: iterations that there were to be before that.
+        early_stop_at: where it was decided to end early, None where it was not.
+        planned_iterations: iterations that there were to be before that.
     """
 
     config: TrainConfig
     iterations: int
-    hastened_after: int | None = None
-    planned: int = 0
+    early_stop_at: int | None = None
+    planned_iterations: int = 0
 
     @classmethod
-    def of(cls, config: TrainConfig, training_pixels: int, shown: float = 1.0) -> "Schedule":
+    def from_config(
+        cls, config: TrainConfig, training_pixels: int, valid_fraction: float = 1.0
+    ) -> "Schedule":
         """The schedule for so many pixels in the training views, of which a share shows anything."""
-        return cls(config, iteration_count(config, training_pixels, shown))
+        return cls(config, iteration_count(config, training_pixels, valid_fraction))
 
-    def hastened(self, done: int) -> "Schedule":
+    def stop_early(self, done: int) -> "Schedule":
         """The schedule of a training for which it is decided after ``done`` iterations to end early.
 
         Nothing is added any more, and what depends on the progress goes on from where it is, only faster.
         """
-        sooner = last_iteration(done, self.iterations)
-        return replace(self, iterations=sooner, hastened_after=done, planned=self.iterations)
+        sooner = early_stop_iteration(done, self.iterations)
+        return replace(self, iterations=sooner, early_stop_at=done, planned_iterations=self.iterations)
 
-    def ends(self, done: int) -> bool:
+    def is_finished(self, done: int) -> bool:
         """Whether all iterations are done."""
         return done == self.iterations
 
-    def measures(self, done: int) -> bool:
+    def is_validation_due(self, done: int) -> bool:
         """Whether the state after ``done`` iterations is measured and kept as a checkpoint."""
         every = self.config.rebuild_every
         every *= -(-self.config.checkpoint_every // every)
-        return done % every == 0 or self.ends(done)
+        return done % every == 0 or self.is_finished(done)
 
-    def judges_views(self, done: int) -> bool:
+    def is_outlier_check_due(self, done: int) -> bool:
         """Whether views that do not fit are looked for after ``done`` iterations, for the rest of the run."""
-        since = MISFITS_AFTER * self.iterations
-        return self.measures(done) and since <= done < self.iterations
+        since = OUTLIER_VIEWS_FROM * self.iterations
+        return self.is_validation_due(done) and since <= done < self.iterations
 
-    def refines_poses(self, done: int) -> bool:
+    def is_pose_refinement_due(self, done: int) -> bool:
         """Whether the poses of training views are refined after ``done`` iterations."""
-        if not self.config.refine_poses or not POSES_FROM <= done / self.iterations <= POSES_UNTIL:
+        if (
+            not self.config.refine_poses
+            or not POSE_REFINEMENT_FROM <= done / self.iterations <= POSE_REFINEMENT_UNTIL
+        ):
             return False
         every = self.config.rebuild_every
-        rebuilds = self.iterations * (POSES_UNTIL - POSES_FROM) / POSE_ROUNDS / every
+        rebuilds = self.iterations * (POSE_REFINEMENT_UNTIL - POSE_REFINEMENT_FROM) / POSE_REFINEMENTS / every
         return done % (every * max(1, round(rebuilds))) == 0
 
-    def averages(self, done: int) -> bool:
+    def is_averaging_due(self, done: int) -> bool:
         """Whether the state after ``done`` iterations counts in the mean that is exported."""
-        return self.is_late(done) and (done % AVERAGE_EVERY == 0 or self.ends(done))
+        return self.is_averaging(done) and (done % AVERAGING_INTERVAL == 0 or self.is_finished(done))
 
-    def is_late(self, done: int) -> bool:
+    def is_averaging(self, done: int) -> bool:
         """Whether states are averaged by then."""
-        return max(self.config.weight_averaging_start * self.iterations, self.hastened_after or 0) < done
+        return max(self.config.weight_averaging_start * self.iterations, self.early_stop_at or 0) < done
 
-    def in_one_order(self, done: int) -> bool:
+    def uses_shared_sort(self, done: int) -> bool:
         """Whether the rays of a window composite in one order in the next iteration."""
-        return in_one_order(self.config) and self.progress(done) < self.config.shared_sort_until
+        return uses_shared_sort(self.config) and self.training_progress(done) < self.config.shared_sort_until
 
-    def settles_sides(self, done: int) -> bool:
+    def is_orientation_due(self, done: int) -> bool:
         """Whether Gaussians whose outer side is in are turned over: until states are averaged."""
         sided = self.config.trace.flip_normal_cos > 0 and self.config.materials.learn
-        return sided and self.measures(done) and done <= self.config.weight_averaging_start * self.iterations
+        return (
+            sided
+            and self.is_validation_due(done)
+            and done <= self.config.weight_averaging_start * self.iterations
+        )
 
-    def rebuilds(self, done: int, gaussians: int) -> bool:
+    def is_rebuild_due(self, done: int, gaussians: int) -> bool:
         """Whether the hierarchy of so many Gaussians is built anew, which is where a run may stop."""
         due = done % rebuild_interval(self.config, gaussians) == 0
-        return due or self.measures(done) or self.refines_poses(done)
+        return due or self.is_validation_due(done) or self.is_pose_refinement_due(done)
 
-    def tells(self, done: int) -> bool:
+    def is_event_due(self, done: int) -> bool:
         """Whether listeners hear of the progress."""
-        return done % EVENT_EVERY == 0 or self.ends(done)
+        return done % EVENT_INTERVAL == 0 or self.is_finished(done)
 
     def sh_degree(self, done: int) -> int:
         """Degree of the harmonics, raised step by step."""
@@ -107,14 +116,14 @@ class Schedule:
 
     def may_densify(self, done: int) -> bool:
         """Whether the fitting of the first Gaussians is over, and the last phase of a short one not begun."""
-        return done >= self.config.densify_from_iter and self.hastened_after is None
+        return done >= self.config.densify_from_iter and self.early_stop_at is None
 
-    def progress(self, done: int) -> float:
+    def training_progress(self, done: int) -> float:
         """Share of the training that is done, which is that of the iterations unless it ends early."""
-        if self.hastened_after is None:
+        if self.early_stop_at is None:
             return done / self.iterations
-        before = self.hastened_after / self.planned
-        return before + (1 - before) * (done - self.hastened_after) / (self.iterations - self.hastened_after)
+        before = self.early_stop_at / self.planned_iterations
+        return before + (1 - before) * (done - self.early_stop_at) / (self.iterations - self.early_stop_at)
 
 
 class Stopwatch:
@@ -140,7 +149,7 @@ class Stopwatch:
         return self.seconds - self._before_s
 
     @contextmanager
-    def held(self) -> Iterator[float]:
+    def paused(self) -> Iterator[float]:
         """Let the watch stand still, and give the time it shows."""
         self._kept_s = self.seconds
         yield self._kept_s

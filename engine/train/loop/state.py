@@ -7,7 +7,7 @@ from jaxtyping import Float64, Int64
 
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.train.optimization.adam import Adam
-from octasplat.engine.train.optimization.weight_averaging import RunningMean
+from octasplat.engine.train.optimization.weight_averaging import WeightAverage
 
 
 @dataclass
@@ -25,13 +25,13 @@ class TrainState:
         running_mse: smoothed squared error of the training rays.
         best_psnr: best probe so far, dB; the Gaussians that reached it are in ``best.npz``.
         best_iteration: when that was.
-        left_out: training views that are left out from here on.
+        excluded_views: training views that are left out from here on.
         average: the mean of the last states, where they are averaged.
         pose_corrections: of all views, where poses are refined: the rotation vectors (rad) and shifts (world
             units) by which the points of their cameras move.
-        probed: iterations and training rays' probe after them, dB.
-        hastened_after: where it was decided to end early, None where it was not.
-        taken_near: Gaussians taken away so far for being too near to a camera.
+        probes: iterations and training rays' probe after them, dB.
+        early_stop_at: where it was decided to end early, None where it was not.
+        pruned_near_cameras: Gaussians taken away so far for being too near to a camera.
     """
 
     iteration: int
@@ -44,27 +44,27 @@ class TrainState:
     running_mse: float = 0.0
     best_psnr: float = -np.inf
     best_iteration: int = 0
-    left_out: Int64[np.ndarray, " m"] = field(default_factory=lambda: np.zeros(0, np.int64))
-    probed: list[tuple[int, float]] = field(default_factory=list)
-    hastened_after: int | None = None
-    taken_near: int = 0
+    excluded_views: Int64[np.ndarray, " m"] = field(default_factory=lambda: np.zeros(0, np.int64))
+    probes: list[tuple[int, float]] = field(default_factory=list)
+    early_stop_at: int | None = None
+    pruned_near_cameras: int = 0
     pose_corrections: Float64[np.ndarray, "v 6"] = field(default_factory=lambda: np.zeros((0, 6)))
-    average: RunningMean = field(default_factory=RunningMean)
+    average: WeightAverage = field(default_factory=WeightAverage)
 
-    def raise_degree(self, degree: int) -> None:
+    def raise_sh_degree(self, degree: int) -> None:
         """Give the colours harmonics up to ``degree``, zero at first, if they have less."""
         if degree > self.gaussians.sh_degree:
             count = (degree + 1) ** 2
             extra = count - self.gaussians.sh.shape[1]
             self.gaussians.sh = np.pad(self.gaussians.sh, ((0, 0), (0, extra), (0, 0)))
-            self.adam = self.adam.widen(count)
+            self.adam = self.adam.with_sh_basis(count)
 
 
-def fresh_state(gaussians: FlatGaussians, seed: int) -> TrainState:
+def initial_state(gaussians: FlatGaussians, seed: int) -> TrainState:
     """The state before the first iteration."""
     return TrainState(
         iteration=0,
         gaussians=gaussians,
-        adam=Adam.fresh(gaussians),
+        adam=Adam.zeros(gaussians),
         rng=np.random.Generator(np.random.PCG64([seed, 0])),
     )

@@ -12,30 +12,35 @@ from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from octasplat.engine.core.errors import Cancelled, ConfigError
+from octasplat.engine.core.errors import CancelledError, ConfigError
 from octasplat.engine.core.writing import write_text
 from octasplat.engine.dataset import Dataset
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.trace.protocol import Tracer
-from octasplat.engine.train.config import MOST_PLANNED_ITERATIONS, TrainConfig, in_one_order, most_gaussians
-from octasplat.engine.train.loop.state import fresh_state
+from octasplat.engine.train.config import (
+    MAX_PLANNED_ITERATIONS,
+    TrainConfig,
+    max_gaussian_count,
+    uses_shared_sort,
+)
+from octasplat.engine.train.loop.state import initial_state
 from octasplat.engine.train.loop.trainer import Trainer
-from octasplat.engine.train.sampling.shown import shown_share
+from octasplat.engine.train.sampling.shown import valid_pixel_fraction
 
-WARM, TIMED = 10, 50
+WARM_UP_ITERATIONS, TIMED_ITERATIONS = 10, 50
 """Iterations before the clock starts, as kernels compile and caches fill, and those that it counts."""
-USED_SHARE = 0.8
+USED_FRACTION = 0.8
 """Of the time; the rest is for checkpoints, probes, and a machine that becomes slower."""
 COST_POWER = 0.8
 """Power of the number of Gaussians by which an iteration takes longer, see ``docs/experiments.md``."""
-ITERATIONS_A_GAUSSIAN = 1 / 20
+ITERATIONS_PER_GAUSSIAN = 1 / 20
 """About as in ``standard``: 10,000 iterations for 185,000 Gaussians, 20,000 for 400,000."""
-OWN_ORDER_PACE = 1.7
+RAY_SORT_SLOWDOWN = 1.7
 """Times as long as in one order takes an iteration whose rays have an order of their own each, see there."""
-LEAST_ITERATIONS, LEAST_GAUSSIANS = 100, 2_000
+MIN_ITERATIONS, MIN_GAUSSIANS = 100, 2_000
 
 
-class Plan(BaseModel):
+class TimeBudgetPlan(BaseModel):
     """What was chosen, and from what.
 
     Attributes:
@@ -54,26 +59,28 @@ class Plan(BaseModel):
     gaussians: int = Field(ge=1)
     seconds: float
 
-    def applied(self, config: TrainConfig) -> TrainConfig:
+    def apply_to(self, config: TrainConfig) -> TrainConfig:
         """The settings with the numbers of the plan."""
         return config.model_copy(update={"iterations": self.iterations, "max_gaussians": self.max_gaussians})
 
 
-def choose_plan(seconds: float, seconds_an_iteration: float, gaussians: int, most: int) -> Plan:
+def choose_plan(
+    seconds: float, seconds_an_iteration: float, gaussians: int, max_gaussians: int
+) -> TimeBudgetPlan:
     """As many Gaussians as there is time to train well, and all the iterations that they leave time for.
 
     Args:
         seconds: for the iterations.
         seconds_an_iteration: measured with ``gaussians`` Gaussians.
         gaussians: see there.
-        most: no more Gaussians than this, as the photographs hold no more down.
+        max_gaussians: no more Gaussians than this, as the photographs hold no more down.
     """
     one = seconds_an_iteration / gaussians**COST_POWER  # an iteration takes one * count ** COST_POWER
-    wanted = (seconds / (one * ITERATIONS_A_GAUSSIAN)) ** (1 / (1 + COST_POWER)) if seconds > 0 else 0.0
-    count = min(most, max(LEAST_GAUSSIANS, round(wanted)))
+    wanted = (seconds / (one * ITERATIONS_PER_GAUSSIAN)) ** (1 / (1 + COST_POWER)) if seconds > 0 else 0.0
+    count = min(max_gaussians, max(MIN_GAUSSIANS, round(wanted)))
     iterations = round(seconds / (one * count**COST_POWER))
-    return Plan(
-        iterations=min(MOST_PLANNED_ITERATIONS, max(LEAST_ITERATIONS, iterations)),
+    return TimeBudgetPlan(
+        iterations=min(MAX_PLANNED_ITERATIONS, max(MIN_ITERATIONS, iterations)),
         max_gaussians=count,
         seconds_an_iteration=seconds_an_iteration,
         gaussians=gaussians,
@@ -89,7 +96,7 @@ def make_plan(
     seconds: float,
     threads: int,
     should_stop: Callable[[], bool] = lambda: False,
-) -> Plan:
+) -> TimeBudgetPlan:
     """Measure the pace and choose.
 
     Args:
@@ -101,37 +108,37 @@ def make_plan(
         should_stop: asked between iterations.
 
     Raises:
-        Cancelled: stopped as asked.
+        CancelledError: stopped as asked.
     """
     began = time.perf_counter()
-    pace_s = _seconds_an_iteration(dataset, config, first, threads, should_stop)
-    if in_one_order(config):  # as the trial was, and the first part of the training is
-        pace_s *= config.shared_sort_until + OWN_ORDER_PACE * (1 - config.shared_sort_until)
-    left_s = USED_SHARE * (seconds - (time.perf_counter() - began))
-    most = most_gaussians(config, dataset.train_pixel_count, shown_share(dataset))
+    pace_s = _seconds_per_iteration(dataset, config, first, threads, should_stop)
+    if uses_shared_sort(config):  # as the trial was, and the first part of the training is
+        pace_s *= config.shared_sort_until + RAY_SORT_SLOWDOWN * (1 - config.shared_sort_until)
+    left_s = USED_FRACTION * (seconds - (time.perf_counter() - began))
+    most = max_gaussian_count(config, dataset.train_pixel_count, valid_pixel_fraction(dataset))
     return choose_plan(left_s, pace_s, len(first), most)
 
 
-def write_plan(path: Path, plan: Plan) -> None:
+def write_plan(path: Path, plan: TimeBudgetPlan) -> None:
     """Write a plan, atomically."""
     write_text(path, plan.model_dump_json(indent=1) + "\n")
 
 
-def read_plan(path: Path) -> Plan:
+def read_plan(path: Path) -> TimeBudgetPlan:
     """Read a plan.
 
     Raises:
         ConfigError: the file is damaged.
     """
     try:
-        return Plan.model_validate_json(path.read_bytes())
+        return TimeBudgetPlan.model_validate_json(path.read_bytes())
     except (OSError, ValidationError) as error:
         raise ConfigError(
             f"{path} cannot be read ({type(error).__name__}); train again in another folder."
         ) from None
 
 
-def _seconds_an_iteration(
+def _seconds_per_iteration(
     dataset: Dataset,
     config: TrainConfig,
     first: FlatGaussians,
@@ -143,22 +150,22 @@ def _seconds_an_iteration(
     def note(_iteration: int, _tracer: Tracer) -> None:
         times.append(time.perf_counter())
 
-    enough = WARM + TIMED
+    enough = WARM_UP_ITERATIONS + TIMED_ITERATIONS
     trial = config.model_copy(
         update={"iterations": 100 * enough, "densify_from_iter": 100 * enough, "probe_rays": 256}
     )
-    with tempfile.TemporaryDirectory() as folder, suppress(Cancelled):
+    with tempfile.TemporaryDirectory() as folder, suppress(CancelledError):
         Trainer(
             dataset,
             trial,
-            fresh_state(first.select(slice(None)), config.seed),
+            initial_state(first.select(slice(None)), config.seed),
             folder=Path(folder),
             fingerprint="",
-            listener=lambda _event: None,
+            progress=lambda _event: None,
             threads=threads,
             should_stop=lambda: len(times) >= enough or should_stop(),
-            onlooker=note,
+            on_step=note,
         ).run()
     if should_stop():
-        raise Cancelled("Stopped before the training; the same command with --resume goes on.")
-    return (times[-1] - times[WARM - 1]) / (len(times) - WARM)
+        raise CancelledError("Stopped before the training; the same command with --resume goes on.")
+    return (times[-1] - times[WARM_UP_ITERATIONS - 1]) / (len(times) - WARM_UP_ITERATIONS)

@@ -6,24 +6,24 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32, Int64
 
-from octasplat.engine.core.color import composited
-from octasplat.engine.core.errors import TrainingFailure
-from octasplat.engine.core.events import HeldOutMeasured, Listener, Warned
+from octasplat.engine.core.color import composite_over
+from octasplat.engine.core.errors import TrainingError
+from octasplat.engine.core.events import EventListener, HeldOutMeasured, Warned
 from octasplat.engine.gaussians.model import FlatGaussians
-from octasplat.engine.shading.protocol import ShadingModel, Sight
+from octasplat.engine.shading.protocol import ShadingModel, TracedRays
 from octasplat.engine.trace.protocol import Tracer
 from octasplat.engine.train.loop.checkpoint import BestState, load_best, save_best
 from octasplat.engine.train.loop.state import TrainState
 from octasplat.engine.train.sampling.pixel_sampler import PixelSampler, TrainingData, view_sizes_px
-from octasplat.engine.train.shading_factory import exposures_of
-from octasplat.engine.train.views.view_grids import guess_exposures
+from octasplat.engine.train.shading_factory import find_exposures
+from octasplat.engine.train.views.view_grids import estimate_untrained_exposures
 
-EMPTY_SHARE = 0.01
+MIN_COVERAGE = 0.01
 """A state that covers less than this share of what the photographs cover is broken."""
 
 
 @dataclass(frozen=True)
-class Probe:
+class RayProbe:
     """Random pixels of some views, over a background.
 
     Attributes:
@@ -51,16 +51,16 @@ def draw_probe(
     count: int,
     background_srgb: Float32[np.ndarray, "3"],
     rng: np.random.Generator,
-) -> Probe:
+) -> RayProbe:
     """Draw ``count`` pixels of the views ``indices``."""
     view, y, x = PixelSampler(indices, view_sizes_px(dataset)).pixels(rng, count)
     rgb, alpha, weight = dataset.pixels(view, y, x)
     covered = float(np.average(alpha, weights=weight)) if weight.any() else 0.0
-    return Probe(view, y, x, composited(rgb, alpha, background_srgb), weight, background_srgb, covered)
+    return RayProbe(view, y, x, composite_over(rgb, alpha, background_srgb), weight, background_srgb, covered)
 
 
-def measure(
-    probe: Probe, dataset: TrainingData, tracer: Tracer, shading: ShadingModel
+def measure_probe(
+    probe: RayProbe, dataset: TrainingData, tracer: Tracer, shading: ShadingModel
 ) -> tuple[float, float]:
     """Return the PSNR of all rays that count together, dB, and the mean accumulated alpha.
 
@@ -71,27 +71,27 @@ def measure(
     """
     rays = dataset.rays(probe.view, probe.y, probe.x)
     seen = tracer.trace(rays)
-    view = probe.view if exposures_of(shading) is not None else None
-    developed = shading.develop(Sight(rays, seen, tracer, view))
-    render = np.clip(developed.over(probe.background_srgb), 0, 1)
+    view = probe.view if find_exposures(shading) is not None else None
+    developed = shading.shade(TracedRays(rays, seen, tracer, view))
+    render = np.clip(developed.composite_over(probe.background_srgb), 0, 1)
     error = ((render - probe.rgb_srgb) ** 2).mean(axis=1) * probe.weight
     count = float(probe.weight.sum(dtype=np.float64))
-    psnr = decibels(float(error.sum(dtype=np.float64)) / count) if count > 0 else 0.0
+    psnr = psnr_from_mse(float(error.sum(dtype=np.float64)) / count) if count > 0 else 0.0
     return psnr, float(seen.alpha.mean())
 
 
-def decibels(mse: float) -> float:
+def psnr_from_mse(mse: float) -> float:
     """PSNR of a mean squared error of display values."""
     return float(-10 * np.log10(max(mse, 1e-10)))
 
 
-class Judge:
+class ValidationProbe:
     """Refuses broken states, keeps the best one, and chooses what is exported.
 
     Args:
         dataset: the photographs; probes are drawn from it.
         folder: the best state goes here.
-        listener: hears of the held-out views.
+        progress: hears of the held-out views.
         rays: number of rays of a probe.
         background_srgb: what is behind the photographs.
         best_checkpoint_margin_db: the best state is chosen where the last one is so much worse.
@@ -102,11 +102,11 @@ class Judge:
         self,
         dataset: TrainingData,
         folder: Path,
-        listener: Listener,
+        progress: EventListener,
         *,
         rays: int,
         background_srgb: Float32[np.ndarray, "3"],
-        step_back_db: float,
+        best_margin_db: float,
         seed: int,
     ) -> None:
         # A generator of its own, so that measuring never changes the training.
@@ -118,45 +118,45 @@ class Judge:
         self._dataset = dataset
         self._folder = folder
         self._background_srgb = background_srgb
-        self._step_back_db = step_back_db
-        self._tell = listener
+        self._best_margin_db = best_margin_db
+        self._progress = progress
 
-    def inspect(self, state: TrainState, tracer: Tracer, shading: ShadingModel) -> None:
+    def measure(self, state: TrainState, tracer: Tracer, shading: ShadingModel) -> None:
         """Measure a state, note that in it, keep it if it is the best, and tell of the held-out views.
 
         Raises:
             TrainingFailure: parameters are no numbers, or nothing is left to see.
         """
         if not state.gaussians.is_finite():
-            raise TrainingFailure(
+            raise TrainingError(
                 f"Parameters became not-a-number by iteration {state.iteration}; nothing is exported. "
                 "The last checkpoint is kept."
             )
-        guess_exposures(self._dataset, self._background_srgb, tracer, shading)
-        psnr, alpha = measure(self._probe, self._dataset, tracer, shading)
-        if alpha < EMPTY_SHARE * self._probe.alpha and state.iteration > 0:
-            raise TrainingFailure(
+        estimate_untrained_exposures(self._dataset, self._background_srgb, tracer, shading)
+        psnr, alpha = measure_probe(self._probe, self._dataset, tracer, shading)
+        if alpha < MIN_COVERAGE * self._probe.alpha and state.iteration > 0:
+            raise TrainingError(
                 f"After iteration {state.iteration} the scene covers only {100 * alpha:.2g} % of the "
                 f"photographs, of which {100 * self._probe.alpha:.2g} % show something; nothing is exported. "
                 "Check that poses and photographs belong together."
             )
-        state.probed.append((state.iteration, psnr))
+        state.probes.append((state.iteration, psnr))
         if psnr > state.best_psnr:
             state.best_psnr, state.best_iteration = psnr, state.iteration
             save_best(BestState(state.gaussians, shading.state(), state.pose_corrections), self._folder)
         if self._held_out is not None:
-            held_out, _ = measure(self._held_out, self._dataset, tracer, shading)
-            self._tell(HeldOutMeasured(state.iteration, held_out, len(state.gaussians), state.seconds))
+            held_out, _ = measure_probe(self._held_out, self._dataset, tracer, shading)
+            self._progress(HeldOutMeasured(state.iteration, held_out, len(state.gaussians), state.seconds))
 
-    def choose(self, state: TrainState, tracer: Tracer, shading: ShadingModel) -> FlatGaussians:
+    def select_final(self, state: TrainState, tracer: Tracer, shading: ShadingModel) -> FlatGaussians:
         """Return the last Gaussians, or the best if those are much worse.
 
         The shading and the pose corrections of ``state`` become theirs, too.
         """
-        last, _ = measure(self._probe, self._dataset, tracer, shading)
-        if last >= state.best_psnr - self._step_back_db:
+        last, _ = measure_probe(self._probe, self._dataset, tracer, shading)
+        if last >= state.best_psnr - self._best_margin_db:
             return state.gaussians
-        self._tell(
+        self._progress(
             Warned(
                 f"The last state ({last:.1f} dB) is worse than that of iteration {state.best_iteration} "
                 f"({state.best_psnr:.1f} dB); the better one is exported."

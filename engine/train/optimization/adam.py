@@ -51,7 +51,7 @@ class Adam:
     steps: Int32[np.ndarray, " n"]
 
     @classmethod
-    def fresh(cls, gaussians: FlatGaussians) -> "Adam":
+    def zeros(cls, gaussians: FlatGaussians) -> "Adam":
         """Zero moments for ``gaussians``."""
         count, columns = len(gaussians), GEOMETRY + 3 * gaussians.sh.shape[1]
         named = sum(gaussians.channels.widths.values())
@@ -76,7 +76,7 @@ class Adam:
         """This state followed by ``other``."""
         return concatenate_rows([self, other])
 
-    def widen(self, basis_count: int) -> "Adam":
+    def with_sh_basis(self, basis_count: int) -> "Adam":
         """Room for ``basis_count`` harmonics; the new ones start with zero moments."""
         extra = GEOMETRY + 3 * basis_count - self.first.shape[1]
         pad = ((0, 0), (0, extra))
@@ -89,7 +89,7 @@ class Adam:
         rates: LearningRates,
         loss: LossWeights,
         *,
-        progress: float,
+        training_progress: float,
         extent: float,
     ) -> Float32[np.ndarray, "u 3"]:
         """Change ``gaussians`` in place.
@@ -100,7 +100,7 @@ class Adam:
                 where the channels are trained.
             rates: learning rates.
             loss: weights of the regularisers on those Gaussians.
-            progress: 0 at the first iteration, 1 at the last.
+            training_progress: 0 at the first iteration, 1 at the last.
             extent: scene extent, world units.
 
         Returns:
@@ -109,13 +109,13 @@ class Adam:
         moved = np.empty((len(gradients.ids), 3), np.float32)
         corrections = np.empty((len(gradients.ids), 2))
         hit = max(1, len(gradients.ids))
-        decay = rates.decay**progress
+        decay = rates.decay**training_progress
         colour = rates.color / SH_C0 * decay
         mean_unit = extent if rates.mean_unit == "extent" else 1.0
         vectors = -(-3 * gaussians.sh.shape[1] // LANES)
         rates_sh = np.full(vectors * LANES, colour * rates.sh_rest_ratio, np.float32)
         rates_sh[:3] = colour
-        powers = _powers(1 << (int(self.steps.max(initial=0)) + 1).bit_length())
+        powers = _beta_powers(1 << (int(self.steps.max(initial=0)) + 1).bit_length())
         run_ranges(
             adam_step, threads_in_use(), -(-len(gradients.ids) // CHUNK),
             gradients.ids,
@@ -130,7 +130,7 @@ class Adam:
                 gradients.opacity_logits, gradients.sh,
             ),
             StepRates(
-                mean_unit * rates.mean * (rates.mean_final / rates.mean) ** progress,
+                mean_unit * rates.mean * (rates.mean_final / rates.mean) ** training_progress,
                 rates.mean_unit == "size", rates.axes == "own",
                 rates.quat * decay, rates.log_scale * decay, rates.opacity * decay, rates_sh,
             ),
@@ -155,7 +155,7 @@ class Adam:
         if gradients.features.shape[1] < self.channel_first.shape[1]:
             return  # the shading model traces something else
         for name, values in gaussians.channels.items():
-            rate, width = rates.of_channel(name), values.shape[1]
+            rate, width = rates.channel_rate(name), values.shape[1]
             if rate > 0:
                 run_ranges(
                     adam_shares, threads_in_use(), len(gradients.ids),
@@ -167,6 +167,6 @@ class Adam:
 
 
 @cache
-def _powers(count: int) -> Float64[np.ndarray, "2 s"]:
+def _beta_powers(count: int) -> Float64[np.ndarray, "2 s"]:
     """Powers 0 to ``count`` - 1 of both betas."""
     return np.array([[beta**k for k in range(count)] for beta in (BETA1, BETA2)])

@@ -12,18 +12,18 @@ from octasplat.engine.train.config import LossWeights
 from octasplat.engine.train.kernels.losses import CHUNKS, pixel_terms
 from octasplat.engine.train.sampling.batches import Batch
 
-C1, C2 = 0.01**2, 0.03**2
-WINDOW, SIGMA = 11, 1.5
+SSIM_C1, SSIM_C2 = 0.01**2, 0.03**2
+SSIM_WINDOW, SSIM_SIGMA = 11, 1.5
 
 
 def gaussian_window() -> Float32[np.ndarray, " w"]:
     """The normalised 11-tap Gaussian window (sigma 1.5) of SSIM."""
-    x = np.arange(WINDOW) - WINDOW // 2
-    window = np.exp(-(x**2) / (2 * SIGMA**2))
+    x = np.arange(SSIM_WINDOW) - SSIM_WINDOW // 2
+    window = np.exp(-(x**2) / (2 * SSIM_SIGMA**2))
     return (window / window.sum()).astype(np.float32)
 
 
-def _filter(images: Float32[np.ndarray, "p h w c"]) -> Float32[np.ndarray, "p h w c"]:
+def _gaussian_blur(images: Float32[np.ndarray, "p h w c"]) -> Float32[np.ndarray, "p h w c"]:
     window = gaussian_window()
     rows = correlate1d(images, window, axis=1, mode="constant")
     return correlate1d(rows, window, axis=2, mode="constant")
@@ -39,14 +39,14 @@ def ssim_loss(
     interior pixels and channels.
     """
     x, y = render, target
-    mu_x, mu_y = _filter(x), _filter(y)
-    var_x = _filter(x * x) - mu_x * mu_x
-    var_y = _filter(y * y) - mu_y * mu_y
-    cov = _filter(x * y) - mu_x * mu_y
-    a1, a2 = 2 * mu_x * mu_y + np.float32(C1), 2 * cov + np.float32(C2)
-    b1, b2 = mu_x * mu_x + mu_y * mu_y + np.float32(C1), var_x + var_y + np.float32(C2)
+    mu_x, mu_y = _gaussian_blur(x), _gaussian_blur(y)
+    var_x = _gaussian_blur(x * x) - mu_x * mu_x
+    var_y = _gaussian_blur(y * y) - mu_y * mu_y
+    cov = _gaussian_blur(x * y) - mu_x * mu_y
+    a1, a2 = 2 * mu_x * mu_y + np.float32(SSIM_C1), 2 * cov + np.float32(SSIM_C2)
+    b1, b2 = mu_x * mu_x + mu_y * mu_y + np.float32(SSIM_C1), var_x + var_y + np.float32(SSIM_C2)
     ssim = a1 * a2 / (b1 * b2)
-    edge = WINDOW // 2
+    edge = SSIM_WINDOW // 2
     inner = np.zeros((*x.shape[:3], 1), np.float32)
     inner[:, edge:-edge, edge:-edge] = 1.0
     count = float(inner.sum()) * x.shape[-1]
@@ -56,7 +56,11 @@ def ssim_loss(
     d_var = weight * -ssim / b2
     d_cov = weight * 2 * a1 / (b1 * b2)
     d_mu = weight * (2 * mu_y * a2 / (b1 * b2) - ssim * 2 * mu_x / b1)
-    gradient = _filter(d_mu - 2 * mu_x * d_var - mu_y * d_cov) + 2 * x * _filter(d_var) + y * _filter(d_cov)
+    gradient = (
+        _gaussian_blur(d_mu - 2 * mu_x * d_var - mu_y * d_cov)
+        + 2 * x * _gaussian_blur(d_var)
+        + y * _gaussian_blur(d_cov)
+    )
     return loss, gradient.astype(np.float32)
 
 
@@ -79,9 +83,9 @@ def batch_loss(render: Float32[np.ndarray, "r 3"], batch: Batch, weights: LossWe
     """All terms by the rendered colours: those of the pixels, and SSIM where the batch has patches."""
     target = batch.target_srgb
     pixel = pixel_loss(render, target, batch.weight, l1=weights.l1, l2=weights.l2)
-    if not batch.patches or weights.ssim == 0:
+    if not batch.ssim_patch_count or weights.ssim == 0:
         return pixel
-    structure, by_patches = _patch_term(render, target, batch)
+    structure, by_patches = _ssim_term(render, target, batch)
     gradient = pixel.gradient.copy()
     gradient[-len(by_patches) :] += np.float32(weights.ssim) * by_patches
     return BatchLoss(pixel.value + weights.ssim * structure, gradient, pixel.squared_error)
@@ -96,12 +100,12 @@ def ray_errors(
     return np.asarray((np.abs(render - target) * weight[:, None]).mean(axis=1, dtype=np.float32))
 
 
-def _patch_term(
+def _ssim_term(
     render: Float32[np.ndarray, "r 3"], target: Float32[np.ndarray, "r 3"], batch: Batch
 ) -> tuple[float, Float32[np.ndarray, "p 3"]]:
     """1 - SSIM of the batch's patches and its gradient; masked pixels take the photograph's colour."""
-    count = batch.patches * batch.side**2
-    shape = (batch.patches, batch.side, batch.side, 3)
+    count = batch.ssim_patch_count * batch.patch_side**2
+    shape = (batch.ssim_patch_count, batch.patch_side, batch.patch_side, 3)
     weight = batch.weight[-count:, None]
     shown = target[-count:]
     mixed = render[-count:] * weight + shown * (1 - weight)

@@ -15,12 +15,12 @@ from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.gaussians.rows import row_arrays
 from octasplat.engine.train.kernels.averaging import move_towards
 
-AVERAGE_EVERY = 10
+AVERAGING_INTERVAL = 10
 """Iterations between two of the states that are averaged."""
 
 
 @dataclass
-class RunningMean:
+class WeightAverage:
     """The mean of some states of the same Gaussians, in order.
 
     Attributes:
@@ -33,7 +33,7 @@ class RunningMean:
 
     def add(self, now: FlatGaussians) -> None:
         """Take in one more state; begin anew where there are other parameters than before."""
-        if self.gaussians is None or _shapes(self.gaussians) != _shapes(now):
+        if self.gaussians is None or _parameter_shapes(self.gaussians) != _parameter_shapes(now):
             # Rows one after the other, so that flat views of them can be written to.
             self.gaussians, self.count = now.copy(), 1
             return
@@ -49,5 +49,5 @@ class RunningMean:
         self.gaussians, self.count = None, 0
 
 
-def _shapes(gaussians: FlatGaussians) -> dict[str, tuple[int, ...]]:
+def _parameter_shapes(gaussians: FlatGaussians) -> dict[str, tuple[int, ...]]:
     return {name: array.shape for name, array in row_arrays(gaussians).items()}

@@ -8,20 +8,20 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Float32, Int64
 
-from octasplat.engine.core.color import composited
+from octasplat.engine.core.color import composite_over
 from octasplat.engine.core.errors import ConfigError
 from octasplat.engine.core.rays import RayBatch
-from octasplat.engine.shading.ray_patches import RayWindows
+from octasplat.engine.shading.ray_patches import RayPatches
 from octasplat.engine.train.config import (
-    SIGHT_LINE_MARGIN,
+    VISIBILITY_RAY_MARGIN,
     Background,
     TrainConfig,
-    most_gaussians,
-    window_side_px,
+    max_gaussian_count,
+    ray_patch_side_px,
 )
 from octasplat.engine.train.sampling.pixel_sampler import PixelSampler, TrainingData, view_sizes_px
-from octasplat.engine.train.sampling.shown import shown_share
-from octasplat.engine.train.sampling.visibility_rays import PhotographsOfPoints, SightLines
+from octasplat.engine.train.sampling.shown import valid_pixel_fraction
+from octasplat.engine.train.sampling.visibility_rays import ObservedPoints, VisibilityRays
 
 TILE_PX = 8
 
@@ -30,9 +30,9 @@ TILE_PX = 8
 class Batch:
     """Rays and what the photographs show there.
 
-    The last ``patches * side * side`` rays are patches, row-major one after another. ``windows`` says
+    The last ``ssim_patch_count * side * side`` rays are patches, row-major one after another. ``ray_patches`` says
     which of the others stand in windows. ``background_srgb`` lies
-    behind both the Gaussians and photographs with alpha. ``sight_lines`` end before points that views show.
+    behind both the Gaussians and photographs with alpha. ``visibility_rays`` end before points that views show.
     """
 
     rays: RayBatch
@@ -40,16 +40,16 @@ class Batch:
     alpha: Float32[np.ndarray, " r"]
     weight: Float32[np.ndarray, " r"]
     view: Int64[np.ndarray, " r"]
-    patches: int
-    side: int
+    ssim_patch_count: int
+    patch_side: int
     background_srgb: Float32[np.ndarray, "3"]
-    sight_lines: RayBatch | None = None
-    windows: RayWindows | None = None
+    visibility_rays: RayBatch | None = None
+    ray_patches: RayPatches | None = None
 
     @cached_property
     def target_srgb(self) -> Float32[np.ndarray, "r 3"]:
         """The photographs' colours over the background."""
-        return composited(self.rgb_srgb, self.alpha, self.background_srgb)
+        return composite_over(self.rgb_srgb, self.alpha, self.background_srgb)
 
 
 class BatchSource:
@@ -75,48 +75,48 @@ class BatchSource:
         self._dataset = dataset
         self._config = config
         self.sampler = PixelSampler(dataset.train_indices, view_sizes_px(dataset))
-        pixels, shown = self.sampler.pixel_count, shown_share(dataset)
-        self._window_side_px = window_side_px(
-            config, self.sampler.longest_side_px, pixels * shown / most_gaussians(config, pixels, shown)
+        pixels, shown = self.sampler.pixel_count, valid_pixel_fraction(dataset)
+        self._ray_patch_side_px = ray_patch_side_px(
+            config, self.sampler.longest_side_px, pixels * shown / max_gaussian_count(config, pixels, shown)
         )
-        self._patches = self._patch_count()
-        self._lines: SightLines | None = None
-        if config.loss.free_space > 0 and isinstance(dataset, PhotographsOfPoints) and len(dataset.points):
-            self._lines = SightLines.of(dataset, SIGHT_LINE_MARGIN)
+        self._ssim_patches = self._patch_count()
+        self._visibility_rays: VisibilityRays | None = None
+        if config.loss.free_space > 0 and isinstance(dataset, ObservedPoints) and len(dataset.points):
+            self._visibility_rays = VisibilityRays.from_dataset(dataset, VISIBILITY_RAY_MARGIN)
 
-    def leave_out(self, views: Int64[np.ndarray, " m"]) -> None:
+    def exclude_views(self, views: Int64[np.ndarray, " m"]) -> None:
         """Draw nothing of these views any more."""
         kept = np.setdiff1d(self._dataset.train_indices, views)
         self.sampler = PixelSampler(kept, view_sizes_px(self._dataset))
-        if self._lines is not None:
-            self._lines = self._lines.without(views)
+        if self._visibility_rays is not None:
+            self._visibility_rays = self._visibility_rays.exclude_views(views)
 
-    def draw(self, rng: np.random.Generator, turn: int = 0) -> Batch:
-        """The next batch, after ``turn`` others."""
+    def draw(self, rng: np.random.Generator, index: int = 0) -> Batch:
+        """The next batch, after ``index`` others."""
         config, sampler, side = self._config, self.sampler, self._config.ssim_patch_side
-        loose = config.rays_per_batch - self._patches * side**2
+        loose = config.rays_per_batch - self._ssim_patches * side**2
         windows = loose // config.ray_patch_rays if config.ray_patch_rays > 1 else 0
         single = loose - windows * config.ray_patch_rays
         drawn, grids = [sampler.pixels(rng, single)], None
         if windows:
-            grids = RayWindows(single, windows, math.isqrt(config.ray_patch_rays))
+            grids = RayPatches(single, windows, math.isqrt(config.ray_patch_rays))
             drawn.append(
-                sampler.windows(
-                    rng, windows, rays=config.ray_patch_rays, side=self._window_side_px, turn=turn
+                sampler.ray_patches(
+                    rng, windows, rays=config.ray_patch_rays, side=self._ray_patch_side_px, index=index
                 )
             )
-        if self._patches:
-            drawn.append(sampler.patches(rng, self._patches, side))
+        if self._ssim_patches:
+            drawn.append(sampler.patches(rng, self._ssim_patches, side))
         view, y, x = (np.concatenate(parts) for parts in zip(*drawn, strict=True))
         rays = self._dataset.rays(view, y, x)
         rgb, alpha, weight = self._dataset.pixels(view, y, x)
         background = self._background(rng)
         lines = None
-        if self._lines is not None and len(self._lines):
-            lines = self._lines.draw(
+        if self._visibility_rays is not None and len(self._visibility_rays):
+            lines = self._visibility_rays.draw(
                 rng, max(1, round(config.visibility_ray_fraction * config.rays_per_batch))
             )
-        batch = Batch(rays, rgb, alpha, weight, view, self._patches, side, background, lines, grids)
+        batch = Batch(rays, rgb, alpha, weight, view, self._ssim_patches, side, background, lines, grids)
         _ = batch.target_srgb  # worked out here, as the next batch is drawn beside the iteration
         return batch
 
@@ -149,10 +149,10 @@ class BatchSource:
             name = "random" if self._dataset.has_alpha else "black"
         if name == "random":
             return rng.random(3, dtype=np.float32)
-        return still_background(name)
+        return evaluation_background(name)
 
 
-class DrawnAhead:
+class PrefetchedBatches:
     """Draws batches, the next one beside whatever else goes on if it is asked for early.
 
     The generator is drawn from in the order of the batches either way, so that they are the same ones.
@@ -166,23 +166,23 @@ class DrawnAhead:
         self._worker = ThreadPoolExecutor(1, thread_name_prefix="batch")
         self._next: Future[Batch] | None = None
 
-    def __enter__(self) -> "DrawnAhead":
+    def __enter__(self) -> "PrefetchedBatches":
         return self
 
     def __exit__(self, *_error: object) -> None:
         self._worker.shutdown()
 
-    def begin(self, rng: np.random.Generator, turn: int) -> None:
+    def prefetch(self, rng: np.random.Generator, index: int) -> None:
         """Begin the next batch; until :meth:`draw` gives it nothing else may draw from ``rng``."""
-        self._next = self._worker.submit(self._source.draw, rng, turn)
+        self._next = self._worker.submit(self._source.draw, rng, index)
 
-    def draw(self, rng: np.random.Generator, turn: int) -> Batch:
-        """The batch after ``turn`` others, begun or not."""
+    def draw(self, rng: np.random.Generator, index: int) -> Batch:
+        """The batch after ``index`` others, begun or not."""
         begun, self._next = self._next, None
-        return self._source.draw(rng, turn) if begun is None else begun.result()
+        return self._source.draw(rng, index) if begun is None else begun.result()
 
 
-def still_background(background: Background) -> Float32[np.ndarray, "3"]:
+def evaluation_background(background: Background) -> Float32[np.ndarray, "3"]:
     """Return the colour behind everything when views are compared: white if asked for, else black."""
     return np.full(3, 1.0 if background == "white" else 0.0, np.float32)
 

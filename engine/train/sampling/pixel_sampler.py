@@ -8,14 +8,14 @@ from jaxtyping import Float32, Int64
 
 from octasplat.engine.core.rays import RayBatch
 from octasplat.engine.dataset import DatasetView
-from octasplat.engine.shading.ray_patches import z_order
+from octasplat.engine.shading.ray_patches import morton_cells
 
-GOLDEN = (math.sqrt(5) - 1) / 2
+GOLDEN_RATIO = (math.sqrt(5) - 1) / 2
 """Its multiples fill the unit interval evenly, however many there are."""
 
 
 @runtime_checkable
-class Pixels(Protocol):
+class PixelSource(Protocol):
     """What training needs of a dataset (see :class:`octasplat.engine.dataset.Dataset`)."""
 
     def rays(
@@ -32,7 +32,7 @@ class Pixels(Protocol):
 
 
 @runtime_checkable
-class TrainingData(Pixels, Protocol):
+class TrainingData(PixelSource, Protocol):
     """The photographs: pixel access, the views and the split.
 
     See :class:`octasplat.engine.dataset.Dataset`.
@@ -83,28 +83,32 @@ class PixelSampler:
         local = flat - (self._ends[which] - width * height)
         return self._views[which], local // width, local % width
 
-    def windows(
-        self, rng: np.random.Generator, count: int, *, rays: int, side: int, turn: int = 0
+    def ray_patches(
+        self, rng: np.random.Generator, count: int, *, rays: int, side: int, index: int = 0
     ) -> tuple[Int64[np.ndarray, " r"], Int64[np.ndarray, " r"], Int64[np.ndarray, " r"]]:
         """``rays`` pixels (a square number) in each of ``count`` windows of about ``side`` x ``side`` pixels.
 
         A window is a grid of cells, one random pixel in each, in the order of
-        :class:`octasplat.engine.shading.ray_patches.RayWindows`. What sticks out of its view
+        :class:`octasplat.engine.shading.ray_patches.RayPatches`. What sticks out of its view
         is folded back, so that every pixel is about as likely as any other. Windows are spread over views and
-        within them, and those of one ``turn`` after the other over what those before have left.
+        within them, and those of one ``index`` after the other over what those before have left.
         """
         cells = math.isqrt(rays)
         cell = max(1, round(side / cells))
-        which, x, y = self._spread(rng, count, cell * cells, turn)
+        which, x, y = self._stratified_pixels(rng, count, cell * cells, index)
         width, height = self._sizes[which].T
-        rows, columns = z_order(cells)
+        rows, columns = morton_cells(cells)
         left, top = x - cell * cells // 2, y - cell * cells // 2
         y = top[:, None] + rows * cell + rng.integers(0, cell, (count, rays))
         x = left[:, None] + columns * cell + rng.integers(0, cell, (count, rays))
         view = np.broadcast_to(self._views[which][:, None], x.shape)
-        return view.reshape(-1), _fold(y, height[:, None]).reshape(-1), _fold(x, width[:, None]).reshape(-1)
+        return (
+            view.reshape(-1),
+            _mirror_into(y, height[:, None]).reshape(-1),
+            _mirror_into(x, width[:, None]).reshape(-1),
+        )
 
-    def _spread(
+    def _stratified_pixels(
         self, rng: np.random.Generator, count: int, side: int, turn: int
     ) -> tuple[Int64[np.ndarray, " c"], Int64[np.ndarray, " c"], Int64[np.ndarray, " c"]]:
         """``count`` pixels as (place of the view among those drawn from, x, y), in strata.
@@ -113,7 +117,7 @@ class PixelSampler:
         steps of one length lead along it, each to a random pixel of the tile there. Each turn begins the
         golden section of a step further on, so that all tiles are seen equally often.
         """
-        at = (np.arange(count) + turn * GOLDEN % 1.0) * (self.pixel_count / count)
+        at = (np.arange(count) + turn * GOLDEN_RATIO % 1.0) * (self.pixel_count / count)
         which = np.searchsorted(self._ends, at, side="right")
         width, height = self._sizes[which].T
         share = (at - (self._ends[which] - width * height)) / (width * height)
@@ -142,7 +146,9 @@ class PixelSampler:
         return view.reshape(-1), y.reshape(-1), x.reshape(-1)
 
 
-def _fold(position: Int64[np.ndarray, "w r"], size: Int64[np.ndarray, "w 1"]) -> Int64[np.ndarray, "w r"]:
+def _mirror_into(
+    position: Int64[np.ndarray, "w r"], size: Int64[np.ndarray, "w 1"]
+) -> Int64[np.ndarray, "w r"]:
     """Positions mirrored at 0 and ``size`` until they lie between."""
     period = np.mod(position, 2 * size)
     return np.minimum(period, 2 * size - 1 - period)

@@ -17,16 +17,16 @@ from octasplat.engine.dataset.camera import Camera
 from octasplat.engine.dataset.model import DatasetView, Observations, SparsePoints
 from octasplat.engine.trace.protocol import Recording, TraceGradients, Tracer
 
-LEAST_TRACK = 3
+MIN_TRACK_LENGTH = 3
 """Points in fewer training views may be wrong matches."""
-DEVIATIONS = 3.0
+MAX_ERROR_SIGMAS = 3.0
 """Sight ends so many standard deviations of its depth before a point."""
-LEAST_ERROR_PX = 0.5
+MIN_ERROR_PX = 0.5
 """No point is placed better than that."""
 
 
 @runtime_checkable
-class PhotographsOfPoints(Protocol):
+class ObservedPoints(Protocol):
     """Photographs with the points that they show, and where these lie.
 
     See :class:`octasplat.engine.dataset.Dataset`.
@@ -40,7 +40,7 @@ class PhotographsOfPoints(Protocol):
 
 
 @dataclass(frozen=True)
-class SightLines:
+class VisibilityRays:
     """Ways from training cameras to the points that they show.
 
     Attributes:
@@ -59,7 +59,7 @@ class SightLines:
         return len(self.ends)
 
     @classmethod
-    def of(cls, dataset: PhotographsOfPoints, margin: float) -> "SightLines":
+    def from_dataset(cls, dataset: ObservedPoints, margin: float) -> "VisibilityRays":
         """Those of the training views.
 
         The depth of a point along one ray of its track is known to
@@ -87,16 +87,16 @@ class SightLines:
         pixel_rad = np.array([dataset.cameras[each.camera_index].pixel_angle_rad for each in dataset.views])[
             view
         ]
-        error_px = np.maximum(points.errors_px[row], LEAST_ERROR_PX)
+        error_px = np.maximum(points.errors_px[row], MIN_ERROR_PX)
         deviation = error_px * pixel_rad * distance / sharpness
-        ends = distance - np.maximum(DEVIATIONS * deviation, margin * distance)
-        good = (track[row] >= LEAST_TRACK) & (ends > 0.5 * distance)
+        ends = distance - np.maximum(MAX_ERROR_SIGMAS * deviation, margin * distance)
+        good = (track[row] >= MIN_TRACK_LENGTH) & (ends > 0.5 * distance)
         return cls(origins[view[good]], direction[good], ends[good], view[good])
 
-    def without(self, views: Int64[np.ndarray, " m"]) -> "SightLines":
+    def exclude_views(self, views: Int64[np.ndarray, " m"]) -> "VisibilityRays":
         """Those of other views."""
         kept = ~np.isin(self.view, views)
-        return SightLines(
+        return VisibilityRays(
             self.starts_world[kept], self.directions_world[kept], self.ends[kept], self.view[kept]
         )
 
@@ -106,11 +106,13 @@ class SightLines:
         return RayBatch(self.starts_world[chosen], self.directions_world[chosen], t_max=self.ends[chosen])
 
 
-def blocked_term(lines: RayBatch, tracer: Tracer, weight: float) -> tuple[Recording, TraceGradients]:
+def free_space_gradient(
+    visibility_rays: RayBatch, tracer: Tracer, weight: float
+) -> tuple[Recording, TraceGradients]:
     """What was traced along lines of sight, and gradients of ``weight`` times their mean hidden share."""
-    seen = tracer.trace(lines, record=True)
+    seen = tracer.trace(visibility_rays, record=True)
     assert seen.recording is not None
     none = np.zeros_like(seen.rgb_srgb)
     return seen.recording, TraceGradients(
-        none, transmittance=np.full(len(lines), -weight / len(lines), np.float32)
+        none, transmittance=np.full(len(visibility_rays), -weight / len(visibility_rays), np.float32)
     )

@@ -10,49 +10,49 @@ from scipy.spatial.transform import Rotation
 from octasplat.engine.core.rays import RayBatch
 from octasplat.engine.dataset import Camera, DatasetView
 from octasplat.engine.train.sampling.pixel_sampler import TrainingData
-from octasplat.engine.train.views.image_alignment import Motion
+from octasplat.engine.train.views.image_alignment import RigidMotion
 
-ROUNDS = 3
+FIT_ROUNDS = 3
 """The common part is found for small angles, and again for what that leaves."""
 
 
 @runtime_checkable
-class PosedPhotographs(TrainingData, Protocol):
+class PosedTrainingData(TrainingData, Protocol):
     """Photographs with their cameras (see :class:`octasplat.engine.dataset.Dataset`)."""
 
     cameras: tuple[Camera, ...]
 
 
-class CorrectedViews:
-    """The same photographs seen from corrected poses; follows :class:`PosedPhotographs`.
+class CorrectedDataset:
+    """The same photographs seen from corrected poses; follows :class:`PosedTrainingData`.
 
     Views of no correction keep every bit of their rays.
 
     Args:
-        given: the photographs as they are.
+        original: the photographs as they are.
 
     Attributes:
-        given: those.
+        original: those.
         views: with the poses as they are corrected.
     """
 
-    def __init__(self, given: PosedPhotographs) -> None:
-        self.given = given
+    def __init__(self, given: PosedTrainingData) -> None:
+        self.original = given
         self.views: tuple[DatasetView, ...] = given.views
         self.cameras = given.cameras
         self.train_indices: Int64[np.ndarray, " t"] = given.train_indices
         self.test_indices: Int64[np.ndarray, " h"] = given.test_indices
         self.has_alpha = given.has_alpha
         self.extent = given.extent
-        self.put(np.zeros((len(given.views), 6)))
+        self.set_corrections(np.zeros((len(given.views), 6)))
 
-    def put(self, corrections: Float64[np.ndarray, "v 6"]) -> None:
+    def set_corrections(self, corrections: Float64[np.ndarray, "v 6"]) -> None:
         """Correct all views: the rotation vector and shift by which each camera's points move."""
         self.views = tuple(
-            corrected(view, Motion.of(numbers)) if numbers.any() else view
-            for view, numbers in zip(self.given.views, corrections, strict=True)
+            correct_view(view, RigidMotion.from_vector(numbers)) if numbers.any() else view
+            for view, numbers in zip(self.original.views, corrections, strict=True)
         )
-        pairs = list(zip(self.views, self.given.views, strict=True))
+        pairs = list(zip(self.views, self.original.views, strict=True))
         self._moved: Bool[np.ndarray, " v"] = np.asarray(corrections.any(axis=1))
         self._turns_world = np.stack(
             [now.rotation_cam_from_world.T @ given.rotation_cam_from_world for now, given in pairs]
@@ -63,7 +63,7 @@ class CorrectedViews:
         self, view: Int64[np.ndarray, " r"], y: Int64[np.ndarray, " r"], x: Int64[np.ndarray, " r"]
     ) -> RayBatch:
         """Unit rays of pixels, world frame."""
-        rays = self.given.rays(view, y, x)
+        rays = self.original.rays(view, y, x)
         moved = self._moved[view]
         if not moved.any():
             return rays
@@ -78,10 +78,10 @@ class CorrectedViews:
         self, view: Int64[np.ndarray, " r"], y: Int64[np.ndarray, " r"], x: Int64[np.ndarray, " r"]
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Those of the photographs."""
-        return self.given.pixels(view, y, x)
+        return self.original.pixels(view, y, x)
 
 
-def corrected(view: DatasetView, motion: Motion) -> DatasetView:
+def correct_view(view: DatasetView, motion: RigidMotion) -> DatasetView:
     """A view whose camera's points have moved."""
     rotation = motion.rotation @ view.rotation_cam_from_world
     return replace(
@@ -91,8 +91,8 @@ def corrected(view: DatasetView, motion: Motion) -> DatasetView:
     )
 
 
-def without_common(
-    corrections: Float64[np.ndarray, "v 6"], dataset: PosedPhotographs, used: Int64[np.ndarray, " t"]
+def remove_common_motion(
+    corrections: Float64[np.ndarray, "v 6"], dataset: PosedTrainingData, used: Int64[np.ndarray, " t"]
 ) -> Float64[np.ndarray, "v 6"]:
     """The corrections without what they have in common: a turn, a shift and a scale of the whole scene.
 
@@ -100,7 +100,7 @@ def without_common(
     it. Views of no correction have a say in what is common, but stay.
 
     Args:
-        corrections: see :meth:`CorrectedViews.put`.
+        corrections: see :meth:`CorrectedDataset.put`.
         dataset: the photographs with their given poses.
         used: views that could be corrected.
     """
@@ -108,9 +108,12 @@ def without_common(
     places = np.stack([view.origin_world for view in given])
     middle = places.mean(axis=0)
     found = corrections.copy()
-    for _ in range(ROUNDS):
-        now = [corrected(v, Motion.of(found[i])) for v, i in zip(given, used.tolist(), strict=True)]
-        turn, shift, growth = _common(given, now, middle, dataset.extent)
+    for _ in range(FIT_ROUNDS):
+        now = [
+            correct_view(v, RigidMotion.from_vector(found[i]))
+            for v, i in zip(given, used.tolist(), strict=True)
+        ]
+        turn, shift, growth = _common_similarity(given, now, middle, dataset.extent)
         back = Rotation.from_rotvec(-turn).as_matrix()
         for old, new, index in zip(given, now, used.tolist(), strict=True):
             if not corrections[index].any():
@@ -118,12 +121,12 @@ def without_common(
             rotation = new.rotation_cam_from_world @ back.T
             origin = middle + back @ (new.origin_world - middle - shift) / (1 + growth)
             relative = rotation @ old.rotation_cam_from_world.T
-            moved = Motion(relative, -rotation @ origin - relative @ old.translation_cam_from_world)
-            found[index] = moved.numbers
+            moved = RigidMotion(relative, -rotation @ origin - relative @ old.translation_cam_from_world)
+            found[index] = moved.to_vector
     return found
 
 
-def _common(
+def _common_similarity(
     given: list[DatasetView], now: list[DatasetView], middle: Float64[np.ndarray, "3"], extent: float
 ) -> tuple[Float64[np.ndarray, "3"], Float64[np.ndarray, "3"], float]:
     """The small turn (rad) about ``middle``, shift and relative growth nearest to all views' motions.

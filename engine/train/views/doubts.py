@@ -12,23 +12,23 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Int64
 
-from octasplat.engine.core.errors import Cancelled
+from octasplat.engine.core.errors import CancelledError
 from octasplat.engine.core.threads import use_threads
 from octasplat.engine.dataset import Dataset
 from octasplat.engine.trace.factory import make_tracer
 from octasplat.engine.train.config import Background, TrainConfig
-from octasplat.engine.train.initialization.first_state import first_state
+from octasplat.engine.train.initialization.first_state import initial_scene
 from octasplat.engine.train.loop.trainer import Trainer
-from octasplat.engine.train.sampling.batches import still_background
-from octasplat.engine.train.views.outlier_views import LEAST_VIEWS, misfits, view_fits
+from octasplat.engine.train.sampling.batches import evaluation_background
+from octasplat.engine.train.views.outlier_views import MIN_VIEWS, find_outlier_views, measure_views
 
-ITERATIONS = 200
-DOUBT_SIGMAS = 3.0
+PROBE_ITERATIONS = 200
+PROBE_SIGMAS = 3.0
 """Nearer to the others than what is called a misfit after a long training, as matches have the last word."""
-MOST_IN_DOUBT, MOST_SHARE_IN_DOUBT = 20, 0.25
+MAX_SUSPECTS, MAX_SUSPECT_FRACTION = 20, 0.25
 """No more views are in doubt, nor a larger share of all; the worst are."""
 _SETTINGS: dict[str, object] = {
-    "iterations": ITERATIONS,
+    "iterations": PROBE_ITERATIONS,
     "max_gaussians": 10_000,
     "rays_per_batch": 8192,
     "sh_degree": 0,
@@ -38,7 +38,7 @@ _SETTINGS: dict[str, object] = {
 }
 
 
-def doubtful_views(
+def find_misplaced_views(
     dataset: Dataset,
     *,
     background: Background,
@@ -55,12 +55,12 @@ def doubtful_views(
         seed: of the training to come.
         threads: of the training; 0 means all cores.
         should_stop: asked between iterations.
-        progress: told the iterations done, of :data:`ITERATIONS`.
+        progress: told the iterations done, of :data:`PROBE_ITERATIONS`.
 
     Raises:
-        Cancelled: stopped as asked.
+        CancelledError: stopped as asked.
     """
-    if len(dataset.train_indices) < LEAST_VIEWS:
+    if len(dataset.train_indices) < MIN_VIEWS:
         return np.zeros(0, np.int64)
     behind: Background = "auto" if background == "learnt" else background
     trial = TrainConfig().model_copy(update={**_SETTINGS, "background": behind, "seed": seed})
@@ -69,25 +69,25 @@ def doubtful_views(
             trainer = Trainer(
                 dataset,
                 trial,
-                first_state(dataset, trial, threads=use_threads(threads)),
+                initial_scene(dataset, trial, threads=use_threads(threads)),
                 folder=Path(folder),
                 fingerprint="",
-                listener=lambda _event: None,
+                progress=lambda _event: None,
                 threads=threads,
                 should_stop=should_stop,
-                onlooker=lambda done, _tracer: progress(done),
+                on_step=lambda done, _tracer: progress(done),
             )
             gaussians = trainer.run()
-    except Cancelled:
-        raise Cancelled(
+    except CancelledError:
+        raise CancelledError(
             "Stopped before the training, while looking for photographs in the wrong place; the same command "
             "with --resume goes on."
         ) from None
     tracer = make_tracer(trial.trace, threads=threads)
     tracer.build(gaussians, trainer.shading.features(gaussians))
-    fits = view_fits(
-        dataset, np.arange(len(dataset.views)), still_background(behind), tracer, trainer.shading
+    fits = measure_views(
+        dataset, np.arange(len(dataset.views)), evaluation_background(behind), tracer, trainer.shading
     )
-    doubtful = misfits(fits, dataset.views, dataset.train_indices, DOUBT_SIGMAS)
-    most = min(MOST_IN_DOUBT, int(MOST_SHARE_IN_DOUBT * len(dataset.views)))
+    doubtful = find_outlier_views(fits, dataset.views, dataset.train_indices, PROBE_SIGMAS)
+    most = min(MAX_SUSPECTS, int(MAX_SUSPECT_FRACTION * len(dataset.views)))
     return np.sort(doubtful[:most])

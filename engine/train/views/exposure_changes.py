@@ -9,23 +9,23 @@ from octasplat.engine.dataset.model import Observations
 from octasplat.engine.train.config import TrainConfig
 from octasplat.engine.train.sampling.pixel_sampler import TrainingData
 
-DARKEST, BRIGHTEST = 0.1, 0.95
+MIN_VALUE, MAX_VALUE = 0.1, 0.95
 """Display values beyond which a brightness says little."""
-LEAST_POINTS = 30
+MIN_POINTS = 30
 """A photograph that shows fewer points says nothing."""
 ROUNDS = 8
-CHANGES = 0.05
+MIN_CHANGE = 0.05
 """Standard deviation of the photographs' log brightness from which on exposure makes a difference."""
 
 
 @runtime_checkable
-class TrackedPhotographs(TrainingData, Protocol):
+class TrackedTrainingData(TrainingData, Protocol):
     """Photographs with the points that they show (see :class:`octasplat.engine.dataset.Dataset`)."""
 
     observations: Observations
 
 
-def log_brightness(dataset: TrackedPhotographs) -> Float64[np.ndarray, " v"]:
+def relative_log_brightness(dataset: TrackedTrainingData) -> Float64[np.ndarray, " v"]:
     """How much brighter each training view shows the points that it shares with others, as a logarithm.
 
     Medians over points and over views by turns, so that highlights and wrong matches do not count. The middle
@@ -43,28 +43,28 @@ def log_brightness(dataset: TrackedPhotographs) -> Float64[np.ndarray, " v"]:
     x, y = np.clip(seen.xy_px[rows].astype(np.int64), 0, sizes - 1).T
     rgb, _, weight = dataset.pixels(view, np.ascontiguousarray(y), np.ascontiguousarray(x))
     shown = rgb.mean(axis=1, dtype=np.float64)
-    valid = (weight > 0) & (shown > DARKEST) & (shown < BRIGHTEST)
+    valid = (weight > 0) & (shown > MIN_VALUE) & (shown < MAX_VALUE)
     view, point, levels = view[valid], point[valid], np.log(shown[valid])
     views = np.zeros(count)
     for _ in range(ROUNDS):
-        points = _medians(levels - views[view], point, int(point.max(initial=0)) + 1)
-        views = _medians(levels - points[point], view, count)
-    known = np.bincount(view, minlength=count) >= LEAST_POINTS
+        points = _group_medians(levels - views[view], point, int(point.max(initial=0)) + 1)
+        views = _group_medians(levels - points[point], view, count)
+    known = np.bincount(view, minlength=count) >= MIN_POINTS
     if known.any():
         brightness[known] = views[known] - np.median(views[known])
     return brightness
 
 
-def evening_gains(dataset: TrackedPhotographs) -> Float32[np.ndarray, " v"]:
+def equalizing_gains(dataset: TrackedTrainingData) -> Float32[np.ndarray, " v"]:
     """Factors on the display colours of each view that make all about as bright; 1 where none is known."""
-    brightness = log_brightness(dataset)
+    brightness = relative_log_brightness(dataset)
     return np.exp(-np.where(np.isfinite(brightness), brightness, 0.0)).astype(np.float32)
 
 
-def exposure_changes(brightness: Float64[np.ndarray, " v"]) -> str | None:
+def exposure_change_notice(brightness: Float64[np.ndarray, " v"]) -> str | None:
     """That the exposure changes so much that it makes a difference, in a sentence; None if it does not."""
     known = brightness[np.isfinite(brightness)]
-    if len(known) < 2 or float(known.std()) < CHANGES:
+    if len(known) < 2 or float(known.std()) < MIN_CHANGE:
         return None
     return (
         f"The exposure changes from photograph to photograph: the same things are shown up to "
@@ -72,7 +72,7 @@ def exposure_changes(brightness: Float64[np.ndarray, " v"]) -> str | None:
     )
 
 
-def with_exposure_decided(config: TrainConfig, dataset: TrackedPhotographs) -> tuple[TrainConfig, str | None]:
+def resolve_exposure(config: TrainConfig, dataset: TrackedTrainingData) -> tuple[TrainConfig, str | None]:
     """The configuration with ``exposure`` no longer ``auto``, and why it is learnt where that decided so.
 
     Materials learn one light for all photographs, and what shines, or was cut out, looks brighter from here
@@ -81,11 +81,11 @@ def with_exposure_decided(config: TrainConfig, dataset: TrackedPhotographs) -> t
     if config.exposure != "auto":
         return config, None
     steady = config.materials.learn or dataset.has_alpha
-    reason = None if steady else exposure_changes(log_brightness(dataset))
+    reason = None if steady else exposure_change_notice(relative_log_brightness(dataset))
     return config.model_copy(update={"exposure": reason is not None}), reason
 
 
-def _medians(
+def _group_medians(
     values: Float64[np.ndarray, " k"], group: Int64[np.ndarray, " k"], count: int
 ) -> Float64[np.ndarray, " g"]:
     """The median of each group's values; 0 where there are none."""

@@ -13,39 +13,39 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int64
 from scipy.spatial.transform import Rotation
 
-from octasplat.engine.core.color import composited
+from octasplat.engine.core.color import composite_over
 from octasplat.engine.dataset import Camera
 from octasplat.engine.dataset.image_motion import image_motion_by_pose
 from octasplat.engine.dataset.view_frusta import rotate_vectors
-from octasplat.engine.train.sampling.pixel_sampler import Pixels
+from octasplat.engine.train.sampling.pixel_sampler import PixelSource
 
-STEPS = 2
-MOST_PX = 1.0
+GAUSS_NEWTON_STEPS = 2
+MAX_RESIDUAL_STEP_PX = 1.0
 """A step moves the middle point no farther; colours beyond say nothing about the slope here."""
 DAMPING = 1e-3
 """Of the mean curvature, added to that of each of the six numbers: what hardly shows is left as it is."""
-LEAST_POINTS = 200
+MIN_POINTS = 200
 """From fewer points nothing is said."""
-FAR_PX = 1e6
+OUTSIDE_PX = 1e6
 """Image points farther off are none."""
-LEAST_NOISE = 0.005
+MIN_NOISE = 0.005
 """Display values; no smaller difference counts as usual."""
 
 
 @dataclass(frozen=True, eq=False)
-class Motion:
+class RigidMotion:
     """A rigid motion in camera coordinates: ``rotation @ x_cam + shift_cam``."""
 
     rotation: Float64[np.ndarray, "3 3"]
     shift_cam: Float64[np.ndarray, "3"]
 
     @classmethod
-    def of(cls, numbers: Float64[np.ndarray, "6"]) -> "Motion":
+    def from_vector(cls, numbers: Float64[np.ndarray, "6"]) -> "RigidMotion":
         """By a rotation vector (rad) and a shift (world units)."""
         return cls(Rotation.from_rotvec(numbers[:3]).as_matrix(), numbers[3:].copy())
 
     @property
-    def numbers(self) -> Float64[np.ndarray, "6"]:
+    def to_vector(self) -> Float64[np.ndarray, "6"]:
         """The rotation vector and the shift."""
         return np.concatenate([Rotation.from_matrix(self.rotation).as_rotvec(), self.shift_cam])
 
@@ -53,22 +53,22 @@ class Motion:
         """The points after the motion."""
         return rotate_vectors(points_cam, self.rotation) + self.shift_cam
 
-    def share(self, share: float) -> "Motion":
+    def scaled(self, share: float) -> "RigidMotion":
         """A share of the motion."""
-        return Motion.of(share * self.numbers)
+        return RigidMotion.from_vector(share * self.to_vector)
 
-    def after(self, first: "Motion") -> "Motion":
+    def compose(self, first: "RigidMotion") -> "RigidMotion":
         """``first``, then this one."""
-        return Motion(self.rotation @ first.rotation, self.rotation @ first.shift_cam + self.shift_cam)
+        return RigidMotion(self.rotation @ first.rotation, self.rotation @ first.shift_cam + self.shift_cam)
 
     @property
-    def undone(self) -> "Motion":
+    def inverse(self) -> "RigidMotion":
         """The motion back."""
-        return Motion(self.rotation.T, -self.rotation.T @ self.shift_cam)
+        return RigidMotion(self.rotation.T, -self.rotation.T @ self.shift_cam)
 
 
 @dataclass(frozen=True, eq=False)
-class Rendered:
+class RenderedPoints:
     """Points of the surface in camera coordinates, and the display colours that they are rendered in."""
 
     points_cam: Float64[np.ndarray, "n 3"]
@@ -76,43 +76,43 @@ class Rendered:
 
 
 @dataclass(frozen=True, eq=False)
-class Shown:
+class PhotographSamples:
     """What a photograph shows at image points.
 
     Attributes:
         rgb_srgb: display colours; 0 where it shows nothing.
-        slope: of the colours, by x and y in pixels.
+        gradient: of the colours, by x and y in pixels.
         valid: whether the photograph shows the point and counts there.
     """
 
     rgb_srgb: Float64[np.ndarray, "n 3"]
-    slope: Float64[np.ndarray, "n 3 2"]
+    gradient: Float64[np.ndarray, "n 3 2"]
     valid: Bool[np.ndarray, " n"]
 
 
-Photograph = Callable[[Float64[np.ndarray, "n 2"]], Shown]
+PhotographFn = Callable[[Float64[np.ndarray, "n 2"]], PhotographSamples]
 """Gives what is shown at image points (px)."""
 
 
 @dataclass(frozen=True, eq=False)
-class _Compared:
+class _Comparison:
     """Render and photograph under one motion; the render as exposed as fits best."""
 
-    shown: Shown
+    photograph: PhotographSamples
     exposed: Float64[np.ndarray, "n 3"]
     errors: Float64[np.ndarray, " n"]
     weights: Float64[np.ndarray, " n"]
     noise: float
 
 
-def photograph_of(
-    dataset: Pixels, view: int, size_px: tuple[int, int], background_srgb: Float32[np.ndarray, "3"]
-) -> Photograph:
+def photograph_spline(
+    dataset: PixelSource, view: int, size_px: tuple[int, int], background_srgb: Float32[np.ndarray, "3"]
+) -> PhotographFn:
     """A view's photograph as a smooth function: its pixels are the coefficients of cubic B-splines."""
     width, height = size_px
 
-    def look(xy_px: Float64[np.ndarray, "n 2"]) -> Shown:
-        known = (np.abs(xy_px) < FAR_PX).all(axis=1)
+    def look(xy_px: Float64[np.ndarray, "n 2"]) -> PhotographSamples:
+        known = (np.abs(xy_px) < OUTSIDE_PX).all(axis=1)
         within = np.where(known[:, None], xy_px, 0.0) - 0.5
         first = np.floor(within).astype(np.int64) - 1
         inside = known & (first >= 0).all(axis=1) & (first + 3 < (width, height)).all(axis=1)
@@ -121,58 +121,62 @@ def photograph_of(
         y = np.minimum(first[:, None, None, 1] + np.arange(4)[None, :, None], height - 1)
         which, y, x = (np.broadcast_to(a, (len(xy_px), 4, 4)).reshape(-1) for a in (np.array(view), y, x))
         rgb, alpha, weight = dataset.pixels(*_contiguous(which, y, x))
-        colours = composited(rgb, alpha, background_srgb).reshape(-1, 4, 4, 3).astype(np.float64)
+        colours = composite_over(rgb, alpha, background_srgb).reshape(-1, 4, 4, 3).astype(np.float64)
         valid = inside & (weight.reshape(-1, 16) > 0).all(axis=1)
         share = np.clip(within - first - 1, 0.0, 1.0)
-        (by_x, slope_x), (by_y, slope_y) = _spline(share[:, 0]), _spline(share[:, 1])
+        (by_x, slope_x), (by_y, slope_y) = _spline_weights(share[:, 0]), _spline_weights(share[:, 1])
         rows, row_slopes = (np.einsum("nyxc,nx->nyc", colours, taps) for taps in (by_x, slope_x))
         values = np.einsum("nyc,ny->nc", rows, by_y)
         slope = np.stack(
             [np.einsum("nyc,ny->nc", row_slopes, by_y), np.einsum("nyc,ny->nc", rows, slope_y)], axis=2
         )
-        return Shown(np.where(valid[:, None], values, 0.0), slope, valid)
+        return PhotographSamples(np.where(valid[:, None], values, 0.0), slope, valid)
 
     return look
 
 
-def aligned(rendered: Rendered, photograph: Photograph, camera: Camera) -> Motion | None:
+def align_camera(rendered: RenderedPoints, photograph: PhotographFn, camera: Camera) -> RigidMotion | None:
     """The motion of the camera's points after which the photograph agrees with the render.
 
     Returns:
         None where too few points are seen, or the agreement becomes no better.
     """
     points = rendered.points_cam
-    if len(points) < LEAST_POINTS:
+    if len(points) < MIN_POINTS:
         return None
     depth = float(np.median(points[:, 2]))
-    motion = Motion.of(np.zeros(6))
-    before = now = _compared(rendered, photograph(camera.project(points)))
-    for _ in range(STEPS):
+    motion = RigidMotion.from_vector(np.zeros(6))
+    before = now = _compare(rendered, photograph(camera.project(points)))
+    for _ in range(GAUSS_NEWTON_STEPS):
         if now is None:
             return None
-        motion = Motion.of(_step(motion(points), now, camera, depth)).after(motion)
-        now = _compared(rendered, photograph(camera.project(motion(points))))
+        motion = RigidMotion.from_vector(_gauss_newton_step(motion(points), now, camera, depth)).compose(
+            motion
+        )
+        now = _compare(rendered, photograph(camera.project(motion(points))))
     if before is None or now is None:
         return None
-    both = before.shown.valid & now.shown.valid
-    better = both.sum() >= LEAST_POINTS and _cost(now, both, before.noise) < _cost(before, both, before.noise)
+    both = before.photograph.valid & now.photograph.valid
+    better = both.sum() >= MIN_POINTS and _huber_cost(now, both, before.noise) < _huber_cost(
+        before, both, before.noise
+    )
     return motion if better else None
 
 
-def _compared(rendered: Rendered, shown: Shown) -> _Compared | None:
+def _compare(rendered: RenderedPoints, shown: PhotographSamples) -> _Comparison | None:
     """The render beside what the photograph shows of its points; None where that are too few."""
-    if int(shown.valid.sum()) < LEAST_POINTS:
+    if int(shown.valid.sum()) < MIN_POINTS:
         return None
     weights = shown.valid.astype(np.float64)
     for _ in range(2):  # the second time without what disagrees
-        exposed = _exposed(rendered.rgb_srgb, shown.rgb_srgb, weights)
+        exposed = _fit_exposure(rendered.rgb_srgb, shown.rgb_srgb, weights)
         errors = np.sqrt(np.square(exposed - shown.rgb_srgb).mean(axis=1))
-        noise = max(LEAST_NOISE, float(np.median(errors[shown.valid])))
+        noise = max(MIN_NOISE, float(np.median(errors[shown.valid])))
         weights = shown.valid / np.maximum(errors, noise)
-    return _Compared(shown, exposed, errors, weights, noise)
+    return _Comparison(shown, exposed, errors, weights, noise)
 
 
-def _exposed(
+def _fit_exposure(
     rgb: Float64[np.ndarray, "n 3"], wanted: Float64[np.ndarray, "n 3"], weights: Float64[np.ndarray, " n"]
 ) -> Float64[np.ndarray, "n 3"]:
     """Colours under the gain and offset of each channel that bring them closest to others."""
@@ -184,39 +188,39 @@ def _exposed(
     return gain * offset + wanted_middle
 
 
-def _cost(compared: _Compared, which: Bool[np.ndarray, " n"], noise: float) -> float:
+def _huber_cost(compared: _Comparison, which: Bool[np.ndarray, " n"], noise: float) -> float:
     """Mean error of points by Huber's function: squared up to ``noise``, linear beyond."""
     errors = compared.errors[which]
     return float(np.where(errors < noise, errors**2, noise * (2 * errors - noise)).mean())
 
 
-def _step(
-    points_cam: Float64[np.ndarray, "n 3"], now: _Compared, camera: Camera, depth: float
+def _gauss_newton_step(
+    points_cam: Float64[np.ndarray, "n 3"], now: _Comparison, camera: Camera, depth: float
 ) -> Float64[np.ndarray, "6"]:
     """A step of Gauss and Newton: a rotation vector and a shift of the camera's points.
 
     Shifts count in depths while it is solved, so that all six numbers are angles.
     """
     flow = image_motion_by_pose(points_cam, camera, depth)
-    by_pose = np.einsum("nci,nik->nck", now.shown.slope, flow)
+    by_pose = np.einsum("nci,nik->nck", now.photograph.gradient, flow)
     slopes = np.zeros((len(points_cam), 3, 12))  # by the pose, and by each channel's gain and offset
     slopes[:, :, :6] = by_pose
     for channel in range(3):
         slopes[:, channel, 6 + channel] = -now.exposed[:, channel]
         slopes[:, channel, 9 + channel] = -1.0
-    slopes[~now.shown.valid] = 0.0
+    slopes[~now.photograph.valid] = 0.0
     weighted = slopes * now.weights[:, None, None]
     curvature = np.einsum("nck,ncl->kl", weighted, slopes)  # no BLAS: the same bits on any number of threads
-    downhill = np.einsum("nck,nc->k", weighted, now.exposed - now.shown.rgb_srgb)
+    downhill = np.einsum("nck,nc->k", weighted, now.exposed - now.photograph.rgb_srgb)
     diagonal = curvature.diagonal()
     damping = np.where(np.arange(12) < 6, DAMPING * diagonal[:6].mean(), 0.0) + 1e-9 * diagonal + 1e-12
     step = np.linalg.solve(curvature + np.diag(damping), downhill)[:6]
-    moved_px = np.linalg.norm(np.einsum("nik,k->ni", flow[now.shown.valid], step), axis=1)
-    step *= min(1.0, MOST_PX / max(float(np.median(moved_px)), 1e-12))
+    moved_px = np.linalg.norm(np.einsum("nik,k->ni", flow[now.photograph.valid], step), axis=1)
+    step *= min(1.0, MAX_RESIDUAL_STEP_PX / max(float(np.median(moved_px)), 1e-12))
     return step * np.repeat([1.0, depth], 3)
 
 
-def _spline(
+def _spline_weights(
     share: Float64[np.ndarray, " n"],
 ) -> tuple[Float64[np.ndarray, "n 4"], Float64[np.ndarray, "n 4"]]:
     """Weights of four neighbours at a share of the way from the second to the third, and their slopes."""

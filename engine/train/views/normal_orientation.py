@@ -13,15 +13,15 @@ from octasplat.engine.trace.protocol import TraceGradients, Tracer
 from octasplat.engine.train.sampling.batches import grid_pixels
 from octasplat.engine.train.sampling.pixel_sampler import TrainingData, view_sizes_px
 
-TILES = 6
+GRID_TILES = 6
 """So many tiles of a view each way tell who sees what.
 
 See :func:`octasplat.engine.train.sampling.batches.grid_pixels`.
 """
-VIEWS_AT_ONCE = 8
+VIEWS_PER_TRACE = 8
 
 
-def turn_outwards(
+def orient_normals(
     gaussians: FlatGaussians, dataset: TrainingData, indices: Int64[np.ndarray, " v"], tracer: Tracer
 ) -> Int32[np.ndarray, " t"]:
     """Turn Gaussians over, in place, that are mostly seen from behind.
@@ -39,22 +39,24 @@ def turn_outwards(
         Numbers of those that were turned, ascending.
     """
     towards = np.zeros((len(gaussians), 3))
-    for start in range(0, len(indices), VIEWS_AT_ONCE):
-        towards += _towards_viewers(len(gaussians), dataset, indices[start : start + VIEWS_AT_ONCE], tracer)
+    for start in range(0, len(indices), VIEWS_PER_TRACE):
+        towards += _summed_view_directions(
+            len(gaussians), dataset, indices[start : start + VIEWS_PER_TRACE], tracer
+        )
     normals = gaussians.rotations[:, :, 0].astype(np.float64)
     turned = np.flatnonzero((normals * towards).sum(axis=1) < 0).astype(np.int32)
-    gaussians.quats_wxyz[turned] = _half_turned(gaussians.quats_wxyz[turned])
+    gaussians.quats_wxyz[turned] = _flip_frames(gaussians.quats_wxyz[turned])
     return turned
 
 
-def _towards_viewers(
+def _summed_view_directions(
     count: int, dataset: TrainingData, indices: Int64[np.ndarray, " v"], tracer: Tracer
 ) -> Float64[np.ndarray, "n 3"]:
     """For each Gaussian, the directions to those who see it, summed by how much of it they see.
 
     That is what the backward pass makes of directions given as gradients of features.
     """
-    rays = dataset.rays(*grid_pixels(indices, view_sizes_px(dataset), TILES))
+    rays = dataset.rays(*grid_pixels(indices, view_sizes_px(dataset), GRID_TILES))
     seen = tracer.trace(rays, record=True)
     assert seen.recording is not None
     by_features = np.zeros_like(seen.features)
@@ -66,7 +68,7 @@ def _towards_viewers(
     return sums
 
 
-def _half_turned(quats_wxyz: np.ndarray) -> np.ndarray:
+def _flip_frames(quats_wxyz: np.ndarray) -> np.ndarray:
     """Frames after half a turn about the first axis in the Gaussians' planes, which octagons do not show."""
     w, x, y, z = quats_wxyz.T
     return np.stack([-y, -z, w, x], axis=-1)

@@ -10,31 +10,31 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int64
 
-from octasplat.engine.core.color import composited
-from octasplat.engine.core.psnr import colour_corrected, psnr
+from octasplat.engine.core.color import composite_over
+from octasplat.engine.core.psnr import fit_color, psnr
 from octasplat.engine.dataset import DatasetView
 from octasplat.engine.shading.protocol import ShadingModel
 from octasplat.engine.trace.protocol import Tracer
 from octasplat.engine.train.sampling.pixel_sampler import TrainingData
-from octasplat.engine.train.views.view_grids import shown_on_grids
+from octasplat.engine.train.views.view_grids import render_grids
 
-TILES = 3
+GRID_TILES = 3
 """So many tiles each way of a view are measured, see :func:`octasplat.engine.train.sampling.batches.grid_pixels`."""
-LEAST_VIEWS = 6
+MIN_VIEWS = 6
 """Among fewer views nobody can say which of them is odd."""
-NEIGHBOURS = 8
-DISTANCES_AT_ONCE = 1 << 22
+NEIGHBORS = 8
+MAX_DISTANCES = 1 << 22
 """Distances between views are found in blocks of so many; 2,048 views fit into one."""
-MOST_DB = 100.0
+MAX_PSNR_DB = 100.0
 """A view that is shown without an error counts as so many."""
-FAR_BELOW_DB, FAR_BELOW_SIGMAS = 3.0, 5.0
+OUTLIER_MARGIN_DB, OUTLIER_SIGMAS = 3.0, 5.0
 """A view that is so much worse than those around it, also in robust standard deviations, is misplaced."""
-MOST_LEFT_OUT = 0.25
+MAX_EXCLUDED_FRACTION = 0.25
 """No larger share of the training views is left out."""
 
 
 @dataclass(frozen=True, eq=False)
-class ViewFits:
+class ViewPsnr:
     """How well views are rendered, each on a fixed grid of its pixels.
 
     Attributes:
@@ -48,32 +48,32 @@ class ViewFits:
     psnr_colour_corrected: Float64[np.ndarray, " v"]
 
 
-def view_fits(
+def measure_views(
     dataset: TrainingData,
     indices: Int64[np.ndarray, " v"],
     background_srgb: Float32[np.ndarray, "3"],
     tracer: Tracer,
     shading: ShadingModel,
-) -> ViewFits:
+) -> ViewPsnr:
     """Measure the Gaussians that ``tracer`` holds on the views ``indices``; changes nothing."""
     plain, corrected = [], []
-    for grids in shown_on_grids(
-        dataset, indices, background_srgb, tracer, shading, tiles=TILES, exposed=True
+    for grids in render_grids(
+        dataset, indices, background_srgb, tracer, shading, tiles=GRID_TILES, exposed=True
     ):
         rgb, alpha, weight = dataset.pixels(*grids.pixels)
-        target = composited(rgb, alpha, background_srgb).reshape(grids.rgb_srgb.shape)
+        target = composite_over(rgb, alpha, background_srgb).reshape(grids.rgb_srgb.shape)
         counts = (weight > 0).astype(np.float32).reshape(len(target), -1)
         for shown, photograph, valid in zip(grids.rgb_srgb, target, counts, strict=True):
             plain.append(psnr(shown, photograph, valid))
-            corrected.append(psnr(colour_corrected(shown, photograph, valid), photograph, valid))
-    return ViewFits(indices, *(np.minimum(values, MOST_DB) for values in (plain, corrected)))
+            corrected.append(psnr(fit_color(shown, photograph, valid), photograph, valid))
+    return ViewPsnr(indices, *(np.minimum(values, MAX_PSNR_DB) for values in (plain, corrected)))
 
 
-def misfits(
-    fits: ViewFits,
+def find_outlier_views(
+    measured: ViewPsnr,
     views: Sequence[DatasetView],
     train_indices: Int64[np.ndarray, " t"],
-    sigmas: float = FAR_BELOW_SIGMAS,
+    sigmas: float = OUTLIER_SIGMAS,
 ) -> Int64[np.ndarray, " m"]:
     """The views that are rendered far worse than the training views around them, worst first.
 
@@ -82,31 +82,31 @@ def misfits(
     Held-out views are as a rule worse than their neighbours and are taken as such. Exposure does not count.
 
     Args:
-        fits: of views, training views among them.
+        measured: of views, training views among them.
         views: all views of the dataset.
         train_indices: views that are trained on.
         sigmas: how many robust standard deviations are far.
     """
-    known = np.isfinite(fits.psnr_colour_corrected)
-    indices, psnr = fits.indices[known], fits.psnr_colour_corrected[known]
+    known = np.isfinite(measured.psnr_colour_corrected)
+    indices, psnr = measured.indices[known], measured.psnr_colour_corrected[known]
     trained = np.isin(indices, train_indices)
-    if int(trained.sum()) < LEAST_VIEWS:
+    if int(trained.sum()) < MIN_VIEWS:
         return np.zeros(0, np.int64)
     low = np.zeros(len(indices), np.bool_)
     below = np.zeros(len(indices))
     for _ in range(2):  # the second time without those that the first found as neighbours
-        above = psnr - _around(indices, psnr, trained & ~low, views)
+        above = psnr - _neighborhood_median(indices, psnr, trained & ~low, views)
         usual = float(np.median(above[trained]))
         sigma = 1.4826 * float(np.median(np.abs(above[trained] - usual)))
         below = usual - above
         if not trained.all():
             below[~trained] -= max(0.0, float(np.median(below[~trained])))
-        low = below > max(FAR_BELOW_DB, sigmas * sigma)
+        low = below > max(OUTLIER_MARGIN_DB, sigmas * sigma)
     worst_first = np.argsort(-below, kind="stable")
     return indices[worst_first[low[worst_first]]]
 
 
-def _around(
+def _neighborhood_median(
     indices: Int64[np.ndarray, " v"],
     psnr: Float64[np.ndarray, " v"],
     counts: Bool[np.ndarray, " v"],
@@ -120,14 +120,14 @@ def _around(
     origins = np.stack([views[i].origin_world for i in indices.tolist()])
     forward = np.stack([views[i].rotation_cam_from_world[2] for i in indices.tolist()])
     total = len(origins)
-    rows = max(1, DISTANCES_AT_ONCE // total)
+    rows = max(1, MAX_DISTANCES // total)
     some = np.unique(np.linspace(0, total - 1, min(rows, total)).astype(np.int64))
-    usual = max(float(np.median(_apart(origins[some], origins))), 1e-12)
-    others = min(NEIGHBOURS, int(counts.sum()) - 1)
+    usual = max(float(np.median(_squared_distances(origins[some], origins))), 1e-12)
+    others = min(NEIGHBORS, int(counts.sum()) - 1)
     result = np.empty(total)
     for start in range(0, total, rows):
         part = slice(start, start + rows)
-        away = _apart(origins[part], origins) / usual + (1 - forward[part] @ forward.T)
+        away = _squared_distances(origins[part], origins) / usual + (1 - forward[part] @ forward.T)
         away[:, ~counts] = np.inf
         away[np.arange(len(away)), np.arange(total)[part]] = np.inf
         nearest = np.argsort(away, axis=1, kind="stable")[:, :others]
@@ -135,15 +135,15 @@ def _around(
     return result
 
 
-def _apart(
+def _squared_distances(
     some: Float64[np.ndarray, "s 3"], others: Float64[np.ndarray, "v 3"]
 ) -> Float64[np.ndarray, "s v"]:
     return np.asarray(np.linalg.norm(some[:, None] - others, axis=2))
 
 
 @dataclass(frozen=True)
-class TrainingViews:
-    """How the training ended for its views, see :class:`ViewFits`.
+class TrainingViewReport:
+    """How the training ended for its views, see :class:`ViewPsnr`.
 
     Attributes:
         psnr: dB, by name, of the views that were trained on to the end.
@@ -168,7 +168,7 @@ class TrainingViews:
             "views": known,
         }
 
-    def complaint(self) -> str | None:
+    def warning(self) -> str | None:
         """What the user should know."""
         loose = [name for name in self.misfits if name not in self.left_out]
         if not loose:
@@ -182,7 +182,7 @@ class TrainingViews:
         )
 
 
-class ViewJudge:
+class OutlierDetector:
     """Looks for views that do not fit.
 
     Args:
@@ -194,28 +194,28 @@ class ViewJudge:
         self._dataset = dataset
         self._background_srgb = background_srgb
 
-    def misfits(
+    def find(
         self, tracer: Tracer, shading: ShadingModel, left_out: Int64[np.ndarray, " k"]
     ) -> Int64[np.ndarray, " m"]:
         """Training views to leave out besides others, as the Gaussians that ``tracer`` holds show them."""
         train = self._dataset.train_indices
         used = np.setdiff1d(train, left_out)
-        fits = view_fits(self._dataset, used, self._background_srgb, tracer, shading)
-        room = int(MOST_LEFT_OUT * len(train)) - len(left_out)
-        return np.sort(misfits(fits, self._dataset.views, used)[: max(0, room)])
+        fits = measure_views(self._dataset, used, self._background_srgb, tracer, shading)
+        room = int(MAX_EXCLUDED_FRACTION * len(train)) - len(left_out)
+        return np.sort(find_outlier_views(fits, self._dataset.views, used)[: max(0, room)])
 
-    def conclude(
+    def report(
         self, tracer: Tracer, shading: ShadingModel, left_out: Int64[np.ndarray, " m"]
-    ) -> TrainingViews:
+    ) -> TrainingViewReport:
         """How well the finished Gaussians, which ``tracer`` holds, show the views."""
         dataset = self._dataset
         used = np.setdiff1d(dataset.train_indices, left_out)
         indices = np.concatenate([used, dataset.test_indices])
-        fits = view_fits(dataset, indices, self._background_srgb, tracer, shading)
-        found = misfits(fits, dataset.views, used)
+        fits = measure_views(dataset, indices, self._background_srgb, tracer, shading)
+        found = find_outlier_views(fits, dataset.views, used)
         names = [view.name for view in dataset.views]
         psnr = dict(zip(fits.indices.tolist(), fits.psnr.tolist(), strict=True))
-        return TrainingViews(
+        return TrainingViewReport(
             psnr={names[i]: psnr[i] for i in used.tolist()},
             misfits=tuple(names[i] for i in [*found.tolist(), *left_out.tolist()]),
             left_out=tuple(names[i] for i in left_out.tolist()),

@@ -15,19 +15,28 @@ import numpy as np
 from jaxtyping import Float32, Float64, Int64
 
 from octasplat.engine.dataset.view_frusta import rotate_vectors
-from octasplat.engine.shading.protocol import ShadingModel, Sight
+from octasplat.engine.shading.protocol import ShadingModel, TracedRays
 from octasplat.engine.trace.protocol import Tracer
 from octasplat.engine.train.sampling.batches import grid_pixels
 from octasplat.engine.train.sampling.pixel_sampler import view_sizes_px
-from octasplat.engine.train.views.corrected_views import CorrectedViews, PosedPhotographs, without_common
-from octasplat.engine.train.views.image_alignment import Motion, Rendered, aligned, photograph_of
+from octasplat.engine.train.views.corrected_views import (
+    CorrectedDataset,
+    PosedTrainingData,
+    remove_common_motion,
+)
+from octasplat.engine.train.views.image_alignment import (
+    RenderedPoints,
+    RigidMotion,
+    align_camera,
+    photograph_spline,
+)
 
-TILES = 5
+GRID_TILES = 5
 """So many tiles each way of a view are aligned, see :func:`octasplat.engine.train.sampling.batches.grid_pixels`."""
-VIEWS_AT_ONCE = 32
-TAKEN = 0.5
+VIEWS_PER_TRACE = 32
+STEP_FRACTION = 0.5
 """Share of a motion that is taken: what the Gaussians get wrong for the moment is averaged out."""
-OPAQUE = 0.7
+MIN_ALPHA = 0.7
 """Least accumulated alpha of a ray that is taken to meet the surface."""
 
 
@@ -61,7 +70,7 @@ class RefinedPoses:
         """JSON-ready, by name."""
         return {name: dict(vars(pose)) for name, pose in self.views.items()}
 
-    def sentence(self) -> str:
+    def summary(self) -> str:
         """What the user should know."""
         sizes = {name: pose.moved_px for name, pose in self.views.items() if pose.moved_px is not None}
         middle = float(np.median(list(sizes.values()))) if sizes else 0.0
@@ -85,8 +94,8 @@ class PoseRefiner:
         dataset: the photographs as they are to be trained on.
     """
 
-    def __init__(self, dataset: PosedPhotographs, background_srgb: Float32[np.ndarray, "3"]) -> None:
-        self.dataset = CorrectedViews(dataset)
+    def __init__(self, dataset: PosedTrainingData, background_srgb: Float32[np.ndarray, "3"]) -> None:
+        self.dataset = CorrectedDataset(dataset)
         self._background_srgb = background_srgb
 
     def refine(
@@ -102,18 +111,20 @@ class PoseRefiner:
         """
         dataset, found = self.dataset, corrections.copy()
         used = np.setdiff1d(dataset.train_indices, left_out)
-        for index, rendered in self._rendered(used, tracer, shading):
+        for index, rendered in self._render_grids(used, tracer, shading):
             view = dataset.views[index]
             size_px = (view.width_px, view.height_px)
-            photograph = photograph_of(dataset, index, size_px, self._background_srgb)
-            motion = aligned(rendered, photograph, dataset.cameras[view.camera_index])
+            photograph = photograph_spline(dataset, index, size_px, self._background_srgb)
+            motion = align_camera(rendered, photograph, dataset.cameras[view.camera_index])
             if motion is not None:
-                found[index] = motion.share(TAKEN).after(Motion.of(found[index])).numbers
-        found = without_common(found, dataset.given, used)
-        dataset.put(found)
+                found[index] = (
+                    motion.scaled(STEP_FRACTION).compose(RigidMotion.from_vector(found[index])).to_vector
+                )
+        found = remove_common_motion(found, dataset.original, used)
+        dataset.set_corrections(found)
         return found
 
-    def conclude(
+    def report(
         self,
         corrections: Float64[np.ndarray, "v 6"],
         tracer: Tracer,
@@ -124,11 +135,11 @@ class PoseRefiner:
         dataset, found = self.dataset, {}
         used = np.setdiff1d(dataset.train_indices, left_out)
         moved = used[corrections[used].any(axis=1)]
-        for index, rendered in self._rendered(moved, tracer, shading):
-            view, given = dataset.views[index], dataset.given.views[index]
-            camera, motion = dataset.cameras[view.camera_index], Motion.of(corrections[index])
+        for index, rendered in self._render_grids(moved, tracer, shading):
+            view, given = dataset.views[index], dataset.original.views[index]
+            camera, motion = dataset.cameras[view.camera_index], RigidMotion.from_vector(corrections[index])
             points = rendered.points_cam
-            away = np.linalg.norm(camera.project(points) - camera.project(motion.undone(points)), axis=1)
+            away = np.linalg.norm(camera.project(points) - camera.project(motion.inverse(points)), axis=1)
             away = away[np.isfinite(away)]
             found[view.name] = RefinedPose(
                 rotation_cam_from_world=view.rotation_cam_from_world.tolist(),
@@ -139,21 +150,21 @@ class PoseRefiner:
             )
         return RefinedPoses(found, len(used))
 
-    def _rendered(
+    def _render_grids(
         self, indices: Int64[np.ndarray, " v"], tracer: Tracer, shading: ShadingModel
-    ) -> Iterator[tuple[int, Rendered]]:
+    ) -> Iterator[tuple[int, RenderedPoints]]:
         """Each view with what the Gaussians show of a grid of its pixels, where they show a surface."""
         dataset = self.dataset
-        for start in range(0, len(indices), VIEWS_AT_ONCE):
-            some = indices[start : start + VIEWS_AT_ONCE]
-            view, y, x = grid_pixels(some, view_sizes_px(dataset), TILES)
+        for start in range(0, len(indices), VIEWS_PER_TRACE):
+            some = indices[start : start + VIEWS_PER_TRACE]
+            view, y, x = grid_pixels(some, view_sizes_px(dataset), GRID_TILES)
             rays = dataset.rays(view, y, x)
             seen = tracer.trace(rays)
-            developed = shading.develop(Sight(rays, seen, tracer, view))
-            rgb = np.clip(developed.over(self._background_srgb), 0, 1)
-            met = (seen.depth_median > 0) & (seen.alpha >= OPAQUE)
+            developed = shading.shade(TracedRays(rays, seen, tracer, view))
+            rgb = np.clip(developed.composite_over(self._background_srgb), 0, 1)
+            met = (seen.depth_median > 0) & (seen.alpha >= MIN_ALPHA)
             points_world = seen.depth_median[:, None].astype(np.float64) * rays.directions_world
             for index in some.tolist():
                 chosen = met & (view == index)
                 points = rotate_vectors(points_world[chosen], dataset.views[index].rotation_cam_from_world)
-                yield index, Rendered(points, rgb[chosen].astype(np.float64))
+                yield index, RenderedPoints(points, rgb[chosen].astype(np.float64))

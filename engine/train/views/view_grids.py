@@ -6,13 +6,13 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float32, Float64, Int64
 
-from octasplat.engine.shading.protocol import ShadingModel, Sight
+from octasplat.engine.shading.protocol import ShadingModel, TracedRays
 from octasplat.engine.trace.protocol import Tracer
 from octasplat.engine.train.sampling.batches import grid_pixels
 from octasplat.engine.train.sampling.pixel_sampler import TrainingData, view_sizes_px
-from octasplat.engine.train.shading_factory import exposures_of
+from octasplat.engine.train.shading_factory import find_exposures
 
-VIEWS_AT_ONCE = 64
+VIEWS_PER_TRACE = 64
 BRIGHTNESS_TILES = 2
 """So many tiles each way tell how bright a view is.
 
@@ -21,7 +21,7 @@ See :func:`octasplat.engine.train.sampling.batches.grid_pixels`.
 
 
 @dataclass(frozen=True, eq=False)
-class ShownGrids:
+class RenderedGrids:
     """Some views on their grids.
 
     Attributes:
@@ -33,7 +33,7 @@ class ShownGrids:
     rgb_srgb: Float32[np.ndarray, "v p 3"]
 
 
-def shown_on_grids(
+def render_grids(
     dataset: TrainingData,
     indices: Int64[np.ndarray, " v"],
     background_srgb: Float32[np.ndarray, "3"],
@@ -42,7 +42,7 @@ def shown_on_grids(
     *,
     tiles: int,
     exposed: bool,
-) -> Iterator[ShownGrids]:
+) -> Iterator[RenderedGrids]:
     """The views ``indices``, some at a time, as the Gaussians that ``tracer`` holds show them.
 
     Args:
@@ -54,30 +54,32 @@ def shown_on_grids(
         tiles: so many each way of a view, see :func:`octasplat.engine.train.sampling.batches.grid_pixels`.
         exposed: as exposed as each view is; else as the mean exposure shows the scene.
     """
-    for start in range(0, len(indices), VIEWS_AT_ONCE):
-        some = indices[start : start + VIEWS_AT_ONCE]
+    for start in range(0, len(indices), VIEWS_PER_TRACE):
+        some = indices[start : start + VIEWS_PER_TRACE]
         pixels = grid_pixels(some, view_sizes_px(dataset), tiles)
         rays = dataset.rays(*pixels)
-        developed = shading.develop(Sight(rays, tracer.trace(rays), tracer, pixels[0] if exposed else None))
-        shown = np.clip(developed.over(background_srgb), 0, 1)
-        yield ShownGrids(pixels, shown.reshape(len(some), -1, 3))
+        developed = shading.shade(
+            TracedRays(rays, tracer.trace(rays), tracer, pixels[0] if exposed else None)
+        )
+        shown = np.clip(developed.composite_over(background_srgb), 0, 1)
+        yield RenderedGrids(pixels, shown.reshape(len(some), -1, 3))
 
 
-def guess_exposures(
+def estimate_untrained_exposures(
     dataset: TrainingData, background_srgb: Float32[np.ndarray, "3"], tracer: Tracer, shading: ShadingModel
 ) -> None:
     """Give held-out views the exposures that a camera would choose there, where exposures are learnt."""
-    exposures = exposures_of(shading)
+    exposures = find_exposures(shading)
     if exposures is not None and exposures.steps.any():
         names = [view.name for view in dataset.views]
-        exposures.guess_others(names, _brightness(dataset, background_srgb, tracer, shading))
+        exposures.estimate_untrained(names, _mean_brightness(dataset, background_srgb, tracer, shading))
 
 
-def _brightness(
+def _mean_brightness(
     dataset: TrainingData, background_srgb: Float32[np.ndarray, "3"], tracer: Tracer, shading: ShadingModel
 ) -> Float64[np.ndarray, " v"]:
     """The mean display value that each view would have with the mean exposure."""
-    shown = shown_on_grids(
+    shown = render_grids(
         dataset, np.arange(len(dataset.views)), background_srgb, tracer, shading,
         tiles=BRIGHTNESS_TILES, exposed=False,
     )  # fmt: skip

@@ -14,7 +14,7 @@ import click
 
 from octasplat.engine.core.errors import ConfigError
 from octasplat.engine.operations.reconstruct import ReconstructOptions
-from octasplat.engine.settings.renamed_settings import tell_renamed
+from octasplat.engine.settings.renamed_settings import notify_renamed
 from octasplat.workers.cli.options import exports_option, parse_export_names, quiet_option
 from octasplat.workers.cli.request_options import request_from_options, request_options
 
@@ -173,7 +173,7 @@ def derive(
 
     _check_output(output, wait=wait)
     if former_on is not None:
-        tell_renamed({"--on": "--other-dataset"})
+        notify_renamed({"--on": "--other-dataset"})
     files = [_parse_file_option(text) for text in given["files"]]
     with connected(server) as api:
         source = None if job_id is None else _get_job(api, job_id)["id"]

@@ -8,7 +8,7 @@ from typing import Any, get_args
 
 import click
 
-from octasplat.engine.settings.fields import Level
+from octasplat.engine.settings.fields import SettingLevel
 
 _json_option = click.option("--json", "as_json", is_flag=True, help="Write JSON.")
 
@@ -20,28 +20,30 @@ def config() -> None:
 
 @config.command("list", short_help="List the settings.")
 @click.option("--all", "everything", is_flag=True, help="List all settings, not only the basic ones.")
-@click.option("--group", type=click.Choice(get_args(Level)), help="List the settings of this group.")
+@click.option("--group", type=click.Choice(get_args(SettingLevel)), help="List the settings of this group.")
 @click.option("--markdown", is_flag=True, help="Write the page docs/settings.md.")
 @_json_option
 def list_settings(everything: bool, group: str | None, markdown: bool, as_json: bool) -> None:
     """List the settings, those that most people need unless asked for others."""
-    from octasplat.engine.runs.settings_catalog import settings, value_text
+    from octasplat.engine.runs.settings_catalog import all_settings, format_value
     from octasplat.engine.runs.settings_page import settings_page
 
     if markdown:
         click.echo(settings_page(), nl=False)
         return
     wanted = group or ("" if everything else "basic")
-    entries = [entry for entry in settings() if not wanted or entry.group == wanted]
+    entries = [entry for entry in all_settings() if not wanted or entry.group == wanted]
     if as_json:
         _write_json([_entry_as_dict(entry) for entry in entries])
         return
     width = max(len(entry.name) for entry in entries)
     for entry in entries:
-        value = " ".join((value_text(entry.default), entry.unit)).strip()
+        value = " ".join((format_value(entry.default), entry.unit)).strip()
         click.echo(f"{entry.name:{width}}  {value:<24}  {_first_sentence(entry.description)}")
-    if len(entries) < len(settings()):
-        click.echo(f"{len(entries)} of {len(settings())} settings; --all lists the others, too.", err=True)
+    if len(entries) < len(all_settings()):
+        click.echo(
+            f"{len(entries)} of {len(all_settings())} settings; --all lists the others, too.", err=True
+        )
 
 
 @config.command(short_help="Explain a setting.")
@@ -49,9 +51,9 @@ def list_settings(everything: bool, group: str | None, markdown: bool, as_json: 
 @_json_option
 def explain(name: str, as_json: bool) -> None:
     """Explain the setting NAME, such as lr.mean: what it does, its unit, range and defaults."""
-    from octasplat.engine.runs.settings_catalog import setting_named, value_text
+    from octasplat.engine.runs.settings_catalog import find_setting, format_value
 
-    entry = setting_named(name)
+    entry = find_setting(name)
     if as_json:
         _write_json(_entry_as_dict(entry))
         return
@@ -62,8 +64,8 @@ def explain(name: str, as_json: bool) -> None:
         "Type": entry.type,
         "Unit": entry.unit,
         "Range": entry.range,
-        "Default": value_text(entry.default),
-        **{f"With {preset}": value_text(value) for preset, value in entry.exceptions.items()},
+        "Default": format_value(entry.default),
+        **{f"With {preset}": format_value(value) for preset, value in entry.exceptions.items()},
     }
     for label, text in facts.items():
         if text:
@@ -78,16 +80,16 @@ def diff(run: Path, other: Path | None, as_json: bool) -> None:
     """Tell in which settings RUN differs from the defaults of its preset, or RUN2 from RUN."""
     from octasplat.engine.runs.config import read_config
     from octasplat.engine.runs.run_folder import CONFIG
-    from octasplat.engine.runs.settings_catalog import defaults_of, differences, value_text
+    from octasplat.engine.runs.settings_catalog import default_values, format_value, setting_differences
 
     first = read_config(run / CONFIG)
-    before, after = (defaults_of(first), first) if other is None else (first, read_config(other / CONFIG))
-    found = differences(before, after)
+    before, after = (default_values(first), first) if other is None else (first, read_config(other / CONFIG))
+    found = setting_differences(before, after)
     if as_json:
         _write_json([asdict(difference) for difference in found])
         return
     for difference in found:
-        old, new = value_text(difference.before), value_text(difference.after)
+        old, new = format_value(difference.before), format_value(difference.after)
         click.echo(f"{difference.name}: {old} -> {new}")
     if not found:
         what = f"the defaults of {first.preset}" if other is None else str(run)

@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from octasplat.engine.dataset.image_sizes import Sizes
+from octasplat.engine.dataset.image_sizes import ImageSizes
 from octasplat.engine.operations.base import Options
 from octasplat.engine.operations.clean import OPERATION as CLEAN
 from octasplat.engine.operations.cost_model import (
@@ -26,7 +26,7 @@ from octasplat.engine.operations.render import OPERATION as RENDER
 from octasplat.engine.operations.stage_init import OPERATION as STAGE_INIT
 from octasplat.engine.operations.transform import OPERATION as TRANSFORM
 from octasplat.engine.runs.config import ReconstructionConfig
-from octasplat.engine.train.config import MOST_PLANNED_ITERATIONS, iteration_count, most_gaussians
+from octasplat.engine.train.config import MAX_PLANNED_ITERATIONS, iteration_count, max_gaussian_count
 from octasplat.workers.worker.job_kinds.image_kinds import RelightKind, RenderKind
 from octasplat.workers.worker.job_kinds.operation_kind import OperationKind
 from octasplat.workers.worker.job_kinds.registry import register
@@ -80,13 +80,13 @@ class ReconstructKind(OperationKind):
         return options.exports
 
     def resource_demands(
-        self, options: ReconstructionConfig, sizes: Sequence[Sizes]
+        self, options: ReconstructionConfig, sizes: Sequence[ImageSizes]
     ) -> tuple[ResourceDemand, ...]:
         """Return what the training asks for."""
         train = options.train
         pixels = training_pixels(options, sizes)
-        gaussians = most_gaussians(train, pixels)
-        iterations = MOST_PLANNED_ITERATIONS if options.minutes else iteration_count(train, pixels)
+        gaussians = max_gaussian_count(train, pixels)
+        iterations = MAX_PLANNED_ITERATIONS if options.minutes else iteration_count(train, pixels)
         return (
             ResourceDemand("train.iterations", "iterations", iterations),
             ResourceDemand("train.max_gaussians", "gaussians", gaussians),
@@ -99,7 +99,7 @@ class ReconstructKind(OperationKind):
             ResourceDemand("max_side", "workspace_bytes", reconstruction_bytes(options, sizes)),
         )
 
-    def estimate(self, options: ReconstructionConfig, sizes: Sequence[Sizes], cores: int) -> Estimate:
+    def estimate(self, options: ReconstructionConfig, sizes: Sequence[ImageSizes], cores: int) -> Estimate:
         """Return the time and memory that it takes."""
         return estimate_reconstruction(options, sizes, cores)
 

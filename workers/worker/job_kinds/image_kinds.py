@@ -5,10 +5,10 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from octasplat.engine.core.errors import Cancelled
-from octasplat.engine.core.events import Listener
-from octasplat.engine.core.progress import stopping
-from octasplat.engine.dataset.image_sizes import Sizes
+from octasplat.engine.core.errors import CancelledError
+from octasplat.engine.core.events import EventListener
+from octasplat.engine.core.progress import stop_when_asked
+from octasplat.engine.dataset.image_sizes import ImageSizes
 from octasplat.engine.operations.base import Operation
 from octasplat.engine.operations.cost_model import (
     Estimate,
@@ -52,12 +52,12 @@ class ImageKind(OperationKind):
         }  # fmt: skip
 
     @contextmanager
-    def progress_callback(self, task: Task) -> Iterator[Listener]:
+    def progress_callback(self, task: Task) -> Iterator[EventListener]:
         """Yield what hears the events; what is done is stored when the work is stopped."""
         frames = FrameCheckpoints(task.progress)
         try:
-            yield stopping(frames, task.should_stop)
-        except Cancelled:
+            yield stop_when_asked(frames, task.should_stop)
+        except CancelledError:
             frames.request_checkpoint()
             raise
 
@@ -87,7 +87,9 @@ class RenderKind(ImageKind):
             places["output"] = task.run / FRAMES_FOLDER / f"preview.{options.format}"
         return places
 
-    def resource_demands(self, options: RenderOptions, sizes: Sequence[Sizes]) -> tuple[ResourceDemand, ...]:
+    def resource_demands(
+        self, options: RenderOptions, sizes: Sequence[ImageSizes]
+    ) -> tuple[ResourceDemand, ...]:
         """Return the pixels and paths of all images."""
         pixels = rendered_pixels(options, sizes)
         always = (
@@ -99,7 +101,7 @@ class RenderKind(ImageKind):
         samples = options.stage.integrator.samples
         return (*always, ResourceDemand("stage.integrator.samples", "render_paths", pixels * samples))
 
-    def estimate(self, options: RenderOptions, sizes: Sequence[Sizes], cores: int) -> Estimate:
+    def estimate(self, options: RenderOptions, sizes: Sequence[ImageSizes], cores: int) -> Estimate:
         """Return the time and memory that it takes."""
         return estimate_render(options, sizes, cores)
 
@@ -107,7 +109,9 @@ class RenderKind(ImageKind):
 class RelightKind(ImageKind):
     """Other light."""
 
-    def resource_demands(self, options: RelightOptions, sizes: Sequence[Sizes]) -> tuple[ResourceDemand, ...]:
+    def resource_demands(
+        self, options: RelightOptions, sizes: Sequence[ImageSizes]
+    ) -> tuple[ResourceDemand, ...]:
         """Return the pixels and paths of all images."""
         pixels, count = rendered_pixels(options, sizes), len(options.environments)
         return (
@@ -116,6 +120,6 @@ class RelightKind(ImageKind):
             ResourceDemand("samples", "render_paths", pixels * count * options.samples_per_pixel),
         )
 
-    def estimate(self, options: RelightOptions, sizes: Sequence[Sizes], cores: int) -> Estimate:
+    def estimate(self, options: RelightOptions, sizes: Sequence[ImageSizes], cores: int) -> Estimate:
         """Return the time and memory that it takes."""
         return estimate_relight(options, sizes, cores)

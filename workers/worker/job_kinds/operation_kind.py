@@ -7,10 +7,10 @@ from typing import Any
 
 from pydantic import BaseModel
 
-from octasplat.engine.core.events import Listener
-from octasplat.engine.core.progress import stopping
+from octasplat.engine.core.events import EventListener
+from octasplat.engine.core.progress import stop_when_asked
 from octasplat.engine.operations.base import Operation, Options, Request
-from octasplat.engine.settings.fields import map_named_files, named_files, takes_files
+from octasplat.engine.settings.fields import accepts_files, iter_named_files, map_named_files
 from octasplat.workers.storage.file_names import check_name
 from octasplat.workers.worker.job_kinds.registry import JobKind, Needs
 from octasplat.workers.worker.task import SCENE_FILE, Task
@@ -58,13 +58,13 @@ class OperationKind(JobKind[Any]):
             source_files=source_files,
         )
         self.operation = operation
-        self.takes_files = takes_files(self.options)
+        self.takes_files = accepts_files(self.options)
         self.reports_stages = reports_stages
         self._output = output
 
     def named_files(self, options: Any) -> Iterable[tuple[str, str]]:
         """Return the files that the options name."""
-        return ((place, path.as_posix()) for place, path in named_files(options))
+        return ((place, path.as_posix()) for place, path in iter_named_files(options))
 
     def build_request(self, task: Task) -> Request:
         """Return the request of a job, whose files lie in the task's folders.
@@ -84,9 +84,9 @@ class OperationKind(JobKind[Any]):
         return request
 
     @contextmanager
-    def progress_callback(self, task: Task) -> Iterator[Listener]:
+    def progress_callback(self, task: Task) -> Iterator[EventListener]:
         """Yield what hears the events of the operation."""
-        yield stopping(task.progress, task.should_stop)
+        yield stop_when_asked(task.progress, task.should_stop)
 
     def result_name(self, path: Path) -> str:
         """Return the name among the results of a file, by its path in the folder of the result."""

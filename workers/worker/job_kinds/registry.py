@@ -7,7 +7,7 @@ from pydantic import BaseModel, ValidationError
 from typing_extensions import TypeVar
 
 from octasplat.engine.core.errors import ConfigError
-from octasplat.engine.dataset.image_sizes import Sizes
+from octasplat.engine.dataset.image_sizes import ImageSizes
 from octasplat.engine.operations.cost_model import Estimate
 from octasplat.workers.worker.job_kinds.resource_limits import ResourceDemand
 
@@ -102,7 +102,7 @@ class JobKind(Generic[OptionsT]):
         """Return the names of the files that it writes in formats of their own."""
         return ()
 
-    def resource_demands(self, options: OptionsT, sizes: Sequence[Sizes]) -> Iterable[ResourceDemand]:
+    def resource_demands(self, options: OptionsT, sizes: Sequence[ImageSizes]) -> Iterable[ResourceDemand]:
         """Return what the options ask for that a service may set a ceiling to, for such photographs."""
         return ()
 
@@ -110,7 +110,7 @@ class JobKind(Generic[OptionsT]):
         """Return the files that the options name, each after the place where they do, with dots."""
         return ()
 
-    def estimate(self, options: OptionsT, sizes: Sequence[Sizes], cores: int) -> Estimate | None:
+    def estimate(self, options: OptionsT, sizes: Sequence[ImageSizes], cores: int) -> Estimate | None:
         """Return the time and memory that it takes on so many cores; None where nobody knows."""
         return None
 

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from typing import Any
 
-from octasplat.engine.dataset.image_sizes import Sizes
+from octasplat.engine.dataset.image_sizes import ImageSizes
 from octasplat.engine.operations.base import Operation, Options
 from octasplat.engine.operations.export import OPERATION as EXPORT
 from octasplat.engine.operations.export import ExportJobOptions
@@ -47,7 +47,7 @@ class ExportKind(OperationKind):
         assert isinstance(options, ExportJobOptions)
         return options.files
 
-    def resource_demands(self, options: Options, sizes: Sequence[Sizes]) -> tuple[ResourceDemand, ...]:
+    def resource_demands(self, options: Options, sizes: Sequence[ImageSizes]) -> tuple[ResourceDemand, ...]:
         """Return the number of files."""
         return (ResourceDemand("files", "exports", len(self.exported_files(options))),)
 

@@ -7,7 +7,7 @@ from typing import Any, Literal
 from pydantic import Field, model_validator
 
 from octasplat.engine.core.errors import ConfigError
-from octasplat.engine.dataset.image_sizes import Sizes
+from octasplat.engine.dataset.image_sizes import ImageSizes
 from octasplat.engine.files import check_surface_path
 from octasplat.engine.operations.base import Options
 from octasplat.engine.operations.surface import OPERATION, SurfaceOptions
@@ -68,7 +68,7 @@ class SurfaceKind(OperationKind):
         }
         return (*super().stages(options), *(name for name, is_asked in asked.items() if is_asked))
 
-    def demands(self, options: SurfaceJobOptions, sizes: Sequence[Sizes]) -> tuple[ResourceDemand, ...]:
+    def demands(self, options: SurfaceJobOptions, sizes: Sequence[ImageSizes]) -> tuple[ResourceDemand, ...]:
         """Return the sides of the maps, the pixels of all depth maps, one a photograph, and the files."""
         side_px = options.depth_side
         pixels = sum(
@@ -97,5 +97,5 @@ class SurfaceKind(OperationKind):
         return places
 
 
-def _longer_px(size: Sizes) -> int:
+def _longer_px(size: ImageSizes) -> int:
     return max(size.width_px, size.height_px)
