@@ -205,7 +205,7 @@ class JsonLinesWriter:
         """Write ``event`` and flush, so that a reader beside the run sees whole lines.
 
         Raises:
-            NoSpaceLeft: there is no room for it.
+            DiskFullError: there is no room for it.
         """
         line = json.dumps({"time": round(time.time(), 3), **event.as_dict()}) + "\n"
         if self._file is None:

@@ -10,7 +10,7 @@ def check_relative_path(name: str) -> str:
     Raises:
         ValueError: it is empty or absolute, names a drive, climbs, or holds a character that no path has.
 
-    >>> checked_relative("left/0001.jpg")
+    >>> check_relative_path("left/0001.jpg")
     'left/0001.jpg'
     """
     paths = (PurePosixPath(name), PureWindowsPath(name))

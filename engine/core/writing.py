@@ -18,7 +18,7 @@ def report_disk_full(path: Path) -> Iterator[None]:
     """Inside the block ``path`` is written, which the system's own errors do not say.
 
     Raises:
-        NoSpaceLeft: there is no room for it.
+        DiskFullError: there is no room for it.
     """
     try:
         yield
@@ -36,7 +36,7 @@ def atomic_replace(path: Path) -> Iterator[Path]:
     error the temporary file is removed and ``path`` is left as it was.
 
     Raises:
-        NoSpaceLeft: there is no room for it.
+        DiskFullError: there is no room for it.
     """
     with report_disk_full(path):
         path.parent.mkdir(parents=True, exist_ok=True)

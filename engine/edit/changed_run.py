@@ -72,7 +72,7 @@ def write_changed_run(
 
     Raises:
         OutputError: the folder is taken or cannot be written.
-        NoSpaceLeft: its disk is full.
+        DiskFullError: its disk is full.
     """
     check_new_run(target)
     partial = target.with_name(f".{target.name}.{os.getpid()}.partial")

@@ -29,7 +29,7 @@ def export_batch(
         None.
 
     Raises:
-        NoSpaceLeft: there is no room for a file.
+        DiskFullError: there is no room for a file.
     """
     written: list[Path] = []
     failed: list[str] = []

@@ -176,7 +176,7 @@ def run(
     Tells the steps of a stage ``export``, one for each of several files.
 
     Raises:
-        ExportFailed: a file could not be written; the others were.
+        ExportError: a file could not be written; the others were.
         OctasplatError: the scene cannot be read, or no format takes a name.
     """
     from octasplat.engine.files import dropped_on_export

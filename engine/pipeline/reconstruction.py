@@ -53,13 +53,13 @@ def reconstruct(
 
     Raises:
         DatasetError: the photographs or the model cannot be used, or no poses be found.
-        PosesCrashed: COLMAP died.
+        ColmapCrashError: COLMAP died.
         OutputError: ``output`` holds something else or cannot be written.
         ConfigError: settings that the photographs rule out or, with ``resume``, other ones than the run's.
         SceneFileError: a file of ``exports`` could not be written on this machine; told before the training.
         CheckpointError: with ``resume``, other photographs or another model than the run's.
-        TrainingFailure: training collapsed.
-        ExportFailed: some of ``exports`` could not be written; all the rest is there.
+        TrainingError: training collapsed.
+        ExportError: some of ``exports`` could not be written; all the rest is there.
         CancelledError: stopped as asked.
     """
     if not (output / SCENE).exists():

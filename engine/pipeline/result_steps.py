@@ -40,7 +40,7 @@ class ExportStep:
         """Write the files.
 
         Raises:
-            ExportFailed: some could not be written.
+            ExportError: some could not be written.
         """
         with phase("export", run.progress, len(run.config.exports)):
             missing = [name for name in run.config.exports if not (run.output / name).exists()]

@@ -68,7 +68,7 @@ def find_poses(
     Raises:
         DatasetError: too few photographs, or they do not fit together; the text says what to do. Also if the
             result that is there is of other photographs.
-        PosesCrashed: COLMAP died.
+        ColmapCrashError: COLMAP died.
         CancelledError: stopped as asked.
     """
     names = photographs_in(images)
@@ -122,7 +122,7 @@ def repair_poses(
 
     Raises:
         DatasetError: COLMAP refuses to work with the photographs or the model.
-        PosesCrashed: COLMAP died.
+        ColmapCrashError: COLMAP died.
         CancelledError: stopped as asked.
     """
     with _work_folder(output) as work:
@@ -168,7 +168,7 @@ def adjust_principal_points(
 
     Raises:
         DatasetError: COLMAP refuses to work with the model.
-        PosesCrashed: COLMAP died.
+        ColmapCrashError: COLMAP died.
         CancelledError: stopped as asked.
     """
     before = read_pose_record(output)
@@ -233,7 +233,7 @@ class _ColmapProcess:
         Raises:
             CancelledError: stopped as asked.
             DatasetError: as the process says.
-            PosesCrashed: it said nothing and died.
+            ColmapCrashError: it said nothing and died.
         """
         log = self._request.work / "log.txt"
         with log.open("wb") as noise, _start_process(self._request, noise) as process:

@@ -51,7 +51,7 @@ class FinishedImages:
         """Record that an image is finished; its file is written.
 
         Raises:
-            NoSpaceLeft: there is no room for the record.
+            DiskFullError: there is no room for the record.
             OutputError: the record cannot be written.
         """
         name, digest = self._name(path), _sha256(path)

@@ -41,7 +41,7 @@ def find_missing_poses(
 
     Raises:
         DatasetError: there are no photographs, or their poses cannot be found.
-        PosesCrashed: COLMAP died.
+        ColmapCrashError: COLMAP died.
         CancelledError: stopped as asked.
     """
     if config.poses == "given" or (config.poses == "missing" and has_colmap_model(scene)):

@@ -7,7 +7,7 @@ from typing import Any
 def merge_options(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
     """Return ``base`` with the values of ``over``, section by section; another kind of section begins anew.
 
-    >>> merged({"rates": {"quat": 1, "mean": 2}}, {"rates": {"quat": 3}})
+    >>> merge_options({"rates": {"quat": 1, "mean": 2}}, {"rates": {"quat": 3}})
     {'rates': {'quat': 3, 'mean': 2}}
     """
     result = dict(base)

@@ -16,7 +16,7 @@ from jaxtyping import Float64, Int64, Shaped
 def morton_cells(side: int) -> tuple[Int64[np.ndarray, " c"], Int64[np.ndarray, " c"]]:
     """Return row and column of each cell of a square of ``side`` x ``side`` cells, along a Z-order curve.
 
-    >>> [(int(row), int(column)) for row, column in zip(*z_order(2))]
+    >>> [(int(row), int(column)) for row, column in zip(*morton_cells(2))]
     [(0, 0), (0, 1), (1, 0), (1, 1)]
     """
     rows, columns = np.divmod(np.arange(side * side), side)

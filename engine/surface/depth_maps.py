@@ -54,7 +54,7 @@ def render_depth_maps(
     The file has no name, so that nothing is left of it whatever happens.
 
     Raises:
-        NoSpaceLeft: there is no room for it.
+        DiskFullError: there is no room for it.
     """
     sizes = [camera.width_px * camera.height_px for camera in cameras]
     with report_disk_full(folder), tempfile.TemporaryFile(dir=folder) as handle:

@@ -17,7 +17,7 @@ def run_reconstruction(
 
     Raises:
         StoppedError: by SIGINT or SIGTERM, after a checkpoint.
-        ExportFailed: some files could not be written; what there is was shown.
+        ExportError: some files could not be written; what there is was shown.
         OctasplatError: as :func:`octasplat.engine.pipeline.reconstruction` does.
     """
     import octasplat.engine.pipeline  # noqa: F401 - pycolmap takes SIGTERM when imported, so before we do

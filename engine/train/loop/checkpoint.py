@@ -90,7 +90,7 @@ def load_checkpoint(path: Path, fingerprint: str) -> TrainState:
     """Read a checkpoint back.
 
     Raises:
-        DamagedCheckpoint: the file cannot be read.
+        DamagedCheckpointError: the file cannot be read.
         CheckpointError: it belongs to another configuration or other photographs.
     """
     try:

@@ -116,7 +116,7 @@ def train_step(
         What was found before the step.
 
     Raises:
-        TrainingFailure: the loss is no number.
+        TrainingError: the loss is no number.
     """
     tracer, shading = components.tracer, components.shading
     densifier = components.densifier

@@ -157,7 +157,7 @@ class Trainer:
         """Train to the end and return the Gaussians to export: the last ones, or the best if those collapsed.
 
         Raises:
-            TrainingFailure: parameters became not-a-number, or nothing is left to see.
+            TrainingError: parameters became not-a-number, or nothing is left to see.
             CancelledError: stopped as asked; a checkpoint is on disk.
         """
         with PrefetchedBatches(self._batches) as batches:

@@ -125,7 +125,7 @@ class ValidationProbe:
         """Measure a state, note that in it, keep it if it is the best, and tell of the held-out views.
 
         Raises:
-            TrainingFailure: parameters are no numbers, or nothing is left to see.
+            TrainingError: parameters are no numbers, or nothing is left to see.
         """
         if not state.gaussians.is_finite():
             raise TrainingError(
