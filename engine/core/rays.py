@@ -59,8 +59,8 @@ class RayBatch:
         object.__setattr__(self, "directions_world", _for_kernels(directions_world))
         object.__setattr__(self, "t_min", _for_kernels(np.maximum(np.atleast_1d(t_min), 0)))
         object.__setattr__(self, "t_max", _for_kernels(np.atleast_1d(t_max)))
-        object.__setattr__(self, "t_viewer", _for_kernels(np.atleast_1d(t_view_origin)))
-        object.__setattr__(self, "t_leaves", _for_kernels(np.atleast_1d(t_backface_cull)))
+        object.__setattr__(self, "t_view_origin", _for_kernels(np.atleast_1d(t_view_origin)))
+        object.__setattr__(self, "t_backface_cull", _for_kernels(np.atleast_1d(t_backface_cull)))
 
     @classmethod
     def between(
