@@ -154,7 +154,7 @@ class Operation(Generic[RequestT, ResultT_co]):
 
 
 def stop_if(should_stop: Callable[[], bool]) -> None:
-    """Raise ``Cancelled`` if a stop is requested, before the next file is written.
+    """Raise ``CancelledError`` if a stop is requested, before the next file is written.
 
     Raises:
         CancelledError: it is.

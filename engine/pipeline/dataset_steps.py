@@ -57,7 +57,7 @@ class OpenDataset:
 
 def _repair_poses(run: ReconstructionRun) -> None:
     """Repair poses and lenses that contradict the photographs; reload the model if it changed."""
-    if place_misfits(run.dataset, run.output, run.config, run.threads, run.progress, run.should_stop):
+    if repair_run_poses(run.dataset, run.output, run.config, run.threads, run.progress, run.should_stop):
         run.dataset = _load_dataset(run)
     if estimate_principal_points(run.dataset, run.output, run.config, run.progress, run.should_stop):
         run.dataset = _load_dataset(run)
