@@ -17,8 +17,8 @@ from octasplat.engine.dataset.colmap_text import find_text_model_error
 from octasplat.engine.dataset.model import SparsePoints
 from octasplat.engine.dataset.pose_check import check_poses
 
-MODEL_FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0")
-"""Where a scene keeps its model; the first that holds one counts."""
+MODEL_FOLDERS = ("sparse", "colmap/sparse", "distorted/sparse")
+"""Where a scene keeps its model, or several in numbered folders below; the first that holds one counts."""
 
 _MODEL_FILES = ("cameras", "images", "points3D")
 MIN_QUATERNION_NORM = 1e-6
@@ -66,23 +66,19 @@ class ColmapModel:
 
 
 def find_colmap_model_folder(root: Path) -> Path:
-    """The folder of the scene's model, the first of :data:`MODEL_FOLDERS` that holds one.
+    """Return the folder of the scene's model: that of most images in the first of :data:`MODEL_FOLDERS`.
 
     Raises:
-        DatasetError: there is none, or the first one lacks a file.
+        DatasetError: there is none, or it lacks a file.
     """
     for name in MODEL_FOLDERS:
-        folder = root / name
-        if not any(
-            (folder / f"{part}{suffix}").is_file() for part in _MODEL_FILES for suffix in (".bin", ".txt")
-        ):
-            continue
-        for suffix in (".bin", ".txt"):
-            if all((folder / f"{part}{suffix}").is_file() for part in _MODEL_FILES):
-                return folder
-        suffix = ".bin" if any((folder / f"{part}.bin").is_file() for part in _MODEL_FILES) else ".txt"
-        missing = [f"{part}{suffix}" for part in _MODEL_FILES if not (folder / f"{part}{suffix}").is_file()]
-        raise DatasetError(f"{folder} lacks {' and '.join(missing)}; copy the whole COLMAP model there.")
+        if models := [*numbered_models(root / name), *_if_model(root / name)]:
+            complete = [folder for folder in models if not _missing_files(folder)]
+            numbered = [folder for folder in complete if folder.name.isdigit()]
+            if complete:
+                return max(numbered or complete, key=posed_image_count)
+            missing = " and ".join(_missing_files(models[0]))
+            raise DatasetError(f"{models[0]} lacks {missing}; copy the whole COLMAP model there.")
     raise DatasetError(
         f"{root} holds no COLMAP model; put cameras, images and points3D (.bin or .txt) into "
         f"{root / 'sparse/0'}, or have the poses found: octasplat reconstruct with --poses auto, or "
@@ -91,13 +87,44 @@ def find_colmap_model_folder(root: Path) -> Path:
 
 
 def has_colmap_model(root: Path) -> bool:
-    """Whether the scene brings a COLMAP model, or at least a part of one."""
-    return any(
-        (root / name / f"{part}{suffix}").is_file()
-        for name in MODEL_FOLDERS
-        for part in _MODEL_FILES
+    """Return whether the scene brings a COLMAP model, or at least a part of one."""
+    return any(numbered_models(root / name) or _if_model(root / name) for name in MODEL_FOLDERS)
+
+
+def numbered_models(folder: Path) -> list[Path]:
+    """Return the folders below ``folder`` that hold models or parts of one, as COLMAP numbers them."""
+    if not folder.is_dir():
+        return []
+    numbered = sorted((path for path in folder.iterdir() if path.name.isdecimal()), key=lambda p: int(p.name))
+    return [path for path in numbered if _if_model(path)]
+
+
+def posed_image_count(folder: Path) -> int:
+    """Return how many images a model announces; 0 where that cannot be read."""
+    try:
+        if (folder / "images.bin").is_file():
+            with (folder / "images.bin").open("rb") as file:
+                return int.from_bytes(file.read(8), "little")
+        with (folder / "images.txt").open("rb") as file:
+            return sum(not line.startswith(b"#") for line in file) // 2
+    except OSError:
+        return 0
+
+
+def _if_model(folder: Path) -> list[Path]:
+    files = (folder / f"{part}{suffix}" for part in _MODEL_FILES for suffix in (".bin", ".txt"))
+    return [folder] if any(file.is_file() for file in files) else []
+
+
+def _missing_files(folder: Path) -> list[str]:
+    """Return which files a model lacks, in the form of which there are some; none where it is complete."""
+    by_form = {
+        suffix: [f"{part}{suffix}" for part in _MODEL_FILES if not (folder / f"{part}{suffix}").is_file()]
         for suffix in (".bin", ".txt")
-    )
+    }
+    if not all(by_form.values()):
+        return []
+    return by_form[".bin"] if len(by_form[".bin"]) < len(_MODEL_FILES) else by_form[".txt"]
 
 
 def read_colmap_model(root: Path, folder: Path | None = None) -> ColmapModel:

@@ -10,7 +10,13 @@ from jaxtyping import Float64
 from octasplat.engine.core.errors import ConfigError, DatasetError
 from octasplat.engine.core.relative_paths import normalize_name
 from octasplat.engine.dataset.camera import Camera
-from octasplat.engine.dataset.colmap_model import ColmapModel, PosedImage, read_colmap_model
+from octasplat.engine.dataset.colmap_model import (
+    ColmapModel,
+    PosedImage,
+    numbered_models,
+    posed_image_count,
+    read_colmap_model,
+)
 from octasplat.engine.dataset.image_info import ImageInfo
 from octasplat.engine.dataset.image_names import match_image_names
 from octasplat.engine.dataset.images import read_image_info
@@ -69,7 +75,7 @@ def load_dataset_model(
         raise ConfigError(f"max_side is {max_side}; it must be at least 1 pixel.")
     if not root.is_dir():
         raise DatasetError(f"{root} is not a folder; name the folder that holds images/ and sparse/.")
-    if model_folder is None and not (root / "images").is_dir():
+    if model_folder is None and image_folder(root) == root:
         if any(path.suffix.lower() in IMAGE_SUFFIXES for path in root.iterdir()):
             raise DatasetError(
                 f"{root} is a bare folder of photographs, without camera poses; have them found: octasplat "
@@ -133,8 +139,8 @@ def load_dataset_model(
 
 
 def image_folder(root: Path) -> Path:
-    """``images/`` of a scene, or the scene itself where it is a bare folder of photographs."""
-    return root / "images" if (root / "images").is_dir() else root
+    """Return ``images/`` or ``input/`` of a scene, or the scene itself where it has neither."""
+    return next((root / name for name in ("images", "input") if (root / name).is_dir()), root)
 
 
 def _find_images(
@@ -225,16 +231,13 @@ def _check_size(camera: Camera, info: ImageInfo, image: PosedImage, path: Path) 
 
 
 def _warn_of_other_models(folder: Path, warnings: list[str]) -> None:
-    if folder.name != "0":
-        return
-    others = sorted(
-        other.name
-        for other in folder.parent.iterdir()
-        if other != folder and any((other / f"images{suffix}").is_file() for suffix in (".bin", ".txt"))
-    )
-    if others:
+    parent = folder.parent if folder.name.isdigit() else folder
+    counts = {other: posed_image_count(other) for other in numbered_models(parent) if other != folder}
+    if counts:
+        others = [f"{other.name} of {count}" for other, count in counts.items()]
         warnings.append(
-            f"{folder.parent} holds further models ({_name_list(others)}); only {folder} is used."
+            f"{parent} holds further models ({len(others)}): {_name_list(others)} images; only {folder} of "
+            f"{posed_image_count(folder)} images is used; take it away to use another."
         )
 
 

@@ -99,11 +99,11 @@ class PoseSearch:
             )
             best = max(best, self._search(thorough=True), key=model_rank)
         self._check_model(best)
+        # One after the other: colours are sums.
+        best.extract_colors_for_all_images(self._photographs, num_threads=1)
         names = dict(zip(self._aliases, self._names, strict=True))
         for image in best.images.values():
             image.name = names[image.name]
-        # One after the other: colours are sums.
-        best.extract_colors_for_all_images(self._images, num_threads=1)
         found.mkdir()
         best.write_binary(found)
         posed = {best.image(number).name for number in best.reg_image_ids()}

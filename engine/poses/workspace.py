@@ -4,20 +4,39 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
+from PIL import Image
+
 from octasplat.engine.core.events import EventListener
 from octasplat.engine.core.progress import counted_phase
+from octasplat.engine.dataset.images import read_image_info, read_photo
+
+_COLMAP_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp"})
 
 
 def link_photographs(images: Path, names: Sequence[str], folder: Path) -> tuple[str, ...]:
-    """Make a folder of links to photographs whose names COLMAP can list and number; returns these names.
+    """Make a folder of photographs whose names COLMAP can list and number; returns these names.
 
-    COLMAP lists pairs by names with a space between, and its numbers follow the order of names.
+    COLMAP lists pairs by names with a space between, and its numbers follow the order of names. Those in
+    formats that COLMAP does not read are copied as PNG, the others are links.
     """
-    aliases = tuple(f"{k:06d}{Path(name).suffix.lower()}" for k, name in enumerate(names))
+    suffixes = [Path(name).suffix.lower() for name in names]
+    aliases = tuple(
+        f"{k:06d}{suffix if suffix in _COLMAP_SUFFIXES else '.png'}" for k, suffix in enumerate(suffixes)
+    )
     folder.mkdir()
-    for alias, name in zip(aliases, names, strict=True):
-        (folder / alias).symlink_to((images / name).resolve())
+    for alias, name, suffix in zip(aliases, names, suffixes, strict=True):
+        if suffix in _COLMAP_SUFFIXES:
+            (folder / alias).symlink_to((images / name).resolve())
+        else:
+            _write_png(images / name, folder / alias)
     return aliases
+
+
+def _write_png(photograph: Path, target: Path) -> None:
+    """Write the display colours of a photograph as a PNG of 8 bits."""
+    info = read_image_info(photograph)
+    colours, _ = read_photo(photograph, info.width_px, info.height_px, 8)
+    Image.fromarray(colours).save(target, compress_level=1)
 
 
 @contextmanager

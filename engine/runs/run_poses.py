@@ -18,7 +18,7 @@ from octasplat.engine.poses import (
 )
 from octasplat.engine.poses.find_poses import read_pose_record
 from octasplat.engine.poses.photograph_check import check_photographs_decode
-from octasplat.engine.poses.photographs import photographs_in
+from octasplat.engine.poses.photographs import left_out_of_search, photographs_in
 from octasplat.engine.runs.config import ReconstructionConfig
 from octasplat.engine.runs.run_folder import POSES, found_model_folder
 from octasplat.engine.train.config import iteration_count
@@ -50,6 +50,8 @@ def find_missing_poses(
         raise DatasetError(f"{scene} is not a folder; name the folder that holds the photographs.")
     folder = image_folder(scene)
     if not (output / POSES).is_dir():
+        for sentence in left_out_of_search(scene):
+            tell(Warned(sentence))
         _refuse_before_search(scene, folder, config, threads)
     find_poses(folder, output / POSES, threads=threads, progress=progress, should_stop=should_stop)
 

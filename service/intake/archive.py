@@ -8,10 +8,10 @@ and names stay data. Only ZIP is taken: the safe part of tar would hold nothing 
 import stat
 import zlib
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import BinaryIO
 
-from octasplat.service.intake.scene_layout import FileRole, common_folder, file_role, is_ignored_file
+from octasplat.engine.core.scene_layout import FileRole, file_role, is_ignored_file, lay_out_scene
 from octasplat.service.intake.upload_names import FileNames
 from octasplat.service.intake.zip_records import (
     DEFLATED,
@@ -22,7 +22,7 @@ from octasplat.service.intake.zip_records import (
     raise_intake_error,
     read_records,
 )
-from octasplat.workers.storage.file_names import quoted_name
+from octasplat.workers.storage.file_names import FileNameError, check_name, quoted_name
 from octasplat.workers.storage.protocol import Blob, BlobWriter
 
 _PIECE_BYTES = 1 << 20
@@ -116,10 +116,12 @@ def list_archive(file: BinaryIO, limits: ArchiveLimits = ArchiveLimits()) -> Arc
     records = read_records(
         file, max_entries=limits.max_entries, max_directory_bytes=limits.max_directory_bytes
     )
+    records = _with_forward_slashes(records)
     names = FileNames()
     for record in records:
         _check_entry(record)
-        names.add(record.name)
+        if not is_ignored_file(record.name):  # what will be left out anyway needs no portable name
+            names.add(record.name)
         _check_size(record, limits)
     total = sum(record.size_bytes for record in records)
     if total > limits.max_total_bytes:
@@ -161,6 +163,22 @@ def archive_type(head: bytes) -> str | None:
         if head[position : position + len(magic)] == magic:
             return kind
     return None
+
+
+def _with_forward_slashes(records: list[ZipEntry]) -> list[ZipEntry]:
+    """Return entries by an old Windows program under the names it meant, where it wrote backslashes only."""
+    names = [record.name.replace("\\", "/") for record in records]
+    if any("/" in record.name for record in records) or not all(map(_is_portable, names)):
+        return records
+    return [replace(record, name=name) for record, name in zip(records, names, strict=True)]
+
+
+def _is_portable(name: str) -> bool:
+    try:
+        check_name(name.removesuffix("/"))
+    except FileNameError:
+        return False
+    return True
 
 
 def _check_entry(record: ZipEntry) -> None:
@@ -212,21 +230,12 @@ def _check_size(record: ZipEntry, limits: ArchiveLimits) -> None:
 
 
 def _scene_listing(records: list[ZipEntry]) -> ArchiveListing:
-    folder = common_folder([record.name for record in records if not is_ignored_file(record.name)])
-    files: list[ArchiveFile] = []
-    left_out: list[str] = []
-    for record in records:
-        name = record.name.removeprefix(folder)
-        if record.name.startswith(folder) and file_role(name) is not FileRole.OTHER:
-            files.append(ArchiveFile(name, record))
-        else:
-            left_out.append(record.name)
-    if not files:
-        raise_intake_error(
-            "archive-empty",
-            "The archive holds no part of a scene; put images/ at its top or into one folder.",
-        )
-    return ArchiveListing(tuple(files), tuple(left_out), folder)
+    by_path = {record.name: record for record in records}
+    layout = lay_out_scene(list(by_path))
+    if not layout.files:
+        raise_intake_error("archive-empty", "The archive holds no part of a scene; put photographs into it.")
+    files = tuple(ArchiveFile(name, by_path[path]) for name, path in layout.files.items())
+    return ArchiveListing(files, (*layout.left_out, *layout.ignored), layout.folder)
 
 
 def _copy_entry(file: BinaryIO, entry: ArchiveFile, writer: BlobWriter) -> None:

@@ -4,12 +4,12 @@ import unicodedata
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
+from octasplat.engine.core.scene_layout import FileRole, file_role
 from octasplat.service.intake.faults import IntakeError, IntakeFault
 from octasplat.service.intake.image_completeness import check_complete
 from octasplat.service.intake.images import ImageHeader, ImageLimits, read_image_header
 from octasplat.service.intake.model_check import MIN_VIEWS, ModelLimits, check_model
 from octasplat.service.intake.model_child import ModelAnswer
-from octasplat.service.intake.scene_layout import FileRole, file_role, model_files
 from octasplat.service.intake.upload_names import FileNames, check_scene_file
 from octasplat.workers.storage.file_names import quoted_name
 from octasplat.workers.storage.protocol import Storage
@@ -130,10 +130,10 @@ def check_dataset(
             IntakeFault("dataset-photographs", f"There are {count} photographs in images/; {wanted}.")
         )
     masks = _check_masks(files, sizes, faults, warnings)
-    by_name = {file.path: file for file in files}
     model = [
-        TreeFile(path=name, sha256=by_name[name].sha256, size_bytes=by_name[name].size_bytes)
-        for name in model_files(list(by_name)).values()
+        TreeFile(path=file.path, sha256=file.sha256, size_bytes=file.size_bytes)
+        for file in files
+        if file_role(file.path) is FileRole.MODEL
     ]
     answer = ModelAnswer()
     if model and not faults:

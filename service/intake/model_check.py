@@ -54,7 +54,7 @@ def check_model(
 
     Args:
         storage: holds the files of the model.
-        model: files of one model, named as in the dataset.
+        model: files of its models, named as in the dataset.
         sizes_px: width and height of every photograph, by its name below ``images/``.
         limits: what parsing may take.
 
@@ -73,7 +73,7 @@ def check_model(
         fetch_tree(storage, model, root, writable=True)  # copies, as the child is not trusted
         request = ModelRequest(
             root=root,
-            files={file.path.rpartition("/")[2]: file.path for file in model},
+            files={file.path: file.path for file in model},
             sizes_px=dict(sizes_px),
             min_views=MIN_VIEWS,
             memory_bytes=limits.memory_bytes,

@@ -37,8 +37,8 @@ class ModelRequest(BaseModel):
     """What the child is asked.
 
     Attributes:
-        root: folder of the scene, which holds the model and nothing else.
-        files: names of the model's files in the dataset, by their last part.
+        root: folder of the scene, which holds the models and nothing else.
+        files: names of the models' files in the dataset, by their paths below ``root``.
         sizes_px: width and height of every photograph, by its name below ``images/``.
         min_views: fewer posed photographs do not make a scene.
         memory_bytes: address space.
@@ -90,6 +90,12 @@ def check(request: ModelRequest) -> ModelAnswer:
     checker = _ModelChecker(request)
     try:
         folder = find_colmap_model_folder(request.root)
+        own = {
+            Path(path).name: name
+            for path, name in request.files.items()
+            if (request.root / path).parent == folder
+        }
+        checker.request = request = request.model_copy(update={"files": own})
         check_binary_colmap_model(folder)
         reconstruction = _load_reconstruction(folder)
         if reconstruction is not None:

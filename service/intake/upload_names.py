@@ -4,8 +4,8 @@ The doors are a file that is put (:func:`check_file_name`), and many that come o
 (:class:`FileNames`): those of an archive, and those of a dataset that is committed.
 """
 
+from octasplat.engine.core.scene_layout import FileRole, file_role
 from octasplat.service.intake.faults import IntakeError, IntakeFault
-from octasplat.service.intake.scene_layout import FileRole, file_role
 from octasplat.workers.storage.file_names import FileNameError, NameSet, check_name, quoted_name
 
 

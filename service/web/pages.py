@@ -8,6 +8,7 @@ from typing import Annotated, Any, Literal
 from fastapi import APIRouter, Query, Request, Response
 from fastapi.responses import HTMLResponse, JSONResponse
 
+from octasplat.engine.core.scene_layout import model_files
 from octasplat.service.actions import jobs as actions
 from octasplat.service.actions.artifacts import get_artifact, list_artifacts
 from octasplat.service.actions.datasets import list_datasets
@@ -15,7 +16,6 @@ from octasplat.service.actions.submission import retry_job
 from octasplat.service.actions.system import list_live_workers
 from octasplat.service.auth import Principal, Reader, Writer
 from octasplat.service.downloads import send_blob
-from octasplat.service.intake.scene_layout import model_files
 from octasplat.service.job_limits import limits_by_path
 from octasplat.service.paging import decode_id_cursor, encode_cursor
 from octasplat.service.queue_workers import unwritable_formats

@@ -248,7 +248,12 @@ def _upload_if_needed(api: Api, scene: Path, on_event: EventListener) -> str:
     if dataset_id is not None:
         return dataset_id
     with counted_phase("upload", on_event) as progress:
-        dataset = upload_scene(api, scene, progress=lambda d, t: progress(d >> 10, t >> 10))
+        dataset = upload_scene(
+            api,
+            scene,
+            progress=lambda d, t: progress(d >> 10, t >> 10),
+            on_warning=lambda sentence: on_event(Warned(sentence)),
+        )
     for warning in dataset["facts"].get("warnings", ()):
         on_event(Warned(warning))
     return str(dataset["id"])

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from octasplat.engine.core.errors import DatasetError
+from octasplat.engine.core.scene_layout import is_ignored_file, lay_out_scene, left_out_sentences
 from octasplat.workers.client.api import Api, ServiceError
 from octasplat.workers.client.backoff import Backoff
 
@@ -21,8 +22,6 @@ MAX_CHECK_WAIT_SECONDS = 600.0
 MAX_DELETED_DATASETS = 30
 """So many datasets of one folder that were deleted are looked past for one that is there."""
 _PIECE_BYTES = 1 << 20
-_SCENE_FOLDERS = ("images", "masks", "sparse", "colmap/sparse")
-_IGNORED_NAMES = frozenset({"thumbs.db", "desktop.ini"})
 
 
 @dataclass(frozen=True)
@@ -34,25 +33,27 @@ class LocalFile:
     size_bytes: int
 
 
-def list_scene_files(scene: Path) -> list[LocalFile]:
-    """Return the files of a scene folder, or a bare folder of photographs, that belong to a dataset.
+def list_scene_files(scene: Path) -> tuple[list[LocalFile], tuple[str, ...]]:
+    """Return the files of a scene folder that belong to a dataset, by name, and sentences on the others.
 
     Raises:
         DatasetError: it is no folder, or holds no photographs.
     """
     if not scene.is_dir():
         raise DatasetError(f"{scene} is not a folder; name the folder that holds images/ and sparse/.")
-    if (scene / "images").is_dir():
-        found = {
-            path.relative_to(scene).as_posix(): path
-            for part in _SCENE_FOLDERS
-            for path in _files_below(scene / part)
-        }
-    else:
-        found = {f"images/{path.name}": path for path in sorted(scene.iterdir()) if _is_uploadable(path)}
-    if not any(name.startswith("images/") for name in found):
-        raise DatasetError(f"{scene} holds no photographs; put them into {scene / 'images'}.")
-    return [LocalFile(name, path, path.stat().st_size) for name, path in sorted(found.items())]
+    layout = lay_out_scene(
+        [path.relative_to(scene).as_posix() for path in sorted(scene.rglob("*")) if path.is_file()]
+    )
+    told = left_out_sentences(layout.left_out)
+    if not any(name.startswith("images/") for name in layout.files):
+        raise DatasetError(
+            " ".join((f"{scene} holds no photographs; put them into {scene / 'images'}.", *told))
+        )
+    files = [
+        LocalFile(name, scene / path, (scene / path).stat().st_size)
+        for name, path in sorted(layout.files.items())
+    ]
+    return files, told
 
 
 def upload_scene(
@@ -61,6 +62,7 @@ def upload_scene(
     *,
     name: str | None = None,
     progress: Callable[[int, int], None] = lambda _done, _total: None,
+    on_warning: Callable[[str], None] = lambda _sentence: None,
 ) -> dict[str, Any]:
     """Send a scene and commit it; the same command again goes on with the same dataset.
 
@@ -69,6 +71,7 @@ def upload_scene(
         scene: a folder with ``images/``, a bare folder of photographs, or a ZIP file.
         name: what to call it; by default as the folder.
         progress: told (bytes done, bytes in all).
+        on_warning: told which files are left out, those of a folder before anything is sent.
 
     Returns:
         The dataset.
@@ -78,11 +81,18 @@ def upload_scene(
         ServiceError: the service refuses it; the text names the files.
     """
     is_archive = scene.is_file()
-    files = [LocalFile(scene.name, scene, scene.stat().st_size)] if is_archive else list_scene_files(scene)
+    told: tuple[str, ...] = ()
+    if is_archive:
+        files = [LocalFile(scene.name, scene, scene.stat().st_size)]
+    else:
+        files, told = list_scene_files(scene)
+    for sentence in told:
+        on_warning(sentence)
     dataset = _find_or_create_dataset(api, name or scene.resolve().stem, files)
     if dataset["state"] == "open":
         if is_archive:
-            _send_archive(api, dataset["id"], files[0], progress)
+            for sentence in _send_archive(api, dataset["id"], files[0], progress):
+                on_warning(sentence)
         else:
             _send_missing(api, dataset["id"], files, progress)
     return _commit(api, dataset)
@@ -183,20 +193,24 @@ def _send_missing(
         job.result()
 
 
-def _send_archive(api: Api, dataset_id: str, file: LocalFile, progress: Callable[[int, int], None]) -> None:
+def _send_archive(
+    api: Api, dataset_id: str, file: LocalFile, progress: Callable[[int, int], None]
+) -> tuple[str, ...]:
+    """Send an archive; returns sentences on the files in it that are left out."""
     progress(0, file.size_bytes)
-    _put_file(api, f"/v1/datasets/{dataset_id}/archive", file.path, _sha256(file.path))
+    answer = _put_file(api, f"/v1/datasets/{dataset_id}/archive", file.path, _sha256(file.path))
     progress(file.size_bytes, file.size_bytes)
+    return left_out_sentences([path for path in answer["left_out"] if not is_ignored_file(path)])
 
 
-def _put_file(api: Api, address: str, path: Path, sha256: str) -> None:
+def _put_file(api: Api, address: str, path: Path, sha256: str) -> Any:
     encoded = base64.b64encode(bytes.fromhex(sha256)).decode()
     headers = {
         "Repr-Digest": f"sha-256=:{encoded}:",
         "Content-Type": "application/octet-stream",
         "Content-Length": str(path.stat().st_size),
     }
-    api.request("PUT", address, content=_RereadableFile(path), headers=headers)
+    return api.request("PUT", address, content=_RereadableFile(path), headers=headers)
 
 
 class _RereadableFile:
@@ -230,11 +244,3 @@ def _file_address(dataset_id: str, name: str) -> str:
 def _sha256(path: Path) -> str:
     with path.open("rb") as handle:
         return hashlib.file_digest(handle, "sha256").hexdigest()
-
-
-def _files_below(folder: Path) -> Iterator[Path]:
-    return (path for path in sorted(folder.rglob("*")) if _is_uploadable(path))
-
-
-def _is_uploadable(path: Path) -> bool:
-    return path.is_file() and not path.name.startswith(".") and path.name.lower() not in _IGNORED_NAMES

@@ -1,8 +1,8 @@
 // Which of the files that a user points at belong to a scene, and what they are called there.
 
-const PARTS = /^(images|masks|sparse|colmap\/sparse)\//;
+const MODEL = /^((colmap\/|distorted\/)?sparse(\/[0-9]+)?)\/(cameras|images|points3D|rigs|frames)\.(bin|txt)$/;
 const PICTURE = /\.(jpe?g|png|tiff?|webp|bmp|exr|hdr)$/i;
-const CLUTTER = /(^|\/)(\.[^/]*|__MACOSX\/.*|thumbs\.db|desktop\.ini)$/i;
+const CLUTTER = /(^|\/)(\.[^/]*|__MACOSX\/.*|thumbs\.db|desktop\.ini|Icon\r?)$/i;
 const ARCHIVE = /\.zip$/i;
 
 /** All files below what was dropped, with their paths. */
@@ -45,10 +45,12 @@ export function sceneOf(found) {
     }
     const top = commonFolder(files.map(({ path }) => path));
     const named = files.map(({ path, file }) => ({ name: path.slice(top.length), file }));
-    let kept = named.filter(({ name }) => PARTS.test(name));
-    if (!kept.some(({ name }) => name.startsWith("images/"))) {
-        // A folder of photographs, and nothing else that is known.
-        kept = named.filter(({ name }) => PICTURE.test(name) && !name.includes("/")).map(({ name, file }) => ({ name: `images/${name}`, file }));
+    // As engine/core/scene_layout.py decides.
+    const pictures = named.filter(({ name }) => PICTURE.test(name));
+    const place = ["images/", "input/"].find((folder) => pictures.some(({ name }) => name.startsWith(folder))) ?? "";
+    const kept = named.filter(({ name }) => MODEL.test(name) || (name.startsWith("masks/") && PICTURE.test(name)));
+    for (const { name, file } of pictures) {
+        if (name.startsWith(place) && !/(^|\/)masks\//.test(name)) kept.push({ name: `images/${name.slice(place.length)}`, file });
     }
     const photographs = kept.filter(({ name }) => name.startsWith("images/") && PICTURE.test(name)).length;
     if (!photographs) throw new Error("There are no photographs in this; choose a folder of photographs, or one that holds images/.");
@@ -58,7 +60,7 @@ export function sceneOf(found) {
         title: top.replace(/\/$/, "").split("/").pop(),
         leftOut: named.filter(({ file }) => !sent.has(file)).map(({ name }) => name),
         photographs,
-        posed: kept.some(({ name }) => /^(colmap\/)?sparse\/(0\/)?cameras\.(bin|txt)$/.test(name)),
+        posed: kept.some(({ name }) => MODEL.test(name)),
         bytes: kept.reduce((sum, { file }) => sum + file.size, 0),
     };
 }
@@ -69,7 +71,7 @@ function commonFolder(paths) {
     for (;;) {
         const tops = new Set(paths.map((path) => path.slice(folder.length)).map((path) => (path.includes("/") ? path.slice(0, path.indexOf("/") + 1) : "")));
         const [top] = tops;
-        if (tops.size !== 1 || !top || /^(images|masks|sparse|colmap)\/$/.test(top)) return folder;
+        if (tops.size !== 1 || !top || /^(images|masks|sparse|colmap|distorted)\/$/.test(top)) return folder;
         folder += top;
     }
 }

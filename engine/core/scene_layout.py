@@ -1,0 +1,177 @@
+"""Which files make up a scene, by their paths: the one decision for folders, archives, uploads and runs.
+
+images/<name>, or input/<name>      photographs; without these folders all photographs that there are
+masks/<name>.png                    masks, where there are any
+sparse, colmap/sparse, distorted/sparse, each also with a number below it: cameras, images, points3D, rigs
+                                    and frames (.bin or .txt)
+"""
+
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from enum import Enum
+from pathlib import PurePosixPath
+
+IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp", ".exr", ".hdr"})
+"""Photographs that are taken at every door."""
+UNREAD_SUFFIXES = frozenset(
+    {".heic", ".heif", ".avif", ".jxl", ".jp2", ".gif", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf"}
+    | {".orf", ".rw2", ".pef", ".srw", ".raw", ".insp"}
+)
+"""Photographs in formats that are not taken."""
+VIDEO_SUFFIXES = frozenset({".mov", ".mp4", ".m4v", ".avi", ".mkv", ".mts", ".webm", ".insv", ".360"})
+SCENE_FOLDERS = ("images", "masks", "sparse", "colmap", "distorted")
+"""Folders whose names say what is in them."""
+
+_MODEL_FILE = re.compile(
+    r"((colmap/|distorted/)?sparse(/[0-9]+)?)/(cameras|images|points3D|rigs|frames)\.(bin|txt)"
+)
+_MODEL_ELSEWHERE = re.compile(r"(.*/)?images\.(bin|txt)")
+_IGNORED_FILE = re.compile(
+    r"(^|/)(__MACOSX/|\.(?!\.?(/|$))[^/]*|thumbs\.db$|desktop\.ini$|Icon\r?$)", re.IGNORECASE
+)
+_SHOWN_NAMES = 3
+
+
+class FileRole(Enum):
+    """What a file is in a scene."""
+
+    IMAGE = "image"
+    MASK = "mask"
+    MODEL = "model"
+    OTHER = "other"
+
+
+@dataclass(frozen=True)
+class SceneLayout:
+    """What of some files belongs to a scene.
+
+    Attributes:
+        files: the path of each file of the scene by its name in the scene, e.g. ``images/a.jpg``.
+        left_out: paths of the other files, but for what file managers leave behind.
+        ignored: paths of what file managers leave behind, and of hidden files.
+        folder: the folder, with its slash, that is around everything; empty where there is none.
+    """
+
+    files: Mapping[str, str]
+    left_out: tuple[str, ...]
+    ignored: tuple[str, ...]
+    folder: str
+
+
+def lay_out_scene(paths: Sequence[str]) -> SceneLayout:
+    """Return which of the files below a folder, or in an archive, make up a scene.
+
+    >>> lay_out_scene(["DCIM/100MEDIA/a.JPG", "DCIM/100MEDIA/a.MOV"]).files
+    {'images/a.JPG': 'DCIM/100MEDIA/a.JPG'}
+    """
+    ignored = tuple(path for path in paths if is_ignored_file(path))
+    rest = [path for path in paths if not is_ignored_file(path)]
+    folder = common_folder(rest)
+    names = {path: path.removeprefix(folder) for path in rest}
+    pictures = [name for name in names.values() if _is_picture(name)]
+    top = next((top for top in ("images/", "input/") if any(name.startswith(top) for name in pictures)), "")
+    results = results_folders(names.values())
+    files: dict[str, str] = {}
+    for path, name in names.items():
+        if file_role(name) in (FileRole.MODEL, FileRole.MASK):
+            files[name] = path
+        elif name.startswith(top) and is_photograph(name, results):
+            files[f"images/{name.removeprefix(top)}"] = path
+    taken = set(files.values())
+    return SceneLayout(files, tuple(path for path in rest if path not in taken), ignored, folder)
+
+
+def is_photograph(name: str, results: Iterable[str] = ()) -> bool:
+    """Return whether a file is a photograph by its path: no mask in a folder of them, and no result of a run.
+
+    Args:
+        name: path below the folder of the scene.
+        results: folders of runs, with their slashes.
+    """
+    in_masks = "masks" in PurePosixPath(name).parts[:-1]
+    return _is_picture(name) and not in_masks and not any(name.startswith(folder) for folder in results)
+
+
+def results_folders(names: Iterable[str]) -> tuple[str, ...]:
+    """Return the folders of runs among files, with their slashes."""
+    known = set(names)
+    heads = [name.removesuffix("events.jsonl") for name in known if name.endswith("/events.jsonl")]
+    return tuple(head for head in heads if f"{head}config.json" in known)
+
+
+def file_role(name: str) -> FileRole:
+    """Return what the file ``name``, relative to the scene, is."""
+    if is_ignored_file(name):
+        return FileRole.OTHER
+    if _MODEL_FILE.fullmatch(name):
+        return FileRole.MODEL
+    top, slash, rest = name.partition("/")
+    if slash and rest and _is_picture(rest):
+        return {"images": FileRole.IMAGE, "masks": FileRole.MASK}.get(top, FileRole.OTHER)
+    return FileRole.OTHER
+
+
+def is_ignored_file(name: str) -> bool:
+    """Return whether a file is one that file managers leave behind, or hidden."""
+    return _IGNORED_FILE.search(name) is not None
+
+
+def common_folder(names: Sequence[str]) -> str:
+    """Return the folder, with its slash, around all of ``names``; empty where there is none.
+
+    It ends above a folder whose name says what is in it.
+    """
+    folder = ""
+    while True:
+        tops = {name[len(folder) :].partition("/")[0] if "/" in name[len(folder) :] else "" for name in names}
+        top = tops.pop() if len(tops) == 1 else ""
+        if top in ("", *SCENE_FOLDERS):
+            return folder
+        folder += f"{top}/"
+
+
+def left_out_sentences(paths: Sequence[str]) -> tuple[str, ...]:
+    """Return what to say of files that are left out: how many of each kind, which, and the way out."""
+    kinds: dict[str, list[str]] = {}
+    for path in paths:
+        kinds.setdefault(_kind_of(path), []).append(path)
+    return tuple(
+        sentence.format(count=len(kinds[kind]), names=_name_list(kinds[kind]))
+        for kind, sentence in _SENTENCES.items()
+        if kind in kinds
+    )
+
+
+_SENTENCES = {
+    "unread": "{count} files look like photographs but are of formats that are not read, and are left out "
+    "({names}); convert them to JPEG, PNG or TIFF.",
+    "picture": "{count} photographs do not lie where those of the scene do and are left out ({names}); move "
+    "them into its images folder.",
+    "video": "{count} videos are left out ({names}); save frames of them as photographs.",
+    "poses": "{count} files hold poses that are not read ({names}); put a COLMAP model into sparse/0, or the "
+    "poses are found anew.",
+    "other": "{count} files are no part of a scene and are left out ({names}).",
+}
+
+
+def _kind_of(path: str) -> str:
+    pure = PurePosixPath(path)
+    suffix = pure.suffix.lower()
+    if suffix in UNREAD_SUFFIXES:
+        return "unread"
+    if _is_picture(path):
+        return "picture"
+    if suffix in VIDEO_SUFFIXES:
+        return "video"
+    is_transforms = pure.name.startswith("transforms") and suffix == ".json"
+    return "poses" if is_transforms or _MODEL_ELSEWHERE.fullmatch(path) else "other"
+
+
+def _is_picture(name: str) -> bool:
+    return PurePosixPath(name).suffix.lower() in IMAGE_SUFFIXES
+
+
+def _name_list(names: Sequence[str]) -> str:
+    shown = ", ".join(name if name.isprintable() else ascii(name) for name in names[:_SHOWN_NAMES])
+    return shown + (", ..." if len(names) > _SHOWN_NAMES else "")
