@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 from fastapi import APIRouter, Query, Request, Response
 from fastapi.responses import HTMLResponse, JSONResponse
 
-from octasplat.engine.core.scene_layout import model_files
+from octasplat.engine.core.scene_layout import FileRole, file_role
 from octasplat.service.actions import jobs as actions
 from octasplat.service.actions.artifacts import get_artifact, list_artifacts
 from octasplat.service.actions.datasets import list_datasets
@@ -302,5 +302,14 @@ def _cameras(
 
 
 def _model_files(files: list[DatasetFile]) -> dict[str, DatasetFile]:
-    by_path = {file.path: file for file in files}
-    return {part: by_path[path] for part, path in model_files(list(by_path)).items()}
+    """Return the files of the model with the most of images, by their last part."""
+    models: dict[PurePosixPath, dict[str, DatasetFile]] = {}
+    for file in files:
+        if file_role(file.path) is FileRole.MODEL:
+            path = PurePosixPath(file.path)
+            models.setdefault(path.parent, {})[path.name] = file
+
+    def image_bytes(model: dict[str, DatasetFile]) -> int:
+        return max((file.size_bytes for name, file in model.items() if name.startswith("images.")), default=0)
+
+    return max(models.values(), key=image_bytes, default={})

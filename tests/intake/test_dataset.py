@@ -208,11 +208,12 @@ def test_names_of_single_files() -> None:
     assert check_file_name("images/a b/ü.jpg") is FileRole.IMAGE
     assert check_file_name("masks/a.jpg.png") is FileRole.MASK
     assert check_file_name("sparse/0/points3D.bin") is FileRole.MODEL
+    assert check_file_name("sparse/1/cameras.bin") is FileRole.MODEL
     for name, code in (
         ("images/a.jpg/../../x", "name-traversal"),
         ("images/a.exe", "name-unexpected"),
         ("images", "name-unexpected"),
-        ("sparse/1/cameras.bin", "name-unexpected"),
+        ("sparse/x/cameras.bin", "name-unexpected"),
         ("checkpoint.pkl", "name-unexpected"),
         ("../evil.png", "name-traversal"),
         ("images/evil.sh", "name-unexpected"),
