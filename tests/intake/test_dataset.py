@@ -11,10 +11,10 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from octasplat.engine.core.scene_layout import FileRole
 from octasplat.service.intake.dataset import DatasetFile, DatasetLimits, DatasetSummary, check_dataset
 from octasplat.service.intake.faults import IntakeError, IntakeFault
 from octasplat.service.intake.model_check import ModelLimits, check_model, parser_environment
-from octasplat.engine.core.scene_layout import FileRole
 from octasplat.service.intake.upload_names import check_file_name
 from octasplat.workers.storage.local import LocalStorage
 from octasplat.workers.storage.trees import TreeFile
