@@ -51,7 +51,7 @@ def find_missing_poses(
     folder = image_folder(scene)
     if not (output / POSES).is_dir():
         for sentence in left_out_of_search(scene):
-            tell(Warned(sentence))
+            progress(Warned(sentence))
         _refuse_before_search(scene, folder, config, threads)
     find_poses(folder, output / POSES, threads=threads, progress=progress, should_stop=should_stop)
 
