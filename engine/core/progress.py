@@ -91,8 +91,8 @@ def stop_when_asked(
 ) -> EventListener:
     """``progress``, but stopping the work at its next event if so asked; training does it by itself.
 
-    The returned listener raises :class:`octasplat.engine.core.errors.CancelledError` with ``message``, or one that
-    names the stage.
+    The returned listener raises :class:`octasplat.engine.core.errors.CancelledError` with ``message``, or
+    one that names the stage.
     """
 
     def listen(event: Event) -> None:

@@ -20,7 +20,8 @@ class RayBatch:
     begin at the mirror (:meth:`reflect`), and the ways between a point light and many points are rays from
     the light that end at the points (:meth:`between`). Tracers follow neighbours with one origin together.
 
-    ``t_view_origin`` says where on each ray its viewer stands. Colours that depend on the direction are those in
+    ``t_view_origin`` says where on each ray its viewer stands. Colours that depend on the direction are
+    those in
     the direction from there to a Gaussian's mean, as in programs that draw splats. A camera's viewer is the
     origin (0). Rays that go on from a surface have none there: so close to it the direction to a mean would
     be any. Behind a mirror or clear glass the viewer stands as far back as the way has been long (below 0),
@@ -28,8 +29,8 @@ class RayBatch:
     (``AT_INFINITY``), and the direction is the ray's own.
 
     Rays that leave a surface of Gaussians may have some of these in their way, as the surface is as thick as
-    their noise. Up to ``t_backface_cull`` a ray passes all Gaussians that it would meet from behind, which is how it
-    meets those of the surface that it leaves. Tracers for normals without a side know no behind.
+    their noise. Up to ``t_backface_cull`` a ray passes all Gaussians that it would meet from behind, which
+    is how it meets those of the surface that it leaves. Tracers for normals without a side know no behind.
 
     Origins, limits and viewers have one row a ray, or a single one that stands for all.
 
@@ -90,7 +91,8 @@ class RayBatch:
     def arrays(self) -> tuple[Float32[np.ndarray, "#r *c"], ...]:
         """What they are made of, in order."""
         return (
-            self.origins_world, self.directions_world, self.t_min, self.t_max, self.t_view_origin, self.t_backface_cull
+            self.origins_world, self.directions_world, self.t_min, self.t_max,
+            self.t_view_origin, self.t_backface_cull
         )  # fmt: skip
 
     def with_t_max(self, t_max: Float[np.ndarray, "#r"] | float) -> "RayBatch":

@@ -172,7 +172,8 @@ def _normalise_quaternions(reconstruction: Any, folder: Path, warnings: list[str
             names = sorted(reconstruction.images[data.id].name for data in frame.image_ids)
             raise DatasetError(
                 f"The pose of {' and '.join(names)} in {folder} has the rotation quaternion "
-                f"{_quaternion_wxyz(frame.rig_from_world)}, which is no rotation; run COLMAP again or remove the image."
+                f"{_quaternion_wxyz(frame.rig_from_world)}, which is no rotation; "
+                "run COLMAP again or remove the image."
             )
         frame.rig_from_world, off = _with_unit_rotation(frame.rig_from_world)
         scaled += off

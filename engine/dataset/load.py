@@ -59,8 +59,8 @@ def load_dataset_model(
     """Read the model of a scene and the headers of its photographs, but no pixels.
 
     Args:
-        root: folder with ``images/``, a COLMAP model (see :mod:`octasplat.engine.dataset.colmap_model`) and, if there
-            are any, ``masks/<image name>.png``.
+        root: folder with ``images/``, a COLMAP model (see :mod:`octasplat.engine.dataset.colmap_model`) and,
+            if there are any, ``masks/<image name>.png``.
         max_side: cap on the longer side of the photographs, in pixels.
         model_folder: of a model that was found for the photographs, see :mod:`octasplat.engine.poses`;
             ``root`` may then be a bare folder of photographs.

@@ -59,7 +59,8 @@ class Exporter(Entry):
         patterns: file names that it takes by default.
         description: one line for help texts.
         write: writes the Gaussians to the path and returns every file written, the path itself first.
-        missing_requirement: what is missing on this machine to write it, to be read after the file's name, or None.
+        missing_requirement: what is missing on this machine to write it, to be read after the file's name,
+            or None.
         holds_channels: whether it writes named channels, too.
         holds_harmonics: whether colours may change with the direction.
         beside: names the files that are written beside the path, if there are any.

@@ -45,13 +45,15 @@ def dropped_on_export(
     if gaussians.channels and without:
         names = ", ".join(gaussians.channels)
         lines.append(
-            f"{_format_list_text(without, 'has', 'have')} no place for named channels; {names} will be left out."
+            f"{_format_list_text(without, 'has', 'have')} no place for named channels; "
+            f"{names} will be left out."
         )
     without = [name for name, exporter in chosen.items() if not exporter.holds_harmonics]
     if gaussians.sh_degree > 0 and without:
         lines.append(
-            f"{_format_list_text(without, 'has', 'have')} one colour for each Gaussian; how colours change with the "
-            "direction will be left out (octasplat export --color chooses the one)."
+            f"{_format_list_text(without, 'has', 'have')} one colour for each Gaussian; "
+            "how colours change with the direction will be left out (octasplat export --color "
+            "chooses the one)."
         )
     return tuple(lines)
 

@@ -86,7 +86,10 @@ class Estimate(BaseModel):
         """Return the estimate in words."""
         cores = f"{self.cores} core{'s' if self.cores > 1 else ''}"
         poses = ", besides the time to find the poses" if self.finds_poses else ""
-        return f"about {format_duration(self.seconds)} on {cores} and {self.memory_bytes / 1e9:.1f} GB of memory{poses}"
+        return (
+            f"about {format_duration(self.seconds)} on {cores} "
+            f"and {self.memory_bytes / 1e9:.1f} GB of memory{poses}"
+        )
 
 
 def estimate_reconstruction(

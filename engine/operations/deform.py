@@ -199,5 +199,5 @@ def _report_text(path: Path, report: DeformReport) -> list[str]:
 
 
 OPERATION = Operation(
-    "deform", "A scene that follows a deformed cage or coarse mesh.", DeformRequest, DeformOptions, run
+    "deform", "Make a scene follow a deformed cage or coarse mesh.", DeformRequest, DeformOptions, run
 )

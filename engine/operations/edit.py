@@ -145,4 +145,6 @@ def _report_text(path: Path, report: EditReport) -> list[str]:
     return lines
 
 
-OPERATION = Operation("edit", "A mesh edited elsewhere back to Gaussians.", EditRequest, EditOptions, run)
+OPERATION = Operation(
+    "edit", "Turn a mesh edited elsewhere back into Gaussians.", EditRequest, EditOptions, run
+)

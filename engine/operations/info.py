@@ -176,5 +176,5 @@ def _vector(values: Any) -> str:
 
 
 OPERATION = Operation(
-    "info", "What is in a scene: counts, bounds, sizes, cost.", InfoRequest, InfoOptions, run
+    "info", "Describe what is in a scene: counts, bounds, sizes, cost.", InfoRequest, InfoOptions, run
 )

@@ -76,7 +76,9 @@ DEFAULT_CONFIG = PosesConfig()
 
 
 class GivenModel(BaseModel):
-    """A model of which some poses may be wrong: see :func:`octasplat.engine.poses.pose_repair.repair_misplaced`.
+    """A model of which some poses may be wrong.
+
+    See :func:`octasplat.engine.poses.pose_repair.repair_misplaced`.
 
     Attributes:
         model: folder of the COLMAP model.
@@ -94,8 +96,10 @@ class GivenModel(BaseModel):
 class PoseSearchRequest(BaseModel):
     """What the process in which COLMAP works is asked.
 
-    With ``given`` see :mod:`octasplat.engine.poses.pose_repair`; with the folder of a model, ``lenses_of``, see
-    :mod:`octasplat.engine.poses.principal_points`; without either :class:`octasplat.engine.poses.search.PoseSearch`.
+    With ``given`` see :mod:`octasplat.engine.poses.pose_repair`; with the folder of a model, ``lenses_of``,
+    see
+    :mod:`octasplat.engine.poses.principal_points`; without either
+    :class:`octasplat.engine.poses.search.PoseSearch`.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")

@@ -93,7 +93,7 @@ def refine_pose(
     matches: Matches,
     inlier_distance: float,
 ) -> Pose:
-    """The pose nearby with which the matches that agree with the given one to ``inlier_distance`` agree best."""
+    """Return the pose nearby that fits best the matches within ``inlier_distance`` of the given one."""
     pose = rotation_cam_from_world, translation_cam_from_world
     for _ in range(_REFINEMENT_ROUNDS):
         close = matches.select(inlier_mask(pose, matches, inlier_distance))

@@ -120,7 +120,10 @@ class DeferredShading:
     def measure_ambient_occlusion(
         self, gaussians: FlatGaussians, ids: Int64[np.ndarray, " u"], tracer: Tracer
     ) -> Float32[np.ndarray, " u"]:
-        """Measure the ambient visibility of Gaussians; returns their open sides for :meth:`measure_diffuse_interreflection`."""
+        """Measure the ambient visibility of Gaussians.
+
+        Returns their open sides, for :meth:`measure_diffuse_interreflection`.
+        """
         rays = self.settings.ambient_occlusion_rays
         visible, side = ambient_visibility(
             gaussians, ids, tracer, rays=rays, offset=self._hemisphere_offset, one_sided=self._is_one_sided

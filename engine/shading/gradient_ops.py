@@ -7,7 +7,9 @@ from jaxtyping import Float64
 def clip_gradients(
     gradients: Float64[np.ndarray, "p 3"], max_median_ratio: float
 ) -> Float64[np.ndarray, "p 3"]:
-    """Gradients no longer than ``max_median_ratio`` times the median of those that are not 0; 0 leaves them alone.
+    """Return gradients no longer than ``max_median_ratio`` times the median of those that are not 0.
+
+    A ratio of 0 leaves them alone.
 
     One pixel that looks into a mirror in a mirror says more loudly than a hundred others where to turn, and
     is as likely to be wrong.

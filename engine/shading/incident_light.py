@@ -58,7 +58,9 @@ class IncidentLightModel(Protocol):
 
 @dataclass(frozen=True)
 class RayPairIncidentLight:
-    """Pairs of rays, what they meet shaded by the split sum; see :mod:`octasplat.engine.shading.reflection_rays`.
+    """Pairs of rays, what they meet shaded by the split sum.
+
+    See :mod:`octasplat.engine.shading.reflection_rays`.
 
     Attributes:
         pairs: what they saw.

@@ -105,8 +105,8 @@ class ShadingModel(Protocol):
         """Look around in the scene of which ``tracer`` has just built the hierarchy.
 
         Channels of the Gaussians, and the features, may be changed: to what follows from their geometry,
-        ``training_progress`` and :meth:`state` alone, and no further by a second call with the same ``training_progress``, so
-        that a training that goes on finds the same.
+        ``training_progress`` and :meth:`state` alone, and no further by a second call with the same
+        ``training_progress``, so that a training that goes on finds the same.
         """
         ...
 

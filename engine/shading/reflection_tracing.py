@@ -1,7 +1,7 @@
 """What reflected rays see: followed from surface to surface through the same Gaussians, with the way back.
 
-:mod:`octasplat.engine.shading.reflection_rays` says how they leave the first surface; from there on paths go by plain
-mirrors.
+:mod:`octasplat.engine.shading.reflection_rays` says how they leave the first surface; from there on paths go
+by plain mirrors.
 """
 
 from collections.abc import Callable
@@ -76,7 +76,8 @@ class ReflectionTracer:
         with_ambient: the surface of a buffer with its ambient visibility.
         max_bounces: on a path, at least 1; the last one sees nothing but the environment.
         offset: how rays leave a surface.
-        min_separation_world: see :func:`octasplat.engine.shading.depth_split.split_by_depth`; 0 parts nothing.
+        min_separation_world: see :func:`octasplat.engine.shading.depth_split.split_by_depth`; 0 parts
+            nothing.
     """
 
     tracer: Tracer

@@ -222,8 +222,8 @@ class Tracer(Protocol):
     def trace(self, rays: RayBatch, *, record: bool = False) -> TraceResult:
         """Trace rays of unit directions; ``record`` stores what :meth:`backward` needs.
 
-        A Gaussian is seen where ``t_min < t < t_max``, in its colour as the ray's viewer has it (``t_view_origin``
-        of :class:`octasplat.engine.core.rays.RayBatch`).
+        A Gaussian is seen where ``t_min < t < t_max``, in its colour as the ray's viewer has it
+        (``t_view_origin`` of :class:`octasplat.engine.core.rays.RayBatch`).
         """
         ...
 

@@ -364,7 +364,7 @@ def info(
     should_stop: Callable[[], bool] = never_stop,
     threads: int = 0,
 ) -> "InfoResult":
-    """Return what is in a scene: counts, bounds, sizes, cost.
+    """Describe what is in a scene: counts, bounds, sizes, cost.
 
     Args:
         source: The scene to look at: the folder of a run, or a file of any format.
@@ -1095,7 +1095,7 @@ def edit(
     should_stop: Callable[[], bool] = never_stop,
     threads: int = 0,
 ) -> "EditResult":
-    """Return a mesh edited elsewhere back to Gaussians.
+    """Turn a mesh edited elsewhere back into Gaussians.
 
     Args:
         source: The scene to read: a file of any format, or the folder of a run.
@@ -1172,7 +1172,7 @@ def deform(
     should_stop: Callable[[], bool] = never_stop,
     threads: int = 0,
 ) -> "DeformResult":
-    """Return a scene that follows a deformed cage or coarse mesh.
+    """Make a scene follow a deformed cage or coarse mesh.
 
     Args:
         source: The scene to read: a file of any format, or the folder of a run.

@@ -56,7 +56,7 @@ LAST_PARAMETERS = (
 )
 LAST_ARGUMENTS = (
     "progress: told each event; by default they are logged, or shown in a notebook.",
-    "should_stop: asked now and then; True ends the work with ``Cancelled``.",
+    "should_stop: asked now and then; True ends the work with ``CancelledError``.",
     "threads: number of threads; 0 takes all cores. The result does not depend on it.",
 )
 

@@ -57,7 +57,8 @@ class Checkpoint:
         step: of the stage.
         files: what is needed.
         results: what the same settings gave in the version that made it, see
-            :data:`octasplat.engine.core.versions.RESULTS_VERSION`; versions that did not say so gave the first.
+            :data:`octasplat.engine.core.versions.RESULTS_VERSION`; versions that did not say so gave the
+            first.
     """
 
     attempt: int

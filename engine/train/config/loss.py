@@ -62,6 +62,7 @@ class LossWeights(Settings):
         0.0,
         ge=0,
         description="Weight of one minus the cosine between normals and what depths span; not with "
-        f"materials. Set it to {SURFACE_DEPTH_NORMAL_WEIGHT} for scenes of which a surface is to be made; it takes about "
+        f"materials. Set it to {SURFACE_DEPTH_NORMAL_WEIGHT} for scenes of which a surface "
+        "is to be made; it takes about "
         "twice as long.",
     )

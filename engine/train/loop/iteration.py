@@ -122,7 +122,8 @@ def train_step(
     densifier = components.densifier
     found = loss_and_gradients(
         batch, tracer, shading, config.loss,
-        training_progress=training_progress, with_errors=densifier.wants_errors, min_blend_weight=config.min_blend_weight,
+        training_progress=training_progress, with_errors=densifier.wants_errors,
+        min_blend_weight=config.min_blend_weight,
     )  # fmt: skip
     if not np.isfinite(found.loss.value):
         raise TrainingError(

@@ -53,7 +53,8 @@ class Trainer:
         fingerprint: what the checkpoints belong to.
         progress: hears the progress.
         threads: for everything; 0 means all cores.
-        should_stop: asked wherever a run may stop, see :class:`octasplat.engine.train.loop.schedule.Schedule`.
+        should_stop: asked wherever a run may stop, see
+            :class:`octasplat.engine.train.loop.schedule.Schedule`.
         scale_floor: what no scale falls below.
         camera_clearance: where no Gaussian stays, whatever the strategy does.
         view_frusta: outside of which none stays.

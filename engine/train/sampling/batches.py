@@ -30,9 +30,10 @@ TILE_PX = 8
 class Batch:
     """Rays and what the photographs show there.
 
-    The last ``ssim_patch_count * side * side`` rays are patches, row-major one after another. ``ray_patches`` says
-    which of the others stand in windows. ``background_srgb`` lies
-    behind both the Gaussians and photographs with alpha. ``visibility_rays`` end before points that views show.
+    The last ``ssim_patch_count * side * side`` rays are patches, row-major one after another.
+    ``ray_patches`` says which of the others stand in windows. ``background_srgb`` lies
+    behind both the Gaussians and photographs with alpha. ``visibility_rays`` end before points that views
+    show.
     """
 
     rays: RayBatch

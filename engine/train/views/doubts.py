@@ -1,8 +1,8 @@
 """Photographs whose given poses are in doubt, by a training so short that it costs a few seconds.
 
 A few thousand coarse Gaussians show well enough what the photographs have in common for those that stand in
-the wrong place to be found, see :mod:`octasplat.engine.train.views.outlier_views`. What is wrong with them it does not
-say.
+the wrong place to be found, see :mod:`octasplat.engine.train.views.outlier_views`. What is wrong with them
+it does not say.
 """
 
 import tempfile

@@ -19,7 +19,10 @@ from octasplat.engine.train.sampling.pixel_sampler import TrainingData
 from octasplat.engine.train.views.view_grids import render_grids
 
 GRID_TILES = 3
-"""So many tiles each way of a view are measured, see :func:`octasplat.engine.train.sampling.batches.grid_pixels`."""
+"""So many tiles each way of a view are measured.
+
+See :func:`octasplat.engine.train.sampling.batches.grid_pixels`.
+"""
 MIN_VIEWS = 6
 """Among fewer views nobody can say which of them is odd."""
 NEIGHBORS = 8

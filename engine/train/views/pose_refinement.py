@@ -1,7 +1,8 @@
 """Small corrections of the training views' poses, learnt while the Gaussians are.
 
 Between iterations each training view is aligned with what the Gaussians show from there (see
-:mod:`octasplat.engine.train.views.image_alignment`); rays are then made from the corrected poses, and both come nearer by
+:mod:`octasplat.engine.train.views.image_alignment`); rays are then made from the corrected poses, and both
+come nearer by
 turns. What all corrections have in common is taken out, so that held-out views, which keep the poses that are
 given, stay in their places. Poses that are wrong by more than some pixels are not found: steps are small, and
 nothing is looked for. The first Gaussians, near zones, floors on scales, meshes and renders "as the
@@ -32,7 +33,10 @@ from octasplat.engine.train.views.image_alignment import (
 )
 
 GRID_TILES = 5
-"""So many tiles each way of a view are aligned, see :func:`octasplat.engine.train.sampling.batches.grid_pixels`."""
+"""So many tiles each way of a view are aligned.
+
+See :func:`octasplat.engine.train.sampling.batches.grid_pixels`.
+"""
 VIEWS_PER_TRACE = 32
 STEP_FRACTION = 0.5
 """Share of a motion that is taken: what the Gaussians get wrong for the moment is averaged out."""
