@@ -63,7 +63,7 @@ def test_ssim_gradient_reaches_gaussians() -> None:
     gaussians.sh += rng.normal(0, 0.4, gaussians.sh.shape).astype(np.float32)
     tracer = CpuTracer(config.trace, threads=1)
 
-    def loss_and_gradients() -> tuple[float, dict[str, np.ndarray]]:
+    def value_and_gradients() -> tuple[float, dict[str, np.ndarray]]:
         tracer.build(gaussians)
         found = loss_and_gradients(batch, tracer, PLAIN_SHADING, config.loss, training_progress=0.0)
         whole = {}
@@ -72,7 +72,7 @@ def test_ssim_gradient_reaches_gaussians() -> None:
             whole[name][found.gaussians.ids] = getattr(found.gaussians, name)
         return found.loss.value, whole
 
-    value, gradients = loss_and_gradients()
+    value, gradients = value_and_gradients()
     assert 0.2 < value < 1.2
     # Rays that enter or leave an octagon with its size give no gradient, as documented.
     for (name, gradient), tolerance in zip(gradients.items(), (0.01, 0.05, 0.1), strict=True):
@@ -81,9 +81,9 @@ def test_ssim_gradient_reaches_gaussians() -> None:
         direction = gradient / np.linalg.norm(gradient) * np.sign(rng.normal(0.8, 1, gradient.shape))
         step = 0.02
         parameter[:] = before + step * direction
-        above, _ = loss_and_gradients()
+        above, _ = value_and_gradients()
         parameter[:] = before - step * direction
-        below, _ = loss_and_gradients()
+        below, _ = value_and_gradients()
         parameter[:] = before
         expected = float((gradient * direction).sum())
         assert (above - below) / (2 * step) == pytest.approx(expected, rel=tolerance)
