@@ -2,7 +2,8 @@
 
 import math
 import re
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ import pycolmap
 from jaxtyping import Float64, Int64
 
 from octasplat.engine.core.errors import DatasetError
+from octasplat.engine.core.local_origin import NO_ORIGIN, Origin, choose_origin
 from octasplat.engine.dataset.camera import Camera
 from octasplat.engine.dataset.colmap_binary import check_binary_colmap_model
 from octasplat.engine.dataset.colmap_text import find_text_model_error
@@ -23,6 +25,8 @@ MODEL_FOLDERS = ("sparse", "colmap/sparse", "distorted/sparse")
 _MODEL_FILES = ("cameras", "images", "points3D")
 MIN_QUATERNION_NORM = 1e-6
 """Quaternions shorter than this say nothing about a rotation."""
+ROUNDING = 1e-9
+"""Camera centres no farther apart than this share of their coordinates stand in one place."""
 UNIT_NORM_TOLERANCE = 1e-9
 """Lengths of quaternions this near to 1 need no correction."""
 WARN_NORM_TOLERANCE = 1e-3
@@ -56,6 +60,8 @@ class ColmapModel:
         images: registered images, sorted by name.
         points: sparse point cloud.
         warnings: one sentence each on what is odd but usable.
+        origin_world: where poses and points have their origin in the coordinates of the files, see
+            :mod:`octasplat.engine.core.local_origin`.
     """
 
     folder: Path
@@ -63,6 +69,7 @@ class ColmapModel:
     images: tuple[PosedImage, ...]
     points: SparsePoints
     warnings: tuple[str, ...]
+    origin_world: Origin = NO_ORIGIN
 
 
 def find_colmap_model_folder(root: Path) -> Path:
@@ -127,8 +134,16 @@ def _missing_files(folder: Path) -> list[str]:
     return by_form[".bin"] if len(by_form[".bin"]) < len(_MODEL_FILES) else by_form[".txt"]
 
 
-def read_colmap_model(root: Path, folder: Path | None = None) -> ColmapModel:
+def read_colmap_model(
+    root: Path, folder: Path | None = None, *, origin_world: Origin | None = None
+) -> ColmapModel:
     """Read the COLMAP model of the scene in ``root``, or the one in ``folder``.
+
+    Args:
+        root: folder of the scene.
+        folder: of the model, if it is not in ``root``.
+        origin_world: local origin to take, that of a scene that the model goes with; None chooses one where
+            coordinates are large.
 
     Raises:
         DatasetError: there is no model, it is damaged, or it holds values that are not finite.
@@ -149,13 +164,16 @@ def read_colmap_model(root: Path, folder: Path | None = None) -> ColmapModel:
     _normalise_quaternions(reconstruction, folder, warnings)
     images = _posed_images(reconstruction, folder, warnings)
     cameras = _cameras(reconstruction, {image.camera_id for image in images}, folder, warnings)
-    points = _sparse_points(reconstruction, folder, warnings)
+    points_world = _point_positions(reconstruction)
+    origin = _local_origin(images, points_world) if origin_world is None else origin_world
+    images = tuple(_about_origin(image, origin) for image in images)
+    points = _sparse_points(reconstruction, points_world - np.array(origin), folder, warnings)
     if images:
         rotations = np.stack([image.rotation_cam_from_world for image in images])
         translations = np.stack([image.translation_cam_from_world for image in images])
         names = [image.name for image in images]
         warnings += check_poses(folder, names, rotations, translations, points)
-    return ColmapModel(folder, cameras, images, points, tuple(warnings))
+    return ColmapModel(folder, cameras, images, points, tuple(warnings), origin)
 
 
 def _normalise_quaternions(reconstruction: Any, folder: Path, warnings: list[str]) -> None:
@@ -256,9 +274,42 @@ def _cameras(reconstruction: Any, used: set[int], folder: Path, warnings: list[s
     return cameras
 
 
-def _sparse_points(reconstruction: Any, folder: Path, warnings: list[str]) -> SparsePoints:
+def _point_positions(reconstruction: Any) -> Float64[np.ndarray, "n 3"]:
+    points = sorted(reconstruction.points3D.items(), key=lambda item: item[0])
+    return np.array([point.xyz for _, point in points], dtype=np.float64).reshape(-1, 3)
+
+
+def _local_origin(images: Sequence[PosedImage], points_world: Float64[np.ndarray, "n 3"]) -> Origin:
+    """Choose an origin by the cameras, and by the points where all cameras stand in one place."""
+    if not images:
+        return NO_ORIGIN
+    centres = np.stack(
+        [-image.rotation_cam_from_world.T @ image.translation_cam_from_world for image in images]
+    )
+    middle = np.median(centres, axis=0)
+    extent = float(np.median(np.linalg.norm(centres - middle, axis=1)))
+    finite = points_world[np.isfinite(points_world).all(axis=1)]
+    if len(finite):
+        # Rounding alone gives cameras in one place a tiny radius.
+        to_points = float(np.median(np.linalg.norm(finite - middle, axis=1)))
+        extent = extent if extent > 1e-4 * to_points else to_points
+    elif extent <= ROUNDING * float(np.linalg.norm(middle)):
+        return NO_ORIGIN
+    return choose_origin(middle, extent)
+
+
+def _about_origin(image: PosedImage, origin: Origin) -> PosedImage:
+    if origin == NO_ORIGIN:
+        return image
+    translation = image.translation_cam_from_world + image.rotation_cam_from_world @ np.array(origin)
+    return replace(image, translation_cam_from_world=translation)
+
+
+def _sparse_points(
+    reconstruction: Any, xyz_local: Float64[np.ndarray, "n 3"], folder: Path, warnings: list[str]
+) -> SparsePoints:
     points = [point for _, point in sorted(reconstruction.points3D.items(), key=lambda item: item[0])]
-    xyz = np.array([point.xyz for point in points], dtype=np.float32).reshape(-1, 3)
+    xyz = xyz_local.astype(np.float32)
     rgb = np.array([point.color for point in points], dtype=np.float32).reshape(-1, 3) / np.float32(255)
     tracks = np.array([point.track.length() for point in points], dtype=np.int32)
     errors = np.array([point.error for point in points], dtype=np.float32)

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float32, Float64, Int, Int64
 
 from octasplat.engine.core.errors import DatasetError
+from octasplat.engine.core.local_origin import NO_ORIGIN, Origin
 from octasplat.engine.core.rays import ImageRays, RayBatch
 from octasplat.engine.dataset.camera import Camera
 from octasplat.engine.dataset.camera_clearance import camera_clearances
@@ -52,6 +53,8 @@ class Dataset:
         train_indices: views to train on.
         test_indices: views held out.
         views_record: what the photographs and their model are, to be compared with those of another time.
+        origin_world: where all of it has its origin in the coordinates of the files, see
+            :mod:`octasplat.engine.core.local_origin`.
         warnings: one sentence each on what is odd but usable.
         has_alpha: whether any pixel can have an alpha below 1.
         has_masks: whether any view has a mask.
@@ -76,6 +79,7 @@ class Dataset:
         self.root: Path = model.root
         self.views: tuple[DatasetView, ...] = model.views
         self.cameras: tuple[Camera, ...] = model.cameras
+        self.origin_world: Origin = model.origin_world
         self.warnings: list[str] = [*model.warnings, *cache.warnings]
         self.train_indices: Int64[np.ndarray, " train"]
         self.test_indices: Int64[np.ndarray, " test"]
@@ -140,6 +144,7 @@ class Dataset:
         threads: int = 0,
         progress: Callable[[int, int], None] | None = None,
         max_table_bytes: int = MAX_TABLE_BYTES,
+        origin_world: Origin | None = None,
     ) -> "Dataset":
         """Load a scene and decode its photographs into ``cache_dir``, or find them there.
 
@@ -158,13 +163,16 @@ class Dataset:
             threads: decoding threads; 0 takes one a processor.
             progress: told (photographs done, photographs in all) while decoding.
             max_table_bytes: limit on the ray tables of cameras that are not pinholes.
+            origin_world: local origin to take; None chooses one where coordinates are large.
 
         Raises:
             DatasetError: something is missing, damaged or does not fit together.
             OutputError: the cache cannot be written.
             ConfigError: a setting is out of range.
         """
-        scene = load_dataset_model(root, max_side=max_side, model_folder=model_folder)
+        scene = load_dataset_model(
+            root, max_side=max_side, model_folder=model_folder, origin_world=origin_world
+        )
         _require_masks(scene, root, masks)
         # Complain before the long work.
         _, test_indices = split_views([view.name for view in scene.views], test_every, held_out)
@@ -183,6 +191,7 @@ class Dataset:
         cache_dir: Path,
         *,
         near_world: float,
+        origin_world: Origin = NO_ORIGIN,
         max_side: int | None = None,
         masks: MaskUse = "ignore",
         threads: int = 0,
@@ -194,6 +203,7 @@ class Dataset:
             root: as in :meth:`open`; the model needs no points.
             cache_dir: folder of the cache.
             near_world: distance at which anything is seen, that of the scene.
+            origin_world: local origin of the scene.
             max_side: cap on the longer side of the photographs, in pixels.
             masks: as in :meth:`open`.
             threads: decoding threads; 0 takes one a processor.
@@ -203,7 +213,9 @@ class Dataset:
             DatasetError: something is missing, damaged or does not fit together.
             OutputError: the cache cannot be written.
         """
-        scene = load_dataset_model(root, max_side=max_side, min_views=1, for_training=False)
+        scene = load_dataset_model(
+            root, max_side=max_side, min_views=1, for_training=False, origin_world=origin_world
+        )
         _require_masks(scene, root, masks)
         cache = open_pixel_cache(scene, cache_dir, threads=threads, progress=progress)
         tables = open_ray_tables(scene.cameras, cache_dir, MAX_TABLE_BYTES)

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from octasplat.engine.core.errors import ConfigError, DatasetError
+from octasplat.engine.core.local_origin import Origin, describe_origin, is_set
 from octasplat.engine.core.relative_paths import normalize_name
 from octasplat.engine.dataset.camera import Camera
 from octasplat.engine.dataset.colmap_model import (
@@ -55,6 +56,7 @@ def load_dataset_model(
     model_folder: Path | None = None,
     min_views: int = MIN_VIEWS,
     for_training: bool = True,
+    origin_world: Origin | None = None,
 ) -> DatasetModel:
     """Read the model of a scene and the headers of its photographs, but no pixels.
 
@@ -66,6 +68,8 @@ def load_dataset_model(
             ``root`` may then be a bare folder of photographs.
         min_views: so many photographs must be posed.
         for_training: warn of what matters to training only.
+        origin_world: local origin to take, that of the scene whose photographs these are; None chooses one
+            where coordinates are large, see :mod:`octasplat.engine.core.local_origin`.
 
     Raises:
         DatasetError: something is missing, damaged or does not fit together.
@@ -82,13 +86,18 @@ def load_dataset_model(
                 "reconstruct with --poses auto, or octasplat submit."
             )
         raise DatasetError(f"{root} has no folder images; put the photographs into {root / 'images'}.")
-    model = read_colmap_model(root, model_folder)
+    model = read_colmap_model(root, model_folder, origin_world=origin_world)
     if len(model.images) < min_views:
         raise DatasetError(
             f"The model in {model.folder} has {len(model.images)} posed images; "
             f"at least {min_views} {'is' if min_views == 1 else 'are'} needed."
         )
     warnings = list(model.warnings)
+    if for_training and is_set(model.origin_world):
+        warnings.append(
+            f"The coordinates of {model.folder} are large against the scene, so it is trained about a local "
+            f"origin; add {describe_origin(model.origin_world)} to what files hold that have no place for it."
+        )
     if for_training and len(model.points) == 0:
         warnings.append(f"The model in {model.folder} has no 3D points; the start will be random.")
     images, paths, beside = _find_images(
@@ -135,6 +144,7 @@ def load_dataset_model(
             np.concatenate(observed_px),
         ),
         warnings=tuple(warnings),
+        origin_world=model.origin_world,
     )
 
 

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32, Float64, Int32, Int64
 
+from octasplat.engine.core.local_origin import NO_ORIGIN, Origin
 from octasplat.engine.dataset.camera import Camera
 from octasplat.engine.dataset.image_info import ImageInfo
 
@@ -114,6 +115,8 @@ class DatasetModel(Viewpoints):
         points: sparse point cloud.
         observations: of the points.
         warnings: one sentence each on what is odd but usable.
+        origin_world: where all of it has its origin in the coordinates of the files, see
+            :mod:`octasplat.engine.core.local_origin`.
     """
 
     views: tuple[DatasetView, ...]
@@ -123,6 +126,7 @@ class DatasetModel(Viewpoints):
     points: SparsePoints
     observations: Observations
     warnings: tuple[str, ...]
+    origin_world: Origin = NO_ORIGIN
 
 
 def scene_extent(origins_world: Float64[np.ndarray, "n 3"], points: SparsePoints) -> float:

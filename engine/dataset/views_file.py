@@ -5,16 +5,25 @@ its mask's; for the sparse points one digest. Where the folder of the photograph
 """
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
 from jaxtyping import Float, Int64
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    Field,
+    ValidationError,
+    model_serializer,
+    model_validator,
+)
 
 from octasplat.engine.core.errors import ConfigError
+from octasplat.engine.core.local_origin import NO_ORIGIN, Origin, is_set
 from octasplat.engine.core.relative_paths import check_relative_path
 from octasplat.engine.core.writing import write_text
 from octasplat.engine.dataset.camera import Camera
@@ -89,6 +98,14 @@ class ViewsRecord(_FrozenModel):
     points_sha256: str
     cameras: tuple[_CameraEntry, ...]
     views: Annotated[tuple[_ViewEntry, ...], Field(min_length=1)]
+    origin_world: _Row = NO_ORIGIN
+
+    @model_serializer(mode="wrap")
+    def _without_zero_origin(self, write: Callable[["ViewsRecord"], dict[str, object]]) -> dict[str, object]:
+        content = write(self)
+        if not is_set(self.origin_world):
+            del content["origin_world"]
+        return content
 
     @model_validator(mode="after")
     def _cameras_exist(self) -> "ViewsRecord":
@@ -126,6 +143,14 @@ class ViewsRecord(_FrozenModel):
             test_indices=np.flatnonzero(held_out).astype(np.int64),
             extent=self.extent_world,
         )
+
+    def about(self, origin_world: Origin) -> "ViewsRecord":
+        """Return the same views with poses about another local origin."""
+        if origin_world == self.origin_world:
+            return self
+        shift = np.array(self.origin_world) - np.array(origin_world)
+        moved = self.transformed(1.0, np.eye(3), shift)
+        return moved.model_copy(update={"origin_world": origin_world})
 
     def transformed(
         self, scale: float, turn: Float[np.ndarray, "3 3"], shift_world: Float[np.ndarray, "3"]
@@ -165,7 +190,7 @@ class ViewsRecord(_FrozenModel):
 
     def is_of_same_world(self, other: "ViewsRecord") -> bool:
         """Return whether ``other`` has photographs of the same names, and all of them in the same poses."""
-        others = {view.name: view for view in other.views}
+        others = {view.name: view for view in other.about(self.origin_world).views}
         shared = [(view, others[view.name]) for view in self.views if view.name in others]
         return bool(shared) and all(
             np.allclose(one.rotation_cam_from_world, two.rotation_cam_from_world, atol=_POSE_TOLERANCE)
@@ -183,7 +208,7 @@ class ViewsRecord(_FrozenModel):
 
         Single ones may, as those that a run placed anew; and all may a little, as where it adjusted lenses.
         """
-        others = {(view.name, view.photograph_sha256): view for view in other.views}
+        others = {(view.name, view.photograph_sha256): view for view in other.about(self.origin_world).views}
         names = ((view, (view.name, view.photograph_sha256)) for view in self.views)
         shared = [(view, others[name]) for view, name in names if name in others]
         return 2 * sum(self._stands_elsewhere(one, two) for one, two in shared) > len(shared)
@@ -218,6 +243,7 @@ def views_record(
     held_out = set(test_indices.tolist())
     train = [index for index in range(len(model.views)) if index not in held_out] or sorted(held_out)
     return ViewsRecord(
+        origin_world=model.origin_world,
         extent_world=_extent(model, np.array(train)),
         points_sha256=_points_digest(model.points),
         cameras=tuple(

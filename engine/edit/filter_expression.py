@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from octasplat.engine.core.errors import ConfigError
+from octasplat.engine.core.local_origin import NO_ORIGIN, Origin, is_set
 from octasplat.engine.gaussians.channels import column_names
 from octasplat.engine.gaussians.materials import ALBEDO
 from octasplat.engine.gaussians.model import FlatGaussians
@@ -32,13 +33,18 @@ _COMPARISONS: Mapping[type[ast.cmpop], Callable[[Any, Any], Any]] = {
 _ADVICE = "compare numbers of the Gaussians, as in: metallic > 0.5 and not z < 0"
 
 
-def expression_variables(gaussians: FlatGaussians) -> dict[str, Float[np.ndarray, " n"]]:
+def expression_variables(
+    gaussians: FlatGaussians, origin_world: Origin = NO_ORIGIN
+) -> dict[str, Float[np.ndarray, " n"]]:
     """Return the variables of an expression, one number per Gaussian each.
 
     Centres are ``x``, ``y``, ``z`` in world units, ``opacity`` is in (0, 1), and channels are called as in
     files (``metallic``, ``label_0``), but for ``albedo.r``, ``albedo.g`` and ``albedo.b``, which are linear.
     """
-    numbers = {axis: gaussians.means_world[:, k] for k, axis in enumerate("xyz")}
+    means = gaussians.means_world
+    if is_set(origin_world):
+        means = means + np.array(origin_world)
+    numbers = {axis: means[:, k] for k, axis in enumerate("xyz")}
     numbers["opacity"] = gaussians.opacities
     for name, array in gaussians.channels.items():
         for k, column in enumerate(column_names(name, array.shape[1])):
@@ -63,14 +69,21 @@ def parse_filter(text: str) -> ast.expr:
     return tree
 
 
-def filter_mask(gaussians: FlatGaussians, text: str) -> Bool[np.ndarray, " n"]:
+def filter_mask(
+    gaussians: FlatGaussians, text: str, origin_world: Origin = NO_ORIGIN
+) -> Bool[np.ndarray, " n"]:
     """Return a mask of the Gaussians for which an expression holds.
+
+    Args:
+        gaussians: the scene.
+        text: the expression.
+        origin_world: where the scene has its origin in the coordinates of the user.
 
     Raises:
         ConfigError: the text is no expression, or names what the scene does not have.
     """
     tree = parse_filter(text)
-    numbers = expression_variables(gaussians)
+    numbers = expression_variables(gaussians, origin_world)
     for node in ast.walk(tree):
         for part in (node.left, *node.comparators) if isinstance(node, ast.Compare) else ():
             if (name := _name(part)) is not None and name not in numbers:

@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from octasplat.engine.core.errors import ConfigError
+from octasplat.engine.core.local_origin import NO_ORIGIN, Origin
 from octasplat.engine.edit.axes import infer_q
 from octasplat.engine.edit.edit_options import Selection
 from octasplat.engine.edit.filter_expression import filter_mask
@@ -15,19 +16,27 @@ from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.gaussians.octagon import CHI2_2_99, octagon_radii
 
 
-def selection_mask(gaussians: FlatGaussians, selection: Selection) -> Bool[np.ndarray, " n"]:
+def selection_mask(
+    gaussians: FlatGaussians, selection: Selection, origin_world: Origin = NO_ORIGIN
+) -> Bool[np.ndarray, " n"]:
     """Return a mask of the Gaussians that a selection holds for.
+
+    Args:
+        gaussians: the scene.
+        selection: in the coordinates of the user.
+        origin_world: where the scene has its origin in these.
 
     Raises:
         ConfigError: the expression names what the scene does not have, or a box or sphere is none.
     """
     chosen = np.ones(len(gaussians), dtype=bool)
+    origin = np.array(origin_world)
     if selection.where is not None:
-        chosen &= filter_mask(gaussians, selection.where)
+        chosen &= filter_mask(gaussians, selection.where, origin_world)
     if (box := selection.box) is not None:
-        chosen &= in_box(gaussians, np.array(box[:3]), np.array(box[3:]))
+        chosen &= in_box(gaussians, np.array(box[:3]) - origin, np.array(box[3:]) - origin)
     if (sphere := selection.sphere) is not None:
-        chosen &= in_sphere(gaussians, np.array(sphere[:3]), sphere[3])
+        chosen &= in_sphere(gaussians, np.array(sphere[:3]) - origin, sphere[3])
     return ~chosen if selection.inverse else chosen
 
 

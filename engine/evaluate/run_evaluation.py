@@ -304,6 +304,7 @@ def _evaluate_on(
         on,
         output / CACHE / EVALUATIONS / name,
         near_world=read_metadata(output).near_world,
+        origin_world=read_metadata(output).origin_world,
         max_side=config.max_side,
         masks=config.masks,
         threads=threads,

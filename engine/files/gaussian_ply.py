@@ -5,7 +5,8 @@ channel-major (all red, then green, then blue), ``opacity`` (logit), ``scale_0..
 deviations) and ``rot_0..3`` (w, x, y, z). The flat axis, the normal r1, is axis 0 with scale ln 1e-5, so that
 every viewer of 3DGS files shows the scene. A comment ``near_world`` gives the distance from a camera at which
 it begins to be seen, as in training, ``pixel_rad`` the angle of a pixel that it was trained with, and
-``turned_beyond`` which normals, that point outwards, are turned, so that one file is one picture.
+``turned_beyond`` which normals, that point outwards, are turned, so that one file is one picture. A comment
+``origin_world`` is to be added to all positions where coordinates are large.
 
 Named channels come last, ``metallic`` or ``albedo_0..2``, and a comment ``octasplat_channel albedo 3`` says
 of each that it is one.
@@ -22,6 +23,7 @@ import numpy as np
 from jaxtyping import Float32
 
 from octasplat.engine.core.errors import ConfigError, SceneFileError
+from octasplat.engine.core.local_origin import NO_ORIGIN, Origin, is_set
 from octasplat.engine.files.channel_columns import ChannelChoice, select_channel_columns
 from octasplat.engine.files.encodings import MAX_SH_DEGREE, dropped_sh_message
 from octasplat.engine.files.export_options import ExportOptions
@@ -52,6 +54,8 @@ is axis 2. ``games`` (GaMeS, REdiSplats): the last two lie in the plane, the nor
 _FILTER = "filter_3D"
 """Standard deviation (world units) of the smoothing that Mip-Splatting and Gaussian Opacity Fields apply to
 each Gaussian before they show it."""
+ORIGIN_KEY = "origin_world"
+"""The comment that gives the origin of large coordinates; :class:`SceneMetadata` calls it so, too."""
 _POSITION = ("x", "y", "z")
 _NORMAL = ("nx", "ny", "nz")
 _SH_DC = ("f_dc_0", "f_dc_1", "f_dc_2")
@@ -90,8 +94,7 @@ def write_gaussian_ply(
     names += [column for name, width in widths.items() for column in column_names(name, width)]
     dtype = np.dtype([(name, "<f4") for name in names])
     element = PlyWriteElement("vertex", len(gaussians), dtype, _row_blocks(gaussians, degree, dtype))
-    known = [f"{name} {value!r}" for name, value in asdict(facts).items() if value > 0]
-    write_ply(path, [element], [*known, *channel_comments(widths)])
+    write_ply(path, [element], [*metadata_comments(facts), *channel_comments(widths)])
 
 
 def read_ply_metadata(path: Path) -> SceneMetadata:
@@ -101,8 +104,10 @@ def read_ply_metadata(path: Path) -> SceneMetadata:
         SceneFileError: the file is damaged, or says something that is no number.
     """
     said = dict(comment.partition(" ")[::2] for comment in reversed(read_ply_header(path).comments))
-    known = {}
+    known: dict[str, float] = {}
     for field in fields(SceneMetadata):
+        if field.name == ORIGIN_KEY:
+            continue
         if (value := said.get(field.name)) is None:
             continue
         try:
@@ -111,8 +116,31 @@ def read_ply_metadata(path: Path) -> SceneMetadata:
             raise SceneFileError(
                 f"{path}: its comment {field.name} is {value!r}, which is no number."
             ) from None
-    facts = SceneMetadata(**known)
+    facts = SceneMetadata(**known, origin_world=_origin(path, said.get(ORIGIN_KEY)))
     return replace(facts, turned_beyond=min(facts.turned_beyond, 1.0))
+
+
+def metadata_comments(facts: SceneMetadata) -> list[str]:
+    """Return the comments of a PLY that say what is known of its scene as a whole."""
+    known = [f"{name} {value!r}" for name, value in asdict(facts).items() if name != ORIGIN_KEY and value > 0]
+    return [*known, *origin_comments(facts.origin_world)]
+
+
+def origin_comments(origin: Origin) -> list[str]:
+    """Return the comment of a text or a PLY that says where it has its origin, if that is not 0."""
+    return [f"{ORIGIN_KEY} {' '.join(map(repr, origin))}"] if is_set(origin) else []
+
+
+def _origin(path: Path, text: str | None) -> Origin:
+    if text is None:
+        return NO_ORIGIN
+    try:
+        x, y, z = map(float, text.split())
+    except ValueError:
+        x = y = z = math.nan
+    if not all(map(math.isfinite, (x, y, z))):
+        raise SceneFileError(f"{path}: its comment {ORIGIN_KEY} is {text!r}, which is no point.") from None
+    return (x, y, z)
 
 
 def _row_blocks(gaussians: FlatGaussians, degree: int, dtype: np.dtype[np.void]) -> Iterator[np.ndarray]:
@@ -336,5 +364,6 @@ register(
         _export,
         holds_channels=True,
         holds_harmonics=True,
+        holds_origin=True,
     )
 )

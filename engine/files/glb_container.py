@@ -6,7 +6,7 @@ vertex attributes that they do not know or stop at the raw bytes.
 
 import json
 import struct
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,6 +16,7 @@ from jaxtyping import Float64
 from numpy.typing import DTypeLike
 
 from octasplat.engine.core.errors import SceneFileError
+from octasplat.engine.core.local_origin import MAX_DISTANCE, NO_ORIGIN, Origin, is_set
 from octasplat.engine.core.writing import atomic_replace
 from octasplat.engine.gaussians.channels import column_names
 from octasplat.engine.gaussians.frames import quaternions_from_matrices, rotation_matrices
@@ -34,6 +35,8 @@ WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 CORE_NODE_NAME = "octasplat_cores"
 """Says in the extras of a primitive that it shows octagons a second time."""
 MAX_NODE_DEPTH = 256
+ORIGIN_KEY = "octasplat_origin"
+"""In the extras of a root node: the origin of large coordinates, which its translation adds."""
 CHANNELS = "octasplat_channels"
 GLB_READ_ERRORS = (KeyError, IndexError, TypeError, ValueError, AttributeError)
 """What reading a document that says nonsense may raise."""
@@ -132,6 +135,61 @@ class GlbFile:
                     if not primitive.get("extras", {}).get(CORE_NODE_NAME):
                         yield matrix, primitive
             waiting += [(child, matrix, depth + 1) for child in reversed(node.get("children", []))]
+
+    def local_origin(self) -> Origin:
+        """Return the origin of large coordinates in our world frame, zeros where there is none.
+
+        It is the translation of the first primitive's node, if our exporters say so, or if it is so large
+        against the primitive that 32 bits could not hold the sum.
+
+        Raises:
+            KeyError, IndexError, TypeError, ValueError: the document says nonsense.
+        """
+        for matrix, primitive in self.primitives():
+            x, y, z = matrix[:3, 3].tolist()
+            origin = (x, -y, -z)
+            bounds = self.document["accessors"][primitive["attributes"]["POSITION"]]
+            reach = max(
+                (abs(value) for value in (*bounds.get("min", ()), *bounds.get("max", ()))), default=0.0
+            )
+            scale = float(np.cbrt(abs(np.linalg.det(matrix[:3, :3]))))
+            is_own = any(node.get("extras", {}).get(ORIGIN_KEY) for node in self.document["nodes"])
+            is_large = 0 < MAX_DISTANCE * scale * reach < float(np.linalg.norm(matrix[:3, 3]))
+            return origin if is_own or is_large else NO_ORIGIN
+        return NO_ORIGIN
+
+    def about_origin(self, matrix: Float64[np.ndarray, "4 4"]) -> Float64[np.ndarray, "4 4"]:
+        """Return the matrix of a node about :meth:`local_origin`."""
+        x, y, z = self.local_origin()
+        local = matrix.copy()
+        local[:3, 3] -= (x, -y, -z)
+        return local
+
+
+def read_glb_origin(path: Path) -> Origin:
+    """Return the local origin of the scene in a GLB.
+
+    Raises:
+        SceneFileError: the file is no GLB, or is damaged.
+    """
+    try:
+        return GlbFile(path).local_origin()
+    except GLB_READ_ERRORS as error:
+        raise SceneFileError(f"{path}: its glTF is damaged or not understood ({error}).") from error
+
+
+def root_translation(origin: Origin, rotation_xyzw: Sequence[float] = HALF_TURN_ABOUT_X) -> dict[str, object]:
+    """Return what a root node says of a scene about a local origin; nothing where there is none.
+
+    Args:
+        origin: in our world frame.
+        rotation_xyzw: from our frame to glTF's.
+    """
+    if not is_set(origin):
+        return {}
+    x, y, z, w = rotation_xyzw
+    turn = rotation_matrices(np.array([[w, x, y, z]], np.float64))[0]
+    return {"translation": (turn @ np.array(origin)).tolist(), "extras": {ORIGIN_KEY: list(origin)}}
 
 
 def _node_matrix(node: dict[str, Any]) -> Float64[np.ndarray, "4 4"]:

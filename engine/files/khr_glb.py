@@ -17,6 +17,7 @@ from jaxtyping import Float32, Float64
 
 from octasplat.engine.core.color import linear_to_srgb, round_to_bytes, srgb_to_linear
 from octasplat.engine.core.errors import ConfigError, SceneFileError
+from octasplat.engine.core.local_origin import Origin
 from octasplat.engine.files import glb_container
 from octasplat.engine.files.channel_columns import ChannelChoice, select_channel_columns
 from octasplat.engine.files.encodings import (
@@ -70,7 +71,7 @@ def read(path: Path, channels: ChannelChoice = "own") -> GaussianCloud:
                 names = ", ".join(splats["extensions"])
                 raise SceneFileError(f"{path}: its splats need {names}, which is not read.")
             attributes = primitive["attributes"]
-            cloud = _to_world(path, _read_cloud(file, attributes, splats), matrix)
+            cloud = _to_world(path, _read_cloud(file, attributes, splats), file.about_origin(matrix))
             columns = {name[1:].lower(): number for name, number in attributes.items() if name[0] == "_"}
             wanted = select_channel_columns(path, declared, columns, channels)
             named = Channels({name: _read_channel(file, columns, own) for name, own in wanted.items()})
@@ -258,7 +259,7 @@ def write(gaussians: FlatGaussians, path: Path, options: ExportOptions) -> tuple
     scene = select_for_export(gaussians, path, options)
     check_scales(scene, path)
     layout = _attributes(scene.sh_degree, scene.channels.widths)
-    text = glb_container.json_bytes(_gltf_json(scene, layout))
+    text = glb_container.json_bytes(_gltf_json(scene, layout, options.facts.origin_world))
     room = pad_to_four(len(text))
     length = len(scene) * sum(attribute.item_bytes for attribute in layout)
     total = glb_container.glb_size(room, length)
@@ -276,7 +277,7 @@ def _binary_blocks(scene: FlatGaussians, layout: tuple[_Attribute, ...]) -> Iter
             yield attribute.rows(block).astype(kind, copy=False).tobytes()
 
 
-def _gltf_json(scene: FlatGaussians, layout: tuple[_Attribute, ...]) -> dict[str, object]:
+def _gltf_json(scene: FlatGaussians, layout: tuple[_Attribute, ...], origin: Origin) -> dict[str, object]:
     low, high = scene.means_world.min(axis=0), scene.means_world.max(axis=0)
     views: list[dict[str, object]] = []
     accessors: list[dict[str, object]] = []
@@ -314,7 +315,7 @@ def _gltf_json(scene: FlatGaussians, layout: tuple[_Attribute, ...]) -> dict[str
         "extensionsUsed": [EXTENSION],
         "scene": 0,
         "scenes": [{"nodes": [0]}],
-        "nodes": [{"name": "octasplat", "mesh": 0}],
+        "nodes": [{"name": "octasplat", "mesh": 0, **glb_container.root_translation(origin)}],
         "meshes": [{"name": "gaussians", "primitives": [primitive]}],
         "accessors": accessors,
         "bufferViews": views,
@@ -335,5 +336,6 @@ register(
         write,
         holds_channels=True,
         holds_harmonics=True,
+        holds_origin=True,
     )
 )

@@ -20,6 +20,7 @@ import itertools
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float32, Int, Int32, UInt8
@@ -291,7 +292,7 @@ def write_surface(mesh: TriangleMesh, path: Path) -> tuple[Path, ...]:
     data = _SurfaceData()
     shading: dict[str, object] = {"metallicFactor": 0.0, "roughnessFactor": 1.0}
     material: dict[str, object] = {"name": "surface", "pbrMetallicRoughness": shading, "doubleSided": True}
-    node: dict[str, object] = {"name": "surface", "rotation": glb_container.HALF_TURN_ABOUT_X, "mesh": 0}
+    node: dict[str, Any] = {"name": "surface", "rotation": glb_container.HALF_TURN_ABOUT_X, "mesh": 0}
     document: dict[str, object] = {
         "asset": {"version": "2.0", "generator": "octasplat"},
         "scene": 0,
@@ -305,6 +306,7 @@ def write_surface(mesh: TriangleMesh, path: Path) -> tuple[Path, ...]:
     else:
         attributes["TANGENT"] = mesh.materials.tangents
         node["rotation"] = glb_container.light_rotation(mesh.materials.light_frame)
+    node |= glb_container.root_translation(mesh.origin_world, node["rotation"])
     if mesh.texture_srgb is not None and mesh.uv is not None:
         attributes["TEXCOORD_0"] = mesh.uv
         shading["baseColorTexture"] = data.texture("surface", mesh.texture_srgb)
@@ -397,6 +399,7 @@ register(
         "octagon mesh as GLB with opacity and fall-off, for looking at objects (rooms: splats or a surface)",
         write_octagons,
         holds_channels=True,
+        holds_origin=True,
     )
 )
 register(MeshReader("glb", ("*.glb",), read, read_with_materials))

@@ -19,8 +19,10 @@ from jaxtyping import Float32, Int32, Int64
 
 from octasplat.engine.core.color import srgb_to_linear
 from octasplat.engine.core.errors import SceneFileError
+from octasplat.engine.core.local_origin import Origin
 from octasplat.engine.core.writing import atomic_replace, write_text
 from octasplat.engine.files.export_options import ExportOptions
+from octasplat.engine.files.gaussian_ply import origin_comments
 from octasplat.engine.files.obj_materials import read_mtl
 from octasplat.engine.files.octagon_batches import BATCH_SIZE, OctagonBatch, OctagonSoup
 from octasplat.engine.files.registry import Exporter, MeshReader, SurfaceWriter, register
@@ -338,7 +340,7 @@ def write_octagons(gaussians: FlatGaussians, path: Path, options: ExportOptions)
         temporary.write_bytes(grey_png(options.falloff_texture_size, options.q))
     write_text(material, f"{_material(MATERIAL)}map_d {texture.name}\n")
     with atomic_replace(path) as temporary, temporary.open("wb") as handle:
-        for text in _octagon_lines(soup, material.name):
+        for text in _octagon_lines(soup, material.name, options.facts.origin_world):
             handle.write(text.encode())
     return path, material, texture
 
@@ -347,11 +349,15 @@ def _material(name: str) -> str:
     return f"newmtl {name}\nKa 0 0 0\nKd 1 1 1\nKs 0 0 0\nillum 0\n"
 
 
-def _octagon_lines(soup: OctagonSoup, material_name: str) -> Iterator[str]:
+def _origin_lines(origin: Origin) -> str:
+    return "".join(f"# {comment}\n" for comment in origin_comments(origin))
+
+
+def _octagon_lines(soup: OctagonSoup, material_name: str, origin: Origin) -> Iterator[str]:
     yield (
         f"# octasplat octagons: {SIDES} vertices and 6 triangles per Gaussian, in the order of the scene\n"
         f"# {Q_KEY} {soup.q!r}\n# {MIN_OPACITY_KEY} {soup.min_opacity!r}\n"
-        f"# octasplat_gaussians {soup.scene_size}\n"
+        f"# octasplat_gaussians {soup.scene_size}\n{_origin_lines(origin)}"
         f"mtllib {material_name}\no octagons\nusemtl {MATERIAL}\n"
     )
     for batch in soup.batches():
@@ -378,7 +384,7 @@ def write_surface(mesh: TriangleMesh, path: Path) -> tuple[Path, ...]:
     Raises:
         OSError: a file cannot be written.
     """
-    head, files = "# octasplat surface\n", [path]
+    head, files = f"# octasplat surface\n{_origin_lines(mesh.origin_world)}", [path]
     if mesh.texture_srgb is not None:
         material, image = _surface_files(path)
         with atomic_replace(image) as temporary:
@@ -424,6 +430,7 @@ register(
         "octagon mesh as OBJ with vertex colours, without opacity",
         write_octagons,
         beside=_octagon_files,
+        holds_origin=True,
     )
 )
 register(MeshReader("obj", ("*.obj",), read, read_with_materials))

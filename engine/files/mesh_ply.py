@@ -13,7 +13,7 @@ from jaxtyping import Float32, Int, Int64
 from octasplat.engine.core.color import srgb_to_linear, to_bytes
 from octasplat.engine.core.errors import SceneFileError
 from octasplat.engine.files.export_options import ExportOptions
-from octasplat.engine.files.gaussian_ply import channel_comments
+from octasplat.engine.files.gaussian_ply import channel_comments, origin_comments
 from octasplat.engine.files.octagon_batches import BATCH_SIZE, OctagonSoup
 from octasplat.engine.files.ply_container import (
     COUNT_SUFFIX,
@@ -147,6 +147,7 @@ def write_octagons(gaussians: FlatGaussians, path: Path, options: ExportOptions)
         f"{MIN_OPACITY_KEY} {options.min_opacity!r}",
         f"octasplat_gaussians {soup.scene_size}",
         *channel_comments(widths),
+        *origin_comments(options.facts.origin_world),
     )
     names = [column for name, width in widths.items() for column in column_names(name, width)]
     vertex = np.dtype([*VERTEX, *((name, "<f4") for name in names)])
@@ -198,7 +199,7 @@ def write_surface(mesh: TriangleMesh, path: Path) -> tuple[Path, ...]:
             rows[name] = to_bytes(mesh.rgb_srgb[:, column])
     vertices = PlyWriteElement("vertex", len(rows), rows.dtype, [rows])
     faces = PlyWriteElement("face", len(mesh.faces), FACE, [_face_rows(mesh.faces)])
-    write_ply(path, [vertices, faces], ["octasplat surface"])
+    write_ply(path, [vertices, faces], ["octasplat surface", *origin_comments(mesh.origin_world)])
     return (path,)
 
 
@@ -216,6 +217,7 @@ register(
         "octagon mesh as a binary PLY with Gaussian numbers, for editing",
         write_octagons,
         holds_channels=True,
+        holds_origin=True,
     )
 )
 register(MeshReader("mesh-ply", ("*.ply",), read, read_with_materials))

@@ -21,6 +21,7 @@ from octasplat.engine.files.glb_container import (
     json_bytes,
     light_rotation,
     pad_to_four,
+    root_translation,
     vector_type,
 )
 from octasplat.engine.gaussians.octagon import FAN_TRIANGLES, SIDES
@@ -139,7 +140,12 @@ class GlbLayout:
             ramp = {"name": "materials", "mimeType": "image/png", "bufferView": self._shared_views - 1}
             images.append(ramp)
         nodes: list[dict[str, object]] = [
-            {"name": "octasplat", "rotation": turn, "children": [1 + chunk for chunk in chunks]},
+            {
+                "name": "octasplat",
+                "rotation": turn,
+                "children": [1 + chunk for chunk in chunks],
+                **root_translation(self._options.facts.origin_world, turn),
+            },
             *({"name": f"octagons_{chunk:02d}", "mesh": chunk} for chunk in chunks),
         ]
         return {

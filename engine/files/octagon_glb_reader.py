@@ -63,7 +63,7 @@ def _read_primitive(
 ) -> tuple[GaussianCloud, Float32[np.ndarray, " n"]]:
     """The Gaussians of a primitive, and their numbers in the scene."""
     attributes = primitive["attributes"]
-    turned = np.diag([1.0, -1.0, -1.0, 1.0]) @ matrix
+    turned = np.diag([1.0, -1.0, -1.0, 1.0]) @ file.about_origin(matrix)
     vertices = file.array(attributes["POSITION"], np.float64) @ turned[:3, :3].T + turned[:3, 3]
     offset = 2.0 * file.array(attributes["TEXCOORD_0"], np.float64) - 1.0
     if len(vertices) % SIDES or len(offset) != len(vertices):

@@ -9,6 +9,7 @@ from octasplat.engine.core.errors import SceneFileError
 from octasplat.engine.core.events import EventListener, PhaseFinished, PhaseStarted, ignore_events
 from octasplat.engine.files.channel_columns import ChannelChoice
 from octasplat.engine.files.gaussian_ply import read_ply_metadata
+from octasplat.engine.files.glb_container import read_glb_origin
 from octasplat.engine.files.registry import importer_for, mesh_reader_for
 from octasplat.engine.gaussians.flattening import ImportReport, flatten
 from octasplat.engine.gaussians.model import FlatGaussians
@@ -59,12 +60,14 @@ def read_scene(
 
 
 def read_metadata(path: Path) -> SceneMetadata:
-    """What a file, or the scene of a run's folder, says of its scene as a whole; only our PLY says anything.
+    """Return the metadata that a file or a run's scene states: our PLY all, a GLB its origin, others none.
 
     Raises:
         SceneFileError: the file cannot be read or is damaged.
     """
     source = _scene_file(path)
+    if source.suffix.lower() == ".glb":
+        return SceneMetadata(origin_world=read_glb_origin(source))
     return read_ply_metadata(source) if source.suffix.lower() == ".ply" else UNKNOWN_METADATA
 
 

@@ -63,6 +63,7 @@ class Exporter(Entry):
             or None.
         holds_channels: whether it writes named channels, too.
         holds_harmonics: whether colours may change with the direction.
+        holds_origin: whether it says where a scene of large coordinates has its origin.
         beside: names the files that are written beside the path, if there are any.
     """
 
@@ -72,6 +73,7 @@ class Exporter(Entry):
     missing_requirement: Callable[[], str | None] = lambda: None
     holds_channels: bool = False
     holds_harmonics: bool = False
+    holds_origin: bool = False
     beside: Callable[[Path], tuple[Path, ...]] = no_files
 
 

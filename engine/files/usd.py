@@ -16,6 +16,7 @@ import numpy as np
 
 from octasplat.engine.core.color import srgb_to_linear
 from octasplat.engine.core.errors import SceneFileError
+from octasplat.engine.core.local_origin import Origin, is_set
 from octasplat.engine.core.writing import atomic_replace
 from octasplat.engine.files.encodings import half_turn_gaussians, unit_quats
 from octasplat.engine.files.export_options import ExportOptions
@@ -50,7 +51,7 @@ def write(gaussians: FlatGaussians, path: Path, options: ExportOptions) -> tuple
     suffix = ".usdc" if path.suffix.lower() in (".usdz", ".usd") else path.suffix.lower()
     with tempfile.TemporaryDirectory(prefix="octasplat-") as folder, atomic_replace(path) as temporary:
         layer = Path(folder) / f"scene{suffix}"
-        _write_stage(pxr, scene, layer)
+        _write_stage(pxr, scene, layer, options.facts.origin_world)
         if path.suffix.lower() == ".usdz":
             package = Path(folder) / "scene.usdz"
             if not pxr["UsdUtils"].CreateNewUsdzPackage(pxr["Sdf"].AssetPath(str(layer)), str(package)):
@@ -89,12 +90,16 @@ def _usd(path: Path) -> dict[str, ModuleType]:
     }
 
 
-def _write_stage(pxr: dict[str, ModuleType], scene: FlatGaussians, layer: Path) -> None:
+def _write_stage(pxr: dict[str, ModuleType], scene: FlatGaussians, layer: Path, origin: Origin) -> None:
     usd, geom, vol, vt = (pxr[name] for name in ("Usd", "UsdGeom", "UsdVol", "Vt"))
     stage = usd.Stage.CreateNew(str(layer))
     geom.SetStageUpAxis(stage, geom.Tokens.y)
     geom.SetStageMetersPerUnit(stage, 1.0)
-    stage.SetDefaultPrim(geom.Xform.Define(stage, ROOT).GetPrim())
+    root = geom.Xform.Define(stage, ROOT)
+    if is_set(origin):
+        x, y, z = origin
+        root.AddTranslateOp(geom.XformOp.PrecisionDouble).Set((x, -y, -z))
+    stage.SetDefaultPrim(root.GetPrim())
     prim = vol.ParticleField.Define(stage, FIELD).GetPrim()
     for schema in SCHEMAS:
         prim.ApplyAPI(getattr(vol, schema))
@@ -138,5 +143,6 @@ register(
         missing_usd,
         holds_channels=True,
         holds_harmonics=True,
+        holds_origin=True,
     )
 )

@@ -4,9 +4,11 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from octasplat.engine.core.errors import ConfigError, SceneFileError
+from octasplat.engine.core.local_origin import describe_origin, is_set
 from octasplat.engine.files.export_options import ExportOptions
 from octasplat.engine.files.registry import SurfaceWriter, exporter_for, surface_suffixes, surface_writer_for
 from octasplat.engine.gaussians.model import FlatGaussians
+from octasplat.engine.gaussians.scene_metadata import UNKNOWN_METADATA, SceneMetadata
 from octasplat.engine.geometry.triangle_mesh import TriangleMesh
 
 
@@ -32,9 +34,19 @@ def export_scene(
 
 
 def dropped_on_export(
-    gaussians: FlatGaussians, paths: Sequence[Path], format: str | None = None
+    gaussians: FlatGaussians,
+    paths: Sequence[Path],
+    format: str | None = None,
+    *,
+    facts: SceneMetadata = UNKNOWN_METADATA,
 ) -> tuple[str, ...]:
     """What :func:`export_scene` will leave out at all of ``paths``, a sentence for each thing left out.
+
+    Args:
+        gaussians: the scene.
+        paths: the files.
+        format: name of the format, if the files' names do not say it.
+        facts: what is known of the scene as a whole.
 
     Raises:
         SceneFileError: there is no such format.
@@ -54,6 +66,12 @@ def dropped_on_export(
             f"{_format_list_text(without, 'has', 'have')} one colour for each Gaussian; "
             "how colours change with the direction will be left out (octasplat export --color "
             "chooses the one)."
+        )
+    without = [name for name, exporter in chosen.items() if not exporter.holds_origin]
+    if is_set(facts.origin_world) and without:
+        lines.append(
+            f"{_format_list_text(without, 'has', 'have')} no place for the origin of large coordinates; add "
+            f"{describe_origin(facts.origin_world)} to its positions."
         )
     return tuple(lines)
 

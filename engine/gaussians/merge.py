@@ -5,8 +5,17 @@ from dataclasses import replace
 
 import numpy as np
 
+from octasplat.engine.core.local_origin import Origin
 from octasplat.engine.gaussians.channels import merge_widths
 from octasplat.engine.gaussians.model import FlatGaussians, concatenate
+
+
+def about_origin(gaussians: FlatGaussians, origin_world: Origin, new_origin: Origin) -> FlatGaussians:
+    """Return a scene with its positions about another local origin."""
+    if origin_world == new_origin:
+        return gaussians
+    shift = np.array(origin_world) - np.array(new_origin)
+    return replace(gaussians, means_world=(gaussians.means_world + shift).astype(np.float32))
 
 
 def with_sh_degree(gaussians: FlatGaussians, degree: int) -> FlatGaussians:

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+from octasplat.engine.core.local_origin import NO_ORIGIN, Origin
 from octasplat.engine.gaussians.materials import ALBEDO
 from octasplat.engine.gaussians.model import FlatGaussians
 
@@ -15,11 +16,14 @@ class SceneMetadata:
         near_world: distance from a camera at which the scene begins to be seen, as in its training.
         pixel_rad: the angle of a pixel in the middle of a training view.
         turned_beyond: of :class:`octasplat.engine.trace.protocol.TraceSettings`; 0: normals have no side.
+        origin_world: where the scene has its origin in the coordinates of its user, see
+            :mod:`octasplat.engine.core.local_origin`.
     """
 
     near_world: float = 0.0
     pixel_rad: float = 0.0
     turned_beyond: float = 0.0
+    origin_world: Origin = NO_ORIGIN
 
     def scaled(self, factor: float) -> "SceneMetadata":
         """Return the metadata of the scene scaled by ``factor``."""
@@ -30,7 +34,7 @@ UNKNOWN_METADATA = SceneMetadata()
 
 
 def merge_metadata(scenes: Sequence[tuple[FlatGaussians, SceneMetadata]]) -> SceneMetadata:
-    """Return the metadata of merged scenes: what holds for each of them.
+    """Return the metadata of merged scenes: what holds for each of them, about the origin of the first.
 
     Whether normals have a side is for those to say that have materials, as no others are lit by them.
     """
@@ -39,4 +43,5 @@ def merge_metadata(scenes: Sequence[tuple[FlatGaussians, SceneMetadata]]) -> Sce
         near_world=min(facts.near_world for _, facts in scenes),
         pixel_rad=min(facts.pixel_rad for _, facts in scenes),
         turned_beyond=min(lit, default=0.0),
+        origin_world=scenes[0][1].origin_world,
     )

@@ -1,10 +1,11 @@
 """Imported meshes, from an editor or as a proxy, of any file format."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float32, Float64, Int32, Int64
 
+from octasplat.engine.core.local_origin import Origin, is_set, vertices_about
 from octasplat.engine.geometry.mesh_material import MeshMaterial
 
 
@@ -49,6 +50,10 @@ class ImportedMesh:
 
     def __len__(self) -> int:
         return len(self.vertices)
+
+    def about(self, origin: Origin) -> "ImportedMesh":
+        """Return the mesh about the local origin of a scene, whichever coordinates its file has."""
+        return replace(self, vertices=vertices_about(self.vertices, origin)) if is_set(origin) else self
 
 
 def flip_v(uv: Float32[np.ndarray, "v 2"]) -> Float32[np.ndarray, "v 2"]:

@@ -5,6 +5,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int32, Int64, UInt8
 
+from octasplat.engine.core.local_origin import NO_ORIGIN, Origin
+
 
 @dataclass(frozen=True)
 class MaterialMaps:
@@ -39,6 +41,8 @@ class TriangleMesh:
         normals_world: unit normals of the vertices where they are not those of the triangles around them, as
             at the seams of a mesh that was cut open; None elsewhere.
         materials: how it is to be lit; None where its colours have their light in them.
+        origin_world: where the mesh has its origin in the coordinates of its user, see
+            :mod:`octasplat.engine.core.local_origin`.
     """
 
     vertices_world: Float32[np.ndarray, "n 3"]
@@ -48,6 +52,7 @@ class TriangleMesh:
     texture_srgb: UInt8[np.ndarray, "h w 3"] | None = None
     normals_world: Float32[np.ndarray, "n 3"] | None = None
     materials: MaterialMaps | None = None
+    origin_world: Origin = NO_ORIGIN
 
     @property
     def face_corners_world(self) -> Float64[np.ndarray, "m 3 3"]:

@@ -61,16 +61,19 @@ def run(
         ConfigError: nothing would be kept.
         SceneFileError: the scene cannot be read or written.
     """
+    from octasplat.engine.core.local_origin import user_position
     from octasplat.engine.edit.selection import selection_mask
+    from octasplat.engine.files import read_metadata
     from octasplat.engine.operations.scene_io import check_changed, edit_note, open_scene, write_changed
 
     source: Path = request.source
     check_changed("crop", request, request.output)
-    gaussians = open_scene(source, progress)
-    keep = selection_mask(gaussians, request)
+    gaussians, origin = open_scene(source, progress), read_metadata(source).origin_world
+    keep = selection_mask(gaussians, request, origin)
     if not keep.any():
-        low, high = gaussians.means_world.min(axis=0), gaussians.means_world.max(axis=0)
-        bounds = " to ".join(" ".join(f"{value:.4g}" for value in corner) for corner in (low, high))
+        means = gaussians.means_world
+        corners = [user_position(corner, origin) for corner in (means.min(axis=0), means.max(axis=0))]
+        bounds = " to ".join(corners)
         raise ConfigError(
             f"{source}: nothing of it would be kept; its centres lie in {bounds} (octasplat info tells where "
             "its solid part is)."

@@ -12,9 +12,10 @@ from pydantic import Field, PlainSerializer
 
 from octasplat.engine.core.errors import SceneFileError
 from octasplat.engine.core.events import EventListener, ignore_events
+from octasplat.engine.core.local_origin import Origin
 from octasplat.engine.edit.axes import AXIS_ROTATIONS, Axes
 from octasplat.engine.edit.reports import DeformReport
-from octasplat.engine.files import ImportedMesh, read_mesh
+from octasplat.engine.files import ImportedMesh, read_mesh, read_metadata
 from octasplat.engine.operations.base import (
     Operation,
     Options,
@@ -107,15 +108,15 @@ def run(
     source: Path = request.source
     paths = expand_patterns(request.deformed)
     frames = SceneSequence("deform", request, paths, [request.proxy])
-    gaussians = open_scene(source, progress)
-    rest = read_mesh(request.proxy)
+    gaussians, origin = open_scene(source, progress), read_metadata(source).origin_world
+    rest = read_mesh(request.proxy).about(origin)
     corners = deformation_corners(gaussians)
     binding = _bind_scene(request, _proxy(request, rest), corners)
     moving, count = int(binding.moving_mask.sum()), len(gaussians)
     note = edit_note("deform", options_of(DeformOptions, request))
     reports, notes = [], [f"{request.proxy}: moves {moving:,} of {count:,} Gaussians."]
     for number, path in enumerate(paths):
-        vertices = _rotate_mesh(_check_same_mesh(path, request.proxy, rest), request.axes)
+        vertices = _rotate_mesh(_check_same_mesh(path, request.proxy, rest, origin), request.axes)
         result, report = deform_to(
             gaussians, corners, binding.deform(vertices), binding.mirrored_mask(vertices)
         )
@@ -159,8 +160,8 @@ def _bind_scene(request: DeformRequest, proxy: "Proxy", corners: Float64[np.ndar
     return binding
 
 
-def _check_same_mesh(path: Path, proxy: Path, rest: ImportedMesh) -> ImportedMesh:
-    mesh = read_mesh(path)
+def _check_same_mesh(path: Path, proxy: Path, rest: ImportedMesh, origin: Origin) -> ImportedMesh:
+    mesh = read_mesh(path).about(origin)
     if len(mesh) != len(rest) or not _has_same_faces(mesh, rest):
         raise SceneFileError(
             f"{path}: is not the mesh {proxy} with vertices moved; both need the same vertices and faces in "

@@ -68,7 +68,7 @@ def run(
         OctasplatError: something cannot be read, matched or written.
     """
     from octasplat.engine.edit.mesh_to_gaussians import recover_gaussians
-    from octasplat.engine.files import read_mesh
+    from octasplat.engine.files import read_mesh, read_metadata
     from octasplat.engine.operations.scene_io import edit_note, open_scene
     from octasplat.engine.operations.sequences import SceneSequence
 
@@ -76,11 +76,11 @@ def run(
     meshes = expand_patterns(request.meshes)
     recovery: MeshToGaussiansOptions = request
     frames = SceneSequence("edit", request, meshes)
-    gaussians = open_scene(source, progress)
+    gaussians, origin = open_scene(source, progress), read_metadata(source).origin_world
     note = edit_note("edit", options_of(EditOptions, request))
     reports, notes = [], []
     for number, path in enumerate(meshes):
-        result, report = recover_gaussians(gaussians, read_mesh(path), path, recovery)
+        result, report = recover_gaussians(gaussians, read_mesh(path).about(origin), path, recovery)
         if recovery.axes == "auto":  # all frames of a sequence came the same way
             recovery = recovery.model_copy(update={"axes": report.axes})
             _warn_about_axes(path, report, progress)

@@ -179,7 +179,7 @@ def run(
         ExportError: a file could not be written; the others were.
         OctasplatError: the scene cannot be read, or no format takes a name.
     """
-    from octasplat.engine.files import dropped_on_export
+    from octasplat.engine.files import dropped_on_export, read_metadata
     from octasplat.engine.files.export_batch import export_batch
     from octasplat.engine.gaussians.materials import require_materials
     from octasplat.engine.operations.scene_io import check_scenes, open_scene
@@ -197,7 +197,9 @@ def run(
     if request.materials:
         require_materials(gaussians, request.source)
     else:
-        for text in dropped_on_export(gaussians, list(request.files), request.format):
+        for text in dropped_on_export(
+            gaussians, list(request.files), request.format, facts=read_metadata(request.source)
+        ):
             progress(Warned(text))
 
     def step(done: int) -> None:

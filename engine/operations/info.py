@@ -10,6 +10,7 @@ import numpy as np
 from pydantic import Field, InstanceOf
 
 from octasplat.engine.core.events import EventListener, ignore_events
+from octasplat.engine.core.local_origin import NO_ORIGIN, describe_origin, is_set, user_position
 from octasplat.engine.evaluate.scene_statistics import (
     OPACITY_EDGES,
     QUANTILES,
@@ -60,6 +61,7 @@ class InfoResult(Result):
         size_bytes: of the file; None of a run.
         photographs: how many the run was made from; None of a file.
         up_world: the direction that points up; known of a run, a guess of a file.
+        origin_world: where the scene has its origin; positions of ``scene`` are about it.
         scene: counts, bounds and sizes of the Gaussians.
         hits: how many Gaussians the rays of the picture meet.
         picture_srgb: the scene from the place of the run's first photograph, or from a turntable; display
@@ -70,6 +72,7 @@ class InfoResult(Result):
     size_bytes: int | None
     photographs: int | None
     up_world: tuple[float, float, float]
+    origin_world: tuple[float, float, float] = NO_ORIGIN
     scene: InstanceOf[SceneStatistics]
     hits: InstanceOf[HitStatistics]
     picture_srgb: InstanceOf[np.ndarray] = Field(repr=False)
@@ -85,6 +88,7 @@ class InfoResult(Result):
             "source": str(self.source),
             "photographs": self.photographs,
             "up_world": list(self.up_world),
+            **({"origin_world": list(self.origin_world)} if is_set(self.origin_world) else {}),
             **scene,
             "opacity_edges": OPACITY_EDGES,
             "scale_quantiles_of": QUANTILES,
@@ -99,15 +103,20 @@ class InfoResult(Result):
         channels = ", ".join(f"{name} ({width})" for name, width in scene.channels.items())
         up = "of the photographs" if self.photographs else "as most files have it; --up says otherwise"
         quantiles = " / ".join(f"{value:.3g}" for value in scene.scale_quantiles)
-        box, solid = scene.box, scene.box_solid
+        box, solid, origin = scene.box, scene.box_solid, self.origin_world
+
+        def place(values: Any) -> str:
+            return user_position(np.asarray(values, np.float64), origin)
+
         return (
             f"{self.source}: {scene.count:,} Gaussians{size}{made_from}",
             f"  memory      {scene.megabytes:.1f} MB, harmonics of degree {scene.sh_degree}"
             + (f", channels {channels}" if channels else ""),
             f"  up          {_vector(self.up_world)} ({up})",
-            f"  centres     {_vector(box.low_world)} to {_vector(box.high_world)}",
-            f"  solid part  {_vector(solid.low_world)} to {_vector(solid.high_world)}",
-            f"  seen        around {_vector(scene.seen.centre_world)}, "
+            *((f"  origin      {describe_origin(origin)} (of what files hold)",) if is_set(origin) else ()),
+            f"  centres     {place(box.low_world)} to {place(box.high_world)}",
+            f"  solid part  {place(solid.low_world)} to {place(solid.high_world)}",
+            f"  seen        around {place(scene.seen.centre_world)}, "
             f"{2 * scene.seen.half_height:.3g} high, {2 * scene.seen.radius:.3g} across",
             f"  size        {quantiles} (larger deviation; 1, 10, 50, 90, 99 in 100)",
             f"  shape       {scene.flatness_median:.2g} (smaller over larger deviation, median)",
@@ -141,6 +150,7 @@ def run(
         OutputError: there is no scene yet, or a file cannot be written.
     """
     from octasplat.engine.core.writing import write_json
+    from octasplat.engine.files import read_metadata
     from octasplat.engine.operations.render_source import open_stage_scene
     from octasplat.engine.operations.scene_inspection import inspect_scene
     from octasplat.engine.operations.written_files import check_targets
@@ -159,6 +169,7 @@ def run(
         size_bytes=source.stat().st_size if source.is_file() else None,
         photographs=found.photographs,
         up_world=(x, y, z),
+        origin_world=read_metadata(source).origin_world,
         scene=found.scene,
         hits=found.hits,
         picture_srgb=found.picture_srgb,

@@ -77,18 +77,18 @@ def run(
     from octasplat.engine.edit.mask_selection import select_by_masks
     from octasplat.engine.edit.material_run import change_materials, edit_note, has_known_light
     from octasplat.engine.edit.selection import in_mesh, selection_mask
-    from octasplat.engine.files import read_mesh
+    from octasplat.engine.files import read_mesh, read_metadata
     from octasplat.engine.gaussians.materials import require_materials
     from octasplat.engine.operations.scene_io import check_changed, open_scene, write_changed
     from octasplat.engine.runs.run_folder import SCENE, is_run
 
     source, output = request.source, request.output
     check_changed("material", request, output, [request.mesh, *request.masks])
-    gaussians = open_scene(source, progress)
+    gaussians, origin = open_scene(source, progress), read_metadata(source).origin_world
     require_materials(gaussians, source / SCENE if is_run(source) else source)
-    chosen = selection_mask(gaussians, request.model_copy(update={"inverse": False}))
+    chosen = selection_mask(gaussians, request.model_copy(update={"inverse": False}), origin)
     if request.mesh is not None:
-        chosen &= in_mesh(gaussians, read_mesh(request.mesh), request.mesh)
+        chosen &= in_mesh(gaussians, read_mesh(request.mesh).about(origin), request.mesh)
     if request.masks:
         chosen &= select_by_masks(source, gaussians, request.masks)
     if request.inverse:

@@ -222,7 +222,13 @@ def _views(request: RelightRequest, source: "RenderSource") -> "tuple[Viewpoints
         assert source.viewpoints is not None, "views were asked for"
         return Viewpoints(source.viewpoints.views, source.viewpoints.cameras), shots
     max_side = request.max_side or source.max_side
-    others = load_dataset_model(request.other_dataset, max_side=max_side, min_views=1, for_training=False)
+    others = load_dataset_model(
+        request.other_dataset,
+        max_side=max_side,
+        min_views=1,
+        for_training=False,
+        origin_world=source.origin_world,
+    )
     shots = view_shots(others, np.arange(len(others.views)), source.near_world)
     return Viewpoints(others.views, others.cameras), shots
 

@@ -9,6 +9,7 @@ from jaxtyping import Float32
 
 from octasplat.engine.core.errors import ConfigError, OutputError
 from octasplat.engine.core.events import EventListener, Warned
+from octasplat.engine.core.local_origin import NO_ORIGIN, Origin, vertices_about
 from octasplat.engine.core.relative_paths import normalize_name
 from octasplat.engine.dataset.model import Viewpoints
 from octasplat.engine.dataset.views_file import SplitViewpoints
@@ -62,6 +63,8 @@ class RenderSource:
         trained_rad: angle of a pixel of the training.
         learnt: background that the run has learnt.
         photographs: where the photographs were taken from, at their full size, if that was asked for.
+        origin_world: where the scene has its origin in the coordinates of its user, see
+            :mod:`octasplat.engine.core.local_origin`.
     """
 
     gaussians: FlatGaussians
@@ -73,6 +76,7 @@ class RenderSource:
     trained_rad: float = 0.0
     learnt: LearnedBackground | None = None
     photographs: Viewpoints | None = None
+    origin_world: Origin = NO_ORIGIN
 
     @property
     def extent_world(self) -> float:
@@ -111,7 +115,13 @@ def read_render_source(
             )
         gaussians, facts = open_scene(source, progress), read_metadata(source)
         settings = TraceSettings(flip_normal_cos=facts.turned_beyond)
-        return RenderSource(gaussians, settings, facts.near_world, trained_rad=facts.pixel_rad)
+        return RenderSource(
+            gaussians,
+            settings,
+            facts.near_world,
+            trained_rad=facts.pixel_rad,
+            origin_world=facts.origin_world,
+        )
     config = read_config(source / CONFIG)
     if not (source / SCENE).exists():
         raise OutputError(
@@ -120,6 +130,7 @@ def read_render_source(
     viewpoints = run_viewpoints(source, scene=dataset, max_side=max_side)
     photographs = run_viewpoints(source, scene=dataset, max_side=ANY_SIDE_PX) if full_size else None
     learnt = run_background(source)
+    facts = read_metadata(source)
     return RenderSource(
         read_gaussian_ply(source / SCENE)[0],
         config.train.trace,
@@ -127,9 +138,10 @@ def read_render_source(
         config.evaluation_background,
         viewpoints,
         config.max_side,
-        read_metadata(source).pixel_rad,
+        facts.pixel_rad,
         learnt,
         photographs,
+        facts.origin_world,
     )
 
 
@@ -142,8 +154,10 @@ def requested_cameras(request: PictureRequest, source: RenderSource) -> tuple[Pi
     if request.mode == "views":
         return None
     if request.camera_path is not None:
-        found = path_cameras(request.camera_path, str(request.path_file or "of the options")).cameras
+        given = path_cameras(request.camera_path, str(request.path_file or "of the options")).cameras
+        found = _about_origin(given, source.origin_world)
     else:
+        origin = np.array(source.origin_world)
         lens = PinholeLens(
             request.width_px,
             request.height_px,
@@ -151,16 +165,35 @@ def requested_cameras(request: PictureRequest, source: RenderSource) -> tuple[Pi
         )
         orbit = Orbit(
             axis_named(request.up or "-y"),
-            None if request.look_at is None else np.array(request.look_at, dtype=np.float64),
+            None if request.look_at is None else np.array(request.look_at, dtype=np.float64) - origin,
             request.distance,
             request.elevation_degrees,
         )
         if request.camera is not None:
-            position = np.array(request.camera)
+            position = np.array(request.camera) - origin
             found = (single_camera(source.gaussians, source.viewpoints, lens, orbit, position),)
         else:
             found = orbit_cameras(source.gaussians, source.viewpoints, lens, orbit, request.frame_count)
     return tuple(replace(camera, near_world=source.near_world) for camera in found)
+
+
+def _about_origin(cameras: tuple[PinholeCamera, ...], origin: Origin) -> tuple[PinholeCamera, ...]:
+    """Return cameras of a path about the scene's origin; a path drawn on exported files is so already."""
+    centres = np.stack([camera.world_from_cam[:3, 3] for camera in cameras])
+    shifted = vertices_about(centres, origin) - centres
+    if not shifted.any():
+        return cameras
+    moved = []
+    for camera in cameras:
+        pose = np.array(camera.world_from_cam)
+        pose[:3, 3] -= np.array(origin)
+        moved.append(
+            PinholeCamera.from_pose(
+                pose, camera.width_px, camera.height_px,
+                fx_px=camera.fx_px, fy_px=camera.fy_px, cx_px=camera.cx_px, cy_px=camera.cy_px,
+            )
+        )  # fmt: skip
+    return tuple(moved)
 
 
 def requested_views(request: PictureRequest, source: RenderSource) -> tuple[Shot, ...]:

@@ -113,7 +113,7 @@ def write_scene(
         SceneFileError: it cannot be written.
     """
     if warn:
-        for text in dropped_on_export(gaussians, [target], None):
+        for text in dropped_on_export(gaussians, [target], facts=facts):
             progress(Warned(text))
     export_scene(gaussians, target, ExportOptions(facts=facts))
     what = exporter_for(target).description.partition(";")[0]

@@ -3,6 +3,7 @@
 import re
 import shutil
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
@@ -225,7 +226,7 @@ def run(
         SceneFileError: the scene cannot be read, or the mesh not be written.
         CancelledError: stopped as asked; nothing was written.
     """
-    from octasplat.engine.files import check_surface_path, surface_files, write_surface
+    from octasplat.engine.files import check_surface_path, read_metadata, surface_files, write_surface
     from octasplat.engine.gaussians.materials import require_materials
     from octasplat.engine.operations.scene_io import open_scene
     from octasplat.engine.operations.surface_inputs import depth_cameras
@@ -249,7 +250,7 @@ def run(
         raise OutputError(
             f"{source} holds no {SCENE} yet; finish the run with octasplat reconstruct --resume."
         )
-    gaussians = open_scene(source, progress)
+    gaussians, origin = open_scene(source, progress), read_metadata(source).origin_world
     features, frame, light = None, None, None
     if request.materials:
         require_materials(gaussians, source / SCENE if is_run(source) else source)
@@ -274,7 +275,7 @@ def run(
         should_stop=should_stop,
     )
     levels = tuple(
-        _level(surface, write_surface(surface.mesh, place))
+        _level(surface, write_surface(replace(surface.mesh, origin_world=origin), place))
         for surface, place in zip(surfaces, request.outputs, strict=True)
     )
     environment = None if light is None else _copy_light(light, output)

@@ -57,7 +57,7 @@ def depth_cameras(
     facts = read_metadata(source)
     settings = TraceSettings(flip_normal_cos=facts.turned_beyond)
     if dataset is not None:
-        photographs = load_dataset_model(dataset)
+        photographs = load_dataset_model(dataset, origin_world=facts.origin_world)
         every = np.arange(len(photographs.views))
         return photograph_cameras(photographs, every, side_px, facts.near_world), settings
     return cameras_around(gaussians, side_px), settings

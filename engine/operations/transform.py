@@ -1,6 +1,7 @@
 """``transform``: move, rotate and scale a scene."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -114,6 +115,7 @@ def run(
         ConfigError: the matrix cannot be read or flattens space.
         SceneFileError: the scene cannot be read or written.
     """
+    from octasplat.engine.core.local_origin import local_map, origin_after
     from octasplat.engine.files import read_metadata
     from octasplat.engine.gaussians.affine import mean_scale, transform_gaussians
     from octasplat.engine.operations.scene_io import check_changed, edit_note, open_scene, write_changed
@@ -121,7 +123,10 @@ def run(
     source: Path = request.source
     check_changed("transform", request, request.output, [request.matrix])
     matrix = request.world_map()
-    moved = transform_gaussians(open_scene(source, progress), matrix)
+    scene, facts = open_scene(source, progress), read_metadata(source)
+    origin = origin_after(matrix, scene.means_world, facts.origin_world)
+    local = local_map(matrix, facts.origin_world, origin)
+    moved = transform_gaussians(scene, local)
     stop_if(should_stop)
     rows = tuple(map(tuple, matrix.tolist()))
     written = write_changed(
@@ -130,8 +135,8 @@ def run(
         request.output,
         progress,
         note={**edit_note("transform", options_of(TransformOptions, request)), "world_map": rows},
-        facts=read_metadata(source).scaled(mean_scale(matrix)),
-        matrix=matrix,
+        facts=replace(facts.scaled(mean_scale(matrix)), origin_world=origin),
+        matrix=local,
     )
     return TransformResult(
         files=written.files, folder=written.folder, notes=(written.sentence,), matrix=rows, count=len(moved)

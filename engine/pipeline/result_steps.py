@@ -64,7 +64,7 @@ def _export(run: ReconstructionRun, names: list[str]) -> str | None:
         on_unknown=lambda text: progress(Warned(text)),
     )
     targets = [output / name for name in names]
-    for lost in dropped_on_export(gaussians, targets_with_known_format(targets)):
+    for lost in dropped_on_export(gaussians, targets_with_known_format(targets), facts=options.facts):
         progress(Warned(lost))
     _, failed = export_batch(
         targets,

@@ -67,6 +67,7 @@ class TrainStep:
                 near_world=dataset.near_world,
                 pixel_rad=training_pixel_angle(dataset.viewpoints),
                 turned_beyond=config.train.trace.flip_normal_cos,
+                origin_world=dataset.origin_world,
             )
             write_gaussian_ply(gaussians, run.output / SCENE, facts=facts)
 

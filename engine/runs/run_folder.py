@@ -8,6 +8,7 @@ import numpy as np
 
 from octasplat.engine.core.errors import ConfigError, DatasetError
 from octasplat.engine.core.events import EventListener, PhaseProgress, Warned
+from octasplat.engine.core.local_origin import Origin
 from octasplat.engine.dataset import Dataset, load_dataset_model
 from octasplat.engine.dataset.camera_clearance import CameraClearance
 from octasplat.engine.dataset.views_file import SplitViewpoints, ViewsRecord, read_views, scene_viewpoints
@@ -85,9 +86,22 @@ def run_viewpoints(
     if scene is None and (output / VIEWS).exists():
         return read_views(output / VIEWS).viewpoints(max_side)
     photographs = load_dataset_model(
-        photographs_folder(output, scene), max_side=max_side, model_folder=found_model_folder(output)
+        photographs_folder(output, scene),
+        max_side=max_side,
+        model_folder=found_model_folder(output),
+        origin_world=run_origin(output),
     )
     return scene_viewpoints(photographs, config.test_every, config.held_out)
+
+
+def run_origin(output: Path) -> Origin | None:
+    """Return the local origin of a run's scene, see :mod:`octasplat.engine.core.local_origin`.
+
+    None before the run has opened its photographs; zeros where coordinates are not large, and of runs of old.
+    """
+    if (output / SCENE).exists():
+        return read_metadata(output / SCENE).origin_world
+    return read_views(output / VIEWS).origin_world if (output / VIEWS).exists() else None
 
 
 def run_min_view_distance(output: Path, viewpoints: SplitViewpoints) -> float:
@@ -202,6 +216,7 @@ def open_run_dataset(
         model_folder=model_folder,
         accept=accept,
         near=config.train.near,
+        origin_world=run_origin(output),
         threads=threads,
         progress=lambda done, total: progress(PhaseProgress("load", done, total)),
     )

@@ -1,0 +1,117 @@
+"""A local origin for scenes whose coordinates are large against their size, as those of maps and the earth.
+
+Gaussians, rays and most files hold 32-bit numbers, of which a coordinate of five million metres leaves half
+a metre. Such scenes are kept about an origin of their own, and the origin in 64 bits beside them: what a user
+gives and reads is the sum of both. Scenes near the origin of their coordinates have none, i.e. zeros.
+"""
+
+import itertools
+
+import numpy as np
+from jaxtyping import Float, Float64
+
+Origin = tuple[float, float, float]
+NO_ORIGIN: Origin = (0.0, 0.0, 0.0)
+MAX_DISTANCE = 100.0
+"""A centre farther than so many extents asks for a local origin: 32 bits leave 1e-5 of the extent there."""
+
+
+def choose_origin(centre: Float[np.ndarray, "3"], extent: float) -> Origin:
+    """Return the local origin of a scene, zeros where its coordinates are not large.
+
+    The origin is a round number near the centre, so that it can be copied by hand.
+
+    Args:
+        centre: of the scene.
+        extent: its radius.
+
+    >>> choose_origin(np.array([512345.6, 5403210.9, 310.2]), 24.0)
+    (512350.0, 5403210.0, 310.0)
+    >>> choose_origin(np.array([20.0, 3.0, 1.0]), 24.0)
+    (0.0, 0.0, 0.0)
+    """
+    if not (np.isfinite(centre).all() and extent > 0 and np.linalg.norm(centre) > MAX_DISTANCE * extent):
+        return NO_ORIGIN
+    step = 10.0 ** np.floor(np.log10(extent))
+    x, y, z = (np.rint(np.asarray(centre, np.float64) / step) * step).tolist()
+    return (x, y, z)
+
+
+def origin_of_points(points: Float[np.ndarray, "n 3"]) -> Origin:
+    """Return the local origin for points, by their median and the median of their distances to it."""
+    if len(points) == 0:
+        return NO_ORIGIN
+    centre = np.median(np.asarray(points, np.float64), axis=0)
+    return choose_origin(centre, float(np.median(np.linalg.norm(points - centre, axis=1))))
+
+
+def is_set(origin: Origin) -> bool:
+    """Return whether there is a local origin."""
+    return any(value != 0.0 for value in origin)
+
+
+def describe_origin(origin: Origin) -> str:
+    """Return the coordinates of an origin in text, every digit."""
+    return " ".join(f"{value:.15g}" for value in origin)
+
+
+def user_position(position: Float[np.ndarray, "3"], origin: Origin) -> str:
+    """Return a position about an origin in the coordinates of the user, in text."""
+    if not is_set(origin):
+        return " ".join(f"{value:.4g}" for value in position)
+    return " ".join(f"{value + start:.11g}" for value, start in zip(position.tolist(), origin, strict=True))
+
+
+def vertices_about(vertices: Float64[np.ndarray, "v 3"], origin: Origin) -> Float64[np.ndarray, "v 3"]:
+    """Return vertices of a file about a local origin, whichever of both the file has them about.
+
+    Programs apply the transform of a file's root node or leave it out, and turn axes. As the origin is far
+    from the scene, the vertices themselves show which is the case.
+
+    Args:
+        vertices: as a file gives them, along whatever axes.
+        origin: of the scene that they belong to.
+    """
+    if not is_set(origin) or len(vertices) == 0:
+        return vertices
+    centre = np.median(vertices, axis=0)
+    values = np.array(origin)
+    turned = [
+        np.array(signs) * values[list(order)]
+        for order in itertools.permutations(range(3))
+        for signs in itertools.product((1.0, -1.0), repeat=3)
+    ]
+    nearest = min(turned, key=lambda candidate: float(np.linalg.norm(centre - candidate)))
+    is_far = np.linalg.norm(centre - nearest) < np.linalg.norm(centre) / 2
+    return vertices - nearest if is_far else vertices
+
+
+def local_map(
+    matrix: Float[np.ndarray, "4 4"], origin: Origin, new_origin: Origin
+) -> Float64[np.ndarray, "4 4"]:
+    """Return an affine map of user coordinates as one from points about ``origin`` to those about another."""
+    local = np.array(matrix, np.float64)
+    local[:3, 3] += local[:3, :3] @ np.array(origin) - np.array(new_origin)
+    return local
+
+
+def origin_after(
+    matrix: Float[np.ndarray, "4 4"], points: Float[np.ndarray, "n 3"], origin: Origin
+) -> Origin:
+    """Return the local origin of points after an affine map of user coordinates.
+
+    Args:
+        matrix: the map.
+        points: about ``origin``.
+        origin: the local origin before.
+    """
+    linear = np.asarray(matrix, np.float64)[:3, :3]
+    carried = linear @ np.array(origin) + matrix[:3, 3]
+    moved = np.asarray(points, np.float64) @ linear.T
+    centre = np.median(moved, axis=0)
+    extent = float(np.median(np.linalg.norm(moved - centre, axis=1)))
+    chosen = choose_origin(centre + carried, extent)
+    if is_set(chosen) and is_set(origin) and np.linalg.norm(centre) <= MAX_DISTANCE * extent:
+        x, y, z = carried.tolist()
+        return (x, y, z)  # points keep their local coordinates
+    return chosen
