@@ -11,6 +11,7 @@ from octasplat.engine.files.export_options import ExportOptions
 from octasplat.engine.files.gaussian_ply import origin_comments
 from octasplat.engine.files.kd_split import kd_order
 from octasplat.engine.files.ply_container import PlyWriteElement, write_ply
+from octasplat.engine.files.range_losses import find_harmonic_losses, find_position_losses
 from octasplat.engine.files.registry import Exporter, register
 from octasplat.engine.files.splat_rows import select_for_export
 from octasplat.engine.gaussians.model import FLAT_SCALE, SH_C0, FlatGaussians
@@ -61,6 +62,20 @@ def write(gaussians: FlatGaussians, path: Path, options: ExportOptions) -> tuple
     return (path,)
 
 
+def _find_losses(scene: FlatGaussians) -> tuple[str, ...]:
+    if len(scene) == 0 or not scene.is_finite():
+        return ()  # which is refused
+    order = kd_order(scene.means_world, CHUNK_SIZE)
+    low, high = _bounds(scene.means_world[order].astype(np.float64))
+    steps = ((high - low) / [2047.0, 1023.0, 2047.0]).max(axis=1)
+    step_world = np.empty(len(scene))
+    step_world[order] = steps[np.arange(len(scene)) // CHUNK_SIZE]
+    return (
+        *find_position_losses("compressed-ply", scene, step_world),
+        *find_harmonic_losses("compressed-ply", scene, SH_RANGE / 2),
+    )
+
+
 _PACKED_WORDS = ("position", "rotation", "scale", "color")
 
 
@@ -101,5 +116,6 @@ register(
         write,
         holds_harmonics=True,
         holds_origin=True,
+        find_losses=_find_losses,
     )
 )

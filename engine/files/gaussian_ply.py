@@ -36,6 +36,12 @@ from octasplat.engine.files.ply_container import (
     read_ply_header,
     write_ply,
 )
+from octasplat.engine.files.ply_dialects import (
+    UNUSED_SCALE_MESSAGE,
+    has_unused_third_scale,
+    ignored_properties_message,
+    refuse_anchors,
+)
 from octasplat.engine.files.registry import Exporter, Importer, register
 from octasplat.engine.files.splat_rows import select_for_export
 from octasplat.engine.gaussians.channels import Channels, column_names, stack_channels
@@ -60,6 +66,8 @@ _POSITION = ("x", "y", "z")
 _NORMAL = ("nx", "ny", "nz")
 _SH_DC = ("f_dc_0", "f_dc_1", "f_dc_2")
 _CHANNEL = "octasplat_channel"
+_POINT_COLOURS = ("red", "green", "blue", "alpha")
+"""Beside the harmonics, for viewers of points: they say nothing more."""
 _ROTATION = ("rot_0", "rot_1", "rot_2", "rot_3")
 
 
@@ -237,6 +245,13 @@ def read_ply_cloud(
         channels=named,
         normal_axis=_normal_axis(dialect, scale_count),
     )
+    used = {*_POSITION, *_NORMAL, *_ROTATION, *_SH_DC, "opacity", _FILTER, *_scale_names(scale_count)}
+    used |= {*_POINT_COLOURS, *(column for own in found.values() for column in own)}
+    ignored = [name for name in vertex.names if name not in used and not name.startswith("f_rest_")]
+    if ignored:
+        cloud = replace(cloud, notes=(*cloud.notes, ignored_properties_message(ignored)))
+    if dialect == "3dgs" and scale_count == 3 and has_unused_third_scale(cloud.log_scales):
+        cloud = replace(cloud, normal_axis=2, notes=(*cloud.notes, UNUSED_SCALE_MESSAGE))
     if dialect == "3dgs" and scale_count == 2:
         cloud = replace(cloud, notes=(*cloud.notes, _FLAT_DIALECT_MESSAGE))
     return _with_mip_filter(cloud, columns(table, [_FILTER])[:, 0]) if _FILTER in vertex.names else cloud
@@ -304,6 +319,7 @@ def _check_properties(path: Path, vertex: PlyElement) -> tuple[int, int]:
     scale_count = 3 if "scale_2" in names else 2
     needed = [*_POSITION, *_SH_DC, "opacity", *_scale_names(scale_count), *_ROTATION]
     missing = [name for name in needed if name not in names]
+    refuse_anchors(path, names)
     if missing:
         raise SceneFileError(
             f"{path}: is not a PLY of Gaussians; it lacks the property {', '.join(missing)}."

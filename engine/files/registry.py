@@ -65,6 +65,7 @@ class Exporter(Entry):
         holds_harmonics: whether colours may change with the direction.
         holds_origin: whether it says where a scene of large coordinates has its origin.
         beside: names the files that are written beside the path, if there are any.
+        find_losses: returns what of a scene lies beyond the ranges of the format, one sentence a loss.
     """
 
     noun: ClassVar[str] = "export"
@@ -75,6 +76,7 @@ class Exporter(Entry):
     holds_harmonics: bool = False
     holds_origin: bool = False
     beside: Callable[[Path], tuple[Path, ...]] = no_files
+    find_losses: Callable[[FlatGaussians], tuple[str, ...]] = lambda _scene: ()
 
 
 @dataclass(frozen=True)

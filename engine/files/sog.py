@@ -20,6 +20,7 @@ from octasplat.engine.core.writing import atomic_replace
 from octasplat.engine.files.encodings import SQRT_HALF, from_smallest_three, logits_from_bytes
 from octasplat.engine.files.export_options import ExportOptions
 from octasplat.engine.files.gaussian_ply import write_gaussian_ply
+from octasplat.engine.files.range_losses import find_position_losses
 from octasplat.engine.files.registry import Exporter, Importer, register
 from octasplat.engine.files.splat_rows import select_for_export
 from octasplat.engine.files.splat_transform import convert, missing_converter
@@ -261,6 +262,15 @@ def write(gaussians: FlatGaussians, path: Path, options: ExportOptions) -> tuple
     return (path,)
 
 
+def _find_losses(scene: FlatGaussians) -> tuple[str, ...]:
+    if len(scene) == 0 or not scene.is_finite():
+        return ()  # which is refused
+    means = scene.means_world.astype(np.float64)
+    curved = np.sign(means) * np.log1p(np.abs(means))
+    step = np.ptp(curved, axis=0) / 65535.0
+    return find_position_losses("sog", scene, ((1.0 + np.abs(means)) * step).max(axis=1))
+
+
 def _recognises(head: bytes) -> bool:
     return head.startswith(b"PK\x03\x04")
 
@@ -282,5 +292,6 @@ register(
         write,
         missing_converter,
         holds_harmonics=True,
+        find_losses=_find_losses,
     )
 )

@@ -21,6 +21,11 @@ from octasplat.engine.files.encodings import (
     smallest_three,
 )
 from octasplat.engine.files.export_options import ExportOptions
+from octasplat.engine.files.range_losses import (
+    find_harmonic_losses,
+    find_position_losses,
+    find_size_losses,
+)
 from octasplat.engine.files.registry import Exporter, Importer, register
 from octasplat.engine.files.splat_rows import iterate_blocks, select_for_export
 from octasplat.engine.files.spz_container import ANTIALIASED, GZIP_MAGIC, MAGIC, SpzFile, read_spz, write_spz
@@ -103,7 +108,12 @@ def write(gaussians: FlatGaussians, path: Path, options: ExportOptions) -> tuple
         OSError: the file cannot be written.
     """
     scene = select_for_export(gaussians, path, options)
-    bits = _fractional_bits(scene, path)
+    if _fitting_bits(scene) < 0:
+        farthest = float(np.abs(scene.means_world).max())
+        raise SceneFileError(
+            f"{path}: not written; SPZ holds positions up to {2**23 - 1} units, one lies at {farthest:.3g}."
+        )
+    bits = _fractional_bits(scene)
     streams = [bytearray() for _ in range(6)]
     for block in iterate_blocks(scene):
         for stream, data in zip(streams, _pack_block(half_turn_gaussians(block), bits), strict=True):
@@ -128,16 +138,28 @@ def _pack_block(scene: FlatGaussians, bits: int) -> tuple[bytes, ...]:
     )
 
 
-def _fractional_bits(scene: FlatGaussians, path: Path) -> int:
+def _fitting_bits(scene: FlatGaussians) -> int:
+    """Return how many fractional bits the farthest position leaves; negative where it has no room."""
     largest = float(np.abs(scene.means_world).max())
-    fits = int(np.floor(np.log2((2**23 - 1) / max(largest, 1.0 / 256.0))))
-    if fits < 0:
-        raise SceneFileError(
-            f"{path}: not written; SPZ holds positions up to {2**23 - 1} units, one lies at {largest:.3g}."
-        )
+    return int(np.floor(np.log2((2**23 - 1) / max(largest, 1.0 / 256.0))))
+
+
+def _fractional_bits(scene: FlatGaussians) -> int:
     small = float(np.quantile(scene.log_scales.min(axis=1).astype(np.float64), SMALL_QUANTILE))
     wanted = int(np.ceil(np.log2(STEPS_PER_SIGMA) - small / np.log(2.0)))
-    return min(max(wanted, FRACTIONAL_BITS), fits, 23)
+    return min(max(wanted, FRACTIONAL_BITS), _fitting_bits(scene), 23)
+
+
+def _find_losses(scene: FlatGaussians) -> tuple[str, ...]:
+    if len(scene) == 0 or not scene.is_finite() or _fitting_bits(scene) < 0:
+        return ()  # which is refused
+    half = 0.5 / LOG_SCALE_STEPS
+    largest = 255.0 / LOG_SCALE_STEPS - LOG_SCALE_OFFSET
+    return (
+        *find_size_losses("spz", scene, -LOG_SCALE_OFFSET - half, largest + half),
+        *find_position_losses("spz", scene, 2.0 ** -_fractional_bits(scene)),
+        *find_harmonic_losses("spz", scene, 1.0),
+    )
 
 
 def _pack_positions(steps: Float[np.ndarray, "n 3"]) -> bytes:
@@ -174,5 +196,6 @@ register(
         "SPZ of Niantic, 15 bytes a Gaussian, for web viewers",
         write,
         holds_harmonics=True,
+        find_losses=_find_losses,
     )
 )

@@ -73,6 +73,8 @@ def dropped_on_export(
             f"{_format_list_text(without, 'has', 'have')} no place for the origin of large coordinates; add "
             f"{describe_origin(facts.origin_world)} to its positions."
         )
+    for exporter in chosen.values():
+        lines += exporter.find_losses(gaussians)
     return tuple(lines)
 
 

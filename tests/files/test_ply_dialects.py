@@ -96,3 +96,81 @@ def test_invalid_harmonics_count_is_refused(tmp_path: Path) -> None:
     path = write_disc(tmp_path / "a.ply", [NORMAL, FIRST, SECOND], [1e-5, *SIGMAS], rest=30)
     with pytest.raises(SceneFileError, match="30 f_rest"):
         read_scene(path)
+
+
+def write_rows(path: Path, log_scales: np.ndarray, **more: np.ndarray) -> Path:
+    """Write a PLY of Gaussians with these scales and everything else alike."""
+    count = len(log_scales)
+    random = np.random.default_rng(11)
+    row = {name: random.standard_normal(count) for name in ("x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2")}
+    row |= {"opacity": np.ones(count)} | {f"scale_{k}": log_scales[:, k] for k in range(3)}
+    row |= {f"rot_{k}": random.standard_normal(count) for k in range(4)} | more
+    table = np.empty(count, dtype=[(name, "<f4") for name in row])
+    for name, values in row.items():
+        table[name] = values
+    write_ply(path, [PlyWriteElement("vertex", count, table.dtype, [table])])
+    return path
+
+
+def split_and_cloned(count: int) -> np.ndarray:
+    """Third scales of gsplat's 2DGS: those of few first points, copied, and divided by 1.6 where split."""
+    random = np.random.default_rng(12)
+    first = random.uniform(-4, -2, count // 4)
+    return random.choice(first, count) - np.log(1.6) * random.integers(0, 2, count)
+
+
+def test_2dgs_of_gsplat_is_known_by_its_untrained_third_scale(tmp_path: Path) -> None:
+    scales = np.random.default_rng(1).uniform(-5, -1, (1000, 3))
+    scales[:, 2] = split_and_cloned(1000)
+    path = write_rows(tmp_path / "a.ply", scales)
+    scene, report = read_scene(path)
+    named, _ = read_scene(path, "2dgs")
+    np.testing.assert_array_equal(scene.quats_wxyz, named.quats_wxyz)
+    np.testing.assert_array_equal(scene.log_scales, scales[:, :2].astype(np.float32))
+    assert any("gsplat's 2DGS" in note for note in report.notes)
+
+
+@pytest.mark.parametrize("kind", ["3dgs", "one thickness", "few bits", "few Gaussians"])
+def test_3dgs_scales_are_not_taken_for_2dgs_of_gsplat(tmp_path: Path, kind: str) -> None:
+    scales = np.random.default_rng(1).uniform(-5, -1, (1000, 3))
+    if kind == "one thickness":
+        scales[:, 2] = np.log(1e-6)
+    elif kind == "few bits":
+        scales = np.rint(scales * 16) / 16
+    elif kind == "few Gaussians":
+        scales = scales[:100]
+        scales[:, 2] = split_and_cloned(100)
+    scene, report = read_scene(write_rows(tmp_path / "a.ply", scales))
+    assert not any("gsplat" in note for note in report.notes)
+    np.testing.assert_allclose(np.sort(scene.log_scales), np.sort(scales)[:, 1:], atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("names", "told"),
+    [
+        (
+            ("trbf_center", "trbf_scale", "motion_0", "motion_1"),
+            "trbf_center, trbf_scale, motion mean nothing",
+        ),
+        (("beta",), "properties beta mean nothing"),
+        (("scale_t", "rot_r_0", "rot_r_1"), "properties scale_t, rot_r mean nothing"),
+        (tuple(f"ins_feat_{k}" for k in range(16)), "properties ins_feat mean nothing"),
+        (("albedo_0", "albedo_1", "albedo_2", "roughness", "metallic"), "albedo, roughness, metallic mean"),
+    ],
+)
+def test_properties_of_other_programs_are_named_when_left_out(
+    tmp_path: Path, names: tuple[str, ...], told: str
+) -> None:
+    scales = np.random.default_rng(1).uniform(-5, -1, (20, 3))
+    path = write_rows(tmp_path / "a.ply", scales, **{name: np.full(20, 0.5) for name in names})
+    assert told in " ".join(read_scene(path)[1].notes)
+    kept, report = read_scene(path, channels="all")
+    assert kept.channels and not any("mean nothing" in note for note in report.notes)
+
+
+@pytest.mark.parametrize("name", ["f_anchor_feat_0", "f_offset_0"])
+def test_anchors_of_scaffold_gs_are_refused_by_name(tmp_path: Path, name: str) -> None:
+    scales = np.zeros((5, 3))
+    path = write_rows(tmp_path / "a.ply", scales, **{name: np.zeros(5)})
+    with pytest.raises(SceneFileError, match="anchors of Scaffold-GS"):
+        read_scene(path)

@@ -1,0 +1,84 @@
+"""What formats of few bits cannot hold of a scene: sizes, positions and colours beyond their ranges.
+
+Each format says in a function of its own what it loses; this module counts and words it, one sentence a loss.
+"""
+
+import math
+
+import numpy as np
+from jaxtyping import Float
+
+from octasplat.engine.gaussians.model import FlatGaussians
+
+MIN_TOLD_FRACTION = 1e-3
+"""Losses of fewer Gaussians than this fraction are not told; those that are too large always are."""
+
+
+def find_size_losses(
+    format_name: str, scene: FlatGaussians, min_log_scale: float, max_log_scale: float
+) -> tuple[str, ...]:
+    """Return what becomes of Gaussians whose standard deviations a format clips.
+
+    Args:
+        format_name: of the format.
+        scene: what is written.
+        min_log_scale: ln of the least deviation that it holds.
+        max_log_scale: ln of the largest.
+    """
+    log_scales = scene.log_scales.astype(np.float64)
+    large = int((log_scales > max_log_scale).any(axis=1).sum())
+    small = int((log_scales < min_log_scale).any(axis=1).sum())
+    if not large and small < MIN_TOLD_FRACTION * len(scene):
+        return ()
+    low, high = float(log_scales.min()), float(log_scales.max())
+    advice = ""
+    if high - low < max_log_scale - min_log_scale:
+        # A power of ten where one fits, so that units stay easy to tell.
+        least, most = (min_log_scale - low) / math.log(10), (max_log_scale - high) / math.log(10)
+        power = math.floor(most) if large else math.ceil(least)
+        exponent = float(power) if least <= power <= most else (least + most) / 2
+        advice = f"; octasplat transform --scale {10.0**exponent:.3g} makes all of them fit"
+    return (
+        f"The format {format_name} holds sizes from {math.exp(min_log_scale):.2g} to "
+        f"{math.exp(max_log_scale):.3g} units; {large + small:,} of {len(scene):,} Gaussians do not fit and "
+        f"will be clipped{advice}.",
+    )
+
+
+def find_position_losses(
+    format_name: str,
+    scene: FlatGaussians,
+    step_world: Float[np.ndarray, " n"] | float,
+) -> tuple[str, ...]:
+    """Return what becomes of Gaussians that are smaller than the steps in which a format holds positions.
+
+    Args:
+        format_name: of the format.
+        scene: what is written.
+        step_world: step of each position, world units.
+    """
+    coarse = int((step_world > np.exp(scene.log_scales.astype(np.float64)).max(axis=1)).sum())
+    if coarse < max(1.0, MIN_TOLD_FRACTION * len(scene)):
+        return ()
+    return (
+        f"The format {format_name} holds positions in steps of {float(np.median(step_world)):.2g} "
+        f"units here, which is more than the size of {coarse:,} of {len(scene):,} Gaussians; "
+        "crop what lies far away (octasplat crop), or move the scene to the origin (octasplat transform --translate).",
+    )
+
+
+def find_harmonic_losses(format_name: str, scene: FlatGaussians, limit: float) -> tuple[str, ...]:
+    """Return what becomes of view-dependent colours beyond the coefficients that a format holds.
+
+    Args:
+        format_name: of the format.
+        scene: what is written.
+        limit: the largest absolute value of a coefficient of degree 1 and above.
+    """
+    clipped = int((np.abs(scene.sh[:, 1:]) > limit).any(axis=(1, 2)).sum())
+    if clipped < max(1.0, MIN_TOLD_FRACTION * len(scene)):
+        return ()
+    return (
+        f"The format {format_name} holds coefficients of view-dependent colours up to {limit:g}; those of "
+        f"{clipped:,} of {len(scene):,} Gaussians are larger and will be clipped.",
+    )
