@@ -15,7 +15,7 @@ known, too; or names."""
 def select_channel_columns(
     path: Path, declared: Mapping[str, tuple[str, ...]], columns: Iterable[str], choice: ChannelChoice
 ) -> dict[str, tuple[str, ...]]:
-    """The columns of each channel that is wanted, by the channel's name.
+    """Return the columns of each channel that is wanted, by the channel's name.
 
     Args:
         path: named in errors.

@@ -45,7 +45,7 @@ def unit_quats(quats: Float[np.ndarray, "n 4"]) -> Float[np.ndarray, "n 4"]:
 def from_smallest_three(
     small: Float[np.ndarray, "n 3"], largest: Int[np.ndarray, " n"]
 ) -> Float32[np.ndarray, "n 4"]:
-    """Unit quaternions from all components but the largest, which is positive.
+    """Return unit quaternions from all components but the largest, which is positive.
 
     Args:
         small: the other three, in their order.
@@ -62,7 +62,7 @@ def from_smallest_three(
 def smallest_three(
     quats: Float[np.ndarray, "n 4"],
 ) -> tuple[Float[np.ndarray, "n 3"], Int[np.ndarray, " n"]]:
-    """The way back: unit quaternions, their sign chosen so that the largest component is positive."""
+    """Return unit quaternions as the three smallest components and the place of the largest."""
     unit = unit_quats(quats)
     largest = np.argmax(np.abs(unit), axis=1)
     unit *= np.where(np.take_along_axis(unit, largest[:, None], axis=1) < 0, -1.0, 1.0)
@@ -89,7 +89,7 @@ def half_turn_points(points: Float32[np.ndarray, "n 3"]) -> Float32[np.ndarray, 
 
 
 def half_turn_gaussians(gaussians: FlatGaussians) -> FlatGaussians:
-    """The scene turned by 180 degrees about x: from y down, z forward to y up, z backward, and back.
+    """Return the scene turned by 180 degrees about x: from y down, z forward to y up, z backward, and back.
 
     Only signs change, so doing it twice gives the same bits.
     """

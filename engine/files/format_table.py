@@ -62,7 +62,7 @@ class FormatTable:
         return tuple(sorted(found, key=lambda entry: entry.name))
 
     def get(self, kind: type[E], name: str, path: Path) -> E:
-        """The entry of that class and name.
+        """Return the entry of that class and name.
 
         Raises:
             SceneFileError: there is none; the text names ``path`` and lists those that exist.
@@ -74,7 +74,7 @@ class FormatTable:
         return by_name[name]
 
     def by_file_name(self, kind: type[E], path: Path) -> E | None:
-        """The entry that takes this file name, or None; upper and lower case are the same."""
+        """Return the entry that takes this file name, or None; upper and lower case are the same."""
         matches = [
             (sum(character not in "*?" for character in pattern), entry)
             for entry in self.entries(kind)
@@ -88,6 +88,6 @@ class FormatTable:
         return "; ".join(f"{entry.name} ({', '.join(entry.patterns)})" for entry in self.entries(kind))
 
     def suffixes(self, kind: type[E]) -> str:
-        """The suffixes that entries take, as in ".glb, .ply or .obj"."""
+        """Return the suffixes that entries take, as in ".glb, .ply or .obj"."""
         found = [pattern.lstrip("*") for entry in self.entries(kind) for pattern in entry.patterns]
         return " or ".join([", ".join(found[:-1]), found[-1]] if len(found) > 1 else found)

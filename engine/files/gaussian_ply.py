@@ -106,7 +106,7 @@ def write_gaussian_ply(
 
 
 def read_ply_metadata(path: Path) -> SceneMetadata:
-    """What a file says of its scene as a whole.
+    """Return what a file says of its scene as a whole.
 
     Raises:
         SceneFileError: the file is damaged, or says something that is no number.
@@ -201,7 +201,7 @@ def read_gaussian_ply(
 def read_ply_cloud(
     path: Path, channels: ChannelChoice = "own", dialect: PlyDialect = "3dgs"
 ) -> GaussianCloud:
-    """The Gaussians of a PLY as they are in the file, found by property name.
+    """Return the Gaussians of a PLY as they are in the file, found by property name.
 
     Args:
         path: the file.
@@ -290,7 +290,7 @@ def _with_mip_filter(cloud: GaussianCloud, deviations: Float32[np.ndarray, " n"]
 
 
 def declared_channels(comments: Sequence[str]) -> dict[str, tuple[str, ...]]:
-    """The channels that a PLY's comments name, with their properties."""
+    """Return the channels that a PLY's comments name, with their properties."""
     found = (comment.split() for comment in comments)
     return {
         words[1]: column_names(words[1], int(words[2]))

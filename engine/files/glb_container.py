@@ -84,7 +84,7 @@ class GlbFile:
         self.document: dict[str, Any] = document
 
     def array(self, number: int, dtype: DTypeLike) -> np.ndarray:
-        """The rows of an accessor as ``dtype``, copied; normalised integers become numbers in [-1, 1].
+        """Return the rows of an accessor as ``dtype``, copied; normalised integers become numbers in [-1, 1].
 
         Raises:
             KeyError, IndexError, TypeError, ValueError: the document does not describe it, or it is stored in
@@ -106,7 +106,7 @@ class GlbFile:
         return values.astype(dtype)
 
     def view_bytes(self, number: int) -> bytes:
-        """The bytes of a buffer view.
+        """Return the bytes of a buffer view.
 
         Raises:
             KeyError, IndexError, TypeError, ValueError: the document does not describe it, or it is cut.
@@ -207,7 +207,7 @@ def _node_matrix(node: dict[str, Any]) -> Float64[np.ndarray, "4 4"]:
 
 
 def light_rotation(light_frame: Float64[np.ndarray, "3 3"]) -> list[float]:
-    """The rotation of a root node (x, y, z, w) for what is lit.
+    """Return the rotation of a root node (x, y, z, w) for what is lit.
 
     It brings the light's up to y and its forward to x, which is how viewers and Blender lay environments.
 
@@ -224,7 +224,7 @@ def pad_to_four(length: int) -> int:
 
 
 def accessor_json(view: int, component: int, count: int, kind: str) -> dict[str, object]:
-    """The description of an array: all of buffer view ``view``, ``count`` items of type ``kind``."""
+    """Return the description of an array: all of buffer view ``view``, ``count`` items of type ``kind``."""
     return {"bufferView": view, "componentType": component, "count": count, "type": kind}
 
 
@@ -251,7 +251,7 @@ class ChannelAttribute:
 
 
 def channel_attributes(widths: Mapping[str, int], widest: int = 4) -> tuple[ChannelAttribute, ...]:
-    """The attributes that hold channels: a vector for up to ``widest`` numbers, else one scalar a number.
+    """Return the attributes that hold channels: a vector up to ``widest`` numbers, else one scalar a number.
 
     Meshes have scalars alone: Blender 5 opens none whose own attributes differ in width.
     """
@@ -268,12 +268,12 @@ def channel_attributes(widths: Mapping[str, int], widest: int = 4) -> tuple[Chan
 
 
 def channel_extras(widths: Mapping[str, int]) -> dict[str, object]:
-    """What the ``extras`` of a file say of its channels: their names and widths."""
+    """Return what the ``extras`` of a file say of its channels: their names and widths."""
     return {CHANNELS: dict(widths)} if widths else {}
 
 
 def declared_channel_attributes(document: Mapping[str, Any]) -> dict[str, tuple[str, ...]]:
-    """The channels that a file's ``extras`` name, with their attributes in lower case, without the _."""
+    """Return the channels that a file's ``extras`` name, with their attributes in lower case without _."""
     found = document.get("asset", {}).get("extras", {}).get(CHANNELS, {})
     columns: dict[str, list[str]] = {}
     for attribute in channel_attributes({name: int(width) for name, width in found.items() if width > 0}):
@@ -282,7 +282,7 @@ def declared_channel_attributes(document: Mapping[str, Any]) -> dict[str, tuple[
 
 
 def json_bytes(document: dict[str, object]) -> bytes:
-    """A document as it stands in the file, without what fills it up to four bytes."""
+    """Return a document as it stands in the file, without what fills it up to four bytes."""
     return json.dumps(document, separators=(",", ":"), allow_nan=False).encode()
 
 
@@ -292,7 +292,7 @@ def glb_size(json_room: int, length: int) -> int:
 
 
 def too_large_error(path: Path, subject: str, total: int, advice: str) -> SceneFileError:
-    """The error for a file beyond ``MAX_BYTES``; ``subject`` says what needs so much, verb included."""
+    """Return the error for a file beyond ``MAX_BYTES``; ``subject`` says what needs it, verb included."""
     return SceneFileError(
         f"{path}: not written; {subject} {total / 2**30:.1f} GiB, and a GLB holds at most 4. {advice}"
     )

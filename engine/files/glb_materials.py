@@ -111,7 +111,7 @@ class _MaterialReader:
         return red, green, blue
 
     def _unsupported_features(self) -> tuple[str, ...]:
-        """What is not understood, in words."""
+        """Return what is not understood, in words."""
         material = self._material
         found = [
             name if "_" in name and name[:3].isupper() else f"KHR_materials_{name}"

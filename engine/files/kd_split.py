@@ -7,7 +7,7 @@ MIN_CHUNK_SIZE = 256
 
 
 def kd_split(points_world: Float[np.ndarray, "n 3"], max_chunks: int) -> list[Int[np.ndarray, "_"]]:
-    """Indices of ``points_world`` in spatially compact chunks of equal size (give or take one point).
+    """Return indices of ``points_world`` in spatially compact chunks of equal size (give or take one point).
 
     Each part is halved at the median along the axis on which it spreads most, while there may be twice as
     many chunks and none falls below ``MIN_CHUNK_SIZE`` points. Within a chunk the order is ascending.

@@ -97,7 +97,7 @@ def _read_channel(
 
 
 def _read_cloud(file: GlbFile, attributes: dict[str, int], splats: dict[str, Any]) -> GaussianCloud:
-    """The Gaussians of a primitive, in its own frame."""
+    """Return the Gaussians of a primitive, in its own frame."""
     xyzw = file.array(attributes[f"{EXTENSION}:ROTATION"], np.float32)
     sh = _harmonics(file, attributes)
     notes: tuple[str, ...] = ()
@@ -137,7 +137,7 @@ def _harmonics(file: GlbFile, attributes: dict[str, int]) -> Float32[np.ndarray,
 
 
 def _to_world(path: Path, cloud: GaussianCloud, matrix: Float64[np.ndarray, "4 4"]) -> GaussianCloud:
-    """The cloud in the world frame: its node's transform, then the half turn to y down."""
+    """Return the cloud in the world frame: its node's transform, then the half turn to y down."""
     if not np.array_equal(matrix, np.eye(4)):
         cloud = _apply_node_transform(path, cloud, matrix)
     return replace(
@@ -197,7 +197,7 @@ class _Attribute:
 
 
 def _colours(some: FlatGaussians) -> np.ndarray:
-    """The fallback of readers that see points only: linear RGB of the constant harmonic, and opacity."""
+    """Return the fallback of readers of points: linear RGB of the constant harmonic, and opacity."""
     linear = srgb_to_linear(np.clip(some.base_rgb_srgb, 0.0, 1.0))
     return round_to_bytes(
         np.concatenate([linear, some.opacities[:, None]], axis=1).astype(np.float64) * 255.0

@@ -73,7 +73,7 @@ def read(path: Path) -> ImportedMesh:
 
 
 def read_with_materials(path: Path) -> ImportedMesh:
-    """The same with materials, normals and colours.
+    """Read the triangles of a GLB with materials, normals and colours.
 
     Raises:
         SceneFileError: likewise, or an image is missing.
@@ -200,7 +200,7 @@ def write_octagons(gaussians: FlatGaussians, path: Path, options: ExportOptions)
 def _plan_files(
     soup: OctagonSoup, path: Path, png_sizes: tuple[int, int], options: ExportOptions
 ) -> list[tuple[GlbLayout, ChunkIndices]]:
-    """The fewest files that hold all chunks; neighbouring chunks stay together."""
+    """Return the fewest files that hold all chunks; neighbouring chunks stay together."""
     chunks = kd_split(soup.means_world, options.chunks)
     channels = channel_attributes(soup.channel_widths, widest=1)
     for count in range(1, len(chunks) + 1):
@@ -223,7 +223,7 @@ def _plan_files(
 
 
 def _extras(soup: OctagonSoup, options: ExportOptions, parts: int) -> list[dict[str, object]]:
-    """What each file says of itself: enough for an edited mesh to find back to its Gaussians."""
+    """Return what each file says of itself: enough for an edited mesh to find back to its Gaussians."""
     extras: dict[str, object] = {
         Q_KEY: options.q,
         MIN_OPACITY_KEY: options.min_opacity,
@@ -243,7 +243,7 @@ def _octagon_data(
     options: ExportOptions,
     bounds: list[Bounds],
 ) -> Iterator[bytes]:
-    """The binary part in the order of the layout; adds the bounds of each chunk to ``bounds``."""
+    """Yield the binary part in the order of the layout; add the bounds of each chunk to ``bounds``."""
     fall_off, ramp = images
     yield fall_off.ljust(pad_to_four(len(fall_off)), b"\0")
     yield octagon_triangles(layout.largest).astype("<u4").tobytes()
@@ -258,7 +258,7 @@ def _octagon_data(
 
 
 def _chunk_data(batch: OctagonBatch, options: ExportOptions) -> Iterator[bytes]:
-    """The attributes of one chunk, in the order of the layout; all are multiples of four bytes."""
+    """Yield the attributes of one chunk, in the order of the layout, all multiples of four bytes."""
     lit = options.light_up is not None
     yield batch.corners_world.astype("<f4").tobytes()
     rgb = np.clip(batch.channels[ALBEDO], 0.0, 1.0) if lit else srgb_to_linear(batch.rgb_srgb)

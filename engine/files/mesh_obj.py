@@ -78,7 +78,7 @@ def read(path: Path) -> ImportedMesh:
 
 
 def read_with_materials(path: Path) -> ImportedMesh:
-    """The same with the texture coordinates of every corner, the colours of vertices, and materials.
+    """Read the triangles of an OBJ with texture coordinates of every corner, vertex colours and materials.
 
     Raises:
         SceneFileError: likewise, or an image that its MTL names is missing.
@@ -136,7 +136,7 @@ def _read_materials(path: Path, parts: _ObjParts, count: int) -> dict[str, Any]:
 
 
 def _blocks(handle: IO[bytes]) -> Iterator[bytes]:
-    """The file in blocks that end at the end of a line."""
+    """Yield the file in blocks that end at the end of a line."""
     rest = handle.read(len(codecs.BOM_UTF8)).removeprefix(codecs.BOM_UTF8)
     while chunk := handle.read(BLOCK_BYTES):
         whole, newline, tail = chunk.rpartition(b"\n")
@@ -207,7 +207,7 @@ def _parse_libraries(block: bytes, parts: _ObjParts) -> None:
 
 
 def _usemtl_ranges(block: bytes, starts: np.ndarray, candidates: np.ndarray) -> list[tuple[int, int, str]]:
-    """The lines of a block from one ``usemtl`` to the next, with the name of the material."""
+    """Yield the lines of a block from one ``usemtl`` to the next, with the name of the material."""
     spans = [(0, len(starts), "")]
     for row in np.flatnonzero(candidates):
         line = block[starts[row] : block.index(b"\n", starts[row])].split(maxsplit=1)
@@ -369,7 +369,10 @@ def _octagon_lines(soup: OctagonSoup, material_name: str, origin: Origin) -> Ite
 
 
 def _vertex_lines(batch: OctagonBatch) -> str:
-    """The ``v`` and ``vt`` lines of a batch; one big format string beats a call per line many times over."""
+    """Return the ``v`` and ``vt`` lines of a batch.
+
+    One big format string beats a call per line many times over.
+    """
     count = len(batch.ids)
     octagons = (POSITION_LINE + "\0") * SIDES * count % tuple(batch.corners_world.reshape(-1).tolist())
     positions = octagons.split("\0")

@@ -88,7 +88,7 @@ def read(path: Path) -> ImportedMesh:
 
 
 def read_with_materials(path: Path) -> ImportedMesh:
-    """The same with normals and colours; a PLY has no materials.
+    """Read the triangles of a PLY with normals and colours; it has no materials.
 
     Raises:
         SceneFileError: likewise.
@@ -124,7 +124,7 @@ def _fan_triangles(polygons: np.ndarray) -> Int64[np.ndarray, "t 3"]:
 
 
 def _attribute(table: np.ndarray, name: str) -> Float32[np.ndarray, " v"] | None:
-    """A vertex attribute under its own name, or under that of the GLB, from which Blender takes it over."""
+    """Return a vertex attribute under its own name, or under that of the GLB, which Blender takes over."""
     for known in (name, f"_{name.upper()}"):
         if known in (table.dtype.names or ()):
             return columns(table, (known,))[:, 0]

@@ -23,7 +23,7 @@ GLASS_ILLUM_MODELS = (4, 6, 7, 9)
 
 
 def read_mtl(obj: Path, names: Sequence[str]) -> dict[str, MeshMaterial]:
-    """The materials by name of the MTL files that an OBJ names; files that are not there have none.
+    """Return the materials by name of the MTL files that an OBJ names; files that are not there have none.
 
     Raises:
         SceneFileError: a file cannot be read, a number is none, or an image is missing.
@@ -103,7 +103,7 @@ def _numbers(path: Path, key: str, text: str, count: int) -> tuple[float, ...]:
 
 
 def _file_name(text: str) -> str:
-    """The name of an image behind its options, such as ``-bm 0.3 wood bark.png``."""
+    """Return the name of an image behind its options, such as ``-bm 0.3 wood bark.png``."""
     words = text.split()
     k = 0
     while k < len(words) and words[k].startswith("-") and len(words[k]) > 1:

@@ -110,7 +110,7 @@ class OctagonSoup:
         return self._gaussians.means_world[self.ids]
 
     def batch(self, places: slice | Int[np.ndarray, " n"]) -> OctagonBatch:
-        """The octagons at ``places``, which count along ``ids``."""
+        """Return the octagons at ``places``, which count along ``ids``."""
         ids = self.ids[places]
         part = self._gaussians.with_base_color_only().select(ids)
         radii = self._radii[ids]

@@ -110,7 +110,7 @@ class GlbLayout:
         self.length += pad_to_four(length)
 
     def json(self, bounds: list[Bounds]) -> bytes:
-        """The JSON part, given each chunk's smallest and largest coordinates."""
+        """Return the JSON part, given each chunk's smallest and largest coordinates."""
         return json_bytes(self._document(bounds))
 
     def _document(self, bounds: list[Bounds]) -> dict[str, object]:

@@ -33,13 +33,13 @@ UNLIT = "KHR_materials_unlit"
 
 
 def octagon_q(file: GlbFile) -> float | None:
-    """The chi-square quantile of a file's octagons; None where it holds none, or holds them to be lit."""
+    """Return the chi-square quantile of a file's octagons; None where it has none, or has them lit."""
     q = file.document.get("asset", {}).get("extras", {}).get(Q_KEY)
     return float(q) if q is not None and UNLIT in file.document.get("extensionsUsed", []) else None
 
 
 def read_octagons(file: GlbFile, path: Path, q: float, channels: ChannelChoice) -> GaussianCloud:
-    """The Gaussians in the order of their numbers, if the octagons are as they were exported.
+    """Read the Gaussians in the order of their numbers, if the octagons are as they were exported.
 
     Raises:
         SceneFileError: they were edited, so that only the scene they came from can bring them back; or there
@@ -61,7 +61,7 @@ def _read_primitive(
     matrix: Float64[np.ndarray, "4 4"],
     primitive: Mapping[str, Any],
 ) -> tuple[GaussianCloud, Float32[np.ndarray, " n"]]:
-    """The Gaussians of a primitive, and their numbers in the scene."""
+    """Return the Gaussians of a primitive, and their numbers in the scene."""
     attributes = primitive["attributes"]
     turned = np.diag([1.0, -1.0, -1.0, 1.0]) @ file.about_origin(matrix)
     vertices = file.array(attributes["POSITION"], np.float64) @ turned[:3, :3].T + turned[:3, 3]

@@ -27,7 +27,7 @@ _ROWS_PER_OCTAGON = (*COLOURS, "alpha", "gid", "radius")
 
 
 def read(path: Path, channels: ChannelChoice = "own") -> GaussianCloud:
-    """The Gaussians in the order of their numbers, if the octagons are as they were exported.
+    """Read the Gaussians in the order of their numbers, if the octagons are as they were exported.
 
     Raises:
         SceneFileError: no mesh PLY of ours, its octagons were edited, so that only the scene they came from

@@ -42,7 +42,7 @@ def gaussians_from_octagons(
 
 
 def edited_octagons_error(path: Path) -> SceneFileError:
-    """What to say of octagons that are not as they were exported."""
+    """Return what to say of octagons that are not as they were exported."""
     return SceneFileError(
         f"{path}: its octagons are not as they were exported; bring them back with octasplat edit --mesh, "
         "which needs the scene that they came from."
@@ -50,7 +50,7 @@ def edited_octagons_error(path: Path) -> SceneFileError:
 
 
 def missing_gaussians_notes(stated: int, found: int) -> tuple[str, ...]:
-    """What a file of octagons lacks of the scene with ``stated`` Gaussians (0 if it does not say)."""
+    """Return what a file of octagons lacks of the scene with ``stated`` Gaussians (0 if it does not say)."""
     if stated <= found:
         return (ONE_COLOUR_NOTE,)
     return (ONE_COLOUR_NOTE, f"Left out of its octagons were {stated - found:,} fainter Gaussians.")

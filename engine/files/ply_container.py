@@ -60,7 +60,7 @@ class PlyElement:
         return tuple(prop for prop in self.properties if prop.count_kind is not None)
 
     def dtype(self, byte_order: str, lengths: Mapping[str, int]) -> np.dtype[np.void]:
-        """The type of one row, given the length of each list property."""
+        """Return the type of one row, given the length of each list property."""
         fields: list[tuple[str, str] | tuple[str, str, tuple[int, ...]]] = []
         for prop in self.properties:
             if prop.count_kind is None:
@@ -81,7 +81,7 @@ class PlyHeader:
     data_offset: int
 
     def element(self, name: str) -> PlyElement | None:
-        """The element called ``name``, or None."""
+        """Return the element called ``name``, or None."""
         return next((element for element in self.elements if element.name == name), None)
 
 
@@ -185,7 +185,7 @@ def read_ply(path: Path, names: Sequence[str]) -> tuple[PlyHeader, dict[str, np.
 
 
 def columns(table: np.ndarray, names: Sequence[str], rows_at_once: int = 16384) -> np.ndarray:
-    """The scalar fields ``names`` of a table as one C-ordered float32 array of shape (rows, len(names)).
+    """Return the scalar fields ``names`` of a table as a C-ordered float32 array (rows, len(names)).
 
     Other numeric types are converted; numbers beyond float32 become infinite.
     """
@@ -282,7 +282,7 @@ def _ascii_table(path: Path, handle: IO[bytes], element: PlyElement) -> np.ndarr
 
 
 def _ascii_values(path: Path, handle: IO[bytes], element: PlyElement) -> np.ndarray:
-    """The numbers of all rows of ``element`` in float64; leaves ``handle`` at the row after them."""
+    """Read the numbers of all rows of ``element`` in float64; leave ``handle`` at the row after them."""
     if element.count == 0:
         return np.zeros((0, 0))
     lines = itertools.islice((line for line in handle if line.strip()), element.count)
@@ -331,7 +331,7 @@ class PlyWriteElement:
 def list_field(
     name: str, kind: str, length: int, count_kind: str = "u1"
 ) -> list[tuple[str, str] | tuple[str, str, tuple[int, ...]]]:
-    """The two dtype fields of a list of fixed ``length``; the first must be filled with ``length``."""
+    """Return the two dtype fields of a list of fixed ``length``; the first must be filled with ``length``."""
     return [(name + COUNT_SUFFIX, "<" + count_kind), (name, "<" + kind, (length,))]
 
 

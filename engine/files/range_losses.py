@@ -63,7 +63,8 @@ def find_position_losses(
     return (
         f"The format {format_name} holds positions in steps of {float(np.median(step_world)):.2g} "
         f"units here, which is more than the size of {coarse:,} of {len(scene):,} Gaussians; "
-        "crop what lies far away (octasplat crop), or move the scene to the origin (octasplat transform --translate).",
+        "crop what lies far away (octasplat crop), or move the scene to the origin "
+        "(octasplat transform --translate).",
     )
 
 

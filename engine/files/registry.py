@@ -136,7 +136,7 @@ def exporters() -> tuple[Exporter, ...]:
 
 
 def importer_for(path: Path, format: str | None = None) -> Importer:
-    """The format called ``format``, or else the one that ``path``'s first bytes or its name show.
+    """Return the format called ``format``, or else the one that ``path``'s first bytes or its name show.
 
     What a file begins with decides, then its name, so that a file under a wrong name is read all the same.
 
@@ -157,7 +157,7 @@ def importer_for(path: Path, format: str | None = None) -> Importer:
 
 
 def exporter_for(path: Path, format: str | None = None) -> Exporter:
-    """The format called ``format``, or else the one that ``path``'s name asks for.
+    """Return the format called ``format``, or else the one that ``path``'s name asks for.
 
     ``.ply`` means a Gaussian PLY, except ``mesh.ply``, ``*.mesh.ply``, ``*_mesh.ply`` and ``*-mesh.ply``,
     which mean the octagon mesh. Upper and lower case are the same.
@@ -192,7 +192,7 @@ def check_writable(names: Iterable[str]) -> None:
 
 
 def mesh_reader_for(path: Path) -> MeshReader:
-    """The mesh format that ``path``'s name shows.
+    """Return the mesh format that ``path``'s name shows.
 
     Raises:
         SceneFileError: there is none.
@@ -205,12 +205,12 @@ def mesh_reader_for(path: Path) -> MeshReader:
 
 
 def surface_writer_for(path: Path) -> SurfaceWriter | None:
-    """The format in which a surface is written to ``path``, as its name says; None where there is none."""
+    """Return the format in which a surface is written to ``path`` by its name; None where there is none."""
     return _TABLE.by_file_name(SurfaceWriter, path)
 
 
 def surface_suffixes() -> str:
-    """What names of surfaces may end in, as in ".glb, .ply or .obj"."""
+    """Return what names of surfaces may end in, as in ".glb, .ply or .obj"."""
     return _TABLE.suffixes(SurfaceWriter)
 
 

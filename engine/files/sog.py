@@ -102,7 +102,7 @@ def _bundle_images(path: Path, bundle: zipfile.ZipFile, folder: Path) -> Images:
 
 
 def _bundle_member(path: Path, bundle: zipfile.ZipFile, name: str) -> bytes:
-    """A file of the bundle, at its root or in its only folder."""
+    """Return a file of the bundle, at its root or in its only folder."""
     names = [info for info in bundle.infolist() if info.filename.rpartition("/")[2] == Path(name).name]
     if not names:
         raise SceneFileError(f"{path}: is no SOG bundle; it lacks {name}.")
@@ -112,7 +112,7 @@ def _bundle_member(path: Path, bundle: zipfile.ZipFile, name: str) -> bytes:
 
 
 def _pixels(path: Path, name: str, image: Path) -> UInt8[np.ndarray, "h w 4"]:
-    """The bytes of an image as they are stored, as RGBA."""
+    """Return the bytes of an image as they are stored, as RGBA."""
     import OpenImageIO as oiio  # which the front end has not
 
     if not image.exists():

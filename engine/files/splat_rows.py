@@ -14,7 +14,7 @@ MAX_LOG_SCALE = float(np.log(np.finfo(np.float32).max)) - 1e-3
 
 
 def select_for_export(gaussians: FlatGaussians, path: Path, options: ExportOptions) -> FlatGaussians:
-    """The Gaussians not fainter than ``options.min_opacity``, all finite; ``path`` names the file in errors.
+    """Return the Gaussians not fainter than ``options.min_opacity``, all finite; ``path`` is for errors.
 
     Raises:
         SceneFileError: nothing to write, or values that are not finite.
@@ -42,7 +42,7 @@ def check_scales(scene: FlatGaussians, path: Path) -> None:
 
 
 def iterate_blocks(scene: FlatGaussians) -> Iterator[FlatGaussians]:
-    """The scene in order, a few thousand Gaussians at a time, without copying it."""
+    """Yield the scene in order, a few thousand Gaussians at a time, without copying it."""
     for start in range(0, len(scene), ROWS_PER_BLOCK):
         part = slice(start, start + ROWS_PER_BLOCK)
         yield scene.view(part)

@@ -15,7 +15,7 @@ TIMEOUT_SECONDS = 1800
 
 
 def find_converter() -> Path | None:
-    """The program, or None where there is none."""
+    """Return the program, or None where there is none."""
     named = os.environ.get(PROGRAM_VARIABLE)
     if named:
         return Path(named) if Path(named).exists() else None
@@ -24,7 +24,7 @@ def find_converter() -> Path | None:
 
 
 def missing_converter() -> str | None:
-    """What to do about the program being missing, or None where it is there."""
+    """Return what to do about the program being missing, or None where it is there."""
     if find_converter() is not None:
         return None
     return (

@@ -126,7 +126,7 @@ def write(gaussians: FlatGaussians, path: Path, options: ExportOptions) -> tuple
 
 
 def _pack_block(scene: FlatGaussians, bits: int) -> tuple[bytes, ...]:
-    """The six attributes of a block that is y up."""
+    """Return the six attributes of a block that is y up."""
     log_scales = np.concatenate([np.full((len(scene), 1), FLAT_LOG_SCALE), scene.log_scales], axis=1)
     return (
         _pack_positions(scene.means_world.astype(np.float64) * (1 << bits)),

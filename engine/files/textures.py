@@ -21,14 +21,14 @@ def radial_alpha(size: int, q: float) -> Float64[np.ndarray, "s s"]:
 
 
 def white_with_alpha_png(size: int, q: float) -> bytes:
-    """The fall-off as alpha of a white RGBA image, as glTF wants it."""
+    """Return the fall-off as alpha of a white RGBA image, as glTF wants it."""
     pixels = np.full((size, size, 4), 255, dtype=np.uint8)
     pixels[..., 3] = to_bytes(radial_alpha(size, q))
     return _png(pixels, colour_type=6)
 
 
 def grey_png(size: int, q: float) -> bytes:
-    """The fall-off as a grey image, as MTL's ``map_d`` wants it (it takes the luminance)."""
+    """Return the fall-off as a grey image, as MTL's ``map_d`` wants it (it takes the luminance)."""
     return _png(to_bytes(radial_alpha(size, q))[..., None], colour_type=0)
 
 
@@ -49,7 +49,7 @@ def material_ramp_uv(
 
 
 def png_bytes(rgb_srgb: UInt8[np.ndarray, "h w 3"]) -> bytes:
-    """An image as it stands in a PNG file."""
+    """Return an image as it stands in a PNG file."""
     from octasplat.engine.render.image_files import (
         write_png,  # loads the image library, which the front end has not
     )
@@ -61,7 +61,7 @@ def png_bytes(rgb_srgb: UInt8[np.ndarray, "h w 3"]) -> bytes:
 
 
 def _png(pixels: UInt8[np.ndarray, "h w c"], colour_type: int) -> bytes:
-    """An 8-bit PNG in memory: the image library here writes to named files only."""
+    """Return an 8-bit PNG in memory: the image library here writes to named files only."""
     height, width, channels = pixels.shape
     rows = np.zeros((height, 1 + width * channels), dtype=np.uint8)  # each row begins with filter 0: none
     rows[:, 1:] = pixels.reshape(height, -1)

@@ -62,7 +62,10 @@ def write(gaussians: FlatGaussians, path: Path, options: ExportOptions) -> tuple
 
 
 def missing_usd() -> str | None:
-    """What is missing to write USD, without loading it; whether an old copy will do shows when it is used."""
+    """Return what is missing to write USD, without loading it.
+
+    Whether an old copy will do shows when it is used.
+    """
     if importlib.util.find_spec("pxr") is None:
         return "needs the package usd-core; install it with pip install 'usd-core>=26.5'"
     try:

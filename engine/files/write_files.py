@@ -40,7 +40,7 @@ def dropped_on_export(
     *,
     facts: SceneMetadata = UNKNOWN_METADATA,
 ) -> tuple[str, ...]:
-    """What :func:`export_scene` will leave out at all of ``paths``, a sentence for each thing left out.
+    """Return what :func:`export_scene` will leave out at all of ``paths``, a sentence for each loss.
 
     Args:
         gaussians: the scene.
@@ -79,7 +79,7 @@ def dropped_on_export(
 
 
 def _format_list_text(names: Sequence[str], one: str, several: str) -> str:
-    """Formats as the subject of a sentence, and its verb."""
+    """Return the formats as the subject of a sentence, and its verb."""
     if len(names) == 1:
         return f"The format {names[0]} {one}"
     return f"The formats {', '.join(names[:-1])} and {names[-1]} {several}"
