@@ -57,7 +57,7 @@ def test_job_without_photographs_takes_colours_from_the_scene(run, octasplat, tm
     assert octasplat("surface", copy, "-o", tmp_path / "a.glb", *few).exit_code == 0
     heard = []
     options = {"resolution": 32, "depth_side": 32}
-    results = results_of(run.output, tmp_path / "attempt", options, listener=heard.append)
+    results = results_of(run.output, tmp_path / "attempt", options, progress=heard.append)
     assert (results / "surface.glb").read_bytes() == (tmp_path / "a.glb").read_bytes()
     assert any("not on this machine" in getattr(event, "message", "") for event in heard)
     assert heard[-1].message.startswith("Wrote results/surface.glb (")
@@ -68,7 +68,7 @@ def test_surface_of_moved_scene_ignores_photographs(run, octasplat, tmp_path):
     assert octasplat("transform", run.output, "-o", moved, "--translate", 1, 0, 0).exit_code == 0
     heard = []
     options = {"resolution": 32, "depth_side": 32}
-    with_them = results_of(moved, tmp_path / "a", options, scene=run.scene, listener=heard.append)
+    with_them = results_of(moved, tmp_path / "a", options, scene=run.scene, progress=heard.append)
     assert any("other names or poses" in getattr(event, "message", "") for event in heard)
     without = results_of(moved, tmp_path / "b", options)
     assert (with_them / "surface.glb").read_bytes() == (without / "surface.glb").read_bytes()

@@ -29,7 +29,7 @@ config = small_config(iterations=60, sh_degree_interval=30, loss={"ssim": 0.2})
 with tempfile.TemporaryDirectory() as folder:
     trained = Trainer(
         world, config, initial_state(world.initial_gaussians(), 0),
-        folder=Path(folder), fingerprint="", listener=lambda event: None, threads=1,
+        folder=Path(folder), fingerprint="", progress=lambda event: None, threads=1,
     ).run()
 for name in ("means_world", "quats_wxyz", "log_scales", "opacity_logits", "sh"):
     sys.stdout.buffer.write(getattr(trained, name).tobytes())
