@@ -19,7 +19,6 @@ import platformdirs
 
 from octasplat.engine.core.errors import ConfigError, OutputError
 from octasplat.engine.dataset.results_among import is_run_folder
-from octasplat.engine.runs.run_folder import CONFIG, dataset_folder_of_run
 
 RECORD_VARIABLE = "OCTASPLAT_WRITTEN"
 """Names another file for the database."""
@@ -97,7 +96,7 @@ class _Read:
             if not place.is_dir():
                 self._files[place] = ""
                 continue
-            if (place / CONFIG).is_file():
+            if (place / "config.json").is_file():
                 self._add_run(place)
             else:
                 self._add_dataset(place, whole=True)
@@ -117,6 +116,8 @@ class _Read:
         self._files |= {(run / name).resolve(): f" in {run}" for name in _RUN_FILES}
         self._folders += [(run / name).resolve() for name in _RUN_FOLDERS]
         with suppress(ConfigError):  # it holds another config.json
+            from octasplat.engine.runs.run_folder import dataset_folder_of_run  # numba and scipy come with it
+
             photographs = dataset_folder_of_run(run)
             if photographs.is_absolute() and photographs.is_dir():
                 self._add_dataset(photographs.resolve(), whole=False)
