@@ -9,8 +9,10 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int64
 from scipy.ndimage import binary_fill_holes, distance_transform_edt
 
+from octasplat.engine.core.compilation import run_ranges
+from octasplat.engine.core.threads import threads_in_use
 from octasplat.engine.edit.deform import deform_to, deformation_corners
-from octasplat.engine.edit.kernels.mean_value import winding_numbers
+from octasplat.engine.edit.kernels.mean_value import POINTS_PER_TASK, winding_numbers
 from octasplat.engine.evaluate.surface_metrics import distances_to_surface, sample_surface
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.geometry.triangle_mesh import TriangleMesh
@@ -76,7 +78,9 @@ def belongs_to(gaussians: FlatGaussians, mesh: TriangleMesh, near: float) -> Boo
     chosen = ((centres >= low) & (centres <= high)).all(axis=1)
     some = np.flatnonzero(chosen)
     turns = np.zeros(len(some), np.int64)
-    winding_numbers(centres[some], mesh.vertices_world.astype(np.float64), mesh.faces.astype(np.int64), turns)
+    vertices, faces = mesh.vertices_world.astype(np.float64), mesh.faces.astype(np.int64)
+    tasks = -(-len(some) // POINTS_PER_TASK)
+    run_ranges(winding_numbers, threads_in_use(), tasks, centres[some], vertices, faces, turns, grain=1)
     close = distances_to_surface(centres[some], mesh, np.random.default_rng(0), 200_000) <= near
     chosen[some] = close | (turns != 0)
     return chosen

@@ -25,7 +25,7 @@ async def test_vanished_front_end_lease_expires(
     """What it stored counts as about to be named for a while only; at most a minute as set."""
     assert storage_leases.LEASE_SECONDS <= 60
     monkeypatch.setattr(storage_leases, "LEASE_SECONDS", 1.0)
-    for name in ("_SETTLED_SECONDS", "CLOCK_SECONDS"):
+    for name in ("_MIN_AGE_SECONDS", "MAX_CLOCK_SKEW_SECONDS"):
         monkeypatch.setattr(garbage_collection, name, 0.0)
     environment = {
         **os.environ,

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-SCRIPTS = Path(__file__).with_name("blender")
+SCRIPTS = Path(__file__).resolve().parents[1] / "tools" / "blender"
 _EXAMPLES = Path(__file__).resolve().parents[2] / "examples" / "blender"
 IMPORT_SCRIPT = _EXAMPLES / "import_octasplat.py"
 EXPORT_PATH_SCRIPT = _EXAMPLES / "export_camera_path.py"

@@ -75,7 +75,7 @@ from tests.support.trace_scenes import make_cloud, make_tracer, random_gradients
 rng = np.random.default_rng(5)
 tracer = make_tracer(make_cloud(rng, 1500, degree=1), threads=int(sys.argv[1]))
 seen = tracer.trace(rays_inwards(rng, 900), record=True)
-gradients = tracer.backward(seen.hits, random_gradients(rng, 900))
+gradients = tracer.backward(seen.recording, random_gradients(rng, 900))
 digest = hashlib.sha256()
 for group in (seen, gradients):
     for field in fields(group):
