@@ -161,7 +161,7 @@ def restart_front_end_during_uploads(those: Upheavals) -> None:
         those.faults.append(
             f"{len(sent)} photographs were sent in {CLIENTS} scenes, and {len(rows)} are there"
         )
-    for job in those.run.patiently(lambda api: list(api.pages("/v1/jobs", "jobs", state=["queued"]))):
+    for job in those.run.patiently(lambda api: list(api.iterate_pages("/v1/jobs", "jobs", state=["queued"]))):
         if job["queue"] == ABSENT:
             those.command("cancel", job["id"])
             those.run.patiently(lambda api, job=job: api.request("DELETE", f"/v1/jobs/{job['id']}"))
