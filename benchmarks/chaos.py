@@ -113,7 +113,10 @@ class Run:
         """Accepted jobs that are not over."""
         active = self.patiently(
             lambda api: sum(
-                1 for _ in api.iterate_pages("/v1/jobs", "jobs", state=["queued", "running", "canceling"], limit=200)
+                1
+                for _ in api.iterate_pages(
+                    "/v1/jobs", "jobs", state=["queued", "running", "canceling"], limit=200
+                )
             )
         )
         return int(active)

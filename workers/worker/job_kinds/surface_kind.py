@@ -68,7 +68,9 @@ class SurfaceKind(OperationKind):
         }
         return (*super().stages(options), *(name for name, is_asked in asked.items() if is_asked))
 
-    def resource_demands(self, options: SurfaceJobOptions, sizes: Sequence[ImageSizes]) -> tuple[ResourceDemand, ...]:
+    def resource_demands(
+        self, options: SurfaceJobOptions, sizes: Sequence[ImageSizes]
+    ) -> tuple[ResourceDemand, ...]:
         """Return the sides of the maps, the pixels of all depth maps, one a photograph, and the files."""
         side_px = options.depth_side
         pixels = sum(
