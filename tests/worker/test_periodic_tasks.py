@@ -61,7 +61,7 @@ def test_periodic_task_is_retried_and_repeated_failure_ends_worker(bench: Worker
     log = bench.folder / "w.log"
     renamed(bench, "workers", "hidden")
     deadline = time.monotonic() + MAX_WAIT_SECONDS
-    while "say_alive failed" not in log.read_text():
+    while "send_heartbeat failed" not in log.read_text():
         assert time.monotonic() < deadline and worker.poll() is None, bench.worker_logs()
         time.sleep(0.02)
     renamed(bench, "hidden", "workers")

@@ -169,7 +169,7 @@ def test_previous_release_works_beside_current(
             bench.wait(handed_back, lambda job: job.worker == "old-too")
             Path(gates[2]).touch()
             done = bench.wait_until_finished(handed_back)
-            has_same_results = results_version(previous) == versions.RESULTS
+            has_same_results = results_version(previous) == versions.RESULTS_VERSION
             begun_at = [0, 30] if has_same_results else [0]
             assert (done.state, starts(bench, handed_back)) == ("succeeded", begun_at)
             assert ("begins anew" in bench.log(handed_back)) != has_same_results
