@@ -19,7 +19,7 @@ import stat
 import sys
 import tempfile
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 from pathlib import Path
@@ -36,7 +36,10 @@ ROWS = 256
 """Rows of an array that are worth a thread: fewer take less time than to wake it."""
 PACKAGE = __name__.partition(".")[0]
 CACHE_VARIABLE = "NUMBA_CACHE_DIR"
-_IMPORT = re.compile(rf"^\s*(?:from\s+({PACKAGE}[\w.]+)\s+import|import\s+({PACKAGE}[\w.]+))", re.MULTILINE)
+_IMPORT = re.compile(
+    rf"^\s*(?:from\s+({PACKAGE}[\w.]*)\s+import\s+(\([^)]*\)|[^\n(]+)|import\s+({PACKAGE}[\w.]+))",
+    re.MULTILINE,
+)
 
 
 class _DeviceCompiler(Compiler):  # type: ignore[misc]
@@ -104,6 +107,18 @@ class _Threads:
 _THREADS = _Threads()
 
 
+def _call_all(kernel: Callable[..., None], calls: Sequence[tuple[Any, ...]]) -> None:
+    """Make all calls at once, the first on this thread; wait for all, then raise the first error."""
+    pool = _THREADS.pool(len(calls) - 1) if len(calls) > 1 else None
+    others = [pool.submit(kernel, *arguments) for arguments in calls[1:]] if pool else []
+    try:
+        kernel(*calls[0])
+    finally:
+        errors = [error for error in (other.exception() for other in others) if error is not None]
+    if errors:
+        raise errors[0]
+
+
 def run_on_threads(kernel: Callable[..., None], threads: int, *arguments: Any) -> None:
     """Call ``kernel(*arguments)`` on ``threads`` threads at once, this one among them; wait for all.
 
@@ -113,16 +128,7 @@ def run_on_threads(kernel: Callable[..., None], threads: int, *arguments: Any) -
     Raises:
         Exception: what the first call that failed raised.
     """
-    others = []
-    if threads > 1:
-        pool = _THREADS.pool(threads - 1)
-        others = [pool.submit(kernel, *arguments) for _ in range(threads - 1)]
-    try:
-        kernel(*arguments)
-    finally:
-        errors = [error for error in (other.exception() for other in others) if error is not None]
-    if errors:
-        raise errors[0]
+    _call_all(kernel, [arguments] * max(1, threads))
 
 
 def run_ranges(
@@ -141,17 +147,20 @@ def run_ranges(
         Exception: what the first call that failed raised.
     """
     threads = max(1, min(threads, count // grain))
-    ends = [count * (k + 1) // threads for k in range(threads)]
-    others = []
-    if threads > 1:
-        pool = _THREADS.pool(threads - 1)
-        others = [pool.submit(kernel, *ends[k : k + 2], *arguments) for k in range(threads - 1)]
-    try:
-        kernel(0, ends[0], *arguments)
-    finally:
-        errors = [error for error in (other.exception() for other in others) if error is not None]
-    if errors:
-        raise errors[0]
+    ends = [count * k // threads for k in range(threads + 1)]
+    _call_all(kernel, [(*ends[k - 1 : k + 1], *arguments) for k in range(1, threads + 1)])
+
+
+@cache
+def _package_folder(package: str) -> Path | None:
+    spec = importlib.util.find_spec(package)
+    locations = None if spec is None else spec.submodule_search_locations
+    return Path(next(iter(locations))) if locations else None
+
+
+def _is_module(package: str, name: str) -> bool:
+    folder = _package_folder(package) if package else None
+    return folder is not None and (folder / f"{name}.py").is_file()
 
 
 @cache
@@ -161,7 +170,11 @@ def _source(module: str) -> tuple[bytes, tuple[str, ...]]:
     if spec is None or spec.origin is None:
         return b"", ()
     content = Path(spec.origin).read_bytes()
-    imported = {first or second for first, second in _IMPORT.findall(content.decode())}
+    imported: set[str] = set()
+    for package, names, whole in _IMPORT.findall(content.decode()):
+        imported.add(package or whole)
+        # A name may be a module of the package, which then counts itself.
+        imported |= {f"{package}.{name}" for name in re.findall(r"\w+", names) if _is_module(package, name)}
     return hashlib.sha256(content).digest(), tuple(sorted(imported))
 
 

@@ -54,7 +54,14 @@ def test_same_sources_in_other_checkout_share_cache(tmp_path: Path) -> None:
     assert "Counter({" in second
 
 
-def test_changed_inlined_source_is_recompiled(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("imports", "called"),
+    [
+        ("from octasplat.engine.inner import factor", "factor"),
+        ("from octasplat.engine import inner", "inner.factor"),
+    ],
+)
+def test_changed_inlined_source_is_recompiled(tmp_path: Path, imports: str, called: str) -> None:
     package = tmp_path / "octasplat"
     (package / "engine" / "core").mkdir(parents=True)
     for name in ("__init__.py", "engine/__init__.py", "engine/core/__init__.py"):
@@ -62,10 +69,8 @@ def test_changed_inlined_source_is_recompiled(tmp_path: Path) -> None:
     (package / "engine" / "core" / "compilation.py").write_text(Path(compilation.__file__).read_text())
     inner, outer = package / "engine" / "inner.py", package / "engine" / "outer.py"
     imported = "from octasplat.engine.core.compilation import device_function, kernel\n"
-    outer.write_text(
-        imported + "from octasplat.engine.inner import factor\n\n"
-        "@kernel()\ndef scaled(x):\n    return factor() * x\n"
-    )
+    body = f"{imports}\n\n@kernel()\ndef scaled(x):\n    return {called}() * x\n"
+    outer.write_text(imported + body)
     say = "from octasplat.engine.outer import scaled\nprint(scaled(2.0))"
     environment = {"NUMBA_CACHE_DIR": str(tmp_path / "code"), "PYTHONPATH": str(tmp_path)}
     found = []
