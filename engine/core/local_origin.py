@@ -37,14 +37,6 @@ def choose_origin(centre: Float[np.ndarray, "3"], extent: float) -> Origin:
     return (x, y, z)
 
 
-def origin_of_points(points: Float[np.ndarray, "n 3"]) -> Origin:
-    """Return the local origin for points, by their median and the median of their distances to it."""
-    if len(points) == 0:
-        return NO_ORIGIN
-    centre = np.median(np.asarray(points, np.float64), axis=0)
-    return choose_origin(centre, float(np.median(np.linalg.norm(points - centre, axis=1))))
-
-
 def is_set(origin: Origin) -> bool:
     """Return whether there is a local origin."""
     return any(value != 0.0 for value in origin)
