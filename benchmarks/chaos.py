@@ -279,7 +279,8 @@ def undisturbed_reconstruction(scene: Path, folder: Path) -> dict[str, bytes]:
 
 def prepare(run: Run, *, chains: int, reconstructions: int, steps: int, seconds: float) -> None:
     """Upload the scene and fill the queue."""
-    run.photographs = {file.name: file.path.read_bytes() for file in list_scene_files(run.scene)[0]}
+    listed = run.patiently(lambda api: list_scene_files(api, run.scene))
+    run.photographs = {file.name: file.path.read_bytes() for file in listed}
     run.dataset = run.patiently(lambda api: upload_scene(api, run.scene))["id"]
     for number in range(max(chains, reconstructions)):
         if number < reconstructions:

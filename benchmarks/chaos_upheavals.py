@@ -225,7 +225,8 @@ UPHEAVALS: tuple[Callable[[Upheavals], None], ...] = (
 def upheave(run: Run, folder: Path) -> Upheavals:
     """Do all of them, fetch a result, and look for faults."""
     those = Upheavals(run, folder)
-    run.photographs = {file.name: file.path.read_bytes() for file in list_scene_files(run.scene)[0]}
+    listed = run.patiently(lambda api: list_scene_files(api, run.scene))
+    run.photographs = {file.name: file.path.read_bytes() for file in listed}
     run.dataset = run.patiently(lambda api: upload_scene(api, run.scene))["id"]
     workers = {process.pid for process in run.machine.kept()} - {p.pid for p in run.machine.front_end()}
     run.submit_chain(STEPS, STEP_SECONDS)

@@ -32,6 +32,7 @@ from octasplat.service.routes import (
     events_and_logs,
     jobs,
     metrics,
+    scene_previews,
     system,
     webhooks,
 )
@@ -96,7 +97,7 @@ def create_app(settings: ServiceSettings | None = None) -> FastAPI:
         license_info={"name": "Apache-2.0", "identifier": "Apache-2.0"},
     )
     for module_router in (
-        datasets.router, jobs.router, estimates.router,
+        datasets.router, scene_previews.router, jobs.router, estimates.router,
         events_and_logs.router, artifacts.router, webhooks.router, system.router,
         system.health_router, metrics.router, audit.router,
     ):  # fmt: skip
@@ -105,7 +106,11 @@ def create_app(settings: ServiceSettings | None = None) -> FastAPI:
     add_problem_handlers(app)
     extend_openapi(app)
     app.add_middleware(AuditMiddleware)
-    app.add_middleware(BodyLimitMiddleware, max_body_bytes=settings.max_body_bytes)
+    app.add_middleware(
+        BodyLimitMiddleware,
+        max_body_bytes=settings.max_body_bytes,
+        longer={scene_previews.PREFIX: scene_previews.MAX_BODY_BYTES},
+    )
     app.add_middleware(SameOriginMiddleware)
     if settings.is_private:
         app.add_middleware(AllowedHostsMiddleware, names=settings.allowed_hosts)

@@ -1,5 +1,6 @@
 """Requests that are turned away before anybody looks at them: foreign names, foreign pages, long bodies."""
 
+from collections.abc import Mapping
 from urllib.parse import urlsplit
 
 from starlette.datastructures import Headers
@@ -55,11 +56,21 @@ class SameOriginMiddleware:
 
 
 class BodyLimitMiddleware:
-    """Limits the length of every body but those of uploads, which are counted where they are written."""
+    """Limits the length of every body but those of uploads, which are counted where they are written.
 
-    def __init__(self, app: ASGIApp, max_body_bytes: int) -> None:
+    Args:
+        app: what comes next.
+        max_body_bytes: length of a body.
+        longer: other lengths, by what their addresses begin with.
+    """
+
+    def __init__(self, app: ASGIApp, max_body_bytes: int, longer: Mapping[str, int]) -> None:
         self._app = app
         self._limited = RequestBodyLimitMiddleware(app, max_body_size=max_body_bytes)
+        self._longer = {
+            prefix: RequestBodyLimitMiddleware(app, max_body_size=max(most, max_body_bytes))
+            for prefix, most in longer.items()
+        }
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Pass a request on with its limit."""
@@ -79,7 +90,8 @@ class BodyLimitMiddleware:
             elif not replaced:
                 await send(message)
 
-        await self._limited(scope, receive, send_as_problem)
+        limited = (app for prefix, app in self._longer.items() if scope["path"].startswith(prefix))
+        await next(limited, self._limited)(scope, receive, send_as_problem)
 
 
 class SecurityHeadersMiddleware:

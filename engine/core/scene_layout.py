@@ -19,9 +19,17 @@ UNREAD_SUFFIXES = frozenset(
     | {".orf", ".rw2", ".pef", ".srw", ".raw", ".insp"}
 )
 """Photographs in formats that are not taken."""
+ARCHIVE_SUFFIXES = frozenset({".zip", ".7z", ".rar", ".tar", ".gz", ".tgz", ".bz2", ".xz", ".zst"})
 VIDEO_SUFFIXES = frozenset({".mov", ".mp4", ".m4v", ".avi", ".mkv", ".mts", ".webm", ".insv", ".360"})
+IMAGES = "images/"
+"""What the names of a scene's photographs begin with."""
+MIN_PHOTOGRAPHS = 3
+"""Fewer photographs than this do not make a scene."""
 SCENE_FOLDERS = ("images", "masks", "sparse", "colmap", "distorted")
 """Folders whose names say what is in them."""
+
+MASK_ENDING = "_mask"
+"""What the name of a mask that lies beside its photograph ends with, before the suffix."""
 
 _MODEL_FILE = re.compile(
     r"((colmap/|distorted/)?sparse(/[0-9]+)?)/(cameras|images|points3D|rigs|frames)\.(bin|txt)"
@@ -58,6 +66,11 @@ class SceneLayout:
     ignored: tuple[str, ...]
     folder: str
 
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Sentences on what is left out, with names relative to the folder around everything."""
+        return left_out_sentences(sorted(path.removeprefix(self.folder) for path in self.left_out))
+
 
 def lay_out_scene(paths: Sequence[str]) -> SceneLayout:
     """Return which of the files below a folder, or in an archive, make up a scene.
@@ -69,9 +82,9 @@ def lay_out_scene(paths: Sequence[str]) -> SceneLayout:
     rest = [path for path in paths if not is_ignored_file(path)]
     folder = common_folder(rest)
     names = {path: path.removeprefix(folder) for path in rest}
-    pictures = [name for name in names.values() if _is_picture(name)]
-    top = next((top for top in ("images/", "input/") if any(name.startswith(top) for name in pictures)), "")
     results = results_folders(names.values())
+    photographs = [name for name in names.values() if is_photograph(name, results)]
+    top = next((top for top in (IMAGES, "input/") if any(name.startswith(top) for name in photographs)), "")
     files: dict[str, str] = {}
     for path, name in names.items():
         if file_role(name) in (FileRole.MODEL, FileRole.MASK):
@@ -131,11 +144,41 @@ def common_folder(names: Sequence[str]) -> str:
         folder += f"{top}/"
 
 
+def masks_beside(names: Iterable[str]) -> dict[str, str]:
+    """Return the names that are masks of others among them, as ``a_mask.png`` of ``a.jpg``.
+
+    Args:
+        names: paths of images, with forward slashes.
+
+    Returns:
+        The photograph of each mask.
+
+    >>> masks_beside(["a.jpg", "a_mask.png", "b_MASK.png", "the_mask.jpg"])
+    {'a_mask.png': 'a.jpg'}
+    """
+    by_stem = {str(PurePosixPath(name).with_suffix("")).casefold(): name for name in names}
+    owners = {}
+    for stem, name in by_stem.items():
+        if stem.endswith(MASK_ENDING) and (owner := by_stem.get(stem.removesuffix(MASK_ENDING))) is not None:
+            owners[name] = owner
+    return owners
+
+
+def too_few_photographs(count: int) -> str | None:
+    """Return the sentence that refuses a scene of so many photographs; None where they are enough."""
+    if count >= MIN_PHOTOGRAPHS:
+        return None
+    formats = "JPEG, PNG, TIFF, WebP, BMP, EXR and HDR are read"
+    return f"There are {count} photographs; at least {MIN_PHOTOGRAPHS} are needed ({formats})."
+
+
 def left_out_sentences(paths: Sequence[str]) -> tuple[str, ...]:
     """Return what to say of files that are left out: how many of each kind, which, and the way out."""
     kinds: dict[str, list[str]] = {}
+    results = results_folders(paths)
     for path in paths:
-        kinds.setdefault(_kind_of(path), []).append(path)
+        kind = "results" if path.startswith(results) else _kind_of(path)
+        kinds.setdefault(kind, []).append(path)
     return tuple(
         sentence.format(count=len(kinds[kind]), names=_name_list(kinds[kind]))
         for kind, sentence in _SENTENCES.items()
@@ -144,11 +187,13 @@ def left_out_sentences(paths: Sequence[str]) -> tuple[str, ...]:
 
 
 _SENTENCES = {
+    "results": "{count} files of results among the photographs are left out ({names}).",
     "unread": "{count} files look like photographs but are of formats that are not read, and are left out "
     "({names}); convert them to JPEG, PNG or TIFF.",
     "picture": "{count} photographs do not lie where those of the scene do and are left out ({names}); move "
     "them into its images folder.",
     "video": "{count} videos are left out ({names}); save frames of them as photographs.",
+    "archive": "{count} archives are left out ({names}); unpack them first.",
     "poses": "{count} files hold poses that are not read ({names}); put a COLMAP model into sparse/0, or the "
     "poses are found anew.",
     "other": "{count} files are no part of a scene and are left out ({names}).",
@@ -164,6 +209,8 @@ def _kind_of(path: str) -> str:
         return "picture"
     if suffix in VIDEO_SUFFIXES:
         return "video"
+    if suffix in ARCHIVE_SUFFIXES:
+        return "archive"
     is_transforms = pure.name.startswith("transforms") and suffix == ".json"
     return "poses" if is_transforms or _MODEL_ELSEWHERE.fullmatch(path) else "other"
 

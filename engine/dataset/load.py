@@ -10,6 +10,7 @@ from jaxtyping import Float64
 from octasplat.engine.core.errors import ConfigError, DatasetError
 from octasplat.engine.core.local_origin import Origin, describe_origin, is_set
 from octasplat.engine.core.relative_paths import normalize_name
+from octasplat.engine.core.scene_layout import is_ignored_file, is_photograph, masks_beside
 from octasplat.engine.dataset.camera import Camera
 from octasplat.engine.dataset.colmap_model import (
     ColmapModel,
@@ -21,7 +22,7 @@ from octasplat.engine.dataset.colmap_model import (
 from octasplat.engine.dataset.image_info import ImageInfo
 from octasplat.engine.dataset.image_names import match_image_names
 from octasplat.engine.dataset.images import read_image_info
-from octasplat.engine.dataset.masks import mask_for, masks_beside
+from octasplat.engine.dataset.masks import mask_for
 from octasplat.engine.dataset.model import DatasetModel, DatasetView, Observations
 from octasplat.engine.dataset.results_among import is_run_folder
 from octasplat.engine.dataset.views_file import capped_size
@@ -149,8 +150,15 @@ def load_dataset_model(
 
 
 def image_folder(root: Path) -> Path:
-    """Return ``images/`` or ``input/`` of a scene, or the scene itself where it has neither."""
-    return next((root / name for name in ("images", "input") if (root / name).is_dir()), root)
+    """Return ``images/`` or ``input/`` of a scene, or the scene itself where neither holds photographs."""
+    folders = [root / name for name in ("images", "input") if (root / name).is_dir()]
+    elsewhere = root if not folders or _holds_photographs(root) else folders[0]
+    return next((folder for folder in folders if _holds_photographs(folder)), elsewhere)
+
+
+def _holds_photographs(folder: Path) -> bool:
+    names = (path.relative_to(folder).as_posix() for path in folder.rglob("*"))
+    return any(is_photograph(name) and not is_ignored_file(name) for name in names)
 
 
 def _find_images(

@@ -1,6 +1,6 @@
 """Masks of photographs: which file is whose, and which pixels they say are valid."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from octasplat.engine.core.errors import DatasetError
+from octasplat.engine.core.scene_layout import MASK_ENDING
 from octasplat.engine.dataset.images import alpha_channel_of, open_image, read_pixels, resize
 
 _VALID = 128
@@ -18,7 +19,6 @@ _MAX_LABELS = 32
 """A picture of fewer values than this, none of them white, holds labels rather than shades."""
 _COLOURED = 16
 """Channels that differ by more than this are no rounding of a grey one."""
-_SUFFIX = "_mask"
 
 
 @dataclass(frozen=True)
@@ -41,26 +41,6 @@ class MaskSummary:
         return self.brightest < _VALID
 
 
-def masks_beside(names: Iterable[str]) -> dict[str, str]:
-    """Return the names that are masks of others among them, as ``a_mask.png`` of ``a.jpg``.
-
-    Args:
-        names: paths of images, with forward slashes.
-
-    Returns:
-        The photograph of each mask.
-
-    >>> masks_beside(["a.jpg", "a_mask.png", "b_MASK.png", "the_mask.jpg"])
-    {'a_mask.png': 'a.jpg'}
-    """
-    by_stem = {str(PurePosixPath(name).with_suffix("")).casefold(): name for name in names}
-    owners = {}
-    for stem, name in by_stem.items():
-        if stem.endswith(_SUFFIX) and (owner := by_stem.get(stem.removesuffix(_SUFFIX))) is not None:
-            owners[name] = owner
-    return owners
-
-
 def mask_for(name: str, masks: Mapping[str, Path], beside: Mapping[str, Path]) -> Path | None:
     """Return the mask of a photograph; None if it has none.
 
@@ -70,7 +50,7 @@ def mask_for(name: str, masks: Mapping[str, Path], beside: Mapping[str, Path]) -
         beside: masks that lie beside the photographs, by the names of these.
     """
     stem = str(PurePosixPath(name).with_suffix(""))
-    for candidate in (f"{name}.png", f"{stem}.png", f"{stem}{_SUFFIX}.png", name, f"{name}.jpg"):
+    for candidate in (f"{name}.png", f"{stem}.png", f"{stem}{MASK_ENDING}.png", name, f"{name}.jpg"):
         found = masks.get(candidate) or masks.get(candidate.casefold())
         if found is not None:
             return found

@@ -8,7 +8,7 @@ from typing import Annotated
 
 from pydantic import Field
 
-from octasplat.engine.core.events import EventListener, ignore_events
+from octasplat.engine.core.events import EventListener, Warned, ignore_events
 from octasplat.engine.dataset.image_sizes import ImageSizes
 from octasplat.engine.operations.base import Operation, Request, Result, never_stop
 from octasplat.engine.operations.reconstruct import ReconstructOptions
@@ -77,9 +77,13 @@ def run(
     """
     from octasplat.engine.dataset.colmap_model import has_colmap_model
     from octasplat.engine.operations.cost_model import estimate_reconstruction
+    from octasplat.engine.poses.photographs import left_out_of_scene, locate_scene
 
-    config = request.config().with_poses_decided(has_colmap_model(request.source))
-    sizes = photograph_sizes(request.source)
+    scene = locate_scene(request.source)
+    for sentence in left_out_of_scene(scene):
+        progress(Warned(sentence))
+    config = request.config().with_poses_decided(has_colmap_model(scene))
+    sizes = photograph_sizes(scene)
     cores = request.cores or threads or len(os.sched_getaffinity(0))
     found = estimate_reconstruction(config, sizes, cores)
     return EstimateResult(photographs=tuple(sizes), **found.model_dump())
@@ -91,24 +95,13 @@ def photograph_sizes(scene: Path) -> list[ImageSizes]:
     Raises:
         DatasetError: there are none, or one cannot be read.
     """
-    from PIL import Image
+    from octasplat.engine.dataset.images import read_image_info
+    from octasplat.engine.dataset.load import image_folder
+    from octasplat.engine.poses.photographs import photographs_of_scene
 
-    from octasplat.engine.core.errors import DatasetError
-    from octasplat.engine.dataset.load import IMAGE_SUFFIXES, image_folder
-
-    if not scene.is_dir():
-        raise DatasetError(f"{scene} is not a folder; name the folder that holds the photographs.")
-    folder = image_folder(scene)
-    counts: Counter[tuple[int, int]] = Counter()
-    found = (path for path in sorted(folder.rglob("*")) if path.suffix.lower() in IMAGE_SUFFIXES)
-    for path in found:
-        try:
-            with Image.open(path) as image:
-                counts[image.size] += 1
-        except OSError as error:
-            raise DatasetError(f"{path} cannot be read ({error}); replace or remove it.") from None
-    if not counts:
-        raise DatasetError(f"{folder} holds no photographs; name the folder that does.")
+    names = photographs_of_scene(scene)
+    infos = [read_image_info(image_folder(scene) / name) for name in names]
+    counts = Counter((info.width_px, info.height_px) for info in infos)
     return [ImageSizes(width, height, count) for (width, height), count in counts.items()]
 
 

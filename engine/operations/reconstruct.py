@@ -217,11 +217,12 @@ def run(
     from octasplat.engine.core.progress import stop_when_asked
     from octasplat.engine.evaluate.summary import summarize_run
     from octasplat.engine.pipeline import reconstruct
+    from octasplat.engine.poses.photographs import locate_scene
 
     config = run_config(request)
     output = request.output
     reconstruct(
-        request.source,
+        locate_scene(request.source),
         output,
         config,
         resume=request.resume,

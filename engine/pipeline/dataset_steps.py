@@ -1,10 +1,12 @@
 """Steps before the training: pose search, and opening of the dataset."""
 
+from octasplat.engine.core.events import Warned
 from octasplat.engine.core.progress import phase
 from octasplat.engine.dataset import Dataset, write_held_out
 from octasplat.engine.dataset.views_file import write_views
 from octasplat.engine.pipeline.output_folder import write_config
 from octasplat.engine.pipeline.run import ReconstructionRun
+from octasplat.engine.poses.photographs import left_out_of_scene
 from octasplat.engine.runs.config import read_config
 from octasplat.engine.runs.run_folder import (
     CONFIG,
@@ -28,7 +30,10 @@ class FindPoses:
         return False
 
     def __call__(self, run: ReconstructionRun) -> None:
-        """Find the poses."""
+        """Find the poses; a new run says first which files it leaves out."""
+        if run.recorded is None:
+            for sentence in left_out_of_scene(run.scene):
+                run.progress(Warned(sentence))
         find_missing_poses(run.scene, run.output, run.config, run.threads, run.progress, run.should_stop)
 
 

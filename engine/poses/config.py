@@ -18,7 +18,6 @@ RECORD_FILE = "poses.json"
 """What was found, and for which photographs; beside the model's files."""
 FOUND_FOLDER = "found"
 """The model's folder, while it lies below the one for the work."""
-MIN_PHOTOGRAPHS = 3
 MAX_IMAGE_SIDE_PX = 1600
 """Size at most to which photographs are shrunk before features are looked for."""
 MAX_FEATURES = 4096

@@ -32,7 +32,7 @@ from octasplat.engine.poses.config import (
     PosesConfig,
     PoseSearchRequest,
 )
-from octasplat.engine.poses.photographs import photographs_in, photographs_sha256
+from octasplat.engine.poses.photographs import photographs_of_scene, photographs_sha256
 
 _POLL_SECONDS = 0.5
 _HEARTBEAT_SECONDS = 30.0
@@ -44,6 +44,7 @@ def find_poses(
     images: Path,
     output: Path,
     *,
+    names: Sequence[str] | None = None,
     config: PosesConfig = DEFAULT_CONFIG,
     threads: int = 0,
     progress: EventListener = ignore_events,
@@ -60,6 +61,7 @@ def find_poses(
         images: folder of photographs, also in folders below it if it is called ``images``.
         output: becomes the folder of the COLMAP model, with ``poses.json`` beside its files. What is needed
             on the way lies in a hidden folder next to it and is removed.
+        names: of the photographs, relative to ``images``; None takes all.
         config: settings.
         threads: to use; 0 means all cores.
         progress: hears the progress.
@@ -71,7 +73,8 @@ def find_poses(
         ColmapCrashError: COLMAP died.
         CancelledError: stopped as asked.
     """
-    names = photographs_in(images)
+    if names is None:
+        names = photographs_of_scene(images)
     sha256 = photographs_sha256(images, names)
     if output.is_dir():
         if read_pose_record(output).get("photographs_sha256", sha256) != sha256:

@@ -11,7 +11,7 @@ from typing import Any
 
 import pycolmap
 
-from octasplat.engine.poses.config import MIN_PHOTOGRAPHS
+from octasplat.engine.core.scene_layout import MIN_PHOTOGRAPHS
 
 OnCount = Callable[[int], None]
 

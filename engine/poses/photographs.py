@@ -1,66 +1,61 @@
 """Which files of a folder are photographs to find poses for."""
 
 import hashlib
-import os
 from collections.abc import Sequence
 from pathlib import Path
 
 from octasplat.engine.core.errors import DatasetError
 from octasplat.engine.core.scene_layout import (
-    FileRole,
-    file_role,
+    IMAGES,
+    SceneLayout,
     is_ignored_file,
-    is_photograph,
     lay_out_scene,
-    left_out_sentences,
+    masks_beside,
+    too_few_photographs,
 )
-from octasplat.engine.dataset.masks import masks_beside
-from octasplat.engine.dataset.results_among import is_run_folder
-from octasplat.engine.poses.config import MIN_PHOTOGRAPHS
+from octasplat.engine.dataset.load import image_folder
 
 
-def photographs_in(folder: Path) -> list[str]:
-    """Names of the photographs that poses can be found for, relative to ``folder``, in folders below it too.
+def locate_scene(folder: Path) -> Path:
+    """Return the scene that ``folder`` is, or the one below it where there is nothing beside that."""
+    inner = folder / _layout_of(folder).folder
+    return inner if image_folder(inner) != inner else folder
+
+
+def photographs_of_scene(scene: Path) -> list[str]:
+    """Return the names of a scene's photographs, relative to its folder of photographs.
 
     Results of a run among them are no photographs, nor are masks: those in a folder ``masks``, and those
     beside photographs, as ``a_mask.png`` of ``a.jpg``.
 
     Raises:
-        DatasetError: there are fewer than three.
+        DatasetError: it is no folder, or there are fewer than three; the text names what is left out.
     """
-    files = _files_below(folder)
-    names = [name for name in files if is_photograph(name)]
-    masks = masks_beside(names)
-    names = [name for name in names if name not in masks]
-    if len(names) < MIN_PHOTOGRAPHS:
-        unread = left_out_sentences([name for name in files if not is_photograph(name)])
-        formats = (
-            f"{folder} holds {len(names)} photographs that poses can be found for (JPEG, PNG, TIFF, BMP, ...)"
-        )
-        raise DatasetError(" ".join((f"{formats}; at least {MIN_PHOTOGRAPHS} are needed.", *unread)))
+    if not scene.is_dir():
+        raise DatasetError(f"{scene} is not a folder; name the folder that holds the photographs.")
+    layout, folder = _layout_of(scene), image_folder(scene)
+    images = {name: path for name, path in layout.files.items() if name.startswith(IMAGES)}
+    masks = masks_beside(images)
+    names = sorted(
+        (scene / path).relative_to(folder).as_posix() for name, path in images.items() if name not in masks
+    )
+    if (fault := too_few_photographs(len(names))) is not None:
+        raise DatasetError(" ".join((fault, *layout.notes)))
     return names
 
 
-def left_out_of_search(scene: Path) -> tuple[str, ...]:
-    """Return sentences on the files of a scene that no poses are looked for.
+def left_out_of_scene(scene: Path) -> tuple[str, ...]:
+    """Return sentences on the files of a folder that are no part of its scene."""
+    return _layout_of(scene).notes
 
-    Raises:
-        DatasetError: a folder below it is the scene, with a model of its own.
-    """
-    layout = lay_out_scene(_files_below(scene))
-    if layout.folder and any(file_role(name) is FileRole.MODEL for name in layout.files):
-        raise DatasetError(
-            f"{scene} holds a scene with a COLMAP model; name {scene / layout.folder} instead."
-        )
-    return left_out_sentences(layout.left_out)
+
+def _layout_of(scene: Path) -> SceneLayout:
+    return lay_out_scene(_files_below(scene))
 
 
 def _files_below(folder: Path) -> list[str]:
-    """Return files by their paths below ``folder``, sorted, without hidden ones and results of runs."""
-    found: list[str] = []
-    for parent, folders, names in os.walk(folder):
-        folders[:] = [name for name in folders if not is_run_folder(Path(parent) / name)]
-        found += ((Path(parent) / name).relative_to(folder).as_posix() for name in names)
+    """Return files by their paths below ``folder``, sorted, without hidden ones."""
+    found = (path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file())
     return sorted(name for name in found if not is_ignored_file(name))
 
 

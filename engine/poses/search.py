@@ -10,6 +10,7 @@ import pycolmap
 
 from octasplat.engine.core.errors import DatasetError
 from octasplat.engine.core.events import EventListener, Warned
+from octasplat.engine.core.scene_layout import MIN_PHOTOGRAPHS
 from octasplat.engine.core.writing import write_json
 from octasplat.engine.dataset.image_info import ImageInfo
 from octasplat.engine.dataset.images import read_image_info
@@ -19,7 +20,6 @@ from octasplat.engine.poses.config import (
     MAPPING_STAGE,
     MATCHES,
     MAX_REPROJECTION_PX,
-    MIN_PHOTOGRAPHS,
     MIN_POINTS,
     RECORD_FILE,
     RETRY_BELOW_SHARE,

@@ -1,6 +1,6 @@
 """Poses of a run: found where there are none, and checked where they are given."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from octasplat.engine.core.errors import ColmapCrashError, DatasetError
@@ -18,7 +18,7 @@ from octasplat.engine.poses import (
 )
 from octasplat.engine.poses.find_poses import read_pose_record
 from octasplat.engine.poses.photograph_check import check_photographs_decode
-from octasplat.engine.poses.photographs import left_out_of_search, photographs_in
+from octasplat.engine.poses.photographs import photographs_of_scene
 from octasplat.engine.runs.config import ReconstructionConfig
 from octasplat.engine.runs.run_folder import POSES, found_model_folder
 from octasplat.engine.train.config import iteration_count
@@ -46,26 +46,30 @@ def find_missing_poses(
     """
     if config.poses == "given" or (config.poses == "missing" and has_colmap_model(scene)):
         return
-    if not scene.is_dir():
-        raise DatasetError(f"{scene} is not a folder; name the folder that holds the photographs.")
-    folder = image_folder(scene)
+    names = photographs_of_scene(scene)
     if not (output / POSES).is_dir():
-        for sentence in left_out_of_search(scene):
-            progress(Warned(sentence))
-        _refuse_before_search(scene, folder, config, threads)
-    find_poses(folder, output / POSES, threads=threads, progress=progress, should_stop=should_stop)
+        _refuse_before_search(scene, names, config, threads)
+    find_poses(
+        image_folder(scene),
+        output / POSES,
+        names=names,
+        threads=threads,
+        progress=progress,
+        should_stop=should_stop,
+    )
 
 
-def _refuse_before_search(scene: Path, folder: Path, config: ReconstructionConfig, threads: int) -> None:
+def _refuse_before_search(
+    scene: Path, names: Sequence[str], config: ReconstructionConfig, threads: int
+) -> None:
     """Refuse photographs and settings that the dataset would refuse after the search, which takes long."""
-    names = photographs_in(folder)
     split_views(names, config.test_every, config.held_out, source_name="photographs")
     if config.masks == "alpha" and not (scene / "masks").is_dir():
         raise DatasetError(
             f"Masks are to be the alpha, but there is no folder {scene / 'masks'}; put them there (as "
             f"{names[0]}.png) or leave --masks alpha out."
         )
-    check_photographs_decode(folder, names, threads=threads)
+    check_photographs_decode(image_folder(scene), names, threads=threads)
 
 
 def repair_run_poses(

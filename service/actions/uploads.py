@@ -64,10 +64,11 @@ class StoredFile:
 
 @dataclass(frozen=True)
 class StoredArchive:
-    """Files that came out of an archive, and names of those that are no part of a scene."""
+    """Files that came out of an archive, names of those that are left out, and sentences on them."""
 
     files: list[DatasetFile]
-    ignored: tuple[str, ...]
+    left_out: tuple[str, ...]
+    notes: tuple[str, ...]
 
 
 async def list_files(
@@ -197,7 +198,7 @@ async def put_archive(
     async with service.evictor.upload_lease(upload.size_bytes) as note:
         received = await _limited_by_quota(receive, left)
         files = await _record_files(service, dataset, note, received.files)
-    return StoredArchive(files, received.left_out)
+    return StoredArchive(files, received.left_out, received.notes)
 
 
 def _is_stored(storage: Storage, file: DatasetFile) -> bool:

@@ -1,8 +1,9 @@
 """Taking a scene out of a ZIP archive from somebody who may mean harm.
 
 Everything is checked before the first byte is written, and counted again while writing. What is odd is
-refused, never mended. Nothing is written under the names in the archive: contents go to the store by digest,
-and names stay data. Only ZIP is taken: the safe part of tar would hold nothing that ZIP does not.
+refused, never mended; what is no part of a scene is left out unseen. Nothing is written under the names in
+the archive: contents go to the store by digest, and names stay data. Only ZIP is taken: the safe part of tar
+would hold nothing that ZIP does not.
 """
 
 import stat
@@ -11,7 +12,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import BinaryIO
 
-from octasplat.engine.core.scene_layout import FileRole, file_role, is_ignored_file, lay_out_scene
+from octasplat.engine.core.scene_layout import FileRole, file_role, lay_out_scene
 from octasplat.service.intake.upload_names import FileNames
 from octasplat.service.intake.zip_records import (
     DEFLATED,
@@ -20,22 +21,23 @@ from octasplat.service.intake.zip_records import (
     STORED,
     ZipEntry,
     raise_intake_error,
+    read_listed_records,
     read_records,
 )
 from octasplat.workers.storage.file_names import FileNameError, check_name, quoted_name
 from octasplat.workers.storage.protocol import Blob, BlobWriter
 
 _PIECE_BYTES = 1 << 20
-_NESTED_SUFFIXES = (
-    ".zip", ".tar", ".gz", ".tgz", ".bz2", ".tbz2", ".xz", ".txz", ".lzma", ".zst", ".7z", ".rar", ".jar",
-    ".cab", ".iso", ".lz4", ".z", ".cbz", ".apk", ".whl",
-)  # fmt: skip
 _MAGIC_NUMBERS = (
     (b"PK\x03\x04", 0, "zip"), (b"PK\x05\x06", 0, "zip"), (b"\x1f\x8b\x08", 0, "gzip"), (b"BZh", 0, "bzip2"),
     (b"\xfd7zXZ\x00", 0, "xz"), (b"7z\xbc\xaf\x27\x1c", 0, "7z"), (b"Rar!\x1a\x07", 0, "rar"),
     (b"\x28\xb5\x2f\xfd", 0, "zstd"), (b"\x04\x22\x4d\x18", 0, "lz4"), (b"MSCF", 0, "cab"),
     (b"ustar", 257, "tar"),
 )  # fmt: skip
+_LEADING_ELSEWHERE = frozenset(
+    {"name-empty", "name-empty-part", "name-traversal", "name-absolute", "name-drive", "name-unc", "name-nul"}
+)
+"""Why names are refused even where their files are left out."""
 
 
 @dataclass(frozen=True)
@@ -79,11 +81,13 @@ class ArchiveListing:
     Attributes:
         files: parts of a scene, in the order of the archive.
         left_out: names of files that are no part of one.
+        notes: sentences on them, but for what file managers leave behind.
         folder: the folder that holds everything and is not part of the names, or an empty text.
     """
 
     files: tuple[ArchiveFile, ...]
     left_out: tuple[str, ...]
+    notes: tuple[str, ...]
     folder: str
 
     @property
@@ -116,20 +120,23 @@ def list_archive(file: BinaryIO, limits: ArchiveLimits = ArchiveLimits()) -> Arc
     records = read_records(
         file, max_entries=limits.max_entries, max_directory_bytes=limits.max_directory_bytes
     )
-    records = _with_forward_slashes(records)
-    names = FileNames()
-    for record in records:
-        _check_entry(record)
-        if not is_ignored_file(record.name):  # what will be left out anyway needs no portable name
-            names.add(record.name)
-        _check_size(record, limits)
-    total = sum(record.size_bytes for record in records)
-    if total > limits.max_total_bytes:
-        raise_intake_error(
-            "archive-too-large",
-            f"The archive unpacks to {total} bytes; {limits.max_total_bytes} are allowed.",
-        )
-    return _scene_listing([record for record in records if not record.name.endswith("/")])
+    listing = _scene_listing(records, limits)
+    if not listing.files:
+        nothing = "The archive holds no part of a scene; put photographs into it."
+        raise_intake_error("archive-empty", " ".join((nothing, *listing.notes)))
+    return listing
+
+
+def list_archive_end(file: BinaryIO, limits: ArchiveLimits = ArchiveLimits()) -> ArchiveListing:
+    """Return what an archive holds by the list at its end, the only part of ``file`` that is read.
+
+    Raises:
+        IntakeError: as by :func:`list_archive`, which looks at the rest as well.
+    """
+    records = read_listed_records(
+        file, max_entries=limits.max_entries, max_directory_bytes=limits.max_directory_bytes
+    )
+    return _scene_listing(records, limits)
 
 
 def unpack_archive(
@@ -186,11 +193,8 @@ def _check_entry(record: ZipEntry) -> None:
     form = stat.S_IFMT(record.unix_mode)
     if form == stat.S_IFLNK:
         raise_intake_error("archive-link", f"{name} is a link; send the file itself.", record.name)
-    is_folder = record.name.endswith("/")
-    if form not in (0, stat.S_IFDIR if is_folder else stat.S_IFREG):
-        raise_intake_error(
-            "archive-special-file", f"{name} is neither a regular file nor a folder.", record.name
-        )
+    if form not in (0, stat.S_IFREG):
+        raise_intake_error("archive-special-file", f"{name} is not a regular file.", record.name)
     if record.flags & (IS_ENCRYPTED | IS_STRONG):
         raise_intake_error(
             "archive-encrypted", f"{name} is encrypted; send the archive without a password.", record.name
@@ -200,12 +204,6 @@ def _check_entry(record: ZipEntry) -> None:
             "archive-method",
             f"{name} is packed by the method {record.method}; pack it with deflate or without compression.",
             record.name,
-        )
-    if is_folder and (record.size_bytes or record.packed_bytes > 2):
-        raise_intake_error("archive-mismatch", f"The folder {name} has a content.", record.name)
-    if record.name.lower().endswith(_NESTED_SUFFIXES):
-        raise_intake_error(
-            "archive-nested", f"{name} is an archive inside the archive; unpack it first.", record.name
         )
 
 
@@ -229,13 +227,44 @@ def _check_size(record: ZipEntry, limits: ArchiveLimits) -> None:
         )
 
 
-def _scene_listing(records: list[ZipEntry]) -> ArchiveListing:
-    by_path = {record.name: record for record in records}
+def _scene_listing(records: list[ZipEntry], limits: ArchiveLimits) -> ArchiveListing:
+    """Lay out the entries as a scene; what is left out is only looked at for names that lead elsewhere."""
+    by_path: dict[str, ZipEntry] = {}
+    taken_names = FileNames()
+    for record in _with_forward_slashes(records):
+        _check_place(record)
+        if record.name in by_path:
+            detail = f"The file name {quoted_name(record.name)} occurs twice."
+            raise_intake_error("name-duplicate", detail, record.name)
+        if not record.name.endswith("/"):
+            by_path[record.name] = record
     layout = lay_out_scene(list(by_path))
-    if not layout.files:
-        raise_intake_error("archive-empty", "The archive holds no part of a scene; put photographs into it.")
+    for name, path in layout.files.items():
+        _check_entry(by_path[path])
+        _check_size(by_path[path], limits)
+        taken_names.add(name)
     files = tuple(ArchiveFile(name, by_path[path]) for name, path in layout.files.items())
-    return ArchiveListing(files, (*layout.left_out, *layout.ignored), layout.folder)
+    left_out = (*layout.left_out, *layout.ignored)
+    listing = ArchiveListing(files, left_out, layout.notes, layout.folder)
+    if listing.size_bytes > limits.max_total_bytes:
+        raise_intake_error(
+            "archive-too-large",
+            f"The archive unpacks to {listing.size_bytes} bytes; {limits.max_total_bytes} are allowed.",
+        )
+    return listing
+
+
+def _check_place(record: ZipEntry) -> None:
+    """Refuse a name that may lead elsewhere, whatever the entry is, and a folder with a content."""
+    try:
+        check_name(record.name.removesuffix("/"))
+    except FileNameError as error:
+        if error.code in _LEADING_ELSEWHERE:
+            raise_intake_error(error.code, str(error), record.name)
+    if record.name.endswith("/") and (record.size_bytes or record.packed_bytes > 2):
+        raise_intake_error(
+            "archive-mismatch", f"The folder {quoted_name(record.name)} has a content.", record.name
+        )
 
 
 def _copy_entry(file: BinaryIO, entry: ArchiveFile, writer: BlobWriter) -> None:

@@ -1,14 +1,14 @@
 """Is this a scene? Checks of single files as they arrive, and of the whole when it is committed."""
 
 import unicodedata
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 
-from octasplat.engine.core.scene_layout import FileRole, file_role
+from octasplat.engine.core.scene_layout import IMAGES, FileRole, file_role, masks_beside, too_few_photographs
 from octasplat.service.intake.faults import IntakeError, IntakeFault
 from octasplat.service.intake.image_completeness import check_complete
 from octasplat.service.intake.images import ImageHeader, ImageLimits, read_image_header
-from octasplat.service.intake.model_check import MIN_VIEWS, ModelLimits, check_model
+from octasplat.service.intake.model_check import ModelLimits, check_model
 from octasplat.service.intake.model_child import ModelAnswer
 from octasplat.service.intake.upload_names import FileNames, check_scene_file
 from octasplat.workers.storage.file_names import quoted_name
@@ -118,17 +118,10 @@ def check_dataset(
     if faults:
         raise IntakeError(*faults[:_MAX_FAULTS])
     sizes = _image_sizes(storage, files, limits.image, faults, warnings)
-    photographs = {path.removeprefix("images/"): s for path, s in sizes.items() if path.startswith("images/")}
-    count = sum(file_role(file.path) is FileRole.IMAGE for file in files)
-    if not MIN_VIEWS <= count <= limits.max_photographs:
-        wanted = (
-            f"at least {MIN_VIEWS} are needed"
-            if count < MIN_VIEWS
-            else f"{limits.max_photographs} are allowed"
-        )
-        faults.append(
-            IntakeFault("dataset-photographs", f"There are {count} photographs in images/; {wanted}.")
-        )
+    names = photographs_among(file.path for file in files)
+    photographs = {name.removeprefix(IMAGES): sizes[name] for name in names if name in sizes}
+    if (fault := photograph_count_fault(len(names), limits.max_photographs)) is not None:
+        faults.append(fault)
     masks = _check_masks(files, sizes, faults, warnings)
     model = [
         TreeFile(path=file.path, sha256=file.sha256, size_bytes=file.size_bytes)
@@ -143,7 +136,7 @@ def check_dataset(
     if faults:
         raise IntakeError(*faults[:_MAX_FAULTS])
     return DatasetSummary(
-        photographs=count,
+        photographs=len(names),
         pixels=sum(width * height for width, height in photographs.values()),
         size_bytes=sum(file.size_bytes for file in files),
         masks=masks,
@@ -154,6 +147,21 @@ def check_dataset(
         points=answer.points,
         warnings=tuple(warnings),
     )
+
+
+def photographs_among(names: Iterable[str]) -> list[str]:
+    """Return which files of a dataset are photographs: masks that lie beside them are none."""
+    images = [name for name in names if file_role(name) is FileRole.IMAGE]
+    masks = masks_beside(images)
+    return [name for name in images if name not in masks]
+
+
+def photograph_count_fault(count: int, limit: int) -> IntakeFault | None:
+    """Return what is wrong with so many photographs; None where they can be taken."""
+    if count > limit:
+        return IntakeFault("dataset-photographs", f"There are {count} photographs; {limit} are allowed.")
+    sentence = too_few_photographs(count)
+    return None if sentence is None else IntakeFault("dataset-photographs", sentence)
 
 
 def _check_file_names(files: Sequence[DatasetFile], faults: list[IntakeFault]) -> None:
@@ -223,4 +231,4 @@ def _check_masks(
         warnings.append(
             f"{alone} masks belong to no photograph; a mask is named like its photograph with .png added."
         )
-    return len(masks) - alone
+    return len(masks) - alone + len(masks_beside(path for path in sizes if path.startswith(IMAGES)))

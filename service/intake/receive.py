@@ -9,7 +9,13 @@ from collections.abc import AsyncIterator, Callable, Mapping
 from dataclasses import dataclass, field
 from typing import BinaryIO
 
-from octasplat.service.intake.archive import ArchiveFile, ArchiveLimits, list_archive, unpack_archive
+from octasplat.service.intake.archive import (
+    ArchiveFile,
+    ArchiveLimits,
+    ArchiveListing,
+    list_archive,
+    unpack_archive,
+)
 from octasplat.service.intake.dataset import DatasetLimits, check_file_content
 from octasplat.service.intake.faults import IntakeError, IntakeFault
 from octasplat.service.intake.images import ImageHeader, ImageLimits
@@ -46,11 +52,13 @@ class ReceivedArchive:
     Attributes:
         files: its files, stored and checked one by one.
         left_out: names of files that are no part of a scene.
+        notes: sentences on them.
         size_bytes: length of the archive.
     """
 
     files: tuple[ReceivedFile, ...]
     left_out: tuple[str, ...]
+    notes: tuple[str, ...]
     size_bytes: int
 
 
@@ -211,10 +219,10 @@ async def receive_archive(
         file = tempfile.TemporaryFile(dir=spool.folder)  # noqa: SIM115 - closed below
     with file, _SpoolWriter(file, spool, storage, sha256, size_bytes, most) as writer:
         blob = await receive_body(stream, writer, idle_seconds=limits.idle_seconds)
-        files, left_out = await run_in_pool(
+        files, listing = await run_in_pool(
             ThreadPurpose.UNPACKING, _unpack_archive, storage, file, limits, max_bytes
         )
-    return ReceivedArchive(files, left_out, blob.size_bytes)
+    return ReceivedArchive(files, listing.left_out, listing.notes, blob.size_bytes)
 
 
 def header_facts(header: ImageHeader | None) -> dict[str, str | int | None]:
@@ -231,7 +239,7 @@ def header_facts(header: ImageHeader | None) -> dict[str, str | int | None]:
 
 def _unpack_archive(
     storage: Storage, file: BinaryIO, limits: UploadLimits, max_bytes: int | None
-) -> tuple[tuple[ReceivedFile, ...], tuple[str, ...]]:
+) -> tuple[tuple[ReceivedFile, ...], ArchiveListing]:
     listing = list_archive(file, limits.archive)
     if max_bytes is not None and listing.size_bytes > max_bytes:
         detail = f"The archive unpacks to {listing.size_bytes} bytes; {max_bytes} are left of your quota."
@@ -247,7 +255,7 @@ def _unpack_archive(
         files.append(ReceivedFile(entry.name, blob, header_facts(header)))
 
     unpack_archive(file, listing, begin, on_file)
-    return tuple(files), listing.left_out
+    return tuple(files), listing
 
 
 class _SpoolWriter(VerifyingWriter):

@@ -82,6 +82,27 @@ def read_records(file: BinaryIO, *, max_entries: int, max_directory_bytes: int) 
     Raises:
         IntakeError: with a code that begins with ``archive-`` or ``name-``.
     """
+    entries, directory_start = _read_directory(file, max_entries, max_directory_bytes)
+    records = [_with_local_header(file, *entry) for entry in entries]
+    records.sort(key=lambda record: record.header_start)
+    _check_coverage(file, records, directory_start)
+    return records
+
+
+def read_listed_records(file: BinaryIO, *, max_entries: int, max_directory_bytes: int) -> list[ZipEntry]:
+    """Return the entries that the list at the end of a ZIP file names, without ``data_start``.
+
+    Nothing before that list is read, so that the end of an archive is enough. Arguments and errors are those
+    of :func:`read_records`.
+    """
+    entries, _ = _read_directory(file, max_entries, max_directory_bytes)
+    return sorted((record for record, _ in entries), key=lambda record: record.header_start)
+
+
+def _read_directory(
+    file: BinaryIO, max_entries: int, max_directory_bytes: int
+) -> tuple[list[tuple[ZipEntry, bytes]], int]:
+    """Return records without ``data_start``, with their names as bytes, and where their list begins."""
     length = file.seek(0, os.SEEK_END)
     end = _read_end(file, length)
     if end.entries > max_entries:
@@ -102,10 +123,7 @@ def read_records(file: BinaryIO, *, max_entries: int, max_directory_bytes: int) 
         raise_intake_error(
             "archive-ambiguous", "The archive has two end records; write it anew without a comment."
         )
-    records = [_with_local_header(file, *entry) for entry in _central_entries(directory, end.entries)]
-    records.sort(key=lambda record: record.header_start)
-    _check_coverage(file, records, end.directory_start)
-    return records
+    return _central_entries(directory, end.entries), end.directory_start
 
 
 def _read_end(file: BinaryIO, length: int) -> _EndRecord:

@@ -152,7 +152,9 @@ async def put_archive(
     """Send a whole scene as a ZIP file; its files join those that are there."""
     archive = await uploads.put_archive(service, who, dataset_id, _upload(request, digest))
     return ArchiveView(
-        files=[FileView.from_row(row) for row in archive.files], left_out=list(archive.ignored)
+        files=[FileView.from_row(row) for row in archive.files],
+        left_out=list(archive.left_out),
+        notes=list(archive.notes),
     )
 
 

@@ -121,3 +121,4 @@ class ArchiveView(BaseModel):
 
     files: list[FileView]
     left_out: list[str] = Field(description="Files that are no part of a scene.")
+    notes: list[str] = Field(description="Sentences on what is left out, with the way out.")

@@ -183,7 +183,6 @@ async def show_new(
         chosen=dataset,
         queues=sorted({"cpu", *(queue for worker in workers for queue in worker.queues)} - {""}),
         max_file_bytes=service.settings.max_upload_bytes,
-        max_archive_bytes=service.settings.max_archive_bytes,
     )
 
 

@@ -10,7 +10,7 @@ import pycolmap
 import pytest
 from PIL import Image
 
-from octasplat.engine.poses.photographs import photographs_in
+from octasplat.engine.poses.photographs import photographs_of_scene
 from tests.support.neighbouring_photographs import write_neighbours
 
 PATCH_TOO_LARGE = ("--set", "ssim_patch_side=64", "--set", "loss.ssim=0.2", "--max-side", "32")
@@ -128,7 +128,7 @@ def test_run_inside_images_folder_resumes(posed_copy, octasplat, tiny):
     assert (output / "renders").is_dir()
     again = octasplat("reconstruct", posed_copy, "-o", output, "--resume")
     assert again.exit_code == 0 and "have no pose" not in again.stderr, again.stderr
-    assert all("run/" not in name for name in photographs_in(posed_copy / "images"))
+    assert all("run/" not in name for name in photographs_of_scene(posed_copy / "images"))
 
 
 def test_names_to_hold_out_are_compared_however_an_umlaut_is_spelt(posed_copy, octasplat, tmp_path, tiny):

@@ -1,15 +1,40 @@
 """What of a folder or an archive is a scene: the same at every door."""
 
+import functools
 import io
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from PIL import Image
 
-from octasplat.engine.core.scene_layout import lay_out_scene, left_out_sentences
+from octasplat.engine.core.errors import DatasetError
+from octasplat.engine.core.events import Event, Warned
+from octasplat.engine.core.scene_layout import (
+    MIN_PHOTOGRAPHS,
+    lay_out_scene,
+    left_out_sentences,
+    masks_beside,
+)
 from octasplat.engine.dataset.colmap_model import find_colmap_model_folder
-from octasplat.engine.poses.photographs import left_out_of_search, photographs_in
+from octasplat.engine.dataset.load import image_folder
+from octasplat.engine.operations.estimate import EstimateRequest
+from octasplat.engine.operations.estimate import run as estimate
+from octasplat.engine.poses.photographs import left_out_of_scene, locate_scene, photographs_of_scene
 from octasplat.service.intake.archive import list_archive
-from octasplat.workers.client.upload import list_scene_files
+from octasplat.service.intake.faults import IntakeError
+from octasplat.service.intake.receive import UploadLimits
+from octasplat.service.intake.scene_preview import (
+    ArchiveEndTooShortError,
+    ListedFile,
+    ScenePreview,
+    preview_archive,
+    preview_files,
+)
 from tests.support.zip_builder import ZipMember, build_zip
 
 PHOTOGRAPHS = ("a.jpg", "b.JPG", "c.webp")
@@ -24,24 +49,139 @@ FOLDERS = {
     "masks": ((*PHOTOGRAPHS, "masks/a.jpg.png"), PHOTOGRAPHS),
     "run": ((*PHOTOGRAPHS, "run/config.json", "run/events.jsonl", "run/renders/x.png"), PHOTOGRAPHS),
     "input": ((*(f"input/{name}" for name in PHOTOGRAPHS), "other/x.jpg"), PHOTOGRAPHS),
+    "images without photographs": ((*PHOTOGRAPHS, "images/readme.txt"), PHOTOGRAPHS),
+    "scene in a folder": ((*(f"fox/images/{name}" for name in PHOTOGRAPHS), "fox/x.md"), PHOTOGRAPHS),
+    "archive inside": ((*PHOTOGRAPHS, "more.zip"), PHOTOGRAPHS),
 }
+LIMITS = UploadLimits()
+
+
+@dataclass(frozen=True)
+class Told:
+    """What a door says: the photographs that are taken, the notes on the others, and the refusals."""
+
+    photographs: frozenset[str]
+    notes: tuple[str, ...]
+    refusals: tuple[str, ...]
+
+
+def by_preview(preview: ScenePreview) -> Told:
+    images = {file.name: file.path for file in preview.files if file.name.startswith("images/")}
+    masks = masks_beside(images)
+    photographs = frozenset(path for name, path in images.items() if name not in masks)
+    assert len(photographs) == preview.photographs
+    return Told(photographs, preview.notes, tuple(fault.detail for fault in preview.faults))
+
+
+def by_folder(paths: Sequence[str]) -> Told:
+    return by_preview(preview_files([ListedFile(path, 1) for path in paths], LIMITS))
+
+
+def by_archive(paths: Sequence[str]) -> Told:
+    data = build_zip(*(ZipMember(path, b"x") for path in paths))
+    preview = preview_archive(data[-20_000:], len(data), LIMITS)
+    listing = list_archive(io.BytesIO(data))
+    assert {file.name for file in listing.files} == {file.name for file in preview.files}
+    assert listing.notes == preview.notes and set(listing.left_out) == set(preview.left_out)
+    return by_preview(preview)
+
+
+def by_run(folder: Path) -> Told:
+    """What ``reconstruct`` says before it looks for poses."""
+    scene = locate_scene(folder)
+    notes = left_out_of_scene(scene)
+    try:
+        names = photographs_of_scene(scene)
+    except DatasetError as error:
+        refusal = str(error).removesuffix(" ".join(("", *notes)))
+        return Told(frozenset(), notes, (refusal,))
+    paths = (image_folder(scene) / name for name in names)
+    return Told(frozenset(path.relative_to(folder).as_posix() for path in paths), notes, ())
+
+
+def by_estimate(folder: Path) -> Told:
+    events: list[Event] = []
+    try:
+        found = estimate(EstimateRequest(source=folder), progress=events.append)
+    except DatasetError as error:
+        notes = tuple(event.message for event in events if isinstance(event, Warned))
+        return Told(frozenset(), notes, (str(error).removesuffix(" ".join(("", *notes))),))
+    notes = tuple(event.message for event in events if isinstance(event, Warned))
+    count = sum(sizes.count for sizes in found.photographs)
+    return Told(frozenset(map(str, range(count))), notes, ())
+
+
+@functools.cache
+def content(suffix: str) -> bytes:
+    """Return the bytes of a small image in the format of a suffix; of others, something."""
+    kind = {".jpg": "JPEG", ".png": "PNG", ".webp": "WEBP", ".tif": "TIFF"}.get(suffix)
+    if kind is None:
+        return b"x"
+    file = io.BytesIO()
+    Image.new("RGB", (8, 6)).save(file, kind)
+    return file.getvalue()
+
+
+def write_files(folder: Path, paths: Sequence[str]) -> None:
+    for path in paths:
+        place = folder / path
+        place.parent.mkdir(parents=True, exist_ok=True)
+        place.write_bytes(content(place.suffix.lower()))
 
 
 @pytest.mark.parametrize("kind", FOLDERS)
 def test_folder_archive_and_search_take_the_same_photographs(kind: str, tmp_path: Path) -> None:
     paths, expected = FOLDERS[kind]
-    for path in paths:
-        (tmp_path / path).parent.mkdir(parents=True, exist_ok=True)
-        (tmp_path / path).write_bytes(b"x")
-    sent, told = list_scene_files(tmp_path)
-    listing = list_archive(io.BytesIO(build_zip(*(ZipMember(path, b"x") for path in paths))))
-    photographs = {f"images/{name}" for name in expected}
-    assert {file.name for file in sent if file.name.startswith("images/")} == photographs
-    assert {file.name for file in listing.files} == {file.name for file in sent}
-    searched = photographs_in(tmp_path / "input" if kind == "input" else tmp_path)
-    assert {Path(name).name for name in searched} == {Path(name).name for name in expected}
-    if kind != "run":
-        assert left_out_of_search(tmp_path) == told
+    write_files(tmp_path, paths)
+    told = by_folder(paths)
+    assert told == by_archive(paths) == by_run(tmp_path)
+    names = {file.name for file in preview_files([ListedFile(path, 1) for path in paths], LIMITS).files}
+    assert {name for name in names if name.startswith("images/")} == {f"images/{name}" for name in expected}
+
+
+PICTURES = st.sampled_from(
+    ["a.jpg", "b.JPG", "c.png", "d.webp", "e.tif", "a_mask.png", "n ä.jpg", "f.HEIC", "g.dng", "h.gif"]
+)
+CLUTTER = st.sampled_from(
+    ["clip.MOV", "gcp_list.txt", "project.ini", "points3D.ply", "transforms.json", "photos.zip", "x.MRK"]
+)
+HIDDEN = st.sampled_from([".DS_Store", "Thumbs.db", "Icon\r", "question?.txt", "back\\slash.txt"])
+RECORDS = st.sampled_from(
+    ["cameras.bin", "images.bin", "points3D.bin", "images.txt", "config.json", "events.jsonl"]
+)
+NAMES = PICTURES | CLUTTER | HIDDEN | RECORDS
+PHOTO_PLACES = st.sampled_from(
+    ["", "images/", "images/left/", "images/masks/", "input/", "masks/", "DCIM/100MEDIA/", "fox/images/"]
+)
+MODEL_PLACES = st.sampled_from(
+    ["sparse/", "sparse/0/", "sparse/1/", "colmap/sparse/0/", "distorted/sparse/0/", "dense/0/", "run/"]
+)
+PLACES = PHOTO_PLACES | MODEL_PLACES | st.sampled_from(["fox/sparse/0/", "photos/"])
+PATHS = st.builds(str.__add__, PLACES, NAMES)
+
+
+@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@given(
+    paths=st.lists(PATHS, min_size=1, max_size=14, unique=True),
+    photographs=st.sampled_from(["", "images/", "input/", "DCIM/100MEDIA/"]),
+    count=st.integers(0, 4),
+    outer=st.sampled_from(["", "", "capture/", "a/b/"]),
+)
+def test_all_doors_take_leave_out_and_refuse_the_same(
+    paths: list[str], photographs: str, count: int, outer: str
+) -> None:
+    paths += [f"{photographs}view_{number}.png" for number in range(count)]
+    paths = [outer + path for path in paths]
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        write_files(folder, paths)
+        told = by_folder(paths)
+        assert told == by_archive(paths)
+        run, estimated = by_run(folder), by_estimate(folder)
+    assert (run.notes, run.refusals) == (told.notes, told.refusals) == (estimated.notes, estimated.refusals)
+    assert bool(told.refusals) == (len(told.photographs) < MIN_PHOTOGRAPHS)
+    if not told.refusals:
+        assert run.photographs == told.photographs and len(estimated.photographs) == len(told.photographs)
 
 
 def test_files_left_out_are_told_by_kind_with_the_way_out() -> None:
@@ -52,6 +192,41 @@ def test_files_left_out_are_told_by_kind_with_the_way_out() -> None:
     assert "1 files look like photographs" in told[0] and "images/b.HEIC" in told[0] and "convert" in told[0]
     assert "c.jpg" in told[1] and "v.MOV" in told[2] and "transforms.json" in told[3]
     assert "sparse/0/project.ini" in told[4] and len(told) == 5
+
+
+@pytest.mark.parametrize("name", ["images/a?.jpg", "images/con.jpg", "images/a.jpg ./b.jpg"])
+def test_photographs_of_names_that_not_every_system_takes_are_refused_before_they_are_sent(name: str) -> None:
+    paths = [name, "images/b.jpg", "images/c.jpg", "images/d.jpg"]
+    told = by_folder(paths)
+    data = build_zip(*(ZipMember(path, b"x") for path in paths))
+    with pytest.raises(IntakeError) as refused:
+        list_archive(io.BytesIO(data))
+    assert told.refusals == by_preview(preview_archive(data, len(data), LIMITS)).refusals
+    assert told.refusals == (str(refused.value),)
+
+
+def test_files_larger_than_the_service_takes_are_refused_before_they_are_sent() -> None:
+    listed = [ListedFile(f"images/{letter}.jpg", 3_000_000) for letter in "abc"]
+    faults = preview_files(listed, UploadLimits(max_file_bytes=2_000_000)).faults
+    assert [fault.detail for fault in faults] == [
+        f"'images/{letter}.jpg' has 3.0 MB; the service takes 2.0 MB." for letter in "abc"
+    ]
+    (fault,) = preview_archive(b"", 3_000_000, UploadLimits(max_archive_bytes=2_000_000)).faults
+    assert fault.detail == "The archive has 3.0 MB; the service takes 2.0 MB."
+
+
+def test_end_of_an_archive_is_enough_to_tell_what_is_left_out() -> None:
+    data = build_zip(*(ZipMember(f"images/{number:04}.jpg", bytes(5000), method=0) for number in range(300)))
+    whole = preview_archive(data, len(data), LIMITS)
+    sizes, needed = [], 30
+    while True:
+        try:
+            assert preview_archive(data[-needed:], len(data), LIMITS) == whole
+            break
+        except ArchiveEndTooShortError as error:
+            needed = error.needed_bytes
+            sizes.append(needed)
+    assert whole.photographs == 300 and needed < len(data) / 2 and len(sizes) <= 3
 
 
 def test_old_windows_archive_with_backslashes_only_is_taken() -> None:

@@ -6,7 +6,7 @@ import pytest
 from octasplat.engine.core.errors import DatasetError
 from octasplat.engine.dataset import Dataset, load_dataset_model
 from octasplat.engine.dataset.image_names import match_image_names
-from octasplat.engine.poses.photographs import photographs_in
+from octasplat.engine.poses.photographs import photographs_of_scene
 
 
 @pytest.mark.parametrize(
@@ -79,7 +79,7 @@ def test_masks_beside_photographs_are_no_photographs(tmp_path, save_image):
         save_image(tmp_path / f"{index}.jpg", np.zeros((8, 8, 3), dtype=np.uint8))
         save_image(tmp_path / f"{index}_mask.png", np.zeros((8, 8), dtype=np.uint8))
     save_image(tmp_path / "the_mask.png", np.zeros((8, 8, 3), dtype=np.uint8))  # a photograph of a mask
-    assert photographs_in(tmp_path) == ["0.jpg", "1.jpg", "2.jpg", "the_mask.png"]
+    assert photographs_of_scene(tmp_path) == ["0.jpg", "1.jpg", "2.jpg", "the_mask.png"]
 
 
 DISC = np.hypot(*np.mgrid[-12:12, -16:16]) < 9

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from octasplat.engine.core.errors import DatasetError
-from octasplat.engine.core.scene_layout import is_ignored_file, lay_out_scene, left_out_sentences
+from octasplat.engine.core.scene_layout import is_ignored_file
 from octasplat.workers.client.api import Api, ServiceError
 from octasplat.workers.client.backoff import Backoff
 
@@ -22,6 +22,10 @@ MAX_CHECK_WAIT_SECONDS = 600.0
 MAX_DELETED_DATASETS = 30
 """So many datasets of one folder that were deleted are looked past for one that is there."""
 _PIECE_BYTES = 1 << 20
+_ARCHIVE_END_BYTES = 1 << 18
+"""So much of the end of an archive is shown first; it holds the names of a thousand files."""
+_ARCHIVE_END_TRIES = 4
+"""The list of contents may ask for more three times: its end record, that of ZIP64, and itself."""
 
 
 @dataclass(frozen=True)
@@ -33,27 +37,65 @@ class LocalFile:
     size_bytes: int
 
 
-def list_scene_files(scene: Path) -> tuple[list[LocalFile], tuple[str, ...]]:
-    """Return the files of a scene folder that belong to a dataset, by name, and sentences on the others.
+def list_scene_files(
+    api: Api, scene: Path, on_warning: Callable[[str], None] = lambda _sentence: None
+) -> list[LocalFile]:
+    """Return the files of a scene folder that the service takes, by name; what it leaves out is told.
 
     Raises:
-        DatasetError: it is no folder, or holds no photographs.
+        DatasetError: it is no folder, or the service would refuse it.
+        ServiceError: the service cannot be asked.
     """
     if not scene.is_dir():
         raise DatasetError(f"{scene} is not a folder; name the folder that holds images/ and sparse/.")
-    layout = lay_out_scene(
-        [path.relative_to(scene).as_posix() for path in sorted(scene.rglob("*")) if path.is_file()]
-    )
-    told = left_out_sentences(layout.left_out)
-    if not any(name.startswith("images/") for name in layout.files):
-        raise DatasetError(
-            " ".join((f"{scene} holds no photographs; put them into {scene / 'images'}.", *told))
-        )
-    files = [
-        LocalFile(name, scene / path, (scene / path).stat().st_size)
-        for name, path in sorted(layout.files.items())
+    found = (path for path in sorted(scene.rglob("*")) if path.is_file())
+    paths = {_sendable(path.relative_to(scene).as_posix()): path for path in found}
+    listed = [
+        {"path": name, "size_bytes": path.stat().st_size}
+        for name, path in paths.items()
+        if not is_ignored_file(name)
     ]
-    return files, told
+    preview = api.post("/v1/scene-previews", {"files": listed})
+    _tell_preview(scene, preview, on_warning)
+    files = [LocalFile(file["name"], paths[file["path"]], file["size_bytes"]) for file in preview["files"]]
+    for file in files:
+        if _sendable(str(file.path)) != str(file.path):
+            raise DatasetError(f"The name of {str(file.path)!a} is not UTF-8; rename the file.")
+    return files
+
+
+def _sendable(name: str) -> str:
+    """Return a name with what is not UTF-8 in it replaced, as JSON cannot hold it."""
+    return name.encode("utf-8", "surrogateescape").decode("utf-8", "replace")
+
+
+def _preview_archive(api: Api, archive: Path, on_warning: Callable[[str], None]) -> None:
+    """Tell what the service would leave out of a ZIP file, by the list of contents at its end.
+
+    Raises:
+        DatasetError: the service would refuse it.
+    """
+    size, needed = archive.stat().st_size, _ARCHIVE_END_BYTES
+    for _ in range(_ARCHIVE_END_TRIES):
+        with archive.open("rb") as file:
+            file.seek(max(0, size - needed))
+            end = file.read()
+        headers = {"Content-Type": "application/octet-stream"}
+        preview = api.request(
+            "POST", f"/v1/scene-previews/archive?size_bytes={size}", content=end, headers=headers
+        ).json()
+        needed = preview["needed_bytes"]
+        if needed is None or needed <= len(end):
+            break
+    _tell_preview(archive, preview, on_warning)
+
+
+def _tell_preview(scene: Path, preview: Mapping[str, Any], on_warning: Callable[[str], None]) -> None:
+    for sentence in preview["notes"]:
+        on_warning(sentence)
+    if preview["refusals"]:
+        refusals = " ".join(dict.fromkeys(refusal["detail"] for refusal in preview["refusals"]))
+        raise DatasetError(f"{scene} cannot be sent: {refusals}")
 
 
 def upload_scene(
@@ -71,28 +113,25 @@ def upload_scene(
         scene: a folder with ``images/``, a bare folder of photographs, or a ZIP file.
         name: what to call it; by default as the folder.
         progress: told (bytes done, bytes in all).
-        on_warning: told which files are left out, those of a folder before anything is sent.
+        on_warning: told which files are left out, before anything is sent.
 
     Returns:
         The dataset.
 
     Raises:
-        DatasetError: the folder holds nothing to send.
+        DatasetError: the service would refuse the scene, which is not sent.
         ServiceError: the service refuses it; the text names the files.
     """
     is_archive = scene.is_file()
-    told: tuple[str, ...] = ()
     if is_archive:
         files = [LocalFile(scene.name, scene, scene.stat().st_size)]
+        _preview_archive(api, scene, on_warning)
     else:
-        files, told = list_scene_files(scene)
-    for sentence in told:
-        on_warning(sentence)
+        files = list_scene_files(api, scene, on_warning)
     dataset = _find_or_create_dataset(api, name or scene.resolve().stem, files)
     if dataset["state"] == "open":
         if is_archive:
-            for sentence in _send_archive(api, dataset["id"], files[0], progress):
-                on_warning(sentence)
+            _send_archive(api, dataset["id"], files[0], progress)
         else:
             _send_missing(api, dataset["id"], files, progress)
     return _commit(api, dataset)
@@ -193,14 +232,10 @@ def _send_missing(
         job.result()
 
 
-def _send_archive(
-    api: Api, dataset_id: str, file: LocalFile, progress: Callable[[int, int], None]
-) -> tuple[str, ...]:
-    """Send an archive; returns sentences on the files in it that are left out."""
+def _send_archive(api: Api, dataset_id: str, file: LocalFile, progress: Callable[[int, int], None]) -> None:
     progress(0, file.size_bytes)
-    answer = _put_file(api, f"/v1/datasets/{dataset_id}/archive", file.path, _sha256(file.path))
+    _put_file(api, f"/v1/datasets/{dataset_id}/archive", file.path, _sha256(file.path))
     progress(file.size_bytes, file.size_bytes)
-    return left_out_sentences([path for path in answer["left_out"] if not is_ignored_file(path)])
 
 
 def _put_file(api: Api, address: str, path: Path, sha256: str) -> Any:

@@ -9,7 +9,7 @@ import { thousands } from "./numbers.js";
 const form = document.getElementById("new-job");
 const find = (id) => document.getElementById(id);
 const drop = find("drop"), known = find("dataset"), start = find("start"), pause = find("pause"), faults = find("faults");
-let scene = null, upload = null;
+let scene = null, upload = null, choice = 0;
 
 followPreset(form);
 const estimateAnew = showEstimates(form, find("estimate"), () => ({ scene, dataset: known?.value, queue: find("queue")?.value ?? "cpu" }));
@@ -33,17 +33,18 @@ function complain(text, sentences = []) {
     faults.focus();
 }
 
-function choose(found) {
+async function choose(found) {
     faults.hidden = true;
+    const number = ++choice;
     try {
-        scene = sceneOf(found);
-        const largest = scene.archive ? Number(form.dataset.maxArchive) : Number(form.dataset.maxFile);
-        const tooLarge = (scene.archive ? [{ name: scene.archive.name, file: scene.archive }] : scene.files).find(({ file }) => file.size > largest);
-        if (tooLarge) throw new Error(`${tooLarge.name} has ${size(tooLarge.file.size)}; the service takes ${size(largest)}.`);
+        const chosen = await sceneOf(found);
+        if (number !== choice) return; // others have been chosen since
+        scene = chosen;
     } catch (error) {
+        if (number !== choice) return;
         scene = null;
         show();
-        complain(error.message);
+        complain(error.faults ? "This cannot be used as it is:" : error.message, error.faults);
         return;
     }
     if (known) known.value = "";
@@ -58,11 +59,11 @@ function show() {
     const notes = find("chosen-notes");
     notes.replaceChildren();
     if (scene) {
-        const what = scene.archive ? `${scene.archive.name}` : `${thousands(scene.photographs)} photographs${scene.posed ? " and a COLMAP model" : ""}`;
+        const what = `${scene.archive ? `${scene.archive.name}, ` : ""}${thousands(scene.photographs)} photographs${scene.posed ? " and a COLMAP model" : ""}`;
         find("chosen-text").textContent = `${scene.title && !scene.archive ? `${scene.title}: ` : ""}${what}, ${size(scene.bytes)}`;
         const add = (text) => notes.append(Object.assign(document.createElement("li"), { textContent: text }));
-        if (scene.posed === false) add("There is no COLMAP model, so the poses are found first; that takes a while.");
-        if (scene.leftOut.length) add(`Not sent: ${scene.leftOut.slice(0, 4).join(", ")}${scene.leftOut.length > 4 ? ` and ${scene.leftOut.length - 4} more` : ""}.`);
+        if (!scene.posed) add("There is no COLMAP model, so the poses are found first; that takes a while.");
+        scene.notes.forEach(add);
         find("label").placeholder = scene.title || "as the folder";
     }
     start.textContent = known?.value && !scene ? "Start" : "Upload and start";
@@ -92,6 +93,7 @@ document.addEventListener("drop", async (event) => {
     if (!upload) choose(await droppedFiles(event.dataTransfer));
 });
 find("forget").addEventListener("click", () => {
+    choice += 1;
     scene = null;
     show();
     form.querySelectorAll("input[type=file]").forEach((input) => { input.value = ""; });

@@ -1,9 +1,10 @@
-// Which of the files that a user points at belong to a scene, and what they are called there.
+// The files that a user points at, and what the service says of them before anything is sent.
 
-const MODEL = /^((colmap\/|distorted\/)?sparse(\/[0-9]+)?)\/(cameras|images|points3D|rigs|frames)\.(bin|txt)$/;
-const PICTURE = /\.(jpe?g|png|tiff?|webp|bmp|exr|hdr)$/i;
-const CLUTTER = /(^|\/)(\.[^/]*|__MACOSX\/.*|thumbs\.db|desktop\.ini|Icon\r?)$/i;
+import { answer } from "./options.js";
+
 const ARCHIVE = /\.zip$/i;
+const ARCHIVE_END_BYTES = 1 << 18; // holds the names of a thousand files
+const ARCHIVE_END_TRIES = 4; // the list of contents may ask for more three times
 
 /** All files below what was dropped, with their paths. */
 export async function droppedFiles(transfer) {
@@ -33,45 +34,47 @@ export function chosenFiles(input) {
 }
 
 /**
- * What to send: {archive} or {files: [{name, file}]}, what the scene may be called, and what is left out.
- * Throws an error with a sentence for the user where there is nothing to send.
+ * What to send: {archive} or {files: [{name, file}]}, what the scene may be called, and notes on what is left out.
+ * Throws an error with sentences for the user where the service would refuse it.
  */
-export function sceneOf(found) {
-    const files = found.filter(({ path }) => !CLUTTER.test(path));
-    const archives = files.filter(({ path }) => ARCHIVE.test(path));
-    if (archives.length === 1 && files.length === 1) {
+export async function sceneOf(found) {
+    const archives = found.filter(({ path }) => ARCHIVE.test(path));
+    const isArchive = archives.length === 1 && found.length === 1;
+    const preview = isArchive ? await previewArchive(archives[0].file) : await previewFiles(found);
+    if (preview.refusals.length) {
+        const sentences = [...new Set([...preview.refusals.map(({ detail }) => detail), ...preview.notes])];
+        throw Object.assign(new Error(sentences[0]), { faults: sentences });
+    }
+    const facts = { notes: preview.notes, photographs: preview.photographs, posed: preview.has_poses };
+    if (isArchive) {
         const [{ file }] = archives;
-        return { archive: file, title: file.name.replace(ARCHIVE, ""), leftOut: [], photographs: null, posed: null, bytes: file.size };
+        return { ...facts, archive: file, title: file.name.replace(ARCHIVE, ""), bytes: file.size };
     }
-    const top = commonFolder(files.map(({ path }) => path));
-    const named = files.map(({ path, file }) => ({ name: path.slice(top.length), file }));
-    // As engine/core/scene_layout.py decides.
-    const pictures = named.filter(({ name }) => PICTURE.test(name));
-    const place = ["images/", "input/"].find((folder) => pictures.some(({ name }) => name.startsWith(folder))) ?? "";
-    const kept = named.filter(({ name }) => MODEL.test(name) || (name.startsWith("masks/") && PICTURE.test(name)));
-    for (const { name, file } of pictures) {
-        if (name.startsWith(place) && !/(^|\/)masks\//.test(name)) kept.push({ name: `images/${name.slice(place.length)}`, file });
-    }
-    const photographs = kept.filter(({ name }) => name.startsWith("images/") && PICTURE.test(name)).length;
-    if (!photographs) throw new Error("There are no photographs in this; choose a folder of photographs, or one that holds images/.");
-    const sent = new Set(kept.map(({ file }) => file));
+    const byPath = new Map(found.map(({ path, file }) => [path, file]));
     return {
-        files: kept.sort((a, b) => (a.name < b.name ? -1 : 1)),
-        title: top.replace(/\/$/, "").split("/").pop(),
-        leftOut: named.filter(({ file }) => !sent.has(file)).map(({ name }) => name),
-        photographs,
-        posed: kept.some(({ name }) => MODEL.test(name)),
-        bytes: kept.reduce((sum, { file }) => sum + file.size, 0),
+        ...facts,
+        files: preview.files.map(({ name, path }) => ({ name, file: byPath.get(path) })),
+        title: preview.folder.replace(/\/$/, "").split("/").pop(),
+        bytes: preview.files.reduce((sum, { size_bytes }) => sum + size_bytes, 0),
     };
 }
 
-/** The folder, with its slash, that is around all paths and is no part of a scene. */
-function commonFolder(paths) {
-    let folder = "";
-    for (;;) {
-        const tops = new Set(paths.map((path) => path.slice(folder.length)).map((path) => (path.includes("/") ? path.slice(0, path.indexOf("/") + 1) : "")));
-        const [top] = tops;
-        if (tops.size !== 1 || !top || /^(images|masks|sparse|colmap|distorted)\/$/.test(top)) return folder;
-        folder += top;
+function previewFiles(found) {
+    const files = found.map(({ path, file }) => ({ path, size_bytes: file.size }));
+    return fetch("/v1/scene-previews", {
+        method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify({ files }),
+    }).then(answer);
+}
+
+/** What the list of contents at the end of an archive says. */
+async function previewArchive(file) {
+    let preview = { needed_bytes: ARCHIVE_END_BYTES };
+    for (let attempt = 0; preview.needed_bytes !== null && attempt < ARCHIVE_END_TRIES; attempt++) {
+        preview = await fetch(`/v1/scene-previews/archive?size_bytes=${file.size}`, {
+            method: "POST",
+            headers: { "Content-Type": "application/octet-stream" },
+            body: file.slice(Math.max(0, file.size - preview.needed_bytes)),
+        }).then(answer);
     }
+    return preview;
 }
