@@ -68,6 +68,34 @@ async def test_upload_single_files_and_commit(connect_service: ConnectService, t
     assert not list((tmp_path / "store" / "staging").iterdir())
 
 
+async def test_scene_is_previewed_before_it_is_sent(connect_service: ConnectService) -> None:
+    """The same answer for the names of a folder and for the end of its archive, and what is refused."""
+    names = [*(f"fox/{name}" for name in photographs()), "fox/clip.MOV", "fox/images/a.HEIC"]
+    archive = build_zip(*(ZipMember(name, bytes(30_000), method=0) for name in names))
+    octets = {"Content-Type": "application/octet-stream"}
+    async with connect_service() as (http, _):
+        listed = [{"path": name, "size_bytes": 30_000} for name in names]
+        folder = (await http.post("/v1/scene-previews", json={"files": listed})).json()
+        address = f"/v1/scene-previews/archive?size_bytes={len(archive)}"
+        short = (await http.post(address, content=archive[-100:], headers=octets)).json()
+        assert 100 < short["needed_bytes"] < len(archive) and not short["files"]
+        end = archive[-short["needed_bytes"] :]
+        assert (await http.post(address, content=end, headers=octets)).json() == folder
+        assert folder["photographs"] == 4 and folder["refusals"] == [] and folder["needed_bytes"] is None
+        assert [file["name"] for file in folder["files"]] == [f"images/v{i}.png" for i in range(4)]
+        assert [("(images/a.HEIC)" in note, "(clip.MOV)" in note) for note in folder["notes"]] == [
+            (True, False), (False, True),
+        ]  # fmt: skip
+        few = await http.post("/v1/scene-previews", json={"files": listed[2:]})
+        assert few.json()["refusals"][0]["code"] == "dataset-photographs"
+        damaged = await http.post(
+            "/v1/scene-previews/archive?size_bytes=9", content=b"no ZIP ..", headers=octets
+        )
+        assert damaged.json()["refusals"][0]["code"] == "archive-damaged"
+        many = [{"path": f"images/{'long/' * 9}{i:06}.jpg", "size_bytes": 1} for i in range(20_000)]
+        assert (await http.post("/v1/scene-previews", json={"files": many})).json()["photographs"] == 20_000
+
+
 async def test_upload_archive_and_commit(connect_service: ConnectService, tmp_path: Path) -> None:
     files = {**photographs(), **ColmapModelBuilder().files()}
     data = build_zip(
@@ -96,7 +124,7 @@ ARCHIVES = {
     "archive-mismatch": lambda: build_zip(
         ZipMember("images/a.png", photograph(), local={"name": b"images/b.png"})
     ),
-    "archive-nested": lambda: build_zip(ZipMember("images/a.zip", b"x")),
+    "archive-nested": lambda: build_zip(ZipMember("images/a.png", build_zip(), method=0)),
     "archive-kind": lambda: b"\x1f\x8b\x08" + bytes(600),
     "archive-damaged": lambda: b"hello",
     "image-kind": lambda: build_zip(ZipMember("images/a.png", b"<svg>")),

@@ -92,7 +92,17 @@ const steps = {
         });
         await page.goto(`${job.url}/new`);
         await page.setInputFiles("#pick-folder", job.folder);
-        found.chosen = await page.locator("#chosen-text").textContent();
+        const chosen = (words) => page.waitForFunction((words) => document.getElementById("chosen-text").textContent.includes(words), words).then(async () => ({ text: await page.textContent("#chosen-text"), notes: await page.locator("#chosen-notes li").allTextContents() }));
+        found.chosen = await chosen("still life: ");
+        await page.click("#forget");
+        await page.setInputFiles("#pick-files", job.empty);
+        await page.waitForFunction(() => !document.getElementById("faults").hidden);
+        found.refused = await page.locator("#faults li").allTextContents();
+        await page.setInputFiles("#pick-files", job.archive);
+        found.chosenArchive = await chosen(".zip");
+        await page.click("#forget");
+        await page.setInputFiles("#pick-folder", job.folder);
+        await chosen("still life: ");
         await page.click("#start");
         await page.waitForFunction(() => /connection is lost/.test(document.getElementById("going-text").textContent));
         await shot(page, "interrupted");

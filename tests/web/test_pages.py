@@ -1,6 +1,7 @@
 """The pages in headless Chromium, on a real service with a real worker and a scene that it makes itself."""
 
 import os
+import shutil
 import subprocess
 import sys
 import uuid
@@ -17,6 +18,7 @@ from octasplat.engine.pathtracing.stage.stage_file import parse_stage
 from octasplat.engine.render.path_file import read_camera_path
 from octasplat.engine.train.config import preset
 from tests.support.web_harness import ROOT, Browse, RunningService, StartService
+from tests.support.zip_builder import ZipMember, build_zip
 
 pytestmark = [pytest.mark.tools, pytest.mark.heavy]
 
@@ -49,13 +51,25 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("generated") / "still life"
     config = SyntheticDatasetConfig(views=VIEWS, width_px=96, height_px=72, samples_per_side=2, points=800)
     write_synthetic_dataset(root, config)
+    (root / "clip.MOV").write_bytes(b"film")
     return root
 
 
 @pytest.fixture(scope="module")
-def flow(start_service: StartService, browse: Browse, folder: Path) -> Flow:
+def flow(start_service: StartService, browse: Browse, folder: Path, tmp_path_factory: Any) -> Flow:
     service = start_service()
-    facts = browse("flow", service.url, folder=str(folder), first=5, options=OPTIONS)
+    archive = Path(shutil.make_archive(str(tmp_path_factory.mktemp("zipped") / "photos"), "zip", folder))
+    empty = archive.with_name("empty.zip")
+    empty.write_bytes(build_zip(ZipMember("photos/a.HEIC", b"x"), ZipMember("photos/b.jpg", b"x")))
+    facts = browse(
+        "flow",
+        service.url,
+        folder=str(folder),
+        archive=str(archive),
+        empty=str(empty),
+        first=5,
+        options=OPTIONS,
+    )
     return Flow(service, folder, facts, facts["job"])
 
 
@@ -90,7 +104,13 @@ def work(flow: Flow, database: str) -> Iterator[None]:
 def test_upload_page_resumes_after_interruption(flow: Flow) -> None:
     facts = flow.facts
     assert facts["empty"] == "Nothing here yet"
-    assert facts["chosen"].startswith(f"still life: {VIEWS} photographs and a COLMAP model")
+    what = f"{VIEWS} photographs and a COLMAP model"
+    notes = ["1 videos are left out (clip.MOV); save frames of them as photographs."]
+    assert facts["chosen"]["text"].startswith(f"still life: {what}") and facts["chosen"]["notes"] == notes
+    archived = facts["chosenArchive"]
+    assert archived["text"].startswith(f"photos.zip, {what}") and archived["notes"] == notes
+    assert facts["refused"][0].startswith("There are 1 photographs; at least 3 are needed")
+    assert "(a.HEIC)" in facts["refused"][1]
     parts = [path for name in ("images", "sparse") for path in (flow.folder / name).rglob("*")]
     wanted = {path.relative_to(flow.folder).as_posix() for path in parts if path.is_file()}
     first, second = facts["firstPuts"], facts["secondPuts"]

@@ -36,6 +36,7 @@ function complain(text, sentences = []) {
 async function choose(found) {
     faults.hidden = true;
     const number = ++choice;
+    start.disabled = true;
     try {
         const chosen = await sceneOf(found);
         if (number !== choice) return; // others have been chosen since
@@ -46,6 +47,8 @@ async function choose(found) {
         show();
         complain(error.faults ? "This cannot be used as it is:" : error.message, error.faults);
         return;
+    } finally {
+        if (number === choice) start.disabled = false;
     }
     if (known) known.value = "";
     show();
@@ -94,6 +97,7 @@ document.addEventListener("drop", async (event) => {
 });
 find("forget").addEventListener("click", () => {
     choice += 1;
+    start.disabled = false;
     scene = null;
     show();
     form.querySelectorAll("input[type=file]").forEach((input) => { input.value = ""; });
