@@ -30,14 +30,17 @@ from octasplat.engine.trace.factory import make_tracer
 from octasplat.engine.trace.protocol import Tracer
 from octasplat.engine.train.config import TrainConfig, uses_shared_sort
 from octasplat.engine.train.densify import make_densifier
-from octasplat.engine.train.initialization.initial_gaussians import initial_gaussians
+from octasplat.engine.train.initialization.initial_gaussians import (
+    InitialGaussianOptions,
+    initial_gaussians,
+)
 from octasplat.engine.train.loop.checkpoint import load_checkpoint, save_checkpoint
 from octasplat.engine.train.loop.iteration import TrainComponents, train_step
 from octasplat.engine.train.loop.state import TrainState, initial_state
 from octasplat.engine.train.loop.trainer import Trainer
 from octasplat.engine.train.optimization.adam import Adam
-from octasplat.engine.train.sampling.batches import BatchSource
-from octasplat.engine.train.shading_factory import make_shading
+from octasplat.engine.train.sampling.batches import BatchOptions, BatchSource
+from octasplat.engine.train.shading_factory import ShadingOptions, make_shading
 
 STAGES = ("batch", "trace", "backward", "Adam", "refresh", "rebuild", "loss and the rest")
 
@@ -79,7 +82,10 @@ class TimedTracer:
 
 def made(dataset: Dataset, config: TrainConfig, path: Path, iterations: int) -> None:
     """A checkpoint of a training after so many iterations."""
-    state = initial_state(initial_gaussians(dataset, config, threads=2), config.seed)
+    state = initial_state(
+        initial_gaussians(dataset, InitialGaussianOptions.from_config(config, dataset), threads=2),
+        config.seed,
+    )
     with tempfile.TemporaryDirectory() as folder:
         Trainer(
             dataset, config.model_copy(update={"iterations": iterations}), state,
@@ -97,8 +103,9 @@ def spent(
     settings = config.trace.model_copy(update={"sort": "packet" if uses_shared_sort(config) else "ray"})
     tracer = TimedTracer(make_tracer(settings, threads=threads, box_padding=config.box_padding), clock)
     densifier = make_densifier(config.densify, iterations=iterations, max_gaussians=len(state.gaussians))
-    machinery = TrainComponents(tracer, make_shading(config, len(dataset.views), dataset.extent), densifier)
-    batches = BatchSource(dataset, config)
+    shading = make_shading(ShadingOptions.from_config(config), len(dataset.views), dataset.extent)
+    machinery = TrainComponents(tracer, shading, densifier)
+    batches = BatchSource(dataset, BatchOptions.from_config(config, dataset))
     draw = clock.timed("batch", batches.draw)
     step = clock.timed("iterate", train_step)
     hits, met = [], []
@@ -109,7 +116,11 @@ def spent(
             if k % config.rebuild_every == 0:
                 tracer.build(state.gaussians)
             batch = draw(state.rng)
-            found = step(state, batch, machinery, config, progress=0.5, extent=dataset.extent)
+            found = step(
+                state, batch, machinery,
+                loss=config.loss, lr=config.lr, min_blend_weight=config.min_blend_weight,
+                training_progress=0.5, extent=dataset.extent,
+            )  # fmt: skip
             hits.append(found.hits_per_ray)
             met.append(len(found.gaussians.ids))
     finally:

@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
@@ -44,8 +45,8 @@ from octasplat.engine.runs.run_folder import (
 )
 from octasplat.engine.shading.protocol import ShadingModel
 from octasplat.engine.trace.factory import make_tracer
-from octasplat.engine.train.config import TrainConfig
 from octasplat.engine.train.shading_factory import (
+    ShadingOptions,
     find_background,
     find_deferred,
     find_exposures,
@@ -140,7 +141,7 @@ def evaluate_scales(
     _check_coordinates(output, dataset, photographs_folder(output, scene))
     gaussians, _ = read_gaussian_ply(output / SCENE)
     extent = _extent_world(output, dataset)
-    shading = finished_shading(output, config.train, dataset, extent)
+    shading = finished_shading(output, ShadingOptions.from_config(config.train), dataset, extent)
     tracer = make_tracer(config.train.trace, threads=threads)
     tracer.build(gaussians, shading.features(gaussians))
     with counted_phase("evaluate", listener, len(dataset.test_indices)) as progress:
@@ -212,7 +213,7 @@ def measure_run(
     truth = _find_ground_truth(dataset, progress, needed=into is not None)
     gaussians, _ = read_gaussian_ply(output / SCENE)
     extent = _extent_world(output, dataset)
-    environment = _environment(output, config.train)
+    environment = _environment(output, config.train.materials.up_world)
     relighter = None
     if truth is not None and truth.relit_folders and environment is not None and has_materials(gaussians):
         relighter = SplitSumRelighter(
@@ -224,7 +225,9 @@ def measure_run(
         gaussians,
         into or output,
         settings=config.train.trace,
-        shading=finished_shading(output, config.train, dataset, extent, exposed=into is None),
+        shading=finished_shading(
+            output, ShadingOptions.from_config(config.train), dataset, extent, exposed=into is None
+        ),
         background=config.evaluation_background,
         run={
             "gaussians": len(gaussians),
@@ -259,13 +262,13 @@ def _find_ground_truth(dataset: Dataset, progress: EventListener, *, needed: boo
 
 
 def finished_shading(
-    output: Path, config: TrainConfig, dataset: Dataset, extent_world: float, *, exposed: bool = True
+    output: Path, options: ShadingOptions, dataset: Dataset, extent_world: float, *, exposed: bool = True
 ) -> ShadingModel:
     """The shading model of a finished run, with what it left: environment, background and exposures.
 
     Args:
         output: folder of the run.
-        config: its settings.
+        options: what it learnt; of exposures, what its record says.
         dataset: photographs.
         extent_world: of the scene.
         exposed: whether the photographs are those of the run, whose exposures are known or guessed.
@@ -274,8 +277,9 @@ def finished_shading(
         ConfigError: the run learnt one of these and its file is missing or damaged.
     """
     known = run_exposures(output)
-    decided = config.model_copy(update={"exposure": known is not None})
-    shading = make_shading(decided, len(dataset.views), extent_world)
+    shading = make_shading(
+        replace(options, learns_exposure=known is not None), len(dataset.views), extent_world
+    )
     if (deferred := find_deferred(shading)) is not None:
         deferred.light.set_radiance(read_environment(run_environment(output)))
     if (background := find_background(shading)) is not None:
@@ -285,11 +289,11 @@ def finished_shading(
     return shading
 
 
-def _environment(output: Path, config: TrainConfig) -> EnvironmentMap | None:
+def _environment(output: Path, up_world: tuple[float, float, float]) -> EnvironmentMap | None:
     """The map that a run with materials has learnt."""
     if not run_environment(output).exists():
         return None
-    up = np.array(config.materials.up_world, np.float64)
+    up = np.array(up_world, np.float64)
     return EnvironmentMap(read_environment(run_environment(output)), environment_frame(up))
 
 

@@ -17,7 +17,7 @@ from octasplat.engine.runs.run_folder import (
     open_run_dataset,
 )
 from octasplat.engine.runs.run_poses import estimate_principal_points, find_missing_poses, repair_run_poses
-from octasplat.engine.train.sampling.batches import BatchSource
+from octasplat.engine.train.sampling.batches import BatchOptions, BatchSource
 
 
 class FindPoses:
@@ -79,5 +79,6 @@ def _load_dataset(run: ReconstructionRun) -> Dataset:
             model_folder=found_model_folder(run.output),
             accept=run.accept,
         )
-        BatchSource(dataset, run.config.train)  # refuses settings that do not suit the photographs
+        options = BatchOptions.from_config(run.config.train, dataset)
+        BatchSource(dataset, options)  # refuses settings that do not suit the photographs
     return dataset

@@ -92,7 +92,10 @@ def _trainer(
 ) -> Trainer:
     """Return the training from its start, or from its newest checkpoint."""
     dataset, progress, folder = run.dataset, run.progress, run.output / CHECKPOINTS
-    config, exposure_changes = resolve_exposure(config, dataset)
+    exposure, exposure_changes = resolve_exposure(
+        config.exposure, dataset, has_materials=config.materials.learn
+    )
+    config = config.model_copy(update={"exposure": exposure})
     fingerprint = run_fingerprint(dataset, config)
     state = load_latest_checkpoint(folder, fingerprint, progress)
     if state is None:
@@ -115,7 +118,7 @@ def _trainer(
         progress=progress,
         threads=run.threads,
         should_stop=run.should_stop,
-        scale_floor=_scale_floor(dataset, config),
+        scale_floor=_scale_floor(dataset, config.min_scale_px),
         camera_clearance=zones if config.camera_clearance > 0 else None,
         view_frusta=seen if config.materials.prunes_unseen else None,
         on_step=None
@@ -169,12 +172,12 @@ def _write_training_record(
     write_json(output / TRAINING, record)
 
 
-def _scale_floor(dataset: Dataset, config: TrainConfig) -> MinScale | None:
-    if config.min_scale_px == 0:
+def _scale_floor(dataset: Dataset, min_scale_px: float) -> MinScale | None:
+    if min_scale_px == 0:
         return None
     pixel_rad = training_pixel_angle(dataset.viewpoints)
     origins = np.stack([dataset.views[i].origin_world for i in dataset.train_indices.tolist()])
-    return MinScale(origins, config.min_scale_px * pixel_rad)
+    return MinScale(origins, min_scale_px * pixel_rad)
 
 
 def _plan_settings(

@@ -30,8 +30,8 @@ from octasplat.engine.train.loop.checkpoint import latest_checkpoint, load_check
 from octasplat.engine.train.loop.iteration import loss_and_gradients
 from octasplat.engine.train.loop.state import TrainState, initial_state
 from octasplat.engine.train.loop.trainer import Trainer
-from octasplat.engine.train.sampling.batches import Batch, BatchSource
-from tests.support.planar_dataset import PlanarDataset, small_config
+from octasplat.engine.train.sampling.batches import Batch
+from tests.support.planar_dataset import PlanarDataset, batch_source, small_config
 
 SHARE = np.float32(0.3)
 ASIDE = np.array([0.2, 0.1, 0.0], np.float32)
@@ -108,7 +108,7 @@ def made(rng: np.random.Generator) -> tuple[FlatGaussians, Lamp, Batch]:
     model = Lamp(gaussians)
     model.albedo[:] = rng.uniform(0.1, 0.9, model.albedo.shape)
     model.lamp[:] = (0.9, 0.7, 1.1)
-    return gaussians, model, BatchSource(world, small_config()).draw(rng)
+    return gaussians, model, batch_source(world, small_config()).draw(rng)
 
 
 def test_gradients_of_several_traces_agree_with_finite_differences() -> None:

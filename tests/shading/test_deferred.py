@@ -24,9 +24,8 @@ from octasplat.engine.train.loop.checkpoint import latest_checkpoint, load_check
 from octasplat.engine.train.loop.iteration import loss_and_gradients
 from octasplat.engine.train.loop.state import TrainState, initial_state
 from octasplat.engine.train.loop.trainer import Trainer
-from octasplat.engine.train.sampling.batches import BatchSource
-from octasplat.engine.train.shading_factory import make_deferred_shading
-from tests.support.planar_dataset import PlanarDataset, small_config
+from octasplat.engine.train.shading_factory import ShadingOptions, make_shading
+from tests.support.planar_dataset import PlanarDataset, batch_source, small_config
 
 BARE = {
     "learn": True,
@@ -84,7 +83,7 @@ def test_gradients_agree_with_finite_differences(indirect: str) -> None:
     model.light.log_radiance[:] = rng.normal(-1, 0.4, model.light.log_radiance.shape)
     tracer = CpuTracer(TraceSettings(q=30.0, transmittance_min=1e-6), threads=1)
     config = small_config(loss={"l1": 0.0, "l2": 1.0})
-    batch = BatchSource(world, config).draw(rng)
+    batch = batch_source(world, config).draw(rng)
 
     def look() -> tuple[float, dict[str, np.ndarray]]:
         tracer.build(gaussians, model.features(gaussians))
@@ -304,7 +303,8 @@ def train(
     state = initial_state(first, config.seed)
 
     def trainer(state: TrainState, last: float) -> tuple[Trainer, DeferredShading]:
-        model = make_deferred_shading(config, world.extent)
+        model = make_shading(ShadingOptions.from_config(config), len(world.views), world.extent)
+        assert isinstance(model, DeferredShading)
         return Trainer(
             world, config, state, folder=folder, fingerprint="test", progress=events.append, threads=threads,
             should_stop=lambda: state.iteration >= last, shading=model,

@@ -9,6 +9,8 @@ from octasplat.engine.dataset import DatasetView
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.train.config import McmcConfig, TrainConfig
 from octasplat.engine.train.initialization.initial_gaussians import gaussians_from_points
+from octasplat.engine.train.sampling.batches import BatchOptions, BatchSource
+from octasplat.engine.train.sampling.pixel_sampler import TrainingData
 
 EXTENT = 1.0
 
@@ -91,6 +93,11 @@ def random_gaussians(count: int, seed: int, degree: int = 0) -> FlatGaussians:
         "sh": ((degree + 1) ** 2, 3),
     }
     return FlatGaussians(**{k: rng.normal(size=(count, *s)).astype(np.float32) for k, s in shapes.items()})
+
+
+def batch_source(dataset: TrainingData, config: TrainConfig) -> BatchSource:
+    """Return the batches of a training with these settings."""
+    return BatchSource(dataset, BatchOptions.from_config(config, dataset))
 
 
 def small_config(**changes: object) -> TrainConfig:

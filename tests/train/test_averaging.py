@@ -57,12 +57,13 @@ def test_averaging_state_survives_checkpoint(tmp_path: Path) -> None:
 
 
 def test_averaging_starts_at_configured_iteration() -> None:
-    schedule = Schedule(TrainConfig(weight_averaging_start=0.5), 100)
+    schedule = Schedule.from_config(TrainConfig(weight_averaging_start=0.5), 100)
     assert [k for k in range(1, 101) if schedule.is_averaging_due(k)] == list(
         range(60, 101, AVERAGING_INTERVAL)
     )
     assert not any(
-        Schedule(TrainConfig(weight_averaging_start=1), 100).is_averaging_due(k) for k in range(1, 101)
+        Schedule.from_config(TrainConfig(weight_averaging_start=1), 100).is_averaging_due(k)
+        for k in range(1, 101)
     )
     assert [k for k in range(1, 101) if schedule.is_averaging(k)] == list(range(51, 101))
-    assert Schedule(TrainConfig(), 17).is_averaging_due(17)  # the last one always
+    assert Schedule.from_config(TrainConfig(), 17).is_averaging_due(17)  # the last one always

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from octasplat.engine.core.errors import ConfigError
-from octasplat.engine.train.sampling.batches import BatchSource
 from octasplat.engine.train.sampling.pixel_sampler import PixelSampler
-from tests.support.planar_dataset import PlanarDataset, small_config
+from tests.support.planar_dataset import PlanarDataset, batch_source, small_config
 
 SIZES = np.array([[8, 6], [20, 10], [16, 16], [5, 3]], np.int64)
 
@@ -118,7 +117,7 @@ def test_batch_has_its_rays(ssim: float, fraction: float, rays: int, ray_patch_r
         ssim_patch_fraction=fraction,
         loss={"ssim": ssim},
     )
-    batch = BatchSource(world, config).draw(np.random.default_rng(0))
+    batch = batch_source(world, config).draw(np.random.default_rng(0))
     assert len(batch.rgb_srgb) == len(batch.rays) == len(batch.alpha) == len(batch.weight) == rays
     assert abs(batch.ssim_patch_count * 256 - (fraction * rays if ssim else 0)) <= 256
     np.testing.assert_allclose(np.linalg.norm(batch.rays.directions_world, axis=1), 1, atol=1e-6)
@@ -126,9 +125,9 @@ def test_batch_has_its_rays(ssim: float, fraction: float, rays: int, ray_patch_r
 
 def test_ssim_is_refused_where_it_would_be_ignored() -> None:
     with pytest.raises(ConfigError, match="only 12 pixels wide or high; lower ssim_patch_side"):
-        BatchSource(PlanarDataset(side_px=12), small_config(loss={"ssim": 0.2}))
+        batch_source(PlanarDataset(side_px=12), small_config(loss={"ssim": 0.2}))
     with pytest.raises(ConfigError, match="raise rays_per_batch or ssim_patch_fraction"):
-        BatchSource(
+        batch_source(
             PlanarDataset(), small_config(rays_per_batch=256, ssim_patch_fraction=0.3, loss={"ssim": 0.2})
         )
 
@@ -137,7 +136,7 @@ def test_ssim_is_refused_where_it_would_be_ignored() -> None:
 def test_photographs_lie_over_the_background(background: str, has_alpha: bool) -> None:
     world = PlanarDataset()
     world.has_alpha = has_alpha
-    batch = BatchSource(world, small_config(background=background)).draw(np.random.default_rng(0))
+    batch = batch_source(world, small_config(background=background)).draw(np.random.default_rng(0))
     if has_alpha:
         assert len(np.unique(batch.background_srgb)) == 3
     else:

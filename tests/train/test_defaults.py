@@ -69,8 +69,8 @@ def test_default_sort_depends_on_trained_parameters() -> None:
         preset("redisplats"),
     ):
         assert not uses_shared_sort(config)
-        assert not Schedule.from_config(config, 10**6).uses_shared_sort(0)
-    schedule = Schedule.from_config(TrainConfig(), 10**6)
+        assert not Schedule.from_config(config, iteration_count(config, 10**6)).uses_shared_sort(0)
+    schedule = Schedule.from_config(TrainConfig(), iteration_count(TrainConfig(), 10**6))
     assert [schedule.uses_shared_sort(done) for done in (0, 5_599, 5_600, 7_000)] == [
         True,
         True,
@@ -138,5 +138,5 @@ def test_default_iterations_decrease_with_rays_per_batch() -> None:
 
 @pytest.mark.parametrize(("gaussians", "iterations"), [(499_999, 25), (500_000, 50), (1_000_000, 75)])
 def test_large_hierarchies_are_rebuilt_less_often(gaussians: int, iterations: int) -> None:
-    assert rebuild_interval(TrainConfig(), gaussians) == iterations
-    assert rebuild_interval(TrainConfig(rebuild_every=10), gaussians) == 10 * iterations // 25
+    assert rebuild_interval(TrainConfig().rebuild_every, gaussians) == iterations
+    assert rebuild_interval(10, gaussians) == 10 * iterations // 25

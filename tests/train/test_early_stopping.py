@@ -40,7 +40,7 @@ def test_early_stopping_detects_plateau(probed: list[tuple[int, float]], least_d
 
 def test_early_stopping_shortened_schedule_ends_training() -> None:
     """Rates go on from where they are to where they were to go, nothing is added, the last states count."""
-    whole = Schedule(TrainConfig(), 1000)
+    whole = Schedule.from_config(TrainConfig(), 1000)
     short = whole.stop_early(500)
     assert short.iterations == early_stop_iteration(500, 1000) == 700
     shares = [short.training_progress(k) for k in range(500, 701)]
@@ -50,8 +50,16 @@ def test_early_stopping_shortened_schedule_ends_training() -> None:
     assert whole.may_densify(510) and not short.may_densify(510)
     assert [k for k in range(1, 701) if short.is_averaging_due(k)] == list(range(600, 701, 10))
     assert short.is_finished(700) and short.is_validation_due(700) and not short.is_finished(699)
-    assert Schedule(TrainConfig(weight_averaging_start=0.1), 1000).stop_early(500).is_averaging_due(510)
-    assert not Schedule(TrainConfig(weight_averaging_start=0.1), 1000).stop_early(500).is_averaging_due(500)
+    assert (
+        Schedule.from_config(TrainConfig(weight_averaging_start=0.1), 1000)
+        .stop_early(500)
+        .is_averaging_due(510)
+    )
+    assert (
+        not Schedule.from_config(TrainConfig(weight_averaging_start=0.1), 1000)
+        .stop_early(500)
+        .is_averaging_due(500)
+    )
 
 
 class NoisyWorld(PlanarDataset):

@@ -328,17 +328,13 @@ def test_changing_brightness_is_noticed() -> None:
     assert np.isnan(found[world.test_indices]).all()
     true = world.log_gains[world.train_indices]
     np.testing.assert_allclose(found[world.train_indices], true - np.median(true), atol=0.08)
-    config = small_config()
-    decided, why = resolve_exposure(config, world)
-    assert decided.exposure is True and why is not None and "1.9 times" in why
-    told = small_config(exposure=False)
-    assert resolve_exposure(told, world) == (told, None)
-    materials = config.materials.model_copy(update={"learn": True})
-    decided, why = resolve_exposure(config.model_copy(update={"materials": materials}), world)
-    assert decided.exposure is False and why is None
+    learns, reason = resolve_exposure("auto", world, has_materials=False)
+    assert learns is True and reason is not None and "1.9 times" in reason
+    assert resolve_exposure(False, world, has_materials=False) == (False, None)
+    assert resolve_exposure("auto", world, has_materials=True) == (False, None)
     world.log_gains[:] = 0
     assert exposure_change_notice(relative_log_brightness(world)) is None
-    assert resolve_exposure(config, world)[0].exposure is False
+    assert resolve_exposure("auto", world, has_materials=False)[0] is False
     world.observations = Observations(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 2)))
     assert exposure_change_notice(relative_log_brightness(world)) is None
 

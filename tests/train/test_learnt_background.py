@@ -21,9 +21,8 @@ from octasplat.engine.train.initialization.initial_background import estimate_ba
 from octasplat.engine.train.loop.checkpoint import latest_checkpoint, load_checkpoint
 from octasplat.engine.train.loop.state import TrainState, initial_state
 from octasplat.engine.train.loop.trainer import Trainer
-from octasplat.engine.train.sampling.batches import BatchSource
 from octasplat.engine.train.shading_factory import find_background
-from tests.support.planar_dataset import PlanarDataset, plane_texture, small_config
+from tests.support.planar_dataset import PlanarDataset, batch_source, plane_texture, small_config
 
 
 def sky(directions: np.ndarray) -> np.ndarray:
@@ -205,7 +204,7 @@ def test_photographs_with_alpha_show_no_background() -> None:
     world = UnderTheSky()
     world.has_alpha = True
     with pytest.raises(ConfigError, match="alpha"):
-        BatchSource(world, small_config(background="learnt"))
+        batch_source(world, small_config(background="learnt"))
 
 
 def test_materials_have_a_light_of_their_own() -> None:

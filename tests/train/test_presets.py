@@ -19,8 +19,7 @@ from octasplat.engine.train.densify import make_densifier
 from octasplat.engine.train.loop.iteration import TrainComponents, loss_and_gradients, train_step
 from octasplat.engine.train.loop.state import initial_state
 from octasplat.engine.train.loop.trainer import Trainer
-from octasplat.engine.train.sampling.batches import BatchSource
-from tests.support.planar_dataset import PlanarDataset, small_config
+from tests.support.planar_dataset import PlanarDataset, batch_source, small_config
 
 
 def held_out_psnr(folder: Path, config: TrainConfig) -> tuple[list[float], Trainer]:
@@ -57,7 +56,7 @@ def test_ssim_gradient_reaches_gaussians() -> None:
     config = small_config(
         ssim_patch_fraction=1.0, ssim_patch_side=32, loss={"l1": 0.0, "l2": 0.0, "ssim": 1.0}
     )
-    batch = BatchSource(world, config).draw(np.random.default_rng(0))
+    batch = batch_source(world, config).draw(np.random.default_rng(0))
     gaussians = world.initial_gaussians(opacity=0.6)
     rng = np.random.default_rng(2)
     gaussians.sh += rng.normal(0, 0.4, gaussians.sh.shape).astype(np.float32)
@@ -100,7 +99,7 @@ def test_training_with_ssim_only_improves_psnr(tmp_path: Path) -> None:
 def test_ssim_weight_without_patches_is_ignored() -> None:
     world = PlanarDataset()
     config = small_config(loss={"ssim": 0.5})
-    batch = BatchSource(world, config).draw(np.random.default_rng(0))
+    batch = batch_source(world, config).draw(np.random.default_rng(0))
     tracer = CpuTracer(threads=1)
     tracer.build(world.initial_gaussians())
     both = loss_and_gradients(batch, tracer, PLAIN_SHADING, config.loss, training_progress=0.0)
@@ -114,7 +113,7 @@ def test_ssim_weight_without_patches_is_ignored() -> None:
 def test_low_weight_gaussians_do_not_move() -> None:
     world = PlanarDataset()
     config = small_config()
-    batch = BatchSource(world, config).draw(np.random.default_rng(0))
+    batch = batch_source(world, config).draw(np.random.default_rng(0))
     tracer = CpuTracer(config.trace, threads=1)
     tracer.build(world.initial_gaussians(opacity=0.6))
     weights = loss_and_gradients(batch, tracer, PLAIN_SHADING, config.loss, training_progress=0.0).gaussians
@@ -128,7 +127,9 @@ def test_low_weight_gaussians_do_not_move() -> None:
         state,
         batch,
         TrainComponents(tracer, PLAIN_SHADING, densifier),
-        config.model_copy(update={"min_blend_weight": least}),
+        loss=config.loss,
+        lr=config.lr,
+        min_blend_weight=least,
         training_progress=0.0,
         extent=world.extent,
     )

@@ -9,7 +9,10 @@ from octasplat.engine.core.events import Event, HeldOutMeasured, TrainingProgres
 from octasplat.engine.dataset import Dataset
 from octasplat.engine.dataset.synthetic import SyntheticDatasetConfig, write_synthetic_dataset
 from octasplat.engine.gaussians.model import FlatGaussians
-from octasplat.engine.train.initialization.initial_gaussians import initial_gaussians
+from octasplat.engine.train.initialization.initial_gaussians import (
+    InitialGaussianOptions,
+    initial_gaussians,
+)
 from octasplat.engine.train.loop.fingerprint import run_fingerprint
 from octasplat.engine.train.loop.state import TrainState, initial_state
 from octasplat.engine.train.loop.trainer import Trainer
@@ -75,7 +78,9 @@ def test_reference_tracer_trains_synthetic_scene(tmp_path: Path) -> None:
             checkpoint_every=50, initial_points=100, plane_sweep_init=False,
         )  # fmt: skip
         events: list[Event] = []
-        state = initial_state(initial_gaussians(dataset, config), config.seed)
+        state = initial_state(
+            initial_gaussians(dataset, InitialGaussianOptions.from_config(config, dataset)), config.seed
+        )
         Trainer(
             dataset, config, state, folder=tmp_path / tracer, fingerprint=run_fingerprint(dataset, config),
             progress=events.append, threads=1,

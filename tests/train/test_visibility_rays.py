@@ -12,9 +12,8 @@ from octasplat.engine.trace.factory import make_tracer
 from octasplat.engine.train.config import LossWeights, TrainConfig
 from octasplat.engine.train.loop.state import initial_state
 from octasplat.engine.train.loop.trainer import Trainer
-from octasplat.engine.train.sampling.batches import BatchSource
 from octasplat.engine.train.sampling.visibility_rays import VisibilityRays, free_space_gradient
-from tests.support.planar_dataset import PlanarDataset
+from tests.support.planar_dataset import PlanarDataset, batch_source
 
 
 class SeenWorld(PlanarDataset):
@@ -121,10 +120,10 @@ def test_training_removes_veil_only_along_visibility_rays(tmp_path: Path) -> Non
 
 def test_batches_have_lines_where_they_count_and_none_of_views_left_out() -> None:
     world, rng = SeenWorld(), np.random.default_rng(0)
-    assert BatchSource(world, TrainConfig(rays_per_batch=1024)).draw(rng).visibility_rays is None
-    assert BatchSource(PlanarDataset(), _counting(0.1)).draw(rng).visibility_rays is None  # shows no points
-    assert BatchSource(SeenWorld(points=0), _counting(0.1)).draw(rng).visibility_rays is None
-    source = BatchSource(world, _counting(0.1))
+    assert batch_source(world, TrainConfig(rays_per_batch=1024)).draw(rng).visibility_rays is None
+    assert batch_source(PlanarDataset(), _counting(0.1)).draw(rng).visibility_rays is None  # shows no points
+    assert batch_source(SeenWorld(points=0), _counting(0.1)).draw(rng).visibility_rays is None
+    source = batch_source(world, _counting(0.1))
     lines = source.draw(rng).visibility_rays
     assert lines is not None and len(lines) == 102
     assert len(np.unique(lines.origins_world, axis=0)) == 6

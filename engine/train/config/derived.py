@@ -2,6 +2,7 @@
 
 import math
 
+from octasplat.engine.train.config.gaussians import GaussianSettings
 from octasplat.engine.train.config.train import TrainConfig
 
 MAX_PLANNED_ITERATIONS = 70_000
@@ -33,7 +34,7 @@ def iteration_count(config: TrainConfig, training_pixels: int, valid_fraction: f
     return config.iterations or min(wanted, 10 * each // 3) * 1000
 
 
-def max_gaussian_count(config: TrainConfig, training_pixels: int, valid_fraction: float = 1.0) -> int:
+def max_gaussian_count(config: GaussianSettings, training_pixels: int, valid_fraction: float = 1.0) -> int:
     """``config.max_gaussians``, or where that is 0 what so many pixels of training views can hold down.
 
     Of those only the share counts that shows anything. More than one for each 10 pixels learn the noise of
@@ -69,9 +70,9 @@ def ray_patch_side_px(config: TrainConfig, longest_side_px: int, pixels_a_gaussi
     return min(widest, max(1, round(math.sqrt(6 * pixels_a_gaussian))))
 
 
-def rebuild_interval(config: TrainConfig, gaussians: int) -> int:
-    """Iterations between rebuilds of the hierarchy: ``rebuild_every``, as much again for each half million.
+def rebuild_interval(rebuild_every: int, gaussians: int) -> int:
+    """Return the iterations between rebuilds: ``rebuild_every``, as much again for each half million.
 
     A rebuild takes time for every Gaussian, an iteration only for those that its rays meet.
     """
-    return config.rebuild_every * (1 + gaussians // 500_000)
+    return rebuild_every * (1 + gaussians // 500_000)

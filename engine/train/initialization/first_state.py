@@ -3,9 +3,13 @@
 from octasplat.engine.dataset import Dataset
 from octasplat.engine.train.config import TrainConfig
 from octasplat.engine.train.initialization.initial_background import estimate_background
-from octasplat.engine.train.initialization.initial_gaussians import add_initial_materials, initial_gaussians
+from octasplat.engine.train.initialization.initial_gaussians import (
+    InitialGaussianOptions,
+    add_initial_materials,
+    initial_gaussians,
+)
 from octasplat.engine.train.loop.state import TrainState, initial_state
-from octasplat.engine.train.shading_factory import find_background, make_shading
+from octasplat.engine.train.shading_factory import ShadingOptions, find_background, make_shading
 
 
 def initial_scene(dataset: Dataset, config: TrainConfig, *, threads: int = 1) -> TrainState:
@@ -20,11 +24,12 @@ def initial_scene(dataset: Dataset, config: TrainConfig, *, threads: int = 1) ->
         DatasetError: nothing says where Gaussians could begin.
     """
     behind = estimate_background(dataset) if config.background == "learnt" else None
-    first = initial_gaussians(dataset, config, threads=threads, background=behind)
+    options = InitialGaussianOptions.from_config(config, dataset)
+    first = initial_gaussians(dataset, options, threads=threads, background=behind)
     if config.materials.learn:
         first = add_initial_materials(first, config.materials)
     state = initial_state(first, config.seed)
-    shading = make_shading(config, len(dataset.views), dataset.extent)
+    shading = make_shading(ShadingOptions.from_config(config), len(dataset.views), dataset.extent)
     background = find_background(shading)
     if behind is not None and background is not None:
         background.set_map(behind.resize(config.background_height))

@@ -5,6 +5,8 @@ from which "REdiSplats: Ray Tracing for Editable Gaussian Splatting" (https://ar
 section 4.2) begins too.
 """
 
+from dataclasses import dataclass
+
 import numpy as np
 from jaxtyping import Float32, Float64
 from scipy.spatial import cKDTree
@@ -37,26 +39,72 @@ MAX_DISTANCE = 50.0
 """Points farther from the cameras than this many extents are matching errors."""
 
 
-def initial_gaussians(
-    dataset: Dataset, config: TrainConfig, *, threads: int = 1, background: InitialBackground | None = None
-) -> FlatGaussians:
-    """The first Gaussians: on the sparse points, or on random rays where there are too few of them.
+@dataclass(frozen=True)
+class InitialGaussianOptions:
+    """How many Gaussians a training begins with, and how they are placed.
 
-    Pixels that show what is ``background`` everything are not lifted.
+    Attributes:
+        seed: of everything random.
+        max_count: most Gaussians.
+        opacity: that all begin with.
+        normal_neighbors: points around one whose plane gives its normal.
+        plane_sweep: whether pixels are lifted to their depth where there are fewer sparse points.
+        plane_sweep_unseen: whether pixels that no neighbouring view shows are lifted, too.
+        equalizes_exposure: whether colours of lifted pixels are compared at equal brightness of the views.
     """
-    rng = np.random.Generator(np.random.PCG64([config.seed, 2]))
-    points = dataset.points
-    most_of_all = max_gaussian_count(config, dataset.train_pixel_count, valid_pixel_fraction(dataset))
-    limit = min(config.initial_points, most_of_all)
+
+    seed: int
+    max_count: int
+    opacity: float
+    normal_neighbors: int
+    plane_sweep: bool
+    plane_sweep_unseen: bool
+    equalizes_exposure: bool
+
+    @classmethod
+    def from_config(cls, config: TrainConfig, dataset: Dataset) -> "InitialGaussianOptions":
+        """Return the options that a configuration asks for with these photographs."""
+        most = max_gaussian_count(config, dataset.train_pixel_count, valid_pixel_fraction(dataset))
+        return cls(
+            seed=config.seed,
+            max_count=min(config.initial_points, most),
+            opacity=config.initial_opacity,
+            normal_neighbors=config.normal_neighbors,
+            plane_sweep=config.plane_sweep_init,
+            plane_sweep_unseen=config.plane_sweep_unseen,
+            equalizes_exposure=config.exposure is True,
+        )
+
+
+def initial_gaussians(
+    dataset: Dataset,
+    options: InitialGaussianOptions,
+    *,
+    threads: int = 1,
+    background: InitialBackground | None = None,
+) -> FlatGaussians:
+    """Return the first Gaussians: on the sparse points, or on random rays where there are too few of them.
+
+    Args:
+        dataset: the photographs.
+        options: how many, and how they are placed.
+        threads: work side by side, which changes nothing that is made.
+        background: what lies behind everything; pixels that show it are not lifted.
+
+    Raises:
+        DatasetError: nothing says where Gaussians could begin.
+    """
+    rng = np.random.Generator(np.random.PCG64([options.seed, 2]))
+    points, limit = dataset.points, options.max_count
     if len(points.xyz_world) >= MIN_POINTS:
         centres = np.stack([dataset.views[i].origin_world for i in dataset.train_indices])
         xyz, rgb = points.xyz_world, points.rgb_srgb
         most = np.full(len(xyz), MAX_ANGULAR_SIZE)
-        if config.plane_sweep_init and len(xyz) < limit:
-            gains = equalizing_gains(dataset) if config.exposure is True else None
+        if options.plane_sweep and len(xyz) < limit:
+            gains = equalizing_gains(dataset) if options.equalizes_exposure else None
             more = plane_sweep_points(
                 dataset, limit - len(xyz), rng,
-                threads=threads, background=background, gains=gains, unseen=config.plane_sweep_unseen,
+                threads=threads, background=background, gains=gains, unseen=options.plane_sweep_unseen,
             )  # fmt: skip
             xyz, rgb = np.concatenate([xyz, more.xyz_world]), np.concatenate([rgb, more.rgb_srgb])
             most = np.concatenate(
@@ -68,9 +116,9 @@ def initial_gaussians(
             centres,
             extent=dataset.extent,
             limit=limit,
-            opacity=config.initial_opacity,
+            opacity=options.opacity,
             rng=rng,
-            plane_points=config.normal_neighbors,
+            plane_points=options.normal_neighbors,
             most_angles=most,
         )
     view, y, x = dataset.sample_pixels(rng, limit)
@@ -82,7 +130,7 @@ def initial_gaussians(
         rays.directions_world[seen],
         rgb[seen],
         extent=dataset.extent,
-        opacity=config.initial_opacity,
+        opacity=options.opacity,
         rng=rng,
     )
 

@@ -12,7 +12,7 @@ from octasplat.engine.core.errors import TrainingError
 from octasplat.engine.shading.protocol import ShadingModel, TracedRays
 from octasplat.engine.trace.gradient_sums import add_gradients, drop_low_weight
 from octasplat.engine.trace.protocol import GaussianGradients, Tracer
-from octasplat.engine.train.config import LossWeights, TrainConfig
+from octasplat.engine.train.config import LearningRates, LossWeights
 from octasplat.engine.train.densify import Densifier
 from octasplat.engine.train.loop.state import TrainState
 from octasplat.engine.train.optimization.losses import BatchLoss, batch_loss, ray_errors
@@ -97,18 +97,22 @@ def train_step(
     state: TrainState,
     batch: Batch,
     components: TrainComponents,
-    config: TrainConfig,
     *,
+    loss: LossWeights,
+    lr: LearningRates,
+    min_blend_weight: float,
     training_progress: float,
     extent: float,
 ) -> LossGradients:
-    """One step downhill; changes ``state`` and tells the tracer of it.
+    """Take one step of the optimisers; changes ``state`` and tells the tracer of it.
 
     Args:
         state: Gaussians and their optimiser.
         batch: what to look at.
         components: the tracer, built around the state's Gaussians, and what else takes part.
-        config: rates and weights.
+        loss: weights of the terms of the loss.
+        lr: step sizes.
+        min_blend_weight: Gaussians whose weights over all rays add up to less keep still.
         training_progress: 0 at the first iteration, 1 at the last.
         extent: scene extent, world units.
 
@@ -121,9 +125,9 @@ def train_step(
     tracer, shading = components.tracer, components.shading
     densifier = components.densifier
     found = loss_and_gradients(
-        batch, tracer, shading, config.loss,
+        batch, tracer, shading, loss,
         training_progress=training_progress, with_errors=densifier.wants_errors,
-        min_blend_weight=config.min_blend_weight,
+        min_blend_weight=min_blend_weight,
     )  # fmt: skip
     if not np.isfinite(found.loss.value):
         raise TrainingError(
@@ -132,7 +136,7 @@ def train_step(
         )
     gradients = found.gaussians
     moved = state.adam.step(
-        state.gaussians, gradients, config.lr, config.loss, training_progress=training_progress, extent=extent
+        state.gaussians, gradients, lr, loss, training_progress=training_progress, extent=extent
     )
     shading.step(state.gaussians, gradients, found.shading, training_progress=training_progress)
     tracer.refresh(gradients.ids)

@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 from octasplat.engine.train.config import (
     OUTLIER_VIEWS_FROM,
     TrainConfig,
-    iteration_count,
     rebuild_interval,
     uses_shared_sort,
 )
@@ -28,23 +27,48 @@ class Schedule:
     the same boxes as one that was never stopped.
 
     Attributes:
-        config: the settings.
         iterations: of the whole training.
+        rebuild_every: iterations between rebuilds of a hierarchy of up to 500,000 Gaussians.
+        checkpoint_every: iterations between checkpoints, at least.
+        densify_from_iter: iterations of fitting the first Gaussians.
+        max_sh_degree: degree of the harmonics in the end.
+        sh_degree_interval: iterations between raising it by one.
+        weight_averaging_start: share of the iterations after which states are averaged.
+        shared_sort_until: share of the training in which the rays of a patch share one order; 0: in none.
+        refines_poses: whether poses of training views are refined.
+        orients_normals: whether Gaussians are turned so that their normals point outwards.
         early_stop_at: where it was decided to end early, None where it was not.
         planned_iterations: iterations that there were to be before that.
     """
 
-    config: TrainConfig
     iterations: int
+    rebuild_every: int
+    checkpoint_every: int
+    densify_from_iter: int
+    max_sh_degree: int
+    sh_degree_interval: int
+    weight_averaging_start: float
+    shared_sort_until: float
+    refines_poses: bool
+    orients_normals: bool
     early_stop_at: int | None = None
     planned_iterations: int = 0
 
     @classmethod
-    def from_config(
-        cls, config: TrainConfig, training_pixels: int, valid_fraction: float = 1.0
-    ) -> "Schedule":
-        """The schedule for so many pixels in the training views, of which a share shows anything."""
-        return cls(config, iteration_count(config, training_pixels, valid_fraction))
+    def from_config(cls, config: TrainConfig, iterations: int) -> "Schedule":
+        """Return the schedule that a configuration asks for, for a training of ``iterations`` iterations."""
+        return cls(
+            iterations=iterations,
+            rebuild_every=config.rebuild_every,
+            checkpoint_every=config.checkpoint_every,
+            densify_from_iter=config.densify_from_iter,
+            max_sh_degree=config.sh_degree,
+            sh_degree_interval=config.sh_degree_interval,
+            weight_averaging_start=config.weight_averaging_start,
+            shared_sort_until=config.shared_sort_until if uses_shared_sort(config) else 0.0,
+            refines_poses=config.refine_poses,
+            orients_normals=config.trace.flip_normal_cos > 0 and config.materials.learn,
+        )
 
     def stop_early(self, done: int) -> "Schedule":
         """The schedule of a training for which it is decided after ``done`` iterations to end early.
@@ -60,8 +84,8 @@ class Schedule:
 
     def is_validation_due(self, done: int) -> bool:
         """Whether the state after ``done`` iterations is measured and kept as a checkpoint."""
-        every = self.config.rebuild_every
-        every *= -(-self.config.checkpoint_every // every)
+        every = self.rebuild_every
+        every *= -(-self.checkpoint_every // every)
         return done % every == 0 or self.is_finished(done)
 
     def is_outlier_check_due(self, done: int) -> bool:
@@ -72,11 +96,11 @@ class Schedule:
     def is_pose_refinement_due(self, done: int) -> bool:
         """Whether the poses of training views are refined after ``done`` iterations."""
         if (
-            not self.config.refine_poses
+            not self.refines_poses
             or not POSE_REFINEMENT_FROM <= done / self.iterations <= POSE_REFINEMENT_UNTIL
         ):
             return False
-        every = self.config.rebuild_every
+        every = self.rebuild_every
         rebuilds = self.iterations * (POSE_REFINEMENT_UNTIL - POSE_REFINEMENT_FROM) / POSE_REFINEMENTS / every
         return done % (every * max(1, round(rebuilds))) == 0
 
@@ -86,24 +110,20 @@ class Schedule:
 
     def is_averaging(self, done: int) -> bool:
         """Whether states are averaged by then."""
-        return max(self.config.weight_averaging_start * self.iterations, self.early_stop_at or 0) < done
+        return max(self.weight_averaging_start * self.iterations, self.early_stop_at or 0) < done
 
     def uses_shared_sort(self, done: int) -> bool:
         """Whether the rays of a window composite in one order in the next iteration."""
-        return uses_shared_sort(self.config) and self.training_progress(done) < self.config.shared_sort_until
+        return self.training_progress(done) < self.shared_sort_until
 
     def is_orientation_due(self, done: int) -> bool:
         """Whether Gaussians whose outer side is in are turned over: until states are averaged."""
-        sided = self.config.trace.flip_normal_cos > 0 and self.config.materials.learn
-        return (
-            sided
-            and self.is_validation_due(done)
-            and done <= self.config.weight_averaging_start * self.iterations
-        )
+        early = done <= self.weight_averaging_start * self.iterations
+        return self.orients_normals and early and self.is_validation_due(done)
 
     def is_rebuild_due(self, done: int, gaussians: int) -> bool:
         """Whether the hierarchy of so many Gaussians is built anew, which is where a run may stop."""
-        due = done % rebuild_interval(self.config, gaussians) == 0
+        due = done % rebuild_interval(self.rebuild_every, gaussians) == 0
         return due or self.is_validation_due(done) or self.is_pose_refinement_due(done)
 
     def is_event_due(self, done: int) -> bool:
@@ -112,11 +132,11 @@ class Schedule:
 
     def sh_degree(self, done: int) -> int:
         """Degree of the harmonics, raised step by step."""
-        return min(self.config.sh_degree, done // self.config.sh_degree_interval)
+        return min(self.max_sh_degree, done // self.sh_degree_interval)
 
     def may_densify(self, done: int) -> bool:
         """Whether the fitting of the first Gaussians is over, and the last phase of a short one not begun."""
-        return done >= self.config.densify_from_iter and self.early_stop_at is None
+        return done >= self.densify_from_iter and self.early_stop_at is None
 
     def training_progress(self, done: int) -> float:
         """Share of the training that is done, which is that of the iterations unless it ends early."""

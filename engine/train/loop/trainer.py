@@ -16,7 +16,7 @@ from octasplat.engine.gaussians.morton import morton_order
 from octasplat.engine.shading.protocol import ShadingModel
 from octasplat.engine.trace.factory import make_tracer
 from octasplat.engine.trace.protocol import Tracer
-from octasplat.engine.train.config import TrainConfig, max_gaussian_count
+from octasplat.engine.train.config import TrainConfig, iteration_count, max_gaussian_count
 from octasplat.engine.train.densify import make_densifier
 from octasplat.engine.train.densify.normal_propagation import NormalPropagation
 from octasplat.engine.train.loop.checkpoint import save_checkpoint
@@ -26,10 +26,15 @@ from octasplat.engine.train.loop.iteration import LossGradients, TrainComponents
 from octasplat.engine.train.loop.schedule import Schedule, Stopwatch
 from octasplat.engine.train.loop.state import TrainState
 from octasplat.engine.train.loop.validation_probe import ValidationProbe, psnr_from_mse
-from octasplat.engine.train.sampling.batches import BatchSource, PrefetchedBatches, evaluation_background
+from octasplat.engine.train.sampling.batches import (
+    BatchOptions,
+    BatchSource,
+    PrefetchedBatches,
+    evaluation_background,
+)
 from octasplat.engine.train.sampling.pixel_sampler import TrainingData
 from octasplat.engine.train.sampling.shown import valid_pixel_fraction
-from octasplat.engine.train.shading_factory import make_shading
+from octasplat.engine.train.shading_factory import ShadingOptions, make_shading
 from octasplat.engine.train.views.corrected_views import PosedTrainingData
 from octasplat.engine.train.views.normal_orientation import orient_normals
 from octasplat.engine.train.views.outlier_views import OutlierDetector, TrainingViewReport
@@ -115,9 +120,9 @@ class Trainer:
             else:
                 state.pose_corrections = np.zeros((len(dataset.views), 6))
         self._dataset = dataset
-        self._batches = BatchSource(dataset, config)
+        self._batches = BatchSource(dataset, BatchOptions.from_config(config, dataset))
         pixels, shown = self._batches.sampler.pixel_count, valid_pixel_fraction(dataset)
-        self.schedule = Schedule.from_config(config, pixels, shown)
+        self.schedule = Schedule.from_config(config, iteration_count(config, pixels, shown))
         rates = config.lr.scaled_for(self.schedule.iterations)
         self._config = config = config.model_copy(update={"lr": rates})
         densifier = make_densifier(
@@ -131,7 +136,9 @@ class Trainer:
             )
         if state.early_stop_at is not None:
             self.schedule = self.schedule.stop_early(state.early_stop_at)
-        self.shading = shading or make_shading(config, len(dataset.views), dataset.extent)
+        self.shading = shading or make_shading(
+            ShadingOptions.from_config(config), len(dataset.views), dataset.extent
+        )
         if state.densifier:
             densifier.restore(state.densifier)
         if state.shading:
@@ -190,8 +197,10 @@ class Trainer:
                 batches.prefetch(state.rng, state.iteration + 1)
             progress = schedule.training_progress(state.iteration)
             found = train_step(
-                state, batch, machinery, self._config, training_progress=progress, extent=self._extent
-            )
+                state, batch, machinery,
+                loss=self._config.loss, lr=self._config.lr, min_blend_weight=self._config.min_blend_weight,
+                training_progress=progress, extent=self._extent,
+            )  # fmt: skip
             stale = schedule.may_densify(state.iteration) and self._update_gaussians()
             if stale:
                 state.average.clear()

@@ -53,36 +53,77 @@ class Batch:
         return composite_over(self.rgb_srgb, self.alpha, self.background_srgb)
 
 
+@dataclass(frozen=True)
+class BatchOptions:
+    """How batches are drawn.
+
+    Attributes:
+        rays_per_batch: number of rays of a batch.
+        background: what lies behind everything.
+        ray_patch_rays: rays of a patch of neighbouring pixels, a square number; 1 scatters them.
+        ray_patch_side_px: side of such a patch, in pixels.
+        ssim_patch_fraction: share of the rays that comes in whole patches for SSIM; None where the
+            loss has no such term.
+        ssim_patch_side_px: side of a whole patch, in pixels.
+        visibility_ray_fraction: visibility rays beside each batch, of its rays; 0 where the loss has no term
+            for them.
+    """
+
+    rays_per_batch: int
+    background: Background
+    ray_patch_rays: int
+    ray_patch_side_px: int
+    ssim_patch_fraction: float | None
+    ssim_patch_side_px: int
+    visibility_ray_fraction: float
+
+    @classmethod
+    def from_config(cls, config: TrainConfig, dataset: TrainingData) -> "BatchOptions":
+        """Return the options that a configuration asks for with these photographs.
+
+        Raises:
+            DatasetError: masks or alpha leave nothing of the training photographs.
+        """
+        sampler = PixelSampler(dataset.train_indices, view_sizes_px(dataset))
+        pixels, valid = sampler.pixel_count, valid_pixel_fraction(dataset)
+        pixels_per_gaussian = pixels * valid / max_gaussian_count(config, pixels, valid)
+        return cls(
+            rays_per_batch=config.rays_per_batch,
+            background=config.background,
+            ray_patch_rays=config.ray_patch_rays,
+            ray_patch_side_px=ray_patch_side_px(config, sampler.longest_side_px, pixels_per_gaussian),
+            ssim_patch_fraction=config.ssim_patch_fraction if config.loss.ssim > 0 else None,
+            ssim_patch_side_px=config.ssim_patch_side,
+            visibility_ray_fraction=config.visibility_ray_fraction if config.loss.free_space > 0 else 0.0,
+        )
+
+
 class BatchSource:
     """Draws the batches of a training.
 
-    A batch has ``config.rays_per_batch`` rays. Where the loss has an SSIM term, about
-    ``config.ssim_patch_fraction`` of them come as patches; the others come in windows, as far as that goes,
-    and singly where a window is one ray.
+    Where the loss has an SSIM term, some of the rays come as whole patches; the others come in patches of
+    neighbours, as far as that goes, and singly where such a patch is one ray.
 
     Args:
         dataset: the photographs.
-        config: sizes and shares.
+        options: sizes and shares.
 
     Raises:
         ConfigError: the SSIM term would have no patch, or a background is to be learnt where none is shown.
     """
 
-    def __init__(self, dataset: TrainingData, config: TrainConfig) -> None:
-        if config.background == "learnt" and dataset.has_alpha:
+    def __init__(self, dataset: TrainingData, options: BatchOptions) -> None:
+        if options.background == "learnt" and dataset.has_alpha:
             raise ConfigError(
                 "These photographs have alpha, so that they show no background; leave background=learnt out."
             )
         self._dataset = dataset
-        self._config = config
+        self._options = options
         self.sampler = PixelSampler(dataset.train_indices, view_sizes_px(dataset))
-        pixels, shown = self.sampler.pixel_count, valid_pixel_fraction(dataset)
-        self._ray_patch_side_px = ray_patch_side_px(
-            config, self.sampler.longest_side_px, pixels * shown / max_gaussian_count(config, pixels, shown)
-        )
         self._ssim_patches = self._patch_count()
         self._visibility_rays: VisibilityRays | None = None
-        if config.loss.free_space > 0 and isinstance(dataset, ObservedPoints) and len(dataset.points):
+        wanted = options.visibility_ray_fraction > 0
+        if wanted and isinstance(dataset, ObservedPoints) and len(dataset.points):
             self._visibility_rays = VisibilityRays.from_dataset(dataset, VISIBILITY_RAY_MARGIN)
 
     def exclude_views(self, views: Int64[np.ndarray, " m"]) -> None:
@@ -94,16 +135,16 @@ class BatchSource:
 
     def draw(self, rng: np.random.Generator, index: int = 0) -> Batch:
         """The next batch, after ``index`` others."""
-        config, sampler, side = self._config, self.sampler, self._config.ssim_patch_side
-        loose = config.rays_per_batch - self._ssim_patches * side**2
-        windows = loose // config.ray_patch_rays if config.ray_patch_rays > 1 else 0
-        single = loose - windows * config.ray_patch_rays
+        options, sampler, side = self._options, self.sampler, self._options.ssim_patch_side_px
+        loose = options.rays_per_batch - self._ssim_patches * side**2
+        windows = loose // options.ray_patch_rays if options.ray_patch_rays > 1 else 0
+        single = loose - windows * options.ray_patch_rays
         drawn, grids = [sampler.pixels(rng, single)], None
         if windows:
-            grids = RayPatches(single, windows, math.isqrt(config.ray_patch_rays))
+            grids = RayPatches(single, windows, math.isqrt(options.ray_patch_rays))
             drawn.append(
                 sampler.ray_patches(
-                    rng, windows, rays=config.ray_patch_rays, side=self._ray_patch_side_px, index=index
+                    rng, windows, rays=options.ray_patch_rays, side=options.ray_patch_side_px, index=index
                 )
             )
         if self._ssim_patches:
@@ -115,15 +156,15 @@ class BatchSource:
         lines = None
         if self._visibility_rays is not None and len(self._visibility_rays):
             lines = self._visibility_rays.draw(
-                rng, max(1, round(config.visibility_ray_fraction * config.rays_per_batch))
+                rng, max(1, round(options.visibility_ray_fraction * options.rays_per_batch))
             )
         batch = Batch(rays, rgb, alpha, weight, view, self._ssim_patches, side, background, lines, grids)
         _ = batch.target_srgb  # worked out here, as the next batch is drawn beside the iteration
         return batch
 
     def _patch_count(self) -> int:
-        config, side = self._config, self._config.ssim_patch_side
-        if config.loss.ssim == 0:
+        options, side = self._options, self._options.ssim_patch_side_px
+        if options.ssim_patch_fraction is None:
             return 0
         smallest = self.sampler.smallest_side_px
         if smallest < side:
@@ -132,20 +173,20 @@ class BatchSource:
                 f"{smallest} pixels wide or high; lower ssim_patch_side (16 at least), or set loss.ssim to 0."
             )
         count = min(
-            round(config.rays_per_batch * config.ssim_patch_fraction / side**2),
-            config.rays_per_batch // side**2,
+            round(options.rays_per_batch * options.ssim_patch_fraction / side**2),
+            options.rays_per_batch // side**2,
         )
         if count == 0:
             raise ConfigError(
                 f"loss.ssim compares patches of {side} x {side} pixels, but a share of "
-                f"{config.ssim_patch_fraction:g} of {config.rays_per_batch} rays makes none; raise "
+                f"{options.ssim_patch_fraction:g} of {options.rays_per_batch} rays makes none; raise "
                 "rays_per_batch or "
                 "ssim_patch_fraction, or set loss.ssim to 0."
             )
         return count
 
     def _background(self, rng: np.random.Generator) -> Float32[np.ndarray, "3"]:
-        name: Background = self._config.background
+        name: Background = self._options.background
         if name == "auto":
             name = "random" if self._dataset.has_alpha else "black"
         if name == "random":

@@ -1,12 +1,11 @@
 """Whether the exposure changes from photograph to photograph, as the points that they share show it."""
 
-from typing import Protocol, runtime_checkable
+from typing import Literal, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float32, Float64, Int64
 
 from octasplat.engine.dataset.model import Observations
-from octasplat.engine.train.config import TrainConfig
 from octasplat.engine.train.sampling.pixel_sampler import TrainingData
 
 MIN_VALUE, MAX_VALUE = 0.1, 0.95
@@ -72,17 +71,24 @@ def exposure_change_notice(brightness: Float64[np.ndarray, " v"]) -> str | None:
     )
 
 
-def resolve_exposure(config: TrainConfig, dataset: TrackedTrainingData) -> tuple[TrainConfig, str | None]:
-    """The configuration with ``exposure`` no longer ``auto``, and why it is learnt where that decided so.
+def resolve_exposure(
+    exposure: bool | Literal["auto"], dataset: TrackedTrainingData, *, has_materials: bool
+) -> tuple[bool, str | None]:
+    """Return whether exposure is learnt, and why where the photographs decided so.
 
     Materials learn one light for all photographs, and what shines, or was cut out, looks brighter from here
     than from there by itself: for these, ``auto`` learns no exposure.
+
+    Args:
+        exposure: what the settings say.
+        dataset: the photographs.
+        has_materials: whether materials are learnt.
     """
-    if config.exposure != "auto":
-        return config, None
-    steady = config.materials.learn or dataset.has_alpha
+    if exposure != "auto":
+        return exposure, None
+    steady = has_materials or dataset.has_alpha
     reason = None if steady else exposure_change_notice(relative_log_brightness(dataset))
-    return config.model_copy(update={"exposure": reason is not None}), reason
+    return reason is not None, reason
 
 
 def _group_medians(
