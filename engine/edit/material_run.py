@@ -15,6 +15,7 @@ from octasplat.engine.runs.config import read_config
 from octasplat.engine.runs.run_folder import CONFIG, SCENE, is_run, run_environment
 from octasplat.engine.shading.environment_frame import environment_frame
 from octasplat.engine.shading.environment_light import EnvironmentLight
+from octasplat.engine.shading.recipes import material_shading
 
 
 def change_materials(
@@ -52,9 +53,7 @@ def has_known_light(source: Path) -> bool:
     """Return whether the light is known in which a scene's harmonics show its materials."""
     if not is_run(source) or not run_environment(source).exists():
         return False
-    return (
-        read_config(source / CONFIG).train.materials.recipe != "ref_gaussian"
-    )  # there they are the matt part
+    return material_shading(read_config(source / CONFIG).train.materials.recipe).harmonics_are_shaded
 
 
 def edit_note(

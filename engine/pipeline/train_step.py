@@ -30,7 +30,9 @@ from octasplat.engine.runs.run_folder import (
     SCENE,
     TRAINING,
 )
+from octasplat.engine.shading.material_settings import MaterialSettings
 from octasplat.engine.shading.protocol import ShadingModel
+from octasplat.engine.shading.recipes import material_shading
 from octasplat.engine.train.config import TrainConfig, iteration_count
 from octasplat.engine.train.initialization.first_state import initial_scene
 from octasplat.engine.train.loop.checkpoint import load_latest_checkpoint
@@ -120,12 +122,17 @@ def _trainer(
         should_stop=run.should_stop,
         scale_floor=_scale_floor(dataset, config.min_scale_px),
         camera_clearance=zones if config.camera_clearance > 0 else None,
-        view_frusta=seen if config.materials.prunes_unseen else None,
+        view_frusta=seen if _prunes_unseen(config.materials) else None,
         on_step=None
         if (on_step := run.on_step) is None
         else lambda done, tracer: on_step(done, dataset, tracer, trainer.shading),
     )
     return trainer
+
+
+def _prunes_unseen(materials: MaterialSettings) -> bool:
+    """Return whether Gaussians that lie in no photograph are removed."""
+    return materials.learn and material_shading(materials.recipe).prunes_unseen(materials)
 
 
 def _write_learnt_light(

@@ -6,10 +6,11 @@ ray is traced once more as far as the mean, which lies between two surfaces wher
 front; what the whole ray saw beyond it is the back, as all that is blended is a sum over the ray.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Int64, Shaped
+from jaxtyping import Bool, Float, Float32, Float64, Int64, Shaped
 
 from octasplat.engine.core.rays import RayBatch, concatenate_rays
 from octasplat.engine.trace.protocol import Recording, TraceGradients, Tracer, TraceResult
@@ -45,6 +46,24 @@ class DepthSplit:
         out = values[:count].copy()
         out[self.split_ids] += values[count:]
         return out
+
+    def ray_means(
+        self,
+        layer_ids: Int64[np.ndarray, " p"],
+        alpha: Float64[np.ndarray, " p"],
+        values: Mapping[str, Float64[np.ndarray, "p _"]],
+    ) -> dict[str, Float32[np.ndarray, "r _"]]:
+        """Return by name the means, weighted by alpha, of values at the points of layers ``layer_ids``."""
+        count = len(self.rays)
+        weights = np.zeros((count, 1))
+        weights[layer_ids] = alpha[:, None]
+        weights /= np.maximum(self.expand(self.sum_layers(weights)), 1e-12)
+        means = {}
+        for name, at_points in values.items():
+            at_layers = np.zeros((count, at_points.shape[1]))
+            at_layers[layer_ids] = at_points
+            means[name] = self.sum_layers(weights * at_layers).astype(np.float32)
+        return means
 
     def expand(self, values: Shaped[np.ndarray, "r *c"]) -> Shaped[np.ndarray, "l *c"]:
         """The value of its ray for each part."""

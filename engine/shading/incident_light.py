@@ -10,7 +10,7 @@ from octasplat.engine.core.color import srgb_to_linear
 from octasplat.engine.shading.depth_split import DepthSplit
 from octasplat.engine.shading.gbuffer import GBuffer, RayOffset, reflected_rays
 from octasplat.engine.shading.gradient_ops import srgb_derivative
-from octasplat.engine.shading.material_settings import REF_GAUSSIAN_RAY_LENGTH, MaterialSettings
+from octasplat.engine.shading.material_settings import MaterialSettings
 from octasplat.engine.shading.protocol import TracedRays
 from octasplat.engine.shading.reflection_rays import (
     ReflectionRayPairs,
@@ -26,8 +26,6 @@ from octasplat.engine.shading.reflection_tracing import IncidentLight, Reflectio
 from octasplat.engine.shading.split_sum import ShadeGradients
 from octasplat.engine.trace.protocol import Recording, TraceGradients
 
-HIDDEN_TRANSMITTANCE = 0.5
-"""Transmittance below which the seed's way of seeing counts the environment as hidden."""
 PROGRESS_SALTS = 1 << 20
 """So finely the share of the training that is done draws other numbers."""
 
@@ -133,7 +131,7 @@ class RayPairIncidentLight:
 
 @dataclass(frozen=True)
 class SingleRayIncidentLight:
-    """One ray a point in the mirrored direction, which meets harmonics, or as the seed's code has it.
+    """One ray a point in the mirrored direction, which hits the colours of the harmonics.
 
     Attributes:
         incident: what came in.
@@ -156,15 +154,6 @@ class SingleRayIncidentLight:
     ) -> "SingleRayIncidentLight":
         """Ask for the points of a buffer."""
         rays = reflected_rays(split.rays, gbuffer, offset)
-        if settings.recipe == "ref_gaussian":
-            met = traced.tracer.trace(
-                rays.with_t_max(REF_GAUSSIAN_RAY_LENGTH), record=traced.view is not None
-            )
-            visibility = (met.transmittance > HIDDEN_TRANSMITTANCE).astype(np.float64)
-            if settings.indirect == "none":
-                return cls(IncidentLight(visibility, np.zeros((len(rays), 3))))
-            hidden = 1.0 - visibility[:, None]
-            return cls(IncidentLight(visibility, hidden * met.rgb_srgb), met.recording, hidden)
         met = traced.tracer.trace(rays, record=traced.view is not None)
         visibility = met.transmittance.astype(np.float64)
         if settings.indirect == "none":

@@ -8,12 +8,6 @@ from octasplat.engine.settings import renamed_settings
 from octasplat.engine.settings.base import FormerSetting, Settings
 from octasplat.engine.settings.fields import ADVANCED, EXPERIMENTAL, Unit
 
-REF_GAUSSIAN_DEFERRED_FROM = 0.36
-"""Share of the training after which the seed's code begins deferred shading, with materials as at first."""
-REF_GAUSSIAN_RAY_LENGTH = 10.0
-"""World units within which the seed's code looks for what hides the environment."""
-REF_GAUSSIAN_MATERIAL = (0.5, 0.5, 0.5, 0.01, 0.1)
-"""Albedo, metallic and roughness that it begins deferred shading with."""
 ENVIRONMENT_EVERY = 4
 """Iterations between two steps of the environment, for each of which all its levels are filtered."""
 ENVIRONMENT_RATE = 0.03
@@ -230,18 +224,9 @@ class MaterialSettings(Settings):
     }
 
     @property
-    def prunes_unseen(self) -> bool:
-        """Whether Gaussians that lie in no photograph are taken away; the seed lets them be."""
-        return self.learn and self.prune_unseen and self.recipe != "ref_gaussian"
-
-    @property
     def smooth_weights(self) -> tuple[float, ...]:
         """Of the smoothness of each column of materials."""
         return (self.smooth_weight,) * 3 + (self.smooth_gloss_weight,) * 2
-
-    def is_ref_gaussian_deferred(self, training_progress: float) -> bool:
-        """Whether the seed's second stage has begun."""
-        return self.recipe == "ref_gaussian" and training_progress >= REF_GAUSSIAN_DEFERRED_FROM
 
     def shading_ramp(self, training_progress: float) -> float:
         """Share of the picture that is shaded, not taken from the harmonics."""

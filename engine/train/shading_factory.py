@@ -9,6 +9,7 @@ from octasplat.engine.shading.exposure import ExposureModel
 from octasplat.engine.shading.material_settings import MaterialSettings
 from octasplat.engine.shading.plain import PLAIN_SHADING
 from octasplat.engine.shading.protocol import ShadingModel
+from octasplat.engine.shading.recipes import material_shading
 from octasplat.engine.train.config import BACKGROUND_SMOOTHNESS, TrainConfig
 
 
@@ -55,7 +56,9 @@ def make_shading(options: ShadingOptions, views: int, extent_world: float) -> Sh
     """Return the model, untrained, for a dataset of ``views`` views and that extent."""
     inner: ShadingModel = PLAIN_SHADING
     if options.materials is not None:  # it holds normals and depths together itself
-        inner = DeferredShading(options.materials, extent_world=extent_world, one_sided=options.is_one_sided)
+        inner = material_shading(options.materials.recipe)(
+            options.materials, extent_world=extent_world, one_sided=options.is_one_sided
+        )
     elif options.depth_normal_weight > 0:
         inner = DepthNormalShading(options.depth_normal_weight)
     if options.background_height is not None:

@@ -5,7 +5,7 @@ import numpy as np
 from octasplat.engine.gaussians.frames import frames_from_normals, quaternions_from_matrices
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.shading.material_settings import MaterialSettings
-from octasplat.engine.train.densify.normal_propagation import propagate_normals
+from octasplat.engine.shading.normal_propagation import propagate_normals
 from octasplat.engine.train.initialization.initial_gaussians import add_initial_materials
 
 

@@ -14,14 +14,9 @@ from scipy.spatial import cKDTree
 from octasplat.engine.core.errors import DatasetError
 from octasplat.engine.dataset import Dataset
 from octasplat.engine.gaussians.frames import frames_from_normals, quaternions_from_matrices
-from octasplat.engine.gaussians.materials import AMBIENT, DIFFUSE_INTERREFLECTION, MATERIAL_WIDTHS
 from octasplat.engine.gaussians.model import SH_C0, FlatGaussians
-from octasplat.engine.shading.material_settings import (
-    INITIAL_ALBEDO,
-    INITIAL_METALLIC,
-    INITIAL_ROUGHNESS,
-    MaterialSettings,
-)
+from octasplat.engine.shading.material_settings import MaterialSettings
+from octasplat.engine.shading.recipes import material_shading
 from octasplat.engine.train.config import TrainConfig, max_gaussian_count
 from octasplat.engine.train.initialization.initial_background import InitialBackground
 from octasplat.engine.train.initialization.plane_sweep import plane_sweep_points
@@ -136,11 +131,8 @@ def initial_gaussians(
 
 
 def add_initial_materials(gaussians: FlatGaussians, settings: MaterialSettings) -> FlatGaussians:
-    """The same Gaussians with the materials that a training begins with, all alike."""
-    values = (INITIAL_ALBEDO,) * 3, (INITIAL_METALLIC,), (INITIAL_ROUGHNESS,)
-    first = dict(zip(MATERIAL_WIDTHS, values, strict=True)) | {AMBIENT: (1.0,)}
-    if settings.recipe == "split_sum" and settings.diffuse_interreflection:
-        first[DIFFUSE_INTERREFLECTION] = (0.0,) * 3
+    """Return the same Gaussians with the materials that a training begins with, all alike."""
+    first = material_shading(settings.recipe).initial_channels(settings)
     return gaussians.with_channels(
         {name: np.tile(np.array(value, np.float32), (len(gaussians), 1)) for name, value in first.items()}
     )

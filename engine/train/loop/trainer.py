@@ -14,6 +14,7 @@ from octasplat.engine.dataset.view_frusta import ViewFrusta
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.gaussians.morton import morton_order
 from octasplat.engine.shading.protocol import ShadingModel
+from octasplat.engine.shading.recipes import material_shading
 from octasplat.engine.trace.factory import make_tracer
 from octasplat.engine.trace.protocol import Tracer
 from octasplat.engine.train.config import TrainConfig, iteration_count, max_gaussian_count
@@ -131,9 +132,8 @@ class Trainer:
             max_gaussians=max_gaussian_count(config, pixels, shown),
         )
         if config.materials.learn and config.materials.normal_propagation:
-            densifier = NormalPropagation(
-                densifier, config.materials.recipe, iterations=self.schedule.iterations
-            )
+            propagate = material_shading(config.materials.recipe).propagate_normals
+            densifier = NormalPropagation(densifier, propagate, iterations=self.schedule.iterations)
         if state.early_stop_at is not None:
             self.schedule = self.schedule.stop_early(state.early_stop_at)
         self.shading = shading or make_shading(
