@@ -34,13 +34,12 @@ from octasplat.engine.shading.material_settings import MaterialSettings
 from octasplat.engine.shading.protocol import ShadingModel
 from octasplat.engine.shading.recipes import material_shading
 from octasplat.engine.train.config import TrainConfig, iteration_count
-from octasplat.engine.train.initialization.first_state import initial_scene
-from octasplat.engine.train.loop.checkpoint import load_latest_checkpoint
-from octasplat.engine.train.loop.fingerprint import run_fingerprint
-from octasplat.engine.train.loop.floors import MinScale
+from octasplat.engine.train.initialization.initial_gaussians import initial_scene
+from octasplat.engine.train.loop.checkpoint import load_latest_checkpoint, run_fingerprint
+from octasplat.engine.train.loop.state import MinScale
 from octasplat.engine.train.loop.time_budget import make_plan, read_plan, write_plan
 from octasplat.engine.train.loop.trainer import Trainer
-from octasplat.engine.train.sampling.shown import valid_pixel_fraction
+from octasplat.engine.train.sampling.pixel_sampler import valid_pixel_fraction
 from octasplat.engine.train.shading_factory import find_background, find_deferred, find_exposures
 from octasplat.engine.train.views.exposure_changes import resolve_exposure
 

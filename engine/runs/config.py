@@ -25,7 +25,7 @@ from octasplat.engine.settings.refusals import (
 )
 from octasplat.engine.settings.renamed_settings import former_names, translate_names
 from octasplat.engine.train.config import TrainConfig, preset, with_materials
-from octasplat.engine.train.config.preset_names import PRESETS, PRESETS_WITH_MATERIALS
+from octasplat.engine.train.config.presets import PRESETS, PRESETS_WITH_MATERIALS
 
 
 class ReconstructionConfig(RunSettings):
@@ -84,7 +84,7 @@ def resolve_config(
     materials, see :func:`octasplat.engine.train.config.with_materials`, and what else is given on top.
 
     Args:
-        preset_name: one of :data:`octasplat.engine.train.config.preset_names.PRESETS`.
+        preset_name: one of :data:`octasplat.engine.train.config.presets.PRESETS`.
         materials: learn materials and the environment.
         settings: fields of :class:`RunSettings`; None values are left at their defaults.
         train: some settings of the training, nested as in :class:`ReconstructionConfig`.

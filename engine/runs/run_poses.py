@@ -3,7 +3,10 @@
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from octasplat.engine.core.errors import ColmapCrashError, DatasetError
+import numpy as np
+from jaxtyping import Int64
+
+from octasplat.engine.core.errors import CancelledError, ColmapCrashError, DatasetError
 from octasplat.engine.core.events import EventListener, PhaseProgress, Warned
 from octasplat.engine.core.progress import phase
 from octasplat.engine.dataset import Dataset, split_views
@@ -21,9 +24,10 @@ from octasplat.engine.poses.photograph_check import check_photographs_decode
 from octasplat.engine.poses.photographs import photographs_of_scene
 from octasplat.engine.runs.config import ReconstructionConfig
 from octasplat.engine.runs.run_folder import POSES, found_model_folder
-from octasplat.engine.train.config import iteration_count
-from octasplat.engine.train.views.doubts import PROBE_ITERATIONS as CHECK_ITERATIONS
-from octasplat.engine.train.views.doubts import find_misplaced_views
+from octasplat.engine.train.config import Background, iteration_count
+from octasplat.engine.train.loop.trial_training import COARSE_ITERATIONS, train_coarse_scene
+from octasplat.engine.train.sampling.batches import evaluation_background
+from octasplat.engine.train.views.outlier_views import MIN_VIEWS, find_misplaced_views
 
 CHECKED_FROM, CHECKED_FROM_MINUTES = 1000, 10.0
 """Given poses are checked before a training of so many iterations, or of so many minutes."""
@@ -91,14 +95,9 @@ def repair_run_poses(
     is_long = _is_long(dataset, config)
     if not (config.train.repair_poses and is_long) or found_model_folder(output) is not None:
         return False
-    with phase("check", progress, CHECK_ITERATIONS):
-        doubtful = find_misplaced_views(
-            dataset,
-            background=config.train.background,
-            seed=config.train.seed,
-            threads=threads,
-            should_stop=should_stop,
-            progress=lambda done: progress(PhaseProgress("check", done, CHECK_ITERATIONS)),
+    with phase("check", progress, COARSE_ITERATIONS):
+        doubtful = _find_misplaced_views(
+            dataset, config.train.background, config.train.seed, threads, progress, should_stop
         )
     if len(doubtful) == 0:
         return False
@@ -126,6 +125,36 @@ def repair_run_poses(
             )
         )
     return bool(moved)
+
+
+def _find_misplaced_views(
+    dataset: Dataset,
+    background: Background,
+    seed: int,
+    threads: int,
+    progress: EventListener,
+    should_stop: Callable[[], bool],
+) -> Int64[np.ndarray, " d"]:
+    """Return the views whose poses a short training puts in doubt, in order."""
+    if len(dataset.train_indices) < MIN_VIEWS:
+        return np.zeros(0, np.int64)
+    if background == "learnt":
+        background = "auto"
+    try:
+        tracer, shading = train_coarse_scene(
+            dataset,
+            background=background,
+            seed=seed,
+            threads=threads,
+            should_stop=should_stop,
+            progress=lambda done: progress(PhaseProgress("check", done, COARSE_ITERATIONS)),
+        )
+    except CancelledError:
+        raise CancelledError(
+            "Stopped before the training, while looking for photographs in the wrong place; the same command "
+            "with --resume goes on."
+        ) from None
+    return find_misplaced_views(dataset, evaluation_background(background), tracer, shading)
 
 
 def estimate_principal_points(

@@ -8,7 +8,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from octasplat.engine.runs.export_names import ExportNames
 from octasplat.engine.settings import renamed_settings
 from octasplat.engine.settings.fields import ADVANCED, BASIC, Spelling, Unit
-from octasplat.engine.train.config.preset_names import PresetName
+from octasplat.engine.train.config.presets import PresetName
 
 
 class RunSettings(BaseModel):

@@ -6,7 +6,7 @@ from types import MappingProxyType
 from typing import Any
 
 from octasplat.engine.train.config import preset
-from octasplat.engine.train.config.preset_names import PRESETS
+from octasplat.engine.train.config.presets import PRESETS
 from octasplat.service.web.form_fields import DEFAULT_FILE_NAMES, FormField, form_fields
 from octasplat.workers.worker.job_kinds import JobKind
 

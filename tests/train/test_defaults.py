@@ -16,11 +16,11 @@ from octasplat.engine.train.config import (
     uses_shared_sort,
     with_materials,
 )
-from octasplat.engine.train.config.preset_names import PRESETS
+from octasplat.engine.train.config.presets import PRESETS
 from octasplat.engine.train.loop.schedule import Schedule
 from octasplat.engine.train.loop.state import initial_state
 from octasplat.engine.train.loop.trainer import Trainer
-from octasplat.engine.train.sampling.shown import valid_pixel_fraction
+from octasplat.engine.train.sampling.pixel_sampler import valid_pixel_fraction
 from tests.support.planar_dataset import PlanarDataset, small_config
 
 

@@ -11,8 +11,7 @@ from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.gaussians.rows import row_arrays
 from octasplat.engine.train.config import TrainConfig
 from octasplat.engine.train.loop.checkpoint import latest_checkpoint, load_checkpoint
-from octasplat.engine.train.loop.early_end import early_stop_iteration, has_converged
-from octasplat.engine.train.loop.schedule import Schedule
+from octasplat.engine.train.loop.schedule import Schedule, early_stop_iteration, has_converged
 from octasplat.engine.train.loop.state import TrainState, initial_state
 from octasplat.engine.train.loop.trainer import Trainer
 from tests.support.planar_dataset import PlanarDataset, small_config

@@ -5,8 +5,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.distance import cdist
 
-from octasplat.engine.train.loop.floors import MinScale
-from octasplat.engine.train.loop.state import initial_state
+from octasplat.engine.train.loop.state import MinScale, initial_state
 from octasplat.engine.train.loop.trainer import Trainer
 from tests.support.planar_dataset import PlanarDataset, small_config
 

@@ -13,7 +13,7 @@ from octasplat.engine.train.initialization.initial_gaussians import (
     InitialGaussianOptions,
     initial_gaussians,
 )
-from octasplat.engine.train.loop.fingerprint import run_fingerprint
+from octasplat.engine.train.loop.checkpoint import run_fingerprint
 from octasplat.engine.train.loop.state import TrainState, initial_state
 from octasplat.engine.train.loop.trainer import Trainer
 from tests.support.planar_dataset import PlanarDataset, small_config

@@ -14,7 +14,7 @@ from octasplat.engine.train.config import McmcConfig, RedisplatsConfig, TrainCon
 from octasplat.engine.train.loop.checkpoint import BestState, latest_checkpoint, load_checkpoint, save_best
 from octasplat.engine.train.loop.state import TrainState, initial_state
 from octasplat.engine.train.loop.trainer import Trainer
-from octasplat.engine.train.sampling.shown import valid_pixel_fraction
+from octasplat.engine.train.sampling.pixel_sampler import valid_pixel_fraction
 from tests.support.planar_dataset import PlanarDataset, small_config
 
 

@@ -18,8 +18,8 @@ def iteration_count(config: TrainConfig, training_pixels: int, valid_fraction: f
 
     Large scenes learn as long as there is something to see; small ones are done after 7,000 with 7 rays a
     pixel. Rays that have an order of their own take longer, so that there are fewer of them. Where only a
-    share of the pixels shows anything (see :mod:`octasplat.engine.train.sampling.shown`), the rays of the
-    others teach little and cost little, and it takes as many more; not with materials.
+    share of the pixels shows anything (``valid_fraction``), the rays of the others teach little and cost
+    little, and it takes as many more; not with materials.
     """
     each = config.rays_per_pixel
     if uses_shared_sort(config):

@@ -1,6 +1,6 @@
 """A densification strategy that also hands normals on to neighbours now and then."""
 
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float32, Int64
@@ -13,6 +13,7 @@ from octasplat.engine.train.densify.protocol import Densifier
 from octasplat.engine.train.optimization.adam import Adam
 
 
+@runtime_checkable
 class Propagation(Protocol):
     """Changes Gaussians in place by what their neighbours' materials say of their normals."""
 

@@ -1,4 +1,4 @@
-"""The first Gaussians: flat ones on the points of the model, or random ones in the cameras' view.
+"""The state before the first iteration, and its Gaussians: on sparse points, or random in the cameras' view.
 
 After "GaMeS: Mesh-Based Adapting and Modification of Gaussian Splatting" (https://arxiv.org/abs/2402.01459),
 from which "REdiSplats: Ray Tracing for Editable Gaussian Splatting" (https://arxiv.org/abs/2503.12284,
@@ -18,9 +18,11 @@ from octasplat.engine.gaussians.model import SH_C0, FlatGaussians
 from octasplat.engine.shading.material_settings import MaterialSettings
 from octasplat.engine.shading.recipes import material_shading
 from octasplat.engine.train.config import TrainConfig, max_gaussian_count
-from octasplat.engine.train.initialization.initial_background import InitialBackground
+from octasplat.engine.train.initialization.initial_background import InitialBackground, estimate_background
 from octasplat.engine.train.initialization.plane_sweep import plane_sweep_points
-from octasplat.engine.train.sampling.shown import valid_pixel_fraction
+from octasplat.engine.train.loop.state import TrainState, initial_state
+from octasplat.engine.train.sampling.pixel_sampler import valid_pixel_fraction
+from octasplat.engine.train.shading_factory import ShadingOptions, find_background, make_shading
 from octasplat.engine.train.views.exposure_changes import equalizing_gains
 
 MIN_POINTS = 50
@@ -136,6 +138,31 @@ def add_initial_materials(gaussians: FlatGaussians, settings: MaterialSettings) 
     return gaussians.with_channels(
         {name: np.tile(np.array(value, np.float32), (len(gaussians), 1)) for name, value in first.items()}
     )
+
+
+def initial_scene(dataset: Dataset, config: TrainConfig, *, threads: int = 1) -> TrainState:
+    """The first Gaussians, their materials and the first background, as far as these are learnt.
+
+    Args:
+        dataset: the photographs.
+        config: all knobs.
+        threads: work side by side, which changes nothing that is made.
+
+    Raises:
+        DatasetError: nothing says where Gaussians could begin.
+    """
+    behind = estimate_background(dataset) if config.background == "learnt" else None
+    options = InitialGaussianOptions.from_config(config, dataset)
+    first = initial_gaussians(dataset, options, threads=threads, background=behind)
+    if config.materials.learn:
+        first = add_initial_materials(first, config.materials)
+    state = initial_state(first, config.seed)
+    shading = make_shading(ShadingOptions.from_config(config), len(dataset.views), dataset.extent)
+    background = find_background(shading)
+    if behind is not None and background is not None:
+        background.set_map(behind.resize(config.background_height))
+        state.shading = shading.state()
+    return state
 
 
 def gaussians_from_points(

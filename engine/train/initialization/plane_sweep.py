@@ -17,29 +17,34 @@ A plane sweep on a few planes a pixel, after "A Space-Sweep Approach to True Mul
 """
 
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float32, Float64, Int64
+from jaxtyping import Float32, Float64
 from scipy.spatial import cKDTree
 
 from octasplat.engine.dataset import Dataset
 from octasplat.engine.train.initialization.initial_background import InitialBackground
+from octasplat.engine.train.initialization.patch_matching import (
+    ExposedPhotographs,
+    PixelPatches,
+    draw_patches,
+    is_inside,
+    patch_cost,
+    project,
+)
 from octasplat.engine.train.initialization.plane_sweep_points import (
     MatchEvidence,
     PlaneSweepPoints,
     is_confirmed,
 )
-from octasplat.engine.train.kernels.patch_costs import patch_differences
-from octasplat.engine.train.sampling.shown import valid_pixel_fraction
+from octasplat.engine.train.initialization.visibility_vote import passes_vote
+from octasplat.engine.train.sampling.pixel_sampler import valid_pixel_fraction
 
 DEPTH_HYPOTHESES = 6
 """Depths tried for a pixel: those of the nearest points in the image."""
 NEIGHBOURS = 4
 """Views in which a guess is judged; the better half of them counts, since the rest may be hidden."""
 ROUNDS = 3
-STEP_PX = 2
-OFFSETS_PX = STEP_PX * np.array([[x, y] for x in (0, 1, -1) for y in (0, 1, -1)], np.int64)
 SWEEP_DEPTHS = 24
 """Depths that are tried besides, in equal ratios from near to far, each moved at random within its step."""
 MAX_AMBIGUOUS_COST = 0.01
@@ -56,8 +61,6 @@ BACKGROUND_COST_MARGIN = 0.005
 """A pixel that matches infinitely far away about as well as at any guess shows the sky."""
 BACKGROUND_DEPTH = 1e6
 """So many times the largest depth."""
-LEVEL_WEIGHT = 0.3
-"""Weight of a difference in brightness against one in texture."""
 MIN_VIEW_COSINE = 0.5
 """Neighbouring views look less than 60 degrees another way."""
 BASELINE = 0.05
@@ -69,51 +72,8 @@ OBSERVED_SPAN, MIN_OBSERVED = 4.0, 10
 """The points are taken to be as far from a view as their middle is, but within this factor of the median
 distance of those that it is known to show, if these are so many: a long capture has its middle anywhere.
 """
-VOTING_VIEWS = 24
-"""Views that vote on each point, spread evenly over all, or nearest to its own where few of these look."""
-MIN_VOTERS = 3
-"""Jurors that must look towards a point."""
-MAX_VOTE_DIFFERENCE = 0.12
-"""Largest mean difference of colour, in display values, of a view that agrees."""
-MIN_VOTE_FRACTION = 0.3
-"""Share of the views looking there that must agree: a point in free space hides other things in most."""
-SWEEP_MAX_VOTE_DIFFERENCE, SWEEP_MIN_VOTE_FRACTION = 0.1, 0.4
-"""The same of points at depths that no other point suggested."""
 OCCLUSION_FACTOR = 1.2
 """Such points beyond so many times the depth that others suggest are wrong: something nearer was known."""
-
-
-@dataclass(frozen=True)
-class _Photographs:
-    """The photographs as if all were exposed alike."""
-
-    dataset: Dataset
-    gains: Float32[np.ndarray, " v"] | None
-
-    def pixels(
-        self, view: Int64[np.ndarray, " r"], y: Int64[np.ndarray, " r"], x: Int64[np.ndarray, " r"]
-    ) -> tuple[Float32[np.ndarray, "r 3"], Float32[np.ndarray, " r"], Float32[np.ndarray, " r"]]:
-        """Straight display colour, alpha and weight of pixels."""
-        rgb, alpha, weight = self.dataset.pixels(view, y, x)
-        if self.gains is not None:
-            rgb = np.clip(rgb * self.gains[view][:, None], 0, 1)
-        return rgb, alpha, weight
-
-
-@dataclass(frozen=True)
-class _Patches:
-    """Pixels of one view with the pixels around them."""
-
-    origin_world: Float64[np.ndarray, "3"]
-    directions_world: Float64[np.ndarray, "n o 3"]
-    depth_factors: Float64[np.ndarray, "n o"]
-    rgb_srgb: Float32[np.ndarray, "n o 3"]
-    y: Int64[np.ndarray, " n"]
-    x: Int64[np.ndarray, " n"]
-
-    def __getitem__(self, which: Int64[np.ndarray, " k"]) -> "_Patches":
-        origin, *rows = vars(self).values()
-        return _Patches(origin, *(row[which] for row in rows))
 
 
 def plane_sweep_points(
@@ -138,7 +98,7 @@ def plane_sweep_points(
         unseen: whether pixels whose place no two neighbouring views show, so that nothing can be matched, are
             lifted, too: to a depth between those of the points around.
     """
-    photographs = _Photographs(dataset, gains)
+    photographs = ExposedPhotographs(dataset, gains)
     known = dataset.points.xyz_world.astype(np.float64)
     neighbours = _neighbouring_views(dataset, known)
     lifted = PlaneSweepPoints.concatenate([])
@@ -162,7 +122,7 @@ def plane_sweep_points(
             parts = list(pool.map(lift, jobs))
             found = PlaneSweepPoints.concatenate([points for points, _ in parts])
             evidence = MatchEvidence.concatenate([e for _, e in parts])
-            elected = _passes_vote(photographs, found, evidence.view, pool)
+            elected = passes_vote(photographs, found, evidence.view, pool)
         found, evidence = found[elected], evidence[elected]
         found = found[~found.swept | is_confirmed(found, evidence, known)]
         lifted = PlaneSweepPoints.concatenate([lifted, found])
@@ -218,7 +178,7 @@ def _observed_distances(dataset: Dataset) -> Float64[np.ndarray, " v"]:
 
 
 def _lift_pixels(
-    photographs: _Photographs,
+    photographs: ExposedPhotographs,
     index: int,
     samples: int,
     points: Float64[np.ndarray, "k 3"],
@@ -230,11 +190,11 @@ def _lift_pixels(
     """Points for random pixels of one view."""
     dataset = photographs.dataset
     nothing = PlaneSweepPoints.concatenate([]), MatchEvidence(np.empty(0, np.int64), np.empty(0), np.empty(0))
-    projected_px, depths = _project(dataset, index, points)
-    inside = _is_inside(dataset, index, projected_px) & (depths > 0)
+    projected_px, depths = project(dataset, index, points)
+    inside = is_inside(dataset, index, projected_px) & (depths > 0)
     if samples == 0 or not neighbours or inside.sum() < DEPTH_HYPOTHESES:
         return nothing
-    patches = _draw_patches(photographs, index, samples, rng)
+    patches = draw_patches(photographs, index, samples, rng)
     if len(patches.y) == 0:
         return nothing
     pixels_px = np.stack([patches.x + 0.5, patches.y + 0.5], axis=1)
@@ -257,7 +217,7 @@ def _lift_pixels(
     depth[alone] = _interpolate_depths(suggested[alone], away_px[alone])
     good |= alone
     if behind is not None:
-        at_infinity = _cost(
+        at_infinity = patch_cost(
             photographs, patches, np.full(len(depth), BACKGROUND_DEPTH * depth.max()), neighbours
         )
         as_well = alone | (at_infinity < cost + BACKGROUND_COST_MARGIN)
@@ -269,13 +229,13 @@ def _lift_pixels(
 
 
 def _hypothesis_costs(
-    photographs: _Photographs,
-    patches: _Patches,
+    photographs: ExposedPhotographs,
+    patches: PixelPatches,
     guesses: Float64[np.ndarray, "n g"],
     neighbours: list[int],
 ) -> Float64[np.ndarray, "n g"]:
     """How much each patch at each of its guesses differs from what the neighbours show."""
-    return np.stack([_cost(photographs, patches, guess, neighbours) for guess in guesses.T], axis=1)
+    return np.stack([patch_cost(photographs, patches, guess, neighbours) for guess in guesses.T], axis=1)
 
 
 def _best_hypothesis(
@@ -310,120 +270,3 @@ def _sweep(
     far = FAR_FACTOR * ordered[int(FAR_QUANTILE * (len(ordered) - 1))]
     steps = (np.arange(SWEEP_DEPTHS) + rng.random((count, SWEEP_DEPTHS))) / SWEEP_DEPTHS
     return np.asarray(near * (far / near) ** steps)
-
-
-def _draw_patches(photographs: _Photographs, index: int, samples: int, rng: np.random.Generator) -> _Patches:
-    """Random pixels that count, away from the border, with those around them."""
-    dataset = photographs.dataset
-    view = dataset.views[index]
-    y = rng.integers(STEP_PX, max(STEP_PX + 1, view.height_px - STEP_PX), samples)
-    x = rng.integers(STEP_PX, max(STEP_PX + 1, view.width_px - STEP_PX), samples)
-    all_y = np.clip(y[:, None] + OFFSETS_PX[:, 1], 0, view.height_px - 1)
-    all_x = np.clip(x[:, None] + OFFSETS_PX[:, 0], 0, view.width_px - 1)
-    which = np.full(all_y.size, index)
-    rays = dataset.rays(which, all_y.reshape(-1), all_x.reshape(-1))
-    origins, directions = rays.origins_world, rays.directions_world
-    rgb, alpha, weight = photographs.pixels(which, all_y.reshape(-1), all_x.reshape(-1))
-    counts = ((weight > 0) & (alpha > 0.5)).reshape(all_y.shape).all(axis=1)
-    directions = directions.astype(np.float64).reshape(*all_y.shape, 3)
-    # Distance along a ray of a point at depth 1 along the camera's axis.
-    factors = 1.0 / np.maximum(directions @ view.rotation_cam_from_world[2], 1e-3)
-    return _Patches(
-        origins[0].astype(np.float64),
-        directions[counts],
-        factors[counts],
-        rgb.reshape(*all_y.shape, 3)[counts],
-        y[counts],
-        x[counts],
-    )
-
-
-def _cost(
-    photographs: _Photographs, patches: _Patches, depths: Float64[np.ndarray, " n"], neighbours: list[int]
-) -> Float64[np.ndarray, " n"]:
-    """How much the patches, moved to the given depths, differ from what the neighbouring views show there."""
-    dataset = photographs.dataset
-    distances = depths[:, None] * patches.depth_factors
-    points = patches.origin_world + distances[:, :, None] * patches.directions_world
-    count, offsets = distances.shape
-    costs = np.full((len(neighbours), count), np.inf)
-    for k, other in enumerate(neighbours):
-        where_px, depth = _project(dataset, other, points.reshape(-1, 3))
-        shown = (_is_inside(dataset, other, where_px) & (depth > 0)).reshape(count, offsets)
-        inside = np.flatnonzero(shown.all(axis=1))
-        if not len(inside):
-            continue
-        chosen = np.floor(where_px.reshape(count, offsets, 2)[inside]).astype(np.int64).reshape(-1, 2)
-        rgb, _, _ = photographs.pixels(np.full(len(chosen), other), chosen[:, 1], chosen[:, 0])
-        differences = np.empty(len(inside))
-        patch_differences(patches.rgb_srgb, rgb.reshape(-1, offsets, 3), inside, LEVEL_WEIGHT, differences)
-        costs[k, inside] = differences
-    costs.sort(axis=0)
-    used = costs[: max(1, (len(neighbours) + 1) // 2)]
-    return np.asarray(used.mean(axis=0))
-
-
-def _passes_vote(
-    photographs: _Photographs,
-    points: PlaneSweepPoints,
-    own_view: Int64[np.ndarray, " n"],
-    pool: ThreadPoolExecutor,
-) -> Bool[np.ndarray, " n"]:
-    """Return whether enough of the views that look towards each point show its colour there."""
-    limits = np.where(points.swept, SWEEP_MAX_VOTE_DIFFERENCE, MAX_VOTE_DIFFERENCE)
-    majority = np.where(points.swept, SWEEP_MIN_VOTE_FRACTION, MIN_VOTE_FRACTION)
-    agree, looking = np.zeros(len(points), np.int64), np.zeros(len(points), np.int64)
-    dataset = photographs.dataset
-    train, xyz_world = dataset.train_indices, points.xyz_world.astype(np.float64)
-
-    def vote(juror: tuple[int, np.ndarray | slice]) -> tuple[np.ndarray, np.ndarray]:
-        index, rows = juror
-        where_px, depth = _project(dataset, index, xyz_world[rows])
-        inside = np.flatnonzero(_is_inside(dataset, index, where_px) & (depth > 0))
-        pixel = np.floor(where_px[inside]).astype(np.int64)
-        rgb, _, _ = photographs.pixels(np.full(len(inside), index), pixel[:, 1], pixel[:, 0])
-        which = inside if isinstance(rows, slice) else rows[inside]
-        return which, np.abs(rgb - points.rgb_srgb[which]).mean(axis=1) < limits[which]
-
-    jury = train[np.unique(np.linspace(0, len(train) - 1, VOTING_VIEWS).astype(np.int64))].tolist()
-    for which, agrees in pool.map(vote, [(index, slice(None)) for index in jury]):
-        looking[which] += 1
-        agree[which] += agrees
-    if len(jury) < len(train):
-        unseen = np.flatnonzero(looking < MIN_VOTERS)
-        looking[unseen] = agree[unseen] = 0
-        for which, agrees in pool.map(vote, _voting_views(dataset, own_view, unseen)):
-            looking[which] += 1
-            agree[which] += agrees
-    return np.asarray(agree >= majority * np.maximum(looking, 1))
-
-
-def _voting_views(
-    dataset: Dataset, own_view: Int64[np.ndarray, " n"], rows: Int64[np.ndarray, " k"]
-) -> list[tuple[int, Int64[np.ndarray, "_"]]]:
-    """Return training views and the rows of points that they vote on: those of the nearest other views."""
-    train = dataset.train_indices
-    centres = np.stack([dataset.views[i].origin_world for i in train.tolist()])
-    jurors = []
-    for index in np.unique(own_view[rows]).tolist():
-        away = np.linalg.norm(centres - dataset.views[index].origin_world, axis=1)
-        near = train[np.argsort(away, kind="stable")[: VOTING_VIEWS + 1]]
-        mine = rows[own_view[rows] == index]
-        jurors += [(juror, mine) for juror in near.tolist() if juror != index]
-    return jurors
-
-
-def _project(
-    dataset: Dataset, index: int, points: Float64[np.ndarray, "n 3"]
-) -> tuple[Float64[np.ndarray, "n 2"], Float64[np.ndarray, " n"]]:
-    """Image points, pixels, and depths along the axis of one view."""
-    view = dataset.views[index]
-    points_cam = points @ view.rotation_cam_from_world.T + view.translation_cam_from_world
-    return dataset.cameras[view.camera_index].project(points_cam), points_cam[:, 2]
-
-
-def _is_inside(dataset: Dataset, index: int, where_px: Float64[np.ndarray, "n 2"]) -> Bool[np.ndarray, " n"]:
-    view = dataset.views[index]
-    x, y = where_px[:, 0], where_px[:, 1]  # what is not-a-number lies nowhere
-    with np.errstate(invalid="ignore"):
-        return np.asarray((x >= 0) & (y >= 0) & (x < view.width_px) & (y < view.height_px))

@@ -1,5 +1,6 @@
 """Checkpoints: everything that the rest of a run depends on, in one file, written whole or not at all."""
 
+import hashlib
 import json
 import struct
 import zipfile
@@ -15,8 +16,11 @@ from jaxtyping import Float64
 from octasplat.engine.core.errors import CheckpointError, DamagedCheckpointError
 from octasplat.engine.core.events import EventListener, Warned
 from octasplat.engine.core.writing import atomic_replace
+from octasplat.engine.dataset import Dataset
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.gaussians.rows import from_row_arrays, row_arrays
+from octasplat.engine.settings.base import dump_with_former_settings
+from octasplat.engine.train.config import TrainConfig
 from octasplat.engine.train.loop.state import TrainState
 from octasplat.engine.train.optimization.adam import Adam
 from octasplat.engine.train.optimization.weight_averaging import WeightAverage
@@ -30,6 +34,12 @@ _DAMAGE = (
     OSError, KeyError, ValueError, TypeError, AttributeError, EOFError, RuntimeError, MemoryError,
     OverflowError, struct.error, zlib.error, zipfile.BadZipFile,
 )  # fmt: skip
+
+
+def run_fingerprint(dataset: Dataset, config: TrainConfig) -> str:
+    """Return a digest of the settings and the photographs that decide every byte of a training."""
+    text = json.dumps([dump_with_former_settings(config), dataset.views_record.fingerprint()])
+    return hashlib.sha256(text.encode()).hexdigest()
 
 
 def checkpoint_path(folder: Path, iteration: int) -> Path:

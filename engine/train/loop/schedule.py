@@ -1,7 +1,7 @@
 """When what happens in a training, and how long it has taken: no state but the clock's."""
 
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
@@ -11,12 +11,18 @@ from octasplat.engine.train.config import (
     rebuild_interval,
     uses_shared_sort,
 )
-from octasplat.engine.train.loop.early_end import early_stop_iteration
 from octasplat.engine.train.optimization.weight_averaging import AVERAGING_INTERVAL
 
 EVENT_INTERVAL = 10
 POSE_REFINEMENT_FROM, POSE_REFINEMENT_UNTIL, POSE_REFINEMENTS = 0.3, 0.8, 12
 """Shares of the iterations between which poses are refined, and about how often."""
+
+EARLY_STOPPING_FROM = 0.4
+"""Share of the planned iterations before which a training never ends early: much is still being added."""
+EARLY_STOPPING_WINDOW = 0.2
+"""Share of them over which the gain counts."""
+EARLY_STOPPING_TAIL = 0.2
+"""Share of them that the training still takes: rates fall to their ends, and the last states are averaged."""
 
 
 @dataclass(frozen=True)
@@ -144,6 +150,27 @@ class Schedule:
             return done / self.iterations
         before = self.early_stop_at / self.planned_iterations
         return before + (1 - before) * (done - self.early_stop_at) / (self.iterations - self.early_stop_at)
+
+
+def has_converged(probes: Sequence[tuple[int, float]], planned: int, min_gain_db: float) -> bool:
+    """Whether the best of the last probes is less than ``min_gain_db`` above the best of those before.
+
+    Args:
+        probes: iterations and PSNR in dB, in order of the iterations; the last one is now.
+        planned: iterations of the whole training.
+        min_gain_db: 0 lets nothing end early.
+    """
+    if min_gain_db <= 0 or not probes or probes[-1][0] < EARLY_STOPPING_FROM * planned:
+        return False
+    since = probes[-1][0] - EARLY_STOPPING_WINDOW * planned
+    before = [psnr for iteration, psnr in probes if iteration <= since]
+    lately = [psnr for iteration, psnr in probes if iteration > since]
+    return bool(before) and max(lately) - max(before) < min_gain_db
+
+
+def early_stop_iteration(decided: int, planned: int) -> int:
+    """Where a training ends for which it was decided after ``decided`` iterations; at most ``planned``."""
+    return min(planned, decided + max(1, round(EARLY_STOPPING_TAIL * planned)))
 
 
 class Stopwatch:

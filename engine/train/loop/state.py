@@ -1,9 +1,10 @@
-"""The state of a training: everything that the rest of a run depends on."""
+"""The state of a training: everything that the rest of a run depends on, and the least size of Gaussians."""
 
 from dataclasses import dataclass, field
 
 import numpy as np
 from jaxtyping import Float64, Int64
+from scipy.spatial import cKDTree
 
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.train.optimization.adam import Adam
@@ -68,3 +69,25 @@ def initial_state(gaussians: FlatGaussians, seed: int) -> TrainState:
         adam=Adam.zeros(gaussians),
         rng=np.random.Generator(np.random.PCG64([seed, 0])),
     )
+
+
+@dataclass(frozen=True, eq=False)
+class MinScale:
+    """The least size of Gaussians: what no photograph can show is not to be learnt.
+
+    After the 3D smoothing filter of "Mip-Splatting: Alias-free 3D Gaussian Splatting"
+    (https://arxiv.org/abs/2311.16493), as a lower limit instead of a convolution.
+
+    Attributes:
+        origins_world: where the training cameras stand.
+        angle_rad: least standard deviation as seen from the nearest of them.
+    """
+
+    origins_world: Float64[np.ndarray, "c 3"]
+    angle_rad: float
+
+    def apply(self, gaussians: FlatGaussians) -> None:
+        """Raise the scales that are smaller, in place."""
+        distance = cKDTree(self.origins_world).query(gaussians.means_world)[0]
+        least = np.log(np.maximum(self.angle_rad * distance, 1e-12)).astype(np.float32)
+        np.maximum(gaussians.log_scales, least[:, None], out=gaussians.log_scales)

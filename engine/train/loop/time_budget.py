@@ -4,31 +4,25 @@ A few iterations are trained and thrown away to see how long one takes; then the
 written down, so that a run that goes on later, at whatever pace, trains what it began.
 """
 
-import tempfile
 import time
 from collections.abc import Callable
-from contextlib import suppress
 from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from octasplat.engine.core.errors import CancelledError, ConfigError
+from octasplat.engine.core.errors import ConfigError
 from octasplat.engine.core.writing import write_text
 from octasplat.engine.dataset import Dataset
 from octasplat.engine.gaussians.model import FlatGaussians
-from octasplat.engine.trace.protocol import Tracer
 from octasplat.engine.train.config import (
     MAX_PLANNED_ITERATIONS,
     TrainConfig,
     max_gaussian_count,
     uses_shared_sort,
 )
-from octasplat.engine.train.loop.state import initial_state
-from octasplat.engine.train.loop.trainer import Trainer
-from octasplat.engine.train.sampling.shown import valid_pixel_fraction
+from octasplat.engine.train.loop.trial_training import seconds_per_iteration
+from octasplat.engine.train.sampling.pixel_sampler import valid_pixel_fraction
 
-WARM_UP_ITERATIONS, TIMED_ITERATIONS = 10, 50
-"""Iterations before the clock starts, as kernels compile and caches fill, and those that it counts."""
 USED_FRACTION = 0.8
 """Of the time; the rest is for checkpoints, probes, and a machine that becomes slower."""
 COST_POWER = 0.8
@@ -111,7 +105,7 @@ def make_plan(
         CancelledError: stopped as asked.
     """
     began = time.perf_counter()
-    pace_s = _seconds_per_iteration(dataset, config, first, threads, should_stop)
+    pace_s = seconds_per_iteration(dataset, config, first, threads=threads, should_stop=should_stop)
     if uses_shared_sort(config):  # as the trial was, and the first part of the training is
         pace_s *= config.shared_sort_until + RAY_SORT_SLOWDOWN * (1 - config.shared_sort_until)
     left_s = USED_FRACTION * (seconds - (time.perf_counter() - began))
@@ -136,36 +130,3 @@ def read_plan(path: Path) -> TimeBudgetPlan:
         raise ConfigError(
             f"{path} cannot be read ({type(error).__name__}); train again in another folder."
         ) from None
-
-
-def _seconds_per_iteration(
-    dataset: Dataset,
-    config: TrainConfig,
-    first: FlatGaussians,
-    threads: int,
-    should_stop: Callable[[], bool],
-) -> float:
-    times: list[float] = []
-
-    def note(_iteration: int, _tracer: Tracer) -> None:
-        times.append(time.perf_counter())
-
-    enough = WARM_UP_ITERATIONS + TIMED_ITERATIONS
-    trial = config.model_copy(
-        update={"iterations": 100 * enough, "densify_from_iter": 100 * enough, "probe_rays": 256}
-    )
-    with tempfile.TemporaryDirectory() as folder, suppress(CancelledError):
-        Trainer(
-            dataset,
-            trial,
-            initial_state(first.select(slice(None)), config.seed),
-            folder=Path(folder),
-            fingerprint="",
-            progress=lambda _event: None,
-            threads=threads,
-            should_stop=lambda: len(times) >= enough or should_stop(),
-            on_step=note,
-        ).run()
-    if should_stop():
-        raise CancelledError("Stopped before the training; the same command with --resume goes on.")
-    return (times[-1] - times[WARM_UP_ITERATIONS - 1]) / (len(times) - WARM_UP_ITERATIONS)

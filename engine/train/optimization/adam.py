@@ -18,7 +18,6 @@ from octasplat.engine.train.config import LearningRates, LossWeights
 from octasplat.engine.train.kernels.adam import (
     CHUNK,
     GEOMETRY,
-    LANES,
     AdamMoments,
     BiasCorrection,
     ParameterArrays,
@@ -28,6 +27,7 @@ from octasplat.engine.train.kernels.adam import (
     adam_shares,
     adam_step,
 )
+from octasplat.engine.train.kernels.adam_lanes import LANES
 
 BETA1, BETA2, EPSILON = 0.9, 0.999, 1e-15
 

@@ -19,8 +19,12 @@ from octasplat.engine.train.config import (
     max_gaussian_count,
     ray_patch_side_px,
 )
-from octasplat.engine.train.sampling.pixel_sampler import PixelSampler, TrainingData, view_sizes_px
-from octasplat.engine.train.sampling.shown import valid_pixel_fraction
+from octasplat.engine.train.sampling.pixel_sampler import (
+    PixelSampler,
+    TrainingData,
+    valid_pixel_fraction,
+    view_sizes_px,
+)
 from octasplat.engine.train.sampling.visibility_rays import ObservedPoints, VisibilityRays
 
 TILE_PX = 8

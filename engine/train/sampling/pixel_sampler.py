@@ -6,12 +6,15 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Float32, Int64
 
+from octasplat.engine.core.errors import DatasetError
 from octasplat.engine.core.rays import RayBatch
 from octasplat.engine.dataset import DatasetView
 from octasplat.engine.shading.ray_patches import morton_cells
 
 GOLDEN_RATIO = (math.sqrt(5) - 1) / 2
 """Its multiples fill the unit interval evenly, however many there are."""
+VALID_PIXEL_SAMPLES = 20_000
+"""Pixels by which the share of valid ones is estimated, always the same: it is right to 0.4 %."""
 
 
 @runtime_checkable
@@ -157,3 +160,32 @@ def _mirror_into(
 def view_sizes_px(dataset: TrainingData) -> Int64[np.ndarray, "n 2"]:
     """Width and height of every view."""
     return np.array([[view.width_px, view.height_px] for view in dataset.views], np.int64)
+
+
+def valid_pixel_fraction(dataset: TrainingData) -> float:
+    """Return the share of the training views' pixels that show something; at least that of one pixel.
+
+    Raises:
+        DatasetError: masks or alpha leave nothing of the training photographs.
+    """
+    sampler = PixelSampler(dataset.train_indices, view_sizes_px(dataset))
+    view, y, x = sampler.pixels(np.random.Generator(np.random.PCG64(0)), VALID_PIXEL_SAMPLES)
+    _, alpha, weight = dataset.pixels(view, y, x)
+    shown = int(((alpha > 0) & (weight > 0)).sum())
+    if shown == 0 and _has_no_valid_pixel(dataset):
+        raise DatasetError(
+            "The training photographs show nothing: their masks or alpha leave no pixel. Masks are white "
+            "where a pixel counts; invert them, or leave them out."
+        )
+    return max(1, shown) / VALID_PIXEL_SAMPLES
+
+
+def _has_no_valid_pixel(dataset: TrainingData) -> bool:
+    """Whether no pixel at all of the training views shows anything."""
+    for index in dataset.train_indices.tolist():
+        view = dataset.views[index]
+        y, x = np.divmod(np.arange(view.width_px * view.height_px), view.width_px)
+        _, alpha, weight = dataset.pixels(np.full(len(y), index), y, x)
+        if ((alpha > 0) & (weight > 0)).any():
+            return False
+    return True

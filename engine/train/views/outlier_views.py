@@ -34,6 +34,10 @@ OUTLIER_MARGIN_DB, OUTLIER_SIGMAS = 3.0, 5.0
 """A view that is so much worse than those around it, also in robust standard deviations, is misplaced."""
 MAX_EXCLUDED_FRACTION = 0.25
 """No larger share of the training views is left out."""
+MISPLACED_SIGMAS = 3.0
+"""Robust standard deviations after a short training: fewer, as matches have the last word on poses."""
+MAX_MISPLACED_VIEWS, MAX_MISPLACED_FRACTION = 20, 0.25
+"""No more views are in doubt, nor a larger share of all; the worst are."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,6 +111,26 @@ def find_outlier_views(
         low = below > max(OUTLIER_MARGIN_DB, sigmas * sigma)
     worst_first = np.argsort(-below, kind="stable")
     return indices[worst_first[low[worst_first]]]
+
+
+def find_misplaced_views(
+    dataset: TrainingData,
+    background_srgb: Float32[np.ndarray, "3"],
+    tracer: Tracer,
+    shading: ShadingModel,
+) -> Int64[np.ndarray, " d"]:
+    """Return views, held-out ones too, that fit the others so badly that their poses are in doubt; in order.
+
+    Args:
+        dataset: the photographs.
+        background_srgb: what lies behind them.
+        tracer: holds the Gaussians of a short training.
+        shading: of that training.
+    """
+    measured = measure_views(dataset, np.arange(len(dataset.views)), background_srgb, tracer, shading)
+    doubtful = find_outlier_views(measured, dataset.views, dataset.train_indices, MISPLACED_SIGMAS)
+    most = min(MAX_MISPLACED_VIEWS, int(MAX_MISPLACED_FRACTION * len(dataset.views)))
+    return np.sort(doubtful[:most])
 
 
 def _neighborhood_median(

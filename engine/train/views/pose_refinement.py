@@ -15,11 +15,12 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float32, Float64, Int64
 
+from octasplat.engine.core.errors import ConfigError
 from octasplat.engine.dataset.view_frusta import rotate_vectors
 from octasplat.engine.shading.protocol import ShadingModel, TracedRays
 from octasplat.engine.trace.protocol import Tracer
 from octasplat.engine.train.sampling.batches import grid_pixels
-from octasplat.engine.train.sampling.pixel_sampler import view_sizes_px
+from octasplat.engine.train.sampling.pixel_sampler import TrainingData, view_sizes_px
 from octasplat.engine.train.views.corrected_views import (
     CorrectedDataset,
     PosedTrainingData,
@@ -172,3 +173,14 @@ class PoseRefiner:
                 chosen = met & (view == index)
                 points = rotate_vectors(points_world[chosen], dataset.views[index].rotation_cam_from_world)
                 yield index, RenderedPoints(points, rgb[chosen].astype(np.float64))
+
+
+def make_pose_refiner(dataset: TrainingData, background_srgb: Float32[np.ndarray, "3"]) -> PoseRefiner:
+    """Return a refiner of the training views' poses.
+
+    Raises:
+        ConfigError: the photographs come without cameras.
+    """
+    if not isinstance(dataset, PosedTrainingData):
+        raise ConfigError("refine_poses projects into the photographs, but these come without cameras.")
+    return PoseRefiner(dataset, background_srgb)
