@@ -12,7 +12,7 @@ def adam_update(
     gradient: Float64[np.ndarray, "h w 3"],
     step: int,
 ) -> tuple[Float32[np.ndarray, "h w 3"], Float32[np.ndarray, "h w 3"], Float64[np.ndarray, "h w 3"]]:
-    """The moments after a gradient, and the change, to be taken off, of a step of size 1.
+    """Return the moments after a gradient, and the change of a step of size 1, to be subtracted.
 
     Args:
         exp_avg: first moments.
@@ -28,7 +28,7 @@ def adam_update(
 
 
 def smoothness_gradient(values: Float[np.ndarray, "h w 3"]) -> Float64[np.ndarray, "h w 3"]:
-    """Four times each texel less the four beside it: the gradient of half the squared differences."""
+    """Return four times each texel less the four beside it: the gradient of half the squared differences."""
     x = values.astype(np.float64)
     padded = np.pad(x, ((1, 1), (0, 0), (0, 0)), mode="edge")
     around = np.roll(x, 1, axis=1) + np.roll(x, -1, axis=1) + padded[:-2] + padded[2:]

@@ -29,7 +29,7 @@ def ambient_visibility(
     offset: RayOffset,
     one_sided: bool = False,
 ) -> tuple[Float32[np.ndarray, " u"], Float32[np.ndarray, " u"]]:
-    """Mean transmittance over the hemisphere, weighted by the cosine, of the outer side.
+    """Return the cosine-weighted mean transmittance over the hemisphere of the outer side.
 
     Where normals do not say which that is, it is the side that sees more: a Gaussian of a solid thing has one
     side outside and one inside.
@@ -63,7 +63,7 @@ def diffuse_interreflection(
     rays: int,
     offset: RayOffset,
 ) -> Float32[np.ndarray, "u 3"]:
-    """Irradiance over pi that the other Gaussians send to one side of each: the mean over the same rays.
+    """Return irradiance over pi that other Gaussians send to one side of each: the mean over the same rays.
 
     Args:
         gaussians: the scene.
@@ -92,7 +92,7 @@ def _hemisphere_rays(
     rays: int,
     offset: RayOffset,
 ) -> RayBatch:
-    """The fan over one side of each, begun a little above."""
+    """Return rays over the hemisphere of one side of each Gaussian, begun a little above it."""
     frames = rotation_matrices(gaussians.quats_wxyz[ids])
     frames = frames * np.stack([side, np.ones_like(side), np.ones_like(side)], axis=1)[:, None, :]
     ways = np.einsum("nij,kj->nki", frames, cosine_hemisphere(rays))
@@ -102,7 +102,7 @@ def _hemisphere_rays(
 
 
 def cosine_hemisphere(rays: int) -> Float64[np.ndarray, "k 3"]:
-    """Directions about the first axis, as dense as the cosine to it; the same each time."""
+    """Return directions about the first axis with a density of the cosine to it; the same each time."""
     square = (np.arange(rays) + 0.5) / rays
     angle = _GOLDEN_ANGLE * np.arange(rays)
     radius = np.sqrt(square)

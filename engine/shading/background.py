@@ -76,7 +76,7 @@ class LearnedBackground:
     def from_map(
         cls, rgb_srgb: Float32[np.ndarray, "h w 3"], inner: ShadingModel = PLAIN_SHADING
     ) -> "LearnedBackground":
-        """A finished map behind a model."""
+        """Return a model with a finished map behind another model."""
         background = cls(len(rgb_srgb), inner=inner)
         background.set_map(rgb_srgb)
         return background
@@ -87,7 +87,7 @@ class LearnedBackground:
         self.rgb_srgb = np.clip(rgb_srgb, 0, 1).astype(np.float32)
 
     def lookup(self, directions_world: Float32[np.ndarray, "r 3"]) -> Float32[np.ndarray, "r 3"]:
-        """Display colours of unit directions, bilinear between texels."""
+        """Return display colours of unit directions, bilinear between texels."""
         height = len(self.rgb_srgb)
         colours = np.empty((len(directions_world), 3), np.float32)
         run_ranges(
@@ -97,15 +97,15 @@ class LearnedBackground:
         return colours
 
     def features(self, gaussians: FlatGaussians) -> Float32[np.ndarray, "n f"] | None:
-        """Those of the model inside."""
+        """Return the features of the inner model."""
         return self.inner.features(gaussians)
 
     def on_rebuild(self, gaussians: FlatGaussians, tracer: Tracer, *, training_progress: float) -> None:
-        """The model inside looks around."""
+        """Let the inner model look around."""
         self.inner.on_rebuild(gaussians, tracer, training_progress=training_progress)
 
     def shade(self, traced: TracedRays) -> ShadedRays:
-        """The colours of the model inside, with the map's where they let it through; nothing is left open."""
+        """Return the inner model's colours over those of the map; nothing stays transparent."""
         inner = self.inner.shade(traced)
         behind = self.lookup(traced.rays.directions_world)
         rgb = inner.rgb_srgb + inner.transmittance[:, None] * behind
@@ -118,7 +118,7 @@ class LearnedBackground:
         by_rgb: Float32[np.ndarray, "r 3"],
         by_transmittance: Float32[np.ndarray, " r"],
     ) -> ShadingGradients:
-        """Gradients by what the model inside developed, and by the map's colours in the rays' directions."""
+        """Return gradients by what the inner model shaded and by the map's colours along the rays."""
         assert isinstance(shaded.ctx, tuple)
         inner, behind = shaded.ctx
         through = (by_rgb * behind).sum(axis=1, dtype=np.float32)
@@ -165,7 +165,7 @@ class LearnedBackground:
         self.rgb_srgb = np.clip(self.rgb_srgb - rate * change, 0, 1).astype(np.float32)
 
     def state(self) -> dict[str, np.ndarray]:
-        """The map, moments and sums, and what the model inside keeps."""
+        """Return the map, its moments and sums, and the state of the inner model."""
         return {**self.inner.state(), **{f"background.{name}": getattr(self, name) for name in _STATE}}
 
     def restore(self, state: Mapping[str, np.ndarray]) -> None:

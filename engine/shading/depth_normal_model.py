@@ -38,7 +38,7 @@ class DepthNormalShading(PlainShading):
         by_rgb: Float32[np.ndarray, "r 3"],
         by_transmittance: Float32[np.ndarray, " r"],
     ) -> ShadingGradients:
-        """The gradients of the plain model, and those of the term by alphas, depths and normals."""
+        """Return the gradients of the plain model, and those of the term by alphas, depths and normals."""
         plain = super().backward(traced, shaded, by_rgb, by_transmittance)
         count = len(by_rgb)
         by_alpha, by_normal, by_depth = np.zeros(count), np.zeros((count, 3)), np.zeros(count)

@@ -41,7 +41,7 @@ class DepthSplit:
     traced: Bool[np.ndarray, " t"] = field(default_factory=lambda: np.zeros(0, bool))
 
     def sum_layers(self, values: Float[np.ndarray, "l c"]) -> Float[np.ndarray, "r c"]:
-        """Sums over the parts of each ray."""
+        """Return the sums over the layers of each ray."""
         count = len(values) - len(self.split_ids)
         out = values[:count].copy()
         out[self.split_ids] += values[count:]
@@ -66,13 +66,13 @@ class DepthSplit:
         return means
 
     def expand(self, values: Shaped[np.ndarray, "r *c"]) -> Shaped[np.ndarray, "l *c"]:
-        """The value of its ray for each part."""
+        """Return the value of its ray for each layer."""
         return np.concatenate([values, values[self.split_ids]]) if len(self.split_ids) else values
 
     def backward(
         self, by_layers: TraceGradients
     ) -> tuple[TraceGradients, tuple[tuple[Recording, TraceGradients], ...]]:
-        """Gradients by the whole rays and by the fronts, from those by the parts."""
+        """Return gradients by the whole rays and by the fronts, from those by the layers."""
         if not len(self.split_ids):
             return by_layers, ()
         count = len(by_layers.rgb_srgb) - len(self.split_ids)
@@ -88,14 +88,14 @@ class DepthSplit:
 
 
 def no_split(rays: RayBatch, result: TraceResult) -> DepthSplit:
-    """Rays as they are."""
+    """Return rays as one layer each."""
     return DepthSplit(rays, result, np.empty(0, np.int64))
 
 
 def split_by_depth(
     rays: RayBatch, result: TraceResult, tracer: Tracer, *, min_separation_world: float, record: bool
 ) -> DepthSplit:
-    """Part the rays whose mean depth is farther than ``min_separation_world`` from the median.
+    """Split the rays whose mean depth is farther than ``min_separation_world`` from the median.
 
     Args:
         rays: with unit directions.

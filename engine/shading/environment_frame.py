@@ -7,7 +7,7 @@ from jaxtyping import Float64
 def environment_frame(
     up_world: Float64[np.ndarray, "3"], rotation_degrees: float = 0.0
 ) -> Float64[np.ndarray, "3 3"]:
-    """Right, up and forward of a map, as rows.
+    """Return right, up and forward of a map, as rows.
 
     Forward, where the middle column lies, is the world's z made level, or its x where z is about up. The
     rotation turns it to the left, seen from above anticlockwise.

@@ -68,12 +68,12 @@ class EnvironmentPrefilter:
 
     @cached_property
     def _turned(self) -> list[_SparseRows]:
-        """The transposes, which only those need who learn."""
+        """Return the transposed filters, which training alone needs."""
         sources = [self.height >> halving for halving in _SOURCES[1:]]
         return [rows.transpose(2 * s * s) for rows, s in zip(self._maps, sources, strict=True)]
 
     def levels(self, radiance_linear: Float[np.ndarray, "h w 3"]) -> EnvironmentLevels:
-        """All levels of an environment."""
+        """Return all levels of an environment."""
         texels = np.empty((int(self.offsets[-1]), 3), np.float32)
         halved = [np.ascontiguousarray(radiance_linear.reshape(-1, 3), np.float32)]
         for _ in range(max(_SOURCES)):
@@ -84,7 +84,7 @@ class EnvironmentPrefilter:
         return EnvironmentLevels(texels, self.offsets[:-1], self.heights, np.array(ROUGHNESSES))
 
     def backward(self, by_texels: Float64[np.ndarray, "t 3"]) -> Float64[np.ndarray, "h w 3"]:
-        """Gradients by the environment's texels from those by the texels of all its levels."""
+        """Return gradients by the environment's texels from those by the texels of all its levels."""
         sizes = [2 * (self.height >> halving) ** 2 for halving in range(max(_SOURCES) + 1)]
         sums = [np.zeros((size, 3)) for size in sizes]
         sums[0] += by_texels[: self.offsets[1]]
@@ -99,12 +99,12 @@ class EnvironmentPrefilter:
 
 @lru_cache(maxsize=4)
 def prefilter_for(height: int) -> EnvironmentPrefilter:
-    """The maps for environments of so many rows, made once."""
+    """Return the prefilter for environments of ``height`` rows, made once."""
     return EnvironmentPrefilter(height)
 
 
 def solid_angles(height: int) -> Float64[np.ndarray, " h"]:
-    """Share of the sphere that a texel of each row covers, times 4 pi."""
+    """Return the solid angle of a texel of each row, steradians."""
     edges = np.cos(np.arange(height + 1) / height * np.pi)
     return (edges[:-1] - edges[1:]) * np.pi / height
 
@@ -112,7 +112,7 @@ def solid_angles(height: int) -> Float64[np.ndarray, " h"]:
 def resample_environment(
     radiance_linear: Float[np.ndarray, "h w 3"], height: int
 ) -> Float32[np.ndarray, "a b 3"]:
-    """An environment in ``height`` x 2 ``height`` texels: means by solid angle where they are fewer."""
+    """Return an environment in ``height`` x 2 ``height`` texels: solid-angle means where they are fewer."""
     rows, columns = radiance_linear.shape[:2]
     if (rows, columns) == (height, 2 * height):
         return radiance_linear.astype(np.float32)
@@ -125,14 +125,14 @@ def resample_environment(
 
 
 def _interval_overlaps(old: int, new: int) -> Float64[np.ndarray, "n o"]:
-    """How much of each old cell lies in each new one, where both divide the same length."""
+    """Return how much of each old cell lies in each new one, where both divide the same length."""
     low = np.maximum(np.arange(new)[:, None] / new, np.arange(old) / old)
     high = np.minimum(np.arange(1, new + 1)[:, None] / new, np.arange(1, old + 1) / old)
     return np.maximum(high - low, 0.0)
 
 
 def _row_fractions(height: int) -> Float64[np.ndarray, "h2 2"]:
-    """Share of the upper and of the lower row in each pair of them."""
+    """Return the share of the upper and of the lower row in each pair of rows."""
     angles = solid_angles(height).reshape(-1, 2)
     return angles / angles.sum(axis=1, keepdims=True)
 
@@ -146,7 +146,7 @@ def _halve(texels: Float[np.ndarray, "t 3"]) -> Float[np.ndarray, "s 3"]:
 
 
 def _halve_backward(gradients: Float64[np.ndarray, "s 3"]) -> Float64[np.ndarray, "t 3"]:
-    """The transpose of :func:`_halve`."""
+    """Apply the transpose of :func:`_halve`."""
     half = int(np.sqrt(len(gradients) // 2))
     rows = gradients.reshape(half, 1, 2 * half, 1, 3) * (_row_fractions(2 * half) / 2)[:, :, None, None, None]
     return np.broadcast_to(rows, (half, 2, 2 * half, 2, 3)).reshape(-1, 3)

@@ -60,7 +60,7 @@ class EnvironmentLight:
 
     @property
     def radiance_linear(self) -> Float32[np.ndarray, "h w 3"]:
-        """The environment."""
+        """Return the radiance of the environment."""
         return np.exp(self.log_radiance)
 
     def set_radiance(self, radiance_linear: Float32[np.ndarray, "h w 3"]) -> None:
@@ -71,7 +71,7 @@ class EnvironmentLight:
 
     @property
     def levels(self) -> EnvironmentLevels:
-        """Its levels, made when they are asked for after a change."""
+        """Return the prefiltered levels, computed when they are asked for after a change."""
         if self._levels is None:
             self._levels = self._prefilter.levels(self.radiance_linear)
         return self._levels
@@ -91,14 +91,14 @@ class EnvironmentLight:
         self._levels = None
 
     def _prior_gradients(self) -> Float64[np.ndarray, "h w 3"]:
-        """Gradients of: light is about white, and about as bright as that beside it."""
+        """Return gradients of the priors: light is nearly white, and nearly as bright as that beside it."""
         x = self.log_radiance.astype(np.float64)
         angles = solid_angles(len(x))[:, None, None] / (4 * np.pi)
         white = x - x.mean(axis=2, keepdims=True)
         return angles * (self._white_weight * white + self._smoothness_weight * smoothness_gradient(x))
 
     def state(self) -> dict[str, np.ndarray]:
-        """Radiance, moments and sums."""
+        """Return radiance, moments and sums."""
         return {name: getattr(self, name) for name in _STATE}
 
     def restore(self, state: Mapping[str, np.ndarray]) -> None:

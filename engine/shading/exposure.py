@@ -62,21 +62,21 @@ class ExposureModel:
 
     @classmethod
     def from_known(cls, names: Sequence[str], known: ExposuresByName) -> "ExposureModel":
-        """Those of views with these names that a finished training has left; not to be trained."""
+        """Return the exposures of named views that a finished training has left; not to be trained."""
         exposures = cls(len(names), rate=0.0)
         exposures.load_known(names, known)
         return exposures
 
     def features(self, gaussians: FlatGaussians) -> Float32[np.ndarray, "n f"] | None:
-        """Those of the model inside."""
+        """Return the features of the inner model."""
         return self.inner.features(gaussians)
 
     def on_rebuild(self, gaussians: FlatGaussians, tracer: Tracer, *, training_progress: float) -> None:
-        """The model inside looks around."""
+        """Let the inner model look around."""
         self.inner.on_rebuild(gaussians, tracer, training_progress=training_progress)
 
     def shade(self, traced: TracedRays) -> ShadedRays:
-        """Colours as the rays' views show them; others have the mean exposure, or that of one view."""
+        """Return colours as the rays' views expose them; other rays have the mean or a fixed exposure."""
         inner = self.inner.shade(traced)
         view = traced.view if self._fixed_view is None else self._fixed_view
         if view is None:
@@ -87,7 +87,7 @@ class ExposureModel:
         return ShadedRays(rgb, inner.transmittance, inner, inner.layers)
 
     def for_view(self, view: int) -> "ExposureModel":
-        """The same model, which exposes everything as a view is; it shares the arrays and is not trained."""
+        """Return the same model, exposing everything as one view; it shares the arrays and is not trained."""
         other = copy.copy(self)
         other._fixed_view = view
         return other
@@ -95,7 +95,7 @@ class ExposureModel:
     def remove_exposure(
         self, rgb_srgb: Float32[np.ndarray, "h w 3"], view: int
     ) -> Float32[np.ndarray, "h w 3"]:
-        """Straight display colours of a view's photograph as the mean exposure shows them, within [0, 1]."""
+        """Return a view's straight display colours at the mean exposure, within [0, 1]."""
         shown = (rgb_srgb - self.offsets[view]) / np.exp(self.log_gains[view])
         return np.asarray(np.clip(shown, 0, 1), np.float32)
 
@@ -123,7 +123,7 @@ class ExposureModel:
         by_rgb: Float32[np.ndarray, "r 3"],
         by_transmittance: Float32[np.ndarray, " r"],
     ) -> ShadingGradients:
-        """Gradients by what the model inside developed, and of each used view's log gains and offsets."""
+        """Return gradients by what the inner model shaded, and by each used view's log gains and offsets."""
         view, inner = traced.view, shaded.ctx
         assert view is not None and isinstance(inner, ShadedRays), (
             "only views of the training are learnt from"
@@ -146,7 +146,7 @@ class ExposureModel:
         *,
         training_progress: float,
     ) -> None:
-        """One step of Adam for the views of the batch, then the mean over all views so far is taken out."""
+        """Take a step of Adam for the views of the batch, then subtract the mean over all views so far."""
         self.inner.step(gaussians, gradients, parameters, training_progress=training_progress)
         used, sums = parameters["exposure.views"], parameters["exposure.sums"]
         self.steps[used] += 1
@@ -163,7 +163,7 @@ class ExposureModel:
             values[seen] -= values[seen].mean(axis=0, dtype=np.float64).astype(np.float32)
 
     def as_dict(self, names: Sequence[str]) -> dict[str, dict[str, list[float]]]:
-        """JSON-ready, by the names of all views; :meth:`take` takes it back."""
+        """Return a JSON-ready record by the names of all views; :meth:`take` reads it."""
         rows = zip(names, self.log_gains.tolist(), self.offsets.tolist(), strict=True)
         return {name: {"log_gains": gains, "offsets": offsets} for name, gains, offsets in rows}
 
@@ -175,7 +175,7 @@ class ExposureModel:
                 self.offsets[number] = known[name]["offsets"]
 
     def state(self) -> dict[str, np.ndarray]:
-        """Gains, offsets and moments, and what the model inside keeps."""
+        """Return gains, offsets and moments, and the state of the inner model."""
         return {**self.inner.state(), **{f"exposure.{name}": getattr(self, name) for name in _STATE}}
 
     def restore(self, state: Mapping[str, np.ndarray]) -> None:

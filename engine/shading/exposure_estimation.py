@@ -20,7 +20,7 @@ MIN_VIEWS_FOR_LINE = 8
 
 
 def times_from_names(names: Sequence[str]) -> Float64[np.ndarray, " v"]:
-    """When photographs were taken, in any unit: the last numbers of their names, as of the frames of a film.
+    """Return when photographs were taken, in any unit: the last numbers of their names, as of video frames.
 
     Their places in the list where these do not ascend.
     """
@@ -39,7 +39,7 @@ def estimate_values(
     times: Float64[np.ndarray, " v"],
     brightness: Float64[np.ndarray, " v"] | None = None,
 ) -> Float64[np.ndarray, "m c"]:
-    """Values of the views ``others``: 0, the mean of the trained ones, as far as nothing tells more.
+    """Return values of the views ``others``: 0, the mean of the trained ones, where nothing tells more.
 
     Args:
         known: values of the trained views, whose mean is about 0.
@@ -71,7 +71,7 @@ def _line_then_neighbors(
     our_brightness: Float64[np.ndarray, " k"],
     their_brightness: Float64[np.ndarray, " m"],
 ) -> Estimator:
-    """What the line over the brightness says, and what is left of the views before and after."""
+    """Predict by a line over the brightness, then by the residuals of the views before and after."""
     middle, height = our_brightness.mean(), known.mean(axis=0)
     slopes, left_out, trust = _slopes(our_brightness - middle, known, height)
     rest = known - trust * (our_brightness - middle)[:, None] * slopes
@@ -87,7 +87,7 @@ def _neighbors_then_line(
     our_brightness: Float64[np.ndarray, " k"],
     their_brightness: Float64[np.ndarray, " m"],
 ) -> Estimator:
-    """What the views before and after say, and a line over how much brighter than these a view is."""
+    """Predict by the views before and after, then by a line over how much brighter than these a view is."""
     found, left = _neighbor_mean(known, ours, theirs)
     brighter = our_brightness[1:-1] - _leave_one_out_neighbors(our_brightness[:, None], ours)[:, 0]
     slopes, left_out, trust = _slopes(brighter, left)
@@ -100,7 +100,7 @@ def _slopes(
     known: Float64[np.ndarray, "k c"],
     height: Float64[np.ndarray, " c"] | None = None,
 ) -> tuple[Float64[np.ndarray, " c"], Float64[np.ndarray, "k c"], float]:
-    """Slopes of the lines over a brightness around 0; what the lines of all others say of each; the trust.
+    """Return slopes of lines over a brightness around 0, the leave-one-out predictions, and the trust.
 
     Lines go through 0, or through the ``height`` of the mean.
     """
@@ -118,7 +118,7 @@ def _slopes(
 def _neighbor_mean(
     known: Float64[np.ndarray, "k c"], ours: Float64[np.ndarray, " k"], theirs: Float64[np.ndarray, " m"]
 ) -> Estimator:
-    """The mean of the trained views before and after, by how near they are, as far as it is to be trusted."""
+    """Return the mean of the trained views before and after, weighted by nearness, times the trust."""
     near = np.stack([np.interp(theirs, ours, channel) for channel in known.T], axis=1)
     between = _leave_one_out_neighbors(known, ours)
     trust = _shrinkage(between, known[1:-1])
@@ -128,12 +128,12 @@ def _neighbor_mean(
 def _leave_one_out_neighbors(
     known: Float64[np.ndarray, "k c"], ours: Float64[np.ndarray, " k"]
 ) -> Float64[np.ndarray, "i c"]:
-    """What the views before and after each say of it, of all but the first and the last."""
+    """Return the prediction of each inner view from the views before and after it."""
     share = (ours[1:-1] - ours[:-2]) / (ours[2:] - ours[:-2])
     return known[:-2] + share[:, None] * (known[2:] - known[:-2])
 
 
 def _shrinkage(said: Float64[np.ndarray, "k c"], known: Float64[np.ndarray, "k c"]) -> float:
-    """The factor between 0 and 1 with which what is said comes nearest to what is known."""
+    """Return the factor in [0, 1] that brings predictions nearest to known values."""
     scale = float((said**2).sum())
     return min(max(float((said * known).sum()) / scale, 0.0), 1.0) if scale > 0 else 0.0

@@ -49,7 +49,7 @@ class GBuffer:
 
 
 def build_gbuffer(rays: RayBatch, result: TraceResult) -> GBuffer:
-    """The buffer of a trace whose first features are materials."""
+    """Return the G-buffer of a trace whose first features are materials."""
     alpha = 1.0 - result.transmittance.astype(np.float64)
     which = np.flatnonzero(alpha > MIN_ALPHA)
     alpha = alpha[which]
@@ -82,7 +82,7 @@ def reflected_rays(
     offset: RayOffset,
     facets_world: Float64[np.ndarray, "p 3"] | None = None,
 ) -> RayBatch:
-    """Rays from the points of a buffer along their reflected directions, begun a little off the surface.
+    """Return rays from the points of a G-buffer along their reflected directions, begun off the surface.
 
     Args:
         rays: that the buffer was gathered along.

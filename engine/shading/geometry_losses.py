@@ -31,7 +31,7 @@ def normal_spread_gradient(
     by_alpha: Float64[np.ndarray, " r"],
     by_normal: Float64[np.ndarray, "r 3"],
 ) -> None:
-    """Half of the sum of w |n - N|^2 over a ray's Gaussians, N the direction of the blended normal.
+    """Add the gradient of half the sum of w |n - N|^2 over a ray's Gaussians, N the blended unit normal.
 
     That is the accumulated alpha minus the length of the blended normal: it needs no neighbours.
     """
@@ -65,7 +65,7 @@ def add_depth_normal_gradient(
     by_normal: Float64[np.ndarray, "r 3"],
     by_depth: Float64[np.ndarray, " r"],
 ) -> None:
-    """One minus the cosine between the blended normal and that of the points of three neighbouring rays."""
+    """Add the gradient of one minus the cosine between blended normals and those of neighbouring depths."""
     windows = traced.ray_patches
     if windows is None:
         return
@@ -110,7 +110,7 @@ def add_depth_normal_gradient(
 def add_normal_smoothness_gradient(
     traced: TracedRays, weight: float, by_normal: Float64[np.ndarray, "r 3"]
 ) -> None:
-    """One minus the cosine between the normals of neighbouring rays, where these show one smooth surface.
+    """Add the gradient of one minus the cosine between neighbouring rays' normals on one smooth surface.
 
     A surface that is bent evenly has no gradient from it.
     """
@@ -139,7 +139,7 @@ def add_material_smoothness_gradient(
     by_features: Float64[np.ndarray, "r f"],
     by_alpha: Float64[np.ndarray, " r"],
 ) -> None:
-    """Differences of materials between neighbouring rays: their size, rounded off near zero.
+    """Add the gradient of material differences between neighbouring rays: their size, rounded off near zero.
 
     Each of the five columns of materials has its weight. That of the albedo is 1 + ``metal`` times as large
     between two metals, in between by the square of the smaller metallic: what reflections do not explain yet

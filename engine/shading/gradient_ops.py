@@ -22,6 +22,6 @@ def clip_gradients(
 
 
 def srgb_derivative(linear: Float64[np.ndarray, "*shape"]) -> Float64[np.ndarray, "*shape"]:
-    """Slope of the display values by the linear ones; beyond white that at white, so that light can fall."""
+    """Return the derivative of display by linear values; beyond white that at white, so light can fall."""
     x = np.clip(linear, 0.0, 1.0)
     return np.where(x <= 0.0031308, 12.92, (1.055 / 2.4) * np.maximum(x, 0.0031308) ** (1 / 2.4 - 1))

@@ -38,11 +38,11 @@ class IncidentLightModel(Protocol):
 
     @property
     def incident(self) -> IncidentLight:
-        """What comes in at each point."""
+        """Return what comes in at each point."""
         ...
 
     def normal_gradient(self, back: ShadeGradients) -> Float64[np.ndarray, "p 3"] | float:
-        """Gradients by the normals through what reflected rays meet."""
+        """Return gradients by the normals through what reflected rays hit."""
         ...
 
     def add_roughness_gradient(self, back: ShadeGradients) -> None:
@@ -50,7 +50,7 @@ class IncidentLightModel(Protocol):
         ...
 
     def backward(self, back: ShadeGradients, by_texels: Float64[np.ndarray, "t 3"]) -> RecordedGradients:
-        """Gradients by what reflected rays met; those by the texels are added to ``by_texels``."""
+        """Return gradients by what reflected rays hit; those by the texels are added to ``by_texels``."""
         ...
 
 
@@ -83,7 +83,7 @@ class RayPairIncidentLight:
         reflection_tracer: ReflectionTracer,
         settings: MaterialSettings,
     ) -> "RayPairIncidentLight":
-        """Ask for the points of a buffer."""
+        """Trace pairs of rays for the points of a G-buffer."""
         rays, record, ways = split.rays, traced.view is not None, gbuffer.surface.direction_world
         salt, least = (
             int(traced.training_progress * PROGRESS_SALTS),
@@ -102,15 +102,15 @@ class RayPairIncidentLight:
 
     @property
     def incident(self) -> IncidentLight:
-        """The mean of each pair."""
+        """Return the mean of each pair."""
         return self.pairs.incident
 
     def normal_gradient(self, back: ShadeGradients) -> Float64[np.ndarray, "p 3"]:
-        """From the differences of the pairs."""
+        """Return gradients by the normals from the differences of the pairs."""
         return backward_normals(self.pairs.reflected.incident, self.pairs.facets, back.around, back.specular)
 
     def add_roughness_gradient(self, back: ShadeGradients) -> None:
-        """From the three rays of those that were drawn, for all."""
+        """Add gradients by the roughness, estimated from the three rays of the points that were drawn."""
         if (found := self.probe) is None:
             return
         at = found.point_ids
@@ -118,7 +118,7 @@ class RayPairIncidentLight:
         back.material[at, 4] += slope / self.settings.roughness_probe_fraction
 
     def backward(self, back: ShadeGradients, by_texels: Float64[np.ndarray, "t 3"]) -> RecordedGradients:
-        """To all that was met on the way."""
+        """Return gradients by all that was hit on the way."""
         by_seen = backward_mean(IncidentLight(back.visibility, back.indirect))
         return backward_reflections(
             self.pairs.reflected,
@@ -152,7 +152,7 @@ class SingleRayIncidentLight:
         offset: RayOffset,
         settings: MaterialSettings,
     ) -> "SingleRayIncidentLight":
-        """Ask for the points of a buffer."""
+        """Trace one ray for each point of a G-buffer."""
         rays = reflected_rays(split.rays, gbuffer, offset)
         met = traced.tracer.trace(rays, record=traced.view is not None)
         visibility = met.transmittance.astype(np.float64)
@@ -163,14 +163,14 @@ class SingleRayIncidentLight:
         return cls(IncidentLight(visibility, linear * alpha), met.recording, 1.0 / srgb_derivative(linear))
 
     def normal_gradient(self, back: ShadeGradients) -> float:
-        """None: one ray says nothing of those beside it."""
+        """Return 0: one ray says nothing of the directions beside it."""
         return 0.0
 
     def add_roughness_gradient(self, back: ShadeGradients) -> None:
-        """None, likewise."""
+        """Add nothing: one ray says nothing of the directions beside it."""
 
     def backward(self, back: ShadeGradients, by_texels: Float64[np.ndarray, "t 3"]) -> RecordedGradients:
-        """To the harmonics that were met."""
+        """Return gradients by the harmonics that were hit."""
         if self.recording is None:
             return ()
         return ((self.recording, TraceGradients(rgb_srgb=(back.indirect * self.by_rgb).astype(np.float32))),)

@@ -225,22 +225,22 @@ class MaterialSettings(Settings):
 
     @property
     def smooth_weights(self) -> tuple[float, ...]:
-        """Of the smoothness of each column of materials."""
+        """Return the weight of the smoothness of each column of materials."""
         return (self.smooth_weight,) * 3 + (self.smooth_gloss_weight,) * 2
 
     def shading_ramp(self, training_progress: float) -> float:
-        """Share of the picture that is shaded, not taken from the harmonics."""
+        """Return the share of the picture that is shaded, not taken from the harmonics."""
         begin, end = SHADING_RAMP
         if training_progress >= end:
             return 1.0
         return max(training_progress - begin, 0.0) / (end - begin)
 
     def blur_roughness(self, training_progress: float) -> float:
-        """Roughness of the level that leads reflected directions."""
+        """Return the roughness of the level of the environment that leads reflected directions."""
         return self.blur * max(0.0, 1.0 - training_progress / self.blur_until) if self.blur_until > 0 else 0.0
 
     def min_facet_slope(self, training_progress: float) -> float:
-        """Tangent of the least angle between a normal and its facets."""
+        """Return the tangent of the least angle between a normal and its facets."""
         first, last = self.reflection_ray_slope
         share = min(training_progress / self.blur_until, 1.0) if self.blur_until > 0 else 1.0
         return first * (last / first) ** share

@@ -58,7 +58,7 @@ def propagate_normals(gaussians: FlatGaussians) -> None:
 def _rotations_between(
     before: Float64[np.ndarray, "n 3"], after: Float64[np.ndarray, "n 3"]
 ) -> Float64[np.ndarray, "n 3 3"]:
-    """The smallest rotations that take unit vectors to others which are not opposite to them."""
+    """Return the smallest rotations between pairs of unit vectors that are not opposite to each other."""
     axis = np.cross(before, after)
     cosine = (before * after).sum(axis=1)
     cross = np.zeros((len(before), 3, 3))

@@ -16,13 +16,13 @@ class PlainShading:
     name = "plain"
 
     def features(self, gaussians: FlatGaussians) -> None:
-        """No features."""
+        """Return None: nothing is blended beside the colour."""
 
     def on_rebuild(self, gaussians: FlatGaussians, tracer: Tracer, *, training_progress: float) -> None:
-        """Nothing to see."""
+        """Do nothing."""
 
     def shade(self, traced: TracedRays) -> ShadedRays:
-        """What was seen."""
+        """Return the colours that were traced."""
         return ShadedRays(traced.result.rgb_srgb, traced.result.transmittance)
 
     def backward(
@@ -32,7 +32,7 @@ class PlainShading:
         by_rgb: Float32[np.ndarray, "r 3"],
         by_transmittance: Float32[np.ndarray, " r"],
     ) -> ShadingGradients:
-        """The same gradients."""
+        """Return the same gradients."""
         return ShadingGradients(TraceGradients(rgb_srgb=by_rgb, transmittance=by_transmittance))
 
     def step(
@@ -43,14 +43,14 @@ class PlainShading:
         *,
         training_progress: float,
     ) -> None:
-        """Nothing to do."""
+        """Do nothing: there are no parameters."""
 
     def state(self) -> dict[str, np.ndarray]:
-        """Nothing to keep."""
+        """Return no state."""
         return {}
 
     def restore(self, state: Mapping[str, np.ndarray]) -> None:
-        """Nothing to take back."""
+        """Do nothing: there is no state."""
 
 
 PLAIN_SHADING = PlainShading()

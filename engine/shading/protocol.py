@@ -62,7 +62,7 @@ class ShadedRays:
     layers: Mapping[str, Float32[np.ndarray, "r _"]] = field(default_factory=dict)
 
     def composite_over(self, background_srgb: Float32[np.ndarray, "3"]) -> Float32[np.ndarray, "r 3"]:
-        """Display colours in front of a background."""
+        """Return display colours in front of a background."""
         if not background_srgb.any():
             return self.rgb_srgb.copy()
         return self.rgb_srgb + self.transmittance[:, None] * background_srgb
@@ -95,14 +95,14 @@ class ShadingModel(Protocol):
     name: str
 
     def features(self, gaussians: FlatGaussians) -> Float32[np.ndarray, "n f"] | None:
-        """What the tracer has to blend of each Gaussian beside its colour, e.g. its material; None: nothing.
+        """Return what to blend of each Gaussian beside its colour, e.g. its material; None: nothing.
 
         The array stays the same one until the next call: :meth:`step` may change its values.
         """
         ...
 
     def on_rebuild(self, gaussians: FlatGaussians, tracer: Tracer, *, training_progress: float) -> None:
-        """Look around in the scene of which ``tracer`` has just built the hierarchy.
+        """Prepare for a scene of which ``tracer`` has just built the hierarchy.
 
         Channels of the Gaussians, and the features, may be changed: to what follows from their geometry,
         ``training_progress`` and :meth:`state` alone, and no further by a second call with the same
@@ -111,7 +111,7 @@ class ShadingModel(Protocol):
         ...
 
     def shade(self, traced: TracedRays) -> ShadedRays:
-        """What photographs show of ``traced``; depends on nothing else but the model's parameters."""
+        """Return what photographs show of ``traced``; depends on nothing else but the model's parameters."""
         ...
 
     def backward(
@@ -121,7 +121,7 @@ class ShadingModel(Protocol):
         by_rgb: Float32[np.ndarray, "r 3"],
         by_transmittance: Float32[np.ndarray, " r"],
     ) -> ShadingGradients:
-        """Gradients by what went into ``shaded`` from those by what came out; changes nothing."""
+        """Return gradients by the inputs of ``shaded`` from those by its outputs; changes nothing."""
         ...
 
     def step(
@@ -132,7 +132,7 @@ class ShadingModel(Protocol):
         *,
         training_progress: float,
     ) -> None:
-        """One step of the optimiser for the model's own parameters.
+        """Take one step of the optimiser for the model's own parameters.
 
         Args:
             gaussians: those traced, after their own step.
@@ -143,7 +143,7 @@ class ShadingModel(Protocol):
         ...
 
     def state(self) -> dict[str, np.ndarray]:
-        """Parameters and optimiser state, for a checkpoint; names begin with the model's and a dot."""
+        """Return parameters and optimiser state, for a checkpoint; names begin with the model's and a dot."""
         ...
 
     def restore(self, state: Mapping[str, np.ndarray]) -> None:

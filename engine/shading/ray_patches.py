@@ -43,7 +43,7 @@ class RayPatches:
 
     @property
     def rays(self) -> slice:
-        """The rays of all windows."""
+        """Return the rays of all patches."""
         return slice(self.first, self.first + self.count * self.side**2)
 
     def grid(self, values: Shaped[np.ndarray, "c ..."]) -> Shaped[np.ndarray, "w s s ..."]:

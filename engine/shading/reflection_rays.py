@@ -40,7 +40,7 @@ class FacetPair:
     slope: Float64[np.ndarray, " p"]
 
     def normals(self, normal_world: Float64[np.ndarray, "p 3"], sign: float) -> Float64[np.ndarray, "p 3"]:
-        """The facets' unit normals on one side."""
+        """Return the facets' unit normals on one side."""
         steep = normal_world + sign * self.slope[:, None] * self.tangent_world
         return steep / np.sqrt(1 + self.slope**2)[:, None]
 
@@ -48,7 +48,7 @@ class FacetPair:
 def sample_facets(
     surface: SurfacePoints, numbers: Float64[np.ndarray, "2 p"], *, min_slope: float
 ) -> FacetPair:
-    """Facets by GGX's distribution, at least ``min_slope`` steep, from two even numbers in [0, 1) each."""
+    """Draw facets by GGX's distribution, at least ``min_slope`` steep, from two uniform numbers each."""
     u, v = numbers
     alpha = surface.material[:, 4] ** 2
     u = u * MAX_FACET_SLOPE
@@ -62,7 +62,7 @@ def sample_facets(
 
 
 def direction_uniforms(directions: Float64[np.ndarray, "p 3"], salt: int) -> Float64[np.ndarray, "2 p"]:
-    """Two numbers in [0, 1) for each direction that follow from it and the salt alone."""
+    """Return two numbers in [0, 1) for each direction that follow from it and the salt alone."""
     bits = np.ascontiguousarray(directions, np.float64).view(np.uint64)
     return hashed_uniforms(bits[:, 0] + np.uint64(salt), bits[:, 1], bits[:, 2])
 
@@ -81,7 +81,7 @@ class ReflectionRayPairs:
 
     @property
     def incident(self) -> IncidentLight:
-        """The mean of the two rays of each point."""
+        """Return the mean of the two rays of each point."""
         return mean_of_pairs(self.reflected.incident)
 
 
@@ -106,7 +106,7 @@ def trace_ray_pairs(
     min_slope: float,
     record: bool,
 ) -> ReflectionRayPairs:
-    """Send two rays from each point of a buffer, mirrored at its facets.
+    """Trace two rays from each point of a G-buffer, mirrored at its facets.
 
     Args:
         rays: that the buffer was gathered along.
@@ -135,7 +135,7 @@ def probe_roughness(
     *,
     min_slope: float,
 ) -> RoughnessProbe:
-    """Send a third ray from the points that were drawn, where facets are as steep as the roughness says."""
+    """Trace a third ray from the drawn points, where facets are as steep as the roughness says."""
     points = np.flatnonzero(drawn & (pairs.facets.slope > min_slope))
     middle = reflection_tracer.trace(
         reflected_rays(rays, gbuffer, reflection_tracer.offset)[points], record=False
@@ -146,7 +146,7 @@ def probe_roughness(
 
 
 def mean_of_pairs(seen: IncidentLight) -> IncidentLight:
-    """What the lobe sees: the mean of the two rays of each point."""
+    """Return the incident light of a lobe: the mean of the two rays of each point."""
     half = len(seen.visibility) // 2
     return IncidentLight(
         (seen.visibility[:half] + seen.visibility[half:]) / 2,
@@ -155,7 +155,7 @@ def mean_of_pairs(seen: IncidentLight) -> IncidentLight:
 
 
 def backward_mean(by_mean: IncidentLight) -> IncidentLight:
-    """Gradients by what each of two rays saw, from those by their mean."""
+    """Return gradients by what each of two rays saw, from those by their mean."""
     visibility, light = by_mean.visibility / 2, by_mean.light_linear / 2
     return IncidentLight(np.concatenate([visibility, visibility]), np.concatenate([light, light]))
 
@@ -166,7 +166,7 @@ def backward_normals(
     around_linear: Float64[np.ndarray, "p 3"],
     by_incoming: Float64[np.ndarray, "p 3"],
 ) -> Float64[np.ndarray, "p 3"]:
-    """Gradients by the normals through what the two rays of each point see differently.
+    """Return gradients by the normals through what the two rays of each point see differently.
 
     Tangents are drawn evenly from all ways around, so that twice the slope along one is the slope along both
     axes of the surface in the mean.
@@ -190,7 +190,7 @@ def backward_roughness(
     around_linear: Float64[np.ndarray, "w 3"],
     by_incoming: Float64[np.ndarray, "w 3"],
 ) -> Float64[np.ndarray, " w"]:
-    """Gradients by the roughness through how far the mean of two rays is from the one in their middle.
+    """Return gradients by the roughness, from how far the mean of two rays is from the one between them.
 
     That distance grows with the square of the facets' slope where what is seen is smooth, and the slope of
     GGX's facets with the square of the roughness: with its fourth power, then. Where lobes reach an edge it

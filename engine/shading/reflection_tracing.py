@@ -59,7 +59,7 @@ class ReflectedRays:
 
     @property
     def incident(self) -> IncidentLight:
-        """What each ray saw."""
+        """Return what each ray saw."""
         light = np.zeros((len(self.depth_split.rays), 3))
         light[self.gbuffer.ray_ids] = self.gbuffer.alpha[:, None] * self.linear
         return IncidentLight(self.trace.transmittance.astype(np.float64), self.depth_split.sum_layers(light))
@@ -89,7 +89,7 @@ class ReflectionTracer:
     min_separation_world: float
 
     def trace(self, rays: RayBatch, *, record: bool) -> ReflectedRays:
-        """What becomes of reflected rays; ``record`` says whether there will be a way back."""
+        """Trace reflected rays over all bounces; ``record`` keeps what the backward pass needs."""
         trace = self.tracer.trace(rays, record=record)
         parted = no_split(rays, trace)
         if self.min_separation_world > 0:
@@ -113,7 +113,7 @@ def backward_reflections(
     by_incident: IncidentLight,
     by_texels: Float64[np.ndarray, "t 3"],
 ) -> tuple[tuple[Recording, TraceGradients], ...]:
-    """Gradients by the materials of all that was met, and by how much of it there is.
+    """Return gradients by the materials of all that was hit, and by its alpha.
 
     So what only a mirror shows takes its shape from there. None by its normals, none by where it was met.
 

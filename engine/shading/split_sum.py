@@ -35,7 +35,7 @@ TABLE_SAMPLES = 512
 
 @lru_cache(maxsize=1)
 def split_sum_table() -> Float64[np.ndarray, "a c 2"]:
-    """Scale A and bias B of F0: rows are roughness 0 to 1, columns the cosine to the viewer 0 to 1."""
+    """Return scale A and bias B of F0: rows are roughness 0 to 1, columns the cosine to the viewer 0 to 1."""
     table = np.empty((TABLE_ROUGHNESSES, TABLE_COSINES, 2))
     run_ranges(
         integrate_table,
@@ -77,7 +77,7 @@ class SurfacePoints:
         normal_world: Float[np.ndarray, "p 3"],
         direction_world: Float[np.ndarray, "p 3"],
     ) -> "SurfacePoints":
-        """Points that nothing hides from the environment."""
+        """Return surface points that nothing hides from the environment."""
         count = len(material)
         nothing = np.zeros((count, 3))
         return cls(
@@ -123,7 +123,7 @@ class ShadeGradients(NamedTuple):
     weights: Float64[np.ndarray, "p 12"]
 
     def sum_texels(self, count: int) -> Float64[np.ndarray, "t 3"]:
-        """Gradients by the texels of all levels, summed pixel after pixel."""
+        """Return gradients by the texels of all levels, summed point after point."""
         sums = np.zeros((count, 3))
         add_to_texels(self.taps, self.weights, self.specular, self.diffuse, sums)
         return sums
@@ -132,7 +132,7 @@ class ShadeGradients(NamedTuple):
 def shade(
     surface: SurfacePoints, light: EnvironmentLevels, frame: Float64[np.ndarray, "3 3"]
 ) -> Float64[np.ndarray, "p 3"]:
-    """Linear colours.
+    """Return linear colours.
 
     Args:
         surface: the points.
@@ -155,7 +155,7 @@ def shade_backward(
     *,
     blur: float = 0.0,
 ) -> ShadeGradients:
-    """Gradients of what :func:`shade` gave.
+    """Return the gradients of :func:`shade` by its inputs.
 
     Args:
         surface: the points.

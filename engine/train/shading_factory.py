@@ -75,25 +75,25 @@ def make_shading(options: ShadingOptions, views: int, extent_world: float) -> Sh
 
 
 def find_exposures(shading: ShadingModel) -> ExposureModel | None:
-    """The exposures that a shading model learns."""
+    """Return the exposures that a shading model learns, or None."""
     return shading if isinstance(shading, ExposureModel) else None
 
 
 def shading_for_view(shading: ShadingModel, view: int) -> ShadingModel:
-    """What develops a view of the dataset, trained on or held out, as exposed as that is known to be."""
+    """Return the model with which to shade a view, trained or held out, at its exposure as far as known."""
     exposures = find_exposures(shading)
     return shading if exposures is None else exposures.for_view(view)
 
 
 def find_background(shading: ShadingModel) -> LearnedBackground | None:
-    """The learnt background that a shading model is, or has inside."""
+    """Return the learnt background that a shading model is or contains, or None."""
     if isinstance(shading, ExposureModel):
         return find_background(shading.inner)
     return shading if isinstance(shading, LearnedBackground) else None
 
 
 def find_deferred(shading: ShadingModel) -> DeferredShading | None:
-    """The model of materials that a shading model is, or has inside."""
+    """Return the model of materials that a shading model is or contains, or None."""
     if isinstance(shading, ExposureModel):
         return find_deferred(shading.inner)
     return shading if isinstance(shading, DeferredShading) else None

@@ -14,7 +14,7 @@ RAY_SORT_ITERATION_RATIO = 3 / 7
 
 
 def iteration_count(config: TrainConfig, training_pixels: int, valid_fraction: float = 1.0) -> int:
-    """``config.iterations``, or where that is 0 so many rays for each pixel, in whole thousands.
+    """Return ``config.iterations``, or where that is 0 so many rays for each pixel, in whole thousands.
 
     Large scenes learn as long as there is something to see; small ones are done after 7,000 with 7 rays a
     pixel. Rays that have an order of their own take longer, so that there are fewer of them. Where only a
@@ -35,7 +35,7 @@ def iteration_count(config: TrainConfig, training_pixels: int, valid_fraction: f
 
 
 def max_gaussian_count(config: GaussianSettings, training_pixels: int, valid_fraction: float = 1.0) -> int:
-    """``config.max_gaussians``, or where that is 0 what so many pixels of training views can hold down.
+    """Return ``config.max_gaussians``, or where that is 0 what the pixels of training views can constrain.
 
     Of those only the share counts that shows anything. More than one for each 10 pixels learn the noise of
     the training views instead of the scene.
@@ -48,7 +48,7 @@ def max_gaussian_count(config: GaussianSettings, training_pixels: int, valid_fra
 
 
 def uses_shared_sort(config: TrainConfig) -> bool:
-    """Whether the rays of a window composite in one order for a part of the training.
+    """Return whether the rays of a patch composite in one order for a part of the training.
 
     Gradients by depths and normals, and a second phase, want each ray's own.
     """
@@ -57,7 +57,7 @@ def uses_shared_sort(config: TrainConfig) -> bool:
 
 
 def ray_patch_side_px(config: TrainConfig, longest_side_px: int, pixels_a_gaussian: float) -> int:
-    """``config.ray_patch_side``, or where that is 0 what suits the Gaussians or the views.
+    """Return ``config.ray_patch_side``, or where that is 0 what suits the Gaussians or the views.
 
     A window is to cover a small angle, so that its rays meet the same Gaussians: what these cost once for all
     rays is most of what rays in one order cost. But rays that are too close learn the same.

@@ -19,7 +19,7 @@ FLIP_NORMAL_COS = 0.5
 
 
 def with_materials(config: TrainConfig) -> TrainConfig:
-    """A configuration for shiny things: materials are learnt, and geometry keeps still enough for mirrors.
+    """Return a configuration for reflective scenes: materials are learnt, and geometry moves in small steps.
 
     Reflections ask for normals to within a degree, so steps are small. Points lifted from photographs that
     show reflections lie behind the surface, so there are none.
@@ -65,7 +65,7 @@ def with_materials(config: TrainConfig) -> TrainConfig:
 
 
 def preset(name: str) -> TrainConfig:
-    """The named preset.
+    """Return the named preset.
 
     Raises:
         ConfigError: there is no such preset.

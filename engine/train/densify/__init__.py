@@ -11,7 +11,7 @@ __all__ = ["Densifier", "McmcDensifier", "RedisplatsDensifier", "make_densifier"
 def make_densifier(
     config: McmcConfig | RedisplatsConfig, *, iterations: int, max_gaussians: int
 ) -> Densifier:
-    """The strategy that ``config`` describes, for so many iterations and at most so many Gaussians."""
+    """Return the strategy that ``config`` describes, for so many iterations and at most so many Gaussians."""
     if isinstance(config, McmcConfig):
         return McmcDensifier(config, iterations=iterations, max_gaussians=max_gaussians)
     return RedisplatsDensifier(config, iterations=iterations, max_gaussians=max_gaussians)

@@ -19,14 +19,14 @@ MAX_COPIES = 32
 def split_opacity(
     opacity: Float64[np.ndarray, " n"], copies: Int64[np.ndarray, " n"]
 ) -> Float64[np.ndarray, " n"]:
-    """Opacity of each of ``copies`` equal Gaussians that together are as opaque as one was: 1-(1-a)^(1/N)."""
+    """Return the opacity of each of ``copies`` Gaussians as opaque together as one was: 1-(1-a)^(1/N)."""
     return 1.0 - (1.0 - opacity) ** (1.0 / copies)
 
 
 def split_scale_factor(
     opacity: Float64[np.ndarray, " n"], copies: Int64[np.ndarray, " n"]
 ) -> Float64[np.ndarray, " n"]:
-    """Factor on the scales of ``copies`` coincident Gaussians that keeps the integral of what they cover.
+    """Return the factor on the scales of ``copies`` coincident Gaussians that keeps their integral.
 
     a / sum_{i=1..N} sum_{k=0..i-1} C(i-1,k) (-1)^k a'^(k+1) / sqrt(k+1), a' = 1-(1-a)^(1/N)
     (the paper's Eq. 9).
@@ -79,14 +79,14 @@ class McmcDensifier:
         self._weights[gradients.ids] += gradients.weight_sums
 
     def is_due(self, iteration: int) -> bool:
-        """Every ``interval`` iterations between the start and the stop; in rounds once the cap is reached."""
+        """Return whether an interval has passed between start and stop; in rounds at the cap."""
         every = self._round if self._relocates_low_weight(len(self._errors)) else self._config.interval
         return self._config.start <= iteration <= self._stop and iteration % every == 0
 
     def apply(
         self, gaussians: FlatGaussians, adam: Adam, rng: np.random.Generator, *, extent: float
     ) -> tuple[FlatGaussians, Adam]:
-        """Relocate the dead, then grow; or, where nothing may grow, relocate the dead and the idle."""
+        """Relocate the dead, then grow; at the cap, relocate the dead and those of low weight instead."""
         config, count = self._config, len(gaussians)
         opacities = gaussians.opacities.astype(np.float64)
         alive = opacities > config.dead_opacity
@@ -140,7 +140,7 @@ class McmcDensifier:
     def _make_copies(
         self, gaussians: FlatGaussians, chosen: Int64[np.ndarray, " w"], area: bool, rng: np.random.Generator
     ) -> tuple[Int64[np.ndarray, " s"], FlatGaussians]:
-        """Which are chosen, and a scattered copy each time; they share their area or their opacity."""
+        """Return the distinct chosen ones and scattered copies, which share their area or opacity."""
         copies = np.minimum(np.bincount(chosen, minlength=len(gaussians)) + 1, MAX_COPIES)
         sources = np.flatnonzero(copies > 1)
         scales = gaussians.scales[chosen]
@@ -163,7 +163,7 @@ class McmcDensifier:
             self._errors, self._weights = self._errors[order], self._weights[order]
 
     def state(self) -> dict[str, np.ndarray]:
-        """The sums of errors and weights."""
+        """Return the sums of errors and weights."""
         return {"errors": self._errors, "weights": self._weights}
 
     def restore(self, state: dict[str, np.ndarray]) -> None:
@@ -171,15 +171,15 @@ class McmcDensifier:
         self._errors, self._weights = state["errors"], state["weights"]
 
     def _reset_sums(self, count: int) -> None:
-        """Sums of nothing yet."""
+        """Set the sums of errors and weights to zero, for ``count`` Gaussians."""
         self._errors, self._weights = np.zeros(count, np.float32), np.zeros(count, np.float32)
 
     def _relocates_low_weight(self, count: int) -> bool:
-        """Whether that many are all that there may be, and the idle are moved then."""
+        """Return whether ``count`` Gaussians are the most allowed, so that those of low weight are moved."""
         return self._config.relocate_low_weight_below > 0 and count >= self._cap
 
     def _low_weight_ids(self, weights: Float32[np.ndarray, " n"]) -> Int64[np.ndarray, " m"]:
-        """Those of least weight."""
+        """Return the Gaussians of least weight."""
         most = int(self._config.relocate_low_weight_fraction * len(weights))
         least = np.argsort(weights, kind="stable")[:most]
         return least[weights[least] < self._config.relocate_low_weight_below * weights.mean()]

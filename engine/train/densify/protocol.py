@@ -27,13 +27,13 @@ class Densifier(Protocol):
         ...
 
     def is_due(self, iteration: int) -> bool:
-        """Whether :meth:`apply` is to be called after this iteration (counted from 1)."""
+        """Return whether :meth:`apply` is to be called after this iteration (counted from 1)."""
         ...
 
     def apply(
         self, gaussians: FlatGaussians, adam: Adam, rng: np.random.Generator, *, extent: float
     ) -> tuple[FlatGaussians, Adam]:
-        """The new set and its optimiser state; may change the old ones in place."""
+        """Return the new set and its optimiser state; may change the old ones in place."""
         ...
 
     def reorder(self, order: Int64[np.ndarray, " n"]) -> None:
@@ -41,7 +41,7 @@ class Densifier(Protocol):
         ...
 
     def state(self) -> dict[str, np.ndarray]:
-        """Everything that was observed, for a checkpoint."""
+        """Return everything that was observed, for a checkpoint."""
         ...
 
     def restore(self, state: dict[str, np.ndarray]) -> None:

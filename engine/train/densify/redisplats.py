@@ -39,7 +39,7 @@ class RedisplatsDensifier:
         self._steps[gradients.ids] = mean_steps_world
 
     def is_due(self, iteration: int) -> bool:
-        """Every ``interval`` iterations between the start and the stop."""
+        """Return whether ``interval`` iterations have passed, between the start and the stop."""
         return self._config.start <= iteration <= self._stop and iteration % self._config.interval == 0
 
     def apply(
@@ -81,7 +81,7 @@ class RedisplatsDensifier:
             self._steps = self._steps[order]
 
     def state(self) -> dict[str, np.ndarray]:
-        """The last steps."""
+        """Return the last steps."""
         return {"steps": self._steps}
 
     def restore(self, state: dict[str, np.ndarray]) -> None:

@@ -54,17 +54,17 @@ class InitialBackground:
     up_world: Float64[np.ndarray, "3"]
 
     def is_above_horizon(self, directions_world: Float64[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
-        """Whether directions are above the horizon, where what is far away is."""
+        """Return whether directions are above the horizon, where what is far away is."""
         return np.asarray(_cosines(directions_world, self.up_world) > 0)
 
     def resize(self, height: int) -> Float32[np.ndarray, "h w 3"]:
-        """The map with so many rows."""
+        """Return the map with ``height`` rows."""
         directions = _texel_directions(LearnedBackground(height))
         return self.map.lookup(directions.astype(np.float32)).reshape(height, 2 * height, 3)
 
 
 def estimate_background(dataset: MappedPhotographs) -> InitialBackground:
-    """The first map of the photographs that are trained on."""
+    """Return the first map of the photographs that are trained on."""
     background = LearnedBackground(ROWS)
     directions = _texel_directions(background)
     train = dataset.train_indices
@@ -86,7 +86,7 @@ def estimate_background(dataset: MappedPhotographs) -> InitialBackground:
 
 
 def _texel_directions(background: LearnedBackground) -> Float64[np.ndarray, "t 3"]:
-    """The middle of each texel as a world direction."""
+    """Return the middle of each texel as a world direction."""
     height, width = background.rgb_srgb.shape[:2]
     polar = np.pi * (np.arange(height)[:, None] + 0.5) / height
     around = 2 * np.pi * ((np.arange(width) + 0.5) / width - 0.5)
@@ -97,14 +97,14 @@ def _texel_directions(background: LearnedBackground) -> Float64[np.ndarray, "t 3
 
 
 def _up_world(dataset: MappedPhotographs) -> Float64[np.ndarray, "3"]:
-    """About which way is up: the mean of the views' upper edges."""
+    """Return roughly which way is up: the mean of the views' upper edges."""
     return -np.mean([dataset.views[i].rotation_cam_from_world[1] for i in dataset.train_indices], axis=0)
 
 
 def _cosines(
     directions: Float64[np.ndarray, "n 3"], axis: Float64[np.ndarray, "3"]
 ) -> Float64[np.ndarray, " n"]:
-    """Products with an axis, added up column by column: the same bits on any number of threads."""
+    """Return products with an axis, added up column by column: the same bits on any number of threads."""
     return np.asarray(sum(directions[:, k] * axis[k] for k in range(3)))
 
 
@@ -114,7 +114,7 @@ def _visible_texels(
     directions: Float64[np.ndarray, "t 3"],
     points: Float64[np.ndarray, "n 3"],
 ) -> tuple[Int64[np.ndarray, " k"], Float32[np.ndarray, "k 3"], Bool[np.ndarray, " k"]]:
-    """The texels that a view shows, the colours that it shows there, and whether nothing near is beside."""
+    """Return the texels that a view shows, their colours there, and whether nothing near is beside."""
     view = dataset.views[index]
     camera = dataset.cameras[view.camera_index]
     in_cam = np.stack([_cosines(directions, axis) for axis in view.rotation_cam_from_world], axis=1)
@@ -136,7 +136,7 @@ def _visible_texels(
 def _medians(
     texel: Int64[np.ndarray, " k"], rgb: Float32[np.ndarray, "k 3"], count: int
 ) -> tuple[Float32[np.ndarray, "t 3"], Int64[np.ndarray, " t"]]:
-    """The lower median of each channel of each texel's colours, and how many there are."""
+    """Return the lower median of each channel of each texel's colours, and how many there are."""
     found = np.bincount(texel, minlength=count)
     medians = np.zeros((count, 3), np.float32)
     middle = np.cumsum(found) - found + np.maximum(found - 1, 0) // 2
@@ -149,7 +149,7 @@ def _medians(
 def _fill_unknown(
     colours: Float32[np.ndarray, "h w 3"], known: Bool[np.ndarray, "h w"]
 ) -> Float32[np.ndarray, "h w 3"]:
-    """The map with what is not known taken, blurred, from the nearest texel that is; its sides meet."""
+    """Return the map with unknown texels blurred from the nearest known ones; its sides meet."""
     if not known.any():
         return np.full_like(colours, 0.5)
     width = colours.shape[1]

@@ -141,7 +141,7 @@ def add_initial_materials(gaussians: FlatGaussians, settings: MaterialSettings) 
 
 
 def initial_scene(dataset: Dataset, config: TrainConfig, *, threads: int = 1) -> TrainState:
-    """The first Gaussians, their materials and the first background, as far as these are learnt.
+    """Return the state with the first Gaussians, their materials and the first background, where learnt.
 
     Args:
         dataset: the photographs.
@@ -177,7 +177,7 @@ def gaussians_from_points(
     plane_points: int = 8,
     most_angles: Float64[np.ndarray, " n"] | None = None,
 ) -> FlatGaussians:
-    """Flat Gaussians on sparse points.
+    """Return flat Gaussians on sparse points.
 
     The scales are the mean distance to the three nearest points; the normal is that of the plane through
     the ``plane_points`` nearest where they lie on one, else it looks at the cameras. More than ``limit``
@@ -227,7 +227,7 @@ def gaussians_from_rays(
     opacity: float,
     rng: np.random.Generator,
 ) -> FlatGaussians:
-    """Random flat Gaussians in the cameras' frustums: one on each ray, log-uniform in depth, facing it."""
+    """Return random flat Gaussians in the frustums: one a ray, log-uniform in depth, facing the camera."""
     if len(origins_world) == 0:
         raise DatasetError("The masks or the alpha leave no pixel to begin from; check masks/ and --masks.")
     depths = extent * np.exp(rng.uniform(np.log(0.3), np.log(5.0), len(origins_world)))

@@ -86,7 +86,7 @@ def plane_sweep_points(
     gains: Float32[np.ndarray, " v"] | None = None,
     unseen: bool = False,
 ) -> PlaneSweepPoints:
-    """About ``count`` points or fewer beside those of the sparse model.
+    """Return about ``count`` points or fewer beside those of the sparse model.
 
     Args:
         dataset: the photographs; the sparse model must have points. Masked and transparent pixels give none.
@@ -140,7 +140,7 @@ def _view_areas(dataset: Dataset) -> Float64[np.ndarray, " t"]:
 
 
 def _neighbouring_views(dataset: Dataset, points: Float64[np.ndarray, "n 3"]) -> dict[int, list[int]]:
-    """Of each training view, the nearest others that look about the same way from another place."""
+    """Return for each training view the nearest others that look about the same way from another place."""
     train = [int(i) for i in dataset.train_indices]
     centres = np.stack([dataset.views[i].origin_world for i in train])
     axes = np.stack([dataset.views[i].rotation_cam_from_world[2] for i in train])
@@ -187,7 +187,7 @@ def _lift_pixels(
     behind: InitialBackground | None,
     unseen: bool,
 ) -> tuple[PlaneSweepPoints, MatchEvidence]:
-    """Points for random pixels of one view."""
+    """Return points for random pixels of one view."""
     dataset = photographs.dataset
     nothing = PlaneSweepPoints.concatenate([]), MatchEvidence(np.empty(0, np.int64), np.empty(0), np.empty(0))
     projected_px, depths = project(dataset, index, points)
@@ -234,20 +234,20 @@ def _hypothesis_costs(
     guesses: Float64[np.ndarray, "n g"],
     neighbours: list[int],
 ) -> Float64[np.ndarray, "n g"]:
-    """How much each patch at each of its guesses differs from what the neighbours show."""
+    """Return how much each patch at each of its depths differs from what the neighbours show."""
     return np.stack([patch_cost(photographs, patches, guess, neighbours) for guess in guesses.T], axis=1)
 
 
 def _best_hypothesis(
     guesses: Float64[np.ndarray, "n g"], costs: Float64[np.ndarray, "n g"]
 ) -> tuple[Float64[np.ndarray, " n"], Float64[np.ndarray, " n"]]:
-    """The guess of each patch that matches best, and its cost."""
+    """Return the depth of each patch that matches best, and its cost."""
     best = np.argmin(costs, axis=1)[:, None]
     return np.take_along_axis(guesses, best, 1)[:, 0], np.take_along_axis(costs, best, 1)[:, 0]
 
 
 def _cost_ratio(costs: Float64[np.ndarray, "n g"]) -> Float64[np.ndarray, " n"]:
-    """The least cost over the next that is more than one step away; depths are in order."""
+    """Return the least cost over the next that is more than one step away; depths are in order."""
     best = np.argmin(costs, axis=1)[:, None]
     beside = np.abs(np.arange(costs.shape[1]) - best) <= 1
     return np.asarray(costs.min(axis=1) / np.maximum(np.where(beside, np.inf, costs).min(axis=1), 1e-12))
@@ -256,7 +256,7 @@ def _cost_ratio(costs: Float64[np.ndarray, "n g"]) -> Float64[np.ndarray, " n"]:
 def _interpolate_depths(
     depths: Float64[np.ndarray, "n g"], away_px: Float64[np.ndarray, "n g"]
 ) -> Float64[np.ndarray, " n"]:
-    """Mean depths, in logarithms, weighted by the inverse of the squared distance in the image."""
+    """Return mean depths, in logarithms, weighted by the inverse of the squared distance in the image."""
     weights = 1.0 / (away_px + 1.0) ** 2
     return np.asarray(np.exp((weights * np.log(depths)).sum(axis=1) / weights.sum(axis=1)))
 
@@ -264,7 +264,7 @@ def _interpolate_depths(
 def _sweep(
     depths: Float64[np.ndarray, " k"], count: int, rng: np.random.Generator
 ) -> Float64[np.ndarray, "n g"]:
-    """Depths for ``count`` pixels of a view whose points lie at ``depths``."""
+    """Return depths to try for ``count`` pixels of a view whose points lie at ``depths``."""
     ordered = np.sort(depths)
     near = NEAR_FACTOR * ordered[min(NEAR_RANK, len(ordered) - 1)]
     far = FAR_FACTOR * ordered[int(FAR_QUANTILE * (len(ordered) - 1))]

@@ -35,12 +35,12 @@ class PlaneSweepPoints:
         return len(self.xyz_world)
 
     def __getitem__(self, which: np.ndarray) -> "PlaneSweepPoints":
-        """Some of them, by number or by a mask."""
+        """Return some of them, by number or by a mask."""
         return PlaneSweepPoints(self.xyz_world[which], self.rgb_srgb[which], self.swept[which])
 
     @classmethod
     def concatenate(cls, parts: Sequence["PlaneSweepPoints"]) -> "PlaneSweepPoints":
-        """One part after the other; none of no parts."""
+        """Return all parts one after the other; no points for no parts."""
         nothing = np.empty((0, 3), np.float32)
         parts = [cls(nothing, nothing, np.empty(0, np.bool_)), *parts]
         return cls(
@@ -67,7 +67,7 @@ class MatchEvidence:
 
     @classmethod
     def concatenate(cls, parts: Sequence["MatchEvidence"]) -> "MatchEvidence":
-        """One part after the other."""
+        """Return all parts one after the other."""
         columns = zip(*(vars(part).values() for part in parts), strict=True)
         return cls(*(np.concatenate(column) for column in columns))
 
@@ -77,7 +77,7 @@ def is_confirmed(
     evidence: MatchEvidence,
     known: Float64[np.ndarray, "k 3"],
 ) -> Bool[np.ndarray, " n"]:
-    """Of points at swept depths, whether something else says that they are right; of others, false.
+    """Return which points at swept depths something else confirms; False for other points.
 
     Args:
         found: points of all training views.
@@ -96,7 +96,7 @@ def is_confirmed(
 
 
 def _confirmations(xyz_world: Float64[np.ndarray, "n 3"], seen: MatchEvidence) -> Int64[np.ndarray, " n"]:
-    """How many other views have a point at the same place as each."""
+    """Return how many other views have a point at the same place as each."""
     near = cKDTree(xyz_world).query_ball_point(xyz_world, SAME_POINT * seen.distance)
     mine = np.repeat(np.arange(len(near)), [len(others) for others in near])
     views = seen.view[np.concatenate(near).astype(np.int64)]

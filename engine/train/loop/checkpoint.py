@@ -43,12 +43,12 @@ def run_fingerprint(dataset: Dataset, config: TrainConfig) -> str:
 
 
 def checkpoint_path(folder: Path, iteration: int) -> Path:
-    """Where the checkpoint of ``iteration`` lies."""
+    """Return the path of the checkpoint of ``iteration``."""
     return folder / f"{_PREFIX}{iteration:07d}.npz"
 
 
 def latest_checkpoint(folder: Path) -> Path | None:
-    """The newest checkpoint of a run, or None."""
+    """Return the newest checkpoint of a run, or None."""
     return max(folder.glob(f"{_PREFIX}*.npz"), default=None)
 
 
@@ -142,7 +142,7 @@ def load_checkpoint(path: Path, fingerprint: str) -> TrainState:
 
 
 def load_latest_checkpoint(folder: Path, fingerprint: str, progress: EventListener) -> TrainState | None:
-    """The newest checkpoint, if there is any; a damaged one is passed over for the one before.
+    """Return the newest checkpoint, if there is any; a damaged one is removed, and the one before is read.
 
     Raises:
         CheckpointError: it belongs to another configuration or other photographs.
@@ -198,7 +198,7 @@ def load_best(folder: Path) -> BestState:
 
 
 def _group_arrays(arrays: Mapping[str, np.ndarray]) -> dict[str, dict[str, np.ndarray]]:
-    """Arrays by what comes before the first dot of their names, then by the rest."""
+    """Return arrays by what comes before the first dot of their names, then by the rest."""
     groups: dict[str, dict[str, np.ndarray]] = {name: {} for name in _GROUPS}
     for name, array in arrays.items():
         group, _, key = name.partition(".")

@@ -59,7 +59,7 @@ def loss_and_gradients(
     with_errors: bool = False,
     min_blend_weight: float = 0.0,
 ) -> LossGradients:
-    """The loss of the Gaussians that ``tracer`` holds, and its gradients; changes nothing.
+    """Return the loss of the Gaussians that ``tracer`` holds, and its gradients; changes nothing.
 
     Args:
         batch: rays and what the photographs show there.

@@ -77,7 +77,7 @@ class Schedule:
         )
 
     def stop_early(self, done: int) -> "Schedule":
-        """The schedule of a training for which it is decided after ``done`` iterations to end early.
+        """Return the schedule of a training for which it is decided after ``done`` iterations to end early.
 
         Nothing is added any more, and what depends on the progress goes on from where it is, only faster.
         """
@@ -85,22 +85,22 @@ class Schedule:
         return replace(self, iterations=sooner, early_stop_at=done, planned_iterations=self.iterations)
 
     def is_finished(self, done: int) -> bool:
-        """Whether all iterations are done."""
+        """Return whether all iterations are done."""
         return done == self.iterations
 
     def is_validation_due(self, done: int) -> bool:
-        """Whether the state after ``done`` iterations is measured and kept as a checkpoint."""
+        """Return whether the state after ``done`` iterations is measured and saved as a checkpoint."""
         every = self.rebuild_every
         every *= -(-self.checkpoint_every // every)
         return done % every == 0 or self.is_finished(done)
 
     def is_outlier_check_due(self, done: int) -> bool:
-        """Whether views that do not fit are looked for after ``done`` iterations, for the rest of the run."""
+        """Return whether views that do not fit are looked for after ``done`` iterations."""
         since = OUTLIER_VIEWS_FROM * self.iterations
         return self.is_validation_due(done) and since <= done < self.iterations
 
     def is_pose_refinement_due(self, done: int) -> bool:
-        """Whether the poses of training views are refined after ``done`` iterations."""
+        """Return whether the poses of training views are refined after ``done`` iterations."""
         if (
             not self.refines_poses
             or not POSE_REFINEMENT_FROM <= done / self.iterations <= POSE_REFINEMENT_UNTIL
@@ -111,41 +111,41 @@ class Schedule:
         return done % (every * max(1, round(rebuilds))) == 0
 
     def is_averaging_due(self, done: int) -> bool:
-        """Whether the state after ``done`` iterations counts in the mean that is exported."""
+        """Return whether the state after ``done`` iterations counts in the mean that is exported."""
         return self.is_averaging(done) and (done % AVERAGING_INTERVAL == 0 or self.is_finished(done))
 
     def is_averaging(self, done: int) -> bool:
-        """Whether states are averaged by then."""
+        """Return whether states are averaged after ``done`` iterations."""
         return max(self.weight_averaging_start * self.iterations, self.early_stop_at or 0) < done
 
     def uses_shared_sort(self, done: int) -> bool:
-        """Whether the rays of a window composite in one order in the next iteration."""
+        """Return whether the rays of a patch composite in one order in the next iteration."""
         return self.training_progress(done) < self.shared_sort_until
 
     def is_orientation_due(self, done: int) -> bool:
-        """Whether Gaussians whose outer side is in are turned over: until states are averaged."""
+        """Return whether Gaussians whose normal points inwards are flipped: until states are averaged."""
         early = done <= self.weight_averaging_start * self.iterations
         return self.orients_normals and early and self.is_validation_due(done)
 
     def is_rebuild_due(self, done: int, gaussians: int) -> bool:
-        """Whether the hierarchy of so many Gaussians is built anew, which is where a run may stop."""
+        """Return whether the hierarchy of so many Gaussians is rebuilt, which is where a run may stop."""
         due = done % rebuild_interval(self.rebuild_every, gaussians) == 0
         return due or self.is_validation_due(done) or self.is_pose_refinement_due(done)
 
     def is_event_due(self, done: int) -> bool:
-        """Whether listeners hear of the progress."""
+        """Return whether the progress is reported."""
         return done % EVENT_INTERVAL == 0 or self.is_finished(done)
 
     def sh_degree(self, done: int) -> int:
-        """Degree of the harmonics, raised step by step."""
+        """Return the degree of the harmonics, raised step by step."""
         return min(self.max_sh_degree, done // self.sh_degree_interval)
 
     def may_densify(self, done: int) -> bool:
-        """Whether the fitting of the first Gaussians is over, and the last phase of a short one not begun."""
+        """Return whether the first Gaussians are fitted, and the last phase of a short training not begun."""
         return done >= self.densify_from_iter and self.early_stop_at is None
 
     def training_progress(self, done: int) -> float:
-        """Share of the training that is done, which is that of the iterations unless it ends early."""
+        """Return the share of the training that is done: that of the iterations unless it ends early."""
         if self.early_stop_at is None:
             return done / self.iterations
         before = self.early_stop_at / self.planned_iterations
@@ -153,7 +153,7 @@ class Schedule:
 
 
 def has_converged(probes: Sequence[tuple[int, float]], planned: int, min_gain_db: float) -> bool:
-    """Whether the best of the last probes is less than ``min_gain_db`` above the best of those before.
+    """Return whether the best of the last probes is less than ``min_gain_db`` above the best before.
 
     Args:
         probes: iterations and PSNR in dB, in order of the iterations; the last one is now.
@@ -169,7 +169,7 @@ def has_converged(probes: Sequence[tuple[int, float]], planned: int, min_gain_db
 
 
 def early_stop_iteration(decided: int, planned: int) -> int:
-    """Where a training ends for which it was decided after ``decided`` iterations; at most ``planned``."""
+    """Return the last iteration of a training that was stopped early after ``decided`` iterations."""
     return min(planned, decided + max(1, round(EARLY_STOPPING_TAIL * planned)))
 
 
@@ -187,12 +187,12 @@ class Stopwatch:
 
     @property
     def seconds(self) -> float:
-        """Time so far."""
+        """Return the seconds so far."""
         return self._kept_s + time.perf_counter() - self._since
 
     @property
     def seconds_here(self) -> float:
-        """Time in this process."""
+        """Return the seconds in this process."""
         return self.seconds - self._before_s
 
     @contextmanager

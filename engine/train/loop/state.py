@@ -62,7 +62,7 @@ class TrainState:
 
 
 def initial_state(gaussians: FlatGaussians, seed: int) -> TrainState:
-    """The state before the first iteration."""
+    """Return the state before the first iteration."""
     return TrainState(
         iteration=0,
         gaussians=gaussians,

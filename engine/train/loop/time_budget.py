@@ -54,14 +54,14 @@ class TimeBudgetPlan(BaseModel):
     seconds: float
 
     def apply_to(self, config: TrainConfig) -> TrainConfig:
-        """The settings with the numbers of the plan."""
+        """Return the settings with the numbers of the plan."""
         return config.model_copy(update={"iterations": self.iterations, "max_gaussians": self.max_gaussians})
 
 
 def choose_plan(
     seconds: float, seconds_an_iteration: float, gaussians: int, max_gaussians: int
 ) -> TimeBudgetPlan:
-    """As many Gaussians as there is time to train well, and all the iterations that they leave time for.
+    """Return as many Gaussians as there is time to train well, and the iterations that the time allows.
 
     Args:
         seconds: for the iterations.

@@ -81,7 +81,7 @@ def measure_probe(
 
 
 def psnr_from_mse(mse: float) -> float:
-    """PSNR of a mean squared error of display values."""
+    """Return the PSNR of a mean squared error of display values, dB."""
     return float(-10 * np.log10(max(mse, 1e-10)))
 
 

@@ -52,7 +52,7 @@ class Adam:
 
     @classmethod
     def zeros(cls, gaussians: FlatGaussians) -> "Adam":
-        """Zero moments for ``gaussians``."""
+        """Return zero moments for ``gaussians``."""
         count, columns = len(gaussians), GEOMETRY + 3 * gaussians.sh.shape[1]
         named = sum(gaussians.channels.widths.values())
         return cls(
@@ -64,7 +64,7 @@ class Adam:
         )
 
     def select(self, index: np.ndarray) -> "Adam":
-        """The state of the Gaussians at ``index``, copied."""
+        """Return the state of the Gaussians at ``index``, copied."""
         return select_rows(self, index)
 
     def reset(self, index: np.ndarray) -> None:
@@ -73,11 +73,11 @@ class Adam:
             array[index] = 0
 
     def append(self, other: "Adam") -> "Adam":
-        """This state followed by ``other``."""
+        """Return this state followed by ``other``."""
         return concatenate_rows([self, other])
 
     def with_sh_basis(self, basis_count: int) -> "Adam":
-        """Room for ``basis_count`` harmonics; the new ones start with zero moments."""
+        """Return a state for ``basis_count`` harmonics; the new ones start with zero moments."""
         extra = GEOMETRY + 3 * basis_count - self.first.shape[1]
         pad = ((0, 0), (0, extra))
         return replace(self, first=np.pad(self.first, pad), second=np.pad(self.second, pad))
@@ -168,5 +168,5 @@ class Adam:
 
 @cache
 def _beta_powers(count: int) -> Float64[np.ndarray, "2 s"]:
-    """Powers 0 to ``count`` - 1 of both betas."""
+    """Return powers 0 to ``count`` - 1 of both betas."""
     return np.array([[beta**k for k in range(count)] for beta in (BETA1, BETA2)])

@@ -17,7 +17,7 @@ SSIM_WINDOW, SSIM_SIGMA = 11, 1.5
 
 
 def gaussian_window() -> Float32[np.ndarray, " w"]:
-    """The normalised 11-tap Gaussian window (sigma 1.5) of SSIM."""
+    """Return the normalised 11-tap Gaussian window (sigma 1.5) of SSIM."""
     x = np.arange(SSIM_WINDOW) - SSIM_WINDOW // 2
     window = np.exp(-(x**2) / (2 * SSIM_SIGMA**2))
     return (window / window.sum()).astype(np.float32)
@@ -32,7 +32,7 @@ def _gaussian_blur(images: Float32[np.ndarray, "p h w c"]) -> Float32[np.ndarray
 def ssim_loss(
     render: Float32[np.ndarray, "p h w 3"], target: Float32[np.ndarray, "p h w 3"]
 ) -> tuple[float, Float32[np.ndarray, "p h w 3"]]:
-    """1 - SSIM over the patches' interior, where windows are whole, and its gradient by ``render``.
+    """Return 1 - SSIM over the patches' interior, where windows are whole, and its gradient by ``render``.
 
     The formula of "Image Quality Assessment: From Error Visibility to Structural Similarity"
     (https://doi.org/10.1109/TIP.2003.819861) with its 11 x 11 Gaussian window; the mean is over patches,
@@ -80,7 +80,7 @@ class BatchLoss:
 
 
 def batch_loss(render: Float32[np.ndarray, "r 3"], batch: Batch, weights: LossWeights) -> BatchLoss:
-    """All terms by the rendered colours: those of the pixels, and SSIM where the batch has patches."""
+    """Return all terms by the rendered colours: those of the pixels, and SSIM where the batch has patches."""
     target = batch.target_srgb
     pixel = pixel_loss(render, target, batch.weight, l1=weights.l1, l2=weights.l2)
     if not batch.ssim_patch_count or weights.ssim == 0:
@@ -96,14 +96,14 @@ def ray_errors(
     target: Float32[np.ndarray, "r 3"],
     weight: Float32[np.ndarray, " r"],
 ) -> Float32[np.ndarray, " r"]:
-    """Each ray's mean absolute error, 0 without weight, for densification."""
+    """Return each ray's mean absolute error, 0 without weight, for densification."""
     return np.asarray((np.abs(render - target) * weight[:, None]).mean(axis=1, dtype=np.float32))
 
 
 def _ssim_term(
     render: Float32[np.ndarray, "r 3"], target: Float32[np.ndarray, "r 3"], batch: Batch
 ) -> tuple[float, Float32[np.ndarray, "p 3"]]:
-    """1 - SSIM of the batch's patches and its gradient; masked pixels take the photograph's colour."""
+    """Return 1 - SSIM of the batch's patches and its gradient; masked pixels take the photograph's colour."""
     count = batch.ssim_patch_count * batch.patch_side**2
     shape = (batch.ssim_patch_count, batch.patch_side, batch.patch_side, 3)
     weight = batch.weight[-count:, None]
@@ -121,7 +121,7 @@ def pixel_loss(
     l1: float,
     l2: float,
 ) -> BatchLoss:
-    """L1 and squared error, averaged over the rays of non-zero weight and the channels."""
+    """Return L1 and squared error, averaged over the rays of non-zero weight and the channels."""
     valid = max(float(weight.sum(dtype=np.float64)), 1.0)
     gradient, sums = np.empty(render.shape, np.float32), np.empty((CHUNKS, 2))
     run_ranges(

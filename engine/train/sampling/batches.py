@@ -53,7 +53,7 @@ class Batch:
 
     @cached_property
     def target_srgb(self) -> Float32[np.ndarray, "r 3"]:
-        """The photographs' colours over the background."""
+        """Return the photographs' colours over the background."""
         return composite_over(self.rgb_srgb, self.alpha, self.background_srgb)
 
 
@@ -138,7 +138,7 @@ class BatchSource:
             self._visibility_rays = self._visibility_rays.exclude_views(views)
 
     def draw(self, rng: np.random.Generator, index: int = 0) -> Batch:
-        """The next batch, after ``index`` others."""
+        """Draw the next batch, after ``index`` others."""
         options, sampler, side = self._options, self.sampler, self._options.ssim_patch_side_px
         loose = options.rays_per_batch - self._ssim_patches * side**2
         windows = loose // options.ray_patch_rays if options.ray_patch_rays > 1 else 0
@@ -223,7 +223,7 @@ class PrefetchedBatches:
         self._next = self._worker.submit(self._source.draw, rng, index)
 
     def draw(self, rng: np.random.Generator, index: int) -> Batch:
-        """The batch after ``index`` others, begun or not."""
+        """Return the batch after ``index`` others, begun or not."""
         begun, self._next = self._next, None
         return self._source.draw(rng, index) if begun is None else begun.result()
 
@@ -236,7 +236,7 @@ def evaluation_background(background: Background) -> Float32[np.ndarray, "3"]:
 def grid_pixels(
     indices: Int64[np.ndarray, " v"], sizes_px: Int64[np.ndarray, "n 2"], tiles: int
 ) -> tuple[Int64[np.ndarray, " r"], Int64[np.ndarray, " r"], Int64[np.ndarray, " r"]]:
-    """Pixels (view, y, x) evenly over each view, ``tiles * TILE_PX`` each way, in tiles of neighbours."""
+    """Return pixels (view, y, x) evenly over each view, ``tiles * TILE_PX`` each way, tile by tile."""
     side = tiles * TILE_PX
     shape = (tiles, tiles, TILE_PX, TILE_PX)
     tile_y, tile_x, y, x = np.unravel_index(np.arange(side * side), shape)

@@ -24,13 +24,13 @@ class PixelSource(Protocol):
     def rays(
         self, view: Int64[np.ndarray, " r"], y: Int64[np.ndarray, " r"], x: Int64[np.ndarray, " r"]
     ) -> RayBatch:
-        """Unit rays of pixels, world frame."""
+        """Return unit rays of pixels, world frame."""
         ...
 
     def pixels(
         self, view: Int64[np.ndarray, " r"], y: Int64[np.ndarray, " r"], x: Int64[np.ndarray, " r"]
     ) -> tuple[Float32[np.ndarray, "r 3"], Float32[np.ndarray, " r"], Float32[np.ndarray, " r"]]:
-        """Straight display colour, alpha, and weight (0 where masked) of pixels."""
+        """Return straight display colour, alpha, and weight (0 where masked) of pixels."""
         ...
 
 
@@ -63,23 +63,23 @@ class PixelSampler:
 
     @property
     def pixel_count(self) -> int:
-        """Number of pixels in all views."""
+        """Return the number of pixels in all views."""
         return int(self._ends[-1])
 
     @property
     def smallest_side_px(self) -> int:
-        """Shortest side of any view."""
+        """Return the shortest side of any view."""
         return int(self._sizes.min())
 
     @property
     def longest_side_px(self) -> int:
-        """Longest side of any view."""
+        """Return the longest side of any view."""
         return int(self._sizes.max())
 
     def pixels(
         self, rng: np.random.Generator, count: int
     ) -> tuple[Int64[np.ndarray, " r"], Int64[np.ndarray, " r"], Int64[np.ndarray, " r"]]:
-        """``count`` pixels as (view, y, x), repeated ones too, sorted by view and row."""
+        """Draw ``count`` pixels as (view, y, x), repeated ones too, sorted by view and row."""
         flat = np.sort(rng.integers(0, self.pixel_count, count))
         which = np.searchsorted(self._ends, flat, side="right")
         width, height = self._sizes[which].T
@@ -89,7 +89,7 @@ class PixelSampler:
     def ray_patches(
         self, rng: np.random.Generator, count: int, *, rays: int, side: int, index: int = 0
     ) -> tuple[Int64[np.ndarray, " r"], Int64[np.ndarray, " r"], Int64[np.ndarray, " r"]]:
-        """``rays`` pixels (a square number) in each of ``count`` windows of about ``side`` x ``side`` pixels.
+        """Draw ``rays`` pixels (a square number) in each of ``count`` patches of about ``side`` px a side.
 
         A window is a grid of cells, one random pixel in each, in the order of
         :class:`octasplat.engine.shading.ray_patches.RayPatches`. What sticks out of its view
@@ -114,7 +114,7 @@ class PixelSampler:
     def _stratified_pixels(
         self, rng: np.random.Generator, count: int, side: int, turn: int
     ) -> tuple[Int64[np.ndarray, " c"], Int64[np.ndarray, " c"], Int64[np.ndarray, " c"]]:
-        """``count`` pixels as (place of the view among those drawn from, x, y), in strata.
+        """Draw ``count`` pixels in strata, as (place of the view among those drawn from, x, y).
 
         All views lie end to end, each as a way to and fro through tiles of about ``side`` x ``side`` pixels;
         steps of one length lead along it, each to a random pixel of the tile there. Each turn begins the
@@ -135,7 +135,7 @@ class PixelSampler:
     def patches(
         self, rng: np.random.Generator, count: int, side: int
     ) -> tuple[Int64[np.ndarray, " r"], Int64[np.ndarray, " r"], Int64[np.ndarray, " r"]]:
-        """``count`` patches of ``side`` x ``side`` pixels as (view, y, x), row-major, inside the views."""
+        """Draw ``count`` patches of ``side`` x ``side`` pixels inside the views: (view, y, x), row-major."""
         areas = np.diff(self._ends, prepend=0)
         which = rng.choice(len(self._views), size=count, p=areas / areas.sum())
         width, height = self._sizes[which].T
@@ -152,13 +152,13 @@ class PixelSampler:
 def _mirror_into(
     position: Int64[np.ndarray, "w r"], size: Int64[np.ndarray, "w 1"]
 ) -> Int64[np.ndarray, "w r"]:
-    """Positions mirrored at 0 and ``size`` until they lie between."""
+    """Return positions mirrored at 0 and ``size`` until they lie between."""
     period = np.mod(position, 2 * size)
     return np.minimum(period, 2 * size - 1 - period)
 
 
 def view_sizes_px(dataset: TrainingData) -> Int64[np.ndarray, "n 2"]:
-    """Width and height of every view."""
+    """Return width and height of every view."""
     return np.array([[view.width_px, view.height_px] for view in dataset.views], np.int64)
 
 
@@ -181,7 +181,7 @@ def valid_pixel_fraction(dataset: TrainingData) -> float:
 
 
 def _has_no_valid_pixel(dataset: TrainingData) -> bool:
-    """Whether no pixel at all of the training views shows anything."""
+    """Return whether no pixel at all of the training views is valid."""
     for index in dataset.train_indices.tolist():
         view = dataset.views[index]
         y, x = np.divmod(np.arange(view.width_px * view.height_px), view.width_px)

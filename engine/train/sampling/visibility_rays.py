@@ -60,7 +60,7 @@ class VisibilityRays:
 
     @classmethod
     def from_dataset(cls, dataset: ObservedPoints, margin: float) -> "VisibilityRays":
-        """Those of the training views.
+        """Return the visibility rays of the training views.
 
         The depth of a point along one ray of its track is known to
         ``error / sqrt(sum over the other rays of sin^2 of the angle between)``, with the reprojection error
@@ -94,14 +94,14 @@ class VisibilityRays:
         return cls(origins[view[good]], direction[good], ends[good], view[good])
 
     def exclude_views(self, views: Int64[np.ndarray, " m"]) -> "VisibilityRays":
-        """Those of other views."""
+        """Return the rays of all other views."""
         kept = ~np.isin(self.view, views)
         return VisibilityRays(
             self.starts_world[kept], self.directions_world[kept], self.ends[kept], self.view[kept]
         )
 
     def draw(self, rng: np.random.Generator, count: int) -> RayBatch:
-        """Any ``count`` of them, neighbours in the order of the views."""
+        """Draw any ``count`` of them, neighbours in the order of the views."""
         chosen = np.sort(rng.integers(0, len(self), count))
         return RayBatch(self.starts_world[chosen], self.directions_world[chosen], t_max=self.ends[chosen])
 
@@ -109,7 +109,7 @@ class VisibilityRays:
 def free_space_gradient(
     visibility_rays: RayBatch, tracer: Tracer, weight: float
 ) -> tuple[Recording, TraceGradients]:
-    """What was traced along lines of sight, and gradients of ``weight`` times their mean hidden share."""
+    """Return the recording of visibility rays, and gradients of ``weight`` times their mean hidden share."""
     seen = tracer.trace(visibility_rays, record=True)
     assert seen.recording is not None
     none = np.zeros_like(seen.rgb_srgb)

@@ -62,7 +62,7 @@ class CorrectedDataset:
     def rays(
         self, view: Int64[np.ndarray, " r"], y: Int64[np.ndarray, " r"], x: Int64[np.ndarray, " r"]
     ) -> RayBatch:
-        """Unit rays of pixels, world frame."""
+        """Return unit rays of pixels, world frame."""
         rays = self.original.rays(view, y, x)
         moved = self._moved[view]
         if not moved.any():
@@ -77,12 +77,12 @@ class CorrectedDataset:
     def pixels(
         self, view: Int64[np.ndarray, " r"], y: Int64[np.ndarray, " r"], x: Int64[np.ndarray, " r"]
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Those of the photographs."""
+        """Return the pixels of the photographs."""
         return self.original.pixels(view, y, x)
 
 
 def correct_view(view: DatasetView, motion: RigidMotion) -> DatasetView:
-    """A view whose camera's points have moved."""
+    """Return a view whose camera's points have moved."""
     rotation = motion.rotation @ view.rotation_cam_from_world
     return replace(
         view,
@@ -94,7 +94,7 @@ def correct_view(view: DatasetView, motion: RigidMotion) -> DatasetView:
 def remove_common_motion(
     corrections: Float64[np.ndarray, "v 6"], dataset: PosedTrainingData, used: Int64[np.ndarray, " t"]
 ) -> Float64[np.ndarray, "v 6"]:
-    """The corrections without what they have in common: a turn, a shift and a scale of the whole scene.
+    """Return the corrections without their common rotation, shift and scale of the whole scene.
 
     Photographs do not tell where the scene as a whole is, and views that were held out keep their places in
     it. Views of no correction have a say in what is common, but stay.
@@ -129,7 +129,7 @@ def remove_common_motion(
 def _common_similarity(
     given: list[DatasetView], now: list[DatasetView], middle: Float64[np.ndarray, "3"], extent: float
 ) -> tuple[Float64[np.ndarray, "3"], Float64[np.ndarray, "3"], float]:
-    """The small turn (rad) about ``middle``, shift and relative growth nearest to all views' motions.
+    """Return the small rotation (rad) about ``middle``, shift and relative scale nearest to all motions.
 
     Least squares of what is left of the turns, in rad, and of the shifts, of the extent.
     """

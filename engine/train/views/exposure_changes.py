@@ -25,7 +25,7 @@ class TrackedTrainingData(TrainingData, Protocol):
 
 
 def relative_log_brightness(dataset: TrackedTrainingData) -> Float64[np.ndarray, " v"]:
-    """How much brighter each training view shows the points that it shares with others, as a logarithm.
+    """Return the log of how much brighter each training view shows the points that it shares with others.
 
     Medians over points and over views by turns, so that highlights and wrong matches do not count. The middle
     view has 0; views that share too few points, and those held out, are not-a-number.
@@ -55,13 +55,13 @@ def relative_log_brightness(dataset: TrackedTrainingData) -> Float64[np.ndarray,
 
 
 def equalizing_gains(dataset: TrackedTrainingData) -> Float32[np.ndarray, " v"]:
-    """Factors on the display colours of each view that make all about as bright; 1 where none is known."""
+    """Return factors on the display colours of each view that make all about as bright; 1 where unknown."""
     brightness = relative_log_brightness(dataset)
     return np.exp(-np.where(np.isfinite(brightness), brightness, 0.0)).astype(np.float32)
 
 
 def exposure_change_notice(brightness: Float64[np.ndarray, " v"]) -> str | None:
-    """That the exposure changes so much that it makes a difference, in a sentence; None if it does not."""
+    """Return a sentence where the exposure changes so much that it makes a difference, else None."""
     known = brightness[np.isfinite(brightness)]
     if len(known) < 2 or float(known.std()) < MIN_CHANGE:
         return None
@@ -94,7 +94,7 @@ def resolve_exposure(
 def _group_medians(
     values: Float64[np.ndarray, " k"], group: Int64[np.ndarray, " k"], count: int
 ) -> Float64[np.ndarray, " g"]:
-    """The median of each group's values; 0 where there are none."""
+    """Return the median of each group's values; 0 where there are none."""
     order = np.lexsort((values, group))
     sizes = np.bincount(group, minlength=count)
     starts = np.cumsum(sizes) - sizes

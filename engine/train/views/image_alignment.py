@@ -41,29 +41,29 @@ class RigidMotion:
 
     @classmethod
     def from_vector(cls, numbers: Float64[np.ndarray, "6"]) -> "RigidMotion":
-        """By a rotation vector (rad) and a shift (world units)."""
+        """Return the motion by a rotation vector (rad) and a shift (world units)."""
         return cls(Rotation.from_rotvec(numbers[:3]).as_matrix(), numbers[3:].copy())
 
     @property
     def to_vector(self) -> Float64[np.ndarray, "6"]:
-        """The rotation vector and the shift."""
+        """Return the rotation vector and the shift."""
         return np.concatenate([Rotation.from_matrix(self.rotation).as_rotvec(), self.shift_cam])
 
     def __call__(self, points_cam: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 3"]:
-        """The points after the motion."""
+        """Return the points after the motion."""
         return rotate_vectors(points_cam, self.rotation) + self.shift_cam
 
     def scaled(self, share: float) -> "RigidMotion":
-        """A share of the motion."""
+        """Return a share of the motion."""
         return RigidMotion.from_vector(share * self.to_vector)
 
     def compose(self, first: "RigidMotion") -> "RigidMotion":
-        """``first``, then this one."""
+        """Return the motion that does ``first``, then this one."""
         return RigidMotion(self.rotation @ first.rotation, self.rotation @ first.shift_cam + self.shift_cam)
 
     @property
     def inverse(self) -> "RigidMotion":
-        """The motion back."""
+        """Return the inverse motion."""
         return RigidMotion(self.rotation.T, -self.rotation.T @ self.shift_cam)
 
 
@@ -108,7 +108,7 @@ class _Comparison:
 def photograph_spline(
     dataset: PixelSource, view: int, size_px: tuple[int, int], background_srgb: Float32[np.ndarray, "3"]
 ) -> PhotographFn:
-    """A view's photograph as a smooth function: its pixels are the coefficients of cubic B-splines."""
+    """Return a view's photograph as a smooth function: its pixels are the coefficients of cubic B-splines."""
     width, height = size_px
 
     def look(xy_px: Float64[np.ndarray, "n 2"]) -> PhotographSamples:
@@ -136,7 +136,7 @@ def photograph_spline(
 
 
 def align_camera(rendered: RenderedPoints, photograph: PhotographFn, camera: Camera) -> RigidMotion | None:
-    """The motion of the camera's points after which the photograph agrees with the render.
+    """Return the motion of the camera's points after which the photograph agrees with the render.
 
     Returns:
         None where too few points are seen, or the agreement becomes no better.
@@ -164,7 +164,7 @@ def align_camera(rendered: RenderedPoints, photograph: PhotographFn, camera: Cam
 
 
 def _compare(rendered: RenderedPoints, shown: PhotographSamples) -> _Comparison | None:
-    """The render beside what the photograph shows of its points; None where that are too few."""
+    """Return the render beside the photograph's colours of its points; None where these are too few."""
     if int(shown.valid.sum()) < MIN_POINTS:
         return None
     weights = shown.valid.astype(np.float64)
@@ -179,7 +179,7 @@ def _compare(rendered: RenderedPoints, shown: PhotographSamples) -> _Comparison 
 def _fit_exposure(
     rgb: Float64[np.ndarray, "n 3"], wanted: Float64[np.ndarray, "n 3"], weights: Float64[np.ndarray, " n"]
 ) -> Float64[np.ndarray, "n 3"]:
-    """Colours under the gain and offset of each channel that bring them closest to others."""
+    """Return colours under the gain and offset of each channel that bring them closest to others."""
     share = (weights / weights.sum())[:, None]
     middle, wanted_middle = (share * rgb).sum(axis=0), (share * wanted).sum(axis=0)
     offset = rgb - middle
@@ -189,7 +189,7 @@ def _fit_exposure(
 
 
 def _huber_cost(compared: _Comparison, which: Bool[np.ndarray, " n"], noise: float) -> float:
-    """Mean error of points by Huber's function: squared up to ``noise``, linear beyond."""
+    """Return the mean error of points by Huber's function: squared up to ``noise``, linear beyond."""
     errors = compared.errors[which]
     return float(np.where(errors < noise, errors**2, noise * (2 * errors - noise)).mean())
 
@@ -197,7 +197,7 @@ def _huber_cost(compared: _Comparison, which: Bool[np.ndarray, " n"], noise: flo
 def _gauss_newton_step(
     points_cam: Float64[np.ndarray, "n 3"], now: _Comparison, camera: Camera, depth: float
 ) -> Float64[np.ndarray, "6"]:
-    """A step of Gauss and Newton: a rotation vector and a shift of the camera's points.
+    """Return a Gauss-Newton step: a rotation vector and a shift of the camera's points.
 
     Shifts count in depths while it is solved, so that all six numbers are angles.
     """
@@ -223,7 +223,7 @@ def _gauss_newton_step(
 def _spline_weights(
     share: Float64[np.ndarray, " n"],
 ) -> tuple[Float64[np.ndarray, "n 4"], Float64[np.ndarray, "n 4"]]:
-    """Weights of four neighbours at a share of the way from the second to the third, and their slopes."""
+    """Return weights of four neighbours between the second and the third, and their slopes."""
     f, g = share, 1 - share
     weights = np.stack([g**3, 3 * f**3 - 6 * f**2 + 4, 3 * g**3 - 6 * g**2 + 4, f**3], axis=1) / 6
     slopes = np.stack([-(g**2), 3 * f**2 - 4 * f, -(3 * g**2 - 4 * g), f**2], axis=1) / 2

@@ -52,7 +52,7 @@ def orient_normals(
 def _summed_view_directions(
     count: int, dataset: TrainingData, indices: Int64[np.ndarray, " v"], tracer: Tracer
 ) -> Float64[np.ndarray, "n 3"]:
-    """For each Gaussian, the directions to those who see it, summed by how much of it they see.
+    """Return for each Gaussian the directions to the cameras, summed by its weight in their pictures.
 
     That is what the backward pass makes of directions given as gradients of features.
     """
@@ -69,6 +69,6 @@ def _summed_view_directions(
 
 
 def _flip_frames(quats_wxyz: np.ndarray) -> np.ndarray:
-    """Frames after half a turn about the first axis in the Gaussians' planes, which octagons do not show."""
+    """Return frames after half a turn about the first axis in the plane, which octagons do not show."""
     w, x, y, z = quats_wxyz.T
     return np.stack([-y, -z, w, x], axis=-1)

@@ -82,7 +82,7 @@ def find_outlier_views(
     train_indices: Int64[np.ndarray, " t"],
     sigmas: float = OUTLIER_SIGMAS,
 ) -> Int64[np.ndarray, " m"]:
-    """The views that are rendered far worse than the training views around them, worst first.
+    """Return the views that are rendered far worse than the training views around them, worst first.
 
     Each is compared with the middle of its neighbours, so that a part of the scene that is hard to learn is
     not taken for wrong poses; how much that difference varies among the training views says what is far.
@@ -183,7 +183,7 @@ class TrainingViewReport:
     left_out: tuple[str, ...]
 
     def as_dict(self) -> dict[str, object]:
-        """JSON-ready, with the mean and the worst view."""
+        """Return a JSON-ready record, with the mean and the worst view."""
         known = {name: round(value, 4) for name, value in self.psnr.items() if np.isfinite(value)}
         worst = min(known, key=lambda name: known[name], default=None)
         return {
@@ -196,7 +196,7 @@ class TrainingViewReport:
         }
 
     def warning(self) -> str | None:
-        """What the user should know."""
+        """Return a warning that names photographs that do not fit, or None."""
         loose = [name for name in self.misfits if name not in self.left_out]
         if not loose:
             return None
@@ -224,7 +224,7 @@ class OutlierDetector:
     def find(
         self, tracer: Tracer, shading: ShadingModel, left_out: Int64[np.ndarray, " k"]
     ) -> Int64[np.ndarray, " m"]:
-        """Training views to leave out besides others, as the Gaussians that ``tracer`` holds show them."""
+        """Return training views to exclude besides ``left_out``, by how ``tracer`` shows them."""
         train = self._dataset.train_indices
         used = np.setdiff1d(train, left_out)
         fits = measure_views(self._dataset, used, self._background_srgb, tracer, shading)
@@ -234,7 +234,7 @@ class OutlierDetector:
     def report(
         self, tracer: Tracer, shading: ShadingModel, left_out: Int64[np.ndarray, " m"]
     ) -> TrainingViewReport:
-        """How well the finished Gaussians, which ``tracer`` holds, show the views."""
+        """Return how well the finished Gaussians, which ``tracer`` holds, show the views."""
         dataset = self._dataset
         used = np.setdiff1d(dataset.train_indices, left_out)
         indices = np.concatenate([used, dataset.test_indices])

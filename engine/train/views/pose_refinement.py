@@ -72,11 +72,11 @@ class RefinedPoses:
     of: int
 
     def as_dict(self) -> dict[str, dict[str, object]]:
-        """JSON-ready, by name."""
+        """Return a JSON-ready record, by name."""
         return {name: dict(vars(pose)) for name, pose in self.views.items()}
 
     def summary(self) -> str:
-        """What the user should know."""
+        """Return a sentence on how far poses were moved."""
         sizes = {name: pose.moved_px for name, pose in self.views.items() if pose.moved_px is not None}
         middle = float(np.median(list(sizes.values()))) if sizes else 0.0
         if not sizes:
@@ -110,7 +110,7 @@ class PoseRefiner:
         shading: ShadingModel,
         left_out: Int64[np.ndarray, " m"],
     ) -> Float64[np.ndarray, "v 6"]:
-        """The corrections after one more alignment of the views with the Gaussians that ``tracer`` holds.
+        """Return the corrections after one more alignment of the views with the Gaussians of ``tracer``.
 
         Views that show too little, or agree no better afterwards, stay as they are, and so do those left out.
         """
@@ -136,7 +136,7 @@ class PoseRefiner:
         shading: ShadingModel,
         left_out: Int64[np.ndarray, " m"],
     ) -> RefinedPoses:
-        """The corrected poses, and how much they differ in the pictures of the finished Gaussians."""
+        """Return the corrected poses, and how much they differ in the pictures of the finished Gaussians."""
         dataset, found = self.dataset, {}
         used = np.setdiff1d(dataset.train_indices, left_out)
         moved = used[corrections[used].any(axis=1)]
@@ -158,7 +158,7 @@ class PoseRefiner:
     def _render_grids(
         self, indices: Int64[np.ndarray, " v"], tracer: Tracer, shading: ShadingModel
     ) -> Iterator[tuple[int, RenderedPoints]]:
-        """Each view with what the Gaussians show of a grid of its pixels, where they show a surface."""
+        """Yield each view with what the Gaussians show of a grid of its pixels, where they show a surface."""
         dataset = self.dataset
         for start in range(0, len(indices), VIEWS_PER_TRACE):
             some = indices[start : start + VIEWS_PER_TRACE]

@@ -43,7 +43,7 @@ def render_grids(
     tiles: int,
     exposed: bool,
 ) -> Iterator[RenderedGrids]:
-    """The views ``indices``, some at a time, as the Gaussians that ``tracer`` holds show them.
+    """Yield the views ``indices``, some at a time, as the Gaussians that ``tracer`` holds show them.
 
     Args:
         dataset: whose views they are.
@@ -78,7 +78,7 @@ def estimate_untrained_exposures(
 def _mean_brightness(
     dataset: TrainingData, background_srgb: Float32[np.ndarray, "3"], tracer: Tracer, shading: ShadingModel
 ) -> Float64[np.ndarray, " v"]:
-    """The mean display value that each view would have with the mean exposure."""
+    """Return the mean display value that each view would have with the mean exposure."""
     shown = render_grids(
         dataset, np.arange(len(dataset.views)), background_srgb, tracer, shading,
         tiles=BRIGHTNESS_TILES, exposed=False,
