@@ -46,12 +46,12 @@ def ambient_visibility(
         That, and the side: 1 where the normal looks, else -1.
     """
     sides = [1.0] if one_sided else [1.0, -1.0]
-    seen = np.empty((len(sides), len(ids)), np.float32)
+    visibility = np.empty((len(sides), len(ids)), np.float32)
     for part in _ray_chunks(len(ids), rays):
         for number, side in enumerate(sides):
-            fan = _hemisphere_rays(gaussians, ids[part], np.full(len(ids[part]), side), rays, offset)
-            seen[number, part] = tracer.transmittance(fan).reshape(-1, rays).mean(axis=1)
-    return seen.max(axis=0), np.array(sides, np.float32)[seen.argmax(axis=0)]
+            hemisphere = _hemisphere_rays(gaussians, ids[part], np.full(len(ids[part]), side), rays, offset)
+            visibility[number, part] = tracer.transmittance(hemisphere).reshape(-1, rays).mean(axis=1)
+    return visibility.max(axis=0), np.array(sides, np.float32)[visibility.argmax(axis=0)]
 
 
 def diffuse_interreflection(
@@ -95,10 +95,10 @@ def _hemisphere_rays(
     """Return rays over the hemisphere of one side of each Gaussian, begun a little above it."""
     frames = rotation_matrices(gaussians.quats_wxyz[ids])
     frames = frames * np.stack([side, np.ones_like(side), np.ones_like(side)], axis=1)[:, None, :]
-    ways = np.einsum("nij,kj->nki", frames, cosine_hemisphere(rays))
+    directions = np.einsum("nij,kj->nki", frames, cosine_hemisphere(rays))
     starts = np.repeat(gaussians.means_world[ids] + offset.bias_world * frames[:, :, 0], rays, axis=0)
     reaches = np.repeat(np.where(side > 0, offset.backface_cull_world, 0.0), rays)
-    return RayBatch(starts, ways.reshape(-1, 3), offset.bias_world, t_backface_cull=reaches)
+    return RayBatch(starts, directions.reshape(-1, 3), offset.bias_world, t_backface_cull=reaches)
 
 
 def cosine_hemisphere(rays: int) -> Float64[np.ndarray, "k 3"]:

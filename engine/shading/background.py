@@ -107,9 +107,9 @@ class LearnedBackground:
     def shade(self, traced: TracedRays) -> ShadedRays:
         """Return the inner model's colours over those of the map; nothing stays transparent."""
         inner = self.inner.shade(traced)
-        behind = self.lookup(traced.rays.directions_world)
-        rgb = inner.rgb_srgb + inner.transmittance[:, None] * behind
-        return ShadedRays(rgb, np.zeros_like(inner.transmittance), (inner, behind), inner.layers)
+        background_srgb = self.lookup(traced.rays.directions_world)
+        rgb = inner.rgb_srgb + inner.transmittance[:, None] * background_srgb
+        return ShadedRays(rgb, np.zeros_like(inner.transmittance), (inner, background_srgb), inner.layers)
 
     def backward(
         self,
@@ -120,14 +120,14 @@ class LearnedBackground:
     ) -> ShadingGradients:
         """Return gradients by what the inner model shaded and by the map's colours along the rays."""
         assert isinstance(shaded.ctx, tuple)
-        inner, behind = shaded.ctx
-        through = (by_rgb * behind).sum(axis=1, dtype=np.float32)
+        inner, background_srgb = shaded.ctx
+        through = (by_rgb * background_srgb).sum(axis=1, dtype=np.float32)
         below = self.inner.backward(traced, inner, by_rgb, through)
-        own = {
+        by_map = {
             "background.directions": traced.rays.directions_world,
             "background.by_colours": inner.transmittance[:, None] * by_rgb,
         }
-        return ShadingGradients(below.trace, below.recorded_traces, {**below.parameters, **own})
+        return ShadingGradients(below.trace, below.recorded_traces, {**below.parameters, **by_map})
 
     def accumulate(self, parameters: Mapping[str, np.ndarray]) -> None:
         """Add what :meth:`backward` found to the sums over the texels."""

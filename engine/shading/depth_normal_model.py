@@ -43,10 +43,10 @@ class DepthNormalShading(PlainShading):
         count = len(by_rgb)
         by_alpha, by_normal, by_depth = np.zeros(count), np.zeros((count, 3)), np.zeros(count)
         add_depth_normal_gradient(traced, self._weight, by_alpha, by_normal, by_depth)
-        seen = replace(
+        by_trace = replace(
             plain.trace,
             transmittance=(by_transmittance - by_alpha).astype(np.float32),
             depth_sum=by_depth.astype(np.float32),
             normal_world=by_normal.astype(np.float32),
         )
-        return replace(plain, trace=seen)
+        return replace(plain, trace=by_trace)

@@ -106,24 +106,24 @@ def split_by_depth(
     """
     mean = result.expected_depth
     far = (np.abs(mean - result.depth_median) > min_separation_world) & (result.depth_median > 0)
-    two = np.flatnonzero(far)
-    if not len(two):
+    split_ids = np.flatnonzero(far)
+    if not len(split_ids):
         return no_split(rays, result)
-    ends = np.minimum(np.broadcast_to(rays.t_max, len(rays))[two], mean[two])
-    front_rays = rays[two].with_t_max(ends)
+    ends = np.minimum(np.broadcast_to(rays.t_max, len(rays))[split_ids], mean[split_ids])
+    front_rays = rays[split_ids].with_t_max(ends)
     front = tracer.trace(front_rays, record=record)
-    kept = (front.alpha > MIN_FRACTION) & (result.alpha[two] - front.alpha > MIN_FRACTION)
-    two = two[kept]
-    if not len(two):
+    is_split = (front.alpha > MIN_FRACTION) & (result.alpha[split_ids] - front.alpha > MIN_FRACTION)
+    split_ids = split_ids[is_split]
+    if not len(split_ids):
         return no_split(rays, result)
 
     def divided(sums: Float32[np.ndarray, "r *c"], ahead: Float32[np.ndarray, "t *c"]) -> np.ndarray:
-        rest = sums.copy()
-        rest[two] -= ahead[kept]
-        return np.concatenate([rest, ahead[kept]])
+        back = sums.copy()
+        back[split_ids] -= ahead[is_split]
+        return np.concatenate([back, ahead[is_split]])
 
     def listed(values: Shaped[np.ndarray, " r"], ahead: Shaped[np.ndarray, " t"]) -> np.ndarray:
-        return np.concatenate([values, ahead[kept]])
+        return np.concatenate([values, ahead[is_split]])
 
     parts = TraceResult(
         rgb_srgb=divided(result.rgb_srgb, front.rgb_srgb),
@@ -134,4 +134,6 @@ def split_by_depth(
         features=divided(result.features, front.features),
         hit_counts=listed(result.hit_counts, front.hit_counts),
     )
-    return DepthSplit(concatenate_rays(rays, front_rays[kept]), parts, two, front.recording, kept)
+    return DepthSplit(
+        concatenate_rays(rays, front_rays[is_split]), parts, split_ids, front.recording, is_split
+    )

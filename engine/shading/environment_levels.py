@@ -40,10 +40,12 @@ class _SparseRows:
 
     def transpose(self, columns: int) -> "_SparseRows":
         shape = (len(self.starts) - 1, columns)
-        turned = csr_matrix((self.weights, self.columns, self.starts), shape).T.tocsr()
-        turned.sort_indices()
+        transposed = csr_matrix((self.weights, self.columns, self.starts), shape).T.tocsr()
+        transposed.sort_indices()
         return _SparseRows(
-            turned.indptr.astype(np.int64), turned.indices.astype(np.int32), turned.data.astype(np.float32)
+            transposed.indptr.astype(np.int64),
+            transposed.indices.astype(np.int32),
+            transposed.data.astype(np.float32),
         )
 
 
@@ -88,9 +90,9 @@ class EnvironmentPrefilter:
         sizes = [2 * (self.height >> halving) ** 2 for halving in range(max(_SOURCES) + 1)]
         sums = [np.zeros((size, 3)) for size in sizes]
         sums[0] += by_texels[: self.offsets[1]]
-        for level, turned in enumerate(self._turned, start=1):
+        for level, transposed in enumerate(self._turned, start=1):
             part = np.empty_like(sums[_SOURCES[level]])
-            turned.multiply(by_texels[self.offsets[level] : self.offsets[level + 1]], part)
+            transposed.multiply(by_texels[self.offsets[level] : self.offsets[level + 1]], part)
             sums[_SOURCES[level]] += part
         for halving in range(max(_SOURCES), 0, -1):
             sums[halving - 1] += _halve_backward(sums[halving])

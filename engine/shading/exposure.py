@@ -96,8 +96,8 @@ class ExposureModel:
         self, rgb_srgb: Float32[np.ndarray, "h w 3"], view: int
     ) -> Float32[np.ndarray, "h w 3"]:
         """Return a view's straight display colours at the mean exposure, within [0, 1]."""
-        shown = (rgb_srgb - self.offsets[view]) / np.exp(self.log_gains[view])
-        return np.asarray(np.clip(shown, 0, 1), np.float32)
+        unexposed = (rgb_srgb - self.offsets[view]) / np.exp(self.log_gains[view])
+        return np.asarray(np.clip(unexposed, 0, 1), np.float32)
 
     def estimate_untrained(
         self, names: Sequence[str], brightness: Float64[np.ndarray, " v"] | None = None
@@ -134,9 +134,13 @@ class ExposureModel:
         terms = np.concatenate([by_rgb * gains * inner.rgb_srgb, by_rgb * alpha[:, None]], axis=1)
         sums = np.stack([np.bincount(place, terms[:, c], len(used)) for c in range(6)], axis=1)
         by_alpha = (by_rgb * self.offsets[view]).sum(axis=1)
-        below = self.inner.backward(traced, inner, by_rgb * gains, by_transmittance - by_alpha)
-        own = {"exposure.views": used, "exposure.sums": sums}
-        return ShadingGradients(below.trace, below.recorded_traces, {**below.parameters, **own})
+        inner_gradients = self.inner.backward(traced, inner, by_rgb * gains, by_transmittance - by_alpha)
+        by_exposures = {"exposure.views": used, "exposure.sums": sums}
+        return ShadingGradients(
+            inner_gradients.trace,
+            inner_gradients.recorded_traces,
+            {**inner_gradients.parameters, **by_exposures},
+        )
 
     def step(
         self,
@@ -158,9 +162,9 @@ class ExposureModel:
         change = (self._rate * self._decay**training_progress * mean / size).astype(np.float32)
         self.log_gains[used] -= change[:, :3]
         self.offsets[used] -= change[:, 3:]
-        seen = self.steps > 0
+        is_trained = self.steps > 0
         for values in (self.log_gains, self.offsets):
-            values[seen] -= values[seen].mean(axis=0, dtype=np.float64).astype(np.float32)
+            values[is_trained] -= values[is_trained].mean(axis=0, dtype=np.float64).astype(np.float32)
 
     def as_dict(self, names: Sequence[str]) -> dict[str, dict[str, list[float]]]:
         """Return a JSON-ready record by the names of all views; :meth:`take` reads it."""

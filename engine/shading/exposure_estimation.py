@@ -24,11 +24,11 @@ def times_from_names(names: Sequence[str]) -> Float64[np.ndarray, " v"]:
 
     Their places in the list where these do not ascend.
     """
-    found = [re.findall(r"\d+", name.rsplit(".", 1)[0]) for name in names]
-    if all(found):
-        numbers = np.array([float(digits[-1]) for digits in found])
-        if (np.diff(numbers) > 0).all():
-            return numbers
+    numbers = [re.findall(r"\d+", name.rsplit(".", 1)[0]) for name in names]
+    if all(numbers):
+        times = np.array([float(digits[-1]) for digits in numbers])
+        if (np.diff(times) > 0).all():
+            return times
     return np.arange(len(names), dtype=np.float64)
 
 
@@ -66,33 +66,33 @@ Estimator = tuple[Float64[np.ndarray, "m c"], Float64[np.ndarray, "i c"]]
 
 def _line_then_neighbors(
     known: Float64[np.ndarray, "k c"],
-    ours: Float64[np.ndarray, " k"],
-    theirs: Float64[np.ndarray, " m"],
-    our_brightness: Float64[np.ndarray, " k"],
-    their_brightness: Float64[np.ndarray, " m"],
+    times: Float64[np.ndarray, " k"],
+    other_times: Float64[np.ndarray, " m"],
+    brightness: Float64[np.ndarray, " k"],
+    other_brightness: Float64[np.ndarray, " m"],
 ) -> Estimator:
     """Predict by a line over the brightness, then by the residuals of the views before and after."""
-    middle, height = our_brightness.mean(), known.mean(axis=0)
-    slopes, left_out, trust = _slopes(our_brightness - middle, known, height)
-    rest = known - trust * (our_brightness - middle)[:, None] * slopes
-    found, left = _neighbor_mean(rest, ours, theirs)
-    missed = trust * ((our_brightness - middle)[:, None] * slopes - left_out)[1:-1]
-    return trust * (their_brightness - middle)[:, None] * slopes + found, left + missed
+    middle, height = brightness.mean(), known.mean(axis=0)
+    slopes, left_out, trust = _slopes(brightness - middle, known, height)
+    off_line = known - trust * (brightness - middle)[:, None] * slopes
+    predicted, residuals = _neighbor_mean(off_line, times, other_times)
+    missed = trust * ((brightness - middle)[:, None] * slopes - left_out)[1:-1]
+    return trust * (other_brightness - middle)[:, None] * slopes + predicted, residuals + missed
 
 
 def _neighbors_then_line(
     known: Float64[np.ndarray, "k c"],
-    ours: Float64[np.ndarray, " k"],
-    theirs: Float64[np.ndarray, " m"],
-    our_brightness: Float64[np.ndarray, " k"],
-    their_brightness: Float64[np.ndarray, " m"],
+    times: Float64[np.ndarray, " k"],
+    other_times: Float64[np.ndarray, " m"],
+    brightness: Float64[np.ndarray, " k"],
+    other_brightness: Float64[np.ndarray, " m"],
 ) -> Estimator:
     """Predict by the views before and after, then by a line over how much brighter than these a view is."""
-    found, left = _neighbor_mean(known, ours, theirs)
-    brighter = our_brightness[1:-1] - _leave_one_out_neighbors(our_brightness[:, None], ours)[:, 0]
-    slopes, left_out, trust = _slopes(brighter, left)
-    their_brighter = their_brightness - np.interp(theirs, ours, our_brightness)
-    return found + trust * their_brighter[:, None] * slopes, left - trust * left_out
+    predicted, residuals = _neighbor_mean(known, times, other_times)
+    brighter = brightness[1:-1] - _leave_one_out_neighbors(brightness[:, None], times)[:, 0]
+    slopes, left_out, trust = _slopes(brighter, residuals)
+    other_brighter = other_brightness - np.interp(other_times, times, brightness)
+    return predicted + trust * other_brighter[:, None] * slopes, residuals - trust * left_out
 
 
 def _slopes(
@@ -107,33 +107,35 @@ def _slopes(
     spread = float(brightness @ brightness)
     if spread <= 1e-12:
         return np.zeros(known.shape[1]), np.zeros_like(known), 0.0
-    slopes, reach = brightness @ known / spread, brightness**2 / spread
+    slopes, leverage = brightness @ known / spread, brightness**2 / spread
     fitted = brightness[:, None] * slopes
     if height is not None:
-        fitted, reach = fitted + height, reach + 1 / len(brightness)
-    left_out = known - (known - fitted) / np.maximum(1 - reach[:, None], 1e-6)
+        fitted, leverage = fitted + height, leverage + 1 / len(brightness)
+    left_out = known - (known - fitted) / np.maximum(1 - leverage[:, None], 1e-6)
     return slopes, left_out, _shrinkage(left_out, known)
 
 
 def _neighbor_mean(
-    known: Float64[np.ndarray, "k c"], ours: Float64[np.ndarray, " k"], theirs: Float64[np.ndarray, " m"]
+    known: Float64[np.ndarray, "k c"],
+    times: Float64[np.ndarray, " k"],
+    other_times: Float64[np.ndarray, " m"],
 ) -> Estimator:
     """Return the mean of the trained views before and after, weighted by nearness, times the trust."""
-    near = np.stack([np.interp(theirs, ours, channel) for channel in known.T], axis=1)
-    between = _leave_one_out_neighbors(known, ours)
+    interpolated = np.stack([np.interp(other_times, times, channel) for channel in known.T], axis=1)
+    between = _leave_one_out_neighbors(known, times)
     trust = _shrinkage(between, known[1:-1])
-    return trust * near, known[1:-1] - trust * between
+    return trust * interpolated, known[1:-1] - trust * between
 
 
 def _leave_one_out_neighbors(
-    known: Float64[np.ndarray, "k c"], ours: Float64[np.ndarray, " k"]
+    known: Float64[np.ndarray, "k c"], times: Float64[np.ndarray, " k"]
 ) -> Float64[np.ndarray, "i c"]:
     """Return the prediction of each inner view from the views before and after it."""
-    share = (ours[1:-1] - ours[:-2]) / (ours[2:] - ours[:-2])
+    share = (times[1:-1] - times[:-2]) / (times[2:] - times[:-2])
     return known[:-2] + share[:, None] * (known[2:] - known[:-2])
 
 
-def _shrinkage(said: Float64[np.ndarray, "k c"], known: Float64[np.ndarray, "k c"]) -> float:
+def _shrinkage(predicted: Float64[np.ndarray, "k c"], known: Float64[np.ndarray, "k c"]) -> float:
     """Return the factor in [0, 1] that brings predictions nearest to known values."""
-    scale = float((said**2).sum())
-    return min(max(float((said * known).sum()) / scale, 0.0), 1.0) if scale > 0 else 0.0
+    scale = float((predicted**2).sum())
+    return min(max(float((predicted * known).sum()) / scale, 0.0), 1.0) if scale > 0 else 0.0

@@ -51,14 +51,14 @@ class GBuffer:
 def build_gbuffer(rays: RayBatch, result: TraceResult) -> GBuffer:
     """Return the G-buffer of a trace whose first features are materials."""
     alpha = 1.0 - result.transmittance.astype(np.float64)
-    which = np.flatnonzero(alpha > MIN_ALPHA)
-    alpha = alpha[which]
-    directions = rays.directions_world[which]
-    normals = face_viewer(result.normal_world[which], directions)
+    ray_ids = np.flatnonzero(alpha > MIN_ALPHA)
+    alpha = alpha[ray_ids]
+    directions = rays.directions_world[ray_ids]
+    normals = face_viewer(result.normal_world[ray_ids], directions)
     surface = SurfacePoints.unoccluded(
-        result.features[which, :5] / alpha[:, None], normals.normal_world, directions
+        result.features[ray_ids, :5] / alpha[:, None], normals.normal_world, directions
     )
-    return GBuffer(which, alpha, result.depth_sum[which] / alpha, normals, surface)
+    return GBuffer(ray_ids, alpha, result.depth_sum[ray_ids] / alpha, normals, surface)
 
 
 def backward_gbuffer(
@@ -70,10 +70,10 @@ def backward_gbuffer(
     by_normal: Float64[np.ndarray, "r 3"],
 ) -> None:
     """Add gradients by a buffer's materials and unit normals to those by what was blended."""
-    which, surface = gbuffer.ray_ids, gbuffer.surface
-    by_features[which, :5] += by_material / gbuffer.alpha[:, None]
-    by_alpha[which] -= (by_material * surface.material).sum(axis=1) / gbuffer.alpha
-    by_normal[which] += gbuffer.facing_normals.backward(by_unit_normal, surface.direction_world)
+    ray_ids, surface = gbuffer.ray_ids, gbuffer.surface
+    by_features[ray_ids, :5] += by_material / gbuffer.alpha[:, None]
+    by_alpha[ray_ids] -= (by_material * surface.material).sum(axis=1) / gbuffer.alpha
+    by_normal[ray_ids] += gbuffer.facing_normals.backward(by_unit_normal, surface.direction_world)
 
 
 def reflected_rays(
@@ -91,9 +91,9 @@ def reflected_rays(
         facets_world: unit normals to be mirrored at instead of the surface's; where that leads below the
             surface, the ray leaves along it.
     """
-    which, normals = gbuffer.ray_ids, gbuffer.surface.normal_world
-    origins = rays.origins_world if len(rays.origins_world) == 1 else rays.origins_world[which]
-    directions = rays.directions_world[which].astype(np.float64)
+    ray_ids, normals = gbuffer.ray_ids, gbuffer.surface.normal_world
+    origins = rays.origins_world if len(rays.origins_world) == 1 else rays.origins_world[ray_ids]
+    directions = rays.directions_world[ray_ids].astype(np.float64)
     gap_world = offset.bias_world
     points = origins + gbuffer.depth[:, None] * directions + gap_world * normals
     facets = normals if facets_world is None else facets_world

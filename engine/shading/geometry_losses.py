@@ -66,45 +66,45 @@ def add_depth_normal_gradient(
     by_depth: Float64[np.ndarray, " r"],
 ) -> None:
     """Add the gradient of one minus the cosine between blended normals and those of neighbouring depths."""
-    windows = traced.ray_patches
-    if windows is None:
+    patches = traced.ray_patches
+    if patches is None:
         return
-    some = windows.rays
-    seen, rays = traced.result, traced.rays
-    alpha = 1.0 - seen.transmittance[some].astype(np.float64)
-    solid = np.maximum(alpha, 1e-6)
-    depth = seen.depth_sum[some] / solid
-    directions = rays.directions_world[some].astype(np.float64)
-    origins = rays.origins_world if len(rays.origins_world) == 1 else rays.origins_world[some]
-    points = windows.grid(origins + depth[:, None] * directions)
+    ray_ids = patches.rays
+    result, rays = traced.result, traced.rays
+    alpha = 1.0 - result.transmittance[ray_ids].astype(np.float64)
+    safe_alpha = np.maximum(alpha, 1e-6)
+    depth = result.depth_sum[ray_ids] / safe_alpha
+    directions = rays.directions_world[ray_ids].astype(np.float64)
+    origins = rays.origins_world if len(rays.origins_world) == 1 else rays.origins_world[ray_ids]
+    points = patches.grid(origins + depth[:, None] * directions)
     middle, right, below = points[:, :-1, :-1], points[:, :-1, 1:], points[:, 1:, :-1]
     a, b = right - middle, below - middle
     cross = np.cross(a, b)
     length = np.maximum(np.linalg.norm(cross, axis=-1, keepdims=True), 1e-12)
-    towards = -windows.grid(directions)[:, :-1, :-1]
-    turned = np.where((cross * towards).sum(axis=-1, keepdims=True) < 0, -1.0, 1.0)
-    spanned = turned * cross / length
-    sums = windows.grid(seen.normal_world[some].astype(np.float64))[:, :-1, :-1]
+    towards = -patches.grid(directions)[:, :-1, :-1]
+    sign = np.where((cross * towards).sum(axis=-1, keepdims=True) < 0, -1.0, 1.0)
+    spanned = sign * cross / length
+    sums = patches.grid(result.normal_world[ray_ids].astype(np.float64))[:, :-1, :-1]
     normal_length = np.maximum(np.linalg.norm(sums, axis=-1, keepdims=True), 1e-9)
     normal = sums / normal_length
-    opaque = windows.grid(alpha) > MIN_ALPHA
+    opaque = patches.grid(alpha) > MIN_ALPHA
     counted = opaque[:, :-1, :-1] & opaque[:, :-1, 1:] & opaque[:, 1:, :-1]
     counted &= (spanned * towards).sum(axis=-1) > MIN_VIEW_COSINE
-    share = np.where(counted, weight / len(seen.transmittance), 0.0)[..., None]
+    share = np.where(counted, weight / len(result.transmittance), 0.0)[..., None]
     cosine = (spanned * normal).sum(axis=-1, keepdims=True)
     by_sums = -share * (spanned - cosine * normal) / normal_length
-    by_cross = -share * turned * (normal - cosine * spanned) / length
+    by_cross = -share * sign * (normal - cosine * spanned) / length
     by_a, by_b = np.cross(b, by_cross), np.cross(by_cross, a)
     by_points = np.zeros_like(points)
     by_points[:, :-1, 1:] += by_a
     by_points[:, 1:, :-1] += by_b
     by_points[:, :-1, :-1] -= by_a + by_b
-    along = (windows.flatten(by_points) * directions).sum(axis=1)
-    by_depth[some] += along / solid
-    by_alpha[some] -= along * depth / solid
-    whole = np.zeros_like(points)
-    whole[:, :-1, :-1] = by_sums
-    by_normal[some] += windows.flatten(whole)
+    by_depth_sum = (patches.flatten(by_points) * directions).sum(axis=1)
+    by_depth[ray_ids] += by_depth_sum / safe_alpha
+    by_alpha[ray_ids] -= by_depth_sum * depth / safe_alpha
+    by_grid_normals = np.zeros_like(points)
+    by_grid_normals[:, :-1, :-1] = by_sums
+    by_normal[ray_ids] += patches.flatten(by_grid_normals)
 
 
 def add_normal_smoothness_gradient(
@@ -114,14 +114,14 @@ def add_normal_smoothness_gradient(
 
     A surface that is bent evenly has no gradient from it.
     """
-    windows = traced.ray_patches
-    if windows is None:
+    patches = traced.ray_patches
+    if patches is None:
         return
-    some = windows.rays
-    sums = windows.grid(traced.result.normal_world[some].astype(np.float64))
+    ray_ids = patches.rays
+    sums = patches.grid(traced.result.normal_world[ray_ids].astype(np.float64))
     length = np.maximum(np.linalg.norm(sums, axis=-1, keepdims=True), 1e-9)
     normal = sums / length
-    opaque = windows.grid(traced.result.transmittance[some]) < 1 - MIN_ALPHA
+    opaque = patches.grid(traced.result.transmittance[ray_ids]) < 1 - MIN_ALPHA
     gradient = np.zeros_like(normal)
     for one, other in _NEIGHBOR_SLICES:
         cosine = (normal[one] * normal[other]).sum(axis=-1, keepdims=True)
@@ -129,7 +129,7 @@ def add_normal_smoothness_gradient(
         share = np.where(counted, weight / len(traced.result.transmittance), 0.0)
         gradient[one] -= share * (normal[other] - cosine * normal[one])
         gradient[other] -= share * (normal[one] - cosine * normal[other])
-    by_normal[some] += windows.flatten(gradient / length)
+    by_normal[ray_ids] += patches.flatten(gradient / length)
 
 
 def add_material_smoothness_gradient(
@@ -145,15 +145,15 @@ def add_material_smoothness_gradient(
     between two metals, in between by the square of the smaller metallic: what reflections do not explain yet
     would else be painted on. Metallic itself gets no gradient from that.
     """
-    windows = traced.ray_patches
-    if windows is None:
+    patches = traced.ray_patches
+    if patches is None:
         return
-    some = windows.rays
-    alpha = 1.0 - traced.result.transmittance[some].astype(np.float64)
-    solid = np.maximum(alpha, 1e-6)[:, None]
-    flat = traced.result.features[some, :5] / solid
-    material = windows.grid(flat)
-    opaque = windows.grid(alpha) > MIN_ALPHA
+    ray_ids = patches.rays
+    alpha = 1.0 - traced.result.transmittance[ray_ids].astype(np.float64)
+    safe_alpha = np.maximum(alpha, 1e-6)[:, None]
+    flat = traced.result.features[ray_ids, :5] / safe_alpha
+    material = patches.grid(flat)
+    opaque = patches.grid(alpha) > MIN_ALPHA
     gradient = np.zeros_like(material)
     share = np.array(weights) / len(traced.result.transmittance)
     for one, other in _NEIGHBOR_SLICES:
@@ -164,9 +164,9 @@ def add_material_smoothness_gradient(
         slope[..., :3] *= 1 + metal * both**2
         gradient[one] += slope
         gradient[other] -= slope
-    by_flat = windows.flatten(gradient)
-    by_features[some, :5] += by_flat / solid
-    by_alpha[some] -= (by_flat * flat).sum(axis=1) / solid[:, 0]
+    by_flat = patches.flatten(gradient)
+    by_features[ray_ids, :5] += by_flat / safe_alpha
+    by_alpha[ray_ids] -= (by_flat * flat).sum(axis=1) / safe_alpha[:, 0]
 
 
 def _where(

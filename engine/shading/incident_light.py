@@ -84,21 +84,23 @@ class RayPairIncidentLight:
         settings: MaterialSettings,
     ) -> "RayPairIncidentLight":
         """Trace pairs of rays for the points of a G-buffer."""
-        rays, record, ways = split.rays, traced.view is not None, gbuffer.surface.direction_world
-        salt, least = (
+        rays, record, directions = split.rays, traced.view is not None, gbuffer.surface.direction_world
+        salt, min_slope = (
             int(traced.training_progress * PROGRESS_SALTS),
             settings.min_facet_slope(traced.training_progress),
         )
         if traced.dither is None:
-            numbers = direction_uniforms(ways, salt)
+            uniforms = direction_uniforms(directions, salt)
         else:
-            numbers = split.expand(traced.dither.T)[gbuffer.ray_ids].T
-        lobe = trace_ray_pairs(rays, gbuffer, reflection_tracer, numbers, min_slope=least, record=record)
-        widened = None
+            uniforms = split.expand(traced.dither.T)[gbuffer.ray_ids].T
+        pairs = trace_ray_pairs(
+            rays, gbuffer, reflection_tracer, uniforms, min_slope=min_slope, record=record
+        )
+        probe = None
         if record and settings.roughness_probe_fraction > 0:
-            drawn = direction_uniforms(ways, salt + 1)[0] < settings.roughness_probe_fraction
-            widened = probe_roughness(rays, gbuffer, reflection_tracer, lobe, drawn, min_slope=least)
-        return cls(lobe, widened, gbuffer.surface.material[:, 4], reflection_tracer, settings)
+            is_probed = direction_uniforms(directions, salt + 1)[0] < settings.roughness_probe_fraction
+            probe = probe_roughness(rays, gbuffer, reflection_tracer, pairs, is_probed, min_slope=min_slope)
+        return cls(pairs, probe, gbuffer.surface.material[:, 4], reflection_tracer, settings)
 
     @property
     def incident(self) -> IncidentLight:
@@ -111,11 +113,11 @@ class RayPairIncidentLight:
 
     def add_roughness_gradient(self, back: ShadeGradients) -> None:
         """Add gradients by the roughness, estimated from the three rays of the points that were drawn."""
-        if (found := self.probe) is None:
+        if (probe := self.probe) is None:
             return
-        at = found.point_ids
-        slope = backward_roughness(found, self.roughness[at], back.around[at], back.specular[at])
-        back.material[at, 4] += slope / self.settings.roughness_probe_fraction
+        ids = probe.point_ids
+        slope = backward_roughness(probe, self.roughness[ids], back.around[ids], back.specular[ids])
+        back.material[ids, 4] += slope / self.settings.roughness_probe_fraction
 
     def backward(self, back: ShadeGradients, by_texels: Float64[np.ndarray, "t 3"]) -> RecordedGradients:
         """Return gradients by all that was hit on the way."""
@@ -154,13 +156,13 @@ class SingleRayIncidentLight:
     ) -> "SingleRayIncidentLight":
         """Trace one ray for each point of a G-buffer."""
         rays = reflected_rays(split.rays, gbuffer, offset)
-        met = traced.tracer.trace(rays, record=traced.view is not None)
-        visibility = met.transmittance.astype(np.float64)
+        result = traced.tracer.trace(rays, record=traced.view is not None)
+        visibility = result.transmittance.astype(np.float64)
         if settings.indirect == "none":
             return cls(IncidentLight(visibility, np.zeros((len(rays), 3))))
         alpha = np.maximum(1.0 - visibility, 1e-6)[:, None]
-        linear = srgb_to_linear(met.rgb_srgb / alpha)
-        return cls(IncidentLight(visibility, linear * alpha), met.recording, 1.0 / srgb_derivative(linear))
+        linear = srgb_to_linear(result.rgb_srgb / alpha)
+        return cls(IncidentLight(visibility, linear * alpha), result.recording, 1.0 / srgb_derivative(linear))
 
     def normal_gradient(self, back: ShadeGradients) -> float:
         """Return 0: one ray says nothing of the directions beside it."""

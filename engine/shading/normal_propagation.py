@@ -36,23 +36,25 @@ def propagate_normals(gaussians: FlatGaussians) -> None:
     frames = gaussians.rotations.astype(np.float64)
     normals = frames[:, :, 0]
     distances, near = cKDTree(means).query(means, NEIGHBOURS + 1)
-    reach = np.maximum(distances[:, NEIGHBOURS // 2], 1e-12)[:, None]
-    shown = gaussians.channels[METALLIC][:, 0] * (1 - gaussians.channels[ROUGHNESS][:, 0])
-    trust = gaussians.opacities * (MIN_TRUST + shown)
+    spacing = np.maximum(distances[:, NEIGHBOURS // 2], 1e-12)[:, None]
+    reflectivity = gaussians.channels[METALLIC][:, 0] * (1 - gaussians.channels[ROUGHNESS][:, 0])
+    trust = gaussians.opacities * (MIN_TRUST + reflectivity)
     cosine = np.einsum("ni,nki->nk", normals, normals[near])
-    off = np.einsum("ni,nki->nk", normals, means[near] - means[:, None]) / (MAX_PLANE_DISTANCE * reach)
-    looks = (
+    plane_distance = np.einsum("ni,nki->nk", normals, means[near] - means[:, None]) / (
+        MAX_PLANE_DISTANCE * spacing
+    )
+    appearance = (
         np.concatenate([gaussians.channels[ALBEDO], gaussians.channels[METALLIC]], axis=1)
         / MAX_COLOR_DIFFERENCE
     )
-    unlike = ((looks[near] - looks[:, None]) ** 2).sum(axis=2)
-    weights = trust[near] * np.exp(-0.5 * ((distances / reach) ** 2 + off**2 + unlike))
+    unlike = ((appearance[near] - appearance[:, None]) ** 2).sum(axis=2)
+    weights = trust[near] * np.exp(-0.5 * ((distances / spacing) ** 2 + plane_distance**2 + unlike))
     weights = np.where(np.abs(cosine) > MIN_COSINE, weights, 0.0) * np.sign(cosine)
     mean = np.einsum("nk,nki->ni", weights, normals[near])
     length = np.linalg.norm(mean, axis=1, keepdims=True)
     mean = np.where(length > 0, mean / np.maximum(length, 1e-12), normals)
-    turned = np.einsum("nij,njk->nik", _rotations_between(normals, mean), frames)
-    gaussians.quats_wxyz[:] = quaternions_from_matrices(turned).astype(np.float32)
+    rotated = np.einsum("nij,njk->nik", _rotations_between(normals, mean), frames)
+    gaussians.quats_wxyz[:] = quaternions_from_matrices(rotated).astype(np.float32)
 
 
 def _rotations_between(

@@ -131,26 +131,29 @@ def probe_roughness(
     gbuffer: GBuffer,
     reflection_tracer: ReflectionTracer,
     pairs: ReflectionRayPairs,
-    drawn: Bool[np.ndarray, " p"],
+    is_probed: Bool[np.ndarray, " p"],
     *,
     min_slope: float,
 ) -> RoughnessProbe:
     """Trace a third ray from the drawn points, where facets are as steep as the roughness says."""
-    points = np.flatnonzero(drawn & (pairs.facets.slope > min_slope))
+    ids = np.flatnonzero(is_probed & (pairs.facets.slope > min_slope))
     middle = reflection_tracer.trace(
-        reflected_rays(rays, gbuffer, reflection_tracer.offset)[points], record=False
+        reflected_rays(rays, gbuffer, reflection_tracer.offset)[ids], record=False
     ).incident
     return RoughnessProbe(
-        points, IncidentLight(*(mean[points] - own for mean, own in zip(pairs.incident, middle, strict=True)))
+        ids,
+        IncidentLight(
+            *(mean[ids] - at_normal for mean, at_normal in zip(pairs.incident, middle, strict=True))
+        ),
     )
 
 
-def mean_of_pairs(seen: IncidentLight) -> IncidentLight:
+def mean_of_pairs(incident: IncidentLight) -> IncidentLight:
     """Return the incident light of a lobe: the mean of the two rays of each point."""
-    half = len(seen.visibility) // 2
+    half = len(incident.visibility) // 2
     return IncidentLight(
-        (seen.visibility[:half] + seen.visibility[half:]) / 2,
-        (seen.light_linear[:half] + seen.light_linear[half:]) / 2,
+        (incident.visibility[:half] + incident.visibility[half:]) / 2,
+        (incident.light_linear[:half] + incident.light_linear[half:]) / 2,
     )
 
 
@@ -161,7 +164,7 @@ def backward_mean(by_mean: IncidentLight) -> IncidentLight:
 
 
 def backward_normals(
-    seen: IncidentLight,
+    incident: IncidentLight,
     facets: FacetPair,
     around_linear: Float64[np.ndarray, "p 3"],
     by_incoming: Float64[np.ndarray, "p 3"],
@@ -172,20 +175,20 @@ def backward_normals(
     axes of the surface in the mean.
 
     Args:
-        seen: what the rays saw.
+        incident: what the rays saw.
         facets: that they were mirrored at.
         around_linear: the environment as the lobe sees it where nothing hides it.
         by_incoming: gradient by the light that comes in.
     """
     half = len(facets.slope)
-    change = seen.light_linear[:half] - seen.light_linear[half:]
-    change += (seen.visibility[:half] - seen.visibility[half:])[:, None] * around_linear
+    change = incident.light_linear[:half] - incident.light_linear[half:]
+    change += (incident.visibility[:half] - incident.visibility[half:])[:, None] * around_linear
     along = (by_incoming * change).sum(axis=1) / facets.slope
     return along[:, None] * facets.tangent_world
 
 
 def backward_roughness(
-    found: RoughnessProbe,
+    probe: RoughnessProbe,
     roughness: Float64[np.ndarray, " w"],
     around_linear: Float64[np.ndarray, "w 3"],
     by_incoming: Float64[np.ndarray, "w 3"],
@@ -199,10 +202,10 @@ def backward_roughness(
     pictures with one pair a pixel wants it.
 
     Args:
-        found: what the three rays saw.
+        probe: what the three rays saw.
         roughness: of the points that sent three.
         around_linear: the environment as their lobes see it where nothing hides it.
         by_incoming: gradient by the light that comes in there.
     """
-    change = found.change.light_linear + found.change.visibility[:, None] * around_linear
+    change = probe.change.light_linear + probe.change.visibility[:, None] * around_linear
     return np.asarray(4 * (by_incoming * change).sum(axis=1) / np.maximum(roughness, MIN_ROUGHNESS))

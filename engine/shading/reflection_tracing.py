@@ -91,19 +91,21 @@ class ReflectionTracer:
     def trace(self, rays: RayBatch, *, record: bool) -> ReflectedRays:
         """Trace reflected rays over all bounces; ``record`` keeps what the backward pass needs."""
         trace = self.tracer.trace(rays, record=record)
-        parted = no_split(rays, trace)
+        split = no_split(rays, trace)
         if self.min_separation_world > 0:
-            parted = split_by_depth(
+            split = split_by_depth(
                 rays, trace, self.tracer, min_separation_world=self.min_separation_world, record=record
             )
-        buffer = build_gbuffer(parted.rays, parted.results)
-        surface, further = self.with_ambient(parted.results, buffer), None
-        if self.max_bounces > 1 and len(buffer.ray_ids):
-            onward = reflected_rays(parted.rays, buffer, self.offset)
-            further = replace(self, max_bounces=self.max_bounces - 1).trace(onward, record=record)
-            seen = further.incident
-            surface = replace(surface, visibility=seen.visibility, indirect_linear=seen.light_linear)
-        return ReflectedRays(trace, parted, buffer, surface, shade(surface, self.light, self.frame), further)
+        gbuffer = build_gbuffer(split.rays, split.results)
+        surface, next_bounce = self.with_ambient(split.results, gbuffer), None
+        if self.max_bounces > 1 and len(gbuffer.ray_ids):
+            next_rays = reflected_rays(split.rays, gbuffer, self.offset)
+            next_bounce = replace(self, max_bounces=self.max_bounces - 1).trace(next_rays, record=record)
+            incident = next_bounce.incident
+            surface = replace(surface, visibility=incident.visibility, indirect_linear=incident.light_linear)
+        return ReflectedRays(
+            trace, split, gbuffer, surface, shade(surface, self.light, self.frame), next_bounce
+        )
 
 
 def backward_reflections(
@@ -124,24 +126,24 @@ def backward_reflections(
         by_incident: gradients by what each ray saw.
         by_texels: those by the texels are added to this.
     """
-    buffer, trace, parted = reflected.gbuffer, reflected.trace, reflected.depth_split
+    gbuffer, trace, split = reflected.gbuffer, reflected.trace, reflected.depth_split
     assert trace.recording is not None
-    which, count = buffer.ray_ids, len(parted.rays)
-    by_light = parted.expand(by_incident.light_linear)[which]
-    back = shade_backward(reflected.surface, light, frame, by_light * buffer.alpha[:, None])
+    ray_ids, count = gbuffer.ray_ids, len(split.rays)
+    by_light = split.expand(by_incident.light_linear)[ray_ids]
+    back = shade_backward(reflected.surface, light, frame, by_light * gbuffer.alpha[:, None])
     by_texels += back.sum_texels(len(by_texels))
-    by_alpha = -parted.expand(by_incident.visibility)
-    by_alpha[which] += (by_light * reflected.linear).sum(axis=1)
+    by_alpha = -split.expand(by_incident.visibility)
+    by_alpha[ray_ids] += (by_light * reflected.linear).sum(axis=1)
     by_features, nothing = np.zeros((count, trace.features.shape[1])), np.zeros((count, 3))
-    backward_gbuffer(buffer, back.material, np.zeros_like(back.normal), by_features, by_alpha, nothing)
-    own = TraceGradients(
+    backward_gbuffer(gbuffer, back.material, np.zeros_like(back.normal), by_features, by_alpha, nothing)
+    by_layers = TraceGradients(
         rgb_srgb=nothing.astype(np.float32),
         transmittance=-by_alpha.astype(np.float32),
         features=by_features.astype(np.float32),
     )
-    by_whole, fronts = parted.backward(own)
-    found = ((trace.recording, by_whole), *fronts)
+    by_trace, fronts = split.backward(by_layers)
+    recorded = ((trace.recording, by_trace), *fronts)
     if reflected.next_bounce is None:
-        return found
-    by_further = IncidentLight(back.visibility, back.indirect)
-    return found + backward_reflections(reflected.next_bounce, light, frame, by_further, by_texels)
+        return recorded
+    by_next = IncidentLight(back.visibility, back.indirect)
+    return recorded + backward_reflections(reflected.next_bounce, light, frame, by_next, by_texels)

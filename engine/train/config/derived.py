@@ -21,17 +21,17 @@ def iteration_count(config: TrainConfig, training_pixels: int, valid_fraction: f
     share of the pixels shows anything (``valid_fraction``), the rays of the others teach little and cost
     little, and it takes as many more; not with materials.
     """
-    each = config.rays_per_pixel
+    rays_per_pixel = config.rays_per_pixel
     if uses_shared_sort(config):
-        least = max(MIN_THOUSANDS, each)
+        min_thousands = max(MIN_THOUSANDS, rays_per_pixel)
     else:
         if not config.materials.learn:  # which have a number of their own
-            each = max(1, round(RAY_SORT_ITERATION_RATIO * each))
-        least = MIN_THOUSANDS * max(1, each // 3)
-    wanted = max(round(each * training_pixels / config.rays_per_batch / 1000), least)
+            rays_per_pixel = max(1, round(RAY_SORT_ITERATION_RATIO * rays_per_pixel))
+        min_thousands = MIN_THOUSANDS * max(1, rays_per_pixel // 3)
+    thousands = max(round(rays_per_pixel * training_pixels / config.rays_per_batch / 1000), min_thousands)
     if not config.materials.learn:
-        wanted = round(wanted / valid_fraction)
-    return config.iterations or min(wanted, 10 * each // 3) * 1000
+        thousands = round(thousands / valid_fraction)
+    return config.iterations or min(thousands, 10 * rays_per_pixel // 3) * 1000
 
 
 def max_gaussian_count(config: GaussianSettings, training_pixels: int, valid_fraction: float = 1.0) -> int:

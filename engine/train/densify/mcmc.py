@@ -34,12 +34,12 @@ def split_scale_factor(
     shared = split_opacity(opacity, copies)
     factor = np.ones_like(opacity)
     for n in np.unique(copies):
-        which = copies == n
-        total = np.zeros(int(which.sum()))
+        is_n = copies == n
+        total = np.zeros(int(is_n.sum()))
         for i in range(1, int(n) + 1):
             for k in range(i):
-                total += comb(i - 1, k) * (-1.0) ** k * shared[which] ** (k + 1) / np.sqrt(k + 1)
-        factor[which] = opacity[which] / total
+                total += comb(i - 1, k) * (-1.0) ** k * shared[is_n] ** (k + 1) / np.sqrt(k + 1)
+        factor[is_n] = opacity[is_n] / total
     return factor
 
 
@@ -125,12 +125,13 @@ class McmcDensifier:
         and a hundred copies of it would be a wall.
         """
         alive[self._low_weight_ids(weights)] = False
-        seen = np.flatnonzero(alive & (errors > 0))
-        free = np.flatnonzero(~alive)[: len(seen)]
+        error_ids = np.flatnonzero(alive & (errors > 0))
+        free = np.flatnonzero(~alive)[: len(error_ids)]
         if len(free) == 0:
             return gaussians, adam
-        late = rng.exponential(size=len(seen)) / errors[seen]  # the first to come of so many, at such rates
-        chosen = seen[np.sort(np.argpartition(late, len(free) - 1)[: len(free)])]
+        # Arrival times at rates of the errors: the first to arrive are drawn without replacement.
+        arrivals = rng.exponential(size=len(error_ids)) / errors[error_ids]
+        chosen = error_ids[np.sort(np.argpartition(arrivals, len(free) - 1)[: len(free)])]
         sources, made = self._make_copies(gaussians, chosen, True, rng)
         adam.reset(sources)
         gaussians.put(free, made)
@@ -180,6 +181,6 @@ class McmcDensifier:
 
     def _low_weight_ids(self, weights: Float32[np.ndarray, " n"]) -> Int64[np.ndarray, " m"]:
         """Return the Gaussians of least weight."""
-        most = int(self._config.relocate_low_weight_fraction * len(weights))
-        least = np.argsort(weights, kind="stable")[:most]
-        return least[weights[least] < self._config.relocate_low_weight_below * weights.mean()]
+        max_count = int(self._config.relocate_low_weight_fraction * len(weights))
+        lowest = np.argsort(weights, kind="stable")[:max_count]
+        return lowest[weights[lowest] < self._config.relocate_low_weight_below * weights.mean()]

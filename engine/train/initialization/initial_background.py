@@ -89,8 +89,8 @@ def _texel_directions(background: LearnedBackground) -> Float64[np.ndarray, "t 3
     """Return the middle of each texel as a world direction."""
     height, width = background.rgb_srgb.shape[:2]
     polar = np.pi * (np.arange(height)[:, None] + 0.5) / height
-    around = 2 * np.pi * ((np.arange(width) + 0.5) / width - 0.5)
-    parts = np.sin(polar) * np.sin(around), np.cos(polar) + 0 * around, np.sin(polar) * np.cos(around)
+    azimuth = 2 * np.pi * ((np.arange(width) + 0.5) / width - 0.5)
+    parts = np.sin(polar) * np.sin(azimuth), np.cos(polar) + 0 * azimuth, np.sin(polar) * np.cos(azimuth)
     return np.asarray(
         sum(part.reshape(-1, 1) * axis for part, axis in zip(parts, background.frame, strict=True))
     )

@@ -61,10 +61,10 @@ class InitialGaussianOptions:
     @classmethod
     def from_config(cls, config: TrainConfig, dataset: Dataset) -> "InitialGaussianOptions":
         """Return the options that a configuration asks for with these photographs."""
-        most = max_gaussian_count(config, dataset.train_pixel_count, valid_pixel_fraction(dataset))
+        max_gaussians = max_gaussian_count(config, dataset.train_pixel_count, valid_pixel_fraction(dataset))
         return cls(
             seed=config.seed,
-            max_count=min(config.initial_points, most),
+            max_count=min(config.initial_points, max_gaussians),
             opacity=config.initial_opacity,
             normal_neighbors=config.normal_neighbors,
             plane_sweep=config.plane_sweep_init,
@@ -96,7 +96,7 @@ def initial_gaussians(
     if len(points.xyz_world) >= MIN_POINTS:
         centres = np.stack([dataset.views[i].origin_world for i in dataset.train_indices])
         xyz, rgb = points.xyz_world, points.rgb_srgb
-        most = np.full(len(xyz), MAX_ANGULAR_SIZE)
+        max_angles = np.full(len(xyz), MAX_ANGULAR_SIZE)
         if options.plane_sweep and len(xyz) < limit:
             gains = equalizing_gains(dataset) if options.equalizes_exposure else None
             more = plane_sweep_points(
@@ -104,8 +104,8 @@ def initial_gaussians(
                 threads=threads, background=background, gains=gains, unseen=options.plane_sweep_unseen,
             )  # fmt: skip
             xyz, rgb = np.concatenate([xyz, more.xyz_world]), np.concatenate([rgb, more.rgb_srgb])
-            most = np.concatenate(
-                [most, np.where(more.swept, PLANE_SWEEP_MAX_ANGULAR_SIZE, MAX_ANGULAR_SIZE)]
+            max_angles = np.concatenate(
+                [max_angles, np.where(more.swept, PLANE_SWEEP_MAX_ANGULAR_SIZE, MAX_ANGULAR_SIZE)]
             )
         return gaussians_from_points(
             xyz,
@@ -116,16 +116,16 @@ def initial_gaussians(
             opacity=options.opacity,
             rng=rng,
             plane_points=options.normal_neighbors,
-            most_angles=most,
+            most_angles=max_angles,
         )
     view, y, x = dataset.sample_pixels(rng, limit)
     rays = dataset.rays(view, y, x)
     rgb, alpha, weight = dataset.pixels(view, y, x)
-    seen = (weight > 0) & (alpha > 0)
+    is_valid = (weight > 0) & (alpha > 0)
     return gaussians_from_rays(
-        rays.origins_world[seen],
-        rays.directions_world[seen],
-        rgb[seen],
+        rays.origins_world[is_valid],
+        rays.directions_world[is_valid],
+        rgb[is_valid],
         extent=dataset.extent,
         opacity=options.opacity,
         rng=rng,
@@ -151,16 +151,16 @@ def initial_scene(dataset: Dataset, config: TrainConfig, *, threads: int = 1) ->
     Raises:
         DatasetError: nothing says where Gaussians could begin.
     """
-    behind = estimate_background(dataset) if config.background == "learnt" else None
+    background_map = estimate_background(dataset) if config.background == "learnt" else None
     options = InitialGaussianOptions.from_config(config, dataset)
-    first = initial_gaussians(dataset, options, threads=threads, background=behind)
+    gaussians = initial_gaussians(dataset, options, threads=threads, background=background_map)
     if config.materials.learn:
-        first = add_initial_materials(first, config.materials)
-    state = initial_state(first, config.seed)
+        gaussians = add_initial_materials(gaussians, config.materials)
+    state = initial_state(gaussians, config.seed)
     shading = make_shading(ShadingOptions.from_config(config), len(dataset.views), dataset.extent)
     background = find_background(shading)
-    if behind is not None and background is not None:
-        background.set_map(behind.resize(config.background_height))
+    if background_map is not None and background is not None:
+        background.set_map(background_map.resize(config.background_height))
         state.shading = shading.state()
     return state
 
@@ -196,23 +196,26 @@ def gaussians_from_points(
             "No point of the sparse model lies near the cameras; check the model, or delete its points."
         )
     tree = cKDTree(points)
-    wanted = min(count, plane_points + 1)
-    distances, neighbours = tree.query(points, wanted)
-    distances, neighbours = distances.reshape(count, wanted), neighbours.reshape(count, wanted)
-    nearest = distances[:, 1 : NEIGHBOURS + 1] if wanted > 1 else np.full((count, 1), 0.01 * extent)
+    neighbor_count = min(count, plane_points + 1)
+    distances, neighbours = tree.query(points, neighbor_count)
+    distances, neighbours = (
+        distances.reshape(count, neighbor_count),
+        neighbours.reshape(count, neighbor_count),
+    )
+    nearest = distances[:, 1 : NEIGHBOURS + 1] if neighbor_count > 1 else np.full((count, 1), 0.01 * extent)
     spacing = nearest.mean(axis=1)
     spacing = np.clip(
         spacing, 1e-5 * extent, 0.2 * extent * np.maximum(1.0, _distance(points, centre) / extent)
     )
     # One point alone in front of a camera would hide everything.
     to_camera = cKDTree(camera_centres_world).query(points)[0]
-    most = MAX_ANGULAR_SIZE if most_angles is None else most_angles[keep]
-    spacing = np.minimum(spacing, np.maximum(most * to_camera, 1e-5 * extent))
+    max_angles = MAX_ANGULAR_SIZE if most_angles is None else most_angles[keep]
+    spacing = np.minimum(spacing, np.maximum(max_angles * to_camera, 1e-5 * extent))
     normals = _unit(centre - points)
-    if wanted == plane_points + 1:
-        around = points[neighbours]
-        around = around - around.mean(axis=1, keepdims=True)
-        values, vectors = np.linalg.eigh(np.einsum("nki,nkj->nij", around, around))
+    if neighbor_count == plane_points + 1:
+        neighborhoods = points[neighbours]
+        neighborhoods = neighborhoods - neighborhoods.mean(axis=1, keepdims=True)
+        values, vectors = np.linalg.eigh(np.einsum("nki,nkj->nij", neighborhoods, neighborhoods))
         planar = values[:, 0] < 0.1 * values[:, 1]
         normals[planar] = vectors[planar, :, 0]
     return _assemble(points, normals, spacing, rgb_srgb[keep], opacity)

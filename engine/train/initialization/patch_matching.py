@@ -51,9 +51,9 @@ class PixelPatches:
     y: Int64[np.ndarray, " n"]
     x: Int64[np.ndarray, " n"]
 
-    def __getitem__(self, which: Int64[np.ndarray, " k"]) -> "PixelPatches":
+    def __getitem__(self, ids: Int64[np.ndarray, " k"]) -> "PixelPatches":
         origin, *rows = vars(self).values()
-        return PixelPatches(origin, *(row[which] for row in rows))
+        return PixelPatches(origin, *(row[ids] for row in rows))
 
 
 def draw_patches(
@@ -66,21 +66,21 @@ def draw_patches(
     x = rng.integers(STEP_PX, max(STEP_PX + 1, view.width_px - STEP_PX), samples)
     all_y = np.clip(y[:, None] + OFFSETS_PX[:, 1], 0, view.height_px - 1)
     all_x = np.clip(x[:, None] + OFFSETS_PX[:, 0], 0, view.width_px - 1)
-    which = np.full(all_y.size, index)
-    rays = dataset.rays(which, all_y.reshape(-1), all_x.reshape(-1))
+    view_ids = np.full(all_y.size, index)
+    rays = dataset.rays(view_ids, all_y.reshape(-1), all_x.reshape(-1))
     origins, directions = rays.origins_world, rays.directions_world
-    rgb, alpha, weight = photographs.pixels(which, all_y.reshape(-1), all_x.reshape(-1))
-    counts = ((weight > 0) & (alpha > 0.5)).reshape(all_y.shape).all(axis=1)
+    rgb, alpha, weight = photographs.pixels(view_ids, all_y.reshape(-1), all_x.reshape(-1))
+    is_valid = ((weight > 0) & (alpha > 0.5)).reshape(all_y.shape).all(axis=1)
     directions = directions.astype(np.float64).reshape(*all_y.shape, 3)
     # Distance along a ray of a point at depth 1 along the camera's axis.
     factors = 1.0 / np.maximum(directions @ view.rotation_cam_from_world[2], 1e-3)
     return PixelPatches(
         origins[0].astype(np.float64),
-        directions[counts],
-        factors[counts],
-        rgb.reshape(*all_y.shape, 3)[counts],
-        y[counts],
-        x[counts],
+        directions[is_valid],
+        factors[is_valid],
+        rgb.reshape(*all_y.shape, 3)[is_valid],
+        y[is_valid],
+        x[is_valid],
     )
 
 
@@ -98,8 +98,8 @@ def patch_cost(
     costs = np.full((len(neighbours), count), np.inf)
     for k, other in enumerate(neighbours):
         image_px, depth = project(dataset, other, points.reshape(-1, 3))
-        shown = (is_inside(dataset, other, image_px) & (depth > 0)).reshape(count, offsets)
-        inside = np.flatnonzero(shown.all(axis=1))
+        is_visible = (is_inside(dataset, other, image_px) & (depth > 0)).reshape(count, offsets)
+        inside = np.flatnonzero(is_visible.all(axis=1))
         if not len(inside):
             continue
         chosen = np.floor(image_px.reshape(count, offsets, 2)[inside]).astype(np.int64).reshape(-1, 2)

@@ -102,11 +102,11 @@ def plane_sweep_points(
     known = dataset.points.xyz_world.astype(np.float64)
     neighbours = _neighbouring_views(dataset, known)
     lifted = PlaneSweepPoints.concatenate([])
-    for_one = min(SAMPLES_PER_POINT / valid_pixel_fraction(dataset), MAX_SAMPLES_PER_POINT)
+    samples_per_point = min(SAMPLES_PER_POINT / valid_pixel_fraction(dataset), MAX_SAMPLES_PER_POINT)
     for round_number in range(ROUNDS):
         # Pixels that no guess fits are lost, and those that show nothing: draw some more.
-        wanted = round(for_one * (count - len(lifted)) / (ROUNDS - round_number))
-        per_view = rng.multinomial(max(0, wanted), _view_areas(dataset))
+        pixel_count = round(samples_per_point * (count - len(lifted)) / (ROUNDS - round_number))
+        per_view = rng.multinomial(max(0, pixel_count), _view_areas(dataset))
         generators = rng.spawn(len(per_view))  # one a view, so that their order does not matter
         jobs = list(zip(dataset.train_indices.tolist(), per_view.tolist(), generators, strict=True))
 
@@ -120,13 +120,13 @@ def plane_sweep_points(
 
         with ThreadPoolExecutor(threads) as pool:
             parts = list(pool.map(lift, jobs))
-            found = PlaneSweepPoints.concatenate([points for points, _ in parts])
+            candidates = PlaneSweepPoints.concatenate([points for points, _ in parts])
             evidence = MatchEvidence.concatenate([e for _, e in parts])
-            elected = passes_vote(photographs, found, evidence.view, pool)
-        found, evidence = found[elected], evidence[elected]
-        found = found[~found.swept | is_confirmed(found, evidence, known)]
-        lifted = PlaneSweepPoints.concatenate([lifted, found])
-        known = np.concatenate([known, found.xyz_world])
+            is_elected = passes_vote(photographs, candidates, evidence.view, pool)
+        candidates, evidence = candidates[is_elected], evidence[is_elected]
+        candidates = candidates[~candidates.swept | is_confirmed(candidates, evidence, known)]
+        lifted = PlaneSweepPoints.concatenate([lifted, candidates])
+        known = np.concatenate([known, candidates.xyz_world])
     if len(lifted) > count:
         lifted = lifted[np.sort(rng.choice(len(lifted), count, replace=False))]
     return lifted
@@ -145,17 +145,20 @@ def _neighbouring_views(dataset: Dataset, points: Float64[np.ndarray, "n 3"]) ->
     centres = np.stack([dataset.views[i].origin_world for i in train])
     axes = np.stack([dataset.views[i].rotation_cam_from_world[2] for i in train])
     middle = np.median(points, axis=0)
-    own = _observed_distances(dataset)
+    observed_distances = _observed_distances(dataset)
     result = {}
     for k, index in enumerate(train):
         distance = np.linalg.norm(centres - centres[k], axis=1)
-        reach = float(np.linalg.norm(middle - centres[k]))
-        if own[index] > 0:
-            reach = min(max(reach, own[index] / OBSERVED_SPAN), own[index] * OBSERVED_SPAN)
-        wanted = BASELINE * reach
-        usable = (axes @ axes[k] > MIN_VIEW_COSINE) & (distance > 0.1 * wanted)
-        unfit = np.abs(np.log(np.maximum(distance, 1e-12) / max(wanted, 1e-12)))
-        order = np.argsort(np.where(usable, unfit, np.inf), kind="stable")
+        scene_distance = float(np.linalg.norm(middle - centres[k]))
+        if observed_distances[index] > 0:
+            scene_distance = min(
+                max(scene_distance, observed_distances[index] / OBSERVED_SPAN),
+                observed_distances[index] * OBSERVED_SPAN,
+            )
+        baseline = BASELINE * scene_distance
+        usable = (axes @ axes[k] > MIN_VIEW_COSINE) & (distance > 0.1 * baseline)
+        baseline_error = np.abs(np.log(np.maximum(distance, 1e-12) / max(baseline, 1e-12)))
+        order = np.argsort(np.where(usable, baseline_error, np.inf), kind="stable")
         result[index] = [train[j] for j in order[:NEIGHBOURS] if usable[j]]
     return result
 
@@ -163,17 +166,19 @@ def _neighbouring_views(dataset: Dataset, points: Float64[np.ndarray, "n 3"]) ->
 def _observed_distances(dataset: Dataset) -> Float64[np.ndarray, " v"]:
     """Return the median distance of the points that each view is known to show; 0 where these are few."""
     result = np.zeros(len(dataset.views))
-    seen, points = dataset.observations, dataset.points
-    if len(points) == 0 or len(seen) == 0:
+    observations, points = dataset.observations, dataset.points
+    if len(points) == 0 or len(observations) == 0:
         return result
-    row = np.minimum(np.searchsorted(points.ids, seen.point), len(points) - 1)
-    known = points.ids[row] == seen.point
+    row = np.minimum(np.searchsorted(points.ids, observations.point), len(points) - 1)
+    known = points.ids[row] == observations.point
     origins = np.stack([view.origin_world for view in dataset.views])
-    away = np.linalg.norm(points.xyz_world[row].astype(np.float64) - origins[seen.view], axis=1)
+    all_distances = np.linalg.norm(
+        points.xyz_world[row].astype(np.float64) - origins[observations.view], axis=1
+    )
     for index in range(len(result)):
-        own = away[known & (seen.view == index)]
-        if len(own) >= MIN_OBSERVED:
-            result[index] = np.median(own)
+        distances = all_distances[known & (observations.view == index)]
+        if len(distances) >= MIN_OBSERVED:
+            result[index] = np.median(distances)
     return result
 
 
@@ -184,21 +189,24 @@ def _lift_pixels(
     points: Float64[np.ndarray, "k 3"],
     neighbours: list[int],
     rng: np.random.Generator,
-    behind: InitialBackground | None,
+    background: InitialBackground | None,
     unseen: bool,
 ) -> tuple[PlaneSweepPoints, MatchEvidence]:
     """Return points for random pixels of one view."""
     dataset = photographs.dataset
-    nothing = PlaneSweepPoints.concatenate([]), MatchEvidence(np.empty(0, np.int64), np.empty(0), np.empty(0))
+    no_points = (
+        PlaneSweepPoints.concatenate([]),
+        MatchEvidence(np.empty(0, np.int64), np.empty(0), np.empty(0)),
+    )
     projected_px, depths = project(dataset, index, points)
     inside = is_inside(dataset, index, projected_px) & (depths > 0)
     if samples == 0 or not neighbours or inside.sum() < DEPTH_HYPOTHESES:
-        return nothing
+        return no_points
     patches = draw_patches(photographs, index, samples, rng)
     if len(patches.y) == 0:
-        return nothing
+        return no_points
     pixels_px = np.stack([patches.x + 0.5, patches.y + 0.5], axis=1)
-    away_px, nearest = cKDTree(projected_px[inside]).query(pixels_px, DEPTH_HYPOTHESES)
+    distances_px, nearest = cKDTree(projected_px[inside]).query(pixels_px, DEPTH_HYPOTHESES)
     suggested = depths[inside][nearest]
     depth, cost = _best_hypothesis(suggested, _hypothesis_costs(photographs, patches, suggested, neighbours))
     doubtful = np.flatnonzero(cost > MAX_AMBIGUOUS_COST)
@@ -208,24 +216,24 @@ def _lift_pixels(
     swept = np.zeros(len(depth), np.bool_)
     swept[doubtful] = other_cost < MAX_RIVALRY * np.minimum(cost[doubtful], MAX_COST)
     chosen = swept[doubtful]
-    good = cost < MAX_COST
-    good[swept] = other[chosen] < OCCLUSION_FACTOR * depth[swept]
+    is_kept = cost < MAX_COST
+    is_kept[swept] = other[chosen] < OCCLUSION_FACTOR * depth[swept]
     depth[swept], cost[swept] = other[chosen], other_cost[chosen]
     rivalry = np.ones(len(depth))
     rivalry[swept] = _cost_ratio(more_costs[chosen])
-    alone = np.isinf(cost) & unseen
-    depth[alone] = _interpolate_depths(suggested[alone], away_px[alone])
-    good |= alone
-    if behind is not None:
+    is_unmatched = np.isinf(cost) & unseen
+    depth[is_unmatched] = _interpolate_depths(suggested[is_unmatched], distances_px[is_unmatched])
+    is_kept |= is_unmatched
+    if background is not None:
         at_infinity = patch_cost(
             photographs, patches, np.full(len(depth), BACKGROUND_DEPTH * depth.max()), neighbours
         )
-        as_well = alone | (at_infinity < cost + BACKGROUND_COST_MARGIN)
-        good &= ~(as_well & behind.is_above_horizon(patches.directions_world[:, 0]))
+        is_background = is_unmatched | (at_infinity < cost + BACKGROUND_COST_MARGIN)
+        is_kept &= ~(is_background & background.is_above_horizon(patches.directions_world[:, 0]))
     distance = depth * patches.depth_factors[:, 0]
     xyz = patches.origin_world + distance[:, None] * patches.directions_world[:, 0]
     lifted = PlaneSweepPoints(xyz.astype(np.float32), patches.rgb_srgb[:, 0], swept)
-    return lifted[good], MatchEvidence(np.full(len(depth), index), distance, rivalry)[good]
+    return lifted[is_kept], MatchEvidence(np.full(len(depth), index), distance, rivalry)[is_kept]
 
 
 def _hypothesis_costs(
@@ -249,8 +257,8 @@ def _best_hypothesis(
 def _cost_ratio(costs: Float64[np.ndarray, "n g"]) -> Float64[np.ndarray, " n"]:
     """Return the least cost over the next that is more than one step away; depths are in order."""
     best = np.argmin(costs, axis=1)[:, None]
-    beside = np.abs(np.arange(costs.shape[1]) - best) <= 1
-    return np.asarray(costs.min(axis=1) / np.maximum(np.where(beside, np.inf, costs).min(axis=1), 1e-12))
+    is_neighbor = np.abs(np.arange(costs.shape[1]) - best) <= 1
+    return np.asarray(costs.min(axis=1) / np.maximum(np.where(is_neighbor, np.inf, costs).min(axis=1), 1e-12))
 
 
 def _interpolate_depths(

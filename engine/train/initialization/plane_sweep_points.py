@@ -34,9 +34,9 @@ class PlaneSweepPoints:
     def __len__(self) -> int:
         return len(self.xyz_world)
 
-    def __getitem__(self, which: np.ndarray) -> "PlaneSweepPoints":
+    def __getitem__(self, ids: np.ndarray) -> "PlaneSweepPoints":
         """Return some of them, by number or by a mask."""
-        return PlaneSweepPoints(self.xyz_world[which], self.rgb_srgb[which], self.swept[which])
+        return PlaneSweepPoints(self.xyz_world[ids], self.rgb_srgb[ids], self.swept[ids])
 
     @classmethod
     def concatenate(cls, parts: Sequence["PlaneSweepPoints"]) -> "PlaneSweepPoints":
@@ -62,8 +62,8 @@ class MatchEvidence:
     distance: Float64[np.ndarray, " n"]
     rivalry: Float64[np.ndarray, " n"]
 
-    def __getitem__(self, which: np.ndarray) -> "MatchEvidence":
-        return MatchEvidence(*(row[which] for row in vars(self).values()))
+    def __getitem__(self, ids: np.ndarray) -> "MatchEvidence":
+        return MatchEvidence(*(row[ids] for row in vars(self).values()))
 
     @classmethod
     def concatenate(cls, parts: Sequence["MatchEvidence"]) -> "MatchEvidence":

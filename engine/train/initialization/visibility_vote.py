@@ -40,19 +40,19 @@ def passes_vote(
         inside = np.flatnonzero(is_inside(dataset, index, image_px) & (depth > 0))
         pixel = np.floor(image_px[inside]).astype(np.int64)
         rgb, _, _ = photographs.pixels(np.full(len(inside), index), pixel[:, 1], pixel[:, 0])
-        which = inside if isinstance(rows, slice) else rows[inside]
-        return which, np.abs(rgb - points.rgb_srgb[which]).mean(axis=1) < limits[which]
+        ids = inside if isinstance(rows, slice) else rows[inside]
+        return ids, np.abs(rgb - points.rgb_srgb[ids]).mean(axis=1) < limits[ids]
 
     jury = train[np.unique(np.linspace(0, len(train) - 1, VOTING_VIEWS).astype(np.int64))].tolist()
-    for which, agrees in pool.map(vote, [(index, slice(None)) for index in jury]):
-        looking[which] += 1
-        agree[which] += agrees
+    for ids, agrees in pool.map(vote, [(index, slice(None)) for index in jury]):
+        looking[ids] += 1
+        agree[ids] += agrees
     if len(jury) < len(train):
         unseen = np.flatnonzero(looking < MIN_VOTERS)
         looking[unseen] = agree[unseen] = 0
-        for which, agrees in pool.map(vote, _voting_views(dataset, own_view, unseen)):
-            looking[which] += 1
-            agree[which] += agrees
+        for ids, agrees in pool.map(vote, _voting_views(dataset, own_view, unseen)):
+            looking[ids] += 1
+            agree[ids] += agrees
     return np.asarray(agree >= majority * np.maximum(looking, 1))
 
 

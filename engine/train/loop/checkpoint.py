@@ -89,8 +89,8 @@ def save_checkpoint(state: TrainState, folder: Path, fingerprint: str) -> Path:
     meta["arrays"] = sorted(arrays)
     with atomic_replace(path) as temporary:
         np.savez(temporary, meta=np.array(json.dumps(meta)), **arrays)
-    for left in folder.glob(".*.partial.npz"):  # of runs that were killed while they wrote
-        left.unlink()
+    for partial in folder.glob(".*.partial.npz"):  # of runs that were killed while they wrote
+        partial.unlink()
     for old in sorted(folder.glob(f"{_PREFIX}*.npz"))[:-KEPT_CHECKPOINTS]:
         old.unlink()
     return path

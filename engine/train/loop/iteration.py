@@ -70,26 +70,32 @@ def loss_and_gradients(
         with_errors: share the rays' errors out to their Gaussians.
         min_blend_weight: Gaussians whose weights over all rays add up to less get no gradients.
     """
-    seen = tracer.trace(batch.rays, record=True)
-    assert seen.recording is not None
-    sight = TracedRays(batch.rays, seen, tracer, batch.view, training_progress, ray_patches=batch.ray_patches)
-    developed = shading.shade(sight)
-    render = developed.composite_over(batch.background_srgb)
+    result = tracer.trace(batch.rays, record=True)
+    assert result.recording is not None
+    traced = TracedRays(
+        batch.rays, result, tracer, batch.view, training_progress, ray_patches=batch.ray_patches
+    )
+    shaded = shading.shade(traced)
+    render = shaded.composite_over(batch.background_srgb)
     loss = batch_loss(render, batch, weights)
-    back = shading.backward(sight, developed, loss.gradient, loss.gradient @ batch.background_srgb)
-    by_seen = back.trace
+    by_shading = shading.backward(traced, shaded, loss.gradient, loss.gradient @ batch.background_srgb)
+    by_trace = by_shading.trace
     if with_errors:
-        by_seen = replace(by_seen, ray_errors=ray_errors(render, batch.target_srgb, batch.weight))
-    recorded = [(seen.recording, by_seen), *back.recorded_traces]
+        by_trace = replace(by_trace, ray_errors=ray_errors(render, batch.target_srgb, batch.weight))
+    recorded = [(result.recording, by_trace), *by_shading.recorded_traces]
     if batch.visibility_rays is not None:
         recorded.append(free_space_gradient(batch.visibility_rays, tracer, weights.free_space))
-    least = min_blend_weight if len(recorded) == 1 else 0.0  # what several say has to be added up first
-    parts = [tracer.backward(hits, by, min_blend_weight=least).numpy() for hits, by in recorded]
+    min_trace_weight = (
+        min_blend_weight if len(recorded) == 1 else 0.0
+    )  # what several say has to be added up first
+    gradients = [
+        tracer.backward(hits, by, min_blend_weight=min_trace_weight).numpy() for hits, by in recorded
+    ]
     return LossGradients(
         loss=loss,
-        gaussians=drop_low_weight(add_gradients(parts), min_blend_weight),
-        shading=back.parameters,
-        hits_per_ray=float(seen.hit_counts.mean()),
+        gaussians=drop_low_weight(add_gradients(gradients), min_blend_weight),
+        shading=by_shading.parameters,
+        hits_per_ray=float(result.hit_counts.mean()),
     )
 
 
@@ -124,24 +130,24 @@ def train_step(
     """
     tracer, shading = components.tracer, components.shading
     densifier = components.densifier
-    found = loss_and_gradients(
+    step_gradients = loss_and_gradients(
         batch, tracer, shading, loss,
         training_progress=training_progress, with_errors=densifier.wants_errors,
         min_blend_weight=min_blend_weight,
     )  # fmt: skip
-    if not np.isfinite(found.loss.value):
+    if not np.isfinite(step_gradients.loss.value):
         raise TrainingError(
-            f"The loss became {found.loss.value} at iteration {state.iteration + 1}; lower the learning "
-            "rates (--set lr.mean=...) or look for damaged photographs. The last checkpoint is kept."
+            f"The loss became {step_gradients.loss.value} at iteration {state.iteration + 1}; lower the "
+            "learning rates (--set lr.mean=...) or look for damaged photographs. The last checkpoint is kept."
         )
-    gradients = found.gaussians
+    gradients = step_gradients.gaussians
     moved = state.adam.step(
         state.gaussians, gradients, lr, loss, training_progress=training_progress, extent=extent
     )
-    shading.step(state.gaussians, gradients, found.shading, training_progress=training_progress)
+    shading.step(state.gaussians, gradients, step_gradients.shading, training_progress=training_progress)
     tracer.refresh(gradients.ids)
     densifier.observe(len(state.gaussians), gradients, moved)
     state.iteration += 1
     keep = min(MSE_SMOOTHING, 1 - 1 / state.iteration)
-    state.running_mse = keep * state.running_mse + (1 - keep) * found.loss.squared_error
-    return found
+    state.running_mse = keep * state.running_mse + (1 - keep) * step_gradients.loss.squared_error
+    return step_gradients

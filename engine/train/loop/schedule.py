@@ -81,8 +81,10 @@ class Schedule:
 
         Nothing is added any more, and what depends on the progress goes on from where it is, only faster.
         """
-        sooner = early_stop_iteration(done, self.iterations)
-        return replace(self, iterations=sooner, early_stop_at=done, planned_iterations=self.iterations)
+        last_iteration = early_stop_iteration(done, self.iterations)
+        return replace(
+            self, iterations=last_iteration, early_stop_at=done, planned_iterations=self.iterations
+        )
 
     def is_finished(self, done: int) -> bool:
         """Return whether all iterations are done."""
@@ -96,8 +98,8 @@ class Schedule:
 
     def is_outlier_check_due(self, done: int) -> bool:
         """Return whether views that do not fit are looked for after ``done`` iterations."""
-        since = OUTLIER_VIEWS_FROM * self.iterations
-        return self.is_validation_due(done) and since <= done < self.iterations
+        first = OUTLIER_VIEWS_FROM * self.iterations
+        return self.is_validation_due(done) and first <= done < self.iterations
 
     def is_pose_refinement_due(self, done: int) -> bool:
         """Return whether the poses of training views are refined after ``done`` iterations."""
@@ -162,10 +164,10 @@ def has_converged(probes: Sequence[tuple[int, float]], planned: int, min_gain_db
     """
     if min_gain_db <= 0 or not probes or probes[-1][0] < EARLY_STOPPING_FROM * planned:
         return False
-    since = probes[-1][0] - EARLY_STOPPING_WINDOW * planned
-    before = [psnr for iteration, psnr in probes if iteration <= since]
-    lately = [psnr for iteration, psnr in probes if iteration > since]
-    return bool(before) and max(lately) - max(before) < min_gain_db
+    recent_from = probes[-1][0] - EARLY_STOPPING_WINDOW * planned
+    before = [psnr for iteration, psnr in probes if iteration <= recent_from]
+    recent = [psnr for iteration, psnr in probes if iteration > recent_from]
+    return bool(before) and max(recent) - max(before) < min_gain_db
 
 
 def early_stop_iteration(decided: int, planned: int) -> int:

@@ -69,10 +69,14 @@ def choose_plan(
         gaussians: see there.
         max_gaussians: no more Gaussians than this, as the photographs hold no more down.
     """
-    one = seconds_an_iteration / gaussians**COST_POWER  # an iteration takes one * count ** COST_POWER
-    wanted = (seconds / (one * ITERATIONS_PER_GAUSSIAN)) ** (1 / (1 + COST_POWER)) if seconds > 0 else 0.0
-    count = min(max_gaussians, max(MIN_GAUSSIANS, round(wanted)))
-    iterations = round(seconds / (one * count**COST_POWER))
+    seconds_unit = (
+        seconds_an_iteration / gaussians**COST_POWER
+    )  # an iteration takes one * count ** COST_POWER
+    gaussian_count = (
+        (seconds / (seconds_unit * ITERATIONS_PER_GAUSSIAN)) ** (1 / (1 + COST_POWER)) if seconds > 0 else 0.0
+    )
+    count = min(max_gaussians, max(MIN_GAUSSIANS, round(gaussian_count)))
+    iterations = round(seconds / (seconds_unit * count**COST_POWER))
     return TimeBudgetPlan(
         iterations=min(MAX_PLANNED_ITERATIONS, max(MIN_ITERATIONS, iterations)),
         max_gaussians=count,
@@ -109,8 +113,8 @@ def make_plan(
     if uses_shared_sort(config):  # as the trial was, and the first part of the training is
         pace_s *= config.shared_sort_until + RAY_SORT_SLOWDOWN * (1 - config.shared_sort_until)
     left_s = USED_FRACTION * (seconds - (time.perf_counter() - began))
-    most = max_gaussian_count(config, dataset.train_pixel_count, valid_pixel_fraction(dataset))
-    return choose_plan(left_s, pace_s, len(first), most)
+    max_gaussians = max_gaussian_count(config, dataset.train_pixel_count, valid_pixel_fraction(dataset))
+    return choose_plan(left_s, pace_s, len(first), max_gaussians)
 
 
 def write_plan(path: Path, plan: TimeBudgetPlan) -> None:

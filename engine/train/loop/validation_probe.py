@@ -70,14 +70,14 @@ def measure_probe(
     All are seen as new views are, but exposed as each is known or guessed to be where exposures are learnt.
     """
     rays = dataset.rays(probe.view, probe.y, probe.x)
-    seen = tracer.trace(rays)
+    result = tracer.trace(rays)
     view = probe.view if find_exposures(shading) is not None else None
-    developed = shading.shade(TracedRays(rays, seen, tracer, view))
+    developed = shading.shade(TracedRays(rays, result, tracer, view))
     render = np.clip(developed.composite_over(probe.background_srgb), 0, 1)
     error = ((render - probe.rgb_srgb) ** 2).mean(axis=1) * probe.weight
     count = float(probe.weight.sum(dtype=np.float64))
     psnr = psnr_from_mse(float(error.sum(dtype=np.float64)) / count) if count > 0 else 0.0
-    return psnr, float(seen.alpha.mean())
+    return psnr, float(result.alpha.mean())
 
 
 def psnr_from_mse(mse: float) -> float:

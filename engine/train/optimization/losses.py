@@ -107,9 +107,9 @@ def _ssim_term(
     count = batch.ssim_patch_count * batch.patch_side**2
     shape = (batch.ssim_patch_count, batch.patch_side, batch.patch_side, 3)
     weight = batch.weight[-count:, None]
-    shown = target[-count:]
-    mixed = render[-count:] * weight + shown * (1 - weight)
-    value, gradient = ssim_loss(mixed.reshape(shape), shown.reshape(shape))
+    rendered = target[-count:]
+    mixed = render[-count:] * weight + rendered * (1 - weight)
+    value, gradient = ssim_loss(mixed.reshape(shape), rendered.reshape(shape))
     return value, gradient.reshape(-1, 3) * weight
 
 

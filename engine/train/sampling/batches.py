@@ -126,43 +126,45 @@ class BatchSource:
         self.sampler = PixelSampler(dataset.train_indices, view_sizes_px(dataset))
         self._ssim_patches = self._patch_count()
         self._visibility_rays: VisibilityRays | None = None
-        wanted = options.visibility_ray_fraction > 0
-        if wanted and isinstance(dataset, ObservedPoints) and len(dataset.points):
+        needs_visibility_rays = options.visibility_ray_fraction > 0
+        if needs_visibility_rays and isinstance(dataset, ObservedPoints) and len(dataset.points):
             self._visibility_rays = VisibilityRays.from_dataset(dataset, VISIBILITY_RAY_MARGIN)
 
     def exclude_views(self, views: Int64[np.ndarray, " m"]) -> None:
         """Draw nothing of these views any more."""
-        kept = np.setdiff1d(self._dataset.train_indices, views)
-        self.sampler = PixelSampler(kept, view_sizes_px(self._dataset))
+        remaining = np.setdiff1d(self._dataset.train_indices, views)
+        self.sampler = PixelSampler(remaining, view_sizes_px(self._dataset))
         if self._visibility_rays is not None:
             self._visibility_rays = self._visibility_rays.exclude_views(views)
 
     def draw(self, rng: np.random.Generator, index: int = 0) -> Batch:
         """Draw the next batch, after ``index`` others."""
         options, sampler, side = self._options, self.sampler, self._options.ssim_patch_side_px
-        loose = options.rays_per_batch - self._ssim_patches * side**2
-        windows = loose // options.ray_patch_rays if options.ray_patch_rays > 1 else 0
-        single = loose - windows * options.ray_patch_rays
-        drawn, grids = [sampler.pixels(rng, single)], None
-        if windows:
-            grids = RayPatches(single, windows, math.isqrt(options.ray_patch_rays))
-            drawn.append(
+        free_count = options.rays_per_batch - self._ssim_patches * side**2
+        patch_count = free_count // options.ray_patch_rays if options.ray_patch_rays > 1 else 0
+        single_count = free_count - patch_count * options.ray_patch_rays
+        pixels, ray_patches = [sampler.pixels(rng, single_count)], None
+        if patch_count:
+            ray_patches = RayPatches(single_count, patch_count, math.isqrt(options.ray_patch_rays))
+            pixels.append(
                 sampler.ray_patches(
-                    rng, windows, rays=options.ray_patch_rays, side=options.ray_patch_side_px, index=index
+                    rng, patch_count, rays=options.ray_patch_rays, side=options.ray_patch_side_px, index=index
                 )
             )
         if self._ssim_patches:
-            drawn.append(sampler.patches(rng, self._ssim_patches, side))
-        view, y, x = (np.concatenate(parts) for parts in zip(*drawn, strict=True))
+            pixels.append(sampler.patches(rng, self._ssim_patches, side))
+        view, y, x = (np.concatenate(parts) for parts in zip(*pixels, strict=True))
         rays = self._dataset.rays(view, y, x)
         rgb, alpha, weight = self._dataset.pixels(view, y, x)
         background = self._background(rng)
-        lines = None
+        visibility_rays = None
         if self._visibility_rays is not None and len(self._visibility_rays):
-            lines = self._visibility_rays.draw(
+            visibility_rays = self._visibility_rays.draw(
                 rng, max(1, round(options.visibility_ray_fraction * options.rays_per_batch))
             )
-        batch = Batch(rays, rgb, alpha, weight, view, self._ssim_patches, side, background, lines, grids)
+        batch = Batch(
+            rays, rgb, alpha, weight, view, self._ssim_patches, side, background, visibility_rays, ray_patches
+        )
         _ = batch.target_srgb  # worked out here, as the next batch is drawn beside the iteration
         return batch
 

@@ -81,10 +81,10 @@ class PixelSampler:
     ) -> tuple[Int64[np.ndarray, " r"], Int64[np.ndarray, " r"], Int64[np.ndarray, " r"]]:
         """Draw ``count`` pixels as (view, y, x), repeated ones too, sorted by view and row."""
         flat = np.sort(rng.integers(0, self.pixel_count, count))
-        which = np.searchsorted(self._ends, flat, side="right")
-        width, height = self._sizes[which].T
-        local = flat - (self._ends[which] - width * height)
-        return self._views[which], local // width, local % width
+        view_rows = np.searchsorted(self._ends, flat, side="right")
+        width, height = self._sizes[view_rows].T
+        local = flat - (self._ends[view_rows] - width * height)
+        return self._views[view_rows], local // width, local % width
 
     def ray_patches(
         self, rng: np.random.Generator, count: int, *, rays: int, side: int, index: int = 0
@@ -98,13 +98,13 @@ class PixelSampler:
         """
         cells = math.isqrt(rays)
         cell = max(1, round(side / cells))
-        which, x, y = self._stratified_pixels(rng, count, cell * cells, index)
-        width, height = self._sizes[which].T
+        view_rows, x, y = self._stratified_pixels(rng, count, cell * cells, index)
+        width, height = self._sizes[view_rows].T
         rows, columns = morton_cells(cells)
         left, top = x - cell * cells // 2, y - cell * cells // 2
         y = top[:, None] + rows * cell + rng.integers(0, cell, (count, rays))
         x = left[:, None] + columns * cell + rng.integers(0, cell, (count, rays))
-        view = np.broadcast_to(self._views[which][:, None], x.shape)
+        view = np.broadcast_to(self._views[view_rows][:, None], x.shape)
         return (
             view.reshape(-1),
             _mirror_into(y, height[:, None]).reshape(-1),
@@ -112,7 +112,7 @@ class PixelSampler:
         )
 
     def _stratified_pixels(
-        self, rng: np.random.Generator, count: int, side: int, turn: int
+        self, rng: np.random.Generator, count: int, side: int, index: int
     ) -> tuple[Int64[np.ndarray, " c"], Int64[np.ndarray, " c"], Int64[np.ndarray, " c"]]:
         """Draw ``count`` pixels in strata, as (place of the view among those drawn from, x, y).
 
@@ -120,30 +120,30 @@ class PixelSampler:
         steps of one length lead along it, each to a random pixel of the tile there. Each turn begins the
         golden section of a step further on, so that all tiles are seen equally often.
         """
-        at = (np.arange(count) + turn * GOLDEN_RATIO % 1.0) * (self.pixel_count / count)
-        which = np.searchsorted(self._ends, at, side="right")
-        width, height = self._sizes[which].T
-        share = (at - (self._ends[which] - width * height)) / (width * height)
+        at = (np.arange(count) + index * GOLDEN_RATIO % 1.0) * (self.pixel_count / count)
+        view_rows = np.searchsorted(self._ends, at, side="right")
+        width, height = self._sizes[view_rows].T
+        share = (at - (self._ends[view_rows] - width * height)) / (width * height)
         columns = np.maximum(1, np.rint(width / side).astype(np.int64))
         rows = np.maximum(1, np.rint(height / side).astype(np.int64))
         row, column = np.divmod((share * columns * rows).astype(np.int64), columns)
         column = np.where(row % 2 == 1, columns - 1 - column, column)
         x = (column + rng.random(count)) * (width / columns)
         y = (row + rng.random(count)) * (height / rows)
-        return which, x.astype(np.int64), y.astype(np.int64)
+        return view_rows, x.astype(np.int64), y.astype(np.int64)
 
     def patches(
         self, rng: np.random.Generator, count: int, side: int
     ) -> tuple[Int64[np.ndarray, " r"], Int64[np.ndarray, " r"], Int64[np.ndarray, " r"]]:
         """Draw ``count`` patches of ``side`` x ``side`` pixels inside the views: (view, y, x), row-major."""
         areas = np.diff(self._ends, prepend=0)
-        which = rng.choice(len(self._views), size=count, p=areas / areas.sum())
-        width, height = self._sizes[which].T
+        view_rows = rng.choice(len(self._views), size=count, p=areas / areas.sum())
+        width, height = self._sizes[view_rows].T
         left = rng.integers(0, width - side + 1)
         top = rng.integers(0, height - side + 1)
         shape = (count, side, side)
         rows, columns = np.arange(side)[None, :, None], np.arange(side)[None, None, :]
-        view = np.broadcast_to(self._views[which][:, None, None], shape)
+        view = np.broadcast_to(self._views[view_rows][:, None, None], shape)
         y = np.broadcast_to(top[:, None, None] + rows, shape)
         x = np.broadcast_to(left[:, None, None] + columns, shape)
         return view.reshape(-1), y.reshape(-1), x.reshape(-1)
@@ -171,13 +171,13 @@ def valid_pixel_fraction(dataset: TrainingData) -> float:
     sampler = PixelSampler(dataset.train_indices, view_sizes_px(dataset))
     view, y, x = sampler.pixels(np.random.Generator(np.random.PCG64(0)), VALID_PIXEL_SAMPLES)
     _, alpha, weight = dataset.pixels(view, y, x)
-    shown = int(((alpha > 0) & (weight > 0)).sum())
-    if shown == 0 and _has_no_valid_pixel(dataset):
+    valid_count = int(((alpha > 0) & (weight > 0)).sum())
+    if valid_count == 0 and _has_no_valid_pixel(dataset):
         raise DatasetError(
             "The training photographs show nothing: their masks or alpha leave no pixel. Masks are white "
             "where a pixel counts; invert them, or leave them out."
         )
-    return max(1, shown) / VALID_PIXEL_SAMPLES
+    return max(1, valid_count) / VALID_PIXEL_SAMPLES
 
 
 def _has_no_valid_pixel(dataset: TrainingData) -> bool:

@@ -68,36 +68,39 @@ class VisibilityRays:
         are those of the model, also where they are refined; errors count as pixels of the working size, so
         that sight ends the sooner before points of photographs that were made smaller.
         """
-        seen, points = dataset.observations, dataset.points
-        row = np.searchsorted(points.ids, seen.point)
+        observations, points = dataset.observations, dataset.points
+        row = np.searchsorted(points.ids, observations.point)
         row = np.minimum(row, len(points) - 1)
-        keep = np.isin(seen.view, dataset.train_indices) & (points.ids[row] == seen.point)
-        row, view = row[keep], seen.view[keep]
+        keep = np.isin(observations.view, dataset.train_indices) & (points.ids[row] == observations.point)
+        row, view = row[keep], observations.view[keep]
         origins = np.stack([each.origin_world for each in dataset.views])
-        way = points.xyz_world[row].astype(np.float64) - origins[view]
-        distance = np.linalg.norm(way, axis=1)
-        direction = way / np.maximum(distance, 1e-12)[:, None]
+        offset = points.xyz_world[row].astype(np.float64) - origins[view]
+        distance = np.linalg.norm(offset, axis=1)
+        direction = offset / np.maximum(distance, 1e-12)[:, None]
         outer = np.zeros((len(points), 3, 3))
         np.add.at(outer, row, direction[:, :, None] * direction[:, None, :])
         track = np.bincount(row, minlength=len(points))
-        along = np.einsum(
+        own_cosines = np.einsum(
             "ki,kij,kj->k", direction, outer[row], direction
         )  # sum of squared cosines, itself 1
-        sharpness = np.sqrt(np.maximum(track[row] - along, 1e-12))
+        sharpness = np.sqrt(np.maximum(track[row] - own_cosines, 1e-12))
         pixel_rad = np.array([dataset.cameras[each.camera_index].pixel_angle_rad for each in dataset.views])[
             view
         ]
         error_px = np.maximum(points.errors_px[row], MIN_ERROR_PX)
         deviation = error_px * pixel_rad * distance / sharpness
         ends = distance - np.maximum(MAX_ERROR_SIGMAS * deviation, margin * distance)
-        good = (track[row] >= MIN_TRACK_LENGTH) & (ends > 0.5 * distance)
-        return cls(origins[view[good]], direction[good], ends[good], view[good])
+        is_usable = (track[row] >= MIN_TRACK_LENGTH) & (ends > 0.5 * distance)
+        return cls(origins[view[is_usable]], direction[is_usable], ends[is_usable], view[is_usable])
 
     def exclude_views(self, views: Int64[np.ndarray, " m"]) -> "VisibilityRays":
         """Return the rays of all other views."""
-        kept = ~np.isin(self.view, views)
+        is_other = ~np.isin(self.view, views)
         return VisibilityRays(
-            self.starts_world[kept], self.directions_world[kept], self.ends[kept], self.view[kept]
+            self.starts_world[is_other],
+            self.directions_world[is_other],
+            self.ends[is_other],
+            self.view[is_other],
         )
 
     def draw(self, rng: np.random.Generator, count: int) -> RayBatch:
@@ -110,9 +113,9 @@ def free_space_gradient(
     visibility_rays: RayBatch, tracer: Tracer, weight: float
 ) -> tuple[Recording, TraceGradients]:
     """Return the recording of visibility rays, and gradients of ``weight`` times their mean hidden share."""
-    seen = tracer.trace(visibility_rays, record=True)
-    assert seen.recording is not None
-    none = np.zeros_like(seen.rgb_srgb)
-    return seen.recording, TraceGradients(
-        none, transmittance=np.full(len(visibility_rays), -weight / len(visibility_rays), np.float32)
+    result = tracer.trace(visibility_rays, record=True)
+    assert result.recording is not None
+    no_color = np.zeros_like(result.rgb_srgb)
+    return result.recording, TraceGradients(
+        no_color, transmittance=np.full(len(visibility_rays), -weight / len(visibility_rays), np.float32)
     )

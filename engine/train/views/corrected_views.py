@@ -107,10 +107,10 @@ def remove_common_motion(
     given = [dataset.views[i] for i in used.tolist()]
     places = np.stack([view.origin_world for view in given])
     middle = places.mean(axis=0)
-    found = corrections.copy()
+    common = corrections.copy()
     for _ in range(FIT_ROUNDS):
         now = [
-            correct_view(v, RigidMotion.from_vector(found[i]))
+            correct_view(v, RigidMotion.from_vector(common[i]))
             for v, i in zip(given, used.tolist(), strict=True)
         ]
         turn, shift, growth = _common_similarity(given, now, middle, dataset.extent)
@@ -122,8 +122,8 @@ def remove_common_motion(
             origin = middle + back @ (new.origin_world - middle - shift) / (1 + growth)
             relative = rotation @ old.rotation_cam_from_world.T
             moved = RigidMotion(relative, -rotation @ origin - relative @ old.translation_cam_from_world)
-            found[index] = moved.to_vector
-    return found
+            common[index] = moved.to_vector
+    return common
 
 
 def _common_similarity(

@@ -32,18 +32,18 @@ def relative_log_brightness(dataset: TrackedTrainingData) -> Float64[np.ndarray,
     """
     count = len(dataset.views)
     brightness = np.full(count, np.nan)
-    seen = dataset.observations
-    rows = np.flatnonzero(np.isin(seen.view, dataset.train_indices))
+    observations = dataset.observations
+    rows = np.flatnonzero(np.isin(observations.view, dataset.train_indices))
     if len(rows) == 0:
         return brightness
-    view = seen.view[rows]
-    _, point = np.unique(seen.point[rows], return_inverse=True)
+    view = observations.view[rows]
+    _, point = np.unique(observations.point[rows], return_inverse=True)
     sizes = np.array([[v.width_px, v.height_px] for v in dataset.views], np.int64)[view]
-    x, y = np.clip(seen.xy_px[rows].astype(np.int64), 0, sizes - 1).T
+    x, y = np.clip(observations.xy_px[rows].astype(np.int64), 0, sizes - 1).T
     rgb, _, weight = dataset.pixels(view, np.ascontiguousarray(y), np.ascontiguousarray(x))
-    shown = rgb.mean(axis=1, dtype=np.float64)
-    valid = (weight > 0) & (shown > MIN_VALUE) & (shown < MAX_VALUE)
-    view, point, levels = view[valid], point[valid], np.log(shown[valid])
+    brightnesses = rgb.mean(axis=1, dtype=np.float64)
+    valid = (weight > 0) & (brightnesses > MIN_VALUE) & (brightnesses < MAX_VALUE)
+    view, point, levels = view[valid], point[valid], np.log(brightnesses[valid])
     views = np.zeros(count)
     for _ in range(ROUNDS):
         points = _group_medians(levels - views[view], point, int(point.max(initial=0)) + 1)
@@ -98,8 +98,8 @@ def _group_medians(
     order = np.lexsort((values, group))
     sizes = np.bincount(group, minlength=count)
     starts = np.cumsum(sizes) - sizes
-    some = sizes > 0
-    sorted_values, found = values[order], np.zeros(count)
-    low, high = (starts + (sizes - 1) // 2)[some], (starts + sizes // 2)[some]
-    found[some] = (sorted_values[low] + sorted_values[high]) / 2
-    return found
+    is_filled = sizes > 0
+    sorted_values, medians = values[order], np.zeros(count)
+    low, high = (starts + (sizes - 1) // 2)[is_filled], (starts + sizes // 2)[is_filled]
+    medians[is_filled] = (sorted_values[low] + sorted_values[high]) / 2
+    return medians

@@ -44,9 +44,9 @@ def orient_normals(
             len(gaussians), dataset, indices[start : start + VIEWS_PER_TRACE], tracer
         )
     normals = gaussians.rotations[:, :, 0].astype(np.float64)
-    turned = np.flatnonzero((normals * towards).sum(axis=1) < 0).astype(np.int32)
-    gaussians.quats_wxyz[turned] = _flip_frames(gaussians.quats_wxyz[turned])
-    return turned
+    flipped_ids = np.flatnonzero((normals * towards).sum(axis=1) < 0).astype(np.int32)
+    gaussians.quats_wxyz[flipped_ids] = _flip_frames(gaussians.quats_wxyz[flipped_ids])
+    return flipped_ids
 
 
 def _summed_view_directions(

@@ -69,10 +69,10 @@ def measure_views(
     ):
         rgb, alpha, weight = dataset.pixels(*grids.pixels)
         target = composite_over(rgb, alpha, background_srgb).reshape(grids.rgb_srgb.shape)
-        counts = (weight > 0).astype(np.float32).reshape(len(target), -1)
-        for shown, photograph, valid in zip(grids.rgb_srgb, target, counts, strict=True):
-            plain.append(psnr(shown, photograph, valid))
-            corrected.append(psnr(fit_color(shown, photograph, valid), photograph, valid))
+        is_valid = (weight > 0).astype(np.float32).reshape(len(target), -1)
+        for rendered, photograph, valid in zip(grids.rgb_srgb, target, is_valid, strict=True):
+            plain.append(psnr(rendered, photograph, valid))
+            corrected.append(psnr(fit_color(rendered, photograph, valid), photograph, valid))
     return ViewPsnr(indices, *(np.minimum(values, MAX_PSNR_DB) for values in (plain, corrected)))
 
 
@@ -129,8 +129,8 @@ def find_misplaced_views(
     """
     measured = measure_views(dataset, np.arange(len(dataset.views)), background_srgb, tracer, shading)
     doubtful = find_outlier_views(measured, dataset.views, dataset.train_indices, MISPLACED_SIGMAS)
-    most = min(MAX_MISPLACED_VIEWS, int(MAX_MISPLACED_FRACTION * len(dataset.views)))
-    return np.sort(doubtful[:most])
+    max_count = min(MAX_MISPLACED_VIEWS, int(MAX_MISPLACED_FRACTION * len(dataset.views)))
+    return np.sort(doubtful[:max_count])
 
 
 def _neighborhood_median(
@@ -148,16 +148,18 @@ def _neighborhood_median(
     forward = np.stack([views[i].rotation_cam_from_world[2] for i in indices.tolist()])
     total = len(origins)
     rows = max(1, MAX_DISTANCES // total)
-    some = np.unique(np.linspace(0, total - 1, min(rows, total)).astype(np.int64))
-    usual = max(float(np.median(_squared_distances(origins[some], origins))), 1e-12)
-    others = min(NEIGHBORS, int(counts.sum()) - 1)
+    sample = np.unique(np.linspace(0, total - 1, min(rows, total)).astype(np.int64))
+    usual_distance = max(float(np.median(_squared_distances(origins[sample], origins))), 1e-12)
+    neighbor_count = min(NEIGHBORS, int(counts.sum()) - 1)
     result = np.empty(total)
     for start in range(0, total, rows):
         part = slice(start, start + rows)
-        away = _squared_distances(origins[part], origins) / usual + (1 - forward[part] @ forward.T)
-        away[:, ~counts] = np.inf
-        away[np.arange(len(away)), np.arange(total)[part]] = np.inf
-        nearest = np.argsort(away, axis=1, kind="stable")[:, :others]
+        distances = _squared_distances(origins[part], origins) / usual_distance + (
+            1 - forward[part] @ forward.T
+        )
+        distances[:, ~counts] = np.inf
+        distances[np.arange(len(distances)), np.arange(total)[part]] = np.inf
+        nearest = np.argsort(distances, axis=1, kind="stable")[:, :neighbor_count]
         result[part] = np.median(psnr[nearest], axis=1)
     return result
 
@@ -227,23 +229,23 @@ class OutlierDetector:
         """Return training views to exclude besides ``left_out``, by how ``tracer`` shows them."""
         train = self._dataset.train_indices
         used = np.setdiff1d(train, left_out)
-        fits = measure_views(self._dataset, used, self._background_srgb, tracer, shading)
-        room = int(MAX_EXCLUDED_FRACTION * len(train)) - len(left_out)
-        return np.sort(find_outlier_views(fits, self._dataset.views, used)[: max(0, room)])
+        measured = measure_views(self._dataset, used, self._background_srgb, tracer, shading)
+        max_more = int(MAX_EXCLUDED_FRACTION * len(train)) - len(left_out)
+        return np.sort(find_outlier_views(measured, self._dataset.views, used)[: max(0, max_more)])
 
     def report(
         self, tracer: Tracer, shading: ShadingModel, left_out: Int64[np.ndarray, " m"]
     ) -> TrainingViewReport:
         """Return how well the finished Gaussians, which ``tracer`` holds, show the views."""
         dataset = self._dataset
-        used = np.setdiff1d(dataset.train_indices, left_out)
-        indices = np.concatenate([used, dataset.test_indices])
-        fits = measure_views(dataset, indices, self._background_srgb, tracer, shading)
-        found = find_outlier_views(fits, dataset.views, used)
+        train_used = np.setdiff1d(dataset.train_indices, left_out)
+        indices = np.concatenate([train_used, dataset.test_indices])
+        measured = measure_views(dataset, indices, self._background_srgb, tracer, shading)
+        outliers = find_outlier_views(measured, dataset.views, train_used)
         names = [view.name for view in dataset.views]
-        psnr = dict(zip(fits.indices.tolist(), fits.psnr.tolist(), strict=True))
+        psnr = dict(zip(measured.indices.tolist(), measured.psnr.tolist(), strict=True))
         return TrainingViewReport(
-            psnr={names[i]: psnr[i] for i in used.tolist()},
-            misfits=tuple(names[i] for i in [*found.tolist(), *left_out.tolist()]),
+            psnr={names[i]: psnr[i] for i in train_used.tolist()},
+            misfits=tuple(names[i] for i in [*outliers.tolist(), *left_out.tolist()]),
             left_out=tuple(names[i] for i in left_out.tolist()),
         )

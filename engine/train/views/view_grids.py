@@ -79,8 +79,8 @@ def _mean_brightness(
     dataset: TrainingData, background_srgb: Float32[np.ndarray, "3"], tracer: Tracer, shading: ShadingModel
 ) -> Float64[np.ndarray, " v"]:
     """Return the mean display value that each view would have with the mean exposure."""
-    shown = render_grids(
+    rendered = render_grids(
         dataset, np.arange(len(dataset.views)), background_srgb, tracer, shading,
         tiles=BRIGHTNESS_TILES, exposed=False,
     )  # fmt: skip
-    return np.concatenate([grids.rgb_srgb.mean(axis=(1, 2), dtype=np.float64) for grids in shown])
+    return np.concatenate([grids.rgb_srgb.mean(axis=(1, 2), dtype=np.float64) for grids in rendered])
