@@ -1,4 +1,4 @@
-"""What reaches a Gaussian from all around: the light past the others, and the light that these send."""
+"""Ambient visibility of Gaussians, and the light that others send them (diffuse interreflection)."""
 
 from collections.abc import Callable
 
@@ -14,10 +14,10 @@ from octasplat.engine.trace.protocol import Tracer
 _GOLDEN_ANGLE = np.pi * (3.0 - np.sqrt(5.0))
 MAX_RAYS_PER_TRACE = 1 << 18
 UNOCCLUDED = 0.98
-"""Share of the light from all around from which on nothing else is asked for."""
+"""Ambient visibility from which on no interreflection is measured."""
 
 RadianceFn = Callable[[RayBatch], Float64[np.ndarray, "r 3"]]
-"""Linear radiance of what rays meet, times the share of it that hides the rest."""
+"""Linear radiance of what rays hit, times its alpha."""
 
 
 def ambient_visibility(

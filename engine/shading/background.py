@@ -29,7 +29,7 @@ _STATE = ("rgb_srgb", "first", "second", "sums", "steps")
 
 
 class LearnedBackground:
-    """Puts a map behind what another model develops.
+    """Composite the colours of another model over a learnt map.
 
     Follows :class:`octasplat.engine.shading.protocol.ShadingModel`.
 
@@ -38,7 +38,7 @@ class LearnedBackground:
         rate: size of a step at the beginning, display values.
         decay: what is left of that at the end; it falls exponentially.
         smoothness_weight: of differences between neighbouring texels.
-        inner: the model that develops what is nearer.
+        inner: the model that shades the Gaussians.
 
     Attributes:
         rgb_srgb: the map, display values; rows from up to down, the middle column is forward.
@@ -46,7 +46,7 @@ class LearnedBackground:
         sums: gradients by the texels since the last step.
         steps: iterations so far.
         frame: right, up and forward of the map in the world, as rows.
-        inner: the model that develops what is nearer.
+        inner: the model that shades the Gaussians.
     """
 
     name = "background"
@@ -169,7 +169,7 @@ class LearnedBackground:
         return {**self.inner.state(), **{f"background.{name}": getattr(self, name) for name in _STATE}}
 
     def restore(self, state: Mapping[str, np.ndarray]) -> None:
-        """Take them back."""
+        """Take the state that :meth:`state` returned."""
         self.inner.restore(state)
         for name in _STATE:
             setattr(self, name, state[f"background.{name}"].copy())

@@ -3,7 +3,7 @@
 Each Gaussian is flat and has a normal; what the depths of neighbouring rays span has one, too. Photographs
 alone let the two differ, so that a surface made of the depths is rough. Follows the depth-normal consistency
 of "2D Gaussian Splatting for Geometrically Accurate Radiance Fields" (https://arxiv.org/abs/2403.17888), with
-neighbours in a window of a batch where that has neighbouring pixels.
+neighbours in a patch of a batch where that has neighbouring pixels.
 """
 
 from dataclasses import replace
@@ -17,7 +17,7 @@ from octasplat.engine.shading.protocol import ShadedRays, ShadingGradients, Trac
 
 
 class DepthNormalShading(PlainShading):
-    """Develops as the plain model, and holds normals and depths together.
+    """Shade as the plain model, and regularise normals by depths.
 
     The term is one minus the cosine between a ray's blended normal and that of the points of three
     neighbouring rays, a mean over the rays.

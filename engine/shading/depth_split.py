@@ -100,9 +100,9 @@ def split_by_depth(
     Args:
         rays: with unit directions.
         result: along them.
-        tracer: that saw it.
-        min_separation_world: see there.
-        record: whether there will be a way back.
+        tracer: that traced them.
+        min_separation_world: distance between mean and median depth, world units.
+        record: whether to keep what the backward pass needs.
     """
     mean = result.expected_depth
     far = (np.abs(mean - result.depth_median) > min_separation_world) & (result.depth_median > 0)

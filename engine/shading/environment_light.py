@@ -102,7 +102,7 @@ class EnvironmentLight:
         return {name: getattr(self, name) for name in _STATE}
 
     def restore(self, state: Mapping[str, np.ndarray]) -> None:
-        """Take them back."""
+        """Take the state that :meth:`state` returned."""
         for name in _STATE:
             setattr(self, name, state[name].copy())
         self._levels = None

@@ -26,13 +26,13 @@ _STATE = ("log_gains", "offsets", "first", "second", "steps")
 
 
 class ExposureModel:
-    """Of each view and channel: shown colour = exp(log_gain) * developed colour + offset.
+    """Expose the colours of another model: exp(log_gain) * colour + offset, for each view and channel.
 
-    Follows :class:`octasplat.engine.shading.protocol.ShadingModel`. What is seen by no view has the mean
+    Follows :class:`octasplat.engine.shading.protocol.ShadingModel`. Rays of no view have the mean
     exposure.
 
     Args:
-        views: how many there are, whether they are trained on or not.
+        views: number of views, whether they are trained on or not.
         rate: size of a step of log gains and offsets at the beginning.
         decay: what is left of that at the end; it falls exponentially.
         inner: the model whose colours are exposed.
@@ -167,7 +167,7 @@ class ExposureModel:
             values[is_trained] -= values[is_trained].mean(axis=0, dtype=np.float64).astype(np.float32)
 
     def as_dict(self, names: Sequence[str]) -> dict[str, dict[str, list[float]]]:
-        """Return a JSON-ready record by the names of all views; :meth:`take` reads it."""
+        """Return a JSON-ready record by the names of all views; :meth:`load_known` reads it."""
         rows = zip(names, self.log_gains.tolist(), self.offsets.tolist(), strict=True)
         return {name: {"log_gains": gains, "offsets": offsets} for name, gains, offsets in rows}
 
@@ -183,7 +183,7 @@ class ExposureModel:
         return {**self.inner.state(), **{f"exposure.{name}": getattr(self, name) for name in _STATE}}
 
     def restore(self, state: Mapping[str, np.ndarray]) -> None:
-        """Take them back."""
+        """Take the state that :meth:`state` returned."""
         self.inner.restore(state)
         for name in _STATE:
             setattr(self, name, state[f"exposure.{name}"])

@@ -1,4 +1,4 @@
-"""What is blended along rays before anything is shaded: materials, normals and depths, with the way back."""
+"""The G-buffer: materials, normals and depths blended along rays before shading, with its backward pass."""
 
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -14,7 +14,7 @@ from octasplat.engine.trace.protocol import TraceResult
 MIN_COSINE = 0.01
 """Cosine to the normal that reflected rays have at least."""
 MIN_ALPHA = 0.02
-"""Rays that met less show nothing that could be shaded."""
+"""Accumulated alpha up to which a ray is not shaded."""
 
 
 class RayOffset(NamedTuple):
@@ -31,11 +31,11 @@ class RayOffset(NamedTuple):
 
 @dataclass(frozen=True)
 class GBuffer:
-    """What was blended along the rays that met something.
+    """What was blended along the rays that hit something.
 
     Attributes:
         ray_ids: numbers of these rays.
-        alpha: what each met.
+        alpha: accumulated alpha of each.
         depth: mean distance, lengths of the direction.
         facing_normals: the blended normals.
         surface: materials, normals and directions, not yet dimmed by anything.

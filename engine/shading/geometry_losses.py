@@ -1,8 +1,8 @@
-"""Terms of the loss that hold normals, depths and materials together, by their gradients alone.
+"""Regularisers of normals, depths and materials, by their gradients alone.
 
-Batches of training rays come in windows (:mod:`octasplat.engine.shading.ray_patches`): square grids of rays
-with one random pixel of each cell. Neighbours in a window are neighbours on the surface, so that differences
-between them mean something.
+Batches of training rays come in patches (:mod:`octasplat.engine.shading.ray_patches`): square grids of rays
+with one random pixel of each cell. Neighbours in a patch are neighbours on the surface, so that they can be
+compared.
 """
 
 import numpy as np

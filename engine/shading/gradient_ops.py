@@ -1,4 +1,4 @@
-"""Small steps of gradients on their way back: through the display's curve, and past what is too loud."""
+"""Gradients of the display curve, and clipping of gradients that are much longer than their median."""
 
 import numpy as np
 from jaxtyping import Float64
@@ -11,8 +11,8 @@ def clip_gradients(
 
     A ratio of 0 leaves them alone.
 
-    One pixel that looks into a mirror in a mirror says more loudly than a hundred others where to turn, and
-    is as likely to be wrong.
+    A pixel that shows a mirror in a mirror has a far longer gradient than others, and is as likely to be
+    wrong.
     """
     lengths = np.linalg.norm(gradients, axis=1)
     if max_median_ratio == 0 or not (lengths > 0).any():

@@ -1,4 +1,4 @@
-"""What comes in along reflected directions: asked by lobes, or by one ray as others do, with the way back."""
+"""Light along reflected directions, by pairs of rays or by single ones, with the backward pass."""
 
 from dataclasses import dataclass, field
 from typing import Protocol, runtime_checkable
@@ -27,14 +27,14 @@ from octasplat.engine.shading.split_sum import ShadeGradients
 from octasplat.engine.trace.protocol import Recording, TraceGradients
 
 PROGRESS_SALTS = 1 << 20
-"""So finely the share of the training that is done draws other numbers."""
+"""Resolution at which the share of the training that is done changes the random numbers."""
 
 RecordedGradients = tuple[tuple[Recording, TraceGradients], ...]
 
 
 @runtime_checkable
 class IncidentLightModel(Protocol):
-    """What reflected rays say of the points of a buffer, and gradients through that."""
+    """Incident light at the points of a G-buffer, and gradients through it."""
 
     @property
     def incident(self) -> IncidentLight:

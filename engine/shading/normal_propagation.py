@@ -24,7 +24,7 @@ MAX_PLANE_DISTANCE = 0.3
 MAX_COLOR_DIFFERENCE = 0.15
 """Difference of albedo or metallic from which on another thing is likely."""
 MIN_TRUST = 0.1
-"""What a matt Gaussian's normal counts against 1 of a perfect mirror's."""
+"""Weight of a diffuse Gaussian's normal, where that of a perfect mirror is 1."""
 
 
 def propagate_normals(gaussians: FlatGaussians) -> None:

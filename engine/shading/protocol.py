@@ -1,6 +1,6 @@
-"""What a shading model is: it makes of what a tracer saw along rays what a photograph would show there.
+"""The protocol of shading models: they turn what was traced along rays into the colours of a photograph.
 
-    batch of rays -> trace -> develop -> loss -> reverse -> backward pass of the trace -> steps
+    batch of rays -> trace -> shade -> loss -> backward of the shading -> backward of the trace -> steps
 
 The training loop and the renderer know models by this protocol alone. A model may look at all that a trace
 gives (colours, transmittance, depths, normals, blended features), may trace further rays through the same
@@ -22,17 +22,17 @@ from octasplat.engine.trace.protocol import GaussianGradients, Recording, TraceG
 
 @dataclass(frozen=True)
 class TracedRays:
-    """What is to be shaded.
+    """Rays and what was traced along them, to be shaded.
 
     Attributes:
         rays: the rays.
-        result: what the tracer saw along them.
+        result: what was traced along them.
         tracer: for further rays, mirrored ones say, through the same Gaussians.
         view: number of each ray's training view; None for views that were not trained on.
         training_progress: share of the training that is done; 1 for a finished scene.
         dither: two numbers in [0, 1) for each ray, for models that draw anything at random; they are evenly
             spread over the rays of a pixel. None: models find some by themselves.
-        ray_patches: those of the rays that stand in windows of neighbours; None if none do.
+        ray_patches: those of the rays that form patches of neighbours; None if none do.
     """
 
     rays: RayBatch
@@ -73,7 +73,7 @@ class ShadingGradients:
     """Gradients of a loss by all that went into :meth:`ShadingModel.shade`.
 
     Attributes:
-        trace: by the outputs of the sight's own trace.
+        trace: by the outputs of the trace that was shaded.
         recorded_traces: by those of the traces that the model recorded itself.
         parameters: by the model's own parameters, in whatever form its ``step`` wants them; names begin
             with the model's.
@@ -86,7 +86,7 @@ class ShadingGradients:
 
 @runtime_checkable
 class ShadingModel(Protocol):
-    """Develops what was seen, and is trained beside the Gaussians.
+    """Shade what was traced; trained beside the Gaussians.
 
     Attributes:
         name: begins the names of the model's arrays in checkpoints.

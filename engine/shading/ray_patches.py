@@ -1,8 +1,8 @@
-"""Square windows of neighbouring rays in a batch, and the order in which their rays stand.
+"""Square patches of neighbouring rays in a batch, and the order of their rays.
 
-A window is a grid of cells, one ray in each. Rays of a window stand along a Z-order curve, so that those side
-by side in the batch are close together, as the tracer's packets want them. What compares neighbours needs
-rows and columns instead: :meth:`RayPatches.grid` and :meth:`RayPatches.flat` change between the two.
+A patch is a grid of cells, one ray in each. Its rays follow a Z-order curve, so that neighbours in the batch
+are close together, as the tracer's packets want them. What compares neighbours needs rows and columns
+instead: :meth:`RayPatches.grid` and :meth:`RayPatches.flatten` convert between the two.
 """
 
 from dataclasses import dataclass
@@ -29,12 +29,12 @@ def morton_cells(side: int) -> tuple[Int64[np.ndarray, " c"], Int64[np.ndarray, 
 
 @dataclass(frozen=True)
 class RayPatches:
-    """Windows among the rays of a batch, one after another.
+    """Patches among the rays of a batch, one after another.
 
     Attributes:
-        first: the first ray that is in a window.
-        count: number of windows.
-        side: cells of a window each way.
+        first: the first ray that is in a patch.
+        count: number of patches.
+        side: cells of a patch each way.
     """
 
     first: int
@@ -47,13 +47,13 @@ class RayPatches:
         return slice(self.first, self.first + self.count * self.side**2)
 
     def grid(self, values: Shaped[np.ndarray, "c ..."]) -> Shaped[np.ndarray, "w s s ..."]:
-        """Return values of the windows' rays by window, row and column."""
+        """Return values of the patches' rays by patch, row and column."""
         rows, columns = morton_cells(self.side)
         grid = np.empty((self.count, self.side, self.side, *values.shape[1:]), values.dtype)
         grid[:, rows, columns] = values.reshape(self.count, self.side**2, *values.shape[1:])
         return grid
 
     def flatten(self, grid: Float64[np.ndarray, "w s s ..."]) -> Float64[np.ndarray, "c ..."]:
-        """Return values by window, row and column in the order of the windows' rays."""
+        """Return values by patch, row and column in the order of the patches' rays."""
         rows, columns = morton_cells(self.side)
         return grid[:, rows, columns].reshape(-1, *grid.shape[3:])

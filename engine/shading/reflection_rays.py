@@ -1,12 +1,12 @@
-"""The lobe of a surface beside others: pairs of reflected rays say what it sees, and how that would change.
+"""Incident light of a specular lobe from pairs of reflected rays, and its derivatives.
 
-From each point of a buffer go two rays, mirrored at two facets that lie on either side of the normal, as far
-off as the roughness says. Their mean is what the lobe sees past other surfaces; their difference says how
-that changes with the normal, whatever it is that they meet. From some points goes a third, mirrored at the
-normal itself: how far the mean of the two is from it says how what is seen changes with the roughness.
+From each point of a G-buffer go two rays, mirrored at two facets on either side of the normal, as far off as
+the roughness says. Their mean estimates the light of the lobe; their difference estimates how that changes
+with the normal, whatever the rays hit. From some points goes a third ray, mirrored at the normal itself: its
+difference from the mean of the two estimates how the light changes with the roughness.
 
-These are slopes of what the lobe's blur makes of the scene, estimated from samples; the tracer is asked for
-no derivative by a ray.
+These are derivatives of the light that the lobe blurs, estimated from samples; the tracer gives no derivative
+by a ray.
 """
 
 from dataclasses import dataclass
@@ -114,7 +114,7 @@ def trace_ray_pairs(
         reflection_tracer: of reflected rays.
         numbers: see :func:`sample_facets`.
         min_slope: likewise.
-        record: whether there will be a way back.
+        record: whether to keep what the backward pass needs.
     """
     facets = sample_facets(gbuffer.surface, numbers, min_slope=min_slope)
     one, other = (

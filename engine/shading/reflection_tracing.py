@@ -1,7 +1,7 @@
-"""What reflected rays see: followed from surface to surface through the same Gaussians, with the way back.
+"""Reflected rays traced from surface to surface through the same Gaussians, with their backward pass.
 
-:mod:`octasplat.engine.shading.reflection_rays` says how they leave the first surface; from there on paths go
-by plain mirrors.
+:mod:`octasplat.engine.shading.reflection_rays` says how they leave the first surface; from there on they
+are mirrored at the normals.
 """
 
 from collections.abc import Callable
@@ -39,7 +39,7 @@ class IncidentLight(NamedTuple):
 
 @dataclass(frozen=True)
 class ReflectedRays:
-    """Reflected rays and what became of them.
+    """Reflected rays and what they hit.
 
     Attributes:
         trace: what they met.
@@ -67,7 +67,7 @@ class ReflectedRays:
 
 @dataclass(frozen=True)
 class ReflectionTracer:
-    """Follows reflected rays, and goes their ways back.
+    """Trace reflected rays over several bounces.
 
     Attributes:
         tracer: built around the Gaussians, with materials as features.

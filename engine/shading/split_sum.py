@@ -5,7 +5,7 @@
 in linear light, with F0 = 0.04 (1 - m) + m albedo; L are the prefiltered levels of the environment in the
 reflected direction R, E its irradiance over pi, and A, B a table that is integrated here. After "Real Shading
 in Unreal Engine 4" (Karis 2013, https://blog.selfshadow.com/publications/s2013-shading-course/) and
-"Reflective Gaussian Splatting" (https://arxiv.org/abs/2412.19282), whose matt part is another.
+"Reflective Gaussian Splatting" (https://arxiv.org/abs/2412.19282), whose diffuse part is another.
 """
 
 from dataclasses import dataclass

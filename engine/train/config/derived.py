@@ -59,7 +59,7 @@ def uses_shared_sort(config: TrainConfig) -> bool:
 def ray_patch_side_px(config: TrainConfig, longest_side_px: int, pixels_a_gaussian: float) -> int:
     """Return ``config.ray_patch_side``, or where that is 0 what suits the Gaussians or the views.
 
-    A window is to cover a small angle, so that its rays meet the same Gaussians: what these cost once for all
+    A patch is to cover a small angle, so that its rays meet the same Gaussians: what these cost once for all
     rays is most of what rays in one order cost. But rays that are too close learn the same.
     """
     if config.ray_patch_side:

@@ -145,7 +145,7 @@ def initial_scene(dataset: Dataset, config: TrainConfig, *, threads: int = 1) ->
 
     Args:
         dataset: the photographs.
-        config: all knobs.
+        config: all settings of the training.
         threads: work side by side, which changes nothing that is made.
 
     Raises:

@@ -1,6 +1,6 @@
 """Points lifted from pixels, and which of those at swept depths are to be believed.
 
-How they are found is told by :mod:`octasplat.engine.train.initialization.plane_sweep`.
+See :mod:`octasplat.engine.train.initialization.plane_sweep` for how they are found.
 """
 
 from collections.abc import Sequence

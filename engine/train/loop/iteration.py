@@ -1,6 +1,6 @@
-"""One iteration: a batch is traced, developed and compared; gradients go back; everything takes a step.
+"""One iteration of the training.
 
-batch -> trace -> develop -> loss -> reverse -> backward -> steps of the Gaussians and of the shading
+batch -> trace -> shade -> loss -> backward of shading and trace -> steps of the Gaussians and the shading
 """
 
 from collections.abc import Mapping
@@ -25,7 +25,7 @@ MSE_SMOOTHING = 0.98
 
 @dataclass(frozen=True)
 class TrainComponents:
-    """What works on the state."""
+    """Tracer, shading model and densification strategy of a training."""
 
     tracer: Tracer
     shading: ShadingModel
@@ -37,7 +37,7 @@ class LossGradients:
     """A loss on one batch with its gradients.
 
     Attributes:
-        loss: the loss on the developed colours.
+        loss: the loss on the shaded colours.
         gaussians: gradients by the Gaussians' parameters.
         shading: gradients by the shading model's own parameters.
         hits_per_ray: mean number of Gaussians on a ray.

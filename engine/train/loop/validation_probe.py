@@ -72,8 +72,8 @@ def measure_probe(
     rays = dataset.rays(probe.view, probe.y, probe.x)
     result = tracer.trace(rays)
     view = probe.view if find_exposures(shading) is not None else None
-    developed = shading.shade(TracedRays(rays, result, tracer, view))
-    render = np.clip(developed.composite_over(probe.background_srgb), 0, 1)
+    shaded = shading.shade(TracedRays(rays, result, tracer, view))
+    render = np.clip(shaded.composite_over(probe.background_srgb), 0, 1)
     error = ((render - probe.rgb_srgb) ** 2).mean(axis=1) * probe.weight
     count = float(probe.weight.sum(dtype=np.float64))
     psnr = psnr_from_mse(float(error.sum(dtype=np.float64)) / count) if count > 0 else 0.0
@@ -91,7 +91,7 @@ class ValidationProbe:
     Args:
         dataset: the photographs; probes are drawn from it.
         folder: the best state goes here.
-        progress: hears of the held-out views.
+        progress: receives the measures of the held-out views.
         rays: number of rays of a probe.
         background_srgb: what is behind the photographs.
         best_checkpoint_margin_db: the best state is chosen where the last one is so much worse.

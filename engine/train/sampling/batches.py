@@ -1,4 +1,4 @@
-"""Batches of rays: random pixels over all training views, mixed with square patches for SSIM."""
+"""Batches of rays: random pixels over all training views, mixed with whole square patches for SSIM."""
 
 import math
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -35,7 +35,7 @@ class Batch:
     """Rays and what the photographs show there.
 
     The last ``ssim_patch_count * side * side`` rays are patches, row-major one after another.
-    ``ray_patches`` says which of the others stand in windows. ``background_srgb`` lies
+    ``ray_patches`` says which of the others form patches. ``background_srgb`` lies
     behind both the Gaussians and photographs with alpha. ``visibility_rays`` end before points that views
     show.
     """
@@ -201,7 +201,7 @@ class BatchSource:
 
 
 class PrefetchedBatches:
-    """Draws batches, the next one beside whatever else goes on if it is asked for early.
+    """Draw batches; the next one in the background where it is prefetched.
 
     The generator is drawn from in the order of the batches either way, so that they are the same ones.
 

@@ -1,4 +1,4 @@
-"""What training asks of a dataset, and pixels drawn from its views: scattered, in windows, or in patches."""
+"""What training needs of a dataset, and pixels drawn from its views: singly, in ray patches, or in blocks."""
 
 import math
 from typing import Protocol, runtime_checkable
@@ -91,9 +91,9 @@ class PixelSampler:
     ) -> tuple[Int64[np.ndarray, " r"], Int64[np.ndarray, " r"], Int64[np.ndarray, " r"]]:
         """Draw ``rays`` pixels (a square number) in each of ``count`` patches of about ``side`` px a side.
 
-        A window is a grid of cells, one random pixel in each, in the order of
+        A patch is a grid of cells, one random pixel in each, in the order of
         :class:`octasplat.engine.shading.ray_patches.RayPatches`. What sticks out of its view
-        is folded back, so that every pixel is about as likely as any other. Windows are spread over views and
+        is folded back, so that every pixel is about as likely as any other. Patches are spread over views and
         within them, and those of one ``index`` after the other over what those before have left.
         """
         cells = math.isqrt(rays)

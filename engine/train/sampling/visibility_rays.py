@@ -2,7 +2,7 @@
 
 A point was matched in each photograph of its track, so the way there is free. Haze and floaters that
 photographs leave undecided, and whatever fills the gap under a thing that stands on a mirror, are in the way
-of such points. Lines of sight are traced beside the rays of each batch, almost as far as their points,
+of such points. Rays to them are traced beside the rays of each batch, almost as far as their points,
 and what hides these costs.
 """
 
@@ -20,7 +20,7 @@ from octasplat.engine.trace.protocol import Recording, TraceGradients, Tracer
 MIN_TRACK_LENGTH = 3
 """Points in fewer training views may be wrong matches."""
 MAX_ERROR_SIGMAS = 3.0
-"""Sight ends so many standard deviations of its depth before a point."""
+"""A ray ends so many standard deviations of its depth before its point."""
 MIN_ERROR_PX = 0.5
 """No point is placed better than that."""
 

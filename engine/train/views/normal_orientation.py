@@ -32,8 +32,8 @@ def orient_normals(
         gaussians: with a normal each.
         dataset: whose views look at them.
         indices: of these views.
-        tracer: built around the Gaussians, with three features or more; their values do not matter. It has
-            to be told of the change.
+        tracer: built around the Gaussians, with three features or more; their values do not matter. Call its
+            ``refresh`` afterwards.
 
     Returns:
         Numbers of those that were turned, ascending.

@@ -5,7 +5,7 @@ Between iterations each training view is aligned with what the Gaussians show fr
 come nearer by
 turns. What all corrections have in common is taken out, so that held-out views, which keep the poses that are
 given, stay in their places. Poses that are wrong by more than some pixels are not found: steps are small, and
-nothing is looked for. The first Gaussians, near zones, floors on scales, meshes and renders "as the
+nothing is looked for. The first Gaussians, camera clearance, least scales, meshes and renders "as the
 photographs" use the poses that are given, and so do later commands; ``training.json`` has the corrected ones.
 """
 
@@ -161,16 +161,16 @@ class PoseRefiner:
         """Yield each view with what the Gaussians show of a grid of its pixels, where they show a surface."""
         dataset = self.dataset
         for start in range(0, len(indices), VIEWS_PER_TRACE):
-            some = indices[start : start + VIEWS_PER_TRACE]
-            view, y, x = grid_pixels(some, view_sizes_px(dataset), GRID_TILES)
+            part = indices[start : start + VIEWS_PER_TRACE]
+            view, y, x = grid_pixels(part, view_sizes_px(dataset), GRID_TILES)
             rays = dataset.rays(view, y, x)
-            seen = tracer.trace(rays)
-            developed = shading.shade(TracedRays(rays, seen, tracer, view))
-            rgb = np.clip(developed.composite_over(self._background_srgb), 0, 1)
-            met = (seen.depth_median > 0) & (seen.alpha >= MIN_ALPHA)
-            points_world = seen.depth_median[:, None].astype(np.float64) * rays.directions_world
-            for index in some.tolist():
-                chosen = met & (view == index)
+            result = tracer.trace(rays)
+            shaded = shading.shade(TracedRays(rays, result, tracer, view))
+            rgb = np.clip(shaded.composite_over(self._background_srgb), 0, 1)
+            has_surface = (result.depth_median > 0) & (result.alpha >= MIN_ALPHA)
+            points_world = result.depth_median[:, None].astype(np.float64) * rays.directions_world
+            for index in part.tolist():
+                chosen = has_surface & (view == index)
                 points = rotate_vectors(points_world[chosen], dataset.views[index].rotation_cam_from_world)
                 yield index, RenderedPoints(points, rgb[chosen].astype(np.float64))
 

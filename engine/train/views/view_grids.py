@@ -55,14 +55,12 @@ def render_grids(
         exposed: as exposed as each view is; else as the mean exposure shows the scene.
     """
     for start in range(0, len(indices), VIEWS_PER_TRACE):
-        some = indices[start : start + VIEWS_PER_TRACE]
-        pixels = grid_pixels(some, view_sizes_px(dataset), tiles)
+        part = indices[start : start + VIEWS_PER_TRACE]
+        pixels = grid_pixels(part, view_sizes_px(dataset), tiles)
         rays = dataset.rays(*pixels)
-        developed = shading.shade(
-            TracedRays(rays, tracer.trace(rays), tracer, pixels[0] if exposed else None)
-        )
-        shown = np.clip(developed.composite_over(background_srgb), 0, 1)
-        yield RenderedGrids(pixels, shown.reshape(len(some), -1, 3))
+        shaded = shading.shade(TracedRays(rays, tracer.trace(rays), tracer, pixels[0] if exposed else None))
+        rendered = np.clip(shaded.composite_over(background_srgb), 0, 1)
+        yield RenderedGrids(pixels, rendered.reshape(len(part), -1, 3))
 
 
 def estimate_untrained_exposures(
