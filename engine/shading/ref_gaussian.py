@@ -3,7 +3,7 @@
 "Reflective Gaussian Splatting" (https://arxiv.org/abs/2412.19282). Other than octasplat's own model: the
 diffuse part is a colour of its own from the harmonics, the environment stays in [0, 1], everything is in
 display values, visibility is yes or no, and materials start over when deferred shading begins. Not the same
-as there: first normals and visibility come from flat Gaussians, not from a mesh.
+as there: the first stage shades pixels, not Gaussians, and visibility comes from the Gaussians, not a mesh.
 """
 
 from collections.abc import Mapping
