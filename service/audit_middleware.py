@@ -1,4 +1,4 @@
-"""Who did what: each change that is asked for goes into the table before its answer is given."""
+"""Middleware that writes each requested change to the audit log before the response is sent."""
 
 import logging
 from typing import TYPE_CHECKING

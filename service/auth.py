@@ -39,7 +39,7 @@ _cookie = APIKeyCookie(
 
 @dataclass(frozen=True)
 class Principal:
-    """Who asks.
+    """The authenticated caller of a request.
 
     Attributes:
         owner: whose things they see and make.
@@ -59,7 +59,7 @@ class Principal:
 
     @property
     def visible_owner(self) -> str | None:
-        """Whose things are listed; None lists everybody's."""
+        """Return the owner whose rows are listed; None lists all owners."""
         return None if self.may("admin") else self.owner
 
     def may_see(self, owner: str) -> bool:
@@ -73,7 +73,7 @@ async def authenticate(
     bearer: Annotated[HTTPAuthorizationCredentials | None, Security(_bearer)],
     _described: Annotated[str | None, Security(_cookie)],
 ) -> Principal:
-    """Who asks.
+    """Return the principal of a request.
 
     Raises:
         ProblemError: 401 without a valid token or session where one is needed, 403 for what came through a
@@ -134,7 +134,7 @@ def session_secret(request: Request) -> str | None:
 
 
 async def principal_of_session(service: Service, secret: str) -> Principal | None:
-    """Who has the session of that secret, or None if it is over."""
+    """Return the principal of the session with that secret; None if it has expired."""
     async with service.pool.connection() as connection:
         session = await find_session(connection, secret)
         token = None if session is None else await get_token(connection, session.token_id)

@@ -37,7 +37,7 @@ class EventBroker:
 
     @property
     def is_closing(self) -> bool:
-        """Whether streams should end."""
+        """Return whether streams should end."""
         return self._closing.is_set()
 
     def close(self) -> None:

@@ -1,4 +1,4 @@
-"""What a job asks for, against the ceilings of the service; and what it will take."""
+"""Resource demands of a job, its check against the limits of the service, and its estimate."""
 
 import os
 from collections.abc import Mapping, Sequence

@@ -54,7 +54,7 @@ class _FixedCollector(Collector):
         self._metrics = list(metrics)
 
     def collect(self) -> Iterator[Metric]:
-        """They."""
+        """Yield the metrics that were given."""
         yield from self._metrics
 
 

@@ -93,7 +93,7 @@ class ProblemError(Exception):
             self.headers["Retry-After"] = str(retry_seconds)
 
     def response(self) -> JSONResponse:
-        """Return the answer."""
+        """Return the problem as a JSON response (RFC 9457)."""
         content: dict[str, Any] = {
             "type": TYPE_PREFIX + self.code,
             "title": HTTPStatus(self.status).phrase,

@@ -1,4 +1,4 @@
-"""What the workers that live can do for a job, and what its owner should know about that."""
+"""Live workers of a queue: which can run a job, and the notes for its owner."""
 
 from collections.abc import Sequence
 from pathlib import Path

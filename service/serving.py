@@ -40,7 +40,7 @@ class _FrontEndServer(uvicorn.Server):
             sys.stdout.flush()
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
-        """Stop."""
+        """Drain the service, close its event streams, and stop the server."""
         state = getattr(self.config.loaded_app, "state", None)
         service = getattr(state, "service", None)
         if service is not None:
@@ -95,7 +95,7 @@ def main() -> int:
 
 
 def _startup_error(app: FastAPI) -> OctasplatError | None:
-    """Why the application did not start, if it could say so; a traceback would add nothing."""
+    """Return the error that kept the application from starting, if it is one for users; else None."""
     failure: OctasplatError | None = getattr(app.state, "failure", None)
     return failure
 

@@ -86,7 +86,7 @@ class ServiceSettings(WorkerSettings):
 
     @property
     def is_private(self) -> bool:
-        """Whether only this machine can reach the service."""
+        """Return whether the service can be reached from this machine only."""
         if self.host == "localhost":
             return True
         try:
@@ -96,7 +96,7 @@ class ServiceSettings(WorkerSettings):
 
     @property
     def quota(self) -> Quota:
-        """What an owner may take who has no limits of their own."""
+        """Return the default quota of an owner."""
         return Quota(self.quota_bytes, self.quota_datasets, self.quota_jobs)
 
     @property
@@ -114,7 +114,7 @@ class ServiceSettings(WorkerSettings):
         return DatasetLimits(model=ModelLimits(hidden=self.own_folders))
 
     def spool(self) -> SpoolSpace:
-        """Room for archives."""
+        """Return the spool folder for uploaded archives, with its limits."""
         folder = self.work_folder / "archives"
         return SpoolSpace(folder, max_bytes=self.max_spool_bytes, floor_bytes=self.floor_bytes)
 

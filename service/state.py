@@ -1,4 +1,4 @@
-"""What all requests share."""
+"""State that all requests share."""
 
 import asyncio
 import time

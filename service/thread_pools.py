@@ -12,7 +12,7 @@ T = TypeVar("T")
 
 
 class ThreadPurpose(Enum):
-    """What threads are for."""
+    """Purposes that have a thread pool of their own."""
 
     UPLOADS = auto()
     """Writing what is sent, and looking at its headers."""

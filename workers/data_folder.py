@@ -1,4 +1,4 @@
-"""Where one machine keeps everything, and what ``octasplat serve`` tells other programs there."""
+"""Data folder of this machine, and the file in which ``octasplat serve`` publishes its address."""
 
 import os
 from pathlib import Path

@@ -33,7 +33,7 @@ SettingsT = TypeVar("SettingsT", bound="WorkerSettings")
 
 @dataclass(frozen=True)
 class Retention:
-    """How long things are kept, in hours; 0 keeps them for ever.
+    """Retention times in hours; 0 keeps for ever.
 
     Attributes:
         jobs_hours: finished jobs with their results and checkpoints, from their end.
@@ -126,12 +126,12 @@ class WorkerSettings(BaseSettings):
 
     @property
     def storage_address(self) -> str:
-        """What :func:`octasplat.workers.storage.factory.open_storage` takes."""
+        """Return the address for :func:`octasplat.workers.storage.factory.open_storage`."""
         return self.storage or str(self.data.absolute() / "store")
 
     @property
     def work_folder(self) -> Path:
-        """Where work under way lies."""
+        """Return the folder for work in progress."""
         return (self.work or self.data / "work").absolute()
 
     @property
@@ -143,7 +143,7 @@ class WorkerSettings(BaseSettings):
 
     @property
     def retention(self) -> Retention:
-        """How long things are kept."""
+        """Return the retention times."""
         return Retention(
             jobs_hours=self.keep_jobs_hours,
             jobs_hours_by_kind=self.keep_jobs_hours_by_kind,

@@ -1,1 +1,1 @@
-"""What all parts of the engine use: errors, events, rays, colors, threads, compilation, and writing files."""
+"""Shared foundations of the engine: errors, events, rays, colors, threads, compilation and file writing."""

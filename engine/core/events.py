@@ -22,7 +22,7 @@ class Event:
     kind: ClassVar[str] = "event"
 
     def as_dict(self) -> dict[str, object]:
-        """The event as JSON-ready values, its kind included."""
+        """Return the event as JSON-ready values, including its kind."""
         return {"kind": self.kind, **asdict(self)}
 
 
@@ -142,7 +142,7 @@ EventListener = Callable[[Event], None]
 
 
 def parse_event(kind: str, content: Mapping[str, Any]) -> Event | None:
-    """The event that was written as JSON; None if there is no such kind, or it lacks something."""
+    """Return the event that was written as JSON; None for an unknown kind or missing fields."""
     model = EVENT_KINDS.get(kind)
     if model is None or not {f.name for f in fields(model) if f.default is MISSING} <= content.keys():
         return None
@@ -150,7 +150,7 @@ def parse_event(kind: str, content: Mapping[str, Any]) -> Event | None:
 
 
 def ignore_events(_event: Event) -> None:
-    """A listener that listens to nothing."""
+    """Discard an event: the listener of callers who want no progress."""
 
 
 def broadcast(listeners: Iterable[EventListener]) -> EventListener:

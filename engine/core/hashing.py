@@ -13,7 +13,7 @@ def hashed_uniforms(*keys: UInt64[np.ndarray, " n"]) -> Float64[np.ndarray, "2 n
 
 
 def splitmix64(x: UInt64[np.ndarray, " n"]) -> UInt64[np.ndarray, " n"]:
-    """A step of SplitMix64, "Fast Splittable Pseudorandom Number Generators" (Steele et al. 2014)."""
+    """Apply one step of SplitMix64, "Fast Splittable Pseudorandom Number Generators" (Steele et al. 2014)."""
     x = x + np.uint64(0x9E3779B97F4A7C15)
     x = (x ^ (x >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     x = (x ^ (x >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)

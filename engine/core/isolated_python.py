@@ -19,7 +19,7 @@ _FLAGS = ("-E", "-P")
 
 
 def python_command(module: str, *arguments: str, further_modules: Sequence[str] = ()) -> tuple[str, ...]:
-    """The command that runs a module of ours in a process of its own, in whatever folder that starts.
+    """Return the command that runs a module of octasplat in a process of its own, from any working folder.
 
     Args:
         module: what ``python -m`` would be told.
@@ -41,12 +41,12 @@ def python_command(module: str, *arguments: str, further_modules: Sequence[str] 
 
 
 def drop_python_variables(environment: Mapping[str, str]) -> dict[str, str]:
-    """The environment without what steers Python, for processes whose own children are Python as well."""
+    """Return the environment without ``PYTHON*`` variables, for processes that start Python themselves."""
     return {name: value for name, value in environment.items() if not name.startswith("PYTHON")}
 
 
 def _folder_of(module: str) -> str:
-    """The folder from which a module is imported, or nothing where there is no such module or folder."""
+    """Return the folder from which a module is imported; empty if there is no such module or folder."""
     try:
         spec = importlib.util.find_spec(module)
     except (ImportError, ValueError):

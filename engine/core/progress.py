@@ -49,11 +49,11 @@ class PhaseClock:
         self._began -= earlier_seconds
 
     def seconds(self) -> float:
-        """The seconds until now, or until it was stopped."""
+        """Return the seconds until now, or until the clock was stopped."""
         return time.perf_counter() - self._began if self._stopped is None else self._stopped
 
     def stop(self) -> float:
-        """The seconds, which are the same from now on: a time told twice is to be one figure."""
+        """Stop the clock and return its seconds; :meth:`seconds` returns the same figure from now on."""
         self._stopped = self.seconds()
         return self._stopped
 
@@ -69,10 +69,16 @@ def phase(name: str, progress: EventListener, steps: int = 0) -> Iterator[PhaseC
 
 @runtime_checkable
 class ProgressCallback(Protocol):
-    """Told how many steps of a stage are done, of how many, and what share of the next one."""
+    """Receives how many steps of a stage are done, of how many, and what share of the next one."""
 
     def __call__(self, done: int, total: int, part: float = 0.0) -> None:
-        """Hear it."""
+        """Report progress.
+
+        Args:
+            done: steps that are done.
+            total: steps of the stage.
+            part: share of the next step that is done, from 0 to 1.
+        """
 
 
 @contextmanager
@@ -89,7 +95,7 @@ def counted_phase(name: str, progress: EventListener, steps: int = 0) -> Iterato
 def stop_when_asked(
     progress: EventListener, should_stop: Callable[[], bool], message: str | None = None
 ) -> EventListener:
-    """``progress``, but stopping the work at its next event if so asked; training does it by itself.
+    """Return ``progress`` with a check at each event that stops the work when ``should_stop`` is true.
 
     The returned listener raises :class:`octasplat.engine.core.errors.CancelledError` with ``message``, or
     one that names the stage.

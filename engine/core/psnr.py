@@ -1,4 +1,4 @@
-"""How near a picture comes to another: PSNR, as it is and with the exposure left out."""
+"""PSNR of an image against a reference, plain and after a fit of exposure and color."""
 
 import numpy as np
 from jaxtyping import Float32
@@ -35,9 +35,10 @@ def fit_color(
     reference: Float32[np.ndarray, "*shape 3"],
     weight: Float32[np.ndarray, "*shape"],
 ) -> Float32[np.ndarray, "*shape 3"]:
-    """The render under the gain and offset of each channel that come closest to the reference.
+    """Return the render under the gain and offset per channel that bring it closest to the reference.
 
-    Weighted least squares, then cut to [0, 1]; without a pixel that counts, the render as it is.
+    Weighted least squares, clipped to [0, 1]. Without a pixel of positive weight the render is returned
+    unchanged.
     """
     corrected = render.copy()
     if weight.sum(dtype=np.float64) <= 0:

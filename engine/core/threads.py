@@ -1,4 +1,4 @@
-"""How many threads the libraries below may take: numba's kernels, torch, and through the tracer Embree."""
+"""Thread limits of the libraries below: numba's kernels, torch, and Embree through the tracer."""
 
 import os
 from collections.abc import Iterator

@@ -1,4 +1,4 @@
-"""What was photographed: COLMAP models, cameras as rays, pixels in a mapped cache, masks and the split.
+"""Photographs and their cameras: COLMAP models, rays, pixels in a mapped cache, masks and the test split.
 
 This package knows nothing of Gaussians. :class:`Dataset` is what training and evaluation read.
 """

@@ -39,7 +39,7 @@ class Camera:
 
     @property
     def is_pinhole(self) -> bool:
-        """Whether rays follow from focal lengths and principal point alone."""
+        """Return whether focal lengths and principal point alone determine the rays."""
         return self.model in ("SIMPLE_PINHOLE", "PINHOLE")
 
     @property
@@ -67,17 +67,17 @@ class Camera:
 
     @property
     def is_panorama(self) -> bool:
-        """Whether the picture shows the whole sphere; all other models show only what lies ahead."""
+        """Return whether the image covers the whole sphere; other models cover only what lies ahead."""
         return self.model == "EQUIRECTANGULAR"
 
     def to_pycolmap(self) -> pycolmap.Camera:
-        """The same camera as an object of pycolmap."""
+        """Return the camera as a ``pycolmap.Camera``."""
         return pycolmap.Camera(
             model=self.model, width=self.width_px, height=self.height_px, params=list(self.params)
         )
 
     def scaled_to(self, width_px: int, height_px: int) -> "Camera":
-        """The camera of the same photograph resized to another size, with the exact ratio along each axis.
+        """Return the camera of the same photograph resized, with the exact ratio along each axis.
 
         A model with one focal length turns into its sibling with two where the ratios differ.
         """
@@ -96,7 +96,7 @@ class Camera:
         return Camera(camera.model_name, tuple(float(p) for p in camera.params), width_px, height_px)
 
     def directions_cam(self, xy_px: Float64[np.ndarray, "n 2"]) -> Float64[np.ndarray, "n 3"]:
-        """Unit directions through image points, in camera coordinates.
+        """Return unit directions through image points, in camera coordinates.
 
         Args:
             xy_px: image points; the centre of the pixel in column x and row y is (x + 0.5, y + 0.5).

@@ -1,4 +1,4 @@
-"""How near to each camera things can stand, as the sparse points around it show.
+"""Free space around each camera, estimated from the sparse points.
 
 Where a camera stood was room for it, and for some way around. A Gaussian there is seen closely by few
 photographs or by none, but hangs as a veil before views from the places between them.
@@ -20,7 +20,7 @@ NEAREST_QUANTILE = 10
 
 
 def camera_clearances(viewpoints: Viewpoints, points: SparsePoints) -> Float64[np.ndarray, " v"]:
-    """The distance from each camera at which the sparse points begin, world units; 0 where too few say.
+    """Return the radius of free space around each camera in world units; 0 where there are too few points.
 
     In any direction: what stands behind a camera, other photographs show. A tree trunk before a house has few
     of all points, so that a share of them would pass it over.
@@ -48,15 +48,15 @@ class CameraClearance:
     def from_views(
         cls, viewpoints: Viewpoints, radii: Float64[np.ndarray, " v"], which: Int64[np.ndarray, " t"]
     ) -> "CameraClearance":
-        """The zones of the views ``which`` of a scene; ``radii`` are those of all its views."""
+        """Return the free space around the views ``which``; ``radii`` has one row for each view."""
         return cls([viewpoints.views[i] for i in which.tolist()], radii[which])
 
     def scaled(self, times: float) -> "CameraClearance":
-        """The same with balls so many times as large."""
+        """Return the same zones with their radii multiplied by ``times``."""
         return CameraClearance(self.views, self.radii * times)
 
     def contains(self, xyz_world: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
-        """Whether points lie in any of the zones."""
+        """Return whether each point lies in any of the zones."""
         inside = np.zeros(len(xyz_world), np.bool_)
         around = np.flatnonzero(self.radii > 0)
         if len(xyz_world) == 0 or len(around) == 0:

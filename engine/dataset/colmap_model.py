@@ -52,7 +52,7 @@ class PosedImage:
 
 @dataclass(frozen=True, eq=False)
 class ColmapModel:
-    """What a COLMAP model says, checked to be finite.
+    """The content of a COLMAP model, checked to be finite.
 
     Attributes:
         folder: where it was read from.
@@ -329,7 +329,7 @@ def _sparse_points(
 
 
 def _declared_point_count(path: Path) -> int | None:
-    """The count that COLMAP writes into the comment at the head of a text file, if it is there."""
+    """Return the point count from the header comment of a text file; None if there is none."""
     if not path.is_file():
         return None
     with path.open(encoding="utf-8", errors="replace") as lines:

@@ -17,7 +17,7 @@ _NUMERIC_FIELDS = {
 
 
 def find_text_model_error(folder: Path) -> str | None:
-    """The first number of a text model that is none, in a sentence that names its file, line and image.
+    """Return a sentence on the first invalid number of a text model, with its file, line and image.
 
     Args:
         folder: of the model.
@@ -63,7 +63,7 @@ def _find_invalid_number(texts: Sequence[str]) -> str | None:
 
 
 def _describe_line(part: str, parts: list[str], names: dict[str, str]) -> tuple[str, str]:
-    """What a line describes, and what to do about it."""
+    """Return what a line describes, and what the user can do about it."""
     if part == "cameras":
         return f"camera {parts[0]}", "mend the line or run COLMAP again"
     if part == "points3D":

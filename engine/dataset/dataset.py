@@ -229,7 +229,7 @@ class Dataset:
 
     @property
     def viewpoints(self) -> Viewpoints:
-        """Where all of them were taken from, and through which lenses."""
+        """Return the poses and cameras of all views."""
         return Viewpoints(self.views, self.cameras)
 
     @property
@@ -245,7 +245,7 @@ class Dataset:
     def rays(
         self, view: Int[np.ndarray, " n"], y: Int[np.ndarray, " n"], x: Int[np.ndarray, " n"]
     ) -> RayBatch:
-        """The unit rays through pixel centres.
+        """Return the unit rays through pixel centres.
 
         A pixel that its camera model cannot un-project looks along the axis of the camera; :meth:`pixels`
         gives it the weight 0.

@@ -1,4 +1,4 @@
-"""What the header of an image tells, apart from what reads it and needs more libraries."""
+"""Properties read from an image header, apart from their reader, which needs more libraries."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -9,7 +9,7 @@ Storage = Literal["8-bit", "16-bit", "float", "radiance"]
 
 @dataclass(frozen=True)
 class ImageInfo:
-    """What the header of an image file tells.
+    """Properties read from the header of an image file.
 
     Attributes:
         width_px: width as stored; an EXIF orientation is not applied, as in COLMAP.

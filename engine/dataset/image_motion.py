@@ -1,4 +1,4 @@
-"""How points move in a picture when its camera moves a little."""
+"""Image motion: derivatives of projected points with respect to the pose of a camera."""
 
 import numpy as np
 from jaxtyping import Float64
@@ -12,7 +12,7 @@ DEPTH_STEP_RATIO = 1e-4
 def image_motion_by_pose(
     points_cam: Float64[np.ndarray, "n 3"], camera: Camera, depth: float
 ) -> Float64[np.ndarray, "n 2 6"]:
-    """How points move in the picture (px) by a rotation of the camera's points (rad) and a shift in depths.
+    """Return the image motion (px) by a rotation (rad) of the points and a translation in units of ``depth``.
 
     Args:
         points_cam: the points in camera coordinates.

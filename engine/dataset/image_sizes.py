@@ -1,4 +1,4 @@
-"""How large the photographs of a dataset are."""
+"""Working sizes of the photographs of a dataset."""
 
 from dataclasses import dataclass
 

@@ -23,7 +23,7 @@ _EXTRA_SAMPLES = 338
 
 @dataclass(frozen=True)
 class ValueScale:
-    """What stored values of a kind of photographs mean.
+    """The meaning of the stored values of photographs of one storage.
 
     Attributes:
         full: the stored value of full brightness.
@@ -197,7 +197,7 @@ def _is_tiff(spec: Any) -> bool:
 
 
 def _has_extra_samples(path: Path) -> bool:
-    """Whether the TIFF says what its further channels are; OpenImageIO takes a fourth one as alpha anyway."""
+    """Return whether a TIFF declares its extra channels; OpenImageIO takes a fourth one as alpha anyway."""
     try:
         with path.open("rb") as file:
             head = file.read(8)

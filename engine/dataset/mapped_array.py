@@ -34,7 +34,7 @@ class MappedArray:
 
     @classmethod
     def empty(cls, dtype: Any) -> "MappedArray":
-        """An array without values that stands for a file that is not there."""
+        """Return an array without values that stands for a missing file."""
         values = np.zeros(0, dtype=dtype)
         values.flags.writeable = False  # the same compiled kernels as for mapped files
         return cls(values)

@@ -23,7 +23,7 @@ _COLOURED = 16
 
 @dataclass(frozen=True)
 class MaskSummary:
-    """What a mask holds, as far as it tells whether it is one.
+    """Value statistics of a mask, from which unusable masks are recognised.
 
     Attributes:
         path: the file.
@@ -37,7 +37,7 @@ class MaskSummary:
 
     @property
     def is_all_invalid(self) -> bool:
-        """Whether no pixel is valid."""
+        """Return whether no pixel is valid."""
         return self.brightest < _VALID
 
 

@@ -1,4 +1,4 @@
-"""What a photographed scene is made of, as plain records without pixels."""
+"""Records of a photographed dataset without its pixels: views, sparse points, observations and split."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,7 +13,7 @@ from octasplat.engine.dataset.image_info import ImageInfo
 
 @dataclass(frozen=True, eq=False)
 class PosedView:
-    """Where one photograph was taken from, at its working size; all of it but the photograph.
+    """Name, pose and working size of one photograph.
 
     Attributes:
         name: name in the COLMAP model, relative to ``images/``, with forward slashes.
@@ -74,7 +74,7 @@ class SparsePoints:
 
 @dataclass(frozen=True, eq=False)
 class Observations:
-    """Which photograph shows which sparse point, and where.
+    """Observations of sparse points in photographs: one row for each pair of view and point.
 
     Attributes:
         view: index of the view.
@@ -92,7 +92,7 @@ class Observations:
 
 @dataclass(frozen=True, eq=False)
 class Viewpoints:
-    """Where photographs were taken from, and through which lenses.
+    """Poses and cameras of a set of photographs.
 
     Attributes:
         views: sorted by name.

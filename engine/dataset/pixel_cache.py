@@ -166,7 +166,7 @@ def _sha256(path: Path) -> str:
 
 
 def _read_index(folder: Path, pixels: int) -> _Index | None:
-    """The index, if it is of this version and the files are as long as it and the count of pixels say."""
+    """Return the index if its version and the sizes of its files are as expected; else None."""
     try:
         index: _Index = json.loads((folder / "pixels.json").read_text(encoding="utf-8"))
         expected = {"rgb.bin": 3 * pixels * index["bits"] // 8}

@@ -91,7 +91,7 @@ def open_ray_tables(cameras: Sequence[Camera], folder: Path, max_bytes: int = MA
 
 
 def rows_per_block(width_px: int) -> int:
-    """How many rows to work on at a time so that scratch memory stays at a few megabytes."""
+    """Return how many rows to process at a time so that scratch memory stays at a few megabytes."""
     return max(1, _PIXELS_PER_BLOCK // width_px)
 
 
@@ -102,7 +102,7 @@ def pixel_centres(width_px: int, first_row: int, end_row: int) -> Float64[np.nda
 
 
 def has_rays_everywhere(camera: Camera) -> bool:
-    """Whether ``camera`` has a ray for each point of a grid over its image, corners included."""
+    """Return whether ``camera`` has a ray for each point of a grid over its image, corners included."""
     x = np.linspace(0.5, camera.width_px - 0.5, 16)
     y = np.linspace(0.5, camera.height_px - 0.5, 16)
     grid = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)

@@ -1,4 +1,4 @@
-"""Which photographs are held out from training."""
+"""Split of the photographs into training views and held-out test views."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -18,7 +18,7 @@ def split_views(
     *,
     source_name: str = "model",
 ) -> tuple[Int64[np.ndarray, " train"], Int64[np.ndarray, " test"]]:
-    """Indices of the training and of the held-out views.
+    """Return the indices of the training views and of the held-out views.
 
     Args:
         names: names of the views, sorted.
@@ -51,7 +51,7 @@ def split_views(
 def evaluation_split(
     names: Sequence[str],
 ) -> tuple[Int64[np.ndarray, " train"], Int64[np.ndarray, " test"]]:
-    """The split of photographs that are only measured: none to train on, all held out."""
+    """Return the split for photographs that are only evaluated: no training views, all held out."""
     return np.zeros(0, np.int64), np.arange(len(names), dtype=np.int64)
 
 

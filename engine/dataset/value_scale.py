@@ -1,4 +1,4 @@
-"""What the numbers in photographs mean where they do not fill the range that their format has.
+"""Scale of photographs whose values do not fill the range of their file format.
 
 Files of 16 bits may hold 12, floating-point files integers, and radiance may be of any exposure. All
 photographs of one storage share one scale, so that they stay comparable.

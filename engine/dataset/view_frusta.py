@@ -1,4 +1,4 @@
-"""What the photographs show of space: which points lie in a view's picture."""
+"""View frusta: tests of which points lie in the image of a view."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -24,11 +24,11 @@ class ViewFrusta:
 
     @classmethod
     def from_views(cls, viewpoints: Viewpoints, which: Int64[np.ndarray, " t"]) -> "ViewFrusta":
-        """The space that the views ``which`` of a scene show."""
+        """Return the frusta of the views ``which`` of a dataset."""
         return cls([viewpoints.views[i] for i in which.tolist()], viewpoints.cameras)
 
     def contains(self, xyz_world: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
-        """Whether points lie in any of the pyramids."""
+        """Return whether each point lies in any of the frusta."""
         inside = np.zeros(len(xyz_world), np.bool_)
         for view in self.views:
             left = np.flatnonzero(~inside)
@@ -40,7 +40,7 @@ class ViewFrusta:
 
 
 def cam_from_world(xyz_world: Float64[np.ndarray, "n 3"], view: PosedView) -> Float64[np.ndarray, "n 3"]:
-    """Camera coordinates."""
+    """Transform world points to the camera coordinates of ``view``."""
     return rotate_vectors(xyz_world, view.rotation_cam_from_world) + view.translation_cam_from_world
 
 

@@ -114,11 +114,11 @@ class ViewsRecord(_FrozenModel):
         return self
 
     def fingerprint(self) -> str:
-        """Names the content."""
+        """Return the SHA-256 of the record's JSON."""
         return hashlib.sha256(self.model_dump_json().encode()).hexdigest()
 
     def viewpoints(self, max_side: int | None) -> SplitViewpoints:
-        """The viewpoints at the size that ``max_side`` (px) gives the photographs; None keeps theirs."""
+        """Return the viewpoints for photographs capped to ``max_side`` (px); None keeps their size."""
         cameras: dict[Camera, int] = {}
         views = []
         for row in self.views:
@@ -155,7 +155,7 @@ class ViewsRecord(_FrozenModel):
     def transformed(
         self, scale: float, turn: Float[np.ndarray, "3 3"], shift_world: Float[np.ndarray, "3"]
     ) -> "ViewsRecord":
-        """The same views of a world that was turned, scaled and then shifted: they show the same pictures."""
+        """Return the views in a world that was rotated, scaled and then shifted; the images stay the same."""
         views = []
         for row in self.views:
             rotation = np.array(row.rotation_cam_from_world) @ turn.T
@@ -168,7 +168,7 @@ class ViewsRecord(_FrozenModel):
         return self.model_copy(update={"extent_world": scale * self.extent_world, "views": tuple(views)})
 
     def difference(self, other: "ViewsRecord") -> str | None:
-        """What ``other`` has otherwise, in a few words; None if nothing."""
+        """Describe in a few words how ``other`` differs; None if it does not."""
         mine, others = {view.name: view for view in self.views}, {view.name: view for view in other.views}
         if mine.keys() != others.keys():
             missing, added = sorted(mine.keys() - others.keys()), sorted(others.keys() - mine.keys())
@@ -221,7 +221,7 @@ class ViewsRecord(_FrozenModel):
         return apart > _ADJUSTED * self.extent_world or float(np.abs(turns[0] - turns[1]).max()) > _ADJUSTED
 
     def _compared_values(self, view: _ViewEntry) -> dict[str, object]:
-        """What is compared of a view, by its name."""
+        """Return the values of a view that :meth:`difference` compares, by name."""
         return {
             "file": view.photograph_sha256,
             "mask": view.mask_sha256,
@@ -233,7 +233,7 @@ class ViewsRecord(_FrozenModel):
 def views_record(
     model: DatasetModel, digests: Sequence[FileDigests], test_indices: Int64[np.ndarray, " test"]
 ) -> ViewsRecord:
-    """The record of a scene and its split.
+    """Return the record of a dataset and its split.
 
     Args:
         model: the scene.
@@ -274,13 +274,13 @@ def views_record(
 def scene_viewpoints(
     model: DatasetModel, test_every: int, held_out: Sequence[str] | None = None
 ) -> SplitViewpoints:
-    """The viewpoints of a scene whose photographs are at hand, split as by :func:`split_views`."""
+    """Return the viewpoints of a loaded dataset, split as by :func:`split_views`."""
     train, test = split_views([view.name for view in model.views], test_every, held_out)
     return SplitViewpoints(model.views, model.cameras, train, test, _extent(model, train))
 
 
 def write_views(path: Path, record: ViewsRecord) -> None:
-    """Write ``views.json``, atomically."""
+    """Write the record to ``path`` (``views.json``) atomically."""
     write_text(path, record.model_dump_json(indent=1) + "\n")
 
 

@@ -32,7 +32,7 @@ _Sphere = tuple[FiniteFloat, FiniteFloat, FiniteFloat, FiniteFloat]
 
 
 class Selection(BaseModel):
-    """Which Gaussians are selected: those for which all given conditions hold."""
+    """Selection of Gaussians: those for which all given conditions hold."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -149,7 +149,7 @@ class MaterialFactors(_ChannelValues):
 
 
 class MaterialChange(BaseModel):
-    """Changes of materials."""
+    """Changes of the materials of the selected Gaussians."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -180,7 +180,7 @@ class MaterialChange(BaseModel):
 
 
 class MeshToGaussiansOptions(BaseModel):
-    """How an edited mesh becomes Gaussians."""
+    """Options of the conversion of an edited mesh to Gaussians."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -220,7 +220,7 @@ class MeshToGaussiansOptions(BaseModel):
 
 
 class CleanupOptions(BaseModel):
-    """What to remove of a scene."""
+    """Options of what to remove from a scene."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 

@@ -1,1 +1,1 @@
-"""How good a reconstruction is: image metrics, per-view results and the report page."""
+"""Evaluation of a reconstruction: image metrics, results per view and the report page."""

@@ -111,7 +111,7 @@ def training_charts(events: Sequence[Row]) -> list[Chart]:
 def training_values(
     events: Sequence[Row], kind: str, key: str, x_key: str = "seconds"
 ) -> list[tuple[float, float]]:
-    """What the events of one kind say of a training.
+    """Return one value of a training over time, from its event rows.
 
     Args:
         events: Rows of ``events.jsonl``. Where a resumed run repeats an iteration, the later row counts.
@@ -134,7 +134,7 @@ def training_values(
 
 
 def format_axis_duration(seconds: float) -> str:
-    """A time span for people: ``8.2 s``, ``4 min 10 s``, ``2 h 05 min``."""
+    """Format a duration for an axis: ``8.2 s``, ``4 min 10 s``, ``2 h 05 min``."""
     if seconds < 60:
         return f"{seconds:.1f} s" if 0 < seconds < 10 else f"{seconds:.0f} s"
     minutes, rest = divmod(round(seconds), 60)
@@ -144,7 +144,7 @@ def format_axis_duration(seconds: float) -> str:
 
 
 def format_axis_number(value: float) -> str:
-    """A number for an axis: ``1500`` as ``1.5 k``, ``2000000`` as ``2 M``."""
+    """Format a number for an axis: ``1500`` as ``1.5 k``, ``2000000`` as ``2 M``."""
     for size, suffix in ((1e9, " G"), (1e6, " M"), (1e3, " k")):
         if abs(value) >= size:
             return f"{value / size:.4g}{suffix}"
@@ -201,7 +201,7 @@ def _chart(
 
 
 def _padded_range(low: float, high: float) -> tuple[float, float]:
-    """A range with some width, so that a single value can be drawn."""
+    """Return the range widened where it is empty, so that a single value can be drawn."""
     if high > low:
         return low, high
     half = abs(low) * 0.1 or 1.0

@@ -32,7 +32,7 @@ MAGMA = np.array(
 
 @dataclass(frozen=True)
 class ViewImages:
-    """What the report shows of one view: display values, the FLIP error per pixel, and layers by name."""
+    """Images of one view for the report: display values, the FLIP error per pixel, and layers by name."""
 
     photograph: Float32[np.ndarray, "h w 3"]
     render: Float32[np.ndarray, "h w 3"]
@@ -40,7 +40,7 @@ class ViewImages:
     layers: Mapping[str, Float32[np.ndarray, "h w 3"]] = field(default_factory=dict)
 
     def downscale(self, max_side_px: int = MAX_SIDE_PX) -> "ViewImages":
-        """The same at most ``max_side_px`` wide and high."""
+        """Return the images downscaled to at most ``max_side_px`` in width and height."""
         return ViewImages(
             shrink_to(self.photograph, max_side_px),
             shrink_to(self.render, max_side_px),
@@ -83,7 +83,7 @@ class WorstAndBestViews(Mapping[str, ViewImages]):
 
 
 def embedded_names(worst_first: list[str], images: Mapping[str, ViewImages]) -> list[str]:
-    """The views to embed: all that have images, or the 12 worst and 4 best of them when there are more."""
+    """Return the views to embed: all that have images, or the 12 worst and 4 best if there are more."""
     known = [name for name in worst_first if name in images]
     return known if len(known) <= WORST_COUNT + BEST_COUNT else [*known[:WORST_COUNT], *known[-BEST_COUNT:]]
 
@@ -95,7 +95,7 @@ def magma(values: Float32[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w 3"]:
 
 
 def webp_data_uri(image: Float32[np.ndarray, "h w 3"]) -> str:
-    """The image as a WebP data URI, for a page without other files."""
+    """Return the image as a WebP data URI, for a page without other files."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "image.webp"
         write_webp(path, image, quality=WEBP_QUALITY)

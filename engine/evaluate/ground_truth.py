@@ -90,7 +90,7 @@ class GroundTruthFile(_Part):
 
 @dataclass(frozen=True)
 class ViewGroundTruth:
-    """What is known of one view; None where it is not.
+    """Ground-truth maps of one view; None where a map is not available.
 
     Attributes:
         mask: where the scene is seen.
@@ -128,7 +128,7 @@ class GroundTruth:
 
     @property
     def up_world(self) -> Float64[np.ndarray, "3"]:
-        """Which way is up."""
+        """Return the up axis in world coordinates, a unit vector."""
         up = self.content.world.up
         return (-1.0 if up.startswith("-") else 1.0) * np.eye(3)[_AXES[up]]
 
@@ -159,7 +159,7 @@ class GroundTruth:
         return shrink_to(image, max_side_px)
 
     def view(self, name: str, size: tuple[int, int]) -> ViewGroundTruth:
-        """The maps of a view.
+        """Return the ground-truth maps of a view.
 
         Args:
             name: of the view.
@@ -194,7 +194,7 @@ class GroundTruth:
         return self.path.parent / self.content.environment.folder / f"{name}.hdr"
 
     def _image(self, kind: str, name: str, size: tuple[int, int]) -> Float64[np.ndarray, "h w c"]:
-        """The stored integers of a map."""
+        """Return the stored values of a map at ``size``, by nearest pixels."""
         path = self.path.parent / self.content.test.folder / kind / name
         image = read_image(path)
         height, width = image.shape[:2]
@@ -208,7 +208,7 @@ class GroundTruth:
 
 
 def find_ground_truth(folder: Path) -> GroundTruth | None:
-    """The truth of the views of a folder, in it or beside it; None without one.
+    """Return the ground truth inside or beside a folder of photographs; None if there is none.
 
     Raises:
         ConfigError: the file is no truth in this format.
@@ -254,6 +254,6 @@ def _unit(stored: Float64[np.ndarray, "*shape"]) -> Float32[np.ndarray, "*shape"
 
 
 def _integer_steps(path: Path) -> float:
-    """How many steps the file's integers have from 0 to 1; 1 for floats."""
+    """Return how many steps the file's integers have from 0 to 1; 1 for floating point."""
     kind = oiio.ImageBuf(str(path)).spec().format.basetype
     return {oiio.UINT8: 255.0, oiio.UINT16: 65535.0}.get(kind, 1.0)

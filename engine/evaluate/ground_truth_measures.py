@@ -116,7 +116,7 @@ class GroundTruthMeasures:
             self.light |= measure_relit(pictures, true_pictures, labels)
 
     def as_dict(self) -> dict[str, object]:
-        """The measures as ``metrics.json`` holds them: by view, and their means."""
+        """Return the measures as ``metrics.json`` holds them: by view, and their means."""
         keys = [key for key in GROUND_TRUTH_DEFINITIONS if any(key in row for row in self.rows.values())]
         mean: dict[str, object] = {
             key: finite_mean([row[key] for row in self.rows.values() if key in row]) for key in keys

@@ -1,4 +1,4 @@
-"""How near normals, depths, materials and light come to the truth; all are pure functions of arrays."""
+"""Errors of normals, depths, materials and light against ground truth; pure functions of arrays."""
 
 from collections.abc import Callable, Sequence
 
@@ -51,7 +51,7 @@ def normal_angles_degrees(
 
 
 def intersection_over_union(one: Bool[np.ndarray, "h w"], other: Bool[np.ndarray, "h w"]) -> float:
-    """What both masks have over what either has; 1 for two empty ones."""
+    """Return the intersection over union (IoU) of two masks; 1 for two empty ones."""
     either = int((one | other).sum())
     return float((one & other).sum()) / either if either else 1.0
 
@@ -83,7 +83,7 @@ def fit_channel_scales(
     curve: Curve,
     weights: Float[np.ndarray, " n"] | None = None,
 ) -> Float64[np.ndarray, "3"]:
-    """The factor of each channel that brings ``curve(factor * linear)`` closest to ``curve(true_linear)``.
+    """Return the factor per channel that brings ``curve(factor * linear)`` closest to ``curve(true_linear)``.
 
     Least squares, between 1/256 and 256; 1 where a channel is black.
     """

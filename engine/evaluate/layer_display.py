@@ -1,4 +1,4 @@
-"""What lies behind a picture, made visible: normals, depths and materials as display colours."""
+"""Display colors for the layers of an image: normals, depths and materials."""
 
 from collections.abc import Mapping
 
@@ -23,7 +23,7 @@ LABELS: Mapping[str, str] = {
 
 
 def display_layers(image: RenderedImage) -> dict[str, Float32[np.ndarray, "h w 3"]]:
-    """The layers of a picture as display values, black where nothing is.
+    """Return the layers of an image as display values, black where alpha is 0.
 
     World normals go from -1 to 1 as colours from 0 to 1; what is near is bright, from the nearest to the
     farthest that is seen; albedo and indirect light are encoded, and everything else is shown as it is.
@@ -39,7 +39,7 @@ def display_layers(image: RenderedImage) -> dict[str, Float32[np.ndarray, "h w 3
 
 
 def display_environment(radiance_linear: Float32[np.ndarray, "h w 3"]) -> Float32[np.ndarray, "h w 3"]:
-    """A map as display values, its brightest parts brought below white by x / (1 + x)."""
+    """Return an environment map as display values, tone mapped by x / (1 + x)."""
     return linear_to_srgb(radiance_linear / (1 + radiance_linear))
 
 

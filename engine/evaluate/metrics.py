@@ -59,7 +59,7 @@ class FlipError(NamedTuple):
 
 
 def quantize_8_bit(image: Float32[np.ndarray, "h w 3"]) -> Float32[np.ndarray, "h w 3"]:
-    """The image as it would come back from an 8-bit file."""
+    """Return the image rounded to the values of an 8-bit file."""
     return to_bytes(image).astype(np.float32) / np.float32(255.0)
 
 
@@ -68,7 +68,7 @@ def fill_invalid(
     reference: Float32[np.ndarray, "h w 3"],
     weight: Float32[np.ndarray, "h w"],
 ) -> Float32[np.ndarray, "h w 3"]:
-    """The render with its invalid pixels (weight 0) replaced by the reference's.
+    """Return the render with its invalid pixels (weight 0) replaced by those of the reference.
 
     For metrics that look at neighbourhoods: what a mask rules out then adds no error, inside or nearby.
     Weights between 0 and 1 blend.
@@ -189,7 +189,7 @@ def _blurred(image: Float64[np.ndarray, "h w 3"]) -> Float64[np.ndarray, "h w 3"
 def _similarity(
     x: Float64[np.ndarray, "h w 3"], y: Float64[np.ndarray, "h w 3"]
 ) -> tuple[Float64[np.ndarray, "h w 3"], Float64[np.ndarray, "h w 3"]]:
-    """The luminance term and the contrast-structure term of SSIM at every pixel, black around the image."""
+    """Return the luminance term and the contrast-structure term of SSIM per pixel, with zero padding."""
     mean_x, mean_y = _blurred(x), _blurred(y)
     variance_x = _blurred(x * x) - mean_x * mean_x
     variance_y = _blurred(y * y) - mean_y * mean_y

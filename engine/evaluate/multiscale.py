@@ -1,4 +1,4 @@
-"""How a scene looks at smaller sizes than it was learnt at, against photographs made smaller.
+"""Evaluation at smaller resolutions than the one trained at, against downscaled photographs.
 
 After the test of "Mip-Splatting: Alias-free 3D Gaussian Splatting" (https://arxiv.org/abs/2311.16493), which
 renders at 1/2, 1/4 and 1/8 of the size and compares with photographs averaged over as many pixels.
@@ -74,7 +74,7 @@ def block_means(image: Float32[np.ndarray, "h w c"], side: int) -> Float32[np.nd
 
 
 def downscale_rays(rays: ImageRays, side: int) -> ImageRays:
-    """The rays through the middles of blocks of ``side`` x ``side`` pixels, see :func:`block_means`."""
+    """Return the rays through the centres of ``side`` x ``side`` pixel blocks, see :func:`block_means`."""
     if side == 1:
         return rays
     ways = block_means(rays.directions_world, side).astype(np.float64)

@@ -123,7 +123,7 @@ def _content(
     config: Mapping[str, object],
     images: Mapping[str, ViewImages],
 ) -> dict[str, object]:
-    """The values that the template shows."""
+    """Return the values that the page template needs."""
     mean = _mapping(metrics.get("mean"))
     views = {name: _mapping(row) for name, row in _mapping(metrics.get("views")).items()}
     columns = _columns(mean)
@@ -159,13 +159,13 @@ def _content(
 
 
 def _map(rgb_srgb: Float32[np.ndarray, "h w 3"]) -> dict[str, object]:
-    """The map's picture and size."""
+    """Return the data URI and size of a map."""
     height, width = rgb_srgb.shape[:2]
     return {"uri": webp_data_uri(shrink_to(rgb_srgb, MAX_SIDE_PX)), "width": width, "height": height}
 
 
 def _environment(radiance_linear: Float32[np.ndarray, "h w 3"]) -> dict[str, object]:
-    """The map's picture, size and brightest value."""
+    """Return the data URI, size and maximum radiance of an environment map."""
     return {
         **_map(display_environment(radiance_linear)),
         "brightest": _format_value(float(radiance_linear.max()), 1),
@@ -173,7 +173,7 @@ def _environment(radiance_linear: Float32[np.ndarray, "h w 3"]) -> dict[str, obj
 
 
 def _columns(mean: Mapping[str, object]) -> list[Column]:
-    """The metrics that were measured; that without the exposure only where exposure makes a difference."""
+    """Return the measured metrics; color-corrected PSNR only where the correction makes a difference."""
     columns = [column for column in COLUMNS if column.key in mean]
     plain, corrected = (_number(mean.get(key), math.nan) for key in ("psnr", "psnr_colour_corrected"))
     if corrected - plain >= MIN_EXPOSURE_GAIN_DB:
@@ -184,7 +184,7 @@ def _columns(mean: Mapping[str, object]) -> list[Column]:
 def _tiles(
     mean: Mapping[str, object], columns: Sequence[Column], interval: object, metrics: Mapping[str, object]
 ) -> list[dict[str, str]]:
-    """The main figures at the head of the page."""
+    """Return the main figures at the head of the page."""
     tiles = []
     for column in columns:
         if column.key != "ssim_valid":
@@ -250,7 +250,7 @@ def _facts(metrics: Mapping[str, object], views: int) -> list[str]:
 
 
 def _phase_times(events: Sequence[Mapping[str, object]]) -> list[dict[str, object]]:
-    """Where the time went: the last finish of each stage, with its share of the whole."""
+    """Return the duration of each phase (its last finish), with its share of the total."""
     spent = {
         str(row.get("stage")): _number(row.get("seconds"), 0.0)
         for row in events
@@ -271,7 +271,7 @@ def _rows(
     columns: list[Column],
     embedded: list[str],
 ) -> list[dict[str, object]]:
-    """The table, worst view first."""
+    """Return the rows of the table of views, worst view first."""
     known = [_number(views[name].get("psnr"), math.nan) for name in worst_first]
     finite = [value for value in known if math.isfinite(value)]
     low, high = (min(finite), max(finite)) if finite else (0.0, 0.0)
@@ -300,7 +300,7 @@ def _rows(
 
 
 def _figure(name: str, view: Mapping[str, object], images: ViewImages) -> dict[str, object]:
-    """The three pictures of a view, and what is written under them."""
+    """Return the three images of a view and their caption."""
     small = images.downscale()
     height, width = small.flip_map.shape
     summary = " · ".join(

@@ -197,7 +197,7 @@ def _check_coordinates(output: Path, dataset: Dataset, folder: Path) -> None:
 
 
 def _extent_world(output: Path, dataset: Dataset) -> float:
-    """The extent that the scene was trained with, whichever photographs measure it."""
+    """Return the scene extent that the run was trained with, regardless of the evaluated photographs."""
     return read_views(output / VIEWS).extent_world if (output / VIEWS).exists() else dataset.extent
 
 
@@ -251,7 +251,7 @@ def measure_run(
 
 
 def _find_ground_truth(dataset: Dataset, progress: EventListener, *, needed: bool) -> GroundTruth | None:
-    """What is known of the photographs; a file that is none is told, and refused where it is ``needed``."""
+    """Return the ground truth of the photographs; an invalid file is a warning, or an error if ``needed``."""
     try:
         return find_ground_truth(dataset.root)
     except ConfigError as error:
@@ -264,7 +264,7 @@ def _find_ground_truth(dataset: Dataset, progress: EventListener, *, needed: boo
 def finished_shading(
     output: Path, options: ShadingOptions, dataset: Dataset, extent_world: float, *, exposed: bool = True
 ) -> ShadingModel:
-    """The shading model of a finished run, with what it left: environment, background and exposures.
+    """Return the shading model of a finished run with its environment, background and exposures.
 
     Args:
         output: folder of the run.
@@ -331,7 +331,7 @@ def _evaluate_on(
 
 
 def _pose_facts(output: Path) -> dict[str, object]:
-    """How many photographs have poses, which were placed anew, and whether lenses were adjusted."""
+    """Return how many photographs have poses, how many were corrected, and whether lenses were adjusted."""
     record = read_pose_record(output / POSES)
     known = {name: record[name] for name in ("placed", "photographs", "moved", "lenses") if name in record}
     return {"poses": known} if known else {}

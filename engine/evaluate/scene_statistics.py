@@ -1,4 +1,4 @@
-"""What a scene of Gaussians is at a glance: how many, how large, how solid, how costly to trace."""
+"""Statistics of a scene of Gaussians: count, sizes, opacities and tracing cost."""
 
 from dataclasses import dataclass
 
@@ -69,7 +69,7 @@ class HitStatistics:
 
 
 def scene_statistics(gaussians: FlatGaussians, up_world: Float64[np.ndarray, "3"]) -> SceneStatistics:
-    """The facts on a scene of at least one Gaussian; ``up_world`` is the axis of the cylinder."""
+    """Return the statistics of a scene of at least one Gaussian; ``up_world`` is the axis of the cylinder."""
     scales = gaussians.scales.astype(np.float64)
     larger = scales.max(axis=1)
     counts, _ = np.histogram(gaussians.opacities, bins=np.array(OPACITY_EDGES))
@@ -89,7 +89,7 @@ def scene_statistics(gaussians: FlatGaussians, up_world: Float64[np.ndarray, "3"
 
 
 def hit_statistics(tracer: Tracer, image: ImageRays) -> HitStatistics:
-    """How many Gaussians the rays of an image meet; ``tracer`` has the scene built."""
+    """Return how many Gaussians the rays of an image hit; ``tracer`` has the scene built."""
     hits = tracer.trace(image.rays[tile_order(image.height_px, image.width_px)]).hit_counts
     some = hits[hits > 0]
     if len(some) == 0:

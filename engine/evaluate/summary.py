@@ -1,4 +1,4 @@
-"""What was measured of a run, in a few lines."""
+"""Short text summary of the evaluation of a run."""
 
 import json
 from collections.abc import Iterable

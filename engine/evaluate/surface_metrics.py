@@ -1,4 +1,4 @@
-"""How near a surface comes to a known one: Chamfer distance and F-score."""
+"""Distance of a surface from a reference surface: Chamfer distance and F-score."""
 
 from dataclasses import dataclass
 

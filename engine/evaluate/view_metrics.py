@@ -95,7 +95,7 @@ class Metrics:
     mean_psnr_ci95: tuple[float, float] | None
 
     def as_dict(self, run: Mapping[str, object]) -> dict[str, object]:
-        """The content of ``metrics.json``.
+        """Return the content of ``metrics.json``.
 
         Args:
             run: What the caller adds about the run: gaussians, iterations, seconds, resolution, seed,

@@ -1,4 +1,4 @@
-"""Which columns of a file are channels of its Gaussians, and which of them are wanted."""
+"""Channel columns of a file: which exist, and which of them are requested."""
 
 from collections.abc import Iterable, Mapping
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""How splat formats write colours, opacities, rotations and axes, in one place for readers and writers."""
+"""Encodings of colors, opacities, rotations and axes in splat formats, shared by readers and writers."""
 
 from dataclasses import replace
 

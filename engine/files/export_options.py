@@ -16,7 +16,7 @@ _TEXTURE = Spelling(metavar="PX")
 
 
 class ExportChoices(BaseModel):
-    """What users choose of how scenes are written; each format takes what concerns it."""
+    """Options of export that users choose; each format uses those that concern it."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -50,7 +50,7 @@ class ExportChoices(BaseModel):
 
 
 class ExportOptions(ExportChoices):
-    """How scenes are written: what users choose, and what is known of the scene.
+    """Options of export: the user's choices, and facts about the scene.
 
     Attributes:
         q: chi-square quantile of the octagons.

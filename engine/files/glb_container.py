@@ -229,7 +229,7 @@ def accessor_json(view: int, component: int, count: int, kind: str) -> dict[str,
 
 
 def vector_type(width: int) -> str:
-    """How glTF names vectors of 1 to 4 numbers."""
+    """Return the glTF accessor type of vectors with 1 to 4 components."""
     return "SCALAR" if width == 1 else f"VEC{width}"
 
 

@@ -37,7 +37,7 @@ def glb_materials(file: GlbFile, path: Path) -> tuple[MeshMaterial, ...]:
 
 
 def texture_frame(material: Mapping[str, Any]) -> tuple[int, Float64[np.ndarray, "2 3"]]:
-    """Which texture coordinates a material uses, and the matrix that brings them to those of its images."""
+    """Return the texture coordinate set of a material, and the matrix from it to image coordinates."""
     for info in _texture_infos(material).values():
         transform = info.get("extensions", {}).get("KHR_texture_transform", {})
         turn = float(transform.get("rotation", 0.0))
@@ -54,7 +54,7 @@ def texture_frame(material: Mapping[str, Any]) -> tuple[int, Float64[np.ndarray,
 
 
 def _texture_infos(material: Mapping[str, Any]) -> dict[str, Any]:
-    """How a material uses its textures, the one of its colour first."""
+    """Return the texture references of a material by name, base color first."""
     shading = material.get("pbrMetallicRoughness", {})
     found = {
         "texture": shading.get("baseColorTexture"),

@@ -282,7 +282,7 @@ def _parse_faces(path: Path, text: bytes, before: Int64[np.ndarray, "f 2"], part
 
 
 def _is_ragged(text: bytes, words_per_line: int) -> bool:
-    """Whether lines of several lengths happen to add up to the same count."""
+    """Return whether the lines have different word counts although the total fits."""
     data = np.frombuffer(text, np.uint8)
     gap = data <= SPACE
     starts = ~gap

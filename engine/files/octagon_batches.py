@@ -1,4 +1,4 @@
-"""What all mesh formats write: the octagons of a scene, with their texture coordinates and colours."""
+"""Octagons of a scene in batches, with texture coordinates and colors, for all mesh formats."""
 
 import math
 from collections.abc import Iterator

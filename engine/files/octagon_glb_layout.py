@@ -1,4 +1,4 @@
-"""Where everything lies in a GLB of octagons, and the JSON that says so."""
+"""Buffer layout of a GLB of octagons, and the JSON that describes it."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

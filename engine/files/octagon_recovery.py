@@ -57,7 +57,7 @@ def missing_gaussians_notes(stated: int, found: int) -> tuple[str, ...]:
 
 
 def is_octagon_ply(head: bytes) -> bool:
-    """Whether a file that begins so is a PLY of octagons with the numbers of their Gaussians."""
+    """Return whether a file with this head is a PLY of octagons that carries the ids of their Gaussians."""
     properties = head.partition(b"end_header")[0].replace(b"\r", b"")
     return head.startswith(b"ply") and all(
         f" {name}\n".encode() in properties for name in ("gid", "corner", "radius")

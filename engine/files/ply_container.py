@@ -73,7 +73,7 @@ class PlyElement:
 
 @dataclass(frozen=True)
 class PlyHeader:
-    """What a PLY file says about itself; ``data_offset`` is where its first element begins, in bytes."""
+    """Header of a PLY file; ``data_offset`` is the byte offset of its first element."""
 
     layout: str
     elements: tuple[PlyElement, ...]

@@ -1,4 +1,4 @@
-"""What programs of the 3DGS family add to a PLY of Gaussians, and how their files are told apart."""
+"""Dialects of Gaussian PLY files: the additions of 3DGS programs, and how each is recognised."""
 
 import re
 from collections.abc import Sequence

@@ -1,4 +1,4 @@
-"""What formats of few bits cannot hold of a scene: sizes, positions and colours beyond their ranges.
+"""Losses of formats with few bits: sizes, positions and colors that are out of range.
 
 Each format says in a function of its own what it loses; this module counts and words it, one sentence a loss.
 """

@@ -36,7 +36,7 @@ _REST_COUNTS = {0: 0, 1: 3, 2: 8, 3: 15}
 
 
 class _ParameterMeta(BaseModel):
-    """What ``meta.json`` says of one parameter, in either version."""
+    """Entry of ``meta.json`` for one parameter, in either version."""
 
     model_config = ConfigDict(extra="ignore")
 

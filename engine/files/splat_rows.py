@@ -1,4 +1,4 @@
-"""What all splat formats share: which Gaussians go out, whether they can, and in which blocks."""
+"""Rows that splat formats write: which Gaussians, whether the format can hold them, and in which blocks."""
 
 from collections.abc import Iterator
 from pathlib import Path

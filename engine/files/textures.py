@@ -43,7 +43,7 @@ def material_ramp_png() -> bytes:
 def material_ramp_uv(
     metallic: Float32[np.ndarray, "n 1"], roughness: Float32[np.ndarray, "n 1"]
 ) -> Float32[np.ndarray, "n 2"]:
-    """Where the ramp has these values, between its pixels too."""
+    """Return the texture coordinates at which the ramp has these values, interpolated between its pixels."""
     both = np.clip(np.concatenate([metallic, roughness], axis=1), 0.0, 1.0)
     return ((both * (RAMP_SIZE_PX - 1) + 0.5) / RAMP_SIZE_PX).astype(np.float32)
 

@@ -24,7 +24,7 @@ from octasplat.engine.settings.fields import OUTPUT_FLAGS, Spelling
 
 
 class CleanOptions(CleanupOptions, Options):
-    """Which Gaussians to remove: the faint, the too small or large, floaters, and those before a camera."""
+    """Options of which Gaussians to remove: faint, too small or large, isolated, or close to a camera."""
 
     former_names: ClassVar[renamed_settings.FormerNames] = renamed_settings.CLEAN
 

@@ -20,7 +20,7 @@ from octasplat.engine.operations.base import (
 
 
 class CropOptions(Selection, Options):
-    """Which Gaussians to keep: those for which all given conditions hold."""
+    """Options of which Gaussians to keep: those for which all given conditions hold."""
 
     @model_validator(mode="after")
     def _chooses(self) -> "CropOptions":

@@ -38,7 +38,7 @@ _Length = Annotated[
 
 
 class DeformOptions(Options):
-    """Which mesh deforms the scene, and which parts of it."""
+    """Options of which mesh deforms the scene, and which parts of it."""
 
     proxy: InputFile = Field(
         description="The mesh at rest (.ply, .obj or .glb), lying on or around what is to move."

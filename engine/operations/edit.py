@@ -25,7 +25,7 @@ from octasplat.engine.settings.fields import InputFile, Spelling
 
 
 class EditOptions(MeshToGaussiansOptions, Options):
-    """Which meshes become scenes, and how."""
+    """Options of which meshes become scenes, and how."""
 
     meshes: Annotated[tuple[InputFile, ...], Spelling(("--mesh",), metavar="MESH")] = Field(
         min_length=1,

@@ -30,7 +30,7 @@ def _read_scales(value: object) -> object:
 
 
 class EvaluateOptions(Options):
-    """Which views of a finished reconstruction are measured, and how."""
+    """Options of which views of a finished reconstruction are evaluated, and how."""
 
     former_names: ClassVar[renamed_settings.FormerNames] = renamed_settings.EVALUATE
 

@@ -120,7 +120,7 @@ def _format_name(target: Path, asked: str | None) -> str | None:
 
 
 class ExportJobOptions(_ExportFields):
-    """Which files to write, and how."""
+    """Options of which files to write, and how."""
 
     files: tuple[ExportName, ...] = Field(
         min_length=1, max_length=100, description="Files to write; their names say the formats."
@@ -157,7 +157,7 @@ class ExportRequest(_ExportFields, SourceRequest):
 
 
 class ExportResult(Result):
-    """The files."""
+    """Result of an export: the files that were written."""
 
     def lines(self) -> tuple[str, ...]:
         """Return the files with their sizes."""

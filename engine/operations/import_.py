@@ -21,7 +21,7 @@ def read_channels(value: object) -> object:
 
 
 class ImportOptions(Options):
-    """Which file to read, and how."""
+    """Options of which file to read, and how."""
 
     file: Annotated[InputFile, Positional("IN")] = Field(
         description="The scene to read, a file of any known format."

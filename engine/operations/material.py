@@ -19,7 +19,7 @@ from octasplat.engine.settings.fields import InputFile, Output, Spelling
 
 
 class MaterialOptions(Selection, MaterialChange, Options):
-    """How materials change, and of which Gaussians: those for which all given conditions hold."""
+    """Options of how materials change, and of which Gaussians: those for which all given conditions hold."""
 
     mesh: Annotated[InputFile | None, Spelling(metavar="MESH")] = Field(
         None,

@@ -21,7 +21,7 @@ from octasplat.engine.settings.fields import InputFile, Positional
 
 
 class MergeOptions(Options):
-    """Which scenes are merged with the first one."""
+    """Options of which scenes to merge with the first one."""
 
     scenes: Annotated[tuple[InputFile, ...], Positional("IN")] = Field(
         (), max_length=100, description="The other scenes: files of any format, each in the same frame."

@@ -23,7 +23,7 @@ _CONFIG, _METRICS, _REPORT, _SCENE = "config.json", "metrics.json", "report.html
 
 
 class ReconstructOptions(RunSettings, Options):
-    """How photographs become a scene: a preset, and settings that differ from it."""
+    """Options of a reconstruction: a preset, and settings that differ from it."""
 
     former_names: ClassVar[renamed_settings.FormerNames] = renamed_settings.RECONSTRUCT
 

@@ -48,5 +48,5 @@ def operation(name: str) -> Operation[Any, Any]:
 
 
 def operations() -> tuple[Operation[Any, Any], ...]:
-    """Return all operations."""
+    """Return all operations, in the order of the documentation."""
     return tuple(map(operation, _MODULES))

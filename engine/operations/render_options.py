@@ -29,7 +29,7 @@ MAX_SIDE_PX = 16384
 
 
 class PictureOptions(Options):
-    """Which cameras see the scene, and which images are made of it."""
+    """Options of which cameras view the scene, and which images are rendered."""
 
     mode: Annotated[Mode, Spelling(hidden=True)] = Field(
         "turntable",

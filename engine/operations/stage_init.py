@@ -16,7 +16,7 @@ from octasplat.engine.settings.fields import DatasetFolder, Output, Source
 
 
 class StageInitOptions(Options):
-    """What a first stage is fitted to, besides the scene."""
+    """Options of an initial stage file besides the scene that it fits."""
 
     up: Axis | None = Field(
         None, description="The axis of a file that points up; a run knows its own.  [default: -y]"

@@ -77,7 +77,7 @@ def _is_on(value: object) -> bool:
 
 
 class SurfaceOptions(ExtractionOptions, Options):
-    """How the surface of a scene is meshed and coloured."""
+    """Options of how the surface of a scene is meshed and colored."""
 
     former_names: ClassVar[renamed_settings.FormerNames] = renamed_settings.EXTRACTION
 

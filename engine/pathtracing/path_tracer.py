@@ -399,7 +399,7 @@ class _Batch(NamedTuple):
     first_sample: int
 
     def start(self, camera_rays: CameraRays, order: Int64[np.ndarray, " n"]) -> PathStart:
-        """What kernels begin the paths from; ``order`` is that of the pixels."""
+        """Return the kernels' description of the paths to start; ``order`` is that of the pixels."""
         return PathStart(camera_rays, order, self.first_pixel, self.paths_per_pixel, self.first_sample)
 
 

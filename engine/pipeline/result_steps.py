@@ -22,7 +22,7 @@ class EvaluateStep:
         return (run.output / METRICS).exists() and (run.output / REPORT).exists()
 
     def __call__(self, run: ReconstructionRun) -> None:
-        """Measure the views."""
+        """Evaluate the held-out views of the run."""
         with phase("evaluate", run.progress, len(run.dataset.test_indices)):
             measure_run(run.dataset, run.output, run.config, run.threads, run.progress)
 

@@ -22,7 +22,7 @@ _MIN_INLIER_SHARE_OF_TRUE_PAIR = 0.5
 
 @dataclass(frozen=True, eq=False)
 class PairInliers:
-    """What became of the matches of each pair.
+    """Counts of inlier and outlier matches for each pair of photographs.
 
     Attributes:
         pairs: numbers of the photographs in the database.
@@ -36,7 +36,7 @@ class PairInliers:
 
 
 def count_pair_inliers(model: Any, database: Path) -> PairInliers:
-    """The votes of all pairs whose two photographs are placed."""
+    """Count the inlier and outlier matches of all pairs whose two photographs have poses."""
     points = {
         number: np.array([p.point3D_id if p.has_point3D() else -1 for p in image.points2D], dtype=np.int64)
         for number, image in model.images.items()
@@ -63,11 +63,11 @@ def count_pair_inliers(model: Any, database: Path) -> PairInliers:
 
 
 def find_false_pairs(votes: PairInliers) -> Int64[np.ndarray, "f 2"]:
-    """The pairs that hold the two sides of a fold together; none where there is no fold.
+    """Return the pairs that falsely join two different places that look alike; empty if there are none.
 
-    A fold is a division of the photographs across which far more matches are broken than kept. It is looked
-    for along the eigenvector of the least eigenvalue of the Laplacian whose weights are kept less broken,
-    and then by moving photographs.
+    Such a fold shows as a cut through the photographs with far more outlier than inlier matches across it.
+    The cut starts from the eigenvector of the smallest eigenvalue of the Laplacian whose weights are inliers
+    minus outliers, and is refined by moving single photographs.
     """
     numbers, index = np.unique(votes.pairs, return_inverse=True)
     if len(numbers) < 3:
@@ -118,7 +118,7 @@ def _min_cut(weight: Float64[np.ndarray, "n n"]) -> Bool[np.ndarray, " n"]:
 def _refine_cut(
     weight: Float64[np.ndarray, "n n"], side: Bool[np.ndarray, " n"]
 ) -> tuple[Bool[np.ndarray, " n"], float]:
-    """The best division on the way of moving every photograph once, the most profitable one first.
+    """Return the best cut met while moving each photograph once, the most profitable one first.
 
     Kernighan and Lin, "An Efficient Heuristic Procedure for Partitioning Graphs" (1970), without swaps.
     """

@@ -39,7 +39,7 @@ INLIER_DISTANCE_PX = 1.5
 
 
 class PosesConfig(Settings):
-    """How poses are found."""
+    """Settings of the pose estimation."""
 
     exhaustive_up_to: Annotated[int, Unit("photographs"), ADVANCED] = Field(
         40,
@@ -93,7 +93,7 @@ class GivenModel(BaseModel):
 
 
 class PoseSearchRequest(BaseModel):
-    """What the process in which COLMAP works is asked.
+    """Request to the process in which COLMAP runs.
 
     With ``given`` see :mod:`octasplat.engine.poses.pose_repair`; with the folder of a model, ``lenses_of``,
     see

@@ -108,7 +108,7 @@ def extract_features(
 
 
 def feature_counts(database: Path, photographs: int) -> list[int]:
-    """Number of features of each photograph of a database, in the order of their numbers."""
+    """Return the number of features of each photograph of a database, in the order of their numbers."""
     with pycolmap.Database.open(database) as found:
         return [found.num_keypoints_for_image(number + 1) for number in range(photographs)]
 

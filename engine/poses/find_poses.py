@@ -196,7 +196,7 @@ def adjust_principal_points(
 
 @contextmanager
 def _work_folder(output: Path) -> Iterator[Path]:
-    """An empty hidden folder beside the one for the result, until the block ends."""
+    """Yield an empty hidden folder beside ``output``, removed when the block ends."""
     work = output.with_name(f".{output.name}.work")
     shutil.rmtree(work, ignore_errors=True)
     work.mkdir(parents=True)
@@ -207,7 +207,7 @@ def _work_folder(output: Path) -> Iterator[Path]:
 
 
 def read_pose_record(output: Path) -> dict[str, Any]:
-    """What was found, and for which photographs; empty if there is nothing."""
+    """Return the record of estimated poses and their photographs; empty if there is none."""
     try:
         record: dict[str, Any] = json.loads((output / RECORD_FILE).read_text(encoding="utf-8"))
     except (OSError, ValueError):
@@ -253,7 +253,7 @@ class _ColmapProcess:
             raise ColmapCrashError(_crash_message(code, self._stage, log))
 
     def _read_chunk(self, pipe: int) -> bytes:
-        """What the process says next; nothing at its end."""
+        """Return the next bytes from the process; empty at its end."""
         while True:
             if self._should_stop():
                 raise CancelledError(
@@ -287,7 +287,7 @@ class _ColmapProcess:
 
 @contextmanager
 def _start_process(request: PoseSearchRequest, stderr_log: IO[bytes]) -> Iterator["subprocess.Popen[bytes]"]:
-    """The process at work; killed in the end, whatever happens. In the caller's group, to die with it."""
+    """Start the process in the caller's process group; it is killed when the block ends."""
     environment = {
         **os.environ,
         **dict.fromkeys(_SINGLE_THREAD_VARIABLES, "1"),

@@ -30,7 +30,7 @@ def map_photographs(
     allow_weak_links: bool = False,
     start: Path | None = None,
 ) -> Any:
-    """The model with the most photographs.
+    """Reconstruct the photographs incrementally and return the model with the most of them.
 
     Args:
         database: with matches.
@@ -85,5 +85,5 @@ def map_photographs(
 
 
 def model_rank(model: Any) -> tuple[int, int]:
-    """What makes one model better than another: its photographs, then its points."""
+    """Return the sort key of models: the count of registered photographs, then of points."""
     return (0, 0) if model is None else (model.num_reg_images(), model.num_points3D())

@@ -1,4 +1,4 @@
-"""Whether the lens moved between photographs, as the sparse points of a model tell.
+"""Check of whether the principal point moved between photographs, from the sparse points of a model.
 
 A stabilised lens is shifted while a photograph is taken, and its picture with it. A model whose photographs
 share one camera then has errors that are much alike all over a photograph. What part of them a small shift
@@ -31,7 +31,7 @@ _ITERATIONS = 5
 def needs_per_view_principal_points(
     viewpoints: Viewpoints, points: SparsePoints, observations: Observations
 ) -> bool:
-    """Whether each photograph should be asked for the place of its own picture behind the lens."""
+    """Return whether each photograph needs a principal point of its own."""
     before, after = [], []
     for view, shown in zip(
         viewpoints.views, _observations_by_view(viewpoints, points, observations), strict=True
@@ -55,7 +55,7 @@ def needs_per_view_principal_points(
 def _observations_by_view(
     viewpoints: Viewpoints, points: SparsePoints, observations: Observations
 ) -> list[tuple[Float64[np.ndarray, "k 3"], Float64[np.ndarray, "k 2"]]]:
-    """The points that each view shows, and where."""
+    """Return the sparse points that each view observes (world), and their image positions (px)."""
     if len(points) == 0:
         return [(np.zeros((0, 3)), np.zeros((0, 2))) for _ in viewpoints.views]
     place = np.minimum(np.searchsorted(points.ids, observations.point), len(points) - 1)

@@ -1,4 +1,4 @@
-"""Which pairs of photographs are worth matching."""
+"""Selection of the pairs of photographs to match."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import combinations
@@ -48,7 +48,7 @@ def batch_pairs(pairs: Iterable[Pair], size: int) -> list[tuple[Pair, ...]]:
 
 
 def largest_features(keypoints: Float32[np.ndarray, "n 6"], count: int) -> Int64[np.ndarray, " k"]:
-    """Indices, in order, of the ``count`` features of the largest scale; columns as COLMAP's."""
+    """Return the sorted indices of the ``count`` features of largest scale; columns as in COLMAP."""
     area = np.abs(keypoints[:, 2] * keypoints[:, 5] - keypoints[:, 3] * keypoints[:, 4])
     kept: Int64[np.ndarray, " k"] = np.sort(np.argsort(-area, kind="stable")[:count])
     return kept

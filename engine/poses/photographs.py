@@ -1,4 +1,4 @@
-"""Which files of a folder are photographs to find poses for."""
+"""Selection of the files of a folder that are photographs to find poses for."""
 
 import hashlib
 from collections.abc import Sequence
@@ -60,7 +60,7 @@ def _files_below(folder: Path) -> list[str]:
 
 
 def photographs_sha256(folder: Path, names: Sequence[str]) -> str:
-    """A digest of the photographs' names and contents."""
+    """Return a SHA-256 over the names and contents of the photographs."""
     digest = hashlib.sha256()
     for name in names:
         digest.update(f"{name}\0{(folder / name).stat().st_size}\n".encode())

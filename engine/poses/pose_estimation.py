@@ -55,7 +55,7 @@ class Matches:
     translations_cam_from_world: Float64[np.ndarray, "p 3"]
 
     def select(self, chosen: Bool[np.ndarray, " m"]) -> "Matches":
-        """Some of them."""
+        """Return the matches where ``chosen`` is true."""
         return Matches(
             self.rays_cam[chosen],
             self.partner_rays_cam[chosen],
@@ -70,7 +70,7 @@ def sampson_distances(
     translation_cam_from_world: Float64[np.ndarray, " 3"],
     matches: Matches,
 ) -> Float64[np.ndarray, " m"]:
-    """How far each match is from agreeing with a pose, in units of the focal length, with a sign.
+    """Return the signed Sampson distance of each match from a pose, in units of the focal length.
 
     To first order the distance that both features together must be moved (Hartley and Zisserman, "Multiple
     View Geometry", section 11.4.3).
@@ -104,7 +104,7 @@ def refine_pose(
 
 
 def _minimise_sampson(pose: Pose, matches: Matches, inlier_distance: float) -> Pose:
-    """The pose near to one from which all of some matches are least distant."""
+    """Return the pose, starting from ``pose``, that minimises the robust Sampson distances of the matches."""
     rotation, translation = pose
     size = float(np.median(np.linalg.norm(translation - matches.translations_cam_from_world, axis=1)))
 
@@ -121,7 +121,7 @@ def _minimise_sampson(pose: Pose, matches: Matches, inlier_distance: float) -> P
 def collect_matches(
     number: int, model: Any, images: dict[int, Any], database: Path, sizes_px: Sequence[tuple[int, int]]
 ) -> Matches | None:
-    """What a photograph has in common with others.
+    """Return the feature matches of a photograph with others whose poses are known.
 
     Args:
         number: of the photograph in the database.
@@ -173,19 +173,19 @@ def collect_matches(
 
 
 def inlier_mask(pose: Pose, matches: Matches, inlier_distance: float) -> Bool[np.ndarray, " m"]:
-    """Which matches agree with a pose."""
+    """Return which matches agree with a pose."""
     agrees: Bool[np.ndarray, " m"] = np.abs(sampson_distances(*pose, matches)) < inlier_distance
     return agrees
 
 
 def is_explained_by_pose(pose: Pose, matches: Matches, inlier_distance: float) -> bool:
-    """Whether a pose explains most of the matches, of which there are enough to say so."""
+    """Return whether a pose explains most of the matches, and there are enough of them to decide."""
     agrees = inlier_mask(pose, matches, inlier_distance)
     return len(agrees) >= MIN_MATCHES and float(agrees.mean()) > MIN_GIVEN_INLIER_SHARE
 
 
 def estimate_pose(matches: Matches, given_pose: Pose, inlier_distance: float, *, seed: int) -> Pose | None:
-    """Where the matches say that the photograph was taken, if they contradict the given pose.
+    """Return a corrected pose where the matches contradict the given one.
 
     Args:
         matches: of the photograph.

@@ -69,7 +69,7 @@ def repair_misplaced(request: PoseSearchRequest, given: GivenModel, progress: Ev
 
 
 class _PoseVerifier:
-    """What photographs say of those in doubt.
+    """Checks doubtful poses against the matches with other photographs.
 
     Attributes:
         model: as it is given.
@@ -122,14 +122,14 @@ class _PoseVerifier:
             )
 
     def is_consistent(self, k: int) -> bool:
-        """Whether a photograph stands where the matches so far say."""
+        """Return whether the given pose of a photograph agrees with the matches so far."""
         matches = self._matches(k)
         return matches is not None and is_explained_by_pose(
             self._given_pose(k), matches, self._inlier_distance(k)
         )
 
     def corrected_pose(self, k: int) -> Pose | None:
-        """The pose of a photograph in doubt where it is not the given one."""
+        """Return the corrected pose of a doubtful photograph; None where the given one stays."""
         if len(self.images[k].frame.data_ids) > 1:  # it would take the other cameras of its rig along
             return None
         matches = self._matches(k)

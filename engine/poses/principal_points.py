@@ -70,7 +70,9 @@ def write_per_view_principal_points(
 
 
 def _adjust_shared_principal_point(given: Any) -> tuple[Any | None, float]:
-    """The model adjusted with the lenses that are given, and its mean error (px); None if it cannot be.
+    """Return the model bundle-adjusted with the given lenses, and its mean error (px); None where it fails.
+
+    It is the baseline: an improvement that it already reaches is not due to the lenses.
 
     What is gained so is not the lenses' doing.
     """
@@ -87,7 +89,7 @@ def _adjust_shared_principal_point(given: Any) -> tuple[Any | None, float]:
 def _adjust_per_view_principal_points(
     shared: Any, given: Any, error_px: float, on_count: Callable[[int], None]
 ) -> Any | None:
-    """A ``shared`` model adjusted further, lenses too, and laid over the given one; None where that fails."""
+    """Return ``shared`` adjusted with lenses per view and aligned to ``given``; None where it fails."""
     fixed = {i for i, image in shared.images.items() if image.num_points3D < MIN_OBSERVATIONS}
     for k in range(_ITERATIONS):
         model = _split_cameras(shared)
@@ -104,7 +106,7 @@ def _adjust_per_view_principal_points(
 
 
 def _split_cameras(given: Any) -> Any:
-    """The same model with a camera, and a rig of one, for each photograph that has a pose."""
+    """Return the model with a camera and a rig of its own for each photograph that has a pose."""
     model: Any = pycolmap.Reconstruction()
     for number, i in enumerate(sorted(k for k, image in given.images.items() if image.has_pose)):
         image, camera = given.images[i], given.cameras[given.images[i].camera_id]

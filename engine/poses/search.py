@@ -174,7 +174,7 @@ class PoseSearch:
         return pairs
 
     def _disambiguate(self, database: Path, model: Any, at: Callable[[int], None]) -> Any:
-        """The model, made anew without the false matches of its folds for as long as it has any."""
+        """Return the model rebuilt without the false matches of its folds, repeated while it has any."""
         for _ in range(_MAX_DISAMBIGUATIONS):
             if model is None:
                 break

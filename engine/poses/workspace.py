@@ -1,4 +1,4 @@
-"""What a search for poses works with: photographs under other names, and stages that are told of."""
+"""Working folder of a pose search: photographs under other names, and progress of its stages."""
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -41,6 +41,6 @@ def _write_png(photograph: Path, target: Path) -> None:
 
 @contextmanager
 def progress_stage(name: str, steps: int, progress: EventListener) -> Iterator[Callable[[int], None]]:
-    """A stage whose steps are known beforehand; yields what is to be told how many are done."""
+    """Run a stage with a known number of steps; yields the callback that takes the count of done steps."""
     with counted_phase(name, progress, steps) as count:
         yield lambda done: count(done, steps)

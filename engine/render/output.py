@@ -15,7 +15,7 @@ from octasplat.engine.render.shots import RenderFn, Shot
 
 @dataclass(frozen=True)
 class ResumeOptions:
-    """How a render treats the images of an interrupted earlier one.
+    """Treatment of images left by an interrupted render.
 
     Attributes:
         resume: go on with them; else they are refused.

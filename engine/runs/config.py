@@ -165,7 +165,7 @@ def _collected(
     train: Mapping[str, Any] | None,
     assignments: Sequence[str],
 ) -> tuple[dict[str, Any], dict[str, Any]]:
-    """The fields of :class:`RunSettings` and the nested settings of the training that are asked for."""
+    """Return the requested fields of :class:`RunSettings` and the nested training settings."""
     values = translate_names((RunSettings,), settings)
     changes: dict[str, Any] = {} if materials is None else {"materials": {"learn": materials}}
     if train:
@@ -193,7 +193,7 @@ def _validated(values: Mapping[str, Any]) -> ReconstructionConfig:
 
 
 def _read_assignment(assignment: str) -> tuple[list[str], Any]:
-    """The path and the value that an assignment names; the value is JSON, or else the text itself."""
+    """Return the path and value of an assignment; the value is read as JSON, or else as text."""
     name, equals, text = (part.strip() for part in assignment.partition("="))
     if not equals or not name:
         sentence = f"{assignment}: write an assignment as name=value, e.g. lr.mean=2e-4."
@@ -207,7 +207,7 @@ def _read_assignment(assignment: str) -> tuple[list[str], Any]:
 
 
 def _base(preset_name: object, materials: bool) -> dict[str, Any]:
-    """The settings of a preset's training; none where there is no such preset, which validation refuses."""
+    """Return the training settings of a preset; empty for an unknown preset, which validation refuses."""
     if preset_name not in PRESETS:
         return {}
     if materials and preset_name not in PRESETS_WITH_MATERIALS:
@@ -222,7 +222,7 @@ def _base(preset_name: object, materials: bool) -> dict[str, Any]:
 
 
 def _learns_materials(train: Mapping[str, Any]) -> bool:
-    """Whether these settings of a training switch materials on, in whichever way they say so."""
+    """Return whether training settings switch materials on, in any accepted spelling."""
     materials = train.get("materials")
     try:
         return isinstance(materials, Mapping) and _BOOL.validate_python(materials.get("learn", False))
@@ -234,7 +234,7 @@ _BOOL = TypeAdapter(bool)
 
 
 def _differences(base: Mapping[str, Any], values: Mapping[str, Any]) -> dict[str, Any]:
-    """The values that are not those of ``base``, section by section."""
+    """Return the values that differ from ``base``, section by section."""
     found: dict[str, Any] = {}
     for key, value in values.items():
         old = base.get(key)
@@ -265,7 +265,7 @@ def _check_names(train: Mapping[str, Any]) -> None:
 def _unknown(
     models: Sequence[type[BaseModel]], values: Mapping[str, Any], path: tuple[str, ...]
 ) -> Iterator[tuple[str, ...]]:
-    """The paths of the values that none of ``models`` has."""
+    """Yield the paths of values that none of ``models`` has a field for."""
     for key, value in values.items():
         place = (*path, str(key))
         infos = [model.model_fields[key] for model in models if key in model.model_fields]
@@ -288,7 +288,7 @@ def _leaves(value: object, path: tuple[str, ...]) -> Iterator[tuple[str, ...]]:
 
 @cache
 def _setting_names() -> tuple[str, ...]:
-    """The names of all settings, with dots."""
+    """Return the dotted names of all settings."""
     return (*RunSettings.model_fields, *dict.fromkeys(_names_in((TrainConfig,), "")))
 
 

@@ -33,12 +33,12 @@ EVALUATIONS = "on"
 
 
 def is_run(source: Path) -> bool:
-    """Whether a command was given the folder of a run, not a file or the folder of an unpacked SOG."""
+    """Return whether ``source`` is a run folder, not a file or the folder of an unpacked SOG."""
     return source.is_dir() and not (source / "meta.json").exists()
 
 
 def dataset_folder_of_run(output: Path) -> Path:
-    """The scene folder that a run was made from.
+    """Return the dataset folder that a run was trained on.
 
     Raises:
         ConfigError: ``output`` is no run.
@@ -50,7 +50,7 @@ def dataset_folder_of_run(output: Path) -> Path:
 
 
 def photographs_folder(output: Path, scene: Path | None = None) -> Path:
-    """The folder of a run's photographs: ``scene`` if given, or else where they were.
+    """Return the folder of a run's photographs: ``scene`` if given, else the recorded one.
 
     Raises:
         ConfigError: ``output`` is no run.
@@ -70,7 +70,7 @@ def photographs_folder(output: Path, scene: Path | None = None) -> Path:
 def run_viewpoints(
     output: Path, *, scene: Path | None = None, max_side: int | None = None
 ) -> SplitViewpoints:
-    """Where the photographs of a run were taken from; the photographs themselves are not needed.
+    """Return the viewpoints of a run; the photographs themselves are not needed.
 
     Args:
         output: folder of the run.
@@ -119,7 +119,7 @@ def run_min_view_distance(output: Path, viewpoints: SplitViewpoints) -> float:
 
 
 def run_camera_clearance(output: Path, share: float) -> CameraClearance | None:
-    """Where nothing of a run's scene should stand, see :mod:`octasplat.engine.dataset.camera_clearance`.
+    """Return the free space around a run's cameras, see :mod:`octasplat.engine.dataset.camera_clearance`.
 
     Args:
         output: folder of the run.
@@ -138,7 +138,7 @@ def run_camera_clearance(output: Path, share: float) -> CameraClearance | None:
 
 
 def run_exposures(output: Path) -> ExposuresByName | None:
-    """The exposures of the views that a finished run has learnt, if it has."""
+    """Return the learnt exposures of a finished run by view name; None if it has none."""
     try:
         known: ExposuresByName | None = json.loads((output / TRAINING).read_text("utf-8")).get("exposures")
     except (OSError, ValueError, AttributeError):
@@ -153,7 +153,7 @@ def run_environment(output: Path) -> Path:
 
 
 def run_background(output: Path) -> LearnedBackground | None:
-    """The background that a finished run has learnt, if it has.
+    """Return the learnt background of a finished run; None if it has none.
 
     Raises:
         ConfigError: ``output`` is no run, or the background is missing or damaged.
@@ -164,7 +164,7 @@ def run_background(output: Path) -> LearnedBackground | None:
 
 
 def unexported_parts(output: Path) -> str | None:
-    """A sentence on what a run has learnt that no other file carries, or None."""
+    """Return a sentence on learnt parts of a run that scene files do not carry; None if there are none."""
     if not (output / CONFIG).exists() or read_config(output / CONFIG).train.background != "learnt":
         return None
     return (
@@ -174,7 +174,7 @@ def unexported_parts(output: Path) -> str | None:
 
 
 def found_model_folder(output: Path) -> Path | None:
-    """The folder of the poses that were found for the photographs of a run, if they had to be."""
+    """Return the folder of the estimated poses of a run's photographs; None if poses were given."""
     for folder in (output / POSES, output / POSES / "sparse" / "0"):
         if any((folder / f"cameras{suffix}").is_file() for suffix in (".bin", ".txt")):
             return folder
@@ -191,7 +191,7 @@ def open_run_dataset(
     model_folder: Path | None = None,
     accept: Callable[[ViewsRecord], None] | None = None,
 ) -> Dataset:
-    """The photographs of a run as its settings say, ready to train on or to be measured.
+    """Open the photographs of a run with its settings, ready for training or evaluation.
 
     Args:
         scene: folder of the photographs.

@@ -1,4 +1,4 @@
-"""What decides a reconstruction beside its training; imports nothing heavy."""
+"""Settings of a reconstruction other than those of its training; imports nothing heavy."""
 
 from collections.abc import Mapping
 from typing import Annotated, Any, ClassVar, Literal
@@ -12,7 +12,7 @@ from octasplat.engine.train.config.presets import PresetName
 
 
 class RunSettings(BaseModel):
-    """What decides a reconstruction beside the settings of its training."""
+    """Settings of a reconstruction other than those of its training."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 

@@ -160,7 +160,7 @@ def _setting(name: str, info: FieldInfo, defaults: Mapping[str, object]) -> Sett
 
 
 def _parts(annotation: Any) -> tuple[Any, ...]:
-    """The alternatives of an annotation, without marks."""
+    """Return the alternatives of an annotation, without marks."""
     if get_origin(annotation) is Annotated:
         return _parts(get_args(annotation)[0])
     if get_origin(annotation) in (Union, types.UnionType):

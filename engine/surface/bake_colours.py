@@ -23,7 +23,7 @@ MIN_ALPHA = 0.25
 
 @dataclass(frozen=True)
 class BakeTarget:
-    """What is read from traced rays.
+    """Quantity that is baked from traced rays.
 
     Attributes:
         width: how many numbers.

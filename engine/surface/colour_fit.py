@@ -42,7 +42,7 @@ class Palette(Protocol):
 
     @property
     def mesh(self) -> TriangleMesh:
-        """Return the surface."""
+        """Return the surface mesh whose colors are fitted."""
 
     @property
     def neighbours(self) -> Int[np.ndarray, "e 2"]:

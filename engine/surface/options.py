@@ -39,7 +39,7 @@ def _read_rim(value: object) -> object:
 
 
 class ExtractionOptions(BaseModel):
-    """Settings of :func:`octasplat.engine.surface.extract.extract_levels`."""
+    """Options of the surface extraction, see :func:`octasplat.engine.surface.extract.extract_levels`."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 

@@ -1,4 +1,4 @@
-"""Factory of tracers."""
+"""Factory that makes the tracer that settings name."""
 
 from octasplat.engine.trace.protocol import Tracer, TraceSettings
 

@@ -1,5 +1,5 @@
-"""What can be done, for the API's routes and the pages alike; one module a subject.
+"""Actions of the service, shared by the API's routes and the web pages; one module a subject.
 
-An action takes the service, who asks, and plain values; it gives rows or views, and raises problems. Of
-requests, answers and their headers it knows nothing.
+An action takes the service, the principal and plain values; it returns rows or views and raises problems. It
+knows nothing of HTTP requests and responses.
 """

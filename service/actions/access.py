@@ -1,4 +1,4 @@
-"""Whose things they are, and whether anything is taken on now."""
+"""Checks of ownership, and of whether the service accepts work at present."""
 
 import uuid
 

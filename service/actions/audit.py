@@ -1,4 +1,4 @@
-"""Who did what."""
+"""Queries of the audit log."""
 
 from octasplat.service.actions.pages import Page, page_of
 from octasplat.service.state import Service

@@ -1,4 +1,4 @@
-"""What a job would take, before it is asked for."""
+"""Estimates of a job's cost before it is submitted."""
 
 from octasplat.engine.dataset.image_sizes import ImageSizes
 from octasplat.engine.operations.cost_model import Estimate

@@ -1,4 +1,4 @@
-"""What happens to a job: its log, its events as a list and as they come."""
+"""Log and events of a job, as a list and as a stream."""
 
 import asyncio
 import uuid

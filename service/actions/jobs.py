@@ -27,7 +27,7 @@ BUSY_RETRY_SECONDS = 2
 
 @dataclass(frozen=True)
 class JobFilter:
-    """Which jobs to list; what is None or empty does not matter.
+    """Filter of a list of jobs; fields that are None or empty match all.
 
     Attributes:
         states: any of these.

@@ -44,7 +44,7 @@ class _RequestedJob:
 
 @dataclass(frozen=True)
 class _JobInputs:
-    """What a job works on, and the options that fit it."""
+    """Inputs of a job, and the options completed for them."""
 
     dataset_id: uuid.UUID | None
     source_id: uuid.UUID | None

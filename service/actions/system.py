@@ -1,4 +1,4 @@
-"""What the service is and how it fares: kinds of jobs, formats, queues, health, numbers."""
+"""Properties and state of the service: job kinds, formats, queues, health, metrics."""
 
 import asyncio
 

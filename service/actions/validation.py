@@ -1,4 +1,4 @@
-"""What is asked for: the kind of a job and its options, checked before anything is looked up."""
+"""Validation of a requested job kind and its options, before any database access."""
 
 from collections.abc import Mapping
 from typing import Any

@@ -42,7 +42,7 @@ _LEADING_ELSEWHERE = frozenset(
 
 @dataclass(frozen=True)
 class ArchiveLimits:
-    """What an archive may ask for.
+    """Limits of an uploaded archive.
 
     Attributes:
         max_entries: files and folders.
@@ -76,7 +76,7 @@ class ArchiveFile:
 
 @dataclass(frozen=True)
 class ArchiveListing:
-    """What an archive that passed all checks holds.
+    """Content of an archive that passed all checks.
 
     Attributes:
         files: parts of a scene, in the order of the archive.

@@ -42,7 +42,7 @@ class DatasetFile:
 
 @dataclass(frozen=True)
 class DatasetLimits:
-    """What a dataset may ask for, part by part."""
+    """Limits of a dataset, by part."""
 
     image: ImageLimits = field(default_factory=ImageLimits)
     model: ModelLimits = field(default_factory=ModelLimits)
@@ -54,7 +54,7 @@ DEFAULT_LIMITS = DatasetLimits()
 
 @dataclass(frozen=True)
 class DatasetSummary:
-    """What a dataset without faults holds.
+    """Summary of a valid dataset.
 
     Attributes:
         photographs: files in ``images/``.

@@ -1,4 +1,4 @@
-"""What is wrong with something that came from outside, in a form for programs and for people."""
+"""Faults of uploaded data, in a form for programs and for people."""
 
 from dataclasses import dataclass
 

@@ -1,9 +1,9 @@
-"""Whether an image file is all there, without decoding it.
+"""Check that an image file is complete, without decoding it.
 
-A file that was cut off still has its header, and readers show the missing part in grey or not at all. Where a
-format says how long it is, or ends with a mark, that is looked at; it takes a few reads, whatever the size.
-Not noticed: data that are damaged in the middle, a JPEG that was cut off and then closed with an end mark,
-and cut-off HDR files, whose rows have any length.
+A truncated file still has its header, and readers show the missing part in grey or not at all. Where a format
+declares its length or ends with a marker, that is checked; it takes a few reads, whatever the size. Not
+detected: data that are damaged in the middle, a JPEG that was truncated and then closed with an end marker,
+and truncated HDR files, whose rows have any length.
 """
 
 import io

@@ -33,7 +33,7 @@ _HEADER_ERRORS = (
 
 @dataclass(frozen=True)
 class ImageLimits:
-    """What a photograph may be.
+    """Limits of an uploaded photograph.
 
     Attributes:
         max_pixels: width times height.
@@ -48,7 +48,7 @@ class ImageLimits:
 
 @dataclass(frozen=True)
 class ImageHeader:
-    """What the header says.
+    """Properties read from an image header.
 
     Attributes:
         kind: ``JPEG``, ``PNG``, ``TIFF``, ``WebP``, ``BMP``, ``EXR`` or ``HDR``.

@@ -28,7 +28,7 @@ _LIBRARY_VARIABLES = ("PATH", "LANG", "LC_ALL", "LD_LIBRARY_PATH", "NUMBA_CACHE_
 
 @dataclass(frozen=True)
 class ModelLimits:
-    """What parsing a model may take.
+    """Resource limits of parsing a COLMAP model.
 
     Attributes:
         memory_bytes: address space of the child; some 0.6 GB of it are the libraries. By default a quarter of

@@ -34,7 +34,7 @@ _UNIT_TOLERANCE = 1e-3
 
 
 class ModelRequest(BaseModel):
-    """What the child is asked.
+    """Request to the child process that parses COLMAP models.
 
     Attributes:
         root: folder of the scene, which holds the models and nothing else.
@@ -56,7 +56,7 @@ class ModelRequest(BaseModel):
 
 
 class ModelAnswer(BaseModel):
-    """What the child found: faults, or else what the model holds."""
+    """Response of the child process: faults, or else the content of the model."""
 
     faults: list[IntakeFault] = []
     views: int = 0

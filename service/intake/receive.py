@@ -64,7 +64,7 @@ class ReceivedArchive:
 
 @dataclass(frozen=True)
 class UploadLimits:
-    """What an upload may ask for.
+    """Limits of an upload.
 
     Attributes:
         max_file_bytes: one file.

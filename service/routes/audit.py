@@ -1,4 +1,4 @@
-"""Who did what."""
+"""Route of the audit log."""
 
 from fastapi import APIRouter, Request, Response
 

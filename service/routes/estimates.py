@@ -1,4 +1,4 @@
-"""What a job would take, before it is asked for."""
+"""Route that estimates a job before it is submitted."""
 
 from fastapi import APIRouter
 

@@ -1,4 +1,4 @@
-"""What happens to a job: its log, its events as a list and as a stream."""
+"""Routes of a job's log and events, as a list and as a stream."""
 
 import json
 import uuid

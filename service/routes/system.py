@@ -1,4 +1,4 @@
-"""What the service is and how it fares: kinds of jobs, formats, queues, tokens, health."""
+"""Routes on the service: job kinds, formats, queues, tokens, health."""
 
 import uuid
 

@@ -1,1 +1,1 @@
-"""What the API takes and gives, with examples; one module a subject."""
+"""Request and response bodies of the API, with examples; one module a subject."""

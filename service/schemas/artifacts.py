@@ -1,4 +1,4 @@
-"""Results of jobs."""
+"""Bodies of the routes on job results."""
 
 from pydantic import BaseModel, ConfigDict
 
@@ -28,7 +28,7 @@ class ArtifactView(BaseModel):
 
     @classmethod
     def from_row(cls, row: Artifact) -> "ArtifactView":
-        """From its row."""
+        """Return the view of a database row."""
         return cls.model_validate(row, from_attributes=True)
 
 

@@ -1,4 +1,4 @@
-"""Who did what."""
+"""Bodies of the audit log's route."""
 
 import uuid
 from datetime import datetime

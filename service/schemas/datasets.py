@@ -24,7 +24,7 @@ class NewDataset(RequestBody):
 
 
 class DatasetChange(RequestBody):
-    """What may be changed of a dataset."""
+    """Changes of a dataset."""
 
     model_config = ConfigDict(extra="forbid", json_schema_extra={"examples": [{"pinned": True}]})
 
@@ -69,7 +69,7 @@ class DatasetView(BaseModel):
 
     @classmethod
     def from_row(cls, row: Dataset) -> "DatasetView":
-        """From its row."""
+        """Return the view of a database row."""
         return cls.model_validate(row, from_attributes=True)
 
 
@@ -105,7 +105,7 @@ class FileView(BaseModel):
 
     @classmethod
     def from_row(cls, row: DatasetFile) -> "FileView":
-        """From its row."""
+        """Return the view of a database row."""
         return cls.model_validate(row, from_attributes=True)
 
 
@@ -117,7 +117,7 @@ class FilePage(BaseModel):
 
 
 class ArchiveView(BaseModel):
-    """What came out of an archive."""
+    """Result of unpacking an archive into a dataset."""
 
     files: list[FileView]
     left_out: list[str] = Field(description="Files that are no part of a scene.")

@@ -1,4 +1,4 @@
-"""What a job would take."""
+"""Bodies of the estimate's route."""
 
 import uuid
 from typing import Any
@@ -41,6 +41,6 @@ class NewEstimate(RequestBody):
 
 
 class EstimateView(BaseModel):
-    """What a job will take, within a factor of two; null where nobody knows."""
+    """Estimated cost of a job, within a factor of two; null where it is unknown."""
 
     estimate: Estimate | None

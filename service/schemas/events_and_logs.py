@@ -1,4 +1,4 @@
-"""What happens to a job: its log and its events."""
+"""Bodies of the routes on a job's log and events."""
 
 from datetime import datetime
 from typing import Any
@@ -18,7 +18,7 @@ class LogLineView(BaseModel):
 
     @classmethod
     def from_row(cls, row: LogLine) -> "LogLineView":
-        """From its row."""
+        """Return the view of a database row."""
         return cls.model_validate(row, from_attributes=True)
 
 
@@ -40,7 +40,7 @@ class EventView(BaseModel):
 
     @classmethod
     def from_row(cls, row: JobEvent) -> "EventView":
-        """From its row."""
+        """Return the view of a database row."""
         return cls.model_validate(row, from_attributes=True)
 
 

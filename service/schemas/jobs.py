@@ -60,14 +60,14 @@ class NewJob(RequestBody):
 
 
 class JobChange(RequestBody):
-    """What may be changed of a job."""
+    """Changes of a job."""
 
     label: str | None = Field(None, max_length=200)
     pinned: bool | None = Field(None, description="Keep it whatever its age.")
 
 
 class RetryRequest(RequestBody):
-    """Where a retried job begins, and what is to be different."""
+    """Retry of a job: the attempt's starting point and changed options."""
 
     model_config = ConfigDict(
         extra="forbid",
@@ -86,7 +86,7 @@ class RetryRequest(RequestBody):
 
 
 class JobError(BaseModel):
-    """Why a job failed."""
+    """Error with which a job failed."""
 
     model_config = ConfigDict(extra="allow")
 
@@ -196,7 +196,7 @@ class JobView(BaseModel):
     def from_row(
         cls, row: Job, stages: list[str], queue_position: int | None = None, notes: Sequence[str] = ()
     ) -> "JobView":
-        """From its row."""
+        """Return the view of a database row."""
         names = {name for name in cls.model_fields if name not in ("stages", "queue_position", "notes")}
         values = {name: getattr(row, name) for name in names}
         return cls(**values, stages=stages, queue_position=queue_position, notes=list(notes))

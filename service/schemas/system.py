@@ -1,4 +1,4 @@
-"""What the service is and how it fares: kinds of jobs, formats, queues, health."""
+"""Bodies of the routes on the service: job kinds, formats, queues, health."""
 
 from datetime import datetime
 from typing import Any, Literal
@@ -34,7 +34,7 @@ class FormatView(BaseModel):
 
 
 class InfoView(BaseModel):
-    """What this service is."""
+    """Name, version and features of the service."""
 
     version: str
     kinds: list[str]
@@ -79,7 +79,7 @@ class QueueList(BaseModel):
 
 
 class Health(BaseModel):
-    """How the service is."""
+    """Health of the service."""
 
     status: Literal["ok", "unready"]
     checks: dict[str, str] = {}

@@ -1,4 +1,4 @@
-"""Tokens."""
+"""Bodies of the routes on API tokens."""
 
 import uuid
 from datetime import datetime
@@ -34,7 +34,7 @@ class TokenView(BaseModel):
 
     @classmethod
     def from_row(cls, row: Token) -> "TokenView":
-        """From its row."""
+        """Return the view of a database row."""
         return cls.model_validate(row, from_attributes=True)
 
 
@@ -45,7 +45,7 @@ class MadeToken(TokenView):
 
 
 class TokenList(BaseModel):
-    """All tokens."""
+    """All tokens that the caller may see."""
 
     tokens: list[TokenView]
 

@@ -25,7 +25,7 @@ Events = Annotated[list[EventName], Field(min_length=1, max_length=6)]
 
 
 class JobWebhook(BaseModel):
-    """Where to tell of one job."""
+    """Webhook for the events of one job."""
 
     model_config = ConfigDict(extra="forbid")
 
@@ -37,7 +37,7 @@ class JobWebhook(BaseModel):
 
 
 class NewWebhook(BaseModel):
-    """Where to tell of jobs."""
+    """Webhook to create."""
 
     model_config = ConfigDict(
         extra="forbid",
@@ -51,7 +51,7 @@ class NewWebhook(BaseModel):
 
 
 class WebhookChange(BaseModel):
-    """What may be changed of a webhook."""
+    """Changes of a webhook."""
 
     model_config = ConfigDict(extra="forbid", json_schema_extra={"examples": [{"enabled": True}]})
 
@@ -62,7 +62,7 @@ class WebhookChange(BaseModel):
 
 
 class WebhookView(BaseModel):
-    """Where somebody is told of jobs."""
+    """A webhook: the URL that receives events of jobs."""
 
     model_config = ConfigDict(
         json_schema_extra={
@@ -90,7 +90,7 @@ class WebhookView(BaseModel):
 
     @classmethod
     def from_row(cls, row: Endpoint) -> "WebhookView":
-        """From its row."""
+        """Return the view of a database row."""
         return cls.model_validate(row, from_attributes=True)
 
 
@@ -154,7 +154,7 @@ class DeliveryView(BaseModel):
 
     @classmethod
     def from_row(cls, row: Delivery) -> "DeliveryView":
-        """From its row."""
+        """Return the view of a database row."""
         values = {name: getattr(row, name) for name in cls.model_fields if name != "message_id"}
         values["due_at"] = row.due_at if row.state == "pending" else None
         return cls(**values, message_id=f"msg_{row.id.hex}")

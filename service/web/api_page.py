@@ -56,7 +56,7 @@ class OperationGroup:
 
 @router.get("/docs")
 async def show_api(request: Request) -> Response:
-    """Return the API."""
+    """Return the page that documents the API."""
     document = request.app.openapi()
     return render_page(request, "api.html", groups=operation_groups(document), info=document["info"])
 

@@ -16,7 +16,7 @@ class StaticAssets(StaticFiles):
         super().__init__(directory=STATIC_FOLDER)
 
     async def get_response(self, path: str, scope: Scope) -> Response:
-        """Return the file."""
+        """Return a static file with its cache and security headers."""
         response = await super().get_response(path, scope)
         response.headers["Cache-Control"] = "no-cache"
         # Workers have a policy of their own, which comes with their file.

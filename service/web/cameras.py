@@ -1,8 +1,8 @@
-"""Where the photographs were taken: read from the COLMAP model of a job, for the viewer to start from.
+"""Cameras of the photographs, read from the COLMAP model of a job, as starting views of the viewer.
 
-The model was checked by a child process when its dataset was committed, or was written by our own worker.
-Only the heads of its records are read here, with bounds on all of them; numbers that make no sense leave a
-camera out.
+The model was validated by a child process when its dataset was committed, or was written by our own worker.
+Only the heads of its records are read here, with bounds on all of them; a camera with invalid numbers is
+left out.
 """
 
 import io

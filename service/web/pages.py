@@ -188,7 +188,7 @@ async def show_new(
 
 @router.post("/jobs/{job_id}/cancel")
 async def cancel(request: Request, job_id: uuid.UUID, who: Writer, service: ServiceDep) -> Response:
-    """Stop a job."""
+    """Cancel a job and return its updated page."""
     await actions.cancel_job(service, who, job_id)
     return await _updated_page(request, job_id, who, service)
 

@@ -1,4 +1,4 @@
-"""What the form of another light needs of a finished job with materials: its views, and maps of light."""
+"""Data of the relighting form: the views of a finished job with materials, and environment maps."""
 
 import uuid
 from collections.abc import Sequence

@@ -1,4 +1,4 @@
-"""What a finished job has to show: figures, views, downloads and what opens them."""
+"""Results page of a finished job: metrics, views, downloads and the programs that open them."""
 
 import json
 import logging
@@ -80,7 +80,7 @@ class HeldOutView:
 
 @dataclass(frozen=True)
 class Measurements:
-    """What ``metrics.json`` says."""
+    """Metrics read from ``metrics.json``."""
 
     columns: tuple[Metric, ...]
     mean: Mapping[str, float | None]

@@ -19,7 +19,7 @@ _LOCAL_HOSTS = frozenset({"127.0.0.1", "localhost"})
 
 @dataclass(frozen=True)
 class ViewedScene:
-    """What the page shows.
+    """Content of the viewer page.
 
     Attributes:
         name: its heading.
@@ -56,7 +56,7 @@ class SceneServer:
         return f"http://127.0.0.1:{self._server.server_port}/"
 
     def close(self) -> None:
-        """End the server."""
+        """Stop the server and wait for its thread."""
         self._server.shutdown()
         self._server.server_close()
         self._thread.join()
@@ -128,4 +128,4 @@ class _SceneHandler(BaseHTTPRequestHandler):
         self.wfile.write(content)
 
     def log_message(self, format: str, *arguments: object) -> None:
-        """Write nothing."""
+        """Write no log of requests."""

@@ -29,7 +29,7 @@ _MAX_FORM_BYTES = 4096
 async def show_sign_in(
     request: Request, next: Annotated[str | None, Query(max_length=500)] = None
 ) -> Response:
-    """Return the form."""
+    """Return the sign-in form."""
     return render_page(request, "sign_in.html", next=safe_local_path(next), refused=False)
 
 

@@ -1,4 +1,4 @@
-"""What the form of a stage needs of a finished job: pictures to place things in, and limits."""
+"""Data of the stage form: images of a finished job in which meshes are placed, and limits."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""What the pages show of jobs, gathered from the tables and the store."""
+"""View models of the pages on jobs, gathered from the database and the storage."""
 
 import uuid
 from collections.abc import Sequence

@@ -64,7 +64,7 @@ class Client:
 
     @property
     def url(self) -> str:
-        """Where the service is."""
+        """Return the address of the service."""
         return self._api.address
 
     def submit(
@@ -169,7 +169,7 @@ class Job:
 
     @property
     def id(self) -> str:
-        """The id."""
+        """Return the id of the job."""
         return str(self.content["id"])
 
     @property
@@ -179,7 +179,7 @@ class Job:
 
     @property
     def label(self) -> str | None:
-        """What it is called."""
+        """Return the label of the job; None if it has none."""
         return cast("str | None", self.content["label"])
 
     @property
@@ -194,7 +194,7 @@ class Job:
 
     @property
     def error(self) -> str | None:
-        """Why it failed."""
+        """Return the message of the error with which the job failed; None if it did not fail."""
         error = self.content.get("error")
         return None if error is None else str(error["message"])
 

@@ -24,7 +24,7 @@ Background = Literal["black", "white"] | tuple[float, float, float]
 
 @dataclass(frozen=True)
 class Image:
-    """What a camera sees of a scene.
+    """An image of a scene, rendered for one camera.
 
     Attributes:
         rgb: display values in [0, 1] over the background.

@@ -1,4 +1,4 @@
-"""What notebooks show: progress while work goes on, and results as small tables. Elsewhere, a log."""
+"""Progress and results for notebooks: a bar and small tables; elsewhere, log lines."""
 
 import html
 import logging
@@ -45,7 +45,7 @@ class ProgressLog:
         self._lines = EventLines(LOGGER.info, warn=_log_warning)
 
     def __call__(self, event: Event) -> None:
-        """Log ``event``."""
+        """Log the line of ``event``, if it has one."""
         self._lines(event)
 
 
@@ -74,7 +74,7 @@ class NotebookProgress:
         self._handle: Any = None
 
     def __call__(self, event: Event) -> None:
-        """Show ``event``."""
+        """Update the progress display by ``event``."""
         self._stage(event)
         if isinstance(event, PhaseProgress):
             self._share = (event.step + event.part) / event.total_steps if event.total_steps else None

@@ -1,4 +1,4 @@
-"""Where files and folders are, as the functions of the package take it."""
+"""Types of paths that the functions of the package accept."""
 
 import os
 

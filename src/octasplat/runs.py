@@ -89,12 +89,12 @@ class Run:
 
     @property
     def is_finished(self) -> bool:
-        """Whether its scene was trained and measured; if not, :func:`reconstruct` goes on with it."""
+        """Return whether the scene is trained and evaluated; if not, :func:`reconstruct` resumes it."""
         return (self.path / _SCENE).exists() and (self.path / _METRICS).exists()
 
     @property
     def metrics(self) -> Mapping[str, Any]:
-        """What was measured, as ``metrics.json`` holds it; empty before."""
+        """Return the metrics as ``metrics.json`` holds them; empty before the evaluation."""
         return _read_json(self.path / _METRICS)
 
     @property
@@ -111,7 +111,7 @@ class Run:
 
     @property
     def settings(self) -> Mapping[str, Any]:
-        """All settings."""
+        """Return all settings of the run by their present names."""
         from octasplat.engine.runs.config import ReconstructionConfig
         from octasplat.engine.settings.renamed_settings import translate_names
 
@@ -121,7 +121,7 @@ class Run:
 
     @property
     def training(self) -> Mapping[str, Any]:
-        """What is noted of the training, such as its ``seconds`` and ``iterations``; empty before its end."""
+        """Return facts about the training, such as ``seconds`` and ``iterations``; empty before its end."""
         return _read_json(self.path / _TRAINING)
 
     @property

@@ -93,7 +93,7 @@ class Scene:
 
     @property
     def means(self) -> Float32[np.ndarray, "n 3"]:
-        """Centres, world units."""
+        """Return the centres, in world units."""
         return self.gaussians.means_world
 
     @means.setter
@@ -125,7 +125,7 @@ class Scene:
 
     @property
     def opacity_logits(self) -> Float32[np.ndarray, " n"]:
-        """What the sigmoid turns into :attr:`opacities`."""
+        """Return the logits of :attr:`opacities`, before the sigmoid."""
         return self.gaussians.opacity_logits
 
     @property
@@ -158,7 +158,7 @@ class Scene:
 
     @property
     def channels(self) -> Mapping[str, np.ndarray]:
-        """What else is known of each Gaussian, such as its albedo, by name."""
+        """Return the further channels of each Gaussian, such as albedo, by name."""
         return self.gaussians.channels
 
     @property

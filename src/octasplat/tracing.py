@@ -115,7 +115,7 @@ class Rays:
 
 @dataclass(frozen=True)
 class TracedRays:
-    """What rays see.
+    """Result of tracing rays through a scene.
 
     Attributes:
         rgb: display colours, multiplied by alpha: with a background b, a picture is rgb + (1 - alpha) b.
@@ -192,7 +192,7 @@ def trace(
 
 @dataclass(frozen=True)
 class _TraceConstants:
-    """What is not differentiated."""
+    """Inputs of the trace that are not differentiated."""
 
     settings: TraceSettings
     t_min: float

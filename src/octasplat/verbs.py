@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
 
 class RenderArguments(TypedDict, total=False):
-    """What :func:`render` takes by name."""
+    """Keyword arguments of :func:`render`."""
 
     overwrite: bool
     mode: Literal["turntable", "views", "path", "camera"] | None

@@ -1,4 +1,4 @@
-"""What ``octasplat demo`` does: the generated scene and its reconstruction, each resumed by itself."""
+"""Steps of ``octasplat demo``: the synthetic dataset and its reconstruction, each resumed by itself."""
 
 from collections.abc import Mapping
 from pathlib import Path

@@ -28,7 +28,7 @@ def threads_option(command: F) -> F:
 
 
 def quiet_option(command: F) -> F:
-    """``--quiet``."""
+    """Add the option ``--quiet`` to a command."""
     return click.option("--quiet", "-q", is_flag=True, help="Show warnings and errors only.")(command)
 
 

@@ -61,7 +61,7 @@ class ProgressBars:
         self.bars = _ProgressWithDetail(console, should_stop)
 
     def __call__(self, event: Event) -> None:
-        """Show ``event``."""
+        """Update the progress bars by ``event``."""
         self._state.update(event)
         if isinstance(event, PhaseStarted):
             self._start_task(event)

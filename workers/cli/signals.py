@@ -21,7 +21,7 @@ class StoppedError(Exception):
 
 
 class StopFlag:
-    """Whether the user asked to stop, and by which signal."""
+    """Flag that is set when the user asks to stop, with the signal."""
 
     def __init__(self) -> None:
         self.signal_number: int | None = None
@@ -32,7 +32,7 @@ class StopFlag:
 
     @property
     def exit_code(self) -> int:
-        """What a shell expects of a program ended by the signal: 130 for SIGINT, 143 for SIGTERM."""
+        """Return the exit code of a program ended by the signal: 130 for SIGINT, 143 for SIGTERM."""
         return 128 + (self.signal_number or signal.SIGINT)
 
 

@@ -67,7 +67,7 @@ def verbs() -> tuple[Verb, ...]:
 
 
 def verbs_page() -> str:
-    """Return ``docs/verbs.md``."""
+    """Return the content of ``docs/verbs.md``."""
     return _PAGE + "".join(f"| {' | '.join(_columns(verb))} |\n" for verb in verbs())
 
 

@@ -112,7 +112,7 @@ class Api:
         self.close()
 
     def close(self) -> None:
-        """Close the connections."""
+        """Close the HTTP connections."""
         self._http.close()
 
     def get(self, path: str, **query: Any) -> Any:

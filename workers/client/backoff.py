@@ -1,4 +1,4 @@
-"""How long a client waits for a service that is away, and how often it asks."""
+"""Back-off of a client while the service is unreachable: its waiting times and their limit."""
 
 import random
 import time

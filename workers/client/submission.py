@@ -28,7 +28,7 @@ class JobFailedError(OctasplatError):
 
 @dataclass(frozen=True)
 class Submission:
-    """What to ask for.
+    """Description of a job to submit.
 
     Attributes:
         scene: folder of photographs, ZIP file, or the id of a dataset.

@@ -1,4 +1,4 @@
-"""Who did what: changes that somebody asked for, and who was turned away; kept until it is old."""
+"""Audit log: requested changes and refused callers, deleted after their retention time."""
 
 import uuid
 from dataclasses import dataclass

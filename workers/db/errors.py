@@ -1,4 +1,4 @@
-"""What can go wrong with the database and in its tables, each fit to be shown as it is."""
+"""Errors of the database and its tables; their messages can be shown to users."""
 
 from octasplat.engine.core.errors import OctasplatError
 
@@ -14,7 +14,7 @@ class ConflictError(OctasplatError):
 
 
 class NotFoundError(OctasplatError):
-    """What was asked for is not there, or not any more; ``kind`` names its kind."""
+    """A requested row does not exist, or does not any more; ``kind`` names its kind."""
 
     error_type = "missing"
 

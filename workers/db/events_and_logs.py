@@ -1,4 +1,4 @@
-"""What happened to jobs and what their programs wrote, as rows that only grow."""
+"""Append-only tables of job events and log lines."""
 
 import uuid
 from collections.abc import Mapping, Sequence

@@ -1,9 +1,10 @@
-"""What an owner may take: bytes, datasets, and jobs that are not over. All tokens of an owner share it.
+"""Quotas of owners: bytes, datasets, and unfinished jobs; all tokens of an owner share them.
 
-The checks take a lock of the owner that ends with the transaction, so that what is checked and what is then
-entered in the same transaction belong together, however many requests come at once. Whoever also locks a job
-or a dataset takes that lock before, see :mod:`octasplat.workers.db.locks`. The database counts bytes as
-they change (``migrations/0012_locks.sql``), so no check takes longer for who has more.
+The checks take a lock of the owner until the end of the transaction, so that a check and the insertion that
+follows in the same transaction are atomic, however many requests arrive at once. A transaction that also
+locks a job or a dataset takes that lock first, see :mod:`octasplat.workers.db.locks`. The database counts
+bytes as they change (``migrations/0012_locks.sql``), so the time of a check does not depend on how much is
+stored.
 """
 
 from collections.abc import Sequence
@@ -53,7 +54,7 @@ class Quota:
 
 @dataclass(frozen=True)
 class Usage:
-    """What an owner has, counted as in :class:`Quota`."""
+    """Usage of an owner, counted as in :class:`Quota`."""
 
     bytes: int
     datasets: int

@@ -144,7 +144,7 @@ class Job:
 
     @property
     def is_over(self) -> bool:
-        """Whether the job is in a terminal state."""
+        """Return whether the job is in a terminal state."""
         return self.state in TERMINAL
 
 

@@ -1,4 +1,4 @@
-"""Which workers are alive."""
+"""Table of the live workers."""
 
 import uuid
 from collections.abc import Mapping, Sequence

@@ -1,1 +1,1 @@
-"""What is done regularly: forgetting what has expired, collecting what nobody names, sending webhooks."""
+"""Periodic maintenance: expiry, garbage collection of the storage, and delivery of webhooks."""

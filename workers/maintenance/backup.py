@@ -47,7 +47,7 @@ class BackupError(OctasplatError):
 
 @dataclass(frozen=True)
 class BackupSummary:
-    """What a backup holds: rows, and contents with their length together."""
+    """Content of a backup: row counts, and the count and total length of its blobs."""
 
     rows: int
     contents: int

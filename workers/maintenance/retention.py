@@ -1,7 +1,7 @@
-"""When jobs and datasets expire, and forgetting those that have.
+"""Expiry of jobs and datasets, and deletion of those that have expired.
 
-What expires is told in its row before it goes: ``expires_at`` is set once, when a job is over or a dataset is
-not in use any more, and stays until it is pinned, used or retried. All times are the database's.
+The time of expiry is in the row beforehand: ``expires_at`` is set once, when a job is over or a dataset is
+not in use any more, and stays until the row is pinned, used or retried. All times are the database's.
 """
 
 import logging

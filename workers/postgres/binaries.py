@@ -1,4 +1,4 @@
-"""Where a Postgres to start comes from: the binaries of a wheel, or those installed on this machine."""
+"""Postgres binaries to start: those of a wheel, or those installed on this machine."""
 
 import importlib.util
 import os

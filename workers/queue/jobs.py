@@ -22,7 +22,7 @@ from octasplat.workers.queue.protocol import JobQueue, QueueDepth
 
 @dataclass(frozen=True)
 class NewJob:
-    """What a job is made from; see :class:`octasplat.workers.db.rows.Job`."""
+    """Values from which a job is created; see :class:`octasplat.workers.db.rows.Job`."""
 
     owner: str
     kind: str

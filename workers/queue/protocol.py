@@ -1,7 +1,8 @@
-"""What a queue has to do for us: deliver slips, each naming a job. The truth about jobs is in our own table.
+"""Protocol of a job queue: it delivers entries that each name a job; the state of jobs is in our own table.
 
-A slip is delivered at least once. One whose worker is lost stays behind; the rescue asks for such slips and
-replaces them. Everything that belongs to a change of a job takes the connection of its transaction.
+An entry is delivered at least once. The entry of a lost worker stays behind; the recovery of stalled jobs
+lists such entries and replaces them. Everything that belongs to a change of a job takes the connection of its
+transaction.
 """
 
 import uuid

@@ -11,7 +11,7 @@ TOTAL_NAMES = ("attempts", "rescues", "poisoned", "succeeded", "failed", "cancel
 
 @dataclass(frozen=True)
 class ServiceStats:
-    """How the service fares.
+    """Figures on queues, jobs, workers and webhooks of the service.
 
     Attributes:
         depths: what waits in each queue that has something waiting.

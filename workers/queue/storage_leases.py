@@ -161,7 +161,7 @@ async def unmark_for_removal(connection: Connection, contents: Collection[str]) 
 
 
 async def oldest_lease(connection: Connection) -> datetime | None:
-    """When the oldest note in force was made; None if nobody stores anything."""
+    """Return when the oldest lease in force was made; None if nobody stores anything."""
     cursor = await connection.execute("SELECT min(began_at) AS began_at FROM storing")
     row = await cursor.fetchone()
     return row["began_at"] if row is not None else None

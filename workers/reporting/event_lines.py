@@ -49,7 +49,7 @@ _STAGE_RESULTS = {
 
 
 class ProgressState:
-    """What both displays remember of the events so far."""
+    """State of the progress that both displays share."""
 
     def __init__(self) -> None:
         self.step = self.total = 0

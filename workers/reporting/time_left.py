@@ -1,4 +1,4 @@
-"""How long a stage that counts its steps will still take."""
+"""Estimate of the remaining time of a stage that counts its steps."""
 
 import time
 

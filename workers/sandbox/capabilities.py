@@ -1,4 +1,4 @@
-"""What of the isolation a machine can do, and what it says where it cannot."""
+"""Isolation features of this machine, and the reasons for missing ones."""
 
 import logging
 import os

@@ -35,7 +35,7 @@ EXTRA_GRACE_SECONDS = 60.0
 
 @dataclass(frozen=True)
 class ServeOptions:
-    """What to run.
+    """Options of the local service.
 
     Attributes:
         settings: of everything.

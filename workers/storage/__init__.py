@@ -1,4 +1,4 @@
-"""Where datasets, checkpoints and results are kept: a folder or a bucket, behind one protocol."""
+"""Storage of datasets, checkpoints and results: a folder or a bucket, behind one protocol."""
 
 from octasplat.workers.storage.errors import (
     BlobNotFoundError,

@@ -1,4 +1,4 @@
-"""Whether there is room to work: in the store, and on the disk of the work under way."""
+"""Free space of the storage and of the disk for work in progress."""
 
 import os
 from dataclasses import dataclass
@@ -14,7 +14,7 @@ MIN_FREE_BYTES = 1 << 20
 
 @dataclass(frozen=True)
 class SpaceUsage:
-    """What a job takes on the disk of the work, and in the store."""
+    """Space that a job needs on the work disk and in the storage."""
 
     work_bytes: int = 0
     store_bytes: int = 0

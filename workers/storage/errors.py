@@ -1,4 +1,4 @@
-"""What can go wrong with stored bytes, each fit to be shown as it is."""
+"""Errors of the storage; their messages can be shown to users."""
 
 from octasplat.engine.core.errors import OctasplatError
 

@@ -39,7 +39,7 @@ class Finding:
 
 @dataclass
 class Report:
-    """What a comparison found.
+    """Result of comparing the tables with the storage.
 
     Attributes:
         references: places in the tables.
@@ -63,7 +63,7 @@ class Report:
 
     @property
     def is_sound(self) -> bool:
-        """Whether everything that the tables name is there."""
+        """Return whether everything that the tables reference exists."""
         return not self.findings
 
 

@@ -1,4 +1,4 @@
-"""What errors of the operating system mean for a store."""
+"""Translation of operating system errors into errors of the storage."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager

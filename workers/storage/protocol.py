@@ -1,9 +1,9 @@
-"""What a store is: content by its SHA-256, and small documents that are published once.
+"""Protocol of a storage: content addressed by SHA-256, and small documents that are published once.
 
-A *blob* is content of any length whose name is the SHA-256 of its bytes; it becomes visible when it is whole
-and its digest is verified, never before. A *document* is a small named text, usually a manifest of blobs;
-publishing one is a single atomic step that never replaces another. Photographs, checkpoints and results are
-blobs; which of them belong together is said by a table or a document.
+A *blob* is content of any length whose name is the SHA-256 of its bytes; it becomes visible when it is
+complete and its digest is verified, never before. A *document* is a small named text, usually a manifest of
+blobs; publishing one is a single atomic step that never replaces another. Photographs, checkpoints and
+results are blobs; a table or a document records which of them belong together.
 
 All calls block; a server calls them from threads.
 """

@@ -86,7 +86,7 @@ class S3Storage:
         )
 
     def close(self) -> None:
-        """Close the connections."""
+        """Close the HTTP connections."""
         self.client.close()
 
     def open_writer(

@@ -1,4 +1,4 @@
-"""What all writers of blobs share: counting, hashing and the comparison with what was announced."""
+"""Base of all blob writers: counts, hashes and compares with the announced length and digest."""
 
 import hashlib
 import threading
@@ -96,7 +96,7 @@ class VerifyingWriter(ABC):
 
     @abstractmethod
     def _write_bytes(self, data: bytes | memoryview) -> None:
-        """Take bytes."""
+        """Write the next bytes to the storage."""
 
     @abstractmethod
     def _publish(self, blob: Blob) -> None:

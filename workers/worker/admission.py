@@ -1,4 +1,4 @@
-"""Whether a worker has room for a job, and room made where there is none."""
+"""Admission of jobs: whether a worker has disk space for one, and eviction to make some."""
 
 import asyncio
 import logging

@@ -1,6 +1,6 @@
-"""Whether this version can do a job. Versions run beside each other while a service is brought up to date.
+"""Check of whether this version can run a job; workers of several versions run during an upgrade.
 
-What a worker does not know, a newer one does: the job is left to that one, and nothing is counted against it.
+A job that this version does not know is left to a newer worker, and no attempt is counted.
 """
 
 import uuid
@@ -24,7 +24,7 @@ def version_facts() -> dict[str, Any]:
 
 
 async def reason_incapable(pool: Pool, job_id: uuid.UUID, stale_seconds: float) -> str | None:
-    """Why a job is left to workers of another version, in a few words, or None.
+    """Return in a few words why a job is left to workers of another version; None if it is not.
 
     Args:
         pool: connections.

@@ -93,7 +93,7 @@ class ChildProcess:
 
     @property
     def pid(self) -> int:
-        """Process id."""
+        """Return the process id."""
         return self._process.pid
 
     async def wait(self) -> int:

@@ -1,4 +1,4 @@
-"""What all attempts of a worker share."""
+"""Context that all attempts of a worker share."""
 
 import asyncio
 import uuid
@@ -19,7 +19,7 @@ class DatabaseLostError(Exception):
 
 @dataclass(frozen=True)
 class WorkerContext:
-    """What all attempts of a worker share.
+    """Context that all attempts of a worker share.
 
     Attributes:
         settings: of the worker.
@@ -43,7 +43,7 @@ class WorkerContext:
 
     @property
     def quota(self) -> Quota:
-        """What an owner may store who has no limits of their own."""
+        """Return the default storage quota of an owner."""
         return Quota(max_bytes=self.settings.quota_bytes)
 
     async def space_shortage(self, excluding: SpaceUsage = NO_USAGE) -> str | None:

@@ -23,7 +23,7 @@ class FrameCheckpoints:
         self._next_at = 0.0
 
     def __call__(self, event: Event) -> None:
-        """Take an event."""
+        """Forward an event; saved images may trigger a checkpoint."""
         if not isinstance(event, ImagesSaved):
             self._listener(event)
             return

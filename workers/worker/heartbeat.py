@@ -39,12 +39,12 @@ class Heartbeat:
 
     @property
     def is_lost(self) -> bool:
-        """Whether others may soon take the job."""
+        """Return whether other workers may soon take the job."""
         return time.monotonic() - self._last_sent > LOST_FRACTION * self._settings.stale_seconds
 
     @property
     def kill_at(self) -> float:
-        """When nothing may be at work on the job here any more, by ``time.monotonic()``."""
+        """Return when the job's processes must have ended here, by ``time.monotonic()``."""
         return self._last_sent + KILL_FRACTION * self._settings.stale_seconds
 
     async def run(self, on_state: Callable[[str], None]) -> None:

@@ -1,4 +1,4 @@
-"""Whether this machine can do jobs at all. What it lacks is its own fault and counts against no job."""
+"""Health of the host: a job that fails for a fault of the machine is not blamed for it."""
 
 import asyncio
 import json

@@ -1,4 +1,4 @@
-"""What a file is, by its name."""
+"""Media types of files, by their names."""
 
 import mimetypes
 from pathlib import PurePosixPath

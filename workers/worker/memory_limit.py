@@ -1,4 +1,4 @@
-"""How much memory a job may use: its share of what this machine, or this container, has."""
+"""Memory limit of a job: its share of the memory of this machine or container."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""What becomes of an attempt, as it is written to the database: succeeded, failed, put back."""
+"""Outcomes of attempts, written to the database: succeeded, failed, requeued."""
 
 import asyncio
 import logging

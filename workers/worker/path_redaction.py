@@ -18,7 +18,7 @@ _KEPT_PATH_PARTS = 2
 
 
 class PathRedactor:
-    """What is called how.
+    """Replaces paths of this machine in texts by neutral names.
 
     Args:
         folder: of an attempt, see :class:`octasplat.workers.worker.task.Task`.

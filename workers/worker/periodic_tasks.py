@@ -1,4 +1,4 @@
-"""What a worker does regularly: watched, done again after any failure, or the worker ends."""
+"""Periodic tasks of a worker: restarted after a failure, or the worker ends."""
 
 import asyncio
 import logging

@@ -1,7 +1,7 @@
-"""What a child says, as rows of the database: progress, events, log, checkpoints and pictures.
+"""Reports of a child process as rows of the database: progress, events, log, checkpoints and previews.
 
-Hearing never waits for the database. What cannot be written is dropped, but for checkpoints; a verdict at the
-end does not depend on any of it.
+Receiving never waits for the database. A row that cannot be written is dropped, except for checkpoints; the
+final outcome does not depend on any of them.
 """
 
 import asyncio
@@ -72,7 +72,7 @@ class Reporter:
 
     @property
     def checkpoint_bytes(self) -> int:
-        """What the newest checkpoint takes in the store."""
+        """Return the size of the newest checkpoint in the storage."""
         return sum(file.size_bytes for file in self._checkpoint.files) if self._checkpoint is not None else 0
 
     def set_stages(self, stages: Sequence[str]) -> None:

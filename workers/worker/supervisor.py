@@ -45,7 +45,7 @@ _WATCH_POOL = ThreadPoolExecutor(1, "watch")
 
 
 class StopReason(Enum):
-    """Why a child was stopped before its time."""
+    """Reason for which a child process was stopped early."""
 
     FENCED = "the job has gone on without this worker"
     DATABASE_LOST = "the database was lost"

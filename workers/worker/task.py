@@ -1,4 +1,4 @@
-"""What the program of a job is given, and how it crosses into the child process."""
+"""Input of a job's program, and its transfer into the child process."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field

@@ -49,7 +49,7 @@ MAX_METRICS_BYTES = 16 << 20
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """What a later attempt goes on from, as the job's row keeps it.
+    """Checkpoint from which a later attempt resumes, as the job's row stores it.
 
     Attributes:
         attempt: that made it.
@@ -68,7 +68,7 @@ class Checkpoint:
     results: int = field(default_factory=lambda: versions.RESULTS_VERSION)
 
     def as_row(self) -> dict[str, Any]:
-        """As JSON values."""
+        """Return the checkpoint as JSON values."""
         return {
             "attempt": self.attempt,
             "stage": self.stage,
@@ -79,7 +79,7 @@ class Checkpoint:
 
     @classmethod
     def from_row(cls, row: Mapping[str, Any]) -> "Checkpoint":
-        """From JSON values."""
+        """Return the checkpoint of JSON values."""
         files = tuple(TreeFile.model_validate(file) for file in row["files"])
         return cls(row["attempt"], row["stage"], row["step"], files, row.get("results", 1))
 
@@ -122,7 +122,7 @@ class Workspace:
             self._lock = _open_locked(self.folder / _LOCK_FILE)
 
     def close(self) -> None:
-        """Remove the folder."""
+        """Remove the folder and release its locks."""
         shutil.rmtree(self.folder, ignore_errors=True)
         if self._lock is not None:
             self._lock.close()

@@ -1,4 +1,4 @@
-"""What the things of the generated scene are made of: linear albedo from texture coordinates.
+"""Albedo of the objects in the synthetic scene, in linear light, from texture coordinates.
 
 Every material takes positions (n, 3) in the object's own frame, in metres, and uv (n, 2), and returns colours
 (n, 3) in linear light.
@@ -217,7 +217,7 @@ def boulder_stone(xyz: TexturePoints, uv: UvCoordinates) -> Colours:
 
 
 def cube_paint(xyz: TexturePoints, uv: UvCoordinates) -> Colours:
-    """A toy block: a chequered body whose faces carry large letters in octagons."""
+    """Return the albedo of a toy block: a checkerboard whose faces carry large letters in octagons."""
     axis = np.argmax(np.abs(xyz), axis=1)
     rows = np.arange(len(xyz))
     first, second = xyz[rows, (axis + 1) % 3], xyz[rows, (axis + 2) % 3]
@@ -240,7 +240,7 @@ def cube_paint(xyz: TexturePoints, uv: UvCoordinates) -> Colours:
 
 
 def book_cloth(xyz: TexturePoints, uv: UvCoordinates) -> Colours:
-    """A closed book on its side: cloth covers with a title and lines of print, pages between."""
+    """Return the albedo of a closed book on its side: cloth covers with a title, and pages between."""
     x, y, z = xyz[:, 0], xyz[:, 1], xyz[:, 2]
     weave = checkerboard(x / 0.004, y / 0.004) * 0.12 + 0.9
     colours = np.broadcast_to(linear_from_hex("7b2d26"), xyz.shape) * grey_column(weave)

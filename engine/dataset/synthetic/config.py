@@ -1,4 +1,4 @@
-"""What a generated scene is made with; imports nothing heavy, so that a front end can use it."""
+"""Settings of a synthetic dataset; imports nothing heavy, so that a front end can use it."""
 
 from dataclasses import asdict, dataclass
 
@@ -61,9 +61,9 @@ class SyntheticDatasetConfig:
 
     @property
     def objects_only(self) -> bool:
-        """Whether only the table and its objects are to be reconstructed, so that points lie on these."""
+        """Return whether only the table and its objects are reconstructed; sparse points lie on them."""
         return self.transparent or self.with_masks
 
     def as_dict(self) -> dict[str, object]:
-        """The settings as JSON-ready values."""
+        """Return the settings as JSON-ready values."""
         return asdict(self)

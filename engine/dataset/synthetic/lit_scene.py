@@ -155,7 +155,7 @@ def _lamp_points(count: int) -> Float[np.ndarray, "n 3"]:
 
 
 def _sphere_directions(count: int) -> Float[np.ndarray, "n 3"]:
-    """Unit vectors spread evenly over the sphere (Fibonacci)."""
+    """Return ``count`` unit vectors spread evenly over the sphere (Fibonacci lattice)."""
     k = np.arange(count)
     z, angle = 1 - (2 * k + 1) / count, k * np.pi * (3 - np.sqrt(5))
     across = np.sqrt(1 - z * z)

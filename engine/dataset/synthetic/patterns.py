@@ -71,7 +71,7 @@ def gradient_noise(
 def cell_noise(
     first: Float32[np.ndarray, " n"], second: Float32[np.ndarray, " n"], seed: int = 0
 ) -> Float32[np.ndarray, " n"]:
-    """A random number in [0, 1) for the integer cell that (first, second) lies in."""
+    """Return a random number in [0, 1) for the integer cell that contains each (first, second)."""
     cells = np.stack([np.floor(first), np.floor(second), np.zeros_like(first)], axis=1).astype(np.int32)
     out = np.empty(len(cells), np.float32)
     noise.hash_cells(cells, seed, out)

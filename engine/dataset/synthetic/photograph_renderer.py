@@ -54,7 +54,7 @@ class PhotographRenderer:
         )
 
     def render(self, view: SyntheticView) -> RenderedPhotograph:
-        """The photograph of ``view`` and its ground truth."""
+        """Render the photograph of ``view`` and its ground truth."""
         height, width = self._config.height_px, self._config.width_px
         life = self._scene.still_life
         origins, directions = rays_world(view, self._centres_cam)

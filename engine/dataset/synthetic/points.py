@@ -81,7 +81,7 @@ def _points_under_pixels(
     pixels: Float[np.ndarray, "n 2"],
     objects_only: bool,
 ) -> tuple[Float[np.ndarray, "m 3"], UInt8[np.ndarray, "m 3"]]:
-    """Where the rays through image positions end, and colours of pixels around these positions."""
+    """Return the surface points seen at image positions, and the mean color of 3 x 3 samples around each."""
     steps = (np.arange(3) + 0.5) / 3 - 0.5
     around = pixels[:, None] + np.stack(np.meshgrid(steps, steps), axis=-1).reshape(1, 9, 2)
     directions = directions_cam(camera, around.reshape(-1, 2)).reshape(-1, 9, 3)

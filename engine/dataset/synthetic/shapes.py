@@ -51,7 +51,7 @@ def _vertex_normals(
 def grid_surface(
     points: Float[np.ndarray, "rows columns 3"], uv: Float[np.ndarray, "rows columns 2"]
 ) -> TexturedMesh:
-    """The surface through a grid of points; seen from outside, columns run rightwards when rows run up.
+    """Return the surface through a grid of points; seen from outside, columns run right where rows run up.
 
     Triangles of no area (at poles) are left out.
     """
@@ -95,7 +95,7 @@ def place_mesh(
 
 
 def flat_patch(corner: Vector, along: Vector, up: Vector, columns: int, rows: int) -> TexturedMesh:
-    """A flat parallelogram that faces ``along`` x ``up``; uv are metres from ``corner``."""
+    """Return a parallelogram that faces ``along`` x ``up``; uv are metres from ``corner``."""
     s, t = np.meshgrid(np.linspace(0, 1, columns + 1), np.linspace(0, 1, rows + 1))
     points = (
         np.asarray(corner, float)
@@ -107,7 +107,7 @@ def flat_patch(corner: Vector, along: Vector, up: Vector, columns: int, rows: in
 
 
 def box_mesh(size: Sequence[float], cells: int) -> TexturedMesh:
-    """A box that stands on z = 0 around the z axis; ``cells`` rows and columns a side."""
+    """Return a box that stands on z = 0 around the z axis; each side has ``cells`` rows and columns."""
     x, y, z = (0.5 * size[0], 0.5 * size[1], float(size[2]))
     return join_meshes(
         [
@@ -122,7 +122,7 @@ def box_mesh(size: Sequence[float], cells: int) -> TexturedMesh:
 
 
 def surface_of_revolution(profile: Float[np.ndarray, "k 2"], columns: int) -> TexturedMesh:
-    """A surface of revolution about z from (radius, height) pairs that go up the outside.
+    """Return a surface of revolution about z from (radius, height) pairs that ascend along its outside.
 
     uv: turns about the axis, and metres along the profile.
     """
@@ -136,7 +136,7 @@ def surface_of_revolution(profile: Float[np.ndarray, "k 2"], columns: int) -> Te
 
 
 def catmull_rom_profile(knots: Float[np.ndarray, "k 2"], steps: int) -> Float[np.ndarray, "q 2"]:
-    """A curve through ``knots`` (Catmull-Rom), ``steps`` points for each piece."""
+    """Return a Catmull-Rom curve through ``knots`` with ``steps`` points for each segment."""
     padded = np.concatenate([2 * knots[:1] - knots[1:2], knots, 2 * knots[-1:] - knots[-2:-1]])
     t = np.linspace(0, 1, steps, endpoint=False)[:, None]
     pieces = [
@@ -149,7 +149,7 @@ def catmull_rom_profile(knots: Float[np.ndarray, "k 2"], steps: int) -> Float[np
 
 
 def torus_knot_mesh(size: float, tube: float, columns: int, rows: int) -> TexturedMesh:
-    """A tube of radius ``tube`` along the (2, 3) torus knot of outer radius 3 ``size``.
+    """Return a tube of radius ``tube`` along the (2, 3) torus knot of outer radius 3 ``size``.
 
     uv: turns along the knot and around the tube.
     """
@@ -171,7 +171,7 @@ def torus_knot_mesh(size: float, tube: float, columns: int, rows: int) -> Textur
 
 
 def _sphere_grid(columns: int, rows: int) -> tuple[Float[np.ndarray, "r c 3"], Float[np.ndarray, "r c 2"]]:
-    """Unit vectors on a grid of longitudes and latitudes; uv: turns, and half turns from the bottom."""
+    """Return unit vectors on a longitude-latitude grid; uv: turns, and half turns from the bottom."""
     u, v = np.meshgrid(np.linspace(0, 1, columns + 1), np.linspace(0, 1, rows + 1))
     across = np.sin(np.pi * v)
     across[[0, -1]] = 0
@@ -183,14 +183,14 @@ def _sphere_grid(columns: int, rows: int) -> tuple[Float[np.ndarray, "r c 3"], F
 
 
 def superquadric_mesh(radius: float, exponent: float, columns: int, rows: int) -> TexturedMesh:
-    """The superquadric |x|^p + |y|^p + |z|^p = radius^p."""
+    """Return the superquadric |x|^p + |y|^p + |z|^p = radius^p with p = ``exponent``."""
     directions, uv = _sphere_grid(columns, rows)
     reach = np.sum(np.abs(directions) ** exponent, axis=-1, keepdims=True) ** (-1 / exponent)
     return grid_surface(radius * reach * directions, uv)
 
 
 def boulder_mesh(radius: float, roughness: float, columns: int, rows: int) -> TexturedMesh:
-    """A ball displaced along its radius by noise, a little flattened."""
+    """Return a slightly flattened sphere, displaced along its radius by noise."""
     directions, uv = _sphere_grid(columns, rows)
     flat = directions.reshape(-1, 3).astype(np.float32)
     coarse = gradient_noise(flat * 1.7, octaves=2, seed=11)
@@ -203,7 +203,7 @@ def boulder_mesh(radius: float, roughness: float, columns: int, rows: int) -> Te
 def twisted_tower_mesh(
     half_width: float, height: float, twist: float, taper: float, cells: int
 ) -> TexturedMesh:
-    """A square tower that turns by ``twist`` radians and narrows to ``taper`` of its width, with a flat top.
+    """Return a square tower that twists by ``twist`` radians and narrows to ``taper`` of its width.
 
     uv: metres from the middle of a side (before narrowing) plus 10 for each further side, and metres up.
     """

@@ -177,7 +177,7 @@ def _scene_objects() -> tuple[SceneObject, ...]:
 
 @lru_cache(maxsize=1)
 def build_still_life() -> StillLife:
-    """The scene that is photographed; always the same."""
+    """Build the scene that is photographed; it has no parameters and is always the same."""
     things = _scene_objects()
     whole = join_meshes([thing.mesh for thing in things])
     counts = [len(thing.mesh.faces) for thing in things]

@@ -1,4 +1,4 @@
-"""Where the photographs are taken from, and through which lens."""
+"""Cameras of the synthetic photographs: poses and intrinsics."""
 
 from dataclasses import dataclass
 
@@ -24,12 +24,12 @@ class SyntheticView:
 
     @property
     def centre_world(self) -> Float[np.ndarray, "3"]:
-        """Where the camera stands."""
+        """Return the camera centre in world coordinates."""
         return -self.rotation_cam_from_world.T @ self.translation_cam_from_world
 
 
 def synthetic_camera(config: SyntheticDatasetConfig) -> pycolmap.Camera:
-    """The camera of all photographs; its principal point is a little off the middle, as real ones are."""
+    """Return the camera of all photographs; its principal point is slightly off-centre, as in real ones."""
     width, height = config.width_px, config.height_px
     focal = 0.5 * width / np.tan(_HALF_FOV)
     cx, cy = 0.5 * width + 0.011 * width, 0.5 * height - 0.008 * width

@@ -15,7 +15,7 @@ from octasplat.engine.dataset.synthetic.still_life import build_still_life
 
 @lru_cache(maxsize=1)
 def cached_lit_scene() -> LitScene:
-    """The still life, lit; kept, because lighting it takes longer than a photograph."""
+    """Return the lit still life; cached, because lighting it takes longer than a photograph."""
     return LitScene(build_still_life())
 
 

@@ -23,7 +23,7 @@ ProgressCallback = Callable[[float], None]
 
 
 def no_progress(_share: float) -> None:
-    """Ignore progress."""
+    """Ignore progress: the callback of callers who want none."""
 
 
 @dataclass(frozen=True)

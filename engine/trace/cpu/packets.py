@@ -108,7 +108,7 @@ class PacketTracer:
         self._hit_capacity = 0
 
     def build(self, primitives: Float32[np.ndarray, "n 16"]) -> None:
-        """Build the hierarchy."""
+        """Build the bounding volume hierarchy of the packed Gaussians."""
         self._bvh = PacketBvh(primitives, self._threads)
 
     def refresh(self, primitives: Float32[np.ndarray, "n 16"], ids: Int32[np.ndarray, " u"]) -> None:

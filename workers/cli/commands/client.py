@@ -26,7 +26,7 @@ STATES = ("queued", "running", "canceling", "succeeded", "failed", "canceled")
 
 
 def server_option(command: F) -> F:
-    """``--server``."""
+    """Add the option ``--server`` to a command."""
     return click.option(
         "--server",
         metavar="URL",
@@ -35,7 +35,7 @@ def server_option(command: F) -> F:
 
 
 def set_option(command: F) -> F:
-    """``--set``."""
+    """Add the option ``--set`` to a command."""
     return click.option(
         "--set",
         "assignments",

@@ -1,4 +1,4 @@
-"""``octasplat edit``."""
+"""Command ``octasplat edit``: convert edited meshes to scenes."""
 
 from octasplat.engine.operations.edit import OPERATION
 from octasplat.workers.cli.request_options import operation_command

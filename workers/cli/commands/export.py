@@ -1,4 +1,4 @@
-"""``octasplat export``."""
+"""Command ``octasplat export``: write a scene in other formats."""
 
 import click
 

@@ -1,4 +1,4 @@
-"""``octasplat merge``."""
+"""Command ``octasplat merge``: merge scenes into one."""
 
 from octasplat.engine.operations.merge import OPERATION
 from octasplat.workers.cli.request_options import operation_command

@@ -1,4 +1,4 @@
-"""``octasplat transform``."""
+"""Command ``octasplat transform``: move, rotate and scale a scene."""
 
 from octasplat.engine.operations.transform import OPERATION
 from octasplat.workers.cli.request_options import operation_command

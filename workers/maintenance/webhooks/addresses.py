@@ -1,4 +1,4 @@
-"""Which addresses messages are sent to."""
+"""Check of the network addresses that webhooks may be sent to."""
 
 import ipaddress
 import re

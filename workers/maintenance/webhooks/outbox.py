@@ -20,19 +20,19 @@ NONE_IN_FLIGHT: Mapping[str, int] = {}
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of a try: HTTP status, or what went wrong before there was one."""
+    """Outcome of a delivery attempt: the HTTP status, or the error before there was one."""
 
     status: int | None
     error: str | None = None
 
     @property
     def is_success(self) -> bool:
-        """Whether the message has arrived."""
+        """Return whether the message was delivered."""
         return self.status is not None and 200 <= self.status < 300
 
     @property
     def is_gone(self) -> bool:
-        """Whether nobody wants to be told any more."""
+        """Return whether the endpoint answered that it is gone (HTTP 410)."""
         return self.status == 410
 
 

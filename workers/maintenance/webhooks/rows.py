@@ -34,7 +34,7 @@ class TooManyEndpointsError(OctasplatError):
 
 @dataclass(frozen=True)
 class Endpoint:
-    """Where somebody wants to be told.
+    """Webhook endpoint: the URL that receives events of jobs.
 
     Attributes:
         id: UUIDv7.

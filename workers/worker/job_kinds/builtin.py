@@ -105,7 +105,7 @@ class ReconstructKind(OperationKind):
 
 
 class EvaluateKind(OperationKind):
-    """Views measured."""
+    """Kind of jobs that evaluate views."""
 
     takes_other_photographs = True
 
@@ -119,7 +119,7 @@ class EvaluateKind(OperationKind):
 
 
 class InfoKind(OperationKind):
-    """What is in a scene."""
+    """Kind of jobs that describe a scene."""
 
     def request_paths(self, task: Task, options: Any) -> dict[str, Any]:
         """Return the scene and the files that tell what is in it; paths are taken out of the facts."""
@@ -131,7 +131,7 @@ class InfoKind(OperationKind):
 
 
 def register_builtin_kinds() -> None:
-    """Register them."""
+    """Register the built-in kinds of jobs."""
     register(
         ReconstructKind(
             RECONSTRUCT,

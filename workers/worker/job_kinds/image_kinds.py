@@ -67,7 +67,7 @@ class ImageKind(OperationKind):
 
 
 class RenderKind(ImageKind):
-    """New views."""
+    """Kind of jobs that render new views."""
 
     def named_files(self, options: RenderOptions) -> Iterable[tuple[str, str]]:
         """Return the files of the stage."""
@@ -107,7 +107,7 @@ class RenderKind(ImageKind):
 
 
 class RelightKind(ImageKind):
-    """Other light."""
+    """Kind of jobs that render under other environment light."""
 
     def resource_demands(
         self, options: RelightOptions, sizes: Sequence[ImageSizes]

@@ -1,4 +1,4 @@
-"""What a kind of job is, and the table of them."""
+"""Base class of job kinds, and their registry."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, Generic, Literal

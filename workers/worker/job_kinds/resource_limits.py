@@ -1,4 +1,4 @@
-"""What options ask for that can be too much for a service, and the ceilings that it sets."""
+"""Resource demands of job options, and the limits that a service sets."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -40,7 +40,7 @@ class ExceededLimit:
 
     @property
     def sentence(self) -> str:
-        """What is wrong and what is allowed, for the user."""
+        """Return what is exceeded and what is allowed, as a sentence for the user."""
         demand = self.demand
         # Numbers of twenty digits are nobody's wish; to write them all out helps nobody either.
         amount = f"{demand.amount:,}" if demand.amount < 10**15 else f"{demand.amount:.0e}"
