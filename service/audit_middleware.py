@@ -35,15 +35,15 @@ class AuditMiddleware:
             await self._app(scope, receive, send)
             return
         state = scope.setdefault("state", {})
-        told = False
+        is_recorded = False
 
         async def tell(status: int, headers: Headers) -> None:
-            nonlocal told
-            if told or (scope["method"] in _UNAUDITED_METHODS and not state.get("is_change")):
+            nonlocal is_recorded
+            if is_recorded or (scope["method"] in _UNAUDITED_METHODS and not state.get("is_change")):
                 return
-            if state.get("who") is None:  # or whoever comes could fill the table
+            if state.get("principal") is None:  # or whoever comes could fill the table
                 return
-            told = True
+            is_recorded = True
             await _write_entry(scope, status, headers.get("location"))
 
         async def send_told(message: Message) -> None:
@@ -60,14 +60,14 @@ class AuditMiddleware:
 
 async def _write_entry(scope: Scope, status: int, location: str | None) -> None:
     service: Service = scope["app"].state.service
-    who = scope["state"]["who"]
+    principal = scope["state"]["principal"]
     try:
         async with service.pool.connection() as connection:
             await add_entry(
                 connection,
-                owner=who.owner,
-                token_id=who.token_id,
-                session_id=who.session_id,
+                owner=principal.owner,
+                token_id=principal.token_id,
+                session_id=principal.session_id,
                 address=scope["client"][0] if scope.get("client") else "unknown",
                 action=f"{scope['method']} {scope['path']}",
                 target=location,

@@ -79,12 +79,12 @@ async def authenticate(
         ProblemError: 401 without a valid token or session where one is needed, 403 for what came through a
             proxy where none is needed, 429 after too many wrong tokens.
     """
-    who = None
+    principal = None
     if bearer is not None:
         token = await authenticate_token(request, service, bearer.credentials)
-        who = None if token is None else Principal(token.owner, frozenset(token.scopes), token.id)
+        principal = None if token is None else Principal(token.owner, frozenset(token.scopes), token.id)
     elif (secret := session_secret(request)) is not None:
-        who = await principal_of_session(service, secret)
+        principal = await principal_of_session(service, secret)
     elif request.headers.get("authorization") is None and await _allows_anonymous(service):
         if passed_through_proxy(request.headers):
             detail = (
@@ -92,14 +92,14 @@ async def authenticate(
                 "make one with octasplat token create, and name the proxy in OCTASPLAT_PROXIES."
             )
             raise ProblemError(403, "open-behind-proxy", detail)
-        who = Principal(LOCAL_OWNER, frozenset({"admin"}))
-    if who is None:
+        principal = Principal(LOCAL_OWNER, frozenset({"admin"}))
+    if principal is None:
         detail = "A valid token is needed: send the header Authorization: Bearer <token>."
         raise ProblemError(
             401, "unauthorized", detail, headers={"WWW-Authenticate": 'Bearer realm="octasplat"'}
         )
-    request.state.who = who  # for the audit
-    return who
+    request.state.principal = principal  # for the audit
+    return principal
 
 
 async def authenticate_token(request: Request, service: Service, secret: str) -> Token | None:
@@ -147,11 +147,11 @@ class _RequireScope:
     def __init__(self, scope: Scope) -> None:
         self._scope = scope
 
-    def __call__(self, who: Annotated[Principal, Depends(authenticate)]) -> Principal:
-        if not who.may(self._scope):
+    def __call__(self, principal: Annotated[Principal, Depends(authenticate)]) -> Principal:
+        if not principal.may(self._scope):
             detail = f"This token may not do that; one with the scope '{self._scope}' is needed."
             raise ProblemError(403, "scope", detail)
-        return who
+        return principal
 
 
 Reader = Annotated[Principal, Depends(_RequireScope("read"))]

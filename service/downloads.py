@@ -50,13 +50,13 @@ def send_blob(
         StorageError: the store does not have it.
     """
     etag = f'"{sha256}"'
-    shown = inline or media_type in _INLINE_TYPES
+    is_inline = inline or media_type in _INLINE_TYPES
     headers = {
         "ETag": etag,
         "Repr-Digest": format_digest(sha256),
         "Cache-Control": "private, no-cache",
         "Accept-Ranges": "bytes",
-        "Content-Disposition": _disposition(name, shown),
+        "Content-Disposition": _disposition(name, is_inline),
     }
     if media_type == "text/html":
         headers["Content-Security-Policy"] = _SANDBOX_POLICY
@@ -73,10 +73,10 @@ def _remote_response(
 ) -> Response:
     """From a store elsewhere, whole or one range."""
     start, stop, status = 0, size, 200
-    asked = _RANGE.fullmatch(request.headers.get("range", ""))
+    requested = _RANGE.fullmatch(request.headers.get("range", ""))
     condition = request.headers.get("if-range")
-    if asked and any(asked.groups()) and (condition is None or condition == headers["ETag"]):
-        first, last = asked.groups()
+    if requested and any(requested.groups()) and (condition is None or condition == headers["ETag"]):
+        first, last = requested.groups()
         if first:
             start, stop = int(first), min(size, int(last) + 1) if last else size
         else:

@@ -18,7 +18,7 @@ def fingerprint(*parts: Any) -> str:
 
 async def create_once(
     connection: Connection,
-    who: Principal,
+    principal: Principal,
     key: str | None,
     request: str,
     create: Callable[[], Awaitable[uuid.UUID]],
@@ -29,7 +29,7 @@ async def create_once(
 
     Args:
         connection: of the caller's transaction.
-        who: asks.
+        principal: asks.
         key: names the request; without one it is always made.
         request: fingerprint of the request.
         create: makes it and returns its id.
@@ -48,18 +48,18 @@ async def create_once(
         INSERT INTO idempotency_keys (owner, key, fingerprint, resource_id) VALUES (%s, %s, %s, %s)
         ON CONFLICT DO NOTHING
         """,
-        [who.owner, key, request, placeholder],
+        [principal.owner, key, request, placeholder],
     )
     if cursor.rowcount:
         made = await create()
         await connection.execute(
             "UPDATE idempotency_keys SET resource_id = %s WHERE owner = %s AND key = %s",
-            [made, who.owner, key],
+            [made, principal.owner, key],
         )
         return made, True
     cursor = await connection.execute(
         "SELECT fingerprint, resource_id FROM idempotency_keys WHERE owner = %s AND key = %s",
-        [who.owner, key],
+        [principal.owner, key],
     )
     row = await cursor.fetchone()
     if row is None or row["fingerprint"] != request:

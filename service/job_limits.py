@@ -41,13 +41,13 @@ def check_job_limits(
         raise ProblemError(422, "ceiling", str(faults[0]["detail"]), errors=faults)
 
 
-def check_priority(who: Principal, priority: int, settings: ServiceSettings) -> None:
+def check_priority(principal: Principal, priority: int, settings: ServiceSettings) -> None:
     """Keep high priorities for administrators.
 
     Raises:
         ProblemError: 422.
     """
-    if priority <= settings.max_priority or who.may("admin"):
+    if priority <= settings.max_priority or principal.may("admin"):
         return
     detail = f"The priority is {priority}; you may give at most {settings.max_priority}, administrators more."
     setting = f"{PREFIX}MAX_PRIORITY"

@@ -233,8 +233,8 @@ async def _on_exception(request: Request, error: Exception) -> JSONResponse:
 def _fault(prefix: str, fault: Mapping[str, Any]) -> dict[str, Any]:
     if fault["loc"][:1] == ("stage",):  # told as whoever reads a stage file would be told
         keys = ("stage", *stage_key_path(fault["loc"][1:]))
-        told = stage_error_message(fault["type"], keys, fault["msg"], fault.get("input"))
-        fault = {**fault, "loc": keys, "msg": told}
+        message = stage_error_message(fault["type"], keys, fault["msg"], fault.get("input"))
+        fault = {**fault, "loc": keys, "msg": message}
     where, *path = fault["loc"] or ("",)
     if prefix:
         path = [where, *path]

@@ -105,7 +105,7 @@ def stop_when_asked(
         progress(event)
         if isinstance(event, PhaseProgress) and should_stop():
             doing = PHASE_TITLES.get(event.stage, event.stage).lower()
-            told = f"Stopped while {doing}; the same command with --resume goes on."
-            raise CancelledError(message or told)
+            default_message = f"Stopped while {doing}; the same command with --resume goes on."
+            raise CancelledError(message or default_message)
 
     return listen

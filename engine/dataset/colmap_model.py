@@ -241,10 +241,10 @@ def _posed_images(reconstruction: Any, folder: Path, warnings: list[str]) -> tup
             raise DatasetError(
                 f"The pose of {image.name} in {folder} is not a finite rigid motion; run COLMAP again."
             )
-        shown = image.get_observation_points2D()
-        observed_px = np.array([point.xy for point in shown], np.float64).reshape(-1, 2)
+        observed = image.get_observation_points2D()
+        observed_px = np.array([point.xy for point in observed], np.float64).reshape(-1, 2)
         # Beyond what a signed number holds lies only COLMAP's mark for none.
-        observed_points = np.array([point.point3D_id for point in shown], np.uint64).astype(np.int64)
+        observed_points = np.array([point.point3D_id for point in observed], np.uint64).astype(np.int64)
         pose = matrix[:, :3].copy(), matrix[:, 3].copy()
         images.append(PosedImage(image.name, int(image.camera_id), *pose, observed_px, observed_points))
     if unposed:

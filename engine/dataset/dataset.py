@@ -344,10 +344,10 @@ class Dataset:
             raise IndexError(f"there is no pixel with view {view[bad]}, y {y[bad]}, x {x[bad]}")
 
     def _camera_directions(
-        self, view: Int64[np.ndarray, " n"], wanted: np.ndarray
+        self, view: Int64[np.ndarray, " n"], selected: np.ndarray
     ) -> list[tuple[int, Int64[np.ndarray, " m"]]]:
         camera = self._view_camera[view]
-        chosen = np.flatnonzero(wanted[camera])
+        chosen = np.flatnonzero(selected[camera])
         chosen = chosen[np.argsort(camera[chosen], kind="stable")]
         if len(chosen) == 0:
             return []

@@ -26,8 +26,8 @@ def match_image_names(names: Iterable[str], files: Collection[str]) -> Mapping[s
     for spelling in (_slashes, _case, _without_suffix, _last_part, _stem):
         taken = set(found.values())
         free = _by_spelling((file for file in files if file not in taken), spelling)
-        wanted = _by_spelling((name for name in names if name not in found), spelling)
-        found |= {name: free[spelt] for spelt, name in wanted.items() if spelt in free}
+        missing = _by_spelling((name for name in names if name not in found), spelling)
+        found |= {name: free[spelt] for spelt, name in missing.items() if spelt in free}
     return found
 
 

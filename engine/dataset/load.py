@@ -140,7 +140,7 @@ def load_dataset_model(
         image_infos=tuple(infos),
         points=model.points,
         observations=Observations(
-            np.repeat(np.arange(len(views)), [len(shown) for shown in observed_px]),
+            np.repeat(np.arange(len(views)), [len(observed) for observed in observed_px]),
             np.concatenate([image.observed_point_ids for image in images]),
             np.concatenate(observed_px),
         ),

@@ -139,9 +139,9 @@ def scene_extent(origins_world: Float64[np.ndarray, "n 3"], points: SparsePoints
     middle = np.median(origins_world, axis=0)
     distances = np.linalg.norm(origins_world - middle, axis=1)
     typical = float(np.median(distances))
-    kept = origins_world[distances <= 5 * typical] if typical > 0 else origins_world
-    centre = kept.mean(axis=0)
-    radius = 1.1 * float(np.linalg.norm(kept - centre, axis=1).max())
+    inliers = origins_world[distances <= 5 * typical] if typical > 0 else origins_world
+    centre = inliers.mean(axis=0)
+    radius = 1.1 * float(np.linalg.norm(inliers - centre, axis=1).max())
     if len(points) == 0:
         return radius if radius > 0 else 1.0
     to_points = float(np.median(np.linalg.norm(points.xyz_world - centre, axis=1)))

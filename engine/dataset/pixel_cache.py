@@ -171,8 +171,8 @@ def _read_index(folder: Path, pixels: int) -> _Index | None:
         index: _Index = json.loads((folder / "pixels.json").read_text(encoding="utf-8"))
         expected = {"rgb.bin": 3 * pixels * index["bits"] // 8}
         expected |= {f"{name}.bin": pixels for name in ("alpha", "mask") if index[name]}
-        whole = all((folder / name).stat().st_size == size for name, size in expected.items())
-        return index if whole and index["version"] == CACHE_VERSION else None
+        is_complete = all((folder / name).stat().st_size == size for name, size in expected.items())
+        return index if is_complete and index["version"] == CACHE_VERSION else None
     except (OSError, ValueError, KeyError, TypeError):
         return None
 

@@ -55,8 +55,8 @@ def is_in_image(in_cam: Float64[np.ndarray, "n 3"], camera: Camera) -> Bool[np.n
     """Return whether points lie in a camera's picture, those behind it only in that of a panorama."""
     if camera.is_panorama:
         return np.asarray(np.isfinite(camera.project(in_cam).reshape(-1, 2)).all(axis=1))
-    shown = in_cam[:, 2] > 0
-    before = in_cam[shown]
+    in_front = in_cam[:, 2] > 0
+    before = in_cam[in_front]
     if camera.is_pinhole:
         fx, fy, cx, cy = camera.pinhole_params
         xy = before[:, :2] / before[:, 2:] * (fx, fy) + (cx, cy)
@@ -65,8 +65,8 @@ def is_in_image(in_cam: Float64[np.ndarray, "n 3"], camera: Camera) -> Bool[np.n
         # Far outside the picture some lens models fold back into it.
         xy[before[:, 2] < 0.98 * min_corner_cosine(camera) * np.linalg.norm(before, axis=1)] = np.nan
     with np.errstate(invalid="ignore"):
-        shown[shown] = ((xy >= 0) & (xy <= (camera.width_px, camera.height_px))).all(axis=1)
-    return shown
+        in_front[in_front] = ((xy >= 0) & (xy <= (camera.width_px, camera.height_px))).all(axis=1)
+    return in_front
 
 
 def min_corner_cosine(camera: Camera) -> float:

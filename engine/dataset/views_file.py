@@ -172,10 +172,10 @@ class ViewsRecord(_FrozenModel):
         mine, others = {view.name: view for view in self.views}, {view.name: view for view in other.views}
         if mine.keys() != others.keys():
             missing, added = sorted(mine.keys() - others.keys()), sorted(others.keys() - mine.keys())
-            told = [f"{_name_list(missing)} missing"] * bool(missing) + [f"{_name_list(added)} added"] * bool(
-                added
-            )
-            return " and ".join(told)
+            changes = [f"{_name_list(missing)} missing"] * bool(missing) + [
+                f"{_name_list(added)} added"
+            ] * bool(added)
+            return " and ".join(changes)
         pairs = [
             (name, self._compared_values(view), other._compared_values(others[name]))
             for name, view in mine.items()

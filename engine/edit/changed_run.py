@@ -76,16 +76,16 @@ def write_changed_run(
     """
     check_new_run(target)
     partial = target.with_name(f".{target.name}.{os.getpid()}.partial")
-    told: tuple[str, ...] = ()
+    messages: tuple[str, ...] = ()
     try:
         with report_disk_full(target):
             partial.mkdir(parents=True)
             if matrix is None:
                 _copy(source, partial)
             elif is_similarity(matrix):
-                told = write_transformed_run_files(source, partial, matrix)
+                messages = write_transformed_run_files(source, partial, matrix)
             else:
-                told = (
+                messages = (
                     "Cameras and learnt light cannot follow a scene that was mirrored, sheared or scaled "
                     f"unevenly, so {target} holds the scene alone.",
                 )
@@ -96,7 +96,7 @@ def write_changed_run(
         raise OutputError(f"{target} cannot be written ({error.strerror or error}).") from None
     finally:
         shutil.rmtree(partial, ignore_errors=True)
-    return told
+    return messages
 
 
 def _copy(source: Path, target: Path) -> None:

@@ -70,8 +70,8 @@ def read_colour(value: object) -> object:
     if not isinstance(value, str):
         return value
     if found := _HEX.fullmatch(value.strip()):
-        shown = np.frombuffer(bytes.fromhex(found[1]), np.uint8) / 255.0
-        return tuple(float(part) for part in srgb_to_linear(shown))
+        display = np.frombuffer(bytes.fromhex(found[1]), np.uint8) / 255.0
+        return tuple(float(part) for part in srgb_to_linear(display))
     try:
         return tuple(float(part) for part in value.split(","))
     except ValueError:

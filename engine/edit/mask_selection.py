@@ -69,9 +69,9 @@ def _blend_weights(tracer: Tracer, rays: RayBatch, count: int) -> Float64[np.nda
     """Return the summed blending weight of each Gaussian over rays."""
     sums = np.zeros(count)
     if len(rays):
-        seen = tracer.trace(rays, record=True)
-        assert seen.recording is not None
-        found = tracer.backward(seen.recording, TraceGradients(np.zeros_like(seen.rgb_srgb))).numpy()
+        traced = tracer.trace(rays, record=True)
+        assert traced.recording is not None
+        found = tracer.backward(traced.recording, TraceGradients(np.zeros_like(traced.rgb_srgb))).numpy()
         sums[found.ids] = found.weight_sums
     return sums
 

@@ -78,7 +78,7 @@ def _shaded_colours(
     material = np.repeat(stack_channels(gaussians.channels, list(MATERIAL_WIDTHS)), views, axis=0)
     surface = SurfacePoints.unoccluded(material, normals, directions)
     if AMBIENT in gaussians.channels:
-        seen = np.repeat(gaussians.channels[AMBIENT][:, 0].astype(np.float64), views)
-        surface = replace(surface, visibility=seen, ambient=seen)
-    shown = linear_to_srgb(np.minimum(shade(surface, light, frame), 1.0))
-    return shown.reshape(count, views, 3)
+        ambient = np.repeat(gaussians.channels[AMBIENT][:, 0].astype(np.float64), views)
+        surface = replace(surface, visibility=ambient, ambient=ambient)
+    display = linear_to_srgb(np.minimum(shade(surface, light, frame), 1.0))
+    return display.reshape(count, views, 3)

@@ -60,9 +60,9 @@ def edit_note(
     change: MaterialChange, selection: Selection, chosen: Bool[np.ndarray, " n"]
 ) -> dict[str, object]:
     """Return a short description of a change as JSON, for ``edits.json``."""
-    asked, where = set(MaterialChange.model_fields), set(Selection.model_fields)
+    change_fields, where = set(MaterialChange.model_fields), set(Selection.model_fields)
     return {
-        **change.model_dump(mode="json", exclude_defaults=True, include=asked),
+        **change.model_dump(mode="json", exclude_defaults=True, include=change_fields),
         **selection.model_dump(mode="json", exclude_defaults=True, include=where),
         "gaussians": int(chosen.sum()),
     }

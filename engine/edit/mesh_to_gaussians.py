@@ -70,8 +70,8 @@ def recover_gaussians(
     radii = octagon_radii(opacities, q)
     octagons = match_octagons(path, mesh, opacities, radii)
     file_rounding = mesh.rounding
-    asked, stated = options.min_opacity, mesh.min_opacity
-    exported = (radii > 0) & (opacities >= ((stated or 0.0) if asked is None else asked))
+    requested, stated = options.min_opacity, mesh.min_opacity
+    exported = (radii > 0) & (opacities >= ((stated or 0.0) if requested is None else requested))
     del mesh  # the largest thing around, where the caller keeps it no longer
     geometry = gaussians.with_base_color_only()
     report = EditReport(len(gaussians), matched_by=octagons.matched_by, axes_usual=default_axes(path), q=q)
@@ -127,12 +127,12 @@ def _recover_parameters(
         unedited = octagon_corners_world(part, radius)
         moves = np.where(present[:, :, None], corners - unedited, 0.0)
         rounding = coordinate_rounding_error(unedited).astype(np.float64) + 2 * file_rounding
-        torn, gone = _torn_octagons(moves, present, part, radius, rounding)
+        torn, is_moved = _torn_octagons(moves, present, part, radius, rounding)
         report.partial += int(torn.sum())
         if options.whole_octagons and torn.any():
             report.snapped += int(torn.sum())
-            follows = torn & (2 * (gone & present).sum(axis=1) >= present.sum(axis=1))
-            present = np.where(follows[:, None], present & gone, present)
+            follows = torn & (2 * (is_moved & present).sum(axis=1) >= present.sum(axis=1))
+            present = np.where(follows[:, None], present & is_moved, present)
             moves[(torn & ~follows)] = 0.0
         stayed = present.any(axis=1) & (np.abs(moves).max(axis=(1, 2)) <= rounding)
         fit = fit_octagons(part, moves, present, radius)
@@ -176,10 +176,10 @@ def _torn_octagons(
     Those of a smooth deformation that ends on them are none: their corners move by less than their size.
     """
     lengths = np.linalg.norm(moves, axis=2)
-    gone = lengths > rounding[:, None]
+    is_moved = lengths > rounding[:, None]
     size = radii * old.scales.max(axis=1)
     far = np.where(present, lengths, 0.0).max(axis=1) > TORN_RATIO * size
-    return far & (present & ~gone).any(axis=1), gone
+    return far & (present & ~is_moved).any(axis=1), is_moved
 
 
 def _three_point(
@@ -249,10 +249,10 @@ def _assemble(
     absent[gids] = False
     never, deleted = absent & ~exported, absent & exported
     report.deleted = int(deleted.sum())
-    kept = np.ones(len(octagons), dtype=bool)
+    is_retained = np.ones(len(octagons), dtype=bool)
     if options.damaged == "drop":
-        kept &= ~recovered.damaged & recovered.readable
-    unreadable = np.flatnonzero(~recovered.readable & kept)
+        is_retained &= ~recovered.damaged & recovered.readable
+    unreadable = np.flatnonzero(~recovered.readable & is_retained)
     # Rows: octagons, then the Gaussians that never had one.
     rest = np.flatnonzero(never)
     pool = originals[recovered.readable[originals]]
@@ -270,13 +270,13 @@ def _assemble(
         recovered.unmoved[pool],
         gaussians.means_world[deleted].astype(np.float64),
     )
-    own = np.flatnonzero(recovered.readable & kept)
+    own = np.flatnonzero(recovered.readable & is_retained)
     orphaned = moved.orphaned.copy()
     orphaned[: len(unreadable)] = False
     report.orphaned = int(orphaned.sum())
     report.carried = int((~orphaned[len(unreadable) :]).sum())
-    report.dropped = int((~kept).sum())
-    report.copies = int((octagons.is_copy & kept).sum())
+    report.dropped = int((~is_retained).sum())
+    report.copies = int((octagons.is_copy & is_retained).sum())
     places = np.concatenate([gids[own], gids[unreadable], rest])
     is_copy = np.concatenate(
         [octagons.is_copy[own], octagons.is_copy[unreadable], np.zeros(len(rest), dtype=bool)]

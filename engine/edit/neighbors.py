@@ -70,12 +70,12 @@ def _orthogonal_fits(
     new = new - new.mean(axis=1, keepdims=True)
     u, spread, vt = np.linalg.svd(np.einsum("nki,nkj->nij", new, old))
     best = np.sign(np.linalg.det(u @ vt))
-    whole = np.sqrt(np.sum(old**2, axis=(1, 2)) * np.sum(new**2, axis=(1, 2)))
-    sign = np.where(2 * spread[:, 2] > MIRROR_GAIN * whole, best, planar_sign)
+    total = np.sqrt(np.sum(old**2, axis=(1, 2)) * np.sum(new**2, axis=(1, 2)))
+    sign = np.where(2 * spread[:, 2] > MIRROR_GAIN * total, best, planar_sign)
     u[:, :, 2] *= (sign * best)[:, None]
     agreement = spread[:, 0] + spread[:, 1] + sign * best * spread[:, 2]
     turns: np.ndarray = u @ vt
-    turns[agreement < MIN_AGREEMENT * whole] = 0.0
+    turns[agreement < MIN_AGREEMENT * total] = 0.0
     return turns
 
 
@@ -139,7 +139,7 @@ def interpolate_motion(
         none = np.zeros(len(points), dtype=bool)
         return CarriedGaussians(points.copy(), eye, ~none, none)
     tree = KDTree(old_means)
-    gone = KDTree(deleted_means) if len(deleted_means) else None
+    deleted_tree = KDTree(deleted_means) if len(deleted_means) else None
     carried = CarriedGaussians(
         np.empty((len(points), 3)),
         np.empty((len(points), 3, 3)),
@@ -156,8 +156,8 @@ def interpolate_motion(
         carried.means_world[block] = np.einsum("nk,nki->ni", weights, moved)
         carried.derivatives[block] = np.einsum("nk,nkij->nij", weights, derivatives)
         carried.unmoved[block] = unmoved[near].all(axis=1)
-        if gone is not None:
-            carried.orphaned[block] = gone.query(part, workers=-1)[0] < distances[:, 0]
+        if deleted_tree is not None:
+            carried.orphaned[block] = deleted_tree.query(part, workers=-1)[0] < distances[:, 0]
     return carried
 
 

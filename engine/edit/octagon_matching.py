@@ -87,10 +87,10 @@ def _match_by_ids(
 ) -> MatchedOctagons:
     scene_size = len(radii)
     with np.errstate(invalid="ignore"):
-        whole = (np.abs(gid - np.round(gid)) < ID_TOLERANCE) & (
+        is_valid_id = (np.abs(gid - np.round(gid)) < ID_TOLERANCE) & (
             np.abs(corner - np.round(corner)) < ID_TOLERANCE
         )
-        known: np.ndarray = whole & (gid > -0.5) & (corner > -0.5) & (corner < SIDES - 0.5)
+        known: np.ndarray = is_valid_id & (gid > -0.5) & (corner > -0.5) & (corner < SIDES - 0.5)
     if known.any() and gid[known].max() > scene_size - 0.5:
         raise SceneFileError(
             f"{path}: numbers a Gaussian {int(gid[known].max())}, but the scene has {scene_size}; "
@@ -110,10 +110,15 @@ def _match_by_ids(
     # Vertices that another object brought when it was joined carry zeros, not ids of their own.
     first = np.concatenate([[True], gids[1:] != gids[:-1]])
     enough = present.sum(axis=1) >= MIN_CORNERS
-    kept = first | enough
-    foreign = len(mesh) - united + int(present[~kept].sum())
-    if not kept.all():
-        gids, corners, present, first = gids[kept], corners[kept], present[kept], first[kept]
+    is_retained = first | enough
+    foreign = len(mesh) - united + int(present[~is_retained].sum())
+    if not is_retained.all():
+        gids, corners, present, first = (
+            gids[is_retained],
+            corners[is_retained],
+            present[is_retained],
+            first[is_retained],
+        )
     return MatchedOctagons(gids, corners, present, ~first, "ids", foreign, ambiguous)
 
 
@@ -236,11 +241,12 @@ def _is_uv_in_order(mesh: ImportedMesh, radii: np.ndarray, all_radii: np.ndarray
     """Return whether the texture coordinates are those of octagons in this order, or absent."""
     if mesh.uv is None:
         return True
-    seen = mesh.uv.reshape(-1, SIDES, 2)
+    found_uv = mesh.uv.reshape(-1, SIDES, 2)
     # The common factor, the exporter's 1 / sqrt(Q), is fitted: it may not be known here.
     for flip in (1.0, -1.0):
         products = [
-            (np.sum(wanted * wanted), np.sum(wanted * here)) for wanted, here in _uv_pairs(seen, radii, flip)
+            (np.sum(expected * expected), np.sum(expected * here))
+            for expected, here in _uv_pairs(found_uv, radii, flip)
         ]
         norm, overlap = np.sum(products, axis=0)
         factor = overlap / norm if norm else 0.0
@@ -248,18 +254,20 @@ def _is_uv_in_order(mesh: ImportedMesh, radii: np.ndarray, all_radii: np.ndarray
             return True
         if factor > 0.0:
             tolerance = UV_TOLERANCE * factor * all_radii.max()
-            pairs = _uv_pairs(seen, radii, flip)
-            if all(np.abs(here - factor * wanted).max(initial=0.0) <= tolerance for wanted, here in pairs):
+            pairs = _uv_pairs(found_uv, radii, flip)
+            if all(
+                np.abs(here - factor * expected).max(initial=0.0) <= tolerance for expected, here in pairs
+            ):
                 return True
     return False
 
 
 def _uv_pairs(
-    seen: Float[np.ndarray, "m 8 2"], radii: Float[np.ndarray, " m"], flip: float
+    found_uv: Float[np.ndarray, "m 8 2"], radii: Float[np.ndarray, " m"], flip: float
 ) -> Iterator[tuple[Float64[np.ndarray, "k 2"], Float64[np.ndarray, "k 2"]]]:
     """Return texture coordinates about their centre, block by block: expected up to a factor, and found."""
-    for block in row_blocks(len(seen)):
-        here = seen[block].astype(np.float64) - 0.5
-        wanted = radii[block, None, None] * corner_directions() * np.array([1.0, flip])
+    for block in row_blocks(len(found_uv)):
+        here = found_uv[block].astype(np.float64) - 0.5
+        expected = radii[block, None, None] * corner_directions() * np.array([1.0, flip])
         known = np.isfinite(here).all(axis=2)
-        yield wanted[known], here[known]
+        yield expected[known], here[known]

@@ -332,12 +332,12 @@ def _size_classes(
     corners: Float64[np.ndarray, "t 3 3"], longest: Float64[np.ndarray, " t"], spacing: float
 ) -> tuple[_SizeClass, ...]:
     """Return triangles of usual size as one class, and larger ones by powers of two."""
-    wanted = longest / (2.0 * spacing)
-    octave = np.ceil(np.log2(np.maximum(wanted / MAX_SUBDIVISIONS, 1.0))).astype(np.int64)
+    ratio = longest / (2.0 * spacing)
+    octave = np.ceil(np.log2(np.maximum(ratio / MAX_SUBDIVISIONS, 1.0))).astype(np.int64)
     classes = []
     for number in np.unique(octave):
         rows = np.flatnonzero(octave == number)
-        cuts = np.clip(np.ceil(wanted[rows]), 1, MAX_SUBDIVISIONS).astype(np.int64)
+        cuts = np.clip(np.ceil(ratio[rows]), 1, MAX_SUBDIVISIONS).astype(np.int64)
         samples, owners = _spread_samples(corners[rows], cuts)
         coarser = float((longest[rows] / cuts).max()) - 2.0 * spacing if number > 0 else 0.0
         classes.append(_SizeClass(KDTree(samples), rows[owners], coarser))

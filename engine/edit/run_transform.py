@@ -72,10 +72,10 @@ def write_transformed_run_files(
                 name: scale * distance for name, distance in training["nearest_world"].items()
             }
         write_json(target / TRAINING, training)
-    told: list[str] = []
+    messages: list[str] = []
     if (source / CONFIG).exists():
-        told += _write_light(source, target, turn)
-    return tuple(told)
+        messages += _write_light(source, target, turn)
+    return tuple(messages)
 
 
 def _write_light(source: Path, target: Path, turn: Float64[np.ndarray, "3 3"]) -> list[str]:
@@ -88,7 +88,7 @@ def _write_light(source: Path, target: Path, turn: Float64[np.ndarray, "3 3"]) -
     if not _is_identity(turn):
         content["reconstruction"]["train"]["materials"]["up_world"] = new_up.tolist()
     write_json(target / CONFIG, content)
-    told = []
+    messages = []
     below = environment_frame(np.array(UP_WORLD))
     for name, old_frame, new_frame in (
         (ENVIRONMENT_EXR, environment_frame(up), environment_frame(new_up)),
@@ -100,14 +100,14 @@ def _write_light(source: Path, target: Path, turn: Float64[np.ndarray, "3 3"]) -
         if _is_identity(turn):
             shutil.copyfile(source / name, target / name)
             continue
-        told.append(f"{name} was turned with the scene, which makes it a little softer.")
+        messages.append(f"{name} was turned with the scene, which makes it a little softer.")
         if name in (ENVIRONMENT_HDR, ENVIRONMENT_EXR):
             radiance = read_environment(source / name)
             write_environment(target / name, rotate_environment(radiance, old_frame, new_frame, turn))
         else:
             rgb_srgb = read_background(source / name)
             write_background(target / name, rotate_environment(rgb_srgb, old_frame, new_frame, turn))
-    return told
+    return messages
 
 
 def rotate_environment(

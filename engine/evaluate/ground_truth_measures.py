@@ -99,19 +99,21 @@ class GroundTruthMeasures:
                 "environment_scales": [round(float(scale), _DECIMALS) for scale in scales],
             }
         names = {view.name: index for index, view in enumerate(dataset.views)}
-        wanted = [name for name in self.truth.content.relight.views if name in names]
-        if relighter is None or not self.rows or not wanted:
+        relit_views = [name for name in self.truth.content.relight.views if name in names]
+        if relighter is None or not self.rows or not relit_views:
             return
         pictures, true_pictures, labels = [], [], []
         for folder, path in self.truth.relit_folders:
             relighter.set_environment(EnvironmentMap(read_environment(path), frame))
-            for name in wanted:
+            for name in relit_views:
                 rays = dataset.view_rays(names[name])
                 pictures.append(relighter.render(rays))
                 side = max(rays.height_px, rays.width_px)
                 true_pictures.append(self.truth.relit_image(folder, name, side))
                 labels.append((folder.name, name))
-                progress(PhaseProgress("evaluate", len(labels), len(wanted) * len(self.truth.relit_folders)))
+                progress(
+                    PhaseProgress("evaluate", len(labels), len(relit_views) * len(self.truth.relit_folders))
+                )
         if pictures:
             self.light |= measure_relit(pictures, true_pictures, labels)
 
@@ -141,10 +143,10 @@ class GroundTruthMeasures:
     def _albedo_mean(self) -> dict[str, object]:
         found, true = np.concatenate(self._albedo), np.concatenate(self._true_albedo)
         scales = fit_channel_scales(found, true, to_display)
-        shown, wanted = to_display(found.astype(np.float64)), to_display(true.astype(np.float64))
+        display, true_display = to_display(found.astype(np.float64)), to_display(true.astype(np.float64))
         return {
-            "albedo_psnr": pooled_psnr(shown, wanted),
-            "albedo_psnr_scaled": pooled_psnr(to_display(found * scales), wanted),
+            "albedo_psnr": pooled_psnr(display, true_display),
+            "albedo_psnr_scaled": pooled_psnr(to_display(found * scales), true_display),
             "albedo_scales": [round(float(scale), _DECIMALS) for scale in scales],
         }
 
@@ -184,20 +186,20 @@ def measure_relit(
     Returns:
         Means, means by map, and the factors.
     """
-    wanted = [image[..., :3] for image in true_srgb]
+    references = [image[..., :3] for image in true_srgb]
     inside = [image[..., 3] > COVERED for image in true_srgb]
     scales = fit_channel_scales(
         np.concatenate([picture.linear[mask] for picture, mask in zip(pictures, inside, strict=True)]),
-        np.concatenate([srgb_to_linear(w[mask]) for w, mask in zip(wanted, inside, strict=True)]),
+        np.concatenate([srgb_to_linear(w[mask]) for w, mask in zip(references, inside, strict=True)]),
         to_display,
     )
     raw: dict[str, list[float]] = {}
     scaled: dict[str, list[float]] = {}
-    for (folder, _), picture, target in zip(names, pictures, wanted, strict=True):
+    for (folder, _), picture, target in zip(names, pictures, references, strict=True):
         flat = target.reshape(-1, 3)
         for values, factor in ((raw, np.ones(3)), (scaled, scales)):
-            shown = picture.coverage[..., None] * to_display(picture.linear * factor)
-            values.setdefault(folder, []).append(pooled_psnr(shown.reshape(-1, 3), flat))
+            display = picture.coverage[..., None] * to_display(picture.linear * factor)
+            values.setdefault(folder, []).append(pooled_psnr(display.reshape(-1, 3), flat))
     return {
         "relight_psnr": float(np.mean([value for values in raw.values() for value in values])),
         "relight_psnr_scaled": float(np.mean([value for values in scaled.values() for value in values])),

@@ -126,12 +126,12 @@ def environment_errors(
     directions = (local @ true.frame).reshape(-1, 3)
     lights = build_light_arrays((), ours.frame[1], ours)
     found, _ = eval_environment_map(lights, directions)
-    wanted = true.radiance_linear.reshape(-1, 3).astype(np.float64)
+    true_radiance = true.radiance_linear.reshape(-1, 3).astype(np.float64)
     weights = np.repeat(np.sin(polar), width)
-    scales = fit_channel_scales(found, wanted, compress_radiance, weights)
+    scales = fit_channel_scales(found, true_radiance, compress_radiance, weights)
     return (
-        pooled_psnr(compress_radiance(found), compress_radiance(wanted), weights),
-        pooled_psnr(compress_radiance(found * scales), compress_radiance(wanted), weights),
+        pooled_psnr(compress_radiance(found), compress_radiance(true_radiance), weights),
+        pooled_psnr(compress_radiance(found * scales), compress_radiance(true_radiance), weights),
         scales,
     )
 

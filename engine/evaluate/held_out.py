@@ -89,8 +89,8 @@ def evaluate_held_out(
     ):
         write_png(output / RENDERS / f"{names[view.name]}.png", view.render)
         if ALBEDO in view.layers:
-            for layer, shown in view.layers.items():
-                write_png(output / LAYERS / layer / f"{names[view.name]}.png", shown)
+            for layer, display in view.layers.items():
+                write_png(output / LAYERS / layer / f"{names[view.name]}.png", display)
         rows.append(measured.metrics)
         images.offer(
             view.name,

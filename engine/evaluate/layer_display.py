@@ -29,13 +29,16 @@ def display_layers(image: RenderedImage) -> dict[str, Float32[np.ndarray, "h w 3
     farthest that is seen; albedo and indirect light are encoded, and everything else is shown as it is.
     """
     alpha = image.alpha[..., None]
-    shown = {"normal": (image.normal_world + 1) / 2 * alpha, "depth": _to_gray(_depth_to_gray(image)) * alpha}
+    displays = {
+        "normal": (image.normal_world + 1) / 2 * alpha,
+        "depth": _to_gray(_depth_to_gray(image)) * alpha,
+    }
     for name in LABELS:
         if name in image.layers:
             values = np.clip(image.layers[name], 0.0, 1.0)
             encoded = linear_to_srgb(values) if values.shape[2] == 3 else _to_gray(values[..., 0])
-            shown[name] = encoded * alpha
-    return {name: values.astype(np.float32) for name, values in shown.items()}
+            displays[name] = encoded * alpha
+    return {name: values.astype(np.float32) for name, values in displays.items()}
 
 
 def display_environment(radiance_linear: Float32[np.ndarray, "h w 3"]) -> Float32[np.ndarray, "h w 3"]:
@@ -44,10 +47,10 @@ def display_environment(radiance_linear: Float32[np.ndarray, "h w 3"]) -> Float3
 
 
 def _depth_to_gray(image: RenderedImage) -> Float32[np.ndarray, "h w"]:
-    seen = image.depth[image.alpha >= MIN_ALPHA]
-    if len(seen) == 0:
+    visible_depths = image.depth[image.alpha >= MIN_ALPHA]
+    if len(visible_depths) == 0:
         return np.zeros_like(image.depth)
-    near, far = np.quantile(seen, (0.01, 0.99))
+    near, far = np.quantile(visible_depths, (0.01, 0.99))
     place = np.clip((image.depth - near) / max(far - near, 1e-9), 0, 1)
     return np.asarray(1 - (1 - FAR_GRAY) * place, np.float32)
 

@@ -47,14 +47,16 @@ def measure_multiscale(
     for done, index in enumerate(dataset.test_indices.tolist(), start=1):
         rgb, alpha, weight = dataset.view_image(index)
         photograph = composite_over(rgb, alpha, background_srgb)
-        rays, shown = dataset.view_rays(index), shading_for_view(shading, index)
+        rays, view_shading = dataset.view_rays(index), shading_for_view(shading, index)
         for scale in scales:
             if min(weight.shape) < scale:
                 continue
             counts = (block_means(weight[..., None], scale)[..., 0] == 1).astype(np.float32)
             small = quantize_8_bit(block_means(photograph, scale))
             for across in rays_across:
-                image = render_averaged(tracer, downscale_rays(rays, scale), background_srgb, shown, across)
+                image = render_averaged(
+                    tracer, downscale_rays(rays, scale), background_srgb, view_shading, across
+                )
                 value = psnr(quantize_8_bit(image.rgb_srgb), small, counts)
                 if np.isfinite(value):
                     row = found.setdefault(f"1/{scale}", {})

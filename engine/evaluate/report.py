@@ -236,8 +236,10 @@ def _facts(metrics: Mapping[str, object], views: int) -> list[str]:
     resolution = metrics.get("resolution")
     if isinstance(resolution, Mapping):
         known = {key: value for key, value in resolution.items() if value is not None}
-        shown = ", ".join(f"{key.replace('_', ' ')} {value}" for key, value in _flatten_settings(known))
-        facts.append(f"resolution: {shown or 'that of the photographs'}")
+        settings_text = ", ".join(
+            f"{key.replace('_', ' ')} {value}" for key, value in _flatten_settings(known)
+        )
+        facts.append(f"resolution: {settings_text or 'that of the photographs'}")
     elif resolution is not None:
         facts.append(f"resolution {resolution}")
     if metrics.get("seed") is not None:

@@ -42,10 +42,10 @@ def summarize_evaluation(path: Path) -> list[str]:
     """Return lines on what was measured on other photographs into ``path``, and where it is shown."""
     metrics: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
     known = metrics.get("truth", {}).get("mean", {})
-    told = [form.format(known[key]) for key, form in _TRUTH if known.get(key) is not None]
+    truth_figures = [form.format(known[key]) for key, form in _TRUTH if known.get(key) is not None]
     return [
         format_mean_metrics(metrics),
-        *([f"Against the truth: {', '.join(told)}"] if told else []),
+        *([f"Against the truth: {', '.join(truth_figures)}"] if truth_figures else []),
         f"{'Report:':8}{path.with_name('report.html')}",
     ]
 

@@ -209,11 +209,11 @@ def bootstrap_interval(
     After "Bootstrap Methods: Another Look at the Jackknife" (https://doi.org/10.1214/aos/1176344552).
     Numbers that are not finite are left out. ``None`` for fewer than two values, which have no spread.
     """
-    kept = np.array([value for value in values if math.isfinite(value)])
-    if len(kept) < 2:
+    finite = np.array([value for value in values if math.isfinite(value)])
+    if len(finite) < 2:
         return None
-    draws = np.random.default_rng(seed).integers(0, len(kept), (BOOTSTRAP_DRAWS, len(kept)))
-    means = kept[draws].mean(axis=1)
+    draws = np.random.default_rng(seed).integers(0, len(finite), (BOOTSTRAP_DRAWS, len(finite)))
+    means = finite[draws].mean(axis=1)
     low, high = np.quantile(means, [(1 - level) / 2, (1 + level) / 2])
     return float(low), float(high)
 

@@ -111,12 +111,12 @@ def read_ply_metadata(path: Path) -> SceneMetadata:
     Raises:
         SceneFileError: the file is damaged, or says something that is no number.
     """
-    said = dict(comment.partition(" ")[::2] for comment in reversed(read_ply_header(path).comments))
+    metadata = dict(comment.partition(" ")[::2] for comment in reversed(read_ply_header(path).comments))
     known: dict[str, float] = {}
     for field in fields(SceneMetadata):
         if field.name == ORIGIN_KEY:
             continue
-        if (value := said.get(field.name)) is None:
+        if (value := metadata.get(field.name)) is None:
             continue
         try:
             known[field.name] = max(float(value), 0.0)
@@ -124,7 +124,7 @@ def read_ply_metadata(path: Path) -> SceneMetadata:
             raise SceneFileError(
                 f"{path}: its comment {field.name} is {value!r}, which is no number."
             ) from None
-    facts = SceneMetadata(**known, origin_world=_origin(path, said.get(ORIGIN_KEY)))
+    facts = SceneMetadata(**known, origin_world=_origin(path, metadata.get(ORIGIN_KEY)))
     return replace(facts, turned_beyond=min(facts.turned_beyond, 1.0))
 
 
@@ -224,11 +224,11 @@ def read_ply_cloud(
     if vertex.count == 0:
         raise SceneFileError(f"{path}: holds no Gaussians.")
     table = read_ply(path, ["vertex"])[1]["vertex"]
-    kept = (min(degree, MAX_SH_DEGREE) + 1) ** 2 - 1
+    retained = (min(degree, MAX_SH_DEGREE) + 1) ** 2 - 1
     each = (degree + 1) ** 2 - 1
-    names = [f"f_rest_{colour * each + k}" for colour in range(3) for k in range(kept)]
+    names = [f"f_rest_{colour * each + k}" for colour in range(3) for k in range(retained)]
     colours = columns(table, [*_SH_DC, *names])
-    rest = colours[:, 3:].reshape(len(table), 3, kept).transpose(0, 2, 1)
+    rest = colours[:, 3:].reshape(len(table), 3, retained).transpose(0, 2, 1)
     unnamed = [name for name in vertex.names if name != _FILTER]
     found = select_channel_columns(path, declared_channels(header.comments), unnamed, channels)
     try:

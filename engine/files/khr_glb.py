@@ -73,8 +73,8 @@ def read(path: Path, channels: ChannelChoice = "own") -> GaussianCloud:
             attributes = primitive["attributes"]
             cloud = _to_world(path, _read_cloud(file, attributes, splats), file.about_origin(matrix))
             columns = {name[1:].lower(): number for name, number in attributes.items() if name[0] == "_"}
-            wanted = select_channel_columns(path, declared, columns, channels)
-            named = Channels({name: _read_channel(file, columns, own) for name, own in wanted.items()})
+            requested = select_channel_columns(path, declared, columns, channels)
+            named = Channels({name: _read_channel(file, columns, own) for name, own in requested.items()})
             clouds.append(replace(cloud, channels=named))
         if not clouds:
             q = octagon_q(file)

@@ -137,7 +137,7 @@ def _mesh(file: GlbFile, *, with_materials: bool) -> tuple[ImportedMesh, Int32[n
             else:
                 extras[key].append(np.full((size, ATTRIBUTE_WIDTHS.get(key, 1)), np.nan, np.float32))
         count += size
-    whole = {key: _concatenate_attribute(parts) for key, parts in extras.items()}
+    joined = {key: _concatenate_attribute(parts) for key, parts in extras.items()}
     stated = file.document.get("asset", {}).get("extras", {})
     numbers_stated = {
         key: float(value)
@@ -147,14 +147,14 @@ def _mesh(file: GlbFile, *, with_materials: bool) -> tuple[ImportedMesh, Int32[n
     mesh = ImportedMesh(
         np.concatenate([*vertices, np.zeros((0, 3))]),
         np.concatenate([*triangles, np.zeros((0, 3), np.int64)]),
-        uv=whole["uv"],
-        gid=_flatten_scalar(whole["gid"]),
-        corner=_flatten_scalar(whole["corner"]),
-        radius=_flatten_scalar(whole["radius"]),
+        uv=joined["uv"],
+        gid=_flatten_scalar(joined["gid"]),
+        corner=_flatten_scalar(joined["corner"]),
+        radius=_flatten_scalar(joined["radius"]),
         q=numbers_stated.get(Q_KEY),
         min_opacity=numbers_stated.get(MIN_OPACITY_KEY),
-        normals=whole.get("normal"),
-        rgb_linear=whole.get("colour"),
+        normals=joined.get("normal"),
+        rgb_linear=joined.get("colour"),
     )
     return mesh, np.concatenate([*numbers, np.zeros(0, np.int32)])
 
@@ -163,8 +163,8 @@ def _concatenate_attribute(parts: list[np.ndarray]) -> np.ndarray | None:
     """One array, or None where no part had the attribute."""
     if not parts:
         return None
-    whole = np.concatenate(parts)
-    return None if np.isnan(whole).all() else whole
+    joined = np.concatenate(parts)
+    return None if np.isnan(joined).all() else joined
 
 
 def _flatten_scalar(values: np.ndarray | None) -> np.ndarray | None:

@@ -139,9 +139,9 @@ def _blocks(handle: IO[bytes]) -> Iterator[bytes]:
     """Yield the file in blocks that end at the end of a line."""
     rest = handle.read(len(codecs.BOM_UTF8)).removeprefix(codecs.BOM_UTF8)
     while chunk := handle.read(BLOCK_BYTES):
-        whole, newline, tail = chunk.rpartition(b"\n")
+        complete, newline, tail = chunk.rpartition(b"\n")
         if newline:
-            yield rest + whole + newline
+            yield rest + complete + newline
             rest = tail
         else:
             rest += chunk

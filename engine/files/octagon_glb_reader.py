@@ -79,12 +79,12 @@ def _read_primitive(
     with np.errstate(divide="ignore"):
         logits = np.log(rgba[:, 3].astype(np.float64)) - np.log1p(-rgba[:, 3].astype(np.float64))
     columns = {name[1:].lower(): number for name, number in attributes.items() if name[0] == "_"}
-    wanted = select_channel_columns(
+    requested = select_channel_columns(
         path, glb_container.declared_channel_attributes(file.document), columns, channels
     )
     named = {
         name: np.concatenate([file.array(columns[column], np.float32)[::SIDES] for column in own], axis=1)
-        for name, own in wanted.items()
+        for name, own in requested.items()
     }
     ids = np.arange(len(corners), dtype=np.float32)
     if "_GID" in attributes:

@@ -56,9 +56,9 @@ def read(path: Path, channels: ChannelChoice = "own") -> GaussianCloud:
     corners = columns(table, ("x", "y", "z")).reshape(-1, SIDES, 3)
     means, quats, log_scales = gaussians_from_octagons(corners, columns(first, ("radius",))[:, 0], path)
     others = (name for name in table.dtype.names or () if name not in known)
-    wanted = select_channel_columns(path, declared_channels(header.comments), others, channels)
+    requested = select_channel_columns(path, declared_channels(header.comments), others, channels)
     try:
-        named = Channels({name: columns(first, own) for name, own in wanted.items()})
+        named = Channels({name: columns(first, own) for name, own in requested.items()})
     except ConfigError as error:
         raise SceneFileError(f"{path}: {error}") from error
     sizes = [comment.split()[1] for comment in header.comments if comment.startswith(f"{_SIZE} ")]

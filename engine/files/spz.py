@@ -57,8 +57,8 @@ def read(path: Path) -> GaussianCloud:
     positions, opacities, colours, scales, rotations, harmonics = (
         np.frombuffer(stream, np.uint8).reshape(file.count, -1) for stream in file.streams
     )
-    kept = (min(file.sh_degree, MAX_SH_DEGREE) + 1) ** 2
-    rest = (harmonics.reshape(file.count, -1, 3)[:, : kept - 1].astype(np.float32) - 128.0) / 128.0
+    retained = (min(file.sh_degree, MAX_SH_DEGREE) + 1) ** 2
+    rest = (harmonics.reshape(file.count, -1, 3)[:, : retained - 1].astype(np.float32) - 128.0) / 128.0
     constant = (colours.astype(np.float32) / 255.0 - 0.5) / COLOUR_SCALE
     sh = np.concatenate([constant[:, None, :], rest], axis=1).astype(np.float32)
     quats = _decode_xyz(rotations) if file.version == 2 else _decode_smallest_three(rotations)
@@ -146,8 +146,8 @@ def _fitting_bits(scene: FlatGaussians) -> int:
 
 def _fractional_bits(scene: FlatGaussians) -> int:
     small = float(np.quantile(scene.log_scales.min(axis=1).astype(np.float64), SMALL_QUANTILE))
-    wanted = int(np.ceil(np.log2(STEPS_PER_SIGMA) - small / np.log(2.0)))
-    return min(max(wanted, FRACTIONAL_BITS), _fitting_bits(scene), 23)
+    needed = int(np.ceil(np.log2(STEPS_PER_SIGMA) - small / np.log(2.0)))
+    return min(max(needed, FRACTIONAL_BITS), _fitting_bits(scene), 23)
 
 
 def _find_losses(scene: FlatGaussians) -> tuple[str, ...]:
@@ -163,8 +163,8 @@ def _find_losses(scene: FlatGaussians) -> tuple[str, ...]:
 
 
 def _pack_positions(steps: Float[np.ndarray, "n 3"]) -> bytes:
-    whole = np.ascontiguousarray(np.rint(steps).astype("<i4"))
-    return whole.view(np.uint8).reshape(*steps.shape, 4)[:, :, :3].tobytes()
+    integers = np.ascontiguousarray(np.rint(steps).astype("<i4"))
+    return integers.view(np.uint8).reshape(*steps.shape, 4)[:, :, :3].tobytes()
 
 
 def _pack_rotations(scene: FlatGaussians) -> bytes:

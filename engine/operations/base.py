@@ -212,8 +212,8 @@ def error_text(message: str, place: Callable[[str], str] = lambda path: path) ->
         message: the message; fields that a validator names stand in it between backquotes.
         place: what users call such a field.
     """
-    told = message.removeprefix("Value error, ").removesuffix(".")
-    return re.sub(r"`([\w.]+)`", lambda match: place(match[1]), told)
+    sentence = message.removeprefix("Value error, ").removesuffix(".")
+    return re.sub(r"`([\w.]+)`", lambda match: place(match[1]), sentence)
 
 
 def emit_warning(progress: EventListener, message: str) -> None:

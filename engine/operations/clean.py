@@ -103,7 +103,7 @@ def run(
     share = request.camera_clearance
     zones = run_camera_clearance(source, share) if share > 0 and is_run(source) else None
     keep, report = clean(gaussians, request, zones)
-    told = (
+    message = (
         f"{source}: {len(gaussians):,} Gaussians; {report.faint:,} too faint, {report.small:,} too small, "
         f"{report.large:,} too large, {report.near:,} too near to a camera, "
         f"{report.floating:,} in {report.groups:,} groups of floaters; {report.kept:,} kept."
@@ -115,11 +115,13 @@ def run(
         )
     counts = {"count": len(gaussians), **asdict(report)}
     if request.output is None:
-        return CleanResult(notes=(told,), **counts)
+        return CleanResult(notes=(message,), **counts)
     stop_if(should_stop)
     note = edit_note("clean", options_of(CleanOptions, request), gaussians=report.kept)
     written = write_changed(source, gaussians.select(keep), request.output, progress, note=note)
-    return CleanResult(files=written.files, folder=written.folder, notes=(told, written.sentence), **counts)
+    return CleanResult(
+        files=written.files, folder=written.folder, notes=(message, written.sentence), **counts
+    )
 
 
 OPERATION = Operation(

@@ -192,7 +192,7 @@ def _measure_scales(request: EvaluateRequest, progress: EventListener, threads: 
         threads=threads,
         listener=progress,
     )
-    told = {
+    measures = {
         scale: ", ".join(f"{psnr:.2f} dB with {rays}" for rays, psnr in row.items())
         for scale, row in found.items()
     }
@@ -200,7 +200,9 @@ def _measure_scales(request: EvaluateRequest, progress: EventListener, threads: 
         files=(request.source / SCALES,),
         folder=request.source,
         scales=found,
-        summary=tuple(f"{scale} of the size: {figures} ray(s) a pixel" for scale, figures in told.items()),
+        summary=tuple(
+            f"{scale} of the size: {figures} ray(s) a pixel" for scale, figures in measures.items()
+        ),
     )
 
 

@@ -94,10 +94,10 @@ class _ExportFields(ExportChoices, Options):
         targets = self.targets()
         names = [_format_name(target, self.format_name()) for target in targets]
         if None not in names and "glb" not in names:
-            told = f"{targets[-1]} is written as {names[-1]}"
+            message = f"{targets[-1]} is written as {names[-1]}"
             for name in ("opaque", "materials", "for_viewers"):
                 if getattr(self, name):
-                    raise ValueError(f"`{name}` is for GLB of octagons; {told}")
+                    raise ValueError(f"`{name}` is for GLB of octagons; {message}")
         if self.for_viewers and (self.opaque or self.materials):
             raise ValueError("`for_viewers` is for GLB of octagons without `opaque` and `materials`")
         return self
@@ -111,10 +111,10 @@ class _ExportFields(ExportChoices, Options):
         return None
 
 
-def _format_name(target: Path, asked: str | None) -> str | None:
+def _format_name(target: Path, requested: str | None) -> str | None:
     """Return the name of the format; None if there is none, which is reported later."""
     try:
-        return exporter_for(target, asked).name
+        return exporter_for(target, requested).name
     except SceneFileError:
         return None
 
@@ -190,8 +190,8 @@ def run(
     )
     found = [exporter_for(path, request.format) for path in request.files]
     if request.color is not None and all(exporter.holds_harmonics for exporter in found):
-        told = "colour goes with formats of one colour for each Gaussian and is passed over."
-        progress(Warned(told))
+        message = "colour goes with formats of one colour for each Gaussian and is passed over."
+        progress(Warned(message))
     count = len(request.files)
     gaussians = open_scene(request.source, progress)
     if request.materials:
@@ -309,8 +309,8 @@ class _ExportPreparation:
         source = self._request.source
         if not (is_run(source) and (source / CONFIG).exists()):
             return gaussians, options
-        seen = run_viewpoints(source)
-        centres = np.stack([seen.views[index].origin_world for index in seen.train_indices])
+        viewpoints = run_viewpoints(source)
+        centres = np.stack([viewpoints.views[index].origin_world for index in viewpoints.train_indices])
         order, agreement = shared_depth_order(gaussians.means_world, centres)
         if agreement < MIN_AGREEMENT:
             return gaussians, options

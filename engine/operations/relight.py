@@ -89,13 +89,13 @@ class RelightOptions(PictureOptions):
 
     def unused(self) -> tuple[str, ...]:
         """Return a sentence about given options that have no effect on such images."""
-        told = super().unused()
+        sentences = super().unused()
         if self.integrator == "split-sum" and self.rays_across**2 != self.samples_per_pixel:
-            told += (
+            sentences += (
                 f"Of {self.samples_per_pixel} samples split-sum takes {self.rays_across**2}, as many across "
                 "a pixel as down.",
             )
-        return told
+        return sentences
 
 
 class RelightRequest(RelightOptions, PictureRequest):
@@ -165,12 +165,12 @@ def run(
     from octasplat.engine.runs.config import read_config
     from octasplat.engine.runs.run_folder import CONFIG, SCENE, is_run
 
-    tell = stop_when_asked(progress, should_stop)
-    for told in request.unused():
-        tell(Warned(told))
+    report = stop_when_asked(progress, should_stop)
+    for sentence in request.unused():
+        report(Warned(sentence))
     of_run = is_run(request.source)
     environments = read_environments(request.environments, request.clamp)
-    source = read_render_source(request.source, tell, dataset=request.dataset, max_side=request.max_side)
+    source = read_render_source(request.source, report, dataset=request.dataset, max_side=request.max_side)
     require_materials(source.gaussians, request.source / SCENE if of_run else request.source)
     learnt = read_config(request.source / CONFIG).train.materials if of_run else None
     up = light_up(request.source, request.up)
@@ -181,7 +181,7 @@ def run(
         "relight", request, tuple(lightings), [request.other_dataset, *request.environments]
     )
     background = request.background or source.background
-    kept = output.finished_images(
+    finished = output.finished_images(
         render_digest(
             "relight",
             source.gaussians,
@@ -205,7 +205,7 @@ def run(
     )
     relighter = _relighter(request, source, learnt, threads)
     paint = RelitRenderFn(relighter, environments, up, background, lightings)
-    files = output.write(tuple(lightings), paint, kept, tell)
+    files = output.write(tuple(lightings), paint, finished, report)
     return RelightResult(files=files, folder=output.folder, images=len(lightings))
 
 

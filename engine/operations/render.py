@@ -85,8 +85,10 @@ class RenderOptions(PictureOptions):
         """Return the stage, with its integrator's settings replaced by the options."""
         if self.stage is None:
             return None
-        asked = {name: True for name in ("layers", "denoise") if getattr(self, name)}
-        return self.stage.model_copy(update={"integrator": self.stage.integrator.model_copy(update=asked)})
+        requested = {name: True for name in ("layers", "denoise") if getattr(self, name)}
+        return self.stage.model_copy(
+            update={"integrator": self.stage.integrator.model_copy(update=requested)}
+        )
 
 
 class RenderRequest(RenderOptions, PictureRequest):
@@ -171,20 +173,24 @@ def run(
     )
     from octasplat.engine.render.shots import camera_shots
 
-    told = "Stopped; the preview is as fine as it was." if request.preview else None
-    tell = stop_when_asked(progress, should_stop, told)
+    message = "Stopped; the preview is as fine as it was." if request.preview else None
+    report = stop_when_asked(progress, should_stop, message)
     for unused in request.unused():
-        tell(Warned(unused))
+        report(Warned(unused))
     max_side = request.max_side or (PREVIEW_SIDE_PX if request.preview else None)
     source = read_render_source(
-        request.source, tell, dataset=request.dataset, max_side=max_side, full_size=request.stage is not None
+        request.source,
+        report,
+        dataset=request.dataset,
+        max_side=max_side,
+        full_size=request.stage is not None,
     )
     cameras = requested_cameras(request, source)
     shots = requested_views(request, source) if cameras is None else camera_shots(cameras)
     written = shots[:1] if request.preview else shots
     output = picture_output("render", request, written, [request.stage_file, *_stage_files(request)])
     render = _render_plain if request.stage is None else _render_on_stage
-    files = render(request, source, cameras, shots, output, tell, threads)
+    files = render(request, source, cameras, shots, output, report, threads)
     return RenderResult(files=files, folder=output.folder, images=len(written))
 
 
@@ -214,7 +220,7 @@ def _render_plain(
     background = background_colour("black" if transparent else request.background or source.background)
     learnt = None if request.background else source.learnt  # another colour was asked for, or alpha
     views = None if cameras is not None else (source.viewpoints, source.near_world)
-    kept = output.finished_images(
+    finished = output.finished_images(
         render_digest(
             source.gaussians, source.settings, background, transparent, cameras, None, views,
             source.trained_rad, None if learnt is None else learnt.rgb_srgb, *output.numbered(shots),
@@ -229,7 +235,7 @@ def _render_plain(
         trained_rad=source.trained_rad,
         shading=learnt or PLAIN_SHADING,
     )
-    return output.write(shots, paint, kept, progress)
+    return output.write(shots, paint, finished, progress)
 
 
 def _render_on_stage(
@@ -257,13 +263,13 @@ def _render_on_stage(
         compile_stage(stage, scene, shots).preview(shots[0], request.output, progress)
         return (request.output,)
     views = None if cameras is not None else (source.viewpoints, source.near_world)
-    kept = output.finished_images(
+    finished = output.finished_images(
         render_digest(
             source.gaussians, source.settings, background, False, cameras,
             stage_identity(stage, request.stage_folder), views, scene.photographs, *output.numbered(shots),
         )
     )  # fmt: skip
-    return output.write(shots, compile_stage(stage, scene, shots).render_fn, kept, progress)
+    return output.write(shots, compile_stage(stage, scene, shots).render_fn, finished, progress)
 
 
 OPERATION = Operation(

@@ -201,6 +201,6 @@ def edit_note(name: str, options: BaseModel, **counts: int) -> dict[str, object]
         options: what was asked for.
         counts: what came of it.
     """
-    asked = map_named_files(options, lambda path: Path(path.name))
-    kept = type(options).model_construct(**asked).model_dump(mode="json", exclude_defaults=True)
-    return {"operation": name, **kept, **counts}
+    requested = map_named_files(options, lambda path: Path(path.name))
+    recorded = type(options).model_construct(**requested).model_dump(mode="json", exclude_defaults=True)
+    return {"operation": name, **recorded, **counts}

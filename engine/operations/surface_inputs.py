@@ -50,10 +50,10 @@ def depth_cameras(
         DatasetError: the photographs cannot be used.
     """
     if is_run(source) and (source / CONFIG).exists():
-        seen = run_viewpoints(source, scene=dataset)
+        viewpoints = run_viewpoints(source, scene=dataset)
         settings = read_config(source / CONFIG).train.trace
-        near_world = run_min_view_distance(source, seen)
-        return photograph_cameras(seen, seen.train_indices, side_px, near_world), settings
+        near_world = run_min_view_distance(source, viewpoints)
+        return photograph_cameras(viewpoints, viewpoints.train_indices, side_px, near_world), settings
     facts = read_metadata(source)
     settings = TraceSettings(flip_normal_cos=facts.turned_beyond)
     if dataset is not None:

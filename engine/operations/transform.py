@@ -54,8 +54,8 @@ class TransformOptions(Options):
 
     @model_validator(mode="after")
     def _does_something(self) -> "TransformOptions":
-        asked = (self.matrix, self.up, self.scale, self.rotate or None, self.translate)
-        if all(value is None for value in asked):
+        requested = (self.matrix, self.up, self.scale, self.rotate or None, self.translate)
+        if all(value is None for value in requested):
             raise ValueError("Say what to do: `matrix`, `up`, `scale`, `rotate` or `translate`")
         return self
 
@@ -74,12 +74,12 @@ class TransformOptions(Options):
             turns = affine.scaling(np.full(3, self.scale)) @ turns
         for axis, degrees in self.rotate:
             turns = affine.rotation(affine.AXES[axis], degrees) @ turns
-        whole = affine.conjugate_by_point(turns, np.array(self.about))
+        combined = affine.conjugate_by_point(turns, np.array(self.about))
         if self.matrix is not None:
-            whole = whole @ affine.read_matrix(self.matrix)
+            combined = combined @ affine.read_matrix(self.matrix)
         if self.translate is not None:
-            whole = affine.translation(np.array(self.translate)) @ whole
-        return whole
+            combined = affine.translation(np.array(self.translate)) @ combined
+        return combined
 
 
 class TransformRequest(TransformOptions, SceneRequest):

@@ -138,9 +138,9 @@ class Film:
     def image(self, *, exposure: float = 0.0, tone: ToneCurve = "none") -> StageImage:
         """Return the image of all paths so far; ``exposure`` is in stops."""
         linear = self._linear()
-        shown = linear_to_srgb(apply_tone_curve(linear * 2.0**exposure, tone))
+        display = linear_to_srgb(apply_tone_curve(linear * 2.0**exposure, tone))
         return StageImage(
-            np.clip(shown, 0.0, 1.0).astype(np.float32).reshape(*self._shape, 3),
+            np.clip(display, 0.0, 1.0).astype(np.float32).reshape(*self._shape, 3),
             self._to_image(linear),
             self._to_image(self._coverage / np.maximum(self._samples, 1)),
             self._layers(linear),
@@ -176,8 +176,8 @@ class Film:
             shade = _safe_divide(self._shade, self._covered(), 1.0)
             colour = srgb_to_linear(_safe_divide(layer, covered)) * np.maximum(shade, 0.0)
             layer = np.where(np.abs(shade - 1.0) < 1e-6, layer, covered * linear_to_srgb(colour))
-        shown = layer + front * linear_to_srgb(surface) + through * linear_to_srgb(light)
-        return np.asarray(srgb_to_linear(shown))
+        display = layer + front * linear_to_srgb(surface) + through * linear_to_srgb(light)
+        return np.asarray(srgb_to_linear(display))
 
     def _covered(self) -> Float64[np.ndarray, "n 1"]:
         return (self._samples - self._transmittance - self._front)[:, None]
@@ -186,19 +186,19 @@ class Film:
         if self._without_meshes is None or self.plate is None:
             return {}
         plain = self._without_meshes._linear(lit=False)
-        seen = (self._without_meshes._samples > 0)[:, None] & (plain > _DARK)
-        shadow = np.where(seen, self._without_meshes._linear() / np.where(seen, plain, 1.0), 1.0)
+        is_lit = (self._without_meshes._samples > 0)[:, None] & (plain > _DARK)
+        shadow = np.where(is_lit, self._without_meshes._linear() / np.where(is_lit, plain, 1.0), 1.0)
         background = self.plate._linear(lit=False)
         behind = background * shadow
         alpha = self._mesh_visibility / np.maximum(self._samples, 1)
         needed = np.where(behind > _DARK, 1.0 - picture / np.maximum(behind, _DARK), 0.0).max(axis=1)
         alpha = np.where(alpha > 0.0, np.clip(np.maximum(alpha, needed), 0.0, 1.0), 0.0)[:, None]
-        things = np.where(alpha > 0.0, np.maximum(picture - (1.0 - alpha) * behind, 0.0), 0.0)
+        mesh_light = np.where(alpha > 0.0, np.maximum(picture - (1.0 - alpha) * behind, 0.0), 0.0)
         beyond = self.plate._coverage / np.maximum(self.plate._samples, 1)
         parts = {
             "background": (background, beyond),
             "shadow": (shadow, np.clip(1.0 - shadow.mean(axis=1), 0.0, 1.0)),
-            "things": (things, alpha[:, 0]),
+            "things": (mesh_light, alpha[:, 0]),
         }
         channels: dict[str, Float32[np.ndarray, "h w"]] = {}
         for name, (rgb, a) in parts.items():

@@ -54,11 +54,11 @@ class GaussianLayers:
 
     def trace(self, rays: RayBatch, t_max: Float32[np.ndarray, " r"]) -> TraceResult:
         """Return the Gaussians' radiance and transmittance along rays up to a distance each."""
-        seen = self.tracer.trace(rays.with_t_max(t_max))
+        traced = self.tracer.trace(rays.with_t_max(t_max))
         if self.tracer.settings.flip_normal_cos > 0:
-            normals = face_viewer(seen.normal_world, rays.directions_world)
-            seen.normal_world = normals.normal_world.astype(np.float32)
-        return seen
+            normals = face_viewer(traced.normal_world, rays.directions_world)
+            traced.normal_world = normals.normal_world.astype(np.float32)
+        return traced
 
 
 def build_gaussian_layers(
@@ -103,16 +103,16 @@ def build_gaussian_layers(
     if not parts:
         return None
     # Channels say nothing of light, and two scenes may mean different things by one name.
-    whole = merge_scenes([part.without_channels(tuple(part.channels)) for part in parts])
+    merged = merge_scenes([part.without_channels(tuple(part.channels)) for part in parts])
     tracer = make_tracer(settings, threads=threads, build_quality=2)
     columns = FEATURE_COUNT if any(surfaces) else BASE_FEATURE_COUNT
-    tracer.build(whole, np.ascontiguousarray(np.concatenate(features)[:, :columns]))
+    tracer.build(merged, np.ascontiguousarray(np.concatenate(features)[:, :columns]))
 
     def caster(chosen: Bool[np.ndarray, " n"]) -> Tracer | None:
         if chosen.all() or not chosen.any():
             return tracer if chosen.any() else None
         some = make_tracer(settings, threads=threads, build_quality=2)
-        some.build(whole.select(chosen))
+        some.build(merged.select(chosen))
         return some
 
     casting = np.concatenate(on_gaussians)

@@ -116,8 +116,8 @@ def transform_points(
     rotation: Float64[np.ndarray, "3 3"] | None = None,
 ) -> Float64[np.ndarray, "n 3"]:
     """Return points scaled along their own axes, rotated, and translated to the world."""
-    whole = rotation_matrix(placement.rotation_degrees) @ (np.eye(3) if rotation is None else rotation)
-    return points * np.array(placement.scale) @ whole.T + np.array(placement.position)
+    linear_map = rotation_matrix(placement.rotation_degrees) @ (np.eye(3) if rotation is None else rotation)
+    return points * np.array(placement.scale) @ linear_map.T + np.array(placement.position)
 
 
 def transform_normals(

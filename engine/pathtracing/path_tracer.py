@@ -175,7 +175,7 @@ class PathTracer:
         pixels = together // at_once // MIN_TILE_PIXELS * MIN_TILE_PIXELS
         tops = range(0, len(order), pixels)
         blocks = range(0, count, at_once)
-        done, whole = 0, len(tops) * len(blocks)
+        done, total = 0, len(tops) * len(blocks)
         for sample in blocks:
             batches = [
                 _Batch(top, order[top : top + pixels], min(at_once, count - sample), first + sample)
@@ -183,9 +183,9 @@ class PathTracer:
             ]
             work = self._trace_wavefront if self._scene.layers is not None else self._trace_per_thread
             for _ in work(film, view, order, image.rays.t_min[:1], batches):
-                progress(done, whole)
+                progress(done, total)
                 done += 1
-        progress(whole, whole)
+        progress(total, total)
 
     def _trace_per_thread(
         self,
@@ -291,10 +291,10 @@ class PathTracer:
             hits = meshes.triangles.closest(rays)
             shadows = allocate_shadow_rays(len(active))
             if layers is not None:
-                seen = layers.trace(rays, hits.distances)
+                traced = layers.trace(rays, hits.distances)
                 layer = LayerArrays(
-                    seen.rgb_srgb, seen.transmittance, seen.depth_median, seen.depth_sum, seen.normal_world,
-                    seen.features,
+                    traced.rgb_srgb, traced.transmittance, traced.depth_median, traced.depth_sum,
+                    traced.normal_world, traced.features,
                 )  # fmt: skip
                 if layers.has_material_surfaces:
                     self._run_kernel(
@@ -357,24 +357,24 @@ class PathTracer:
         layers: GaussianLayers,
     ) -> None:
         """Add the light that reaches layers of Gaussians, less what meshes shadow."""
-        asked = np.flatnonzero(
+        queried = np.flatnonzero(
             shadows.radiance_linear.any(axis=1) | shadows.occluded_radiance_linear.any(axis=1)
         )
-        if len(asked) == 0:
+        if len(queried) == 0:
             return
-        share = self._shadow_transmittance(shadows, passes_rough_glass=True)[asked]
-        free, whole = share.any(axis=1), (share == 1.0).all(axis=1)
-        through = np.ones((2, len(asked)), np.float32)
+        share = self._shadow_transmittance(shadows, passes_rough_glass=True)[queried]
+        free, unoccluded = share.any(axis=1), (share == 1.0).all(axis=1)
+        through = np.ones((2, len(queried)), np.float32)
         for row, tracer in enumerate((layers.gaussian_shadow_tracer, layers.non_shadow_tracer)):
             # What nobody keeps off needs no tracing where nothing else would count it.
-            needed = free if row == 0 else ~whole | (layers.gaussian_shadow_tracer is not None)
+            needed = free if row == 0 else ~unoccluded | (layers.gaussian_shadow_tracer is not None)
             if tracer is not None and needed.any():
                 through[row, needed] = tracer.transmittance(
-                    _shadow_ray_batch(shadows, asked[needed], layers.shadow_bias)
+                    _shadow_ray_batch(shadows, queried[needed], layers.shadow_bias)
                 )
         self._run_kernel(
-            add_layer_light, len(asked), paths, active[asked], shadows.radiance_linear[asked],
-            shadows.occluded_radiance_linear[asked], share, through[0], through[1],
+            add_layer_light, len(queried), paths, active[queried], shadows.radiance_linear[queried],
+            shadows.occluded_radiance_linear[queried], share, through[0], through[1],
         )  # fmt: skip
 
     def _run_kernel(self, kernel: Callable[..., None], rows: int, *arguments: object) -> None:

@@ -70,10 +70,10 @@ def _resting_point(
         origin, direction = np.array(rest.origin), np.array(rest.direction)
         what = "the ray"
     direction = direction / np.linalg.norm(direction)
-    seen = tracer.trace(RayBatch(origin[None], direction[None].astype(np.float32)))
-    if not seen.depth_median[0] > 0:
+    traced = tracer.trace(RayBatch(origin[None], direction[None].astype(np.float32)))
+    if not traced.depth_median[0] > 0:
         raise ConfigError(f"{key}: {what} meets nothing solid; choose another.")
-    return np.asarray(origin + float(seen.depth_median[0]) * direction)
+    return np.asarray(origin + float(traced.depth_median[0]) * direction)
 
 
 def estimate_stage_layout(
@@ -106,12 +106,12 @@ def estimate_stage_layout(
     spots, standing = _find_floor(some.means_world.astype(np.float64), normals @ up, area, up, size)
     # Somewhat above the spot, so that the surface itself is not in the way.
     ways = [RayBatch.between(camera[None], spots + 0.05 * size * up) for camera in cameras_world]
-    seen = np.mean([tracer.transmittance(way) for way in ways], axis=0)
+    transmittance = np.mean([tracer.transmittance(way) for way in ways], axis=0)
     free = np.full(len(spots), 0.3 * size)
     if len(standing):
         free = np.minimum(cKDTree(standing).query(spots)[0], free)
     away = np.linalg.norm(spots - centre_world, axis=1)
-    floor = spots[np.argmax(size * seen + free - 0.7 * away)]
+    floor = spots[np.argmax(size * transmittance + free - 0.7 * away)]
     light = -_estimate_light_direction(some.base_rgb_srgb, normals, area, up)
     if (
         level_fraction(some.means_world @ up, normals @ up, area, float(spots[0] @ up), size)
@@ -119,8 +119,10 @@ def estimate_stage_layout(
     ):
         return _stage_layout(up, floor, size, light)
     places = centre_world + np.array(HANGING_FRACTIONS)[:, None] * (cameras_world.mean(axis=0) - centre_world)
-    seen = np.mean([tracer.transmittance(RayBatch.between(c[None], places)) for c in cameras_world], axis=0)
-    hanging = places[np.argmax(seen > 0.9 * seen.max())]
+    transmittance = np.mean(
+        [tracer.transmittance(RayBatch.between(c[None], places)) for c in cameras_world], axis=0
+    )
+    hanging = places[np.argmax(transmittance > 0.9 * transmittance.max())]
     return replace(
         _stage_layout(up, hanging - BALL_RADIUS_FRACTION * size * up, size, light), has_floor=False
     )

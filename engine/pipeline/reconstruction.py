@@ -80,8 +80,8 @@ def _run_all_steps(run: ReconstructionRun, *, is_new: bool, is_made: bool) -> No
     began, output = time.perf_counter(), run.output
     recorded = read_views(output / VIEWS) if (output / VIEWS).exists() else None
     events = JsonLinesWriter(output / EVENTS, hold=recorded is not None)
-    tell = broadcast([events, run.progress])
-    run.progress, run.recorded = tell, recorded
+    report = broadcast([events, run.progress])
+    run.progress, run.recorded = report, recorded
     if recorded is not None:
         run.accept = _require_same_dataset(recorded, run.scene, output, events)
     try:
@@ -89,7 +89,7 @@ def _run_all_steps(run: ReconstructionRun, *, is_new: bool, is_made: bool) -> No
             run_steps(DATASET_STEPS, run)
         run_steps(RESULT_STEPS, run)
         run.dataset.release_pages()
-        tell(RunFinished(_result_names(output), time.perf_counter() - began))
+        report(RunFinished(_result_names(output), time.perf_counter() - began))
     finally:
         events.close()
 

@@ -109,7 +109,7 @@ def _trainer(
     zones = CameraClearance.from_views(
         dataset.viewpoints, config.camera_clearance * nearest_world, dataset.train_indices
     )
-    seen = ViewFrusta.from_views(dataset.viewpoints, dataset.train_indices)
+    frusta = ViewFrusta.from_views(dataset.viewpoints, dataset.train_indices)
     trainer: Trainer = Trainer(
         dataset,
         config,

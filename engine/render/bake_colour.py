@@ -65,15 +65,15 @@ def fit_colours_to_cameras(
     tracer.build(gaussians)
     targets, sums, weights = [], np.zeros((len(gaussians), 3)), np.zeros(len(gaussians))
     for rays in batches:
-        seen = tracer.trace(rays, record=True)
-        targets.append(seen.rgb_srgb.astype(np.float64))
-        assert seen.recording is not None
-        found = tracer.backward(seen.recording, TraceGradients(np.zeros_like(seen.rgb_srgb))).numpy()
+        traced = tracer.trace(rays, record=True)
+        targets.append(traced.rgb_srgb.astype(np.float64))
+        assert traced.recording is not None
+        found = tracer.backward(traced.recording, TraceGradients(np.zeros_like(traced.rgb_srgb))).numpy()
         away = gaussians.means_world[found.ids] - rays.origins_world[0]
         away = away / np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-12)
         sums[found.ids] += found.weight_sums[:, None] * _evaluate_colours(gaussians.select(found.ids), away)
         weights[found.ids] += found.weight_sums
-        del seen  # its recording's memory serves the next one
+        del traced  # its recording's memory serves the next one
     on_pass(1, steps + 2)
     means = np.where(
         weights[:, None] > 0, sums / np.maximum(weights, 1e-12)[:, None], gaussians.base_rgb_srgb
@@ -100,13 +100,13 @@ class _NormalEquations:
         self._tracer.refresh()
         out = np.zeros(colours.shape)
         for number, rays in enumerate(self._batches):
-            seen = self._tracer.trace(rays, record=True)
-            assert seen.recording is not None
-            rest = seen.features if targets is None else seen.features - targets[number]
-            gradients = TraceGradients(np.zeros_like(seen.rgb_srgb), features=rest.astype(np.float32))
-            found = self._tracer.backward(seen.recording, gradients).numpy()
+            traced = self._tracer.trace(rays, record=True)
+            assert traced.recording is not None
+            rest = traced.features if targets is None else traced.features - targets[number]
+            gradients = TraceGradients(np.zeros_like(traced.rgb_srgb), features=rest.astype(np.float32))
+            found = self._tracer.backward(traced.recording, gradients).numpy()
             out[found.ids] += found.features
-            del seen  # its recording's memory serves the next one
+            del traced  # its recording's memory serves the next one
         return out
 
 

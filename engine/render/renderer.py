@@ -70,18 +70,18 @@ def render_rays(
         layers,
     )
     for band, order, rays in _row_bands(image):
-        seen = tracer.trace(rays)
+        traced = tracer.trace(rays)
         dither = pixel_jitter(band.start * width + order, sample)
-        developed = shading.shade(TracedRays(rays, seen, tracer, dither=dither))
+        developed = shading.shade(TracedRays(rays, traced, tracer, dither=dither))
         rgb = developed.composite_over(background)
         for name, values in developed.layers.items():
             layers.setdefault(name, np.empty((height, width, values.shape[1]), np.float32))
         for part, values in (
             (out.rgb_srgb, np.clip(rgb, 0, 1)),
-            (out.alpha, seen.alpha),
-            (out.depth, seen.expected_depth),
-            (out.depth_median, seen.depth_median),
-            (out.normal_world, face_viewer(seen.normal_world, rays.directions_world).normal_world),
+            (out.alpha, traced.alpha),
+            (out.depth, traced.expected_depth),
+            (out.depth_median, traced.depth_median),
+            (out.normal_world, face_viewer(traced.normal_world, rays.directions_world).normal_world),
             *((layers[name], values) for name, values in developed.layers.items()),
         ):
             part[band].reshape(len(order), -1)[order] = values.reshape(len(order), -1)
@@ -110,10 +110,10 @@ def shade_layer(
     for start in range(0, len(pixels), RAYS_PER_BATCH):
         chosen = pixels[start : start + RAYS_PER_BATCH]
         rays = image.rays[chosen]
-        seen = tracer.trace(rays)
-        developed = shading.shade(TracedRays(rays, seen, tracer, dither=pixel_jitter(chosen, sample)))
+        traced = tracer.trace(rays)
+        developed = shading.shade(TracedRays(rays, traced, tracer, dither=pixel_jitter(chosen, sample)))
         found.append(developed.layers[layer])
-        alphas.append(seen.alpha)
+        alphas.append(traced.alpha)
     return np.concatenate(found), np.concatenate(alphas)
 
 
@@ -134,8 +134,8 @@ def front_normals(
     for band, order, rays in _row_bands(image):
         depth = depth_median[band].reshape(-1)[order]
         ends = np.where(depth > 0, depth * np.float32(1 + FRONT_DEPTH_TOLERANCE), np.inf).astype(np.float32)
-        seen = tracer.trace(replace(rays, t_max=np.minimum(rays.t_max, ends).astype(np.float32)))
-        out[band].reshape(-1, 3)[order] = face_viewer(seen.normal_world, rays.directions_world).normal_world
+        traced = tracer.trace(replace(rays, t_max=np.minimum(rays.t_max, ends).astype(np.float32)))
+        out[band].reshape(-1, 3)[order] = face_viewer(traced.normal_world, rays.directions_world).normal_world
     return out
 
 
@@ -151,9 +151,9 @@ def dominant_gaussians(
     """
     out = np.empty((image.height_px, image.width_px), np.int32)
     for band, order, rays in _row_bands(image, RECORDED_RAYS_PER_BATCH):
-        seen = tracer.trace(rays, record=True)
-        assert seen.recording is not None
-        found = ray_hits.dominant_gaussians(gaussians, rays, seen.recording, tracer.settings)
+        traced = tracer.trace(rays, record=True)
+        assert traced.recording is not None
+        found = ray_hits.dominant_gaussians(gaussians, rays, traced.recording, tracer.settings)
         out[band].reshape(-1)[order] = found
     return out
 

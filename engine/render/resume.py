@@ -79,18 +79,18 @@ class FinishedImages:
         except (OSError, UnicodeDecodeError) as error:
             raise ConfigError(f"{self.record} cannot be read ({error}); remove it.") from None
         # A kill may have cut the last line short; its image is rendered again.
-        whole = [line for line in lines if line.endswith("\n")]
-        if len(whole) < 2:
+        complete = [line for line in lines if line.endswith("\n")]
+        if len(complete) < 2:
             return self._forget()
         if not resume:
             if or_anew:
                 return self._forget()
             raise ConfigError(
-                f"{self.folder} holds images of a render that was stopped ({len(whole) - 1} are done); add "
-                "--resume to go on with it, or --overwrite to begin anew."
+                f"{self.folder} holds images of a render that was stopped ({len(complete) - 1} are done); "
+                "add --resume to go on with it, or --overwrite to begin anew."
             )
         try:
-            rows = [json.loads(line) for line in whole]
+            rows = [json.loads(line) for line in complete]
             identity, digests = rows[0]["identity"], {row["file"]: row["sha256"] for row in rows[1:]}
         except (ValueError, KeyError, TypeError):
             raise ConfigError(f"{self.record} is damaged; remove it to begin anew.") from None
@@ -101,8 +101,8 @@ class FinishedImages:
                 f"{self.folder} holds images of another render (its scene, stage, cameras or version "
                 "differ); say --overwrite to begin anew."
             )
-        if len(lines) > len(whole):
-            write_text(self.record, "".join(whole))
+        if len(lines) > len(complete):
+            write_text(self.record, "".join(complete))
         self._remove_partial()
         return digests
 

@@ -100,7 +100,7 @@ def _render_missing(
     progress: ProgressCallback,
     on_finished: OnFinished,
 ) -> Iterator[Path]:
-    whole = len(shots)
+    total = len(shots)
     for number, shot in enumerate(shots):
         path = file_of(number, shot)
         if not finished.is_finished(
@@ -109,15 +109,15 @@ def _render_missing(
 
             def part(share: float, done: int = number) -> None:
                 if share < 1:
-                    progress(done, whole, share)
+                    progress(done, total, share)
 
-            progress(number, whole)
+            progress(number, total)
             render_fn(shot, path, part)
             finished.add(path)
             on_finished(number + 1)
-            progress(number + 1, whole)
+            progress(number + 1, total)
         yield path
-    progress(whole, whole)
+    progress(total, total)
 
 
 def _display_values(path: Path) -> Float32[np.ndarray, "h w 3"]:

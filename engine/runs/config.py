@@ -54,12 +54,12 @@ class ReconstructionConfig(RunSettings):
         Args:
             has_alpha: whether the photographs have alpha, so that they have no background of their own.
         """
-        shown = self.evaluation_background
+        evaluated = self.evaluation_background
         trained = self.train.background if self.train.background != "auto" else "black"
-        if has_alpha or trained not in ("black", "white") or trained == shown:
+        if has_alpha or trained not in ("black", "white") or trained == evaluated:
             return None
         return (
-            f"The scene is trained on {trained} and measured on {shown}, which shows where it does "
+            f"The scene is trained on {trained} and measured on {evaluated}, which shows where it does "
             "not cover a photograph; leave the background of the evaluation out."
         )
 
@@ -126,18 +126,18 @@ def revise_config(
     before = translate_names((ReconstructionConfig,), before)
     values, changes = _collected(settings or {}, materials, train, assignments)
     values = {**before, **values}
-    kept: Mapping[str, Any] = before.get("train", {})
-    learnt = _learns_materials(kept)
+    former: Mapping[str, Any] = before.get("train", {})
+    learnt = _learns_materials(former)
     if values.get("preset") != before.get("preset"):
-        kept = {}
-    elif _learns_materials(merge_options(kept, changes)) == learnt:
-        return _validated({**values, "train": merge_options(kept, changes)})
+        former = {}
+    elif _learns_materials(merge_options(former, changes)) == learnt:
+        return _validated({**values, "train": merge_options(former, changes)})
     else:
-        kept = _differences(_base(before.get("preset"), learnt), kept)
-        kept.get("materials", {}).pop("learn", None)
-    asked = merge_options(kept, changes)
-    base = _base(values.get("preset"), _learns_materials(asked))
-    return _validated({**values, "train": merge_options(base, asked)})
+        former = _differences(_base(before.get("preset"), learnt), former)
+        former.get("materials", {}).pop("learn", None)
+    requested = merge_options(former, changes)
+    base = _base(values.get("preset"), _learns_materials(requested))
+    return _validated({**values, "train": merge_options(base, requested)})
 
 
 def read_config(path: Path) -> ReconstructionConfig:

@@ -97,15 +97,17 @@ def find_setting(name: str) -> Setting:
     Raises:
         ConfigError: there is none; the sentence offers the nearest one.
     """
-    wanted = name.removeprefix("train.")
+    plain_name = name.removeprefix("train.")
     names = [setting.name for setting in all_settings()]
     for setting in all_settings():
-        if setting.name == wanted:
+        if setting.name == plain_name:
             return setting
-    inside = [known for known in names if known.startswith(f"{wanted}.")]
+    inside = [known for known in names if known.startswith(f"{plain_name}.")]
     if inside:
         raise ConfigError(f"{name} is a group of settings: {', '.join(inside)}.")
-    raise SettingsRefused([refuse_unknown_setting(wanted.split("."), names, former=former_setting_names())])
+    raise SettingsRefused(
+        [refuse_unknown_setting(plain_name.split("."), names, former=former_setting_names())]
+    )
 
 
 def setting_values(config: ReconstructionConfig) -> dict[str, object]:

@@ -69,7 +69,7 @@ def bake(
     """
     occluder = Occluder(mesh)
     means: list[np.ndarray] = []
-    seen: list[np.ndarray] = []
+    visible: list[np.ndarray] = []
     progress(0, len(points_world))
     for start in range(0, len(points_world), POINTS_PER_BATCH):
         part = slice(start, start + POINTS_PER_BATCH)
@@ -78,9 +78,9 @@ def bake(
         )
         mean, met = _weighted_means(points_world[part], choice, weights, cameras, tracer, look)
         means.append(mean)
-        seen.append(met)
+        visible.append(met)
         progress(min(start + POINTS_PER_BATCH, len(points_world)), len(points_world))
-    return np.concatenate(means), np.concatenate(seen)
+    return np.concatenate(means), np.concatenate(visible)
 
 
 def _best_cameras(
@@ -143,7 +143,7 @@ def _weighted_means(
         weight = weights[used[solid], k].astype(np.float64) ** 2
         total[used[solid]] += weight[:, None] * values[solid]
         sums[used[solid]] += weight
-    seen = sums > 0
+    is_visible = sums > 0
     mean = np.full(total.shape, UNSEEN_VALUE)
-    mean[seen] = total[seen] / sums[seen, None]
-    return mean.astype(np.float32), seen
+    mean[is_visible] = total[is_visible] / sums[is_visible, None]
+    return mean.astype(np.float32), is_visible

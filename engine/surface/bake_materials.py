@@ -28,9 +28,9 @@ def material_features(gaussians: FlatGaussians) -> Float32[np.ndarray, "n 6"]:
     return np.concatenate([*(gaussians.channels[name] for name in MATERIAL_WIDTHS), ambient], axis=1)
 
 
-def _materials(seen: TraceResult) -> Float32[np.ndarray, "r 9"]:
-    blended = np.clip(seen.features[:, :6] / seen.alpha[:, None], 0.0, 1.0)
-    return np.concatenate([blended, seen.normal_world / seen.alpha[:, None]], axis=1)
+def _materials(traced: TraceResult) -> Float32[np.ndarray, "r 9"]:
+    blended = np.clip(traced.features[:, :6] / traced.alpha[:, None], 0.0, 1.0)
+    return np.concatenate([blended, traced.normal_world / traced.alpha[:, None]], axis=1)
 
 
 MATERIAL_TARGET = BakeTarget(9, _materials)

@@ -150,10 +150,12 @@ def fit_colours(
         The colours, and which points any pixel shows.
     """
     count = len(start_srgb)
-    normal, wanted = _normal_equations(points, start_srgb, pictures, progress)
+    normal, right_side = _normal_equations(points, start_srgb, pictures, progress)
     smooth = SMOOTHNESS * difference_matrix(points.neighbours, count)
     system = (normal + smooth + PRIOR_WEIGHT * identity(count, np.float32)).tocsr().astype(np.float32)
-    correction = conjugate_gradients(lambda x: system @ x, system.diagonal()[:, None], wanted, CG_ITERATIONS)
+    correction = conjugate_gradients(
+        lambda x: system @ x, system.diagonal()[:, None], right_side, CG_ITERATIONS
+    )
     return np.clip(start_srgb + correction, 0.0, 1.0).astype(np.float32), normal.diagonal() > 0
 
 
@@ -164,7 +166,7 @@ def _normal_equations(
     count = len(start_srgb)
     scene = TriangleBvh(points.mesh.vertices_world, points.mesh.faces)
     normal = csr_matrix((count, count), dtype=np.float32)
-    wanted = np.zeros((count, 3), np.float32)
+    right_side = np.zeros((count, 3), np.float32)
     waiting: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
     total = len(pictures)
     progress(0, total)
@@ -175,19 +177,19 @@ def _normal_equations(
             rows = interpolation_matrix(shares, numbers, count)
             columns = rows.T.tocsr()
             normal = normal + columns @ rows
-            wanted += columns @ (rgb - rows @ start_srgb)
+            right_side += columns @ (rgb - rows @ start_srgb)
             waiting.clear()
         progress(done, total)
-    return normal, wanted
+    return normal, right_side
 
 
 def _equations(
     scene: TriangleBvh, points: Palette, rays: ImageRays, rgba: UInt8[np.ndarray, "h w 4"]
 ) -> tuple[Int[np.ndarray, "r k"], Float32[np.ndarray, "r k"], Float32[np.ndarray, "r 3"]]:
     """Return points and shares of each pixel that shows only surface in both, and its colour."""
-    seen = rgba.reshape(-1, 4).astype(np.float32) / 255
+    observed = rgba.reshape(-1, 4).astype(np.float32) / 255
     samples = [scene.closest(rays.shifted(*offset).rays) for offset in SAMPLES_PER_PIXEL]
-    used = np.flatnonzero(np.all([hits.is_hit for hits in samples], axis=0) & (seen[:, 3] >= MIN_ALPHA))
+    used = np.flatnonzero(np.all([hits.is_hit for hits in samples], axis=0) & (observed[:, 3] >= MIN_ALPHA))
     numbers, shares = [], []
     for hits in samples:
         others = hits.barycentrics[used]
@@ -195,5 +197,5 @@ def _equations(
         number, share = points.shares(hits.faces[used], weights)
         numbers.append(number)
         shares.append(share / np.float32(len(samples)))
-    rgb = np.clip(seen[used, :3] / seen[used, 3:], 0.0, 1.0)
+    rgb = np.clip(observed[used, :3] / observed[used, 3:], 0.0, 1.0)
     return np.concatenate(numbers, axis=1), np.concatenate(shares, axis=1), rgb

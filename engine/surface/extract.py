@@ -90,20 +90,20 @@ def extract_levels(
         ConfigError: the region cannot be found, is empty or takes too much memory.
         CancelledError: stopped as asked.
     """
-    tell = stop_when_asked(listener, should_stop, "Stopped; no surface was written.")
+    report = stop_when_asked(listener, should_stop, "Stopped; no surface was written.")
     if not options.unbounded and options.bounds is None:
         focus_point(cameras)  # complain before the long work
-    with counted_phase("depth", tell, len(cameras)) as progress:
+    with counted_phase("depth", report, len(cameras)) as progress:
         maps, renders = render_depth_maps(tracer, cameras, options, scratch, progress)
     region = choose_region(maps, options)
-    with counted_phase("fusing", tell, 2 * len(cameras)) as progress:
+    with counted_phase("fusing", report, 2 * len(cameras)) as progress:
         volume: TsdfVolume | None = fuse_depth_maps(maps, region, options, progress)
     del maps
     assert volume is not None
     if options.unseen == "solid":
         fill_unseen(volume, options.min_weight)
     volume_bytes = len(volume.blocks) * BYTES_PER_BLOCK
-    with counted_phase("meshing", tell, 3) as progress:
+    with counted_phase("meshing", report, 3) as progress:
         mesh = marching_cubes(volume, options.min_weight)
         volume, found = None, len(mesh.faces)
         progress(1, 3)
@@ -113,9 +113,9 @@ def extract_levels(
         mesh, closed = fill_holes(mesh, max_rim) if max_rim is None or max_rim > 0 else (mesh, 0)
         progress(3, 3)
     if options.refine_vertices:  # while triangles are small enough to show what the pictures do
-        with counted_phase("settling", tell, 0) as progress:
+        with counted_phase("settling", report, 0) as progress:
             mesh = refine_vertices(mesh, photographs or renders, progress)
-    meshes = _decimate_levels(mesh, options, levels, tell)
+    meshes = _decimate_levels(mesh, options, levels, report)
     del mesh
     result = []
     for mesh in meshes:
@@ -123,7 +123,7 @@ def extract_levels(
         if options.backdrop:
             mesh = with_backdrop(mesh, np.mean([camera.centre_world for camera in cameras], axis=0))
         coloured = _bake_colours(
-            tracer, cameras, renders, photographs, options, mesh, region, light_frame, tell
+            tracer, cameras, renders, photographs, options, mesh, region, light_frame, report
         )
         result.append(ExtractedSurface(coloured, region, volume_bytes, found, closed, edges))
     return tuple(result)
@@ -138,7 +138,7 @@ def _bake_colours(
     mesh: TriangleMesh,
     region: Region,
     light_frame: Float64[np.ndarray, "3 3"] | None,
-    tell: EventListener,
+    report: EventListener,
 ) -> TriangleMesh:
     """Return the mesh with colours at its vertices, or with textures."""
     tolerance = TOLERANCE_VOXELS * region.voxel_world
@@ -146,9 +146,9 @@ def _bake_colours(
     def look_at(
         points: Points, normals: Points, look: BakeTarget
     ) -> tuple[np.ndarray, Bool[np.ndarray, " n"]]:
-        with counted_phase("colouring", tell, 0) as progress:
-            baked, seen = bake(points, normals, mesh, cameras, tracer, look, tolerance, progress)
-            return _fill_unseen(points, baked, seen), seen
+        with counted_phase("colouring", report, 0) as progress:
+            baked, is_visible = bake(points, normals, mesh, cameras, tracer, look, tolerance, progress)
+            return _fill_unseen(points, baked, is_visible), is_visible
 
     def colours(palette: Palette, points: Points, normals: Points) -> Points:
         if not (options.fit and photographs):
@@ -157,14 +157,14 @@ def _bake_colours(
             rgb = np.full((len(points), 3), 0.5, np.float32)
         if not options.fit:
             return rgb
-        with counted_phase("fitting", tell, 0) as progress:
+        with counted_phase("fitting", report, 0) as progress:
             return _fill_unseen(points, *fit_colours(palette, rgb, photographs or renders, progress))
 
     if options.texture_size is None:
         assert light_frame is None, "materials need a texture"
         rgb = colours(VertexPalette(mesh), mesh.vertices_world, mesh.vertex_normals())
         return replace(mesh, rgb_srgb=rgb)
-    with counted_phase("unwrapping", tell, 0):
+    with counted_phase("unwrapping", report, 0):
         layout = unwrap(mesh, options.texture_size)
     points, normals = layout.points_world, layout.normals_world
     if light_frame is not None:
@@ -174,13 +174,13 @@ def _bake_colours(
 
 
 def _decimate_levels(
-    mesh: TriangleMesh, options: ExtractionOptions, levels: Sequence[int | None], tell: EventListener
+    mesh: TriangleMesh, options: ExtractionOptions, levels: Sequence[int | None], report: EventListener
 ) -> list[TriangleMesh]:
     """Return the mesh for each level, with at most its number of triangles."""
     if all(level is None for level in levels):
         return [mesh] * len(levels)
     meshes = []
-    with counted_phase("decimating", tell, len(levels)) as progress:
+    with counted_phase("decimating", report, len(levels)) as progress:
         for done, level in enumerate(levels, 1):
             # Thin parts may come apart.
             meshes.append(mesh if level is None else _keep_components(decimate(mesh, level), options))
@@ -193,12 +193,12 @@ def _keep_components(mesh: TriangleMesh, options: ExtractionOptions) -> Triangle
 
 
 def _fill_unseen(
-    points: Float32[np.ndarray, "n 3"], baked: Float32[np.ndarray, "n c"], seen: Bool[np.ndarray, " n"]
+    points: Float32[np.ndarray, "n 3"], baked: Float32[np.ndarray, "n c"], is_visible: Bool[np.ndarray, " n"]
 ) -> Float32[np.ndarray, "n c"]:
     """Return baked values; points that no camera sees take those of the nearest seen point."""
-    if seen.all() or not seen.any():
+    if is_visible.all() or not is_visible.any():
         return baked
-    _, nearest = cKDTree(points[seen]).query(points[~seen])
+    _, nearest = cKDTree(points[is_visible]).query(points[~is_visible])
     filled = baked.copy()
-    filled[~seen] = baked[seen][nearest]
+    filled[~is_visible] = baked[is_visible][nearest]
     return filled

@@ -34,11 +34,11 @@ def keep_largest_components(
     part = face_components(mesh)
     areas: Float64[np.ndarray, " p"] = np.bincount(part, mesh.face_areas)
     if keep is not None:
-        wanted = np.zeros(len(areas), dtype=bool)
-        wanted[np.argsort(-areas, kind="stable")[:keep]] = True
+        is_retained = np.zeros(len(areas), dtype=bool)
+        is_retained[np.argsort(-areas, kind="stable")[:keep]] = True
     else:
-        wanted = areas >= min_share * areas.max()
-    return mesh.select_faces(wanted[part])
+        is_retained = areas >= min_share * areas.max()
+    return mesh.select_faces(is_retained[part])
 
 
 def decimate(mesh: TriangleMesh, max_triangles: int) -> TriangleMesh:

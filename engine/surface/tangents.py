@@ -68,10 +68,10 @@ def world_to_tangent(
     bitangent = _unit(np.cross(normals_world, tangent)) * np.sign(tangents[:, 3:])
     frame = np.stack([tangent, bitangent, normals_world], axis=2)
     # Between vertices the tangent is not quite level.
-    whole = np.abs(np.linalg.det(frame)) > 1e-3
-    frame[~whole] = np.eye(3)
+    is_regular = np.abs(np.linalg.det(frame)) > 1e-3
+    frame[~is_regular] = np.eye(3)
     local = np.linalg.solve(frame, wanted_world[:, :, None])[:, :, 0]
-    local[~whole] = (0.0, 0.0, 1.0)
+    local[~is_regular] = (0.0, 0.0, 1.0)
     return _unit(local)
 
 

@@ -133,14 +133,14 @@ def _step(
     apart: csr_matrix,
 ) -> tuple[TriangleMesh, Float32[np.ndarray, "n 3"]]:
     """Take one step; displacements are in pixels of the pictures at each vertex's distance."""
-    sight = _visible_pixels(mesh, pictures)
-    count, corners = len(rgb), mesh.faces[sight.faces]
-    size = _pixel_sizes(sight, corners, count)
-    still = np.zeros_like(sight.weights)
+    visible = _visible_pixels(mesh, pictures)
+    count, corners = len(rgb), mesh.faces[visible.faces]
+    size = _pixel_sizes(visible, corners, count)
+    still = np.zeros_like(visible.weights)
     sure = np.ones(len(corners), np.float32)
     x = _solve_step(
-        _PixelJacobian(corners, sight.weights, still, still),
-        sight.rgb_srgb,
+        _PixelJacobian(corners, visible.weights, still, still),
+        visible.rgb_srgb,
         sure,
         rgb,
         apart,
@@ -148,16 +148,16 @@ def _step(
     )
     rgb = rgb + x[:, :3]
     normals = mesh.vertex_normals()
-    change, lifts = np.empty_like(sight.weights), np.empty_like(sight.weights)
+    change, lifts = np.empty_like(visible.weights), np.empty_like(visible.weights)
     run_ranges(
         linearise, threads_in_use(), len(corners),
-        mesh.vertices_world, normals, size, rgb, corners, sight.weights,
-        sight.directions_world, sight.steady, change, lifts,
+        mesh.vertices_world, normals, size, rgb, corners, visible.weights,
+        visible.directions_world, visible.steady, change, lifts,
     )  # fmt: skip
-    pixels = _PixelJacobian(corners, sight.weights, lifts, change)
-    lacking = sight.rgb_srgb - pixels.apply(_colours_and_displacements(rgb))
+    pixels = _PixelJacobian(corners, visible.weights, lifts, change)
+    lacking = visible.rgb_srgb - pixels.apply(_colours_and_displacements(rgb))
     sure = (1 / (1 + (lacking**2).sum(axis=1) / OUTLIER_THRESHOLD**2)).astype(np.float32)
-    x = _solve_step(pixels, sight.rgb_srgb, sure, rgb, apart, CG_ITERATIONS)
+    x = _solve_step(pixels, visible.rgb_srgb, sure, rgb, apart, CG_ITERATIONS)
     moved = np.clip(x[:, 3:], -MAX_DISPLACEMENT_PX, MAX_DISPLACEMENT_PX) * size[:, None] * normals
     return replace(mesh, vertices_world=mesh.vertices_world + moved), rgb + x[:, :3]
 
@@ -222,10 +222,10 @@ def _colours_and_displacements(rgb: Float32[np.ndarray, "n 3"]) -> Float32[np.nd
 
 
 def _pixel_sizes(
-    sight: _VisiblePixels, corners: Int32[np.ndarray, "p 3"], count: int
+    visible: _VisiblePixels, corners: Int32[np.ndarray, "p 3"], count: int
 ) -> Float32[np.ndarray, " n"]:
     """Return the width of a pixel at each vertex, world units; the median where no picture sees it."""
-    sums = np.bincount(corners.reshape(-1), np.repeat(sight.size_world, 3), minlength=count)
+    sums = np.bincount(corners.reshape(-1), np.repeat(visible.size_world, 3), minlength=count)
     uses = np.bincount(corners.reshape(-1), minlength=count)
-    middle = float(np.median(sight.size_world)) if len(corners) else 0.0
+    middle = float(np.median(visible.size_world)) if len(corners) else 0.0
     return np.where(uses > 0, sums / np.maximum(uses, 1), middle).astype(np.float32)

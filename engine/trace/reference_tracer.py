@@ -115,10 +115,10 @@ class ReferenceTracer:
                 sums, _leaf_gradients(_loss(result, gradients, piece), leaves), strict=True
             ):
                 total += found
-            seen = result.features[:, -1]
-            weights += _leaf_gradients(seen.sum(), leaves)[-1][:, -1]
+            visibility = result.features[:, -1]
+            weights += _leaf_gradients(visibility.sum(), leaves)[-1][:, -1]
             if gradients.ray_errors is not None:
-                shared = (seen * torch.tensor(gradients.ray_errors[piece], dtype=torch.float64)).sum()
+                shared = (visibility * torch.tensor(gradients.ray_errors[piece], dtype=torch.float64)).sum()
                 errors += _leaf_gradients(shared, leaves)[-1][:, -1]
         ids, counts = np.unique(np.concatenate([np.empty(0, np.int64), *recording.ids]), return_counts=True)
         rows = {name: total[ids].astype(np.float32) for name, total in zip(_PARAMETERS, sums, strict=True)}

@@ -15,26 +15,28 @@ from octasplat.workers.queue.jobs import get_job
 _RETRY_SECONDS = 10
 
 
-async def owned_job(connection: Connection, who: Principal, job_id: uuid.UUID, *, lock: bool = False) -> Job:
+async def owned_job(
+    connection: Connection, principal: Principal, job_id: uuid.UUID, *, lock: bool = False
+) -> Job:
     """Return the job, if it is the asker's to see.
 
     Raises:
         ProblemError: 404.
     """
     job = await get_job(connection, job_id, lock=lock)
-    if job is None or not who.may_see(job.owner):
+    if job is None or not principal.may_see(job.owner):
         raise not_found_error("job")
     return job
 
 
-async def read_job(service: Service, who: Principal, job_id: uuid.UUID) -> Job:
+async def read_job(service: Service, principal: Principal, job_id: uuid.UUID) -> Job:
     """As :func:`owned_job`, on a connection of its own."""
     async with service.pool.connection() as connection:
-        return await owned_job(connection, who, job_id)
+        return await owned_job(connection, principal, job_id)
 
 
 async def owned_dataset(
-    connection: Connection, who: Principal, dataset_id: uuid.UUID, *, lock: bool = False
+    connection: Connection, principal: Principal, dataset_id: uuid.UUID, *, lock: bool = False
 ) -> Dataset:
     """Return the dataset, if it is the asker's to see.
 
@@ -42,19 +44,19 @@ async def owned_dataset(
         ProblemError: 404.
     """
     dataset = await get_dataset(connection, dataset_id, lock=lock)
-    if dataset is None or not who.may_see(dataset.owner):
+    if dataset is None or not principal.may_see(dataset.owner):
         raise not_found_error("dataset")
     return dataset
 
 
-async def open_dataset(connection: Connection, who: Principal, dataset_id: uuid.UUID) -> Dataset:
+async def open_dataset(connection: Connection, principal: Principal, dataset_id: uuid.UUID) -> Dataset:
     """Return the dataset, if it is the asker's and still takes files.
 
     Raises:
         ProblemError: 404.
         ConflictError: it is committed, or being checked.
     """
-    dataset = await owned_dataset(connection, who, dataset_id)
+    dataset = await owned_dataset(connection, principal, dataset_id)
     if dataset.state != "open":
         raise ConflictError(
             f"The dataset is {dataset.state}, so its files do not change; make a new dataset."
@@ -62,14 +64,14 @@ async def open_dataset(connection: Connection, who: Principal, dataset_id: uuid.
     return dataset
 
 
-async def owned_webhook(connection: Connection, who: Principal, webhook_id: uuid.UUID) -> Endpoint:
+async def owned_webhook(connection: Connection, principal: Principal, webhook_id: uuid.UUID) -> Endpoint:
     """Return the webhook, if it is the asker's to see.
 
     Raises:
         ProblemError: 404.
     """
     endpoint = await get_endpoint(connection, webhook_id)
-    if endpoint is None or not who.may_see(endpoint.owner):
+    if endpoint is None or not principal.may_see(endpoint.owner):
         raise not_found_error("webhook")
     return endpoint
 

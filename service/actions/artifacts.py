@@ -12,19 +12,19 @@ from octasplat.workers.queue import jobs as rows
 from octasplat.workers.storage.protocol import Blob
 
 
-async def list_artifacts(service: Service, who: Principal, job_id: uuid.UUID) -> list[Artifact]:
+async def list_artifacts(service: Service, principal: Principal, job_id: uuid.UUID) -> list[Artifact]:
     """Return the results of a job.
 
     Raises:
         ProblemError: 404.
     """
     async with service.pool.connection() as connection:
-        await owned_job(connection, who, job_id)
+        await owned_job(connection, principal, job_id)
         return await rows.artifacts_of(connection, job_id)
 
 
 async def get_artifact(
-    service: Service, who: Principal, job_id: uuid.UUID, name: str, *, kind: str = "result"
+    service: Service, principal: Principal, job_id: uuid.UUID, name: str, *, kind: str = "result"
 ) -> Artifact:
     """Return a result of a job; without one the problem says that there is no such ``kind``.
 
@@ -32,21 +32,21 @@ async def get_artifact(
         ProblemError: 404.
     """
     async with service.pool.connection() as connection:
-        await owned_job(connection, who, job_id)
+        await owned_job(connection, principal, job_id)
         row = await rows.get_artifact(connection, job_id, check_searchable_name(name, kind))
     if row is None:
         raise not_found_error(kind)
     return row
 
 
-async def get_preview(service: Service, who: Principal, job_id: uuid.UUID) -> Blob:
+async def get_preview(service: Service, principal: Principal, job_id: uuid.UUID) -> Blob:
     """Return the newest picture of the scene in the making, a PNG.
 
     Raises:
         ProblemError: 404.
         StorageError: the store does not have it.
     """
-    job = await read_job(service, who, job_id)
+    job = await read_job(service, principal, job_id)
     if job.preview is None:
         raise not_found_error("picture yet")
     return await run_in_pool(ThreadPurpose.DOWNLOADS, service.storage.stat, job.preview["sha256"])

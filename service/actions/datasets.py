@@ -33,7 +33,7 @@ MAX_END_CHECK_SECONDS = 60.0
 
 @retry_on_deadlock
 async def create_dataset(
-    service: Service, who: Principal, new: NewDataset, *, idempotency_key: str | None = None
+    service: Service, principal: Principal, new: NewDataset, *, idempotency_key: str | None = None
 ) -> Dataset:
     """Make a dataset; the same request with the same ``idempotency_key`` makes nothing new.
 
@@ -44,44 +44,46 @@ async def create_dataset(
     async with service.pool.connection() as connection, connection.transaction():
 
         async def make() -> uuid.UUID:
-            await check_new_dataset(connection, who.owner, service.settings.quota)
-            return (await rows.create_dataset(connection, who.owner, new.name, new.holds)).id
+            await check_new_dataset(connection, principal.owner, service.settings.quota)
+            return (await rows.create_dataset(connection, principal.owner, new.name, new.holds)).id
 
         request = fingerprint("dataset", new.model_dump(exclude=set() if new.holds == "files" else {"holds"}))
-        dataset_id, _ = await create_once(connection, who, idempotency_key, request, make)
-        return await owned_dataset(connection, who, dataset_id)
+        dataset_id, _ = await create_once(connection, principal, idempotency_key, request, make)
+        return await owned_dataset(connection, principal, dataset_id)
 
 
 async def list_datasets(
-    service: Service, who: Principal, *, before: uuid.UUID | None = None, limit: int
+    service: Service, principal: Principal, *, before: uuid.UUID | None = None, limit: int
 ) -> Page[Dataset]:
     """Datasets that the asker may see, the newest first, those made before ``before``."""
     async with service.pool.connection() as connection:
-        found = await rows.list_datasets(connection, owner=who.visible_owner, before=before, limit=limit + 1)
+        found = await rows.list_datasets(
+            connection, owner=principal.visible_owner, before=before, limit=limit + 1
+        )
     return page_of(found, limit, lambda dataset: dataset.id)
 
 
 async def list_files_by_suffix(
-    service: Service, who: Principal, suffixes: Sequence[str], *, limit: int
+    service: Service, principal: Principal, suffixes: Sequence[str], *, limit: int
 ) -> list[tuple[Dataset, str]]:
     """Files of the asker's committed datasets that hold files: those whose names end so, the newest first."""
     async with service.pool.connection() as connection:
-        return await rows.list_files_by_suffix(connection, who.owner, suffixes, limit=limit)
+        return await rows.list_files_by_suffix(connection, principal.owner, suffixes, limit=limit)
 
 
-async def get_dataset(service: Service, who: Principal, dataset_id: uuid.UUID) -> Dataset:
+async def get_dataset(service: Service, principal: Principal, dataset_id: uuid.UUID) -> Dataset:
     """Return a dataset.
 
     Raises:
         ProblemError: 404.
     """
     async with service.pool.connection() as connection:
-        return await owned_dataset(connection, who, dataset_id)
+        return await owned_dataset(connection, principal, dataset_id)
 
 
 @retry_on_deadlock
 async def change_dataset(
-    service: Service, who: Principal, dataset_id: uuid.UUID, change: DatasetChange
+    service: Service, principal: Principal, dataset_id: uuid.UUID, change: DatasetChange
 ) -> Dataset:
     """Rename a dataset, or keep it whatever its age.
 
@@ -89,7 +91,7 @@ async def change_dataset(
         ProblemError: 404.
     """
     async with service.pool.connection() as connection, connection.transaction():
-        dataset = await owned_dataset(connection, who, dataset_id, lock=True)
+        dataset = await owned_dataset(connection, principal, dataset_id, lock=True)
         return await rows.change_dataset(
             connection,
             dataset_id,
@@ -99,7 +101,7 @@ async def change_dataset(
 
 
 @retry_on_deadlock
-async def delete_dataset(service: Service, who: Principal, dataset_id: uuid.UUID) -> None:
+async def delete_dataset(service: Service, principal: Principal, dataset_id: uuid.UUID) -> None:
     """Delete a dataset.
 
     Raises:
@@ -107,12 +109,12 @@ async def delete_dataset(service: Service, who: Principal, dataset_id: uuid.UUID
         ConflictError: a job needs it.
     """
     async with service.pool.connection() as connection:
-        await owned_dataset(connection, who, dataset_id)
+        await owned_dataset(connection, principal, dataset_id)
         await rows.delete_dataset(connection, dataset_id)
     service.evictor.evict_if_low_later()
 
 
-async def commit_dataset(service: Service, who: Principal, dataset_id: uuid.UUID) -> Dataset:
+async def commit_dataset(service: Service, principal: Principal, dataset_id: uuid.UUID) -> Dataset:
     """Check a dataset; one that is sound never changes again.
 
     Raises:
@@ -121,7 +123,7 @@ async def commit_dataset(service: Service, who: Principal, dataset_id: uuid.UUID
         IntakeError: it is not sound.
     """
     async with service.pool.connection() as connection:
-        owner = (await owned_dataset(connection, who, dataset_id)).owner
+        owner = (await owned_dataset(connection, principal, dataset_id)).owner
     async with service.check_limiter.limited(owner):
         return await _check(service, dataset_id)
 

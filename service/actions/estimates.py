@@ -13,7 +13,7 @@ from octasplat.workers.db.datasets import get_dataset, photograph_sizes
 from octasplat.workers.queue.jobs import get_job
 
 
-async def estimate(service: Service, who: Principal, new: NewEstimate) -> Estimate | None:
+async def estimate(service: Service, principal: Principal, new: NewEstimate) -> Estimate | None:
     """Return what a job would take, checked as if it were made; None where nobody knows.
 
     Raises:
@@ -23,23 +23,23 @@ async def estimate(service: Service, who: Principal, new: NewEstimate) -> Estima
     options = resolve_options(kind, new.options)
     async with service.pool.connection() as connection:
         sizes = [ImageSizes(group.width_px, group.height_px, group.count) for group in new.photographs]
-        sizes += await _sizes_of(connection, who, new)
+        sizes += await _sizes_of(connection, principal, new)
         workers = await live_workers_of_queue(connection, new.queue, service.settings.stale_seconds)
     check_job_limits(kind, options, sizes, service.settings)
     return estimate_job(kind, options, sizes, workers)
 
 
-async def _sizes_of(connection: Connection, who: Principal, new: NewEstimate) -> list[ImageSizes]:
+async def _sizes_of(connection: Connection, principal: Principal, new: NewEstimate) -> list[ImageSizes]:
     """Sizes of the photographs of a dataset, or of the one that a job worked on."""
     dataset_id = new.dataset_id
     if new.source_id is not None:
         job = await get_job(connection, new.source_id)
-        if job is None or not who.may_see(job.owner):
+        if job is None or not principal.may_see(job.owner):
             raise input_problem("source_id", "There is no such job.")
         dataset_id = dataset_id or job.dataset_id
     if dataset_id is None:
         return []
     dataset = await get_dataset(connection, dataset_id)
-    if dataset is None or not who.may_see(dataset.owner):
+    if dataset is None or not principal.may_see(dataset.owner):
         raise input_problem("dataset_id", "There is no such dataset.")
     return await photograph_sizes(connection, dataset_id)

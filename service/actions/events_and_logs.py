@@ -18,33 +18,33 @@ _RETRY_SECONDS = 10
 
 
 async def read_log(
-    service: Service, who: Principal, job_id: uuid.UUID, *, after: int, limit: int
+    service: Service, principal: Principal, job_id: uuid.UUID, *, after: int, limit: int
 ) -> list[LogLine]:
     """Lines of a job's log, after the one with the id ``after``.
 
     Raises:
         ProblemError: 404.
     """
-    await read_job(service, who, job_id)
+    await read_job(service, principal, job_id)
     async with service.pool.connection() as connection:
         return await log_after(connection, job_id, after, limit)
 
 
 async def read_events(
-    service: Service, who: Principal, job_id: uuid.UUID, *, after: int, limit: int
+    service: Service, principal: Principal, job_id: uuid.UUID, *, after: int, limit: int
 ) -> list[JobEvent]:
     """Return what happened to a job, after the event with the id ``after``.
 
     Raises:
         ProblemError: 404.
     """
-    await read_job(service, who, job_id)
+    await read_job(service, principal, job_id)
     async with service.pool.connection() as connection:
         return await events_after(connection, job_id, after, limit)
 
 
 async def follow_events(
-    service: Service, who: Principal, job_id: uuid.UUID, *, after: int
+    service: Service, principal: Principal, job_id: uuid.UUID, *, after: int
 ) -> AsyncGenerator[JobEvent | None, None] | None:
     """Return what happens to a job until it is over, as it happens; None where everything was told already.
 
@@ -53,7 +53,7 @@ async def follow_events(
     Raises:
         ProblemError: 404, or 503 with too many who listen.
     """
-    job = await read_job(service, who, job_id)
+    job = await read_job(service, principal, job_id)
     if service.event_broker.subscriber_count >= service.settings.max_streams:
         detail = "Too many streams are open; poll GET /v1/jobs/{id} instead."
         raise ProblemError(503, "streams", detail, retry_seconds=_RETRY_SECONDS)
@@ -61,11 +61,11 @@ async def follow_events(
         async with service.pool.connection() as connection:
             if not await events_after(connection, job_id, after, 1):
                 return None
-    return _events(service, who, job_id, after)
+    return _events(service, principal, job_id, after)
 
 
 async def _events(
-    service: Service, who: Principal, job_id: uuid.UUID, after: int
+    service: Service, principal: Principal, job_id: uuid.UUID, after: int
 ) -> AsyncGenerator[JobEvent | None, None]:
     ping = service.settings.ping_seconds
     quiet = 0.0
@@ -75,7 +75,7 @@ async def _events(
             news.clear()
             async with service.pool.connection() as connection:
                 job = await get_job(connection, job_id)
-                if job is None or not who.may_see(job.owner):
+                if job is None or not principal.may_see(job.owner):
                     return  # it was deleted, which ends the stream
                 over = job.is_over
                 events = await events_after(connection, job_id, after, _PAGE_SIZE)

@@ -51,13 +51,13 @@ class JobWithView:
 
 
 async def list_jobs(
-    service: Service, who: Principal, job_filter: JobFilter, *, before: uuid.UUID | None, limit: int
+    service: Service, principal: Principal, job_filter: JobFilter, *, before: uuid.UUID | None, limit: int
 ) -> Page[Job]:
     """Jobs that the asker may see, the newest first.
 
     Args:
         service: the service.
-        who: asks.
+        principal: asks.
         job_filter: which of them.
         before: made before this one.
         limit: at most so many.
@@ -65,7 +65,7 @@ async def list_jobs(
     async with service.pool.connection() as connection:
         found = await rows.list_jobs(
             connection,
-            owner=who.visible_owner,
+            owner=principal.visible_owner,
             states=job_filter.states,
             kind=_without_nul(job_filter.kind),
             label=_without_nul(job_filter.label),
@@ -76,21 +76,21 @@ async def list_jobs(
     return page_of(found, limit, lambda job: job.id)
 
 
-async def get_job(service: Service, who: Principal, job_id: uuid.UUID) -> JobWithView:
+async def get_job(service: Service, principal: Principal, job_id: uuid.UUID) -> JobWithView:
     """Return a job.
 
     Raises:
         ProblemError: 404.
     """
     async with service.pool.connection() as connection:
-        job = await owned_job(connection, who, job_id)
+        job = await owned_job(connection, principal, job_id)
         return JobWithView(job, await job_view(connection, service, job))
 
 
 @retry_on_deadlock
 async def change_job(
     service: Service,
-    who: Principal,
+    principal: Principal,
     job_id: uuid.UUID,
     change: JobChange,
     check: Callable[[JobWithView], None] = lambda _: None,
@@ -99,7 +99,7 @@ async def change_job(
 
     Args:
         service: the service.
-        who: asks.
+        principal: asks.
         job_id: the job.
         change: what is to be different.
         check: sees the job as it is, while nobody else can change it, and raises to leave it so.
@@ -108,7 +108,7 @@ async def change_job(
         ProblemError: 404.
     """
     async with service.pool.connection() as connection, connection.transaction():
-        job = await owned_job(connection, who, job_id, lock=True)
+        job = await owned_job(connection, principal, job_id, lock=True)
         check(JobWithView(job, await job_view(connection, service, job)))
         given = change.model_dump(exclude_unset=True)
         job = await rows.change_job(
@@ -121,7 +121,7 @@ async def change_job(
 
 
 @retry_on_deadlock
-async def cancel_job(service: Service, who: Principal, job_id: uuid.UUID) -> JobView:
+async def cancel_job(service: Service, principal: Principal, job_id: uuid.UUID) -> JobView:
     """Ask a job to stop.
 
     Raises:
@@ -129,18 +129,20 @@ async def cancel_job(service: Service, who: Principal, job_id: uuid.UUID) -> Job
         ConflictError: it is over.
     """
     async with service.pool.connection() as connection:
-        await owned_job(connection, who, job_id)
+        await owned_job(connection, principal, job_id)
         job = await rows.cancel_job(connection, service.job_queue, job_id)
         return await job_view(connection, service, job)
 
 
 @retry_on_deadlock
-async def delete_job(service: Service, who: Principal, job_id: uuid.UUID, *, cancel: bool = False) -> None:
+async def delete_job(
+    service: Service, principal: Principal, job_id: uuid.UUID, *, cancel: bool = False
+) -> None:
     """Delete a finished job with its results.
 
     Args:
         service: the service.
-        who: asks.
+        principal: asks.
         job_id: the job.
         cancel: stop it first if it is not over.
 
@@ -149,7 +151,7 @@ async def delete_job(service: Service, who: Principal, job_id: uuid.UUID, *, can
         ConflictError: it is not over.
     """
     async with service.pool.connection() as connection:
-        job = await owned_job(connection, who, job_id)
+        job = await owned_job(connection, principal, job_id)
         if cancel and not job.is_over:
             job = await rows.cancel_job(connection, service.job_queue, job_id)
     if cancel and not job.is_over:

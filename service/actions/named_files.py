@@ -14,13 +14,17 @@ from octasplat.workers.worker.job_kinds import JobKind
 
 
 async def check_named_files(
-    connection: Connection, who: Principal, kind: JobKind, options: BaseModel, files_id: uuid.UUID | None
+    connection: Connection,
+    principal: Principal,
+    kind: JobKind,
+    options: BaseModel,
+    files_id: uuid.UUID | None,
 ) -> None:
     """Refuse options that name a file which is not there under just this name.
 
     Args:
         connection: to the database.
-        who: asks.
+        principal: asks.
         kind: of the job.
         options: complete ones.
         files_id: the dataset that is to hold the files.
@@ -34,7 +38,7 @@ async def check_named_files(
         if not kind.takes_files:
             raise input_problem("files_id", f"Jobs of the kind {kind.name} take no files.")
         dataset = await get_dataset(connection, files_id, lock=True)
-        if dataset is None or not who.may_see(dataset.owner):
+        if dataset is None or not principal.may_see(dataset.owner):
             raise input_problem("files_id", "There is no such dataset.")
         if dataset.holds != "files":
             detail = "The dataset holds photographs; make one that holds files."

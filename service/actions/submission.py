@@ -55,7 +55,7 @@ class _JobInputs:
 @retry_on_deadlock
 async def submit_job(
     service: Service,
-    who: Principal,
+    principal: Principal,
     request: NewJob,
     *,
     idempotency_key: str | None = None,
@@ -65,7 +65,7 @@ async def submit_job(
 
     Args:
         service: the service.
-        who: asks.
+        principal: asks.
         request: the job.
         idempotency_key: the same request with it makes nothing new.
         traceparent: what the job's log is to name (W3C Trace Context).
@@ -77,26 +77,26 @@ async def submit_job(
     check_not_draining(service)
     kind = validate_kind(request.kind)
     with collect_notices() as notices:
-        asked = _RequestedJob(request, kind, resolve_options(kind, request.options), traceparent)
-    check_priority(who, request.priority, service.settings)
+        requested = _RequestedJob(request, kind, resolve_options(kind, request.options), traceparent)
+    check_priority(principal, request.priority, service.settings)
     if request.webhook is not None:
         check_webhook_address(service, request.webhook.url, "#/webhook/url")
     async with service.pool.connection() as connection, connection.transaction():
 
         async def make() -> uuid.UUID:
-            return await _create_job(connection, service, who, asked)
+            return await _create_job(connection, service, principal, requested)
 
         # Without what was not asked for: a version that knows more may get the repetition.
         named = fingerprint("job", request.model_dump(mode="json", exclude_defaults=True))
-        job_id, _ = await create_once(connection, who, idempotency_key, named, make)
-        view = await job_view(connection, service, await owned_job(connection, who, job_id))
+        job_id, _ = await create_once(connection, principal, idempotency_key, named, make)
+        view = await job_view(connection, service, await owned_job(connection, principal, job_id))
         return view.model_copy(update={"notes": [*view.notes, *notices]})
 
 
 @retry_on_deadlock
 async def retry_job(
     service: Service,
-    who: Principal,
+    principal: Principal,
     job_id: uuid.UUID,
     request: RetryRequest,
     *,
@@ -106,7 +106,7 @@ async def retry_job(
 
     Args:
         service: the service.
-        who: asks.
+        principal: asks.
         job_id: the job.
         request: where it begins, and with which options.
         idempotency_key: the same request with it does nothing more.
@@ -117,13 +117,13 @@ async def retry_job(
         QuotaExceededError: its owner has too many jobs.
     """
     async with service.pool.connection() as connection, connection.transaction():
-        owner = (await owned_job(connection, who, job_id)).owner
+        owner = (await owned_job(connection, principal, job_id)).owner
 
         async def make() -> uuid.UUID:
             await lock_owner(connection, owner)
-            job = await owned_job(connection, who, job_id, lock=True)
+            job = await owned_job(connection, principal, job_id, lock=True)
             await check_new_job(connection, owner, service.settings.quota)
-            options, estimate = await _revised_options(connection, service, who, job, request)
+            options, estimate = await _revised_options(connection, service, principal, job, request)
             await rows.retry_job(
                 connection,
                 service.job_queue,
@@ -138,24 +138,24 @@ async def retry_job(
             "retry", str(job_id), request.start, *([request.options] if request.options else [])
         )
         with collect_notices() as notices:
-            await create_once(connection, who, idempotency_key, named, make)
-        view = await job_view(connection, service, await owned_job(connection, who, job_id))
+            await create_once(connection, principal, idempotency_key, named, make)
+        view = await job_view(connection, service, await owned_job(connection, principal, job_id))
         return view.model_copy(update={"notes": [*view.notes, *notices]})
 
 
 async def _create_job(
-    connection: Connection, service: Service, who: Principal, requested: _RequestedJob
+    connection: Connection, service: Service, principal: Principal, requested: _RequestedJob
 ) -> uuid.UUID:
     new, kind = requested.new, requested.kind
-    await lock_owner(connection, who.owner)
-    inputs = await _check_inputs(connection, who, requested)
-    await check_new_job(connection, who.owner, service.settings.quota)
+    await lock_owner(connection, principal.owner)
+    inputs = await _check_inputs(connection, principal, requested)
+    await check_new_job(connection, principal.owner, service.settings.quota)
     workers = await live_workers_of_queue(connection, new.queue, service.settings.stale_seconds)
     check_formats_writable(kind, inputs.options, new.queue, workers)
     sizes = await photograph_sizes(connection, inputs.dataset_id) if inputs.dataset_id is not None else []
     check_job_limits(kind, inputs.options, sizes, service.settings)
     made = rows.NewJob(
-        owner=who.owner,
+        owner=principal.owner,
         kind=kind.name,
         options=inputs.options.model_dump(mode="json"),
         queue=new.queue,
@@ -171,7 +171,7 @@ async def _create_job(
     if new.webhook is not None:
         await add_endpoint(
             connection,
-            owner=who.owner,
+            owner=principal.owner,
             url=new.webhook.url,
             secret=new.webhook.secret,
             events=new.webhook.events,
@@ -180,16 +180,16 @@ async def _create_job(
     return job_id
 
 
-async def _check_inputs(connection: Connection, who: Principal, requested: _RequestedJob) -> _JobInputs:
+async def _check_inputs(connection: Connection, principal: Principal, requested: _RequestedJob) -> _JobInputs:
     """Return what the job works on, checked."""
     needed = {"result": _check_source, "dataset": _check_dataset, "files": _check_files}[requested.kind.needs]
-    inputs = await needed(connection, who, requested)
+    inputs = await needed(connection, principal, requested)
     files_id = requested.new.files_id
-    await check_named_files(connection, who, requested.kind, inputs.options, files_id)
+    await check_named_files(connection, principal, requested.kind, inputs.options, files_id)
     return replace(inputs, files_id=files_id)
 
 
-async def _check_source(connection: Connection, who: Principal, requested: _RequestedJob) -> _JobInputs:
+async def _check_source(connection: Connection, principal: Principal, requested: _RequestedJob) -> _JobInputs:
     new, kind = requested.new, requested.kind
     if new.source_id is None:
         raise input_problem("source_id", f"The kind {kind.name} works on source_id, a finished job.")
@@ -197,7 +197,7 @@ async def _check_source(connection: Connection, who: Principal, requested: _Requ
         detail = f"The kind {kind.name} works on source_id alone, a finished job."
         raise input_problem("dataset_id", detail)
     source = await rows.get_job(connection, new.source_id, lock=True)
-    if source is None or not who.may_see(source.owner):
+    if source is None or not principal.may_see(source.owner):
         raise input_problem("source_id", "There is no such job.")
     names = {artifact.name for artifact in await rows.artifacts_of(connection, source.id)}
     if source.state != "succeeded" and not (source.state == "failed" and names):
@@ -205,7 +205,7 @@ async def _check_source(connection: Connection, who: Principal, requested: _Requ
     if kind.source_files and kind.source_files[0] not in names:
         raise input_problem("source_id", f"The job in source_id has no {kind.source_files[0]}.")
     if new.dataset_id is not None and kind.takes_other_photographs:
-        dataset = await _get_photographs(connection, who, new.dataset_id)
+        dataset = await _get_photographs(connection, principal, new.dataset_id)
         if not dataset.has_poses:
             detail = "The dataset holds no COLMAP model, which says where in the scene its photographs are."
             raise input_problem("dataset_id", detail)
@@ -218,7 +218,7 @@ async def _check_source(connection: Connection, who: Principal, requested: _Requ
     return _JobInputs(source.dataset_id if kind.keeps_world_frame else None, source.id, requested.options)
 
 
-async def _check_files(connection: Connection, who: Principal, requested: _RequestedJob) -> _JobInputs:
+async def _check_files(connection: Connection, principal: Principal, requested: _RequestedJob) -> _JobInputs:
     new, name = requested.new, requested.kind.name
     for place in ("source_id", "dataset_id"):
         if getattr(new, place) is not None:
@@ -229,21 +229,23 @@ async def _check_files(connection: Connection, who: Principal, requested: _Reque
     return _JobInputs(None, None, requested.options)
 
 
-async def _check_dataset(connection: Connection, who: Principal, requested: _RequestedJob) -> _JobInputs:
+async def _check_dataset(
+    connection: Connection, principal: Principal, requested: _RequestedJob
+) -> _JobInputs:
     new, kind = requested.new, requested.kind
     if new.dataset_id is None or new.source_id is not None:
         raise input_problem("dataset_id", f"A job of the kind {kind.name} works on dataset_id, a dataset.")
-    dataset = await _get_photographs(connection, who, new.dataset_id)
+    dataset = await _get_photographs(connection, principal, new.dataset_id)
     if kind.needs_poses(requested.options) and not dataset.has_poses:
         detail = "The dataset holds no COLMAP model; set the option poses to auto, or send a model."
         raise ProblemError(422, "poses", detail, errors=[{"pointer": "#/options/poses", "detail": detail}])
     return _JobInputs(dataset.id, None, kind.with_poses_known(requested.options, dataset.has_poses))
 
 
-async def _get_photographs(connection: Connection, who: Principal, dataset_id: uuid.UUID) -> Dataset:
+async def _get_photographs(connection: Connection, principal: Principal, dataset_id: uuid.UUID) -> Dataset:
     """Return a dataset of photographs that is ready."""
     dataset = await get_dataset(connection, dataset_id, lock=True)
-    if dataset is None or not who.may_see(dataset.owner):
+    if dataset is None or not principal.may_see(dataset.owner):
         raise input_problem("dataset_id", "There is no such dataset.")
     if dataset.holds != "photographs":
         raise input_problem("dataset_id", "The dataset holds no photographs; give it as files_id.")
@@ -255,7 +257,7 @@ async def _get_photographs(connection: Connection, who: Principal, dataset_id: u
 
 
 async def _revised_options(
-    connection: Connection, service: Service, who: Principal, job: Job, request: RetryRequest
+    connection: Connection, service: Service, principal: Principal, job: Job, request: RetryRequest
 ) -> tuple[dict[str, Any] | None, dict[str, Any] | None]:
     """Return the checked options of a retried job and their estimate; None leaves them as they are."""
     workers = await live_workers_of_queue(connection, job.queue, service.settings.stale_seconds)
@@ -274,7 +276,7 @@ async def _revised_options(
     except (ValidationError, SettingsRefused) as error:
         raise options_error(error) from None
     check_formats_writable(kind, options, job.queue, workers)
-    await check_named_files(connection, who, kind, options, job.files_id)
+    await check_named_files(connection, principal, kind, options, job.files_id)
     sizes = await photograph_sizes(connection, job.dataset_id) if job.dataset_id is not None else []
     check_job_limits(kind, options, sizes, service.settings)
     if not request.options:

@@ -41,7 +41,7 @@ def get_kind(service: Service, name: str) -> KindView:
         raise not_found_error("kind of job") from None
 
 
-def describe(service: Service, who: Principal) -> InfoView:
+def describe(service: Service, principal: Principal) -> InfoView:
     """Versions, limits, formats, and who asks."""
     return InfoView(
         version=__version__,
@@ -52,8 +52,8 @@ def describe(service: Service, who: Principal) -> InfoView:
         max_upload_bytes=service.settings.max_upload_bytes,
         max_archive_bytes=service.settings.max_archive_bytes,
         needs_token=service.has_tokens or not service.settings.is_private,
-        owner=who.owner,
-        scopes=sorted(who.scopes),
+        owner=principal.owner,
+        scopes=sorted(principal.scopes),
         isolation=sandbox_capabilities(),
     )
 

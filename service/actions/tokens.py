@@ -45,14 +45,14 @@ async def revoke_token(service: Service, token_id: uuid.UUID) -> None:
     service.invalidate_token_state()
 
 
-async def create_sign_in_link(service: Service, who: Principal) -> SignInLink:
+async def create_sign_in_link(service: Service, principal: Principal) -> SignInLink:
     """Make a link that signs in once.
 
     Raises:
         ProblemError: 409 where nobody needs to sign in.
     """
-    if who.token_id is None:
+    if principal.token_id is None:
         raise ProblemError(409, "no-token", "There are no tokens, so nobody has to sign in.")
     async with service.pool.connection() as connection:
-        secret = await add_link(connection, who.token_id)
+        secret = await add_link(connection, principal.token_id)
     return SignInLink(path=f"/sign-in/once?key={secret}")

@@ -72,7 +72,7 @@ class StoredArchive:
 
 
 async def list_files(
-    service: Service, who: Principal, dataset_id: uuid.UUID, *, after: str, limit: int
+    service: Service, principal: Principal, dataset_id: uuid.UUID, *, after: str, limit: int
 ) -> Page[DatasetFile]:
     """Return the files that have arrived, by name, from the one after ``after``.
 
@@ -80,19 +80,19 @@ async def list_files(
         ProblemError: 404.
     """
     async with service.pool.connection() as connection:
-        await owned_dataset(connection, who, dataset_id)
+        await owned_dataset(connection, principal, dataset_id)
         found = await rows.files_of(connection, dataset_id, after=after, limit=limit + 1)
     return page_of(found, limit, lambda file: file.path)
 
 
-async def get_file(service: Service, who: Principal, dataset_id: uuid.UUID, path: str) -> DatasetFile:
+async def get_file(service: Service, principal: Principal, dataset_id: uuid.UUID, path: str) -> DatasetFile:
     """Return a file of a dataset.
 
     Raises:
         ProblemError: 404.
     """
     async with service.pool.connection() as connection:
-        await owned_dataset(connection, who, dataset_id)
+        await owned_dataset(connection, principal, dataset_id)
         row = await rows.get_file(connection, dataset_id, check_searchable_name(path, "file"))
     if row is None:
         raise not_found_error("file")
@@ -100,7 +100,7 @@ async def get_file(service: Service, who: Principal, dataset_id: uuid.UUID, path
 
 
 @retry_on_deadlock
-async def remove_file(service: Service, who: Principal, dataset_id: uuid.UUID, path: str) -> None:
+async def remove_file(service: Service, principal: Principal, dataset_id: uuid.UUID, path: str) -> None:
     """Take a file out of an open dataset.
 
     Raises:
@@ -108,14 +108,14 @@ async def remove_file(service: Service, who: Principal, dataset_id: uuid.UUID, p
         ConflictError: the dataset is not open.
     """
     async with service.pool.connection() as connection:
-        await open_dataset(connection, who, dataset_id)
+        await open_dataset(connection, principal, dataset_id)
         if not await rows.remove_file(connection, dataset_id, check_searchable_name(path, "file")):
             raise not_found_error("file")
     service.evictor.evict_if_low_later()
 
 
 async def put_file(
-    service: Service, who: Principal, dataset_id: uuid.UUID, path: str, upload: Upload
+    service: Service, principal: Principal, dataset_id: uuid.UUID, path: str, upload: Upload
 ) -> StoredFile:
     """Put a file into an open dataset. One that is there with the announced digest is not read.
 
@@ -128,7 +128,7 @@ async def put_file(
     """
     check_not_draining(service)
     async with service.pool.connection() as connection:
-        dataset = await open_dataset(connection, who, dataset_id)
+        dataset = await open_dataset(connection, principal, dataset_id)
         check = _content_check_for(dataset, path)
         known = await rows.get_file(connection, dataset_id, path)
         left = await bytes_left(connection, dataset.owner, service.settings.quota)
@@ -160,7 +160,7 @@ async def put_file(
 
 
 async def put_archive(
-    service: Service, who: Principal, dataset_id: uuid.UUID, upload: Upload
+    service: Service, principal: Principal, dataset_id: uuid.UUID, upload: Upload
 ) -> StoredArchive:
     """Put the files of a ZIP file into an open dataset, beside those that are there.
 
@@ -173,7 +173,7 @@ async def put_archive(
     """
     check_not_draining(service)
     async with service.pool.connection() as connection:
-        dataset = await open_dataset(connection, who, dataset_id)
+        dataset = await open_dataset(connection, principal, dataset_id)
         left = await bytes_left(connection, dataset.owner, service.settings.quota)
         known = await rows.files_of(connection, dataset_id)
     if dataset.holds == "files":

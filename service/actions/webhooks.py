@@ -26,7 +26,7 @@ class CreatedEndpoint:
 
 
 @retry_on_deadlock
-async def create_webhook(service: Service, who: Principal, new: NewWebhook) -> CreatedEndpoint:
+async def create_webhook(service: Service, principal: Principal, new: NewWebhook) -> CreatedEndpoint:
     """Be told of the asker's jobs, or of one job.
 
     Raises:
@@ -35,12 +35,12 @@ async def create_webhook(service: Service, who: Principal, new: NewWebhook) -> C
     check_webhook_address(service, new.url)
     secret = new.secret or new_secret()
     async with service.pool.connection() as connection, connection.transaction():
-        owner = who.owner
+        owner = principal.owner
         if new.job_id is not None:
-            owner = (await owned_job(connection, who, new.job_id)).owner
+            owner = (await owned_job(connection, principal, new.job_id)).owner
         await lock_owner(connection, owner)
         if new.job_id is not None:
-            await owned_job(connection, who, new.job_id, lock=True)
+            await owned_job(connection, principal, new.job_id, lock=True)
         made = await rows.add_endpoint(
             connection, owner=owner, url=new.url, secret=secret, events=new.events, job_id=new.job_id
         )
@@ -48,27 +48,29 @@ async def create_webhook(service: Service, who: Principal, new: NewWebhook) -> C
 
 
 async def list_webhooks(
-    service: Service, who: Principal, *, before: uuid.UUID | None, limit: int
+    service: Service, principal: Principal, *, before: uuid.UUID | None, limit: int
 ) -> Page[Endpoint]:
     """Webhooks that the asker may see, the newest first, those made before ``before``."""
     async with service.pool.connection() as connection:
-        found = await rows.list_endpoints(connection, owner=who.visible_owner, before=before, limit=limit + 1)
+        found = await rows.list_endpoints(
+            connection, owner=principal.visible_owner, before=before, limit=limit + 1
+        )
     return page_of(found, limit, lambda endpoint: endpoint.id)
 
 
-async def get_webhook(service: Service, who: Principal, webhook_id: uuid.UUID) -> Endpoint:
+async def get_webhook(service: Service, principal: Principal, webhook_id: uuid.UUID) -> Endpoint:
     """Return a webhook.
 
     Raises:
         ProblemError: 404.
     """
     async with service.pool.connection() as connection:
-        return await owned_webhook(connection, who, webhook_id)
+        return await owned_webhook(connection, principal, webhook_id)
 
 
 @retry_on_deadlock
 async def change_webhook(
-    service: Service, who: Principal, webhook_id: uuid.UUID, change: WebhookChange
+    service: Service, principal: Principal, webhook_id: uuid.UUID, change: WebhookChange
 ) -> Endpoint:
     """Change a webhook, pause it, or enable it again.
 
@@ -78,36 +80,36 @@ async def change_webhook(
     if change.url is not None:
         check_webhook_address(service, change.url)
     async with service.pool.connection() as connection:
-        await owned_webhook(connection, who, webhook_id)
+        await owned_webhook(connection, principal, webhook_id)
         return await rows.change_endpoint(connection, webhook_id, **change.model_dump(exclude_unset=True))
 
 
 @retry_on_deadlock
-async def delete_webhook(service: Service, who: Principal, webhook_id: uuid.UUID) -> None:
+async def delete_webhook(service: Service, principal: Principal, webhook_id: uuid.UUID) -> None:
     """Delete a webhook with its messages.
 
     Raises:
         ProblemError: 404.
     """
     async with service.pool.connection() as connection:
-        await owned_webhook(connection, who, webhook_id)
+        await owned_webhook(connection, principal, webhook_id)
         await rows.delete_endpoint(connection, webhook_id)
 
 
-async def send_test(service: Service, who: Principal, webhook_id: uuid.UUID) -> Delivery:
+async def send_test(service: Service, principal: Principal, webhook_id: uuid.UUID) -> Delivery:
     """Send a message that says nothing.
 
     Raises:
         ProblemError: 404, or 409 if the webhook is disabled.
     """
     async with service.pool.connection() as connection:
-        endpoint = _check_enabled(await owned_webhook(connection, who, webhook_id))
+        endpoint = _check_enabled(await owned_webhook(connection, principal, webhook_id))
         data = {"webhook_id": str(endpoint.id)}
         return await rows.add_delivery(connection, endpoint.id, rows.TEST_EVENT, data)
 
 
 async def list_deliveries(
-    service: Service, who: Principal, webhook_id: uuid.UUID, limit: int
+    service: Service, principal: Principal, webhook_id: uuid.UUID, limit: int
 ) -> list[Delivery]:
     """Return the newest messages and what became of them.
 
@@ -115,13 +117,13 @@ async def list_deliveries(
         ProblemError: 404.
     """
     async with service.pool.connection() as connection:
-        await owned_webhook(connection, who, webhook_id)
+        await owned_webhook(connection, principal, webhook_id)
         return await rows.list_deliveries(connection, webhook_id, limit)
 
 
 @retry_on_deadlock
 async def redeliver(
-    service: Service, who: Principal, webhook_id: uuid.UUID, delivery_id: uuid.UUID
+    service: Service, principal: Principal, webhook_id: uuid.UUID, delivery_id: uuid.UUID
 ) -> Delivery:
     """Send a message once more, with the same id and content.
 
@@ -129,7 +131,7 @@ async def redeliver(
         ProblemError: 404, or 409 if the webhook is disabled.
     """
     async with service.pool.connection() as connection, connection.transaction():
-        _check_enabled(await owned_webhook(connection, who, webhook_id))
+        _check_enabled(await owned_webhook(connection, principal, webhook_id))
         if await rows.get_delivery(connection, webhook_id, delivery_id) is None:
             raise not_found_error("message")
         return await rows.redeliver(connection, delivery_id)

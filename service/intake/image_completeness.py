@@ -40,10 +40,10 @@ def check_complete(file: BinaryIO, name: str, kind: str) -> None:
     size_bytes = file.seek(0, io.SEEK_END)
     file.seek(0)
     try:
-        whole = _CHECKS.get(kind, _assume_complete)(file, size_bytes)
+        is_complete = _CHECKS.get(kind, _assume_complete)(file, size_bytes)
     except _READ_ERRORS:
-        whole = False  # what says how long it is lies beyond the end
-    if not whole:
+        is_complete = False  # what says how long it is lies beyond the end
+    if not is_complete:
         detail = (
             f"{quoted_name(name)} is cut off: the end of its {kind} data is missing; send the whole file."
         )

@@ -75,7 +75,7 @@ def read_image_header(file: BinaryIO, name: str, limits: ImageLimits = ImageLimi
         IntakeError: ``image-kind``, ``image-damaged``, ``image-header-too-long``, ``image-animated``,
             ``image-too-many-pixels`` or ``image-too-long-side``.
     """
-    shown = quoted_name(name)
+    quoted = quoted_name(name)
     bounded: Any = _BoundedFile(file, limits.max_header_bytes)
     head = bounded.read(32)
     bounded.seek(0)
@@ -84,33 +84,35 @@ def read_image_header(file: BinaryIO, name: str, limits: ImageLimits = ImageLimi
         raise IntakeError(
             IntakeFault(
                 "image-kind",
-                f"{shown} is not an image of a known kind; send JPEG, PNG, TIFF, WebP, BMP, EXR or HDR.",
+                f"{quoted} is not an image of a known kind; send JPEG, PNG, TIFF, WebP, BMP, EXR or HDR.",
                 name,
             )
         )
     try:
         width, height, frames = _READERS[kind](bounded)
     except _HeaderTooLongError:
-        detail = f"{shown} has no size in its first {limits.max_header_bytes} bytes of header; write it anew."
+        detail = (
+            f"{quoted} has no size in its first {limits.max_header_bytes} bytes of header; write it anew."
+        )
         raise IntakeError(IntakeFault("image-header-too-long", detail, name)) from None
     except _HEADER_ERRORS:
-        detail = f"{shown} has a damaged {kind} header; replace the file."
+        detail = f"{quoted} has a damaged {kind} header; replace the file."
         raise IntakeError(IntakeFault("image-damaged", detail, name)) from None
     if width < 1 or height < 1:
-        raise IntakeError(IntakeFault("image-damaged", f"{shown} is {width}x{height} pixels large.", name))
+        raise IntakeError(IntakeFault("image-damaged", f"{quoted} is {width}x{height} pixels large.", name))
     if frames > 1:
-        detail = f"{shown} is an animation of {frames} frames; send photographs one by one."
+        detail = f"{quoted} is an animation of {frames} frames; send photographs one by one."
         raise IntakeError(IntakeFault("image-animated", detail, name))
     if max(width, height) > limits.max_side_px:
-        detail = f"{shown} is {width}x{height} pixels large; {limits.max_side_px} are allowed on a side."
+        detail = f"{quoted} is {width}x{height} pixels large; {limits.max_side_px} are allowed on a side."
         raise IntakeError(IntakeFault("image-too-long-side", detail, name))
     if width * height > limits.max_pixels:
-        detail = f"{shown} has {width * height} pixels ({width}x{height}); {limits.max_pixels} are allowed."
+        detail = f"{quoted} has {width * height} pixels ({width}x{height}); {limits.max_pixels} are allowed."
         raise IntakeError(IntakeFault("image-too-many-pixels", detail, name))
     suffix = PurePosixPath(name).suffix.lower()
     odd = suffix not in _SUFFIXES[kind]
     return ImageHeader(
-        kind, width, height, f"{shown} is a {kind} file by its content, not by its name." if odd else None
+        kind, width, height, f"{quoted} is a {kind} file by its content, not by its name." if odd else None
     )
 
 
@@ -155,10 +157,10 @@ class _BoundedFile(io.RawIOBase):
         return self._file.tell()
 
     def read(self, size: int | None = -1) -> bytes:
-        wanted = -1 if size is None else size
-        if wanted < 0 or wanted > self._bytes_left:
-            wanted = self._bytes_left + 1
-        data = self._file.read(wanted)
+        requested = -1 if size is None else size
+        if requested < 0 or requested > self._bytes_left:
+            requested = self._bytes_left + 1
+        data = self._file.read(requested)
         self._count(len(data))
         return data
 

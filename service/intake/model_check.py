@@ -108,13 +108,13 @@ def _run_model_child(request: ModelRequest, limits: ModelLimits) -> ModelAnswer:
         answer.seek(0)
         text = answer.read(MAX_ANSWER_BYTES)
         noise.seek(max(0, noise.seek(0, os.SEEK_END) - 2000))
-        said = noise.read(2000)
+        output = noise.read(2000)
     if child.returncode == -signal.SIGXCPU or child.returncode == -signal.SIGKILL:
         return _failed_answer("model-timeout", f"Reading the COLMAP model took more than {limits.seconds} s.")
     try:
         return ModelAnswer.model_validate_json(text)
     except ValidationError:
-        _log.warning("the reader of a COLMAP model ended with %s: %a", child.returncode, said)
+        _log.warning("the reader of a COLMAP model ended with %s: %a", child.returncode, output)
         return _failed_answer(
             "model-crash", "The COLMAP model cannot be read (its reader crashed); write it anew with COLMAP."
         )
@@ -122,8 +122,8 @@ def _run_model_child(request: ModelRequest, limits: ModelLimits) -> ModelAnswer:
 
 def parser_environment() -> dict[str, str]:
     """Return what a child that parses foreign bytes may know: how to find libraries, and no secrets."""
-    kept = {name: os.environ[name] for name in _LIBRARY_VARIABLES if name in os.environ}
-    return {**kept, "OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1", "PYTHONDONTWRITEBYTECODE": "1"}
+    inherited = {name: os.environ[name] for name in _LIBRARY_VARIABLES if name in os.environ}
+    return {**inherited, "OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1", "PYTHONDONTWRITEBYTECODE": "1"}
 
 
 def _failed_answer(code: str, detail: str) -> ModelAnswer:

@@ -149,28 +149,30 @@ class _ModelChecker:
                 continue
             if not image.has_pose:
                 continue
-            shown = quoted_name(name)
+            quoted = quoted_name(name)
             posed += 1
             key = unicodedata.normalize("NFC", name)
             if key in known:
                 self._add_fault(
-                    "images", "model-image-twice", f"The COLMAP model has the image {shown} twice."
+                    "images", "model-image-twice", f"The COLMAP model has the image {quoted} twice."
                 )
             known.add(key)
             if key not in self._sizes:
                 self._add_fault(
                     "images",
                     "model-image-missing",
-                    f"The image {shown} of the COLMAP model is not among the photographs in images/; "
+                    f"The image {quoted} of the COLMAP model is not among the photographs in images/; "
                     "upload it or run COLMAP without it.",
                 )
             pose = image.cam_from_world()
             quat, translation = np.array(pose.rotation.quat), np.array(pose.translation)
             # A quaternion of zeros would pass for the identity further on.
             if not (np.isfinite(quat).all() and abs(float(np.linalg.norm(quat)) - 1.0) <= _UNIT_TOLERANCE):
-                self._add_fault("images", "model-pose", f"The rotation of {shown} is not a unit quaternion.")
+                self._add_fault("images", "model-pose", f"The rotation of {quoted} is not a unit quaternion.")
             if not (np.isfinite(translation).all() and (abs(translation) < _MAX_COORDINATE).all()):
-                self._add_fault("images", "model-pose", f"The translation of {shown} is not a usable number.")
+                self._add_fault(
+                    "images", "model-pose", f"The translation of {quoted} is not a usable number."
+                )
         if posed < self.request.min_views:
             self._add_fault(
                 "images",

@@ -17,9 +17,9 @@ router = APIRouter(prefix="/v1/jobs", tags=["results"])
 
 
 @router.get("/{job_id}/artifacts", responses=problem_responses(404))
-async def list_artifacts(job_id: uuid.UUID, who: Reader, service: ServiceDep) -> ArtifactList:
+async def list_artifacts(job_id: uuid.UUID, principal: Reader, service: ServiceDep) -> ArtifactList:
     """Return the results of a job; none before it has succeeded."""
-    found = await actions.list_artifacts(service, who, job_id)
+    found = await actions.list_artifacts(service, principal, job_id)
     return ArtifactList(artifacts=[ArtifactView.from_row(row) for row in found])
 
 
@@ -30,12 +30,12 @@ async def list_artifacts(job_id: uuid.UUID, who: Reader, service: ServiceDep) ->
     "/{job_id}/artifacts/{name:path}", responses=problem_responses(404, 410, 416), include_in_schema=False
 )
 async def get_artifact_content(
-    job_id: uuid.UUID, name: Annotated[str, Path(max_length=1000)], who: Reader, service: ServiceDep,
+    job_id: uuid.UUID, name: Annotated[str, Path(max_length=1000)], principal: Reader, service: ServiceDep,
     request: Request,
     inline: Annotated[bool, Query(description="Show it in the browser rather than save it.")] = False,
 ) -> Response:  # fmt: skip
     """Return a result; `Range` and `If-Range` let a download go on."""
-    row = await actions.get_artifact(service, who, job_id, name)
+    row = await actions.get_artifact(service, principal, job_id, name)
     return await run_in_pool(
         ThreadPurpose.DOWNLOADS,
         lambda: send_blob(
@@ -55,9 +55,11 @@ async def get_artifact_content(
     responses={200: {"content": {"image/png": {}}}, **problem_responses(404, 410)},
     response_class=Response,
 )
-async def get_preview(job_id: uuid.UUID, who: Reader, service: ServiceDep, request: Request) -> Response:
+async def get_preview(
+    job_id: uuid.UUID, principal: Reader, service: ServiceDep, request: Request
+) -> Response:
     """Return the newest picture of the scene in the making."""
-    blob = await actions.get_preview(service, who, job_id)
+    blob = await actions.get_preview(service, principal, job_id)
     response = await run_in_pool(
         ThreadPurpose.DOWNLOADS,
         lambda: send_blob(

@@ -40,53 +40,53 @@ FilePath = Annotated[str, Path(max_length=1000, description="Such as images/0001
 
 @router.post("", status_code=201, responses=problem_responses())
 async def create_dataset(
-    new: NewDataset, who: Writer, service: ServiceDep, response: Response, key: IdempotencyKey = None
+    new: NewDataset, principal: Writer, service: ServiceDep, response: Response, key: IdempotencyKey = None
 ) -> DatasetView:
     """Make a dataset to put photographs into, or files that the options of jobs name."""
-    dataset = await actions.create_dataset(service, who, new, idempotency_key=key)
+    dataset = await actions.create_dataset(service, principal, new, idempotency_key=key)
     response.headers["Location"] = f"/v1/datasets/{dataset.id}"
     return DatasetView.from_row(dataset)
 
 
 @router.get("", responses=problem_responses())
 async def list_datasets(
-    who: Reader, service: ServiceDep, request: Request, response: Response, limit: Limit = 50,
+    principal: Reader, service: ServiceDep, request: Request, response: Response, limit: Limit = 50,
     cursor: Cursor = None,
 ) -> DatasetPage:  # fmt: skip
     """Your datasets, the newest first."""
-    part = await actions.list_datasets(service, who, before=decode_id_cursor(cursor), limit=limit)
+    part = await actions.list_datasets(service, principal, before=decode_id_cursor(cursor), limit=limit)
     following = set_next_link(request, response, part.next_key)
     return DatasetPage(datasets=[DatasetView.from_row(row) for row in part.rows], next=following)
 
 
 @router.get("/{dataset_id}", responses=problem_responses(404))
-async def get_dataset(dataset_id: uuid.UUID, who: Reader, service: ServiceDep) -> DatasetView:
+async def get_dataset(dataset_id: uuid.UUID, principal: Reader, service: ServiceDep) -> DatasetView:
     """Return a dataset."""
-    return DatasetView.from_row(await actions.get_dataset(service, who, dataset_id))
+    return DatasetView.from_row(await actions.get_dataset(service, principal, dataset_id))
 
 
 @router.patch("/{dataset_id}", responses=problem_responses(404))
 async def change_dataset(
-    dataset_id: uuid.UUID, change: DatasetChange, who: Writer, service: ServiceDep
+    dataset_id: uuid.UUID, change: DatasetChange, principal: Writer, service: ServiceDep
 ) -> DatasetView:
     """Rename a dataset, or keep it whatever its age."""
-    return DatasetView.from_row(await actions.change_dataset(service, who, dataset_id, change))
+    return DatasetView.from_row(await actions.change_dataset(service, principal, dataset_id, change))
 
 
 @router.delete("/{dataset_id}", status_code=204, responses=problem_responses(404, 409))
-async def delete_dataset(dataset_id: uuid.UUID, who: Writer, service: ServiceDep) -> None:
+async def delete_dataset(dataset_id: uuid.UUID, principal: Writer, service: ServiceDep) -> None:
     """Delete a dataset that no job needs."""
-    await actions.delete_dataset(service, who, dataset_id)
+    await actions.delete_dataset(service, principal, dataset_id)
 
 
 @router.get("/{dataset_id}/files", responses=problem_responses(404))
 async def list_files(
-    dataset_id: uuid.UUID, who: Reader, service: ServiceDep, request: Request, response: Response,
+    dataset_id: uuid.UUID, principal: Reader, service: ServiceDep, request: Request, response: Response,
     limit: Annotated[int, Query(ge=1, le=5000)] = 1000, cursor: Cursor = None,
 ) -> FilePage:  # fmt: skip
     """Return the files that have arrived, by name; whoever resumes an upload sends only the others."""
     after = decode_cursor(cursor) or ""
-    part = await uploads.list_files(service, who, dataset_id, after=after, limit=limit)
+    part = await uploads.list_files(service, principal, dataset_id, after=after, limit=limit)
     following = set_next_link(request, response, part.next_key)
     return FilePage(files=[FileView.from_row(row) for row in part.rows], next=following)
 
@@ -101,11 +101,11 @@ async def list_files(
     openapi_extra={"requestBody": {"content": {"application/octet-stream": {}}, "required": True}},
 )
 async def put_file(
-    dataset_id: uuid.UUID, path: FilePath, who: Writer, service: ServiceDep, request: Request,
+    dataset_id: uuid.UUID, path: FilePath, principal: Writer, service: ServiceDep, request: Request,
     response: Response, digest: Digest = None,
 ) -> FileView:  # fmt: skip
     """Send a file: the body is its content. A repeat with the same digest does nothing."""
-    file = await uploads.put_file(service, who, dataset_id, path, _upload(request, digest))
+    file = await uploads.put_file(service, principal, dataset_id, path, _upload(request, digest))
     if file.is_unchanged:
         response.status_code = 200
     return FileView.from_row(file.row)
@@ -118,10 +118,10 @@ async def put_file(
     "/{dataset_id}/files/{path:path}", responses=problem_responses(404, 410, 416), include_in_schema=False
 )
 async def get_file(
-    dataset_id: uuid.UUID, path: FilePath, who: Reader, service: ServiceDep, request: Request
+    dataset_id: uuid.UUID, path: FilePath, principal: Reader, service: ServiceDep, request: Request
 ) -> Response:
     """Return the content of a file."""
-    row = await uploads.get_file(service, who, dataset_id, path)
+    row = await uploads.get_file(service, principal, dataset_id, path)
     return await run_in_pool(
         ThreadPurpose.DOWNLOADS,
         lambda: send_blob(
@@ -136,9 +136,9 @@ async def get_file(
 
 
 @router.delete("/{dataset_id}/files/{path:path}", status_code=204, responses=problem_responses(404, 409))
-async def delete_file(dataset_id: uuid.UUID, path: FilePath, who: Writer, service: ServiceDep) -> None:
+async def delete_file(dataset_id: uuid.UUID, path: FilePath, principal: Writer, service: ServiceDep) -> None:
     """Take a file out of an open dataset."""
-    await uploads.remove_file(service, who, dataset_id, path)
+    await uploads.remove_file(service, principal, dataset_id, path)
 
 
 @router.put(
@@ -147,10 +147,10 @@ async def delete_file(dataset_id: uuid.UUID, path: FilePath, who: Writer, servic
     openapi_extra={"requestBody": {"content": {"application/zip": {}}, "required": True}},
 )
 async def put_archive(
-    dataset_id: uuid.UUID, who: Writer, service: ServiceDep, request: Request, digest: Digest = None
+    dataset_id: uuid.UUID, principal: Writer, service: ServiceDep, request: Request, digest: Digest = None
 ) -> ArchiveView:
     """Send a whole scene as a ZIP file; its files join those that are there."""
-    archive = await uploads.put_archive(service, who, dataset_id, _upload(request, digest))
+    archive = await uploads.put_archive(service, principal, dataset_id, _upload(request, digest))
     return ArchiveView(
         files=[FileView.from_row(row) for row in archive.files],
         left_out=list(archive.left_out),
@@ -159,9 +159,9 @@ async def put_archive(
 
 
 @router.post("/{dataset_id}/commit", responses=problem_responses(404, 409))
-async def commit_dataset(dataset_id: uuid.UUID, who: Writer, service: ServiceDep) -> DatasetView:
+async def commit_dataset(dataset_id: uuid.UUID, principal: Writer, service: ServiceDep) -> DatasetView:
     """Check the dataset; if it is sound it never changes again and jobs can use it, else see `errors`."""
-    return DatasetView.from_row(await actions.commit_dataset(service, who, dataset_id))
+    return DatasetView.from_row(await actions.commit_dataset(service, principal, dataset_id))
 
 
 def _upload(request: Request, digest: str | None) -> uploads.Upload:

@@ -12,9 +12,9 @@ router = APIRouter(prefix="/v1/estimates", tags=["jobs"])
 
 
 @router.post("", responses=problem_responses(404))
-async def make_estimate(new: NewEstimate, who: Writer, service: ServiceDep) -> EstimateView:
+async def make_estimate(new: NewEstimate, principal: Writer, service: ServiceDep) -> EstimateView:
     """Say what a job would take, without making it; options are checked as if it were made.
 
     Time and memory are right within a factor of two.
     """
-    return EstimateView(estimate=await estimate(service, who, new))
+    return EstimateView(estimate=await estimate(service, principal, new))

@@ -24,21 +24,21 @@ After = Annotated[int, Query(ge=0, lt=1 << 62, description="`next` of the answer
 
 @router.get("/{job_id}/logs", responses=problem_responses(404))
 async def read_log(
-    job_id: uuid.UUID, who: Reader, service: ServiceDep, after: After = 0,
+    job_id: uuid.UUID, principal: Reader, service: ServiceDep, after: After = 0,
     limit: Annotated[int, Query(ge=1, le=5000)] = 1000,
 ) -> LogPage:  # fmt: skip
     """Return the job's log: stages, pace, warnings, errors with their cause, and the program's output."""
-    lines = await actions.read_log(service, who, job_id, after=after, limit=limit)
+    lines = await actions.read_log(service, principal, job_id, after=after, limit=limit)
     return LogPage(lines=[LogLineView.from_row(row) for row in lines], next=lines[-1].id if lines else after)
 
 
 @router.get("/{job_id}/timeline", responses=problem_responses(404))
 async def read_timeline(
-    job_id: uuid.UUID, who: Reader, service: ServiceDep, after: After = 0,
+    job_id: uuid.UUID, principal: Reader, service: ServiceDep, after: After = 0,
     limit: Annotated[int, Query(ge=1, le=5000)] = 1000,
 ) -> EventPage:  # fmt: skip
     """Return what happened to the job, as a list; `/events` is the same as a stream."""
-    events = await actions.read_events(service, who, job_id, after=after, limit=limit)
+    events = await actions.read_events(service, principal, job_id, after=after, limit=limit)
     return EventPage(
         events=[EventView.from_row(row) for row in events], next=events[-1].id if events else after
     )
@@ -54,14 +54,14 @@ async def read_timeline(
     },
 )
 async def stream_events(
-    job_id: uuid.UUID, who: Reader, service: ServiceDep,
+    job_id: uuid.UUID, principal: Reader, service: ServiceDep,
     last_event_id: Annotated[str | None, Header(max_length=40)] = None,
     after: After = 0,
 ) -> Response:  # fmt: skip
     """Stream the job's events; after a break, `Last-Event-ID` names the last one received."""
     if last_event_id is not None and last_event_id.isdecimal():
         after = min(int(last_event_id), (1 << 62) - 1)
-    events = await actions.follow_events(service, who, job_id, after=after)
+    events = await actions.follow_events(service, principal, job_id, after=after)
     if events is None:
         return Response(status_code=204)
     headers = {"Cache-Control": "no-cache", "X-Accel-Buffering": "no"}

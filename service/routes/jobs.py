@@ -25,19 +25,19 @@ _MAX_RETRY_SECONDS = 30
 
 @router.post("", status_code=202, responses=problem_responses(404, 409))
 async def create_job(
-    new: NewJob, who: Writer, service: ServiceDep, request: Request, response: Response,
+    new: NewJob, principal: Writer, service: ServiceDep, request: Request, response: Response,
     key: IdempotencyKey = None,
 ) -> JobView:  # fmt: skip
     """Accept a job; poll the address in `Location`, or listen to its `/events`."""
     traceparent = request.headers.get("traceparent", "")[:100] or None
-    view = await submit_job(service, who, new, idempotency_key=key, traceparent=traceparent)
+    view = await submit_job(service, principal, new, idempotency_key=key, traceparent=traceparent)
     _set_location(response, view)
     return view
 
 
 @router.get("", responses=problem_responses())
 async def list_jobs(
-    who: Reader, service: ServiceDep, request: Request, response: Response,
+    principal: Reader, service: ServiceDep, request: Request, response: Response,
     state: Annotated[list[JobState] | None, Query(description="May be given several times.")] = None,
     kind: Annotated[str | None, Query(max_length=40)] = None,
     label: Annotated[str | None, Query(max_length=200)] = None,
@@ -46,18 +46,20 @@ async def list_jobs(
     cursor: Cursor = None,
 ) -> JobPage:  # fmt: skip
     """Your jobs, the newest first."""
-    wanted = JobFilter(state or (), kind, label, dataset_id)
-    part = await actions.list_jobs(service, who, wanted, before=decode_id_cursor(cursor), limit=limit)
+    job_filter = JobFilter(state or (), kind, label, dataset_id)
+    part = await actions.list_jobs(
+        service, principal, job_filter, before=decode_id_cursor(cursor), limit=limit
+    )
     following = set_next_link(request, response, part.next_key)
     return JobPage(jobs=[JobView.from_row(job, stages_of(job)) for job in part.rows], next=following)
 
 
 @router.get("/{job_id}", responses={304: {"description": "Not changed"}, **problem_responses(404)})
 async def get_job(
-    job_id: uuid.UUID, who: Reader, service: ServiceDep, request: Request, response: Response
+    job_id: uuid.UUID, principal: Reader, service: ServiceDep, request: Request, response: Response
 ) -> JobView:
     """Return a job. Polling with `If-None-Match` costs next to nothing."""
-    job = await actions.get_job(service, who, job_id)
+    job = await actions.get_job(service, principal, job_id)
     headers = {"ETag": _etag(job), "Cache-Control": "no-cache"}
     if etag_matches(request.headers.get("if-none-match"), headers["ETag"]):
         return Response(status_code=304, headers=headers)  # type: ignore[return-value]
@@ -69,27 +71,29 @@ async def get_job(
 
 @router.patch("/{job_id}", responses=problem_responses(404, 412))
 async def change_job(
-    job_id: uuid.UUID, change: JobChange, who: Writer, service: ServiceDep, request: Request
+    job_id: uuid.UUID, change: JobChange, principal: Writer, service: ServiceDep, request: Request
 ) -> JobView:
     """Rename a job, or keep it whatever its age."""
 
     def check(job: JobWithView) -> None:
         check_precondition(request, _etag(job))
 
-    return await actions.change_job(service, who, job_id, change, check)
+    return await actions.change_job(service, principal, job_id, change, check)
 
 
 @router.post("/{job_id}/cancel", status_code=202, responses=problem_responses(404, 409))
-async def cancel_job(job_id: uuid.UUID, who: Writer, service: ServiceDep, response: Response) -> JobView:
+async def cancel_job(
+    job_id: uuid.UUID, principal: Writer, service: ServiceDep, response: Response
+) -> JobView:
     """Ask a job to stop; may be repeated. Its checkpoint stays, so that a retry goes on from it."""
-    view = await actions.cancel_job(service, who, job_id)
+    view = await actions.cancel_job(service, principal, job_id)
     _set_location(response, view)
     return view
 
 
 @router.post("/{job_id}/retry", status_code=202, responses=problem_responses(404, 409))
 async def retry_job(
-    job_id: uuid.UUID, who: Writer, service: ServiceDep, response: Response,
+    job_id: uuid.UUID, principal: Writer, service: ServiceDep, response: Response,
     retry: RetryRequest | None = None, key: IdempotencyKey = None,
 ) -> JobView:  # fmt: skip
     """Queue a failed or cancelled job again, from its newest checkpoint or from the start.
@@ -97,19 +101,19 @@ async def retry_job(
     With other options if some are given: a reconstruction whose files could not be written goes on from its
     trained scene with other `exports`.
     """
-    asked = retry or RetryRequest(start="checkpoint")
-    view = await retry_again(service, who, job_id, asked, idempotency_key=key)
+    request_body = retry or RetryRequest(start="checkpoint")
+    view = await retry_again(service, principal, job_id, request_body, idempotency_key=key)
     _set_location(response, view)
     return view
 
 
 @router.delete("/{job_id}", status_code=204, responses=problem_responses(404, 409))
 async def delete_job(
-    job_id: uuid.UUID, who: Writer, service: ServiceDep,
+    job_id: uuid.UUID, principal: Writer, service: ServiceDep,
     cancel: Annotated[bool, Query(description="Stop it first if it is not over.")] = False,
 ) -> None:  # fmt: skip
     """Delete a finished job with its results; repeat the request for one that still stops."""
-    await actions.delete_job(service, who, job_id, cancel=cancel)
+    await actions.delete_job(service, principal, job_id, cancel=cancel)
 
 
 def _etag(job: JobWithView) -> str:

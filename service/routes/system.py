@@ -29,9 +29,9 @@ async def get_options(kind: str, _who: Reader, service: ServiceDep) -> KindView:
 
 
 @router.get("/info", responses=problem_responses())
-async def get_info(who: Reader, service: ServiceDep) -> InfoView:
+async def get_info(principal: Reader, service: ServiceDep) -> InfoView:
     """Versions, limits, formats, and who you are."""
-    return actions.describe(service, who)
+    return actions.describe(service, principal)
 
 
 @router.get("/queues", responses=problem_responses())
@@ -61,9 +61,9 @@ async def delete_token(token_id: uuid.UUID, _who: Admin, service: ServiceDep) ->
 
 
 @router.post("/sign-in-links", status_code=201, responses=problem_responses(409))
-async def create_sign_in_link(who: Writer, service: ServiceDep) -> SignInLink:
+async def create_sign_in_link(principal: Writer, service: ServiceDep) -> SignInLink:
     """Make a link that signs a browser in with your token, once, within five minutes."""
-    return await tokens.create_sign_in_link(service, who)
+    return await tokens.create_sign_in_link(service, principal)
 
 
 @health_router.get("/healthz")

@@ -25,7 +25,7 @@ router = APIRouter(prefix="/v1/webhooks", tags=["webhooks"])
 
 @router.post("", status_code=201, responses=problem_responses(404))
 async def create_webhook(
-    new: NewWebhook, who: Writer, service: ServiceDep, response: Response
+    new: NewWebhook, principal: Writer, service: ServiceDep, response: Response
 ) -> MadeWebhook:
     """Be told of your jobs, or of one of them, at an address of yours.
 
@@ -33,55 +33,55 @@ async def create_webhook(
     says which job it is about; ask `GET /v1/jobs/{id}` for the rest. It may come more than once and is sent
     again for a day until the answer is 2xx within 15 seconds; an answer 410 disables the webhook.
     """
-    made = await actions.create_webhook(service, who, new)
+    made = await actions.create_webhook(service, principal, new)
     response.headers["Location"] = f"/v1/webhooks/{made.row.id}"
     return MadeWebhook(**WebhookView.from_row(made.row).model_dump(), secret=made.secret)
 
 
 @router.get("", responses=problem_responses())
 async def list_webhooks(
-    who: Reader, service: ServiceDep, request: Request, response: Response, limit: Limit = 50,
+    principal: Reader, service: ServiceDep, request: Request, response: Response, limit: Limit = 50,
     cursor: Cursor = None,
 ) -> WebhookPage:  # fmt: skip
     """Your webhooks, the newest first."""
-    part = await actions.list_webhooks(service, who, before=decode_id_cursor(cursor), limit=limit)
+    part = await actions.list_webhooks(service, principal, before=decode_id_cursor(cursor), limit=limit)
     following = set_next_link(request, response, part.next_key)
     return WebhookPage(webhooks=[WebhookView.from_row(row) for row in part.rows], next=following)
 
 
 @router.get("/{webhook_id}", responses=problem_responses(404))
-async def get_webhook(webhook_id: uuid.UUID, who: Reader, service: ServiceDep) -> WebhookView:
+async def get_webhook(webhook_id: uuid.UUID, principal: Reader, service: ServiceDep) -> WebhookView:
     """Return a webhook, without its secret."""
-    return WebhookView.from_row(await actions.get_webhook(service, who, webhook_id))
+    return WebhookView.from_row(await actions.get_webhook(service, principal, webhook_id))
 
 
 @router.patch("/{webhook_id}", responses=problem_responses(404))
 async def change_webhook(
-    webhook_id: uuid.UUID, change: WebhookChange, who: Writer, service: ServiceDep
+    webhook_id: uuid.UUID, change: WebhookChange, principal: Writer, service: ServiceDep
 ) -> WebhookView:
     """Change a webhook, pause it, or enable it again after the service disabled it."""
-    return WebhookView.from_row(await actions.change_webhook(service, who, webhook_id, change))
+    return WebhookView.from_row(await actions.change_webhook(service, principal, webhook_id, change))
 
 
 @router.delete("/{webhook_id}", status_code=204, responses=problem_responses(404))
-async def delete_webhook(webhook_id: uuid.UUID, who: Writer, service: ServiceDep) -> None:
+async def delete_webhook(webhook_id: uuid.UUID, principal: Writer, service: ServiceDep) -> None:
     """Delete a webhook; what was not delivered yet is not sent any more."""
-    await actions.delete_webhook(service, who, webhook_id)
+    await actions.delete_webhook(service, principal, webhook_id)
 
 
 @router.post("/{webhook_id}/test", status_code=202, responses=problem_responses(404, 409))
-async def test_webhook(webhook_id: uuid.UUID, who: Writer, service: ServiceDep) -> DeliveryView:
+async def test_webhook(webhook_id: uuid.UUID, principal: Writer, service: ServiceDep) -> DeliveryView:
     """Send a message of the type `webhook.test`; see `/deliveries` for what became of it."""
-    return DeliveryView.from_row(await actions.send_test(service, who, webhook_id))
+    return DeliveryView.from_row(await actions.send_test(service, principal, webhook_id))
 
 
 @router.get("/{webhook_id}/deliveries", responses=problem_responses(404))
 async def list_deliveries(
-    webhook_id: uuid.UUID, who: Reader, service: ServiceDep,
+    webhook_id: uuid.UUID, principal: Reader, service: ServiceDep,
     limit: Annotated[int, Query(ge=1, le=200)] = 50,
 ) -> DeliveryList:  # fmt: skip
     """Return the newest messages and what became of them; they are kept for 30 days."""
-    found = await actions.list_deliveries(service, who, webhook_id, limit)
+    found = await actions.list_deliveries(service, principal, webhook_id, limit)
     return DeliveryList(deliveries=[DeliveryView.from_row(row) for row in found])
 
 
@@ -89,7 +89,7 @@ async def list_deliveries(
     "/{webhook_id}/deliveries/{delivery_id}/redeliver", status_code=202, responses=problem_responses(404, 409)
 )
 async def resend_delivery(
-    webhook_id: uuid.UUID, delivery_id: uuid.UUID, who: Writer, service: ServiceDep
+    webhook_id: uuid.UUID, delivery_id: uuid.UUID, principal: Writer, service: ServiceDep
 ) -> DeliveryView:
     """Send a message once more, with the same id and content."""
-    return DeliveryView.from_row(await actions.redeliver(service, who, webhook_id, delivery_id))
+    return DeliveryView.from_row(await actions.redeliver(service, principal, webhook_id, delivery_id))

@@ -81,13 +81,13 @@ def read_view_poses(content: Mapping[str, Any]) -> list[PhotographPose]:
 def _pose_of_view(view: Mapping[str, Any], cameras: Sequence[Mapping[str, Any]]) -> PhotographPose | None:
     camera = cameras[view["camera"]]
     fy = float(camera["params"][0 if camera["model"] in _SINGLE_FOCAL_NAMES else 1])
-    seen = _optics(camera["width_px"], camera["height_px"], fy)
+    optics = _optics(camera["width_px"], camera["height_px"], fy)
     rotation = np.array(view["rotation_cam_from_world"], np.float64)
     translation = np.array(view["translation_cam_from_world"], np.float64)
-    if seen is None or not (np.isfinite(rotation).all() and np.isfinite(translation).all()):
+    if optics is None or not (np.isfinite(rotation).all() and np.isfinite(translation).all()):
         return None
     centre = -rotation.T @ translation
-    return PhotographPose(str(view["name"]), rotation, centre, seen.fov_y_degrees, seen.aspect)
+    return PhotographPose(str(view["name"]), rotation, centre, optics.fov_y_degrees, optics.aspect)
 
 
 def viewer_cameras(poses: list[PhotographPose], held_out: Iterable[str] = ()) -> dict[str, object]:
@@ -115,7 +115,7 @@ def viewer_cameras(poses: list[PhotographPose], held_out: Iterable[str] = ()) ->
         target, depth = ahead, np.einsum("ij,ij->i", ahead - centres, forwards)
     held = set(held_out)
     step = -(-len(poses) // MAX_VIEWS)
-    shown = [pose for k, pose in enumerate(poses) if k % step == 0 or pose.name in held][:MAX_VIEWS]
+    selected = [pose for k, pose in enumerate(poses) if k % step == 0 or pose.name in held][:MAX_VIEWS]
     return {
         "up": _rounded(up),
         "target": _rounded(target),
@@ -130,7 +130,7 @@ def viewer_cameras(poses: list[PhotographPose], held_out: Iterable[str] = ()) ->
                 "aspect": round(pose.aspect, 5),
                 "held_out": pose.name in held,
             }
-            for pose in shown
+            for pose in selected
         ],
     }
 
@@ -173,8 +173,8 @@ def _pose(record: _Record, optics: dict[int, _Optics]) -> PhotographPose | None:
     numbers, camera_id, name = record
     quat_wxyz, translation = np.array(numbers[:4]), np.array(numbers[4:7])
     length = np.linalg.norm(quat_wxyz)
-    seen = optics.get(camera_id)
-    if seen is None or not np.isfinite(numbers).all() or length < 1e-6:
+    camera_optics = optics.get(camera_id)
+    if camera_optics is None or not np.isfinite(numbers).all() or length < 1e-6:
         return None
     w, x, y, z = quat_wxyz / length
     rotation = np.array(
@@ -184,7 +184,9 @@ def _pose(record: _Record, optics: dict[int, _Optics]) -> PhotographPose | None:
             [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
         ]
     )
-    return PhotographPose(name, rotation, -rotation.T @ translation, seen.fov_y_degrees, seen.aspect)
+    return PhotographPose(
+        name, rotation, -rotation.T @ translation, camera_optics.fov_y_degrees, camera_optics.aspect
+    )
 
 
 def _binary_optics(file: IO[bytes]) -> dict[int, _Optics]:

@@ -69,27 +69,29 @@ _REPORT_POLICY = (
 
 @router.get("/")
 async def show_jobs(
-    request: Request, who: Reader, service: ServiceDep, show: StateFilter = "all", cursor: Cursor = None
+    request: Request, principal: Reader, service: ServiceDep, show: StateFilter = "all", cursor: Cursor = None
 ) -> Response:
     """Return the list of jobs."""
-    values = await _job_list_context(service, who, show, cursor)
-    return render_page(request, "jobs.html", who, **values)
+    values = await _job_list_context(service, principal, show, cursor)
+    return render_page(request, "jobs.html", principal, **values)
 
 
 @router.get("/parts/jobs")
 async def show_job_list(
-    request: Request, who: Reader, service: ServiceDep, show: StateFilter = "all", cursor: Cursor = None
+    request: Request, principal: Reader, service: ServiceDep, show: StateFilter = "all", cursor: Cursor = None
 ) -> Response:
     """Return the list alone."""
-    return render_page(request, "_jobs.html", who, **await _job_list_context(service, who, show, cursor))
+    return render_page(
+        request, "_jobs.html", principal, **await _job_list_context(service, principal, show, cursor)
+    )
 
 
 @router.get("/jobs/{job_id}")
-async def show_job(request: Request, job_id: uuid.UUID, who: Reader, service: ServiceDep) -> Response:
+async def show_job(request: Request, job_id: uuid.UUID, principal: Reader, service: ServiceDep) -> Response:
     """Return a job: how it fares, and its result once it has one."""
-    detail = await job_detail(service, who, job_id)
-    artifacts = await list_artifacts(service, who, job_id)
-    photographs = await photographs_of(service, who, job_id)
+    detail = await job_detail(service, principal, job_id)
+    artifacts = await list_artifacts(service, principal, job_id)
+    photographs = await photographs_of(service, principal, job_id)
     unwritable = unwritable_formats(await list_live_workers(service))
     by_name = {row.name: row for row in artifacts}
     metrics, config = await run_in_pool(
@@ -99,7 +101,7 @@ async def show_job(request: Request, job_id: uuid.UUID, who: Reader, service: Se
     held_out = await run_in_pool(ThreadPurpose.DOWNLOADS, read_names, service.storage, by_name.get(HELD_OUT))
     figures = read_measurements(metrics, artifacts, photographs)
     preview = detail.line.job.preview or {}
-    shown = f"images/{preview.get('view')}"
+    preview_path = f"images/{preview.get('view')}"
     extra = [
         kind
         for kind in job_kinds()
@@ -110,11 +112,13 @@ async def show_job(request: Request, job_id: uuid.UUID, who: Reader, service: Se
     return render_page(
         request,
         "job.html",
-        who,
+        principal,
         detail=detail,
         measured=figures,
-        light=stage_form(figures, artifacts, photographs, service.settings) if who.may("write") else None,
-        relight=await relight_form(service, who, artifacts, held_out),
+        light=stage_form(figures, artifacts, photographs, service.settings)
+        if principal.may("write")
+        else None,
+        relight=await relight_form(service, principal, artifacts, held_out),
         layers=LAYERS,
         pictures=[row for row in artifacts if row.name.startswith("views/") and row.name.endswith(".png")][
             :MAX_PICTURES
@@ -127,22 +131,28 @@ async def show_job(request: Request, job_id: uuid.UUID, who: Reader, service: Se
         q=_octagon_q(config),
         up=_up_world(config),
         background=_evaluation_background(config),
-        photograph=shown if any(file.path == shown for file in photographs) else None,
-        further=[options_form(kind, unwritable) for kind in extra] if who.may("write") else [],
+        photograph=preview_path if any(file.path == preview_path for file in photographs) else None,
+        further=[options_form(kind, unwritable) for kind in extra] if principal.may("write") else [],
         max_file_bytes=service.settings.max_upload_bytes,
     )
 
 
 @router.get("/parts/jobs/{job_id}")
-async def show_job_status(request: Request, job_id: uuid.UUID, who: Reader, service: ServiceDep) -> Response:
+async def show_job_status(
+    request: Request, job_id: uuid.UUID, principal: Reader, service: ServiceDep
+) -> Response:
     """Return how a job fares."""
-    return render_page(request, "_status.html", who, detail=await job_detail(service, who, job_id))
+    return render_page(
+        request, "_status.html", principal, detail=await job_detail(service, principal, job_id)
+    )
 
 
 @router.get("/jobs/{job_id}/report")
-async def show_report(request: Request, job_id: uuid.UUID, who: Reader, service: ServiceDep) -> Response:
+async def show_report(
+    request: Request, job_id: uuid.UUID, principal: Reader, service: ServiceDep
+) -> Response:
     """Return the report of a job as a page."""
-    row = await get_artifact(service, who, job_id, REPORT, kind="report")
+    row = await get_artifact(service, principal, job_id, REPORT, kind="report")
     response = await run_in_pool(
         ThreadPurpose.DOWNLOADS,
         lambda: send_blob(
@@ -155,10 +165,10 @@ async def show_report(request: Request, job_id: uuid.UUID, who: Reader, service:
 
 
 @router.get("/jobs/{job_id}/cameras.json")
-async def get_cameras(job_id: uuid.UUID, who: Reader, service: ServiceDep) -> JSONResponse:
+async def get_cameras(job_id: uuid.UUID, principal: Reader, service: ServiceDep) -> JSONResponse:
     """Return where the photographs of a job were taken, for the viewer."""
-    artifacts = await list_artifacts(service, who, job_id)
-    files = await photographs_of(service, who, job_id)
+    artifacts = await list_artifacts(service, principal, job_id)
+    files = await photographs_of(service, principal, job_id)
     held_out = next((row for row in artifacts if row.name == HELD_OUT), None)
     content = await run_in_pool(ThreadPurpose.DOWNLOADS, _cameras, service, artifacts, files, held_out)
     headers = {"Cache-Control": "private, max-age=300"}
@@ -167,16 +177,16 @@ async def get_cameras(job_id: uuid.UUID, who: Reader, service: ServiceDep) -> JS
 
 @router.get("/new")
 async def show_new(
-    request: Request, who: Writer, service: ServiceDep, dataset: uuid.UUID | None = None
+    request: Request, principal: Writer, service: ServiceDep, dataset: uuid.UUID | None = None
 ) -> Response:
     """Send photographs and queue their reconstruction."""
     kind = get_job_kind("reconstruct")
-    datasets = await list_datasets(service, who, limit=MAX_DATASETS)
+    datasets = await list_datasets(service, principal, limit=MAX_DATASETS)
     workers = await list_live_workers(service)
     return render_page(
         request,
         "new.html",
-        who,
+        principal,
         form=options_form(kind, unwritable_formats(workers), limits_by_path(kind, service.settings)),
         from_files=[options_form(other) for other in job_kinds() if other.needs == "files"],
         datasets=[row for row in datasets.rows if row.state == "committed" and row.holds == "photographs"],
@@ -187,58 +197,60 @@ async def show_new(
 
 
 @router.post("/jobs/{job_id}/cancel")
-async def cancel(request: Request, job_id: uuid.UUID, who: Writer, service: ServiceDep) -> Response:
+async def cancel(request: Request, job_id: uuid.UUID, principal: Writer, service: ServiceDep) -> Response:
     """Cancel a job and return its updated page."""
-    await actions.cancel_job(service, who, job_id)
-    return await _updated_page(request, job_id, who, service)
+    await actions.cancel_job(service, principal, job_id)
+    return await _updated_page(request, job_id, principal, service)
 
 
 @router.post("/jobs/{job_id}/retry")
 async def retry(
-    request: Request, job_id: uuid.UUID, who: Writer, service: ServiceDep,
+    request: Request, job_id: uuid.UUID, principal: Writer, service: ServiceDep,
     start: Literal["checkpoint", "start"] = "checkpoint",
 ) -> Response:  # fmt: skip
     """Queue a job again."""
-    await retry_job(service, who, job_id, RetryRequest(start=start))
-    return await _updated_page(request, job_id, who, service)
+    await retry_job(service, principal, job_id, RetryRequest(start=start))
+    return await _updated_page(request, job_id, principal, service)
 
 
 @router.post("/jobs/{job_id}/pin")
 async def pin(
-    request: Request, job_id: uuid.UUID, who: Writer, service: ServiceDep, keep: bool = True
+    request: Request, job_id: uuid.UUID, principal: Writer, service: ServiceDep, keep: bool = True
 ) -> Response:
     """Keep a job whatever its age, or no longer."""
-    await actions.change_job(service, who, job_id, JobChange(pinned=keep))
-    return await _updated_page(request, job_id, who, service)
+    await actions.change_job(service, principal, job_id, JobChange(pinned=keep))
+    return await _updated_page(request, job_id, principal, service)
 
 
 @router.post("/jobs/{job_id}/delete")
-async def delete(request: Request, job_id: uuid.UUID, who: Writer, service: ServiceDep) -> Response:
+async def delete(request: Request, job_id: uuid.UUID, principal: Writer, service: ServiceDep) -> Response:
     """Delete a job with its results."""
-    await actions.delete_job(service, who, job_id)
+    await actions.delete_job(service, principal, job_id)
     return redirect(request, "/")
 
 
-async def _updated_page(request: Request, job_id: uuid.UUID, who: Principal, service: Service) -> Response:
+async def _updated_page(
+    request: Request, job_id: uuid.UUID, principal: Principal, service: Service
+) -> Response:
     """Return what has changed on the page that asked."""
     if not is_htmx_request(request):
         return redirect(request, f"/jobs/{job_id}")
     if request.query_params.get("in") == "list":
         return Response(status_code=200, headers={"HX-Reswap": "none", "HX-Trigger": "jobs-changed"})
-    detail = await job_detail(service, who, job_id)
-    response: HTMLResponse = render_page(request, "_status.html", who, detail=detail)
+    detail = await job_detail(service, principal, job_id)
+    response: HTMLResponse = render_page(request, "_status.html", principal, detail=detail)
     response.headers["HX-Trigger"] = json.dumps({"job-changed": {"state": detail.line.job.state}})
     return response
 
 
 async def _job_list_context(
-    service: Service, who: Principal, show: StateFilter, cursor: str | None
+    service: Service, principal: Principal, show: StateFilter, cursor: str | None
 ) -> dict[str, Any]:
-    part = await list_job_rows(service, who, show, decode_id_cursor(cursor), PAGE_SIZE)
+    part = await list_job_rows(service, principal, show, decode_id_cursor(cursor), PAGE_SIZE)
     return {
         "lines": part.rows,
         "next": None if part.next_key is None else encode_cursor(part.next_key),
-        "counts": await job_counts(service, who),
+        "counts": await job_counts(service, principal),
         "show": show,
         "cursor": cursor,
     }

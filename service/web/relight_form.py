@@ -46,13 +46,13 @@ class RelightForm:
 
 
 async def relight_form(
-    service: Service, who: Principal, artifacts: Sequence[Artifact], held_out: Sequence[str]
+    service: Service, principal: Principal, artifacts: Sequence[Artifact], held_out: Sequence[str]
 ) -> RelightForm | None:
     """Return the form for a job's result; None where it has no materials, or the asker may queue nothing."""
     names = {row.name for row in artifacts}
-    if not who.may("write") or not names.issuperset(get_job_kind("relight").source_files):
+    if not principal.may("write") or not names.issuperset(get_job_kind("relight").source_files):
         return None
-    files = await list_files_by_suffix(service, who, ENVIRONMENT_SUFFIXES, limit=MAX_ENVIRONMENTS)
+    files = await list_files_by_suffix(service, principal, ENVIRONMENT_SUFFIXES, limit=MAX_ENVIRONMENTS)
     settings: ServiceSettings = service.settings
     return RelightForm(
         sorted(held_out)[:MAX_VIEWS],

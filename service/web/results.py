@@ -159,13 +159,13 @@ def read_measurements(
     for (name, row), rendered in zip(rows.items(), unique_render_names(list(rows)), strict=True):
         render = f"renders/{rendered}.png"
         photograph = f"images/{name}"
-        shown = photograph in files and PurePosixPath(name).suffix.lower() in _BROWSER_IMAGE_SUFFIXES
+        has_photograph = photograph in files and PurePosixPath(name).suffix.lower() in _BROWSER_IMAGE_SUFFIXES
         views.append(
             HeldOutView(
                 name,
                 {metric.key: _number(row.get(metric.key)) for metric in METRICS_SHOWN},
                 render if render in results else None,
-                photograph if shown else None,
+                photograph if has_photograph else None,
                 {
                     layer: name
                     for layer in LAYERS

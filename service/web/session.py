@@ -76,7 +76,7 @@ async def sign_out(request: Request, service: ServiceDep) -> Response:
     """End the session; the token stays valid."""
     secret = session_secret(request)
     if secret is not None:
-        request.state.who = await principal_of_session(service, secret)
+        request.state.principal = await principal_of_session(service, secret)
         async with service.pool.connection() as connection:
             await end_session(connection, secret)
     response = redirect(request, "/sign-in")
@@ -89,7 +89,7 @@ async def _begin_session(request: Request, response: Response, service: Service,
     hours = service.settings.session_hours
     async with service.pool.connection() as connection:
         session_id, secret = await begin_session(connection, token, hours)
-    request.state.who = Principal(token.owner, frozenset(token.scopes), token.id, session_id)
+    request.state.principal = Principal(token.owner, frozenset(token.scopes), token.id, session_id)
     is_secure = request.url.scheme == "https"
     response.set_cookie(
         SECURE_COOKIE if is_secure else COOKIE,

@@ -34,20 +34,25 @@ STATE_LABELS = {
 
 
 def render_page(
-    request: Request, template: str, who: Principal | None = None, *, status: int = 200, **values: object
+    request: Request,
+    template: str,
+    principal: Principal | None = None,
+    *,
+    status: int = 200,
+    **values: object,
 ) -> HTMLResponse:
     """Return a rendered template.
 
     Args:
         request: what it answers.
         template: file in ``templates/``.
-        who: asks; None where nobody has signed in.
+        principal: asks; None where nobody has signed in.
         status: of the answer.
         values: what the template shows.
     """
     text = render_template(
         template,
-        who=who,
+        principal=principal,
         signed_in=session_secret(request) is not None,
         path=request.url.path,
         version=__version__,

@@ -71,15 +71,17 @@ class JobDetail:
 
 
 async def list_job_rows(
-    service: Service, who: Principal, state_filter: str, before: uuid.UUID | None, limit: int
+    service: Service, principal: Principal, state_filter: str, before: uuid.UUID | None, limit: int
 ) -> Page[JobRow]:
     """Return the newest jobs, of one kind of state."""
-    part = await list_jobs(service, who, JobFilter(STATE_FILTERS[state_filter]), before=before, limit=limit)
+    part = await list_jobs(
+        service, principal, JobFilter(STATE_FILTERS[state_filter]), before=before, limit=limit
+    )
     async with service.pool.connection() as connection:
         return Page(await _job_rows(service, connection, part.rows), part.next_key)
 
 
-async def job_counts(service: Service, who: Principal) -> dict[str, int]:
+async def job_counts(service: Service, principal: Principal) -> dict[str, int]:
     """Return how many jobs there are of each kind of state."""
     async with service.pool.connection() as connection:
         cursor = await connection.execute(
@@ -87,7 +89,7 @@ async def job_counts(service: Service, who: Principal) -> dict[str, int]:
             SELECT state, count(*) AS n FROM jobs WHERE %(owner)s::text IS NULL OR owner = %(owner)s
             GROUP BY state
             """,
-            {"owner": who.visible_owner},
+            {"owner": principal.visible_owner},
         )
         by_state = {row["state"]: row["n"] for row in await cursor.fetchall()}
     return {
@@ -96,14 +98,14 @@ async def job_counts(service: Service, who: Principal) -> dict[str, int]:
     }
 
 
-async def job_detail(service: Service, who: Principal, job_id: uuid.UUID) -> JobDetail:
+async def job_detail(service: Service, principal: Principal, job_id: uuid.UUID) -> JobDetail:
     """Return a job with what has happened to it.
 
     Raises:
         ProblemError: 404.
     """
     async with service.pool.connection() as connection:
-        job = await owned_job(connection, who, job_id)
+        job = await owned_job(connection, principal, job_id)
         [line] = await _job_rows(service, connection, [job])
         line = replace(line, job=await job_view(connection, service, job))
         dataset = await get_dataset(connection, job.dataset_id) if job.dataset_id else None
@@ -135,14 +137,14 @@ async def job_detail(service: Service, who: Principal, job_id: uuid.UUID) -> Job
     )
 
 
-async def photographs_of(service: Service, who: Principal, job_id: uuid.UUID) -> list[DatasetFile]:
+async def photographs_of(service: Service, principal: Principal, job_id: uuid.UUID) -> list[DatasetFile]:
     """Return the files of the dataset that a job works on; none if it is gone.
 
     Raises:
         ProblemError: 404.
     """
     async with service.pool.connection() as connection:
-        job = await owned_job(connection, who, job_id)
+        job = await owned_job(connection, principal, job_id)
         return await files_of(connection, job.dataset_id) if job.dataset_id else []
 
 

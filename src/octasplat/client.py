@@ -276,8 +276,8 @@ class Job:
         return f"Job({self.id!r}, {self.kind}, {self.state})"
 
     def _repr_html_(self) -> str:
-        told = {"kind": self.kind, "label": self.label, "state": self.state, "psnr": self.psnr}
-        told["error"] = self.error
+        facts = {"kind": self.kind, "label": self.label, "state": self.state, "psnr": self.psnr}
+        facts["error"] = self.error
         return table_html(
-            f"Job {self.id}", {name: value for name, value in told.items() if value is not None}
+            f"Job {self.id}", {name: value for name, value in facts.items() if value is not None}
         )

@@ -123,10 +123,12 @@ def render_view(
     )
     rays = camera.rays()
     tracer = _build_tracer(scene, threads)
-    seen = render_averaged(
+    rendered = render_averaged(
         tracer, rays, behind, PLAIN_SHADING, rays_per_pixel_side(rays, scene.facts.pixel_rad)
     )
-    return Image(seen.rgb_srgb, seen.depth, seen.normal_world, seen.alpha, scene, rays, threads)
+    return Image(
+        rendered.rgb_srgb, rendered.depth, rendered.normal_world, rendered.alpha, scene, rays, threads
+    )
 
 
 def _build_tracer(scene: Scene, threads: int) -> "Tracer":

@@ -90,11 +90,11 @@ class NotebookProgress:
     def _update(self) -> None:
         from IPython.display import HTML, display
 
-        shown = HTML(self.html())
+        content = HTML(self.html())
         if self._handle is None:
-            self._handle = display(shown, display_id=True)
+            self._handle = display(content, display_id=True)
         else:
-            self._handle.update(shown)
+            self._handle.update(content)
 
     def html(self) -> str:
         """Return what is shown."""

@@ -45,11 +45,11 @@ def reconstruct_run(
         {name: value for name, value in given.items() if name in ReconstructOptions.model_fields}
     )
     stopped = False
-    shown = progress or default_progress()
+    listener = progress or default_progress()
 
     def listen(event: Event) -> None:
         nonlocal stopped
-        shown(event)
+        listener(event)
         if on_step is not None and isinstance(event, TrainingProgress) and on_step(event) is False:
             stopped = True
 

@@ -229,14 +229,14 @@ class _TraceFunction(torch.autograd.Function):
         lease = _PooledTracer(limits.settings, limits.threads)
         tracer = lease.tracer
         tracer.build(gaussians, features if features.shape[1] else None)
-        seen = tracer.trace(rays, record=any(ctx.needs_input_grad))  # type: ignore[attr-defined]
+        traced = tracer.trace(rays, record=any(ctx.needs_input_grad))  # type: ignore[attr-defined]
         ctx.save_for_backward(*tensors)  # so that torch notices where they are changed before backward
-        ctx.state = gaussians, rays, lease, seen.recording, features  # type: ignore[attr-defined]
+        ctx.state = gaussians, rays, lease, traced.recording, features  # type: ignore[attr-defined]
         return tuple(
             torch.from_numpy(array)
             for array in (
-                seen.rgb_srgb, seen.transmittance, seen.depth_sum, seen.depth_median, seen.normal_world,
-                seen.features,
+                traced.rgb_srgb, traced.transmittance, traced.depth_sum, traced.depth_median,
+                traced.normal_world, traced.features,
             )
         )  # fmt: skip
 

@@ -91,8 +91,8 @@ def view(
         write_gaussian_ply(scene.gaussians, ply, facts=scene.facts)
         name = "Scene" if path is None else path.resolve().name
         q = None if run is None else float(Run(run).settings["train"]["trace"]["q"])
-        shown = ViewedScene(name, ply, {"views": []} if run is None else _run_cameras(run), q, background)
-        viewer = Viewer(SceneServer(shown, port), folder)
+        viewed = ViewedScene(name, ply, {"views": []} if run is None else _run_cameras(run), q, background)
+        viewer = Viewer(SceneServer(viewed, port), folder)
     except BaseException:
         folder.cleanup()
         raise

@@ -96,9 +96,9 @@ class _LazyGroup(click.Group):
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """Write the list of commands without importing them."""
         added = {name: command.get_short_help_str(100) for name, command in self.commands.items()}
-        told = {name: text for name, (_, text) in _COMMANDS.items()} | added
+        help_texts = {name: text for name, (_, text) in _COMMANDS.items()} | added
         with formatter.section("Commands"):
-            formatter.write_dl([(name, told[name]) for name in self.list_commands(ctx)])
+            formatter.write_dl([(name, help_texts[name]) for name in self.list_commands(ctx)])
 
     def invoke(self, ctx: click.Context) -> Any:
         """Run the chosen command."""

@@ -84,8 +84,8 @@ def operation_command(
     if threads:
         command = threads_option(command)
     command = request_options(operation.request)(command)
-    told = (operation.request.__doc__ or "").replace("``", "")
-    make = click.command(operation.name, cls=cls, short_help=operation.title, help=told)
+    help_text = (operation.request.__doc__ or "").replace("``", "")
+    make = click.command(operation.name, cls=cls, short_help=operation.title, help=help_text)
     made: click.Command = make(command)
     return made
 
@@ -276,8 +276,8 @@ def _option_flags(name: str, info: FieldInfo) -> tuple[str, ...]:
 def _help_text(info: FieldInfo, optional: bool) -> str:
     text = info.description or ""
     default = info.default
-    shown = default not in (None, PydanticUndefined, ()) and not isinstance(default, bool | BaseModel)
-    if shown:
+    shows_default = default not in (None, PydanticUndefined, ()) and not isinstance(default, bool | BaseModel)
+    if shows_default:
         value = " ".join(map(str, default)) if isinstance(default, tuple) else default
         return f"{text}  [default: {value}]"
     return text

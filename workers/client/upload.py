@@ -206,8 +206,8 @@ def _send_missing(
     api: Api, dataset_id: str, files: list[LocalFile], progress: Callable[[int, int], None]
 ) -> None:
     there = {f["path"]: f for f in api.iterate_pages(f"/v1/datasets/{dataset_id}/files", "files", limit=5000)}
-    wanted = {file.name for file in files}
-    for path in there.keys() - wanted:
+    names = {file.name for file in files}
+    for path in there.keys() - names:
         try:
             api.request("DELETE", _file_address(dataset_id, path))
         except ServiceError as error:

@@ -133,16 +133,16 @@ def wait_for_tables(conninfo: str, seconds: float = MAX_WAIT_SECONDS) -> None:
     Raises:
         DatabaseError: the database cannot be reached, is too new for this version, or nobody has.
     """
-    deadline, told = time.monotonic() + seconds, False
+    deadline, is_reported = time.monotonic() + seconds, False
     while missing := _missing_in_database(conninfo):
         if time.monotonic() > deadline:
             raise DatabaseError(
                 f"The database lacks tables of this version ({missing[0]}); start octasplat serve or the "
                 "front end of this version, or run octasplat migrate."
             )
-        if not told:
+        if not is_reported:
             logger.warning("the database lacks tables of this version (%s); waiting for them", missing[0])
-        told = True
+        is_reported = True
         time.sleep(1)
 
 

@@ -93,10 +93,10 @@ def create_backup(
                 "SELECT sequencename, last_value FROM pg_sequences "
                 "WHERE schemaname = current_schema() AND last_value IS NOT NULL"
             ).fetchall())  # fmt: skip
-            wanted = {sha256 for (sha256,) in connection.execute(_CONTENTS_QUERY)}
+            referenced = {sha256 for (sha256,) in connection.execute(_CONTENTS_QUERY)}
             jobs = {str(job_id) for (job_id,) in connection.execute("SELECT id FROM jobs")}
         copy = LocalStorage(folder / STORE_FOLDER, floor_bytes=0)
-        contents, size_bytes = _copy_store(storage, copy, wanted, jobs, on_content)
+        contents, size_bytes = _copy_store(storage, copy, referenced, jobs, on_content)
     record = {
         "format": FORMAT, "version": __version__, "folder": rows.name,
         "steps": steps, "tables": tables, "sequences": sequences,
@@ -136,8 +136,8 @@ def restore_backup(
         if connection.execute("SELECT EXISTS (TABLE datasets) OR EXISTS (TABLE jobs)").fetchone() != (False,):
             raise BackupError("The database is not empty; name another one, or another data folder.")
         copy = LocalStorage(folder / STORE_FOLDER, floor_bytes=0)
-        wanted = {entry.blob.sha256 for entry in copy.list_blobs()}
-        contents, size_bytes = _copy_store(copy, storage, wanted, None, on_content)
+        listed = {entry.blob.sha256 for entry in copy.list_blobs()}
+        contents, size_bytes = _copy_store(copy, storage, listed, None, on_content)
         for table in record["tables"]:
             _read_table(connection, table, folder / record["folder"])
         for name, value in record["sequences"].items():
@@ -146,7 +146,7 @@ def restore_backup(
         # Nobody works on them here.
         connection.execute("UPDATE jobs SET state = 'queued', worker = NULL WHERE state = 'running'")
         connection.execute("UPDATE jobs SET state = 'canceled', slip = NULL WHERE state = 'canceling'")
-        missing = {sha256 for (sha256,) in connection.execute(_CONTENTS_QUERY)} - wanted
+        missing = {sha256 for (sha256,) in connection.execute(_CONTENTS_QUERY)} - listed
         if missing:
             raise BackupError(
                 f"The backup lacks {len(missing)} contents that its tables name; use another one."

@@ -164,8 +164,8 @@ class EmbeddedPostgres:
     def _socket_folder(self) -> Path:
         """Return the socket's folder: that of the running server, else always the same."""
         folder = (self.home / "run").resolve()
-        if (told := self._running_socket_folder()) is not None:
-            return told
+        if (running := self._running_socket_folder()) is not None:
+            return running
         socket = f"{folder}/.s.PGSQL.{SOCKET_PORT}"
         # A comma separates hosts in what clients are given, and folders in the server's settings.
         if len(os.fsencode(socket)) <= _MAX_SOCKET_BYTES and "," not in socket:

@@ -81,10 +81,10 @@ class StorageLease:
                 raise StorageUnavailableError("Contents are being removed from the store; store them again.")
             await asyncio.sleep(_POLL_SECONDS)
         if removals != self.removals:
-            gone = await asyncio.to_thread(_missing, self.storage, contents)
-            if gone:
+            missing = await asyncio.to_thread(_missing, self.storage, contents)
+            if missing:
                 raise StorageUnavailableError(
-                    f"{len(gone)} contents were removed meanwhile; store them again."
+                    f"{len(missing)} contents were removed meanwhile; store them again."
                 )
         return removals
 
@@ -127,11 +127,11 @@ async def storage_lease(pool: Pool, storage: Storage) -> AsyncIterator[StorageLe
         is_quiet = row is not None and row["quiet"] and not await _are_being_removed(connection, None)
         note = StorageLease(new_id(), pool, storage, await _removal_count(connection) if is_quiet else None)
         await connection.execute("INSERT INTO storing (id) VALUES (%s)", [note.id])
-    seen = asyncio.create_task(_renew(pool, note))
+    renewal = asyncio.create_task(_renew(pool, note))
     try:
         yield note
     finally:
-        seen.cancel()
+        renewal.cancel()
         await asyncio.shield(_release(pool, note))
 
 
@@ -226,10 +226,10 @@ async def _removal_count(connection: Connection) -> int:
 
 
 def _missing(storage: Storage, contents: Collection[str]) -> list[str]:
-    gone = []
+    missing = []
     for sha256 in contents:
         try:
             storage.stat(sha256)
         except BlobNotFoundError:
-            gone.append(sha256)
-    return gone
+            missing.append(sha256)
+    return missing

@@ -131,17 +131,17 @@ async def _run(
 
     for number in (signal.SIGINT, signal.SIGTERM):
         loop.add_signal_handler(number, leave)
-    kept = [asyncio.create_task(api.supervise())]
+    tasks = [asyncio.create_task(api.supervise())]
     guard = asyncio.create_task(_restart_database(database))
     stopped = asyncio.create_task(stop.wait())
     work: asyncio.Future[None] | None = None
     try:
         await _wait_until_ready(api, address, stopped)
         # After the front end, so that they do not take its processor time; nobody misses them yet.
-        kept += [asyncio.create_task(child.supervise()) for child in children[1:]]
+        tasks += [asyncio.create_task(child.supervise()) for child in children[1:]]
         if not stop.is_set():
-            asked = on_ready(address.result())
-            work = asyncio.ensure_future(asked) if asked is not None else None
+            ready = on_ready(address.result())
+            work = asyncio.ensure_future(ready) if ready is not None else None
             await asyncio.wait({stopped, *([work] if work else [])}, return_when=asyncio.FIRST_COMPLETED)
             if work is not None and work.done():
                 work.result()
@@ -153,7 +153,7 @@ async def _run(
         # Workers first, so that they can hand back their jobs while everything else still runs.
         for child in reversed(children):
             child.stop()
-        await kill_after_timeout(children, kept, options.settings.grace_seconds + EXTRA_GRACE_SECONDS)
+        await kill_after_timeout(children, tasks, options.settings.grace_seconds + EXTRA_GRACE_SECONDS)
         await cancel_and_wait([guard, stopped])
 
 

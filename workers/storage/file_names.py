@@ -40,40 +40,40 @@ def check_name(name: str) -> str:
     """
     if not name:
         raise FileNameError("name-empty", "A file has an empty name.")
-    shown = quoted_name(name)
+    quoted = quoted_name(name)
     try:
         encoded = name.encode("utf-8")
     except UnicodeEncodeError:
-        raise FileNameError("name-not-text", f"The file name {shown} is not valid Unicode.") from None
+        raise FileNameError("name-not-text", f"The file name {quoted} is not valid Unicode.") from None
     if len(encoded) > MAX_NAME_BYTES:
-        raise FileNameError("name-too-long", f"The file name {shown} is longer than {MAX_NAME_BYTES} bytes.")
+        raise FileNameError("name-too-long", f"The file name {quoted} is longer than {MAX_NAME_BYTES} bytes.")
     if "\0" in name:
-        raise FileNameError("name-nul", f"The file name {shown} contains a NUL character.")
+        raise FileNameError("name-nul", f"The file name {quoted} contains a NUL character.")
     # Cf holds the marks that turn the direction of writing, with which a name can look like another.
     if any(unicodedata.category(letter) in ("Cc", "Cf", "Zl", "Zp") for letter in name):
-        raise FileNameError("name-control", f"The file name {shown} contains invisible characters.")
+        raise FileNameError("name-control", f"The file name {quoted} contains invisible characters.")
     if name.startswith(("\\\\", "//")):
-        raise FileNameError("name-unc", f"The file name {shown} is a network path; names must be relative.")
+        raise FileNameError("name-unc", f"The file name {quoted} is a network path; names must be relative.")
     if "\\" in name:
         raise FileNameError(
-            "name-backslash", f"The file name {shown} contains a backslash; use forward slashes."
+            "name-backslash", f"The file name {quoted} contains a backslash; use forward slashes."
         )
     if name.startswith("/"):
-        raise FileNameError("name-absolute", f"The file name {shown} is absolute; names must be relative.")
+        raise FileNameError("name-absolute", f"The file name {quoted} is absolute; names must be relative.")
     if re.match("[A-Za-z]:", name):
         raise FileNameError(
-            "name-drive", f"The file name {shown} begins with a drive; names must be relative."
+            "name-drive", f"The file name {quoted} begins with a drive; names must be relative."
         )
     if _FORBIDDEN_CHARACTERS & set(name):
         raise FileNameError(
             "name-character",
-            f'The file name {shown} contains one of < > : " | ? *, which not every system takes.',
+            f'The file name {quoted} contains one of < > : " | ? *, which not every system takes.',
         )
     parts = name.split("/")
     if len(parts) > MAX_DEPTH:
-        raise FileNameError("name-too-deep", f"The file name {shown} has more than {MAX_DEPTH} parts.")
+        raise FileNameError("name-too-deep", f"The file name {quoted} has more than {MAX_DEPTH} parts.")
     for part in parts:
-        _check_component(part, shown)
+        _check_component(part, quoted)
     return name
 
 

@@ -40,8 +40,8 @@ def reconstruct(task: Task) -> None:
     except (CheckpointError, ConfigError) as error:
         if not has_left:
             raise
-        told = _path_redactor(task).replace_job_paths(str(error))
-        task.progress(Warned(f"What was there cannot be gone on with, so the job begins anew: {told}"))
+        message = _path_redactor(task).replace_job_paths(str(error))
+        task.progress(Warned(f"What was there cannot be gone on with, so the job begins anew: {message}"))
         shutil.rmtree(task.run)
         shutil.rmtree(task.results)
         _run_reconstruction(task)
@@ -87,11 +87,13 @@ def run_operation(task: Task) -> None:
     kind = get_job_kind(task.kind)
     assert isinstance(kind, OperationKind)
     options = kind.resolve(task.options)
-    with kind.progress_callback(task) as tell:
-        whole = nullcontext() if kind.reports_stages else counted_phase(kind.stages(options)[0], tell, 0)
-        with whole:
+    with kind.progress_callback(task) as report:
+        phase_context = (
+            nullcontext() if kind.reports_stages else counted_phase(kind.stages(options)[0], report, 0)
+        )
+        with phase_context:
             result = kind.operation.run(
-                kind.build_request(task), progress=tell, should_stop=task.should_stop, threads=task.threads
+                kind.build_request(task), progress=report, should_stop=task.should_stop, threads=task.threads
             )
     for path in result.files:
         if not path.is_relative_to(task.results):

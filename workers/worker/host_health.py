@@ -156,7 +156,7 @@ class HostHealth:
             async with asyncio.timeout(PROBE_SECONDS):
                 assert process.stdin is not None and process.stderr is not None
                 process.stdin.write(json.dumps(task).encode() + b"\n")
-                said = await process.stderr.read()  # it takes the end of its stdin for that of its worker
+                output = await process.stderr.read()  # it takes the end of its stdin for that of its worker
                 await process.wait()
                 process.stdin.close()
         except TimeoutError:
@@ -164,5 +164,5 @@ class HostHealth:
             return f"A job's program was not ready after {PROBE_SECONDS:g} s."
         if process.returncode == 0:
             return None
-        last = said.decode(errors="replace").strip().rpartition("\n")[2][-300:]
+        last = output.decode(errors="replace").strip().rpartition("\n")[2][-300:]
         return f"A job's program cannot be started here (exit code {process.returncode}): {last}"

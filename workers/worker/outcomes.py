@@ -160,15 +160,15 @@ class OutcomeWriter:
             await self._attempt.requeue_lost(self._context.job_queue, error, results, lease)
             return
         message = f"{error['message']} {lacking or ''}".strip()
-        kept, taken = (
+        kept_bytes, taken = (
             self._reporter.checkpoint_bytes,
             await asyncio.to_thread(self._workspace.peak_used_bytes),
         )
-        if await self._context.space_shortage(SpaceUsage(taken, kept + taken)) is not None:
+        if await self._context.space_shortage(SpaceUsage(taken, kept_bytes + taken)) is not None:
             await self._attempt.requeue(self._context.job_queue, message)
             return
         # What it kept goes at the end if the store lacks room with it: nobody else could store anything.
-        crowds = kept > 0 and await self._context.space_shortage(SpaceUsage(taken, taken)) is not None
+        crowds = kept_bytes > 0 and await self._context.space_shortage(SpaceUsage(taken, taken)) is not None
         await self._attempt.requeue_lost(
             self._context.job_queue,
             {"type": NO_SPACE_ERROR, "message": message},

@@ -76,8 +76,8 @@ def _last_parts(match: re.Match[str]) -> str:
     parts = [part for part in match[0].split("/") if part]
     if parts[0] not in _top_folders():
         return match[0]
-    kept = parts[1:][-_KEPT_PATH_PARTS:]
-    return "/".join(["…", *kept]) if kept else "…"
+    last_parts = parts[1:][-_KEPT_PATH_PARTS:]
+    return "/".join(["…", *last_parts]) if last_parts else "…"
 
 
 @cache

@@ -103,11 +103,11 @@ class Reporter:
     def on_event(self, event: dict[str, Any]) -> None:
         """Take an event of the child."""
         kind = event["kind"]
-        told = decode_event(kind, event)
-        if isinstance(told, Warned):
-            self.add_note(f"Warning: {told.message}")
-        elif told is not None:
-            self._progress_lines(told)
+        decoded = decode_event(kind, event)
+        if isinstance(decoded, Warned):
+            self.add_note(f"Warning: {decoded.message}")
+        elif decoded is not None:
+            self._progress_lines(decoded)
         elif kind == "error":
             for line in event.get("cause", ()):
                 self.add_note(str(line))
@@ -206,11 +206,11 @@ class Reporter:
 
     async def _store_pending(self) -> None:
         """Store the newest checkpoint and picture, if there are new ones."""
-        wanted, self._wanted_checkpoint = self._wanted_checkpoint, None
+        pending, self._wanted_checkpoint = self._wanted_checkpoint, None
         preview, self._preview = self._preview, None
         try:
-            if wanted is not None:
-                await self._store_checkpoint(*wanted)
+            if pending is not None:
+                await self._store_checkpoint(*pending)
             if preview is not None:
                 async with storage_lease(self._attempt.pool, self._workspace.storage) as note:
                     sha256 = await asyncio.to_thread(
@@ -220,14 +220,14 @@ class Reporter:
                     await self._attempt.record_preview(row, note)
         except asyncio.CancelledError:
             self._wanted_checkpoint, self._preview = (
-                self._wanted_checkpoint or wanted,
+                self._wanted_checkpoint or pending,
                 self._preview or preview,
             )
             raise
         except (StorageError, *_IGNORED_ERRORS) as error:
             logger.warning("checkpoint of job %s was not stored: %s", self._attempt.job.id, error)
             self.add_note(f"Warning: a checkpoint could not be stored: {error}")
-            self._wanted_checkpoint = self._wanted_checkpoint or wanted
+            self._wanted_checkpoint = self._wanted_checkpoint or pending
 
     async def _store_checkpoint(self, stage: str, step: int) -> None:
         if not self._stores_checkpoints:

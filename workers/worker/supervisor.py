@@ -153,8 +153,10 @@ class Supervisor:
         elif self._child.is_ready:
             await self._after_exit(self._child, code)
         else:
-            said = self._child.error["message"] if self._child.error is not None else f"code {code}"
-            await self._outcomes.diagnose_and_requeue(f"The job's program ended before it began: {said}")
+            error_text = self._child.error["message"] if self._child.error is not None else f"code {code}"
+            await self._outcomes.diagnose_and_requeue(
+                f"The job's program ended before it began: {error_text}"
+            )
 
     async def _prepare(self, kind: JobKind) -> dict[str, Any]:
         """Fill the workspace; returns the child's task."""
@@ -274,16 +276,16 @@ class Supervisor:
         """Wait for the child's end, which is brought about if anything asks for it."""
         exited = asyncio.create_task(child.wait())
         limits = asyncio.create_task(self._watch_limits(child))
-        asked = False
+        is_asked_to_stop = False
         try:
             while not exited.done():
                 left = self._kill_at - time.monotonic()
                 if left <= 0:
                     child.kill()
                     break
-                if self._stop_reason is not None and not asked:
+                if self._stop_reason is not None and not is_asked_to_stop:
                     child.request_stop()
-                    asked = True
+                    is_asked_to_stop = True
                 self._stop_event.clear()
                 news = asyncio.create_task(self._stop_event.wait())
                 timeout = left if math.isfinite(left) else None

@@ -172,9 +172,9 @@ class _Worker:
         for number in (signal.SIGTERM, signal.SIGINT):
             loop.add_signal_handler(number, self._start_draining)
         settings = self._settings
-        chores = [
-            asyncio.create_task(run_periodically(chore))
-            for chore in (
+        periodic = [
+            asyncio.create_task(run_periodically(task))
+            for task in (
                 PeriodicTask(
                     self._send_heartbeat, settings.heartbeat_seconds, max(60.0, settings.stale_seconds)
                 ),
@@ -190,9 +190,9 @@ class _Worker:
         ]
         logger.info("worker %s takes %s", self._name, dict(self._queues) or "no jobs, only care of lost ones")
         try:
-            await self._take_jobs(chores)
+            await self._take_jobs(periodic)
         finally:
-            for outcome in await cancel_and_wait(chores):
+            for outcome in await cancel_and_wait(periodic):
                 if isinstance(outcome, PeriodicTaskError):
                     logger.error("worker %s ends, as %s", self._name, outcome)
             await self._sender.close()

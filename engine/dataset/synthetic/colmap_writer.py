@@ -15,9 +15,9 @@ def write_model(
     """Write a binary COLMAP model: one camera in one rig, an image and a frame a view, and the tracks."""
     model = pycolmap.Reconstruction()
     model.add_camera_with_trivial_rig(camera)
-    seen = np.isfinite(points.observed_px[..., 0])
+    visible = np.isfinite(points.observed_px[..., 0])
     for k, view in enumerate(views):
-        keypoints = points.observed_px[seen[:, k], k]
+        keypoints = points.observed_px[visible[:, k], k]
         image = pycolmap.Image(
             name=view.name,
             keypoints=np.ascontiguousarray(keypoints),
@@ -29,8 +29,8 @@ def write_model(
         )
         model.add_image_with_trivial_frame(image, pose)
     # A point's place among its image's observations: how many earlier points that image sees.
-    places = np.cumsum(seen, axis=0) - 1
-    for xyz, rgb, row, place in zip(points.xyz_world, points.rgb_srgb8, seen, places, strict=True):
+    places = np.cumsum(visible, axis=0) - 1
+    for xyz, rgb, row, place in zip(points.xyz_world, points.rgb_srgb8, visible, places, strict=True):
         track = pycolmap.Track()
         for index in np.flatnonzero(row).tolist():
             track.add_element(index + 1, int(place[index]))

@@ -62,14 +62,16 @@ class LitScene:
         pieces = np.array_split(np.arange(len(self.still_life.vertices)), _CHUNKS)
         with ThreadPoolExecutor(THREADS) as pool:
             parts = list(pool.map(self._irradiance_at, pieces))
-        return np.concatenate([light for light, _ in parts]), np.concatenate([seen for _, seen in parts])
+        return np.concatenate([light for light, _ in parts]), np.concatenate(
+            [visibility for _, visibility in parts]
+        )
 
     def _irradiance_at(
         self, which: np.ndarray
     ) -> tuple[Float32[np.ndarray, "n 3"], Float32[np.ndarray, " n"]]:
         normals = self.still_life.vertex_normals[which].astype(np.float64)
         starts = self.still_life.vertices[which] + _SHADOW_RAY_OFFSET * normals
-        light, seen = np.zeros_like(starts), np.zeros(len(starts))
+        light, visibility = np.zeros_like(starts), np.zeros(len(starts))
         lamp_points = _lamp_points(36)
         for lamp_point in lamp_points:
             way = lamp_point - starts
@@ -78,7 +80,7 @@ class LitScene:
             free = np.zeros(len(starts))
             lit = np.flatnonzero(cosine > 0)
             free[lit] = self._shadow_transmittance(starts[lit], way[lit])
-            seen += free / len(lamp_points)
+            visibility += free / len(lamp_points)
             light += (free * cosine / squared)[:, None] * _LAMP / len(lamp_points)
         directions = _sphere_directions(112)
         for direction in directions:
@@ -90,7 +92,7 @@ class LitScene:
             )
             sky = np.zeros(3) if direction[2] <= 0 else _sky_radiance(direction[None])[0]
             light += (4 / len(directions)) * cosine[:, None] * (free * sky + (1 - free) * _INDIRECT_LIGHT)
-        return light.astype(np.float32), seen.astype(np.float32)
+        return light.astype(np.float32), visibility.astype(np.float32)
 
     def shade_hits(
         self, hits: TriangleHits, origins: Float32[np.ndarray, "n 3"], directions: Float32[np.ndarray, "n 3"]
@@ -106,16 +108,18 @@ class LitScene:
         noise.interpolate_attributes(self._attributes, self.still_life.faces, faces, u, v, at)
         kinds = self.still_life.face_object[faces]
         for kind in np.unique(kinds):
-            thing = self.still_life.objects[kind]
+            scene_object = self.still_life.objects[kind]
             mine = np.flatnonzero(kinds == kind)
             here = at[mine]
-            albedo = thing.material(np.ascontiguousarray(here[:, _XYZ]), np.ascontiguousarray(here[:, _UV]))
+            albedo = scene_object.material(
+                np.ascontiguousarray(here[:, _XYZ]), np.ascontiguousarray(here[:, _UV])
+            )
             bright = albedo * here[:, _LIGHT]
-            if thing.specular:
+            if scene_object.specular:
                 rays = hit[mine]
                 places = origins[rays] + hits.distances[rays, None] * directions[rays]
                 bright += (
-                    np.float32(thing.specular)
+                    np.float32(scene_object.specular)
                     * _phong_highlight(places, directions[rays], here[:, _NORMAL])[:, None]
                     * (here[:, _LAMP_SEEN, None] * _SPECULAR_STRENGTH)
                 )

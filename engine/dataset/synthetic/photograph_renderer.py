@@ -81,9 +81,9 @@ class PhotographRenderer:
             hits = self._scene.trace(origins, directions)
             colours = self._scene.shade_hits(hits, origins, directions).reshape(-1, samples, 3)
             if self._config.transparent:
-                shown = self._is_foreground(hits).reshape(-1, samples, 1)
-                coverage = shown.mean(axis=1, dtype=np.float32)
-                summed = (colours * shown).mean(axis=1, dtype=np.float32)
+                foreground = self._is_foreground(hits).reshape(-1, samples, 1)
+                coverage = foreground.mean(axis=1, dtype=np.float32)
+                summed = (colours * foreground).mean(axis=1, dtype=np.float32)
                 parts.append(np.concatenate([summed / np.maximum(coverage, 1e-6), coverage], axis=1))
             else:
                 parts.append(colours.mean(axis=1, dtype=np.float32))

@@ -91,12 +91,12 @@ def _points_under_pixels(
     colours = scene.shade_hits(hits, origins, along).reshape(-1, 9, 3).mean(axis=1)
     middle = slice(4, None, 9)
     face = hits.faces[middle]
-    wanted: Bool[np.ndarray, " n"] = face >= 0
+    selected: Bool[np.ndarray, " n"] = face >= 0
     if objects_only:
-        wanted &= scene.still_life.face_is_foreground[face]
-    distance = np.where(wanted, hits.distances[middle], 0).astype(np.float64)
+        selected &= scene.still_life.face_is_foreground[face]
+    distance = np.where(selected, hits.distances[middle], 0).astype(np.float64)
     xyz = origins[middle] + distance[:, None] * along[middle]
-    return xyz[wanted], to_bytes(colours[wanted])
+    return xyz[selected], to_bytes(colours[selected])
 
 
 def _project_unoccluded(

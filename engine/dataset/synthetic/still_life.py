@@ -178,20 +178,20 @@ def _scene_objects() -> tuple[SceneObject, ...]:
 @lru_cache(maxsize=1)
 def build_still_life() -> StillLife:
     """Build the scene that is photographed; it has no parameters and is always the same."""
-    things = _scene_objects()
-    whole = join_meshes([thing.mesh for thing in things])
-    counts = [len(thing.mesh.faces) for thing in things]
-    corners = whole.vertices.astype(np.float64)[whole.faces]
+    scene_objects = _scene_objects()
+    joined = join_meshes([scene_object.mesh for scene_object in scene_objects])
+    counts = [len(scene_object.mesh.faces) for scene_object in scene_objects]
+    corners = joined.vertices.astype(np.float64)[joined.faces]
     across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    face_thing = np.repeat(np.arange(len(things), dtype=np.int32), counts)
+    face_thing = np.repeat(np.arange(len(scene_objects), dtype=np.int32), counts)
     return StillLife(
-        things,
-        whole.vertices,
-        whole.faces,
-        whole.normals,
-        whole.uv,
-        whole.texture_xyz,
+        scene_objects,
+        joined.vertices,
+        joined.faces,
+        joined.normals,
+        joined.uv,
+        joined.texture_xyz,
         face_thing,
-        np.array([thing.is_foreground for thing in things])[face_thing],
+        np.array([scene_object.is_foreground for scene_object in scene_objects])[face_thing],
         (across / np.linalg.norm(across, axis=1, keepdims=True)).astype(np.float32),
     )

@@ -25,13 +25,13 @@ def sidecar_files(mesh: Path) -> tuple[str, ...]:
 
 def _referenced_files(folder: Path, suffixes: Iterable[str], texts: Iterable[Path]) -> tuple[str, ...]:
     """Return the files of these suffixes whose names occur in a text, by name."""
-    said = b"\n".join(path.read_bytes() for path in texts).replace(b"\\", b"/")
-    return tuple(name for name in sorted(_files_with_suffix(folder, suffixes)) if name.encode() in said)
+    content = b"\n".join(path.read_bytes() for path in texts).replace(b"\\", b"/")
+    return tuple(name for name in sorted(_files_with_suffix(folder, suffixes)) if name.encode() in content)
 
 
 def _files_with_suffix(folder: Path, suffixes: Iterable[str]) -> Iterator[str]:
-    wanted = set(suffixes)
+    accepted = set(suffixes)
     for pattern in ("*", "*/*"):
         for path in folder.glob(pattern):
-            if path.suffix.lower() in wanted and path.is_file():
+            if path.suffix.lower() in accepted and path.is_file():
                 yield path.relative_to(folder).as_posix()

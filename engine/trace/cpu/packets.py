@@ -155,15 +155,15 @@ class PacketTracer:
                 ((len(packets),), np.int64), ((len(packets),), np.int32), ((len(packets), 9), np.float64),
                 ((rays,), np.float32),
             )  # fmt: skip
-            kept = SharedSortHits(ids, bits, lines, starts, counts, frames, left)
+            packet_hits = SharedSortHits(ids, bits, lines, starts, counts, frames, left)
             met = np.zeros(1, np.int64)
             run_on_threads(
                 trace_packets_shared_sort, self._threads,
-                forward, packets, self._bvh.arrays, kept, np.zeros(1, np.int64), met,
+                forward, packets, self._bvh.arrays, packet_hits, np.zeros(1, np.int64), met,
             )  # fmt: skip
             if met[0] <= places or not forward.is_recording:
                 left[:] = forward.out.transmittance
-                return kept
+                return packet_hits
             self._hit_capacity = int(met[0]) * 5 // 4
 
     def write_transmittance(
@@ -192,8 +192,8 @@ class PacketTracer:
 
         Gaussians whose weights add up to less than ``min_blend_weight`` are left out before the sums.
         """
-        kept = recording.packet_hits
-        counts = kept.counts if isinstance(kept, SharedSortHits) else kept.slot_counts
+        packet_hits = recording.packet_hits
+        counts = packet_hits.counts if isinstance(packet_hits, SharedSortHits) else packet_hits.slot_counts
         firsts = np.concatenate([[0], np.cumsum(counts, dtype=np.int64)])
         count, basis_count, feature_count = int(firsts[-1]), scene.sh.shape[1], scene.features.shape[1]
         geometry = GEOMETRY_WORDS if gradients.has_geometry else 0
@@ -210,13 +210,13 @@ class PacketTracer:
             recording.packets,
             np.zeros(1, np.int64),
         )
-        if isinstance(kept, SharedSortHits):
+        if isinstance(packet_hits, SharedSortHits):
             run_on_threads(
                 backward_packets_shared_sort,
                 self._threads,
                 rays,
                 packets,
-                kept,
+                packet_hits,
                 self._limits,
                 gradients,
                 counter,
@@ -225,7 +225,7 @@ class PacketTracer:
         else:
             run_on_threads(
                 backward_packets, self._threads,
-                rays, packets, recording.hits, kept, recording.counts, parameters, scene.features,
+                rays, packets, recording.hits, packet_hits, recording.counts, parameters, scene.features,
                 self._limits, gradients, counter, rows,
             )  # fmt: skip
         by_gaussian = GaussianSegments(*sort_by_gaussian(rows.ids, len(parameters.means), self._threads))

@@ -147,18 +147,18 @@ class CpuTracer:
         forward = ForwardPass(
             RayArrays.from_batch(rays), self._packed_scene, self._limits, output_arrays(result), hits, record
         )
-        kept: PacketHits | SharedSortHits
+        packet_hits: PacketHits | SharedSortHits
         if in_one_order:
-            kept = self._packet_tracer.trace_shared_sort(forward, packets, count)
+            packet_hits = self._packet_tracer.trace_shared_sort(forward, packets, count)
         else:
-            kept = self._packet_tracer.allocate_hits(packets, count, is_recording=record)
+            packet_hits = self._packet_tracer.allocate_hits(packets, count, is_recording=record)
             if len(packets):
-                self._packet_tracer.trace(forward, packets, kept)
+                self._packet_tracer.trace(forward, packets, packet_hits)
         if len(alone):
             self._single_tracer.trace(forward, alone)
         if record:
             result.recording = CpuRecording(
-                rays, result.hit_counts, packets, alone, hits, kept, self._limits, self._build_id
+                rays, result.hit_counts, packets, alone, hits, packet_hits, self._limits, self._build_id
             )
         return result
 

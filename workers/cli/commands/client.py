@@ -86,8 +86,8 @@ def submit(
     _check_output(output, wait=wait)
     options: ReconstructOptions = request_from_options(ReconstructOptions, given)
     options.config()  # what cannot be used is refused before anything is sent
-    asked = options.model_dump(mode="json", exclude_unset=True)
-    what = Submission(scene, asked, label, queue, priority)
+    requested = options.model_dump(mode="json", exclude_unset=True)
+    what = Submission(scene, requested, label, queue, priority)
     with connected(server) as api:
         if wait:
             submit_and_wait(api, what, output or Path(f"{scene.stem or 'scene'}-result"), quiet=quiet)
@@ -329,8 +329,8 @@ def _changed_options(given: dict[str, Any], job: dict[str, Any]) -> dict[str, An
         # The service replaces an option as a whole, of which a name with dots is only a part.
         sections = {assignment.partition("=")[0].partition(".") for assignment in given["assignments"]}
         known = {name.strip(): job["options"].get(name.strip()) for name, dot, _ in sections if dot}
-        kept = {name: value for name, value in copy.deepcopy(known).items() if isinstance(value, dict)}
-        return _with_assignments(kept | options, given["assignments"])
+        result = {name: value for name, value in copy.deepcopy(known).items() if isinstance(value, dict)}
+        return _with_assignments(result | options, given["assignments"])
     return options | ({"assignments": list(given["assignments"])} if given["assignments"] else {})
 
 

@@ -31,8 +31,8 @@ def list_settings(everything: bool, group: str | None, markdown: bool, as_json: 
     if markdown:
         click.echo(settings_page(), nl=False)
         return
-    wanted = group or ("" if everything else "basic")
-    entries = [entry for entry in all_settings() if not wanted or entry.group == wanted]
+    listed_group = group or ("" if everything else "basic")
+    entries = [entry for entry in all_settings() if not listed_group or entry.group == listed_group]
     if as_json:
         _write_json([_entry_as_dict(entry) for entry in entries])
         return

@@ -59,14 +59,14 @@ class SurfaceKind(OperationKind):
 
     def stages(self, options: SurfaceJobOptions) -> tuple[str, ...]:
         """Return the stages; colours that are fitted to photographs need not be seen in the scene first."""
-        asked = {
+        requested = {
             "settling": options.refine_vertices,
             "decimating": bool(options.max_triangles),
             "unwrapping": options.texture_size is not None,
             "colouring": options.materials or not options.fit,
             "fitting": options.fit and not options.materials,
         }
-        return (*super().stages(options), *(name for name, is_asked in asked.items() if is_asked))
+        return (*super().stages(options), *(name for name, is_asked in requested.items() if is_asked))
 
     def resource_demands(
         self, options: SurfaceJobOptions, sizes: Sequence[ImageSizes]
@@ -88,8 +88,8 @@ class SurfaceKind(OperationKind):
         """Return the options of a job with changes; what its presets decided follows those of now."""
         presets = {name: options[name] for name in _PRESET_OPTIONS if name in options}
         decided = self.resolve(presets).model_dump(mode="json")
-        kept = {name: value for name, value in options.items() if decided.get(name) != value}
-        return self.resolve({**presets, **kept, **changes})
+        changed = {name: value for name, value in options.items() if decided.get(name) != value}
+        return self.resolve({**presets, **changed, **changes})
 
     def request_paths(self, task: Task, options: SurfaceJobOptions) -> dict[str, Path]:
         """Return where a job reads and writes; photographs are those of a whole run only."""
