@@ -135,25 +135,25 @@ async def _service_lifespan(settings: ServiceSettings) -> AsyncIterator[Service]
                 if token.revoked_at is not None:
                     logger.warning("the token of OCTASPLAT_TOKEN was revoked and stays so; set another one")
             settings.check_public(await has_any_token(connection))
-        hub = EventBroker(conninfo, listen=settings.listen)
-        listening = asyncio.create_task(hub.run())
-        room = SpaceEvictor(pool, storage)
+        event_broker = EventBroker(conninfo, listen=settings.listen)
+        listening = asyncio.create_task(event_broker.run())
+        evictor = SpaceEvictor(pool, storage)
         try:
-            guesses = LoginThrottle(settings.wrong_token_seconds)
+            login_throttle = LoginThrottle(settings.wrong_token_seconds)
             yield Service(
                 settings,
                 pool,
                 ProcrastinateQueue(),
                 storage,
-                hub,
-                room,
-                guesses,
+                event_broker,
+                evictor,
+                login_throttle,
                 settings.spool(),
                 _check_limiter(settings),
             )
         finally:
-            await room.close()
-            hub.close()
+            await evictor.close()
+            event_broker.close()
             await cancel_and_wait([listening])
 
 

@@ -37,7 +37,7 @@ class AuditMiddleware:
         state = scope.setdefault("state", {})
         is_recorded = False
 
-        async def tell(status: int, headers: Headers) -> None:
+        async def record(status: int, headers: Headers) -> None:
             nonlocal is_recorded
             if is_recorded or (scope["method"] in _UNAUDITED_METHODS and not state.get("is_change")):
                 return
@@ -46,15 +46,15 @@ class AuditMiddleware:
             is_recorded = True
             await _write_entry(scope, status, headers.get("location"))
 
-        async def send_told(message: Message) -> None:
+        async def send_and_record(message: Message) -> None:
             if message["type"] == "http.response.start":
-                await tell(message["status"], Headers(raw=message["headers"]))
+                await record(message["status"], Headers(raw=message["headers"]))
             await send(message)
 
         try:
-            await self._app(scope, receive, send_told)
+            await self._app(scope, receive, send_and_record)
         except Exception:
-            await tell(500, Headers())
+            await record(500, Headers())
             raise
 
 

@@ -103,11 +103,11 @@ def limit_notes(
             f"{max(allowed) / 1e9:.1f} GB; ask for fewer Gaussians, rays or pixels."
         )
     disks = [row.facts.get("disk_bytes") for row in workers]
-    rooms = [int(room) for room in disks if isinstance(room, int)]
-    if rooms and len(rooms) == len(disks) and known.disk_bytes > max(rooms):
+    capacities = [int(capacity) for capacity in disks if isinstance(capacity, int)]
+    if capacities and len(capacities) == len(disks) and known.disk_bytes > max(capacities):
         notes.append(
             f"It needs at least {known.disk_bytes / 1e9:.1f} GB of disk, and no worker has more than "
-            f"{max(rooms) / 1e9:.1f} GB."
+            f"{max(capacities) / 1e9:.1f} GB."
         )
     hours = settings.max_job_hours
     if hours and known.seconds > 3600 * hours:

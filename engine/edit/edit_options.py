@@ -116,12 +116,12 @@ class _ChannelValues(BaseModel):
             unknown = [found for found in error.errors() if found["type"] == "extra_forbidden"]
             if not unknown:
                 raise
-            told = PydanticCustomError(
+            no_material = PydanticCustomError(
                 "no_material",
                 "there is no such material; choose {names}",
                 {"names": ", ".join(MATERIAL_WIDTHS)},
             )
-            lines = [InitErrorDetails(type=told, loc=found["loc"], input=value) for found in unknown]
+            lines = [InitErrorDetails(type=no_material, loc=found["loc"], input=value) for found in unknown]
             raise ValidationError.from_exception_data(cls.__name__, lines) from None
 
     def set_values(self) -> dict[str, Any]:

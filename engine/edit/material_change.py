@@ -57,10 +57,10 @@ def refit_sh(
     sh, rows = after.sh.copy(), np.flatnonzero(chosen)
     for start in range(0, len(rows), _ROWS_PER_BLOCK):
         part = rows[start : start + _ROWS_PER_BLOCK]
-        looks = [
+        colours = [
             _shaded_colours(scene.select(part), directions_world, light, frame) for scene in (before, after)
         ]
-        sh[part] += np.einsum("kd,ndc->nkc", solve, looks[1] - looks[0]).astype(np.float32)
+        sh[part] += np.einsum("kd,ndc->nkc", solve, colours[1] - colours[0]).astype(np.float32)
     return replace(after, sh=sh)
 
 

@@ -201,7 +201,7 @@ def _normal_signs(
     old: FlatGaussians,
     means: Float64[np.ndarray, "m 3"],
     legs: Float64[np.ndarray, "m 3 2"],
-    asked: Bool[np.ndarray, " m"],
+    requested: Bool[np.ndarray, " m"],
     octagons: MatchedOctagons,
 ) -> tuple[Float64[np.ndarray, " m"], Bool[np.ndarray, " m"], Bool[np.ndarray, " m"]]:
     """Return the normals' signs and which Gaussians flipped or were mirrored, judged by their neighbours.
@@ -219,7 +219,7 @@ def _normal_signs(
     complete = octagons.present.sum(axis=1) >= MIN_CORNERS
     for group in groups:
         members = np.flatnonzero(group & complete)
-        wanted = np.flatnonzero(asked[members])
+        wanted = np.flatnonzero(requested[members])
         if not len(wanted):
             continue
         turns = neighbour_rotations(old.means_world[members].astype(np.float64), means[members], wanted)

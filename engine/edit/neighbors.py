@@ -39,7 +39,7 @@ class CarriedGaussians:
 def neighbour_rotations(
     old_means: Float64[np.ndarray, "n 3"],
     new_means: Float64[np.ndarray, "n 3"],
-    asked: Int64[np.ndarray, " m"],
+    requested: Int64[np.ndarray, " m"],
 ) -> Float64[np.ndarray, "m 3 3"]:
     """Return the orthogonal matrices that best map each Gaussian's old neighbours to the new ones (Kabsch).
 
@@ -48,14 +48,14 @@ def neighbour_rotations(
     plane do not show whether they were mirrored; for them the whole scene decides.
     """
     count = min(NEIGHBOURS, len(old_means))
-    if count < 4 or len(asked) == 0:
-        return np.zeros((len(asked), 3, 3))
+    if count < 4 or len(requested) == 0:
+        return np.zeros((len(requested), 3, 3))
     tree = KDTree(old_means)
     everything = _orthogonal_fits(old_means[None], new_means[None], 1.0)
     planar_sign = -1.0 if _is_reflection(everything)[0] else 1.0
-    turns = np.empty((len(asked), 3, 3))
-    for block in row_blocks(len(asked)):
-        _, near = tree.query(old_means[asked[block]], k=count, workers=-1)
+    turns = np.empty((len(requested), 3, 3))
+    for block in row_blocks(len(requested)):
+        _, near = tree.query(old_means[requested[block]], k=count, workers=-1)
         turns[block] = _orthogonal_fits(old_means[near], new_means[near], planar_sign)
         stray = _strays(old_means[near], new_means[near], turns[block])
         turns[block][stray] = 0.0

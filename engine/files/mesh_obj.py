@@ -98,7 +98,7 @@ def _read(path: Path, parts: _ObjParts) -> ImportedMesh:
     positions = np.concatenate(parts.positions)
     parts.positions.clear()
     uv = _uv_of_vertices(path, parts, len(positions))
-    looks = _read_materials(path, parts, len(positions)) if parts.with_materials else {}
+    materials = _read_materials(path, parts, len(positions)) if parts.with_materials else {}
     parts.uv.clear()
     parts.triangle_uv.clear()
     triangles = np.concatenate([*parts.triangles, np.zeros((0, 3), np.int32)], dtype=np.int64)
@@ -110,7 +110,7 @@ def _read(path: Path, parts: _ObjParts) -> ImportedMesh:
         q=number_in_comments(tuple(parts.comments), Q_KEY),
         min_opacity=number_in_comments(tuple(parts.comments), MIN_OPACITY_KEY),
         rounding=rounding,
-        **looks,
+        **materials,
     )
 
 

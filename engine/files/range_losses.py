@@ -10,7 +10,7 @@ from jaxtyping import Float
 
 from octasplat.engine.gaussians.model import FlatGaussians
 
-MIN_TOLD_FRACTION = 1e-3
+MIN_REPORTED_FRACTION = 1e-3
 """Losses of fewer Gaussians than this fraction are not told; those that are too large always are."""
 
 
@@ -28,7 +28,7 @@ def find_size_losses(
     log_scales = scene.log_scales.astype(np.float64)
     large = int((log_scales > max_log_scale).any(axis=1).sum())
     small = int((log_scales < min_log_scale).any(axis=1).sum())
-    if not large and small < MIN_TOLD_FRACTION * len(scene):
+    if not large and small < MIN_REPORTED_FRACTION * len(scene):
         return ()
     low, high = float(log_scales.min()), float(log_scales.max())
     advice = ""
@@ -58,7 +58,7 @@ def find_position_losses(
         step_world: step of each position, world units.
     """
     coarse = int((step_world > np.exp(scene.log_scales.astype(np.float64)).max(axis=1)).sum())
-    if coarse < max(1.0, MIN_TOLD_FRACTION * len(scene)):
+    if coarse < max(1.0, MIN_REPORTED_FRACTION * len(scene)):
         return ()
     return (
         f"The format {format_name} holds positions in steps of {float(np.median(step_world)):.2g} "
@@ -77,7 +77,7 @@ def find_harmonic_losses(format_name: str, scene: FlatGaussians, limit: float) -
         limit: the largest absolute value of a coefficient of degree 1 and above.
     """
     clipped = int((np.abs(scene.sh[:, 1:]) > limit).any(axis=(1, 2)).sum())
-    if clipped < max(1.0, MIN_TOLD_FRACTION * len(scene)):
+    if clipped < max(1.0, MIN_REPORTED_FRACTION * len(scene)):
         return ()
     return (
         f"The format {format_name} holds coefficients of view-dependent colours up to {limit:g}; those of "

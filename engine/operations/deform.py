@@ -123,7 +123,7 @@ def run(
         stop_if(should_stop)
         notes += [*_report_text(path, report), frames.write(number, result, progress, note)]
         reports.append(report)
-        frames.tell(number, progress)
+        frames.report(number, progress)
     frames.write_report([{"deformed": str(path)} for path in paths], map(asdict, reports))
     return DeformResult(
         files=frames.files,

@@ -88,7 +88,7 @@ def run(
         stop_if(should_stop)
         notes += [*_report_text(path, report), frames.write(number, result, progress, note)]
         reports.append(report)
-        frames.tell(number, progress)
+        frames.report(number, progress)
     frames.write_report([{"mesh": str(path)} for path in meshes], map(asdict, reports))
     return EditResult(files=frames.files, folder=frames.folder, notes=tuple(notes), reports=tuple(reports))
 

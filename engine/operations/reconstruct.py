@@ -164,14 +164,14 @@ class ReconstructResult(Result):
         return self.summary
 
 
-def options_from_json(asked: Mapping[str, Any]) -> ReconstructOptions:
+def options_from_json(requested: Mapping[str, Any]) -> ReconstructOptions:
     """Return options from JSON.
 
     Raises:
         SettingsRefused: an option is unknown or out of range.
     """
     try:
-        return ReconstructOptions.model_validate(dict(asked))
+        return ReconstructOptions.model_validate(dict(requested))
     except ValidationError as error:
         raise SettingsRefused(refusals_from(error, ReconstructOptions)) from None
 

@@ -101,7 +101,7 @@ class SceneSequence:
         self.files = (*self.files, target)
         return write_scene(gaussians, read_metadata(self._source), target, progress, warn=number == 0)
 
-    def tell(self, number: int, progress: EventListener) -> None:
+    def report(self, number: int, progress: EventListener) -> None:
         """Report that the scene of the mesh with this number is written, if there are several."""
         if len(self._targets) > 1:
             progress(PhaseProgress("edit", number + 1, len(self._targets)))

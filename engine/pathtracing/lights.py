@@ -68,7 +68,7 @@ def build_light_arrays(
         texture_sizes: likewise.
     """
     count = len(lights) + len(meshes) + (environment is not None)
-    kinds, seen, adds = np.zeros((3, count), np.int32)
+    kinds, visibility, adds = np.zeros((3, count), np.int32)
     positions, axes, rgb, sides_u, sides_v = np.zeros((5, count, 3))
     areas, cosines = np.zeros(count), np.tile([0.0, 1.0], (count, 1))
     textures, rows = np.full(count, -1, np.int32), np.zeros((count, 3), np.int64)
@@ -86,18 +86,18 @@ def build_light_arrays(
                 cosines[l] = np.cos(np.radians([light.outer_degrees, light.inner_degrees]))
             elif light.radius > 0.0:
                 areas[l] = np.pi * light.radius**2
-                kinds[l], rgb[l], seen[l] = SPHERE, rgb[l] / areas[l], light.visible
+                kinds[l], rgb[l], visibility[l] = SPHERE, rgb[l] / areas[l], light.visible
         elif isinstance(light, DirectionalLight):
             kinds[l], rgb[l] = DIRECTIONAL, colour * light.irradiance
         else:
-            kinds[l], rgb[l], seen[l] = RECTANGLE, colour * light.radiance, light.visible
+            kinds[l], rgb[l], visibility[l] = RECTANGLE, colour * light.radiance, light.visible
             sides_u[l], sides_v[l] = rectangle_sides(light, up_world)
             areas[l] = light.width * light.height
     sums, corners, uv = [], [np.zeros((0, 3, 3), np.float32)], [np.zeros((0, 3, 2), np.float32)]
     face, row = 0, 0
     for l, mesh in enumerate(meshes, len(lights)):
         own = triangle_areas(mesh.corners_world)
-        kinds[l], rgb[l], areas[l], seen[l], adds[l] = MESH, mesh.rgb_linear, own.sum(), 1, 1
+        kinds[l], rgb[l], areas[l], visibility[l], adds[l] = MESH, mesh.rgb_linear, own.sum(), 1, 1
         positions[l] = own @ mesh.corners_world.mean(axis=1, dtype=np.float64) / own.sum()
         textures[l], rows[l] = mesh.texture, (row, row + len(own), face)
         sums.append(np.concatenate([[0.0], np.cumsum(own) / own.sum()]))
@@ -107,10 +107,10 @@ def build_light_arrays(
     radiance, frame = np.zeros((1, 1, 3), np.float32), np.eye(3)
     if environment is not None:
         radiance, frame = environment.radiance_linear, environment.frame
-        kinds[-1], rgb[-1], seen[-1] = ENVIRONMENT, mean_irradiance(radiance), 1
+        kinds[-1], rgb[-1], visibility[-1] = ENVIRONMENT, mean_irradiance(radiance), 1
     sampler = build_environment_sampler(radiance)
     return LightArrays(
-        kinds, positions, axes, rgb, sides_u, sides_v, areas, cosines, seen,
+        kinds, positions, axes, rgb, sides_u, sides_v, areas, cosines, visibility,
         adds, bool(adds.any()), textures, rows, np.concatenate([np.zeros(0), *sums]), np.concatenate(corners),
         np.concatenate(uv),
         np.zeros((0, 3), np.float32) if texels_linear is None else texels_linear,

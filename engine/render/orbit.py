@@ -51,10 +51,10 @@ class Orbit:
     elevation_degrees: float | None = None
 
 
-def choose_fov_y_degrees(asked_degrees: float | None, viewpoints: Viewpoints | None) -> float:
+def choose_fov_y_degrees(requested_degrees: float | None, viewpoints: Viewpoints | None) -> float:
     """Return the field of view that is asked for, else that of the photographs, else 50 degrees."""
-    if asked_degrees is not None:
-        return asked_degrees
+    if requested_degrees is not None:
+        return requested_degrees
     return DEFAULT_FOV_Y_DEGREES if viewpoints is None else fov_y_of_views(viewpoints)
 
 

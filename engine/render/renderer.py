@@ -72,9 +72,9 @@ def render_rays(
     for band, order, rays in _row_bands(image):
         traced = tracer.trace(rays)
         dither = pixel_jitter(band.start * width + order, sample)
-        developed = shading.shade(TracedRays(rays, traced, tracer, dither=dither))
-        rgb = developed.composite_over(background)
-        for name, values in developed.layers.items():
+        shaded = shading.shade(TracedRays(rays, traced, tracer, dither=dither))
+        rgb = shaded.composite_over(background)
+        for name, values in shaded.layers.items():
             layers.setdefault(name, np.empty((height, width, values.shape[1]), np.float32))
         for part, values in (
             (out.rgb_srgb, np.clip(rgb, 0, 1)),
@@ -82,7 +82,7 @@ def render_rays(
             (out.depth, traced.expected_depth),
             (out.depth_median, traced.depth_median),
             (out.normal_world, face_viewer(traced.normal_world, rays.directions_world).normal_world),
-            *((layers[name], values) for name, values in developed.layers.items()),
+            *((layers[name], values) for name, values in shaded.layers.items()),
         ):
             part[band].reshape(len(order), -1)[order] = values.reshape(len(order), -1)
     return out
@@ -111,8 +111,8 @@ def shade_layer(
         chosen = pixels[start : start + RAYS_PER_BATCH]
         rays = image.rays[chosen]
         traced = tracer.trace(rays)
-        developed = shading.shade(TracedRays(rays, traced, tracer, dither=pixel_jitter(chosen, sample)))
-        found.append(developed.layers[layer])
+        shaded = shading.shade(TracedRays(rays, traced, tracer, dither=pixel_jitter(chosen, sample)))
+        found.append(shaded.layers[layer])
         alphas.append(traced.alpha)
     return np.concatenate(found), np.concatenate(alphas)
 

@@ -35,7 +35,7 @@ class BakeTarget:
     read: Callable[[TraceResult], Float32[np.ndarray, "r c"]]
 
 
-COLOUR_TARGET = BakeTarget(3, lambda seen: np.clip(seen.rgb_srgb / seen.alpha[:, None], 0.0, 1.0))
+COLOUR_TARGET = BakeTarget(3, lambda traced: np.clip(traced.rgb_srgb / traced.alpha[:, None], 0.0, 1.0))
 """Display values."""
 
 

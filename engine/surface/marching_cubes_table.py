@@ -59,12 +59,12 @@ def case_loops(case: int) -> list[_Loop]:
         inside = [bool(case >> corner & 1) for corner in face]
         for k in range(4):
             if inside[k] and not inside[(k + 1) % 4]:
-                leaving = number[frozenset((face[k], face[(k + 1) % 4]))]
+                outgoing = number[frozenset((face[k], face[(k + 1) % 4]))]
                 start = k
                 while inside[start - 1]:  # back to where this run of inside corners was entered
                     start -= 1
                 entering = number[frozenset((face[start - 1], face[start % 4]))]
-                after[entering] = leaving
+                after[entering] = outgoing
     found = []
     while after:
         first, current = next(iter(after.items()))

@@ -7,7 +7,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, field_valida
 from octasplat.engine.settings.fields import Group, Spelling, Unit
 
 Box = tuple[float, float, float, float, float, float]
-_SAID = Spelling(negatable=True)
+_NEGATABLE = Spelling(negatable=True)
 """Of what ``room`` switches on where nothing is said."""
 
 
@@ -43,7 +43,7 @@ class ExtractionOptions(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    unbounded: Annotated[bool, _SAID] = Field(
+    unbounded: Annotated[bool, _NEGATABLE] = Field(
         False, description="Reach to the horizon, with ever coarser voxels, instead of meshing a box."
     )
     bounds: Annotated[
@@ -98,11 +98,11 @@ class ExtractionOptions(BaseModel):
         description="Space near the surface that no view saw: open leaves holes there, solid closes the "
         "mesh.",
     )
-    backdrop: Annotated[bool, _SAID] = Field(
+    backdrop: Annotated[bool, _NEGATABLE] = Field(
         False,
         description="A sphere around everything that shows what the scene shows in the gaps of the mesh.",
     )
-    refine_vertices: Annotated[bool, _SAID] = Field(
+    refine_vertices: Annotated[bool, _NEGATABLE] = Field(
         False, description="Move vertices along their normals to where the pictures agree, before colours."
     )
     keep_components: Annotated[int | None, Spelling(("--components",))] = Field(

@@ -120,7 +120,7 @@ def _visible_pixels(mesh: TriangleMesh, pictures: Sequence[tuple[ImageRays, np.n
         )
     return _VisiblePixels(
         *(
-            np.concatenate([getattr(sight, name) for sight in found])
+            np.concatenate([getattr(part, name) for part in found])
             for name in ("faces", "weights", "directions_world", "size_world", "steady", "rgb_srgb")
         )
     )

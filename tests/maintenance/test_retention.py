@@ -24,8 +24,8 @@ from octasplat.workers.maintenance.garbage_collection import collect_garbage
 from octasplat.workers.maintenance.retention import (
     DeletedCounts,
     Retention,
+    apply_retention,
     delete_expired,
-    forget_old_things,
     update_expiry_times,
 )
 from octasplat.workers.queue.attempts import Attempt, ResultFile, claim
@@ -306,7 +306,7 @@ async def test_expired_jobs_are_deleted_in_own_transactions(conninfo: str) -> No
             await connection.execute(f"UPDATE datasets SET used_at = {past}".encode())
             query = f"UPDATE datasets SET expires_at = {past} WHERE id = ANY(%s)"
             await connection.execute(query.encode(), [[dataset.id for dataset in old]])
-        await forget_old_things(pool, KEEP, 1.0)
+        await apply_retention(pool, KEEP, 1.0)
         async with pool.connection() as connection:
             assert [await get_job(connection, job.id) for job in jobs] == [None] * 4
             assert [await get_dataset(connection, dataset.id) for dataset in old] == [None] * 2

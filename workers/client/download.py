@@ -62,12 +62,12 @@ def download_results(
         path = folder / artifact["name"]
         before = done
 
-        def tell(count: int, before: int = before) -> None:
+        def report(count: int, before: int = before) -> None:
             progress(before + count, total)
 
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            _download_file(api, job_id, artifact, path, tell)
+            _download_file(api, job_id, artifact, path, report)
         except OSError as error:
             raise OutputError(f"{path} cannot be written ({error.strerror or error}).") from None
         done += artifact["size_bytes"]
@@ -118,8 +118,8 @@ def _resume_download(
         headers |= {"Range": f"bytes={begin}-", "If-Range": f'"{artifact["sha256"]}"'}
     with api.stream("GET", address, headers=headers) as response:
         api.raise_for_stream_status(response)
-        goes_on = response.status_code == 206
-        with partial.open("ab" if goes_on else "wb") as handle:
+        is_partial = response.status_code == 206
+        with partial.open("ab" if is_partial else "wb") as handle:
             for piece in response.iter_bytes():
                 handle.write(piece)
                 on_bytes(handle.tell())

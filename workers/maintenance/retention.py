@@ -37,7 +37,7 @@ class DeletedCounts:
     datasets: int
 
 
-async def forget_old_things(pool: Pool, retention: Retention, audit_hours: float) -> None:
+async def apply_retention(pool: Pool, retention: Retention, audit_hours: float) -> None:
     """Let go of what is older than it is to be kept, and open what a lost process has closed.
 
     Each step is a transaction of its own: rows that one has locked are not kept from others while the next

@@ -291,8 +291,8 @@ class EmbeddedPostgres:
 
     def _last_log_error(self) -> str:
         lines = (self.home / "log").read_text(encoding="utf-8", errors="replace").splitlines()
-        telling = [line for line in lines[-20:] if "FATAL" in line or "PANIC" in line] or lines[-1:]
-        return telling[-1] if telling else "it says nothing."
+        fatal = [line for line in lines[-20:] if "FATAL" in line or "PANIC" in line] or lines[-1:]
+        return fatal[-1] if fatal else "it says nothing."
 
     def _run_program(
         self,

@@ -41,7 +41,7 @@ async def create_job(connection: Connection, job_queue: JobQueue, new: NewJob) -
     """Write the job and its slip in one transaction."""
     async with connection.transaction():
         job_id = new_id()
-        slip = await job_queue.enqueue(connection, job_id, new.queue, new.priority)
+        entry_id = await job_queue.enqueue(connection, job_id, new.queue, new.priority)
         await connection.execute(
             """
             INSERT INTO jobs (id, owner, kind, dataset_id, source_id, label, options, queue, priority, slip,
@@ -50,7 +50,7 @@ async def create_job(connection: Connection, job_queue: JobQueue, new: NewJob) -
             """,
             [
                 job_id, new.owner, new.kind, new.dataset_id, new.source_id, new.label,
-                as_json(dict(new.options)), new.queue, new.priority, slip, new.traceparent,
+                as_json(dict(new.options)), new.queue, new.priority, entry_id, new.traceparent,
                 as_json_or_null(new.estimate), new.files_id,
             ],
         )  # fmt: skip
@@ -248,18 +248,18 @@ async def requeue_job(
     """
     if job.slip is not None and not keep_entry:
         await job_queue.remove(connection, job.slip)
-    slip = await job_queue.enqueue(
+    entry_id = await job_queue.enqueue(
         connection, job.id, job.queue, job.priority, position_of=job.slip, delay_seconds=delay_seconds
     )
     if without_event:
-        await connection.execute("UPDATE jobs SET slip = %s WHERE id = %s", [slip, job.id])
+        await connection.execute("UPDATE jobs SET slip = %s WHERE id = %s", [entry_id, job.id])
         return
     await connection.execute(
         """
         UPDATE jobs SET state = 'queued', slip = %s, queued_at = now(), worker = NULL, seconds_left = NULL
         WHERE id = %s
         """,
-        [slip, job.id],
+        [entry_id, job.id],
     )
     await add_event(connection, job.id, job.attempt, "state", {"state": "queued"})
 

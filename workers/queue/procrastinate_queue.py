@@ -66,9 +66,9 @@ class ProcrastinateQueue:
             task_name=TASK_NAME,
             task_kwargs={"job_id": str(job_id)},
         )
-        slip = (await self._manager.defer_job_async(job, connection=connection)).id
-        assert slip is not None
-        return slip
+        entry_id = (await self._manager.defer_job_async(job, connection=connection)).id
+        assert entry_id is not None
+        return entry_id
 
     async def remove(self, connection: Connection, entry_id: int) -> None:
         """Take a slip away; see the port."""

@@ -101,7 +101,7 @@ async def _run(
 ) -> int:
     address: asyncio.Future[str] = asyncio.get_running_loop().create_future()
 
-    def hear(line: str) -> None:
+    def on_line(line: str) -> None:
         if line.startswith("http"):
             write_json(address_file, {"url": line})
             if not address.done():
@@ -113,7 +113,7 @@ async def _run(
     listen = {"HOST": options.host, "PORT": None if options.port is None else str(options.port)}
     front = {f"{PREFIX}{name}": value for name, value in listen.items() if value is not None}
     api = SupervisedProcess(
-        "front end", _python_command(options, "octasplat.service.serving"), {**environment, **front}, hear
+        "front end", _python_command(options, "octasplat.service.serving"), {**environment, **front}, on_line
     )
     command = _python_command(options, "octasplat", "worker", "--queues")
     children = [api, SupervisedProcess("maintenance", (*command, "", "--name", "maintenance"), environment)]

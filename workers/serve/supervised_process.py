@@ -40,8 +40,8 @@ class SupervisedProcess:
     ) -> None:
         self.name = name
         self._command = command
-        kept = drop_python_variables(os.environ)
-        self._environment = {**kept, **environment, PARENT_PID_VARIABLE: str(os.getpid())}
+        inherited = drop_python_variables(os.environ)
+        self._environment = {**inherited, **environment, PARENT_PID_VARIABLE: str(os.getpid())}
         self._on_line = on_line
         self._process: asyncio.subprocess.Process | None = None
         self._stopping = asyncio.Event()

@@ -97,7 +97,7 @@ class Admission:
         """Return the largest capacity of the queue's live workers; None if one does not report it."""
         stale = self._context.settings.stale_seconds
         async with self._pool.connection() as connection:
-            rooms = [
+            capacities = [
                 row.facts.get("disk_bytes")
                 for row in await live_workers(connection, stale)
                 if job.queue in row.queues
@@ -106,7 +106,7 @@ class Admission:
             own = await asyncio.to_thread(self._context.disk_space.capacity_bytes)
         except StorageError:
             return None
-        return None if None in rooms else max([own, *map(int, filter(None, rooms))])
+        return None if None in capacities else max([own, *map(int, filter(None, capacities))])
 
     async def _free_space(self) -> None:
         """Remove what nobody names, and photographs that can be had from the store again."""

@@ -63,7 +63,7 @@ def main() -> NoReturn:
 
 
 def _run_task(task: dict[str, Any], events: _EventStream, stop: threading.Event) -> int:
-    def tell(event: Event) -> None:
+    def report(event: Event) -> None:
         events.write(event.as_dict())
 
     try:
@@ -83,7 +83,7 @@ def _run_task(task: dict[str, Any], events: _EventStream, stop: threading.Event)
                 scene=Path(task["scene"]) if task["scene"] else None,
                 title=task["title"],
                 threads=task["threads"],
-                progress=tell,
+                progress=report,
                 should_stop=stop.is_set,
                 kind=task.get("kind", ""),
             )

@@ -28,7 +28,7 @@ from octasplat.workers.db.ids import new_id
 from octasplat.workers.db.migrate import wait_for_tables
 from octasplat.workers.db.workers import record_worker_heartbeat, remove_stale_workers, remove_worker
 from octasplat.workers.maintenance.garbage_collection import collect_garbage
-from octasplat.workers.maintenance.retention import forget_old_things, thin_progress_events
+from octasplat.workers.maintenance.retention import apply_retention, thin_progress_events
 from octasplat.workers.maintenance.webhooks.sender import WebhookSender
 from octasplat.workers.parent_death_signal import die_with_local_service
 from octasplat.workers.queue.attempts import FencedError, claim
@@ -205,13 +205,13 @@ class _Worker:
 
     async def _take_jobs(self, tasks: Sequence["asyncio.Task[None]"]) -> None:
         """Take jobs until asked to stop, or all is lost; none while something ails the machine."""
-        host, slips = self._context.host_health, self._context.job_queue
+        host, job_queue = self._context.host_health, self._context.job_queue
         left = asyncio.create_task(self._context.draining.wait())
         while not self._context.draining.is_set() and not self._is_database_lost:
             host.changed.clear()
             ails = asyncio.create_task(host.changed.wait())
             takers = [
-                asyncio.create_task(slips.consume(queue, slots, self._deliver))
+                asyncio.create_task(job_queue.consume(queue, slots, self._deliver))
                 for queue, slots in self._queues.items()
             ]
             await asyncio.wait({left, ails, *tasks, *takers}, return_when=asyncio.FIRST_COMPLETED)
@@ -220,10 +220,10 @@ class _Worker:
             self._is_database_lost = self._is_database_lost or not (
                 self._context.draining.is_set() or host.fault
             )
-            if any(chore.done() for chore in tasks):
+            if any(task.done() for task in tasks):
                 self._is_database_lost = True
                 self._context.draining.set()
-            slips.pause()
+            job_queue.pause()
             for outcome in await asyncio.gather(*takers, return_exceptions=True):
                 if isinstance(outcome, Exception):
                     logger.warning("a queue ended: %s", outcome)
@@ -231,7 +231,7 @@ class _Worker:
             while host.fault and not self._context.draining.is_set() and not self._is_database_lost:
                 seconds = self._settings.recover_seconds
                 await asyncio.wait({left, *tasks}, timeout=seconds, return_when=asyncio.FIRST_COMPLETED)
-                if any(chore.done() for chore in tasks) or await host.try_recover():
+                if any(task.done() for task in tasks) or await host.try_recover():
                     break
         left.cancel()
 
@@ -343,7 +343,7 @@ class _Worker:
 
     async def _delete_expired(self) -> None:
         """Let go of what is older than it is to be kept."""
-        await forget_old_things(self._pool, self._settings.retention, self._settings.keep_audit_hours)
+        await apply_retention(self._pool, self._settings.retention, self._settings.keep_audit_hours)
         for job_id in await fail_abandoned_jobs(
             self._pool,
             self._context.job_queue,

@@ -183,7 +183,7 @@ def build_still_life() -> StillLife:
     counts = [len(scene_object.mesh.faces) for scene_object in scene_objects]
     corners = joined.vertices.astype(np.float64)[joined.faces]
     across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    face_thing = np.repeat(np.arange(len(scene_objects), dtype=np.int32), counts)
+    face_object = np.repeat(np.arange(len(scene_objects), dtype=np.int32), counts)
     return StillLife(
         scene_objects,
         joined.vertices,
@@ -191,7 +191,7 @@ def build_still_life() -> StillLife:
         joined.normals,
         joined.uv,
         joined.texture_xyz,
-        face_thing,
-        np.array([scene_object.is_foreground for scene_object in scene_objects])[face_thing],
+        face_object,
+        np.array([scene_object.is_foreground for scene_object in scene_objects])[face_object],
         (across / np.linalg.norm(across, axis=1, keepdims=True)).astype(np.float32),
     )

@@ -51,8 +51,8 @@ async def _set_and_show(conninfo: str, owner: str, clear: bool, limits: dict[str
 
     async with open_pool(conninfo, max_size=1) as pool, pool.connection() as connection:
         if clear or any(value is not None for value in limits.values()):
-            kept = NO_QUOTA if clear else await quota_of(connection, owner)
-            await set_quota(connection, owner, Quota(**limits).with_defaults(kept))
+            present = NO_QUOTA if clear else await quota_of(connection, owner)
+            await set_quota(connection, owner, Quota(**limits).with_defaults(present))
         quota, usage = await quota_of(connection, owner), await usage_of(connection, owner)
     rows = (
         ("bytes", usage.bytes, quota.max_bytes),
