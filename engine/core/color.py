@@ -5,21 +5,33 @@ from jaxtyping import Float, UInt8
 
 
 def srgb_to_linear(srgb: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape"]:
-    """Linear values of display values in [0, 1]; values below 0 are treated as 0."""
+    """Linear values of display values in [0, 1]; values below 0 are treated as 0.
+
+    >>> srgb_to_linear(np.array([0.0, 0.5, 1.0])).round(3)
+    array([0.   , 0.214, 1.   ])
+    """
     s = np.maximum(srgb.astype(np.float64), 0.0)
     linear = np.where(s <= 0.04045, s / 12.92, ((s + 0.055) / 1.055) ** 2.4)
     return linear.astype(srgb.dtype)
 
 
 def linear_to_srgb(linear: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape"]:
-    """Display values of linear values in [0, 1], computed in their precision; those below 0 count as 0."""
+    """Display values of linear values in [0, 1], computed in their precision; those below 0 count as 0.
+
+    >>> linear_to_srgb(np.array([0.0, 0.214, 1.0])).round(3)
+    array([0. , 0.5, 1. ])
+    """
     exponent = linear.dtype.type(1 / 2.4)
     curve = 1.055 * np.maximum(linear, 0.0031308) ** exponent - 0.055
     return np.where(linear <= 0.0031308, 12.92 * np.maximum(linear, 0.0), curve)
 
 
 def to_bytes(values: Float[np.ndarray, "*shape"]) -> UInt8[np.ndarray, "*shape"]:
-    """Values in [0, 1], clipped and rounded to the nearest of 256 steps (halves to even)."""
+    """Values in [0, 1], clipped and rounded to the nearest of 256 steps (halves to even).
+
+    >>> to_bytes(np.array([-0.1, 0.0, 0.5, 1.0, 1.2]))
+    array([  0,   0, 128, 255, 255], dtype=uint8)
+    """
     return round_to_bytes(values * 255.0)
 
 
@@ -33,5 +45,9 @@ def composite_over(
     alpha: Float[np.ndarray, "*pixels"],
     background_srgb: Float[np.ndarray, "3"],
 ) -> Float[np.ndarray, "*pixels 3"]:
-    """Straight colours over a background, display values throughout."""
+    """Straight colours over a background, display values throughout.
+
+    >>> composite_over(np.array([[1.0, 0.0, 0.0]]), np.array([0.25]), np.array([1.0, 1.0, 1.0]))
+    array([[1.  , 0.75, 0.75]])
+    """
     return rgb_srgb * alpha[..., None] + background_srgb * (np.float32(1) - alpha[..., None])

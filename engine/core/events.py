@@ -142,7 +142,13 @@ EventListener = Callable[[Event], None]
 
 
 def parse_event(kind: str, content: Mapping[str, Any]) -> Event | None:
-    """Return the event that was written as JSON; None for an unknown kind or missing fields."""
+    """Return the event that was written as JSON; None for an unknown kind or missing fields.
+
+    >>> parse_event("stage_finished", {"stage": "train", "seconds": 12.5})
+    PhaseFinished(stage='train', seconds=12.5)
+    >>> parse_event("stage_finished", {"stage": "train"}) is None
+    True
+    """
     model = EVENT_KINDS.get(kind)
     if model is None or not {f.name for f in fields(model) if f.default is MISSING} <= content.keys():
         return None

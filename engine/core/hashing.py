@@ -5,7 +5,12 @@ from jaxtyping import Float64, UInt64
 
 
 def hashed_uniforms(*keys: UInt64[np.ndarray, " n"]) -> Float64[np.ndarray, "2 n"]:
-    """Two numbers in [0, 1) for each row of keys."""
+    """Two numbers in [0, 1) for each row of keys.
+
+    >>> hashed_uniforms(np.arange(2, dtype=np.uint64)).round(3)
+    array([[0.883, 0.567],
+           [0.652, 0.368]])
+    """
     state = splitmix64(keys[0])
     for key in keys[1:]:
         state = splitmix64(state + key)

@@ -41,7 +41,11 @@ def python_command(module: str, *arguments: str, further_modules: Sequence[str] 
 
 
 def drop_python_variables(environment: Mapping[str, str]) -> dict[str, str]:
-    """Return the environment without ``PYTHON*`` variables, for processes that start Python themselves."""
+    """Return the environment without ``PYTHON*`` variables, for processes that start Python themselves.
+
+    >>> drop_python_variables({"PATH": "/bin", "PYTHONPATH": "/tmp/modules"})
+    {'PATH': '/bin'}
+    """
     return {name: value for name, value in environment.items() if not name.startswith("PYTHON")}
 
 

@@ -38,12 +38,20 @@ def choose_origin(centre: Float[np.ndarray, "3"], extent: float) -> Origin:
 
 
 def is_set(origin: Origin) -> bool:
-    """Return whether there is a local origin."""
+    """Return whether there is a local origin.
+
+    >>> is_set((0.0, 0.0, 0.0)), is_set((512350.0, 5403210.0, 310.0))
+    (False, True)
+    """
     return any(value != 0.0 for value in origin)
 
 
 def describe_origin(origin: Origin) -> str:
-    """Return the coordinates of an origin in text, every digit."""
+    """Return the coordinates of an origin in text, every digit.
+
+    >>> describe_origin((512350.0, 5403210.0, 310.0))
+    '512350 5403210 310'
+    """
     return " ".join(f"{value:.15g}" for value in origin)
 
 

@@ -18,6 +18,10 @@ def psnr(
 
     Returns:
         The PSNR; infinite for images that agree wherever they count, not-a-number when no pixel counts.
+
+    >>> reference = np.full((2, 2, 3), 0.5, np.float32)
+    >>> round(psnr(reference + np.float32(0.1), reference), 3), psnr(reference, reference)
+    (20.0, inf)
     """
     squared = np.square(render.astype(np.float64) - reference).mean(axis=-1)
     if weight is None:
@@ -39,6 +43,11 @@ def fit_color(
 
     Weighted least squares, clipped to [0, 1]. Without a pixel of positive weight the render is returned
     unchanged.
+
+    >>> reference = np.linspace(0.1, 0.9, 12, dtype=np.float32).reshape(2, 2, 3)
+    >>> darker = 0.5 * reference
+    >>> np.allclose(fit_color(darker, reference, np.ones((2, 2), np.float32)), reference, atol=1e-6)
+    True
     """
     corrected = render.copy()
     if weight.sum(dtype=np.float64) <= 0:

@@ -80,6 +80,9 @@ class Camera:
         """Return the camera of the same photograph resized, with the exact ratio along each axis.
 
         A model with one focal length turns into its sibling with two where the ratios differ.
+
+        >>> Camera("PINHOLE", (100.0, 100.0, 50.0, 40.0), 100, 80).scaled_to(50, 40).params
+        (50.0, 50.0, 25.0, 20.0)
         """
         if (width_px, height_px) == (self.width_px, self.height_px):
             return self
@@ -104,6 +107,10 @@ class Camera:
         Returns:
             Unit vectors; not-a-number where the model has no ray for the point. A direction counts only if
             it projects back onto its point: some models answer with a wrong one beyond their field of view.
+
+        >>> camera = Camera("PINHOLE", (100.0, 100.0, 50.0, 40.0), 100, 80)
+        >>> camera.directions_cam(np.array([[50.0, 40.0], [150.0, 40.0]])).round(4).tolist()
+        [[0.0, 0.0, 1.0], [0.7071, 0.0, 0.7071]]
         """
         if self.is_pinhole:
             fx, fy, cx, cy = self.pinhole_params

@@ -96,7 +96,11 @@ def rows_per_block(width_px: int) -> int:
 
 
 def pixel_centres(width_px: int, first_row: int, end_row: int) -> Float64[np.ndarray, "n 2"]:
-    """Image points (x, y) of the centres of all pixels of some rows, row by row, in pixels."""
+    """Image points (x, y) of the centres of all pixels of some rows, row by row, in pixels.
+
+    >>> pixel_centres(2, 0, 2).tolist()
+    [[0.5, 0.5], [1.5, 0.5], [0.5, 1.5], [1.5, 1.5]]
+    """
     y, x = np.mgrid[first_row:end_row, 0:width_px]
     return np.stack([x.ravel() + 0.5, y.ravel() + 0.5], axis=1)
 

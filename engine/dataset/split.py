@@ -29,6 +29,10 @@ def split_views(
     Raises:
         DatasetError: a name in ``held_out`` is unknown, or nothing is left to train on.
         ConfigError: ``test_every`` is negative.
+
+    >>> train, test = split_views([f"{k:03d}.jpg" for k in range(10)], test_every=4)
+    >>> train.tolist(), test.tolist()
+    ([1, 2, 3, 5, 6, 7, 9], [0, 4, 8])
     """
     if test_every < 0:
         raise ConfigError(f"test_every is {test_every}; it must be 0 (hold out none) or more.")
@@ -51,7 +55,12 @@ def split_views(
 def evaluation_split(
     names: Sequence[str],
 ) -> tuple[Int64[np.ndarray, " train"], Int64[np.ndarray, " test"]]:
-    """Return the split for photographs that are only evaluated: no training views, all held out."""
+    """Return the split for photographs that are only evaluated: no training views, all held out.
+
+    >>> train, test = evaluation_split(["a.jpg", "b.jpg"])
+    >>> train.tolist(), test.tolist()
+    ([], [0, 1])
+    """
     return np.zeros(0, np.int64), np.arange(len(names), dtype=np.int64)
 
 

@@ -47,12 +47,22 @@ def cam_from_world(xyz_world: Float64[np.ndarray, "n 3"], view: PosedView) -> Fl
 def rotate_vectors(
     vectors: Float64[np.ndarray, "n 3"], rotation: Float64[np.ndarray, "3 3"]
 ) -> Float64[np.ndarray, "n 3"]:
-    """``rotation @ vector``, added up column by column: the same bits on any number of threads."""
+    """``rotation @ vector``, added up column by column: the same bits on any number of threads.
+
+    >>> quarter_turn = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    >>> rotate_vectors(np.array([[1.0, 0.0, 0.0]]), quarter_turn)
+    array([[0., 1., 0.]])
+    """
     return np.asarray(sum(vectors[:, k, None] * rotation[:, k] for k in range(3)))
 
 
 def is_in_image(in_cam: Float64[np.ndarray, "n 3"], camera: Camera) -> Bool[np.ndarray, " n"]:
-    """Return whether points lie in a camera's picture, those behind it only in that of a panorama."""
+    """Return whether points lie in a camera's picture, those behind it only in that of a panorama.
+
+    >>> camera = Camera("PINHOLE", (100.0, 100.0, 50.0, 50.0), 100, 100)
+    >>> is_in_image(np.array([[0.0, 0.0, 2.0], [0.0, 0.0, -2.0], [5.0, 0.0, 2.0]]), camera).tolist()
+    [True, False, False]
+    """
     if camera.is_panorama:
         return np.asarray(np.isfinite(camera.project(in_cam).reshape(-1, 2)).all(axis=1))
     in_front = in_cam[:, 2] > 0

@@ -298,7 +298,11 @@ def read_views(path: Path) -> ViewsRecord:
 
 
 def capped_size(width_px: int, height_px: int, max_side: int | None) -> tuple[int, int]:
-    """Width and height after the cap on the longer side; never enlarged, never below one pixel."""
+    """Width and height after the cap on the longer side; never enlarged, never below one pixel.
+
+    >>> capped_size(4032, 3024, 1600), capped_size(640, 480, 1600), capped_size(640, 480, None)
+    ((1600, 1200), (640, 480), (640, 480))
+    """
     longer = max(width_px, height_px)
     if max_side is None or longer <= max_side:
         return width_px, height_px

@@ -134,7 +134,11 @@ def training_values(
 
 
 def format_axis_duration(seconds: float) -> str:
-    """Format a duration for an axis: ``8.2 s``, ``4 min 10 s``, ``2 h 05 min``."""
+    """Format a duration for an axis: ``8.2 s``, ``4 min 10 s``, ``2 h 05 min``.
+
+    >>> format_axis_duration(8.2), format_axis_duration(250), format_axis_duration(7500)
+    ('8.2 s', '4 min 10 s', '2 h 05 min')
+    """
     if seconds < 60:
         return f"{seconds:.1f} s" if 0 < seconds < 10 else f"{seconds:.0f} s"
     minutes, rest = divmod(round(seconds), 60)
@@ -144,7 +148,11 @@ def format_axis_duration(seconds: float) -> str:
 
 
 def format_axis_number(value: float) -> str:
-    """Format a number for an axis: ``1500`` as ``1.5 k``, ``2000000`` as ``2 M``."""
+    """Format a number for an axis: ``1500`` as ``1.5 k``, ``2000000`` as ``2 M``.
+
+    >>> format_axis_number(0.25), format_axis_number(1500), format_axis_number(2_000_000)
+    ('0.25', '1.5 k', '2 M')
+    """
     for size, suffix in ((1e9, " G"), (1e6, " M"), (1e3, " k")):
         if abs(value) >= size:
             return f"{value / size:.4g}{suffix}"

@@ -51,7 +51,12 @@ def normal_angles_degrees(
 
 
 def intersection_over_union(one: Bool[np.ndarray, "h w"], other: Bool[np.ndarray, "h w"]) -> float:
-    """Return the intersection over union (IoU) of two masks; 1 for two empty ones."""
+    """Return the intersection over union (IoU) of two masks; 1 for two empty ones.
+
+    >>> left, right = np.array([[True, True, False]]), np.array([[False, True, True]])
+    >>> round(intersection_over_union(left, right), 3)
+    0.333
+    """
     either = int((one | other).sum())
     return float((one & other).sum()) / either if either else 1.0
 

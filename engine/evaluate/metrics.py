@@ -72,6 +72,10 @@ def fill_invalid(
 
     For metrics that look at neighbourhoods: what a mask rules out then adds no error, inside or nearby.
     Weights between 0 and 1 blend.
+
+    >>> render, reference = np.zeros((1, 2, 3), np.float32), np.ones((1, 2, 3), np.float32)
+    >>> fill_invalid(render, reference, np.array([[1.0, 0.0]], np.float32))[0, :, 0].tolist()
+    [0.0, 1.0]
     """
     w = weight[..., None]
     return np.asarray(render * w + reference * (1 - w), dtype=np.float32)

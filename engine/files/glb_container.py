@@ -229,7 +229,11 @@ def accessor_json(view: int, component: int, count: int, kind: str) -> dict[str,
 
 
 def vector_type(width: int) -> str:
-    """Return the glTF accessor type of vectors with 1 to 4 components."""
+    """Return the glTF accessor type of vectors with 1 to 4 components.
+
+    >>> vector_type(1), vector_type(3)
+    ('SCALAR', 'VEC3')
+    """
     return "SCALAR" if width == 1 else f"VEC{width}"
 
 

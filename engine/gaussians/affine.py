@@ -46,12 +46,20 @@ def transform_gaussians(gaussians: FlatGaussians, matrix: Float[np.ndarray, "4 4
 
 
 def mean_scale(matrix: Float[np.ndarray, "4 4"]) -> float:
-    """Return the mean scale of an affine map: the cube root of its volume factor."""
+    """Return the mean scale of an affine map: the cube root of its volume factor.
+
+    >>> round(mean_scale(scaling(np.array([1.0, 2.0, 4.0]))), 6)
+    2.0
+    """
     return float(np.cbrt(abs(np.linalg.det(np.asarray(matrix, np.float64)[:3, :3]))))
 
 
 def translation(offset_world: Float[np.ndarray, "3"]) -> Float64[np.ndarray, "4 4"]:
-    """Return the matrix of a translation."""
+    """Return the matrix of a translation.
+
+    >>> translation(np.array([1.0, 2.0, 3.0])) @ [0.0, 0.0, 0.0, 1.0]
+    array([1., 2., 3., 1.])
+    """
     matrix = np.eye(4)
     matrix[:3, 3] = offset_world
     return matrix
@@ -63,7 +71,11 @@ def scaling(factors: Float[np.ndarray, "3"]) -> Float64[np.ndarray, "4 4"]:
 
 
 def rotation(axis_world: Float[np.ndarray, "3"], degrees: float) -> Float64[np.ndarray, "4 4"]:
-    """Return the matrix of a rotation about an axis through the origin, counter-clockwise from its tip."""
+    """Return the matrix of a rotation about an axis through the origin, counter-clockwise from its tip.
+
+    >>> (rotation(np.array([0.0, 0.0, 1.0]), 90.0) @ [1.0, 0.0, 0.0, 1.0]).round(6).tolist()
+    [0.0, 1.0, 0.0, 1.0]
+    """
     axis = np.asarray(axis_world, np.float64)
     length = float(np.linalg.norm(axis))
     if not np.isfinite(length) or length == 0.0:
@@ -82,7 +94,11 @@ def rotation(axis_world: Float[np.ndarray, "3"], degrees: float) -> Float64[np.n
 
 
 def between_axes(old_up: str, new_up: str) -> Float64[np.ndarray, "4 4"]:
-    """Return the shortest rotation that brings one axis (``x``, ``-x``, ... ``-z``) to another."""
+    """Return the shortest rotation that brings one axis (``x``, ``-x``, ... ``-z``) to another.
+
+    >>> (between_axes("-y", "z") @ [0.0, -1.0, 0.0, 1.0]).round(6).tolist()
+    [0.0, 0.0, 1.0, 1.0]
+    """
     old, new = AXES[old_up], AXES[new_up]
     if np.array_equal(old, new):
         return np.eye(4)
@@ -94,7 +110,13 @@ def between_axes(old_up: str, new_up: str) -> Float64[np.ndarray, "4 4"]:
 def conjugate_by_point(
     matrix: Float[np.ndarray, "4 4"], point_world: Float[np.ndarray, "3"]
 ) -> Float64[np.ndarray, "4 4"]:
-    """Return the same map with ``point_world`` in the place of the origin."""
+    """Return the same map with ``point_world`` in the place of the origin.
+
+    >>> point = np.array([1.0, 1.0, 0.0])
+    >>> turn = conjugate_by_point(rotation(np.array([0.0, 0.0, 1.0]), 90.0), point)
+    >>> (turn @ [*point, 1.0]).round(6).tolist()
+    [1.0, 1.0, 0.0, 1.0]
+    """
     result: np.ndarray = translation(point_world) @ matrix @ translation(-np.asarray(point_world))
     return result
 

@@ -14,7 +14,11 @@ ROWS_PER_BLOCK = 1 << 15
 
 
 def row_blocks(count: int, rows_at_once: int = ROWS_PER_BLOCK) -> Iterator[slice]:
-    """Yield slices that cover ``count`` rows in order."""
+    """Yield slices that cover ``count`` rows in order.
+
+    >>> list(row_blocks(10, 4))
+    [slice(0, 4, None), slice(4, 8, None), slice(8, 10, None)]
+    """
     for start in range(0, count, rows_at_once):
         yield slice(start, min(start + rows_at_once, count))
 

@@ -57,7 +57,12 @@ class ImportedMesh:
 
 
 def flip_v(uv: Float32[np.ndarray, "v 2"]) -> Float32[np.ndarray, "v 2"]:
-    """Return texture coordinates with v counted from the top, where a file counts from the bottom."""
+    """Return texture coordinates with v counted from the top, where a file counts from the bottom.
+
+    >>> flip_v(np.array([[0.25, 0.0], [0.5, 0.75]], np.float32))
+    array([[0.25, 1.  ],
+           [0.5 , 0.25]], dtype=float32)
+    """
     return uv * np.array([1, -1], np.float32) + np.array([0, 1], np.float32)
 
 
@@ -66,7 +71,11 @@ MIN_OPACITY_KEY = "octasplat_min_opacity"
 
 
 def number_in_comments(comments: tuple[str, ...], name: str) -> float | None:
-    """Return the number that our exporters write under ``name`` in a comment, or None."""
+    """Return the number that our exporters write under ``name`` in a comment, or None.
+
+    >>> number_in_comments(("made by octasplat", "q 11.5"), "q")
+    11.5
+    """
     for comment in comments:
         words = comment.split()
         if len(words) == 2 and words[0] == name:

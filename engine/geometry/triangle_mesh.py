@@ -125,7 +125,12 @@ class EdgeReport:
 
 
 def edge_report(faces: Int32[np.ndarray, "m 3"]) -> EdgeReport:
-    """Count the open, crowded (more than two triangles) and inconsistently wound edges."""
+    """Count the open, crowded (more than two triangles) and inconsistently wound edges.
+
+    >>> tetrahedron = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]], np.int32)
+    >>> edge_report(tetrahedron)
+    EdgeReport(open_edges=0, non_manifold_edges=0, inconsistent_edges=0)
+    """
     directed = directed_edges(faces)
     ordered = np.sort(directed, axis=1)
     forward = directed[:, 0] < directed[:, 1]
@@ -140,12 +145,20 @@ def edge_report(faces: Int32[np.ndarray, "m 3"]) -> EdgeReport:
 
 
 def directed_edges(faces: Int32[np.ndarray, "m 3"]) -> Int32[np.ndarray, "e 2"]:
-    """Return the three edges of each triangle in its winding, triangle by triangle."""
+    """Return the three edges of each triangle in its winding, triangle by triangle.
+
+    >>> directed_edges(np.array([[0, 1, 2]], np.int32)).tolist()
+    [[0, 1], [1, 2], [2, 0]]
+    """
     return np.ascontiguousarray(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2))
 
 
 def unique_edges(faces: Int32[np.ndarray, "m 3"]) -> Int32[np.ndarray, "e 2"]:
-    """Return the ends of each edge, the lower number first, each edge once and in order."""
+    """Return the ends of each edge, the lower number first, each edge once and in order.
+
+    >>> unique_edges(np.array([[0, 1, 2], [2, 1, 3]], np.int32)).tolist()
+    [[0, 1], [0, 2], [1, 2], [1, 3], [2, 3]]
+    """
     ends = np.sort(directed_edges(faces), axis=1)
     # One number an edge, as sorting rows takes ten times as long.
     size = int(ends.max(initial=0)) + 1

@@ -77,7 +77,7 @@ class PinholeCamera:
         Raises:
             ConfigError: it stands in its target, or looks along the up direction.
 
-        >>> RenderCamera.looking_at((0, 0, -4), (0, 0, 0), 96, 64).centre_world
+        >>> PinholeCamera.looking_at((0, 0, -4), (0, 0, 0), 96, 64).centre_world
         array([ 0.,  0., -4.])
         """
         from octasplat.engine.render.pose_paths import look_at
