@@ -5,7 +5,7 @@ from jaxtyping import Float, UInt8
 
 
 def srgb_to_linear(srgb: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape"]:
-    """Linear values of display values in [0, 1]; values below 0 are treated as 0.
+    """Convert display (sRGB-encoded) values in [0, 1] to linear ones; values below 0 are treated as 0.
 
     >>> srgb_to_linear(np.array([0.0, 0.5, 1.0])).round(3)
     array([0.   , 0.214, 1.   ])
@@ -16,7 +16,7 @@ def srgb_to_linear(srgb: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, "*sha
 
 
 def linear_to_srgb(linear: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape"]:
-    """Display values of linear values in [0, 1], computed in their precision; those below 0 count as 0.
+    """Convert linear values in [0, 1] to display values, in their precision; values below 0 count as 0.
 
     >>> linear_to_srgb(np.array([0.0, 0.214, 1.0])).round(3)
     array([0. , 0.5, 1. ])
@@ -27,7 +27,7 @@ def linear_to_srgb(linear: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, "*s
 
 
 def to_bytes(values: Float[np.ndarray, "*shape"]) -> UInt8[np.ndarray, "*shape"]:
-    """Values in [0, 1], clipped and rounded to the nearest of 256 steps (halves to even).
+    """Convert values in [0, 1] to bytes, clipped and rounded to the nearest of 256 steps (halves to even).
 
     >>> to_bytes(np.array([-0.1, 0.0, 0.5, 1.0, 1.2]))
     array([  0,   0, 128, 255, 255], dtype=uint8)
@@ -36,7 +36,7 @@ def to_bytes(values: Float[np.ndarray, "*shape"]) -> UInt8[np.ndarray, "*shape"]
 
 
 def round_to_bytes(steps: Float[np.ndarray, "*shape"]) -> UInt8[np.ndarray, "*shape"]:
-    """Values in units of one byte step, clipped to 0 ... 255 and rounded (halves to even)."""
+    """Convert values in units of one byte step to bytes, clipped to 0 ... 255, rounded (halves to even)."""
     return np.rint(np.clip(steps, 0.0, 255.0)).astype(np.uint8)
 
 
@@ -45,7 +45,7 @@ def composite_over(
     alpha: Float[np.ndarray, "*pixels"],
     background_srgb: Float[np.ndarray, "3"],
 ) -> Float[np.ndarray, "*pixels 3"]:
-    """Straight colours over a background, display values throughout.
+    """Composite straight (not premultiplied) colours over a background; all are display values.
 
     >>> composite_over(np.array([[1.0, 0.0, 0.0]]), np.array([0.25]), np.array([1.0, 1.0, 1.0]))
     array([[1.  , 0.75, 0.75]])

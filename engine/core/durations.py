@@ -1,4 +1,4 @@
-"""Spans of time in words."""
+"""Durations as text."""
 
 
 def format_clock(seconds: float) -> str:

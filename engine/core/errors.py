@@ -1,4 +1,4 @@
-"""The exceptions that users see: one clear sentence each, naming the file and what to do."""
+"""Exceptions for users: each message is one sentence that names the file and what to do."""
 
 import re
 from typing import Any, ClassVar
@@ -15,7 +15,7 @@ class OctasplatError(Exception):
     error_type: ClassVar[str] = "octasplat_error"
 
     def __init_subclass__(cls, **options: Any) -> None:
-        """Give a class without its own ``error_type`` the one that its name spells."""
+        """Derive ``error_type`` from the class name where a class does not set its own."""
         super().__init_subclass__(**options)
         if "error_type" not in vars(cls):
             cls.error_type = re.sub(r"(?<!^)(?=[A-Z])", "_", cls.__name__).lower()
@@ -28,7 +28,7 @@ class DatasetError(OctasplatError):
 
 
 class ColmapCrashError(OctasplatError):
-    """COLMAP died while it looked for poses."""
+    """COLMAP crashed during pose estimation."""
 
     error_type = "poses_crashed"
 
@@ -40,7 +40,7 @@ class SceneFileError(OctasplatError):
 
 
 class ExportError(OctasplatError):
-    """Some of the files that were asked for could not be written; everything else is there."""
+    """Some of the requested files could not be written; the others were."""
 
     error_type = "export_failed"
 
@@ -52,13 +52,13 @@ class ConfigError(OctasplatError):
 
 
 class OutputError(OctasplatError):
-    """The output folder cannot be used as asked (it holds another run, or cannot be written)."""
+    """The output folder cannot be used: it holds another run, or cannot be written."""
 
     error_type = "output_error"
 
 
 class DiskFullError(OutputError):
-    """A file cannot be written because its disk is full; what was there before is whole."""
+    """A file cannot be written because its disk is full; its former version is unchanged."""
 
     error_type = "no_space_left"
 
@@ -76,12 +76,12 @@ class DamagedCheckpointError(CheckpointError):
 
 
 class TrainingError(OctasplatError):
-    """Training collapsed (not-a-number, an empty scene, a scene that covers nothing); nothing is exported."""
+    """Training failed (not-a-number, an empty scene, a scene that covers nothing); nothing is exported."""
 
     error_type = "training_failure"
 
 
 class CancelledError(OctasplatError):
-    """The run was asked to stop; a checkpoint was written and ``--resume`` goes on from it."""
+    """The run was asked to stop; a checkpoint was written and ``--resume`` continues from it."""
 
     error_type = "cancelled"

@@ -1,7 +1,7 @@
-"""Typed progress events, written as JSON lines and shown by whoever listens.
+"""Typed progress events, written as JSON lines and displayed by listeners.
 
-The engine emits; a progress bar, ``events.jsonl`` and later the web page listen. This module imports
-neither torch nor numba, so that a front end can use it.
+The engine emits events; progress bars, ``events.jsonl`` and the web pages listen. This module imports neither
+torch nor numba, so that a front end can use it.
 """
 
 import json
@@ -84,7 +84,7 @@ class HeldOutMeasured(Event):
 
 @dataclass(frozen=True)
 class CheckpointWritten(Event):
-    """A checkpoint of ``iteration``, or of so many images of a render, is safe on disk at ``path``."""
+    """A checkpoint of ``iteration``, or of that many images of a render, is stored at ``path``."""
 
     kind: ClassVar[str] = "checkpoint_written"
     iteration: int
@@ -93,7 +93,7 @@ class CheckpointWritten(Event):
 
 @dataclass(frozen=True)
 class ImagesSaved(Event):
-    """So many images of a render are safe on disk; a render that is stopped goes on with the others."""
+    """``count`` images of a render are stored; a resumed render continues with the others."""
 
     kind: ClassVar[str] = "images_kept"
     count: int
@@ -101,7 +101,7 @@ class ImagesSaved(Event):
 
 @dataclass(frozen=True)
 class Warned(Event):
-    """Something the user should know, in one sentence; the work goes on."""
+    """A warning for the user, in one sentence; the work continues."""
 
     kind: ClassVar[str] = "warning"
     message: str
@@ -109,7 +109,7 @@ class Warned(Event):
 
 @dataclass(frozen=True)
 class Noted(Event):
-    """Something worth a line of the log, in one sentence, that needs no attention."""
+    """A line for the log, in one sentence, that needs no attention."""
 
     kind: ClassVar[str] = "note"
     message: str
@@ -160,7 +160,7 @@ def ignore_events(_event: Event) -> None:
 
 
 def broadcast(listeners: Iterable[EventListener]) -> EventListener:
-    """One listener that passes every event on to ``listeners``, in order."""
+    """Return a listener that passes every event on to ``listeners``, in order."""
     targets = tuple(listeners)
 
     def send(event: Event) -> None:
@@ -171,7 +171,7 @@ def broadcast(listeners: Iterable[EventListener]) -> EventListener:
 
 
 def read_events(path: Path) -> list[dict[str, object]]:
-    """Rows of an event file, none where there is no file; a last line that a kill cut short is left out."""
+    """Return the rows of an event file, without an incomplete last line; empty if there is no file."""
     rows = []
     if path.exists():
         for line in path.read_text(encoding="utf-8").splitlines():
@@ -198,7 +198,7 @@ class JsonLinesWriter:
             self.release()
 
     def release(self) -> None:
-        """Write what was held, and from now on each event at once."""
+        """Write the events that were held back, and from now on each event at once."""
         if self._file is not None:
             return
         self._path.parent.mkdir(parents=True, exist_ok=True)

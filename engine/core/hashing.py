@@ -1,11 +1,11 @@
-"""Numbers that look random and follow from what they are for, not from a generator's state."""
+"""Pseudorandom numbers by hashing their keys, without a generator's state."""
 
 import numpy as np
 from jaxtyping import Float64, UInt64
 
 
 def hashed_uniforms(*keys: UInt64[np.ndarray, " n"]) -> Float64[np.ndarray, "2 n"]:
-    """Two numbers in [0, 1) for each row of keys.
+    """Return two uniform numbers in [0, 1) for each row of keys.
 
     >>> hashed_uniforms(np.arange(2, dtype=np.uint64)).round(3)
     array([[0.883, 0.567],

@@ -1,8 +1,8 @@
-"""Programs of ours in processes that import nothing from the current folder or ``PYTHONPATH``.
+"""Child processes of octasplat that import nothing from the current folder or ``PYTHONPATH``.
 
-``python -m module`` looks in the current folder first, where anything may lie that is called as what we use.
-What is started here runs with ``-E -P`` instead, finds the very packages that the starting process runs, and
-where somebody asked for modules by name, those. This file is also what is run; it imports nothing of ours.
+``python -m module`` searches the current folder first, where a file may have the name of a module we import.
+The processes started here run with ``-E -P`` instead and find the packages of the starting process, and the
+further modules that the caller names. This file is also the script that is run; it imports nothing of ours.
 """
 
 import importlib.util

@@ -1,8 +1,8 @@
-"""A local origin for scenes whose coordinates are large against their size, as those of maps and the earth.
+"""Local origin for scenes whose coordinates are large compared with their size, such as map coordinates.
 
-Gaussians, rays and most files hold 32-bit numbers, of which a coordinate of five million metres leaves half
-a metre. Such scenes are kept about an origin of their own, and the origin in 64 bits beside them: what a user
-gives and reads is the sum of both. Scenes near the origin of their coordinates have none, i.e. zeros.
+Gaussians, rays and most files hold 32-bit numbers, whose steps at five million metres are half a metre. Such
+scenes are stored relative to a local origin, which is kept in 64 bits beside them: a user gives and reads the
+sum of both. Scenes near the origin of their coordinates have the local origin zero.
 """
 
 import itertools
@@ -56,17 +56,17 @@ def describe_origin(origin: Origin) -> str:
 
 
 def user_position(position: Float[np.ndarray, "3"], origin: Origin) -> str:
-    """Return a position about an origin in the coordinates of the user, in text."""
+    """Return a position relative to ``origin`` as text in the coordinates of the user."""
     if not is_set(origin):
         return " ".join(f"{value:.4g}" for value in position)
     return " ".join(f"{value + start:.11g}" for value, start in zip(position.tolist(), origin, strict=True))
 
 
 def vertices_about(vertices: Float64[np.ndarray, "v 3"], origin: Origin) -> Float64[np.ndarray, "v 3"]:
-    """Return vertices of a file about a local origin, whichever of both the file has them about.
+    """Return vertices of a file relative to a local origin, whichever of the two frames the file uses.
 
-    Programs apply the transform of a file's root node or leave it out, and turn axes. As the origin is far
-    from the scene, the vertices themselves show which is the case.
+    Programs either apply the transform of a file's root node or leave it out, and may turn axes. As the
+    origin is far from the scene, the vertices themselves show which is the case.
 
     Args:
         vertices: as a file gives them, along whatever axes.
@@ -89,7 +89,7 @@ def vertices_about(vertices: Float64[np.ndarray, "v 3"], origin: Origin) -> Floa
 def local_map(
     matrix: Float[np.ndarray, "4 4"], origin: Origin, new_origin: Origin
 ) -> Float64[np.ndarray, "4 4"]:
-    """Return an affine map of user coordinates as one from points about ``origin`` to those about another."""
+    """Return an affine map of user coordinates as a map between points relative to two local origins."""
     local = np.array(matrix, np.float64)
     local[:3, 3] += local[:3, :3] @ np.array(origin) - np.array(new_origin)
     return local

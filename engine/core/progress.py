@@ -1,4 +1,4 @@
-"""The stages of long work, announced when they begin and end, and the time that each took."""
+"""Phases of long work: events at their beginning and end, and the time each took."""
 
 import time
 from collections.abc import Callable, Iterator
@@ -38,14 +38,14 @@ PHASE_TITLES = {
 
 
 class PhaseClock:
-    """The time of a stage, with that of runs before this one that were stopped in it."""
+    """Clock of a phase; includes the time of earlier, interrupted runs."""
 
     def __init__(self) -> None:
         self._began = time.perf_counter()
         self._stopped: float | None = None
 
     def add(self, earlier_seconds: float) -> None:
-        """Count seconds of an earlier run as well."""
+        """Add the seconds of an earlier run."""
         self._began -= earlier_seconds
 
     def seconds(self) -> float:
@@ -60,7 +60,7 @@ class PhaseClock:
 
 @contextmanager
 def phase(name: str, progress: EventListener, steps: int = 0) -> Iterator[PhaseClock]:
-    """Announce a stage; yields its clock, which is stopped at the end if it was not before."""
+    """Run a phase: reports its beginning and end, and yields its clock."""
     progress(PhaseStarted(name, steps))
     clock = PhaseClock()
     yield clock
@@ -83,7 +83,7 @@ class ProgressCallback(Protocol):
 
 @contextmanager
 def counted_phase(name: str, progress: EventListener, steps: int = 0) -> Iterator[ProgressCallback]:
-    """Announce a stage that counts; yields its progress callback."""
+    """Run a phase that counts its steps; yields its progress callback."""
 
     def count(done: int, total: int, part: float = 0.0) -> None:
         progress(PhaseProgress(name, done, total, part))

@@ -9,7 +9,7 @@ def psnr(
     reference: Float32[np.ndarray, "*shape 3"],
     weight: Float32[np.ndarray, "*shape"] | None = None,
 ) -> float:
-    """Peak signal-to-noise ratio in dB, for a peak of 1.
+    """Return the peak signal-to-noise ratio in dB, for a peak of 1.
 
     Args:
         render: Display values.

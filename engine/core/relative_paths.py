@@ -1,4 +1,4 @@
-"""Names in files from elsewhere: paths that stay below a folder, in one spelling of umlauts."""
+"""Relative paths in files from elsewhere: they stay below a folder, in one Unicode spelling."""
 
 import unicodedata
 from pathlib import PurePosixPath, PureWindowsPath
@@ -22,5 +22,5 @@ def check_relative_path(name: str) -> str:
 
 
 def normalize_name(name: str) -> str:
-    """Return a file name in the one spelling (NFC) in which names from two machines are compared."""
+    """Return a file name in Unicode form NFC, in which names from two machines are compared."""
     return unicodedata.normalize("NFC", name)

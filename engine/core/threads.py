@@ -6,7 +6,7 @@ from contextlib import contextmanager
 
 
 def available_threads() -> int:
-    """Most threads that can be used: ``NUMBA_NUM_THREADS``, or the cores this process may run on."""
+    """Return the most threads that can be used: ``NUMBA_NUM_THREADS``, or the cores of this process."""
     limit = os.environ.get("NUMBA_NUM_THREADS", "")
     if limit.isdigit() and int(limit) > 0:
         return int(limit)
@@ -14,7 +14,7 @@ def available_threads() -> int:
 
 
 def use_threads(threads: int) -> int:
-    """Let numba's parallel kernels take ``threads`` threads when this thread calls them; 0 means all.
+    """Set how many threads numba's parallel kernels use when this thread calls them; 0 means all.
 
     Returns:
         The number that they take, which is never more than numba was started with.
@@ -28,7 +28,7 @@ def use_threads(threads: int) -> int:
 
 
 def threads_in_use() -> int:
-    """Return how many threads kernels take when this thread calls them, as :func:`use_threads` has set it."""
+    """Return how many threads kernels use when this thread calls them, as set by :func:`use_threads`."""
     import numba
 
     return int(numba.get_num_threads())
@@ -36,7 +36,7 @@ def threads_in_use() -> int:
 
 @contextmanager
 def limit_torch_threads() -> Iterator[None]:
-    """Keep torch to the calling thread, where several photographs are worked on side by side already."""
+    """Limit torch to the calling thread, for work that is already parallel over photographs."""
     import torch  # here, as it takes a second and most work needs none of it
 
     before = torch.get_num_threads()

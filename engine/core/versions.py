@@ -1,4 +1,4 @@
-"""Versions of everything that can change a result; they stand in ``config.json`` and ``metrics.json``."""
+"""Versions of everything that can change a result, written to ``config.json`` and ``metrics.json``."""
 
 import importlib.metadata
 
@@ -25,5 +25,5 @@ anew under another, rather than gone on with."""
 
 
 def package_versions() -> dict[str, str]:
-    """Version of the project and of each package that it computes with, by name."""
+    """Return the versions of the project and of the packages that it computes with, by name."""
     return {"octasplat": __version__, **{name: importlib.metadata.version(name) for name in PACKAGES}}

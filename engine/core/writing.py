@@ -1,4 +1,4 @@
-"""Writing files so that a reader never sees half of one, and a full disk is told with the file's name."""
+"""Atomic writing of files, with errors of a full disk that name the file."""
 
 import errno
 import json
@@ -15,7 +15,7 @@ DISK_FULL_ERRORS = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
 
 @contextmanager
 def report_disk_full(path: Path) -> Iterator[None]:
-    """Inside the block ``path`` is written, which the system's own errors do not say.
+    """Raise errors of a full disk inside the block as an error that names ``path``.
 
     Raises:
         DiskFullError: there is no room for it.

@@ -1,4 +1,4 @@
-"""Cameras of every model COLMAP knows, used as rays through pixels; nothing is ever undistorted."""
+"""Cameras of every COLMAP model, used as rays through pixels; images are never undistorted."""
 
 from dataclasses import dataclass
 
@@ -44,7 +44,7 @@ class Camera:
 
     @property
     def pinhole_params(self) -> tuple[float, float, float, float]:
-        """The parameters (fx, fy, cx, cy) of a pinhole camera, in pixels.
+        """Return the parameters (fx, fy, cx, cy) of a pinhole camera, in pixels.
 
         Raises:
             ValueError: the camera is not a pinhole camera.
@@ -59,7 +59,7 @@ class Camera:
 
     @property
     def pixel_angle_rad(self) -> float:
-        """The angle of a pixel in the middle of the image; 0 where the model has no rays there."""
+        """Return the angle of a pixel at the image centre; 0 where the model has no rays there."""
         x, y = self.width_px / 2, self.height_px / 2
         ways = self.directions_cam(np.array([[x, y], [x + 1, y]]))
         angle = float(np.linalg.norm(np.cross(ways[0], ways[1])))
@@ -126,5 +126,5 @@ class Camera:
         return directions
 
     def project(self, points_cam: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 2"]:
-        """Image points of points in camera coordinates, in pixels; not-a-number where there is none."""
+        """Project points in camera coordinates to pixels; not-a-number where there is no projection."""
         return np.array(self.to_pycolmap().img_from_cam(np.ascontiguousarray(points_cam)), dtype=np.float64)

@@ -1,7 +1,7 @@
 """Free space around each camera, estimated from the sparse points.
 
-Where a camera stood was room for it, and for some way around. A Gaussian there is seen closely by few
-photographs or by none, but hangs as a veil before views from the places between them.
+There is free space where a camera was, and for some distance around it. A Gaussian there is seen from close
+up by few photographs or by none, but is a floater in views from between the cameras.
 """
 
 from collections.abc import Sequence
@@ -22,8 +22,8 @@ NEAREST_QUANTILE = 10
 def camera_clearances(viewpoints: Viewpoints, points: SparsePoints) -> Float64[np.ndarray, " v"]:
     """Return the radius of free space around each camera in world units; 0 where there are too few points.
 
-    In any direction: what stands behind a camera, other photographs show. A tree trunk before a house has few
-    of all points, so that a share of them would pass it over.
+    It is the same in all directions, as other photographs show what is behind a camera. It comes from the
+    nearest points, not from a share of all: a tree trunk before a house has few of all points.
     """
     if len(points) < MIN_POINTS:
         return np.zeros(len(viewpoints.views))

@@ -1,6 +1,6 @@
-"""A look over the structure of COLMAP's binary files.
+"""Check of the structure of COLMAP's binary files.
 
-COLMAP's own reader takes a file that ends too early without complaint, or asks for absurd amounts of memory.
+COLMAP's own reader accepts a truncated file without complaint, or asks for absurd amounts of memory.
 """
 
 import mmap
@@ -14,7 +14,7 @@ from octasplat.engine.core.errors import DatasetError
 
 
 def check_binary_colmap_model(folder: Path) -> None:
-    """Check that the binary files of the model in ``folder`` are whole.
+    """Check that the binary files of the model in ``folder`` are complete.
 
     Raises:
         DatasetError: a file ends too early or late, or names a camera model that is not known.

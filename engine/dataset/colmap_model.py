@@ -1,4 +1,4 @@
-"""Reading a COLMAP model, with or without rigs, binary or text, into plain records."""
+"""Reader of COLMAP models, with or without rigs, binary or text."""
 
 import math
 import re
@@ -94,7 +94,7 @@ def find_colmap_model_folder(root: Path) -> Path:
 
 
 def has_colmap_model(root: Path) -> bool:
-    """Return whether the scene brings a COLMAP model, or at least a part of one."""
+    """Return whether the dataset has a COLMAP model, or at least a part of one."""
     return any(numbered_models(root / name) or _if_model(root / name) for name in MODEL_FOLDERS)
 
 
@@ -107,7 +107,7 @@ def numbered_models(folder: Path) -> list[Path]:
 
 
 def posed_image_count(folder: Path) -> int:
-    """Return how many images a model announces; 0 where that cannot be read."""
+    """Return how many images a model declares; 0 where that cannot be read."""
     try:
         if (folder / "images.bin").is_file():
             with (folder / "images.bin").open("rb") as file:
@@ -177,9 +177,9 @@ def read_colmap_model(
 
 
 def _normalise_quaternions(reconstruction: Any, folder: Path, warnings: list[str]) -> None:
-    """Bring the quaternions of frames and rigs to unit length, before poses are composed of them.
+    """Normalise the quaternions of frames and rigs before poses are composed of them.
 
-    pycolmap takes them as they are, and composes anything, even zeros, to something like a pose.
+    pycolmap composes poses of any quaternions, even of zeros.
     """
     scaled = 0
     for frame in reconstruction.frames.values():
@@ -216,7 +216,7 @@ def _normalise_quaternions(reconstruction: Any, folder: Path, warnings: list[str
 
 
 def _with_unit_rotation(pose: Any) -> tuple[Any, bool]:
-    """``pose`` with its quaternion at length 1, and whether that is worth telling."""
+    """Return ``pose`` with its quaternion normalised, and whether that deserves a warning."""
     length = pose.rotation.norm()
     if abs(length - 1) <= UNIT_NORM_TOLERANCE:
         return pose, False
@@ -280,7 +280,7 @@ def _point_positions(reconstruction: Any) -> Float64[np.ndarray, "n 3"]:
 
 
 def _local_origin(images: Sequence[PosedImage], points_world: Float64[np.ndarray, "n 3"]) -> Origin:
-    """Choose an origin by the cameras, and by the points where all cameras stand in one place."""
+    """Choose a local origin by the cameras, or by the points where all cameras are in one place."""
     if not images:
         return NO_ORIGIN
     centres = np.stack(

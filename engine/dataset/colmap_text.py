@@ -1,6 +1,6 @@
-"""A look at the lines of COLMAP's text files, for when COLMAP's own reader gave up on one of them.
+"""Check of the lines of COLMAP's text files, for models that COLMAP's own reader refuses.
 
-It says which check of its code failed, which helps nobody to find the line.
+COLMAP's message names the failed check in its code, not the line.
 """
 
 import math
@@ -38,7 +38,7 @@ def find_text_model_error(folder: Path) -> str | None:
 
 
 def _lines(path: Path) -> Iterator[tuple[int, list[str]]]:
-    """Numbers and fields of the lines that describe something, the observations of images left out."""
+    """Yield the number and the fields of each line, without the observations of images."""
     if not path.is_file():
         return
     with path.open(encoding="utf-8", errors="replace") as lines:

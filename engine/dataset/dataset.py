@@ -1,4 +1,4 @@
-"""A scene with its pixels: rays and colours of any pixels of any views."""
+"""Datasets with their pixels: rays and colors of any pixels of any views."""
 
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -197,7 +197,7 @@ class Dataset:
         threads: int = 0,
         progress: Callable[[int, int], None] | None = None,
     ) -> "Dataset":
-        """Photographs to measure a scene by that was trained on others: all are held out, one is enough.
+        """Open photographs that only evaluate a scene trained on others: all are held out, one is enough.
 
         Args:
             root: as in :meth:`open`; the model needs no points.
@@ -234,7 +234,7 @@ class Dataset:
 
     @property
     def train_pixel_count(self) -> int:
-        """Number of pixels of all training views, those of weight 0 included."""
+        """Return the number of pixels of all training views, including those of weight 0."""
         return int(self._train_pixels[-1])
 
     @property
@@ -268,7 +268,7 @@ class Dataset:
     def pixels(
         self, view: Int[np.ndarray, " n"], y: Int[np.ndarray, " n"], x: Int[np.ndarray, " n"]
     ) -> tuple[Float32[np.ndarray, "n 3"], Float32[np.ndarray, " n"], Float32[np.ndarray, " n"]]:
-        """Straight display colours and alpha in [0, 1], and weights: 1, or 0 where a pixel does not count.
+        """Return straight display colors and alpha in [0, 1], and weights: 1, or 0 for invalid pixels.
 
         Raises:
             IndexError: a pixel does not exist.
@@ -294,7 +294,7 @@ class Dataset:
         return rgb, alpha, weight
 
     def view_rays(self, view_index: int) -> ImageRays:
-        """All rays of one view."""
+        """Return all rays of one view."""
         width, height = self._view_size(view_index)
         directions = np.empty((height * width, 3), dtype=np.float32)
         for pixels, view, y, x in _iterate_row_blocks(view_index, width, height):
@@ -306,7 +306,7 @@ class Dataset:
     def view_image(
         self, view_index: int
     ) -> tuple[Float32[np.ndarray, "h w 3"], Float32[np.ndarray, "h w"], Float32[np.ndarray, "h w"]]:
-        """Colours, alpha and weights of all pixels of one view, as by :meth:`pixels`."""
+        """Return colors, alpha and weights of all pixels of one view, as by :meth:`pixels`."""
         width, height = self._view_size(view_index)
         rgb = np.empty((height * width, 3), dtype=np.float32)
         alpha = np.empty(height * width, dtype=np.float32)
@@ -318,7 +318,7 @@ class Dataset:
     def sample_pixels(
         self, rng: np.random.Generator, count: int
     ) -> tuple[Int64[np.ndarray, " n"], Int64[np.ndarray, " n"], Int64[np.ndarray, " n"]]:
-        """``count`` pixels (view, y, x), uniform and independent over all pixels of all training views."""
+        """Draw ``count`` pixels (view, y, x), uniformly and independently over all training views."""
         drawn = rng.integers(0, self._train_pixels[-1], size=count, dtype=np.int64)
         which = np.searchsorted(self._train_pixels, drawn, side="right")
         view = self.train_indices[which]
@@ -328,7 +328,7 @@ class Dataset:
         return view, y, inside - y * width
 
     def release_pages(self) -> None:
-        """Give mapped pages back to the system, e.g. before a stage that needs the memory."""
+        """Release mapped pages to the system, e.g. before a stage that needs the memory."""
         for mapped in (self._cache.rgb, self._cache.alpha, self._cache.mask, self._ray_tables.values):
             mapped.release()
 
@@ -387,7 +387,7 @@ def _pixel_centres(y: Int64[np.ndarray, " n"], x: Int64[np.ndarray, " n"]) -> Fl
 def _iterate_row_blocks(
     view_index: int, width: int, height: int
 ) -> Iterator[tuple[slice, Int64[np.ndarray, " n"], Int64[np.ndarray, " n"], Int64[np.ndarray, " n"]]]:
-    """All pixels of a view, some rows at a time: their place in the view, view, y and x."""
+    """Yield all pixels of a view, some rows at a time: their index in the view, view, y and x."""
     step = rows_per_block(width)
     for start in range(0, height, step):
         stop = min(start + step, height)

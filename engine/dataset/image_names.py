@@ -1,7 +1,7 @@
-"""Names of images in a model, matched with the files that are there though they are spelt otherwise.
+"""Matching of the image names in a model with files whose names are spelt differently.
 
-Models come from other machines: upper and lower case, backslashes, folders before the name and suffixes
-differ. A name is taken for a file only where no other name and no other file could be meant.
+Models come from other machines: case, backslashes, leading folders and suffixes differ. A name is matched
+with a file only where no other name and no other file fits.
 """
 
 from collections import Counter
@@ -32,7 +32,7 @@ def match_image_names(names: Iterable[str], files: Collection[str]) -> Mapping[s
 
 
 def _by_spelling(names: Iterable[str], spelling: Callable[[str], str]) -> dict[str, str]:
-    """Return the names by how they are spelt, without those that are then the same."""
+    """Return the names by their spelling, without those whose spelling is not unique."""
     pairs = [(spelling(name), name) for name in names]
     counts = Counter(spelt for spelt, _ in pairs)
     return {spelt: name for spelt, name in pairs if counts[spelt] == 1}

@@ -1,4 +1,4 @@
-"""Reading photographs and masks, whatever their format, as display values at a working size."""
+"""Reader of photographs and masks of any format, as display values at a working size."""
 
 import struct
 from dataclasses import dataclass

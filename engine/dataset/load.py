@@ -1,4 +1,4 @@
-"""Matching a COLMAP model with the photographs and masks on disk."""
+"""Matching of a COLMAP model with the photographs and masks on disk."""
 
 import os
 from dataclasses import replace
@@ -164,7 +164,7 @@ def _holds_photographs(folder: Path) -> bool:
 def _find_images(
     folder: Path, model: ColmapModel, warnings: list[str], *, warn_unposed: bool
 ) -> tuple[list[PosedImage], list[Path], dict[str, Path]]:
-    """Return the images of the model under the names of their files, sorted, the files and masks beside."""
+    """Return the images of the model with their file names, sorted, and the files and masks beside them."""
     on_disk = _files_below(folder)
     images_on_disk = [name for name, path in on_disk.items() if path.suffix.lower() in IMAGE_SUFFIXES]
     owners = masks_beside(images_on_disk)
@@ -220,7 +220,7 @@ def _mask_paths(
 
 
 def _files_below(folder: Path) -> dict[str, Path]:
-    """Files by their NFC-normalised path below ``folder``, without hidden ones and results of runs."""
+    """Return files by their NFC path below ``folder``, without hidden ones and results of runs."""
     files: dict[str, Path] = {}
     for parent, folders, names in os.walk(folder, followlinks=True):
         folders[:] = sorted(

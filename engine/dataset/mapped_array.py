@@ -1,4 +1,4 @@
-"""Flat arrays that live in files and are mapped, not read, into memory."""
+"""Flat arrays in files that are mapped into memory, not read."""
 
 import mmap
 import os
@@ -11,7 +11,7 @@ import numpy as np
 
 @dataclass(frozen=True, eq=False)
 class MappedArray:
-    """A read-only flat array over a mapped file; its pages can be given back at any time."""
+    """A read-only flat array over a mapped file; its pages can be released at any time."""
 
     values: np.ndarray[Any, np.dtype[Any]]
     _map: mmap.mmap | None = None
@@ -20,8 +20,8 @@ class MappedArray:
     def open(cls, path: Path, dtype: Any) -> "MappedArray":
         """Map the file at ``path`` as a flat array of ``dtype``.
 
-        A file below half of the machine's memory is read ahead; of a larger one only the pages asked for
-        are read, as random access would drag in many neighbours for nothing.
+        A file below half of the machine's memory is read ahead; of a larger one only the requested pages are
+        read, as read-ahead would load many unused neighbours.
         """
         size = path.stat().st_size
         if size == 0:
@@ -40,6 +40,6 @@ class MappedArray:
         return cls(values)
 
     def release(self) -> None:
-        """Give the pages back to the system; they are read again when they are next asked for."""
+        """Release the pages to the system; they are read again when they are next used."""
         if self._map is not None:
             self._map.madvise(mmap.MADV_DONTNEED)

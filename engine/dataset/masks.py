@@ -1,4 +1,4 @@
-"""Masks of photographs: which file is whose, and which pixels they say are valid."""
+"""Masks of photographs: which file belongs to which photograph, and which pixels are valid."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -60,7 +60,7 @@ def mask_for(name: str, masks: Mapping[str, Path], beside: Mapping[str, Path]) -
 def read_mask(
     path: Path, image_size_px: tuple[int, int], width_px: int, height_px: int
 ) -> tuple[UInt8[np.ndarray, "h w"], MaskSummary]:
-    """Read a mask, 255 where the photograph is valid, and say what the file holds.
+    """Read a mask, 255 where the photograph is valid, and its summary.
 
     Args:
         path: the mask file; its first channel counts.
@@ -80,7 +80,7 @@ def read_mask(
 
 
 def check_masks(masks: Sequence[MaskSummary], photograph_count: int) -> tuple[str, ...]:
-    """Return warnings of masks that leave nothing of their photographs.
+    """Return warnings for masks that leave no valid pixel.
 
     Args:
         masks: of a scene.

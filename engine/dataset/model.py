@@ -33,7 +33,7 @@ class PosedView:
 
     @property
     def origin_world(self) -> Float64[np.ndarray, "3"]:
-        """Centre of projection, in world coordinates."""
+        """Return the centre of projection in world coordinates."""
         return -self.rotation_cam_from_world.T @ self.translation_cam_from_world
 
 
@@ -130,7 +130,7 @@ class DatasetModel(Viewpoints):
 
 
 def scene_extent(origins_world: Float64[np.ndarray, "n 3"], points: SparsePoints) -> float:
-    """Radius of the camera positions, the unit of length of learning rates and densification; never 0.
+    """Return the radius of the camera positions, the unit of learning rates and densification; never 0.
 
     1.1 times the largest distance of a camera centre to their mean, as in 3D Gaussian Splatting (Kerbl et
     al. 2023), among the centres that are not strays, i.e. not farther than 5 times the median distance from

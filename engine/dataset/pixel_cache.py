@@ -40,7 +40,7 @@ Progress = Callable[[int, int], None]
 
 @dataclass(frozen=True, eq=False)
 class PixelCache:
-    """Mapped planes of all views; ``alpha`` and ``mask`` are empty where there is nothing to say.
+    """Mapped planes of all views; ``alpha`` and ``mask`` are empty where no view has them.
 
     Attributes:
         rgb: straight display colours, 3 values a pixel.
@@ -60,7 +60,7 @@ class PixelCache:
 
 
 def file_digests(model: DatasetModel, folder: Path, *, threads: int = 0) -> tuple[FileDigests, ...]:
-    """Digests of the files of every view, from the cache in ``folder`` where it is that of just these files.
+    """Return digests of the files of every view, from the cache in ``folder`` if it is of these files.
 
     Raises:
         DatasetError: a file cannot be read.
@@ -139,7 +139,7 @@ def _open_plane(path: Path, exists: bool) -> MappedArray:
 
 
 def _cache_key(model: DatasetModel) -> str:
-    """Names the files by their places, sizes and times, and the size of the views."""
+    """Return a key of the files by their paths, sizes and times, and of the size of the views."""
     sources: list[object] = [str(model.root.resolve())]
     for view in model.views:
         for path in (view.image_path, view.mask_path):

@@ -1,4 +1,4 @@
-"""A look over the poses of a model: cameras absurdly far off, and poses that several images share."""
+"""Check of the poses of a model: cameras absurdly far away, and poses that several images share."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -24,7 +24,7 @@ def check_poses(
     translations_cam_from_world: Float64[np.ndarray, "n 3"],
     points: SparsePoints,
 ) -> list[str]:
-    """Refuse poses that nothing can come of, and tell of those that look wrong.
+    """Refuse unusable poses, and warn of suspicious ones.
 
     Distances are measured from the median camera. What is usual is their median, or that of the points where
     this is larger, as it is where a camera only turned.

@@ -1,4 +1,4 @@
-"""Tables of ray directions for cameras whose rays are not worth computing anew each time.
+"""Tables of ray directions for cameras whose rays are too expensive to compute each time.
 
 ``directions.bin`` holds, for every camera that is not a pinhole, the unit direction through the centre of
 every pixel (row by row, 3 float32, camera coordinates; not-a-number where the model has none);
@@ -96,7 +96,7 @@ def rows_per_block(width_px: int) -> int:
 
 
 def pixel_centres(width_px: int, first_row: int, end_row: int) -> Float64[np.ndarray, "n 2"]:
-    """Image points (x, y) of the centres of all pixels of some rows, row by row, in pixels.
+    """Return the image points (x, y) of all pixel centres of some rows, row by row, in pixels.
 
     >>> pixel_centres(2, 0, 2).tolist()
     [[0.5, 0.5], [1.5, 0.5], [0.5, 1.5], [1.5, 1.5]]

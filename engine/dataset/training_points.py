@@ -1,7 +1,7 @@
-"""The sparse points that the training photographs know without the held-out ones.
+"""Sparse points that the training photographs determine without the held-out ones.
 
-A point that only held-out photographs show, or one training photograph and a held-out one, tells where the
-surface lies that the held-out views are to be measured by. A training must not begin with it.
+A point that only held-out photographs observe, or one training photograph and a held-out one, reveals where
+the surface is that the held-out views are evaluated on. Training must not start from it.
 """
 
 import numpy as np
@@ -16,7 +16,7 @@ MIN_OBSERVATIONS = 2
 def is_observed_by(
     views: Int64[np.ndarray, " t"], points: SparsePoints, observations: Observations
 ) -> Bool[np.ndarray, " n"]:
-    """Return which points at least two of ``views`` show.
+    """Return which points at least two of ``views`` observe.
 
     All count where no photograph is said to show any, or where none would be left.
 
@@ -38,7 +38,7 @@ def is_observed_by(
 def training_points(
     views: Int64[np.ndarray, " t"], points: SparsePoints, observations: Observations
 ) -> SparsePoints:
-    """Return the points that at least two of ``views`` show; see :func:`is_observed_by`."""
+    """Return the points that at least two of ``views`` observe; see :func:`is_observed_by`."""
     known = is_observed_by(views, points, observations)
     return SparsePoints(
         points.xyz_world[known],

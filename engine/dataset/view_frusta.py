@@ -12,7 +12,7 @@ from octasplat.engine.dataset.model import PosedView, Viewpoints
 
 @dataclass(frozen=True, eq=False)
 class ViewFrusta:
-    """All that lies in the pyramid of any of these views, at whatever depth, hidden or not.
+    """Union of the view frusta of some views, at any depth, occluded or not.
 
     Attributes:
         views: the views.
@@ -47,7 +47,7 @@ def cam_from_world(xyz_world: Float64[np.ndarray, "n 3"], view: PosedView) -> Fl
 def rotate_vectors(
     vectors: Float64[np.ndarray, "n 3"], rotation: Float64[np.ndarray, "3 3"]
 ) -> Float64[np.ndarray, "n 3"]:
-    """``rotation @ vector``, added up column by column: the same bits on any number of threads.
+    """Return ``rotation @ vector``, summed column by column: the same bits on any number of threads.
 
     >>> quarter_turn = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
     >>> rotate_vectors(np.array([[1.0, 0.0, 0.0]]), quarter_turn)
@@ -57,7 +57,7 @@ def rotate_vectors(
 
 
 def is_in_image(in_cam: Float64[np.ndarray, "n 3"], camera: Camera) -> Bool[np.ndarray, " n"]:
-    """Return whether points lie in a camera's picture, those behind it only in that of a panorama.
+    """Return whether points project into a camera's image; points behind it only for a panorama.
 
     >>> camera = Camera("PINHOLE", (100.0, 100.0, 50.0, 50.0), 100, 100)
     >>> is_in_image(np.array([[0.0, 0.0, 2.0], [0.0, 0.0, -2.0], [5.0, 0.0, 2.0]]), camera).tolist()
@@ -80,7 +80,7 @@ def is_in_image(in_cam: Float64[np.ndarray, "n 3"], camera: Camera) -> Bool[np.n
 
 
 def min_corner_cosine(camera: Camera) -> float:
-    """Of the angle between the camera's axis and the rays of its corners, 0.1 at least and if unknown."""
+    """Return the cosine between the camera's axis and its corner rays, at least 0.1; 0.1 if unknown."""
     width, height = float(camera.width_px), float(camera.height_px)
     corners = np.array([[0.0, 0.0], [width, 0.0], [0.0, height], [width, height]])
     cosines = camera.directions_cam(corners)[:, 2]

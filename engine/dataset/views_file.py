@@ -1,7 +1,8 @@
-"""``views.json``: what a run was made from, to tell other photographs from them and to do without them.
+"""``views.json``: the photographs, cameras and split of a run.
 
-For every photograph its name, size, pose and camera, whether it was held out, and digests of its file and of
-its mask's; for the sparse points one digest. Where the folder of the photographs lies is not part of it.
+A later command can tell other photographs from these, and needs no photographs where cameras suffice. For
+every photograph it has the name, size, pose and camera, whether it was held out, and digests of its file and
+of its mask's; for the sparse points one digest. The folder of the photographs is not part of it.
 """
 
 import hashlib
@@ -145,7 +146,7 @@ class ViewsRecord(_FrozenModel):
         )
 
     def about(self, origin_world: Origin) -> "ViewsRecord":
-        """Return the same views with poses about another local origin."""
+        """Return the views with poses relative to another local origin."""
         if origin_world == self.origin_world:
             return self
         shift = np.array(self.origin_world) - np.array(origin_world)
@@ -189,7 +190,7 @@ class ViewsRecord(_FrozenModel):
         return None if self == other else "another split"
 
     def is_of_same_world(self, other: "ViewsRecord") -> bool:
-        """Return whether ``other`` has photographs of the same names, and all of them in the same poses."""
+        """Return whether ``other`` has photographs of the same names in the same poses."""
         others = {view.name: view for view in other.about(self.origin_world).views}
         shared = [(view, others[view.name]) for view in self.views if view.name in others]
         return bool(shared) and all(
@@ -204,9 +205,10 @@ class ViewsRecord(_FrozenModel):
         )
 
     def is_of_another_world(self, other: "ViewsRecord") -> bool:
-        """Return whether most of the photographs that ``other`` shares stand elsewhere there.
+        """Return whether most of the photographs that ``other`` shares have other poses there.
 
-        Single ones may, as those that a run placed anew; and all may a little, as where it adjusted lenses.
+        Single ones may differ, as those that a run corrected; and all may differ a little, as where it
+        adjusted lenses.
         """
         others = {(view.name, view.photograph_sha256): view for view in other.about(self.origin_world).views}
         names = ((view, (view.name, view.photograph_sha256)) for view in self.views)
@@ -298,7 +300,7 @@ def read_views(path: Path) -> ViewsRecord:
 
 
 def capped_size(width_px: int, height_px: int, max_side: int | None) -> tuple[int, int]:
-    """Width and height after the cap on the longer side; never enlarged, never below one pixel.
+    """Return width and height after the cap on the longer side; never enlarged, never below one pixel.
 
     >>> capped_size(4032, 3024, 1600), capped_size(640, 480, 1600), capped_size(640, 480, None)
     ((1600, 1200), (640, 480), (640, 480))

@@ -1,4 +1,4 @@
-"""Scenes with one colour for each Gaussian, as formats without harmonics need them: which colour that is."""
+"""Scenes with one color for each Gaussian, as formats without harmonics need them, and its choice."""
 
 from collections.abc import Callable, Sequence
 from functools import cached_property
@@ -23,7 +23,7 @@ MAX_VIEWS = 48
 
 
 class BakedScene:
-    """A scene of which the one colour of each Gaussian is found when somebody asks, and once.
+    """A scene whose single color per Gaussian is computed once, when it is first requested.
 
     Args:
         gaussians: the scene.
@@ -49,7 +49,7 @@ class BakedScene:
 
     @cached_property
     def gaussians(self) -> FlatGaussians:
-        """The scene without harmonics beyond the constant one."""
+        """Return the scene without harmonics beyond the constant one."""
         if self._gaussians.sh_degree == 0:
             return self._gaussians
         if self._run is None:
@@ -78,6 +78,6 @@ def _around(gaussians: FlatGaussians) -> Sequence[Callable[[], ImageRays]]:
 
 
 def _some(indices: Int64[np.ndarray, " n"]) -> Int64[np.ndarray, " m"]:
-    """Not more than ``MAX_VIEWS`` of them, spread evenly."""
+    """Return at most ``MAX_VIEWS`` of the views, spread evenly."""
     count = min(len(indices), MAX_VIEWS)
     return indices[np.linspace(0, len(indices) - 1, count).round().astype(np.int64)]

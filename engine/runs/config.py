@@ -1,4 +1,4 @@
-"""The settings of a reconstruction, and how they follow from what is asked for.
+"""Settings of a reconstruction, and their resolution from preset, options and assignments.
 
 Imports neither torch nor numba.
 """
@@ -29,7 +29,7 @@ from octasplat.engine.train.config.presets import PRESETS, PRESETS_WITH_MATERIAL
 
 
 class ReconstructionConfig(RunSettings):
-    """Everything that decides what a reconstruction gives; the number of threads does not."""
+    """All settings that decide the result of a reconstruction; the number of threads does not."""
 
     train: TrainConfig = Field(TrainConfig(), description="The settings of the training.")
     evaluation_background: Annotated[Literal["black", "white"], ADVANCED] = Field(
@@ -64,7 +64,7 @@ class ReconstructionConfig(RunSettings):
         )
 
     def with_poses_decided(self, has_model: bool) -> "ReconstructionConfig":
-        """Return the same with ``poses`` as they come out for a dataset with or without a COLMAP model."""
+        """Return the settings with ``poses`` resolved for a dataset with or without a COLMAP model."""
         if self.poses != "missing":
             return self
         return self.model_copy(update={"poses": "given" if has_model else "auto"})

@@ -1,4 +1,4 @@
-"""The folder of a run: the names of its files, and what its photographs are and were taken from."""
+"""Run folder: the names of its files, and the photographs and cameras of the run."""
 
 import json
 from collections.abc import Callable

@@ -1,4 +1,4 @@
-"""Poses of a run: found where there are none, and checked where they are given."""
+"""Poses of a run: estimated where there are none, and checked where they are given."""
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -41,7 +41,7 @@ def find_missing_poses(
     progress: EventListener,
     should_stop: Callable[[], bool],
 ) -> None:
-    """Find the poses of a run's photographs, if that is asked for and not done yet.
+    """Estimate the poses of a run's photographs, if requested and not done yet.
 
     Raises:
         DatasetError: there are no photographs, or their poses cannot be found.
@@ -84,7 +84,7 @@ def repair_run_poses(
     progress: EventListener,
     should_stop: Callable[[], bool],
 ) -> bool:
-    """Place photographs of a given model anew that stand in the wrong place; whether there are any.
+    """Correct wrong poses of a given model; returns whether any was corrected.
 
     Photographs that a short training shows to be in doubt (stage ``check``) are matched with the others;
     those that are moved have their poses from the model in the run's ``poses/`` from then on.
@@ -164,7 +164,7 @@ def estimate_principal_points(
     progress: EventListener,
     should_stop: Callable[[], bool],
 ) -> bool:
-    """Give each photograph a principal point of its own if the lens moved; whether it did.
+    """Estimate a principal point for each photograph if the lens moved; returns whether it did.
 
     The model is then the one in the run's ``poses/``; see :mod:`octasplat.engine.poses.lens_check` for what
     is asked first, which takes no time worth a stage.

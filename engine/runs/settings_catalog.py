@@ -49,12 +49,12 @@ class Setting:
 
     @property
     def default(self) -> object:
-        """The value in the preset ``standard``, or else in the first that has the setting."""
+        """Return the value in the preset ``standard``, or else in the first that has the setting."""
         return self.defaults.get("standard", next(iter(self.defaults.values()), None))
 
     @property
     def exceptions(self) -> Mapping[str, object]:
-        """The values by preset that differ from the default."""
+        """Return the values by preset that differ from the default."""
         return {name: value for name, value in self.defaults.items() if value != self.default}
 
 
@@ -162,7 +162,7 @@ def _setting(name: str, info: FieldInfo, defaults: Mapping[str, object]) -> Sett
 
 
 def _parts(annotation: Any) -> tuple[Any, ...]:
-    """Return the alternatives of an annotation, without marks."""
+    """Return the alternatives of a type annotation, without their marks."""
     if get_origin(annotation) is Annotated:
         return _parts(get_args(annotation)[0])
     if get_origin(annotation) in (Union, types.UnionType):

@@ -1,4 +1,4 @@
-"""Compiled gathers over the mapped pixels and ray tables."""
+"""Kernels that gather pixels and rays from the mapped planes and ray tables."""
 
 import math
 from typing import NamedTuple

@@ -37,7 +37,7 @@ def write_synthetic_dataset(
     config: SyntheticDatasetConfig | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> None:
-    """Make the generated scene in the folder ``root``, all of it or nothing.
+    """Write the synthetic dataset into the folder ``root``, completely or not at all.
 
     The scene is built in a folder beside ``root`` that takes its place at the end. Where the same scene is
     already complete, nothing is done.

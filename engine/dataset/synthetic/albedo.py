@@ -30,7 +30,7 @@ Colours = Float32[np.ndarray, "n 3"]
 
 
 def _wood_grain(xyz: TexturePoints, light: str, dark: str, seed: int) -> Colours:
-    """Wood whose fibres run along x."""
+    """Return the albedo of wood whose fibres run along x."""
     wander = gradient_noise(scale_points(xyz, (1.2, 5.0, 5.0)), octaves=2, seed=seed)
     rings = 0.5 + 0.5 * np.sin(70 * xyz[:, 1] + 22 * xyz[:, 2] + 9 * wander)
     fibre = gradient_noise(scale_points(xyz, (5.0, 130.0, 130.0)), octaves=2, seed=seed + 1)
@@ -42,7 +42,7 @@ def _wood_grain(xyz: TexturePoints, light: str, dark: str, seed: int) -> Colours
 
 
 def table_wood(xyz: TexturePoints, uv: UvCoordinates) -> Colours:
-    """Oiled planks with dark seams."""
+    """Return the albedo of oiled planks with dark seams."""
     plank = np.floor(xyz[:, 1] / 0.19 + 0.5)
     shade = cell_noise(plank, np.zeros_like(plank), seed=3)
     shifted = xyz + np.stack([7 * shade, 3 * shade, 5 * shade], axis=1)
@@ -52,12 +52,12 @@ def table_wood(xyz: TexturePoints, uv: UvCoordinates) -> Colours:
 
 
 def pedestal_wood(xyz: TexturePoints, uv: UvCoordinates) -> Colours:
-    """Dark turned wood, fibres upright."""
+    """Return the albedo of dark turned wood, fibres upright."""
     return _wood_grain(np.ascontiguousarray(xyz[:, [2, 0, 1]]), "7a4a2c", "3b2012", seed=24)
 
 
 def floor_tiles(xyz: TexturePoints, uv: UvCoordinates) -> Colours:
-    """Terracotta and cream tiles, some with an octagon, all stained and grouted."""
+    """Return the albedo of terracotta and cream tiles, some with an octagon, all stained and grouted."""
     u, v = xyz[:, 0] / 0.4, xyz[:, 1] / 0.4
     tone = cell_noise(u, v, seed=5)
     odd = checkerboard(u, v)
@@ -71,7 +71,7 @@ def floor_tiles(xyz: TexturePoints, uv: UvCoordinates) -> Colours:
 
 
 def _painting(index: int, u: np.ndarray, v: np.ndarray) -> Colours:
-    """Eight different paintings, u and v in [0, 1] across the canvas."""
+    """Return the albedo of eight different paintings, u and v in [0, 1] across the canvas."""
     flat = np.stack([u, v, np.full_like(u, index)], axis=1).astype(np.float32)
     if index == 0:  # hills at dusk, one behind another
         colours = lerp(linear_from_hex("f6c177"), linear_from_hex("3e5c9a"), smoothstep(0.35, 1.0, v))
@@ -115,7 +115,7 @@ def _painting(index: int, u: np.ndarray, v: np.ndarray) -> Colours:
 
 
 def room_walls(xyz: TexturePoints, uv: UvCoordinates) -> Colours:
-    """Panelled below, papered above, a painting on each side, letters along a frieze; u has 10 m a side."""
+    """Return the albedo of panelled walls with wallpaper, paintings and a frieze; u has 10 m a side."""
     side = np.floor(uv[:, 0] / 10 + 0.5).astype(np.int32)
     u, v = uv[:, 0] - 10 * side.astype(np.float32), uv[:, 1]
     stripe = box_mask(np.mod(u / 0.24, 1), 0.0, 0.5)
@@ -146,7 +146,7 @@ def room_walls(xyz: TexturePoints, uv: UvCoordinates) -> Colours:
 
 
 def vase_glaze(xyz: TexturePoints, uv: UvCoordinates) -> Colours:
-    """White porcelain painted with blue bands."""
+    """Return the albedo of white porcelain painted with blue bands."""
     turn, z = uv[:, 0], xyz[:, 2]
     paint = gradient_noise(xyz * np.float32(35), octaves=3, seed=60)
     colours = np.broadcast_to(linear_from_hex("eee8dc"), xyz.shape) * grey_column(1 + 0.07 * paint)
@@ -177,7 +177,7 @@ def vase_glaze(xyz: TexturePoints, uv: UvCoordinates) -> Colours:
 
 
 def knot_glaze(xyz: TexturePoints, uv: UvCoordinates) -> Colours:
-    """Glossy bands that wind around the tube, flecked."""
+    """Return the albedo of flecked bands that wind around the tube."""
     phase = 30 * uv[:, 0] + 2 * uv[:, 1]
     band = np.floor(np.mod(phase, 3))
     colours = lerp(linear_from_hex("d62839"), linear_from_hex("f6b92b"), (band == 1).astype(np.float32))
@@ -188,7 +188,7 @@ def knot_glaze(xyz: TexturePoints, uv: UvCoordinates) -> Colours:
 
 
 def tower_bricks(xyz: TexturePoints, uv: UvCoordinates) -> Colours:
-    """Small bricks with mortar, and a band of letters on each side."""
+    """Return the albedo of small bricks with mortar, and a band of letters on each side."""
     u, v = uv[:, 0], uv[:, 1]
     course = v / 0.032
     along = u / 0.07 + 0.5 * np.mod(np.floor(course), 2)
@@ -205,7 +205,7 @@ def tower_bricks(xyz: TexturePoints, uv: UvCoordinates) -> Colours:
 
 
 def boulder_stone(xyz: TexturePoints, uv: UvCoordinates) -> Colours:
-    """Speckled granite with lichen on its upper side."""
+    """Return the albedo of speckled granite with lichen on its upper side."""
     body = gradient_noise(xyz * np.float32(9), octaves=4, seed=65)
     colours = lerp(linear_from_hex("8d8a83"), linear_from_hex("4f4b48"), np.clip(0.5 + 0.9 * body, 0, 1))
     speck = gradient_noise(xyz * np.float32(110), octaves=2, seed=66)

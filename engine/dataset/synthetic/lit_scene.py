@@ -1,4 +1,4 @@
-"""The still life in Embree, lit once: light that falls on each vertex, and colours of hits."""
+"""The still life in Embree, lit once: irradiance of each vertex, and colors of hits."""
 
 import os
 from concurrent.futures import ThreadPoolExecutor
@@ -48,17 +48,17 @@ class LitScene:
     def trace(
         self, origins: Float32[np.ndarray, "n 3"], directions: Float32[np.ndarray, "n 3"]
     ) -> TriangleHits:
-        """First hits along rays in the world frame; directions need not have unit length."""
+        """Return the first hits of rays in the world frame; directions need not have unit length."""
         return self._mesh.closest(RayBatch(origins, directions))
 
     def _shadow_transmittance(
         self, origins: Float[np.ndarray, "n 3"], directions: Float[np.ndarray, "n 3"]
     ) -> np.ndarray:
-        """1.0 where nothing lies between an origin and the origin plus its direction, else 0.0."""
+        """Return 1.0 where nothing is between an origin and the origin plus its direction, else 0.0."""
         return 1.0 - self._mesh.occluded(RayBatch(origins, directions, t_max=1.0))
 
     def _vertex_irradiance(self) -> tuple[Float32[np.ndarray, "n 3"], Float32[np.ndarray, " n"]]:
-        """Irradiance on each vertex (lamp, sky, a constant for bounces) and the share of the lamp seen."""
+        """Return the irradiance of each vertex (lamp, sky, constant indirect) and the lamp's visibility."""
         pieces = np.array_split(np.arange(len(self.still_life.vertices)), _CHUNKS)
         with ThreadPoolExecutor(THREADS) as pool:
             parts = list(pool.map(self._irradiance_at, pieces))
@@ -97,7 +97,7 @@ class LitScene:
     def shade_hits(
         self, hits: TriangleHits, origins: Float32[np.ndarray, "n 3"], directions: Float32[np.ndarray, "n 3"]
     ) -> Float32[np.ndarray, "n 3"]:
-        """Display colours in [0, 1] that rays bring back from their hits."""
+        """Return the display colors in [0, 1] of hits."""
         radiance = np.empty_like(directions)
         missed = ~hits.is_hit
         radiance[missed] = _sky_radiance(directions[missed])
@@ -132,7 +132,7 @@ def _phong_highlight(
     directions: Float32[np.ndarray, "n 3"],
     normals: Float32[np.ndarray, "n 3"],
 ) -> Float32[np.ndarray, " n"]:
-    """Mirrored lamp on a glossy surface: a Phong lobe about the mirrored ray."""
+    """Return the lamp's highlight on a glossy surface: a Phong lobe about the mirrored ray."""
     ahead, upwards, to_lamp = (
         _normalised(a) for a in (directions, normals, _LAMP_WORLD.astype(np.float32) - places)
     )
@@ -145,7 +145,7 @@ def _normalised(vectors: Float32[np.ndarray, "n 3"]) -> Float32[np.ndarray, "n 3
 
 
 def _lamp_points(count: int) -> Float[np.ndarray, "n 3"]:
-    """Points spread evenly (by the golden angle) over the lamp's disc, which faces the table."""
+    """Return points spread evenly (by the golden angle) over the lamp's disc, which faces the table."""
     k = np.arange(count)
     radius, angle = _LAMP_RADIUS * np.sqrt((k + 0.5) / count), k * np.pi * (3 - np.sqrt(5))
     down = -_LAMP_WORLD / np.linalg.norm(_LAMP_WORLD)
@@ -167,11 +167,11 @@ def _sphere_directions(count: int) -> Float[np.ndarray, "n 3"]:
 
 
 def _sky_radiance(directions: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-    """Radiance of the open roof."""
+    """Return the radiance of the open roof."""
     height = np.clip(directions[:, 2:] / np.linalg.norm(directions, axis=1, keepdims=True), 0, 1)
     return _HORIZON + (_ZENITH - _HORIZON) * height
 
 
 def _tonemap(radiance: Float32[np.ndarray, "n 3"]) -> Float32[np.ndarray, "n 3"]:
-    """sRGB-encoded colours of linear light, with a soft shoulder so that nothing clips hard."""
+    """Return sRGB-encoded colors of linear light, with a soft shoulder so that nothing clips hard."""
     return linear_to_srgb(1 - np.exp(radiance * np.float32(-_EXPOSURE)))

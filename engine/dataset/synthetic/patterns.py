@@ -39,7 +39,7 @@ _BITMAPS = _font_bitmaps()
 
 
 def linear_from_hex(colour: str) -> Float32[np.ndarray, "3"]:
-    """Linear light of a display colour written as ``rrggbb``."""
+    """Return the linear light of a display color written as ``rrggbb``."""
     srgb = np.array([int(colour[k : k + 2], 16) for k in (0, 2, 4)]) / 255
     return srgb_to_linear(srgb).astype(np.float32)
 
@@ -49,12 +49,12 @@ def lerp(
     second: Float32[np.ndarray, "... 3"],
     amount: Float32[np.ndarray, " n"],
 ) -> Float32[np.ndarray, "n 3"]:
-    """Colours on the way from ``first`` (amount 0) to ``second`` (amount 1)."""
+    """Interpolate linearly between ``first`` (amount 0) and ``second`` (amount 1)."""
     return first + (second - first) * amount[:, None]
 
 
 def smoothstep(low: float, high: float, values: Float32[np.ndarray, " n"]) -> Float32[np.ndarray, " n"]:
-    """0 below ``low``, 1 above ``high``, smooth between; ``low`` above ``high`` turns it round."""
+    """Return 0 below ``low``, 1 above ``high``, smooth between; ``low`` above ``high`` reverses it."""
     t = np.clip((values - np.float32(low)) * np.float32(1 / (high - low)), 0, 1)
     return t * t * (3 - 2 * t)
 
@@ -62,7 +62,7 @@ def smoothstep(low: float, high: float, values: Float32[np.ndarray, " n"]) -> Fl
 def gradient_noise(
     points: Float32[np.ndarray, "n 3"], octaves: int = 1, seed: int = 0
 ) -> Float32[np.ndarray, " n"]:
-    """Fractal gradient noise, one cell of the coarsest octave a unit."""
+    """Return fractal gradient noise; a cell of the coarsest octave has the size 1."""
     out = np.empty(len(points), np.float32)
     noise.fractal_noise(np.ascontiguousarray(points), octaves, seed, out)
     return out
@@ -79,21 +79,21 @@ def cell_noise(
 
 
 def box_mask(values: Float32[np.ndarray, " n"], low: float, high: float) -> Float32[np.ndarray, " n"]:
-    """1 between ``low`` and ``high``, else 0."""
+    """Return 1 between ``low`` and ``high``, else 0."""
     return ((values >= low) & (values < high)).astype(np.float32)
 
 
 def checkerboard(
     first: Float32[np.ndarray, " n"], second: Float32[np.ndarray, " n"]
 ) -> Float32[np.ndarray, " n"]:
-    """0 and 1 on alternate unit squares."""
+    """Return 0 and 1 on alternate unit squares."""
     return np.mod(np.floor(first) + np.floor(second), 2)
 
 
 def grid_lines(
     first: Float32[np.ndarray, " n"], second: Float32[np.ndarray, " n"], width: float
 ) -> Float32[np.ndarray, " n"]:
-    """1 in lines of ``width`` along the borders of unit squares, else 0."""
+    """Return 1 in lines of ``width`` along the borders of unit squares, else 0."""
     reach = np.maximum(np.abs(np.mod(first, 1) - 0.5), np.abs(np.mod(second, 1) - 0.5))
     return (reach > 0.5 - 0.5 * width).astype(np.float32)
 
@@ -101,14 +101,14 @@ def grid_lines(
 def sawtooth_mask(
     first: Float32[np.ndarray, " n"], second: Float32[np.ndarray, " n"]
 ) -> Float32[np.ndarray, " n"]:
-    """1 below a saw of unit period and unit height, else 0."""
+    """Return 1 below a sawtooth of unit period and unit height, else 0."""
     return (second < np.abs(2 * np.mod(first, 1) - 1)).astype(np.float32)
 
 
 def disc_pattern(
     first: Float32[np.ndarray, " n"], second: Float32[np.ndarray, " n"], radius: float
 ) -> Float32[np.ndarray, " n"]:
-    """1 in discs of ``radius`` at the middles of unit squares, else 0."""
+    """Return 1 in discs of ``radius`` at the centres of unit squares, else 0."""
     distance = np.hypot(np.mod(first, 1) - 0.5, np.mod(second, 1) - 0.5)
     return (distance < radius).astype(np.float32)
 
@@ -116,7 +116,7 @@ def disc_pattern(
 def octagon_pattern(
     first: Float32[np.ndarray, " n"], second: Float32[np.ndarray, " n"], radius: float
 ) -> Float32[np.ndarray, " n"]:
-    """1 in regular octagons of apothem ``radius`` at the middles of unit squares, else 0."""
+    """Return 1 in regular octagons of apothem ``radius`` at the centres of unit squares, else 0."""
     x, y = np.abs(np.mod(first, 1) - 0.5), np.abs(np.mod(second, 1) - 0.5)
     reach = np.maximum(np.maximum(x, y), (x + y) * np.float32(np.sqrt(0.5)))
     return (reach < radius).astype(np.float32)
@@ -125,7 +125,7 @@ def octagon_pattern(
 def text_mask(
     first: Float32[np.ndarray, " n"], second: Float32[np.ndarray, " n"], lines: Sequence[str]
 ) -> Float32[np.ndarray, " n"]:
-    """1 on the strokes of capital letters, else 0.
+    """Return 1 on the strokes of capital letters, else 0.
 
     A letter fills one unit of ``first``; lines are one unit of ``second`` apart, the first at the top
     (``second`` just below 0), the text repeating in both directions.
@@ -144,10 +144,10 @@ def text_mask(
 
 
 def scale_points(points: Float32[np.ndarray, "n 3"], factors: Sequence[float]) -> Float32[np.ndarray, "n 3"]:
-    """``points`` with each coordinate multiplied, to stretch a solid texture."""
+    """Return ``points`` with each coordinate multiplied, to stretch a solid texture."""
     return points * np.asarray(factors, np.float32)
 
 
 def grey_column(values: Float[np.ndarray, " n"]) -> Float32[np.ndarray, "n 1"]:
-    """Numbers as a column that scales colours."""
+    """Return numbers as a column that scales colors."""
     return values.astype(np.float32)[:, None]

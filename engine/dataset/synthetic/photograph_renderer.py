@@ -1,4 +1,4 @@
-"""Photographs of the still life, and what is known exactly about each of their pixels."""
+"""Photographs of the still life, and the ground truth of their pixels."""
 
 from dataclasses import dataclass
 
@@ -34,7 +34,7 @@ class RenderedPhotograph:
 
 
 class PhotographRenderer:
-    """Takes photographs with one lens; ``render`` may be called from several threads."""
+    """Renders photographs with one camera; ``render`` may be called from several threads."""
 
     def __init__(self, scene: LitScene, camera: pycolmap.Camera, config: SyntheticDatasetConfig) -> None:
         self._scene = scene
@@ -72,7 +72,7 @@ class PhotographRenderer:
         )
 
     def _render_pixels(self, view: SyntheticView) -> Float32[np.ndarray, "n channels"]:
-        """Box-filtered display colours of all pixels."""
+        """Return box-filtered display colors of all pixels."""
         samples = len(self._offsets)
         step = max(1, _RAYS_PER_CHUNK // samples) * samples
         parts = []
@@ -96,7 +96,7 @@ class PhotographRenderer:
 def rays_world(
     view: SyntheticView, directions: Float32[np.ndarray, "n 3"]
 ) -> tuple[Float32[np.ndarray, "n 3"], Float32[np.ndarray, "n 3"]]:
-    """Origins and directions in the world frame of rays with z = 1 in the camera frame.
+    """Return world origins and directions of rays with z = 1 in the camera frame.
 
     Distances along them, counted in lengths of the direction, are therefore z-depths.
     """

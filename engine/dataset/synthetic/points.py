@@ -1,4 +1,4 @@
-"""Surface points that several photographs see, as structure from motion would have found them."""
+"""Surface points that several photographs observe, as structure from motion would find them."""
 
 from dataclasses import dataclass
 
@@ -38,7 +38,7 @@ class SurfacePoints:
 def sample_surface_points(
     scene: LitScene, camera: pycolmap.Camera, views: list[SyntheticView], config: SyntheticDatasetConfig
 ) -> SurfacePoints:
-    """``config.points`` points under randomly chosen pixels, each seen by at least two views.
+    """Sample ``config.points`` surface points under random pixels, each observed by at least two views.
 
     Where only the objects are to be reconstructed, the points lie on these. Fewer points come back if the
     views hardly overlap.
@@ -102,7 +102,7 @@ def _points_under_pixels(
 def _project_unoccluded(
     scene: LitScene, camera: pycolmap.Camera, view: SyntheticView, xyz: Float[np.ndarray, "n 3"]
 ) -> Float[np.ndarray, "n 2"]:
-    """Image positions of the points that ``view`` sees, not-a-number for the others."""
+    """Return the image positions of the points that ``view`` observes, not-a-number for the others."""
     pixels = project_visible(camera, view, xyz)
     inside = np.flatnonzero(np.isfinite(pixels[:, 0]))
     ways = (xyz[inside] - view.centre_world).astype(np.float32)

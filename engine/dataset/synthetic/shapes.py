@@ -1,4 +1,4 @@
-"""Triangle meshes of simple shapes, each made of grids that are smooth within and sharp between.
+"""Triangle meshes of simple shapes, each made of grids with smooth normals inside and sharp edges between.
 
 All shapes are in their own frame, z up, in metres; faces wind anticlockwise as seen from outside.
 """
@@ -36,7 +36,7 @@ class TexturedMesh:
 def _vertex_normals(
     vertices: Float[np.ndarray, "n 3"], faces: Int32[np.ndarray, "m 3"]
 ) -> Float32[np.ndarray, "n 3"]:
-    """Area-weighted normals; vertices at the same place share one, so seams and poles do not show."""
+    """Return area-weighted normals; vertices at the same place share one, so that seams are invisible."""
     a, b, c = (vertices[faces[:, k]] for k in range(3))
     across = np.cross(b - a, c - a)
     _, place = np.unique(np.round(vertices, 6), axis=0, return_inverse=True)
@@ -73,7 +73,7 @@ def grid_surface(
 
 
 def join_meshes(meshes: Sequence[TexturedMesh]) -> TexturedMesh:
-    """All ``meshes`` as one, vertices kept apart."""
+    """Join ``meshes`` to one without merging vertices."""
     starts = np.cumsum([0] + [len(mesh.vertices) for mesh in meshes[:-1]])
     return TexturedMesh(
         np.concatenate([mesh.vertices for mesh in meshes]),
@@ -87,7 +87,7 @@ def join_meshes(meshes: Sequence[TexturedMesh]) -> TexturedMesh:
 def place_mesh(
     mesh: TexturedMesh, rotation: Float[np.ndarray, "3 3"], x: float, y: float, bottom: float
 ) -> TexturedMesh:
-    """``mesh`` turned by ``rotation``, its origin over (x, y) and its lowest point at z = ``bottom``."""
+    """Return ``mesh`` rotated by ``rotation``, its origin over (x, y) and its lowest point at ``bottom``."""
     turned = mesh.vertices.astype(np.float64) @ rotation.T
     turned += [x, y, bottom - turned[:, 2].min()]
     normals = mesh.normals.astype(np.float64) @ rotation.T

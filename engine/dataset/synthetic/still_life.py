@@ -1,4 +1,4 @@
-"""The still life: which things stand where, in what material, and all of it as one mesh.
+"""The still life: placement and material of its objects, and all of it as one mesh.
 
 The world is in metres with z up; the table top is the plane z = 0 around the origin, the floor lies at
 ``FLOOR_Z``, and eight walls surround both. The roof is open to a sky and to one lamp.
@@ -34,7 +34,7 @@ WALL_HEIGHT = 4.2
 
 @dataclass(frozen=True)
 class SceneObject:
-    """One part of the still life; ``is_foreground`` tells the table and what is on it from the room."""
+    """One object of the still life; ``is_foreground`` separates the table and its objects from the room."""
 
     name: str
     mesh: TexturedMesh
@@ -45,7 +45,7 @@ class SceneObject:
 
 @dataclass(frozen=True)
 class StillLife:
-    """All things as one mesh: its ``faces`` index ``vertices``, ``face_object`` indexes ``objects``."""
+    """All objects as one mesh: its ``faces`` index ``vertices``, ``face_object`` indexes ``objects``."""
 
     objects: tuple[SceneObject, ...]
     vertices: Float32[np.ndarray, "n 3"]

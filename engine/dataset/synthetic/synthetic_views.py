@@ -46,7 +46,7 @@ def synthetic_camera(config: SyntheticDatasetConfig) -> pycolmap.Camera:
 
 
 def synthetic_views(config: SyntheticDatasetConfig) -> list[SyntheticView]:
-    """All views, ring by ring from the lowest; each looks about at the middle of the still life."""
+    """Return all views, ring by ring from the lowest; each looks at about the middle of the still life."""
     random = np.random.default_rng([config.seed, 1])
     ends = np.round(np.cumsum([share for share, _, _ in _RINGS]) * config.views).astype(int)
     counts = np.diff(ends, prepend=0)
@@ -74,7 +74,7 @@ def synthetic_views(config: SyntheticDatasetConfig) -> list[SyntheticView]:
 
 
 def directions_cam(camera: pycolmap.Camera, pixels: Float[np.ndarray, "n 2"]) -> Float32[np.ndarray, "n 3"]:
-    """Directions (x, y, 1) in the camera frame that end up at image positions, lens distortion undone."""
+    """Return camera-frame directions (x, y, 1) through image positions, lens distortion undone."""
     xy = camera.cam_from_img(np.ascontiguousarray(pixels, np.float64))
     return np.concatenate([xy, np.ones((len(xy), 1))], axis=1).astype(np.float32)
 
@@ -82,7 +82,7 @@ def directions_cam(camera: pycolmap.Camera, pixels: Float[np.ndarray, "n 2"]) ->
 def project_visible(
     camera: pycolmap.Camera, view: SyntheticView, points_world: Float[np.ndarray, "n 3"]
 ) -> Float[np.ndarray, "n 2"]:
-    """Image positions of points, not-a-number where they lie behind the camera or outside the photograph."""
+    """Project points to image positions, not-a-number behind the camera or outside the photograph."""
     in_cam = points_world @ view.rotation_cam_from_world.T + view.translation_cam_from_world
     pixels = np.full((len(in_cam), 2), np.nan)
     ahead = np.flatnonzero(in_cam[:, 2] > 1e-6)

@@ -1,4 +1,4 @@
-"""Filling a folder with the generated scene's files."""
+"""Writer of the files of a synthetic dataset."""
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor, as_completed
