@@ -1,4 +1,4 @@
-"""The end of tasks that run beside others."""
+"""Cancellation of tasks that run beside others."""
 
 import asyncio
 from collections.abc import Iterable
@@ -11,11 +11,11 @@ RECANCEL_SECONDS = 5.0
 async def cancel_and_wait(tasks: Iterable["asyncio.Future[Any]"]) -> list[BaseException | None]:
     """Cancel tasks until all have ended.
 
-    Once is not enough: a cancellation that comes as what a task waits for ends may be lost on its way
-    through ``asyncio.wait_for`` (Python before 3.12) or a library, and whoever waits would do so for ever.
+    A single cancellation is not enough: one that arrives just as the awaited operation ends may be lost in
+    ``asyncio.wait_for`` (Python before 3.12) or in a library, and the caller would wait for ever.
 
     Returns:
-        What each ended by, in their order; None where it had returned.
+        The exception that ended each task, in their order; None where it had returned.
     """
     ordered = list(tasks)
     left = set(ordered)

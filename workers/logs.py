@@ -8,7 +8,7 @@ _NOISY = ("procrastinate", "psycopg", "httpx", "httpcore")
 
 
 def log_to_stderr() -> None:
-    """Write warnings of libraries and everything of ours, one line each, to stderr."""
+    """Write warnings of libraries and all log lines of octasplat to stderr."""
     debug = os.environ.get("OCTASPLAT_DEBUG") == "1"
     handler = logging.StreamHandler(sys.stderr)
     handler.setFormatter(logging.Formatter("%(asctime)s %(levelname).1s %(name)s: %(message)s", "%H:%M:%S"))

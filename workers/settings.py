@@ -1,4 +1,4 @@
-"""Settings of everything that talks to the database, from the environment; the service adds its own."""
+"""Settings of all processes that use the database, from the environment; the service adds its own."""
 
 import json
 from collections.abc import Mapping
@@ -136,7 +136,7 @@ class WorkerSettings(BaseSettings):
 
     @property
     def own_folders(self) -> tuple[Path, ...]:
-        """Folders that only the service itself may open: its data, its store and the work under way."""
+        """Return the folders that only the service may open: its data, its storage and its work."""
         address = urlsplit(self.storage_address)
         store = (Path(address.path).absolute(),) if address.scheme in ("", "file") else ()
         return (self.data.absolute(), self.work_folder, *store)
@@ -162,7 +162,7 @@ class WorkerSettings(BaseSettings):
         return EmbeddedPostgres(self.data.absolute()).conninfo()
 
     def checked(self) -> "WorkerSettings":
-        """Return the settings themselves, if they fit together.
+        """Return the settings if they are consistent; raise otherwise.
 
         Raises:
             ConfigError: they do not.

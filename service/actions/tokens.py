@@ -34,7 +34,7 @@ async def create_token(service: Service, new: NewToken) -> MadeToken:
 
 
 async def revoke_token(service: Service, token_id: uuid.UUID) -> None:
-    """Shut a token out.
+    """Revoke a token.
 
     Raises:
         ProblemError: 404.

@@ -56,7 +56,7 @@ async def create_token(new: NewToken, _who: Admin, service: ServiceDep, response
 
 @router.delete("/tokens/{token_id}", status_code=204, responses=problem_responses(404))
 async def delete_token(token_id: uuid.UUID, _who: Admin, service: ServiceDep) -> None:
-    """Shut a token out, with the sessions of browsers that were begun with it."""
+    """Revoke a token, with the sessions of browsers that were begun with it."""
     await tokens.revoke_token(service, token_id)
 
 

@@ -1,4 +1,4 @@
-"""Browsers that are opened for somebody, signed in."""
+"""Opening of a signed-in browser."""
 
 import os
 import sys
@@ -19,7 +19,7 @@ _PAGE_OPEN_SECONDS = 10.0
 
 
 def has_display() -> bool:
-    """Return whether somebody sits in front of a display."""
+    """Return whether there is a display to open a browser on."""
     found = sys.platform == "darwin" or any(os.environ.get(n) for n in ("DISPLAY", "WAYLAND_DISPLAY"))
     return found and sys.stdout.isatty()
 

@@ -1,4 +1,4 @@
-"""Options that several commands share, and what they mean."""
+"""Options that several commands share."""
 
 from collections.abc import Callable
 from typing import Any, TypeVar
@@ -16,7 +16,7 @@ def _cap_to_cores(_context: click.Context, _parameter: click.Parameter, value: i
 
 
 def threads_option(command: F) -> F:
-    """``--threads``; the command gets no more than there are cores."""
+    """Add the option ``--threads``; the command gets no more threads than there are cores."""
     return click.option(
         "--threads",
         type=click.IntRange(min=0),
@@ -33,7 +33,7 @@ def quiet_option(command: F) -> F:
 
 
 def parse_export_names(text: str | None) -> tuple[str, ...] | None:
-    """``mesh.glb,scene.spz`` as names of files; None where nothing was said.
+    """Return the names in ``mesh.glb,scene.spz``; None where nothing was given.
 
     Raises:
         ConfigError: one of them is no name of a result.

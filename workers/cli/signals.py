@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM as a wish to stop, so that a run can write a checkpoint first."""
+"""SIGINT and SIGTERM as requests to stop, so that a run can write a checkpoint first."""
 
 import os
 import signal
@@ -13,7 +13,7 @@ _SHOW_CURSOR = b"\x1b[?25h"
 
 
 class StoppedError(Exception):
-    """The user stopped the command; the text is what to tell, ``exit_code`` what to return."""
+    """The user stopped the command; the text is the message, ``exit_code`` the code to return."""
 
     def __init__(self, message: str, exit_code: int) -> None:
         super().__init__(message)
@@ -27,7 +27,7 @@ class StopFlag:
         self.signal_number: int | None = None
 
     def __call__(self) -> bool:
-        """Return whether a signal came."""
+        """Return whether a signal was received."""
         return self.signal_number is not None
 
     @property

@@ -1,1 +1,1 @@
-"""The service from the outside: uploads, jobs, progress, downloads, over HTTP only; prints nothing."""
+"""Client of the service: uploads, jobs, progress and downloads, over HTTP only; prints nothing."""

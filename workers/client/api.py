@@ -148,7 +148,7 @@ class Api:
                 return self._raise_for_status(response)
 
     def new_backoff(self) -> Backoff:
-        """For how long the service may be away now."""
+        """Return the back-off for an outage of the service that begins now."""
         return Backoff(MAX_OUTAGE_SECONDS if self._has_answered else MAX_FIRST_OUTAGE_SECONDS)
 
     def stream(self, method: str, path: str, **arguments: Any) -> Any:
@@ -186,7 +186,7 @@ class Api:
         )
 
     def _raise_for_status(self, response: httpx.Response) -> httpx.Response:
-        """Return the answer itself, if it is good."""
+        """Return the response itself if it is successful; raise otherwise."""
         if response.is_success:
             return response
         if response.status_code in UNAVAILABLE_STATUSES and not _is_from_service(response):

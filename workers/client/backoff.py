@@ -12,7 +12,7 @@ MAX_PAUSE_SECONDS = 10.0
 
 
 class Backoff:
-    """Counts the time for which a service is away, over any number of tries; growing pauses lie between them.
+    """Waits with growing pauses while the service is unreachable, up to a total time.
 
     Args:
         seconds: how long it may be away.
@@ -28,7 +28,7 @@ class Backoff:
         self._since, self._pause = None, FIRST_PAUSE_SECONDS
 
     def wait(self, min_seconds: float = 0.0) -> bool:
-        """Return the service is away: pause, or False if it was for too long.
+        """Pause because the service is unreachable; returns False once the total time is used up.
 
         Args:
             min_seconds: how long it asks to be left alone, s.

@@ -67,7 +67,7 @@ def watch_job(
 
 
 def _read_events(api: Api, job_id: str, last: str) -> Iterator[tuple[str, dict[str, Any], str]]:
-    """Kind, data and id of events after ``last``, until the stream ends."""
+    """Yield kind, data and id of the events after ``last``, until the stream ends."""
     timeout = httpx.Timeout(10.0, read=60.0)
     headers = {"Last-Event-ID": last, "Accept": "text/event-stream"}
     with api.stream("GET", f"/v1/jobs/{job_id}/events", headers=headers, timeout=timeout) as response:

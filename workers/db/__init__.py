@@ -1,1 +1,1 @@
-"""The tables of the job service: connections, migrations, and what stands in each table."""
+"""Tables of the job service: connections, migrations, and the rows of each table."""

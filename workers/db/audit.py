@@ -13,7 +13,7 @@ _MAX_CHARACTERS = 500
 
 @dataclass(frozen=True)
 class AuditEntry:
-    """Something that was asked for.
+    """An entry of the audit log: one requested change.
 
     Attributes:
         id: rises.
@@ -68,7 +68,7 @@ async def add_entry(
 
 
 async def list_entries(connection: Connection, *, before: int | None, limit: int) -> list[AuditEntry]:
-    """Entries, the newest first; those before the entry ``before``, at most ``limit``."""
+    """Return at most ``limit`` entries before the entry ``before``, newest first."""
     async with connection.cursor(row_factory=class_row(AuditEntry)) as cursor:
         await cursor.execute(
             with_columns(
@@ -84,7 +84,7 @@ async def list_entries(connection: Connection, *, before: int | None, limit: int
 
 
 async def delete_old_entries(connection: Connection, hours: float) -> None:
-    """Let go of entries that are older; 0 keeps them for ever."""
+    """Delete entries that are older; 0 keeps them for ever."""
     if hours > 0:
         await connection.execute(
             "DELETE FROM audit WHERE at < now() - make_interval(secs => %s)", [3600 * hours]
@@ -92,5 +92,5 @@ async def delete_old_entries(connection: Connection, hours: float) -> None:
 
 
 def _storable(text: str) -> str:
-    """Bounded, and without what Postgres does not hold."""
+    """Return a text cut to a bounded length and without characters that Postgres refuses."""
     return text.replace("\0", "\N{REPLACEMENT CHARACTER}")[:_MAX_CHARACTERS]

@@ -1,4 +1,4 @@
-"""Connections to the database."""
+"""Connections to the database, with their timeouts."""
 
 import asyncio
 import functools
@@ -60,7 +60,7 @@ def with_columns(query: LiteralString, row: type[Any], table_name: str = "") -> 
 def retry_on_deadlock(
     action: Callable[Parameters, Awaitable[Outcome]],
 ) -> Callable[Parameters, Coroutine[Any, Any, Outcome]]:
-    """Return a function whose transaction is begun anew where the database ended it in favour of another.
+    """Return a function whose transaction is repeated where the database ended it in a deadlock.
 
     The function must leave nothing behind but what it did in that transaction.
     """
@@ -118,7 +118,7 @@ async def open_pool(conninfo: str, *, max_size: int = 10, wait_seconds: float = 
 
 
 async def _set_timeouts(connection: Connection) -> None:
-    """Bound what others may have to wait for this connection; not by options, as a pooler refuses them."""
+    """Set the timeouts of a connection; by statements, as a pooler refuses connection options."""
     settings = {
         "statement_timeout": f"{STATEMENT_SECONDS}s",
         "idle_in_transaction_session_timeout": f"{IDLE_SECONDS}s",
@@ -134,14 +134,14 @@ async def _set_timeouts(connection: Connection) -> None:
 
 
 async def extend_timeouts(connection: Connection, seconds: float) -> None:
-    """Let the transaction under way last, and be idle, for so long."""
+    """Extend the timeouts of the current transaction, including its idle time."""
     limit = f"{seconds:g}s"
     names = ("idle_in_transaction_session_timeout", "transaction_timeout")
     await _set_known_settings(connection, dict.fromkeys(names, limit), is_local=True)
 
 
 async def _set_known_settings(connection: Connection, settings: Mapping[str, str], *, is_local: bool) -> None:
-    """Set what of this the server knows."""
+    """Set those of the settings that the server knows."""
     await connection.execute(
         """
         SELECT set_config(name, value, %s) FROM unnest(%s::text[], %s::text[]) AS given (name, value)

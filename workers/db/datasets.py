@@ -45,7 +45,7 @@ async def get_dataset(connection: Connection, dataset_id: uuid.UUID, *, lock: bo
 async def list_datasets(
     connection: Connection, *, owner: str | None = None, before: uuid.UUID | None = None, limit: int = 50
 ) -> list[Dataset]:
-    """Datasets, the newest first; ``owner`` None takes everybody's."""
+    """Return datasets, newest first; ``owner`` None takes those of all owners."""
     async with connection.cursor(row_factory=class_row(Dataset)) as cursor:
         await cursor.execute(
             with_columns(
@@ -65,7 +65,7 @@ async def list_datasets(
 async def list_files_by_suffix(
     connection: Connection, owner: str, suffixes: Sequence[str], *, limit: int
 ) -> list[tuple[Dataset, str]]:
-    """Files that options may name, whose names end so, with their committed datasets; the newest first."""
+    """Return files that options may name, by suffix, with their committed datasets; newest first."""
     async with connection.cursor(row_factory=dict_row) as cursor:
         await cursor.execute(
             with_columns(
@@ -96,7 +96,7 @@ class NewFile:
 async def put_files(
     connection: Connection, dataset_id: uuid.UUID, files: Sequence[NewFile]
 ) -> list[DatasetFile]:
-    """Record files that have arrived, each in the place of one of the same path; by path.
+    """Record uploaded files, each replacing one of the same path; by path.
 
     All go in one statement, as the locks of the dataset and its owner are held for as long as it takes.
 
@@ -162,7 +162,7 @@ async def remove_file(connection: Connection, dataset_id: uuid.UUID, path: str) 
 
 
 async def get_file(connection: Connection, dataset_id: uuid.UUID, path: str) -> DatasetFile | None:
-    """One file of a dataset, or None."""
+    """Return one file of a dataset, or None."""
     async with connection.cursor(row_factory=class_row(DatasetFile)) as cursor:
         await cursor.execute(
             with_columns("SELECT {} FROM dataset_files WHERE dataset_id = %s AND path = %s", DatasetFile),
@@ -174,7 +174,7 @@ async def get_file(connection: Connection, dataset_id: uuid.UUID, path: str) -> 
 async def files_of(
     connection: Connection, dataset_id: uuid.UUID, *, after: str = "", limit: int | None = None
 ) -> list[DatasetFile]:
-    """Files of a dataset by path; those after the path ``after``, at most ``limit``."""
+    """Return at most ``limit`` files of a dataset after the path ``after``, by path."""
     async with connection.cursor(row_factory=class_row(DatasetFile)) as cursor:
         await cursor.execute(
             with_columns(
@@ -206,7 +206,7 @@ async def photograph_sizes(connection: Connection, dataset_id: uuid.UUID) -> lis
 
 @dataclass(frozen=True)
 class Check:
-    """A validation under way.
+    """A validation in progress.
 
     Attributes:
         dataset: as it was when it began; one that is committed needs none.
@@ -219,7 +219,7 @@ class Check:
 
 
 async def begin_check(connection: Connection, dataset_id: uuid.UUID) -> Check:
-    """Close an open dataset for the time of its validation.
+    """Close an open dataset for its validation.
 
     Raises:
         ConflictError: it is being validated already.
@@ -242,7 +242,7 @@ async def begin_check(connection: Connection, dataset_id: uuid.UUID) -> Check:
 
 
 async def renew_check(connection: Connection, check: Check) -> None:
-    """Say that a dataset is still being validated."""
+    """Renew the validation of a dataset, so that it does not count as abandoned."""
     before = list(check.said_at)
     check.said_at.append(await _clock(connection))  # known before it is written, as the answer may be lost
     await connection.execute(
@@ -252,7 +252,7 @@ async def renew_check(connection: Connection, check: Check) -> None:
 
 
 async def reopen_stale_checks(connection: Connection) -> int:
-    """Open datasets again whose validation nobody goes on with; returns how many."""
+    """Reopen datasets whose validation was abandoned; returns how many."""
     cursor = await connection.execute(
         """
         UPDATE datasets SET state = 'open' WHERE id IN (
@@ -274,7 +274,7 @@ async def end_check(
     photographs: int = 0,
     facts: Mapping[str, Any] | None = None,
 ) -> Dataset:
-    """Commit a dataset that was found sound, or open it again for better files.
+    """Commit a valid dataset, or reopen an invalid one for corrections.
 
     Nothing changes where the dataset is not this validation's any more; the row says so.
 
@@ -306,7 +306,7 @@ async def end_check(
 async def change_dataset(
     connection: Connection, dataset_id: uuid.UUID, *, name: str, pinned: bool
 ) -> Dataset:
-    """Rename a dataset, or keep it whatever its age."""
+    """Rename a dataset, or pin it so that it does not expire."""
     await connection.execute(
         """
         UPDATE datasets SET name = %(name)s, pinned = %(pinned)s,
@@ -322,7 +322,7 @@ async def change_dataset(
 
 
 async def delete_dataset(connection: Connection, dataset_id: uuid.UUID) -> None:
-    """Forget a dataset that no job needs; its blobs stay until they are swept.
+    """Delete a dataset that no job needs; its blobs stay until they are collected.
 
     Raises:
         ConflictError: jobs were made from it, or it is being validated.
@@ -353,7 +353,7 @@ async def _clock(connection: Connection) -> datetime:
 
 
 async def _is_check_stale(connection: Connection, dataset_id: uuid.UUID) -> bool:
-    """Return whether whoever checks was not heard of for so long that it must have gone."""
+    """Return whether a validation has not been renewed for so long that its process must be gone."""
     cursor = await connection.execute(
         "SELECT used_at < now() - make_interval(secs => %s) AS lost FROM datasets WHERE id = %s",
         [STALE_CHECK_SECONDS, dataset_id],

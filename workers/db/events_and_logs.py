@@ -17,7 +17,7 @@ CHANNEL = "octasplat_events"
 async def add_event(
     connection: Connection, job_id: uuid.UUID, attempt: int, kind: str, data: Mapping[str, Any]
 ) -> None:
-    """Add an event; whoever listens on :data:`CHANNEL` hears of it when the transaction commits."""
+    """Add an event; listeners on :data:`CHANNEL` are notified when the transaction commits."""
     await connection.execute(
         "INSERT INTO job_events (job_id, attempt, kind, data) VALUES (%s, %s, %s, %s)",
         [job_id, attempt, kind, as_json(dict(data))],
@@ -38,7 +38,7 @@ async def add_log_lines(
 
 
 async def trim_log(connection: Connection, job_id: uuid.UUID, max_lines: int) -> None:
-    """Forget all but the newest ``max_lines`` lines of a job's log."""
+    """Delete all but the newest ``max_lines`` lines of a job's log."""
     await connection.execute(
         """
         DELETE FROM job_logs WHERE job_id = %(job)s AND id <= (
@@ -52,7 +52,7 @@ async def trim_log(connection: Connection, job_id: uuid.UUID, max_lines: int) ->
 async def events_after(
     connection: Connection, job_id: uuid.UUID, after: int = 0, limit: int = 500
 ) -> list[JobEvent]:
-    """Events of a job with an id above ``after``, in order."""
+    """Return events of a job with an id above ``after``, in order."""
     async with connection.cursor(row_factory=class_row(JobEvent)) as cursor:
         await cursor.execute(
             with_columns(
@@ -66,7 +66,7 @@ async def events_after(
 async def log_after(
     connection: Connection, job_id: uuid.UUID, after: int = 0, limit: int = 1000
 ) -> list[LogLine]:
-    """Log lines of a job with an id above ``after``, in order."""
+    """Return log lines of a job with an id above ``after``, in order."""
     async with connection.cursor(row_factory=class_row(LogLine)) as cursor:
         await cursor.execute(
             with_columns(

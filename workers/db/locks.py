@@ -1,15 +1,16 @@
-"""The locks that transactions wait for, and the one order in which they take them.
+"""Locks of transactions, and the one order in which they are taken.
 
-1. An idempotency key (a row), by which twins of a request wait for each other.
-2. The lock of the store (advisory): shared by who names contents, exclusive for who marks unused ones.
-3. The lock of an owner (advisory): what they have is checked against their quota and counted.
+1. An idempotency key (a row), on which duplicates of a request wait.
+2. The lock of the storage (advisory): shared for transactions that reference contents, exclusive for
+   those that mark unused ones.
+3. The lock of an owner (advisory): the owner's usage is compared with the quota and counted.
 4. Rows: jobs, then datasets, then whatever belongs to them.
 
-So nobody waits for an advisory lock who has locked a row of a job or a dataset: a heartbeat waits for its
-row only as long as a few statements take. Nothing is asked of the store, or of anything else in the network,
-while one of these locks is held. Triggers of the database take the lock of an owner as well, so whoever
-changes files of datasets, results or checkpoints, or deletes a dataset or a job, takes it first. The tests
-run on a database that refuses any other order (``tests/support/lock_order_check.py``).
+So no transaction that has locked a row of a job or a dataset waits for an advisory lock: a heartbeat waits
+for its row only as long as a few statements take. The storage, and anything else on the network, is not
+accessed while one of these locks is held. Triggers of the database take the lock of an owner as well, so a
+transaction that changes files of datasets, results or checkpoints, or deletes a dataset or a job, takes it
+first. The tests run on a database that refuses any other order (``tests/support/lock_order_check.py``).
 """
 
 from octasplat.workers.db.connections import Connection
@@ -21,7 +22,7 @@ OWNER = 0x71756F74  # "quot"; the database's triggers know it as well
 
 
 async def lock_store(connection: Connection, *, shared: bool) -> None:
-    """Take the lock of the store until the transaction ends."""
+    """Take the lock of the storage until the transaction ends."""
     name = "pg_advisory_xact_lock_shared" if shared else "pg_advisory_xact_lock"
     await connection.execute(f"SELECT {name}(%s)".encode(), [STORE])
 

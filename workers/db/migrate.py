@@ -1,7 +1,7 @@
-"""Brings a database to this version's tables: ours and the queue's, each step once, under one lock.
+"""Migration of a database to this version's tables: ours and the queue's, each step once, under one lock.
 
-Steps add to what is there, so that processes of the version before go on beside this one's: they only begin,
-end and write what they know. What they can no longer read or write raises :data:`OLDEST_READER`.
+Steps only add, so that processes of the former version can continue beside this one's: they begin, end and
+write only what they know. A step that they can no longer read or write raises :data:`OLDEST_READER`.
 """
 
 import logging
@@ -99,10 +99,10 @@ def _acquire_lock(connection: psycopg.Connection) -> None:
 
 
 def apply_step(connection: psycopg.Connection, step: Migration) -> None:
-    """Apply a step. Its locks are asked for again and again for a short time each.
+    """Apply a step, requesting its locks again and again for a short time each.
 
-    Whoever waits for the lock of a table holds up everybody who comes after it, so that none is waited for
-    longer than a running service can bear.
+    A transaction that waits for the lock of a table blocks all that come after it, so no wait is longer than
+    a running service can bear.
 
     Raises:
         DatabaseError: somebody holds a table for too long.
@@ -128,7 +128,7 @@ def apply_step(connection: psycopg.Connection, step: Migration) -> None:
 
 
 def wait_for_tables(conninfo: str, seconds: float = MAX_WAIT_SECONDS) -> None:
-    """Wait until somebody has brought the tables to this version; changes nothing.
+    """Wait until another process has migrated the tables to this version; changes nothing.
 
     Raises:
         DatabaseError: the database cannot be reached, is too new for this version, or nobody has.

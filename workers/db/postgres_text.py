@@ -38,5 +38,5 @@ def as_json(value: Any) -> Jsonb:
 
 
 def as_json_or_null(value: Any | None) -> Jsonb | None:
-    """Return the same where None stands for SQL's NULL."""
+    """Return a value for a column of JSON; None is SQL's NULL."""
     return None if value is None else as_json(value)

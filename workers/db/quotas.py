@@ -119,7 +119,7 @@ class Recounted:
 
 
 async def recount(connection: Connection) -> list[Recounted]:
-    """Count all owners' bytes anew, while nobody changes anything; those whose count was wrong, by owner."""
+    """Recount the bytes of all owners, with changes locked out; returns those that were wrong, by owner."""
     async with connection.transaction(), connection.cursor(row_factory=class_row(Recounted)) as cursor:
         await cursor.execute(
             "SELECT whose AS owner, bytes_before, bytes_after AS bytes FROM octasplat_recount()"
@@ -136,7 +136,7 @@ async def owned_bytes(connection: Connection, owner: str, sha256: str) -> int:
 
 
 async def check_bytes(connection: Connection, owner: str, default: Quota = NO_QUOTA) -> None:
-    """Refuse what was just entered in this transaction if it is too much.
+    """Check the owner's bytes after an insertion in this transaction.
 
     Raises:
         QuotaExceededError: the owner has more bytes than allowed; the transaction must be rolled back.
@@ -153,7 +153,7 @@ async def check_bytes(connection: Connection, owner: str, default: Quota = NO_QU
 
 
 async def check_new_dataset(connection: Connection, owner: str, default: Quota = NO_QUOTA) -> None:
-    """Before a dataset is made in this transaction.
+    """Check the owner's quota before a dataset is created in this transaction.
 
     Raises:
         QuotaExceededError: the owner has as many as allowed.
@@ -169,7 +169,7 @@ async def check_new_dataset(connection: Connection, owner: str, default: Quota =
 
 
 async def check_new_job(connection: Connection, owner: str, default: Quota = NO_QUOTA) -> None:
-    """Before a job is made, or queued again, in this transaction.
+    """Check the owner's quota before a job is created, or queued again, in this transaction.
 
     Raises:
         QuotaExceededError: as many as allowed are not over yet.

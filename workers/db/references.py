@@ -1,4 +1,4 @@
-"""Everything in the tables that names content of the store."""
+"""References from the tables to content of the storage."""
 
 from collections.abc import AsyncIterator
 from typing import Any
@@ -8,7 +8,7 @@ from octasplat.workers.storage.fsck import Reference
 
 
 async def references(connection: Connection) -> AsyncIterator[Reference]:
-    """Files of datasets, results, checkpoints and previews."""
+    """Return the references of dataset files, results, checkpoints and previews."""
     async with connection.transaction():
         async with connection.cursor("dataset_files") as cursor:
             await cursor.execute("SELECT dataset_id, path, sha256, size_bytes FROM dataset_files")

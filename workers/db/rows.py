@@ -1,4 +1,4 @@
-"""The rows of the tables, as they are read."""
+"""Rows of the tables, as they are read."""
 
 import uuid
 from dataclasses import dataclass
@@ -14,7 +14,7 @@ TERMINAL: frozenset[str] = frozenset({"succeeded", "failed", "canceled"})
 
 @dataclass(frozen=True)
 class Dataset:
-    """Photographs, and perhaps their poses, that jobs work on; or other files that their options name.
+    """A dataset: photographs and perhaps their poses, or other files that the options of jobs name.
 
     Attributes:
         id: UUIDv7.
@@ -63,7 +63,7 @@ class DatasetFile:
 
 @dataclass(frozen=True)
 class Job:
-    """A piece of work and how far it is.
+    """A job and its progress.
 
     Attributes:
         id: UUIDv7.
@@ -75,7 +75,7 @@ class Job:
         options: every setting, resolved when it was accepted.
         queue: which workers may take it.
         priority: higher goes first.
-        slip: its current slip in the queue; others are stale.
+        slip: its current queue entry in the queue; others are stale.
         state: where it is in its life; the last three never change again except by a retry.
         attempt: counts starts; every write of a worker carries the number it began with.
         fresh_after: attempts up to this one had other options or are to be forgotten: what they published

@@ -1,6 +1,6 @@
-"""Sessions of browsers, and links that begin one; the tables know the SHA-256 of their secrets only.
+"""Sessions of browsers, and links that begin one; the tables hold only the SHA-256 of their secrets.
 
-A session is worth what the token is worth that it was begun with, and ends with it.
+A session has the rights of the token that it was begun with, and ends with it.
 """
 
 import secrets
@@ -54,7 +54,7 @@ async def find_session(connection: Connection, secret: str) -> Session | None:
 
 
 async def end_session(connection: Connection, secret: str) -> None:
-    """Make a cookie worthless, wherever it may lie."""
+    """Invalidate the session of a cookie."""
     await connection.execute(
         "UPDATE sessions SET revoked_at = now() WHERE sha256 = %s AND revoked_at IS NULL",
         [hash_secret(secret)],
@@ -85,7 +85,7 @@ async def use_link(connection: Connection, secret: str) -> uuid.UUID | None:
 
 
 async def delete_old_sessions(connection: Connection) -> None:
-    """Let go of sessions and links that are long over."""
+    """Delete sessions and links that are long over."""
     await connection.execute(
         "DELETE FROM sessions WHERE expires_at < now() - make_interval(days => %s)", [RETENTION_DAYS]
     )

@@ -1,4 +1,4 @@
-"""Access tokens; the tables know the SHA-256 of their secrets only."""
+"""Access tokens; the tables hold only the SHA-256 of their secrets."""
 
 import hashlib
 import secrets
@@ -39,9 +39,9 @@ async def add_token(
     scopes: Sequence[str],
     hours: float | None = None,
 ) -> Token:
-    """Let ``secret`` in; one that is known already keeps its row and gets these rights.
+    """Add a token; one that exists keeps its row and gets these rights.
 
-    One that was shut out stays so.
+    One that was revoked stays so.
 
     Args:
         connection: to the database.
@@ -84,10 +84,10 @@ async def add_token(
 
 
 async def add_environment_token(connection: Connection, secret: str) -> Token:
-    """Let the secret of the environment in, and shut out those that it was before.
+    """Add the token of the environment, and revoke its former values.
 
     Returns:
-        Its row; one that was shut out stays so, and then nothing is changed.
+        Its row; one that was revoked stays so, and then nothing is changed.
     """
     async with connection.transaction():
         await connection.execute("SELECT pg_advisory_xact_lock(%s)", [_LOCK])
@@ -105,7 +105,7 @@ async def add_environment_token(connection: Connection, secret: str) -> Token:
 
 
 async def set_origin(connection: Connection, token_id: uuid.UUID, origin: Origin) -> None:
-    """Say that a token was made by a program rather than by somebody."""
+    """Record that a token was made by a program rather than by a user."""
     await connection.execute(
         "INSERT INTO token_origins (token_id, origin) VALUES (%s, %s) ON CONFLICT DO NOTHING",
         [token_id, origin],
@@ -165,7 +165,7 @@ async def has_any_token(connection: Connection, *, valid_only: bool = True) -> b
 
 
 async def revoke_token(connection: Connection, token_id: uuid.UUID) -> bool:
-    """Shut a token out, with the sessions that were begun with it; False if there is none that is valid."""
+    """Revoke a token, with the sessions that were begun with it; False if there is none that is valid."""
     cursor = await connection.execute(
         "UPDATE tokens SET revoked_at = now() WHERE id = %s AND revoked_at IS NULL", [token_id]
     )

@@ -20,7 +20,7 @@ async def record_worker_heartbeat(
     slots: int,
     facts: Mapping[str, Any],
 ) -> None:
-    """Say that a worker lives."""
+    """Record the heartbeat of a worker."""
     await connection.execute(
         """
         INSERT INTO workers (id, name, queues, slots, facts) VALUES (%s, %s, %s, %s, %s)
@@ -36,14 +36,14 @@ async def remove_worker(connection: Connection, worker_id: uuid.UUID) -> None:
 
 
 async def remove_stale_workers(connection: Connection, older_than_seconds: float) -> None:
-    """Forget workers that were not seen for that long."""
+    """Delete workers that were not seen for that long."""
     await connection.execute(
         "DELETE FROM workers WHERE seen_at < now() - make_interval(secs => %s)", [older_than_seconds]
     )
 
 
 async def live_workers(connection: Connection, stale_seconds: float) -> list[WorkerRow]:
-    """Workers that were seen within ``stale_seconds``, by name."""
+    """Return the workers that were seen within ``stale_seconds``, by name."""
     async with connection.cursor(row_factory=class_row(WorkerRow)) as cursor:
         await cursor.execute(
             with_columns(

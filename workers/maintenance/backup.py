@@ -156,7 +156,7 @@ def restore_backup(
 
 
 def _tables(connection: psycopg.Connection) -> list[str]:
-    """Our tables, each after those that it refers to."""
+    """Return our tables, each after those that it references."""
     rows = connection.execute(
         "SELECT tablename FROM pg_tables WHERE schemaname = current_schema() "
         "AND tablename NOT LIKE 'procrastinate%' ORDER BY 1"
@@ -194,7 +194,7 @@ def _write_table(connection: psycopg.Connection, name: str, folder: Path) -> dic
 
 
 def _read_table(connection: psycopg.Connection, table: dict[str, Any], folder: Path) -> None:
-    """Rows as they are: no trigger counts or tells anything once more."""
+    """Read rows unchanged, with triggers disabled."""
     name, columns = _identifiers(table["name"], table["columns"])
     connection.execute(sql.SQL("ALTER TABLE {} DISABLE TRIGGER USER").format(name))
     connection.execute(sql.SQL("DELETE FROM {}").format(name))
@@ -269,7 +269,7 @@ def _read_backup_file(folder: Path) -> dict[str, Any]:
 
 @contextlib.contextmanager
 def translate_database_errors() -> Iterator[None]:
-    """Turn the errors of the database into sentences.
+    """Translate errors of the database into sentences for users.
 
     Raises:
         BackupError: what went wrong.

@@ -1,7 +1,7 @@
-"""Collecting what deleted, replaced and abandoned things have left in the store.
+"""Garbage collection of the storage: contents left by deleted, replaced and abandoned objects.
 
-What stays: everything in the tables (so all results, whether pinned or not), the published results of
-attempts that did not get to enter them, as the next attempt will, and what somebody stores at the moment.
+Kept are contents that the tables reference (so all results, whether pinned or not), the published results of
+attempts that are not entered yet, as the next attempt will enter them, and contents that are being stored.
 """
 
 import asyncio
@@ -80,7 +80,7 @@ async def collect_garbage(
 async def collect_garbage_now(
     pool: Pool, storage: Storage, *, every_seconds: float = IMMEDIATE_INTERVAL_SECONDS
 ) -> RemovedContents | None:
-    """Remove everything that nothing names, whatever its age, because room is short.
+    """Remove all unreferenced contents, whatever their age, because space is short.
 
     Contents that somebody stores at the moment and has yet to name are spared, see
     :mod:`octasplat.workers.queue.storage_leases`.
@@ -102,7 +102,7 @@ async def collect_garbage_now(
 
 @asynccontextmanager
 async def _collection_turn(pool: Pool, storage: Storage, every_seconds: float) -> AsyncIterator[bool]:
-    """Yield whether it is time and nobody else collects, which then holds for as long as the block runs."""
+    """Yield whether a collection is due and no other runs, which is then reserved for the block."""
     async with pool.connection() as connection, connection.transaction():
         cursor = await connection.execute(
             """
@@ -127,7 +127,7 @@ async def _collection_turn(pool: Pool, storage: Storage, every_seconds: float) -
 
 
 def _is_own_store(storage: Storage, installation: bytes) -> bool:
-    """Return whether the store is this database's; one that is nobody's becomes so."""
+    """Return whether the storage belongs to this database; an unclaimed one is claimed."""
     # Read first, as a full store takes not even this.
     known = storage.read_document(INSTALLATION_DOCUMENT)
     return (
@@ -192,11 +192,11 @@ async def _collect_now(pool: Pool, storage: Storage) -> RemovedContents:
 async def _remove(
     connection: Connection, storage: Storage, contents: Sequence[UnusedContent]
 ) -> RemovedContents:
-    """Remove contents, some at a time, each marked before, while nobody could name it.
+    """Remove contents in batches, each marked before, while no transaction can reference it.
 
-    Whoever stored one of them once more in this very moment waits until it is unmarked and then looks whether
-    it is there, see :meth:`octasplat.workers.queue.storage_leases.StorageLease.verify`; or has named it
-    before, and then it stays. The store is asked without any lock, as its answers may take long.
+    A process that stored one of them again in this moment waits until it is unmarked and then checks whether
+    it exists, see :meth:`octasplat.workers.queue.storage_leases.StorageLease.verify`; or has referenced it
+    before, and then it stays. The storage is accessed without any lock, as its answers may take long.
     """
     removed = RemovedContents()
     for start in range(0, len(contents), BATCH_SIZE):
@@ -239,13 +239,13 @@ async def _expire_stale_leases(connection: Connection) -> None:
 
 
 async def _oldest_lease_unix(connection: Connection) -> float:
-    """Before when, by the clock of the store, nothing was stored that is about to be named; s."""
+    """Return the time, by the storage's clock, before which no content of an open lease was stored; s."""
     began_at = await oldest_lease(connection)
     return began_at.timestamp() - MAX_CLOCK_SKEW_SECONDS if began_at is not None else float("inf")
 
 
 async def _referenced(connection: Connection) -> tuple[set[str], set[uuid.UUID]]:
-    """Contents that the tables name, and the jobs whose results are among them."""
+    """Return the contents that the tables reference, and the jobs whose results are among them."""
     named = {reference.sha256 async for reference in references(connection)}
     cursor = await connection.execute("SELECT id FROM jobs WHERE state = 'succeeded'")
     return named, {row["id"] for row in await cursor.fetchall()}
@@ -259,7 +259,7 @@ def _log_removed(removed_contents: RemovedContents) -> None:
 
 
 async def _published_results(connection: Connection, storage: Storage, entered: set[uuid.UUID]) -> set[str]:
-    """Contents of published results that are in no table yet; results of jobs that are gone are withdrawn."""
+    """Return contents of published results in no table yet; those of deleted jobs are withdrawn."""
     found = await asyncio.to_thread(lambda: sorted(storage.list_documents("results/")))
     jobs = {name: uuid.UUID(match[1]) for name in found if (match := _RESULTS.fullmatch(name))}
     # Asked after the documents were listed: a job is there before its results are.

@@ -31,14 +31,14 @@ _BATCH_SIZE = 200
 
 @dataclass(frozen=True)
 class DeletedCounts:
-    """Numbers of jobs and datasets that were forgotten."""
+    """Numbers of deleted jobs and datasets."""
 
     jobs: int
     datasets: int
 
 
 async def apply_retention(pool: Pool, retention: Retention, audit_hours: float) -> None:
-    """Let go of what is older than it is to be kept, and open what a lost process has closed.
+    """Delete what is older than it is to be kept, and open what a lost process has closed.
 
     Each step is a transaction of its own: rows that one has locked are not kept from others while the next
     one waits for the lock of an owner.
@@ -63,7 +63,7 @@ async def apply_retention(pool: Pool, retention: Retention, audit_hours: float) 
 
 
 async def update_expiry_times(connection: Connection, retention: Retention) -> None:
-    """Tell what will expire when, and take that back from what is kept after all."""
+    """Set the expiry times of rows that will expire, and clear those of rows that are kept after all."""
     async with connection.transaction():
         await connection.execute(
             """
@@ -126,14 +126,14 @@ async def update_expiry_times(connection: Connection, retention: Retention) -> N
 
 
 async def delete_expired(connection: Connection) -> DeletedCounts:
-    """Forget what has expired; its contents stay in the store until they are collected."""
+    """Delete what has expired; its contents stay in the store until they are collected."""
     jobs = [await _delete_expired_job(connection, job_id) for job_id in await _expired(connection, "jobs")]
     datasets = [await _delete_expired_dataset(connection, d) for d in await _expired(connection, "datasets")]
     return DeletedCounts(sum(jobs), sum(datasets))
 
 
 async def delete_old_idempotency_keys(connection: Connection) -> None:
-    """Forget idempotency keys that nobody repeats any more."""
+    """Delete idempotency keys that are too old to be repeated."""
     await connection.execute(
         "DELETE FROM idempotency_keys WHERE created_at < now() - make_interval(days => %s)",
         [IDEMPOTENCY_KEY_DAYS],
@@ -141,7 +141,7 @@ async def delete_old_idempotency_keys(connection: Connection) -> None:
 
 
 async def thin_progress_events(connection: Connection, max_events: int = MAX_PROGRESS_EVENTS) -> int:
-    """Leave out some of the progress in the journals of long jobs; their curves keep their form.
+    """Thin out the progress events of long jobs; their curves keep their shape.
 
     Args:
         connection: to the database.

@@ -1,5 +1,5 @@
-"""The job service's tables and its queue, both in one Postgres.
+"""Tables of the job service and its queue, both in one Postgres.
 
-``jobs`` says what is true; a slip in the queue only says that somebody should look at a job. Both are written
+``jobs`` has the state; an entry in the queue only says that a worker should look at a job. Both are written
 in one transaction.
 """

@@ -1,7 +1,7 @@
-"""Changes of jobs by the worker that has them, every one of them fenced by the number of the attempt.
+"""Changes of a job by the worker that runs it, each fenced by the number of the attempt.
 
 A worker that was taken for dead may come back. By then its job has a higher attempt number or is over, and
-whatever it still wants to write is refused with :class:`FencedError`.
+its writes are refused with :class:`FencedError`.
 """
 
 import uuid
@@ -28,7 +28,7 @@ MAX_EARLIER_LOG_LINES = 20_000
 
 
 class FencedError(Exception):
-    """The attempt is over: the job has gone on without this worker."""
+    """The attempt is over: the job has continued without this worker."""
 
 
 @dataclass(frozen=True)
@@ -58,13 +58,13 @@ class Attempt:
     quota: Quota = NO_QUOTA
 
     async def heartbeat(self) -> str:
-        """Say that the worker lives; returns the state, ``running`` or ``canceling``."""
+        """Write a heartbeat; returns the state, ``running`` or ``canceling``."""
         async with self._fenced_transaction() as (connection, job):
             await connection.execute("UPDATE jobs SET heartbeat_at = now() WHERE id = %s", [job.id])
             return job.state
 
     async def read_state(self) -> str:
-        """Return the state, without saying anything."""
+        """Return the state without writing a heartbeat."""
         async with self.pool.connection() as connection:
             job = await get_job(connection, self.job.id)
         self._check_fence(job)
@@ -72,7 +72,7 @@ class Attempt:
         return job.state
 
     async def add_event(self, kind: str, data: Mapping[str, Any]) -> None:
-        """Add an event to the journal; what was measured on held-out views is also the job's PSNR."""
+        """Add an event to the event log; a measurement of held-out views also sets the job's PSNR."""
         async with self._fenced_transaction() as (connection, job):
             if kind == "held_out_measured":
                 await connection.execute("UPDATE jobs SET psnr = %s WHERE id = %s", [data["psnr"], job.id])
@@ -93,7 +93,7 @@ class Attempt:
         training_psnr: float | None = None,
         event: Mapping[str, Any] | None = None,
     ) -> None:
-        """Say how far the job is; ``event`` goes to the journal besides."""
+        """Set the progress of the job; ``event`` is added to the event log."""
         async with self._fenced_transaction() as (connection, job):
             await connection.execute(
                 """
@@ -109,7 +109,7 @@ class Attempt:
     async def record_checkpoint(
         self, manifest: Mapping[str, Any], *, is_progress: bool, lease: StorageLease | None = None
     ) -> None:
-        """Record a stored checkpoint; one that advances forgives the job the workers it has lost.
+        """Record a stored checkpoint; one that advances resets the count of lost workers.
 
         Raises:
             StorageUnavailableError: ``lease``, under which it was stored, was given up.
@@ -160,7 +160,7 @@ class Attempt:
         *,
         discarded: Sequence[ResultFile] = (),
     ) -> None:
-        """End the job for a reason that another try would meet again, with the results there are so far.
+        """End the job for a reason that another attempt would meet again, with the results so far.
 
         Args:
             error: what happened.
@@ -186,12 +186,12 @@ class Attempt:
             )
 
     async def cancel(self) -> None:
-        """End the job as its owner asked."""
+        """End the job as its owner requested."""
         async with self._fenced_transaction() as (connection, job):
             await end_job(connection, job, "canceled", None)
 
     async def requeue(self, job_queue: JobQueue, reason: str, *, max_uncounted: int | None = None) -> None:
-        """Put the job back into the queue, as its worker has to go; a cancelled one ends instead.
+        """Put the job back into the queue because its worker stops; a job being cancelled ends instead.
 
         Args:
             job_queue: the queue.
@@ -282,7 +282,7 @@ class Attempt:
 
 
 async def _count_requeues(connection: Connection, job: Job, reason: str) -> int:
-    """Return how often a job was handed back for a reason since it came any further or was accepted."""
+    """Return how often a job was requeued for a reason since it last advanced or was accepted."""
     cursor = await connection.execute(
         """
         SELECT count(*) AS n FROM job_events
@@ -298,7 +298,7 @@ async def _count_requeues(connection: Connection, job: Job, reason: str) -> int:
 
 
 async def claim(pool: Pool, job_id: uuid.UUID, entry_id: int, worker: str) -> Attempt | None:
-    """Begin an attempt at a queued job, or None if the slip is stale: the job has gone on without it."""
+    """Begin an attempt at a queued job; None if the entry is stale because the job has continued."""
     async with pool.connection() as connection, connection.transaction():
         job = await get_job(connection, job_id, lock=True)
         if job is None or job.state != "queued" or job.slip != entry_id:
@@ -337,9 +337,9 @@ async def recover_attempt(
 ) -> bool:
     """Give a job whose attempt was lost to another worker; the caller holds the job's lock.
 
-    A job that was to be cancelled is cancelled. One that was lost too often without getting any further is
-    failed with ``error``. With ``keep_entry`` the slip is still being delivered and goes by itself. Nobody
-    takes it up before ``delay_seconds`` are over.
+    A job that was being cancelled is cancelled. One that was lost too often without advancing is failed with
+    ``error``. With ``keep_entry`` the queue entry is still being delivered and is removed by that. The job is
+    not taken up before ``delay_seconds`` have passed.
 
     Returns:
         Whether it failed.
@@ -373,7 +373,7 @@ def _digests(results: Sequence[ResultFile]) -> set[str]:
 
 
 async def _replace_artifacts(connection: Connection, job: Job, results: Sequence[ResultFile]) -> None:
-    """Put results into the place of earlier ones; the one place where they become visible."""
+    """Replace the results of a job; the one place where they become visible."""
     await connection.execute("DELETE FROM artifacts WHERE job_id = %s", [job.id])
     await connection.execute(
         """

@@ -1,7 +1,7 @@
-"""Owners take turns: a slip says that a job may begin, not whose it is.
+"""Fair share between owners: a queue entry says that some job may begin, not which one.
 
-Of jobs of the same priority goes first that of an owner with the fewest that run, and among these of the one
-whose turn was longest ago. Jobs of one owner keep their order.
+Among jobs of the same priority, that of an owner with the fewest running jobs goes first, and among these
+that of the owner whose turn was longest ago. Jobs of one owner keep their order.
 """
 
 import uuid
@@ -19,9 +19,9 @@ _MAX_CANDIDATES = 30
 async def choose_job(
     pool: Pool, job_queue: JobQueue, job_id: uuid.UUID, entry_id: int
 ) -> tuple[uuid.UUID, int] | None:
-    """Return which job to begin when a slip is delivered, and its slip; None if the slip is stale.
+    """Return the job to begin when an entry is delivered, and its entry; None if the entry is stale.
 
-    If that is another job than the slip's, the latter goes back to its place.
+    If that is another job than the entry's, the latter is queued again at its place.
     """
     async with pool.connection() as connection, connection.transaction():
         job = await get_job(connection, job_id, lock=True)
@@ -35,7 +35,7 @@ async def choose_job(
 
 
 async def _next_fair_job(connection: Connection, job_queue: JobQueue, job: Job) -> Job | None:
-    """Return the job that goes before ``job``, its slip taken out of the queue; None if none does."""
+    """Return the job that goes before ``job``, its entry taken out of the queue; None if there is none."""
     cursor = await connection.execute(
         """
         SELECT jobs.id FROM jobs

@@ -1,4 +1,4 @@
-"""Ends of jobs before their work: how long they have run, queues that nobody takes, hosts too small."""
+"""Jobs that end before their work: run for too long, in a queue without workers, or on too small hosts."""
 
 import uuid
 from collections.abc import Mapping
@@ -15,7 +15,7 @@ from octasplat.workers.queue.recovery import StalledAttempts
 
 
 async def seconds_spent(connection: Connection, job: Job) -> float:
-    """For how long workers had a job in earlier attempts, since it was accepted or retried by its owner."""
+    """Return for how long workers had a job in earlier attempts, since it was accepted or retried."""
     cursor = await connection.execute(
         """
         SELECT coalesce(sum(extract(epoch FROM ended.at - began.at)), 0)::float8 AS seconds
@@ -94,7 +94,7 @@ async def fail_abandoned_jobs(
 async def fail_before_start(
     connection: Connection, job_id: uuid.UUID, entry_id: int, error: Mapping[str, Any]
 ) -> bool:
-    """Fail a job whose slip is being delivered, before any attempt; False if it has gone on without it."""
+    """Fail a job whose entry is being delivered, before any attempt; False if it has continued meanwhile."""
     async with connection.transaction():
         job = await get_job(connection, job_id, lock=True)
         if job is None or job.state != "queued" or job.slip != entry_id:

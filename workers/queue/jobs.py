@@ -1,6 +1,6 @@
-"""Changes of jobs from the outside: accepted, listed, cancelled, retried, deleted.
+"""Changes of jobs by users: created, listed, cancelled, retried, deleted.
 
-Every function takes a connection and does its work in one transaction of its own or of the caller's.
+Every function takes a connection and works in one transaction of its own or of the caller's.
 """
 
 import uuid
@@ -38,7 +38,7 @@ class NewJob:
 
 
 async def create_job(connection: Connection, job_queue: JobQueue, new: NewJob) -> Job:
-    """Write the job and its slip in one transaction."""
+    """Write the job and its queue entry in one transaction."""
     async with connection.transaction():
         job_id = new_id()
         entry_id = await job_queue.enqueue(connection, job_id, new.queue, new.priority)
@@ -83,7 +83,7 @@ async def list_jobs(
     before: uuid.UUID | None = None,
     limit: int = 50,
 ) -> list[Job]:
-    """Jobs that fit, the newest first.
+    """Return the jobs that match, newest first.
 
     Args:
         connection: to the database.
@@ -233,16 +233,16 @@ async def requeue_job(
     delay_seconds: float = 0.0,
     without_event: bool = False,
 ) -> None:
-    """Put a job back into its queue with a new slip; the caller holds the job's lock.
+    """Put a job back into its queue with a new entry; the caller holds the job's lock.
 
-    A job that has a slip, as it was interrupted or not even begun, keeps its place: it goes before all that
+    A job that has an entry, as it was interrupted or not even begun, keeps its place: it goes before all that
     were queued after it. One that was over goes last.
 
     Args:
         connection: of the transaction.
         job_queue: the queue.
         job: which.
-        keep_entry: the old slip is being delivered and goes by itself when that ends.
+        keep_entry: the old queue entry is being delivered and goes by itself when that ends.
         delay_seconds: for how long it is not taken up.
         without_event: it never ceased to be queued, so that nobody needs to hear of it.
     """
@@ -265,7 +265,7 @@ async def requeue_job(
 
 
 async def change_job(connection: Connection, job_id: uuid.UUID, *, label: str | None, pinned: bool) -> Job:
-    """Rename a job, or keep it whatever its age."""
+    """Rename a job, or pin it so that it does not expire."""
     await connection.execute(
         """
         UPDATE jobs SET label = %(label)s, pinned = %(pinned)s,
@@ -278,7 +278,7 @@ async def change_job(connection: Connection, job_id: uuid.UUID, *, label: str | 
 
 
 async def delete_job(connection: Connection, job_id: uuid.UUID) -> None:
-    """Forget a finished job; its blobs stay until they are swept.
+    """Delete a finished job; its blobs stay until they are collected.
 
     Raises:
         ConflictError: it is not over, or other jobs work on its results.
@@ -313,7 +313,7 @@ async def artifacts_of(connection: Connection, job_id: uuid.UUID) -> list[Artifa
 
 
 async def get_artifact(connection: Connection, job_id: uuid.UUID, name: str) -> Artifact | None:
-    """One result of a job, or None."""
+    """Return one result of a job, or None."""
     async with connection.cursor(row_factory=class_row(Artifact)) as cursor:
         await cursor.execute(
             with_columns("SELECT {} FROM artifacts WHERE job_id = %s AND name = %s", Artifact), [job_id, name]
@@ -322,7 +322,7 @@ async def get_artifact(connection: Connection, job_id: uuid.UUID, name: str) -> 
 
 
 async def queue_depths(connection: Connection) -> list[QueueDepth]:
-    """Return how much waits in each queue that has something waiting."""
+    """Return the count of waiting entries of each queue that has some."""
     cursor = await connection.execute(
         """
         SELECT queue, count(*) AS waiting,
@@ -334,7 +334,7 @@ async def queue_depths(connection: Connection) -> list[QueueDepth]:
 
 
 async def running_by_queue(connection: Connection) -> dict[str, int]:
-    """Return number of jobs that run, by queue."""
+    """Return the number of running jobs by queue."""
     cursor = await connection.execute(
         "SELECT queue, count(*) AS n FROM jobs WHERE state IN ('running', 'canceling') GROUP BY queue"
     )

@@ -1,4 +1,4 @@
-"""The port on Procrastinate."""
+"""Job queue on Procrastinate."""
 
 import uuid
 from collections.abc import Sequence
@@ -17,13 +17,13 @@ _FIRST_REQUEUED_ID = -(1 << 62)
 
 
 class ProcrastinateQueue:
-    """A queue of slips in the tables of Procrastinate.
+    """A job queue in the tables of Procrastinate.
 
     Args:
         pool: connections; only :meth:`work` needs it.
         heartbeat_seconds: how often a worker says that it lives.
         stale_seconds: after how long without it is taken for dead.
-        poll_seconds: how often to look for slips that no notification told of.
+        poll_seconds: how often to look for queue entries that no notification told of.
         listen: whether notifications reach this process; a pooler in transaction mode swallows them.
     """
 
@@ -55,7 +55,7 @@ class ProcrastinateQueue:
         position_of: int | None = None,
         delay_seconds: float = 0.0,
     ) -> int:
-        """Queue a slip; see the port."""
+        """Queue an entry; see the protocol."""
         if position_of is not None:
             return await _reenqueue(connection, job_id, queue, priority, position_of, delay_seconds)
         job = procrastinate.jobs.Job(
@@ -71,11 +71,11 @@ class ProcrastinateQueue:
         return entry_id
 
     async def remove(self, connection: Connection, entry_id: int) -> None:
-        """Take a slip away; see the port."""
+        """Remove an entry; see the protocol."""
         await connection.execute("DELETE FROM procrastinate_jobs WHERE id = %s", [entry_id])
 
     async def take_waiting(self, connection: Connection, entry_id: int) -> bool:
-        """Take away a slip that waits; see the port."""
+        """Remove an entry that waits; see the protocol."""
         cursor = await connection.execute(
             """
             DELETE FROM procrastinate_jobs WHERE id = (
@@ -89,7 +89,7 @@ class ProcrastinateQueue:
         return cursor.rowcount > 0
 
     async def orphaned_jobs(self, connection: Connection) -> Sequence[uuid.UUID]:
-        """Queued jobs without a living slip; see the port."""
+        """Return queued jobs without a live entry; see the protocol."""
         cursor = await connection.execute(
             """
             SELECT jobs.id FROM jobs
@@ -105,7 +105,7 @@ class ProcrastinateQueue:
         return [row["id"] for row in await cursor.fetchall()]
 
     async def consume(self, queue: str, concurrency: int, deliver: DeliveryCallback) -> None:
-        """Deliver slips; see the port."""
+        """Deliver entries; see the protocol."""
         assert self._pool is not None
         connector = procrastinate.PsycopgConnector()
         await connector.open_async(cast(Any, self._pool))  # its cursors name their own kind of rows
@@ -137,12 +137,12 @@ class ProcrastinateQueue:
             self._workers.discard(worker)
 
     def stop(self) -> None:
-        """Deliver no more; see the port."""
+        """Stop delivering; see the protocol."""
         self._stopped = True
         self.pause()
 
     def pause(self) -> None:
-        """Deliver no more for now; see the port."""
+        """Pause delivering; see the protocol."""
         for worker in self._workers:
             worker.stop()  # type: ignore[no-untyped-call]
 
@@ -155,7 +155,7 @@ async def _reenqueue(
     position_of: int,
     delay_seconds: float,
 ) -> int:
-    """Queue a slip in the place of an earlier one; Procrastinate's own way numbers them all anew."""
+    """Queue an entry in the place of an earlier one; Procrastinate's own way gives them new numbers."""
     cursor = await connection.execute(
         """
         INSERT INTO procrastinate_jobs (id, queue_name, task_name, priority, args, scheduled_at)
@@ -177,11 +177,11 @@ async def _reenqueue(
 
 
 def requeued_entry_id(entry_id: int) -> int:
-    """Return the number of a slip that takes the place of ``entry_id``.
+    """Return the number of an entry that takes the place of ``entry_id``.
 
-    Numbers below zero are for slips that came back: they go before all that never were delivered, and among
-    themselves in the order of the numbers that they had at first. What is counted besides tells the slips of
-    one job apart.
+    Numbers below zero are for entries that were queued again: they go before all that were never delivered,
+    and among themselves in the order of their first numbers. A counter in the number distinguishes the
+    entries of one job.
     """
     if entry_id < 0:
         first, returns = divmod(entry_id - _FIRST_REQUEUED_ID, _MAX_REQUEUES)

@@ -13,12 +13,12 @@ from typing import Protocol, runtime_checkable
 from octasplat.workers.db.connections import Connection
 
 DeliveryCallback = Callable[[uuid.UUID, int], Awaitable[None]]
-"""Called with the job's id and the slip's number; when it returns the slip is done with."""
+"""Called with the job's id and the queue entry's number; when it returns the queue entry is done with."""
 
 
 @dataclass(frozen=True)
 class QueueDepth:
-    """Slips of one queue that wait, and the seconds for which the oldest of them has."""
+    """Entries of one queue that wait, and the seconds for which the oldest of them has waited."""
 
     queue: str
     waiting: int
@@ -27,7 +27,7 @@ class QueueDepth:
 
 @runtime_checkable
 class JobQueue(Protocol):
-    """A queue of slips."""
+    """A queue of entries, each for one job."""
 
     async def enqueue(
         self,
@@ -39,7 +39,7 @@ class JobQueue(Protocol):
         position_of: int | None = None,
         delay_seconds: float = 0.0,
     ) -> int:
-        """Queue a slip for a job within the transaction of ``connection``.
+        """Queue an entry for a job within the transaction of ``connection``.
 
         Args:
             connection: of the transaction.
@@ -51,30 +51,30 @@ class JobQueue(Protocol):
             delay_seconds: with ``position_of``, for how long others go before it all the same.
 
         Returns:
-            The slip's number, which no slip of this job had.
+            The entry's number, which no queue entry of this job had.
         """
         ...
 
     async def remove(self, connection: Connection, entry_id: int) -> None:
-        """Take a slip away, whether it waits or its worker was lost; harmless if it is gone."""
+        """Remove an entry, whether it waits or its worker was lost; harmless if it is gone."""
         ...
 
     async def take_waiting(self, connection: Connection, entry_id: int) -> bool:
-        """Take away a slip that could be delivered now; False if it is with somebody, or is yet to wait."""
+        """Remove an entry that could be delivered now; False if it is being delivered or is delayed."""
         ...
 
     async def orphaned_jobs(self, connection: Connection) -> Sequence[uuid.UUID]:
-        """Jobs that say they are queued although no slip of theirs waits or is with a live worker."""
+        """Return jobs in the state queued that have no entry that waits or is with a live worker."""
         ...
 
     async def consume(self, queue: str, concurrency: int, deliver: DeliveryCallback) -> None:
-        """Deliver slips until :meth:`stop` is called or the database is lost; returns when all are done."""
+        """Deliver entries until :meth:`stop` is called or the database is lost; returns when all are done."""
         ...
 
     def pause(self) -> None:
-        """Deliver no more slips until :meth:`work` is called again."""
+        """Pause delivering until :meth:`consume` is called again."""
         ...
 
     def stop(self) -> None:
-        """Deliver no more slips."""
+        """Stop delivering entries."""
         ...

@@ -1,4 +1,4 @@
-"""Jobs whose worker was lost go to another one."""
+"""Recovery of jobs whose worker was lost."""
 
 import logging
 import time
@@ -19,14 +19,14 @@ logger = logging.getLogger(__name__)
 
 
 class StalledAttempts:
-    """Attempts that were not heard of for long by the database's clock, and for how long that is known here.
+    """Attempts without a recent heartbeat by the database's clock, and since when they are known here.
 
-    That clock may jump, as on a laptop that slept, and then nobody was heard of for long. So only those are
-    lost that are still not heard of a while later, by a clock that does not jump. After a jump back the last
-    word of a lost worker lies in the future; it is silent too.
+    That clock may jump, as on a laptop that slept, and then all heartbeats look old. So only attempts that
+    still have no new heartbeat a while later, by a monotonic clock, are lost. After a jump back the last
+    heartbeat of a lost worker is in the future; that counts as old too.
 
     Args:
-        wait_seconds: how long that is; by then every worker that lives was heard of.
+        wait_seconds: how long that is; by then every live worker has written a heartbeat.
     """
 
     def __init__(self, wait_seconds: float) -> None:
@@ -34,7 +34,7 @@ class StalledAttempts:
         self._since: dict[tuple[uuid.UUID, int, datetime | None], float] = {}
 
     def confirm(self, stale: Sequence[Job]) -> list[Job]:
-        """Return those of the silent that did not change since they were seen first, long enough ago."""
+        """Return the stalled attempts that have not changed since they were first found, long enough ago."""
         now = time.monotonic()
         found = {(job.id, job.attempt, job.heartbeat_at): job for job in stale}
         self._since = {key: self._since.get(key, now) for key in found}
@@ -44,7 +44,7 @@ class StalledAttempts:
 async def recover_stalled_jobs(
     pool: Pool, job_queue: JobQueue, stale_seconds: float, stalled: StalledAttempts
 ) -> int:
-    """Queue again whatever has not been heard of for ``stale_seconds`` by the database's clock.
+    """Requeue jobs without a heartbeat for ``stale_seconds`` by the database's clock.
 
     Safe to run anywhere at any time, also twice at once.
 

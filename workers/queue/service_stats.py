@@ -1,4 +1,4 @@
-"""Numbers of the whole service for monitoring; none of them names a job, a dataset or an owner."""
+"""Figures on the whole service for monitoring; none of them names a job, a dataset or an owner."""
 
 from dataclasses import dataclass
 
@@ -35,7 +35,7 @@ class ServiceStats:
 
 
 async def read_service_stats(connection: Connection, stale_seconds: float) -> ServiceStats:
-    """Read them all.
+    """Return the present figures.
 
     Args:
         connection: to the database.

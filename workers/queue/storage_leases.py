@@ -1,12 +1,12 @@
-"""Notes of who stores contents and will name them in a table only afterwards, so that nobody collects them.
+"""Leases on contents that are stored and will be referenced in a table afterwards; they are not collected.
 
-A lease exists before the first byte is stored. A process names the contents in a transaction of
-:meth:`StorageLease.reference`, which fails if the lease has expired: that of a process that was silent for
-long no longer counts.
+A lease exists before the first byte is stored. A process references the contents in a transaction of
+:meth:`StorageLease.reference`, which fails if the lease has expired, as that of a process without heartbeats
+does.
 
-Contents are removed from the store without a lock, as that may take long. They are marked first, while nobody
-names anything (:func:`marked_for_removal`), and whoever has stored one of them meanwhile waits until it is
-unmarked and then looks whether it is there.
+Contents are removed from the storage without a lock, as that may take long. They are marked first, while no
+transaction references anything (:func:`mark_for_removal`); a process that has stored one of them meanwhile
+waits until it is unmarked and then checks whether it exists.
 """
 
 import asyncio
@@ -43,7 +43,7 @@ _CONNECTION_ERRORS = (psycopg.OperationalError, psycopg.InterfaceError, PoolTime
 
 @dataclass(frozen=True)
 class StorageLease:
-    """Says that something is being stored.
+    """A lease of a process that is storing contents.
 
     Attributes:
         id: of the row.
@@ -58,7 +58,7 @@ class StorageLease:
     removals: int | None
 
     async def verify(self, contents: Collection[str]) -> int:
-        """Make sure that nothing that was stored under the note has been removed meanwhile.
+        """Check that no content stored under the lease has been removed meanwhile.
 
         Args:
             contents: the digests of all that was stored.
@@ -90,7 +90,7 @@ class StorageLease:
 
     @asynccontextmanager
     async def reference(self, contents: Collection[str]) -> AsyncIterator[Connection]:
-        """Yield a transaction that names contents; until it ends none of them is removed.
+        """Yield a transaction that references contents; none of them is removed until it ends.
 
         Args:
             contents: their digests.
@@ -119,7 +119,7 @@ class StorageLease:
 
 @asynccontextmanager
 async def storage_lease(pool: Pool, storage: Storage) -> AsyncIterator[StorageLease]:
-    """Yield a note for as long as the block runs, in which contents are stored and then named."""
+    """Yield a lease for the block, in which contents are stored and then referenced."""
     async with pool.connection() as connection:
         # Of the version before, removals hold the lock instead of marking what they remove.
         cursor = await connection.execute("SELECT pg_try_advisory_xact_lock_shared(%s) AS quiet", [STORE])
@@ -137,7 +137,7 @@ async def storage_lease(pool: Pool, storage: Storage) -> AsyncIterator[StorageLe
 
 @asynccontextmanager
 async def removal_transaction(connection: Connection) -> AsyncIterator[None]:
-    """Yield a transaction in which nobody names contents, for :func:`mark_for_removal`."""
+    """Yield a transaction in which no other references contents, for :func:`mark_for_removal`."""
     async with connection.transaction():
         await lock_store(connection, shared=False)
         await connection.execute("SELECT nextval('octasplat_removals')")
@@ -145,7 +145,7 @@ async def removal_transaction(connection: Connection) -> AsyncIterator[None]:
 
 
 async def mark_for_removal(connection: Connection, contents: Collection[str]) -> None:
-    """Mark contents that nothing names as being removed, in a transaction of :func:`removal_transaction`."""
+    """Mark unreferenced contents as being removed, in a transaction of :func:`removal_transaction`."""
     await connection.execute(
         """
         INSERT INTO removing_contents (sha256) SELECT unnest(%s::text[])
@@ -156,7 +156,7 @@ async def mark_for_removal(connection: Connection, contents: Collection[str]) ->
 
 
 async def unmark_for_removal(connection: Connection, contents: Collection[str]) -> None:
-    """Contents are removed, or left after all."""
+    """Unmark contents after they were removed, or kept after all."""
     await connection.execute("DELETE FROM removing_contents WHERE sha256 = ANY(%s)", [list(contents)])
 
 
@@ -168,7 +168,7 @@ async def oldest_lease(connection: Connection) -> datetime | None:
 
 
 async def expire_stale_leases(connection: Connection) -> None:
-    """Give up the notes of processes that are gone; one that is being confirmed stays."""
+    """Expire the leases of processes that are gone; one that is being confirmed stays."""
     await connection.execute(
         """
         DELETE FROM storing WHERE id IN (

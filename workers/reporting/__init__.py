@@ -1,1 +1,1 @@
-"""Events and numbers in words, for whoever shows them: the command line, the logs of jobs, the client."""
+"""Events and figures as text for the command line, the logs of jobs and the client."""

@@ -59,7 +59,7 @@ class ProgressState:
         self._pace = TimeLeftEstimator()
 
     def update(self, event: Event) -> None:
-        """Remember what ``event`` tells."""
+        """Update the state by ``event``."""
         if isinstance(event, PhaseStarted):
             self.step, self.total = 0, event.total_steps
             self.seconds_left, self._pace = None, TimeLeftEstimator()
@@ -111,7 +111,7 @@ class EventLines:
         self._state = ProgressState()
 
     def __call__(self, event: Event) -> None:
-        """Show ``event``, or leave it out if the last line is only a moment old."""
+        """Write a line for ``event``, unless the last line is too recent."""
         self._state.update(event)
         if isinstance(event, PhaseStarted):
             self._write(PHASE_TITLES.get(event.stage, event.stage))

@@ -1,4 +1,4 @@
-"""The engine's events again, from the kind and the data with which they are told and kept."""
+"""Conversion between the engine's events and the stored ones."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -23,6 +23,6 @@ def decode_event(kind: str, data: Mapping[str, Any]) -> Event | None:
 
 
 def encode_training_progress(event: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a training's progress as the journal keeps it: the PSNR of its own rays is called so."""
+    """Return a training's progress as the event log stores it, with ``training_psnr`` for its rays."""
     data = {key: value for key, value in event.items() if key != "kind"}
     return {**data, "training_psnr": data["psnr"]}

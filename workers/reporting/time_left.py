@@ -4,13 +4,13 @@ import time
 
 
 class TimeLeftEstimator:
-    """The time left of a stage, from how fast it has gone since it was first heard of."""
+    """Estimates the remaining time of a stage from its speed since its first report."""
 
     def __init__(self) -> None:
         self._first: tuple[float, float] | None = None
 
     def seconds_left(self, steps_done: float, total_steps: float) -> float | None:
-        """Seconds; None while nothing can be said.
+        """Return the remaining seconds; None while there is no estimate.
 
         Args:
             steps_done: steps, with the share of the one under way.

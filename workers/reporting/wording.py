@@ -1,4 +1,4 @@
-"""Numbers and results in the words in which they are shown."""
+"""Formatting of figures and results for display."""
 
 from octasplat.engine.core.events import HeldOutMeasured, TrainingProgress
 
@@ -11,7 +11,7 @@ def format_rate(per_second: float) -> str:
 
 
 def format_training_state(event: TrainingProgress, held_out: HeldOutMeasured | None) -> str:
-    """Return how far the training has come, but for its iterations and the time left."""
+    """Return the state of the training, without its iterations and the time left."""
     parts = [f"training {event.psnr:.1f} dB"]
     if held_out is not None:
         parts.append(f"held out {held_out.psnr:.1f} dB")

@@ -1,7 +1,7 @@
-"""Processes that cannot do what their work does not need, as far as the kernel takes part.
+"""Sandbox of processes that handle untrusted data, as far as the kernel supports it.
 
-Parents hide what they know from their children (:mod:`octasplat.workers.sandbox.hiding`). Children that
-read what others have made give up the network, what watches over other processes, and the folders of the
-service, for good (:mod:`octasplat.workers.sandbox.confinement`). What a machine supports is found by
+Parents hide their memory from their children (:mod:`octasplat.workers.sandbox.hiding`). Children that read
+untrusted data give up the network, access to other processes, and the folders of the service, for good
+(:mod:`octasplat.workers.sandbox.confinement`). Supported features are found by
 :mod:`octasplat.workers.sandbox.capabilities`.
 """

@@ -27,7 +27,7 @@ def sandbox_capabilities() -> dict[str, str | None]:
 
 
 def log_missing_capabilities() -> None:
-    """Say in the log, in one line, what isolates nothing here."""
+    """Log in one line which isolation features are missing here."""
     lacking = [
         subject.replace("_", " ") for subject, means in sandbox_capabilities().items() if means is None
     ]

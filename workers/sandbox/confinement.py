@@ -1,4 +1,4 @@
-"""A child process gives up what its work does not need, before it looks at anything that others have made."""
+"""Confinement of a child process before it reads untrusted data."""
 
 import contextlib
 import ctypes
@@ -37,7 +37,7 @@ def confine(
     may_start_processes: bool,
     is_read_only_elsewhere: bool,
 ) -> None:
-    """Give up rights, for good; whatever the kernel does not take part in is left.
+    """Give up rights for good; what the kernel does not support is left out.
 
     Args:
         hidden: folders that cannot be opened, see
@@ -61,7 +61,7 @@ def confine(
 
 
 def set_resource_limits(memory_limit_bytes: int | None) -> None:
-    """Bound what a job can take faster than its worker looks: processes of its user, and memory."""
+    """Limit the processes and the memory of a job, which may grow faster than its worker checks."""
     with contextlib.suppress(ValueError, OSError, psutil.Error):
         _, most = resource.getrlimit(resource.RLIMIT_NPROC)
         limit = _count_user_threads() + _MAX_THREADS
@@ -74,7 +74,7 @@ def set_resource_limits(memory_limit_bytes: int | None) -> None:
 
 
 def _count_user_threads() -> int:
-    """Threads of this user, which the limit of processes counts together."""
+    """Return the number of threads of this user, which the process limit counts together."""
     uid, found = os.getuid(), 0
     for process in psutil.process_iter(("uids", "num_threads")):
         if process.info["uids"] is not None and process.info["uids"].real == uid:
@@ -87,7 +87,7 @@ class _CapabilityHeader(ctypes.Structure):
 
 
 def _drop_capabilities() -> None:
-    """Root without its powers: files are still its own, other processes are not."""
+    """Drop the capabilities of root: its own files stay accessible, other processes do not."""
     if not IS_LINUX or os.geteuid() != 0:
         return
     for number in range(64):

@@ -1,4 +1,4 @@
-"""Processes that know secrets: no other process reads their memory, not even of the same user."""
+"""Protection of processes that hold secrets: no other process reads their memory, even of the same user."""
 
 import contextlib
 import resource
@@ -7,7 +7,7 @@ from octasplat.workers.sandbox.linux import PR_SET_DUMPABLE, prctl
 
 
 def forbid_memory_access() -> None:
-    """Let no other process of this user read this one's memory and environment, and write none to disk."""
+    """Forbid other processes of this user to read this one's memory and environment, and core dumps."""
     with contextlib.suppress(OSError):
         prctl(PR_SET_DUMPABLE, 0)
     with contextlib.suppress(ValueError, OSError):

@@ -1,7 +1,7 @@
 """Folders that a process cannot open any more (Landlock), and processes that it cannot signal.
 
-https://docs.kernel.org/userspace-api/landlock.html. Landlock allows what is named and nothing else, so that
-all is named that lies beside the way to what is hidden.
+https://docs.kernel.org/userspace-api/landlock.html. Landlock allows only what is named, so all folders beside
+the path to a hidden one are named.
 """
 
 import ctypes

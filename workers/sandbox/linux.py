@@ -1,4 +1,4 @@
-"""Calls of the Linux kernel that Python has no words for."""
+"""Linux system calls that Python has no functions for."""
 
 import ctypes
 import errno
@@ -14,7 +14,7 @@ IS_LINUX = sys.platform.startswith("linux")
 
 
 def prctl(option: int, value: int = 0, pointer: object = 0) -> None:
-    """Change something of this process.
+    """Change a property of this process.
 
     Raises:
         OSError: the kernel refuses, or this is not Linux.

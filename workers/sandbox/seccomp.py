@@ -1,4 +1,4 @@
-"""A filter of system calls (seccomp): no sockets, no looking into other processes, no changes of the system.
+"""Filter of system calls (seccomp): no sockets, no access to other processes, no system changes.
 
 https://docs.kernel.org/userspace-api/seccomp_filter.html. It holds for a process and all that it starts.
 """
@@ -53,7 +53,7 @@ class _Program(ctypes.Structure):
 
 
 def has_seccomp() -> bool:
-    """Return whether this kernel takes filters, and this type of processor is known here."""
+    """Return whether this kernel supports filters, and this processor type is known here."""
     if platform.machine() not in _ARCHES:
         return False
     try:
@@ -64,7 +64,7 @@ def has_seccomp() -> bool:
 
 
 def install_seccomp_filter(*, may_start_processes: bool) -> None:
-    """Take the calls away, for good.
+    """Block the system calls for good.
 
     Args:
         may_start_processes: whether it may start other programs, which have the same filter.

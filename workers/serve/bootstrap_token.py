@@ -1,6 +1,6 @@
-"""The token that ``octasplat serve`` makes for itself: who can read a file of its user may do everything.
+"""Token that ``octasplat serve`` makes for itself; its file is readable by its user only.
 
-Without one, whoever is on the machine could, and so could a page by way of a proxy.
+Without a token, every user of the machine would have access, and a web page through a proxy.
 """
 
 import os
@@ -24,9 +24,9 @@ from octasplat.workers.db.tokens import (
 
 
 async def ensure_bootstrap_token(conninfo: str, path: Path) -> None:
-    """Make a token and keep it in a file, unless there is one that is valid.
+    """Create a token and store it in a file, unless there is a valid one.
 
-    One that others could read is shut out.
+    One that others could read is revoked.
 
     Args:
         conninfo: of the database.

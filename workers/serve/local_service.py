@@ -1,4 +1,4 @@
-"""Database, front end and workers of one machine."""
+"""Local service: the database, front end and workers of one machine."""
 
 import asyncio
 import contextlib
@@ -86,7 +86,7 @@ async def serve(options: ServeOptions, on_ready: Callable[[str], Awaitable[None]
 
 
 def connections_needed(options: ServeOptions) -> int:
-    """Return what the processes of this machine may use, and some for commands and workers elsewhere."""
+    """Return the database connections for the processes of this machine, and some for other commands."""
     front = options.settings.pool_size + 1
     workers = [worker_connections({}), *([worker_connections(options.queues)] if options.queues else [])]
     return max(MIN_CONNECTIONS, front + sum(workers) + SPARE_CONNECTIONS)
@@ -162,7 +162,7 @@ def _python_command(options: ServeOptions, module: str, *arguments: str) -> tupl
 
 
 def _path_variables(settings: WorkerSettings) -> dict[str, str]:
-    """Variables that name folders and programs, so that they mean the same wherever a process stands."""
+    """Return environment variables with absolute paths, valid in any working folder."""
     places = {
         f"{PREFIX}DATA": str(settings.data.absolute()),
         f"{PREFIX}WORK": str(settings.work_folder),
@@ -177,7 +177,7 @@ def _path_variables(settings: WorkerSettings) -> dict[str, str]:
 async def _wait_until_ready(
     api: SupervisedProcess, address: "asyncio.Future[str]", stopped: "asyncio.Task[bool]"
 ) -> None:
-    """Wait for the front end.
+    """Wait until the front end accepts requests.
 
     Raises:
         OutputError: it does not start.
@@ -195,7 +195,7 @@ async def _wait_until_ready(
 
 
 async def _restart_database(database: EmbeddedPostgres | None) -> None:
-    """Start the private database again whenever it ends."""
+    """Restart the private database whenever it ends."""
     while database is not None:
         await asyncio.sleep(DATABASE_CHECK_SECONDS)
         await asyncio.to_thread(database.rotate_log)

@@ -1,4 +1,4 @@
-"""Processes that are started again when they end, later and later if they keep ending."""
+"""Supervised processes: restarted when they end, with growing pauses if they keep ending."""
 
 import asyncio
 import contextlib
@@ -22,7 +22,7 @@ EXIT_NOT_STARTED = 127
 
 
 class SupervisedProcess:
-    """A process that is started again whenever it ends.
+    """A process that is restarted whenever it ends.
 
     Args:
         name: for the log.
@@ -50,15 +50,15 @@ class SupervisedProcess:
 
     @property
     def pid(self) -> int | None:
-        """Process id while it runs."""
+        """Return the process id while it runs, else None."""
         return self._process.pid if self._process is not None else None
 
     def set_variable(self, name: str, value: str) -> None:
-        """Set a variable for the next starts."""
+        """Set an environment variable for the next starts."""
         self._environment[name] = value
 
     async def supervise(self) -> None:
-        """Start it, and again, until :meth:`stop`."""
+        """Start the process, and restart it, until :meth:`stop`."""
         wait = FIRST_RESTART_SECONDS
         while not self._stopping.is_set():
             began = time.monotonic()
@@ -73,7 +73,7 @@ class SupervisedProcess:
             wait = min(MAX_RESTART_SECONDS, 2 * wait)
 
     def stop(self) -> None:
-        """Ask it to end, and start it no more; a second time kills it."""
+        """Ask the process to end and restart it no more; a second call kills it."""
         again = self._stopping.is_set()
         self._stopping.set()
         if self._process is not None and self._process.returncode is None:

@@ -25,7 +25,7 @@ NO_USAGE = SpaceUsage()
 
 @dataclass(frozen=True)
 class DiskSpace:
-    """Watches the disks that jobs fill.
+    """Monitors the disks that jobs fill.
 
     Attributes:
         storage: the store, which keeps a floor of its own.
@@ -46,7 +46,7 @@ class DiskSpace:
     store_folder: Path | None = None
 
     def shortage(self, excluding: SpaceUsage = NO_USAGE) -> str | None:
-        """One sentence on what lacks room, or None.
+        """Return a sentence on which disk is short of space, or None.
 
         Args:
             excluding: as if this were not there.
@@ -70,7 +70,7 @@ class DiskSpace:
         return None
 
     def free_bytes(self) -> int:
-        """Room for jobs on the fuller of the disks.
+        """Return the space for jobs on the fuller of the disks.
 
         Raises:
             StorageUnavailableError: a disk does not answer.
@@ -79,7 +79,7 @@ class DiskSpace:
         return free if stored is None else min(free, stored)
 
     def capacity_bytes(self) -> int:
-        """Return what the disk of ``work`` has above the floor when nothing but the system is on it.
+        """Return the capacity of the disk of ``work`` above the floor, with only the system on it.
 
         Raises:
             StorageUnavailableError: the disk does not answer.
@@ -88,7 +88,7 @@ class DiskSpace:
         return max(0, facts.f_blocks * facts.f_frsize - self.floor_bytes)
 
     def ensure_workspace(self, size_bytes: int) -> None:
-        """Refuse what would take from the reserve on the disk of ``work``.
+        """Refuse a size that would use the reserve on the disk of ``work``.
 
         Raises:
             StorageFullError: it would.

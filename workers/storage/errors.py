@@ -8,19 +8,19 @@ class StorageError(OctasplatError):
 
 
 class StorageFullError(StorageError):
-    """There is no room, or what is left is kept free on purpose; HTTP status 507."""
+    """The storage is full, or the rest is kept free on purpose; HTTP status 507."""
 
     error_type = "storage_full"
 
 
 class StorageUnavailableError(StorageError):
-    """The store does not answer or refuses the service; later it may work."""
+    """The storage does not answer or refuses the service; it may work later."""
 
     error_type = "storage_unavailable"
 
 
 class DigestMismatchError(StorageError):
-    """The bytes that came are not those that were announced."""
+    """The received bytes do not match the announced digest or length."""
 
     error_type = "digest_mismatch"
 
@@ -39,6 +39,6 @@ class ContentTooLargeError(StorageError):
 
 
 class BlobNotFoundError(StorageError):
-    """The store does not hold the content that was asked for."""
+    """The storage does not hold the requested content."""
 
     error_type = "blob_missing"

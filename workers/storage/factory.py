@@ -1,4 +1,4 @@
-"""From a setting to a store."""
+"""Factory of storages from their addresses."""
 
 from pathlib import Path
 from urllib.parse import parse_qs, urlsplit

@@ -1,6 +1,6 @@
-"""Names of files that came from elsewhere: relative, portable, and none the twin of another.
+"""Names of uploaded files: relative, portable, and distinct on every file system.
 
-A name that is odd is refused, never mended, so that what the user sees is what was sent.
+An invalid name is refused, never repaired, so that users see the names that they sent.
 """
 
 import re
@@ -20,7 +20,7 @@ _FORBIDDEN_CHARACTERS = frozenset('<>:"|?*')
 
 
 class FileNameError(DatasetError):
-    """A file name that cannot be taken; ``code`` names the reason."""
+    """A file name that is refused; ``code`` names the reason."""
 
     error_type = "name_refused"
 
@@ -103,27 +103,27 @@ def _check_component(component: str, quoted: str) -> None:
 
 
 def collision_key(name: str) -> str:
-    """Return what two names share that some file system takes for one: canonical Unicode without case."""
+    """Return the key that names share which some file system treats as equal: NFC without case."""
     return unicodedata.normalize(
         "NFC", unicodedata.normalize("NFD", unicodedata.normalize("NFD", name).casefold())
     )
 
 
 def quoted_name(name: str) -> str:
-    """Return a name as it can be put into a sentence: quoted, escaped and cut."""
+    """Return a name for use in a sentence: quoted, escaped and cut."""
     text = name if len(name) <= 80 else f"{name[:60]}...{name[-15:]}"
     return ascii(text) if not text.isprintable() or "\\" in text else f"'{text}'"
 
 
 class NameSet:
-    """Names taken so far; adding one checks it against all the others."""
+    """A set of names; each added one is checked against all others."""
 
     def __init__(self) -> None:
         self._files: dict[str, str] = {}
         self._folders: dict[str, str] = {}
 
     def add(self, name: str) -> None:
-        """Take a checked name of a file.
+        """Add a checked name of a file.
 
         Raises:
             FileNameError: ``name-duplicate``, ``name-twin`` (differs in case or in the spelling of accents
@@ -148,7 +148,7 @@ class NameSet:
         self._files[key] = name
 
     def add_folder(self, name: str) -> None:
-        """Take the name of a folder, without its final slash; repeats are welcome.
+        """Add the name of a folder, without its final slash; repeats are allowed.
 
         Raises:
             FileNameError: as by :meth:`add`, but for ``name-duplicate``.

@@ -1,4 +1,4 @@
-"""Comparing what the tables say with what the store holds. It reports and changes nothing."""
+"""Comparison of the tables with the storage; reports and changes nothing."""
 
 import hashlib
 import time
@@ -29,7 +29,7 @@ class Reference:
 
 @dataclass(frozen=True)
 class Finding:
-    """Something that does not fit: ``missing``, ``damaged``, ``size`` or ``unreadable``."""
+    """A mismatch: ``missing``, ``damaged``, ``size`` or ``unreadable``."""
 
     kind: str
     where: str

@@ -64,7 +64,7 @@ class LocalStorage:
         self._root_fd, self._blobs_fd, self._documents_fd, self._staging_fd = folders
 
     def close(self) -> None:
-        """Let go of the folders; the store must not be used afterwards."""
+        """Close the folders; the storage must not be used afterwards."""
         self._finalizer()
 
     def open_writer(
@@ -86,7 +86,7 @@ class LocalStorage:
         return os.fdopen(self._open_blob(sha256), "rb")
 
     def read(self, sha256: str, start: int = 0, stop: int | None = None) -> Iterator[bytes]:
-        """Bytes of the content in pieces; see the protocol."""
+        """Yield bytes of the content in pieces; see the protocol."""
         self.stat(sha256)
         return self._chunks(sha256, start, stop)
 
@@ -228,13 +228,13 @@ class LocalStorage:
             return True
 
     def free_bytes(self) -> int:
-        """Room above the floor; see the protocol."""
+        """Return the space above the floor; see the protocol."""
         with translate_os_errors(self.root):
             facts = os.fstatvfs(self._root_fd)
         return facts.f_bavail * facts.f_frsize - self.floor_bytes
 
     def ensure_space(self, size_bytes: int) -> None:
-        """Refuse what would go below the floor; see the protocol."""
+        """Refuse a size that would go below the floor; see the protocol."""
         free = self.free_bytes()
         if size_bytes > free:
             raise StorageFullError(

@@ -11,7 +11,7 @@ FREE_SPACE_HINT = "delete datasets or jobs, whose contents then go at once, or a
 
 
 def is_disk_full(error: BaseException | None) -> bool:
-    """Return whether an error, or what it came from, is that there was no room on a disk."""
+    """Return whether an error, or its cause, is a full disk."""
     for _ in range(20):
         if error is None:
             return False

@@ -42,7 +42,7 @@ class StoredBlob:
 
 @runtime_checkable
 class BlobWriter(Protocol):
-    """Takes the bytes of one blob; nobody sees them before :meth:`commit`. Left as a context, it aborts."""
+    """Writer of one blob; it is visible after :meth:`commit`. Left as a context, it aborts."""
 
     def write(self, data: bytes | memoryview) -> None:
         """Take the next bytes.
@@ -65,7 +65,7 @@ class BlobWriter(Protocol):
         ...
 
     def abort(self) -> None:
-        """Throw away what was written; does nothing after :meth:`commit` or a second time."""
+        """Discard what was written; does nothing after :meth:`commit` or a second time."""
         ...
 
     def __enter__(self) -> Self: ...
@@ -75,7 +75,7 @@ class BlobWriter(Protocol):
 
 @runtime_checkable
 class Storage(Protocol):
-    """A store of blobs and documents, see the module. Digests and names that are malformed: ValueError."""
+    """A storage of blobs and documents, see the module. Digests and names that are malformed: ValueError."""
 
     def open_writer(
         self, *, sha256: str | None = None, size_bytes: int | None = None, max_bytes: int | None = None
@@ -110,7 +110,7 @@ class Storage(Protocol):
         ...
 
     def read(self, sha256: str, start: int = 0, stop: int | None = None) -> Iterator[bytes]:
-        """Bytes ``start`` to ``stop`` of the content, in pieces.
+        """Yield bytes ``start`` to ``stop`` of the content, in pieces.
 
         Raises:
             BlobNotFoundError: there is none.
@@ -118,7 +118,7 @@ class Storage(Protocol):
         ...
 
     def local_path(self, sha256: str) -> Path | None:
-        """Return where the content lies as a file of this machine, to be read only; None for a remote store.
+        """Return the content's file on this machine, read-only; None for a remote storage.
 
         Raises:
             BlobNotFoundError: there is none.
@@ -146,7 +146,7 @@ class Storage(Protocol):
         ...
 
     def delete_older(self, sha256: str, before_unix: float) -> bool:
-        """Remove a blob unless it was written, or written once more, since ``before_unix``, s.
+        """Remove a blob unless it was written, or written again, since ``before_unix``, s.
 
         Returns:
             False if it was, or if there was none.
@@ -179,7 +179,7 @@ class Storage(Protocol):
         ...
 
     def ensure_space(self, size_bytes: int) -> None:
-        """Refuse early what would not fit.
+        """Refuse early a size that would not fit.
 
         Raises:
             StorageFullError: ``size_bytes`` more would go below the floor.
@@ -187,11 +187,11 @@ class Storage(Protocol):
         ...
 
     def free_bytes(self) -> int | None:
-        """Room above the floor, negative below it; None where the store has no known end."""
+        """Return the space above the floor, negative below it; None where the capacity is unknown."""
         ...
 
     def check(self) -> None:
-        """Check that the store can be used now.
+        """Check that the storage can be used now.
 
         Raises:
             StorageUnavailableError: it is not there, does not answer, or refuses the service.
@@ -199,12 +199,12 @@ class Storage(Protocol):
         ...
 
     def remove_stale_uploads(self, older_than_seconds: float) -> int:
-        """Remove what uploads that were killed left behind; returns how many there were."""
+        """Remove the remains of killed uploads; returns how many there were."""
         ...
 
 
 def check_sha256(sha256: str) -> str:
-    """Return the digest itself, if it is one.
+    """Return the digest if it is valid; raise otherwise.
 
     Raises:
         ValueError: it is not 64 lower-case hexadecimal digits.
@@ -215,7 +215,7 @@ def check_sha256(sha256: str) -> str:
 
 
 def check_document_name(name: str) -> str:
-    """Return the name itself, if a document can have it.
+    """Return the name if it is valid for a document; raise otherwise.
 
     Raises:
         ValueError: it is not made of parts like ``a-z0-9._-`` joined by ``/``.

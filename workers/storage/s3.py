@@ -107,13 +107,13 @@ class S3Storage:
         return io.BufferedReader(_RangeReader(self, self.stat(sha256)), 256 << 10)
 
     def read(self, sha256: str, start: int = 0, stop: int | None = None) -> Iterator[bytes]:
-        """Bytes of the content in pieces; see the protocol."""
+        """Yield bytes of the content in pieces; see the protocol."""
         size = self.stat(sha256).size_bytes
         stop = size if stop is None else min(stop, size)
         return self._chunks(sha256, start, stop)
 
     def local_path(self, sha256: str) -> None:
-        """None, as a bucket has no files; see the protocol."""
+        """Return None, as a bucket has no files; see the protocol."""
         self.stat(sha256)
 
     def materialise(self, sha256: str, target: Path, *, writable: bool = False) -> None:
@@ -134,7 +134,7 @@ class S3Storage:
         return True
 
     def delete_older(self, sha256: str, before_unix: float) -> bool:
-        """Remove a blob that is old; see the protocol. S3 leaves a moment between look and removal."""
+        """Remove a blob that is old; see the protocol. S3 has no atomic check and removal."""
         key = self._blob_key(sha256)
         try:
             with self._translate_errors(sha256):
@@ -202,7 +202,7 @@ class S3Storage:
         """Do nothing, as a bucket has no known capacity; see the protocol."""
 
     def free_bytes(self) -> None:
-        """None; see the protocol."""
+        """Return None; see the protocol."""
 
     def check(self) -> None:
         """Check that the bucket answers; see the protocol."""
@@ -264,7 +264,7 @@ class S3Storage:
 
     @contextmanager
     def _translate_errors(self, what: str) -> Iterator[None]:
-        """Turn the errors of the client into those of a store."""
+        """Translate errors of the client into those of a storage."""
         try:
             yield
         except ClientError as error:
@@ -344,7 +344,7 @@ class S3Writer(VerifyingWriter):
                 self._copy_to_final_key(final_key, blob.size_bytes)
 
     def _copy_to_final_key(self, final_key: str, size_bytes: int) -> None:
-        """Copy inside the store, in ranges, as a single copy ends at 5 GiB."""
+        """Copy inside the storage, in ranges, as a single copy is limited to 5 GiB."""
         client, bucket = self._storage.client, self._storage.bucket
         source: Any = {"Bucket": bucket, "Key": self._key}
         upload = client.create_multipart_upload(Bucket=bucket, Key=final_key)["UploadId"]
@@ -382,7 +382,7 @@ class S3Writer(VerifyingWriter):
 
 
 class _RangeReader(io.RawIOBase):
-    """A blob as a raw file; every read is one request for a range."""
+    """A blob as a raw file; every read requests one range."""
 
     def __init__(self, storage: S3Storage, blob: Blob) -> None:
         self._storage = storage

@@ -1,7 +1,7 @@
-"""Folders in a store: a manifest of names and digests, the files as blobs.
+"""Folders in a storage: a manifest of names and digests, the files as blobs.
 
-A dataset, a checkpoint and the results of an attempt are such trees. Storing the files is repeatable and
-shows nothing; publishing the manifest is the one step that makes a tree exist.
+A dataset, a checkpoint and the results of an attempt are such trees. Storing the files can be repeated and
+makes nothing visible; publishing the manifest is the one step that creates a tree.
 """
 
 from collections.abc import Callable, Iterable
@@ -28,7 +28,7 @@ class TreeFile(BaseModel):
 
 
 class Manifest(BaseModel):
-    """The files of a tree, sorted by name, and what the writer wants to say about it."""
+    """The files of a tree, sorted by name, and metadata of the writer."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -38,11 +38,11 @@ class Manifest(BaseModel):
 
     @property
     def size_bytes(self) -> int:
-        """Sum over the files; content that occurs twice counts twice."""
+        """Return the sum over the files; content that occurs twice counts twice."""
         return sum(file.size_bytes for file in self.files)
 
     def to_bytes(self) -> bytes:
-        """As it is published; equal manifests give equal bytes."""
+        """Return the published bytes; equal manifests give equal bytes."""
         return self.model_dump_json(indent=1).encode("utf-8")
 
 

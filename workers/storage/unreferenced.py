@@ -1,4 +1,4 @@
-"""Contents that nothing names, found and removed. Whoever calls this knows all that is named."""
+"""Search and removal of unreferenced contents; the caller knows all references."""
 
 import math
 from collections.abc import Iterable, Sequence, Set
@@ -35,7 +35,7 @@ def find_unused(
     unused_before_unix: float,
     replaced_before_unix: float,
 ) -> list[UnusedContent]:
-    """Contents that are not named and were not written lately.
+    """Return contents that are not referenced and were not written lately.
 
     Content is stored first and named afterwards, and storing it once more makes it young, so what is old and
     not named is not about to be named either.
@@ -60,7 +60,7 @@ def find_unused(
 
 
 def list_unreferenced(storage: Storage, referenced: Set[str]) -> list[StoredBlob]:
-    """Contents that are not named, as they are now.
+    """Return contents that are not referenced, as they are now.
 
     Raises:
         StorageError: the store cannot be listed.
@@ -71,7 +71,7 @@ def list_unreferenced(storage: Storage, referenced: Set[str]) -> list[StoredBlob
 def still_unreferenced(
     listed: Sequence[StoredBlob], referenced: Set[str], *, before_unix: float
 ) -> list[UnusedContent]:
-    """Of contents that were listed those that are still not named, as long as they are as they were listed.
+    """Return those of the listed contents that are still unreferenced and unchanged.
 
     Args:
         listed: what :func:`list_unreferenced` listed before ``referenced`` was gathered.
@@ -86,7 +86,7 @@ def still_unreferenced(
 
 
 def remove_contents(storage: Storage, contents: Iterable[UnusedContent]) -> RemovedContents:
-    """Remove contents that were not written once more.
+    """Remove contents that were not written again.
 
     Raises:
         StorageError: the store cannot be changed.

@@ -1,4 +1,4 @@
-"""Copying content out of a store so that damage does not go unnoticed."""
+"""Copy of content out of a storage that detects damage."""
 
 import hashlib
 import os

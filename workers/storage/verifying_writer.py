@@ -10,7 +10,7 @@ from octasplat.workers.storage.protocol import Blob, check_sha256
 
 
 class VerifyingWriter(ABC):
-    """Base of the writers; the subclasses put bytes somewhere, make them visible, or throw them away."""
+    """Base of the writers; subclasses store bytes and make them visible or discard them."""
 
     def __init__(self, sha256: str | None, size_bytes: int | None, max_bytes: int | None) -> None:
         self._expected_sha256 = None if sha256 is None else check_sha256(sha256)
@@ -25,17 +25,17 @@ class VerifyingWriter(ABC):
             self._check_size(size_bytes, max_bytes)
 
     def write(self, data: bytes | memoryview) -> None:
-        """Take the next bytes; see the protocol."""
+        """Write the next bytes; see the protocol."""
         with self._lock:
             self._write(data)
 
     def commit(self) -> Blob:
-        """Verify and make visible; see the protocol."""
+        """Verify the content and make it visible; see the protocol."""
         with self._lock:
             return self._commit()
 
     def abort(self) -> None:
-        """Throw away; see the protocol."""
+        """Discard the content; see the protocol."""
         with self._lock:
             if self._open:
                 self._open = False
@@ -104,4 +104,4 @@ class VerifyingWriter(ABC):
 
     @abstractmethod
     def _discard(self) -> None:
-        """Throw away all bytes; raises nothing."""
+        """Discard all bytes; raises nothing."""

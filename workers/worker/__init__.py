@@ -1,1 +1,1 @@
-"""Workers: a small supervisor that talks to the database and the store, the work in a child process."""
+"""Workers: a supervisor that uses the database and the storage; the work runs in a child process."""

@@ -27,7 +27,7 @@ MAX_DEFERRAL_SECONDS = 20.0
 
 
 class Admission:
-    """Looks for room before jobs are begun.
+    """Checks disk space before jobs begin.
 
     Args:
         name: of the worker.
@@ -42,10 +42,10 @@ class Admission:
         self._is_shortage_logged = False
 
     async def admit(self, job_id: uuid.UUID, entry_id: int) -> bool:
-        """Return whether there is room for a job, waiting a while for it; else the job was left to others.
+        """Return whether there is space for a job, after waiting a while; else the job is left to others.
 
-        Without room for any job the worker waits. A job that needs more than there is waits by itself, and
-        others go before it; one that no worker of its queue could ever have room for has failed.
+        Without space for any job the worker waits. A job that needs more than is free is deferred and others
+        go before it; one that no worker of its queue could ever hold is failed.
         """
         deadline = time.monotonic() + MAX_SPACE_WAIT_SECONDS
         while (lacking := await self._context.space_shortage()) is not None:
@@ -63,7 +63,7 @@ class Admission:
         return await self._has_space_for(job_id, entry_id)
 
     async def free_space_if_short(self) -> None:
-        """Make room if it is lacking."""
+        """Free space if it is short."""
         if await self._context.space_shortage() is not None:
             await self._free_space()
 
@@ -109,7 +109,7 @@ class Admission:
         return None if None in capacities else max([own, *map(int, filter(None, capacities))])
 
     async def _free_space(self) -> None:
-        """Remove what nobody names, and photographs that can be had from the store again."""
+        """Remove unreferenced contents, and photographs that can be fetched again."""
         try:
             await asyncio.to_thread(sweep_workspaces, self._context.settings.work_folder, 0.0)
             await collect_garbage_now(self._pool, self._context.storage)
@@ -120,7 +120,7 @@ class Admission:
 async def defer_job(
     pool: Pool, job_queue: JobQueue, job_id: uuid.UUID, entry_id: int, delay_seconds: float = 0.0
 ) -> None:
-    """Leave a job whose slip is being delivered to whoever comes after ``delay_seconds``."""
+    """Defer a job whose entry is being delivered by ``delay_seconds``."""
     async with pool.connection() as connection, connection.transaction():
         job = await get_job(connection, job_id, lock=True)
         if job is not None and job.state == "queued" and job.slip == entry_id:

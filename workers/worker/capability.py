@@ -19,7 +19,7 @@ from octasplat.workers.worker.workspace import Checkpoint
 
 
 def version_facts() -> dict[str, Any]:
-    """Return what a worker says of its version, for others to match with jobs."""
+    """Return the version facts that a worker publishes, to be matched with jobs."""
     return {"kinds": [kind.name for kind in job_kinds()], "results": versions.RESULTS_VERSION}
 
 
@@ -47,7 +47,7 @@ async def reason_incapable(pool: Pool, job_id: uuid.UUID, stale_seconds: float) 
 
 
 def _unknown_to_version(job: Job) -> str | None:
-    """Return what this version does not know of a job."""
+    """Return what this version does not know of a job, or None."""
     try:
         get_job_kind(job.kind).options.model_validate(job.options)
     except ConfigError:

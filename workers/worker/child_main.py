@@ -1,8 +1,8 @@
-"""The child process of a worker: does one job, tells of it in JSON lines, stops when asked or orphaned.
+"""Child process of a worker: runs one job, reports in JSON lines, stops when asked or orphaned.
 
 Run by :func:`octasplat.engine.core.isolated_python.python_command`. The first line of stdin is the task
-(JSON); a later line ``stop`` asks for a checkpoint and a stop. If stdin ends, the worker has died. Events
-go to stdout, one JSON object a line; whatever libraries print goes to stderr, which is the job's log.
+(JSON); a later line ``stop`` requests a checkpoint and a stop. If stdin ends, the worker has died. Events go
+to stdout, one JSON object a line; output of libraries goes to stderr, which is the job's log.
 """
 
 import contextlib
@@ -29,7 +29,7 @@ MAX_CAUSE_LINES = 60
 
 
 class _EventStream:
-    """The original stdout, for JSON lines only."""
+    """The original stdout, reserved for JSON lines."""
 
     def __init__(self) -> None:
         self._file = os.fdopen(os.dup(1), "w", encoding="utf-8")
@@ -45,7 +45,7 @@ class _EventStream:
 
 
 def main() -> NoReturn:
-    """Do the task that stdin brings and exit."""
+    """Run the task from stdin and exit."""
     lines = _EventStream()
     given: dict[str, Any] = json.loads(sys.stdin.readline())
     set_parent_death_signal(
@@ -111,7 +111,7 @@ def _run_task(task: dict[str, Any], events: _EventStream, stop: threading.Event)
 
 
 def _cause_lines(error: BaseException) -> list[str]:
-    """Return what an error came from, a line each."""
+    """Return the causes of an error, one line each."""
     found: list[str] = []
     while len(found) < MAX_CAUSE_LINES:
         inner = error.__cause__ or (None if error.__suppress_context__ else error.__context__)
@@ -130,13 +130,13 @@ def _watch_stdin(stop: threading.Event) -> None:
 
 
 def _raise_oom_score() -> None:
-    """Let the system kill this process rather than the database when memory runs out."""
+    """Raise the OOM score, so that the system kills this process before the database."""
     with contextlib.suppress(OSError):
         Path("/proc/self/oom_score_adj").write_text(str(OOM_SCORE_ADJUSTMENT), encoding="ascii")
 
 
 def _enter_sandbox(task: dict[str, Any]) -> None:
-    """Give up what the work does not need, while there is one thread; those that come later have no more."""
+    """Give up rights that the work does not need, while there is one thread; later ones inherit this."""
     set_resource_limits(task.get("memory_limit_bytes"))
     written: tuple[Path, ...] = ()
     if "folder" in task:

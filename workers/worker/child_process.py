@@ -1,4 +1,4 @@
-"""The child process as its worker sees it: started, asked to stop, killed, heard."""
+"""The child process as seen by its worker: started, asked to stop, killed, read."""
 
 import asyncio
 import contextlib
@@ -28,7 +28,7 @@ _PASSED_VARIABLES = re.compile(
 
 
 def child_environment(environment: Mapping[str, str]) -> dict[str, str]:
-    """Return what a job's process may know of this one's environment: no password, key or token among it."""
+    """Return the environment for a job's process, without passwords, keys and tokens."""
     passed = {name: value for name, value in environment.items() if _PASSED_VARIABLES.fullmatch(name)}
     # Threads that wait for each other sleep instead of spinning, as in the command line.
     passed.setdefault("OMP_WAIT_POLICY", "PASSIVE")
@@ -36,7 +36,7 @@ def child_environment(environment: Mapping[str, str]) -> dict[str, str]:
 
 
 def _with_absolute_paths(environment: dict[str, str]) -> dict[str, str]:
-    """Return the same for a process in another folder."""
+    """Return the environment with absolute paths, for a process in another folder."""
     named = environment.get(SPLAT_TRANSFORM)
     return environment if not named else {**environment, SPLAT_TRANSFORM: str(Path(named).absolute())}
 
@@ -97,7 +97,7 @@ class ChildProcess:
         return self._process.pid
 
     async def wait(self) -> int:
-        """Wait for the end and everything said until then; returns the exit code, negative for a signal."""
+        """Wait for the end and all output; returns the exit code, negative for a signal."""
         code = await self._process.wait()
         # A grandchild may hold the pipes open.
         _, late = await asyncio.wait(self._readers, timeout=5)
@@ -112,12 +112,12 @@ class ChildProcess:
         self._send("stop")
 
     def kill(self) -> None:
-        """End it and whatever it started, at once."""
+        """Kill the process and whatever it started, at once."""
         with contextlib.suppress(ProcessLookupError, PermissionError):
             os.killpg(self._process.pid, signal.SIGKILL)
 
     def memory_bytes(self) -> int:
-        """Private memory of the child and what it started.
+        """Return the private memory of the child and its descendants.
 
         Pages of files that are mapped, as those of photographs, belong to the system, which takes them back
         when it needs them.
@@ -132,7 +132,7 @@ class ChildProcess:
         return total
 
     def process_count(self) -> int:
-        """Return number of processes that the child has started and that live."""
+        """Return the number of live descendants of the child."""
         with contextlib.suppress(psutil.Error):
             return len(psutil.Process(self._process.pid).children(recursive=True))
         return 0
@@ -143,7 +143,7 @@ class ChildProcess:
             self._process.stdin.write(f"{line}\n".encode())
 
     async def _read_lines(self, stream: asyncio.StreamReader, on_line: Callable[[str], None]) -> None:
-        """Take whole lines; a line without an end is cut, so that memory stays bounded."""
+        """Yield complete lines; a line without an end is cut, so that memory stays bounded."""
         rest = b""
         while piece := await stream.read(_READ_BYTES):
             self.last_output_at = time.monotonic()

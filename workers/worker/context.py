@@ -14,7 +14,7 @@ from octasplat.workers.worker.host_health import HostHealth
 
 
 class DatabaseLostError(Exception):
-    """The worker cannot say any more whether its jobs are its own, so it has let go of them."""
+    """The worker cannot confirm any more that its jobs are its own, so it has given them up."""
 
 
 @dataclass(frozen=True)
@@ -47,14 +47,14 @@ class WorkerContext:
         return Quota(max_bytes=self.settings.quota_bytes)
 
     async def space_shortage(self, excluding: SpaceUsage = NO_USAGE) -> str | None:
-        """Return what lacks room for jobs, in a sentence, or None."""
+        """Return a sentence on which disk is short of space for jobs, or None."""
         try:
             return await asyncio.to_thread(self.disk_space.shortage, excluding)
         except StorageError as error:
             return str(error)
 
     async def free_bytes(self) -> int:
-        """Room for jobs; 0 where that cannot be said."""
+        """Return the space for jobs; 0 where it is unknown."""
         try:
             return await asyncio.to_thread(self.disk_space.free_bytes)
         except StorageError:

@@ -1,4 +1,4 @@
-"""The programs of the kinds that octasplat brings; only a job's own process imports this."""
+"""Programs of the built-in job kinds; only a job's own process imports this."""
 
 import json
 import os
@@ -30,7 +30,7 @@ REPORT = "report.html"
 
 
 def reconstruct(task: Task) -> None:
-    """Photographs to a scene, its meshes and measurements; goes on from what an earlier attempt left.
+    """Run a reconstruction, resumed from what an earlier attempt left.
 
     If that is of other settings, as another version may understand the same options, it begins anew.
     """
@@ -72,7 +72,7 @@ def _run_reconstruction(task: Task) -> None:
 
 
 def _publish_run(task: Task) -> None:
-    """Put all that a run has finished among the results; nothing before there is a scene."""
+    """Publish what a run has finished as results; there are none before the scene."""
     if not (task.run / SCENE).exists():
         return
     for path in sorted(task.run.rglob("*")):
@@ -107,11 +107,11 @@ def _path_redactor(task: Task) -> PathRedactor:
 
 
 def _publish_file(task: Task, path: Path, name: str) -> None:
-    """Put a file among the results, without a copy."""
+    """Add a file to the results without a copy."""
     target = task.results / name
     target.parent.mkdir(parents=True, exist_ok=True)
     target.unlink(missing_ok=True)
-    if name == CONFIG:  # where the photographs lay on this machine is nobody's business
+    if name == CONFIG:  # where the photographs lay on this machine is private
         content = json.loads(path.read_text(encoding="utf-8"))
         write_json(target, {**content, "scene": task.title})
     elif name in (EVENTS, REPORT, INFO_FILE):

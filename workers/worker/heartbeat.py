@@ -1,4 +1,4 @@
-"""Contact with the database: heartbeats of a worker for one attempt, and the clock that runs between them."""
+"""Heartbeats of a worker for one attempt, and the clock that runs between them."""
 
 import asyncio
 import time
@@ -21,15 +21,15 @@ DATABASE_ERRORS = (
 
 
 class Heartbeat:
-    """Says whether an attempt is surely still this worker's.
+    """Tells whether an attempt is certainly still this worker's.
 
     Only a heartbeat that this worker wrote counts, from the moment at which it was sent: others judge by the
-    time in the row, which is no earlier. That the row can be read proves nothing.
+    time in the row, which is no earlier. A successful read of the row proves nothing.
 
     Args:
         attempt: the claimed job.
         settings: of the worker.
-        claimed_at: when the claim was asked for, by ``time.monotonic()``.
+        claimed_at: when the claim was requested, by ``time.monotonic()``.
     """
 
     def __init__(self, attempt: Attempt, settings: WorkerSettings, claimed_at: float) -> None:
@@ -48,7 +48,7 @@ class Heartbeat:
         return self._last_sent + KILL_FRACTION * self._settings.stale_seconds
 
     async def run(self, on_state: Callable[[str], None]) -> None:
-        """Say that the worker lives, for ever, and tell ``on_state`` the job's state.
+        """Write heartbeats for ever, and pass the job's state to ``on_state``.
 
         Raises:
             FencedError: the job has gone on without this worker.

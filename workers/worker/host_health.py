@@ -25,7 +25,7 @@ owner alone cannot bring that about."""
 
 
 class HostHealth:
-    """Knows what ails this machine.
+    """Monitors faults of this machine.
 
     Args:
         name: of the worker, for the log.
@@ -72,7 +72,7 @@ class HostHealth:
         self._crashed_jobs.clear()
 
     def mark_faulty(self, fault: str) -> None:
-        """Take no jobs until :meth:`try_recover` finds nothing any more."""
+        """Take no jobs until :meth:`try_recover` finds no fault any more."""
         if self.fault is None:
             logger.error("worker %s takes no jobs: %s", self._name, fault)
         self.fault = fault
@@ -103,7 +103,7 @@ class HostHealth:
         return found
 
     async def try_recover(self) -> bool:
-        """Return whether jobs can be taken again; what is wrong is said in :attr:`fault`."""
+        """Return whether jobs can be taken again; a remaining fault is in :attr:`fault`."""
         if time.monotonic() < self._cooldown_until:
             return False
         found = await self.check_work_folder() or await self._check_store()

@@ -25,7 +25,7 @@ def memory_limit_bytes(requested_bytes: int | None, slots: int) -> int | None:
 
 
 def total_memory_bytes() -> int:
-    """Memory of the machine, or what a container may use of it."""
+    """Return the memory of the machine, or the limit of its container."""
     total = psutil.virtual_memory().total
     for path in _CGROUP_FILES:
         try:

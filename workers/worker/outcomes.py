@@ -29,20 +29,21 @@ logger = logging.getLogger(__name__)
 T = TypeVar("T")
 
 MAX_CONTRADICTIONS = 3
-"""So often a verdict is told again that contradicts what others changed at the same time."""
+"""So often an outcome is told again that contradicts what others changed at the same time."""
 
 
 class OutcomeWriter:
-    """Writes what becomes of one attempt, again and again while the job is surely ours.
+    """Writes the outcome of one attempt, with retries while the job is certainly ours.
 
-    Every method raises DatabaseLostError when that time is over, and FencedError when the job has gone on.
+    Every method raises DatabaseLostError when that time is over, and FencedError when the job has continued
+    elsewhere.
 
     Args:
         attempt: the claimed job.
         context: the worker.
         workspace: of the attempt.
         reporter: of the attempt.
-        heartbeat: says whether the job is ours.
+        heartbeat: tells whether the job is ours.
         program: of the job; empty where this version does not know its kind.
     """
 
@@ -84,7 +85,7 @@ class OutcomeWriter:
         self._context.host_health.record_success()
 
     async def fail(self, error: dict[str, Any]) -> None:
-        """End the job with what its program has finished."""
+        """Fail the job, with the results that its program has finished."""
         try:
             await self._with_partial_results(lambda results, note: self._attempt.fail(error, results, note))
         except QuotaExceededError as excess:
@@ -94,7 +95,7 @@ class OutcomeWriter:
             await self.handle_error(storage_error)
 
     async def fail_refused_value(self, error: psycopg.DataError) -> None:
-        """End the job with the database's refusal of something that was to be written about it."""
+        """Fail the job because the database refused a value that was to be written."""
         logger.error("what was to be written about job %s is refused: %s", self._job.id, error)
         described = {
             "type": "refused_value",
@@ -103,15 +104,15 @@ class OutcomeWriter:
         await self._retry_write(lambda: self._attempt.fail(described))
 
     async def cancel(self) -> None:
-        """End the job as its owner asked."""
+        """End the job as its owner requested."""
         await self._retry_write(self._attempt.cancel)
 
     async def requeue(self, reason: str) -> None:
-        """Put the job back for no fault of its own."""
+        """Requeue the job for a reason that is not its own."""
         await self._retry_write(lambda: self._attempt.requeue(self._context.job_queue, reason))
 
     async def requeue_or_fail(self, error: dict[str, Any]) -> None:
-        """Put the job back after a failure that may be its own, or end it with what it has finished."""
+        """Requeue the job after a failure that may be its own, or fail it with its finished results."""
         if self._job.rescues >= MAX_RECOVERIES:
             try:
                 await self._with_partial_results(
@@ -123,11 +124,11 @@ class OutcomeWriter:
         await self._retry_write(lambda: self._requeue_counted(error))
 
     async def requeue_counted(self, error: dict[str, Any]) -> None:
-        """Put the job back for a reason that may pass."""
+        """Requeue the job for a reason that may pass; the attempt counts."""
         await self._retry_write(lambda: self._requeue_counted(error))
 
     async def handle_error(self, error: OctasplatError) -> None:
-        """Put the job back, or end it, after an error around its program."""
+        """Requeue the job, or fail it, after an error around its program."""
         described = _error_as_dict(error)
         if isinstance(error, StorageUnavailableError):
             await self.diagnose_and_requeue(described["message"])
@@ -139,7 +140,7 @@ class OutcomeWriter:
             await self._retry_write(lambda: self._attempt.fail(described))
 
     async def diagnose_and_requeue(self, message: str) -> None:
-        """Put the job back after a failure that may be this machine's: it counts only if it is not."""
+        """Requeue the job after a failure; the attempt counts unless the machine is at fault."""
         found = await self._context.host_health.diagnose(self._program)
         if found is None:
             error = {"type": "crashed", "message": message}
@@ -198,7 +199,7 @@ class OutcomeWriter:
                 await self._pause_or_raise(error)
 
     async def _withdraw(self) -> None:
-        """Nothing names results any more that are not wanted, so that they are collected."""
+        """Withdraw results that are not wanted, so that they are collected."""
         try:
             await asyncio.to_thread(self._workspace.withdraw_results)
         except StorageError as error:
@@ -207,7 +208,7 @@ class OutcomeWriter:
     async def _with_partial_results(
         self, write: Callable[[list[ResultFile], StorageLease], Awaitable[None]]
     ) -> None:
-        """Store what a program has finished and say so."""
+        """Store the finished results of a program and record them."""
         while True:
             try:
                 async with storage_lease(self._attempt.pool, self._context.storage) as note:

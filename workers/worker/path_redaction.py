@@ -1,6 +1,6 @@
-"""Sentences and log lines without the paths of the machine that wrote them.
+"""Removal of this machine's paths from sentences and log lines.
 
-Files of a job are named relative to its scene or its result; of any other path little but a name is left.
+Files of a job are named relative to its scene or its result; of any other path only the last parts are left.
 """
 
 import os
@@ -23,7 +23,7 @@ class PathRedactor:
     Args:
         folder: of an attempt, see :class:`octasplat.workers.worker.task.Task`.
         work: folder of all work on this machine.
-        others: further folders whose paths are nobody's business, such as that of the store.
+        others: further folders whose paths are private, such as that of the store.
     """
 
     def __init__(self, folder: Path, work: Path, others: Iterable[Path] = ()) -> None:
@@ -62,7 +62,7 @@ def shorten_absolute_paths(text: str) -> str:
 
 
 def redact_json(value: Any, redactor: PathRedactor) -> Any:
-    """Return a JSON value with all its texts as they are shown."""
+    """Return a JSON value with all its texts redacted."""
     if isinstance(value, str):
         return redactor.redact(value)
     if isinstance(value, dict):

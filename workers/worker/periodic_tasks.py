@@ -10,14 +10,14 @@ from octasplat.workers.worker.heartbeat import DATABASE_ERRORS
 logger = logging.getLogger(__name__)
 
 MAX_FAILURES = 10
-"""So many failures of a chore one after another, for no reason that will pass, end the worker."""
+"""So many failures of a periodic task one after another, for no reason that will pass, end the worker."""
 DEFAULT_TIMEOUT_SECONDS = 600.0
-"""A chore that has not ended after this time, or after ten times its interval, has failed."""
+"""A periodic task that has not ended after this time, or after ten times its interval, has failed."""
 
 
 @dataclass(frozen=True)
 class PeriodicTask:
-    """An action to run every ``interval_seconds``; after ``timeout_seconds`` it is stopped and run again."""
+    """An action to run every ``interval_seconds``; cancelled after ``timeout_seconds`` and run again."""
 
     action: Callable[[], Awaitable[None]]
     interval_seconds: float
@@ -25,7 +25,7 @@ class PeriodicTask:
 
 
 class PeriodicTaskError(Exception):
-    """A periodic task fails again and again, so that the worker should be restarted."""
+    """A periodic task failed repeatedly, so that the worker should be restarted."""
 
 
 async def run_periodically(task: PeriodicTask) -> None:

@@ -1,4 +1,4 @@
-"""Small pictures of a scene in the making, beside the photographs they answer to."""
+"""Preview images of a scene during its training, beside the photographs of the same view."""
 
 import math
 import time
@@ -39,7 +39,7 @@ class PreviewWritten(Event):
 
 
 class PreviewRenderer:
-    """Watches a training and draws one view of it every few seconds, whatever its checkpoints.
+    """Renders one view of a training every few seconds, independent of its checkpoints.
 
     It traces rays with the training's own tracer between two iterations. That changes nothing in it, so the
     training is what it would be without.
@@ -59,7 +59,7 @@ class PreviewRenderer:
         self._image_count = 0
 
     def __call__(self, iteration: int, dataset: Dataset, tracer: Tracer, shading: ShadingModel) -> None:
-        """Draw a picture if it is time."""
+        """Render a preview if it is due."""
         began = time.monotonic()
         if began < self._next_at:
             return
@@ -79,7 +79,7 @@ class PreviewRenderer:
 
 
 def grid_rays(dataset: Dataset, view: int, side_px: int) -> ImageRays:
-    """Rays through evenly spaced pixels of a view.
+    """Return rays through evenly spaced pixels of a view.
 
     Args:
         dataset: the photographs.

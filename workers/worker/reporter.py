@@ -42,7 +42,7 @@ _IGNORED_ERRORS = (psycopg.Error, PoolTimeout, TimeoutError, OSError)
 
 
 class Reporter:
-    """Tells the database what a child says.
+    """Writes the reports of a child process to the database.
 
     Args:
         attempt: the job.
@@ -76,17 +76,17 @@ class Reporter:
         return sum(file.size_bytes for file in self._checkpoint.files) if self._checkpoint is not None else 0
 
     def set_stages(self, stages: Sequence[str]) -> None:
-        """Say which stages there will be."""
+        """Set the stages that there will be."""
         self._stages = tuple(stages)
         self._events.append(("stages", {"stages": list(stages)}))
 
     def record_resume(self, checkpoint: Checkpoint) -> None:
-        """Say what the attempt goes on from; only what is beyond it is progress."""
+        """Record what the attempt resumes from; only what is beyond it is progress."""
         self._checkpoint = checkpoint
         self.add_note(f"Goes on from step {checkpoint.step} of {checkpoint.stage}")
 
     def log(self, line: str) -> None:
-        """Take a line that the child's libraries wrote."""
+        """Add a line that the child's libraries wrote."""
         self._log_line_count += 1
         if self._log_line_count <= MAX_LOG_LINES:
             if len(self._lines) < _MAX_PENDING_LINES:
@@ -95,13 +95,13 @@ class Reporter:
             self._lines.append(f"(More than {MAX_LOG_LINES} lines; the rest is left out.)")
 
     def add_note(self, line: str) -> None:
-        """Put a line into the log that is not lost among those of libraries."""
+        """Add a line to the log that is kept apart from those of libraries."""
         self._note_count += 1
         if self._note_count <= MAX_NOTE_LINES:
             self._lines.append(line)
 
     def on_event(self, event: dict[str, Any]) -> None:
-        """Take an event of the child."""
+        """Handle an event of the child."""
         kind = event["kind"]
         decoded = decode_event(kind, event)
         if isinstance(decoded, Warned):
@@ -130,7 +130,7 @@ class Reporter:
         elif kind == "checkpoint_written":
             self._want_checkpoint(event["iteration"])
         elif kind == "stage_finished":
-            # The last step comes before the end in the journal too, and is not lost to the next first one.
+            # The last step comes before the end in the event log too, and is not lost to the next first one.
             if self._progress is not None and "event" in self._progress:
                 self._events.append(("progress", self._progress.pop("event")))
             if event["stage"] in ("poses", "placing", "lenses", "train"):
@@ -142,7 +142,7 @@ class Reporter:
             self._events.append((kind, {key: value for key, value in event.items() if key != "kind"}))
 
     async def finish(self) -> None:
-        """Write everything that is left, the last checkpoint included."""
+        """Write everything that is pending, including the last checkpoint."""
         async with self._flushing:  # a flush that is under way would lose what it has taken
             for task in self._tasks:
                 task.cancel()
@@ -152,7 +152,7 @@ class Reporter:
         await self._store_pending()
 
     async def close(self) -> None:
-        """Stop, leaving what is left."""
+        """Stop without writing what is pending."""
         await cancel_and_wait(self._tasks)
 
     def _on_stage_progress(self, event: dict[str, Any]) -> None:

@@ -1,4 +1,4 @@
-"""One attempt at a job: the child at work, the heartbeat beside it, and a verdict at the end."""
+"""One attempt at a job: the child process, its heartbeat, and its outcome."""
 
 import asyncio
 import logging
@@ -96,7 +96,7 @@ class Supervisor:
         self._deadline_at = math.inf
 
     async def run(self) -> None:
-        """Work until the job is over, handed back or lost.
+        """Work until the job is over, requeued or lost.
 
         Raises:
             DatabaseLostError: the database did not answer for too long.
@@ -273,7 +273,7 @@ class Supervisor:
             await self._outcomes.requeue_or_fail({"type": "crashed", "message": message})
 
     async def _wait_for_child(self, child: ChildProcess) -> int:
-        """Wait for the child's end, which is brought about if anything asks for it."""
+        """Wait for the child's end, and stop it when something requires that."""
         exited = asyncio.create_task(child.wait())
         limits = asyncio.create_task(self._watch_limits(child))
         is_asked_to_stop = False
@@ -296,7 +296,7 @@ class Supervisor:
             limits.cancel()
 
     async def _run_heartbeat(self) -> None:
-        """Say that the worker lives, and hear of the wishes of others."""
+        """Write heartbeats, and handle requests to cancel or stop."""
         try:
             await self._heartbeat.run(
                 lambda state: self._stop(StopReason.CANCELED) if state == "canceling" else None
@@ -329,7 +329,7 @@ class Supervisor:
             await self._watch_disk()
 
     async def _watch_disk(self) -> None:
-        """Stop a child that fills the disk; of several the one that took most."""
+        """Stop a child that fills the disk; of several the one that used most."""
         around, loop = self._context, asyncio.get_running_loop()
         taken = await loop.run_in_executor(_WATCH_POOL, self._workspace.used_bytes)
         around.taken_bytes[self._job.id] = taken
@@ -344,14 +344,14 @@ class Supervisor:
             logger.info("the disk of job %s was not looked at: %s", self._job.id, error)
 
     def _stop(self, reason: StopReason) -> None:
-        """Stop the child for ``reason``; the first counts, but for those that forbid writing."""
+        """Stop the child for ``reason``; the first reason counts, except for those that forbid writing."""
         if self._stop_reason is None or reason in (StopReason.FENCED, StopReason.DATABASE_LOST):
             self._stop_reason = reason
         self._kill_at = min(self._kill_at, self._kill_deadline(reason))
         self._stop_event.set()
 
     def _kill_deadline(self, reason: StopReason) -> float:
-        """Until when the child may go on to stop by itself, by ``time.monotonic()``."""
+        """Return until when the child may take to stop by itself, by ``time.monotonic()``."""
         now, grace = time.monotonic(), self._settings.grace_seconds
         if reason is StopReason.DATABASE_LOST:
             return self._heartbeat.kill_at

@@ -56,22 +56,22 @@ class Task:
 
     @property
     def run(self) -> Path:
-        """The engine's output folder."""
+        """Return the engine's output folder."""
         return self.folder / RUN_FOLDER
 
     @property
     def source(self) -> Path:
-        """The source job's results as a run, or, where they are no whole run, the scene among them."""
+        """Return the source job's results as a run, or, where they are not a complete run, its scene file."""
         return self.run if (self.run / CONFIG_FILE).exists() else self.run / SCENE_FILE
 
     @property
     def files(self) -> Path:
-        """Folder of the files that the options name, if they name some; they must not be changed."""
+        """Return the folder of the files that the options name; they must not be changed."""
         return self.folder / FILES_FOLDER
 
     @property
     def results(self) -> Path:
-        """Folder of the files to publish; made when it is first asked for."""
+        """Return the folder of the files to publish; it is created when first used."""
         folder = self.folder / RESULTS_FOLDER
         folder.mkdir(exist_ok=True)
         return folder

@@ -1,4 +1,4 @@
-"""The process of a worker: takes slips from its queues, supervises attempts, and looks after lost jobs."""
+"""Worker process: takes entries from its queues, supervises attempts, and recovers lost jobs."""
 
 import asyncio
 import contextlib
@@ -74,7 +74,7 @@ MAX_FORGIVEN_FAILURES = 3
 
 
 def make_job_queue(settings: WorkerSettings, pool: Pool | None = None) -> ProcrastinateQueue:
-    """Return the queue, as the settings say."""
+    """Return the queue that the settings select."""
     return ProcrastinateQueue(
         pool,
         heartbeat_seconds=settings.heartbeat_seconds,
@@ -87,7 +87,7 @@ def make_job_queue(settings: WorkerSettings, pool: Pool | None = None) -> Procra
 async def run_worker(settings: WorkerSettings, queues: Mapping[str, int], *, name: str | None = None) -> int:
     """Work until asked to stop.
 
-    Lost jobs are looked after as well, whatever the jobs under way do. With no queues that is all.
+    Lost jobs are recovered as well, whatever the running jobs do. With no queues that is all.
 
     Args:
         settings: of this worker.
@@ -95,7 +95,7 @@ async def run_worker(settings: WorkerSettings, queues: Mapping[str, int], *, nam
         name: of this worker; by default host and process id.
 
     Returns:
-        Exit code: 0 after a wish to stop, 69 if the database was lost and the worker should be started again.
+        Exit code: 0 after a request to stop, 69 if the database was lost and the worker should be restarted.
 
     Raises:
         DatabaseError: the database cannot be reached or is of another version.
@@ -204,7 +204,7 @@ class _Worker:
         return 0
 
     async def _take_jobs(self, tasks: Sequence["asyncio.Task[None]"]) -> None:
-        """Take jobs until asked to stop, or all is lost; none while something ails the machine."""
+        """Take jobs until asked to stop, or the database is lost; none while the machine has a fault."""
         host, job_queue = self._context.host_health, self._context.job_queue
         left = asyncio.create_task(self._context.draining.wait())
         while not self._context.draining.is_set() and not self._is_database_lost:
@@ -216,7 +216,7 @@ class _Worker:
             ]
             await asyncio.wait({left, ails, *tasks, *takers}, return_when=asyncio.FIRST_COMPLETED)
             # A queue that ends by itself has lost the database; running jobs go on as long as they may. What
-            # a chore did nobody does any more after its end, so that they are handed back.
+            # a periodic task did nobody does any more after its end, so that they are handed back.
             self._is_database_lost = self._is_database_lost or not (
                 self._context.draining.is_set() or host.fault
             )
@@ -293,7 +293,7 @@ class _Worker:
         return True
 
     async def _return_to_queue(self, job_id: uuid.UUID, entry_id: int) -> None:
-        """Leave a job to other workers whose slip came too late to this one."""
+        """Leave a job to other workers whose entry arrived too late at this one."""
         await defer_job(self._pool, self._context.job_queue, job_id, entry_id)
 
     async def _send_heartbeat(self) -> None:
@@ -342,7 +342,7 @@ class _Worker:
         await self._sender.start_due()
 
     async def _delete_expired(self) -> None:
-        """Let go of what is older than it is to be kept."""
+        """Apply the retention times."""
         await apply_retention(self._pool, self._settings.retention, self._settings.keep_audit_hours)
         for job_id in await fail_abandoned_jobs(
             self._pool,
@@ -373,7 +373,7 @@ class _Worker:
         await asyncio.to_thread(sweep_temporary, Path(tempfile.gettempdir()), STALE_UPLOAD_SECONDS)
 
     async def _sweep_store(self) -> None:
-        """Remove what killed uploads left in the store; no upload takes a day."""
+        """Remove the remains of killed uploads from the storage; no upload takes a day."""
         try:
             await asyncio.to_thread(self._context.storage.remove_stale_uploads, STALE_UPLOAD_SECONDS)
         except StorageError as error:
@@ -381,7 +381,7 @@ class _Worker:
 
 
 def _on_unhandled_exception(loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
-    """Ignore that a queue entry taken from this worker cannot be signed off any more."""
+    """Ignore that an entry taken from this worker can no longer be acknowledged."""
     error = context.get("exception")
     if isinstance(error, ConnectorException):
         logger.info("a slip of another attempt was left alone: %s", error.__cause__ or error)

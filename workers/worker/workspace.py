@@ -1,4 +1,4 @@
-"""The folder of an attempt: filled from the store before the work, stored after it. All calls block."""
+"""Folder of an attempt: filled from the storage before the work, stored afterwards. All calls block."""
 
 import contextlib
 import fcntl
@@ -111,7 +111,7 @@ class Workspace:
         self._peak_used_bytes = 0
 
     def open(self) -> None:
-        """Make the folder, anew if there is one of that name.
+        """Create the folder, replacing one of that name.
 
         Raises:
             StorageError: it cannot be made.
@@ -132,7 +132,7 @@ class Workspace:
             self._dataset_lock = None
 
     def used_bytes(self) -> int:
-        """Return what the folder takes on its disk, without what it shares with the store."""
+        """Return the disk usage of the folder, without files shared with the storage."""
         blocks: dict[int, int] = {}
         for folder, names, files in os.walk(self.folder):
             if Path(folder) == self.folder and FILES_FOLDER in names:
@@ -146,7 +146,7 @@ class Workspace:
         return taken
 
     def peak_used_bytes(self) -> int:
-        """Return the most that the folder was found to take."""
+        """Return the largest disk usage that was measured."""
         self.used_bytes()
         return self._peak_used_bytes
 
@@ -167,11 +167,11 @@ class Workspace:
         return place
 
     def fetch_files(self, files: Sequence[DatasetFile]) -> None:
-        """Files that the options name; they must not be changed."""
+        """Fetch the files that the options name; they must not be changed."""
         fetch_tree(self.storage, _tree_files(files), self.folder / FILES_FOLDER)
 
     def fetch_source(self, artifacts: Sequence[Artifact], names: Sequence[str]) -> None:
-        """Results of the source job into the run folder."""
+        """Fetch results of the source job into the run folder."""
         tree = [
             TreeFile(path=a.name, sha256=a.sha256, size_bytes=a.size_bytes)
             for a in artifacts
@@ -185,7 +185,7 @@ class Workspace:
         fetch_tree(self.storage, [*tree, *poses], self.folder / RUN_FOLDER, writable=True)
 
     def restore(self, checkpoint: Checkpoint) -> None:
-        """Put back what an earlier attempt kept.
+        """Restore the checkpoint of an earlier attempt.
 
         Raises:
             StorageError: some of it is gone or damaged.
@@ -193,11 +193,11 @@ class Workspace:
         fetch_tree(self.storage, checkpoint.files, self.folder, writable=True)
 
     def discard_run(self) -> None:
-        """Forget what was restored."""
+        """Discard what was restored."""
         shutil.rmtree(self.folder / RUN_FOLDER, ignore_errors=True)
 
     def store_checkpoint(self, stage: str, step: int) -> Checkpoint | None:
-        """Store what is needed to go on from here; None if there is nothing yet."""
+        """Store what a later attempt needs to resume; None if there is nothing yet."""
         for _ in range(_MAX_TRIES):
             names = self._checkpoint_files(stage)
             if not names:
@@ -214,7 +214,7 @@ class Workspace:
         return None
 
     def store_results(self) -> Manifest:
-        """Store the results, which belong to nothing yet."""
+        """Store the results without publishing them."""
         return store_tree(
             self.storage,
             self.folder / RESULTS_FOLDER,
@@ -228,17 +228,17 @@ class Workspace:
         return _result_files(manifest)
 
     def withdraw_results(self) -> None:
-        """Take back the manifests of this attempt, and of those before it that it would begin with."""
+        """Withdraw the manifests of this attempt, and of earlier ones that it would begin with."""
         for attempt in range(self._job.attempt, self._job.fresh_after, -1):
             self.storage.remove_document(_results_document(self._job, attempt))
 
     def store_partial_results(self) -> list[ResultFile]:
-        """Store what results there are of a program that failed; its job's row shows them, nothing else."""
+        """Store the finished results of a failed program; only its job's row shows them."""
         folder = self.folder / RESULTS_FOLDER
         return _result_files(store_tree(self.storage, folder)) if folder.is_dir() else []
 
     def measured_psnr(self, results: Sequence[ResultFile]) -> float | None:
-        """Mean PSNR over the held-out views, dB, as the results say; None if they do not."""
+        """Return the mean PSNR over the held-out views in dB; None if the results have none."""
         for result in results:
             if result.name == METRICS_FILE and result.size_bytes <= MAX_METRICS_BYTES:
                 try:
@@ -249,7 +249,7 @@ class Workspace:
         return None
 
     def find_published_results(self) -> list[ResultFile] | None:
-        """Results that an earlier attempt published without getting to say so."""
+        """Return results that an earlier attempt published but could not record."""
         for attempt in range(self._job.attempt - 1, self._job.fresh_after, -1):
             manifest = read_manifest(self.storage, _results_document(self._job, attempt))
             if manifest is not None:

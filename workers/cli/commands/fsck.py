@@ -1,4 +1,4 @@
-"""``octasplat fsck``: whether the store holds what the tables name."""
+"""``octasplat fsck``: comparison of the storage with what the tables reference."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING

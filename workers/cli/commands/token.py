@@ -70,7 +70,7 @@ def list_all(data: Path | None) -> None:
 @click.argument("token_id", type=click.UUID)
 @click.option("--data", type=click.Path(path_type=Path), metavar="FOLDER")
 def revoke(token_id: uuid.UUID, data: Path | None) -> None:
-    """Shut the token TOKEN_ID out, with the sessions of browsers that were begun with it."""
+    """Revoke the token TOKEN_ID, with the browser sessions that were begun with it."""
     from octasplat.workers.db.tokens import revoke_token
 
     async def shut(connection: "Connection") -> bool:

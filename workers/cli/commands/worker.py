@@ -9,7 +9,7 @@ _QUEUE = re.compile(r"([a-z][a-z0-9_-]{0,40})(?:=(\d{1,3}))?")
 
 
 def parse_queues(text: str) -> dict[str, int]:
-    """``cpu,long=2`` as names of queues and numbers of jobs at once.
+    """Return the queue names and job counts in a text such as ``cpu,long=2``.
 
     Raises:
         click.UsageError: it cannot be read so.

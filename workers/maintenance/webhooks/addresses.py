@@ -16,7 +16,7 @@ _NUMERIC_LABEL = re.compile(r"[0-9]+|0[xX][0-9a-fA-F]*")
 
 
 class AddressRefusedError(OctasplatError):
-    """Messages are not sent to such an address."""
+    """Messages may not be sent to this address."""
 
     error_type = "address_refused"
 
@@ -57,7 +57,7 @@ def check_url(url: str, allowed_hosts: tuple[str, ...] = ()) -> str:
 
 
 def is_allowed(host: str, allowed_hosts: tuple[str, ...]) -> bool:
-    """Return whether a host may be an inner one."""
+    """Return whether a host may have an internal address."""
     return host.lower().rstrip(".") in {name.lower() for name in allowed_hosts}
 
 
@@ -82,7 +82,7 @@ def is_public(address: IPAddress) -> bool:
 
 
 def _is_internal(host: str) -> bool:
-    """Return whether it is surely an inner one; what a name leads to is only known when it is looked up."""
+    """Return whether an address is certainly internal; a host name is only known after its lookup."""
     # Full-width digits and dots are plain ones to whoever looks the name up.
     name = unicodedata.normalize("NFKC", host).replace("\N{IDEOGRAPHIC FULL STOP}", ".").lower().rstrip(".")
     try:

@@ -1,4 +1,4 @@
-"""A transport that looks a host up itself, and connects to nothing but what that gave and was found fit."""
+"""HTTP transport that resolves hosts itself and connects only to addresses that it has checked."""
 
 import asyncio
 import socket
@@ -72,7 +72,7 @@ class GuardedTransport(httpx.AsyncBaseTransport):
         await self._inner.aclose()
 
     async def _resolve_checked(self, host: str, port: int, owner: str) -> list[IPAddress]:
-        """Return the addresses of a host, all of them fit to connect to."""
+        """Return the addresses of a host, all of them allowed."""
         try:
             found = await asyncio.wrap_future(self._look_up(host, port, owner))
         except (OSError, UnicodeError) as error:
@@ -83,7 +83,7 @@ class GuardedTransport(httpx.AsyncBaseTransport):
         return addresses
 
     def _look_up(self, host: str, port: int, owner: str) -> "Future[list[Any]]":
-        """Look a host up in a thread, which counts until it ends, also where nobody waits for it any more."""
+        """Resolve a host in a thread, which counts until it ends, even if nobody waits for it any more."""
         with self._lookups_lock:
             if self._lookups[owner] >= MAX_LOOKUPS_PER_OWNER:
                 raise OSError("Too many hosts of one owner are being looked up.")

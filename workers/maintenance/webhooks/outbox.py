@@ -1,4 +1,4 @@
-"""The queue of messages: who takes one has it for a while, and says what became of it."""
+"""Queue of webhook messages: a sender leases one for a while and records its outcome."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -43,7 +43,7 @@ async def lease_due(
     max_per_owner: int | None = None,
     in_flight: Mapping[str, int] = NONE_IN_FLIGHT,
 ) -> list[tuple[Delivery, Endpoint]]:
-    """Messages to send now; nobody else gets them for :data:`LEASE_SECONDS`.
+    """Return messages to send now; nobody else gets them for :data:`LEASE_SECONDS`.
 
     Args:
         connection: to the database.
@@ -92,7 +92,7 @@ async def lease_due(
 
 
 async def record_outcome(connection: Connection, delivery: Delivery, outcome: Outcome) -> None:
-    """Enter what became of a try; if another has been made meanwhile, that one counts."""
+    """Record the outcome of a delivery attempt; if a later one was made meanwhile, that one counts."""
     wait = RETRY_DELAYS_SECONDS[delivery.failures] if delivery.failures < len(RETRY_DELAYS_SECONDS) else None
     again = wait is not None and not outcome.is_gone
     async with connection.transaction():
@@ -133,7 +133,7 @@ async def record_outcome(connection: Connection, delivery: Delivery, outcome: Ou
 
 
 async def purge_deliveries(connection: Connection) -> None:
-    """Forget messages that were settled long ago; give up those that wait too long for a paused webhook."""
+    """Delete messages that were settled long ago; give up those that wait too long for a paused webhook."""
     await connection.execute(
         """
         UPDATE webhook_deliveries SET state = 'failed', error = 'The webhook was paused for too long.'

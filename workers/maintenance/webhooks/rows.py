@@ -147,7 +147,7 @@ async def list_endpoints(
     before: uuid.UUID | None = None,
     limit: int | None = None,
 ) -> list[Endpoint]:
-    """Endpoints, the newest first; ``owner`` None takes everybody's.
+    """Return endpoints, newest first; ``owner`` None takes those of all owners.
 
     Args:
         connection: to the database.
@@ -180,7 +180,7 @@ async def change_endpoint(
     events: Sequence[str] | None = None,
     enabled: bool | None = None,
 ) -> Endpoint:
-    """Change what is given; None leaves a value as it is.
+    """Change the given values; None leaves a value unchanged.
 
     Raises:
         NotFoundError: there is no such endpoint.
@@ -207,7 +207,7 @@ async def change_endpoint(
 
 
 async def delete_endpoint(connection: Connection, endpoint_id: uuid.UUID) -> None:
-    """Forget an endpoint and its messages."""
+    """Delete an endpoint and its messages."""
     await connection.execute("DELETE FROM webhook_endpoints WHERE id = %s", [endpoint_id])
 
 

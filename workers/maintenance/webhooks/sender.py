@@ -1,4 +1,4 @@
-"""Sending messages to addresses that others chose."""
+"""Delivery of webhook messages to addresses that users chose."""
 
 import asyncio
 import logging
@@ -42,7 +42,7 @@ class WebhookSender:
         self.sent_count = 0
 
     async def start_due(self) -> int:
-        """Begin to send what is due and may be sent now; returns how many messages these are."""
+        """Start sending the messages that are due and allowed now; returns how many."""
         async with self._pool.connection() as connection:
             taken = await lease_due(
                 connection,
@@ -58,12 +58,12 @@ class WebhookSender:
         return len(taken)
 
     async def wait(self) -> None:
-        """Until one of the messages under way is settled."""
+        """Wait until one of the messages in flight is settled."""
         if self._tasks:
             await asyncio.wait(set(self._tasks), return_when=asyncio.FIRST_COMPLETED)
 
     async def close(self) -> None:
-        """Give up what is under way; it will be sent again."""
+        """Stop sending; messages in flight will be sent again."""
         await cancel_and_wait(self._tasks)
         await self._client.aclose()
 
@@ -100,7 +100,7 @@ def guarded_client(allowed_hosts: tuple[str, ...] = ()) -> httpx.AsyncClient:
 async def send(
     client: httpx.AsyncClient, delivery: Delivery, endpoint: Endpoint, allowed_hosts: tuple[str, ...] = ()
 ) -> Outcome:
-    """Send a message once. Of the answer only the status is looked at."""
+    """Send a message once; only the status of the response is used."""
     body, headers = signed_message(endpoint.secret, delivery.id, delivery.payload, datetime.now(UTC))
     try:
         check_url(endpoint.url, allowed_hosts)

@@ -40,7 +40,7 @@ def check_secret(secret: str) -> str:
 def signed_message(
     secret: str, delivery_id: uuid.UUID, payload: Mapping[str, Any], now: datetime
 ) -> tuple[bytes, dict[str, str]]:
-    """Body and headers of a message; the body is the same at every try.
+    """Return the body and headers of a message; the body is the same at every attempt.
 
     Args:
         secret: of the endpoint.

@@ -1,7 +1,7 @@
-"""The kinds of jobs, in one table: what each needs, its options, and the program that does it.
+"""Kinds of jobs, in one table: the input, options and program of each.
 
 A new kind is one call of :func:`octasplat.workers.worker.job_kinds.registry.register`; the API, the workers
-and the command line take it from there.
+and the command line read the table.
 """
 
 from octasplat.workers.worker.job_kinds import builtin as _builtin

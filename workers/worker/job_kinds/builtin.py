@@ -1,4 +1,4 @@
-"""The kinds that octasplat brings."""
+"""The built-in kinds of jobs."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -46,12 +46,12 @@ from octasplat.workers.worker.task import INFO_FILE, Task
 
 
 class ReconstructKind(OperationKind):
-    """Photographs to a scene."""
+    """Kind of jobs that reconstruct a scene from photographs."""
 
     export_option = "exports"
 
     def resolve(self, values: Mapping[str, Any]) -> ReconstructionConfig:
-        """Return complete options: those of the preset, and what was asked for on top."""
+        """Return complete options: those of the preset, overridden by the given ones."""
         return options_from_json(values).config()
 
     def revise(self, options: Mapping[str, Any], changes: Mapping[str, Any]) -> ReconstructionConfig:
@@ -82,7 +82,7 @@ class ReconstructKind(OperationKind):
     def resource_demands(
         self, options: ReconstructionConfig, sizes: Sequence[ImageSizes]
     ) -> tuple[ResourceDemand, ...]:
-        """Return what the training asks for."""
+        """Return the resource demands of the training."""
         train = options.train
         pixels = training_pixels(options, sizes)
         gaussians = max_gaussian_count(train, pixels)

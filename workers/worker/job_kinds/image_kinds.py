@@ -1,4 +1,4 @@
-"""Kinds of jobs that make pictures: new views, and other light."""
+"""Kinds of jobs that render images: new views, and other light."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
@@ -35,7 +35,7 @@ _PIXEL_OPTIONS = {"turntable": "frames", "path": "camera_path", "camera": "width
 
 
 class ImageKind(OperationKind):
-    """Pictures of a scene; an attempt goes on from the images that earlier ones have stored."""
+    """Base of kinds that render images; an attempt resumes from the stored images of earlier ones."""
 
     def __init__(self, operation: Operation[Any, Any], *, title: str, source_files: Sequence[str]) -> None:
         super().__init__(

@@ -1,4 +1,4 @@
-"""Kinds of jobs that do an operation of the engine."""
+"""Kinds of jobs that run an operation of the engine."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
@@ -19,7 +19,7 @@ PROGRAM = "octasplat.workers.worker.handlers:run_operation"
 
 
 class OperationKind(JobKind[Any]):
-    """A kind of job that does an operation: its options are the operation's.
+    """A kind of job that runs an operation, with the operation's options.
 
     Args:
         operation: what it does.

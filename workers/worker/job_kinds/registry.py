@@ -18,7 +18,7 @@ Needs = Literal["dataset", "result", "files"]
 
 
 class JobKind(Generic[OptionsT]):
-    """A kind of job; subclasses override what is otherwise for them.
+    """A kind of job; subclasses override methods.
 
     Args:
         name: what the API calls it.
@@ -103,7 +103,7 @@ class JobKind(Generic[OptionsT]):
         return ()
 
     def resource_demands(self, options: OptionsT, sizes: Sequence[ImageSizes]) -> Iterable[ResourceDemand]:
-        """Return what the options ask for that a service may set a ceiling to, for such photographs."""
+        """Return the demands of the options that a service may limit, for such photographs."""
         return ()
 
     def named_files(self, options: OptionsT) -> Iterable[tuple[str, str]]:
@@ -111,7 +111,7 @@ class JobKind(Generic[OptionsT]):
         return ()
 
     def estimate(self, options: OptionsT, sizes: Sequence[ImageSizes], cores: int) -> Estimate | None:
-        """Return the time and memory that it takes on so many cores; None where nobody knows."""
+        """Return the time and memory on so many cores; None where it is unknown."""
         return None
 
 

@@ -18,7 +18,7 @@ LIMIT_UNITS: Mapping[str, str] = {
 
 @dataclass(frozen=True)
 class ResourceDemand:
-    """So much of something that has a ceiling.
+    """An amount of a resource that may be limited.
 
     Attributes:
         path: where the options say so, with dots.
@@ -33,7 +33,7 @@ class ResourceDemand:
 
 @dataclass(frozen=True)
 class ExceededLimit:
-    """A demand that is too high, and how high it may be."""
+    """A demand that exceeds its limit."""
 
     demand: ResourceDemand
     limit: int
@@ -49,7 +49,7 @@ class ExceededLimit:
 
 
 def exceeded_limits(demands: Iterable[ResourceDemand], limits: Mapping[str, int]) -> list[ExceededLimit]:
-    """Return the demands above their ceilings."""
+    """Return the demands above their limits."""
     return [
         ExceededLimit(demand, limits[demand.resource])
         for demand in demands

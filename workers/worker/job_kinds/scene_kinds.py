@@ -1,4 +1,4 @@
-"""Kinds of jobs that read scenes and write them: export, import, and those that change a scene."""
+"""Kinds of jobs that read and write scenes: export, import, and edits."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -23,7 +23,7 @@ CHANGED_FOLDER = "changed"
 
 
 class ExportKind(OperationKind):
-    """A scene in other formats."""
+    """Kind of jobs that write a scene in other formats."""
 
     export_option = "files"
 
@@ -53,7 +53,7 @@ class ExportKind(OperationKind):
 
 
 class ImportKind(OperationKind):
-    """A scene of another program; it needs nothing but files that are sent."""
+    """Kind of jobs that read a scene of another program from uploaded files."""
 
     def __init__(self) -> None:
         super().__init__(IMPORT, stages=("read",), needs="files", source_files=(), reports_stages=True)

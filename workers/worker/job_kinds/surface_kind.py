@@ -38,7 +38,7 @@ class SurfaceJobOptions(SurfaceOptions):
 
 
 class SurfaceKind(OperationKind):
-    """A mesh; its colours are fitted to the photographs where they are at hand."""
+    """Kind of jobs that extract a mesh; colors are fitted to the photographs where these exist."""
 
     def __init__(self) -> None:
         super().__init__(
