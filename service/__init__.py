@@ -1,1 +1,1 @@
-"""The HTTP front end. Never imports torch, numba or the engine's numerical parts."""
+"""HTTP front end; it never imports torch, numba or the engine's numerical parts."""

@@ -1,4 +1,4 @@
-"""The application: routes, guards, and what lives as long as it does."""
+"""The application: routes, middleware, and resources of its lifespan."""
 
 import asyncio
 import importlib
@@ -61,7 +61,7 @@ Errors are problem documents (RFC 9457).
 
 
 def create_app(settings: ServiceSettings | None = None) -> FastAPI:
-    """Return the application.
+    """Create the application.
 
     Args:
         settings: by default those of the environment.
@@ -122,7 +122,7 @@ def create_app(settings: ServiceSettings | None = None) -> FastAPI:
 
 @asynccontextmanager
 async def _service_lifespan(settings: ServiceSettings) -> AsyncIterator[Service]:
-    """Database, store and listener for as long as the application lives."""
+    """Open the database, storage and event listener for the lifespan of the application."""
     conninfo = settings.conninfo()
     await asyncio.to_thread(migrate, conninfo)
     storage = await asyncio.to_thread(
@@ -158,7 +158,7 @@ async def _service_lifespan(settings: ServiceSettings) -> AsyncIterator[Service]
 
 
 def _check_limiter(settings: ServiceSettings) -> ConcurrencyLimiter:
-    """Lets in those whose datasets are checked; half of the places are there for other owners."""
+    """Return the limiter of validations; half of the places are reserved for other owners."""
     at_once, waiting = settings.max_checks, settings.max_waiting_checks
     return ConcurrencyLimiter(
         "datasets", max_concurrent=at_once, max_waiting=waiting, max_per_owner=-(-(at_once + waiting) // 2)

@@ -20,7 +20,7 @@ _UNAUDITED_METHODS = frozenset({"GET", "HEAD", "OPTIONS", "TRACE", "PUT"})
 
 
 class AuditMiddleware:
-    """Writes down who asked for a change, if that is known, and what came of it.
+    """Records changes in the audit log, with the caller if known and the outcome.
 
     Args:
         app: behind it.
@@ -30,7 +30,7 @@ class AuditMiddleware:
         self._app = app
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Pass a request on, and its answer once it is written down."""
+        """Pass a request on, and send its response once it is recorded."""
         if scope["type"] != "http":
             await self._app(scope, receive, send)
             return

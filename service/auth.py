@@ -54,7 +54,7 @@ class Principal:
     session_id: uuid.UUID | None = None
 
     def may(self, scope: Scope) -> bool:
-        """Return whether they may do what needs ``scope``."""
+        """Return whether the principal has the rights of ``scope``."""
         return bool(self.scopes & _SUFFICIENT_SCOPES[scope])
 
     @property
@@ -63,7 +63,7 @@ class Principal:
         return None if self.may("admin") else self.owner
 
     def may_see(self, owner: str) -> bool:
-        """Return whether something of ``owner`` is theirs to see."""
+        """Return whether the principal may see objects of ``owner``."""
         return self.may("admin") or owner == self.owner
 
 
@@ -103,7 +103,7 @@ async def authenticate(
 
 
 async def authenticate_token(request: Request, service: Service, secret: str) -> Token | None:
-    """Return the valid token of that secret, or after a while None.
+    """Return the valid token of that secret; None after a delay.
 
     Raises:
         ProblemError: 429 while too many wrong ones of the same address wait for their answer.
@@ -124,12 +124,12 @@ async def authenticate_token(request: Request, service: Service, secret: str) ->
 
 
 def client_address(request: Request) -> str:
-    """Return where a request comes from, as a trusted proxy says if there is one."""
+    """Return the client's address, as a trusted proxy reports it if there is one."""
     return request.client.host if request.client is not None else "unknown"
 
 
 def session_secret(request: Request) -> str | None:
-    """Return what the cookie of a browser holds; where there is TLS, only that of this very host counts."""
+    """Return the secret in the session cookie; with TLS, only the host-only cookie counts."""
     return request.cookies.get(SECURE_COOKIE if request.url.scheme == "https" else COOKIE)
 
 
@@ -160,7 +160,7 @@ Admin = Annotated[Principal, Depends(_RequireScope("admin"))]
 
 
 async def _allows_anonymous(service: Service) -> bool:
-    """Return whether whoever reaches the service may use it: from this machine, before there was any token.
+    """Return whether requests need no token: from this machine, before there was any token.
 
     Tokens that have expired or were shut out count: that the last of them has ended opens nothing.
     """

@@ -1,4 +1,4 @@
-"""Work of which only so much is done at once and only so much waits."""
+"""Limits on how much work of a kind runs and waits at once."""
 
 import asyncio
 from collections import Counter
@@ -11,7 +11,7 @@ RETRY_SECONDS = 10
 
 
 class ConcurrencyLimiter:
-    """Lets in a few at a time; the others wait in the order in which they came, if they are not too many.
+    """Limits concurrent work; further callers wait in order, up to a maximum.
 
     Args:
         noun: is done, in the plural, for the sentence.
@@ -29,7 +29,7 @@ class ConcurrencyLimiter:
 
     @asynccontextmanager
     async def limited(self, owner: str) -> AsyncIterator[None]:
-        """For as long as the block runs, one of those that are done.
+        """Hold one of the places for the block.
 
         Raises:
             ProblemError: 429, with too many there.

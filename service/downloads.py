@@ -1,4 +1,4 @@
-"""Sending stored content: whole or in ranges, with ETag and digest."""
+"""Responses with stored content: complete or in ranges, with ETag and digest."""
 
 import re
 import urllib.parse
@@ -29,7 +29,7 @@ def send_blob(
     name: str,
     inline: bool = False,
 ) -> Response:
-    """Return an answer with stored content.
+    """Return a response with stored content.
 
     Content never changes under its digest, which makes the ETag. What an address leads to may change, as
     results do by a retry, so that a browser asks each time whether it is still that. What came from users or
@@ -71,7 +71,7 @@ def send_blob(
 def _remote_response(
     service: Service, request: Request, sha256: str, size: int, media_type: str, headers: dict[str, str]
 ) -> Response:
-    """From a store elsewhere, whole or one range."""
+    """Return a response from a remote storage, complete or one range."""
     start, stop, status = 0, size, 200
     requested = _RANGE.fullmatch(request.headers.get("range", ""))
     condition = request.headers.get("if-range")
@@ -95,7 +95,7 @@ def _remote_response(
 
 
 def _disposition(name: str, inline: bool) -> str:
-    """Return the header of RFC 6266."""
+    """Return the Content-Disposition header (RFC 6266)."""
     last = PurePosixPath(name).name
     plain = re.sub(r"[^A-Za-z0-9._ -]", "_", last)
     kind = "inline" if inline else "attachment"

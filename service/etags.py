@@ -1,4 +1,4 @@
-"""ETags: cheap polling and no lost updates."""
+"""ETags for cheap polling and against lost updates."""
 
 from fastapi import Request
 
@@ -14,7 +14,7 @@ def etag_matches(header: str | None, etag: str) -> bool:
 
 
 def check_precondition(request: Request, etag: str) -> None:
-    """Refuse a change of something that has changed since it was seen.
+    """Refuse a change of an object that has changed since the caller read it.
 
     Raises:
         ProblemError: 412.

@@ -1,4 +1,4 @@
-"""Tells streams when a job has new events: one listening connection for all of them."""
+"""Notification of streams when a job has new events, over one listening connection."""
 
 import asyncio
 import contextlib
@@ -17,7 +17,7 @@ _RECONNECT_SECONDS = 1.0
 
 
 class EventBroker:
-    """Wakes who waits for a job's events.
+    """Wakes the streams that wait for a job's events.
 
     Args:
         conninfo: how to connect.
@@ -32,7 +32,7 @@ class EventBroker:
 
     @property
     def subscriber_count(self) -> int:
-        """Number of streams that wait."""
+        """Return the number of waiting streams."""
         return sum(len(events) for events in self._subscribers.values())
 
     @property
@@ -41,13 +41,13 @@ class EventBroker:
         return self._closing.is_set()
 
     def close(self) -> None:
-        """Wake everybody for the last time."""
+        """Wake all subscribers for the last time."""
         self._closing.set()
         self._wake_all()
 
     @contextlib.contextmanager
     def subscribe(self, job_id: uuid.UUID) -> Iterator[asyncio.Event]:
-        """Yield an event that is set whenever the job has something new, until the block ends."""
+        """Yield an event that is set whenever the job has new events, until the block ends."""
         event = asyncio.Event()
         self._subscribers.setdefault(job_id, set()).add(event)
         try:

@@ -1,4 +1,4 @@
-"""Room for uploads: what nobody names any more goes when it is short, before anybody is refused."""
+"""Eviction of unreferenced contents when space for uploads is short, before uploads are refused."""
 
 import asyncio
 import logging
@@ -23,7 +23,7 @@ LOW_SPACE_BYTES = 1 << 30
 
 
 class SpaceEvictor:
-    """Makes room in a store.
+    """Frees space in a storage.
 
     Args:
         pool: connections.
@@ -38,7 +38,7 @@ class SpaceEvictor:
 
     @asynccontextmanager
     async def upload_lease(self, size_bytes: int | None) -> AsyncIterator[StorageLease]:
-        """For an upload: the block stores contents and names them, under the note that it is given.
+        """Yield a lease for an upload, under which the block stores and references contents.
 
         Args:
             size_bytes: how much will come, if it is known.
@@ -61,13 +61,13 @@ class SpaceEvictor:
             raise
 
     def evict_if_low_later(self) -> None:
-        """Something was deleted: its contents go now if room is short."""
+        """Evict unreferenced contents in the background if space is low; called after deletions."""
         task = asyncio.create_task(self._evict_if_low())
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
 
     async def close(self) -> None:
-        """Give up what is under way."""
+        """Cancel the evictions in progress."""
         await cancel_and_wait(self._tasks)
 
     async def _evict_if_low(self) -> None:

@@ -1,4 +1,4 @@
-"""``Idempotency-Key``: the same request twice makes one thing."""
+"""``Idempotency-Key``: a repeated request creates nothing new."""
 
 import hashlib
 import json
@@ -12,7 +12,7 @@ from octasplat.workers.db.connections import Connection
 
 
 def fingerprint(*parts: Any) -> str:
-    """Return names the content of a request."""
+    """Return a fingerprint of the content of a request."""
     return hashlib.sha256(json.dumps(parts, sort_keys=True, default=str).encode()).hexdigest()
 
 
@@ -23,7 +23,7 @@ async def create_once(
     request: str,
     create: Callable[[], Awaitable[uuid.UUID]],
 ) -> tuple[uuid.UUID, bool]:
-    """Make something, or find what the same request has made before, in one transaction.
+    """Create an object, or return the one that an equal request created, in one transaction.
 
     A twin that comes while the first is under way waits for it.
 

@@ -20,7 +20,7 @@ from octasplat.workers.worker.job_kinds.resource_limits import exceeded_limits
 def check_job_limits(
     kind: JobKind, options: BaseModel, sizes: Sequence[ImageSizes], settings: ServiceSettings
 ) -> None:
-    """Refuse options that ask for too much.
+    """Refuse options that exceed the limits of the service.
 
     Raises:
         ProblemError: 422, with each such option and its ceiling.
@@ -42,7 +42,7 @@ def check_job_limits(
 
 
 def check_priority(principal: Principal, priority: int, settings: ServiceSettings) -> None:
-    """Keep high priorities for administrators.
+    """Refuse high priorities of callers who are not administrators.
 
     Raises:
         ProblemError: 422.
@@ -58,7 +58,7 @@ def check_priority(principal: Principal, priority: int, settings: ServiceSetting
 
 
 def limits_by_path(kind: JobKind, settings: ServiceSettings) -> dict[str, int]:
-    """Return what each option may ask for, of those that say it themselves."""
+    """Return the limit of each option that has one of its own, by path."""
     try:
         options = kind.resolve({})
     except ValueError:  # something has to be given
@@ -90,7 +90,7 @@ def estimate_job(
 def limit_notes(
     estimate: Mapping[str, Any] | None, workers: Sequence[WorkerRow], settings: ServiceSettings
 ) -> list[str]:
-    """Return what the owner of a job should know that is likely to meet a limit, in sentences."""
+    """Return sentences for the owner of a job that will probably reach a limit."""
     if estimate is None:
         return []
     known = Estimate.model_validate(dict(estimate))
@@ -118,7 +118,7 @@ def limit_notes(
 
 
 def _cores(worker: WorkerRow) -> int:
-    """Cores that one job of a worker has, where it says so."""
+    """Return the cores for one job of a worker, if it reports them."""
     found = worker.facts.get("threads", worker.facts.get("cores"))
     cores = found if isinstance(found, int) and found > 0 else 1
     return max(1, cores // max(1, worker.slots))

@@ -1,4 +1,4 @@
-"""Wrong tokens: whoever tries them out waits, longer each time, and does not keep others waiting."""
+"""Throttling of wrong tokens: growing delays for a client, without delaying others."""
 
 import asyncio
 import hashlib
@@ -27,7 +27,7 @@ class _ClientAttempts:
 
 
 class LoginThrottle:
-    """Counts wrong tokens by the address that they come from.
+    """Counts wrong tokens by client address.
 
     Args:
         seconds: how long the first one waits for its answer; each further one half as long again. 0 lets all
@@ -41,7 +41,7 @@ class LoginThrottle:
 
     @contextmanager
     def attempt(self, address: str, secret: str) -> Iterator[bool]:
-        """Around looking at a secret and the answer; yields False if it is not to be looked at now.
+        """Hold the place of an attempt for the block; yields False if the secret must not be checked now.
 
         Secrets that were right before always are.
         """
@@ -59,14 +59,14 @@ class LoginThrottle:
             guesser.under_way -= 1
 
     def record_success(self, secret: str) -> None:
-        """Remember a secret that was let in."""
+        """Remember a valid secret."""
         self._known_digests[_digest(secret)] = None
         self._known_digests.move_to_end(_digest(secret))
         if len(self._known_digests) > _MAX_KNOWN_SECRETS:
             self._known_digests.popitem(last=False)
 
     async def delay_failure(self, address: str) -> bool:
-        """Wait before the answer; returns whether it is the first wrong one of the address for a while."""
+        """Delay the answer; returns whether it is the address's first failure for a while."""
         guesser = self._client(address)
         guesser.wrong += 1
         guesser.last = time.monotonic()
@@ -90,7 +90,7 @@ def _digest(secret: str) -> bytes:
 
 
 def _client_key(address: str) -> str:
-    """Return what one guesser has for certain: an IPv4 address, or 64 bits of IPv6."""
+    """Return the part of an address that one client owns: an IPv4 address, or 64 bits of IPv6."""
     try:
         parsed = ipaddress.ip_address(address)
     except ValueError:

@@ -1,4 +1,4 @@
-"""Metrics in the format of Prometheus: what the tables say now, and what this process has counted."""
+"""Prometheus metrics: figures of the tables, and counters of this process."""
 
 from collections.abc import Iterable, Iterator, Mapping
 
@@ -28,7 +28,7 @@ class Metrics:
         )
 
     def render(self, stats: ServiceStats, *, streams: int, free_bytes: int | None) -> bytes:
-        """Everything, as text.
+        """Return all metrics as text.
 
         Args:
             stats: what the tables say.
@@ -48,7 +48,7 @@ class Metrics:
 
 
 class _FixedCollector(Collector):
-    """Metrics that are known already."""
+    """Collector of metrics that were computed beforehand."""
 
     def __init__(self, metrics: Iterable[Metric]) -> None:
         self._metrics = list(metrics)

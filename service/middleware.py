@@ -1,4 +1,4 @@
-"""Requests that are turned away before anybody looks at them: foreign names, foreign pages, long bodies."""
+"""Middleware that refuses requests early: foreign hosts, foreign pages, too long bodies."""
 
 from collections.abc import Mapping
 from urllib.parse import urlsplit
@@ -14,7 +14,7 @@ _SAFE_METHODS = frozenset({"GET", "HEAD", "OPTIONS", "TRACE"})
 
 
 class AllowedHostsMiddleware:
-    """Takes requests for this machine's own names only, so that no web page comes in under its own.
+    """Accepts requests for this machine's own names only, against DNS rebinding.
 
     Args:
         app: behind it.
@@ -26,7 +26,7 @@ class AllowedHostsMiddleware:
         self._names = _LOCAL_HOSTS | {name.lower() for name in names}
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Let a request through or answer 421."""
+        """Pass a request on, or answer 421."""
         if scope["type"] == "http" and _host_name(Headers(scope=scope).get("host", "")) not in self._names:
             detail = (
                 "This service answers to localhost and 127.0.0.1 only; OCTASPLAT_ALLOWED_HOSTS adds more."
@@ -37,13 +37,13 @@ class AllowedHostsMiddleware:
 
 
 class SameOriginMiddleware:
-    """Takes no changes that another site's page asks a browser to make."""
+    """Refuses changes that a page of another site sends through a browser."""
 
     def __init__(self, app: ASGIApp) -> None:
         self._app = app
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Let a request through or answer 403."""
+        """Pass a request on, or answer 403."""
         if (
             scope["type"] == "http"
             and scope["method"] not in _SAFE_METHODS
@@ -95,13 +95,13 @@ class BodyLimitMiddleware:
 
 
 class SecurityHeadersMiddleware:
-    """Says to browsers that nothing here is to be guessed at, framed or remembered by others."""
+    """Adds headers that forbid browsers to sniff types, frame pages and store responses."""
 
     def __init__(self, app: ASGIApp) -> None:
         self._app = app
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Add the headers to the answer."""
+        """Add the headers to the response."""
 
         async def with_headers(message: Message) -> None:
             if message["type"] == "http.response.start":

@@ -1,4 +1,4 @@
-"""The OpenAPI document: that of the routes, with problems and the options of each kind of job."""
+"""OpenAPI document: that of the routes, with problems and the options of each kind of job."""
 
 from typing import Any
 
@@ -20,7 +20,7 @@ def operation_id(route: APIRoute) -> str:
 
 
 def extend_openapi(app: FastAPI) -> None:
-    """Put the problem document and the options of jobs into the schemas of ``app``."""
+    """Add the problem document and the options of jobs to the schemas of ``app``."""
     original = app.openapi
 
     def openapi() -> dict[str, Any]:
@@ -38,7 +38,7 @@ def extend_openapi(app: FastAPI) -> None:
 
 
 def add_option_schemas(schemas: dict[str, Any]) -> None:
-    """Make ``NewJob`` one schema for each kind of job, told apart by ``kind``, with the options of that kind.
+    """Make ``NewJob`` a union of one schema for each kind of job, discriminated by ``kind``.
 
     Args:
         schemas: of the document, by name; changed in place.

@@ -1,4 +1,4 @@
-"""Long lists in parts: an opaque cursor, and a link to the next part (RFC 8288)."""
+"""Pagination of long lists: an opaque cursor, and a link to the next part (RFC 8288)."""
 
 import base64
 import binascii
@@ -14,12 +14,12 @@ Cursor = Annotated[str | None, Query(max_length=2000, description="`next` of the
 
 
 def encode_cursor(key: str) -> str:
-    """Return a cursor that stands for a place in a list."""
+    """Return the cursor of a position in a list."""
     return base64.urlsafe_b64encode(key.encode()).decode().rstrip("=")
 
 
 def decode_cursor(cursor: str | None) -> str | None:
-    """Return the place that a cursor stands for.
+    """Return the position of a cursor.
 
     Raises:
         ProblemError: 422 if it is none of ours.
@@ -37,7 +37,7 @@ def decode_cursor(cursor: str | None) -> str | None:
 
 
 def decode_id_cursor(cursor: str | None) -> uuid.UUID | None:
-    """As :func:`decode_cursor`, for a list that is ordered by id."""
+    """Return the position of a cursor in a list ordered by id; see :func:`decode_cursor`."""
     place = decode_cursor(cursor)
     try:
         return None if place is None else uuid.UUID(place)
@@ -46,7 +46,7 @@ def decode_id_cursor(cursor: str | None) -> uuid.UUID | None:
 
 
 def decode_number_cursor(cursor: str | None) -> int | None:
-    """As :func:`decode_cursor`, for a list that is ordered by a number that counts up."""
+    """Return the position of a cursor in a list ordered by a number; see :func:`decode_cursor`."""
     place = decode_cursor(cursor)
     if place is None:
         return None
@@ -56,7 +56,7 @@ def decode_number_cursor(cursor: str | None) -> int | None:
 
 
 def set_next_link(request: Request, response: Response, next_key: str | None) -> str | None:
-    """Return the cursor of the next part, which the header ``Link`` names as well; None at the end."""
+    """Set the header ``Link`` and return the cursor of the next part; None at the end."""
     if next_key is None:
         return None
     cursor = encode_cursor(next_key)

@@ -1,4 +1,4 @@
-"""Errors as problem documents (RFC 9457), and nothing but those."""
+"""Errors as problem documents (RFC 9457)."""
 
 import logging
 from collections.abc import Iterable, Mapping, Sequence
@@ -62,7 +62,7 @@ class ProblemDocument(BaseModel):
 
 
 class ProblemError(Exception):
-    """Something to be answered with a problem document.
+    """An error that is answered with a problem document.
 
     Args:
         status: HTTP status.
@@ -106,12 +106,12 @@ class ProblemError(Exception):
 
 
 def not_found_error(kind: str) -> ProblemError:
-    """There is none, or it is somebody else's; which of the two is not told."""
+    """Return the problem of an object that does not exist or is another owner's, without saying which."""
     return ProblemError(404, "not-found", f"There is no such {kind}.")
 
 
 def options_error(error: ValidationError | SettingsRefused, prefix: str = "/options") -> ProblemError:
-    """Options that do not fit their schema."""
+    """Return the problem of options that do not fit their schema."""
     if isinstance(error, SettingsRefused):
         faults = [
             {"code": each.code, "detail": each.sentence, "pointer": _pointer(prefix, each.path)}
@@ -140,7 +140,7 @@ def add_problem_handlers(app: FastAPI) -> None:
 
 
 def problem_from_error(error: OctasplatError) -> ProblemError:
-    """Return how an error of ours is answered."""
+    """Return the problem document of an error of ours."""
     detail, again = str(error), RETRY_SECONDS
     if isinstance(error, IntakeError):
         status = 408 if error.code == "upload-stalled" else 422
@@ -217,7 +217,7 @@ async def _on_data_error(_request: Request, error: Exception) -> JSONResponse:
 
 
 async def _on_integrity_error(_request: Request, error: Exception) -> JSONResponse:
-    """Two requests at once, of which the other came first."""
+    """Return the problem of two concurrent requests of which the other came first."""
     logger.info("the database refused what contradicts it: %s", " ".join(str(error).split()))
     detail = "Something that this builds on was changed or deleted at the same time; look again."
     return ProblemError(409, "conflict", detail).response()

@@ -1,4 +1,4 @@
-"""Proxies in front of the service: what they say of a request is believed of those that are named only."""
+"""Headers of proxies in front of the service; only those of trusted proxies are used."""
 
 import ipaddress
 import re
@@ -18,7 +18,7 @@ _PAIR = re.compile(r'\s*([A-Za-z]+)\s*=\s*("[^"]*"|[^\s";,]*)\s*')
 
 
 class ProxyHeadersMiddleware:
-    """Puts what a trusted proxy says of a client in the place of the proxy's own address, scheme and host.
+    """Replaces the proxy's address, scheme and host by those that a trusted proxy reports.
 
     One kind of header is read: a proxy that sets the one kind passes on what a client says in the other.
 
@@ -45,7 +45,7 @@ class ProxyHeadersMiddleware:
         await self._app(scope, receive, send)
 
     def _apply(self, scope: Scope, hops: list[dict[str, str]]) -> None:
-        """Take the last hop that a trusted proxy wrote; what stands before it, anybody may have made up."""
+        """Use the last hop that a trusted proxy wrote; earlier ones may be forged."""
         for hop in reversed(hops):
             if hop.get("proto") in ("http", "https"):
                 scope["scheme"] = hop["proto"]
@@ -70,12 +70,12 @@ class ProxyHeadersMiddleware:
 
 
 def passed_through_proxy(headers: Headers) -> bool:
-    """Return whether a request has headers that proxies write and nobody else."""
+    """Return whether a request has headers that only proxies write."""
     return any(name in PROXY_HEADER_NAMES for name in headers)
 
 
 def _parse_x_forwarded(headers: Headers) -> list[dict[str, str]]:
-    """Return the hops, the client's first; a scheme or host that is said once is the client's."""
+    """Return the hops, the client's first; a scheme or host that is given once is the client's."""
     lists = {key: _header_values(headers, f"x-forwarded-{key}") for key in ("for", "proto", "host")}
     count = max(len(values) for values in lists.values())
     hops: list[dict[str, str]] = [{} for _ in range(count)]

@@ -14,12 +14,12 @@ from octasplat.workers.worker.job_kinds import JobKind
 
 
 async def live_workers_of_queue(connection: Connection, queue: str, stale_seconds: float) -> list[WorkerRow]:
-    """Return the living workers that take jobs from a queue."""
+    """Return the live workers that take jobs from a queue."""
     return [row for row in await live_workers(connection, stale_seconds) if queue in row.queues]
 
 
 def unwritable_formats(workers: Sequence[WorkerRow]) -> dict[str, str]:
-    """Return formats that none of ``workers`` can write, with what they need.
+    """Return formats that none of ``workers`` can write, with their missing requirements.
 
     Without workers there are none: nobody can say what those that come will be able to write.
     """
@@ -33,7 +33,7 @@ def unwritable_formats(workers: Sequence[WorkerRow]) -> dict[str, str]:
 def check_formats_writable(
     kind: JobKind, options: BaseModel, queue: str, workers: Sequence[WorkerRow]
 ) -> None:
-    """Refuse files that no living worker of the queue can write.
+    """Refuse files that no live worker of the queue can write.
 
     Raises:
         ProblemError: 422, with the place of each such file.
@@ -55,7 +55,7 @@ def check_formats_writable(
 def queued_job_notes(
     kind: JobKind, options: BaseModel, queue: str, workers: Sequence[WorkerRow]
 ) -> list[str]:
-    """Return what the owner of a job that waits should know, in sentences."""
+    """Return sentences for the owner of a queued job."""
     if workers:
         takers = [row for row in workers if kind.name in row.facts.get("kinds", (kind.name,))]
         if takers:

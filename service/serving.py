@@ -26,14 +26,14 @@ KEEP_ALIVE_SECONDS = 75
 
 
 class _FrontEndServer(uvicorn.Server):
-    """Ends streams first when asked to stop, as they would never end by themselves."""
+    """Server that ends event streams first when asked to stop, as they never end by themselves."""
 
     def __init__(self, config: uvicorn.Config) -> None:
         super().__init__(config)
         self.address = ""
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
-        """Start, and say where."""
+        """Start the server and print its address."""
         await super().startup(sockets)
         if self.started:
             sys.stdout.write(f"{self.address}\n")

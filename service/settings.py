@@ -1,4 +1,4 @@
-"""Settings of the front end, in one place; those of the workers come first."""
+"""Settings of the front end, which extend those of the workers."""
 
 import ipaddress
 from typing import Annotated
@@ -101,16 +101,16 @@ class ServiceSettings(WorkerSettings):
 
     @property
     def ceilings(self) -> dict[str, int]:
-        """By the names of :data:`octasplat.workers.worker.job_kinds.resource_limits.LIMIT_UNITS`."""
+        """Return the limits of jobs, by the names in ``LIMIT_UNITS``."""
         found = {name: getattr(self, f"max_{name}") for name in LIMIT_UNITS}
         return found if self.max_workspace_bytes else {**found, "workspace_bytes": 1 << 62}
 
     def upload_limits(self) -> UploadLimits:
-        """Return what the intake takes."""
+        """Return the limits of uploads."""
         return UploadLimits(max_file_bytes=self.max_upload_bytes, max_archive_bytes=self.max_archive_bytes)
 
     def dataset_limits(self) -> DatasetLimits:
-        """Return what the check of a dataset may take, and see."""
+        """Return the limits of the validation of datasets."""
         return DatasetLimits(model=ModelLimits(hidden=self.own_folders))
 
     def spool(self) -> SpoolSpace:
@@ -119,7 +119,7 @@ class ServiceSettings(WorkerSettings):
         return SpoolSpace(folder, max_bytes=self.max_spool_bytes, floor_bytes=self.floor_bytes)
 
     def check_public(self, has_token: bool) -> None:
-        """Refuse to be reached from elsewhere by everybody.
+        """Refuse a public address without any token.
 
         Raises:
             ConfigError: the address is public, or there is a proxy before it, and nobody has a token.

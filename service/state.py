@@ -21,7 +21,7 @@ from octasplat.workers.storage.protocol import Storage
 
 @dataclass
 class Service:
-    """The service while it runs.
+    """State of the running service.
 
     Attributes:
         settings: its settings.
@@ -58,12 +58,12 @@ class Service:
     started_at: float = field(default_factory=time.monotonic)
 
     def invalidate_token_state(self) -> None:
-        """Look for tokens anew at the next request."""
+        """Make the next request check again whether there are tokens."""
         self.tokens_checked_at = -1e9
 
 
 def get_service(request: Request) -> Service:
-    """Return the service that a request has reached."""
+    """Return the service of a request."""
     service: Service = request.app.state.service
     return service
 

@@ -1,4 +1,4 @@
-"""Threads by purpose, so that what is slow or comes in numbers keeps nothing else waiting."""
+"""Thread pools by purpose, so that slow or numerous work does not delay other work."""
 
 import asyncio
 import contextvars
@@ -39,6 +39,6 @@ _POOLS = {purpose: ThreadPoolExecutor(most, purpose.name.lower()) for purpose, m
 async def run_in_pool(
     purpose: ThreadPurpose, function: Callable[..., T], /, *values: object, **named: object
 ) -> T:
-    """Call a function that blocks in one of the threads for ``purpose``; as :func:`asyncio.to_thread`."""
+    """Call a blocking function in a thread of the pool for ``purpose``; as :func:`asyncio.to_thread`."""
     call = functools.partial(contextvars.copy_context().run, function, *values, **named)
     return await asyncio.get_running_loop().run_in_executor(_POOLS[purpose], call)

@@ -1,4 +1,4 @@
-"""Addresses of webhooks, refused before anything is stored."""
+"""Check of webhook addresses before they are stored."""
 
 from octasplat.service.problems import ProblemError
 from octasplat.service.state import Service
@@ -6,7 +6,7 @@ from octasplat.workers.maintenance.webhooks.addresses import AddressRefusedError
 
 
 def check_webhook_address(service: Service, url: str, pointer: str = "#/url") -> None:
-    """Refuse an address that messages are not sent to.
+    """Refuse an address that messages may not be sent to.
 
     Raises:
         ProblemError: 422.

@@ -18,7 +18,7 @@ _RETRY_SECONDS = 10
 async def owned_job(
     connection: Connection, principal: Principal, job_id: uuid.UUID, *, lock: bool = False
 ) -> Job:
-    """Return the job, if it is the asker's to see.
+    """Return the job if the principal may see it.
 
     Raises:
         ProblemError: 404.
@@ -30,7 +30,7 @@ async def owned_job(
 
 
 async def read_job(service: Service, principal: Principal, job_id: uuid.UUID) -> Job:
-    """As :func:`owned_job`, on a connection of its own."""
+    """Return the job if the principal may see it, on a connection of its own."""
     async with service.pool.connection() as connection:
         return await owned_job(connection, principal, job_id)
 
@@ -38,7 +38,7 @@ async def read_job(service: Service, principal: Principal, job_id: uuid.UUID) ->
 async def owned_dataset(
     connection: Connection, principal: Principal, dataset_id: uuid.UUID, *, lock: bool = False
 ) -> Dataset:
-    """Return the dataset, if it is the asker's to see.
+    """Return the dataset if the principal may see it.
 
     Raises:
         ProblemError: 404.
@@ -50,7 +50,7 @@ async def owned_dataset(
 
 
 async def open_dataset(connection: Connection, principal: Principal, dataset_id: uuid.UUID) -> Dataset:
-    """Return the dataset, if it is the asker's and still takes files.
+    """Return the dataset if the principal may see it and it still takes files.
 
     Raises:
         ProblemError: 404.
@@ -65,7 +65,7 @@ async def open_dataset(connection: Connection, principal: Principal, dataset_id:
 
 
 async def owned_webhook(connection: Connection, principal: Principal, webhook_id: uuid.UUID) -> Endpoint:
-    """Return the webhook, if it is the asker's to see.
+    """Return the webhook if the principal may see it.
 
     Raises:
         ProblemError: 404.
@@ -77,7 +77,7 @@ async def owned_webhook(connection: Connection, principal: Principal, webhook_id
 
 
 def check_searchable_name(name: str, kind: str) -> str:
-    """Return a name to look for.
+    """Return a name to search for, if the database can hold it.
 
     Raises:
         ProblemError: 404, as nothing has a name that the database cannot hold.
@@ -88,7 +88,7 @@ def check_searchable_name(name: str, kind: str) -> str:
 
 
 def check_not_draining(service: Service) -> None:
-    """Take nothing on that may not be finished.
+    """Refuse work that may not be finished before the service stops.
 
     Raises:
         ProblemError: 503.

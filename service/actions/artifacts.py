@@ -1,4 +1,4 @@
-"""Results of jobs, and pictures of scenes in the making."""
+"""Results of jobs, and previews of running ones."""
 
 import uuid
 
@@ -40,7 +40,7 @@ async def get_artifact(
 
 
 async def get_preview(service: Service, principal: Principal, job_id: uuid.UUID) -> Blob:
-    """Return the newest picture of the scene in the making, a PNG.
+    """Return the newest preview of a running job, a PNG.
 
     Raises:
         ProblemError: 404.

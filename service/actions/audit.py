@@ -7,7 +7,7 @@ from octasplat.workers.db.audit import AuditEntry
 
 
 async def list_entries(service: Service, *, before: int | None, limit: int) -> Page[AuditEntry]:
-    """Entries, the newest first.
+    """Return entries of the audit log, newest first.
 
     Args:
         service: the service.

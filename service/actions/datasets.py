@@ -1,4 +1,4 @@
-"""Datasets: made, listed, changed, checked, deleted; their files are in ``uploads``."""
+"""Datasets: created, listed, changed, validated, deleted; their files are in ``uploads``."""
 
 import asyncio
 import time
@@ -35,7 +35,7 @@ MAX_END_CHECK_SECONDS = 60.0
 async def create_dataset(
     service: Service, principal: Principal, new: NewDataset, *, idempotency_key: str | None = None
 ) -> Dataset:
-    """Make a dataset; the same request with the same ``idempotency_key`` makes nothing new.
+    """Create a dataset; a repetition with the same ``idempotency_key`` creates nothing.
 
     Raises:
         ProblemError: 422 if the key was used for another request.
@@ -55,7 +55,7 @@ async def create_dataset(
 async def list_datasets(
     service: Service, principal: Principal, *, before: uuid.UUID | None = None, limit: int
 ) -> Page[Dataset]:
-    """Datasets that the asker may see, the newest first, those made before ``before``."""
+    """Return the datasets before ``before`` that the principal may see, newest first."""
     async with service.pool.connection() as connection:
         found = await rows.list_datasets(
             connection, owner=principal.visible_owner, before=before, limit=limit + 1
@@ -66,7 +66,7 @@ async def list_datasets(
 async def list_files_by_suffix(
     service: Service, principal: Principal, suffixes: Sequence[str], *, limit: int
 ) -> list[tuple[Dataset, str]]:
-    """Files of the asker's committed datasets that hold files: those whose names end so, the newest first."""
+    """Return files, by suffix, of the owner's committed datasets for options; newest first."""
     async with service.pool.connection() as connection:
         return await rows.list_files_by_suffix(connection, principal.owner, suffixes, limit=limit)
 
@@ -85,7 +85,7 @@ async def get_dataset(service: Service, principal: Principal, dataset_id: uuid.U
 async def change_dataset(
     service: Service, principal: Principal, dataset_id: uuid.UUID, change: DatasetChange
 ) -> Dataset:
-    """Rename a dataset, or keep it whatever its age.
+    """Rename a dataset, or pin it so that it does not expire.
 
     Raises:
         ProblemError: 404.
@@ -115,7 +115,7 @@ async def delete_dataset(service: Service, principal: Principal, dataset_id: uui
 
 
 async def commit_dataset(service: Service, principal: Principal, dataset_id: uuid.UUID) -> Dataset:
-    """Check a dataset; one that is sound never changes again.
+    """Validate a dataset and commit it; a committed one never changes again.
 
     Raises:
         ProblemError: 404; 429 with too many that wait to be checked.
@@ -154,7 +154,7 @@ async def _check(service: Service, dataset_id: uuid.UUID) -> Dataset:
 
 
 async def _renew_check(service: Service, check: rows.Check) -> None:
-    """Say now and then that the check is under way; without that others take it for lost."""
+    """Renew the validation regularly; without that it counts as abandoned."""
     while True:
         await asyncio.sleep(rows.STALE_CHECK_SECONDS / 6)
         with suppress(psycopg.Error, PoolTimeout):
@@ -165,7 +165,7 @@ async def _renew_check(service: Service, check: rows.Check) -> None:
 async def _end_check(
     service: Service, check: rows.Check, summary: DatasetSummary | dict[str, Any] | None
 ) -> Dataset:
-    """Say what the check found, again and again while the database is away."""
+    """Record the result of the validation, with retries while the database is away."""
     wait, deadline = 0.2, time.monotonic() + MAX_END_CHECK_SECONDS
     while True:
         try:

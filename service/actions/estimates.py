@@ -14,7 +14,7 @@ from octasplat.workers.queue.jobs import get_job
 
 
 async def estimate(service: Service, principal: Principal, new: NewEstimate) -> Estimate | None:
-    """Return what a job would take, checked as if it were made; None where nobody knows.
+    """Return the estimate of a job, validated as a submission is; None where it is unknown.
 
     Raises:
         ProblemError: 422.
@@ -30,7 +30,7 @@ async def estimate(service: Service, principal: Principal, new: NewEstimate) -> 
 
 
 async def _sizes_of(connection: Connection, principal: Principal, new: NewEstimate) -> list[ImageSizes]:
-    """Sizes of the photographs of a dataset, or of the one that a job worked on."""
+    """Return the sizes of the photographs of a dataset, or of the one that a job worked on."""
     dataset_id = new.dataset_id
     if new.source_id is not None:
         job = await get_job(connection, new.source_id)

@@ -20,7 +20,7 @@ _RETRY_SECONDS = 10
 async def read_log(
     service: Service, principal: Principal, job_id: uuid.UUID, *, after: int, limit: int
 ) -> list[LogLine]:
-    """Lines of a job's log, after the one with the id ``after``.
+    """Return lines of a job's log after the id ``after``.
 
     Raises:
         ProblemError: 404.
@@ -33,7 +33,7 @@ async def read_log(
 async def read_events(
     service: Service, principal: Principal, job_id: uuid.UUID, *, after: int, limit: int
 ) -> list[JobEvent]:
-    """Return what happened to a job, after the event with the id ``after``.
+    """Return the events of a job after the id ``after``.
 
     Raises:
         ProblemError: 404.
@@ -46,7 +46,7 @@ async def read_events(
 async def follow_events(
     service: Service, principal: Principal, job_id: uuid.UUID, *, after: int
 ) -> AsyncGenerator[JobEvent | None, None] | None:
-    """Return what happens to a job until it is over, as it happens; None where everything was told already.
+    """Return the events of a job as they happen until it is over; None if all were sent already.
 
     In the place of an event comes None as a sign of life, where nothing has happened for a while.
 

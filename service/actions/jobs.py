@@ -44,7 +44,7 @@ class JobFilter:
 
 @dataclass(frozen=True)
 class JobWithView:
-    """A job with what is shown of it, both of one moment."""
+    """A job and its view, both of one moment."""
 
     row: Job
     view: JobView
@@ -53,7 +53,7 @@ class JobWithView:
 async def list_jobs(
     service: Service, principal: Principal, job_filter: JobFilter, *, before: uuid.UUID | None, limit: int
 ) -> Page[Job]:
-    """Jobs that the asker may see, the newest first.
+    """Return jobs that the principal may see, newest first.
 
     Args:
         service: the service.
@@ -95,7 +95,7 @@ async def change_job(
     change: JobChange,
     check: Callable[[JobWithView], None] = lambda _: None,
 ) -> JobView:
-    """Rename a job, or keep it whatever its age.
+    """Rename a job, or pin it so that it does not expire.
 
     Args:
         service: the service.
@@ -163,7 +163,7 @@ async def delete_job(
 
 
 def stages_of(job: Job) -> list[str]:
-    """Return names of the stages of a job, in order."""
+    """Return the names of a job's stages, in order."""
     try:
         kind = get_job_kind(job.kind)
         return list(kind.stages(kind.options.model_validate(job.options)))
@@ -172,7 +172,7 @@ def stages_of(job: Job) -> list[str]:
 
 
 async def job_view(connection: Connection, service: Service, job: Job) -> JobView:
-    """Return a job as it is shown alone: with its place in the queue, and what to know while it waits."""
+    """Return the view of one job, with its position in the queue and notes while it waits."""
     notes: list[str] = []
     if job.state == "queued":
         with suppress(ConfigError, ValidationError):  # of another version
@@ -184,5 +184,5 @@ async def job_view(connection: Connection, service: Service, job: Job) -> JobVie
 
 
 def _without_nul(text: str | None) -> str | None:
-    """Postgres holds no NUL, so nothing has it."""
+    """Return the text with NUL replaced, which Postgres cannot hold, so that it matches nothing."""
     return text if text is None else text.replace("\0", "\N{REPLACEMENT CHARACTER}")

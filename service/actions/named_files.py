@@ -1,4 +1,4 @@
-"""Files that the options of a job name, looked for among those that were sent."""
+"""Check that files named in the options of a job are among the uploaded ones."""
 
 import uuid
 
@@ -20,7 +20,7 @@ async def check_named_files(
     options: BaseModel,
     files_id: uuid.UUID | None,
 ) -> None:
-    """Refuse options that name a file which is not there under just this name.
+    """Refuse options that name a file which was not uploaded under exactly this name.
 
     Args:
         connection: to the database.

@@ -1,4 +1,4 @@
-"""Long lists in parts."""
+"""Pages of long lists."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -9,7 +9,7 @@ Row = TypeVar("Row")
 
 @dataclass(frozen=True)
 class Page(Generic[Row]):
-    """A part of a long list.
+    """A page of a long list.
 
     Attributes:
         rows: its entries.
@@ -21,6 +21,6 @@ class Page(Generic[Row]):
 
 
 def page_of(rows_found: Sequence[Row], limit: int, key_of: Callable[[Row], object]) -> Page[Row]:
-    """Return the first ``limit`` of what was found; that there is more shows in one entry too many."""
+    """Return the first ``limit`` rows as a page; one row too many shows that there are more."""
     rows = list(rows_found[:limit])
     return Page(rows, str(key_of(rows[-1])) if len(rows_found) > limit else None)

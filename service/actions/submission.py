@@ -1,4 +1,4 @@
-"""Jobs taken on: new ones, and those that are tried again."""
+"""Submission of jobs: new ones, and retries."""
 
 import uuid
 from dataclasses import dataclass, replace
@@ -34,7 +34,7 @@ from octasplat.workers.worker.job_kinds import JobKind, get_job_kind
 
 @dataclass(frozen=True)
 class _RequestedJob:
-    """A new job as it was asked for: its kind and the complete options."""
+    """A requested job: its kind and complete options."""
 
     new: NewJob
     kind: JobKind
@@ -61,7 +61,7 @@ async def submit_job(
     idempotency_key: str | None = None,
     traceparent: str | None = None,
 ) -> JobView:
-    """Accept a job.
+    """Create a job from a request.
 
     Args:
         service: the service.
@@ -181,7 +181,7 @@ async def _create_job(
 
 
 async def _check_inputs(connection: Connection, principal: Principal, requested: _RequestedJob) -> _JobInputs:
-    """Return what the job works on, checked."""
+    """Return the inputs of the job, checked."""
     needed = {"result": _check_source, "dataset": _check_dataset, "files": _check_files}[requested.kind.needs]
     inputs = await needed(connection, principal, requested)
     files_id = requested.new.files_id

@@ -30,7 +30,7 @@ def list_kinds(service: Service) -> list[KindView]:
 
 
 def get_kind(service: Service, name: str) -> KindView:
-    """One kind of job with its options.
+    """Return one kind of job with its options.
 
     Raises:
         ProblemError: 404.
@@ -42,7 +42,7 @@ def get_kind(service: Service, name: str) -> KindView:
 
 
 def describe(service: Service, principal: Principal) -> InfoView:
-    """Versions, limits, formats, and who asks."""
+    """Return versions, limits, formats, and the caller's identity."""
     return InfoView(
         version=__version__,
         kinds=[kind.name for kind in job_kinds()],
@@ -59,13 +59,13 @@ def describe(service: Service, principal: Principal) -> InfoView:
 
 
 async def list_live_workers(service: Service) -> list[WorkerRow]:
-    """Return the workers that have been heard of lately."""
+    """Return the live workers."""
     async with service.pool.connection() as connection:
         return await live_workers(connection, service.settings.stale_seconds)
 
 
 async def list_queues(service: Service) -> QueueList:
-    """Return what waits, what runs, and who works."""
+    """Return the waiting and running jobs of each queue, and the workers."""
     async with service.pool.connection() as connection:
         depths = {depth.queue: depth for depth in await queue_depths(connection)}
         running = await running_by_queue(connection)
@@ -91,7 +91,7 @@ async def list_queues(service: Service) -> QueueList:
 
 
 async def check_readiness(service: Service) -> dict[str, str]:
-    """Return whether requests can be served, part by part: ``ok``, or what ails it."""
+    """Return the readiness of each part: ``ok``, or the fault."""
     return {
         "database": await _check_database(service),
         "storage": await _check_storage(service),
@@ -100,7 +100,7 @@ async def check_readiness(service: Service) -> dict[str, str]:
 
 
 async def render_metrics(service: Service) -> bytes:
-    """Return how the service fares, in the format of Prometheus."""
+    """Return the metrics of the service in the Prometheus format."""
     async with service.pool.connection() as connection:
         numbers = await read_service_stats(connection, service.settings.stale_seconds)
     free_bytes = await run_in_pool(ThreadPurpose.STORE_CHECKS, _free_bytes, service)
@@ -126,7 +126,7 @@ async def _check_database(service: Service) -> str:
 
 
 async def _check_storage(service: Service) -> str:
-    """Check the store once for all concurrent requests; a store that hangs takes one thread only."""
+    """Check the storage once for all concurrent requests; a storage that hangs blocks one thread only."""
     if service.storage_check is None or service.storage_check.done():
         service.storage_check = asyncio.ensure_future(
             run_in_pool(ThreadPurpose.STORE_CHECKS, _storage_state, service)

@@ -1,4 +1,4 @@
-"""Tokens: made, listed, shut out."""
+"""Tokens: created, listed, revoked."""
 
 import uuid
 
@@ -18,7 +18,7 @@ async def list_tokens(service: Service) -> list[Token]:
 
 
 async def create_token(service: Service, new: NewToken) -> MadeToken:
-    """Make a token. From the first one on, nobody gets in without."""
+    """Create a token; from the first one on, every request needs one."""
     secret = rows.new_secret()
     async with service.pool.connection() as connection:
         token = await rows.add_token(
@@ -46,7 +46,7 @@ async def revoke_token(service: Service, token_id: uuid.UUID) -> None:
 
 
 async def create_sign_in_link(service: Service, principal: Principal) -> SignInLink:
-    """Make a link that signs in once.
+    """Create a link that signs in once.
 
     Raises:
         ProblemError: 409 where nobody needs to sign in.

@@ -1,4 +1,4 @@
-"""Files of datasets: taken in one by one or as an archive, listed, found, taken out."""
+"""Files of datasets: uploaded one by one or as an archive, listed, read, removed."""
 
 import logging
 import uuid
@@ -41,7 +41,7 @@ ReceivedT = TypeVar("ReceivedT")
 
 @dataclass(frozen=True)
 class Upload:
-    """Something that is being sent.
+    """An upload in progress.
 
     Attributes:
         body: its bytes, as they come.
@@ -74,7 +74,7 @@ class StoredArchive:
 async def list_files(
     service: Service, principal: Principal, dataset_id: uuid.UUID, *, after: str, limit: int
 ) -> Page[DatasetFile]:
-    """Return the files that have arrived, by name, from the one after ``after``.
+    """Return the uploaded files after ``after``, by name.
 
     Raises:
         ProblemError: 404.
@@ -101,7 +101,7 @@ async def get_file(service: Service, principal: Principal, dataset_id: uuid.UUID
 
 @retry_on_deadlock
 async def remove_file(service: Service, principal: Principal, dataset_id: uuid.UUID, path: str) -> None:
-    """Take a file out of an open dataset.
+    """Remove a file from an open dataset.
 
     Raises:
         ProblemError: 404.
@@ -117,7 +117,7 @@ async def remove_file(service: Service, principal: Principal, dataset_id: uuid.U
 async def put_file(
     service: Service, principal: Principal, dataset_id: uuid.UUID, path: str, upload: Upload
 ) -> StoredFile:
-    """Put a file into an open dataset. One that is there with the announced digest is not read.
+    """Store a file in an open dataset; the body is not read if the announced content is there.
 
     Raises:
         ProblemError: 404, or 503 if the service is about to stop.
@@ -162,7 +162,7 @@ async def put_file(
 async def put_archive(
     service: Service, principal: Principal, dataset_id: uuid.UUID, upload: Upload
 ) -> StoredArchive:
-    """Put the files of a ZIP file into an open dataset, beside those that are there.
+    """Store the files of a ZIP file in an open dataset, beside those that are there.
 
     Raises:
         ProblemError: 404, or 503 if the service is about to stop.
@@ -202,7 +202,7 @@ async def put_archive(
 
 
 def _is_stored(storage: Storage, file: DatasetFile) -> bool:
-    """Return whether the store holds the content of a file, as far as can be seen without reading it."""
+    """Return whether the storage holds the content of a file, without reading it."""
     try:
         return storage.stat(file.sha256).size_bytes == file.size_bytes
     except BlobNotFoundError:
@@ -210,7 +210,7 @@ def _is_stored(storage: Storage, file: DatasetFile) -> bool:
 
 
 def _content_check_for(dataset: Dataset, path: str) -> ContentCheck:
-    """Return the content check for an accepted file name."""
+    """Return the content check for a valid file name."""
     if dataset.holds == "files":
         check_input_name(path)
         return check_input_content
@@ -234,7 +234,7 @@ async def _limited_by_quota(receive: Callable[[], Awaitable[ReceivedT]], bytes_l
 async def _record_files(
     service: Service, dataset: Dataset, lease: StorageLease, received: Sequence[ReceivedFile]
 ) -> list[DatasetFile]:
-    """Enter what is stored into the dataset, or none of it."""
+    """Record stored files in the dataset, all or none."""
     new = [rows.NewFile(f.path, f.blob.sha256, f.blob.size_bytes, f.facts) for f in received]
     async with lease.reference({file.sha256 for file in new}) as connection:
         files = await rows.put_files(connection, dataset.id, new)

@@ -26,7 +26,7 @@ def validate_kind(name: str) -> JobKind:
 
 
 def resolve_options(kind: JobKind, values: Mapping[str, Any]) -> BaseModel:
-    """Complete options.
+    """Return the complete options.
 
     Raises:
         ProblemError: 422.
@@ -38,5 +38,5 @@ def resolve_options(kind: JobKind, values: Mapping[str, Any]) -> BaseModel:
 
 
 def input_problem(name: str, detail: str) -> ProblemError:
-    """Return what a job is to work on is not there, or does not fit its kind."""
+    """Return the problem of inputs that are missing or do not fit the kind."""
     return ProblemError(422, "input", detail, errors=[{"pointer": f"#/{name}", "detail": detail}])

@@ -1,4 +1,4 @@
-"""Webhooks: made, listed, changed, tried out; and what became of their messages."""
+"""Webhooks: created, listed, changed, tested, and their deliveries."""
 
 import uuid
 from dataclasses import dataclass
@@ -19,7 +19,7 @@ from octasplat.workers.maintenance.webhooks.signing import new_secret
 
 @dataclass(frozen=True)
 class CreatedEndpoint:
-    """A webhook that was just made, with its secret."""
+    """A new webhook, with its secret."""
 
     row: Endpoint
     secret: str
@@ -27,7 +27,7 @@ class CreatedEndpoint:
 
 @retry_on_deadlock
 async def create_webhook(service: Service, principal: Principal, new: NewWebhook) -> CreatedEndpoint:
-    """Be told of the asker's jobs, or of one job.
+    """Create a webhook for the caller's jobs, or for one job.
 
     Raises:
         ProblemError: 404, or 422 for an address that messages are not sent to.
@@ -50,7 +50,7 @@ async def create_webhook(service: Service, principal: Principal, new: NewWebhook
 async def list_webhooks(
     service: Service, principal: Principal, *, before: uuid.UUID | None, limit: int
 ) -> Page[Endpoint]:
-    """Webhooks that the asker may see, the newest first, those made before ``before``."""
+    """Return the webhooks before ``before`` that the principal may see, newest first."""
     async with service.pool.connection() as connection:
         found = await rows.list_endpoints(
             connection, owner=principal.visible_owner, before=before, limit=limit + 1
@@ -97,7 +97,7 @@ async def delete_webhook(service: Service, principal: Principal, webhook_id: uui
 
 
 async def send_test(service: Service, principal: Principal, webhook_id: uuid.UUID) -> Delivery:
-    """Send a message that says nothing.
+    """Send a test message.
 
     Raises:
         ProblemError: 404, or 409 if the webhook is disabled.
@@ -111,7 +111,7 @@ async def send_test(service: Service, principal: Principal, webhook_id: uuid.UUI
 async def list_deliveries(
     service: Service, principal: Principal, webhook_id: uuid.UUID, limit: int
 ) -> list[Delivery]:
-    """Return the newest messages and what became of them.
+    """Return the newest messages and their outcomes.
 
     Raises:
         ProblemError: 404.
@@ -125,7 +125,7 @@ async def list_deliveries(
 async def redeliver(
     service: Service, principal: Principal, webhook_id: uuid.UUID, delivery_id: uuid.UUID
 ) -> Delivery:
-    """Send a message once more, with the same id and content.
+    """Send a message again, with the same id and content.
 
     Raises:
         ProblemError: 404, or 409 if the webhook is disabled.

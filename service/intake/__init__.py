@@ -1,4 +1,4 @@
-"""Letting photographs and models in: strict about names, archives, images and COLMAP models.
+"""Validation of uploads: names, archives, images and COLMAP models.
 
 Nothing here imports pycolmap, torch or numba; a model is only ever parsed in a child process.
 """

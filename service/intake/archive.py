@@ -1,4 +1,4 @@
-"""Taking a scene out of a ZIP archive from somebody who may mean harm.
+"""Reader of untrusted ZIP archives of a dataset.
 
 Everything is checked before the first byte is written, and counted again while writing. What is odd is
 refused, never mended; what is no part of a scene is left out unseen. Nothing is written under the names in
@@ -70,7 +70,7 @@ class ArchiveFile:
 
     @property
     def size_bytes(self) -> int:
-        """Length of its content."""
+        """Return the length of the content."""
         return self.record.size_bytes
 
 
@@ -92,7 +92,7 @@ class ArchiveListing:
 
     @property
     def size_bytes(self) -> int:
-        """Length of all contents together."""
+        """Return the total length of the contents."""
         return sum(file.size_bytes for file in self.files)
 
 
@@ -145,7 +145,7 @@ def unpack_archive(
     open_writer: Callable[[ArchiveFile], BlobWriter],
     on_file: Callable[[ArchiveFile, Blob], None],
 ) -> None:
-    """Write the files of an archive to a store.
+    """Write the files of an archive to a storage.
 
     Args:
         file: the archive.
@@ -173,7 +173,7 @@ def archive_type(head: bytes) -> str | None:
 
 
 def _with_forward_slashes(records: list[ZipEntry]) -> list[ZipEntry]:
-    """Return entries by an old Windows program under the names it meant, where it wrote backslashes only."""
+    """Return entries with forward slashes where an old Windows program wrote backslashes only."""
     names = [record.name.replace("\\", "/") for record in records]
     if any("/" in record.name for record in records) or not all(map(_is_portable, names)):
         return records

@@ -1,4 +1,4 @@
-"""Is this a scene? Checks of single files as they arrive, and of the whole when it is committed."""
+"""Validation of datasets: of single files as they arrive, and of the whole at its commit."""
 
 import unicodedata
 from collections.abc import Iterable, Sequence
@@ -84,7 +84,7 @@ class DatasetSummary:
 def check_file_content(
     storage: Storage, name: str, sha256: str, limits: ImageLimits = DEFAULT_IMAGE_LIMITS
 ) -> ImageHeader | None:
-    """Check a stored file before it is entered into a dataset; the header of an image, else None.
+    """Check a stored file before it is added to a dataset; returns the header of an image, else None.
 
     Raises:
         IntakeError: the header is refused, or the file was cut off.
@@ -208,7 +208,7 @@ def _check_masks(
     faults: list[IntakeFault],
     warnings: list[str],
 ) -> int:
-    """Masks against their photographs, which are named alike but for ``.png`` at the end."""
+    """Check masks against their photographs, whose names they have with ``.png`` at the end."""
     photographs = {unicodedata.normalize("NFC", path): size for path, size in sizes.items()}
     masks = [file.path for file in files if file_role(file.path) is FileRole.MASK]
     alone = 0

@@ -21,19 +21,19 @@ class IntakeFault:
 
     @property
     def pointer(self) -> str:
-        """JSON pointer (RFC 6901, as a fragment) to the file among the files of the dataset."""
+        """Return the JSON pointer (RFC 6901, as a fragment) to the file in the dataset."""
         if self.file is None:
             return "#/files"
         return f"#/files/{self.file.replace('~', '~0').replace('/', '~1')}"
 
     def as_dict(self) -> dict[str, str]:
-        """As an element of ``errors`` of a problem document (RFC 9457)."""
+        """Return an element of ``errors`` in a problem document (RFC 9457)."""
         facts = {"code": self.code, "detail": self.detail, "pointer": self.pointer}
         return facts if self.file is None else {**facts, "file": self.file}
 
 
 class IntakeError(DatasetError):
-    """Something from outside is refused; ``faults`` say why, the text is that of the first."""
+    """An upload is refused; ``faults`` have the reasons, the text is that of the first."""
 
     error_type = "intake_refused"
 
@@ -43,5 +43,5 @@ class IntakeError(DatasetError):
 
     @property
     def code(self) -> str:
-        """Reason of the first fault."""
+        """Return the code of the first fault."""
         return self.faults[0].code

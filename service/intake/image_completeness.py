@@ -26,7 +26,7 @@ _TIFF_LAYOUTS = {3: "H", 4: "I", 16: "Q"}
 
 
 def check_complete(file: BinaryIO, name: str, kind: str) -> None:
-    """Refuse an image that was cut off.
+    """Refuse a truncated image.
 
     Args:
         file: seekable, with a header that :func:`octasplat.service.intake.images.read_image_header` found
@@ -70,7 +70,7 @@ def _is_jpeg_complete(file: BinaryIO, size_bytes: int) -> bool:
 
 
 def _first_scan_offset(file: BinaryIO) -> int:
-    """Return where the data of the first scan begin."""
+    """Return the offset of the data of the first scan."""
     file.seek(2)
     marked = False
     for _ in range(_MAX_SEGMENTS):
@@ -107,7 +107,7 @@ def _is_webp_complete(file: BinaryIO, size_bytes: int) -> bool:
 
 
 def _is_bmp_complete(file: BinaryIO, size_bytes: int) -> bool:
-    """There are as many rows as the header says, where they are not compressed."""
+    """Return whether all rows are there, where they are not compressed."""
     head = file.read(34)
     (start,) = struct.unpack_from("<I", head, 10)
     if struct.unpack_from("<I", head, 14)[0] < 40:
@@ -119,7 +119,7 @@ def _is_bmp_complete(file: BinaryIO, size_bytes: int) -> bool:
 
 
 def _is_tiff_complete(file: BinaryIO, size_bytes: int) -> bool:
-    """Return all strips or tiles of the first page lie within the file."""
+    """Return whether all strips or tiles of the first page lie within the file."""
     order = "<" if file.read(2) == b"II" else ">"
     (version,) = unpack_struct(file, f"{order}H")
     big = version == 43
@@ -142,7 +142,7 @@ def _is_tiff_complete(file: BinaryIO, size_bytes: int) -> bool:
 
 
 def _tiff_values(file: BinaryIO, layout: str, number: int, inline: bytes, address: str) -> tuple[int, ...]:
-    """Return the values of a field, which stand in the field itself if they fit."""
+    """Return the values of a field, which are in the field itself if they fit."""
     order, letter = layout[0], layout[1]
     length = struct.calcsize(layout) * number
     if length <= len(inline):
@@ -155,7 +155,7 @@ def _tiff_values(file: BinaryIO, layout: str, number: int, inline: bytes, addres
 
 
 def _is_exr_complete(file: BinaryIO, size_bytes: int) -> bool:
-    """Return all blocks of rows lie within the file, where it has one part without tiles."""
+    """Return whether all blocks of rows lie within the file, where it has one part without tiles."""
     _, flags = unpack_struct(file, "<2I")
     if flags & (0x200 | 0x800 | 0x1000):
         return True

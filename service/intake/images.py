@@ -1,8 +1,8 @@
-"""The size of an image from its header, before anybody decodes it.
+"""Size of an image from its header, without decoding it.
 
-A header may lie and may be endless, so every reader works on a file that gives out only so many bytes. Pillow
-reads JPEG, PNG and BMP; of the formats it refuses, decodes at once (WebP) or does not know, only the few
-fields that hold the size are read here.
+A header may be wrong and may be endless, so every reader works on a file of bounded length. Pillow reads
+JPEG, PNG and BMP; of the formats that it refuses, decodes at once (WebP) or does not know, only the fields
+that hold the size are read here.
 """
 
 import io
@@ -131,11 +131,11 @@ def image_type(head: bytes) -> str | None:
 
 
 class _HeaderTooLongError(Exception):
-    """More was read than a header may hold."""
+    """More bytes were read than a header may have."""
 
 
 class _BoundedFile(io.RawIOBase):
-    """A file that gives out only so many bytes, and takes only so many calls."""
+    """A file that returns a bounded number of bytes in a bounded number of calls."""
 
     def __init__(self, file: BinaryIO, max_bytes: int) -> None:
         self._file = file
@@ -177,7 +177,7 @@ class _BoundedFile(io.RawIOBase):
 
 
 def _pillow_reader(reader: Callable[[Any], ImageFile.ImageFile]) -> Callable[[Any], tuple[int, int, int]]:
-    """Sizes by one of Pillow's readers, called directly: its limit on pixels is not ours."""
+    """Return a reader of sizes by a plugin of Pillow, called directly, as its pixel limit is not ours."""
 
     def read(file: Any) -> tuple[int, int, int]:
         image = reader(file)
@@ -210,7 +210,7 @@ def _read_webp_size(file: Any) -> tuple[int, int, int]:
 
 
 def _read_tiff_size(file: Any) -> tuple[int, int, int]:
-    """Size of the first page, the only one that counts."""
+    """Return the size of the first page, the only one that counts."""
     order = "<" if file.read(2) == b"II" else ">"
     (version,) = unpack_struct(file, f"{order}H")
     if version == 43:
@@ -253,7 +253,7 @@ def _read_exr_size(file: Any) -> tuple[int, int, int]:
 
 
 def read_null_terminated(file: Any) -> bytes:
-    """Return a text that ends with a zero, of at most 255 bytes."""
+    """Return a null-terminated text of at most 255 bytes."""
     text = bytearray()
     while (letter := file.read(1)) != b"\0":
         text += letter

@@ -1,4 +1,4 @@
-"""Files that the options of a job name, such as the meshes and textures of a stage, at the door."""
+"""Validation of uploaded files that options name, such as the meshes and textures of a stage."""
 
 import zipfile
 from collections.abc import Sequence
@@ -28,7 +28,7 @@ ALLOWED_SUFFIXES = frozenset(
 
 
 def check_input_name(name: str) -> None:
-    """Look at a file's name.
+    """Check the name of an uploaded file.
 
     Raises:
         IntakeError: ``name-...``; ``name-unexpected``, as nothing reads such files.
@@ -43,7 +43,7 @@ def check_input_name(name: str) -> None:
 
 
 def check_input_content(storage: Storage, name: str, sha256: str, limits: ImageLimits) -> ImageHeader | None:
-    """Look at the first bytes of a stored file; the header of an image, else None.
+    """Check the first bytes of a stored file; returns the header of an image, else None.
 
     Raises:
         IntakeError: it is not what its name says, or was cut off.
@@ -87,7 +87,7 @@ def _has_long_line(file: BinaryIO) -> bool:
 
 
 def check_input_files(files: Sequence[DatasetFile]) -> dict[str, Any]:
-    """Look at all files together; returns what is to be told of them.
+    """Check all files together; returns warnings.
 
     Raises:
         IntakeError: there are none or too many, or two have names that some systems take for one.

@@ -1,4 +1,4 @@
-"""Asking a child process, under limits, whether a COLMAP model can be used."""
+"""Validation of a COLMAP model in a child process with limits."""
 
 import logging
 import os
@@ -121,7 +121,7 @@ def _run_model_child(request: ModelRequest, limits: ModelLimits) -> ModelAnswer:
 
 
 def parser_environment() -> dict[str, str]:
-    """Return what a child that parses foreign bytes may know: how to find libraries, and no secrets."""
+    """Return the environment of a child that parses untrusted data: library paths, no secrets."""
     inherited = {name: os.environ[name] for name in _LIBRARY_VARIABLES if name in os.environ}
     return {**inherited, "OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1", "PYTHONDONTWRITEBYTECODE": "1"}
 

@@ -1,11 +1,10 @@
-"""The child process that parses a COLMAP model from somebody who may mean harm.
+"""Child process that parses an untrusted COLMAP model.
 
     python -P -m octasplat.service.intake.model_child < request.json > answer.json
 
 It limits its own memory, time and output, and gives up the network, other programs and writing, before it
-imports anything that parses. Only this module's ``main``
-imports pycolmap. The parent is :mod:`octasplat.service.intake.model_check`; what it sends and receives is
-defined here.
+imports anything that parses. Only this module's ``main`` imports pycolmap. The parent is
+:mod:`octasplat.service.intake.model_check`; the request and the answer are defined here.
 """
 
 import contextlib
@@ -67,7 +66,7 @@ class ModelAnswer(BaseModel):
 
 
 def main() -> None:
-    """Read the request from stdin, parse, and write the answer to stdout."""
+    """Read the request from stdin, parse the model, and write the answer to stdout."""
     answer_fd = os.dup(1)
     os.dup2(2, 1)  # libraries that talk do so to stderr
     request = ModelRequest.model_validate_json(sys.stdin.buffer.read())
@@ -82,7 +81,7 @@ def main() -> None:
 
 
 def check(request: ModelRequest) -> ModelAnswer:
-    """Parse the model and list all that is wrong with it."""
+    """Parse the model and list all its faults."""
     from octasplat.engine.core.errors import DatasetError
     from octasplat.engine.dataset.colmap_binary import check_binary_colmap_model
     from octasplat.engine.dataset.colmap_model import find_colmap_model_folder, read_colmap_model
@@ -112,7 +111,7 @@ def check(request: ModelRequest) -> ModelAnswer:
 
 
 def _load_reconstruction(folder: Path) -> Any:
-    """Return the model as pycolmap reads it, or None where it does not; the engine then says why."""
+    """Return the model as pycolmap reads it; None where it does not, and the engine then says why."""
     import pycolmap
 
     try:
@@ -124,7 +123,7 @@ def _load_reconstruction(folder: Path) -> Any:
 
 
 class _ModelChecker:
-    """Collects faults, a bounded number of them."""
+    """Collects a bounded number of faults."""
 
     def __init__(self, request: ModelRequest) -> None:
         self.request = request
@@ -181,7 +180,7 @@ class _ModelChecker:
             )
 
     def check_cameras(self, reconstruction: Any) -> None:
-        """Parameters, and sizes against those of the photographs."""
+        """Check parameters of cameras, and their sizes against those of the photographs."""
         import numpy as np
 
         bad: set[int] = set()
@@ -239,7 +238,7 @@ def _image_name(image: Any, image_id: int) -> str:
 
 
 def has_same_aspect(camera_px: tuple[int, int], image_px: tuple[int, int]) -> bool:
-    """Return whether an image is that of the camera but for its scale, to a pixel, as the engine demands."""
+    """Return whether an image has the camera's aspect ratio to within a pixel, as the engine requires."""
     expected_height = camera_px[1] * image_px[0] / camera_px[0]
     expected_width = camera_px[0] * image_px[1] / camera_px[1]
     return min(abs(expected_height - image_px[1]), abs(expected_width - image_px[0])) <= 1
@@ -258,12 +257,12 @@ def _file_in_sentence(sentence: str, request: ModelRequest) -> str | None:
 
 
 def _without_root(sentence: str, root: Path) -> str:
-    """Return the sentence without the folder of this machine that the model was put into."""
+    """Return the sentence without the folder of this machine that holds the model."""
     return sentence.replace(f"{root}/", "").replace(str(root), "the dataset")
 
 
 def _enter_sandbox(request: ModelRequest) -> None:
-    """Give up what a parser does not need, for good."""
+    """Give up rights that a parser does not need, for good."""
     with contextlib.suppress(OSError):
         prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
     for kind, value in (

@@ -1,4 +1,4 @@
-"""Taking in bodies of any length with constant memory: single files, and archives of whole scenes."""
+"""Receiving of bodies of any length in constant memory: single files, and archives of datasets."""
 
 import asyncio
 import base64
@@ -163,7 +163,7 @@ async def receive_file(
     max_bytes: int | None = None,
     check: ContentCheck = check_file_content,
 ) -> ReceivedFile:
-    """Take in one file of a dataset. It is stored, but belongs to nothing yet.
+    """Receive one file of a dataset and store it; it belongs to nothing yet.
 
     Args:
         storage: where to.
@@ -198,7 +198,7 @@ async def receive_archive(
     limits: UploadLimits = DEFAULT_LIMITS,
     max_bytes: int | None = None,
 ) -> ReceivedArchive:
-    """Take in a scene as an archive. Its files are stored, but belong to nothing yet.
+    """Receive a dataset as an archive and store its files; they belong to nothing yet.
 
     Args:
         storage: where to.
@@ -226,7 +226,7 @@ async def receive_archive(
 
 
 def header_facts(header: ImageHeader | None) -> dict[str, str | int | None]:
-    """Return what the table keeps of the header of an image."""
+    """Return the properties of an image header that the table stores."""
     if header is None:
         return {}
     facts: dict[str, str | int | None] = {
@@ -259,7 +259,7 @@ def _unpack_archive(
 
 
 class _SpoolWriter(VerifyingWriter):
-    """Writes an archive into a nameless file of this machine; its room is taken until the context ends."""
+    """Writes an archive into a nameless file of this machine, with its space reserved."""
 
     def __init__(
         self,

@@ -1,4 +1,4 @@
-"""Room on this machine for archives while they are read, whatever store their contents go to."""
+"""Spool space on this machine for archives while they are read."""
 
 import os
 import threading
@@ -9,7 +9,7 @@ from octasplat.workers.storage.os_errors import translate_os_errors
 
 
 class SpoolSpace:
-    """Bounds what all archives take that are being read.
+    """Limits the total size of the archives that are being read.
 
     Args:
         folder: where they lie; made when the first one comes.
@@ -25,7 +25,7 @@ class SpoolSpace:
         self._lock = threading.Lock()
 
     def reserve(self, size_bytes: int) -> None:
-        """Set so much aside, until it is given back.
+        """Reserve space until it is released.
 
         Raises:
             StorageFullError: there is not as much.
@@ -46,6 +46,6 @@ class SpoolSpace:
             self._reserved_bytes += size_bytes
 
     def release(self, size_bytes: int) -> None:
-        """So much is taken no more."""
+        """Release reserved space."""
         with self._lock:
             self._reserved_bytes -= size_bytes

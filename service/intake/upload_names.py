@@ -1,7 +1,7 @@
-"""Names of files at the door: each is checked once, where it comes in, and taken as it is behind it.
+"""Validation of uploaded file names: each is checked once, where it arrives, and trusted afterwards.
 
-The doors are a file that is put (:func:`check_file_name`), and many that come or are counted together
-(:class:`FileNames`): those of an archive, and those of a dataset that is committed.
+Names arrive with a single file (:func:`check_file_name`), or in numbers (:class:`FileNames`): those of an
+archive, and those of a dataset that is committed.
 """
 
 from octasplat.engine.core.scene_layout import FileRole, file_role
@@ -10,7 +10,7 @@ from octasplat.workers.storage.file_names import FileNameError, NameSet, check_n
 
 
 def check_file_name(name: str) -> FileRole:
-    """Return what a file of that name is in a dataset.
+    """Return the role of a file of that name in a dataset.
 
     Raises:
         IntakeError: the name is refused (``name-...``), or is that of no part of a scene
@@ -24,7 +24,7 @@ def check_file_name(name: str) -> FileRole:
 
 
 def check_scene_file(name: str) -> FileRole:
-    """Return what a file of that name, which is checked, is in a scene.
+    """Return the role in a dataset of a file whose name is checked.
 
     Raises:
         IntakeError: ``name-unexpected``, as it is no part of one.
@@ -43,13 +43,13 @@ def check_scene_file(name: str) -> FileRole:
 
 
 class FileNames:
-    """Names taken so far; adding one checks it by itself and against all the others."""
+    """A set of file names; each added one is checked by itself and against all others."""
 
     def __init__(self) -> None:
         self._names = NameSet()
 
     def add(self, name: str) -> None:
-        """Take the name of a file, or that of a folder, which ends with a slash.
+        """Add the name of a file, or that of a folder, which ends with a slash.
 
         Raises:
             IntakeError: ``name-...``.

@@ -1,8 +1,8 @@
-"""The records of a ZIP file, read strictly: every byte of the file must belong to exactly one of them.
+"""Strict reader of ZIP records: every byte of the file must belong to exactly one of them.
 
 Readers of ZIP files disagree about files whose two lists of contents, the local headers and the central
-directory, do not agree. So this reads both and takes only files in which they say the same, in which the
-entries follow each other without gap or overlap, and after which nothing comes. Facts: APPNOTE.TXT 6.3.10.
+directory, differ. So this reads both and accepts only files in which they agree, in which the entries follow
+each other without gap or overlap, and after which nothing follows. Source: APPNOTE.TXT 6.3.10.
 """
 
 import os
@@ -29,7 +29,7 @@ _EXTRA_ZIP64, _EXTRA_NAME = 0x0001, 0x7075
 
 @dataclass(frozen=True)
 class ZipEntry:
-    """One entry, as both lists say.
+    """One entry, on which both lists agree.
 
     Attributes:
         name: as stored, a folder's with its final slash.

@@ -1,4 +1,4 @@
-"""The addresses of the API, one module a subject."""
+"""Routes of the API, one module a subject."""
 
 from typing import Any
 
@@ -6,7 +6,7 @@ from octasplat.service.problems import MEDIA_TYPE, ProblemDocument
 
 
 def problem_responses(*statuses: int) -> dict[int | str, dict[str, Any]]:
-    """Return how errors of these statuses are described in OpenAPI; 400, 401, 429 and 503 are everywhere."""
+    """Return the OpenAPI descriptions of these error statuses; 400, 401, 429 and 503 are everywhere."""
     content = {MEDIA_TYPE: {"schema": {"$ref": "#/components/schemas/ProblemDocument"}}}
     names = {
         400: "Malformed", 401: "No valid token", 403: "The token's scope does not suffice",

@@ -1,4 +1,4 @@
-"""Results of jobs, and pictures of scenes in the making."""
+"""Routes of job results, and previews of running jobs."""
 
 import uuid
 from typing import Annotated
@@ -34,7 +34,7 @@ async def get_artifact_content(
     request: Request,
     inline: Annotated[bool, Query(description="Show it in the browser rather than save it.")] = False,
 ) -> Response:  # fmt: skip
-    """Return a result; `Range` and `If-Range` let a download go on."""
+    """Return a result; `Range` and `If-Range` let a download resume."""
     row = await actions.get_artifact(service, principal, job_id, name)
     return await run_in_pool(
         ThreadPurpose.DOWNLOADS,
@@ -58,7 +58,7 @@ async def get_artifact_content(
 async def get_preview(
     job_id: uuid.UUID, principal: Reader, service: ServiceDep, request: Request
 ) -> Response:
-    """Return the newest picture of the scene in the making."""
+    """Return the newest preview of a running job."""
     blob = await actions.get_preview(service, principal, job_id)
     response = await run_in_pool(
         ThreadPurpose.DOWNLOADS,

@@ -14,7 +14,7 @@ router = APIRouter(prefix="/v1/audit", tags=["service"])
 
 @router.get("", responses=problem_responses())
 async def list_audit_entries(
-    _who: Admin, service: ServiceDep, request: Request, response: Response, limit: Limit = 50,
+    _principal: Admin, service: ServiceDep, request: Request, response: Response, limit: Limit = 50,
     cursor: Cursor = None,
 ) -> AuditPage:  # fmt: skip
     """List requested changes, by whom and with what outcome, the newest first.

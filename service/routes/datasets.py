@@ -1,4 +1,4 @@
-"""Datasets: made, filled file by file or by an archive, checked, read, deleted."""
+"""Routes of datasets: created, filled file by file or by an archive, committed, read, deleted."""
 
 import uuid
 from collections.abc import AsyncIterator
@@ -42,7 +42,7 @@ FilePath = Annotated[str, Path(max_length=1000, description="Such as images/0001
 async def create_dataset(
     new: NewDataset, principal: Writer, service: ServiceDep, response: Response, key: IdempotencyKey = None
 ) -> DatasetView:
-    """Make a dataset to put photographs into, or files that the options of jobs name."""
+    """Create a dataset for photographs, or for files that the options of jobs name."""
     dataset = await actions.create_dataset(service, principal, new, idempotency_key=key)
     response.headers["Location"] = f"/v1/datasets/{dataset.id}"
     return DatasetView.from_row(dataset)
@@ -53,7 +53,7 @@ async def list_datasets(
     principal: Reader, service: ServiceDep, request: Request, response: Response, limit: Limit = 50,
     cursor: Cursor = None,
 ) -> DatasetPage:  # fmt: skip
-    """Your datasets, the newest first."""
+    """List your datasets, newest first."""
     part = await actions.list_datasets(service, principal, before=decode_id_cursor(cursor), limit=limit)
     following = set_next_link(request, response, part.next_key)
     return DatasetPage(datasets=[DatasetView.from_row(row) for row in part.rows], next=following)
@@ -61,7 +61,7 @@ async def list_datasets(
 
 @router.get("/{dataset_id}", responses=problem_responses(404))
 async def get_dataset(dataset_id: uuid.UUID, principal: Reader, service: ServiceDep) -> DatasetView:
-    """Return a dataset."""
+    """Return one dataset."""
     return DatasetView.from_row(await actions.get_dataset(service, principal, dataset_id))
 
 
@@ -69,7 +69,7 @@ async def get_dataset(dataset_id: uuid.UUID, principal: Reader, service: Service
 async def change_dataset(
     dataset_id: uuid.UUID, change: DatasetChange, principal: Writer, service: ServiceDep
 ) -> DatasetView:
-    """Rename a dataset, or keep it whatever its age."""
+    """Rename a dataset, or pin it so that it does not expire."""
     return DatasetView.from_row(await actions.change_dataset(service, principal, dataset_id, change))
 
 
@@ -84,7 +84,7 @@ async def list_files(
     dataset_id: uuid.UUID, principal: Reader, service: ServiceDep, request: Request, response: Response,
     limit: Annotated[int, Query(ge=1, le=5000)] = 1000, cursor: Cursor = None,
 ) -> FilePage:  # fmt: skip
-    """Return the files that have arrived, by name; whoever resumes an upload sends only the others."""
+    """List the uploaded files by name; a resumed upload sends only the others."""
     after = decode_cursor(cursor) or ""
     part = await uploads.list_files(service, principal, dataset_id, after=after, limit=limit)
     following = set_next_link(request, response, part.next_key)
@@ -137,7 +137,7 @@ async def get_file(
 
 @router.delete("/{dataset_id}/files/{path:path}", status_code=204, responses=problem_responses(404, 409))
 async def delete_file(dataset_id: uuid.UUID, path: FilePath, principal: Writer, service: ServiceDep) -> None:
-    """Take a file out of an open dataset."""
+    """Remove a file from an open dataset."""
     await uploads.remove_file(service, principal, dataset_id, path)
 
 
@@ -149,7 +149,7 @@ async def delete_file(dataset_id: uuid.UUID, path: FilePath, principal: Writer, 
 async def put_archive(
     dataset_id: uuid.UUID, principal: Writer, service: ServiceDep, request: Request, digest: Digest = None
 ) -> ArchiveView:
-    """Send a whole scene as a ZIP file; its files join those that are there."""
+    """Upload a scene as a ZIP file; its files are added to those that are there."""
     archive = await uploads.put_archive(service, principal, dataset_id, _upload(request, digest))
     return ArchiveView(
         files=[FileView.from_row(row) for row in archive.files],
@@ -160,7 +160,7 @@ async def put_archive(
 
 @router.post("/{dataset_id}/commit", responses=problem_responses(404, 409))
 async def commit_dataset(dataset_id: uuid.UUID, principal: Writer, service: ServiceDep) -> DatasetView:
-    """Check the dataset; if it is sound it never changes again and jobs can use it, else see `errors`."""
+    """Validate and commit the dataset; it never changes again and jobs can use it. Faults are in `errors`."""
     return DatasetView.from_row(await actions.commit_dataset(service, principal, dataset_id))
 
 
@@ -171,7 +171,7 @@ def _upload(request: Request, digest: str | None) -> uploads.Upload:
 
 
 async def _body(request: Request) -> AsyncIterator[bytes]:
-    """Yield the body of a request; one that breaks off is nobody's fault and leaves nothing."""
+    """Yield the body of a request; one that breaks off leaves nothing."""
     try:
         async for piece in request.stream():
             yield piece

@@ -13,7 +13,7 @@ router = APIRouter(prefix="/v1/estimates", tags=["jobs"])
 
 @router.post("", responses=problem_responses(404))
 async def make_estimate(new: NewEstimate, principal: Writer, service: ServiceDep) -> EstimateView:
-    """Say what a job would take, without making it; options are checked as if it were made.
+    """Estimate a job without creating it; options are validated as in a submission.
 
     Time and memory are right within a factor of two.
     """

@@ -37,7 +37,7 @@ async def read_timeline(
     job_id: uuid.UUID, principal: Reader, service: ServiceDep, after: After = 0,
     limit: Annotated[int, Query(ge=1, le=5000)] = 1000,
 ) -> EventPage:  # fmt: skip
-    """Return what happened to the job, as a list; `/events` is the same as a stream."""
+    """List the events of the job; `/events` streams the same."""
     events = await actions.read_events(service, principal, job_id, after=after, limit=limit)
     return EventPage(
         events=[EventView.from_row(row) for row in events], next=events[-1].id if events else after
@@ -69,7 +69,7 @@ async def stream_events(
 
 
 async def _encode_stream(events: AsyncGenerator[JobEvent | None, None]) -> AsyncIterator[bytes]:
-    """Events as they are sent, with signs of life in between."""
+    """Yield events in their wire format, with keep-alive comments between them."""
     async with aclosing(events):
         yield b"retry: 2000\n\n"
         async for event in events:

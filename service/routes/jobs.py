@@ -1,4 +1,4 @@
-"""Jobs: accepted, listed, read, cancelled, retried, deleted."""
+"""Routes of jobs: created, listed, read, cancelled, retried, deleted."""
 
 import uuid
 from typing import Annotated
@@ -28,7 +28,7 @@ async def create_job(
     new: NewJob, principal: Writer, service: ServiceDep, request: Request, response: Response,
     key: IdempotencyKey = None,
 ) -> JobView:  # fmt: skip
-    """Accept a job; poll the address in `Location`, or listen to its `/events`."""
+    """Create a job; poll the address in `Location`, or listen to its `/events`."""
     traceparent = request.headers.get("traceparent", "")[:100] or None
     view = await submit_job(service, principal, new, idempotency_key=key, traceparent=traceparent)
     _set_location(response, view)
@@ -45,7 +45,7 @@ async def list_jobs(
     limit: Limit = 50,
     cursor: Cursor = None,
 ) -> JobPage:  # fmt: skip
-    """Your jobs, the newest first."""
+    """List your jobs, newest first."""
     job_filter = JobFilter(state or (), kind, label, dataset_id)
     part = await actions.list_jobs(
         service, principal, job_filter, before=decode_id_cursor(cursor), limit=limit
@@ -58,7 +58,7 @@ async def list_jobs(
 async def get_job(
     job_id: uuid.UUID, principal: Reader, service: ServiceDep, request: Request, response: Response
 ) -> JobView:
-    """Return a job. Polling with `If-None-Match` costs next to nothing."""
+    """Return a job; polling with `If-None-Match` is cheap."""
     job = await actions.get_job(service, principal, job_id)
     headers = {"ETag": _etag(job), "Cache-Control": "no-cache"}
     if etag_matches(request.headers.get("if-none-match"), headers["ETag"]):
@@ -73,7 +73,7 @@ async def get_job(
 async def change_job(
     job_id: uuid.UUID, change: JobChange, principal: Writer, service: ServiceDep, request: Request
 ) -> JobView:
-    """Rename a job, or keep it whatever its age."""
+    """Rename a job, or pin it so that it does not expire."""
 
     def check(job: JobWithView) -> None:
         check_precondition(request, _etag(job))
@@ -85,7 +85,7 @@ async def change_job(
 async def cancel_job(
     job_id: uuid.UUID, principal: Writer, service: ServiceDep, response: Response
 ) -> JobView:
-    """Ask a job to stop; may be repeated. Its checkpoint stays, so that a retry goes on from it."""
+    """Cancel a job; may be repeated. Its checkpoint stays, so that a retry resumes from it."""
     view = await actions.cancel_job(service, principal, job_id)
     _set_location(response, view)
     return view
@@ -112,7 +112,7 @@ async def delete_job(
     job_id: uuid.UUID, principal: Writer, service: ServiceDep,
     cancel: Annotated[bool, Query(description="Stop it first if it is not over.")] = False,
 ) -> None:  # fmt: skip
-    """Delete a finished job with its results; repeat the request for one that still stops."""
+    """Delete a finished job with its results; repeat the request for one that is still stopping."""
     await actions.delete_job(service, principal, job_id, cancel=cancel)
 
 
@@ -128,6 +128,6 @@ def _set_location(response: Response, view: JobView) -> None:
 
 
 def _set_retry_after(response: Response, view: JobView) -> None:
-    """Ask again sooner where something moves."""
+    """Set `Retry-After`, shorter for jobs that advance."""
     ahead = view.queue_position or 0
     response.headers["Retry-After"] = str(min(_MAX_RETRY_SECONDS, BUSY_RETRY_SECONDS + ahead))

@@ -1,4 +1,4 @@
-"""Metrics for Prometheus, which sends a token like everybody else (`authorization` in its settings)."""
+"""Route of the Prometheus metrics; it needs a token like every other (`authorization` in its settings)."""
 
 from fastapi import APIRouter, Response
 from prometheus_client import CONTENT_TYPE_LATEST
@@ -16,7 +16,7 @@ router = APIRouter(tags=["health"])
     responses={200: {"content": {"text/plain": {"schema": {"type": "string"}}}}, **problem_responses()},
     response_class=Response,
 )
-async def get_metrics(_who: Reader, service: ServiceDep) -> Response:
-    """Return how the service fares, in the format of Prometheus."""
+async def get_metrics(_principal: Reader, service: ServiceDep) -> Response:
+    """Return the metrics of the service in the Prometheus format."""
     text = await render_metrics(service)
     return Response(text, headers={"Content-Type": CONTENT_TYPE_LATEST, "Cache-Control": "no-store"})

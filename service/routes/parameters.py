@@ -1,4 +1,4 @@
-"""Headers that several routes take."""
+"""Headers that several routes accept."""
 
 from typing import Annotated
 

@@ -1,4 +1,4 @@
-"""Webhooks: other programs are told what happens to jobs (https://www.standardwebhooks.com)."""
+"""Routes of webhooks, which notify other programs of job events (https://www.standardwebhooks.com)."""
 
 import uuid
 from typing import Annotated
@@ -27,7 +27,7 @@ router = APIRouter(prefix="/v1/webhooks", tags=["webhooks"])
 async def create_webhook(
     new: NewWebhook, principal: Writer, service: ServiceDep, response: Response
 ) -> MadeWebhook:
-    """Be told of your jobs, or of one of them, at an address of yours.
+    """Create a webhook for your jobs, or for one of them.
 
     A message is a POST of JSON with the headers `webhook-id`, `webhook-timestamp` and `webhook-signature`. It
     says which job it is about; ask `GET /v1/jobs/{id}` for the rest. It may come more than once and is sent
@@ -43,7 +43,7 @@ async def list_webhooks(
     principal: Reader, service: ServiceDep, request: Request, response: Response, limit: Limit = 50,
     cursor: Cursor = None,
 ) -> WebhookPage:  # fmt: skip
-    """Your webhooks, the newest first."""
+    """List your webhooks, newest first."""
     part = await actions.list_webhooks(service, principal, before=decode_id_cursor(cursor), limit=limit)
     following = set_next_link(request, response, part.next_key)
     return WebhookPage(webhooks=[WebhookView.from_row(row) for row in part.rows], next=following)
@@ -71,7 +71,7 @@ async def delete_webhook(webhook_id: uuid.UUID, principal: Writer, service: Serv
 
 @router.post("/{webhook_id}/test", status_code=202, responses=problem_responses(404, 409))
 async def test_webhook(webhook_id: uuid.UUID, principal: Writer, service: ServiceDep) -> DeliveryView:
-    """Send a message of the type `webhook.test`; see `/deliveries` for what became of it."""
+    """Send a message of the type `webhook.test`; its outcome is in `/deliveries`."""
     return DeliveryView.from_row(await actions.send_test(service, principal, webhook_id))
 
 
@@ -80,7 +80,7 @@ async def list_deliveries(
     webhook_id: uuid.UUID, principal: Reader, service: ServiceDep,
     limit: Annotated[int, Query(ge=1, le=200)] = 50,
 ) -> DeliveryList:  # fmt: skip
-    """Return the newest messages and what became of them; they are kept for 30 days."""
+    """List the newest messages and their outcomes; they are kept for 30 days."""
     found = await actions.list_deliveries(service, principal, webhook_id, limit)
     return DeliveryList(deliveries=[DeliveryView.from_row(row) for row in found])
 
@@ -91,5 +91,5 @@ async def list_deliveries(
 async def resend_delivery(
     webhook_id: uuid.UUID, delivery_id: uuid.UUID, principal: Writer, service: ServiceDep
 ) -> DeliveryView:
-    """Send a message once more, with the same id and content."""
+    """Send a message again, with the same id and content."""
     return DeliveryView.from_row(await actions.redeliver(service, principal, webhook_id, delivery_id))

@@ -7,7 +7,7 @@ from pydantic import BaseModel, Field
 
 
 class AuditView(BaseModel):
-    """Something that was asked for."""
+    """An entry of the audit log."""
 
     id: int
     at: datetime
@@ -21,7 +21,7 @@ class AuditView(BaseModel):
 
 
 class AuditPage(BaseModel):
-    """Part of the list."""
+    """A page of the audit log."""
 
     entries: list[AuditView]
     next: str | None = Field(description="Cursor of the next part.")

@@ -1,4 +1,4 @@
-"""Datasets and their files."""
+"""Bodies of the routes on datasets and their files."""
 
 import uuid
 from datetime import datetime
@@ -11,7 +11,7 @@ from octasplat.workers.db.rows import Dataset, DatasetFile, DatasetHolds, Datase
 
 
 class NewDataset(RequestBody):
-    """A dataset to make."""
+    """Dataset to create."""
 
     model_config = ConfigDict(extra="forbid", json_schema_extra={"examples": [{"name": "fox"}]})
 
@@ -74,14 +74,14 @@ class DatasetView(BaseModel):
 
 
 class DatasetPage(BaseModel):
-    """A part of the list of datasets."""
+    """A page of the list of datasets."""
 
     datasets: list[DatasetView]
     next: str | None = Field(description="Cursor of the next part.")
 
 
 class FileView(BaseModel):
-    """A file that has arrived."""
+    """An uploaded file."""
 
     model_config = ConfigDict(
         json_schema_extra={
@@ -110,7 +110,7 @@ class FileView(BaseModel):
 
 
 class FilePage(BaseModel):
-    """A part of the list of files; comparing it with your own files is how an upload goes on."""
+    """A page of the list of files; a resumed upload compares it with the local files."""
 
     files: list[FileView]
     next: str | None

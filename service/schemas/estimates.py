@@ -18,7 +18,7 @@ class PhotographSizes(RequestBody):
 
 
 class NewEstimate(RequestBody):
-    """A job that might be asked for; of photographs that are not here yet their sizes are enough."""
+    """Job to estimate; for photographs that are not uploaded yet their sizes suffice."""
 
     model_config = ConfigDict(
         extra="forbid",

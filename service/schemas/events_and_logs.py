@@ -23,14 +23,14 @@ class LogLineView(BaseModel):
 
 
 class LogPage(BaseModel):
-    """A part of a job's log; ask again with `after` set to `next`."""
+    """A page of a job's log; for the next, set `after` to `next`."""
 
     lines: list[LogLineView]
     next: int
 
 
 class EventView(BaseModel):
-    """Something that happened to a job."""
+    """An event of a job."""
 
     id: int
     attempt: int
@@ -45,7 +45,7 @@ class EventView(BaseModel):
 
 
 class EventPage(BaseModel):
-    """A part of what happened; ask again with `after` set to `next`."""
+    """A page of events; for the next, set `after` to `next`."""
 
     events: list[EventView]
     next: int

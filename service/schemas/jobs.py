@@ -1,4 +1,4 @@
-"""Jobs: what is asked for, and how they fare."""
+"""Bodies of the routes on jobs."""
 
 import uuid
 from collections.abc import Sequence
@@ -14,7 +14,7 @@ from octasplat.workers.db.rows import Job, JobState
 
 
 class NewJob(RequestBody):
-    """A job to accept."""
+    """Job to create."""
 
     model_config = ConfigDict(
         extra="forbid",
@@ -95,7 +95,7 @@ class JobError(BaseModel):
 
 
 class CheckpointView(BaseModel):
-    """The newest point from which the job can go on."""
+    """The newest checkpoint from which the job can resume."""
 
     stage: str
     step: int
@@ -203,7 +203,7 @@ class JobView(BaseModel):
 
 
 class JobPage(BaseModel):
-    """A part of the list of jobs, the newest first."""
+    """A page of the list of jobs, newest first."""
 
     jobs: list[JobView]
     next: str | None

@@ -61,7 +61,7 @@ class QueueView(BaseModel):
 
 
 class WorkerView(BaseModel):
-    """A worker that lives."""
+    """A live worker."""
 
     name: str
     queues: list[str]

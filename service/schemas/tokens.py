@@ -11,7 +11,7 @@ from octasplat.workers.db.rows import Token
 
 
 class NewToken(RequestBody):
-    """A token to make."""
+    """Token to create."""
 
     name: str = Field(max_length=100)
     owner: str = Field(pattern=r"^[A-Za-z0-9._@-]{1,100}$", description="Whose things it shows.")
@@ -51,6 +51,6 @@ class TokenList(BaseModel):
 
 
 class SignInLink(BaseModel):
-    """A link for a browser; it is worth a token until it is opened."""
+    """A sign-in link for a browser; until it is used it is as powerful as a token."""
 
     path: str = Field(description="Below the address of the service.")

@@ -1,4 +1,4 @@
-"""Webhooks and their messages."""
+"""Bodies of the routes on webhooks and their messages."""
 
 import uuid
 from datetime import datetime
@@ -101,14 +101,14 @@ class MadeWebhook(WebhookView):
 
 
 class WebhookPage(BaseModel):
-    """A part of the list of webhooks."""
+    """A page of the list of webhooks."""
 
     webhooks: list[WebhookView]
     next: str | None
 
 
 class DeliveryView(BaseModel):
-    """A message and what became of it. What the address answered is not shown."""
+    """A message and its outcome; the body of the response is not shown."""
 
     model_config = ConfigDict(
         json_schema_extra={

@@ -1,4 +1,4 @@
-"""The web page: rendered here, with htmx, uPlot and a viewer on three.js that come along as static files."""
+"""Web pages: rendered here, with htmx, uPlot and a three.js viewer as static files."""
 
 from fastapi import FastAPI
 

@@ -1,4 +1,4 @@
-"""The API described on a page, from its OpenAPI document."""
+"""Page that documents the API, from its OpenAPI document."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -27,7 +27,7 @@ class Parameter:
 
 @dataclass(frozen=True)
 class ApiOperation:
-    """One thing that can be asked for.
+    """An operation of the API.
 
     Attributes:
         method: of HTTP.

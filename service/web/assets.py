@@ -1,4 +1,4 @@
-"""The static files: scripts, styles and what came from others."""
+"""Static files: scripts, styles and third-party modules."""
 
 from pathlib import Path
 
@@ -10,7 +10,7 @@ STATIC_FOLDER = Path(__file__).parent / "static"
 
 
 class StaticAssets(StaticFiles):
-    """Files that a browser may keep if it asks whether they have changed."""
+    """Files that a browser may cache if it revalidates them."""
 
     def __init__(self) -> None:
         super().__init__(directory=STATIC_FOLDER)

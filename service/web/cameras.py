@@ -27,7 +27,7 @@ _SINGLE_FOCAL_NAMES = frozenset(
 
 
 class CamerasUnreadableError(Exception):
-    """The files are not as expected."""
+    """The camera files have an unexpected format."""
 
 
 @dataclass(frozen=True)

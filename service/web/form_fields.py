@@ -1,4 +1,4 @@
-"""Fields of forms, made from the JSON Schema of options: one for each setting."""
+"""Fields of forms, generated from the JSON Schema of options: one for each setting."""
 
 import json
 import re
@@ -59,7 +59,7 @@ Presets = Mapping[str, Mapping[str, Any]]
 
 @dataclass(frozen=True)
 class Choice:
-    """One of several values: what is sent, what is shown, and whether nobody can do it."""
+    """One of several values: the value, its label, and whether it is unavailable."""
 
     value: str
     text: str
@@ -68,7 +68,7 @@ class Choice:
 
 @dataclass(frozen=True)
 class FormField:
-    """One setting.
+    """A form field for one setting.
 
     Attributes:
         path: where it goes in the options, with dots.
@@ -100,7 +100,7 @@ class FormField:
 
     @property
     def name(self) -> str:
-        """For ids in the page."""
+        """Return the name for ids in the page."""
         return self.path.replace(".", "-")
 
 
@@ -115,7 +115,7 @@ def form_fields(schema: Mapping[str, Any], presets: Presets) -> Iterator[FormFie
 
 
 def label_of(name: str) -> str:
-    """Return a name of the program as words."""
+    """Return an identifier as words."""
     words = _UNIT_IN_NAME.sub("", name.replace("_", " ")).capitalize()
     return _ACRONYMS.sub(lambda found: found[0].upper(), words)
 
@@ -188,7 +188,7 @@ def _form_field(
 
 
 def _control_for(name: str, schema: Mapping[str, Any]) -> tuple[Control, Sequence[str]]:
-    """Return how a value is asked for, and the values to choose from."""
+    """Return the control of a value, and the values to choose from."""
     if "enum" in schema:
         return "choice", [str(value) for value in schema["enum"]]
     if "anyOf" in schema:
@@ -215,7 +215,7 @@ def _control_of_array(name: str, schema: Mapping[str, Any]) -> Control:
 
 
 def _control_of_several(options: Sequence[Mapping[str, Any]]) -> tuple[Control, Sequence[str]]:
-    """Return how one of several types is asked for: by a choice where all values are known, else as text."""
+    """Return the control of a union of types: a choice where all values are known, else text."""
     values: list[str] = []
     for option in options:
         if option.get("type") == "null":
@@ -230,7 +230,7 @@ def _control_of_several(options: Sequence[Mapping[str, Any]]) -> tuple[Control, 
 
 
 def _help_sentence(text: str) -> str:
-    """Words of the program as words of a form, where None is an empty field."""
+    """Return the description as a form shows it, where None is an empty field."""
     return text[:1].upper() + re.sub(r"\bNone\b", "empty", text[1:])
 
 

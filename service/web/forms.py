@@ -1,4 +1,4 @@
-"""Forms of the kinds of jobs: what most people set, what fewer do, and experiments."""
+"""Forms of the job kinds, in three groups: basic, advanced and experimental settings."""
 
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
@@ -28,7 +28,7 @@ KINDS_WITH_OWN_FORM = ("relight",)
 
 @dataclass
 class Section:
-    """Settings that belong together."""
+    """A section of a form: settings that belong together."""
 
     title: str
     fields: list[FormField] = field(default_factory=list)
@@ -36,7 +36,7 @@ class Section:
 
 @dataclass(frozen=True)
 class OptionsForm:
-    """A form.
+    """The form of a job kind.
 
     Attributes:
         kind: name of the kind of job.

@@ -1,4 +1,4 @@
-"""The pages: jobs, one job with its result, a new job; and the parts of them that renew themselves."""
+"""Pages: the list of jobs, one job with its results, a new job; and their parts that refresh themselves."""
 
 import json
 import uuid
@@ -71,7 +71,7 @@ _REPORT_POLICY = (
 async def show_jobs(
     request: Request, principal: Reader, service: ServiceDep, show: StateFilter = "all", cursor: Cursor = None
 ) -> Response:
-    """Return the list of jobs."""
+    """Return the page with the list of jobs."""
     values = await _job_list_context(service, principal, show, cursor)
     return render_page(request, "jobs.html", principal, **values)
 
@@ -80,7 +80,7 @@ async def show_jobs(
 async def show_job_list(
     request: Request, principal: Reader, service: ServiceDep, show: StateFilter = "all", cursor: Cursor = None
 ) -> Response:
-    """Return the list alone."""
+    """Return the list of jobs without its page."""
     return render_page(
         request, "_jobs.html", principal, **await _job_list_context(service, principal, show, cursor)
     )
@@ -88,7 +88,7 @@ async def show_job_list(
 
 @router.get("/jobs/{job_id}")
 async def show_job(request: Request, job_id: uuid.UUID, principal: Reader, service: ServiceDep) -> Response:
-    """Return a job: how it fares, and its result once it has one."""
+    """Return the page of a job: its state, and its results once it has some."""
     detail = await job_detail(service, principal, job_id)
     artifacts = await list_artifacts(service, principal, job_id)
     photographs = await photographs_of(service, principal, job_id)
@@ -141,7 +141,7 @@ async def show_job(request: Request, job_id: uuid.UUID, principal: Reader, servi
 async def show_job_status(
     request: Request, job_id: uuid.UUID, principal: Reader, service: ServiceDep
 ) -> Response:
-    """Return how a job fares."""
+    """Return the state of a job without its page."""
     return render_page(
         request, "_status.html", principal, detail=await job_detail(service, principal, job_id)
     )
@@ -166,7 +166,7 @@ async def show_report(
 
 @router.get("/jobs/{job_id}/cameras.json")
 async def get_cameras(job_id: uuid.UUID, principal: Reader, service: ServiceDep) -> JSONResponse:
-    """Return where the photographs of a job were taken, for the viewer."""
+    """Return the cameras of a job's photographs, for the viewer."""
     artifacts = await list_artifacts(service, principal, job_id)
     files = await photographs_of(service, principal, job_id)
     held_out = next((row for row in artifacts if row.name == HELD_OUT), None)
@@ -179,7 +179,7 @@ async def get_cameras(job_id: uuid.UUID, principal: Reader, service: ServiceDep)
 async def show_new(
     request: Request, principal: Writer, service: ServiceDep, dataset: uuid.UUID | None = None
 ) -> Response:
-    """Send photographs and queue their reconstruction."""
+    """Return the page that uploads photographs and queues their reconstruction."""
     kind = get_job_kind("reconstruct")
     datasets = await list_datasets(service, principal, limit=MAX_DATASETS)
     workers = await list_live_workers(service)
@@ -208,7 +208,7 @@ async def retry(
     request: Request, job_id: uuid.UUID, principal: Writer, service: ServiceDep,
     start: Literal["checkpoint", "start"] = "checkpoint",
 ) -> Response:  # fmt: skip
-    """Queue a job again."""
+    """Queue a job again and return its updated page."""
     await retry_job(service, principal, job_id, RetryRequest(start=start))
     return await _updated_page(request, job_id, principal, service)
 
@@ -217,14 +217,14 @@ async def retry(
 async def pin(
     request: Request, job_id: uuid.UUID, principal: Writer, service: ServiceDep, keep: bool = True
 ) -> Response:
-    """Keep a job whatever its age, or no longer."""
+    """Pin a job so that it does not expire, or unpin it."""
     await actions.change_job(service, principal, job_id, JobChange(pinned=keep))
     return await _updated_page(request, job_id, principal, service)
 
 
 @router.post("/jobs/{job_id}/delete")
 async def delete(request: Request, job_id: uuid.UUID, principal: Writer, service: ServiceDep) -> Response:
-    """Delete a job with its results."""
+    """Delete a job with its results and go to the list."""
     await actions.delete_job(service, principal, job_id)
     return redirect(request, "/")
 
@@ -232,7 +232,7 @@ async def delete(request: Request, job_id: uuid.UUID, principal: Writer, service
 async def _updated_page(
     request: Request, job_id: uuid.UUID, principal: Principal, service: Service
 ) -> Response:
-    """Return what has changed on the page that asked."""
+    """Return the changed parts of the page that sent the request."""
     if not is_htmx_request(request):
         return redirect(request, f"/jobs/{job_id}")
     if request.query_params.get("in") == "list":
@@ -268,7 +268,7 @@ def _config_value(config: dict[str, object], *keys: str) -> object:
 
 
 def _up_world(config: dict[str, object]) -> str:
-    """Return the axis about which the light of a result lies, as JSON."""
+    """Return the up axis of the light of a result, as JSON."""
     found = _config_value(config, "reconstruction", "train", "materials", "up_world")
     known = isinstance(found, list) and len(found) == 3 and all(isinstance(x, int | float) for x in found)
     return json.dumps(found if known else [0, 0, 1])

@@ -19,7 +19,7 @@ MAX_ENVIRONMENTS = 60
 
 @dataclass(frozen=True)
 class UploadedEnvironment:
-    """A map of light that was sent before: its dataset, what that is called, and its name in it."""
+    """An uploaded environment map: its dataset, the dataset's name, and its name in it."""
 
     dataset_id: uuid.UUID
     title: str
@@ -28,7 +28,7 @@ class UploadedEnvironment:
 
 @dataclass(frozen=True)
 class RelightForm:
-    """The form of another light.
+    """The relighting form.
 
     Attributes:
         views: names of the photographs that were held out, for previews.
@@ -48,7 +48,7 @@ class RelightForm:
 async def relight_form(
     service: Service, principal: Principal, artifacts: Sequence[Artifact], held_out: Sequence[str]
 ) -> RelightForm | None:
-    """Return the form for a job's result; None where it has no materials, or the asker may queue nothing."""
+    """Return the form for a job's result; None without materials, or if the caller may not queue jobs."""
     names = {row.name for row in artifacts}
     if not principal.may("write") or not names.issuperset(get_job_kind("relight").source_files):
         return None

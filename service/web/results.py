@@ -37,7 +37,7 @@ _BROWSER_IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".webp", ".bmp"})
 
 @dataclass(frozen=True)
 class Metric:
-    """A figure of merit: its key in ``metrics.json``, and how it is shown."""
+    """A metric: its key in ``metrics.json``, and its display."""
 
     key: str
     heading: str
@@ -57,7 +57,7 @@ METRICS_SHOWN = (
 
 @dataclass(frozen=True)
 class HeldOutView:
-    """A held-out view: its figures, its render and its photograph.
+    """A held-out view: its metrics, its render and its photograph.
 
     Attributes:
         name: of the photograph.
@@ -92,7 +92,7 @@ class Measurements:
 
 @dataclass(frozen=True)
 class Download:
-    """A result to save, and what opens it."""
+    """A result to save, and the programs that open it."""
 
     name: str
     size_bytes: int
@@ -101,7 +101,7 @@ class Download:
 
 @dataclass(frozen=True)
 class DownloadGroup:
-    """Downloads that belong together; a folded group opens on request."""
+    """A group of downloads; a folded group opens on request."""
 
     title: str
     files: list[Download]
@@ -109,18 +109,18 @@ class DownloadGroup:
 
     @property
     def size_bytes(self) -> int:
-        """Length of all of them."""
+        """Return the total length of the downloads."""
         return sum(file.size_bytes for file in self.files)
 
 
 def read_json(storage: Storage, row: Artifact | None) -> dict[str, Any]:
-    """Return the content of a small JSON result; empty if it cannot be had."""
+    """Return the content of a small JSON result; empty if it cannot be read."""
     content = _read_json(storage, row)
     return content if isinstance(content, dict) else {}
 
 
 def read_names(storage: Storage, row: Artifact | None) -> list[str]:
-    """Return the names in a small JSON result; none if it cannot be had."""
+    """Return the names in a small JSON result; none if it cannot be read."""
     content = _read_json(storage, row)
     return [str(name) for name in content] if isinstance(content, list) else []
 
@@ -141,14 +141,14 @@ def _read_json(storage: Storage, row: Artifact | None) -> object:
 
 @lru_cache(maxsize=256)
 def _read_text(storage: Hashable, sha256: str) -> bytes:
-    """Contents never change under their digest, so that lists need not read them again."""
+    """Return stored text, cached, as content never changes under its digest."""
     return b"".join(cast(Storage, storage).read(sha256))
 
 
 def read_measurements(
     metrics: Mapping[str, Any], artifacts: Sequence[Artifact], photographs: Sequence[DatasetFile]
 ) -> Measurements | None:
-    """Return the figures of a result, the worst view first; None if there are none."""
+    """Return the metrics of a result, worst view first; None if there are none."""
     mean = _mapping(metrics.get("mean"))
     rows = {str(name): _mapping(row) for name, row in _mapping(metrics.get("views")).items()}
     if not mean:
@@ -202,7 +202,7 @@ def viewable_mesh(artifacts: Sequence[Artifact]) -> Artifact | None:
 
 
 def download_groups(artifacts: Sequence[Artifact]) -> list[DownloadGroup]:
-    """Return the results by what they are for."""
+    """Return the results grouped by their use."""
     groups = {title: DownloadGroup(title, [], folded) for title, folded in _GROUPS.items()}
     for row in sorted(artifacts, key=lambda row: (_sort_rank(row.name), row.name)):
         group, opens_in = _group_and_use(row.name)

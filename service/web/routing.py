@@ -1,4 +1,4 @@
-"""Routes of pages: what is a problem document elsewhere is a page here, and who is unknown signs in."""
+"""Routes of pages: errors are shown as pages, and unauthenticated users are sent to sign in."""
 
 import json
 import logging
@@ -46,7 +46,7 @@ class PageRoute(APIRoute):
 
 
 def is_htmx_request(request: Request) -> bool:
-    """Return whether htmx asks, to change a part of a page."""
+    """Return whether htmx sent the request, to replace a part of a page."""
     return request.headers.get("hx-request") == "true"
 
 
@@ -58,7 +58,7 @@ def redirect(request: Request, address: str) -> Response:
 
 
 def safe_local_path(address: str | None) -> str:
-    """``address`` if it is a place on this site, else the first page."""
+    """Return ``address`` if it is a path on this site, else the first page."""
     if not address or not address.startswith("/") or address[1:2] in ("/", "\\"):
         return "/"
     return address if address.isprintable() else "/"

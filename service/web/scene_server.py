@@ -1,4 +1,4 @@
-"""A small server for the viewer of one scene on this machine, without jobs, database or sign-in."""
+"""Local server of the viewer for one scene, without jobs, database or sign-in."""
 
 import json
 import mimetypes
@@ -38,7 +38,7 @@ class ViewedScene:
 
 
 class SceneServer:
-    """Serves the page of one scene to browsers of this machine, from a thread of its own.
+    """Serves the page of one scene to browsers of this machine, in a thread of its own.
 
     Args:
         scene: what to show.
@@ -52,7 +52,7 @@ class SceneServer:
 
     @property
     def url(self) -> str:
-        """The address of the page."""
+        """Return the address of the page."""
         return f"http://127.0.0.1:{self._server.server_port}/"
 
     def close(self) -> None:
@@ -74,7 +74,7 @@ class _SceneHttpServer(ThreadingHTTPServer):
         self.scene = scene
 
     def handle_error(self, request: object, client_address: object) -> None:
-        """Say nothing of browsers that leave before the end."""
+        """Ignore browsers that disconnect early."""
         if not isinstance(sys.exception(), ConnectionError):
             super().handle_error(request, client_address)  # type: ignore[arg-type]
 

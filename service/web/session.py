@@ -1,4 +1,4 @@
-"""Signing in with a token or a link, for browsers: the cookie holds a session, which scripts cannot read."""
+"""Sign-in of browsers with a token or a link; the session cookie is not readable by scripts."""
 
 import urllib.parse
 from typing import Annotated
@@ -52,7 +52,7 @@ async def sign_in(request: Request, service: ServiceDep) -> Response:
 async def sign_in_once(
     request: Request, service: ServiceDep, key: Annotated[str, Query(max_length=100)] = ""
 ) -> Response:
-    """Begin a session with a link that was made for it; it is used up, whoever opened it."""
+    """Begin a session with a sign-in link, which is used up."""
     request.state.is_change = True
     async with service.pool.connection() as connection:
         token_id = await use_link(connection, key)

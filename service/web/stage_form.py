@@ -14,7 +14,7 @@ PREVIEW_PRIORITY = 10
 
 @dataclass(frozen=True)
 class PlacementView:
-    """A held-out view in which a place can be shown.
+    """A held-out view in which meshes can be placed.
 
     Attributes:
         name: of the photograph.
@@ -50,7 +50,7 @@ def stage_form(
     photographs: Sequence[DatasetFile],
     settings: ServiceSettings,
 ) -> StageForm | None:
-    """Return the form for a job's result; None where it has no scene or no picture to place things in."""
+    """Return the form for a job's result; None where it has no scene or no image to place meshes in."""
     names = {row.name for row in artifacts}
     if measured is None or not names.issuperset(REQUIRED_RESULTS):
         return None

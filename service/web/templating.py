@@ -1,4 +1,4 @@
-"""Templates, and the headers that every page has."""
+"""Templates, and the headers of every page."""
 
 import json
 import uuid
@@ -92,12 +92,12 @@ def _environment() -> Any:
 
 
 def short_id(job_id: uuid.UUID) -> str:
-    """Return the end of an id; its beginning is the time, which many share."""
+    """Return the end of an id; the beginning is the time, which many ids share."""
     return str(job_id)[-6:]
 
 
 def flatten_settings(values: Mapping[str, Any], prefix: str = "") -> list[tuple[str, str]]:
-    """Nested settings as dotted names and short texts."""
+    """Return nested settings as dotted names and short texts."""
     rows: list[tuple[str, str]] = []
     for key, value in values.items():
         if isinstance(value, Mapping):

@@ -49,7 +49,7 @@ def build_vendor_files(target: Path = VENDOR_FOLDER) -> None:
 
 
 def _bundle(modules: Path, entry: Path, output: Path) -> None:
-    """One minified ES module with everything that ``entry`` uses."""
+    """Return one minified ES module with everything that ``entry`` imports."""
     esbuild = modules / "esbuild" / "bin" / "esbuild"
     options = ("--bundle", "--minify", "--format=esm", "--target=es2022", "--legal-comments=none")
     node = shutil.which("node") or "node"
@@ -66,7 +66,7 @@ def _bundle(modules: Path, entry: Path, output: Path) -> None:
 
 
 def _licences(modules: Path) -> str:
-    """Names, versions and licences of all that was taken."""
+    """Return the names, versions and licences of the bundled packages."""
     parts = []
     for package in LICENCES:
         facts = json.loads((modules / package / "package.json").read_text(encoding="utf-8"))

@@ -205,7 +205,7 @@ def _stage_rows(job: JobView, spent: dict[str, Any]) -> list[StageRow]:
 
 
 def _with_unexpected_stages(expected_stages: Sequence[str], reported: Sequence[str]) -> list[str]:
-    """Stages as they were expected, with those that came up besides where they did."""
+    """Return the expected stages, with unexpected ones inserted where they occurred."""
     names = list(expected_stages)
     for before, name in zip((None, *reported), reported, strict=False):
         if name not in names:
@@ -220,7 +220,7 @@ async def _dataset_names(connection: Connection, jobs: Sequence[Job]) -> dict[uu
 
 
 async def _gaussian_counts(connection: Connection, ids: list[uuid.UUID]) -> dict[uuid.UUID, int]:
-    """Return the newest number of Gaussians that each job has told."""
+    """Return the newest reported number of Gaussians of each job."""
     cursor = await connection.execute(
         """
         SELECT wanted.id, (
