@@ -1,4 +1,4 @@
-"""How the kernels are compiled, and where their machine code is kept.
+"""Compilation of the kernels, and the cache of their machine code.
 
 Three rules keep the first use of the program short:
 
@@ -86,7 +86,7 @@ def kernel(**options: Any) -> Callable[[Any], Any]:
 
 
 class _Threads:
-    """Threads that wait for work; as many as were ever asked for at once."""
+    """Pool of waiting threads; as many as were ever requested at once."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -171,8 +171,8 @@ def _source(module: str) -> tuple[bytes, tuple[str, ...]]:
         return b"", ()
     content = Path(spec.origin).read_bytes()
     imported: set[str] = set()
-    for package, names, whole in _IMPORT.findall(content.decode()):
-        imported.add(package or whole)
+    for package, names, module_name in _IMPORT.findall(content.decode()):
+        imported.add(package or module_name)
         # A name may be a module of the package, which then counts itself.
         imported |= {f"{package}.{name}" for name in re.findall(r"\w+", names) if _is_module(package, name)}
     return hashlib.sha256(content).digest(), tuple(sorted(imported))
@@ -181,21 +181,21 @@ def _source(module: str) -> tuple[bytes, tuple[str, ...]]:
 @cache
 def source_digest(module: str) -> str:
     """Return a digest of the sources of ``module`` and of all modules of the package that it imports."""
-    seen: set[str] = set()
+    visited: set[str] = set()
     todo = [module]
     while todo:
         name = todo.pop()
-        if name not in seen:
-            seen.add(name)
+        if name not in visited:
+            visited.add(name)
             todo.extend(_source(name)[1])
     total = hashlib.sha256()
-    for name in sorted(seen):
+    for name in sorted(visited):
         total.update(name.encode() + b"\0" + _source(name)[0])
     return total.hexdigest()[:20]
 
 
 def _is_usable(folder: Path) -> bool:
-    """Whether this process may keep code in ``folder``, and nobody else but root may."""
+    """Return whether this process may store code in ``folder``, and nobody else but root may."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):
@@ -218,11 +218,11 @@ def cache_folder() -> Path:
     """
     from platformdirs import user_cache_path
 
-    wanted = (
+    preferred = (
         Path(named) if (named := os.environ.get(CACHE_VARIABLE)) else user_cache_path(PACKAGE) / "kernels"
     )
-    if _is_usable(wanted):
-        return wanted
+    if _is_usable(preferred):
+        return preferred
     user = os.getuid() if hasattr(os, "getuid") else 0
     private = Path(tempfile.gettempdir()) / f"{PACKAGE}-kernels-{user}"
     if not _is_private(private):
@@ -230,7 +230,7 @@ def cache_folder() -> Path:
     LOG.warning(
         "compiled kernels cannot be kept in %s, which cannot be written; they are kept in %s."
         " Set %s to a folder that can be written to keep them for good",
-        wanted,
+        preferred,
         private,
         CACHE_VARIABLE,
     )

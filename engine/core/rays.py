@@ -1,4 +1,4 @@
-"""Rays as every part of the engine passes them on: from cameras and photographs to whatever traces them."""
+"""Batches of rays, as cameras, photographs and tracers exchange them."""
 
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -55,7 +55,7 @@ class RayBatch:
         t_view_origin: Float[np.ndarray, "#r"] | float = 0.0,
         t_backface_cull: Float[np.ndarray, "#r"] | float = 0.0,
     ) -> None:
-        """Rays through ``directions_world``; a ``t_min`` below 0 counts as 0."""
+        """Store rays along ``directions_world``; a ``t_min`` below 0 counts as 0."""
         object.__setattr__(self, "origins_world", _for_kernels(origins_world))
         object.__setattr__(self, "directions_world", _for_kernels(directions_world))
         object.__setattr__(self, "t_min", _for_kernels(np.maximum(np.atleast_1d(t_min), 0)))
@@ -70,9 +70,13 @@ class RayBatch:
         ends_world: Float[np.ndarray, "r 3"],
         gap: float = 0.0,
     ) -> "RayBatch":
-        """Unit rays from each start to each end that stop ``gap`` (world units) before the end.
+        """Return unit rays from each start to each end that stop ``gap`` (world units) before the end.
 
         A ray between two equal points looks along z and has no length.
+
+        >>> rays = RayBatch.between(np.zeros((1, 3)), np.array([[0.0, 0.0, 4.0]]), gap=1.0)
+        >>> rays.directions_world.tolist(), rays.t_max.tolist()
+        ([[0.0, 0.0, 1.0]], [3.0])
         """
         ways = np.asarray(ends_world, np.float64) - np.asarray(starts_world, np.float32)
         lengths = np.linalg.norm(ways, axis=1)
@@ -84,24 +88,24 @@ class RayBatch:
         return len(self.directions_world)
 
     def __getitem__(self, which: slice | Int[np.ndarray, " k"] | np.ndarray) -> "RayBatch":
-        """The rays of a slice, of numbers or of a mask."""
+        """Return the rays that a slice, indices or a mask select."""
         return RayBatch(*(rows if len(rows) == 1 and len(self) != 1 else rows[which] for rows in self.arrays))
 
     @property
     def arrays(self) -> tuple[Float32[np.ndarray, "#r *c"], ...]:
-        """What they are made of, in order."""
+        """Return the arrays of the batch, in the order of its fields."""
         return (
             self.origins_world, self.directions_world, self.t_min, self.t_max,
             self.t_view_origin, self.t_backface_cull
         )  # fmt: skip
 
     def with_t_max(self, t_max: Float[np.ndarray, "#r"] | float) -> "RayBatch":
-        """These rays with another end."""
+        """Return the rays with another ``t_max``."""
         return replace(self, t_max=np.atleast_1d(t_max))
 
     @cached_property
     def starts_world(self) -> Float32[np.ndarray, "r 3"]:
-        """Where each ray begins: the point at ``t_min``."""
+        """Return the point at ``t_min`` of each ray."""
         return np.asarray(self.origins_world + self.t_min[:, None] * self.directions_world)
 
     def reflect(
@@ -110,7 +114,7 @@ class RayBatch:
         normal_world: Float[np.ndarray, "3"],
         t_mirror: Float[np.ndarray, " r"],
     ) -> "RayBatch":
-        """These rays after their reflection in one plane, which they meet at ``t_mirror``.
+        """Return the rays after their reflection at a plane, which they meet at ``t_mirror``.
 
         They begin at the mirror, and distances go on counting from where they counted before. The reflections
         of rays with one origin have one origin.
@@ -119,6 +123,11 @@ class RayBatch:
             point_world: any point of the plane.
             normal_world: the plane's normal, of any length and sign.
             t_mirror: where each ray meets the plane; what lies on its near side is left out.
+
+        >>> down = RayBatch(np.zeros((1, 3), np.float32), np.array([[0.0, 0.0, 1.0]], np.float32))
+        >>> mirrored = down.reflect(np.array([0.0, 0.0, 2.0]), np.array([0.0, 0.0, 1.0]), np.array([2.0]))
+        >>> mirrored.starts_world.tolist(), mirrored.directions_world.tolist()
+        ([[0.0, 0.0, 2.0]], [[0.0, 0.0, -1.0]])
         """
         normal = np.asarray(normal_world, np.float64)
         normal = normal / np.linalg.norm(normal)
@@ -136,7 +145,7 @@ class RayBatch:
 
 
 def concatenate_rays(first: RayBatch, second: RayBatch) -> RayBatch:
-    """One batch after the other; what stands for all rays of both goes on doing so."""
+    """Concatenate two batches; a row that stands for all rays of both is kept single."""
 
     def both(one: np.ndarray, other: np.ndarray) -> np.ndarray:
         if len(one) == 1 and np.array_equal(one, other):
@@ -164,13 +173,13 @@ class ImageRays:
         directions_world: Float[np.ndarray, "h w 3"],
         near_world: float = 0.0,
     ) -> "ImageRays":
-        """Rays along unit directions that see nothing nearer than ``near_world``."""
+        """Return rays along unit directions that see nothing nearer than ``near_world``."""
         height, width = directions_world.shape[:2]
         rays = RayBatch(origin_world[None], directions_world.reshape(-1, 3), near_world)
         return cls(rays, height, width)
 
     def shifted(self, across_px: float, down_px: float) -> "ImageRays":
-        """The rays beside the pixels' centres, by the slopes between neighbours (to the second order)."""
+        """Return the rays offset from the pixel centres, by finite differences of their neighbours."""
         if across_px == 0 and down_px == 0:
             return self
         ways = self.directions_world.astype(np.float64)
@@ -182,15 +191,15 @@ class ImageRays:
 
     @property
     def origin_world(self) -> Float32[np.ndarray, "3"]:
-        """Where the camera stands."""
+        """Return the camera centre in world coordinates."""
         return self.rays.origins_world[0]
 
     @property
     def directions_world(self) -> Float32[np.ndarray, "h w 3"]:
-        """The direction of each pixel."""
+        """Return the direction of each pixel."""
         return self.rays.directions_world.reshape(self.height_px, self.width_px, 3)
 
 
 def _for_kernels(values: Float[np.ndarray, "..."]) -> Float32[np.ndarray, "..."]:
-    """``values`` as the one kind of array that kernels are compiled for, not copied where they are that."""
+    """Return ``values`` in the array layout that kernels are compiled for, copied only where needed."""
     return np.require(values, np.float32, ["C", "W"])

@@ -123,22 +123,30 @@ def stack_channels(channels: Channels, names: Sequence[str] | None = None) -> Fl
 
 
 def column_names(name: str, width: int) -> tuple[str, ...]:
-    """Return a channel's column names in files: ``metallic``, or ``albedo_0``, ``albedo_1``, ``albedo_2``."""
+    """Return a channel's column names in files: ``metallic``, or ``albedo_0``, ``albedo_1``, ``albedo_2``.
+
+    >>> column_names("metallic", 1), column_names("albedo", 3)
+    (('metallic',), ('albedo_0', 'albedo_1', 'albedo_2'))
+    """
     return (name,) if width == 1 else tuple(f"{name}_{place}" for place in range(width))
 
 
 def group_columns(columns: Iterable[str]) -> dict[str, tuple[str, ...]]:
-    """Group column names to channels: names numbered from 0 without a gap, two at least, are one channel."""
+    """Group column names to channels: names numbered from 0 without a gap, two at least, are one channel.
+
+    >>> group_columns(["albedo_0", "albedo_1", "albedo_2", "metallic"])
+    {'albedo': ('albedo_0', 'albedo_1', 'albedo_2'), 'metallic': ('metallic',)}
+    """
     found = list(columns)
     numbered: dict[str, set[int]] = {}
     for column in found:
         if match := _NUMBERED.fullmatch(column):
             numbered.setdefault(match[1], set()).add(int(match[2]))
-    whole = {stem for stem, places in numbered.items() if 1 < len(places) == max(places) + 1}
+    complete = {stem for stem, places in numbered.items() if 1 < len(places) == max(places) + 1}
     groups: dict[str, tuple[str, ...]] = {}
     for column in found:
         match = _NUMBERED.fullmatch(column)
-        if match and match[1] in whole:
+        if match and match[1] in complete:
             groups[match[1]] = column_names(match[1], len(numbered[match[1]]))
         else:
             groups[column] = (column,)
@@ -146,7 +154,11 @@ def group_columns(columns: Iterable[str]) -> dict[str, tuple[str, ...]]:
 
 
 def is_valid_channel_name(name: str, columns: Iterable[str]) -> bool:
-    """Return whether a channel may have this name and these columns, other channels aside."""
+    """Return whether a channel may have this name and these columns, other channels aside.
+
+    >>> is_valid_channel_name("label", ["label"]), is_valid_channel_name("opacity", ["opacity"])
+    (True, False)
+    """
     return bool(_NAME.fullmatch(name)) and not any(
         RESERVED_COLUMNS.fullmatch(text) for text in (name, *columns)
     )

@@ -8,6 +8,9 @@ def rotation_matrices(quats_wxyz: Float[np.ndarray, "n 4"]) -> Float[np.ndarray,
     """Return rotation matrices of quaternions that need not be of unit length.
 
     Computed in float64 and returned in the input's precision.
+
+    >>> rotation_matrices(np.array([[1.0, 0.0, 0.0, 1.0]])).round(6).tolist()  # 90 degrees about z
+    [[[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]]
     """
     q = quats_wxyz.astype(np.float64)
     w, x, y, z = (q / np.linalg.norm(q, axis=-1, keepdims=True)).T
@@ -27,6 +30,9 @@ def quaternions_from_matrices(rotations: Float[np.ndarray, "n 3 3"]) -> Float[np
 
     The largest of the four components is found first and the others follow from it, which is stable for
     every rotation.
+
+    >>> quaternions_from_matrices(np.eye(3)[None]).tolist()
+    [[1.0, 0.0, 0.0, 0.0]]
     """
     r = rotations.astype(np.float64)
     m00, m11, m22 = r[:, 0, 0], r[:, 1, 1], r[:, 2, 2]

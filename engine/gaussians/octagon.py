@@ -25,6 +25,9 @@ def octagon_radii(opacities: Float[np.ndarray, " n"], q: float = CHI2_2_99) -> F
 
     At that radius alpha falls to exp(-Q/2), whatever the opacity a. A Gaussian fainter than that has
     radius 0 and no octagon.
+
+    >>> octagon_radii(np.array([1.0, 0.5, 0.001])).round(3).tolist()
+    [3.035, 2.797, 0.0]
     """
     with np.errstate(divide="ignore"):
         return np.sqrt(np.maximum(0.0, q + 2.0 * np.log(opacities.astype(np.float64)))).astype(
@@ -33,7 +36,11 @@ def octagon_radii(opacities: Float[np.ndarray, " n"], q: float = CHI2_2_99) -> F
 
 
 def corner_directions() -> Float[np.ndarray, "8 2"]:
-    """Return unit corner positions (cos, sin)(2 pi k / 8) in the (r2, r3) plane."""
+    """Return unit corner positions (cos, sin)(2 pi k / 8) in the (r2, r3) plane.
+
+    >>> corner_directions()[[0, 2, 4]].round(6).tolist()
+    [[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0]]
+    """
     angles = 2.0 * np.pi * np.arange(SIDES) / SIDES
     return np.stack([np.cos(angles), np.sin(angles)], axis=-1)
 
@@ -51,7 +58,11 @@ def octagon_corners_world(
 
 
 def octagon_triangles(count: int) -> Int[np.ndarray, "m 3"]:
-    """Return the fan triangles (0,1,2)...(0,6,7) of ``count`` octagons, in sequence."""
+    """Return the fan triangles (0,1,2)...(0,6,7) of ``count`` octagons, in sequence.
+
+    >>> octagon_triangles(1).tolist()
+    [[0, 1, 2], [0, 2, 3], [0, 3, 4], [0, 4, 5], [0, 5, 6], [0, 6, 7]]
+    """
     return (np.arange(count)[:, None, None] * SIDES + FAN_TRIANGLES).reshape(-1, 3)
 
 

@@ -17,7 +17,7 @@ RowIndex = np.ndarray | slice
 
 @runtime_checkable
 class RowTable(Protocol):
-    """Any dataclass."""
+    """A dataclass whose fields are arrays with one row for each Gaussian."""
 
     __dataclass_fields__: ClassVar[dict[str, Field[Any]]]
 
@@ -88,13 +88,13 @@ def concatenate_rows(parts: Sequence[TableT]) -> TableT:
     every = [row_arrays(part) for part in parts]
     _check_same_arrays(every)
     joined = {name: np.concatenate([arrays[name] for arrays in every]) for name in every[0]}
-    whole = from_row_arrays(type(parts[0]), joined)
+    table = from_row_arrays(type(parts[0]), joined)
     others = {
         field.name: getattr(parts[0], field.name)
         for field in fields(parts[0])
         if not isinstance(getattr(parts[0], field.name), np.ndarray | Channels)
     }
-    return replace(whole, **others)
+    return replace(table, **others)
 
 
 def _check_same_arrays(every: Sequence[Mapping[str, np.ndarray]]) -> None:

@@ -44,7 +44,11 @@ _GOLDEN_ANGLE = np.pi * (3.0 - np.sqrt(5.0))
 
 
 def sh_basis(directions: Float[np.ndarray, "*n 3"], degree: int) -> Float[np.ndarray, "*n k"]:
-    """Return real harmonics of degree 0 to ``degree`` (at most 3) at unit directions, signs as in 3DGS."""
+    """Return real harmonics of degree 0 to ``degree`` (at most 3) at unit directions, signs as in 3DGS.
+
+    >>> abs(sh_basis(np.array([[0.0, 0.0, 1.0]]), 1)).round(4).tolist()
+    [[0.2821, 0.0, 0.4886, 0.0]]
+    """
     x, y, z = np.moveaxis(directions, -1, 0)
     xx, yy, zz = x * x, y * y, z * z
     c1, c2, c3 = SH_C1, SH_C2, SH_C3
@@ -117,7 +121,12 @@ def sh_rotation_matrices(
 
 
 def fibonacci_sphere(count: int) -> Float[np.ndarray, "s 3"]:
-    """Return unit directions spread evenly over the sphere (Fibonacci spiral)."""
+    """Return unit directions spread evenly over the sphere (Fibonacci spiral).
+
+    >>> directions = fibonacci_sphere(100)
+    >>> bool(np.allclose(np.linalg.norm(directions, axis=1), 1.0)), bool((abs(directions.mean(axis=0)) < 0.05).all())
+    (True, True)
+    """
     z = 1 - 2 * (np.arange(count) + 0.5) / count
     angle = _GOLDEN_ANGLE * np.arange(count)
     ring = np.sqrt(1 - z * z)

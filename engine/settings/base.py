@@ -1,4 +1,4 @@
-"""The base of all models of settings, and what it knows of settings that became constants."""
+"""Base of all models of settings, and the settings that have become constants."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -37,16 +37,16 @@ class Settings(BaseModel):
         """Read former names; leave out former settings that have the value of the constant, refuse others."""
         if not isinstance(given, Mapping):
             return given
-        kept = translate_names((cls,), given)
+        values = translate_names((cls,), given)
         for name, former in cls.former_settings.items():
-            if name not in kept or name in cls.model_fields:
+            if name not in values or name in cls.model_fields:
                 continue
-            value = kept.pop(name)
+            value = values.pop(name)
             if (list(value) if isinstance(value, tuple) else value) != former.value:
                 raise ValueError(
                     f"{name} is no setting any more: it is always {former.value}, not {value}; leave it out"
                 )
-        return kept
+        return values
 
 
 def json_by_former_names(settings: Settings) -> str:

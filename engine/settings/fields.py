@@ -1,4 +1,4 @@
-"""What the fields of requests say beside their type: unit, role, and how a command spells them."""
+"""Marks on the fields of requests beside their type: unit, role, and command-line spelling."""
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
@@ -15,7 +15,7 @@ SettingLevel = Literal["basic", "advanced", "experimental"]
 
 
 class _InSchema:
-    """Base of marks that stand in the JSON schema of a field, too."""
+    """Base of marks that appear in the JSON schema of a field."""
 
     def schema_entries(self) -> Mapping[str, object]:
         raise NotImplementedError
@@ -33,18 +33,18 @@ class Unit(_InSchema):
     symbol: str
 
     def schema_entries(self) -> Mapping[str, object]:
-        """Return what stands in the schema."""
+        """Return the entries of the JSON schema."""
         return {"unit": self.symbol}
 
 
 @dataclass(frozen=True)
 class Group(_InSchema):
-    """How many users need a setting; forms and documents begin with the basic ones."""
+    """Audience of a setting; forms and documents list the basic ones first."""
 
     level: SettingLevel
 
     def schema_entries(self) -> Mapping[str, object]:
-        """Return what stands in the schema."""
+        """Return the entries of the JSON schema."""
         return {"group": self.level}
 
 
@@ -82,7 +82,7 @@ class Shortcut(_InSchema):
 
 @dataclass(frozen=True)
 class Spelling:
-    """How a command spells a field, where it is not ``--name-of-field``.
+    """Command-line spelling of a field, where it is not ``--name-of-field``.
 
     Attributes:
         flags: flags of the option, such as ``("-o", "--output")``.
@@ -101,7 +101,7 @@ class Spelling:
 
 
 def is_negatable(info: FieldInfo) -> bool:
-    """Return whether the field is a switch that differs between off and not said, see :class:`Spelling`."""
+    """Return whether the field is a switch that is on, off or not given; see :class:`Spelling`."""
     return any(isinstance(mark, Spelling) and mark.negatable for mark in info.metadata)
 
 
@@ -117,7 +117,7 @@ class NamedFile(_InSchema):
     """Mark of a file that options name; a job finds it by name among the files that came with it."""
 
     def schema_entries(self) -> Mapping[str, object]:
-        """Return what stands in the schema."""
+        """Return the entries of the JSON schema."""
         return {"format": "octasplat-file"}
 
 

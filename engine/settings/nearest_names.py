@@ -1,4 +1,4 @@
-"""The known name that a mistyped one probably means."""
+"""Search for the known name that a mistyped one probably means."""
 
 from collections.abc import Iterable
 from difflib import get_close_matches
@@ -9,14 +9,14 @@ def nearest_name(name: str, known: Iterable[str]) -> str | None:
 
     Names with dots are also found by their last part.
 
-    >>> nearest_name("window_ray", ["ray_patch_rays", "lr.quat"])
+    >>> nearest_name("ray_patch_ray", ["ray_patch_rays", "lr.quat"])
     'ray_patch_rays'
     >>> nearest_name("quats", ["ray_patch_rays", "lr.quat"])
     'lr.quat'
     """
     names = list(known)
-    if whole := get_close_matches(name, names, n=1, cutoff=0.75):
-        return whole[0]
+    if matches := get_close_matches(name, names, n=1, cutoff=0.75):
+        return matches[0]
     by_last_part: dict[str, str] = {}
     for full in names:
         by_last_part.setdefault(full.rpartition(".")[2], full)

@@ -1,4 +1,4 @@
-"""Why settings cannot be used: one short sentence for each, the same wherever they were given."""
+"""Refusals of settings: one short sentence for each, the same for every interface."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -58,7 +58,7 @@ def refuse_unknown_setting(
     of_kind: str = "",
     former: Mapping[str, str] = MappingProxyType({}),
 ) -> Refusal:
-    """Return the refusal of a setting that there is not; it offers the nearest of those that are known.
+    """Return the refusal of an unknown setting, which offers the nearest known one.
 
     Args:
         path: where it is.
@@ -98,13 +98,13 @@ def _sentence(path: Sequence[str | int], fault: Mapping[str, Any]) -> str:
     name = "" if is_ours and tuple(path) == ("train",) else setting_name(path)
     message = str(fault["msg"]).removeprefix("Value error, ").removesuffix(".")
     value = fault.get("input")
-    shown = not is_ours and (isinstance(value, str | int | float | bool) or value is None)
-    told = f" (it is {value!r})" if shown and len(repr(value)) <= _LONGEST_VALUE else ""
-    return f"{name}: {message}{told}." if name else f"{message}."
+    shows_value = not is_ours and (isinstance(value, str | int | float | bool) or value is None)
+    value_text = f" (it is {value!r})" if shows_value and len(repr(value)) <= _LONGEST_VALUE else ""
+    return f"{name}: {message}{value_text}." if name else f"{message}."
 
 
 def _unknown(model: type[BaseModel], place: Sequence[str | int]) -> Refusal:
-    """The refusal of a field that a model has not."""
+    """Return the refusal of a field that a model does not have."""
     path, models, kind = _path_in(model, place[:-1])
     if kind:
         models = tuple(inner for inner in models if inner.model_fields["kind"].default == kind)
@@ -116,7 +116,7 @@ def _unknown(model: type[BaseModel], place: Sequence[str | int]) -> Refusal:
 def _path_in(
     model: type[BaseModel], place: Sequence[str | int]
 ) -> tuple[tuple[str | int, ...], tuple[type[BaseModel], ...], str]:
-    """The path of a setting without what pydantic adds where a value may be of several types.
+    """Return the path of a setting without the parts that pydantic adds for union types.
 
     Returns:
         The path, the models of what is there, and the kind where there are several.

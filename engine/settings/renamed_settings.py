@@ -1,4 +1,4 @@
-"""Settings and options that had other names in the last version, which this version still reads.
+"""Settings and options that were renamed since the last version, whose former names this version still reads.
 
 A model names its part of the tables as ``former_names``; :func:`translate_names` is the only reader of them.
 The next version drops this module.
@@ -25,7 +25,7 @@ class RenamedSettingWarning(FutureWarning):
 
 @dataclass(frozen=True)
 class FormerNames:
-    """What fields of a model, their values and the flags of a command were called in the last version.
+    """Former names of a model's fields and values, and of the flags of a command.
 
     Attributes:
         fields: name of each field that was renamed, by its former one.
@@ -125,7 +125,7 @@ _collected: ContextVar[list[str] | None] = ContextVar("notices of renamed settin
 
 
 def former_names(model: type[BaseModel]) -> FormerNames:
-    """Return what the fields of a model were called."""
+    """Return the former names of the fields of a model."""
     found = getattr(model, "former_names", NONE)
     assert isinstance(found, FormerNames)
     return found
@@ -134,7 +134,7 @@ def former_names(model: type[BaseModel]) -> FormerNames:
 def translate_names(
     models: Iterable[type[BaseModel]], values: Mapping[str, Any], prefix: str = "", source: str = ""
 ) -> dict[str, Any]:
-    """Return nested values by the names of this version, and tell which had those of the last one.
+    """Return nested values under the present names, with a notice for each former one.
 
     Where a field is given by both names, the later one counts.
 
@@ -153,10 +153,10 @@ def translate_names(
 
 def notify_renamed(renamed: Mapping[str, str], source: str = "") -> None:
     """Tell that names of the last version were read: a warning, or a notice where those are collected."""
-    shown = list(renamed.items())[:_SHOWN]
-    told = ", ".join(f"{old} is called {new} now" for old, new in shown)
+    listed = list(renamed.items())[:_SHOWN]
+    changes = ", ".join(f"{old} is called {new} now" for old, new in listed)
     more = f", and {len(renamed) - _SHOWN} more have new names" if len(renamed) > _SHOWN else ""
-    text = f"{source}{': ' if source else ''}{told}{more}; former names are read in this version only."
+    text = f"{source}{': ' if source else ''}{changes}{more}; former names are read in this version only."
     notices = _collected.get()
     if notices is None:
         warnings.warn(text, RenamedSettingWarning, stacklevel=2)
@@ -182,7 +182,7 @@ def _renamed(
     after: str,
     renamed: dict[str, str],
 ) -> dict[str, Any]:
-    """The values by new names; adds to ``renamed``, from the former path to the new one."""
+    """Return the values under their present names; adds each renamed path to ``renamed``."""
     tables = [former_names(model) for model in models]
     fields = {old: new for table in tables for old, new in table.fields.items()}
     result: dict[str, Any] = {}

@@ -16,7 +16,7 @@ from octasplat.engine.settings.fields import ADVANCED, EXPERIMENTAL, Unit
 
 
 class TraceSettings(Settings):
-    """Which tracer, and its limits. Where a ray begins is a property of the ray."""
+    """Choice of the tracer and its limits; where a ray begins is a property of the ray."""
 
     former_names: ClassVar[renamed_settings.FormerNames] = renamed_settings.TRACE
 
@@ -205,7 +205,7 @@ class Tracer(Protocol):
     settings: TraceSettings
 
     def build(self, gaussians: FlatGaussians, features: Float32[np.ndarray, "n f"] | None = None) -> None:
-        """Keep ``gaussians`` and ``features`` and build the acceleration structure around them.
+        """Build the acceleration structure; ``gaussians`` and ``features`` are kept by reference.
 
         Earlier recordings can no longer be differentiated.
         """

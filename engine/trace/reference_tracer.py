@@ -60,7 +60,7 @@ class ReferenceTracer:
         self._build_id = object()
 
     def build(self, gaussians: FlatGaussians, features: Float32[np.ndarray, "n f"] | None = None) -> None:
-        """Keep ``gaussians``; there is nothing to build."""
+        """Set ``gaussians``; there is no structure to build."""
         self._features = np.empty((len(gaussians), 0), np.float32) if features is None else features
         self._gaussians = gaussians
         self._build_id = object()

@@ -12,7 +12,7 @@ from octasplat.engine.settings.renamed_settings import FormerNames
 
 ROOT = Path(__file__).resolve().parents[2]
 WORDS = """
-chore chores contact doors fitness folds footprint frosted hasten heard hears hub journal
+chore chores contact doors fitness folds footprint frosted gapless hasten heard hears hub journal
 know knows lean meet meets onlooker onlookers opening openings sights slips surroundings
 telling twin twins upkeep verdict verdicts widening workshop
 """

@@ -263,7 +263,7 @@ def _gather(
     vertices: Float64[np.ndarray, "v 3"],
     near: float,
     rows: Float64[np.ndarray, "3 8"],
-    seen: Float64[np.ndarray, "s 8"],
+    offsets: Float64[np.ndarray, "s 8"],
 ) -> int:
     """Eight points from ``first`` on (the last one again where there are fewer), and the vertices from there.
 
@@ -273,7 +273,7 @@ def _gather(
         i = min(first + lane, len(points) - 1)
         for axis in range(3):
             rows[axis, lane] = points[i, axis]
-    met, place, at = 0, rows.ctypes.data, seen.ctypes.data
+    met, place, at = 0, rows.ctypes.data, offsets.ctypes.data
     for j in range(len(vertices)):
         row = np.uintp(at + j * VERTEX_ROWS * LANES * 8)
         met |= vertex_rows(place, vertices[j, 0], vertices[j, 1], vertices[j, 2], near, row)
@@ -306,11 +306,11 @@ def _winding_block(
     result: Int64[np.ndarray, " p"],
 ) -> None:
     rows, total = np.empty((POINT_ROWS, LANES)), np.empty((1, LANES))
-    seen = np.empty((len(vertices) * VERTEX_ROWS, LANES))
+    offsets = np.empty((len(vertices) * VERTEX_ROWS, LANES))
     for first in range(start, min(start + POINTS_PER_TASK, len(points)), LANES):
-        _gather(points, first, vertices, 0.0, rows, seen)
+        _gather(points, first, vertices, 0.0, rows, offsets)
         total[:] = 0.0
-        at, step = seen.ctypes.data, VERTEX_ROWS * LANES * 8
+        at, step = offsets.ctypes.data, VERTEX_ROWS * LANES * 8
         for t in range(len(triangles)):
             a, b, c = triangles[t, 0], triangles[t, 1], triangles[t, 2]
             add_solid_angle(
@@ -358,12 +358,12 @@ def _weights_block(
     count = len(vertices)
     rows = np.empty((POINT_ROWS, LANES))
     # Of vertices, then of edges; one array, as numba frees what only its address is used of.
-    seen, sums = np.empty((count * VERTEX_ROWS + len(edges), LANES)), np.empty((count, LANES))
+    offsets, sums = np.empty((count * VERTEX_ROWS + len(edges), LANES)), np.empty((count, LANES))
     row, step = LANES * 8, VERTEX_ROWS * LANES * 8
-    at, counted = seen.ctypes.data, sums.ctypes.data
+    at, counted = offsets.ctypes.data, sums.ctypes.data
     beside = at + count * step
     for first in range(start, min(start + POINTS_PER_TASK, len(points)), LANES):
-        special = _gather(points, first, vertices, near, rows, seen)
+        special = _gather(points, first, vertices, near, rows, offsets)
         for e in range(len(edges)):
             a, b = np.uintp(at + edges[e, 0] * step), np.uintp(at + edges[e, 1] * step)
             if edge_rows(a, b, np.uintp(beside + e * row)) != 0:
@@ -381,7 +381,7 @@ def _weights_block(
         totals[:] = 0.0
         for j in range(count):
             for lane in range(LANES):
-                sums[j, lane] *= seen[j * VERTEX_ROWS + 3, lane]
+                sums[j, lane] *= offsets[j * VERTEX_ROWS + 3, lane]
                 totals[lane] += sums[j, lane]
         for lane in range(min(LANES, len(points) - first)):
             if (special >> lane) & 1:

@@ -125,7 +125,7 @@ def _query_layer_light(
     relit: float,
     query: LightQuery,
 ) -> None:
-    """Ask a light at a layer.
+    """Queue a light query of a layer of Gaussians.
 
     ``weight`` is what one unit of the layer's light counts, ``shadowed`` the share of it that shadows take,
     and ``relit`` the share that the lights give.

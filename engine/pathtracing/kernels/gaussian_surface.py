@@ -77,7 +77,7 @@ def intersect_gaussian_surfaces(
     min_transmittance: float,
     shadows: ShadowRayArrays,
 ) -> None:
-    """Let paths meet the Gaussians with materials on their rays, or take these away from what was seen.
+    """Intersect paths with the Gaussians that have materials, or remove these from the layer.
 
     A path that meets them goes on from there: its face becomes :data:`PATH_ENDED`, and nothing of the layer
     is left. ``shadows`` gets what it asks of lights.
@@ -158,7 +158,7 @@ def start_paths_at_surfaces(
     paths: PathArrays,
     shadows: ShadowRayArrays,
 ) -> None:
-    """Paths that begin at points of surfaces, as if the camera's rays had met them there."""
+    """Start paths at points of surfaces, as if the camera's rays had hit them there."""
     column = PathSamples(scratch.random_numbers, 0)
     tables = AlbedoTables(materials.ggx_albedo, materials.coat_albedo[0], materials.coat_mean_albedo[0])
     for k in range(first, last):

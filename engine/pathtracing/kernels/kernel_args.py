@@ -1,4 +1,4 @@
-"""What the path tracer's kernels read and write, as named tuples of arrays."""
+"""Arguments of the path tracer's kernels: named tuples of arrays."""
 
 from typing import NamedTuple, TypeAlias
 
@@ -249,7 +249,7 @@ class MeshScene(NamedTuple):
 
 
 class MeshHits(NamedTuple):
-    """What ``n`` rays meet first of the meshes.
+    """Nearest hits of ``n`` rays with the meshes.
 
     Attributes:
         distances: infinite where a ray meets nothing.
@@ -263,7 +263,7 @@ class MeshHits(NamedTuple):
 
 
 class LayerArrays(NamedTuple):
-    """What ``n`` rays see of Gaussians: arrays of a :class:`octasplat.engine.trace.protocol.TraceResult`."""
+    """Gaussians along ``n`` rays: arrays of a :class:`octasplat.engine.trace.protocol.TraceResult`."""
 
     rgb: Float32[np.ndarray, "n 3"]
     transmittance: Float32[np.ndarray, " n"]
@@ -294,7 +294,7 @@ class Bsdf(NamedTuple):
 
 
 class AlbedoTables(NamedTuple):
-    """How much one bounce sends back, by roughness and cosine.
+    """Directional albedo of one bounce, by roughness and cosine.
 
     Attributes:
         ggx_albedo: of a colorless metal.
@@ -315,7 +315,7 @@ class PathSamples(NamedTuple):
 
 
 class MeshQueries(NamedTuple):
-    """What kernels ask Embree about the meshes of a stage.
+    """Embree queries on the meshes of a stage.
 
     Attributes:
         closest_hit: the nearest of all triangles.
@@ -348,7 +348,7 @@ class IntegratorParameters(NamedTuple):
 
 
 class LightQuery(NamedTuple):
-    """Where a surface asks a light: row ``k`` of the shadow rays."""
+    """Light query of a surface: row ``k`` of the shadow rays."""
 
     lights: LightArrays
     integrator: IntegratorParameters
@@ -357,7 +357,7 @@ class LightQuery(NamedTuple):
 
 
 class PathScratch(NamedTuple):
-    """What one thread's kernels work in, ``b`` rows at a time.
+    """Scratch memory of one thread's kernels, for ``b`` rows at a time.
 
     Attributes:
         embree: see :func:`octasplat.engine.trace.triangle_bvh.allocate_embree_scratch`.
@@ -403,7 +403,9 @@ class CameraRays(NamedTuple):
 
 
 class PathStart(NamedTuple):
-    """Which paths begin: ``paths_per_pixel`` of the pixels ``pixel_order[first_pixel]`` and on.
+    """Range of paths to start: ``paths_per_pixel`` for each of ``pixel_order[first_pixel:]``.
+
+    Their sample numbers begin with ``first_sample``.
 
     They are numbered from ``first_sample`` on.
     """
@@ -416,7 +418,7 @@ class PathStart(NamedTuple):
 
 
 class PathBlock(NamedTuple):
-    """What one thread follows a block of paths with.
+    """Memory in which one thread follows a block of paths.
 
     Attributes:
         active: which paths are left.
@@ -432,7 +434,7 @@ class PathBlock(NamedTuple):
 
 
 def allocate_paths(count: int) -> PathArrays:
-    """Paths of which nothing is known."""
+    """Allocate the arrays of paths, without values."""
 
     def vectors() -> Float32[np.ndarray, "p 3"]:
         return np.empty((count, 3), np.float32)
@@ -447,7 +449,7 @@ def allocate_paths(count: int) -> PathArrays:
 
 
 def allocate_shadow_rays(count: int) -> ShadowRayArrays:
-    """Shadow rays that bring nothing."""
+    """Allocate shadow rays without radiance."""
     return ShadowRayArrays(
         np.zeros((count, 3), np.float32), np.zeros((count, 3), np.float32), np.zeros(count, np.float32),
         np.zeros((count, 3), np.float32), np.zeros((count, 3), np.float32), np.zeros(count, np.bool_),

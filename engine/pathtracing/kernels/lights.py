@@ -29,7 +29,7 @@ INFINITE_DISTANCE = 1e30
 
 @njit_no_refcount(forceinline=True)
 def luminance(red: float, green: float, blue: float) -> float:
-    """Of linear Rec. 709 values."""
+    """Return the luminance of linear Rec. 709 values."""
     return 0.2126 * red + 0.7152 * green + 0.0722 * blue
 
 
@@ -45,7 +45,7 @@ def _spot_falloff(lights: LightArrays, l: int, way_x: float, way_y: float, way_z
 
 @njit_no_refcount(forceinline=True)
 def light_importance(lights: LightArrays, l: int, p_x: float, p_y: float, p_z: float) -> float:
-    """About the irradiance that a light gives to a surface at p that faces it; 0 only where it gives none."""
+    """Estimate the irradiance of a light at a surface at p that faces it; 0 only where it is exactly 0."""
     power = luminance(lights.rgb_linear[l, 0], lights.rgb_linear[l, 1], lights.rgb_linear[l, 2])
     kind = lights.kinds[l]
     if kind in (DIRECTIONAL, ENVIRONMENT):
@@ -151,7 +151,7 @@ def emitter_hit_pdf(
 
 @njit_no_refcount()
 def _one_minus_cosine(squared_sine: float) -> float:
-    """1 less the cosine of an angle below 90 degrees, without losing digits where it is small."""
+    """Return 1 - cos of an angle below 90 degrees, without cancellation where it is small."""
     squared_sine = min(squared_sine, 1.0)
     return max(squared_sine / (1.0 + math.sqrt(1.0 - squared_sine)), 1e-12)
 
@@ -386,7 +386,7 @@ def light_samples(
     density: Float64[np.ndarray, " n"],
     lights_asked: Int64[np.ndarray, " n"],
 ) -> None:
-    """:func:`sample_light_index` and :func:`sample_light` at rows of points with three uniform numbers each.
+    """Run :func:`sample_light_index` and :func:`sample_light` at points with three uniform numbers each.
 
     ``density`` and, of light that comes from one direction only, ``radiance`` hold the choice of the light.
     """

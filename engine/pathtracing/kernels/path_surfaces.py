@@ -122,7 +122,7 @@ def _pixel_direction(directions: Float32[np.ndarray, "h w 3"], y: int, x: int, u
 
 @njit_no_refcount(forceinline=True)
 def _reset_path(paths: PathArrays, k: int, origin: Vec3, direction: Vec3) -> None:
-    """Begin a path at the camera."""
+    """Start a path at the camera."""
     paths.origins_world[k, 0], paths.origins_world[k, 1], paths.origins_world[k, 2] = origin
     paths.directions_world[k, 0], paths.directions_world[k, 1], paths.directions_world[k, 2] = direction
     for channel in range(3):
@@ -143,7 +143,7 @@ def start_paths(
     start: PathStart,
     paths: PathArrays,
 ) -> None:
-    """Begin the paths ``first`` to ``last`` of those that ``start`` describes.
+    """Start the paths ``first`` to ``last`` of those that ``start`` describes.
 
     Beside a pixel's centre the direction follows the slopes between the neighbours, which is right for any
     lens to the second order in a pixel.
@@ -219,7 +219,7 @@ def add_radiance(paths: PathArrays, p: int, red: float, green: float, blue: floa
 def _shade_miss(
     paths: PathArrays, p: int, lights: LightArrays, environment: int, integrator: IntegratorParameters
 ) -> None:
-    """End a path behind everything."""
+    """Terminate a path that leaves the scene, with the light of the background."""
     d = paths.directions_world[p]
     red, green, blue = eval_background(lights, environment, integrator, paths.flags[p], d[0], d[1], d[2])
     share = 1.0
@@ -264,7 +264,7 @@ def _shade_emitter(
 def _scatter_mirror(
     paths: PathArrays, p: int, point: Vec3, normal: Vec3, shading_normal: Vec3, reflectance: Rgb
 ) -> None:
-    """Reflect a path."""
+    """Reflect a path at a mirror and multiply its throughput by ``reflectance``."""
     (x, y, z), (n_x, n_y, n_z), (s_x, s_y, s_z) = point, normal, shading_normal
     red, green, blue = reflectance
     d = paths.directions_world[p]
@@ -345,7 +345,7 @@ def _fill_samples(
 def _write_denoiser_guides(
     paths: PathArrays, p: int, red: float, green: float, blue: float, n_x: float, n_y: float, n_z: float
 ) -> None:
-    """Note colour and normal of the first mesh that the camera's ray meets, as far as it is seen."""
+    """Write color and normal of the first mesh that the camera's ray hits, weighted by visibility."""
     share = paths.mesh_visibility[p]
     paths.albedo_linear[p, 0] = share * red
     paths.albedo_linear[p, 1] = share * green
@@ -377,7 +377,7 @@ def _scatter_rough_glass(
     samples: PathSamples,
     query: LightQuery,
 ) -> None:
-    """Ask a light at rough glass, and send the path on as the facets reflect or refract it."""
+    """Queue a light query at rough glass, and reflect or refract the path at a microfacet."""
     (x, y, z), (n_x, n_y, n_z), (s_x, s_y, s_z) = point, normal, shading_normal
     lights, shadows, k = query.lights, query.shadows, query.k
     d = paths.directions_world[p]
@@ -446,7 +446,7 @@ def _scatter_rough_glass(
 
 @njit_no_refcount(forceinline=True)
 def survives_roulette(paths: PathArrays, p: int, roulette: float) -> bool:
-    """End a path by chance, the likelier the less its light still counts; tell whether it goes on."""
+    """Play russian roulette: terminate a path by its throughput; returns whether it continues."""
     w = paths.throughput[p]
     stay = min(max(w[0], w[1], w[2]), 0.95)
     if roulette >= stay:
@@ -472,7 +472,7 @@ def _scatter_at_material(
     samples: PathSamples,
     query: LightQuery,
 ) -> None:
-    """Send a path on by the material of a face, and ask a light where that scatters.
+    """Scatter a path by the material of a face, with a light query where the material scatters.
 
     ``weights`` are those of the corners; ``is_guide`` tells whether color and normal guide the denoiser.
     """

@@ -131,7 +131,7 @@ def principled_sample(
 
 @njit_no_refcount(forceinline=True)
 def orthonormal_basis(n_x: float, n_y: float, n_z: float) -> tuple[float, float, float, float, float, float]:
-    """Two unit vectors that make a right-handed frame with the unit vector n as its third axis.
+    """Return two unit vectors that complete the unit vector n to a right-handed frame.
 
     "Building an Orthonormal Basis, Revisited" (Duff et al. 2017, https://jcgt.org/published/0006/01/01/).
     """

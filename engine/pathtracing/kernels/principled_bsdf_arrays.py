@@ -36,7 +36,7 @@ class BsdfArrays(NamedTuple):
 def integrate_albedo(
     first: int, last: int, ior: float, samples: int, table: Float64[np.ndarray, "a c"]
 ) -> None:
-    """Integrate the share of light from each direction that one bounce off facets sends back.
+    """Integrate the directional albedo of one bounce off microfacets.
 
     Writes the rows ``first`` to ``last`` of ``table``. Rows are roughness and columns the cosine, both from
     0 to

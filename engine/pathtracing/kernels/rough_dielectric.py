@@ -26,7 +26,7 @@ MIN_GLASS_ROUGHNESS = 0.03
 def rough_dielectric_eval(
     o_x: float, o_y: float, o_z: float, i_x: float, i_y: float, i_z: float, eta: float, alpha: float
 ) -> tuple[float, float]:
-    """Value times cosine, and the density of :func:`rough_dielectric_sample` over solid angle."""
+    """Return value times cosine, and the solid-angle density of :func:`rough_dielectric_sample`."""
     if o_z <= 0.0 or i_z == 0.0:
         return 0.0, 0.0
     ratio = 1.0 if i_z > 0.0 else eta
@@ -75,7 +75,7 @@ def rough_dielectric_sample(
 def integrate_rough_dielectric(
     first: int, last: int, eta: float, samples: int, table: Float64[np.ndarray, "a c"]
 ) -> None:
-    """Integrate the share of light from each direction that one bounce off or through facets keeps.
+    """Integrate the directional albedo of one bounce off or through microfacets.
 
     Writes the rows ``first`` to ``last`` of ``table``. Rows are roughness and columns the cosine, both from
     0 to 1.

@@ -18,7 +18,7 @@ ONE_MINUS_EPSILON = 1.0 - 2.0**-24
 
 @njit_no_refcount(inline="always")
 def hash_uint32(x: np.uint32) -> np.uint32:
-    """32 well mixed bits of a uint32."""
+    """Return 32 well mixed bits of a uint32."""
     x = np.uint32(x)
     x = np.uint32((x ^ (x >> np.uint32(16))) * np.uint32(0x7FEB352D))
     x = np.uint32((x ^ (x >> np.uint32(15))) * np.uint32(0x846CA68B))
@@ -46,7 +46,7 @@ def reverse_bits(x: np.uint32) -> np.uint32:
 
 @njit_no_refcount()
 def _laine_karras_permutation(x: np.uint32, seed: np.uint32) -> np.uint32:
-    """Change each bit by a hash of the bits below it (Laine and Karras)."""
+    """Permute bits: each is changed by a hash of the bits below it (Laine and Karras)."""
     x = np.uint32(x + seed)
     x = np.uint32(x ^ np.uint32(x * np.uint32(0x6C50B47C)))
     x = np.uint32(x ^ np.uint32(x * np.uint32(0xB82F1E52)))
@@ -76,7 +76,7 @@ def pixel_key(seed: int, pixel: int) -> np.uint32:
 
 @njit_no_refcount()
 def uniform_pair(key: np.uint32, sample: int, pair: int) -> tuple[float, float]:
-    """Two numbers in [0, 1) for number ``sample`` (below 65,536) in the pair of dimensions ``pair``."""
+    """Return two numbers in [0, 1) for sample ``sample`` (below 65,536) in the dimensions ``pair``."""
     seed = hash_uint32(np.uint32(key + np.uint32(0x85EBCA6B) * np.uint32(pair + 1)))
     # The order is scrambled within its 16 bits, so that the first 2^k samples stay a whole block.
     order = _laine_karras_permutation(reverse_bits(np.uint32(sample) << np.uint32(16)), seed)
@@ -127,7 +127,7 @@ def fill_pairs(
     first: int,
     out: Float64[np.ndarray, "d 2 p"],
 ) -> None:
-    """:func:`uniform_pair` of ``count`` paths in the pairs of dimensions from ``first`` on.
+    """Write :func:`uniform_pair` of ``count`` paths in the pairs of dimensions from ``first`` on.
 
     ``out`` (pairs, 2, count or more) gets them.
     """

@@ -47,7 +47,7 @@ SHADOW_RAY_SCALE = 1.0 - 1e-4
 def spawn_ray(
     paths: PathArrays, p: int, x: float, y: float, z: float, d_x: float, d_y: float, d_z: float, pdf: float
 ) -> None:
-    """Send a path on; its viewer is left behind, and lost where the path has been scattered."""
+    """Start the next ray of a path; its viewer stays behind, and is lost once the path has scattered."""
     o = paths.origins_world[p]
     if pdf > 0.0:
         paths.t_view_origin[p] = AT_INFINITY
@@ -68,7 +68,7 @@ def queue_shadow_ray(
     radiance: Rgb,
     clamp: float,
 ) -> None:
-    """Ask a light: what it brings if nothing is in its way, no more than ``clamp``."""
+    """Queue a shadow ray with the light's contribution, clamped to ``clamp``."""
     (x, y, z), (w_x, w_y, w_z), (red, green, blue) = origin, direction, radiance
     most = max(red, green, blue)
     if most > clamp:
@@ -116,7 +116,7 @@ def scatter_path(
     tables: AlbedoTables,
     query: LightQuery,
 ) -> None:
-    """Ask a light, and send path ``p`` on from a point off its surface.
+    """Queue a light query, and continue path ``p`` from a point off its surface.
 
     ``normal`` is the surface's own, ``shading_normal`` the one that it is shaded by; a surface that
     ``is_diffuse`` has a color alone.

@@ -1,4 +1,4 @@
-"""What meshes keep off and let through between lit points and lights."""
+"""Shadow rays: occlusion and transmittance of meshes between shaded points and lights."""
 
 import math
 
@@ -62,7 +62,7 @@ def _trace_occlusion(
     count: int,
     transmittance: Float32[np.ndarray, "n 3"],
 ) -> int:
-    """Take the light from those of the first ``count`` rows that something is in the way of."""
+    """Set the light of occluded rows among the first ``count`` to zero."""
     scratch.t_starts[0] = 0.0
     rays = TriangleRays(
         shadows.origins_world, shadows.directions_world, scratch.t_starts[:1], shadows.t_max, scratch.rows
@@ -91,7 +91,7 @@ def _trace_glass(
     passes_rough_glass: bool,
     transmittance: Float32[np.ndarray, "n 3"],
 ) -> None:
-    """Take what Fresnel, tint and Beer take from ``count`` rows on their way straight through glass."""
+    """Attenuate ``count`` rows on their way straight through glass, by Fresnel, tint and Beer's law."""
     for k in range(BLOCK_SIZE):
         scratch.t_starts[k] = 0.0
     # Starts are kept by the row's place in the block.
@@ -113,20 +113,20 @@ def _trace_glass(
             n_x, n_y, n_z = face_normal(surfaces.corners_world[face])
             d = shadows.directions_world[k]
             cosine = n_x * d[0] + n_y * d[1] + n_z * d[2]
-            kept, _ = fresnel_dielectric(min(abs(cosine), 1.0), materials.iors[m])
-            kept = 1.0 - kept
+            reflectance, _ = fresnel_dielectric(min(abs(cosine), 1.0), materials.iors[m])
+            reflectance = 1.0 - reflectance
             if (
                 not passes_rough_glass
                 and materials.roughness[m] >= MIN_GLASS_ROUGHNESS
                 and materials.iors[m] != 1.0
             ):
-                kept = 0.0
+                reflectance = 0.0
             t = scratch.distances[i]
             # Out of the glass: what it absorbed on the way.
             length = float(t - scratch.t_starts[place]) if cosine > 0.0 else 0.0
             for channel in range(3):
                 passed = math.exp(-materials.absorption[m, channel] * length)
-                transmittance[k, channel] *= kept * materials.colours_linear[m, channel] * passed
+                transmittance[k, channel] *= reflectance * materials.colours_linear[m, channel] * passed
             scratch.t_starts[place] = t * RESTART_SCALE + RESTART_OFFSET
             scratch.rows[left] = place
             left += 1

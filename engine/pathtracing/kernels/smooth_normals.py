@@ -16,7 +16,7 @@ def smooth_normals(
     min_cosine: float,
     normals: Float32[np.ndarray, "f 3 3"],
 ) -> None:
-    """Mean normal, weighted by angle, of the faces round a corner that are turned from its own by little.
+    """Return the angle-weighted mean normal of the faces around a corner whose normals differ little.
 
     ``order`` lists corners (3 * face + place) so that those of one point lie together, point q from
     ``starts[q]`` on; ``normals`` (f, 3, 3) gets the result.

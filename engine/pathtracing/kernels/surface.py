@@ -1,4 +1,4 @@
-"""What a ray finds on a triangle: the point, its normals, and its material with textures looked up."""
+"""Surface interaction of a ray with a triangle: point, normals and material with its textures."""
 
 import math
 
@@ -111,7 +111,7 @@ def eval_normal_map(
     shading_normal: Vec3,
     direction: Vec3,
 ) -> Vec3:
-    """Turn the shading normal s as the normal texture says; ``normal`` is the face's, on the viewer's side.
+    """Perturb the shading normal s by the normal texture; ``normal`` is the face's, on the viewer's side.
 
     The frame follows the texture coordinates of the face: x where u grows, y where v shrinks, as v counts
     downwards. s stays where the face has none, or where the viewer would see the new one from behind.

@@ -51,7 +51,7 @@ class Relighter(Protocol):
     """Renderer of a scene under an environment."""
 
     def set_environment(self, environment: EnvironmentMap) -> None:
-        """Use this environment from now on."""
+        """Set the environment light."""
         ...
 
     def render(self, image: ImageRays, progress: ProgressCallback = no_progress) -> RelitImage:
@@ -82,7 +82,7 @@ class PathRelighter:
         self._tracer: PathTracer | None = None
 
     def set_environment(self, environment: EnvironmentMap) -> None:
-        """Use this environment from now on."""
+        """Set the environment light."""
         lights = build_light_arrays((), environment.frame[1], environment)
         meshes = self._meshes.with_lights(lights)
         self._tracer = PathTracer(

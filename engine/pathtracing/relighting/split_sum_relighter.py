@@ -65,7 +65,7 @@ class SplitSumRelighter:
         self._radiance: Float32[np.ndarray, "h w 3"] | None = None
 
     def set_environment(self, environment: EnvironmentMap) -> None:
-        """Use this environment from now on."""
+        """Set the environment light."""
         other = self._radiance is not environment.radiance_linear
         if other:
             self._shading.light.set_radiance(environment.radiance_linear)

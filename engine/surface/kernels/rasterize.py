@@ -1,4 +1,4 @@
-"""Which triangle of a layout each pixel of its texture shows."""
+"""Rasterization of a texture layout: the triangle at each pixel."""
 
 import math
 

@@ -40,7 +40,7 @@ class DepthView(NamedTuple):
 
 
 class VoxelGrid(NamedTuple):
-    """Where voxels lie: from ``low`` on, ``voxel`` apart, in units of ``radius`` around ``middle``.
+    """Voxel grid from ``low`` on with spacing ``voxel``, in units of ``radius`` around ``middle``.
 
     With ``contracted`` space outside of the unit ball is contracted. ``truncation`` is in voxels.
     """

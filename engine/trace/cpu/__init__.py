@@ -1,5 +1,4 @@
-"""The tracer for any CPU: packets of neighbouring rays, and single rays through Embree.
+"""Tracer for any CPU: packets of neighbouring rays, and single rays through Embree.
 
-It is in :mod:`octasplat.engine.trace.cpu.tracer`, and not loaded for those that take no more than its
-vectors.
+It is in :mod:`octasplat.engine.trace.cpu.tracer`, and not loaded by modules that use only its vectors.
 """

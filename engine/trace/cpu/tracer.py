@@ -100,7 +100,7 @@ class CpuTracer:
         self._build_id = object()
 
     def build(self, gaussians: FlatGaussians, features: Float32[np.ndarray, "n f"] | None = None) -> None:
-        """Keep ``gaussians`` by reference and build the hierarchy around them."""
+        """Build the hierarchy around ``gaussians``, which are kept by reference."""
         use_threads(self.threads)
         count = len(gaussians)
         if len(self._primitives) != count:

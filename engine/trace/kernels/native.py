@@ -57,7 +57,7 @@ class NativeCallback:
 
     @property
     def address(self) -> Address:
-        """Its address, good while this lives."""
+        """Return the callback's address, valid while this object lives."""
         return int(self._compiled.address)
 
 
@@ -150,13 +150,13 @@ def atomic_fetch_add(typingctx: TypingContext, address: Address, count: int) -> 
 
 @njit_no_refcount(forceinline=True)
 def atomic_fetch_next(address: int) -> int:
-    """:func:`atomic_fetch_add` of one."""
+    """Increment the integer at ``address`` atomically and return its former value."""
     return atomic_fetch_add(address, 1)
 
 
 @intrinsic
 def prefetch(typingctx: TypingContext, address: Address) -> Intrinsic:
-    """Ask for the cache line at ``address``, which is read some dozen operations later."""
+    """Prefetch the cache line at ``address``, which is read some dozen operations later."""
     signature = types.void(types.uintp)
 
     def codegen(
@@ -175,6 +175,6 @@ def prefetch(typingctx: TypingContext, address: Address) -> Intrinsic:
 
 @njit_no_refcount(forceinline=True)
 def prefetch_bytes(address: int, size: int) -> None:
-    """:func:`prefetch` for all lines of so many bytes."""
+    """Run :func:`prefetch` for all cache lines of so many bytes."""
     for line in range(address // CACHE_LINE_BYTES * CACHE_LINE_BYTES, address + size, CACHE_LINE_BYTES):
         prefetch(line)

@@ -60,7 +60,7 @@ def _query_rays8(
     is_coherent: bool,
     scratch: Float32[np.ndarray, " w"],
 ) -> None:
-    """Search along the rays of row ``first`` and the next ones before ``last``, eight at most."""
+    """Trace up to eight rays, from row ``first`` on and before ``last``."""
     words = scratch.view(np.int32)
     # --- the rays, a lane each ---
     for lane in range(LANES):

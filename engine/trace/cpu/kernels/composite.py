@@ -1,4 +1,4 @@
-"""What a hit does to a ray that is followed alone."""
+"""Compositing of one hit into the state of a single ray."""
 
 from typing import NamedTuple
 
@@ -13,7 +13,7 @@ from octasplat.engine.trace.kernels.native import njit_no_refcount
 
 
 class RayState(NamedTuple):
-    """A ray as far as it has been followed; sums are over the hits so far, each times its weight.
+    """State of a ray while it is traced; sums are over the hits so far, each times its weight.
 
     ``t1`` is the transmittance, ``t2`` that of the second phase, which begins where ``t1`` falls below eps1
     (Algorithm 1 of RaySplats). ``next_hit_index`` is where the next hit is stored.
@@ -47,7 +47,7 @@ class Hit(NamedTuple):
 
 @njit_no_refcount(forceinline=True)
 def init_ray_state(forward: ForwardPass, r: int, first_hit_index: int) -> RayState:
-    """Ray ``r`` before its first hit; its hits will be stored from ``first_hit_index`` on."""
+    """Return the state of ray ``r`` before its first hit; its hits are stored from ``first_hit_index`` on."""
     for f in range(forward.scene.features.shape[1]):
         forward.out.features[r, f] = np.float32(0.0)
     if forward.is_recording:

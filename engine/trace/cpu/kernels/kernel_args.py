@@ -1,11 +1,11 @@
-"""What kernels take: a named tuple for each subject, so that an argument is a subject and not an array.
+"""Arguments of the kernels: a named tuple for each subject.
 
-numba passes the fields of a named tuple like arguments of their own. Two things it does not do with them: the
-body of a parallel loop must hand them on to a function instead of writing to their arrays (it would take the
-writing for useless), and may not be given tuples of tuples.
+numba passes the fields of a named tuple as separate arguments, with two limits: the body of a parallel loop
+must pass the tuple to a function instead of writing to its arrays (numba would remove the writes as dead
+code), and it may not be given tuples of tuples.
 
-``r`` counts rays, ``n`` Gaussians,
-``p`` packets, ``h`` places for hits, ``k`` spherical harmonics and ``f`` extra channels.
+Dimensions: ``r`` rays, ``n`` Gaussians, ``p`` packets, ``h`` hit slots, ``k`` spherical harmonics and ``f``
+extra channels.
 """
 
 from typing import NamedTuple
@@ -35,9 +35,9 @@ class RayArrays(NamedTuple):
 
 
 class PackedScene(NamedTuple):
-    """What hits are evaluated from: geometry.
+    """Geometry and color from which hits are evaluated.
 
-    See :mod:`octasplat.engine.trace.cpu.kernels.octagon_hit`) and colour.
+    See :mod:`octasplat.engine.trace.cpu.kernels.octagon_hit` for the geometry.
     """
 
     primitives: Float32[np.ndarray, "n 16"]
@@ -65,7 +65,7 @@ class GaussianParameters(NamedTuple):
 
 
 class TraceLimits(NamedTuple):
-    """Where a ray ends and normals are turned; ``eps2`` above 1 means that there is no second phase."""
+    """Limits of rays and of normal flipping; ``eps2`` above 1 switches the second phase off."""
 
     eps1: float
     eps2: float
@@ -99,9 +99,9 @@ class OutputArrays(NamedTuple):
 
 
 class HitArrays(NamedTuple):
-    """Hits in order along each ray: those of ray r from ``starts[r]`` on.
+    """Hits in order along each ray: those of ray r start at ``starts[r]``.
 
-    ``ids`` and ``rgb`` are for rays that go alone; packets keep them once for a Gaussian.
+    ``ids`` and ``rgb`` are for single rays; packets store them once for each Gaussian.
     """
 
     starts: Int64[np.ndarray, " r"]
@@ -112,7 +112,7 @@ class HitArrays(NamedTuple):
 
 
 class PacketHits(NamedTuple):
-    """What packets keep of their hits beside :class:`HitArrays`.
+    """Hits of packets beside :class:`HitArrays`.
 
     ``us`` and ``vs`` are the hits in standard deviations. ``slots`` numbers the Gaussians of each packet in
     the order in which it met them: the Gaussian in slot s of the packet that begins with ray f is
@@ -129,7 +129,7 @@ class PacketHits(NamedTuple):
 
 
 class SharedSortHits(NamedTuple):
-    """What packets keep whose rays see their Gaussians in one order.
+    """Hits of packets whose rays share one order of Gaussians.
 
     Packet p has met ``counts[p]`` Gaussians, front to back from place ``starts[p]`` on: their ``ids``; the
     ``ray_masks`` of the rays that met them; and the ``packet_primitives`` of
@@ -194,7 +194,7 @@ class GaussianSegments(NamedTuple):
 
 
 class BvhArrays(NamedTuple):
-    """The hierarchy; :mod:`octasplat.engine.trace.cpu.kernels.packet_bvh` says how it is laid out."""
+    """The bounding volume hierarchy, laid out as in :mod:`octasplat.engine.trace.cpu.kernels.packet_bvh`."""
 
     nodes: Float32[np.ndarray, "m 6 8"]
     level_starts: Int64[np.ndarray, " l"]
@@ -217,7 +217,7 @@ class Frustum(NamedTuple):
 
 
 class TraversalScratch(NamedTuple):
-    """Memory of a walk: waiting nodes and blocks, bins and distances of a block, and buckets for sorting."""
+    """Memory of a traversal: pending nodes and blocks, bins and distances of a block, sort buckets."""
 
     stack: Int64[np.ndarray, " s"]
     block_queue: Int64[np.ndarray, " w"]

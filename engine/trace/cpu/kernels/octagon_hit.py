@@ -114,7 +114,7 @@ def intersect_plane(
 def eval_octagon(
     primitive: Float32[np.ndarray, "16"], context_f64: Float64[np.ndarray, " words2"], distance: float
 ) -> tuple[float, float, bool]:
-    """Where the ray meets the plane, in standard deviations, and whether that is inside the octagon."""
+    """Return the hit point on the plane in standard deviations, and whether it is inside the octagon."""
     x = context_f64[RAY_F64] - primitive[MEAN] + distance * context_f64[RAY_F64 + 3]
     y = context_f64[RAY_F64 + 1] - primitive[MEAN + 1] + distance * context_f64[RAY_F64 + 4]
     z = context_f64[RAY_F64 + 2] - primitive[MEAN + 2] + distance * context_f64[RAY_F64 + 5]
@@ -129,13 +129,13 @@ def eval_octagon(
 def eval_alpha(
     primitive: Float32[np.ndarray, "16"], context_f64: Float64[np.ndarray, " words2"], u: float, v: float
 ) -> np.float32:
-    """Alpha of the Gaussian at u, v, rounded to float32."""
+    """Return the alpha of the Gaussian at u, v, rounded to float32."""
     return np.float32(min(primitive[OPACITY] * math.exp(-0.5 * (u * u + v * v)), context_f64[ALPHA_MAX]))
 
 
 @native_callback(types.void(types.CPointer(types.uint64)), fastmath={"contract"})
 def intersect_octagon(arguments: Address) -> None:
-    """RTCIntersectFunctionN for one ray: exact plane hit, octagon test, alpha, insertion."""
+    """Intersect one ray (RTCIntersectFunctionN): exact plane hit, octagon test, alpha, insertion."""
     words = carray(arguments, 6)
     gaussian = np.int64(words[2] & np.uint64(0xFFFFFFFF))
     context_i32 = carray(int32_pointer(words[3]), CONTEXT_WORDS)
@@ -174,7 +174,7 @@ def intersect_octagon(arguments: Address) -> None:
 
 @native_callback(types.void(types.CPointer(types.uint64)), fastmath={"contract"})
 def attenuate_by_octagon(arguments: Address) -> None:
-    """RTCOccludedFunctionN for one ray: takes the ray's transmittance along until too little is left."""
+    """Attenuate one ray (RTCOccludedFunctionN) by a Gaussian until too little transmittance is left."""
     words = carray(arguments, 6)
     gaussian = np.int64(words[2] & np.uint64(0xFFFFFFFF))
     context_f32 = carray(float32_pointer(words[3]), CONTEXT_WORDS)
@@ -198,7 +198,7 @@ def attenuate_by_octagon(arguments: Address) -> None:
 
 @native_callback(types.void(types.CPointer(types.uint64)))
 def octagon_bounds(arguments: Address) -> None:
-    """RTCBoundsFunction: copy the prepared box of a Gaussian."""
+    """Copy the prepared bounding box of a Gaussian (RTCBoundsFunction)."""
     words = carray(arguments, 3)
     gaussian = np.uint64(words[1] & np.uint64(0xFFFFFFFF))
     box = carray(float32_pointer(words[0] + gaussian * np.uint64(24)), 6)

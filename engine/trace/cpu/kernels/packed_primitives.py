@@ -1,4 +1,4 @@
-"""Parameters of flat Gaussians turned into the tracer's records and boxes."""
+"""Packing of flat Gaussians into the tracer's primitives and bounding boxes."""
 
 import math
 
@@ -33,7 +33,7 @@ def rotation_columns(
 
 @device_function(_nrt=False, error_model="numpy")
 def opacity_and_radius(logit: float, q: float) -> tuple[float, float]:
-    """Opacity, and the octagon's corner radius in standard deviations."""
+    """Return the opacity, and the octagon's corner radius in standard deviations."""
     # without overflow at either end
     part = math.exp(-abs(logit))
     opacity = (1.0 if logit > 0 else part) / (1.0 + part)
@@ -67,7 +67,7 @@ def pack_primitive(
     logits: Float32[np.ndarray, " n"],
     q: float,
 ) -> None:
-    """Record of one Gaussian."""
+    """Pack one Gaussian into a row of ``primitives``."""
     r1, r2, r3 = rotation_columns(
         np.float64(quats[i, 0]), np.float64(quats[i, 1]), np.float64(quats[i, 2]), np.float64(quats[i, 3])
     )
@@ -94,7 +94,7 @@ def pack_primitives(
     logits: Float32[np.ndarray, " n"],
     q: float,
 ) -> None:
-    """All records."""
+    """Pack the Gaussians ``first`` to ``last`` (exclusive) into rows of ``primitives``."""
     for i in range(first, last):
         pack_primitive(primitives, i, means, quats, log_scales, logits, q)
 
@@ -158,10 +158,10 @@ def refit_outgrown_boxes(
     q: float,
     padding: float,
 ) -> None:
-    """Give those of ``ids`` that have left their box a new one, and mark them in ``outgrown``.
+    """Enlarge the boxes of those ``ids`` that have left theirs, and mark them in ``outgrown``.
 
-    The new box is larger by ``padding`` and by four times what the Gaussian stuck out, so that one that goes
-    on moving as fast does not need the next one at once.
+    The new box is larger by ``padding`` and by four times the overhang, so that a Gaussian that keeps moving
+    as fast does not need the next one at once.
     """
     for k in range(first, last):
         i = ids[k]

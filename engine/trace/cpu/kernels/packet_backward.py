@@ -82,7 +82,7 @@ class MomentRows(NamedTuple):
 
 
 class PacketBackwardScratch(NamedTuple):
-    """Memory of a thread: the transmittance before each hit, turned normals of a packet, and eight hits."""
+    """Memory of a thread: transmittance before each hit, flipped normals of a packet, and eight hits."""
 
     transmittance_before: Float64[np.ndarray, " h"]
     normals: Float64[np.ndarray, "s 3"]
@@ -117,7 +117,7 @@ def init_moment_rows(
     output_gradients: OutputGradientArrays,
     rows: MomentRows,
 ) -> None:
-    """Rows of zeros for the Gaussians of a packet, and their normals where those have a gradient."""
+    """Clear the moment rows for the Gaussians of a packet, and set their normals where needed."""
     first, slots = packets[packet, 0], packet_hits.slot_counts[packet]
     slot_base, base = first_hit_index(first, limits), rows.firsts[packet]
     means, quats = parameters.means, parameters.quats

@@ -44,10 +44,10 @@ def morton_keys(
     inverse_cell: float,
     keys: UInt64[np.ndarray, " n"],
 ) -> None:
-    """Keys along a Z-order curve, by size class first: factors of four, the large ones in front.
+    """Return keys along a Z-order curve, with the size class (factors of four, large ones first) on top.
 
-    Without the classes one large Gaussian would blow up its small neighbours' box. One that has no octagon
-    may get one before the next build, so it has a place, too; one that is no number has none.
+    Without the classes one large Gaussian would enlarge the box of its small neighbours. A Gaussian without
+    an octagon may get one before the next build, so it has a key, too; one that is not a number has none.
     """
     for i in range(first, last):
         radius = max(np.float64(primitives[i, INNER_RADIUS]), 0.0) / COS_22
@@ -72,7 +72,7 @@ def morton_keys(
 def write_leaf(
     blocks: Float32[np.ndarray, "b 9 8"], slot: int, primitives: Float32[np.ndarray, "n 16"], i: int
 ) -> None:
-    """Mean and legs of Gaussian ``i`` into its lane; a vanished octagon gets legs that are not a number."""
+    """Write mean and legs of Gaussian ``i`` to its lane; a vanished octagon gets not-a-number legs."""
     block, lane = slot // WIDTH, slot % WIDTH
     radius = np.float64(primitives[i, INNER_RADIUS]) / COS_22 * AXIS_MARGIN
     u2 = v2 = 0.0
@@ -179,7 +179,7 @@ def update_leaves(
     ids: Int32[np.ndarray, " u"],
     dirty: Bool[np.ndarray, " b"],
 ) -> None:
-    """Rewrite the lanes of Gaussians whose records changed, and note the blocks that they lie in."""
+    """Rewrite the lanes of Gaussians whose primitives changed, and mark their blocks."""
     for k in range(first, last):
         slot = slots[ids[k]]
         if slot >= 0:

@@ -122,9 +122,9 @@ def find_packet_starts(
     min_cosine: float,
     starts: Int64[np.ndarray, " r1"],
 ) -> int:
-    """First ray of each packet: neighbours in the array that share an origin and look about one way.
+    """Find the first ray of each packet: neighbours in the array with one origin and similar directions.
 
-    Returns the number of packets; ``starts`` has room for one more than there are rays.
+    Returns the number of packets; ``starts`` has one more element than there are rays.
     """
     packets = 0
     first = 0
@@ -160,7 +160,7 @@ def find_candidates(
     traversal: TraversalScratch,
     candidates: Candidates,
 ) -> tuple[Candidates, int]:
-    """Candidates of the packet of rays ``first`` to ``last``, and how many; room grows as needed."""
+    """Find the candidates of the packet of rays ``first`` to ``last`` and return their count."""
     write_frustum(rays, first, last, frustum)
     one_end = len(rays.t_max) == 1
     farthest = rays.t_max[0 if one_end else first]
@@ -199,9 +199,9 @@ def write_packet_primitive(
     origin: tuple[float, float, float],
     frame: Float64[np.ndarray, "15"],
 ) -> None:
-    """One Gaussian's row, as a column of ``block``, for rays from one origin.
+    """Write one Gaussian's row as a column of ``block``, for rays from one origin.
 
-    Differences and turns into the packet's ``frame`` are taken in float64, and only what comes of them is
+    Differences and rotations into the packet's ``frame`` are computed in float64, and only the results are
     rounded.
     """
     x, y, z = primitive[MEAN] - origin[0], primitive[MEAN + 1] - origin[1], primitive[MEAN + 2] - origin[2]
@@ -232,7 +232,7 @@ def write_candidate_blocks(
     frame: Float64[np.ndarray, "15"],
     prefetch_sh: bool,
 ) -> None:
-    """Rows of the candidates for rays from one origin; the last block is filled with lanes that never hit.
+    """Write the rows of the candidates for rays from one origin; the last block is padded with misses.
 
     Harmonics are asked for if hits will be ``prefetch_sh``.
     """

@@ -87,7 +87,7 @@ class RayScratch(NamedTuple):
 
 
 class PacketTrace(NamedTuple):
-    """A packet whose rays are followed: its candidates in order, and what it keeps of its hits.
+    """A packet in progress: its candidates in order, and its stored hits.
 
     The Gaussians that it meets are listed from ``slot_base`` on. ``origin`` is that of its rays, and
     ``frame`` its axis, e and f.
@@ -120,7 +120,7 @@ def allocate_ray_scratch() -> RayScratch:
 
 @njit_no_refcount()
 def sort_ties_by_id(candidates: Candidates, first: int, last: int) -> None:
-    """Order the hits ``first`` to ``last``, which are sorted by distance, by id where they share one."""
+    """Order the hits ``first`` to ``last``, which are sorted by distance, by id where distances are equal."""
     pending, numbers, ids = candidates.hit_keys, candidates.hit_candidates, candidates.ids
     for i in range(first + 1, last):
         key = pending[i]
@@ -205,7 +205,7 @@ def eval_alphas(candidates: Candidates, first: int, last: int, alpha_max: float)
 def prefetch_colors(
     new_hits: int, candidate_indices: Int64[np.ndarray, "8"], ids: Int32[np.ndarray, " c"], scene: PackedScene
 ) -> None:
-    """Ask for what the hits ``new_hits`` show at once, so that memory is not waited for one by one."""
+    """Prefetch the color data of the hits ``new_hits``, so that memory latencies overlap."""
     sh_at, sh_bytes = scene.sh.ctypes.data, scene.sh.shape[1] * 12
     while new_hits != 0:
         i = ids[candidate_indices[lowest_bit(new_hits)]]
@@ -273,7 +273,7 @@ def fill_slots(
     packet: PacketTrace,
     scratch: RayScratch,
 ) -> int:
-    """Give the hits ``new_hits`` a slot of their packet each, with its colour and normal.
+    """Give each of the hits ``new_hits`` a slot of the packet, with its color and normal.
 
     Returns:
         The number of slots.
@@ -286,12 +286,14 @@ def fill_slots(
         new_hits &= new_hits - 1
         number = scratch.candidate_indices[k]
         scratch.slots[k] = candidates.slots[number] = slot_count
-        shown = candidates.color_normals[slot_count]
-        eval_color_normal(shown, ids[number], forward.scene, forward.limits, packet.origin, scratch.basis)
+        color_normal = candidates.color_normals[slot_count]
+        eval_color_normal(
+            color_normal, ids[number], forward.scene, forward.limits, packet.origin, scratch.basis
+        )
         if forward.is_recording:
             packet.hits.slot_ids[packet.slot_base + slot_count] = ids[number]
             for channel in range(3):
-                packet.hits.slot_rgb[packet.slot_base + slot_count, channel] = shown[channel]
+                packet.hits.slot_rgb[packet.slot_base + slot_count, channel] = color_normal[channel]
         slot_count += 1
     return slot_count
 
@@ -300,7 +302,7 @@ def fill_slots(
 def store_hits(
     keys_at: Address, count: int, first_hit: int, packet: PacketTrace, scratch: RayScratch
 ) -> None:
-    """Keep the first ``count`` of eight hits from place ``first_hit`` on for the backward pass."""
+    """Store the first ``count`` of eight hits from place ``first_hit`` on for the backward pass."""
     candidates, hits, packet_hits = packet.candidates, packet.forward.hits, packet.hits
     tables = HitTables(candidates.us.ctypes.data, candidates.vs.ctypes.data)
     out = HitStore(

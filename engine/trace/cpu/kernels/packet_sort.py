@@ -1,4 +1,4 @@
-"""The order in which a packet's candidates are tested."""
+"""Sort of a packet's candidates into the order in which they are tested."""
 
 import numpy as np
 from jaxtyping import Int32, UInt64
@@ -61,7 +61,7 @@ def sort_by_distance(candidates: Candidates, count: int, histogram: Int32[np.nda
 
 @njit_no_refcount()
 def copy_candidates_unsorted(candidates: Candidates, count: int, order: Int32[np.ndarray, " n"]) -> None:
-    """Leave the candidates in the order in which they were found, where none is needed."""
+    """Copy the candidates in the order in which they were found, where no order is needed."""
     for b in range((count + WIDTH - 1) // WIDTH):
         candidates.block_ray_masks[b] = 0
     for k in range(count):

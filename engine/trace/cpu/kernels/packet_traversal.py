@@ -1,7 +1,7 @@
-"""The walk of a packet: one pyramid around its rays, and what reaches into it.
+"""Traversal of the hierarchy by a packet: one frustum around its rays, and what overlaps it.
 
-Boxes and ellipses are tested in float32, eight at once, with room for rounding: what is found may lie just
-beside the pyramid, but nothing that a ray meets is left out.
+Boxes and ellipses are tested in float32, eight at once, with a margin for rounding: a candidate may lie just
+beside the frustum, but no Gaussian that a ray meets is left out.
 """
 
 import math
@@ -125,10 +125,9 @@ def gather_candidates(
     traversal: TraversalScratch,
     candidates: Candidates,
 ) -> int:
-    """Gather the Gaussians whose ellipse a ray of the pyramid may meet before ``t_max``; return how many.
+    """Gather the Gaussians whose ellipse a ray of the frustum may meet before ``t_max``; return how many.
 
-    Only as many as there is room for are written. Blocks are asked for when their box is reached, and tested
-    when many wait.
+    Only as many as fit are written. Blocks are prefetched when their box is reached, and tested in batches.
     """
     stack, blocks, level_starts = traversal.stack, traversal.block_queue, bvh.level_starts
     ox, oy, oz = np.float32(origin[0]), np.float32(origin[1]), np.float32(origin[2])

@@ -1,7 +1,7 @@
 """A stable parallel sort by integer keys.
 
-Hits are sorted by Gaussian, so that gradients are summed in one fixed order, and Gaussians along the curve of
-the packets' hierarchy.
+Hits are sorted by Gaussian, so that gradients are summed in one fixed order, and Gaussians along the Z-order
+curve of the packets' hierarchy.
 """
 
 import numpy as np
@@ -128,7 +128,7 @@ def stable_argsort(
 def sort_by_gaussian(
     keys: Int[np.ndarray, " e"], gaussian_count: int, threads: int
 ) -> tuple[Int32[np.ndarray, " e"], Int[np.ndarray, " e"], Int64[np.ndarray, " s1"]]:
-    """Stable order of ``keys`` and where each key begins.
+    """Return the stable order of ``keys`` and the first position of each key.
 
     The result does not depend on ``threads``. Returns (order, sorted keys, starts) with one more start
     than there are distinct keys.

@@ -1,4 +1,4 @@
-"""Which rays of a packet may meet which candidate, as the bits of one word, and at which distance.
+"""Ray masks: the rays of a packet that may hit each candidate, as bits of one word, and the distances.
 
 A ray is the point (a, b) where it passes the plane at distance one along the packet's axis. The outline of a
 candidate's ellipse, seen from the packet's origin, lies between two values of a and two of b; the rays
@@ -106,7 +106,7 @@ def ellipse_bins(
     bins: Address,
     distances: Address,
 ) -> Intrinsic:
-    """Outlines and distances of the eight ellipses of a block of leaves, seen from o; all float32.
+    """Write the bins and distances of the eight ellipses of a block of leaves, seen from o; all float32.
 
     Writes the first and last bin along a, then along b, as rows of eight int32 to ``bins``, and two rows to
     ``distances``: the least distance at which a ray of the packet can meet the ellipse, and that at which
@@ -162,7 +162,7 @@ def ellipse_bins(
 
 
 def dot(a: Sequence[Vector], b: Sequence[Vector]) -> Vector:
-    """Sum of products."""
+    """Return the dot product of two vectors with three components."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 

@@ -1,4 +1,4 @@
-"""Single rays and vectors out of bundles, where one origin, limit or viewer may stand for all."""
+"""Access to single rays and vectors of batches, where one origin, limit or viewer may stand for all."""
 
 import math
 
@@ -46,7 +46,7 @@ def ray_slopes(rays: RayArrays, r: int, frame: Float64[np.ndarray, "15"]) -> tup
 
 @njit_no_refcount(forceinline=True)
 def primitive_vector(primitive: Float32[np.ndarray, "16"], offset: int) -> tuple[float, float, float]:
-    """Three numbers of a record in float64."""
+    """Return three numbers of a primitive in float64."""
     return np.float64(primitive[offset]), np.float64(primitive[offset + 1]), np.float64(primitive[offset + 2])
 
 
@@ -64,7 +64,7 @@ def ray_t_view_origin(rays: RayArrays, r: int) -> float:
 
 @njit_no_refcount(forceinline=True)
 def ray_t_backface_cull(rays: RayArrays, r: int, limits: TraceLimits) -> np.float32:
-    """Up to where ray ``r`` passes what it would meet from behind; a single distance stands for all rays."""
+    """Return up to where ray ``r`` passes Gaussians that it meets from behind."""
     if limits.flip_normal_cos == 0.0:  # normals have no side
         return np.float32(0.0)
     return rays.t_backface_cull[r if len(rays.t_backface_cull) > 1 else 0]
@@ -74,7 +74,7 @@ def ray_t_backface_cull(rays: RayArrays, r: int, limits: TraceLimits) -> np.floa
 def facing_sign(
     to_mean: tuple[float, float, float], normal: tuple[float, float, float], limits: TraceLimits
 ) -> float:
-    """1, or -1 where ``normal`` is turned to the viewer.
+    """Return 1, or -1 where ``normal`` is flipped towards the viewer.
 
     See :class:`octasplat.engine.trace.protocol.TraceSettings`.
 

@@ -104,7 +104,7 @@ class PacketScratch(NamedTuple):
 
 @device_function(error_model="numpy")
 def allocate_aligned_rows(rows: int, lanes: int) -> Float32[np.ndarray, "rows lanes"]:
-    """Rows of so many float32, a multiple of sixteen, on cache lines."""
+    """Allocate rows of so many float32, a multiple of sixteen, aligned to cache lines."""
     return allocate_aligned_float64(rows * lanes // 2).view(np.float32).reshape((rows, lanes))
 
 
@@ -146,7 +146,7 @@ def write_ray_rows(
 
 @njit_no_refcount(forceinline=True)
 def group_lanes(ray_mask: int, group: int) -> np.int64:
-    """Those of a group of rays."""
+    """Return the lanes of a group of rays."""
     return np.int64((ray_mask >> np.uint64(GROUP_SIZE * group)) & GROUP_MASK)
 
 
@@ -162,17 +162,21 @@ def trace_packet_shared_sort(
     count: int,
     scratch: PacketScratch,
 ) -> int:
-    """Let the rays ``first`` to ``last`` see the sorted candidates; returns how many were met."""
-    scene, limits, seen = forward.scene, forward.limits, scratch.state_rows
+    """Composite the sorted candidates into the rays ``first`` to ``last``; returns how many were hit."""
+    scene, limits, state_rows = forward.scene, forward.limits, scratch.state_rows
     keys, found, masks = candidates.keys, candidates.curve_indices, candidates.ray_masks
     records_at, sh_at = scene.primitives.ctypes.data, scene.sh.ctypes.data
     sh_bytes = scene.sh.shape[1] * 12
-    rays_at, seen_at, met_at = scratch.ray_rows.ctypes.data, seen.ctypes.data, scratch.hit_rows.ctypes.data
+    rays_at, seen_at, met_at = (
+        scratch.ray_rows.ctypes.data,
+        state_rows.ctypes.data,
+        scratch.hit_rows.ctypes.data,
+    )
     least, most = np.float32(limits.eps1), np.float32(limits.max_hits)
     alpha_max = np.float32(limits.alpha_max)
     write_ray_rows(forward.rays, first, last, frame, scratch.ray_rows)
-    seen[:, :] = np.float32(0.0)
-    seen[TRANSMITTANCE, : last - first] = np.float32(1.0)
+    state_rows[:, :] = np.float32(0.0)
+    state_rows[TRANSMITTANCE, : last - first] = np.float32(1.0)
     alive = ~np.uint64(0) >> np.uint64(PACKET_RAYS - (last - first))
     met = 0
     for k in range(count):
@@ -240,7 +244,7 @@ def store_packet_hits(
     packet_hits: SharedSortHits,
     start: int,
 ) -> None:
-    """Keep what a packet has met from place ``start`` on."""
+    """Store the hits of a packet from place ``start`` on."""
     packet_hits.starts[packet], packet_hits.counts[packet] = start, hit_count
     for k in range(9):
         packet_hits.frames[packet, k] = frame[k]

@@ -52,7 +52,7 @@ A row of :mod:`octasplat.engine.trace.cpu.kernels.packet_backward` begins so.
 
 
 def _group_rows(builder: ir.IRBuilder, address: ir.Value, group: ir.Value) -> VectorRows:
-    """Rows of 64 numbers, of which a group's sixteen."""
+    """Return the sixteen lanes of a group in rows of 64 numbers."""
     offset = builder.mul(group, ir.Constant(I64, GROUP_SIZE * 4))
     return VectorRows(builder, builder.add(address, offset), FLOAT16, row_bytes=PACKET_RAYS * 4)
 
@@ -69,7 +69,7 @@ def _mask_lanes(builder: ir.IRBuilder, mask: ir.Value, vector: Vector) -> Vector
 
 
 def _plane_uv(rays: VectorRows, primitive: Callable[[int], Vector]) -> tuple[Vector, Vector, Vector, Vector]:
-    """u, v, the cosine times the length over the way along the axis, and one over that."""
+    """Return u, v, the cosine times the length over the way along the axis, and one over that."""
 
     def along(row: int) -> Vector:
         return primitive(row + 2) * rays[SLOPE_B] + (primitive(row + 1) * rays[SLOPE_A] + primitive(row))
@@ -140,7 +140,7 @@ def composite_group16(
     ray_mask: int,
     min_transmittance: float,
 ) -> Intrinsic:
-    """Show a Gaussian to those rays of a group, the ``ray_mask``, that have ``hit_rows`` it.
+    """Composite a Gaussian into those rays of a group, the ``ray_mask``, that have ``hit_rows`` it.
 
     ``normal`` are three numbers, turned. Bit k of the result: ray k has ``min_transmittance`` behind it.
     """
@@ -181,7 +181,7 @@ def backward_group16(
     ray_mask: int,
     alpha_max: float,
 ) -> Intrinsic:
-    """Go back before a Gaussian that those rays of a group, the ``ray_mask``, have met.
+    """Propagate gradients back over a Gaussian that those rays of a group, the ``ray_mask``, have hit.
 
     With h = dL/d ln(alpha) adds to the ``moments``, rows of sixteen, lane by lane: h times 1, u, v, u^2, u v,
     v^2, u (u^2 + v^2) and v (u^2 + v^2); weights, counts, weights times errors and times dL by each colour.

@@ -68,7 +68,7 @@ class PacketRay(NamedTuple):
 
 
 class HitBuffer(NamedTuple):
-    """Where the hits of a ray are kept: addresses of uint64 keys, float32 numbers and int32 candidates."""
+    """Hit buffer of a ray: addresses of its uint64 keys, float32 numbers and int32 candidates."""
 
     keys: Address
     exponents: Address
@@ -136,9 +136,9 @@ def intersect_block8(
             (farthest <= rows[INNER_RADIUS_ROW]) & (abs(slant) >= per_axis * 1e-6) & (t > t_min) & (t < t_max)
         )
 
-        gapless = CompressedStore(context, builder, met.value)
+        compressed = CompressedStore(context, builder, met.value)
         places = builder.add(splat(builder, tail, I64), ir.Constant(LONG8, list(range(LANES))))
-        distance = builder.zext(gapless.compress(builder.bitcast(t.value, INT8)), LONG8)
+        distance = builder.zext(compressed.compress(builder.bitcast(t.value, INT8)), LONG8)
         key = builder.or_(builder.shl(distance, ir.Constant(LONG8, [32] * LANES)), places)
         store(builder, key, element_address(builder, keys, tail, 8))
         number = builder.add(
@@ -146,9 +146,9 @@ def intersect_block8(
         )
         power = (u * u + v * v) * -0.5
         for vector, array in ((power, powers), (rows[ALPHA_0], opacities), (u, us), (v, vs)):
-            gapless.compress_store(vector.value, element_address(builder, array, tail, 4))
-        gapless.compress_store(number, element_address(builder, numbers, tail, 4))
-        return gapless.count()
+            compressed.compress_store(vector.value, element_address(builder, array, tail, 4))
+        compressed.compress_store(number, element_address(builder, numbers, tail, 4))
+        return compressed.count()
 
     return signature, codegen
 
@@ -157,7 +157,7 @@ def intersect_block8(
 def eval_alphas8(
     typingctx: TypingContext, exponents: Address, opacities: Address, first: int, alpha_max: float
 ) -> Intrinsic:
-    """Eight exponents from ``first`` on become alphas: opacity exp(power), at most the max; all float32.
+    """Evaluate eight alphas from exponents: opacity exp(power), at most the maximum; all float32.
 
     The exponential is right to a relative 1e-7 for |power| < 87.
     """
@@ -297,7 +297,7 @@ def lookup_slots8(
     slots: Address,
     depth_sums: Address,
 ) -> Intrinsic:
-    """Which candidates the first ``count`` of eight hits are, and under which slots their packet knows them.
+    """Look up the candidates of the first ``count`` of eight hits, and their slots in the packet.
 
     Writes ``candidate_indices``, read from ``candidate_table`` at the places in the keys, and ``slots``,
     both int64; adds weights times distances to the eight ``depth_sums``. Bit k of the result: hit k has no

@@ -95,7 +95,7 @@ def backward_hits8(
     ray_gradients: Address,
     out: HitGradients8,
 ) -> Intrinsic:
-    """Go backwards through ``count`` of eight hits and add to the rows of their Gaussians.
+    """Propagate gradients back through ``count`` of eight hits, into the rows of their Gaussians.
 
     Args:
         typingctx: numba's.
@@ -210,7 +210,7 @@ def _accumulate_moments(
 
 
 def _transpose8(builder: ir.IRBuilder, rows: Sequence[ir.Value]) -> list[ir.Value]:
-    """Eight vectors of eight float32, rows and columns exchanged."""
+    """Transpose eight vectors of eight float32."""
 
     def mixed(a: ir.Value, b: ir.Value, order: list[int]) -> ir.Value:
         return builder.shuffle_vector(a, b, ir.Constant(INT8, order))

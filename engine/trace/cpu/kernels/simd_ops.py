@@ -1,4 +1,4 @@
-"""What vectors of eight are made with: constants, lanes that move, and arrays at an address."""
+"""Operations on vectors of eight lanes: constants, lane moves, and loads and stores by address."""
 
 from collections.abc import Callable
 
@@ -21,14 +21,14 @@ def prefix_scan(
     neutral: float,
     reverse: bool = False,
 ) -> Vector:
-    """Each lane with all before it, or behind it, combined in three steps."""
+    """Combine each lane with all before it, or behind it, in three steps."""
     for step in (1, 2, 4):
         vector = combine(vector, shift_lanes(builder, vector, -step if reverse else step, neutral))
     return vector
 
 
 def shift_lanes(builder: ir.IRBuilder, vector: Vector, offset_lanes: int, fill_value: float) -> Vector:
-    """Lane k moves to lane k + ``offset_lanes``; ``fill_value`` comes in."""
+    """Move lane k to lane k + ``offset_lanes``; ``fill_value`` enters."""
     fill = ir.Constant(vector.value.type, [float(fill_value)] * LANES)
     places = [k - offset_lanes if 0 <= k - offset_lanes < LANES else LANES for k in range(LANES)]
     order = ir.Constant(ir.VectorType(I32, LANES), places)
@@ -67,7 +67,7 @@ def key_distances(builder: ir.IRBuilder, key: ir.Value) -> ir.Value:
 
 
 def gather(builder: ir.IRBuilder, address: ir.Value, indices: ir.Value, kind: ir.Type) -> ir.Value:
-    """Eight elements of ``kind`` at places of an array."""
+    """Gather eight elements of ``kind`` at indices of an array."""
     element = kind.element
     size, name = {FLOAT: (4, "f32"), DOUBLE: (8, "f64"), I32: (4, "i32")}[element]
     pointers = ir.VectorType(ir.IntType(8).as_pointer(), LANES)
@@ -114,7 +114,7 @@ class CompressedStore:
         return self.builder.ctpop(self.bits)
 
     def compress(self, value: ir.Value) -> ir.Value:
-        """Eight lanes of 32 bits."""
+        """Compress eight lanes of 32 bits by the mask, without gaps."""
         if not self.use_permute:
             return self._compress_avx512(value)
         return self._permute(value, self.permutation)

@@ -28,7 +28,7 @@ def _shuffle(builder: ir.IRBuilder, vector: ir.Value, lanes: list[int]) -> ir.Va
 
 
 def _load_basis(builder: ir.IRBuilder, basis: ir.Value) -> list[Vector]:
-    """Sixteen doubles, as four vectors in which each stands three times."""
+    """Load sixteen doubles as four vectors in which each is repeated three times."""
     rows = VectorRows(builder, basis, DOUBLE8)
     low, high = (builder.fptrunc(rows[k].value, FLOAT8) for k in range(2))
     whole = builder.shuffle_vector(low, high, _shuffle_mask(list(range(HARMONICS))))
@@ -39,7 +39,7 @@ def _load_basis(builder: ir.IRBuilder, basis: ir.Value) -> list[Vector]:
 
 
 def _tile_channels(builder: ir.IRBuilder, rgb: Sequence[ir.Value]) -> Vector:
-    """Three doubles, four times over."""
+    """Return three doubles, repeated four times."""
     vector = ir.Constant(FLOAT4, [0.0] * 4)
     for channel, value in enumerate(rgb):
         vector = builder.insert_element(vector, builder.fptrunc(value, FLOAT), ir.Constant(I32, channel))

@@ -101,7 +101,7 @@ class Vector:
         )
 
     def select(self, if_true: "Vector | float", if_false: "Vector | float") -> "Vector":
-        """Lanes of ``if_true`` where this comparison holds, else those of ``if_false``."""
+        """Return lanes of ``if_true`` where this comparison holds, else those of ``if_false``."""
         lanes = if_true if isinstance(if_true, Vector) else if_false
         assert isinstance(lanes, Vector), "one of the two must be a vector"
         return Vector(
@@ -109,7 +109,7 @@ class Vector:
         )
 
     def sqrt(self) -> "Vector":
-        """Return square roots."""
+        """Return the square root of each lane."""
         kind = self.value.type
         name = "llvm.sqrt.v8f64" if kind == DOUBLE8 else "llvm.sqrt.v8f32"
         function = cgutils.get_or_insert_function(self.builder.module, ir.FunctionType(kind, [kind]), name)
@@ -120,7 +120,7 @@ class Vector:
         return Vector(self.builder, self.builder.fpext(self.value, DOUBLE8))
 
     def to_int32(self) -> "Vector":
-        """Towards zero, as int32; the lanes must fit."""
+        """Convert to int32, rounded towards zero; the lanes must fit."""
         return Vector(self.builder, self.builder.fptosi(self.value, ir.VectorType(ir.IntType(32), LANES)))
 
     def to_bitmask(self) -> ir.Value:
@@ -195,7 +195,7 @@ def sum_abs(vectors: Sequence[Vector]) -> Vector:
 def boxes_in_frustum(
     typingctx: TypingContext, node: Address, planes: Address, ox: float, oy: float, oz: float
 ) -> Intrinsic:
-    """Bit k: box k of a node reaches into the pyramid with apex o and the five inward ``planes``.
+    """Return a mask; bit k: box k of a node overlaps the frustum with apex o and five inward ``planes``.
 
     Row s of the planes is a normal, its positive parts and its negative ones, float32. A box turned inside
     out, whose corners are infinite, is in no pyramid.
@@ -227,7 +227,7 @@ def boxes_in_frustum(
 def ellipses_in_frustum(
     typingctx: TypingContext, block: Address, planes: Address, ox: float, oy: float, oz: float
 ) -> Intrinsic:
-    """Bit k: ellipse k of a block of leaves reaches into the pyramid; see :func:`boxes_in_frustum`.
+    """Return a mask; bit k: ellipse k of a block overlaps the frustum; see :func:`boxes_in_frustum`.
 
     Its farthest point inwards along a normal lies sqrt(u^2 + v^2) beyond its centre, u and v being its legs
     along the normal.
@@ -256,7 +256,7 @@ def ellipses_in_frustum(
 
 
 def _plane_component(builder: ir.IRBuilder, planes: ir.Value, side: int, column: int) -> Vector:
-    """One number of a normal's row in all lanes."""
+    """Broadcast one number of a normal's row to all lanes."""
     words = builder.inttoptr(planes, ir.FloatType().as_pointer())
     place = ir.Constant(I64, side * PLANE_WORDS + column)
     return broadcast(builder, builder.load(builder.gep(words, [place])))

@@ -45,7 +45,7 @@ RAY_ID_MASK = (1 << 28) - 1
 
 
 class HitGradients(NamedTuple):
-    """What each hit of the replayed rays adds to its Gaussian, ray after ray.
+    """Contributions of each hit of the replayed rays to the gradient of its Gaussian, ray after ray.
 
     ``ray_flags`` has a hit's ray in the bits below 2^28; ``h_alpha`` is dL/d ln(alpha), ``g_t`` is dL/dt.
     """
@@ -93,7 +93,7 @@ def backward_ray(
     output_gradients: OutputGradientArrays,
     hit_gradients: HitGradients,
 ) -> None:
-    """dL/dalpha_k = <g, T_k c_k - (C - prefix_k)/(1 - alpha_k)> of the hits of ray ``r``, for every channel.
+    """Write dL/dalpha_k = <g, T_k c_k - (C - prefix_k)/(1 - alpha_k)> of the hits of ray ``r``, per channel.
 
     They go to ``hit_gradients`` from ``first`` on.
     """
@@ -175,7 +175,7 @@ def backward_rays(
     output_gradients: OutputGradientArrays,
     hit_gradients: HitGradients,
 ) -> None:
-    """:func:`backward_ray` on the rays ``ray_indices``.
+    """Run :func:`backward_ray` on the rays ``ray_indices``.
 
     ``offsets`` are the places of their hits in ``hit_gradients``.
     """

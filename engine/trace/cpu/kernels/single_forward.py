@@ -174,7 +174,7 @@ def trace_rays(
     rays_per_chunk: int,
     counter: Int64[np.ndarray, "1"],
 ) -> None:
-    """:func:`trace_rays_worker` with room for the harmonics."""
+    """Run :func:`trace_rays_worker` with memory for the harmonics."""
     trace_rays_worker(embree, forward, ray_indices, rays_per_chunk, counter, np.empty(16, np.float64))
 
 

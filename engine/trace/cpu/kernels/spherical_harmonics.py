@@ -103,7 +103,7 @@ def eval_ray_view_basis(
     direction: tuple[float, float, float],
     t_view_origin: float,
 ) -> tuple[float, float, float, float]:
-    """:func:`eval_view_basis` for a ray, ``to_mean`` from its origin.
+    """Evaluate :func:`eval_view_basis` for a ray, ``to_mean`` from its origin.
 
     No slope where its viewer is at infinity.
     """
@@ -145,7 +145,7 @@ def write_basis_gradient(
 def mean_gradient(
     basis_gradient: Float64[np.ndarray, " k"], count: int, view: tuple[float, float, float, float]
 ) -> tuple[float, float, float]:
-    """Gradient by a Gaussian's mean, through the direction in which its colour is seen.
+    """Return the gradient by a Gaussian's mean through its viewing direction.
 
     ``basis_gradient`` are the gradients by the values of its harmonics; ``view`` is that direction and one
     over the distance, as :func:`eval_view_basis` gives them; 0 for a viewer at infinity, where the mean
