@@ -124,8 +124,10 @@ def fibonacci_sphere(count: int) -> Float[np.ndarray, "s 3"]:
     """Return unit directions spread evenly over the sphere (Fibonacci spiral).
 
     >>> directions = fibonacci_sphere(100)
-    >>> bool(np.allclose(np.linalg.norm(directions, axis=1), 1.0)), bool((abs(directions.mean(axis=0)) < 0.05).all())
-    (True, True)
+    >>> bool(np.allclose(np.linalg.norm(directions, axis=1), 1.0))
+    True
+    >>> bool((abs(directions.mean(axis=0)) < 0.05).all())
+    True
     """
     z = 1 - 2 * (np.arange(count) + 0.5) / count
     angle = _GOLDEN_ANGLE * np.arange(count)
