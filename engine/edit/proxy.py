@@ -55,7 +55,7 @@ class Proxy:
 
     @property
     def diagonal(self) -> float:
-        """Diagonal of the bounding box, world units."""
+        """Return the diagonal of the bounding box in world units."""
         return float(np.linalg.norm(np.ptp(self.vertices_world, axis=0)))
 
     def is_mirrored(self, vertices_world: Float64[np.ndarray, "v 3"]) -> bool:

@@ -30,7 +30,7 @@ class Curve:
 
     @property
     def path(self) -> str:
-        """The points as the ``points`` attribute of an SVG polyline."""
+        """Return the points as the ``points`` attribute of an SVG polyline."""
         return " ".join(f"{x:g},{y:g}" for x, y in self.points)
 
 
@@ -87,7 +87,7 @@ _CHARTS = (
 
 
 def training_charts(events: Sequence[Row]) -> list[Chart]:
-    """Charts of PSNR, loss and the number of Gaussians, each over iterations and over seconds.
+    """Return charts of PSNR, loss and the number of Gaussians, each over iterations and over seconds.
 
     Args:
         events: Rows of ``events.jsonl``. Where a resumed run repeats an iteration, the later row counts.
@@ -217,7 +217,7 @@ def _padded_range(low: float, high: float) -> tuple[float, float]:
 
 
 def _linear_ticks(low: float, high: float, about: int) -> list[float]:
-    """Round numbers within a range, ``about`` of them."""
+    """Return round numbers within a range, ``about`` of them."""
     raw = (high - low) / about
     power = 10.0 ** math.floor(math.log10(raw))
     step = next(power * f for f in (1, 2, 2.5, 5, 10) if power * f >= raw * 0.999)
@@ -226,7 +226,7 @@ def _linear_ticks(low: float, high: float, about: int) -> list[float]:
 
 
 def _time_ticks(low: float, high: float) -> list[float]:
-    """Whole seconds, minutes or hours within a range."""
+    """Return whole seconds, minutes or hours within a range."""
     round_spans = (1, 2, 5, 10, 20, 30, 60, 120, 300, 600, 1200, 1800, 3600, 7200, 14400, 28800, 86400)
     step = next((span for span in round_spans if (high - low) / span <= 5), None)
     if step is None or high - low < 3:
@@ -235,7 +235,7 @@ def _time_ticks(low: float, high: float) -> list[float]:
 
 
 def _log_ticks(low: float, high: float) -> list[float]:
-    """Logarithms of 1, 2 and 5 times the powers of ten within a range; fewer where it is wide."""
+    """Return logarithms of 1, 2 and 5 times powers of ten within a range; fewer where it is wide."""
     factors = (1,) if high - low > 2.5 else (1, 2, 5) if high - low > 0.5 else (1, 1.5, 2, 3, 4, 5, 6, 8)
     powers = range(math.floor(low), math.ceil(high) + 1)
     steps = [power + math.log10(factor) for power in powers for factor in factors]

@@ -123,7 +123,7 @@ class GroundTruth:
 
     @property
     def views(self) -> tuple[str, ...]:
-        """Names of the views with maps."""
+        """Return the names of the views with maps."""
         return self.content.test.truth_views
 
     @property
@@ -134,20 +134,20 @@ class GroundTruth:
 
     @property
     def environment(self) -> Path | None:
-        """The map that lit the photographs."""
+        """Return the environment map that lit the photographs."""
         train = self.content.environment.train
         return None if train is None else self._map(train)
 
     @property
     def relit_folders(self) -> tuple[tuple[Path, Path], ...]:
-        """Folders of pictures under other light, each with its map."""
+        """Return the folders of images under other light, each with its map."""
         root = self.path.parent
         return tuple(
             (root / folder, self._map(PurePosixPath(folder).name)) for folder in self.content.relight.folders
         )
 
     def relit_image(self, folder: Path, name: str, max_side_px: int) -> Float32[np.ndarray, "h w 4"]:
-        """Display colours times coverage, and coverage, of a view under other light, shrunk to a side.
+        """Return premultiplied display colors and coverage of a view under other light, downscaled.
 
         Raises:
             DatasetError: the picture is missing or damaged, or has no alpha.
@@ -240,7 +240,7 @@ def read_ground_truth(path: Path) -> GroundTruth:
 
 
 def _decode(stored: Float64[np.ndarray, "*shape"], text: str) -> Float32[np.ndarray, "*shape"]:
-    """Values by the formula in a sentence: v over a number, times one, plus one."""
+    """Decode values by a formula in a sentence: v over a number, times one, plus one."""
     match = _FORMULA.search(text)
     assert match is not None
     by, times, plus = (

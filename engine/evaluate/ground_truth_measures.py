@@ -176,7 +176,7 @@ def measure_relit(
     true_srgb: Sequence[Float32[np.ndarray, "h w 4"]],
     names: Sequence[tuple[str, str]],
 ) -> dict[str, object]:
-    """Measures of pictures under other light.
+    """Measure images under other light.
 
     Args:
         pictures: what is measured.

@@ -43,7 +43,7 @@ GROUND_TRUTH_DEFINITIONS: dict[str, str] = {
 def normal_angles_degrees(
     normal_world: Float[np.ndarray, "*n 3"], true_world: Float[np.ndarray, "*n 3"]
 ) -> Float64[np.ndarray, "*n"]:
-    """Angles between unit vectors; 90 where the first is 0."""
+    """Return angles between unit vectors; 90 where the first is 0."""
     cosine = (normal_world.astype(np.float64) * true_world).sum(axis=-1)
     sine = np.linalg.norm(np.cross(normal_world.astype(np.float64), true_world), axis=-1)
     angle = np.degrees(np.arctan2(sine, cosine))
@@ -62,12 +62,12 @@ def intersection_over_union(one: Bool[np.ndarray, "h w"], other: Bool[np.ndarray
 
 
 def to_display(linear: Float64[np.ndarray, "*shape"]) -> Float64[np.ndarray, "*shape"]:
-    """Display values of linear ones, cut to [0, 1]."""
+    """Convert linear values to display values, clipped to [0, 1]."""
     return linear_to_srgb(np.clip(linear, 0.0, 1.0))
 
 
 def compress_radiance(linear: Float64[np.ndarray, "*shape"]) -> Float64[np.ndarray, "*shape"]:
-    """Radiance without an upper limit brought below 1: x / (1 + x)."""
+    """Compress unbounded radiance below 1: x / (1 + x)."""
     return linear / (1.0 + linear)
 
 
@@ -76,7 +76,7 @@ def pooled_psnr(
     true: Float[np.ndarray, "n 3"],
     weights: Float[np.ndarray, " n"] | None = None,
 ) -> float:
-    """PSNR in dB for a peak of 1 over all rows; infinite where nothing differs."""
+    """Return the PSNR in dB for a peak of 1 over all rows; infinite where nothing differs."""
     squared = np.square(values.astype(np.float64) - true).mean(axis=1)
     error = float(np.average(squared, weights=weights))
     return float("inf") if error == 0 else float(-10.0 * np.log10(error))
@@ -117,7 +117,7 @@ def fit_channel_scales(
 def environment_errors(
     ours: EnvironmentMap, true: EnvironmentMap
 ) -> tuple[float, float, Float64[np.ndarray, "3"]]:
-    """PSNR of a map against the true one, raw and with one factor a channel, and these factors.
+    """Return the PSNR of a map against the true one, raw and with one factor per channel, and the factors.
 
     Ours is looked up at the pixels of the true map, bilinearly.
     """
@@ -152,5 +152,5 @@ def z_depth(
     directions_world: Float32[np.ndarray, "h w 3"],
     axis_world: Float64[np.ndarray, "3"],
 ) -> Float64[np.ndarray, "h w"]:
-    """Distances along rays as distances along the camera's axis."""
+    """Convert distances along rays to distances along the camera's axis."""
     return depth.astype(np.float64) * (directions_world.astype(np.float64) @ axis_world)

@@ -86,7 +86,7 @@ def ssim(
     reference: Float32[np.ndarray, "h w 3"],
     weight: Float32[np.ndarray, "h w"] | None = None,
 ) -> float:
-    """SSIM as in 3D Gaussian Splatting: windows reach over the border, where the images count as black."""
+    """Return SSIM as in 3D Gaussian Splatting: windows reach over the border, with zero padding."""
     return ssim_both(render, reference, weight)[0]
 
 
@@ -95,7 +95,7 @@ def ssim_valid(
     reference: Float32[np.ndarray, "h w 3"],
     weight: Float32[np.ndarray, "h w"] | None = None,
 ) -> float:
-    """SSIM as first published: only windows that lie wholly inside the image count.
+    """Return SSIM as first published: only windows completely inside the image count.
 
     Not-a-number when the image is smaller than the window of 11 pixels.
     """
@@ -126,7 +126,7 @@ def ms_ssim(
     reference: Float32[np.ndarray, "h w 3"],
     weight: Float32[np.ndarray, "h w"] | None = None,
 ) -> float | None:
-    """Multi-scale SSIM over five scales, windows wholly inside.
+    """Return multi-scale SSIM over five scales, with windows completely inside the image.
 
     Negative means are cut to 0, per channel and scale, and the channels averaged last. With ``weight`` the
     means are over the windows around pixels that count; a pixel of a coarser scale counts by the mean of
@@ -158,7 +158,7 @@ def flip(
     reference: Float32[np.ndarray, "h w 3"],
     weight: Float32[np.ndarray, "h w"] | None = None,
 ) -> FlipError:
-    """LDR-FLIP: what a viewer notices when the two images alternate.
+    """Return LDR-FLIP: the differences that a viewer notices when the two images alternate.
 
     Computed by NVIDIA's own library for a screen of 67 pixels per degree. With ``weight`` the mean is over
     the pixels that count, not-a-number where none does.
@@ -219,7 +219,7 @@ def _inner(values: Float[np.ndarray, "h w *c"]) -> Float[np.ndarray, "a b *c"]:
 
 
 def _halved(image: Float64[np.ndarray, "h w c"]) -> Float64[np.ndarray, "a b c"]:
-    """Means of 2x2 blocks; odd sides get a black line before them, which counts as image."""
+    """Return means of 2x2 blocks; odd sides get a black line before them, which counts as image."""
     odd = [(side % 2, 0) for side in image.shape[:2]]
     even = np.pad(image, [*odd, (0, 0)])
     # The reference implementation pads both sides and floors, which drops the padding at the far end.

@@ -29,7 +29,7 @@ def measure_multiscale(
     rays_across: Sequence[int],
     on_view: Callable[[int], None] = lambda _done: None,
 ) -> dict[str, dict[str, float]]:
-    """Mean PSNR over the held-out views at each scale, dB, with so many rays across a pixel.
+    """Return the mean PSNR over the held-out views at each scale, dB, with so many rays across a pixel.
 
     Args:
         dataset: photographs and split.
@@ -68,7 +68,7 @@ def measure_multiscale(
 
 
 def block_means(image: Float32[np.ndarray, "h w c"], side: int) -> Float32[np.ndarray, "h2 w2 c"]:
-    """Means over blocks of ``side`` x ``side`` pixels; what makes no whole block is left out."""
+    """Return means over blocks of ``side`` x ``side`` pixels; incomplete blocks are left out."""
     height, width = image.shape[0] // side, image.shape[1] // side
     cut = image[: height * side, : width * side].astype(np.float64)
     means = cut.reshape(height, side, width, side, -1).mean(axis=(1, 3))

@@ -231,7 +231,7 @@ def _tiles(
 
 
 def _facts(metrics: Mapping[str, object], views: int) -> list[str]:
-    """Short statements under the title."""
+    """Return short statements for the line under the title."""
     facts = [f"{views} held-out view{'' if views == 1 else 's'}"]
     resolution = metrics.get("resolution")
     if isinstance(resolution, Mapping):
@@ -326,7 +326,7 @@ def _figure(name: str, view: Mapping[str, object], images: ViewImages) -> dict[s
 
 
 def _flatten_settings(values: Mapping[str, object], prefix: str = "") -> list[tuple[str, str]]:
-    """Nested settings as dotted names and short texts."""
+    """Return nested settings as dotted names and short texts."""
     rows: list[tuple[str, str]] = []
     for key, value in values.items():
         if isinstance(value, Mapping):

@@ -32,12 +32,12 @@ class SurfaceMetrics:
 
     @property
     def chamfer(self) -> float:
-        """Mean of accuracy and completeness."""
+        """Return the mean of accuracy and completeness."""
         return 0.5 * (self.accuracy + self.completeness)
 
     @property
     def f_score(self) -> float:
-        """Harmonic mean of precision and recall.
+        """Return the harmonic mean of precision and recall.
 
         As in "Tanks and Temples: Benchmarking Large-Scale Scene Reconstruction"
         (https://doi.org/10.1145/3072959.3073599).
@@ -62,7 +62,7 @@ def surface_metrics(
 def sample_surface(
     mesh: TriangleMesh, count: int, rng: np.random.Generator
 ) -> tuple[Float64[np.ndarray, "n 3"], Int64[np.ndarray, " n"]]:
-    """Points spread uniformly over the area of a mesh, and the triangles that they lie on."""
+    """Sample points uniformly over the area of a mesh; returns them and their triangles."""
     sums = np.cumsum(mesh.face_areas)
     face = np.searchsorted(sums, rng.random(count) * sums[-1], side="right").astype(np.int64)
     face = np.minimum(face, len(sums) - 1)
@@ -77,7 +77,7 @@ def distances_to_surface(
     rng: np.random.Generator,
     samples: int = 1_000_000,
 ) -> Float64[np.ndarray, " n"]:
-    """Distances of points to a mesh: to the triangles of the nearest of many samples, which is all but exact.
+    """Return distances of points to a mesh: to the triangles of the nearest of many samples.
 
     Never too small; too large by no more than the spacing of the samples, and only where the triangle
     nearest to the point is not among those of its eight nearest samples.
@@ -98,7 +98,7 @@ def distances_to_surface(
 def point_triangle_distances(
     points: Float64[np.ndarray, "n 3"], triangles: Float64[np.ndarray, "n 3 3"]
 ) -> Float64[np.ndarray, " n"]:
-    """Distance of each point to its own triangle."""
+    """Return the distance of each point to its own triangle."""
     a, b, c = triangles.transpose(1, 0, 2)
     normal = np.cross(b - a, c - a)
     squared = np.maximum(np.sum(normal * normal, axis=1), 1e-300)

@@ -123,7 +123,7 @@ class Metrics:
 
 
 def measure_view(view: RenderedView) -> MeasuredView:
-    """All metrics of one view.
+    """Measure all metrics of one view.
 
     Render and reference are rounded to 8 bits first, as they would be in files. Pixels that the weight rules
     out do not count; where metrics look at the neighbourhood of others, they show what the reference shows.
@@ -165,7 +165,7 @@ def depth_spread(
     depth_median: Float32[np.ndarray, "h w"],
     weight: Float32[np.ndarray, "h w"] | None = None,
 ) -> float | None:
-    """Share of the covered pixels that show more than one surface: haze, clouds and strokes at other depths.
+    """Return the share of covered pixels that show more than one surface, such as haze.
 
     Args:
         depth: Expected distances.
@@ -204,7 +204,7 @@ def summarize_views(views: Iterable[ViewMetrics]) -> Metrics:
 def bootstrap_interval(
     values: Sequence[float], *, level: float = 0.95, seed: int = 0
 ) -> tuple[float, float] | None:
-    """Percentile bootstrap interval of the mean; the same values always give the same interval.
+    """Return the percentile bootstrap interval of the mean; deterministic.
 
     After "Bootstrap Methods: Another Look at the Jackknife" (https://doi.org/10.1214/aos/1176344552).
     Numbers that are not finite are left out. ``None`` for fewer than two values, which have no spread.

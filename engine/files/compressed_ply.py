@@ -85,7 +85,7 @@ def _check_elements(path: Path, header: PlyHeader) -> None:
 
 
 def _unpack_11_10_11(packed: UInt32[np.ndarray, " n"]) -> Float32[np.ndarray, "n 3"]:
-    """11, 10 and 11 bits as numbers in [0, 1]."""
+    """Unpack 11, 10 and 11 bits to numbers in [0, 1]."""
     fields = [(packed >> 21) / 2047, ((packed >> 11) & 1023) / 1023, (packed & 2047) / 2047]
     return np.stack(fields, axis=1).astype(np.float32)
 
@@ -93,14 +93,14 @@ def _unpack_11_10_11(packed: UInt32[np.ndarray, " n"]) -> Float32[np.ndarray, "n
 def _dequantise(
     chunks: np.ndarray, name: str, axes: str, chunk: Int[np.ndarray, " n"], share: Float32[np.ndarray, "n 3"]
 ) -> Float32[np.ndarray, "n 3"]:
-    """Numbers in [0, 1] spread between the bounds of their chunks."""
+    """Scale numbers in [0, 1] to the bounds of their chunks."""
     low = columns(chunks, [name.format("min", axis) for axis in axes])[chunk]
     high = columns(chunks, [name.format("max", axis) for axis in axes])[chunk]
     return low * (1 - share) + high * share
 
 
 def _rotations(packed: UInt32[np.ndarray, " n"]) -> Float32[np.ndarray, "n 4"]:
-    """Two bits say which component of (w, x, y, z) is the largest; the others have 10 bits each."""
+    """Unpack quaternions: two bits for the index of the largest component, 10 bits for each other one."""
     fields = np.stack([(packed >> shift) & 1023 for shift in (20, 10, 0)], axis=1)
     small = (fields / 1023.0 - 0.5) * (2.0 * SQRT_HALF)
     return from_smallest_three(small, (packed >> 30).astype(np.int64))

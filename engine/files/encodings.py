@@ -22,12 +22,12 @@ def dropped_sh_message(degree: int) -> tuple[str, ...]:
 
 
 def sh0_from_rgb(rgb_srgb: Float[np.ndarray, "n 3"]) -> Float32[np.ndarray, "n 1 3"]:
-    """Coefficients of the constant harmonic for display colours, with no higher ones."""
+    """Return the coefficients of the constant harmonic for display colors, without higher ones."""
     return ((rgb_srgb.astype(np.float64) - 0.5) / SH_C0).astype(np.float32)[:, None, :]
 
 
 def logits_from_bytes(opacities: UInt8[np.ndarray, " n"]) -> Float32[np.ndarray, " n"]:
-    """Logits of opacities written as bytes.
+    """Return the logits of opacities stored as bytes.
 
     0 and 255 stand for the middle of the numbers that round to them, 1/1020 and 1019/1020, so that no logit
     is infinite and writing gives the same byte again.
@@ -37,7 +37,7 @@ def logits_from_bytes(opacities: UInt8[np.ndarray, " n"]) -> Float32[np.ndarray,
 
 
 def unit_quats(quats: Float[np.ndarray, "n 4"]) -> Float[np.ndarray, "n 4"]:
-    """Quaternions of length 1, in float64."""
+    """Return quaternions normalised in float64."""
     q = quats.astype(np.float64)
     return q / np.linalg.norm(q, axis=1, keepdims=True)
 
@@ -71,12 +71,12 @@ def smallest_three(
 
 
 def half_turn_sh(sh: Float32[np.ndarray, "n k 3"]) -> Float32[np.ndarray, "n k 3"]:
-    """Coefficients of colours turned by 180 degrees about x; exact, as only signs change."""
+    """Return the coefficients of colors rotated by 180 degrees about x; exact, as only signs change."""
     return sh * HALF_TURN_SIGNS[: sh.shape[1], None]
 
 
 def half_turn_quats(quats_wxyz: Float32[np.ndarray, "n 4"]) -> Float32[np.ndarray, "n 4"]:
-    """Quaternions of F R F with the half turn F about x.
+    """Return the quaternions of F R F with the half turn F about x.
 
     That is R turned by F, but for the signs of the two last columns, which make no difference to a Gaussian.
     """
@@ -84,7 +84,7 @@ def half_turn_quats(quats_wxyz: Float32[np.ndarray, "n 4"]) -> Float32[np.ndarra
 
 
 def half_turn_points(points: Float32[np.ndarray, "n 3"]) -> Float32[np.ndarray, "n 3"]:
-    """Points turned by 180 degrees about x."""
+    """Return points rotated by 180 degrees about x."""
     return points * np.array([1, -1, -1], dtype=np.float32)
 
 

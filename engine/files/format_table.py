@@ -53,7 +53,7 @@ class FormatTable:
         self._entries[key] = entry
 
     def entries(self, kind: type[E]) -> tuple[E, ...]:
-        """All entries of a class, by name."""
+        """Return all entries of a class, by name."""
         if not self._is_loaded:
             for module in pkgutil.iter_modules(importlib.import_module(self._package).__path__):
                 importlib.import_module(f"{self._package}.{module.name}")
@@ -84,7 +84,7 @@ class FormatTable:
         return max(matches, key=lambda match: match[0])[1] if matches else None
 
     def describe_choices(self, kind: type[E]) -> str:
-        """All entries with their patterns, for errors."""
+        """Return all entries with their patterns, for errors."""
         return "; ".join(f"{entry.name} ({', '.join(entry.patterns)})" for entry in self.entries(kind))
 
     def suffixes(self, kind: type[E]) -> str:

@@ -300,7 +300,7 @@ def declared_channels(comments: Sequence[str]) -> dict[str, tuple[str, ...]]:
 
 
 def channel_comments(widths: Mapping[str, int]) -> tuple[str, ...]:
-    """Comments that say which properties of a PLY are channels."""
+    """Return the comments that declare which properties of a PLY are channels."""
     return tuple(f"{_CHANNEL} {name} {width}" for name, width in widths.items())
 
 

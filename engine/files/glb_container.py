@@ -119,7 +119,7 @@ class GlbFile:
         return content
 
     def primitives(self) -> Iterator[tuple[Float64[np.ndarray, "4 4"], dict[str, Any]]]:
-        """Every primitive of the default scene with the matrix of its node, but for the cores of octagons."""
+        """Return every primitive of the default scene with its node's matrix, except cores of octagons."""
         nodes = self.document.get("nodes", [])
         scenes = self.document.get("scenes", [])
         roots = scenes[self.document.get("scene", 0)].get("nodes", []) if scenes else range(len(nodes))
@@ -219,7 +219,7 @@ def light_rotation(light_frame: Float64[np.ndarray, "3 3"]) -> list[float]:
 
 
 def pad_to_four(length: int) -> int:
-    """``length`` rounded up to the four bytes to which a GLB aligns everything."""
+    """Return ``length`` rounded up to a multiple of four bytes, GLB's alignment."""
     return -(-length // 4) * 4
 
 
@@ -291,7 +291,7 @@ def json_bytes(document: dict[str, object]) -> bytes:
 
 
 def glb_size(json_room: int, length: int) -> int:
-    """Size of a file with so many bytes of JSON and of data."""
+    """Return the size of a file with so many bytes of JSON and of data."""
     return HEADER_BYTES + 2 * CHUNK_HEADER_BYTES + json_room + length
 
 

@@ -24,7 +24,7 @@ PARTLY_SUPPORTED_EXTENSIONS = {"thicknessTexture", "transmissionTexture"}
 
 
 def glb_materials(file: GlbFile, path: Path) -> tuple[MeshMaterial, ...]:
-    """All materials of a file, in its order.
+    """Return all materials of a file, in its order.
 
     Raises:
         SceneFileError: an image is missing or stored in a way that is not read.
@@ -101,7 +101,7 @@ class _MaterialReader:
         )
 
     def _absorption(self) -> tuple[float, float, float]:
-        """Of the volume: after the stated distance the stated share of light is left."""
+        """Return the absorption of the volume, from its attenuation distance and color."""
         volume = self._extensions.get("volume", {})
         distance = float(volume.get("attenuationDistance", math.inf))
         left = [float(share) for share in volume.get("attenuationColor", (1.0, 1.0, 1.0))]

@@ -218,7 +218,7 @@ def _float_count(attribute: glb_container.ChannelAttribute) -> Callable[[FlatGau
 
 
 def _attributes(sh_degree: int, widths: Mapping[str, int]) -> tuple[_Attribute, ...]:
-    """All attributes of a scene with harmonics of that degree and these channels, in file order."""
+    """Return the attributes of a scene with that degree of harmonics and these channels, in file order."""
     basic = (
         _Attribute("POSITION", "VEC3", FLOAT, 12, lambda some: half_turn_points(some.means_world)),
         _Attribute("COLOR_0", "VEC4", UNSIGNED_BYTE, 4, _colours),

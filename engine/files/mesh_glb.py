@@ -100,7 +100,7 @@ def _read(path: Path, *, with_materials: bool) -> ImportedMesh:
 
 
 def _mesh(file: GlbFile, *, with_materials: bool) -> tuple[ImportedMesh, Int32[np.ndarray, " t"]]:
-    """All triangles, and the number of the material of each."""
+    """Return all triangles, and the material index of each."""
     vertices: list[np.ndarray] = []
     triangles: list[np.ndarray] = []
     numbers: list[np.ndarray] = []
@@ -160,7 +160,7 @@ def _mesh(file: GlbFile, *, with_materials: bool) -> tuple[ImportedMesh, Int32[n
 
 
 def _concatenate_attribute(parts: list[np.ndarray]) -> np.ndarray | None:
-    """One array, or None where no part had the attribute."""
+    """Concatenate an attribute; None where no part has it."""
     if not parts:
         return None
     joined = np.concatenate(parts)

@@ -115,7 +115,7 @@ def _read(path: Path, parts: _ObjParts) -> ImportedMesh:
 
 
 def _read_materials(path: Path, parts: _ObjParts, count: int) -> dict[str, Any]:
-    """Texture coordinates of corners, colours of vertices and materials."""
+    """Return texture coordinates of corners, colors of vertices and materials."""
     places = np.concatenate([*parts.triangle_uv, np.zeros((0, 3), np.int32)])
     looks: dict[str, Any] = {}
     if parts.uv and (places >= 0).any():
@@ -225,7 +225,7 @@ def _lines(data: np.ndarray, chosen: np.ndarray, lengths: np.ndarray) -> bytes:
 
 
 def _numbers(path: Path, text: bytes, lines: int, keyword: str) -> np.ndarray:
-    """All numbers of ``lines`` lines, one row a line; all lines must have the same count."""
+    """Parse ``lines`` lines of numbers to rows; all lines must have the same count."""
     with warnings.catch_warnings():
         warnings.simplefilter("error", DeprecationWarning)  # numpy's way to say that it met no number
         try:
@@ -239,7 +239,7 @@ def _numbers(path: Path, text: bytes, lines: int, keyword: str) -> np.ndarray:
 
 
 def _ragged_numbers(path: Path, text: bytes, keyword: str) -> np.ndarray:
-    """As many columns as the shortest line has (some programs colour only part of the vertices)."""
+    """Parse as many columns as the shortest line has (some programs color only part of the vertices)."""
     rows = [line.split() for line in text.split(b"\n") if line.strip()]
     width = min(len(row) for row in rows)
     if width == 0:
@@ -248,7 +248,7 @@ def _ragged_numbers(path: Path, text: bytes, keyword: str) -> np.ndarray:
 
 
 def _parse_faces(path: Path, text: bytes, before: Int64[np.ndarray, "f 2"], parts: _ObjParts) -> None:
-    """Take faces as fans of triangles, and the texture coordinates of their corners where they name some.
+    """Parse faces as triangle fans, with the texture coordinates of their corners where given.
 
     Args:
         path: named in errors.
@@ -308,7 +308,7 @@ def _add_fans(
 
 
 def _to_int32(numbers: Int64[np.ndarray, "t 3"]) -> Int32[np.ndarray, "t 3"]:
-    """Numbers in half the memory; those that no mesh can hold stay too large."""
+    """Convert to int32 with saturation, so that indices out of range stay out of range."""
     return np.clip(numbers, -1, np.iinfo(np.int32).max).astype(np.int32)
 
 

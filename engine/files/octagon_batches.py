@@ -101,12 +101,12 @@ class OctagonSoup:
 
     @property
     def channel_widths(self) -> dict[str, int]:
-        """The channels of the batches, with their numbers a Gaussian."""
+        """Return the channels of the batches, with their widths."""
         return self._gaussians.channels.widths
 
     @property
     def means_world(self) -> Float32[np.ndarray, "n 3"]:
-        """Centres of the octagons, world units, in the order of ``ids``."""
+        """Return the centres of the octagons, world units, in the order of ``ids``."""
         return self._gaussians.means_world[self.ids]
 
     def batch(self, places: slice | Int[np.ndarray, " n"]) -> OctagonBatch:
@@ -136,6 +136,6 @@ class OctagonSoup:
         )
 
     def batches(self) -> Iterator[OctagonBatch]:
-        """All octagons in the order of ``ids``, a few thousand at a time."""
+        """Yield all octagons in the order of ``ids``, a few thousand at a time."""
         for start in range(0, len(self.ids), BATCH_SIZE):
             yield self.batch(slice(start, start + BATCH_SIZE))

@@ -44,7 +44,7 @@ class Attribute:
 
     @property
     def type(self) -> str:
-        """The shape, as glTF names it."""
+        """Return the glTF accessor type."""
         return vector_type(self.width)
 
 

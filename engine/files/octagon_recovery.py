@@ -21,7 +21,7 @@ ONE_COLOUR_NOTE = "It holds one colour of each Gaussian, no harmonics."
 def gaussians_from_octagons(
     corners_world: Float32[np.ndarray, "n 8 3"], radii: Float32[np.ndarray, " n"], path: Path
 ) -> tuple[Float32[np.ndarray, "n 3"], Float32[np.ndarray, "n 4"], Float32[np.ndarray, "n 2"]]:
-    """Centres, rotations and log scales of the Gaussians with these octagons.
+    """Return centres, rotations and log scales of the Gaussians with these octagons.
 
     Args:
         corners_world: corner by corner.

@@ -51,12 +51,12 @@ class PlyElement:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the properties, in file order."""
+        """Return the names of the properties, in file order."""
         return tuple(prop.name for prop in self.properties)
 
     @property
     def lists(self) -> tuple[PlyProperty, ...]:
-        """Those properties that are lists."""
+        """Return the properties that are lists."""
         return tuple(prop for prop in self.properties if prop.count_kind is not None)
 
     def dtype(self, byte_order: str, lengths: Mapping[str, int]) -> np.dtype[np.void]:
@@ -225,7 +225,7 @@ def _binary_tables(path: Path, header: PlyHeader) -> Iterator[tuple[str, np.ndar
 
 
 def _first_lengths(path: Path, element: PlyElement, byte_order: str, offset: int) -> dict[str, int]:
-    """List lengths of the first row, which all others must share."""
+    """Return the list lengths of the first row, which all others must share."""
     lengths: dict[str, int] = {}
     with path.open("rb") as handle:
         handle.seek(offset)

@@ -126,12 +126,12 @@ def register(entry: E) -> E:
 
 
 def importers() -> tuple[Importer, ...]:
-    """All formats of Gaussians that are read, by name."""
+    """Return all formats of Gaussians that can be read, by name."""
     return _TABLE.entries(Importer)
 
 
 def exporters() -> tuple[Exporter, ...]:
-    """All formats in which scenes are written, by name."""
+    """Return all formats in which scenes can be written, by name."""
     return _TABLE.entries(Exporter)
 
 
@@ -175,7 +175,7 @@ def exporter_for(path: Path, format: str | None = None) -> Exporter:
 
 
 def writable_formats() -> tuple[str, ...]:
-    """Names of the formats that this machine can write, as of now."""
+    """Return the names of the formats that this machine can write at present."""
     return tuple(exporter.name for exporter in exporters() if exporter.missing_requirement() is None)
 
 

@@ -182,7 +182,7 @@ def _decode(path: Path, text: bytes, images: Images) -> GaussianCloud:
 
 
 def _dequantise(path: Path, part: _ParameterMeta, share: np.ndarray) -> np.ndarray:
-    """Numbers in [0, 1] between the bounds of their channel."""
+    """Scale numbers in [0, 1] to the bounds of their channel."""
     low, high = _as_float_array(path, part.mins), _as_float_array(path, part.maxs)
     if not len(low) == len(high) == share.shape[1]:
         raise SceneFileError(
@@ -207,7 +207,7 @@ def _as_float_array(path: Path, values: Sequence[float] | float) -> np.ndarray:
 
 
 def _rotations(rgba: UInt8[np.ndarray, "n 4"]) -> Float32[np.ndarray, "n 4"]:
-    """Three components as bytes, and a tag for the left-out one; other tags mean no rotation."""
+    """Decode quaternions of three byte components and the tag of the fourth; other tags mean no rotation."""
     small = (rgba[:, :3] / 255.0 * 2.0 - 1.0) * SQRT_HALF
     quats = from_smallest_three(small, np.maximum(rgba[:, 3].astype(np.int64) - FIRST_QUAT_TAG, 0))
     quats[rgba[:, 3] < FIRST_QUAT_TAG] = (1.0, 0.0, 0.0, 0.0)
@@ -217,7 +217,7 @@ def _rotations(rgba: UInt8[np.ndarray, "n 4"]) -> Float32[np.ndarray, "n 4"]:
 def _sh_rest(
     path: Path, part: _ParameterMeta, images: Images, labels: UInt8[np.ndarray, "n 4"]
 ) -> Float32[np.ndarray, "n k 3"]:
-    """Higher harmonics: each Gaussian names an entry of the palette, of which 64 lie in a row."""
+    """Decode higher harmonics: each Gaussian indexes a palette with 64 entries a row."""
     pixels = images(part.files[0])
     rows, width = pixels.shape[:2]
     k = width // PALETTE_COLUMNS

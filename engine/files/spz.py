@@ -77,7 +77,7 @@ def read(path: Path) -> GaussianCloud:
 
 
 def _fixed_point(packed: np.ndarray, fractional_bits: int) -> Float32[np.ndarray, "n 3"]:
-    """Three little-endian bytes a coordinate, two's complement."""
+    """Decode coordinates of three little-endian bytes, two's complement."""
     parts = packed.reshape(len(packed), 3, 3).astype(np.int32)
     values = parts[:, :, 0] | (parts[:, :, 1] << 8) | (parts[:, :, 2] << 16)
     signed = np.where(values >= 1 << 23, values - (1 << 24), values)
@@ -85,14 +85,14 @@ def _fixed_point(packed: np.ndarray, fractional_bits: int) -> Float32[np.ndarray
 
 
 def _decode_xyz(packed: np.ndarray) -> Float32[np.ndarray, "n 4"]:
-    """Version 2: x, y, z as bytes; w is what is missing to length 1."""
+    """Decode quaternions of version 2: x, y, z as bytes; w completes the unit length."""
     xyz = packed.astype(np.float64) / 127.5 - 1.0
     w = np.sqrt(np.maximum(0.0, 1.0 - np.sum(xyz**2, axis=1)))
     return np.concatenate([w[:, None], xyz], axis=1).astype(np.float32)
 
 
 def _decode_smallest_three(packed: np.ndarray) -> Float32[np.ndarray, "n 4"]:
-    """Two bits for the place of the largest of x, y, z, w; ten each, the sign first, for the others."""
+    """Decode quaternions: two bits for the largest component, ten for each other, sign first."""
     words = np.ascontiguousarray(packed).view("<u4")[:, 0]
     fields = np.stack([(words >> shift) & 1023 for shift in (20, 10, 0)], axis=1).astype(np.int64)
     small = (fields & 511) * (SQRT_HALF / 511.0) * np.where(fields & 512, -1.0, 1.0)

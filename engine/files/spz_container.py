@@ -52,7 +52,7 @@ class SpzFile:
 
 
 def stream_widths(version: int, sh_degree: int) -> tuple[int, ...]:
-    """Bytes a Gaussian of positions, opacities, colours, scales, rotations and harmonics."""
+    """Return bytes per Gaussian of positions, opacities, colors, scales, rotations and harmonics."""
     return (9, 1, 3, 3, 3 if version == 2 else 4, 3 * ((sh_degree + 1) ** 2 - 1))
 
 

@@ -14,7 +14,7 @@ RAMP_SIZE_PX = 256
 
 
 def radial_alpha(size: int, q: float) -> Float64[np.ndarray, "s s"]:
-    """exp(-rho^2 / 2) at the texel centres of a square spanning [-sqrt(Q), sqrt(Q)] standard deviations."""
+    """Return exp(-rho^2 / 2) at texel centres of a square over [-sqrt(Q), sqrt(Q)] standard deviations."""
     squares = (2.0 * (np.arange(size) + 0.5) / size - 1.0) ** 2
     result: np.ndarray = np.exp(-0.5 * q * (squares[:, None] + squares))
     return result
@@ -33,7 +33,7 @@ def grey_png(size: int, q: float) -> bytes:
 
 
 def material_ramp_png() -> bytes:
-    """Metallic in blue along u and roughness in green along v, each step of 8 bits one pixel; red is full."""
+    """Return a PNG with metallic in blue along u, roughness in green along v, one pixel a step; red is 1."""
     steps = np.arange(RAMP_SIZE_PX, dtype=np.uint8)
     pixels = np.full((RAMP_SIZE_PX, RAMP_SIZE_PX, 3), 255, np.uint8)
     pixels[..., 1], pixels[..., 2] = steps[:, None], steps

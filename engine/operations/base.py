@@ -217,7 +217,7 @@ def error_text(message: str, place: Callable[[str], str] = lambda path: path) ->
 
 
 def emit_warning(progress: EventListener, message: str) -> None:
-    """Emit a warning; the work goes on."""
+    """Emit a warning; the work continues."""
     progress(Warned(message))
 
 

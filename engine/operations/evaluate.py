@@ -108,7 +108,7 @@ class EvaluateResult(Result):
 
     @property
     def ssim(self) -> float | None:
-        """Mean structural similarity of the views."""
+        """Return the mean structural similarity of the views."""
         return self._mean("ssim")
 
     @property

@@ -155,7 +155,7 @@ class ReconstructResult(Result):
 
     @property
     def psnr(self) -> float | None:
-        """Mean PSNR of the held-out views in dB; None where there were none."""
+        """Return the mean PSNR of the held-out views in dB; None where there are none."""
         value = self.metrics.get("mean", {}).get("psnr")
         return None if value is None else float(value)
 

@@ -98,7 +98,7 @@ def remove_pairs(database: Path, pairs: Int64[np.ndarray, "f 2"]) -> None:
 
 
 def _min_cut(weight: Float64[np.ndarray, "n n"]) -> Bool[np.ndarray, " n"]:
-    """Sides of a division with a small sum of the weights across it."""
+    """Return the sides of a cut with a small sum of weights across it."""
     _, vectors = np.linalg.eigh(np.diag(weight.sum(axis=1)) - weight)
     order = np.argsort(vectors[:, 0], kind="stable")
     side = np.zeros(len(weight), dtype=bool)

@@ -151,7 +151,7 @@ def match_pairs(
 def preselect_pairs(
     database: Path, names: Sequence[str], config: PosesConfig, *, threads: int, on_count: OnCount
 ) -> list[Pair]:
-    """Pairs worth matching, by a match of each photograph's largest features with everybody else's.
+    """Return pairs worth matching, by matching only the largest features of all photographs.
 
     Args:
         database: with features; is only read.

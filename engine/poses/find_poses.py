@@ -152,7 +152,7 @@ def adjust_principal_points(
     progress: EventListener = ignore_events,
     should_stop: Callable[[], bool] = lambda: False,
 ) -> dict[str, float] | None:
-    """Give each photograph of a model a principal point of its own, where that explains far more.
+    """Estimate a principal point for each photograph, where that explains the observations far better.
 
     There is one stage, ``lenses``. See :mod:`octasplat.engine.poses.principal_points`.
 
@@ -231,7 +231,7 @@ class _ColmapProcess:
         self._is_done = False
 
     def wait(self) -> None:
-        """Wait for the result, telling of the progress and hearing of the wish to stop meanwhile.
+        """Wait for the result, with progress and a check for requests to stop.
 
         Raises:
             CancelledError: stopped as asked.

@@ -72,7 +72,7 @@ def _observations_by_view(
 def _reprojection_errors(
     points_cam: Float64[np.ndarray, "k 3"], xy_px: Float64[np.ndarray, "k 2"], camera: Camera
 ) -> tuple[float, float] | None:
-    """Mean distance in the picture now, and after the shift, turn and motion that fit most points best."""
+    """Return the mean reprojection error now, and after the best shift, rotation and translation."""
     points_cam, xy_px = points_cam[points_cam[:, 2] > 0], xy_px[points_cam[:, 2] > 0]
     away = xy_px - camera.project(points_cam)
     fine = np.isfinite(away).all(axis=1)

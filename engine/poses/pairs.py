@@ -11,14 +11,14 @@ _TILE = 8
 
 
 def all_pairs(count: int) -> list[Pair]:
-    """Every pair of ``count`` photographs, the lower index first."""
+    """Return every pair of ``count`` photographs, the lower index first."""
     return list(combinations(range(count), 2))
 
 
 def select_pairs(
     match_counts: Mapping[Pair, int], count: int, *, min_matches: int, partners: int, neighbours: int
 ) -> list[Pair]:
-    """Pairs that have something in common, and neighbours by name.
+    """Return pairs that have matches in common, and neighbours by name.
 
     The quick look is the preemptive matching of Wu, "Towards Linear-time Incremental Structure from Motion"
     (3DV 2013): two photographs that share features share some of the largest ones.
@@ -42,7 +42,7 @@ def select_pairs(
 
 
 def batch_pairs(pairs: Iterable[Pair], size: int) -> list[tuple[Pair, ...]]:
-    """Pairs a few at a time, those of the same photographs together, which COLMAP prepares anew each time."""
+    """Yield pairs in batches, those of the same photographs together, as COLMAP loads each only once then."""
     ordered = sorted(pairs, key=lambda pair: (pair[0] // _TILE, pair[1] // _TILE, pair))
     return [tuple(ordered[start : start + size]) for start in range(0, len(ordered), size)]
 
@@ -55,6 +55,6 @@ def largest_features(keypoints: Float32[np.ndarray, "n 6"], count: int) -> Int64
 
 
 def pairs_with(photographs: Sequence[int], count: int, excluded: Iterable[Pair]) -> list[Pair]:
-    """Pairs of ``photographs`` photographs with any other, but for those in ``excluded``."""
+    """Return pairs of ``photographs`` with any other, except those in ``excluded``."""
     wanted = {(min(a, b), max(a, b)) for a in photographs for b in range(count) if a != b}
     return sorted(wanted - set(excluded))

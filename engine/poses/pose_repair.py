@@ -147,14 +147,14 @@ class _PoseVerifier:
         return pose.rotation.matrix(), np.asarray(pose.translation)
 
     def _inlier_distance(self, k: int) -> float:
-        """Distance at which a match agrees, in units of the focal length."""
+        """Return the distance at which a match is an inlier, in units of the focal length."""
         camera, (width_px, height_px) = self.model.cameras[self.images[k].camera_id], self._sizes_px[k]
         shrunk = min(1.0, MAX_IMAGE_SIDE_PX / max(width_px, height_px))
         return float(INLIER_DISTANCE_PX * camera.width / width_px / shrunk / camera.mean_focal_length())
 
 
 def _evenly_spaced(numbers: Sequence[int], count: int) -> list[int]:
-    """As many of some numbers as there may be, evenly."""
+    """Return at most so many of some numbers, evenly spaced."""
     if count <= 0 or not numbers:
         return []
     chosen = np.unique(np.linspace(0, len(numbers) - 1, count).round().astype(np.int64))
@@ -162,7 +162,7 @@ def _evenly_spaced(numbers: Sequence[int], count: int) -> list[int]:
 
 
 def _set_pose(model: Any, image: Any, pose: Pose) -> None:
-    """Give an image another pose; what it took part in as a sparse point was seen from the wrong place."""
+    """Set another pose of an image and delete its observations, which belong to the former pose."""
     cam_from_world = pycolmap.Rigid3d(pycolmap.Rotation3d(pose[0]), pose[1])
     cam_from_rig = image.cam_from_world() * image.frame.rig_from_world.inverse()
     image.frame.rig_from_world = cam_from_rig.inverse() * cam_from_world

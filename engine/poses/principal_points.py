@@ -148,7 +148,7 @@ def _bundle_adjust(model: Any, fixed: set[int], error_px: float) -> bool:
 
 
 def _align_to_given(model: Any, given: Any) -> None:
-    """Bring the cameras to where the given ones are; those that show too little stand there as before."""
+    """Align the model to the given cameras; those with too few observations keep their given poses."""
     kept = [i for i in sorted(model.images) if model.images[i].num_points3D >= MIN_OBSERVATIONS_TO_MOVE]
     ours, theirs = (
         np.array([source.images[i].projection_center() for i in kept]) for source in (model, given)

@@ -197,7 +197,7 @@ class PoseSearch:
     def _register_remaining(
         self, database: Path, best: Any, matched: list[Pair], at: Callable[[int], None]
     ) -> Any:
-        """Photographs that were left out: matched with all others, and placed by fewer matches."""
+        """Register photographs that were left out: matched with all others, with fewer matches required."""
         posed = set() if best is None else {number - 1 for number in best.reg_image_ids()}
         rest = [k for k in range(len(self._names)) if k not in posed]
         more = pairs_with(rest, len(self._names), matched)

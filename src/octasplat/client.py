@@ -77,7 +77,7 @@ class Client:
         progress: EventListener | None = None,
         **options: Any,
     ) -> "Job":
-        """Send photographs and queue their reconstruction; photographs that are there are not sent again.
+        """Upload photographs and queue their reconstruction; uploaded photographs are not sent again.
 
         Args:
             photographs: a folder, a ZIP file, or the id of a dataset.
@@ -174,7 +174,7 @@ class Job:
 
     @property
     def kind(self) -> str:
-        """The kind, such as ``reconstruct``."""
+        """Return the kind, such as ``reconstruct``."""
         return str(self.content["kind"])
 
     @property
@@ -184,12 +184,12 @@ class Job:
 
     @property
     def state(self) -> JobState:
-        """The state, when it was last asked for."""
+        """Return the state at the last request."""
         return cast(JobState, self.content["state"])
 
     @property
     def psnr(self) -> float | None:
-        """PSNR of the held-out views in dB, once it is known."""
+        """Return the PSNR of the held-out views in dB; None until it is known."""
         return cast("float | None", self.content.get("psnr"))
 
     @property
@@ -200,11 +200,11 @@ class Job:
 
     @property
     def options(self) -> Mapping[str, Any]:
-        """All of its options."""
+        """Return all options of the job."""
         return cast("Mapping[str, Any]", self.content["options"])
 
     def refresh(self) -> "Job":
-        """Ask how it fares, and return the job itself."""
+        """Request the job's present state, and return the job itself."""
         self.content = self._api.get(f"/v1/jobs/{self.id}")
         return self
 

@@ -51,7 +51,7 @@ class Image:
 
     @cached_property
     def gaussian(self) -> Int32[np.ndarray, "h w"]:
-        """Number of the Gaussian that weighs most in the middle of each pixel, -1 where there is none.
+        """Return the id of the Gaussian with the largest weight at each pixel centre, -1 where there is none.
 
         It is found when it is first asked for, in the scene as it then is.
         """

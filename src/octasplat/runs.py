@@ -99,13 +99,13 @@ class Run:
 
     @property
     def psnr(self) -> float | None:
-        """Mean PSNR of the held-out views in dB; None where nothing was measured."""
+        """Return the mean PSNR of the held-out views in dB; None before the evaluation."""
         value = self.metrics.get("mean", {}).get("psnr")
         return None if value is None else float(value)
 
     @property
     def views(self) -> Mapping[str, Mapping[str, float]]:
-        """Figures of each held-out view, by the name of its photograph."""
+        """Return the metrics of each held-out view, by the name of its photograph."""
         found: Mapping[str, Mapping[str, float]] = self.metrics.get("views", {})
         return found
 
@@ -126,12 +126,12 @@ class Run:
 
     @property
     def report(self) -> Path:
-        """The page that shows what was measured."""
+        """Return the path of the report page."""
         return self.path / _REPORT
 
     @cached_property
     def scene(self) -> Scene:
-        """The scene, read when it is first asked for."""
+        """Return the scene, read when it is first used."""
         return load(self.path)
 
     def __repr__(self) -> str:

@@ -33,15 +33,15 @@ class Viewer:
 
     @property
     def url(self) -> str:
-        """The address of the page, for browsers of this machine."""
+        """Return the address of the page, for browsers of this machine."""
         return self._server.url
 
     def close(self) -> None:
-        """End the server; the page goes on with what it has loaded."""
+        """Stop the server; an open page keeps what it has loaded."""
         self._end()
 
     def wait(self) -> None:
-        """Wait until the viewer is closed, or for Ctrl-C: at the end of a script."""
+        """Wait until the viewer is closed, or for Ctrl-C; for the end of a script."""
         self._server.wait()
 
     def __enter__(self) -> "Viewer":

@@ -51,7 +51,7 @@ def _half_angle_over_sine(missing: Float64[np.ndarray, " n"]) -> Float64[np.ndar
 def _fit_polynomial(
     function: Callable[[Float64[np.ndarray, " n"]], Float64[np.ndarray, " n"]], degree: int, end: float
 ) -> list[float]:
-    """Coefficients of a polynomial that is a function from 0 to ``end``, to rounding."""
+    """Return the coefficients of a polynomial that fits a function from 0 to ``end`` to rounding."""
     fitted = Chebyshev.interpolate(function, degree, domain=[0.0, end])
     return [float(value) for value in fitted.convert(kind=Polynomial).coef]
 
@@ -70,7 +70,7 @@ def _polynomial(coefficients: Sequence[float], x: Vector) -> Vector:
 
 
 def _angle(sine: Vector, cosine: Vector) -> Vector:
-    """Angles in [0, pi] of vectors whose sines are not negative; both may have any common factor."""
+    """Return the angles in [0, pi] of vectors with sines >= 0; both may have any common factor."""
     ahead = abs(cosine)
     beyond = sine > ahead
     small, large = beyond.select(ahead, sine), beyond.select(sine, ahead)

@@ -39,7 +39,7 @@ class VolumeArrays(NamedTuple):
 def neighbour(
     table: Int32[np.ndarray, "bx by bz"], blocks: Int32[np.ndarray, "b 3"], b: int, x: int, y: int, z: int
 ) -> tuple[int, int]:
-    """Row of the block that holds voxel (x, y, z) counted from block ``b``, and the voxel's place in it."""
+    """Return the block row that holds voxel (x, y, z) counted from block ``b``, and its place there."""
     bx, by, bz = (
         blocks[b, 0] + x // BLOCK_SIDE,
         blocks[b, 1] + y // BLOCK_SIDE,

@@ -65,7 +65,7 @@ def contract(x: float, y: float, z: float) -> tuple[float, float, float]:
 
 @device_function()
 def expand(x: float, y: float, z: float) -> tuple[float, float, float, float]:
-    """Undo :func:`contract`, and tell how much lengths grow on it, at most (1 inside the ball).
+    """Invert :func:`contract`, and return its largest stretch of lengths (1 inside the ball).
 
     Points on and beyond the rim of contracted space, which stand for infinity, give a stretch of 0.
     """
@@ -172,7 +172,7 @@ def tile_ranges(
     nearest: Float32[np.ndarray, "th tw"],
     farthest: Float32[np.ndarray, "th tw"],
 ) -> None:
-    """Least and largest distance in each tile of 16 x 16 pixels; unknown ones count as 0."""
+    """Return the smallest and largest distance in each tile of 16 x 16 pixels; unknown ones count as 0."""
     height, width = distances.shape
     nearest[:], farthest[:] = np.inf, 0.0
     for row in range(height):
