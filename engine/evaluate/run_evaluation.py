@@ -290,7 +290,7 @@ def finished_shading(
 
 
 def _environment(output: Path, up_world: tuple[float, float, float]) -> EnvironmentMap | None:
-    """The map that a run with materials has learnt."""
+    """Return the environment map that a run with materials has learnt."""
     if not run_environment(output).exists():
         return None
     up = np.array(up_world, np.float64)

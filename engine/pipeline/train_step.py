@@ -121,7 +121,7 @@ def _trainer(
         should_stop=run.should_stop,
         scale_floor=_scale_floor(dataset, config.min_scale_px),
         camera_clearance=zones if config.camera_clearance > 0 else None,
-        view_frusta=seen if _prunes_unseen(config.materials) else None,
+        view_frusta=frusta if _prunes_unseen(config.materials) else None,
         on_step=None
         if (on_step := run.on_step) is None
         else lambda done, tracer: on_step(done, dataset, tracer, trainer.shading),

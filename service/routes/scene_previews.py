@@ -25,7 +25,7 @@ router = APIRouter(prefix=PREFIX, tags=["datasets"])
 
 
 @router.post("", responses=problem_responses(413))
-async def preview_scene(new: NewScenePreview, _who: Writer, service: ServiceDep) -> ScenePreviewView:
+async def preview_scene(new: NewScenePreview, _principal: Writer, service: ServiceDep) -> ScenePreviewView:
     """Say what of a folder would be taken, left out or refused, with the sentences to show."""
     listed = [ListedFile(file.path, file.size_bytes) for file in new.files]
     limits = service.settings.upload_limits()
@@ -38,7 +38,7 @@ async def preview_scene(new: NewScenePreview, _who: Writer, service: ServiceDep)
 async def preview_scene_archive(
     end: Annotated[bytes, Body(media_type="application/octet-stream", description="Its last bytes.")],
     size_bytes: Annotated[int, Query(ge=1, description="Length of the whole archive.")],
-    _who: Writer,
+    _principal: Writer,
     service: ServiceDep,
 ) -> ScenePreviewView:
     """Say the same of a ZIP file; its last bytes, which hold its list of contents, are enough."""
