@@ -13,8 +13,8 @@ from octasplat.engine.settings.renamed_settings import FormerNames
 ROOT = Path(__file__).resolve().parents[2]
 WORDS = """
 chore chores contact doors doubts fitness folds footprint frosted gapless hasten heard hears hub journal
-know knows lean machinery meet meets onlooker onlookers opening openings sight sights slips parted surroundings telling
-told twin twins upkeep verdict verdicts widening workshop
+know knows lean machinery meet meets onlooker onlookers opening openings parted sight sights slips
+surroundings telling told twin twins upkeep verdict verdicts widening workshop
 """
 NAMES = """
 Buffer Developed End Facets Front Judge LEAVING Leaving Lobe Machinery Paint Reversed Sight Slip absorb
