@@ -3,7 +3,7 @@
     python -m benchmarks.estimates SCENE --max-side 480 --set iterations=300
 
 CPU time and largest private memory of the whole command, the compilation of kernels included where they are
-not in the cache. Prints a row for ``docs/experiments.md``.
+not in the cache. Prints a row for ``docs/notes/speed.md``.
 """
 
 import argparse

@@ -1,5 +1,6 @@
-"""``truth.json``: what is known of a rendered scene, read and checked; docs/materials.md tells the format.
+"""``truth.json``: what is known of a rendered scene, read and checked.
 
+docs/materials.md, "truth.json", tells the format.
 It lies beside the scene, or beside the folder of the views whose truth it is.
 """
 

@@ -1,6 +1,6 @@
 """Cost model: time and memory of a job before it starts, for users and for limits.
 
-The figures come from runs on photographed scenes (``docs/experiments.md``); ``benchmarks/estimates.py``
+The figures come from runs on photographed scenes (``docs/notes/scenes.md``); ``benchmarks/estimates.py``
 compares anew. What the photographs show decides as much as how many they are, so that an estimate is right
 within a factor of two, not better. Imports neither torch nor numba.
 """
@@ -41,7 +41,7 @@ _MATERIAL_EVALUATE_CPU_SECONDS_PER_PIXEL = 5.5e-5
 """With four to sixteen rays a pixel and what they reflect: 8 to 10 s for each picture of 400 x 400 pixels."""
 _SHARED_SORT_SAVING = 0.6
 """Share of a ray's time that is saved where the rays of a window composite in one order
-(``docs/experiments.md``, "One order")."""
+(``docs/notes/speed.md``, "One order")."""
 _SINGLE_RAY_CPU_SECONDS = 10.8e-6
 """For a ray that comes alone, as the preset redisplats has them."""
 _PAPER_GAUSSIANS = 60_000

@@ -7,8 +7,10 @@ def mount_pages(app: FastAPI) -> None:
     """Add the pages and their static files to the application."""
     from octasplat.service.web import api_page, pages, session
     from octasplat.service.web.assets import StaticAssets
+    from octasplat.service.web.documentation import DocumentationSite
 
     app.include_router(session.router)
     app.include_router(pages.router)
     app.include_router(api_page.router)
     app.mount("/static", StaticAssets(), name="static")
+    app.mount("/documentation", DocumentationSite(), name="documentation")

@@ -24,7 +24,7 @@ def sources() -> list[Path]:
     """Return the modules and pages in which papers are named."""
     modules = [path for name in ("engine", "workers", "service") for path in (ROOT / name).rglob("*.py")]
     package = list((ROOT / "src" / "octasplat").glob("*.py"))
-    pages = [path for path in (ROOT / "docs").rglob("*.md") if path.name != "experiments.md"]
+    pages = [path for path in (ROOT / "docs").rglob("*.md") if path.parent.name != "notes"]
     return sorted([*modules, *package, *pages, ROOT / "README.md"])
 
 

@@ -1,4 +1,4 @@
-"""Estimates beside what runs have taken (``docs/experiments.md``, ``docs/materials.md``)."""
+"""Estimates beside what runs have taken (``docs/notes/scenes.md``, ``docs/notes/materials.md``)."""
 
 import pytest
 

@@ -26,7 +26,8 @@ from octasplat.engine.train.sampling.pixel_sampler import valid_pixel_fraction
 USED_FRACTION = 0.8
 """Of the time; the rest is for checkpoints, probes, and a machine that becomes slower."""
 COST_POWER = 0.8
-"""Power of the number of Gaussians by which an iteration takes longer, see ``docs/experiments.md``."""
+"""Power of the number of Gaussians by which an iteration takes longer, see ``docs/notes/training.md``,
+"So many minutes"."""
 ITERATIONS_PER_GAUSSIAN = 1 / 20
 """About as in ``standard``: 10,000 iterations for 185,000 Gaussians, 20,000 for 400,000."""
 RAY_SORT_SLOWDOWN = 1.7

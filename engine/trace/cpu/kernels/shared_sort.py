@@ -16,7 +16,7 @@ the same list from the back, finds the alphas again, and ends with one row of mo
 packet, like the other one's.
 
 Not done: where octagons cross, and where a packet sees them obliquely, some of its rays composite in the
-wrong order; what that costs is in docs/experiments.md, "One order". Nor is there a second phase, are there
+wrong order; what that costs is in docs/notes/speed.md, "One order". Nor is there a second phase, are there
 features, or gradients by depths and normals; :class:`octasplat.engine.trace.cpu.tracer.CpuTracer` says when
 this is used.
 """
