@@ -70,18 +70,15 @@ def run(
         SceneFileError: a scene cannot be read, or the result not be written.
     """
     from octasplat.engine.files import read_metadata
-    from octasplat.engine.gaussians.merge import about_origin, merge_scenes
+    from octasplat.engine.gaussians.merge import merge_scenes
     from octasplat.engine.gaussians.scene_metadata import merge_metadata
-    from octasplat.engine.operations.scene_io import check_changed, edit_note, open_scene, write_changed
+    from octasplat.engine.operations.scene_io import check_changed, edit_note, open_scene_about, write_changed
 
     first: Path = request.source
     sources = (first, *request.scenes)
     check_changed("merge", request, request.output, request.scenes)
     facts = [read_metadata(source) for source in sources]
-    scenes = [
-        about_origin(open_scene(source, progress), each.origin_world, facts[0].origin_world)
-        for source, each in zip(sources, facts, strict=True)
-    ]
+    scenes = [open_scene_about(source, facts[0].origin_world, progress) for source in sources]
     every = dict.fromkeys(name for scene in scenes for name in scene.channels)
     for source, scene in zip(sources, scenes, strict=True):
         if missing := ", ".join(name for name in every if name not in scene.channels):

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float32
 
 from octasplat.engine.core.errors import ConfigError, OutputError
-from octasplat.engine.core.events import EventListener, Warned
+from octasplat.engine.core.events import EventListener, Noted, Warned
 from octasplat.engine.core.local_origin import NO_ORIGIN, Origin, vertices_about
 from octasplat.engine.core.relative_paths import normalize_name
 from octasplat.engine.dataset.model import Viewpoints
@@ -18,7 +18,7 @@ from octasplat.engine.files.gaussian_ply import read_gaussian_ply
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.operations.axes import axis_named
 from octasplat.engine.operations.render_options import PictureRequest
-from octasplat.engine.operations.scene_io import open_scene
+from octasplat.engine.operations.scene_io import open_scene, open_scene_about
 from octasplat.engine.operations.written_files import check_targets
 from octasplat.engine.pathtracing.stage_scene import StageScene
 from octasplat.engine.render.orbit import (
@@ -272,10 +272,12 @@ def stage_scene(
         source.settings,
         source.photographs,
         folder,
-        lambda path: open_scene(path, progress),
+        lambda path: open_scene_about(path, source.origin_world, progress),
         background_srgb,
         threads,
         lambda message: progress(Warned(message)),
+        lambda message: progress(Noted(message)),
+        source.origin_world,
     )
 
 

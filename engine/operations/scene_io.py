@@ -9,6 +9,7 @@ from jaxtyping import Float
 from pydantic import BaseModel
 
 from octasplat.engine.core.events import EventListener, Noted, Warned
+from octasplat.engine.core.local_origin import Origin, describe_origin
 from octasplat.engine.edit.changed_run import check_new_run, write_changed_run
 from octasplat.engine.files import (
     ExportOptions,
@@ -19,12 +20,16 @@ from octasplat.engine.files import (
     read_scene,
 )
 from octasplat.engine.gaussians.flattening import ImportReport
+from octasplat.engine.gaussians.merge import about_origin
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.gaussians.scene_metadata import SceneMetadata
 from octasplat.engine.operations.base import SourceRequest
 from octasplat.engine.operations.written_files import check_targets
 from octasplat.engine.runs.run_folder import is_run, unexported_parts
 from octasplat.engine.settings.fields import map_named_files
+
+MAX_ROUNDING = 0.01
+"""Positions that are rounded to more than this share of a Gaussian's size are worth a warning."""
 
 
 def open_scene(path: Path, progress: EventListener, *, drop_invalid: bool = False) -> FlatGaussians:
@@ -43,6 +48,29 @@ def open_scene(path: Path, progress: EventListener, *, drop_invalid: bool = Fals
     if is_run(path) and (left_out := unexported_parts(path)) is not None:
         progress(Warned(left_out))
     return gaussians
+
+
+def open_scene_about(path: Path, origin_world: Origin, progress: EventListener) -> FlatGaussians:
+    """Return the Gaussians of a file about the local origin of another scene.
+
+    A warning says where this costs digits, as one of both scenes has large coordinates and the other has not.
+
+    Raises:
+        SceneFileError: the file cannot be read.
+    """
+    scene, own = open_scene(path, progress), read_metadata(path).origin_world
+    moved = about_origin(scene, own, origin_world)
+    step = float(np.spacing(np.abs(moved.means_world).max(initial=0.0)))
+    sizes = float(np.median(scene.scales)) if len(scene) else 0.0
+    if own != origin_world and step > MAX_ROUNDING * sizes:
+        progress(
+            Warned(
+                f"{path} lies far from the other scene, about whose origin {describe_origin(origin_world)} "
+                f"it is put: 32 bits keep its positions to {step:.2g} units only, where its Gaussians are "
+                f"{sizes:.2g} wide; move it beside the other with octasplat transform --translate first."
+            )
+        )
+    return moved
 
 
 def report_dropped_on_import(path: Path, report: ImportReport, progress: EventListener) -> None:

@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float32, Float64, Int32, Int64
 
 from octasplat.engine.core.color import srgb_to_linear
 from octasplat.engine.core.errors import ConfigError
+from octasplat.engine.core.local_origin import NO_ORIGIN, Origin, vertices_about
 from octasplat.engine.core.rays import RayBatch
 from octasplat.engine.pathtracing.environment import EnvironmentMap, environment_frame
 from octasplat.engine.pathtracing.imported_materials import ImportedMaterial, import_material
@@ -95,7 +96,12 @@ class CompiledMeshes:
 
 
 def compile_meshes(
-    stage: Stage, folder: Path, *, threads: int = 0, warn: WarnCallback = lambda _sentence: None
+    stage: Stage,
+    folder: Path,
+    *,
+    threads: int = 0,
+    warn: WarnCallback = lambda _sentence: None,
+    origin_world: Origin = NO_ORIGIN,
 ) -> CompiledMeshes:
     """Read and place everything of a stage except its Gaussians.
 
@@ -104,6 +110,7 @@ def compile_meshes(
         folder: where the stage's files are relative to.
         threads: for building and tracing; 0 takes all.
         warn: told in a sentence what of a mesh file's materials is not understood.
+        origin_world: local origin of the scene, about which meshes of files in large coordinates are put.
 
     Raises:
         ConfigError: a mesh of glass is not closed, one that shines has no area, or an image is none.
@@ -112,7 +119,7 @@ def compile_meshes(
     up = np.array(stage.up)
     gathered = _MeshBuilder(MaterialTable(folder), len(stage.lights))
     for number, mesh in enumerate(stage.meshes):
-        _add_mesh(gathered, mesh, number, load_mesh_shape(mesh, number, folder), up, warn)
+        _add_mesh(gathered, mesh, number, load_mesh_shape(mesh, number, folder, origin_world), up, warn)
     for number, light in enumerate(stage.lights):
         corners = _light_triangles(light, up)
         if corners is not None:
@@ -292,8 +299,12 @@ def mesh_up_axis(mesh: StageMesh) -> str:
     return "y" if mesh.shape is not None or (mesh.file or "").lower().endswith(".glb") else "world"
 
 
-def load_mesh_shape(mesh: StageMesh, number: int, folder: Path) -> MeshShape:
+def load_mesh_shape(
+    mesh: StageMesh, number: int, folder: Path, origin_world: Origin = NO_ORIGIN
+) -> MeshShape:
     """Return the triangles of mesh ``number`` before placement, with its file's materials.
+
+    Vertices of a file that has them in large coordinates are about ``origin_world``.
 
     Raises:
         ConfigError: it is of glass and not closed.
@@ -304,6 +315,7 @@ def load_mesh_shape(mesh: StageMesh, number: int, folder: Path) -> MeshShape:
     else:
         assert mesh.file is not None
         shape, name = read_shape(folder / mesh.file), str(folder / mesh.file)
+        shape = replace(shape, vertices=vertices_about(shape.vertices, origin_world))
     if isinstance(mesh.material, Glass):
         count = count_open_edges(shape)
         if count:

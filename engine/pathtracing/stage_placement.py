@@ -9,6 +9,7 @@ from jaxtyping import Float32, Float64
 from scipy.spatial import cKDTree
 
 from octasplat.engine.core.errors import ConfigError
+from octasplat.engine.core.local_origin import NO_ORIGIN, Origin
 from octasplat.engine.core.rays import RayBatch
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.pathtracing.compile_meshes import load_mesh_shape, mesh_up_axis
@@ -31,9 +32,13 @@ HANGING_FRACTIONS = (0.2, 0.3, 0.4, 0.5, 0.6)
 
 
 def place_resting_meshes(
-    stage: Stage, tracer: Tracer | None, ray_of_pixel: RayOfPixel, folder: Path
+    stage: Stage,
+    tracer: Tracer | None,
+    ray_of_pixel: RayOfPixel,
+    folder: Path,
+    origin_world: Origin = NO_ORIGIN,
 ) -> Stage:
-    """Return the stage with the meshes that rest ``on`` something moved there.
+    """Return the stage with the meshes that rest ``on`` something moved there; all about ``origin_world``.
 
     Raises:
         ConfigError: the stage has no Gaussians, a ray meets nothing, or a photograph is not known.
@@ -47,7 +52,7 @@ def place_resting_meshes(
         if tracer is None:
             raise ConfigError(f"{key}: there are no Gaussians on which it could stand.")
         spot = _resting_point(mesh.on, tracer, ray_of_pixel, key)
-        shape = load_mesh_shape(mesh, number, folder)
+        shape = load_mesh_shape(mesh, number, folder, origin_world)
         points = transform_points(
             shape.vertices, mesh, up_axis_rotation(mesh_up_axis(mesh), mesh.turn_degrees, up)
         ) - np.array(mesh.position)

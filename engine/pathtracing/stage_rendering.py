@@ -8,12 +8,14 @@ import numpy as np
 
 from octasplat.engine.core.color import srgb_to_linear
 from octasplat.engine.core.events import EventListener
+from octasplat.engine.core.local_origin import is_set
 from octasplat.engine.core.progress import counted_phase
 from octasplat.engine.pathtracing.compile_meshes import CompiledMeshes, check_outside_glass, compile_meshes
 from octasplat.engine.pathtracing.film import StageImage
 from octasplat.engine.pathtracing.gaussian_layers import build_gaussian_layers
 from octasplat.engine.pathtracing.path_tracer import PathTracer, PathTracerScene
 from octasplat.engine.pathtracing.stage.model import Integrator, Stage
+from octasplat.engine.pathtracing.stage_origin import places_note, stage_about
 from octasplat.engine.pathtracing.stage_placement import place_resting_meshes
 from octasplat.engine.pathtracing.stage_scene import SIZE_PER_RADIUS, StageScene
 from octasplat.engine.render.image_files import write_exr, write_png
@@ -59,14 +61,24 @@ def compile_stage(stage: Stage, scene: StageScene, shots: Sequence[Shot]) -> Sta
     Raises:
         OctasplatError: something of the stage cannot be used, or a camera stands in glass.
     """
+    stage, moved = stage_about(stage, scene.origin_world)
+    if is_set(scene.origin_world):
+        subtracted = f" It was subtracted from {', '.join(moved)}." if moved else ""
+        scene.note(places_note(scene.origin_world) + subtracted)
     layers = build_gaussian_layers(
         stage, scene.gaussians, scene.read_gaussians, scene.folder, scene.settings,
         size=SIZE_PER_RADIUS * scene.turntable(np.array(stage.up)).radius, threads=scene.threads,
     )  # fmt: skip
     stage = place_resting_meshes(
-        stage, None if layers is None else layers.tracer, scene.ray_of_pixel, scene.folder
+        stage,
+        None if layers is None else layers.tracer,
+        scene.ray_of_pixel,
+        scene.folder,
+        scene.origin_world,
     )
-    meshes = compile_meshes(stage, scene.folder, threads=scene.threads, warn=scene.warn)
+    meshes = compile_meshes(
+        stage, scene.folder, threads=scene.threads, warn=scene.warn, origin_world=scene.origin_world
+    )
     check_cameras_outside_glass(meshes, shots)
     background = srgb_to_linear(scene.background_srgb.astype(np.float64))
     only_environment = stage.model_copy(update={"meshes": (), "lights": ()})

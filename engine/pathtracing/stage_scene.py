@@ -1,16 +1,18 @@
 """The scene for a stage, and the first stage of a scene."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float32, Float64
 
 from octasplat.engine.core.errors import ConfigError
+from octasplat.engine.core.local_origin import NO_ORIGIN, Origin, is_set
 from octasplat.engine.dataset.model import Viewpoints
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.pathtracing.stage.stage_file import StageLayout
+from octasplat.engine.pathtracing.stage_origin import places_note
 from octasplat.engine.pathtracing.stage_placement import estimate_stage_layout
 from octasplat.engine.render.pose_paths import Turntable
 from octasplat.engine.render.shots import gaussian_turntable, turntable_of_views
@@ -36,6 +38,9 @@ class StageScene:
         background_srgb: display colour behind everything.
         threads: to use; 0 takes all.
         warn: told in a sentence what of a mesh file is not understood.
+        note: told in a sentence about which origin places are.
+        origin_world: local origin of the Gaussians and photographs, see
+            :mod:`octasplat.engine.core.local_origin`.
     """
 
     gaussians: FlatGaussians
@@ -46,6 +51,8 @@ class StageScene:
     background_srgb: Float32[np.ndarray, "3"]
     threads: int
     warn: Callable[[str], None] = lambda _sentence: None
+    note: Callable[[str], None] = lambda _sentence: None
+    origin_world: Origin = NO_ORIGIN
 
     def turntable(self, up_world: Float64[np.ndarray, "3"] | None = None) -> Turntable:
         """Return a circle around the visible scene."""
@@ -94,4 +101,5 @@ def first_stage_layout(scene: StageScene, up_world: Float64[np.ndarray, "3"] | N
     tracer = make_tracer(scene.settings, threads=scene.threads)
     tracer.build(scene.gaussians)
     size = SIZE_PER_RADIUS * table.radius
-    return estimate_stage_layout(scene.gaussians, tracer, table.up_world, table.centre_world, size, cameras)
+    found = estimate_stage_layout(scene.gaussians, tracer, table.up_world, table.centre_world, size, cameras)
+    return replace(found, note=places_note(scene.origin_world) if is_set(scene.origin_world) else "")

@@ -105,6 +105,7 @@ class StageLayout:
         size: about as large as what the cameras look at, world units.
         light_direction: the way that the scene's light seems to go.
         has_floor: whether the scene shows anything level to stand on.
+        note: a sentence about the positions, for the head of the file.
     """
 
     up: tuple[float, float, float]
@@ -112,6 +113,7 @@ class StageLayout:
     size: float
     light_direction: tuple[float, float, float]
     has_floor: bool = True
+    note: str = ""
 
 
 def write_stage_template(path: Path, layout: StageLayout) -> None:
@@ -126,6 +128,7 @@ def write_stage_template(path: Path, layout: StageLayout) -> None:
     write_text(
         path,
         _TEMPLATE.format(
+            places=f"# {layout.note}\n" if layout.note else "",
             up=_format_vector(layout.up),
             centre=_format_vector(centre),
             floor=_format_vector(layout.floor),
@@ -187,7 +190,7 @@ _UNION_TAGS = (
 _TEMPLATE = """\
 # A stage: things, lights and how the scene takes part. Lengths are in the scene's units, colours are
 # display values from 0 to 1, files are relative to this one. Everything that can be set: docs/light.md.
-version = 1
+{places}version = 1
 up = {up}
 
 # How the scene takes light. emissive: as trained; shadowed: darker where a new thing keeps light off;
