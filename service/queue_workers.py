@@ -11,6 +11,7 @@ from octasplat.workers.db.connections import Connection
 from octasplat.workers.db.rows import WorkerRow
 from octasplat.workers.db.workers import live_workers
 from octasplat.workers.worker.job_kinds import JobKind
+from octasplat.workers.worker.path_redaction import shorten_absolute_paths
 
 
 async def live_workers_of_queue(connection: Connection, queue: str, stale_seconds: float) -> list[WorkerRow]:
@@ -59,7 +60,7 @@ def queued_job_notes(
     if workers:
         takers = [row for row in workers if kind.name in row.facts.get("kinds", (kind.name,))]
         if takers:
-            return []
+            return _refusing_workers_note(queue, takers)
         return [
             f"No worker of the queue {queue} knows jobs of the kind {kind.name}; the job waits for one of a "
             "newer version."
@@ -69,6 +70,15 @@ def queued_job_notes(
     if needy:
         notes.append(f"Whether {' and '.join(needy)} can be written is not known before a worker is there.")
     return notes
+
+
+def _refusing_workers_note(queue: str, takers: Sequence[WorkerRow]) -> list[str]:
+    """Return why none of the workers takes a job; nothing where one of them does."""
+    reasons = [row.facts.get("ailing") for row in takers]
+    told = dict.fromkeys(shorten_absolute_paths(str(reason)).rstrip(".") for reason in reasons if reason)
+    if not all(reasons):
+        return []
+    return [f"The workers of the queue {queue} take no jobs for now: {'; '.join(told)}."]
 
 
 _ALL_FORMATS = tuple(exporter.name for exporter in exporters())

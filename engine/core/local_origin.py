@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Float, Float64
 
 Origin = tuple[float, float, float]
+Box = tuple[float, float, float, float, float, float]
 NO_ORIGIN: Origin = (0.0, 0.0, 0.0)
 MAX_DISTANCE = 100.0
 """A centre farther than so many extents asks for a local origin: 32 bits leave 1e-5 of the extent there."""
@@ -53,6 +54,14 @@ def describe_origin(origin: Origin) -> str:
     '512350 5403210 310'
     """
     return " ".join(f"{value:.15g}" for value in origin)
+
+
+def box_about(box: Box | None, origin: Origin) -> Box | None:
+    """Return a box in the coordinates of the user, low and high corner in one, about an origin."""
+    if box is None:
+        return None
+    x0, y0, z0, x1, y1, z1 = (float(value) for value in np.array(box) - np.tile(origin, 2))
+    return (x0, y0, z0, x1, y1, z1)
 
 
 def user_position(position: Float[np.ndarray, "3"], origin: Origin) -> str:

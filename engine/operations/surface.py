@@ -226,6 +226,7 @@ def run(
         SceneFileError: the scene cannot be read, or the mesh not be written.
         CancelledError: stopped as asked; nothing was written.
     """
+    from octasplat.engine.core.local_origin import box_about
     from octasplat.engine.files import check_surface_path, read_metadata, surface_files, write_surface
     from octasplat.engine.gaussians.materials import require_materials
     from octasplat.engine.operations.scene_io import open_scene
@@ -266,7 +267,7 @@ def run(
     surfaces = extract_levels(
         tracer,
         cameras,
-        request,
+        request.model_copy(update={"bounds": box_about(request.bounds, origin)}),
         tuple(request.levels.values()) or (None,),
         scratch=output.parent,
         light_frame=frame,

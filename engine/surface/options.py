@@ -4,9 +4,9 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, field_validator
 
+from octasplat.engine.core.local_origin import Box
 from octasplat.engine.settings.fields import Group, Spelling, Unit
 
-Box = tuple[float, float, float, float, float, float]
 _NEGATABLE = Spelling(negatable=True)
 """Of what ``room`` switches on where nothing is said."""
 

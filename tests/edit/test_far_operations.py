@@ -41,7 +41,7 @@ class Site:
 def sites(make_scene: Callable[..., FlatGaussians], tmp_path: Path) -> tuple[Site, Site]:
     scene = make_scene(120)
     half, one = np.full((120, 3), 0.5, np.float32), np.ones((120, 1), np.float32)
-    scene = replace(scene, channels={"albedo": half, "metallic": one, "roughness": one})
+    scene = scene.with_channels({"albedo": half, "metallic": one, "roughness": one})
     return Site(tmp_path / "near", scene, NO_ORIGIN), Site(tmp_path / "far", scene, ORIGIN)
 
 
@@ -91,19 +91,10 @@ def test_material_by_mesh_and_box_in_user_coordinates(octasplat: Run, sites: tup
         mesh = site.folder / "mesh.ply"
         box = (*site.place(-0.7, -0.7, -2), *site.place(0.7, 0.7, 2))
         out = site.folder / "out.ply"
-        run(
-            octasplat,
-            "material",
-            site.scene,
-            "--mesh",
-            mesh,
-            "--box",
-            *box,
-            "--set",
-            "roughness=0.3",
-            "-o",
-            out,
-        )
+        where = ("--mesh", mesh, "--box", *box)
+        run(octasplat, "material", site.scene, *where, "--set", "roughness=0.3", "-o", out)
+    changed = read_scene(out)[0].channels["roughness"] < 0.4
+    assert 0 < changed.sum() < len(changed)
     assert_same(sites[0].folder / "out.ply", sites[1].folder / "out.ply")
 
 
@@ -207,8 +198,8 @@ def test_surface_of_a_far_scene_is_that_at_the_origin(
     meshes = []
     for name, origin in (("near", NO_ORIGIN), ("far", ORIGIN)):
         site = Site(tmp_path / name, scene, origin)
-        bounds = ",".join(map(str, (*site.place(-1.2, -1.2, -1.2), *site.place(1.2, 1.2, 0.2))))
-        options = ("--resolution", 20, "--depth-side", 32, "--no-fit", "--bounds", bounds)
+        bounds = ",".join(map(str, (*site.place(-1.6, -1.6, -1.6), *site.place(1.6, 1.6, 0.4))))
+        options = ("--resolution", 20, "--depth-side", 96, "--no-fit", "--bounds", bounds)
         run(octasplat, "surface", site.scene, "-o", site.folder / "surface.ply", *options)
         meshes.append(read_mesh(site.folder / "surface.ply").about(tuple(site.origin)))
     assert len(meshes[0].vertices) > 50

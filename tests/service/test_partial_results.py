@@ -32,6 +32,27 @@ async def worker_lives(service: Service, *lacking: str, queue: str = "cpu") -> N
         )
 
 
+async def test_queued_job_says_why_no_worker_takes_it(connect_service: ConnectService) -> None:
+    async with connect_service() as (http, service):
+        dataset = await committed_dataset(service)
+        made = await http.post("/v1/jobs", json={"dataset_id": dataset})
+
+        async def heartbeat(worker: uuid.UUID, ailing: str | None) -> list[str]:
+            async with service.pool.connection() as connection:
+                await record_worker_heartbeat(
+                    connection, worker, name="w", queues=["cpu"], slots=1, facts={"ailing": ailing}
+                )
+            notes: list[str] = (await http.get(made.headers["Location"])).json()["notes"]
+            return notes
+
+        first, second = uuid.uuid4(), uuid.uuid4()
+        told = await heartbeat(first, "the folder /srv/data/octasplat/work cannot be written")
+        reason = "the folder …/octasplat/work cannot be written"
+        assert told == [f"The workers of the queue cpu take no jobs for now: {reason}."]
+        assert await heartbeat(second, None) == []  # this one takes it
+        assert await heartbeat(first, None) == []
+
+
 async def test_create_job_unwritable_format_is_refused(connect_service: ConnectService) -> None:
     async with connect_service() as (http, service):
         dataset = await committed_dataset(service)

@@ -39,7 +39,8 @@ class Admission:
         self._name = name
         self._pool = pool
         self._context = context
-        self._is_shortage_logged = False
+        self.shortage: str | None = None
+        """What there is no room for, while the worker takes no jobs."""
 
     async def admit(self, job_id: uuid.UUID, entry_id: int) -> bool:
         """Return whether there is space for a job, after waiting a while; else the job is left to others.
@@ -49,17 +50,17 @@ class Admission:
         """
         deadline = time.monotonic() + MAX_SPACE_WAIT_SECONDS
         while (lacking := await self._context.space_shortage()) is not None:
-            if not self._is_shortage_logged:
+            if self.shortage is None:
                 logger.warning("worker %s takes no jobs: %s", self._name, lacking)
-            self._is_shortage_logged = True
+            self.shortage = lacking
             await self._free_space()
             if time.monotonic() > deadline or self._context.draining.is_set():
                 await defer_job(self._pool, self._context.job_queue, job_id, entry_id)
                 return False
             await asyncio.sleep(self._context.settings.poll_seconds)
-        if self._is_shortage_logged:
+        if self.shortage is not None:
             logger.info("worker %s has room again", self._name)
-        self._is_shortage_logged = False
+        self.shortage = None
         return await self._has_space_for(job_id, entry_id)
 
     async def free_space_if_short(self) -> None:

@@ -326,7 +326,7 @@ class _Worker:
             "memory_bytes": memory.total,
             "memory_free_bytes": memory.available,
             "memory_limit_bytes": self._context.memory_limit_bytes,
-            "ailing": self._context.host_health.fault,
+            "ailing": self._context.host_health.fault or self._admission.shortage,
             "isolation": sandbox_capabilities(),
             **version_facts(),
         }
