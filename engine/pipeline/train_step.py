@@ -34,7 +34,7 @@ from octasplat.engine.shading.material_settings import MaterialSettings
 from octasplat.engine.shading.protocol import ShadingModel
 from octasplat.engine.shading.recipes import material_shading
 from octasplat.engine.train.config import TrainConfig, iteration_count
-from octasplat.engine.train.initialization.initial_gaussians import initial_scene
+from octasplat.engine.train.initialization.initial_gaussians import initial_train_state
 from octasplat.engine.train.loop.checkpoint import load_latest_checkpoint, run_fingerprint
 from octasplat.engine.train.loop.state import MinScale
 from octasplat.engine.train.loop.time_budget import make_plan, read_plan, write_plan
@@ -100,7 +100,7 @@ def _trainer(
     fingerprint = run_fingerprint(dataset, config)
     state = load_latest_checkpoint(folder, fingerprint, progress)
     if state is None:
-        state = initial_scene(dataset, config, threads=use_threads(run.threads))
+        state = initial_train_state(dataset, config, threads=use_threads(run.threads))
         if exposure_changes is not None:
             progress(Warned(f"{exposure_changes} That is learnt; exposure=false leaves it out."))
         state.seconds = clock.seconds()
@@ -119,7 +119,7 @@ def _trainer(
         progress=progress,
         threads=run.threads,
         should_stop=run.should_stop,
-        scale_floor=_scale_floor(dataset, config.min_scale_px),
+        min_scale=_min_scale(dataset, config.min_scale_px),
         camera_clearance=zones if config.camera_clearance > 0 else None,
         view_frusta=frusta if _prunes_unseen(config.materials) else None,
         on_step=None
@@ -178,7 +178,7 @@ def _write_training_record(
     write_json(output / TRAINING, record)
 
 
-def _scale_floor(dataset: Dataset, min_scale_px: float) -> MinScale | None:
+def _min_scale(dataset: Dataset, min_scale_px: float) -> MinScale | None:
     if min_scale_px == 0:
         return None
     pixel_rad = training_pixel_angle(dataset.viewpoints)
@@ -199,7 +199,7 @@ def _plan_settings(
     if settings.minutes is None:
         return config
     if not (output / PLAN).exists():
-        first = initial_scene(dataset, config, threads=use_threads(threads)).gaussians
+        first = initial_train_state(dataset, config, threads=use_threads(threads)).gaussians
         left = 60 * settings.minutes - 2 * clock.seconds()  # the first Gaussians are made once more
         plan = make_plan(dataset, config, first, seconds=left, threads=threads, should_stop=should_stop)
         write_plan(output / PLAN, plan)

@@ -17,7 +17,7 @@ def test_min_scale_is_enforced(tmp_path: Path) -> None:
     floor = MinScale(world.origins[world.train_indices], 0.02)
     trained = Trainer(
         world, small_config(iterations=40), initial_state(start, 0), folder=tmp_path, fingerprint="test",
-        progress=lambda _event: None, threads=1, scale_floor=floor,
+        progress=lambda _event: None, threads=1, min_scale=floor,
     ).run()  # fmt: skip
     away = cdist(trained.means_world, floor.origins_world).min(axis=1)
     assert (trained.scales >= 0.02 * away[:, None] * (1 - 1e-5)).all()

@@ -140,7 +140,7 @@ def add_initial_materials(gaussians: FlatGaussians, settings: MaterialSettings) 
     )
 
 
-def initial_scene(dataset: Dataset, config: TrainConfig, *, threads: int = 1) -> TrainState:
+def initial_train_state(dataset: Dataset, config: TrainConfig, *, threads: int = 1) -> TrainState:
     """Return the state with the first Gaussians, their materials and the first background, where learnt.
 
     Args:

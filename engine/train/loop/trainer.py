@@ -52,7 +52,7 @@ class Trainer:
         threads: for everything; 0 means all cores.
         should_stop: asked wherever a run may stop, see
             :class:`octasplat.engine.train.loop.schedule.Schedule`.
-        scale_floor: least size of Gaussians.
+        min_scale: least size of Gaussians.
         camera_clearance: zones around cameras in which no Gaussian stays, whatever the strategy does.
         view_frusta: frusta of the views; no Gaussian stays outside of all of them.
         tracer: anything that follows the protocol; None takes the one that the configuration names.
@@ -82,7 +82,7 @@ class Trainer:
         progress: EventListener,
         threads: int = 0,
         should_stop: Callable[[], bool] = lambda: False,
-        scale_floor: MinScale | None = None,
+        min_scale: MinScale | None = None,
         camera_clearance: CameraClearance | None = None,
         view_frusta: ViewFrusta | None = None,
         tracer: Tracer | None = None,
@@ -91,7 +91,7 @@ class Trainer:
     ) -> None:
         self.state = state
         self._on_step = on_step
-        self._scale_floor = scale_floor
+        self._min_scale = min_scale
         self._allowed_region = AllowedRegion(camera_clearance, view_frusta)
         self._config = config
         self._folder = folder
@@ -172,8 +172,8 @@ class Trainer:
                 state.average.clear()
             if schedule.is_rebuild_due(state.iteration, len(state.gaussians)):
                 state.raise_sh_degree(schedule.sh_degree(state.iteration))
-                if self._scale_floor is not None:
-                    self._scale_floor.apply(state.gaussians)
+                if self._min_scale is not None:
+                    self._min_scale.apply(state.gaussians)
                 self._build()
                 self._checkpoint_or_stop(watch, resumed=0 < state.iteration == first_iteration)
                 schedule = self.schedule

@@ -14,7 +14,7 @@ from octasplat.engine.shading.protocol import ShadingModel
 from octasplat.engine.trace.factory import make_tracer
 from octasplat.engine.trace.protocol import Tracer
 from octasplat.engine.train.config import Background, TrainConfig
-from octasplat.engine.train.initialization.initial_gaussians import initial_scene
+from octasplat.engine.train.initialization.initial_gaussians import initial_train_state
 from octasplat.engine.train.loop.state import TrainState, initial_state
 from octasplat.engine.train.loop.trainer import Trainer
 
@@ -61,7 +61,7 @@ def train_coarse_scene(
     gaussians, shading = _train(
         dataset,
         config,
-        initial_scene(dataset, config, threads=use_threads(threads)),
+        initial_train_state(dataset, config, threads=use_threads(threads)),
         threads,
         should_stop,
         lambda done, _tracer: progress(done),

@@ -92,7 +92,7 @@ class Adam:
         training_progress: float,
         extent: float,
     ) -> Float32[np.ndarray, "u 3"]:
-        """Change ``gaussians`` in place.
+        """Take one step of Adam for the Gaussians that were hit; changes ``gaussians`` in place.
 
         Args:
             gaussians: parameters.
@@ -106,15 +106,15 @@ class Adam:
         Returns:
             Each hit Gaussian's step of the mean, world units.
         """
-        moved = np.empty((len(gradients.ids), 3), np.float32)
+        mean_steps = np.empty((len(gradients.ids), 3), np.float32)
         corrections = np.empty((len(gradients.ids), 2))
-        hit = max(1, len(gradients.ids))
+        hit_count = max(1, len(gradients.ids))
         decay = rates.decay**training_progress
-        colour = rates.color / SH_C0 * decay
+        color_rate = rates.color / SH_C0 * decay
         mean_unit = extent if rates.mean_unit == "extent" else 1.0
         vectors = -(-3 * gaussians.sh.shape[1] // LANES)
-        rates_sh = np.full(vectors * LANES, colour * rates.sh_rest_ratio, np.float32)
-        rates_sh[:3] = colour
+        rates_sh = np.full(vectors * LANES, color_rate * rates.sh_rest_ratio, np.float32)
+        rates_sh[:3] = color_rate
         powers = _beta_powers(1 << (int(self.steps.max(initial=0)) + 1).bit_length())
         run_ranges(
             adam_step, threads_in_use(), -(-len(gradients.ids) // CHUNK),
@@ -135,13 +135,13 @@ class Adam:
                 rates.quat * decay, rates.log_scale * decay, rates.opacity * decay, rates_sh,
             ),
             Regularization(
-                loss.opacity / hit, loss.scale / (2 * hit * extent),
+                loss.opacity / hit_count, loss.scale / (2 * hit_count * extent),
                 float(np.log(1e-6 * extent)), float(np.log(10.0 * extent)),
             ),
-            moved, grain=1,
+            mean_steps, grain=1,
         )  # fmt: skip
         self._step_channels(gaussians, gradients, rates, decay, corrections)
-        return moved
+        return mean_steps
 
     def _step_channels(
         self,

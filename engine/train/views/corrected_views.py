@@ -133,19 +133,19 @@ def _common_similarity(
 
     Least squares of what is left of the turns, in rad, and of the shifts, of the extent.
     """
-    slopes = np.zeros((len(given), 6, 7))
-    wanted = np.zeros((len(given), 6))
+    jacobian = np.zeros((len(given), 6, 7))
+    motions = np.zeros((len(given), 6))
     for k, (old, new) in enumerate(zip(given, now, strict=True)):
-        turned = new.rotation_cam_from_world.T @ old.rotation_cam_from_world
-        wanted[k, :3] = Rotation.from_matrix(turned).as_rotvec()
-        wanted[k, 3:] = (new.origin_world - old.origin_world) / extent
-        slopes[k, :3, :3] = np.eye(3)
-        slopes[k, 3:, 3:6] = np.eye(3) / extent
-        place = old.origin_world - middle
-        slopes[k, 3:, :3] = np.cross(np.eye(3), place).T / extent
-        slopes[k, 3:, 6] = place / extent
-    curvature = np.einsum("vik,vil->kl", slopes, slopes)
-    diagonal = curvature.diagonal()
+        rotation = new.rotation_cam_from_world.T @ old.rotation_cam_from_world
+        motions[k, :3] = Rotation.from_matrix(rotation).as_rotvec()
+        motions[k, 3:] = (new.origin_world - old.origin_world) / extent
+        jacobian[k, :3, :3] = np.eye(3)
+        jacobian[k, 3:, 3:6] = np.eye(3) / extent
+        offset = old.origin_world - middle
+        jacobian[k, 3:, :3] = np.cross(np.eye(3), offset).T / extent
+        jacobian[k, 3:, 6] = offset / extent
+    hessian = np.einsum("vik,vil->kl", jacobian, jacobian)
+    diagonal = hessian.diagonal()
     ridge = np.diag(1e-9 * diagonal + 1e-12)
-    common = np.linalg.solve(curvature + ridge, np.einsum("vik,vi->k", slopes, wanted))
+    common = np.linalg.solve(hessian + ridge, np.einsum("vik,vi->k", jacobian, motions))
     return common[:3], common[3:6], float(common[6])
