@@ -60,3 +60,10 @@ rough_dielectric_sample_array
 fill_uniform
 read_camera_path
 DIELECTRIC_F0
+# keys of transforms files, read by their names or known so that they are not told as unused
+camera_angle_x
+camera_angle_y
+fl_x
+fl_y
+is_fisheye
+train_filenames

@@ -16,8 +16,8 @@ from pathlib import Path
 
 import numpy as np
 
+from octasplat.engine.core.ply_container import read_ply
 from octasplat.engine.files import export_scene
-from octasplat.engine.files.ply_container import read_ply
 from octasplat.engine.gaussians.model import FlatGaussians
 
 

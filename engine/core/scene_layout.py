@@ -3,7 +3,11 @@
 images/<name>, or input/<name>      photographs; without these folders all photographs that there are
 masks/<name>.png                    masks, where there are any
 sparse, colmap/sparse, distorted/sparse, each also with a number below it: cameras, images, points3D, rigs
-                                    and frames (.bin or .txt)
+                                    and frames (.bin or .txt); the same beside the photographs, if all are
+                                    there, as Metashape and RealityScan export them
+transforms.json, or transforms_train.json, transforms_test.json and transforms_val.json, and <name>.ply with
+                                    the points that they name: poses as nerfstudio, instant-ngp and Blender
+                                    scenes have them
 """
 
 import re
@@ -16,7 +20,7 @@ IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", "
 """Photographs that are taken at every door."""
 UNREAD_SUFFIXES = frozenset(
     {".heic", ".heif", ".avif", ".jxl", ".jp2", ".gif", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf"}
-    | {".orf", ".rw2", ".pef", ".srw", ".raw", ".insp"}
+    | {".orf", ".rw2", ".pef", ".srw", ".raw", ".insp", ".ppm", ".pgm", ".tga", ".dpx", ".psd", ".j2k"}
 )
 """Photographs in formats that are not taken."""
 ARCHIVE_SUFFIXES = frozenset({".zip", ".7z", ".rar", ".tar", ".gz", ".tgz", ".bz2", ".xz", ".zst"})
@@ -32,8 +36,10 @@ MASK_ENDING = "_mask"
 """What the name of a mask that lies beside its photograph ends with, before the suffix."""
 
 _MODEL_FILE = re.compile(
-    r"((colmap/|distorted/)?sparse(/[0-9]+)?)/(cameras|images|points3D|rigs|frames)\.(bin|txt)"
+    r"((colmap/|distorted/)?sparse(/[0-9]+)?/)?(cameras|images|points3D|rigs|frames)\.(bin|txt)"
 )
+_POSES_FILE = re.compile(r"transforms(_train|_test|_val)?\.json")
+_POINTS_FILE = re.compile(r"[^/]+\.ply", re.IGNORECASE)
 _MODEL_ELSEWHERE = re.compile(r"(.*/)?images\.(bin|txt)")
 _IGNORED_FILE = re.compile(
     r"(^|/)(__MACOSX/|\.(?!\.?(/|$))[^/]*|thumbs\.db$|desktop\.ini$|Icon\r?$)", re.IGNORECASE
@@ -85,14 +91,25 @@ def lay_out_scene(paths: Sequence[str]) -> SceneLayout:
     results = results_folders(names.values())
     photographs = [name for name in names.values() if is_photograph(name, results)]
     top = next((top for top in (IMAGES, "input/") if any(name.startswith(top) for name in photographs)), "")
+    unused = _unused_model_files(names.values())
     files: dict[str, str] = {}
     for path, name in names.items():
-        if file_role(name) in (FileRole.MODEL, FileRole.MASK):
+        if name not in unused and file_role(name) in (FileRole.MODEL, FileRole.MASK):
             files[name] = path
         elif name.startswith(top) and is_photograph(name, results):
             files[f"images/{name.removeprefix(top)}"] = path
     taken = set(files.values())
     return SceneLayout(files, tuple(path for path in rest if path not in taken), ignored, folder)
+
+
+def _unused_model_files(names: Iterable[str]) -> set[str]:
+    """Return files that may be of a model but are not: parts of one at the top, points without poses."""
+    at_top = {name for name in names if "/" not in name}
+    forms = ({f"{part}{suffix}" for part in ("cameras", "images", "points3D")} for suffix in (".bin", ".txt"))
+    unused = set() if any(form <= at_top for form in forms) else set(filter(_MODEL_FILE.fullmatch, at_top))
+    if not at_top & {"transforms.json", "transforms_train.json"}:
+        unused |= {name for name in at_top if _POSES_FILE.fullmatch(name) or _POINTS_FILE.fullmatch(name)}
+    return unused
 
 
 def is_photograph(name: str, results: Iterable[str] = ()) -> bool:
@@ -117,7 +134,7 @@ def file_role(name: str) -> FileRole:
     """Return what the file ``name``, relative to the scene, is."""
     if is_ignored_file(name):
         return FileRole.OTHER
-    if _MODEL_FILE.fullmatch(name):
+    if any(pattern.fullmatch(name) for pattern in (_MODEL_FILE, _POSES_FILE, _POINTS_FILE)):
         return FileRole.MODEL
     top, slash, rest = name.partition("/")
     if slash and rest and _is_picture(rest):

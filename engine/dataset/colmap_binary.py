@@ -1,16 +1,22 @@
-"""Check of the structure of COLMAP's binary files.
+"""COLMAP's binary files: a look over their structure, and a reader for those that its own one stops at.
 
-COLMAP's own reader accepts a truncated file without complaint, or asks for absurd amounts of memory.
+COLMAP's reader takes a file that ends too early without complaint, or asks for absurd amounts of memory; it
+refuses points that name images which are not there.
 """
 
 import mmap
 import struct
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
+import numpy as np
 import pycolmap
 
 from octasplat.engine.core.errors import DatasetError
+from octasplat.engine.dataset.colmap_records import CameraRecord, ImageRecord, ModelRecords, PointRecord
+
+_Record = TypeVar("_Record")
 
 
 def check_binary_colmap_model(folder: Path) -> None:
@@ -37,6 +43,89 @@ def check_binary_colmap_model(folder: Path) -> None:
                 f"{path} is damaged: its contents do not fill its {len(data)} bytes; "
                 "copy it anew or run COLMAP again."
             )
+
+
+def read_binary_model(folder: Path) -> ModelRecords:
+    """Read the files of a whole binary model, see :func:`check_binary_colmap_model`.
+
+    Raises:
+        DatasetError: an id comes twice, or an image has a camera that is not there or a name that is no text.
+    """
+    cameras = _by_id(folder / "cameras.bin", _read_cameras, "camera")
+    images = _by_id(folder / "images.bin", _read_images, "image")
+    for image in images.values():
+        if image.camera_id not in cameras:
+            raise DatasetError(
+                f"{folder / 'images.bin'} names camera {image.camera_id} for {image.name}, which is not in "
+                "cameras.bin; copy both files from one model."
+            )
+    points = _by_id(folder / "points3D.bin", _read_points, "point")
+    rigs = [f"Rigs of the model in {folder} are not used; the poses in images.bin are taken."]
+    has_rigs = any((folder / f"{part}.bin").is_file() for part in ("rigs", "frames"))
+    return ModelRecords(cameras, images, points, tuple(rigs * has_rigs))
+
+
+def _by_id(
+    path: Path, read: Callable[[Any, Path], Iterator[tuple[int, _Record]]], what: str
+) -> dict[int, _Record]:
+    records: dict[int, _Record] = {}
+    for number, record in read(path.read_bytes(), path):
+        if number in records:
+            raise DatasetError(f"{path} has {what} {number} twice; copy it anew or run COLMAP again.")
+        records[number] = record
+    return records
+
+
+def _read_cameras(data: bytes, path: Path) -> Iterator[tuple[int, CameraRecord]]:
+    names = {int(model): name for name, model in pycolmap.CameraModelId.__members__.items()}
+    position = 8
+    for _ in range(_unpack("Q", data, 0)[0]):
+        camera_id, model, width, height = _unpack("IiQQ", data, position)
+        count = len(pycolmap.Camera.create_from_model_name(0, names[model], 1.0, 1, 1).params)
+        params = _unpack(f"{count}d", data, position + 24)
+        position += 24 + 8 * count
+        yield camera_id, CameraRecord(camera_id, names[model], width, height, params)
+
+
+def _read_images(data: bytes, path: Path) -> Iterator[tuple[int, ImageRecord]]:
+    shown = np.dtype([("px", "<f8", 2), ("point", "<i8")])
+    position = 8
+    for _ in range(_unpack("Q", data, 0)[0]):
+        image_id, *numbers, camera_id = _unpack("I7dI", data, position)
+        end_of_name = data.index(b"\0", position + 64)
+        try:
+            name = data[position + 64 : end_of_name].decode()
+        except UnicodeDecodeError:
+            raise DatasetError(
+                f"{path} names image {image_id} otherwise than in UTF-8; rename the photograph in plain "
+                "letters and run COLMAP again."
+            ) from None
+        (count,) = _unpack("Q", data, end_of_name + 1)
+        values = np.frombuffer(data, shown, count, end_of_name + 9)
+        position = end_of_name + 9 + shown.itemsize * count
+        yield (
+            image_id,
+            ImageRecord(
+                image_id=image_id,
+                quaternion_wxyz=tuple(numbers[:4]),
+                translation=tuple(numbers[4:]),
+                camera_id=camera_id,
+                name=name,
+                observed_px=values["px"].astype(np.float64),
+                observed_point_ids=values["point"].astype(np.int64),
+            ),
+        )
+
+
+def _read_points(data: bytes, path: Path) -> Iterator[tuple[int, PointRecord]]:
+    position = 8
+    for _ in range(_unpack("Q", data, 0)[0]):
+        point_id, *numbers, length = _unpack("Q3d3BdQ", data, position)
+        xyz, rgb, error = tuple(numbers[:3]), tuple(numbers[3:6]), numbers[6]
+        track = _unpack(f"{2 * length}I", data, position + 51)
+        position += 51 + 8 * length
+        pairs = tuple(zip(track[::2], track[1::2], strict=True))
+        yield point_id, PointRecord(point_id, xyz, rgb, error, pairs)
 
 
 def _memory_map(path: Path) -> mmap.mmap:

@@ -2,8 +2,9 @@
 
 import math
 import re
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,15 +15,10 @@ from jaxtyping import Float64, Int64
 from octasplat.engine.core.errors import DatasetError
 from octasplat.engine.core.local_origin import NO_ORIGIN, Origin, choose_origin
 from octasplat.engine.dataset.camera import Camera
-from octasplat.engine.dataset.colmap_binary import check_binary_colmap_model
-from octasplat.engine.dataset.colmap_text import find_text_model_error
+from octasplat.engine.dataset.colmap_reading import load_model
 from octasplat.engine.dataset.model import SparsePoints
 from octasplat.engine.dataset.pose_check import check_poses
 
-MODEL_FOLDERS = ("sparse", "colmap/sparse", "distorted/sparse")
-"""Where a scene keeps its model, or several in numbered folders below; the first that holds one counts."""
-
-_MODEL_FILES = ("cameras", "images", "points3D")
 MIN_QUATERNION_NORM = 1e-6
 """Quaternions shorter than this say nothing about a rotation."""
 ROUNDING = 1e-9
@@ -62,6 +58,8 @@ class ColmapModel:
         warnings: one sentence each on what is odd but usable.
         origin_world: where poses and points have their origin in the coordinates of the files, see
             :mod:`octasplat.engine.core.local_origin`.
+        held_out: names of the images that the model's files hold out; None where they do not say.
+        masks: paths of masks that the files name, by the names of their images.
     """
 
     folder: Path
@@ -70,97 +68,29 @@ class ColmapModel:
     points: SparsePoints
     warnings: tuple[str, ...]
     origin_world: Origin = NO_ORIGIN
-
-
-def find_colmap_model_folder(root: Path) -> Path:
-    """Return the folder of the scene's model: that of most images in the first of :data:`MODEL_FOLDERS`.
-
-    Raises:
-        DatasetError: there is none, or it lacks a file.
-    """
-    for name in MODEL_FOLDERS:
-        if models := [*numbered_models(root / name), *_if_model(root / name)]:
-            complete = [folder for folder in models if not _missing_files(folder)]
-            numbered = [folder for folder in complete if folder.name.isdigit()]
-            if complete:
-                return max(numbered or complete, key=posed_image_count)
-            missing = " and ".join(_missing_files(models[0]))
-            raise DatasetError(f"{models[0]} lacks {missing}; copy the whole COLMAP model there.")
-    raise DatasetError(
-        f"{root} holds no COLMAP model; put cameras, images and points3D (.bin or .txt) into "
-        f"{root / 'sparse/0'}, or have the poses found: octasplat reconstruct with --poses auto, or "
-        "octasplat submit."
-    )
-
-
-def has_colmap_model(root: Path) -> bool:
-    """Return whether the dataset has a COLMAP model, or at least a part of one."""
-    return any(numbered_models(root / name) or _if_model(root / name) for name in MODEL_FOLDERS)
-
-
-def numbered_models(folder: Path) -> list[Path]:
-    """Return the folders below ``folder`` that hold models or parts of one, as COLMAP numbers them."""
-    if not folder.is_dir():
-        return []
-    numbered = sorted((path for path in folder.iterdir() if path.name.isdecimal()), key=lambda p: int(p.name))
-    return [path for path in numbered if _if_model(path)]
-
-
-def posed_image_count(folder: Path) -> int:
-    """Return how many images a model declares; 0 where that cannot be read."""
-    try:
-        if (folder / "images.bin").is_file():
-            with (folder / "images.bin").open("rb") as file:
-                return int.from_bytes(file.read(8), "little")
-        with (folder / "images.txt").open("rb") as file:
-            return sum(not line.startswith(b"#") for line in file) // 2
-    except OSError:
-        return 0
-
-
-def _if_model(folder: Path) -> list[Path]:
-    files = (folder / f"{part}{suffix}" for part in _MODEL_FILES for suffix in (".bin", ".txt"))
-    return [folder] if any(file.is_file() for file in files) else []
-
-
-def _missing_files(folder: Path) -> list[str]:
-    """Return which files a model lacks, in the form of which there are some; none where it is complete."""
-    by_form = {
-        suffix: [f"{part}{suffix}" for part in _MODEL_FILES if not (folder / f"{part}{suffix}").is_file()]
-        for suffix in (".bin", ".txt")
-    }
-    if not all(by_form.values()):
-        return []
-    return by_form[".bin"] if len(by_form[".bin"]) < len(_MODEL_FILES) else by_form[".txt"]
+    held_out: tuple[str, ...] | None = None
+    masks: Mapping[str, str] = field(default_factory=dict)
 
 
 def read_colmap_model(
-    root: Path, folder: Path | None = None, *, origin_world: Origin | None = None
+    folder: Path,
+    *,
+    origin_world: Origin | None = None,
+    sizes_px: Mapping[str, tuple[int, int]] | None = None,
 ) -> ColmapModel:
-    """Read the COLMAP model of the scene in ``root``, or the one in ``folder``.
+    """Read a COLMAP model, or poses of a transforms file.
 
     Args:
-        root: folder of the scene.
-        folder: of the model, if it is not in ``root``.
+        folder: of the model, or a transforms file; see :mod:`octasplat.engine.dataset.model_sources`.
         origin_world: local origin to take, that of a scene that the model goes with; None chooses one where
             coordinates are large.
+        sizes_px: see :func:`octasplat.engine.dataset.colmap_reading.load_model`.
 
     Raises:
-        DatasetError: there is no model, it is damaged, or it holds values that are not finite.
+        DatasetError: the model lacks something, is damaged, or it holds values that are not finite.
     """
-    folder = folder or find_colmap_model_folder(root)
-    check_binary_colmap_model(folder)
-    try:
-        reconstruction = pycolmap.Reconstruction(str(folder))
-    except (ValueError, IndexError, KeyError, TypeError, RuntimeError, MemoryError, OSError) as error:
-        fault = find_text_model_error(folder)
-        if fault is not None:
-            raise DatasetError(fault) from error
-        reason = " ".join(str(error).split())[:200].rstrip(".") or type(error).__name__
-        raise DatasetError(
-            f"The COLMAP model in {folder} cannot be read ({reason}); copy it anew or run COLMAP again."
-        ) from error
-    warnings: list[str] = []
+    loaded = load_model(folder, sizes_px)
+    reconstruction, warnings = loaded.reconstruction, list(loaded.notes)
     _normalise_quaternions(reconstruction, folder, warnings)
     images = _posed_images(reconstruction, folder, warnings)
     cameras = _cameras(reconstruction, {image.camera_id for image in images}, folder, warnings)
@@ -173,7 +103,9 @@ def read_colmap_model(
         translations = np.stack([image.translation_cam_from_world for image in images])
         names = [image.name for image in images]
         warnings += check_poses(folder, names, rotations, translations, points)
-    return ColmapModel(folder, cameras, images, points, tuple(warnings), origin)
+    return ColmapModel(
+        folder, cameras, images, points, tuple(warnings), origin, loaded.held_out, loaded.masks
+    )
 
 
 def _normalise_quaternions(reconstruction: Any, folder: Path, warnings: list[str]) -> None:
@@ -246,10 +178,29 @@ def _posed_images(reconstruction: Any, folder: Path, warnings: list[str]) -> tup
         # Beyond what a signed number holds lies only COLMAP's mark for none.
         observed_points = np.array([point.point3D_id for point in observed], np.uint64).astype(np.int64)
         pose = matrix[:, :3].copy(), matrix[:, 3].copy()
-        images.append(PosedImage(image.name, int(image.camera_id), *pose, observed_px, observed_points))
+        images.append(
+            PosedImage(_image_name(image, folder), int(image.camera_id), *pose, observed_px, observed_points)
+        )
     if unposed:
         warnings.append(f"{unposed} images of the model in {folder} have no pose and are left out.")
+    names = Counter(image.name for image in images)
+    twice = sorted(name for name, count in names.items() if count > 1)
+    if twice:
+        raise DatasetError(
+            f"The model in {folder} has {len(twice)} images twice ({', '.join(twice[:3])}); remove one of "
+            "each or run COLMAP again."
+        )
     return tuple(sorted(images, key=lambda image: image.name))
+
+
+def _image_name(image: Any, folder: Path) -> str:
+    try:
+        return str(image.name)
+    except UnicodeDecodeError:
+        raise DatasetError(
+            f"The name of image {image.image_id} in {folder} is not UTF-8; save text files as UTF-8, or "
+            "rename the photograph in plain letters and run COLMAP again."
+        ) from None
 
 
 def _cameras(reconstruction: Any, used: set[int], folder: Path, warnings: list[str]) -> dict[int, Camera]:

@@ -24,7 +24,8 @@ from octasplat.engine.dataset.ray_tables import (
     open_ray_tables,
     rows_per_block,
 )
-from octasplat.engine.dataset.split import evaluation_split, split_views
+from octasplat.engine.dataset.scene_split import SceneSplit, SplitRule, SplitSource, split_scene
+from octasplat.engine.dataset.split import evaluation_split
 from octasplat.engine.dataset.training_points import training_points
 from octasplat.engine.dataset.views_file import ViewsRecord, views_record
 
@@ -70,8 +71,7 @@ class Dataset:
         cache: PixelCache,
         tables: RayTables,
         *,
-        test_every: int = 8,
-        held_out: Sequence[str] | None = None,
+        split: SceneSplit | None = None,
         masks: MaskUse = "ignore",
         near: float = 0.0,
         near_world: float | None = None,
@@ -84,9 +84,9 @@ class Dataset:
         self.train_indices: Int64[np.ndarray, " train"]
         self.test_indices: Int64[np.ndarray, " test"]
         names = [view.name for view in model.views]
-        self.train_indices, self.test_indices = (
-            split_views(names, test_every, held_out) if near_world is None else evaluation_split(names)
-        )
+        split = SceneSplit(*evaluation_split(names)) if split is None else split
+        self.train_indices, self.test_indices = split.train_indices, split.test_indices
+        self.warnings += split.warnings
         self.points: SparsePoints = (
             training_points(self.train_indices, model.points, model.observations)
             if len(self.train_indices)
@@ -145,6 +145,9 @@ class Dataset:
         progress: Callable[[int, int], None] | None = None,
         max_table_bytes: int = MAX_TABLE_BYTES,
         origin_world: Origin | None = None,
+        burst_length: int = 1,
+        split: SplitSource = "given",
+        model: str | None = None,
     ) -> "Dataset":
         """Load a scene and decode its photographs into ``cache_dir``, or find them there.
 
@@ -164,6 +167,9 @@ class Dataset:
             progress: told (photographs done, photographs in all) while decoding.
             max_table_bytes: limit on the ray tables of cameras that are not pinholes.
             origin_world: local origin to take; None chooses one where coordinates are large.
+            burst_length: so many views that follow each other by name fall on one side of the split.
+            split: ``given`` holds out what the scene says, if it does; ``every`` does not ask it.
+            model: which of several models of the scene to take, by its path below it or its number.
 
         Raises:
             DatasetError: something is missing, damaged or does not fit together.
@@ -171,18 +177,19 @@ class Dataset:
             ConfigError: a setting is out of range.
         """
         scene = load_dataset_model(
-            root, max_side=max_side, model_folder=model_folder, origin_world=origin_world
+            root, max_side=max_side, model_folder=model_folder, model=model, origin_world=origin_world
         )
         _require_masks(scene, root, masks)
         # Complain before the long work.
-        _, test_indices = split_views([view.name for view in scene.views], test_every, held_out)
+        rule = SplitRule(test_every, held_out, burst_length, split)
+        parts = split_scene(scene, rule)
         digests = None
         if accept is not None:
             digests = file_digests(scene, cache_dir, threads=threads)
-            accept(views_record(scene, digests, test_indices))
+            accept(views_record(scene, digests, parts.test_indices))
         cache = open_pixel_cache(scene, cache_dir, digests, threads=threads, progress=progress)
         tables = open_ray_tables(scene.cameras, cache_dir, max_table_bytes)
-        return cls(scene, cache, tables, test_every=test_every, held_out=held_out, masks=masks, near=near)
+        return cls(scene, cache, tables, split=parts, masks=masks, near=near)
 
     @classmethod
     def open_for_evaluation(

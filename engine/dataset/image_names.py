@@ -21,7 +21,7 @@ def match_image_names(names: Iterable[str], files: Collection[str]) -> Mapping[s
     >>> match_image_names(["A/1.JPG", "2.jpg", "/tmp/3.png"], ["a/1.jpg", "2.jpg", "3.png", "4.png"])
     {'2.jpg': '2.jpg', 'A/1.JPG': 'a/1.jpg', '/tmp/3.png': '3.png'}
     """
-    names = list(names)
+    names = [name for name in names if PurePosixPath(_slashes(name)).name]
     found = {name: normalize_name(name) for name in names if normalize_name(name) in files}
     for spelling in (_slashes, _case, _without_suffix, _last_part, _stem):
         taken = set(found.values())

@@ -1,8 +1,8 @@
 """Matching of a COLMAP model with the photographs and masks on disk."""
 
-import os
-from dataclasses import replace
-from pathlib import Path
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path, PurePosixPath
 
 import numpy as np
 from jaxtyping import Float64
@@ -10,44 +10,20 @@ from jaxtyping import Float64
 from octasplat.engine.core.errors import ConfigError, DatasetError
 from octasplat.engine.core.local_origin import Origin, describe_origin, is_set
 from octasplat.engine.core.relative_paths import normalize_name
-from octasplat.engine.core.scene_layout import is_ignored_file, is_photograph, masks_beside
+from octasplat.engine.core.scene_layout import is_photograph, left_out_sentences, masks_beside
 from octasplat.engine.dataset.camera import Camera
-from octasplat.engine.dataset.colmap_model import (
-    ColmapModel,
-    PosedImage,
-    numbered_models,
-    posed_image_count,
-    read_colmap_model,
-)
+from octasplat.engine.dataset.colmap_model import ColmapModel, PosedImage, read_colmap_model
 from octasplat.engine.dataset.image_info import ImageInfo
 from octasplat.engine.dataset.image_names import match_image_names
 from octasplat.engine.dataset.images import read_image_info
 from octasplat.engine.dataset.masks import mask_for
 from octasplat.engine.dataset.model import DatasetModel, DatasetView, Observations
-from octasplat.engine.dataset.results_among import is_run_folder
+from octasplat.engine.dataset.model_sources import find_model, has_model, other_models, posed_image_count
+from octasplat.engine.dataset.photograph_files import files_below, image_folder, photographs_below
 from octasplat.engine.dataset.views_file import capped_size
 
 MIN_VIEWS = 3
 """Fewer photographs than this do not make a scene."""
-
-IMAGE_SUFFIXES = frozenset(
-    {
-        ".jpg",
-        ".jpeg",
-        ".png",
-        ".tif",
-        ".tiff",
-        ".exr",
-        ".hdr",
-        ".bmp",
-        ".webp",
-        ".ppm",
-        ".pgm",
-        ".tga",
-        ".jp2",
-    }
-    | {".jxl", ".heic", ".avif", ".dpx", ".psd"}
-)
 
 
 def load_dataset_model(
@@ -55,6 +31,7 @@ def load_dataset_model(
     *,
     max_side: int | None = None,
     model_folder: Path | None = None,
+    model: str | None = None,
     min_views: int = MIN_VIEWS,
     for_training: bool = True,
     origin_world: Origin | None = None,
@@ -62,11 +39,12 @@ def load_dataset_model(
     """Read the model of a scene and the headers of its photographs, but no pixels.
 
     Args:
-        root: folder with ``images/``, a COLMAP model (see :mod:`octasplat.engine.dataset.colmap_model`) and,
-            if there are any, ``masks/<image name>.png``.
+        root: folder with ``images/``, a COLMAP model or transforms file (see
+            :mod:`octasplat.engine.dataset.model_sources`) and, if there are any, ``masks/<image name>.png``.
         max_side: cap on the longer side of the photographs, in pixels.
         model_folder: of a model that was found for the photographs, see :mod:`octasplat.engine.poses`;
             ``root`` may then be a bare folder of photographs.
+        model: which of several models in ``root`` to take, by its path below it or its number.
         min_views: so many photographs must be posed.
         for_training: warn of what matters to training only.
         origin_world: local origin to take, that of the scene whose photographs these are; None chooses one
@@ -80,33 +58,37 @@ def load_dataset_model(
         raise ConfigError(f"max_side is {max_side}; it must be at least 1 pixel.")
     if not root.is_dir():
         raise DatasetError(f"{root} is not a folder; name the folder that holds images/ and sparse/.")
-    if model_folder is None and image_folder(root) == root:
-        if any(path.suffix.lower() in IMAGE_SUFFIXES for path in root.iterdir()):
+    if (
+        model_folder is None
+        and image_folder(root) == root
+        and not (photographs_below(root) and has_model(root))
+    ):
+        if any(is_photograph(path.name) for path in root.iterdir()):
             raise DatasetError(
                 f"{root} is a bare folder of photographs, without camera poses; have them found: octasplat "
                 "reconstruct with --poses auto, or octasplat submit."
             )
         raise DatasetError(f"{root} has no folder images; put the photographs into {root / 'images'}.")
-    model = read_colmap_model(root, model_folder, origin_world=origin_world)
-    if len(model.images) < min_views:
+    source = model_folder or find_model(root, model)
+    found = read_colmap_model(source, origin_world=origin_world)
+    if len(found.images) < min_views:
         raise DatasetError(
-            f"The model in {model.folder} has {len(model.images)} posed images; "
+            f"The model in {found.folder} has {len(found.images)} posed images; "
             f"at least {min_views} {'is' if min_views == 1 else 'are'} needed."
         )
-    warnings = list(model.warnings)
-    if for_training and is_set(model.origin_world):
+    warnings = list(found.warnings)
+    if for_training and is_set(found.origin_world):
         warnings.append(
-            f"The coordinates of {model.folder} are large against the scene, so it is trained about a local "
-            f"origin; add {describe_origin(model.origin_world)} to what files hold that have no place for it."
+            f"The coordinates of {found.folder} are large against the scene, so it is trained about a local "
+            f"origin; add {describe_origin(found.origin_world)} to what files hold that have no place for it."
         )
-    if for_training and len(model.points) == 0:
-        warnings.append(f"The model in {model.folder} has no 3D points; the start will be random.")
-    images, paths, beside = _find_images(
-        image_folder(root), model, warnings, warn_unposed=model_folder is None
-    )
-    masks = _mask_paths(root, [image.name for image in images], beside, warnings)
+    if for_training and len(found.points) == 0:
+        warnings.append(f"The model in {found.folder} has no 3D points; the start will be random.")
+    located = _find_images(image_folder(root), found, warnings, warn_unposed=model_folder is None)
+    images, paths = located.images, located.paths
+    masks = _mask_paths(root, located, warnings)
     if model_folder is None:
-        _warn_of_other_models(model.folder, warnings)
+        _warn_of_other_models(root, found.folder, warnings)
 
     views: list[DatasetView] = []
     infos: list[ImageInfo] = []
@@ -114,7 +96,7 @@ def load_dataset_model(
     camera_indices: dict[Camera, int] = {}
     for image, path, mask in zip(images, paths, masks, strict=True):
         info = read_image_info(path)
-        original = model.cameras[image.camera_id]
+        original = found.cameras[image.camera_id]
         _check_size(original, info, image, path)
         width, height = capped_size(info.width_px, info.height_px, max_side)
         camera = original.scaled_to(width, height)
@@ -136,38 +118,46 @@ def load_dataset_model(
         views=tuple(views),
         cameras=tuple(camera_indices),
         root=root,
-        model_folder=model.folder,
+        model_folder=found.folder,
         image_infos=tuple(infos),
-        points=model.points,
+        points=found.points,
         observations=Observations(
             np.repeat(np.arange(len(views)), [len(observed) for observed in observed_px]),
             np.concatenate([image.observed_point_ids for image in images]),
             np.concatenate(observed_px),
         ),
         warnings=tuple(warnings),
-        origin_world=model.origin_world,
+        origin_world=found.origin_world,
+        held_out=None if found.held_out is None else tuple(map(located.file_name, found.held_out)),
     )
 
 
-def image_folder(root: Path) -> Path:
-    """Return ``images/`` or ``input/`` of a scene, or the scene itself where neither holds photographs."""
-    folders = [root / name for name in ("images", "input") if (root / name).is_dir()]
-    elsewhere = root if not folders or _holds_photographs(root) else folders[0]
-    return next((folder for folder in folders if _holds_photographs(folder)), elsewhere)
+@dataclass(frozen=True, eq=False)
+class _LocatedImages:
+    """The images of a model under the names of their files.
 
+    Attributes:
+        images: sorted by name.
+        paths: their files.
+        masks: paths of masks beside them or named by the model, by the names of their images.
+        respelt: names of files by those of the model where they differ.
+    """
 
-def _holds_photographs(folder: Path) -> bool:
-    names = (path.relative_to(folder).as_posix() for path in folder.rglob("*"))
-    return any(is_photograph(name) and not is_ignored_file(name) for name in names)
+    images: list[PosedImage]
+    paths: list[Path]
+    masks: dict[str, Path]
+    respelt: dict[str, str]
+
+    def file_name(self, name: str) -> str:
+        """Return the name of the file that an image of the model is taken for."""
+        return self.respelt.get(name, name)
 
 
 def _find_images(
     folder: Path, model: ColmapModel, warnings: list[str], *, warn_unposed: bool
-) -> tuple[list[PosedImage], list[Path], dict[str, Path]]:
-    """Return the images of the model with their file names, sorted, and the files and masks beside them."""
-    on_disk = _files_below(folder)
-    images_on_disk = [name for name, path in on_disk.items() if path.suffix.lower() in IMAGE_SUFFIXES]
-    owners = masks_beside(images_on_disk)
+) -> _LocatedImages:
+    on_disk = photographs_below(folder)
+    owners = masks_beside(on_disk)
     names = [image.name for image in model.images]
     # Nothing outside images/ is read, whatever a model from elsewhere asks for.
     found = match_image_names(
@@ -175,39 +165,61 @@ def _find_images(
     )
     missing = [name for name in names if name not in found]
     if missing:
+        unread = sorted(match_image_names(missing, files_below(folder).keys() - on_disk.keys()).values())
         raise DatasetError(
             f"{len(missing)} of {len(names)} images of the model are not in {folder} "
-            f"({_name_list(missing)}); put them there or run COLMAP without them."
+            f"({_name_list(missing)}); "
+            + (" ".join(left_out_sentences(unread)) or "put them there or run COLMAP without them.")
         )
-    respelt = [name for name in names if normalize_name(name) != found[name]]
-    if respelt:
+    respelt = {name: found[name] for name in names if normalize_name(name) != found[name]}
+    # Transforms files leave out suffixes, which is no other spelling.
+    odd = [name for name in respelt if not respelt[name].startswith(f"{normalize_name(name)}.")]
+    if odd:
         warnings.append(
-            f"{len(respelt)} images of the model are spelt otherwise in {folder}; "
-            f"{found[respelt[0]]} is taken for {respelt[0]}, for instance."
+            f"{len(odd)} images of the model are spelt otherwise in {folder}; "
+            f"{found[odd[0]]} is taken for {odd[0]}, for instance."
         )
-    others = {name: found[name] for name in respelt}
-    images = [replace(image, name=others.get(image.name, image.name)) for image in model.images]
+    images = [replace(image, name=respelt.get(image.name, image.name)) for image in model.images]
     images.sort(key=lambda image: image.name)
     paths = [on_disk[normalize_name(image.name)] for image in images]
     posed = set(found.values())
-    unposed = sorted(set(images_on_disk) - posed - owners.keys())
+    unposed = sorted(set(on_disk) - posed - owners.keys())
     if unposed and warn_unposed:
         warnings.append(
             f"{len(unposed)} images in {folder} have no pose and are left out ({_name_list(unposed)})."
         )
     beside = {owner: on_disk[mask] for mask, owner in owners.items() if mask not in posed}
-    return images, paths, beside
+    named = {
+        respelt.get(name, name): path for name, path in _named_masks(folder, model.masks, warnings).items()
+    }
+    return _LocatedImages(images, paths, beside | named, respelt)
 
 
-def _mask_paths(
-    root: Path, names: list[str], beside: dict[str, Path], warnings: list[str]
-) -> list[Path | None]:
-    folder = root / "masks"
-    if not folder.is_dir() and not beside:
+def _named_masks(folder: Path, masks: Mapping[str, str], warnings: list[str]) -> dict[str, Path]:
+    """Return the masks that a transforms file names, of those in ``masks`` and beside photographs."""
+    if not masks:
+        return {}
+    root = folder.parent if folder.name in ("images", "input") else folder
+    on_disk = {f"masks/{name}": path for name, path in files_below(root / "masks").items()}
+    on_disk |= {f"{folder.name}/{name}": path for name, path in files_below(folder).items()}
+    paths = {name: PurePosixPath(path.replace("\\", "/")).as_posix() for name, path in masks.items()}
+    there = {name: on_disk[path] for name, path in paths.items() if path in on_disk}
+    gone = [masks[name] for name in masks if name not in there]
+    if gone:
+        warnings.append(
+            f"{len(gone)} masks that the transforms file names are neither in masks/ nor beside the "
+            f"photographs ({_name_list(gone)}); put them into masks/."
+        )
+    return there
+
+
+def _mask_paths(root: Path, located: _LocatedImages, warnings: list[str]) -> list[Path | None]:
+    folder, names = root / "masks", [image.name for image in located.images]
+    if not folder.is_dir() and not located.masks:
         return [None] * len(names)
-    on_disk = _files_below(folder)
+    on_disk = files_below(folder)
     on_disk = {name.casefold(): path for name, path in on_disk.items()} | on_disk
-    masks = [mask_for(normalize_name(name), on_disk, beside) for name in names]
+    masks = [mask_for(normalize_name(name), on_disk, located.masks) for name in names]
     without = [name for name, mask in zip(names, masks, strict=True) if mask is None]
     if len(without) == len(names):
         warnings.append(
@@ -217,21 +229,6 @@ def _mask_paths(
     elif without:
         warnings.append(f"{len(without)} images have no mask and count whole ({_name_list(without)}).")
     return masks
-
-
-def _files_below(folder: Path) -> dict[str, Path]:
-    """Return files by their NFC path below ``folder``, without hidden ones and results of runs."""
-    files: dict[str, Path] = {}
-    for parent, folders, names in os.walk(folder, followlinks=True):
-        folders[:] = sorted(
-            name for name in folders if not name.startswith(".") and not is_run_folder(Path(parent) / name)
-        )
-        for name in sorted(names):
-            if not name.startswith("."):
-                path = Path(parent) / name
-                # File systems differ in how they spell an umlaut; models come from other machines.
-                files[normalize_name(path.relative_to(folder).as_posix())] = path
-    return files
 
 
 def _check_size(camera: Camera, info: ImageInfo, image: PosedImage, path: Path) -> None:
@@ -248,14 +245,14 @@ def _check_size(camera: Camera, info: ImageInfo, image: PosedImage, path: Path) 
     )
 
 
-def _warn_of_other_models(folder: Path, warnings: list[str]) -> None:
-    parent = folder.parent if folder.name.isdigit() else folder
-    counts = {other: posed_image_count(other) for other in numbered_models(parent) if other != folder}
-    if counts:
-        others = [f"{other.name} of {count}" for other, count in counts.items()]
+def _warn_of_other_models(root: Path, taken: Path, warnings: list[str]) -> None:
+    others = other_models(root, taken)
+    if others:
+        described = [name if count is None else f"{name} of {count} images" for name, count in others.items()]
+        size = f" of {posed_image_count(taken)} images" * taken.is_dir()
         warnings.append(
-            f"{parent} holds further models ({len(others)}): {_name_list(others)} images; only {folder} of "
-            f"{posed_image_count(folder)} images is used; take it away to use another."
+            f"{root} holds further models ({len(others)}): {_name_list(described)}; only {taken}{size} is used; "
+            f"--model {next(iter(others))} takes another."
         )
 
 

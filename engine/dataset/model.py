@@ -117,6 +117,7 @@ class DatasetModel(Viewpoints):
         warnings: one sentence each on what is odd but usable.
         origin_world: where all of it has its origin in the coordinates of the files, see
             :mod:`octasplat.engine.core.local_origin`.
+        held_out: names of the views that the scene says are to be held out; None where it says nothing.
     """
 
     views: tuple[DatasetView, ...]
@@ -127,6 +128,7 @@ class DatasetModel(Viewpoints):
     observations: Observations
     warnings: tuple[str, ...]
     origin_world: Origin = NO_ORIGIN
+    held_out: tuple[str, ...] | None = None
 
 
 def scene_extent(origins_world: Float64[np.ndarray, "n 3"], points: SparsePoints) -> float:

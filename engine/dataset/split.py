@@ -17,6 +17,8 @@ def split_views(
     held_out: Sequence[str] | None = None,
     *,
     source_name: str = "model",
+    burst_length: int = 1,
+    duplicates: Sequence[Sequence[int]] = (),
 ) -> tuple[Int64[np.ndarray, " train"], Int64[np.ndarray, " test"]]:
     """Return the indices of the training views and of the held-out views.
 
@@ -25,6 +27,8 @@ def split_views(
         test_every: every how-manieth view is held out, beginning with the first; 0 holds out none.
         held_out: names of the views to hold out instead; an umlaut may be spelt as one character or as two.
         source_name: what the names are of, for complaints.
+        burst_length: so many names that follow each other count as one, and fall on one side.
+        duplicates: groups of views that count as one, and fall on one side.
 
     Raises:
         DatasetError: a name in ``held_out`` is unknown, or nothing is left to train on.
@@ -36,6 +40,7 @@ def split_views(
     """
     if test_every < 0:
         raise ConfigError(f"test_every is {test_every}; it must be 0 (hold out none) or more.")
+    unit = _units(len(names), burst_length, duplicates)
     if held_out is not None:
         chosen = set(map(normalize_name, held_out))
         unknown = sorted(chosen - set(map(normalize_name, names)))
@@ -44,12 +49,22 @@ def split_views(
                 f"{len(unknown)} of the images to hold out are not in the {source_name} "
                 f"({', '.join(unknown[:3])}); give names as they stand there."
             )
-        is_test = np.array([normalize_name(name) in chosen for name in names], dtype=bool)
+        is_chosen = np.array([normalize_name(name) in chosen for name in names], dtype=bool)
+        is_test = np.isin(unit, unit[is_chosen])
     else:
-        is_test = np.arange(len(names)) % test_every == 0 if test_every else np.zeros(len(names), dtype=bool)
+        is_test = unit % test_every == 0 if test_every else np.zeros(len(names), dtype=bool)
     if is_test.all():
         raise DatasetError(f"All {len(names)} images are held out; leave some to train on.")
     return np.flatnonzero(~is_test).astype(np.int64), np.flatnonzero(is_test).astype(np.int64)
+
+
+def _units(count: int, burst_length: int, duplicates: Sequence[Sequence[int]]) -> Int64[np.ndarray, " n"]:
+    """Return the number of the unit that each of ``count`` views belongs to, by the first view of each."""
+    unit = np.arange(count, dtype=np.int64) // burst_length
+    for group in duplicates:
+        together = np.unique(unit[list(group)])
+        unit[np.isin(unit, together)] = together[0]
+    return np.unique(unit, return_inverse=True)[1].astype(np.int64)
 
 
 def evaluation_split(

@@ -29,7 +29,7 @@ from octasplat.engine.core.relative_paths import check_relative_path
 from octasplat.engine.core.writing import write_text
 from octasplat.engine.dataset.camera import Camera
 from octasplat.engine.dataset.model import DatasetModel, PosedView, SparsePoints, Viewpoints, scene_extent
-from octasplat.engine.dataset.split import split_views
+from octasplat.engine.dataset.scene_split import SplitRule, split_scene
 from octasplat.engine.dataset.training_points import training_points
 
 _Finite = Annotated[float, Field(allow_inf_nan=False)]
@@ -273,11 +273,10 @@ def views_record(
     )
 
 
-def scene_viewpoints(
-    model: DatasetModel, test_every: int, held_out: Sequence[str] | None = None
-) -> SplitViewpoints:
-    """Return the viewpoints of a loaded dataset, split as by :func:`split_views`."""
-    train, test = split_views([view.name for view in model.views], test_every, held_out)
+def scene_viewpoints(model: DatasetModel, rule: SplitRule) -> SplitViewpoints:
+    """Return the viewpoints of a loaded dataset, split as by :func:`split_scene`."""
+    split = split_scene(model, rule)
+    train, test = split.train_indices, split.test_indices
     return SplitViewpoints(model.views, model.cameras, train, test, _extent(model, train))
 
 

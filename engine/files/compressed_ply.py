@@ -10,8 +10,8 @@ import numpy as np
 from jaxtyping import Float32, Int, UInt32
 
 from octasplat.engine.core.errors import SceneFileError
+from octasplat.engine.core.ply_container import PlyHeader, columns, read_ply, read_ply_header
 from octasplat.engine.files.encodings import SQRT_HALF, from_smallest_three, logits_from_bytes, sh0_from_rgb
-from octasplat.engine.files.ply_container import PlyHeader, columns, read_ply, read_ply_header
 from octasplat.engine.files.registry import Importer, register
 from octasplat.engine.gaussians.flattening import GaussianCloud
 

@@ -5,12 +5,12 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Float64, UInt32
 
+from octasplat.engine.core.ply_container import PlyWriteElement, write_ply
 from octasplat.engine.files.compressed_ply import CHUNK_SIZE, PATTERNS, SH_RANGE
 from octasplat.engine.files.encodings import SQRT_HALF, smallest_three
 from octasplat.engine.files.export_options import ExportOptions
 from octasplat.engine.files.gaussian_ply import origin_comments
 from octasplat.engine.files.kd_split import kd_order
-from octasplat.engine.files.ply_container import PlyWriteElement, write_ply
 from octasplat.engine.files.range_losses import find_harmonic_losses, find_position_losses
 from octasplat.engine.files.registry import Exporter, register
 from octasplat.engine.files.splat_rows import select_for_export

@@ -24,11 +24,7 @@ from jaxtyping import Float32
 
 from octasplat.engine.core.errors import ConfigError, SceneFileError
 from octasplat.engine.core.local_origin import NO_ORIGIN, Origin, is_set
-from octasplat.engine.files.channel_columns import ChannelChoice, select_channel_columns
-from octasplat.engine.files.encodings import MAX_SH_DEGREE, dropped_sh_message
-from octasplat.engine.files.export_options import ExportOptions
-from octasplat.engine.files.octagon_recovery import is_octagon_ply
-from octasplat.engine.files.ply_container import (
+from octasplat.engine.core.ply_container import (
     PlyElement,
     PlyWriteElement,
     columns,
@@ -36,6 +32,10 @@ from octasplat.engine.files.ply_container import (
     read_ply_header,
     write_ply,
 )
+from octasplat.engine.files.channel_columns import ChannelChoice, select_channel_columns
+from octasplat.engine.files.encodings import MAX_SH_DEGREE, dropped_sh_message
+from octasplat.engine.files.export_options import ExportOptions
+from octasplat.engine.files.octagon_recovery import is_octagon_ply
 from octasplat.engine.files.ply_dialects import (
     UNUSED_SCALE_MESSAGE,
     has_unused_third_scale,

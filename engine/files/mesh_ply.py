@@ -12,10 +12,7 @@ from jaxtyping import Float32, Int, Int64
 
 from octasplat.engine.core.color import srgb_to_linear, to_bytes
 from octasplat.engine.core.errors import SceneFileError
-from octasplat.engine.files.export_options import ExportOptions
-from octasplat.engine.files.gaussian_ply import channel_comments, origin_comments
-from octasplat.engine.files.octagon_batches import BATCH_SIZE, OctagonSoup
-from octasplat.engine.files.ply_container import (
+from octasplat.engine.core.ply_container import (
     COUNT_SUFFIX,
     PlyWriteElement,
     columns,
@@ -23,6 +20,9 @@ from octasplat.engine.files.ply_container import (
     read_ply,
     write_ply,
 )
+from octasplat.engine.files.export_options import ExportOptions
+from octasplat.engine.files.gaussian_ply import channel_comments, origin_comments
+from octasplat.engine.files.octagon_batches import BATCH_SIZE, OctagonSoup
 from octasplat.engine.files.registry import Exporter, MeshReader, SurfaceWriter, register
 from octasplat.engine.gaussians.channels import column_names
 from octasplat.engine.gaussians.model import FlatGaussians

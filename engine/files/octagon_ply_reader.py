@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from octasplat.engine.core.errors import ConfigError, SceneFileError
+from octasplat.engine.core.ply_container import columns, read_ply
 from octasplat.engine.files.channel_columns import ChannelChoice, select_channel_columns
 from octasplat.engine.files.encodings import logits_from_bytes, sh0_from_rgb
 from octasplat.engine.files.gaussian_ply import declared_channels
@@ -15,7 +16,6 @@ from octasplat.engine.files.octagon_recovery import (
     is_octagon_ply,
     missing_gaussians_notes,
 )
-from octasplat.engine.files.ply_container import columns, read_ply
 from octasplat.engine.files.registry import Importer, register
 from octasplat.engine.gaussians.channels import Channels
 from octasplat.engine.gaussians.flattening import GaussianCloud

@@ -75,14 +75,14 @@ def run(
         DatasetError: there are no photographs, or one cannot be read.
         ConfigError: a setting cannot be used.
     """
-    from octasplat.engine.dataset.colmap_model import has_colmap_model
+    from octasplat.engine.dataset.model_sources import has_model
     from octasplat.engine.operations.cost_model import estimate_reconstruction
     from octasplat.engine.poses.photographs import left_out_of_scene, locate_scene
 
     scene = locate_scene(request.source)
     for sentence in left_out_of_scene(scene):
         progress(Warned(sentence))
-    config = request.config().with_poses_decided(has_colmap_model(scene))
+    config = request.config().with_poses_decided(has_model(scene))
     sizes = photograph_sizes(scene)
     cores = request.cores or threads or len(os.sched_getaffinity(0))
     found = estimate_reconstruction(config, sizes, cores)
@@ -96,7 +96,7 @@ def photograph_sizes(scene: Path) -> list[ImageSizes]:
         DatasetError: there are none, or one cannot be read.
     """
     from octasplat.engine.dataset.images import read_image_info
-    from octasplat.engine.dataset.load import image_folder
+    from octasplat.engine.dataset.photograph_files import image_folder
     from octasplat.engine.poses.photographs import photographs_of_scene
 
     names = photographs_of_scene(scene)

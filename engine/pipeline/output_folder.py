@@ -9,7 +9,7 @@ from octasplat.engine.core.errors import ConfigError, DatasetError, OutputError
 from octasplat.engine.core.relative_paths import normalize_name
 from octasplat.engine.core.versions import package_versions
 from octasplat.engine.core.writing import write_json
-from octasplat.engine.dataset.colmap_model import has_colmap_model
+from octasplat.engine.dataset.model_sources import has_model
 from octasplat.engine.poses.find_poses import read_pose_record
 from octasplat.engine.runs.config import ReconstructionConfig, read_config
 from octasplat.engine.runs.run_folder import CACHE, CONFIG, EVENTS, POSES
@@ -35,7 +35,7 @@ def claim_output(scene: Path, output: Path, config: ReconstructionConfig, resume
         _check_settings(scene, output, config)
         return False
     if output.is_dir() and not _is_unclaimed(
-        output, config.with_poses_decided(has_colmap_model(scene)).poses == "auto"
+        output, config.with_poses_decided(has_model(scene)).poses == "auto"
     ):
         raise OutputError(f"{output} is not empty and holds no run; name an empty or a new folder.")
     try:
@@ -106,7 +106,7 @@ def write_config(scene: Path, output: Path, config: ReconstructionConfig) -> Non
 
 def _check_settings(scene: Path, output: Path, config: ReconstructionConfig) -> None:
     """Check that settings are the run's own, apart from the files to export."""
-    is_posed = has_colmap_model(scene)
+    is_posed = has_model(scene)
     before = read_config(output / CONFIG).model_copy(update={"exports": config.exports})
     if _comparable(before, is_posed) != _comparable(config, is_posed):
         raise ConfigError(

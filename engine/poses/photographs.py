@@ -13,13 +13,14 @@ from octasplat.engine.core.scene_layout import (
     masks_beside,
     too_few_photographs,
 )
-from octasplat.engine.dataset.load import image_folder
+from octasplat.engine.dataset.model_sources import has_model
+from octasplat.engine.dataset.photograph_files import image_folder
 
 
 def locate_scene(folder: Path) -> Path:
     """Return the scene that ``folder`` is, or the one below it where there is nothing beside that."""
     inner = folder / _layout_of(folder).folder
-    return inner if image_folder(inner) != inner else folder
+    return inner if image_folder(inner) != inner or has_model(inner) else folder
 
 
 def photographs_of_scene(scene: Path) -> list[str]:

@@ -9,6 +9,7 @@ import pycolmap
 from octasplat.engine.core.errors import DatasetError
 from octasplat.engine.core.events import EventListener
 from octasplat.engine.core.writing import write_json
+from octasplat.engine.dataset.colmap_reading import load_model
 from octasplat.engine.dataset.images import read_image_info
 from octasplat.engine.poses.config import (
     FEATURES,
@@ -77,7 +78,7 @@ class _PoseVerifier:
     """
 
     def __init__(self, request: PoseSearchRequest, given: GivenModel, progress: EventListener) -> None:
-        self.model: Any = pycolmap.Reconstruction(given.model)
+        self.model: Any = load_model(given.model).reconstruction
         by_name = {image.name: image for image in self.model.images.values()}
         self.images: dict[int, Any] = {k: by_name[name] for k, name in enumerate(given.names)}
         self._config, self._tell, self._threads = request.config, progress, request.threads or -1

@@ -18,6 +18,7 @@ import pycolmap
 
 from octasplat.engine.core.events import EventListener
 from octasplat.engine.core.writing import write_json
+from octasplat.engine.dataset.colmap_reading import load_model
 from octasplat.engine.poses.config import FOUND_FOLDER, LENSES_STAGE, RECORD_FILE, PoseSearchRequest
 from octasplat.engine.poses.lens_check import MIN_OBSERVATIONS
 from octasplat.engine.poses.workspace import progress_stage
@@ -43,7 +44,7 @@ def write_per_view_principal_points(
         progress: hears the progress.
     """
     pycolmap.logging.minloglevel = 2
-    given: Any = pycolmap.Reconstruction(folder)
+    given: Any = load_model(folder).reconstruction
     found = request.work / FOUND_FOLDER
     found.mkdir()
     with progress_stage(LENSES_STAGE, _ITERATIONS + 1, progress) as at:

@@ -11,6 +11,7 @@ from octasplat.engine.core.events import EventListener, PhaseProgress, Warned
 from octasplat.engine.core.local_origin import Origin
 from octasplat.engine.dataset import Dataset, load_dataset_model
 from octasplat.engine.dataset.camera_clearance import CameraClearance
+from octasplat.engine.dataset.scene_split import SplitRule
 from octasplat.engine.dataset.views_file import SplitViewpoints, ViewsRecord, read_views, scene_viewpoints
 from octasplat.engine.files import read_metadata
 from octasplat.engine.render.environment_files import read_background
@@ -89,9 +90,11 @@ def run_viewpoints(
         photographs_folder(output, scene),
         max_side=max_side,
         model_folder=found_model_folder(output),
+        model=config.model,
         origin_world=run_origin(output),
     )
-    return scene_viewpoints(photographs, config.test_every, config.held_out)
+    rule = SplitRule(config.test_every, config.held_out, config.burst_length, config.split)
+    return scene_viewpoints(photographs, rule)
 
 
 def run_origin(output: Path) -> Origin | None:
@@ -212,8 +215,11 @@ def open_run_dataset(
         max_side=config.max_side,
         test_every=config.test_every,
         held_out=config.held_out,
+        burst_length=config.burst_length,
+        split=config.split,
         masks=config.masks,
         model_folder=model_folder,
+        model=config.model,
         accept=accept,
         near=config.train.near,
         origin_world=run_origin(output),

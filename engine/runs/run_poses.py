@@ -10,8 +10,8 @@ from octasplat.engine.core.errors import CancelledError, ColmapCrashError, Datas
 from octasplat.engine.core.events import EventListener, PhaseProgress, Warned
 from octasplat.engine.core.progress import phase
 from octasplat.engine.dataset import Dataset, split_views
-from octasplat.engine.dataset.colmap_model import find_colmap_model_folder, has_colmap_model
-from octasplat.engine.dataset.load import image_folder
+from octasplat.engine.dataset.model_sources import find_model, has_model
+from octasplat.engine.dataset.photograph_files import image_folder
 from octasplat.engine.poses import (
     GivenModel,
     adjust_principal_points,
@@ -48,7 +48,7 @@ def find_missing_poses(
         ColmapCrashError: COLMAP died.
         CancelledError: stopped as asked.
     """
-    if config.poses == "given" or (config.poses == "missing" and has_colmap_model(scene)):
+    if config.poses == "given" or (config.poses == "missing" and has_model(scene)):
         return
     names = photographs_of_scene(scene)
     if not (output / POSES).is_dir():
@@ -67,7 +67,13 @@ def _refuse_before_search(
     scene: Path, names: Sequence[str], config: ReconstructionConfig, threads: int
 ) -> None:
     """Refuse photographs and settings that the dataset would refuse after the search, which takes long."""
-    split_views(names, config.test_every, config.held_out, source_name="photographs")
+    split_views(
+        names,
+        config.test_every,
+        config.held_out,
+        source_name="photographs",
+        burst_length=config.burst_length,
+    )
     if config.masks == "alpha" and not (scene / "masks").is_dir():
         raise DatasetError(
             f"Masks are to be the alpha, but there is no folder {scene / 'masks'}; put them there (as "
@@ -103,7 +109,7 @@ def repair_run_poses(
         return False
     images = image_folder(dataset.root)
     given = GivenModel(
-        model=find_colmap_model_folder(dataset.root),
+        model=find_model(dataset.root, config.model),
         names=tuple(view.name for view in dataset.views),
         doubtful=tuple(doubtful.tolist()),
     )
@@ -178,7 +184,7 @@ def estimate_principal_points(
         return False
     if not needs_per_view_principal_points(dataset.viewpoints, dataset.points, dataset.observations):
         return False
-    model = found_model_folder(output) or find_colmap_model_folder(dataset.root)
+    model = found_model_folder(output) or find_model(dataset.root, config.model)
     try:
         facts = adjust_principal_points(model, output / POSES, progress=progress, should_stop=should_stop)
     except (DatasetError, ColmapCrashError) as error:

@@ -39,11 +39,29 @@ class RunSettings(BaseModel):
     held_out: Annotated[tuple[str, ...] | None, Spelling(metavar="NAME"), ADVANCED] = Field(
         None, description="Names of the views to hold out instead of every how-manieth."
     )
+    split: Annotated[Literal["given", "every"], ADVANCED] = Field(
+        "given",
+        description="Which views are held out where the scene says so itself (transforms_test.json): given "
+        "follows it, every takes every how-manieth view all the same.",
+    )
+    burst_length: Annotated[int, Unit("views"), ADVANCED] = Field(
+        1,
+        ge=1,
+        description="So many views that follow each other by name, as frames of a video or shots of a burst, "
+        "count as one where views are held out, so that none is measured by its neighbour. Photographs that "
+        "are there twice always do.",
+    )
     poses: Annotated[Literal["given", "auto", "missing"], BASIC] = Field(
         "missing",
         description="Where the poses of the cameras come from: given takes the COLMAP model of the dataset "
         "(photographs far from where matches put them are moved, see repair_poses); auto finds the poses, "
         "by COLMAP's features, matching and mapping; missing does so only where the dataset holds no model.",
+    )
+    model: Annotated[str | None, ADVANCED] = Field(
+        None,
+        min_length=1,
+        description="Which of several models of the dataset gives the poses: its folder or its number, e.g. "
+        "sparse/1, or transforms.json; by default the COLMAP model of most photographs.",
     )
     masks: Annotated[Literal["ignore", "alpha"], ADVANCED] = Field(
         "ignore",

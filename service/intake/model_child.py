@@ -13,6 +13,7 @@ import resource
 import signal
 import sys
 import unicodedata
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -83,43 +84,30 @@ def main() -> None:
 def check(request: ModelRequest) -> ModelAnswer:
     """Parse the model and list all its faults."""
     from octasplat.engine.core.errors import DatasetError
-    from octasplat.engine.dataset.colmap_binary import check_binary_colmap_model
-    from octasplat.engine.dataset.colmap_model import find_colmap_model_folder, read_colmap_model
+    from octasplat.engine.dataset.colmap_model import read_colmap_model
+    from octasplat.engine.dataset.colmap_reading import load_model
+    from octasplat.engine.dataset.model_sources import find_model
 
     checker = _ModelChecker(request)
     try:
-        folder = find_colmap_model_folder(request.root)
+        folder = find_model(request.root)
         own = {
             Path(path).name: name
             for path, name in request.files.items()
-            if (request.root / path).parent == folder
+            if (request.root / path).parent == (folder if folder.is_dir() else folder.parent)
         }
         checker.request = request = request.model_copy(update={"files": own})
-        check_binary_colmap_model(folder)
-        reconstruction = _load_reconstruction(folder)
-        if reconstruction is not None:
-            checker.check_images(reconstruction)
-            checker.check_cameras(reconstruction)
+        reconstruction = load_model(folder, request.sizes_px).reconstruction
+        checker.check_images(reconstruction)
+        checker.check_cameras(reconstruction)
         if checker.faults:
             return ModelAnswer(faults=checker.faults)
-        model = read_colmap_model(request.root)
+        model = read_colmap_model(folder, sizes_px=request.sizes_px)
     except DatasetError as error:
         return _fault_answer(
             "model-damaged", _without_root(str(error), request.root), _file_in_sentence(str(error), request)
         )
     return checker.summary(model)
-
-
-def _load_reconstruction(folder: Path) -> Any:
-    """Return the model as pycolmap reads it; None where it does not, and the engine then says why."""
-    import pycolmap
-
-    try:
-        return pycolmap.Reconstruction(str(folder))
-    except MemoryError:
-        raise
-    except Exception:  # noqa: BLE001 - whatever a parser of foreign bytes may raise
-        return None
 
 
 class _ModelChecker:
@@ -128,6 +116,7 @@ class _ModelChecker:
     def __init__(self, request: ModelRequest) -> None:
         self.request = request
         self.faults: list[IntakeFault] = []
+        self._files: Mapping[str, str] = {}
         self._sizes = {unicodedata.normalize("NFC", name): size for name, size in request.sizes_px.items()}
 
     def _add_fault(self, model_file: str, code: str, detail: str) -> None:
@@ -138,11 +127,18 @@ class _ModelChecker:
         """Check the images' names against the photographs, and their poses."""
         import numpy as np
 
+        from octasplat.engine.dataset.image_names import match_image_names
+
         known: set[str] = set()
         posed = 0
+        names = [_image_name(image) for image in reconstruction.images.values()]
+        self._files = match_image_names([name for name in names if name is not None], self._sizes.keys())
         for image_id, image in sorted(reconstruction.images.items()):
+            name = _image_name(image)
             try:
-                name = check_name(_image_name(image, int(image_id)))
+                if name is None:
+                    raise FileNameError("name-not-text", f"The name of image {image_id} is not UTF-8.")
+                check_name(self._files.get(name, name))
             except FileNameError as error:
                 self._add_fault("images", error.code, f"The COLMAP model names an image so: {error}")
                 continue
@@ -156,7 +152,7 @@ class _ModelChecker:
                     "images", "model-image-twice", f"The COLMAP model has the image {quoted} twice."
                 )
             known.add(key)
-            if key not in self._sizes:
+            if name not in self._files:
                 self._add_fault(
                     "images",
                     "model-image-missing",
@@ -197,13 +193,10 @@ class _ModelChecker:
             if problem:
                 bad.add(int(camera_id))
                 self._add_fault("cameras", "model-camera", f"Camera {camera_id} {problem} ({facts[:200]}).")
-        for image_id, image in sorted(reconstruction.images.items()):
-            try:
-                name = _image_name(image, int(image_id))
-            except FileNameError:
-                continue  # told already
-            size = self._sizes.get(unicodedata.normalize("NFC", name))
-            if size is None or not image.has_pose or int(image.camera_id) in bad:
+        for _, image in sorted(reconstruction.images.items()):
+            name = _image_name(image)
+            size = None if name is None else self._sizes.get(self._files.get(name, name))
+            if name is None or size is None or not image.has_pose or int(image.camera_id) in bad:
                 continue
             camera = reconstruction.cameras[image.camera_id]
             if not has_same_aspect((int(camera.width), int(camera.height)), size):
@@ -230,11 +223,12 @@ class _ModelChecker:
         )
 
 
-def _image_name(image: Any, image_id: int) -> str:
+def _image_name(image: Any) -> str | None:
+    """Return the name of an image, or None where it is no text."""
     try:
         return str(image.name)
     except UnicodeDecodeError:
-        raise FileNameError("name-not-text", f"The name of image {image_id} is not UTF-8.") from None
+        return None
 
 
 def has_same_aspect(camera_px: tuple[int, int], image_px: tuple[int, int]) -> bool:

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
 
 class RenderArguments(TypedDict, total=False):
-    """Keyword arguments of :func:`render`."""
+    """What :func:`render` takes by name."""
 
     overwrite: bool
     mode: Literal["turntable", "views", "path", "camera"] | None
@@ -80,7 +80,10 @@ def reconstruct(
     max_side: int | None = None,
     test_every: int | None = None,
     held_out: Sequence[str] | None = None,
+    split: Literal["given", "every"] | None = None,
+    burst_length: int | None = None,
     poses: Literal["given", "auto", "missing"] | None = None,
+    model: str | None = None,
     masks: Literal["ignore", "alpha"] | None = None,
     evaluation_background: Literal["black", "white"] | None = None,
     minutes: float | None = None,
@@ -113,10 +116,17 @@ def reconstruct(
         test_every: Every how-manieth view by name is held out to be measured; 0 holds out none, so that
             all are trained on. Default: 8.
         held_out: Names of the views to hold out instead of every how-manieth.
+        split: Which views are held out where the scene says so itself (transforms_test.json): given
+            follows it, every takes every how-manieth view all the same. Default: given.
+        burst_length: So many views that follow each other by name, as frames of a video or shots of a
+            burst, count as one where views are held out, so that none is measured by its neighbour.
+            Photographs that are there twice always do. Default: 1.
         poses: Where the poses of the cameras come from: given takes the COLMAP model of the dataset
             (photographs far from where matches put them are moved, see repair_poses); auto finds the
             poses, by COLMAP's features, matching and mapping; missing does so only where the dataset
             holds no model. Default: missing.
+        model: Which of several models of the dataset gives the poses: its folder or its number, e.g.
+            sparse/1, or transforms.json; by default the COLMAP model of most photographs.
         masks: What masks mean: ignore leaves masked pixels out of the loss, alpha takes the mask as the
             alpha, for objects that are cut out. Default: ignore.
         evaluation_background: What lies behind renders and photographs with alpha when they are
@@ -166,7 +176,10 @@ def reconstruct(
             "max_side": max_side,
             "test_every": test_every,
             "held_out": held_out,
+            "split": split,
+            "burst_length": burst_length,
             "poses": poses,
+            "model": model,
             "masks": masks,
             "evaluation_background": evaluation_background,
             "minutes": minutes,
@@ -199,7 +212,10 @@ def estimate(
     max_side: int | None = None,
     test_every: int | None = None,
     held_out: Sequence[str] | None = None,
+    split: Literal["given", "every"] | None = None,
+    burst_length: int | None = None,
     poses: Literal["given", "auto", "missing"] | None = None,
+    model: str | None = None,
     masks: Literal["ignore", "alpha"] | None = None,
     evaluation_background: Literal["black", "white"] | None = None,
     minutes: float | None = None,
@@ -230,10 +246,17 @@ def estimate(
         test_every: Every how-manieth view by name is held out to be measured; 0 holds out none, so that
             all are trained on. Default: 8.
         held_out: Names of the views to hold out instead of every how-manieth.
+        split: Which views are held out where the scene says so itself (transforms_test.json): given
+            follows it, every takes every how-manieth view all the same. Default: given.
+        burst_length: So many views that follow each other by name, as frames of a video or shots of a
+            burst, count as one where views are held out, so that none is measured by its neighbour.
+            Photographs that are there twice always do. Default: 1.
         poses: Where the poses of the cameras come from: given takes the COLMAP model of the dataset
             (photographs far from where matches put them are moved, see repair_poses); auto finds the
             poses, by COLMAP's features, matching and mapping; missing does so only where the dataset
             holds no model. Default: missing.
+        model: Which of several models of the dataset gives the poses: its folder or its number, e.g.
+            sparse/1, or transforms.json; by default the COLMAP model of most photographs.
         masks: What masks mean: ignore leaves masked pixels out of the loss, alpha takes the mask as the
             alpha, for objects that are cut out. Default: ignore.
         evaluation_background: What lies behind renders and photographs with alpha when they are
@@ -274,7 +297,10 @@ def estimate(
             "max_side": max_side,
             "test_every": test_every,
             "held_out": held_out,
+            "split": split,
+            "burst_length": burst_length,
             "poses": poses,
+            "model": model,
             "masks": masks,
             "evaluation_background": evaluation_background,
             "minutes": minutes,

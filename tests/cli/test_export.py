@@ -7,9 +7,9 @@ import struct
 import numpy as np
 import pytest
 
+from octasplat.engine.core.ply_container import PlyWriteElement, write_ply
 from octasplat.engine.files import read_scene
 from octasplat.engine.files.gaussian_ply import read_gaussian_ply
-from octasplat.engine.files.ply_container import PlyWriteElement, write_ply
 from octasplat.engine.render.depth_order import MIN_AGREEMENT, shared_depth_order
 from octasplat.engine.runs.run_folder import run_viewpoints
 

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
+from octasplat.engine.core.ply_container import PlyWriteElement, write_ply
 from octasplat.engine.files import read_scene
 from octasplat.engine.files.gaussian_ply import read_gaussian_ply, write_gaussian_ply
-from octasplat.engine.files.ply_container import PlyWriteElement, write_ply
 from octasplat.engine.gaussians.model import FlatGaussians
 
 

@@ -20,8 +20,8 @@ from octasplat.engine.core.scene_layout import (
     left_out_sentences,
     masks_beside,
 )
-from octasplat.engine.dataset.colmap_model import find_colmap_model_folder
-from octasplat.engine.dataset.load import image_folder
+from octasplat.engine.dataset.model_sources import find_model
+from octasplat.engine.dataset.photograph_files import image_folder
 from octasplat.engine.operations.estimate import EstimateRequest
 from octasplat.engine.operations.estimate import run as estimate
 from octasplat.engine.poses.photographs import left_out_of_scene, locate_scene, photographs_of_scene
@@ -80,6 +80,10 @@ def by_folder(paths: Sequence[str]) -> Told:
 def by_archive(paths: Sequence[str]) -> Told:
     data = build_zip(*(ZipMember(path, b"x") for path in paths))
     preview = preview_archive(data[-20_000:], len(data), LIMITS)
+    if not preview.files:
+        with pytest.raises(IntakeError, match="no part of a scene"):
+            list_archive(io.BytesIO(data))
+        return by_preview(preview)
     listing = list_archive(io.BytesIO(data))
     assert {file.name for file in listing.files} == {file.name for file in preview.files}
     assert listing.notes == preview.notes and set(listing.left_out) == set(preview.left_out)
@@ -185,7 +189,7 @@ def test_all_doors_take_leave_out_and_refuse_the_same(
 
 
 def test_files_left_out_are_told_by_kind_with_the_way_out() -> None:
-    paths = ["images/a.jpg", "sparse/0/project.ini", "images/b.HEIC", "c.jpg", "v.MOV", "transforms.json"]
+    paths = ["images/a.jpg", "sparse/0/project.ini", "images/b.HEIC", "c.jpg", "v.MOV", "old/transforms.json"]
     layout = lay_out_scene(paths)
     assert layout.files == {"images/a.jpg": "images/a.jpg"} and set(layout.left_out) == set(paths[1:])
     told = left_out_sentences(layout.left_out)
@@ -241,7 +245,7 @@ def test_largest_of_several_models_is_taken(tmp_path: Path, parent: str) -> None
         folder.mkdir(parents=True)
         for part in ("cameras", "images", "points3D"):
             (folder / f"{part}.bin").write_bytes(count.to_bytes(8, "little"))
-    assert find_colmap_model_folder(tmp_path) == tmp_path / parent / "1"
+    assert find_model(tmp_path) == tmp_path / parent / "1"
 
 
 def test_only_model_with_another_number_is_kept_in_an_archive() -> None:

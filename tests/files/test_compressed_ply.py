@@ -6,8 +6,8 @@ import pytest
 from scipy.spatial import cKDTree
 
 from octasplat.engine.core.errors import SceneFileError
+from octasplat.engine.core.ply_container import PlyWriteElement, write_ply
 from octasplat.engine.files import export_scene, exporter_for, importer_for, read_scene
-from octasplat.engine.files.ply_container import PlyWriteElement, write_ply
 from octasplat.engine.gaussians.flattening import GaussianCloud
 from octasplat.engine.gaussians.model import FlatGaussians
 from tests.support.cloud_difference import difference

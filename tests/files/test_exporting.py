@@ -6,9 +6,9 @@ import pytest
 from pydantic import ValidationError
 
 from octasplat.engine.core.errors import SceneFileError
+from octasplat.engine.core.ply_container import read_ply_header
 from octasplat.engine.files import Exporter, ExportOptions, export_scene, exporter_for, exporters, register
 from octasplat.engine.files.gaussian_ply import read_gaussian_ply
-from octasplat.engine.files.ply_container import read_ply_header
 from octasplat.engine.gaussians.model import FlatGaussians
 
 Make = Callable[..., FlatGaussians]

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from octasplat.engine.core.errors import SceneFileError
+from octasplat.engine.core.ply_container import read_ply
 from octasplat.engine.files import read_metadata, read_scene
 from octasplat.engine.files.gaussian_ply import read_gaussian_ply, write_gaussian_ply
-from octasplat.engine.files.ply_container import read_ply
 from octasplat.engine.gaussians.frames import rotation_matrices
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.gaussians.scene_metadata import SceneMetadata

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from octasplat.engine.core.errors import SceneFileError
+from octasplat.engine.core.ply_container import COUNT_SUFFIX, PlyWriteElement, list_field, write_ply
 from octasplat.engine.files import mesh_obj, read_mesh
-from octasplat.engine.files.ply_container import COUNT_SUFFIX, PlyWriteElement, list_field, write_ply
 
 
 def obj(tmp_path: Path, text: str) -> Path:

@@ -9,8 +9,8 @@ import pytest
 
 import octasplat.engine.files.mesh_obj as obj_module
 from octasplat.engine.core.errors import SceneFileError
+from octasplat.engine.core.ply_container import read_ply
 from octasplat.engine.files import ExportOptions, export_scene, octagon_batches, read_scene
-from octasplat.engine.files.ply_container import read_ply
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.gaussians.octagon import (
     CHI2_2_99,

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from octasplat.engine.core.errors import SceneFileError
-from octasplat.engine.files.ply_container import (
+from octasplat.engine.core.ply_container import (
     PlyWriteElement,
     list_field,
     read_ply,

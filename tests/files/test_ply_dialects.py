@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from octasplat.engine.core.errors import SceneFileError
+from octasplat.engine.core.ply_container import PlyWriteElement, write_ply
 from octasplat.engine.files import read_scene
-from octasplat.engine.files.ply_container import PlyWriteElement, write_ply
 from octasplat.engine.gaussians.frames import quaternions_from_matrices
 from octasplat.engine.gaussians.model import FlatGaussians
 

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from octasplat.engine.core.ply_container import read_ply
 from octasplat.engine.files import ExportOptions, export_scene
-from octasplat.engine.files.ply_container import read_ply
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.gaussians.octagon import octagon_corners_world, octagon_radii
 from octasplat.engine.render.image_files import read_image, write_exr

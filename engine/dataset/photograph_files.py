@@ -1,0 +1,40 @@
+"""The files of a scene's photographs on disk."""
+
+import os
+from pathlib import Path
+
+from octasplat.engine.core.relative_paths import normalize_name
+from octasplat.engine.core.scene_layout import is_ignored_file, is_photograph
+from octasplat.engine.dataset.results_among import is_run_folder
+
+
+def image_folder(root: Path) -> Path:
+    """Return ``images/`` or ``input/`` of a scene, or the scene itself where neither holds photographs."""
+    folders = [root / name for name in ("images", "input") if (root / name).is_dir()]
+    elsewhere = root if not folders or _holds_photographs(root) else folders[0]
+    return next((folder for folder in folders if _holds_photographs(folder)), elsewhere)
+
+
+def _holds_photographs(folder: Path) -> bool:
+    names = (path.relative_to(folder).as_posix() for path in folder.rglob("*"))
+    return any(is_photograph(name) and not is_ignored_file(name) for name in names)
+
+
+def files_below(folder: Path) -> dict[str, Path]:
+    """Return files by their NFC-normalised path below ``folder``, without hidden ones and results of runs."""
+    files: dict[str, Path] = {}
+    for parent, folders, names in os.walk(folder, followlinks=True):
+        folders[:] = sorted(
+            name for name in folders if not name.startswith(".") and not is_run_folder(Path(parent) / name)
+        )
+        for name in sorted(names):
+            if not name.startswith("."):
+                path = Path(parent) / name
+                # File systems differ in how they spell an umlaut; models come from other machines.
+                files[normalize_name(path.relative_to(folder).as_posix())] = path
+    return files
+
+
+def photographs_below(folder: Path) -> dict[str, Path]:
+    """Return photographs by their NFC-normalised path below ``folder``, of the formats that are taken."""
+    return {name: path for name, path in files_below(folder).items() if is_photograph(name)}

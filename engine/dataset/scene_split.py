@@ -1,0 +1,67 @@
+"""The split of a scene: by rule, by names, or as the scene says, with copies of photographs on one side."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Int64
+
+from octasplat.engine.dataset.duplicates import find_duplicates
+from octasplat.engine.dataset.model import DatasetModel
+from octasplat.engine.dataset.split import split_views
+
+SplitSource = Literal["given", "every"]
+
+
+@dataclass(frozen=True)
+class SplitRule:
+    """How views are held out.
+
+    Attributes:
+        test_every: every how-manieth view is held out, beginning with the first; 0 holds out none.
+        held_out: names of the views to hold out instead.
+        burst_length: so many views that follow each other by name count as one.
+        split: ``given`` holds out what the scene says, where it says anything and neither ``held_out`` nor a
+            ``test_every`` of 0 says otherwise; ``every`` does not ask the scene.
+    """
+
+    test_every: int = 8
+    held_out: Sequence[str] | None = None
+    burst_length: int = 1
+    split: SplitSource = "given"
+
+
+@dataclass(frozen=True, eq=False)
+class SceneSplit:
+    """Indices of the views to train on and of those held out, and sentences on how it came about."""
+
+    train_indices: Int64[np.ndarray, " train"]
+    test_indices: Int64[np.ndarray, " test"]
+    warnings: tuple[str, ...] = ()
+
+
+def split_scene(model: DatasetModel, rule: SplitRule) -> SceneSplit:
+    """Return the split of a scene.
+
+    Raises:
+        DatasetError: a name to hold out is unknown, or nothing is left to train on.
+        ConfigError: ``test_every`` is negative.
+    """
+    names = [view.name for view in model.views]
+    held_out = rule.held_out
+    warnings: list[str] = []
+    if model.held_out is not None:
+        of_scene = f"{model.model_folder} holds out {len(model.held_out)} views"
+        if held_out is None and rule.test_every and rule.split == "given":
+            held_out = model.held_out
+            warnings.append(f"{of_scene}, which are measured; split=every holds out every n-th view instead.")
+        else:
+            warnings.append(f"{of_scene}; this run holds out others, as asked.")
+    duplicates = find_duplicates(model)
+    if (sentence := duplicates.sentence(names)) is not None:
+        warnings.append(sentence)
+    train, test = split_views(
+        names, rule.test_every, held_out, burst_length=rule.burst_length, duplicates=duplicates.groups
+    )
+    return SceneSplit(train, test, tuple(warnings))
