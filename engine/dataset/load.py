@@ -251,8 +251,8 @@ def _warn_of_other_models(root: Path, taken: Path, warnings: list[str]) -> None:
         described = [name if count is None else f"{name} of {count} images" for name, count in others.items()]
         size = f" of {posed_image_count(taken)} images" * taken.is_dir()
         warnings.append(
-            f"{root} holds further models ({len(others)}): {_name_list(described)}; only {taken}{size} is used; "
-            f"--model {next(iter(others))} takes another."
+            f"{root} holds further models ({len(others)}): {_name_list(described)}; only "
+            f"{taken}{size} is used; --model {next(iter(others))} takes another."
         )
 
 
