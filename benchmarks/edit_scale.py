@@ -19,6 +19,7 @@ import numpy as np
 from octasplat.engine.core.ply_container import read_ply
 from octasplat.engine.files import export_scene
 from octasplat.engine.gaussians.model import FlatGaussians
+from tests.support.edit_scenes import cube, grid
 
 
 def random_scene(count: int, degree: int) -> FlatGaussians:
@@ -72,29 +73,6 @@ def write_obj(path: Path, vertices: np.ndarray, triangles: np.ndarray) -> None:
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
-def sheet(cells: int, half: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
-    """A square in the plane z = 0."""
-    u = np.linspace(-half, half, cells + 1)
-    x, y = np.meshgrid(u, u, indexing="ij")
-    i = np.arange((cells + 1) ** 2).reshape(cells + 1, cells + 1)
-    a, b, c, d = i[:-1, :-1].ravel(), i[1:, :-1].ravel(), i[1:, 1:].ravel(), i[:-1, 1:].ravel()
-    triangles = np.concatenate([np.stack([a, b, c], axis=-1), np.stack([a, c, d], axis=-1)])
-    return np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=-1), triangles
-
-
-def cage(cells: int, half: float = 1.05) -> tuple[np.ndarray, np.ndarray]:
-    """A closed cube."""
-    flat, triangles = sheet(cells, half)
-    points, faces = [], []
-    for axis in range(3):
-        for side in (1, -1):
-            face = np.stack([np.full(len(flat), side * half), flat[:, 0], flat[:, 1]], axis=-1)
-            faces.append((triangles if side > 0 else triangles[:, ::-1]) + len(flat) * len(points))
-            points.append(np.roll(face, axis, axis=1))
-    vertices, numbers = np.unique(np.concatenate(points).round(9), axis=0, return_inverse=True)
-    return vertices, numbers.reshape(-1)[np.concatenate(faces)]
-
-
 def measure(name: str, *arguments: object) -> None:
     """One row of the table, if it was asked for."""
     if len(sys.argv) > 3 and sys.argv[3] not in name:
@@ -124,7 +102,7 @@ def main() -> None:
             export_scene(scene, path)
         write_edited(meshes[0], folder / "twisted.ply", shuffle=False)
         write_edited(meshes[0], folder / "shuffled.ply", shuffle=True)
-        proxies = {"sheet": sheet(24), "cage": cage(4)}
+        proxies = {"sheet": grid(24, 1.0), "cage": cube(4, 1.05)}
         for kind, (vertices, triangles) in proxies.items():
             write_obj(folder / f"{kind}.obj", vertices, triangles)
             write_obj(folder / f"{kind}_twisted.obj", twisted(vertices), triangles)

@@ -74,8 +74,8 @@ def prepare(gaussians: FlatGaussians) -> Boxes:
     parameters = GaussianParameters.from_gaussians(gaussians)
     records = aligned_empty((len(gaussians), PRIMITIVE_WORDS))
     boxes = np.empty((len(gaussians), 6), np.float32)
-    pack_primitives(records, *parameters, SETTINGS.q)
-    write_boxes(boxes, *parameters, SETTINGS.q, 0.0)
+    pack_primitives(0, len(gaussians), records, parameters, SETTINGS.q)
+    write_boxes(0, len(gaussians), boxes, parameters, SETTINGS.q, 0.0)
     return Boxes(gaussians, records, boxes)
 
 

@@ -28,12 +28,9 @@ from octasplat.engine.gaussians.octagon import CHI2_3_99
 from octasplat.engine.pathtracing.compile_meshes import CompiledMeshes, compile_meshes
 from octasplat.engine.pathtracing.gaussian_layers import GaussianLayers, build_gaussian_layers
 from octasplat.engine.pathtracing.path_tracer import PathTracer, PathTracerScene
+from octasplat.engine.pathtracing.stage.materials import Diffuse, Glass, Metal, Mirror
 from octasplat.engine.pathtracing.stage.model import (
-    Diffuse,
-    Glass,
     Integrator,
-    Metal,
-    Mirror,
     RectangleLight,
     Stage,
     StageGaussians,

@@ -28,7 +28,7 @@ from octasplat.engine.gaussians.materials import MATERIAL_WIDTHS
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.pathtracing.compile_meshes import compile_meshes
 from octasplat.engine.pathtracing.gaussian_layers import build_gaussian_layers
-from octasplat.engine.pathtracing.kernels.kernel_args import SurfaceInteractions
+from octasplat.engine.pathtracing.kernels.path_args import SurfaceInteractions
 from octasplat.engine.pathtracing.kernels.principled_bsdf import orthonormal_basis
 from octasplat.engine.pathtracing.path_tracer import PathTracer, PathTracerScene
 from octasplat.engine.pathtracing.stage.model import Environment, Integrator, Stage, StageGaussians

@@ -29,7 +29,6 @@ from octasplat.engine.trace.cpu.tracer import CpuTracer
 from octasplat.engine.trace.protocol import GaussianGradients, TraceGradients, TraceResult, TraceSettings
 
 SIDE = 256
-THIN = 1e-5
 ENLARGE = 3.0
 PAUSE_SECONDS = 0.1
 """Before each measurement, so that the other side's threads no longer wait at full speed."""
@@ -75,27 +74,12 @@ class Mitsuba:
         import drjit as dr
         import mitsuba as mi
 
+        from tests.support.mitsuba_gaussians import ellipsoids
+
         mi.set_variant("llvm_ad_rgb")
         dr.set_thread_count(2)
         self.dr, self.mi = dr, mi
-        count = len(gaussians)
-        # Ours has the normal as first axis, theirs is free: the thin scale goes first.
-        scales = np.concatenate([np.full((count, 1), THIN, np.float32), gaussians.scales], axis=1)
-        quats = gaussians.quats_wxyz / np.linalg.norm(gaussians.quats_wxyz, axis=1, keepdims=True)
-        self.scene = mi.load_dict(
-            {
-                "type": "scene",
-                "gaussians": {
-                    "type": "ellipsoidsmesh",
-                    "centers": mi.TensorXf(gaussians.means_world),
-                    "scales": mi.TensorXf(scales),
-                    "quaternions": mi.TensorXf(quats[:, [1, 2, 3, 0]].astype(np.float32)),
-                    "opacities": mi.TensorXf(gaussians.opacities.reshape(-1, 1)),
-                    "sh_coeffs": mi.TensorXf(gaussians.sh.reshape(count, -1)),
-                    "extent": CHI2_3_99**0.5,
-                },
-            }
-        )
+        self.scene = mi.load_dict({"type": "scene", "gaussians": ellipsoids(gaussians, CHI2_3_99**0.5)})
         self.integrator = mi.load_dict(
             {"type": "volprim_rf_basic", "max_depth": SETTINGS.max_hits, "srgb_primitives": False}
         )

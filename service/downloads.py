@@ -11,6 +11,7 @@ from octasplat.service.etags import etag_matches
 from octasplat.service.intake.receive import format_digest
 from octasplat.service.problems import ProblemError
 from octasplat.service.state import Service
+from octasplat.service.thread_pools import ThreadPurpose, run_in_pool
 
 _RANGE = re.compile(r"bytes=([0-9]{0,18})-([0-9]{0,18})")
 _INLINE_TYPES = ("image/png", "image/jpeg", "application/json", "text/plain", "model/gltf-binary")
@@ -19,12 +20,12 @@ _SANDBOX_POLICY = (
 )
 
 
-def send_blob(
+async def send_blob(
     service: Service,
     request: Request,
-    *,
     sha256: str,
     size_bytes: int,
+    *,
     media_type: str,
     name: str,
     inline: bool = False,
@@ -62,16 +63,25 @@ def send_blob(
         headers["Content-Security-Policy"] = _SANDBOX_POLICY
     if etag_matches(request.headers.get("if-none-match"), etag):
         return Response(status_code=304, headers=headers)
+    return await run_in_pool(
+        ThreadPurpose.DOWNLOADS,
+        _stored_response,
+        service,
+        request,
+        sha256,
+        size_bytes,
+        media_type,
+        headers,
+    )
+
+
+def _stored_response(
+    service: Service, request: Request, sha256: str, size: int, media_type: str, headers: dict[str, str]
+) -> Response:
+    """Return a response with a local file, or from a remote storage, complete or one range."""
     path = service.storage.local_path(sha256)
     if path is not None:
         return FileResponse(path, media_type=media_type, headers=headers)
-    return _remote_response(service, request, sha256, size_bytes, media_type, headers)
-
-
-def _remote_response(
-    service: Service, request: Request, sha256: str, size: int, media_type: str, headers: dict[str, str]
-) -> Response:
-    """Return a response from a remote storage, complete or one range."""
     start, stop, status = 0, size, 200
     requested = _RANGE.fullmatch(request.headers.get("range", ""))
     condition = request.headers.get("if-range")

@@ -33,6 +33,7 @@ import sys
 from pathlib import Path
 from octasplat.engine.runs.config import ReconstructionConfig
 from octasplat.engine.pipeline import reconstruct
+from tests.support.tiny_dataset import make_tiny_dataset
 scene, output, config, threads = sys.argv[1:]
 reconstruct(
     Path(scene),
@@ -75,11 +76,7 @@ def threads_as_before() -> Iterator[None]:
 
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    root = tmp_path_factory.mktemp("resume") / "scene"
-    write_synthetic_dataset(
-        root, SyntheticDatasetConfig(views=8, width_px=64, height_px=48, samples_per_side=2, points=600)
-    )
-    return root
+    return make_tiny_dataset(tmp_path_factory, samples_per_side=2, points=600)
 
 
 @pytest.fixture(scope="module")

@@ -41,13 +41,13 @@ def clean(
         floating = int(loose.sum())
         groups = int((sizes < min(options.min_group, sizes.max())).sum())
     report = CleanReport(
-        int(faint.sum()),
-        int(small.sum()),
-        int(large.sum()),
-        int(near.sum()),
-        floating,
-        groups,
-        int(keep.sum()),
+        faint=int(faint.sum()),
+        small=int(small.sum()),
+        large=int(large.sum()),
+        near=int(near.sum()),
+        floating=floating,
+        groups=groups,
+        kept=int(keep.sum()),
     )
     return keep, report
 

@@ -2,6 +2,8 @@
 
 from dataclasses import dataclass
 
+from pydantic import BaseModel, ConfigDict
+
 from octasplat.engine.edit.axes import Axes
 from octasplat.engine.gaussians.octagon import CHI2_2_99
 
@@ -89,8 +91,7 @@ class DeformReport:
     residual_max: float
 
 
-@dataclass(frozen=True)
-class CleanReport:
+class CleanReport(BaseModel):
     """Counts of the removed Gaussians, each by the first reason that holds.
 
     Attributes:
@@ -102,6 +103,8 @@ class CleanReport:
         groups: number of such groups.
         kept: those that stay.
     """
+
+    model_config = ConfigDict(frozen=True)
 
     faint: int
     small: int

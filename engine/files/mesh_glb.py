@@ -1,4 +1,4 @@
-"""Meshes as binary glTF: octagons of a scene out, surfaces out, edited meshes in with their ids kept.
+"""Meshes as binary glTF: octagons of a scene out, edited meshes in with their ids kept.
 
 Octagons: the format to look at, as it carries colour, opacity and the Gaussian fall-off. Base colour = white
 texture with radial alpha x COLOR_0, so that alpha = opacity * exp(-rho^2 / 2) at every pixel (to the 8 bits
@@ -20,10 +20,9 @@ import itertools
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from jaxtyping import Float32, Int, Int32, UInt8
+from jaxtyping import Float32, Int, Int32
 
 from octasplat.engine.core.color import srgb_to_linear
 from octasplat.engine.core.errors import ConfigError, SceneFileError
@@ -31,6 +30,7 @@ from octasplat.engine.files import glb_container
 from octasplat.engine.files.export_options import ExportOptions
 from octasplat.engine.files.glb_container import GlbFile, channel_attributes, pad_to_four, write_glb
 from octasplat.engine.files.glb_materials import glb_materials, texture_frame
+from octasplat.engine.files.glb_surface import write_surface
 from octasplat.engine.files.kd_split import kd_split
 from octasplat.engine.files.octagon_batches import OctagonBatch, OctagonSoup
 from octasplat.engine.files.octagon_glb_layout import OPAQUE_CUTOFF, Bounds, GlbLayout
@@ -38,26 +38,16 @@ from octasplat.engine.files.registry import Exporter, MeshReader, SurfaceWriter,
 from octasplat.engine.files.textures import (
     material_ramp_png,
     material_ramp_uv,
-    png_bytes,
     white_with_alpha_png,
 )
 from octasplat.engine.gaussians.materials import ALBEDO, METALLIC, ROUGHNESS, has_materials
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.gaussians.octagon import SIDES, octagon_triangles
 from octasplat.engine.geometry.imported_mesh import MIN_OPACITY_KEY, Q_KEY, ImportedMesh
-from octasplat.engine.geometry.triangle_mesh import TriangleMesh
 
 COMPRESSIONS = ("KHR_draco_mesh_compression", "EXT_meshopt_compression", "KHR_meshopt_compression")
 ATTRIBUTES = {"uv": "TEXCOORD_0", "gid": "_GID", "corner": "_CORNER", "radius": "_RADIUS"}
 ATTRIBUTE_WIDTHS = {"uv": 2, "normal": 3, "colour": 3}
-UNLIT = "KHR_materials_unlit"
-SAMPLER = {
-    "magFilter": glb_container.LINEAR,
-    "minFilter": glb_container.LINEAR_MIPMAP_LINEAR,
-    "wrapS": glb_container.CLAMP_TO_EDGE,
-    "wrapT": glb_container.CLAMP_TO_EDGE,
-}
-
 ChunkIndices = list[Int[np.ndarray, "_"]]
 
 
@@ -275,121 +265,6 @@ def _chunk_data(batch: OctagonBatch, options: ExportOptions) -> Iterator[bytes]:
 
 def _per_corner(values: Float32[np.ndarray, "n c"] | Int[np.ndarray, "n c"]) -> Float32[np.ndarray, "m c"]:
     return np.repeat(values.astype("<f4"), SIDES, axis=0)
-
-
-def write_surface(mesh: TriangleMesh, path: Path) -> tuple[Path, ...]:
-    """Write a surface with normals and with a texture or the colours of its vertices.
-
-    Unlit, unless it has materials: then these are textures beside the base colour's, tangents say how its
-    normals lie, and the root node turns the light's up to y and its forward to x, which is how environments
-    lie in glTF's viewers and in Blender.
-
-    Raises:
-        SceneFileError: more than the 4 GiB that a GLB can hold.
-        OSError: the file cannot be written.
-    """
-    attributes = {"POSITION": mesh.vertices_world, "NORMAL": mesh.vertex_normals()}
-    data = _SurfaceData()
-    shading: dict[str, object] = {"metallicFactor": 0.0, "roughnessFactor": 1.0}
-    material: dict[str, object] = {"name": "surface", "pbrMetallicRoughness": shading, "doubleSided": True}
-    node: dict[str, Any] = {"name": "surface", "rotation": glb_container.HALF_TURN_ABOUT_X, "mesh": 0}
-    document: dict[str, object] = {
-        "asset": {"version": "2.0", "generator": "octasplat"},
-        "scene": 0,
-        "scenes": [{"nodes": [0]}],
-        "nodes": [node],
-        "materials": [material],
-    }
-    if mesh.materials is None:
-        document["extensionsUsed"] = [UNLIT]
-        material["extensions"] = {UNLIT: {}}
-    else:
-        attributes["TANGENT"] = mesh.materials.tangents
-        node["rotation"] = glb_container.light_rotation(mesh.materials.light_frame)
-    node |= glb_container.root_translation(mesh.origin_world, node["rotation"])
-    if mesh.texture_srgb is not None and mesh.uv is not None:
-        attributes["TEXCOORD_0"] = mesh.uv
-        shading["baseColorTexture"] = data.texture("surface", mesh.texture_srgb)
-        if mesh.materials is not None:
-            shading["metallicFactor"] = 1.0
-            packed = data.texture("materials", mesh.materials.occlusion_roughness_metallic)
-            shading["metallicRoughnessTexture"] = packed
-            material["occlusionTexture"] = packed
-            material["normalTexture"] = data.texture("normals", mesh.materials.normals)
-        document |= {"textures": data.textures, "samplers": [SAMPLER], "images": data.images}
-    elif mesh.rgb_srgb is not None:
-        attributes["COLOR_0"] = srgb_to_linear(mesh.rgb_srgb)
-    accessors: list[dict[str, object]] = []
-    used: dict[str, int] = {}
-    for semantic, values in attributes.items():
-        view = data.add(np.ascontiguousarray(values, "<f4").tobytes(), glb_container.ARRAY_BUFFER)
-        used[semantic] = len(accessors)
-        accessors.append(
-            glb_container.accessor_json(
-                view, glb_container.FLOAT, len(values), glb_container.vector_type(values.shape[1])
-            )
-        )
-    accessors[0] |= {
-        "min": mesh.vertices_world.min(axis=0).tolist(),
-        "max": mesh.vertices_world.max(axis=0).tolist(),
-    }
-    view = data.add(mesh.faces.astype("<u4").tobytes(), glb_container.ELEMENT_ARRAY_BUFFER)
-    accessors.append(glb_container.accessor_json(view, glb_container.UNSIGNED_INT, mesh.faces.size, "SCALAR"))
-    document |= {
-        "meshes": [
-            {
-                "name": "surface",
-                "primitives": [{"attributes": used, "indices": len(accessors) - 1, "material": 0}],
-            }
-        ],
-        "accessors": accessors,
-        "bufferViews": data.views,
-        "buffers": [{"byteLength": data.length}],
-    }
-    text = glb_container.json_bytes(document)
-    room = pad_to_four(len(text))
-    if glb_container.glb_size(room, data.length) > glb_container.MAX_BYTES:
-        advice = "Decimate it with --max-triangles, or name a .ply."
-        raise glb_container.too_large_error(
-            path, "the surface needs", glb_container.glb_size(room, data.length), advice
-        )
-    write_glb(path, room, data.length, data.pieces, lambda: text)
-    return (path,)
-
-
-class _SurfaceData:
-    """The binary part of a surface as it grows, and what the document says of it.
-
-    Attributes:
-        pieces: in the order of the file.
-        length: bytes of all pieces.
-        views: of the buffer.
-        textures: of the document.
-        images: likewise.
-    """
-
-    def __init__(self) -> None:
-        self.pieces: list[bytes] = []
-        self.length = 0
-        self.views: list[dict[str, object]] = []
-        self.textures: list[dict[str, object]] = []
-        self.images: list[dict[str, object]] = []
-
-    def add(self, piece: bytes, target: int | None = None) -> int:
-        """Add a buffer view and return its number."""
-        self.views.append({"buffer": 0, "byteOffset": self.length, "byteLength": len(piece)})
-        if target is not None:
-            self.views[-1]["target"] = target
-        self.pieces.append(piece.ljust(pad_to_four(len(piece)), b"\0"))
-        self.length += len(self.pieces[-1])
-        return len(self.views) - 1
-
-    def texture(self, name: str, pixels: UInt8[np.ndarray, "h w 3"]) -> dict[str, object]:
-        """Add an image and return how a material names it."""
-        view = self.add(png_bytes(pixels))
-        self.images.append({"name": name, "mimeType": "image/png", "bufferView": view})
-        self.textures.append({"sampler": 0, "source": len(self.images) - 1})
-        return {"index": len(self.textures) - 1}
 
 
 register(

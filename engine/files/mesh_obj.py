@@ -2,20 +2,14 @@
 
 Octagons: plain geometry for any program, with vertex colours, an MTL and the radial texture beside it. OBJ
 has no opacity per vertex, so the Gaussians' own opacities are lost; the texture keeps the fall-off.
-
-Reading is fast: whole blocks of the file are sorted by kind of line and parsed at once.
 """
 
-import codecs
-import re
-import warnings
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 import numpy as np
-from jaxtyping import Float32, Int32, Int64
 
 from octasplat.engine.core.color import srgb_to_linear
 from octasplat.engine.core.errors import SceneFileError
@@ -24,6 +18,7 @@ from octasplat.engine.core.writing import atomic_replace, write_text
 from octasplat.engine.files.export_options import ExportOptions
 from octasplat.engine.files.gaussian_ply import origin_comments
 from octasplat.engine.files.obj_materials import read_mtl
+from octasplat.engine.files.obj_parser import ObjParts, parse_block, read_blocks, uv_of_vertices
 from octasplat.engine.files.octagon_batches import BATCH_SIZE, OctagonBatch, OctagonSoup
 from octasplat.engine.files.registry import Exporter, MeshReader, SurfaceWriter, register
 from octasplat.engine.files.textures import grey_png, png_bytes
@@ -39,33 +34,12 @@ from octasplat.engine.geometry.imported_mesh import (
 from octasplat.engine.geometry.mesh_material import MeshMaterial
 from octasplat.engine.geometry.triangle_mesh import TriangleMesh
 
-BLOCK_BYTES = 1 << 22
-NEWLINE, SPACE, TAB = 10, 32, 9  # every other white space lies below the space
-MAX_HEADER_LINES = 64
-DIGIT_LINES = 2000
 LINES_PER_BLOCK = 100_000
-_INDENT = re.compile(rb"^[ \t]+", re.MULTILINE)
 MATERIAL = "octagons"
 POSITION_LINE = "v %.9g %.9g %.9g"
 COLOUR_END = " %.5g %.5g %.5g\n"
 TEXTURE_LINE = "vt %.6f %.6f\n"
 FACE_LINE = "f %d/%d %d/%d %d/%d\n"
-
-
-@dataclass
-class _ObjParts:
-    positions: list[np.ndarray] = field(default_factory=list)
-    uv: list[np.ndarray] = field(default_factory=list)
-    triangles: list[np.ndarray] = field(default_factory=list)
-    triangle_uv: list[np.ndarray] = field(default_factory=list)
-    comments: list[str] = field(default_factory=list)
-    decimals: int = 0
-    vertex_count: int = 0
-    uv_count: int = 0
-    with_materials: bool = False
-    colours: list[np.ndarray] = field(default_factory=list)
-    libraries: list[str] = field(default_factory=list)
-    material_uses: list[tuple[int, str]] = field(default_factory=list)
 
 
 def read(path: Path) -> ImportedMesh:
@@ -74,7 +48,7 @@ def read(path: Path) -> ImportedMesh:
     Raises:
         SceneFileError: the file cannot be read, or a line is not understood.
     """
-    return _read(path, _ObjParts())
+    return _read(path, ObjParts())
 
 
 def read_with_materials(path: Path) -> ImportedMesh:
@@ -83,21 +57,21 @@ def read_with_materials(path: Path) -> ImportedMesh:
     Raises:
         SceneFileError: likewise, or an image that its MTL names is missing.
     """
-    return _read(path, _ObjParts(with_materials=True))
+    return _read(path, ObjParts(with_materials=True))
 
 
-def _read(path: Path, parts: _ObjParts) -> ImportedMesh:
+def _read(path: Path, parts: ObjParts) -> ImportedMesh:
     try:
         with path.open("rb") as handle:
-            for block in _blocks(handle):
-                _parse_block(path, block, parts)
+            for block in read_blocks(handle):
+                parse_block(path, block, parts)
     except OSError as error:
         raise SceneFileError(f"{path}: cannot be read ({error.strerror or error}).") from error
     if not parts.positions:
         raise SceneFileError(f"{path}: is no OBJ mesh; it has no line that begins with 'v'.")
     positions = np.concatenate(parts.positions)
     parts.positions.clear()
-    uv = _uv_of_vertices(path, parts, len(positions))
+    uv = uv_of_vertices(path, parts, len(positions))
     materials = _read_materials(path, parts, len(positions)) if parts.with_materials else {}
     parts.uv.clear()
     parts.triangle_uv.clear()
@@ -114,7 +88,7 @@ def _read(path: Path, parts: _ObjParts) -> ImportedMesh:
     )
 
 
-def _read_materials(path: Path, parts: _ObjParts, count: int) -> dict[str, Any]:
+def _read_materials(path: Path, parts: ObjParts, count: int) -> dict[str, Any]:
     """Return texture coordinates of corners, colors of vertices and materials."""
     places = np.concatenate([*parts.triangle_uv, np.zeros((0, 3), np.int32)])
     looks: dict[str, Any] = {}
@@ -133,198 +107,6 @@ def _read_materials(path: Path, parts: _ObjParts, count: int) -> dict[str, Any]:
         looks["material_indices"] = numbers
         looks["materials"] = tuple(materials.get(name, replace(missing, name=name)) for name in known)
     return looks
-
-
-def _blocks(handle: IO[bytes]) -> Iterator[bytes]:
-    """Yield the file in blocks that end at the end of a line."""
-    rest = handle.read(len(codecs.BOM_UTF8)).removeprefix(codecs.BOM_UTF8)
-    while chunk := handle.read(BLOCK_BYTES):
-        complete, newline, tail = chunk.rpartition(b"\n")
-        if newline:
-            yield rest + complete + newline
-            rest = tail
-        else:
-            rest += chunk
-    if rest:
-        yield rest + b"\n"
-
-
-def _parse_block(path: Path, block: bytes, parts: _ObjParts) -> None:
-    if not parts.positions:
-        for line in block.split(b"\n", MAX_HEADER_LINES)[:MAX_HEADER_LINES]:
-            if line.startswith(b"#"):
-                parts.comments.append(line[1:].decode("utf-8", "replace").strip())
-    if b"\\\n" in block or b"\\\r\n" in block:
-        block = block.replace(b"\\\r\n", b" ").replace(b"\\\n", b" ")
-    if _INDENT.search(block):
-        block = _INDENT.sub(b"", block)
-    data = np.frombuffer(block, np.uint8)
-    ends = np.flatnonzero(data == NEWLINE) + 1
-    starts = np.concatenate([[0], ends[:-1]])
-    first, second = data[starts], data[np.minimum(starts + 1, len(data) - 1)]
-    third = data[np.minimum(starts + 2, len(data) - 1)]
-    blank = (second == SPACE) | (second == TAB)
-    is_position = (first == ord("v")) & blank
-    is_uv = (first == ord("v")) & (second == ord("t")) & ((third == SPACE) | (third == TAB))
-    is_face = (first == ord("f")) & blank
-    lengths = ends - starts
-    # Vertices and texture coordinates before each line, from which its relative numbers count back.
-    before = np.stack(
-        [parts.vertex_count + np.cumsum(is_position), parts.uv_count + np.cumsum(is_uv)], axis=1
-    )
-    if is_position.any():
-        text = _lines(data, is_position, lengths)
-        values = _numbers(path, text.translate(None, b"v"), int(is_position.sum()), "v")
-        if values.shape[1] < 3:
-            raise SceneFileError(f"{path}: a line 'v' has fewer than three numbers.")
-        parts.positions.append(values[:, :3].copy())  # without the colours behind them
-        if parts.with_materials and values.shape[1] >= 6:
-            parts.colours.append(values[:, 3:6].astype(np.float32))
-        parts.vertex_count += len(values)
-        for line in text.split(b"\n", DIGIT_LINES)[:DIGIT_LINES]:
-            words = line.split()[1:4]
-            parts.decimals = max([parts.decimals, *(len(word.partition(b".")[2]) for word in words)])
-    if is_uv.any():
-        text = _lines(data, is_uv, lengths).translate(None, b"vt")
-        parts.uv.append(_numbers(path, text, int(is_uv.sum()), "vt")[:, :2].astype(np.float32))
-        parts.uv_count += int(is_uv.sum())
-    spans = [(0, len(starts), "")]
-    if parts.with_materials:
-        _parse_libraries(block, parts)
-        spans = _usemtl_ranges(block, starts, first == ord("u"))
-    for begin, end, material in spans:
-        if material:
-            parts.material_uses.append((sum(map(len, parts.triangles)), material))
-        chosen = is_face.copy()
-        chosen[:begin] = chosen[end:] = False
-        if chosen.any():
-            _parse_faces(path, _lines(data, chosen, lengths), before[chosen], parts)
-
-
-def _parse_libraries(block: bytes, parts: _ObjParts) -> None:
-    for line in re.findall(rb"^mtllib[ \t]+(.+)$", block, re.MULTILINE):
-        parts.libraries.append(line.decode("utf-8", "replace").strip())
-
-
-def _usemtl_ranges(block: bytes, starts: np.ndarray, candidates: np.ndarray) -> list[tuple[int, int, str]]:
-    """Yield the lines of a block from one ``usemtl`` to the next, with the name of the material."""
-    spans = [(0, len(starts), "")]
-    for row in np.flatnonzero(candidates):
-        line = block[starts[row] : block.index(b"\n", starts[row])].split(maxsplit=1)
-        if len(line) == 2 and line[0] == b"usemtl":
-            begin, _, before = spans.pop()
-            spans += [
-                (begin, int(row), before),
-                (int(row), len(starts), line[1].decode("utf-8", "replace").strip()),
-            ]
-    return spans
-
-
-def _lines(data: np.ndarray, chosen: np.ndarray, lengths: np.ndarray) -> bytes:
-    return data.tobytes() if chosen.all() else data[np.repeat(chosen, lengths)].tobytes()
-
-
-def _numbers(path: Path, text: bytes, lines: int, keyword: str) -> np.ndarray:
-    """Parse ``lines`` lines of numbers to rows; all lines must have the same count."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("error", DeprecationWarning)  # numpy's way to say that it met no number
-        try:
-            values = np.fromstring(text, dtype=np.float64, sep=" ")
-        except (DeprecationWarning, ValueError) as error:
-            raise SceneFileError(f"{path}: a line '{keyword}' holds something that is no number.") from error
-    words = len(text[: text.index(b"\n")].split())
-    if len(values) != lines * words or _is_ragged(text, words):
-        return _ragged_numbers(path, text, keyword)
-    return values.reshape(lines, words)
-
-
-def _ragged_numbers(path: Path, text: bytes, keyword: str) -> np.ndarray:
-    """Parse as many columns as the shortest line has (some programs color only part of the vertices)."""
-    rows = [line.split() for line in text.split(b"\n") if line.strip()]
-    width = min(len(row) for row in rows)
-    if width == 0:
-        raise SceneFileError(f"{path}: a line '{keyword}' is empty.")
-    return np.array([[float(word) for word in row[:width]] for row in rows])
-
-
-def _parse_faces(path: Path, text: bytes, before: Int64[np.ndarray, "f 2"], parts: _ObjParts) -> None:
-    """Parse faces as triangle fans, with the texture coordinates of their corners where given.
-
-    Args:
-        path: named in errors.
-        text: the lines of the faces.
-        before: vertices and texture coordinates that come before each of these lines.
-        parts: gets the triangles.
-    """
-    lines = len(before)
-    sample = text[: text.index(b"\n")].split()[1:]
-    slashes = {word.count(b"/") for word in sample}
-    spaces, words_per_line = text.count(b"/"), len(sample)
-    uniform = len(slashes) == 1 and spaces == lines * words_per_line * next(iter(slashes))
-    if uniform and b"//" not in text:
-        per_word = 1 + next(iter(slashes))
-        values = _numbers(path, text.replace(b"/", b" ").translate(None, b"f"), lines, "f")
-        if values.shape[1] == words_per_line * per_word and not _is_ragged(text, words_per_line + 1):
-            indices = values.astype(np.int64).reshape(lines, words_per_line, per_word)
-            _add_fans(indices[:, :, 0], indices[:, :, 1] if per_word > 1 else None, before, parts)
-            return
-    for number, line in enumerate(text.split(b"\n")[:lines]):
-        words = [word.split(b"/") for word in line.split()[1:]]
-        if len(words) < 3:
-            continue
-        try:
-            vertex = np.array([[int(word[0]) for word in words]])
-            named = all(len(word) > 1 and word[1] for word in words)
-            texture = np.array([[int(word[1]) for word in words]]) if named else None
-        except ValueError as error:
-            raise SceneFileError(f"{path}: a line 'f' holds something that is no number.") from error
-        _add_fans(vertex, texture, before[number : number + 1], parts)
-
-
-def _is_ragged(text: bytes, words_per_line: int) -> bool:
-    """Return whether the lines have different word counts although the total fits."""
-    data = np.frombuffer(text, np.uint8)
-    gap = data <= SPACE
-    starts = ~gap
-    starts[1:] &= gap[:-1]
-    ends = np.flatnonzero(data == NEWLINE)
-    counts = np.diff(np.concatenate([[0], np.cumsum(starts, dtype=np.int64)[ends]]))
-    return bool((counts != words_per_line).any())
-
-
-def _add_fans(
-    vertex: np.ndarray, texture: np.ndarray | None, before: Int64[np.ndarray, "f 2"], parts: _ObjParts
-) -> None:
-    sides = vertex.shape[1]
-    fan = np.array([[0, k, k + 1] for k in range(1, sides - 1)])
-    # Numbers count from 1; negative ones count back from the newest vertex before the line.
-    positions = np.where(vertex > 0, vertex - 1, vertex + before[:, :1])
-    parts.triangles.append(_to_int32(positions[:, fan].reshape(-1, 3)))
-    if texture is None:
-        parts.triangle_uv.append(np.full((len(vertex) * len(fan), 3), -1, np.int32))
-    else:
-        places = np.where(texture > 0, texture - 1, texture + before[:, 1:])
-        parts.triangle_uv.append(_to_int32(places[:, fan].reshape(-1, 3)))
-
-
-def _to_int32(numbers: Int64[np.ndarray, "t 3"]) -> Int32[np.ndarray, "t 3"]:
-    """Convert to int32 with saturation, so that indices out of range stay out of range."""
-    return np.clip(numbers, -1, np.iinfo(np.int32).max).astype(np.int32)
-
-
-def _uv_of_vertices(path: Path, parts: _ObjParts, count: int) -> Float32[np.ndarray, "v 2"] | None:
-    if not parts.uv or not parts.triangle_uv:
-        return None
-    table = np.concatenate(parts.uv)
-    uv = np.full((count, 2), np.nan, np.float32)
-    for triangles, places in zip(parts.triangles, parts.triangle_uv, strict=True):
-        if places.max(initial=-1) >= len(table):
-            raise SceneFileError(f"{path}: a face names a texture coordinate that is not there.")
-        vertices, places = triangles[places >= 0], places[places >= 0]
-        if len(vertices) and not (vertices.min() >= 0 and vertices.max() < count):
-            raise SceneFileError(f"{path}: a face names a vertex that is not there; the file is damaged.")
-        uv[vertices] = table[places]
-    return uv
 
 
 def write_octagons(gaussians: FlatGaussians, path: Path, options: ExportOptions) -> tuple[Path, ...]:

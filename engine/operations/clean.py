@@ -9,6 +9,7 @@ from pydantic import Field, model_validator
 from octasplat.engine.core.errors import ConfigError
 from octasplat.engine.core.events import EventListener, ignore_events
 from octasplat.engine.edit.edit_options import CleanupOptions
+from octasplat.engine.edit.reports import CleanReport
 from octasplat.engine.operations.base import (
     CHANGED_SCENE,
     Operation,
@@ -53,28 +54,14 @@ class CleanRequest(CleanOptions, SourceRequest):
         return self
 
 
-class CleanResult(ScenesWritten):
+class CleanResult(CleanReport, ScenesWritten):
     """Counts of the removed Gaussians, each by the first reason that holds.
 
     Attributes:
         count: number of Gaussians of the source.
-        faint: below the least opacity.
-        small: below the least scale.
-        large: above the largest scale.
-        near: nearer to a camera than what its photograph shows.
-        floating: in groups too small.
-        groups: number of such groups.
-        kept: those that stay.
     """
 
     count: int
-    faint: int
-    small: int
-    large: int
-    near: int
-    floating: int
-    groups: int
-    kept: int
 
 
 def run(
@@ -90,8 +77,6 @@ def run(
         ConfigError: nothing would be left.
         SceneFileError: the scene cannot be read or written.
     """
-    from dataclasses import asdict
-
     from octasplat.engine.edit.cleaning import clean
     from octasplat.engine.operations.scene_io import check_changed, edit_note, open_scene, write_changed
     from octasplat.engine.runs.run_folder import is_run, run_camera_clearance
@@ -113,7 +98,7 @@ def run(
             f"{source}: nothing of it would be left; ask for less (octasplat info tells its sizes and "
             "opacities)."
         )
-    counts = {"count": len(gaussians), **asdict(report)}
+    counts = {"count": len(gaussians), **report.model_dump()}
     if request.output is None:
         return CleanResult(notes=(message,), **counts)
     stop_if(should_stop)

@@ -3,7 +3,7 @@
 import tomllib
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
 from pydantic import BeforeValidator, Field, model_validator
 
@@ -150,6 +150,16 @@ class RenderResult(Result):
         return (f"Wrote {self.files[0]}{more}",)
 
 
+class _RenderPlan(NamedTuple):
+    """What is rendered of what, and where to; ``cameras`` None stands for views of the photographs."""
+
+    request: RenderRequest
+    source: "RenderSource"
+    cameras: "tuple[PinholeCamera, ...] | None"
+    shots: "tuple[Shot, ...]"
+    output: "RenderOutput"
+
+
 def run(
     request: RenderRequest,
     *,
@@ -190,7 +200,7 @@ def run(
     written = shots[:1] if request.preview else shots
     output = picture_output("render", request, written, [request.stage_file, *_stage_files(request)])
     render = _render_plain if request.stage is None else _render_on_stage
-    files = render(request, source, cameras, shots, output, report, threads)
+    files = render(_RenderPlan(request, source, cameras, shots, output), report, threads)
     return RenderResult(files=files, folder=output.folder, images=len(written))
 
 
@@ -201,15 +211,8 @@ def _stage_files(request: RenderRequest) -> list[Path]:
     return [request.stage_folder / name for _, name in referenced_files(request.stage)]
 
 
-def _render_plain(
-    request: RenderRequest,
-    source: "RenderSource",
-    cameras: "tuple[PinholeCamera, ...] | None",
-    shots: "tuple[Shot, ...]",
-    output: "RenderOutput",
-    progress: EventListener,
-    threads: int,
-) -> tuple[Path, ...]:
+def _render_plain(plan: _RenderPlan, progress: EventListener, threads: int) -> tuple[Path, ...]:
+    request, source, cameras, shots, output = plan
     from octasplat.engine.render.render_digest import render_digest
     from octasplat.engine.render.renderer import background_colour
     from octasplat.engine.render.shots import scene_render_fn
@@ -238,15 +241,8 @@ def _render_plain(
     return output.write(shots, paint, finished, progress)
 
 
-def _render_on_stage(
-    request: RenderRequest,
-    source: "RenderSource",
-    cameras: "tuple[PinholeCamera, ...] | None",
-    shots: "tuple[Shot, ...]",
-    output: "RenderOutput",
-    progress: EventListener,
-    threads: int,
-) -> tuple[Path, ...]:
+def _render_on_stage(plan: _RenderPlan, progress: EventListener, threads: int) -> tuple[Path, ...]:
+    request, source, cameras, shots, output = plan
     from octasplat.engine.operations.render_source import stage_scene
     from octasplat.engine.pathtracing.stage.stage_file import stage_identity
     from octasplat.engine.pathtracing.stage_rendering import compile_stage

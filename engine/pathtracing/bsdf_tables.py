@@ -8,8 +8,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from octasplat.engine.core.compilation import run_ranges
-from octasplat.engine.pathtracing.kernels.principled_bsdf_arrays import integrate_albedo
-from octasplat.engine.pathtracing.kernels.rough_dielectric import integrate_rough_dielectric
+from octasplat.engine.pathtracing.kernels.albedo_integrals import integrate_albedo, integrate_rough_dielectric
 
 TABLE_ROUGHNESSES = 32
 TABLE_COSINES = 64

@@ -37,16 +37,8 @@ from octasplat.engine.pathtracing.mesh_shapes import (
     transform_points,
     up_axis_rotation,
 )
-from octasplat.engine.pathtracing.stage.model import (
-    Diffuse,
-    Emissive,
-    Glass,
-    Light,
-    PointLight,
-    RectangleLight,
-    Stage,
-    StageMesh,
-)
+from octasplat.engine.pathtracing.stage.materials import Diffuse, Emissive, Glass
+from octasplat.engine.pathtracing.stage.model import Light, PointLight, RectangleLight, Stage, StageMesh
 from octasplat.engine.render.environment_files import read_environment
 from octasplat.engine.trace.triangle_bvh import TriangleBvh
 

@@ -23,7 +23,7 @@ from jaxtyping import Float32, Float64, Int64
 
 from octasplat.engine.core.color import linear_to_srgb, srgb_to_linear
 from octasplat.engine.pathtracing.kernels.film import accumulate_pixels
-from octasplat.engine.pathtracing.kernels.kernel_args import PathArrays
+from octasplat.engine.pathtracing.kernels.path_args import PathArrays
 from octasplat.engine.pathtracing.kernels.scatter import FLAG_GAUSSIAN_SURFACE
 
 ToneCurve = Literal["none", "reinhard", "filmic"]

@@ -8,7 +8,7 @@ import numpy as np
 from octasplat.engine.core.color import linear_to_srgb
 from octasplat.engine.core.errors import ConfigError
 from octasplat.engine.geometry.mesh_material import FileImage, MeshMaterial
-from octasplat.engine.pathtracing.stage.model import Glass, Material, MetallicRoughness
+from octasplat.engine.pathtracing.stage.materials import Glass, Material, MetallicRoughness
 
 MAX_IOR = 4.0
 THIN_IOR = 1.0

@@ -12,6 +12,7 @@ from octasplat.engine.pathtracing.environment import (
     build_environment_sampler,
     mean_irradiance,
 )
+from octasplat.engine.pathtracing.kernels.environment_light import eval_environment_array
 from octasplat.engine.pathtracing.kernels.kernel_args import (
     DIRECTIONAL,
     ENVIRONMENT,
@@ -22,7 +23,6 @@ from octasplat.engine.pathtracing.kernels.kernel_args import (
     SPOT,
     LightArrays,
 )
-from octasplat.engine.pathtracing.kernels.lights import eval_environment_array
 from octasplat.engine.pathtracing.stage.model import (
     DirectionalLight,
     Light,

@@ -15,7 +15,7 @@ from octasplat.engine.pathtracing.bsdf_tables import albedo_table, rough_dielect
 from octasplat.engine.pathtracing.kernels.kernel_args import MaterialArrays
 from octasplat.engine.pathtracing.kernels.principled_bsdf import BURLEY, COUPLED
 from octasplat.engine.pathtracing.kernels.surface import DIFFUSE, EMITTER, GLASS, MIRROR, PRINCIPLED
-from octasplat.engine.pathtracing.stage.model import (
+from octasplat.engine.pathtracing.stage.materials import (
     Dielectric,
     Diffuse,
     Emissive,

@@ -12,7 +12,7 @@ from octasplat.engine.files import read_mesh
 from octasplat.engine.geometry.mesh_material import MeshMaterial
 from octasplat.engine.geometry.triangle_mesh import edge_report
 from octasplat.engine.pathtracing.kernels.smooth_normals import smooth_normals
-from octasplat.engine.pathtracing.stage.model import Transformed
+from octasplat.engine.pathtracing.stage.base import Transformed
 
 SPHERE_DIVISIONS = 5
 WELD_TOLERANCE = 1e-6

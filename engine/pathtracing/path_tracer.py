@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 from queue import Queue
-from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float32, Float64, Int32, Int64
@@ -17,39 +16,45 @@ from octasplat.engine.pathtracing.compile_meshes import CompiledMeshes, compile_
 from octasplat.engine.pathtracing.denoising import load_denoiser
 from octasplat.engine.pathtracing.film import Film
 from octasplat.engine.pathtracing.gaussian_layers import GaussianLayers
-from octasplat.engine.pathtracing.kernels.gaussian_layer import add_layer_light, intersect_gaussian_layers
+from octasplat.engine.pathtracing.kernels.camera_paths import start_paths
+from octasplat.engine.pathtracing.kernels.gaussian_layer import (
+    LayerLight,
+    add_layer_light,
+    intersect_gaussian_layers,
+)
 from octasplat.engine.pathtracing.kernels.gaussian_surface import (
     intersect_gaussian_surfaces,
     start_paths_at_surfaces,
 )
-from octasplat.engine.pathtracing.kernels.kernel_args import (
-    BLOCK_SIZE,
+from octasplat.engine.pathtracing.kernels.kernel_args import IntegratorParameters, LayerArrays, MeshScene
+from octasplat.engine.pathtracing.kernels.path_args import (
+    Bounce,
     CameraRays,
-    IntegratorParameters,
-    LayerArrays,
     MeshHits,
-    MeshScene,
     PathArrays,
-    PathBlock,
-    PathScratch,
-    PathStart,
     ShadowRayArrays,
     SurfaceInteractions,
     allocate_path_scratch,
     allocate_paths,
     allocate_shadow_rays,
 )
-from octasplat.engine.pathtracing.kernels.path_surfaces import add_direct_light, shade_surfaces, start_paths
+from octasplat.engine.pathtracing.kernels.path_radiance import add_direct_light
+from octasplat.engine.pathtracing.kernels.path_surfaces import shade_surfaces
 from octasplat.engine.pathtracing.kernels.shadow_rays import shadow_transmittance
 from octasplat.engine.pathtracing.kernels.trace_paths import trace_paths
+from octasplat.engine.pathtracing.path_batches import (
+    PATHS_PER_THREAD,
+    Batch,
+    ImageBatches,
+    Workspace,
+    optical_axis,
+)
 from octasplat.engine.pathtracing.stage.model import Integrator, Stage
 from octasplat.engine.render.renderer import tile_order
 from octasplat.engine.trace.protocol import Tracer
 
 PATHS_PER_WAVE = 1 << 18
 """Paths that are traced together through Gaussians."""
-PATHS_PER_THREAD = 1 << 14
-"""Paths that a thread follows by itself among meshes alone."""
 MIN_TILE_PIXELS = 64
 MIN_ROWS_PER_THREAD = 8192
 INFINITE_T_MAX = np.full(1, np.inf, np.float32)
@@ -164,7 +169,7 @@ class PathTracer:
         view = CameraRays(
             image.origin_world.astype(np.float64),
             image.directions_world,
-            _optical_axis(image.directions_world),
+            optical_axis(image.directions_world),
             self._settings.aperture,
             self._settings.focus_distance or 1.0,
         )
@@ -178,43 +183,36 @@ class PathTracer:
         done, total = 0, len(tops) * len(blocks)
         for sample in blocks:
             batches = [
-                _Batch(top, order[top : top + pixels], min(at_once, count - sample), first + sample)
+                Batch(top, order[top : top + pixels], min(at_once, count - sample), first + sample)
                 for top in tops
             ]
             work = self._trace_wavefront if self._scene.layers is not None else self._trace_per_thread
-            for _ in work(film, view, order, image.rays.t_min[:1], batches):
+            for _ in work(film, ImageBatches(view, order, image.rays.t_min[:1], batches)):
                 progress(done, total)
                 done += 1
         progress(total, total)
 
-    def _trace_per_thread(
-        self,
-        film: Film,
-        camera_rays: CameraRays,
-        order: Int64[np.ndarray, " n"],
-        t_min: Float32[np.ndarray, "1"],
-        batches: list["_Batch"],
-    ) -> Iterator[None]:
+    def _trace_per_thread(self, film: Film, image: ImageBatches) -> Iterator[None]:
         """Trace paths among meshes only, a batch per thread; yield before each batch that is awaited."""
         scene, queries = self._mesh_scene, self._scene.meshes.queries
-        free: Queue[_Workspace] = Queue()
+        free: Queue[Workspace] = Queue()
         for scratch in self._scratches:
-            free.put(_Workspace.allocate(scratch))
+            free.put(Workspace.allocate(scratch))
 
-        def work(batch: _Batch) -> None:
+        def work(batch: Batch) -> None:
             workspace = free.get()
             try:
                 paths = workspace.paths(len(batch.pixels) * batch.paths_per_pixel)
-                start = batch.start(camera_rays, order)
+                start = image.start(batch)
                 trace_paths(
                     len(paths.keys), workspace.scratch, self._integrator, start, scene, queries,
-                    t_min, INFINITE_T_MAX, paths, workspace.block,
+                    image.t_min, INFINITE_T_MAX, paths, workspace.block,
                 )  # fmt: skip
                 film.add(paths, batch.pixels)
             finally:
                 free.put(workspace)
 
-        tasks = [self._pool.submit(work, batch) for batch in batches]
+        tasks = [self._pool.submit(work, batch) for batch in image.batches]
         try:
             for task in tasks:
                 yield
@@ -223,21 +221,14 @@ class PathTracer:
             for task in tasks:
                 task.cancel()
 
-    def _trace_wavefront(
-        self,
-        film: Film,
-        camera_rays: CameraRays,
-        order: Int64[np.ndarray, " n"],
-        t_min: Float32[np.ndarray, "1"],
-        batches: list["_Batch"],
-    ) -> Iterator[None]:
+    def _trace_wavefront(self, film: Film, image: ImageBatches) -> Iterator[None]:
         """Trace paths among Gaussians, all threads on one batch; yield before each."""
-        for batch in batches:
+        for batch in image.batches:
             yield
             paths = allocate_paths(len(batch.pixels) * batch.paths_per_pixel)
-            start = batch.start(camera_rays, order)
+            start = image.start(batch)
             self._run_kernel(start_paths, len(paths.keys), self._integrator, start, paths)
-            self._trace_paths(paths, t_min)
+            self._trace_paths(paths, image.t_min)
             film.add(paths, batch.pixels)
 
     def radiance(
@@ -290,27 +281,20 @@ class PathTracer:
             )
             hits = meshes.triangles.closest(rays)
             shadows = allocate_shadow_rays(len(active))
+            met = MeshHits(hits.distances, hits.faces, hits.barycentrics)
+            bounce = Bounce(paths, active, depth, met, scene, self._integrator, shadows)
             if layers is not None:
                 traced = layers.trace(rays, hits.distances)
                 layer = LayerArrays(
                     traced.rgb_srgb, traced.transmittance, traced.depth_median, traced.depth_sum,
-                    traced.normal_world, traced.features,
+                    traced.normal_world, traced.features, layers.min_transmittance,
                 )  # fmt: skip
                 if layers.has_material_surfaces:
-                    self._run_kernel(
-                        intersect_gaussian_surfaces, len(active), paths, active, depth, hits.faces, layer,
-                        scene, self._integrator, layers.min_transmittance, shadows,
-                    )  # fmt: skip
+                    self._run_kernel(intersect_gaussian_surfaces, len(active), bounce, layer)
                     self._add_surface_light(paths, active, shadows, layers.tracer)
-                self._run_kernel(
-                    intersect_gaussian_layers, len(active), paths, active, depth, hits.faces, layer,
-                    scene, self._integrator, layers.min_transmittance, shadows,
-                )  # fmt: skip
+                self._run_kernel(intersect_gaussian_layers, len(active), bounce, layer)
                 self._add_layer_light(paths, active, shadows, layers)
-            met = MeshHits(hits.distances, hits.faces, hits.barycentrics)
-            self._run_kernel(
-                shade_surfaces, len(active), paths, active, depth, met, scene, self._integrator, shadows
-            )
+            self._run_kernel(shade_surfaces, len(active), bounce)
             self._add_surface_light(
                 paths, active, shadows, None if layers is None else layers.mesh_shadow_tracer
             )
@@ -372,10 +356,10 @@ class PathTracer:
                 through[row, needed] = tracer.transmittance(
                     _shadow_ray_batch(shadows, queried[needed], layers.shadow_bias)
                 )
-        self._run_kernel(
-            add_layer_light, len(queried), paths, active[queried], shadows.radiance_linear[queried],
-            shadows.occluded_radiance_linear[queried], share, through[0], through[1],
-        )  # fmt: skip
+        light = LayerLight(
+            shadows.radiance_linear[queried], shadows.occluded_radiance_linear[queried], share, *through
+        )
+        self._run_kernel(add_layer_light, len(queried), paths, active[queried], light)
 
     def _run_kernel(self, kernel: Callable[..., None], rows: int, *arguments: object) -> None:
         """Run a kernel over rows on all threads. Numba's own loops cannot write to named tuples."""
@@ -390,54 +374,8 @@ class PathTracer:
             task.result()
 
 
-class _Batch(NamedTuple):
-    """Paths traced together: ``paths_per_pixel`` for each pixel from ``first_pixel`` of their order on."""
-
-    first_pixel: int
-    pixels: Int64[np.ndarray, " n"]
-    paths_per_pixel: int
-    first_sample: int
-
-    def start(self, camera_rays: CameraRays, order: Int64[np.ndarray, " n"]) -> PathStart:
-        """Return the kernels' description of the paths to start; ``order`` is that of the pixels."""
-        return PathStart(camera_rays, order, self.first_pixel, self.paths_per_pixel, self.first_sample)
-
-
-@dataclass(frozen=True)
-class _Workspace:
-    """Buffers for one thread's paths, allocated once, as fresh memory costs time."""
-
-    scratch: PathScratch
-    all_paths: PathArrays
-    block: PathBlock
-
-    @classmethod
-    def allocate(cls, scratch: PathScratch) -> "_Workspace":
-        hits = MeshHits(
-            np.empty(BLOCK_SIZE, np.float32), np.empty(BLOCK_SIZE, np.int32),
-            np.empty((BLOCK_SIZE, 2), np.float32),
-        )  # fmt: skip
-        block = PathBlock(
-            np.empty(BLOCK_SIZE, np.int32), hits, allocate_shadow_rays(BLOCK_SIZE),
-            np.empty((BLOCK_SIZE, 3), np.float32),
-        )  # fmt: skip
-        return cls(scratch, allocate_paths(PATHS_PER_THREAD), block)
-
-    def paths(self, count: int) -> PathArrays:
-        """Return views of the first ``count`` paths."""
-        return PathArrays(*(values[:count] for values in self.all_paths))
-
-
 def _shadow_ray_batch(
     shadows: ShadowRayArrays, rows: Int64[np.ndarray, " n"], t_min: float = 0.0
 ) -> RayBatch:
     """Return some of the shadow rays as a batch."""
     return RayBatch(shadows.origins_world[rows], shadows.directions_world[rows], t_min, shadows.t_max[rows])
-
-
-def _optical_axis(directions_world: Float32[np.ndarray, "h w 3"]) -> Float64[np.ndarray, "3"]:
-    """Return the direction through the image's centre."""
-    height, width = directions_world.shape[:2]
-    middle = directions_world[(height - 1) // 2 : height // 2 + 1, (width - 1) // 2 : width // 2 + 1]
-    axis = middle.reshape(-1, 3).mean(axis=0, dtype=np.float64)
-    return np.asarray(axis / np.linalg.norm(axis))

@@ -11,7 +11,6 @@ from octasplat.service.downloads import send_blob
 from octasplat.service.routes import problem_responses
 from octasplat.service.schemas.artifacts import ArtifactList, ArtifactView
 from octasplat.service.state import ServiceDep
-from octasplat.service.thread_pools import ThreadPurpose, run_in_pool
 
 router = APIRouter(prefix="/v1/jobs", tags=["results"])
 
@@ -36,17 +35,8 @@ async def get_artifact_content(
 ) -> Response:  # fmt: skip
     """Return a result; `Range` and `If-Range` let a download resume."""
     row = await actions.get_artifact(service, principal, job_id, name)
-    return await run_in_pool(
-        ThreadPurpose.DOWNLOADS,
-        lambda: send_blob(
-            service,
-            request,
-            sha256=row.sha256,
-            size_bytes=row.size_bytes,
-            media_type=row.media_type,
-            name=row.name,
-            inline=inline,
-        ),
+    return await send_blob(
+        service, request, row.sha256, row.size_bytes, media_type=row.media_type, name=row.name, inline=inline
     )
 
 
@@ -60,16 +50,8 @@ async def get_preview(
 ) -> Response:
     """Return the newest preview of a running job."""
     blob = await actions.get_preview(service, principal, job_id)
-    response = await run_in_pool(
-        ThreadPurpose.DOWNLOADS,
-        lambda: send_blob(
-            service,
-            request,
-            sha256=blob.sha256,
-            size_bytes=blob.size_bytes,
-            media_type="image/png",
-            name="preview.png",
-        ),
+    response = await send_blob(
+        service, request, blob.sha256, blob.size_bytes, media_type="image/png", name="preview.png"
     )
     response.headers["Cache-Control"] = "no-cache"
     return response

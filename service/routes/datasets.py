@@ -26,7 +26,6 @@ from octasplat.service.schemas.datasets import (
     NewDataset,
 )
 from octasplat.service.state import ServiceDep
-from octasplat.service.thread_pools import ThreadPurpose, run_in_pool
 from octasplat.workers.worker.media_types import media_type
 
 router = APIRouter(prefix="/v1/datasets", tags=["datasets"])
@@ -122,16 +121,8 @@ async def get_file(
 ) -> Response:
     """Return the content of a file."""
     row = await uploads.get_file(service, principal, dataset_id, path)
-    return await run_in_pool(
-        ThreadPurpose.DOWNLOADS,
-        lambda: send_blob(
-            service,
-            request,
-            sha256=row.sha256,
-            size_bytes=row.size_bytes,
-            media_type=media_type(row.path),
-            name=row.path,
-        ),
+    return await send_blob(
+        service, request, row.sha256, row.size_bytes, media_type=media_type(row.path), name=row.path
     )
 
 

@@ -153,13 +153,9 @@ async def show_report(
 ) -> Response:
     """Return the report of a job as a page."""
     row = await get_artifact(service, principal, job_id, REPORT, kind="report")
-    response = await run_in_pool(
-        ThreadPurpose.DOWNLOADS,
-        lambda: send_blob(
-            service, request, sha256=row.sha256, size_bytes=row.size_bytes, media_type="text/html",
-            name=REPORT, inline=True,
-        )
-    )  # fmt: skip
+    response = await send_blob(
+        service, request, row.sha256, row.size_bytes, media_type="text/html", name=REPORT, inline=True
+    )
     response.headers["Content-Security-Policy"] = _REPORT_POLICY
     return response
 

@@ -12,12 +12,12 @@ import numpy as np
 import pytest
 from click.testing import CliRunner, Result
 
-from octasplat.engine.dataset.synthetic import SyntheticDatasetConfig, write_synthetic_dataset
 from octasplat.engine.files.gaussian_ply import read_gaussian_ply, write_gaussian_ply
 from octasplat.engine.gaussians.scene_metadata import SceneMetadata
 from octasplat.engine.render.environment_files import write_environment
 from octasplat.engine.runs.config import resolve_config
 from octasplat.workers.cli.main import cli
+from tests.support.tiny_dataset import make_tiny_dataset
 
 ROOT = Path(__file__).resolve().parents[2]
 TINY = (
@@ -85,11 +85,7 @@ def tiny() -> tuple[str, ...]:
 
 @pytest.fixture(scope="session")
 def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    root = tmp_path_factory.mktemp("generated") / "scene"
-    write_synthetic_dataset(
-        root, SyntheticDatasetConfig(views=8, width_px=64, height_px=48, samples_per_side=1, points=400)
-    )
-    return root
+    return make_tiny_dataset(tmp_path_factory)
 
 
 @pytest.fixture(scope="session")

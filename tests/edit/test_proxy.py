@@ -7,7 +7,8 @@ import pytest
 
 from octasplat.engine.core.errors import SceneFileError
 from octasplat.engine.edit.deform import deform, deform_to, deformation_corners
-from octasplat.engine.edit.proxy import MeanValueBinding, NearTriangles, Proxy, bind_corners
+from octasplat.engine.edit.near_triangles import NearTriangles
+from octasplat.engine.edit.proxy import MeanValueBinding, Proxy, bind_corners
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.gaussians.spherical_harmonics import sh_basis
 from tests.support.edit_scenes import (
@@ -276,7 +277,7 @@ def test_proxy_nearest_triangle_with_uneven_density_is_found(size: float) -> Non
     sphere = centre + radius * sphere / np.linalg.norm(sphere, axis=1, keepdims=True)
     floor = size * np.array([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
     triangles = np.concatenate([facets, np.array([[0, 1, 2], [0, 2, 3]]) + len(sphere)])
-    near = NearTriangles(Proxy(np.concatenate([sphere, floor]), triangles))
+    near = NearTriangles(np.concatenate([sphere, floor])[triangles].astype(np.float64))
     random = np.random.default_rng(2)
     points = random.uniform([-4, -4, 0.05], [4, 4, 6], (20_000, 3))
     to_ball = np.linalg.norm(points - centre, axis=1) - radius

@@ -10,7 +10,7 @@ import pytest
 
 from octasplat.engine.core.errors import SceneFileError
 from octasplat.engine.core.ply_container import COUNT_SUFFIX, PlyWriteElement, list_field, write_ply
-from octasplat.engine.files import mesh_obj, read_mesh
+from octasplat.engine.files import obj_parser, read_mesh
 
 
 def obj(tmp_path: Path, text: str) -> Path:
@@ -53,7 +53,7 @@ f -1 -2 -3
 @pytest.mark.parametrize("line_end", ["\n", "\r\n"])
 @pytest.mark.parametrize("block", [1 << 26, 64])
 def test_obj_with_all_kinds_of_lines(tmp_path: Path, monkeypatch, line_end: str, block: int) -> None:
-    monkeypatch.setattr(mesh_obj, "BLOCK_BYTES", block)
+    monkeypatch.setattr(obj_parser, "BLOCK_BYTES", block)
     mesh = read_mesh(obj(tmp_path, TWO_QUADS.replace("\n", line_end)))
     np.testing.assert_array_equal(mesh.vertices[4:], [[-1e-3, 2.5, 10], [0.5, -0.5, 3]])
     np.testing.assert_array_equal(mesh.triangles, [[0, 1, 2], [0, 2, 3], [4, 5, 0], [5, 4, 3]])
@@ -79,7 +79,7 @@ def test_obj_faces_whose_counts_add_up_by_chance(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("block", [16, 1 << 22])
 def test_obj_relative_numbers_count_back_from_their_own_line(tmp_path: Path, monkeypatch, block: int) -> None:
-    monkeypatch.setattr(mesh_obj, "BLOCK_BYTES", block)
+    monkeypatch.setattr(obj_parser, "BLOCK_BYTES", block)
     lines = []
     for k in range(3):  # triangles one after the other, each behind its own vertices
         lines += [f"v {k} {corner} 0" for corner in range(3)]

@@ -12,16 +12,18 @@ import pytest
 
 from octasplat.engine.pathtracing.compile_meshes import compile_meshes
 from octasplat.engine.pathtracing.environment import environment_frame
-from octasplat.engine.pathtracing.stage.model import (
+from octasplat.engine.pathtracing.stage.materials import (
     Dielectric,
     Diffuse,
-    DirectionalLight,
-    Environment,
     Glass,
-    Integrator,
     Metal,
     MetallicRoughness,
     Mirror,
+)
+from octasplat.engine.pathtracing.stage.model import (
+    DirectionalLight,
+    Environment,
+    Integrator,
     PointLight,
     RectangleLight,
     Stage,

@@ -10,16 +10,8 @@ from octasplat.engine.files.gaussian_ply import write_gaussian_ply
 from octasplat.engine.pathtracing.compile_meshes import compile_meshes
 from octasplat.engine.pathtracing.gaussian_layers import build_gaussian_layers
 from octasplat.engine.pathtracing.path_tracer import PathTracer, PathTracerScene
-from octasplat.engine.pathtracing.stage.model import (
-    Diffuse,
-    Glass,
-    Integrator,
-    Mirror,
-    PointLight,
-    RectangleLight,
-    Stage,
-    StageMesh,
-)
+from octasplat.engine.pathtracing.stage.materials import Diffuse, Glass, Mirror
+from octasplat.engine.pathtracing.stage.model import Integrator, PointLight, RectangleLight, Stage, StageMesh
 from octasplat.engine.trace.protocol import TraceSettings
 from octasplat.workers.cli.main import cli
 from tests.support.image_channels import read_channels

@@ -9,8 +9,8 @@ from octasplat.engine.core.errors import ConfigError
 from octasplat.engine.pathtracing.compile_meshes import compile_meshes
 from octasplat.engine.pathtracing.gaussian_layers import build_gaussian_layers
 from octasplat.engine.pathtracing.path_tracer import PathTracer, PathTracerScene
+from octasplat.engine.pathtracing.stage.materials import Diffuse
 from octasplat.engine.pathtracing.stage.model import (
-    Diffuse,
     DirectionalLight,
     Integrator,
     PointLight,

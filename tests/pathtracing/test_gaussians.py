@@ -9,13 +9,11 @@ from octasplat.engine.gaussians.model import SH_C0, FlatGaussians
 from octasplat.engine.pathtracing.compile_meshes import compile_meshes
 from octasplat.engine.pathtracing.gaussian_layers import build_gaussian_layers
 from octasplat.engine.pathtracing.path_tracer import PathTracer, PathTracerScene
+from octasplat.engine.pathtracing.stage.materials import Diffuse, Glass, Mirror
 from octasplat.engine.pathtracing.stage.model import (
-    Diffuse,
     DirectionalLight,
     Environment,
-    Glass,
     Integrator,
-    Mirror,
     PointLight,
     RectangleLight,
     Stage,

@@ -11,7 +11,8 @@ from octasplat.engine.gaussians.octagon import CHI2_3_99
 from octasplat.engine.pathtracing.compile_meshes import compile_meshes
 from octasplat.engine.pathtracing.gaussian_layers import build_gaussian_layers
 from octasplat.engine.pathtracing.path_tracer import PathTracer, PathTracerScene
-from octasplat.engine.pathtracing.stage.model import Integrator, Mirror, Stage, StageGaussians, StageMesh
+from octasplat.engine.pathtracing.stage.materials import Mirror
+from octasplat.engine.pathtracing.stage.model import Integrator, Stage, StageGaussians, StageMesh
 from octasplat.engine.trace.protocol import TraceSettings
 from tests.support.light_scenes import camera, psnr
 

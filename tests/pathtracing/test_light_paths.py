@@ -8,15 +8,11 @@ import pytest
 from octasplat.engine.core.errors import ConfigError
 from octasplat.engine.pathtracing.compile_meshes import check_outside_glass, compile_meshes
 from octasplat.engine.pathtracing.path_tracer import PathTracer, PathTracerScene
+from octasplat.engine.pathtracing.stage.materials import Dielectric, Diffuse, Glass, Metal, Mirror
 from octasplat.engine.pathtracing.stage.model import (
-    Dielectric,
-    Diffuse,
     DirectionalLight,
     Environment,
-    Glass,
     Integrator,
-    Metal,
-    Mirror,
     PointLight,
     RectangleLight,
     Stage,

@@ -10,15 +10,8 @@ from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.pathtracing.compile_meshes import compile_meshes
 from octasplat.engine.pathtracing.gaussian_layers import build_gaussian_layers
 from octasplat.engine.pathtracing.path_tracer import PathTracer, PathTracerScene
-from octasplat.engine.pathtracing.stage.model import (
-    Environment,
-    Integrator,
-    MetallicRoughness,
-    Mirror,
-    Stage,
-    StageGaussians,
-    StageMesh,
-)
+from octasplat.engine.pathtracing.stage.materials import MetallicRoughness, Mirror
+from octasplat.engine.pathtracing.stage.model import Environment, Integrator, Stage, StageGaussians, StageMesh
 from octasplat.engine.render.environment_files import write_environment
 from octasplat.engine.trace.protocol import TraceSettings
 from tests.support.light_scenes import camera, psnr, shiny_ball

@@ -13,13 +13,10 @@ from octasplat.engine.core.errors import OctasplatError
 from octasplat.engine.files import glb_container
 from octasplat.engine.pathtracing.compile_meshes import compile_meshes
 from octasplat.engine.pathtracing.mesh_shapes import MeshShape, primitive_shape
+from octasplat.engine.pathtracing.stage.materials import Diffuse, Glass, Material, MetallicRoughness
 from octasplat.engine.pathtracing.stage.model import (
-    Diffuse,
     DirectionalLight,
-    Glass,
     Integrator,
-    Material,
-    MetallicRoughness,
     PointLight,
     Stage,
     StageMesh,

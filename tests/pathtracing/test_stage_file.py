@@ -9,13 +9,8 @@ import pytest
 
 from octasplat.engine.core.errors import ConfigError
 from octasplat.engine.files import read_mesh
-from octasplat.engine.pathtracing.stage.model import (
-    Glass,
-    MetallicRoughness,
-    PointLight,
-    RectangleLight,
-    Stage,
-)
+from octasplat.engine.pathtracing.stage.materials import Glass, MetallicRoughness
+from octasplat.engine.pathtracing.stage.model import PointLight, RectangleLight, Stage
 from octasplat.engine.pathtracing.stage.stage_file import (
     StageLayout,
     parse_stage,

@@ -8,12 +8,13 @@ import pycolmap
 import pytest
 
 from octasplat.engine.core.errors import CancelledError, DatasetError
-from octasplat.engine.core.events import Event, PhaseFinished, PhaseStarted, Warned
+from octasplat.engine.core.events import Event, PhaseFinished, Warned
 from octasplat.engine.dataset.load import load_dataset_model
 from octasplat.engine.dataset.synthetic import SyntheticDatasetConfig, write_synthetic_dataset
 from octasplat.engine.pipeline import reconstruct
 from octasplat.engine.poses import adjust_principal_points, needs_per_view_principal_points
 from octasplat.engine.runs.config import resolve_config
+from tests.support.stopped_run import reconstruct_until
 
 VIEWS = 20
 NOISE_PX = 0.3
@@ -131,16 +132,7 @@ def test_photograph_with_few_points_keeps_lens(moved: Path, tmp_path: Path) -> N
 def test_lens_fit_runs_during_reconstruction_and_resumes(moved: Path, tmp_path: Path) -> None:
     output, events = tmp_path / "run", list[Event]()
     config = resolve_config("fast", settings={"exports": ()}, assignments=SETTINGS)
-    begun: list[str] = []
-
-    def note(event: Event) -> None:
-        if isinstance(event, PhaseStarted):
-            begun.append(event.stage)
-
-    with pytest.raises(CancelledError, match="--resume"):
-        reconstruct(
-            moved, output, config, resume=True, progress=note, should_stop=lambda: begun[-1:] == ["lenses"]
-        )
+    reconstruct_until("lenses", moved, output, config)
     assert not (output / "poses").exists()
     reconstruct(moved, output, config, resume=True, progress=events.append)
     stages = [event.stage for event in events if isinstance(event, PhaseFinished)]

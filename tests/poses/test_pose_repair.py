@@ -8,12 +8,13 @@ import numpy as np
 import pycolmap
 import pytest
 
-from octasplat.engine.core.errors import CancelledError, DatasetError
+from octasplat.engine.core.errors import DatasetError
 from octasplat.engine.core.events import Event, PhaseFinished, PhaseStarted, Warned
 from octasplat.engine.dataset.synthetic import SyntheticDatasetConfig, write_synthetic_dataset
 from octasplat.engine.pipeline import reconstruct
 from octasplat.engine.poses import GivenModel, PosesConfig, repair_poses
 from octasplat.engine.runs.config import resolve_config
+from tests.support.stopped_run import reconstruct_until
 
 pytestmark = pytest.mark.heavy
 
@@ -101,17 +102,7 @@ def test_pose_repair_unreadable_model_is_refused(scene: Path, tmp_path: Path) ->
 def stages_until(last: str, scene: Path, output: Path, *settings: str) -> list[str]:
     """Begin a run or go on with one, and stop it in the stage ``last``; returns those that had begun."""
     config = resolve_config("fast", settings={"exports": ()}, assignments=[*SETTINGS, *settings])
-    begun: list[str] = []
-
-    def note(event: Event) -> None:
-        if isinstance(event, PhaseStarted):
-            begun.append(event.stage)
-
-    with pytest.raises(CancelledError, match="--resume"):
-        reconstruct(
-            scene, output, config, resume=True, progress=note, should_stop=lambda: begun[-1:] == [last]
-        )
-    return begun
+    return reconstruct_until(last, scene, output, config)
 
 
 def test_pose_repair_runs_during_reconstruction(scene: Path, tmp_path: Path) -> None:

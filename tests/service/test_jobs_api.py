@@ -9,22 +9,14 @@ from typing import Any
 import httpx
 import pytest
 
-from octasplat.service.state import Service
 from octasplat.workers.queue.attempts import ResultFile
 from tests.support.service_harness import (
     ConnectService,
     claim_job,
     committed_dataset,
+    new_job,
     store_content,
 )
-
-
-async def new_job(http: httpx.AsyncClient, service: Service, **body: Any) -> dict[str, Any]:
-    given = {"kind": "toy", "dataset_id": await committed_dataset(service), **body}
-    answer = await http.post("/v1/jobs", json=given)
-    assert answer.status_code == 202, answer.text
-    job: dict[str, Any] = answer.json()
-    return job
 
 
 def is_problem(answer: httpx.Response, status: int, code: str) -> bool:

@@ -20,6 +20,7 @@ import pytest
 
 from octasplat.workers.db.locks import OWNER
 from octasplat.workers.storage.local import LocalStorage
+from tests.support.service_harness import api_environment
 
 pytestmark = pytest.mark.heavy
 
@@ -47,11 +48,7 @@ class FrontEnd:
 @pytest.fixture
 def front_end(conninfo: str, tmp_path: Path) -> Iterator[FrontEnd]:
     environment = {
-        **os.environ,
-        "DATABASE_URL": conninfo,
-        "OCTASPLAT_DATA": str(tmp_path),
-        "OCTASPLAT_FLOOR_BYTES": "0",
-        "OCTASPLAT_PORT": "0",
+        **api_environment(conninfo, tmp_path),
         "OCTASPLAT_TOKEN": TOKEN,
         "OCTASPLAT_WRONG_TOKEN_SECONDS": "0",
         "OCTASPLAT_KIND_MODULES": '["tests.support.toy_kind"]',

@@ -15,7 +15,6 @@ import psutil
 import pytest
 from click.testing import CliRunner
 
-from octasplat.engine.dataset.synthetic import SyntheticDatasetConfig, write_synthetic_dataset
 from octasplat.engine.operations.reconstruct import options_from_json
 from octasplat.engine.pipeline import reconstruct
 from octasplat.workers.cli.main import cli
@@ -24,6 +23,7 @@ from octasplat.workers.client.download import download_results
 from octasplat.workers.client.submission import Submission, submit
 from octasplat.workers.client.upload import upload_scene
 from octasplat.workers.client.watch import watch_job
+from tests.support.tiny_dataset import make_tiny_dataset
 
 pytestmark = pytest.mark.heavy
 
@@ -99,11 +99,7 @@ def start(data: Path) -> Machine:
 
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    root = tmp_path_factory.mktemp("served") / "scene"
-    write_synthetic_dataset(
-        root, SyntheticDatasetConfig(views=8, width_px=48, height_px=36, samples_per_side=1, points=500)
-    )
-    return root
+    return make_tiny_dataset(tmp_path_factory, width_px=48, height_px=36, points=500)
 
 
 @pytest.fixture(scope="module")

@@ -1,7 +1,6 @@
 """A front end that freezes while somebody sends it a file keeps nobody else waiting."""
 
 import asyncio
-import os
 import signal
 import socket
 import subprocess
@@ -13,7 +12,7 @@ import pytest
 
 from octasplat.workers.maintenance import garbage_collection
 from octasplat.workers.queue import storage_leases
-from tests.support.service_harness import running_service
+from tests.support.service_harness import api_environment, running_service
 
 ROOT = Path(__file__).parents[2]
 PATIENCE_SECONDS = 60.0
@@ -27,13 +26,7 @@ async def test_vanished_front_end_lease_expires(
     monkeypatch.setattr(storage_leases, "LEASE_SECONDS", 1.0)
     for name in ("_MIN_AGE_SECONDS", "MAX_CLOCK_SKEW_SECONDS"):
         monkeypatch.setattr(garbage_collection, name, 0.0)
-    environment = {
-        **os.environ,
-        "DATABASE_URL": conninfo,
-        "OCTASPLAT_DATA": str(tmp_path),
-        "OCTASPLAT_FLOOR_BYTES": "0",
-        "OCTASPLAT_PORT": "0",
-    }
+    environment = api_environment(conninfo, tmp_path)
     command = [sys.executable, "-m", "octasplat", "api"]
     process = subprocess.Popen(command, env=environment, cwd=ROOT, stdout=subprocess.PIPE, text=True)
     try:

@@ -31,6 +31,7 @@ from tests.support.service_harness import (
     claim_job,
     client_with_token,
     committed_dataset,
+    new_job,
     running_service,
 )
 from tests.support.webhook_receiver import WebhookReceiver, receive_webhooks
@@ -64,14 +65,6 @@ async def make(http: httpx.AsyncClient, receiver: WebhookReceiver, **more: Any) 
     made: dict[str, Any] = answer.json()
     assert answer.headers["Location"] == f"/v1/webhooks/{made['id']}"
     return made
-
-
-async def new_job(http: httpx.AsyncClient, service: Service, **body: Any) -> dict[str, Any]:
-    given = {"kind": "toy", "dataset_id": await committed_dataset(service), **body}
-    answer = await http.post("/v1/jobs", json=given)
-    assert answer.status_code == 202, answer.text
-    job: dict[str, Any] = answer.json()
-    return job
 
 
 async def deliveries(http: httpx.AsyncClient, hook: dict[str, Any]) -> list[dict[str, Any]]:

@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 from jaxtyping import Float32
 
-from octasplat.engine.core.errors import CancelledError
 from octasplat.engine.core.events import Event, HeldOutMeasured
 from octasplat.engine.core.rays import RayBatch
 from octasplat.engine.gaussians.model import FlatGaussians
@@ -26,12 +25,12 @@ from octasplat.engine.trace.protocol import (
     TraceSettings,
 )
 from octasplat.engine.train.config import McmcConfig
-from octasplat.engine.train.loop.checkpoint import latest_checkpoint, load_checkpoint
 from octasplat.engine.train.loop.iteration import loss_and_gradients
 from octasplat.engine.train.loop.state import TrainState, initial_state
 from octasplat.engine.train.loop.trainer import Trainer
 from octasplat.engine.train.sampling.batches import Batch
 from tests.support.planar_dataset import PlanarDataset, batch_source, small_config
+from tests.support.stopped_run import train_with_a_stop
 
 SHARE = np.float32(0.3)
 ASIDE = np.array([0.2, 0.1, 0.0], np.float32)
@@ -158,22 +157,18 @@ def train(folder: Path, *, stop_after: int | None = None) -> tuple[Lamp, TrainSt
     config = small_config(densify=McmcConfig(start=10_000).model_dump(), sh_degree=0)
     state = initial_state(world.initial_gaussians(opacity=0.6), config.seed)
 
-    def trainer(state: TrainState, last: float) -> tuple[Trainer, Lamp]:
-        model = Lamp(state.gaussians)
+    models: list[Lamp] = []
+
+    def trainer(state: TrainState, last: float) -> Trainer:
+        models.append(Lamp(state.gaussians))
         return Trainer(
             world, config, state, folder=folder, fingerprint="test", progress=events.append, threads=1,
-            should_stop=lambda: state.iteration >= last, shading=model,
-        ), model  # fmt: skip
+            should_stop=lambda: state.iteration >= last, shading=models[-1],
+        )  # fmt: skip
 
-    if stop_after is not None:
-        with pytest.raises(CancelledError):
-            trainer(state, stop_after)[0].run()
-        path = latest_checkpoint(folder)
-        assert path is not None
-        state = load_checkpoint(path, "test")
-    last, model = trainer(state, np.inf)
+    _, state = train_with_a_stop(trainer, state, folder, stop_after)
+    model = models[-1]
     assert isinstance(model, ShadingModel)
-    last.run()
     return model, state, [event.psnr for event in events if isinstance(event, HeldOutMeasured)]
 
 

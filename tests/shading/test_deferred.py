@@ -5,7 +5,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from octasplat.engine.core.errors import CancelledError
 from octasplat.engine.core.events import Event, HeldOutMeasured
 from octasplat.engine.core.rays import RayBatch
 from octasplat.engine.gaussians.channels import stack_channels
@@ -20,12 +19,12 @@ from octasplat.engine.trace.cpu.tracer import CpuTracer
 from octasplat.engine.trace.gradient_sums import add_gradients
 from octasplat.engine.trace.protocol import TraceSettings
 from octasplat.engine.train.initialization.initial_gaussians import add_initial_materials
-from octasplat.engine.train.loop.checkpoint import latest_checkpoint, load_checkpoint
 from octasplat.engine.train.loop.iteration import loss_and_gradients
 from octasplat.engine.train.loop.state import TrainState, initial_state
 from octasplat.engine.train.loop.trainer import Trainer
 from octasplat.engine.train.shading_factory import ShadingOptions, make_shading
 from tests.support.planar_dataset import PlanarDataset, batch_source, small_config
+from tests.support.stopped_run import train_with_a_stop
 
 BARE = {
     "learn": True,
@@ -302,22 +301,19 @@ def train(
     first = add_initial_materials(world.initial_gaussians(opacity=0.6), config.materials)
     state = initial_state(first, config.seed)
 
-    def trainer(state: TrainState, last: float) -> tuple[Trainer, DeferredShading]:
+    models: list[DeferredShading] = []
+
+    def trainer(state: TrainState, last: float) -> Trainer:
         model = make_shading(ShadingOptions.from_config(config), len(world.views), world.extent)
         assert isinstance(model, DeferredShading)
+        models.append(model)
         return Trainer(
             world, config, state, folder=folder, fingerprint="test", progress=events.append, threads=threads,
-            should_stop=lambda: state.iteration >= last, shading=model,
-        ), model  # fmt: skip
+            should_stop=lambda: state.iteration >= last, shading=models[-1],
+        )  # fmt: skip
 
-    if stop_after is not None:
-        with pytest.raises(CancelledError):
-            trainer(state, stop_after)[0].run()
-        path = latest_checkpoint(folder)
-        assert path is not None
-        state = load_checkpoint(path, "test")
-    last, model = trainer(state, np.inf)
-    last.run()
+    _, state = train_with_a_stop(trainer, state, folder, stop_after)
+    model = models[-1]
     return model, state, [event.psnr for event in events if isinstance(event, HeldOutMeasured)]
 
 

@@ -83,4 +83,12 @@ def add_columns(conninfo: str) -> None:
             connection.execute(query.format(sql.Identifier(table)))
 
 
+@pytest.fixture(params=[False, True], ids=["own-tables", "later-tables"])
+def conninfo_of_both_versions(conninfo_of_own_version: str, request: pytest.FixtureRequest) -> str:
+    """A database of the test's own; also with the further columns that the next version's tables have."""
+    if request.param:
+        add_columns(conninfo_of_own_version)
+    return conninfo_of_own_version
+
+
 os.environ.pop("DATABASE_URL", None)

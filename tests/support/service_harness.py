@@ -1,5 +1,6 @@
 """A service within the test's own process, and short ways to its tables."""
 
+import os
 import uuid
 from collections.abc import AsyncIterator
 from contextlib import AbstractAsyncContextManager, asynccontextmanager
@@ -54,6 +55,26 @@ async def committed_dataset(service: Service, owner: str = "local", *, has_poses
             [dataset_id, owner, has_poses],
         )
     return str(dataset_id)
+
+
+async def new_job(http: httpx.AsyncClient, service: Service, **body: Any) -> dict[str, Any]:
+    """A job of the toy kind, queued over HTTP."""
+    given = {"kind": "toy", "dataset_id": await committed_dataset(service), **body}
+    answer = await http.post("/v1/jobs", json=given)
+    assert answer.status_code == 202, answer.text
+    job: dict[str, Any] = answer.json()
+    return job
+
+
+def api_environment(conninfo: str, folder: Path) -> dict[str, str]:
+    """The environment of a front end in a process of its own, on a free port."""
+    return {
+        **os.environ,
+        "DATABASE_URL": conninfo,
+        "OCTASPLAT_DATA": str(folder),
+        "OCTASPLAT_FLOOR_BYTES": "0",
+        "OCTASPLAT_PORT": "0",
+    }
 
 
 async def claim_job(service: Service, job: dict[str, Any]) -> Attempt:

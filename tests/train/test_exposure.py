@@ -6,7 +6,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from octasplat.engine.core.errors import CancelledError
 from octasplat.engine.core.events import Event, HeldOutMeasured
 from octasplat.engine.core.rays import RayBatch
 from octasplat.engine.dataset.model import Observations
@@ -16,7 +15,6 @@ from octasplat.engine.shading.protocol import TracedRays
 from octasplat.engine.trace.cpu.tracer import CpuTracer
 from octasplat.engine.trace.protocol import GaussianGradients, TraceResult
 from octasplat.engine.train.config import TrainConfig
-from octasplat.engine.train.loop.checkpoint import latest_checkpoint, load_checkpoint
 from octasplat.engine.train.loop.state import TrainState, initial_state
 from octasplat.engine.train.loop.trainer import Trainer
 from octasplat.engine.train.views.exposure_changes import (
@@ -25,6 +23,7 @@ from octasplat.engine.train.views.exposure_changes import (
     resolve_exposure,
 )
 from tests.support.planar_dataset import PlanarDataset, small_config
+from tests.support.stopped_run import train_with_a_stop
 
 NO_GRADIENTS = GaussianGradients(
     ids=np.zeros(0, np.int32),
@@ -60,15 +59,7 @@ def run(folder: Path, config: TrainConfig, *, stop_after: int | None = None) -> 
             should_stop=lambda: state.iteration >= last,
         )  # fmt: skip
 
-    if stop_after is not None:
-        with pytest.raises(CancelledError):
-            trainer(state, stop_after).run()
-        path = latest_checkpoint(folder)
-        assert path is not None
-        state = load_checkpoint(path, "test")
-    last = trainer(state, np.inf)
-    last.run()
-    return last, events
+    return train_with_a_stop(trainer, state, folder, stop_after)[0], events
 
 
 def last_psnr(events: list[Event]) -> float:

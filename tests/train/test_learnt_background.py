@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from octasplat.engine.core.errors import CancelledError, ConfigError
+from octasplat.engine.core.errors import ConfigError
 from octasplat.engine.core.rays import RayBatch
 from octasplat.engine.dataset import Camera
 from octasplat.engine.dataset.model import SparsePoints
@@ -18,11 +18,11 @@ from octasplat.engine.shading.protocol import TracedRays
 from octasplat.engine.trace.cpu.tracer import CpuTracer
 from octasplat.engine.trace.protocol import TraceResult
 from octasplat.engine.train.initialization.initial_background import estimate_background
-from octasplat.engine.train.loop.checkpoint import latest_checkpoint, load_checkpoint
 from octasplat.engine.train.loop.state import TrainState, initial_state
 from octasplat.engine.train.loop.trainer import Trainer
 from octasplat.engine.train.shading_factory import find_background
 from tests.support.planar_dataset import PlanarDataset, batch_source, plane_texture, small_config
+from tests.support.stopped_run import train_with_a_stop
 
 
 def sky(directions: np.ndarray) -> np.ndarray:
@@ -105,15 +105,7 @@ def train(
             threads=threads, should_stop=lambda: state.iteration >= last,
         )  # fmt: skip
 
-    if stop_after is not None:
-        with pytest.raises(CancelledError):
-            trainer(state, stop_after).run()
-        path = latest_checkpoint(folder)
-        assert path is not None
-        state = load_checkpoint(path, "test")
-    last = trainer(state, np.inf)
-    last.run()
-    return last, world
+    return train_with_a_stop(trainer, state, folder, stop_after)[0], world
 
 
 def test_gradients_agree_with_finite_differences() -> None:

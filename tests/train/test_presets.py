@@ -20,6 +20,7 @@ from octasplat.engine.train.loop.iteration import TrainComponents, loss_and_grad
 from octasplat.engine.train.loop.state import initial_state
 from octasplat.engine.train.loop.trainer import Trainer
 from tests.support.planar_dataset import PlanarDataset, batch_source, small_config
+from tests.support.tiny_dataset import make_tiny_dataset
 
 
 def held_out_psnr(folder: Path, config: TrainConfig) -> tuple[list[float], Trainer]:
@@ -141,11 +142,7 @@ def test_low_weight_gaussians_do_not_move() -> None:
 
 @pytest.fixture(scope="module")
 def three_views(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    root = tmp_path_factory.mktemp("few") / "scene"
-    write_synthetic_dataset(
-        root, SyntheticDatasetConfig(views=3, width_px=64, height_px=48, samples_per_side=1, points=400)
-    )
-    return root
+    return make_tiny_dataset(tmp_path_factory, views=3)
 
 
 @pytest.mark.parametrize("training_views", [1, 2])

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import octasplat.service.web as service_web
-from octasplat.engine.files.mesh_glb import write_surface
+from octasplat.engine.files.glb_surface import write_surface
 from octasplat.engine.geometry.triangle_mesh import TriangleMesh
 from tests.support.browser import Page, open_page
 

@@ -13,7 +13,6 @@ from PIL import Image
 from octasplat.engine.core.events import Event
 from octasplat.engine.core.rays import ImageRays, RayBatch
 from octasplat.engine.dataset import Dataset
-from octasplat.engine.dataset.synthetic import SyntheticDatasetConfig, write_synthetic_dataset
 from octasplat.engine.operations.reconstruct import options_from_json
 from octasplat.engine.pipeline import OnStep, reconstruct
 from octasplat.engine.runs.config import ReconstructionConfig
@@ -22,6 +21,7 @@ from octasplat.engine.shading.protocol import ShadingModel
 from octasplat.engine.trace.protocol import Tracer
 from octasplat.workers.worker import preview
 from octasplat.workers.worker.preview import PreviewRenderer, PreviewWritten
+from tests.support.tiny_dataset import make_tiny_dataset
 
 
 class Clock:
@@ -43,11 +43,7 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
 
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    root = tmp_path_factory.mktemp("watched") / "scene"
-    write_synthetic_dataset(
-        root, SyntheticDatasetConfig(views=8, width_px=48, height_px=36, samples_per_side=1, points=500)
-    )
-    return root
+    return make_tiny_dataset(tmp_path_factory, width_px=48, height_px=36, points=500)
 
 
 def config() -> ReconstructionConfig:

@@ -4,9 +4,7 @@ import uuid
 from dataclasses import dataclass
 from datetime import datetime
 
-from psycopg.rows import class_row
-
-from octasplat.workers.db.connections import Connection, with_columns
+from octasplat.workers.db.connections import Connection, fetch_all
 
 _MAX_CHARACTERS = 500
 
@@ -69,18 +67,15 @@ async def add_entry(
 
 async def list_entries(connection: Connection, *, before: int | None, limit: int) -> list[AuditEntry]:
     """Return at most ``limit`` entries before the entry ``before``, newest first."""
-    async with connection.cursor(row_factory=class_row(AuditEntry)) as cursor:
-        await cursor.execute(
-            with_columns(
-                """
+    return await fetch_all(
+        connection,
+        AuditEntry,
+        """
             SELECT {} FROM audit WHERE (%(before)s::bigint IS NULL OR id < %(before)s)
             ORDER BY id DESC LIMIT %(limit)s
             """,
-                AuditEntry,
-            ),
-            {"before": before, "limit": limit},
-        )
-        return await cursor.fetchall()
+        {"before": before, "limit": limit},
+    )
 
 
 async def delete_old_entries(connection: Connection, hours: float) -> None:

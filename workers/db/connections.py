@@ -3,7 +3,7 @@
 import asyncio
 import functools
 import random
-from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine, Mapping
+from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine, Mapping, Sequence
 from contextlib import asynccontextmanager
 from dataclasses import fields
 from functools import cache
@@ -11,13 +11,14 @@ from typing import Any, LiteralString, ParamSpec, TypeVar
 
 import psycopg
 from psycopg import sql
-from psycopg.rows import DictRow, dict_row
+from psycopg.rows import DictRow, class_row, dict_row
 from psycopg_pool import AsyncConnectionPool
 
 from octasplat.workers.db.errors import DatabaseError
 
 Parameters = ParamSpec("Parameters")
 Outcome = TypeVar("Outcome")
+RowT = TypeVar("RowT")
 Connection = psycopg.AsyncConnection[DictRow]
 Pool = AsyncConnectionPool[Connection]
 
@@ -41,7 +42,6 @@ KEEPALIVES: Mapping[str, int] = {
 """So that a host that vanished is noticed within half a minute; by itself TCP takes hours."""
 
 
-@cache
 def with_columns(query: LiteralString, row: type[Any], table_name: str = "") -> sql.Composed:
     """Return a query with the columns that a row has in the place of its braces.
 
@@ -52,9 +52,50 @@ def with_columns(query: LiteralString, row: type[Any], table_name: str = "") -> 
         row: a dataclass whose fields are named as the columns.
         table_name: name of the table, where the query has several.
     """
+    return _compose(query, tuple(field.name for field in fields(row)), table_name)
+
+
+@cache
+def _compose(query: LiteralString, columns: tuple[str, ...], table_name: str) -> sql.Composed:
     table = (table_name,) if table_name else ()
-    columns = (sql.Identifier(*table, field.name) for field in fields(row))
-    return sql.SQL(query).format(sql.SQL(", ").join(columns))
+    named = (sql.Identifier(*table, column) for column in columns)
+    return sql.SQL(query).format(sql.SQL(", ").join(named))
+
+
+async def fetch_all(
+    connection: Connection,
+    row: type[RowT],
+    query: LiteralString,
+    values: Sequence[object] | Mapping[str, object] | None = None,
+    *,
+    table_name: str = "",
+) -> list[RowT]:
+    """Return all rows that a query finds.
+
+    Args:
+        connection: to the database.
+        row: see :func:`with_columns`, as for ``query`` and ``table_name``.
+        query: with ``{}`` where the columns belong.
+        values: of the query's placeholders.
+        table_name: name of the table, where the query has several.
+    """
+    async with connection.cursor(row_factory=class_row(row)) as cursor:
+        await cursor.execute(with_columns(query, row, table_name), values)
+        return await cursor.fetchall()
+
+
+async def fetch_one(
+    connection: Connection,
+    row: type[RowT],
+    query: LiteralString,
+    values: Sequence[object] | Mapping[str, object] | None = None,
+    *,
+    table_name: str = "",
+) -> RowT | None:
+    """Return the first row that a query finds, or None; arguments as of :func:`fetch_all`."""
+    async with connection.cursor(row_factory=class_row(row)) as cursor:
+        await cursor.execute(with_columns(query, row, table_name), values)
+        return await cursor.fetchone()
 
 
 def retry_on_deadlock(

@@ -9,7 +9,7 @@ from typing import Any
 from psycopg.rows import class_row, dict_row
 
 from octasplat.engine.dataset.image_sizes import ImageSizes
-from octasplat.workers.db.connections import Connection, with_columns
+from octasplat.workers.db.connections import Connection, fetch_all, fetch_one, with_columns
 from octasplat.workers.db.errors import ConflictError, NotFoundError
 from octasplat.workers.db.ids import new_id
 from octasplat.workers.db.locks import lock_owner
@@ -37,29 +37,24 @@ async def create_dataset(
 async def get_dataset(connection: Connection, dataset_id: uuid.UUID, *, lock: bool = False) -> Dataset | None:
     """Return the dataset of that id, or None."""
     query = "SELECT {} FROM datasets WHERE id = %s"
-    async with connection.cursor(row_factory=class_row(Dataset)) as cursor:
-        await cursor.execute(with_columns(f"{query} FOR UPDATE" if lock else query, Dataset), [dataset_id])
-        return await cursor.fetchone()
+    return await fetch_one(connection, Dataset, f"{query} FOR UPDATE" if lock else query, [dataset_id])
 
 
 async def list_datasets(
     connection: Connection, *, owner: str | None = None, before: uuid.UUID | None = None, limit: int = 50
 ) -> list[Dataset]:
     """Return datasets, newest first; ``owner`` None takes those of all owners."""
-    async with connection.cursor(row_factory=class_row(Dataset)) as cursor:
-        await cursor.execute(
-            with_columns(
-                """
+    return await fetch_all(
+        connection,
+        Dataset,
+        """
             SELECT {} FROM datasets
             WHERE (%(owner)s::text IS NULL OR owner = %(owner)s)
               AND (%(before)s::uuid IS NULL OR id < %(before)s)
             ORDER BY id DESC LIMIT %(limit)s
             """,
-                Dataset,
-            ),
-            {"owner": owner, "before": before, "limit": limit},
-        )
-        return await cursor.fetchall()
+        {"owner": owner, "before": before, "limit": limit},
+    )
 
 
 async def list_files_by_suffix(
@@ -163,30 +158,27 @@ async def remove_file(connection: Connection, dataset_id: uuid.UUID, path: str) 
 
 async def get_file(connection: Connection, dataset_id: uuid.UUID, path: str) -> DatasetFile | None:
     """Return one file of a dataset, or None."""
-    async with connection.cursor(row_factory=class_row(DatasetFile)) as cursor:
-        await cursor.execute(
-            with_columns("SELECT {} FROM dataset_files WHERE dataset_id = %s AND path = %s", DatasetFile),
-            [dataset_id, path],
-        )
-        return await cursor.fetchone()
+    return await fetch_one(
+        connection,
+        DatasetFile,
+        "SELECT {} FROM dataset_files WHERE dataset_id = %s AND path = %s",
+        [dataset_id, path],
+    )
 
 
 async def files_of(
     connection: Connection, dataset_id: uuid.UUID, *, after: str = "", limit: int | None = None
 ) -> list[DatasetFile]:
     """Return at most ``limit`` files of a dataset after the path ``after``, by path."""
-    async with connection.cursor(row_factory=class_row(DatasetFile)) as cursor:
-        await cursor.execute(
-            with_columns(
-                """
+    return await fetch_all(
+        connection,
+        DatasetFile,
+        """
             SELECT {} FROM dataset_files WHERE dataset_id = %s AND path COLLATE "C" > %s
             ORDER BY path COLLATE "C" LIMIT %s
             """,
-                DatasetFile,
-            ),
-            [dataset_id, after, limit],
-        )
-        return await cursor.fetchall()
+        [dataset_id, after, limit],
+    )
 
 
 async def photograph_sizes(connection: Connection, dataset_id: uuid.UUID) -> list[ImageSizes]:

@@ -4,9 +4,7 @@ import uuid
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from psycopg.rows import class_row
-
-from octasplat.workers.db.connections import Connection, with_columns
+from octasplat.workers.db.connections import Connection, fetch_all
 from octasplat.workers.db.postgres_text import as_json, storable_text
 from octasplat.workers.db.rows import JobEvent, LogLine
 
@@ -53,25 +51,21 @@ async def events_after(
     connection: Connection, job_id: uuid.UUID, after: int = 0, limit: int = 500
 ) -> list[JobEvent]:
     """Return events of a job with an id above ``after``, in order."""
-    async with connection.cursor(row_factory=class_row(JobEvent)) as cursor:
-        await cursor.execute(
-            with_columns(
-                "SELECT {} FROM job_events WHERE job_id = %s AND id > %s ORDER BY id LIMIT %s", JobEvent
-            ),
-            [job_id, after, limit],
-        )
-        return await cursor.fetchall()
+    return await fetch_all(
+        connection,
+        JobEvent,
+        "SELECT {} FROM job_events WHERE job_id = %s AND id > %s ORDER BY id LIMIT %s",
+        [job_id, after, limit],
+    )
 
 
 async def log_after(
     connection: Connection, job_id: uuid.UUID, after: int = 0, limit: int = 1000
 ) -> list[LogLine]:
     """Return log lines of a job with an id above ``after``, in order."""
-    async with connection.cursor(row_factory=class_row(LogLine)) as cursor:
-        await cursor.execute(
-            with_columns(
-                "SELECT {} FROM job_logs WHERE job_id = %s AND id > %s ORDER BY id LIMIT %s", LogLine
-            ),
-            [job_id, after, limit],
-        )
-        return await cursor.fetchall()
+    return await fetch_all(
+        connection,
+        LogLine,
+        "SELECT {} FROM job_logs WHERE job_id = %s AND id > %s ORDER BY id LIMIT %s",
+        [job_id, after, limit],
+    )

@@ -7,9 +7,7 @@ import secrets
 import uuid
 from dataclasses import dataclass
 
-from psycopg.rows import class_row
-
-from octasplat.workers.db.connections import Connection, with_columns
+from octasplat.workers.db.connections import Connection, fetch_one
 from octasplat.workers.db.ids import new_id
 from octasplat.workers.db.rows import Token
 from octasplat.workers.db.tokens import hash_secret
@@ -42,15 +40,12 @@ async def begin_session(connection: Connection, token: Token, hours: float) -> t
 
 async def find_session(connection: Connection, secret: str) -> Session | None:
     """Return the session of that secret, or None; whether its token is still valid is another question."""
-    async with connection.cursor(row_factory=class_row(Session)) as cursor:
-        await cursor.execute(
-            with_columns(
-                "SELECT {} FROM sessions WHERE sha256 = %s AND revoked_at IS NULL AND expires_at > now()",
-                Session,
-            ),
-            [hash_secret(secret)],
-        )
-        return await cursor.fetchone()
+    return await fetch_one(
+        connection,
+        Session,
+        "SELECT {} FROM sessions WHERE sha256 = %s AND revoked_at IS NULL AND expires_at > now()",
+        [hash_secret(secret)],
+    )
 
 
 async def end_session(connection: Connection, secret: str) -> None:

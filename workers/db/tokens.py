@@ -6,9 +6,7 @@ import uuid
 from collections.abc import Sequence
 from typing import Literal
 
-from psycopg.rows import class_row
-
-from octasplat.workers.db.connections import Connection, with_columns
+from octasplat.workers.db.connections import Connection, fetch_all, fetch_one
 from octasplat.workers.db.ids import new_id
 from octasplat.workers.db.rows import Token
 
@@ -57,28 +55,25 @@ async def add_token(
     unknown = set(scopes) - set(SCOPES)
     if unknown or not scopes:
         raise ValueError(f"scopes are {', '.join(SCOPES)}, not {', '.join(sorted(unknown)) or 'none'}")
-    async with connection.cursor(row_factory=class_row(Token)) as cursor:
-        await cursor.execute(
-            with_columns(
-                """
+    token = await fetch_one(
+        connection,
+        Token,
+        """
             INSERT INTO tokens (id, owner, name, sha256, scopes, expires_at)
             VALUES (%s, %s, %s, %s, %s, now() + make_interval(secs => %s))
             ON CONFLICT (sha256) DO UPDATE
             SET owner = excluded.owner, name = excluded.name, scopes = excluded.scopes
             RETURNING {}
             """,
-                Token,
-            ),
-            [
-                new_id(),
-                owner,
-                name,
-                hash_secret(secret),
-                list(scopes),
-                None if hours is None else 3600 * hours,
-            ],
-        )
-        token = await cursor.fetchone()
+        [
+            new_id(),
+            owner,
+            name,
+            hash_secret(secret),
+            list(scopes),
+            None if hours is None else 3600 * hours,
+        ],
+    )
     assert token is not None
     return token
 
@@ -114,41 +109,33 @@ async def set_origin(connection: Connection, token_id: uuid.UUID, origin: Origin
 
 async def find_token(connection: Connection, secret: str) -> Token | None:
     """Return the valid token of that secret, or None."""
-    async with connection.cursor(row_factory=class_row(Token)) as cursor:
-        await cursor.execute(
-            with_columns(
-                """
+    return await fetch_one(
+        connection,
+        Token,
+        """
             SELECT {} FROM tokens WHERE sha256 = %s AND revoked_at IS NULL
               AND (expires_at IS NULL OR expires_at > now())
             """,
-                Token,
-            ),
-            [hash_secret(secret)],
-        )
-        return await cursor.fetchone()
+        [hash_secret(secret)],
+    )
 
 
 async def get_token(connection: Connection, token_id: uuid.UUID) -> Token | None:
     """Return the valid token of that id, or None."""
-    async with connection.cursor(row_factory=class_row(Token)) as cursor:
-        await cursor.execute(
-            with_columns(
-                """
+    return await fetch_one(
+        connection,
+        Token,
+        """
             SELECT {} FROM tokens WHERE id = %s AND revoked_at IS NULL
               AND (expires_at IS NULL OR expires_at > now())
             """,
-                Token,
-            ),
-            [token_id],
-        )
-        return await cursor.fetchone()
+        [token_id],
+    )
 
 
 async def list_tokens(connection: Connection) -> list[Token]:
     """Return all tokens, the newest first."""
-    async with connection.cursor(row_factory=class_row(Token)) as cursor:
-        await cursor.execute(with_columns("SELECT {} FROM tokens ORDER BY id DESC", Token))
-        return await cursor.fetchall()
+    return await fetch_all(connection, Token, "SELECT {} FROM tokens ORDER BY id DESC")
 
 
 async def has_any_token(connection: Connection, *, valid_only: bool = True) -> bool:

@@ -4,9 +4,7 @@ import uuid
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from psycopg.rows import class_row
-
-from octasplat.workers.db.connections import Connection, with_columns
+from octasplat.workers.db.connections import Connection, fetch_all
 from octasplat.workers.db.postgres_text import as_json
 from octasplat.workers.db.rows import WorkerRow
 
@@ -44,12 +42,9 @@ async def remove_stale_workers(connection: Connection, older_than_seconds: float
 
 async def live_workers(connection: Connection, stale_seconds: float) -> list[WorkerRow]:
     """Return the workers that were seen within ``stale_seconds``, by name."""
-    async with connection.cursor(row_factory=class_row(WorkerRow)) as cursor:
-        await cursor.execute(
-            with_columns(
-                "SELECT {} FROM workers WHERE seen_at > now() - make_interval(secs => %s) ORDER BY name",
-                WorkerRow,
-            ),
-            [stale_seconds],
-        )
-        return await cursor.fetchall()
+    return await fetch_all(
+        connection,
+        WorkerRow,
+        "SELECT {} FROM workers WHERE seen_at > now() - make_interval(secs => %s) ORDER BY name",
+        [stale_seconds],
+    )

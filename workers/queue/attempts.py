@@ -13,15 +13,13 @@ from typing import Any
 from octasplat.workers.db.connections import Connection, Pool
 from octasplat.workers.db.events_and_logs import add_event, add_log_lines, trim_log
 from octasplat.workers.db.locks import lock_owner
-from octasplat.workers.db.postgres_text import as_json, as_json_or_null, storable_text
+from octasplat.workers.db.postgres_text import as_json, storable_text
 from octasplat.workers.db.quotas import NO_QUOTA, Quota, check_bytes
 from octasplat.workers.db.rows import TERMINAL, Job
+from octasplat.workers.queue.job_endings import end_job, recover_attempt
 from octasplat.workers.queue.jobs import get_job, requeue_job
 from octasplat.workers.queue.protocol import JobQueue
 from octasplat.workers.queue.storage_leases import StorageLease
-
-MAX_RECOVERIES = 3
-"""Lost attempts without a new checkpoint after which a job is taken for one that kills its workers."""
 
 MAX_EARLIER_LOG_LINES = 20_000
 """Lines of the attempts before that stay in the log when a new one begins."""
@@ -326,42 +324,6 @@ async def claim(pool: Pool, job_id: uuid.UUID, entry_id: int, worker: str) -> At
     return Attempt(pool, claimed)
 
 
-async def recover_attempt(
-    connection: Connection,
-    job_queue: JobQueue,
-    job: Job,
-    error: Mapping[str, Any],
-    *,
-    keep_entry: bool = False,
-    delay_seconds: float = 0.0,
-) -> bool:
-    """Give a job whose attempt was lost to another worker; the caller holds the job's lock.
-
-    A job that was being cancelled is cancelled. One that was lost too often without advancing is failed with
-    ``error``. With ``keep_entry`` the queue entry is still being delivered and is removed by that. The job is
-    not taken up before ``delay_seconds`` have passed.
-
-    Returns:
-        Whether it failed.
-    """
-    if job.slip is not None and not keep_entry:
-        await job_queue.remove(connection, job.slip)
-    if job.state == "canceling":
-        await end_job(connection, job, "canceled", None)
-    elif job.rescues >= MAX_RECOVERIES:
-        message = f"{error['message']} This happened {job.rescues + 1} times without getting any further."
-        await end_job(connection, job, "failed", {**error, "message": message, "rescues": job.rescues})
-        return True
-    else:
-        await connection.execute("UPDATE jobs SET rescues = rescues + 1 WHERE id = %s", [job.id])
-        data = {"reason": error["message"], "rescues": job.rescues + 1}
-        await add_event(connection, job.id, job.attempt, "rescued", data)
-        lost = f"Lost, and queued again: {error['message']}"
-        await add_log_lines(connection, job.id, job.attempt, [lost])
-        await requeue_job(connection, job_queue, job, keep_entry=keep_entry, delay_seconds=delay_seconds)
-    return False
-
-
 @asynccontextmanager
 async def _transaction(pool: Pool) -> AsyncIterator[Connection]:
     async with pool.connection() as connection, connection.transaction():
@@ -388,23 +350,3 @@ async def _replace_artifacts(connection: Connection, job: Job, results: Sequence
             [result.media_type for result in results],
         ],
     )
-
-
-async def end_job(connection: Connection, job: Job, state: str, error: Mapping[str, Any] | None) -> None:
-    """Bring a job to a terminal state; the caller holds the job's lock."""
-    await connection.execute(
-        """
-        UPDATE jobs SET state = %s, error = %s, finished_at = now(), slip = NULL, seconds_left = NULL,
-            checkpoint = CASE WHEN %s THEN NULL ELSE checkpoint END
-        WHERE id = %s
-        """,
-        [state, as_json_or_null(error), state == "succeeded", job.id],
-    )
-    data: dict[str, Any] = {"state": state}
-    if error is not None:
-        data["error"] = dict(error)
-    await add_event(connection, job.id, job.attempt, "state", data)
-    line = {"succeeded": "Succeeded", "canceled": "Cancelled"}.get(state, "Failed")
-    if error is not None:
-        line += f": {error['message']}"
-    await add_log_lines(connection, job.id, job.attempt, [line])

@@ -8,7 +8,7 @@ from psycopg.rows import class_row
 
 from octasplat.workers.db.connections import Connection, Pool, with_columns
 from octasplat.workers.db.rows import TERMINAL, Job
-from octasplat.workers.queue.attempts import end_job
+from octasplat.workers.queue.job_endings import end_job
 from octasplat.workers.queue.jobs import get_job
 from octasplat.workers.queue.protocol import JobQueue
 from octasplat.workers.queue.recovery import StalledAttempts

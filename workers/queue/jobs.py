@@ -8,9 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from psycopg.rows import class_row
-
-from octasplat.workers.db.connections import Connection, with_columns
+from octasplat.workers.db.connections import Connection, fetch_all, fetch_one
 from octasplat.workers.db.errors import ConflictError, NotFoundError
 from octasplat.workers.db.events_and_logs import add_event
 from octasplat.workers.db.ids import new_id
@@ -67,9 +65,7 @@ async def get_job(connection: Connection, job_id: uuid.UUID, *, lock: bool = Fal
     query = "SELECT {} FROM jobs WHERE id = %s FOR UPDATE" if lock else "SELECT {} FROM jobs WHERE id = %s"
     if lock:
         await about_to_lock_jobs(connection)
-    async with connection.cursor(row_factory=class_row(Job)) as cursor:
-        await cursor.execute(with_columns(query, Job), [job_id])
-        return await cursor.fetchone()
+    return await fetch_one(connection, Job, query, [job_id])
 
 
 async def list_jobs(
@@ -95,10 +91,10 @@ async def list_jobs(
         before: made before this job.
         limit: at most so many.
     """
-    async with connection.cursor(row_factory=class_row(Job)) as cursor:
-        await cursor.execute(
-            with_columns(
-                """
+    return await fetch_all(
+        connection,
+        Job,
+        """
             SELECT {} FROM jobs
             WHERE (%(owner)s::text IS NULL OR owner = %(owner)s)
               AND (cardinality(%(states)s::text[]) = 0 OR state = ANY(%(states)s))
@@ -108,19 +104,16 @@ async def list_jobs(
               AND (%(before)s::uuid IS NULL OR id < %(before)s)
             ORDER BY id DESC LIMIT %(limit)s
             """,
-                Job,
-            ),
-            {
-                "owner": owner,
-                "states": list(states),
-                "kind": kind,
-                "label": label,
-                "dataset": dataset_id,
-                "before": before,
-                "limit": limit,
-            },
-        )
-        return await cursor.fetchall()
+        {
+            "owner": owner,
+            "states": list(states),
+            "kind": kind,
+            "label": label,
+            "dataset": dataset_id,
+            "before": before,
+            "limit": limit,
+        },
+    )
 
 
 async def queue_position(connection: Connection, job: Job) -> int | None:
@@ -305,20 +298,16 @@ async def delete_job(connection: Connection, job_id: uuid.UUID) -> None:
 
 async def artifacts_of(connection: Connection, job_id: uuid.UUID) -> list[Artifact]:
     """Return the results of a job, by name."""
-    async with connection.cursor(row_factory=class_row(Artifact)) as cursor:
-        await cursor.execute(
-            with_columns("SELECT {} FROM artifacts WHERE job_id = %s ORDER BY name", Artifact), [job_id]
-        )
-        return await cursor.fetchall()
+    return await fetch_all(
+        connection, Artifact, "SELECT {} FROM artifacts WHERE job_id = %s ORDER BY name", [job_id]
+    )
 
 
 async def get_artifact(connection: Connection, job_id: uuid.UUID, name: str) -> Artifact | None:
     """Return one result of a job, or None."""
-    async with connection.cursor(row_factory=class_row(Artifact)) as cursor:
-        await cursor.execute(
-            with_columns("SELECT {} FROM artifacts WHERE job_id = %s AND name = %s", Artifact), [job_id, name]
-        )
-        return await cursor.fetchone()
+    return await fetch_one(
+        connection, Artifact, "SELECT {} FROM artifacts WHERE job_id = %s AND name = %s", [job_id, name]
+    )
 
 
 async def queue_depths(connection: Connection) -> list[QueueDepth]:

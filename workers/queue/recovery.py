@@ -11,7 +11,7 @@ from psycopg.rows import class_row
 from octasplat.workers.db.connections import Pool, with_columns
 from octasplat.workers.db.locks import about_to_lock_jobs
 from octasplat.workers.db.rows import Job
-from octasplat.workers.queue.attempts import recover_attempt
+from octasplat.workers.queue.job_endings import recover_attempt
 from octasplat.workers.queue.jobs import get_job, requeue_job
 from octasplat.workers.queue.protocol import JobQueue
 

@@ -9,7 +9,8 @@ import psycopg
 
 from octasplat.engine.core.errors import OctasplatError
 from octasplat.workers.db.quotas import QuotaExceededError
-from octasplat.workers.queue.attempts import MAX_RECOVERIES, Attempt, ResultFile
+from octasplat.workers.queue.attempts import Attempt, ResultFile
+from octasplat.workers.queue.job_endings import MAX_RECOVERIES
 from octasplat.workers.queue.storage_leases import StorageLease, storage_lease
 from octasplat.workers.storage.disk_space import SpaceUsage
 from octasplat.workers.storage.errors import (

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float32, Float64, Int64, UInt, UInt8
 
-from octasplat.engine.core.compilation import kernel
+from octasplat.engine.core.compilation import device_function, kernel
 
 
 class PixelIndices(NamedTuple):
@@ -53,6 +53,12 @@ class PixelPlanes(NamedTuple):
     mask_is_alpha: bool
 
 
+@device_function()
+def _is_pixel(sizes: Int64[np.ndarray, "v 2"], view: int, y: int, x: int) -> bool:
+    """Return whether there is such a view, and it has the pixel."""
+    return 0 <= view < sizes.shape[0] and 0 <= x < sizes[view, 0] and 0 <= y < sizes[view, 1]
+
+
 @kernel()
 def gather_rays(
     pixels: PixelIndices,
@@ -82,11 +88,7 @@ def gather_rays(
     view_size, view_camera, camera_table, table = views
     for i in range(view.shape[0]):
         v = view[i]
-        if (
-            v < 0
-            or v >= view_size.shape[0]
-            or not (0 <= x[i] < view_size[v, 0] and 0 <= y[i] < view_size[v, 1])
-        ):
+        if not _is_pixel(view_size, v, y[i], x[i]):
             return i
         camera = view_camera[v]
         dx, dy, dz = 0.0, 0.0, 1.0
@@ -142,11 +144,7 @@ def gather_pixels(
     zero = np.float32(0.0)
     for i in range(view.shape[0]):
         v = view[i]
-        if (
-            v < 0
-            or v >= view_size.shape[0]
-            or not (0 <= x[i] < view_size[v, 0] and 0 <= y[i] < view_size[v, 1])
-        ):
+        if not _is_pixel(view_size, v, y[i], x[i]):
             return i
         inside = y[i] * view_size[v, 0] + x[i]
         pixel = view_offset[v] + inside

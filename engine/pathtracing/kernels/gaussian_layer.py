@@ -13,35 +13,29 @@ composited as such, into one layer of premultiplied colour g and transmittance T
 """
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float32, Float64, Int32
 
 from octasplat.engine.core.compilation import kernel
-from octasplat.engine.pathtracing.kernels.kernel_args import (
-    SAMPLE_PAIRS_PER_BOUNCE,
-    IntegratorParameters,
-    LayerArrays,
-    LightQuery,
-    MeshScene,
-    PathArrays,
-    PathScratch,
-    Rgb,
-    ShadowRayArrays,
-    Vec3,
-)
+from octasplat.engine.pathtracing.kernels.kernel_args import LayerArrays, Rgb, Vec3
 from octasplat.engine.pathtracing.kernels.lights import (
     INFINITE_DISTANCE,
     additive_light_probability,
     sample_light,
     sample_light_index,
 )
-from octasplat.engine.pathtracing.kernels.path_surfaces import (
+from octasplat.engine.pathtracing.kernels.path_args import (
     CAMERA_SAMPLE_PAIRS,
     PATH_ENDED,
-    add_radiance,
-    eval_background,
+    SAMPLE_PAIRS_PER_BOUNCE,
+    Bounce,
+    LightQuery,
+    PathArrays,
+    PathScratch,
 )
+from octasplat.engine.pathtracing.kernels.path_radiance import add_radiance, eval_background
 from octasplat.engine.pathtracing.kernels.sampler import uniform_pair
 from octasplat.engine.pathtracing.kernels.scatter import (
     FLAG_LOSSLESS,
@@ -56,6 +50,24 @@ MIN_COVERAGE = 1e-6
 SINGLE_SURFACE_TOLERANCE = 0.05
 SHADOWED, RELIT, AMBIENT = 0, 1, 2
 """Features of Gaussians: share that shadows take, share that is relit, and that times its ambient part."""
+
+
+class LayerLight(NamedTuple):
+    """What shadow rays of layers bring.
+
+    Attributes:
+        radiance: where nothing is in the way.
+        occluded_radiance: where a mesh is in the way of light that would have come.
+        mesh_transmittance: the share in each channel that meshes let through.
+        caster_transmittance: that of the Gaussians that cast shadows on Gaussians.
+        other_transmittance: that of the Gaussians that do not.
+    """
+
+    radiance: Float32[np.ndarray, "n 3"]
+    occluded_radiance: Float32[np.ndarray, "n 3"]
+    mesh_transmittance: Float32[np.ndarray, "n 3"]
+    caster_transmittance: Float32[np.ndarray, " n"]
+    other_transmittance: Float32[np.ndarray, " n"]
 
 
 @njit_no_refcount(forceinline=True)
@@ -161,24 +173,14 @@ def _query_layer_light(
 
 @kernel(_nrt=False, error_model="numpy")
 def intersect_gaussian_layers(
-    first: int,
-    last: int,
-    scratch: PathScratch,
-    paths: PathArrays,
-    active: Int32[np.ndarray, " n"],
-    depth: int,
-    faces: Int32[np.ndarray, " n"],
-    layer: LayerArrays,
-    scene: MeshScene,
-    integrator: IntegratorParameters,
-    min_transmittance: float,
-    shadows: ShadowRayArrays,
+    first: int, last: int, scratch: PathScratch, bounce: Bounce, layer: LayerArrays
 ) -> None:
-    """Put the layers of Gaussians in front of the surfaces ``faces`` onto the paths ``active``.
+    """Put the layers of Gaussians in front of the surfaces ``faces`` onto paths.
 
-    ``shadows`` gets what the layers ask of lights. A ray of which less than ``min_transmittance`` is left
-    ends: its face becomes :data:`PATH_ENDED`.
+    The shadow rays get what the layers ask of lights. Where a ray ends, its face becomes :data:`PATH_ENDED`.
     """
+    paths, active, depth, hits, scene, integrator, shadows = bounce
+    faces = hits.faces
     lights, absorption = scene.lights, scene.materials.absorption
     for k in range(first, last):
         p = active[k]
@@ -214,7 +216,7 @@ def intersect_gaussian_layers(
             paths.shading_factor[p, 1] += g_g * base
             paths.shading_factor[p, 2] += g_b * base
             paths.transmittance[p] *= left
-            if paths.transmittance[p] < min_transmittance:
+            if paths.transmittance[p] < layer.min_transmittance:
                 paths.radiance_linear[p, 0] = b_r
                 paths.radiance_linear[p, 1] = b_g
                 paths.radiance_linear[p, 2] = b_b
@@ -235,7 +237,7 @@ def intersect_gaussian_layers(
             add_radiance(paths, p, g_r * base, g_g * base, g_b * base, integrator.clamp)
         for channel in range(3):
             paths.throughput[p, channel] *= left
-        if left < min_transmittance:
+        if left < layer.min_transmittance:
             paths.is_alive[p], faces[k] = False, PATH_ENDED
 
 
@@ -246,24 +248,15 @@ def add_layer_light(
     scratch: PathScratch,
     paths: PathArrays,
     active: Int32[np.ndarray, " n"],
-    radiance: Float32[np.ndarray, "n 3"],
-    occluded_radiance: Float32[np.ndarray, "n 3"],
-    mesh_transmittance: Float32[np.ndarray, "n 3"],
-    caster_transmittance: Float32[np.ndarray, " n"],
-    other_transmittance: Float32[np.ndarray, " n"],
+    light: LayerLight,
 ) -> None:
-    """Add what shadow rays of layers brought.
-
-    ``mesh_transmittance`` is the share in each channel that meshes let through, ``caster_transmittance``
-    and ``other_transmittance`` are transmittances of the Gaussians that cast shadows on Gaussians and of
-    those that do not.
-    """
+    """Add what shadow rays of layers brought."""
     for k in range(first, last):
         p = active[k]
         for channel in range(3):
-            reached = mesh_transmittance[k, channel] * caster_transmittance[k]
-            taken = other_transmittance[k] * (1.0 - reached)
-            amount = radiance[k, channel] * reached + occluded_radiance[k, channel] * taken
+            reached = light.mesh_transmittance[k, channel] * light.caster_transmittance[k]
+            taken = light.other_transmittance[k] * (1.0 - reached)
+            amount = light.radiance[k, channel] * reached + light.occluded_radiance[k, channel] * taken
             if paths.flags[p] & FLAG_LOSSLESS:
                 paths.shading_factor[p, channel] += amount
             else:

@@ -8,9 +8,10 @@ and else goes on to what is behind; so no light is counted twice, and rays of al
 import math
 
 import numpy as np
-from jaxtyping import Float64, Int32, Int64
+from jaxtyping import Float64, Int64
 
 from octasplat.engine.core.compilation import kernel
+from octasplat.engine.pathtracing.kernels.camera_paths import reset_path
 from octasplat.engine.pathtracing.kernels.gaussian_layer import MIN_COVERAGE
 from octasplat.engine.pathtracing.kernels.kernel_args import (
     AlbedoTables,
@@ -18,16 +19,19 @@ from octasplat.engine.pathtracing.kernels.kernel_args import (
     IntegratorParameters,
     LayerArrays,
     LightArrays,
-    LightQuery,
     MaterialArrays,
-    MeshScene,
+    SurfacePoint,
+)
+from octasplat.engine.pathtracing.kernels.path_args import (
+    PATH_ENDED,
+    Bounce,
+    LightQuery,
     PathArrays,
     PathSamples,
     PathScratch,
     ShadowRayArrays,
     SurfaceInteractions,
 )
-from octasplat.engine.pathtracing.kernels.path_surfaces import PATH_ENDED, survives_roulette
 from octasplat.engine.pathtracing.kernels.principled_bsdf import BURLEY
 from octasplat.engine.pathtracing.kernels.sampler import pixel_key, uniform_pair
 from octasplat.engine.pathtracing.kernels.scatter import (
@@ -38,6 +42,7 @@ from octasplat.engine.pathtracing.kernels.scatter import (
     LIGHT_POSITION_SAMPLE,
     LOBE_SAMPLE,
     scatter_path,
+    survives_roulette,
 )
 from octasplat.engine.pathtracing.kernels.surface import normalize
 from octasplat.engine.trace.kernels.native import njit_no_refcount
@@ -64,24 +69,15 @@ def _draw_samples(paths: PathArrays, p: int, pair: int, random_numbers: Float64[
 
 @kernel(_nrt=False, error_model="numpy")
 def intersect_gaussian_surfaces(
-    first: int,
-    last: int,
-    scratch: PathScratch,
-    paths: PathArrays,
-    active: Int32[np.ndarray, " n"],
-    depth: int,
-    faces: Int32[np.ndarray, " n"],
-    layer: LayerArrays,
-    scene: MeshScene,
-    integrator: IntegratorParameters,
-    min_transmittance: float,
-    shadows: ShadowRayArrays,
+    first: int, last: int, scratch: PathScratch, bounce: Bounce, layer: LayerArrays
 ) -> None:
     """Intersect paths with the Gaussians that have materials, or remove these from the layer.
 
     A path that meets them goes on from there: its face becomes :data:`PATH_ENDED`, and nothing of the layer
-    is left. ``shadows`` gets what it asks of lights.
+    is left. The shadow rays get what it asks of lights.
     """
+    paths, active, depth, hits, scene, integrator, shadows = bounce
+    faces = hits.faces
     materials, lights = scene.materials, scene.lights
     rgb, transmittance, features = layer.rgb, layer.transmittance, layer.features
     depth_median, depth_sum, normals = layer.depth_median, layer.depth_sum, layer.normals
@@ -94,7 +90,7 @@ def intersect_gaussian_surfaces(
         share = 1.0 - left
         if chance <= MIN_COVERAGE:
             continue
-        if left < min_transmittance:  # the tracer stopped looking here
+        if left < layer.min_transmittance:  # the tracer stopped looking here
             chance /= share
         pair = FIRST_PAIR + depth * PAIRS_PER_BOUNCE
         choice, roulette = uniform_pair(paths.keys[p], paths.samples[p], pair)
@@ -141,7 +137,7 @@ def intersect_gaussian_surfaces(
         metallic, roughness = min(features[k, METALLIC] * part, 1.0), min(features[k, ROUGHNESS] * part, 1.0)
         bsdf = Bsdf(color, metallic, roughness, IOR, BURLEY, False)
         normal, query = (n_x, n_y, n_z), LightQuery(lights, integrator, shadows, k)
-        scatter_path(p, samples, paths, False, point, normal, normal, bsdf, tables, query)
+        scatter_path(p, samples, paths, False, SurfacePoint(point, normal, normal), bsdf, tables, query)
 
 
 @kernel(_nrt=False, error_model="numpy")
@@ -163,28 +159,18 @@ def start_paths_at_surfaces(
     tables = AlbedoTables(materials.ggx_albedo, materials.coat_albedo[0], materials.coat_mean_albedo[0])
     for k in range(first, last):
         paths.keys[k], paths.samples[k] = pixel_key(integrator.seed, pixels[k]), samples[k]
-        for channel in range(3):
-            paths.directions_world[k, channel] = interactions.directions_world[k, channel]
-            paths.throughput[k, channel] = 1.0
-            paths.radiance_linear[k, channel] = 0.0
-            paths.layer_srgb[k, channel] = 0.0
-            paths.shading_factor[k, channel] = 0.0
-            paths.albedo_linear[k, channel], paths.normals_world[k, channel] = 0.0, 0.0
-            shadows.radiance_linear[k, channel] = 0.0
-        paths.transmittance[k], paths.coverage[k], paths.mesh_visibility[k] = 1.0, 1.0, 0.0
-        paths.pdf[k], paths.t_view_origin[k], paths.medium_ids[k] = 0.0, 0.0, -1
-        paths.flags[k], paths.is_alive[k] = FLAG_GAUSSIAN_SURFACE, True
-        _draw_samples(paths, k, FIRST_PAIR + 1, scratch.random_numbers)
-        point, n, material = (
+        shadows.radiance_linear[k, 0] = shadows.radiance_linear[k, 1] = shadows.radiance_linear[k, 2] = 0.0
+        point, d, n = (
             interactions.points_world[k],
+            interactions.directions_world[k],
             interactions.normals_world[k],
-            interactions.materials[k],
         )
+        origin = float(point[0]), float(point[1]), float(point[2])
+        reset_path(paths, k, origin, (float(d[0]), float(d[1]), float(d[2])), FLAG_GAUSSIAN_SURFACE)
+        _draw_samples(paths, k, FIRST_PAIR + 1, scratch.random_numbers)
+        material = interactions.materials[k]
         normal = float(n[0]), float(n[1]), float(n[2])
         color = float(material[0]), float(material[1]), float(material[2])
         bsdf = Bsdf(color, float(material[3]), float(material[4]), IOR, BURLEY, False)
-        origin, query = (
-            (float(point[0]), float(point[1]), float(point[2])),
-            LightQuery(lights, integrator, shadows, k),
-        )
-        scatter_path(k, column, paths, False, origin, normal, normal, bsdf, tables, query)
+        query = LightQuery(lights, integrator, shadows, k)
+        scatter_path(k, column, paths, False, SurfacePoint(origin, normal, normal), bsdf, tables, query)

@@ -13,8 +13,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from octasplat.engine.core.compilation import kernel
-from octasplat.engine.pathtracing.kernels.principled_bsdf import MIN_ALPHA, fresnel_dielectric
-from octasplat.engine.pathtracing.kernels.sampler import UINT32_TO_UNIT, reverse_bits
+from octasplat.engine.pathtracing.kernels.principled_bsdf import fresnel_dielectric
 from octasplat.engine.shading.kernels.microfacets import ggx_density, ggx_masking, sample_visible_normal
 from octasplat.engine.trace.kernels.native import njit_no_refcount
 
@@ -72,37 +71,6 @@ def rough_dielectric_sample(
 
 
 @kernel(_nrt=False, error_model="numpy")
-def integrate_rough_dielectric(
-    first: int, last: int, eta: float, samples: int, table: Float64[np.ndarray, "a c"]
-) -> None:
-    """Integrate the directional albedo of one bounce off or through microfacets.
-
-    Writes the rows ``first`` to ``last`` of ``table``. Rows are roughness and columns the cosine, both from
-    0 to 1.
-    """
-    rows, columns = table.shape
-    for j in range(first, last):
-        roughness = j / (rows - 1)
-        alpha = max(roughness * roughness, MIN_ALPHA)
-        for i in range(columns):
-            o_z = max(i / (columns - 1), 1e-4)
-            o_x = math.sqrt(1.0 - o_z * o_z)
-            total = 0.0
-            for k in range(samples):
-                u, v = (k + 0.5) / samples, reverse_bits(np.uint32(k)) * UINT32_TO_UNIT
-                h_x, _, h_z = sample_visible_normal(o_x, 0.0, o_z, alpha, u, v)
-                cos_o = o_x * h_x + o_z * h_z
-                share, cos_t = fresnel_dielectric(min(cos_o, 1.0), eta)
-                up = 2.0 * cos_o * h_z - o_z
-                if up > 0.0:
-                    total += share * ggx_masking(up, alpha)
-                down = (cos_o / eta - cos_t) * h_z - o_z / eta
-                if down < 0.0:
-                    total += (1.0 - share) * ggx_masking(-down, alpha)
-            table[j, i] = total / samples
-
-
-@kernel(_nrt=False, error_model="numpy")
 def rough_dielectric_eval_array(
     first: int,
     last: int,
@@ -132,13 +100,7 @@ def rough_dielectric_sample_array(
 ) -> None:
     """Write :func:`rough_dielectric_sample` of the rows ``first`` to ``last``."""
     for n in range(first, last):
+        choice, u, v = random_numbers[n, 0], random_numbers[n, 1], random_numbers[n, 2]
         i[n, 0], i[n, 1], i[n, 2] = rough_dielectric_sample(
-            o[n, 0],
-            o[n, 1],
-            o[n, 2],
-            eta,
-            alpha,
-            random_numbers[n, 0],
-            random_numbers[n, 1],
-            random_numbers[n, 2],
+            o[n, 0], o[n, 1], o[n, 2], eta, alpha, choice, u, v
         )

@@ -5,6 +5,7 @@ The two ways in which light is found are joined by multiple importance sampling 
 """
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
@@ -12,14 +13,18 @@ from octasplat.engine.core.rays import AT_INFINITY
 from octasplat.engine.pathtracing.kernels.kernel_args import (
     AlbedoTables,
     Bsdf,
-    LightQuery,
-    PathArrays,
-    PathSamples,
+    LightArrays,
     Rgb,
-    ShadowRayArrays,
+    SurfacePoint,
     Vec3,
 )
 from octasplat.engine.pathtracing.kernels.lights import INFINITE_DISTANCE, sample_light, sample_light_index
+from octasplat.engine.pathtracing.kernels.path_args import (
+    LightQuery,
+    PathArrays,
+    PathSamples,
+    ShadowRayArrays,
+)
 from octasplat.engine.pathtracing.kernels.principled_bsdf import (
     orthonormal_basis,
     principled_eval,
@@ -91,6 +96,52 @@ def sample_pair(samples: PathSamples, pair: int) -> tuple[float, float]:
     return samples.random_numbers[pair, 0, samples.n], samples.random_numbers[pair, 1, samples.n]
 
 
+class LightSample(NamedTuple):
+    """A place on a light, drawn for a point.
+
+    Attributes:
+        id: number of the light, -1 where there is none for the point; all else is 0 then.
+        share: probability that this light was chosen.
+        direction: to the place, a unit vector.
+        distance: to the place.
+        rgb: linear radiance from there, or what a light without extent sends.
+        pdf: density of the direction, 0 for a light without extent.
+    """
+
+    id: int
+    share: float
+    direction: Vec3
+    distance: float
+    rgb: Rgb
+    pdf: float
+
+
+@njit_no_refcount(forceinline=True)
+def draw_light(lights: LightArrays, point: Vec3, samples: PathSamples) -> LightSample:
+    """Choose a light for a point, and a place on it."""
+    x, y, z = point
+    if len(lights.kinds):
+        l, share = sample_light_index(lights, x, y, z, sample_pair(samples, LIGHT_CHOICE_SAMPLE)[0])
+        if l >= 0:
+            u, v = sample_pair(samples, LIGHT_POSITION_SAMPLE)
+            w_x, w_y, w_z, distance, red, green, blue, pdf = sample_light(lights, l, x, y, z, u, v)
+            return LightSample(l, share, (w_x, w_y, w_z), distance, (red, green, blue), pdf)
+    return LightSample(-1, 0.0, (0.0, 0.0, 0.0), 0.0, (0.0, 0.0, 0.0), 0.0)
+
+
+@njit_no_refcount(forceinline=True)
+def survives_roulette(paths: PathArrays, p: int, roulette: float) -> bool:
+    """Play russian roulette: terminate a path by its throughput; returns whether it continues."""
+    w = paths.throughput[p]
+    stay = min(max(w[0], w[1], w[2]), 0.95)
+    if roulette >= stay:
+        paths.is_alive[p] = False
+        return False
+    for channel in range(3):
+        paths.throughput[p, channel] /= stay
+    return True
+
+
 @njit_no_refcount(forceinline=True)
 def surface_eval(
     o: Vec3, i: Vec3, is_diffuse: bool, bsdf: Bsdf, tables: AlbedoTables
@@ -109,19 +160,16 @@ def scatter_path(
     samples: PathSamples,
     paths: PathArrays,
     is_diffuse: bool,
-    point: Vec3,
-    normal: Vec3,
-    shading_normal: Vec3,
+    point: SurfacePoint,
     bsdf: Bsdf,
     tables: AlbedoTables,
     query: LightQuery,
 ) -> None:
     """Queue a light query, and continue path ``p`` from a point off its surface.
 
-    ``normal`` is the surface's own, ``shading_normal`` the one that it is shaded by; a surface that
-    ``is_diffuse`` has a color alone.
+    A surface that ``is_diffuse`` has a color alone.
     """
-    (x, y, z), (n_x, n_y, n_z), (s_x, s_y, s_z) = point, normal, shading_normal
+    (x, y, z), (n_x, n_y, n_z), (s_x, s_y, s_z) = point
     lights, shadows, k = query.lights, query.shadows, query.k
     d = paths.directions_world[p]
     # --- the direction to the viewer, in the frame of the shading normal ---
@@ -132,24 +180,20 @@ def scatter_path(
         -(d[0] * s_x + d[1] * s_y + d[2] * s_z),
     )
     # --- a sample of a light ---
-    if len(lights.kinds):
-        l, share = sample_light_index(lights, x, y, z, sample_pair(samples, LIGHT_CHOICE_SAMPLE)[0])
-        if l >= 0:
-            u, v = sample_pair(samples, LIGHT_POSITION_SAMPLE)
-            w_x, w_y, w_z, distance, l_r, l_g, l_b, l_pdf = sample_light(lights, l, x, y, z, u, v)
-            i_z = w_x * s_x + w_y * s_y + w_z * s_z
-            if i_z > 0.0 and w_x * n_x + w_y * n_y + w_z * n_z > 0.0 and l_r + l_g + l_b > 0.0:
-                i = w_x * a_x + w_y * a_y + w_z * a_z, w_x * b_x + w_y * b_y + w_z * b_z, i_z
-                f_r, f_g, f_b, pdf = surface_eval(o, i, is_diffuse, bsdf, tables)
-                factor = 1.0 / share
-                shadows.passes_glass[k] = l_pdf == 0.0
-                if l_pdf > 0.0:
-                    l_pdf *= share
-                    factor = 1.0 / (l_pdf + pdf) if lights.is_hittable[l] else 1.0 / l_pdf
-                w = paths.throughput[p]
-                radiance = w[0] * f_r * l_r * factor, w[1] * f_g * l_g * factor, w[2] * f_b * l_b * factor
-                clamp = query.integrator.clamp if paths.flags[p] & FLAG_SCATTERED else np.inf
-                queue_shadow_ray(shadows, k, point, (w_x, w_y, w_z), distance, radiance, clamp)
+    l, share, (w_x, w_y, w_z), distance, (l_r, l_g, l_b), l_pdf = draw_light(lights, point.position, samples)
+    i_z = w_x * s_x + w_y * s_y + w_z * s_z
+    if i_z > 0.0 and w_x * n_x + w_y * n_y + w_z * n_z > 0.0 and l_r + l_g + l_b > 0.0:
+        i = w_x * a_x + w_y * a_y + w_z * a_z, w_x * b_x + w_y * b_y + w_z * b_z, i_z
+        f_r, f_g, f_b, pdf = surface_eval(o, i, is_diffuse, bsdf, tables)
+        factor = 1.0 / share
+        shadows.passes_glass[k] = l_pdf == 0.0
+        if l_pdf > 0.0:
+            l_pdf *= share
+            factor = 1.0 / (l_pdf + pdf) if lights.is_hittable[l] else 1.0 / l_pdf
+        w = paths.throughput[p]
+        radiance = w[0] * f_r * l_r * factor, w[1] * f_g * l_g * factor, w[2] * f_b * l_b * factor
+        clamp = query.integrator.clamp if paths.flags[p] & FLAG_SCATTERED else np.inf
+        queue_shadow_ray(shadows, k, point.position, (w_x, w_y, w_z), distance, radiance, clamp)
     # --- a sample of the BSDF ---
     u, v = sample_pair(samples, DIRECTION_SAMPLE)
     if is_diffuse:

@@ -6,14 +6,8 @@ import numpy as np
 from jaxtyping import Float32, Int32
 
 from octasplat.engine.core.compilation import kernel
-from octasplat.engine.pathtracing.kernels.kernel_args import (
-    BLOCK_SIZE,
-    MaterialArrays,
-    MeshQueries,
-    PathScratch,
-    ShadowRayArrays,
-    SurfaceArrays,
-)
+from octasplat.engine.pathtracing.kernels.kernel_args import MaterialArrays, MeshQueries, SurfaceArrays
+from octasplat.engine.pathtracing.kernels.path_args import BLOCK_SIZE, PathScratch, ShadowRayArrays
 from octasplat.engine.pathtracing.kernels.principled_bsdf import fresnel_dielectric
 from octasplat.engine.pathtracing.kernels.rough_dielectric import MIN_GLASS_ROUGHNESS
 from octasplat.engine.pathtracing.kernels.surface import face_normal

@@ -4,17 +4,18 @@ import numpy as np
 from jaxtyping import Float32
 
 from octasplat.engine.core.compilation import kernel
-from octasplat.engine.pathtracing.kernels.kernel_args import (
+from octasplat.engine.pathtracing.kernels.camera_paths import start_paths
+from octasplat.engine.pathtracing.kernels.kernel_args import IntegratorParameters, MeshQueries, MeshScene
+from octasplat.engine.pathtracing.kernels.path_args import (
     BLOCK_SIZE,
-    IntegratorParameters,
-    MeshQueries,
-    MeshScene,
+    Bounce,
     PathArrays,
     PathBlock,
     PathScratch,
     PathStart,
 )
-from octasplat.engine.pathtracing.kernels.path_surfaces import add_direct_light, shade_surfaces, start_paths
+from octasplat.engine.pathtracing.kernels.path_radiance import add_direct_light
+from octasplat.engine.pathtracing.kernels.path_surfaces import shade_surfaces
 from octasplat.engine.pathtracing.kernels.shadow_rays import shadow_transmittance
 from octasplat.engine.trace.kernels.triangles import TriangleHitArrays, TriangleRays, closest_hits
 
@@ -49,7 +50,7 @@ def trace_paths(
             met = TriangleHitArrays(hits.distances, hits.faces, hits.barycentrics)
             closest_hits(queries.closest_hit, rays, 0, left, depth == 0, scratch.embree, met)
             # --- surfaces, and light that reaches them ---
-            shade_surfaces(0, left, scratch, paths, active, depth, hits, scene, integrator, shadows)
+            shade_surfaces(0, left, scratch, Bounce(paths, active, depth, hits, scene, integrator, shadows))
             shadow_transmittance(
                 0, left, scratch, queries, scene.surfaces, scene.materials, shadows, False, transmittance
             )

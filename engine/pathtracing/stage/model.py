@@ -8,170 +8,24 @@ are linear. Imports neither torch nor numba.
 import math
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
+
+from octasplat.engine.pathtracing.stage.base import (
+    WHITE,
+    Color,
+    Finite,
+    NonNegative,
+    Positive,
+    StageModel,
+    Transformed,
+    UnitInterval,
+    Vector,
+)
+from octasplat.engine.pathtracing.stage.materials import Material
 
 MAX_MESHES = 1000
 MAX_LIGHTS = 1000
 MAX_SCENES = 100
-
-Finite = Annotated[float, Field(allow_inf_nan=False)]
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
-UnitInterval = Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)]
-Vector = tuple[Finite, Finite, Finite]
-Color = tuple[UnitInterval, UnitInterval, UnitInterval]
-WHITE = (1.0, 1.0, 1.0)
-
-
-class StageModel(BaseModel):
-    """Base of all stage models: unknown keys are refused, and instances are immutable."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-
-class NormalMapped(StageModel):
-    """A surface with an optional normal map.
-
-    Attributes:
-        normal_texture: image file of normals in the frame of the texture coordinates: x to the right of the
-            image, y up in it, z off the surface, each from -1 to 1 as 0 to 1.
-        normal_scale: factor of x and y.
-    """
-
-    normal_texture: str | None = None
-    normal_scale: NonNegative = 1.0
-
-
-class Emissive(StageModel):
-    """A surface that may emit light, on both sides.
-
-    Attributes:
-        emission: linear radiance of its own light, the same in all directions; 0 for none.
-        emission_srgb: colour of that light.
-        emission_texture: image file of display colours, multiplied by it.
-    """
-
-    emission: NonNegative = 0.0
-    emission_srgb: Color = WHITE
-    emission_texture: str | None = None
-
-
-class Diffuse(NormalMapped, Emissive):
-    """A diffuse (Lambertian) surface.
-
-    Attributes:
-        colour_srgb: share of the light that it sends back.
-        texture: image file of display colours, multiplied by the colour.
-    """
-
-    kind: Literal["diffuse"] = "diffuse"
-    colour_srgb: Color = (0.8, 0.8, 0.8)
-    texture: str | None = None
-
-
-class Mirror(StageModel):
-    """A perfect mirror; white reflects everything."""
-
-    kind: Literal["mirror"] = "mirror"
-    colour_srgb: Color = WHITE
-
-
-class Glass(StageModel):
-    """Clear or rough glass, for closed meshes.
-
-    Attributes:
-        ior: index of refraction; that of the surroundings is 1.
-        tint_srgb: colour that light takes at each surface that it passes.
-        absorption: what is absorbed inside in each linear channel, per world unit (Beer's law).
-        roughness: of its surface; perceptual, GGX's alpha is its square; below 0.03 it is smooth.
-        multiple_scattering: light that facets throw at each other is kept, not lost.
-    """
-
-    kind: Literal["glass"] = "glass"
-    ior: Annotated[float, Field(ge=1, le=4)] = 1.5
-    tint_srgb: Color = WHITE
-    absorption: tuple[NonNegative, NonNegative, NonNegative] = (0.0, 0.0, 0.0)
-    roughness: UnitInterval = 0.0
-    multiple_scattering: bool = True
-
-
-class Metal(NormalMapped):
-    """Metal with a microfacet surface (GGX).
-
-    Attributes:
-        colour_srgb: colour of what it reflects head-on.
-        roughness: perceptual, GGX's alpha is its square.
-        multiple_scattering: light that facets throw at each other is kept, not lost.
-    """
-
-    kind: Literal["metal"] = "metal"
-    colour_srgb: Color = (0.9, 0.9, 0.9)
-    roughness: UnitInterval = 0.2
-    multiple_scattering: bool = True
-
-
-class Dielectric(NormalMapped, Emissive):
-    """A coloured substrate under a clear coat with a microfacet surface, such as plastic or glaze.
-
-    Attributes:
-        colour_srgb: of the ground.
-        texture: image file of the ground's display colours, multiplied by the colour.
-        roughness: of the coat; perceptual, GGX's alpha is its square.
-        ior: index of refraction of the coat.
-    """
-
-    kind: Literal["dielectric"] = "dielectric"
-    colour_srgb: Color = (0.8, 0.8, 0.8)
-    texture: str | None = None
-    roughness: UnitInterval = 0.3
-    ior: Annotated[float, Field(gt=1, le=4)] = 1.5
-
-
-class MetallicRoughness(NormalMapped, Emissive):
-    """glTF's material: a mixture of a dielectric and a metal.
-
-    Attributes:
-        colour_srgb: of the dielectric's ground and of the metal.
-        texture: image file of display colours, multiplied by the colour.
-        metallic: share of the metal.
-        roughness: perceptual, GGX's alpha is its square.
-        metallic_roughness_texture: image file with roughness in green and metallic in blue, multiplied by
-            the two numbers.
-        ior: index of refraction of the dielectric.
-        diffuse: how the ground shares light with the coat: ``coupled`` keeps all energy, ``burley`` is the
-            diffuse term of Disney's principled material, which does not quite.
-        multiple_scattering: light that facets throw at each other is kept, not lost.
-    """
-
-    kind: Literal["metallic-roughness"] = "metallic-roughness"
-    colour_srgb: Color = WHITE
-    texture: str | None = None
-    metallic: UnitInterval = 0.0
-    roughness: UnitInterval = 1.0
-    metallic_roughness_texture: str | None = None
-    ior: Annotated[float, Field(gt=1, le=4)] = 1.5
-    diffuse: Literal["coupled", "burley"] = "coupled"
-    multiple_scattering: bool = True
-
-
-Material = Annotated[
-    Diffuse | Mirror | Glass | Metal | Dielectric | MetallicRoughness,
-    Field(discriminator="kind"),
-]
-
-
-class Transformed(StageModel):
-    """Something with a placement in the world: scaled first, then rotated, then translated.
-
-    Attributes:
-        position: where its origin comes to lie.
-        rotation_degrees: about the world's x, then y, then z axis.
-        scale: one factor, or one for each axis of its own.
-    """
-
-    position: Vector = (0.0, 0.0, 0.0)
-    rotation_degrees: Vector = (0.0, 0.0, 0.0)
-    scale: Positive | tuple[Positive, Positive, Positive] = 1.0
 
 
 class RestingPlace(StageModel):

@@ -15,6 +15,7 @@ BLOCK_SIDE = 8
 SIDE = BLOCK_SIDE + 1
 """A block's cells also need the first voxels of the next blocks."""
 CELLS = SIDE**3
+BLOCK_VOXELS = BLOCK_SIDE**3
 
 
 class VolumeArrays(NamedTuple):
@@ -52,8 +53,9 @@ def neighbour(
 
 
 @device_function()
-def gather_block_values(volume: VolumeArrays, b: int, out: Float32[np.ndarray, "729"]) -> None:
-    """Write the 9^3 values that the cells of a block need; not-a-number where too little is known."""
+def block_values(volume: VolumeArrays, b: int) -> Float32[np.ndarray, "729"]:
+    """Return the 9^3 values that the cells of a block need; not-a-number where too little is known."""
+    out = np.empty(CELLS, np.float32)
     for x in range(SIDE):
         for y in range(SIDE):
             for z in range(SIDE):
@@ -62,6 +64,14 @@ def gather_block_values(volume: VolumeArrays, b: int, out: Float32[np.ndarray, "
                     out[(x * SIDE + y) * SIDE + z] = volume.values[row, place]
                 else:
                     out[(x * SIDE + y) * SIDE + z] = np.nan
+    return out
+
+
+@device_function()
+def voxel_place(voxel: int) -> tuple[int, int, int, int]:
+    """Return x, y and z of a block's voxel, and its place among the 9^3 values."""
+    x, y, z = voxel // (BLOCK_SIDE * BLOCK_SIDE), voxel // BLOCK_SIDE % BLOCK_SIDE, voxel % BLOCK_SIDE
+    return x, y, z, (x * SIDE + y) * SIDE + z
 
 
 @device_function()
@@ -100,23 +110,20 @@ def count_block_elements(
     later.
     """
     for b in range(first_block, last_block):
-        near = np.empty(CELLS, np.float32)
-        gather_block_values(volume, b, near)
+        near = block_values(volume, b)
         vertex_count, triangle_count = 0, 0
-        for x in range(BLOCK_SIDE):
-            for y in range(BLOCK_SIDE):
-                for z in range(BLOCK_SIDE):
-                    at = (x * SIDE + y) * SIDE + z
-                    value = near[at]
-                    bits = 0
-                    if not np.isnan(value):
-                        for axis in range(3):
-                            other = near[at + corner_offset(1 << axis)]
-                            if not np.isnan(other) and (value < 0.0) != (other < 0.0):
-                                bits |= 1 << axis
-                                vertex_count += 1
-                        triangle_count += triangle_counts[cube_case(near, at)]
-                    crossed[b, (x * BLOCK_SIDE + y) * BLOCK_SIDE + z] = bits
+        for voxel in range(BLOCK_VOXELS):
+            _, _, _, at = voxel_place(voxel)
+            value = near[at]
+            bits = 0
+            if not np.isnan(value):
+                for axis in range(3):
+                    other = near[at + corner_offset(1 << axis)]
+                    if not np.isnan(other) and (value < 0.0) != (other < 0.0):
+                        bits |= 1 << axis
+                        vertex_count += 1
+                triangle_count += triangle_counts[cube_case(near, at)]
+            crossed[b, voxel] = bits
         vertices[b], triangles[b] = vertex_count, triangle_count
 
 
@@ -136,25 +143,21 @@ def place_vertices(
     """
     blocks = volume.blocks
     for b in range(first_block, last_block):
-        near = np.empty(CELLS, np.float32)
-        gather_block_values(volume, b, near)
+        near = block_values(volume, b)
         number = starts[b]
-        for x in range(BLOCK_SIDE):
-            for y in range(BLOCK_SIDE):
-                for z in range(BLOCK_SIDE):
-                    place = (x * BLOCK_SIDE + y) * BLOCK_SIDE + z
-                    first[b, place] = number
-                    at = (x * SIDE + y) * SIDE + z
-                    for axis in range(3):
-                        if crossed[b, place] >> axis & 1:
-                            here, there = near[at], near[at + corner_offset(1 << axis)]
-                            # Not quite to the ends, where triangles would lose their area.
-                            t = min(max(here / (here - there), np.float32(0.01)), np.float32(0.99))
-                            points[number, 0] = blocks[b, 0] * BLOCK_SIDE + x
-                            points[number, 1] = blocks[b, 1] * BLOCK_SIDE + y
-                            points[number, 2] = blocks[b, 2] * BLOCK_SIDE + z
-                            points[number, axis] += t
-                            number += 1
+        for voxel in range(BLOCK_VOXELS):
+            x, y, z, at = voxel_place(voxel)
+            first[b, voxel] = number
+            for axis in range(3):
+                if crossed[b, voxel] >> axis & 1:
+                    here, there = near[at], near[at + corner_offset(1 << axis)]
+                    # Not quite to the ends, where triangles would lose their area.
+                    t = min(max(here / (here - there), np.float32(0.01)), np.float32(0.99))
+                    points[number, 0] = blocks[b, 0] * BLOCK_SIDE + x
+                    points[number, 1] = blocks[b, 1] * BLOCK_SIDE + y
+                    points[number, 2] = blocks[b, 2] * BLOCK_SIDE + z
+                    points[number, axis] += t
+                    number += 1
 
 
 @kernel()
@@ -172,30 +175,27 @@ def place_triangles(
 ) -> None:
     """Place the triangles of the cells, in the order of the blocks ``first_block`` to ``last_block``."""
     for b in range(first_block, last_block):
-        near = np.empty(CELLS, np.float32)
-        gather_block_values(volume, b, near)
+        near = block_values(volume, b)
         number = starts[b]
-        for x in range(BLOCK_SIDE):
-            for y in range(BLOCK_SIDE):
-                for z in range(BLOCK_SIDE):
-                    at = (x * SIDE + y) * SIDE + z
-                    if np.isnan(near[at]):
-                        continue
-                    case = cube_case(near, at)
-                    for k in range(3 * triangle_counts[case]):
-                        edge = edge_table[case, k]
-                        low = edge_corners[edge, 0]
-                        axis = edge // 4
-                        row, place = neighbour(
-                            volume.table,
-                            volume.blocks,
-                            b,
-                            x + (low & 1),
-                            y + (low >> 1 & 1),
-                            z + (low >> 2 & 1),
-                        )
-                        vertex = first[row, place]
-                        for before in range(axis):
-                            vertex += crossed[row, place] >> before & 1
-                        faces[number + k // 3, k % 3] = vertex
-                    number += triangle_counts[case]
+        for voxel in range(BLOCK_VOXELS):
+            x, y, z, at = voxel_place(voxel)
+            if np.isnan(near[at]):
+                continue
+            case = cube_case(near, at)
+            for k in range(3 * triangle_counts[case]):
+                edge = edge_table[case, k]
+                low = edge_corners[edge, 0]
+                axis = edge // 4
+                row, place = neighbour(
+                    volume.table,
+                    volume.blocks,
+                    b,
+                    x + (low & 1),
+                    y + (low >> 1 & 1),
+                    z + (low >> 2 & 1),
+                )
+                vertex = first[row, place]
+                for before in range(axis):
+                    vertex += crossed[row, place] >> before & 1
+                faces[number + k // 3, k % 3] = vertex
+            number += triangle_counts[case]

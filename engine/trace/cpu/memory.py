@@ -137,11 +137,11 @@ def output_gradient_arrays(gradients: TraceGradients, rays: int, features: int) 
     return OutputGradientArrays(
         contiguous_float32(g.rgb_srgb),
         zeros_if_none(g.transmittance, (rays,)),
+        zeros_if_none(g.features, (rays, features)),
+        zeros_if_none(g.ray_errors, (rays,)),
         zeros_if_none(g.depth_sum, (rays,)),
         zeros_if_none(g.depth_median, (rays,)),
         zeros_if_none(g.normal_world, (rays, 3)),
-        zeros_if_none(g.features, (rays, features)),
-        zeros_if_none(g.ray_errors, (rays,)),
         g.has_geometry,
     )
 

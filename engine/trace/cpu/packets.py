@@ -8,27 +8,21 @@ from jaxtyping import Float32, Int32, Int64
 from octasplat.engine.core.compilation import run_on_threads, run_ranges
 from octasplat.engine.core.rays import RayBatch
 from octasplat.engine.trace.cpu.kernels.kernel_args import (
+    BackwardPass,
     ForwardPass,
-    GaussianParameters,
     GaussianSegments,
-    OutputGradientArrays,
     PackedScene,
     PacketHits,
     RayArrays,
     SharedSortHits,
     TraceLimits,
 )
-from octasplat.engine.trace.cpu.kernels.packet_backward import (
-    GEOMETRY_WORDS,
-    ROW_WORDS,
-    BackwardPass,
-    MomentRows,
-    backward_packets,
-    reduce_packets,
-    reduce_weights,
-)
+from octasplat.engine.trace.cpu.kernels.moment_rows import GEOMETRY_WORDS, ROW_WORDS, MomentRows
+from octasplat.engine.trace.cpu.kernels.packet_backward import backward_packets
 from octasplat.engine.trace.cpu.kernels.packet_candidates import find_packet_starts
-from octasplat.engine.trace.cpu.kernels.packet_forward import packet_transmittance, trace_packets
+from octasplat.engine.trace.cpu.kernels.packet_forward import trace_packets
+from octasplat.engine.trace.cpu.kernels.packet_reduction import reduce_packets, reduce_weights
+from octasplat.engine.trace.cpu.kernels.packet_transmittance import packet_transmittance
 from octasplat.engine.trace.cpu.kernels.radix_sort import sort_by_gaussian
 from octasplat.engine.trace.cpu.kernels.rays import HIT_PADDING
 from octasplat.engine.trace.cpu.kernels.shared_sort import trace_packets_shared_sort
@@ -181,22 +175,17 @@ class PacketTracer:
         )  # fmt: skip
 
     def backward(
-        self,
-        recording: CpuRecording,
-        gradients: OutputGradientArrays,
-        scene: PackedScene,
-        parameters: GaussianParameters,
-        min_blend_weight: float,
+        self, recording: CpuRecording, backward: BackwardPass, min_blend_weight: float
     ) -> GaussianGradients:
         """Return gradients of the raw parameters, summed within each packet, then in packet order.
 
         Gaussians whose weights add up to less than ``min_blend_weight`` are left out before the sums.
         """
-        packet_hits = recording.packet_hits
+        packet_hits, scene = recording.packet_hits, backward.scene
         counts = packet_hits.counts if isinstance(packet_hits, SharedSortHits) else packet_hits.slot_counts
         firsts = np.concatenate([[0], np.cumsum(counts, dtype=np.int64)])
         count, basis_count, feature_count = int(firsts[-1]), scene.sh.shape[1], scene.features.shape[1]
-        geometry = GEOMETRY_WORDS if gradients.has_geometry else 0
+        geometry = GEOMETRY_WORDS if backward.output_gradients.has_geometry else 0
         ids, weights, sums, by_geometry, features = self._pool.empty(
             ((count,), np.int32),
             ((count,), np.float32),
@@ -205,37 +194,32 @@ class PacketTracer:
             ((count, feature_count), np.float32),
         )
         rows = MomentRows(firsts, ids, weights, sums, by_geometry, features)
-        rays, packets, counter = (
-            RayArrays.from_batch(recording.rays),
-            recording.packets,
-            np.zeros(1, np.int64),
-        )
+        packets, counter = recording.packets, np.zeros(1, np.int64)
         if isinstance(packet_hits, SharedSortHits):
             run_on_threads(
                 backward_packets_shared_sort,
                 self._threads,
-                rays,
+                backward,
                 packets,
                 packet_hits,
-                self._limits,
-                gradients,
                 counter,
                 rows,
             )
         else:
             run_on_threads(
                 backward_packets, self._threads,
-                rays, packets, recording.hits, packet_hits, recording.counts, parameters, scene.features,
-                self._limits, gradients, counter, rows,
+                backward, packets, recording.hits, packet_hits, recording.counts, counter, rows,
             )  # fmt: skip
-        by_gaussian = GaussianSegments(*sort_by_gaussian(rows.ids, len(parameters.means), self._threads))
+        by_gaussian = GaussianSegments(
+            *sort_by_gaussian(rows.ids, len(backward.parameters.means), self._threads)
+        )
         met = np.empty(len(by_gaussian.starts) - 1, np.float32)
         run_ranges(reduce_weights, self._threads, len(met), by_gaussian, rows.weights, met)
         which = np.flatnonzero(met >= min_blend_weight)
         out = empty_gradients(len(which), basis_count, feature_count)
         run_on_threads(
             reduce_packets, self._threads,
-            BackwardPass(rays, packets, parameters, scene, self._limits), by_gaussian, which, rows,
+            backward, packets, by_gaussian, which, rows,
             REDUCE_CHUNKS_PER_THREAD * self._threads, np.zeros(1, np.int64), gradient_arrays(out),
         )  # fmt: skip
         return out

@@ -5,10 +5,9 @@ from jaxtyping import Float32, Int64
 
 from octasplat.engine.core.compilation import run_on_threads, run_ranges
 from octasplat.engine.trace.cpu.kernels.kernel_args import (
+    BackwardPass,
     ForwardPass,
-    GaussianParameters,
     GaussianSegments,
-    OutputGradientArrays,
     PackedScene,
     RayArrays,
     TraceLimits,
@@ -98,24 +97,18 @@ class SingleRayTracer:
             _rays_per_chunk(ray_indices), np.zeros(1, np.int64), transmittance,
         )  # fmt: skip
 
-    def backward(
-        self,
-        recording: CpuRecording,
-        gradients: OutputGradientArrays,
-        scene: PackedScene,
-        parameters: GaussianParameters,
-    ) -> GaussianGradients:
+    def backward(self, recording: CpuRecording, backward: BackwardPass) -> GaussianGradients:
         """Return gradients of the raw parameters, hits sorted by Gaussian and summed in ray order."""
-        rays, which = RayArrays.from_batch(recording.rays), recording.single_rays
+        which, scene = recording.single_rays, backward.scene
         offsets = np.concatenate([[0], np.cumsum(recording.counts[which], dtype=np.int64)])
         total = int(offsets[-1])
         ids, flags = np.empty(total, np.int32), np.empty(total, np.int32)
         shares = HitGradients(ids, flags, *(np.empty(total, np.float32) for _ in range(3)))
         run_ranges(
             backward_rays, self._threads, len(which),
-            rays, which, offsets, recording.hits, recording.counts, scene, self._limits, gradients, shares,
+            which, offsets, backward, recording.hits, recording.counts, shares,
         )  # fmt: skip
-        by_gaussian = GaussianSegments(*sort_by_gaussian(ids, len(parameters.means), self._threads))
+        by_gaussian = GaussianSegments(*sort_by_gaussian(ids, len(backward.parameters.means), self._threads))
         starts = by_gaussian.starts
         segments = len(starts) - 1
         places = np.linspace(0, total, REDUCE_CHUNKS_PER_THREAD * self._threads + 1).astype(np.int64)
@@ -124,8 +117,7 @@ class SingleRayTracer:
         out = empty_gradients(segments, scene.sh.shape[1], scene.features.shape[1])
         run_on_threads(
             reduce_hits, self._threads,
-            rays, parameters, scene, self._limits, by_gaussian, bounds,
-            np.zeros(1, np.int64), shares, gradients, gradient_arrays(out),
+            backward, by_gaussian, bounds, np.zeros(1, np.int64), shares, gradient_arrays(out),
         )  # fmt: skip
         return out
 

@@ -9,6 +9,7 @@ from octasplat.engine.core.rays import RayBatch
 from octasplat.engine.core.threads import use_threads
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.trace.cpu.kernels.kernel_args import (
+    BackwardPass,
     ForwardPass,
     GaussianParameters,
     HitArrays,
@@ -113,7 +114,7 @@ class CpuTracer:
             self.threads,
             count,
             self._primitives,
-            *GaussianParameters.from_gaussians(gaussians),
+            GaussianParameters.from_gaussians(gaussians),
             self.settings.q,
         )
         self._packet_tracer.build(self._primitives)
@@ -127,13 +128,13 @@ class CpuTracer:
         if ids is None:
             ids = np.arange(len(self._gaussians), dtype=np.int32)
         parameters, q = GaussianParameters.from_gaussians(self._gaussians), self.settings.q
-        run_ranges(repack_primitives, self.threads, len(ids), self._primitives, ids, *parameters, q)
+        run_ranges(repack_primitives, self.threads, len(ids), self._primitives, ids, parameters, q)
         self._packet_tracer.refresh(self._primitives, ids)
         if self._is_single_built:
             outgrown = np.zeros(len(ids), np.bool_)
             run_ranges(
                 refit_outgrown_boxes, self.threads, len(ids),
-                outgrown, self._boxes, ids, *parameters, q, self._padding,
+                outgrown, self._boxes, ids, parameters, q, self._padding,
             )  # fmt: skip
             self._is_single_built = not outgrown.any()
 
@@ -187,15 +188,16 @@ class CpuTracer:
         if isinstance(recording.packet_hits, SharedSortHits) and gradients.has_geometry:
             raise ValueError("depths and normals have no gradients in one order: trace with sort='ray'")
         given = output_gradient_arrays(gradients, len(recording.rays), self._features.shape[1])
-        parameters = GaussianParameters.from_gaussians(self._gaussians)
+        backward = BackwardPass(
+            RayArrays.from_batch(recording.rays), GaussianParameters.from_gaussians(self._gaussians),
+            self._packed_scene, self._limits, given,
+        )  # fmt: skip
         if len(recording.single_rays) == 0:
-            return self._packet_tracer.backward(
-                recording, given, self._packed_scene, parameters, min_blend_weight
-            )
+            return self._packet_tracer.backward(recording, backward, min_blend_weight)
         parts = []
         if len(recording.packets):
-            parts.append(self._packet_tracer.backward(recording, given, self._packed_scene, parameters, 0.0))
-        parts.append(self._single_tracer.backward(recording, given, self._packed_scene, parameters))
+            parts.append(self._packet_tracer.backward(recording, backward, 0.0))
+        parts.append(self._single_tracer.backward(recording, backward))
         return drop_low_weight(add_gradients(parts), min_blend_weight)
 
     @property
@@ -220,7 +222,7 @@ class CpuTracer:
             parameters = GaussianParameters.from_gaussians(self._gaussians)
             run_ranges(
                 write_boxes, self.threads, len(self._boxes),
-                self._boxes, *parameters, self.settings.q, self._padding,
+                self._boxes, parameters, self.settings.q, self._padding,
             )  # fmt: skip
             self._single_tracer.build(self._boxes)
             self._is_single_built = True

@@ -87,7 +87,9 @@ float64_pointer = _pointer_cast(types.float64)
 uint64_pointer = _pointer_cast(types.uint64)
 
 
-def _call_address(context: BaseContext, builder: ir.IRBuilder, args: Sequence[ir.Value]) -> ir.Value:
+def _call_address(
+    context: BaseContext, builder: ir.IRBuilder, sig: Signature, args: Sequence[ir.Value]
+) -> ir.Value:
     """Call the address ``args[0]`` with the others as pointers."""
     pointer = ir.IntType(8).as_pointer()
     function_type = ir.FunctionType(ir.VoidType(), [pointer] * (len(args) - 1))
@@ -102,13 +104,7 @@ def call_with_three_pointers(
 ) -> Intrinsic:
     """Call ``void function(void*, void*, void*)`` at a run-time address."""
     signature = types.void(types.uintp, types.uintp, types.uintp, types.uintp)
-
-    def codegen(
-        context: BaseContext, builder: ir.IRBuilder, sig: Signature, args: Sequence[ir.Value]
-    ) -> ir.Value:
-        return _call_address(context, builder, args)
-
-    return signature, codegen
+    return signature, _call_address
 
 
 @intrinsic
@@ -122,13 +118,7 @@ def call_with_four_pointers(
 ) -> Intrinsic:
     """Call ``void function(void*, void*, void*, void*)`` at a run-time address."""
     signature = types.void(types.uintp, types.uintp, types.uintp, types.uintp, types.uintp)
-
-    def codegen(
-        context: BaseContext, builder: ir.IRBuilder, sig: Signature, args: Sequence[ir.Value]
-    ) -> ir.Value:
-        return _call_address(context, builder, args)
-
-    return signature, codegen
+    return signature, _call_address
 
 
 @intrinsic

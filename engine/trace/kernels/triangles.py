@@ -55,17 +55,17 @@ class TriangleHitArrays(NamedTuple):
 def _query_rays8(
     query: EmbreeQuery,
     rays: TriangleRays,
-    first: int,
-    last: int,
+    row: int,
+    end: int,
     is_coherent: bool,
     scratch: Float32[np.ndarray, " w"],
 ) -> None:
-    """Trace up to eight rays, from row ``first`` on and before ``last``."""
+    """Trace up to eight rays, from ``row`` on and before ``end``."""
     words = scratch.view(np.int32)
     # --- the rays, a lane each ---
     for lane in range(LANES):
-        row = min(first + lane, last - 1)
-        r = rays.ray_indices[row] if len(rays.ray_indices) else row
+        lane_row = min(row + lane, end - 1)
+        r = rays.ray_indices[lane_row] if len(rays.ray_indices) else lane_row
         o = r if len(rays.origins) > 1 else 0
         for axis in range(3):
             scratch[(ORIGIN + axis) * LANES + lane] = rays.origins[o, axis]
@@ -81,7 +81,7 @@ def _query_rays8(
         words[FACE * LANES + lane] = INVALID_ID
         words[GEOMETRY * LANES + lane] = INVALID_ID
         words[INSTANCE * LANES + lane] = INVALID_ID
-        words[VALID * LANES + lane] = -1 if first + lane < last and near <= far else 0
+        words[VALID * LANES + lane] = -1 if row + lane < end and near <= far else 0
     # --- RTCIntersectArguments ---
     words[ARGUMENTS * LANES] = RTC_RAY_QUERY_FLAG_COHERENT if is_coherent else 0
     words[ARGUMENTS * LANES + 1] = RTC_FEATURE_FLAG_ALL

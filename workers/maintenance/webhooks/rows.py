@@ -9,7 +9,7 @@ from typing import Any, Literal
 from psycopg.rows import class_row
 
 from octasplat.engine.core.errors import OctasplatError
-from octasplat.workers.db.connections import Connection, with_columns
+from octasplat.workers.db.connections import Connection, fetch_all, fetch_one, with_columns
 from octasplat.workers.db.errors import NotFoundError
 from octasplat.workers.db.ids import new_id
 from octasplat.workers.db.locks import lock_owner
@@ -133,11 +133,9 @@ async def add_endpoint(
 
 async def get_endpoint(connection: Connection, endpoint_id: uuid.UUID) -> Endpoint | None:
     """Return the endpoint of that id, or None."""
-    async with connection.cursor(row_factory=class_row(Endpoint)) as cursor:
-        await cursor.execute(
-            with_columns("SELECT {} FROM webhook_endpoints WHERE id = %s", Endpoint), [endpoint_id]
-        )
-        return await cursor.fetchone()
+    return await fetch_one(
+        connection, Endpoint, "SELECT {} FROM webhook_endpoints WHERE id = %s", [endpoint_id]
+    )
 
 
 async def list_endpoints(
@@ -155,20 +153,17 @@ async def list_endpoints(
         before: made before this one.
         limit: at most so many.
     """
-    async with connection.cursor(row_factory=class_row(Endpoint)) as cursor:
-        await cursor.execute(
-            with_columns(
-                """
+    return await fetch_all(
+        connection,
+        Endpoint,
+        """
             SELECT {} FROM webhook_endpoints
             WHERE (%(owner)s::text IS NULL OR owner = %(owner)s)
               AND (%(before)s::uuid IS NULL OR id < %(before)s)
             ORDER BY id DESC LIMIT %(limit)s
             """,
-                Endpoint,
-            ),
-            {"owner": owner, "before": before, "limit": limit},
-        )
-        return await cursor.fetchall()
+        {"owner": owner, "before": before, "limit": limit},
+    )
 
 
 async def change_endpoint(
@@ -215,21 +210,18 @@ async def add_delivery(
     connection: Connection, endpoint_id: uuid.UUID, kind: str, data: dict[str, Any]
 ) -> Delivery:
     """Put a message into the queue."""
-    async with connection.cursor(row_factory=class_row(Delivery)) as cursor:
-        await cursor.execute(
-            with_columns(
-                """
+    delivery = await fetch_one(
+        connection,
+        Delivery,
+        """
             INSERT INTO webhook_deliveries (endpoint_id, kind, payload)
             VALUES (%(endpoint)s, %(kind)s, jsonb_build_object(
                 'type', %(kind)s::text, 'data', %(data)s::jsonb,
                 'timestamp', to_char(now() AT TIME ZONE 'UTC', 'YYYY-MM-DD"T"HH24:MI:SS.US"Z"')))
             RETURNING {}
             """,
-                Delivery,
-            ),
-            {"endpoint": endpoint_id, "kind": kind, "data": as_json(data)},
-        )
-        delivery = await cursor.fetchone()
+        {"endpoint": endpoint_id, "kind": kind, "data": as_json(data)},
+    )
     assert delivery is not None
     return delivery
 
@@ -238,27 +230,24 @@ async def get_delivery(
     connection: Connection, endpoint_id: uuid.UUID, delivery_id: uuid.UUID
 ) -> Delivery | None:
     """Return a message to an endpoint, or None."""
-    async with connection.cursor(row_factory=class_row(Delivery)) as cursor:
-        await cursor.execute(
-            with_columns("SELECT {} FROM webhook_deliveries WHERE id = %s AND endpoint_id = %s", Delivery),
-            [delivery_id, endpoint_id],
-        )
-        return await cursor.fetchone()
+    return await fetch_one(
+        connection,
+        Delivery,
+        "SELECT {} FROM webhook_deliveries WHERE id = %s AND endpoint_id = %s",
+        [delivery_id, endpoint_id],
+    )
 
 
 async def list_deliveries(connection: Connection, endpoint_id: uuid.UUID, limit: int) -> list[Delivery]:
     """Return the newest messages to an endpoint."""
-    async with connection.cursor(row_factory=class_row(Delivery)) as cursor:
-        await cursor.execute(
-            with_columns(
-                """
+    return await fetch_all(
+        connection,
+        Delivery,
+        """
                 SELECT {} FROM webhook_deliveries WHERE endpoint_id = %s ORDER BY created_at DESC, id LIMIT %s
                 """,
-                Delivery,
-            ),
-            [endpoint_id, limit],
-        )
-        return await cursor.fetchall()
+        [endpoint_id, limit],
+    )
 
 
 async def redeliver(connection: Connection, delivery_id: uuid.UUID) -> Delivery:
@@ -267,18 +256,15 @@ async def redeliver(connection: Connection, delivery_id: uuid.UUID) -> Delivery:
     Raises:
         NotFoundError: there is no such message.
     """
-    async with connection.cursor(row_factory=class_row(Delivery)) as cursor:
-        await cursor.execute(
-            with_columns(
-                """
+    delivery = await fetch_one(
+        connection,
+        Delivery,
+        """
             UPDATE webhook_deliveries SET state = 'pending', failures = 0, due_at = now() WHERE id = %s
             RETURNING {}
             """,
-                Delivery,
-            ),
-            [delivery_id],
-        )
-        delivery = await cursor.fetchone()
+        [delivery_id],
+    )
     if delivery is None:
         raise NotFoundError("message")
     return delivery

@@ -162,12 +162,22 @@ class OutputGradientArrays(NamedTuple):
 
     rgb: Float32[np.ndarray, "r 3"]
     transmittance: Float32[np.ndarray, " r"]
+    features: Float32[np.ndarray, "r f"]
+    ray_errors: Float32[np.ndarray, " r"]
     depth_sum: Float32[np.ndarray, " r"]
     depth_median: Float32[np.ndarray, " r"]
     normal: Float32[np.ndarray, "r 3"]
-    features: Float32[np.ndarray, "r f"]
-    ray_errors: Float32[np.ndarray, " r"]
     has_geometry: bool
+
+
+class BackwardPass(NamedTuple):
+    """A backward pass: rays, Gaussians as parameters and as packed, and gradients by the outputs."""
+
+    rays: RayArrays
+    parameters: GaussianParameters
+    scene: PackedScene
+    limits: TraceLimits
+    output_gradients: OutputGradientArrays
 
 
 class GaussianGradientArrays(NamedTuple):

@@ -133,9 +133,21 @@ def eval_alpha(
     return np.float32(min(primitive[OPACITY] * math.exp(-0.5 * (u * u + v * v)), context_f64[ALPHA_MAX]))
 
 
-@native_callback(types.void(types.CPointer(types.uint64)), fastmath={"contract"})
-def intersect_octagon(arguments: Address) -> None:
-    """Intersect one ray (RTCIntersectFunctionN): exact plane hit, octagon test, alpha, insertion."""
+@device_function(forceinline=True)
+def callback_arguments(
+    arguments: Address,
+) -> tuple[
+    np.int64,
+    Int32[np.ndarray, " words"],
+    Float32[np.ndarray, " words"],
+    Float64[np.ndarray, " words2"],
+    Float32[np.ndarray, " words"],
+    Float32[np.ndarray, "16"],
+]:
+    """Return what Embree hands to a callback for one ray.
+
+    The number of the Gaussian, the context as words of each type, the ray, and the Gaussian's record.
+    """
     words = carray(arguments, 6)
     gaussian = np.int64(words[2] & np.uint64(0xFFFFFFFF))
     context_i32 = carray(int32_pointer(words[3]), CONTEXT_WORDS)
@@ -147,7 +159,13 @@ def intersect_octagon(arguments: Address) -> None:
         float32_pointer(context_u64[PRIMITIVES_ADDRESS] + np.uint64(gaussian * PRIMITIVE_WORDS * 4)),
         PRIMITIVE_WORDS,
     )
+    return gaussian, context_i32, context_f32, context_f64, ray, record
 
+
+@native_callback(types.void(types.CPointer(types.uint64)), fastmath={"contract"})
+def intersect_octagon(arguments: Address) -> None:
+    """Intersect one ray (RTCIntersectFunctionN): exact plane hit, octagon test, alpha, insertion."""
+    gaussian, context_i32, context_f32, context_f64, ray, record = callback_arguments(arguments)
     distance, behind = intersect_plane(record, context_f64)
     t = np.float32(distance)
     if t > ray[RAY_TFAR] or t >= context_f32[T_MAX] or t < context_f32[LAST_T]:
@@ -175,16 +193,7 @@ def intersect_octagon(arguments: Address) -> None:
 @native_callback(types.void(types.CPointer(types.uint64)), fastmath={"contract"})
 def attenuate_by_octagon(arguments: Address) -> None:
     """Attenuate one ray (RTCOccludedFunctionN) by a Gaussian until too little transmittance is left."""
-    words = carray(arguments, 6)
-    gaussian = np.int64(words[2] & np.uint64(0xFFFFFFFF))
-    context_f32 = carray(float32_pointer(words[3]), CONTEXT_WORDS)
-    context_f64 = carray(float64_pointer(words[3]), CONTEXT_WORDS // 2)
-    context_u64 = carray(uint64_pointer(words[3]), CONTEXT_WORDS // 2)
-    ray = carray(float32_pointer(words[4]), RAY_WORDS)
-    record = carray(
-        float32_pointer(context_u64[PRIMITIVES_ADDRESS] + np.uint64(gaussian * PRIMITIVE_WORDS * 4)),
-        PRIMITIVE_WORDS,
-    )
+    _, _, context_f32, context_f64, ray, record = callback_arguments(arguments)
     distance, behind = intersect_plane(record, context_f64)
     t = np.float32(distance)
     if t <= context_f32[LAST_T] or t >= context_f32[T_MAX] or (behind and t < context_f32[T_BACKFACE_CULL]):

@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, Int32
 
 from octasplat.engine.core.compilation import device_function, kernel
+from octasplat.engine.trace.cpu.kernels.kernel_args import GaussianParameters
 from octasplat.engine.trace.cpu.kernels.octagon_hit import (
     AXIS_U,
     AXIS_V,
@@ -32,6 +33,16 @@ def rotation_columns(
 
 
 @device_function(_nrt=False, error_model="numpy")
+def gaussian_axes(
+    quats: Float32[np.ndarray, "n 4"], i: int
+) -> tuple[tuple[float, float, float], tuple[float, float, float], tuple[float, float, float]]:
+    """Return r1, r2 and r3 of Gaussian ``i`` in float64: its normal and the axes of its ellipse."""
+    return rotation_columns(
+        np.float64(quats[i, 0]), np.float64(quats[i, 1]), np.float64(quats[i, 2]), np.float64(quats[i, 3])
+    )
+
+
+@device_function(_nrt=False, error_model="numpy")
 def opacity_and_radius(logit: float, q: float) -> tuple[float, float]:
     """Return the opacity, and the octagon's corner radius in standard deviations."""
     # without overflow at either end
@@ -43,16 +54,13 @@ def opacity_and_radius(logit: float, q: float) -> tuple[float, float]:
 @device_function(_nrt=False, error_model="numpy")
 def ellipse_semi_axes(
     i: int,
-    quats: Float32[np.ndarray, "n 4"],
-    log_scales: Float32[np.ndarray, "n 2"],
-    logits: Float32[np.ndarray, " n"],
+    parameters: GaussianParameters,
     q: float,
 ) -> tuple[float, float, tuple[float, float, float], tuple[float, float, float]]:
     """Return corner radii in world units along r2 and r3, and those axes."""
-    _r1, r2, r3 = rotation_columns(
-        np.float64(quats[i, 0]), np.float64(quats[i, 1]), np.float64(quats[i, 2]), np.float64(quats[i, 3])
-    )
-    _opacity, radius = opacity_and_radius(np.float64(logits[i]), q)
+    log_scales = parameters.log_scales
+    _r1, r2, r3 = gaussian_axes(parameters.quats, i)
+    _opacity, radius = opacity_and_radius(np.float64(parameters.logits[i]), q)
     s2, s3 = math.exp(np.float64(log_scales[i, 0])), math.exp(np.float64(log_scales[i, 1]))
     return radius * s2, radius * s3, r2, r3
 
@@ -61,18 +69,14 @@ def ellipse_semi_axes(
 def pack_primitive(
     primitives: Float32[np.ndarray, "n 16"],
     i: int,
-    means: Float32[np.ndarray, "n 3"],
-    quats: Float32[np.ndarray, "n 4"],
-    log_scales: Float32[np.ndarray, "n 2"],
-    logits: Float32[np.ndarray, " n"],
+    parameters: GaussianParameters,
     q: float,
 ) -> None:
     """Pack one Gaussian into a row of ``primitives``."""
-    r1, r2, r3 = rotation_columns(
-        np.float64(quats[i, 0]), np.float64(quats[i, 1]), np.float64(quats[i, 2]), np.float64(quats[i, 3])
-    )
+    means, log_scales = parameters.means, parameters.log_scales
+    r1, r2, r3 = gaussian_axes(parameters.quats, i)
     per_s2, per_s3 = math.exp(-np.float64(log_scales[i, 0])), math.exp(-np.float64(log_scales[i, 1]))
-    opacity, radius = opacity_and_radius(np.float64(logits[i]), q)
+    opacity, radius = opacity_and_radius(np.float64(parameters.logits[i]), q)
     for axis in range(3):
         primitives[i, MEAN + axis] = means[i, axis]
         primitives[i, NORMAL + axis] = r1[axis]
@@ -88,25 +92,19 @@ def pack_primitives(
     first: int,
     last: int,
     primitives: Float32[np.ndarray, "n 16"],
-    means: Float32[np.ndarray, "n 3"],
-    quats: Float32[np.ndarray, "n 4"],
-    log_scales: Float32[np.ndarray, "n 2"],
-    logits: Float32[np.ndarray, " n"],
+    parameters: GaussianParameters,
     q: float,
 ) -> None:
     """Pack the Gaussians ``first`` to ``last`` (exclusive) into rows of ``primitives``."""
     for i in range(first, last):
-        pack_primitive(primitives, i, means, quats, log_scales, logits, q)
+        pack_primitive(primitives, i, parameters, q)
 
 
 @device_function(_nrt=False, error_model="numpy")
 def write_box(
     box: Float32[np.ndarray, "6"],
     i: int,
-    means: Float32[np.ndarray, "n 3"],
-    quats: Float32[np.ndarray, "n 4"],
-    log_scales: Float32[np.ndarray, "n 2"],
-    logits: Float32[np.ndarray, " n"],
+    parameters: GaussianParameters,
     q: float,
     padding: float,
 ) -> None:
@@ -114,11 +112,11 @@ def write_box(
 
     A Gaussian without an octagon gets a box turned inside out, which Embree leaves out of its hierarchy.
     """
-    a, b, r2, r3 = ellipse_semi_axes(i, quats, log_scales, logits, q)
+    a, b, r2, r3 = ellipse_semi_axes(i, parameters, q)
     reach = padding * max(a, b)
     for axis in range(3):
         half = math.sqrt((a * r2[axis]) ** 2 + (b * r3[axis]) ** 2)
-        centre = np.float64(means[i, axis])
+        centre = np.float64(parameters.means[i, axis])
         # Room for float32 rounding in the box test, and for changes to come.
         half += reach + 4e-6 * (abs(centre) + half)
         if a <= 0.0 or not math.isfinite(half):
@@ -132,16 +130,13 @@ def write_boxes(
     first: int,
     last: int,
     boxes: Float32[np.ndarray, "n 6"],
-    means: Float32[np.ndarray, "n 3"],
-    quats: Float32[np.ndarray, "n 4"],
-    log_scales: Float32[np.ndarray, "n 2"],
-    logits: Float32[np.ndarray, " n"],
+    parameters: GaussianParameters,
     q: float,
     padding: float,
 ) -> None:
     """Write boxes of all octagons, see :func:`write_box`."""
     for i in range(first, last):
-        write_box(boxes[i], i, means, quats, log_scales, logits, q, padding)
+        write_box(boxes[i], i, parameters, q, padding)
 
 
 @kernel(error_model="numpy")
@@ -151,10 +146,7 @@ def refit_outgrown_boxes(
     outgrown: Bool[np.ndarray, " u"],
     boxes: Float32[np.ndarray, "n 6"],
     ids: Int32[np.ndarray, " u"],
-    means: Float32[np.ndarray, "n 3"],
-    quats: Float32[np.ndarray, "n 4"],
-    log_scales: Float32[np.ndarray, "n 2"],
-    logits: Float32[np.ndarray, " n"],
+    parameters: GaussianParameters,
     q: float,
     padding: float,
 ) -> None:
@@ -166,13 +158,13 @@ def refit_outgrown_boxes(
     for k in range(first, last):
         i = ids[k]
         now = np.empty(6, np.float32)
-        write_box(now, i, means, quats, log_scales, logits, q, 0.0)
+        write_box(now, i, parameters, q, 0.0)
         out = np.float32(0.0)
         for axis in range(3):
             out = max(out, boxes[i, axis] - now[axis], now[3 + axis] - boxes[i, 3 + axis])
         if out > 0.0 and now[0] <= now[3]:
             outgrown[k] = True
-            write_box(boxes[i], i, means, quats, log_scales, logits, q, padding)
+            write_box(boxes[i], i, parameters, q, padding)
             if out < np.inf:
                 for axis in range(3):
                     boxes[i, axis] -= 4 * out
@@ -185,12 +177,9 @@ def repack_primitives(
     last: int,
     primitives: Float32[np.ndarray, "n 16"],
     ids: Int32[np.ndarray, " u"],
-    means: Float32[np.ndarray, "n 3"],
-    quats: Float32[np.ndarray, "n 4"],
-    log_scales: Float32[np.ndarray, "n 2"],
-    logits: Float32[np.ndarray, " n"],
+    parameters: GaussianParameters,
     q: float,
 ) -> None:
     """Write records of the Gaussians ``ids`` from their changed parameters."""
     for k in range(first, last):
-        pack_primitive(primitives, ids[k], means, quats, log_scales, logits, q)
+        pack_primitive(primitives, ids[k], parameters, q)

@@ -24,7 +24,7 @@ r"""Packets of rays that share an origin: which Gaussians may they meet, and the
    the hits before "safe", eight at once. It ends where its transmittance says so; what lies behind is never
    tested. A Gaussian has one colour for all rays of the packet, found when the first of them meets it.
 5. Backwards, the rays of a packet sum their shares of a Gaussian in one row of moments, which is enough as
-   all share o (:mod:`octasplat.engine.trace.cpu.kernels.packet_backward`). Rows are sorted and summed by
+   all share o (:mod:`octasplat.engine.trace.cpu.kernels.packet_reduction`). Rows are sorted and summed by
    Gaussian.
 
 Steps 1 to 3 leave out only what no ray meets. Rows are computed in float64 from the record, in the packet's

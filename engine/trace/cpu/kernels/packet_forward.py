@@ -13,63 +13,53 @@ from octasplat.engine.trace.cpu.kernels.kernel_args import (
     OutputArrays,
     PackedScene,
     PacketHits,
-    RayArrays,
     TraceLimits,
 )
 from octasplat.engine.trace.cpu.kernels.octagon_hit import MEAN, NORMAL
 from octasplat.engine.trace.cpu.kernels.packet_bvh import WIDTH
 from octasplat.engine.trace.cpu.kernels.packet_candidates import (
-    CANDIDATE_BLOCK_BYTES,
-    CHUNK,
     COLOR_NORMAL_WORDS,
     INITIAL_CAPACITY,
-    MASK_BITS,
     PRIMITIVE_BYTES,
     allocate_candidates,
     find_candidates,
     write_candidate_blocks,
 )
-from octasplat.engine.trace.cpu.kernels.packet_sort import copy_candidates_unsorted, sort_candidates
+from octasplat.engine.trace.cpu.kernels.packet_hits import (
+    BLOCKS_PER_CHUNK,
+    HIGH_WORD_SHIFT,
+    RANK_SORT_MAX,
+    eval_alphas,
+    intersect_blocks,
+    sort_hits,
+)
+from octasplat.engine.trace.cpu.kernels.packet_sort import sort_candidates
 from octasplat.engine.trace.cpu.kernels.packet_traversal import allocate_frustum, allocate_traversal
 from octasplat.engine.trace.cpu.kernels.rays import (
     facing_sign,
     first_hit_index,
+    next_packet,
     primitive_vector,
     ray_limits,
     ray_origin,
     ray_slopes,
 )
 from octasplat.engine.trace.cpu.kernels.simd8 import (
-    HitBuffer,
     HitStore,
     HitTables,
-    PacketRay,
     accumulate_color_normals,
     composite8,
-    eval_alphas8,
-    intersect_block8,
     lookup_slots8,
-    rank_sort,
     store_hits8,
 )
 from octasplat.engine.trace.cpu.kernels.simd_vector import float32_bits, float32_from_bits, lowest_bit
 from octasplat.engine.trace.cpu.kernels.spherical_harmonics import eval_color, eval_view_basis
 from octasplat.engine.trace.kernels.native import (
     Address,
-    atomic_fetch_next,
     njit_no_refcount,
     prefetch,
     prefetch_bytes,
 )
-
-RANK_SORT_MAX = 96
-"""Hits that are sorted by counting, for each, the smaller ones, eight at once: quadratic, but without a
-branch that the processor could guess wrongly. The few longer lists take an insertion sort.
-"""
-BLOCKS_PER_CHUNK = CHUNK // WIDTH
-CHUNK_BLOCKS_MASK = np.uint64((1 << BLOCKS_PER_CHUNK) - 1)
-LOW_WORD_MASK = np.uint64(0xFFFFFFFF)
-HIGH_WORD_SHIFT = np.uint64(32)
 
 
 class RayScratch(NamedTuple):
@@ -116,89 +106,6 @@ def allocate_ray_scratch() -> RayScratch:
         np.empty(WIDTH, np.int64),
         np.empty(WIDTH, np.int64),
     )
-
-
-@njit_no_refcount()
-def sort_ties_by_id(candidates: Candidates, first: int, last: int) -> None:
-    """Order the hits ``first`` to ``last``, which are sorted by distance, by id where distances are equal."""
-    pending, numbers, ids = candidates.hit_keys, candidates.hit_candidates, candidates.ids
-    for i in range(first + 1, last):
-        key = pending[i]
-        if key >> HIGH_WORD_SHIFT != pending[i - 1] >> HIGH_WORD_SHIFT:
-            continue
-        mine = ids[numbers[np.int64(key & LOW_WORD_MASK)]]
-        j = i
-        while (
-            j > first
-            and pending[j - 1] >> HIGH_WORD_SHIFT == key >> HIGH_WORD_SHIFT
-            and ids[numbers[np.int64(pending[j - 1] & LOW_WORD_MASK)]] > mine
-        ):
-            pending[j] = pending[j - 1]
-            j -= 1
-        pending[j] = key
-
-
-@njit_no_refcount()
-def sort_hits(candidates: Candidates, rank_buffer: UInt64[np.ndarray, "104"], first: int, last: int) -> None:
-    """Sort the hits ``first`` to ``last`` of a ray by distance, and by id where they share one."""
-    if last - first <= RANK_SORT_MAX:
-        if rank_sort(candidates.hit_keys.ctypes.data + first * 8, last - first, rank_buffer.ctypes.data):
-            sort_ties_by_id(candidates, first, last)
-        return
-    pending = candidates.hit_keys
-    for i in range(first + 1, last):
-        key = pending[i]
-        j = i
-        while j > first and pending[j - 1] > key:
-            pending[j] = pending[j - 1]
-            j -= 1
-        pending[j] = key
-    sort_ties_by_id(candidates, first, last)
-
-
-@njit_no_refcount(forceinline=True)
-def intersect_blocks(
-    candidates: Candidates,
-    ray_bit: int,
-    first: int,
-    slopes: tuple[float, float, float],
-    limits: tuple[float, float],
-    hit_count: int,
-) -> int:
-    """Test the ``BLOCKS_PER_CHUNK`` blocks from ``first`` on that the packet's ray ``ray_bit`` may meet.
-
-    Returns how many hits there are then; ``hit_count`` are known already. The blocks' bits lie in one word.
-    """
-    ray = PacketRay(
-        np.float32(slopes[0]), np.float32(slopes[1]), np.float32(slopes[2]),
-        np.float32(limits[0]), np.float32(limits[1]),
-    )  # fmt: skip
-    c = candidates
-    hits = HitBuffer(
-        c.hit_keys.ctypes.data, c.alphas.ctypes.data, c.opacities.ctypes.data, c.us.ctypes.data,
-        c.vs.ctypes.data, c.hit_candidates.ctypes.data,
-    )  # fmt: skip
-    blocks_at = c.blocks.ctypes.data
-    bits = (
-        c.ray_block_masks[first // MASK_BITS, ray_bit] >> np.uint64(first % MASK_BITS)
-    ) & CHUNK_BLOCKS_MASK
-    bits = np.int64(bits)
-    while bits != 0:
-        block = first + lowest_bit(bits)
-        bits &= bits - 1
-        hit_count += intersect_block8(
-            blocks_at + block * CANDIDATE_BLOCK_BYTES, ray, block * WIDTH, hit_count, hits
-        )
-    return hit_count
-
-
-@njit_no_refcount(forceinline=True)
-def eval_alphas(candidates: Candidates, first: int, last: int, alpha_max: float) -> None:
-    """Write alphas of the hits ``first`` to ``last`` of a ray."""
-    for place in range(first, last, WIDTH):
-        eval_alphas8(
-            candidates.alphas.ctypes.data, candidates.opacities.ctypes.data, place, np.float32(alpha_max)
-        )
 
 
 @njit_no_refcount(forceinline=True)
@@ -426,10 +333,9 @@ def trace_packets(
     pyramid, walk, scratch = allocate_frustum(), allocate_traversal(), allocate_ray_scratch()
     candidates = allocate_candidates(INITIAL_CAPACITY)
     while True:
-        packet = atomic_fetch_next(counter.ctypes.data)
-        if packet >= len(packets):
+        packet, first, last = next_packet(counter, packets)
+        if packet < 0:
             break
-        first, last = packets[packet, 0], packets[packet, 1]
         candidates, count = find_candidates(forward.rays, first, last, bvh, pyramid, walk, candidates)
         sort_candidates(candidates, count, bvh.order, walk.histogram)
         origin = ray_origin(forward.rays, first)
@@ -442,52 +348,3 @@ def trace_packets(
             place, slots = trace_ray(r, r - first, place, slots, state, scratch)
         if forward.is_recording:
             packet_hits.slot_counts[packet] = slots
-
-
-@njit_no_refcount(fastmath={"contract"})
-def ray_transmittance(
-    r: int,
-    ray_bit: int,
-    rays: RayArrays,
-    frame: Float64[np.ndarray, "15"],
-    candidates: Candidates,
-    count: int,
-    limits: TraceLimits,
-) -> float:
-    """Return what candidates leave of ray ``r``, ray ``ray_bit`` of its packet; 0 where it is below eps1."""
-    slopes, span = ray_slopes(rays, r, frame), ray_limits(rays, r)
-    block_count = (count + WIDTH - 1) // WIDTH
-    left = 1.0
-    for b0 in range(0, block_count, BLOCKS_PER_CHUNK):
-        tail = intersect_blocks(candidates, ray_bit, b0, slopes, span, 0)
-        eval_alphas(candidates, 0, tail, limits.alpha_max)
-        for m in range(tail):
-            left *= 1.0 - candidates.alphas[m]
-            if left < limits.eps1:
-                return 0.0
-    return left
-
-
-@kernel(error_model="numpy")
-def packet_transmittance(
-    rays: RayArrays,
-    scene: PackedScene,
-    limits: TraceLimits,
-    packets: Int64[np.ndarray, "p 2"],
-    bvh: BvhArrays,
-    counter: Int64[np.ndarray, "1"],
-    transmittance: Float32[np.ndarray, " r"],
-) -> None:
-    """Write the transmittance of rays alone: nothing is sorted, no colour is read."""
-    pyramid, walk = allocate_frustum(), allocate_traversal()
-    candidates = allocate_candidates(INITIAL_CAPACITY)
-    while True:
-        packet = atomic_fetch_next(counter.ctypes.data)
-        if packet >= len(packets):
-            break
-        first, last = packets[packet, 0], packets[packet, 1]
-        candidates, count = find_candidates(rays, first, last, bvh, pyramid, walk, candidates)
-        copy_candidates_unsorted(candidates, count, bvh.order)
-        write_candidate_blocks(candidates, count, scene, ray_origin(rays, first), pyramid.frame, False)
-        for r in range(first, last):
-            transmittance[r] = ray_transmittance(r, r - first, rays, pyramid.frame, candidates, count, limits)

@@ -3,10 +3,10 @@
 import math
 
 import numpy as np
-from jaxtyping import Float32, Float64
+from jaxtyping import Float32, Float64, Int64
 
-from octasplat.engine.trace.cpu.kernels.kernel_args import RayArrays, TraceLimits
-from octasplat.engine.trace.kernels.native import njit_no_refcount
+from octasplat.engine.trace.cpu.kernels.kernel_args import OutputGradientArrays, RayArrays, TraceLimits
+from octasplat.engine.trace.kernels.native import atomic_fetch_next, njit_no_refcount
 
 HIT_PADDING = 8
 """Places for hits beyond the most that a ray can have, as they are written eight at a time."""
@@ -93,3 +93,30 @@ def facing_sign(
 def first_hit_index(r: int, limits: TraceLimits) -> int:
     """Return where the hits of ray ``r`` may be stored from: each ray before it has room for its own."""
     return r * (limits.max_hits + HIT_PADDING)
+
+
+@njit_no_refcount(forceinline=True)
+def geometry_gradient(
+    output_gradients: OutputGradientArrays, r: int
+) -> tuple[float, float, tuple[float, float, float]]:
+    """Return the gradients by the summed depth, the median depth and the normal of ray ``r`` in float64."""
+    if not output_gradients.has_geometry:
+        return 0.0, 0.0, (0.0, 0.0, 0.0)
+    normal = output_gradients.normal
+    return (
+        np.float64(output_gradients.depth_sum[r]),
+        np.float64(output_gradients.depth_median[r]),
+        (np.float64(normal[r, 0]), np.float64(normal[r, 1]), np.float64(normal[r, 2])),
+    )
+
+
+@njit_no_refcount(forceinline=True)
+def next_packet(counter: Int64[np.ndarray, "1"], packets: Int64[np.ndarray, "p 2"]) -> tuple[int, int, int]:
+    """Return the number of the packet that is next by the ``counter``, its first ray and the one behind it.
+
+    The number is -1 where none is left.
+    """
+    packet = atomic_fetch_next(counter.ctypes.data)
+    if packet >= len(packets):
+        return -1, 0, 0
+    return packet, packets[packet, 0], packets[packet, 1]

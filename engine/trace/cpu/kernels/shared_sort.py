@@ -48,7 +48,7 @@ from octasplat.engine.trace.cpu.kernels.packet_candidates import (
 from octasplat.engine.trace.cpu.kernels.packet_forward import eval_color_normal
 from octasplat.engine.trace.cpu.kernels.packet_sort import sort_by_distance
 from octasplat.engine.trace.cpu.kernels.packet_traversal import allocate_frustum, allocate_traversal
-from octasplat.engine.trace.cpu.kernels.rays import ray_limits, ray_origin, ray_slopes
+from octasplat.engine.trace.cpu.kernels.rays import next_packet, ray_limits, ray_origin, ray_slopes
 from octasplat.engine.trace.cpu.kernels.simd16 import (
     COLOR,
     COUNT,
@@ -74,7 +74,6 @@ from octasplat.engine.trace.cpu.kernels.simd16 import (
 )
 from octasplat.engine.trace.kernels.native import (
     atomic_fetch_add,
-    atomic_fetch_next,
     njit_no_refcount,
     prefetch,
     prefetch_bytes,
@@ -274,10 +273,9 @@ def trace_packets_shared_sort(
     pyramid, walk = allocate_frustum(), allocate_traversal()
     candidates, view = allocate_candidates(INITIAL_CAPACITY), allocate_packet_scratch(INITIAL_CAPACITY)
     while True:
-        packet = atomic_fetch_next(counter.ctypes.data)
-        if packet >= len(packets):
+        packet, first, last = next_packet(counter, packets)
+        if packet < 0:
             break
-        first, last = packets[packet, 0], packets[packet, 1]
         candidates, count = find_candidates(forward.rays, first, last, bvh, pyramid, walk, candidates)
         if count > len(view.hit_ids):
             view = allocate_packet_scratch(len(candidates.curve_indices))

@@ -1,7 +1,7 @@
 """The backward pass for packets whose rays see their Gaussians in one order.
 
 Each Gaussian of a packet gets a row of moments as in
-:mod:`octasplat.engine.trace.cpu.kernels.packet_backward`, which sums them by Gaussian. Rays go back from what
+:mod:`octasplat.engine.trace.cpu.kernels.moment_rows`, which are summed by Gaussian. Rays go back from what
 they have left in the end; float32 is enough, as what lies behind is summed from the back.
 """
 
@@ -11,13 +11,9 @@ import numpy as np
 from jaxtyping import Float32, Int64
 
 from octasplat.engine.core.compilation import kernel
-from octasplat.engine.trace.cpu.kernels.kernel_args import (
-    OutputGradientArrays,
-    RayArrays,
-    SharedSortHits,
-    TraceLimits,
-)
-from octasplat.engine.trace.cpu.kernels.packet_backward import PACKET, RED, ROW_WORDS, MomentRows, W
+from octasplat.engine.trace.cpu.kernels.kernel_args import BackwardPass, SharedSortHits
+from octasplat.engine.trace.cpu.kernels.moment_rows import PACKET, RED, ROW_WORDS, MomentRows, W
+from octasplat.engine.trace.cpu.kernels.rays import next_packet
 from octasplat.engine.trace.cpu.kernels.shared_sort import allocate_aligned_rows, group_lanes, write_ray_rows
 from octasplat.engine.trace.cpu.kernels.simd16 import (
     BACKWARD_ROWS,
@@ -35,7 +31,7 @@ from octasplat.engine.trace.cpu.kernels.simd16 import (
     backward_group16,
     reduce_moments,
 )
-from octasplat.engine.trace.kernels.native import atomic_fetch_next, njit_no_refcount
+from octasplat.engine.trace.kernels.native import njit_no_refcount
 
 
 class SharedSortBackwardScratch(NamedTuple):
@@ -49,20 +45,19 @@ class SharedSortBackwardScratch(NamedTuple):
 @njit_no_refcount(fastmath={"contract"})
 def backward_packet_shared_sort(
     packet: int,
-    rays: RayArrays,
+    backward: BackwardPass,
     packets: Int64[np.ndarray, "p 2"],
     packet_hits: SharedSortHits,
-    limits: TraceLimits,
-    output_gradients: OutputGradientArrays,
     rows: MomentRows,
     scratch: SharedSortBackwardScratch,
 ) -> None:
     """Write the rows of one packet."""
     first, last = packets[packet, 0], packets[packet, 1]
     start, base, back = packet_hits.starts[packet], rows.firsts[packet], scratch.backward_rows
-    words, alpha_max = rows.sums.view(np.int32), np.float32(limits.alpha_max)
+    words, alpha_max = rows.sums.view(np.int32), np.float32(backward.limits.alpha_max)
+    output_gradients = backward.output_gradients
     rays_at, back_at, moments_at = scratch.ray_rows.ctypes.data, back.ctypes.data, scratch.moments.ctypes.data
-    write_ray_rows(rays, first, last, packet_hits.frames[packet], scratch.ray_rows)
+    write_ray_rows(backward.rays, first, last, packet_hits.frames[packet], scratch.ray_rows)
     back[:, :] = np.float32(0.0)
     for r in range(first, last):
         k = r - first
@@ -91,11 +86,9 @@ def backward_packet_shared_sort(
 
 @kernel(error_model="numpy")
 def backward_packets_shared_sort(
-    rays: RayArrays,
+    backward: BackwardPass,
     packets: Int64[np.ndarray, "p 2"],
     packet_hits: SharedSortHits,
-    limits: TraceLimits,
-    output_gradients: OutputGradientArrays,
     counter: Int64[np.ndarray, "1"],
     rows: MomentRows,
 ) -> None:
@@ -106,7 +99,7 @@ def backward_packets_shared_sort(
         allocate_aligned_rows(MOMENTS, GROUP_SIZE),
     )
     while True:
-        packet = atomic_fetch_next(counter.ctypes.data)
-        if packet >= len(packets):
+        packet, _first, _last = next_packet(counter, packets)
+        if packet < 0:
             break
-        backward_packet_shared_sort(packet, rays, packets, packet_hits, limits, output_gradients, rows, view)
+        backward_packet_shared_sort(packet, backward, packets, packet_hits, rows, view)

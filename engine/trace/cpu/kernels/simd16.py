@@ -47,7 +47,7 @@ COLOR = 12
 MOMENTS = 14
 """Sums of a Gaussian over the rays.
 
-A row of :mod:`octasplat.engine.trace.cpu.kernels.packet_backward` begins so.
+A row of :mod:`octasplat.engine.trace.cpu.kernels.moment_rows` begins so.
 """
 
 

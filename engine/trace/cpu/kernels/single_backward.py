@@ -5,7 +5,6 @@ h = dL/d ln(alpha). After the hits are sorted by Gaussian, the second kernel sum
 ray order in float64: no atomics, no dense buffer, and the same bits on any number of threads.
 """
 
-import math
 from typing import NamedTuple
 
 import numpy as np
@@ -13,20 +12,21 @@ from jaxtyping import Float32, Float64, Int32, Int64
 
 from octasplat.engine.core.compilation import kernel
 from octasplat.engine.gaussians.model import SH_C0
+from octasplat.engine.trace.cpu.kernels.geometry_gradients import (
+    GaussianMoments,
+    gaussian_frame,
+    write_geometry_gradients,
+)
 from octasplat.engine.trace.cpu.kernels.kernel_args import (
+    BackwardPass,
     GaussianGradientArrays,
-    GaussianParameters,
     GaussianSegments,
     HitArrays,
-    OutputGradientArrays,
-    PackedScene,
-    RayArrays,
-    TraceLimits,
 )
-from octasplat.engine.trace.cpu.kernels.octagon_hit import MEAN, NORMAL, OPACITY
-from octasplat.engine.trace.cpu.kernels.packed_primitives import rotation_columns
+from octasplat.engine.trace.cpu.kernels.octagon_hit import MEAN, NORMAL
 from octasplat.engine.trace.cpu.kernels.rays import (
     facing_sign,
+    geometry_gradient,
     primitive_vector,
     ray_direction,
     ray_origin,
@@ -57,47 +57,21 @@ class HitGradients(NamedTuple):
     g_t: Float32[np.ndarray, " e"]
 
 
-class GaussianMoments(NamedTuple):
-    """Sums over a Gaussian's hits; with the hit at u, v standard deviations and tau = dL/dt / <d, r1>.
-
-    ``n0`` to ``n2`` sum the gradient of the turned normal times the weight, ``m0`` to ``m2`` that by the mean
-    through the direction in which its colour is seen.
-    """
-
-    h: float
-    hu: float
-    hv: float
-    huu: float
-    huv: float
-    hvv: float
-    tau: float
-    tau_u: float
-    tau_v: float
-    n0: float
-    n1: float
-    n2: float
-    m0: float
-    m1: float
-    m2: float
-
-
 @njit_no_refcount(forceinline=True, fastmath={"contract"})
 def backward_ray(
     r: int,
     first: int,
-    rays: RayArrays,
+    backward: BackwardPass,
     hits: HitArrays,
     counts: Int32[np.ndarray, " r"],
-    scene: PackedScene,
-    limits: TraceLimits,
-    output_gradients: OutputGradientArrays,
     hit_gradients: HitGradients,
 ) -> None:
     """Write dL/dalpha_k = <g, T_k c_k - (C - prefix_k)/(1 - alpha_k)> of the hits of ray ``r``, per channel.
 
     They go to ``hit_gradients`` from ``first`` on.
     """
-    records, features = scene.primitives, scene.features
+    rays, limits, output_gradients = backward.rays, backward.limits, backward.output_gradients
+    records, features = backward.scene.primitives, backward.scene.features
     alphas, ts, hit_rgb = hits.alphas, hits.distances, hits.rgb
     weights = hit_gradients.weights
     feature_count = features.shape[1]
@@ -114,15 +88,8 @@ def backward_ray(
         np.float64(output_gradients.rgb[r, 1]),
         np.float64(output_gradients.rgb[r, 2]),
     )
-    gn0 = gn1 = gn2 = gd = gm = 0.0
+    gd, gm, (gn0, gn1, gn2) = geometry_gradient(output_gradients, r)
     ox, oy, oz = ray_origin(rays, r)
-    if output_gradients.has_geometry:
-        gd, gm = np.float64(output_gradients.depth_sum[r]), np.float64(output_gradients.depth_median[r])
-        gn0, gn1, gn2 = (
-            np.float64(output_gradients.normal[r, 0]),
-            np.float64(output_gradients.normal[r, 1]),
-            np.float64(output_gradients.normal[r, 2]),
-        )
     # What lies behind the current hit, as the gradient sees it: <g, C - prefix> over all channels. It is
     # summed from the back in float64: as a difference of sums it would drown behind opaque surfaces.
     behind = np.float64(output_gradients.transmittance[r]) * t
@@ -165,14 +132,11 @@ def backward_ray(
 def backward_rays(
     first: int,
     last: int,
-    rays: RayArrays,
     ray_indices: Int64[np.ndarray, " i"],
     offsets: Int64[np.ndarray, " i"],
+    backward: BackwardPass,
     hits: HitArrays,
     counts: Int32[np.ndarray, " r"],
-    scene: PackedScene,
-    limits: TraceLimits,
-    output_gradients: OutputGradientArrays,
     hit_gradients: HitGradients,
 ) -> None:
     """Run :func:`backward_ray` on the rays ``ray_indices``.
@@ -180,69 +144,7 @@ def backward_rays(
     ``offsets`` are the places of their hits in ``hit_gradients``.
     """
     for s in range(first, last):
-        backward_ray(
-            ray_indices[s], offsets[s], rays, hits, counts, scene, limits, output_gradients, hit_gradients
-        )
-
-
-@njit_no_refcount(forceinline=True, fastmath={"contract"})
-def write_geometry_gradients(
-    segment: int,
-    i: int,
-    frame: tuple[
-        tuple[float, float, float], tuple[float, float, float], tuple[float, float, float], float, float
-    ],
-    quats: Float32[np.ndarray, "n 4"],
-    primitives: Float32[np.ndarray, "n 16"],
-    moments: GaussianMoments,
-    out: GaussianGradientArrays,
-) -> None:
-    """Write gradients of one Gaussian's raw geometry from its sums over rays.
-
-    In the Gaussian's own frame, with u, v the hit in standard deviations, tau = dL/dt through the point
-    over <d, r1>: dL/dm = S(h u)/s2 r2 + S(h v)/s3 r3 + S(tau) r1, dL/dln s = S(h u^2), S(h v^2), and the
-    frame turns by the torque S r_i x dL/dr_i. ``frame`` are r1, r2, r3, s2 and s3.
-    """
-    q0, q1, q2, q3 = (
-        np.float64(quats[i, 0]), np.float64(quats[i, 1]), np.float64(quats[i, 2]), np.float64(quats[i, 3])
-    )  # fmt: skip
-    r1, r2, r3, s2, s3 = frame
-    inv_s2, inv_s3 = 1.0 / s2, 1.0 / s3
-    # torque = r1 x G1 + r2 x G2 + r3 x G3, G1 = -(sums.tau_u s2 r2 + sums.tau_v s3 r3) + normal channel
-    on_r3, on_r2 = -moments.tau_u * s2, moments.tau_v * s3
-    on_r1 = -moments.huv * s3 * inv_s2 + moments.huv * s2 * inv_s3
-    w0 = on_r1 * r1[0] + on_r2 * r2[0] + on_r3 * r3[0] + r1[1] * moments.n2 - r1[2] * moments.n1
-    w1 = on_r1 * r1[1] + on_r2 * r2[1] + on_r3 * r3[1] + r1[2] * moments.n0 - r1[0] * moments.n2
-    w2 = on_r1 * r1[2] + on_r2 * r2[2] + on_r3 * r3[2] + r1[0] * moments.n1 - r1[1] * moments.n0
-    # dL/dq = 2 (0, w) q / |q|^2: the rotation depends on the direction of q only
-    factor = 2.0 / (q0 * q0 + q1 * q1 + q2 * q2 + q3 * q3)
-    out.quats[segment, 0] = factor * (-w0 * q1 - w1 * q2 - w2 * q3)
-    out.quats[segment, 1] = factor * (w0 * q0 + w1 * q3 - w2 * q2)
-    out.quats[segment, 2] = factor * (w1 * q0 + w2 * q1 - w0 * q3)
-    out.quats[segment, 3] = factor * (w2 * q0 + w0 * q2 - w1 * q1)
-    by_view = moments.m0, moments.m1, moments.m2
-    for axis in range(3):
-        out.means[segment, axis] = (
-            moments.hu * inv_s2 * r2[axis]
-            + moments.hv * inv_s3 * r3[axis]
-            + moments.tau * r1[axis]
-            + by_view[axis]
-        )
-    out.log_scales[segment, 0] = moments.huu
-    out.log_scales[segment, 1] = moments.hvv
-    out.logits[segment] = moments.h * (1.0 - np.float64(primitives[i, OPACITY]))
-
-
-@njit_no_refcount(forceinline=True)
-def gaussian_frame(
-    i: int, quats: Float32[np.ndarray, "n 4"], log_scales: Float32[np.ndarray, "n 2"]
-) -> tuple[tuple[float, float, float], tuple[float, float, float], tuple[float, float, float], float, float]:
-    """Return r1, r2, r3, s2 and s3 of Gaussian ``i`` in float64."""
-    r1, r2, r3 = rotation_columns(
-        np.float64(quats[i, 0]), np.float64(quats[i, 1]), np.float64(quats[i, 2]), np.float64(quats[i, 3])
-    )
-    s2, s3 = math.exp(np.float64(log_scales[i, 0])), math.exp(np.float64(log_scales[i, 1]))
-    return r1, r2, r3, s2, s3
+        backward_ray(ray_indices[s], offsets[s], backward, hits, counts, hit_gradients)
 
 
 @njit_no_refcount(forceinline=True, fastmath={"contract"})
@@ -323,13 +225,9 @@ def reduce_hits_chunk(
     first: int,
     last: int,
     scratch: tuple[Float64[np.ndarray, "16"], Float64[np.ndarray, "16 3"], Float64[np.ndarray, " f"]],
-    rays: RayArrays,
-    parameters: GaussianParameters,
-    scene: PackedScene,
-    limits: TraceLimits,
+    backward: BackwardPass,
     gaussian_segments: GaussianSegments,
     hit_gradients: HitGradients,
-    output_gradients: OutputGradientArrays,
     out: GaussianGradientArrays,
 ) -> None:
     """Write the gradients of the Gaussians ``first`` to ``last`` of the sorted hits.
@@ -337,6 +235,8 @@ def reduce_hits_chunk(
     ``scratch`` has room for the harmonics, their gradients and those of the features.
     """
     basis, sh_sum, feature_sum = scratch
+    rays, scene, limits = backward.rays, backward.scene, backward.limits
+    parameters, output_gradients = backward.parameters, backward.output_gradients
     order, starts = gaussian_segments.order, gaussian_segments.starts
     means, quats, log_scales = parameters.means, parameters.quats, parameters.log_scales
     basis_count, feature_count = out.sh.shape[1], out.features.shape[1]
@@ -401,15 +301,11 @@ def reduce_hits_chunk(
 
 @kernel(fastmath={"contract"}, error_model="numpy")
 def reduce_hits(
-    rays: RayArrays,
-    parameters: GaussianParameters,
-    scene: PackedScene,
-    limits: TraceLimits,
+    backward: BackwardPass,
     gaussian_segments: GaussianSegments,
     chunk_bounds: Int64[np.ndarray, " c1"],
     counter: Int64[np.ndarray, "1"],
     hit_gradients: HitGradients,
-    output_gradients: OutputGradientArrays,
     out: GaussianGradientArrays,
 ) -> None:
     """Sum the hits of each Gaussian and turn the sums into gradients of its raw parameters.
@@ -423,16 +319,4 @@ def reduce_hits(
         if chunk >= len(chunk_bounds) - 1:
             break
         first, last = chunk_bounds[chunk], chunk_bounds[chunk + 1]
-        reduce_hits_chunk(
-            first,
-            last,
-            memory,
-            rays,
-            parameters,
-            scene,
-            limits,
-            gaussian_segments,
-            hit_gradients,
-            output_gradients,
-            out,
-        )
+        reduce_hits_chunk(first, last, memory, backward, gaussian_segments, hit_gradients, out)

@@ -59,7 +59,7 @@ class EmbreeRayQuery(NamedTuple):
 
 @njit_no_refcount()
 def chunk_context(
-    embree: EmbreeRayQuery, chunk: int
+    embree: EmbreeRayQuery, chunk: int, primitives: Float32[np.ndarray, "n 16"]
 ) -> tuple[
     Float32[np.ndarray, " words"],
     Int32[np.ndarray, " words"],
@@ -67,9 +67,10 @@ def chunk_context(
     Int32[np.ndarray, " words"],
     Float64[np.ndarray, " words"],
 ]:
-    """Return the ray of a chunk and its context, as words of each type."""
+    """Return the ray of a chunk and its context, as words of each type; the context has the records."""
     ray = embree.scratch[chunk]
     context = ray[RAY_WORDS:]
+    context.view(np.uint64)[PRIMITIVES_ADDRESS] = primitives.ctypes.data
     return ray, ray.view(np.int32), context, context.view(np.int32), context.view(np.float64)
 
 
@@ -117,8 +118,7 @@ def trace_rays_worker(
         chunk = atomic_fetch_next(counter.ctypes.data)
         if chunk >= chunk_count:
             break
-        ray, ray_i32, context, context_i32, context_f64 = chunk_context(embree, chunk)
-        context.view(np.uint64)[PRIMITIVES_ADDRESS] = scene.primitives.ctypes.data
+        ray, ray_i32, context, context_i32, context_f64 = chunk_context(embree, chunk, scene.primitives)
         context_f64[PRUNE_BELOW], context_f64[ALPHA_MAX] = prune_below, limits.alpha_max
         place, before = 0, -2
         for s in range(chunk * rays_per_chunk, min(len(ray_indices), (chunk + 1) * rays_per_chunk)):
@@ -195,8 +195,7 @@ def write_ray_transmittance(
         chunk = atomic_fetch_next(counter.ctypes.data)
         if chunk >= chunk_count:
             break
-        ray, ray_i32, context, context_i32, context_f64 = chunk_context(embree, chunk)
-        context.view(np.uint64)[PRIMITIVES_ADDRESS] = scene.primitives.ctypes.data
+        ray, ray_i32, context, context_i32, context_f64 = chunk_context(embree, chunk, scene.primitives)
         context_f64[PRUNE_BELOW], context_f64[ALPHA_MAX] = limits.eps1, limits.alpha_max
         for s in range(chunk * rays_per_chunk, min(len(ray_indices), (chunk + 1) * rays_per_chunk)):
             r = ray_indices[s]

@@ -2,31 +2,19 @@
 
 import { OrbitControls, PerspectiveCamera, Vector3 } from "../vendor/three.js";
 import { thousands } from "../numbers.js";
+import { LoadingViewer } from "./loading_viewer.js";
 import { MeshRenderer } from "./meshes.js";
 
-const AUTOMATIC_BYTES = 80e6;
 const MAX_PIXEL_RATIO = 2;
 const BACKGROUNDS = [[0, 0, 0], [1, 1, 1]];
 const START = new Vector3(0.5, 0.4, 1).normalize();
 const FOV = 45;
 
-class MeshViewer {
+class MeshViewer extends LoadingViewer {
     constructor(box) {
-        this.box = box;
-        this.canvas = box.querySelector("canvas");
-        this.veil = box.querySelector(".veil");
+        super(box);
         this.background = 0;
-        const button = this.veil.querySelector("button");
-        if (Number(box.dataset.size) <= AUTOMATIC_BYTES && !navigator.connection?.saveData) this.start();
-        else {
-            this.say("");
-            button.hidden = false;
-            button.addEventListener("click", () => { button.hidden = true; this.start(); });
-        }
-    }
-
-    say(text) {
-        this.veil.querySelector(".veil-text").textContent = text;
+        this.startOrAsk();
     }
 
     async start() {

@@ -5,17 +5,15 @@ import { CameraPath } from "./camera_path.js";
 import { Walking } from "./walking.js";
 import { CHI2_2_99, Sorting, SplatRenderer } from "./splats.js";
 import { thousands } from "../numbers.js";
+import { LoadingViewer } from "./loading_viewer.js";
 
-const AUTOMATIC_BYTES = 80e6;
 const MAX_PIXEL_RATIO = 2;
 const SLOW_MS = 60;
 const BACKGROUNDS = { black: [0, 0, 0], white: [1, 1, 1] };
 
-class Viewer {
+class Viewer extends LoadingViewer {
     constructor(box) {
-        this.box = box;
-        this.canvas = box.querySelector("canvas");
-        this.veil = box.querySelector(".veil");
+        super(box);
         this.place = box.querySelector(".place");
         this.q = Number(box.dataset.q) || CHI2_2_99;
         this.background = box.dataset.background in BACKGROUNDS ? box.dataset.background : "black";
@@ -24,17 +22,7 @@ class Viewer {
         this.lastFrame = 0;
         this.view = -1;
         this.path = new CameraPath();
-        const button = this.veil.querySelector("button");
-        if (Number(box.dataset.size) <= AUTOMATIC_BYTES && !navigator.connection?.saveData) this.start();
-        else {
-            this.say("");
-            button.hidden = false;
-            button.addEventListener("click", () => { button.hidden = true; this.start(); });
-        }
-    }
-
-    say(text) {
-        this.veil.querySelector(".veil-text").textContent = text;
+        this.startOrAsk();
     }
 
     fail(error) {

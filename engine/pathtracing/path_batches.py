@@ -1,0 +1,88 @@
+"""Batches of paths from the camera, and the buffers of the threads that trace them."""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float32, Float64, Int64
+
+from octasplat.engine.pathtracing.kernels.path_args import (
+    BLOCK_SIZE,
+    CameraRays,
+    MeshHits,
+    PathArrays,
+    PathBlock,
+    PathScratch,
+    PathStart,
+    allocate_paths,
+    allocate_shadow_rays,
+)
+
+PATHS_PER_THREAD = 1 << 14
+"""Paths that a thread follows by itself among meshes alone."""
+
+
+class Batch(NamedTuple):
+    """Paths traced together: ``paths_per_pixel`` for each pixel from ``first_pixel`` of their order on."""
+
+    first_pixel: int
+    pixels: Int64[np.ndarray, " n"]
+    paths_per_pixel: int
+    first_sample: int
+
+
+@dataclass(frozen=True)
+class ImageBatches:
+    """The paths of an image, batch by batch.
+
+    Attributes:
+        camera_rays: rays through the centres of the pixels.
+        order: of the pixels.
+        t_min: the camera sees nothing nearer.
+        batches: in the order in which they are traced.
+    """
+
+    camera_rays: CameraRays
+    order: Int64[np.ndarray, " n"]
+    t_min: Float32[np.ndarray, "1"]
+    batches: list[Batch]
+
+    def start(self, batch: Batch) -> PathStart:
+        """Return the kernels' description of the paths to start."""
+        return PathStart(
+            self.camera_rays, self.order, batch.first_pixel, batch.paths_per_pixel, batch.first_sample
+        )
+
+
+@dataclass(frozen=True)
+class Workspace:
+    """Buffers for one thread's paths, allocated once, as fresh memory costs time."""
+
+    scratch: PathScratch
+    all_paths: PathArrays
+    block: PathBlock
+
+    @classmethod
+    def allocate(cls, scratch: PathScratch) -> "Workspace":
+        """Return buffers for :data:`PATHS_PER_THREAD` paths."""
+        hits = MeshHits(
+            np.empty(BLOCK_SIZE, np.float32), np.empty(BLOCK_SIZE, np.int32),
+            np.empty((BLOCK_SIZE, 2), np.float32),
+        )  # fmt: skip
+        block = PathBlock(
+            np.empty(BLOCK_SIZE, np.int32), hits, allocate_shadow_rays(BLOCK_SIZE),
+            np.empty((BLOCK_SIZE, 3), np.float32),
+        )  # fmt: skip
+        return cls(scratch, allocate_paths(PATHS_PER_THREAD), block)
+
+    def paths(self, count: int) -> PathArrays:
+        """Return views of the first ``count`` paths."""
+        return PathArrays(*(values[:count] for values in self.all_paths))
+
+
+def optical_axis(directions_world: Float32[np.ndarray, "h w 3"]) -> Float64[np.ndarray, "3"]:
+    """Return the direction through the image's centre."""
+    height, width = directions_world.shape[:2]
+    middle = directions_world[(height - 1) // 2 : height // 2 + 1, (width - 1) // 2 : width // 2 + 1]
+    axis = middle.reshape(-1, 3).mean(axis=0, dtype=np.float64)
+    return np.asarray(axis / np.linalg.norm(axis))
