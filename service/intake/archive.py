@@ -244,14 +244,19 @@ def _scene_listing(records: list[ZipEntry], limits: ArchiveLimits) -> ArchiveLis
         _check_size(by_path[path], limits)
         taken_names.add(name)
     files = tuple(ArchiveFile(name, by_path[path]) for name, path in layout.files.items())
-    left_out = (*layout.left_out, *layout.ignored)
-    listing = ArchiveListing(files, left_out, layout.notes, layout.folder)
+    left_out = tuple(map(_shown_name, (*layout.left_out, *layout.ignored)))
+    listing = ArchiveListing(files, left_out, layout.notes, _shown_name(layout.folder))
     if listing.size_bytes > limits.max_total_bytes:
         raise_intake_error(
             "archive-too-large",
             f"The archive unpacks to {listing.size_bytes} bytes; {limits.max_total_bytes} are allowed.",
         )
     return listing
+
+
+def _shown_name(name: str) -> str:
+    """Return a name with bytes that are not UTF-8 written as escapes."""
+    return name.encode("utf-8", "backslashreplace").decode()
 
 
 def _check_place(record: ZipEntry) -> None:

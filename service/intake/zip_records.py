@@ -7,6 +7,7 @@ each other without gap or overlap, and after which nothing follows. Source: APPN
 
 import os
 import struct
+import zlib
 from dataclasses import dataclass
 from typing import BinaryIO, NoReturn
 
@@ -226,10 +227,7 @@ def _central_entries(directory: bytes, count: int) -> list[tuple[ZipEntry, bytes
             raise_intake_error(
                 "archive-several-disks", "The archive is split into several files; send it as one."
             )
-        if extra.get(_EXTRA_NAME, b"\1" + bytes(4) + raw_name)[5:] != raw_name:
-            raise_intake_error(
-                "archive-second-name", f"The entry {quoted_name(name)} carries a second name.", name
-            )
+        name = _full_name(raw_name, name, extra)
         # The upper half of the attributes is the mode on Unix; some programs read it whatever the home.
         entries.append(
             (ZipEntry(name, method, flags, crc32, packed, size, start, 0, attributes >> 16), raw_name)
@@ -266,7 +264,8 @@ def _with_local_header(file: BinaryIO, record: ZipEntry, raw_name: bytes) -> Zip
     same &= all(
         here == there or (deferred and here == 0) for here, there in zip(facts, announced, strict=True)
     )
-    if extra.get(_EXTRA_NAME, b"\1" + bytes(4) + raw_name)[5:] != raw_name:
+    local_name = _full_name(raw_name, _decode_name(raw_name), extra)
+    if _EXTRA_NAME in extra and local_name != record.name:
         raise_intake_error(
             "archive-second-name", f"The entry {quoted_name(record.name)} carries a second name.", record.name
         )
@@ -330,14 +329,22 @@ def _is_descriptor(data: bytes, length: int, record: ZipEntry) -> bool:
 
 
 def _decode_name(name: bytes) -> str:
-    try:
-        return name.decode("utf-8")
-    except UnicodeDecodeError:
+    """Return a name as UTF-8; other bytes become lone surrogates, which no file that is taken may have."""
+    return name.decode("utf-8", "surrogateescape")
+
+
+def _full_name(raw_name: bytes, name: str, extra: dict[int, bytes]) -> str:
+    """Return the name of an entry: that of its Unicode field if it has one that belongs to the other name."""
+    field = extra.get(_EXTRA_NAME)
+    if field is None or field[5:] == raw_name:
+        return name
+    is_for_name = field[:1] == b"\1" and field[1:5] == struct.pack("<I", zlib.crc32(raw_name))
+    # A name in ASCII needs no other.
+    if not is_for_name or raw_name.isascii():
         raise_intake_error(
-            "name-not-text",
-            f"The archive holds a file name that is not UTF-8 ({ascii(name)[2:82]}); write it with a program "
-            "that stores names as UTF-8.",
+            "archive-second-name", f"The entry {quoted_name(name)} carries a second name.", name
         )
+    return _decode_name(field[5:])
 
 
 def _extra_fields(data: bytes, name: str) -> dict[int, bytes]:
