@@ -49,7 +49,7 @@ TRAIN = {
     "densify_from_iter": 10, "rebuild_every": 25, "checkpoint_every": 25, "probe_rays": 256,
 }  # fmt: skip
 RECONSTRUCTION: dict[str, Any] = {"preset": "fast", "train": TRAIN}
-COMPARED = ("chain.bin", "scene.ply", "mesh.ply", "mesh.obj", "mesh.glb", "held_out.json")
+COMPARED = ("chain.bin", "scene.ply", "octagons.ply", "octagons.obj", "octagons.glb", "held_out.json")
 MAX_RETRIES = 3
 
 

@@ -169,7 +169,7 @@ def test_killed_in_another_stage(scene: Path, whole_run: Path, tmp_path: Path, s
         # Everything up to the stage is there already, as it would be.
         shutil.copytree(whole_run, run)
         (run / "events.jsonl").write_text("")
-        leftovers = ["mesh.obj", "mesh.glb"] + (
+        leftovers = ["octagons.obj", "octagons.glb"] + (
             ["metrics.json", "report.html"] if stage == "evaluate" else []
         )
         for name in leftovers:
@@ -276,7 +276,14 @@ def test_failed_training_writes_no_exports(scene: Path, tmp_path: Path) -> None:
     with pytest.raises(TrainingError):
         reconstruct(scene, run, config, threads=1)
     names = {path.name for path in run.iterdir()}
-    assert not names & {"scene.ply", "mesh.ply", "mesh.obj", "mesh.glb", "metrics.json", "report.html"}
+    assert not names & {
+        "scene.ply",
+        "octagons.ply",
+        "octagons.obj",
+        "octagons.glb",
+        "metrics.json",
+        "report.html",
+    }
 
 
 def test_pipeline_resume_of_finished_run_changes_nothing(

@@ -1,11 +1,13 @@
 """Settings shared by all export formats."""
 
+from collections.abc import Callable
 from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
 from octasplat.engine.gaussians.octagon import CHI2_2_99
 from octasplat.engine.gaussians.scene_metadata import UNKNOWN_METADATA, SceneMetadata
+from octasplat.engine.geometry.triangle_mesh import TriangleMesh
 from octasplat.engine.settings.fields import Group, Spelling, Unit
 
 OctagonQ = Annotated[float, Field(gt=0.0, le=100.0)]
@@ -49,6 +51,28 @@ class ExportChoices(BaseModel):
     )
 
 
+class ExportCamera(BaseModel):
+    """A camera for programs that open a scene with one, as glTF has cameras: they look along -z, up is y.
+
+    Attributes:
+        name: of the photograph.
+        position_world: its centre.
+        rotation_xyzw: quaternion that turns the camera's axes to those of the world.
+        yfov_rad: angle from top to bottom.
+        aspect: width over height.
+        near_world: distance from which on it sees.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    name: str
+    position_world: tuple[float, float, float]
+    rotation_xyzw: tuple[float, float, float, float]
+    yfov_rad: float
+    aspect: float
+    near_world: float
+
+
 class ExportOptions(ExportChoices):
     """Options of export: the user's choices, and facts about the scene.
 
@@ -59,10 +83,17 @@ class ExportOptions(ExportChoices):
             former. None draws no cores.
         light_up: GLB: lit by the materials of the scene, for light whose up is this in the world; None writes
             colours as they are, to be seen without light. What is lit carries no ids.
+        camera: GLB: a camera to look from.
+        turn_xyzw: GLB for viewers, surface: rotation of the root node, which turns the scene upright; None is
+            a half turn about x.
+        surface: returns the mesh that is written as a surface; None meshes what cameras all around see.
         facts: Gaussian PLY: what is known of the scene as a whole.
     """
 
     q: OctagonQ = CHI2_2_99
     cores: float | None = Field(default=None, gt=0.0, lt=1.0)
     light_up: tuple[float, float, float] | None = None
+    camera: ExportCamera | None = None
+    turn_xyzw: tuple[float, float, float, float] | None = None
+    surface: Callable[[], TriangleMesh] | None = None
     facts: SceneMetadata = UNKNOWN_METADATA

@@ -37,6 +37,8 @@ CORE_NODE_NAME = "octasplat_cores"
 MAX_NODE_DEPTH = 256
 ORIGIN_KEY = "octasplat_origin"
 """In the extras of a root node: the origin of large coordinates, which its translation adds."""
+TURN_KEY = "octasplat_turn"
+"""In the extras of a root node whose rotation (x, y, z, w) is another than the half turn about x."""
 CHANNELS = "octasplat_channels"
 GLB_READ_ERRORS = (KeyError, IndexError, TypeError, ValueError, AttributeError)
 """What reading a document that says nonsense may raise."""
@@ -123,7 +125,7 @@ class GlbFile:
         nodes = self.document.get("nodes", [])
         scenes = self.document.get("scenes", [])
         roots = scenes[self.document.get("scene", 0)].get("nodes", []) if scenes else range(len(nodes))
-        waiting = [(node, np.eye(4), 0) for node in reversed(roots)]
+        waiting = [(node, self._about_half_turn(node), 0) for node in reversed(roots)]
         while waiting:
             number, parent, depth = waiting.pop()
             if depth > MAX_NODE_DEPTH:
@@ -135,6 +137,14 @@ class GlbFile:
                     if not primitive.get("extras", {}).get(CORE_NODE_NAME):
                         yield matrix, primitive
             waiting += [(child, matrix, depth + 1) for child in reversed(node.get("children", []))]
+
+    def _about_half_turn(self, root: int) -> Float64[np.ndarray, "4 4"]:
+        """Return what makes a root that our exporters turned upright one that is turned by half about x."""
+        matrix = np.eye(4)
+        turn = self.document["nodes"][root].get("extras", {}).get(TURN_KEY)
+        if turn is not None:
+            matrix[:3, :3] = rotation_of(HALF_TURN_ABOUT_X) @ rotation_of(turn).T
+        return matrix
 
     def local_origin(self) -> Origin:
         """Return the origin of large coordinates in our world frame, zeros where there is none.
@@ -178,6 +188,19 @@ def read_glb_origin(path: Path) -> Origin:
         raise SceneFileError(f"{path}: its glTF is damaged or not understood ({error}).") from error
 
 
+def rotation_of(rotation_xyzw: Sequence[float]) -> Float64[np.ndarray, "3 3"]:
+    """Return the matrix of a quaternion as glTF writes it."""
+    x, y, z, w = rotation_xyzw
+    return np.asarray(rotation_matrices(np.array([[w, x, y, z]], np.float64))[0])
+
+
+def upright_root(rotation_xyzw: Sequence[float], origin: Origin) -> dict[str, object]:
+    """Return what a root node says that turns a scene upright: rotation, translation and extras."""
+    place = root_translation(origin, rotation_xyzw)
+    extras = {**dict(place.pop("extras", {})), TURN_KEY: list(rotation_xyzw)}  # type: ignore[call-overload]
+    return {"rotation": list(rotation_xyzw), **place, "extras": extras}
+
+
 def root_translation(origin: Origin, rotation_xyzw: Sequence[float] = HALF_TURN_ABOUT_X) -> dict[str, object]:
     """Return what a root node says of a scene about a local origin; nothing where there is none.
 
@@ -187,9 +210,10 @@ def root_translation(origin: Origin, rotation_xyzw: Sequence[float] = HALF_TURN_
     """
     if not is_set(origin):
         return {}
-    x, y, z, w = rotation_xyzw
-    turn = rotation_matrices(np.array([[w, x, y, z]], np.float64))[0]
-    return {"translation": (turn @ np.array(origin)).tolist(), "extras": {ORIGIN_KEY: list(origin)}}
+    return {
+        "translation": (rotation_of(rotation_xyzw) @ np.array(origin)).tolist(),
+        "extras": {ORIGIN_KEY: list(origin)},
+    }
 
 
 def _node_matrix(node: dict[str, Any]) -> Float64[np.ndarray, "4 4"]:

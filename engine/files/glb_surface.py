@@ -1,5 +1,6 @@
 """Surfaces as binary glTF: normals, and a texture, materials or the colours of the vertices."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -21,12 +22,20 @@ SAMPLER = {
 }
 
 
-def write_surface(mesh: TriangleMesh, path: Path) -> tuple[Path, ...]:
+def write_surface(
+    mesh: TriangleMesh, path: Path, turn_xyzw: Sequence[float] | None = None
+) -> tuple[Path, ...]:
     """Write a surface with normals and with a texture or the colours of its vertices.
 
     Unlit, unless it has materials: then these are textures beside the base colour's, tangents say how its
     normals lie, and the root node turns the light's up to y and its forward to x, which is how environments
     lie in glTF's viewers and in Blender.
+
+    Args:
+        mesh: the surface.
+        path: the file.
+        turn_xyzw: rotation of the root node of what is not lit, which turns the scene upright; None is a half
+            turn about x.
 
     Raises:
         SceneFileError: more than the 4 GiB that a GLB can hold.
@@ -50,7 +59,10 @@ def write_surface(mesh: TriangleMesh, path: Path) -> tuple[Path, ...]:
     else:
         attributes["TANGENT"] = mesh.materials.tangents
         node["rotation"] = glb_container.light_rotation(mesh.materials.light_frame)
-    node |= glb_container.root_translation(mesh.origin_world, node["rotation"])
+    if turn_xyzw is not None and mesh.materials is None:
+        node |= glb_container.upright_root(turn_xyzw, mesh.origin_world)
+    else:
+        node |= glb_container.root_translation(mesh.origin_world, node["rotation"])
     if mesh.texture_srgb is not None and mesh.uv is not None:
         attributes["TEXCOORD_0"] = mesh.uv
         shading["baseColorTexture"] = data.texture("surface", mesh.texture_srgb)

@@ -40,12 +40,17 @@ from octasplat.engine.files.textures import (
     material_ramp_uv,
     white_with_alpha_png,
 )
+from octasplat.engine.gaussians.channels import Channels
 from octasplat.engine.gaussians.materials import ALBEDO, METALLIC, ROUGHNESS, has_materials
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.gaussians.octagon import SIDES, octagon_triangles
 from octasplat.engine.geometry.imported_mesh import MIN_OPACITY_KEY, Q_KEY, ImportedMesh
 
 COMPRESSIONS = ("KHR_draco_mesh_compression", "EXT_meshopt_compression", "KHR_meshopt_compression")
+VIEWER_FORMAT = "viewer-glb"
+CORES_OF_CHUNKS, CORES_IN_ORDER = 0.3, 0.5
+"""From which alpha on octagons are drawn solid for viewers, in chunks and in one order
+(docs/opening/threejs.md)."""
 ATTRIBUTES = {"uv": "TEXCOORD_0", "gid": "_GID", "corner": "_CORNER", "radius": "_RADIUS"}
 ATTRIBUTE_WIDTHS = {"uv": 2, "normal": 3, "colour": 3}
 ChunkIndices = list[Int[np.ndarray, "_"]]
@@ -267,13 +272,33 @@ def _per_corner(values: Float32[np.ndarray, "n c"] | Int[np.ndarray, "n c"]) -> 
     return np.repeat(values.astype("<f4"), SIDES, axis=0)
 
 
+def write_for_viewers(gaussians: FlatGaussians, path: Path, options: ExportOptions) -> tuple[Path, ...]:
+    """Write the octagons with solid middles beneath, without numbers for edits and without named channels.
+
+    Raises:
+        SceneFileError, OSError: as :func:`write_octagons`.
+    """
+    cores = CORES_OF_CHUNKS if options.cores is None else options.cores
+    options = options.model_copy(update={"ids": False, "cores": cores, "opaque": False, "light_up": None})
+    return write_octagons(replace(gaussians, channels=Channels()), path, options)
+
+
 register(
     Exporter(
         "glb",
         ("*.glb",),
-        "octagon mesh as GLB with opacity and fall-off, for looking at objects (rooms: splats or a surface)",
+        "octagon mesh as GLB with opacity, fall-off and Gaussian numbers, for editing",
         write_octagons,
         holds_channels=True,
+        holds_origin=True,
+    )
+)
+register(
+    Exporter(
+        VIEWER_FORMAT,
+        ("viewer.glb", "*.viewer.glb", "*_viewer.glb", "*-viewer.glb"),
+        "octagon mesh as GLB that looks right in glTF viewers; a run's shows what was photographed",
+        write_for_viewers,
         holds_origin=True,
     )
 )

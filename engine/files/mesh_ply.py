@@ -38,7 +38,10 @@ from octasplat.engine.geometry.triangle_mesh import TriangleMesh
 
 _POSITION, _NORMAL = ("x", "y", "z"), ("nx", "ny", "nz")
 COLOURS = ("red", "green", "blue")
-PATTERNS = ("mesh.ply", "*.mesh.ply", "*_mesh.ply", "*-mesh.ply")
+PATTERNS = (
+    *("mesh.ply", "*.mesh.ply", "*_mesh.ply", "*-mesh.ply"),
+    *("octagons.ply", "*.octagons.ply", "*_octagons.ply", "*-octagons.ply"),
+)
 _FACE_LISTS = ("vertex_indices", "vertex_index")
 VERTEX = [
     *((name, "<f4") for name in (*_POSITION, "s", "t")),

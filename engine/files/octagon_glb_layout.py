@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from octasplat.engine.files.export_options import ExportOptions
+from octasplat.engine.files.export_options import ExportCamera, ExportOptions
 from octasplat.engine.files.glb_container import (
     ARRAY_BUFFER,
     CLAMP_TO_EDGE,
@@ -22,6 +22,7 @@ from octasplat.engine.files.glb_container import (
     light_rotation,
     pad_to_four,
     root_translation,
+    upright_root,
     vector_type,
 )
 from octasplat.engine.gaussians.octagon import FAN_TRIANGLES, SIDES
@@ -144,16 +145,25 @@ class GlbLayout:
                 "name": "octasplat",
                 "rotation": turn,
                 "children": [1 + chunk for chunk in chunks],
-                **root_translation(self._options.facts.origin_world, turn),
+                **(
+                    root_translation(self._options.facts.origin_world, turn)
+                    if self._options.turn_xyzw is None
+                    else upright_root(self._options.turn_xyzw, self._options.facts.origin_world)
+                ),
             },
             *({"name": f"octagons_{chunk:02d}", "mesh": chunk} for chunk in chunks),
         ]
+        cameras = [] if self._options.camera is None else [self._options.camera]
+        if cameras:
+            nodes[0]["children"] = list(range(1, len(nodes) + 1))
+            nodes.append(_camera_node(cameras[0]))
         return {
             "asset": {"version": "2.0", "generator": "octasplat", "extras": self._extras},
             **({} if lit else {"extensionsUsed": ["KHR_materials_unlit"]}),
             "scene": 0,
             "scenes": [{"nodes": [0]}],
             "nodes": nodes,
+            **({"cameras": [_camera_json(camera) for camera in cameras]} if cameras else {}),
             "meshes": meshes,
             "materials": [
                 _material(OPAQUE_CUTOFF if self._options.opaque else None, lit),
@@ -172,6 +182,16 @@ class GlbLayout:
             "bufferViews": self._views,
             "buffers": [{"byteLength": self.length}],
         }
+
+
+def _camera_node(camera: ExportCamera) -> dict[str, object]:
+    place = {"translation": list(camera.position_world), "rotation": list(camera.rotation_xyzw)}
+    return {"name": camera.name, "camera": 0, **place}
+
+
+def _camera_json(camera: ExportCamera) -> dict[str, object]:
+    lens = {"yfov": camera.yfov_rad, "aspectRatio": camera.aspect, "znear": camera.near_world}
+    return {"name": camera.name, "type": "perspective", "perspective": lens}
 
 
 def _material(cutoff: float | None, lit: bool, name: str = "octagons") -> dict[str, object]:

@@ -160,7 +160,7 @@ def exporter_for(path: Path, format: str | None = None) -> Exporter:
     """Return the format called ``format``, or else the one that ``path``'s name asks for.
 
     ``.ply`` means a Gaussian PLY, except ``mesh.ply``, ``*.mesh.ply``, ``*_mesh.ply`` and ``*-mesh.ply``,
-    which mean the octagon mesh. Upper and lower case are the same.
+    which mean the octagon mesh, as the same names with ``octagons`` do. Upper and lower case are the same.
 
     Raises:
         SceneFileError: no format has that name or takes that file name; the text lists those that exist.

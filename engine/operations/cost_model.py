@@ -15,6 +15,7 @@ from octasplat.engine.operations.relight import RelightOptions
 from octasplat.engine.operations.render import RenderOptions
 from octasplat.engine.operations.render_options import PictureOptions
 from octasplat.engine.runs.config import ReconstructionConfig
+from octasplat.engine.runs.result_files import SURFACE_GLB
 from octasplat.engine.train.config import TrainConfig, iteration_count, max_gaussian_count, uses_shared_sort
 
 _START_CPU_SECONDS = 16.0
@@ -22,6 +23,10 @@ _LOAD_CPU_SECONDS_PER_PIXEL = 1.0e-7
 _LIFT_CPU_SECONDS_PER_POINT = 7.0e-5
 _EVALUATE_CPU_SECONDS_PER_PIXEL = 2.7e-6
 _RENDER_CPU_SECONDS_PER_PIXEL = 1.5e-6
+_EXPORT_CPU_SECONDS_PER_GAUSSIAN = 1.0e-4
+"""For the octagon meshes and the one colour of each Gaussian that they have."""
+_SURFACE_CPU_SECONDS = 9.0
+"""For the small surface, whose size does not depend on the scene."""
 _RENDER_START_CPU_SECONDS = 3.0
 """Measured for a picture of 320 x 240 pixels: 2.6 s, with compiled kernels there."""
 _PATH_CPU_SECONDS = 1.0e-5
@@ -117,6 +122,7 @@ def estimate_reconstruction(
         + _LIFT_CPU_SECONDS_PER_POINT * min(train.initial_points, gaussians) * train.plane_sweep_init
         + each_pixel * pixels * held_out
         + training_cpu_seconds
+        + _export_cpu_seconds(options, gaussians)
     )
     training = _gaussian_bytes(train.sh_degree) * gaussians + _RAY_BYTES * max(
         train.rays_per_batch, train.probe_rays
@@ -126,6 +132,13 @@ def estimate_reconstruction(
     memory = _START_BYTES + max(training, _PIXEL_BYTES * largest)
     disk = reconstruction_bytes(options, photographs)
     return _estimate(cpu_seconds, memory, cores, finds_poses=options.poses == "auto", disk_bytes=disk)
+
+
+def _export_cpu_seconds(options: ReconstructionConfig, gaussians: int) -> float:
+    """Return the time to write the files besides the scene."""
+    names = set(options.exports)
+    seconds = _SURFACE_CPU_SECONDS if SURFACE_GLB.name in names else 0.0
+    return seconds + (_EXPORT_CPU_SECONDS_PER_GAUSSIAN * gaussians if names - {SURFACE_GLB.name} else 0.0)
 
 
 def reconstruction_bytes(options: ReconstructionConfig, photographs: Sequence[ImageSizes]) -> int:

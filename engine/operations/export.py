@@ -21,9 +21,7 @@ from octasplat.engine.settings.fields import Group, Positional, Spelling
 
 if TYPE_CHECKING:
     from octasplat.engine.gaussians.model import FlatGaussians
-
-CORES_OF_CHUNKS, CORES_IN_ORDER = 0.3, 0.5
-"""Where ``for_viewers`` draws solid, in chunks and in one order (docs/opening/threejs.md)."""
+    from octasplat.engine.geometry.triangle_mesh import TriangleMesh
 
 
 def read_direction(value: object) -> object:
@@ -74,9 +72,14 @@ class _ExportFields(ExportChoices, Options):
     )
     for_viewers: bool = Field(
         False,
-        description="GLB: for programs that sort chunks at best: solid middles beneath, and in a run whose "
-        "photographs were taken from one side, the order that is right from most of them. Carries no numbers "
-        "for edits.",
+        description="GLB: for programs that sort chunks at best, as viewer.glb is: solid middles beneath, "
+        "and in a run whose photographs were taken from one side, the order that is right from most of "
+        "them. Carries no numbers for edits.",
+    )
+    extent: Literal["photographed", "all"] = Field(
+        "photographed",
+        description="GLB for viewers: how much of a run is written, what lies in the space that the cameras "
+        "surround, which viewers then frame, or all of it, with what is far behind.",
     )
     materials: bool = Field(
         False,
@@ -93,11 +96,13 @@ class _ExportFields(ExportChoices, Options):
             raise ValueError("`up` goes with `materials`")
         targets = self.targets()
         names = [_format_name(target, self.format_name()) for target in targets]
+        message = f"{targets[-1]} is written as {names[-1]}"
         if None not in names and "glb" not in names:
-            message = f"{targets[-1]} is written as {names[-1]}"
             for name in ("opaque", "materials", "for_viewers"):
                 if getattr(self, name):
                     raise ValueError(f"`{name}` is for GLB of octagons; {message}")
+        if self.extent != "photographed" and not (self.for_viewers or {None, "viewer-glb"} & set(names)):
+            raise ValueError(f"`extent` is for GLB for viewers; {message}")
         if self.for_viewers and (self.opaque or self.materials):
             raise ValueError("`for_viewers` is for GLB of octagons without `opaque` and `materials`")
         return self
@@ -233,17 +238,34 @@ class _ExportPreparation:
 
     def prepare(self, exporter: Exporter) -> "tuple[FlatGaussians, ExportOptions]":
         """Return the scene and the options for a format."""
+        from octasplat.engine.files.mesh_glb import VIEWER_FORMAT
+        from octasplat.engine.files.surface_export import SURFACE_FORMAT
+        from octasplat.engine.runs.viewer_glb import prepare_for_viewers, upright_turn
+
         request, options = self._request, self._options
         is_glb = exporter.name == "glb"
+        if exporter.name == SURFACE_FORMAT:
+            return self._gaussians, options.model_copy(
+                update={"surface": self._surface, "turn_xyzw": upright_turn(request.source)}
+            )
         if not (exporter.holds_harmonics or (request.materials and is_glb)):
             gaussians = self._baked_colour
         else:
             gaussians = self._gaussians
-        if not is_glb:
-            return gaussians, options.model_copy(update={"light_up": None})
-        if request.for_viewers:
-            return self._in_depth_order(gaussians, options)
-        return gaussians, options
+        if exporter.name == VIEWER_FORMAT or (is_glb and request.for_viewers):
+            return prepare_for_viewers(gaussians, request.source, options, request.extent)
+        return gaussians, options if is_glb else options.model_copy(update={"light_up": None})
+
+    def _surface(self) -> "TriangleMesh":
+        from octasplat.engine.runs.small_surface import small_surface
+
+        return small_surface(
+            self._request.source,
+            self._gaussians,
+            threads=self._threads,
+            scratch=self._request.files[0].parent,
+            on_pass=self._on_pass,
+        )
 
     @cached_property
     def _options(self) -> ExportOptions:
@@ -257,8 +279,6 @@ class _ExportPreparation:
             **choices,
             "facts": read_metadata(request.source),
             "light_up": light,
-            "ids": request.ids and not request.for_viewers,
-            "cores": CORES_OF_CHUNKS if request.for_viewers else None,
         }
         if (q := request.q or self._training_q) is not None:
             options["q"] = q
@@ -296,25 +316,6 @@ class _ExportPreparation:
                 on_unknown=lambda text: self._progress(Warned(text)),
             ).gaussians
         return with_constant_colour(gaussians, colours_along(gaussians, np.array(colour)))
-
-    def _in_depth_order(
-        self, gaussians: "FlatGaussians", options: ExportOptions
-    ) -> "tuple[FlatGaussians, ExportOptions]":
-        """Return the scene in one chunk, in the order of most cameras; unchanged where these disagree."""
-        import numpy as np
-
-        from octasplat.engine.render.depth_order import MIN_AGREEMENT, shared_depth_order
-        from octasplat.engine.runs.run_folder import CONFIG, is_run, run_viewpoints
-
-        source = self._request.source
-        if not (is_run(source) and (source / CONFIG).exists()):
-            return gaussians, options
-        viewpoints = run_viewpoints(source)
-        centres = np.stack([viewpoints.views[index].origin_world for index in viewpoints.train_indices])
-        order, agreement = shared_depth_order(gaussians.means_world, centres)
-        if agreement < MIN_AGREEMENT:
-            return gaussians, options
-        return gaussians.select(order), options.model_copy(update={"chunks": 1, "cores": CORES_IN_ORDER})
 
 
 OPERATION = Operation(

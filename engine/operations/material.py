@@ -24,8 +24,8 @@ class MaterialOptions(Selection, MaterialChange, Options):
     mesh: Annotated[InputFile | None, Spelling(metavar="MESH")] = Field(
         None,
         exclude_if=lambda mesh: mesh is None,
-        description="Those whose octagons are in this mesh: IN's mesh.ply after the rest was deleted in an "
-        "editor.",
+        description="Those whose octagons are in this mesh: IN's octagons.ply after the rest was "
+        "deleted in an editor.",
     )
     masks: Annotated[tuple[InputFile, ...], Spelling(("--mask",), metavar="IMAGE")] = Field(
         (),

@@ -230,9 +230,9 @@ def run(
     from octasplat.engine.files import check_surface_path, read_metadata, surface_files, write_surface
     from octasplat.engine.gaussians.materials import require_materials
     from octasplat.engine.operations.scene_io import open_scene
-    from octasplat.engine.operations.surface_inputs import depth_cameras
     from octasplat.engine.operations.written_files import check_targets
     from octasplat.engine.runs.run_folder import SCENE, is_run
+    from octasplat.engine.runs.surface_inputs import depth_cameras
     from octasplat.engine.shading.environment_frame import environment_frame
     from octasplat.engine.surface.bake_materials import material_features
     from octasplat.engine.surface.extract import extract_levels
@@ -285,7 +285,7 @@ def run(
 
 
 def _photographs(request: SurfaceRequest, threads: int, progress: EventListener) -> "tuple[Picture, ...]":
-    from octasplat.engine.operations.surface_inputs import training_photographs
+    from octasplat.engine.runs.surface_inputs import training_photographs
 
     if not request.fit:
         return ()

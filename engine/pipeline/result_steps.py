@@ -1,15 +1,21 @@
 """Steps after the training: evaluation, and export to other formats."""
 
-from octasplat.engine.core.errors import ExportError
+from octasplat.engine.core.errors import CancelledError, ConfigError, ExportError
 from octasplat.engine.core.events import PhaseProgress, Warned
 from octasplat.engine.core.progress import phase
 from octasplat.engine.evaluate.run_evaluation import measure_run
-from octasplat.engine.files import ExportOptions, dropped_on_export, read_metadata
+from octasplat.engine.files import ExportOptions, dropped_on_export, exporter_for, read_metadata
 from octasplat.engine.files.export_batch import export_batch, targets_with_known_format
 from octasplat.engine.files.gaussian_ply import read_gaussian_ply
+from octasplat.engine.files.mesh_glb import VIEWER_FORMAT
+from octasplat.engine.files.registry import Exporter
+from octasplat.engine.files.surface_export import SURFACE_FORMAT
+from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.pipeline.run import ReconstructionRun
 from octasplat.engine.runs.baked_scene import BakedScene
 from octasplat.engine.runs.run_folder import METRICS, REPORT, SCENE, unexported_parts
+from octasplat.engine.runs.small_surface import small_surface
+from octasplat.engine.runs.viewer_glb import prepare_for_viewers, upright_turn
 
 
 class EvaluateStep:
@@ -56,19 +62,44 @@ def _export(run: ReconstructionRun, names: list[str]) -> str | None:
     if (left_out := unexported_parts(output)) is not None:
         progress(Warned(left_out))
     options = ExportOptions(q=run.config.train.trace.q, facts=read_metadata(output))
+
+    def beat() -> None:
+        if run.should_stop():
+            raise CancelledError("Stopped while exporting; the same command with --resume goes on.")
+        progress(PhaseProgress("export", 0, len(names)))
+
     plain = BakedScene(
         gaussians,
         output,
         threads=run.threads,
-        on_pass=lambda _done, _total: progress(PhaseProgress("export", 0, len(names))),
+        on_pass=lambda _done, _total: beat(),
         on_unknown=lambda text: progress(Warned(text)),
     )
+    surface = None
+    surfaces = [name for name in names if exporter_for(output / name).name == SURFACE_FORMAT]
+    if surfaces:
+        try:
+            surface = small_surface(output, gaussians, threads=run.threads, scratch=output, on_pass=beat)
+        except ConfigError as error:  # nothing opaque enough was seen, which is no failure of the run
+            progress(Warned(f"{' and '.join(surfaces)} cannot be made: {error}"))
+            names = [name for name in names if name not in surfaces]
     targets = [output / name for name in names]
     for lost in dropped_on_export(gaussians, targets_with_known_format(targets), facts=options.facts):
         progress(Warned(lost))
+
+    def prepare(exporter: Exporter) -> tuple[FlatGaussians, ExportOptions]:
+        if exporter.name == SURFACE_FORMAT:
+            return gaussians, options.model_copy(
+                update={"surface": lambda: surface, "turn_xyzw": upright_turn(output)}
+            )
+        scene = gaussians if exporter.holds_harmonics else plain.gaussians
+        if exporter.name == VIEWER_FORMAT:
+            return prepare_for_viewers(scene, output, options, "photographed")
+        return scene, options
+
     _, failed = export_batch(
         targets,
-        lambda exporter: (gaussians if exporter.holds_harmonics else plain.gaussians, options),
+        prepare,
         on_done=lambda done: progress(PhaseProgress("export", done, len(names))),
     )
     return failed

@@ -21,7 +21,7 @@ def check_export_name(name: str) -> str:
     from octasplat.engine.files import exporter_for
 
     if not _FILE_NAME.fullmatch(name) or ".." in name:
-        raise ValueError("name a file such as mesh.glb: letters, digits, '.', '_' and '-'")
+        raise ValueError("name a file such as viewer.glb: letters, digits, '.', '_' and '-'")
     if name.lower() in _TAKEN:
         raise ValueError(f"{name} is the name of another result")
     try:
@@ -32,7 +32,7 @@ def check_export_name(name: str) -> str:
 
 
 def split_names(value: object) -> object:
-    """Return the names of a text such as ``mesh.glb,scene.spz``, each once; anything else as it is."""
+    """Return the names of a text such as ``viewer.glb,scene.spz``, each once; anything else as it is."""
     if not isinstance(value, str):
         return value
     return tuple(dict.fromkeys(filter(None, (part.strip() for part in value.split(",")))))

@@ -6,6 +6,7 @@ from typing import Annotated, Any, ClassVar, Literal
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from octasplat.engine.runs.export_names import ExportNames
+from octasplat.engine.runs.result_files import DEFAULT_EXPORTS
 from octasplat.engine.settings import renamed_settings
 from octasplat.engine.settings.fields import ADVANCED, BASIC, Spelling, Unit
 from octasplat.engine.train.config.presets import PresetName
@@ -81,7 +82,7 @@ class RunSettings(BaseModel):
         "pace of the machine that begins it; by default the other settings do.",
     )
     exports: Annotated[ExportNames, Spelling(metavar="NAMES"), BASIC] = Field(
-        ("mesh.ply", "mesh.obj", "mesh.glb"),
+        DEFAULT_EXPORTS,
         max_length=100,
         description="Files to write besides scene.ply; their names say the format.",
     )

@@ -62,7 +62,7 @@ def extract_levels(
     *,
     scratch: Path,
     light_frame: Float64[np.ndarray, "3 3"] | None = None,
-    photographs: Sequence[Picture] = (),
+    photographs: Sequence[Picture] | None = (),
     listener: EventListener = ignore_events,
     should_stop: Callable[[], bool] = lambda: False,
 ) -> tuple[ExtractedSurface, ...]:
@@ -80,7 +80,8 @@ def extract_levels(
             the tracer must have as its first features
             (:func:`octasplat.engine.surface.bake_materials.material_features`), and a texture is needed; None
             bakes colours.
-        photographs: what colours are fitted to; without any, what the scene shows from ``cameras``.
+        photographs: what colours are fitted to; without any, what the scene shows from ``cameras``. None
+            takes the latter alone, at the size of the depth maps, which is fast.
         listener: receives the events of the stages ``depth``, ``fusing``, ``meshing``, ``settling`` and
             ``decimating`` (if requested), ``unwrapping`` (with a texture), ``colouring`` and ``fitting`` (of
             colours).
@@ -95,6 +96,7 @@ def extract_levels(
         focus_point(cameras)  # complain before the long work
     with counted_phase("depth", report, len(cameras)) as progress:
         maps, renders = render_depth_maps(tracer, cameras, options, scratch, progress)
+    photographs = renders if photographs is None else photographs
     region = choose_region(maps, options)
     with counted_phase("fusing", report, 2 * len(cameras)) as progress:
         volume: TsdfVolume | None = fuse_depth_maps(maps, region, options, progress)

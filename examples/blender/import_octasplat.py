@@ -44,7 +44,7 @@ def read_header(path):
     names, comments, faces, element = [], [], 0, ""
     with path.open("rb") as handle:
         if handle.readline().strip() != b"ply":
-            raise SystemExit(f"{path}: is not a PLY file; name the mesh.ply of a run.")
+            raise SystemExit(f"{path}: is not a PLY file; name the octagons.ply of a run.")
         for line in handle:
             words = line.decode("utf-8", "replace").split()
             if not words:
@@ -82,7 +82,7 @@ def check_glb(path):
     with path.open("rb") as handle:
         start = handle.read(20)
         if len(start) < 20 or start[:4] != b"glTF":
-            raise SystemExit(f"{path}: is not a GLB file; name the mesh.glb of a run.")
+            raise SystemExit(f"{path}: is not a GLB file; name the octagons.glb of a run.")
         try:
             document = json.loads(handle.read(struct.unpack_from("<I", start, 12)[0]))
             q = float(document["asset"]["extras"]["octasplat_q"])
@@ -348,7 +348,7 @@ def new_camera():
 def main(arguments):
     """Make the .blend, and the images if asked for."""
     parser = argparse.ArgumentParser(prog="import_octasplat.py", description="Octagon meshes into Blender.")
-    parser.add_argument("mesh", type=Path, help="mesh.ply or mesh.glb of a run, or an export of either")
+    parser.add_argument("mesh", type=Path, help="octagons.ply or .glb of a run, or an export of either")
     parser.add_argument("blend", type=Path, help="the .blend to write")
     parser.add_argument(
         "--cameras", type=Path, help="a camera path in JSON, as octasplat render --path takes"

@@ -12,7 +12,7 @@ class ArtifactView(BaseModel):
         json_schema_extra={
             "examples": [
                 {
-                    "name": "mesh.glb",
+                    "name": "viewer.glb",
                     "sha256": "e3b0c44298fc1c149afbf4c8996fb92427ae41e4649b934ca495991b7852b855",
                     "size_bytes": 7340032,
                     "media_type": "model/gltf-binary",

@@ -73,7 +73,7 @@ class RetryRequest(RequestBody):
         extra="forbid",
         populate_by_name=True,
         json_schema_extra={
-            "examples": [{"from": "checkpoint"}, {"options": {"exports": ["mesh.glb"]}}],
+            "examples": [{"from": "checkpoint"}, {"options": {"exports": ["viewer.glb"]}}],
         },
     )
 

@@ -14,6 +14,8 @@ from typing import IO, Any
 import numpy as np
 from jaxtyping import Float64
 
+from octasplat.engine.render.upright import estimate_up
+
 MAX_CAMERAS = 20_000
 MAX_VIEWS = 400
 """Views that the viewer offers; of more, every so manieth."""
@@ -99,7 +101,7 @@ def viewer_cameras(poses: list[PhotographPose], held_out: Iterable[str] = ()) ->
     centres = np.stack([pose.centre_world for pose in poses])
     rotations = np.stack([pose.rotation_cam_from_world for pose in poses])
     forwards = rotations[:, 2]
-    up = _estimate_up(rotations)
+    up = estimate_up(rotations)
     middle = centres.mean(axis=0)
     spread = float(np.linalg.norm(centres - middle, axis=1).mean()) or 1.0
     # Least squares of the distances to the axes; the small term keeps parallel axes solvable.
@@ -133,24 +135,6 @@ def viewer_cameras(poses: list[PhotographPose], held_out: Iterable[str] = ()) ->
             for pose in selected
         ],
     }
-
-
-def _estimate_up(rotations_cam_from_world: Float64[np.ndarray, "n 3 3"]) -> Float64[np.ndarray, " 3"]:
-    """Return the direction against gravity.
-
-    People tilt cameras up and down but seldom roll them, so it is the direction that is closest to square to
-    what all cameras have to their right; a little of their mean up decides where that leaves a choice.
-    """
-    rights, ups = rotations_cam_from_world[:, 0], -rotations_cam_from_world[:, 1]
-    mean = ups.mean(axis=0)
-    length = float(np.linalg.norm(mean))
-    if length < 1e-3:
-        return np.array([0.0, -1.0, 0.0])  # COLMAP's y points down
-    mean = mean / length
-    spread = rights.T @ rights / len(rights) + 0.01 * (np.eye(3) - np.outer(mean, mean))
-    up = np.linalg.eigh(spread)[1][:, 0]
-    agreement = float(up @ mean)
-    return np.asarray(up * np.sign(agreement) if abs(agreement) > 0.5 else mean)
 
 
 @dataclass(frozen=True)

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal, cast
 
 from octasplat.engine.files import exporters
+from octasplat.engine.runs.result_files import RESULT_FILES
 from octasplat.engine.settings.fields import SettingLevel
 
 Control = Literal[
@@ -15,9 +16,7 @@ Control = Literal[
 ]  # fmt: skip
 
 DEFAULT_FILE_NAMES = {
-    "glb": "mesh.glb",
-    "mesh-ply": "mesh.ply",
-    "obj": "mesh.obj",
+    **{file.format: file.name for file in RESULT_FILES},
     "spz": "scene.spz",
     "sog": "scene.sog",
     "splat": "scene.splat",

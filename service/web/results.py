@@ -10,6 +10,7 @@ from pathlib import PurePosixPath
 from typing import Any, cast
 
 from octasplat.engine.render.file_names import unique_render_names
+from octasplat.engine.runs.result_files import OCTAGONS_PLY, RESULT_FILES
 from octasplat.workers.db.rows import Artifact, DatasetFile
 from octasplat.workers.storage.errors import StorageError
 from octasplat.workers.storage.protocol import Storage
@@ -214,7 +215,8 @@ _SCENE, _FIGURES, _IMAGES, _RECORDS = "Scene and meshes", "Report and figures", 
 _GROUPS = {_SCENE: False, _FIGURES: False, _IMAGES: True, _RECORDS: True}
 _USE_BY_NAME = {
     SCENE: (_SCENE, "SuperSplat, PlayCanvas, Spark, Unity and Unreal splat plug-ins; octasplat itself"),
-    "mesh.ply": (_SCENE, "Blender, MeshLab, CloudCompare: for editing, as it keeps every Gaussian's number"),
+    **{name: (_SCENE, file.opens_in) for file in RESULT_FILES for name in file.names},
+    "octagons_alpha.png": (_SCENE, "the texture that octagons.obj uses"),
     "mesh_alpha.png": (_SCENE, "the texture that mesh.obj uses"),
     METRICS: (_FIGURES, "any program that reads JSON"),
     REPORT: (_FIGURES, "a browser; one file, to keep or to send"),
@@ -232,7 +234,7 @@ _USE_BY_NAME = {
 _USE_BY_SUFFIX = {
     ".glb": (
         _SCENE,
-        "Blender, three.js, model-viewer, any glTF viewer: looks as it should, fall-off included",
+        "Blender, three.js, model-viewer, any glTF viewer",
     ),
     ".obj": (_SCENE, "Blender, MeshLab, most 3D programs: geometry and colours, without opacity"),
     ".mtl": (_SCENE, "goes with the OBJ of that name"),
@@ -260,8 +262,8 @@ def _group_and_use(name: str) -> tuple[str, str]:
         return _USE_BY_NAME[name]
     if _holds_splats(name):
         return _SCENE, "three.js, PlayCanvas, Babylon.js: Gaussians by KHR_gaussian_splatting"
-    if lower.endswith("mesh.ply"):
-        return _USE_BY_NAME["mesh.ply"]
+    if lower.endswith(("mesh.ply", OCTAGONS_PLY.name)):
+        return _SCENE, OCTAGONS_PLY.opens_in
     return _USE_BY_SUFFIX.get(PurePosixPath(lower).suffix, _USE_OTHER)
 
 
@@ -270,7 +272,7 @@ def _holds_splats(name: str) -> bool:
 
 
 def _sort_rank(name: str) -> int:
-    order = [SCENE, "mesh.glb", "mesh.ply", "mesh.obj", REPORT, METRICS]
+    order = [SCENE, *(name for file in RESULT_FILES for name in file.names), REPORT, METRICS]
     return order.index(name) if name in order else len(order)
 
 

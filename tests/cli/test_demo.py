@@ -89,12 +89,12 @@ def test_demo_is_generated_once_and_names_report(octasplat, tmp_path, tiny_demo,
 
 def test_demo_resumes_automatically(octasplat, tmp_path, tiny_demo):
     assert octasplat("demo", "-o", tmp_path, *SIZE).exit_code == 0
-    for name in ("report.html", "mesh.glb"):
+    for name in ("report.html", "viewer.glb"):
         (tmp_path / "result" / name).unlink()
     again = octasplat("demo", "-o", tmp_path, *SIZE)
     assert again.exit_code == 0, again.output
     assert "Training" not in again.stdout
-    assert (tmp_path / "result" / "mesh.glb").exists()
+    assert (tmp_path / "result" / "viewer.glb").exists()
 
 
 def test_demo_with_other_settings_is_refused(octasplat, tmp_path, tiny_demo):

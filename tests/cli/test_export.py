@@ -6,6 +6,7 @@ import struct
 
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
 from octasplat.engine.core.ply_container import PlyWriteElement, write_ply
 from octasplat.engine.files import read_scene
@@ -145,6 +146,38 @@ def test_export_for_viewers_sorts_by_cameras(run, octasplat, tmp_path):
     assert in_order == (agreement >= MIN_AGREEMENT)
     if in_order:
         assert len(document["meshes"]) == 1
+
+
+def glb_document(path):
+    data = path.read_bytes()
+    return json.loads(data[20 : 20 + struct.unpack_from("<I", data, 12)[0]])
+
+
+def test_viewer_glb_of_run_has_its_name_solid_middles_and_a_camera(run, octasplat, tmp_path):
+    result = octasplat("export", run.output, tmp_path / "a.viewer.glb", "--extent", "all")
+    assert result.exit_code == 0, result.output
+    document = glb_document(tmp_path / "a.viewer.glb")
+    first = document["meshes"][0]["primitives"]
+    assert [document["materials"][each["material"]]["alphaMode"] for each in first] == ["MASK", "BLEND"]
+    assert "_GID" not in first[1]["attributes"]
+    (node,) = [node for node in document["nodes"] if "camera" in node]
+    seen = run_viewpoints(run.output)
+    view = {view.name: view for view in seen.views}[node["name"]]
+    assert node["translation"] == pytest.approx(view.origin_world.tolist())
+    x, y, z, w = node["rotation"]
+    looks = -np.array([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)])
+    assert looks == pytest.approx(view.rotation_cam_from_world[2], abs=1e-6)
+    # read back, it stands where the scene does, though it is turned upright for viewers
+    means = read_scene(tmp_path / "a.viewer.glb")[0].means_world
+    distances, _ = cKDTree(read_scene(run.output)[0].means_world).query(means)
+    assert len(means) > 100 and distances.max() < 1e-3
+    # the run itself wrote the same, of what was photographed
+    assert len(read_scene(run.output / "viewer.glb")[0]) <= len(read_scene(tmp_path / "a.viewer.glb")[0])
+
+
+def test_extent_is_for_viewer_glb(run, octasplat, tmp_path):
+    result = octasplat("export", run.output, tmp_path / "a.glb", "--extent", "all")
+    assert result.exit_code == 2 and "--extent" in result.output
 
 
 def test_for_viewers_is_for_octagon_glb(run, octasplat, tmp_path):

@@ -44,7 +44,7 @@ def copy(run, tmp_path: Path) -> Callable[..., Path]:
     return make
 
 
-LATER = ("metrics.json", "report.html", "mesh.ply", "mesh.obj", "mesh.glb")
+LATER = ("metrics.json", "report.html", "viewer.glb", "octagons.ply", "octagons.obj", "octagons.glb")
 
 
 @pytest.mark.parametrize(
@@ -54,8 +54,8 @@ LATER = ("metrics.json", "report.html", "mesh.ply", "mesh.obj", "mesh.glb")
         (("checkpoints", "scene.ply", *LATER), "checkpoints/iteration_0000000.npz", 30_000),
         (("scene.ply", *LATER), "scene.ply", 20_000),
         (("report.html",), "report.html", 40_000),
-        (("mesh.obj",), "mesh.obj", 40_000),
-        (("mesh.glb",), "mesh.glb", 40_000),
+        (("octagons.obj",), "octagons.obj", 40_000),
+        (("octagons.glb",), "octagons.glb", 40_000),
     ],
 )
 def test_full_disk_error_names_file_and_run_resumes(copy, run, octasplat, missing, named, limit_bytes):

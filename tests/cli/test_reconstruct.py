@@ -14,7 +14,8 @@ import numpy as np
 import pytest
 
 FILES = (
-    "scene.ply", "mesh.ply", "mesh.obj", "mesh.glb", "metrics.json", "report.html", "config.json",
+    "scene.ply", "viewer.glb", "octagons.ply", "octagons.obj", "octagons.glb", "metrics.json", "report.html",
+    "config.json",
     "events.jsonl", "held_out.json",
 )  # fmt: skip
 
@@ -52,7 +53,7 @@ def test_plain_output_has_no_control_characters_and_names_the_results(run):
     assert not re.search(r"[\x00-\x09\x0b-\x1f\x7f\x80-\x9f]", run.stdout)
     assert f"PSNR {run.metrics()['mean']['psnr']:.2f} dB" in run.stdout
     assert str(run.output / "report.html") in run.stdout
-    assert str(run.output / "mesh.glb") in run.stdout
+    assert str(run.output / "viewer.glb") in run.stdout
     assert "Trained 60 iterations" in run.stdout
     assert "rays/s" in run.stdout
 

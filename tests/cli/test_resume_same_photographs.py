@@ -77,7 +77,14 @@ def test_resume_with_other_photographs_is_refused(run, octasplat, tmp_path, chan
     output, others = tmp_path / "run", tmp_path / "others"
     shutil.copytree(run.output, output)
     if not finished:
-        for name in ("scene.ply", "metrics.json", "report.html", "mesh.ply", "mesh.obj", "mesh.glb"):
+        for name in (
+            "scene.ply",
+            "metrics.json",
+            "report.html",
+            "octagons.ply",
+            "octagons.obj",
+            "octagons.glb",
+        ):
             (output / name).unlink()
     shutil.copytree(run.scene, others)
     change(others)
@@ -104,7 +111,7 @@ def test_resume_with_photographs_changed_in_place_is_refused(run, octasplat, tmp
 def test_photographs_may_move_and_are_not_decoded_again(run, octasplat, tmp_path):
     output, moved = tmp_path / "run", tmp_path / "moved"
     shutil.copytree(run.output, output)
-    for name in ("scene.ply", "mesh.ply", "mesh.obj", "mesh.glb"):
+    for name in ("scene.ply", "octagons.ply", "octagons.obj", "octagons.glb"):
         (output / name).unlink()
     shutil.copytree(run.scene, moved)
     for path in (moved / "images").iterdir():
@@ -114,5 +121,5 @@ def test_photographs_may_move_and_are_not_decoded_again(run, octasplat, tmp_path
     assert result.exit_code == 0, result.output
     assert (output / "cache/rgb.bin").stat().st_ino == decoded
     assert json.loads((output / "config.json").read_text())["scene"] == str(moved)
-    for name in ("scene.ply", "mesh.ply", "mesh.obj", "mesh.glb", "views.json"):
+    for name in ("scene.ply", "octagons.ply", "octagons.obj", "octagons.glb", "views.json"):
         assert (output / name).read_bytes() == (run.output / name).read_bytes(), name

@@ -94,7 +94,7 @@ def test_images_work_together(
             job = submit(api, Submission(scene, {"preset": "fast", "train": FEW}))
             done = watch_job(api, job["id"], lambda _event: None, lambda _state: None)
             assert done["state"] == "succeeded", (done, worker.log())
-            assert {"mesh.glb", "metrics.json"} <= {
+            assert {"viewer.glb", "metrics.json"} <= {
                 path.name for path in download_results(api, job["id"], tmp_path / "result")
             }
         codes = [ChrootImage.stop(process) for process in processes]

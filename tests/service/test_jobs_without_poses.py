@@ -60,7 +60,7 @@ def test_reconstruct_folder_without_poses_succeeds(
         "--server", machine.address,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr + done.stdout
-    assert (result / "mesh.glb").exists() and (result / "poses" / "images.bin").exists()
+    assert (result / "viewer.glb").exists() and (result / "poses" / "images.bin").exists()
     metrics = json.loads((result / "metrics.json").read_text())
     assert metrics["gaussians"] > 0 and metrics["poses"] == {"placed": 8, "photographs": 8}
     assert "Poses found for 8 of 8 photographs" in done.stdout

@@ -74,7 +74,7 @@ async def test_create_job_unwritable_format_is_refused(connect_service: ConnectS
             line.split('value="')[1].split('"')[0]: line for line in page.splitlines() if "checkbox" in line
         }
         assert "disabled" in boxes["scene.sog"] and "disabled" in boxes["scene.usdz"]
-        assert "disabled" not in boxes["mesh.glb"] and "checked" in boxes["mesh.glb"]
+        assert "disabled" not in boxes["viewer.glb"] and "checked" in boxes["viewer.glb"]
         await worker_lives(service, "usd")  # another one that can
         assert (await http.post("/v1/jobs", json=body)).status_code == 202
         elsewhere = {**body, "queue": "large", "options": {"exports": ["scene.usdz"]}}

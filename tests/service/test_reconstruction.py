@@ -117,7 +117,7 @@ def machine(short_root: Path, request: pytest.FixtureRequest) -> Iterator[Machin
 
 def contents(folder: Path) -> dict[str, bytes]:
     """The files that must not depend on what happened on the way."""
-    names = ("scene.ply", "mesh.ply", "mesh.obj", "mesh.glb", "held_out.json", "views.json")
+    names = ("scene.ply", "octagons.ply", "octagons.obj", "octagons.glb", "held_out.json", "views.json")
     renders = [path.relative_to(folder).as_posix() for path in folder.glob("renders/**/*.png")]
     assert renders
     return {name: (folder / name).read_bytes() for name in (*names, *sorted(renders))}

@@ -13,8 +13,8 @@ from octasplat.engine.dataset import Dataset
 from octasplat.engine.dataset.synthetic import SyntheticDatasetConfig, write_synthetic_dataset
 from octasplat.engine.dataset.views_file import read_views, write_views
 from octasplat.engine.operations import surface_inputs
-from octasplat.engine.operations.surface_inputs import training_photographs
 from octasplat.engine.runs.config import resolve_config
+from octasplat.engine.runs.surface_inputs import training_photographs
 
 TURN = np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]])
 

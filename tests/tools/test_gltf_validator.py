@@ -6,14 +6,24 @@ import numpy as np
 import pytest
 
 from octasplat.engine.files import ExportOptions, export_scene
+from octasplat.engine.files.export_options import ExportCamera
 from octasplat.engine.gaussians.materials import MATERIAL_WIDTHS
 from octasplat.engine.gaussians.model import FlatGaussians
 
 pytestmark = pytest.mark.tools
+CAMERA = ExportCamera(
+    name="a.jpg",
+    position_world=(1, 2, 3),
+    rotation_xyzw=(0, 0, 0, 1),
+    yfov_rad=0.8,
+    aspect=1.5,
+    near_world=0.01,
+)
 
 
 @pytest.mark.parametrize(
-    "settings", [{}, {"ids": False}, {"opaque": True}, {"chunks": 1}, {"light_up": (0, 0, 1)}]
+    "settings",
+    [{}, {"ids": False}, {"opaque": True}, {"chunks": 1}, {"light_up": (0, 0, 1)}, {"camera": CAMERA}],
 )
 @pytest.mark.parametrize("count", [1, 3, 5001])
 def test_octagon_glb_passes_khronos_validator(

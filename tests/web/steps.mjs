@@ -252,6 +252,7 @@ const steps = {
         const picture = () => page.locator("#viewer canvas").screenshot().then((png) => png.toString("base64"));
         // The picture once it stands still.
         const still = async () => {
+            await page.waitForSelector("#viewer[data-rested=yes]");
             for (let before = await picture(), k = 0; ; k++) {
                 await page.waitForTimeout(150);
                 const now = await picture();

@@ -61,7 +61,7 @@ def test_limits_choices_and_words() -> None:
 def test_files_are_chosen_from_the_formats() -> None:
     export = fields_of(options_form(get_job_kind("export")))
     names = [choice.value for choice in export["files"].choices]
-    assert {"mesh.glb", "scene.spz", "scene.splat"} <= set(names)
+    assert {"viewer.glb", "surface.glb", "octagons.ply", "scene.spz", "scene.splat"} <= set(names)
     assert export["files"].required
     for name in names:  # the kind takes all that is offered
         get_job_kind("export").resolve({"files": [name]})

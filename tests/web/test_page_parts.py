@@ -189,6 +189,8 @@ def test_downloads_name_programs_that_open_them() -> None:
     names = [
         "scene.ply",
         "mesh.glb",
+        "viewer.glb",
+        "octagons.glb",
         "scene.splats.glb",
         "mesh.obj",
         "x.spz",
@@ -201,6 +203,8 @@ def test_downloads_name_programs_that_open_them() -> None:
     found = {file.name: file.opens_in for group in groups for file in group.files}
     assert set(found) == set(names) and all(found.values())
     assert "KHR_gaussian_splatting" in found["scene.splats.glb"] and "Blender" in found["mesh.glb"]
+    assert "any glTF viewer" in found["viewer.glb"]
+    assert "haze" in found["mesh.glb"] and found["mesh.glb"] == found["octagons.glb"]
     assert groups[0].files[0].name == "scene.ply"
     assert [group.title for group in groups if group.folded] == ["Images", "Records of the run"]
 

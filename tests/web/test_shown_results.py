@@ -17,6 +17,7 @@ def artifact(name: str) -> Artifact:
     [
         (["surface.glb", "views.json"], "surface.glb"),
         (["a.glb", "mesh.glb"], "mesh.glb"),
+        (["octagons.glb", "surface.glb", "viewer.glb"], "viewer.glb"),
         (["scene.splats.glb", "mesh.obj"], None),
         ([], None),
     ],

@@ -47,7 +47,7 @@ window.result = (async () => {
     };
     worker.postMessage({ load: job.url });
   });
-  view.setScene(scene, job.q);
+  await view.setScene(scene, job.q);
   if (job.light) {
     view.setLight(readHdr(await (await fetch("/files/light.hdr")).arrayBuffer()));
     view.lighting.turn(job.light.up, job.light.degrees);

@@ -33,7 +33,7 @@ def quiet_option(command: F) -> F:
 
 
 def parse_export_names(text: str | None) -> tuple[str, ...] | None:
-    """Return the names in ``mesh.glb,scene.spz``; None where nothing was given.
+    """Return the names in ``viewer.glb,scene.spz``; None where nothing was given.
 
     Raises:
         ConfigError: one of them is no name of a result.
@@ -56,5 +56,5 @@ def exports_option(command: F) -> F:
     return click.option(
         "--exports",
         metavar="NAMES",
-        help="Files to write besides scene.ply, e.g. mesh.glb,scene.spz; see octasplat export --help.",
+        help="Files to write besides scene.ply, e.g. viewer.glb,scene.spz; see octasplat export --help.",
     )(command)

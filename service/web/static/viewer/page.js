@@ -2,13 +2,15 @@
 
 import { OrbitControls, PerspectiveCamera, Vector3 } from "../vendor/three.js";
 import { CameraPath } from "./camera_path.js";
+import { Limits } from "./limits.js";
+import { Pacing } from "./pacing.js";
 import { Walking } from "./walking.js";
 import { CHI2_2_99, Sorting, SplatRenderer } from "./splats.js";
 import { thousands } from "../numbers.js";
 import { LoadingViewer } from "./loading_viewer.js";
 
 const MAX_PIXEL_RATIO = 2;
-const SLOW_MS = 60;
+const REST_MS = 150;
 const BACKGROUNDS = { black: [0, 0, 0], white: [1, 1, 1] };
 
 class Viewer extends LoadingViewer {
@@ -17,9 +19,12 @@ class Viewer extends LoadingViewer {
         this.place = box.querySelector(".place");
         this.q = Number(box.dataset.q) || CHI2_2_99;
         this.background = box.dataset.background in BACKGROUNDS ? box.dataset.background : "black";
-        this.needsFrame = true;
-        this.slow = 0;
+        this.isStale = true; // what is shown is not what the camera sees
+        this.movedAt = 0;
         this.lastFrame = 0;
+        this.isBusy = false; // with a picture, or a part of one
+        this.isOrderWhole = false;
+        this.added = null; // Gaussians of the picture of a resting camera so far
         this.view = -1;
         this.path = new CameraPath();
         this.startOrAsk();
@@ -41,15 +46,16 @@ class Viewer extends LoadingViewer {
             return;
         }
         try {
-            const [scene, cameras] = await Promise.all([this.load(), this.loadCameras()]);
-            this.splats.setScene(scene, this.q);
+            const cameras = await this.loadCameras();
+            const scene = await this.load(cameras.views);
+            await this.splats.setScene(scene, this.q);
             this.setUp(scene, cameras);
         } catch (error) {
             this.fail(error);
         }
     }
 
-    load() {
+    load(views) {
         const bar = this.veil.querySelector("progress");
         bar.hidden = false;
         this.worker = new Worker(new URL("./scene_worker.js", import.meta.url), { type: "module" });
@@ -64,7 +70,7 @@ class Viewer extends LoadingViewer {
                     this.say(`Loading the scene: ${(data.loaded / 1e6).toFixed(1)} of ${(data.total / 1e6).toFixed(1)} MB`);
                 }
             };
-            this.worker.postMessage({ load: new URL(this.box.dataset.scene, location.href).href });
+            this.worker.postMessage({ load: new URL(this.box.dataset.scene, location.href).href, views });
         });
     }
 
@@ -79,6 +85,8 @@ class Viewer extends LoadingViewer {
 
     setUp(scene, cameras) {
         this.frame = cameras.views.length ? cameras : frameOf(scene);
+        this.limits = new Limits(this.frame);
+        this.pacing = new Pacing(scene.count);
         this.camera = new PerspectiveCamera(50, 1, this.frame.radius * 2e-3, this.frame.radius * 1e4);
         this.camera.up.fromArray(this.frame.up);
         this.controls = new OrbitControls(this.camera, this.canvas);
@@ -86,11 +94,13 @@ class Viewer extends LoadingViewer {
         this.controls.addEventListener("change", () => this.wake());
         this.controls.addEventListener("start", () => { this.place.textContent = ""; });
         this.walking = new Walking(this.canvas, this.camera, this.controls, this.frame.radius, (action) => this.do(action), () => this.wake());
-        this.sorting = new Sorting(this.worker, scene.count, this.q, (order, count) => {
+        this.sorting = new Sorting(this.worker, scene.count, this.q, (order, count, limit) => {
             this.splats.setOrder(order, count);
+            this.isOrderWhole = limit === Infinity && !this.sorting.wanted;
+            this.isStale = true;
+            this.added = null;
             this.box.dataset.ready = "yes";
             this.veil.hidden = true;
-            this.wake();
         });
         const tools = this.box.querySelector(".tools");
         tools.hidden = false;
@@ -191,34 +201,73 @@ class Viewer extends LoadingViewer {
     }
 
     wake() {
-        this.needsFrame = true;
+        this.isStale = true;
+        this.added = null;
+        this.movedAt = performance.now();
+        this.box.dataset.rested = "no";
     }
 
-    /** Draws when something has changed; while that is slow, with fewer pixels. */
+    /** Moves the camera and draws; nothing is asked for while the picture before is not there. */
     tick(now) {
         requestAnimationFrame((next) => this.tick(next));
         const seconds = Math.min(0.1, (now - this.lastFrame) / 1000);
-        const moves = this.walking.step(seconds);
-        if (!this.walking.flying) this.controls.update();
-        const gap = now - this.lastFrame;
         this.lastFrame = now;
-        if (!this.needsFrame && !moves) {
-            if (this.splats.scale < 1) {
-                this.splats.scale = 1;
-                this.draw();
-            }
-            return;
-        }
-        this.slow = gap > SLOW_MS ? Math.min(this.slow + 1, 6) : Math.max(this.slow - 0.2, 0);
-        this.splats.scale = this.slow > 3 ? 0.5 : 1;
-        this.draw();
+        if (this.walking.step(seconds)) this.wake();
+        if (!this.walking.flying) this.controls.update();
+        this.limits.clampTarget(this.controls.target);
+        if (this.limits.clamp(this.camera.position) && !this.walking.flying) this.camera.lookAt(this.controls.target);
+        if (this.isBusy || !this.isStale) return;
+        this.camera.updateMatrixWorld();
+        if (performance.now() - this.movedAt < REST_MS) this.drawMoving();
+        else this.drawResting();
     }
 
-    draw() {
-        this.needsFrame = false;
-        this.camera.updateMatrixWorld();
-        this.sorting.see(this.camera, this.camera.position.distanceTo(this.controls.target));
+    /** Draws the heaviest Gaussians with fewer pixels, as many as there is time for. */
+    drawMoving() {
+        const limit = this.pacing.limit < this.pacing.count ? this.pacing.limit : Infinity;
+        this.sort(limit);
+        if (this.splats.ordered > limit) return; // the order of a resting camera is too much to wait for
+        this.splats.scale = this.pacing.scale;
         this.splats.render(this.camera);
+        this.isStale = false;
+        this.wait((milliseconds) => {
+            this.pacing.noteFrame(milliseconds);
+            this.box.dataset.frameMs = milliseconds.toFixed(1);
+            this.isStale = true; // until the camera rests and all is drawn
+        });
+    }
+
+    /** Draws all Gaussians, part by part, and shows them together. */
+    drawResting() {
+        this.sort(Infinity);
+        if (!this.isOrderWhole) return;
+        if (this.added === null) {
+            this.added = 0;
+            this.splats.scale = 1;
+            this.splats.begin();
+        }
+        const count = Math.min(this.pacing.slice, this.splats.ordered - this.added);
+        this.splats.add(this.camera, this.added, count);
+        this.added += count;
+        if (this.added >= this.splats.ordered) {
+            this.splats.show(this.camera);
+            this.isStale = false;
+            this.box.dataset.rested = "yes";
+        }
+        this.wait((milliseconds) => { if (count === this.pacing.slice) this.pacing.noteSlice(milliseconds); });
+    }
+
+    sort(limit) {
+        if (this.sorting.see(this.camera, this.camera.position.distanceTo(this.controls.target), limit)) this.isOrderWhole = false;
+    }
+
+    /** Calls back with how long what was asked for takes. */
+    async wait(note) {
+        this.isBusy = true;
+        const begun = performance.now();
+        await this.splats.finished();
+        note(performance.now() - begun);
+        this.isBusy = false;
     }
 }
 

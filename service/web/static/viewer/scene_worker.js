@@ -1,5 +1,6 @@
-// Loads a scene and keeps it in order, beside the page: {load}, then {position, forward, reach, order} again
-// and again; answers are {loaded, total}, {scene}, {order, count} or {error}.
+// Loads a scene and keeps it in order, beside the page: {load, views}, then {position, forward, reach, order,
+// limit} again
+// and again; answers are {loaded, total}, {scene}, {order, count, limit} or {error}.
 
 import { readGaussians } from "./ply.js";
 import { makeSorter } from "./sorting.js";
@@ -45,7 +46,7 @@ function joined(pieces, length) {
     return bytes;
 }
 
-async function load(url) {
+async function load(url, views) {
     let told = 0;
     const bytes = await download(url, (loaded, total) => {
         if (loaded < total && performance.now() - told < 50) return;
@@ -53,16 +54,15 @@ async function load(url) {
         postMessage({ loaded, total });
     });
     const scene = readGaussians(bytes);
-    // The sorter keeps its own copy: what is sent to the page is gone from here.
-    sort = makeSorter({ count: scene.count, geometry: scene.geometry.slice(), bounds: scene.bounds.slice() });
+    sort = makeSorter({ ...scene, views }); // before the arrays go to the page
     postMessage({ scene }, [scene.geometry.buffer, scene.harmonics.buffer, scene.bounds.buffer, ...(scene.materials ? [scene.materials.buffer] : [])]);
 }
 
 onmessage = ({ data }) => {
     if (data.load) {
-        load(data.load).catch((error) => postMessage({ error: error.message }));
+        load(data.load, data.views).catch((error) => postMessage({ error: error.message }));
         return;
     }
-    const count = sort(data.position, data.forward, data.reach, data.order);
-    postMessage({ order: data.order, count }, [data.order.buffer]);
+    const count = sort(data.position, data.forward, data.reach, data.order, data.limit);
+    postMessage({ order: data.order, count, limit: data.limit }, [data.order.buffer]);
 };

@@ -11,6 +11,7 @@ import { FRAGMENT, PRESENT_FRAGMENT, PRESENT_VERTEX, VERTEX } from "./shaders.js
 
 export const CHI2_2_99 = 9.210340371976184;
 const SIDES = 8;
+const UPLOAD_BYTES = 4 << 20;
 const FAN = Array.from({ length: SIDES - 2 }, (_, k) => [0, k + 1, k + 2]).flat();
 
 /** Draws one scene into a canvas. */
@@ -38,13 +39,14 @@ export class SplatRenderer {
         this.buffer = new Vector2();
     }
 
-    /** Takes over a scene as of ply.js. */
-    setScene(scene, q = CHI2_2_99) {
-        const limit = this.renderer.capabilities.maxTextureSize;
-        const geometry = packed(scene.geometry, scene.count, 3, limit, FloatType, Float32Array);
-        const harmonics = packed(scene.harmonics, scene.count, scene.shCount, limit, HalfFloatType, Uint16Array);
+    /** Takes over a scene as of ply.js, a few megabytes at a time. */
+    async setScene(scene, q = CHI2_2_99) {
+        const geometry = await this.upload(scene.geometry, scene.count, 3, FloatType);
+        const harmonics = await this.upload(scene.harmonics, scene.count, scene.shCount, HalfFloatType);
         this.mesh?.geometry.dispose();
         this.scene.clear();
+        this.order = new Uint32Array(scene.count);
+        this.ordered = 0;
         this.mesh = new Mesh(octagons(scene.count), new RawShaderMaterial({
             glslVersion: GLSL3, vertexShader: VERTEX, fragmentShader: FRAGMENT,
             uniforms: {
@@ -58,7 +60,7 @@ export class SplatRenderer {
         this.mesh.frustumCulled = false;
         this.scene.add(this.mesh);
         if (!scene.materials || !this.precise) return;
-        const materials = packed(scene.materials, scene.count, 2, limit, HalfFloatType, Uint16Array);
+        const materials = await this.upload(scene.materials, scene.count, 2, HalfFloatType);
         const { geometryTexture, geometryColumns, q: radius } = this.mesh.material.uniforms;
         const uniforms = { geometryTexture, geometryColumns, q: radius, materialTexture: { value: materials.texture }, materialColumns: { value: materials.columns } };
         this.lighting = new Lighting(this.mesh.geometry, uniforms, fullScreen);
@@ -71,14 +73,45 @@ export class SplatRenderer {
         this.isLit = Boolean(map);
     }
 
-    /** Draws the first `count` Gaussians of `order`, in that order. */
+    /** A texture with `texels` texels a Gaussian and as many Gaussians in a row as fit. */
+    async upload(values, count, texels, type) {
+        const limit = this.renderer.capabilities.maxTextureSize;
+        const columns = Math.max(1, Math.min(Math.floor(limit / texels), Math.ceil(Math.sqrt(count / texels))));
+        const rows = Math.max(1, Math.ceil(count / columns)), width = columns * texels;
+        if (rows > limit) throw new Error(`${count} Gaussians are too many for this device.`);
+        const texture = new DataTexture(null, width, rows, RGBAFormat, type);
+        texture.source.dataReady = false; // allocates it
+        texture.needsUpdate = true;
+        this.renderer.initTexture(texture);
+        const step = Math.max(1, Math.floor(UPLOAD_BYTES / (width * 4 * values.BYTES_PER_ELEMENT)));
+        for (let row = 0; row < rows; row += step) {
+            const taken = Math.min(step, rows - row);
+            let part = values.subarray(4 * width * row, 4 * width * (row + taken));
+            if (part.length < 4 * width * taken) {
+                const padded = new values.constructor(4 * width * taken);
+                padded.set(part);
+                part = padded;
+            }
+            this.renderer.copyTextureToTexture(new DataTexture(part, width, taken, RGBAFormat, type), texture, null, new Vector2(0, row));
+            if (row + taken < rows) await this.finished();
+        }
+        return { texture, columns };
+    }
+
+    /** Resolves once everything asked for so far is drawn; the page goes on meanwhile. */
+    async finished() {
+        const gl = this.renderer.getContext();
+        const fence = gl.fenceSync(gl.SYNC_GPU_COMMANDS_COMPLETE, 0);
+        gl.flush();
+        do await new Promise((resolve) => setTimeout(resolve, 4));
+        while (fence && !gl.isContextLost() && gl.getSyncParameter(fence, gl.SYNC_STATUS) !== gl.SIGNALED);
+        gl.deleteSync(fence);
+    }
+
+    /** The first `count` Gaussians of `order` will be drawn, in that order. */
     setOrder(order, count) {
-        const attribute = this.mesh.geometry.getAttribute("number");
-        attribute.array.set(order.subarray(0, count));
-        attribute.clearUpdateRanges();
-        attribute.addUpdateRange(0, count);
-        attribute.needsUpdate = true;
-        this.mesh.geometry.instanceCount = count;
+        this.order.set(order.subarray(0, count));
+        this.ordered = count;
     }
 
     /** Size on the page, and pixels of the screen for each of the page's. */
@@ -91,15 +124,42 @@ export class SplatRenderer {
         this.background.setRGB(red, green, blue, LinearSRGBColorSpace);
     }
 
+    /** Draws all of the order. */
     render(camera) {
+        this.begin();
+        this.add(camera, 0, this.ordered);
+        this.show(camera);
+    }
+
+    /** Begins a picture. */
+    begin() {
         this.renderer.getDrawingBufferSize(this.buffer);
         const width = Math.max(1, Math.round(this.buffer.x * this.scale)), height = Math.max(1, Math.round(this.buffer.y * this.scale));
-        const target = this.isLit ? this.lighting.target : this.target;
+        const target = this.drawn;
         if (target.width !== width || target.height !== height) target.setSize(width, height);
         this.renderer.setRenderTarget(target);
         this.renderer.setClearColor(0x000000, 0);
         this.renderer.clear(true, false, false);
-        if (this.mesh) this.renderer.render(this.isLit ? this.lighting.octagons : this.scene, camera);
+    }
+
+    /** Adds `count` Gaussians of the order to the picture, which nearer ones follow. */
+    add(camera, first, count) {
+        const attribute = this.mesh.geometry.getAttribute("number");
+        attribute.array.set(this.order.subarray(first, first + count));
+        attribute.clearUpdateRanges();
+        attribute.addUpdateRange(0, count);
+        attribute.needsUpdate = true;
+        this.mesh.geometry.instanceCount = count;
+        this.renderer.setRenderTarget(this.drawn);
+        this.renderer.render(this.isLit ? this.lighting.octagons : this.scene, camera);
+    }
+
+    get drawn() {
+        return this.isLit ? this.lighting.target : this.target;
+    }
+
+    /** Puts the picture onto the page. */
+    show(camera) {
         this.renderer.setRenderTarget(null);
         const { uniforms } = this.isLit ? this.lighting : this.present.material;
         uniforms.sizePx.value.copy(this.buffer);
@@ -108,7 +168,7 @@ export class SplatRenderer {
     }
 }
 
-/** Back-to-front order that is made beside the page; `onOrder(order, count)` hears of it. */
+/** Back-to-front order that is made beside the page; `onOrder(order, count, limit)` hears of it. */
 export class Sorting {
     constructor(worker, count, q, onOrder) {
         this.worker = worker;
@@ -120,21 +180,23 @@ export class Sorting {
         this.now = new Vector3();
         worker.onmessage = ({ data }) => {
             if (!data.order) return;
-            onOrder(data.order, data.count);
             this.spare = data.order;
+            onOrder(data.order, data.count, data.limit);
             if (this.wanted) this.send();
         };
     }
 
-    /** Asks for the order as seen by a camera, if it moved. */
-    see(camera, distance) {
+    /** Asks for the order of the `limit` heaviest as seen by a camera, if it moved; whether it did. */
+    see(camera, distance, limit = Infinity) {
         camera.getWorldDirection(this.now);
         const moved = this.position.distanceTo(camera.position) > 1e-3 * distance || this.forward.dot(this.now) < 0.99999;
-        if (!moved) return;
+        if (!moved && limit === this.limit) return false;
+        this.limit = limit;
         this.position.copy(camera.position);
         this.forward.copy(this.now);
-        this.wanted = { position: camera.position.toArray(), forward: this.now.toArray(), reach: this.reach };
+        this.wanted = { position: camera.position.toArray(), forward: this.now.toArray(), reach: this.reach, limit };
         if (this.spare) this.send();
+        return true;
     }
 
     send() {
@@ -153,18 +215,6 @@ function octagons(count) {
     geometry.setAttribute("number", numbers);
     geometry.instanceCount = 0;
     return geometry;
-}
-
-/** A texture with `texels` texels a Gaussian and as many Gaussians in a row as fit. */
-function packed(values, count, texels, limit, type, ArrayType) {
-    const columns = Math.max(1, Math.min(Math.floor(limit / texels), Math.ceil(Math.sqrt(count / texels))));
-    const rows = Math.max(1, Math.ceil(count / columns));
-    if (rows > limit) throw new Error(`${count} Gaussians are too many for this device.`);
-    const padded = new ArrayType(columns * rows * texels * 4);
-    padded.set(values);
-    const texture = new DataTexture(padded, columns * texels, rows, RGBAFormat, type);
-    texture.needsUpdate = true;
-    return { texture, columns };
 }
 
 /** A scene of one triangle that fills the screen. */
