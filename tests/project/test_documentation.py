@@ -125,6 +125,16 @@ def test_shell_blocks_are_shell(page: Path) -> None:
         assert done.returncode == 0, f"{block}\n{done.stderr}"
 
 
+def test_python_blocks_are_python() -> None:
+    count = 0
+    for page in pages():
+        for block in blocks(page, "python"):
+            if ">>>" not in block:  # those are run, by tests/api
+                compile(block, str(page), "exec")
+                count += 1
+    assert count > 3
+
+
 @pytest.mark.parametrize("command", COMMANDS, ids=str)
 def test_commands_have_options_that_exist(command: DocumentedCommand) -> None:
     check_command(command.words)

@@ -5,7 +5,7 @@ waits for clocks and browsers. What is not listed takes less than ten seconds an
 """
 
 _NAMES = """
-test_other_cpus.py test_two_hosts.py test_pages.py
+test_other_cpus.py test_documented_commands.py test_two_hosts.py test_pages.py
 test_known_geometry.py test_chaos_short.py
 test_find.py test_pose_repair.py test_docker_steps.py test_reconstruction.py test_lost_database.py
 test_reconstruct_without_poses.py test_worker_recovery.py test_tracers.py test_openapi_fuzz.py
