@@ -84,7 +84,9 @@ def estimate_job(
     """
     if not sizes:
         return None
-    return kind.estimate(options, sizes, max(map(_cores, workers), default=os.cpu_count() or 1))
+    found = kind.estimate(options, sizes, max(map(_cores, workers), default=os.cpu_count() or 1))
+    cold = min(map(_cold_start_seconds, workers), default=0.0)
+    return found.with_cold_start(cold) if found is not None and cold else found
 
 
 def limit_notes(
@@ -115,6 +117,12 @@ def limit_notes(
             f"It may take {known.seconds / 3600:.0f} hours, and is ended after {hours:g}; ask for less."
         )
     return notes
+
+
+def _cold_start_seconds(worker: WorkerRow) -> float:
+    """Seconds in which a worker compiles the kernels that it lacks."""
+    found = worker.facts.get("cold_start_seconds")
+    return float(found) if isinstance(found, int | float) else 0.0
 
 
 def _cores(worker: WorkerRow) -> int:

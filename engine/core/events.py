@@ -116,6 +116,14 @@ class Noted(Event):
 
 
 @dataclass(frozen=True)
+class KernelsCompiled(Event):
+    """Kernels were compiled, or waited for, which took ``seconds``; no pace is estimated from these."""
+
+    kind: ClassVar[str] = "kernels_compiled"
+    seconds: float
+
+
+@dataclass(frozen=True)
 class RunFinished(Event):
     """The whole job is done; ``outputs`` are paths relative to the output folder."""
 
@@ -135,6 +143,7 @@ EVENT_KINDS: dict[str, type[Event]] = {
         CheckpointWritten,
         Warned,
         Noted,
+        KernelsCompiled,
     )
 }
 

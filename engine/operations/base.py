@@ -9,8 +9,10 @@ from typing import Any, ClassVar, Generic, Protocol, TypeVar, runtime_checkable
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
+from octasplat.engine.core.compiling import report_compilation
 from octasplat.engine.core.errors import CancelledError, ConfigError
 from octasplat.engine.core.events import Event, EventListener, Warned, ignore_events
+from octasplat.engine.operations.precompile import compile_beside, request_groups
 from octasplat.engine.settings import renamed_settings
 from octasplat.engine.settings.fields import Output, Positional, Source
 
@@ -151,6 +153,23 @@ class Operation(Generic[RequestT, ResultT_co]):
     request: type[RequestT]
     options: type[Options]
     run: Run[RequestT, ResultT_co]
+
+    def execute(
+        self,
+        request: RequestT,
+        *,
+        progress: EventListener = ignore_events,
+        should_stop: Callable[[], bool] = never_stop,
+        threads: int = 0,
+    ) -> ResultT_co:
+        """Do a request as :meth:`Run.__call__`, its kernels compiled beside it, which ``progress`` is told.
+
+        Raises:
+            OctasplatError: as ``run`` does.
+        """
+        groups = request_groups(self.name, request)
+        with report_compilation(progress), compile_beside(groups):
+            return self.run(request, progress=progress, should_stop=should_stop, threads=threads)
 
 
 def stop_if(should_stop: Callable[[], bool]) -> None:

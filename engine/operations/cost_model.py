@@ -76,6 +76,7 @@ class Estimate(BaseModel):
         memory_bytes: largest private memory of the job's process.
         disk_bytes: the least that its folder takes on the worker's disk; 0 where nobody knows.
         finds_poses: whether poses are found first, which takes time that is not in it.
+        cold_start_seconds: for kernels that are not compiled yet, in ``cpu_seconds`` and ``seconds``.
     """
 
     cpu_seconds: float
@@ -84,15 +85,31 @@ class Estimate(BaseModel):
     memory_bytes: int
     finds_poses: bool = False
     disk_bytes: int = 0
+    cold_start_seconds: float = 0.0
+
+    def with_cold_start(self, seconds: float) -> "Estimate":
+        """Return the estimate where kernels are compiled first, which takes one core so long."""
+        return self.model_copy(
+            update={
+                "cpu_seconds": round(self.cpu_seconds + seconds, 1),
+                "seconds": round(self.seconds + seconds, 1),
+                "cold_start_seconds": round(seconds, 1),
+            }
+        )
 
     @computed_field  # type: ignore[prop-decorator]
     @property
     def text(self) -> str:
         """Return the estimate in words."""
         cores = f"{self.cores} core{'s' if self.cores > 1 else ''}"
+        cold = (
+            f", {format_duration(self.cold_start_seconds)} of it to compile kernels"
+            if self.cold_start_seconds >= 1
+            else ""
+        )
         poses = ", besides the time to find the poses" if self.finds_poses else ""
         return (
-            f"about {format_duration(self.seconds)} on {cores} "
+            f"about {format_duration(self.seconds)} on {cores}{cold} "
             f"and {self.memory_bytes / 1e9:.1f} GB of memory{poses}"
         )
 

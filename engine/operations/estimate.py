@@ -43,6 +43,7 @@ class EstimateResult(Result):
         memory_bytes: largest private memory of the process.
         disk_bytes: least size of the folder of the run.
         finds_poses: whether poses are found first, which takes time that is not in it.
+        cold_start_seconds: for kernels that are not compiled yet, in ``cpu_seconds`` and ``seconds``.
         text: the same in words.
     """
 
@@ -53,6 +54,7 @@ class EstimateResult(Result):
     memory_bytes: int
     disk_bytes: int
     finds_poses: bool
+    cold_start_seconds: float
     text: str
 
     def lines(self) -> tuple[str, ...]:
@@ -77,6 +79,7 @@ def run(
     """
     from octasplat.engine.dataset.model_sources import has_model
     from octasplat.engine.operations.cost_model import estimate_reconstruction
+    from octasplat.engine.operations.precompile import cold_start_seconds
     from octasplat.engine.poses.photographs import left_out_of_scene, locate_scene
 
     scene = locate_scene(request.source)
@@ -86,6 +89,7 @@ def run(
     sizes = photograph_sizes(scene)
     cores = request.cores or threads or len(os.sched_getaffinity(0))
     found = estimate_reconstruction(config, sizes, cores)
+    found = found.with_cold_start(cold_start_seconds(["reconstruct"]))
     return EstimateResult(photographs=tuple(sizes), **found.model_dump())
 
 

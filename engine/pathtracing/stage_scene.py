@@ -98,7 +98,7 @@ def first_stage_layout(scene: StageScene, up_world: Float64[np.ndarray, "3"] | N
     else:
         views = scene.photographs.views
         cameras = np.stack([view.origin_world for view in views[:: -(-len(views) // LAYOUT_CAMERAS)]])
-    tracer = make_tracer(scene.settings, threads=scene.threads)
+    tracer = make_tracer(scene.settings, threads=scene.threads, is_used_once=True)
     tracer.build(scene.gaussians)
     size = SIZE_PER_RADIUS * table.radius
     found = estimate_stage_layout(scene.gaussians, tracer, table.up_world, table.centre_world, size, cameras)

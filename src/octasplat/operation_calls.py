@@ -76,7 +76,7 @@ def run_operation(
     """
     verb = operation(name)
     request = build_request(verb.request, explicit_values(verb.request, values))
-    result = verb.run(
+    result = verb.execute(
         request, progress=progress or default_progress(), should_stop=should_stop, threads=threads
     )
     remember_written(name, result.files)

@@ -46,6 +46,7 @@ _COMMANDS = {
     "crop": ("crop", "Keep part of a scene."),
     "merge": ("merge", "Put scenes together."),
     "clean": ("clean", "Remove faint Gaussians, oversized ones and floaters."),
+    "warm-up": ("warm_up", "Compile everything that the first use would wait for."),
     "verbs": ("verbs", "The verbs as commands, jobs and Python calls."),
     "demo": ("demo", "Try everything on a generated scene."),
     "backup": ("backup", "Copy a service, tables and store, while it runs."),

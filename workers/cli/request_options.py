@@ -126,14 +126,14 @@ def run_operation(
         with request_stop_on_signals() as should_stop:
             try:
                 with show_progress(quiet=quiet, should_stop=should_stop) as progress:
-                    result = operation.run(
+                    result = operation.execute(
                         request, progress=progress, should_stop=should_stop, threads=threads
                     )
             except CancelledError as error:
                 raise StoppedError(str(error), should_stop.exit_code) from None
     else:
         with exit_on_sigterm(), show_progress(quiet=quiet) as progress:
-            result = operation.run(request, progress=progress, should_stop=never_stop, threads=threads)
+            result = operation.execute(request, progress=progress, should_stop=never_stop, threads=threads)
     remember_written(operation.name, result.files)
     if not quiet:
         for line in result.lines():

@@ -7,6 +7,7 @@ from octasplat.engine.core.durations import format_clock, format_duration
 from octasplat.engine.core.events import (
     Event,
     HeldOutMeasured,
+    KernelsCompiled,
     Noted,
     PhaseFinished,
     PhaseProgress,
@@ -70,6 +71,8 @@ class ProgressState:
             self.step, self.training = event.iteration, event
         elif isinstance(event, HeldOutMeasured):
             self.held_out = event
+        elif isinstance(event, KernelsCompiled):
+            self._pace.leave_out(event.seconds)
 
     def finished_line(self, event: PhaseFinished) -> str:
         """Return what the stage did and how long it took, as a line."""

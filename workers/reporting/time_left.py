@@ -21,3 +21,9 @@ class TimeLeftEstimator:
             self._first = steps_done, now
         begun, at = self._first
         return (now - at) / (steps_done - begun) * (total_steps - steps_done) if steps_done > begun else None
+
+    def leave_out(self, seconds: float) -> None:
+        """Do not count the last ``seconds``, in which something was done that is not done again."""
+        if self._first is not None:
+            begun, at = self._first
+            self._first = begun, at + seconds

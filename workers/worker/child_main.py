@@ -19,6 +19,7 @@ from typing import Any, NoReturn
 
 from octasplat.engine.core.errors import CancelledError, OctasplatError
 from octasplat.engine.core.events import Event
+from octasplat.engine.core.kernel_folder import shared_cache_folder
 from octasplat.workers.parent_death_signal import set_parent_death_signal
 from octasplat.workers.sandbox.confinement import confine, set_resource_limits
 from octasplat.workers.storage.os_errors import is_disk_full
@@ -144,10 +145,12 @@ def _enter_sandbox(task: dict[str, Any]) -> None:
         temporary = written[0] / "tmp"
         temporary.mkdir(exist_ok=True)
         os.environ["TMPDIR"] = str(temporary)
+    # Machine code that other processes run is theirs to make; a job reads it.
+    kernels = shared_cache_folder()
     confine(
-        hidden=[Path(path) for path in task.get("hidden", ())],
+        hidden=[*(Path(path) for path in task.get("hidden", ())), kernels],
         writable=written,
-        readable=[Path(task["scene"])] if task.get("scene") else (),
+        readable=[kernels, *([Path(task["scene"])] if task.get("scene") else ())],
         may_start_processes=True,
         is_read_only_elsewhere=False,
     )

@@ -6,6 +6,7 @@ import shutil
 from contextlib import nullcontext
 from pathlib import Path
 
+from octasplat.engine.core.compiling import report_compilation
 from octasplat.engine.core.errors import CheckpointError, ConfigError
 from octasplat.engine.core.events import (
     Event,
@@ -57,16 +58,17 @@ def _run_reconstruction(task: Task) -> None:
             _publish_run(task)
 
     try:
-        reconstruct_scene(
-            task.scene,
-            task.run,
-            config,
-            resume=True,
-            threads=task.threads,
-            progress=stop_when_asked(broadcast([task.progress, publish_finished]), task.should_stop),
-            should_stop=task.should_stop,
-            on_step=PreviewRenderer(task.run, config.evaluation_background, task.progress),
-        )
+        with report_compilation(task.progress):
+            reconstruct_scene(
+                task.scene,
+                task.run,
+                config,
+                resume=True,
+                threads=task.threads,
+                progress=stop_when_asked(broadcast([task.progress, publish_finished]), task.should_stop),
+                should_stop=task.should_stop,
+                on_step=PreviewRenderer(task.run, config.evaluation_background, task.progress),
+            )
     finally:
         _publish_run(task)
 
@@ -92,7 +94,7 @@ def run_operation(task: Task) -> None:
             nullcontext() if kind.reports_stages else counted_phase(kind.stages(options)[0], report, 0)
         )
         with phase_context:
-            result = kind.operation.run(
+            result = kind.operation.execute(
                 kind.build_request(task), progress=report, should_stop=task.should_stop, threads=task.threads
             )
     for path in result.files:

@@ -115,6 +115,8 @@ class Reporter:
             self._stage, self._time_left = event["stage"], TimeLeftEstimator()
             self._steps = int(event["total_steps"])
             self._progress = {"stage": self._stage, "step": 0, "total_steps": self._steps or None}
+        elif kind == "kernels_compiled":
+            self._time_left.leave_out(float(event["seconds"]))
         elif kind == "stage_progress":
             self._on_stage_progress(event)
         elif kind == "training_progress":

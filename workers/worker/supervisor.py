@@ -14,6 +14,7 @@ import psycopg
 
 from octasplat.engine.core import versions
 from octasplat.engine.core.errors import ConfigError, OctasplatError
+from octasplat.engine.operations.precompile import request_groups
 from octasplat.workers.cancellation import cancel_and_wait
 from octasplat.workers.db.datasets import files_of, get_dataset
 from octasplat.workers.queue.attempts import Attempt, FencedError
@@ -30,6 +31,7 @@ from octasplat.workers.worker.child_process import ChildProcess
 from octasplat.workers.worker.context import DatabaseLostError, WorkerContext
 from octasplat.workers.worker.heartbeat import DATABASE_ERRORS, Heartbeat
 from octasplat.workers.worker.job_kinds import JobKind, get_job_kind
+from octasplat.workers.worker.kernels import compile_for_job
 from octasplat.workers.worker.outcomes import OutcomeWriter
 from octasplat.workers.worker.path_redaction import PathRedactor, redact_json
 from octasplat.workers.worker.reporter import Reporter
@@ -184,6 +186,11 @@ class Supervisor:
         if checkpoint is not None:
             await self._restore(checkpoint)
         self._reporter.set_stages(kind.stages(options))
+        await compile_for_job(
+            request_groups(kind.name, options),
+            self._reporter.add_note,
+            lambda: self._stop_reason is not None,
+        )
         return {
             "program": kind.program,
             "kind": kind.name,

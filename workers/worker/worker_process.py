@@ -22,6 +22,7 @@ from procrastinate.exceptions import ConnectorException
 from octasplat.engine import __version__
 from octasplat.engine.core.threads import available_threads
 from octasplat.engine.files import writable_formats
+from octasplat.engine.operations.precompile import cold_start_seconds, kernel_groups
 from octasplat.workers.cancellation import cancel_and_wait
 from octasplat.workers.db.connections import Pool, open_pool
 from octasplat.workers.db.ids import new_id
@@ -48,6 +49,7 @@ from octasplat.workers.worker.capability import reason_incapable, version_facts
 from octasplat.workers.worker.context import DatabaseLostError, WorkerContext
 from octasplat.workers.worker.heartbeat import DATABASE_ERRORS
 from octasplat.workers.worker.host_health import HostHealth
+from octasplat.workers.worker.kernels import compile_in_background
 from octasplat.workers.worker.memory_limit import memory_limit_bytes
 from octasplat.workers.worker.periodic_tasks import PeriodicTask, PeriodicTaskError, run_periodically
 from octasplat.workers.worker.supervisor import Supervisor
@@ -190,7 +192,9 @@ class _Worker:
         ]
         logger.info("worker %s takes %s", self._name, dict(self._queues) or "no jobs, only care of lost ones")
         try:
-            await self._take_jobs(periodic)
+            # Who only looks after lost jobs needs none.
+            async with compile_in_background() if self._queues else contextlib.nullcontext():
+                await self._take_jobs(periodic)
         finally:
             for outcome in await cancel_and_wait(periodic):
                 if isinstance(outcome, PeriodicTaskError):
@@ -328,6 +332,7 @@ class _Worker:
             "memory_limit_bytes": self._context.memory_limit_bytes,
             "ailing": self._context.host_health.fault or self._admission.shortage,
             "isolation": sandbox_capabilities(),
+            "cold_start_seconds": round(cold_start_seconds(kernel_groups()), 1),
             **version_facts(),
         }
 

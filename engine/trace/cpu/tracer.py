@@ -117,7 +117,8 @@ class CpuTracer:
             GaussianParameters.from_gaussians(gaussians),
             self.settings.q,
         )
-        self._packet_tracer.build(self._primitives)
+        if self._packet_mode != "never":
+            self._packet_tracer.build(self._primitives)
         self._is_single_built = False
         self._build_id = object()
 
@@ -129,7 +130,8 @@ class CpuTracer:
             ids = np.arange(len(self._gaussians), dtype=np.int32)
         parameters, q = GaussianParameters.from_gaussians(self._gaussians), self.settings.q
         run_ranges(repack_primitives, self.threads, len(ids), self._primitives, ids, parameters, q)
-        self._packet_tracer.refresh(self._primitives, ids)
+        if self._packet_mode != "never":
+            self._packet_tracer.refresh(self._primitives, ids)
         if self._is_single_built:
             outgrown = np.zeros(len(ids), np.bool_)
             run_ranges(

@@ -5,6 +5,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
+from octasplat.engine.core.compiling import compilation_seconds
 from octasplat.engine.train.config import (
     OUTLIER_VIEWS_FROM,
     TrainConfig,
@@ -186,6 +187,7 @@ class Stopwatch:
         self._before_s = before_s
         self._kept_s = before_s
         self._since = time.perf_counter()
+        self._left_out_s = compilation_seconds()
 
     @property
     def seconds(self) -> float:
@@ -193,13 +195,14 @@ class Stopwatch:
         return self._kept_s + time.perf_counter() - self._since
 
     @property
-    def seconds_here(self) -> float:
-        """Return the seconds in this process."""
-        return self.seconds - self._before_s
+    def pace_seconds(self) -> float:
+        """Return the seconds in this process without the compilation of kernels, from which a pace can be estimated."""
+        return self.seconds - self._before_s - (compilation_seconds() - self._left_out_s)
 
     @contextmanager
     def paused(self) -> Iterator[float]:
         """Let the watch stand still, and give the time it shows."""
-        self._kept_s = self.seconds
+        self._kept_s, compiled_s = self.seconds, compilation_seconds()
         yield self._kept_s
+        self._left_out_s += compilation_seconds() - compiled_s
         self._since = time.perf_counter()

@@ -368,7 +368,7 @@ class Trainer:
 
     def _report(self, step: LossGradients, watch: Stopwatch, iterations_here: int) -> None:
         state, total = self.state, self.schedule.iterations
-        pace_s = watch.seconds_here / iterations_here
+        pace_s = watch.pace_seconds / iterations_here
         self._progress(
             TrainingProgress(
                 iteration=state.iteration,
