@@ -6,6 +6,7 @@ one is compiling.
 
 import sys
 from collections.abc import Sequence
+from contextlib import suppress
 
 from octasplat.engine.core.kernel_signatures import compile_kernel
 from octasplat.engine.operations.precompile import kernels_of
@@ -15,7 +16,9 @@ def compile_groups(number: int, groups: Sequence[str]) -> None:
     """Compile all kernels of the groups, from the end of the list for an odd ``number``."""
     todo = list(kernels_of(groups))
     for found in reversed(todo) if number % 2 else todo:
-        compile_kernel(found.module, found.function, found.arguments, skip_busy=True)
+        # A kernel that has moved since the table was written is compiled when it is called.
+        with suppress(ImportError, AttributeError):
+            compile_kernel(found.module, found.function, found.arguments, skip_busy=True)
 
 
 if __name__ == "__main__":

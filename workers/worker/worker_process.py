@@ -192,7 +192,6 @@ class _Worker:
         ]
         logger.info("worker %s takes %s", self._name, dict(self._queues) or "no jobs, only care of lost ones")
         try:
-            # Who only looks after lost jobs needs none.
             async with compile_in_background() if self._queues else contextlib.nullcontext():
                 await self._take_jobs(periodic)
         finally:
@@ -332,7 +331,8 @@ class _Worker:
             "memory_limit_bytes": self._context.memory_limit_bytes,
             "ailing": self._context.host_health.fault or self._admission.shortage,
             "isolation": sandbox_capabilities(),
-            "cold_start_seconds": round(cold_start_seconds(kernel_groups()), 1),
+            # Who only looks after lost jobs may have no compiler.
+            "cold_start_seconds": round(cold_start_seconds(kernel_groups()), 1) if self._queues else 0.0,
             **version_facts(),
         }
 
