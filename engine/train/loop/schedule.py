@@ -196,7 +196,7 @@ class Stopwatch:
 
     @property
     def pace_seconds(self) -> float:
-        """Return the seconds in this process without the compilation of kernels, from which a pace can be estimated."""
+        """Return the seconds in this process without those of compiling kernels, to estimate a pace from."""
         return self.seconds - self._before_s - (compilation_seconds() - self._left_out_s)
 
     @contextmanager
