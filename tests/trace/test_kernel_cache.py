@@ -170,7 +170,7 @@ def test_each_kernel_of_the_table_is_one() -> None:
 def test_groups_of_requests() -> None:
     options = operation("render").options
     assert request_groups("render", options()) == ("render",)
-    assert request_groups("render", options(stage="stage.toml")) == ("render-stage",)
+    assert request_groups("render", options().model_copy(update={"stage": "stage.toml"})) == ("render-stage",)
 
 
 @pytest.mark.heavy
