@@ -12,7 +12,7 @@ from octasplat.engine.core.events import Event, Noted, Warned
 from octasplat.engine.dataset import Dataset
 from octasplat.engine.dataset.synthetic import SyntheticDatasetConfig, write_synthetic_dataset
 from octasplat.engine.dataset.views_file import read_views, write_views
-from octasplat.engine.operations import surface_inputs
+from octasplat.engine.runs import surface_inputs
 from octasplat.engine.runs.config import resolve_config
 from octasplat.engine.runs.surface_inputs import training_photographs
 
