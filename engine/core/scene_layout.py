@@ -44,6 +44,10 @@ _MODEL_ELSEWHERE = re.compile(r"(.*/)?images\.(bin|txt)")
 _IGNORED_FILE = re.compile(
     r"(^|/)(__MACOSX/|\.(?!\.?(/|$))[^/]*|thumbs\.db$|desktop\.ini$|Icon\r?$)", re.IGNORECASE
 )
+_GENERATED_FILE = re.compile(
+    r"(.*/)?(generated\.json|ground_truth/(mesh\.ply|(depth|normals)/[^/]+\.exr|masks/[^/]+\.png))"
+)
+"""What a generated scene has beside its photographs, and nobody misses among them."""
 _SHOWN_NAMES = 3
 
 
@@ -62,8 +66,9 @@ class SceneLayout:
 
     Attributes:
         files: the path of each file of the scene by its name in the scene, e.g. ``images/a.jpg``.
-        left_out: paths of the other files, but for what file managers leave behind.
-        ignored: paths of what file managers leave behind, and of hidden files.
+        left_out: paths of the other files, but for those that are ignored.
+        ignored: paths of what file managers leave behind, of hidden files, and of the ground truth of a
+            generated scene.
         folder: the folder, with its slash, that is around everything; empty where there is none.
     """
 
@@ -84,8 +89,9 @@ def lay_out_scene(paths: Sequence[str]) -> SceneLayout:
     >>> lay_out_scene(["DCIM/100MEDIA/a.JPG", "DCIM/100MEDIA/a.MOV"]).files
     {'images/a.JPG': 'DCIM/100MEDIA/a.JPG'}
     """
-    ignored = tuple(path for path in paths if is_ignored_file(path))
-    rest = [path for path in paths if not is_ignored_file(path)]
+    ignored = tuple(path for path in paths if is_ignored_file(path) or _GENERATED_FILE.fullmatch(path))
+    known = set(ignored)
+    rest = [path for path in paths if path not in known]
     folder = common_folder(rest)
     names = {path: path.removeprefix(folder) for path in rest}
     results = results_folders(names.values())

@@ -80,10 +80,10 @@ def run(
     from octasplat.engine.dataset.model_sources import has_model
     from octasplat.engine.operations.cost_model import estimate_reconstruction
     from octasplat.engine.operations.precompile import cold_start_seconds
-    from octasplat.engine.poses.photographs import left_out_of_scene, locate_scene
+    from octasplat.engine.poses.photographs import locate_scene, notes_on_files
 
     scene = locate_scene(request.source)
-    for sentence in left_out_of_scene(scene):
+    for sentence in notes_on_files(scene):
         progress(Warned(sentence))
     config = request.config().with_poses_decided(has_model(scene))
     sizes = photograph_sizes(scene)

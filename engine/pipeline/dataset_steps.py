@@ -6,7 +6,7 @@ from octasplat.engine.dataset import Dataset, write_held_out
 from octasplat.engine.dataset.views_file import write_views
 from octasplat.engine.pipeline.output_folder import write_config
 from octasplat.engine.pipeline.run import ReconstructionRun
-from octasplat.engine.poses.photographs import left_out_of_scene
+from octasplat.engine.poses.photographs import notes_on_files
 from octasplat.engine.runs.config import read_config
 from octasplat.engine.runs.run_folder import (
     CONFIG,
@@ -32,7 +32,7 @@ class FindPoses:
     def __call__(self, run: ReconstructionRun) -> None:
         """Find the poses; a new run says first which files it leaves out."""
         if run.recorded is None:
-            for sentence in left_out_of_scene(run.scene):
+            for sentence in notes_on_files(run.scene):
                 run.progress(Warned(sentence))
         find_missing_poses(run.scene, run.output, run.config, run.threads, run.progress, run.should_stop)
 

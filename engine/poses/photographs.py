@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from octasplat.engine.core.errors import DatasetError
+from octasplat.engine.core.portable_names import unportable_names_sentence
 from octasplat.engine.core.scene_layout import (
     IMAGES,
     SceneLayout,
@@ -45,9 +46,11 @@ def photographs_of_scene(scene: Path) -> list[str]:
     return names
 
 
-def left_out_of_scene(scene: Path) -> tuple[str, ...]:
-    """Return sentences on the files of a folder that are no part of its scene."""
-    return _layout_of(scene).notes
+def notes_on_files(scene: Path) -> tuple[str, ...]:
+    """Return sentences on the files of a folder that are left out, or bear names that others refuse."""
+    layout = _layout_of(scene)
+    unportable = unportable_names_sentence(layout.files)
+    return layout.notes if unportable is None else (*layout.notes, unportable)
 
 
 def _layout_of(scene: Path) -> SceneLayout:

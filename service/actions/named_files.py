@@ -4,12 +4,12 @@ import uuid
 
 from pydantic import BaseModel
 
+from octasplat.engine.core.portable_names import quoted_name
 from octasplat.service.actions.validation import input_problem
 from octasplat.service.auth import Principal
 from octasplat.service.problems import ProblemError
 from octasplat.workers.db.connections import Connection
 from octasplat.workers.db.datasets import files_of, get_dataset
-from octasplat.workers.storage.file_names import quoted_name
 from octasplat.workers.worker.job_kinds import JobKind
 
 

@@ -12,6 +12,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import BinaryIO
 
+from octasplat.engine.core.portable_names import FileNameError, check_name, quoted_name
 from octasplat.engine.core.scene_layout import FileRole, file_role, lay_out_scene
 from octasplat.service.intake.upload_names import FileNames
 from octasplat.service.intake.zip_records import (
@@ -24,7 +25,6 @@ from octasplat.service.intake.zip_records import (
     read_listed_records,
     read_records,
 )
-from octasplat.workers.storage.file_names import FileNameError, check_name, quoted_name
 from octasplat.workers.storage.protocol import Blob, BlobWriter
 
 _PIECE_BYTES = 1 << 20

@@ -4,6 +4,7 @@ import unicodedata
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 
+from octasplat.engine.core.portable_names import quoted_name
 from octasplat.engine.core.scene_layout import IMAGES, FileRole, file_role, masks_beside, too_few_photographs
 from octasplat.service.intake.faults import IntakeError, IntakeFault
 from octasplat.service.intake.image_completeness import check_complete
@@ -11,7 +12,6 @@ from octasplat.service.intake.images import ImageHeader, ImageLimits, read_image
 from octasplat.service.intake.model_check import ModelLimits, check_model
 from octasplat.service.intake.model_child import ModelAnswer
 from octasplat.service.intake.upload_names import FileNames, check_scene_file
-from octasplat.workers.storage.file_names import quoted_name
 from octasplat.workers.storage.protocol import Storage
 from octasplat.workers.storage.trees import TreeFile
 

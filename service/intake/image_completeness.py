@@ -12,9 +12,9 @@ import struct
 from collections.abc import Callable
 from typing import BinaryIO
 
+from octasplat.engine.core.portable_names import quoted_name
 from octasplat.service.intake.faults import IntakeError, IntakeFault
 from octasplat.service.intake.images import read_null_terminated, unpack_struct
-from octasplat.workers.storage.file_names import quoted_name
 
 _TAIL_BYTES = 64 << 10
 _PIECE_BYTES = 1 << 20

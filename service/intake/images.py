@@ -18,8 +18,8 @@ from PIL.BmpImagePlugin import BmpImageFile
 from PIL.JpegImagePlugin import JpegImageFile
 from PIL.PngImagePlugin import PngImageFile
 
+from octasplat.engine.core.portable_names import quoted_name
 from octasplat.service.intake.faults import IntakeError, IntakeFault
-from octasplat.workers.storage.file_names import quoted_name
 
 _SUFFIXES = {
     "JPEG": (".jpg", ".jpeg"), "PNG": (".png",), "TIFF": (".tif", ".tiff"), "WebP": (".webp",),

@@ -5,13 +5,13 @@ from collections.abc import Sequence
 from pathlib import PurePosixPath
 from typing import Any, BinaryIO
 
+from octasplat.engine.core.portable_names import quoted_name
 from octasplat.engine.core.scene_layout import IMAGE_SUFFIXES, is_ignored_file
 from octasplat.service.intake.dataset import DatasetFile
 from octasplat.service.intake.faults import IntakeError, IntakeFault
 from octasplat.service.intake.image_completeness import check_complete
 from octasplat.service.intake.images import ImageHeader, ImageLimits, read_image_header
 from octasplat.service.intake.upload_names import FileNames
-from octasplat.workers.storage.file_names import quoted_name
 from octasplat.workers.storage.protocol import Storage
 
 MAX_FILES = 1000

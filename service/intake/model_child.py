@@ -19,10 +19,10 @@ from typing import TYPE_CHECKING, Any
 
 from pydantic import BaseModel
 
+from octasplat.engine.core.portable_names import FileNameError, check_name, quoted_name
 from octasplat.service.intake.faults import IntakeFault
 from octasplat.workers.sandbox.confinement import confine
 from octasplat.workers.sandbox.linux import PR_SET_PDEATHSIG, prctl
-from octasplat.workers.storage.file_names import FileNameError, check_name, quoted_name
 
 if TYPE_CHECKING:
     from octasplat.engine.dataset.colmap_model import ColmapModel

@@ -4,13 +4,13 @@ import io
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from octasplat.engine.core.portable_names import quoted_name
 from octasplat.engine.core.scene_layout import FileRole, file_role, lay_out_scene
 from octasplat.service.intake.archive import list_archive_end
 from octasplat.service.intake.dataset import photograph_count_fault, photographs_among
 from octasplat.service.intake.faults import IntakeError, IntakeFault
 from octasplat.service.intake.receive import UploadLimits
 from octasplat.service.intake.upload_names import FileNames
-from octasplat.workers.storage.file_names import quoted_name
 
 _MAX_FAULTS = 100
 

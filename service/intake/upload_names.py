@@ -4,9 +4,9 @@ Names arrive with a single file (:func:`check_file_name`), or in numbers (:class
 archive, and those of a dataset that is committed.
 """
 
+from octasplat.engine.core.portable_names import FileNameError, NameSet, check_name, quoted_name
 from octasplat.engine.core.scene_layout import FileRole, file_role
 from octasplat.service.intake.faults import IntakeError, IntakeFault
-from octasplat.workers.storage.file_names import FileNameError, NameSet, check_name, quoted_name
 
 
 def check_file_name(name: str) -> FileRole:

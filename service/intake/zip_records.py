@@ -11,8 +11,8 @@ import zlib
 from dataclasses import dataclass
 from typing import BinaryIO, NoReturn
 
+from octasplat.engine.core.portable_names import quoted_name
 from octasplat.service.intake.faults import IntakeError, IntakeFault
-from octasplat.workers.storage.file_names import quoted_name
 
 STORED, DEFLATED = 0, 8
 IS_ENCRYPTED, HAS_DESCRIPTOR, IS_PATCHED, IS_STRONG, IS_UTF8, IS_MASKED = 1, 8, 32, 64, 2048, 8192

@@ -8,7 +8,7 @@ import pytest
 from octasplat.engine.core.errors import DatasetError
 from octasplat.engine.core.scene_layout import lay_out_scene
 from octasplat.engine.dataset.model_sources import find_model
-from octasplat.engine.poses.photographs import left_out_of_scene, locate_scene
+from octasplat.engine.poses.photographs import locate_scene, notes_on_files
 from octasplat.service.intake.archive import list_archive
 from tests.support.zip_builder import ZipMember, build_zip
 
@@ -40,9 +40,7 @@ def test_folder_and_archive_take_the_same_poses(kind: str, tmp_path: Path) -> No
     assert set(layout.files.values()) == set(taken)
     assert {file.name for file in listing.files} == layout.files.keys()
     assert set(listing.left_out) == set(layout.left_out) == set(left_out)
-    assert listing.notes == left_out_of_scene(locate_scene(tmp_path)) and bool(listing.notes) == bool(
-        left_out
-    )
+    assert listing.notes == notes_on_files(locate_scene(tmp_path)) and bool(listing.notes) == bool(left_out)
 
 
 def test_poses_elsewhere_are_named_where_nothing_fits(tmp_path: Path) -> None:

@@ -24,7 +24,7 @@ from octasplat.engine.dataset.model_sources import find_model
 from octasplat.engine.dataset.photograph_files import image_folder
 from octasplat.engine.operations.estimate import EstimateRequest
 from octasplat.engine.operations.estimate import run as estimate
-from octasplat.engine.poses.photographs import left_out_of_scene, locate_scene, photographs_of_scene
+from octasplat.engine.poses.photographs import locate_scene, notes_on_files, photographs_of_scene
 from octasplat.service.intake.archive import list_archive
 from octasplat.service.intake.faults import IntakeError
 from octasplat.service.intake.receive import UploadLimits
@@ -93,7 +93,7 @@ def by_archive(paths: Sequence[str]) -> Told:
 def by_run(folder: Path) -> Told:
     """What ``reconstruct`` says before it looks for poses."""
     scene = locate_scene(folder)
-    notes = left_out_of_scene(scene)
+    notes = notes_on_files(scene)
     try:
         names = photographs_of_scene(scene)
     except DatasetError as error:
@@ -207,6 +207,28 @@ def test_photographs_of_names_that_not_every_system_takes_are_refused_before_the
         list_archive(io.BytesIO(data))
     assert told.refusals == by_preview(preview_archive(data, len(data), LIMITS)).refusals
     assert told.refusals == (str(refused.value),)
+
+
+@pytest.mark.parametrize("name", ["a?.jpg", "con.jpg"])
+def test_run_takes_names_that_the_service_would_refuse_and_says_so(name: str, tmp_path: Path) -> None:
+    paths = [f"images/{name}", "images/b.jpg", "images/c.jpg"]
+    write_files(tmp_path, paths)
+    told = by_run(tmp_path)
+    assert told.photographs == set(paths) and not told.refusals
+    (note,) = told.notes
+    assert f"'images/{name}'" in note and "service would refuse 1 of these files" in note
+
+
+def test_ground_truth_of_a_generated_scene_is_left_out_without_a_word(tmp_path: Path) -> None:
+    truth = ["mesh.ply", "depth/a.exr", "normals/a.exr", "masks/a.png"]
+    paths = [f"images/{name}" for name in PHOTOGRAPHS] + [f"ground_truth/{name}" for name in truth]
+    paths.append("generated.json")
+    write_files(tmp_path, paths)
+    told = by_folder(paths)
+    assert told == by_archive(paths) == by_run(tmp_path)
+    assert told.notes == () and len(told.photographs) == len(PHOTOGRAPHS)
+    (note,) = by_folder([*paths, "ground_truth/b.jpg"]).notes
+    assert "ground_truth/b.jpg" in note
 
 
 def test_files_larger_than_the_service_takes_are_refused_before_they_are_sent() -> None:

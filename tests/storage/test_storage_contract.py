@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from octasplat.engine.core.portable_names import FileNameError
 from octasplat.workers.storage import (
     Blob,
     BlobNotFoundError,
@@ -23,7 +24,6 @@ from octasplat.workers.storage import (
     read_manifest,
     store_tree,
 )
-from octasplat.workers.storage.file_names import FileNameError
 from octasplat.workers.storage.s3 import S3Storage
 
 MIB = 1 << 20

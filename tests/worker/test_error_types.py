@@ -7,12 +7,12 @@ import pytest
 
 from octasplat.engine.core import errors as engine_errors
 from octasplat.engine.core.errors import OctasplatError
+from octasplat.engine.core.portable_names import FileNameError
 from octasplat.engine.operations.base import ContradictoryRequestError
 from octasplat.engine.settings.refusals import SettingsRefused
 from octasplat.workers.db.datasets import create_dataset, put_file
 from octasplat.workers.db.quotas import QuotaExceededError
 from octasplat.workers.storage import errors as storage_errors
-from octasplat.workers.storage.file_names import FileNameError
 from tests.support.worker_harness import WorkerHarness
 
 ENGINE_TYPES = {

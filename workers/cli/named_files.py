@@ -5,10 +5,10 @@ from dataclasses import replace
 from pathlib import Path
 
 from octasplat.engine.core.errors import ConfigError
+from octasplat.engine.core.portable_names import FileNameError, check_name
 from octasplat.engine.operations import operation, operation_names
 from octasplat.engine.operations.file_patterns import expand_patterns
 from octasplat.workers.client.submission import Derivation
-from octasplat.workers.storage.file_names import FileNameError, check_name
 
 
 def with_named_files(derivation: Derivation, files_by_option: Sequence[tuple[str, Path]]) -> Derivation:

@@ -9,6 +9,7 @@ from typing import Any
 import httpx
 
 from octasplat.engine.core.errors import OutputError
+from octasplat.engine.core.portable_names import NameSet
 from octasplat.workers.client.api import (
     BUSY_STATUSES,
     UNAVAILABLE_STATUSES,
@@ -16,7 +17,6 @@ from octasplat.workers.client.api import (
     ServiceError,
     ServiceUnreachableError,
 )
-from octasplat.workers.storage.file_names import NameSet
 
 MAX_DAMAGED_DOWNLOADS = 3
 """So often a file is fetched anew whose content is not what it should be."""

@@ -8,6 +8,7 @@ from typing import Any
 
 from octasplat.engine.core.errors import ConfigError, OctasplatError
 from octasplat.engine.core.events import EventListener, Warned, ignore_events
+from octasplat.engine.core.portable_names import FileNameError, check_name
 from octasplat.engine.core.progress import counted_phase
 from octasplat.engine.pathtracing.stage.sidecar_files import sidecar_files
 from octasplat.engine.pathtracing.stage.stage_file import read_stage, referenced_files, with_renamed_files
@@ -17,7 +18,6 @@ from octasplat.workers.client.api import Api
 from octasplat.workers.client.download import download_results
 from octasplat.workers.client.upload import upload_files, upload_scene
 from octasplat.workers.client.watch import watch_job
-from octasplat.workers.storage.file_names import FileNameError, check_name
 
 
 class JobFailedError(OctasplatError):

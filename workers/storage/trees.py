@@ -9,8 +9,8 @@ from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
+from octasplat.engine.core.portable_names import NameSet
 from octasplat.workers.storage.errors import StorageError
-from octasplat.workers.storage.file_names import NameSet
 from octasplat.workers.storage.os_errors import translate_os_errors
 from octasplat.workers.storage.protocol import Storage
 

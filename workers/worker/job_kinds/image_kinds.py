@@ -7,6 +7,7 @@ from typing import Any
 
 from octasplat.engine.core.errors import CancelledError
 from octasplat.engine.core.events import EventListener
+from octasplat.engine.core.portable_names import check_name
 from octasplat.engine.core.progress import stop_when_asked
 from octasplat.engine.dataset.image_sizes import ImageSizes
 from octasplat.engine.operations.base import Operation
@@ -20,7 +21,6 @@ from octasplat.engine.operations.cost_model import (
 from octasplat.engine.operations.relight import RelightOptions
 from octasplat.engine.operations.render import RenderOptions
 from octasplat.engine.pathtracing.stage.stage_file import referenced_files
-from octasplat.workers.storage.file_names import check_name
 from octasplat.workers.worker.frame_checkpoints import FrameCheckpoints
 from octasplat.workers.worker.job_kinds.operation_kind import OperationKind
 from octasplat.workers.worker.job_kinds.resource_limits import ResourceDemand

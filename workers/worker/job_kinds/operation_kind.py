@@ -8,10 +8,10 @@ from typing import Any
 from pydantic import BaseModel
 
 from octasplat.engine.core.events import EventListener
+from octasplat.engine.core.portable_names import check_name
 from octasplat.engine.core.progress import stop_when_asked
 from octasplat.engine.operations.base import Operation, Options, Request
 from octasplat.engine.settings.fields import accepts_files, iter_named_files, map_named_files
-from octasplat.workers.storage.file_names import check_name
 from octasplat.workers.worker.job_kinds.registry import JobKind, Needs
 from octasplat.workers.worker.task import SCENE_FILE, Task
 

@@ -1,10 +1,12 @@
-"""Names of uploaded files: relative, portable, and distinct on every file system.
+"""Names of files that every system can hold: relative, portable, and distinct on every file system.
 
-An invalid name is refused, never repaired, so that users see the names that they sent.
+Uploads take no others. An invalid name is refused, never repaired, so that users see the names that they
+sent.
 """
 
 import re
 import unicodedata
+from collections.abc import Iterable
 
 from octasplat.engine.core.errors import DatasetError
 
@@ -12,6 +14,7 @@ MAX_NAME_BYTES = 1000
 MAX_COMPONENT_BYTES = 240
 MAX_DEPTH = 12
 
+_SHOWN_NAMES = 3
 _RESERVED_NAMES = re.compile(
     r"(con|prn|aux|nul|conin\$|conout\$|clock\$|(com|lpt)[0-9\u00b9\u00b2\u00b3]) *(\..*)?",
     re.IGNORECASE | re.DOTALL,
@@ -113,6 +116,27 @@ def quoted_name(name: str) -> str:
     """Return a name for use in a sentence: quoted, escaped and cut."""
     text = name if len(name) <= 80 else f"{name[:60]}...{name[-15:]}"
     return ascii(text) if not text.isprintable() or "\\" in text else f"'{text}'"
+
+
+def unportable_names_sentence(names: Iterable[str]) -> str | None:
+    """Return what to say of names that are read here and refused where they are sent; None without any.
+
+    >>> unportable_names_sentence(["a.jpg", "con.jpg"])
+    "The service would refuse 1 of these files by their names ('con.jpg'); rename them before they are sent."
+    """
+    known, refused = NameSet(), []
+    for name in names:
+        try:
+            known.add(name)
+        except FileNameError:
+            refused.append(name)
+    if not refused:
+        return None
+    shown = ", ".join(map(quoted_name, refused[:_SHOWN_NAMES])) + ", ..." * (len(refused) > _SHOWN_NAMES)
+    return (
+        f"The service would refuse {len(refused)} of these files by their names ({shown}); rename them "
+        "before they are sent."
+    )
 
 
 class NameSet:
