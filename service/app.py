@@ -141,15 +141,15 @@ async def _service_lifespan(settings: ServiceSettings) -> AsyncIterator[Service]
         try:
             login_throttle = LoginThrottle(settings.wrong_token_seconds)
             yield Service(
-                settings,
-                pool,
-                ProcrastinateQueue(),
-                storage,
-                event_broker,
-                evictor,
-                login_throttle,
-                settings.spool(),
-                _check_limiter(settings),
+                settings=settings,
+                pool=pool,
+                job_queue=ProcrastinateQueue(),
+                storage=storage,
+                event_broker=event_broker,
+                evictor=evictor,
+                login_throttle=login_throttle,
+                spool_space=settings.spool(),
+                check_limiter=_check_limiter(settings),
             )
         finally:
             await evictor.close()

@@ -20,8 +20,8 @@ from octasplat.workers.db.sessions import find_session
 from octasplat.workers.db.tokens import LOCAL_OWNER, find_token, get_token, has_any_token
 
 Scope = Literal["read", "write", "admin"]
-COOKIE = "octasplat_session"
-SECURE_COOKIE = f"__Host-{COOKIE}"
+SESSION_COOKIE = "octasplat_session"
+SECURE_SESSION_COOKIE = f"__Host-{SESSION_COOKIE}"
 """Where there is TLS: browsers take it from this very host only, and send it nowhere else."""
 _SUFFICIENT_SCOPES: dict[str, frozenset[str]] = {
     "read": frozenset({"read", "write", "admin"}),
@@ -33,7 +33,9 @@ _THROTTLE_RETRY_SECONDS = 5
 
 _bearer = HTTPBearer(auto_error=False, description="A token made with `octasplat token create`.")
 _cookie = APIKeyCookie(
-    name=COOKIE, auto_error=False, description=f"A browser's session; with TLS it is called {SECURE_COOKIE}."
+    name=SESSION_COOKIE,
+    auto_error=False,
+    description=f"A browser's session; with TLS it is called {SECURE_SESSION_COOKIE}.",
 )
 
 
@@ -130,7 +132,7 @@ def client_address(request: Request) -> str:
 
 def session_secret(request: Request) -> str | None:
     """Return the secret in the session cookie; with TLS, only the host-only cookie counts."""
-    return request.cookies.get(SECURE_COOKIE if request.url.scheme == "https" else COOKIE)
+    return request.cookies.get(SECURE_SESSION_COOKIE if request.url.scheme == "https" else SESSION_COOKIE)
 
 
 async def principal_of_session(service: Service, secret: str) -> Principal | None:

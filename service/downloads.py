@@ -57,7 +57,7 @@ async def send_blob(
         "Repr-Digest": format_digest(sha256),
         "Cache-Control": "private, no-cache",
         "Accept-Ranges": "bytes",
-        "Content-Disposition": _disposition(name, is_inline),
+        "Content-Disposition": _content_disposition(name, is_inline),
     }
     if media_type == "text/html":
         headers["Content-Security-Policy"] = _SANDBOX_POLICY
@@ -104,7 +104,7 @@ def _stored_response(
     return StreamingResponse(pieces, status_code=status, headers=headers, media_type=media_type)
 
 
-def _disposition(name: str, inline: bool) -> str:
+def _content_disposition(name: str, inline: bool) -> str:
     """Return the Content-Disposition header (RFC 6266)."""
     last = PurePosixPath(name).name
     plain = re.sub(r"[^A-Za-z0-9._ -]", "_", last)

@@ -84,7 +84,7 @@ def estimate_job(
     """
     if not sizes:
         return None
-    found = kind.estimate(options, sizes, max(map(_cores, workers), default=os.cpu_count() or 1))
+    found = kind.estimate(options, sizes, max(map(_cores_per_job, workers), default=os.cpu_count() or 1))
     cold = min(map(_cold_start_seconds, workers), default=0.0)
     return found.with_cold_start(cold) if found is not None and cold else found
 
@@ -125,7 +125,7 @@ def _cold_start_seconds(worker: WorkerRow) -> float:
     return float(found) if isinstance(found, int | float) else 0.0
 
 
-def _cores(worker: WorkerRow) -> int:
+def _cores_per_job(worker: WorkerRow) -> int:
     """Return the cores for one job of a worker, if it reports them."""
     found = worker.facts.get("threads", worker.facts.get("cores"))
     cores = found if isinstance(found, int) and found > 0 else 1

@@ -45,10 +45,10 @@ class LoginThrottle:
 
         Secrets that were right before always are.
         """
-        if _digest(secret) in self._known_digests:
+        if _secret_digest(secret) in self._known_digests:
             yield True
             return
-        guesser = self._client(address)
+        guesser = self._attempts_of_client(address)
         if guesser.under_way >= (MAX_CONCURRENT_AFTER_FAILURE if guesser.wrong else MAX_CONCURRENT):
             yield False
             return
@@ -60,21 +60,21 @@ class LoginThrottle:
 
     def record_success(self, secret: str) -> None:
         """Remember a valid secret."""
-        self._known_digests[_digest(secret)] = None
-        self._known_digests.move_to_end(_digest(secret))
+        self._known_digests[_secret_digest(secret)] = None
+        self._known_digests.move_to_end(_secret_digest(secret))
         if len(self._known_digests) > _MAX_KNOWN_SECRETS:
             self._known_digests.popitem(last=False)
 
     async def delay_failure(self, address: str) -> bool:
         """Delay the answer; returns whether it is the address's first failure for a while."""
-        guesser = self._client(address)
+        guesser = self._attempts_of_client(address)
         guesser.wrong += 1
         guesser.last = time.monotonic()
         is_first = guesser.wrong == 1
         await asyncio.sleep(min(MAX_DELAY_SECONDS, self._seconds * 1.5 ** min(guesser.wrong - 1, 40)))
         return is_first
 
-    def _client(self, address: str) -> _ClientAttempts:
+    def _attempts_of_client(self, address: str) -> _ClientAttempts:
         group = _client_key(address)
         guesser = self._clients.pop(group, None)
         if guesser is None or (not guesser.under_way and time.monotonic() - guesser.last > RESET_SECONDS):
@@ -85,7 +85,7 @@ class LoginThrottle:
         return guesser
 
 
-def _digest(secret: str) -> bytes:
+def _secret_digest(secret: str) -> bytes:
     return hashlib.sha256(secret.encode()).digest()
 
 

@@ -98,21 +98,21 @@ def _schemas_with_presets(definitions: dict[str, Any]) -> set[str]:
         reference
         for schema in definitions.values()
         if "preset" in schema.get("properties", {})
-        for reference in _references(schema)
+        for reference in _schema_references(schema)
     ]
     while waiting:
         name = waiting.pop()
         if name not in found:
             found.add(name)
-            waiting += _references(definitions[name])
+            waiting += _schema_references(definitions[name])
     return found
 
 
-def _references(schema: object) -> list[str]:
+def _schema_references(schema: object) -> list[str]:
     if isinstance(schema, dict):
         own = [schema["$ref"].removeprefix(_REF)] if isinstance(schema.get("$ref"), str) else []
-        return own + [name for value in schema.values() for name in _references(value)]
-    return [name for item in schema for name in _references(item)] if isinstance(schema, list) else []
+        return own + [name for value in schema.values() for name in _schema_references(value)]
+    return [name for item in schema for name in _schema_references(item)] if isinstance(schema, list) else []
 
 
 def _without_client_defaults(schema: dict[str, Any], *, keeps_defaults: bool) -> dict[str, Any]:

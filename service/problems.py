@@ -16,7 +16,7 @@ from starlette.exceptions import HTTPException
 from octasplat.engine.core.errors import OctasplatError
 from octasplat.engine.operations.base import error_text
 from octasplat.engine.pathtracing.stage.stage_file import stage_error_message, stage_key_path
-from octasplat.engine.settings.refusals import SettingsRefused
+from octasplat.engine.settings.refusals import InvalidSettingsError
 from octasplat.service.intake.faults import IntakeError
 from octasplat.workers.db.errors import ConflictError, NotFoundError
 from octasplat.workers.db.quotas import QuotaExceededError
@@ -110,9 +110,9 @@ def not_found_error(kind: str) -> ProblemError:
     return ProblemError(404, "not-found", f"There is no such {kind}.")
 
 
-def options_error(error: ValidationError | SettingsRefused, prefix: str = "/options") -> ProblemError:
+def options_error(error: ValidationError | InvalidSettingsError, prefix: str = "/options") -> ProblemError:
     """Return the problem of options that do not fit their schema."""
-    if isinstance(error, SettingsRefused):
+    if isinstance(error, InvalidSettingsError):
         faults = [
             {"code": each.code, "detail": each.sentence, "pointer": _pointer(prefix, each.path)}
             for each in error.refusals
@@ -122,7 +122,7 @@ def options_error(error: ValidationError | SettingsRefused, prefix: str = "/opti
         422,
         "options",
         f"{len(error.errors())} of the options cannot be used; see errors, and GET /v1/options.",
-        errors=[_fault(prefix, fault) for fault in error.errors(include_url=False)],
+        errors=[_field_error(prefix, fault) for fault in error.errors(include_url=False)],
     )
 
 
@@ -183,7 +183,7 @@ async def _on_octasplat_error(_request: Request, error: Exception) -> JSONRespon
 
 async def _on_validation_error(_request: Request, error: Exception) -> JSONResponse:
     assert isinstance(error, RequestValidationError)
-    faults = [_fault("", fault) for fault in error.errors()]
+    faults = [_field_error("", fault) for fault in error.errors()]
     return ProblemError(
         422, "request", "The request does not have the form that is asked for; see errors.", errors=faults
     ).response()
@@ -230,7 +230,7 @@ async def _on_exception(request: Request, error: Exception) -> JSONResponse:
     ).response()
 
 
-def _fault(prefix: str, fault: Mapping[str, Any]) -> dict[str, Any]:
+def _field_error(prefix: str, fault: Mapping[str, Any]) -> dict[str, Any]:
     if fault["loc"][:1] == ("stage",):  # told as whoever reads a stage file would be told
         keys = ("stage", *stage_key_path(fault["loc"][1:]))
         message = stage_error_message(fault["type"], keys, fault["msg"], fault.get("input"))

@@ -36,7 +36,7 @@ class ProxyHeadersMiddleware:
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Pass a request on as its client sent it."""
-        if scope["type"] == "http" and scope.get("client") and self._trusts(scope["client"][0]):
+        if scope["type"] == "http" and scope.get("client") and self._is_trusted_address(scope["client"][0]):
             headers = Headers(scope=scope)
             hops = (
                 _parse_x_forwarded(headers) if self._dialect == "x-forwarded" else _parse_forwarded(headers)
@@ -56,10 +56,10 @@ class ProxyHeadersMiddleware:
             if address is None:
                 return
             scope["client"] = (address, 0)
-            if not self._trusts(address):
+            if not self._is_trusted_address(address):
                 return
 
-    def _trusts(self, text: str) -> bool:
+    def _is_trusted_address(self, text: str) -> bool:
         try:
             address = ipaddress.ip_address(text)
         except ValueError:

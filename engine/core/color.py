@@ -16,14 +16,14 @@ def srgb_to_linear(srgb: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, "*sha
 
 
 def linear_to_srgb(linear: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape"]:
-    """Convert linear values in [0, 1] to display values, in their precision; values below 0 count as 0.
+    """Convert linear values to sRGB-encoded ones of the same dtype; clamps below 0, but not above 1.
 
     >>> linear_to_srgb(np.array([0.0, 0.214, 1.0])).round(3)
     array([0. , 0.5, 1. ])
     """
     exponent = linear.dtype.type(1 / 2.4)
-    curve = 1.055 * np.maximum(linear, 0.0031308) ** exponent - 0.055
-    return np.where(linear <= 0.0031308, 12.92 * np.maximum(linear, 0.0), curve)
+    power_segment = 1.055 * np.maximum(linear, 0.0031308) ** exponent - 0.055
+    return np.where(linear <= 0.0031308, 12.92 * np.maximum(linear, 0.0), power_segment)
 
 
 def to_bytes(values: Float[np.ndarray, "*shape"]) -> UInt8[np.ndarray, "*shape"]:

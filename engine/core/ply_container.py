@@ -213,7 +213,7 @@ def _binary_tables(path: Path, header: PlyHeader) -> Iterator[tuple[str, np.ndar
         dtype = element.dtype(byte_order, lengths)
         needed = element.count * dtype.itemsize
         if offset + needed > size:
-            raise _truncated(path, element, max(0, size - offset) // max(1, dtype.itemsize))
+            raise _truncated_error(path, element, max(0, size - offset) // max(1, dtype.itemsize))
         table: np.ndarray
         if needed:
             table = np.memmap(path, dtype=dtype, mode="c", offset=offset, shape=(element.count,))
@@ -234,10 +234,10 @@ def _first_lengths(path: Path, element: PlyElement, byte_order: str, offset: int
                 count_type = np.dtype(byte_order + prop.count_kind)
                 raw = handle.read(count_type.itemsize)
                 if len(raw) < count_type.itemsize:
-                    raise _truncated(path, element, 0)
+                    raise _truncated_error(path, element, 0)
                 lengths[prop.name] = max(0, int(np.frombuffer(raw, dtype=count_type)[0]))
                 if lengths[prop.name] > path.stat().st_size:
-                    raise _truncated(path, element, 0)
+                    raise _truncated_error(path, element, 0)
                 handle.seek(lengths[prop.name] * np.dtype(prop.kind).itemsize, 1)
             else:
                 handle.seek(np.dtype(prop.kind).itemsize, 1)
@@ -288,7 +288,7 @@ def _ascii_values(path: Path, handle: IO[bytes], element: PlyElement) -> np.ndar
     lines = itertools.islice((line for line in handle if line.strip()), element.count)
     first = next(lines, None)
     if first is None:
-        raise _truncated(path, element, 0)
+        raise _truncated_error(path, element, 0)
     try:
         values: np.ndarray = np.loadtxt(
             itertools.chain([first], lines), dtype=np.float64, comments=None, ndmin=2
@@ -298,7 +298,7 @@ def _ascii_values(path: Path, handle: IO[bytes], element: PlyElement) -> np.ndar
             f"{path}: the rows of element '{element.name}' are not all numbers in equal count ({error})."
         ) from error
     if len(values) < element.count:
-        raise _truncated(path, element, len(values))
+        raise _truncated_error(path, element, len(values))
     return values
 
 
@@ -311,7 +311,7 @@ def _check_lengths(path: Path, element: PlyElement, table: np.ndarray, lengths: 
             )
 
 
-def _truncated(path: Path, element: PlyElement, found: int) -> SceneFileError:
+def _truncated_error(path: Path, element: PlyElement, found: int) -> SceneFileError:
     return SceneFileError(
         f"{path}: is truncated; element '{element.name}' should have {element.count} rows "
         f"but only {found} are there."

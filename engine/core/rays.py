@@ -135,12 +135,12 @@ class RayBatch:
         origins -= 2 * ((origins - point_world) @ normal)[:, None] * normal
         directions -= 2 * (directions @ normal)[:, None] * normal
         return RayBatch(
-            origins,
-            directions,
-            np.maximum(t_mirror, self.t_min),
-            self.t_max,
-            self.t_view_origin,
-            self.t_backface_cull,
+            origins_world=origins,
+            directions_world=directions,
+            t_min=np.maximum(t_mirror, self.t_min),
+            t_max=self.t_max,
+            t_view_origin=self.t_view_origin,
+            t_backface_cull=self.t_backface_cull,
         )
 
 

@@ -93,7 +93,7 @@ def read_colmap_model(
     reconstruction, warnings = loaded.reconstruction, list(loaded.notes)
     _normalise_quaternions(reconstruction, folder, warnings)
     images = _posed_images(reconstruction, folder, warnings)
-    cameras = _cameras(reconstruction, {image.camera_id for image in images}, folder, warnings)
+    cameras = _convert_cameras(reconstruction, {image.camera_id for image in images}, folder, warnings)
     points_world = _point_positions(reconstruction)
     origin = _local_origin(images, points_world) if origin_world is None else origin_world
     images = tuple(_about_origin(image, origin) for image in images)
@@ -104,7 +104,14 @@ def read_colmap_model(
         names = [image.name for image in images]
         warnings += check_poses(folder, names, rotations, translations, points)
     return ColmapModel(
-        folder, cameras, images, points, tuple(warnings), origin, loaded.held_out, loaded.masks
+        folder=folder,
+        cameras=cameras,
+        images=images,
+        points=points,
+        warnings=tuple(warnings),
+        origin_world=origin,
+        held_out=loaded.held_out,
+        masks=loaded.masks,
     )
 
 
@@ -203,7 +210,9 @@ def _image_name(image: Any, folder: Path) -> str:
         ) from None
 
 
-def _cameras(reconstruction: Any, used: set[int], folder: Path, warnings: list[str]) -> dict[int, Camera]:
+def _convert_cameras(
+    reconstruction: Any, used: set[int], folder: Path, warnings: list[str]
+) -> dict[int, Camera]:
     cameras: dict[int, Camera] = {}
     for camera_id, camera in reconstruction.cameras.items():
         if camera_id not in used:

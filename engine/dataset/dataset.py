@@ -139,7 +139,7 @@ class Dataset:
         held_out: Sequence[str] | None = None,
         masks: MaskUse = "ignore",
         model_folder: Path | None = None,
-        accept: Callable[[ViewsRecord], None] | None = None,
+        check_views: Callable[[ViewsRecord], None] | None = None,
         near: float = 0.0,
         threads: int = 0,
         progress: Callable[[int, int], None] | None = None,
@@ -149,30 +149,31 @@ class Dataset:
         split: SplitSource = "given",
         model: str | None = None,
     ) -> "Dataset":
-        """Load a scene and decode its photographs into ``cache_dir``, or find them there.
+        """Load a scene and decode its photographs into ``cache_dir``, or reuse those already cached there.
 
         Args:
             root: folder with ``images/``, a COLMAP model in ``sparse/0``, ``sparse`` or ``colmap/sparse/0``
                 and, if there are any, ``masks/<image name>.png`` (white = valid).
-            cache_dir: folder of the cache, some 3 bytes a pixel (6 if a photograph has more than 8 bits).
+            cache_dir: folder of the cache, about 3 bytes per pixel (6 if a photograph has more than 8 bits).
             max_side: cap on the longer side of the photographs, in pixels.
-            test_every: every how-manieth view by name is held out, beginning with the first; 0 for none.
+            test_every: hold out every N-th view in name order, starting with the first; 0 holds out none.
             held_out: names of the views to hold out instead.
             masks: ``ignore`` gives pixels outside the mask the weight 0; ``alpha`` multiplies the mask into
                 alpha, for an object on a transparent background.
             model_folder: where the COLMAP model is, if not in ``root``.
-            accept: told what was found before anything is written; to refuse it, it raises.
-            near: distance at which anything is seen, of the extent.
-            threads: decoding threads; 0 takes one a processor.
-            progress: told (photographs done, photographs in all) while decoding.
-            max_table_bytes: limit on the ray tables of cameras that are not pinholes.
-            origin_world: local origin to take; None chooses one where coordinates are large.
+            check_views: called with the record of the views before any photograph is decoded; raises to
+                reject the dataset.
+            near: distance of the near plane as a fraction of the scene extent; nothing nearer is seen.
+            threads: decoding threads; 0 takes one per processor.
+            progress: called with (photographs done, total) while decoding.
+            max_table_bytes: limit on the ray tables of non-pinhole cameras.
+            origin_world: world position to use as the local origin; None chooses one for large coordinates.
             burst_length: so many views that follow each other by name fall on one side of the split.
             split: ``given`` holds out what the scene says, if it does; ``every`` does not ask it.
             model: which of several models of the scene to take, by its path below it or its number.
 
         Raises:
-            DatasetError: something is missing, damaged or does not fit together.
+            DatasetError: something is missing, damaged or inconsistent.
             OutputError: the cache cannot be written.
             ConfigError: a setting is out of range.
         """
@@ -180,13 +181,13 @@ class Dataset:
             root, max_side=max_side, model_folder=model_folder, model=model, origin_world=origin_world
         )
         _require_masks(scene, root, masks)
-        # Complain before the long work.
+        # Fail before the expensive decoding.
         rule = SplitRule(test_every, held_out, burst_length, split)
         parts = split_scene(scene, rule)
         digests = None
-        if accept is not None:
+        if check_views is not None:
             digests = file_digests(scene, cache_dir, threads=threads)
-            accept(views_record(scene, digests, parts.test_indices))
+            check_views(views_record(scene, digests, parts.test_indices))
         cache = open_pixel_cache(scene, cache_dir, digests, threads=threads, progress=progress)
         tables = open_ray_tables(scene.cameras, cache_dir, max_table_bytes)
         return cls(scene, cache, tables, split=parts, masks=masks, near=near)
@@ -209,15 +210,15 @@ class Dataset:
         Args:
             root: as in :meth:`open`; the model needs no points.
             cache_dir: folder of the cache.
-            near_world: distance at which anything is seen, that of the scene.
+            near_world: distance of the near plane, that of the scene.
             origin_world: local origin of the scene.
             max_side: cap on the longer side of the photographs, in pixels.
             masks: as in :meth:`open`.
-            threads: decoding threads; 0 takes one a processor.
-            progress: told (photographs done, photographs in all) while decoding.
+            threads: decoding threads; 0 takes one per processor.
+            progress: called with (photographs done, total) while decoding.
 
         Raises:
-            DatasetError: something is missing, damaged or does not fit together.
+            DatasetError: something is missing, damaged or inconsistent.
             OutputError: the cache cannot be written.
         """
         scene = load_dataset_model(

@@ -78,8 +78,8 @@ def find_duplicates(model: DatasetModel) -> Duplicates:
     alike = _equal_files([view.image_path for view in model.views])
     pairs = [pair for group in alike for pair in itertools.combinations(group, 2)]
     equal = poses.near_pairs(np.array(pairs, np.int64).reshape(-1, 2), EQUAL_SHIFT, EQUAL_TURN_RAD)
-    groups = _joined(len(model.views), (*equal, *_near_pictures(model, poses)))
-    return Duplicates(groups, len(set(groups) & set(_joined(len(model.views), equal))))
+    groups = _merge_overlapping_groups(len(model.views), (*equal, *_near_pictures(model, poses)))
+    return Duplicates(groups, len(set(groups) & set(_merge_overlapping_groups(len(model.views), equal))))
 
 
 def _equal_files(paths: Sequence[Path]) -> list[Group]:
@@ -90,11 +90,11 @@ def _equal_files(paths: Sequence[Path]) -> list[Group]:
     for indices in by_size.values():
         if len(indices) > 1:
             for index in indices:
-                by_content.setdefault(_digest(paths[index]), []).append(index)
+                by_content.setdefault(_file_digest(paths[index]), []).append(index)
     return [tuple(indices) for indices in by_content.values() if len(indices) > 1]
 
 
-def _digest(path: Path) -> bytes:
+def _file_digest(path: Path) -> bytes:
     try:
         with path.open("rb") as file:
             return hashlib.file_digest(file, "sha256").digest()
@@ -125,7 +125,7 @@ def _near_pictures(model: DatasetModel, poses: _Poses) -> list[Group]:
     close = cKDTree(poses.centres).query_pairs(NEAR_SHIFT * poses.extent, output_type="ndarray")
     pairs = poses.near_pairs(close.astype(np.int64), NEAR_SHIFT, NEAR_TURN_RAD)
     small = {index: _small_picture(model, index) for index in sorted({i for pair in pairs for i in pair})}
-    return [(a, b) for a, b in pairs if _difference(small[a], small[b]) <= NEAR_DIFFERENCE]
+    return [(a, b) for a, b in pairs if _rms_difference(small[a], small[b]) <= NEAR_DIFFERENCE]
 
 
 def _small_picture(model: DatasetModel, index: int) -> Float32[np.ndarray, "h w 3"]:
@@ -134,11 +134,11 @@ def _small_picture(model: DatasetModel, index: int) -> Float32[np.ndarray, "h w 
     return read_photo(model.views[index].image_path, width, height, 8)[0].astype(np.float32)
 
 
-def _difference(one: Float32[np.ndarray, "h w 3"], two: Float32[np.ndarray, "h w 3"]) -> float:
+def _rms_difference(one: Float32[np.ndarray, "h w 3"], two: Float32[np.ndarray, "h w 3"]) -> float:
     return float(np.sqrt(np.mean((one - two) ** 2))) if one.shape == two.shape else np.inf
 
 
-def _joined(count: int, groups: Sequence[Group]) -> tuple[Group, ...]:
+def _merge_overlapping_groups(count: int, groups: Sequence[Group]) -> tuple[Group, ...]:
     """Return the groups with those that share a view made one, of two views or more."""
     rows = [group[0] for group in groups for _ in group]
     columns = [index for group in groups for index in group]

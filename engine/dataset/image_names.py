@@ -21,9 +21,9 @@ def match_image_names(names: Iterable[str], files: Collection[str]) -> Mapping[s
     >>> match_image_names(["A/1.JPG", "2.jpg", "/tmp/3.png"], ["a/1.jpg", "2.jpg", "3.png", "4.png"])
     {'2.jpg': '2.jpg', 'A/1.JPG': 'a/1.jpg', '/tmp/3.png': '3.png'}
     """
-    names = [name for name in names if PurePosixPath(_slashes(name)).name]
+    names = [name for name in names if PurePosixPath(_with_forward_slashes(name)).name]
     found = {name: normalize_name(name) for name in names if normalize_name(name) in files}
-    for spelling in (_slashes, _case, _without_suffix, _last_part, _stem):
+    for spelling in (_with_forward_slashes, _fold_case, _without_suffix, _last_part, _folded_stem):
         taken = set(found.values())
         free = _by_spelling((file for file in files if file not in taken), spelling)
         missing = _by_spelling((name for name in names if name not in found), spelling)
@@ -38,21 +38,21 @@ def _by_spelling(names: Iterable[str], spelling: Callable[[str], str]) -> dict[s
     return {spelt: name for spelt, name in pairs if counts[spelt] == 1}
 
 
-def _slashes(name: str) -> str:
+def _with_forward_slashes(name: str) -> str:
     return str(PurePosixPath(normalize_name(name).replace("\\", "/")))
 
 
-def _case(name: str) -> str:
-    return _slashes(name).casefold()
+def _fold_case(name: str) -> str:
+    return _with_forward_slashes(name).casefold()
 
 
 def _without_suffix(name: str) -> str:
-    return str(PurePosixPath(_case(name)).with_suffix(""))
+    return str(PurePosixPath(_fold_case(name)).with_suffix(""))
 
 
 def _last_part(name: str) -> str:
-    return PurePosixPath(_case(name)).name
+    return PurePosixPath(_fold_case(name)).name
 
 
-def _stem(name: str) -> str:
-    return PurePosixPath(_case(name)).stem
+def _folded_stem(name: str) -> str:
+    return PurePosixPath(_fold_case(name)).stem

@@ -48,7 +48,7 @@ def read_image_info(path: Path) -> ImageInfo:
         bits=8 if spec.format.basetype in (oiio.UINT8, oiio.INT8) else 16,
         has_alpha=alpha_channel_of(spec, path) is not None,
         orientation=spec.get_int_attribute("Orientation", 1),
-        storage=_storage(spec, path),
+        storage=_storage_kind(spec, path),
     )
 
 
@@ -110,7 +110,7 @@ def read_photo(
     colours = _as_float(rgb)
     coverage = None if alpha is None else np.clip(_as_float(alpha), 0.0, 1.0)
     if coverage is not None and not straight:
-        colours = _unpremultiplied(colours, coverage)
+        colours = _unpremultiply_alpha(colours, coverage)
     if is_float:
         colours = np.clip(np.nan_to_num(colours, nan=0.0, posinf=1.0, neginf=0.0), 0.0, 1.0)
         if scale is None or not scale.is_display:
@@ -121,7 +121,7 @@ def read_photo(
         planes = np.concatenate([colours * coverage[..., None], coverage[..., None]], axis=2)
         planes = resize(planes, width_px, height_px)
         # Colours are divided before the filter's overshoot is clipped off alpha, as both overshoot alike.
-        colours = _unpremultiplied(planes[..., :3], planes[..., 3])
+        colours = _unpremultiply_alpha(planes[..., :3], planes[..., 3])
         coverage = np.clip(planes[..., 3], 0.0, 1.0)
     elif not is_float and straight:
         # Nothing was computed, so the stored values pass through exactly.
@@ -210,7 +210,7 @@ def _has_extra_samples(path: Path) -> bool:
         return True
 
 
-def _storage(spec: Any, path: Path) -> Storage:
+def _storage_kind(spec: Any, path: Path) -> Storage:
     if spec.format.basetype in _FLOATS:
         return "radiance" if path.suffix.lower() in (".exr", ".hdr", ".rgbe", ".pic") else "float"
     return "8-bit" if spec.format.basetype in (oiio.UINT8, oiio.INT8) else "16-bit"
@@ -244,7 +244,7 @@ def _as_bits(values: Pixels, bits: int) -> Pixels:
     return (np.clip(_as_float(values), 0.0, 1.0) * full + np.float32(0.5)).astype(target)
 
 
-def _unpremultiplied(
+def _unpremultiply_alpha(
     colours: Float32[np.ndarray, "h w 3"], alpha: Float32[np.ndarray, "h w"]
 ) -> Float32[np.ndarray, "h w 3"]:
     divisor = np.where(alpha > 0, alpha, np.float32(1.0))

@@ -1,7 +1,8 @@
 """The pixel cache: all photographs of a scene, decoded and reduced, as flat files to be mapped.
 
 ``rgb.bin`` holds the colours of all views one after the other, row by row, as uint8 or, if any photograph
-is deeper, uint16; ``alpha.bin`` and ``mask.bin`` hold one byte a pixel and exist only where they are needed.
+is deeper, uint16; ``alpha.bin`` and ``mask.bin`` hold one byte per pixel and exist only where
+needed.
 ``pixels.json`` says from which files they were made: by digests of their contents, and by a stamp of their
 folder, sizes and times, which spares reading them again.
 """
@@ -43,9 +44,9 @@ class PixelCache:
     """Mapped planes of all views; ``alpha`` and ``mask`` are empty where no view has them.
 
     Attributes:
-        rgb: straight display colours, 3 values a pixel.
-        alpha: 255 where opaque, one value a pixel.
-        mask: 255 where valid, one value a pixel.
+        rgb: straight display colours, 3 values per pixel.
+        alpha: 255 where opaque, one value per pixel.
+        mask: 255 where valid, one value per pixel.
         offsets: first pixel of every view, and the count of all pixels at the end.
         digests: of the files of every view.
         warnings: one sentence each on what is odd but usable.
@@ -87,8 +88,8 @@ def open_pixel_cache(
         folder: folder of the cache files.
         digests: of the files of every view, if they are known; files that only moved, or were copied, are
             then not decoded again.
-        threads: decoding threads; 0 takes one a processor. Fewer run where photographs are huge.
-        progress: told (photographs done, photographs in all) while decoding.
+        threads: decoding threads; 0 takes one per processor. Fewer run where photographs are huge.
+        progress: called with (photographs done, total) while decoding.
 
     Raises:
         DatasetError: a photograph or a mask cannot be read.
@@ -106,7 +107,9 @@ def open_pixel_cache(
         else:
             index = None
     if index is None:
-        _build_cache(model, folder, offsets, stamp, threads, progress)
+        _build_cache(
+            model=model, folder=folder, offsets=offsets, stamp=stamp, threads=threads, progress=progress
+        )
         index = _read_index(folder, int(offsets[-1]))
         if index is None or index["stamp"] != stamp:
             raise OutputError(
@@ -202,7 +205,9 @@ def _build_cache(
                 files[name] = os.open(temporary, os.O_RDWR | os.O_CREAT | os.O_TRUNC, 0o666)
                 stack.callback(os.close, files[name])
                 os.posix_fallocate(files[name], 0, size)  # a full disk shows now, not after an hour
-            summaries, warnings = _decode_all(model, offsets, bits, files, threads, progress)
+            summaries, warnings = _decode_all(
+                model=model, offsets=offsets, bits=bits, files=files, threads=threads, progress=progress
+            )
         # Many RGBA files are opaque throughout; their plane would only cost memory traffic.
         transparent = any(summary.is_transparent for summary in summaries)
         for name in ("alpha", "mask"):
@@ -249,9 +254,16 @@ def _decode_all(
 
     def decode(index: int) -> _ViewSummary:
         view, info = model.views[index], model.image_infos[index]
-        return _decode_view(view, info, int(offsets[index]), bits, files, scales.get(info.storage))
+        return _decode_view(
+            view=view,
+            info=info,
+            offset=int(offsets[index]),
+            bits=bits,
+            files=files,
+            scale=scales.get(info.storage),
+        )
 
-    # Bytes a pixel: as stored, as float32, and a copy of either while channels are rearranged.
+    # Bytes per pixel: as stored, as float32, and a copy of either while channels are rearranged.
     largest = max(36 * info.width_px * info.height_px for info in model.image_infos)
     workers = min(threads if threads > 0 else os.cpu_count() or 1, max(1, DECODING_BYTES // largest))
     summaries: list[_ViewSummary] = []

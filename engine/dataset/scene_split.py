@@ -19,7 +19,7 @@ class SplitRule:
     """How views are held out.
 
     Attributes:
-        test_every: every how-manieth view is held out, beginning with the first; 0 holds out none.
+        test_every: hold out every N-th view, starting with the first; 0 holds out none.
         held_out: names of the views to hold out instead.
         burst_length: so many views that follow each other by name count as one.
         split: ``given`` holds out what the scene says, where it says anything and neither ``held_out`` nor a

@@ -24,7 +24,7 @@ def split_views(
 
     Args:
         names: names of the views, sorted.
-        test_every: every how-manieth view is held out, beginning with the first; 0 holds out none.
+        test_every: hold out every N-th view, starting with the first; 0 holds out none.
         held_out: names of the views to hold out instead; an umlaut may be spelt as one character or as two.
         source_name: what the names are of, for complaints.
         burst_length: so many names that follow each other count as one, and fall on one side.
@@ -40,7 +40,7 @@ def split_views(
     """
     if test_every < 0:
         raise ConfigError(f"test_every is {test_every}; it must be 0 (hold out none) or more.")
-    unit = _units(len(names), burst_length, duplicates)
+    unit = _split_units(len(names), burst_length, duplicates)
     if held_out is not None:
         chosen = set(map(normalize_name, held_out))
         unknown = sorted(chosen - set(map(normalize_name, names)))
@@ -58,7 +58,9 @@ def split_views(
     return np.flatnonzero(~is_test).astype(np.int64), np.flatnonzero(is_test).astype(np.int64)
 
 
-def _units(count: int, burst_length: int, duplicates: Sequence[Sequence[int]]) -> Int64[np.ndarray, " n"]:
+def _split_units(
+    count: int, burst_length: int, duplicates: Sequence[Sequence[int]]
+) -> Int64[np.ndarray, " n"]:
     """Return the number of the unit that each of ``count`` views belongs to, by the first view of each."""
     unit = np.arange(count, dtype=np.int64) // burst_length
     for group in duplicates:

@@ -135,15 +135,15 @@ def read_transforms(path: Path, size_of: SizeOf) -> TransformsModel:
     for part, file in zip(parts, files, strict=True):
         for frame in file.frames:
             name = photograph_name(frame.file_path)
-            model, width, height, params = _camera(part, file, frame, size_of)
+            model, width, height, params = _camera_of_frame(part, file, frame, size_of)
             key = (model, width, height, params)
             camera = cameras.setdefault(key, CameraRecord(len(cameras) + 1, model, width, height, params))
             number = len(images) + 1
-            images[number] = _image(part, frame, number, name, camera.camera_id)
+            images[number] = _posed_image(part, frame, number, name, camera.camera_id)
             if frame.mask_path is not None:
                 masks[name] = frame.mask_path
     notes += _unread_keys(parts, files)
-    points = _points(path, files[0].ply_file_path, notes)
+    points = _read_points(path, files[0].ply_file_path, notes)
     by_id = {camera.camera_id: camera for camera in cameras.values()}
     records = ModelRecords(by_id, images, points, tuple(notes))
     return TransformsModel(records, None if held_out is None else tuple(held_out), masks)
@@ -175,7 +175,7 @@ def _read_file(path: Path) -> _File:
     return file
 
 
-def _camera(
+def _camera_of_frame(
     path: Path, file: _File, frame: _Frame, size_of: SizeOf
 ) -> tuple[str, int, int, tuple[float, ...]]:
     """Return model, width, height and parameters of the camera of a frame, in COLMAP's terms."""
@@ -197,12 +197,12 @@ def _camera(
             f"{path} names the camera model {name[:40]} for {frame.file_path}, which is not read; undistort "
             "the photographs, or give a COLMAP model in sparse/0."
         )
-    focal = _focal(values, "x", width) or _focal(values, "y", height)
+    focal = _focal_length_px(values, "x", width) or _focal_length_px(values, "y", height)
     if focal is None:
         raise DatasetError(
             f"{path} says no focal length for {frame.file_path}; give fl_x (in pixels) or camera_angle_x."
         )
-    fx, fy = focal, _focal(values, "y", height) or focal
+    fx, fy = focal, _focal_length_px(values, "y", height) or focal
     cx, cy = float(values.get("cx", width / 2)), float(values.get("cy", height / 2))
     k1, k2, k3, k4, p1, p2 = (float(values.get(key, 0.0)) for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
     if name == "OPENCV_FISHEYE":
@@ -218,7 +218,7 @@ def _camera(
     return "OPENCV", width, height, (fx, fy, cx, cy, k1, k2, p1, p2)
 
 
-def _focal(values: Mapping[str, Any], axis: str, side_px: int) -> float | None:
+def _focal_length_px(values: Mapping[str, Any], axis: str, side_px: int) -> float | None:
     if f"fl_{axis}" in values:
         return float(values[f"fl_{axis}"])
     if f"camera_angle_{axis}" in values:
@@ -233,7 +233,7 @@ def _unknown_lens(path: Path, frame: _Frame, what: str) -> DatasetError:
     )
 
 
-def _image(path: Path, frame: _Frame, number: int, name: str, camera_id: int) -> ImageRecord:
+def _posed_image(path: Path, frame: _Frame, number: int, name: str, camera_id: int) -> ImageRecord:
     world_from_cam = np.array(frame.transform_matrix[:3])
     rotation = world_from_cam[:, :3].copy()
     off = float(np.abs(rotation.T @ rotation - np.eye(3)).max())
@@ -250,7 +250,7 @@ def _image(path: Path, frame: _Frame, number: int, name: str, camera_id: int) ->
     return ImageRecord(number, (w, x, y, z), translation, camera_id, name, *nothing)
 
 
-def _points(path: Path, named: str | None, notes: list[str]) -> dict[int, PointRecord]:
+def _read_points(path: Path, named: str | None, notes: list[str]) -> dict[int, PointRecord]:
     if named is None:
         return {}
     # Nothing outside the folder of the scene is read, whatever a file from elsewhere asks for.
@@ -263,14 +263,14 @@ def _points(path: Path, named: str | None, notes: list[str]) -> dict[int, PointR
         xyz = np.stack([vertices[axis].astype(np.float64) for axis in "xyz"], axis=1)
     except (SceneFileError, ValueError, KeyError) as error:
         raise DatasetError(f"The points of {path} cannot be read: {error}") from None
-    rgb = _colors(vertices, len(xyz))
+    rgb = _point_colors(vertices, len(xyz))
     return {
         number: PointRecord(number, tuple(place), tuple(color), -1.0, ())
         for number, (place, color) in enumerate(zip(xyz.tolist(), rgb.tolist(), strict=True), start=1)
     }
 
 
-def _colors(vertices: np.ndarray, count: int) -> Int64[np.ndarray, "n 3"]:
+def _point_colors(vertices: np.ndarray, count: int) -> Int64[np.ndarray, "n 3"]:
     names = ("red", "green", "blue")
     if not set(names) <= set(vertices.dtype.names or ()):
         return np.full((count, 3), 128, np.int64)

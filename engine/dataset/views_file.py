@@ -246,7 +246,7 @@ def views_record(
     train = [index for index in range(len(model.views)) if index not in held_out] or sorted(held_out)
     return ViewsRecord(
         origin_world=model.origin_world,
-        extent_world=_extent(model, np.array(train)),
+        extent_world=_training_extent(model, np.array(train)),
         points_sha256=_points_digest(model.points),
         cameras=tuple(
             _CameraEntry(model=c.model, params=c.params, width_px=c.width_px, height_px=c.height_px)
@@ -277,7 +277,7 @@ def scene_viewpoints(model: DatasetModel, rule: SplitRule) -> SplitViewpoints:
     """Return the viewpoints of a loaded dataset, split as by :func:`split_scene`."""
     split = split_scene(model, rule)
     train, test = split.train_indices, split.test_indices
-    return SplitViewpoints(model.views, model.cameras, train, test, _extent(model, train))
+    return SplitViewpoints(model.views, model.cameras, train, test, _training_extent(model, train))
 
 
 def write_views(path: Path, record: ViewsRecord) -> None:
@@ -311,7 +311,7 @@ def capped_size(width_px: int, height_px: int, max_side: int | None) -> tuple[in
     return max(1, round(width_px * ratio)), max(1, round(height_px * ratio))
 
 
-def _extent(model: DatasetModel, train_indices: Int64[np.ndarray, " train"]) -> float:
+def _training_extent(model: DatasetModel, train_indices: Int64[np.ndarray, " train"]) -> float:
     points = training_points(train_indices, model.points, model.observations)
     return scene_extent(np.stack([model.views[i].origin_world for i in train_indices]), points)
 

@@ -45,27 +45,27 @@ def check_new_run(target: Path) -> None:
         raise OutputError(f"{target} is there already; name a new folder.")
 
 
-def write_changed_run(
+def write_edited_run(
     source: Path,
     gaussians: FlatGaussians,
     target: Path,
-    note: Mapping[str, object],
+    edit_record: Mapping[str, object],
     *,
     facts: SceneMetadata | None = None,
     matrix: Float[np.ndarray, "4 4"] | None = None,
 ) -> tuple[str, ...]:
-    """Write a run's folder with a changed scene, atomically.
+    """Write a run's folder with an edited scene, atomically.
 
     What was measured, rendered and exported of the run does not come along, nor do checkpoints. Of a scene
     that was moved the cameras and the learnt light are moved along, or left out where that cannot be.
 
     Args:
         source: folder of the run.
-        gaussians: the other scene.
+        gaussians: the Gaussians after the edit.
         target: a folder that does not exist or is empty.
-        note: what was changed, added to ``edits.json``.
-        facts: what is known of the other scene as a whole; None takes that of the run's.
-        matrix: the affine map from the run's world to that of the scene, if they are not the same.
+        edit_record: description of the edit, added to ``edits.json``.
+        facts: metadata of the edited scene as a whole; None takes that of the run's.
+        matrix: affine map from the run's world to the edited scene's; None if the world frame is unchanged.
 
     Returns:
         What of the run was left out or is not as exact as it was, a sentence each.
@@ -90,7 +90,7 @@ def write_changed_run(
                     f"unevenly, so {target} holds the scene alone.",
                 )
             write_gaussian_ply(gaussians, partial / SCENE, facts=facts or read_metadata(source))
-            write_json(partial / EDITS_FILE, [*_read_edits(source), dict(note)])
+            write_json(partial / EDITS_FILE, [*_read_edits(source), dict(edit_record)])
             partial.replace(target)
     except OSError as error:
         raise OutputError(f"{target} cannot be written ({error.strerror or error}).") from None

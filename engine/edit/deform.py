@@ -96,12 +96,12 @@ def deform_to(
     known = residuals[~unmoved & ~collapsed]
     median, p95 = np.quantile(known, [0.5, 0.95]).tolist() if len(known) else (0.0, 0.0)
     report = DeformReport(
-        int((~unmoved).sum()),
-        int(unmoved.sum()),
-        int(collapsed.sum()),
-        int((~unmoved & (signs < 0)).sum()),
-        median,
-        p95,
-        float(known.max(initial=0.0)),
+        moved=int((~unmoved).sum()),
+        unmoved=int(unmoved.sum()),
+        collapsed=int(collapsed.sum()),
+        mirrored=int((~unmoved & (signs < 0)).sum()),
+        residual_median=median,
+        residual_p95=p95,
+        residual_max=float(known.max(initial=0.0)),
     )
     return result, report

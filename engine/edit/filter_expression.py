@@ -63,7 +63,7 @@ def parse_filter(text: str) -> ast.expr:
         raise ConfigError(f"An expression may have {MAX_LENGTH} characters, and this one has {len(text)}.")
     try:
         tree = ast.parse(text.strip(), mode="eval").body
-        _check(text, tree)
+        _check_node(text, tree)
     except (SyntaxError, ValueError, RecursionError, MemoryError):
         raise ConfigError(f"'{text}' is no expression; {_ADVICE}.") from None
     return tree
@@ -86,22 +86,22 @@ def filter_mask(
     numbers = expression_variables(gaussians, origin_world)
     for node in ast.walk(tree):
         for part in (node.left, *node.comparators) if isinstance(node, ast.Compare) else ():
-            if (name := _name(part)) is not None and name not in numbers:
+            if (name := _variable_name(part)) is not None and name not in numbers:
                 raise ConfigError(f"'{text}': the scene has no {name}; it has {', '.join(numbers)}.")
     result = np.broadcast_to(_evaluate_condition(tree, numbers), len(gaussians))
     return np.array(result, dtype=bool)
 
 
-def _check(text: str, node: ast.expr) -> None:
+def _check_node(text: str, node: ast.expr) -> None:
     """Check that a node is one of those that :func:`_evaluate_condition` supports."""
     if isinstance(node, ast.BoolOp):
         for part in node.values:
-            _check(text, part)
+            _check_node(text, part)
     elif isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.Not):
-        _check(text, node.operand)
+        _check_node(text, node.operand)
     elif isinstance(node, ast.Compare) and all(type(sign) in _COMPARISONS for sign in node.ops):
         for part in (node.left, *node.comparators):
-            if _number(part) is None and _name(part) is None:
+            if _constant_value(part) is None and _variable_name(part) is None:
                 raise ConfigError(f"'{text}': {ast.unparse(part)} cannot be compared; {_ADVICE}.")
     else:
         raise ConfigError(f"'{text}': {ast.unparse(node)} is no comparison; {_ADVICE}.")
@@ -121,14 +121,14 @@ def _evaluate_condition(node: ast.expr, numbers: Mapping[str, np.ndarray]) -> np
 
 
 def _evaluate_number(node: ast.expr, numbers: Mapping[str, np.ndarray]) -> float | np.ndarray:
-    number = _number(node)
+    number = _constant_value(node)
     # Beside a Python number arrays keep their precision, so that 0.3 is what the file calls 0.3.
-    return number if number is not None else numbers[_name(node) or ""]
+    return number if number is not None else numbers[_variable_name(node) or ""]
 
 
-def _number(node: ast.AST) -> float | None:
+def _constant_value(node: ast.AST) -> float | None:
     if isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.USub | ast.UAdd):
-        inner = _number(node.operand)
+        inner = _constant_value(node.operand)
         return None if inner is None else -inner if isinstance(node.op, ast.USub) else inner
     if (
         isinstance(node, ast.Constant)
@@ -139,7 +139,7 @@ def _number(node: ast.AST) -> float | None:
     return None
 
 
-def _name(node: ast.AST) -> str | None:
+def _variable_name(node: ast.AST) -> str | None:
     if isinstance(node, ast.Name):
         return node.id
     if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name):

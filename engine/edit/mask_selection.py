@@ -42,8 +42,10 @@ def select_by_masks(
     near_world = run_min_view_distance(source, viewpoints)
     tracer = make_tracer(config.train.trace, threads=threads)
     tracer.build(gaussians)
-    views = ((_rays(viewpoints, path, near_world), path) for path in masks)
-    return mostly_inside(tracer, len(gaussians), ((rays, _mask(path, rays)) for rays, path in views))
+    views = ((_rays_of_masked_view(viewpoints, path, near_world), path) for path in masks)
+    return mostly_inside(
+        tracer, len(gaussians), ((rays, _mask_at_pixels(path, rays)) for rays, path in views)
+    )
 
 
 def mostly_inside(
@@ -76,7 +78,7 @@ def _blend_weights(tracer: Tracer, rays: RayBatch, count: int) -> Float64[np.nda
     return sums
 
 
-def _rays(viewpoints: Viewpoints, path: Path, near_world: float) -> ImageRays:
+def _rays_of_masked_view(viewpoints: Viewpoints, path: Path, near_world: float) -> ImageRays:
     number = photograph_of_mask(path, [view.name for view in viewpoints.views])
     return view_shots(viewpoints, np.array([number]), near_world)[0].rays()
 
@@ -114,7 +116,7 @@ def photograph_of_mask(mask: Path, photographs: Sequence[str]) -> int:
     return found[0]
 
 
-def _mask(path: Path, image: ImageRays) -> Bool[np.ndarray, "h w"]:
+def _mask_at_pixels(path: Path, image: ImageRays) -> Bool[np.ndarray, "h w"]:
     """Return which pixels of an image of rays lie where a mask is white."""
     try:
         mask = read_image(path)[..., 0]

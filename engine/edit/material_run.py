@@ -56,7 +56,7 @@ def has_known_light(source: Path) -> bool:
     return material_shading(read_config(source / CONFIG).train.materials.recipe).harmonics_are_shaded
 
 
-def edit_note(
+def describe_edit(
     change: MaterialChange, selection: Selection, chosen: Bool[np.ndarray, " n"]
 ) -> dict[str, object]:
     """Return a short description of a change as JSON, for ``edits.json``."""

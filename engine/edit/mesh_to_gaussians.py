@@ -87,8 +87,23 @@ def recover_gaussians(
     if octagons.is_copy.any():
         octagons = octagons.prefer_nearest(_mean_displacements(geometry, octagons, radii))
     old = geometry.select(octagons.gids)
-    recovered = _recover_parameters(old, octagons, radii[octagons.gids], file_rounding, options, report)
-    result = _assemble(gaussians, old, octagons, recovered, exported, options, report)
+    recovered = _recover_parameters(
+        old=old,
+        octagons=octagons,
+        radii=radii[octagons.gids],
+        file_rounding=file_rounding,
+        options=options,
+        report=report,
+    )
+    result = _assemble(
+        gaussians=gaussians,
+        old=old,
+        octagons=octagons,
+        recovered=recovered,
+        exported=exported,
+        options=options,
+        report=report,
+    )
     report.foreign_vertices = octagons.foreign_vertices
     report.ambiguous_corners = octagons.ambiguous_corners
     report.result_size = len(result)
@@ -161,7 +176,14 @@ def _recover_parameters(
         report.strained = int((known > STRAINED_RATIO).sum())
         report.residual_median, report.residual_p95 = np.quantile(known, [0.5, 0.95]).tolist()
         report.residual_max = float(known.max())
-    return _RecoveredParameters(means, legs, signs, unmoved, readable, ~complete | crumpled | flipped)
+    return _RecoveredParameters(
+        means=means,
+        legs=legs,
+        signs=signs,
+        unmoved=unmoved,
+        readable=readable,
+        damaged=~complete | crumpled | flipped,
+    )
 
 
 def _torn_octagons(
@@ -263,12 +285,12 @@ def _assemble(
         return volume_derivatives(old.select(rows), recovered.legs[rows], recovered.signs[rows])
 
     moved = interpolate_motion(
-        base.means_world.astype(np.float64),
-        old.means_world[pool].astype(np.float64),
-        recovered.means[pool],
-        derivatives_of,
-        recovered.unmoved[pool],
-        gaussians.means_world[deleted].astype(np.float64),
+        points=base.means_world.astype(np.float64),
+        old_means=old.means_world[pool].astype(np.float64),
+        new_means=recovered.means[pool],
+        derivatives_of=derivatives_of,
+        unmoved=recovered.unmoved[pool],
+        deleted_means=gaussians.means_world[deleted].astype(np.float64),
     )
     own = np.flatnonzero(recovered.readable & is_retained)
     orphaned = moved.orphaned.copy()

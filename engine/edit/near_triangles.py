@@ -38,7 +38,7 @@ class NearTriangles:
     ) -> tuple[Int32[np.ndarray, "p k"], Float32[np.ndarray, "p k"], Float64[np.ndarray, " p"]]:
         """Return the triangles near each point with smooth weights, and the distance to the nearest one."""
         points = np.ascontiguousarray(points)
-        apart, candidates = self._candidates(points)
+        apart, candidates = self._nearest_samples(points)
         chosen = np.zeros(candidates.shape, np.int32)
         weights = np.zeros(candidates.shape, np.float32)
         distances = np.zeros(len(points))
@@ -48,7 +48,7 @@ class NearTriangles:
         )  # fmt: skip
         return chosen, weights, distances
 
-    def _candidates(
+    def _nearest_samples(
         self, points: Float64[np.ndarray, "p 3"]
     ) -> tuple[Float64[np.ndarray, "p k"], Int64[np.ndarray, "p k"]]:
         """Return ascending distances to the samples nearest to each point, and the samples' triangles."""

@@ -57,7 +57,7 @@ def neighbour_rotations(
     for block in row_blocks(len(requested)):
         _, near = tree.query(old_means[requested[block]], k=count, workers=-1)
         turns[block] = _orthogonal_fits(old_means[near], new_means[near], planar_sign)
-        stray = _strays(old_means[near], new_means[near], turns[block])
+        stray = _find_rim_gaussians(old_means[near], new_means[near], turns[block])
         turns[block][stray] = 0.0
     return turns
 
@@ -79,7 +79,7 @@ def _orthogonal_fits(
     return turns
 
 
-def _strays(
+def _find_rim_gaussians(
     old: Float64[np.ndarray, "m k 3"], new: Float64[np.ndarray, "m k 3"], turns: Float64[np.ndarray, "m 3 3"]
 ) -> Bool[np.ndarray, " m"]:
     """Return Gaussians whose nearest neighbours moved differently: the rim of what was moved."""
@@ -151,7 +151,7 @@ def interpolate_motion(
         distances, near = (found.reshape(len(part), count) for found in tree.query(part, k=count, workers=-1))
         known, place = np.unique(near, return_inverse=True)
         derivatives = derivatives_of(known)[place.reshape(near.shape)]
-        weights = _weights(distances)
+        weights = _neighbor_weights(distances)
         moved = new_means[near] + np.einsum("nkij,nkj->nki", derivatives, part[:, None] - old_means[near])
         carried.means_world[block] = np.einsum("nk,nki->ni", weights, moved)
         carried.derivatives[block] = np.einsum("nk,nkij->nij", weights, derivatives)
@@ -161,7 +161,7 @@ def interpolate_motion(
     return carried
 
 
-def _weights(distances: Float[np.ndarray, "u k"]) -> Float[np.ndarray, "u k"]:
+def _neighbor_weights(distances: Float[np.ndarray, "u k"]) -> Float[np.ndarray, "u k"]:
     """Return weights that fall to zero at the last neighbour, so that they are continuous."""
     reach = distances[:, -1:] * (1 + 1e-6) + 1e-30
     weights = (1 - distances / reach) ** 2 + 1e-12

@@ -105,7 +105,7 @@ def _match_by_ids(
         instance = keys // SIDES
     else:
         keys, vertices, node_of_vertex = _unite_split_vertices(vertices, keys, mesh.vertices)
-        instance = _instances(keys, node_of_vertex, mesh.triangles)
+        instance = _octagon_of_vertex(keys, node_of_vertex, mesh.triangles)
     gids, corners, present, ambiguous = _assemble(keys, mesh.vertices, vertices, instance)
     # Vertices that another object brought when it was joined carry zeros, not ids of their own.
     first = np.concatenate([[True], gids[1:] != gids[:-1]])
@@ -119,7 +119,15 @@ def _match_by_ids(
             present[is_retained],
             first[is_retained],
         )
-    return MatchedOctagons(gids, corners, present, ~first, "ids", foreign, ambiguous)
+    return MatchedOctagons(
+        gids=gids,
+        corners_world=corners,
+        present=present,
+        is_copy=~first,
+        matched_by="ids",
+        foreign_vertices=foreign,
+        ambiguous_corners=ambiguous,
+    )
 
 
 def _unite_split_vertices(
@@ -149,7 +157,7 @@ def _unite_split_vertices(
     return keys[new], vertices[new], node_of_vertex
 
 
-def _instances(
+def _octagon_of_vertex(
     keys: Int64[np.ndarray, " u"], node_of_vertex: np.ndarray, triangles: Int64[np.ndarray, "t 3"]
 ) -> Int64[np.ndarray, " u"]:
     """Return a number for the octagon that each united vertex is part of.
@@ -227,13 +235,13 @@ def _match_by_order(
         )
     corners = mesh.vertices.reshape(count, SIDES, 3)
     return MatchedOctagons(
-        gids,
-        corners,
-        np.ones((count, SIDES), dtype=bool),
-        np.zeros(count, dtype=bool),
-        "order",
-        0,
-        0,
+        gids=gids,
+        corners_world=corners,
+        present=np.ones((count, SIDES), dtype=bool),
+        is_copy=np.zeros(count, dtype=bool),
+        matched_by="order",
+        foreign_vertices=0,
+        ambiguous_corners=0,
     )
 
 

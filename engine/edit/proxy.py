@@ -219,7 +219,7 @@ class MeanValueBinding:
         self._rows_at_once = max(1, min(ROWS_PER_BLOCK, VALUES_PER_BLOCK // numbers_a_row))
         self._stored: list[np.ndarray] | None = None
         if self._rows.size * numbers_a_row * 8 <= MAX_CACHE_BYTES:
-            self._stored = [self._coordinates(self._rows[block]) for block in self._blocks()]
+            self._stored = [self._corner_coordinates(self._rows[block]) for block in self._row_blocks()]
 
     @property
     def moving_mask(self) -> Bool[np.ndarray, " n"]:
@@ -231,9 +231,9 @@ class MeanValueBinding:
         """Return the corners for the cage's vertices at ``vertices_world``."""
         shifts = _check_vertices(vertices_world, self._proxy) - self._proxy.vertices_world
         result = self._corners.copy()
-        for number, block in enumerate(self._blocks()):
+        for number, block in enumerate(self._row_blocks()):
             rows = self._rows[block]
-            weights = self._coordinates(rows) if self._stored is None else self._stored[number]
+            weights = self._corner_coordinates(rows) if self._stored is None else self._stored[number]
             corners = self._corners[rows]
             moved = corners + (weights @ shifts).reshape(corners.shape)
             result[rows] = _blend_corners(corners, moved, self._influence[rows])
@@ -243,10 +243,10 @@ class MeanValueBinding:
         """Return the Gaussians that follow the cage by more than half, if it was mirrored."""
         return _mirrored_followers(self._influence, self._proxy.is_mirrored(vertices_world))
 
-    def _blocks(self) -> list[slice]:
+    def _row_blocks(self) -> list[slice]:
         return list(row_blocks(len(self._rows), self._rows_at_once))
 
-    def _coordinates(self, rows: Int64[np.ndarray, " r"]) -> Float64[np.ndarray, "p v"]:
+    def _corner_coordinates(self, rows: Int64[np.ndarray, " r"]) -> Float64[np.ndarray, "p v"]:
         """Return the mean-value coordinates of the corners of some Gaussians."""
         points = self._corners[rows].reshape(-1, 3)
         weights = np.empty((len(points), len(self._proxy.vertices_world)))

@@ -10,9 +10,9 @@ from jaxtyping import Float, Float32, Float64
 from octasplat.engine.core.writing import write_json
 from octasplat.engine.dataset.views_file import read_views, write_views
 from octasplat.engine.render.environment_files import (
-    read_background,
+    read_background_map,
     read_environment,
-    write_background,
+    write_background_map,
     write_environment,
 )
 from octasplat.engine.runs.config import read_config
@@ -105,8 +105,8 @@ def _write_light(source: Path, target: Path, turn: Float64[np.ndarray, "3 3"]) -
             radiance = read_environment(source / name)
             write_environment(target / name, rotate_environment(radiance, old_frame, new_frame, turn))
         else:
-            rgb_srgb = read_background(source / name)
-            write_background(target / name, rotate_environment(rgb_srgb, old_frame, new_frame, turn))
+            rgb_srgb = read_background_map(source / name)
+            write_background_map(target / name, rotate_environment(rgb_srgb, old_frame, new_frame, turn))
     return messages
 
 

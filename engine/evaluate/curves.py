@@ -64,25 +64,48 @@ class Chart:
 
 
 @dataclass(frozen=True)
-class _Source:
+class _SeriesSource:
+    """Where the values of one line of a chart come from: the kind of the event rows, and their key."""
+
     kind: str
     key: str
     label: str
     style: str
 
 
+MAX_TIME_INTERVALS = 5
+"""Most intervals between ticks of an axis of time."""
+MIN_TIME_RANGE_SECONDS = 3.0
+"""Shorter ranges have ticks at fractions of a second."""
+
+
+@dataclass(frozen=True)
+class _ChartSource:
+    """What a chart shows; ``y_from_zero`` begins the vertical axis at exactly 0."""
+
+    title: str
+    unit: str
+    series: tuple[_SeriesSource, ...]
+    logarithmic: bool = False
+    y_from_zero: bool = False
+
+
 _CHARTS = (
-    (
+    _ChartSource(
         "PSNR",
         "dB",
-        False,
         (
-            _Source("training_progress", "psnr", "training rays", "quiet"),
-            _Source("held_out_measured", "psnr", "held-out views", "main"),
+            _SeriesSource("training_progress", "psnr", "training rays", "quiet"),
+            _SeriesSource("held_out_measured", "psnr", "held-out views", "main"),
         ),
     ),
-    ("Loss", "", True, (_Source("training_progress", "loss", "loss", "main"),)),
-    ("Gaussians", "", False, (_Source("training_progress", "gaussians", "Gaussians", "main"),)),
+    _ChartSource("Loss", "", (_SeriesSource("training_progress", "loss", "loss", "main"),), logarithmic=True),
+    _ChartSource(
+        "Gaussians",
+        "",
+        (_SeriesSource("training_progress", "gaussians", "Gaussians", "main"),),
+        y_from_zero=True,
+    ),
 )
 
 
@@ -97,14 +120,14 @@ def training_charts(events: Sequence[Row]) -> list[Chart]:
     """
     charts = []
     for x_key, x_label in (("iteration", "iteration"), ("seconds", "training time")):
-        for title, unit, logarithmic, sources in _CHARTS:
-            lines = [
+        for chart in _CHARTS:
+            series = [
                 (source, _subsample(training_values(events, source.kind, source.key, x_key)))
-                for source in sources
+                for source in chart.series
             ]
-            lines = [(source, values) for source, values in lines if values]
-            if lines:
-                charts.append(_chart(title, x_key, x_label, unit, logarithmic, lines))
+            series = [(source, values) for source, values in series if values]
+            if series:
+                charts.append(_layout_chart(chart, x_key, x_label, series))
     return charts
 
 
@@ -164,48 +187,56 @@ def _subsample(values: list[tuple[float, float]]) -> list[tuple[float, float]]:
     return values[::step] + ([values[-1]] if values and (len(values) - 1) % step else [])
 
 
-def _chart(
-    title: str,
+def _layout_chart(
+    chart: _ChartSource,
     x_key: str,
     x_label: str,
-    unit: str,
-    logarithmic: bool,
-    lines: list[tuple[_Source, list[tuple[float, float]]]],
+    series: list[tuple[_SeriesSource, list[tuple[float, float]]]],
 ) -> Chart:
-    logarithmic = logarithmic and all(y > 0 for _, values in lines for _, y in values)
+    """Return a chart's axes, ticks and lines in SVG units; ``series`` has at least one point."""
+    logarithmic = chart.logarithmic and all(y > 0 for _, values in series for _, y in values)
     if logarithmic:
-        lines = [(source, [(x, math.log10(y)) for x, y in values]) for source, values in lines]
-    xs = [x for _, values in lines for x, _ in values]
-    ys = [y for _, values in lines for _, y in values]
-    x_low, x_high = _padded_range(min(0.0, *xs), max(xs))
+        series = [(source, [(x, math.log10(y)) for x, y in values]) for source, values in series]
+    xs = [x for _, values in series for x, _ in values]
+    ys = [y for _, values in series for _, y in values]
+    x_low, x_high = _padded_range(min(0.0, *xs), max(xs))  # training begins at 0
     y_low, y_high = _padded_range(min(ys), max(ys))
-    if title == "Gaussians":
+    if chart.y_from_zero:
         y_low = 0.0
+    # Lines keep clear of the frame, except from an axis that begins at exactly 0.
     margin = 0.05 * (y_high - y_low)
-    y_low, y_high = (y_low - margin if y_low else y_low), y_high + margin
+    y_low, y_high = (y_low if y_low == 0.0 else y_low - margin), y_high + margin
 
-    def across(x: float) -> float:
+    def to_svg_x(x: float) -> float:
         return round(LEFT + (x - x_low) / (x_high - x_low) * (WIDTH - LEFT - RIGHT), 2)
 
-    def up(y: float) -> float:
+    def to_svg_y(y: float) -> float:
         return round(HEIGHT - BOTTOM - (y - y_low) / (y_high - y_low) * (HEIGHT - TOP - BOTTOM), 2)
 
     if x_key == "seconds":
-        x_ticks = [Tick(across(x), format_axis_duration(x)) for x in _time_ticks(x_low, x_high)]
+        x_ticks = [Tick(to_svg_x(x), format_axis_duration(x)) for x in _time_ticks(x_low, x_high)]
     else:
-        x_ticks = [Tick(across(x), format_axis_number(x)) for x in _linear_ticks(x_low, x_high, 5)]
+        x_ticks = [Tick(to_svg_x(x), format_axis_number(x)) for x in _linear_ticks(x_low, x_high, 5)]
     if logarithmic:
-        y_ticks = [Tick(up(y), f"{10**y:.2g}") for y in _log_ticks(y_low, y_high)]
+        y_ticks = [Tick(to_svg_y(y), f"{10**y:.2g}") for y in _log_ticks(y_low, y_high)]
     else:
-        y_ticks = [Tick(up(y), format_axis_number(y)) for y in _linear_ticks(y_low, y_high, 5)]
+        y_ticks = [Tick(to_svg_y(y), format_axis_number(y)) for y in _linear_ticks(y_low, y_high, 5)]
     curves = tuple(
-        Curve(source.label, source.style, tuple((across(x), up(y)) for x, y in values))
-        for source, values in lines
+        Curve(source.label, source.style, tuple((to_svg_x(x), to_svg_y(y)) for x, y in values))
+        for source, values in series
     )
     return Chart(
-        title, x_key, x_label, unit, (x_low, x_high), (y_low, y_high), logarithmic,
-        tuple(x_ticks), tuple(y_ticks), curves,
-    )  # fmt: skip
+        title=chart.title,
+        x_key=x_key,
+        x_label=x_label,
+        unit=chart.unit,
+        x_range=(x_low, x_high),
+        y_range=(y_low, y_high),
+        logarithmic=logarithmic,
+        x_ticks=tuple(x_ticks),
+        y_ticks=tuple(y_ticks),
+        curves=curves,
+    )
 
 
 def _padded_range(low: float, high: float) -> tuple[float, float]:
@@ -225,13 +256,15 @@ def _linear_ticks(low: float, high: float, about: int) -> list[float]:
     return [k * step for k in range(first, math.floor(high / step + 1e-9) + 1)]
 
 
-def _time_ticks(low: float, high: float) -> list[float]:
-    """Return whole seconds, minutes or hours within a range."""
-    round_spans = (1, 2, 5, 10, 20, 30, 60, 120, 300, 600, 1200, 1800, 3600, 7200, 14400, 28800, 86400)
-    step = next((span for span in round_spans if (high - low) / span <= 5), None)
-    if step is None or high - low < 3:
-        return _linear_ticks(low, high, 4)
-    return [float(k * step) for k in range(math.ceil(low / step), math.floor(high / step) + 1)]
+def _time_ticks(low_seconds: float, high_seconds: float) -> list[float]:
+    """Return whole seconds, minutes or hours within a range; linear ticks for very short or long ranges."""
+    round_steps = (1, 2, 5, 10, 20, 30, 60, 120, 300, 600, 1200, 1800, 3600, 7200, 14400, 28800, 86400)
+    length = high_seconds - low_seconds
+    step = next((step for step in round_steps if length / step <= MAX_TIME_INTERVALS), None)
+    if step is None or length < MIN_TIME_RANGE_SECONDS:
+        return _linear_ticks(low_seconds, high_seconds, 4)
+    first, last = math.ceil(low_seconds / step), math.floor(high_seconds / step)
+    return [float(k * step) for k in range(first, last + 1)]
 
 
 def _log_ticks(low: float, high: float) -> list[float]:

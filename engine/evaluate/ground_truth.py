@@ -24,14 +24,14 @@ _FORMULA = re.compile(r"\bv(?:/(\d+(?:\.\d+)?))?(?:\*(\d+(?:\.\d+)?))?([+-]\d+(?
 _AXES = {f"{sign}{name}": k for k, name in enumerate("xyz") for sign in ("+", "-", "")}
 
 
-def _formula(text: str) -> str:
+def _check_formula(text: str) -> str:
     if _FORMULA.search(text) is None:
         raise ValueError("tells no formula of the stored value v, as v/255 or v/65535*8.0")
     return text
 
 
 _Path = Annotated[str, AfterValidator(check_relative_path)]
-_Formula = Annotated[str, AfterValidator(_formula)]
+_Formula = Annotated[str, AfterValidator(_check_formula)]
 
 
 class _Part(BaseModel):
@@ -137,14 +137,15 @@ class GroundTruth:
     def environment(self) -> Path | None:
         """Return the environment map that lit the photographs."""
         train = self.content.environment.train
-        return None if train is None else self._map(train)
+        return None if train is None else self._environment_path(train)
 
     @property
     def relit_folders(self) -> tuple[tuple[Path, Path], ...]:
         """Return the folders of images under other light, each with its map."""
         root = self.path.parent
         return tuple(
-            (root / folder, self._map(PurePosixPath(folder).name)) for folder in self.content.relight.folders
+            (root / folder, self._environment_path(PurePosixPath(folder).name))
+            for folder in self.content.relight.folders
         )
 
     def relit_image(self, folder: Path, name: str, max_side_px: int) -> Float32[np.ndarray, "h w 4"]:
@@ -171,9 +172,9 @@ class GroundTruth:
             DatasetError: a map that truth.json tells of is missing, damaged, or of another shape.
         """
         maps = self.content.test
-        mask = self._image("mask", name, size)[..., 0] > 0.5
+        mask = self._stored_image("mask", name, size)[..., 0] > 0.5
         scalars = {
-            kind: None if text is None else _decode(self._image(kind, name, size)[..., 0], text)
+            kind: None if text is None else _decode(self._stored_image(kind, name, size)[..., 0], text)
             for kind, text in (
                 ("depth", maps.depth),
                 ("roughness", maps.roughness),
@@ -182,19 +183,24 @@ class GroundTruth:
         }
         normal = albedo = None
         if maps.normal is not None:
-            normal = _decode(self._image("normal", name, size)[..., :3], maps.normal)
+            normal = _decode(self._stored_image("normal", name, size)[..., :3], maps.normal)
             normal /= np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-12)
             normal[~mask] = 0.0
         if maps.albedo is not None:
-            albedo = srgb_to_linear(_unit(self._image("albedo", name, size)[..., :3]))
+            albedo = srgb_to_linear(_bytes_to_unit_range(self._stored_image("albedo", name, size)[..., :3]))
         return ViewGroundTruth(
-            mask, normal, scalars["depth"], albedo, scalars["roughness"], scalars["metallic"]
+            mask=mask,
+            normal_world=normal,
+            depth_z=scalars["depth"],
+            albedo_linear=albedo,
+            roughness=scalars["roughness"],
+            metallic=scalars["metallic"],
         )
 
-    def _map(self, name: str) -> Path:
+    def _environment_path(self, name: str) -> Path:
         return self.path.parent / self.content.environment.folder / f"{name}.hdr"
 
-    def _image(self, kind: str, name: str, size: tuple[int, int]) -> Float64[np.ndarray, "h w c"]:
+    def _stored_image(self, kind: str, name: str, size: tuple[int, int]) -> Float64[np.ndarray, "h w c"]:
         """Return the stored values of a map at ``size``, by nearest pixels."""
         path = self.path.parent / self.content.test.folder / kind / name
         image = read_image(path)
@@ -250,7 +256,7 @@ def _decode(stored: Float64[np.ndarray, "*shape"], text: str) -> Float32[np.ndar
     return (stored / by * times + plus).astype(np.float32)
 
 
-def _unit(stored: Float64[np.ndarray, "*shape"]) -> Float32[np.ndarray, "*shape"]:
+def _bytes_to_unit_range(stored: Float64[np.ndarray, "*shape"]) -> Float32[np.ndarray, "*shape"]:
     return (stored / 255.0).astype(np.float32)
 
 

@@ -64,7 +64,7 @@ class GroundTruthMeasures:
             return
         height, width = image.alpha.shape
         known = self.truth.view(name, (height, width))
-        self.rows[name] = _geometry(image, known, rays, axis_world)
+        self.rows[name] = _geometry_metrics(image, known, rays, axis_world)
         if known.mask.any():
             self._add_materials(name, image, known)
 
@@ -81,7 +81,7 @@ class GroundTruthMeasures:
             dataset: with the views that were relit.
             environment: that of the scene.
             relighter: shows the scene; None measures no pictures.
-            progress: hears the progress.
+            progress: receives the progress events.
 
         Raises:
             ConfigError: a map of the truth cannot be used.
@@ -127,7 +127,7 @@ class GroundTruthMeasures:
             mean |= self._albedo_mean()
         return {
             "mean": {**mean, **self.light},
-            "views": {name: _rounded(row) for name, row in self.rows.items()},
+            "views": {name: _round_metrics(row) for name, row in self.rows.items()},
             "definitions": dict(GROUND_TRUTH_DEFINITIONS),
         }
 
@@ -151,7 +151,7 @@ class GroundTruthMeasures:
         }
 
 
-def _geometry(
+def _geometry_metrics(
     image: RenderedImage, known: ViewGroundTruth, rays: ImageRays, axis_world: np.ndarray
 ) -> dict[str, float]:
     mask = known.mask
@@ -167,7 +167,7 @@ def _geometry(
     return row
 
 
-def _rounded(row: Mapping[str, float]) -> dict[str, float]:
+def _round_metrics(row: Mapping[str, float]) -> dict[str, float]:
     return {key: round(value, _DECIMALS) for key, value in row.items()}
 
 

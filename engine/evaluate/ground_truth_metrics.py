@@ -13,7 +13,7 @@ from octasplat.engine.pathtracing.lights import build_light_arrays, eval_environ
 _OCTAVES = 8.0
 """Scales are looked for between 2 to the power of minus and plus this."""
 MOST_FITTED = 200_000
-"""Pixels that a scale is fitted to; of more, every so-manieth."""
+"""Most pixels that a scale is fitted to; of more, every N-th is taken."""
 
 Curve = Callable[[Float64[np.ndarray, "*shape"]], Float64[np.ndarray, "*shape"]]
 

@@ -71,7 +71,7 @@ def evaluate_held_out(
         run: facts about the run that join the metrics.
         config: shown in the report.
         threads: for rendering and measuring; 0 means all cores.
-        progress: hears the progress.
+        progress: receives the progress events.
         truth: of the scene, whose measures then join the metrics as ``truth``.
         environment: the map that the scene was learnt with.
         relighter: shows the scene in other light, for what the truth knows of that.
@@ -84,8 +84,8 @@ def evaluate_held_out(
     total = len(dataset.test_indices)
     photographs = [view.name for view in dataset.views]
     names = dict(zip(photographs, unique_render_names(photographs), strict=True))
-    for view, measured in _measured(
-        _rendered(dataset, tracer, shading, background, measures), threads or numba.get_num_threads()
+    for view, measured in _measure_views(
+        _render_views(dataset, tracer, shading, background, measures), threads or numba.get_num_threads()
     ):
         write_png(output / RENDERS / f"{names[view.name]}.png", view.render)
         if ALBEDO in view.layers:
@@ -119,7 +119,7 @@ def evaluate_held_out(
     )
 
 
-def _rendered(
+def _render_views(
     dataset: Dataset,
     tracer: Tracer,
     shading: ShadingModel,
@@ -137,17 +137,19 @@ def _rendered(
             measures.add(view.name, image, rays, view.rotation_cam_from_world[2])
         reference = composite_over(rgb, alpha, colour)
         yield RenderedView(
-            dataset.views[index].name,
-            image.rgb_srgb,
-            reference,
-            weight,
-            alpha if dataset.has_alpha else None,
-            display_layers(image),
-            depth_spread(image.depth, image.depth_median, weight),
+            name=dataset.views[index].name,
+            render=image.rgb_srgb,
+            reference=reference,
+            weight=weight,
+            alpha=alpha if dataset.has_alpha else None,
+            layers=display_layers(image),
+            depth_spread=depth_spread(image.depth, image.depth_median, weight),
         )
 
 
-def _measured(views: Iterator[RenderedView], workers: int) -> Iterator[tuple[RenderedView, MeasuredView]]:
+def _measure_views(
+    views: Iterator[RenderedView], workers: int
+) -> Iterator[tuple[RenderedView, MeasuredView]]:
     """Measure a few views side by side, in order; numpy and FLIP leave the interpreter free meanwhile."""
     if workers == 1:
         yield from ((view, measure_view(view)) for view in views)

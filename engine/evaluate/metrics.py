@@ -112,13 +112,17 @@ def ssim_both(
     With ``weight``, how much each pixel counts, the means are over the windows around pixels that do;
     not-a-number where none does.
     """
-    luminance, structure = _similarity(render.astype(np.float64), reference.astype(np.float64))
+    luminance, structure = _ssim_terms(render.astype(np.float64), reference.astype(np.float64))
     similarity = luminance * structure
-    inner = _inner(similarity)
+    inner = _crop_window_margin(similarity)
     if weight is None or (weight == 1).all():
         return float(similarity.mean()), float(inner.mean()) if inner.size else float("nan")
-    valid = float(_means(inner, _inner(weight)).mean()) if inner.size else float("nan")
-    return float(_means(similarity, weight).mean()), valid
+    valid = (
+        float(_weighted_channel_means(inner, _crop_window_margin(weight)).mean())
+        if inner.size
+        else float("nan")
+    )
+    return float(_weighted_channel_means(similarity, weight).mean()), valid
 
 
 def ms_ssim(
@@ -143,13 +147,17 @@ def ms_ssim(
     is_whole = bool((counts == 1).all())
     product = np.ones(3)
     for scale, exponent in enumerate(MS_SSIM_WEIGHTS):
-        luminance, structure = _similarity(x, y)
+        luminance, structure = _ssim_terms(x, y)
         last = scale == len(MS_SSIM_WEIGHTS) - 1
-        values = _inner(luminance * structure if last else structure)
-        mean = values.mean(axis=(0, 1)) if is_whole else _means(values, _inner(counts)[..., 0])
+        values = _crop_window_margin(luminance * structure if last else structure)
+        mean = (
+            values.mean(axis=(0, 1))
+            if is_whole
+            else _weighted_channel_means(values, _crop_window_margin(counts)[..., 0])
+        )
         product *= np.maximum(mean, 0.0) ** exponent
         if not last:
-            x, y, counts = _halved(x), _halved(y), _halved(counts)
+            x, y, counts = _downsample_by_two(x), _downsample_by_two(y), _downsample_by_two(counts)
     return float(product.mean()) if np.isfinite(product).all() else None
 
 
@@ -174,7 +182,7 @@ def flip(
     error = np.asarray(error, dtype=np.float32).reshape(render.shape[:2])
     if weight is None or (weight == 1).all():
         return FlipError(error, float(error.mean(dtype=np.float64)))
-    return FlipError(error, float(_means(error[..., None].astype(np.float64), weight)[0]))
+    return FlipError(error, float(_weighted_channel_means(error[..., None].astype(np.float64), weight)[0]))
 
 
 def _gaussian_window() -> Float64[np.ndarray, "taps"]:
@@ -183,27 +191,27 @@ def _gaussian_window() -> Float64[np.ndarray, "taps"]:
     return np.asarray(window / window.sum())
 
 
-def _blurred(image: Float64[np.ndarray, "h w 3"]) -> Float64[np.ndarray, "h w 3"]:
+def _gaussian_blur(image: Float64[np.ndarray, "h w 3"]) -> Float64[np.ndarray, "h w 3"]:
     window = _gaussian_window()
     for axis in (0, 1):
         image = correlate1d(image, window, axis=axis, mode="constant", cval=0.0)
     return image
 
 
-def _similarity(
+def _ssim_terms(
     x: Float64[np.ndarray, "h w 3"], y: Float64[np.ndarray, "h w 3"]
 ) -> tuple[Float64[np.ndarray, "h w 3"], Float64[np.ndarray, "h w 3"]]:
     """Return the luminance term and the contrast-structure term of SSIM per pixel, with zero padding."""
-    mean_x, mean_y = _blurred(x), _blurred(y)
-    variance_x = _blurred(x * x) - mean_x * mean_x
-    variance_y = _blurred(y * y) - mean_y * mean_y
-    covariance = _blurred(x * y) - mean_x * mean_y
+    mean_x, mean_y = _gaussian_blur(x), _gaussian_blur(y)
+    variance_x = _gaussian_blur(x * x) - mean_x * mean_x
+    variance_y = _gaussian_blur(y * y) - mean_y * mean_y
+    covariance = _gaussian_blur(x * y) - mean_x * mean_y
     luminance = (2 * mean_x * mean_y + SSIM_C1) / (mean_x * mean_x + mean_y * mean_y + SSIM_C1)
     structure = (2 * covariance + SSIM_C2) / (variance_x + variance_y + SSIM_C2)
     return luminance, structure
 
 
-def _means(
+def _weighted_channel_means(
     values: Float64[np.ndarray, "h w c"], weight: Float[np.ndarray, "h w"]
 ) -> Float64[np.ndarray, "c"]:
     """Return the weighted mean of each channel; not-a-number where the weights are 0."""
@@ -213,12 +221,12 @@ def _means(
     return np.asarray((values * weight[..., None]).sum(axis=(0, 1)) / total)
 
 
-def _inner(values: Float[np.ndarray, "h w *c"]) -> Float[np.ndarray, "a b *c"]:
+def _crop_window_margin(values: Float[np.ndarray, "h w *c"]) -> Float[np.ndarray, "a b *c"]:
     reach = SSIM_WINDOW // 2
     return values[reach : values.shape[0] - reach, reach : values.shape[1] - reach]
 
 
-def _halved(image: Float64[np.ndarray, "h w c"]) -> Float64[np.ndarray, "a b c"]:
+def _downsample_by_two(image: Float64[np.ndarray, "h w c"]) -> Float64[np.ndarray, "a b c"]:
     """Return means of 2x2 blocks; odd sides get a black line before them, which counts as image."""
     odd = [(side % 2, 0) for side in image.shape[:2]]
     even = np.pad(image, [*odd, (0, 0)])

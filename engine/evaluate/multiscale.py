@@ -38,10 +38,10 @@ def measure_multiscale(
         background_srgb: behind renders and photographs with alpha.
         scales: a pixel is so many of the photograph's across, and down.
         rays_across: so many rays across a pixel, and down.
-        on_view: told how many views are done.
+        on_view: called with the number of views done.
 
     Returns:
-        By scale, as ``1/4``, and by rays a pixel, as ``1`` or ``4``.
+        By scale, as ``1/4``, and by rays per pixel, as ``1`` or ``4``.
     """
     found: dict[str, dict[str, list[float]]] = {}
     for done, index in enumerate(dataset.test_indices.tolist(), start=1):

@@ -106,9 +106,9 @@ def write_report(
         lstrip_blocks=True,
     )
     page = environment.get_template("report.html").render(
-        _content(title, metrics, events, config, images),
-        environment=None if environment_linear is None else _environment(environment_linear),
-        background=None if background_srgb is None else _map(background_srgb),
+        _template_values(title, metrics, events, config, images),
+        environment=None if environment_linear is None else _embedded_environment(environment_linear),
+        background=None if background_srgb is None else _embedded_map(background_srgb),
     )
     try:
         write_text(path, page)
@@ -116,7 +116,7 @@ def write_report(
         raise OutputError(f"Cannot write {path}: {error.strerror or error}.") from error
 
 
-def _content(
+def _template_values(
     title: str,
     metrics: Mapping[str, object],
     events: Sequence[Mapping[str, object]],
@@ -124,10 +124,10 @@ def _content(
     images: Mapping[str, ViewImages],
 ) -> dict[str, object]:
     """Return the values that the page template needs."""
-    mean = _mapping(metrics.get("mean"))
-    views = {name: _mapping(row) for name, row in _mapping(metrics.get("views")).items()}
-    columns = _columns(mean)
-    worst_first = sorted(views, key=lambda name: (_number(views[name].get("psnr"), math.inf), name))
+    mean = _as_mapping(metrics.get("mean"))
+    views = {name: _as_mapping(row) for name, row in _as_mapping(metrics.get("views")).items()}
+    columns = _metric_columns(mean)
+    worst_first = sorted(views, key=lambda name: (_as_number(views[name].get("psnr"), math.inf), name))
     embedded = embedded_names(worst_first, images)
     interval = metrics.get("mean_psnr_ci95")
     layers = [name for name in LABELS if any(name in images[view].layers for view in embedded)]
@@ -135,13 +135,13 @@ def _content(
         "labels": {**_LABELS, **{name: LABELS[name] for name in layers}},
         "tabs": layers,
         "title": title,
-        "tiles": _tiles(mean, columns, interval, metrics),
-        "facts": _facts(metrics, len(views)),
+        "tiles": _summary_tiles(mean, columns, interval, metrics),
+        "facts": _run_facts(metrics, len(views)),
         "stages": _phase_times(events),
         "charts": training_charts(events),
         "columns": columns,
-        "rows": _rows(worst_first, views, columns, embedded),
-        "figures": [_figure(name, views[name], images[name]) for name in embedded],
+        "rows": _view_rows(worst_first, views, columns, embedded),
+        "figures": [_view_figure(name, views[name], images[name]) for name in embedded],
         "left_out": len(views) - len(embedded),
         "thinned": len(embedded) < len(views)
         and embedded == [*worst_first[:WORST_COUNT], *worst_first[-BEST_COUNT:]],
@@ -149,39 +149,39 @@ def _content(
         "best": BEST_COUNT,
         "magma": [f"rgb({r} {g} {b})" for r, g, b in (MAGMA * 255).round().astype(int).tolist()],
         "settings": _flatten_settings(config),
-        "versions": _flatten_settings(_mapping(metrics.get("versions"))),
+        "versions": _flatten_settings(_as_mapping(metrics.get("versions"))),
         "definitions": [
-            *_mapping(metrics.get("definitions")).items(),
-            *_mapping(_mapping(metrics.get("truth")).get("definitions")).items(),
+            *_as_mapping(metrics.get("definitions")).items(),
+            *_as_mapping(_as_mapping(metrics.get("truth")).get("definitions")).items(),
         ],
         "warnings": list(dict.fromkeys(str(e.get("message")) for e in events if e.get("kind") == "warning")),
     }
 
 
-def _map(rgb_srgb: Float32[np.ndarray, "h w 3"]) -> dict[str, object]:
+def _embedded_map(rgb_srgb: Float32[np.ndarray, "h w 3"]) -> dict[str, object]:
     """Return the data URI and size of a map."""
     height, width = rgb_srgb.shape[:2]
     return {"uri": webp_data_uri(shrink_to(rgb_srgb, MAX_SIDE_PX)), "width": width, "height": height}
 
 
-def _environment(radiance_linear: Float32[np.ndarray, "h w 3"]) -> dict[str, object]:
+def _embedded_environment(radiance_linear: Float32[np.ndarray, "h w 3"]) -> dict[str, object]:
     """Return the data URI, size and maximum radiance of an environment map."""
     return {
-        **_map(display_environment(radiance_linear)),
+        **_embedded_map(display_environment(radiance_linear)),
         "brightest": _format_value(float(radiance_linear.max()), 1),
     }
 
 
-def _columns(mean: Mapping[str, object]) -> list[Column]:
+def _metric_columns(mean: Mapping[str, object]) -> list[Column]:
     """Return the measured metrics; color-corrected PSNR only where the correction makes a difference."""
     columns = [column for column in COLUMNS if column.key in mean]
-    plain, corrected = (_number(mean.get(key), math.nan) for key in ("psnr", "psnr_colour_corrected"))
+    plain, corrected = (_as_number(mean.get(key), math.nan) for key in ("psnr", "psnr_colour_corrected"))
     if corrected - plain >= MIN_EXPOSURE_GAIN_DB:
         return columns
     return [column for column in columns if column.key != "psnr_colour_corrected"]
 
 
-def _tiles(
+def _summary_tiles(
     mean: Mapping[str, object], columns: Sequence[Column], interval: object, metrics: Mapping[str, object]
 ) -> list[dict[str, str]]:
     """Return the main figures at the head of the page."""
@@ -195,7 +195,7 @@ def _tiles(
             unit = "dB" if column.key.startswith("psnr") else ""
             value = _format_value(mean[column.key], column.decimals)
             tiles.append({"label": column.heading, "value": value, "unit": unit, "note": note})
-    trained = _mapping(metrics.get("training_views"))
+    trained = _as_mapping(metrics.get("training_views"))
     if trained.get("psnr") is not None:
         note = f"worst {_format_value(trained.get('worst_psnr'), 2)} dB: {trained.get('worst')}"
         if left := trained.get("left_out"):
@@ -208,7 +208,7 @@ def _tiles(
                 "note": note,
             }
         )
-    known = _mapping(_mapping(metrics.get("truth")).get("mean"))
+    known = _as_mapping(_as_mapping(metrics.get("truth")).get("mean"))
     for key, label, decimals, unit in _TRUTH_TILES:
         if known.get(key) is not None:
             note = "against the truth" + (", one factor a channel" if key.endswith("_scaled") else "")
@@ -230,7 +230,7 @@ def _tiles(
     return tiles
 
 
-def _facts(metrics: Mapping[str, object], views: int) -> list[str]:
+def _run_facts(metrics: Mapping[str, object], views: int) -> list[str]:
     """Return short statements for the line under the title."""
     facts = [f"{views} held-out view{'' if views == 1 else 's'}"]
     resolution = metrics.get("resolution")
@@ -246,7 +246,7 @@ def _facts(metrics: Mapping[str, object], views: int) -> list[str]:
         facts.append(f"seed {metrics['seed']}")
     if taken := metrics.get("taken_near"):
         facts.append(
-            f"{_format_thousands(int(_number(taken, 0)))} Gaussians too near to a camera were taken away"
+            f"{_format_thousands(int(_as_number(taken, 0)))} Gaussians too near to a camera were taken away"
         )
     return facts
 
@@ -254,7 +254,7 @@ def _facts(metrics: Mapping[str, object], views: int) -> list[str]:
 def _phase_times(events: Sequence[Mapping[str, object]]) -> list[dict[str, object]]:
     """Return the duration of each phase (its last finish), with its share of the total."""
     spent = {
-        str(row.get("stage")): _number(row.get("seconds"), 0.0)
+        str(row.get("stage")): _as_number(row.get("seconds"), 0.0)
         for row in events
         if row.get("kind") == "stage_finished"
     }
@@ -267,14 +267,14 @@ def _phase_times(events: Sequence[Mapping[str, object]]) -> list[dict[str, objec
     ]
 
 
-def _rows(
+def _view_rows(
     worst_first: list[str],
     views: Mapping[str, Mapping[str, object]],
     columns: list[Column],
     embedded: list[str],
 ) -> list[dict[str, object]]:
     """Return the rows of the table of views, worst view first."""
-    known = [_number(views[name].get("psnr"), math.nan) for name in worst_first]
+    known = [_as_number(views[name].get("psnr"), math.nan) for name in worst_first]
     finite = [value for value in known if math.isfinite(value)]
     low, high = (min(finite), max(finite)) if finite else (0.0, 0.0)
     place = {name: index for index, name in enumerate(embedded)}
@@ -287,7 +287,7 @@ def _rows(
             for column in columns
         ]
         size = f"{view['width']} × {view['height']}" if "width" in view and "height" in view else "–"
-        pixels = _number(view.get("width"), 0.0) * _number(view.get("height"), 0.0)
+        pixels = _as_number(view.get("width"), 0.0) * _as_number(view.get("height"), 0.0)
         rows.append(
             {
                 "name": name,
@@ -301,7 +301,7 @@ def _rows(
     return rows
 
 
-def _figure(name: str, view: Mapping[str, object], images: ViewImages) -> dict[str, object]:
+def _view_figure(name: str, view: Mapping[str, object], images: ViewImages) -> dict[str, object]:
     """Return the three images of a view and their caption."""
     small = images.downscale()
     height, width = small.flip_map.shape
@@ -338,11 +338,11 @@ def _flatten_settings(values: Mapping[str, object], prefix: str = "") -> list[tu
     return rows
 
 
-def _mapping(value: object) -> Mapping[str, object]:
+def _as_mapping(value: object) -> Mapping[str, object]:
     return value if isinstance(value, Mapping) else {}
 
 
-def _number(value: object, otherwise: float) -> float:
+def _as_number(value: object, otherwise: float) -> float:
     return float(value) if isinstance(value, int | float) and not isinstance(value, bool) else otherwise
 
 

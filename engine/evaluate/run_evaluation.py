@@ -25,7 +25,7 @@ from octasplat.engine.gaussians.materials import has_materials
 from octasplat.engine.pathtracing.environment import EnvironmentMap, environment_frame
 from octasplat.engine.pathtracing.relighting.split_sum_relighter import SplitSumRelighter
 from octasplat.engine.poses.find_poses import read_pose_record
-from octasplat.engine.render.environment_files import read_background, read_environment
+from octasplat.engine.render.environment_files import read_background_map, read_environment
 from octasplat.engine.render.renderer import background_colour
 from octasplat.engine.runs.config import ReconstructionConfig, read_config
 from octasplat.engine.runs.run_folder import (
@@ -81,7 +81,7 @@ def evaluate(
             stay as they are.
         background: behind the scene; None takes that of the run.
         threads: for everything; 0 means all cores.
-        progress: hears the progress.
+        progress: receives the progress events.
 
     Returns:
         The path of ``metrics.json``.
@@ -125,10 +125,10 @@ def evaluate_scales(
         scene: where the photographs are now; None takes the folder that the run was made from.
         background: behind the scene; None takes that of the run.
         threads: for everything; 0 means all cores.
-        listener: hears the progress.
+        listener: receives the progress events.
 
     Returns:
-        Mean PSNR of the held-out views, by scale and by rays a pixel.
+        Mean PSNR of the held-out views, by scale and by rays per pixel.
 
     Raises:
         ConfigError: ``output`` is no run.
@@ -146,12 +146,12 @@ def evaluate_scales(
     tracer.build(gaussians, shading.features(gaussians))
     with counted_phase("evaluate", listener, len(dataset.test_indices)) as progress:
         found = measure_multiscale(
-            dataset,
-            tracer,
-            shading,
-            background_colour(config.evaluation_background),
-            scales,
-            RAYS_ACROSS,
+            dataset=dataset,
+            tracer=tracer,
+            shading=shading,
+            background_srgb=background_colour(config.evaluation_background),
+            scales=scales,
+            rays_across=RAYS_ACROSS,
             on_view=lambda done: progress(done, len(dataset.test_indices)),
         )
     write_json(output / SCALES, found)
@@ -213,7 +213,7 @@ def measure_run(
     truth = _find_ground_truth(dataset, progress, needed=into is not None)
     gaussians, _ = read_gaussian_ply(output / SCENE)
     extent = _extent_world(output, dataset)
-    environment = _environment(output, config.train.materials.up_world)
+    environment = _read_run_environment(output, config.train.materials.up_world)
     relighter = None
     if truth is not None and truth.relit_folders and environment is not None and has_materials(gaussians):
         relighter = SplitSumRelighter(
@@ -283,13 +283,13 @@ def finished_shading(
     if (deferred := find_deferred(shading)) is not None:
         deferred.light.set_radiance(read_environment(run_environment(output)))
     if (background := find_background(shading)) is not None:
-        background.set_map(read_background(output / BACKGROUND))
+        background.set_map(read_background_map(output / BACKGROUND))
     if exposed and known is not None and (exposures := find_exposures(shading)) is not None:
         exposures.load_known([view.name for view in dataset.views], known)
     return shading
 
 
-def _environment(output: Path, up_world: tuple[float, float, float]) -> EnvironmentMap | None:
+def _read_run_environment(output: Path, up_world: tuple[float, float, float]) -> EnvironmentMap | None:
     """Return the environment map that a run with materials has learnt."""
     if not run_environment(output).exists():
         return None
@@ -326,7 +326,9 @@ def _evaluate_on(
             )
     with phase("evaluate", progress, len(dataset.test_indices)):
         write_views(into / VIEWS, dataset.views_record)
-        measure_run(dataset, output, config, threads, progress, into)
+        measure_run(
+            dataset=dataset, output=output, config=config, threads=threads, progress=progress, into=into
+        )
     return into / "metrics.json"
 
 

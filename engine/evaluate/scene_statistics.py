@@ -78,8 +78,8 @@ def scene_statistics(gaussians: FlatGaussians, up_world: Float64[np.ndarray, "3"
         count=len(gaussians),
         sh_degree=gaussians.sh_degree,
         channels=gaussians.channels.widths,
-        box=_box(gaussians.means_world),
-        box_solid=_box(gaussians.means_world[core_gaussians(gaussians)]),
+        box=_bounding_box(gaussians.means_world),
+        box_solid=_bounding_box(gaussians.means_world[core_gaussians(gaussians)]),
         seen=visible_bounds(gaussians, up_world),
         opacity_counts=tuple(int(count) for count in counts),
         scale_quantiles=tuple(float(value) for value in np.quantile(larger, QUANTILES)),
@@ -97,6 +97,6 @@ def hit_statistics(tracer: Tracer, image: ImageRays) -> HitStatistics:
     return HitStatistics(float(some.mean()), float(np.quantile(some, 0.95)), len(some) / len(hits))
 
 
-def _box(points: np.ndarray) -> Box:
+def _bounding_box(points: np.ndarray) -> Box:
     low, high = points.min(axis=0), points.max(axis=0)
     return Box(tuple(map(float, low)), tuple(map(float, high)))  # type: ignore[arg-type]

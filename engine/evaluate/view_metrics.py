@@ -106,16 +106,18 @@ class Metrics:
         """
         views = {}
         for view in self.views:
-            row = {key: _finite(value) for key, value in asdict(view).items() if key != "name"}
+            row = {key: _none_if_not_finite(value) for key, value in asdict(view).items() if key != "name"}
             for key in OPTIONAL_METRICS:
                 if key not in self.mean:
                     del row[key]
             views[view.name] = row
         interval = self.mean_psnr_ci95
         return {
-            "mean": {key: _finite(value) for key, value in self.mean.items()},
+            "mean": {key: _none_if_not_finite(value) for key, value in self.mean.items()},
             **({"mean_left_out": self.left_out} if self.left_out else {}),
-            "mean_psnr_ci95": None if interval is None else [_finite(bound) for bound in interval],
+            "mean_psnr_ci95": None
+            if interval is None
+            else [_none_if_not_finite(bound) for bound in interval],
             "views": views,
             "definitions": dict(DEFINITIONS),
             **run,
@@ -133,8 +135,8 @@ def measure_view(view: RenderedView) -> MeasuredView:
     """
     if view.render.shape != view.reference.shape:
         raise DatasetError(
-            f"The render of {view.name} has {_size(view.render)} pixels but its photograph "
-            f"{_size(view.reference)}; render at the photograph's size."
+            f"The render of {view.name} has {_size_text(view.render)} pixels but its photograph "
+            f"{_size_text(view.reference)}; render at the photograph's size."
         )
     if not np.isfinite(view.render).all():
         raise DatasetError(f"The render of {view.name} has pixels that are no number.")
@@ -150,10 +152,10 @@ def measure_view(view: RenderedView) -> MeasuredView:
         height=height,
         psnr=psnr(render, reference, view.weight),
         psnr_colour_corrected=psnr(fit_color(render, reference, view.weight), reference, view.weight),
-        ssim=_known(padded),
-        ssim_valid=_known(valid),
+        ssim=_none_if_nan(padded),
+        ssim_valid=_none_if_nan(valid),
         ms_ssim=ms_ssim(filled, reference, view.weight),
-        flip=_known(mean_flip),
+        flip=_none_if_nan(mean_flip),
         psnr_foreground=_psnr_foreground(render, reference, view.weight, view.alpha),
         depth_spread=view.depth_spread,
     )
@@ -227,10 +229,10 @@ def _psnr_foreground(
     if alpha is None:
         return None
     value = psnr(render, reference, np.where(alpha > FOREGROUND_ALPHA, weight, np.float32(0)))
-    return _known(value)
+    return _none_if_nan(value)
 
 
-def _known(value: float) -> float | None:
+def _none_if_nan(value: float) -> float | None:
     return None if math.isnan(value) else value
 
 
@@ -238,9 +240,9 @@ def _is_finite(value: float | None) -> bool:
     return value is not None and math.isfinite(value)
 
 
-def _finite(value: object) -> object:
+def _none_if_not_finite(value: object) -> object:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def _size(image: np.ndarray) -> str:
+def _size_text(image: np.ndarray) -> str:
     return f"{image.shape[1]} x {image.shape[0]}"

@@ -48,7 +48,7 @@ def read(path: Path) -> GaussianCloud:
         means_world=_dequantise(
             tables["chunk"], "{}_{}", "xyz", chunk, _unpack_11_10_11(packed["packed_position"])
         ),
-        quats_wxyz=_rotations(packed["packed_rotation"]),
+        quats_wxyz=_unpack_rotations(packed["packed_rotation"]),
         log_scales=_dequantise(
             tables["chunk"], "{}_scale_{}", "xyz", chunk, _unpack_11_10_11(packed["packed_scale"])
         ),
@@ -99,7 +99,7 @@ def _dequantise(
     return low * (1 - share) + high * share
 
 
-def _rotations(packed: UInt32[np.ndarray, " n"]) -> Float32[np.ndarray, "n 4"]:
+def _unpack_rotations(packed: UInt32[np.ndarray, " n"]) -> Float32[np.ndarray, "n 4"]:
     """Unpack quaternions: two bits for the index of the largest component, 10 bits for each other one."""
     fields = np.stack([(packed >> shift) & 1023 for shift in (20, 10, 0)], axis=1)
     small = (fields / 1023.0 - 0.5) * (2.0 * SQRT_HALF)

@@ -35,7 +35,7 @@ def write(gaussians: FlatGaussians, path: Path, options: ExportOptions) -> tuple
     chunks = np.empty(-(-count // CHUNK_SIZE), dtype=[(name, "<f4") for name in _bound_names()])
     shares = {}
     for key, values in groups.items():
-        low, high = _bounds(values)
+        low, high = _chunk_bounds(values)
         for axis in range(3):
             letter = "rgb"[axis] if key == "rgb" else f"{key}{'xyz'[axis]}"
             chunks[f"min_{letter}"], chunks[f"max_{letter}"] = low[:, axis], high[:, axis]
@@ -45,7 +45,7 @@ def write(gaussians: FlatGaussians, path: Path, options: ExportOptions) -> tuple
         shares[key] = np.divide(offset, extent, out=np.zeros_like(values), where=extent > 0)
     vertices = np.empty(count, dtype=[(f"packed_{what}", "<u4") for what in _PACKED_WORDS])
     vertices["packed_position"] = _pack_word(shares[""], (11, 10, 11))
-    vertices["packed_rotation"] = _rotations(scene)
+    vertices["packed_rotation"] = _pack_rotations(scene)
     vertices["packed_scale"] = _pack_word(shares["scale_"], (11, 10, 11))
     opacities = scene.opacities.astype(np.float64)[:, None]
     vertices["packed_color"] = _pack_word(np.concatenate([shares["rgb"], opacities], axis=1), (8, 8, 8, 8))
@@ -66,7 +66,7 @@ def _find_losses(scene: FlatGaussians) -> tuple[str, ...]:
     if len(scene) == 0 or not scene.is_finite():
         return ()  # which is refused
     order = kd_order(scene.means_world, CHUNK_SIZE)
-    low, high = _bounds(scene.means_world[order].astype(np.float64))
+    low, high = _chunk_bounds(scene.means_world[order].astype(np.float64))
     steps = ((high - low) / [2047.0, 1023.0, 2047.0]).max(axis=1)
     step_world = np.empty(len(scene))
     step_world[order] = steps[np.arange(len(scene)) // CHUNK_SIZE]
@@ -86,7 +86,7 @@ def _bound_names() -> list[str]:
     return names
 
 
-def _bounds(
+def _chunk_bounds(
     values: Float64[np.ndarray, "n 3"],
 ) -> tuple[Float64[np.ndarray, "c 3"], Float64[np.ndarray, "c 3"]]:
     starts = np.arange(0, len(values), CHUNK_SIZE)
@@ -102,7 +102,7 @@ def _pack_word(shares: Float[np.ndarray, "n f"], bits: tuple[int, ...]) -> UInt3
     return word
 
 
-def _rotations(scene: FlatGaussians) -> UInt32[np.ndarray, " n"]:
+def _pack_rotations(scene: FlatGaussians) -> UInt32[np.ndarray, " n"]:
     small, largest = smallest_three(scene.quats_wxyz)
     packed = _pack_word(small / (2.0 * SQRT_HALF) + 0.5, (10, 10, 10))
     return np.asarray((largest.astype(np.uint32) << np.uint32(30)) | packed)

@@ -21,7 +21,7 @@ def export_batch(
     Args:
         targets: the files; their names say the formats.
         prepare: makes what is written in a format: the scene, and how.
-        on_done: told how many files have been dealt with, after each; it may raise to stop.
+        on_done: called with the number of files dealt with, after each; it may raise to stop.
         format: name of the format of all of them, if their names do not say it.
 
     Returns:

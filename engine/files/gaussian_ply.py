@@ -124,7 +124,7 @@ def read_ply_metadata(path: Path) -> SceneMetadata:
             raise SceneFileError(
                 f"{path}: its comment {field.name} is {value!r}, which is no number."
             ) from None
-    facts = SceneMetadata(**known, origin_world=_origin(path, metadata.get(ORIGIN_KEY)))
+    facts = SceneMetadata(**known, origin_world=_parse_origin(path, metadata.get(ORIGIN_KEY)))
     return replace(facts, turned_beyond=min(facts.turned_beyond, 1.0))
 
 
@@ -139,7 +139,7 @@ def origin_comments(origin: Origin) -> list[str]:
     return [f"{ORIGIN_KEY} {' '.join(map(repr, origin))}"] if is_set(origin) else []
 
 
-def _origin(path: Path, text: str | None) -> Origin:
+def _parse_origin(path: Path, text: str | None) -> Origin:
     if text is None:
         return NO_ORIGIN
     try:

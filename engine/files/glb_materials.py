@@ -85,7 +85,7 @@ class _MaterialReader:
             strength * float(share) for share in material.get("emissiveFactor", (0.0, 0.0, 0.0))
         )
         base = [float(value) for value in shading.get("baseColorFactor", (1.0, 1.0, 1.0, 1.0))]
-        images = {name: self._image(info) for name, info in _texture_infos(material).items()}
+        images = {name: self._read_texture_image(info) for name, info in _texture_infos(material).items()}
         return MeshMaterial(
             self._name or f"material {number}",
             (base[0], base[1], base[2]),
@@ -95,12 +95,12 @@ class _MaterialReader:
             normal_scale=float(material.get("normalTexture", {}).get("scale", 1.0)),
             transmission=float(extensions.get("transmission", {}).get("transmissionFactor", 0.0)),
             ior=float(extensions.get("ior", {}).get("ior", 1.5)),
-            absorption=self._absorption(),
+            absorption=self._absorption_coefficients(),
             unsupported=self._unsupported_features(),
             **images,  # type: ignore[arg-type]
         )
 
-    def _absorption(self) -> tuple[float, float, float]:
+    def _absorption_coefficients(self) -> tuple[float, float, float]:
         """Return the absorption of the volume, from its attenuation distance and color."""
         volume = self._extensions.get("volume", {})
         distance = float(volume.get("attenuationDistance", math.inf))
@@ -130,7 +130,7 @@ class _MaterialReader:
             found.append("other texture coordinates than those of its first texture")
         return tuple(found)
 
-    def _image(self, info: dict[str, Any]) -> FileImage:
+    def _read_texture_image(self, info: dict[str, Any]) -> FileImage:
         document = self._file.document
         texture = document["textures"][info["index"]]
         source = texture.get("source")

@@ -99,7 +99,7 @@ def _read_channel(
 def _read_cloud(file: GlbFile, attributes: dict[str, int], splats: dict[str, Any]) -> GaussianCloud:
     """Return the Gaussians of a primitive, in its own frame."""
     xyzw = file.array(attributes[f"{EXTENSION}:ROTATION"], np.float32)
-    sh = _harmonics(file, attributes)
+    sh = _read_harmonics(file, attributes)
     notes: tuple[str, ...] = ()
     if splats.get("colorSpace") == "lin_rec709_display":
         notes = ("Its colours are linear; they were converted, without what depends on the view.",)
@@ -124,7 +124,7 @@ def _sh_degree_of(attributes: dict[str, int]) -> int:
     return max((int(match[1]) for match in found if match), default=0)
 
 
-def _harmonics(file: GlbFile, attributes: dict[str, int]) -> Float32[np.ndarray, "n k 3"]:
+def _read_harmonics(file: GlbFile, attributes: dict[str, int]) -> Float32[np.ndarray, "n k 3"]:
     bands: list[np.ndarray] = []
     for degree in range(MAX_SH_DEGREE + 1):
         names = [f"{EXTENSION}:SH_DEGREE_{degree}_COEF_{place}" for place in range(2 * degree + 1)]
@@ -196,7 +196,7 @@ class _Attribute:
     rows: Callable[[FlatGaussians], np.ndarray]
 
 
-def _colours(some: FlatGaussians) -> np.ndarray:
+def _fallback_colours(some: FlatGaussians) -> np.ndarray:
     """Return the fallback of readers of points: linear RGB of the constant harmonic, and opacity."""
     linear = srgb_to_linear(np.clip(some.base_rgb_srgb, 0.0, 1.0))
     return round_to_bytes(
@@ -204,12 +204,12 @@ def _colours(some: FlatGaussians) -> np.ndarray:
     )
 
 
-def _scales(some: FlatGaussians) -> np.ndarray:
+def _scales_3d(some: FlatGaussians) -> np.ndarray:
     flat = np.full((len(some), 1), FLAT_SCALE, dtype=np.float32)
     return np.concatenate([flat, some.scales], axis=1)
 
 
-def _coefficient(number: int) -> Callable[[FlatGaussians], np.ndarray]:
+def _sh_coefficient_reader(number: int) -> Callable[[FlatGaussians], np.ndarray]:
     return lambda some: some.sh[:, number] * HALF_TURN_SIGNS[number]
 
 
@@ -217,11 +217,11 @@ def _float_count(attribute: glb_container.ChannelAttribute) -> Callable[[FlatGau
     return lambda some: some.channels[attribute.channel][:, attribute.part]
 
 
-def _attributes(sh_degree: int, widths: Mapping[str, int]) -> tuple[_Attribute, ...]:
+def _file_attributes(sh_degree: int, widths: Mapping[str, int]) -> tuple[_Attribute, ...]:
     """Return the attributes of a scene with that degree of harmonics and these channels, in file order."""
     basic = (
         _Attribute("POSITION", "VEC3", FLOAT, 12, lambda some: half_turn_points(some.means_world)),
-        _Attribute("COLOR_0", "VEC4", UNSIGNED_BYTE, 4, _colours),
+        _Attribute("COLOR_0", "VEC4", UNSIGNED_BYTE, 4, _fallback_colours),
         _Attribute(
             f"{EXTENSION}:ROTATION",
             "VEC4",
@@ -229,12 +229,16 @@ def _attributes(sh_degree: int, widths: Mapping[str, int]) -> tuple[_Attribute, 
             16,
             lambda some: unit_quats(half_turn_quats(some.quats_wxyz)[:, [1, 2, 3, 0]]),
         ),
-        _Attribute(f"{EXTENSION}:SCALE", "VEC3", FLOAT, 12, _scales),
+        _Attribute(f"{EXTENSION}:SCALE", "VEC3", FLOAT, 12, _scales_3d),
         _Attribute(f"{EXTENSION}:OPACITY", "SCALAR", FLOAT, 4, lambda some: some.opacities),
     )
     harmonics = tuple(
         _Attribute(
-            f"{EXTENSION}:SH_DEGREE_{degree}_COEF_{place}", "VEC3", FLOAT, 12, _coefficient(degree**2 + place)
+            f"{EXTENSION}:SH_DEGREE_{degree}_COEF_{place}",
+            "VEC3",
+            FLOAT,
+            12,
+            _sh_coefficient_reader(degree**2 + place),
         )
         for degree in range(sh_degree + 1)
         for place in range(2 * degree + 1)
@@ -258,7 +262,7 @@ def write(gaussians: FlatGaussians, path: Path, options: ExportOptions) -> tuple
     """
     scene = select_for_export(gaussians, path, options)
     check_scales(scene, path)
-    layout = _attributes(scene.sh_degree, scene.channels.widths)
+    layout = _file_attributes(scene.sh_degree, scene.channels.widths)
     text = glb_container.json_bytes(_gltf_json(scene, layout, options.facts.origin_world))
     room = pad_to_four(len(text))
     length = len(scene) * sum(attribute.item_bytes for attribute in layout)

@@ -85,7 +85,7 @@ def _read(path: Path, *, with_materials: bool) -> ImportedMesh:
                 f"{path}: its meshes are compressed ({packed[0]}), which changes the order of vertices; "
                 "export it without compression."
             )
-        mesh, numbers = _mesh(file, with_materials=with_materials)
+        mesh, numbers = _read_triangles(file, with_materials=with_materials)
         if not with_materials:
             return mesh
         uv = None if mesh.uv is None else mesh.uv[mesh.triangles]
@@ -94,7 +94,7 @@ def _read(path: Path, *, with_materials: bool) -> ImportedMesh:
         raise SceneFileError(f"{path}: its glTF is damaged or not understood ({error}).") from error
 
 
-def _mesh(file: GlbFile, *, with_materials: bool) -> tuple[ImportedMesh, Int32[np.ndarray, " t"]]:
+def _read_triangles(file: GlbFile, *, with_materials: bool) -> tuple[ImportedMesh, Int32[np.ndarray, " t"]]:
     """Return all triangles, and the material index of each."""
     vertices: list[np.ndarray] = []
     triangles: list[np.ndarray] = []
@@ -187,7 +187,9 @@ def write_octagons(gaussians: FlatGaussians, path: Path, options: ExportOptions)
     paths = [path, *(path.with_name(f"{path.stem}.part{k}{path.suffix}") for k in range(2, len(parts) + 1))]
     for part_path, (layout, chunks) in zip(paths, parts, strict=True):
         bounds: list[Bounds] = []
-        data = _octagon_data(layout, soup, chunks, (png, ramp), options, bounds)
+        data = _octagon_data(
+            layout=layout, soup=soup, chunks=chunks, images=(png, ramp), options=options, bounds=bounds
+        )
         write_glb(part_path, layout.json_room, layout.length, data, lambda: layout.json(bounds))  # noqa: B023
     return tuple(paths)
 
@@ -204,11 +206,16 @@ def _plan_files(
         parts = [
             (
                 GlbLayout(
-                    [len(chunk) for chunk in group], png_sizes[0], options, extras, channels, png_sizes[1]
+                    chunk_sizes=[len(chunk) for chunk in group],
+                    png_size=png_sizes[0],
+                    options=options,
+                    extras=extras,
+                    channels=channels,
+                    ramp_size=png_sizes[1],
                 ),
                 group,
             )
-            for group, extras in zip(groups, _extras(soup, options, count), strict=True)
+            for group, extras in zip(groups, _file_extras(soup, options, count), strict=True)
         ]
         if all(layout.total <= glb_container.MAX_BYTES for layout, _ in parts):
             return parts
@@ -217,7 +224,7 @@ def _plan_files(
     raise glb_container.too_large_error(path, "its largest chunk needs", largest, advice)
 
 
-def _extras(soup: OctagonSoup, options: ExportOptions, parts: int) -> list[dict[str, object]]:
+def _file_extras(soup: OctagonSoup, options: ExportOptions, parts: int) -> list[dict[str, object]]:
     """Return what each file says of itself: enough for an edited mesh to find back to its Gaussians."""
     extras: dict[str, object] = {
         Q_KEY: options.q,

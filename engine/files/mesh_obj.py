@@ -120,14 +120,14 @@ def write_octagons(gaussians: FlatGaussians, path: Path, options: ExportOptions)
     material, texture = _octagon_files(path)
     with atomic_replace(texture) as temporary:
         temporary.write_bytes(grey_png(options.falloff_texture_size, options.q))
-    write_text(material, f"{_material(MATERIAL)}map_d {texture.name}\n")
+    write_text(material, f"{_material_entry(MATERIAL)}map_d {texture.name}\n")
     with atomic_replace(path) as temporary, temporary.open("wb") as handle:
         for text in _octagon_lines(soup, material.name, options.facts.origin_world):
             handle.write(text.encode())
     return path, material, texture
 
 
-def _material(name: str) -> str:
+def _material_entry(name: str) -> str:
     return f"newmtl {name}\nKa 0 0 0\nKd 1 1 1\nKs 0 0 0\nillum 0\n"
 
 
@@ -174,7 +174,7 @@ def write_surface(mesh: TriangleMesh, path: Path) -> tuple[Path, ...]:
         material, image = _surface_files(path)
         with atomic_replace(image) as temporary:
             temporary.write_bytes(png_bytes(mesh.texture_srgb))
-        write_text(material, f"{_material('surface')}map_Kd {image.name}\n")
+        write_text(material, f"{_material_entry('surface')}map_Kd {image.name}\n")
         head += f"mtllib {material.name}\nusemtl surface\n"
         files += [material, image]
     with atomic_replace(path) as temporary, temporary.open("w", encoding="utf-8") as handle:

@@ -82,9 +82,9 @@ def read(path: Path) -> ImportedMesh:
         positions,
         triangles,
         uv=columns(table, ("s", "t")) if {"s", "t"} <= set(vertex.names) else None,
-        gid=_attribute(table, "gid"),
-        corner=_attribute(table, "corner"),
-        radius=_attribute(table, "radius"),
+        gid=_find_attribute(table, "gid"),
+        corner=_find_attribute(table, "corner"),
+        radius=_find_attribute(table, "radius"),
         q=number_in_comments(header.comments, Q_KEY),
         min_opacity=number_in_comments(header.comments, MIN_OPACITY_KEY),
     )
@@ -126,7 +126,7 @@ def _fan_triangles(polygons: np.ndarray) -> Int64[np.ndarray, "t 3"]:
     return polygons.astype(np.int64)[:, fan].reshape(-1, 3)
 
 
-def _attribute(table: np.ndarray, name: str) -> Float32[np.ndarray, " v"] | None:
+def _find_attribute(table: np.ndarray, name: str) -> Float32[np.ndarray, " v"] | None:
     """Return a vertex attribute under its own name, or under that of the GLB, which Blender takes over."""
     for known in (name, f"_{name.upper()}"):
         if known in (table.dtype.names or ()):
@@ -154,13 +154,13 @@ def write_octagons(gaussians: FlatGaussians, path: Path, options: ExportOptions)
     )
     names = [column for name, width in widths.items() for column in column_names(name, width)]
     vertex = np.dtype([*VERTEX, *((name, "<f4") for name in names)])
-    vertices = PlyWriteElement("vertex", count * SIDES, vertex, _vertices(soup, vertex))
-    faces = PlyWriteElement("face", count * len(FAN_TRIANGLES), FACE, _faces(count))
+    vertices = PlyWriteElement("vertex", count * SIDES, vertex, _vertex_batches(soup, vertex))
+    faces = PlyWriteElement("face", count * len(FAN_TRIANGLES), FACE, _face_batches(count))
     write_ply(path, [vertices, faces], comments)
     return (path,)
 
 
-def _vertices(soup: OctagonSoup, vertex: np.dtype[np.void]) -> Iterator[np.ndarray]:
+def _vertex_batches(soup: OctagonSoup, vertex: np.dtype[np.void]) -> Iterator[np.ndarray]:
     for batch in soup.batches():
         rows = np.empty((len(batch.ids), SIDES), dtype=vertex)
         for axis, name in enumerate(_POSITION):
@@ -178,7 +178,7 @@ def _vertices(soup: OctagonSoup, vertex: np.dtype[np.void]) -> Iterator[np.ndarr
         yield rows.reshape(-1)
 
 
-def _faces(count: int) -> Iterator[np.ndarray]:
+def _face_batches(count: int) -> Iterator[np.ndarray]:
     for start in range(0, count, BATCH_SIZE):
         yield _face_rows(octagon_triangles(min(BATCH_SIZE, count - start)) + start * SIDES)
 

@@ -41,7 +41,7 @@ def read_mtl(obj: Path, names: Sequence[str]) -> dict[str, MeshMaterial]:
         except OSError as error:
             raise SceneFileError(f"{path}: cannot be read ({error.strerror or error}).") from error
         for entry in _parse_entries(text):
-            materials[entry["newmtl"]] = _material(path, entry)
+            materials[entry["newmtl"]] = _parse_material(path, entry)
     return materials
 
 
@@ -56,11 +56,11 @@ def _parse_entries(text: str) -> list[dict[str, str]]:
     return entries
 
 
-def _material(path: Path, entry: dict[str, str]) -> MeshMaterial:
-    numbers = {key: _numbers(path, key, entry[key], 1)[0] for key in sorted(NUMBERS & set(entry))}
+def _parse_material(path: Path, entry: dict[str, str]) -> MeshMaterial:
+    numbers = {key: _parse_numbers(path, key, entry[key], 1)[0] for key in sorted(NUMBERS & set(entry))}
     colours: dict[str, tuple[float, float, float]] = {}
     for key in sorted(COLOURS & set(entry)):
-        red, green, blue = _numbers(path, key, entry[key], 3)
+        red, green, blue = _parse_numbers(path, key, entry[key], 3)
         colours[key] = (red, green, blue)
     found: dict[str, Any] = {}
     for key, field in IMAGES.items():
@@ -89,7 +89,7 @@ def _material(path: Path, entry: dict[str, str]) -> MeshMaterial:
     )
 
 
-def _numbers(path: Path, key: str, text: str, count: int) -> tuple[float, ...]:
+def _parse_numbers(path: Path, key: str, text: str, count: int) -> tuple[float, ...]:
     words = text.split()
     if count == 3 and len(words) == 1:
         words *= 3

@@ -77,8 +77,8 @@ def parse_block(path: Path, block: bytes, parts: ObjParts) -> None:
         [parts.vertex_count + np.cumsum(is_position), parts.uv_count + np.cumsum(is_uv)], axis=1
     )
     if is_position.any():
-        text = _lines(data, is_position, lengths)
-        values = _numbers(path, text.translate(None, b"v"), int(is_position.sum()), "v")
+        text = _select_lines(data, is_position, lengths)
+        values = _parse_number_rows(path, text.translate(None, b"v"), int(is_position.sum()), "v")
         if values.shape[1] < 3:
             raise SceneFileError(f"{path}: a line 'v' has fewer than three numbers.")
         parts.positions.append(values[:, :3].copy())  # without the colours behind them
@@ -89,8 +89,8 @@ def parse_block(path: Path, block: bytes, parts: ObjParts) -> None:
             words = line.split()[1:4]
             parts.decimals = max([parts.decimals, *(len(word.partition(b".")[2]) for word in words)])
     if is_uv.any():
-        text = _lines(data, is_uv, lengths).translate(None, b"vt")
-        parts.uv.append(_numbers(path, text, int(is_uv.sum()), "vt")[:, :2].astype(np.float32))
+        text = _select_lines(data, is_uv, lengths).translate(None, b"vt")
+        parts.uv.append(_parse_number_rows(path, text, int(is_uv.sum()), "vt")[:, :2].astype(np.float32))
         parts.uv_count += int(is_uv.sum())
     spans = [(0, len(starts), "")]
     if parts.with_materials:
@@ -102,7 +102,7 @@ def parse_block(path: Path, block: bytes, parts: ObjParts) -> None:
         chosen = is_face.copy()
         chosen[:begin] = chosen[end:] = False
         if chosen.any():
-            _parse_faces(path, _lines(data, chosen, lengths), before[chosen], parts)
+            _parse_faces(path, _select_lines(data, chosen, lengths), before[chosen], parts)
 
 
 def _parse_libraries(block: bytes, parts: ObjParts) -> None:
@@ -124,11 +124,11 @@ def _usemtl_ranges(block: bytes, starts: np.ndarray, candidates: np.ndarray) -> 
     return spans
 
 
-def _lines(data: np.ndarray, chosen: np.ndarray, lengths: np.ndarray) -> bytes:
+def _select_lines(data: np.ndarray, chosen: np.ndarray, lengths: np.ndarray) -> bytes:
     return data.tobytes() if chosen.all() else data[np.repeat(chosen, lengths)].tobytes()
 
 
-def _numbers(path: Path, text: bytes, lines: int, keyword: str) -> np.ndarray:
+def _parse_number_rows(path: Path, text: bytes, lines: int, keyword: str) -> np.ndarray:
     """Parse ``lines`` lines of numbers to rows; all lines must have the same count."""
     with warnings.catch_warnings():
         warnings.simplefilter("error", DeprecationWarning)  # numpy's way to say that it met no number
@@ -167,7 +167,7 @@ def _parse_faces(path: Path, text: bytes, before: Int64[np.ndarray, "f 2"], part
     uniform = len(slashes) == 1 and spaces == lines * words_per_line * next(iter(slashes))
     if uniform and b"//" not in text:
         per_word = 1 + next(iter(slashes))
-        values = _numbers(path, text.replace(b"/", b" ").translate(None, b"f"), lines, "f")
+        values = _parse_number_rows(path, text.replace(b"/", b" ").translate(None, b"f"), lines, "f")
         if values.shape[1] == words_per_line * per_word and not _is_ragged(text, words_per_line + 1):
             indices = values.astype(np.int64).reshape(lines, words_per_line, per_word)
             _add_fans(indices[:, :, 0], indices[:, :, 1] if per_word > 1 else None, before, parts)

@@ -125,14 +125,14 @@ class OctagonSoup:
         rgb = np.clip(part.base_rgb_srgb, 0.0, 1.0)
         channels = {name: array[ids] for name, array in self._gaussians.channels.items()}
         return OctagonBatch(
-            ids,
-            corners,
-            uv.astype(np.float32),
-            rgb,
-            self._opacities[ids],
-            radii,
-            np.ascontiguousarray(part.rotations[:, :, 0]),
-            Channels(channels),
+            ids=ids,
+            corners_world=corners,
+            uv=uv.astype(np.float32),
+            rgb_srgb=rgb,
+            opacities=self._opacities[ids],
+            radii=radii,
+            normals_world=np.ascontiguousarray(part.rotations[:, :, 0]),
+            channels=Channels(channels),
         )
 
     def batches(self) -> Iterator[OctagonBatch]:

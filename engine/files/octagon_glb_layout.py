@@ -112,9 +112,9 @@ class GlbLayout:
 
     def json(self, bounds: list[Bounds]) -> bytes:
         """Return the JSON part, given each chunk's smallest and largest coordinates."""
-        return json_bytes(self._document(bounds))
+        return json_bytes(self._gltf_document(bounds))
 
-    def _document(self, bounds: list[Bounds]) -> dict[str, object]:
+    def _gltf_document(self, bounds: list[Bounds]) -> dict[str, object]:
         accessors: list[dict[str, object]] = []
         meshes: list[dict[str, object]] = []
         for chunk, size in enumerate(self._chunk_sizes):
@@ -166,11 +166,11 @@ class GlbLayout:
             **({"cameras": [_camera_json(camera) for camera in cameras]} if cameras else {}),
             "meshes": meshes,
             "materials": [
-                _material(OPAQUE_CUTOFF if self._options.opaque else None, lit),
+                _material_json(OPAQUE_CUTOFF if self._options.opaque else None, lit),
                 *(
                     []
                     if self._options.cores is None
-                    else [_material(self._options.cores, lit, "octagon_cores")]
+                    else [_material_json(self._options.cores, lit, "octagon_cores")]
                 ),
             ],
             "textures": [{"sampler": 0, "source": number} for number in range(len(images))],
@@ -194,7 +194,7 @@ def _camera_json(camera: ExportCamera) -> dict[str, object]:
     return {"name": camera.name, "type": "perspective", "perspective": lens}
 
 
-def _material(cutoff: float | None, lit: bool, name: str = "octagons") -> dict[str, object]:
+def _material_json(cutoff: float | None, lit: bool, name: str = "octagons") -> dict[str, object]:
     transparency: dict[str, object] = {"alphaMode": "BLEND"}
     if cutoff is not None:
         transparency = {"alphaMode": "MASK", "alphaCutoff": cutoff}

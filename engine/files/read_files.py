@@ -36,7 +36,7 @@ def read_scene(
         drop_invalid: leave out Gaussians with values that are not finite, instead of refusing the file.
         channels: which named channels are wanted: those that the file says are channels, as ours do; all that
             nothing else is known of, too; or names.
-        progress: told when reading begins and ends (stage ``read``).
+        progress: receives events when reading begins and ends (stage ``read``).
 
     Returns:
         Flat Gaussians, and what flattening and reading lost.

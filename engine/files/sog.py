@@ -87,7 +87,7 @@ def read(path: Path) -> GaussianCloud:
 
 def _folder_images(path: Path) -> Images:
     def load(name: str) -> UInt8[np.ndarray, "h w 4"]:
-        return _pixels(path, name, path.parent / Path(name).name)
+        return _rgba_pixels(path, name, path.parent / Path(name).name)
 
     return load
 
@@ -96,7 +96,7 @@ def _bundle_images(path: Path, bundle: zipfile.ZipFile, folder: Path) -> Images:
     def load(name: str) -> UInt8[np.ndarray, "h w 4"]:
         image = folder / Path(name).name
         image.write_bytes(_bundle_member(path, bundle, name))
-        return _pixels(path, name, image)
+        return _rgba_pixels(path, name, image)
 
     return load
 
@@ -111,7 +111,7 @@ def _bundle_member(path: Path, bundle: zipfile.ZipFile, name: str) -> bytes:
     return bundle.read(names[0])
 
 
-def _pixels(path: Path, name: str, image: Path) -> UInt8[np.ndarray, "h w 4"]:
+def _rgba_pixels(path: Path, name: str, image: Path) -> UInt8[np.ndarray, "h w 4"]:
     """Return the bytes of an image as they are stored, as RGBA."""
     import OpenImageIO as oiio  # which the front end has not
 
@@ -173,7 +173,7 @@ def _decode(path: Path, text: bytes, images: Images) -> GaussianCloud:
         sh = np.concatenate([sh, _sh_rest(path, meta.shN, images, rgba(meta.shN, 1))], axis=1)
     return GaussianCloud(
         means_world=(np.sign(curved) * np.expm1(np.abs(curved))).astype(np.float32),
-        quats_wxyz=_rotations(rgba(meta.quats)),
+        quats_wxyz=_decode_rotations(rgba(meta.quats)),
         log_scales=scales,
         opacity_logits=np.ascontiguousarray(logits),
         sh=np.ascontiguousarray(sh),
@@ -206,7 +206,7 @@ def _as_float_array(path: Path, values: Sequence[float] | float) -> np.ndarray:
     return numbers
 
 
-def _rotations(rgba: UInt8[np.ndarray, "n 4"]) -> Float32[np.ndarray, "n 4"]:
+def _decode_rotations(rgba: UInt8[np.ndarray, "n 4"]) -> Float32[np.ndarray, "n 4"]:
     """Decode quaternions of three byte components and the tag of the fourth; other tags mean no rotation."""
     small = (rgba[:, :3] / 255.0 * 2.0 - 1.0) * SQRT_HALF
     quats = from_smallest_three(small, np.maximum(rgba[:, 3].astype(np.int64) - FIRST_QUAT_TAG, 0))

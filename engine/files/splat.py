@@ -54,11 +54,11 @@ def write(gaussians: FlatGaussians, path: Path, options: ExportOptions) -> tuple
     check_scales(gaussians, path)
     with atomic_replace(path) as temporary, temporary.open("wb") as handle:
         for block in iterate_blocks(gaussians):
-            handle.write(_rows(block).data)
+            handle.write(_splat_rows(block).data)
     return (path,)
 
 
-def _rows(some: FlatGaussians) -> np.ndarray:
+def _splat_rows(some: FlatGaussians) -> np.ndarray:
     rows = np.empty(len(some), dtype=SPLAT_DTYPE)
     rows["mean"] = some.means_world
     rows["scale"][:, 0] = FLAT_SCALE

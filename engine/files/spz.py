@@ -119,7 +119,14 @@ def write(gaussians: FlatGaussians, path: Path, options: ExportOptions) -> tuple
         for stream, data in zip(streams, _pack_block(half_turn_gaussians(block), bits), strict=True):
             stream += data
     packed = tuple(bytes(stream) for stream in streams)
-    file = SpzFile(options.spz_version, len(scene), scene.sh_degree, bits, 0, packed)
+    file = SpzFile(
+        version=options.spz_version,
+        count=len(scene),
+        sh_degree=scene.sh_degree,
+        fractional_bits=bits,
+        flags=0,
+        streams=packed,
+    )
     with atomic_replace(path) as temporary:
         write_spz(temporary, file)
     return (path,)

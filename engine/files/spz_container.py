@@ -83,12 +83,14 @@ def _read_gzip(path: Path) -> SpzFile:
             raise SceneFileError(f"{path}: is SPZ version {version}; versions 2, 3 and 4 are read.")
         widths = _checked_widths(path, version, degree)
         if count * sum(widths) > _GZIP_RATIO * path.stat().st_size:
-            raise _truncated(path, count)
+            raise _truncated_error(path, count)
         streams = tuple(handle.read(count * width) for width in widths)
         handle.read(_MAX_EXTENSIONS)  # the end of the stream is where its checksum is looked at
     if any(len(stream) < count * width for stream, width in zip(streams, widths, strict=True)):
-        raise _truncated(path, count)
-    return SpzFile(version, count, degree, bits, flags, streams)
+        raise _truncated_error(path, count)
+    return SpzFile(
+        version=version, count=count, sh_degree=degree, fractional_bits=bits, flags=flags, streams=streams
+    )
 
 
 def _read_v4(path: Path, data: bytes) -> SpzFile:
@@ -107,14 +109,21 @@ def _read_v4(path: Path, data: bytes) -> SpzFile:
         if full_size != count * width:
             raise SceneFileError(f"{path}: is damaged; attribute {number} does not have {count} items.")
         if offset + size > len(data) or full_size > _ZSTD_RATIO * max(1, size):
-            raise _truncated(path, count)
+            raise _truncated_error(path, count)
         packed = data[offset : offset + size]
         reader = zstandard.ZstdDecompressor().stream_reader(packed)
         streams.append(reader.read(full_size) if full_size else b"")
         if len(streams[-1]) < full_size:
-            raise _truncated(path, count)
+            raise _truncated_error(path, count)
         offset += size
-    return SpzFile(version, count, degree, bits, flags, tuple(streams))
+    return SpzFile(
+        version=version,
+        count=count,
+        sh_degree=degree,
+        fractional_bits=bits,
+        flags=flags,
+        streams=tuple(streams),
+    )
 
 
 def _checked_widths(path: Path, version: int, degree: int) -> tuple[int, ...]:
@@ -123,7 +132,7 @@ def _checked_widths(path: Path, version: int, degree: int) -> tuple[int, ...]:
     return stream_widths(version, degree)
 
 
-def _truncated(path: Path, count: int) -> SceneFileError:
+def _truncated_error(path: Path, count: int) -> SceneFileError:
     return SceneFileError(f"{path}: is truncated; not all of its {count} Gaussians are there.")
 
 

@@ -47,7 +47,7 @@ def write(gaussians: FlatGaussians, path: Path, options: ExportOptions) -> tuple
     """
     scene = half_turn_gaussians(select_for_export(gaussians, path, options))
     check_scales(scene, path)
-    pxr = _usd(path)
+    pxr = _import_usd(path)
     suffix = ".usdc" if path.suffix.lower() in (".usdz", ".usd") else path.suffix.lower()
     with tempfile.TemporaryDirectory(prefix="octasplat-") as folder, atomic_replace(path) as temporary:
         layer = Path(folder) / f"scene{suffix}"
@@ -76,7 +76,7 @@ def missing_usd() -> str | None:
     return None if numbers >= (26, 5) else f"usd-core {version} is too old; install usd-core 26.5 or later"
 
 
-def _usd(path: Path) -> dict[str, ModuleType]:
+def _import_usd(path: Path) -> dict[str, ModuleType]:
     try:
         from pxr import Sdf, Usd, UsdGeom, UsdUtils, UsdVol, Vt
     except ImportError as error:

@@ -42,7 +42,14 @@ def transform_gaussians(gaussians: FlatGaussians, matrix: Float[np.ndarray, "4 4
         return moved
     signs = np.full(count, np.sign(np.linalg.det(turn)))
     legs = linear @ legs_world(gaussians)
-    return apply_legs(gaussians, means, legs, signs, np.zeros(count, dtype=bool), turn)
+    return apply_legs(
+        old=gaussians,
+        means_world=means,
+        legs=legs,
+        normal_signs=signs,
+        unmoved=np.zeros(count, dtype=bool),
+        turn=turn,
+    )
 
 
 def mean_scale(matrix: Float[np.ndarray, "4 4"]) -> float:

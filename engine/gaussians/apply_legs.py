@@ -45,7 +45,14 @@ def apply_legs(
         turn: orthogonal matrix, world to world.
     """
     result = old.copy()
-    apply_legs_to(result, np.flatnonzero(~unmoved), means_world, legs, normal_signs, turn)
+    apply_legs_to(
+        gaussians=result,
+        rows=np.flatnonzero(~unmoved),
+        means_world=means_world,
+        legs=legs,
+        normal_signs=normal_signs,
+        turn=turn,
+    )
     return result
 
 

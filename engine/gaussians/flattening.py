@@ -124,7 +124,12 @@ def flatten(
         if scale_count == 3:
             in_plane = np.ascontiguousarray(in_plane[:, [(normal + 1) % 3, (normal + 2) % 3]])
     gaussians = FlatGaussians(
-        cloud.means_world, quats, in_plane, cloud.opacity_logits, cloud.sh, cloud.channels
+        means_world=cloud.means_world,
+        quats_wxyz=quats,
+        log_scales=in_plane,
+        opacity_logits=cloud.opacity_logits,
+        sh=cloud.sh,
+        channels=cloud.channels,
     )
     report = ImportReport(
         count=len(gaussians),

@@ -27,7 +27,7 @@ class Options(BaseModel):
     @model_validator(mode="before")
     @classmethod
     def _by_new_names(cls, given: Any) -> Any:
-        return renamed_settings.translate_names((cls,), given) if isinstance(given, Mapping) else given
+        return renamed_settings.replace_former_names((cls,), given) if isinstance(given, Mapping) else given
 
 
 class Request(Options):

@@ -43,7 +43,7 @@ _MATERIAL_RAY_CPU_SECONDS = 2.1e-5
 """For a ray with what it reflects, of a training with materials of so many Gaussians."""
 _MATERIAL_GAUSSIANS = 80_000
 _MATERIAL_EVALUATE_CPU_SECONDS_PER_PIXEL = 5.5e-5
-"""With four to sixteen rays a pixel and what they reflect: 8 to 10 s for each picture of 400 x 400 pixels."""
+"""With four to sixteen rays per pixel and what they reflect: 8 to 10 s per picture of 400 x 400 pixels."""
 _SHARED_SORT_SAVING = 0.6
 """Share of a ray's time that is saved where the rays of a window composite in one order
 (``docs/notes/speed.md``, "One order")."""
@@ -126,7 +126,7 @@ def estimate_reconstruction(
     held_out = _held_out(options, count) / max(count, 1)
     trained_on = training_pixels(options, photographs)
     iterations = iteration_count(train, trained_on)
-    gaussians = _gaussians(train, trained_on)
+    gaussians = _expected_gaussians(train, trained_on)
     training_cpu_seconds = iterations * train.rays_per_batch * _ray_cpu_seconds(train, gaussians)
     if options.minutes is not None:
         training_cpu_seconds = 60 * options.minutes * max(1, cores) ** _CORE_POWER
@@ -148,7 +148,7 @@ def estimate_reconstruction(
         training = max(training + _MATERIAL_TRAIN_BYTES, _MATERIAL_START_BYTES)
     memory = _START_BYTES + max(training, _PIXEL_BYTES * largest)
     disk = reconstruction_bytes(options, photographs)
-    return _estimate(cpu_seconds, memory, cores, finds_poses=options.poses == "auto", disk_bytes=disk)
+    return _make_estimate(cpu_seconds, memory, cores, finds_poses=options.poses == "auto", disk_bytes=disk)
 
 
 def _export_cpu_seconds(options: ReconstructionConfig, gaussians: int) -> float:
@@ -162,7 +162,7 @@ def reconstruction_bytes(options: ReconstructionConfig, photographs: Sequence[Im
     """Return the minimal size of a reconstruction's folder: decoded photographs and one checkpoint."""
     shrunk = [_capped_sizes(sizes, options.max_side) for sizes in photographs]
     pixels = sum(sizes.width_px * sizes.height_px * sizes.count for sizes in shrunk)
-    gaussians = _gaussians(options.train, training_pixels(options, photographs))
+    gaussians = _expected_gaussians(options.train, training_pixels(options, photographs))
     return _CACHED_PIXEL_BYTES * pixels + _checkpoint_bytes(options.train.sh_degree) * gaussians
 
 
@@ -187,7 +187,7 @@ def estimate_render(options: RenderOptions, photographs: Sequence[ImageSizes], c
         each += _PATH_CPU_SECONDS * options.stage.integrator.samples
     cpu_seconds = _RENDER_START_CPU_SECONDS + each * pixels
     memory = _START_BYTES + _gaussian_bytes(2) * _TYPICAL_RENDER_GAUSSIANS
-    return _estimate(cpu_seconds, memory, cores, disk_bytes=image_bytes(options, photographs))
+    return _make_estimate(cpu_seconds, memory, cores, disk_bytes=image_bytes(options, photographs))
 
 
 def estimate_relight(options: RelightOptions, photographs: Sequence[ImageSizes], cores: int) -> Estimate:
@@ -196,7 +196,7 @@ def estimate_relight(options: RelightOptions, photographs: Sequence[ImageSizes],
     cpu_seconds = _RENDER_START_CPU_SECONDS + each * rendered_pixels(options, photographs)
     memory = _START_BYTES + _gaussian_bytes(2) * _TYPICAL_RENDER_GAUSSIANS
     disk = image_bytes(options, photographs, len(options.environments))
-    return _estimate(cpu_seconds, memory, cores, disk_bytes=disk)
+    return _make_estimate(cpu_seconds, memory, cores, disk_bytes=disk)
 
 
 def rendered_pixels(options: PictureOptions, photographs: Sequence[ImageSizes]) -> int:
@@ -214,7 +214,7 @@ def rendered_pixels(options: PictureOptions, photographs: Sequence[ImageSizes]) 
     return sum(sizes.width_px * sizes.height_px * sizes.count for sizes in shrunk)
 
 
-def _estimate(
+def _make_estimate(
     cpu_seconds: float, memory_bytes: float, cores: int, *, finds_poses: bool = False, disk_bytes: int = 0
 ) -> Estimate:
     return Estimate(
@@ -243,7 +243,7 @@ def _held_out(options: ReconstructionConfig, count: int) -> int:
     return -(-count // options.test_every) if options.test_every else 0
 
 
-def _gaussians(train: TrainConfig, trained_on: int) -> int:
+def _expected_gaussians(train: TrainConfig, trained_on: int) -> int:
     most = max_gaussian_count(train, trained_on)
     return min(most, _PAPER_GAUSSIANS) if train.densify.kind == "redisplats" else most
 

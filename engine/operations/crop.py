@@ -23,7 +23,7 @@ class CropOptions(Selection, Options):
     """Options of which Gaussians to keep: those for which all given conditions hold."""
 
     @model_validator(mode="after")
-    def _chooses(self) -> "CropOptions":
+    def _check_selection_given(self) -> "CropOptions":
         if self.where is None and self.box is None and self.sphere is None:
             raise ValueError("Say what to keep: a box, a sphere or an expression (where)")
         return self
@@ -64,10 +64,15 @@ def run(
     from octasplat.engine.core.local_origin import user_position
     from octasplat.engine.edit.selection import selection_mask
     from octasplat.engine.files import read_metadata
-    from octasplat.engine.operations.scene_io import check_changed, edit_note, open_scene, write_changed
+    from octasplat.engine.operations.scene_io import (
+        check_edited_output,
+        describe_edit,
+        open_scene,
+        write_edited_scene,
+    )
 
     source: Path = request.source
-    check_changed("crop", request, request.output)
+    check_edited_output("crop", request, request.output)
     gaussians, origin = open_scene(source, progress), read_metadata(source).origin_world
     keep = selection_mask(gaussians, request, origin)
     if not keep.any():
@@ -80,8 +85,8 @@ def run(
         )
     kept, count = int(keep.sum()), len(keep)
     stop_if(should_stop)
-    note = edit_note("crop", options_of(CropOptions, request), gaussians=kept)
-    written = write_changed(source, gaussians.select(keep), request.output, progress, note=note)
+    record = describe_edit("crop", options_of(CropOptions, request), gaussians=kept)
+    written = write_edited_scene(source, gaussians.select(keep), request.output, progress, edit_record=record)
     notes = (f"{source}: {kept:,} of {count:,} Gaussians kept.", written.sentence)
     return CropResult(files=written.files, folder=written.folder, notes=notes, kept=kept, count=count)
 

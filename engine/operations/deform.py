@@ -102,7 +102,7 @@ def run(
         OctasplatError: something cannot be read or written, or the meshes are not the same one.
     """
     from octasplat.engine.edit.deform import deform_to, deformation_corners
-    from octasplat.engine.operations.scene_io import edit_note, open_scene
+    from octasplat.engine.operations.scene_io import describe_edit, open_scene
     from octasplat.engine.operations.sequences import SceneSequence
 
     source: Path = request.source
@@ -111,9 +111,9 @@ def run(
     gaussians, origin = open_scene(source, progress), read_metadata(source).origin_world
     rest = read_mesh(request.proxy).about(origin)
     corners = deformation_corners(gaussians)
-    binding = _bind_scene(request, _proxy(request, rest), corners)
+    binding = _bind_scene(request, _make_proxy(request, rest), corners)
     moving, count = int(binding.moving_mask.sum()), len(gaussians)
-    note = edit_note("deform", options_of(DeformOptions, request))
+    note = describe_edit("deform", options_of(DeformOptions, request))
     reports, notes = [], [f"{request.proxy}: moves {moving:,} of {count:,} Gaussians."]
     for number, path in enumerate(paths):
         vertices = _rotate_mesh(_check_same_mesh(path, request.proxy, rest, origin), request.axes)
@@ -135,7 +135,7 @@ def run(
     )
 
 
-def _proxy(request: DeformRequest, rest: ImportedMesh) -> "Proxy":
+def _make_proxy(request: DeformRequest, rest: ImportedMesh) -> "Proxy":
     from octasplat.engine.edit.proxy import Proxy
 
     mirrored = {"auto": None, "yes": True, "no": False}[request.mirrored]

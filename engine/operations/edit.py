@@ -69,7 +69,7 @@ def run(
     """
     from octasplat.engine.edit.mesh_to_gaussians import recover_gaussians
     from octasplat.engine.files import read_mesh, read_metadata
-    from octasplat.engine.operations.scene_io import edit_note, open_scene
+    from octasplat.engine.operations.scene_io import describe_edit, open_scene
     from octasplat.engine.operations.sequences import SceneSequence
 
     source: Path = request.source
@@ -77,7 +77,7 @@ def run(
     recovery: MeshToGaussiansOptions = request
     frames = SceneSequence("edit", request, meshes)
     gaussians, origin = open_scene(source, progress), read_metadata(source).origin_world
-    note = edit_note("edit", options_of(EditOptions, request))
+    note = describe_edit("edit", options_of(EditOptions, request))
     reports, notes = [], []
     for number, path in enumerate(meshes):
         result, report = recover_gaussians(gaussians, read_mesh(path).about(origin), path, recovery)

@@ -104,22 +104,22 @@ class EvaluateResult(Result):
     @property
     def psnr(self) -> float | None:
         """Return the mean PSNR of the views in dB; None if there were none."""
-        return self._mean("psnr")
+        return self._mean_metric("psnr")
 
     @property
     def ssim(self) -> float | None:
         """Return the mean structural similarity of the views."""
-        return self._mean("ssim")
+        return self._mean_metric("ssim")
 
     @property
     def ms_ssim(self) -> float | None:
         """Return the mean multi-scale structural similarity; None for images too small for it."""
-        return self._mean("ms_ssim")
+        return self._mean_metric("ms_ssim")
 
     @property
     def flip(self) -> float | None:
         """Return the mean perceived difference (FLIP); lower is better."""
-        return self._mean("flip")
+        return self._mean_metric("flip")
 
     @property
     def views(self) -> Mapping[str, Mapping[str, float | None]]:
@@ -131,7 +131,7 @@ class EvaluateResult(Result):
         """Return the metrics and the report's place in sentences."""
         return self.summary
 
-    def _mean(self, name: str) -> float | None:
+    def _mean_metric(self, name: str) -> float | None:
         value = self.metrics.get("mean", {}).get(name)
         return None if value is None else float(value)
 
@@ -170,7 +170,9 @@ def run(
         progress=listener,
     )
     folder = metrics.parent
-    summary = summarize_evaluation(metrics) if on is not None else summarize_run(folder, _exports(folder))
+    summary = (
+        summarize_evaluation(metrics) if on is not None else summarize_run(folder, _exports_of_run(folder))
+    )
     pictures = [path for name in _PICTURES for path in sorted((folder / name).rglob("*.png"))]
     return EvaluateResult(
         files=(metrics, folder / _REPORT, *pictures),
@@ -206,7 +208,7 @@ def _measure_scales(request: EvaluateRequest, progress: EventListener, threads: 
     )
 
 
-def _exports(run: Path) -> tuple[str, ...]:
+def _exports_of_run(run: Path) -> tuple[str, ...]:
     from octasplat.engine.runs.config import read_config
     from octasplat.engine.runs.run_folder import CONFIG
 

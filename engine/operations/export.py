@@ -242,7 +242,7 @@ class _ExportPreparation:
         from octasplat.engine.files.surface_export import SURFACE_FORMAT
         from octasplat.engine.runs.viewer_glb import prepare_for_viewers, upright_turn
 
-        request, options = self._request, self._options
+        request, options = self._request, self._export_options
         is_glb = exporter.name == "glb"
         if exporter.name == SURFACE_FORMAT:
             return self._gaussians, options.model_copy(
@@ -268,7 +268,7 @@ class _ExportPreparation:
         )
 
     @cached_property
-    def _options(self) -> ExportOptions:
+    def _export_options(self) -> ExportOptions:
         from octasplat.engine.files import read_metadata
         from octasplat.engine.operations.axes import light_up
 

@@ -112,7 +112,7 @@ class InfoResult(Result):
             f"{self.source}: {scene.count:,} Gaussians{size}{made_from}",
             f"  memory      {scene.megabytes:.1f} MB, harmonics of degree {scene.sh_degree}"
             + (f", channels {channels}" if channels else ""),
-            f"  up          {_vector(self.up_world)} ({up})",
+            f"  up          {_format_vector(self.up_world)} ({up})",
             *((f"  origin      {describe_origin(origin)} (of what files hold)",) if is_set(origin) else ()),
             f"  centres     {place(box.low_world)} to {place(box.high_world)}",
             f"  solid part  {place(solid.low_world)} to {place(solid.high_world)}",
@@ -123,10 +123,10 @@ class InfoResult(Result):
             f"  hits a ray  {hits.mean:.0f}, of one in 20 more than {hits.p95:.0f}; "
             f"{100 * hits.share:.0f} % of the picture's rays meet any",
             "  opacity",
-            *self._histogram(),
+            *self._opacity_histogram_lines(),
         )
 
-    def _histogram(self) -> tuple[str, ...]:
+    def _opacity_histogram_lines(self) -> tuple[str, ...]:
         counts = self.scene.opacity_counts
         return tuple(
             f"    {low:4.2f} to {high:4.2f}  {'#' * round(_BAR * count / max(counts)):<{_BAR}}  {count:,}"
@@ -182,7 +182,7 @@ def run(
     return result
 
 
-def _vector(values: Any) -> str:
+def _format_vector(values: Any) -> str:
     return " ".join(f"{value:.4g}" for value in values)
 
 

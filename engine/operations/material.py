@@ -75,15 +75,15 @@ def run(
         SceneFileError: the scene or the mesh cannot be read, or the scene not be written.
     """
     from octasplat.engine.edit.mask_selection import select_by_masks
-    from octasplat.engine.edit.material_run import change_materials, edit_note, has_known_light
+    from octasplat.engine.edit.material_run import change_materials, describe_edit, has_known_light
     from octasplat.engine.edit.selection import in_mesh, selection_mask
     from octasplat.engine.files import read_mesh, read_metadata
     from octasplat.engine.gaussians.materials import require_materials
-    from octasplat.engine.operations.scene_io import check_changed, open_scene, write_changed
+    from octasplat.engine.operations.scene_io import check_edited_output, open_scene, write_edited_scene
     from octasplat.engine.runs.run_folder import SCENE, is_run
 
     source, output = request.source, request.output
-    check_changed("material", request, output, [request.mesh, *request.masks])
+    check_edited_output("material", request, output, [request.mesh, *request.masks])
     gaussians, origin = open_scene(source, progress), read_metadata(source).origin_world
     require_materials(gaussians, source / SCENE if is_run(source) else source)
     chosen = selection_mask(gaussians, request.model_copy(update={"inverse": False}), origin)
@@ -102,9 +102,9 @@ def run(
         )
     mesh = {"mesh": request.mesh.name} if request.mesh is not None else {}
     masks = {"masks": [path.name for path in request.masks]} if request.masks else {}
-    note = edit_note(request, request, chosen) | mesh | masks
+    record = describe_edit(request, request, chosen) | mesh | masks
     stop_if(should_stop)
-    written = write_changed(source, changed, output, progress, note=note)
+    written = write_edited_scene(source, changed, output, progress, edit_record=record)
     return MaterialResult(
         files=written.files,
         folder=written.folder,

@@ -72,11 +72,16 @@ def run(
     from octasplat.engine.files import read_metadata
     from octasplat.engine.gaussians.merge import merge_scenes
     from octasplat.engine.gaussians.scene_metadata import merge_metadata
-    from octasplat.engine.operations.scene_io import check_changed, edit_note, open_scene_about, write_changed
+    from octasplat.engine.operations.scene_io import (
+        check_edited_output,
+        describe_edit,
+        open_scene_about,
+        write_edited_scene,
+    )
 
     first: Path = request.source
     sources = (first, *request.scenes)
-    check_changed("merge", request, request.output, request.scenes)
+    check_edited_output("merge", request, request.output, request.scenes)
     facts = [read_metadata(source) for source in sources]
     scenes = [open_scene_about(source, facts[0].origin_world, progress) for source in sources]
     every = dict.fromkeys(name for scene in scenes for name in scene.channels)
@@ -85,12 +90,12 @@ def run(
             emit_warning(progress, f"{source}: has no channel {missing}; it is 0 there.")
     merged = merge_scenes(scenes, request.sh_degree)
     stop_if(should_stop)
-    written = write_changed(
+    written = write_edited_scene(
         first,
         merged,
         request.output,
         progress,
-        note=edit_note("merge", options_of(MergeOptions, request), gaussians=len(merged)),
+        edit_record=describe_edit("merge", options_of(MergeOptions, request), gaussians=len(merged)),
         facts=merge_metadata(list(zip(scenes, facts, strict=True))),
     )
     return MergeResult(

@@ -13,7 +13,7 @@ from octasplat.engine.runs.run_settings import RunSettings
 from octasplat.engine.settings import renamed_settings
 from octasplat.engine.settings.fields import ADVANCED, BASIC, PartialOf, Positional, Shortcut, Spelling
 from octasplat.engine.settings.nested_options import merge_options
-from octasplat.engine.settings.refusals import SettingsRefused, refusals_from
+from octasplat.engine.settings.refusals import InvalidSettingsError, refusals_from
 
 if TYPE_CHECKING:
     from octasplat.engine.pipeline import OnStep
@@ -67,7 +67,7 @@ class ReconstructOptions(RunSettings, Options):
         """Return the complete configuration that the options mean.
 
         Raises:
-            SettingsRefused: a setting is unknown, out of range or contradicts another.
+            InvalidSettingsError: a setting is unknown, out of range or contradicts another.
         """
         from octasplat.engine.runs.config import resolve_config
 
@@ -76,7 +76,7 @@ class ReconstructOptions(RunSettings, Options):
             self.preset,
             materials=self.materials,
             settings=settings,
-            train=self._training(),
+            train=self._nested_train_settings(),
             assignments=self.assignments,
         )
 
@@ -84,7 +84,7 @@ class ReconstructOptions(RunSettings, Options):
         """Return a complete configuration, given as JSON, overridden by the options that were given.
 
         Raises:
-            SettingsRefused: a setting is unknown, out of range or contradicts another.
+            InvalidSettingsError: a setting is unknown, out of range or contradicts another.
         """
         from octasplat.engine.runs.config import revise_config
 
@@ -93,11 +93,11 @@ class ReconstructOptions(RunSettings, Options):
             before,
             materials=self.materials if "materials" in given else None,
             settings={name: getattr(self, name) for name in RunSettings.model_fields if name in given},
-            train=self._training(),
+            train=self._nested_train_settings(),
             assignments=self.assignments,
         )
 
-    def _training(self) -> dict[str, Any]:
+    def _nested_train_settings(self) -> dict[str, Any]:
         """Return the training's settings that the options name, nested."""
         from octasplat.engine.train.config import SURFACE_DEPTH_NORMAL_WEIGHT
 
@@ -168,12 +168,12 @@ def options_from_json(requested: Mapping[str, Any]) -> ReconstructOptions:
     """Return options from JSON.
 
     Raises:
-        SettingsRefused: an option is unknown or out of range.
+        InvalidSettingsError: an option is unknown or out of range.
     """
     try:
         return ReconstructOptions.model_validate(dict(requested))
     except ValidationError as error:
-        raise SettingsRefused(refusals_from(error, ReconstructOptions)) from None
+        raise InvalidSettingsError(refusals_from(error, ReconstructOptions)) from None
 
 
 def run_config(request: ReconstructRequest) -> "ReconstructionConfig":

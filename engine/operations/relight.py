@@ -175,7 +175,7 @@ def run(
     learnt = read_config(request.source / CONFIG).train.materials if of_run else None
     up = light_up(request.source, request.up)
     cameras = None if request.other_dataset is not None else requested_cameras(request, source)
-    views, shots = _views(request, source) if cameras is None else (None, camera_shots(cameras))
+    views, shots = _selected_views(request, source) if cameras is None else (None, camera_shots(cameras))
     lightings = lit_shots(list(environments), shots, request.rotation_degrees, spin=request.spin)
     output = picture_output(
         "relight", request, tuple(lightings), [request.other_dataset, *request.environments]
@@ -203,13 +203,13 @@ def run(
             *output.numbered(shots),
         )
     )
-    relighter = _relighter(request, source, learnt, threads)
+    relighter = _make_relighter(request, source, learnt, threads)
     paint = RelitRenderFn(relighter, environments, up, background, lightings)
     files = output.write(tuple(lightings), paint, finished, report)
     return RelightResult(files=files, folder=output.folder, images=len(lightings))
 
 
-def _views(request: RelightRequest, source: "RenderSource") -> "tuple[Viewpoints, tuple[Shot, ...]]":
+def _selected_views(request: RelightRequest, source: "RenderSource") -> "tuple[Viewpoints, tuple[Shot, ...]]":
     """Return the views of photographs that are asked for, and the cameras of all photographs among them."""
     import numpy as np
 
@@ -233,7 +233,7 @@ def _views(request: RelightRequest, source: "RenderSource") -> "tuple[Viewpoints
     return Viewpoints(others.views, others.cameras), shots
 
 
-def _relighter(
+def _make_relighter(
     request: RelightRequest, source: "RenderSource", learnt: "MaterialSettings | None", threads: int
 ) -> "Relighter":
     from octasplat.engine.pathtracing.relighting.path_relighter import PathRelighter

@@ -231,10 +231,10 @@ class PictureRequest(PictureOptions, WritingRequest):
 
     @model_validator(mode="before")
     @classmethod
-    def _complete(cls, values: Any) -> Any:
+    def _complete_values(cls, values: Any) -> Any:
         if not isinstance(values, dict) or "output" not in values or "source" not in values:
             return values
-        given = renamed_settings.translate_names((cls,), values)
+        given = renamed_settings.replace_former_names((cls,), values)
         given = {name: value for name, value in given.items() if value is not None}
         if "path_file" in given and "camera_path" not in given:
             given["camera_path"] = read_path_document(Path(given["path_file"]))

@@ -98,7 +98,7 @@ def read_render_source(
 
     Args:
         source: the folder of a run, or a file.
-        progress: told what reading lost.
+        progress: receives what reading lost.
         dataset: folder of photographs whose cameras to take, instead of those that the run keeps.
         max_side: cap on the longer side of the views, px; None takes the run's.
         full_size: whether to read the cameras at the full size of the photographs, too, as stages need them.
@@ -132,16 +132,16 @@ def read_render_source(
     learnt = run_background(source)
     facts = read_metadata(source)
     return RenderSource(
-        read_gaussian_ply(source / SCENE)[0],
-        config.train.trace,
-        run_min_view_distance(source, viewpoints),
-        config.evaluation_background,
-        viewpoints,
-        config.max_side,
-        facts.pixel_rad,
-        learnt,
-        photographs,
-        facts.origin_world,
+        gaussians=read_gaussian_ply(source / SCENE)[0],
+        settings=config.train.trace,
+        near_world=run_min_view_distance(source, viewpoints),
+        background=config.evaluation_background,
+        viewpoints=viewpoints,
+        max_side=config.max_side,
+        trained_rad=facts.pixel_rad,
+        learnt=learnt,
+        photographs=photographs,
+        origin_world=facts.origin_world,
     )
 
 
@@ -264,20 +264,20 @@ def stage_scene(
         source: the scene, with the cameras at full size.
         folder: where the names of the stage's files are relative to.
         background_srgb: display colour behind everything.
-        progress: told what reading files of the stage loses.
+        progress: receives what reading files of the stage loses.
         threads: to use; 0 takes all.
     """
     return StageScene(
-        source.gaussians,
-        source.settings,
-        source.photographs,
-        folder,
-        lambda path: open_scene_about(path, source.origin_world, progress),
-        background_srgb,
-        threads,
-        lambda message: progress(Warned(message)),
-        lambda message: progress(Noted(message)),
-        source.origin_world,
+        gaussians=source.gaussians,
+        settings=source.settings,
+        photographs=source.photographs,
+        folder=folder,
+        read_gaussians=lambda path: open_scene_about(path, source.origin_world, progress),
+        background_srgb=background_srgb,
+        threads=threads,
+        warn=lambda message: progress(Warned(message)),
+        note=lambda message: progress(Noted(message)),
+        origin_world=source.origin_world,
     )
 
 
@@ -288,7 +288,7 @@ def open_stage_scene(
 
     Args:
         source: the folder of a run, or a file.
-        progress: told what reading lost.
+        progress: receives what reading lost.
         dataset: folder of the photographs, if the run does not keep their cameras.
         threads: to use; 0 takes all.
 

@@ -10,7 +10,7 @@ from pydantic import BaseModel
 
 from octasplat.engine.core.events import EventListener, Noted, Warned
 from octasplat.engine.core.local_origin import Origin, describe_origin
-from octasplat.engine.edit.changed_run import check_new_run, write_changed_run
+from octasplat.engine.edit.changed_run import check_new_run, write_edited_run
 from octasplat.engine.files import (
     ExportOptions,
     dropped_on_export,
@@ -37,7 +37,7 @@ def open_scene(path: Path, progress: EventListener, *, drop_invalid: bool = Fals
 
     Args:
         path: the file or folder.
-        progress: told what reading lost: a warning if it changes the look, else a note.
+        progress: receives what reading lost: a warning if it changes the look, else a note.
         drop_invalid: leave out Gaussians with values that are not finite.
 
     Raises:
@@ -134,8 +134,8 @@ def write_scene(
         gaussians: the scene.
         facts: what goes along with it.
         target: the file.
-        progress: told what the format leaves out.
-        warn: whether to tell that.
+        progress: receives a warning for each thing that the format leaves out.
+        warn: whether to send these warnings.
 
     Raises:
         SceneFileError: it cannot be written.
@@ -153,7 +153,7 @@ def is_run_output(source: Path, output: Path) -> bool:
     return is_run(source) and not output.suffix
 
 
-def check_changed(
+def check_edited_output(
     verb: str, request: SourceRequest, output: Path, inputs: Sequence[Path | None] = ()
 ) -> None:
     """Check before long work that a changed scene can be written to ``output``, a file or a run's folder.
@@ -177,7 +177,7 @@ def check_changed(
 
 @dataclass(frozen=True)
 class WrittenScene:
-    """A changed scene that was written.
+    """An edited scene that was written.
 
     Attributes:
         files: its files.
@@ -190,44 +190,49 @@ class WrittenScene:
     folder: Path | None = None
 
 
-def write_changed(
+def write_edited_scene(
     source: Path,
     gaussians: FlatGaussians,
     output: Path,
     progress: EventListener,
     *,
-    note: Mapping[str, object],
+    edit_record: Mapping[str, object],
     facts: SceneMetadata | None = None,
     matrix: Float[np.ndarray, "4 4"] | None = None,
 ) -> WrittenScene:
-    """Write the changed scene of ``source``: a file, or a run's folder with the files that stay valid.
+    """Write the edited version of ``source``: a scene file, or a run folder with the files that stay valid.
+
+    Whether it is a run folder depends on source and output, see :func:`is_run_output`; a scene file takes
+    neither ``edit_record`` nor ``matrix``.
 
     Args:
-        source: the scene that was changed, a file or a run's folder.
-        gaussians: what became of it.
-        output: where to; see :func:`is_run_output`.
-        progress: told what is lost.
-        note: what was done, for the run's ``edits.json``.
-        facts: what is known of the scene as a whole; None takes that of the source.
-        matrix: the affine map from the source's world to that of the scene, if they are not the same.
+        source: the scene that was edited, a file or a run's folder.
+        gaussians: the Gaussians after the edit.
+        output: the scene file or the new run's folder.
+        progress: receives a warning for each thing that the output cannot hold.
+        edit_record: description of the edit for the run's ``edits.json``; unused for a scene file.
+        facts: metadata of the scene as a whole; None takes that of the source.
+        matrix: affine map from the source's world to the edited scene's, by which a run's cameras follow;
+            None if the world frame is unchanged. Unused for a scene file.
     """
     if not is_run_output(source, output):
         return WrittenScene(
             (output,), write_scene(gaussians, facts or read_metadata(source), output, progress)
         )
-    for text in write_changed_run(source, gaussians, output, note, facts=facts, matrix=matrix):
-        progress(Warned(text))
+    for warning in write_edited_run(source, gaussians, output, edit_record, facts=facts, matrix=matrix):
+        progress(Warned(warning))
     files = tuple(sorted(path for path in output.rglob("*") if path.is_file()))
-    return WrittenScene(files, f"Wrote {output}: a run with {len(gaussians):,} Gaussians.", output)
+    sentence = f"Wrote {output}: a run with {len(gaussians):,} Gaussians."
+    return WrittenScene(files, sentence, folder=output)
 
 
-def edit_note(name: str, options: BaseModel, **counts: int) -> dict[str, object]:
-    """Return a short description of an edit as JSON, for ``edits.json``; files by name only.
+def describe_edit(name: str, options: BaseModel, **counts: int) -> dict[str, object]:
+    """Return the record of an edit for ``edits.json``, as JSON values; files by name only.
 
     Args:
         name: the verb.
         options: what was asked for.
-        counts: what came of it.
+        counts: numbers of Gaussians that it changed.
     """
     requested = map_named_files(options, lambda path: Path(path.name))
     recorded = type(options).model_construct(**requested).model_dump(mode="json", exclude_defaults=True)

@@ -10,7 +10,7 @@ from octasplat.engine.core.writing import write_json
 from octasplat.engine.edit.changed_run import check_new_run
 from octasplat.engine.files import read_metadata
 from octasplat.engine.gaussians.model import FlatGaussians
-from octasplat.engine.operations.scene_io import check_scenes, is_run_output, write_changed, write_scene
+from octasplat.engine.operations.scene_io import check_scenes, is_run_output, write_edited_scene, write_scene
 from octasplat.engine.operations.sequence_request import SequenceRequest
 from octasplat.engine.operations.written_files import check_targets
 
@@ -95,7 +95,7 @@ class SceneSequence:
         target = self._targets[number]
         if self._is_run:
             counted = {**note, "gaussians": len(gaussians)}
-            written = write_changed(self._source, gaussians, target, progress, note=counted)
+            written = write_edited_scene(self._source, gaussians, target, progress, edit_record=counted)
             self.files, self.folder = written.files, written.folder
             return written.sentence
         self.files = (*self.files, target)

@@ -46,7 +46,7 @@ ROOM_DEFAULTS: Mapping[str, object] = {
 _FACTORS = {"": 1, "k": 1000, "M": 1_000_000}
 
 
-def _triangles(text: str) -> int:
+def _parse_triangle_count(text: str) -> int:
     """Return the number of a text such as ``60000`` or ``60k``; 0 if it is none."""
     written = re.fullmatch(r"(\d+(?:\.\d+)?)([kM]?)", text)
     return round(float(written[1]) * _FACTORS[written[2]]) if written else 0
@@ -60,7 +60,7 @@ def _read_levels(value: object) -> object:
     texts = [str(part).strip() for part in (parts if isinstance(parts, list | tuple) else [parts])]
     counts: list[int] = []
     for text in texts:
-        count = _triangles(text)
+        count = _parse_triangle_count(text)
         if not 4 <= count < 1 << 31:
             raise ValueError(f"{text!r} is no number of triangles from 4 on, such as 60000 or 50k")
         if count in counts:
@@ -110,14 +110,14 @@ class SurfaceOptions(ExtractionOptions, Options):
     def _with_presets(cls, given: Any) -> Any:
         if not isinstance(given, Mapping):
             return given
-        given = renamed_settings.translate_names((cls,), given)
+        given = renamed_settings.replace_former_names((cls,), given)
         room = ROOM_DEFAULTS if _is_on(given.get("room", False)) else {}
         materials = MATERIAL_DEFAULTS if _is_on(given.get("materials", False)) else {}
         return {**room, **materials, **given}
 
     @field_validator("up")
     @classmethod
-    def _lights(cls, up: Axis | None, info: Any) -> Axis | None:
+    def _check_up(cls, up: Axis | None, info: Any) -> Axis | None:
         if up is not None and info.data.get("materials") is False:
             raise ValueError("goes with materials, and there are none")
         return up
@@ -125,7 +125,7 @@ class SurfaceOptions(ExtractionOptions, Options):
     @property
     def levels(self) -> Mapping[str, int]:
         """Return the number of triangles of each level of detail, by its name; None keeps all triangles."""
-        return {text: _triangles(text) for text in self.max_triangles}
+        return {text: _parse_triangle_count(text) for text in self.max_triangles}
 
 
 class SurfaceRequest(SurfaceOptions, WritingRequest):
@@ -271,12 +271,12 @@ def run(
         tuple(request.levels.values()) or (None,),
         scratch=output.parent,
         light_frame=frame,
-        photographs=_photographs(request, threads, progress),
+        photographs=_fit_photographs(request, threads, progress),
         listener=progress,
         should_stop=should_stop,
     )
     levels = tuple(
-        _level(surface, write_surface(replace(surface.mesh, origin_world=origin), place))
+        _surface_level(surface, write_surface(replace(surface.mesh, origin_world=origin), place))
         for surface, place in zip(surfaces, request.outputs, strict=True)
     )
     environment = None if light is None else _copy_light(light, output)
@@ -284,7 +284,7 @@ def run(
     return SurfaceResult(files=files, folder=output.parent, levels=levels, environment=environment)
 
 
-def _photographs(request: SurfaceRequest, threads: int, progress: EventListener) -> "tuple[Picture, ...]":
+def _fit_photographs(request: SurfaceRequest, threads: int, progress: EventListener) -> "tuple[Picture, ...]":
     from octasplat.engine.runs.surface_inputs import training_photographs
 
     if not request.fit:
@@ -292,7 +292,7 @@ def _photographs(request: SurfaceRequest, threads: int, progress: EventListener)
     return training_photographs(request.source, request.dataset, threads, progress, copy=request.photographs)
 
 
-def _level(extracted: "ExtractedSurface", files: tuple[Path, ...]) -> SurfaceLevel:
+def _surface_level(extracted: "ExtractedSurface", files: tuple[Path, ...]) -> SurfaceLevel:
     return SurfaceLevel(
         files=files,
         triangles=len(extracted.mesh.faces),

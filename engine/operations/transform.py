@@ -118,10 +118,15 @@ def run(
     from octasplat.engine.core.local_origin import local_map, origin_after
     from octasplat.engine.files import read_metadata
     from octasplat.engine.gaussians.affine import mean_scale, transform_gaussians
-    from octasplat.engine.operations.scene_io import check_changed, edit_note, open_scene, write_changed
+    from octasplat.engine.operations.scene_io import (
+        check_edited_output,
+        describe_edit,
+        open_scene,
+        write_edited_scene,
+    )
 
     source: Path = request.source
-    check_changed("transform", request, request.output, [request.matrix])
+    check_edited_output("transform", request, request.output, [request.matrix])
     matrix = request.world_map()
     scene, facts = open_scene(source, progress), read_metadata(source)
     origin = origin_after(matrix, scene.means_world, facts.origin_world)
@@ -129,12 +134,12 @@ def run(
     moved = transform_gaussians(scene, local)
     stop_if(should_stop)
     rows = tuple(map(tuple, matrix.tolist()))
-    written = write_changed(
+    written = write_edited_scene(
         source,
         moved,
         request.output,
         progress,
-        note={**edit_note("transform", options_of(TransformOptions, request)), "world_map": rows},
+        edit_record={**describe_edit("transform", options_of(TransformOptions, request)), "world_map": rows},
         facts=replace(facts.scaled(mean_scale(matrix)), origin_world=origin),
         matrix=local,
     )

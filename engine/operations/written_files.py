@@ -65,7 +65,7 @@ def check_targets(
     there = [target for target in checked if target.exists()]
     if overwrite or not there:
         return
-    known = _known(verb, there)
+    known = _recorded_files(verb, there)
     if foreign := [target for target in there if not _is_ours(target, known)]:
         more = f" and {len(foreign) - 1:,} more are" if len(foreign) > 1 else " is"
         raise OutputError(
@@ -80,8 +80,8 @@ def remember_written(verb: str, files: Iterable[Path]) -> None:
     for file in files if verb != _FOR_EDITS else ():
         with suppress(OSError):
             stat = file.stat()
-            rows.append((str(file.resolve()), _kind(verb), stat.st_size, stat.st_mtime_ns))
-    with suppress(OSError, sqlite3.Error), _database() as database, database:
+            rows.append((str(file.resolve()), _kind_of_verb(verb), stat.st_size, stat.st_mtime_ns))
+    with suppress(OSError, sqlite3.Error), _open_database() as database, database:
         database.executemany("INSERT OR REPLACE INTO written VALUES (?, ?, ?, ?)", rows)
 
 
@@ -128,7 +128,7 @@ class _Read:
         self._folders += inner or ([root] if whole else [])
 
 
-def _kind(verb: str) -> str:
+def _kind_of_verb(verb: str) -> str:
     return _KINDS.get(verb, verb)
 
 
@@ -137,19 +137,19 @@ def _is_ours(file: Path, known: _UNCHANGED_SINCE) -> bool:
     return known.get(str(file.resolve())) == (stat.st_size, stat.st_mtime_ns)
 
 
-def _known(verb: str, files: Sequence[Path]) -> _UNCHANGED_SINCE:
+def _recorded_files(verb: str, files: Sequence[Path]) -> _UNCHANGED_SINCE:
     """Return recorded size and time of the files that are output of the verb's kind."""
     found: _UNCHANGED_SINCE = {}
-    with suppress(OSError, sqlite3.Error), _database() as database:
+    with suppress(OSError, sqlite3.Error), _open_database() as database:
         for file in files:
             query = "SELECT size, time_ns FROM written WHERE path = ? AND kind = ?"
-            for size, time_ns in database.execute(query, (str(file.resolve()), _kind(verb))):
+            for size, time_ns in database.execute(query, (str(file.resolve()), _kind_of_verb(verb))):
                 found[str(file.resolve())] = (size, time_ns)
     return found
 
 
 @contextmanager
-def _database() -> Iterator[sqlite3.Connection]:
+def _open_database() -> Iterator[sqlite3.Connection]:
     named = os.environ.get(RECORD_VARIABLE)
     path = Path(named) if named else platformdirs.user_state_path("octasplat") / "written.sqlite"
     path.parent.mkdir(parents=True, exist_ok=True)

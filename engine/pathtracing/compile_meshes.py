@@ -101,7 +101,7 @@ def compile_meshes(
         stage: whose meshes have no place in the scene left to be found (``on``).
         folder: where the stage's files are relative to.
         threads: for building and tracing; 0 takes all.
-        warn: told in a sentence what of a mesh file's materials is not understood.
+        warn: called with a sentence on what of a mesh file's materials is not understood.
         origin_world: local origin of the scene, about which meshes of files in large coordinates are put.
 
     Raises:
@@ -111,7 +111,14 @@ def compile_meshes(
     up = np.array(stage.up)
     gathered = _MeshBuilder(MaterialTable(folder), len(stage.lights))
     for number, mesh in enumerate(stage.meshes):
-        _add_mesh(gathered, mesh, number, load_mesh_shape(mesh, number, folder, origin_world), up, warn)
+        _add_mesh(
+            builder=gathered,
+            mesh=mesh,
+            number=number,
+            shape=load_mesh_shape(mesh, number, folder, origin_world),
+            up=up,
+            warn=warn,
+        )
     for number, light in enumerate(stage.lights):
         corners = _light_triangles(light, up)
         if corners is not None:
@@ -126,21 +133,26 @@ def compile_meshes(
         )
     surfaces, materials = gathered.surfaces(), gathered.table.arrays()
     lights = build_light_arrays(
-        stage.lights, up, environment, gathered.emissive, materials.texels_linear, materials.texture_sizes
+        lights=stage.lights,
+        up_world=up,
+        environment=environment,
+        meshes=gathered.emissive,
+        texels_linear=materials.texels_linear,
+        texture_sizes=materials.texture_sizes,
     )
     points = surfaces.corners_world.reshape(-1, 3)
     faces = np.arange(len(points), dtype=np.int32).reshape(-1, 3)
     is_glass = materials.kinds[surfaces.material_ids] == GLASS
     some = bool(is_glass.any())
     return CompiledMeshes(
-        surfaces,
-        TriangleBvh(points, faces, threads=threads),
-        materials,
-        lights,
-        stage.environment is not None and stage.environment.visible,
-        TriangleBvh(points, faces[~is_glass], threads=threads) if some else None,
-        TriangleBvh(points, faces[is_glass], threads=threads) if some else None,
-        np.flatnonzero(is_glass) if some else None,
+        surfaces=surfaces,
+        triangles=TriangleBvh(points, faces, threads=threads),
+        materials=materials,
+        lights=lights,
+        environment_visible=stage.environment is not None and stage.environment.visible,
+        obstacles=TriangleBvh(points, faces[~is_glass], threads=threads) if some else None,
+        glass=TriangleBvh(points, faces[is_glass], threads=threads) if some else None,
+        glass_faces=np.flatnonzero(is_glass) if some else None,
     )
 
 

@@ -137,13 +137,13 @@ class Film:
 
     def image(self, *, exposure: float = 0.0, tone: ToneCurve = "none") -> StageImage:
         """Return the image of all paths so far; ``exposure`` is in stops."""
-        linear = self._linear()
+        linear = self._linear_radiance()
         display = linear_to_srgb(apply_tone_curve(linear * 2.0**exposure, tone))
         return StageImage(
             np.clip(display, 0.0, 1.0).astype(np.float32).reshape(*self._shape, 3),
             self._to_image(linear),
             self._to_image(self._coverage / np.maximum(self._samples, 1)),
-            self._layers(linear),
+            self._mesh_layers(linear),
         )
 
     def denoised(self, denoise: DenoiseFn) -> "Film":
@@ -164,7 +164,7 @@ class Film:
             film._without_meshes = self._without_meshes.denoised(denoise)
         return film
 
-    def _linear(self, *, lit: bool = True) -> Float64[np.ndarray, "n 3"]:
+    def _linear_radiance(self, *, lit: bool = True) -> Float64[np.ndarray, "n 3"]:
         """Return linear values; without ``lit`` those of the Gaussians as trained."""
         count = np.maximum(self._samples, 1)[:, None]
         through, front = self._transmittance[:, None] / count, self._front[:, None] / count
@@ -182,13 +182,13 @@ class Film:
     def _covered(self) -> Float64[np.ndarray, "n 1"]:
         return (self._samples - self._transmittance - self._front)[:, None]
 
-    def _layers(self, picture: Float64[np.ndarray, "n 3"]) -> dict[str, Float32[np.ndarray, "h w"]]:
+    def _mesh_layers(self, picture: Float64[np.ndarray, "n 3"]) -> dict[str, Float32[np.ndarray, "h w"]]:
         if self._without_meshes is None or self.plate is None:
             return {}
-        plain = self._without_meshes._linear(lit=False)
+        plain = self._without_meshes._linear_radiance(lit=False)
         is_lit = (self._without_meshes._samples > 0)[:, None] & (plain > _DARK)
-        shadow = np.where(is_lit, self._without_meshes._linear() / np.where(is_lit, plain, 1.0), 1.0)
-        background = self.plate._linear(lit=False)
+        shadow = np.where(is_lit, self._without_meshes._linear_radiance() / np.where(is_lit, plain, 1.0), 1.0)
+        background = self.plate._linear_radiance(lit=False)
         behind = background * shadow
         alpha = self._mesh_visibility / np.maximum(self._samples, 1)
         needed = np.where(behind > _DARK, 1.0 - picture / np.maximum(behind, _DARK), 0.0).max(axis=1)

@@ -117,13 +117,13 @@ def build_gaussian_layers(
 
     casting = np.concatenate(on_gaussians)
     return GaussianLayers(
-        tracer,
-        settings.transmittance_min,
-        caster(np.concatenate(on_meshes)),
-        caster(casting),
-        caster(~casting),
-        max(biases),
-        any(surfaces),
+        tracer=tracer,
+        min_transmittance=settings.transmittance_min,
+        mesh_shadow_tracer=caster(np.concatenate(on_meshes)),
+        gaussian_shadow_tracer=caster(casting),
+        non_shadow_tracer=caster(~casting),
+        shadow_bias=max(biases),
+        has_material_surfaces=any(surfaces),
     )
 
 

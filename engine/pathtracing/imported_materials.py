@@ -37,7 +37,7 @@ def import_material(
         source: the file's.
         is_closed: whether its triangles close something, so that glass has an inside.
         scale: world units in one unit of the file.
-        warn: told in a sentence what is not understood.
+        warn: called with a sentence on what is not understood.
 
     Raises:
         ConfigError: a number is not finite or out of range.

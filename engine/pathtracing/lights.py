@@ -110,13 +110,30 @@ def build_light_arrays(
         kinds[-1], rgb[-1], visibility[-1] = ENVIRONMENT, mean_irradiance(radiance), 1
     sampler = build_environment_sampler(radiance)
     return LightArrays(
-        kinds, positions, axes, rgb, sides_u, sides_v, areas, cosines, visibility,
-        adds, bool(adds.any()), textures, rows, np.concatenate([np.zeros(0), *sums]), np.concatenate(corners),
-        np.concatenate(uv),
-        np.zeros((0, 3), np.float32) if texels_linear is None else texels_linear,
-        np.zeros((0, 3), np.int64) if texture_sizes is None else texture_sizes,
-        radiance, sampler.row_cdf, sampler.column_cdf, sampler.probabilities, frame,
-    )  # fmt: skip
+        kinds=kinds,
+        positions_world=positions,
+        axes=axes,
+        rgb_linear=rgb,
+        sides_u=sides_u,
+        sides_v=sides_v,
+        areas=areas,
+        cosines=cosines,
+        is_hittable=visibility,
+        adds_light=adds,
+        any_adds_light=bool(adds.any()),
+        textures=textures,
+        mesh_rows=rows,
+        mesh_cdf=np.concatenate([np.zeros(0), *sums]),
+        mesh_corners_world=np.concatenate(corners),
+        mesh_uv=np.concatenate(uv),
+        texels_linear=np.zeros((0, 3), np.float32) if texels_linear is None else texels_linear,
+        texture_sizes=np.zeros((0, 3), np.int64) if texture_sizes is None else texture_sizes,
+        environment_linear=radiance,
+        environment_row_cdf=sampler.row_cdf,
+        environment_column_cdf=sampler.column_cdf,
+        environment_probabilities=sampler.probabilities,
+        environment_frame=frame,
+    )
 
 
 def triangle_areas(corners: Float32[np.ndarray, "f 3 3"]) -> Float64[np.ndarray, " f"]:

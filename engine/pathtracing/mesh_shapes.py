@@ -45,7 +45,7 @@ class MeshShape:
 
 def primitive_shape(name: str) -> MeshShape:
     """Return a ``sphere`` of radius 1, a ``cube`` from -1 to 1, or a ``plane`` from -1 to 1 with normal y."""
-    return {"sphere": _sphere, "cube": _cube, "plane": _plane}[name]()
+    return {"sphere": _sphere_shape, "cube": _cube_shape, "plane": _plane_shape}[name]()
 
 
 def read_shape(path: Path) -> MeshShape:
@@ -59,13 +59,13 @@ def read_shape(path: Path) -> MeshShape:
     if len(mesh.triangles) == 0:
         raise ConfigError(f"{path}: holds no triangles, so that light has nothing to fall on.")
     return MeshShape(
-        mesh.vertices,
-        mesh.triangles,
-        mesh.corner_uv,
-        None if mesh.normals is None else mesh.normals.astype(np.float64),
-        None if mesh.rgb_linear is None else mesh.rgb_linear[mesh.triangles],
-        mesh.material_indices,
-        mesh.materials,
+        vertices=mesh.vertices,
+        faces=mesh.triangles,
+        corner_uv=mesh.corner_uv,
+        normals=None if mesh.normals is None else mesh.normals.astype(np.float64),
+        corner_rgb_linear=None if mesh.rgb_linear is None else mesh.rgb_linear[mesh.triangles],
+        material_numbers=mesh.material_indices,
+        materials=mesh.materials,
     )
 
 
@@ -162,7 +162,7 @@ def count_open_edges(shape: MeshShape, face_mask: Bool[np.ndarray, " f"] | None 
     return report.open_edges + report.non_manifold_edges + report.inconsistent_edges
 
 
-def _sphere() -> MeshShape:
+def _sphere_shape() -> MeshShape:
     """Return an icosahedron subdivided several times and projected to the unit sphere."""
     golden = (1 + 5**0.5) / 2
     around = np.array([[-1, golden, 0], [1, golden, 0], [-1, -golden, 0], [1, -golden, 0]])
@@ -190,7 +190,7 @@ def _sphere() -> MeshShape:
     return MeshShape(vertices, faces.astype(np.int64), uv.astype(np.float32), vertices)
 
 
-def _cube() -> MeshShape:
+def _cube_shape() -> MeshShape:
     vertices: list[Float64[np.ndarray, 3]] = []
     faces: list[list[int]] = []
     uv: list[list[list[int]]] = []
@@ -207,7 +207,7 @@ def _cube() -> MeshShape:
     return MeshShape(np.array(vertices), np.array(faces, np.int64), np.array(uv, np.float32))
 
 
-def _plane() -> MeshShape:
+def _plane_shape() -> MeshShape:
     vertices = np.array([[-1.0, 0, 1], [1, 0, 1], [1, 0, -1], [-1, 0, -1]])
     uv = np.array([[[0, 1], [1, 1], [1, 0]], [[0, 1], [1, 0], [0, 0]]], np.float32)
     return MeshShape(vertices, np.array([[0, 1, 2], [0, 2, 3]], np.int64), uv)

@@ -102,13 +102,13 @@ class PathTracer:
         self._scratches = allocate_path_scratch(self._threads)
         background = np.zeros(3) if scene.background_linear is None else scene.background_linear
         self._integrator = IntegratorParameters(
-            settings.seed,
-            settings.max_depth,
-            settings.roulette_depth,
-            np.inf if settings.clamp is None else settings.clamp,
-            settings.anti_aliasing,
-            scene.meshes.environment_visible,
-            background.astype(np.float64),
+            seed=settings.seed,
+            max_depth=settings.max_depth,
+            roulette_depth=settings.roulette_depth,
+            clamp=np.inf if settings.clamp is None else settings.clamp,
+            anti_aliasing=settings.anti_aliasing,
+            environment_visible=scene.meshes.environment_visible,
+            background_linear=background.astype(np.float64),
         )
         self._denoise = load_denoiser() if settings.denoise else None
         self._plate: PathTracer | None = None
@@ -127,7 +127,7 @@ class PathTracer:
 
         Args:
             image: rays through the centres of its pixels.
-            progress: told (batches done, batches in all).
+            progress: called with (batches done, total).
         """
         film = self._make_film(image)
         self.add_samples(film, image, 0, self._settings.samples, progress)
@@ -282,13 +282,26 @@ class PathTracer:
             hits = meshes.triangles.closest(rays)
             shadows = allocate_shadow_rays(len(active))
             met = MeshHits(hits.distances, hits.faces, hits.barycentrics)
-            bounce = Bounce(paths, active, depth, met, scene, self._integrator, shadows)
+            bounce = Bounce(
+                paths=paths,
+                active=active,
+                depth=depth,
+                hits=met,
+                scene=scene,
+                integrator=self._integrator,
+                shadows=shadows,
+            )
             if layers is not None:
                 traced = layers.trace(rays, hits.distances)
                 layer = LayerArrays(
-                    traced.rgb_srgb, traced.transmittance, traced.depth_median, traced.depth_sum,
-                    traced.normal_world, traced.features, layers.min_transmittance,
-                )  # fmt: skip
+                    rgb=traced.rgb_srgb,
+                    transmittance=traced.transmittance,
+                    depth_median=traced.depth_median,
+                    depth_sum=traced.depth_sum,
+                    normals=traced.normal_world,
+                    features=traced.features,
+                    min_transmittance=layers.min_transmittance,
+                )
                 if layers.has_material_surfaces:
                     self._run_kernel(intersect_gaussian_surfaces, len(active), bounce, layer)
                     self._add_surface_light(paths, active, shadows, layers.tracer)

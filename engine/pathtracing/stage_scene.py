@@ -37,8 +37,8 @@ class StageScene:
         read_gaussians: reads a file of Gaussians.
         background_srgb: display colour behind everything.
         threads: to use; 0 takes all.
-        warn: told in a sentence what of a mesh file is not understood.
-        note: told in a sentence about which origin places are.
+        warn: called with a sentence on what of a mesh file is not understood.
+        note: called with a sentence on which origin places are.
         origin_world: local origin of the Gaussians and photographs, see
             :mod:`octasplat.engine.core.local_origin`.
     """
@@ -101,5 +101,12 @@ def first_stage_layout(scene: StageScene, up_world: Float64[np.ndarray, "3"] | N
     tracer = make_tracer(scene.settings, threads=scene.threads, is_used_once=True)
     tracer.build(scene.gaussians)
     size = SIZE_PER_RADIUS * table.radius
-    found = estimate_stage_layout(scene.gaussians, tracer, table.up_world, table.centre_world, size, cameras)
+    found = estimate_stage_layout(
+        gaussians=scene.gaussians,
+        tracer=tracer,
+        up_world=table.up_world,
+        centre_world=table.centre_world,
+        size=size,
+        cameras_world=cameras,
+    )
     return replace(found, note=places_note(scene.origin_world) if is_set(scene.origin_world) else "")

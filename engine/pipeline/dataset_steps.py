@@ -34,7 +34,14 @@ class FindPoses:
         if run.recorded is None:
             for sentence in notes_on_files(run.scene):
                 run.progress(Warned(sentence))
-        find_missing_poses(run.scene, run.output, run.config, run.threads, run.progress, run.should_stop)
+        find_missing_poses(
+            scene=run.scene,
+            output=run.output,
+            config=run.config,
+            threads=run.threads,
+            progress=run.progress,
+            should_stop=run.should_stop,
+        )
 
 
 class OpenDataset:
@@ -62,7 +69,14 @@ class OpenDataset:
 
 def _repair_poses(run: ReconstructionRun) -> None:
     """Repair poses and lenses that contradict the photographs; reload the model if it changed."""
-    if repair_run_poses(run.dataset, run.output, run.config, run.threads, run.progress, run.should_stop):
+    if repair_run_poses(
+        dataset=run.dataset,
+        output=run.output,
+        config=run.config,
+        threads=run.threads,
+        progress=run.progress,
+        should_stop=run.should_stop,
+    ):
         run.dataset = _load_dataset(run)
     if estimate_principal_points(run.dataset, run.output, run.config, run.progress, run.should_stop):
         run.dataset = _load_dataset(run)
@@ -77,7 +91,7 @@ def _load_dataset(run: ReconstructionRun) -> Dataset:
             run.threads,
             run.progress,
             model_folder=found_model_folder(run.output),
-            accept=run.accept,
+            check_views=run.check_views,
         )
         options = BatchOptions.from_config(run.config.train, dataset)
         BatchSource(dataset, options)  # refuses settings that do not suit the photographs

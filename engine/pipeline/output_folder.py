@@ -108,14 +108,14 @@ def _check_settings(scene: Path, output: Path, config: ReconstructionConfig) -> 
     """Check that settings are the run's own, apart from the files to export."""
     is_posed = has_model(scene)
     before = read_config(output / CONFIG).model_copy(update={"exports": config.exports})
-    if _comparable(before, is_posed) != _comparable(config, is_posed):
+    if _normalize_config(before, is_posed) != _normalize_config(config, is_posed):
         raise ConfigError(
             f"{output / CONFIG} has other settings than this command; repeat the settings of the run, "
             "or name another folder."
         )
 
 
-def _comparable(config: ReconstructionConfig, is_posed: bool) -> ReconstructionConfig:
+def _normalize_config(config: ReconstructionConfig, is_posed: bool) -> ReconstructionConfig:
     """Return settings normalize_name, so that equal meanings compare equal."""
     held_out = None if config.held_out is None else tuple(sorted(map(normalize_name, config.held_out)))
     return config.with_poses_decided(is_posed).model_copy(update={"held_out": held_out})

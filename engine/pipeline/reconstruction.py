@@ -47,7 +47,7 @@ def reconstruct(
         config: all settings.
         resume: go on with the run that is in ``output``; only ``exports`` may then be others than the run's.
         threads: for everything; 0 means all cores.
-        progress: hears the events that also go to ``events.jsonl``.
+        progress: receives the events that also go to ``events.jsonl``.
         should_stop: asked now and then; True stops the run after a checkpoint.
         on_step: shown the training after each iteration; it must change nothing.
 
@@ -68,7 +68,15 @@ def reconstruct(
     is_made, is_new = not output.exists(), claim_output(scene, output, config, resume)
     with lock_run_folder(output):
         _run_all_steps(
-            ReconstructionRun(scene, output, config, threads, progress, should_stop, on_step),
+            ReconstructionRun(
+                scene=scene,
+                output=output,
+                config=config,
+                threads=threads,
+                progress=progress,
+                should_stop=should_stop,
+                on_step=on_step,
+            ),
             is_new=is_new,
             is_made=is_made,
         )
@@ -83,7 +91,7 @@ def _run_all_steps(run: ReconstructionRun, *, is_new: bool, is_made: bool) -> No
     report = broadcast([events, run.progress])
     run.progress, run.recorded = report, recorded
     if recorded is not None:
-        run.accept = _require_same_dataset(recorded, run.scene, output, events)
+        run.check_views = _require_same_dataset(recorded, run.scene, output, events)
     try:
         with release_on_refusal(output, is_new=is_new, is_made=is_made):
             run_steps(DATASET_STEPS, run)
@@ -105,7 +113,7 @@ def _require_same_dataset(
 ) -> Callable[[ViewsRecord], None]:
     """Return a check that a run resumes with its own photographs only; nothing is written before it."""
 
-    def accept(found: ViewsRecord) -> None:
+    def check_views(found: ViewsRecord) -> None:
         if (difference := recorded.difference(found)) is not None:
             raise CheckpointError(
                 f"{output} was made from other photographs or another model than {scene} holds "
@@ -113,4 +121,4 @@ def _require_same_dataset(
             )
         events.release()
 
-    return accept
+    return check_views

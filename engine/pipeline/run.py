@@ -31,8 +31,7 @@ class ReconstructionRun:
         should_stop: asked now and then; True stops the run after a checkpoint.
         on_step: called with the training after each iteration.
         recorded: the photographs of a run that goes on; None for a new one.
-        accept: called with the photographs that were found before anything is written; to refuse them, it
-            raises.
+        check_views: called with the photographs that were found, before decoding; raises to reject them.
     """
 
     scene: Path
@@ -43,7 +42,7 @@ class ReconstructionRun:
     should_stop: Callable[[], bool]
     on_step: OnStep | None = None
     recorded: ViewsRecord | None = None
-    accept: Callable[[ViewsRecord], None] | None = None
+    check_views: Callable[[ViewsRecord], None] | None = None
     _dataset: Dataset | None = None
 
     @property

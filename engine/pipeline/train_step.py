@@ -18,7 +18,7 @@ from octasplat.engine.gaussians.materials import reflective_fraction
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.gaussians.scene_metadata import SceneMetadata
 from octasplat.engine.pipeline.run import ReconstructionRun
-from octasplat.engine.render.environment_files import write_background, write_environment
+from octasplat.engine.render.environment_files import write_background_map, write_environment
 from octasplat.engine.render.shots import training_pixel_angle
 from octasplat.engine.runs.config import ReconstructionConfig
 from octasplat.engine.runs.run_folder import (
@@ -74,9 +74,16 @@ class TrainStep:
 
 
 def _train(run: ReconstructionRun, clock: PhaseClock) -> FlatGaussians:
-    config = _plan_settings(run.dataset, run.output, run.config, run.threads, run.should_stop, clock)
+    config = _plan_settings(
+        dataset=run.dataset,
+        output=run.output,
+        settings=run.config,
+        threads=run.threads,
+        should_stop=run.should_stop,
+        clock=clock,
+    )
     nearest_world = camera_clearances(run.dataset.viewpoints, run.dataset.points)
-    trainer = _trainer(run, config, nearest_world, clock)
+    trainer = _make_trainer(run, config, nearest_world, clock)
     gaussians = trainer.run()
     _write_learnt_light(trainer.shading, gaussians, run.output, run.progress)
     _write_training_record(
@@ -85,7 +92,7 @@ def _train(run: ReconstructionRun, clock: PhaseClock) -> FlatGaussians:
     return gaussians
 
 
-def _trainer(
+def _make_trainer(
     run: ReconstructionRun,
     config: TrainConfig,
     nearest_world: Float64[np.ndarray, " views"],
@@ -149,7 +156,7 @@ def _write_learnt_light(
                 )
             )
     if (background := find_background(shading)) is not None:
-        write_background(output / BACKGROUND, background.rgb_srgb)
+        write_background_map(output / BACKGROUND, background.rgb_srgb)
 
 
 def _write_training_record(

@@ -55,12 +55,12 @@ def fit_colours_to_cameras(
         tracer: with settings as the scene was trained with; it is built anew.
         images: make the rays of each camera.
         steps: of the conjugate gradients; 0 gives the mean of what the cameras see of each Gaussian.
-        on_pass: told (passes over the images done, in all); it may raise to stop.
+        on_pass: called with (passes over the images done, total); it may raise to stop.
 
     Returns:
         Display values in [0, 1]; those of the constant harmonic for Gaussians that no camera sees.
     """
-    batches = [_batch(make()) for make in images]
+    batches = [_rays_in_tile_order(make()) for make in images]
     on_pass(0, steps + 2)
     tracer.build(gaussians)
     targets, sums, weights = [], np.zeros((len(gaussians), 3)), np.zeros(len(gaussians))
@@ -81,7 +81,9 @@ def fit_colours_to_cameras(
     if steps == 0 or not batches:
         return np.clip(means, 0, 1).astype(np.float32)
     solve = _NormalEquations(replace(gaussians.with_base_color_only(), channels=Channels()), tracer, batches)
-    colours = _conjugate_gradients(solve, targets, means, weights, steps, on_pass)
+    colours = _conjugate_gradients(
+        normal=solve, targets=targets, start=means, weights=weights, steps=steps, on_pass=on_pass
+    )
     return np.clip(colours, 0, 1).astype(np.float32)
 
 
@@ -139,7 +141,7 @@ def _conjugate_gradients(
     return colours
 
 
-def _batch(image: ImageRays) -> RayBatch:
+def _rays_in_tile_order(image: ImageRays) -> RayBatch:
     return image.rays[tile_order(image.height_px, image.width_px)]
 
 

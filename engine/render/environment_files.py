@@ -51,8 +51,8 @@ def write_environment(path: Path, radiance_linear: Float32[np.ndarray, "h w 3"])
         raise ConfigError(f"{path}: an environment is written as .hdr or .exr.")
 
 
-def write_background(path: Path, rgb_srgb: Float32[np.ndarray, "h w 3"]) -> None:
-    """Write a learnt background, display values, as a map of linear radiance.
+def write_background_map(path: Path, rgb_srgb: Float32[np.ndarray, "h w 3"]) -> None:
+    """Write a learnt background, sRGB-encoded, as an equirectangular map of linear radiance.
 
     Raises:
         OutputError: the file cannot be written.
@@ -60,8 +60,8 @@ def write_background(path: Path, rgb_srgb: Float32[np.ndarray, "h w 3"]) -> None
     write_environment(path, srgb_to_linear(rgb_srgb).astype(np.float32))
 
 
-def read_background(path: Path) -> Float32[np.ndarray, "h w 3"]:
-    """Return the display values of a learnt background.
+def read_background_map(path: Path) -> Float32[np.ndarray, "h w 3"]:
+    """Return the sRGB-encoded values of a learnt background.
 
     Raises:
         ConfigError: the file is no such map.

@@ -95,7 +95,7 @@ class RenderOutput:
         Raises:
             ConfigError: there are images of another render, or of one that is not to be gone on with.
         """
-        how, record = self.resumption, self._record
+        how, record = self.resumption, self._record_path
         return FinishedImages(
             record.parent, identity, resume=how.resume, or_anew=how.or_anew, record=record.name
         )
@@ -103,10 +103,10 @@ class RenderOutput:
     @property
     def has_begun(self) -> bool:
         """Return whether there is an unfinished series."""
-        return self._record.exists()
+        return self._record_path.exists()
 
     @property
-    def _record(self) -> Path:
+    def _record_path(self) -> Path:
         if self.is_image_name:
             return self.path.with_name(f"{self.path.name}.{RECORD_FILE}")
         return (self._frames_folder if self.is_video else self.path) / RECORD_FILE
@@ -125,6 +125,21 @@ class RenderOutput:
 
         with counted_phase("render", progress) as count:
             if self.is_video:
-                render_video(shots, self.path, self.fps, render_fn, finished, count, on_kept)
+                render_video(
+                    shots=shots,
+                    film=self.path,
+                    fps=self.fps,
+                    render_fn=render_fn,
+                    finished=finished,
+                    progress=count,
+                    on_finished=on_kept,
+                )
                 return (self.path,)
-            return render_series(shots, self.path_for, render_fn, finished, count, on_kept)
+            return render_series(
+                shots=shots,
+                file_of=self.path_for,
+                render_fn=render_fn,
+                finished=finished,
+                progress=count,
+                on_finished=on_kept,
+            )

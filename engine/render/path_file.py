@@ -38,14 +38,14 @@ def path_cameras(document: PathDocument, name: str = "") -> CameraPath:
     Raises:
         ConfigError: no smooth path leads through the keys.
     """
-    given = tuple(_camera(document, frame) for frame in document.frames or document.keys or ())
+    given = tuple(_camera_of_frame(document, frame) for frame in document.frames or document.keys or ())
     try:
         return CameraPath(document.fps, given if document.frames else _between_keys(document, given))
     except ConfigError as error:
         raise ConfigError(f"The camera path {name or 'of the options'} is not valid: {error}") from None
 
 
-def _camera(content: PathDocument, frame: PathFrame) -> PinholeCamera:
+def _camera_of_frame(content: PathDocument, frame: PathFrame) -> PinholeCamera:
     pose = np.array(frame.camera_to_world, dtype=np.float64)
     left, _, right = np.linalg.svd(pose[:3, :3])
     pose[:3, :3] = left @ right  # Rounded digits in the file leave it not quite a rotation.

@@ -185,7 +185,9 @@ class PosePath:
         positions = self.poses[order, :3, 3]
         rotations = Rotation.from_matrix(self.poses[order, :3, :3])
         path = np.tile(np.eye(4), (len(times), 1, 1))
-        path[:, :3, 3] = CubicHermiteSpline(key_times, positions, _tangents(key_times, positions))(times)
+        path[:, :3, 3] = CubicHermiteSpline(
+            key_times, positions, _catmull_rom_velocities(key_times, positions)
+        )(times)
         path[:, :3, :3] = RotationSpline(key_times, rotations)(times).as_matrix()
         return path
 
@@ -206,7 +208,7 @@ def interpolate(
     return PosePath(poses, closed).poses_at(np.linspace(0.0, 1.0, frames, endpoint=not closed))
 
 
-def _tangents(
+def _catmull_rom_velocities(
     times: Float64[np.ndarray, "n"], positions: Float64[np.ndarray, "n 3"]
 ) -> Float64[np.ndarray, "n 3"]:
     """Return Catmull-Rom velocities at uneven times: of the parabola through each key and its neighbours."""

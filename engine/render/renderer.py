@@ -62,12 +62,12 @@ def render_rays(
     height, width = image.height_px, image.width_px
     layers: dict[str, Float32[np.ndarray, "h w _"]] = {}
     out = RenderedImage(
-        np.empty((height, width, 3), np.float32),
-        np.empty((height, width), np.float32),
-        np.empty((height, width), np.float32),
-        np.empty((height, width), np.float32),
-        np.empty((height, width, 3), np.float32),
-        layers,
+        rgb_srgb=np.empty((height, width, 3), np.float32),
+        alpha=np.empty((height, width), np.float32),
+        depth=np.empty((height, width), np.float32),
+        depth_median=np.empty((height, width), np.float32),
+        normal_world=np.empty((height, width, 3), np.float32),
+        layers=layers,
     )
     for band, order, rays in _row_bands(image):
         traced = tracer.trace(rays)

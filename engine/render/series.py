@@ -37,13 +37,22 @@ def render_series(
         file_of: the file of a shot, given its number and itself.
         render_fn: renders one.
         finished: what is there already.
-        progress: told after each image, and within it.
-        on_finished: told after each image that was rendered.
+        progress: called after each image, and within it.
+        on_finished: called after each image that was rendered.
 
     Raises:
         OutputError: a file cannot be written.
     """
-    paths = tuple(_render_missing(shots, file_of, render_fn, finished, progress, on_finished))
+    paths = tuple(
+        _render_missing(
+            shots=shots,
+            file_of=file_of,
+            render_fn=render_fn,
+            finished=finished,
+            progress=progress,
+            on_finished=on_finished,
+        )
+    )
     finished.remove_record()
     return paths
 
@@ -78,7 +87,14 @@ def render_video(
     first = shots[0].rays()
     try:
         with VideoWriter(unfinished, fps, first.width_px, first.height_px) as video:
-            for path in _render_missing(shots, frame, render_fn, finished, progress, on_finished):
+            for path in _render_missing(
+                shots=shots,
+                file_of=frame,
+                render_fn=render_fn,
+                finished=finished,
+                progress=progress,
+                on_finished=on_finished,
+            ):
                 video.write(_display_values(path))
         film.parent.mkdir(parents=True, exist_ok=True)
         unfinished.replace(film)

@@ -41,7 +41,7 @@ class Shot:
 
 
 RenderFn = Callable[[Shot, Path, Callable[[float], None]], None]
-"""Renders a shot and writes it to a file, whose suffix says the format; told the share that is done.
+"""Renders a shot and writes it to a file, whose suffix says the format; called with the share that is done.
 
 It raises :class:`octasplat.engine.core.errors.OutputError` where the file cannot be written.
 """

@@ -56,12 +56,12 @@ def pixel_means(
         image: rays through the centres of the pixels.
         shading: a model with the layer ``linear``.
         side: so many rays across a pixel, and as many down.
-        part: told the share that is done.
+        part: called with the share that is done.
     """
     size = image.height_px, image.width_px
     light, coverage = np.zeros((*size, 3)), np.zeros(size)
     lowest, highest = np.full((*size, 3), np.inf, np.float32), np.zeros((*size, 3), np.float32)
-    for number, (across, down) in enumerate(_offsets(side)):
+    for number, (across, down) in enumerate(_subpixel_offsets(side)):
         part(number / (2 * side**2))
         found = render_rays(tracer, image.shifted(across, down), background_colour("black"), shading, number)
         light += found.alpha[..., None] * found.layers[LINEAR] / side**2
@@ -73,10 +73,12 @@ def pixel_means(
     uneven = order[((highest - lowest).max(axis=2) > UNEVEN_RATIO).reshape(-1)[order]]
     if finer > side and len(uneven):
         light.reshape(-1, 3)[uneven], coverage.reshape(-1)[uneven] = 0, 0
-        for number, (across, down) in enumerate(_offsets(finer)):
+        for number, (across, down) in enumerate(_subpixel_offsets(finer)):
             part(0.5 + number / (2 * finer**2))
             shifted, sample = image.shifted(across, down), side**2 + number
-            linear, alpha = shade_layer(tracer, shifted, uneven, shading, LINEAR, sample)
+            linear, alpha = shade_layer(
+                tracer=tracer, image=shifted, pixels=uneven, shading=shading, layer=LINEAR, sample=sample
+            )
             light.reshape(-1, 3)[uneven] += alpha[:, None] * linear / finer**2
             coverage.reshape(-1)[uneven] += alpha / finer**2
     mean = light / np.maximum(coverage, 1e-6)[..., None]
@@ -123,7 +125,7 @@ def render_averaged(
     if side == 1:
         return centre
     rgb, alpha = np.zeros(centre.rgb_srgb.shape), np.zeros(centre.alpha.shape)
-    for number, (across, down) in enumerate(_offsets(side)):
+    for number, (across, down) in enumerate(_subpixel_offsets(side)):
         shifted = image.shifted(across, down)
         found = centre if shifted is image else render_rays(tracer, shifted, background_srgb, shading, number)
         rgb += found.rgb_srgb
@@ -152,7 +154,7 @@ def render_filtered(
     return replace(centre, rgb_srgb=rgb.astype(np.float32), alpha=means.alpha)
 
 
-def _offsets(side: int) -> list[tuple[float, float]]:
+def _subpixel_offsets(side: int) -> list[tuple[float, float]]:
     """Return places of ``side`` x ``side`` rays in a pixel, across and down from its centre, row by row."""
     steps = [((k + 0.5) / side - 0.5) for k in range(side)]
     return [(across, down) for down, across in product(steps, steps)]

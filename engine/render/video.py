@@ -62,7 +62,7 @@ class VideoWriter:
                 # A file rather than a pipe, which would have to be emptied lest ffmpeg wait.
                 self._messages = stack.enter_context(tempfile.TemporaryFile())
                 self._process = subprocess.Popen(  # noqa: S603
-                    self._command(temporary),
+                    self._ffmpeg_command(temporary),
                     stdin=subprocess.PIPE,
                     stdout=subprocess.DEVNULL,
                     stderr=self._messages,
@@ -90,7 +90,7 @@ class VideoWriter:
         try:
             self._process.stdin.write(np.ascontiguousarray(frame).data)
         except OSError as error:
-            raise OutputError(f"Cannot write the video {self._path}: {self._reason()}.") from error
+            raise OutputError(f"Cannot write the video {self._path}: {self._ffmpeg_error()}.") from error
         self._frames += 1
 
     def __exit__(
@@ -119,7 +119,7 @@ class VideoWriter:
                 if self._frames == 0:
                     raise OutputError(f"The video {self._path} got no frames.")
                 if status != 0:
-                    raise OutputError(f"Cannot write the video {self._path}: {self._reason()}.")
+                    raise OutputError(f"Cannot write the video {self._path}: {self._ffmpeg_error()}.")
         except OSError as failure:
             raise OutputError(f"Cannot write the video {self._path}: {failure}.") from failure
 
@@ -132,7 +132,7 @@ class VideoWriter:
                 process.stdin.close()
         return process.wait()
 
-    def _command(self, target: Path) -> list[str]:
+    def _ffmpeg_command(self, target: Path) -> list[str]:
         """Return ffmpeg's arguments: raw RGB in, H.264 out, with the colour space stated in the file."""
         size = f"{self._width + self._width % 2}x{self._height + self._height % 2}"
         return [
@@ -144,7 +144,7 @@ class VideoWriter:
             "-color_range", "tv", "-movflags", "+faststart", str(target),
         ]  # fmt: skip
 
-    def _reason(self) -> str:
+    def _ffmpeg_error(self) -> str:
         """Return the last line of ffmpeg's error output."""
         if self._messages is None:
             return "ffmpeg stopped"

@@ -30,9 +30,9 @@ class BakedScene:
         run: the folder of the run that it is of; its training views are those for which the colours lose
             least. None takes cameras all around.
         threads: to use; 0 takes all.
-        on_pass: told (passes done, in all); it may raise to stop.
-        on_unknown: told in a sentence if the cameras of the run are not known any more, so that the colours
-            of the constant harmonics stay.
+        on_pass: called with (passes done, total); it may raise to stop.
+        on_unknown: called with a sentence if the cameras of the run are not known any more, so that the
+            colours of the constant harmonics stay.
     """
 
     def __init__(
@@ -53,7 +53,7 @@ class BakedScene:
         if self._gaussians.sh_degree == 0:
             return self._gaussians
         if self._run is None:
-            settings, images = TraceSettings(), _around(self._gaussians)
+            settings, images = TraceSettings(), _rays_around(self._gaussians)
         else:
             try:
                 settings, images = _of_run(self._run)
@@ -69,15 +69,15 @@ def _of_run(run: Path) -> tuple[TraceSettings, Sequence[Callable[[], ImageRays]]
     config = read_config(run / CONFIG)
     viewpoints = run_viewpoints(run, max_side=SIDE_PX)
     near = run_min_view_distance(run, viewpoints)
-    shots = view_shots(viewpoints, _some(viewpoints.train_indices), near)
+    shots = view_shots(viewpoints, _spread_views(viewpoints.train_indices), near)
     return config.train.trace, [shot.rays for shot in shots]
 
 
-def _around(gaussians: FlatGaussians) -> Sequence[Callable[[], ImageRays]]:
+def _rays_around(gaussians: FlatGaussians) -> Sequence[Callable[[], ImageRays]]:
     return [camera.rays for camera in cameras_around(gaussians, SIDE_PX, MAX_VIEWS)]
 
 
-def _some(indices: Int64[np.ndarray, " n"]) -> Int64[np.ndarray, " m"]:
+def _spread_views(indices: Int64[np.ndarray, " n"]) -> Int64[np.ndarray, " m"]:
     """Return at most ``MAX_VIEWS`` of the views, spread evenly."""
     count = min(len(indices), MAX_VIEWS)
     return indices[np.linspace(0, len(indices) - 1, count).round().astype(np.int64)]

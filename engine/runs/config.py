@@ -17,13 +17,13 @@ from octasplat.engine.settings.base import Settings
 from octasplat.engine.settings.fields import ADVANCED
 from octasplat.engine.settings.nested_options import merge_options
 from octasplat.engine.settings.refusals import (
+    InvalidSettingsError,
     Refusal,
-    SettingsRefused,
     refusals_from,
     refuse_unknown_setting,
     submodels,
 )
-from octasplat.engine.settings.renamed_settings import former_names, translate_names
+from octasplat.engine.settings.renamed_settings import former_names, replace_former_names
 from octasplat.engine.train.config import TrainConfig, preset, with_materials
 from octasplat.engine.train.config.presets import PRESETS, PRESETS_WITH_MATERIALS
 
@@ -38,15 +38,19 @@ class ReconstructionConfig(RunSettings):
 
     @model_validator(mode="before")
     @classmethod
-    def _measured_as_trained(cls, values: Any) -> Any:
+    def _default_evaluation_background(cls, values: Any) -> Any:
+        """Set the background of the evaluation, if it is not given, to that of the training.
+
+        Backgrounds that are no fixed colour are evaluated on black.
+        """
         if not isinstance(values, Mapping):
             return values
-        values = translate_names((cls,), values)
+        values = replace_former_names((cls,), values)
         if values.get("evaluation_background") is not None:
             return values
         train = values.get("train", {})
-        behind = train.get("background") if isinstance(train, Mapping) else train.background
-        return {**values, "evaluation_background": "white" if behind == "white" else "black"}
+        train_background = train.get("background") if isinstance(train, Mapping) else train.background
+        return {**values, "evaluation_background": "white" if train_background == "white" else "black"}
 
     def background_mismatch(self, has_alpha: bool) -> str | None:
         """Return a sentence where views are measured on another background than they were trained on.
@@ -92,12 +96,14 @@ def resolve_config(
             ``train.lr.mean=2e-4``, or ``test_every=4``.
 
     Raises:
-        SettingsRefused: an unknown name, a value out of range, or settings that contradict each other.
+        InvalidSettingsError: an unknown name, a value out of range, or settings that contradict each other.
     """
     given = {key: value for key, value in (settings or {}).items() if value is not None}
-    values, changes = _collected({**given, "preset": preset_name}, materials or None, train, assignments)
-    base = _base(values["preset"], _learns_materials(changes))
-    return _validated({**values, "train": merge_options(base, changes)})
+    values, changes = _collect_changes(
+        {**given, "preset": preset_name}, materials or None, train, assignments
+    )
+    base = _preset_settings(values["preset"], _learns_materials(changes))
+    return _validate_config({**values, "train": merge_options(base, changes)})
 
 
 def revise_config(
@@ -121,37 +127,37 @@ def revise_config(
         assignments: as for :func:`resolve_config`.
 
     Raises:
-        SettingsRefused: an unknown name, a value out of range, or settings that contradict each other.
+        InvalidSettingsError: an unknown name, a value out of range, or settings that contradict each other.
     """
-    before = translate_names((ReconstructionConfig,), before)
-    values, changes = _collected(settings or {}, materials, train, assignments)
+    before = replace_former_names((ReconstructionConfig,), before)
+    values, changes = _collect_changes(settings or {}, materials, train, assignments)
     values = {**before, **values}
     former: Mapping[str, Any] = before.get("train", {})
     learnt = _learns_materials(former)
     if values.get("preset") != before.get("preset"):
         former = {}
     elif _learns_materials(merge_options(former, changes)) == learnt:
-        return _validated({**values, "train": merge_options(former, changes)})
+        return _validate_config({**values, "train": merge_options(former, changes)})
     else:
-        former = _differences(_base(before.get("preset"), learnt), former)
+        former = _changed_values(_preset_settings(before.get("preset"), learnt), former)
         former.get("materials", {}).pop("learn", None)
     requested = merge_options(former, changes)
-    base = _base(values.get("preset"), _learns_materials(requested))
-    return _validated({**values, "train": merge_options(base, requested)})
+    base = _preset_settings(values.get("preset"), _learns_materials(requested))
+    return _validate_config({**values, "train": merge_options(base, requested)})
 
 
 def read_config(path: Path) -> ReconstructionConfig:
-    """Return the configuration part of a run's ``config.json``.
+    """Return the ``reconstruction`` section of a run's ``config.json``.
 
     Raises:
         ConfigError: the file is missing, damaged, or of another version.
     """
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
-        return _validated(
-            translate_names((ReconstructionConfig,), content["reconstruction"], source=str(path))
+        return _validate_config(
+            replace_former_names((ReconstructionConfig,), content["reconstruction"], source=str(path))
         )
-    except SettingsRefused as error:
+    except InvalidSettingsError as error:
         raise ConfigError(f"{path} is not a configuration of this version: {error}") from None
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise ConfigError(
@@ -159,24 +165,24 @@ def read_config(path: Path) -> ReconstructionConfig:
         ) from None
 
 
-def _collected(
+def _collect_changes(
     settings: Mapping[str, object],
     materials: bool | None,
     train: Mapping[str, Any] | None,
     assignments: Sequence[str],
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     """Return the requested fields of :class:`RunSettings` and the nested training settings."""
-    values = translate_names((RunSettings,), settings)
+    values = replace_former_names((RunSettings,), settings)
     changes: dict[str, Any] = {} if materials is None else {"materials": {"learn": materials}}
     if train:
-        train = translate_names((TrainConfig,), train)
+        train = replace_former_names((TrainConfig,), train)
         _check_names(train)
         changes = merge_options(changes, train)
     for assignment in assignments:
         path, value = _read_assignment(assignment)
         for name in reversed(path):
             value = {name: value}
-        value = translate_names((RunSettings, TrainConfig), value)
+        value = replace_former_names((RunSettings, TrainConfig), value)
         if RunSettings.model_fields.keys() & value:
             values |= value
             continue
@@ -185,11 +191,11 @@ def _collected(
     return values, changes
 
 
-def _validated(values: Mapping[str, Any]) -> ReconstructionConfig:
+def _validate_config(values: Mapping[str, Any]) -> ReconstructionConfig:
     try:
         return ReconstructionConfig.model_validate(dict(values))
     except ValidationError as error:
-        raise SettingsRefused(refusals_from(error, ReconstructionConfig)) from None
+        raise InvalidSettingsError(refusals_from(error, ReconstructionConfig)) from None
 
 
 def _read_assignment(assignment: str) -> tuple[list[str], Any]:
@@ -197,7 +203,7 @@ def _read_assignment(assignment: str) -> tuple[list[str], Any]:
     name, equals, text = (part.strip() for part in assignment.partition("="))
     if not equals or not name:
         sentence = f"{assignment}: write an assignment as name=value, e.g. lr.mean=2e-4."
-        raise SettingsRefused([Refusal(("assignments",), "assignment", sentence)])
+        raise InvalidSettingsError([Refusal(("assignments",), "assignment", sentence)])
     try:
         value = json.loads(text)
     except ValueError:
@@ -206,7 +212,7 @@ def _read_assignment(assignment: str) -> tuple[list[str], Any]:
     return path[1:] if path[0] == "train" and len(path) > 1 else path, value
 
 
-def _base(preset_name: object, materials: bool) -> dict[str, Any]:
+def _preset_settings(preset_name: object, materials: bool) -> dict[str, Any]:
     """Return the training settings of a preset; empty for an unknown preset, which validation refuses."""
     if preset_name not in PRESETS:
         return {}
@@ -216,7 +222,7 @@ def _base(preset_name: object, materials: bool) -> dict[str, Any]:
             f"The preset {preset_name} is for scenes without materials; with materials choose "
             f"{', '.join(others)} or {last}."
         )
-        raise SettingsRefused([Refusal(("preset",), "materials", sentence)])
+        raise InvalidSettingsError([Refusal(("preset",), "materials", sentence)])
     chosen = preset(str(preset_name))
     return (with_materials(chosen) if materials else chosen).model_dump()
 
@@ -233,13 +239,13 @@ def _learns_materials(train: Mapping[str, Any]) -> bool:
 _BOOL = TypeAdapter(bool)
 
 
-def _differences(base: Mapping[str, Any], values: Mapping[str, Any]) -> dict[str, Any]:
+def _changed_values(base: Mapping[str, Any], values: Mapping[str, Any]) -> dict[str, Any]:
     """Return the values that differ from ``base``, section by section."""
     found: dict[str, Any] = {}
     for key, value in values.items():
         old = base.get(key)
         if isinstance(value, Mapping) and isinstance(old, Mapping) and value.get("kind") == old.get("kind"):
-            if inner := _differences(old, value):
+            if inner := _changed_values(old, value):
                 found[key] = inner
         elif value != (list(old) if isinstance(old, tuple) else old):
             found[key] = value
@@ -250,11 +256,11 @@ def _check_names(train: Mapping[str, Any]) -> None:
     """Refuse settings of the training that there are not, with the nearest name.
 
     Raises:
-        SettingsRefused: some are unknown.
+        InvalidSettingsError: some are unknown.
     """
-    unknown = list(_unknown((TrainConfig,), train, ("train",)))
+    unknown = list(_unknown_paths((TrainConfig,), train, ("train",)))
     if unknown:
-        raise SettingsRefused(
+        raise InvalidSettingsError(
             [
                 refuse_unknown_setting(path, _setting_names(), former=former_setting_names())
                 for path in unknown
@@ -262,7 +268,7 @@ def _check_names(train: Mapping[str, Any]) -> None:
         )
 
 
-def _unknown(
+def _unknown_paths(
     models: Sequence[type[BaseModel]], values: Mapping[str, Any], path: tuple[str, ...]
 ) -> Iterator[tuple[str, ...]]:
     """Yield the paths of values that none of ``models`` has a field for."""
@@ -272,16 +278,16 @@ def _unknown(
         if not infos:
             former = (model.former_settings for model in models if issubclass(model, Settings))
             if not any(key in names for names in former):
-                yield from _leaves(value, place)
+                yield from _leaf_paths(value, place)
         elif isinstance(value, Mapping):
             inner = tuple(model for info in infos for model in submodels(info.annotation))
-            yield from _unknown(inner, value, place)
+            yield from _unknown_paths(inner, value, place)
 
 
-def _leaves(value: object, path: tuple[str, ...]) -> Iterator[tuple[str, ...]]:
+def _leaf_paths(value: object, path: tuple[str, ...]) -> Iterator[tuple[str, ...]]:
     if isinstance(value, Mapping) and value:
         for key, inner in value.items():
-            yield from _leaves(inner, (*path, str(key)))
+            yield from _leaf_paths(inner, (*path, str(key)))
     else:
         yield path
 

@@ -14,7 +14,7 @@ from octasplat.engine.dataset.camera_clearance import CameraClearance
 from octasplat.engine.dataset.scene_split import SplitRule
 from octasplat.engine.dataset.views_file import SplitViewpoints, ViewsRecord, read_views, scene_viewpoints
 from octasplat.engine.files import read_metadata
-from octasplat.engine.render.environment_files import read_background
+from octasplat.engine.render.environment_files import read_background_map
 from octasplat.engine.runs.config import ReconstructionConfig, read_config
 from octasplat.engine.shading.background import LearnedBackground
 from octasplat.engine.shading.exposure import ExposuresByName
@@ -163,7 +163,7 @@ def run_background(output: Path) -> LearnedBackground | None:
     """
     if read_config(output / CONFIG).train.background != "learnt":
         return None
-    return LearnedBackground.from_map(read_background(output / BACKGROUND))
+    return LearnedBackground.from_map(read_background_map(output / BACKGROUND))
 
 
 def unexported_parts(output: Path) -> str | None:
@@ -192,7 +192,7 @@ def open_run_dataset(
     progress: EventListener,
     *,
     model_folder: Path | None = None,
-    accept: Callable[[ViewsRecord], None] | None = None,
+    check_views: Callable[[ViewsRecord], None] | None = None,
 ) -> Dataset:
     """Open the photographs of a run with its settings, ready for training or evaluation.
 
@@ -201,9 +201,10 @@ def open_run_dataset(
         output: folder of the run, which holds the cache.
         config: of the run.
         threads: for decoding; 0 takes all cores.
-        progress: hears the progress and what is odd but usable.
+        progress: receives the progress events, and what is odd but usable.
         model_folder: of poses that were found, see :func:`found_model_folder`.
-        accept: told what was found before anything is written; to refuse it, it raises.
+        check_views: called with the record of the views before any photograph is decoded; raises to reject
+            the dataset.
 
     Raises:
         DatasetError: the photographs cannot be used.
@@ -220,7 +221,7 @@ def open_run_dataset(
         masks=config.masks,
         model_folder=model_folder,
         model=config.model,
-        accept=accept,
+        check_views=check_views,
         near=config.train.near,
         origin_world=run_origin(output),
         threads=threads,

@@ -103,7 +103,12 @@ def repair_run_poses(
         return False
     with phase("check", progress, COARSE_ITERATIONS):
         doubtful = _find_misplaced_views(
-            dataset, config.train.background, config.train.seed, threads, progress, should_stop
+            dataset=dataset,
+            background=config.train.background,
+            seed=config.train.seed,
+            threads=threads,
+            progress=progress,
+            should_stop=should_stop,
         )
     if len(doubtful) == 0:
         return False

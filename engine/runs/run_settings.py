@@ -34,16 +34,16 @@ class RunSettings(BaseModel):
     test_every: Annotated[int, Unit("views"), BASIC] = Field(
         8,
         ge=0,
-        description="Every how-manieth view by name is held out to be measured; 0 holds out none, so that "
+        description="Every N-th view by name is held out to be measured; 0 holds out none, so that "
         "all are trained on.",
     )
     held_out: Annotated[tuple[str, ...] | None, Spelling(metavar="NAME"), ADVANCED] = Field(
-        None, description="Names of the views to hold out instead of every how-manieth."
+        None, description="Names of the views to hold out instead of every N-th."
     )
     split: Annotated[Literal["given", "every"], ADVANCED] = Field(
         "given",
         description="Which views are held out where the scene says so itself (transforms_test.json): given "
-        "follows it, every takes every how-manieth view all the same.",
+        "follows it, every takes every N-th view all the same.",
     )
     burst_length: Annotated[int, Unit("views"), ADVANCED] = Field(
         1,
@@ -90,4 +90,4 @@ class RunSettings(BaseModel):
     @model_validator(mode="before")
     @classmethod
     def _by_new_names(cls, given: Any) -> Any:
-        return renamed_settings.translate_names((cls,), given) if isinstance(given, Mapping) else given
+        return renamed_settings.replace_former_names((cls,), given) if isinstance(given, Mapping) else given

@@ -16,7 +16,7 @@ from pydantic.fields import FieldInfo
 from octasplat.engine.core.errors import ConfigError
 from octasplat.engine.runs.config import ReconstructionConfig, former_setting_names, resolve_config
 from octasplat.engine.settings.fields import Group, SettingLevel, Unit
-from octasplat.engine.settings.refusals import SettingsRefused, refuse_unknown_setting
+from octasplat.engine.settings.refusals import InvalidSettingsError, refuse_unknown_setting
 from octasplat.engine.train.config.presets import PRESETS, PRESETS_WITH_MATERIALS
 
 MATERIALS = "+materials"
@@ -87,7 +87,7 @@ def all_settings() -> tuple[Setting, ...]:
         defaults = {key: value[name] for key, value in values.items() if name in value}
         if name == "preset":
             defaults = {"standard": "standard"}
-        found.setdefault(name, _setting(name, info, defaults))
+        found.setdefault(name, _setting_entry(name, info, defaults))
     return tuple(found.values())
 
 
@@ -105,14 +105,14 @@ def find_setting(name: str) -> Setting:
     inside = [known for known in names if known.startswith(f"{plain_name}.")]
     if inside:
         raise ConfigError(f"{name} is a group of settings: {', '.join(inside)}.")
-    raise SettingsRefused(
+    raise InvalidSettingsError(
         [refuse_unknown_setting(plain_name.split("."), names, former=former_setting_names())]
     )
 
 
 def setting_values(config: ReconstructionConfig) -> dict[str, object]:
     """Return the JSON value of each setting by its name."""
-    return dict(_flattened(config.model_dump(mode="json"), ""))
+    return dict(_flatten_settings(config.model_dump(mode="json"), ""))
 
 
 def setting_differences(before: ReconstructionConfig, after: ReconstructionConfig) -> tuple[Difference, ...]:
@@ -145,28 +145,36 @@ def format_value(value: object) -> str:
 def _walk(model: type[BaseModel], prefix: str) -> Iterator[tuple[str, FieldInfo]]:
     for name, info in model.model_fields.items():
         path = f"{prefix}{name}".removeprefix("train.")
-        models = [part for part in _parts(info.annotation) if _is_model(part)]
+        models = [part for part in _alternatives(info.annotation) if _is_model(part)]
         if not models:
             yield path, info
         for inner in models:
             yield from _walk(inner, f"{prefix}{name}.")
 
 
-def _setting(name: str, info: FieldInfo, defaults: Mapping[str, object]) -> Setting:
+def _setting_entry(name: str, info: FieldInfo, defaults: Mapping[str, object]) -> Setting:
     group: SettingLevel = next((mark.level for mark in info.metadata if isinstance(mark, Group)), "advanced")
     unit = next((mark.symbol for mark in info.metadata if isinstance(mark, Unit)), "")
     kind = _type_text(info.annotation)
     if name == "densify.kind":
         kind = " or ".join(dict.fromkeys(str(value) for value in defaults.values()))
-    return Setting(name, kind, unit, _range_text(info.metadata), group, info.description or "", defaults)
+    return Setting(
+        name=name,
+        type=kind,
+        unit=unit,
+        range=_range_text(info.metadata),
+        group=group,
+        description=info.description or "",
+        defaults=defaults,
+    )
 
 
-def _parts(annotation: Any) -> tuple[Any, ...]:
+def _alternatives(annotation: Any) -> tuple[Any, ...]:
     """Return the alternatives of a type annotation, without their marks."""
     if get_origin(annotation) is Annotated:
-        return _parts(get_args(annotation)[0])
+        return _alternatives(get_args(annotation)[0])
     if get_origin(annotation) in (Union, types.UnionType):
-        return tuple(part for option in get_args(annotation) for part in _parts(option))
+        return tuple(part for option in get_args(annotation) for part in _alternatives(option))
     return (annotation,)
 
 
@@ -185,7 +193,7 @@ _TYPE_NAMES: Mapping[Any, str] = {
 
 def _type_text(annotation: Any) -> str:
     texts: list[str] = []
-    for part in _parts(annotation):
+    for part in _alternatives(annotation):
         if get_origin(part) is Literal:
             texts += map(str, get_args(part))
         elif get_origin(part) is tuple:
@@ -218,10 +226,10 @@ def _range_text(marks: Sequence[Any]) -> str:
     return ", ".join(texts)
 
 
-def _flattened(values: Mapping[str, Any], prefix: str) -> Iterator[tuple[str, object]]:
+def _flatten_settings(values: Mapping[str, Any], prefix: str) -> Iterator[tuple[str, object]]:
     for name, value in values.items():
         path = f"{prefix}{name}"
         if isinstance(value, Mapping):
-            yield from _flattened(value, f"{path}.")
+            yield from _flatten_settings(value, f"{path}.")
         else:
             yield path.removeprefix("train."), value

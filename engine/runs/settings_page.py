@@ -24,14 +24,14 @@ def settings_page() -> str:
     """Return ``docs/settings.md``: all settings by group, as Markdown."""
     lines = [_INTRODUCTION]
     for level, title in _TITLES:
-        rows = (_columns(entry) for entry in all_settings() if entry.group == level)
+        rows = (_setting_row(entry) for entry in all_settings() if entry.group == level)
         lines += [f"## {title}", "", *_HEAD]
-        lines += ["| " + " | ".join(map(_cell, row)) + " |" for row in rows]
+        lines += ["| " + " | ".join(map(_escape_cell, row)) + " |" for row in rows]
         lines.append("")
     return "\n".join(lines[:-1]) + "\n"
 
 
-def _columns(entry: Setting) -> tuple[str, ...]:
+def _setting_row(entry: Setting) -> tuple[str, ...]:
     kind = entry.type + (f", {entry.range}" if entry.range else "")
     return f"`{entry.name}`", kind, entry.unit, _defaults_text(entry), entry.description
 
@@ -44,5 +44,5 @@ def _defaults_text(entry: Setting) -> str:
     return format_value(entry.default) + (f" ({rest})" if rest else "")
 
 
-def _cell(text: str) -> str:
+def _escape_cell(text: str) -> str:
     return text.replace("|", "\\|").replace("<", "&lt;")

@@ -72,7 +72,7 @@ def training_photographs(
         source: the folder of a run, or a file of Gaussians, which has none.
         dataset: the folder of the photographs; None takes the one that the run was made from.
         threads: for decoding; 0 takes all cores.
-        progress: hears the progress, and why there are none.
+        progress: receives the progress events, and why there are none.
         copy: another folder of the photographs that the run was made from.
 
     Returns:
@@ -95,9 +95,9 @@ def training_photographs(
         progress(Noted(f"{instead}. {error}"))
         return ()
     try:
-        accept = partial(_check_same_poses, source, folder)
+        check_views = partial(_check_same_poses, source, folder)
         opened = open_run_dataset(
-            folder, source, config, threads, progress, model_folder=model, accept=accept
+            folder, source, config, threads, progress, model_folder=model, check_views=check_views
         )
     except DatasetError as error:
         if dataset is not None:
@@ -107,7 +107,9 @@ def training_photographs(
     exposures = None
     if (known := run_exposures(source)) is not None:
         exposures = ExposureModel.from_known([view.name for view in opened.views], known)
-    return tuple(partial(_photograph, opened, exposures, index) for index in opened.train_indices.tolist())
+    return tuple(
+        partial(_photograph_rays, opened, exposures, index) for index in opened.train_indices.tolist()
+    )
 
 
 def _check_same_poses(source: Path, folder: Path, found: ViewsRecord) -> None:
@@ -123,7 +125,7 @@ def _check_same_poses(source: Path, folder: Path, found: ViewsRecord) -> None:
         )
 
 
-def _photograph(
+def _photograph_rays(
     dataset: Dataset, exposures: ExposureModel | None, index: int
 ) -> tuple[ImageRays, UInt8[np.ndarray, "h w 4"]]:
     rgb, alpha, weight = dataset.view_image(index)

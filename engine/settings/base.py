@@ -6,7 +6,7 @@ from typing import Any, ClassVar
 
 from pydantic import BaseModel, ConfigDict, model_validator
 
-from octasplat.engine.settings.renamed_settings import NONE, FormerNames, former_names, translate_names
+from octasplat.engine.settings.renamed_settings import NONE, FormerNames, former_names, replace_former_names
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ class Settings(BaseModel):
         """Read former names; leave out former settings that have the value of the constant, refuse others."""
         if not isinstance(given, Mapping):
             return given
-        values = translate_names((cls,), given)
+        values = replace_former_names((cls,), given)
         for name, former in cls.former_settings.items():
             if name not in values or name in cls.model_fields:
                 continue

@@ -152,7 +152,7 @@ def map_named_files(options: BaseModel, change: Callable[[Path], Path]) -> dict[
     values: dict[str, Any] = {}
     for name, info in type(options).model_fields.items():
         annotation = Annotated[info.annotation, *info.metadata] if info.metadata else info.annotation
-        values[name] = _mapped(annotation, getattr(options, name), change)
+        values[name] = _map_files(annotation, getattr(options, name), change)
     return values
 
 
@@ -176,9 +176,9 @@ def _files_in(annotation: Any, value: Any, place: str) -> Iterator[tuple[str, Pa
         yield place, value
 
 
-def _mapped(annotation: Any, value: Any, change: Callable[[Path], Path]) -> Any:
+def _map_files(annotation: Any, value: Any, change: Callable[[Path], Path]) -> Any:
     if value is None or not _has_files(annotation):
         return value
     if isinstance(value, tuple | list):
-        return tuple(_mapped(annotation, item, change) for item in value)
+        return tuple(_map_files(annotation, item, change) for item in value)
     return change(value) if isinstance(value, Path) else value

@@ -29,8 +29,8 @@ class Refusal:
     sentence: str
 
 
-class SettingsRefused(ConfigError):
-    """Settings that cannot be used; the text is the first one's sentence."""
+class InvalidSettingsError(ConfigError):
+    """Settings that are unknown, out of range or contradictory; the message is the first one's sentence."""
 
     error_type = "settings_refused"
 
@@ -44,10 +44,10 @@ def refusals_from(error: ValidationError, model: type[BaseModel]) -> list[Refusa
     found: dict[tuple[str | int, ...], Refusal] = {}
     for fault in error.errors(include_url=False):
         if fault["type"] == "extra_forbidden":
-            refusal = _unknown(model, fault["loc"])
+            refusal = _unknown_field_refusal(model, fault["loc"])
         else:
             path, _, _ = _path_in(model, fault["loc"])
-            refusal = Refusal(path, fault["type"], _sentence(path, fault))
+            refusal = Refusal(path, fault["type"], _fault_sentence(path, fault))
         found.setdefault(refusal.path, refusal)
     return list(found.values())
 
@@ -93,7 +93,7 @@ def submodels(annotation: Any) -> tuple[type[BaseModel], ...]:
     return (annotation,) if isinstance(annotation, type) and issubclass(annotation, BaseModel) else ()
 
 
-def _sentence(path: Sequence[str | int], fault: Mapping[str, Any]) -> str:
+def _fault_sentence(path: Sequence[str | int], fault: Mapping[str, Any]) -> str:
     is_ours = fault["type"] == "value_error"
     name = "" if is_ours and tuple(path) == ("train",) else setting_name(path)
     message = str(fault["msg"]).removeprefix("Value error, ").removesuffix(".")
@@ -103,7 +103,7 @@ def _sentence(path: Sequence[str | int], fault: Mapping[str, Any]) -> str:
     return f"{name}: {message}{value_text}." if name else f"{message}."
 
 
-def _unknown(model: type[BaseModel], place: Sequence[str | int]) -> Refusal:
+def _unknown_field_refusal(model: type[BaseModel], place: Sequence[str | int]) -> Refusal:
     """Return the refusal of a field that a model does not have."""
     path, models, kind = _path_in(model, place[:-1])
     if kind:

@@ -1,6 +1,6 @@
 """Settings and options that were renamed since the last version, whose former names this version still reads.
 
-A model names its part of the tables as ``former_names``; :func:`translate_names` is the only reader of them.
+A model names its part of the tables as ``former_names``; :func:`replace_former_names` alone reads them.
 The next version drops this module.
 """
 
@@ -131,10 +131,10 @@ def former_names(model: type[BaseModel]) -> FormerNames:
     return found
 
 
-def translate_names(
+def replace_former_names(
     models: Iterable[type[BaseModel]], values: Mapping[str, Any], prefix: str = "", source: str = ""
 ) -> dict[str, Any]:
-    """Return nested values under the present names, with a notice for each former one.
+    """Return nested values with settings' former names replaced by the present ones; notifies of each.
 
     Where a field is given by both names, the later one counts.
 
@@ -145,14 +145,14 @@ def translate_names(
         source: where they stand, such as a file, for the notice.
     """
     renamed: dict[str, str] = {}
-    result = _renamed(tuple(models), values, prefix, prefix, renamed)
+    result = _replace_names(tuple(models), values, prefix, prefix, renamed)
     if renamed:
         notify_renamed(renamed, source)
     return result
 
 
 def notify_renamed(renamed: Mapping[str, str], source: str = "") -> None:
-    """Tell that names of the last version were read: a warning, or a notice where those are collected."""
+    """Notify that names of the last version were read: a warning, or a notice where those are collected."""
     listed = list(renamed.items())[:_SHOWN]
     changes = ", ".join(f"{old} is called {new} now" for old, new in listed)
     more = f", and {len(renamed) - _SHOWN} more have new names" if len(renamed) > _SHOWN else ""
@@ -175,7 +175,7 @@ def collect_notices() -> Iterator[list[str]]:
         _collected.reset(token)
 
 
-def _renamed(
+def _replace_names(
     models: tuple[type[BaseModel], ...],
     values: Mapping[str, Any],
     before: str,
@@ -197,7 +197,7 @@ def _renamed(
         if isinstance(value, Mapping) and inner:
             # The settings of the training need no "train." before them.
             places = (before, after) if name == "train" else (f"{before}{key}.", f"{after}{name}.")
-            value = _renamed(inner, value, *places, renamed)
+            value = _replace_names(inner, value, *places, renamed)
             if isinstance(result.get(name), Mapping):
                 value = {**result[name], **value}
         elif f"{before}{key}" != f"{after}{name}":

@@ -20,7 +20,7 @@ from octasplat.engine.gaussians.channels import stack_channels
 from octasplat.engine.gaussians.materials import AMBIENT, DIFFUSE_INTERREFLECTION, MATERIAL_WIDTHS
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.shading.ambient_occlusion import UNOCCLUDED, ambient_visibility, diffuse_interreflection
-from octasplat.engine.shading.depth_split import DepthSplit, no_split, split_by_depth
+from octasplat.engine.shading.depth_split import DepthLayers, single_layer, split_by_depth
 from octasplat.engine.shading.environment_frame import environment_frame
 from octasplat.engine.shading.environment_light import EnvironmentLight
 from octasplat.engine.shading.gbuffer import GBuffer, RayOffset, backward_gbuffer, build_gbuffer
@@ -53,7 +53,7 @@ class ShadingContext:
     """What :meth:`DeferredShading.backward` needs of :meth:`DeferredShading.shade`.
 
     Attributes:
-        depth_split: the surfaces that were shaded each by itself, ``l`` layers of ``r`` rays.
+        depth_layers: the layers that were shaded separately, ``l`` of ``r`` rays.
         gbuffer: blended materials, normals and positions of the ``p`` shaded points.
         surface: the points as they were shaded.
         linear: their radiance.
@@ -62,7 +62,7 @@ class ShadingContext:
         ramp: share of the picture that is shaded, not taken from the harmonics.
     """
 
-    depth_split: DepthSplit
+    depth_layers: DepthLayers
     gbuffer: GBuffer
     surface: SurfacePoints
     linear: Float64[np.ndarray, "p 3"]
@@ -102,9 +102,11 @@ class DeferredShading:
             smoothness_weight=settings.environment_smoothness_weight,
         )
         self.frame = environment_frame(np.array(settings.up_world, np.float64))
-        self._ray_bias = settings.ray_bias * extent_world
-        self._reflection_offset = RayOffset(self._ray_bias, settings.backface_cull_distance * extent_world)
-        self._hemisphere_offset = self._reflection_offset._replace(bias_world=2 * self._ray_bias)
+        self._ray_bias_world = settings.ray_bias * extent_world
+        self._reflection_offset = RayOffset(
+            self._ray_bias_world, settings.backface_cull_distance * extent_world
+        )
+        self._hemisphere_offset = self._reflection_offset._replace(bias_world=2 * self._ray_bias_world)
         self._occlusion_turn = np.array([-1.0, -1.0])
         self._features: Float32[np.ndarray, "n f"] = np.empty((0, 5), np.float32)
 
@@ -219,7 +221,7 @@ class DeferredShading:
         ramp, result = self.settings.shading_ramp(traced.training_progress), traced.result
         if ramp == 0:
             return ShadedRays(result.rgb_srgb, result.transmittance)
-        split = self._split_by_depth(traced)
+        split = self._split_into_layers(traced)
         gbuffer = build_gbuffer(split.rays, split.results)
         surface, incident = self._surface_with_ambient(split.results, gbuffer), None
         if self.settings.visibility and traced.training_progress >= self.settings.secondary_from:
@@ -227,11 +229,19 @@ class DeferredShading:
             visibility, indirect = incident.incident
             surface = replace(surface, visibility=visibility, indirect_linear=indirect)
         linear = shade(surface, self.light.levels, self.frame)
-        display = self._display(linear)
-        context = ShadingContext(split, gbuffer, surface, linear, display, incident, ramp)
+        display = self._to_display(linear)
+        context = ShadingContext(
+            depth_layers=split,
+            gbuffer=gbuffer,
+            surface=surface,
+            linear=linear,
+            display=display,
+            incident=incident,
+            ramp=ramp,
+        )
         rgb = self._unshaded_part(traced, context)
         rgb[gbuffer.ray_ids] += (ramp * gbuffer.alpha[:, None] * display).astype(np.float32)
-        layers = {} if traced.view is not None else self._layers(context, rgb)
+        layers = {} if traced.view is not None else self._named_layers(context, rgb)
         return ShadedRays(split.sum_layers(rgb), result.transmittance, context, layers)
 
     def backward(
@@ -245,7 +255,7 @@ class DeferredShading:
         settings, ctx = self.settings, shaded.ctx
         if not isinstance(ctx, ShadingContext):
             return ShadingGradients(TraceGradients(rgb_srgb=by_rgb, transmittance=by_transmittance))
-        split, gbuffer, incident = ctx.depth_split, ctx.gbuffer, ctx.incident
+        split, gbuffer, incident = ctx.depth_layers, ctx.gbuffer, ctx.incident
         # --- regularisers of the rays' geometry and materials ---
         by_alpha = -by_transmittance.astype(np.float64)
         by_normal = np.zeros((len(by_rgb), 3))
@@ -311,13 +321,16 @@ class DeferredShading:
 
     # --- the steps in which recipes differ ---
 
-    def _split_by_depth(self, traced: TracedRays) -> DepthSplit:
-        """Return the surfaces that are shaded each by itself."""
+    def _split_into_layers(self, traced: TracedRays) -> DepthLayers:
+        """Return the depth layers of the rays, each to be shaded separately."""
         if self.settings.depth_split == 0:
-            return no_split(traced.rays, traced.result)
-        separation, record = self.settings.depth_split * self._ray_bias, traced.view is not None
+            return single_layer(traced.rays, traced.result)
         return split_by_depth(
-            traced.rays, traced.result, traced.tracer, min_separation_world=separation, record=record
+            traced.rays,
+            traced.result,
+            traced.tracer,
+            min_separation_world=self.settings.depth_split * self._ray_bias_world,
+            record_for_backward=traced.view is not None,  # only rays of a training batch have a view
         )
 
     def _surface_with_ambient(self, result: TraceResult, gbuffer: GBuffer) -> SurfacePoints:
@@ -331,18 +344,23 @@ class DeferredShading:
             return surface
         return replace(surface, bounced_linear=features[:, INTERREFLECTION_COLUMNS])
 
-    def _trace_incident(self, traced: TracedRays, split: DepthSplit, gbuffer: GBuffer) -> IncidentLightModel:
+    def _trace_incident(self, traced: TracedRays, split: DepthLayers, gbuffer: GBuffer) -> IncidentLightModel:
         """Trace the light that comes in along reflected directions."""
         settings = self.settings
         if settings.indirect != "shaded":
             return SingleRayIncidentLight.trace(traced, split, gbuffer, self._reflection_offset, settings)
         reflection_tracer = ReflectionTracer(
-            traced.tracer, self.light.levels, self.frame, self._surface_with_ambient,
-            settings.max_bounces, self._reflection_offset, settings.depth_split * self._ray_bias,
-        )  # fmt: skip
+            tracer=traced.tracer,
+            light=self.light.levels,
+            frame=self.frame,
+            with_ambient=self._surface_with_ambient,
+            max_bounces=settings.max_bounces,
+            offset=self._reflection_offset,
+            min_separation_world=settings.depth_split * self._ray_bias_world,
+        )
         return RayPairIncidentLight.trace(traced, split, gbuffer, reflection_tracer, settings)
 
-    def _display(self, linear: Float64[np.ndarray, "p 3"]) -> Float64[np.ndarray, "p 3"]:
+    def _to_display(self, linear: Float64[np.ndarray, "p 3"]) -> Float64[np.ndarray, "p 3"]:
         """Return the colours with which radiance is shown."""
         return linear_to_srgb(np.minimum(linear, 1.0))
 
@@ -356,7 +374,7 @@ class DeferredShading:
 
     def _unshaded_part(self, traced: TracedRays, ctx: ShadingContext) -> Float32[np.ndarray, "l 3"]:
         """Return what the harmonics add to the colours of each layer."""
-        return ctx.depth_split.results.rgb_srgb * np.float32(1 - ctx.ramp)
+        return ctx.depth_layers.results.rgb_srgb * np.float32(1 - ctx.ramp)
 
     def _unshaded_part_backward(
         self,
@@ -371,9 +389,9 @@ class DeferredShading:
         Once the harmonics add nothing any more, they learn the shaded colours.
         """
         if ctx.ramp < 1:
-            return ctx.depth_split.expand(by_rgb * np.float32(1 - ctx.ramp))
+            return ctx.depth_layers.expand(by_rgb * np.float32(1 - ctx.ramp))
         weight = np.float32(self.settings.harmonics_weight * 2 / (3 * len(by_rgb)))
-        return ctx.depth_split.expand(weight * (traced.result.rgb_srgb - shaded.rgb_srgb))
+        return ctx.depth_layers.expand(weight * (traced.result.rgb_srgb - shaded.rgb_srgb))
 
     def _layer_radiance(
         self, ctx: ShadingContext, rgb_srgb: Float32[np.ndarray, "l 3"]
@@ -383,7 +401,7 @@ class DeferredShading:
 
     # --- layers of a finished picture ---
 
-    def _layers(
+    def _named_layers(
         self, ctx: ShadingContext, rgb_srgb: Float32[np.ndarray, "l 3"]
     ) -> dict[str, Float32[np.ndarray, "r _"]]:
         """Return radiance, materials, visibility and indirect light by name, means over each ray's layers."""
@@ -396,4 +414,4 @@ class DeferredShading:
             "visibility": surface.visibility[:, None],
             "indirect": surface.indirect_linear,
         }
-        return ctx.depth_split.ray_means(ctx.gbuffer.ray_ids, ctx.gbuffer.alpha, values)
+        return ctx.depth_layers.ray_means(ctx.gbuffer.ray_ids, ctx.gbuffer.alpha, values)

@@ -20,8 +20,8 @@ MIN_FRACTION = 0.05
 
 
 @dataclass(frozen=True)
-class DepthSplit:
-    """What rays show, one surface at a time: ``l`` parts of ``r`` rays.
+class DepthLayers:
+    """Depth layers of rays, each one surface: ``l`` parts of ``r`` rays.
 
     The first ``r`` parts are the rays as they were, those of ``split_ids`` without their front; then come the
     fronts. The transmittance of a part is one minus what it adds to the ray's accumulated alpha.
@@ -87,14 +87,19 @@ class DepthSplit:
         return TraceGradients(**of_rays), fronts
 
 
-def no_split(rays: RayBatch, result: TraceResult) -> DepthSplit:
-    """Return rays as one layer each."""
-    return DepthSplit(rays, result, np.empty(0, np.int64))
+def single_layer(rays: RayBatch, result: TraceResult) -> DepthLayers:
+    """Return rays as one depth layer each, none of them split."""
+    return DepthLayers(rays, result, np.empty(0, np.int64))
 
 
 def split_by_depth(
-    rays: RayBatch, result: TraceResult, tracer: Tracer, *, min_separation_world: float, record: bool
-) -> DepthSplit:
+    rays: RayBatch,
+    result: TraceResult,
+    tracer: Tracer,
+    *,
+    min_separation_world: float,
+    record_for_backward: bool,
+) -> DepthLayers:
     """Split the rays whose mean depth is farther than ``min_separation_world`` from the median.
 
     Args:
@@ -102,20 +107,20 @@ def split_by_depth(
         result: along them.
         tracer: that traced them.
         min_separation_world: distance between mean and median depth, world units.
-        record: whether to keep what the backward pass needs.
+        record_for_backward: whether to keep what the backward pass needs.
     """
     mean = result.expected_depth
     far = (np.abs(mean - result.depth_median) > min_separation_world) & (result.depth_median > 0)
     split_ids = np.flatnonzero(far)
     if not len(split_ids):
-        return no_split(rays, result)
+        return single_layer(rays, result)
     ends = np.minimum(np.broadcast_to(rays.t_max, len(rays))[split_ids], mean[split_ids])
     front_rays = rays[split_ids].with_t_max(ends)
-    front = tracer.trace(front_rays, record=record)
+    front = tracer.trace(front_rays, record=record_for_backward)
     is_split = (front.alpha > MIN_FRACTION) & (result.alpha[split_ids] - front.alpha > MIN_FRACTION)
     split_ids = split_ids[is_split]
     if not len(split_ids):
-        return no_split(rays, result)
+        return single_layer(rays, result)
 
     def divided(sums: Float32[np.ndarray, "r *c"], ahead: Float32[np.ndarray, "t *c"]) -> np.ndarray:
         back = sums.copy()
@@ -134,6 +139,6 @@ def split_by_depth(
         features=divided(result.features, front.features),
         hit_counts=listed(result.hit_counts, front.hit_counts),
     )
-    return DepthSplit(
+    return DepthLayers(
         concatenate_rays(rays, front_rays[is_split]), parts, split_ids, front.recording, is_split
     )

@@ -69,7 +69,7 @@ class EnvironmentPrefilter:
             self._maps.append(_lobe_matrix(int(self.heights[level]), source, alpha, _LEAST[level]))
 
     @cached_property
-    def _transposed(self) -> list[_SparseRows]:
+    def _transposed_filters(self) -> list[_SparseRows]:
         """Return the transposed filters, which training alone needs."""
         sources = [self.height >> halving for halving in _SOURCES[1:]]
         return [rows.transpose(2 * s * s) for rows, s in zip(self._maps, sources, strict=True)]
@@ -90,7 +90,7 @@ class EnvironmentPrefilter:
         sizes = [2 * (self.height >> halving) ** 2 for halving in range(max(_SOURCES) + 1)]
         sums = [np.zeros((size, 3)) for size in sizes]
         sums[0] += by_texels[: self.offsets[1]]
-        for level, transposed in enumerate(self._transposed, start=1):
+        for level, transposed in enumerate(self._transposed_filters, start=1):
             part = np.empty_like(sums[_SOURCES[level]])
             transposed.multiply(by_texels[self.offsets[level] : self.offsets[level + 1]], part)
             sums[_SOURCES[level]] += part

@@ -73,7 +73,7 @@ def _line_then_neighbors(
 ) -> Estimator:
     """Predict by a line over the brightness, then by the residuals of the views before and after."""
     middle, height = brightness.mean(), known.mean(axis=0)
-    slopes, left_out, trust = _slopes(brightness - middle, known, height)
+    slopes, left_out, trust = _fit_slopes(brightness - middle, known, height)
     off_line = known - trust * (brightness - middle)[:, None] * slopes
     predicted, residuals = _neighbor_mean(off_line, times, other_times)
     missed = trust * ((brightness - middle)[:, None] * slopes - left_out)[1:-1]
@@ -90,12 +90,12 @@ def _neighbors_then_line(
     """Predict by the views before and after, then by a line over how much brighter than these a view is."""
     predicted, residuals = _neighbor_mean(known, times, other_times)
     brighter = brightness[1:-1] - _leave_one_out_neighbors(brightness[:, None], times)[:, 0]
-    slopes, left_out, trust = _slopes(brighter, residuals)
+    slopes, left_out, trust = _fit_slopes(brighter, residuals)
     other_brighter = other_brightness - np.interp(other_times, times, brightness)
     return predicted + trust * other_brighter[:, None] * slopes, residuals - trust * left_out
 
 
-def _slopes(
+def _fit_slopes(
     brightness: Float64[np.ndarray, " k"],
     known: Float64[np.ndarray, "k c"],
     height: Float64[np.ndarray, " c"] | None = None,
@@ -112,7 +112,7 @@ def _slopes(
     if height is not None:
         fitted, leverage = fitted + height, leverage + 1 / len(brightness)
     left_out = known - (known - fitted) / np.maximum(1 - leverage[:, None], 1e-6)
-    return slopes, left_out, _shrinkage(left_out, known)
+    return slopes, left_out, _shrinkage_factor(left_out, known)
 
 
 def _neighbor_mean(
@@ -123,7 +123,7 @@ def _neighbor_mean(
     """Return the mean of the trained views before and after, weighted by nearness, times the trust."""
     interpolated = np.stack([np.interp(other_times, times, channel) for channel in known.T], axis=1)
     between = _leave_one_out_neighbors(known, times)
-    trust = _shrinkage(between, known[1:-1])
+    trust = _shrinkage_factor(between, known[1:-1])
     return trust * interpolated, known[1:-1] - trust * between
 
 
@@ -135,7 +135,7 @@ def _leave_one_out_neighbors(
     return known[:-2] + share[:, None] * (known[2:] - known[:-2])
 
 
-def _shrinkage(predicted: Float64[np.ndarray, "k c"], known: Float64[np.ndarray, "k c"]) -> float:
+def _shrinkage_factor(predicted: Float64[np.ndarray, "k c"], known: Float64[np.ndarray, "k c"]) -> float:
     """Return the factor in [0, 1] that brings predictions nearest to known values."""
     scale = float((predicted**2).sum())
     return min(max(float((predicted * known).sum()) / scale, 0.0), 1.0) if scale > 0 else 0.0

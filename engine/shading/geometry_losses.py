@@ -159,7 +159,7 @@ def add_material_smoothness_gradient(
     for one, other in _NEIGHBOR_SLICES:
         difference = material[one] - material[other]
         slope = difference / np.sqrt(difference**2 + HUBER_DELTA**2)
-        slope = _where(opaque[one] & opaque[other], slope) * share
+        slope = _zero_outside(opaque[one] & opaque[other], slope) * share
         both = np.clip(np.minimum(material[one][..., 3:4], material[other][..., 3:4]), 0, 1)
         slope[..., :3] *= 1 + metal * both**2
         gradient[one] += slope
@@ -169,7 +169,7 @@ def add_material_smoothness_gradient(
     by_alpha[ray_ids] -= (by_flat * flat).sum(axis=1) / safe_alpha[:, 0]
 
 
-def _where(
+def _zero_outside(
     mask: Bool[np.ndarray, "*shape"], values: Float64[np.ndarray, "*shape 5"]
 ) -> Float64[np.ndarray, "*shape 5"]:
     return np.where(mask[..., None], values, 0.0)

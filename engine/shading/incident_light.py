@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from octasplat.engine.core.color import srgb_to_linear
-from octasplat.engine.shading.depth_split import DepthSplit
+from octasplat.engine.shading.depth_split import DepthLayers
 from octasplat.engine.shading.gbuffer import GBuffer, RayOffset, reflected_rays
 from octasplat.engine.shading.gradient_ops import srgb_derivative
 from octasplat.engine.shading.material_settings import MaterialSettings
@@ -78,7 +78,7 @@ class RayPairIncidentLight:
     def trace(
         cls,
         traced: TracedRays,
-        split: DepthSplit,
+        split: DepthLayers,
         gbuffer: GBuffer,
         reflection_tracer: ReflectionTracer,
         settings: MaterialSettings,
@@ -149,7 +149,7 @@ class SingleRayIncidentLight:
     def trace(
         cls,
         traced: TracedRays,
-        split: DepthSplit,
+        split: DepthLayers,
         gbuffer: GBuffer,
         offset: RayOffset,
         settings: MaterialSettings,

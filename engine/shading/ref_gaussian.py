@@ -21,7 +21,7 @@ from octasplat.engine.gaussians.materials import (
 )
 from octasplat.engine.gaussians.model import SH_C0, FlatGaussians
 from octasplat.engine.shading.deferred import DeferredShading, ShadingContext
-from octasplat.engine.shading.depth_split import DepthSplit, no_split
+from octasplat.engine.shading.depth_split import DepthLayers, single_layer
 from octasplat.engine.shading.gbuffer import GBuffer, reflected_rays
 from octasplat.engine.shading.incident_light import IncidentLightModel, SingleRayIncidentLight
 from octasplat.engine.shading.material_settings import MaterialSettings
@@ -99,11 +99,11 @@ class RefGaussianShading(DeferredShading):
     ) -> None:
         """Step as the other model, but start materials and environment over when deferred shading begins."""
         if is_deferred(training_progress) and not self._has_restarted[0]:
-            self._restart(gaussians)
+            self._reset_materials(gaussians)
             return
         super().step(gaussians, gradients, parameters, training_progress=training_progress)
 
-    def _restart(self, gaussians: FlatGaussians) -> None:
+    def _reset_materials(self, gaussians: FlatGaussians) -> None:
         first = 0
         for name, width in MATERIAL_WIDTHS.items():
             gaussians.channels[name][:] = DEFERRED_MATERIAL[first : first + width]
@@ -121,14 +121,14 @@ class RefGaussianShading(DeferredShading):
         super().restore(state)
         self._has_restarted = state["materials.started_over"].copy()
 
-    def _split_by_depth(self, traced: TracedRays) -> DepthSplit:
-        return no_split(traced.rays, traced.result)
+    def _split_into_layers(self, traced: TracedRays) -> DepthLayers:
+        return single_layer(traced.rays, traced.result)
 
     def _surface_with_ambient(self, result: TraceResult, gbuffer: GBuffer) -> SurfacePoints:
         """Return the surface without ambient light, as the diffuse part is a colour of its own."""
         return replace(gbuffer.surface, ambient=np.zeros(len(gbuffer.ray_ids)))
 
-    def _trace_incident(self, traced: TracedRays, split: DepthSplit, gbuffer: GBuffer) -> IncidentLightModel:
+    def _trace_incident(self, traced: TracedRays, split: DepthLayers, gbuffer: GBuffer) -> IncidentLightModel:
         """Trace one mirrored ray a point, which hits harmonics in display values or nothing."""
         rays = reflected_rays(split.rays, gbuffer, self._reflection_offset)
         result = traced.tracer.trace(rays.with_t_max(RAY_LENGTH), record=traced.view is not None)
@@ -139,7 +139,7 @@ class RefGaussianShading(DeferredShading):
         incident = IncidentLight(visibility, hidden * result.rgb_srgb)
         return SingleRayIncidentLight(incident, result.recording, hidden)
 
-    def _display(self, linear: Float64[np.ndarray, "p 3"]) -> Float64[np.ndarray, "p 3"]:
+    def _to_display(self, linear: Float64[np.ndarray, "p 3"]) -> Float64[np.ndarray, "p 3"]:
         return linear
 
     def _display_backward(

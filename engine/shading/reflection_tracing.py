@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from octasplat.engine.core.rays import RayBatch
-from octasplat.engine.shading.depth_split import DepthSplit, no_split, split_by_depth
+from octasplat.engine.shading.depth_split import DepthLayers, single_layer, split_by_depth
 from octasplat.engine.shading.gbuffer import (
     GBuffer,
     RayOffset,
@@ -43,7 +43,7 @@ class ReflectedRays:
 
     Attributes:
         trace: what they met.
-        depth_split: that, one surface at a time.
+        depth_layers: that, one surface at a time.
         gbuffer: what was blended along those that met something.
         surface: the points of that, with what further rays say of them.
         linear: their radiance.
@@ -51,7 +51,7 @@ class ReflectedRays:
     """
 
     trace: TraceResult
-    depth_split: DepthSplit
+    depth_layers: DepthLayers
     gbuffer: GBuffer
     surface: SurfacePoints
     linear: Float64[np.ndarray, "q 3"]
@@ -60,9 +60,9 @@ class ReflectedRays:
     @property
     def incident(self) -> IncidentLight:
         """Return what each ray saw."""
-        light = np.zeros((len(self.depth_split.rays), 3))
+        light = np.zeros((len(self.depth_layers.rays), 3))
         light[self.gbuffer.ray_ids] = self.gbuffer.alpha[:, None] * self.linear
-        return IncidentLight(self.trace.transmittance.astype(np.float64), self.depth_split.sum_layers(light))
+        return IncidentLight(self.trace.transmittance.astype(np.float64), self.depth_layers.sum_layers(light))
 
 
 @dataclass(frozen=True)
@@ -91,10 +91,14 @@ class ReflectionTracer:
     def trace(self, rays: RayBatch, *, record: bool) -> ReflectedRays:
         """Trace reflected rays over all bounces; ``record`` keeps what the backward pass needs."""
         trace = self.tracer.trace(rays, record=record)
-        split = no_split(rays, trace)
+        split = single_layer(rays, trace)
         if self.min_separation_world > 0:
             split = split_by_depth(
-                rays, trace, self.tracer, min_separation_world=self.min_separation_world, record=record
+                rays,
+                trace,
+                self.tracer,
+                min_separation_world=self.min_separation_world,
+                record_for_backward=record,
             )
         gbuffer = build_gbuffer(split.rays, split.results)
         surface, next_bounce = self.with_ambient(split.results, gbuffer), None
@@ -104,7 +108,12 @@ class ReflectionTracer:
             incident = next_bounce.incident
             surface = replace(surface, visibility=incident.visibility, indirect_linear=incident.light_linear)
         return ReflectedRays(
-            trace, split, gbuffer, surface, shade(surface, self.light, self.frame), next_bounce
+            trace=trace,
+            depth_layers=split,
+            gbuffer=gbuffer,
+            surface=surface,
+            linear=shade(surface, self.light, self.frame),
+            next_bounce=next_bounce,
         )
 
 
@@ -126,7 +135,7 @@ def backward_reflections(
         by_incident: gradients by what each ray saw.
         by_texels: those by the texels are added to this.
     """
-    gbuffer, trace, split = reflected.gbuffer, reflected.trace, reflected.depth_split
+    gbuffer, trace, split = reflected.gbuffer, reflected.trace, reflected.depth_layers
     assert trace.recording is not None
     ray_ids, count = gbuffer.ray_ids, len(split.rays)
     by_light = split.expand(by_incident.light_linear)[ray_ids]
@@ -135,7 +144,14 @@ def backward_reflections(
     by_alpha = -split.expand(by_incident.visibility)
     by_alpha[ray_ids] += (by_light * reflected.linear).sum(axis=1)
     by_features, nothing = np.zeros((count, trace.features.shape[1])), np.zeros((count, 3))
-    backward_gbuffer(gbuffer, back.material, np.zeros_like(back.normal), by_features, by_alpha, nothing)
+    backward_gbuffer(
+        gbuffer=gbuffer,
+        by_material=back.material,
+        by_unit_normal=np.zeros_like(back.normal),
+        by_features=by_features,
+        by_alpha=by_alpha,
+        by_normal=nothing,
+    )
     by_layers = TraceGradients(
         rgb_srgb=nothing.astype(np.float32),
         transmittance=-by_alpha.astype(np.float32),

@@ -185,11 +185,11 @@ def shade_backward(
 
 def _surface_arrays(surface: SurfacePoints, frame: Float64[np.ndarray, "3 3"]) -> SurfaceArrays:
     return SurfaceArrays(
-        surface.material,
-        np.ascontiguousarray(surface.normal_world @ frame.T),
-        np.ascontiguousarray(surface.direction_world @ frame.T),
-        surface.visibility,
-        surface.indirect_linear,
-        surface.ambient,
-        surface.bounced_linear,
+        material=surface.material,
+        normal=np.ascontiguousarray(surface.normal_world @ frame.T),
+        direction=np.ascontiguousarray(surface.direction_world @ frame.T),
+        visibility=surface.visibility,
+        indirect=surface.indirect_linear,
+        ambient=surface.ambient,
+        bounced=surface.bounced_linear,
     )

@@ -62,7 +62,7 @@ def bake(
         tracer: with the scene built.
         look: what.
         tolerance: surface this near to a point (world units) does not hide it.
-        progress: told (points done, points in all).
+        progress: called with (points done, total).
 
     Returns:
         The means, 0.5 where no camera sees the point, and whether one does.
@@ -76,7 +76,14 @@ def bake(
         choice, weights = _best_cameras(
             points_world[part].astype(np.float64), normals_world[part], cameras, occluder, tolerance
         )
-        mean, met = _weighted_means(points_world[part], choice, weights, cameras, tracer, look)
+        mean, met = _weighted_means(
+            points=points_world[part],
+            choice=choice,
+            weights=weights,
+            cameras=cameras,
+            tracer=tracer,
+            look=look,
+        )
         means.append(mean)
         visible.append(met)
         progress(min(start + POINTS_PER_BATCH, len(points_world)), len(points_world))

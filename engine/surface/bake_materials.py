@@ -28,12 +28,12 @@ def material_features(gaussians: FlatGaussians) -> Float32[np.ndarray, "n 6"]:
     return np.concatenate([*(gaussians.channels[name] for name in MATERIAL_WIDTHS), ambient], axis=1)
 
 
-def _materials(traced: TraceResult) -> Float32[np.ndarray, "r 9"]:
+def _blended_materials(traced: TraceResult) -> Float32[np.ndarray, "r 9"]:
     blended = np.clip(traced.features[:, :6] / traced.alpha[:, None], 0.0, 1.0)
     return np.concatenate([blended, traced.normal_world / traced.alpha[:, None]], axis=1)
 
 
-MATERIAL_TARGET = BakeTarget(9, _materials)
+MATERIAL_TARGET = BakeTarget(9, _blended_materials)
 """Linear base colour, metallic, roughness, share of the light from all around, and the normal in the world
 (not of unit length)."""
 
@@ -55,7 +55,7 @@ def with_materials(
     tangents = vertex_tangents(layout.mesh)
     surface = layout.normals_world.astype(np.float64)
     local = world_to_tangent(
-        _normals(baked[:, 6:].astype(np.float64), surface, known), surface, layout.interpolate(tangents)
+        _limit_normals(baked[:, 6:].astype(np.float64), surface, known), surface, layout.interpolate(tangents)
     )
     packed = baked[:, [5, 4, 3]]
     return TriangleMesh(
@@ -73,7 +73,7 @@ def with_materials(
     )
 
 
-def _normals(
+def _limit_normals(
     blended_world: Float64[np.ndarray, "n 3"],
     surface_world: Float64[np.ndarray, "n 3"],
     known: Bool[np.ndarray, " n"],

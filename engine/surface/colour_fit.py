@@ -84,7 +84,7 @@ class TexturePalette:
         return self.layout.mesh
 
     @cached_property
-    def _numbers(self) -> Int32[np.ndarray, "h w"]:
+    def _texel_numbers(self) -> Int32[np.ndarray, "h w"]:
         layout = self.layout
         numbers = np.full((layout.side_px, layout.side_px), -1, np.int32)
         numbers[layout.rows, layout.columns] = np.arange(len(layout.rows), dtype=np.int32)
@@ -93,7 +93,7 @@ class TexturePalette:
     @property
     def neighbours(self) -> Int[np.ndarray, "e 2"]:
         """Return horizontally and vertically neighbouring texels."""
-        numbers = self._numbers
+        numbers = self._texel_numbers
         pairs = np.concatenate(
             [
                 np.stack([numbers[:, :-1], numbers[:, 1:]], axis=-1).reshape(-1, 2),
@@ -115,7 +115,7 @@ class TexturePalette:
         for down in (0, 1):
             for across in (0, 1):
                 column, row = np.clip(low + np.array([across, down]), 0, side - 1).astype(np.int64).T
-                numbers.append(self._numbers[row, column])
+                numbers.append(self._texel_numbers[row, column])
                 of_row = part[:, 1] if down else 1 - part[:, 1]
                 shares.append(of_row * (part[:, 0] if across else 1 - part[:, 0]))
         number, share = np.stack(numbers, axis=1), np.stack(shares, axis=1)
@@ -144,7 +144,7 @@ def fit_colours(
         points: that have colours.
         start_srgb: display values to begin with.
         pictures: of the scene.
-        progress: told (pictures done, pictures in all).
+        progress: called with (pictures done, total).
 
     Returns:
         The colours, and which points any pixel shows.
@@ -171,7 +171,7 @@ def _normal_equations(
     total = len(pictures)
     progress(0, total)
     for done, picture in enumerate(pictures, 1):
-        waiting.append(_equations(scene, points, *picture()))
+        waiting.append(_pixel_equations(scene, points, *picture()))
         if sum(len(numbers) for numbers, _, _ in waiting) >= RAYS_PER_BATCH or done == total:
             numbers, shares, rgb = (np.concatenate(parts) for parts in zip(*waiting, strict=True))
             rows = interpolation_matrix(shares, numbers, count)
@@ -183,7 +183,7 @@ def _normal_equations(
     return normal, right_side
 
 
-def _equations(
+def _pixel_equations(
     scene: TriangleBvh, points: Palette, rays: ImageRays, rgba: UInt8[np.ndarray, "h w 4"]
 ) -> tuple[Int[np.ndarray, "r k"], Float32[np.ndarray, "r k"], Float32[np.ndarray, "r 3"]]:
     """Return points and shares of each pixel that shows only surface in both, and its colour."""

@@ -41,7 +41,7 @@ def photograph_cameras(
         if camera.is_panorama:
             cameras.extend(_cube_faces(view, camera, max_side, near_world))
         else:
-            cameras.append(_pinhole(view, camera, max_side, near_world))
+            cameras.append(_pinhole_camera(view, camera, max_side, near_world))
     return tuple(cameras)
 
 
@@ -62,7 +62,7 @@ def cameras_around(
     focal_px = focal_from_fov(AROUND_FOV_DEGREES, max_side)
     return tuple(
         PinholeCamera.from_pose(
-            look_at(table.centre_world + distance * out, table.centre_world, _across(out)),
+            look_at(table.centre_world + distance * out, table.centre_world, _least_aligned_axis(out)),
             max_side,
             max_side,
             fy_px=focal_px,
@@ -71,7 +71,7 @@ def cameras_around(
     )
 
 
-def _across(direction: Float64[np.ndarray, "3"]) -> Float64[np.ndarray, "3"]:
+def _least_aligned_axis(direction: Float64[np.ndarray, "3"]) -> Float64[np.ndarray, "3"]:
     """Return an axis that is not along ``direction``."""
     return np.eye(3)[int(np.argmin(np.abs(direction)))]
 
@@ -99,7 +99,7 @@ def _cube_faces(
     )
 
 
-def _pinhole(view: PosedView, camera: Camera, max_side: int, near_world: float) -> PinholeCamera:
+def _pinhole_camera(view: PosedView, camera: Camera, max_side: int, near_world: float) -> PinholeCamera:
     width, height = view.width_px, view.height_px
     scale = min(1.0, max_side / max(width, height))
     width_px, height_px = max(1, round(width * scale)), max(1, round(height * scale))

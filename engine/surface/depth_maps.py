@@ -72,7 +72,7 @@ def render_depth_maps(
         start += 3 * size
         rays = camera.rays()
         image = render_rays(tracer, rays, black)
-        distances[-1][...] = _distances(image, options)
+        distances[-1][...] = _depth_values(image, options)
         # The tracer turns normals to the viewer, so the dot product is negative.
         cosines[-1][...] = np.clip(-np.sum(image.normal_world * rays.directions_world, axis=-1), 0.0, 1.0)
         colours[-1][...] = to_bytes(np.concatenate([image.rgb_srgb, image.alpha[..., None]], axis=2))
@@ -87,7 +87,7 @@ def _stored_image(
     return camera.rays(), np.asarray(stored)
 
 
-def _distances(image: RenderedImage, options: ExtractionOptions) -> Float32[np.ndarray, "h w"]:
+def _depth_values(image: RenderedImage, options: ExtractionOptions) -> Float32[np.ndarray, "h w"]:
     distances = image.depth_median if options.depth_mode == "median" else image.depth
     distances = np.where(image.alpha >= options.min_alpha, distances, UNKNOWN_DEPTH)
     distances[image.alpha < EMPTY_ALPHA] = EMPTY_DEPTH

@@ -125,9 +125,26 @@ def extract_levels(
         if options.backdrop:
             mesh = with_backdrop(mesh, np.mean([camera.centre_world for camera in cameras], axis=0))
         coloured = _bake_colours(
-            tracer, cameras, renders, photographs, options, mesh, region, light_frame, report
+            tracer=tracer,
+            cameras=cameras,
+            renders=renders,
+            photographs=photographs,
+            options=options,
+            mesh=mesh,
+            region=region,
+            light_frame=light_frame,
+            report=report,
         )
-        result.append(ExtractedSurface(coloured, region, volume_bytes, found, closed, edges))
+        result.append(
+            ExtractedSurface(
+                mesh=coloured,
+                region=region,
+                volume_bytes=volume_bytes,
+                triangles_found=found,
+                holes_closed=closed,
+                edges=edges,
+            )
+        )
     return tuple(result)
 
 
@@ -149,7 +166,16 @@ def _bake_colours(
         points: Points, normals: Points, look: BakeTarget
     ) -> tuple[np.ndarray, Bool[np.ndarray, " n"]]:
         with counted_phase("colouring", report, 0) as progress:
-            baked, is_visible = bake(points, normals, mesh, cameras, tracer, look, tolerance, progress)
+            baked, is_visible = bake(
+                points_world=points,
+                normals_world=normals,
+                mesh=mesh,
+                cameras=cameras,
+                tracer=tracer,
+                look=look,
+                tolerance=tolerance,
+                progress=progress,
+            )
             return _fill_unseen(points, baked, is_visible), is_visible
 
     def colours(palette: Palette, points: Points, normals: Points) -> Points:

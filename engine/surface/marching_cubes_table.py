@@ -16,7 +16,7 @@ _Loop = tuple[int, ...]
 _Triangles = list[tuple[int, int, int]]
 
 
-def _edges() -> tuple[tuple[int, int], ...]:
+def _cell_edges() -> tuple[tuple[int, int], ...]:
     """Return the two corners of each edge, the lower first."""
     found = []
     for axis in range(3):
@@ -24,11 +24,11 @@ def _edges() -> tuple[tuple[int, int], ...]:
     return tuple(found)
 
 
-EDGES = _edges()
+EDGES = _cell_edges()
 """Corners of the twelve edges."""
 
 
-def _faces() -> tuple[tuple[int, ...], ...]:
+def _cell_faces() -> tuple[tuple[int, ...], ...]:
     """Return the four corners of each face, anticlockwise as seen from outside the cell."""
     found: list[tuple[int, ...]] = []
     for axis in range(3):
@@ -39,7 +39,7 @@ def _faces() -> tuple[tuple[int, ...], ...]:
     return tuple(found)
 
 
-FACES = _faces()
+FACES = _cell_faces()
 
 
 def _faces_of_edges() -> tuple[frozenset[int], ...]:
@@ -77,14 +77,14 @@ def case_loops(case: int) -> list[_Loop]:
     return found
 
 
-def _triangulations(loop: _Loop) -> list[_Triangles]:
+def _loop_triangulations(loop: _Loop) -> list[_Triangles]:
     if len(loop) < 3:
         return [[]]
     found = []
     for k in range(1, len(loop) - 1):
         here = (loop[0], loop[k], loop[-1])
-        for left in _triangulations(loop[: k + 1]):
-            found += [[here, *left, *right] for right in _triangulations(loop[k:])]
+        for left in _loop_triangulations(loop[: k + 1]):
+            found += [[here, *left, *right] for right in _loop_triangulations(loop[k:])]
     return found
 
 
@@ -96,7 +96,7 @@ def case_triangles(case: int) -> _Triangles:
     found: _Triangles = []
     for loop in case_loops(case):
         sides = {frozenset((a, b)) for a, b in zip(loop, (*loop[1:], loop[0]), strict=True)}
-        for candidate in _triangulations(loop):
+        for candidate in _loop_triangulations(loop):
             lines = {frozenset(pair) for a, b, c in candidate for pair in ((a, b), (b, c), (c, a))}
             if all(not _share_a_face(*line) for line in lines - sides):
                 found += candidate

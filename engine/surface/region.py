@@ -164,4 +164,12 @@ def _make_grid(
         )
     size = (int(blocks[0]), int(blocks[1]), int(blocks[2]))
     truncation = options.truncation or max(MIN_TRUNCATION_VOXELS, TRUNCATION_SHARE * distance / voxel)
-    return Region(low.astype(np.float64), float(voxel), size, False, np.zeros(3), 1.0, truncation)
+    return Region(
+        low=low.astype(np.float64),
+        voxel=float(voxel),
+        blocks=size,
+        contracted=False,
+        centre_world=np.zeros(3),
+        radius=1.0,
+        truncation=truncation,
+    )

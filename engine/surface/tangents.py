@@ -36,19 +36,22 @@ def vertex_tangents(mesh: TriangleMesh) -> Float32[np.ndarray, "n 4"]:
         vertex = mesh.faces[:, k]
         normal = normals[vertex]
         one, two = (
-            _unit(_perpendicular_part(corners[:, (k + j) % 3] - corners[:, k], normal)) for j in (1, 2)
+            _normalize_vectors(_perpendicular_part(corners[:, (k + j) % 3] - corners[:, k], normal))
+            for j in (1, 2)
         )
         angle = np.arccos(np.clip((one * two).sum(axis=1), -1.0, 1.0)) * (area != 0)
-        share = angle[:, None] * _unit(_perpendicular_part(along, normal))
+        share = angle[:, None] * _normalize_vectors(_perpendicular_part(along, normal))
         for row, sign in enumerate((1.0, -1.0)):
             mine = side == sign
             angles[row] += np.bincount(vertex[mine], angle[mine], len(normals))
             for axis in range(3):
                 sums[row, :, axis] += np.bincount(vertex[mine], share[mine, axis], len(normals))
     mirrored = angles[1] > angles[0]
-    tangents = _unit(np.where(mirrored[:, None], sums[1], sums[0]))
+    tangents = _normalize_vectors(np.where(mirrored[:, None], sums[1], sums[0]))
     lost = (tangents == 0).all(axis=1)
-    tangents[lost] = _unit(np.cross(normals[lost], np.eye(3)[np.argmin(np.abs(normals[lost]), axis=1)]))
+    tangents[lost] = _normalize_vectors(
+        np.cross(normals[lost], np.eye(3)[np.argmin(np.abs(normals[lost]), axis=1)])
+    )
     return np.concatenate([tangents, np.where(mirrored, -1.0, 1.0)[:, None]], axis=1).astype(np.float32)
 
 
@@ -64,15 +67,15 @@ def world_to_tangent(
         normals_world: unit normals of the surface.
         tangents: of the surface, with the side in the fourth column, not of unit length.
     """
-    tangent = _unit(tangents[:, :3])
-    bitangent = _unit(np.cross(normals_world, tangent)) * np.sign(tangents[:, 3:])
+    tangent = _normalize_vectors(tangents[:, :3])
+    bitangent = _normalize_vectors(np.cross(normals_world, tangent)) * np.sign(tangents[:, 3:])
     frame = np.stack([tangent, bitangent, normals_world], axis=2)
     # Between vertices the tangent is not quite level.
     is_regular = np.abs(np.linalg.det(frame)) > 1e-3
     frame[~is_regular] = np.eye(3)
     local = np.linalg.solve(frame, wanted_world[:, :, None])[:, :, 0]
     local[~is_regular] = (0.0, 0.0, 1.0)
-    return _unit(local)
+    return _normalize_vectors(local)
 
 
 def _perpendicular_part(
@@ -81,7 +84,7 @@ def _perpendicular_part(
     return vectors - (vectors * normals).sum(axis=1, keepdims=True) * normals
 
 
-def _unit(vectors: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 3"]:
+def _normalize_vectors(vectors: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 3"]:
     """Return vectors of length 1; those of length 0 stay so."""
     length = np.linalg.norm(vectors, axis=1, keepdims=True)
     return np.divide(vectors, length, out=np.zeros_like(vectors), where=length > 1e-30)

@@ -93,7 +93,14 @@ def unwrap(mesh: TriangleMesh, side_px: int) -> TextureLayout:
     others = weights[rows, columns].astype(np.float64)
     first = 1 - others.sum(axis=1, keepdims=True)
     corners = cut.faces[owner[rows, columns]]
-    return TextureLayout(cut, side_px, rows, columns, corners, np.concatenate([first, others], axis=1))
+    return TextureLayout(
+        mesh=cut,
+        side_px=side_px,
+        rows=rows,
+        columns=columns,
+        corners=corners,
+        weights=np.concatenate([first, others], axis=1),
+    )
 
 
 def smooth_mesh(mesh: TriangleMesh) -> TriangleMesh:

@@ -64,7 +64,7 @@ def fuse_depth_maps(
         maps: the depth maps.
         region: where.
         options: the limit of memory.
-        progress: told (steps done, steps in all), two steps a map.
+        progress: called with (steps done, total), two steps a map.
 
     Raises:
         ConfigError: no depth lies in the region, or the volume takes too much memory.
@@ -72,11 +72,16 @@ def fuse_depth_maps(
     total = 2 * len(maps.cameras)
     marks = np.zeros(region.blocks, np.uint8)
     grid = VoxelGrid(
-        region.low, region.voxel, region.contracted, region.centre_world, region.radius, region.truncation
+        low=region.low,
+        voxel=region.voxel,
+        contracted=region.contracted,
+        middle=region.centre_world,
+        radius=region.radius,
+        truncation=region.truncation,
     )
     threads = threads_in_use()
     progress(0, total)
-    for number, (view, distances) in enumerate(zip(_views(maps), maps.distances, strict=True)):
+    for number, (view, distances) in enumerate(zip(_depth_views(maps), maps.distances, strict=True)):
         run_ranges(
             mark_blocks,
             threads,
@@ -95,7 +100,7 @@ def fuse_depth_maps(
     values = np.zeros((len(blocks), VOXELS_PER_BLOCK), np.float32)
     weights = np.zeros((len(blocks), VOXELS_PER_BLOCK), np.float32)
     for number, (view, distances, cosines) in enumerate(
-        zip(_views(maps), maps.distances, maps.cosines, strict=True)
+        zip(_depth_views(maps), maps.distances, maps.cosines, strict=True)
     ):
         tiles = (-(-distances.shape[0] // TILE), -(-distances.shape[1] // TILE))
         nearest, farthest = np.empty(tiles, np.float32), np.empty(tiles, np.float32)
@@ -116,9 +121,16 @@ def fill_unseen(volume: TsdfVolume, min_weight: float) -> None:
     volume.weights[unseen] = min_weight
 
 
-def _views(maps: DepthMaps) -> list[DepthView]:
+def _depth_views(maps: DepthMaps) -> list[DepthView]:
     return [
-        DepthView(c.fx_px, c.fy_px, c.cx_px, c.cy_px, c.rotation_cam_from_world, c.centre_world)
+        DepthView(
+            fx=c.fx_px,
+            fy=c.fy_px,
+            cx=c.cx_px,
+            cy=c.cy_px,
+            rotation=c.rotation_cam_from_world,
+            centre=c.centre_world,
+        )
         for c in maps.cameras
     ]
 

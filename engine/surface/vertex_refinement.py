@@ -30,7 +30,7 @@ from octasplat.engine.trace.triangle_bvh import TriangleBvh
 SIDE_PX = 260
 """Pictures are made about this large: displacements count that are about a pixel of theirs."""
 MAX_IMAGES = 128
-"""Of more, so many are taken, spread evenly: about 100 bytes a pixel are needed at once."""
+"""Of more, so many are taken, spread evenly: about 100 bytes per pixel are needed at once."""
 REFINEMENT_STEPS = 2
 CG_ITERATIONS = 15
 COLOUR_CG_ITERATIONS = 8
@@ -64,7 +64,7 @@ def refine_vertices(
     Args:
         mesh: near the right place.
         pictures: of the scene.
-        progress: told (steps done, steps in all).
+        progress: called with (steps done, total).
     """
     count = len(mesh.vertices_world)
     taken = np.unique(np.linspace(0, len(pictures) - 1, min(MAX_IMAGES, len(pictures))).astype(int))
@@ -110,12 +110,12 @@ def _visible_pixels(mesh: TriangleMesh, pictures: Sequence[tuple[ImageRays, np.n
         angle = float(np.median(np.linalg.norm(np.diff(ways, axis=1), axis=2))) if ways.shape[1] > 1 else 1.0
         found.append(
             _VisiblePixels(
-                hits.faces[used],
-                np.concatenate([1 - others.sum(axis=1, keepdims=True), others], axis=1),
-                batch.directions_world[used],
-                (hits.distances[used] * angle).astype(np.float32),
-                ~rim[used],
-                np.clip(pixels[:, :3] / pixels[:, 3:], 0.0, 1.0),
+                faces=hits.faces[used],
+                weights=np.concatenate([1 - others.sum(axis=1, keepdims=True), others], axis=1),
+                directions_world=batch.directions_world[used],
+                size_world=(hits.distances[used] * angle).astype(np.float32),
+                steady=~rim[used],
+                rgb_srgb=np.clip(pixels[:, :3] / pixels[:, 3:], 0.0, 1.0),
             )
         )
     return _VisiblePixels(
@@ -139,12 +139,12 @@ def _step(
     still = np.zeros_like(visible.weights)
     sure = np.ones(len(corners), np.float32)
     x = _solve_step(
-        _PixelJacobian(corners, visible.weights, still, still),
-        visible.rgb_srgb,
-        sure,
-        rgb,
-        apart,
-        COLOUR_CG_ITERATIONS,
+        pixels=_PixelJacobian(corners, visible.weights, still, still),
+        wanted_srgb=visible.rgb_srgb,
+        sure=sure,
+        rgb=rgb,
+        apart=apart,
+        rounds=COLOUR_CG_ITERATIONS,
     )
     rgb = rgb + x[:, :3]
     normals = mesh.vertex_normals()
@@ -157,7 +157,9 @@ def _step(
     pixels = _PixelJacobian(corners, visible.weights, lifts, change)
     lacking = visible.rgb_srgb - pixels.apply(_colours_and_displacements(rgb))
     sure = (1 / (1 + (lacking**2).sum(axis=1) / OUTLIER_THRESHOLD**2)).astype(np.float32)
-    x = _solve_step(pixels, visible.rgb_srgb, sure, rgb, apart, CG_ITERATIONS)
+    x = _solve_step(
+        pixels=pixels, wanted_srgb=visible.rgb_srgb, sure=sure, rgb=rgb, apart=apart, rounds=CG_ITERATIONS
+    )
     moved = np.clip(x[:, 3:], -MAX_DISPLACEMENT_PX, MAX_DISPLACEMENT_PX) * size[:, None] * normals
     return replace(mesh, vertices_world=mesh.vertices_world + moved), rgb + x[:, :3]
 

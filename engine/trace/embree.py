@@ -75,28 +75,28 @@ def load_library() -> ctypes.CDLL:
 @cache
 def intersect1_address() -> int:
     """Return the address of rtcIntersect1, passed to kernels at run time so that they can be cached."""
-    return _address("rtcIntersect1")
+    return _function_address("rtcIntersect1")
 
 
 @cache
 def occluded1_address() -> int:
     """Return the address of rtcOccluded1, which stops at any hit."""
-    return _address("rtcOccluded1")
+    return _function_address("rtcOccluded1")
 
 
 @cache
 def intersect8_address() -> int:
     """Return the address of rtcIntersect8, for eight rays through triangles."""
-    return _address("rtcIntersect8")
+    return _function_address("rtcIntersect8")
 
 
 @cache
 def occluded8_address() -> int:
     """Return the address of rtcOccluded8."""
-    return _address("rtcOccluded8")
+    return _function_address("rtcOccluded8")
 
 
-def _address(name: str) -> int:
+def _function_address(name: str) -> int:
     address = ctypes.cast(getattr(load_library(), name), ctypes.c_void_p).value
     assert address is not None
     return address

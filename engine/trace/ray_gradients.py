@@ -48,7 +48,14 @@ def ray_gradients(
     origins, directions = np.zeros((len(rays), 3), np.float32), np.zeros((len(rays), 3), np.float32)
     for part, hits in batched_ray_hits(gaussians, rays, recording, settings):
         given = _OutputGradients.from_slice(gradients, part)
-        by_origin, by_direction = _hit_gradients(gaussians, rays[part], hits, given, settings, features)
+        by_origin, by_direction = _hit_gradients(
+            gaussians=gaussians,
+            rays=rays[part],
+            hits=hits,
+            output_gradients=given,
+            settings=settings,
+            features=features,
+        )
         for axis in range(3):
             origins[part, axis] = hits.sums_per_ray(by_origin[:, axis])
             directions[part, axis] = hits.sums_per_ray(by_direction[:, axis])

@@ -124,8 +124,19 @@ def _evaluate_hits(
     wide = counts.astype(np.int64)
     through = np.exp(_segmented_exclusive_cumsum(np.log1p(-alpha), wide))
     return RayHits(
-        wide, ray, numbers, to_mean, frames, scales, cosine, t, uv, alpha, clamped, through
-    )  # fmt: skip
+        counts=wide,
+        ray_ids=ray,
+        ids=numbers,
+        to_mean=to_mean,
+        frames=frames,
+        scales=scales,
+        cosine=cosine,
+        t=t,
+        uv=uv,
+        alpha=alpha,
+        is_clamped=clamped,
+        transmittance=through,
+    )
 
 
 def _segmented_exclusive_cumsum(

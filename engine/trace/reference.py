@@ -177,7 +177,15 @@ def trace_reference(
             ]
         )
     rgb, through, depth, median, normal, extra = (torch.stack(column) for column in zip(*out, strict=True))
-    return ReferenceResult(rgb, through, depth, median, normal, extra, hit_ids)
+    return ReferenceResult(
+        rgb_srgb=rgb,
+        transmittance=through,
+        depth_sum=depth,
+        depth_median=median,
+        normal_world=normal,
+        features=extra,
+        hit_ids=hit_ids,
+    )
 
 
 def _hit_count(alphas: Tensor, settings: TraceSettings) -> int:

@@ -70,9 +70,11 @@ class ReferenceTracer:
 
     def trace(self, rays: RayBatch, *, record: bool = False) -> TraceResult:
         """Trace rays; see the protocol."""
-        parameters = self._parameters()
+        parameters = self._reference_parameters()
         with torch.no_grad():
-            parts = [trace_reference(parameters, rays[piece], self.settings) for piece in self._batches(rays)]
+            parts = [
+                trace_reference(parameters, rays[piece], self.settings) for piece in self._ray_slices(rays)
+            ]
         hit_ids = [ids for part in parts for ids in part.hit_ids]
         shapes = {"rgb_srgb": (3,), "normal_world": (3,), "features": (self._features.shape[1] + 1,)}
         found = {
@@ -88,13 +90,13 @@ class ReferenceTracer:
 
     def transmittance(self, rays: RayBatch) -> Float32[np.ndarray, " r"]:
         """Return the transmittance along each ray; see the protocol."""
-        parameters = self._parameters()
+        parameters = self._reference_parameters()
         unlimited = self.settings.model_copy(
             update={"transmittance_min": 0.0, "second_phase_min": None, "max_hits": 2**31}
         )
         left = np.empty(len(rays), np.float32)
         with torch.no_grad():
-            for piece in self._batches(rays):
+            for piece in self._ray_slices(rays):
                 left[piece] = trace_reference(parameters, rays[piece], unlimited).transmittance.numpy()
         left[left < self.settings.transmittance_min] = 0.0
         return left
@@ -105,14 +107,14 @@ class ReferenceTracer:
         """Return gradients of the raw parameters by autograd; see the protocol."""
         if not isinstance(recording, ReferenceRecording) or recording.build_id is not self._build_id:
             raise ValueError("the recording is not of this tracer, or older than its last build")
-        parameters = self._parameters()
+        parameters = self._reference_parameters()
         leaves = [getattr(parameters, name) for name in _PARAMETERS]
         sums = [np.zeros(leaf.shape) for leaf in leaves]
         weights, errors = np.zeros(len(parameters.means_world)), np.zeros(len(parameters.means_world))
-        for piece in self._batches(recording.rays):
+        for piece in self._ray_slices(recording.rays):
             result = trace_reference(parameters, recording.rays[piece], self.settings)
             for total, found in zip(
-                sums, _leaf_gradients(_loss(result, gradients, piece), leaves), strict=True
+                sums, _leaf_gradients(_objective_of_gradients(result, gradients, piece), leaves), strict=True
             ):
                 total += found
             visibility = result.features[:, -1]
@@ -132,7 +134,7 @@ class ReferenceTracer:
         )
         return drop_low_weight(everything, min_blend_weight)
 
-    def _parameters(self) -> ReferenceParameters:
+    def _reference_parameters(self) -> ReferenceParameters:
         assert self._gaussians is not None, "build first"
         # One channel more than asked for, whose sum along a ray is the sum of the weights.
         ones = np.ones((len(self._gaussians), 1), np.float32)
@@ -140,12 +142,12 @@ class ReferenceTracer:
             self._gaussians, np.concatenate([self._features, ones], axis=1, dtype=np.float32)
         )
 
-    def _batches(self, rays: RayBatch) -> list[slice]:
+    def _ray_slices(self, rays: RayBatch) -> list[slice]:
         size = max(1, PAIRS_PER_BATCH // max(1, len(self._features)))
         return [slice(start, min(start + size, len(rays))) for start in range(0, len(rays), size)]
 
 
-def _loss(result: ReferenceResult, gradients: TraceGradients, batch: slice) -> Tensor:
+def _objective_of_gradients(result: ReferenceResult, gradients: TraceGradients, batch: slice) -> Tensor:
     """Return the scalar whose gradients by the outputs are ``gradients``."""
     loss = torch.zeros((), dtype=torch.float64)
     for name in _OUTPUTS:

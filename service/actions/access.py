@@ -9,19 +9,19 @@ from octasplat.workers.db.connections import Connection
 from octasplat.workers.db.datasets import get_dataset
 from octasplat.workers.db.errors import ConflictError
 from octasplat.workers.db.rows import Dataset, Job
-from octasplat.workers.maintenance.webhooks.rows import Endpoint, get_endpoint
+from octasplat.workers.maintenance.webhooks.rows import Endpoint, get_webhook_endpoint
 from octasplat.workers.queue.jobs import get_job
 
 _RETRY_SECONDS = 10
 
 
-async def owned_job(
+async def fetch_visible_job(
     connection: Connection, principal: Principal, job_id: uuid.UUID, *, lock: bool = False
 ) -> Job:
     """Return the job if the principal may see it.
 
     Raises:
-        ProblemError: 404.
+        ProblemError: 404 if it does not exist or the principal may not see it.
     """
     job = await get_job(connection, job_id, lock=lock)
     if job is None or not principal.may_see(job.owner):
@@ -32,16 +32,16 @@ async def owned_job(
 async def read_job(service: Service, principal: Principal, job_id: uuid.UUID) -> Job:
     """Return the job if the principal may see it, on a connection of its own."""
     async with service.pool.connection() as connection:
-        return await owned_job(connection, principal, job_id)
+        return await fetch_visible_job(connection, principal, job_id)
 
 
-async def owned_dataset(
+async def fetch_visible_dataset(
     connection: Connection, principal: Principal, dataset_id: uuid.UUID, *, lock: bool = False
 ) -> Dataset:
     """Return the dataset if the principal may see it.
 
     Raises:
-        ProblemError: 404.
+        ProblemError: 404 if it does not exist or the principal may not see it.
     """
     dataset = await get_dataset(connection, dataset_id, lock=lock)
     if dataset is None or not principal.may_see(dataset.owner):
@@ -53,10 +53,10 @@ async def open_dataset(connection: Connection, principal: Principal, dataset_id:
     """Return the dataset if the principal may see it and it still takes files.
 
     Raises:
-        ProblemError: 404.
+        ProblemError: 404 if it does not exist or the principal may not see it.
         ConflictError: it is committed, or being checked.
     """
-    dataset = await owned_dataset(connection, principal, dataset_id)
+    dataset = await fetch_visible_dataset(connection, principal, dataset_id)
     if dataset.state != "open":
         raise ConflictError(
             f"The dataset is {dataset.state}, so its files do not change; make a new dataset."
@@ -64,13 +64,15 @@ async def open_dataset(connection: Connection, principal: Principal, dataset_id:
     return dataset
 
 
-async def owned_webhook(connection: Connection, principal: Principal, webhook_id: uuid.UUID) -> Endpoint:
+async def fetch_visible_webhook(
+    connection: Connection, principal: Principal, webhook_id: uuid.UUID
+) -> Endpoint:
     """Return the webhook if the principal may see it.
 
     Raises:
-        ProblemError: 404.
+        ProblemError: 404 if it does not exist or the principal may not see it.
     """
-    endpoint = await get_endpoint(connection, webhook_id)
+    endpoint = await get_webhook_endpoint(connection, webhook_id)
     if endpoint is None or not principal.may_see(endpoint.owner):
         raise not_found_error("webhook")
     return endpoint

@@ -2,7 +2,7 @@
 
 import uuid
 
-from octasplat.service.actions.access import check_searchable_name, owned_job, read_job
+from octasplat.service.actions.access import check_searchable_name, fetch_visible_job, read_job
 from octasplat.service.auth import Principal
 from octasplat.service.problems import not_found_error
 from octasplat.service.state import Service
@@ -16,10 +16,10 @@ async def list_artifacts(service: Service, principal: Principal, job_id: uuid.UU
     """Return the results of a job.
 
     Raises:
-        ProblemError: 404.
+        ProblemError: 404 if it does not exist or the principal may not see it.
     """
     async with service.pool.connection() as connection:
-        await owned_job(connection, principal, job_id)
+        await fetch_visible_job(connection, principal, job_id)
         return await rows.artifacts_of(connection, job_id)
 
 
@@ -29,10 +29,10 @@ async def get_artifact(
     """Return a result of a job; without one the problem says that there is no such ``kind``.
 
     Raises:
-        ProblemError: 404.
+        ProblemError: 404 if it does not exist or the principal may not see it.
     """
     async with service.pool.connection() as connection:
-        await owned_job(connection, principal, job_id)
+        await fetch_visible_job(connection, principal, job_id)
         row = await rows.get_artifact(connection, job_id, check_searchable_name(name, kind))
     if row is None:
         raise not_found_error(kind)
@@ -43,7 +43,7 @@ async def get_preview(service: Service, principal: Principal, job_id: uuid.UUID)
     """Return the newest preview of a running job, a PNG.
 
     Raises:
-        ProblemError: 404.
+        ProblemError: 404 if it does not exist or the principal may not see it.
         StorageError: the store does not have it.
     """
     job = await read_job(service, principal, job_id)

@@ -11,7 +11,7 @@ from typing import Any
 import psycopg
 from psycopg_pool import PoolTimeout
 
-from octasplat.service.actions.access import owned_dataset
+from octasplat.service.actions.access import fetch_visible_dataset
 from octasplat.service.actions.pages import Page, page_of
 from octasplat.service.auth import Principal
 from octasplat.service.idempotency import create_once, fingerprint
@@ -49,7 +49,7 @@ async def create_dataset(
 
         request = fingerprint("dataset", new.model_dump(exclude=set() if new.holds == "files" else {"holds"}))
         dataset_id, _ = await create_once(connection, principal, idempotency_key, request, make)
-        return await owned_dataset(connection, principal, dataset_id)
+        return await fetch_visible_dataset(connection, principal, dataset_id)
 
 
 async def list_datasets(
@@ -72,13 +72,13 @@ async def list_files_by_suffix(
 
 
 async def get_dataset(service: Service, principal: Principal, dataset_id: uuid.UUID) -> Dataset:
-    """Return a dataset.
+    """Return the dataset with that id, if the principal may see it.
 
     Raises:
-        ProblemError: 404.
+        ProblemError: 404 if it does not exist or the principal may not see it.
     """
     async with service.pool.connection() as connection:
-        return await owned_dataset(connection, principal, dataset_id)
+        return await fetch_visible_dataset(connection, principal, dataset_id)
 
 
 @retry_on_deadlock
@@ -88,10 +88,10 @@ async def change_dataset(
     """Rename a dataset, or pin it so that it does not expire.
 
     Raises:
-        ProblemError: 404.
+        ProblemError: 404 if it does not exist or the principal may not see it.
     """
     async with service.pool.connection() as connection, connection.transaction():
-        dataset = await owned_dataset(connection, principal, dataset_id, lock=True)
+        dataset = await fetch_visible_dataset(connection, principal, dataset_id, lock=True)
         return await rows.change_dataset(
             connection,
             dataset_id,
@@ -105,11 +105,11 @@ async def delete_dataset(service: Service, principal: Principal, dataset_id: uui
     """Delete a dataset.
 
     Raises:
-        ProblemError: 404.
+        ProblemError: 404 if it does not exist or the principal may not see it.
         ConflictError: a job needs it.
     """
     async with service.pool.connection() as connection:
-        await owned_dataset(connection, principal, dataset_id)
+        await fetch_visible_dataset(connection, principal, dataset_id)
         await rows.delete_dataset(connection, dataset_id)
     service.evictor.evict_if_low_later()
 
@@ -123,7 +123,7 @@ async def commit_dataset(service: Service, principal: Principal, dataset_id: uui
         IntakeError: it is not sound.
     """
     async with service.pool.connection() as connection:
-        owner = (await owned_dataset(connection, principal, dataset_id)).owner
+        owner = (await fetch_visible_dataset(connection, principal, dataset_id)).owner
     async with service.check_limiter.limited(owner):
         return await _check(service, dataset_id)
 

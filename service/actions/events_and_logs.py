@@ -8,7 +8,7 @@ from octasplat.service.actions.access import read_job
 from octasplat.service.auth import Principal
 from octasplat.service.problems import ProblemError
 from octasplat.service.state import Service
-from octasplat.workers.db.events_and_logs import events_after, log_after
+from octasplat.workers.db.events_and_logs import list_job_events, list_log_lines
 from octasplat.workers.db.rows import JobEvent, LogLine
 from octasplat.workers.queue.jobs import get_job
 
@@ -23,11 +23,11 @@ async def read_log(
     """Return lines of a job's log after the id ``after``.
 
     Raises:
-        ProblemError: 404.
+        ProblemError: 404 if it does not exist or the principal may not see it.
     """
     await read_job(service, principal, job_id)
     async with service.pool.connection() as connection:
-        return await log_after(connection, job_id, after, limit)
+        return await list_log_lines(connection, job_id, after, limit)
 
 
 async def read_events(
@@ -36,11 +36,11 @@ async def read_events(
     """Return the events of a job after the id ``after``.
 
     Raises:
-        ProblemError: 404.
+        ProblemError: 404 if it does not exist or the principal may not see it.
     """
     await read_job(service, principal, job_id)
     async with service.pool.connection() as connection:
-        return await events_after(connection, job_id, after, limit)
+        return await list_job_events(connection, job_id, after, limit)
 
 
 async def follow_events(
@@ -59,12 +59,12 @@ async def follow_events(
         raise ProblemError(503, "streams", detail, retry_seconds=_RETRY_SECONDS)
     if job.is_over:
         async with service.pool.connection() as connection:
-            if not await events_after(connection, job_id, after, 1):
+            if not await list_job_events(connection, job_id, after, 1):
                 return None
-    return _events(service, principal, job_id, after)
+    return _stream_events(service, principal, job_id, after)
 
 
-async def _events(
+async def _stream_events(
     service: Service, principal: Principal, job_id: uuid.UUID, after: int
 ) -> AsyncGenerator[JobEvent | None, None]:
     ping = service.settings.ping_seconds
@@ -78,7 +78,7 @@ async def _events(
                 if job is None or not principal.may_see(job.owner):
                     return  # it was deleted, which ends the stream
                 over = job.is_over
-                events = await events_after(connection, job_id, after, _PAGE_SIZE)
+                events = await list_job_events(connection, job_id, after, _PAGE_SIZE)
             for event in events:
                 after = event.id
                 yield event

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pydantic import ValidationError
 
 from octasplat.engine.core.errors import ConfigError
-from octasplat.service.actions.access import owned_job
+from octasplat.service.actions.access import fetch_visible_job
 from octasplat.service.actions.pages import Page, page_of
 from octasplat.service.auth import Principal
 from octasplat.service.job_limits import limit_notes
@@ -77,13 +77,13 @@ async def list_jobs(
 
 
 async def get_job(service: Service, principal: Principal, job_id: uuid.UUID) -> JobWithView:
-    """Return a job.
+    """Return the job with that id, if the principal may see it.
 
     Raises:
-        ProblemError: 404.
+        ProblemError: 404 if it does not exist or the principal may not see it.
     """
     async with service.pool.connection() as connection:
-        job = await owned_job(connection, principal, job_id)
+        job = await fetch_visible_job(connection, principal, job_id)
         return JobWithView(job, await job_view(connection, service, job))
 
 
@@ -105,10 +105,10 @@ async def change_job(
         check: sees the job as it is, while nobody else can change it, and raises to leave it so.
 
     Raises:
-        ProblemError: 404.
+        ProblemError: 404 if it does not exist or the principal may not see it.
     """
     async with service.pool.connection() as connection, connection.transaction():
-        job = await owned_job(connection, principal, job_id, lock=True)
+        job = await fetch_visible_job(connection, principal, job_id, lock=True)
         check(JobWithView(job, await job_view(connection, service, job)))
         given = change.model_dump(exclude_unset=True)
         job = await rows.change_job(
@@ -125,11 +125,11 @@ async def cancel_job(service: Service, principal: Principal, job_id: uuid.UUID) 
     """Ask a job to stop.
 
     Raises:
-        ProblemError: 404.
+        ProblemError: 404 if it does not exist or the principal may not see it.
         ConflictError: it is over.
     """
     async with service.pool.connection() as connection:
-        await owned_job(connection, principal, job_id)
+        await fetch_visible_job(connection, principal, job_id)
         job = await rows.cancel_job(connection, service.job_queue, job_id)
         return await job_view(connection, service, job)
 
@@ -151,7 +151,7 @@ async def delete_job(
         ConflictError: it is not over.
     """
     async with service.pool.connection() as connection:
-        job = await owned_job(connection, principal, job_id)
+        job = await fetch_visible_job(connection, principal, job_id)
         if cancel and not job.is_over:
             job = await rows.cancel_job(connection, service.job_queue, job_id)
     if cancel and not job.is_over:

@@ -8,9 +8,9 @@ from pydantic import BaseModel, ValidationError
 
 from octasplat.engine.core.errors import ConfigError
 from octasplat.engine.operations.cost_model import Estimate
-from octasplat.engine.settings.refusals import SettingsRefused
+from octasplat.engine.settings.refusals import InvalidSettingsError
 from octasplat.engine.settings.renamed_settings import collect_notices
-from octasplat.service.actions.access import check_not_draining, owned_job
+from octasplat.service.actions.access import check_not_draining, fetch_visible_job
 from octasplat.service.actions.jobs import job_view
 from octasplat.service.actions.named_files import check_named_files
 from octasplat.service.actions.validation import input_problem, resolve_options, validate_kind
@@ -89,7 +89,7 @@ async def submit_job(
         # Without what was not asked for: a version that knows more may get the repetition.
         named = fingerprint("job", request.model_dump(mode="json", exclude_defaults=True))
         job_id, _ = await create_once(connection, principal, idempotency_key, named, make)
-        view = await job_view(connection, service, await owned_job(connection, principal, job_id))
+        view = await job_view(connection, service, await fetch_visible_job(connection, principal, job_id))
         return view.model_copy(update={"notes": [*view.notes, *notices]})
 
 
@@ -117,11 +117,11 @@ async def retry_job(
         QuotaExceededError: its owner has too many jobs.
     """
     async with service.pool.connection() as connection, connection.transaction():
-        owner = (await owned_job(connection, principal, job_id)).owner
+        owner = (await fetch_visible_job(connection, principal, job_id)).owner
 
         async def make() -> uuid.UUID:
             await lock_owner(connection, owner)
-            job = await owned_job(connection, principal, job_id, lock=True)
+            job = await fetch_visible_job(connection, principal, job_id, lock=True)
             await check_new_job(connection, owner, service.settings.quota)
             options, estimate = await _revised_options(connection, service, principal, job, request)
             await rows.retry_job(
@@ -139,7 +139,7 @@ async def retry_job(
         )
         with collect_notices() as notices:
             await create_once(connection, principal, idempotency_key, named, make)
-        view = await job_view(connection, service, await owned_job(connection, principal, job_id))
+        view = await job_view(connection, service, await fetch_visible_job(connection, principal, job_id))
         return view.model_copy(update={"notes": [*view.notes, *notices]})
 
 
@@ -273,7 +273,7 @@ async def _revised_options(
         raise ProblemError(409, "source", "The job whose results it works on was deleted; make a new job.")
     try:
         options = kind.revise(job.options, request.options) if request.options else before
-    except (ValidationError, SettingsRefused) as error:
+    except (ValidationError, InvalidSettingsError) as error:
         raise options_error(error) from None
     check_formats_writable(kind, options, job.queue, workers)
     await check_named_files(connection, principal, kind, options, job.files_id)

@@ -33,7 +33,7 @@ def get_kind(service: Service, name: str) -> KindView:
     """Return one kind of job with its options.
 
     Raises:
-        ProblemError: 404.
+        ProblemError: 404 if it does not exist or the principal may not see it.
     """
     try:
         return _kind_view(get_job_kind(name), service)

@@ -37,7 +37,7 @@ async def revoke_token(service: Service, token_id: uuid.UUID) -> None:
     """Revoke a token.
 
     Raises:
-        ProblemError: 404.
+        ProblemError: 404 if it does not exist or the principal may not see it.
     """
     async with service.pool.connection() as connection:
         if not await rows.revoke_token(connection, token_id):

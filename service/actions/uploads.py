@@ -9,8 +9,8 @@ from typing import TypeVar
 from octasplat.service.actions.access import (
     check_not_draining,
     check_searchable_name,
+    fetch_visible_dataset,
     open_dataset,
-    owned_dataset,
 )
 from octasplat.service.actions.pages import Page, page_of
 from octasplat.service.auth import Principal
@@ -77,10 +77,10 @@ async def list_files(
     """Return the uploaded files after ``after``, by name.
 
     Raises:
-        ProblemError: 404.
+        ProblemError: 404 if it does not exist or the principal may not see it.
     """
     async with service.pool.connection() as connection:
-        await owned_dataset(connection, principal, dataset_id)
+        await fetch_visible_dataset(connection, principal, dataset_id)
         found = await rows.files_of(connection, dataset_id, after=after, limit=limit + 1)
     return page_of(found, limit, lambda file: file.path)
 
@@ -89,10 +89,10 @@ async def get_file(service: Service, principal: Principal, dataset_id: uuid.UUID
     """Return a file of a dataset.
 
     Raises:
-        ProblemError: 404.
+        ProblemError: 404 if it does not exist or the principal may not see it.
     """
     async with service.pool.connection() as connection:
-        await owned_dataset(connection, principal, dataset_id)
+        await fetch_visible_dataset(connection, principal, dataset_id)
         row = await rows.get_file(connection, dataset_id, check_searchable_name(path, "file"))
     if row is None:
         raise not_found_error("file")
@@ -104,7 +104,7 @@ async def remove_file(service: Service, principal: Principal, dataset_id: uuid.U
     """Remove a file from an open dataset.
 
     Raises:
-        ProblemError: 404.
+        ProblemError: 404 if it does not exist or the principal may not see it.
         ConflictError: the dataset is not open.
     """
     async with service.pool.connection() as connection:

@@ -6,7 +6,7 @@ from typing import Any
 from pydantic import BaseModel, ValidationError
 
 from octasplat.engine.core.errors import ConfigError
-from octasplat.engine.settings.refusals import SettingsRefused
+from octasplat.engine.settings.refusals import InvalidSettingsError
 from octasplat.service.problems import ProblemError, options_error
 from octasplat.workers.worker.job_kinds import JobKind, get_job_kind
 
@@ -33,7 +33,7 @@ def resolve_options(kind: JobKind, values: Mapping[str, Any]) -> BaseModel:
     """
     try:
         return kind.options.model_validate(kind.resolve(values).model_dump(mode="json"))
-    except (ValidationError, SettingsRefused) as error:
+    except (ValidationError, InvalidSettingsError) as error:
         raise options_error(error) from None
 
 

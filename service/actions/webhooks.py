@@ -3,7 +3,7 @@
 import uuid
 from dataclasses import dataclass
 
-from octasplat.service.actions.access import owned_job, owned_webhook
+from octasplat.service.actions.access import fetch_visible_job, fetch_visible_webhook
 from octasplat.service.actions.pages import Page, page_of
 from octasplat.service.auth import Principal
 from octasplat.service.problems import ProblemError, not_found_error
@@ -37,10 +37,10 @@ async def create_webhook(service: Service, principal: Principal, new: NewWebhook
     async with service.pool.connection() as connection, connection.transaction():
         owner = principal.owner
         if new.job_id is not None:
-            owner = (await owned_job(connection, principal, new.job_id)).owner
+            owner = (await fetch_visible_job(connection, principal, new.job_id)).owner
         await lock_owner(connection, owner)
         if new.job_id is not None:
-            await owned_job(connection, principal, new.job_id, lock=True)
+            await fetch_visible_job(connection, principal, new.job_id, lock=True)
         made = await rows.add_endpoint(
             connection, owner=owner, url=new.url, secret=secret, events=new.events, job_id=new.job_id
         )
@@ -59,13 +59,13 @@ async def list_webhooks(
 
 
 async def get_webhook(service: Service, principal: Principal, webhook_id: uuid.UUID) -> Endpoint:
-    """Return a webhook.
+    """Return the webhook with that id, if the principal may see it.
 
     Raises:
-        ProblemError: 404.
+        ProblemError: 404 if it does not exist or the principal may not see it.
     """
     async with service.pool.connection() as connection:
-        return await owned_webhook(connection, principal, webhook_id)
+        return await fetch_visible_webhook(connection, principal, webhook_id)
 
 
 @retry_on_deadlock
@@ -80,7 +80,7 @@ async def change_webhook(
     if change.url is not None:
         check_webhook_address(service, change.url)
     async with service.pool.connection() as connection:
-        await owned_webhook(connection, principal, webhook_id)
+        await fetch_visible_webhook(connection, principal, webhook_id)
         return await rows.change_endpoint(connection, webhook_id, **change.model_dump(exclude_unset=True))
 
 
@@ -89,10 +89,10 @@ async def delete_webhook(service: Service, principal: Principal, webhook_id: uui
     """Delete a webhook with its messages.
 
     Raises:
-        ProblemError: 404.
+        ProblemError: 404 if it does not exist or the principal may not see it.
     """
     async with service.pool.connection() as connection:
-        await owned_webhook(connection, principal, webhook_id)
+        await fetch_visible_webhook(connection, principal, webhook_id)
         await rows.delete_endpoint(connection, webhook_id)
 
 
@@ -103,7 +103,7 @@ async def send_test(service: Service, principal: Principal, webhook_id: uuid.UUI
         ProblemError: 404, or 409 if the webhook is disabled.
     """
     async with service.pool.connection() as connection:
-        endpoint = _check_enabled(await owned_webhook(connection, principal, webhook_id))
+        endpoint = _check_enabled(await fetch_visible_webhook(connection, principal, webhook_id))
         data = {"webhook_id": str(endpoint.id)}
         return await rows.add_delivery(connection, endpoint.id, rows.TEST_EVENT, data)
 
@@ -114,10 +114,10 @@ async def list_deliveries(
     """Return the newest messages and their outcomes.
 
     Raises:
-        ProblemError: 404.
+        ProblemError: 404 if it does not exist or the principal may not see it.
     """
     async with service.pool.connection() as connection:
-        await owned_webhook(connection, principal, webhook_id)
+        await fetch_visible_webhook(connection, principal, webhook_id)
         return await rows.list_deliveries(connection, webhook_id, limit)
 
 
@@ -131,7 +131,7 @@ async def redeliver(
         ProblemError: 404, or 409 if the webhook is disabled.
     """
     async with service.pool.connection() as connection, connection.transaction():
-        _check_enabled(await owned_webhook(connection, principal, webhook_id))
+        _check_enabled(await fetch_visible_webhook(connection, principal, webhook_id))
         if await rows.get_delivery(connection, webhook_id, delivery_id) is None:
             raise not_found_error("message")
         return await rows.redeliver(connection, delivery_id)

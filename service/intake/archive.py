@@ -151,7 +151,8 @@ def unpack_archive(
         file: the archive.
         listing: what :func:`list_archive` said of it.
         open_writer: opens the writer for a file.
-        on_file: told what was stored; it may raise to refuse it. Nothing counts before this function returns.
+        on_file: called with what was stored; it may raise to refuse it. Nothing counts before this
+            function returns.
 
     Raises:
         IntakeError: a content is not what the archive announces, or is an archive itself.

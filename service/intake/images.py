@@ -150,7 +150,7 @@ class _BoundedFile(io.RawIOBase):
         return True
 
     def seek(self, offset: int, whence: int = io.SEEK_SET) -> int:
-        self._count(0)
+        self._charge_read(0)
         return self._file.seek(offset, whence)
 
     def tell(self) -> int:
@@ -161,15 +161,15 @@ class _BoundedFile(io.RawIOBase):
         if requested < 0 or requested > self._bytes_left:
             requested = self._bytes_left + 1
         data = self._file.read(requested)
-        self._count(len(data))
+        self._charge_read(len(data))
         return data
 
     def readline(self, size: int | None = -1) -> bytes:
         data = self._file.readline(4096)
-        self._count(len(data))
+        self._charge_read(len(data))
         return data
 
-    def _count(self, taken: int) -> None:
+    def _charge_read(self, taken: int) -> None:
         self._bytes_left -= taken
         self._calls_left -= 1
         if self._bytes_left < 0 or self._calls_left < 0:

@@ -217,7 +217,12 @@ async def receive_archive(
     with translate_os_errors(spool.folder):
         spool.folder.mkdir(parents=True, exist_ok=True, mode=0o700)
         file = tempfile.TemporaryFile(dir=spool.folder)  # noqa: SIM115 - closed below
-    with file, _SpoolWriter(file, spool, storage, sha256, size_bytes, most) as writer:
+    with (
+        file,
+        _SpoolWriter(
+            file=file, spool=spool, storage=storage, sha256=sha256, size_bytes=size_bytes, max_bytes=most
+        ) as writer,
+    ):
         blob = await receive_body(stream, writer, idle_seconds=limits.idle_seconds)
         files, listing = await run_in_pool(
             ThreadPurpose.UNPACKING, _unpack_archive, storage, file, limits, max_bytes

@@ -68,7 +68,7 @@ def preview_files(listed: Sequence[ListedFile], limits: UploadLimits) -> ScenePr
     sizes = {file.path: file.size_bytes for file in listed}
     layout = lay_out_scene(list(sizes))
     files = tuple(PreviewedFile(name, path, sizes[path]) for name, path in sorted(layout.files.items()))
-    return _preview(files, layout.left_out, layout.notes, layout.folder, limits)
+    return _preview_files(files, layout.left_out, layout.notes, layout.folder, limits)
 
 
 def preview_archive(end: bytes, size_bytes: int, limits: UploadLimits) -> ScenePreview:
@@ -92,10 +92,10 @@ def preview_archive(end: bytes, size_bytes: int, limits: UploadLimits) -> SceneP
         PreviewedFile(file.name, file.record.name, file.size_bytes)
         for file in sorted(listing.files, key=lambda file: file.name)
     )
-    return _preview(files, listing.left_out, listing.notes, listing.folder, limits)
+    return _preview_files(files, listing.left_out, listing.notes, listing.folder, limits)
 
 
-def _preview(
+def _preview_files(
     files: tuple[PreviewedFile, ...],
     left_out: tuple[str, ...],
     notes: tuple[str, ...],

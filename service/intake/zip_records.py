@@ -230,7 +230,20 @@ def _central_entries(directory: bytes, count: int) -> list[tuple[ZipEntry, bytes
         name = _full_name(raw_name, name, extra)
         # The upper half of the attributes is the mode on Unix; some programs read it whatever the home.
         entries.append(
-            (ZipEntry(name, method, flags, crc32, packed, size, start, 0, attributes >> 16), raw_name)
+            (
+                ZipEntry(
+                    name=name,
+                    method=method,
+                    flags=flags,
+                    crc32=crc32,
+                    packed_bytes=packed,
+                    size_bytes=size,
+                    header_start=start,
+                    data_start=0,
+                    unix_mode=attributes >> 16,
+                ),
+                raw_name,
+            )
         )
         position = after
     if position != len(directory):
@@ -277,9 +290,16 @@ def _with_local_header(file: BinaryIO, record: ZipEntry, raw_name: bytes) -> Zip
         )
     data_start = record.header_start + _LOCAL_LAYOUT.size + name_length + extra_length
     return ZipEntry(
-        record.name, record.method, record.flags, record.crc32, record.packed_bytes, record.size_bytes,
-        record.header_start, data_start, record.unix_mode,
-    )  # fmt: skip
+        name=record.name,
+        method=record.method,
+        flags=record.flags,
+        crc32=record.crc32,
+        packed_bytes=record.packed_bytes,
+        size_bytes=record.size_bytes,
+        header_start=record.header_start,
+        data_start=data_start,
+        unix_mode=record.unix_mode,
+    )
 
 
 def _check_version(needed: int, name: str) -> None:

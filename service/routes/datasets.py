@@ -104,7 +104,7 @@ async def put_file(
     response: Response, digest: Digest = None,
 ) -> FileView:  # fmt: skip
     """Send a file: the body is its content. A repeat with the same digest does nothing."""
-    file = await uploads.put_file(service, principal, dataset_id, path, _upload(request, digest))
+    file = await uploads.put_file(service, principal, dataset_id, path, _upload_of_request(request, digest))
     if file.is_unchanged:
         response.status_code = 200
     return FileView.from_row(file.row)
@@ -141,7 +141,7 @@ async def put_archive(
     dataset_id: uuid.UUID, principal: Writer, service: ServiceDep, request: Request, digest: Digest = None
 ) -> ArchiveView:
     """Upload a scene as a ZIP file; its files are added to those that are there."""
-    archive = await uploads.put_archive(service, principal, dataset_id, _upload(request, digest))
+    archive = await uploads.put_archive(service, principal, dataset_id, _upload_of_request(request, digest))
     return ArchiveView(
         files=[FileView.from_row(row) for row in archive.files],
         left_out=list(archive.left_out),
@@ -155,13 +155,13 @@ async def commit_dataset(dataset_id: uuid.UUID, principal: Writer, service: Serv
     return DatasetView.from_row(await actions.commit_dataset(service, principal, dataset_id))
 
 
-def _upload(request: Request, digest: str | None) -> uploads.Upload:
+def _upload_of_request(request: Request, digest: str | None) -> uploads.Upload:
     text = request.headers.get("content-length")
     length = int(text) if text is not None and text.isdigit() else None
-    return uploads.Upload(_body(request), sha256=parse_digest(digest), size_bytes=length)
+    return uploads.Upload(_request_body(request), sha256=parse_digest(digest), size_bytes=length)
 
 
-async def _body(request: Request) -> AsyncIterator[bytes]:
+async def _request_body(request: Request) -> AsyncIterator[bytes]:
     """Yield the body of a request; one that breaks off leaves nothing."""
     try:
         async for piece in request.stream():

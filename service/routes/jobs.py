@@ -60,7 +60,7 @@ async def get_job(
 ) -> JobView:
     """Return a job; polling with `If-None-Match` is cheap."""
     job = await actions.get_job(service, principal, job_id)
-    headers = {"ETag": _etag(job), "Cache-Control": "no-cache"}
+    headers = {"ETag": _job_etag(job), "Cache-Control": "no-cache"}
     if etag_matches(request.headers.get("if-none-match"), headers["ETag"]):
         return Response(status_code=304, headers=headers)  # type: ignore[return-value]
     response.headers.update(headers)
@@ -76,7 +76,7 @@ async def change_job(
     """Rename a job, or pin it so that it does not expire."""
 
     def check(job: JobWithView) -> None:
-        check_precondition(request, _etag(job))
+        check_precondition(request, _job_etag(job))
 
     return await actions.change_job(service, principal, job_id, change, check)
 
@@ -116,7 +116,7 @@ async def delete_job(
     await actions.delete_job(service, principal, job_id, cancel=cancel)
 
 
-def _etag(job: JobWithView) -> str:
+def _job_etag(job: JobWithView) -> str:
     view = job.view
     place = "" if view.queue_position is None else f".{view.queue_position}.{len(view.notes)}"
     return f'"{job.row.version}{place}"'

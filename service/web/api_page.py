@@ -70,17 +70,17 @@ def operation_groups(document: Mapping[str, Any]) -> list[OperationGroup]:
                 operation = item[method]
                 name = operation.get("tags", ["other"])[0]
                 groups.setdefault(name, OperationGroup(name)).operations.append(
-                    _operation(method, path, operation)
+                    _api_operation(method, path, operation)
                 )
     return list(groups.values())
 
 
-def _operation(method: str, path: str, operation: Mapping[str, Any]) -> ApiOperation:
+def _api_operation(method: str, path: str, operation: Mapping[str, Any]) -> ApiOperation:
     return ApiOperation(
-        method.upper(),
-        path,
-        operation.get("description") or operation.get("summary", ""),
-        [
+        method=method.upper(),
+        path=path,
+        text=operation.get("description") or operation.get("summary", ""),
+        parameters=[
             Parameter(
                 parameter["in"],
                 parameter["name"],
@@ -91,8 +91,10 @@ def _operation(method: str, path: str, operation: Mapping[str, Any]) -> ApiOpera
             for parameter in operation.get("parameters", ())
             if parameter["in"] != "cookie"
         ],
-        list(operation.get("requestBody", {}).get("content", {})),
-        [(status, answer.get("description", "")) for status, answer in operation["responses"].items()],
+        body=list(operation.get("requestBody", {}).get("content", {})),
+        answers=[
+            (status, answer.get("description", "")) for status, answer in operation["responses"].items()
+        ],
     )
 
 

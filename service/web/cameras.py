@@ -18,7 +18,7 @@ from octasplat.engine.render.upright import estimate_up
 
 MAX_CAMERAS = 20_000
 MAX_VIEWS = 400
-"""Views that the viewer offers; of more, every so manieth."""
+"""Most views that the viewer offers; of more, every N-th."""
 _MAX_NAME_BYTES = 4096
 _PARAMETER_COUNTS = {0: 3, 1: 4, 2: 4, 3: 5, 4: 8, 5: 8, 6: 12, 7: 5, 8: 4, 9: 5, 10: 12}
 """Number of parameters by COLMAP's camera model number."""
@@ -63,9 +63,9 @@ def read_poses(cameras: IO[bytes], images: IO[bytes], *, binary: bool) -> list[P
         CamerasUnreadableError: the files are cut short or hold something else.
     """
     try:
-        optics = _binary_optics(cameras) if binary else _text_optics(cameras)
-        records = _binary_images(images) if binary else _text_images(images)
-        poses = [pose for record in records if (pose := _pose(record, optics)) is not None]
+        intrinsics = _read_cameras_bin(cameras) if binary else _read_cameras_txt(cameras)
+        records = _read_images_bin(images) if binary else _read_images_txt(images)
+        poses = [pose for record in records if (pose := _pose_of_image(record, intrinsics)) is not None]
     except (struct.error, ValueError, UnicodeDecodeError, OverflowError, IndexError, EOFError) as error:
         raise CamerasUnreadableError(str(error)) from None
     return sorted(poses, key=lambda pose: pose.name)
@@ -83,13 +83,13 @@ def read_view_poses(content: Mapping[str, Any]) -> list[PhotographPose]:
 def _pose_of_view(view: Mapping[str, Any], cameras: Sequence[Mapping[str, Any]]) -> PhotographPose | None:
     camera = cameras[view["camera"]]
     fy = float(camera["params"][0 if camera["model"] in _SINGLE_FOCAL_NAMES else 1])
-    optics = _optics(camera["width_px"], camera["height_px"], fy)
+    intrinsics = _intrinsics_from_focal(camera["width_px"], camera["height_px"], fy)
     rotation = np.array(view["rotation_cam_from_world"], np.float64)
     translation = np.array(view["translation_cam_from_world"], np.float64)
-    if optics is None or not (np.isfinite(rotation).all() and np.isfinite(translation).all()):
+    if intrinsics is None or not (np.isfinite(rotation).all() and np.isfinite(translation).all()):
         return None
     centre = -rotation.T @ translation
-    return PhotographPose(str(view["name"]), rotation, centre, optics.fov_y_degrees, optics.aspect)
+    return PhotographPose(str(view["name"]), rotation, centre, intrinsics.fov_y_degrees, intrinsics.aspect)
 
 
 def viewer_cameras(poses: list[PhotographPose], held_out: Iterable[str] = ()) -> dict[str, object]:
@@ -119,15 +119,15 @@ def viewer_cameras(poses: list[PhotographPose], held_out: Iterable[str] = ()) ->
     step = -(-len(poses) // MAX_VIEWS)
     selected = [pose for k, pose in enumerate(poses) if k % step == 0 or pose.name in held][:MAX_VIEWS]
     return {
-        "up": _rounded(up),
-        "target": _rounded(target),
+        "up": _round_values(up),
+        "target": _round_values(target),
         "radius": round(float(np.median(np.linalg.norm(target - centres, axis=1))) or 1.0, 6),
         "views": [
             {
                 "name": pose.name,
-                "position": _rounded(pose.centre_world),
-                "forward": _rounded(pose.rotation_cam_from_world[2]),
-                "up": _rounded(-pose.rotation_cam_from_world[1]),
+                "position": _round_values(pose.centre_world),
+                "forward": _round_values(pose.rotation_cam_from_world[2]),
+                "up": _round_values(-pose.rotation_cam_from_world[1]),
                 "fov_y_degrees": round(pose.fov_y_degrees, 4),
                 "aspect": round(pose.aspect, 5),
                 "held_out": pose.name in held,
@@ -138,27 +138,30 @@ def viewer_cameras(poses: list[PhotographPose], held_out: Iterable[str] = ()) ->
 
 
 @dataclass(frozen=True)
-class _Optics:
+class _Intrinsics:
+    """What the viewer needs of a camera's intrinsics."""
+
     fov_y_degrees: float
     aspect: float
 
 
-_Record = tuple[list[float], int, str]
+_ImageRecord = tuple[list[float], int, str]
 """Seven numbers of the pose, the camera's id, the name."""
 
 
-def _optics(width: float, height: float, fy: float) -> _Optics | None:
+def _intrinsics_from_focal(width: float, height: float, fy: float) -> _Intrinsics | None:
+    """Return the vertical field of view and the aspect; None where a number is not positive and finite."""
     if not (width > 0 and height > 0 and fy > 0 and np.isfinite([width, height, fy]).all()):
         return None
-    return _Optics(float(np.degrees(2 * np.arctan(height / (2 * fy)))), width / height)
+    return _Intrinsics(float(np.degrees(2 * np.arctan(height / (2 * fy)))), width / height)
 
 
-def _pose(record: _Record, optics: dict[int, _Optics]) -> PhotographPose | None:
+def _pose_of_image(record: _ImageRecord, intrinsics: dict[int, _Intrinsics]) -> PhotographPose | None:
     numbers, camera_id, name = record
     quat_wxyz, translation = np.array(numbers[:4]), np.array(numbers[4:7])
     length = np.linalg.norm(quat_wxyz)
-    camera_optics = optics.get(camera_id)
-    if camera_optics is None or not np.isfinite(numbers).all() or length < 1e-6:
+    camera = intrinsics.get(camera_id)
+    if camera is None or not np.isfinite(numbers).all() or length < 1e-6:
         return None
     w, x, y, z = quat_wxyz / length
     rotation = np.array(
@@ -168,29 +171,30 @@ def _pose(record: _Record, optics: dict[int, _Optics]) -> PhotographPose | None:
             [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
         ]
     )
-    return PhotographPose(
-        name, rotation, -rotation.T @ translation, camera_optics.fov_y_degrees, camera_optics.aspect
-    )
+    return PhotographPose(name, rotation, -rotation.T @ translation, camera.fov_y_degrees, camera.aspect)
 
 
-def _binary_optics(file: IO[bytes]) -> dict[int, _Optics]:
+def _read_cameras_bin(file: IO[bytes]) -> dict[int, _Intrinsics]:
+    """Return the intrinsics of COLMAP's ``cameras.bin`` by camera id, without invalid cameras."""
     (count,) = _unpack(file, "<Q")
-    _check_count(count)
-    optics = {}
+    _check_record_count(count)
+    intrinsics = {}
     for _ in range(count):
         camera_id, model, width, height = _unpack(file, "<iiQQ")
         if model not in _PARAMETER_COUNTS:
-            raise ValueError(f"camera model {model}")
+            raise ValueError(f"unsupported COLMAP camera model {model}")
         parameters = _unpack(file, f"<{_PARAMETER_COUNTS[model]}d")
-        found = _optics(width, height, parameters[0 if model in _SINGLE_FOCAL_MODELS else 1])
+        fy = parameters[0 if model in _SINGLE_FOCAL_MODELS else 1]  # after fx, where there are two
+        found = _intrinsics_from_focal(width, height, fy)
         if found is not None:
-            optics[camera_id] = found
-    return optics
+            intrinsics[camera_id] = found
+    return intrinsics
 
 
-def _binary_images(file: IO[bytes]) -> Iterator[_Record]:
+def _read_images_bin(file: IO[bytes]) -> Iterator[_ImageRecord]:
+    """Yield the records of COLMAP's ``images.bin``."""
     (count,) = _unpack(file, "<Q")
-    _check_count(count)
+    _check_record_count(count)
     for _ in range(count):
         _, *numbers, camera_id = _unpack(file, "<i7di")
         name = bytearray()
@@ -203,22 +207,24 @@ def _binary_images(file: IO[bytes]) -> Iterator[_Record]:
         yield [float(number) for number in numbers], camera_id, name.decode()
 
 
-def _text_optics(file: IO[bytes]) -> dict[int, _Optics]:
-    optics = {}
+def _read_cameras_txt(file: IO[bytes]) -> dict[int, _Intrinsics]:
+    """Return the intrinsics of COLMAP's ``cameras.txt`` by camera id, without invalid cameras."""
+    intrinsics = {}
     for line in _text_lines(file):
         words = line.split()
         if not words:
             continue
         parameters = [float(word) for word in words[4:]]
         fy = parameters[0 if words[1] in _SINGLE_FOCAL_NAMES else 1]
-        found = _optics(float(words[2]), float(words[3]), fy)
+        found = _intrinsics_from_focal(float(words[2]), float(words[3]), fy)
         if found is not None:
-            optics[int(words[0])] = found
-        _check_count(len(optics))
-    return optics
+            intrinsics[int(words[0])] = found
+        _check_record_count(len(intrinsics))
+    return intrinsics
 
 
-def _text_images(file: IO[bytes]) -> Iterator[_Record]:
+def _read_images_txt(file: IO[bytes]) -> Iterator[_ImageRecord]:
+    """Yield the records of COLMAP's ``images.txt``."""
     lines = _text_lines(file)
     for line in lines:
         words = line.split(maxsplit=9)
@@ -243,10 +249,10 @@ def _read_exactly(file: IO[bytes], count: int) -> bytes:
     return data
 
 
-def _check_count(count: float) -> None:
+def _check_record_count(count: float) -> None:
     if count > MAX_CAMERAS:
         raise ValueError(f"{count} records")
 
 
-def _rounded(values: Float64[np.ndarray, " n"]) -> list[float]:
+def _round_values(values: Float64[np.ndarray, " n"]) -> list[float]:
     return [round(float(value), 6) for value in values]

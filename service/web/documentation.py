@@ -39,12 +39,12 @@ class DocumentationSite(StaticFiles):
             )
         response = await super().get_response(path, scope)
         response.headers["Cache-Control"] = "no-cache"
-        response.headers["Content-Security-Policy"] = _policy(self._folder)
+        response.headers["Content-Security-Policy"] = _content_security_policy(self._folder)
         return response
 
 
 @cache
-def _policy(folder: Path) -> str:
+def _content_security_policy(folder: Path) -> str:
     """Return the content security policy of the site: its own files, and its inline scripts by digest."""
     scripts = {
         script

@@ -169,7 +169,7 @@ def _form_field(
     by_preset = {key: _value_at(values, path) for key, values in presets.items()}
     by_preset = {key: value for key, value in by_preset.items() if value is not _MISSING}
     control, values = _control_for(name, schema)
-    choices = _file_choices() if control == "files" else tuple(_choice(name, value) for value in values)
+    choices = _file_choices() if control == "files" else tuple(_make_choice(name, value) for value in values)
     return FormField(
         path=path,
         label=_LABELS.get(path) or _LABELS.get(name) or label_of(name),
@@ -233,7 +233,7 @@ def _help_sentence(text: str) -> str:
     return text[:1].upper() + re.sub(r"\bNone\b", "empty", text[1:])
 
 
-def _choice(name: str, value: str) -> Choice:
+def _make_choice(name: str, value: str) -> Choice:
     yes_no = {"true": "yes", "false": "no"}
     return Choice(value, _CHOICES.get((name, value)) or yes_no.get(value) or value.replace("_", " "))
 

@@ -166,7 +166,9 @@ async def get_cameras(job_id: uuid.UUID, principal: Reader, service: ServiceDep)
     artifacts = await list_artifacts(service, principal, job_id)
     files = await photographs_of(service, principal, job_id)
     held_out = next((row for row in artifacts if row.name == HELD_OUT), None)
-    content = await run_in_pool(ThreadPurpose.DOWNLOADS, _cameras, service, artifacts, files, held_out)
+    content = await run_in_pool(
+        ThreadPurpose.DOWNLOADS, _viewer_cameras_of_job, service, artifacts, files, held_out
+    )
     headers = {"Cache-Control": "private, max-age=300"}
     return JSONResponse(content, headers=headers)
 
@@ -280,7 +282,7 @@ def _octagon_q(config: dict[str, object]) -> float | None:
     return float(found) if isinstance(found, int | float) and found > 0 else None
 
 
-def _cameras(
+def _viewer_cameras_of_job(
     service: Service, artifacts: list[Artifact], files: list[DatasetFile], held_out: Artifact | None
 ) -> dict[str, object]:
     """Return the cameras of the job's poses, else of its dataset; none without a model."""

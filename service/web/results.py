@@ -150,8 +150,8 @@ def read_measurements(
     metrics: Mapping[str, Any], artifacts: Sequence[Artifact], photographs: Sequence[DatasetFile]
 ) -> Measurements | None:
     """Return the metrics of a result, worst view first; None if there are none."""
-    mean = _mapping(metrics.get("mean"))
-    rows = {str(name): _mapping(row) for name, row in _mapping(metrics.get("views")).items()}
+    mean = _as_mapping(metrics.get("mean"))
+    rows = {str(name): _as_mapping(row) for name, row in _as_mapping(metrics.get("views")).items()}
     if not mean:
         return None
     results = {row.name for row in artifacts}
@@ -163,37 +163,37 @@ def read_measurements(
         has_photograph = photograph in files and PurePosixPath(name).suffix.lower() in _BROWSER_IMAGE_SUFFIXES
         views.append(
             HeldOutView(
-                name,
-                {metric.key: _number(row.get(metric.key)) for metric in METRICS_SHOWN},
-                render if render in results else None,
-                photograph if has_photograph else None,
-                {
+                name=name,
+                values={metric.key: _finite_number(row.get(metric.key)) for metric in METRICS_SHOWN},
+                render=render if render in results else None,
+                photograph=photograph if has_photograph else None,
+                layers={
                     layer: name
                     for layer in LAYERS
                     if (name := render.replace("renders/", f"layers/{layer}/", 1)) in results
                 },
-                int(_number(row.get("width")) or 4),
-                int(_number(row.get("height")) or 3),
+                width=int(_finite_number(row.get("width")) or 4),
+                height=int(_finite_number(row.get("height")) or 3),
             )
         )
     views.sort(key=lambda view: (_value_or(view.values["psnr"], math.inf), view.name))
     interval = metrics.get("mean_psnr_ci95")
-    bounds = [_number(bound) for bound in interval] if isinstance(interval, list) else []
+    bounds = [_finite_number(bound) for bound in interval] if isinstance(interval, list) else []
     low, high = bounds if len(bounds) == 2 else (None, None)
-    gaussians = _number(metrics.get("gaussians"))
+    gaussians = _finite_number(metrics.get("gaussians"))
     return Measurements(
-        tuple(metric for metric in METRICS_SHOWN if _number(mean.get(metric.key)) is not None),
-        {metric.key: _number(mean.get(metric.key)) for metric in METRICS_SHOWN},
-        (low, high) if low is not None and high is not None else None,
-        None if gaussians is None else int(gaussians),
-        _number(metrics.get("seconds")),
-        tuple(views),
+        columns=tuple(metric for metric in METRICS_SHOWN if _finite_number(mean.get(metric.key)) is not None),
+        mean={metric.key: _finite_number(mean.get(metric.key)) for metric in METRICS_SHOWN},
+        interval=(low, high) if low is not None and high is not None else None,
+        gaussians=None if gaussians is None else int(gaussians),
+        seconds=_finite_number(metrics.get("seconds")),
+        views=tuple(views),
     )
 
 
 def mean_psnr(metrics: Mapping[str, Any]) -> float | None:
     """Return the mean PSNR of the held-out views, dB."""
-    return _number(_mapping(metrics.get("mean")).get("psnr"))
+    return _finite_number(_as_mapping(metrics.get("mean")).get("psnr"))
 
 
 def viewable_mesh(artifacts: Sequence[Artifact]) -> Artifact | None:
@@ -276,11 +276,11 @@ def _sort_rank(name: str) -> int:
     return order.index(name) if name in order else len(order)
 
 
-def _mapping(value: object) -> Mapping[str, Any]:
+def _as_mapping(value: object) -> Mapping[str, Any]:
     return value if isinstance(value, Mapping) else {}
 
 
-def _number(value: object) -> float | None:
+def _finite_number(value: object) -> float | None:
     if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
         return None
     return float(value)

@@ -6,8 +6,8 @@ from typing import Annotated
 from fastapi import APIRouter, Query, Request, Response
 
 from octasplat.service.auth import (
-    COOKIE,
-    SECURE_COOKIE,
+    SECURE_SESSION_COOKIE,
+    SESSION_COOKIE,
     Principal,
     authenticate_token,
     principal_of_session,
@@ -73,15 +73,16 @@ async def sign_in_once(
 
 @router.post("/sign-out")
 async def sign_out(request: Request, service: ServiceDep) -> Response:
-    """End the session; the token stays valid."""
+    """End the session; the API token it was begun with stays valid."""
     secret = session_secret(request)
     if secret is not None:
+        # For the audit log, which names who signed out.
         request.state.principal = await principal_of_session(service, secret)
         async with service.pool.connection() as connection:
             await end_session(connection, secret)
     response = redirect(request, "/sign-in")
-    response.delete_cookie(COOKIE, httponly=True, samesite="strict")
-    response.delete_cookie(SECURE_COOKIE, httponly=True, samesite="strict", secure=True)
+    response.delete_cookie(SESSION_COOKIE, httponly=True, samesite="strict")
+    response.delete_cookie(SECURE_SESSION_COOKIE, httponly=True, samesite="strict", secure=True)
     return response
 
 
@@ -92,7 +93,7 @@ async def _begin_session(request: Request, response: Response, service: Service,
     request.state.principal = Principal(token.owner, frozenset(token.scopes), token.id, session_id)
     is_secure = request.url.scheme == "https"
     response.set_cookie(
-        SECURE_COOKIE if is_secure else COOKIE,
+        SECURE_SESSION_COOKIE if is_secure else SESSION_COOKIE,
         secret,
         max_age=int(3600 * hours),
         httponly=True,

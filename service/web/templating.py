@@ -63,12 +63,12 @@ def render_page(
 
 def render_template(template: str, **values: object) -> str:
     """Return the text of a file in ``templates/`` that shows ``values``."""
-    text: str = _environment().get_template(template).render(**values)
+    text: str = _jinja_environment().get_template(template).render(**values)
     return text
 
 
 @cache
-def _environment() -> Any:
+def _jinja_environment() -> Any:
     from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
 
     environment = Environment(

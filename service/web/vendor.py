@@ -38,17 +38,17 @@ def build_vendor_files(target: Path = VENDOR_FOLDER) -> None:
         made = folder / "made"
         made.mkdir()
         for bundle in BUNDLES:
-            _bundle(modules, folder / f"{bundle}.js", made / f"{bundle}.js")
+            _bundle_modules(modules, folder / f"{bundle}.js", made / f"{bundle}.js")
         for copy, source in COPIES.items():
             text = (modules / source).read_text(encoding="utf-8")
             lines = [line for line in text.splitlines() if not line.startswith("//# sourceMappingURL")]
             (made / copy).write_text("\n".join(lines) + "\n", encoding="utf-8")
-        (made / "LICENSES.txt").write_text(_licences(modules), encoding="utf-8")
+        (made / "LICENSES.txt").write_text(_licence_texts(modules), encoding="utf-8")
         shutil.rmtree(target, ignore_errors=True)
         shutil.copytree(made, target)
 
 
-def _bundle(modules: Path, entry: Path, output: Path) -> None:
+def _bundle_modules(modules: Path, entry: Path, output: Path) -> None:
     """Return one minified ES module with everything that ``entry`` imports."""
     esbuild = modules / "esbuild" / "bin" / "esbuild"
     options = ("--bundle", "--minify", "--format=esm", "--target=es2022", "--legal-comments=none")
@@ -65,7 +65,7 @@ def _bundle(modules: Path, entry: Path, output: Path) -> None:
     subprocess.run(command, check=True)  # noqa: S603 - of our own making
 
 
-def _licences(modules: Path) -> str:
+def _licence_texts(modules: Path) -> str:
     """Return the names, versions and licences of the bundled packages."""
     parts = []
     for package in LICENCES:

@@ -7,7 +7,7 @@ from typing import Any
 
 from psycopg.rows import class_row
 
-from octasplat.service.actions.access import owned_job
+from octasplat.service.actions.access import fetch_visible_job
 from octasplat.service.actions.jobs import JobFilter, job_view, list_jobs, stages_of
 from octasplat.service.actions.pages import Page
 from octasplat.service.auth import Principal
@@ -16,7 +16,7 @@ from octasplat.service.state import Service
 from octasplat.service.thread_pools import ThreadPurpose, run_in_pool
 from octasplat.service.web.results import METRICS, mean_psnr, read_json
 from octasplat.service.web.templating import short_id
-from octasplat.workers.db.connections import Connection, with_columns
+from octasplat.workers.db.connections import Connection, select_columns
 from octasplat.workers.db.datasets import files_of, get_dataset
 from octasplat.workers.db.rows import Artifact, Dataset, DatasetFile, Job, JobEvent, JobState
 from octasplat.workers.queue import jobs as rows
@@ -102,16 +102,16 @@ async def job_detail(service: Service, principal: Principal, job_id: uuid.UUID) 
     """Return a job with what has happened to it.
 
     Raises:
-        ProblemError: 404.
+        ProblemError: 404 if it does not exist or the principal may not see it.
     """
     async with service.pool.connection() as connection:
-        job = await owned_job(connection, principal, job_id)
+        job = await fetch_visible_job(connection, principal, job_id)
         [line] = await _job_rows(service, connection, [job])
         line = replace(line, job=await job_view(connection, service, job))
         dataset = await get_dataset(connection, job.dataset_id) if job.dataset_id else None
         async with connection.cursor(row_factory=class_row(JobEvent)) as cursor:
             await cursor.execute(
-                with_columns(
+                select_columns(
                     """
                 SELECT {} FROM job_events
                 WHERE job_id = %s AND kind NOT IN ('progress', 'preview', 'checkpoint')
@@ -141,10 +141,10 @@ async def photographs_of(service: Service, principal: Principal, job_id: uuid.UU
     """Return the files of the dataset that a job works on; none if it is gone.
 
     Raises:
-        ProblemError: 404.
+        ProblemError: 404 if it does not exist or the principal may not see it.
     """
     async with service.pool.connection() as connection:
-        job = await owned_job(connection, principal, job_id)
+        job = await fetch_visible_job(connection, principal, job_id)
         return await files_of(connection, job.dataset_id) if job.dataset_id else []
 
 

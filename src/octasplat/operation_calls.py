@@ -16,7 +16,7 @@ from octasplat.engine.operations.registry import operation
 from octasplat.engine.operations.written_files import remember_written
 from octasplat.engine.settings.fields import is_negatable
 from octasplat.engine.settings.nearest_names import nearest_name
-from octasplat.engine.settings.renamed_settings import translate_names
+from octasplat.engine.settings.renamed_settings import replace_former_names
 from octasplat.notebook import default_progress
 
 P = ParamSpec("P")
@@ -42,7 +42,7 @@ def names_checked(function: Callable[P, R]) -> Callable[P, R]:
         former = [name for name in options if name not in names]
         if former and function.__module__ == "octasplat.verbs":
             request = operation(function.__name__.rstrip("_").replace("_", "-")).request
-            renamed = translate_names((request,), {name: options.pop(name) for name in former})
+            renamed = replace_former_names((request,), {name: options.pop(name) for name in former})
             options.update(renamed)
         for name in options:
             if name not in names:

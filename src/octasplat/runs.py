@@ -113,11 +113,11 @@ class Run:
     def settings(self) -> Mapping[str, Any]:
         """Return all settings of the run by their present names."""
         from octasplat.engine.runs.config import ReconstructionConfig
-        from octasplat.engine.settings.renamed_settings import translate_names
+        from octasplat.engine.settings.renamed_settings import replace_former_names
 
         path = self.path / _CONFIG
         found: Mapping[str, Any] = _read_json(path).get("reconstruction", {})
-        return translate_names((ReconstructionConfig,), found, source=str(path))
+        return replace_former_names((ReconstructionConfig,), found, source=str(path))
 
     @property
     def training(self) -> Mapping[str, Any]:

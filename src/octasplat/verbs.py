@@ -113,11 +113,11 @@ def reconstruct(
             published settings. Default: standard.
         max_side: Longest side to which photographs are shrunk; by default they keep their size. Set it
             for a quick try, or where memory is short.
-        test_every: Every how-manieth view by name is held out to be measured; 0 holds out none, so that
-            all are trained on. Default: 8.
-        held_out: Names of the views to hold out instead of every how-manieth.
+        test_every: Every N-th view by name is held out to be measured; 0 holds out none, so that all
+            are trained on. Default: 8.
+        held_out: Names of the views to hold out instead of every N-th.
         split: Which views are held out where the scene says so itself (transforms_test.json): given
-            follows it, every takes every how-manieth view all the same. Default: given.
+            follows it, every takes every N-th view all the same. Default: given.
         burst_length: So many views that follow each other by name, as frames of a video or shots of a
             burst, count as one where views are held out, so that none is measured by its neighbour.
             Photographs that are there twice always do. Default: 1.
@@ -243,11 +243,11 @@ def estimate(
             published settings. Default: standard.
         max_side: Longest side to which photographs are shrunk; by default they keep their size. Set it
             for a quick try, or where memory is short.
-        test_every: Every how-manieth view by name is held out to be measured; 0 holds out none, so that
-            all are trained on. Default: 8.
-        held_out: Names of the views to hold out instead of every how-manieth.
+        test_every: Every N-th view by name is held out to be measured; 0 holds out none, so that all
+            are trained on. Default: 8.
+        held_out: Names of the views to hold out instead of every N-th.
         split: Which views are held out where the scene says so itself (transforms_test.json): given
-            follows it, every takes every how-manieth view all the same. Default: given.
+            follows it, every takes every N-th view all the same. Default: given.
         burst_length: So many views that follow each other by name, as frames of a video or shots of a
             burst, count as one where views are held out, so that none is measured by its neighbour.
             Photographs that are there twice always do. Default: 1.

@@ -9,7 +9,11 @@ import pytest
 from octasplat.engine.dataset.views_file import read_views
 from octasplat.engine.edit.run_transform import rotate_environment
 from octasplat.engine.files.gaussian_ply import read_gaussian_ply
-from octasplat.engine.render.environment_files import read_environment, write_background, write_environment
+from octasplat.engine.render.environment_files import (
+    read_environment,
+    write_background_map,
+    write_environment,
+)
 from octasplat.engine.runs.config import read_config
 from octasplat.engine.runs.run_folder import run_camera_clearance
 from octasplat.engine.shading.environment_frame import environment_frame
@@ -31,7 +35,7 @@ def test_transformed_run_keeps_relative_cameras(shiny_run, octasplat, tmp_path):
     shiny_run = shutil.copytree(shiny_run, tmp_path / "run")
     radiance = np.random.default_rng(0).random((16, 32, 3)).astype(np.float32)
     write_environment(shiny_run / "environment.hdr", radiance)
-    write_background(shiny_run / "background.exr", radiance)
+    write_background_map(shiny_run / "background.exr", radiance)
     move = ("--rotate", "z", 90, "--scale", 2, "--translate", 3, -4, 5)
     done = octasplat("transform", shiny_run, *move, "-o", tmp_path / "moved")
     assert done.exit_code == 0, done.output

@@ -6,7 +6,7 @@ import shutil
 import numpy as np
 import pytest
 
-from octasplat.engine.render.environment_files import read_background
+from octasplat.engine.render.environment_files import read_background_map
 from octasplat.engine.render.image_files import read_image
 
 LEARNT = ("--set", "background=learnt", "--set", "background_height=32")
@@ -22,7 +22,7 @@ def far_run(scene, octasplat, tiny, tmp_path_factory):
 
 
 def test_background_file_holds_trained_background(far_run, octasplat, tmp_path):
-    colours = read_background(far_run / "background.exr")
+    colours = read_background_map(far_run / "background.exr")
     assert colours.shape == (32, 64, 3) and 0 <= colours.min() < colours.max() <= 1
     copied = tmp_path / "run"
     shutil.copytree(far_run, copied)

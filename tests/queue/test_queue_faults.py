@@ -18,7 +18,7 @@ from octasplat.workers.db.datasets import (
     renew_check,
     reopen_stale_checks,
 )
-from octasplat.workers.db.events_and_logs import events_after, log_after
+from octasplat.workers.db.events_and_logs import list_job_events, list_log_lines
 from octasplat.workers.db.locks import lock_owner, lock_store
 from octasplat.workers.db.rows import Job
 from octasplat.workers.maintenance.webhooks.rows import add_endpoint, delete_endpoint
@@ -79,8 +79,8 @@ async def test_job_events_with_invalid_text_are_stored(conninfo: str) -> None:
         assert job.state == "failed" and job.error is not None
         assert job.error["message"] == "header \ufffd and \ufffd"
         async with pool.connection() as connection:
-            told = {event.kind: event.data for event in await events_after(connection, job.id)}
-            lines = [line.text for line in await log_after(connection, job.id)]
+            told = {event.kind: event.data for event in await list_job_events(connection, job.id)}
+            lines = [line.text for line in await list_log_lines(connection, job.id)]
         assert told["warning"] == {"message": "header \ufffd and \ufffd", "value": None}
         assert "header \ufffd and \ufffd" in lines
 

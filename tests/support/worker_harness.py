@@ -16,7 +16,7 @@ from typing import Any
 import psycopg
 from psycopg.rows import class_row
 
-from octasplat.workers.db.connections import Connection, open_pool, with_columns
+from octasplat.workers.db.connections import Connection, open_pool, select_columns
 from octasplat.workers.db.rows import Artifact, Job, JobEvent
 from octasplat.workers.queue.jobs import NewJob, artifacts_of, cancel_job, create_job, retry_job
 from octasplat.workers.queue.procrastinate_queue import ProcrastinateQueue
@@ -120,7 +120,9 @@ class WorkerHarness:
         """The job as it is."""
         with psycopg.connect(self.conninfo) as connection:
             cursor = connection.cursor(row_factory=class_row(Job))
-            job = cursor.execute(with_columns("SELECT {} FROM jobs WHERE id = %s", Job), [job_id]).fetchone()
+            job = cursor.execute(
+                select_columns("SELECT {} FROM jobs WHERE id = %s", Job), [job_id]
+            ).fetchone()
         assert job is not None
         return job
 
@@ -128,7 +130,7 @@ class WorkerHarness:
         """What happened to the job."""
         with psycopg.connect(self.conninfo) as connection:
             cursor = connection.cursor(row_factory=class_row(JobEvent))
-            query = with_columns("SELECT {} FROM job_events WHERE job_id = %s ORDER BY id", JobEvent)
+            query = select_columns("SELECT {} FROM job_events WHERE job_id = %s ORDER BY id", JobEvent)
             cursor.execute(query, [job_id])
             return cursor.fetchall()
 

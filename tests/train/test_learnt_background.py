@@ -11,7 +11,7 @@ from octasplat.engine.core.rays import RayBatch
 from octasplat.engine.dataset import Camera
 from octasplat.engine.dataset.model import SparsePoints
 from octasplat.engine.gaussians.model import FlatGaussians
-from octasplat.engine.render.environment_files import read_background, write_background
+from octasplat.engine.render.environment_files import read_background_map, write_background_map
 from octasplat.engine.shading.background import LearnedBackground
 from octasplat.engine.shading.exposure import ExposureModel
 from octasplat.engine.shading.protocol import TracedRays
@@ -188,8 +188,8 @@ def test_background_is_exposed_with_foreground(tmp_path: Path) -> None:
 
 def test_files_keep_the_colours(tmp_path: Path) -> None:
     colours = np.random.default_rng(0).random((16, 32, 3)).astype(np.float32)
-    write_background(tmp_path / "background.exr", colours)
-    np.testing.assert_allclose(read_background(tmp_path / "background.exr"), colours, atol=1e-6)
+    write_background_map(tmp_path / "background.exr", colours)
+    np.testing.assert_allclose(read_background_map(tmp_path / "background.exr"), colours, atol=1e-6)
 
 
 def test_photographs_with_alpha_show_no_background() -> None:

@@ -9,7 +9,7 @@ from octasplat.engine.core import errors as engine_errors
 from octasplat.engine.core.errors import OctasplatError
 from octasplat.engine.core.portable_names import FileNameError
 from octasplat.engine.operations.base import ContradictoryRequestError
-from octasplat.engine.settings.refusals import SettingsRefused
+from octasplat.engine.settings.refusals import InvalidSettingsError
 from octasplat.workers.db.datasets import create_dataset, put_file
 from octasplat.workers.db.quotas import QuotaExceededError
 from octasplat.workers.storage import errors as storage_errors
@@ -54,7 +54,7 @@ def types_in(module: object) -> set[str]:
 def test_published_error_types_are_those_of_the_previous_release() -> None:
     assert types_in(engine_errors) == ENGINE_TYPES
     assert types_in(storage_errors) == STORAGE_TYPES | {"octasplat_error"}
-    others = (ContradictoryRequestError, SettingsRefused, QuotaExceededError, FileNameError)
+    others = (ContradictoryRequestError, InvalidSettingsError, QuotaExceededError, FileNameError)
     published = ["contradictory_request", "settings_refused", "quota_exceeded", "name_refused"]
     assert [kind.error_type for kind in others] == published
 

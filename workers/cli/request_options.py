@@ -47,7 +47,7 @@ def request_options(model: type[BaseModel], *, exclude: Sequence[str] = ()) -> C
     decorators = [
         _option_decorator(name, info, former_values=values.get(name))
         for name, info in fields.items()
-        if not _spelling(info).hidden
+        if not _spelling_of(info).hidden
     ]
     decorators += [_former_option(flag, fields[name]) for flag, name in _former_flags(model, fields).items()]
 
@@ -162,7 +162,7 @@ def _former_flags(model: type[BaseModel], fields: Mapping[str, FieldInfo]) -> di
     return {
         flag: name
         for flag, name in spelt.items()
-        if flag not in taken and name in fields and not _spelling(fields[name]).hidden
+        if flag not in taken and name in fields and not _spelling_of(fields[name]).hidden
     }
 
 
@@ -221,11 +221,11 @@ def _option_decorator(
                 name, metavar=place.metavar, required=info.is_required(), type=_click_type(inner, info)
             )
         )
-    spelling = _spelling(info)
+    spelling = _spelling_of(info)
     settings: dict[str, Any] = {
         "help": _help_text(info, optional),
         "required": info.is_required() and not hidden,
-        "metavar": spelling.metavar or _metavar(inner),
+        "metavar": spelling.metavar or _default_metavar(inner),
         "default": None,
         "hidden": hidden,
     }
@@ -259,13 +259,13 @@ def _is_parsed_from_text(info: FieldInfo) -> bool:
 
 def _may_repeat(info: FieldInfo) -> bool:
     """Return whether the option may be given several times, so that none at all is an empty tuple."""
-    return _spelling(info).repeated or (
+    return _spelling_of(info).repeated or (
         not _is_parsed_from_text(info) and _is_sequence(_strip_optional(info.annotation)[0])
     )
 
 
 def _option_flags(name: str, info: FieldInfo) -> tuple[str, ...]:
-    if flags := _spelling(info).flags:
+    if flags := _spelling_of(info).flags:
         return flags
     flag = "--" + name.replace("_", "-")
     inner, _ = _strip_optional(info.annotation)
@@ -283,7 +283,7 @@ def _help_text(info: FieldInfo, optional: bool) -> str:
     return text
 
 
-def _metavar(annotation: Any) -> str | None:
+def _default_metavar(annotation: Any) -> str | None:
     parts = get_args(annotation) if get_origin(annotation) is tuple else ()
     if parts and parts[-1] is not Ellipsis and len(set(parts)) == 1 and len(parts) == 3:
         return "X Y Z"
@@ -374,7 +374,7 @@ def _number_range(kind: type, marks: Sequence[Any]) -> Any:
     return click.FloatRange(low, high, min_open=low_open, max_open=high_open)
 
 
-def _spelling(info: FieldInfo) -> Spelling:
+def _spelling_of(info: FieldInfo) -> Spelling:
     return _find_mark(info, Spelling) or Spelling()
 
 

@@ -56,7 +56,7 @@ def verbs() -> tuple[Verb, ...]:
             Verb(
                 name=entry.name,
                 title=entry.title,
-                command=_command(entry.name),
+                command=_command_of_verb(entry.name),
                 job_kind=kind.name if kind else "",
                 works_on=kind.needs if kind else "",
                 http=f'POST /v1/jobs {{"kind": "{kind.name}", ...}}' if kind else "",
@@ -68,10 +68,10 @@ def verbs() -> tuple[Verb, ...]:
 
 def verbs_page() -> str:
     """Return the content of ``docs/verbs.md``."""
-    return _PAGE + "".join(f"| {' | '.join(_columns(verb))} |\n" for verb in verbs())
+    return _PAGE + "".join(f"| {' | '.join(_verb_row(verb))} |\n" for verb in verbs())
 
 
-def _command(name: str) -> str:
+def _command_of_verb(name: str) -> str:
     """Return the command of a verb; ``stage-init`` is ``octasplat stage init``."""
     words = name.split("-")
     return f"octasplat {' '.join(words)}" if has_command(words[0]) else ""
@@ -86,7 +86,7 @@ def _python_call(entry: Operation[Any, Any]) -> str:
     return f"{module}.run({module}.{entry.request.__name__}(...))"
 
 
-def _columns(verb: Verb) -> tuple[str, ...]:
+def _verb_row(verb: Verb) -> tuple[str, ...]:
     works_on = "files" if verb.works_on == "files" else f"a {verb.works_on}"
     job = f"`{verb.job_kind}`, on {works_on}" if verb.job_kind else ""
     code = (f"`{text}`" if text else "" for text in (verb.command, verb.http, verb.python))

@@ -117,12 +117,12 @@ class Api:
 
     def get(self, path: str, **query: Any) -> Any:
         """Return the JSON of a GET."""
-        return _json(self.request("GET", path, params=query or None))
+        return _response_json(self.request("GET", path, params=query or None))
 
     def post(self, path: str, body: Any = None, *, key: str | None = None) -> Any:
         """Return the JSON of a POST; with a key, which is made if not given, it is safe to try again."""
         headers = {"Idempotency-Key": key or uuid.uuid4().hex}
-        return _json(self.request("POST", path, json=body, headers=headers))
+        return _response_json(self.request("POST", path, json=body, headers=headers))
 
     def request(self, method: str, path: str, **arguments: Any) -> httpx.Response:
         """Send a request, again while the service is away or busy; bodies must be content or JSON.
@@ -199,7 +199,7 @@ def _is_from_service(response: httpx.Response) -> bool:
     return response.is_success or response.headers.get("content-type", "").startswith(PROBLEM_MEDIA_TYPE)
 
 
-def _json(response: httpx.Response) -> Any:
+def _response_json(response: httpx.Response) -> Any:
     try:
         return response.json()
     except ValueError:

@@ -37,7 +37,7 @@ def download_results(
         job_id: which.
         folder: where to; files that are there with the right content are left alone.
         names: only these results.
-        progress: told (bytes done, bytes in all).
+        progress: called with (bytes done, total).
 
     Returns:
         The files.
@@ -85,13 +85,13 @@ def _download_file(
     address = f"/v1/jobs/{job_id}/artifacts/{urllib.parse.quote(artifact['name'])}"
     patience, damaged = api.new_backoff(), 0
     while damaged < MAX_DAMAGED_DOWNLOADS:
-        before = _size(partial)
+        before = _file_size(partial)
         try:
             _resume_download(api, address, artifact, partial, on_bytes)
         except (httpx.TransportError, ServiceUnreachableError, ServiceError) as error:
             if isinstance(error, ServiceError) and error.status not in BUSY_STATUSES | UNAVAILABLE_STATUSES:
                 raise
-            if _size(partial) > before:
+            if _file_size(partial) > before:
                 patience.reset()
             if not patience.wait():
                 raise (
@@ -109,7 +109,7 @@ def _download_file(
 def _resume_download(
     api: Api, address: str, artifact: dict[str, Any], partial: Path, on_bytes: Callable[[int], None]
 ) -> None:
-    begin = _size(partial)
+    begin = _file_size(partial)
     if begin >= artifact["size_bytes"]:
         partial.touch()
         return
@@ -125,7 +125,7 @@ def _resume_download(
                 on_bytes(handle.tell())
 
 
-def _size(path: Path) -> int:
+def _file_size(path: Path) -> int:
     return path.stat().st_size if path.exists() else 0
 
 

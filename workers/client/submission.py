@@ -51,7 +51,7 @@ def submit(api: Api, submission: Submission, on_event: EventListener = ignore_ev
     Args:
         api: the service.
         submission: the scene and what to do with it.
-        on_event: hears of the stage ``upload``, whose steps are kB, and of what the service warns of.
+        on_event: receives the stage ``upload``, whose steps are kB, and of what the service warns of.
 
     Raises:
         OctasplatError: the scene or the options are refused, or the service does not answer.
@@ -203,8 +203,8 @@ def wait_for_job(
     Args:
         api: the service.
         job_id: which.
-        on_event: hears what the engine tells.
-        on_note: told in a sentence when another worker takes the job over.
+        on_event: receives the events of the engine.
+        on_note: called with a sentence when another worker takes the job over.
 
     Raises:
         JobFailedError: it failed or was cancelled.

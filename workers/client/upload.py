@@ -49,7 +49,7 @@ def list_scene_files(
     if not scene.is_dir():
         raise DatasetError(f"{scene} is not a folder; name the folder that holds images/ and sparse/.")
     found = (path for path in sorted(scene.rglob("*")) if path.is_file())
-    paths = {_sendable(path.relative_to(scene).as_posix()): path for path in found}
+    paths = {_replace_non_utf8(path.relative_to(scene).as_posix()): path for path in found}
     listed = [
         {"path": name, "size_bytes": path.stat().st_size}
         for name, path in paths.items()
@@ -59,12 +59,12 @@ def list_scene_files(
     _tell_preview(scene, preview, on_warning)
     files = [LocalFile(file["name"], paths[file["path"]], file["size_bytes"]) for file in preview["files"]]
     for file in files:
-        if _sendable(str(file.path)) != str(file.path):
+        if _replace_non_utf8(str(file.path)) != str(file.path):
             raise DatasetError(f"The name of {str(file.path)!a} is not UTF-8; rename the file.")
     return files
 
 
-def _sendable(name: str) -> str:
+def _replace_non_utf8(name: str) -> str:
     """Return a name with what is not UTF-8 in it replaced, as JSON cannot hold it."""
     return name.encode("utf-8", "surrogateescape").decode("utf-8", "replace")
 
@@ -112,8 +112,8 @@ def upload_scene(
         api: the service.
         scene: a folder with ``images/``, a bare folder of photographs, or a ZIP file.
         name: what to call it; by default as the folder.
-        progress: told (bytes done, bytes in all).
-        on_warning: told which files are left out, before anything is sent.
+        progress: called with (bytes done, total).
+        on_warning: called with a sentence on which files are left out, before anything is sent.
 
     Returns:
         The dataset.
@@ -150,7 +150,7 @@ def upload_files(
         api: the service.
         files: where they are, by the names that the options call them.
         name: what to call the dataset.
-        progress: told (bytes done, bytes in all).
+        progress: called with (bytes done, total).
 
     Returns:
         The dataset, committed; a job gets it as ``files_id``.

@@ -31,7 +31,7 @@ def watch_job(
     Args:
         api: the service.
         job_id: which.
-        on_event: hears what the engine tells.
+        on_event: receives the events of the engine.
         on_state: hears of changes of state, rescues and the like.
 
     Returns:

@@ -57,9 +57,9 @@ async def add_entry(
             owner,
             token_id,
             session_id,
-            _storable(address),
-            _storable(action),
-            target and _storable(target),
+            _storable_text(address),
+            _storable_text(action),
+            target and _storable_text(target),
             status,
         ],
     )
@@ -86,6 +86,6 @@ async def delete_old_entries(connection: Connection, hours: float) -> None:
         )
 
 
-def _storable(text: str) -> str:
+def _storable_text(text: str) -> str:
     """Return a text cut to a bounded length and without characters that Postgres refuses."""
     return text.replace("\0", "\N{REPLACEMENT CHARACTER}")[:_MAX_CHARACTERS]

@@ -42,8 +42,8 @@ KEEPALIVES: Mapping[str, int] = {
 """So that a host that vanished is noticed within half a minute; by itself TCP takes hours."""
 
 
-def with_columns(query: LiteralString, row: type[Any], table_name: str = "") -> sql.Composed:
-    """Return a query with the columns that a row has in the place of its braces.
+def select_columns(query: LiteralString, row: type[Any], table_name: str = "") -> sql.Composed:
+    """Return a query that selects the columns of ``row``, whose names replace its braces.
 
     They are named, as the next version's tables, with which this one goes on for a while, may have more.
 
@@ -74,13 +74,13 @@ async def fetch_all(
 
     Args:
         connection: to the database.
-        row: see :func:`with_columns`, as for ``query`` and ``table_name``.
+        row: see :func:`select_columns`, as for ``query`` and ``table_name``.
         query: with ``{}`` where the columns belong.
         values: of the query's placeholders.
         table_name: name of the table, where the query has several.
     """
     async with connection.cursor(row_factory=class_row(row)) as cursor:
-        await cursor.execute(with_columns(query, row, table_name), values)
+        await cursor.execute(select_columns(query, row, table_name), values)
         return await cursor.fetchall()
 
 
@@ -94,7 +94,7 @@ async def fetch_one(
 ) -> RowT | None:
     """Return the first row that a query finds, or None; arguments as of :func:`fetch_all`."""
     async with connection.cursor(row_factory=class_row(row)) as cursor:
-        await cursor.execute(with_columns(query, row, table_name), values)
+        await cursor.execute(select_columns(query, row, table_name), values)
         return await cursor.fetchone()
 
 

@@ -9,7 +9,7 @@ from typing import Any
 from psycopg.rows import class_row, dict_row
 
 from octasplat.engine.dataset.image_sizes import ImageSizes
-from octasplat.workers.db.connections import Connection, fetch_all, fetch_one, with_columns
+from octasplat.workers.db.connections import Connection, fetch_all, fetch_one, select_columns
 from octasplat.workers.db.errors import ConflictError, NotFoundError
 from octasplat.workers.db.ids import new_id
 from octasplat.workers.db.locks import lock_owner
@@ -63,7 +63,7 @@ async def list_files_by_suffix(
     """Return files that options may name, by suffix, with their committed datasets; newest first."""
     async with connection.cursor(row_factory=dict_row) as cursor:
         await cursor.execute(
-            with_columns(
+            select_columns(
                 """
             SELECT f.path AS file_path, {} FROM datasets d JOIN dataset_files f ON f.dataset_id = d.id
             WHERE d.owner = %s AND d.holds = 'files' AND d.state = 'committed'
@@ -103,7 +103,7 @@ async def put_files(
         await _lock_open_dataset(connection, dataset_id)
         async with connection.cursor(row_factory=class_row(DatasetFile)) as cursor:
             await cursor.execute(
-                with_columns(
+                select_columns(
                     """
             INSERT INTO dataset_files (dataset_id, path, sha256, size_bytes, facts)
             SELECT %s, given.path, given.sha256, given.size_bytes, given.facts
@@ -225,7 +225,7 @@ async def begin_check(connection: Connection, dataset_id: uuid.UUID) -> Check:
             raise ConflictError("The dataset is being checked already; ask again in a moment.")
         check = Check(dataset)
         if dataset.state != "committed":
-            check.said_at.append(await _clock(connection))
+            check.said_at.append(await _database_time(connection))
             await connection.execute(
                 "UPDATE datasets SET state = 'checking', used_at = %s, expires_at = NULL WHERE id = %s",
                 [check.said_at[-1], dataset_id],
@@ -236,7 +236,9 @@ async def begin_check(connection: Connection, dataset_id: uuid.UUID) -> Check:
 async def renew_check(connection: Connection, check: Check) -> None:
     """Renew the validation of a dataset, so that it does not count as abandoned."""
     before = list(check.said_at)
-    check.said_at.append(await _clock(connection))  # known before it is written, as the answer may be lost
+    check.said_at.append(
+        await _database_time(connection)
+    )  # known before it is written, as the answer may be lost
     await connection.execute(
         "UPDATE datasets SET used_at = %s WHERE id = %s AND state = 'checking' AND used_at = ANY(%s)",
         [check.said_at[-1], check.dataset.id, before],
@@ -336,7 +338,7 @@ async def delete_dataset(connection: Connection, dataset_id: uuid.UUID) -> None:
         await connection.execute("DELETE FROM datasets WHERE id = %s", [dataset_id])
 
 
-async def _clock(connection: Connection) -> datetime:
+async def _database_time(connection: Connection) -> datetime:
     """Return the time by the database's clock."""
     row = await (await connection.execute("SELECT clock_timestamp() AS at")).fetchone()
     assert row is not None

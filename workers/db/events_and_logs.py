@@ -47,25 +47,25 @@ async def trim_log(connection: Connection, job_id: uuid.UUID, max_lines: int) ->
     )
 
 
-async def events_after(
-    connection: Connection, job_id: uuid.UUID, after: int = 0, limit: int = 500
+async def list_job_events(
+    connection: Connection, job_id: uuid.UUID, after_id: int = 0, limit: int = 500
 ) -> list[JobEvent]:
-    """Return events of a job with an id above ``after``, in order."""
+    """Return the job's events whose id is above ``after_id``, in ascending order."""
     return await fetch_all(
         connection,
         JobEvent,
         "SELECT {} FROM job_events WHERE job_id = %s AND id > %s ORDER BY id LIMIT %s",
-        [job_id, after, limit],
+        [job_id, after_id, limit],
     )
 
 
-async def log_after(
-    connection: Connection, job_id: uuid.UUID, after: int = 0, limit: int = 1000
+async def list_log_lines(
+    connection: Connection, job_id: uuid.UUID, after_id: int = 0, limit: int = 1000
 ) -> list[LogLine]:
-    """Return log lines of a job with an id above ``after``, in order."""
+    """Return the job's log lines whose id is above ``after_id``, in ascending order."""
     return await fetch_all(
         connection,
         LogLine,
         "SELECT {} FROM job_logs WHERE job_id = %s AND id > %s ORDER BY id LIMIT %s",
-        [job_id, after, limit],
+        [job_id, after_id, limit],
     )

@@ -76,7 +76,7 @@ def migrate(conninfo: str, only: Collection[str] | None = None) -> tuple[str, ..
             _acquire_lock(connection)
             return tuple(_apply_missing(connection, only))
     except psycopg.OperationalError as error:
-        raise _unreachable(error) from None
+        raise _unreachable_error(error) from None
     except psycopg.Error as error:
         raise DatabaseError(
             f"The database's tables cannot be brought up to date: {_one_line(error)}"
@@ -115,7 +115,7 @@ def apply_step(connection: psycopg.Connection, step: Migration) -> None:
                     "SELECT set_config('lock_timeout', %s, true)", [f"{LOCK_TIMEOUT_SECONDS:g}s"]
                 )
                 connection.execute(step.sql)
-                _record(connection, step)
+                _record_migration(connection, step)
             return
         except (psycopg.errors.LockNotAvailable, psycopg.errors.DeadlockDetected) as error:
             if time.monotonic() > deadline:
@@ -231,10 +231,10 @@ def _missing_in_database(conninfo: str) -> list[str]:
             _is_newer(connection, applied)
             return missing_migrations(applied)
     except psycopg.OperationalError as error:
-        raise _unreachable(error) from None
+        raise _unreachable_error(error) from None
 
 
-def _unreachable(error: psycopg.Error) -> DatabaseError:
+def _unreachable_error(error: psycopg.Error) -> DatabaseError:
     return DatabaseError(
         f"The database cannot be reached ({_one_line(error)}); check DATABASE_URL and that it runs."
     )
@@ -246,11 +246,11 @@ def _create_queue_schema(connection: psycopg.Connection) -> Iterator[str]:
     with connection.transaction():
         connection.execute(schema)
         for step in queue_migrations():
-            _record(connection, step)
+            _record_migration(connection, step)
     yield "schema.sql"
 
 
-def _record(connection: psycopg.Connection, migration: Migration) -> None:
+def _record_migration(connection: psycopg.Connection, migration: Migration) -> None:
     connection.execute(
         "INSERT INTO schema_steps (component, name) VALUES (%s, %s)", [migration.component, migration.name]
     )

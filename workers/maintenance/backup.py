@@ -85,7 +85,7 @@ def create_backup(
             rows = folder / f"{TABLES_PREFIX}{uuid.uuid4().hex[:12]}"
             with translate_os_errors(folder):
                 rows.mkdir(mode=0o700)
-            tables = [_write_table(connection, name, rows) for name in _tables(connection)]
+            tables = [_write_table(connection, name, rows) for name in _ordered_tables(connection)]
             steps = [name for (name,) in connection.execute(
                 "SELECT name FROM schema_steps WHERE component = %s ORDER BY name", [OWN_COMPONENT]
             )]  # fmt: skip
@@ -155,7 +155,7 @@ def restore_backup(
     return BackupSummary(sum(table["rows"] for table in record["tables"]), contents, size_bytes)
 
 
-def _tables(connection: psycopg.Connection) -> list[str]:
+def _ordered_tables(connection: psycopg.Connection) -> list[str]:
     """Return our tables, each after those that it references."""
     rows = connection.execute(
         "SELECT tablename FROM pg_tables WHERE schemaname = current_schema() "
@@ -184,7 +184,9 @@ def _write_table(connection: psycopg.Connection, name: str, folder: Path) -> dic
         (folder / f"{name}.copy").open("wb") as handle,
         connection.cursor() as cursor,
     ):
-        with cursor.copy(sql.SQL("COPY {} ({}) TO STDOUT").format(*_identifiers(name, columns))) as copy:
+        with cursor.copy(
+            sql.SQL("COPY {} ({}) TO STDOUT").format(*_table_identifiers(name, columns))
+        ) as copy:
             for piece in copy:
                 rows += bytes(piece).count(b"\n")
                 handle.write(piece)
@@ -195,7 +197,7 @@ def _write_table(connection: psycopg.Connection, name: str, folder: Path) -> dic
 
 def _read_table(connection: psycopg.Connection, table: dict[str, Any], folder: Path) -> None:
     """Read rows unchanged, with triggers disabled."""
-    name, columns = _identifiers(table["name"], table["columns"])
+    name, columns = _table_identifiers(table["name"], table["columns"])
     connection.execute(sql.SQL("ALTER TABLE {} DISABLE TRIGGER USER").format(name))
     connection.execute(sql.SQL("DELETE FROM {}").format(name))
     with (
@@ -209,7 +211,7 @@ def _read_table(connection: psycopg.Connection, table: dict[str, Any], folder: P
     connection.execute(sql.SQL("ALTER TABLE {} ENABLE TRIGGER USER").format(name))
 
 
-def _identifiers(name: str, columns: list[str]) -> tuple[sql.Composable, sql.Composable]:
+def _table_identifiers(name: str, columns: list[str]) -> tuple[sql.Composable, sql.Composable]:
     return sql.Identifier(name), sql.SQL(", ").join(map(sql.Identifier, columns))
 
 

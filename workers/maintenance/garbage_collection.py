@@ -146,7 +146,7 @@ async def _collect(
         async with connection.transaction():
             await connection.execute("SET TRANSACTION ISOLATION LEVEL REPEATABLE READ")
             began_unix = await _oldest_lease_unix(connection)
-            named, entered = await _referenced(connection)
+            named, entered = await _referenced_contents(connection)
             cursor = await connection.execute(
                 "SELECT sha256 FROM replaced_contents WHERE replaced_at < now() - make_interval(secs => %s)",
                 [replaced_seconds],
@@ -173,14 +173,14 @@ async def _collect_now(pool: Pool, storage: Storage) -> RemovedContents:
     async with pool.connection() as connection:
         await _expire_stale_leases(connection)
         async with connection.transaction():
-            named, _ = await _referenced(connection)
+            named, _ = await _referenced_contents(connection)
         # Listed before the notes and names that count are read: whoever makes a note later and stores one of
         # these again makes it younger than it was in the list.
         found = await asyncio.to_thread(list_unreferenced, storage, named)
         async with connection.transaction():
             await connection.execute("SET TRANSACTION ISOLATION LEVEL REPEATABLE READ")
             began_unix = await _oldest_lease_unix(connection)
-            named, entered = await _referenced(connection)
+            named, entered = await _referenced_contents(connection)
         named |= await _published_results(connection, storage, entered)
         await connection.commit()
         limit_unix = min(now - _MIN_AGE_SECONDS, began_unix)
@@ -244,7 +244,7 @@ async def _oldest_lease_unix(connection: Connection) -> float:
     return began_at.timestamp() - MAX_CLOCK_SKEW_SECONDS if began_at is not None else float("inf")
 
 
-async def _referenced(connection: Connection) -> tuple[set[str], set[uuid.UUID]]:
+async def _referenced_contents(connection: Connection) -> tuple[set[str], set[uuid.UUID]]:
     """Return the contents that the tables reference, and the jobs whose results are among them."""
     named = {reference.sha256 async for reference in references(connection)}
     cursor = await connection.execute("SELECT id FROM jobs WHERE state = 'succeeded'")

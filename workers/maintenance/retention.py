@@ -127,8 +127,12 @@ async def update_expiry_times(connection: Connection, retention: Retention) -> N
 
 async def delete_expired(connection: Connection) -> DeletedCounts:
     """Delete what has expired; its contents stay in the store until they are collected."""
-    jobs = [await _delete_expired_job(connection, job_id) for job_id in await _expired(connection, "jobs")]
-    datasets = [await _delete_expired_dataset(connection, d) for d in await _expired(connection, "datasets")]
+    jobs = [
+        await _delete_expired_job(connection, job_id) for job_id in await _expired_ids(connection, "jobs")
+    ]
+    datasets = [
+        await _delete_expired_dataset(connection, d) for d in await _expired_ids(connection, "datasets")
+    ]
     return DeletedCounts(sum(jobs), sum(datasets))
 
 
@@ -172,7 +176,7 @@ async def thin_progress_events(connection: Connection, max_events: int = MAX_PRO
     return cursor.rowcount
 
 
-async def _expired(connection: Connection, table: str) -> list[uuid.UUID]:
+async def _expired_ids(connection: Connection, table: str) -> list[uuid.UUID]:
     query = sql.SQL("SELECT id FROM {} WHERE expires_at < now() AND NOT pinned ORDER BY expires_at LIMIT %s")
     async with connection.transaction():  # which ends here, so that each is forgotten in one of its own
         cursor = await connection.execute(query.format(sql.Identifier(table)), [_BATCH_SIZE])

@@ -54,19 +54,19 @@ def find_binaries(major: int | None = None) -> PostgresBinaries:
 
 
 def _all_binaries() -> Iterator[PostgresBinaries]:
-    for folder in _candidates():
+    for folder in _candidate_folders():
         if all((folder / name).exists() for name in ("initdb", "pg_ctl", "postgres")):
             major = _major_of(folder)
             if major is not None and major >= MIN_MAJOR:
                 yield PostgresBinaries(folder.resolve(), major)
 
 
-def _candidates() -> Iterator[Path]:
+def _candidate_folders() -> Iterator[Path]:
     """Folders that may hold binaries, the best ones first."""
     spec = importlib.util.find_spec(_WHEEL)  # not imported: it makes folders of its own then
     for location in (spec.submodule_search_locations or ()) if spec is not None else ():
         folders = Path(location).glob("pginstall*/bin")
-        yield from sorted(folders, key=lambda folder: _digits(folder.parent.name), reverse=True)
+        yield from sorted(folders, key=lambda folder: _version_number(folder.parent.name), reverse=True)
     on_path = shutil.which("postgres")
     if on_path is not None:
         yield Path(on_path).resolve().parent
@@ -79,10 +79,10 @@ def _candidates() -> Iterator[Path]:
             installed += root.glob("postgresql@*/bin")
         else:
             installed += root.glob("*/bin")
-    yield from sorted(installed, key=lambda folder: _digits(folder.parent.name), reverse=True)
+    yield from sorted(installed, key=lambda folder: _version_number(folder.parent.name), reverse=True)
 
 
-def _digits(name: str) -> int:
+def _version_number(name: str) -> int:
     return int("".join(re.findall(r"\d+", name)) or 0)
 
 

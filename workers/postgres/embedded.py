@@ -118,7 +118,7 @@ class EmbeddedPostgres:
         self._make_home(user)
         with self._folder_lock():
             if not self.is_running():
-                binaries = self._binaries(user)
+                binaries = self._find_binaries(user)
                 if not (self.cluster / "PG_VERSION").exists():
                     self._create_cluster(binaries, user)
                 self._remove_stale_locks()
@@ -133,7 +133,7 @@ class EmbeddedPostgres:
         user = server_user()
         with self._folder_lock():
             self._run_program(
-                self._binaries(user), user, "pg_ctl", "-D", ".", "-m", "fast", "-w", "stop", check=False
+                self._find_binaries(user), user, "pg_ctl", "-D", ".", "-m", "fast", "-w", "stop", check=False
             )
 
     def _make_home(self, user: ServerUser) -> None:
@@ -183,7 +183,7 @@ class EmbeddedPostgres:
             return None
         return (self.cluster / line).resolve() if line and is_postgres_running(pid_file) else None
 
-    def _binaries(self, user: ServerUser) -> PostgresBinaries:
+    def _find_binaries(self, user: ServerUser) -> PostgresBinaries:
         version = self.cluster / "PG_VERSION"
         try:
             major = int(version.read_text(encoding="ascii")) if version.exists() else None

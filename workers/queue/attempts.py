@@ -170,7 +170,7 @@ class Attempt:
             StorageUnavailableError: ``lease``, under which they were stored, was given up.
             QuotaExceededError: the job's owner may not store as much.
         """
-        async with self._fenced_transaction(lease, _digests(results), changes_usage=bool(results)) as (
+        async with self._fenced_transaction(lease, _result_digests(results), changes_usage=bool(results)) as (
             connection,
             job,
         ):
@@ -180,7 +180,7 @@ class Attempt:
             await end_job(connection, job, "failed", self.redact(dict(error)))
             await connection.execute(
                 "INSERT INTO replaced_contents (sha256) SELECT unnest(%s::text[]) ON CONFLICT DO NOTHING",
-                [sorted(_digests(discarded))],
+                [sorted(_result_digests(discarded))],
             )
 
     async def cancel(self) -> None:
@@ -235,7 +235,7 @@ class Attempt:
             QuotaExceededError: as by :meth:`fail`.
         """
         counts = drop_checkpoint or bool(results)
-        async with self._fenced_transaction(lease, _digests(results), changes_usage=counts) as (
+        async with self._fenced_transaction(lease, _result_digests(results), changes_usage=counts) as (
             connection,
             job,
         ):
@@ -330,7 +330,7 @@ async def _transaction(pool: Pool) -> AsyncIterator[Connection]:
         yield connection
 
 
-def _digests(results: Sequence[ResultFile]) -> set[str]:
+def _result_digests(results: Sequence[ResultFile]) -> set[str]:
     return {result.sha256 for result in results}
 
 

@@ -8,7 +8,7 @@ import uuid
 
 from psycopg.rows import class_row
 
-from octasplat.workers.db.connections import Connection, Pool, with_columns
+from octasplat.workers.db.connections import Connection, Pool, select_columns
 from octasplat.workers.db.rows import Job
 from octasplat.workers.queue.jobs import get_job, requeue_job
 from octasplat.workers.queue.protocol import JobQueue
@@ -54,7 +54,7 @@ async def _next_fair_job(connection: Connection, job_queue: JobQueue, job: Job) 
             return None
         async with connection.cursor(row_factory=class_row(Job)) as locking:
             query = "SELECT {} FROM jobs WHERE id = %s AND state = 'queued' FOR UPDATE SKIP LOCKED"
-            await locking.execute(with_columns(query, Job), [row["id"]])
+            await locking.execute(select_columns(query, Job), [row["id"]])
             other = await locking.fetchone()
         if (
             other is not None

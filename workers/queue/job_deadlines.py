@@ -6,7 +6,7 @@ from typing import Any
 
 from psycopg.rows import class_row
 
-from octasplat.workers.db.connections import Connection, Pool, with_columns
+from octasplat.workers.db.connections import Connection, Pool, select_columns
 from octasplat.workers.db.rows import TERMINAL, Job
 from octasplat.workers.queue.job_endings import end_job
 from octasplat.workers.queue.jobs import get_job
@@ -55,7 +55,7 @@ async def fail_abandoned_jobs(
         return []
     async with pool.connection() as connection, connection.cursor(row_factory=class_row(Job)) as cursor:
         await cursor.execute(
-            with_columns(
+            select_columns(
                 """
             SELECT {} FROM jobs WHERE state = 'queued'
               AND queued_at < now() - make_interval(secs => %(limit)s)

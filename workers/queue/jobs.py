@@ -242,7 +242,7 @@ async def requeue_job(
     if job.slip is not None and not keep_entry:
         await job_queue.remove(connection, job.slip)
     entry_id = await job_queue.enqueue(
-        connection, job.id, job.queue, job.priority, position_of=job.slip, delay_seconds=delay_seconds
+        connection, job.id, job.queue, job.priority, earlier_entry_id=job.slip, delay_seconds=delay_seconds
     )
     if without_event:
         await connection.execute("UPDATE jobs SET slip = %s WHERE id = %s", [entry_id, job.id])

@@ -52,12 +52,19 @@ class ProcrastinateQueue:
         queue: str,
         priority: int,
         *,
-        position_of: int | None = None,
+        earlier_entry_id: int | None = None,
         delay_seconds: float = 0.0,
     ) -> int:
         """Queue an entry; see the protocol."""
-        if position_of is not None:
-            return await _reenqueue(connection, job_id, queue, priority, position_of, delay_seconds)
+        if earlier_entry_id is not None:
+            return await _reenqueue(
+                connection,
+                job_id,
+                queue=queue,
+                priority=priority,
+                earlier_entry_id=earlier_entry_id,
+                delay_seconds=delay_seconds,
+            )
         job = procrastinate.jobs.Job(
             queue=queue,
             priority=priority,
@@ -152,23 +159,27 @@ async def _reenqueue(
     job_id: uuid.UUID,
     queue: str,
     priority: int,
-    position_of: int,
+    earlier_entry_id: int,
     delay_seconds: float,
 ) -> int:
-    """Queue an entry in the place of an earlier one; Procrastinate's own way gives them new numbers."""
+    """Queue an entry (a job of Procrastinate) of our job ``job_id`` at the queue position of an earlier one.
+
+    Procrastinate's own retry would assign a new id and so lose the position.
+    """
     cursor = await connection.execute(
         """
         INSERT INTO procrastinate_jobs (id, queue_name, task_name, priority, args, scheduled_at)
         VALUES (%(id)s, %(queue)s, %(task)s, %(priority)s, jsonb_build_object('job_id', %(job)s::text),
-            CASE WHEN %(wait)s > 0 THEN now() + make_interval(secs => %(wait)s) END) RETURNING id
+            CASE WHEN %(delay_seconds)s > 0 THEN now() + make_interval(secs => %(delay_seconds)s) END)
+        RETURNING id
         """,
         {
-            "id": requeued_entry_id(position_of),
+            "id": requeued_entry_id(earlier_entry_id),
             "queue": queue,
             "task": TASK_NAME,
             "priority": priority,
             "job": str(job_id),
-            "wait": delay_seconds,
+            "delay_seconds": delay_seconds,
         },
     )
     row = await cursor.fetchone()
@@ -177,11 +188,11 @@ async def _reenqueue(
 
 
 def requeued_entry_id(entry_id: int) -> int:
-    """Return the number of an entry that takes the place of ``entry_id``.
+    """Return the id of an entry that takes the queue position of ``entry_id``.
 
-    Numbers below zero are for entries that were queued again: they go before all that were never delivered,
-    and among themselves in the order of their first numbers. A counter in the number distinguishes the
-    entries of one job.
+    Entries of one priority are delivered in ascending order of id. Ids below zero are for entries that were
+    queued again: they go before all that were never delivered, and among themselves in the order of their
+    first ids. A counter in the id distinguishes the entries of one job, so that no two are the same.
     """
     if entry_id < 0:
         first, returns = divmod(entry_id - _FIRST_REQUEUED_ID, _MAX_REQUEUES)

@@ -36,7 +36,7 @@ class JobQueue(Protocol):
         queue: str,
         priority: int,
         *,
-        position_of: int | None = None,
+        earlier_entry_id: int | None = None,
         delay_seconds: float = 0.0,
     ) -> int:
         """Queue an entry for a job within the transaction of ``connection``.
@@ -46,9 +46,9 @@ class JobQueue(Protocol):
             job_id: which job.
             queue: who may take it.
             priority: higher goes first; where it is the same, the smaller number does.
-            position_of: an earlier queue entry of the job, whose place the new one takes: before all that
-                were queued after it. None queues it last.
-            delay_seconds: with ``position_of``, for how long others go before it all the same.
+            earlier_entry_id: an earlier queue entry of the job, whose queue position the new one takes:
+                before all that were queued after it. None queues it last.
+            delay_seconds: with ``earlier_entry_id``, for how long others go before it all the same.
 
         Returns:
             The entry's number, which no queue entry of this job had.

@@ -8,7 +8,7 @@ from datetime import datetime
 
 from psycopg.rows import class_row
 
-from octasplat.workers.db.connections import Pool, with_columns
+from octasplat.workers.db.connections import Pool, select_columns
 from octasplat.workers.db.locks import about_to_lock_jobs
 from octasplat.workers.db.rows import Job
 from octasplat.workers.queue.job_endings import recover_attempt
@@ -61,7 +61,7 @@ async def recover_stalled_jobs(
         async with connection.transaction(), connection.cursor(row_factory=class_row(Job)) as cursor:
             await about_to_lock_jobs(connection)
             await cursor.execute(
-                with_columns(
+                select_columns(
                     """
                 SELECT {} FROM jobs
                 WHERE state IN ('running', 'canceling')

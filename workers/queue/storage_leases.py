@@ -81,7 +81,7 @@ class StorageLease:
                 raise StorageUnavailableError("Contents are being removed from the store; store them again.")
             await asyncio.sleep(_POLL_SECONDS)
         if removals != self.removals:
-            missing = await asyncio.to_thread(_missing, self.storage, contents)
+            missing = await asyncio.to_thread(_missing_contents, self.storage, contents)
             if missing:
                 raise StorageUnavailableError(
                     f"{len(missing)} contents were removed meanwhile; store them again."
@@ -225,7 +225,7 @@ async def _removal_count(connection: Connection) -> int:
     return int(row["n"])
 
 
-def _missing(storage: Storage, contents: Collection[str]) -> list[str]:
+def _missing_contents(storage: Storage, contents: Collection[str]) -> list[str]:
     missing = []
     for sha256 in contents:
         try:

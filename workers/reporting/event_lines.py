@@ -127,9 +127,9 @@ class EventLines:
             self._write_note(event.message)
         elif isinstance(event, PhaseProgress | TrainingProgress) and time.monotonic() >= self._next_at:
             self._next_at = time.monotonic() + self._interval_seconds
-            self._write(self._line(event))
+            self._write(self._event_line(event))
 
-    def _line(self, event: PhaseProgress | TrainingProgress) -> str:
+    def _event_line(self, event: PhaseProgress | TrainingProgress) -> str:
         if isinstance(event, PhaseProgress):
             left = self._state.seconds_left
             return f"  {event.step}/{event.total_steps}" + (

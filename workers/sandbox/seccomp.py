@@ -75,13 +75,13 @@ def install_seccomp_filter(*, may_start_processes: bool) -> None:
     machine = platform.machine()
     if machine not in _ARCHES:
         raise OSError(errno.ENOSYS, f"the calls of {machine} are not known")
-    instructions = list(_instructions(machine, may_start_processes))
+    instructions = list(_filter_instructions(machine, may_start_processes))
     array = (_Instruction * len(instructions))(*instructions)
     prctl(PR_SET_NO_NEW_PRIVS, 1)
     prctl(PR_SET_SECCOMP, _MODE_FILTER, ctypes.byref(_Program(len(instructions), array)))
 
 
-def _instructions(machine: str, may_start_processes: bool) -> Iterator[_Instruction]:
+def _filter_instructions(machine: str, may_start_processes: bool) -> Iterator[_Instruction]:
     column = list(_ARCHES).index(machine)
     yield _Instruction(_LOAD, 0, 0, _ARCH_OFFSET)
     yield _Instruction(_EQUAL, 1, 0, _ARCHES[machine])

@@ -61,7 +61,7 @@ def store_tree(
         folder: local folder.
         names: files to store, relative to it; by default all regular files below it. Links are refused.
         metadata: goes into the manifest.
-        on_stored: told the length of every file stored; it may raise to give up.
+        on_stored: called with the length of every file stored; it may raise to give up.
 
     Raises:
         StorageError: a file cannot be read, is a link, or the store does not take it.

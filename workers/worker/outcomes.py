@@ -75,14 +75,15 @@ class OutcomeWriter:
         await self.succeed(results)
 
     async def succeed(self, results: list[ResultFile]) -> None:
-        """End the job with results that are published."""
-        psnr = await asyncio.to_thread(self._workspace.measured_psnr, results)
+        """Mark the job as succeeded with the ``results`` that are already published."""
+        psnr = await asyncio.to_thread(self._workspace.read_psnr, results)
         try:
-            await self._retry_write(lambda: self._attempt.succeed(results, psnr))
+            await self._write_with_retries(lambda: self._attempt.succeed(results, psnr))
         except QuotaExceededError as error:
-            described = {"type": "quota", "message": f"The results cannot be stored. {error}"}
-            await self._retry_write(lambda: self._attempt.fail(described, discarded=results))
-            await self._withdraw()
+            problem = {"type": "quota", "message": f"The results cannot be stored. {error}"}
+            await self._write_with_retries(lambda: self._attempt.fail(problem, discarded=results))
+            await self._discard_published_results()
+        # The machine did its work in either case: a quota is its owner's matter.
         self._context.host_health.record_success()
 
     async def fail(self, error: dict[str, Any]) -> None:
@@ -91,7 +92,7 @@ class OutcomeWriter:
             await self._with_partial_results(lambda results, note: self._attempt.fail(error, results, note))
         except QuotaExceededError as excess:
             message = f"{error['message']} What it has finished cannot be stored. {excess}"
-            await self._retry_write(lambda: self._attempt.fail({**error, "message": message}))
+            await self._write_with_retries(lambda: self._attempt.fail({**error, "message": message}))
         except StorageError as storage_error:
             await self.handle_error(storage_error)
 
@@ -102,15 +103,15 @@ class OutcomeWriter:
             "type": "refused_value",
             "message": "The job says something that cannot be written down.",
         }
-        await self._retry_write(lambda: self._attempt.fail(described))
+        await self._write_with_retries(lambda: self._attempt.fail(described))
 
     async def cancel(self) -> None:
         """End the job as its owner requested."""
-        await self._retry_write(self._attempt.cancel)
+        await self._write_with_retries(self._attempt.cancel)
 
     async def requeue(self, reason: str) -> None:
         """Requeue the job for a reason that is not its own."""
-        await self._retry_write(lambda: self._attempt.requeue(self._context.job_queue, reason))
+        await self._write_with_retries(lambda: self._attempt.requeue(self._context.job_queue, reason))
 
     async def requeue_or_fail(self, error: dict[str, Any]) -> None:
         """Requeue the job after a failure that may be its own, or fail it with its finished results."""
@@ -122,11 +123,11 @@ class OutcomeWriter:
                 return
             except (StorageError, QuotaExceededError) as storage_error:
                 logger.warning("the results there are could not be stored: %s", storage_error)
-        await self._retry_write(lambda: self._requeue_counted(error))
+        await self._write_with_retries(lambda: self._requeue_counted(error))
 
     async def requeue_counted(self, error: dict[str, Any]) -> None:
         """Requeue the job for a reason that may pass; the attempt counts."""
-        await self._retry_write(lambda: self._requeue_counted(error))
+        await self._write_with_retries(lambda: self._requeue_counted(error))
 
     async def handle_error(self, error: OctasplatError) -> None:
         """Requeue the job, or fail it, after an error around its program."""
@@ -138,7 +139,7 @@ class OutcomeWriter:
         ):
             await self.requeue_counted(described)
         else:
-            await self._retry_write(lambda: self._attempt.fail(described))
+            await self._write_with_retries(lambda: self._attempt.fail(described))
 
     async def diagnose_and_requeue(self, message: str) -> None:
         """Requeue the job after a failure; the attempt counts unless the machine is at fault."""
@@ -199,8 +200,8 @@ class OutcomeWriter:
             except DATABASE_ERRORS as error:
                 await self._pause_or_raise(error)
 
-    async def _withdraw(self) -> None:
-        """Withdraw results that are not wanted, so that they are collected."""
+    async def _discard_published_results(self) -> None:
+        """Delete the manifest of the published results, so that garbage collection removes them."""
         try:
             await asyncio.to_thread(self._workspace.withdraw_results)
         except StorageError as error:
@@ -219,7 +220,7 @@ class OutcomeWriter:
             except DATABASE_ERRORS as error:
                 await self._pause_or_raise(error)
 
-    async def _retry_write(self, write: Callable[[], Awaitable[T]]) -> T:
+    async def _write_with_retries(self, write: Callable[[], Awaitable[T]]) -> T:
         """Call ``write`` until it succeeds, with a longer timeout each time for slow databases."""
         settings = self._context.settings
         seconds = settings.heartbeat_seconds

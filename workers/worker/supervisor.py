@@ -88,12 +88,12 @@ class Supervisor:
         self._stop_event = asyncio.Event()
         self._heartbeat = Heartbeat(attempt, context.settings, claimed_at)
         self._outcomes = OutcomeWriter(
-            attempt,
-            context,
-            self._workspace,
-            self._reporter,
-            self._heartbeat,
-            _program_of_kind(attempt.job.kind),
+            attempt=attempt,
+            context=context,
+            workspace=self._workspace,
+            reporter=self._reporter,
+            heartbeat=self._heartbeat,
+            program=_program_of_kind(attempt.job.kind),
         )
         self._deadline_at = math.inf
 

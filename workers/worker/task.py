@@ -40,7 +40,7 @@ class Task:
         scene: folder of the photographs, or None.
         title: what the user calls the photographs.
         threads: to use; 0 means all cores.
-        progress: hears the progress.
+        progress: receives the progress events.
         should_stop: asked now and then; True asks to stop with what is needed to go on.
         kind: name of the job's kind.
     """

@@ -131,13 +131,13 @@ async def run_worker(settings: WorkerSettings, queues: Mapping[str, int], *, nam
             settings,
             pool,
             WorkerContext(
-                settings,
-                make_job_queue(settings, pool),
-                storage,
-                room,
-                host,
-                asyncio.Event(),
-                memory_limit_bytes(settings.memory_limit_bytes, slots),
+                settings=settings,
+                job_queue=make_job_queue(settings, pool),
+                storage=storage,
+                disk_space=room,
+                host_health=host,
+                draining=asyncio.Event(),
+                memory_limit_bytes=memory_limit_bytes(settings.memory_limit_bytes, slots),
             ),
             name,
             queues,
@@ -300,7 +300,7 @@ class _Worker:
         await defer_job(self._pool, self._context.job_queue, job_id, entry_id)
 
     async def _send_heartbeat(self) -> None:
-        facts = await asyncio.to_thread(self._facts)
+        facts = await asyncio.to_thread(self._machine_facts)
         async with self._pool.connection() as connection:
             await record_worker_heartbeat(
                 connection,
@@ -311,7 +311,7 @@ class _Worker:
                 facts=facts,
             )
 
-    def _facts(self) -> dict[str, Any]:
+    def _machine_facts(self) -> dict[str, Any]:
         memory, room = psutil.virtual_memory(), self._context.disk_space
         try:
             disk = {"disk_bytes": room.capacity_bytes(), "disk_free_bytes": room.free_bytes()}

@@ -237,7 +237,7 @@ class Workspace:
         folder = self.folder / RESULTS_FOLDER
         return _result_files(store_tree(self.storage, folder)) if folder.is_dir() else []
 
-    def measured_psnr(self, results: Sequence[ResultFile]) -> float | None:
+    def read_psnr(self, results: Sequence[ResultFile]) -> float | None:
         """Return the mean PSNR over the held-out views in dB; None if the results have none."""
         for result in results:
             if result.name == METRICS_FILE and result.size_bytes <= MAX_METRICS_BYTES:

@@ -70,7 +70,7 @@ def floor_tiles(xyz: TexturePoints, uv: UvCoordinates) -> Colours:
     return lerp(colours, linear_from_hex("6d665c"), grid_lines(u, v, 0.035))
 
 
-def _painting(index: int, u: np.ndarray, v: np.ndarray) -> Colours:
+def _painting_albedo(index: int, u: np.ndarray, v: np.ndarray) -> Colours:
     """Return the albedo of eight different paintings, u and v in [0, 1] across the canvas."""
     flat = np.stack([u, v, np.full_like(u, index)], axis=1).astype(np.float32)
     if index == 0:  # hills at dusk, one behind another
@@ -141,7 +141,7 @@ def room_walls(xyz: TexturePoints, uv: UvCoordinates) -> Colours:
         if len(here):
             across, up = (u[here] / half_width + 1) / 2, ((v[here] - middle) / half_height + 1) / 2
             weave = gradient_noise(scale_points(xyz[here], (60.0, 60.0, 60.0)), octaves=1, seed=34)
-            colours[here] = _painting(index, across, up) * grey_column(1 + 0.1 * weave)
+            colours[here] = _painting_albedo(index, across, up) * grey_column(1 + 0.1 * weave)
     return colours
 
 

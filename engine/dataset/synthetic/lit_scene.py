@@ -134,13 +134,13 @@ def _phong_highlight(
 ) -> Float32[np.ndarray, " n"]:
     """Return the lamp's highlight on a glossy surface: a Phong lobe about the mirrored ray."""
     ahead, upwards, to_lamp = (
-        _normalised(a) for a in (directions, normals, _LAMP_WORLD.astype(np.float32) - places)
+        _normalize_vectors(a) for a in (directions, normals, _LAMP_WORLD.astype(np.float32) - places)
     )
     mirrored = ahead - 2 * np.sum(ahead * upwards, axis=1, keepdims=True) * upwards
     return np.maximum(np.sum(mirrored * to_lamp, axis=1), 0) ** 90
 
 
-def _normalised(vectors: Float32[np.ndarray, "n 3"]) -> Float32[np.ndarray, "n 3"]:
+def _normalize_vectors(vectors: Float32[np.ndarray, "n 3"]) -> Float32[np.ndarray, "n 3"]:
     return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
 
 

@@ -79,7 +79,7 @@ def _table_top() -> TexturedMesh:
     )
 
 
-def _pedestal() -> TexturedMesh:
+def _pedestal_mesh() -> TexturedMesh:
     knots = np.array(
         [
             [0.42, 0.0],
@@ -97,7 +97,7 @@ def _pedestal() -> TexturedMesh:
     return surface_of_revolution(catmull_rom_profile(knots, 8), columns=72)
 
 
-def _walls() -> TexturedMesh:
+def _wall_meshes() -> TexturedMesh:
     half = ROOM_INRADIUS * np.tan(np.pi / 8)
     sides = []
     for k in range(8):
@@ -110,7 +110,7 @@ def _walls() -> TexturedMesh:
     return join_meshes(sides)
 
 
-def _vase() -> TexturedMesh:
+def _vase_mesh() -> TexturedMesh:
     outside = np.array(
         [
             [0.0, 0.0],
@@ -136,11 +136,14 @@ def _scene_objects() -> tuple[SceneObject, ...]:
     floor = flat_patch([-3.95, -3.95, FLOOR_Z], [7.9, 0.0, 0.0], [0.0, 7.9, 0.0], columns=180, rows=180)
     return (
         SceneObject("floor", floor, albedo.floor_tiles, is_foreground=False),
-        SceneObject("walls", _walls(), albedo.room_walls, is_foreground=False),
+        SceneObject("walls", _wall_meshes(), albedo.room_walls, is_foreground=False),
         SceneObject("table", _table_top(), albedo.table_wood),
-        SceneObject("pedestal", place_mesh(_pedestal(), stand, 0.0, 0.0, FLOOR_Z), albedo.pedestal_wood),
+        SceneObject("pedestal", place_mesh(_pedestal_mesh(), stand, 0.0, 0.0, FLOOR_Z), albedo.pedestal_wood),
         SceneObject(
-            "vase", place_mesh(_vase(), _rotation_z(20.0), -0.48, 0.36, 0.0), albedo.vase_glaze, specular=0.12
+            "vase",
+            place_mesh(_vase_mesh(), _rotation_z(20.0), -0.48, 0.36, 0.0),
+            albedo.vase_glaze,
+            specular=0.12,
         ),
         SceneObject(
             "knot",
@@ -185,13 +188,15 @@ def build_still_life() -> StillLife:
     across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     face_object = np.repeat(np.arange(len(scene_objects), dtype=np.int32), counts)
     return StillLife(
-        scene_objects,
-        joined.vertices,
-        joined.faces,
-        joined.normals,
-        joined.uv,
-        joined.texture_xyz,
-        face_object,
-        np.array([scene_object.is_foreground for scene_object in scene_objects])[face_object],
-        (across / np.linalg.norm(across, axis=1, keepdims=True)).astype(np.float32),
+        objects=scene_objects,
+        vertices=joined.vertices,
+        faces=joined.faces,
+        vertex_normals=joined.normals,
+        uv=joined.uv,
+        texture_xyz=joined.texture_xyz,
+        face_object=face_object,
+        face_is_foreground=np.array([scene_object.is_foreground for scene_object in scene_objects])[
+            face_object
+        ],
+        face_normals=(across / np.linalg.norm(across, axis=1, keepdims=True)).astype(np.float32),
     )

@@ -125,7 +125,7 @@ def edge_rows(typingctx: TypingContext, a: Address, b: Address, edge: Address) -
     def codegen(
         context: BaseContext, builder: ir.IRBuilder, sig: Signature, args: Sequence[ir.Value]
     ) -> ir.Value:
-        a, b = (_unit(builder, address) for address in args[:2])
+        a, b = (_read_direction(builder, address) for address in args[:2])
         cosine = _dot(a, b)
         VectorRows(builder, args[2], DOUBLE8)[0] = _polynomial(NARROW, cosine * -1.0 + 1.0)
         return (cosine < WIDE_ANGLE).to_bitmask()
@@ -141,7 +141,7 @@ def edge_rows_wide(typingctx: TypingContext, a: Address, b: Address, edge: Addre
     def codegen(
         context: BaseContext, builder: ir.IRBuilder, sig: Signature, args: Sequence[ir.Value]
     ) -> ir.Value:
-        a, b = (_unit(builder, address) for address in args[:2])
+        a, b = (_read_direction(builder, address) for address in args[:2])
         across = _cross(a, b)
         sine = _dot(across, across).sqrt()
         half = _angle(sine, _dot(a, b)) * 0.5
@@ -151,32 +151,48 @@ def edge_rows_wide(typingctx: TypingContext, a: Address, b: Address, edge: Addre
     return signature, codegen
 
 
-def _unit(builder: ir.IRBuilder, address: ir.Value) -> list[Vector]:
+def _read_direction(builder: ir.IRBuilder, address: ir.Value) -> list[Vector]:
     rows = VectorRows(builder, address, DOUBLE8)
     return [rows[axis] for axis in range(3)]
 
 
 class _Triangle:
-    """A triangle as seen from the points."""
+    """A triangle seen from the points: what its corners' mean-value weights are computed from.
+
+    Attributes:
+        units: unit directions from the points to the corners.
+        edge_plane_normals: normals of the planes through the points and an edge, edge k opposite of corner k.
+        determinant: signed, of the three directions; six times the volume of their tetrahedron.
+    """
 
     def __init__(self, builder: ir.IRBuilder, corners: ir.Value, edges: ir.Value) -> None:
         self._builder = builder
-        self.units = [_unit(builder, builder.extract_value(corners, k)) for k in range(3)]
-        self.normals = [_cross(self.units[(k + 1) % 3], self.units[(k + 2) % 3]) for k in range(3)]
-        self.volume = _dot(self.units[0], self.normals[0])
-        self._shares = [VectorRows(builder, builder.extract_value(edges, k), DOUBLE8)[0] for k in range(3)]
+        self.units = [_read_direction(builder, builder.extract_value(corners, k)) for k in range(3)]
+        self.edge_plane_normals = [_cross(self.units[(k + 1) % 3], self.units[(k + 2) % 3]) for k in range(3)]
+        self.determinant = _dot(self.units[0], self.edge_plane_normals[0])
+        self._half_angles_over_sine = [
+            VectorRows(builder, builder.extract_value(edges, k), DOUBLE8)[0] for k in range(3)
+        ]
 
-    def add(self, where: Vector, sums: ir.Value) -> None:
-        """Add the components of the mean vector to the sums of the corners."""
-        builder, normals, shares = self._builder, self.normals, self._shares
+    def emit_corner_weights(self, active: Vector, accumulators: ir.Value) -> None:
+        """Emit code that adds each corner's mean-value weight to the accumulator in memory of that corner.
+
+        The weight of corner k is normal_k . mean / determinant, where the mean vector is the sum of the
+        edge planes' normals, each by half the edge's angle over its sine (Ju, Schaefer, Warren 2005).
+
+        Args:
+            active: mask of the points that the triangle counts for; the others add 0.
+            accumulators: addresses of the corners' rows.
+        """
+        builder, normals, factors = self._builder, self.edge_plane_normals, self._half_angles_over_sine
         mean = [
-            shares[0] * normals[0][axis] + shares[1] * normals[1][axis] + shares[2] * normals[2][axis]
+            factors[0] * normals[0][axis] + factors[1] * normals[1][axis] + factors[2] * normals[2][axis]
             for axis in range(3)
         ]
-        inverse = where.select(_constant_one(builder) / self.volume, 0.0)
+        inverse_determinant = active.select(_constant_one(builder) / self.determinant, 0.0)
         for k, normal in enumerate(normals):
-            row = VectorRows(builder, builder.extract_value(sums, k), DOUBLE8)
-            row[0] = row[0] + _dot(mean, normal) * inverse
+            accumulator = VectorRows(builder, builder.extract_value(accumulators, k), DOUBLE8)
+            accumulator[0] = accumulator[0] + _dot(mean, normal) * inverse_determinant  # stores to memory
 
 
 THREE_CORNERS = types.UniTuple(types.uintp, 3)
@@ -199,8 +215,8 @@ def add_means(
         context: BaseContext, builder: ir.IRBuilder, sig: Signature, args: Sequence[ir.Value]
     ) -> ir.Value:
         triangle = _Triangle(builder, *args[:2])
-        solid = abs(triangle.volume) > FLAT_TOLERANCE
-        triangle.add(solid, args[2])
+        solid = abs(triangle.determinant) > FLAT_TOLERANCE
+        triangle.emit_corner_weights(solid, args[2])
         return (~solid).to_bitmask()
 
     return signature, codegen
@@ -220,11 +236,11 @@ def add_flat_means(
         context: BaseContext, builder: ir.IRBuilder, sig: Signature, args: Sequence[ir.Value]
     ) -> ir.Value:
         triangle = _Triangle(builder, *args[:2])
-        u, sines = triangle.units, [_dot(normal, normal).sqrt() for normal in triangle.normals]
-        size = abs(triangle.volume)
+        u, sines = triangle.units, [_dot(normal, normal).sqrt() for normal in triangle.edge_plane_normals]
+        size = abs(triangle.determinant)
         beside = size <= sines[0] * FLAT_TOLERANCE
         # In the triangle's plane but not on it, a triangle counts nothing.
-        triangle.add((size <= FLAT_TOLERANCE) & ~beside, args[2])
+        triangle.emit_corner_weights((size <= FLAT_TOLERANCE) & ~beside, args[2])
         around = _angle(sines[0], _dot(u[1], u[2]))
         for k in (1, 2):
             around = around + _angle(sines[k], _dot(u[(k + 1) % 3], u[(k + 2) % 3]))
@@ -243,7 +259,7 @@ def add_solid_angle(
     def codegen(
         context: BaseContext, builder: ir.IRBuilder, sig: Signature, args: Sequence[ir.Value]
     ) -> ir.Value:
-        a, b, c = (_unit(builder, builder.extract_value(args[0], k)) for k in range(3))
+        a, b, c = (_read_direction(builder, builder.extract_value(args[0], k)) for k in range(3))
         volume = _dot(a, _cross(b, c))
         angle = _angle(abs(volume), _dot(a, b) + _dot(b, c) + _dot(c, a) + 1.0)
         rows = VectorRows(builder, args[1], DOUBLE8)

@@ -118,16 +118,30 @@ def gradient_arrays(gradients: GaussianGradients) -> GaussianGradientArrays:
     """Return the arrays of ``gradients`` as kernels take them."""
     g = gradients
     return GaussianGradientArrays(
-        g.ids, g.means_world, g.quats_wxyz, g.log_scales, g.opacity_logits, g.sh, g.features, g.weight_sums,
-        g.error_sums, g.hit_counts,
-    )  # fmt: skip
+        ids=g.ids,
+        means=g.means_world,
+        quats=g.quats_wxyz,
+        log_scales=g.log_scales,
+        logits=g.opacity_logits,
+        sh=g.sh,
+        features=g.features,
+        weights=g.weight_sums,
+        errors=g.error_sums,
+        counts=g.hit_counts,
+    )
 
 
 def output_arrays(result: TraceResult) -> OutputArrays:
     """Return the arrays of ``result`` as kernels take them."""
     r = result
     return OutputArrays(
-        r.rgb_srgb, r.transmittance, r.depth_sum, r.depth_median, r.normal_world, r.features, r.hit_counts
+        rgb=r.rgb_srgb,
+        transmittance=r.transmittance,
+        depth_sum=r.depth_sum,
+        depth_median=r.depth_median,
+        normal=r.normal_world,
+        features=r.features,
+        counts=r.hit_counts,
     )
 
 
@@ -135,14 +149,14 @@ def output_gradient_arrays(gradients: TraceGradients, rays: int, features: int) 
     """Return ``gradients`` as kernels take them, zeros for None."""
     g = gradients
     return OutputGradientArrays(
-        contiguous_float32(g.rgb_srgb),
-        zeros_if_none(g.transmittance, (rays,)),
-        zeros_if_none(g.features, (rays, features)),
-        zeros_if_none(g.ray_errors, (rays,)),
-        zeros_if_none(g.depth_sum, (rays,)),
-        zeros_if_none(g.depth_median, (rays,)),
-        zeros_if_none(g.normal_world, (rays, 3)),
-        g.has_geometry,
+        rgb=contiguous_float32(g.rgb_srgb),
+        transmittance=zeros_if_none(g.transmittance, (rays,)),
+        features=zeros_if_none(g.features, (rays, features)),
+        ray_errors=zeros_if_none(g.ray_errors, (rays,)),
+        depth_sum=zeros_if_none(g.depth_sum, (rays,)),
+        depth_median=zeros_if_none(g.depth_median, (rays,)),
+        normal=zeros_if_none(g.normal_world, (rays, 3)),
+        has_geometry=g.has_geometry,
     )
 
 

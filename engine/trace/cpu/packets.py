@@ -149,7 +149,15 @@ class PacketTracer:
                 ((len(packets),), np.int64), ((len(packets),), np.int32), ((len(packets), 9), np.float64),
                 ((rays,), np.float32),
             )  # fmt: skip
-            packet_hits = SharedSortHits(ids, bits, lines, starts, counts, frames, left)
+            packet_hits = SharedSortHits(
+                ids=ids,
+                ray_masks=bits,
+                packet_primitives=lines,
+                starts=starts,
+                counts=counts,
+                frames=frames,
+                transmittance=left,
+            )
             met = np.zeros(1, np.int64)
             run_on_threads(
                 trace_packets_shared_sort, self._threads,
@@ -193,7 +201,9 @@ class PacketTracer:
             ((count, geometry), np.float32),
             ((count, feature_count), np.float32),
         )
-        rows = MomentRows(firsts, ids, weights, sums, by_geometry, features)
+        rows = MomentRows(
+            firsts=firsts, ids=ids, weights=weights, sums=sums, geometry=by_geometry, features=features
+        )
         packets, counter = recording.packets, np.zeros(1, np.int64)
         if isinstance(packet_hits, SharedSortHits):
             run_on_threads(

@@ -66,12 +66,12 @@ class SingleRayTracer:
         self._bvh = None  # free the old hierarchy before the new one is made
         self._boxes = boxes
         self._bvh = EmbreeBoxScene(
-            self._device,
-            len(boxes),
-            boxes.ctypes.data,
-            octagon_bounds.address,
-            intersect_octagon.address,
-            attenuate_by_octagon.address,
+            device=self._device,
+            count=len(boxes),
+            boxes_address=boxes.ctypes.data,
+            bounds_callback=octagon_bounds.address,
+            intersect_callback=intersect_octagon.address,
+            occluded_callback=attenuate_by_octagon.address,
             quality=self._quality,
         )
 

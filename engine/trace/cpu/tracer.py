@@ -148,7 +148,12 @@ class CpuTracer:
         in_one_order = len(packets) > 0 and self._uses_shared_sort
         hits = self._allocate_hits(count if record and not (in_one_order and len(alone) == 0) else 0)
         forward = ForwardPass(
-            RayArrays.from_batch(rays), self._packed_scene, self._limits, output_arrays(result), hits, record
+            rays=RayArrays.from_batch(rays),
+            scene=self._packed_scene,
+            limits=self._limits,
+            out=output_arrays(result),
+            hits=hits,
+            is_recording=record,
         )
         packet_hits: PacketHits | SharedSortHits
         if in_one_order:
@@ -161,7 +166,14 @@ class CpuTracer:
             self._single_tracer.trace(forward, alone)
         if record:
             result.recording = CpuRecording(
-                rays, result.hit_counts, packets, alone, hits, packet_hits, self._limits, self._build_id
+                rays=rays,
+                counts=result.hit_counts,
+                packets=packets,
+                single_rays=alone,
+                hits=hits,
+                packet_hits=packet_hits,
+                limits=self._limits,
+                build_id=self._build_id,
             )
         return result
 

@@ -55,7 +55,7 @@ class InitialBackground:
 
     def is_above_horizon(self, directions_world: Float64[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
         """Return whether directions are above the horizon, where what is far away is."""
-        return np.asarray(_cosines(directions_world, self.up_world) > 0)
+        return np.asarray(_axis_products(directions_world, self.up_world) > 0)
 
     def resize(self, height: int) -> Float32[np.ndarray, "h w 3"]:
         """Return the map with ``height`` rows."""
@@ -74,8 +74,8 @@ def estimate_background(dataset: MappedPhotographs) -> InitialBackground:
     seen = [_visible_texels(dataset, index, directions, points) for index in chosen.tolist()]
     texel, rgb, empty = (np.concatenate(parts) for parts in zip(*seen, strict=True))
     count = 2 * ROWS * ROWS
-    shown, shown_by = _medians(texel, rgb, count)
-    far, far_by = _medians(texel[empty], rgb[empty], count)
+    shown, shown_by = _texel_medians(texel, rgb, count)
+    far, far_by = _texel_medians(texel[empty], rgb[empty], count)
     # Floors have no points either, close to the camera.
     found = InitialBackground(background, _up_world(dataset))
     is_far = (far_by >= MIN_VIEWS) & found.is_above_horizon(directions)
@@ -101,7 +101,7 @@ def _up_world(dataset: MappedPhotographs) -> Float64[np.ndarray, "3"]:
     return -np.mean([dataset.views[i].rotation_cam_from_world[1] for i in dataset.train_indices], axis=0)
 
 
-def _cosines(
+def _axis_products(
     directions: Float64[np.ndarray, "n 3"], axis: Float64[np.ndarray, "3"]
 ) -> Float64[np.ndarray, " n"]:
     """Return products with an axis, added up column by column: the same bits on any number of threads."""
@@ -117,7 +117,7 @@ def _visible_texels(
     """Return the texels that a view shows, their colours there, and whether nothing near is beside."""
     view = dataset.views[index]
     camera = dataset.cameras[view.camera_index]
-    in_cam = np.stack([_cosines(directions, axis) for axis in view.rotation_cam_from_world], axis=1)
+    in_cam = np.stack([_axis_products(directions, axis) for axis in view.rotation_cam_from_world], axis=1)
     texel = np.flatnonzero(is_in_image(in_cam, camera))
     pixels_px = camera.project(in_cam[texel]).reshape(-1, 2)
     x = np.clip(pixels_px[:, 0].astype(np.int64), 0, view.width_px - 1)
@@ -133,7 +133,7 @@ def _visible_texels(
     return texel[valid], rgb[valid], empty[valid]
 
 
-def _medians(
+def _texel_medians(
     texel: Int64[np.ndarray, " k"], rgb: Float32[np.ndarray, "k 3"], count: int
 ) -> tuple[Float32[np.ndarray, "t 3"], Int64[np.ndarray, " t"]]:
     """Return the lower median of each channel of each texel's colours, and how many there are."""

@@ -205,13 +205,13 @@ def gaussians_from_points(
     nearest = distances[:, 1 : NEIGHBOURS + 1] if neighbor_count > 1 else np.full((count, 1), 0.01 * extent)
     spacing = nearest.mean(axis=1)
     spacing = np.clip(
-        spacing, 1e-5 * extent, 0.2 * extent * np.maximum(1.0, _distance(points, centre) / extent)
+        spacing, 1e-5 * extent, 0.2 * extent * np.maximum(1.0, _distances_from(points, centre) / extent)
     )
     # One point alone in front of a camera would hide everything.
     to_camera = cKDTree(camera_centres_world).query(points)[0]
     max_angles = MAX_ANGULAR_SIZE if most_angles is None else most_angles[keep]
     spacing = np.minimum(spacing, np.maximum(max_angles * to_camera, 1e-5 * extent))
-    normals = _unit(centre - points)
+    normals = _normalize_or_z_axis(centre - points)
     if neighbor_count == plane_points + 1:
         neighborhoods = points[neighbours]
         neighborhoods = neighborhoods - neighborhoods.mean(axis=1, keepdims=True)
@@ -257,10 +257,10 @@ def _assemble(
     )
 
 
-def _unit(vectors: np.ndarray) -> np.ndarray:
+def _normalize_or_z_axis(vectors: np.ndarray) -> np.ndarray:
     length = np.linalg.norm(vectors, axis=-1, keepdims=True)
     return np.where(length > 0, vectors / np.where(length > 0, length, 1.0), np.array([0.0, 0.0, 1.0]))
 
 
-def _distance(points: np.ndarray, centre: np.ndarray) -> np.ndarray:
+def _distances_from(points: np.ndarray, centre: np.ndarray) -> np.ndarray:
     return np.asarray(np.linalg.norm(points - centre, axis=1))

@@ -75,12 +75,12 @@ def draw_patches(
     # Distance along a ray of a point at depth 1 along the camera's axis.
     factors = 1.0 / np.maximum(directions @ view.rotation_cam_from_world[2], 1e-3)
     return PixelPatches(
-        origins[0].astype(np.float64),
-        directions[is_valid],
-        factors[is_valid],
-        rgb.reshape(*all_y.shape, 3)[is_valid],
-        y[is_valid],
-        x[is_valid],
+        origin_world=origins[0].astype(np.float64),
+        directions_world=directions[is_valid],
+        depth_factors=factors[is_valid],
+        rgb_srgb=rgb.reshape(*all_y.shape, 3)[is_valid],
+        y=y[is_valid],
+        x=x[is_valid],
     )
 
 

@@ -115,7 +115,14 @@ def plane_sweep_points(
         ) -> tuple[PlaneSweepPoints, MatchEvidence]:
             index, samples, generator = job
             return _lift_pixels(
-                photographs, index, samples, known, neighbours[index], generator, background, unseen
+                photographs=photographs,
+                index=index,
+                samples=samples,
+                points=known,
+                neighbours=neighbours[index],
+                rng=generator,
+                background=background,
+                unseen=unseen,
             )
 
         with ThreadPoolExecutor(threads) as pool:
@@ -210,7 +217,7 @@ def _lift_pixels(
     suggested = depths[inside][nearest]
     depth, cost = _best_hypothesis(suggested, _hypothesis_costs(photographs, patches, suggested, neighbours))
     doubtful = np.flatnonzero(cost > MAX_AMBIGUOUS_COST)
-    more = _sweep(depths[inside], len(doubtful), rng)
+    more = _trial_depths(depths[inside], len(doubtful), rng)
     more_costs = _hypothesis_costs(photographs, patches[doubtful], more, neighbours)
     other, other_cost = _best_hypothesis(more, more_costs)
     swept = np.zeros(len(depth), np.bool_)
@@ -269,7 +276,7 @@ def _interpolate_depths(
     return np.asarray(np.exp((weights * np.log(depths)).sum(axis=1) / weights.sum(axis=1)))
 
 
-def _sweep(
+def _trial_depths(
     depths: Float64[np.ndarray, " k"], count: int, rng: np.random.Generator
 ) -> Float64[np.ndarray, "n g"]:
     """Return depths to try for ``count`` pixels of a view whose points lie at ``depths``."""

@@ -90,12 +90,14 @@ def is_confirmed(
         return right
     xyz, seen = found.xyz_world[swept].astype(np.float64), evidence[swept]
     beside, _ = cKDTree(known).query(xyz)
-    same_place = _confirmations(xyz, seen) >= MIN_CONFIRMATIONS
+    same_place = _count_confirmations(xyz, seen) >= MIN_CONFIRMATIONS
     right[swept] = (beside < NEAR_SPARSE_POINT * seen.distance) | (same_place & (seen.rivalry < MAX_RIVALRY))
     return right
 
 
-def _confirmations(xyz_world: Float64[np.ndarray, "n 3"], seen: MatchEvidence) -> Int64[np.ndarray, " n"]:
+def _count_confirmations(
+    xyz_world: Float64[np.ndarray, "n 3"], seen: MatchEvidence
+) -> Int64[np.ndarray, " n"]:
     """Return how many other views have a point at the same place as each."""
     near = cKDTree(xyz_world).query_ball_point(xyz_world, SAME_POINT * seen.distance)
     mine = np.repeat(np.arange(len(near)), [len(others) for others in near])

@@ -33,7 +33,7 @@ class AllowedRegion:
 
         ``state`` changes in place: their opacity, their moments, and the count of those near to cameras.
         """
-        is_near, is_outside = self._masks(state.gaussians, 1.0)
+        is_near, is_outside = self._prune_masks(state.gaussians, 1.0)
         is_outside &= state.gaussians.opacity_logits > PRUNED_LOGIT
         state.pruned_near_cameras += int((is_near & is_outside).sum())
         rows = np.flatnonzero(is_outside)
@@ -43,13 +43,13 @@ class AllowedRegion:
 
     def select_final(self, gaussians: FlatGaussians, state: TrainState) -> FlatGaussians:
         """Return the Gaussians to export of ``gaussians``; counts those near to cameras in ``state``."""
-        is_near, is_outside = self._masks(gaussians, FINAL_CLEARANCE_SCALE)
+        is_near, is_outside = self._prune_masks(gaussians, FINAL_CLEARANCE_SCALE)
         if not is_outside.any():
             return gaussians
         state.pruned_near_cameras += int((is_near & (gaussians.opacity_logits > PRUNED_LOGIT)).sum())
         return gaussians.select(np.flatnonzero(~is_outside))
 
-    def _masks(
+    def _prune_masks(
         self, gaussians: FlatGaussians, clearance_scale: float
     ) -> tuple[Bool[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
         """Return which Gaussians are in the scaled zone around a camera, and which are that or in no view."""

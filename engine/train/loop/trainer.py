@@ -133,7 +133,7 @@ class Trainer:
             densifier.restore(state.densifier)
         if state.shading:
             self.shading.restore(state.shading)
-        self._given_tracer = tracer
+        self._caller_tracer = tracer
         self._components = TrainComponents(tracer or self._make_tracer(), self.shading, densifier)
         self._probe = ValidationProbe(
             dataset,
@@ -174,11 +174,11 @@ class Trainer:
                 state.raise_sh_degree(schedule.sh_degree(state.iteration))
                 if self._min_scale is not None:
                     self._min_scale.apply(state.gaussians)
-                self._build()
+                self._rebuild_bvh()
                 self._checkpoint_or_stop(watch, resumed=0 < state.iteration == first_iteration)
                 schedule = self.schedule
             elif is_stale:
-                self._build()
+                self._rebuild_bvh()
             if schedule.is_finished(state.iteration):
                 return self._finish()
             components = self._components
@@ -238,10 +238,12 @@ class Trainer:
         settings = self._config.trace.model_copy(update={"sort": sort})
         return make_tracer(settings, threads=self._threads, box_padding=self._config.box_padding)
 
-    def _build(self) -> None:
-        """Build the hierarchy of the present Gaussians, with another tracer where the sort order changes."""
-        is_shared = self._components.tracer.settings.sort == "packet"
-        if self._given_tracer is None and is_shared != self.schedule.uses_shared_sort(self.state.iteration):
+    def _rebuild_bvh(self) -> None:
+        """Rebuild the BVH over the current Gaussians, replacing the tracer when the sort mode changes."""
+        uses_shared_sort = self._components.tracer.settings.sort == "packet"
+        if self._caller_tracer is None and uses_shared_sort != self.schedule.uses_shared_sort(
+            self.state.iteration
+        ):
             self._components = replace(self._components, tracer=self._make_tracer())
         gaussians, tracer, shading = self.state.gaussians, self._components.tracer, self._components.shading
         tracer.build(gaussians, shading.features(gaussians))

@@ -59,12 +59,12 @@ def train_coarse_scene(
     """
     config = TrainConfig().model_copy(update={**_COARSE_SETTINGS, "background": background, "seed": seed})
     gaussians, shading = _train(
-        dataset,
-        config,
-        initial_train_state(dataset, config, threads=use_threads(threads)),
-        threads,
-        should_stop,
-        lambda done, _tracer: progress(done),
+        dataset=dataset,
+        config=config,
+        state=initial_train_state(dataset, config, threads=use_threads(threads)),
+        threads=threads,
+        should_stop=should_stop,
+        on_step=lambda done, _tracer: progress(done),
     )
     tracer = make_tracer(config.trace, threads=threads)
     tracer.build(gaussians, shading.features(gaussians))
@@ -95,7 +95,14 @@ def seconds_per_iteration(
     )
     state = initial_state(first.select(slice(None)), config.seed)
     with suppress(CancelledError):
-        _train(dataset, trial, state, threads, lambda: len(times) >= enough or should_stop(), note)
+        _train(
+            dataset=dataset,
+            config=trial,
+            state=state,
+            threads=threads,
+            should_stop=lambda: len(times) >= enough or should_stop(),
+            on_step=note,
+        )
     if should_stop():
         raise CancelledError("Stopped before the training; the same command with --resume goes on.")
     return (times[-1] - times[WARM_UP_ITERATIONS - 1]) / (len(times) - WARM_UP_ITERATIONS)

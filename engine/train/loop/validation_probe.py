@@ -56,7 +56,15 @@ def draw_probe(
     view, y, x = PixelSampler(indices, view_sizes_px(dataset)).pixels(rng, count)
     rgb, alpha, weight = dataset.pixels(view, y, x)
     covered = float(np.average(alpha, weights=weight)) if weight.any() else 0.0
-    return RayProbe(view, y, x, composite_over(rgb, alpha, background_srgb), weight, background_srgb, covered)
+    return RayProbe(
+        view=view,
+        y=y,
+        x=x,
+        rgb_srgb=composite_over(rgb, alpha, background_srgb),
+        weight=weight,
+        background_srgb=background_srgb,
+        alpha=covered,
+    )
 
 
 def measure_probe(

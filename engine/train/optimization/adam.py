@@ -117,29 +117,44 @@ class Adam:
         rates_sh[:3] = color_rate
         powers = _beta_powers(1 << (int(self.steps.max(initial=0)) + 1).bit_length())
         run_ranges(
-            adam_step, threads_in_use(), -(-len(gradients.ids) // CHUNK),
+            adam_step,
+            threads_in_use(),
+            -(-len(gradients.ids) // CHUNK),
             gradients.ids,
             BiasCorrection(self.steps, powers, corrections),
             AdamMoments(self.first, self.second, BETA1, BETA2, EPSILON),
             ParameterArrays(
-                gaussians.means_world, gaussians.quats_wxyz, gaussians.log_scales,
-                gaussians.opacity_logits, gaussians.sh,
+                gaussians.means_world,
+                gaussians.quats_wxyz,
+                gaussians.log_scales,
+                gaussians.opacity_logits,
+                gaussians.sh,
             ),
             ParameterGradients(
-                gradients.means_world, gradients.quats_wxyz, gradients.log_scales,
-                gradients.opacity_logits, gradients.sh,
+                gradients.means_world,
+                gradients.quats_wxyz,
+                gradients.log_scales,
+                gradients.opacity_logits,
+                gradients.sh,
             ),
             StepRates(
-                mean_unit * rates.mean * (rates.mean_final / rates.mean) ** training_progress,
-                rates.mean_unit == "size", rates.axes == "own",
-                rates.quat * decay, rates.log_scale * decay, rates.opacity * decay, rates_sh,
+                mean=mean_unit * rates.mean * (rates.mean_final / rates.mean) ** training_progress,
+                mean_by_size=rates.mean_unit == "size",
+                own_axes=rates.axes == "own",
+                quat=rates.quat * decay,
+                log_scale=rates.log_scale * decay,
+                opacity=rates.opacity * decay,
+                sh=rates_sh,
             ),
             Regularization(
-                loss.opacity / hit_count, loss.scale / (2 * hit_count * extent),
-                float(np.log(1e-6 * extent)), float(np.log(10.0 * extent)),
+                loss.opacity / hit_count,
+                loss.scale / (2 * hit_count * extent),
+                float(np.log(1e-6 * extent)),
+                float(np.log(10.0 * extent)),
             ),
-            mean_steps, grain=1,
-        )  # fmt: skip
+            mean_steps,
+            grain=1,
+        )
         self._step_channels(gaussians, gradients, rates, decay, corrections)
         return mean_steps
 

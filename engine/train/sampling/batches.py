@@ -156,14 +156,23 @@ class BatchSource:
         view, y, x = (np.concatenate(parts) for parts in zip(*pixels, strict=True))
         rays = self._dataset.rays(view, y, x)
         rgb, alpha, weight = self._dataset.pixels(view, y, x)
-        background = self._background(rng)
+        background = self._background_colors(rng)
         visibility_rays = None
         if self._visibility_rays is not None and len(self._visibility_rays):
             visibility_rays = self._visibility_rays.draw(
                 rng, max(1, round(options.visibility_ray_fraction * options.rays_per_batch))
             )
         batch = Batch(
-            rays, rgb, alpha, weight, view, self._ssim_patches, side, background, visibility_rays, ray_patches
+            rays=rays,
+            rgb_srgb=rgb,
+            alpha=alpha,
+            weight=weight,
+            view=view,
+            ssim_patch_count=self._ssim_patches,
+            patch_side=side,
+            background_srgb=background,
+            visibility_rays=visibility_rays,
+            ray_patches=ray_patches,
         )
         _ = batch.target_srgb  # worked out here, as the next batch is drawn beside the iteration
         return batch
@@ -191,7 +200,7 @@ class BatchSource:
             )
         return count
 
-    def _background(self, rng: np.random.Generator) -> Float32[np.ndarray, "3"]:
+    def _background_colors(self, rng: np.random.Generator) -> Float32[np.ndarray, "3"]:
         name: Background = self._options.background
         if name == "auto":
             name = "random" if self._dataset.has_alpha else "black"

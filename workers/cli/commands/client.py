@@ -207,7 +207,7 @@ def jobs(state: tuple[str, ...], limit: int, server: str | None) -> None:
         click.echo("No jobs.")
     for job in found:
         line = (
-            f"{job['id']}  {job['state']:9}  {job['kind']:11}  {_progress_text(job):22}  {_decibels(job):8}"
+            f"{job['id']}  {job['state']:9}  {job['kind']:11}  {_progress_text(job):22}  {_psnr_text(job):8}"
         )
         click.echo(f"{line}  {job['label'] or ''}".rstrip())
 
@@ -237,7 +237,7 @@ def status(job_id: str, wait: bool, as_json: bool, server: str | None, quiet: bo
     if job["psnr"] is not None:
         training = job.get("training_psnr")
         rest = f"; {training:.2f} dB over the training's own rays" if training is not None else ""
-        click.echo(f"PSNR {_decibels(job)} over held-out views{rest}")
+        click.echo(f"PSNR {_psnr_text(job)} over held-out views{rest}")
     if job["error"]:
         click.echo(job["error"]["message"])
 
@@ -373,7 +373,7 @@ def _get_job(api: "Api", job_id: str) -> dict[str, Any]:
     return first
 
 
-def _decibels(job: dict[str, Any]) -> str:
+def _psnr_text(job: dict[str, Any]) -> str:
     """Return the PSNR over held-out views."""
     return "" if job["psnr"] is None else f"{job['psnr']:.2f} dB"
 

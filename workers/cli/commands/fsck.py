@@ -32,9 +32,9 @@ def fsck(data: Path | None, verify: bool, as_json: bool, recount: bool) -> None:
 
     settings = load_settings(WorkerSettings, data=data)
     if recount:
-        for line in _recount(settings):
+        for line in _recount_quotas(settings):
             click.echo(line, err=as_json)
-    report = _report(settings, verify)
+    report = _print_report(settings, verify)
     if as_json:
         click.echo(json.dumps(dataclasses.asdict(report), indent=2))
     else:
@@ -68,7 +68,7 @@ def report_lines(report: "Report") -> list[str]:
     return lines
 
 
-def _report(settings: "WorkerSettings", verify: bool) -> "Report":
+def _print_report(settings: "WorkerSettings", verify: bool) -> "Report":
     import asyncio
 
     from octasplat.workers.storage.factory import open_storage
@@ -76,10 +76,10 @@ def _report(settings: "WorkerSettings", verify: bool) -> "Report":
 
     conninfo = settings.conninfo()
     storage = open_storage(settings.storage_address, floor_bytes=0)
-    return compare_with_storage(storage, asyncio.run(_references(conninfo)), verify=verify)
+    return compare_with_storage(storage, asyncio.run(_read_references(conninfo)), verify=verify)
 
 
-def _recount(settings: "WorkerSettings") -> list[str]:
+def _recount_quotas(settings: "WorkerSettings") -> list[str]:
     import asyncio
 
     from octasplat.workers.db.connections import open_pool
@@ -95,7 +95,7 @@ def _recount(settings: "WorkerSettings") -> list[str]:
     return asyncio.run(count())
 
 
-async def _references(conninfo: str) -> "list[Reference]":
+async def _read_references(conninfo: str) -> "list[Reference]":
     from octasplat.workers.db.connections import open_pool
     from octasplat.workers.db.references import references
 

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 
 from psycopg.rows import class_row
 
-from octasplat.workers.db.connections import Connection, with_columns
-from octasplat.workers.maintenance.webhooks.rows import Delivery, Endpoint, get_endpoint
+from octasplat.workers.db.connections import Connection, select_columns
+from octasplat.workers.maintenance.webhooks.rows import Delivery, Endpoint, get_webhook_endpoint
 
 LEASE_SECONDS = 60
 """After so long a message whose sender was lost is taken by another."""
@@ -53,7 +53,7 @@ async def lease_due(
     """
     async with connection.transaction(), connection.cursor(row_factory=class_row(Delivery)) as cursor:
         await cursor.execute(
-            with_columns(
+            select_columns(
                 """
             WITH ranked AS (
                 SELECT deliveries.id, endpoints.owner,
@@ -86,7 +86,7 @@ async def lease_due(
         )
         taken = await cursor.fetchall()
         with_endpoints = [
-            (delivery, await get_endpoint(connection, delivery.endpoint_id)) for delivery in taken
+            (delivery, await get_webhook_endpoint(connection, delivery.endpoint_id)) for delivery in taken
         ]
     return [(delivery, endpoint) for delivery, endpoint in with_endpoints if endpoint is not None]
 

@@ -9,7 +9,7 @@ from typing import Any, Literal
 from psycopg.rows import class_row
 
 from octasplat.engine.core.errors import OctasplatError
-from octasplat.workers.db.connections import Connection, fetch_all, fetch_one, with_columns
+from octasplat.workers.db.connections import Connection, fetch_all, fetch_one, select_columns
 from octasplat.workers.db.errors import NotFoundError
 from octasplat.workers.db.ids import new_id
 from octasplat.workers.db.locks import lock_owner
@@ -117,7 +117,7 @@ async def add_endpoint(
         if row is not None and row["n"] >= limit:
             raise TooManyEndpointsError(f"There are {limit} such webhooks already; delete some first.")
         await cursor.execute(
-            with_columns(
+            select_columns(
                 """
             INSERT INTO webhook_endpoints (id, owner, job_id, url, secret, events)
             VALUES (%s, %s, %s, %s, %s, %s) RETURNING {}
@@ -131,8 +131,8 @@ async def add_endpoint(
     return endpoint
 
 
-async def get_endpoint(connection: Connection, endpoint_id: uuid.UUID) -> Endpoint | None:
-    """Return the endpoint of that id, or None."""
+async def get_webhook_endpoint(connection: Connection, endpoint_id: uuid.UUID) -> Endpoint | None:
+    """Return the webhook endpoint with that id, or None."""
     return await fetch_one(
         connection, Endpoint, "SELECT {} FROM webhook_endpoints WHERE id = %s", [endpoint_id]
     )
@@ -195,7 +195,7 @@ async def change_endpoint(
             "id": endpoint_id,
         },
     )
-    endpoint = await get_endpoint(connection, endpoint_id)
+    endpoint = await get_webhook_endpoint(connection, endpoint_id)
     if endpoint is None:
         raise NotFoundError("webhook")
     return endpoint

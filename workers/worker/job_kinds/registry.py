@@ -66,7 +66,7 @@ class JobKind(Generic[OptionsT]):
 
         Raises:
             ValidationError: an option cannot be used.
-            SettingsRefused: likewise, with a sentence for each.
+            InvalidSettingsError: likewise, with a sentence for each.
         """
         return self.options.model_validate(dict(values))
 

@@ -27,7 +27,7 @@ class SurfaceJobOptions(SurfaceOptions):
     )
 
     @model_validator(mode="after")
-    def _fits(self) -> "SurfaceJobOptions":
+    def _check_format(self) -> "SurfaceJobOptions":
         try:
             check_surface_path(
                 Path(f"surface.{self.format}"), textured=self.texture_size is not None, lit=self.materials

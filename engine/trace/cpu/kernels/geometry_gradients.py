@@ -88,7 +88,10 @@ def write_geometry_gradients(
 def gaussian_frame(
     i: int, quats: Float32[np.ndarray, "n 4"], log_scales: Float32[np.ndarray, "n 2"]
 ) -> tuple[tuple[float, float, float], tuple[float, float, float], tuple[float, float, float], float, float]:
-    """Return r1, r2, r3, s2 and s3 of Gaussian ``i`` in float64."""
-    r1, r2, r3 = gaussian_axes(quats, i)
-    s2, s3 = math.exp(np.float64(log_scales[i, 0])), math.exp(np.float64(log_scales[i, 1]))
-    return r1, r2, r3, s2, s3
+    """Return the normal, both tangents and the standard deviations along them of Gaussian ``i``, in float64.
+
+    They are the columns of its rotation, normal first, and the two scales; its quaternion has w first.
+    """
+    normal, tangent_u, tangent_v = gaussian_axes(quats, i)
+    scale_u, scale_v = math.exp(np.float64(log_scales[i, 0])), math.exp(np.float64(log_scales[i, 1]))
+    return normal, tangent_u, tangent_v, scale_u, scale_v

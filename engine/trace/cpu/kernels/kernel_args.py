@@ -64,8 +64,21 @@ class GaussianParameters(NamedTuple):
         )
 
 
+NO_SECOND_PHASE = 2.0
+"""Value of ``eps2`` that no transmittance reaches: kernels take a threshold above 1 for a single phase."""
+
+
 class TraceLimits(NamedTuple):
-    """Limits of rays and of normal flipping; ``eps2`` above 1 switches the second phase off."""
+    """Parameters of compositing, from :class:`octasplat.engine.trace.protocol.TraceSettings`.
+
+    Attributes:
+        eps1: transmittance below which a ray, or its first phase, ends.
+        eps2: transmittance below which the second phase ends; :data:`NO_SECOND_PHASE` switches it off.
+        alpha_max: alpha is clamped to this.
+        max_hits: most Gaussians on a ray.
+        flip_normal_cos: a normal that points away from the viewer is flipped where its cosine to the
+            direction from the ray's origin to the mean is larger.
+    """
 
     eps1: float
     eps2: float
@@ -75,14 +88,14 @@ class TraceLimits(NamedTuple):
 
     @classmethod
     def from_settings(cls, settings: TraceSettings) -> "TraceLimits":
-        """Return the limits among ``settings``."""
-        eps2 = settings.second_phase_min
+        """Return the kernels' parameters taken from ``settings``."""
+        second_phase_min = settings.second_phase_min
         return cls(
-            settings.transmittance_min,
-            2.0 if eps2 is None else eps2,
-            settings.alpha_max,
-            settings.max_hits,
-            settings.flip_normal_cos,
+            eps1=settings.transmittance_min,
+            eps2=NO_SECOND_PHASE if second_phase_min is None else second_phase_min,
+            alpha_max=settings.alpha_max,
+            max_hits=settings.max_hits,
+            flip_normal_cos=settings.flip_normal_cos,
         )
 
 
