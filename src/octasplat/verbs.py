@@ -134,8 +134,8 @@ def reconstruct(
             black.
         minutes: Time in which the training is to end, which decides its iterations and Gaussians by the
             pace of the machine that begins it; by default the other settings do.
-        exports: Files to write besides scene.ply; their names say the format. Default: ('mesh.ply',
-            'mesh.obj', 'mesh.glb').
+        exports: Files to write besides scene.ply; their names say the format. Default: ('viewer.glb',
+            'surface.glb', 'octagons.ply', 'octagons.obj', 'octagons.glb').
         materials: Learn materials and the environment of shiny things; environment.hdr lies beside the
             scene then.
         for_surface: Hold normals and depths together, so that a surface made of the scene is smoother.
@@ -264,8 +264,8 @@ def estimate(
             black.
         minutes: Time in which the training is to end, which decides its iterations and Gaussians by the
             pace of the machine that begins it; by default the other settings do.
-        exports: Files to write besides scene.ply; their names say the format. Default: ('mesh.ply',
-            'mesh.obj', 'mesh.glb').
+        exports: Files to write besides scene.ply; their names say the format. Default: ('viewer.glb',
+            'surface.glb', 'octagons.ply', 'octagons.obj', 'octagons.glb').
         materials: Learn materials and the environment of shiny things; environment.hdr lies beside the
             scene then.
         for_surface: Hold normals and depths together, so that a surface made of the scene is smoother.
@@ -589,7 +589,7 @@ def material(
         box: Two corners of a box that their centres lie in, smallest coordinates first.
         sphere: Centre and radius of a sphere that their centres lie in.
         inverse: Take the other Gaussians instead.
-        mesh: Those whose octagons are in this mesh: IN's mesh.ply after the rest was deleted in an
+        mesh: Those whose octagons are in this mesh: IN's octagons.ply after the rest was deleted in an
             editor.
         masks: Those that show where this image is white; it has the name of one of the run's
             photographs. Several say together what is meant.
@@ -976,6 +976,7 @@ def export(
     q: float | None = None,
     color: Literal["cameras", "constant"] | Sequence[float] | str | None = None,
     for_viewers: bool = False,
+    extent: Literal["photographed", "all"] | None = None,
     materials: bool = False,
     up: Literal["x", "-x", "y", "-y", "z", "-z"] | None = None,
     format: str | None = None,
@@ -1003,9 +1004,12 @@ def export(
         color: Formats with one colour for each Gaussian: the one that loses least seen from the
             photographs' places of a run, or from all around a file; the harmonics' constant part; or
             the one seen along a direction. [default: cameras for a run, constant for a file]
-        for_viewers: GLB: for programs that sort chunks at best: solid middles beneath, and in a run
-            whose photographs were taken from one side, the order that is right from most of them.
-            Carries no numbers for edits.
+        for_viewers: GLB: for programs that sort chunks at best, as viewer.glb is: solid middles
+            beneath, and in a run whose photographs were taken from one side, the order that is right
+            from most of them. Carries no numbers for edits.
+        extent: GLB for viewers: how much of a run is written, what lies in the space that the cameras
+            surround, which viewers then frame, or all of it, with what is far behind. Default:
+            photographed.
         materials: GLB: base colour, metallic and roughness instead of colours that have their light in
             them.
         up: With materials: the axis that points up. [default: the run's, of a file -y]
@@ -1036,6 +1040,7 @@ def export(
             "q": q,
             "color": color,
             "for_viewers": for_viewers,
+            "extent": extent,
             "materials": materials,
             "up": up,
             "files": files,
