@@ -75,10 +75,10 @@ def queued_job_notes(
 def _refusing_workers_note(queue: str, takers: Sequence[WorkerRow]) -> list[str]:
     """Return why none of the workers takes a job; nothing where one of them does."""
     reasons = [row.facts.get("ailing") for row in takers]
-    told = dict.fromkeys(shorten_absolute_paths(str(reason)).rstrip(".") for reason in reasons if reason)
+    distinct = dict.fromkeys(shorten_absolute_paths(str(reason)).rstrip(".") for reason in reasons if reason)
     if not all(reasons):
         return []
-    return [f"The workers of the queue {queue} take no jobs for now: {'; '.join(told)}."]
+    return [f"The workers of the queue {queue} take no jobs for now: {'; '.join(distinct)}."]
 
 
 _ALL_FORMATS = tuple(exporter.name for exporter in exporters())

@@ -1,4 +1,4 @@
-"""What is known of kernels being compiled in this process: who is told, and how long it took.
+"""What is known of kernels being compiled in this process: which events report it, and how long it took.
 
 This module imports no numba.
 """
@@ -57,11 +57,11 @@ def _tell(event: Event) -> None:
 @contextmanager
 def report_compilation(progress: EventListener) -> Iterator[None]:
     """Tell ``progress`` once that kernels are compiled, and how long each time, within this context."""
-    told: set[type[Event]] = set()
+    reported: set[type[Event]] = set()
 
     def tell(event: Event) -> None:
-        if isinstance(event, KernelsCompiled) or Noted not in told:
-            told.add(type(event))
+        if isinstance(event, KernelsCompiled) or Noted not in reported:
+            reported.add(type(event))
             progress(event)
 
     with _LOCK:
