@@ -59,7 +59,9 @@ def test_depth_split_colours_by_coverage() -> None:
 def test_depth_split_layers_sum_to_ray() -> None:
     model = model_of()
     tracer, sight = traced(concatenate([ground(), veil()]), model)
-    found = split_by_depth(sight.rays, sight.result, tracer, min_separation_world=0.01, record=False)
+    found = split_by_depth(
+        sight.rays, sight.result, tracer, min_separation_world=0.01, record_for_backward=False
+    )
     np.testing.assert_array_equal(found.split_ids, [0, 1, 2])
     assert len(found.rays) == len(found.results.depth_sum) == 6
     for name in ("features", "normal_world", "rgb_srgb"):
@@ -76,7 +78,7 @@ def test_depth_split_layers_sum_to_ray() -> None:
     assert (
         len(
             split_by_depth(
-                sight.rays, sight.result, tracer, min_separation_world=0.01, record=False
+                sight.rays, sight.result, tracer, min_separation_world=0.01, record_for_backward=False
             ).split_ids
         )
         == 0
