@@ -1,6 +1,6 @@
 """Datasets with their pixels: rays and colors of any pixels of any views."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Literal
 
@@ -147,6 +147,7 @@ class Dataset:
         origin_world: Origin | None = None,
         burst_length: int = 1,
         split: SplitSource = "given",
+        stored_split: Mapping[str, bool] | None = None,
         model: str | None = None,
     ) -> "Dataset":
         """Load a scene and decode its photographs into ``cache_dir``, or reuse those already cached there.
@@ -170,6 +171,7 @@ class Dataset:
             origin_world: world position to use as the local origin; None chooses one for large coordinates.
             burst_length: so many views that follow each other by name fall on one side of the split.
             split: ``given`` holds out what the scene says, if it does; ``every`` does not ask it.
+            stored_split: whether each view is held out by the run that goes on, see :class:`SplitRule`.
             model: which of several models of the scene to take, by its path below it or its number.
 
         Raises:
@@ -182,7 +184,7 @@ class Dataset:
         )
         _require_masks(scene, root, masks)
         # Fail before the expensive decoding.
-        rule = SplitRule(test_every, held_out, burst_length, split)
+        rule = SplitRule(test_every, held_out, burst_length, split, stored_split)
         parts = split_scene(scene, rule)
         digests = None
         if check_views is not None:

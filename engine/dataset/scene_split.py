@@ -1,13 +1,13 @@
 """The split of a scene: by rule, by names, or as the scene says, with copies of photographs on one side."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 from jaxtyping import Int64
 
-from octasplat.engine.dataset.duplicates import find_duplicates
+from octasplat.engine.dataset.duplicates import Duplicates, find_duplicates
 from octasplat.engine.dataset.model import DatasetModel
 from octasplat.engine.dataset.split import split_views
 
@@ -24,12 +24,15 @@ class SplitRule:
         burst_length: so many views that follow each other by name count as one.
         split: ``given`` holds out what the scene says, where it says anything and neither ``held_out`` nor a
             ``test_every`` of 0 says otherwise; ``every`` does not ask the scene.
+        stored: whether each view is held out by a run that was begun before; taken as it is, whatever the
+            rule says now, where the scene has just these views.
     """
 
     test_every: int = 8
     held_out: Sequence[str] | None = None
     burst_length: int = 1
     split: SplitSource = "given"
+    stored: Mapping[str, bool] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,6 +52,8 @@ def split_scene(model: DatasetModel, rule: SplitRule) -> SceneSplit:
         ConfigError: ``test_every`` is negative.
     """
     names = [view.name for view in model.views]
+    if rule.stored is not None and rule.stored.keys() == set(names):
+        return _stored_split(names, rule.stored, find_duplicates(model))
     held_out = rule.held_out
     warnings: list[str] = []
     if model.held_out is not None:
@@ -65,3 +70,17 @@ def split_scene(model: DatasetModel, rule: SplitRule) -> SceneSplit:
         names, rule.test_every, held_out, burst_length=rule.burst_length, duplicates=duplicates.groups
     )
     return SceneSplit(train, test, tuple(warnings))
+
+
+def _stored_split(names: Sequence[str], stored: Mapping[str, bool], duplicates: Duplicates) -> SceneSplit:
+    is_test = np.array([stored[name] for name in names], bool)
+    apart = [group for group in duplicates.groups if len(set(is_test[list(group)].tolist())) == 2]
+    if not apart:
+        return SceneSplit(np.flatnonzero(~is_test), np.flatnonzero(is_test))
+    shown = " = ".join(names[index] for index in apart[0])
+    warning = (
+        f"{len(apart)} photographs are there more than once, on both sides of the split that the run was "
+        f"begun with ({shown}, for instance), so that its figures measure memory in part; a new run keeps "
+        "them on one side."
+    )
+    return SceneSplit(np.flatnonzero(~is_test), np.flatnonzero(is_test), (warning,))

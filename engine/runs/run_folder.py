@@ -93,8 +93,17 @@ def run_viewpoints(
         model=config.model,
         origin_world=run_origin(output),
     )
-    rule = SplitRule(config.test_every, config.held_out, config.burst_length, config.split)
+    rule = SplitRule(
+        config.test_every, config.held_out, config.burst_length, config.split, stored_split(output)
+    )
     return scene_viewpoints(photographs, rule)
+
+
+def stored_split(output: Path) -> dict[str, bool] | None:
+    """Return whether each view of a run is held out; None before the run has opened its photographs."""
+    if not (output / VIEWS).exists():
+        return None
+    return {view.name: view.held_out for view in read_views(output / VIEWS).views}
 
 
 def run_origin(output: Path) -> Origin | None:
@@ -218,6 +227,7 @@ def open_run_dataset(
         held_out=config.held_out,
         burst_length=config.burst_length,
         split=config.split,
+        stored_split=stored_split(output),
         masks=config.masks,
         model_folder=model_folder,
         model=config.model,

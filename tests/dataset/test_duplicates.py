@@ -7,6 +7,9 @@ import numpy as np
 import pytest
 
 from octasplat.engine.dataset import Dataset, split_views
+from octasplat.engine.dataset.views_file import ViewsRecord, read_views, write_views
+from octasplat.engine.runs.config import ReconstructionConfig
+from octasplat.engine.runs.run_folder import open_run_dataset
 
 Images = list[tuple[str, int, np.ndarray]]
 
@@ -117,3 +120,25 @@ def test_blank_views_are_no_duplicates(tmp_path: Path, make_scene: Callable[...,
     images = [(f"{index}.png", 0, blank) for index in range(9)]
     dataset = _open(make_scene(tmp_path / "scene", images=images, positions=_ring), tmp_path)
     assert _held_out(dataset) == {"0.png", "8.png"} and not _duplicate_sentences(dataset)
+
+
+def test_run_that_was_begun_with_duplicates_apart_goes_on_with_its_own_split(
+    tmp_path: Path, make_scene: Callable[..., Path]
+) -> None:
+    pictures = _pictures(9)
+    images = [(f"{index}.png", 0, picture) for index, picture in enumerate([*pictures, pictures[0]])]
+    root = make_scene(tmp_path / "scene", images=images, positions=lambda index: _ring(index % 9))
+    assert _held_out(_open(root, tmp_path)) == {"0.png", "8.png", "9.png"}
+    begun_with = {f"{index}.png": index in (0, 8) for index in range(10)}
+    record = _open(root, tmp_path, stored_split=begun_with).views_record
+    output = tmp_path / "run"
+    output.mkdir()
+    write_views(output / "views.json", record)
+    found: list[ViewsRecord] = []
+    dataset = open_run_dataset(
+        root, output, ReconstructionConfig(), 1, lambda _event: None, check_views=found.append
+    )
+    assert _held_out(dataset) == {"0.png", "8.png"}
+    assert read_views(output / "views.json").difference(found[0]) is None
+    (sentence,) = _duplicate_sentences(dataset)
+    assert "both sides of the split that the run was begun with (0.png = 9.png" in sentence
