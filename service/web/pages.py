@@ -167,7 +167,7 @@ async def get_cameras(job_id: uuid.UUID, principal: Reader, service: ServiceDep)
     files = await photographs_of(service, principal, job_id)
     held_out = next((row for row in artifacts if row.name == HELD_OUT), None)
     content = await run_in_pool(
-        ThreadPurpose.DOWNLOADS, _viewer_cameras_of_job, service, artifacts, files, held_out
+        ThreadPurpose.DOWNLOADS, viewer_cameras_of_job, service, artifacts, files, held_out
     )
     headers = {"Cache-Control": "private, max-age=300"}
     return JSONResponse(content, headers=headers)
@@ -282,18 +282,21 @@ def _octagon_q(config: dict[str, object]) -> float | None:
     return float(found) if isinstance(found, int | float) and found > 0 else None
 
 
-def _viewer_cameras_of_job(
+def viewer_cameras_of_job(
     service: Service, artifacts: list[Artifact], files: list[DatasetFile], held_out: Artifact | None
 ) -> dict[str, object]:
-    """Return the cameras of the job's poses, else of its dataset; none without a model."""
+    """Return the cameras that the job's result keeps, else of its poses or its dataset; none without any.
+
+    Only the first are about the local origin of a scene with large coordinates, as the scene is, and there
+    whatever form the poses of the dataset have.
+    """
+    names = read_names(service.storage, held_out)
+    views = next((row for row in artifacts if row.name == VIEWS), None)
+    if views is not None and (poses := read_view_poses(read_json(service.storage, views))):
+        return viewer_cameras(poses, names)
     found = {PurePosixPath(row.name).name: row.sha256 for row in artifacts if row.name.startswith("poses/")}
     if not found:
         found = {name: row.sha256 for name, row in _model_files(files).items()}
-    names = read_names(service.storage, held_out)
-    views = next((row for row in artifacts if row.name == VIEWS), None)
-    if not found and views is not None:  # of a scene that was moved away from its photographs
-        poses = read_view_poses(read_json(service.storage, views))
-        return viewer_cameras(poses, names) if poses else {"views": []}
     for suffix in (".bin", ".txt"):
         if f"cameras{suffix}" not in found or f"images{suffix}" not in found:
             continue

@@ -1,8 +1,10 @@
 """The viewer's cameras, from COLMAP models in both forms."""
 
 import io
+import json
 import struct
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -16,6 +18,7 @@ from octasplat.service.web.cameras import (
     read_poses,
     viewer_cameras,
 )
+from octasplat.service.web.pages import viewer_cameras_of_job
 
 UP = np.array([0.0, 0.0, 1.0])
 CENTRES = [(3.0, 0.0, 1.0), (0.0, 3.0, 2.0), (-3.0, 0.5, 1.5), (0.5, -3.0, 0.7)]
@@ -131,3 +134,32 @@ def test_web_cameras_of_real_model_match_pycolmap(scenes_root: Path) -> None:
     assert len(poses) == reconstruction.num_images()
     for image in reconstruction.images.values():
         np.testing.assert_allclose(poses[image.name].centre_world, image.projection_center(), atol=1e-6)
+
+
+class StoredViews:
+    """A storage that holds the views of a run."""
+
+    def read(self, sha256: str) -> list[bytes]:
+        camera = {"model": "PINHOLE", "params": [300, 300, 200, 150], "width_px": 400, "height_px": 300}
+        views = [
+            {
+                "name": f"{k}.jpg",
+                "camera": 0,
+                "rotation_cam_from_world": rotation.tolist(),
+                "translation_cam_from_world": (-rotation @ np.array(centre)).tolist(),
+            }
+            for k, (rotation, centre) in enumerate(zip(rotations(), CENTRES, strict=True))
+        ]
+        assert sha256 == "views"
+        return [json.dumps({"cameras": [camera], "views": views}).encode()]
+
+
+def test_cameras_of_a_job_on_a_transforms_file_are_those_of_its_result() -> None:
+    row = SimpleNamespace(name="views.json", sha256="views", size_bytes=1000)
+    files = [SimpleNamespace(path="transforms.json", sha256="poses", size_bytes=1000)]
+    service = SimpleNamespace(storage=StoredViews())
+    found = viewer_cameras_of_job(service, [row], files, None)["views"]  # type: ignore[arg-type]
+    places = {view["name"]: view["position"] for view in found}
+    for k, centre in enumerate(CENTRES):
+        np.testing.assert_allclose(places[f"{k}.jpg"], centre, atol=1e-4)
+    assert viewer_cameras_of_job(service, [], files, None) == {"views": []}  # type: ignore[arg-type]
