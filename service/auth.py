@@ -107,22 +107,24 @@ async def authenticate(
 async def authenticate_token(request: Request, service: Service, secret: str) -> Token | None:
     """Return the valid token of that secret; None after a delay.
 
+    It is looked up before anything is limited, so wrong tokens of the same address, which may be that of a
+    whole network, never keep a valid one out.
+
     Raises:
-        ProblemError: 429 while too many wrong ones of the same address wait for their answer.
+        ProblemError: 429 for a wrong one while too many of the same address wait for their answer.
     """
+    async with service.pool.connection() as connection:
+        token = await find_token(connection, secret)
+    if token is not None:
+        return token
     address = client_address(request)
-    with service.login_throttle.attempt(address, secret) as is_looked_at:
-        if not is_looked_at:
-            detail = "Too many wrong tokens came from this address; try again in a moment."
-            raise ProblemError(429, "too-many-guesses", detail, retry_seconds=_THROTTLE_RETRY_SECONDS)
+    if service.login_throttle.is_refused(address):
+        detail = "Too many wrong tokens came from this address; try again in a moment."
+        raise ProblemError(429, "too-many-guesses", detail, retry_seconds=_THROTTLE_RETRY_SECONDS)
+    if await service.login_throttle.delay_failure(address):
         async with service.pool.connection() as connection:
-            token = await find_token(connection, secret)
-        if token is not None:
-            service.login_throttle.record_success(secret)
-        elif await service.login_throttle.delay_failure(address):
-            async with service.pool.connection() as connection:
-                await add_entry(connection, address=address, action="wrong token", status=401)
-    return token
+            await add_entry(connection, address=address, action="wrong token", status=401)
+    return None
 
 
 def client_address(request: Request) -> str:
