@@ -14,6 +14,7 @@ from typing import BinaryIO
 import psutil
 
 from benchmarks.chaos_machine import FAST, ROOT
+from octasplat.workers.db.tokens import new_secret
 from octasplat.workers.postgres.embedded import EmbeddedPostgres
 
 STOP_SECONDS = 60.0
@@ -51,6 +52,7 @@ class Fleet:
     address: str = ""
     _database: EmbeddedPostgres = field(init=False)
     _conninfo: str = ""
+    _token: str = field(default_factory=new_secret)
     _processes: dict[str, "subprocess.Popen[bytes]"] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -159,7 +161,7 @@ class Fleet:
         settings = {
             **FAST, "HEARTBEAT_SECONDS": "1", "STALE_SECONDS": "12", "KIND_MODULES": KINDS,
             "DATA": str(self.data), "STORAGE": str(self.data / "store"),
-            "FLOOR_BYTES": "0", **further,
+            "FLOOR_BYTES": "0", "TOKEN": self._token, **further,
         }  # fmt: skip
         return {
             **os.environ,

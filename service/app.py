@@ -9,7 +9,7 @@ from contextlib import asynccontextmanager
 from fastapi import FastAPI
 
 from octasplat.engine import __version__
-from octasplat.engine.core.errors import OctasplatError
+from octasplat.engine.core.errors import ConfigError, OctasplatError
 from octasplat.service.audit_middleware import AuditMiddleware
 from octasplat.service.concurrency_limiter import ConcurrencyLimiter
 from octasplat.service.event_broker import EventBroker
@@ -44,6 +44,7 @@ from octasplat.workers.db.connections import open_pool
 from octasplat.workers.db.migrate import migrate
 from octasplat.workers.db.tokens import add_environment_token, has_any_token
 from octasplat.workers.queue.procrastinate_queue import ProcrastinateQueue
+from octasplat.workers.settings import PREFIX
 from octasplat.workers.storage.factory import open_storage
 
 logger = logging.getLogger(__name__)
@@ -134,7 +135,11 @@ async def _service_lifespan(settings: ServiceSettings) -> AsyncIterator[Service]
                 token = await add_environment_token(connection, settings.token.get_secret_value())
                 if token.revoked_at is not None:
                     logger.warning("the token of OCTASPLAT_TOKEN was revoked and stays so; set another one")
-            settings.check_public(await has_any_token(connection))
+            if not await has_any_token(connection):
+                raise ConfigError(
+                    f"The front end takes requests with a token only, and there is none: set {PREFIX}TOKEN, "
+                    "or make one with octasplat token create."
+                )
         event_broker = EventBroker(conninfo, listen=settings.listen)
         listening = asyncio.create_task(event_broker.run())
         evictor = SpaceEvictor(pool, storage)

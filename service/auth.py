@@ -1,9 +1,5 @@
-"""Authentication and rights: tokens with scopes, sessions begun with one, or anonymous access.
+"""Authentication and rights: tokens with scopes, and sessions begun with one."""
 
-Requests from this machine need no token while there never was one; see :func:`_allows_anonymous`.
-"""
-
-import time
 import uuid
 from dataclasses import dataclass
 from typing import Annotated, Literal
@@ -12,12 +8,11 @@ from fastapi import Depends, Request, Security
 from fastapi.security import APIKeyCookie, HTTPAuthorizationCredentials, HTTPBearer
 
 from octasplat.service.problems import ProblemError
-from octasplat.service.proxy_headers import passed_through_proxy
 from octasplat.service.state import Service, ServiceDep
 from octasplat.workers.db.audit import add_entry
 from octasplat.workers.db.rows import Token
 from octasplat.workers.db.sessions import find_session
-from octasplat.workers.db.tokens import LOCAL_OWNER, find_token, get_token, has_any_token
+from octasplat.workers.db.tokens import find_token, get_token
 
 Scope = Literal["read", "write", "admin"]
 SESSION_COOKIE = "octasplat_session"
@@ -28,7 +23,6 @@ _SUFFICIENT_SCOPES: dict[str, frozenset[str]] = {
     "write": frozenset({"write", "admin"}),
     "admin": frozenset({"admin"}),
 }
-_TOKEN_CHECK_SECONDS = 2.0
 _THROTTLE_RETRY_SECONDS = 5
 
 _bearer = HTTPBearer(auto_error=False, description="A token made with `octasplat token create`.")
@@ -52,7 +46,7 @@ class Principal:
 
     owner: str
     scopes: frozenset[str]
-    token_id: uuid.UUID | None = None
+    token_id: uuid.UUID
     session_id: uuid.UUID | None = None
 
     def may(self, scope: Scope) -> bool:
@@ -78,8 +72,7 @@ async def authenticate(
     """Return the principal of a request.
 
     Raises:
-        ProblemError: 401 without a valid token or session where one is needed, 403 for what came through a
-            proxy where none is needed, 429 after too many wrong tokens.
+        ProblemError: 401 without a valid token or session, 429 after too many wrong tokens.
     """
     principal = None
     if bearer is not None:
@@ -87,14 +80,6 @@ async def authenticate(
         principal = None if token is None else Principal(token.owner, frozenset(token.scopes), token.id)
     elif (secret := session_secret(request)) is not None:
         principal = await principal_of_session(service, secret)
-    elif request.headers.get("authorization") is None and await _allows_anonymous(service):
-        if passed_through_proxy(request.headers):
-            detail = (
-                "This request came by way of a proxy, and without tokens whoever comes may do everything; "
-                "make one with octasplat token create, and name the proxy in OCTASPLAT_PROXIES."
-            )
-            raise ProblemError(403, "open-behind-proxy", detail)
-        principal = Principal(LOCAL_OWNER, frozenset({"admin"}))
     if principal is None:
         detail = "A valid token is needed: send the header Authorization: Bearer <token>."
         raise ProblemError(
@@ -161,18 +146,3 @@ class _RequireScope:
 Reader = Annotated[Principal, Depends(_RequireScope("read"))]
 Writer = Annotated[Principal, Depends(_RequireScope("write"))]
 Admin = Annotated[Principal, Depends(_RequireScope("admin"))]
-
-
-async def _allows_anonymous(service: Service) -> bool:
-    """Return whether requests need no token: from this machine, before there was any token.
-
-    Tokens that have expired or were shut out count: that the last of them has ended opens nothing.
-    """
-    if not service.settings.is_private or service.settings.proxies:
-        return False
-    now = time.monotonic()
-    if now - service.tokens_checked_at > _TOKEN_CHECK_SECONDS:
-        async with service.pool.connection() as connection:
-            service.has_tokens = await has_any_token(connection, valid_only=False)
-        service.tokens_checked_at = now
-    return not service.has_tokens

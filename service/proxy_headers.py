@@ -10,10 +10,6 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 
 Network = ipaddress.IPv4Network | ipaddress.IPv6Network
 HeaderStyle = Literal["x-forwarded", "forwarded"]
-PROXY_HEADER_NAMES = frozenset(
-    {"forwarded", "x-forwarded-for", "x-forwarded-host", "x-forwarded-proto", "x-forwarded-port"}
-    | {"x-forwarded-server", "x-real-ip", "via"}
-)
 _PAIR = re.compile(r'\s*([A-Za-z]+)\s*=\s*("[^"]*"|[^\s";,]*)\s*')
 
 
@@ -67,11 +63,6 @@ class ProxyHeadersMiddleware:
         if isinstance(address, ipaddress.IPv6Address) and address.ipv4_mapped is not None:
             address = address.ipv4_mapped
         return any(address in network for network in self._proxies)
-
-
-def passed_through_proxy(headers: Headers) -> bool:
-    """Return whether a request has headers that only proxies write."""
-    return any(name in PROXY_HEADER_NAMES for name in headers)
 
 
 def _parse_x_forwarded(headers: Headers) -> list[dict[str, str]]:

@@ -5,14 +5,13 @@ from typing import Annotated
 
 from pydantic import Field, IPvAnyNetwork, SecretStr
 
-from octasplat.engine.core.errors import ConfigError
 from octasplat.service.intake.dataset import DatasetLimits
 from octasplat.service.intake.model_check import ModelLimits
 from octasplat.service.intake.receive import UploadLimits
 from octasplat.service.intake.spool import SpoolSpace
 from octasplat.service.proxy_headers import HeaderStyle
 from octasplat.workers.db.quotas import Quota
-from octasplat.workers.settings import COMMA_SEPARATED, PREFIX, WorkerSettings
+from octasplat.workers.settings import COMMA_SEPARATED, WorkerSettings
 from octasplat.workers.worker.job_kinds.resource_limits import LIMIT_UNITS
 
 DEFAULT_PORT = 8642
@@ -117,22 +116,3 @@ class ServiceSettings(WorkerSettings):
         """Return the spool folder for uploaded archives, with its limits."""
         folder = self.work_folder / "archives"
         return SpoolSpace(folder, max_bytes=self.max_spool_bytes, floor_bytes=self.floor_bytes)
-
-    def check_public(self, has_token: bool) -> None:
-        """Refuse a public address without any token.
-
-        Raises:
-            ConfigError: the address is public, or there is a proxy before it, and nobody has a token.
-        """
-        if has_token:
-            return
-        if self.proxies:
-            raise ConfigError(
-                f"{PREFIX}PROXIES names proxies, so a token is needed: set {PREFIX}TOKEN, or make one with "
-                "octasplat token create."
-            )
-        if not self.is_private:
-            raise ConfigError(
-                f"{self.host} can be reached from other machines, so a token is needed: set {PREFIX}TOKEN, "
-                "or make one with octasplat token create, or listen at 127.0.0.1."
-            )

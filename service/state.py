@@ -35,8 +35,6 @@ class Service:
         check_limiter: lets in those whose datasets are checked.
         storage_check: what the store was last found to be, or is being.
         metrics: counts what this process does.
-        has_tokens: whether anybody ever had a token, as of ``tokens_checked_at``.
-        tokens_checked_at: monotonic time.
         is_draining: whether it is about to stop.
         started_at: monotonic time.
     """
@@ -52,14 +50,8 @@ class Service:
     check_limiter: ConcurrencyLimiter
     storage_check: "asyncio.Future[str] | None" = None
     metrics: Metrics = field(default_factory=Metrics)
-    has_tokens: bool = True
-    tokens_checked_at: float = -1e9
     is_draining: bool = False
     started_at: float = field(default_factory=time.monotonic)
-
-    def invalidate_token_state(self) -> None:
-        """Make the next request check again whether there are tokens."""
-        self.tokens_checked_at = -1e9
 
 
 def get_service(request: Request) -> Service:

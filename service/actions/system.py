@@ -51,7 +51,6 @@ def describe(service: Service, principal: Principal) -> InfoView:
         ],
         max_upload_bytes=service.settings.max_upload_bytes,
         max_archive_bytes=service.settings.max_archive_bytes,
-        needs_token=service.has_tokens or not service.settings.is_private,
         owner=principal.owner,
         scopes=sorted(principal.scopes),
         isolation=sandbox_capabilities(),

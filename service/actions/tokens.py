@@ -3,7 +3,7 @@
 import uuid
 
 from octasplat.service.auth import Principal
-from octasplat.service.problems import ProblemError, not_found_error
+from octasplat.service.problems import not_found_error
 from octasplat.service.schemas.tokens import MadeToken, NewToken, SignInLink, TokenView
 from octasplat.service.state import Service
 from octasplat.workers.db import tokens as rows
@@ -18,7 +18,7 @@ async def list_tokens(service: Service) -> list[Token]:
 
 
 async def create_token(service: Service, new: NewToken) -> MadeToken:
-    """Create a token; from the first one on, every request needs one."""
+    """Create a token."""
     secret = rows.new_secret()
     async with service.pool.connection() as connection:
         token = await rows.add_token(
@@ -29,7 +29,6 @@ async def create_token(service: Service, new: NewToken) -> MadeToken:
             scopes=new.scopes,
             hours=new.hours or service.settings.token_hours or None,
         )
-    service.invalidate_token_state()
     return MadeToken(**TokenView.from_row(token).model_dump(), token=secret)
 
 
@@ -42,17 +41,10 @@ async def revoke_token(service: Service, token_id: uuid.UUID) -> None:
     async with service.pool.connection() as connection:
         if not await rows.revoke_token(connection, token_id):
             raise not_found_error("token")
-    service.invalidate_token_state()
 
 
 async def create_sign_in_link(service: Service, principal: Principal) -> SignInLink:
-    """Create a link that signs in once.
-
-    Raises:
-        ProblemError: 409 where nobody needs to sign in.
-    """
-    if principal.token_id is None:
-        raise ProblemError(409, "no-token", "There are no tokens, so nobody has to sign in.")
+    """Create a link that signs in once."""
     async with service.pool.connection() as connection:
         secret = await add_link(connection, principal.token_id)
     return SignInLink(path=f"/sign-in/once?key={secret}")

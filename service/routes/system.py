@@ -62,7 +62,7 @@ async def delete_token(token_id: uuid.UUID, _principal: Admin, service: ServiceD
     await tokens.revoke_token(service, token_id)
 
 
-@router.post("/sign-in-links", status_code=201, responses=problem_responses(409))
+@router.post("/sign-in-links", status_code=201, responses=problem_responses())
 async def create_sign_in_link(principal: Writer, service: ServiceDep) -> SignInLink:
     """Create a link that signs a browser in with your token, once, within five minutes."""
     return await tokens.create_sign_in_link(service, principal)

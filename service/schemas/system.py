@@ -41,7 +41,6 @@ class InfoView(BaseModel):
     formats: list[FormatView]
     max_upload_bytes: int
     max_archive_bytes: int
-    needs_token: bool
     owner: str
     scopes: list[str]
     isolation: dict[str, str | None] = Field(

@@ -14,6 +14,7 @@ from test_docker_files import ROOT, instructions
 from octasplat.engine.dataset.synthetic import SyntheticDatasetConfig, write_synthetic_dataset
 from octasplat.workers.client.api import Api
 from octasplat.workers.client.upload import upload_scene
+from tests.support.service_harness import TOKEN
 
 pytestmark = pytest.mark.heavy
 
@@ -57,6 +58,7 @@ def test_front_end_and_maintenance_run_without_torch(image: Path, conninfo: str,
         "OCTASPLAT_DATA": str(tmp_path / "data"),
         "OCTASPLAT_FLOOR_BYTES": "0",
         "OCTASPLAT_PORT": "0",
+        "OCTASPLAT_TOKEN": TOKEN,
     }
     front = [python, "-m", "octasplat", "api"]
     worker = [image / "bin" / "octasplat", "worker", "--queues", "", "--name", "maintenance"]
@@ -74,7 +76,7 @@ def test_front_end_and_maintenance_run_without_torch(image: Path, conninfo: str,
         write_synthetic_dataset(
             scene, SyntheticDatasetConfig(views=8, width_px=48, height_px=36, samples_per_side=1, points=500)
         )
-        with Api(address) as client:
+        with Api(address, TOKEN) as client:
             dataset = upload_scene(client, scene)
             assert (dataset["state"], dataset["has_poses"], dataset["photographs"]) == ("committed", True, 8)
             assert client.get("/v1/options/reconstruct")["options"]["properties"]

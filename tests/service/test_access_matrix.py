@@ -124,7 +124,7 @@ def _is_about_now(operation: Operation) -> bool:
 
 @pytest.fixture
 async def stage(connect_service: ConnectService) -> AsyncIterator[Stage]:
-    async with connect_service() as (http, service):
+    async with connect_service(signed_in=False) as (http, service):
         stage = Stage(http, service)
         await stage.set()
         yield stage

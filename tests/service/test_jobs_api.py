@@ -327,7 +327,7 @@ async def test_info_describes_service(connect_service: ConnectService) -> None:
     async with connect_service() as (http, service):
         info = (await http.get("/v1/info")).json()
         assert {"reconstruct", "evaluate", "export", "render", "toy"} <= set(info["kinds"])
-        assert "glb" in [form["name"] for form in info["formats"]] and info["needs_token"] is False
+        assert "glb" in [form["name"] for form in info["formats"]]
         schema = (await http.get("/v1/options/reconstruct")).json()["options"]
         assert schema["properties"]["preset"]["enum"] == ["fast", "standard", "high", "redisplats"]
         assert is_problem(await http.get("/v1/options/nothing"), 404, "not-found")

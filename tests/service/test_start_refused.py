@@ -38,7 +38,7 @@ def test_serve_without_database_is_refused(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("settings", "word"),
-    [({"HOST": "0.0.0.0"}, "token"), ({"STORAGE": "/dev/null/store"}, "/dev/null/store")],
+    [({}, "octasplat token create"), ({"STORAGE": "/dev/null/store"}, "/dev/null/store")],
 )
 def test_start_with_invalid_settings_is_refused(
     conninfo: str, tmp_path: Path, settings: dict[str, str], word: str

@@ -12,7 +12,7 @@ import pytest
 
 from octasplat.workers.maintenance import garbage_collection
 from octasplat.workers.queue import storage_leases
-from tests.support.service_harness import api_environment, running_service
+from tests.support.service_harness import BEARER, api_environment, running_service
 
 ROOT = Path(__file__).parents[2]
 PATIENCE_SECONDS = 60.0
@@ -39,7 +39,7 @@ async def test_vanished_front_end_lease_expires(
             with socket.create_connection((host, int(port))) as connection:
                 connection.sendall(
                     f"PUT {dataset}/files/images/a.png HTTP/1.1\r\nHost: localhost\r\n"
-                    "Content-Length: 1000\r\n\r\nhalf".encode()
+                    f"Authorization: {BEARER['Authorization']}\r\nContent-Length: 1000\r\n\r\nhalf".encode()
                 )
                 deadline = time.monotonic() + PATIENCE_SECONDS
                 while await _note(service) is None:

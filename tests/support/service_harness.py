@@ -13,16 +13,36 @@ from pydantic import SecretStr
 from octasplat.service.app import create_app
 from octasplat.service.settings import ServiceSettings
 from octasplat.service.state import Service
-from octasplat.workers.db.tokens import add_token, new_secret
+from octasplat.workers.db.connections import open_pool
+from octasplat.workers.db.tokens import LOCAL_OWNER, add_token, new_secret
 from octasplat.workers.queue.attempts import Attempt, claim
 from octasplat.workers.storage.trees import Manifest
+
+TOKEN = new_secret()
+"""What the clients of these services send unless a test says otherwise."""
+BEARER = {"Authorization": f"Bearer {TOKEN}"}
+
+
+async def add_local_token(conninfo: str) -> None:
+    """Add the token of the machine's own user, an administrator."""
+    async with (
+        open_pool(conninfo, max_size=1) as pool,
+        pool.connection() as connection,
+    ):
+        await add_token(connection, TOKEN, owner=LOCAL_OWNER, name="tests", scopes=["admin"])
 
 
 @asynccontextmanager
 async def running_service(
-    conninfo: str, folder: Path, **settings: Any
+    conninfo: str, folder: Path, *, signed_in: bool = True, has_token: bool = True, **settings: Any
 ) -> AsyncIterator[tuple[httpx.AsyncClient, Service]]:
-    """A client of a service, and the service."""
+    """A client of a service, and the service.
+
+    The client sends the token of the machine's own user unless ``signed_in`` is False, and ``has_token`` is
+    whether there is one.
+    """
+    if has_token:
+        await add_local_token(conninfo)
     given = {
         "data": folder,
         "storage": str(folder / "store"),
@@ -35,7 +55,11 @@ async def running_service(
     app = create_app(ServiceSettings(**given))
     async with app.router.lifespan_context(app):
         transport = httpx.ASGITransport(app=app)
-        async with httpx.AsyncClient(transport=transport, base_url="http://localhost:8642") as http:
+        async with httpx.AsyncClient(
+            transport=transport,
+            base_url="http://localhost:8642",
+            headers=BEARER if signed_in else None,
+        ) as http:
             yield http, app.state.service
 
 
@@ -74,6 +98,7 @@ def api_environment(conninfo: str, folder: Path) -> dict[str, str]:
         "OCTASPLAT_DATA": str(folder),
         "OCTASPLAT_FLOOR_BYTES": "0",
         "OCTASPLAT_PORT": "0",
+        "OCTASPLAT_TOKEN": TOKEN,
     }
 
 
@@ -93,7 +118,6 @@ async def client_with_token(service: Service, owner: str, *scopes: str) -> dict[
     secret = new_secret()
     async with service.pool.connection() as connection:
         await add_token(connection, secret, owner=owner, name=owner, scopes=scopes)
-    service.tokens_checked_at = -1e9
     return {"Authorization": f"Bearer {secret}"}
 
 
@@ -105,6 +129,8 @@ def store_content(service: Service, content: bytes) -> str:
 
 
 __all__ = [
+    "BEARER",
+    "TOKEN",
     "ConnectService",
     "Manifest",
     "claim_job",

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from tests.support.run_replay import RunReplay
+from tests.support.service_harness import BEARER
 
 ROOT = Path(__file__).parents[2]
 
@@ -29,7 +30,9 @@ class RunningService:
     def request(self, method: str, path: str, body: object = None, **headers: str) -> Any:
         """The JSON that the API answers."""
         data = body if isinstance(body, bytes) else None if body is None else json.dumps(body).encode()
-        request = urllib.request.Request(self.url + path, data=data, method=method, headers=headers)
+        request = urllib.request.Request(
+            self.url + path, data=data, method=method, headers={**BEARER, **headers}
+        )
         if body is not None and not isinstance(body, bytes):
             request.add_header("Content-Type", "application/json")
         with urllib.request.urlopen(request, timeout=60) as answer:

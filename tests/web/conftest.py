@@ -21,7 +21,7 @@ from tests.support.browser import PLAYWRIGHT, chromium
 from tests.support.npm_packages import npm_folder
 from tests.support.postgres_fixtures import copied_database, postgres, short_root, template
 from tests.support.run_replay import RunReplay
-from tests.support.service_harness import ConnectService, running_service
+from tests.support.service_harness import TOKEN, ConnectService, running_service
 from tests.support.web_harness import ROOT, Browse, RunningService, StartService
 
 __all__ = ["postgres", "short_root", "template"]
@@ -50,7 +50,7 @@ def start_service(database: str, tmp_path_factory: pytest.TempPathFactory) -> It
         with socket.socket() as probe:
             probe.bind(("127.0.0.1", 0))
             port = probe.getsockname()[1]
-        given = {"DATA": str(root), "PORT": str(port), "FLOOR_BYTES": "0", **settings}
+        given = {"DATA": str(root), "PORT": str(port), "FLOOR_BYTES": "0", "TOKEN": TOKEN, **settings}
         environment = {
             **os.environ,
             "DATABASE_URL": database,
@@ -78,7 +78,7 @@ def start_service(database: str, tmp_path_factory: pytest.TempPathFactory) -> It
 
 @pytest.fixture(scope="module")
 def service(start_service: StartService) -> RunningService:
-    """A front end without tokens."""
+    """A front end."""
     return start_service()
 
 
@@ -94,7 +94,7 @@ def browse(tmp_path_factory: pytest.TempPathFactory) -> Browse:
         shots.mkdir(parents=True, exist_ok=True)
         given = {
             "name": name, "url": url, "chromium": str(browser), "playwright": str(playwright),
-            "shots": str(shots), "seconds": seconds, **job,
+            "shots": str(shots), "seconds": seconds, "token": TOKEN, **job,
         }  # fmt: skip
         done = subprocess.run(
             [node, str(Path(__file__).with_name("steps.mjs"))],

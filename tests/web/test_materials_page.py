@@ -12,6 +12,7 @@ from click.testing import CliRunner
 from octasplat.engine.dataset.synthetic import SyntheticDatasetConfig, write_synthetic_dataset
 from octasplat.engine.render.environment_files import write_environment
 from octasplat.workers.cli.main import cli
+from tests.support.service_harness import BEARER, TOKEN
 from tests.support.web_harness import Browse, RunningService
 
 pytestmark = [pytest.mark.tools, pytest.mark.heavy]
@@ -59,7 +60,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def job(service: RunningService, folder: Path) -> str:
     """A reconstruction that nobody has worked on yet."""
     command = ("submit", folder / "scene", "--queue", "nobody", "--server", service.url, "-q")
-    done = CliRunner().invoke(cli, [str(part) for part in command])
+    done = CliRunner().invoke(cli, [str(part) for part in command], env={"OCTASPLAT_TOKEN": TOKEN})
     assert done.exit_code == 0, done.output
     return done.stdout.strip().splitlines()[-1]
 
@@ -111,7 +112,8 @@ def test_result_without_materials_has_no_materials_page(
     left_out = shutil.ignore_patterns("environment.hdr", "layers")
     shutil.copytree(folder / "run", tmp_path / "run", ignore=left_out)
     service.worker.run(uuid.UUID(plain), tmp_path / "run")
-    with urllib.request.urlopen(f"{service.url}/jobs/{plain}", timeout=60) as answer:
+    page = urllib.request.Request(f"{service.url}/jobs/{plain}", headers=BEARER)
+    with urllib.request.urlopen(page, timeout=60) as answer:
         text = answer.read().decode()
     assert "Held-out views" in text
     for part in ('id="relight"', 'data-kind="material"', "Base colour, times"):

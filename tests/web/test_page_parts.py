@@ -123,7 +123,7 @@ async def test_names_of_users_are_text(connect_service: ConnectService, database
 
 
 async def test_job_list_shows_own_jobs_only(connect_service: ConnectService, database: str) -> None:
-    async with connect_service() as (http, _):
+    async with connect_service(signed_in=False) as (http, _):
         job = await make_job(database, owner="ann", label="of ann")
         async with open_pool(database, max_size=1, wait_seconds=10) as pool, pool.connection() as connection:
             for owner, scope in (("ann", "write"), ("bob", "write"), ("eve", "read")):

@@ -22,6 +22,7 @@ from octasplat.workers.queue.jobs import NewJob, cancel_job, create_job
 from octasplat.workers.queue.procrastinate_queue import ProcrastinateQueue
 from tests.support import lock_order_check
 from tests.support.postgres_fixtures import copied_database
+from tests.support.service_harness import BEARER, TOKEN
 from tests.support.worker_harness import MAX_WAIT_SECONDS, ROOT, WorkerHarness
 
 PREVIOUS = "6f3bf281170c"
@@ -131,6 +132,7 @@ def test_previous_release_works_beside_current(
             "PORT": "0",
             "STORAGE": str(tmp_path / "store"),
             "FLOOR_BYTES": "0",
+            "TOKEN": TOKEN,
         }
         front = subprocess.Popen(
             [sys.executable, "-m", "octasplat", "api"],
@@ -162,7 +164,8 @@ def test_previous_release_works_beside_current(
             bench.wait(begun, lambda job: job.worker == "old-too")
             Path(gates[0]).touch()
             assert bench.wait_until_finished(begun).state == "succeeded" and starts(bench, begun) == [0, 30]
-            with urllib.request.urlopen(f"{address}/v1/jobs/{begun}", timeout=30) as answer:
+            asked = urllib.request.Request(f"{address}/v1/jobs/{begun}", headers=BEARER)
+            with urllib.request.urlopen(asked, timeout=30) as answer:
                 assert b'"succeeded"' in answer.read()
 
             new.kill()

@@ -138,14 +138,13 @@ async def list_tokens(connection: Connection) -> list[Token]:
     return await fetch_all(connection, Token, "SELECT {} FROM tokens ORDER BY id DESC")
 
 
-async def has_any_token(connection: Connection, *, valid_only: bool = True) -> bool:
-    """Return whether there is any valid token; with ``valid_only`` False, whether there ever was one."""
+async def has_any_token(connection: Connection) -> bool:
+    """Return whether there is any valid token."""
     cursor = await connection.execute(
         """
-        SELECT EXISTS (SELECT 1 FROM tokens WHERE NOT %s OR (revoked_at IS NULL
-                       AND (expires_at IS NULL OR expires_at > now()))) AS any
-        """,
-        [valid_only],
+        SELECT EXISTS (SELECT 1 FROM tokens WHERE revoked_at IS NULL
+                       AND (expires_at IS NULL OR expires_at > now())) AS any
+        """
     )
     row = await cursor.fetchone()
     return bool(row and row["any"])

@@ -32,7 +32,7 @@ def token() -> None:
 def create(
     name: str, owner: str | None, scopes: tuple[str, ...], days: float | None, data: Path | None
 ) -> None:
-    """Make a token called NAME and show its secret, this once. From the first on, nobody gets in without."""
+    """Make a token called NAME and show its secret, this once."""
     from octasplat.workers.db.tokens import add_token, new_secret
 
     secret = new_secret()
