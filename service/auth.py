@@ -10,8 +10,9 @@ from fastapi.security import APIKeyCookie, HTTPAuthorizationCredentials, HTTPBea
 from octasplat.service.problems import ProblemError
 from octasplat.service.state import Service, ServiceDep
 from octasplat.workers.db.audit import add_entry
+from octasplat.workers.db.connections import Connection
 from octasplat.workers.db.rows import Token
-from octasplat.workers.db.sessions import find_session
+from octasplat.workers.db.sessions import find_session, is_session_valid
 from octasplat.workers.db.tokens import find_token, get_token
 
 Scope = Literal["read", "write", "admin"]
@@ -130,6 +131,14 @@ async def principal_of_session(service: Service, secret: str) -> Principal | Non
     if session is None or token is None:
         return None
     return Principal(token.owner, frozenset(token.scopes), token.id, session.id)
+
+
+async def is_still_valid(connection: Connection, principal: Principal) -> bool:
+    """Return whether the token and the session of a principal still are what they were when it asked."""
+    token = await get_token(connection, principal.token_id)
+    if token is None or frozenset(token.scopes) != principal.scopes or token.owner != principal.owner:
+        return False
+    return principal.session_id is None or await is_session_valid(connection, principal.session_id)
 
 
 class _RequireScope:

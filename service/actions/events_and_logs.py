@@ -1,11 +1,12 @@
 """Log and events of a job, as a list and as a stream."""
 
 import asyncio
+import time
 import uuid
 from collections.abc import AsyncGenerator
 
 from octasplat.service.actions.access import read_job
-from octasplat.service.auth import Principal
+from octasplat.service.auth import Principal, is_still_valid
 from octasplat.service.problems import ProblemError
 from octasplat.service.state import Service
 from octasplat.workers.db.events_and_logs import list_job_events, list_log_lines
@@ -13,6 +14,8 @@ from octasplat.workers.db.rows import JobEvent, LogLine
 from octasplat.workers.queue.jobs import get_job
 
 _POLL_SECONDS = 2.0
+_ACCESS_CHECK_SECONDS = 5.0
+"""A stream of a token or session that has ended ends at most so much later."""
 _PAGE_SIZE = 500
 _RETRY_SECONDS = 10
 
@@ -69,11 +72,16 @@ async def _stream_events(
 ) -> AsyncGenerator[JobEvent | None, None]:
     ping = service.settings.ping_seconds
     quiet = 0.0
-    wait = ping if service.settings.listen else min(ping, _POLL_SECONDS)
+    wait = min(ping, _ACCESS_CHECK_SECONDS if service.settings.listen else _POLL_SECONDS)
+    checked_at = time.monotonic()
     with service.event_broker.subscribe(job_id) as news:
         while not service.event_broker.is_closing:
             news.clear()
             async with service.pool.connection() as connection:
+                if time.monotonic() - checked_at >= _ACCESS_CHECK_SECONDS:
+                    if not await is_still_valid(connection, principal):
+                        return
+                    checked_at = time.monotonic()
                 job = await get_job(connection, job_id)
                 if job is None or not principal.may_see(job.owner):
                     return  # it was deleted, which ends the stream

@@ -7,7 +7,8 @@ import httpx
 import pytest
 from pydantic import SecretStr
 
-from tests.support.service_harness import ConnectService, client_with_token
+from octasplat.workers.db.tokens import hash_secret
+from tests.support.service_harness import BEARER, ConnectService, client_with_token, new_job
 
 BEHIND_TLS = {"X-Forwarded-Proto": "https", "X-Forwarded-For": "203.0.113.9"}
 
@@ -168,6 +169,38 @@ async def test_wrong_tokens_are_throttled_per_address(connect_service: ConnectSe
         assert not any(task.done() for task in pending)
         for task in pending:
             task.cancel()
+
+
+async def test_event_streams_end_with_their_token_or_session(connect_service: ConnectService) -> None:
+    async with connect_service(ping_seconds=60.0) as (http, service):
+        job = await new_job(http, service)
+        address = f"/v1/jobs/{job['id']}/events"
+        me = "local"
+        bearer = [await client_with_token(service, me, "read") for _ in range(3)]
+        del http.headers["Authorization"]
+        _, browser = await sign_in(http, bearer[2]["Authorization"].split()[1])
+        keeps = await client_with_token(service, me, "read")
+        asked = [*bearer[:2], browser, keeps]
+        revoked, expired, signed_out, stays = (
+            asyncio.create_task(http.get(address, headers=headers)) for headers in asked
+        )
+        while service.event_broker.subscriber_count < len(asked):
+            await asyncio.sleep(0.01)
+        hashes = [hash_secret(headers["Authorization"].split()[1]) for headers in bearer[:2]]
+        async with service.pool.connection() as connection:
+            for change, sha256 in zip(("revoked_at", "expires_at"), hashes, strict=True):
+                await connection.execute(
+                    f"UPDATE tokens SET {change} = now() WHERE sha256 = %s",
+                    [sha256],
+                )
+        assert (await http.post("/sign-out", headers=browser)).status_code == 303
+        async with asyncio.timeout(10):
+            answers = await asyncio.gather(revoked, expired, signed_out)
+        assert [answer.status_code for answer in answers] == [200, 200, 200]
+        assert not stays.done()
+        assert (await http.post(f"/v1/jobs/{job['id']}/cancel", headers=BEARER)).is_success
+        async with asyncio.timeout(30):
+            assert (await stays).status_code == 200
 
 
 async def test_audit_log_records_changes(connect_service: ConnectService) -> None:

@@ -240,7 +240,8 @@ REFUSED_URLS = [
     "https://127.1:8443/", "https://0x7f.1/", "https://0x7f.1./", "https://2130706433/", "https://0177.0.0.1/",
     "https://127.0.0.0x1/", "https://127.0.0.1.../", "https://10.1/", "https://[::127.0.0.1]/",
     "https://[64:ff9b::10.0.0.1]/", "https://[2002:7f00:1::]/", "https://１２７.0.0.1/", "https://127。0。0。1/",
-    "https://example.1/", "https://example.0x/",
+    "https://example.1/", "https://example.0x/", "https://[64:ff9b:1::7f00:1]/", "https://[::ffff:0:127.0.0.1]/",
+    "https://[64:ff9b:1:2::8.8.8.8]/", "https://[2001:0:4136:e378:8000:63bf:80ff:fffe]/",
 ]  # fmt: skip
 
 
@@ -251,7 +252,13 @@ def test_webhook_internal_addresses_are_refused(url: str) -> None:
 
 
 def test_webhook_valid_addresses_are_accepted() -> None:
-    for url in ("https://example.org/hook?x=1", "https://example.org:8443/", "https://93.184.216.34/"):
+    for url in (
+        "https://example.org/hook?x=1",
+        "https://example.org:8443/",
+        "https://93.184.216.34/",
+        "https://[64:ff9b::8.8.8.8]/",
+        "https://[::ffff:0:8.8.8.8]/",
+    ):
         assert check_url(url) == url
     assert check_url("http://hooks.internal:9000/x", ("hooks.internal",))
     with pytest.raises(AddressRefusedError):
@@ -263,7 +270,7 @@ def test_webhook_valid_addresses_are_accepted() -> None:
     "host",
     ["127.0.0.1", "[::1]", "[::ffff:127.0.0.1]", "2130706433", "0x7f000001", "localhost", "[64:ff9b::7f00:1]",
      "100.64.0.1", "169.254.169.254", "[fd00::1]", "224.0.0.1", "0.0.0.0", "127.1", "0x7f.1",
-     "[::127.0.0.1]", "127。0。0。1"],
+     "[::127.0.0.1]", "127。0。0。1", "[::ffff:0:127.0.0.1]", "[64:ff9b:1::7f00:1]"],
 )  # fmt: skip
 async def test_connections_into_inner_networks_are_not_made(host: str, allowed: tuple[str, ...]) -> None:
     """Not even to see whether there is somebody: what is asked is the same for a port that is open."""

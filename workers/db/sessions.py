@@ -48,6 +48,14 @@ async def find_session(connection: Connection, secret: str) -> Session | None:
     )
 
 
+async def is_session_valid(connection: Connection, session_id: uuid.UUID) -> bool:
+    """Return whether the session of that id is neither ended nor expired."""
+    cursor = await connection.execute(
+        "SELECT 1 FROM sessions WHERE id = %s AND revoked_at IS NULL AND expires_at > now()", [session_id]
+    )
+    return await cursor.fetchone() is not None
+
+
 async def end_session(connection: Connection, secret: str) -> None:
     """Invalidate the session of a cookie."""
     await connection.execute(

@@ -11,7 +11,11 @@ PORTS = (443, 8443)
 MAX_URL = 2000
 IPAddress = ipaddress.IPv4Address | ipaddress.IPv6Address
 # Behind these, the last 32 bits are an IPv4 address that is meant.
-_IPV4_EMBEDDING_NETWORKS = (ipaddress.IPv6Network("64:ff9b::/96"), ipaddress.IPv6Network("::/96"))
+_IPV4_EMBEDDING_NETWORKS = tuple(
+    map(ipaddress.IPv6Network, ("64:ff9b::/96", "::/96", "::ffff:0:0:0/96"))  # NAT64, compatible, SIIT
+)
+_LOCAL_NAT64 = ipaddress.IPv6Network("64:ff9b:1::/48")
+"""Translated within one's own network only (RFC 8215), to where nobody outside can know."""
 _NUMERIC_LABEL = re.compile(r"[0-9]+|0[xX][0-9a-fA-F]*")
 
 
@@ -78,6 +82,8 @@ def is_public(address: IPAddress) -> bool:
             embedded = ipaddress.IPv4Address(address.packed[-4:])
         if embedded is not None:
             return embedded.is_global and not embedded.is_multicast
+        if address in _LOCAL_NAT64 or address.teredo is not None:
+            return False
     return address.is_global and not address.is_multicast
 
 
