@@ -1,20 +1,27 @@
 """Settings of the front end, which extend those of the workers."""
 
 import ipaddress
-from typing import Annotated
+import math
+import re
+from typing import Annotated, Self
 
 from pydantic import Field, IPvAnyNetwork, SecretStr
 
+from octasplat.engine.core.errors import ConfigError
 from octasplat.service.intake.dataset import DatasetLimits
 from octasplat.service.intake.model_check import ModelLimits
 from octasplat.service.intake.receive import UploadLimits
 from octasplat.service.intake.spool import SpoolSpace
 from octasplat.service.proxy_headers import HeaderStyle
 from octasplat.workers.db.quotas import Quota
-from octasplat.workers.settings import COMMA_SEPARATED, WorkerSettings
+from octasplat.workers.settings import COMMA_SEPARATED, PREFIX, WorkerSettings
 from octasplat.workers.worker.job_kinds.resource_limits import LIMIT_UNITS
 
 DEFAULT_PORT = 8642
+MIN_TOKEN_BITS = 128
+_ALPHABETS = (("[0-9]*", 10), ("[0-9a-f]*|[0-9A-F]*", 16), ("[0-9a-z]*|[0-9A-Z]*", 36))
+_MIN_DISTINCT_CHARACTERS = 8
+"""A text of fewer is none that was drawn at random."""
 
 
 class ServiceSettings(WorkerSettings):
@@ -23,8 +30,8 @@ class ServiceSettings(WorkerSettings):
     Attributes:
         host: address to listen at.
         port: port to listen at; 0 takes a free one.
-        token: a token that lets its owner do everything; any other is made with ``octasplat token``. Another
-            one here shuts out the one that was here before.
+        token: a token of 128 random bits or more that lets its owner do everything; any other is made with
+            ``octasplat token``. Another one here shuts out the one that was here before.
         token_hours: for how long a new token is valid unless its maker says otherwise; 0 is for ever.
         session_hours: for how long a browser stays signed in.
         wrong_token_seconds: how long the first wrong token of an address waits for its answer; each further
@@ -116,3 +123,27 @@ class ServiceSettings(WorkerSettings):
         """Return the spool folder for uploaded archives, with its limits."""
         folder = self.work_folder / "archives"
         return SpoolSpace(folder, max_bytes=self.max_spool_bytes, floor_bytes=self.floor_bytes)
+
+    def checked(self) -> Self:
+        """Return the settings if they are consistent; raise otherwise.
+
+        Raises:
+            ConfigError: they do not fit together, or the token can be guessed.
+        """
+        super().checked()
+        if self.token is not None and secret_bits(self.token.get_secret_value()) < MIN_TOKEN_BITS:
+            raise ConfigError(
+                f"{PREFIX}TOKEN has less than {MIN_TOKEN_BITS} bits, so it could be guessed; take a long "
+                "random text, such as openssl rand -hex 24 prints."
+            )
+        return self
+
+
+def secret_bits(secret: str) -> float:
+    """Return how many bits a random text of this length and these kinds of characters has at most."""
+    if len(set(secret)) < _MIN_DISTINCT_CHARACTERS:
+        return 0.0
+    for pattern, alphabet in _ALPHABETS:
+        if re.fullmatch(pattern, secret):
+            return len(secret) * math.log2(alphabet)
+    return len(secret) * math.log2(64)

@@ -4,7 +4,7 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, TypeVar
+from typing import Annotated, Self, TypeVar
 from urllib.parse import urlsplit
 
 from pydantic import AliasChoices, BeforeValidator, Field, SecretStr, ValidationError
@@ -161,7 +161,7 @@ class WorkerSettings(BaseSettings):
             return self.database_url.get_secret_value()
         return EmbeddedPostgres(self.data.absolute()).conninfo()
 
-    def checked(self) -> "WorkerSettings":
+    def checked(self) -> Self:
         """Return the settings if they are consistent; raise otherwise.
 
         Raises:

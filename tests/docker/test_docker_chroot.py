@@ -32,7 +32,7 @@ pytestmark = [
 FEW = {
     "iterations": 60, "rays_per_batch": 256, "max_gaussians": 400, "initial_points": 300, "probe_rays": 256,
 }  # fmt: skip
-TOKEN = "octa_of_this_test"
+TOKEN = "octa_of_this_test_in_Containers"
 
 
 @pytest.fixture(scope="module")

@@ -1,10 +1,14 @@
 """Who gets in: tokens, scopes, owners, hosts, origins; test_access_matrix asks at every route."""
 
+import secrets
+
 import pytest
 from pydantic import SecretStr
 
 from octasplat.engine.core.errors import ConfigError
+from octasplat.service.settings import ServiceSettings
 from tests.support.service_harness import (
+    TOKEN,
     ConnectService,
     client_with_token,
     committed_dataset,
@@ -68,12 +72,12 @@ async def test_made_token_is_valid_until_it_is_revoked(connect_service: ConnectS
 
 
 async def test_token_of_the_environment_is_let_in(connect_service: ConnectService) -> None:
-    async with connect_service(signed_in=False, host="0.0.0.0", token=SecretStr("from-the-environment")) as (
+    async with connect_service(signed_in=False, host="0.0.0.0", token=SecretStr(TOKEN)) as (
         http,
         _,
     ):
         assert (await http.get("/v1/jobs")).status_code == 401
-        headers = {"Authorization": "Bearer from-the-environment", "Host": "anything.example"}
+        headers = {"Authorization": f"Bearer {TOKEN}", "Host": "anything.example"}
         assert (await http.get("/v1/tokens", headers=headers)).status_code == 200
 
 
@@ -86,3 +90,13 @@ async def test_start_without_a_token_is_refused(connect_service: ConnectService)
     for host in addresses:
         async with connect_service(host=host):
             pass
+
+
+def test_token_of_the_environment_must_be_long_and_random() -> None:
+    weak = ("a", "from-the-environment", "0123456789" * 3, secrets.token_hex(16)[:31], "ab" * 40)
+    for secret in weak:
+        with pytest.raises(ConfigError, match="OCTASPLAT_TOKEN has less than 128 bits") as refusal:
+            ServiceSettings(token=SecretStr(secret)).checked()
+        assert len(secret) == 1 or secret not in str(refusal.value)
+    for secret in (secrets.token_hex(16), secrets.token_hex(24), secrets.token_urlsafe(16), TOKEN):
+        assert ServiceSettings(token=SecretStr(secret)).checked().token is not None

@@ -25,7 +25,7 @@ from tests.support.service_harness import api_environment
 pytestmark = pytest.mark.heavy
 
 ROOT = Path(__file__).parents[2]
-TOKEN = "octa_for-the-fuzzing"
+TOKEN = "octa_for-the-fuzzing-of-Every-route"
 EXAMPLES = int(os.environ.get("OCTASPLAT_TEST_EXAMPLES", "6"))
 """Requests of each kind for each operation; with many, links from one to the next are followed as well."""
 PHASES = "examples,coverage,fuzzing" + (",stateful" if EXAMPLES >= 50 else "")

@@ -7,7 +7,7 @@ import httpx
 import pytest
 from pydantic import SecretStr
 
-from octasplat.workers.db.tokens import hash_secret
+from octasplat.workers.db.tokens import hash_secret, new_secret
 from tests.support.service_harness import BEARER, ConnectService, client_with_token, new_job
 
 BEHIND_TLS = {"X-Forwarded-Proto": "https", "X-Forwarded-For": "203.0.113.9"}
@@ -68,16 +68,17 @@ async def test_sessions_and_tokens_run_out(connect_service: ConnectService) -> N
 async def test_environment_token_change_revokes_previous(connect_service: ConnectService) -> None:
     async def start(secret: str) -> dict[str, int]:
         async with connect_service(signed_in=False, token=SecretStr(secret)) as (http, _):
-            return {s: await status(http, {"Authorization": f"Bearer {s}"}) for s in ("first", "second")}
+            return {s: await status(http, {"Authorization": f"Bearer {s}"}) for s in secrets}
 
-    assert await start("first") == {"first": 200, "second": 401}
-    assert await start("first") == {"first": 200, "second": 401}
-    assert await start("second") == {"first": 401, "second": 200}
-    assert await start("first") == {"first": 401, "second": 200}  # and it does not come back
+    first, second = secrets = new_secret(), new_secret()
+    assert await start(first) == {first: 200, second: 401}
+    assert await start(first) == {first: 200, second: 401}
+    assert await start(second) == {first: 401, second: 200}
+    assert await start(first) == {first: 401, second: 200}  # and it does not come back
 
 
 async def test_cookies_behind_trusted_tls_proxy_are_secure(connect_service: ConnectService) -> None:
-    async with connect_service(signed_in=False, proxies=("127.0.0.0/8",), token=SecretStr("another")) as (
+    async with connect_service(signed_in=False, proxies=("127.0.0.0/8",), token=SecretStr(new_secret())) as (
         http,
         service,
     ):
@@ -98,7 +99,7 @@ async def test_cookies_behind_trusted_tls_proxy_are_secure(connect_service: Conn
 
 
 async def test_proxy_headers_of_untrusted_clients_are_ignored(connect_service: ConnectService) -> None:
-    async with connect_service(signed_in=False, proxies=("10.0.0.1",), token=SecretStr("another")) as (
+    async with connect_service(signed_in=False, proxies=("10.0.0.1",), token=SecretStr(new_secret())) as (
         http,
         service,
     ):
@@ -129,7 +130,7 @@ async def test_forwarded_address_uses_nearest_hop(
         signed_in=False,
         proxies=("127.0.0.1", "10.0.0.0/8"),
         proxy_headers=dialect,
-        token=SecretStr("another"),
+        token=SecretStr(new_secret()),
     ) as (http, service):
         secret = (await client_with_token(service, "me", "admin"))["Authorization"].split()[1]
         line, mine = await sign_in(http, secret, **headers)
