@@ -181,7 +181,7 @@ async def test_repeated_request_to_next_version_is_idempotent(connect_service: C
         async with service.pool.connection() as connection:
             job = await get_job(connection, uuid.UUID(first.json()["id"]))
         assert job is not None
-        who = Principal(job.owner, frozenset({"read", "write"}))
+        who = Principal(job.owner, frozenset({"read", "write"}), uuid.uuid4())
         again = await submit_job(service, who, LaterJob.model_validate(asked), idempotency_key="k")
         assert str(again.id) == first.json()["id"]
 

@@ -21,7 +21,7 @@ from PIL import Image
 
 from octasplat.workers.storage.local import LocalStorage
 from tests.support.model_builder import ColmapModelBuilder, photograph, photographs
-from tests.support.service_harness import ConnectService
+from tests.support.service_harness import BEARER, TOKEN, ConnectService
 from tests.support.zip_builder import ZipMember, build_zip
 
 ROOT = Path(__file__).parents[2]
@@ -309,6 +309,7 @@ def start_server(conninfo: str, tmp_path: Path, short_root: Path) -> Iterator[Ca
         "DATABASE_URL": conninfo,
         "OCTASPLAT_DATA": str(tmp_path),
         "OCTASPLAT_FLOOR_BYTES": "0",
+        "OCTASPLAT_TOKEN": TOKEN,
     }
     processes: list[subprocess.Popen[bytes]] = []
 
@@ -352,7 +353,9 @@ def test_memory_does_not_grow_with_the_upload(
             yield number.to_bytes(8, "big") * (1 << 17)
 
     transport = httpx.HTTPTransport(uds=str(socket))
-    with httpx.Client(transport=transport, base_url="http://localhost:8642", timeout=600) as http:
+    with httpx.Client(
+        transport=transport, base_url="http://localhost:8642", headers=BEARER, timeout=600
+    ) as http:
         dataset = http.post("/v1/datasets", json={"name": "large"}).headers["Location"]
         name = "sparse/0/points3D.bin"
         assert http.put(f"{dataset}/files/{name}", content=body(8)).status_code == 201
@@ -384,7 +387,7 @@ def test_upload_to_killed_service_keeps_complete_files_only(
 
     def connect(path: Path) -> httpx.Client:
         transport = httpx.HTTPTransport(uds=str(path))
-        return httpx.Client(transport=transport, base_url="http://localhost:8642", timeout=60)
+        return httpx.Client(transport=transport, base_url="http://localhost:8642", headers=BEARER, timeout=60)
 
     name = "sparse/0/points3D.bin"
     with connect(socket) as http:
