@@ -353,7 +353,8 @@ def test_memory_does_not_grow_with_the_upload(
             yield number.to_bytes(8, "big") * (1 << 17)
 
     transport = httpx.HTTPTransport(uds=str(socket))
-    with httpx.Client(
+    base = "http://localhost:8642"
+    with httpx.Client(transport=transport, base_url=base, headers=BEARER, timeout=600) as http:
         transport=transport, base_url="http://localhost:8642", headers=BEARER, timeout=600
     ) as http:
         dataset = http.post("/v1/datasets", json={"name": "large"}).headers["Location"]
