@@ -355,8 +355,6 @@ def test_memory_does_not_grow_with_the_upload(
     transport = httpx.HTTPTransport(uds=str(socket))
     base = "http://localhost:8642"
     with httpx.Client(transport=transport, base_url=base, headers=BEARER, timeout=600) as http:
-        transport=transport, base_url="http://localhost:8642", headers=BEARER, timeout=600
-    ) as http:
         dataset = http.post("/v1/datasets", json={"name": "large"}).headers["Location"]
         name = "sparse/0/points3D.bin"
         assert http.put(f"{dataset}/files/{name}", content=body(8)).status_code == 201
