@@ -1,6 +1,7 @@
 """Short text summary of the evaluation of a run."""
 
 import json
+import shlex
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -65,6 +66,7 @@ def summarize_run(output: Path, exports: Iterable[str]) -> list[str]:
         f"{metrics['gaussians']:,} Gaussians after {metrics['iterations']:,} iterations, "
         f"trained in {format_duration(metrics['seconds'])}",
         *(f"{label + ':':8}{output / name}" for label, name in files if (output / name).exists()),
+        f"{'In 3D:':8}octasplat view {shlex.quote(str(output))}",
     ]
 
 

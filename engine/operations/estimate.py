@@ -12,7 +12,7 @@ from octasplat.engine.core.events import EventListener, Warned, ignore_events
 from octasplat.engine.dataset.image_sizes import ImageSizes
 from octasplat.engine.operations.base import Operation, Request, Result, never_stop
 from octasplat.engine.operations.reconstruct import ReconstructOptions
-from octasplat.engine.settings.fields import Positional, Spelling, Unit
+from octasplat.engine.settings.fields import Positional, ReadPath, Spelling, Unit
 
 
 class EstimateOptions(ReconstructOptions):
@@ -29,7 +29,9 @@ class EstimateRequest(EstimateOptions, Request):
     The options are those of reconstruct. Photographs are not decoded: their sizes are enough.
     """
 
-    source: Annotated[Path, Positional("SCENE")] = Field(description="The folder of the photographs.")
+    source: Annotated[Path, Positional("SCENE"), ReadPath()] = Field(
+        description="The folder of the photographs."
+    )
 
 
 class EstimateResult(Result):

@@ -10,7 +10,7 @@ from pydantic import BeforeValidator, Field, model_validator
 from octasplat.engine.core.events import EventListener, ignore_events
 from octasplat.engine.operations.base import Operation, Options, Request, Result, never_stop
 from octasplat.engine.settings import renamed_settings
-from octasplat.engine.settings.fields import DatasetFolder, Positional, Spelling
+from octasplat.engine.settings.fields import DatasetFolder, Positional, ReadPath, Spelling
 
 _METRICS, _REPORT, _PICTURES = "metrics.json", "report.html", ("renders", "layers")
 
@@ -66,12 +66,14 @@ class EvaluateOptions(Options):
 class EvaluateRequest(EvaluateOptions, Request):
     """Measure the run in the folder OUT again: metrics.json, report.html and renders/ are written anew."""
 
-    source: Annotated[Path, Positional("OUT")] = Field(description="The folder of a finished run.")
+    source: Annotated[Path, Positional("OUT"), ReadPath()] = Field(
+        description="The folder of a finished run."
+    )
     dataset: DatasetFolder = Field(
         None,
         description="Where the run's photographs are now, if they were moved or the run was downloaded.",
     )
-    other_dataset: Annotated[Path | None, Spelling(metavar="FOLDER")] = Field(
+    other_dataset: Annotated[Path | None, Spelling(metavar="FOLDER"), ReadPath()] = Field(
         None,
         description="Measure all photographs of another folder instead (images/ and sparse/0 in the same "
         "world as the run's); the results go to OUT/on/<its name>.",

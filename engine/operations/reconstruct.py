@@ -11,7 +11,15 @@ from octasplat.engine.core.events import EventListener, ignore_events
 from octasplat.engine.operations.base import Operation, Options, Output, Request, Result, never_stop
 from octasplat.engine.runs.run_settings import RunSettings
 from octasplat.engine.settings import renamed_settings
-from octasplat.engine.settings.fields import ADVANCED, BASIC, PartialOf, Positional, Shortcut, Spelling
+from octasplat.engine.settings.fields import (
+    ADVANCED,
+    BASIC,
+    PartialOf,
+    Positional,
+    ReadPath,
+    Shortcut,
+    Spelling,
+)
 from octasplat.engine.settings.nested_options import merge_options
 from octasplat.engine.settings.refusals import InvalidSettingsError, refusals_from
 
@@ -121,7 +129,9 @@ class ReconstructRequest(ReconstructOptions, Request):
     writing a checkpoint; the same command with --resume goes on.
     """
 
-    source: Annotated[Path, Positional("SCENE")] = Field(description="The folder of the photographs.")
+    source: Annotated[Path, Positional("SCENE"), ReadPath()] = Field(
+        description="The folder of the photographs."
+    )
     output: Output = Field(description="Folder for the results.")
     resume: bool = Field(
         False,

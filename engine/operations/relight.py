@@ -13,7 +13,7 @@ from octasplat.engine.operations.base import Operation, never_stop
 from octasplat.engine.operations.render import RenderResult
 from octasplat.engine.operations.render_options import PictureOptions, PictureRequest
 from octasplat.engine.settings import renamed_settings
-from octasplat.engine.settings.fields import ADVANCED, InputFile, Spelling, Unit
+from octasplat.engine.settings.fields import ADVANCED, InputFile, ReadPath, Spelling, Unit
 
 if TYPE_CHECKING:
     from octasplat.engine.dataset import Viewpoints
@@ -105,7 +105,7 @@ class RelightRequest(RelightOptions, PictureRequest):
     has a folder of its name, or its turn in one video.
     """
 
-    other_dataset: Annotated[Path | None, Spelling(metavar="FOLDER")] = Field(
+    other_dataset: Annotated[Path | None, Spelling(metavar="FOLDER"), ReadPath()] = Field(
         None,
         description="Render the views of the photographs of another folder (images/ and sparse/0).",
     )

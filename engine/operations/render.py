@@ -12,7 +12,7 @@ from octasplat.engine.operations.base import Operation, Result, never_stop
 from octasplat.engine.operations.render_options import PictureOptions, PictureRequest, check_layers
 from octasplat.engine.pathtracing.stage.model import Stage
 from octasplat.engine.pathtracing.stage.stage_file import read_stage, referenced_files
-from octasplat.engine.settings.fields import ADVANCED, Spelling
+from octasplat.engine.settings.fields import ADVANCED, ReadPath, Spelling
 
 if TYPE_CHECKING:
     from octasplat.engine.operations.render_source import RenderSource
@@ -98,7 +98,7 @@ class RenderRequest(RenderOptions, PictureRequest):
     under way has come to a safe point; the same command with --resume goes on.
     """
 
-    stage_file: Annotated[Path | None, Spelling(("--stage",), metavar="STAGE.toml")] = Field(
+    stage_file: Annotated[Path | None, Spelling(("--stage",), metavar="STAGE.toml"), ReadPath()] = Field(
         None,
         description="Render with the meshes, lights and materials of a stage, which docs/light.md describes.",
     )

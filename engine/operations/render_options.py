@@ -16,7 +16,7 @@ from octasplat.engine.render.path_document import (
     read_path_document,
 )
 from octasplat.engine.settings import renamed_settings
-from octasplat.engine.settings.fields import ADVANCED, DatasetFolder, Output, Source, Spelling, Unit
+from octasplat.engine.settings.fields import ADVANCED, DatasetFolder, Output, ReadPath, Source, Spelling, Unit
 
 Mode = Literal["turntable", "views", "path", "camera"]
 Format = Literal["mp4", "png", "exr"]
@@ -218,7 +218,7 @@ class PictureRequest(PictureOptions, WritingRequest):
         description="Take the cameras of the photographs in this folder.  [default: those that the run "
         "keeps]",
     )
-    path_file: Annotated[Path | None, Spelling(("--path",), metavar="FILE")] = Field(
+    path_file: Annotated[Path | None, Spelling(("--path",), metavar="FILE"), ReadPath()] = Field(
         None, description="Render the cameras of a JSON file; docs/cameras.md tells its format."
     )
     resume: bool = Field(False, description="Go on with a render that was stopped, if there is one.")

@@ -113,6 +113,11 @@ class Positional:
 
 
 @dataclass(frozen=True)
+class ReadPath:
+    """Mark of a path, a file or a folder, that is read where it is and so has to exist."""
+
+
+@dataclass(frozen=True)
 class NamedFile(_InSchema):
     """Mark of a file that options name; a job finds it by name among the files that came with it."""
 
@@ -123,37 +128,53 @@ class NamedFile(_InSchema):
 
 InputFile = Annotated[Path, NamedFile()]
 """A file that options name: a path here, a name among the job's files in a service."""
-Source = Annotated[Path, Positional("IN")]
+Source = Annotated[Path, Positional("IN"), ReadPath()]
 """The input that a verb works on; a job has its own."""
 OUTPUT_FLAGS = Spelling(("-o", "--output"))
 Output = Annotated[Path, OUTPUT_FLAGS]
 """Where a verb writes; a job has its own place."""
-DatasetFolder = Annotated[Path | None, Spelling(("--dataset",), metavar="FOLDER")]
+DatasetFolder = Annotated[Path | None, Spelling(("--dataset",), metavar="FOLDER"), ReadPath()]
 """The folder of a run's photographs; a job that needs them has its own."""
 
 
 def iter_named_files(options: BaseModel) -> Iterator[tuple[str, Path]]:
     """Yield each file that the options name, after the place where they do, with dots."""
     for name, info in type(options).model_fields.items():
-        annotation = Annotated[info.annotation, *info.metadata] if info.metadata else info.annotation
-        yield from _files_in(annotation, getattr(options, name), name)
+        yield from _files_in(_full_annotation(info), getattr(options, name), name)
+
+
+def iter_read_paths(model: type[BaseModel], values: Mapping[str, Any]) -> Iterator[Path]:
+    """Yield each path that a request of this class would read: fields marked ReadPath, and named files.
+
+    Args:
+        model: class of the request.
+        values: paths and other values by field name, of those fields that were given.
+    """
+    fields = {name: info for name, info in model.model_fields.items() if name in values}
+    for name, info in fields.items():
+        if isinstance(values[name], Path) and any(isinstance(mark, ReadPath) for mark in info.metadata):
+            yield values[name]
+    for name, info in fields.items():
+        for _, path in _files_in(_full_annotation(info), values[name], name):
+            yield path
 
 
 def accepts_files(model: type[BaseModel]) -> bool:
     """Return whether options of this class can name files."""
-    return any(
-        _has_files(Annotated[info.annotation, *info.metadata] if info.metadata else info.annotation)
-        for info in model.model_fields.values()
-    )
+    return any(_has_files(_full_annotation(info)) for info in model.model_fields.values())
 
 
 def map_named_files(options: BaseModel, change: Callable[[Path], Path]) -> dict[str, Any]:
     """Return the values of the options by field name, each file that they name replaced by ``change``."""
     values: dict[str, Any] = {}
     for name, info in type(options).model_fields.items():
-        annotation = Annotated[info.annotation, *info.metadata] if info.metadata else info.annotation
-        values[name] = _map_files(annotation, getattr(options, name), change)
+        values[name] = _map_files(_full_annotation(info), getattr(options, name), change)
     return values
+
+
+def _full_annotation(info: FieldInfo) -> Any:
+    """Return the annotation of a field with its marks."""
+    return Annotated[info.annotation, *info.metadata] if info.metadata else info.annotation
 
 
 def _is_file(annotation: Any) -> bool:

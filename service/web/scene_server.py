@@ -2,6 +2,7 @@
 
 import json
 import mimetypes
+import secrets
 import sys
 import threading
 from collections.abc import Mapping
@@ -40,6 +41,8 @@ class ViewedScene:
 class SceneServer:
     """Serves the page of one scene to browsers of this machine, in a thread of its own.
 
+    Page and scene lie under a random path, so that other users of the machine cannot find them.
+
     Args:
         scene: what to show.
         port: where; 0 takes a free one.
@@ -53,7 +56,7 @@ class SceneServer:
     @property
     def url(self) -> str:
         """Return the address of the page."""
-        return f"http://127.0.0.1:{self._server.server_port}/"
+        return f"http://127.0.0.1:{self._server.server_port}{self._server.page_path}"
 
     def close(self) -> None:
         """Stop the server and wait for its thread."""
@@ -72,6 +75,7 @@ class _SceneHttpServer(ThreadingHTTPServer):
     def __init__(self, scene: ViewedScene, port: int) -> None:
         super().__init__(("127.0.0.1", port), _SceneHandler)
         self.scene = scene
+        self.page_path = f"/{secrets.token_urlsafe(16)}/"
 
     def handle_error(self, request: object, client_address: object) -> None:
         """Ignore browsers that disconnect early."""
@@ -85,21 +89,22 @@ class _SceneHandler(BaseHTTPRequestHandler):
     def do_GET(self) -> None:
         host = urlsplit(f"//{self.headers.get('Host', '')}").hostname
         path = unquote(urlsplit(self.path).path)
-        scene = self.server.scene
+        scene, page = self.server.scene, self.server.page_path
         if host not in _LOCAL_HOSTS:  # a page from elsewhere whose name leads here must not read the scene
             self.send_error(403)
-        elif path == "/":
+        elif path == page:
             text = render_template(
                 "viewer.html",
                 name=scene.name,
+                page=page,
                 size_bytes=scene.ply.stat().st_size,
                 q=scene.q,
                 background=scene.background,
             )
             self._send(text.encode(), "text/html; charset=utf-8", PAGE_HEADERS)
-        elif path == "/cameras.json":
+        elif path == f"{page}cameras.json":
             self._send(json.dumps(scene.cameras).encode(), "application/json")
-        elif path == "/scene.ply":
+        elif path == f"{page}scene.ply":
             self._send(scene.ply.read_bytes(), "application/octet-stream")
         else:
             self._send_asset(path)

@@ -1,7 +1,11 @@
 """The command ``octasplat``, also as ``python -m octasplat``."""
 
+import webbrowser
+from pathlib import Path
+
 import click
 
+from octasplat.engine.core.errors import ConfigError
 from octasplat.workers.cli.main import cli, main
 
 
@@ -18,7 +22,58 @@ def api(ctx: click.Context) -> None:
     ctx.exit(serve_api())
 
 
+@click.command(short_help="Show a scene in the browser, in 3D.")
+@click.argument("source", metavar="IN", type=click.Path(path_type=Path))
+@click.option(
+    "--open/--no-open", "open_page", default=None, help="Open the page in a browser.  [default: on a desktop]"
+)
+@click.option(
+    "--port",
+    type=click.IntRange(0, 65535),
+    default=0,
+    help="Port of the page.  [default: 0, which takes a free one]",
+)
+@click.option(
+    "--background",
+    type=click.Choice(["black", "white"]),
+    default="black",
+    show_default=True,
+    help="Colour behind the scene, to begin with.",
+)
+def view(source: Path, open_page: bool | None, port: int, background: str) -> None:
+    """Show a scene in the browser: the folder of a run, or a file of any format.
+
+    The page needs no service and no network: this command serves it, to browsers of this machine alone, until
+    Ctrl-C. Of a run, one can go from photograph to photograph.
+    """
+    from octasplat.workers.cli.input_paths import check_readable
+
+    check_readable(source)
+    from octasplat.scenes import read_scene
+    from octasplat.viewer import serve_scene
+    from octasplat.workers.cli.browser import has_display
+    from octasplat.workers.cli.progress import show_progress
+    from octasplat.workers.cli.signals import exit_on_sigterm
+
+    with show_progress() as progress:
+        scene = read_scene(source, progress)
+    with exit_on_sigterm():
+        try:
+            viewer = serve_scene(scene, source, port=port, background=background)
+        except OSError as error:
+            raise ConfigError(f"--port {port} cannot be used ({error.strerror}); choose another.") from None
+        with viewer:
+            click.echo(f"Open {viewer.url} in a browser of this machine (Ctrl-C ends it).")
+            if has_display() if open_page is None else open_page:
+                webbrowser.open(viewer.url)
+            try:
+                viewer.wait()
+            except KeyboardInterrupt:  # the usual end
+                click.echo()
+
+
 cli.add_command(api)
+cli.add_command(view)
 
 
 if __name__ == "__main__":

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float, Float32, Float64
 
 from octasplat.engine.core.errors import ConfigError
+from octasplat.engine.core.events import EventListener
 from octasplat.engine.gaussians.channels import Channels
 from octasplat.engine.gaussians.flattening import MAX_LOGIT
 from octasplat.engine.gaussians.model import FlatGaussians
@@ -284,11 +285,19 @@ def load(source: PathLike, *, drop_invalid: bool = False) -> Scene:
     >>> osp.load("scene.ply")
     Scene(1,200 Gaussians, harmonics of degree 1)
     """
+    return read_scene(Path(source), log_event, drop_invalid=drop_invalid)
+
+
+def read_scene(path: Path, progress: EventListener, *, drop_invalid: bool = False) -> Scene:
+    """Return the scene of a file or run as :func:`load`, where ``progress`` is told what reading loses.
+
+    Raises:
+        SceneFileError: the file cannot be read.
+    """
     from octasplat.engine.files import read_metadata
     from octasplat.engine.operations.scene_io import open_scene
 
-    path = Path(source)
-    return Scene(open_scene(path, log_event, drop_invalid=drop_invalid), read_metadata(path))
+    return Scene(open_scene(path, progress, drop_invalid=drop_invalid), read_metadata(path))
 
 
 def save(scene: Scene, path: PathLike) -> Path:

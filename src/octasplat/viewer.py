@@ -66,8 +66,8 @@ def view(
 ) -> Viewer:
     """Show a scene in a browser, and return the viewer, which is to be kept.
 
-    The page draws the octagons as the tracer sees them and comes from this process alone. Of a run, one can
-    go from photograph to photograph.
+    The page draws the octagons as the tracer sees them and comes from this process alone, under a random
+    address that only browsers of this machine reach. Of a run, one can go from photograph to photograph.
 
     Args:
         source: a scene, a file of any format, or a run.
@@ -84,6 +84,21 @@ def view(
     """
     scene = source if isinstance(source, Scene) else load(source)
     path = None if isinstance(source, Scene) else Path(source)
+    viewer = serve_scene(scene, path, port=port, background=background)
+    if open_browser:
+        webbrowser.open(viewer.url)
+    return viewer
+
+
+def serve_scene(scene: Scene, path: Path | None, *, port: int, background: str) -> Viewer:
+    """Return the viewer of a scene, without opening a browser.
+
+    Args:
+        scene: what is shown.
+        path: where it was read from, which names the page and, of a run, has the cameras; None if nowhere.
+        port: where to serve it; 0 takes a free one.
+        background: ``black`` or ``white``, to begin with.
+    """
     run = path if path is not None and is_run(path) and (path / CONFIG).exists() else None
     folder = tempfile.TemporaryDirectory(prefix="octasplat-view-")
     try:
@@ -92,13 +107,10 @@ def view(
         name = "Scene" if path is None else path.resolve().name
         q = None if run is None else float(Run(run).settings["train"]["trace"]["q"])
         viewed = ViewedScene(name, ply, {"views": []} if run is None else _run_cameras(run), q, background)
-        viewer = Viewer(SceneServer(viewed, port), folder)
+        return Viewer(SceneServer(viewed, port), folder)
     except BaseException:
         folder.cleanup()
         raise
-    if open_browser:
-        webbrowser.open(viewer.url)
-    return viewer
 
 
 def _run_cameras(run: Path) -> Mapping[str, Any]:

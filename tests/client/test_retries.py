@@ -98,6 +98,29 @@ def test_requests_survive_service_restart(serve: Callable[..., Front], known: bo
         assert api.get("/v1") == {"fine": True}
 
 
+def test_refused_connection_is_told_without_waiting(
+    serve: Callable[..., Front], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pauses: list[float] = []
+    monkeypatch.setattr(backoff.time, "sleep", pauses.append)
+    front = serve(lambda *_: as_json({}))
+    front.stop()
+    with (
+        Api(front.address, awaits_start=False) as api,
+        pytest.raises(ServiceUnreachableError, match="octasplat serve"),
+    ):
+        api.get("/v1/jobs")
+    assert pauses == []
+
+
+def test_service_that_has_answered_is_awaited_in_any_case(serve: Callable[..., Front]) -> None:
+    front = serve(lambda *_: as_json({"fine": True}))
+    with Api(front.address, awaits_start=False) as api:
+        api.get("/v1")
+        front.start_again_after(0.5)
+        assert api.get("/v1") == {"fine": True}
+
+
 def test_missing_service_fails_quickly(serve: Callable[..., Front], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("octasplat.workers.client.api.MAX_FIRST_OUTAGE_SECONDS", 1.0)
     front = serve(lambda *_: as_json({}))

@@ -8,7 +8,7 @@ import tempfile
 import urllib.request
 from collections.abc import Iterator
 from pathlib import Path
-from urllib.parse import urlsplit
+from urllib.parse import urljoin, urlsplit
 
 import numpy as np
 import pytest
@@ -36,33 +36,43 @@ def viewer(scene: osp.Scene) -> Iterator[osp.Viewer]:
 
 
 def get(url: str, path: str, host: str | None = None) -> tuple[int, str, bytes]:
-    parts = urlsplit(url)
+    """Return the answer to a path; a relative one is of the page."""
+    parts = urlsplit(urljoin(url, path))
     connection = http.client.HTTPConnection(parts.hostname or "", parts.port)
-    connection.request("GET", path, headers={} if host is None else {"Host": host})
+    connection.request("GET", parts.path, headers={} if host is None else {"Host": host})
     answer = connection.getresponse()
     return answer.status, answer.headers.get("Content-Type", ""), answer.read()
 
 
 def test_page_scene_and_scripts_are_served(viewer: osp.Viewer, scene: osp.Scene, tmp_path: Path) -> None:
-    status, kind, page = get(viewer.url, "/")
+    status, kind, page = get(viewer.url, "")
     assert (status, kind) == (200, "text/html; charset=utf-8")
-    assert b'data-scene="/scene.ply"' in page and b'data-background="white"' in page
-    _, _, ply = get(viewer.url, "/scene.ply")
+    assert f'data-scene="{urlsplit(viewer.url).path}scene.ply"'.encode() in page
+    assert b'data-background="white"' in page
+    _, _, ply = get(viewer.url, "scene.ply")
     (tmp_path / "again.ply").write_bytes(ply)
     np.testing.assert_array_equal(osp.load(tmp_path / "again.ply").means, scene.means)
     assert get(viewer.url, "/static/viewer/page.js")[:2] == (200, "text/javascript")
-    assert json.loads(get(viewer.url, "/cameras.json")[2]) == {"views": []}
+    assert json.loads(get(viewer.url, "cameras.json")[2]) == {"views": []}
 
 
 @pytest.mark.parametrize(
-    "path", ["/static/../templates/base.html", "/static/%2e%2e/pages.py", "/etc/passwd", "/x"]
+    "path",
+    ["/static/../templates/base.html", "/static/%2e%2e/pages.py", "/etc/passwd", "/x", "/", "/scene.ply"],
 )
 def test_scene_server_other_paths_are_404(viewer: osp.Viewer, path: str) -> None:
     assert get(viewer.url, path)[0] == 404
 
 
 def test_scene_server_refuses_foreign_origin(viewer: osp.Viewer) -> None:
-    assert get(viewer.url, "/scene.ply", host="rebound.example")[0] == 403
+    assert get(viewer.url, "scene.ply", host="rebound.example")[0] == 403
+
+
+def test_scene_server_addresses_differ(viewer: osp.Viewer, scene: osp.Scene) -> None:
+    with osp.view(scene, open_browser=False) as other:
+        secrets = {len(urlsplit(found.url).path) for found in (viewer, other)}
+        assert secrets == {24}  # 128 random bits
+        assert urlsplit(viewer.url).path != urlsplit(other.url).path
 
 
 def test_scene_server_closed_refuses_connections(scene: osp.Scene) -> None:

@@ -23,6 +23,7 @@ from octasplat.engine.operations.base import (
 from octasplat.engine.operations.written_files import remember_written
 from octasplat.engine.settings.fields import Positional, Spelling, is_negatable
 from octasplat.engine.settings.renamed_settings import former_names, notify_renamed
+from octasplat.workers.cli.input_paths import check_inputs
 from octasplat.workers.cli.options import quiet_option, threads_option
 from octasplat.workers.cli.progress import show_progress
 from octasplat.workers.cli.signals import StoppedError, exit_on_sigterm, request_stop_on_signals
@@ -96,12 +97,14 @@ def request_from_options(model: type[Any], given_values: dict[str, Any]) -> Any:
     Raises:
         UsageError: what is asked for is not complete, or contradicts itself.
         ConfigError: a value is out of range; the sentence names the option.
+        SceneFileError: what is to be read does not exist, which is found before anything heavy is imported.
     """
     values = {
         name: value
         for name, value in _by_new_flags(model, given_values).items()
         if value is not None and not (value == () and _may_repeat(model.model_fields[name]))
     }
+    check_inputs(model, values)  # some requests look into their source, with much to import
     try:
         return build_request(model, values, functools.partial(option_name, model))
     except ContradictoryRequestError as error:

@@ -79,14 +79,17 @@ class Api:
     Args:
         address: e.g. ``http://127.0.0.1:8642``.
         token: a bearer token, if it needs one.
+        awaits_start: whether a service that refuses the first connection may be starting and is asked again;
+            else the refusal is told at once.
     """
 
-    def __init__(self, address: str, token: str | None = None) -> None:
+    def __init__(self, address: str, token: str | None = None, *, awaits_start: bool = True) -> None:
         headers = {"User-Agent": "octasplat"}
         if token:
             headers["Authorization"] = f"Bearer {token}"
         self.address = address
         self._has_answered = False
+        self._awaits_start = awaits_start
         # Proxies of the environment are not for the own machine.
         local = httpx.URL(address).host in ("127.0.0.1", "localhost", "::1")
         self._http = httpx.Client(
@@ -136,7 +139,7 @@ class Api:
             try:
                 response = self._http.request(method, path, **arguments)
             except httpx.TransportError as error:
-                if not patience.wait():
+                if self._is_absent(error) or not patience.wait():
                     raise self.unreachable_error(error) from None
                 continue
             if response.status_code not in BUSY_STATUSES | UNAVAILABLE_STATUSES:
@@ -184,6 +187,10 @@ class Api:
             f"No service answers at {self.address} ({reason}); start one with octasplat serve, or "
             f"set {SERVER_VARIABLE}."
         )
+
+    def _is_absent(self, error: httpx.TransportError) -> bool:
+        """Return whether a first request met no service, for which nobody wants to wait."""
+        return isinstance(error, httpx.ConnectError) and not (self._awaits_start or self._has_answered)
 
     def _raise_for_status(self, response: httpx.Response) -> httpx.Response:
         """Return the response itself if it is successful; raise otherwise."""

@@ -46,12 +46,18 @@ def set_option(command: F) -> F:
 
 
 @contextmanager
-def connected(server: str | None) -> Iterator["Api"]:
-    """Yield the service that the user means; the token is no option, as others on a machine see those."""
+def connected(server: str | None, *, awaits_start: bool = False) -> Iterator["Api"]:
+    """Yield the service that the user means; the token is no option, as others on a machine see those.
+
+    Args:
+        server: its address; None for that of the environment or of this machine.
+        awaits_start: whether the command waits for a service that is being started again, as long work does;
+            else a refused connection is told at once.
+    """
     from octasplat.workers.client.api import Api, find_address, find_token
 
     address = server or find_address(os.environ)
-    with Api(address, find_token(os.environ, address)) as api:
+    with Api(address, find_token(os.environ, address), awaits_start=awaits_start) as api:
         yield api
 
 
@@ -88,7 +94,7 @@ def submit(
     options.config()  # what cannot be used is refused before anything is sent
     requested = options.model_dump(mode="json", exclude_unset=True)
     what = Submission(scene, requested, label, queue, priority)
-    with connected(server) as api:
+    with connected(server, awaits_start=True) as api:
         if wait:
             submit_and_wait(api, what, output or Path(f"{scene.stem or 'scene'}-result"), quiet=quiet)
             return
@@ -175,7 +181,7 @@ def derive(
     if former_on is not None:
         notify_renamed({"--on": "--other-dataset"})
     files = [_parse_file_option(text) for text in given["files"]]
-    with connected(server) as api:
+    with connected(server, awaits_start=wait) as api:
         source = None if job_id is None else _get_job(api, job_id)["id"]
         what = Derivation(
             source, kind, _with_assignments({}, given["assignments"]), scene=other_dataset or former_on,
@@ -222,7 +228,7 @@ def status(job_id: str, wait: bool, as_json: bool, server: str | None, quiet: bo
     """Show how far JOB is; 'last' is the newest one."""
     from octasplat.workers.cli.remote_jobs import wait_for
 
-    with connected(server) as api:
+    with connected(server, awaits_start=wait) as api:
         job = _get_job(api, job_id)
         if wait:
             job = wait_for(api, job["id"], quiet=quiet or as_json)
@@ -310,7 +316,7 @@ def download(
     """Save the results of JOB, or only those called NAMES; goes on where it broke off."""
     from octasplat.workers.cli.remote_jobs import download_results
 
-    with connected(server) as api:
+    with connected(server, awaits_start=True) as api:
         job = _get_job(api, job_id)
         download_results(api, job["id"], output or Path(f"octasplat-{job['id'][-12:]}"), names, quiet=quiet)
 
