@@ -97,7 +97,9 @@ def main() -> None:
         if path.is_file()
     ]
     truth = read_ground_truth(places[0]) if places else None
-    photographs = load_dataset_model(folder, max_side=asked.max_side, min_views=1, for_training=False)
+    photographs = load_dataset_model(
+        asked.other_dataset, max_side=asked.max_side, min_views=1, for_training=False
+    )
     names = [view.name for view in photographs.views]
     wanted = [name for name in (truth.content.relight.views if truth else names) if name in names]
 

@@ -24,6 +24,7 @@ from octasplat.engine.core.events import CheckpointWritten, Event
 from octasplat.engine.dataset.synthetic import SyntheticDatasetConfig, write_synthetic_dataset
 from octasplat.engine.pipeline import reconstruct
 from octasplat.engine.runs.config import ReconstructionConfig, resolve_config
+from tests.support.tiny_dataset import make_tiny_dataset
 
 pytestmark = pytest.mark.heavy
 
@@ -33,7 +34,6 @@ import sys
 from pathlib import Path
 from octasplat.engine.runs.config import ReconstructionConfig
 from octasplat.engine.pipeline import reconstruct
-from tests.support.tiny_dataset import make_tiny_dataset
 scene, output, config, threads = sys.argv[1:]
 reconstruct(
     Path(scene),

@@ -39,9 +39,9 @@ def decode_type(value: EncodedType) -> Any:
     """Return the numba type that :func:`encode_type` wrote.
 
     >>> decode_type("float32 2C readonly")
-    Array(float32, 2, 'C', False, aligned=True)
+    Array(float32, 2, 'C', True, aligned=True)
     >>> decode_type({"items": ["int64", "int64"]})
-    UniTuple(int64 x 2)
+    UniTuple(int64, 2)
     """
     if isinstance(value, dict):
         items = tuple(decode_type(item) for item in value["items"])

@@ -6,6 +6,7 @@ from octasplat.engine import __version__
 
 PACKAGES = (
     "embreex",  # Embree: which rays meet which boxes
+    "fast-simplification",  # fewer triangles for surfaces
     "flip-evaluator",
     "llvmlite",  # compiles the kernels
     "numba",
@@ -15,6 +16,7 @@ PACKAGES = (
     "pycolmap",  # undistorts rays
     "scipy",
     "torch",  # shrinks photographs
+    "xatlas",  # cuts surfaces open for textures
     "zstandard",  # packs some exports
 )
 

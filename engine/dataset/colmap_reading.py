@@ -12,7 +12,6 @@ from octasplat.engine.dataset.colmap_binary import check_binary_colmap_model, re
 from octasplat.engine.dataset.colmap_records import ModelRecords, build_reconstruction
 from octasplat.engine.dataset.colmap_text import is_plain_text_model, read_text_model
 from octasplat.engine.dataset.image_names import match_image_names
-from octasplat.engine.dataset.images import read_image_info
 from octasplat.engine.dataset.photograph_files import image_folder, photographs_below
 from octasplat.engine.dataset.transforms_file import read_transforms
 
@@ -99,5 +98,8 @@ class _PhotographSizes:
             )
         if self._sizes_px is not None:
             return self._sizes_px[file]
+        # Needs OpenImageIO, which the front end lacks; it gives the sizes.
+        from octasplat.engine.dataset.images import read_image_info
+
         info = read_image_info(self._paths[file])
         return info.width_px, info.height_px

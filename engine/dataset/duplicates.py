@@ -25,7 +25,7 @@ from octasplat.engine.dataset.model import DatasetModel, scene_extent
 NEAR_SHIFT, NEAR_TURN_RAD = 2e-3, 5e-3
 """Pictures that hardly differ are duplicates if they stand no farther apart than this share of the scene's
 extent, and are turned by no more than this."""
-EQUAL_SHIFT, EQUAL_TURN_RAD = 0.1, 0.1
+EQUAL_SHIFT, EQUAL_TURN_RAD = 0.025, 0.1
 """The same for equal files, which a search for poses may have placed apart; views of a rendered scene that
 show nothing of it are equal, too, but lie farther apart."""
 NEAR_DIFFERENCE = 3.0

@@ -42,7 +42,7 @@ def photographs_of_scene(scene: Path) -> list[str]:
         (scene / path).relative_to(folder).as_posix() for name, path in images.items() if name not in masks
     )
     if (fault := too_few_photographs(len(names))) is not None:
-        raise DatasetError(" ".join((fault, *layout.notes)))
+        raise DatasetError(" ".join((f"{scene}: {fault}", *layout.notes)))
     return names
 
 

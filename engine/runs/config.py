@@ -16,6 +16,7 @@ from octasplat.engine.runs.run_settings import RunSettings
 from octasplat.engine.settings.base import Settings
 from octasplat.engine.settings.fields import ADVANCED
 from octasplat.engine.settings.nested_options import merge_options
+from octasplat.engine.settings.preset_names import PRESETS, PRESETS_WITH_MATERIALS
 from octasplat.engine.settings.refusals import (
     InvalidSettingsError,
     Refusal,
@@ -25,7 +26,6 @@ from octasplat.engine.settings.refusals import (
 )
 from octasplat.engine.settings.renamed_settings import former_names, replace_former_names
 from octasplat.engine.train.config import TrainConfig, preset, with_materials
-from octasplat.engine.train.config.presets import PRESETS, PRESETS_WITH_MATERIALS
 
 
 class ReconstructionConfig(RunSettings):
@@ -88,7 +88,7 @@ def resolve_config(
     materials, see :func:`octasplat.engine.train.config.with_materials`, and what else is given on top.
 
     Args:
-        preset_name: one of :data:`octasplat.engine.train.config.presets.PRESETS`.
+        preset_name: one of :data:`octasplat.engine.settings.preset_names.PRESETS`.
         materials: learn materials and the environment.
         settings: fields of :class:`RunSettings`; None values are left at their defaults.
         train: some settings of the training, nested as in :class:`ReconstructionConfig`.

@@ -9,7 +9,7 @@ from octasplat.engine.runs.export_names import ExportNames
 from octasplat.engine.runs.result_files import DEFAULT_EXPORTS
 from octasplat.engine.settings import renamed_settings
 from octasplat.engine.settings.fields import ADVANCED, BASIC, Spelling, Unit
-from octasplat.engine.train.config.presets import PresetName
+from octasplat.engine.settings.preset_names import PresetName
 
 
 class RunSettings(BaseModel):

@@ -16,8 +16,8 @@ from pydantic.fields import FieldInfo
 from octasplat.engine.core.errors import ConfigError
 from octasplat.engine.runs.config import ReconstructionConfig, former_setting_names, resolve_config
 from octasplat.engine.settings.fields import Group, SettingLevel, Unit
+from octasplat.engine.settings.preset_names import PRESETS, PRESETS_WITH_MATERIALS
 from octasplat.engine.settings.refusals import InvalidSettingsError, refuse_unknown_setting
-from octasplat.engine.train.config.presets import PRESETS, PRESETS_WITH_MATERIALS
 
 MATERIALS = "+materials"
 """What is added to the name of a preset where materials are learnt with it."""

@@ -5,8 +5,8 @@ from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 from typing import Any
 
+from octasplat.engine.settings.preset_names import PRESETS
 from octasplat.engine.train.config import preset
-from octasplat.engine.train.config.presets import PRESETS
 from octasplat.service.web.form_fields import DEFAULT_FILE_NAMES, FormField, form_fields
 from octasplat.workers.worker.job_kinds import JobKind
 

@@ -40,5 +40,5 @@ def test_estimate_command_prints_sentence(octasplat, photographs: Path) -> None:
 
 
 def test_folder_without_photographs_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(DatasetError, match="holds no photographs"):
+    with pytest.raises(DatasetError, match=rf"{tmp_path.name}: There are 0 photographs"):
         run(EstimateRequest(source=tmp_path))

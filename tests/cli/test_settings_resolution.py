@@ -16,7 +16,7 @@ from octasplat.engine.operations.reconstruct import ReconstructOptions, Reconstr
 from octasplat.engine.runs.config import ReconstructionConfig, RunSettings
 from octasplat.engine.runs.settings_catalog import all_settings as catalog
 from octasplat.engine.settings.nested_options import merge_options
-from octasplat.engine.train.config.presets import PRESETS
+from octasplat.engine.settings.preset_names import PRESETS
 from octasplat.service.actions.validation import resolve_options
 from octasplat.service.problems import ProblemError
 from octasplat.workers.cli.main import cli

@@ -97,7 +97,7 @@ def by_run(folder: Path) -> Told:
     try:
         names = photographs_of_scene(scene)
     except DatasetError as error:
-        refusal = str(error).removesuffix(" ".join(("", *notes)))
+        refusal = str(error).removeprefix(f"{scene}: ").removesuffix(" ".join(("", *notes)))
         return Told(frozenset(), notes, (refusal,))
     paths = (image_folder(scene) / name for name in names)
     return Told(frozenset(path.relative_to(folder).as_posix() for path in paths), notes, ())
@@ -109,7 +109,8 @@ def by_estimate(folder: Path) -> Told:
         found = estimate(EstimateRequest(source=folder), progress=events.append)
     except DatasetError as error:
         notes = tuple(event.message for event in events if isinstance(event, Warned))
-        return Told(frozenset(), notes, (str(error).removesuffix(" ".join(("", *notes))),))
+        refusal = str(error).removeprefix(f"{locate_scene(folder)}: ").removesuffix(" ".join(("", *notes)))
+        return Told(frozenset(), notes, (refusal,))
     notes = tuple(event.message for event in events if isinstance(event, Warned))
     count = sum(sizes.count for sizes in found.photographs)
     return Told(frozenset(map(str, range(count))), notes, ())

@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from octasplat.engine.settings.preset_names import PRESETS
 from octasplat.engine.train.config import (
     LossWeights,
     TrainConfig,
@@ -16,7 +17,6 @@ from octasplat.engine.train.config import (
     uses_shared_sort,
     with_materials,
 )
-from octasplat.engine.train.config.presets import PRESETS
 from octasplat.engine.train.loop.schedule import Schedule
 from octasplat.engine.train.loop.state import initial_state
 from octasplat.engine.train.loop.trainer import Trainer

@@ -5,8 +5,8 @@ from itertools import chain
 
 import pytest
 
+from octasplat.engine.settings.preset_names import PRESETS
 from octasplat.engine.train.config import TrainConfig
-from octasplat.engine.train.config.presets import PRESETS
 from octasplat.service.web.form_fields import FormField
 from octasplat.service.web.forms import OptionsForm, options_form
 from octasplat.workers.worker.job_kinds import JobKind, get_job_kind, job_kinds

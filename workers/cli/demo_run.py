@@ -10,7 +10,7 @@ from octasplat.engine.dataset.synthetic import SyntheticDatasetConfig, write_syn
 from octasplat.engine.operations.reconstruct import ReconstructRequest
 from octasplat.engine.runs.config import ReconstructionConfig, read_config
 from octasplat.engine.runs.run_folder import CONFIG
-from octasplat.engine.train.config.presets import PresetName
+from octasplat.engine.settings.preset_names import PresetName
 from octasplat.workers.cli.progress import show_progress
 from octasplat.workers.cli.reconstruction import run_reconstruction
 from octasplat.workers.cli.signals import exit_on_sigterm

@@ -1,19 +1,14 @@
 """The presets: named starting points of the settings of a training."""
 
-from typing import Literal, get_args
-
 from octasplat.engine.core.errors import ConfigError
 from octasplat.engine.gaussians.octagon import CHI2_3_99
+from octasplat.engine.settings.preset_names import PRESETS
 from octasplat.engine.trace.protocol import TraceSettings
 from octasplat.engine.train.config.densify import McmcConfig, RedisplatsConfig
 from octasplat.engine.train.config.learning_rates import LearningRates
 from octasplat.engine.train.config.loss import LossWeights
 from octasplat.engine.train.config.train import TrainConfig
 
-PresetName = Literal["fast", "standard", "high", "redisplats"]
-PRESETS: tuple[PresetName, ...] = get_args(PresetName)
-PRESETS_WITH_MATERIALS: tuple[PresetName, ...] = ("fast", "standard", "high")
-"""Those with which materials can be learnt; ``redisplats`` has published settings for scenes without."""
 FLIP_NORMAL_COS = 0.5
 """Cosine beyond which normals that point away are turned, where materials are learnt."""
 

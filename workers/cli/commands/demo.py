@@ -9,7 +9,7 @@ from pydantic import Field
 from octasplat.engine.operations.base import Request
 from octasplat.engine.settings import renamed_settings
 from octasplat.engine.settings.fields import Output, Spelling, Unit
-from octasplat.engine.train.config.presets import PresetName
+from octasplat.engine.settings.preset_names import PresetName
 from octasplat.workers.cli.browser import has_display
 from octasplat.workers.cli.options import quiet_option, threads_option
 from octasplat.workers.cli.request_options import request_from_options, request_options
