@@ -47,7 +47,7 @@ def packages_behind(module: str) -> set[str]:
 
 
 def test_versions_cover_reconstruction_packages() -> None:
-    # Some are one extension module, without a record of its top-level name; "_" and "-" are the same in names.
+    # Some are one extension module, without a record of its name; "_" and "-" mean the same.
     owners = importlib.metadata.packages_distributions()
     names = {owners.get(name, [name])[0] for name in packages_behind("octasplat.engine.pipeline")} - HARMLESS
     behind = {name.replace("_", "-") for name in names}
