@@ -9,6 +9,7 @@ from scipy.sparse import coo_matrix
 
 from octasplat.engine.geometry.triangle_mesh import TriangleMesh, directed_edges
 from octasplat.engine.surface.kernels.rasterize import rasterise
+from octasplat.engine.surface.unwrap_process import unwrap_in_process
 
 PADDING_PX = 2
 SMOOTHING_ROUNDS = 20
@@ -69,22 +70,24 @@ def unwrap(mesh: TriangleMesh, side_px: int) -> TextureLayout:
 
     It is cut where a smooth surface of its shape would be: along its own creases, one that was measured falls
     into hundreds of scraps, on which nobody can paint.
-    """
-    import xatlas
 
+    Raises:
+        ExportError: xatlas failed.
+    """
     smooth = smooth_mesh(mesh)
-    atlas = xatlas.Atlas()
-    atlas.add_mesh(smooth.vertices_world, mesh.faces.astype(np.uint32), smooth.vertex_normals())
-    charts, packing = xatlas.ChartOptions(), xatlas.PackOptions()
-    packing.resolution, packing.padding, packing.bilinear = side_px, PADDING_PX, True
-    atlas.generate(charts, packing)
-    origin, faces, uv = atlas[0]
+    atlas = unwrap_in_process(
+        smooth.vertices_world,
+        mesh.faces.astype(np.uint32),
+        smooth.vertex_normals(),
+        resolution_px=side_px,
+        padding_px=PADDING_PX,
+    )
     # xatlas picks a scale at which everything fits about; the image may come out a little larger or smaller.
     normals = mesh.vertex_normals()
-    uv = uv.astype(np.float64) * [atlas.width, atlas.height] / max(atlas.width, atlas.height)
+    uv = atlas.uv.astype(np.float64) * atlas.size_px / atlas.size_px.max()
     cut = TriangleMesh(
-        mesh.vertices_world[origin], faces.astype(np.int32), uv=uv.astype(np.float32),
-        normals_world=normals[origin],
+        mesh.vertices_world[atlas.origin], atlas.faces.astype(np.int32), uv=uv.astype(np.float32),
+        normals_world=normals[atlas.origin],
     )  # fmt: skip
     owner = np.full((side_px, side_px), -1, np.int32)
     weights = np.zeros((side_px, side_px, 2), np.float32)

@@ -16,15 +16,15 @@ class SlowJournal:
         self.told: list[str] = []
         self.telling = asyncio.Event()
 
-    async def tell(self, kind: str, data: dict[str, Any]) -> None:
+    async def add_event(self, kind: str, data: dict[str, Any]) -> None:
         self.telling.set()
         await asyncio.sleep(0.05)
         self.told.append(f"{kind} {data.get('stage', '')}".strip())
 
-    async def progress(self, **_progress: object) -> None:
+    async def set_progress(self, **_progress: object) -> None:
         await asyncio.sleep(0)
 
-    async def log(self, _lines: tuple[str, ...]) -> None:
+    async def add_log_lines(self, _lines: tuple[str, ...]) -> None:
         await asyncio.sleep(0)
 
 
@@ -57,7 +57,7 @@ async def test_reporter_logs_progress_at_intervals(monkeypatch: pytest.MonkeyPat
             super().__init__()
             self.lines: list[str] = []
 
-        async def log(self, lines: tuple[str, ...]) -> None:
+        async def add_log_lines(self, lines: tuple[str, ...]) -> None:
             self.lines += lines
 
     journal = Log()
