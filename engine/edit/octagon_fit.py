@@ -72,7 +72,7 @@ def fit_octagons(
 
 
 def largest_scale(legs: Float64[np.ndarray, "n 3 2"]) -> Float64[np.ndarray, " n"]:
-    """Return the larger singular value of each pair of legs."""
+    """Return the larger singular value of each 3 x 2 matrix, whose columns are tangent vectors."""
     gram = legs.transpose(0, 2, 1) @ legs
     mean = (gram[:, 0, 0] + gram[:, 1, 1]) / 2
     spread = np.hypot((gram[:, 0, 0] - gram[:, 1, 1]) / 2, gram[:, 0, 1])

@@ -60,10 +60,11 @@ def migrate(conninfo: str, only: Collection[str] | None = None) -> tuple[str, ..
 
     Args:
         conninfo: how to connect.
-        only: of our own steps only those of these names.
+        only: names to which the steps of octasplat itself are restricted; those of Procrastinate are applied
+            in any case.
 
     Returns:
-        Names of the steps applied; none where a newer version made the tables, which this one may use.
+        Names of the steps applied; empty where a newer, compatible version has migrated already.
 
     Raises:
         DatabaseError: the database cannot be reached, is too old, or is too new for this version.

@@ -246,10 +246,10 @@ class EmbeddedPostgres:
             os.truncate(log, 0)  # the server appends to it
 
     def _remove_stale_locks(self) -> None:
-        """Remove lock files of a server that is gone where Postgres would give up.
+        """Remove lock files of a server that is gone and that would keep Postgres from starting.
 
-        That is where the number in them belongs to another program by now, or to a dead process that nobody
-        has buried, as in containers without an init process.
+        Their PID may belong to another program by now, or to a zombie process that nothing reaps, as in
+        containers without an init process.
         """
         for path in (
             self.cluster / "postmaster.pid",

@@ -14,18 +14,24 @@ RAY_SORT_ITERATION_RATIO = 3 / 7
 
 
 def iteration_count(config: TrainConfig, training_pixels: int, valid_fraction: float = 1.0) -> int:
-    """Return ``config.iterations``, or where that is 0 so many rays for each pixel, in whole thousands.
+    """Return ``config.iterations``, or where that is 0 the number that the training pixels ask for.
 
-    Large scenes learn as long as there is something to see; small ones are done after 7,000 with 7 rays a
-    pixel. Rays that have an order of their own take longer, so that there are fewer of them. Where only a
-    share of the pixels shows anything (``valid_fraction``), the rays of the others teach little and cost
-    little, and it takes as many more; not with materials.
+    That is ``config.rays_per_pixel`` rays for each pixel, rounded to thousands of iterations, at least
+    ``MIN_THOUSANDS`` or one thousand for each ray per pixel, whichever is more, and at most ten thirds of a
+    thousand for each. With per-ray sorting an iteration takes longer, so fewer rays are traced. Where only
+    ``valid_fraction`` of the pixels shows anything, the other rays teach and cost little, and the count is
+    divided by it; not with materials.
+
+    Args:
+        config: settings of the training.
+        training_pixels: pixels of all training views.
+        valid_fraction: share of them that shows anything.
     """
     rays_per_pixel = config.rays_per_pixel
     if uses_shared_sort(config):
         min_thousands = max(MIN_THOUSANDS, rays_per_pixel)
     else:
-        if not config.materials.learn:  # which have a number of their own
+        if not config.materials.learn:  # their presets set rays_per_pixel for per-ray sorting already
             rays_per_pixel = max(1, round(RAY_SORT_ITERATION_RATIO * rays_per_pixel))
         min_thousands = MIN_THOUSANDS * max(1, rays_per_pixel // 3)
     thousands = max(round(rays_per_pixel * training_pixels / config.rays_per_batch / 1000), min_thousands)
