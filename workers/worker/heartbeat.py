@@ -59,7 +59,7 @@ class Heartbeat:
             sent = time.monotonic()
             beats = sent >= self._last_sent + settings.heartbeat_seconds
             try:
-                # Where packets vanish, psycopg takes up to 10 s more to give up, so this task does nothing else.
+                # Where packets vanish, psycopg gives up 10 s later at most, so this task does nothing else.
                 async with asyncio.timeout(settings.heartbeat_seconds):
                     state = await (self._attempt.heartbeat() if beats else self._attempt.read_state())
             except DATABASE_ERRORS:
