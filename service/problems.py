@@ -33,6 +33,8 @@ from octasplat.workers.worker.path_redaction import shorten_absolute_paths
 MEDIA_TYPE = "application/problem+json"
 TYPE_PREFIX = "urn:octasplat:problem:"
 RETRY_SECONDS = 5
+MAX_ERRORS = 50
+"""Most single faults that an answer lists."""
 
 logger = logging.getLogger(__name__)
 
@@ -115,14 +117,15 @@ def options_error(error: ValidationError | InvalidSettingsError, prefix: str = "
     if isinstance(error, InvalidSettingsError):
         faults = [
             {"code": each.code, "detail": each.sentence, "pointer": _pointer(prefix, each.path)}
-            for each in error.refusals
+            for each in error.refusals[:MAX_ERRORS]
         ]
-        return ProblemError(422, "options", str(error), errors=faults)
+        return ProblemError(422, "options", str(error) + _unlisted(len(error.refusals)), errors=faults)
     return ProblemError(
         422,
         "options",
-        f"{len(error.errors())} of the options cannot be used; see errors, and GET /v1/options.",
-        errors=[_field_error(prefix, fault) for fault in error.errors(include_url=False)],
+        f"{error.error_count()} of the options cannot be used; see errors, and GET /v1/options."
+        + _unlisted(error.error_count()),
+        errors=[_field_error(prefix, fault) for fault in error.errors(include_url=False)[:MAX_ERRORS]],
     )
 
 
@@ -144,7 +147,9 @@ def problem_from_error(error: OctasplatError) -> ProblemError:
     detail, again = str(error), RETRY_SECONDS
     if isinstance(error, IntakeError):
         status = 408 if error.code == "upload-stalled" else 422
-        return ProblemError(status, error.code, detail, errors=[fault.as_dict() for fault in error.faults])
+        detail += _unlisted(len(error.faults))
+        faults = [fault.as_dict() for fault in error.faults[:MAX_ERRORS]]
+        return ProblemError(status, error.code, detail, errors=faults)
     if isinstance(error, QuotaExceededError):
         # Bytes come back by deleting only, the others also by waiting.
         status = 413 if error.resource == "bytes" else 429
@@ -183,10 +188,10 @@ async def _on_octasplat_error(_request: Request, error: Exception) -> JSONRespon
 
 async def _on_validation_error(_request: Request, error: Exception) -> JSONResponse:
     assert isinstance(error, RequestValidationError)
-    faults = [_field_error("", fault) for fault in error.errors()]
-    return ProblemError(
-        422, "request", "The request does not have the form that is asked for; see errors.", errors=faults
-    ).response()
+    found = error.errors()
+    detail = "The request does not have the form that is asked for; see errors." + _unlisted(len(found))
+    faults = [_field_error("", fault) for fault in found[:MAX_ERRORS]]
+    return ProblemError(422, "request", detail, errors=faults).response()
 
 
 async def _on_http_exception(_request: Request, error: Exception) -> JSONResponse:
@@ -228,6 +233,11 @@ async def _on_exception(request: Request, error: Exception) -> JSONResponse:
     return ProblemError(
         500, "unexpected", "Something went wrong here; the service's log says what."
     ).response()
+
+
+def _unlisted(count: int) -> str:
+    """Return how many of so many faults an answer leaves out, as a sentence after another; empty for none."""
+    return f" {count - MAX_ERRORS} more are not listed." if count > MAX_ERRORS else ""
 
 
 def _field_error(prefix: str, fault: Mapping[str, Any]) -> dict[str, Any]:

@@ -20,6 +20,8 @@ class ThreadPurpose(Enum):
     """Reading archives that have come."""
     CHECKS = auto()
     """Checking datasets; :mod:`octasplat.service.concurrency_limiter` bounds how many at once."""
+    OPTIONS = auto()
+    """Validating options, a stage's text among them."""
     DOWNLOADS = auto()
     """Looking up what is read."""
     STORE_CHECKS = auto()
@@ -30,6 +32,7 @@ _POOL_SIZES = {
     ThreadPurpose.UPLOADS: 16,
     ThreadPurpose.UNPACKING: 3,
     ThreadPurpose.CHECKS: 8,
+    ThreadPurpose.OPTIONS: 2,
     ThreadPurpose.DOWNLOADS: 12,
     ThreadPurpose.STORE_CHECKS: 4,
 }

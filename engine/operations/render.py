@@ -12,6 +12,7 @@ from octasplat.engine.operations.base import Operation, Result, never_stop
 from octasplat.engine.operations.render_options import PictureOptions, PictureRequest, check_layers
 from octasplat.engine.pathtracing.stage.model import Stage
 from octasplat.engine.pathtracing.stage.stage_file import read_stage, referenced_files
+from octasplat.engine.pathtracing.stage.text_bounds import check_stage_text
 from octasplat.engine.settings.fields import ADVANCED, ReadPath, Spelling
 
 if TYPE_CHECKING:
@@ -28,9 +29,14 @@ STAGE_LACKS_BACKGROUND = (
 
 
 def parse_stage_text(value: object) -> object:
-    """Return the content of a TOML text; any other value as it is. Raises ValueError for invalid TOML."""
+    """Return the content of a TOML text; any other value as it is.
+
+    Raises:
+        ValueError: invalid TOML, or a text beyond the bounds of :func:`check_stage_text`.
+    """
     if not isinstance(value, str):
         return value
+    check_stage_text(value)
     try:
         return tomllib.loads(value)
     except (tomllib.TOMLDecodeError, RecursionError) as error:

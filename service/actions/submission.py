@@ -8,7 +8,6 @@ from pydantic import BaseModel, ValidationError
 
 from octasplat.engine.core.errors import ConfigError
 from octasplat.engine.operations.cost_model import Estimate
-from octasplat.engine.settings.refusals import InvalidSettingsError
 from octasplat.engine.settings.renamed_settings import collect_notices
 from octasplat.service.actions.access import check_not_draining, fetch_visible_job
 from octasplat.service.actions.jobs import job_view
@@ -17,7 +16,7 @@ from octasplat.service.actions.validation import input_problem, resolve_options,
 from octasplat.service.auth import Principal
 from octasplat.service.idempotency import create_once, fingerprint
 from octasplat.service.job_limits import check_job_limits, check_priority, estimate_job
-from octasplat.service.problems import ProblemError, options_error
+from octasplat.service.problems import ProblemError
 from octasplat.service.queue_workers import check_formats_writable, live_workers_of_queue
 from octasplat.service.schemas.jobs import JobView, NewJob, RetryRequest
 from octasplat.service.state import Service
@@ -77,7 +76,8 @@ async def submit_job(
     check_not_draining(service)
     kind = validate_kind(request.kind)
     with collect_notices() as notices:
-        requested = _RequestedJob(request, kind, resolve_options(kind, request.options), traceparent)
+        options = await resolve_options(kind, request.options)
+    requested = _RequestedJob(request, kind, options, traceparent)
     check_priority(principal, request.priority, service.settings)
     if request.webhook is not None:
         check_webhook_address(service, request.webhook.url, "#/webhook/url")
@@ -271,10 +271,9 @@ async def _revised_options(
         raise ProblemError(409, "version", detail) from None
     if kind.needs == "result" and job.source_id is None:
         raise ProblemError(409, "source", "The job whose results it works on was deleted; make a new job.")
-    try:
-        options = kind.revise(job.options, request.options) if request.options else before
-    except (ValidationError, InvalidSettingsError) as error:
-        raise options_error(error) from None
+    options = before
+    if request.options:
+        options = await resolve_options(kind, request.options, before=job.options)
     check_formats_writable(kind, options, job.queue, workers)
     await check_named_files(connection, principal, kind, options, job.files_id)
     sizes = await photograph_sizes(connection, job.dataset_id) if job.dataset_id is not None else []

@@ -8,6 +8,7 @@ from pydantic import BaseModel, ValidationError
 from octasplat.engine.core.errors import ConfigError
 from octasplat.engine.settings.refusals import InvalidSettingsError
 from octasplat.service.problems import ProblemError, options_error
+from octasplat.service.thread_pools import ThreadPurpose, run_in_pool
 from octasplat.workers.worker.job_kinds import JobKind, get_job_kind
 
 
@@ -25,13 +26,26 @@ def validate_kind(name: str) -> JobKind:
         ) from None
 
 
-def resolve_options(kind: JobKind, values: Mapping[str, Any]) -> BaseModel:
-    """Return the complete options.
+async def resolve_options(
+    kind: JobKind, values: Mapping[str, Any], *, before: Mapping[str, Any] | None = None
+) -> BaseModel:
+    """Return the complete options, validated in a thread, so that large ones delay no other request.
+
+    Args:
+        kind: the kind of the job.
+        values: what was asked for.
+        before: options of a job that they change; None for a new job.
 
     Raises:
         ProblemError: 422.
     """
+    return await run_in_pool(ThreadPurpose.OPTIONS, _resolve, kind, values, before)
+
+
+def _resolve(kind: JobKind, values: Mapping[str, Any], before: Mapping[str, Any] | None) -> BaseModel:
     try:
+        if before is not None:
+            return kind.revise(before, values)
         return kind.options.model_validate(kind.resolve(values).model_dump(mode="json"))
     except (ValidationError, InvalidSettingsError) as error:
         raise options_error(error) from None

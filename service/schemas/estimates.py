@@ -9,8 +9,10 @@ from octasplat.engine.operations.cost_model import Estimate
 from octasplat.service.schemas.base import RequestBody
 
 
-class PhotographSizes(RequestBody):
+class PhotographSizes(BaseModel):
     """Photographs of one size."""
+
+    model_config = ConfigDict(extra="forbid")
 
     width_px: int = Field(ge=1, le=65_536)
     height_px: int = Field(ge=1, le=65_536)

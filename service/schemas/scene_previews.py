@@ -1,5 +1,7 @@
 """What would be taken of a scene, before it is sent."""
 
+from typing import ClassVar
+
 from pydantic import BaseModel, ConfigDict, Field
 
 from octasplat.service.intake.scene_preview import ScenePreview
@@ -8,8 +10,10 @@ from octasplat.service.schemas.base import RequestBody
 MAX_LISTED_FILES = 100_000
 
 
-class ListedFile(RequestBody):
+class ListedFile(BaseModel):
     """A file of a folder."""
+
+    model_config = ConfigDict(extra="forbid")
 
     path: str = Field(min_length=1, max_length=4096, description="Below the folder, with forward slashes.")
     size_bytes: int = Field(ge=0, le=1 << 50)
@@ -22,6 +26,8 @@ class NewScenePreview(RequestBody):
         extra="forbid",
         json_schema_extra={"examples": [{"files": [{"path": "images/0001.jpg", "size_bytes": 123456}]}]},
     )
+
+    max_values: ClassVar[int] = 3 * MAX_LISTED_FILES + 1
 
     files: list[ListedFile] = Field(max_length=MAX_LISTED_FILES)
 

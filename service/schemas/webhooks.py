@@ -6,7 +6,7 @@ from typing import Annotated, Any
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
-from octasplat.service.schemas.base import EXAMPLE_ID, EXAMPLE_TIME
+from octasplat.service.schemas.base import EXAMPLE_ID, EXAMPLE_TIME, RequestBody
 from octasplat.workers.maintenance.webhooks.addresses import MAX_URL
 from octasplat.workers.maintenance.webhooks.rows import (
     TERMINAL_EVENTS,
@@ -24,7 +24,7 @@ Url = Annotated[str, Field(min_length=1, max_length=MAX_URL)]
 Events = Annotated[list[EventName], Field(min_length=1, max_length=6)]
 
 
-class JobWebhook(BaseModel):
+class JobWebhook(RequestBody):
     """Webhook for the events of one job."""
 
     model_config = ConfigDict(extra="forbid")
@@ -33,10 +33,10 @@ class JobWebhook(BaseModel):
     secret: Secret = Field(
         description="`whsec_` and the base64 of 24 to 64 random bytes; signs the messages."
     )
-    events: Events = list(TERMINAL_EVENTS)
+    events: Events = Field(list(TERMINAL_EVENTS))
 
 
-class NewWebhook(BaseModel):
+class NewWebhook(RequestBody):
     """Webhook to create."""
 
     model_config = ConfigDict(
@@ -50,7 +50,7 @@ class NewWebhook(BaseModel):
     secret: Secret | None = Field(None, description="By default one is made.")
 
 
-class WebhookChange(BaseModel):
+class WebhookChange(RequestBody):
     """Changes of a webhook."""
 
     model_config = ConfigDict(extra="forbid", json_schema_extra={"examples": [{"enabled": True}]})
