@@ -203,7 +203,8 @@ def test_pipeline_stopped_run_resumes_to_same_bytes(scene: Path, whole_run: Path
         def stop_soon() -> bool:
             nonlocal asked
             asked += 1
-            return asked > 4
+            # A surface is exported from its beginning again, and would never be done.
+            return asked > 4 and not (run / "scene.ply").exists()
 
         try:
             reconstruct(
