@@ -198,6 +198,7 @@ def test_material_invalid_arguments_print_one_sentence(
     monkeypatch.chdir(tmp_path)
     write_gaussian_ply(scene_of(shiny_run), tmp_path / "shiny.ply")
     write_gaussian_ply(scene_of(shiny_run).without_channels(["roughness"]), tmp_path / "plain.ply")
+    (tmp_path / "a.png").write_text("a mask")
     done = octasplat("material", *arguments, "-o", "out.ply")
     assert done.exit_code == 1 and done.stderr.count("\n") == 1 and told in done.stderr, done.stderr
     assert not (tmp_path / "out.ply").exists()
@@ -220,11 +221,13 @@ def test_material_unusable_output_or_mask_is_refused(shiny_run, octasplat, tmp_p
     (tmp_path / "there").mkdir()
     (tmp_path / "there" / "file").write_text("x")
     (tmp_path / "view_000.png").write_text("no picture")
+    (tmp_path / "other.png").write_text("of no photograph")
     for arguments, told in (
         (("-o", tmp_path / "there"), "is there already"),
         (("-o", tmp_path / "new", "--mask", tmp_path / "view_000.png"), "the mask cannot be read"),
         (("-o", tmp_path / "new", "--mask", tmp_path / "other.png"), "no photograph of this name"),
+        (("-o", tmp_path / "new", "--mask", tmp_path / "missing.png"), "missing.png: cannot be read"),
     ):
         done = octasplat("material", shiny_run, "--set", "metallic=1", *arguments)
         assert done.exit_code == 1 and done.stderr.count("\n") == 1 and told in done.stderr, done.stderr
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["there", "view_000.png"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["other.png", "there", "view_000.png"]
