@@ -1,5 +1,6 @@
 """Names that settings and options had in the last version: they are read, mean the same, and are told."""
 
+import asyncio
 import json
 from pathlib import Path
 from typing import Any
@@ -83,7 +84,9 @@ def test_former_option_of_a_python_verb_is_read_and_told() -> None:
     assert notices == ["by is called integrator now; former names are read in this version only."]
 
 
-def test_former_command_options_are_read_with_notice(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_former_command_options_are_read_with_notice(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    (tmp_path / "scene").mkdir()
+    monkeypatch.chdir(tmp_path)
     found: list[ReconstructionConfig] = []
 
     def keep(request: ReconstructRequest, **_how: object) -> None:
@@ -111,7 +114,8 @@ def test_former_submitted_options_are_read_with_notice(monkeypatch: pytest.Monke
     found: list[Any] = []
 
     def keep(_api: object, what: Any, **_how: object) -> dict[str, str]:
-        found.append(resolve_options(get_job_kind("reconstruct"), json.loads(json.dumps(what.options))))
+        options = json.loads(json.dumps(what.options))
+        found.append(asyncio.run(resolve_options(get_job_kind("reconstruct"), options)))
         return {"id": "1"}
 
     monkeypatch.setattr("octasplat.workers.cli.remote_jobs.submit", keep)
@@ -127,7 +131,7 @@ def test_former_submitted_options_are_read_with_notice(monkeypatch: pytest.Monke
 def test_former_names_in_the_options_of_a_job_mean_the_same() -> None:
     kind = get_job_kind("reconstruct")
     with collect_notices() as notices:
-        assert resolve_options(kind, FORMER) == EXPECTED
+        assert asyncio.run(resolve_options(kind, FORMER)) == EXPECTED
     assert notices
     stored = EXPECTED.model_dump(mode="json")
     stored |= {"evaluate_background": stored.pop("evaluation_background"), "preset": "paper"}

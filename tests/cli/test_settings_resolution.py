@@ -1,5 +1,6 @@
 """The command, ``submit``, HTTP and Python mean the same by the same settings, or refuse them alike."""
 
+import asyncio
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -87,6 +88,13 @@ def settings_asked_for(draw: st.DrawFn) -> tuple[str, bool, list[str]]:
     return preset, draw(st.booleans()), found
 
 
+@pytest.fixture(autouse=True)
+def scene(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A folder that commands find, as they look for it first."""
+    (tmp_path / "scene").mkdir()
+    monkeypatch.chdir(tmp_path)
+
+
 def by_command(preset: str, materials: bool, given: list[str], monkeypatch: pytest.MonkeyPatch) -> Outcome:
     found: list[ReconstructionConfig] = []
 
@@ -130,7 +138,7 @@ def by_http(options: Mapping[str, Any]) -> Outcome:
 
 
 def _accepted(options: Mapping[str, Any]) -> ReconstructionConfig:
-    found = resolve_options(get_job_kind("reconstruct"), options)
+    found = asyncio.run(resolve_options(get_job_kind("reconstruct"), options))
     stored = json.loads(json.dumps(found.model_dump(mode="json")))
     return ReconstructionConfig.model_validate(stored)
 

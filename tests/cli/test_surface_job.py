@@ -112,6 +112,7 @@ def test_texts_are_read_alike_by_command_and_job(octasplat, tmp_path, name, flag
     with pytest.raises(ValidationError) as refused:
         SURFACE.resolve({name: text})
     sentence = first_error(refused.value).removeprefix(f"{name}: ")
+    (tmp_path / "none.ply").touch()
     done = octasplat("surface", tmp_path / "none.ply", "-o", tmp_path / "a.glb", flag, text)
     assert done.exit_code == 1 and done.stderr == f"Error: {flag}: {sentence}\n"
     joined = ",".join(map(str, value)) if isinstance(value, list) else str(value)

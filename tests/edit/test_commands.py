@@ -131,6 +131,7 @@ def test_edit_refuses_in_one_sentence(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     octasplat("export", "scene.ply", "mesh.ply")
+    (tmp_path / "mesh.fbx").touch()
     before = scene.read_bytes()
     result = octasplat("edit", "scene.ply", *arguments)
     assert result.exit_code == 1
