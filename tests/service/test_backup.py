@@ -80,6 +80,7 @@ async def test_restored_service_continues_jobs(
         made["usage"] = (len(list((backup / "store").rglob("*"))), len(list(backup.glob("tables-*"))))
 
     async def after(http: httpx.AsyncClient, service: Service) -> None:
+        http.headers.pop("Authorization", None)
         assert (await http.get("/v1/jobs")).status_code == 401
         http.headers.update(made["headers"])
         answer = await http.get(f"{made['dataset']}/files/images/a.png")
