@@ -20,6 +20,7 @@ async def test_options_are_refused_with_the_sentence_of_the_command(conninfo: st
         ("material", "set/rough", "--set", "rough=1"),
     )
 
+    (tmp_path / "none.ply").touch()
     async with running_service(conninfo, tmp_path) as (http, service):
         source = await finished(http, service, {"scene.ply": b"ply", "environment.hdr": b"hdr"})
         for kind, path, flag, text in cases:
