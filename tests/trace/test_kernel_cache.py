@@ -116,6 +116,7 @@ def test_confined_process_reads_code_that_it_cannot_write(package: Path, tmp_pat
 
 
 def test_compilation_is_told_once_with_its_times_and_without_the_collector() -> None:
+    gc.enable()  # whatever other tests of this process have left
     told: list[Event] = []
     collecting: list[bool] = []
 
