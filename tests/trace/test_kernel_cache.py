@@ -115,8 +115,11 @@ def test_confined_process_reads_code_that_it_cannot_write(package: Path, tmp_pat
     assert {path: path.read_bytes() for path in code.rglob("*") if path.is_file()} == before
 
 
-def test_compilation_is_told_once_with_its_times_and_without_the_collector() -> None:
-    gc.enable()  # whatever other tests of this process have left
+def test_compilation_is_told_once_with_its_times_and_without_the_collector(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # Code that an earlier run of this test has kept would not be compiled again.
+    monkeypatch.setattr("octasplat.engine.core.kernel_cache.code_folder", lambda _module: tmp_path)
     told: list[Event] = []
     collecting: list[bool] = []
 
