@@ -119,7 +119,7 @@ def test_compilation_is_told_once_with_its_times_and_without_the_collector(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # Code that an earlier run of this test has kept would not be compiled again.
-    monkeypatch.setattr("octasplat.engine.core.kernel_cache.code_folder", lambda _module: tmp_path)
+    monkeypatch.setattr("numba.core.config.CACHE_DIR", str(tmp_path))
     told: list[Event] = []
     collecting: list[bool] = []
 
