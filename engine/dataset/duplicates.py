@@ -78,7 +78,7 @@ def find_duplicates(model: DatasetModel) -> Duplicates:
     alike = _equal_files([view.image_path for view in model.views])
     pairs = [pair for group in alike for pair in itertools.combinations(group, 2)]
     equal = poses.near_pairs(np.array(pairs, np.int64).reshape(-1, 2), EQUAL_SHIFT, EQUAL_TURN_RAD)
-    groups = _merge_overlapping_groups(len(model.views), (*equal, *_near_pictures(model, poses)))
+    groups = _merge_overlapping_groups(len(model.views), (*equal, *_near_pictures(model, poses, set(equal))))
     return Duplicates(groups, len(set(groups) & set(_merge_overlapping_groups(len(model.views), equal))))
 
 
@@ -120,10 +120,11 @@ class _Poses:
         return [(a, b) for a, b in pairs[is_near].tolist()]
 
 
-def _near_pictures(model: DatasetModel, poses: _Poses) -> list[Group]:
-    """Return pairs of views of nearly one pose and nearly one picture."""
+def _near_pictures(model: DatasetModel, poses: _Poses, known: set[Group]) -> list[Group]:
+    """Return pairs of views of nearly one pose and nearly one picture, without those known already."""
     close = cKDTree(poses.centres).query_pairs(NEAR_SHIFT * poses.extent, output_type="ndarray")
-    pairs = poses.near_pairs(close.astype(np.int64), NEAR_SHIFT, NEAR_TURN_RAD)
+    near = poses.near_pairs(close.astype(np.int64), NEAR_SHIFT, NEAR_TURN_RAD)
+    pairs = [pair for pair in near if pair not in known]
     small = {index: _small_picture(model, index) for index in sorted({i for pair in pairs for i in pair})}
     return [(a, b) for a, b in pairs if _rms_difference(small[a], small[b]) <= NEAR_DIFFERENCE]
 

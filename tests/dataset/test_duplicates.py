@@ -44,7 +44,6 @@ def test_equal_files_count_as_one_photograph(tmp_path: Path, make_scene: Callabl
     once: Images = [(f"{index:02d}.png", 0, picture) for index, picture in enumerate(pictures)]
     copies: Images = [(f"{index:02d} (1).png", 0, picture) for index, picture in enumerate(pictures)]
     alone = _open(make_scene(tmp_path / "once", images=once, positions=_ring), tmp_path / "a")
-    # The search for poses places copies a little elsewhere.
     # A search for poses does not place copies at just one spot.
     apart = make_scene(
         tmp_path / "twice",
