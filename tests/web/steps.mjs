@@ -399,7 +399,7 @@ const steps = {
             if (job.every && live) await shot(page, `live_${live}`, false);
         }
         found.looks = looks.map(({ mean }) => mean);
-        await page.selectOption("#relight-by", job.by);
+        await page.selectOption("#relight-integrator", job.by);
         if (job.preview) {
             await page.click("#relight [data-do=preview]");
             await page.waitForSelector("#relight figure.preview:not([hidden])");
