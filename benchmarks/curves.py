@@ -129,18 +129,18 @@ def draw(runs: Sequence[RunCurves], path: Path, x_label: str) -> None:
     pyplot.close(figure)
 
 
-def _draw_run(plot, run: RunCurves, colour: str, since: float) -> None:
+def _draw_run(plot, run: RunCurves, color: str, since: float) -> None:
     lines = (
-        (run.held_out, run.held_out_end, "-", colour, "held out"),
+        (run.held_out, run.held_out_end, "-", color, "held out"),
         (run.trained, run.trained_end, "--", "none", "training rays"),
     )
     for values, end, style, fill, what in lines:
         shown = [(x, y) for x, y in values if x >= since]
         if not shown:
             continue
-        plot.plot(*zip(*shown, strict=True), style, color=colour, label=f"{run.label}, {what}", lw=1.4)
+        plot.plot(*zip(*shown, strict=True), style, color=color, label=f"{run.label}, {what}", lw=1.4)
         if end is not None:
-            plot.plot(shown[-1][0], end, "o", color=colour, mfc=fill, ms=6)
+            plot.plot(shown[-1][0], end, "o", color=color, mfc=fill, ms=6)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

@@ -1,4 +1,4 @@
-"""Ways to give flat Gaussians to Embree, and colours of half the size, on the same rays.
+"""Ways to give flat Gaussians to Embree, and colors of half the size, on the same rays.
 
     python benchmarks/embree_geometry.py [scene.ply]
 
@@ -219,7 +219,7 @@ def geometry(scene: Boxes, origins: np.ndarray, directions: np.ndarray) -> None:
 def storage(scene: Boxes, origins: np.ndarray, directions: np.ndarray) -> None:
     """Packets whose harmonics are float32 or 16-bit integers; the kernels take both.
 
-    The integers are not scaled back, so that their colours mean nothing: a multiplication a basis function.
+    The integers are not scaled back, so that their colors mean nothing: a multiplication a basis function.
     """
     g = scene.gaussians
     rng = np.random.default_rng(0)

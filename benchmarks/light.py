@@ -47,7 +47,7 @@ def stage(samples: int) -> Stage:
     balls = (
         Mirror(),
         Glass(),
-        Metal(colour_srgb=(1, 1, 1), roughness=0.5, multiple_scattering=False),
+        Metal(color_srgb=(1, 1, 1), roughness=0.5, multiple_scattering=False),
         Diffuse(),
     )
     meshes = tuple(

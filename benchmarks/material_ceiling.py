@@ -158,7 +158,7 @@ def tracer_under(
 def picture_from(
     buffer: Buffer, covered: Float32[np.ndarray, "h w"], tracer: PathTracer, samples: int, lift: float
 ) -> Float64[np.ndarray, "h w 3"]:
-    """Linear colours of all pixels that are covered; camera rays meet the true surfaces."""
+    """Linear colors of all pixels that are covered; camera rays meet the true surfaces."""
     y, x = np.nonzero(covered > 0)
     at_y, at_x = nearest_in(buffer.mask, y, x)
     sums = np.zeros((len(y), 3))

@@ -23,7 +23,7 @@ NAMES = ("scene.ply", "scene.splat", "scene.spz", "scene.splats.glb", "scene.usd
 
 
 def random_scene(count: int, sh_degree: int) -> FlatGaussians:
-    """Gaussians of plausible size, opacity and colour, in no order."""
+    """Gaussians of plausible size, opacity and color, in no order."""
     random = np.random.default_rng(0)
 
     def normal(*shape: int) -> np.ndarray:

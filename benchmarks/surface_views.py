@@ -1,4 +1,4 @@
-"""A coloured surface beside the scene that it was made of, at views that neither was trained on.
+"""A colored surface beside the scene that it was made of, at views that neither was trained on.
 
     octasplat surface OUT -o thing.glb --texture-size 2048
     python benchmarks/surface_views.py OUT thing.glb [--pictures FOLDER]
@@ -26,7 +26,7 @@ from octasplat.engine.files import read_mesh, read_scene
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.geometry.imported_mesh import ImportedMesh
 from octasplat.engine.render.image_files import write_png
-from octasplat.engine.render.renderer import background_colour, render_rays
+from octasplat.engine.render.renderer import background_color, render_rays
 from octasplat.engine.render.shots import gaussian_turntable, turntable_cameras
 from octasplat.engine.runs.config import read_config
 from octasplat.engine.runs.run_folder import CONFIG, SCENE, is_run, open_run_dataset, photographs_folder
@@ -66,12 +66,12 @@ class Surface:
             hit = hits.is_hit
             b = hits.barycentrics[hit]
             weights = np.stack([1 - b.sum(axis=1), b[:, 0], b[:, 1]], axis=1)
-            rgb[hit] = self._colours(hits.faces[hit], weights)
+            rgb[hit] = self._colors(hits.faces[hit], weights)
             total += rgb.reshape(total.shape) / len(OFFSETS) ** 2
             covered += float(hit.mean()) / len(OFFSETS) ** 2
         return total, covered
 
-    def _colours(self, faces: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    def _colors(self, faces: np.ndarray, weights: np.ndarray) -> np.ndarray:
         mesh = self._mesh
         if self._texture is not None and mesh.corner_uv is not None:
             uv = (weights[:, :, None] * mesh.corner_uv[faces]).sum(axis=1)
@@ -81,7 +81,7 @@ class Surface:
                 [map_coordinates(self._texture[..., c], at, order=1, mode="nearest") for c in range(3)],
                 axis=1,
             )
-        assert mesh.rgb_linear is not None, "the surface has neither a texture nor colours"
+        assert mesh.rgb_linear is not None, "the surface has neither a texture nor colors"
         linear = mesh.rgb_linear[mesh.triangles[faces]]
         return linear_to_srgb((weights[:, :, None] * linear).sum(axis=1).astype(np.float32))
 
@@ -92,7 +92,7 @@ def views_of(
     """Names, rays and photographs of the held-out views of a run, or turntable views of a file."""
     if not is_run(source):
         cameras = turntable_cameras(gaussian_turntable(gaussians), **TURNTABLE)
-        black = background_colour("black")
+        black = background_color("black")
         return (
             [(f"turn_{k}", camera.rays(), None) for k, camera in enumerate(cameras)],
             TraceSettings(),
@@ -100,13 +100,13 @@ def views_of(
         )
     config = read_config(source / CONFIG)
     dataset = open_run_dataset(photographs_folder(source), source, config, 0, lambda _event: None)
-    colour = background_colour(config.evaluation_background)
+    color = background_color(config.evaluation_background)
     found: list[tuple[str, ImageRays, Picture | None]] = []
     for index in dataset.test_indices:
         rgb, alpha, _ = dataset.view_image(int(index))
         rays = dataset.view_rays(int(index))
-        found.append((Path(dataset.views[index].name).stem, rays, composite_over(rgb, alpha, colour)))
-    return found, config.train.trace, colour
+        found.append((Path(dataset.views[index].name).stem, rays, composite_over(rgb, alpha, color)))
+    return found, config.train.trace, color
 
 
 def drawn_scene(tracer: Tracer, rays: ImageRays, background: Float32[np.ndarray, "3"]) -> Picture:

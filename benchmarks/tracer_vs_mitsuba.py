@@ -98,7 +98,7 @@ class Mitsuba:
         return out, state
 
     def forward(self) -> np.ndarray:
-        """Colours of all rays."""
+        """Colors of all rays."""
         with self.dr.suspend_grad():
             out, _ = self._sample(self.dr.ADMode.Primal, None, None)
         return np.array(out).T

@@ -21,8 +21,8 @@ def striped_ball(count: int = 3000) -> osp.Scene:
     quats = np.stack(
         [1 + normals[:, 0], 0 * normals[:, 0], -normals[:, 2], normals[:, 1]], axis=1
     )  # x to normal
-    colours = np.where(np.sin(8 * normals[:, 1:2]) > 0, [[0.9, 0.2, 0.1]], [[0.9, 0.9, 0.9]])
-    sh = ((colours - 0.5) / 0.2821)[:, None]
+    colors = np.where(np.sin(8 * normals[:, 1:2]) > 0, [[0.9, 0.2, 0.1]], [[0.9, 0.9, 0.9]])
+    sh = ((colors - 0.5) / 0.2821)[:, None]
     return osp.Scene.from_arrays(normals, quats, np.full((count, 2), 0.06), np.full(count, 0.95), sh)
 
 

@@ -73,7 +73,7 @@ def scene() -> FlatGaussians:
 
 
 def assert_right_rows(result: FlatGaussians, *, near: FlatGaussians | None = None) -> None:
-    """Channels are those of their rows, told by colour or, where a file rounds that, by place."""
+    """Channels are those of their rows, told by color or, where a file rounds that, by place."""
     assert len(result) > 0
     rows = result.sh[:, 0, 0].astype(np.int64)
     if near is not None:
@@ -220,7 +220,7 @@ def test_export_to_several_formats_warns_once() -> None:
     paths = [Path("mesh.ply"), Path("mesh.glb"), Path("a.splat"), Path("scene.ply"), Path("mesh.obj")]
     channels, harmonics = dropped_on_export(scene(), paths)
     assert channels.startswith("The formats splat and obj have no place for named channels")
-    assert harmonics.startswith("The formats mesh-ply, glb, splat and obj have one colour")
+    assert harmonics.startswith("The formats mesh-ply, glb, splat and obj have one color")
 
 
 def test_missing_channel_is_zero(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""Display (sRGB-encoded) and linear colour values (IEC 61966-2-1), and values as bytes."""
+"""Display (sRGB-encoded) and linear color values (IEC 61966-2-1), and values as bytes."""
 
 import numpy as np
 from jaxtyping import Float, UInt8
@@ -45,7 +45,7 @@ def composite_over(
     alpha: Float[np.ndarray, "*pixels"],
     background_srgb: Float[np.ndarray, "3"],
 ) -> Float[np.ndarray, "*pixels 3"]:
-    """Composite straight (not premultiplied) colours over a background; all are display values.
+    """Composite straight (not premultiplied) colors over a background; all are display values.
 
     >>> composite_over(np.array([[1.0, 0.0, 0.0]]), np.array([0.25]), np.array([1.0, 1.0, 1.0]))
     array([[1.  , 0.75, 0.75]])

@@ -15,7 +15,7 @@ from typing import IO, Any
 from octasplat.engine.core.compiling import begin_compilation, end_compilation
 from octasplat.engine.core.kernel_folder import PACKAGE, code_folder, source_digest
 
-# Read by numba as it is imported: colouring messages of overloads that do not fit takes time.
+# Read by numba as it is imported: coloring messages of overloads that do not fit takes time.
 os.environ.setdefault("NUMBA_DISABLE_ERROR_MESSAGE_HIGHLIGHTING", "1")
 
 from numba.core.caching import CacheImpl, FunctionCache, _CacheLocator

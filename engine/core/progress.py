@@ -31,8 +31,8 @@ PHASE_TITLES = {
     "settling": "Settling",
     "decimating": "Decimating",
     "unwrapping": "Unwrapping",
-    "colouring": "Colouring",
-    "fitting": "Fitting colours",
+    "coloring": "Coloring",
+    "fitting": "Fitting colors",
 }
 """What is being done at a stage, in a word or two."""
 

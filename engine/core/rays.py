@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float, Float32, Int
 
 AT_INFINITY = -np.inf
-"""Viewer of rays whose colours are those in their own direction."""
+"""Viewer of rays whose colors are those in their own direction."""
 
 
 @dataclass(frozen=True, init=False, eq=False)
@@ -20,7 +20,7 @@ class RayBatch:
     begin at the mirror (:meth:`reflect`), and the ways between a point light and many points are rays from
     the light that end at the points (:meth:`between`). Tracers follow neighbours with one origin together.
 
-    ``t_view_origin`` says where on each ray its viewer stands. Colours that depend on the direction are
+    ``t_view_origin`` says where on each ray its viewer stands. Colors that depend on the direction are
     those in
     the direction from there to a Gaussian's mean, as in programs that draw splats. A camera's viewer is the
     origin (0). Rays that go on from a surface have none there: so close to it the direction to a mean would

@@ -41,7 +41,7 @@ Along a wall 2 m away, the path of 400 photographs a metre apart has an extent o
 class Dataset:
     """Photographs with poses, ready to train on; pixels stay on disk and are mapped into memory.
 
-    Colours are straight display values; world coordinates are COLMAP's. Every method that takes pixels takes
+    Colors are straight display values; world coordinates are COLMAP's. Every method that takes pixels takes
     three arrays: the view, the row ``y`` and the column ``x`` of each pixel.
 
     Attributes:

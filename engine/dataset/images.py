@@ -18,7 +18,7 @@ from octasplat.engine.dataset.image_info import ImageInfo, Storage
 Pixels = np.ndarray[Any, np.dtype[Any]]
 _FLOATS = (oiio.HALF, oiio.FLOAT, oiio.DOUBLE)
 _EXTRA_SAMPLES = 338
-"""The TIFF tag that says what channels beyond the colours are."""
+"""The TIFF tag that says what channels beyond the colors are."""
 
 
 @dataclass(frozen=True)
@@ -52,8 +52,8 @@ def read_image_info(path: Path) -> ImageInfo:
     )
 
 
-def read_stored_colours(path: Path) -> Float32[np.ndarray, "h w 3"]:
-    """Read the colours of an image in the file's own units, e.g. 0 to 65535 for 16 bits.
+def read_stored_colors(path: Path) -> Float32[np.ndarray, "h w 3"]:
+    """Read the colors of an image in the file's own units, e.g. 0 to 65535 for 16 bits.
 
     Raises:
         DatasetError: the file cannot be read to its end.
@@ -61,16 +61,16 @@ def read_stored_colours(path: Path) -> Float32[np.ndarray, "h w 3"]:
     source, spec = open_image(path)
     kind = "float" if spec.format.basetype in _FLOATS else "uint16"
     pixels = read_pixels(source, path, kind)
-    return _colour_channels(pixels, spec, alpha_channel_of(spec, path)).astype(np.float32)
+    return _color_channels(pixels, spec, alpha_channel_of(spec, path)).astype(np.float32)
 
 
 def read_photo(
     path: Path, width_px: int, height_px: int, bits: int, scale: ValueScale | None = None
 ) -> tuple[Pixels, UInt8[np.ndarray, "h w"] | None]:
-    """Read a photograph as straight (not premultiplied) display colours.
+    """Read a photograph as straight (not premultiplied) display colors.
 
     Floating-point formats hold linear light: they are clipped to [0, 1] and sRGB-encoded. A file that is
-    larger than the working size is reduced with an antialiased bicubic filter, on premultiplied colours
+    larger than the working size is reduced with an antialiased bicubic filter, on premultiplied colors
     where it has an alpha channel.
 
     Args:
@@ -81,7 +81,7 @@ def read_photo(
         scale: what the stored values mean, where that is not as the format says.
 
     Returns:
-        Colours (height, width, 3) as uint8 or uint16 over their full range, and alpha or None.
+        Colors (height, width, 3) as uint8 or uint16 over their full range, and alpha or None.
 
     Raises:
         DatasetError: the file cannot be read to its end.
@@ -92,7 +92,7 @@ def read_photo(
     straight = spec.get_int_attribute("oiio:UnassociatedAlpha", 0) == 1
     pixels = read_pixels(source, path, "float" if is_float else "uint8" if is_8_bit else "uint16")
     alpha_channel = alpha_channel_of(spec, path)
-    rgb = _colour_channels(pixels, spec, alpha_channel)
+    rgb = _color_channels(pixels, spec, alpha_channel)
     alpha = None if alpha_channel is None else pixels[..., alpha_channel]
     if scale is not None:
         rgb = np.clip(rgb.astype(np.float32) / np.float32(scale.full), 0.0, None)
@@ -107,27 +107,27 @@ def read_photo(
             rgb = resize(_as_float(rgb), width_px, height_px)
         return _as_bits(rgb, bits), None
 
-    colours = _as_float(rgb)
+    colors = _as_float(rgb)
     coverage = None if alpha is None else np.clip(_as_float(alpha), 0.0, 1.0)
     if coverage is not None and not straight:
-        colours = _unpremultiply_alpha(colours, coverage)
+        colors = _unpremultiply_alpha(colors, coverage)
     if is_float:
-        colours = np.clip(np.nan_to_num(colours, nan=0.0, posinf=1.0, neginf=0.0), 0.0, 1.0)
+        colors = np.clip(np.nan_to_num(colors, nan=0.0, posinf=1.0, neginf=0.0), 0.0, 1.0)
         if scale is None or not scale.is_display:
-            colours = linear_to_srgb(colours)
+            colors = linear_to_srgb(colors)
     if resized and coverage is None:
-        colours = resize(colours, width_px, height_px)
+        colors = resize(colors, width_px, height_px)
     elif resized and coverage is not None:
-        planes = np.concatenate([colours * coverage[..., None], coverage[..., None]], axis=2)
+        planes = np.concatenate([colors * coverage[..., None], coverage[..., None]], axis=2)
         planes = resize(planes, width_px, height_px)
-        # Colours are divided before the filter's overshoot is clipped off alpha, as both overshoot alike.
-        colours = _unpremultiply_alpha(planes[..., :3], planes[..., 3])
+        # Colors are divided before the filter's overshoot is clipped off alpha, as both overshoot alike.
+        colors = _unpremultiply_alpha(planes[..., :3], planes[..., 3])
         coverage = np.clip(planes[..., 3], 0.0, 1.0)
     elif not is_float and straight:
         # Nothing was computed, so the stored values pass through exactly.
         assert alpha is not None
         return _as_bits(rgb, bits), _as_bits(alpha, 8)
-    return _as_bits(colours, bits), None if coverage is None else _as_bits(coverage, 8)
+    return _as_bits(colors, bits), None if coverage is None else _as_bits(coverage, 8)
 
 
 def resize(pixels: Pixels, width_px: int, height_px: int, mode: str = "bicubic") -> Pixels:
@@ -150,7 +150,7 @@ def open_image(path: Path) -> tuple[Any, Any]:
     Raises:
         DatasetError: the file is missing or not an image.
     """
-    # By default OpenImageIO multiplies alpha into the colours of formats that store them straight.
+    # By default OpenImageIO multiplies alpha into the colors of formats that store them straight.
     wish = oiio.ImageSpec()
     wish.attribute("oiio:UnassociatedAlpha", 1)
     source = oiio.ImageInput.open(str(path), wish)
@@ -216,7 +216,7 @@ def _storage_kind(spec: Any, path: Path) -> Storage:
     return "8-bit" if spec.format.basetype in (oiio.UINT8, oiio.INT8) else "16-bit"
 
 
-def _colour_channels(pixels: Pixels, spec: Any, alpha_channel: int | None) -> Pixels:
+def _color_channels(pixels: Pixels, spec: Any, alpha_channel: int | None) -> Pixels:
     names = [name.rsplit(".", 1)[-1].upper() for name in spec.channelnames]
     if all(letter in names for letter in "RGB"):
         picked = [names.index(letter) for letter in "RGB"]
@@ -245,7 +245,7 @@ def _as_bits(values: Pixels, bits: int) -> Pixels:
 
 
 def _unpremultiply_alpha(
-    colours: Float32[np.ndarray, "h w 3"], alpha: Float32[np.ndarray, "h w"]
+    colors: Float32[np.ndarray, "h w 3"], alpha: Float32[np.ndarray, "h w"]
 ) -> Float32[np.ndarray, "h w 3"]:
     divisor = np.where(alpha > 0, alpha, np.float32(1.0))
-    return np.where(alpha[..., None] > 0, colours / divisor[..., None], np.float32(0.0)).astype(np.float32)
+    return np.where(alpha[..., None] > 0, colors / divisor[..., None], np.float32(0.0)).astype(np.float32)

@@ -17,7 +17,7 @@ _WHITE = 250
 """A mask that reaches this value has white in it, whatever else it has."""
 _MAX_LABELS = 32
 """A picture of fewer values than this, none of them white, holds labels rather than shades."""
-_COLOURED = 16
+_COLORED = 16
 """Channels that differ by more than this are no rounding of a grey one."""
 
 
@@ -70,7 +70,7 @@ def read_mask(
 
     Raises:
         DatasetError: the file is not a whole image, has another size than its photograph, holds no value
-            above 1, i.e. uses 1 for white, or says what is valid by colours or by its alpha channel.
+            above 1, i.e. uses 1 for white, or says what is valid by colors or by its alpha channel.
     """
     mask = _read_first_channel(path, image_size_px)
     summary = _summarise_mask(path, mask)
@@ -134,12 +134,12 @@ def _read_first_channel(path: Path, image_size_px: tuple[int, int]) -> UInt8[np.
             raise DatasetError(
                 f"{path} has its mask in the alpha channel; save that channel as a black and white image."
             )
-    colours = pixels[..., [i for i in range(min(pixels.shape[2], 4)) if i != alpha_channel]]
-    if np.ptp(colours, axis=2).max() > _COLOURED:
-        shades = np.unique(colours.reshape(-1, colours.shape[2]), axis=0)
+    colors = pixels[..., [i for i in range(min(pixels.shape[2], 4)) if i != alpha_channel]]
+    if np.ptp(colors, axis=2).max() > _COLORED:
+        shades = np.unique(colors.reshape(-1, colors.shape[2]), axis=0)
         if mask.max() < _VALID or 2 < len(shades) <= _MAX_LABELS:
             raise DatasetError(
-                f"{path} is coloured, as labels are; store valid pixels as white (255) and the others as "
+                f"{path} is colored, as labels are; store valid pixels as white (255) and the others as "
                 "black."
             )
     return mask

@@ -56,7 +56,7 @@ class SparsePoints:
 
     Attributes:
         xyz_world: positions.
-        rgb_srgb: display colours in [0, 1].
+        rgb_srgb: display colors in [0, 1].
         track_lengths: number of observations of each point.
         errors_px: mean reprojection error at the size COLMAP worked with; -1 where it is not known.
         ids: COLMAP's numbers, ascending.

@@ -1,6 +1,6 @@
 """The pixel cache: all photographs of a scene, decoded and reduced, as flat files to be mapped.
 
-``rgb.bin`` holds the colours of all views one after the other, row by row, as uint8 or, if any photograph
+``rgb.bin`` holds the colors of all views one after the other, row by row, as uint8 or, if any photograph
 is deeper, uint16; ``alpha.bin`` and ``mask.bin`` hold one byte per pixel and exist only where
 needed.
 ``pixels.json`` says from which files they were made: by digests of their contents, and by a stamp of their
@@ -44,7 +44,7 @@ class PixelCache:
     """Mapped planes of all views; ``alpha`` and ``mask`` are empty where no view has them.
 
     Attributes:
-        rgb: straight display colours, 3 values per pixel.
+        rgb: straight display colors, 3 values per pixel.
         alpha: 255 where opaque, one value per pixel.
         mask: 255 where valid, one value per pixel.
         offsets: first pixel of every view, and the count of all pixels at the end.

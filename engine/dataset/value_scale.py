@@ -12,7 +12,7 @@ import numpy as np
 
 from octasplat.engine.core.errors import DatasetError
 from octasplat.engine.dataset.image_info import ImageInfo, Storage
-from octasplat.engine.dataset.images import ValueScale, read_stored_colours
+from octasplat.engine.dataset.images import ValueScale, read_stored_colors
 
 _FULL_16_BIT = 65535.0
 _INTEGER_RANGES = (255.0, 1023.0, 4095.0, 16383.0, _FULL_16_BIT)
@@ -67,8 +67,8 @@ def find_value_scales(
 
 
 def _read_values(path: Path) -> _Values:
-    colours = read_stored_colours(path)
-    finite = colours[np.isfinite(colours)]
+    colors = read_stored_colors(path)
+    finite = colors[np.isfinite(colors)]
     positive = finite[finite > 0]
     if len(positive) == 0:
         return _Values(0.0, 0.0, 0.0)

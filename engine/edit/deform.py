@@ -68,7 +68,7 @@ def deform_to(
         corners_world: as :func:`deformation_corners` gave them.
         moved_world: where they are now.
         mirrored: whether space was mirrored, everywhere or around each Gaussian. There the view-dependent
-            colours are mirrored, too, and the normals lie on the mirrored side.
+            colors are mirrored, too, and the normals lie on the mirrored side.
 
     Raises:
         ValueError: a moved point is not finite.

@@ -62,7 +62,7 @@ class Selection(BaseModel):
         return text
 
 
-def read_colour(value: object) -> object:
+def read_color(value: object) -> object:
     """Return linear values of a text: ``#rrggbb`` has display values, ``r,g,b`` linear ones.
 
     Anything else is given back as it is. Raises ValueError where a text is neither.
@@ -80,9 +80,9 @@ def read_colour(value: object) -> object:
 
 _Share = Annotated[float, Field(ge=0, le=1)]
 _Factor = Annotated[FiniteFloat, Field(ge=0)]
-_Colour = Annotated[
+_Color = Annotated[
     tuple[_Share, _Share, _Share],
-    BeforeValidator(read_colour, json_schema_input_type=tuple[_Share, _Share, _Share] | str),
+    BeforeValidator(read_color, json_schema_input_type=tuple[_Share, _Share, _Share] | str),
 ]
 
 
@@ -132,9 +132,9 @@ class _ChannelValues(BaseModel):
 class MaterialValues(_ChannelValues):
     """Values that materials are set to."""
 
-    albedo: _Colour | None = Field(
+    albedo: _Color | None = Field(
         None,
-        description="Base colour: r,g,b from 0 to 1, linear, or a text such as '#ff8000', display values.",
+        description="Base color: r,g,b from 0 to 1, linear, or a text such as '#ff8000', display values.",
     )
     metallic: _Share | None = Field(None, description="0 is matt or glazed, 1 is metal.")
     roughness: _Share | None = Field(None, description="0 is a mirror, 1 is as rough as can be.")
@@ -143,7 +143,7 @@ class MaterialValues(_ChannelValues):
 class MaterialFactors(_ChannelValues):
     """Factors that materials are multiplied by; the products are clamped to [0, 1]."""
 
-    albedo: _Factor | None = Field(None, description="Of the linear base colour.")
+    albedo: _Factor | None = Field(None, description="Of the linear base color.")
     metallic: _Factor | None = Field(None, description="From 0, below 1 less metallic.")
     roughness: _Factor | None = Field(None, description="From 0, below 1 smoother.")
 

@@ -48,8 +48,8 @@ def expression_variables(
     numbers["opacity"] = gaussians.opacities
     for name, array in gaussians.channels.items():
         for k, column in enumerate(column_names(name, array.shape[1])):
-            is_colour = name == ALBEDO and array.shape[1] == 3
-            numbers[f"{name}.{'rgb'[k]}" if is_colour else column] = array[:, k]
+            is_color = name == ALBEDO and array.shape[1] == 3
+            numbers[f"{name}.{'rgb'[k]}" if is_color else column] = array[:, k]
     return numbers
 
 

@@ -57,20 +57,20 @@ def refit_sh(
     sh, rows = after.sh.copy(), np.flatnonzero(chosen)
     for start in range(0, len(rows), _ROWS_PER_BLOCK):
         part = rows[start : start + _ROWS_PER_BLOCK]
-        colours = [
-            _shaded_colours(scene.select(part), directions_world, light, frame) for scene in (before, after)
+        colors = [
+            _shaded_colors(scene.select(part), directions_world, light, frame) for scene in (before, after)
         ]
-        sh[part] += np.einsum("kd,ndc->nkc", solve, colours[1] - colours[0]).astype(np.float32)
+        sh[part] += np.einsum("kd,ndc->nkc", solve, colors[1] - colors[0]).astype(np.float32)
     return replace(after, sh=sh)
 
 
-def _shaded_colours(
+def _shaded_colors(
     gaussians: FlatGaussians,
     directions_world: Float64[np.ndarray, "d 3"],
     light: EnvironmentLevels,
     frame: Float64[np.ndarray, "3 3"],
 ) -> Float64[np.ndarray, "n d 3"]:
-    """Return the display colours of Gaussians seen along directions."""
+    """Return the display colors of Gaussians seen along directions."""
     count, views = len(gaussians), len(directions_world)
     directions = np.tile(directions_world, (count, 1))
     normals = np.repeat(gaussians.rotations[:, :, 0].astype(np.float64), views, axis=0)

@@ -124,13 +124,13 @@ def rotate_environment(
         new_frame: those of the result in the new world.
         turn: rotation from the old world to the new one.
     """
-    from octasplat.engine.shading.kernels.environment_map import map_colours
+    from octasplat.engine.shading.kernels.environment_map import map_colors
 
     height = len(values)
     directions = _texel_directions(height) @ new_frame @ turn
     turned = np.empty((2 * height * height, 3), np.float32)
     texels = np.ascontiguousarray(values).reshape(-1, 3)
-    map_colours(0, len(turned), texels, height, old_frame, directions.astype(np.float32), turned)
+    map_colors(0, len(turned), texels, height, old_frame, directions.astype(np.float32), turned)
     return turned.reshape(height, 2 * height, 3)
 
 

@@ -1,4 +1,4 @@
-"""The pictures of the report: which views to keep, the colours of an error map, images as data URIs."""
+"""The pictures of the report: which views to keep, the colors of an error map, images as data URIs."""
 
 import base64
 import bisect
@@ -27,7 +27,7 @@ MAGMA = np.array(
     ],
     dtype=np.float32,
 )  # fmt: skip
-"""The colours FLIP maps are shown in, at 17 equal steps of the error from 0 to 1."""
+"""The colors FLIP maps are shown in, at 17 equal steps of the error from 0 to 1."""
 
 
 @dataclass(frozen=True)

@@ -180,7 +180,7 @@ def measure_relit(
 
     Args:
         pictures: what is measured.
-        true_srgb: display colours times coverage, and coverage, of the same pictures.
+        true_srgb: display colors times coverage, and coverage, of the same pictures.
         names: map and view of each.
 
     Returns:

@@ -30,7 +30,7 @@ from octasplat.engine.pathtracing.environment import EnvironmentMap
 from octasplat.engine.pathtracing.relighting.path_relighter import Relighter
 from octasplat.engine.render.file_names import unique_render_names
 from octasplat.engine.render.image_files import write_png
-from octasplat.engine.render.renderer import background_colour, front_normals
+from octasplat.engine.render.renderer import background_color, front_normals
 from octasplat.engine.render.supersampling import render_filtered
 from octasplat.engine.shading.protocol import ShadingModel
 from octasplat.engine.trace.factory import make_tracer
@@ -126,16 +126,16 @@ def _render_views(
     background: str,
     measures: GroundTruthMeasures | None,
 ) -> Iterator[RenderedView]:
-    colour = background_colour(background)
+    color = background_color(background)
     for index in dataset.test_indices:
         rgb, alpha, weight = dataset.view_image(int(index))
         rays = dataset.view_rays(int(index))
-        image = render_filtered(tracer, rays, colour, shading_for_view(shading, int(index)), SIDE)
+        image = render_filtered(tracer, rays, color, shading_for_view(shading, int(index)), SIDE)
         if measures is not None:
             image = replace(image, normal_world=front_normals(tracer, rays, image.depth_median))
             view = dataset.views[index]
             measures.add(view.name, image, rays, view.rotation_cam_from_world[2])
-        reference = composite_over(rgb, alpha, colour)
+        reference = composite_over(rgb, alpha, color)
         yield RenderedView(
             name=dataset.views[index].name,
             render=image.rgb_srgb,

@@ -25,7 +25,7 @@ LABELS: Mapping[str, str] = {
 def display_layers(image: RenderedImage) -> dict[str, Float32[np.ndarray, "h w 3"]]:
     """Return the layers of an image as display values, black where alpha is 0.
 
-    World normals go from -1 to 1 as colours from 0 to 1; what is near is bright, from the nearest to the
+    World normals go from -1 to 1 as colors from 0 to 1; what is near is bright, from the nearest to the
     farthest that is seen; albedo and indirect light are encoded, and everything else is shown as it is.
     """
     alpha = image.alpha[..., None]

@@ -26,7 +26,7 @@ from octasplat.engine.pathtracing.environment import EnvironmentMap, environment
 from octasplat.engine.pathtracing.relighting.split_sum_relighter import SplitSumRelighter
 from octasplat.engine.poses.find_poses import read_pose_record
 from octasplat.engine.render.environment_files import read_background_map, read_environment
-from octasplat.engine.render.renderer import background_colour
+from octasplat.engine.render.renderer import background_color
 from octasplat.engine.runs.config import ReconstructionConfig, read_config
 from octasplat.engine.runs.run_folder import (
     BACKGROUND,
@@ -149,7 +149,7 @@ def evaluate_scales(
             dataset=dataset,
             tracer=tracer,
             shading=shading,
-            background_srgb=background_colour(config.evaluation_background),
+            background_srgb=background_color(config.evaluation_background),
             scales=scales,
             rays_across=RAYS_ACROSS,
             on_view=lambda done: progress(done, len(dataset.test_indices)),

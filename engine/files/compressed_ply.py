@@ -1,6 +1,6 @@
 """Compressed PLY of PlayCanvas and SuperSplat: 16 bytes a Gaussian, quantised within chunks of 256.
 
-Element ``chunk`` holds the bounds of positions, ln scales and (in newer files) colours; element ``vertex``
+Element ``chunk`` holds the bounds of positions, ln scales and (in newer files) colors; element ``vertex``
 has four uint32 a Gaussian; an optional element ``sh`` has a byte a higher coefficient, channel-major.
 """
 
@@ -38,10 +38,10 @@ def read(path: Path) -> GaussianCloud:
     }
     chunk = np.arange(len(tables["vertex"])) // CHUNK_SIZE
     rgba = packed["packed_color"]
-    colour = np.stack([(rgba >> shift) & 255 for shift in (24, 16, 8)], axis=1).astype(np.float32) / 255
+    color = np.stack([(rgba >> shift) & 255 for shift in (24, 16, 8)], axis=1).astype(np.float32) / 255
     if "min_r" in (tables["chunk"].dtype.names or ()):
-        colour = _dequantise(tables["chunk"], "{}_{}", "rgb", chunk, colour)
-    sh = sh0_from_rgb(colour)
+        color = _dequantise(tables["chunk"], "{}_{}", "rgb", chunk, color)
+    sh = sh0_from_rgb(color)
     if "sh" in tables:
         sh = np.concatenate([sh, _sh_rest(tables["sh"])], axis=1)
     return GaussianCloud(

@@ -82,7 +82,7 @@ class ExportOptions(ExportChoices):
             behind is hidden in any order of drawing; the blended octagons follow. Our readers pass over the
             former. None draws no cores.
         light_up: GLB: lit by the materials of the scene, for light whose up is this in the world; None writes
-            colours as they are, to be seen without light. What is lit carries no ids.
+            colors as they are, to be seen without light. What is lit carries no ids.
         camera: GLB: a camera to look from.
         turn_xyzw: GLB for viewers, surface: rotation of the root node, which turns the scene upright; None is
             a half turn about x.

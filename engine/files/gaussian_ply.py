@@ -66,7 +66,7 @@ _POSITION = ("x", "y", "z")
 _NORMAL = ("nx", "ny", "nz")
 _SH_DC = ("f_dc_0", "f_dc_1", "f_dc_2")
 _CHANNEL = "octasplat_channel"
-_POINT_COLOURS = ("red", "green", "blue", "alpha")
+_POINT_COLORS = ("red", "green", "blue", "alpha")
 """Beside the harmonics, for viewers of points: they say nothing more."""
 _ROTATION = ("rot_0", "rot_1", "rot_2", "rot_3")
 
@@ -226,9 +226,9 @@ def read_ply_cloud(
     table = read_ply(path, ["vertex"])[1]["vertex"]
     retained = (min(degree, MAX_SH_DEGREE) + 1) ** 2 - 1
     each = (degree + 1) ** 2 - 1
-    names = [f"f_rest_{colour * each + k}" for colour in range(3) for k in range(retained)]
-    colours = columns(table, [*_SH_DC, *names])
-    rest = colours[:, 3:].reshape(len(table), 3, retained).transpose(0, 2, 1)
+    names = [f"f_rest_{color * each + k}" for color in range(3) for k in range(retained)]
+    colors = columns(table, [*_SH_DC, *names])
+    rest = colors[:, 3:].reshape(len(table), 3, retained).transpose(0, 2, 1)
     unnamed = [name for name in vertex.names if name != _FILTER]
     found = select_channel_columns(path, declared_channels(header.comments), unnamed, channels)
     try:
@@ -240,13 +240,13 @@ def read_ply_cloud(
         quats_wxyz=columns(table, _ROTATION),
         log_scales=columns(table, _scale_names(scale_count)),
         opacity_logits=columns(table, ["opacity"])[:, 0],
-        sh=np.ascontiguousarray(np.concatenate([colours[:, None, :3], rest], axis=1)),
+        sh=np.ascontiguousarray(np.concatenate([colors[:, None, :3], rest], axis=1)),
         notes=dropped_sh_message(degree),
         channels=named,
         normal_axis=_normal_axis(dialect, scale_count),
     )
     used = {*_POSITION, *_NORMAL, *_ROTATION, *_SH_DC, "opacity", _FILTER, *_scale_names(scale_count)}
-    used |= {*_POINT_COLOURS, *(column for own in found.values() for column in own)}
+    used |= {*_POINT_COLORS, *(column for own in found.values() for column in own)}
     ignored = [name for name in vertex.names if name not in used and not name.startswith("f_rest_")]
     if ignored:
         cloud = replace(cloud, notes=(*cloud.notes, ignored_properties_message(ignored)))

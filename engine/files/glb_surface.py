@@ -1,4 +1,4 @@
-"""Surfaces as binary glTF: normals, and a texture, materials or the colours of the vertices."""
+"""Surfaces as binary glTF: normals, and a texture, materials or the colors of the vertices."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -25,9 +25,9 @@ SAMPLER = {
 def write_surface(
     mesh: TriangleMesh, path: Path, turn_xyzw: Sequence[float] | None = None
 ) -> tuple[Path, ...]:
-    """Write a surface with normals and with a texture or the colours of its vertices.
+    """Write a surface with normals and with a texture or the colors of its vertices.
 
-    Unlit, unless it has materials: then these are textures beside the base colour's, tangents say how its
+    Unlit, unless it has materials: then these are textures beside the base color's, tangents say how its
     normals lie, and the root node turns the light's up to y and its forward to x, which is how environments
     lie in glTF's viewers and in Blender.
 

@@ -43,7 +43,7 @@ from octasplat.engine.gaussians.rows import concatenate_rows
 from octasplat.engine.gaussians.spherical_harmonics import rotate_sh
 
 EXTENSION = "KHR_gaussian_splatting"
-COLOUR_SPACE = "srgb_rec709_display"
+COLOR_SPACE = "srgb_rec709_display"
 SIMILARITY_TOLERANCE = 1e-4
 """Relative error up to which a node may fail to be a rotation with one scale."""
 
@@ -102,7 +102,7 @@ def _read_cloud(file: GlbFile, attributes: dict[str, int], splats: dict[str, Any
     sh = _read_harmonics(file, attributes)
     notes: tuple[str, ...] = ()
     if splats.get("colorSpace") == "lin_rec709_display":
-        notes = ("Its colours are linear; they were converted, without what depends on the view.",)
+        notes = ("Its colors are linear; they were converted, without what depends on the view.",)
         sh = sh0_from_rgb(linear_to_srgb(0.5 + SH_C0 * sh[:, 0]))
     with np.errstate(divide="ignore", invalid="ignore"):
         opacity = file.array(attributes[f"{EXTENSION}:OPACITY"], np.float32)[:, 0].astype(np.float64)
@@ -196,7 +196,7 @@ class _Attribute:
     rows: Callable[[FlatGaussians], np.ndarray]
 
 
-def _fallback_colours(some: FlatGaussians) -> np.ndarray:
+def _fallback_colors(some: FlatGaussians) -> np.ndarray:
     """Return the fallback of readers of points: linear RGB of the constant harmonic, and opacity."""
     linear = srgb_to_linear(np.clip(some.base_rgb_srgb, 0.0, 1.0))
     return round_to_bytes(
@@ -221,7 +221,7 @@ def _file_attributes(sh_degree: int, widths: Mapping[str, int]) -> tuple[_Attrib
     """Return the attributes of a scene with that degree of harmonics and these channels, in file order."""
     basic = (
         _Attribute("POSITION", "VEC3", FLOAT, 12, lambda some: half_turn_points(some.means_world)),
-        _Attribute("COLOR_0", "VEC4", UNSIGNED_BYTE, 4, _fallback_colours),
+        _Attribute("COLOR_0", "VEC4", UNSIGNED_BYTE, 4, _fallback_colors),
         _Attribute(
             f"{EXTENSION}:ROTATION",
             "VEC4",
@@ -307,7 +307,7 @@ def _gltf_json(scene: FlatGaussians, layout: tuple[_Attribute, ...], origin: Ori
         "extensions": {
             EXTENSION: {
                 "kernel": "ellipse",
-                "colorSpace": COLOUR_SPACE,
+                "colorSpace": COLOR_SPACE,
                 "projection": "perspective",
                 "sortingMethod": "cameraDistance",
             }

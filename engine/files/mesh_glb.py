@@ -1,13 +1,13 @@
 """Meshes as binary glTF: octagons of a scene out, edited meshes in with their ids kept.
 
-Octagons: the format to look at, as it carries colour, opacity and the Gaussian fall-off. Base colour = white
+Octagons: the format to look at, as it carries color, opacity and the Gaussian fall-off. Base color = white
 texture with radial alpha x COLOR_0, so that alpha = opacity * exp(-rho^2 / 2) at every pixel (to the 8 bits
-of the texture). COLOR_0 is float32, as some programs misread 16-bit colours and 8-bit linear colours are too
+of the texture). COLOR_0 is float32, as some programs misread 16-bit colors and 8-bit linear colors are too
 coarse in the dark. Vertices stay in the world frame of COLMAP (y down, z forward); a half turn about x in the
 root node brings them to glTF's (y up). The scene is cut into spatial chunks, each with its own node, because
 viewers sort transparent objects, not triangles.
 
-The lit variant has the base colour of the materials in place of the colour, normals, and second texture
+The lit variant has the base color of the materials in place of the color, normals, and second texture
 coordinates that look metallic and roughness up in an image which holds all pairs: so every Gaussian has its
 own, to 8 bits, though glTF has one material for all. Light falls on it as viewers lay it, so its root node
 turns the light's up to y; it carries no ids, as it is not what edits come from.
@@ -52,7 +52,7 @@ CORES_OF_CHUNKS, CORES_IN_ORDER = 0.3, 0.5
 """From which alpha on octagons are drawn solid for viewers, in chunks and in one order
 (docs/opening/threejs.md)."""
 ATTRIBUTES = {"uv": "TEXCOORD_0", "gid": "_GID", "corner": "_CORNER", "radius": "_RADIUS"}
-ATTRIBUTE_WIDTHS = {"uv": 2, "normal": 3, "colour": 3}
+ATTRIBUTE_WIDTHS = {"uv": 2, "normal": 3, "color": 3}
 ChunkIndices = list[Int[np.ndarray, "_"]]
 
 
@@ -68,7 +68,7 @@ def read(path: Path) -> ImportedMesh:
 
 
 def read_with_materials(path: Path) -> ImportedMesh:
-    """Read the triangles of a GLB with materials, normals and colours.
+    """Read the triangles of a GLB with materials, normals and colors.
 
     Raises:
         SceneFileError: likewise, or an image is missing.
@@ -99,7 +99,7 @@ def _read_triangles(file: GlbFile, *, with_materials: bool) -> tuple[ImportedMes
     vertices: list[np.ndarray] = []
     triangles: list[np.ndarray] = []
     numbers: list[np.ndarray] = []
-    names = ATTRIBUTES | ({"normal": "NORMAL", "colour": "COLOR_0"} if with_materials else {})
+    names = ATTRIBUTES | ({"normal": "NORMAL", "color": "COLOR_0"} if with_materials else {})
     extras: dict[str, list[np.ndarray]] = {key: [] for key in names}
     count = 0
     for matrix, primitive in file.primitives():
@@ -149,7 +149,7 @@ def _read_triangles(file: GlbFile, *, with_materials: bool) -> tuple[ImportedMes
         q=numbers_stated.get(Q_KEY),
         min_opacity=numbers_stated.get(MIN_OPACITY_KEY),
         normals=joined.get("normal"),
-        rgb_linear=joined.get("colour"),
+        rgb_linear=joined.get("color"),
     )
     return mesh, np.concatenate([*numbers, np.zeros(0, np.int32)])
 

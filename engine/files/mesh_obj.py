@@ -1,6 +1,6 @@
 """Meshes as OBJ: octagons of a scene out, surfaces out, edited meshes in.
 
-Octagons: plain geometry for any program, with vertex colours, an MTL and the radial texture beside it. OBJ
+Octagons: plain geometry for any program, with vertex colors, an MTL and the radial texture beside it. OBJ
 has no opacity per vertex, so the Gaussians' own opacities are lost; the texture keeps the fall-off.
 """
 
@@ -37,13 +37,13 @@ from octasplat.engine.geometry.triangle_mesh import TriangleMesh
 LINES_PER_BLOCK = 100_000
 MATERIAL = "octagons"
 POSITION_LINE = "v %.9g %.9g %.9g"
-COLOUR_END = " %.5g %.5g %.5g\n"
+COLOR_END = " %.5g %.5g %.5g\n"
 TEXTURE_LINE = "vt %.6f %.6f\n"
 FACE_LINE = "f %d/%d %d/%d %d/%d\n"
 
 
 def read(path: Path) -> ImportedMesh:
-    """Read positions, texture coordinates and faces of an OBJ; colours, normals and groups are passed over.
+    """Read positions, texture coordinates and faces of an OBJ; colors, normals and groups are passed over.
 
     Raises:
         SceneFileError: the file cannot be read, or a line is not understood.
@@ -52,7 +52,7 @@ def read(path: Path) -> ImportedMesh:
 
 
 def read_with_materials(path: Path) -> ImportedMesh:
-    """Read the triangles of an OBJ with texture coordinates of every corner, vertex colours and materials.
+    """Read the triangles of an OBJ with texture coordinates of every corner, vertex colors and materials.
 
     Raises:
         SceneFileError: likewise, or an image that its MTL names is missing.
@@ -95,8 +95,8 @@ def _read_materials(path: Path, parts: ObjParts, count: int) -> dict[str, Any]:
     if parts.uv and (places >= 0).any():
         table = np.concatenate([flip_v(np.concatenate(parts.uv)), np.full((1, 2), np.nan, np.float32)])
         looks["corner_uv"] = table[places]  # -1 is the last row
-    if sum(map(len, parts.colours)) == count:
-        looks["rgb_linear"] = srgb_to_linear(np.clip(np.concatenate(parts.colours), 0, 1)).astype(np.float32)
+    if sum(map(len, parts.colors)) == count:
+        looks["rgb_linear"] = srgb_to_linear(np.clip(np.concatenate(parts.colors), 0, 1)).astype(np.float32)
     if parts.material_uses:
         known = {name: k for k, name in enumerate(dict.fromkeys(name for _, name in parts.material_uses))}
         materials = read_mtl(path, parts.libraries)
@@ -158,13 +158,13 @@ def _vertex_lines(batch: OctagonBatch) -> str:
     count = len(batch.ids)
     octagons = (POSITION_LINE + "\0") * SIDES * count % tuple(batch.corners_world.reshape(-1).tolist())
     positions = octagons.split("\0")
-    colours = [COLOUR_END % tuple(rgb) for rgb in batch.rgb_srgb.tolist()]
-    vertices = "".join([positions[k] + colours[k // SIDES] for k in range(count * SIDES)])
+    colors = [COLOR_END % tuple(rgb) for rgb in batch.rgb_srgb.tolist()]
+    vertices = "".join([positions[k] + colors[k // SIDES] for k in range(count * SIDES)])
     return vertices + TEXTURE_LINE * (count * SIDES) % tuple(batch.uv.reshape(-1).tolist())
 
 
 def write_surface(mesh: TriangleMesh, path: Path) -> tuple[Path, ...]:
-    """Write a surface; vertex colours stand behind the positions, a texture in an MTL and a PNG beside it.
+    """Write a surface; vertex colors stand behind the positions, a texture in an MTL and a PNG beside it.
 
     Raises:
         OSError: a file cannot be written.
@@ -212,7 +212,7 @@ register(
     Exporter(
         "obj",
         ("*.obj",),
-        "octagon mesh as OBJ with vertex colours, without opacity",
+        "octagon mesh as OBJ with vertex colors, without opacity",
         write_octagons,
         beside=_octagon_files,
         holds_origin=True,

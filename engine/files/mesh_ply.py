@@ -37,7 +37,7 @@ from octasplat.engine.geometry.imported_mesh import (
 from octasplat.engine.geometry.triangle_mesh import TriangleMesh
 
 _POSITION, _NORMAL = ("x", "y", "z"), ("nx", "ny", "nz")
-COLOURS = ("red", "green", "blue")
+COLORS = ("red", "green", "blue")
 PATTERNS = (
     *("mesh.ply", "*.mesh.ply", "*_mesh.ply", "*-mesh.ply"),
     *("octagons.ply", "*.octagons.ply", "*_octagons.ply", "*-octagons.ply"),
@@ -45,7 +45,7 @@ PATTERNS = (
 _FACE_LISTS = ("vertex_indices", "vertex_index")
 VERTEX = [
     *((name, "<f4") for name in (*_POSITION, "s", "t")),
-    *((name, "u1") for name in (*COLOURS, "alpha")),
+    *((name, "u1") for name in (*COLORS, "alpha")),
     *((name, "<f4") for name in ("gid", "corner", "radius")),
 ]
 FACE = np.dtype(list_field("vertex_indices", "i4", 3))
@@ -91,7 +91,7 @@ def read(path: Path) -> ImportedMesh:
 
 
 def read_with_materials(path: Path) -> ImportedMesh:
-    """Read the triangles of a PLY with normals and colours; it has no materials.
+    """Read the triangles of a PLY with normals and colors; it has no materials.
 
     Raises:
         SceneFileError: likewise.
@@ -102,17 +102,17 @@ def read_with_materials(path: Path) -> ImportedMesh:
     uv = mesh.uv
     if uv is None and {"u", "v"} <= names:
         uv = columns(table, ("u", "v"))
-    colours = None
-    if set(COLOURS) <= names:
-        colours = columns(table, COLOURS)
+    colors = None
+    if set(COLORS) <= names:
+        colors = columns(table, COLORS)
         if table.dtype["red"].kind in "iu":
-            colours = colours / np.float32(np.iinfo(table.dtype["red"]).max)
-        colours = srgb_to_linear(np.clip(colours, 0.0, 1.0)).astype(np.float32)
+            colors = colors / np.float32(np.iinfo(table.dtype["red"]).max)
+        colors = srgb_to_linear(np.clip(colors, 0.0, 1.0)).astype(np.float32)
     return replace(
         mesh,
         corner_uv=None if uv is None else flip_v(uv)[mesh.triangles],
         normals=columns(table, _NORMAL) if set(_NORMAL) <= names else None,
-        rgb_linear=colours,
+        rgb_linear=colors,
     )
 
 
@@ -137,7 +137,7 @@ def _find_attribute(table: np.ndarray, name: str) -> Float32[np.ndarray, " v"] |
 def write_octagons(gaussians: FlatGaussians, path: Path, options: ExportOptions) -> tuple[Path, ...]:
     """Write eight vertices and six triangles per Gaussian.
 
-    Per vertex: position (world), texture coordinates ``s t``, display colour and opacity as bytes, and as
+    Per vertex: position (world), texture coordinates ``s t``, display color and opacity as bytes, and as
     floats ``gid`` (number of the Gaussian), ``corner`` (0 to 7), ``radius`` (of the corners, in standard
     deviations) and the Gaussian's channels.
     """
@@ -167,7 +167,7 @@ def _vertex_batches(soup: OctagonSoup, vertex: np.dtype[np.void]) -> Iterator[np
             rows[name] = batch.corners_world[..., axis]
         rows["s"], rows["t"] = batch.uv[..., 0], batch.uv[..., 1]
         rgba = to_bytes(np.concatenate([batch.rgb_srgb, batch.opacities[:, None]], axis=1))
-        for channel, name in enumerate((*COLOURS, "alpha")):
+        for channel, name in enumerate((*COLORS, "alpha")):
             rows[name] = rgba[:, channel, None]
         rows["gid"] = batch.ids[:, None]
         rows["corner"] = np.arange(SIDES)
@@ -184,21 +184,21 @@ def _face_batches(count: int) -> Iterator[np.ndarray]:
 
 
 def write_surface(mesh: TriangleMesh, path: Path) -> tuple[Path, ...]:
-    """Write a surface with its normals and the colours of its vertices, if it has some.
+    """Write a surface with its normals and the colors of its vertices, if it has some.
 
     Raises:
         SceneFileError: the file cannot be written.
     """
-    colours = COLOURS if mesh.rgb_srgb is not None else ()
+    colors = COLORS if mesh.rgb_srgb is not None else ()
     rows = np.empty(
         len(mesh.vertices_world),
-        dtype=[*((name, "<f4") for name in (*_POSITION, *_NORMAL)), *((name, "u1") for name in colours)],
+        dtype=[*((name, "<f4") for name in (*_POSITION, *_NORMAL)), *((name, "u1") for name in colors)],
     )
     vectors = np.concatenate([mesh.vertices_world, mesh.vertex_normals()], axis=1)
     for column, name in enumerate((*_POSITION, *_NORMAL)):
         rows[name] = vectors[:, column]
     if mesh.rgb_srgb is not None:
-        for column, name in enumerate(colours):
+        for column, name in enumerate(colors):
             rows[name] = to_bytes(mesh.rgb_srgb[:, column])
     vertices = PlyWriteElement("vertex", len(rows), rows.dtype, [rows])
     faces = PlyWriteElement("face", len(mesh.faces), FACE, [_face_rows(mesh.faces)])

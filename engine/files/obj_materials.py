@@ -1,7 +1,7 @@
 """The materials of an OBJ: its MTL files, as far as they are understood.
 
 The keys of http://paulbourke.net/dataformats/mtl/ with the extension for physically based rendering (``Pr``,
-``Pm``, ``norm``) that modelling programs write today. Colours are taken as linear, as Blender writes them.
+``Pm``, ``norm``) that modelling programs write today. Colors are taken as linear, as Blender writes them.
 """
 
 import math
@@ -14,7 +14,7 @@ from octasplat.engine.geometry.mesh_material import MeshMaterial, resolve_image
 
 MAX_BYTES = 64 << 20
 NUMBERS = {"Ns", "Ni", "d", "Tr", "Pr", "Pm", "illum"}
-COLOURS = {"Kd", "Ke"}
+COLORS = {"Kd", "Ke"}
 IMAGES = {"map_Kd": "texture", "map_Ke": "emission_texture", "norm": "normal_texture"}
 IGNORED_KEYS = {"Ka", "Ks", "Tf", "Ns", "newmtl", "map_Ka", "map_Ks"}
 """What older programs write into every file, and what has no counterpart."""
@@ -58,30 +58,30 @@ def _parse_entries(text: str) -> list[dict[str, str]]:
 
 def _parse_material(path: Path, entry: dict[str, str]) -> MeshMaterial:
     numbers = {key: _parse_numbers(path, key, entry[key], 1)[0] for key in sorted(NUMBERS & set(entry))}
-    colours: dict[str, tuple[float, float, float]] = {}
-    for key in sorted(COLOURS & set(entry)):
+    colors: dict[str, tuple[float, float, float]] = {}
+    for key in sorted(COLORS & set(entry)):
         red, green, blue = _parse_numbers(path, key, entry[key], 3)
-        colours[key] = (red, green, blue)
+        colors[key] = (red, green, blue)
     found: dict[str, Any] = {}
     for key, field in IMAGES.items():
         if key in entry:
             found[field] = resolve_image(path, _file_name(entry[key]))
     if "texture" in found:
-        colours["Kd"] = (1.0, 1.0, 1.0)  # programs leave a grey here that the image is not meant to have
-    if "emission_texture" in found and not any(colours.get("Ke", ())):
-        colours["Ke"] = (1.0, 1.0, 1.0)
+        colors["Kd"] = (1.0, 1.0, 1.0)  # programs leave a grey here that the image is not meant to have
+    if "emission_texture" in found and not any(colors.get("Ke", ())):
+        colors["Ke"] = (1.0, 1.0, 1.0)
     opacity = numbers.get("d", 1.0 - numbers.get("Tr", 0.0))
     clear = int(numbers.get("illum", 0)) in GLASS_ILLUM_MODELS and ("Ni" in numbers or opacity < 1.0)
-    known = NUMBERS | COLOURS | set(IMAGES) | IGNORED_KEYS
+    known = NUMBERS | COLORS | set(IMAGES) | IGNORED_KEYS
     passed_over = [key for key in entry if key not in known]
     if opacity < 1.0 and not clear:
         passed_over.append(f"opacity {opacity:g}")
     return MeshMaterial(
         entry["newmtl"],
-        colours.get("Kd", (0.6, 0.6, 0.6)),
+        colors.get("Kd", (0.6, 0.6, 0.6)),
         metallic=min(max(numbers.get("Pm", 0.0), 0.0), 1.0),
         roughness=min(max(numbers.get("Pr", 1.0), 0.0), 1.0),
-        emission_linear=colours.get("Ke", (0.0, 0.0, 0.0)),
+        emission_linear=colors.get("Ke", (0.0, 0.0, 0.0)),
         transmission=float(clear),
         ior=numbers.get("Ni", 1.5) if numbers.get("Ni", 1.5) >= 1.0 else 1.5,
         unsupported=tuple(passed_over),

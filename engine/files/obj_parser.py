@@ -33,7 +33,7 @@ class ObjParts:
     vertex_count: int = 0
     uv_count: int = 0
     with_materials: bool = False
-    colours: list[np.ndarray] = field(default_factory=list)
+    colors: list[np.ndarray] = field(default_factory=list)
     libraries: list[str] = field(default_factory=list)
     material_uses: list[tuple[int, str]] = field(default_factory=list)
 
@@ -81,9 +81,9 @@ def parse_block(path: Path, block: bytes, parts: ObjParts) -> None:
         values = _parse_number_rows(path, text.translate(None, b"v"), int(is_position.sum()), "v")
         if values.shape[1] < 3:
             raise SceneFileError(f"{path}: a line 'v' has fewer than three numbers.")
-        parts.positions.append(values[:, :3].copy())  # without the colours behind them
+        parts.positions.append(values[:, :3].copy())  # without the colors behind them
         if parts.with_materials and values.shape[1] >= 6:
-            parts.colours.append(values[:, 3:6].astype(np.float32))
+            parts.colors.append(values[:, 3:6].astype(np.float32))
         parts.vertex_count += len(values)
         for line in text.split(b"\n", DIGIT_LINES)[:DIGIT_LINES]:
             words = line.split()[1:4]

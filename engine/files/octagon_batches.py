@@ -33,7 +33,7 @@ class OctagonBatch:
         corners_world: corners, in world units.
         uv: texture coordinates of the corners; the texture spans sqrt(Q) standard deviations to each side, so
             a fainter Gaussian, whose octagon is smaller, uses less of it.
-        rgb_srgb: colour of the constant harmonic in [0, 1], display values.
+        rgb_srgb: color of the constant harmonic in [0, 1], display values.
         opacities: in (0, 1].
         radii: corner radii in standard deviations.
         normals_world: unit normals, from where the corners run anticlockwise.

@@ -1,7 +1,7 @@
 """The Gaussians of a GLB of octagons, as far as such a file holds them.
 
 Geometry comes from the corners, the radius of an octagon in standard deviations from its texture coordinates,
-colour and opacity from ``COLOR_0``. Harmonics and Gaussians too faint for an octagon are not in the file.
+color and opacity from ``COLOR_0``. Harmonics and Gaussians too faint for an octagon are not in the file.
 """
 
 from collections.abc import Mapping

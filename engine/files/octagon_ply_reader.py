@@ -1,4 +1,4 @@
-"""The Gaussians of a mesh PLY of octagons, as far as such a file holds them: one colour each, in bytes."""
+"""The Gaussians of a mesh PLY of octagons, as far as such a file holds them: one color each, in bytes."""
 
 from pathlib import Path
 
@@ -9,7 +9,7 @@ from octasplat.engine.core.ply_container import columns, read_ply
 from octasplat.engine.files.channel_columns import ChannelChoice, select_channel_columns
 from octasplat.engine.files.encodings import logits_from_bytes, sh0_from_rgb
 from octasplat.engine.files.gaussian_ply import declared_channels
-from octasplat.engine.files.mesh_ply import COLOURS, PATTERNS, VERTEX
+from octasplat.engine.files.mesh_ply import COLORS, PATTERNS, VERTEX
 from octasplat.engine.files.octagon_recovery import (
     edited_octagons_error,
     gaussians_from_octagons,
@@ -23,7 +23,7 @@ from octasplat.engine.gaussians.octagon import SIDES
 from octasplat.engine.gaussians.rows import select_rows
 
 _SIZE = "octasplat_gaussians"
-_ROWS_PER_OCTAGON = (*COLOURS, "alpha", "gid", "radius")
+_ROWS_PER_OCTAGON = (*COLORS, "alpha", "gid", "radius")
 
 
 def read(path: Path, channels: ChannelChoice = "own") -> GaussianCloud:
@@ -41,8 +41,8 @@ def read(path: Path, channels: ChannelChoice = "own") -> GaussianCloud:
         raise SceneFileError(
             f"{path}: its octagons lack the property {', '.join(missing)}; save the mesh with its attributes."
         )
-    if any(table.dtype[name] != np.uint8 for name in (*COLOURS, "alpha")):
-        raise SceneFileError(f"{path}: its colours are not bytes; bring it back with octasplat edit --mesh.")
+    if any(table.dtype[name] != np.uint8 for name in (*COLORS, "alpha")):
+        raise SceneFileError(f"{path}: its colors are not bytes; bring it back with octasplat edit --mesh.")
     if len(table) == 0 or len(table) % SIDES:
         raise edited_octagons_error(path)
     rows = table.reshape(-1, SIDES)
@@ -65,7 +65,7 @@ def read(path: Path, channels: ChannelChoice = "own") -> GaussianCloud:
     stated = int(sizes[0]) if sizes and sizes[0].isdecimal() else 0
     cloud = GaussianCloud(
         means, quats, log_scales, logits_from_bytes(first["alpha"]),
-        sh0_from_rgb(columns(first, COLOURS) / np.float32(255)),
+        sh0_from_rgb(columns(first, COLORS) / np.float32(255)),
         notes=missing_gaussians_notes(stated, len(ids)), channels=named,
     )  # fmt: skip
     return select_rows(cloud, np.argsort(ids, kind="stable"))
@@ -75,7 +75,7 @@ register(
     Importer(
         "mesh-ply",
         PATTERNS,
-        "octagon mesh as it was exported, one colour for each Gaussian",
+        "octagon mesh as it was exported, one color for each Gaussian",
         read,
         is_octagon_ply,
         read_channels=read,

@@ -15,7 +15,7 @@ from octasplat.engine.gaussians.octagon import (
 
 TOLERANCE = 1e-3
 """Octagons further from a regular one than this, as a share of their size, were edited."""
-ONE_COLOUR_NOTE = "It holds one colour of each Gaussian, no harmonics."
+ONE_COLOR_NOTE = "It holds one color of each Gaussian, no harmonics."
 
 
 def gaussians_from_octagons(
@@ -52,8 +52,8 @@ def edited_octagons_error(path: Path) -> SceneFileError:
 def missing_gaussians_notes(stated: int, found: int) -> tuple[str, ...]:
     """Return what a file of octagons lacks of the scene with ``stated`` Gaussians (0 if it does not say)."""
     if stated <= found:
-        return (ONE_COLOUR_NOTE,)
-    return (ONE_COLOUR_NOTE, f"Left out of its octagons were {stated - found:,} fainter Gaussians.")
+        return (ONE_COLOR_NOTE,)
+    return (ONE_COLOR_NOTE, f"Left out of its octagons were {stated - found:,} fainter Gaussians.")
 
 
 def is_octagon_ply(head: bytes) -> bool:

@@ -69,7 +69,7 @@ def find_position_losses(
 
 
 def find_harmonic_losses(format_name: str, scene: FlatGaussians, limit: float) -> tuple[str, ...]:
-    """Return what becomes of view-dependent colours beyond the coefficients that a format holds.
+    """Return what becomes of view-dependent colors beyond the coefficients that a format holds.
 
     Args:
         format_name: of the format.
@@ -80,6 +80,6 @@ def find_harmonic_losses(format_name: str, scene: FlatGaussians, limit: float) -
     if clipped < max(1.0, MIN_REPORTED_FRACTION * len(scene)):
         return ()
     return (
-        f"The format {format_name} holds coefficients of view-dependent colours up to {limit:g}; those of "
+        f"The format {format_name} holds coefficients of view-dependent colors up to {limit:g}; those of "
         f"{clipped:,} of {len(scene):,} Gaussians are larger and will be clipped.",
     )

@@ -72,7 +72,7 @@ def read_metadata(path: Path) -> SceneMetadata:
 
 
 def read_mesh(path: Path, *, with_materials: bool = False) -> ImportedMesh:
-    """Read a PLY, OBJ or GLB mesh; ``with_materials`` asks for materials, normals and colours too.
+    """Read a PLY, OBJ or GLB mesh; ``with_materials`` asks for materials, normals and colors too.
 
     Raises:
         SceneFileError: another suffix, a file that cannot be read, is damaged or compressed, or has vertices

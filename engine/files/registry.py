@@ -62,7 +62,7 @@ class Exporter(Entry):
         missing_requirement: what is missing on this machine to write it, to be read after the file's name,
             or None.
         holds_channels: whether it writes named channels, too.
-        holds_harmonics: whether colours may change with the direction.
+        holds_harmonics: whether colors may change with the direction.
         holds_origin: whether it says where a scene of large coordinates has its origin.
         beside: names the files that are written beside the path, if there are any.
         find_losses: returns what of a scene lies beyond the ranges of the format, one sentence a loss.
@@ -87,7 +87,7 @@ class MeshReader(Entry):
         name: of the format.
         patterns: file names that it takes.
         read: reads all triangles.
-        read_with_materials: reads them with materials, normals and colours too.
+        read_with_materials: reads them with materials, normals and colors too.
     """
 
     noun: ClassVar[str] = "mesh"

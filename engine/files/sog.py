@@ -1,6 +1,6 @@
 """SOG of PlayCanvas: lossless images of quantised parameters with a ``meta.json``, zipped or in a folder.
 
-Version 2 looks scales and colours up in code books; the older layout without a version spreads them between
+Version 2 looks scales and colors up in code books; the older layout without a version spreads them between
 bounds. Positions have 16 bits in sign(x) ln(1 + |x|); higher harmonics are entries of a palette. Written by
 the program splat-transform, where that is.
 """
@@ -159,14 +159,14 @@ def _decode(path: Path, text: bytes, images: Images) -> GaussianCloud:
 
     low, high = rgba(meta.means)[:, :3], rgba(meta.means, 1)[:, :3]
     curved = _dequantise(path, meta.means, (low.astype(np.float64) + 256.0 * high) / 65535.0)
-    colour = rgba(meta.sh0)
+    color = rgba(meta.sh0)
     if meta.version == 2:
         scales = _codebook_values(path, meta.scales, rgba(meta.scales)[:, :3])
-        constant = _codebook_values(path, meta.sh0, colour[:, :3])
-        logits = logits_from_bytes(colour[:, 3])
+        constant = _codebook_values(path, meta.sh0, color[:, :3])
+        logits = logits_from_bytes(color[:, 3])
     else:
         scales = _dequantise(path, meta.scales, rgba(meta.scales)[:, :3] / 255.0).astype(np.float32)
-        both = _dequantise(path, meta.sh0, colour / 255.0).astype(np.float32)
+        both = _dequantise(path, meta.sh0, color / 255.0).astype(np.float32)
         constant, logits = both[:, :3], both[:, 3]
     sh = constant[:, None, :]
     if meta.shN is not None:

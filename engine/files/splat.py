@@ -1,4 +1,4 @@
-""".splat: 32 bytes a Gaussian without a header; colour and opacity are bytes, harmonics are missing."""
+""".splat: 32 bytes a Gaussian without a header; color and opacity are bytes, harmonics are missing."""
 
 from pathlib import Path
 

@@ -32,7 +32,7 @@ from octasplat.engine.files.spz_container import ANTIALIASED, GZIP_MAGIC, MAGIC,
 from octasplat.engine.gaussians.flattening import FLAT_LOG_SCALE, GaussianCloud
 from octasplat.engine.gaussians.model import FlatGaussians
 
-COLOUR_SCALE = 0.15
+COLOR_SCALE = 0.15
 """Constant harmonics h are written as the byte 255 (0.15 h + 0.5)."""
 LOG_SCALE_STEPS = 16.0
 LOG_SCALE_OFFSET = 10.0
@@ -54,12 +54,12 @@ def read(path: Path) -> GaussianCloud:
     file = read_spz(path)
     if file.count == 0:
         raise SceneFileError(f"{path}: holds no Gaussians.")
-    positions, opacities, colours, scales, rotations, harmonics = (
+    positions, opacities, colors, scales, rotations, harmonics = (
         np.frombuffer(stream, np.uint8).reshape(file.count, -1) for stream in file.streams
     )
     retained = (min(file.sh_degree, MAX_SH_DEGREE) + 1) ** 2
     rest = (harmonics.reshape(file.count, -1, 3)[:, : retained - 1].astype(np.float32) - 128.0) / 128.0
-    constant = (colours.astype(np.float32) / 255.0 - 0.5) / COLOUR_SCALE
+    constant = (colors.astype(np.float32) / 255.0 - 0.5) / COLOR_SCALE
     sh = np.concatenate([constant[:, None, :], rest], axis=1).astype(np.float32)
     quats = _decode_xyz(rotations) if file.version == 2 else _decode_smallest_three(rotations)
     notes = [*dropped_sh_message(file.sh_degree)]
@@ -138,7 +138,7 @@ def _pack_block(scene: FlatGaussians, bits: int) -> tuple[bytes, ...]:
     return (
         _pack_positions(scene.means_world.astype(np.float64) * (1 << bits)),
         round_to_bytes(scene.opacities.astype(np.float64) * 255.0).tobytes(),
-        round_to_bytes((scene.sh[:, 0].astype(np.float64) * COLOUR_SCALE + 0.5) * 255.0).tobytes(),
+        round_to_bytes((scene.sh[:, 0].astype(np.float64) * COLOR_SCALE + 0.5) * 255.0).tobytes(),
         round_to_bytes((log_scales.astype(np.float64) + LOG_SCALE_OFFSET) * LOG_SCALE_STEPS).tobytes(),
         _pack_rotations(scene),
         _pack_sh(scene),

@@ -1,6 +1,6 @@
 """The SPZ container (Niantic): one gzip stream in versions 2 and 3, one Zstandard stream an attribute in 4.
 
-Attributes follow each other whole: positions, opacities, colours, scales, rotations, harmonics. The frame is
+Attributes follow each other whole: positions, opacities, colors, scales, rotations, harmonics. The frame is
 y up, z backward; harmonics beyond degree 3 are left to the caller.
 """
 

@@ -24,12 +24,12 @@ def white_with_alpha_png(size: int, q: float) -> bytes:
     """Return the fall-off as alpha of a white RGBA image, as glTF wants it."""
     pixels = np.full((size, size, 4), 255, dtype=np.uint8)
     pixels[..., 3] = to_bytes(radial_alpha(size, q))
-    return _encode_png(pixels, colour_type=6)
+    return _encode_png(pixels, color_type=6)
 
 
 def grey_png(size: int, q: float) -> bytes:
     """Return the fall-off as a grey image, as MTL's ``map_d`` wants it (it takes the luminance)."""
-    return _encode_png(to_bytes(radial_alpha(size, q))[..., None], colour_type=0)
+    return _encode_png(to_bytes(radial_alpha(size, q))[..., None], color_type=0)
 
 
 def material_ramp_png() -> bytes:
@@ -37,7 +37,7 @@ def material_ramp_png() -> bytes:
     steps = np.arange(RAMP_SIZE_PX, dtype=np.uint8)
     pixels = np.full((RAMP_SIZE_PX, RAMP_SIZE_PX, 3), 255, np.uint8)
     pixels[..., 1], pixels[..., 2] = steps[:, None], steps
-    return _encode_png(pixels, colour_type=2)
+    return _encode_png(pixels, color_type=2)
 
 
 def material_ramp_uv(
@@ -60,12 +60,12 @@ def png_bytes(rgb_srgb: UInt8[np.ndarray, "h w 3"]) -> bytes:
         return path.read_bytes()
 
 
-def _encode_png(pixels: UInt8[np.ndarray, "h w c"], colour_type: int) -> bytes:
+def _encode_png(pixels: UInt8[np.ndarray, "h w c"], color_type: int) -> bytes:
     """Return an 8-bit PNG in memory: the image library here writes to named files only."""
     height, width, channels = pixels.shape
     rows = np.zeros((height, 1 + width * channels), dtype=np.uint8)  # each row begins with filter 0: none
     rows[:, 1:] = pixels.reshape(height, -1)
-    header = struct.pack(">IIBBBBB", width, height, 8, colour_type, 0, 0, 0)
+    header = struct.pack(">IIBBBBB", width, height, 8, color_type, 0, 0, 0)
     chunks = [(b"IHDR", header), (b"IDAT", zlib.compress(rows.tobytes(), 9)), (b"IEND", b"")]
     return b"\x89PNG\r\n\x1a\n" + b"".join(
         struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))

@@ -26,7 +26,7 @@ from octasplat.engine.gaussians.flattening import rotate_axis_to_first
 from octasplat.engine.gaussians.model import FLAT_SCALE, FlatGaussians
 
 ROOT, FIELD = "/octasplat", "/octasplat/gaussians"
-COLOUR_SPACE = "srgb_rec709_scene"
+COLOR_SPACE = "srgb_rec709_scene"
 EXTENT_SIGMAS = 3.0
 SCHEMAS = (
     "ParticleFieldPositionAttributeAPI",
@@ -106,7 +106,7 @@ def _write_stage(pxr: dict[str, ModuleType], scene: FlatGaussians, layer: Path, 
     prim = vol.ParticleField.Define(stage, FIELD).GetPrim()
     for schema in SCHEMAS:
         prim.ApplyAPI(getattr(vol, schema))
-    usd.ColorSpaceAPI.Apply(prim).CreateColorSpaceNameAttr(COLOUR_SPACE)
+    usd.ColorSpaceAPI.Apply(prim).CreateColorSpaceNameAttr(COLOR_SPACE)
 
     def attribute(name: str, values: Any) -> None:
         prim.GetAttribute(name).Set(values)
@@ -126,8 +126,8 @@ def _write_stage(pxr: dict[str, ModuleType], scene: FlatGaussians, layer: Path, 
     extent = np.stack([(scene.means_world - reach).min(axis=0), (scene.means_world + reach).max(axis=0)])
     attribute("extent", vt.Vec3fArray.FromNumpy(extent.astype(np.float32)))
     fallback = geom.Gprim(prim)
-    colours = srgb_to_linear(np.clip(scene.base_rgb_srgb, 0.0, 1.0))
-    fallback.CreateDisplayColorPrimvar(geom.Tokens.vertex).Set(vt.Vec3fArray.FromNumpy(colours))
+    colors = srgb_to_linear(np.clip(scene.base_rgb_srgb, 0.0, 1.0))
+    fallback.CreateDisplayColorPrimvar(geom.Tokens.vertex).Set(vt.Vec3fArray.FromNumpy(colors))
     fallback.CreateDisplayOpacityPrimvar(geom.Tokens.vertex).Set(vt.FloatArray.FromNumpy(scene.opacities))
     primvars, kinds = geom.PrimvarsAPI(prim), pxr["Sdf"].ValueTypeNames
     for name, values in scene.channels.items():

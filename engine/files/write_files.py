@@ -63,8 +63,8 @@ def dropped_on_export(
     without = [name for name, exporter in chosen.items() if not exporter.holds_harmonics]
     if gaussians.sh_degree > 0 and without:
         lines.append(
-            f"{_format_list_text(without, 'has', 'have')} one colour for each Gaussian; "
-            "how colours change with the direction will be left out (octasplat export --color "
+            f"{_format_list_text(without, 'has', 'have')} one color for each Gaussian; "
+            "how colors change with the direction will be left out (octasplat export --color "
             "chooses the one)."
         )
     without = [name for name, exporter in chosen.items() if not exporter.holds_origin]
@@ -107,10 +107,10 @@ def surface_files(path: Path, *, textured: bool) -> tuple[Path, ...]:
 def write_surface(mesh: TriangleMesh, path: Path) -> tuple[Path, ...]:
     """Write ``mesh`` as GLB, PLY or OBJ, as its suffix says, and return every file written, ``path`` first.
 
-    GLB: unlit, the colours being those of the photographs with their light; normals are there for who wants
+    GLB: unlit, the colors being those of the photographs with their light; normals are there for who wants
     to light it anew. Its root node turns COLMAP's frame to glTF's. With materials it is lit, and the node
     turns the light's up to glTF's. PLY and OBJ keep the world frame. OBJ
-    with vertex colours writes them behind the positions; with a texture, an MTL and a PNG lie beside it.
+    with vertex colors writes them behind the positions; with a texture, an MTL and a PNG lie beside it.
 
     Raises:
         ConfigError: the suffix does not fit.

@@ -21,7 +21,7 @@ def transform_gaussians(gaussians: FlatGaussians, matrix: Float[np.ndarray, "4 4
     """Return the scene under the affine map x -> M x + t, its harmonics rotated, and mirrored if M mirrors.
 
     Covariances are exact for any invertible M. A map without rotation and scale leaves frames, scales and
-    colours untouched.
+    colors untouched.
 
     Raises:
         ConfigError: the matrix is not finite, not affine or flattens space.

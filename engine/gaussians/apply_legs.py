@@ -34,7 +34,7 @@ def apply_legs(
     """Return Gaussians with new centres, legs and rotated harmonics; ``unmoved`` ones stay bit for bit.
 
     The harmonics turn as the surface does, or all by ``turn`` where the whole map is known. A Gaussian whose
-    new legs have no area at all keeps its old frame, scales and colour.
+    new legs have no area at all keeps its old frame, scales and color.
 
     Args:
         old: the Gaussians before.

@@ -32,7 +32,7 @@ class GaussianCloud:
         quats_wxyz: rotations, not necessarily of unit length.
         log_scales: ln of the standard deviations along all three axes, or along the two in the plane.
         opacity_logits: opacity is their sigmoid; infinite where it is 0 or 1.
-        sh: coefficients of the display colour, coefficient-major, as in
+        sh: coefficients of the display color, coefficient-major, as in
             :class:`octasplat.engine.gaussians.model.FlatGaussians`.
         notes: what the reader of the file left out or had to assume, one sentence each.
         channels: what else is known of each, by name.
@@ -157,7 +157,7 @@ def _valid_mask(cloud: GaussianCloud, path: Path, drop_invalid: bool) -> Bool[np
         "rotation": ~np.isfinite(cloud.quats_wxyz).all(axis=1),
         "scale": bad_scale,
         "opacity": ~np.isfinite(cloud.opacity_logits),
-        "colour": ~np.isfinite(cloud.sh).all(axis=(1, 2)),
+        "color": ~np.isfinite(cloud.sh).all(axis=(1, 2)),
         **{name: ~np.isfinite(array).all(axis=1) for name, array in cloud.channels.items()},
     }
     no_length = (cloud.quats_wxyz == 0).all(axis=1)

@@ -2,8 +2,8 @@
 
 A material is that of "Physically Based Shading at Disney" (Burley 2012,
 https://media.disneyanimation.com/uploads/production/publication_asset/48/asset/s2012_pbs_disney_brdf_notes_v3.pdf)
-cut down to what real-time renderers and glTF share: base colour, metallic and roughness. All values are kept
-as they mean, in [0, 1], not as their logits; the base colour is linear.
+cut down to what real-time renderers and glTF share: base color, metallic and roughness. All values are kept
+as they mean, in [0, 1], not as their logits; the base color is linear.
 """
 
 from collections.abc import Mapping
@@ -18,7 +18,7 @@ ALBEDO, METALLIC, ROUGHNESS = "albedo", "metallic", "roughness"
 MATERIAL_WIDTHS: Mapping[str, int] = {ALBEDO: 3, METALLIC: 1, ROUGHNESS: 1}
 """The channels of a material and their widths, in the order in which they are traced.
 
-``albedo`` is the linear base colour: of the matt ground, and of what a metal reflects head-on. ``roughness``
+``albedo`` is the linear base color: of the matt ground, and of what a metal reflects head-on. ``roughness``
 is perceptual: GGX's alpha is its square.
 """
 AMBIENT = "ambient"

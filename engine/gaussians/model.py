@@ -34,8 +34,8 @@ class FlatGaussians:
             and the in-plane axes r2, r3.
         log_scales: ln of the standard deviations s2, s3 along r2, r3, world units.
         opacity_logits: opacity is their sigmoid.
-        sh: spherical-harmonic coefficients of the display (sRGB-encoded) colour, coefficient-major, with
-            1, 4, 9 or 16 coefficients; colour = max(0, 1/2 + sum_k sh[k] Y_k(ray direction)).
+        sh: spherical-harmonic coefficients of the display (sRGB-encoded) color, coefficient-major, with
+            1, 4, 9 or 16 coefficients; color = max(0, 1/2 + sum_k sh[k] Y_k(ray direction)).
         channels: what else is known of each Gaussian, by name.
     """
 
@@ -76,7 +76,7 @@ class FlatGaussians:
 
     @property
     def base_rgb_srgb(self) -> Float32[np.ndarray, "n 3"]:
-        """Return the constant harmonic's display colour, 1/2 + C0 sh[0], clipped below at 0."""
+        """Return the constant harmonic's display color, 1/2 + C0 sh[0], clipped below at 0."""
         return np.maximum(0.5 + np.float32(SH_C0) * self.sh[:, 0], 0.0).astype(np.float32)
 
     def select(self, index: RowIndex) -> "FlatGaussians":
@@ -92,7 +92,7 @@ class FlatGaussians:
         overwrite_rows(self, index, others)
 
     def with_base_color_only(self) -> "FlatGaussians":
-        """Return the Gaussians, not copied, with the constant colour only and no channels."""
+        """Return the Gaussians, not copied, with the constant color only and no channels."""
         return replace(self, sh=self.sh[:, :1], channels=Channels())
 
     def with_channels(self, channels: Mapping[str, np.ndarray]) -> "FlatGaussians":

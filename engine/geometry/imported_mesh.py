@@ -28,7 +28,7 @@ class ImportedMesh:
         corner_uv: of a mesh read with its looks: texture coordinates of the triangles' corners, (0, 0) at the
             upper left, NaN where there are none; None without any.
         normals: likewise, of the vertices, NaN where there are none; None without any.
-        rgb_linear: likewise, colours of the vertices.
+        rgb_linear: likewise, colors of the vertices.
         material_indices: likewise, row of each triangle in ``materials``, -1 for none.
         materials: likewise, those that the file gives.
     """

@@ -29,13 +29,13 @@ class MeshMaterial:
 
     Attributes:
         name: as the file gives it.
-        rgb_linear: base colour.
-        texture: display colours, multiplied by the base colour.
+        rgb_linear: base color.
+        texture: display colors, multiplied by the base color.
         metallic: share of the metal.
         roughness: perceptual.
         metallic_roughness_texture: roughness in green and metallic in blue, multiplied by the two numbers.
         emission_linear: radiance of its own light.
-        emission_texture: display colours, multiplied by that radiance.
+        emission_texture: display colors, multiplied by that radiance.
         normal_texture: normals in the frame of the texture coordinates.
         normal_scale: factor of their slopes.
         transmission: share of the light that goes through instead of being scattered by the ground.

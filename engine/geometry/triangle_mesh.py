@@ -1,4 +1,4 @@
-"""A triangle mesh with colours, and measurements of it."""
+"""A triangle mesh with colors, and measurements of it."""
 
 from dataclasses import dataclass, replace
 
@@ -10,7 +10,7 @@ from octasplat.engine.core.local_origin import NO_ORIGIN, Origin
 
 @dataclass(frozen=True)
 class MaterialMaps:
-    """Material textures of a lit surface besides its base colour, in the same layout.
+    """Material textures of a lit surface besides its base color, in the same layout.
 
     Attributes:
         occlusion_roughness_metallic: in red the share of the light from all around that arrives, roughness
@@ -34,13 +34,13 @@ class TriangleMesh:
     Attributes:
         vertices_world: positions.
         faces: vertex indices.
-        rgb_srgb: display colours of the vertices in [0, 1]; None before they are baked.
+        rgb_srgb: display colors of the vertices in [0, 1]; None before they are baked.
         uv: texture coordinates of the vertices, (0, 0) at the upper left of the image as in glTF; None
             without a texture.
-        texture_srgb: the texture's display values; None without one. With materials, the base colour's.
+        texture_srgb: the texture's display values; None without one. With materials, the base color's.
         normals_world: unit normals of the vertices where they are not those of the triangles around them, as
             at the seams of a mesh that was cut open; None elsewhere.
-        materials: how it is to be lit; None where its colours have their light in them.
+        materials: how it is to be lit; None where its colors have their light in them.
         origin_world: where the mesh has its origin in the coordinates of its user, see
             :mod:`octasplat.engine.core.local_origin`.
     """

@@ -24,7 +24,7 @@ _LIFT_CPU_SECONDS_PER_POINT = 7.0e-5
 _EVALUATE_CPU_SECONDS_PER_PIXEL = 2.7e-6
 _RENDER_CPU_SECONDS_PER_PIXEL = 1.5e-6
 _EXPORT_CPU_SECONDS_PER_GAUSSIAN = 1.0e-4
-"""For the octagon meshes and the one colour of each Gaussian that they have."""
+"""For the octagon meshes and the one color of each Gaussian that they have."""
 _SURFACE_CPU_SECONDS = 9.0
 """For the small surface, whose size does not depend on the scene."""
 _RENDER_START_CPU_SECONDS = 3.0

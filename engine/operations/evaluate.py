@@ -53,7 +53,7 @@ class EvaluateOptions(Options):
     evaluation_background: Literal["black", "white"] | None = Field(
         None,
         exclude_if=lambda background: background is None,
-        description="Colour behind the scene and behind what masks leave out.  [default: the run's]",
+        description="Color behind the scene and behind what masks leave out.  [default: the run's]",
     )
 
     @model_validator(mode="after")

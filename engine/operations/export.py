@@ -40,13 +40,13 @@ def _several_paths(value: object) -> object:
     return (value,) if isinstance(value, str | os.PathLike) else value
 
 
-_Colour = Literal["cameras", "constant"] | tuple[FiniteFloat, FiniteFloat, FiniteFloat]
+_Color = Literal["cameras", "constant"] | tuple[FiniteFloat, FiniteFloat, FiniteFloat]
 
 
-def _with_direction(colour: _Colour | None) -> _Colour | None:
-    if isinstance(colour, tuple) and not math.hypot(*colour) > 0:
+def _with_direction(color: _Color | None) -> _Color | None:
+    if isinstance(color, tuple) and not math.hypot(*color) > 0:
         raise ValueError("is no direction")
-    return colour
+    return color
 
 
 class _ExportFields(ExportChoices, Options):
@@ -60,13 +60,13 @@ class _ExportFields(ExportChoices, Options):
         "run, of a file 9.21]",
     )
     color: Annotated[
-        _Colour | None,
-        BeforeValidator(read_direction, json_schema_input_type=_Colour | str | None),
+        _Color | None,
+        BeforeValidator(read_direction, json_schema_input_type=_Color | str | None),
         AfterValidator(_with_direction),
         Spelling(metavar="cameras|constant|X,Y,Z"),
     ] = Field(
         None,
-        description="Formats with one colour for each Gaussian: the one that loses least seen from the "
+        description="Formats with one color for each Gaussian: the one that loses least seen from the "
         "photographs' places of a run, or from all around a file; the harmonics' constant part; or the one "
         "seen along a direction.  [default: cameras for a run, constant for a file]",
     )
@@ -83,7 +83,7 @@ class _ExportFields(ExportChoices, Options):
     )
     materials: bool = Field(
         False,
-        description="GLB: base colour, metallic and roughness instead of colours that have their light in "
+        description="GLB: base color, metallic and roughness instead of colors that have their light in "
         "them.",
     )
     up: Annotated[Axis | None, Group("advanced")] = Field(
@@ -195,7 +195,7 @@ def run(
     )
     found = [exporter_for(path, request.format) for path in request.files]
     if request.color is not None and all(exporter.holds_harmonics for exporter in found):
-        message = "colour goes with formats of one colour for each Gaussian and is passed over."
+        message = "color goes with formats of one color for each Gaussian and is passed over."
         progress(Warned(message))
     count = len(request.files)
     gaussians = open_scene(request.source, progress)
@@ -249,7 +249,7 @@ class _ExportPreparation:
                 update={"surface": self._surface, "turn_xyzw": upright_turn(request.source)}
             )
         if not (exporter.holds_harmonics or (request.materials and is_glb)):
-            gaussians = self._baked_colour
+            gaussians = self._baked_color
         else:
             gaussians = self._gaussians
         if exporter.name == VIEWER_FORMAT or (is_glb and request.for_viewers):
@@ -295,19 +295,19 @@ class _ExportPreparation:
         return read_config(source / CONFIG).train.trace.q if known else None
 
     @cached_property
-    def _baked_colour(self) -> "FlatGaussians":
-        """Return the scene with constant colours."""
+    def _baked_color(self) -> "FlatGaussians":
+        """Return the scene with constant colors."""
         import numpy as np
 
-        from octasplat.engine.render.bake_colour import colours_along, with_constant_colour
+        from octasplat.engine.render.bake_color import colors_along, with_constant_color
         from octasplat.engine.runs.baked_scene import BakedScene
         from octasplat.engine.runs.run_folder import is_run
 
         gaussians, source = self._gaussians, self._request.source
-        colour = self._request.color or ("cameras" if is_run(source) else "constant")
-        if colour == "constant" or gaussians.sh_degree == 0:
+        color = self._request.color or ("cameras" if is_run(source) else "constant")
+        if color == "constant" or gaussians.sh_degree == 0:
             return gaussians
-        if colour == "cameras":
+        if color == "cameras":
             return BakedScene(
                 gaussians,
                 source if is_run(source) else None,
@@ -315,7 +315,7 @@ class _ExportPreparation:
                 on_pass=lambda _done, _total: self._on_pass(),
                 on_unknown=lambda text: self._progress(Warned(text)),
             ).gaussians
-        return with_constant_colour(gaussians, colours_along(gaussians, np.array(colour)))
+        return with_constant_color(gaussians, colors_along(gaussians, np.array(color)))
 
 
 OPERATION = Operation(

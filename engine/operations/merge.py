@@ -30,7 +30,7 @@ class MergeOptions(Options):
         None,
         ge=0,
         le=3,
-        description="Degree of the colours' harmonics.  [default: the highest among the scenes]",
+        description="Degree of the colors' harmonics.  [default: the highest among the scenes]",
     )
 
     @model_validator(mode="after")

@@ -54,7 +54,7 @@ class ReconstructOptions(RunSettings, Options):
         None, description="Most Gaussians; 0, the default, asks the photographs' pixels."
     )
     sh_degree: Annotated[int | None, Shortcut("sh_degree"), Spelling(metavar="N")] = Field(
-        None, description="Degree of the spherical harmonics of the colours, 0 to 3."
+        None, description="Degree of the spherical harmonics of the colors, 0 to 3."
     )
     seed: Annotated[int | None, Shortcut("seed"), Spelling(metavar="N")] = Field(
         None, description="Seed of everything random.  [default: 0]"

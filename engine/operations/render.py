@@ -220,14 +220,14 @@ def _stage_files(request: RenderRequest) -> list[Path]:
 def _render_plain(plan: _RenderPlan, progress: EventListener, threads: int) -> tuple[Path, ...]:
     request, source, cameras, shots, output = plan
     from octasplat.engine.render.render_digest import render_digest
-    from octasplat.engine.render.renderer import background_colour
+    from octasplat.engine.render.renderer import background_color
     from octasplat.engine.render.shots import scene_render_fn
     from octasplat.engine.shading.plain import PLAIN_SHADING
     from octasplat.engine.trace.factory import make_tracer
 
     transparent = request.background == "transparent"
-    background = background_colour("black" if transparent else request.background or source.background)
-    learnt = None if request.background else source.learnt  # another colour was asked for, or alpha
+    background = background_color("black" if transparent else request.background or source.background)
+    learnt = None if request.background else source.learnt  # another color was asked for, or alpha
     views = None if cameras is not None else (source.viewpoints, source.near_world)
     finished = output.finished_images(
         render_digest(
@@ -253,13 +253,13 @@ def _render_on_stage(plan: _RenderPlan, progress: EventListener, threads: int) -
     from octasplat.engine.pathtracing.stage.stage_file import stage_identity
     from octasplat.engine.pathtracing.stage_rendering import compile_stage
     from octasplat.engine.render.render_digest import render_digest
-    from octasplat.engine.render.renderer import background_colour
+    from octasplat.engine.render.renderer import background_color
 
     stage = request.staged
     assert stage is not None
     if source.learnt is not None and request.background is None and stage.environment is None:
         progress(Warned(STAGE_LACKS_BACKGROUND))
-    background = background_colour(request.background or source.background)
+    background = background_color(request.background or source.background)
     scene = stage_scene(source, request.stage_folder, background, progress, threads=threads)
     if request.preview:
         compile_stage(stage, scene, shots).preview(shots[0], request.output, progress)

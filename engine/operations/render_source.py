@@ -31,7 +31,7 @@ from octasplat.engine.render.orbit import (
 from octasplat.engine.render.output import RenderOutput, ResumeOptions
 from octasplat.engine.render.path_file import path_cameras
 from octasplat.engine.render.pinhole_camera import PinholeCamera
-from octasplat.engine.render.renderer import background_colour
+from octasplat.engine.render.renderer import background_color
 from octasplat.engine.render.shots import Shot, gaussian_turntable, view_shots
 from octasplat.engine.runs.config import read_config
 from octasplat.engine.runs.run_folder import (
@@ -57,7 +57,7 @@ class RenderSource:
         gaussians: the scene.
         settings: where rays are cut off.
         near_world: distance of the cameras from which on anything is seen.
-        background: display colour behind the scene, by name.
+        background: display color behind the scene, by name.
         viewpoints: where the photographs were taken from.
         max_side: longer side of the photographs in the training, px.
         trained_rad: angle of a pixel of the training.
@@ -263,7 +263,7 @@ def stage_scene(
     Args:
         source: the scene, with the cameras at full size.
         folder: where the names of the stage's files are relative to.
-        background_srgb: display colour behind everything.
+        background_srgb: display color behind everything.
         progress: receives what reading files of the stage loses.
         threads: to use; 0 takes all.
     """
@@ -296,5 +296,5 @@ def open_stage_scene(
         OctasplatError: it cannot be read.
     """
     found = read_render_source(source, progress, dataset=dataset, full_size=True)
-    background = background_colour(found.background)
+    background = background_color(found.background)
     return stage_scene(found, source.parent, background, progress, threads=threads)

@@ -1,4 +1,4 @@
-"""``surface``: one coloured triangle mesh of a scene, in one or several levels of detail."""
+"""``surface``: one colored triangle mesh of a scene, in one or several levels of detail."""
 
 import re
 import shutil
@@ -25,7 +25,7 @@ from octasplat.engine.settings.fields import DatasetFolder, Output, Source, Spel
 from octasplat.engine.surface.options import ExtractionOptions
 
 if TYPE_CHECKING:
-    from octasplat.engine.surface.colour_fit import Picture
+    from octasplat.engine.surface.color_fit import Picture
     from octasplat.engine.surface.extract import ExtractedSurface
 
 MATERIAL_DEFAULTS: Mapping[str, object] = {"texture_size": 1024, "max_triangles": 60_000}
@@ -98,7 +98,7 @@ class SurfaceOptions(ExtractionOptions, Options):
     )
     materials: bool = Field(
         False,
-        description="Base colour, metallic, roughness and normals in textures, to be lit; .glb. Takes 60,000 "
+        description="Base color, metallic, roughness and normals in textures, to be lit; .glb. Takes 60,000 "
         "triangles and a texture of 1,024 pixels where nothing else is said.",
     )
     up: Axis | None = Field(
@@ -129,7 +129,7 @@ class SurfaceOptions(ExtractionOptions, Options):
 
 
 class SurfaceRequest(SurfaceOptions, WritingRequest):
-    """Mesh IN, the folder of a run or a file of Gaussians, into one surface of coloured triangles.
+    """Mesh IN, the folder of a run or a file of Gaussians, into one surface of colored triangles.
 
     Depth is rendered from where the photographs were taken; for a file without photographs, from cameras all
     around, which suits an object but no room. The result lies in the frame of the scene.
@@ -141,12 +141,12 @@ class SurfaceRequest(SurfaceOptions, WritingRequest):
     output: Output = Field(description="A .glb, .ply or .obj file.")
     dataset: DatasetFolder = Field(
         None,
-        description="Take the cameras of the photographs in this folder, and of a run the colours.  "
+        description="Take the cameras of the photographs in this folder, and of a run the colors.  "
         "[default: the cameras that a run keeps; else none]",
     )
     photographs: Annotated[Path | None, Spelling(hidden=True)] = Field(
         None,
-        description="A copy of the photographs that the run was made from, for colours alone; left out if it "
+        description="A copy of the photographs that the run was made from, for colors alone; left out if it "
         "has other poses.",
     )
 
@@ -342,6 +342,4 @@ def _copy_light(light: Path, output: Path) -> Path:
     return place
 
 
-OPERATION = Operation(
-    "surface", "One coloured triangle mesh of a scene.", SurfaceRequest, SurfaceOptions, run
-)
+OPERATION = Operation("surface", "One colored triangle mesh of a scene.", SurfaceRequest, SurfaceOptions, run)

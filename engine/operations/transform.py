@@ -83,7 +83,7 @@ class TransformOptions(Options):
 
 
 class TransformRequest(TransformOptions, SceneRequest):
-    """Move, turn, scale or shear the scene, its view-dependent colours included.
+    """Move, turn, scale or shear the scene, its view-dependent colors included.
 
     Done in this order: matrix, up, scale, rotate as often as given, translate. The cameras and the learnt
     light of a run go along where they can.

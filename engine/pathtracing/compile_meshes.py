@@ -184,11 +184,11 @@ class _MeshBuilder:
         self.rgb_linear.append(rgb_linear)
 
     def surfaces(self) -> SurfaceArrays:
-        coloured = any(rgb is not None for rgb in self.rgb_linear)
-        colours = [
+        colored = any(rgb is not None for rgb in self.rgb_linear)
+        colors = [
             np.ones_like(corners) if rgb is None else np.nan_to_num(rgb, nan=1.0)
             for corners, rgb in zip(self.corners, self.rgb_linear, strict=True)
-            if coloured
+            if colored
         ]
         nothing = np.zeros((0, 3, 3), np.float32)
         return SurfaceArrays(
@@ -196,7 +196,7 @@ class _MeshBuilder:
             np.concatenate([nothing, *self.normals]),
             np.concatenate([np.zeros((0, 3, 2), np.float32), *self.uv]),
             np.concatenate([np.zeros(0, np.int32), *self.rows]),
-            np.concatenate([nothing, *colours]),
+            np.concatenate([nothing, *colors]),
         )
 
 
@@ -253,7 +253,7 @@ def _face_materials(
     for value in np.unique(numbers):
         chosen = numbers == value
         if value < 0:
-            plain = Diffuse(colour_srgb=(1, 1, 1)) if shape.corner_rgb_linear is not None else Diffuse()
+            plain = Diffuse(color_srgb=(1, 1, 1)) if shape.corner_rgb_linear is not None else Diffuse()
             found.append((chosen, ImportedMaterial(plain, {})))
             continue
 

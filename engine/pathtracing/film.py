@@ -1,6 +1,6 @@
 """The film: sums over paths per pixel, and the image that they make.
 
-A pixel has a front layer of Gaussians (premultiplied display colour, transmittance, and the factor that the
+A pixel has a front layer of Gaussians (premultiplied display color, transmittance, and the factor that the
 stage's lights give to it) and linear light behind it; for the reason see
 :mod:`octasplat.engine.pathtracing.kernels.gaussian_layer`.
 
@@ -31,7 +31,7 @@ DenoiseFn = Callable[
     [Float32[np.ndarray, "h w 3"], Float32[np.ndarray, "h w 3"] | None, Float32[np.ndarray, "h w 3"] | None],
     Float32[np.ndarray, "h w 3"],
 ]
-"""Takes noise from a linear image, guided by the colours and normals of surfaces where they are given."""
+"""Takes noise from a linear image, guided by the colors and normals of surfaces where they are given."""
 _NO_FACTORS = np.empty(0, np.float32)
 _LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 _DARK = 1e-6
@@ -147,7 +147,7 @@ class Film:
         )
 
     def denoised(self, denoise: DenoiseFn) -> "Film":
-        """Return the film with its lit part denoised; the Gaussians' own colours stay as they are."""
+        """Return the film with its lit part denoised; the Gaussians' own colors stay as they are."""
         film = copy.copy(self)
         count = np.maximum(self._samples, 1)[:, None]
         if self._mesh_visibility.any():
@@ -174,8 +174,8 @@ class Film:
         surface = _safe_divide(self._front_light, self._front[:, None])
         if lit:
             shade = _safe_divide(self._shade, self._covered(), 1.0)
-            colour = srgb_to_linear(_safe_divide(layer, covered)) * np.maximum(shade, 0.0)
-            layer = np.where(np.abs(shade - 1.0) < 1e-6, layer, covered * linear_to_srgb(colour))
+            color = srgb_to_linear(_safe_divide(layer, covered)) * np.maximum(shade, 0.0)
+            layer = np.where(np.abs(shade - 1.0) < 1e-6, layer, covered * linear_to_srgb(color))
         display = layer + front * linear_to_srgb(surface) + through * linear_to_srgb(light)
         return np.asarray(srgb_to_linear(display))
 

@@ -38,7 +38,7 @@ class GaussianLayers:
         min_transmittance: transmittance at which a ray counts as ended.
         mesh_shadow_tracer: those that cast shadows on meshes; None where none do.
         gaussian_shadow_tracer: those that cast shadows on Gaussians.
-        non_shadow_tracer: those that do not; the light that they keep off is in the colours already.
+        non_shadow_tracer: those that do not; the light that they keep off is in the colors already.
         shadow_bias: Gaussians nearer than this to a lit layer keep nothing off it, world units.
         has_material_surfaces: whether some are surfaces of their materials, with the features of
             :mod:`octasplat.engine.pathtracing.kernels.gaussian_surface`.

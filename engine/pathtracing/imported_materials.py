@@ -77,7 +77,7 @@ def import_material(
         images = {name: image for name, image in fields.items() if image is not None}
         red, green, blue = (value / strength if strength else 1.0 for value in source.emission_linear)
         material = MetallicRoughness(
-            colour_srgb=_to_srgb(source.rgb_linear),
+            color_srgb=_to_srgb(source.rgb_linear),
             metallic=_clamp_unit(source.metallic),
             roughness=_clamp_unit(source.roughness),
             ior=max(ior, 1.0 + 1e-6),

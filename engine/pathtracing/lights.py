@@ -73,14 +73,14 @@ def build_light_arrays(
     areas, cosines = np.zeros(count), np.tile([0.0, 1.0], (count, 1))
     textures, rows = np.full(count, -1, np.int32), np.zeros((count, 3), np.int64)
     for l, light in enumerate(lights):
-        colour = srgb_to_linear(np.array(light.colour_srgb))
+        color = srgb_to_linear(np.array(light.color_srgb))
         adds[l] = light.adds_light
         if not isinstance(light, DirectionalLight):
             positions[l] = light.position
         if not isinstance(light, PointLight):
             axes[l] = np.array(light.direction) / np.linalg.norm(light.direction)
         if isinstance(light, PointLight | SpotLight):
-            kinds[l], rgb[l] = POINT, colour * light.intensity
+            kinds[l], rgb[l] = POINT, color * light.intensity
             if isinstance(light, SpotLight):
                 kinds[l] = SPOT
                 cosines[l] = np.cos(np.radians([light.outer_degrees, light.inner_degrees]))
@@ -88,9 +88,9 @@ def build_light_arrays(
                 areas[l] = np.pi * light.radius**2
                 kinds[l], rgb[l], visibility[l] = SPHERE, rgb[l] / areas[l], light.visible
         elif isinstance(light, DirectionalLight):
-            kinds[l], rgb[l] = DIRECTIONAL, colour * light.irradiance
+            kinds[l], rgb[l] = DIRECTIONAL, color * light.irradiance
         else:
-            kinds[l], rgb[l], visibility[l] = RECTANGLE, colour * light.radiance, light.visible
+            kinds[l], rgb[l], visibility[l] = RECTANGLE, color * light.radiance, light.visible
             sides_u[l], sides_v[l] = rectangle_sides(light, up_world)
             areas[l] = light.width * light.height
     sums, corners, uv = [], [np.zeros((0, 3, 3), np.float32)], [np.zeros((0, 3, 2), np.float32)]

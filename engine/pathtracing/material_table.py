@@ -29,12 +29,12 @@ from octasplat.engine.pathtracing.stage.materials import (
 from octasplat.engine.render.image_files import read_image
 
 MAX_TEXELS = 1 << 27
-TextureUse = Literal["colour", "light", "data"]
-"""What an image holds: display colours, display colours of light, or numbers that are taken as they are."""
+TextureUse = Literal["color", "light", "data"]
+"""What an image holds: display colors, display colors of light, or numbers that are taken as they are."""
 
 _DEFAULTS: dict[str, np.ndarray] = {
     "kinds": np.array(DIFFUSE, np.int32),
-    "colours_linear": np.ones(3),
+    "colors_linear": np.ones(3),
     "metallic": np.array(0.0),
     "roughness": np.array(0.0),
     "iors": np.array(1.5),
@@ -42,7 +42,7 @@ _DEFAULTS: dict[str, np.ndarray] = {
     "substrates": np.array(COUPLED, np.int32),
     "energy_compensation": np.array(1, np.int32),
     "coat_tables": np.array(0, np.int32),
-    "colour_textures": np.array(-1, np.int32),
+    "color_textures": np.array(-1, np.int32),
     "metallic_roughness_textures": np.array(-1, np.int32),
     "normal_textures": np.array(-1, np.int32),
     "normal_scales": np.array(1.0),
@@ -81,7 +81,7 @@ class MaterialTable:
             material: what to add.
             label: what errors call it.
             has_uv: whether the mesh has texture coordinates.
-            uses_vertex_color: whether the colours of the mesh's corners count.
+            uses_vertex_color: whether the colors of the mesh's corners count.
             images: of a mesh file, by the names that the material has for them.
 
         Raises:
@@ -98,16 +98,16 @@ class MaterialTable:
             )
 
         if isinstance(material, Glass):
-            colour = material.tint_srgb
+            color = material.tint_srgb
             row |= {"kinds": GLASS, "iors": material.ior, "absorption": material.absorption}
             row |= {"roughness": material.roughness, "energy_compensation": material.multiple_scattering}
             if material.roughness > 0.0 and material.ior > 1.0:
                 row["coat_tables"] = self._albedo_table_id("rough_dielectric", material.ior)
                 self._albedo_table_id("rough_dielectric", 1.0 / material.ior)
         else:
-            colour = material.colour_srgb
+            color = material.color_srgb
             row["kinds"] = {Diffuse: DIFFUSE, Mirror: MIRROR}.get(type(material), PRINCIPLED)
-        row["colours_linear"] = srgb_to_linear(np.array(colour))
+        row["colors_linear"] = srgb_to_linear(np.array(color))
         if isinstance(material, Metal | Dielectric | MetallicRoughness):
             row["roughness"] = material.roughness
         if isinstance(material, Metal):
@@ -119,7 +119,7 @@ class MaterialTable:
         if isinstance(material, Dielectric | MetallicRoughness):
             row |= {"iors": material.ior, "coat_tables": self._albedo_table_id("coat", material.ior)}
         if isinstance(material, Diffuse | Dielectric | MetallicRoughness):
-            row["colour_textures"] = texture(material.texture, "colour")
+            row["color_textures"] = texture(material.texture, "color")
         if isinstance(material, NormalMapped):
             row["normal_textures"] = texture(material.normal_texture, "data")
             row["normal_scales"] = material.normal_scale

@@ -29,7 +29,7 @@ class MeshShape:
         corner_uv: texture coordinates of the faces' corners, (0, 0) at the upper left, NaN where there are
             none; None without any.
         normals: of the vertices, NaN where they are not known; None without any.
-        corner_rgb_linear: colours of the faces' corners; None without any.
+        corner_rgb_linear: colors of the faces' corners; None without any.
         material_numbers: row of each face in ``materials``, -1 for none; None without any.
         materials: of the file.
     """

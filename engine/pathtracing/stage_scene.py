@@ -35,7 +35,7 @@ class StageScene:
         photographs: of a run, at their full size; None for a file.
         folder: where the names of the stage's files are relative to.
         read_gaussians: reads a file of Gaussians.
-        background_srgb: display colour behind everything.
+        background_srgb: display color behind everything.
         threads: to use; 0 takes all.
         warn: called with a sentence on what of a mesh file is not understood.
         note: called with a sentence on which origin places are.

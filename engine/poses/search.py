@@ -99,7 +99,7 @@ class PoseSearch:
             )
             best = max(best, self._search(thorough=True), key=model_rank)
         self._check_model(best)
-        # One after the other: colours are sums.
+        # One after the other: colors are sums.
         best.extract_colors_for_all_images(self._photographs, num_threads=1)
         names = dict(zip(self._aliases, self._names, strict=True))
         for image in best.images.values():

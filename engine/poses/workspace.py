@@ -33,10 +33,10 @@ def link_photographs(images: Path, names: Sequence[str], folder: Path) -> tuple[
 
 
 def _write_png(photograph: Path, target: Path) -> None:
-    """Write the display colours of a photograph as a PNG of 8 bits."""
+    """Write the display colors of a photograph as a PNG of 8 bits."""
     info = read_image_info(photograph)
-    colours, _ = read_photo(photograph, info.width_px, info.height_px, 8)
-    Image.fromarray(colours).save(target, compress_level=1)
+    colors, _ = read_photo(photograph, info.width_px, info.height_px, 8)
+    Image.fromarray(colors).save(target, compress_level=1)
 
 
 @contextmanager

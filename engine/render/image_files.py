@@ -1,6 +1,6 @@
 """Image files: 8-bit PNG and WebP for display, OpenEXR and RGBE for further processing.
 
-Colours in memory are display values (sRGB-encoded) in [0, 1]. A PNG keeps them as they are. An EXR holds, as
+Colors in memory are display values (sRGB-encoded) in [0, 1]. A PNG keeps them as they are. An EXR holds, as
 its readers expect, linear light: ``exr_layers`` converts.
 """
 
@@ -17,7 +17,7 @@ from octasplat.engine.core.errors import DatasetError, OutputError
 from octasplat.engine.core.writing import atomic_replace
 
 _RAW_CONFIG = "oiio:UnassociatedAlpha"
-"""Keeps OpenImageIO from multiplying or dividing colours by alpha on its own."""
+"""Keeps OpenImageIO from multiplying or dividing colors by alpha on its own."""
 _FIXED_TIMESTAMP = "1970:01:01 00:00:00"
 """Else OpenImageIO notes the time in an EXR, and the same picture would have other bytes each time."""
 
@@ -35,7 +35,7 @@ def exr_layers(
     Args:
         rgb_srgb: The render, composited on display values; it becomes linear R, G, B as displayed, that is,
             with its background and not divided by alpha.
-        transparent: The render is over black, which stands for nothing: R, G, B become linear colours
+        transparent: The render is over black, which stands for nothing: R, G, B become linear colors
             multiplied by alpha, as EXR has them, so that other programs can lay them over anything.
         alpha: Becomes A.
         depth: Distance in scene units; becomes Z.
@@ -66,7 +66,7 @@ def write_png(
 
     Args:
         path: Where to.
-        rgb_srgb: Straight colours, as PNG defines them: not multiplied by alpha. A render over black is
+        rgb_srgb: Straight colors, as PNG defines them: not multiplied by alpha. A render over black is
             multiplied; divide it by its alpha first if both are to be written.
         alpha: Coverage in [0, 1]; ``None`` writes an opaque image.
 

@@ -186,6 +186,6 @@ def pixel_jitter(pixels: Int64[np.ndarray, " r"], sample: int) -> Float64[np.nda
     return (hashed_uniforms(pixels.astype(np.uint64)) + sample * STEPS[:, None]) % 1.0
 
 
-def background_colour(name: str) -> Float32[np.ndarray, "3"]:
-    """Return the colour called ``black`` or ``white``."""
+def background_color(name: str) -> Float32[np.ndarray, "3"]:
+    """Return the color called ``black`` or ``white``."""
     return np.full(3, 1.0 if name == "white" else 0.0, np.float32)

@@ -142,12 +142,12 @@ def scene_render_fn(
     """Return the function that renders a shot of a scene to a file.
 
     ``.exr`` gets linear R, G, B, alpha A, the expected distance Z (0 where nothing is) and the world normal
-    N.x, N.y, N.z; anything else gets 8-bit display colours.
+    N.x, N.y, N.z; anything else gets 8-bit display colors.
 
     Args:
         tracer: with the scene built.
-        background: display colour behind the scene.
-        transparent: PNG get straight colours and alpha, EXR linear ones multiplied by alpha; the background
+        background: display color behind the scene.
+        transparent: PNG get straight colors and alpha, EXR linear ones multiplied by alpha; the background
             should be black.
         trained_rad: angle of a pixel of the training views; larger pixels get several rays, so that what is
             smaller than they neither sparkles nor breaks up. 0 where it is not known: one ray each.

@@ -11,7 +11,7 @@ from octasplat.engine.core.color import linear_to_srgb
 from octasplat.engine.core.rays import ImageRays
 from octasplat.engine.render.renderer import (
     RenderedImage,
-    background_colour,
+    background_color,
     render_rays,
     shade_layer,
     tile_order,
@@ -63,7 +63,7 @@ def pixel_means(
     lowest, highest = np.full((*size, 3), np.inf, np.float32), np.zeros((*size, 3), np.float32)
     for number, (across, down) in enumerate(_subpixel_offsets(side)):
         part(number / (2 * side**2))
-        found = render_rays(tracer, image.shifted(across, down), background_colour("black"), shading, number)
+        found = render_rays(tracer, image.shifted(across, down), background_color("black"), shading, number)
         light += found.alpha[..., None] * found.layers[LINEAR] / side**2
         coverage += found.alpha / side**2
         np.minimum(lowest, found.rgb_srgb, out=lowest)
@@ -117,7 +117,7 @@ def render_averaged(
     shading: ShadingModel,
     side: int,
 ) -> RenderedImage:
-    """Return an image whose display colours and alpha are means over ``side`` x ``side`` rays per pixel.
+    """Return an image whose display colors and alpha are means over ``side`` x ``side`` rays per pixel.
 
     That is what making a larger picture smaller gives. Everything else is that of the pixels' centres.
     """
@@ -141,7 +141,7 @@ def render_filtered(
     shading: ShadingModel,
     side: int,
 ) -> RenderedImage:
-    """Return an image whose colours and alpha are filtered as a photograph's pixels collect them.
+    """Return an image whose colors and alpha are filtered as a photograph's pixels collect them.
 
     Everything else is that of the centres of the pixels.
     """

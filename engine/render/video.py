@@ -133,7 +133,7 @@ class VideoWriter:
         return process.wait()
 
     def _ffmpeg_command(self, target: Path) -> list[str]:
-        """Return ffmpeg's arguments: raw RGB in, H.264 out, with the colour space stated in the file."""
+        """Return ffmpeg's arguments: raw RGB in, H.264 out, with the color space stated in the file."""
         size = f"{self._width + self._width % 2}x{self._height + self._height % 2}"
         return [
             imageio_ffmpeg.get_ffmpeg_exe(), "-y", "-loglevel", "error",

@@ -10,7 +10,7 @@ from jaxtyping import Int64
 from octasplat.engine.core.errors import OctasplatError
 from octasplat.engine.core.rays import ImageRays
 from octasplat.engine.gaussians.model import FlatGaussians
-from octasplat.engine.render.bake_colour import fit_colours_to_cameras, with_constant_colour
+from octasplat.engine.render.bake_color import fit_colors_to_cameras, with_constant_color
 from octasplat.engine.render.shots import view_shots
 from octasplat.engine.runs.config import read_config
 from octasplat.engine.runs.run_folder import CONFIG, run_min_view_distance, run_viewpoints
@@ -27,12 +27,12 @@ class BakedScene:
 
     Args:
         gaussians: the scene.
-        run: the folder of the run that it is of; its training views are those for which the colours lose
+        run: the folder of the run that it is of; its training views are those for which the colors lose
             least. None takes cameras all around.
         threads: to use; 0 takes all.
         on_pass: called with (passes done, total); it may raise to stop.
         on_unknown: called with a sentence if the cameras of the run are not known any more, so that the
-            colours of the constant harmonics stay.
+            colors of the constant harmonics stay.
     """
 
     def __init__(
@@ -58,11 +58,11 @@ class BakedScene:
             try:
                 settings, images = _of_run(self._run)
             except OctasplatError as error:
-                self._on_unknown(f"The one colour of each Gaussian is the constant harmonic: {error}")
-                return with_constant_colour(self._gaussians, self._gaussians.base_rgb_srgb)
+                self._on_unknown(f"The one color of each Gaussian is the constant harmonic: {error}")
+                return with_constant_color(self._gaussians, self._gaussians.base_rgb_srgb)
         tracer = make_tracer(settings, threads=self._threads)
-        colours = fit_colours_to_cameras(self._gaussians, tracer, images, on_pass=self._on_pass)
-        return with_constant_colour(self._gaussians, colours)
+        colors = fit_colors_to_cameras(self._gaussians, tracer, images, on_pass=self._on_pass)
+        return with_constant_color(self._gaussians, colors)
 
 
 def _of_run(run: Path) -> tuple[TraceSettings, Sequence[Callable[[], ImageRays]]]:

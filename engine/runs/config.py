@@ -41,7 +41,7 @@ class ReconstructionConfig(RunSettings):
     def _default_evaluation_background(cls, values: Any) -> Any:
         """Set the background of the evaluation, if it is not given, to that of the training.
 
-        Backgrounds that are no fixed colour are evaluated on black.
+        Backgrounds that are no fixed color are evaluated on black.
         """
         if not isinstance(values, Mapping):
             return values

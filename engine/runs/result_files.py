@@ -44,7 +44,7 @@ OCTAGONS_PLY = ResultFile(
 OCTAGONS_OBJ = ResultFile(
     "octagons.obj",
     "obj",
-    "Blender, MeshLab, most 3D programs: for editing, geometry and colours without opacity",
+    "Blender, MeshLab, most 3D programs: for editing, geometry and colors without opacity",
     "mesh.obj",
 )
 OCTAGONS_GLB = ResultFile(

@@ -28,7 +28,7 @@ from octasplat.engine.runs.run_folder import (
     run_viewpoints,
 )
 from octasplat.engine.shading.exposure import ExposureModel
-from octasplat.engine.surface.colour_fit import Picture
+from octasplat.engine.surface.color_fit import Picture
 from octasplat.engine.surface.depth_cameras import cameras_around, photograph_cameras
 from octasplat.engine.trace.protocol import TraceSettings
 
@@ -88,7 +88,7 @@ def training_photographs(
     config = read_config(source / CONFIG)
     if config.train.materials.learn:
         return ()
-    instead = "Colours are those that the scene shows, not those of photographs"
+    instead = "Colors are those that the scene shows, not those of photographs"
     try:
         folder, model = photographs_folder(source, dataset or copy), found_model_folder(source)
     except DatasetError as error:
@@ -121,7 +121,7 @@ def _check_same_poses(source: Path, folder: Path, found: ViewsRecord) -> None:
     if (source / VIEWS).exists() and not read_views(source / VIEWS).is_of_same_world(found):
         raise DatasetError(
             f"{folder} is not what {source} was made from: its photographs have other names or poses; name "
-            "the right folder, or use --no-fit to take no colours from them."
+            "the right folder, or use --no-fit to take no colors from them."
         )
 
 

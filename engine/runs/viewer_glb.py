@@ -44,7 +44,7 @@ def prepare_for_viewers(
     camera of a training view goes with it, and the scene is turned upright, its front to the viewer.
 
     Args:
-        gaussians: the scene, with constant colours.
+        gaussians: the scene, with constant colors.
         source: the folder of its run; of a file, no cameras are known, and all of it is written in chunks.
         options: how else to write it.
         extent: whether to write all of it, or what was photographed.

@@ -1,7 +1,7 @@
-"""What is infinitely far away: a map of colours in all directions, learnt behind the Gaussians.
+"""What is infinitely far away: a map of colors in all directions, learnt behind the Gaussians.
 
 The sky has no depth: Gaussians that are to show it stand somewhere in the air, and every photograph that was
-not trained on sees them from the side. Here what shines through them all is a map's colour instead. As
+not trained on sees them from the side. Here what shines through them all is a map's color instead. As
 everywhere these are display values, mixed as such.
 """
 
@@ -16,7 +16,7 @@ from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.shading.adam_map import adam_update, smoothness_gradient
 from octasplat.engine.shading.environment_frame import environment_frame
 from octasplat.engine.shading.environment_levels import solid_angles
-from octasplat.engine.shading.kernels.environment_map import add_to_texels, map_colours
+from octasplat.engine.shading.kernels.environment_map import add_to_texels, map_colors
 from octasplat.engine.shading.plain import PLAIN_SHADING
 from octasplat.engine.shading.protocol import ShadedRays, ShadingGradients, ShadingModel, TracedRays
 from octasplat.engine.trace.protocol import GaussianGradients, Tracer
@@ -29,7 +29,7 @@ _STATE = ("rgb_srgb", "first", "second", "sums", "steps")
 
 
 class LearnedBackground:
-    """Composite the colours of another model over a learnt map.
+    """Composite the colors of another model over a learnt map.
 
     Follows :class:`octasplat.engine.shading.protocol.ShadingModel`.
 
@@ -87,14 +87,14 @@ class LearnedBackground:
         self.rgb_srgb = np.clip(rgb_srgb, 0, 1).astype(np.float32)
 
     def lookup(self, directions_world: Float32[np.ndarray, "r 3"]) -> Float32[np.ndarray, "r 3"]:
-        """Return display colours of unit directions, bilinear between texels."""
+        """Return display colors of unit directions, bilinear between texels."""
         height = len(self.rgb_srgb)
-        colours = np.empty((len(directions_world), 3), np.float32)
+        colors = np.empty((len(directions_world), 3), np.float32)
         run_ranges(
-            map_colours, threads_in_use(), len(colours),
-            self.rgb_srgb.reshape(-1, 3), height, self.frame, directions_world, colours,
+            map_colors, threads_in_use(), len(colors),
+            self.rgb_srgb.reshape(-1, 3), height, self.frame, directions_world, colors,
         )  # fmt: skip
-        return colours
+        return colors
 
     def features(self, gaussians: FlatGaussians) -> Float32[np.ndarray, "n f"] | None:
         """Return the features of the inner model."""
@@ -105,7 +105,7 @@ class LearnedBackground:
         self.inner.on_rebuild(gaussians, tracer, training_progress=training_progress)
 
     def shade(self, traced: TracedRays) -> ShadedRays:
-        """Return the inner model's colours over those of the map; nothing stays transparent."""
+        """Return the inner model's colors over those of the map; nothing stays transparent."""
         inner = self.inner.shade(traced)
         background_srgb = self.lookup(traced.rays.directions_world)
         rgb = inner.rgb_srgb + inner.transmittance[:, None] * background_srgb
@@ -118,14 +118,14 @@ class LearnedBackground:
         by_rgb: Float32[np.ndarray, "r 3"],
         by_transmittance: Float32[np.ndarray, " r"],
     ) -> ShadingGradients:
-        """Return gradients by what the inner model shaded and by the map's colours along the rays."""
+        """Return gradients by what the inner model shaded and by the map's colors along the rays."""
         assert isinstance(shaded.ctx, tuple)
         inner, background_srgb = shaded.ctx
         through = (by_rgb * background_srgb).sum(axis=1, dtype=np.float32)
         below = self.inner.backward(traced, inner, by_rgb, through)
         by_map = {
             "background.directions": traced.rays.directions_world,
-            "background.by_colours": inner.transmittance[:, None] * by_rgb,
+            "background.by_colors": inner.transmittance[:, None] * by_rgb,
         }
         return ShadingGradients(below.trace, below.recorded_traces, {**below.parameters, **by_map})
 
@@ -136,7 +136,7 @@ class LearnedBackground:
             len(self.sums),
             self.frame,
             parameters["background.directions"],
-            parameters["background.by_colours"],
+            parameters["background.by_colors"],
             self.sums.reshape(-1, 3),
         )
 
@@ -148,7 +148,7 @@ class LearnedBackground:
         *,
         training_progress: float,
     ) -> None:
-        """Count an iteration, and take a step of Adam if it is time; colours stay what a screen can show."""
+        """Count an iteration, and take a step of Adam if it is time; colors stay what a screen can show."""
         self.inner.step(gaussians, gradients, parameters, training_progress=training_progress)
         self.accumulate(parameters)
         self.steps += 1

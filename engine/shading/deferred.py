@@ -57,7 +57,7 @@ class ShadingContext:
         gbuffer: blended materials, normals and positions of the ``p`` shaded points.
         surface: the points as they were shaded.
         linear: their radiance.
-        display: their colours as shown.
+        display: their colors as shown.
         incident: light along reflected directions; None where none was traced.
         ramp: share of the picture that is shaded, not taken from the harmonics.
     """
@@ -72,7 +72,7 @@ class ShadingContext:
 
 
 class DeferredShading:
-    """Compute colours from materials, normals and an environment; follows the protocol of shading models.
+    """Compute colors from materials, normals and an environment; follows the protocol of shading models.
 
     The materials themselves are channels of the Gaussians, stepped by their optimiser. Another recipe is a
     subclass that overrides the steps in which it differs.
@@ -83,7 +83,7 @@ class DeferredShading:
         one_sided: whether normals point outwards, so that only one side of each Gaussian is lit.
 
     Attributes:
-        harmonics_are_shaded: whether the harmonics learn the shaded colours, so that they can be computed
+        harmonics_are_shaded: whether the harmonics learn the shaded colors, so that they can be computed
             from materials and light.
         light: the environment.
         frame: its right, up and forward in the world, as rows.
@@ -217,7 +217,7 @@ class DeferredShading:
         return radiance
 
     def shade(self, traced: TracedRays) -> ShadedRays:
-        """Return display colours, shaded as far as the ramp from the harmonics to that has come."""
+        """Return display colors, shaded as far as the ramp from the harmonics to that has come."""
         ramp, result = self.settings.shading_ramp(traced.training_progress), traced.result
         if ramp == 0:
             return ShadedRays(result.rgb_srgb, result.transmittance)
@@ -361,19 +361,19 @@ class DeferredShading:
         return RayPairIncidentLight.trace(traced, split, gbuffer, reflection_tracer, settings)
 
     def _to_display(self, linear: Float64[np.ndarray, "p 3"]) -> Float64[np.ndarray, "p 3"]:
-        """Return the colours with which radiance is shown."""
+        """Return the colors with which radiance is shown."""
         return linear_to_srgb(np.minimum(linear, 1.0))
 
     def _display_backward(
         self, linear: Float64[np.ndarray, "p 3"], by_display: Float64[np.ndarray, "p 3"]
     ) -> Float64[np.ndarray, "p 3"]:
-        """Return gradients by radiance from those by the colours with which it is shown."""
+        """Return gradients by radiance from those by the colors with which it is shown."""
         by_linear = by_display * srgb_derivative(linear)
         by_linear[(linear >= 1) & (by_linear < 0)] = 0.0  # no photograph is whiter than white
         return by_linear
 
     def _unshaded_part(self, traced: TracedRays, ctx: ShadingContext) -> Float32[np.ndarray, "l 3"]:
-        """Return what the harmonics add to the colours of each layer."""
+        """Return what the harmonics add to the colors of each layer."""
         return ctx.depth_layers.results.rgb_srgb * np.float32(1 - ctx.ramp)
 
     def _unshaded_part_backward(
@@ -384,9 +384,9 @@ class DeferredShading:
         by_rgb: Float32[np.ndarray, "r 3"],
         by_material: Float64[np.ndarray, "p 5"],
     ) -> Float32[np.ndarray, "l 3"]:
-        """Return gradients by the colours of the harmonics; those by materials are added to ``by_material``.
+        """Return gradients by the colors of the harmonics; those by materials are added to ``by_material``.
 
-        Once the harmonics add nothing any more, they learn the shaded colours.
+        Once the harmonics add nothing any more, they learn the shaded colors.
         """
         if ctx.ramp < 1:
             return ctx.depth_layers.expand(by_rgb * np.float32(1 - ctx.ramp))

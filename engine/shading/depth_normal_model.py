@@ -1,4 +1,4 @@
-"""A model whose scene is to become one surface: normals agree with depths, whatever colours say.
+"""A model whose scene is to become one surface: normals agree with depths, whatever colors say.
 
 Each Gaussian is flat and has a normal; what the depths of neighbouring rays span has one, too. Photographs
 alone let the two differ, so that a surface made of the depths is rough. Follows the depth-normal consistency

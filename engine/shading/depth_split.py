@@ -1,6 +1,6 @@
 """Rays that show two surfaces, one behind the edge of the other, parted so that each is shaded by itself.
 
-The photograph of an edge is the mean of two colours. Materials and normals that are blended over both
+The photograph of an edge is the mean of two colors. Materials and normals that are blended over both
 surfaces first and shaded then belong to neither. Where the mean depth of a ray lies far from its median, the
 ray is traced once more as far as the mean, which lies between two surfaces wherever these are. That is the
 front; what the whole ray saw beyond it is the back, as all that is blended is a sum over the ray.

@@ -27,7 +27,7 @@ class EnvironmentLight:
     Args:
         height: texels from up to down; there are twice as many around.
         hdr: whether the radiance may be more than 1.
-        white_weight: weight of the distance of the colours to grey.
+        white_weight: weight of the distance of the colors to grey.
         smoothness_weight: weight of differences between neighbouring texels.
 
     Attributes:

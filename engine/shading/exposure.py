@@ -26,7 +26,7 @@ _STATE = ("log_gains", "offsets", "first", "second", "steps")
 
 
 class ExposureModel:
-    """Expose the colours of another model: exp(log_gain) * colour + offset, for each view and channel.
+    """Expose the colors of another model: exp(log_gain) * color + offset, for each view and channel.
 
     Follows :class:`octasplat.engine.shading.protocol.ShadingModel`. Rays of no view have the mean
     exposure.
@@ -35,14 +35,14 @@ class ExposureModel:
         views: number of views, whether they are trained on or not.
         rate: size of a step of log gains and offsets at the beginning.
         decay: what is left of that at the end; it falls exponentially.
-        inner: the model whose colours are exposed.
+        inner: the model whose colors are exposed.
 
     Attributes:
         log_gains: logarithm of each view's gains.
         offsets: of each view, display values.
         first: first moments of Adam, gains before offsets; ``second`` holds the second ones.
         steps: each view's steps.
-        inner: the model whose colours are exposed.
+        inner: the model whose colors are exposed.
     """
 
     name = "exposure"
@@ -76,7 +76,7 @@ class ExposureModel:
         self.inner.on_rebuild(gaussians, tracer, training_progress=training_progress)
 
     def shade(self, traced: TracedRays) -> ShadedRays:
-        """Return colours as the rays' views expose them; other rays have the mean or a fixed exposure."""
+        """Return colors as the rays' views expose them; other rays have the mean or a fixed exposure."""
         inner = self.inner.shade(traced)
         view = traced.view if self._fixed_view is None else self._fixed_view
         if view is None:
@@ -95,7 +95,7 @@ class ExposureModel:
     def remove_exposure(
         self, rgb_srgb: Float32[np.ndarray, "h w 3"], view: int
     ) -> Float32[np.ndarray, "h w 3"]:
-        """Return a view's straight display colours at the mean exposure, within [0, 1]."""
+        """Return a view's straight display colors at the mean exposure, within [0, 1]."""
         unexposed = (rgb_srgb - self.offsets[view]) / np.exp(self.log_gains[view])
         return np.asarray(np.clip(unexposed, 0, 1), np.float32)
 

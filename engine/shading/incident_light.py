@@ -133,12 +133,12 @@ class RayPairIncidentLight:
 
 @dataclass(frozen=True)
 class SingleRayIncidentLight:
-    """One ray a point in the mirrored direction, which hits the colours of the harmonics.
+    """One ray a point in the mirrored direction, which hits the colors of the harmonics.
 
     Attributes:
         incident: what came in.
         recording: recording of the rays; None where there is none, or nothing learns from them.
-        by_rgb: gradient of what came in by the display colours that were met.
+        by_rgb: gradient of what came in by the display colors that were met.
     """
 
     incident: IncidentLight

@@ -13,7 +13,7 @@ ENVIRONMENT_EVERY = 4
 ENVIRONMENT_RATE = 0.03
 """First size of a step of the environment's log radiance."""
 SHADING_RAMP = (0.0, 0.02)
-"""Shares of the training when shading begins to replace the harmonics' colours, and when it has."""
+"""Shares of the training when shading begins to replace the harmonics' colors, and when it has."""
 PROPAGATION_EVERY = 0.06
 """Share of the training between two times that normals are handed on to neighbours."""
 PROPAGATION_UNTIL = 0.4
@@ -36,7 +36,7 @@ class MaterialSettings(Settings):
     recipe: Annotated[Recipe, EXPERIMENTAL] = Field(
         "split_sum",
         description='split_sum is the way of octasplat; ref_gaussian does what the code of "Reflective '
-        'Gaussian Splatting" (https://arxiv.org/abs/2412.19282) does: the matt part is a colour of its '
+        'Gaussian Splatting" (https://arxiv.org/abs/2412.19282) does: the matt part is a color of its '
         "own from the harmonics, the environment stays in [0, 1], everything is in display "
         "values, visibility is yes or no, and materials start over when deferred shading "
         "begins.",
@@ -177,12 +177,12 @@ class MaterialSettings(Settings):
         0.08,
         ge=0,
         description="Weight of differences of metallic and roughness between neighbouring rays, which "
-        "change less over a thing than its colour does.",
+        "change less over a thing than its color does.",
     )
     smooth_metal: Annotated[float, Unit("factor"), ADVANCED] = Field(
         10.0,
         ge=0,
-        description="So many times more smooth_weight counts between metals, which are one colour more "
+        description="So many times more smooth_weight counts between metals, which are one color more "
         "often and which have what is reflected wrongly painted on.",
     )
     prune_unseen: Annotated[bool, ADVANCED] = Field(
@@ -193,7 +193,7 @@ class MaterialSettings(Settings):
     white_weight: Annotated[float, Unit("weight"), ADVANCED] = Field(
         0.01,
         ge=0,
-        description="Weight of the logarithms of the colours of the environment, which keeps it grey where "
+        description="Weight of the logarithms of the colors of the environment, which keeps it grey where "
         "nothing else is known.",
     )
     environment_smoothness_weight: Annotated[float, Unit("weight"), ADVANCED] = Field(

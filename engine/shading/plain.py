@@ -16,13 +16,13 @@ class PlainShading:
     name = "plain"
 
     def features(self, gaussians: FlatGaussians) -> None:
-        """Return None: nothing is blended beside the colour."""
+        """Return None: nothing is blended beside the color."""
 
     def on_rebuild(self, gaussians: FlatGaussians, tracer: Tracer, *, training_progress: float) -> None:
         """Do nothing."""
 
     def shade(self, traced: TracedRays) -> ShadedRays:
-        """Return the colours that were traced."""
+        """Return the colors that were traced."""
         return ShadedRays(traced.result.rgb_srgb, traced.result.transmittance)
 
     def backward(

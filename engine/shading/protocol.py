@@ -1,9 +1,9 @@
-"""The protocol of shading models: they turn what was traced along rays into the colours of a photograph.
+"""The protocol of shading models: they turn what was traced along rays into the colors of a photograph.
 
     batch of rays -> trace -> shade -> loss -> backward of the shading -> backward of the trace -> steps
 
 The training loop and the renderer know models by this protocol alone. A model may look at all that a trace
-gives (colours, transmittance, depths, normals, blended features), may trace further rays through the same
+gives (colors, transmittance, depths, normals, blended features), may trace further rays through the same
 Gaussians, and may have parameters of its own: of the views, or of the scene as a whole.
 """
 
@@ -46,10 +46,10 @@ class TracedRays:
 
 @dataclass(frozen=True)
 class ShadedRays:
-    """Colours as a photograph shows them, in front of no background yet.
+    """Colors as a photograph shows them, in front of no background yet.
 
     Attributes:
-        rgb_srgb: display colour, premultiplied by 1 - ``transmittance``.
+        rgb_srgb: display color, premultiplied by 1 - ``transmittance``.
         transmittance: share of the background that shines through; 0 where a model brings its own.
         ctx: whatever the model needs to :meth:`ShadingModel.backward` this.
         layers: what else can be looked at, by name, a row a ray, 0 where there is nothing; only for views
@@ -62,7 +62,7 @@ class ShadedRays:
     layers: Mapping[str, Float32[np.ndarray, "r _"]] = field(default_factory=dict)
 
     def composite_over(self, background_srgb: Float32[np.ndarray, "3"]) -> Float32[np.ndarray, "r 3"]:
-        """Return display colours in front of a background."""
+        """Return display colors in front of a background."""
         if not background_srgb.any():
             return self.rgb_srgb.copy()
         return self.rgb_srgb + self.transmittance[:, None] * background_srgb
@@ -95,7 +95,7 @@ class ShadingModel(Protocol):
     name: str
 
     def features(self, gaussians: FlatGaussians) -> Float32[np.ndarray, "n f"] | None:
-        """Return what to blend of each Gaussian beside its colour, e.g. its material; None: nothing.
+        """Return what to blend of each Gaussian beside its color, e.g. its material; None: nothing.
 
         The array stays the same one until the next call: :meth:`step` may change its values.
         """

@@ -1,7 +1,7 @@
 """The recipe of Reflective Gaussian Splatting, as its published code has it, for comparisons.
 
 "Reflective Gaussian Splatting" (https://arxiv.org/abs/2412.19282). Other than octasplat's own model: the
-diffuse part is a colour of its own from the harmonics, the environment stays in [0, 1], everything is in
+diffuse part is a color of its own from the harmonics, the environment stays in [0, 1], everything is in
 display values, visibility is yes or no, and materials start over when deferred shading begins. Not the same
 as there: the first stage shades pixels, not Gaussians, and visibility comes from the Gaussians, not a mesh.
 """
@@ -45,7 +45,7 @@ PROPAGATION_GROWTH = 1.5
 REFLECTIVE_METALLIC, REFLECTIVE_ROUGHNESS = 0.02, 0.01
 """Least metallic and most roughness of Gaussians that count as reflecting in a propagation."""
 PROPAGATION_NOISE = 0.4
-"""Largest change of the other Gaussians' colours in a propagation, display values."""
+"""Largest change of the other Gaussians' colors in a propagation, display values."""
 
 
 class RefGaussianShading(DeferredShading):
@@ -78,7 +78,7 @@ class RefGaussianShading(DeferredShading):
     def propagate_normals(
         gaussians: FlatGaussians, rng: np.random.Generator, *, training_progress: float
     ) -> None:
-        """Raise all opacities, enlarge what reflects, and disturb the colours of the rest, in place."""
+        """Raise all opacities, enlarge what reflects, and disturb the colors of the rest, in place."""
         raised = np.float32(np.log(PROPAGATED_OPACITY / (1 - PROPAGATED_OPACITY)))
         gaussians.opacity_logits[:] = np.maximum(gaussians.opacity_logits, raised)
         is_metallic = gaussians.channels[METALLIC][:, 0] >= REFLECTIVE_METALLIC
@@ -125,7 +125,7 @@ class RefGaussianShading(DeferredShading):
         return single_layer(traced.rays, traced.result)
 
     def _surface_with_ambient(self, result: TraceResult, gbuffer: GBuffer) -> SurfacePoints:
-        """Return the surface without ambient light, as the diffuse part is a colour of its own."""
+        """Return the surface without ambient light, as the diffuse part is a color of its own."""
         return replace(gbuffer.surface, ambient=np.zeros(len(gbuffer.ray_ids)))
 
     def _trace_incident(self, traced: TracedRays, split: DepthLayers, gbuffer: GBuffer) -> IncidentLightModel:

@@ -1,6 +1,6 @@
 """Split-sum shading: light of an environment off a surface of a material, as pure functions with gradients.
 
-    colour = (F0 A(N.V, r) + B(N.V, r)) (V L(R, r) + indirect) + (1 - m) albedo (ambient E(N) + bounced)
+    color = (F0 A(N.V, r) + B(N.V, r)) (V L(R, r) + indirect) + (1 - m) albedo (ambient E(N) + bounced)
 
 in linear light, with F0 = 0.04 (1 - m) + m albedo; L are the prefiltered levels of the environment in the
 reflected direction R, E its irradiance over pi, and A, B a table that is integrated here. After "Real Shading
@@ -132,7 +132,7 @@ class ShadeGradients(NamedTuple):
 def shade(
     surface: SurfacePoints, light: EnvironmentLevels, frame: Float64[np.ndarray, "3 3"]
 ) -> Float64[np.ndarray, "p 3"]:
-    """Return linear colours.
+    """Return linear colors.
 
     Args:
         surface: the points.
@@ -161,7 +161,7 @@ def shade_backward(
         surface: the points.
         light: the environment's levels.
         frame: its right, up and forward in the world, as rows.
-        by_rgb: gradient by the colours.
+        by_rgb: gradient by the colors.
         blur: roughness from which on up the levels may lead the reflected direction: one that sees far,
             while normals are still wrong. 0 gives the true gradient.
     """

@@ -10,10 +10,10 @@ RADIUS_FACTOR = 1.05
 
 
 def with_backdrop(mesh: TriangleMesh, centre_world: Float64[np.ndarray, "3"]) -> TriangleMesh:
-    """Return the mesh with a closed sphere around it that is seen from inside; to be called before colouring.
+    """Return the mesh with a closed sphere around it that is seen from inside; to be called before coloring.
 
     Args:
-        mesh: without colours.
+        mesh: without colors.
         centre_world: of the sphere, where the cameras are.
     """
     radius = RADIUS_FACTOR * float(np.linalg.norm(mesh.vertices_world - centre_world, axis=1).max())

@@ -7,7 +7,7 @@ from octasplat.engine.core.color import linear_to_srgb, to_bytes
 from octasplat.engine.gaussians.materials import AMBIENT, MATERIAL_WIDTHS
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.geometry.triangle_mesh import MaterialMaps, TriangleMesh
-from octasplat.engine.surface.bake_colours import BakeTarget
+from octasplat.engine.surface.bake_colors import BakeTarget
 from octasplat.engine.surface.tangents import vertex_tangents, world_to_tangent
 from octasplat.engine.surface.texture import TextureLayout
 from octasplat.engine.trace.protocol import TraceResult
@@ -34,7 +34,7 @@ def _blended_materials(traced: TraceResult) -> Float32[np.ndarray, "r 9"]:
 
 
 MATERIAL_TARGET = BakeTarget(9, _blended_materials)
-"""Linear base colour, metallic, roughness, share of the light from all around, and the normal in the world
+"""Linear base color, metallic, roughness, share of the light from all around, and the normal in the world
 (not of unit length)."""
 
 

@@ -1,4 +1,4 @@
-"""Depth maps and colours of a scene, rendered by the tracer into a temporary file."""
+"""Depth maps and colors of a scene, rendered by the tracer into a temporary file."""
 
 import os
 import tempfile
@@ -15,7 +15,7 @@ from octasplat.engine.core.rays import ImageRays
 from octasplat.engine.core.writing import report_disk_full
 from octasplat.engine.render.pinhole_camera import PinholeCamera
 from octasplat.engine.render.renderer import RenderedImage, render_rays
-from octasplat.engine.surface.colour_fit import Picture
+from octasplat.engine.surface.color_fit import Picture
 from octasplat.engine.surface.options import ExtractionOptions
 from octasplat.engine.trace.protocol import Tracer
 
@@ -49,7 +49,7 @@ def render_depth_maps(
     folder: Path,
     progress: Progress = lambda _done, _total: None,
 ) -> tuple[DepthMaps, tuple[Picture, ...]]:
-    """Render depth maps and colours from ``cameras`` into a file in ``folder``, 12 bytes per pixel.
+    """Render depth maps and colors from ``cameras`` into a file in ``folder``, 12 bytes per pixel.
 
     The file has no name, so that nothing is left of it whatever happens.
 
@@ -61,24 +61,24 @@ def render_depth_maps(
         # Not a file with holes: a full disk would end the program when they are filled.
         os.posix_fallocate(handle.fileno(), 0, max(12, 12 * sum(sizes)))
         stored = np.memmap(handle, dtype=np.float32, mode="r+", shape=(3 * sum(sizes),))
-    distances, cosines, colours, start = [], [], [], 0
+    distances, cosines, colors, start = [], [], [], 0
     black = np.zeros(3, np.float32)
     progress(0, len(cameras))
     for number, (camera, size) in enumerate(zip(cameras, sizes, strict=True)):
         shape = (camera.height_px, camera.width_px)
         distances.append(stored[start : start + size].reshape(shape))
         cosines.append(stored[start + size : start + 2 * size].reshape(shape))
-        colours.append(stored[start + 2 * size : start + 3 * size].view(np.uint8).reshape(*shape, 4))
+        colors.append(stored[start + 2 * size : start + 3 * size].view(np.uint8).reshape(*shape, 4))
         start += 3 * size
         rays = camera.rays()
         image = render_rays(tracer, rays, black)
         distances[-1][...] = _depth_values(image, options)
         # The tracer turns normals to the viewer, so the dot product is negative.
         cosines[-1][...] = np.clip(-np.sum(image.normal_world * rays.directions_world, axis=-1), 0.0, 1.0)
-        colours[-1][...] = to_bytes(np.concatenate([image.rgb_srgb, image.alpha[..., None]], axis=2))
+        colors[-1][...] = to_bytes(np.concatenate([image.rgb_srgb, image.alpha[..., None]], axis=2))
         progress(number + 1, len(cameras))
     maps = DepthMaps(tuple(cameras), tuple(distances), tuple(cosines))
-    return maps, tuple(partial(_stored_image, *pair) for pair in zip(cameras, colours, strict=True))
+    return maps, tuple(partial(_stored_image, *pair) for pair in zip(cameras, colors, strict=True))
 
 
 def _stored_image(

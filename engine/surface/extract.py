@@ -1,4 +1,4 @@
-"""Extraction of one coloured triangle mesh from Gaussians and cameras."""
+"""Extraction of one colored triangle mesh from Gaussians and cameras."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -14,9 +14,9 @@ from octasplat.engine.core.progress import counted_phase, stop_when_asked
 from octasplat.engine.geometry.triangle_mesh import EdgeReport, TriangleMesh, edge_report
 from octasplat.engine.render.pinhole_camera import PinholeCamera
 from octasplat.engine.surface.backdrop import with_backdrop
-from octasplat.engine.surface.bake_colours import COLOUR_TARGET, BakeTarget, bake
+from octasplat.engine.surface.bake_colors import COLOR_TARGET, BakeTarget, bake
 from octasplat.engine.surface.bake_materials import MATERIAL_TARGET, with_materials
-from octasplat.engine.surface.colour_fit import Palette, Picture, TexturePalette, VertexPalette, fit_colours
+from octasplat.engine.surface.color_fit import Palette, Picture, TexturePalette, VertexPalette, fit_colors
 from octasplat.engine.surface.depth_maps import render_depth_maps
 from octasplat.engine.surface.holes import fill_holes
 from octasplat.engine.surface.marching_cubes import marching_cubes
@@ -30,7 +30,7 @@ from octasplat.engine.trace.protocol import Tracer
 
 Points = Float32[np.ndarray, "n 3"]
 TOLERANCE_VOXELS = 2.0
-"""Surface this near to a point does not hide it when colours are baked."""
+"""Surface this near to a point does not hide it when colors are baked."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class ExtractedSurface:
     """A mesh and how it came about.
 
     Attributes:
-        mesh: the coloured mesh, in the world frame.
+        mesh: the colored mesh, in the world frame.
         region: the grid it was found in.
         volume_bytes: memory of the fused volume.
         triangles_found: triangles before small parts were removed and holes were closed.
@@ -66,25 +66,25 @@ def extract_levels(
     listener: EventListener = ignore_events,
     should_stop: Callable[[], bool] = lambda: False,
 ) -> tuple[ExtractedSurface, ...]:
-    """Return one surface in several levels of detail, fused once, then decimated and coloured for each.
+    """Return one surface in several levels of detail, fused once, then decimated and colored for each.
 
     Each level is the same as when it is extracted alone.
 
     Args:
         tracer: with the scene built.
-        cameras: where depth and colours are rendered from.
+        cameras: where depth and colors are rendered from.
         options: all settings.
         levels: at most so many triangles; None keeps all.
         scratch: folder for a temporary file of 12 bytes for every pixel of the depth maps.
         light_frame: rows are the light's right, up and forward axes, world frame. Materials are baked, which
             the tracer must have as its first features
             (:func:`octasplat.engine.surface.bake_materials.material_features`), and a texture is needed; None
-            bakes colours.
-        photographs: what colours are fitted to; without any, what the scene shows from ``cameras``. None
+            bakes colors.
+        photographs: what colors are fitted to; without any, what the scene shows from ``cameras``. None
             takes the latter alone, at the size of the depth maps, which is fast.
         listener: receives the events of the stages ``depth``, ``fusing``, ``meshing``, ``settling`` and
-            ``decimating`` (if requested), ``unwrapping`` (with a texture), ``colouring`` and ``fitting`` (of
-            colours).
+            ``decimating`` (if requested), ``unwrapping`` (with a texture), ``coloring`` and ``fitting`` (of
+            colors).
         should_stop: asked now and then.
 
     Raises:
@@ -124,7 +124,7 @@ def extract_levels(
         edges = edge_report(mesh.faces)
         if options.backdrop:
             mesh = with_backdrop(mesh, np.mean([camera.centre_world for camera in cameras], axis=0))
-        coloured = _bake_colours(
+        colored = _bake_colors(
             tracer=tracer,
             cameras=cameras,
             renders=renders,
@@ -137,7 +137,7 @@ def extract_levels(
         )
         result.append(
             ExtractedSurface(
-                mesh=coloured,
+                mesh=colored,
                 region=region,
                 volume_bytes=volume_bytes,
                 triangles_found=found,
@@ -148,7 +148,7 @@ def extract_levels(
     return tuple(result)
 
 
-def _bake_colours(
+def _bake_colors(
     tracer: Tracer,
     cameras: Sequence[PinholeCamera],
     renders: Sequence[Picture],
@@ -159,13 +159,13 @@ def _bake_colours(
     light_frame: Float64[np.ndarray, "3 3"] | None,
     report: EventListener,
 ) -> TriangleMesh:
-    """Return the mesh with colours at its vertices, or with textures."""
+    """Return the mesh with colors at its vertices, or with textures."""
     tolerance = TOLERANCE_VOXELS * region.voxel_world
 
     def look_at(
         points: Points, normals: Points, look: BakeTarget
     ) -> tuple[np.ndarray, Bool[np.ndarray, " n"]]:
-        with counted_phase("colouring", report, 0) as progress:
+        with counted_phase("coloring", report, 0) as progress:
             baked, is_visible = bake(
                 points_world=points,
                 normals_world=normals,
@@ -178,26 +178,26 @@ def _bake_colours(
             )
             return _fill_unseen(points, baked, is_visible), is_visible
 
-    def colours(palette: Palette, points: Points, normals: Points) -> Points:
+    def colors(palette: Palette, points: Points, normals: Points) -> Points:
         if not (options.fit and photographs):
-            rgb, _ = look_at(points, normals, COLOUR_TARGET)
+            rgb, _ = look_at(points, normals, COLOR_TARGET)
         else:  # they show all detail that there is
             rgb = np.full((len(points), 3), 0.5, np.float32)
         if not options.fit:
             return rgb
         with counted_phase("fitting", report, 0) as progress:
-            return _fill_unseen(points, *fit_colours(palette, rgb, photographs or renders, progress))
+            return _fill_unseen(points, *fit_colors(palette, rgb, photographs or renders, progress))
 
     if options.texture_size is None:
         assert light_frame is None, "materials need a texture"
-        rgb = colours(VertexPalette(mesh), mesh.vertices_world, mesh.vertex_normals())
+        rgb = colors(VertexPalette(mesh), mesh.vertices_world, mesh.vertex_normals())
         return replace(mesh, rgb_srgb=rgb)
     with counted_phase("unwrapping", report, 0):
         layout = unwrap(mesh, options.texture_size)
     points, normals = layout.points_world, layout.normals_world
     if light_frame is not None:
         return with_materials(layout, *look_at(points, normals, MATERIAL_TARGET), light_frame)
-    rgb = colours(TexturePalette(layout), points, normals)
+    rgb = colors(TexturePalette(layout), points, normals)
     return replace(layout.mesh, texture_srgb=to_bytes(layout.image(rgb)))
 
 

@@ -54,7 +54,7 @@ def fill_holes(mesh: TriangleMesh, max_rim: float | None) -> tuple[TriangleMesh,
 
     A hole is closed by cutting off its sharpest corner again and again; where that would draw an edge or a
     triangle that the mesh has already, by a fan around a new vertex in its middle. The winding is that of the
-    mesh around it. To be done before colours are baked.
+    mesh around it. To be done before colors are baked.
 
     Returns:
         The mesh, and the number of holes closed.

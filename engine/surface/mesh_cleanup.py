@@ -44,7 +44,7 @@ def keep_largest_components(
 def decimate(mesh: TriangleMesh, max_triangles: int) -> TriangleMesh:
     """Return a mesh of at most ``max_triangles`` triangles, by quadric edge collapse.
 
-    Colours are not carried over; bake them afterwards. A watertight mesh stays watertight. Closing what the
+    Colors are not carried over; bake them afterwards. A watertight mesh stays watertight. Closing what the
     collapse tangled can add a handful of triangles back, so that a few more than asked for may come out.
     """
     import fast_simplification

@@ -103,7 +103,7 @@ class ExtractionOptions(BaseModel):
         description="A sphere around everything that shows what the scene shows in the gaps of the mesh.",
     )
     refine_vertices: Annotated[bool, _NEGATABLE] = Field(
-        False, description="Move vertices along their normals to where the pictures agree, before colours."
+        False, description="Move vertices along their normals to where the pictures agree, before colors."
     )
     keep_components: Annotated[int | None, Spelling(("--components",))] = Field(
         None,
@@ -121,13 +121,13 @@ class ExtractionOptions(BaseModel):
     ] = Field(0.0, description="Close holes with rims shorter than so many voxels; or 'all'.")
     fit: Annotated[bool, Group("advanced")] = Field(
         True,
-        description="Of all colours, take those with which the mesh looks as like the pictures as it can.",
+        description="Of all colors, take those with which the mesh looks as like the pictures as it can.",
     )
     texture_size: Annotated[int | None, Unit("px"), Spelling(metavar="PX")] = Field(
         None,
         ge=64,
         le=16384,
-        description="Colours in a square texture of this side instead of in the vertices; .glb and .obj.",
+        description="Colors in a square texture of this side instead of in the vertices; .glb and .obj.",
     )
     max_memory_gb: Annotated[float, Unit("GB"), Spelling(("--max-memory",), metavar="GB")] = Field(
         4.0, gt=0, description="Refuse a volume that takes more memory than this."

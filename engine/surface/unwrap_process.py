@@ -67,7 +67,7 @@ def unwrap_in_process(
         last = done.stderr.decode("utf-8", "replace").strip().splitlines()[-1:]
         raise ExportError(
             f"xatlas could not unwrap {len(faces)} triangles (exit code {done.returncode}"
-            f"{''.join(f', {line}' for line in last)}); choose fewer triangles, or colours at the vertices."
+            f"{''.join(f', {line}' for line in last)}); choose fewer triangles, or colors at the vertices."
         )
     result = io.BytesIO(done.stdout)
     return Atlas(*(np.load(result) for _ in Atlas._fields))

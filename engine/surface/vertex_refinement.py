@@ -1,8 +1,8 @@
 """Refinement of vertices along their normals, by photo-consistency of a surface's renders.
 
 If a surface lies too near or too far, each picture paints it a little beside the others. What a pixel shows
-changes, to the first order, with the colours around and with how far the surface moves, so both are solved
-for together by Gauss and Newton's method: colours and one displacement a vertex, the neighbours' much alike.
+changes, to the first order, with the colors around and with how far the surface moves, so both are solved
+for together by Gauss and Newton's method: colors and one displacement a vertex, the neighbours' much alike.
 """
 
 from collections.abc import Sequence
@@ -17,7 +17,7 @@ from octasplat.engine.core.compilation import run_ranges
 from octasplat.engine.core.rays import ImageRays, RayBatch
 from octasplat.engine.core.threads import threads_in_use
 from octasplat.engine.geometry.triangle_mesh import TriangleMesh
-from octasplat.engine.surface.colour_fit import MIN_ALPHA, Picture, Progress, VertexPalette
+from octasplat.engine.surface.color_fit import MIN_ALPHA, Picture, Progress, VertexPalette
 from octasplat.engine.surface.kernels.vertex_refinement import (
     apply_jacobian,
     apply_jacobian_transpose,
@@ -33,8 +33,8 @@ MAX_IMAGES = 128
 """Of more, so many are taken, spread evenly: about 100 bytes per pixel are needed at once."""
 REFINEMENT_STEPS = 2
 CG_ITERATIONS = 15
-COLOUR_CG_ITERATIONS = 8
-COLOUR_SMOOTHNESS = 0.1
+COLOR_CG_ITERATIONS = 8
+COLOR_SMOOTHNESS = 0.1
 SMOOTHNESS = 0.001
 PRIOR_WEIGHT = 1e-4
 OUTLIER_THRESHOLD = 0.16
@@ -59,7 +59,7 @@ class _VisiblePixels:
 def refine_vertices(
     mesh: TriangleMesh, pictures: Sequence[Picture], progress: Progress = lambda _done, _total: None
 ) -> TriangleMesh:
-    """Return the mesh with vertices where the pictures agree better; to be called before colouring.
+    """Return the mesh with vertices where the pictures agree better; to be called before coloring.
 
     Args:
         mesh: near the right place.
@@ -144,7 +144,7 @@ def _step(
         sure=sure,
         rgb=rgb,
         apart=apart,
-        rounds=COLOUR_CG_ITERATIONS,
+        rounds=COLOR_CG_ITERATIONS,
     )
     rgb = rgb + x[:, :3]
     normals = mesh.vertex_normals()
@@ -155,7 +155,7 @@ def _step(
         visible.directions_world, visible.steady, change, lifts,
     )  # fmt: skip
     pixels = _PixelJacobian(corners, visible.weights, lifts, change)
-    lacking = visible.rgb_srgb - pixels.apply(_colours_and_displacements(rgb))
+    lacking = visible.rgb_srgb - pixels.apply(_colors_and_displacements(rgb))
     sure = (1 / (1 + (lacking**2).sum(axis=1) / OUTLIER_THRESHOLD**2)).astype(np.float32)
     x = _solve_step(
         pixels=pixels, wanted_srgb=visible.rgb_srgb, sure=sure, rgb=rgb, apart=apart, rounds=CG_ITERATIONS
@@ -166,7 +166,7 @@ def _step(
 
 @dataclass(frozen=True)
 class _PixelJacobian:
-    """The linear map from colours and displacements of vertices to colours of pixels."""
+    """The linear map from colors and displacements of vertices to colors of pixels."""
 
     corners: Int32[np.ndarray, "p 3"]
     weights: Float32[np.ndarray, "p 3"]
@@ -200,9 +200,9 @@ def _solve_step(
     apart: csr_matrix,
     rounds: int,
 ) -> Float32[np.ndarray, "n 4"]:
-    """Return corrections of colours and displacements that fit the pixels best."""
-    count, now = len(rgb), _colours_and_displacements(rgb)
-    smooth = np.array([COLOUR_SMOOTHNESS] * 3 + [SMOOTHNESS], np.float32)
+    """Return corrections of colors and displacements that fit the pixels best."""
+    count, now = len(rgb), _colors_and_displacements(rgb)
+    smooth = np.array([COLOR_SMOOTHNESS] * 3 + [SMOOTHNESS], np.float32)
 
     def times(x: Float32[np.ndarray, "n 4"]) -> Float32[np.ndarray, "n 4"]:
         return (
@@ -218,8 +218,8 @@ def _solve_step(
     return conjugate_gradients(times, diagonal, lacking, rounds, coupled=True)
 
 
-def _colours_and_displacements(rgb: Float32[np.ndarray, "n 3"]) -> Float32[np.ndarray, "n 4"]:
-    """Return start values: the colours, and zero displacements."""
+def _colors_and_displacements(rgb: Float32[np.ndarray, "n 3"]) -> Float32[np.ndarray, "n 4"]:
+    """Return start values: the colors, and zero displacements."""
     return np.concatenate([rgb, np.zeros_like(rgb[:, :1])], axis=1)
 
 

@@ -83,7 +83,7 @@ class TraceResult:
     """Radiance and geometry along ``r`` rays, with no background added.
 
     Attributes:
-        rgb_srgb: sum of weight times colour; display values.
+        rgb_srgb: sum of weight times color; display values.
         transmittance: what is left behind the last Gaussian; accumulated alpha is one minus this.
         depth_sum: sum of weight times distance; the expected depth is this over the accumulated alpha.
         depth_median: distance of the Gaussian at which the transmittance falls to one half, 0 where it
@@ -222,13 +222,13 @@ class Tracer(Protocol):
     def trace(self, rays: RayBatch, *, record: bool = False) -> TraceResult:
         """Trace rays of unit directions; ``record`` stores what :meth:`backward` needs.
 
-        A Gaussian is seen where ``t_min < t < t_max``, in its colour as the ray's viewer has it
+        A Gaussian is seen where ``t_min < t < t_max``, in its color as the ray's viewer has it
         (``t_view_origin`` of :class:`octasplat.engine.core.rays.RayBatch`).
         """
         ...
 
     def transmittance(self, rays: RayBatch) -> Float32[np.ndarray, " r"]:
-        """Return the transmittance along each ray between its limits, for shadows: no order, no colour.
+        """Return the transmittance along each ray between its limits, for shadows: no order, no color.
 
         It is 0 where less than ``transmittance_min`` is left, whatever ``max_hits`` and the second phase say.
         """

@@ -2,7 +2,7 @@
 
 A ray o + t d meets the plane of a Gaussian with mean m and normal r1 at t = <m - o, r1> / <d, r1>. The hit
 p = o + t d moves with o and d directly and through t, with dt/do = -r1 / <d, r1> and dt/dd = t dt/do. So the
-gradient by d is t times that by o, but for the direction in which the Gaussian's colour is seen.
+gradient by d is t times that by o, but for the direction in which the Gaussian's color is seen.
 """
 
 from dataclasses import dataclass
@@ -104,7 +104,7 @@ def _hit_gradients(
     directions = rays.directions_world.astype(np.float64)[ray]
     normals, weight = hits.frames[:, :, 0], hits.weight
 
-    # --- colour, and the direction in which it is seen ---
+    # --- color, and the direction in which it is seen ---
     viewers = np.broadcast_to(rays.t_view_origin, len(rays)).astype(np.float64)[ray]
     is_near = np.isfinite(viewers)
     to_viewer = np.where(is_near, viewers, 0.0)[:, None]
@@ -112,15 +112,15 @@ def _hit_gradients(
     length = np.linalg.norm(view, axis=1, keepdims=True)
     view /= length
     sh = gaussians.sh[ids].astype(np.float64)
-    colour = 0.5 + np.einsum("hk,hkc->hc", sh_basis(view, gaussians.sh_degree), sh)
-    by_colour = np.where(colour > 0, weight[:, None] * output_gradients.rgb[ray], 0.0)
-    slopes = np.einsum("hki,hkc,hc->hi", sh_basis_gradients(view, gaussians.sh_degree), sh, by_colour)
+    color = 0.5 + np.einsum("hk,hkc->hc", sh_basis(view, gaussians.sh_degree), sh)
+    by_color = np.where(color > 0, weight[:, None] * output_gradients.rgb[ray], 0.0)
+    slopes = np.einsum("hki,hkc,hc->hi", sh_basis_gradients(view, gaussians.sh_degree), sh, by_color)
     by_view = (slopes - (slopes * view).sum(axis=1, keepdims=True) * view) / length
 
     # --- what a hit brings for each unit of its weight ---
     cosine_to_mean = np.einsum("hi,hi->h", hits.to_mean, normals) / np.linalg.norm(hits.to_mean, axis=1)
     facing = np.where(cosine_to_mean > settings.flip_normal_cos, -1.0, 1.0)
-    value = np.einsum("hc,hc->h", np.maximum(colour, 0), output_gradients.rgb[ray])
+    value = np.einsum("hc,hc->h", np.maximum(color, 0), output_gradients.rgb[ray])
     value += hits.t * output_gradients.depth_sum[ray]
     value += facing * np.einsum("hi,hi->h", normals, output_gradients.normal[ray])
     if features is not None and output_gradients.features is not None:

@@ -160,7 +160,7 @@ def trace_reference(
         if viewers[ray].isfinite():
             view = to_mean[ray, ids] - viewers[ray] * view
         basis = sh_basis(view / view.norm(dim=-1, keepdim=True), p.sh.shape[1])
-        colour = torch.clamp(0.5 + torch.einsum("nk,nkc->nc", basis, p.sh[ids]), min=0)
+        color = torch.clamp(0.5 + torch.einsum("nk,nkc->nc", basis, p.sh[ids]), min=0)
         ways = to_mean[ray, ids].detach()
         away = (ways * r1[ids].detach()).sum(-1) / ways.norm(dim=-1)
         facing = torch.where(away > settings.flip_normal_cos, -1.0, 1.0)
@@ -168,7 +168,7 @@ def trace_reference(
         median = t[ray, ids[crossing[0]]] if len(crossing) else torch.zeros((), dtype=torch.float64)
         out.append(
             [
-                weight @ colour,
+                weight @ color,
                 through[-1],
                 weight @ t[ray, ids],
                 median,

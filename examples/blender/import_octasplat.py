@@ -9,7 +9,7 @@ In Blender: Scripting > Open > this file, write the path of a mesh behind ``MESH
 
 What it sets, and why:
 
-* Colours are composited as display values, so the mesh emits them as if they were light (those of a GLB,
+* Colors are composited as display values, so the mesh emits them as if they were light (those of a GLB,
   which are linear, go through sRGB's curve first), and the view transform is Raw. With ``--view standard`` it
   is Standard, for scenes with other things in them, and the compositor turns the picture into light after it
   was blended (Convert Colorspace, from sRGB to Linear Rec.709): the same picture.
@@ -70,7 +70,7 @@ def check(path):
         mesh = path.with_suffix(".mesh.ply")
         raise SystemExit(f"{path}: holds points, not a mesh; first run: octasplat export {path} {mesh}")
     if not {"s", "t", "red", "alpha"} <= set(names):
-        raise SystemExit(f"{path}: has no texture coordinates or colours; export it with octasplat.")
+        raise SystemExit(f"{path}: has no texture coordinates or colors; export it with octasplat.")
     stated = [words[1] for words in comments if len(words) == 2 and words[0] == "octasplat_q"]
     return float(stated[0]) if stated else DEFAULT_Q
 
@@ -135,10 +135,10 @@ def set_material(octagons, material, q):
     octagons["octasplat_q"] = q
 
 
-def octagon_material(q, colours, linear=False):
-    """Emission of display colours, mixed with transparency by the Gaussian's alpha.
+def octagon_material(q, colors, linear=False):
+    """Emission of display colors, mixed with transparency by the Gaussian's alpha.
 
-    With ``linear`` the colour attribute is linear and goes through sRGB's curve.
+    With ``linear`` the color attribute is linear and goes through sRGB's curve.
     """
     material = bpy.data.materials.new("octagons")
     if not material.node_tree:
@@ -174,9 +174,9 @@ def octagon_material(q, colours, linear=False):
     offset = vectors("SUBTRACT", uv, (0.5, 0.5, 0.0)).outputs["Vector"]
     square = vectors("DOT_PRODUCT", offset, offset).outputs["Value"]
     fall_off = maths("EXPONENT", maths("MULTIPLY", square, -2.0 * q))
-    colour = node("ShaderNodeAttribute", attribute_type="GEOMETRY", attribute_name=colours)
-    alpha = maths("MULTIPLY", fall_off, colour.outputs["Alpha"])
-    shown = colour.outputs["Color"]
+    color = node("ShaderNodeAttribute", attribute_type="GEOMETRY", attribute_name=colors)
+    alpha = maths("MULTIPLY", fall_off, color.outputs["Alpha"])
+    shown = color.outputs["Color"]
     if linear:
         parts = node("ShaderNodeSeparateColor", [(0, shown)]).outputs
         shown = node("ShaderNodeCombineColor", [(k, display(parts[k])) for k in range(3)]).outputs[0]

@@ -33,8 +33,8 @@ def glaze() -> np.ndarray:
     blue = (np.abs(v - 0.22) < 0.012) | (np.abs(v - 0.3) < 0.02) | (np.abs(v - 0.05) < 0.02)
     dots = (u * 12 % 1 - 0.5) ** 2 / 0.5 + ((v - 0.4) / 0.09) ** 2 < 0.25
     waves = np.abs(v - 0.38 - 0.03 * np.sin(2 * np.pi * 6 * u)) < 0.008
-    colour = np.where((blue | dots | waves)[..., None], [0.09, 0.2, 0.5], [0.9, 0.88, 0.82])
-    return np.asarray(colour.astype(np.float32))
+    color = np.where((blue | dots | waves)[..., None], [0.09, 0.2, 0.5], [0.9, 0.88, 0.82])
+    return np.asarray(color.astype(np.float32))
 
 
 def main() -> None:

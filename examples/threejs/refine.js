@@ -11,16 +11,16 @@ import {
 const OCTAGON_VERTEX = `
 uniform mat4 modelViewMatrix, projectionMatrix;
 in vec3 position; in vec4 color; in vec2 uv;
-out vec4 vertexColour; out vec2 vertexUv; flat out uint octagon;
+out vec4 vertexColor; out vec2 vertexUv; flat out uint octagon;
 void main() {
-  vertexColour = color; vertexUv = uv; octagon = uint(gl_VertexID) / 8u;
+  vertexColor = color; vertexUv = uv; octagon = uint(gl_VertexID) / 8u;
   gl_Position = projectionMatrix * modelViewMatrix * vec4(position, 1.0);
 }`;
 const OCTAGON_FRAGMENT = `
 precision highp float; precision highp int;
 uniform sampler2D fallOff; uniform uint frame;
-in vec4 vertexColour; in vec2 vertexUv; flat in uint octagon;
-out vec4 colour;
+in vec4 vertexColor; in vec2 vertexUv; flat in uint octagon;
+out vec4 color;
 uvec4 pcg(uvec4 v) { // Jarzynski and Olano, Hash Functions for GPU Rendering, 2020
   v = v * 1664525u + 1013904223u;
   v.x += v.y * v.w; v.y += v.z * v.x; v.z += v.x * v.y; v.w += v.y * v.z;
@@ -30,10 +30,10 @@ uvec4 pcg(uvec4 v) { // Jarzynski and Olano, Hash Functions for GPU Rendering, 2
 }
 void main() {
   float chance = float(pcg(uvec4(uvec2(gl_FragCoord.xy), octagon, frame)).x >> 8u) / 16777216.0;
-  if (chance >= vertexColour.a * texture(fallOff, vertexUv).a) discard;
-  vec3 linear = vertexColour.rgb;
+  if (chance >= vertexColor.a * texture(fallOff, vertexUv).a) discard;
+  vec3 linear = vertexColor.rgb;
   vec3 display = mix(1.055 * pow(linear, vec3(1.0 / 2.4)) - 0.055, 12.92 * linear, lessThanEqual(linear, vec3(0.0031308)));
-  colour = vec4(display, 1.0);
+  color = vec4(display, 1.0);
 }`;
 const FULL_VERTEX = `
 in vec3 position;
@@ -41,10 +41,10 @@ void main() { gl_Position = vec4(position.xy, 0.0, 1.0); }`;
 const MEAN_FRAGMENT = `
 precision highp float;
 uniform sampler2D before, latest; uniform float weight;
-out vec4 colour;
+out vec4 color;
 void main() {
   ivec2 pixel = ivec2(gl_FragCoord.xy);
-  colour = mix(texelFetch(before, pixel, 0), texelFetch(latest, pixel, 0), weight);
+  color = mix(texelFetch(before, pixel, 0), texelFetch(latest, pixel, 0), weight);
 }`;
 
 export class Refiner {

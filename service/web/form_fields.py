@@ -36,8 +36,8 @@ _LABELS = {
     "q": "Squared octagon radius",
     "where": "Where",
     "materials.learn": "Learn materials and light",
-    "set.albedo": "Base colour",
-    "scale.albedo": "Base colour, times",
+    "set.albedo": "Base color",
+    "scale.albedo": "Base color, times",
     "scale.metallic": "Metallic, times",
     "scale.roughness": "Roughness, times",
 }

@@ -25,7 +25,7 @@ SCENE, METRICS, REPORT, CONFIG, HELD_OUT = (
 LAYERS: Mapping[str, str] = {
     "normal": "Normals",
     "depth": "Depth",
-    "albedo": "Base colour",
+    "albedo": "Base color",
     "metallic": "Metallic",
     "roughness": "Roughness",
     "visibility": "Visibility",
@@ -236,7 +236,7 @@ _USE_BY_SUFFIX = {
         _SCENE,
         "Blender, three.js, model-viewer, any glTF viewer",
     ),
-    ".obj": (_SCENE, "Blender, MeshLab, most 3D programs: geometry and colours, without opacity"),
+    ".obj": (_SCENE, "Blender, MeshLab, most 3D programs: geometry and colors, without opacity"),
     ".mtl": (_SCENE, "goes with the OBJ of that name"),
     ".spz": (_SCENE, "Niantic Scaniverse, Spark, PlayCanvas: small, for the web"),
     ".sog": (_SCENE, "PlayCanvas and SuperSplat: the smallest, for the web"),
@@ -249,7 +249,7 @@ _USE_BY_SUFFIX = {
     ".stl": (_SCENE, "Blender, MeshLab, 3D printing"),
     ".mp4": (_FIGURES, "any video player or browser"),
     ".png": (_IMAGES, "any image viewer"),
-    ".exr": (_IMAGES, "Blender, Nuke, DJV: linear colour, depth and normals"),
+    ".exr": (_IMAGES, "Blender, Nuke, DJV: linear color, depth and normals"),
     ".bin": (_RECORDS, "COLMAP"),
     ".txt": (_RECORDS, "COLMAP or a text editor"),
 }

@@ -38,7 +38,7 @@ def api(ctx: click.Context) -> None:
     type=click.Choice(["black", "white"]),
     default="black",
     show_default=True,
-    help="Colour behind the scene, to begin with.",
+    help="Color behind the scene, to begin with.",
 )
 def view(source: Path, open_page: bool | None, port: int, background: str) -> None:
     """Show a scene in the browser: the folder of a run, or a file of any format.

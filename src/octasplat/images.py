@@ -62,7 +62,7 @@ class Image:
         )
 
     def save(self, path: PathLike) -> Path:
-        """Write an 8-bit PNG of the colours, or an OpenEXR with linear colours, alpha, depth and normals.
+        """Write an 8-bit PNG of the colors, or an OpenEXR with linear colors, alpha, depth and normals.
 
         Raises:
             OutputError: the file cannot be written.
@@ -114,13 +114,11 @@ def render_view(
         background: what lies behind, by name or as display values in [0, 1].
         threads: 0 takes all cores; the result does not depend on it.
     """
-    from octasplat.engine.render.renderer import background_colour
+    from octasplat.engine.render.renderer import background_color
     from octasplat.engine.render.supersampling import rays_per_pixel_side, render_averaged
     from octasplat.engine.shading.plain import PLAIN_SHADING
 
-    behind = (
-        background_colour(background) if isinstance(background, str) else np.array(background, np.float32)
-    )
+    behind = background_color(background) if isinstance(background, str) else np.array(background, np.float32)
     rays = camera.rays()
     tracer = _build_tracer(scene, threads)
     rendered = render_averaged(

@@ -62,7 +62,7 @@ class Scene:
                 axes in the plane.
             scales: standard deviations along these axes, world units.
             opacities: from 0 to 1.
-            sh: spherical harmonics of the display colour, 1, 4, 9 or 16 coefficients a Gaussian.
+            sh: spherical harmonics of the display color, 1, 4, 9 or 16 coefficients a Gaussian.
             channels: further numbers of each Gaussian, by name.
 
         Raises:
@@ -140,7 +140,7 @@ class Scene:
 
     @property
     def sh(self) -> Float32[np.ndarray, "n k 3"]:
-        """Spherical harmonics of the display colour, coefficient-major."""
+        """Spherical harmonics of the display color, coefficient-major."""
         return self.gaussians.sh
 
     @sh.setter

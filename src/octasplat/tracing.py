@@ -33,8 +33,8 @@ class GaussianTensors:
         quats: rotations (w, x, y, z) of any length.
         log_scales: natural logarithms of the standard deviations in the plane.
         opacity_logits: what the sigmoid turns into opacities.
-        sh: spherical harmonics of the display colour; colour = max(0, 1/2 + sum_k sh[k] Y_k(direction)).
-        features: any further numbers, composited like colours.
+        sh: spherical harmonics of the display color; color = max(0, 1/2 + sum_k sh[k] Y_k(direction)).
+        features: any further numbers, composited like colors.
         facts: what is known of the scene as a whole; it decides how the scene is traced.
 
     >>> import octasplat as osp
@@ -118,7 +118,7 @@ class TracedRays:
     """Result of tracing rays through a scene.
 
     Attributes:
-        rgb: display colours, multiplied by alpha: with a background b, a picture is rgb + (1 - alpha) b.
+        rgb: display colors, multiplied by alpha: with a background b, a picture is rgb + (1 - alpha) b.
         alpha: how much of the ray the Gaussians hide.
         depth: mean distance, world units; 0 where nothing was met.
         depth_median: distance of the Gaussian with which half of the light is gone; 0 where it never is.
@@ -151,7 +151,7 @@ def trace(
     """Return what rays see of flat Gaussians, differentiably.
 
     Everything has gradients by all parameters and by the origins and directions of the rays: those of the
-    compositing, the falloff, the planes and the view-dependent colour. There are none through the edges of
+    compositing, the falloff, the planes and the view-dependent color. There are none through the edges of
     the octagons and the order of the hits. Rays beside each other that share their origin, as those of a
     camera do, are traced together and fastest.
 

@@ -142,7 +142,7 @@ def reconstruct(
         iterations: Iterations of the training; 0 asks the photographs' pixels.
         rays_per_batch: Rays of one iteration.
         max_gaussians: Most Gaussians; 0, the default, asks the photographs' pixels.
-        sh_degree: Degree of the spherical harmonics of the colours, 0 to 3.
+        sh_degree: Degree of the spherical harmonics of the colors, 0 to 3.
         seed: Seed of everything random. [default: 0]
         train: Settings of the training that are to be otherwise than the preset's.
         assignments: Any other setting, e.g. lr.quat=0.02 or test_every=4, values as JSON; octasplat
@@ -272,7 +272,7 @@ def estimate(
         iterations: Iterations of the training; 0 asks the photographs' pixels.
         rays_per_batch: Rays of one iteration.
         max_gaussians: Most Gaussians; 0, the default, asks the photographs' pixels.
-        sh_degree: Degree of the spherical harmonics of the colours, 0 to 3.
+        sh_degree: Degree of the spherical harmonics of the colors, 0 to 3.
         seed: Seed of everything random. [default: 0]
         train: Settings of the training that are to be otherwise than the preset's.
         assignments: Any other setting, e.g. lr.quat=0.02 or test_every=4, values as JSON; octasplat
@@ -344,7 +344,7 @@ def evaluate(
             folder>; so it is with photographs of another dataset, which a job names as 'dataset_id'.
         scales: Measure smaller sizes instead, such as 2,4,8: renders at 1/2, 1/4 and 1/8 of the size
             against photographs made as small, with 1, 4 and 16 rays per pixel; into scales.json.
-        evaluation_background: Colour behind the scene and behind what masks leave out. [default: the
+        evaluation_background: Color behind the scene and behind what masks leave out. [default: the
             run's]
         dataset: Where the run's photographs are now, if they were moved or the run was downloaded.
         other_dataset: Measure all photographs of another folder instead (images/ and sparse/0 in the
@@ -462,7 +462,7 @@ def surface(
     should_stop: Callable[[], bool] = never_stop,
     threads: int = 0,
 ) -> "SurfaceResult":
-    """One coloured triangle mesh of a scene.
+    """One colored triangle mesh of a scene.
 
     Args:
         source: The scene to mesh: the folder of a run, or a file of any format.
@@ -488,24 +488,24 @@ def surface(
         unseen: Space near the surface that no view saw: open leaves holes there, solid closes the mesh.
             Default: open.
         backdrop: A sphere around everything that shows what the scene shows in the gaps of the mesh.
-        refine_vertices: Move vertices along their normals to where the pictures agree, before colours.
+        refine_vertices: Move vertices along their normals to where the pictures agree, before colors.
         keep_components: Keep so many connected parts only, largest first. [default: by min_component]
         min_component: Remove parts of less than this share of the largest part's area. Default: 0.01.
         fill_holes: Close holes with rims shorter than so many voxels; or 'all'. Default: 0.0.
-        fit: Of all colours, take those with which the mesh looks as like the pictures as it can.
-        texture_size: Colours in a square texture of this side instead of in the vertices; .glb and
+        fit: Of all colors, take those with which the mesh looks as like the pictures as it can.
+        texture_size: Colors in a square texture of this side instead of in the vertices; .glb and
             .obj.
         max_memory_gb: Refuse a volume that takes more memory than this. Default: 4.0.
         room: What pictures of a room need, where nothing else is said: unbounded, unseen solid,
             backdrop, settle and finer voxels.
         max_triangles: Decimate to so many triangles, such as 60000 or 60k; 5k,50k,500k writes a file
             each, NAME_5k.glb. [default: all]
-        materials: Base colour, metallic, roughness and normals in textures, to be lit; .glb. Takes
+        materials: Base color, metallic, roughness and normals in textures, to be lit; .glb. Takes
             60,000 triangles and a texture of 1,024 pixels where nothing else is said.
         up: With materials: the axis that points up. [default: the run's, of a file -y]
-        dataset: Take the cameras of the photographs in this folder, and of a run the colours. [default:
+        dataset: Take the cameras of the photographs in this folder, and of a run the colors. [default:
             the cameras that a run keeps; else none]
-        photographs: A copy of the photographs that the run was made from, for colours alone; left out
+        photographs: A copy of the photographs that the run was made from, for colors alone; left out
             if it has other poses.
         progress: told each event; by default they are logged, or shown in a notebook.
         should_stop: asked now and then; True ends the work with ``CancelledError``.
@@ -1001,7 +1001,7 @@ def export(
         ids: GLB: write the numbers by which edits find back to their Gaussians.
         q: Meshes: squared radius of the octagons in standard deviations. [default: that of the run, of
             a file 9.21]
-        color: Formats with one colour for each Gaussian: the one that loses least seen from the
+        color: Formats with one color for each Gaussian: the one that loses least seen from the
             photographs' places of a run, or from all around a file; the harmonics' constant part; or
             the one seen along a direction. [default: cameras for a run, constant for a file]
         for_viewers: GLB: for programs that sort chunks at best, as viewer.glb is: solid middles
@@ -1010,7 +1010,7 @@ def export(
         extent: GLB for viewers: how much of a run is written, what lies in the space that the cameras
             surround, which viewers then frame, or all of it, with what is far behind. Default:
             photographed.
-        materials: GLB: base colour, metallic and roughness instead of colours that have their light in
+        materials: GLB: base color, metallic and roughness instead of colors that have their light in
             them.
         up: With materials: the axis that points up. [default: the run's, of a file -y]
         format: The format, if OUT's name does not say it.
@@ -1393,7 +1393,7 @@ def merge(
         scenes: The other scenes: files of any format, each in the same frame.
         overwrite: Replace files that are there already, too, which are not of an earlier run of this
             command or were changed since. What is read is never replaced.
-        sh_degree: Degree of the colours' harmonics. [default: the highest among the scenes]
+        sh_degree: Degree of the colors' harmonics. [default: the highest among the scenes]
         progress: told each event; by default they are logged, or shown in a notebook.
         should_stop: asked now and then; True ends the work with ``CancelledError``.
         threads: number of threads; 0 takes all cores. The result does not depend on it.

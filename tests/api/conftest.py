@@ -21,7 +21,7 @@ COUNT = 1200
 
 
 def small_scene() -> FlatGaussians:
-    """A ball of radius 1, whose colours say where the surface faces."""
+    """A ball of radius 1, whose colors say where the surface faces."""
     normals = fibonacci_sphere(COUNT).astype(np.float32)
     random = np.random.default_rng(4)
     sh = np.zeros((COUNT, 4, 3), np.float32)

@@ -68,7 +68,7 @@ def test_save_to_lossy_format_logs_dropped_values(
 ) -> None:
     with caplog.at_level(logging.INFO, logger="octasplat"):
         osp.save(osp.load(scene_file), tmp_path / "plain.splat")
-    assert any("how colours change with the direction will be left out" in text for text in caplog.messages)
+    assert any("how colors change with the direction will be left out" in text for text in caplog.messages)
     assert capfd.readouterr() == ("", "")
 
 

@@ -116,7 +116,7 @@ def test_parameters_changed_before_backward_are_refused() -> None:
         seen.rgb.sum().backward()
 
 
-def test_features_are_composited_like_colours() -> None:
+def test_features_are_composited_like_colors() -> None:
     parameters, lines, _ = tensors_and_rays(20, 40)
     parameters.features = torch.ones(20, 2, requires_grad=True)
     seen = osp.trace(parameters, lines)

@@ -33,11 +33,11 @@ def test_operations_have_package_functions(name: str) -> None:
 
 
 def test_refused_values_have_the_sentence_of_the_request(scene_file: Path, tmp_path: Path) -> None:
-    values = {"source": scene_file, "output": tmp_path / "a.ply", "where": "colour > 3 and"}
+    values = {"source": scene_file, "output": tmp_path / "a.ply", "where": "color > 3 and"}
     with pytest.raises(ConfigError) as expected:
         build_request(operation("crop").request, values)
     with pytest.raises(ConfigError) as found:
-        osp.crop(scene_file, tmp_path / "a.ply", where="colour > 3 and")
+        osp.crop(scene_file, tmp_path / "a.ply", where="color > 3 and")
     assert str(found.value) == str(expected.value)
 
 

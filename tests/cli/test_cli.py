@@ -97,7 +97,7 @@ def test_output_with_other_files(octasplat, run, tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "word"),
     [
-        (["--set", "colour=7"], "colour"),
+        (["--set", "color=7"], "color"),
         (["--set", "lr.mean"], "name=value"),
         (["--set", "lr.mean=-1"], "mean"),
         (["--set", "train.lr.mean=-1"], "mean"),

@@ -114,9 +114,9 @@ def test_downloaded_run_surface_matches_original(results, octasplat, tmp_path):
     )
     assert np.array_equal(without.vertices, with_them.vertices)
     assert np.array_equal(without.faces, with_them.faces)
-    # Colours are fitted to the photographs where there are any, to renders of the same views elsewhere.
-    colours = (mesh.visual.vertex_colors.astype(float) for mesh in (without, with_them))
-    assert 0 < np.abs(next(colours) - next(colours)).mean() < 25
+    # Colors are fitted to the photographs where there are any, to renders of the same views elsewhere.
+    colors = (mesh.visual.vertex_colors.astype(float) for mesh in (without, with_them))
+    assert 0 < np.abs(next(colors) - next(colors)).mean() < 25
 
 
 def test_evaluate_without_photographs_names_option(results, octasplat, tmp_path):

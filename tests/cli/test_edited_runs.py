@@ -102,7 +102,7 @@ def test_transformed_run_rotates_environment():
         ],
         axis=-1,
     )
-    values = (0.5 + 0.5 * directions @ frames[0]).astype(np.float32)  # the colour of a direction is itself
+    values = (0.5 + 0.5 * directions @ frames[0]).astype(np.float32)  # the color of a direction is itself
     want = 0.5 + 0.5 * (directions @ frames[1]) @ turn
     np.testing.assert_allclose(rotate_environment(values, *frames, turn), want, atol=0.003)
 

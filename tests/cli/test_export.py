@@ -114,17 +114,17 @@ def write_thick_gaussians(path, thickness):
     write_ply(path, [PlyWriteElement("vertex", len(rows), rows.dtype, iter([rows]))])
 
 
-def test_single_colour_mode_is_applied(run, octasplat, tmp_path):
-    colours = {}
-    for colour in ("constant", "cameras", "0,0,1"):
-        path = tmp_path / f"{colour}.splat"
-        result = octasplat("export", run.output, path, "--color", colour)
+def test_single_color_mode_is_applied(run, octasplat, tmp_path):
+    colors = {}
+    for color in ("constant", "cameras", "0,0,1"):
+        path = tmp_path / f"{color}.splat"
+        result = octasplat("export", run.output, path, "--color", color)
         assert result.exit_code == 0, result.output
-        colours[colour] = read_scene(path)[0].base_rgb_srgb
+        colors[color] = read_scene(path)[0].base_rgb_srgb
     gaussians = read_scene(run.output)[0]
     if gaussians.sh_degree:
         assert "will be left out" in result.stderr
-        assert all(np.abs(colours["constant"] - colours[name]).max() > 0.01 for name in ("cameras", "0,0,1"))
+        assert all(np.abs(colors["constant"] - colors[name]).max() > 0.01 for name in ("cameras", "0,0,1"))
     for text in ("red", "1,2", "0,0,0"):
         result = octasplat("export", run.output, tmp_path / "x.splat", "--color", text)
         assert result.exit_code == 1 and not (tmp_path / "x.splat").exists()
@@ -186,8 +186,8 @@ def test_for_viewers_is_for_octagon_glb(run, octasplat, tmp_path):
         assert result.exit_code == 2 and "--for-viewers" in result.output
 
 
-def test_unused_colour_option_is_warned_of(run, octasplat, tmp_path):
-    told = "colour goes with formats of one colour"
+def test_unused_color_option_is_warned_of(run, octasplat, tmp_path):
+    told = "color goes with formats of one color"
     done = octasplat("export", run.output, tmp_path / "a.spz", "--color", "constant")
     assert done.exit_code == 0 and told in done.stderr
     both = (tmp_path / "b.spz", tmp_path / "b.glb")

@@ -22,8 +22,8 @@ def far_run(scene, octasplat, tiny, tmp_path_factory):
 
 
 def test_background_file_holds_trained_background(far_run, octasplat, tmp_path):
-    colours = read_background_map(far_run / "background.exr")
-    assert colours.shape == (32, 64, 3) and 0 <= colours.min() < colours.max() <= 1
+    colors = read_background_map(far_run / "background.exr")
+    assert colors.shape == (32, 64, 3) and 0 <= colors.min() < colors.max() <= 1
     copied = tmp_path / "run"
     shutil.copytree(far_run, copied)
     before = json.loads((copied / "metrics.json").read_text())["mean"]["psnr"]

@@ -63,11 +63,11 @@ def test_surface_of_file_uses_surrounding_cameras(run, octasplat, tmp_path):
     )
     assert result.exit_code == 0, result.output
     lines = result.output.splitlines()
-    started = ["Rendering depth", "Fusing depth", "Meshing", "Colouring"]
+    started = ["Rendering depth", "Fusing depth", "Meshing", "Coloring"]
     assert [line for line in lines if line in started] == started
     finished = [line.partition(" in ")[0] for line in lines if line.endswith(" s")]
     assert finished[:3] == ["Rendered 96 depth maps", "Fused the depth maps", "Made the mesh"]
-    assert re.fullmatch(r"Coloured [\d,]+ points", finished[3])
+    assert re.fullmatch(r"Colored [\d,]+ points", finished[3])
 
 
 @pytest.mark.parametrize(

@@ -49,7 +49,7 @@ def test_job_with_photographs_gives_the_bytes_of_the_command(run, octasplat, tmp
         assert (results / name).read_bytes() == (tmp_path / name).read_bytes(), name
 
 
-def test_job_without_photographs_takes_colours_from_the_scene(run, octasplat, tmp_path):
+def test_job_without_photographs_takes_colors_from_the_scene(run, octasplat, tmp_path):
     few = ("--resolution", 32, "--depth-side", 32, "--threads", 1)
     copy = shutil.copytree(run.output, tmp_path / "run", ignore=shutil.ignore_patterns("cache"))
     config = json.loads((copy / "config.json").read_text())
@@ -132,7 +132,7 @@ def test_surface_job_presets_fill_unset_options():
     assert request.refine_vertices and [path.name for path in request.outputs] == ["b_5k.glb", "b_60000.glb"]
 
 
-def test_surface_job_colour_fit_needs_photographs():
+def test_surface_job_color_fit_needs_photographs():
     for options, needed in (({}, True), ({"fit": False}, False), ({"materials": True}, False)):
         assert SURFACE.needs_photographs(SURFACE.resolve(options)) is needed
 

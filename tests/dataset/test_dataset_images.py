@@ -18,7 +18,7 @@ def noise(*shape, dtype=np.uint8, seed=0):
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
 @pytest.mark.parametrize("suffix", ["png", "tif"])
-def test_colours_pass_through_exactly(tmp_path, save_image, dtype, suffix):
+def test_colors_pass_through_exactly(tmp_path, save_image, dtype, suffix):
     pixels = noise(6, 8, 3, dtype=dtype)
     save_image(tmp_path / f"a.{suffix}", pixels)
     rgb, alpha = read(tmp_path / f"a.{suffix}")
@@ -123,7 +123,7 @@ def test_fine_stripes_average_out_when_reduced(tmp_path, save_image):
     assert np.abs(rgb[2:-2, 2:-2].astype(int) - 128).max() <= 2
 
 
-def test_transparent_pixels_do_not_bleed_into_colours(tmp_path, save_image):
+def test_transparent_pixels_do_not_bleed_into_colors(tmp_path, save_image):
     pixels = np.zeros((32, 32, 4), np.uint8)
     pixels[..., 0] = 255  # red where it is transparent
     pixels[8:24, 8:24] = [0, 200, 0, 255]

@@ -93,10 +93,10 @@ DISC = np.hypot(*np.mgrid[-12:12, -16:16]) < 9
         (np.where(DISC, 200, 100 * (np.arange(32) % 2)).astype(np.uint8), "hold the values 0, 100, 200"),
         (DISC.astype(np.uint8), "uses the value 1 for valid pixels"),
         (np.zeros((24, 32), dtype=np.uint8), "All 4 masks are black"),
-        (np.dstack([0 * DISC, 0 * DISC, 200 * DISC]).astype(np.uint8), "is coloured, as labels are"),
+        (np.dstack([0 * DISC, 0 * DISC, 200 * DISC]).astype(np.uint8), "is colored, as labels are"),
         (
             np.dstack([128 * DISC, 0 * DISC, 128 * (np.arange(32) % 2) * ~DISC]).astype(np.uint8),
-            "is coloured, as labels are",
+            "is colored, as labels are",
         ),
         (np.dstack([0 * DISC] * 3 + [255 * DISC]).astype(np.uint8), "mask in the alpha channel"),
         (np.dstack([255 + 0 * DISC] * 3 + [255 * DISC]).astype(np.uint8), "mask in the alpha channel"),
@@ -119,7 +119,7 @@ def test_masks_of_one_photograph_without_valid_pixel_warn(tmp_path, make_scene, 
     assert warnings == ["1 masks hold no valid (white) pixel, e.g. view_0.png.png."]
 
 
-def test_mask_of_cut_out_with_equal_colours_and_alpha_is_taken(tmp_path, make_scene, save_image):
+def test_mask_of_cut_out_with_equal_colors_and_alpha_is_taken(tmp_path, make_scene, save_image):
     make_scene(tmp_path)
     for index in range(4):
         save_image(tmp_path / f"masks/view_{index}.png.png", np.dstack([255 * DISC] * 4).astype(np.uint8))

@@ -10,8 +10,8 @@ from octasplat.engine.dataset.images import read_image_info, read_photo
 
 
 @pytest.fixture
-def colours() -> np.ndarray:
-    """Display colours in [0, 1] with black and white among them."""
+def colors() -> np.ndarray:
+    """Display colors in [0, 1] with black and white among them."""
     values = np.random.default_rng(7).random((24, 32, 3))
     values[0, 0], values[0, 1] = 0.0, 1.0
     return values
@@ -33,8 +33,8 @@ def open_with(tmp_path, make_scene, save_image):
 
 @pytest.mark.parametrize("bits", [8, 10, 12, 14])
 @pytest.mark.parametrize("suffix", [".tif", ".png"])
-def test_few_bits_in_sixteen_are_scaled_with_a_warning(open_with, colours, bits, suffix):
-    stored = np.rint(colours * (2**bits - 1)).astype(np.uint16)
+def test_few_bits_in_sixteen_are_scaled_with_a_warning(open_with, colors, bits, suffix):
+    stored = np.rint(colors * (2**bits - 1)).astype(np.uint16)
     dataset = open_with(suffix, stored)
     rgb, _, _ = dataset.view_image(1)
     np.testing.assert_allclose(rgb, stored / (2**bits - 1), atol=2e-5)
@@ -43,21 +43,21 @@ def test_few_bits_in_sixteen_are_scaled_with_a_warning(open_with, colours, bits,
 
 
 @pytest.mark.parametrize("full", [255.0, 4095.0, 65535.0])
-def test_float_tiff_of_integers_is_read_as_display_values(open_with, colours, full):
-    dataset = open_with(".tif", (colours * full).astype(np.float32))
+def test_float_tiff_of_integers_is_read_as_display_values(open_with, colors, full):
+    dataset = open_with(".tif", (colors * full).astype(np.float32))
     rgb, _, _ = dataset.view_image(0)
-    np.testing.assert_allclose(rgb, colours, atol=2e-5)
+    np.testing.assert_allclose(rgb, colors, atol=2e-5)
     assert any(f"with {full:.5g} for white" in text for text in dataset.warnings)
 
 
-def test_float_values_up_to_millions_are_refused(open_with, colours):
+def test_float_values_up_to_millions_are_refused(open_with, colors):
     with pytest.raises(DatasetError, match="neither light from 0 to 1 nor integers"):
-        open_with(".tif", (colours * 1e7).astype(np.float32))
+        open_with(".tif", (colors * 1e7).astype(np.float32))
 
 
 @pytest.mark.parametrize("exposure", [300.0, 1e-4])
-def test_radiance_of_any_exposure_is_brought_to_white(open_with, colours, exposure):
-    dataset = open_with(".exr", (colours * exposure).astype(np.float32))
+def test_radiance_of_any_exposure_is_brought_to_white(open_with, colors, exposure):
+    dataset = open_with(".exr", (colors * exposure).astype(np.float32))
     rgb, _, _ = dataset.view_image(0)
     assert 0.5 < rgb.mean() < 0.8  # the mean of sRGB-encoded uniform light is 0.68
     assert any("linear light" in text for text in dataset.warnings)
@@ -71,13 +71,13 @@ def test_radiance_of_any_exposure_is_brought_to_white(open_with, colours, exposu
         (".tif", np.float32),
     ],
 )
-def test_values_that_fill_their_format_are_taken_as_they_are(open_with, colours, suffix, stored):
+def test_values_that_fill_their_format_are_taken_as_they_are(open_with, colors, suffix, stored):
     full = 65535 if stored == np.uint16 else 1
-    assert open_with(suffix, (colours * full).astype(stored)).warnings == []
+    assert open_with(suffix, (colors * full).astype(stored)).warnings == []
 
 
-def test_highlights_above_one_stay_clipped(open_with, colours):
-    bright = colours.astype(np.float32)
+def test_highlights_above_one_stay_clipped(open_with, colors):
+    bright = colors.astype(np.float32)
     bright[:4] *= 20
     dataset = open_with(".exr", bright)
     assert dataset.warnings == []
@@ -85,19 +85,19 @@ def test_highlights_above_one_stay_clipped(open_with, colours):
 
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
-def test_fourth_channel_without_a_tag_is_no_alpha(tmp_path, colours, dtype):
+def test_fourth_channel_without_a_tag_is_no_alpha(tmp_path, colors, dtype):
     path = tmp_path / "rgbn.tif"
     full = np.iinfo(dtype).max
-    stored = (np.dstack([colours, 0.4 * colours[..., :1]]) * full).astype(dtype)
+    stored = (np.dstack([colors, 0.4 * colors[..., :1]]) * full).astype(dtype)
     _save_without_extra_samples(path, stored)
     assert not read_image_info(path).has_alpha
     rgb, alpha = read_photo(path, 32, 24, 8)
     assert alpha is None
-    np.testing.assert_allclose(rgb / 255.0, colours, atol=1 / 255)
+    np.testing.assert_allclose(rgb / 255.0, colors, atol=1 / 255)
 
 
-def test_alpha_of_tiff_png_and_exr_is_kept(tmp_path, save_image, colours):
-    values = np.dstack([colours, np.linspace(0, 1, 24)[:, None] * np.ones(32)])
+def test_alpha_of_tiff_png_and_exr_is_kept(tmp_path, save_image, colors):
+    values = np.dstack([colors, np.linspace(0, 1, 24)[:, None] * np.ones(32)])
     for name, stored in (
         ("a.tif", (values * 255).astype(np.uint8)),
         ("a.png", (values * 255).astype(np.uint8)),
@@ -108,10 +108,10 @@ def test_alpha_of_tiff_png_and_exr_is_kept(tmp_path, save_image, colours):
         assert read_photo(tmp_path / name, 32, 24, 8)[1] is not None
 
 
-def test_gif_is_read(tmp_path, colours):
+def test_gif_is_read(tmp_path, colors):
     from PIL import Image
 
-    image = Image.fromarray((colours * 255).astype(np.uint8)).quantize(256)
+    image = Image.fromarray((colors * 255).astype(np.uint8)).quantize(256)
     image.save(tmp_path / "a.gif")
     rgb, alpha = read_photo(tmp_path / "a.gif", 32, 24, 8)
     np.testing.assert_array_equal(rgb, np.asarray(image.convert("RGB")))

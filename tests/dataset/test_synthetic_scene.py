@@ -160,7 +160,7 @@ def test_synthetic_scene_points_match_depth(scene: Path) -> None:
     assert np.mean(np.array(offsets) < 0.05) > 0.9
 
 
-def test_photographs_agree_about_the_colour_of_a_point(tmp_path: Path) -> None:
+def test_photographs_agree_about_the_color_of_a_point(tmp_path: Path) -> None:
     write_synthetic_dataset(tmp_path / "scene", small(width_px=128, height_px=96, samples_per_side=3))
     model = pycolmap.Reconstruction(str(tmp_path / "scene" / "sparse" / "0"))
     pictures = {
@@ -174,10 +174,10 @@ def test_photographs_agree_about_the_colour_of_a_point(tmp_path: Path) -> None:
     same, own, unlike = [], [], []
     points = list(model.points3D.values())
     for point, other in zip(points, points[1:] + points[:1], strict=True):
-        colours = [seen_in(element) for element in point.track.elements]
-        same.append(np.abs(np.diff(colours, axis=0)).mean())
-        own.append(np.abs(colours - point.color / 255).mean())
-        unlike.append(np.abs(seen_in(other.track.elements[0]) - colours[0]).mean())
+        colors = [seen_in(element) for element in point.track.elements]
+        same.append(np.abs(np.diff(colors, axis=0)).mean())
+        own.append(np.abs(colors - point.color / 255).mean())
+        unlike.append(np.abs(seen_in(other.track.elements[0]) - colors[0]).mean())
     assert np.median(same) < 0.06
     assert np.median(own) < 0.05
     assert np.median(same) < 0.4 * np.median(unlike)
@@ -261,7 +261,7 @@ def test_transparent_photographs_show_the_objects_alone(scene: Path, tmp_path: P
     assert {0, 255} < set(np.unique(alpha)) <= {0, 64, 128, 191, 255}
     np.testing.assert_array_equal(clear[alpha == 255, :3], opaque[alpha == 255])
     assert (clear[alpha == 0] == 0).all()
-    # Where a pixel is half covered its colour is that of the object, not darkened by what is missing.
+    # Where a pixel is half covered its color is that of the object, not darkened by what is missing.
     edge = (alpha > 0) & (alpha < 255)
     assert clear[edge, :3].mean() > 0.6 * clear[alpha == 255, :3].mean()
     mask = pixels(tmp_path / "scene" / "ground_truth" / "masks" / "view_000.png")[..., 0]

@@ -191,7 +191,7 @@ def test_coincident_vertices_keep_gaussians_finite(make_scene: Make) -> None:
         deform(g, lambda corners: corners * np.nan)
 
 
-def colours_seen(g: FlatGaussians, directions: np.ndarray) -> np.ndarray:
+def colors_seen(g: FlatGaussians, directions: np.ndarray) -> np.ndarray:
     """Of each Gaussian along each of the ray directions, world frame."""
     return np.einsum("sk,nkc->nsc", sh_basis(directions, g.sh_degree), g.sh.astype(np.float64))
 
@@ -230,11 +230,11 @@ def test_proxy_mirrored_mesh_mirrors_scene(make_scene: Make, linear, method: str
     np.testing.assert_allclose(np.linalg.det(result.rotations), 1.0, atol=1e-5)
     normals = np.einsum("ij,nj->ni", linear / scale, g.rotations[:, :, 0])
     np.testing.assert_allclose(np.sum(normals * result.rotations[:, :, 0], axis=1), 1.0, atol=1e-5)
-    # Seen along the mirrored ray, each Gaussian has the colour that it had.
+    # Seen along the mirrored ray, each Gaussian has the color that it had.
     directions = np.random.default_rng(2).standard_normal((20, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    seen = colours_seen(result, directions @ (linear / scale).T)
-    np.testing.assert_allclose(seen, colours_seen(g, directions), atol=2e-4)
+    seen = colors_seen(result, directions @ (linear / scale).T)
+    np.testing.assert_allclose(seen, colors_seen(g, directions), atol=2e-4)
 
 
 def test_proxy_mirrored_cage_reports_gaussians(make_scene: Make) -> None:

@@ -63,8 +63,8 @@ def test_curves_of_several_runs_share_plot(run, tmp_path, capsys):
     pixels = np.asarray(Image.open(picture).convert("RGB")).astype(int)
     assert pixels.shape[1] > 2 * pixels.shape[0]  # a panel for each scene
     half = pixels.shape[1] // 2
-    for colour, in_first, in_second in (((31, 119, 180), True, True), ((255, 127, 14), True, False)):
-        there = (np.abs(pixels - colour).max(axis=-1) < 8).sum(axis=0)
+    for color, in_first, in_second in (((31, 119, 180), True, True), ((255, 127, 14), True, False)):
+        there = (np.abs(pixels - color).max(axis=-1) < 8).sum(axis=0)
         assert (there[:half].sum() > 50, there[half:].sum() > 50) == (in_first, in_second)
     assert re.search(r"x old: held out 25\.00 dB after 20 s\n", capsys.readouterr().out)
 

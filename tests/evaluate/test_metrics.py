@@ -50,7 +50,7 @@ def test_psnr_agrees_with_scikit_image():
     assert psnr(render, reference) == pytest.approx(expected, abs=1e-9)
 
 
-def test_colour_correction_undoes_gain_and_offset_where_pixels_count():
+def test_color_correction_undoes_gain_and_offset_where_pixels_count():
     _, reference = pair(30, 41)
     gain, offset = np.array([0.8, 0.9, 0.7]), np.array([0.05, -0.02, 0.1])
     render = (reference * gain + offset).astype(np.float32)
@@ -62,7 +62,7 @@ def test_colour_correction_undoes_gain_and_offset_where_pixels_count():
     assert psnr(corrected, reference, weight) > 100
 
 
-def test_colour_correction_agrees_with_numpys_least_squares():
+def test_color_correction_agrees_with_numpys_least_squares():
     render, reference = pair(30, 41)
     corrected = fit_color(render, reference, np.ones((30, 41), np.float32))
     for channel in range(3):
@@ -71,7 +71,7 @@ def test_colour_correction_agrees_with_numpys_least_squares():
         np.testing.assert_allclose(corrected[..., channel].ravel(), expected, atol=1e-5)
 
 
-def test_colour_correction_constant_or_empty_image():
+def test_color_correction_constant_or_empty_image():
     grey, target = np.full((4, 5, 3), 0.5, np.float32), np.full((4, 5, 3), 0.25, np.float32)
     np.testing.assert_allclose(fit_color(grey, target, np.ones((4, 5), np.float32)), target)
     assert (fit_color(grey, target, np.zeros((4, 5), np.float32)) == grey).all()

@@ -281,14 +281,14 @@ def test_axes_have_labelled_ticks_inside_the_plot():
         assert len({tick.label for tick in chart.x_ticks}) == len(chart.x_ticks)
 
 
-def test_error_colours_are_those_of_flip_itself():
+def test_error_colors_are_those_of_flip_itself():
     import flip_evaluator
 
     rng = np.random.default_rng(0)
     a, b = (rng.random((40, 40, 3), dtype=np.float32) for _ in range(2))
     values, _, _ = flip_evaluator.evaluate(a, b, "LDR", applyMagma=False)
-    coloured, _, _ = flip_evaluator.evaluate(a, b, "LDR", applyMagma=True)
-    assert np.abs(magma(values[..., 0]) - coloured).max() < 0.02
+    colored, _, _ = flip_evaluator.evaluate(a, b, "LDR", applyMagma=True)
+    assert np.abs(magma(values[..., 0]) - colored).max() < 0.02
 
 
 def test_report_unwritable_path_raises_output_error(tmp_path):

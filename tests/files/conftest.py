@@ -53,7 +53,7 @@ def splats() -> Path:
 
 @pytest.fixture
 def make_scene() -> Callable[..., FlatGaussians]:
-    """Random scenes in which some Gaussians are too faint for an octagon and some colours leave [0, 1]."""
+    """Random scenes in which some Gaussians are too faint for an octagon and some colors leave [0, 1]."""
 
     def make(count: int, seed: int = 0) -> FlatGaussians:
         random = np.random.default_rng(seed)

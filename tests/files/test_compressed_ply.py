@@ -26,7 +26,7 @@ def pack_unit(values: np.ndarray, bits: tuple[int, ...]) -> np.ndarray:
     return word.astype(np.uint32)
 
 
-def write_compressed(path: Path, cloud: GaussianCloud, *, colour_bounds: bool = True) -> None:
+def write_compressed(path: Path, cloud: GaussianCloud, *, color_bounds: bool = True) -> None:
     """The encoder of the format, chunk by chunk."""
     n = len(cloud.means_world)
     rgb = 0.5 + SH_C0 * cloud.sh[:, 0]
@@ -39,7 +39,7 @@ def write_compressed(path: Path, cloud: GaussianCloud, *, colour_bounds: bool = 
         row: dict[str, float] = {}
         for key, values in groups.items():
             low, high = values[part].min(axis=0), values[part].max(axis=0)
-            if key == "rgb" and not colour_bounds:
+            if key == "rgb" and not color_bounds:
                 shares[key][part] = values[part]
                 continue
             shares[key][part] = (values[part] - low) / np.maximum(high - low, 1e-9)
@@ -85,7 +85,7 @@ def test_values_come_back_within_their_quantum(
     write_compressed(path, cloud)
     assert importer_for(path).name == "compressed-ply"
     back = importer_for(path).read(path)
-    # Half a step: 6 units / 1023, 5 / 1023 in ln, sqrt(2) / 1023 a component, one colour / 255, 8 / 256.
+    # Half a step: 6 units / 1023, 5 / 1023 in ln, sqrt(2) / 1023 a component, one color / 255, 8 / 256.
     difference(back, cloud).assert_below(
         position=0.5 * 6 / 1023 * 1.001,
         rotation_degrees=0.25,
@@ -146,9 +146,9 @@ def test_compressed_ply_outliers_keep_precision(tmp_path: Path, far: int) -> Non
     assert (errors > 0.1 * sigma).mean() < (0.0001 if far == 0 else 8 * 256 / count)
 
 
-def test_older_files_without_bounds_of_colours(make_cloud: Make, tmp_path: Path) -> None:
+def test_older_files_without_bounds_of_colors(make_cloud: Make, tmp_path: Path) -> None:
     cloud = make_cloud(300)
-    write_compressed(tmp_path / "a.ply", cloud, colour_bounds=False)
+    write_compressed(tmp_path / "a.ply", cloud, color_bounds=False)
     assert importer_for(tmp_path / "a.ply").name == "compressed-ply"
     back, report = read_scene(tmp_path / "a.ply")
     assert (report.count, report.flattened) == (300, 300)

@@ -228,7 +228,7 @@ def test_odd_counts_of_harmonics_are_refused(make_gaussians: Make, tmp_path: Pat
 
 
 @pytest.mark.parametrize(
-    ("name", "what"), [("y", "position"), ("rot_2", "rotation"), ("scale_1", "scale"), ("f_dc_0", "colour")]
+    ("name", "what"), [("y", "position"), ("rot_2", "rotation"), ("scale_1", "scale"), ("f_dc_0", "color")]
 )
 def test_nonfinite_values_are_counted(make_gaussians: Make, tmp_path: Path, name: str, what: str) -> None:
     columns = columns_of(make_gaussians(9))

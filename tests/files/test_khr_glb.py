@@ -80,12 +80,12 @@ def test_attributes_are_those_of_the_specification(make_scene: Make, tmp_path: P
         covariance, np.einsum("nij,nj,nkj->nik", ours, scene.scales**2, ours), atol=1e-5
     )
     np.testing.assert_array_equal(attribute(document, binary, f"{KHR}:OPACITY")[:, 0], scene.opacities)
-    colour = attribute(document, binary, "COLOR_0") / 255
+    color = attribute(document, binary, "COLOR_0") / 255
     linear = srgb_to_linear(np.clip(scene.base_rgb_srgb, 0, 1))
-    np.testing.assert_allclose(colour[:, :3], linear, atol=0.502 / 255)
+    np.testing.assert_allclose(color[:, :3], linear, atol=0.502 / 255)
 
 
-def test_colours_seen_from_a_direction_turn_with_the_scene(make_scene: Make, tmp_path: Path) -> None:
+def test_colors_seen_from_a_direction_turn_with_the_scene(make_scene: Make, tmp_path: Path) -> None:
     base = make_scene(50)
     sh = np.random.default_rng(0).standard_normal((50, 16, 3)).astype(np.float32)
     scene = FlatGaussians(base.means_world, base.quats_wxyz, base.log_scales, base.opacity_logits, sh)
@@ -162,7 +162,7 @@ def test_several_primitives_and_quantised_attributes(make_scene: Make, tmp_path:
     np.testing.assert_allclose(back.rotations[30:], back.rotations[:30], atol=2e-4)
 
 
-def test_khr_glb_linear_colours_are_converted_with_warning(make_scene: Make, tmp_path: Path) -> None:
+def test_khr_glb_linear_colors_are_converted_with_warning(make_scene: Make, tmp_path: Path) -> None:
     scene = make_scene(30)
     export_scene(scene, tmp_path / "a.splats.glb")
     document, binary = parts(tmp_path / "a.splats.glb")
@@ -235,14 +235,14 @@ def test_primitives_without_a_channel_get_zeros(make_scene: Make, tmp_path: Path
         read_scene(join(tmp_path / "c.glb", document, binary))
 
 
-def test_octagons_are_a_scene_with_one_colour_each(make_scene: Make, tmp_path: Path) -> None:
+def test_octagons_are_a_scene_with_one_color_each(make_scene: Make, tmp_path: Path) -> None:
     scene = make_scene(300)
     label = np.arange(300, dtype=np.float32)[:, None]
     export_scene(scene.with_channels({"label": label}), tmp_path / "mesh.glb", ExportOptions(chunks=4))
     back, report = read_scene(tmp_path / "mesh.glb")
     kept = scene.select(octagon_radii(scene.opacities) > 0)
     assert 0 < len(back) == len(kept) < 300 and report.flattened == 0
-    assert "one colour" in report.notes[0] and f"{300 - len(kept)} fainter" in report.notes[1]
+    assert "one color" in report.notes[0] and f"{300 - len(kept)} fainter" in report.notes[1]
     np.testing.assert_array_equal(back.channels["label"], label[octagon_radii(scene.opacities) > 0])
     np.testing.assert_allclose(back.means_world, kept.means_world, atol=2e-6)
     np.testing.assert_allclose(back.scales, kept.scales, rtol=1e-3)

@@ -47,9 +47,9 @@ def test_mesh_ply_holds_every_octagon_once(make_scene: Make, tmp_path: Path) -> 
     np.testing.assert_array_equal(corners, octagon_corners_world(scene, radii)[ids])
     uv = np.stack([vertex["s"], vertex["t"]], axis=-1)
     np.testing.assert_allclose(uv, expected_uv(radii[ids], options.q), atol=1e-6)
-    colours = np.stack([vertex[name] for name in ("red", "green", "blue", "alpha")], axis=-1)
+    colors = np.stack([vertex[name] for name in ("red", "green", "blue", "alpha")], axis=-1)
     rgba = np.concatenate([np.clip(scene.base_rgb_srgb, 0, 1), scene.opacities[:, None]], axis=1)[ids]
-    assert np.abs(colours / 255.0 - rgba[:, None]).max() <= 0.5 / 255 + 1e-6
+    assert np.abs(colors / 255.0 - rgba[:, None]).max() <= 0.5 / 255 + 1e-6
     np.testing.assert_array_equal(tables["face"]["vertex_indices"], octagon_triangles(len(ids)))
 
 
@@ -65,7 +65,7 @@ def test_mesh_ply_comes_back_to_the_same_gaussians(make_scene: Make, tmp_path: P
     np.testing.assert_allclose(log_scales, scene.log_scales[ids], atol=1e-3)
 
 
-def test_mesh_ply_is_a_scene_with_one_colour_each(make_scene: Make, tmp_path: Path) -> None:
+def test_mesh_ply_is_a_scene_with_one_color_each(make_scene: Make, tmp_path: Path) -> None:
     scene = make_scene(300)
     label = np.arange(300, dtype=np.float32)[:, None]
     export_scene(scene.with_channels({"label": label}), tmp_path / "mesh.ply")
@@ -74,7 +74,7 @@ def test_mesh_ply_is_a_scene_with_one_colour_each(make_scene: Make, tmp_path: Pa
     shown = octagon_radii(scene.opacities) > 0
     kept = scene.select(shown)
     assert 0 < len(back) == len(kept) < 300 and report.flattened == 0
-    assert "one colour" in report.notes[0] and f"{300 - len(kept)} fainter" in report.notes[1]
+    assert "one color" in report.notes[0] and f"{300 - len(kept)} fainter" in report.notes[1]
     np.testing.assert_array_equal(back.channels["label"], label[shown])
     np.testing.assert_allclose(back.means_world, kept.means_world, atol=2e-6)
     np.testing.assert_allclose(back.scales, kept.scales, rtol=1e-3)
@@ -152,7 +152,7 @@ def test_obj_texture_is_the_fall_off_as_grey(make_scene: Make, tmp_path: Path) -
 
 
 @pytest.mark.parametrize("name", ["a.obj", "a.mesh.ply"])
-def test_trimesh_reads_the_same_octagons_colours_and_texture_coordinates(
+def test_trimesh_reads_the_same_octagons_colors_and_texture_coordinates(
     make_scene: Make, tmp_path: Path, name: str
 ) -> None:
     trimesh = pytest.importorskip("trimesh")
@@ -168,9 +168,9 @@ def test_trimesh_reads_the_same_octagons_colours_and_texture_coordinates(
     np.testing.assert_allclose(
         mesh.visual.uv.reshape(-1, 8, 2), expected_uv(radii[ids], CHI2_2_99), atol=1e-6
     )
-    colours = np.asarray(mesh.vertex_attributes["color"])[::8, :3].astype(np.float64)
-    colours /= 255.0 if colours.max() > 1.0 else 1.0
-    np.testing.assert_allclose(colours, np.clip(scene.base_rgb_srgb, 0, 1)[ids], atol=0.51 / 255)
+    colors = np.asarray(mesh.vertex_attributes["color"])[::8, :3].astype(np.float64)
+    colors /= 255.0 if colors.max() > 1.0 else 1.0
+    np.testing.assert_allclose(colors, np.clip(scene.base_rgb_srgb, 0, 1)[ids], atol=0.51 / 255)
 
 
 def test_mesh_ply_holds_channels(make_scene: Make, tmp_path: Path) -> None:

@@ -79,7 +79,7 @@ def bilinear(image: np.ndarray, uv: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("q", [4.0, 9.21, 11.345])
-def test_texture_times_vertex_colour_is_the_gaussian(make_scene: Make, tmp_path: Path, q: float) -> None:
+def test_texture_times_vertex_color_is_the_gaussian(make_scene: Make, tmp_path: Path, q: float) -> None:
     scene = make_scene(400)
     export_scene(scene, tmp_path / "a.glb", ExportOptions(q=q))
     glb = Glb(tmp_path / "a.glb")
@@ -97,11 +97,11 @@ def test_texture_times_vertex_colour_is_the_gaussian(make_scene: Make, tmp_path:
     local = np.einsum("tji,tj->ti", scene.rotations[ids].astype(np.float64), offsets)
     rho2 = np.sum((local[:, 1:] / scene.scales[ids]) ** 2, axis=1)
     assert rho2.max() > 0.9 * q
-    colour = interpolate("COLOR_0") * bilinear(texture, interpolate("TEXCOORD_0"))
+    color = interpolate("COLOR_0") * bilinear(texture, interpolate("TEXCOORD_0"))
     expected = scene.opacities[ids] * np.exp(-rho2 / 2)
-    np.testing.assert_allclose(colour[:, 3], expected, atol=0.003)
+    np.testing.assert_allclose(color[:, 3], expected, atol=0.003)
     linear = srgb_to_linear(np.clip(scene.base_rgb_srgb, 0, 1))[ids]
-    np.testing.assert_allclose(colour[:, :3], linear, atol=1e-6)
+    np.testing.assert_allclose(color[:, :3], linear, atol=1e-6)
 
 
 def test_texture_filtering_error_is_within_bound() -> None:

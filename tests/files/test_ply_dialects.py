@@ -87,7 +87,7 @@ def test_ply_zero_filter_leaves_scales_unchanged(tmp_path: Path) -> None:
 def test_ply_degree_four_harmonics_are_truncated_with_warning(tmp_path: Path) -> None:
     path = write_disc(tmp_path / "a.ply", [NORMAL, FIRST, SECOND], [1e-5, *SIGMAS], rest=72)
     scene, report = read_scene(path)
-    expected = 0.01 * np.array([[24 * colour + k for colour in range(3)] for k in range(15)])
+    expected = 0.01 * np.array([[24 * color + k for color in range(3)] for k in range(15)])
     np.testing.assert_allclose(scene.sh[0, 1:], expected, rtol=1e-6)
     assert report.notes == ("Harmonics of degree 4 were left out; degree 3 is the highest here.",)
 

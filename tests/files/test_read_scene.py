@@ -71,7 +71,7 @@ def test_gaussians_without_finite_values_can_be_left_out(gaussians: FlatGaussian
     rows[3, 0] = np.nan  # position
     rows[7, -4:] = 0.0  # rotation
     rows[9, -5] = np.inf  # scale
-    rows[11, 10] = np.nan  # colour
+    rows[11, 10] = np.nan  # color
     (tmp_path / "a.ply").write_bytes(data)
     with pytest.raises(SceneFileError, match=r"1 of 30 Gaussians have no finite position; .*--drop-invalid"):
         read_scene(tmp_path / "a.ply")

@@ -24,12 +24,12 @@ SH_SIGNS = np.sign(sh_basis(DIRECTION * (1, -1, -1), 3) * sh_basis(DIRECTION, 3)
 
 def pack(cloud: GaussianCloud, version: int, degree: int | None = None) -> tuple[bytes, list[bytes]]:
     """Header and attributes of an SPZ, one Gaussian after another."""
-    positions, alphas, colours, scales, rotations, harmonics = (bytearray() for _ in range(6))
+    positions, alphas, colors, scales, rotations, harmonics = (bytearray() for _ in range(6))
     for i in range(len(cloud.means_world)):
         for value in cloud.means_world[i] * (1, -1, -1):
             positions += round(float(value) * (1 << BITS)).to_bytes(3, "little", signed=True)
         alphas.append(round(255 / (1 + np.exp(-cloud.opacity_logits[i]))))
-        colours += bytes(round(255 * (0.15 * float(value) + 0.5)) for value in cloud.sh[i, 0])
+        colors += bytes(round(255 * (0.15 * float(value) + 0.5)) for value in cloud.sh[i, 0])
         scales += bytes(round((float(value) + 10) * 16) for value in cloud.log_scales[i])
         w, x, y, z = cloud.quats_wxyz[i] / np.linalg.norm(cloud.quats_wxyz[i])
         xyzw = np.array([x, -y, -z, w])
@@ -53,7 +53,7 @@ def pack(cloud: GaussianCloud, version: int, degree: int | None = None) -> tuple
     header = struct.pack(
         "<4sIIBBBB", b"NGSP", version, len(cloud.means_world), own if degree is None else degree, BITS, 0, 0
     )
-    return header, [bytes(b) for b in (positions, alphas, colours, scales, rotations, harmonics)]
+    return header, [bytes(b) for b in (positions, alphas, colors, scales, rotations, harmonics)]
 
 
 def write_spz(path: Path, cloud: GaussianCloud, version: int) -> None:

@@ -29,7 +29,7 @@ def test_harmonics_basis_equals_tracer() -> None:
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 @pytest.mark.parametrize("mirrored", [False, True])
-def test_turned_colours_are_the_old_ones_seen_from_turned_directions(degree: int, mirrored: bool) -> None:
+def test_turned_colors_are_the_old_ones_seen_from_turned_directions(degree: int, mirrored: bool) -> None:
     random = np.random.default_rng(degree)
     count = 40
     sh = random.standard_normal((count, (degree + 1) ** 2, 3)).astype(np.float32)

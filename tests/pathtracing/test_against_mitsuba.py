@@ -42,7 +42,7 @@ VIEW = camera(*EYE, SIZE, 40)
 LAMP = RectangleLight(
     position=(-1.0, -3.5, -1.0), direction=(0.25, 1, 0.25), width=1.5, height=1.5, radiance=9
 )
-FLOOR = StageMesh(shape="plane", scale=4, material=Diffuse(colour_srgb=(0.7, 0.6, 0.5)))
+FLOOR = StageMesh(shape="plane", scale=4, material=Diffuse(color_srgb=(0.7, 0.6, 0.5)))
 
 
 def ball(material: Any, radius: float = 0.9) -> StageMesh:
@@ -153,23 +153,23 @@ def stage_of(*meshes: StageMesh, lights: tuple[Any, ...] = (LAMP,), env: Environ
 OPAQUE = {
     "mirror": (Mirror(), {"type": "conductor", "material": "none"}),
     "metal": (
-        Metal(colour_srgb=(0.95, 0.8, 0.5), roughness=0.5, multiple_scattering=False),
+        Metal(color_srgb=(0.95, 0.8, 0.5), roughness=0.5, multiple_scattering=False),
         {"type": "principled", "base_color": linear(0.95, 0.8, 0.5), "metallic": 1.0, "roughness": 0.5},
     ),
     "rough mirror": (
-        Metal(colour_srgb=(1, 1, 1), roughness=0.7, multiple_scattering=False),
+        Metal(color_srgb=(1, 1, 1), roughness=0.7, multiple_scattering=False),
         {"type": "roughconductor", "material": "none", "distribution": "ggx", "alpha": 0.49},
     ),
     "principled": (
         MetallicRoughness(
-            colour_srgb=(0.6, 0.3, 0.2), metallic=0.3, roughness=0.4,
+            color_srgb=(0.6, 0.3, 0.2), metallic=0.3, roughness=0.4,
             diffuse="burley", multiple_scattering=False,
         ),
         {"type": "principled", "base_color": linear(0.6, 0.3, 0.2), "metallic": 0.3, "roughness": 0.4},
     ),
     # A smooth coat: Mitsuba's rough one loses up to a fifth of what falls on white (alpha 0.16).
     "plastic": (
-        Dielectric(colour_srgb=(0.7, 0.2, 0.2), roughness=0.03),
+        Dielectric(color_srgb=(0.7, 0.2, 0.2), roughness=0.03),
         {"type": "plastic", "int_ior": 1.5, "ext_ior": 1.0, "diffuse_reflectance": linear(0.7, 0.2, 0.2)},
     ),
     "glass": (Glass(ior=1.5), {"type": "dielectric", "int_ior": 1.5, "ext_ior": 1.0}),
@@ -224,16 +224,16 @@ def test_point_and_directional_lights(tmp_path: Path) -> None:
         "b": {"type": "directional", "direction": [1, 2, 1], "irradiance": {"type": "rgb", "value": 0.7}},
     }
     red = {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": linear(0.8, 0.2, 0.2)}}
-    stage = stage_of(FLOOR, ball(Diffuse(colour_srgb=(0.8, 0.2, 0.2))), lights=lights)
+    stage = stage_of(FLOOR, ball(Diffuse(color_srgb=(0.8, 0.2, 0.2))), lights=lights)
     print("points", same(stage, tmp_path, [GROUND, red], emitters))  # noqa: T201
 
 
 def test_emissive_and_light_spheres_match_mitsuba(tmp_path: Path) -> None:
-    glow = Diffuse(colour_srgb=(0, 0, 0), emission=4.0)
+    glow = Diffuse(color_srgb=(0, 0, 0), emission=4.0)
     shining = StageMesh(
         shape="cube", scale=0.4, position=(-1, -1.5, 0), rotation_degrees=(20, 30, 0), material=glow
     )
-    matt = ball(Diffuse(colour_srgb=(0.8, 0.2, 0.2)), 0.6)
+    matt = ball(Diffuse(color_srgb=(0.8, 0.2, 0.2)), 0.6)
     lamp_ball = PointLight(position=(1.4, -1.8, -0.5), intensity=2.0, radius=0.3)
     red = {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": linear(0.8, 0.2, 0.2)}}
     areas = [{"type": "area", "radiance": {"type": "rgb", "value": v}} for v in (4.0, 2.0 / (np.pi * 0.09))]
@@ -249,7 +249,7 @@ def test_normal_texture_matches_mitsuba(tmp_path: Path) -> None:
     texture = {"type": "bitmap", "filename": str(tmp_path / "bumps.png"), "raw": True}
     plain = {"type": "principled", "base_color": linear(0.6, 0.4, 0.3), "roughness": 0.4}
     material = MetallicRoughness(
-        colour_srgb=(0.6, 0.4, 0.3), normal_texture="bumps.png", roughness=0.4, diffuse="burley"
+        color_srgb=(0.6, 0.4, 0.3), normal_texture="bumps.png", roughness=0.4, diffuse="burley"
     )
     box = StageMesh(
         shape="cube", scale=0.7, position=(0, -0.7, 0), rotation_degrees=(0, 35, 0), material=material

@@ -27,10 +27,10 @@ def hemisphere(rows: int, columns: int) -> tuple[np.ndarray, float]:
 
 
 def material(
-    n: int, *, metallic: float, roughness: float, colour: float = 1.0, **more: object
+    n: int, *, metallic: float, roughness: float, color: float = 1.0, **more: object
 ) -> OpaqueMaterial:
     return OpaqueMaterial(
-        np.full((n, 3), colour),
+        np.full((n, 3), color),
         np.full(n, metallic),
         np.full(n, roughness),
         **more,  # type: ignore[arg-type]
@@ -82,9 +82,9 @@ def test_bsdf_pdf_integrates_to_upper_hemisphere_share(metallic: float, roughnes
     n = 1 << 15
     rng = np.random.default_rng(2)
     for cosine in (0.3, 0.8):
-        some = material(len(lit), metallic=metallic, roughness=roughness, colour=0.5)
+        some = material(len(lit), metallic=metallic, roughness=roughness, color=0.5)
         total = some.evaluate(towards(cosine, len(lit)), lit)[1].sum() * patch
-        few = material(n, metallic=metallic, roughness=roughness, colour=0.5)
+        few = material(n, metallic=metallic, roughness=roughness, color=0.5)
         above = (few.sample(towards(cosine, n), rng.random((n, 3)))[:, 2] > 0).mean()
         assert abs(total - above) < 4 * np.sqrt(0.25 / n) + 1e-3
 
@@ -93,7 +93,7 @@ def test_bsdf_pdf_integrates_to_upper_hemisphere_share(metallic: float, roughnes
 def test_samples_follow_their_density(metallic: float) -> None:
     n, rows, columns, fine = 200_000, 8, 16, 12
     rng = np.random.default_rng(3)
-    some = material(n, metallic=metallic, roughness=0.6, colour=0.5)
+    some = material(n, metallic=metallic, roughness=0.6, color=0.5)
     lit = some.sample(towards(0.7, n), rng.random((n, 3)))
     lit = lit[lit[:, 2] > 0]
     angle = np.arctan2(lit[:, 1], lit[:, 0]) / (2 * np.pi) % 1
@@ -103,7 +103,7 @@ def test_samples_follow_their_density(metallic: float) -> None:
         indexing="ij",
     )  # fmt: skip
     grid = directions(cosines.ravel(), 2 * np.pi * angles.ravel())
-    pdf = material(len(grid), metallic=metallic, roughness=0.6, colour=0.5).evaluate(
+    pdf = material(len(grid), metallic=metallic, roughness=0.6, color=0.5).evaluate(
         towards(0.7, len(grid)), grid
     )[1]
     patch = 2 * np.pi / len(grid)

@@ -24,7 +24,7 @@ LAMP = RectangleLight(
 BALLS = tuple(
     StageMesh(shape="sphere", scale=0.15, position=(x, -0.15, z), material=material)
     for x, z, material in (
-        (0.5, -0.3, Diffuse(colour_srgb=(0.02, 0.02, 0.02))),
+        (0.5, -0.3, Diffuse(color_srgb=(0.02, 0.02, 0.02))),
         (-0.4, -0.4, Glass()),
         (0.5, 0.4, Mirror()),
     )

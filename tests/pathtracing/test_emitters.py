@@ -24,7 +24,7 @@ from tests.support.light_scenes import camera, film_of, table_with_a_box
 
 NUMBERS = Integrator(samples=1024, max_depth=1, anti_aliasing=False)
 WHITE = (1.0, 1.0, 1.0)
-FLOOR = StageMesh(shape="plane", scale=9, material=Diffuse(colour_srgb=WHITE))
+FLOOR = StageMesh(shape="plane", scale=9, material=Diffuse(color_srgb=WHITE))
 SPOT = camera((0.0, -0.05, -0.3), (0, 0, 0), (3, 3), 1e-3)
 """Sees the floor's middle from so low that no lamp above is in the way."""
 
@@ -48,7 +48,7 @@ def test_emissive_disc_irradiance_matches_form_factor(tmp_path: Path) -> None:
     factor = 4 * x / np.pi * np.arctan(a / np.hypot(a, h))
     write_png(tmp_path / "half.png", np.full((2, 2, 3), 0.5, np.float32))
     for more, share in (({}, 1.0), ({"emission_texture": "half.png"}, 0.21404)):
-        glow = Diffuse(colour_srgb=(0, 0, 0), emission=2.0, emission_srgb=WHITE, **more)
+        glow = Diffuse(color_srgb=(0, 0, 0), emission=2.0, emission_srgb=WHITE, **more)
         lamp = StageMesh(shape="plane", scale=a, position=(0, -h, 0), material=glow)
         stage = Stage(gaussians=(), meshes=(FLOOR, lamp), integrator=NUMBERS)
         assert irradiance(stage, tmp_path) == pytest.approx(2.0 * np.pi * factor * share, rel=0.01)

@@ -33,7 +33,7 @@ PLAIN = Integrator(samples=1, max_depth=6, roulette_depth=64, anti_aliasing=Fals
 def cloud(
     count: int, seed: int = 0, spread: float = 0.6, centre: tuple[float, ...] = (0, 0, 0)
 ) -> FlatGaussians:
-    """Coloured Gaussians of all opacities, their colours dependent on the direction."""
+    """Colored Gaussians of all opacities, their colors dependent on the direction."""
     rng = np.random.default_rng(seed)
     sh = rng.normal(0, 0.08, (count, 4, 3))
     sh[:, 0] = (rng.random((count, 3)) - 0.5) / SH_C0
@@ -47,12 +47,12 @@ def cloud(
 
 
 def wall(
-    z: float, half: float, per_side: int = 40, colour: float = 0.5, overlap: float = 1.0
+    z: float, half: float, per_side: int = 40, color: float = 0.5, overlap: float = 1.0
 ) -> FlatGaussians:
     """Gaussians side by side in the plane z: opaque where they overlap well."""
     x, y = np.meshgrid(*[(np.arange(per_side) + 0.5) / per_side * 2 * half - half] * 2)
     count = per_side**2
-    sh = np.full((count, 1, 3), (colour - 0.5) / SH_C0, np.float32)
+    sh = np.full((count, 1, 3), (color - 0.5) / SH_C0, np.float32)
     quats = np.tile(np.float32([np.sqrt(0.5), 0, -np.sqrt(0.5), 0]), (count, 1))  # the normal along z
     return FlatGaussians(
         np.stack([x.ravel(), y.ravel(), np.full(count, z)], axis=1).astype(np.float32),
@@ -143,14 +143,14 @@ def test_mirror_shows_gaussians_of_virtual_camera() -> None:
     shown = picture(emissive(mirror), into, some, background=((0.3 + 0.055) / 1.055) ** 2.4)
     assert psnr(shown, direct) > 50
     # A mirror that takes a hair of the light composites by the other rule, and shows the same but for that.
-    dimmer = StageMesh(**(dict(mirror) | {"material": Mirror(colour_srgb=(0.999, 0.999, 0.999))}))
+    dimmer = StageMesh(**(dict(mirror) | {"material": Mirror(color_srgb=(0.999, 0.999, 0.999))}))
     assert psnr(picture(emissive(dimmer), into, some, background=((0.3 + 0.055) / 1.055) ** 2.4), direct) > 50
 
 
 @pytest.mark.parametrize("light", ["directional", "point", "rectangle"])
 def test_gaussian_wall_shadow_equals_mesh_shadow(light: str) -> None:
     floor = StageMesh(
-        shape="plane", position=(0, 1, 0), scale=4, material=Diffuse(colour_srgb=(0.8, 0.8, 0.8))
+        shape="plane", position=(0, 1, 0), scale=4, material=Diffuse(color_srgb=(0.8, 0.8, 0.8))
     )
     lamps = {
         "directional": DirectionalLight(direction=(0.2, 0.7, 1), irradiance=3),
@@ -161,10 +161,10 @@ def test_gaussian_wall_shadow_equals_mesh_shadow(light: str) -> None:
     }
     numbers = Integrator(samples=16, max_depth=1, anti_aliasing=False)
     view = camera((0, -2, 4), (0, 0.8, 1), (48, 36), 45)
-    plate = StageMesh(shape="cube", scale=(0.5, 0.5, 1e-4), material=Diffuse(colour_srgb=(0, 0, 0)))
+    plate = StageMesh(shape="cube", scale=(0.5, 0.5, 1e-4), material=Diffuse(color_srgb=(0, 0, 0)))
     lights = {"lights": (lamps[light],)}
     with_mesh = Stage(gaussians=(), meshes=(floor, plate), integrator=numbers, **lights)
-    black = wall(0.0, 0.5, colour=0.0)
+    black = wall(0.0, 0.5, color=0.0)
     by_mesh = picture_without(with_mesh, view)
     by_gaussians = picture(emissive(floor, numbers=numbers, **lights), view, black)
     empty = picture_without(Stage(gaussians=(), meshes=(floor,), integrator=numbers, **lights), view)
@@ -179,7 +179,7 @@ def picture_without(stage: Stage, view: PinholeCamera) -> np.ndarray:
 
 
 def test_thin_gaussians_cast_thin_shadows() -> None:
-    floor = StageMesh(shape="plane", position=(0, 1, 0), scale=9, material=Diffuse(colour_srgb=(1, 1, 1)))
+    floor = StageMesh(shape="plane", position=(0, 1, 0), scale=9, material=Diffuse(color_srgb=(1, 1, 1)))
     sun = DirectionalLight(direction=(0, 1, 0), irradiance=np.pi)
     one = FlatGaussians(
         np.zeros((1, 3), np.float32), np.float32([[np.sqrt(0.5), 0, 0, np.sqrt(0.5)]]),
@@ -217,12 +217,12 @@ def test_meshes_take_the_light_of_shadowed_gaussians_away_and_no_more() -> None:
 
 
 def test_relit_gaussians_match_diffuse_wall() -> None:
-    screen = wall(0.0, 2.0, colour=0.6)
+    screen = wall(0.0, 2.0, color=0.6)
     lamp = PointLight(position=(0.5, -0.5, -1.5), intensity=4)
     numbers = Integrator(samples=1, max_depth=1, anti_aliasing=False)
     view = camera((0.4, 0.3, -2.5), (0, 0, 0), (24, 18), 30)
     board = StageMesh(
-        shape="cube", scale=(2, 2, 0.01), position=(0, 0, 0.01), material=Diffuse(colour_srgb=(0.6, 0.6, 0.6))
+        shape="cube", scale=(2, 2, 0.01), position=(0, 0, 0.01), material=Diffuse(color_srgb=(0.6, 0.6, 0.6))
     )
     as_mesh = picture_without(Stage(gaussians=(), meshes=(board,), lights=(lamp,), integrator=numbers), view)
     stage = Stage(gaussians=(StageGaussians(light="relit", ambient=0.0),), lights=(lamp,), integrator=numbers)
@@ -235,9 +235,9 @@ def test_relit_gaussians_match_diffuse_wall() -> None:
 
 def test_gaussians_light_mesh_as_equivalent_wall(tmp_path: Path) -> None:
     # A matt ball within a bright wall of Gaussians on one side, and the same light as an area light.
-    screen = wall(-1.5, 1.0, per_side=120, colour=0.9)
+    screen = wall(-1.5, 1.0, per_side=120, color=0.9)
     floor = StageMesh(
-        shape="plane", rotation_degrees=(-90, 0, 0), scale=3, material=Diffuse(colour_srgb=(1, 1, 1))
+        shape="plane", rotation_degrees=(-90, 0, 0), scale=3, material=Diffuse(color_srgb=(1, 1, 1))
     )
     numbers = Integrator(samples=1024, max_depth=1, anti_aliasing=False)
     view = camera((2.0, 0, -0.8), (0, 0, 0), (5, 4), 5)

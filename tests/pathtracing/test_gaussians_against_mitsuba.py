@@ -28,7 +28,7 @@ SETTINGS = TraceSettings(q=CHI2_3_99, transmittance_min=0.01, alpha_max=0.9999)
 
 
 def cloud(count: int) -> FlatGaussians:
-    """Coloured Gaussians of all opacities within 3 units, their colours dependent on the direction."""
+    """Colored Gaussians of all opacities within 3 units, their colors dependent on the direction."""
     rng = np.random.default_rng(3)
     sh = rng.normal(0, 0.08, (count, 4, 3))
     sh[:, 0] = (rng.random((count, 3)) - 0.5) / SH_C0

@@ -33,13 +33,13 @@ def white_sky(folder: Path, value: float = 1.0) -> Environment:
 @pytest.mark.parametrize(
     "material",
     [
-        Diffuse(colour_srgb=WHITE),
+        Diffuse(color_srgb=WHITE),
         Mirror(),
         Glass(ior=1.5),
         Glass(ior=1.5, roughness=0.5),
-        Metal(colour_srgb=WHITE, roughness=0.6),
-        Metal(colour_srgb=WHITE, roughness=0.15),
-        Dielectric(colour_srgb=WHITE, roughness=0.4),
+        Metal(color_srgb=WHITE, roughness=0.6),
+        Metal(color_srgb=WHITE, roughness=0.15),
+        Dielectric(color_srgb=WHITE, roughness=0.4),
     ],
     ids=lambda m: m.kind,
 )
@@ -105,7 +105,7 @@ def test_light_inside_glass_is_totally_reflected_beyond_the_critical_angle(tmp_p
 
 
 def test_rectangle_light_floor_form_factor(tmp_path: Path) -> None:
-    floor = StageMesh(shape="plane", scale=50, material=Diffuse(colour_srgb=WHITE))
+    floor = StageMesh(shape="plane", scale=50, material=Diffuse(color_srgb=WHITE))
     lamp = RectangleLight(position=(0, -1, 0), direction=(0, 1, 0), width=1.4, height=2.0, radiance=2.0)
     numbers = Integrator(samples=4096, max_depth=1, anti_aliasing=False)
     stage = Stage(gaussians=(), meshes=(floor,), lights=(lamp,), integrator=numbers)
@@ -122,7 +122,7 @@ def test_rectangle_light_floor_form_factor(tmp_path: Path) -> None:
 def test_mirror_shows_mesh_of_virtual_camera(tmp_path: Path) -> None:
     things = (
         StageMesh(
-            shape="cube", scale=0.4, position=(0.3, 0.1, -1), material=Diffuse(colour_srgb=(0.9, 0.3, 0.1))
+            shape="cube", scale=0.4, position=(0.3, 0.1, -1), material=Diffuse(color_srgb=(0.9, 0.3, 0.1))
         ),
         StageMesh(shape="sphere", scale=0.4, position=(-0.5, -0.2, -1.5), material=Diffuse()),
     )
@@ -168,7 +168,7 @@ def test_render_depends_on_seed_not_on_threads(tmp_path: Path) -> None:
 
 def test_depth_of_field_blurs_out_of_focus_objects(tmp_path: Path) -> None:
     edge = StageMesh(
-        shape="cube", position=(-1, 0, 0), scale=(1, 9, 0.001), material=Diffuse(colour_srgb=WHITE)
+        shape="cube", position=(-1, 0, 0), scale=(1, 9, 0.001), material=Diffuse(color_srgb=WHITE)
     )
     light = (DirectionalLight(direction=(0, 0, 1), irradiance=3.0),)
     view = camera((0, 0, -4), (0, 0, 0), (64, 8), 1)
@@ -185,7 +185,7 @@ def test_depth_of_field_blurs_out_of_focus_objects(tmp_path: Path) -> None:
 
 
 def test_light_of_a_point_goes_straight_through_a_pane(tmp_path: Path) -> None:
-    floor = StageMesh(shape="plane", position=(0, 1, 0), scale=9, material=Diffuse(colour_srgb=WHITE))
+    floor = StageMesh(shape="plane", position=(0, 1, 0), scale=9, material=Diffuse(color_srgb=WHITE))
     pane = StageMesh(
         shape="cube", scale=(3, 0.5, 3), position=(0, -2, 0), material=Glass(ior=1.5, absorption=(0.5, 0, 0))
     )

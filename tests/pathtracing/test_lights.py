@@ -75,7 +75,7 @@ def test_spot_light_is_limited_to_cone() -> None:
 def test_several_lights_add_up() -> None:
     lights = (
         PointLight(position=(0, 0, 1), intensity=1.0),
-        PointLight(position=(3, 0, 1), intensity=20.0, colour_srgb=(1, 0, 0)),
+        PointLight(position=(3, 0, 1), intensity=20.0, color_srgb=(1, 0, 0)),
         DirectionalLight(direction=(0, 0, -1), irradiance=0.5),
         RectangleLight(position=(0, 0, -1), direction=(0, 0, -1), width=1, height=1, radiance=9.0),
     )

@@ -54,9 +54,9 @@ def both(
     albedo, metallic, roughness = material["albedo"], material["metallic"], material["roughness"]
     gaussians = shiny_ball(3000, 1.0, albedo=albedo, metallic=metallic, roughness=roughness)
     ours = Stage(gaussians=(StageGaussians(light="relit"),), meshes=meshes, **given)
-    colour = tuple(float(c) for c in linear_to_srgb(np.array(albedo)))
+    color = tuple(float(c) for c in linear_to_srgb(np.array(albedo)))
     solid = MetallicRoughness(
-        colour_srgb=colour,
+        color_srgb=color,
         metallic=metallic,
         roughness=roughness,
         diffuse="burley",
@@ -82,13 +82,13 @@ def test_gaussian_ball_matches_mesh_ball(tmp_path, metallic, roughness, least):
 def test_mirror_and_gaussians_reflect_each_other(tmp_path):
     material = {"albedo": (0.9, 0.9, 0.9), "metallic": 1.0, "roughness": 0.2}
     mirror = StageMesh(
-        shape="plane", position=(0, 1.3, 0), scale=3.0, material=Mirror(colour_srgb=(0.9, 0.9, 0.9))
+        shape="plane", position=(0, 1.3, 0), scale=3.0, material=Mirror(color_srgb=(0.9, 0.9, 0.9))
     )
     box = StageMesh(
         shape="cube",
         position=(1.3, -0.3, -0.9),
         scale=0.25,
-        material=MetallicRoughness(colour_srgb=(0.9, 0.1, 0.1)),
+        material=MetallicRoughness(color_srgb=(0.9, 0.1, 0.1)),
     )
     ours, theirs = both(sky(tmp_path), material, {"meshes": (mirror, box)})
     assert psnr(ours, theirs) > 24
@@ -107,7 +107,7 @@ def test_material_gaussians_white_furnace_conserves_energy(tmp_path):
     assert image.max() <= 1.0 + 1e-6 and image[9:16, 9:16].mean() > 0.985
 
 
-def test_material_render_independent_of_threads_and_colours(tmp_path):
+def test_material_render_independent_of_threads_and_colors(tmp_path):
     gaussians = shiny_ball(1500, 1.0, albedo=(0.5, 0.5, 0.5), metallic=0.5, roughness=0.3)
     stage = Stage(
         gaussians=(StageGaussians(light="relit"),),
@@ -115,6 +115,6 @@ def test_material_render_independent_of_threads_and_colours(tmp_path):
         integrator=Integrator(samples=4, max_depth=3),
     )
     first = picture(stage, gaussians, threads=1)
-    coloured = shiny_ball(1500, 1.0, albedo=(0.5, 0.5, 0.5), metallic=0.5, roughness=0.3)
-    coloured.sh[:] = 1.0
-    assert (picture(stage, coloured, threads=2) == first).all()
+    colored = shiny_ball(1500, 1.0, albedo=(0.5, 0.5, 0.5), metallic=0.5, roughness=0.3)
+    colored.sh[:] = 1.0
+    assert (picture(stage, colored, threads=2) == first).all()

@@ -1,4 +1,4 @@
-"""Meshes as files bring them: materials, textures, normals and colours of GLB, OBJ and PLY."""
+"""Meshes as files bring them: materials, textures, normals and colors of GLB, OBJ and PLY."""
 
 import json
 from collections.abc import Callable
@@ -133,7 +133,7 @@ def test_glb_material_and_textures_are_read(tmp_path: Path) -> None:
     red, green, blue = linear_to_srgb(np.array([0.8, 0.6, 0.5])).tolist()
     light = linear_to_srgb(np.array([1, 0.5, 0.25])).tolist()
     twin = MetallicRoughness(
-        colour_srgb=(red, green, blue), metallic=0.7, roughness=0.9, normal_scale=0.5, emission=0.6,
+        color_srgb=(red, green, blue), metallic=0.7, roughness=0.9, normal_scale=0.5, emission=0.6,
         emission_srgb=(1, light[1], light[2]), **{name: f"{name}.png" for name in names},
     )  # fmt: skip
     found = same_as(tmp_path, "a.glb", twin)
@@ -183,7 +183,7 @@ def test_obj_materials_are_read_from_mtl(tmp_path: Path) -> None:
     )
 
 
-def test_ply_vertex_colours_become_material(tmp_path: Path) -> None:
+def test_ply_vertex_colors_become_material(tmp_path: Path) -> None:
     plane = primitive_shape("plane")
     rows = "\n".join("{} {} {} 188 64 0".format(*vertex) for vertex in plane.vertices)
     faces = "\n".join("3 {} {} {}".format(*face) for face in plane.faces)
@@ -195,14 +195,14 @@ def test_ply_vertex_colours_become_material(tmp_path: Path) -> None:
         f"property list uchar int vertex_indices\nend_header\n{rows}\n{faces}\n"
     )
     write_obj(tmp_path / "twin.obj", plane)
-    same_as(tmp_path, "p.ply", Diffuse(colour_srgb=(188 / 255, 64 / 255, 0)))
+    same_as(tmp_path, "p.ply", Diffuse(color_srgb=(188 / 255, 64 / 255, 0)))
 
 
 def test_normal_texture_changes_shading_normal(tmp_path: Path) -> None:
     # x to the right of the image, y up in it; the plane's image has its top towards -z.
     tilt = np.array([0.36, 0.48, 0.8])
     write_png(tmp_path / "tilt.png", np.tile((tilt / 2 + 0.5).astype(np.float32), (2, 2, 1)))
-    floor = StageMesh(shape="plane", material=Diffuse(colour_srgb=(1, 1, 1), normal_texture="tilt.png"))
+    floor = StageMesh(shape="plane", material=Diffuse(color_srgb=(1, 1, 1), normal_texture="tilt.png"))
     view = camera((0, 3, 1e-3), (0, 0, 0), (3, 3), 1)
     numbers = Integrator(samples=1, max_depth=1, anti_aliasing=False)
     for light in ((0.0, -1.0, 0.0), (-0.6, -0.8, 0.0), (0.0, -0.8, 0.6)):

@@ -74,7 +74,7 @@ def test_stage_object_rests_on_surface(scene: Path, tmp_path: Path) -> None:
     stage.write_text(
         "[[gaussians]]\nlight = 'emissive'\n[[meshes]]\nshape = 'cube'\nscale = 0.1\n"
         "on = { origin = [0.6, -2, 0.5], direction = [0, 1, 0] }\n"
-        "material = { kind = 'diffuse', colour_srgb = [0, 0, 0] }\n[integrator]\nsamples = 1\n"
+        "material = { kind = 'diffuse', color_srgb = [0, 0, 0] }\n[integrator]\nsamples = 1\n"
     )
     done = octasplat("render", scene, "-o", tmp_path / "one.exr", "--preview", "--stage", stage, *SMALL)
     assert done.exit_code == 0, done.output
@@ -85,7 +85,7 @@ def test_stage_object_rests_on_surface(scene: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("colour = 1", "there is no key colour"),
+        ("color = 1", "there is no key color"),
         ("[environment]\nfile = 'sky.hdr'", "there is no file"),
         ("[environment]\nfile = 'no_picture.hdr'", "no_picture.hdr"),
         ("[[meshes]]\nfile = 'leaf.obj'\nmaterial = { kind = 'glass' }", "is not closed"),

@@ -18,6 +18,7 @@ from octasplat.engine.pathtracing.stage.stage_file import (
     write_stage_template,
 )
 
+GOLD = '[[meshes]]\nshape = "sphere"\nmaterial = {{ kind = "metal", {key} = [0.9, 0.8, 0.5] }}\n'
 BALL = '[[meshes]]\nshape = "sphere"\n'
 
 
@@ -62,8 +63,8 @@ def test_stage_file_with_all_keys_is_read(tmp_path: Path) -> None:
     ("text", "words"),
     [
         ("up = [0, 1", "no TOML"),
-        ("colour = 3", "no key colour"),
-        (BALL + "colour = 3", r"no key meshes\[0\]\.colour"),
+        ("color = 3", "no key color"),
+        (BALL + "color = 3", r"no key meshes\[0\]\.color"),
         (
             BALL + 'material = { kind = "mirror", roughness = 0.5 }',
             r"no key meshes\[0\]\.material\.roughness",
@@ -153,3 +154,8 @@ def test_example_stages_are_valid(tmp_path: Path) -> None:
     assert [stage.gaussians[0].light for stage in stages] == ["shadowed", "emissive", "relit", "shadowed"]
     vase = read_mesh(tmp_path / "vase.obj", with_materials=True)
     assert vase.materials[0].texture is not None and vase.corner_uv is not None
+
+
+def test_colors_are_read_under_their_former_key(tmp_path: Path) -> None:
+    layout = StageLayout(tmp_path)
+    assert parse_stage(GOLD.format(key="colour_srgb"), layout) == parse_stage(GOLD.format(key="color_srgb"), layout)

@@ -21,7 +21,7 @@ Buffer Developed End Facets Front Judge LEAVING Leaving Lobe Machinery Paint Rev
 accepting against_truth ask average_after bundles calm_after densities develop even_weight fit_iterations
 free_lenses gate goes_on guards hand_over hasten_after hear kernels_eight kernels_sixteen know_alphas
 know_slots learnt_light lens_doubt let_through making_room map_steps meet_block meet_group mesh_looks
-near_share on_loss one_colour only_seen opaque_sample opaque_value own_token place_misfits plain_colours
+near_share on_loss one_color only_seen opaque_sample opaque_value own_token place_misfits plain_colors
 programs put_off rays_a_pixel see see_from_counter see_packets settle sh_every shown_share sight_lines
 spatial staging step_back_db t_leaves t_viewer weigh_next window_rays window_side window_size
 """

@@ -24,8 +24,8 @@ def scene_folders() -> list[Path]:
 
 
 @pytest.mark.parametrize("root", scene_folders(), ids=lambda path: path.name)
-def test_sparse_points_have_the_colours_of_the_photographs(root, tmp_path):
-    """Where structure from motion saw a point, its colour is found, which proves frames, rays and pixels."""
+def test_sparse_points_have_the_colors_of_the_photographs(root, tmp_path):
+    """Where structure from motion saw a point, its color is found, which proves frames, rays and pixels."""
     data = Dataset.open(root, tmp_path / "cache", max_side=200)
     assert len(data.points) > 0
     model = pycolmap.Reconstruction(str(load_dataset_model(root).model_folder))
@@ -36,7 +36,7 @@ def test_sparse_points_have_the_colours_of_the_photographs(root, tmp_path):
         view = data.views[index]
         observed = [model.points3D[p.point3D_id] for p in seen_by[view.name].get_observation_points2D()]
         xyz = np.array([point.xyz for point in observed])
-        colour = np.array([point.color for point in observed]) / 255
+        color = np.array([point.color for point in observed]) / 255
         camera = data.cameras[view.camera_index]
         cam = xyz @ view.rotation_cam_from_world.T + view.translation_cam_from_world
         xy = camera.project(cam)
@@ -44,7 +44,7 @@ def test_sparse_points_have_the_colours_of_the_photographs(root, tmp_path):
         assert inside.mean() > 0.99
         x, y = xy[inside].astype(int).T
         rgb, _, weight = data.pixels(np.full(len(x), index), y, x)
-        differences.append(np.abs(rgb - colour[inside])[weight == 1].mean(axis=1))
+        differences.append(np.abs(rgb - color[inside])[weight == 1].mean(axis=1))
         # The ray through that pixel must pass within half a pixel's diagonal of the point.
         rays = data.rays(np.full(len(x), index), y, x)
         origins, directions = rays.origins_world, rays.directions_world

@@ -5,7 +5,7 @@ import numpy as np
 from octasplat.engine.gaussians.frames import frames_from_normals, quaternions_from_matrices
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.render.pinhole_camera import PinholeCamera
-from octasplat.engine.render.renderer import background_colour, front_normals, render_rays
+from octasplat.engine.render.renderer import background_color, front_normals, render_rays
 from octasplat.engine.trace.factory import make_tracer
 from octasplat.engine.trace.protocol import TraceSettings
 
@@ -25,7 +25,7 @@ def test_normals_are_of_the_surface_in_front() -> None:
     tracer = make_tracer(TraceSettings(), threads=1)
     tracer.build(scene)
     rays = PinholeCamera.from_pose(np.eye(4), SIDE, SIDE, fy_px=SIDE).rays()
-    image = render_rays(tracer, rays, background_colour("black"))
+    image = render_rays(tracer, rays, background_color("black"))
     found = front_normals(tracer, rays, image.depth_median)
     np.testing.assert_allclose(np.linalg.norm(found, axis=2), 1, atol=1e-5)
     distance = np.linalg.norm(rays.rays.directions_world.reshape(SIDE, SIDE, 3)[..., 2:], axis=2)

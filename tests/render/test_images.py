@@ -20,7 +20,7 @@ def test_png_keeps_display_values_to_8_bits(tmp_path, picture):
     assert [p.name for p in tmp_path.iterdir()] == ["a.png"]
 
 
-def test_png_keeps_straight_colours_under_any_alpha(tmp_path, picture):
+def test_png_keeps_straight_colors_under_any_alpha(tmp_path, picture):
     alpha = np.linspace(0, 1, 54, dtype=np.float32).reshape(6, 9)
     image_files.write_png(tmp_path / "a.png", picture, alpha)
     again = image_files.read_image(tmp_path / "a.png")

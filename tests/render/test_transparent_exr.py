@@ -1,4 +1,4 @@
-"""Edges of transparent EXR pictures have the colour of what they are edges of."""
+"""Edges of transparent EXR pictures have the color of what they are edges of."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -28,7 +28,7 @@ def shot() -> Shot:
     return Shot("a", camera.rays)
 
 
-def assert_edges_have_the_colour(path: Path) -> None:
+def assert_edges_have_the_color(path: Path) -> None:
     layers = read_channels(path)
     edge = (layers["A"] > 0.02) & (layers["A"] < 0.9)
     assert edge.sum() > 20
@@ -48,12 +48,12 @@ def test_transparent_exr_edges_of_render_are_premultiplied(tmp_path: Path) -> No
     tracer.build(disc)
     paint = scene_render_fn(tracer, np.zeros(3, np.float32), transparent=True)
     paint(shot(), tmp_path / "a.exr", lambda _share: None)
-    assert_edges_have_the_colour(tmp_path / "a.exr")
+    assert_edges_have_the_color(tmp_path / "a.exr")
 
 
 @pytest.fixture
 def relighter() -> Callable[[np.ndarray], Relighter]:
-    """A relighter that shows one colour, covering as given."""
+    """A relighter that shows one color, covering as given."""
 
     def make(coverage: np.ndarray) -> Relighter:
         linear = np.broadcast_to(srgb_to_linear(RGB_SRGB), (*coverage.shape, 3)).astype(np.float32)
@@ -77,4 +77,4 @@ def test_transparent_exr_edges_of_relight_are_premultiplied(
         relighter(coverage), {"e": grey}, np.array([0.0, -1, 0]), "transparent", {one: ShotLighting("e", 0.0)}
     )
     paint(one, tmp_path / "a.exr", lambda _share: None)
-    assert_edges_have_the_colour(tmp_path / "a.exr")
+    assert_edges_have_the_color(tmp_path / "a.exr")

@@ -75,7 +75,7 @@ async def sent(http: httpx.AsyncClient, files: dict[str, bytes]) -> str:
 
 
 BAD = [
-    ("colour = 1", "options", "#/options/stage/colour", "no key stage.colour"),
+    ("color = 1", "options", "#/options/stage/color", "no key stage.color"),
     ("[[meshes]", "options", "#/options/stage", "no TOML"),
     (
         "[[meshes]]\nshape = 'cube'\nposition = [nan, 0, 0]",

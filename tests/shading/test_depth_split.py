@@ -43,7 +43,7 @@ def traced(scene: FlatGaussians, model: DeferredShading) -> tuple[CpuTracer, Tra
     return tracer, TracedRays(RAYS, tracer.trace(RAYS, record=True), tracer, np.zeros(3, np.int64))
 
 
-def test_depth_split_colours_by_coverage() -> None:
+def test_depth_split_colors_by_coverage() -> None:
     model = model_of(visibility=False)
     alone = [model.shade(traced(scene, model)[1]) for scene in (veil(), ground())]
     through = alone[0].transmittance[:, None]

@@ -7,7 +7,7 @@ from test_deferred import BARE, floor, wall
 from octasplat.engine.core.color import srgb_to_linear
 from octasplat.engine.core.rays import ImageRays, RayBatch
 from octasplat.engine.gaussians.model import concatenate
-from octasplat.engine.render.renderer import background_colour, render_rays
+from octasplat.engine.render.renderer import background_color, render_rays
 from octasplat.engine.render.supersampling import pixel_means
 from octasplat.engine.shading.deferred import DeferredShading
 from octasplat.engine.shading.material_settings import MaterialSettings
@@ -61,12 +61,12 @@ def test_reflection_pair_differences_estimate_normal_gradient() -> None:
     normal = np.tile(unit(np.array([0.1, 0.2, 1.0])), (count, 1))
     surface = SurfacePoints.unoccluded(np.full((count, 5), 0.1), normal, way)
     facets = sample_facets(surface, direction_uniforms(way, 0), min_slope=1e-3)
-    colours, hidden = rng.normal(size=(3, 3)), rng.normal(size=3)
+    colors, hidden = rng.normal(size=(3, 3)), rng.normal(size=3)
 
     def seen(facing: np.ndarray) -> IncidentLight:
         """Light and visibility that grow evenly with the reflected direction."""
         mirrored = way - 2 * (way * facing).sum(axis=1, keepdims=True) * facing
-        return IncidentLight(mirrored @ hidden, mirrored @ colours)
+        return IncidentLight(mirrored @ hidden, mirrored @ colors)
 
     one, other = (seen(facets.normals(normal, sign)) for sign in (1.0, -1.0))
     pairs = IncidentLight(*(np.concatenate(both) for both in zip(one, other, strict=True)))
@@ -168,7 +168,7 @@ def test_pixels_with_varying_rays_get_more_samples() -> None:
     tracer, image, model = half_a_row()
     found, many = pixel_means(tracer, image, model, 2), pixel_means(tracer, image, model, 4)
     quarters = [(a, b) for a in (-0.25, 0.25) for b in (-0.25, 0.25)]
-    black = background_colour("black")
+    black = background_color("black")
     few = np.mean([render_rays(tracer, image.shifted(*at), black, model).alpha for at in quarters], axis=0)
     assert abs(few[0, 4] - many.alpha[0, 4]) > 0.01  # two columns see the edge elsewhere than four
     assert found.alpha[0, 4] == pytest.approx(many.alpha[0, 4], abs=1e-6)

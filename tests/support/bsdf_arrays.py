@@ -62,7 +62,7 @@ class OpaqueMaterial:
     """A mixture of metal and of a diffuse substrate under a clear coat, ``n`` points of it.
 
     Attributes:
-        colours_linear: of the substrate, and of the metal head-on.
+        colors_linear: of the substrate, and of the metal head-on.
         metallic: share of the metal.
         roughness: perceptual; GGX's alpha is its square.
         ior: index of refraction of the coat.
@@ -70,7 +70,7 @@ class OpaqueMaterial:
         multiple_scattering: whether light that the metal's facets reflect to each other is kept.
     """
 
-    colours_linear: Float64[np.ndarray, "n 3"]
+    colors_linear: Float64[np.ndarray, "n 3"]
     metallic: Float64[np.ndarray, " n"]
     roughness: Float64[np.ndarray, " n"]
     ior: float = 1.5
@@ -99,7 +99,7 @@ class OpaqueMaterial:
     def _arrays(self) -> BsdfArrays:
         substrate = BURLEY if self.substrate == "burley" else COUPLED
         return BsdfArrays(
-            self.colours_linear, self.metallic, self.roughness, self.ior, substrate, self.multiple_scattering
+            self.colors_linear, self.metallic, self.roughness, self.ior, substrate, self.multiple_scattering
         )
 
 

@@ -56,7 +56,7 @@ class GaussiansBesideMirror:
         parameters.update()
         white = replace(gaussians, sh=np.full((len(gaussians), 1, 3), 0.5 / SH_C0, np.float32))
         extent = settings.q**0.5
-        self._coloured = mi.load_dict({"type": "scene", "a": ellipsoids(gaussians, extent), "b": mesh})
+        self._colored = mi.load_dict({"type": "scene", "a": ellipsoids(gaussians, extent), "b": mesh})
         self._white = mi.load_dict({"type": "scene", "a": ellipsoids(white, extent), "b": mesh})
         self._mirror = mi.load_dict({"type": "scene", "b": mesh})
         self._bsdf = mi.load_dict({"type": "twosided", "a": {"type": "conductor", "material": "none"}})
@@ -66,7 +66,7 @@ class GaussiansBesideMirror:
         self._sampler = mi.load_dict({"type": "independent"})
 
     def trace(self, origin: np.ndarray, directions: np.ndarray) -> np.ndarray:
-        """Display colours of rays from one point, over black."""
+        """Display colors of rays from one point, over black."""
         rays = self._rays(origin, directions)
         covered = self._follow(self._white, rays)
         front, behind, met = self._both(rays)
@@ -82,12 +82,12 @@ class GaussiansBesideMirror:
         return mi.Ray3f(start, mi.Vector3f(directions.T))
 
     def _both(self, rays: Any) -> tuple[Any, Any, Any]:
-        """Colours in front of the mirror and behind it, and whether there is one."""
+        """Colors in front of the mirror and behind it, and whether there is one."""
         met = self._mirror.ray_intersect(rays)
         sample, _ = self._bsdf.sample(mi.BSDFContext(), met, 0.5, mi.Point2f(0.5))
         on = met.spawn_ray(met.to_world(sample.wo))
-        front = self._follow(self._coloured, rays)
-        return front, self._follow(self._coloured, on, met.is_valid()), met.is_valid()
+        front = self._follow(self._colored, rays)
+        return front, self._follow(self._colored, on, met.is_valid()), met.is_valid()
 
     def _follow(self, scene: Any, rays: Any, active: Any = True) -> Any:
         with dr.suspend_grad():

@@ -16,7 +16,7 @@ EXTENT = 1.0
 
 
 def plane_texture(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Colour of the plane z = 0 at a point, in [0.1, 0.9]."""
+    """Color of the plane z = 0 at a point, in [0.1, 0.9]."""
     waves = np.stack([np.sin(4 * x), np.sin(4 * y + 1), np.sin(3 * x - 2 * y)], axis=-1)
     return (0.5 + 0.4 * waves).astype(np.float32)
 
@@ -55,7 +55,7 @@ class PlanarDataset:
         return self.shown(self.rays(view, y, x))
 
     def shown(self, rays: RayBatch) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Colour, alpha and weight of the plane where rays meet it."""
+        """Color, alpha and weight of the plane where rays meet it."""
         origins, directions = rays.origins_world, rays.directions_world
         points = origins - directions * (origins[:, 2:] / directions[:, 2:])
         rgb = plane_texture(self.detail * points[:, 0], self.detail * points[:, 1])
@@ -67,7 +67,7 @@ class PlanarDataset:
     def initial_gaussians(
         self, count: int = 300, opacity: float = 0.1, *, painted: bool = False
     ) -> FlatGaussians:
-        """Gaussians on random points of the plane, grey or in its colours."""
+        """Gaussians on random points of the plane, grey or in its colors."""
         rng = np.random.default_rng(1)
         xyz = np.concatenate([rng.uniform(-1.6, 1.6, (count, 2)), np.zeros((count, 1))], axis=1)
         painting = plane_texture(self.detail * xyz[:, 0], self.detail * xyz[:, 1])

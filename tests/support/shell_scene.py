@@ -14,7 +14,7 @@ from octasplat.engine.gaussians.model import SH_C0, FlatGaussians
 from octasplat.engine.render.image_files import read_image
 from octasplat.engine.render.path_file import CameraPath
 from octasplat.engine.render.pinhole_camera import PinholeCamera
-from octasplat.engine.render.renderer import background_colour, render_rays
+from octasplat.engine.render.renderer import background_color, render_rays
 from octasplat.engine.trace.cpu.tracer import CpuTracer
 from octasplat.engine.trace.protocol import TraceSettings
 from tests.support.camera_paths import write_camera_path
@@ -23,7 +23,7 @@ WIDTH_PX, HEIGHT_PX = 256, 192
 
 
 def shell_scene(count: int = 300, seed: int = 4) -> FlatGaussians:
-    """Gaussians on a shell of radius 0.9 to 1, lying roughly along it, of all opacities and colours."""
+    """Gaussians on a shell of radius 0.9 to 1, lying roughly along it, of all opacities and colors."""
     random = np.random.default_rng(seed)
     outward = random.normal(size=(count, 3))
     outward /= np.linalg.norm(outward, axis=1, keepdims=True)
@@ -60,7 +60,7 @@ def our_view(scene: FlatGaussians, camera: PinholeCamera) -> Float32[np.ndarray,
     """What our tracer sees over black, with nothing cut short."""
     tracer = CpuTracer(TraceSettings(transmittance_min=1e-6, alpha_max=0.9999), threads=1)
     tracer.build(scene)
-    return render_rays(tracer, camera.rays(), background_colour("black")).rgb_srgb
+    return render_rays(tracer, camera.rays(), background_color("black")).rgb_srgb
 
 
 def psnr_db(path: Path, expected: Float32[np.ndarray, "h w 3"]) -> float:

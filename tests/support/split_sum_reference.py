@@ -47,7 +47,7 @@ def reference_split_sum(
     light: EnvironmentLevels,
     frame: np.ndarray,
 ) -> torch.Tensor:
-    """Linear colours; ``texels`` stands for those of ``light``."""
+    """Linear colors; ``texels`` stands for those of ``light``."""
     turn = torch.from_numpy(frame)
     albedo, metallic, roughness = material[:, :3], material[:, 3:4], material[:, 4]
     cosine = -(normal * direction).sum(1)

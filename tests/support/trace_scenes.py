@@ -35,7 +35,7 @@ def make_cloud(
     logits: tuple[float, float] = (-3.0, 4.0),
     radius: float = 1.0,
 ) -> FlatGaussians:
-    """Gaussians of random orientation in a ball of ``radius``; some harmonics drive colours below zero."""
+    """Gaussians of random orientation in a ball of ``radius``; some harmonics drive colors below zero."""
     basis = (degree + 1) ** 2
     return FlatGaussians(
         means_world=f32(radius * unit(rng.normal(size=(count, 3))) * rng.random((count, 1)) ** (1 / 3)),

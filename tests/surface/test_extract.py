@@ -1,4 +1,4 @@
-"""The whole way from Gaussians to coloured files, on a tiled ball."""
+"""The whole way from Gaussians to colored files, on a tiled ball."""
 
 import json
 import struct
@@ -46,7 +46,7 @@ def textured(tracer, tmp_path_factory) -> TriangleMesh:
     return extracted(tracer, tmp_path_factory.mktemp("scratch"), triangles=2000, texture_size=256).mesh
 
 
-def test_ball_comes_out_closed_round_and_in_its_colours(surface):
+def test_ball_comes_out_closed_round_and_in_its_colors(surface):
     mesh = surface.mesh
     assert surface.edges.is_watertight
     assert edge_report(mesh.faces) == surface.edges
@@ -54,8 +54,8 @@ def test_ball_comes_out_closed_round_and_in_its_colours(surface):
     # The tiles are flat and overlap, so that the median hit lies a little under the ball.
     assert np.abs(radii - 1).max() < 0.03
     height = mesh.vertices_world[:, 2]
-    for side, colour in ((height > 0.25, RED), (height < -0.25, BLUE)):
-        np.testing.assert_allclose(mesh.rgb_srgb[side], np.broadcast_to(colour, (side.sum(), 3)), atol=0.03)
+    for side, color in ((height > 0.25, RED), (height < -0.25, BLUE)):
+        np.testing.assert_allclose(mesh.rgb_srgb[side], np.broadcast_to(color, (side.sum(), 3)), atol=0.03)
     assert surface.volume_bytes == pytest.approx(surface.volume_bytes // (512 * 13) * 512 * 13)
     assert surface.triangles_found == len(mesh.faces)
 
@@ -68,7 +68,7 @@ def test_expected_depth_is_there_to_choose(tracer, surface, tmp_path):
     )
 
 
-def test_texture_has_the_colours_where_its_coordinates_say(textured):
+def test_texture_has_the_colors_where_its_coordinates_say(textured):
     mesh = textured
     assert mesh.texture_srgb.shape == (256, 256, 3)
     assert len(mesh.faces) <= 2000
@@ -76,8 +76,8 @@ def test_texture_has_the_colours_where_its_coordinates_say(textured):
     middle = mesh.face_corners_world.mean(axis=1)
     at = mesh.uv[mesh.faces].mean(axis=1) * 256
     shown = mesh.texture_srgb[at[:, 1].astype(int), at[:, 0].astype(int)] / 255
-    for side, colour in ((middle[:, 2] > 0.25, RED), (middle[:, 2] < -0.25, BLUE)):
-        close = np.abs(shown[side] - colour).max(axis=1) < 0.05
+    for side, color in ((middle[:, 2] > 0.25, RED), (middle[:, 2] < -0.25, BLUE)):
+        close = np.abs(shown[side] - color).max(axis=1) < 0.05
         assert close.mean() > 0.99
 
 
@@ -140,7 +140,7 @@ def test_surface_extraction_reports_stages_and_stops_cleanly(tracer, tmp_path):
     heard = []
     extract_levels(tracer, cameras, options, scratch=tmp_path, listener=heard.append)
     finished = [event.stage for event in heard if isinstance(event, PhaseFinished)]
-    assert finished == ["depth", "fusing", "meshing", "colouring", "fitting"]
+    assert finished == ["depth", "fusing", "meshing", "coloring", "fitting"]
     for stop_at in range(1, 40, 9):
         asked = iter(range(1000))
         with pytest.raises(CancelledError):

@@ -1,4 +1,4 @@
-"""Colours fitted to pictures, where the right ones are known; what closes a mesh beyond what was seen."""
+"""Colors fitted to pictures, where the right ones are known; what closes a mesh beyond what was seen."""
 
 from functools import partial
 
@@ -8,7 +8,7 @@ from octasplat.engine.core.color import to_bytes
 from octasplat.engine.core.rays import RayBatch
 from octasplat.engine.geometry.triangle_mesh import TriangleMesh, edge_report
 from octasplat.engine.surface.backdrop import with_backdrop
-from octasplat.engine.surface.colour_fit import Picture, TexturePalette, VertexPalette, fit_colours
+from octasplat.engine.surface.color_fit import Picture, TexturePalette, VertexPalette, fit_colors
 from octasplat.engine.surface.marching_cubes import marching_cubes
 from octasplat.engine.surface.texture import unwrap
 from octasplat.engine.surface.tsdf_volume import fill_unseen
@@ -18,7 +18,7 @@ from tests.support.surface_shapes import cameras_on_sphere, sphere, volume_of
 
 
 def painted(points_world: np.ndarray) -> np.ndarray:
-    """Colours that change smoothly over a ball."""
+    """Colors that change smoothly over a ball."""
     return (0.5 + 0.4 * np.sin(2 * points_world)).astype(np.float32)
 
 
@@ -40,29 +40,27 @@ def ball() -> TriangleMesh:
     return TriangleMesh(mesh.vertices_world, mesh.faces)
 
 
-def test_wrong_colours_of_vertices_are_put_right():
+def test_wrong_colors_of_vertices_are_put_right():
     mesh = ball()
     wrong = np.random.default_rng(0).random((len(mesh.vertices_world), 3)).astype(np.float32)
     right = painted(mesh.vertices_world)
-    found, _ = fit_colours(VertexPalette(mesh), wrong, pictures_of(mesh))
+    found, _ = fit_colors(VertexPalette(mesh), wrong, pictures_of(mesh))
     assert np.abs(found - right).mean() < 0.03 < 0.2 < np.abs(wrong - right).mean()
-    np.testing.assert_allclose(
-        fit_colours(VertexPalette(mesh), right, pictures_of(mesh))[0], right, atol=0.03
-    )
+    np.testing.assert_allclose(fit_colors(VertexPalette(mesh), right, pictures_of(mesh))[0], right, atol=0.03)
 
 
-def test_wrong_colours_of_a_texture_are_put_right():
+def test_wrong_colors_of_a_texture_are_put_right():
     layout = unwrap(ball(), 128)
     right = painted(layout.points_world)
     wrong = np.full_like(right, 0.5)
-    found, _ = fit_colours(TexturePalette(layout), wrong, pictures_of(layout.mesh))
+    found, _ = fit_colors(TexturePalette(layout), wrong, pictures_of(layout.mesh))
     assert np.abs(found - right).mean() < 0.03 < 0.2 < np.abs(wrong - right).mean()
 
 
-def test_colour_fit_keeps_unseen_vertices():
+def test_color_fit_keeps_unseen_vertices():
     mesh = ball()
     start = np.full((len(mesh.vertices_world), 3), 0.25, np.float32)
-    found, seen = fit_colours(VertexPalette(mesh), start, [])
+    found, seen = fit_colors(VertexPalette(mesh), start, [])
     np.testing.assert_array_equal(found, start)
     assert not seen.any()
 

@@ -1,4 +1,4 @@
-"""Whether the photographs that a surface's colours are fitted to are those of its scene."""
+"""Whether the photographs that a surface's colors are fitted to are those of its scene."""
 
 import json
 import shutil
@@ -59,7 +59,7 @@ def test_photographs_of_another_model_are_refused_or_left_out_with_a_word(folder
     events: list[Event] = []
     assert training_photographs(folder / "run", None, 1, events.append) == ()
     (warning,) = (event.message for event in events if isinstance(event, Warned))
-    assert "Colours are those that the scene shows" in warning and "other names or poses" in warning
+    assert "Colors are those that the scene shows" in warning and "other names or poses" in warning
 
 
 def test_full_disk_stops_cache_of_photographs(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:

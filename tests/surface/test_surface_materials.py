@@ -62,12 +62,12 @@ def decoded(mesh: TriangleMesh, shown: np.ndarray) -> np.ndarray:
 def test_textures_hold_the_materials(surface):
     height = surface.face_corners_world.mean(axis=1)[:, 2]
     packed = at_middles(surface, surface.materials.occlusion_roughness_metallic)
-    colour = at_middles(surface, surface.texture_srgb)
+    color = at_middles(surface, surface.texture_srgb)
     for side, known in ((height > 0.3, ABOVE), (height < -0.3, BELOW)):
         wanted = [known["ambient"], known["roughness"], known["metallic"]]
         np.testing.assert_allclose(packed[side], np.tile(wanted, (side.sum(), 1)), atol=0.01)
         albedo = linear_to_srgb(np.array(known["albedo"]))
-        np.testing.assert_allclose(colour[side], np.tile(albedo, (side.sum(), 1)), atol=0.01)
+        np.testing.assert_allclose(color[side], np.tile(albedo, (side.sum(), 1)), atol=0.01)
 
 
 def test_normals_are_those_of_the_ball(surface):

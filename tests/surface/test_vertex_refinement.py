@@ -45,8 +45,8 @@ def test_vertex_gather_is_transpose_of_scatter():
     np.testing.assert_allclose(squares.reshape(-1), diagonal, rtol=1e-5)
 
 
-def test_ray_at_raised_plane_sees_neighbouring_colour():
-    """On z = 0 with colour (x, y, 0), raised by h, a ray along d meets (x, y) + h (dx, dy) / dz."""
+def test_ray_at_raised_plane_sees_neighbouring_color():
+    """On z = 0 with color (x, y, 0), raised by h, a ray along d meets (x, y) + h (dx, dy) / dz."""
     vertices = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], np.float32)
     normals = np.tile(np.float32([0, 0, 1]), (3, 1))
     rgb = vertices * [1, 1, 0]

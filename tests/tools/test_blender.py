@@ -54,7 +54,7 @@ def test_cycles_render_equals_tracer(scene: FlatGaussians, blend: Path, tmp_path
 
 @pytest.mark.parametrize(("name", "view"), [("a.glb", "standard"), ("a.mesh.ply", "standard")])
 def test_blender_standard_view_matches(scene: FlatGaussians, tmp_path: Path, name: str, view: str) -> None:
-    """Of a GLB, too, whose colours and opacities Blender keeps in 8 bits."""
+    """Of a GLB, too, whose colors and opacities Blender keeps in 8 bits."""
     export_scene(scene, tmp_path / name, ExportOptions(chunks=2))
     write_shell_cameras(tmp_path / "cameras.json")
     given = (tmp_path / name, tmp_path / "a.blend", "--cameras", tmp_path / "cameras.json", "--view", view)
@@ -117,9 +117,7 @@ def test_blender_script_mesh_ply_round_trip(blend: Path, tmp_path: Path) -> None
     assert_same_ply(tmp_path / "b.ply", blend.with_name("scene.mesh.ply"))
 
 
-def test_blender_obj_keeps_order_colours_and_texture_coordinates(
-    scene: FlatGaussians, tmp_path: Path
-) -> None:
+def test_blender_obj_keeps_order_colors_and_texture_coordinates(scene: FlatGaussians, tmp_path: Path) -> None:
     export_scene(scene, tmp_path / "a.obj")
     run_blender(SCRIPTS / "round_trip.py", tmp_path / "a.obj", tmp_path / "b.obj")
     before, after = (

@@ -125,7 +125,7 @@ def test_nearest_distance_of_stack_is_known() -> None:
     assert look_up(stack, 0, 0, z=0.0).hit_counts[0] == 3  # behind the origin and at it: not seen
 
 
-def test_colour_is_clamped_at_zero_without_gradient() -> None:
+def test_color_is_clamped_at_zero_without_gradient() -> None:
     dark = facing_z([0, 0, 0], opacities=0.5, rgb_srgb=[-0.2, 0.3, 1.7])
     tracer = make_tracer(dark)
     seen = tracer.trace(RayBatch(f32([[0, 0, -1]]), UP), record=True)
@@ -141,7 +141,7 @@ def test_harmonics_are_those_of_the_direction_to_the_mean() -> None:
     lobe.sh[0, 2] = [0.5, 0.0, -0.5]  # the z lobe
     swing = 0.4886025119029199 * 0.5
     front, back = [0.5 + swing, 0.5, 0.5 - swing], [0.5 - swing, 0.5, 0.5 + swing]
-    # Two rays from each side: through the centre, and past it at an angle, which shows the same colour.
+    # Two rays from each side: through the centre, and past it at an angle, which shows the same color.
     directions = np.array([[0, 0, 1], [0.6, 0, 2], [0, 0, -1], [0.6, 0, -2]])
     directions = directions / np.linalg.norm(directions, axis=1, keepdims=True)
     rays = RayBatch(f32([[0, 0, -2], [0, 0, -2], [0, 0, 2], [0, 0, 2]]), f32(directions))

@@ -34,7 +34,7 @@ SEEN = ("rgb_srgb", "transmittance", "depth_sum", "depth_median", "normal_world"
 
 
 def given_by(rng: np.random.Generator, rays: int) -> TraceGradients:
-    """Random gradients by colours and transmittances, and errors."""
+    """Random gradients by colors and transmittances, and errors."""
     every = random_gradients(rng, rays)
     return TraceGradients(every.rgb_srgb, every.transmittance, ray_errors=every.ray_errors)
 

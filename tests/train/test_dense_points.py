@@ -1,4 +1,4 @@
-"""Pixels lifted to points: they lie on the surfaces that the photographs show, in the colours shown there."""
+"""Pixels lifted to points: they lie on the surfaces that the photographs show, in the colors shown there."""
 
 import shutil
 from dataclasses import replace
@@ -54,7 +54,7 @@ def test_points_lie_on_the_surfaces(dataset: Dataset, surface: cKDTree) -> None:
     assert (off < 0.3).mean() > 0.85
 
 
-def test_points_have_the_colour_of_their_pixels(dataset: Dataset) -> None:
+def test_points_have_the_color_of_their_pixels(dataset: Dataset) -> None:
     lifted = plane_sweep_points(dataset, 1000, np.random.default_rng(0))
     xyz, rgb = lifted.xyz_world, lifted.rgb_srgb
     best = np.full(len(xyz), np.inf)
@@ -144,12 +144,12 @@ def test_dense_points_independent_of_threads(dataset: Dataset) -> None:
 
 
 def test_dense_points_skip_sky(dataset: Dataset, tmp_path: Path) -> None:
-    """Photographs that show the same colour in a direction from wherever they are: all sky."""
+    """Photographs that show the same color in a direction from wherever they are: all sky."""
     shutil.copytree(dataset.root, tmp_path / "scene")
     for index, view in enumerate(dataset.views):
         ways = dataset.view_rays(index).directions_world.astype(np.float64)
-        colours = 0.5 + 0.3 * np.sin(3 * ways)
-        write_png(tmp_path / "scene" / "images" / view.name, colours.astype(np.float32))
+        colors = 0.5 + 0.3 * np.sin(3 * ways)
+        write_png(tmp_path / "scene" / "images" / view.name, colors.astype(np.float32))
     under_sky = Dataset.open(tmp_path / "scene", tmp_path / "cache")
     # As if up were where the cameras look, so that nearly all that they see is above the horizon.
     ahead = np.mean([view.rotation_cam_from_world[2] for view in dataset.views], axis=0)

@@ -67,7 +67,7 @@ def last_psnr(events: list[Event]) -> float:
 
 
 def sight(view: np.ndarray, rgb: np.ndarray, alpha: np.ndarray) -> TracedRays:
-    """A sight of given colours and alphas; Gaussians and rays do not matter to exposures."""
+    """A sight of given colors and alphas; Gaussians and rays do not matter to exposures."""
     zeros, three = np.zeros(len(view), np.float32), np.zeros((len(view), 3), np.float32)
     seen = TraceResult(
         rgb_srgb=rgb, transmittance=np.float32(1) - alpha, depth_sum=zeros, depth_median=zeros,

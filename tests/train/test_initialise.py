@@ -11,8 +11,8 @@ CAMERAS = np.array([[0.0, 0.0, -3.0], [1.0, 0.0, -3.0], [0.0, 1.0, -3.0]])
 
 def start(xyz: np.ndarray, rgb: object = 0.5, **options: object):
     settings = {"extent": 1.0, "limit": 10_000, "opacity": 0.1, "rng": np.random.default_rng(0), **options}
-    colours = np.broadcast_to(np.asarray(rgb, np.float32), (len(xyz), 3)).copy()
-    return gaussians_from_points(xyz.astype(np.float32), colours, CAMERAS, **settings)
+    colors = np.broadcast_to(np.asarray(rgb, np.float32), (len(xyz), 3)).copy()
+    return gaussians_from_points(xyz.astype(np.float32), colors, CAMERAS, **settings)
 
 
 def grid(side: int = 12, spacing: float = 0.05) -> np.ndarray:
@@ -33,7 +33,7 @@ def test_scales_are_the_spacing_of_the_points() -> None:
     assert (first.log_scales[:, 0] == first.log_scales[:, 1]).all()
 
 
-def test_initialise_sets_opacity_and_colour() -> None:
+def test_initialise_sets_opacity_and_color() -> None:
     first = start(grid(), rgb=[0.9, 0.2, 0.5], opacity=0.3)
     np.testing.assert_allclose(first.opacities, 0.3, rtol=1e-5)
     np.testing.assert_allclose(first.base_rgb_srgb, [[0.9, 0.2, 0.5]] * 144, atol=1e-6)

@@ -26,7 +26,7 @@ from tests.support.stopped_run import train_with_a_stop
 
 
 def sky(directions: np.ndarray) -> np.ndarray:
-    """The true colour of a direction: brighter up (-y), redder to the right."""
+    """The true color of a direction: brighter up (-y), redder to the right."""
     return np.stack(
         [0.5 + 0.3 * directions[:, 0], 0.5 - 0.3 * directions[:, 1], 0.6 + 0 * directions[:, 2]], axis=1
     ).astype(np.float32)
@@ -74,7 +74,7 @@ class UnderTheSky(PlanarDataset):
 
 
 def sight(directions: np.ndarray, rgb: np.ndarray, transmittance: np.ndarray) -> TracedRays:
-    """A sight of given colours and transmittances."""
+    """A sight of given colors and transmittances."""
     zeros, three = np.zeros(len(rgb), np.float32), np.zeros((len(rgb), 3), np.float32)
     seen = TraceResult(
         rgb_srgb=rgb, transmittance=transmittance, depth_sum=zeros, depth_median=zeros, normal_world=three,
@@ -186,10 +186,10 @@ def test_background_is_exposed_with_foreground(tmp_path: Path) -> None:
     assert isinstance(trainer.shading, ExposureModel) and find_background(trainer.shading) is not None
 
 
-def test_files_keep_the_colours(tmp_path: Path) -> None:
-    colours = np.random.default_rng(0).random((16, 32, 3)).astype(np.float32)
-    write_background_map(tmp_path / "background.exr", colours)
-    np.testing.assert_allclose(read_background_map(tmp_path / "background.exr"), colours, atol=1e-6)
+def test_files_keep_the_colors(tmp_path: Path) -> None:
+    colors = np.random.default_rng(0).random((16, 32, 3)).astype(np.float32)
+    write_background_map(tmp_path / "background.exr", colors)
+    np.testing.assert_allclose(read_background_map(tmp_path / "background.exr"), colors, atol=1e-6)
 
 
 def test_photographs_with_alpha_show_no_background() -> None:

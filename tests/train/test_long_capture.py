@@ -12,7 +12,7 @@ WIDTH, HEIGHT, FOCAL, AWAY = 80, 60, 50.0, 2.0
 
 
 def paint(xy: np.ndarray) -> np.ndarray:
-    """Colours of the wall z = 0 in [0.1, 0.9], nowhere twice the same."""
+    """Colors of the wall z = 0 in [0.1, 0.9], nowhere twice the same."""
     random = np.random.default_rng(3)
     waves = random.uniform(-9, 9, (12, 2))
     phases, mix = random.uniform(0, 6, 12), random.uniform(-1, 1, (12, 3))

@@ -46,11 +46,11 @@ def test_adam_matches_torch_when_all_gaussians_are_hit() -> None:
     ours, extent = gaussians(50), 2.0
     rates = LearningRates(mean=1e-3, mean_final=1e-3, mean_unit="extent", quat=2e-3, log_scale=3e-3,
                           axes="world", opacity=4e-2, color=5e-3, sh_rest_ratio=0.1, decay=1.0)  # fmt: skip
-    colour = rates.color / SH_C0
+    color = rates.color / SH_C0
     leaves = {name: torch.tensor(getattr(ours, name), dtype=torch.float64) for name in NAMES}
     leaves["sh0"], leaves["sh_rest"] = leaves["sh"][:, :1].clone(), leaves.pop("sh")[:, 1:].clone()
     steps = {"means_world": rates.mean * extent, "quats_wxyz": rates.quat, "log_scales": rates.log_scale,
-             "opacity_logits": rates.opacity, "sh0": colour, "sh_rest": 0.1 * colour}  # fmt: skip
+             "opacity_logits": rates.opacity, "sh0": color, "sh_rest": 0.1 * color}  # fmt: skip
     judge = torch.optim.Adam([{"params": [leaves[name]], "lr": lr} for name, lr in steps.items()], eps=1e-15)
     adam = Adam.zeros(ours)
     for _ in range(30):

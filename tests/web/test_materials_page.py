@@ -77,7 +77,7 @@ def test_materials_page_offers_layers_relight_and_edit(
     assert shown == [
         "Normals",
         "Depth",
-        "Base colour",
+        "Base color",
         "Metallic",
         "Roughness",
         "Visibility",
@@ -116,5 +116,5 @@ def test_result_without_materials_has_no_materials_page(
     with urllib.request.urlopen(page, timeout=60) as answer:
         text = answer.read().decode()
     assert "Held-out views" in text
-    for part in ('id="relight"', 'data-kind="material"', "Base colour, times"):
+    for part in ('id="relight"', 'data-kind="material"', "Base color, times"):
         assert part not in text

@@ -1,4 +1,4 @@
-"""The viewer of meshes on the web page shows the mesh of a GLB file in its colours."""
+"""The viewer of meshes on the web page shows the mesh of a GLB file in its colors."""
 
 import json
 from pathlib import Path
@@ -58,7 +58,7 @@ def draw(mesh: TriangleMesh, folder: Path, eye: tuple[float, float, float]) -> P
     return open_page(page, files=files | {"mesh.glb": folder / "mesh.glb"}, width=SIDE_PX, height=SIDE_PX)
 
 
-def test_mesh_with_colours_of_vertices_is_shown_in_them(tmp_path: Path) -> None:
+def test_mesh_with_colors_of_vertices_is_shown_in_them(tmp_path: Path) -> None:
     page = draw(square((0.1, 0.8, 0.1)), tmp_path, (0, 0, 4))
     assert page.result["triangles"] == 2, page.messages
     assert page.result["center"] == pytest.approx([0, 0, 0])

@@ -234,11 +234,11 @@ def test_pages_are_usable_by_keyboard(
     assert found["complaints"] == []
 
 
-def test_pages_fit_phone_in_both_colour_schemes(flow: Flow, watched: dict[str, Any], browse: Browse) -> None:
+def test_pages_fit_phone_in_both_color_schemes(flow: Flow, watched: dict[str, Any], browse: Browse) -> None:
     found = browse("phone", flow.service.url, job=flow.job)
     assert {name: width for name, width in found["overflow"].items() if width > 0} == {}
-    for name, colour in found["background"].items():
-        channels = [int(part) for part in colour[4:-1].split(",")]
+    for name, color in found["background"].items():
+        channels = [int(part) for part in color[4:-1].split(",")]
         assert (max(channels) < 60) if name.endswith("dark") else (min(channels) > 200), name
     assert found["touchTurns"]
     assert [

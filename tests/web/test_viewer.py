@@ -16,7 +16,7 @@ from octasplat.engine.pathtracing.environment import EnvironmentMap, environment
 from octasplat.engine.pathtracing.relighting.split_sum_relighter import SplitSumRelighter
 from octasplat.engine.render.environment_files import read_environment, write_environment
 from octasplat.engine.render.pinhole_camera import PinholeCamera, focal_from_fov
-from octasplat.engine.render.renderer import background_colour, render_rays
+from octasplat.engine.render.renderer import background_color, render_rays
 from octasplat.engine.trace.cpu.tracer import CpuTracer
 from octasplat.engine.trace.protocol import TraceSettings
 from tests.support.browser import Page, open_page, psnr
@@ -131,7 +131,7 @@ def test_viewer_with_paper_radius_over_white(tmp_path: Path) -> None:
     page = draw(scene, camera, tmp_path, q=CHI2_3_99, background=(1, 1, 1))
     tracer = CpuTracer(TraceSettings(q=CHI2_3_99, transmittance_min=1e-6), threads=1)
     tracer.build(scene)
-    ours = to_bytes(render_rays(tracer, camera.rays(), background_colour("white")).rgb_srgb)
+    ours = to_bytes(render_rays(tracer, camera.rays(), background_color("white")).rgb_srgb)
     assert page.result["drawn"] < len(scene)
     quality = psnr(page.image, ours)
     assert quality >= 42.0, page.messages
@@ -163,7 +163,7 @@ def test_draws_materials_in_the_light_of_a_map(
     relighter.set_environment(
         EnvironmentMap(read_environment(tmp_path / "light.hdr"), environment_frame(np.array(up), degrees))
     )
-    ours = to_bytes(np.clip(relighter.render(camera.rays()).composite_over(background_colour("black")), 0, 1))
+    ours = to_bytes(np.clip(relighter.render(camera.rays()).composite_over(background_color("black")), 0, 1))
     assert (ours.max(axis=2) > 20).mean() > 0.1
     quality = psnr(page.image, ours)
     assert quality >= least, page.messages

@@ -38,7 +38,7 @@ _COMMANDS = {
     "render": ("render", "Render new views of a scene as images or a video."),
     "relight": ("relight", "Show a scene with materials in other light."),
     "stage": ("stage", "Stages: things and lights put into a scene."),
-    "surface": ("surface", "One coloured triangle mesh of a scene."),
+    "surface": ("surface", "One colored triangle mesh of a scene."),
     "material": ("material", "Change the materials of a scene."),
     "edit": ("edit", "Turn a mesh edited elsewhere back into Gaussians."),
     "deform": ("deform", "Make a scene follow a deformed cage or coarse mesh."),

@@ -44,8 +44,8 @@ _STAGE_RESULTS = {
     "unwrapping": ("Cut the mesh open for the texture", ""),
     "settling": ("Moved the vertices to where the pictures agree", ""),
     "decimating": ("Merged triangles", ""),
-    "colouring": ("Coloured", "point"),
-    "fitting": ("Fitted the colours", ""),
+    "coloring": ("Colored", "point"),
+    "fitting": ("Fitted the colors", ""),
 }
 
 

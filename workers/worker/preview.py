@@ -12,7 +12,7 @@ from octasplat.engine.core.events import Event, EventListener
 from octasplat.engine.core.rays import ImageRays
 from octasplat.engine.dataset import Dataset
 from octasplat.engine.render.image_files import write_png
-from octasplat.engine.render.renderer import background_colour, render_rays
+from octasplat.engine.render.renderer import background_color, render_rays
 from octasplat.engine.shading.plain import PLAIN_SHADING
 from octasplat.engine.shading.protocol import ShadingModel
 from octasplat.engine.trace.protocol import Tracer
@@ -52,7 +52,7 @@ class PreviewRenderer:
 
     def __init__(self, run: Path, background: str, progress: EventListener) -> None:
         self._run = run
-        self._background = background_colour(background)
+        self._background = background_color(background)
         self._listener = progress
         self._side_px = MAX_SIDE_PX
         self._next_at = -math.inf

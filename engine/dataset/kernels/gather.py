@@ -38,7 +38,7 @@ class PixelPlanes(NamedTuple):
 
     Attributes:
         offsets: first pixel of each view.
-        rgb: colours.
+        rgb: colors.
         rgb_full: the value of full brightness.
         alpha: alpha, or empty.
         mask: masks, or empty.
@@ -123,13 +123,13 @@ def gather_pixels(
     alpha_out: Float32[np.ndarray, " n"],
     weight_out: Float32[np.ndarray, " n"],
 ) -> int:
-    """Write colours, alpha and weights of pixels.
+    """Write colors, alpha and weights of pixels.
 
     Args:
         pixels: the pixels.
         views: what they belong to.
         planes: the photographs.
-        rgb_out: receives display colours in [0, 1].
+        rgb_out: receives display colors in [0, 1].
         alpha_out: receives alpha in [0, 1].
         weight_out: receives 1, or 0 where the pixel does not count.
 

@@ -15,7 +15,7 @@ class SyntheticDatasetConfig:
         views: Number of photographs, on three rings around the table.
         width_px: Width of a photograph.
         height_px: Height of a photograph.
-        samples_per_side: A pixel is the mean of this number squared of display colours, on a regular grid.
+        samples_per_side: A pixel is the mean of this number squared of display colors, on a regular grid.
         points: Number of points in the COLMAP model.
         seed: Seeds the jitter of the cameras and the choice of the points; the objects stay the same.
         camera_model: COLMAP's name of the lens, one of ``CAMERA_MODELS``; it distorts the

@@ -1,6 +1,6 @@
 """Procedural patterns: pure functions of texture coordinates, evaluated wherever a ray hits.
 
-Patterns return numbers in [0, 1] (noise in about [-1, 1]); colours are linear light.
+Patterns return numbers in [0, 1] (noise in about [-1, 1]); colors are linear light.
 """
 
 from collections.abc import Sequence
@@ -38,9 +38,9 @@ def _font_bitmaps() -> UInt8[np.ndarray, "letters 7 5"]:
 _BITMAPS = _font_bitmaps()
 
 
-def linear_from_hex(colour: str) -> Float32[np.ndarray, "3"]:
+def linear_from_hex(color: str) -> Float32[np.ndarray, "3"]:
     """Return the linear light of a display color written as ``rrggbb``."""
-    srgb = np.array([int(colour[k : k + 2], 16) for k in (0, 2, 4)]) / 255
+    srgb = np.array([int(color[k : k + 2], 16) for k in (0, 2, 4)]) / 255
     return srgb_to_linear(srgb).astype(np.float32)
 
 

@@ -12,7 +12,7 @@ from octasplat.engine.dataset.synthetic.lit_scene import LitScene
 from octasplat.engine.dataset.synthetic.synthetic_views import SyntheticView, directions_cam
 from octasplat.engine.trace.triangle_bvh import TriangleHits
 
-# Rays traced and shaded at a time: arrays of this many colours stay in the processor's cache.
+# Rays traced and shaded at a time: arrays of this many colors stay in the processor's cache.
 _RAYS_PER_CHUNK = 1 << 15
 
 
@@ -21,7 +21,7 @@ class RenderedPhotograph:
     """One view.
 
     Attributes:
-        pixels: 8-bit display colours, RGB, or RGBA with straight alpha.
+        pixels: 8-bit display colors, RGB, or RGBA with straight alpha.
         depth_cam: z in the camera frame at pixel centres, in metres; 0 where nothing was hit.
         normals_world: Unit normals of the triangles at pixel centres, towards the camera; 0 where no hit.
         is_foreground: Whether a pixel's centre shows the table or a thing on it.
@@ -79,14 +79,14 @@ class PhotographRenderer:
         for start in range(0, len(self._samples_cam), step):
             origins, directions = rays_world(view, self._samples_cam[start : start + step])
             hits = self._scene.trace(origins, directions)
-            colours = self._scene.shade_hits(hits, origins, directions).reshape(-1, samples, 3)
+            colors = self._scene.shade_hits(hits, origins, directions).reshape(-1, samples, 3)
             if self._config.transparent:
                 foreground = self._is_foreground(hits).reshape(-1, samples, 1)
                 coverage = foreground.mean(axis=1, dtype=np.float32)
-                summed = (colours * foreground).mean(axis=1, dtype=np.float32)
+                summed = (colors * foreground).mean(axis=1, dtype=np.float32)
                 parts.append(np.concatenate([summed / np.maximum(coverage, 1e-6), coverage], axis=1))
             else:
-                parts.append(colours.mean(axis=1, dtype=np.float32))
+                parts.append(colors.mean(axis=1, dtype=np.float32))
         return np.concatenate(parts)
 
     def _is_foreground(self, hits: TriangleHits) -> Bool[np.ndarray, " n"]:

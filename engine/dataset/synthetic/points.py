@@ -26,7 +26,7 @@ class SurfacePoints:
 
     Attributes:
         xyz_world: Positions with a little noise.
-        rgb_srgb8: Mean display colours of a pixel that shows them.
+        rgb_srgb8: Mean display colors of a pixel that shows them.
         observed_px: Exact image positions of the noiseless points; not-a-number where not seen.
     """
 
@@ -45,7 +45,7 @@ def sample_surface_points(
     """
     random = np.random.default_rng([config.seed, 2])
     places: list[np.ndarray] = []
-    colours: list[np.ndarray] = []
+    colors: list[np.ndarray] = []
     tracks: list[np.ndarray] = []
     found = 0
     for _ in range(_MAX_BATCHES):
@@ -59,7 +59,7 @@ def sample_surface_points(
         # The batch is sorted by view; a shuffle keeps a cut at the wanted number fair to all views.
         order = random.permutation(np.flatnonzero(good))[: config.points - found]
         places.append(xyz[order])
-        colours.append(rgb[order])
+        colors.append(rgb[order])
         tracks.append(observed[order])
         found += len(order)
         if found == config.points:
@@ -69,7 +69,7 @@ def sample_surface_points(
     extent = float(np.linalg.norm(np.ptp(centres, axis=0)))
     return SurfacePoints(
         xyz + random.normal(0, _POSITION_NOISE * extent, xyz.shape),
-        np.concatenate(colours),
+        np.concatenate(colors),
         np.concatenate(tracks),
     )
 
@@ -88,7 +88,7 @@ def _points_under_pixels(
     rays = [rays_world(view, rows) for view, rows in zip(views, directions, strict=True)]
     origins, along = (np.concatenate(parts) for parts in zip(*rays, strict=True))
     hits = scene.trace(origins, along)
-    colours = scene.shade_hits(hits, origins, along).reshape(-1, 9, 3).mean(axis=1)
+    colors = scene.shade_hits(hits, origins, along).reshape(-1, 9, 3).mean(axis=1)
     middle = slice(4, None, 9)
     face = hits.faces[middle]
     selected: Bool[np.ndarray, " n"] = face >= 0
@@ -96,7 +96,7 @@ def _points_under_pixels(
         selected &= scene.still_life.face_is_foreground[face]
     distance = np.where(selected, hits.distances[middle], 0).astype(np.float64)
     xyz = origins[middle] + distance[:, None] * along[middle]
-    return xyz[selected], to_bytes(colours[selected])
+    return xyz[selected], to_bytes(colors[selected])
 
 
 def _project_unoccluded(

@@ -1,7 +1,7 @@
 """Gaussians on a ray: the layer that they are in front of what the ray meets.
 
-How display colours and linear light meet. The trained colours of Gaussians are display values and are
-composited as such, into one layer of premultiplied colour g and transmittance T for each ray.
+How display colors and linear light meet. The trained colors of Gaussians are display values and are
+composited as such, into one layer of premultiplied color g and transmittance T for each ray.
 
 - On the camera's own ray, and on as long as mirrors and glass pass on all of it in one direction, layers are
   composited with each other and over what is behind them in display values: g + T encode(L), L the mean

@@ -80,7 +80,7 @@ def scatter_smooth_glass(
     if eta != 1.0 and choice < share:
         scatter_mirror(paths, p, point, (1.0, 1.0, 1.0))
         return
-    tint = materials.colours_linear[m]
+    tint = materials.colors_linear[m]
     plain = tint[0] == 1.0 and tint[1] == 1.0 and tint[2] == 1.0
     absorbs = materials.absorption[m, 0] + materials.absorption[m, 1] + materials.absorption[m, 2] > 0.0
     if not plain or absorbs:
@@ -122,7 +122,7 @@ def scatter_rough_glass(
     d = paths.directions_world[p]
     materials, m, is_entering = glass
     eta = relative_ior(glass)
-    tint, roughness = materials.colours_linear[m], materials.roughness[m]
+    tint, roughness = materials.colors_linear[m], materials.roughness[m]
     alpha = roughness * roughness
     # --- the direction to the viewer, in the frame of the shading normal ---
     a_x, a_y, a_z, b_x, b_y, b_z = orthonormal_basis(s_x, s_y, s_z)

@@ -23,7 +23,7 @@ class SurfaceArrays(NamedTuple):
         corner_normals: shading normals at the corners, unit vectors.
         corner_uv: texture coordinates at the corners, (0, 0) at the upper left.
         material_ids: row of each face in :class:`MaterialArrays`.
-        corner_rgb_linear: colours of the corners; no rows at all where no mesh has any.
+        corner_rgb_linear: colors of the corners; no rows at all where no mesh has any.
     """
 
     corners_world: Float32[np.ndarray, "f 3 3"]
@@ -38,7 +38,7 @@ class MaterialArrays(NamedTuple):
 
     Attributes:
         kinds: which of the kinds of :mod:`octasplat.engine.pathtracing.kernels.surface`.
-        colours_linear: base colour, reflectance or tint.
+        colors_linear: base color, reflectance or tint.
         metallic: share of the metal.
         roughness: perceptual.
         iors: index of refraction.
@@ -46,11 +46,11 @@ class MaterialArrays(NamedTuple):
         substrates: how the ground shares light with the coat.
         energy_compensation: whether light that facets throw at each other is kept.
         coat_tables: which of the tables the coat has; of rough glass that of entering, leaving has the next.
-        colour_textures: number of a texture, -1 for none.
+        color_textures: number of a texture, -1 for none.
         metallic_roughness_textures: likewise.
         normal_textures: likewise.
         normal_scales: factor of their slopes.
-        uses_vertex_color: whether the corners' colours count.
+        uses_vertex_color: whether the corners' colors count.
         light_ids: number of the light that a shining surface is, -1 for none.
         ggx_albedo: table of facets that reflect everything.
         coat_albedo: tables of dielectrics' surfaces.
@@ -60,7 +60,7 @@ class MaterialArrays(NamedTuple):
     """
 
     kinds: Int32[np.ndarray, " m"]
-    colours_linear: Float64[np.ndarray, "m 3"]
+    colors_linear: Float64[np.ndarray, "m 3"]
     metallic: Float64[np.ndarray, " m"]
     roughness: Float64[np.ndarray, " m"]
     iors: Float64[np.ndarray, " m"]
@@ -68,7 +68,7 @@ class MaterialArrays(NamedTuple):
     substrates: Int32[np.ndarray, " m"]
     energy_compensation: Int32[np.ndarray, " m"]
     coat_tables: Int32[np.ndarray, " m"]
-    colour_textures: Int32[np.ndarray, " m"]
+    color_textures: Int32[np.ndarray, " m"]
     metallic_roughness_textures: Int32[np.ndarray, " m"]
     normal_textures: Int32[np.ndarray, " m"]
     normal_scales: Float64[np.ndarray, " m"]

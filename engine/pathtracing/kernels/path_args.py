@@ -28,14 +28,14 @@ class PathArrays(NamedTuple):
         directions_world: where it goes, unit vectors.
         throughput: what light that it brings still counts, per channel.
         radiance_linear: light of the surfaces and surroundings behind the first layer.
-        layer_srgb: display colours of the Gaussians of the first layer, premultiplied.
+        layer_srgb: display colors of the Gaussians of the first layer, premultiplied.
         transmittance: what the first layer lets through.
         shading_factor: sum over the first layer of coverage times the factor that the stage's lights give
             to it.
         coverage: 1 less what is seen of the background behind everything.
         mesh_visibility: what the Gaussians let through of the first mesh that the camera's ray meets; 0
             without one.
-        albedo_linear: colour of that mesh, white where it mirrors or lets through, times the same share.
+        albedo_linear: color of that mesh, white where it mirrors or lets through, times the same share.
         normals_world: its shading normal times the same share.
         pdf: of the last direction over solid angle; 0 for the camera, mirrors and glass.
         t_view_origin: where on the next ray its viewer stands, see

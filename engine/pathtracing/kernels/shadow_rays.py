@@ -120,7 +120,7 @@ def _trace_glass(
             length = float(t - scratch.t_starts[place]) if cosine > 0.0 else 0.0
             for channel in range(3):
                 passed = math.exp(-materials.absorption[m, channel] * length)
-                transmittance[k, channel] *= reflectance * materials.colours_linear[m, channel] * passed
+                transmittance[k, channel] *= reflectance * materials.colors_linear[m, channel] * passed
             scratch.t_starts[place] = t * RESTART_SCALE + RESTART_OFFSET
             scratch.rows[left] = place
             left += 1

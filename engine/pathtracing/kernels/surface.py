@@ -72,14 +72,14 @@ def offset_ray_origin(
 def eval_material(
     materials: MaterialArrays, m: int, u: float, v: float
 ) -> tuple[float, float, float, float, float]:
-    """Return base colour, metallic and roughness of material ``m`` at texture coordinates."""
+    """Return base color, metallic and roughness of material ``m`` at texture coordinates."""
     red, green, blue = (
-        materials.colours_linear[m, 0],
-        materials.colours_linear[m, 1],
-        materials.colours_linear[m, 2],
+        materials.colors_linear[m, 0],
+        materials.colors_linear[m, 1],
+        materials.colors_linear[m, 2],
     )
     metallic, roughness = materials.metallic[m], materials.roughness[m]
-    texture = materials.colour_textures[m]
+    texture = materials.color_textures[m]
     if texture >= 0:
         t_r, t_g, t_b = eval_texture(materials, texture, u, v)
         red, green, blue = red * t_r, green * t_g, blue * t_b
@@ -94,7 +94,7 @@ def eval_material(
 def eval_vertex_color(
     surfaces: SurfaceArrays, face: int, a: float, b: float, c: float
 ) -> tuple[float, float, float]:
-    """Return the colour of the corners of a face at a place, white where no mesh has colours of its own."""
+    """Return the color of the corners of a face at a place, white where no mesh has colors of its own."""
     if len(surfaces.corner_rgb_linear) == 0:
         return 1.0, 1.0, 1.0
     return interpolate_corners(surfaces.corner_rgb_linear[face], a, b, c)

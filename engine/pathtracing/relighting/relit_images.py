@@ -13,7 +13,7 @@ from octasplat.engine.pathtracing.environment import EnvironmentMap, environment
 from octasplat.engine.pathtracing.relighting.path_relighter import Relighter, render_environment
 from octasplat.engine.render.environment_files import read_environment
 from octasplat.engine.render.image_files import write_exr, write_png
-from octasplat.engine.render.renderer import background_colour
+from octasplat.engine.render.renderer import background_color
 from octasplat.engine.render.shots import Shot
 
 RadianceMap = Float32[np.ndarray, "h w 3"]
@@ -109,7 +109,7 @@ class RelitRenderFn:
         if self.background == "transparent" and not is_exr:
             write_png(path, np.clip(linear_to_srgb(image.linear), 0, 1), image.coverage)
             return
-        plain = background_colour("white" if self.background == "white" else "black")
+        plain = background_color("white" if self.background == "white" else "black")
         rgb = image.composite_over(
             render_environment(environment, rays) if self.background == "environment" else plain
         )

@@ -1,8 +1,8 @@
 """Types of values in a stage, and the base of its models. Imports neither torch nor numba."""
 
-from typing import Annotated
+from typing import Annotated, Any
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
@@ -17,6 +17,14 @@ class StageModel(BaseModel):
     """Base of all stage models: unknown keys are refused, and instances are immutable."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _read_former_key(cls, given: Any) -> Any:
+        """Read ``colour_srgb`` of earlier stage files as ``color_srgb``."""
+        if isinstance(given, dict) and "colour_srgb" in given and "color_srgb" not in given:
+            return {("color_srgb" if key == "colour_srgb" else key): value for key, value in given.items()}
+        return given
 
 
 class Transformed(StageModel):

@@ -25,8 +25,8 @@ class Emissive(StageModel):
 
     Attributes:
         emission: linear radiance of its own light, the same in all directions; 0 for none.
-        emission_srgb: colour of that light.
-        emission_texture: image file of display colours, multiplied by it.
+        emission_srgb: color of that light.
+        emission_texture: image file of display colors, multiplied by it.
     """
 
     emission: NonNegative = 0.0
@@ -38,12 +38,12 @@ class Diffuse(NormalMapped, Emissive):
     """A diffuse (Lambertian) surface.
 
     Attributes:
-        colour_srgb: share of the light that it sends back.
-        texture: image file of display colours, multiplied by the colour.
+        color_srgb: share of the light that it sends back.
+        texture: image file of display colors, multiplied by the color.
     """
 
     kind: Literal["diffuse"] = "diffuse"
-    colour_srgb: Color = (0.8, 0.8, 0.8)
+    color_srgb: Color = (0.8, 0.8, 0.8)
     texture: str | None = None
 
 
@@ -51,7 +51,7 @@ class Mirror(StageModel):
     """A perfect mirror; white reflects everything."""
 
     kind: Literal["mirror"] = "mirror"
-    colour_srgb: Color = WHITE
+    color_srgb: Color = WHITE
 
 
 class Glass(StageModel):
@@ -59,7 +59,7 @@ class Glass(StageModel):
 
     Attributes:
         ior: index of refraction; that of the surroundings is 1.
-        tint_srgb: colour that light takes at each surface that it passes.
+        tint_srgb: color that light takes at each surface that it passes.
         absorption: what is absorbed inside in each linear channel, per world unit (Beer's law).
         roughness: of its surface; perceptual, GGX's alpha is its square; below 0.03 it is smooth.
         multiple_scattering: light that facets throw at each other is kept, not lost.
@@ -77,29 +77,29 @@ class Metal(NormalMapped):
     """Metal with a microfacet surface (GGX).
 
     Attributes:
-        colour_srgb: colour of what it reflects head-on.
+        color_srgb: color of what it reflects head-on.
         roughness: perceptual, GGX's alpha is its square.
         multiple_scattering: light that facets throw at each other is kept, not lost.
     """
 
     kind: Literal["metal"] = "metal"
-    colour_srgb: Color = (0.9, 0.9, 0.9)
+    color_srgb: Color = (0.9, 0.9, 0.9)
     roughness: UnitInterval = 0.2
     multiple_scattering: bool = True
 
 
 class Dielectric(NormalMapped, Emissive):
-    """A coloured substrate under a clear coat with a microfacet surface, such as plastic or glaze.
+    """A colored substrate under a clear coat with a microfacet surface, such as plastic or glaze.
 
     Attributes:
-        colour_srgb: of the ground.
-        texture: image file of the ground's display colours, multiplied by the colour.
+        color_srgb: of the ground.
+        texture: image file of the ground's display colors, multiplied by the color.
         roughness: of the coat; perceptual, GGX's alpha is its square.
         ior: index of refraction of the coat.
     """
 
     kind: Literal["dielectric"] = "dielectric"
-    colour_srgb: Color = (0.8, 0.8, 0.8)
+    color_srgb: Color = (0.8, 0.8, 0.8)
     texture: str | None = None
     roughness: UnitInterval = 0.3
     ior: Annotated[float, Field(gt=1, le=4)] = 1.5
@@ -109,8 +109,8 @@ class MetallicRoughness(NormalMapped, Emissive):
     """glTF's material: a mixture of a dielectric and a metal.
 
     Attributes:
-        colour_srgb: of the dielectric's ground and of the metal.
-        texture: image file of display colours, multiplied by the colour.
+        color_srgb: of the dielectric's ground and of the metal.
+        texture: image file of display colors, multiplied by the color.
         metallic: share of the metal.
         roughness: perceptual, GGX's alpha is its square.
         metallic_roughness_texture: image file with roughness in green and metallic in blue, multiplied by
@@ -122,7 +122,7 @@ class MetallicRoughness(NormalMapped, Emissive):
     """
 
     kind: Literal["metallic-roughness"] = "metallic-roughness"
-    colour_srgb: Color = WHITE
+    color_srgb: Color = WHITE
     texture: str | None = None
     metallic: UnitInterval = 0.0
     roughness: UnitInterval = 1.0

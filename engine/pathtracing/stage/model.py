@@ -1,6 +1,6 @@
 """The stage's data model: meshes, lights, an environment and Gaussian scenes that are rendered together.
 
-Positions and lengths are in world units, angles in degrees. Colours of materials and lights are display
+Positions and lengths are in world units, angles in degrees. Colors of materials and lights are display
 (sRGB-encoded) values in [0, 1] and turned into linear ones for the transport of light; strengths of lights
 are linear. Imports neither torch nor numba.
 """
@@ -69,7 +69,7 @@ class StageMesh(Transformed):
         turn_degrees: about the stage's up, anticlockwise seen from above, before ``rotation_degrees``.
         smooth_degrees: edges up to this angle are shaded as if they were round; 0 shows every facet. By
             default the normals of the file are taken, or 30 where it has none.
-        material: what it is made of; by default what the file says of its materials and colours, or else a
+        material: what it is made of; by default what the file says of its materials and colors, or else a
             matt grey.
         on: a place in the scene on which it stands; its position counts from there.
     """
@@ -93,12 +93,12 @@ class LightModel(StageModel):
     """Settings that all lights have.
 
     Attributes:
-        colour_srgb: of the light.
-        adds_light: whether it adds its light to shadowed Gaussians. Otherwise their colours hold it already,
+        color_srgb: of the light.
+        adds_light: whether it adds its light to shadowed Gaussians. Otherwise their colors hold it already,
             and they only lose it where something new is in its way.
     """
 
-    colour_srgb: Color = WHITE
+    color_srgb: Color = WHITE
     adds_light: bool = False
 
 
@@ -215,13 +215,13 @@ class StageGaussians(Transformed):
 
     Attributes:
         file: splat file of any format; None for the scene that is rendered. Its scale is one number.
-        light: ``emissive`` shows the trained colours as they are; ``shadowed`` takes from them what the
+        light: ``emissive`` shows the trained colors as they are; ``shadowed`` takes from them what the
             meshes keep off of the stage's lights, and adds the light of those that add theirs, and of meshes
             that shine; ``relit`` takes them as the albedo of a matt surface with
             the octagons' normals that the stage's lights shine on.
-        ambient: share of the trained colour that is there without the stage's lights (shadowed, relit).
+        ambient: share of the trained color that is there without the stage's lights (shadowed, relit).
         shadows_on_meshes: whether they keep light off the meshes.
-        shadows_on_gaussians: whether they keep light off the Gaussians. Trained colours hold the scene's
+        shadows_on_gaussians: whether they keep light off the Gaussians. Trained colors hold the scene's
             own shadows already.
         shadow_bias: Gaussians nearer than this to a lit point cast no shadow on it, world units; None takes
             3 % of the scene's size.
@@ -257,8 +257,8 @@ class Integrator(StageModel):
         aperture: diameter of the lens in world units; 0 shows everything sharp.
         focus_distance: along the camera's axis, world units; what is there is sharp.
         layers: pictures are EXR files with what a compositor needs: the scene, the shadows and the things.
-        denoise: noise is taken from what light brings, guided by colours and normals; the Gaussians' own
-            colours stay as they are. Needs the extra ``denoise``.
+        denoise: noise is taken from what light brings, guided by colors and normals; the Gaussians' own
+            colors stay as they are. Needs the extra ``denoise``.
     """
 
     samples: Annotated[int, Field(ge=1, le=65536)] = 16

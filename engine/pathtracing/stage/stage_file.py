@@ -188,16 +188,16 @@ _UNION_TAGS = (
 )  # fmt: skip
 
 _TEMPLATE = """\
-# A stage: things, lights and how the scene takes part. Lengths are in the scene's units, colours are
+# A stage: things, lights and how the scene takes part. Lengths are in the scene's units, colors are
 # display values from 0 to 1, files are relative to this one. Everything that can be set: docs/light.md.
 {places}version = 1
 up = {up}
 
 # How the scene takes light. emissive: as trained; shadowed: darker where a new thing keeps light off;
-# relit: its colours lit by nothing but the lights below and the ambient share.
+# relit: its colors lit by nothing but the lights below and the ambient share.
 [[gaussians]]
 light = "shadowed"
-ambient = 0.4                    # what is left of the colour in full shadow
+ambient = 0.4                    # what is left of the color in full shadow
 shadows_on_meshes = true
 
 # {where} {floor}.
@@ -208,8 +208,8 @@ scale = {radius}
 smooth_degrees = 180
 material = {{ kind = "glass", ior = 1.5 }}
 # material = {{ kind = "mirror" }}
-# material = {{ kind = "metal", colour_srgb = [0.95, 0.8, 0.5], roughness = 0.25 }}
-# material = {{ kind = "dielectric", colour_srgb = [0.7, 0.1, 0.1], roughness = 0.2 }}
+# material = {{ kind = "metal", color_srgb = [0.95, 0.8, 0.5], roughness = 0.25 }}
+# material = {{ kind = "dielectric", color_srgb = [0.7, 0.1, 0.1], roughness = 0.2 }}
 # To stand on what a pixel of a photograph shows (its position then counts from there):
 # on = {{ view = "0001.jpg", pixel = [200, 300] }}
 
@@ -218,7 +218,7 @@ material = {{ kind = "glass", ior = 1.5 }}
 # shape = "plane"
 # position = {floor}
 # scale = {half}
-# material = {{ kind = "mirror", colour_srgb = [0.9, 0.9, 0.9] }}
+# material = {{ kind = "mirror", color_srgb = [0.9, 0.9, 0.9] }}
 
 # The light, from where it seems to come in the photographs.
 [[lights]]
@@ -241,7 +241,7 @@ irradiance = 2.0
 # position = {lamp}
 # intensity = {intensity}
 # radius = 0.0                    # larger makes its shadows soft
-# adds_light = true               # it is new: not yet in the colours of the photographs
+# adds_light = true               # it is new: not yet in the colors of the photographs
 
 # [environment]
 # file = "studio.hdr"

@@ -1,4 +1,4 @@
-"""Colours of a map of all directions, and gradients back to its texels."""
+"""Colors of a map of all directions, and gradients back to its texels."""
 
 import numpy as np
 from jaxtyping import Float, Float32, Float64
@@ -23,20 +23,20 @@ def _place(
 
 
 @kernel(_nrt=False, error_model="numpy")
-def map_colours(
+def map_colors(
     first: int,
     last: int,
     texels: Float[np.ndarray, "t 3"],
     height: int,
     frame: Float64[np.ndarray, "3 3"],
     directions_world: Float[np.ndarray, "r 3"],
-    colours: Float[np.ndarray, "r 3"],
+    colors: Float[np.ndarray, "r 3"],
 ) -> None:
-    """Write bilinear colours of a map of ``height`` rows; ``frame`` is its right, up and forward as rows."""
+    """Write bilinear colors of a map of ``height`` rows; ``frame`` is its right, up and forward as rows."""
     for r in range(first, last):
         a, b, c, d, x, y, _, _, _ = _place(texels, height, frame, directions_world[r])
         for k in range(3):
-            colours[r, k] = mix(texels, a, b, c, d, x, y, k)
+            colors[r, k] = mix(texels, a, b, c, d, x, y, k)
 
 
 @kernel(error_model="numpy")
@@ -45,12 +45,12 @@ def add_to_texels(
     height: int,
     frame: Float64[np.ndarray, "3 3"],
     directions_world: Float[np.ndarray, "r 3"],
-    by_colours: Float[np.ndarray, "r 3"],
+    by_colors: Float[np.ndarray, "r 3"],
     sums: Float64[np.ndarray, "t 3"],
 ) -> None:
-    """Add gradients by the colours to those by the texels, in the order of the rays: always the same sums."""
+    """Add gradients by the colors to those by the texels, in the order of the rays: always the same sums."""
     for r in range(len(directions_world)):
-        red, green, blue = by_colours[r, 0], by_colours[r, 1], by_colours[r, 2]
+        red, green, blue = by_colors[r, 0], by_colors[r, 1], by_colors[r, 2]
         if red == 0.0 and green == 0.0 and blue == 0.0:
             continue
         a, b, c, d, x, y, _, _, _ = _place(texels, height, frame, directions_world[r])

@@ -145,7 +145,7 @@ def shade_pixel(
     table: Float64[np.ndarray, "a c 2"],
     rgb: Float64[np.ndarray, "p 3"],
 ) -> None:
-    """Write the linear colour of one pixel."""
+    """Write the linear color of one pixel."""
     material, normal, direction, visibility, indirect, ambient, bounced = surface
     texels, offsets, heights, roughnesses = light.texels, light.offsets, light.heights, light.roughnesses
     n_x, n_y, n_z = normal[p, 0], normal[p, 1], normal[p, 2]
@@ -179,7 +179,7 @@ def shade_pixels(
     table: Float64[np.ndarray, "a c 2"],
     rgb: Float64[np.ndarray, "p 3"],
 ) -> None:
-    """Write the linear colours of the pixels ``first`` to ``last``."""
+    """Write the linear colors of the pixels ``first`` to ``last``."""
     for p in range(first, last):
         shade_pixel(p, surface, light, table, rgb)
 

@@ -26,9 +26,9 @@ def linearise(
     change: Float32[np.ndarray, "p 3"],
     lifts: Float32[np.ndarray, "p 3"],
 ) -> None:
-    """Write how each pixel's colour changes as its triangle moves by one along its normal, and who moves it.
+    """Write how each pixel's color changes as its triangle moves by one along its normal, and who moves it.
 
-    The point that the ray meets then moves along the ray by one over the cosine, and with it the colour. A
+    The point that the ray meets then moves along the ray by one over the cosine, and with it the color. A
     vertex moves by its ``sizes`` along its own normal; ``lifts`` is by how much that moves the triangle.
     """
     for p in range(first, last):
@@ -66,7 +66,7 @@ def apply_jacobian(
     values: Float32[np.ndarray, "n 4"],
     pixels: Float32[np.ndarray, "p 3"],
 ) -> None:
-    """Write the colours of pixels for ``values`` of vertices: red, green, blue and how far they move."""
+    """Write the colors of pixels for ``values`` of vertices: red, green, blue and how far they move."""
     for p in range(first, last):
         red = green = blue = moved = np.float32(0.0)
         for c in range(3):

@@ -54,13 +54,13 @@ def find_packets(
     """Split rays into packets and single rays.
 
     A group are neighbours in the batch that share an origin, to the bit, and look about one way. Each is
-    judged by its own size, but few small ones go as packets, too. A packet sees a Gaussian in one colour, so
-    that where colours matter the viewers have to stand at the origins. Rays that leave surfaces go alone.
+    judged by its own size, but few small ones go as packets, too. A packet sees a Gaussian in one color, so
+    that where colors matter the viewers have to stand at the origins. Rays that leave surfaces go alone.
 
     Args:
         rays: any rays.
         mode: ``auto`` by what is faster; ``always`` (where that is possible) or ``never`` in packets.
-        needs_color: whether colours matter.
+        needs_color: whether colors matter.
 
     Returns:
         First ray of each packet and the one behind its last; and the rays that go alone.

@@ -9,7 +9,7 @@ from octasplat.engine.settings.fields import ADVANCED, BASIC, EXPERIMENTAL, Unit
 
 
 class GaussianSettings(Settings):
-    """The first Gaussians, their colours, and their number."""
+    """The first Gaussians, their colors, and their number."""
 
     densify_from_iter: Annotated[int, Unit("iterations"), ADVANCED] = Field(
         100, ge=0, description="Iterations of fitting the first Gaussians before anything is added."
@@ -18,7 +18,7 @@ class GaussianSettings(Settings):
         3,
         ge=0,
         le=3,
-        description="Degree of the spherical harmonics: how much colours may change with the direction of "
+        description="Degree of the spherical harmonics: how much colors may change with the direction of "
         "view, 0 not at all. Lower it for smaller files and for matt scenes.",
     )
     sh_degree_interval: Annotated[int, Unit("iterations"), ADVANCED] = Field(

@@ -59,16 +59,16 @@ class LearningRates(Settings):
         description="First step of the opacity logits; 0 keeps opacities. Lower it where surfaces become "
         "transparent early.",
     )
-    color: Annotated[float, Unit("display colour"), ADVANCED] = Field(
+    color: Annotated[float, Unit("display color"), ADVANCED] = Field(
         1e-2,
         ge=0,
-        description="First step of the display colour; the constant harmonic gets it over C0. Raise it in "
+        description="First step of the display color; the constant harmonic gets it over C0. Raise it in "
         "very short trainings.",
     )
-    sh_rest_ratio: Annotated[float, Unit("share of colour"), ADVANCED] = Field(
+    sh_rest_ratio: Annotated[float, Unit("share of color"), ADVANCED] = Field(
         0.1,
         ge=0,
-        description="Step of the higher harmonics, of the constant one's. Lower it where colours flicker "
+        description="Step of the higher harmonics, of the constant one's. Lower it where colors flicker "
         "between views.",
     )
     exposure: Annotated[float, Unit("log gain"), ADVANCED] = Field(
@@ -77,8 +77,8 @@ class LearningRates(Settings):
         description="First step of the views' log gains and offsets, where exposure is learnt. Raise it for "
         "short trainings of photographs of very different brightness.",
     )
-    background: Annotated[float, Unit("display colour"), ADVANCED] = Field(
-        0.01, ge=0, description="First step of the display colours of a learnt background."
+    background: Annotated[float, Unit("display color"), ADVANCED] = Field(
+        0.01, ge=0, description="First step of the display colors of a learnt background."
     )
     albedo: Annotated[float, Unit("Adam step"), ADVANCED] = Field(
         0.03, ge=0, description="First step of the albedo logit, where materials are learnt; 0 keeps it."

@@ -25,13 +25,13 @@ class LossWeights(Settings):
     l1: Annotated[float, Unit("weight"), ADVANCED] = Field(
         0.8,
         ge=0,
-        description="Weight of the mean absolute difference of display colours. Raise it against l2 where a "
+        description="Weight of the mean absolute difference of display colors. Raise it against l2 where a "
         "few wrong pixels, such as passers-by, matter too much.",
     )
     l2: Annotated[float, Unit("weight"), ADVANCED] = Field(
         1.0,
         ge=0,
-        description="Weight of the mean squared difference of display colours. Raise it against l1 for "
+        description="Weight of the mean squared difference of display colors. Raise it against l1 for "
         "higher PSNR, lower it for sharper pictures.",
     )
     ssim: Annotated[float, Unit("weight"), ADVANCED] = Field(

@@ -80,8 +80,8 @@ def estimate_background(dataset: MappedPhotographs) -> InitialBackground:
     found = InitialBackground(background, _up_world(dataset))
     is_far = (far_by >= MIN_VIEWS) & found.is_above_horizon(directions)
     known = is_far | (shown_by > 0)
-    colours = np.where(is_far[:, None], far, shown).reshape(ROWS, 2 * ROWS, 3)
-    background.set_map(_fill_unknown(colours, known.reshape(ROWS, 2 * ROWS)))
+    colors = np.where(is_far[:, None], far, shown).reshape(ROWS, 2 * ROWS, 3)
+    background.set_map(_fill_unknown(colors, known.reshape(ROWS, 2 * ROWS)))
     return found
 
 
@@ -114,7 +114,7 @@ def _visible_texels(
     directions: Float64[np.ndarray, "t 3"],
     points: Float64[np.ndarray, "n 3"],
 ) -> tuple[Int64[np.ndarray, " k"], Float32[np.ndarray, "k 3"], Bool[np.ndarray, " k"]]:
-    """Return the texels that a view shows, their colours there, and whether nothing near is beside."""
+    """Return the texels that a view shows, their colors there, and whether nothing near is beside."""
     view = dataset.views[index]
     camera = dataset.cameras[view.camera_index]
     in_cam = np.stack([_axis_products(directions, axis) for axis in view.rotation_cam_from_world], axis=1)
@@ -136,7 +136,7 @@ def _visible_texels(
 def _texel_medians(
     texel: Int64[np.ndarray, " k"], rgb: Float32[np.ndarray, "k 3"], count: int
 ) -> tuple[Float32[np.ndarray, "t 3"], Int64[np.ndarray, " t"]]:
-    """Return the lower median of each channel of each texel's colours, and how many there are."""
+    """Return the lower median of each channel of each texel's colors, and how many there are."""
     found = np.bincount(texel, minlength=count)
     medians = np.zeros((count, 3), np.float32)
     middle = np.cumsum(found) - found + np.maximum(found - 1, 0) // 2
@@ -147,14 +147,14 @@ def _texel_medians(
 
 
 def _fill_unknown(
-    colours: Float32[np.ndarray, "h w 3"], known: Bool[np.ndarray, "h w"]
+    colors: Float32[np.ndarray, "h w 3"], known: Bool[np.ndarray, "h w"]
 ) -> Float32[np.ndarray, "h w 3"]:
     """Return the map with unknown texels blurred from the nearest known ones; its sides meet."""
     if not known.any():
-        return np.full_like(colours, 0.5)
-    width = colours.shape[1]
+        return np.full_like(colors, 0.5)
+    width = colors.shape[1]
     around = np.tile(known, (1, 3))
     row, column = distance_transform_edt(~around, return_distances=False, return_indices=True)
-    nearest = colours[row, column % width][:, width : 2 * width]
+    nearest = colors[row, column % width][:, width : 2 * width]
     soft = gaussian_filter(nearest, (*BLUR_TEXELS, 0), mode=("nearest", "wrap", "nearest"))
     return np.where(known[..., None], nearest, soft)

@@ -47,7 +47,7 @@ class InitialGaussianOptions:
         normal_neighbors: points around one whose plane gives its normal.
         plane_sweep: whether pixels are lifted to their depth where there are fewer sparse points.
         plane_sweep_unseen: whether pixels that no neighbouring view shows are lifted, too.
-        equalizes_exposure: whether colours of lifted pixels are compared at equal brightness of the views.
+        equalizes_exposure: whether colors of lifted pixels are compared at equal brightness of the views.
     """
 
     seed: int

@@ -24,7 +24,7 @@ class ExposedPhotographs:
     def pixels(
         self, view: Int64[np.ndarray, " r"], y: Int64[np.ndarray, " r"], x: Int64[np.ndarray, " r"]
     ) -> tuple[Float32[np.ndarray, "r 3"], Float32[np.ndarray, " r"], Float32[np.ndarray, " r"]]:
-        """Return straight display colour, alpha and weight of pixels."""
+        """Return straight display color, alpha and weight of pixels."""
         rgb, alpha, weight = self.dataset.pixels(view, y, x)
         if self.gains is not None:
             rgb = np.clip(rgb * self.gains[view][:, None], 0, 1)
@@ -39,7 +39,7 @@ class PixelPatches:
         origin_world: the view's camera.
         directions_world: unit vectors through the pixels.
         depth_factors: distance along each ray of a point at depth 1 along the camera's axis.
-        rgb_srgb: colours of the pixels.
+        rgb_srgb: colors of the pixels.
         y: rows of the pixels in the middle.
         x: columns of the pixels in the middle.
     """

@@ -56,7 +56,7 @@ NEAR_RANK, NEAR_FACTOR = 10, 0.7
 FAR_QUANTILE, FAR_FACTOR = 0.98, 1.5
 """It ends at so many times the depth that this share of the points lies before."""
 MAX_COST = 0.06
-"""Mean difference of colour, in display values, above which no guess counts as right."""
+"""Mean difference of color, in display values, above which no guess counts as right."""
 BACKGROUND_COST_MARGIN = 0.005
 """A pixel that matches infinitely far away about as well as at any guess shows the sky."""
 BACKGROUND_DEPTH = 1e6
@@ -94,7 +94,7 @@ def plane_sweep_points(
         rng: draws the pixels.
         threads: work on the views side by side, which changes no point.
         background: what is behind everything; pixels that show it give no points.
-        gains: factors on the display colours of each view, after which all are exposed alike; None for 1.
+        gains: factors on the display colors of each view, after which all are exposed alike; None for 1.
         unseen: whether pixels whose place no two neighbouring views show, so that nothing can be matched, are
             lifted, too: to a depth between those of the points around.
     """

@@ -23,7 +23,7 @@ class PlaneSweepPoints:
 
     Attributes:
         xyz_world: where they are.
-        rgb_srgb: display colours.
+        rgb_srgb: display colors.
         swept: whether no point around suggested the depth; more of these are wrong.
     """
 

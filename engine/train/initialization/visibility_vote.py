@@ -14,7 +14,7 @@ VOTING_VIEWS = 24
 MIN_VOTERS = 3
 """Jurors that must look towards a point."""
 MAX_VOTE_DIFFERENCE = 0.12
-"""Largest mean difference of colour, in display values, of a view that agrees."""
+"""Largest mean difference of color, in display values, of a view that agrees."""
 MIN_VOTE_FRACTION = 0.3
 """Share of the views looking there that must agree: a point in free space hides other things in most."""
 SWEEP_MAX_VOTE_DIFFERENCE, SWEEP_MIN_VOTE_FRACTION = 0.1, 0.4
@@ -27,7 +27,7 @@ def passes_vote(
     own_view: Int64[np.ndarray, " n"],
     pool: ThreadPoolExecutor,
 ) -> Bool[np.ndarray, " n"]:
-    """Return whether enough of the views that look towards each point show its colour there."""
+    """Return whether enough of the views that look towards each point show its color there."""
     limits = np.where(points.swept, SWEEP_MAX_VOTE_DIFFERENCE, MAX_VOTE_DIFFERENCE)
     majority = np.where(points.swept, SWEEP_MIN_VOTE_FRACTION, MIN_VOTE_FRACTION)
     agree, looking = np.zeros(len(points), np.int64), np.zeros(len(points), np.int64)

@@ -37,7 +37,7 @@ class LossGradients:
     """A loss on one batch with its gradients.
 
     Attributes:
-        loss: the loss on the shaded colours.
+        loss: the loss on the shaded colors.
         gaussians: gradients by the Gaussians' parameters.
         shading: gradients by the shading model's own parameters.
         hits_per_ray: mean number of Gaussians on a ray.

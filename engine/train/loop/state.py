@@ -53,7 +53,7 @@ class TrainState:
     average: WeightAverage = field(default_factory=WeightAverage)
 
     def raise_sh_degree(self, degree: int) -> None:
-        """Give the colours harmonics up to ``degree``, zero at first, if they have less."""
+        """Give the colors harmonics up to ``degree``, zero at first, if they have less."""
         if degree > self.gaussians.sh_degree:
             count = (degree + 1) ** 2
             extra = count - self.gaussians.sh.shape[1]

@@ -66,11 +66,11 @@ def ssim_loss(
 
 @dataclass(frozen=True)
 class BatchLoss:
-    """A loss and its gradient by the rendered colours.
+    """A loss and its gradient by the rendered colors.
 
     Attributes:
         value: the loss.
-        gradient: by the colours.
+        gradient: by the colors.
         squared_error: mean over the rays of non-zero weight and the channels.
     """
 
@@ -80,7 +80,7 @@ class BatchLoss:
 
 
 def batch_loss(render: Float32[np.ndarray, "r 3"], batch: Batch, weights: LossWeights) -> BatchLoss:
-    """Return all terms by the rendered colours: those of the pixels, and SSIM where the batch has patches."""
+    """Return all terms by the rendered colors: those of the pixels, and SSIM where the batch has patches."""
     target = batch.target_srgb
     pixel = pixel_loss(render, target, batch.weight, l1=weights.l1, l2=weights.l2)
     if not batch.ssim_patch_count or weights.ssim == 0:
@@ -103,7 +103,7 @@ def ray_errors(
 def _ssim_term(
     render: Float32[np.ndarray, "r 3"], target: Float32[np.ndarray, "r 3"], batch: Batch
 ) -> tuple[float, Float32[np.ndarray, "p 3"]]:
-    """Return 1 - SSIM of the batch's patches and its gradient; masked pixels take the photograph's colour."""
+    """Return 1 - SSIM of the batch's patches and its gradient; masked pixels take the photograph's color."""
     count = batch.ssim_patch_count * batch.patch_side**2
     shape = (batch.ssim_patch_count, batch.patch_side, batch.patch_side, 3)
     weight = batch.weight[-count:, None]

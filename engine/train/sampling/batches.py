@@ -53,7 +53,7 @@ class Batch:
 
     @cached_property
     def target_srgb(self) -> Float32[np.ndarray, "r 3"]:
-        """Return the photographs' colours over the background."""
+        """Return the photographs' colors over the background."""
         return composite_over(self.rgb_srgb, self.alpha, self.background_srgb)
 
 
@@ -240,7 +240,7 @@ class PrefetchedBatches:
 
 
 def evaluation_background(background: Background) -> Float32[np.ndarray, "3"]:
-    """Return the colour behind everything when views are compared: white if asked for, else black."""
+    """Return the color behind everything when views are compared: white if asked for, else black."""
     return np.full(3, 1.0 if background == "white" else 0.0, np.float32)
 
 

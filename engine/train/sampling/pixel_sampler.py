@@ -30,7 +30,7 @@ class PixelSource(Protocol):
     def pixels(
         self, view: Int64[np.ndarray, " r"], y: Int64[np.ndarray, " r"], x: Int64[np.ndarray, " r"]
     ) -> tuple[Float32[np.ndarray, "r 3"], Float32[np.ndarray, " r"], Float32[np.ndarray, " r"]]:
-        """Return straight display colour, alpha, and weight (0 where masked) of pixels."""
+        """Return straight display color, alpha, and weight (0 where masked) of pixels."""
         ...
 
 

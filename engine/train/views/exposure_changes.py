@@ -55,7 +55,7 @@ def relative_log_brightness(dataset: TrackedTrainingData) -> Float64[np.ndarray,
 
 
 def equalizing_gains(dataset: TrackedTrainingData) -> Float32[np.ndarray, " v"]:
-    """Return factors on the display colours of each view that make all about as bright; 1 where unknown."""
+    """Return factors on the display colors of each view that make all about as bright; 1 where unknown."""
     brightness = relative_log_brightness(dataset)
     return np.exp(-np.where(np.isfinite(brightness), brightness, 0.0)).astype(np.float32)
 

@@ -1,7 +1,7 @@
 """How a camera moves so that a photograph shows the surface where its render does: direct image alignment.
 
-Points of the surface, with the colours that they are rendered in, are projected into the photograph. Steps of
-Gauss and Newton change the six numbers of the pose until the photograph has these colours there, as in
+Points of the surface, with the colors that they are rendered in, are projected into the photograph. Steps of
+Gauss and Newton change the six numbers of the pose until the photograph has these colors there, as in
 "Direct Sparse Odometry" (https://arxiv.org/abs/1607.02565). A gain and an offset for each channel are solved
 along with them, so that exposure does not look like motion; what disagrees for other reasons counts little.
 """
@@ -21,7 +21,7 @@ from octasplat.engine.train.sampling.pixel_sampler import PixelSource
 
 GAUSS_NEWTON_STEPS = 2
 MAX_RESIDUAL_STEP_PX = 1.0
-"""A step moves the middle point no farther; colours beyond say nothing about the slope here."""
+"""A step moves the middle point no farther; colors beyond say nothing about the slope here."""
 DAMPING = 1e-3
 """Of the mean curvature, added to that of each of the six numbers: what hardly shows is left as it is."""
 MIN_POINTS = 200
@@ -69,7 +69,7 @@ class RigidMotion:
 
 @dataclass(frozen=True, eq=False)
 class RenderedPoints:
-    """Points of the surface in camera coordinates, and the display colours that they are rendered in."""
+    """Points of the surface in camera coordinates, and the display colors that they are rendered in."""
 
     points_cam: Float64[np.ndarray, "n 3"]
     rgb_srgb: Float64[np.ndarray, "n 3"]
@@ -80,8 +80,8 @@ class PhotographSamples:
     """What a photograph shows at image points.
 
     Attributes:
-        rgb_srgb: display colours; 0 where it shows nothing.
-        gradient: of the colours, by x and y in pixels.
+        rgb_srgb: display colors; 0 where it shows nothing.
+        gradient: of the colors, by x and y in pixels.
         valid: whether the photograph shows the point and counts there.
     """
 
@@ -121,11 +121,11 @@ def photograph_spline(
         y = np.minimum(first[:, None, None, 1] + np.arange(4)[None, :, None], height - 1)
         which, y, x = (np.broadcast_to(a, (len(xy_px), 4, 4)).reshape(-1) for a in (np.array(view), y, x))
         rgb, alpha, weight = dataset.pixels(*_contiguous(which, y, x))
-        colours = composite_over(rgb, alpha, background_srgb).reshape(-1, 4, 4, 3).astype(np.float64)
+        colors = composite_over(rgb, alpha, background_srgb).reshape(-1, 4, 4, 3).astype(np.float64)
         valid = inside & (weight.reshape(-1, 16) > 0).all(axis=1)
         share = np.clip(within - first - 1, 0.0, 1.0)
         (by_x, slope_x), (by_y, slope_y) = _spline_weights(share[:, 0]), _spline_weights(share[:, 1])
-        rows, row_slopes = (np.einsum("nyxc,nx->nyc", colours, taps) for taps in (by_x, slope_x))
+        rows, row_slopes = (np.einsum("nyxc,nx->nyc", colors, taps) for taps in (by_x, slope_x))
         values = np.einsum("nyc,ny->nc", rows, by_y)
         slope = np.stack(
             [np.einsum("nyc,ny->nc", row_slopes, by_y), np.einsum("nyc,ny->nc", rows, slope_y)], axis=2
@@ -164,7 +164,7 @@ def align_camera(rendered: RenderedPoints, photograph: PhotographFn, camera: Cam
 
 
 def _compare(rendered: RenderedPoints, shown: PhotographSamples) -> _Comparison | None:
-    """Return the render beside the photograph's colours of its points; None where these are too few."""
+    """Return the render beside the photograph's colors of its points; None where these are too few."""
     if int(shown.valid.sum()) < MIN_POINTS:
         return None
     weights = shown.valid.astype(np.float64)
@@ -179,7 +179,7 @@ def _compare(rendered: RenderedPoints, shown: PhotographSamples) -> _Comparison 
 def _fit_exposure(
     rgb: Float64[np.ndarray, "n 3"], wanted: Float64[np.ndarray, "n 3"], weights: Float64[np.ndarray, " n"]
 ) -> Float64[np.ndarray, "n 3"]:
-    """Return colours under the gain and offset of each channel that bring them closest to others."""
+    """Return colors under the gain and offset of each channel that bring them closest to others."""
     share = (weights / weights.sum())[:, None]
     middle, wanted_middle = (share * rgb).sum(axis=0), (share * wanted).sum(axis=0)
     offset = rgb - middle

@@ -5,9 +5,9 @@ import { thousands } from "./numbers.js";
 
 // The first of several curves of a chart is the one that is read out.
 const CHARTS = [
-    { title: "PSNR", unit: "dB", digits: 2, curves: [{ key: "held_out_psnr", label: "held-out views", colour: "--accent" }, { key: "training_psnr", label: "training rays", colour: "--soft", dash: [4, 3] }] },
-    { title: "Loss", unit: "", digits: 4, logarithmic: true, curves: [{ key: "loss", label: "loss", colour: "--accent" }] },
-    { title: "Gaussians", unit: "", digits: 0, curves: [{ key: "gaussians", label: "Gaussians", colour: "--accent" }] },
+    { title: "PSNR", unit: "dB", digits: 2, curves: [{ key: "held_out_psnr", label: "held-out views", color: "--accent" }, { key: "training_psnr", label: "training rays", color: "--soft", dash: [4, 3] }] },
+    { title: "Loss", unit: "", digits: 4, logarithmic: true, curves: [{ key: "loss", label: "loss", color: "--accent" }] },
+    { title: "Gaussians", unit: "", digits: 0, curves: [{ key: "gaussians", label: "Gaussians", color: "--accent" }] },
 ];
 const KEYS = CHARTS.flatMap(({ curves }) => curves.map(({ key }) => key));
 const HEIGHT = 170;
@@ -74,7 +74,7 @@ export class Charts {
     build() {
         if (this.training.iterations.length < 2) return;
         const style = getComputedStyle(document.documentElement);
-        const colour = (name) => style.getPropertyValue(name).trim();
+        const color = (name) => style.getPropertyValue(name).trim();
         this.plots.forEach(({ plot }) => plot.destroy());
         this.box.replaceChildren();
         this.plots = CHARTS.map((chart) => {
@@ -83,7 +83,7 @@ export class Charts {
             title.append(Object.assign(document.createElement("span"), { textContent: chart.unit ? `${chart.title}, ${chart.unit}` : chart.title }), output);
             card.append(title);
             this.box.append(card);
-            const axis = { stroke: colour("--soft"), grid: { stroke: colour("--line"), width: 1 }, ticks: { show: false }, font: "11px system-ui, sans-serif" };
+            const axis = { stroke: color("--soft"), grid: { stroke: color("--line"), width: 1 }, ticks: { show: false }, font: "11px system-ui, sans-serif" };
             const plot = new uPlot({
                 width: Math.max(120, card.clientWidth - 20), height: HEIGHT,
                 legend: { show: false },
@@ -93,7 +93,7 @@ export class Charts {
                     { ...axis, size: 26, values: (_, ticks) => ticks.map((tick) => short.format(tick)) },
                     { ...axis, size: 44, values: (_, ticks) => ticks.map((tick) => tick === null ? "" : chart.logarithmic ? String(Number(tick.toPrecision(1))) : short.format(tick)) },
                 ],
-                series: [{}, ...chart.curves.map((curve) => ({ label: curve.label, stroke: colour(curve.colour), width: 1.8, dash: curve.dash, spanGaps: true, points: { show: false } }))],
+                series: [{}, ...chart.curves.map((curve) => ({ label: curve.label, stroke: color(curve.color), width: 1.8, dash: curve.dash, spanGaps: true, points: { show: false } }))],
                 hooks: { setCursor: [(self) => this.say(output, chart, self.cursor.idx)] },
             }, this.training.data(chart), card);
             plot.root.setAttribute("role", "img");
@@ -107,7 +107,7 @@ export class Charts {
     /** Writes the values at a point, or the newest ones, beside the title; with several curves, under their names. */
     say(output, chart, index) {
         const last = this.training.iterations.length - 1;
-        const parts = chart.curves.map(({ key, label, colour, dash }) => {
+        const parts = chart.curves.map(({ key, label, color, dash }) => {
             const values = this.training.values[key];
             let at = index ?? last;
             while (at >= 0 && values[at] == null) at -= 1; // not every point has every value
@@ -115,7 +115,7 @@ export class Charts {
             const part = document.createElement("span");
             if (chart.curves.length > 1) {
                 const line = Object.assign(document.createElement("i"), { className: dash ? "curve dashed" : "curve" });
-                line.style.color = `var(${colour})`;
+                line.style.color = `var(${color})`;
                 part.append(line, `${label} `);
             }
             part.append(`${thousands(values[at], chart.digits)} at ${thousands(this.training.iterations[at])}`);

@@ -30,7 +30,7 @@ def info(as_json: bool, threads: int, **given: Any) -> None:
 
 
 def _terminal_image(image_srgb: Any) -> str:
-    """Return a picture for a terminal that shows colours: two pixels a letter, one above the other."""
+    """Return a picture for a terminal that shows colors: two pixels a letter, one above the other."""
     import numpy as np
 
     height, width = image_srgb.shape[:2]

@@ -1,4 +1,4 @@
-"""``octasplat surface``: one coloured triangle mesh of a scene."""
+"""``octasplat surface``: one colored triangle mesh of a scene."""
 
 from octasplat.engine.operations.surface import OPERATION
 from octasplat.workers.cli.request_options import operation_command

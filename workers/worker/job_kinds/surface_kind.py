@@ -20,7 +20,7 @@ _PRESET_OPTIONS = ("room", "materials")
 
 
 class SurfaceJobOptions(SurfaceOptions):
-    """Options of ``surface``: how the surface is meshed and coloured, and in which format."""
+    """Options of ``surface``: how the surface is meshed and colored, and in which format."""
 
     format: Literal["glb", "ply", "obj"] = Field(
         "glb", description="Format of the mesh, which is surface.glb, .ply or .obj among the results."
@@ -43,7 +43,7 @@ class SurfaceKind(OperationKind):
     def __init__(self) -> None:
         super().__init__(
             OPERATION,
-            title="One coloured triangle mesh of the scene of a reconstruction",
+            title="One colored triangle mesh of the scene of a reconstruction",
             options=SurfaceJobOptions,
             stages=("depth", "fusing", "meshing"),
             source_files=(
@@ -54,16 +54,16 @@ class SurfaceKind(OperationKind):
         )
 
     def needs_photographs(self, options: SurfaceJobOptions) -> bool:
-        """Return whether colours are fitted to photographs."""
+        """Return whether colors are fitted to photographs."""
         return options.fit and not options.materials
 
     def stages(self, options: SurfaceJobOptions) -> tuple[str, ...]:
-        """Return the stages; colours that are fitted to photographs need not be seen in the scene first."""
+        """Return the stages; colors that are fitted to photographs need not be seen in the scene first."""
         requested = {
             "settling": options.refine_vertices,
             "decimating": bool(options.max_triangles),
             "unwrapping": options.texture_size is not None,
-            "colouring": options.materials or not options.fit,
+            "coloring": options.materials or not options.fit,
             "fitting": options.fit and not options.materials,
         }
         return (*super().stages(options), *(name for name, is_asked in requested.items() if is_asked))

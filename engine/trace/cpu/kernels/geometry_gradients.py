@@ -16,7 +16,7 @@ class GaussianMoments(NamedTuple):
     """Sums over a Gaussian's hits; with the hit at u, v standard deviations and tau = dL/dt / <d, r1>.
 
     ``n0`` to ``n2`` sum the gradient of the turned normal times the weight, ``m0`` to ``m2`` that by the mean
-    through the direction in which its colour is seen.
+    through the direction in which its color is seen.
     """
 
     h: float

@@ -129,7 +129,7 @@ class PacketHits(NamedTuple):
 
     ``us`` and ``vs`` are the hits in standard deviations. ``slots`` numbers the Gaussians of each packet in
     the order in which it met them: the Gaussian in slot s of the packet that begins with ray f is
-    ``slot_ids[first_place(f) + s]``, its colour is in ``slot_rgb``, and packet p has ``slot_counts[p]`` of
+    ``slot_ids[first_place(f) + s]``, its color is in ``slot_rgb``, and packet p has ``slot_counts[p]`` of
     them.
     """
 

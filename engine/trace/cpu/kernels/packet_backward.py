@@ -243,7 +243,7 @@ def backward_packet(
     for slot in range(slots):
         words[base + slot, PACKET] = packet
         rows.weights[base + slot] = rows.sums[base + slot, W]
-        for channel in range(3):  # a colour clamped at zero gets no gradient
+        for channel in range(3):  # a color clamped at zero gets no gradient
             if packet_hits.slot_rgb[slot_base + slot, channel] <= 0.0:
                 rows.sums[base + slot, RED + channel] = np.float32(0.0)
 

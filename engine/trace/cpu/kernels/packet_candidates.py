@@ -22,7 +22,7 @@ r"""Packets of rays that share an origin: which Gaussians may they meet, and the
    same rays may meet come together, so that a block of eight has few bits.
 4. Each ray tests the blocks that have its bit, eight octagons at once, sorts what it has met, and composites
    the hits before "safe", eight at once. It ends where its transmittance says so; what lies behind is never
-   tested. A Gaussian has one colour for all rays of the packet, found when the first of them meets it.
+   tested. A Gaussian has one color for all rays of the packet, found when the first of them meets it.
 5. Backwards, the rays of a packet sum their shares of a Gaussian in one row of moments, which is enough as
    all share o (:mod:`octasplat.engine.trace.cpu.kernels.packet_reduction`). Rows are sorted and summed by
    Gaussian.
@@ -74,7 +74,7 @@ ray's hits, once a chunk, does not show; a chunk's rows (6 kB) stay in the first
 MASK_BITS = 64
 """Blocks whose bits make one word of a ray's."""
 COLOR_NORMAL_WORDS = 8
-"""What a Gaussian shows to a packet: its colour, 0, the normal turned towards the origin, 0."""
+"""What a Gaussian shows to a packet: its color, 0, the normal turned towards the origin, 0."""
 INITIAL_CAPACITY = 512
 """Candidates that a thread has room for at first; a packet that has more makes it grow."""
 

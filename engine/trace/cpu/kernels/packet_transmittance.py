@@ -1,4 +1,4 @@
-"""The transmittance of packets of rays alone: nothing is sorted, no colour is read."""
+"""The transmittance of packets of rays alone: nothing is sorted, no color is read."""
 
 import numpy as np
 from jaxtyping import Float32, Float64, Int64

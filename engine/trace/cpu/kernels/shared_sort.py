@@ -8,7 +8,7 @@ order, sixteen rays at a time (:mod:`octasplat.engine.trace.cpu.kernels.simd16`)
 
     for each candidate, front to back        rays of the packet, sixteen to a vector
         alphas of the rays that may meet it   [. . a a a . . .]   octagon, distance and limits as ever
-        its colour, if any ray does           c
+        its color, if any ray does           c
         what the rays see                     rgb += T a c,  T *= 1 - a
 
 Kept of it are the Gaussians that were met, as lines, and which rays met them. The backward pass goes through

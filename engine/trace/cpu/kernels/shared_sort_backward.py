@@ -79,7 +79,7 @@ def backward_packet_shared_sort(
         reduce_moments(moments_at, rows.sums.ctypes.data + row * (ROW_WORDS * 4))
         rows.ids[row], words[row, PACKET] = packet_hits.ids[start + k], packet
         rows.weights[row] = rows.sums[row, W]
-        for channel in range(3):  # a colour clamped at zero gets no gradient
+        for channel in range(3):  # a color clamped at zero gets no gradient
             if packet_hits.packet_primitives[start + k, COLOR + channel] <= 0.0:
                 rows.sums[row, RED + channel] = np.float32(0.0)
 

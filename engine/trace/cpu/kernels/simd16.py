@@ -2,7 +2,7 @@
 
 What is known of the packet's rays lies in rows of 64 numbers, a lane for each ray; so does what they have
 seen so far, and what goes back along them. A Gaussian is a line of sixteen numbers: the twelve of a row of
-:mod:`octasplat.engine.trace.cpu.kernels.simd8`, its colour, and nothing. No flag allows the compiler to
+:mod:`octasplat.engine.trace.cpu.kernels.simd8`, its color, and nothing. No flag allows the compiler to
 change a result.
 """
 
@@ -33,17 +33,17 @@ RAY_ROWS = 5
 """Of each ray: its slopes, its length over its way along the axis, and between which distances it sees."""
 TRANSMITTANCE, RED, GREEN, BLUE, DEPTH, MEDIAN, NORMAL_0, NORMAL_1, NORMAL_2, COUNT = range(10)
 STATE_ROWS = 10
-"""What each ray has seen: the transmittance that is left, sums of colour, distance and normal, the median
+"""What each ray has seen: the transmittance that is left, sums of color, distance and normal, the median
 distance, and the number of its hits."""
 ALPHA, DISTANCE = range(2)
 HIT_ROWS = 2
 """Where each ray meets the Gaussian that is being tested."""
 GRAD_RED, GRAD_GREEN, GRAD_BLUE, ERROR, GRAD_BEHIND, TRANSMITTANCE_BEHIND = range(6)
 BACKWARD_ROWS = 6
-"""Backwards: dL by each ray's colour, its error, dL by what lies behind, and the transmittance there."""
+"""Backwards: dL by each ray's color, its error, dL by what lies behind, and the transmittance there."""
 PACKET_PRIMITIVE_WORDS = 16
 COLOR = 12
-"""Where a line has its colour; before it are the rows of :mod:`octasplat.engine.trace.cpu.kernels.simd8`."""
+"""Where a line has its color; before it are the rows of :mod:`octasplat.engine.trace.cpu.kernels.simd8`."""
 MOMENTS = 14
 """Sums of a Gaussian over the rays.
 
@@ -184,7 +184,7 @@ def backward_group16(
     """Propagate gradients back over a Gaussian that those rays of a group, the ``ray_mask``, have hit.
 
     With h = dL/d ln(alpha) adds to the ``moments``, rows of sixteen, lane by lane: h times 1, u, v, u^2, u v,
-    v^2, u (u^2 + v^2) and v (u^2 + v^2); weights, counts, weights times errors and times dL by each colour.
+    v^2, u (u^2 + v^2) and v (u^2 + v^2); weights, counts, weights times errors and times dL by each color.
     What was clamped to ``alpha_max`` has no h. The transmittance before a hit is what lies behind it over
     1 - alpha, so that nothing but the line and the bits need be kept of it.
     """

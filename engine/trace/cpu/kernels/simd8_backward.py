@@ -100,12 +100,12 @@ def backward_hits8(
     Args:
         typingctx: numba's.
         hits: the hits.
-        weight_gradients: dL by a weight of one of each hit, float64, but for what its colour does to that.
-        slot_rgb: float32 colours of the slots.
+        weight_gradients: dL by a weight of one of each hit, float64, but for what its color does to that.
+        slot_rgb: float32 colors of the slots.
         count: how many of the eight there are.
         gradient_behind: dL by what lies behind the last.
         alpha_max: the alpha (float32) that was clamped and has no gradient.
-        ray_gradients: eight float32 of the ray: 1, 0, its error, dL by its colour, 0, 0.
+        ray_gradients: eight float32 of the ray: 1, 0, its error, dL by its color, 0, 0.
         out: row s at ``rows`` is that of slot s, sixteen float32.
 
     Of each hit, with h = dL/d ln(alpha), adds to the first eight the moments h (1, u, v, u^2, u v, v^2,
@@ -128,10 +128,10 @@ def backward_hits8(
         first_word = builder.mul(slot, ir.Constant(LONG8, [3] * LANES))
         for channel in range(3):
             word = builder.add(first_word, ir.Constant(LONG8, [channel] * LANES))
-            colour = builder.fpext(gather(builder, slot_rgb, word, FLOAT8), DOUBLE8)
+            color = builder.fpext(gather(builder, slot_rgb, word, FLOAT8), DOUBLE8)
             at = builder.add(by_ray, ir.Constant(I64, (3 + channel) * 4))
             slope = builder.fpext(builder.load(builder.inttoptr(at, FLOAT.as_pointer())), DOUBLE)
-            value = value + Vector(builder, colour) * broadcast(builder, slope)
+            value = value + Vector(builder, color) * broadcast(builder, slope)
         alpha = VectorRows(builder, alphas, FLOAT8)[0].to_float64()
         clamped = alpha >= broadcast(builder, builder.fpext(alpha_max, DOUBLE))
         alpha = keep_first_lanes(builder, alpha, count)

@@ -40,7 +40,7 @@ from octasplat.engine.trace.cpu.kernels.spherical_harmonics import (
 from octasplat.engine.trace.kernels.native import atomic_fetch_next, njit_no_refcount
 
 RED_CLAMPED, GREEN_CLAMPED, BLUE_CLAMPED = 1 << 28, 1 << 29, 1 << 30
-"""Bits of a hit's ray number: this channel's colour was clamped at zero and gets no gradient."""
+"""Bits of a hit's ray number: this channel's color was clamped at zero and gets no gradient."""
 RAY_ID_MASK = (1 << 28) - 1
 
 

@@ -1,6 +1,6 @@
 """Real spherical harmonics of degree 0 to 3 in the sign and order of the 3DGS family.
 
-A Gaussian has one colour for all rays with one viewer, that in the direction from there to its mean.
+A Gaussian has one color for all rays with one viewer, that in the direction from there to its mean.
 """
 
 import math
@@ -51,7 +51,7 @@ def eval_sh_basis(basis: Float64[np.ndarray, " k"], count: int, x: float, y: flo
 def eval_color(
     sh: Float32[np.ndarray, "n k 3"], i: int, basis: Float64[np.ndarray, " k"]
 ) -> tuple[float, float, float]:
-    """Return display colour max(0, 1/2 + sum_k sh[i, k] basis[k]) of Gaussian ``i``, three float64."""
+    """Return display color max(0, 1/2 + sum_k sh[i, k] basis[k]) of Gaussian ``i``, three float64."""
     if sh.shape[1] == HARMONICS:
         red, green, blue = eval_sh16(sh.ctypes.data + i * SH_BYTES, basis.ctypes.data)
         return max(0.5 + red, 0.0), max(0.5 + green, 0.0), max(0.5 + blue, 0.0)

@@ -31,7 +31,7 @@ export function stageText(values, scene, spot, extent) {
     }
     if (values.floor) {
         const half = values.floor_size / 200 * size;
-        parts.push(["[[meshes]]", 'shape = "plane"', on, lifted, `scale = ${number(half)}`, 'material = { kind = "mirror", colour_srgb = [0.9, 0.9, 0.9] }']);
+        parts.push(["[[meshes]]", 'shape = "plane"', on, lifted, `scale = ${number(half)}`, 'material = { kind = "mirror", color_srgb = [0.9, 0.9, 0.9] }']);
     }
     if (values.light !== "none") parts.push(light(values, scene, up, size));
     if (values.sky) {
@@ -60,11 +60,11 @@ function directionTo({ height, around }, forward, up) {
     return level.map((value, axis) => Math.cos(high) * (right[axis] * Math.sin(turn) - value * Math.cos(turn)) + Math.sin(high) * up[axis]);
 }
 
-function material({ material, colour, roughness }) {
-    const rgb = [1, 3, 5].map((at) => number(parseInt(colour.slice(at, at + 2), 16) / 255)).join(", ");
+function material({ material, color, roughness }) {
+    const rgb = [1, 3, 5].map((at) => number(parseInt(color.slice(at, at + 2), 16) / 255)).join(", ");
     if (material === "glass") return `{ kind = "glass", ior = 1.5, tint_srgb = [${rgb}] }`;
     const rough = material === "metal" || material === "dielectric" ? `, roughness = ${number(roughness)}` : "";
-    return `{ kind = ${quoted(material)}, colour_srgb = [${rgb}]${rough} }`;
+    return `{ kind = ${quoted(material)}, color_srgb = [${rgb}]${rough} }`;
 }
 
 /** A turn about `up` as turns about x, then y, then z. */

@@ -30,9 +30,9 @@ export class Lighting {
         }));
         mesh.frustumCulled = false;
         this.octagons = new Scene().add(mesh);
-        const [colour, facing, rest] = this.target.textures;
+        const [color, facing, rest] = this.target.textures;
         this.uniforms = Object.fromEntries(Object.entries({
-            colour, facing, rest, table: textureOf(splitSumTable()), sizePx: new Vector2(), background: null, cameraWorld: null,
+            color, facing, rest, table: textureOf(splitSumTable()), sizePx: new Vector2(), background: null, cameraWorld: null,
             projectionInverse: null, right: new Vector3(), up: new Vector3(), forward: new Vector3(),
             ...Object.fromEntries(LEVELS.map((name) => [name, null])),
         }).map(([name, value]) => [name, { value }]));

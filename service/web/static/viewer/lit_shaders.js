@@ -6,7 +6,7 @@ export const MATERIAL_VERTEX = /* glsl */ `${OCTAGON}
 uniform sampler2D materialTexture;
 uniform int materialColumns;
 
-flat out vec4 first;           // base colour and metallic
+flat out vec4 first;           // base color and metallic
 flat out vec2 second;          // roughness and the share of light from all around
 flat out vec3 normal;
 
@@ -26,13 +26,13 @@ export const MATERIAL_FRAGMENT = /* glsl */ `${FALL_OFF}
 flat in vec4 first;
 flat in vec2 second;
 flat in vec3 normal;
-layout(location = 0) out vec4 colour;
+layout(location = 0) out vec4 color;
 layout(location = 1) out vec4 facing;
 layout(location = 2) out vec4 rest;
 
 void main() {
     float alpha = alphaHere();
-    colour = vec4(first.rgb * alpha, alpha);
+    color = vec4(first.rgb * alpha, alpha);
     facing = vec4(normal * alpha, alpha);
     rest = vec4(vec3(first.a, second) * alpha, alpha);
 }
@@ -41,7 +41,7 @@ void main() {
 export const LIT_FRAGMENT = /* glsl */ `
 precision highp float;
 precision highp sampler2D;
-uniform sampler2D colour, facing, rest, table;
+uniform sampler2D color, facing, rest, table;
 uniform sampler2D level0, level1, level2, level3, level4, level5, irradiance;
 uniform vec2 sizePx;
 uniform vec3 background;
@@ -65,7 +65,7 @@ vec3 lobe(vec2 at, float roughness) {
 
 void main() {
     vec2 place = gl_FragCoord.xy / sizePx;
-    vec4 c = texture(colour, place);
+    vec4 c = texture(color, place);
     shown = vec4(background, 1.0);
     if (c.a < 1e-3) return;
     vec3 albedo = c.rgb / c.a, others = texture(rest, place).rgb / c.a;

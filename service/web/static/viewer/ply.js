@@ -47,7 +47,7 @@ export function readHeader(bytes) {
  *   geometry has 12 numbers a Gaussian: mean x y z and opacity, first leg x y z and 0, second leg x y z and 0,
  *   world units. A leg is an in-plane axis times its standard deviation. harmonics has 4 half-precision
  *   numbers a coefficient: red, green, blue and 0. bounds has the length of the longer leg. materials, if there
- *   are any, has 8 half-precision numbers: linear base colour, metallic, roughness, share of ambient light, 0, 0.
+ *   are any, has 8 half-precision numbers: linear base color, metallic, roughness, share of ambient light, 0, 0.
  */
 export function readGaussians(bytes) {
     const header = readHeader(bytes);

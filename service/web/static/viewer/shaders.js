@@ -53,7 +53,7 @@ uniform sampler2D harmonicsTexture;
 uniform int harmonicsColumns;
 uniform int shCount;
 
-out vec3 colour;
+out vec3 color;
 
 vec3 sh(ivec2 at, int k) {
     return texelFetch(harmonicsTexture, at + ivec2(k, 0), 0).rgb;
@@ -83,17 +83,17 @@ vec3 shaded(int i, vec3 d) {
 void main() {
     int i = int(number);
     vec3 world;
-    if (placeCorner(i, world)) colour = shaded(i, normalize(world - cameraPosition));
+    if (placeCorner(i, world)) color = shaded(i, normalize(world - cameraPosition));
 }
 `;
 
 export const FRAGMENT = /* glsl */ `${FALL_OFF}
-in vec3 colour;
+in vec3 color;
 out vec4 premultiplied;
 
 void main() {
     float alpha = alphaHere();
-    premultiplied = vec4(max(colour, 0.0) * alpha, alpha);
+    premultiplied = vec4(max(color, 0.0) * alpha, alpha);
 }
 `;
 

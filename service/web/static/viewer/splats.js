@@ -21,7 +21,7 @@ export class SplatRenderer {
         this.renderer.outputColorSpace = LinearSRGBColorSpace; // nothing is converted: the numbers are display values
         this.renderer.autoClear = false;
         const gl = this.renderer.getContext();
-        // Sums of many layers in 8 bits would lose them one by one; colours above 1 would be cut too early.
+        // Sums of many layers in 8 bits would lose them one by one; colors above 1 would be cut too early.
         const precise = gl.getExtension("EXT_color_buffer_half_float") || gl.getExtension("EXT_color_buffer_float");
         this.target = new WebGLRenderTarget(1, 1, {
             type: precise ? HalfFloatType : UnsignedByteType, depthBuffer: false,

@@ -1,6 +1,6 @@
-"""Colours of a surface mesh, fitted to renders of the scene by least squares.
+"""Colors of a surface mesh, fitted to renders of the scene by least squares.
 
-What a pixel shows is a mean of the colours at a few points of the surface, its vertices or the pixels of its
+What a pixel shows is a mean of the colors at a few points of the surface, its vertices or the pixels of its
 texture. So all pixels of all pictures make one sparse linear system, solved by least squares.
 """
 
@@ -27,18 +27,18 @@ Progress = Callable[[int, int], None]
 SMOOTHNESS = 0.3
 """How much neighbours may be corrected differently, against the error of one pixel."""
 PRIOR_WEIGHT = 1e-3
-"""How much a colour that pixels say little of stays as it was."""
+"""How much a color that pixels say little of stays as it was."""
 CG_ITERATIONS = 15
 SAMPLES_PER_PIXEL = ((-0.25, -0.25), (0.25, 0.25))
 """Where in a pixel the surface is looked at, from its middle, px; the pixel shows their mean."""
 MIN_ALPHA = 0.25
-"""Pixels that the scene covers less than this say nothing of its colour."""
+"""Pixels that the scene covers less than this say nothing of its color."""
 RAYS_PER_BATCH = 1 << 20
 
 
 @runtime_checkable
 class Palette(Protocol):
-    """The coloured points of a surface: vertices or texels."""
+    """The colored points of a surface: vertices or texels."""
 
     @property
     def mesh(self) -> TriangleMesh:
@@ -56,7 +56,7 @@ class Palette(Protocol):
 
 @dataclass(frozen=True)
 class VertexPalette:
-    """Colours at a mesh's vertices, interpolated over triangles."""
+    """Colors at a mesh's vertices, interpolated over triangles."""
 
     mesh: TriangleMesh
 
@@ -74,7 +74,7 @@ class VertexPalette:
 
 @dataclass(frozen=True)
 class TexturePalette:
-    """Colours at the texels that show surface, interpolated bilinearly."""
+    """Colors at the texels that show surface, interpolated bilinearly."""
 
     layout: TextureLayout
 
@@ -128,26 +128,26 @@ Picture = Callable[[], tuple[ImageRays, UInt8[np.ndarray, "_h _w 4"]]]
 """The rays of a picture, and what they show: display values over black and the alpha, as bytes."""
 
 
-def fit_colours(
+def fit_colors(
     points: Palette,
     start_srgb: Float32[np.ndarray, "n 3"],
     pictures: Sequence[Picture],
     progress: Progress = lambda _done, _total: None,
 ) -> tuple[Float32[np.ndarray, "n 3"], Bool[np.ndarray, " n"]]:
-    """Return the colours with which the surface's renders match the scene's best.
+    """Return the colors with which the surface's renders match the scene's best.
 
     Corrections of ``start_srgb`` are sought, by conjugate gradients on the normal equations with a few steps;
     a correction that differs from its neighbours' costs a little, so that what lies between the pixels
     keeps its detail and what no picture shows follows what is around it.
 
     Args:
-        points: that have colours.
+        points: that have colors.
         start_srgb: display values to begin with.
         pictures: of the scene.
         progress: called with (pictures done, total).
 
     Returns:
-        The colours, and which points any pixel shows.
+        The colors, and which points any pixel shows.
     """
     count = len(start_srgb)
     normal, right_side = _normal_equations(points, start_srgb, pictures, progress)
@@ -186,7 +186,7 @@ def _normal_equations(
 def _pixel_equations(
     scene: TriangleBvh, points: Palette, rays: ImageRays, rgba: UInt8[np.ndarray, "h w 4"]
 ) -> tuple[Int[np.ndarray, "r k"], Float32[np.ndarray, "r k"], Float32[np.ndarray, "r 3"]]:
-    """Return points and shares of each pixel that shows only surface in both, and its colour."""
+    """Return points and shares of each pixel that shows only surface in both, and its color."""
     observed = rgba.reshape(-1, 4).astype(np.float32) / 255
     samples = [scene.closest(rays.shifted(*offset).rays) for offset in SAMPLES_PER_PIXEL]
     used = np.flatnonzero(np.all([hits.is_hit for hits in samples], axis=0) & (observed[:, 3] >= MIN_ALPHA))

@@ -1,4 +1,4 @@
-"""Colours and materials of surface points, baked from the cameras that see them best."""
+"""Colors and materials of surface points, baked from the cameras that see them best."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -18,7 +18,7 @@ POINTS_PER_BATCH = 1 << 15
 MIN_COSINE = 0.1
 UNSEEN_VALUE = 0.5
 MIN_ALPHA = 0.25
-"""Rays that the scene covers less than this say nothing of its colour."""
+"""Rays that the scene covers less than this say nothing of its color."""
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,7 @@ class BakeTarget:
     read: Callable[[TraceResult], Float32[np.ndarray, "r c"]]
 
 
-COLOUR_TARGET = BakeTarget(3, lambda traced: np.clip(traced.rgb_srgb / traced.alpha[:, None], 0.0, 1.0))
+COLOR_TARGET = BakeTarget(3, lambda traced: np.clip(traced.rgb_srgb / traced.alpha[:, None], 0.0, 1.0))
 """Display values."""
 
 

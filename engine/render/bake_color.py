@@ -1,9 +1,9 @@
-"""One colour per Gaussian, for formats without view-dependent colours.
+"""One color per Gaussian, for formats without view-dependent colors.
 
-What a ray shows is linear in the colours of the Gaussians: W c, where W holds their weights along the rays.
-So the colours that come nearest to the pictures of the whole scene, taken from given cameras, are a
+What a ray shows is linear in the colors of the Gaussians: W c, where W holds their weights along the rays.
+So the colors that come nearest to the pictures of the whole scene, taken from given cameras, are a
 least-squares problem, which conjugate gradients solve in a few steps; W is the forward pass of the tracer
-with colours as features, its transpose the backward pass.
+with colors as features, its transpose the backward pass.
 """
 
 from collections.abc import Callable, Sequence
@@ -22,23 +22,23 @@ from octasplat.engine.trace.protocol import TraceGradients, Tracer
 CG_ITERATIONS = 4
 """More follow the given cameras closer, and others less."""
 REGULARISATION = 0.02
-"""Weight, in rays, that holds a Gaussian at its mean colour; those that are hardly seen stay there."""
+"""Weight, in rays, that holds a Gaussian at its mean color; those that are hardly seen stay there."""
 
 
-def with_constant_colour(gaussians: FlatGaussians, rgb_srgb: Float32[np.ndarray, "n 3"]) -> FlatGaussians:
-    """Return the Gaussians with these colours from every direction."""
+def with_constant_color(gaussians: FlatGaussians, rgb_srgb: Float32[np.ndarray, "n 3"]) -> FlatGaussians:
+    """Return the Gaussians with these colors from every direction."""
     return replace(gaussians, sh=((rgb_srgb - np.float32(0.5)) / np.float32(SH_C0))[:, None])
 
 
-def colours_along(
+def colors_along(
     gaussians: FlatGaussians, direction_world: Float64[np.ndarray, "3"]
 ) -> Float32[np.ndarray, "n 3"]:
-    """Return the display colours seen by a distant camera that looks along a direction of any length."""
+    """Return the display colors seen by a distant camera that looks along a direction of any length."""
     length = np.linalg.norm(direction_world)
-    return _evaluate_colours(gaussians, (direction_world / length)[None])
+    return _evaluate_colors(gaussians, (direction_world / length)[None])
 
 
-def fit_colours_to_cameras(
+def fit_colors_to_cameras(
     gaussians: FlatGaussians,
     tracer: Tracer,
     images: Sequence[Callable[[], ImageRays]],
@@ -46,7 +46,7 @@ def fit_colours_to_cameras(
     steps: int = CG_ITERATIONS,
     on_pass: Callable[[int, int], None] = lambda _done, _total: None,
 ) -> Float32[np.ndarray, "n 3"]:
-    """Return the constant colours that reproduce the cameras' images best, by least squares.
+    """Return the constant colors that reproduce the cameras' images best, by least squares.
 
     Small images do: each needs one trace and one backward pass a step.
 
@@ -71,7 +71,7 @@ def fit_colours_to_cameras(
         found = tracer.backward(traced.recording, TraceGradients(np.zeros_like(traced.rgb_srgb))).numpy()
         away = gaussians.means_world[found.ids] - rays.origins_world[0]
         away = away / np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-12)
-        sums[found.ids] += found.weight_sums[:, None] * _evaluate_colours(gaussians.select(found.ids), away)
+        sums[found.ids] += found.weight_sums[:, None] * _evaluate_colors(gaussians.select(found.ids), away)
         weights[found.ids] += found.weight_sums
         del traced  # its recording's memory serves the next one
     on_pass(1, steps + 2)
@@ -81,10 +81,10 @@ def fit_colours_to_cameras(
     if steps == 0 or not batches:
         return np.clip(means, 0, 1).astype(np.float32)
     solve = _NormalEquations(replace(gaussians.with_base_color_only(), channels=Channels()), tracer, batches)
-    colours = _conjugate_gradients(
+    colors = _conjugate_gradients(
         normal=solve, targets=targets, start=means, weights=weights, steps=steps, on_pass=on_pass
     )
-    return np.clip(colours, 0, 1).astype(np.float32)
+    return np.clip(colors, 0, 1).astype(np.float32)
 
 
 class _NormalEquations:
@@ -96,11 +96,11 @@ class _NormalEquations:
         tracer.build(gaussians, self._features)
 
     def __call__(
-        self, colours: Float64[np.ndarray, "n 3"], targets: Sequence[Float64[np.ndarray, "r 3"]] | None = None
+        self, colors: Float64[np.ndarray, "n 3"], targets: Sequence[Float64[np.ndarray, "r 3"]] | None = None
     ) -> Float64[np.ndarray, "n 3"]:
-        self._features[...] = colours
+        self._features[...] = colors
         self._tracer.refresh()
-        out = np.zeros(colours.shape)
+        out = np.zeros(colors.shape)
         for number, rays in enumerate(self._batches):
             traced = self._tracer.trace(rays, record=True)
             assert traced.recording is not None
@@ -122,8 +122,8 @@ def _conjugate_gradients(
 ) -> Float64[np.ndarray, "n 3"]:
     """Take steps towards the minimum of |W c - y|^2 + HELD |c - start|^2, each channel on its own."""
     scale = (weights + REGULARISATION)[:, None]
-    colours = start.copy()
-    rest = -normal(colours, targets)
+    colors = start.copy()
+    rest = -normal(colors, targets)
     on_pass(2, steps + 2)
     preconditioned = rest / scale
     direction = preconditioned.copy()
@@ -132,25 +132,25 @@ def _conjugate_gradients(
         image = normal(direction) + REGULARISATION * direction
         curvature = (direction * image).sum(axis=0)
         length = np.divide(product, curvature, out=np.zeros(3), where=curvature > 0)
-        colours += length * direction
+        colors += length * direction
         rest -= length * image
         preconditioned = rest / scale
         before, product = product, (rest * preconditioned).sum(axis=0)
         direction = preconditioned + np.divide(product, before, out=np.zeros(3), where=before > 0) * direction
         on_pass(min(step + 3, steps + 2), steps + 2)
-    return colours
+    return colors
 
 
 def _rays_in_tile_order(image: ImageRays) -> RayBatch:
     return image.rays[tile_order(image.height_px, image.width_px)]
 
 
-def _evaluate_colours(
+def _evaluate_colors(
     gaussians: FlatGaussians, directions_world: Float[np.ndarray, "m 3"]
 ) -> Float32[np.ndarray, "n 3"]:
     # m is 1, a direction for all, or n.
     basis = sh_basis(np.asarray(directions_world, np.float64), gaussians.sh_degree)
-    colours = 0.5 + np.einsum(
+    colors = 0.5 + np.einsum(
         "nk,nkc->nc", np.broadcast_to(basis, (len(gaussians), basis.shape[1])), gaussians.sh
     )
-    return np.maximum(colours, 0.0).astype(np.float32)
+    return np.maximum(colors, 0.0).astype(np.float32)
