@@ -1,7 +1,6 @@
 """``octasplat evaluate OUT --other-dataset FOLDER``: photographs that are not the run's are measured."""
 
 import json
-import re
 import shutil
 from pathlib import Path
 
@@ -98,12 +97,11 @@ def test_invalid_ground_truth_file_is_refused(run, octasplat, tmp_path):
     assert not (run.output / "on" / "odd_truth").exists()
 
 
-def moved_world(scene: Path, folder: Path, scale: float, turn: float, shift: float) -> Path:
+def moved_world(scene: Path, folder: Path, shift: float) -> Path:
     """The photographs of a scene whose model was moved to another world."""
     shutil.copytree(scene / "images", folder / "images")
     model = pycolmap.Reconstruction(scene / "sparse" / "0")
-    axis = np.array([0.0, np.sin(turn / 2), 0.0, np.cos(turn / 2)])
-    model.transform(pycolmap.Sim3d(scale, pycolmap.Rotation3d(axis), np.array([shift, 0.0, 0.0])))
+    model.transform(pycolmap.Sim3d(1.0, pycolmap.Rotation3d(), np.array([shift, 0.0, 0.0])))
     (folder / "sparse" / "0").mkdir(parents=True)
     model.write(folder / "sparse" / "0")
     for image in (folder / "images").iterdir():  # other files than those of the run, which are known again
@@ -111,18 +109,12 @@ def moved_world(scene: Path, folder: Path, scale: float, turn: float, shift: flo
     return folder
 
 
-@pytest.mark.parametrize(
-    ("scale", "turn", "shift", "said"),
-    [
-        (1.0, 0.0, 1000.0, "scene extents from the cameras of the run"),
-        (1.0, 0.0, 40.0, "do not see the scene"),
-    ],
-)
-def test_photographs_of_another_world_are_warned_of(run, octasplat, tmp_path, scale, turn, shift, said):
-    folder = moved_world(run.scene, tmp_path / f"world_{scale}_{shift}", scale, turn, shift)
+def test_photographs_of_another_world_are_warned_of(run, octasplat, tmp_path):
+    folder = moved_world(run.scene, tmp_path / "other_world", 1000.0)
     result = octasplat("evaluate", run.output, "--other-dataset", folder)
     assert result.exit_code == 0, result.output
     words = " ".join(result.output.split())
-    assert "Warning" in words and re.search(said, words) and "name a folder whose model" in words
+    assert "scene extents from the cameras of the run" in words
+    assert "Warning" in words and "name a folder whose model" in words
     report = (run.output / "on" / folder.name / "report.html").read_text()
     assert "name a folder whose model" in report
