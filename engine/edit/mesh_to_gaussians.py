@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float, Float64, Int64
 from octasplat.engine.core.errors import SceneFileError
 from octasplat.engine.edit.axes import AXIS_ROTATIONS, default_axes, detect_axes, infer_q
 from octasplat.engine.edit.edit_options import MeshToGaussiansOptions
+from octasplat.engine.edit.mesh_identity import check_mesh_of_scene
 from octasplat.engine.edit.neighbors import interpolate_motion, is_flipped, neighbour_rotations
 from octasplat.engine.edit.octagon_fit import MIN_CORNERS, fit_octagons
 from octasplat.engine.edit.octagon_matching import MatchedOctagons, match_octagons
@@ -69,11 +70,12 @@ def recover_gaussians(
     q = options.q or infer_q(mesh, opacities, CHI2_2_99)
     radii = octagon_radii(opacities, q)
     octagons = match_octagons(path, mesh, opacities, radii)
+    geometry = gaussians.with_base_color_only()
+    check_mesh_of_scene(path, mesh, octagons, geometry, radii)
     file_rounding = mesh.rounding
     requested, stated = options.min_opacity, mesh.min_opacity
     exported = (radii > 0) & (opacities >= ((stated or 0.0) if requested is None else requested))
     del mesh  # the largest thing around, where the caller keeps it no longer
-    geometry = gaussians.with_base_color_only()
     report = EditReport(len(gaussians), matched_by=octagons.matched_by, axes_usual=default_axes(path), q=q)
     if options.axes == "auto":
         some = np.unique(np.linspace(0, len(octagons) - 1, AXES_SAMPLES).astype(np.int64))

@@ -19,6 +19,8 @@ ID_TOLERANCE = 1e-3
 """Numbers that an editor blended between vertices are further than this from whole ones."""
 VERTICES_PER_BLOCK = 1 << 18
 EXPORT_ADVICE = "Edit the mesh that was exported as PLY and save it as PLY, or the GLB with its attributes."
+OTHER_SCENE = "looks like the mesh of another scene; name the scene that it was exported from"
+OTHER_ORDER = f"If nothing was added or removed, it {OTHER_SCENE}."
 UV_TOLERANCE = 0.02
 """Share of the texture by which coordinates may differ from those exported (some editors keep 16 bits)."""
 
@@ -75,8 +77,13 @@ def match_octagons(
 
     Raises:
         SceneFileError: the mesh has no ids and its vertices are not those exported, in their order; or its
-            ids are those of another scene.
+            ids, or the size of the scene that its file states, are those of another scene.
     """
+    if mesh.scene_size is not None and mesh.scene_size != len(radii):
+        raise SceneFileError(
+            f"{path}: was exported from a scene of {mesh.scene_size:,} Gaussians, but the scene has "
+            f"{len(radii):,}; it {OTHER_SCENE}."
+        )
     if mesh.gid is not None and mesh.corner is not None:
         return _match_by_ids(path, mesh, mesh.gid, mesh.corner, radii)
     return _match_by_order(path, mesh, opacities, radii)
@@ -94,7 +101,7 @@ def _match_by_ids(
     if known.any() and gid[known].max() > scene_size - 0.5:
         raise SceneFileError(
             f"{path}: numbers a Gaussian {int(gid[known].max())}, but the scene has {scene_size}; "
-            "name the scene that the mesh was exported from."
+            f"it {OTHER_SCENE}."
         )
     vertices = np.flatnonzero(known)
     if not len(vertices):
@@ -223,7 +230,8 @@ def _match_by_order(
     if rest or not 0 < count <= expected:
         raise SceneFileError(
             f"{path}: cannot be matched to the scene; its vertices carry no ids (attributes gid and corner), "
-            f"and it has {len(mesh)} of them where {expected * SIDES} were exported. {EXPORT_ADVICE}"
+            f"and it has {len(mesh)} of them where {expected * SIDES} were exported. {EXPORT_ADVICE} "
+            f"{OTHER_ORDER}"
         )
     # An export with a least opacity leaves the faintest out.
     faintest = np.sort(opacities[radii > 0])[expected - count]
@@ -231,7 +239,8 @@ def _match_by_order(
     if len(gids) != count or not _is_uv_in_order(mesh, radii[gids], radii):
         raise SceneFileError(
             f"{path}: cannot be matched to the scene; its vertices carry no ids (attributes gid and corner), "
-            f"and their texture coordinates show that their order has changed. {EXPORT_ADVICE}"
+            f"and their texture coordinates show that their order has changed. {EXPORT_ADVICE} "
+            f"{OTHER_ORDER}"
         )
     corners = mesh.vertices.reshape(count, SIDES, 3)
     return MatchedOctagons(

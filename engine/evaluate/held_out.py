@@ -8,13 +8,14 @@ from pathlib import Path
 import numba
 
 from octasplat.engine.core.color import composite_over
-from octasplat.engine.core.events import EventListener, PhaseProgress, read_events
+from octasplat.engine.core.events import EventListener, PhaseProgress, Warned, read_events
 from octasplat.engine.core.writing import write_json
 from octasplat.engine.dataset import Dataset
 from octasplat.engine.evaluate.gallery import ViewImages, WorstAndBestViews
 from octasplat.engine.evaluate.ground_truth import GroundTruth
 from octasplat.engine.evaluate.ground_truth_measures import GroundTruthMeasures
 from octasplat.engine.evaluate.layer_display import display_environment, display_layers
+from octasplat.engine.evaluate.other_world import OtherWorldCheck
 from octasplat.engine.evaluate.report import write_report
 from octasplat.engine.evaluate.view_metrics import (
     MeasuredView,
@@ -57,6 +58,7 @@ def evaluate_held_out(
     truth: GroundTruth | None = None,
     environment: EnvironmentMap | None = None,
     relighter: Relighter | None = None,
+    check: OtherWorldCheck | None = None,
 ) -> None:
     """Measure ``gaussians`` on the held-out views of ``dataset``.
 
@@ -75,10 +77,14 @@ def evaluate_held_out(
         truth: of the scene, whose measures then join the metrics as ``truth``.
         environment: the map that the scene was learnt with.
         relighter: shows the scene in other light, for what the truth knows of that.
+        check: warns if the photographs are of another world than the scene.
     """
     tracer = make_tracer(settings, threads=threads)
     tracer.build(gaussians, shading.features(gaussians))
     measures = None if truth is None else GroundTruthMeasures(truth)
+    warnings: list[Warned] = []
+    if check is not None:
+        warnings = _told(check.warn_of_cameras(dataset.viewpoints, gaussians), progress)
     rows: list[ViewMetrics] = []
     images = WorstAndBestViews()
     total = len(dataset.test_indices)
@@ -92,12 +98,16 @@ def evaluate_held_out(
             for layer, display in view.layers.items():
                 write_png(output / LAYERS / layer / f"{names[view.name]}.png", display)
         rows.append(measured.metrics)
+        if check is not None:
+            check.add(view, measured.metrics.psnr)
         images.offer(
             view.name,
             measured.metrics.psnr,
             ViewImages(view.reference, view.render, measured.flip_map, view.layers),
         )
         progress(PhaseProgress("evaluate", len(rows), total))
+    if check is not None and not warnings:
+        warnings = _told(check.warn_of_renders(), progress)
     if measures is not None and environment is not None:
         measures.add_light(dataset, environment, relighter, progress)
     if measures is not None and (measures.rows or measures.light):
@@ -111,12 +121,20 @@ def evaluate_held_out(
         output / REPORT,
         title=dataset.root.name,
         metrics=metrics,
-        events=read_events(output / "events.jsonl"),
+        events=[*read_events(output / "events.jsonl"), *(warning.as_dict() for warning in warnings)],
         config=config,
         images=images,
         environment_linear=None if environment is None else environment.radiance_linear,
         background_srgb=None if behind is None else behind.rgb_srgb,
     )
+
+
+def _told(message: str | None, progress: EventListener) -> list[Warned]:
+    """Emit a warning, if there is one, and return what was emitted."""
+    warnings = [] if message is None else [Warned(message)]
+    for warning in warnings:
+        progress(warning)
+    return warnings
 
 
 def _render_views(

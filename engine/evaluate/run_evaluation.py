@@ -17,8 +17,9 @@ from octasplat.engine.core.writing import write_json
 from octasplat.engine.dataset import Dataset
 from octasplat.engine.dataset.views_file import read_views, write_views
 from octasplat.engine.evaluate.ground_truth import GroundTruth, find_ground_truth
-from octasplat.engine.evaluate.held_out import evaluate_held_out
+from octasplat.engine.evaluate.held_out import METRICS, evaluate_held_out
 from octasplat.engine.evaluate.multiscale import measure_multiscale
+from octasplat.engine.evaluate.other_world import OtherWorldCheck
 from octasplat.engine.files import read_metadata
 from octasplat.engine.files.gaussian_ply import read_gaussian_ply
 from octasplat.engine.gaussians.materials import has_materials
@@ -208,8 +209,12 @@ def measure_run(
     threads: int,
     progress: EventListener,
     into: Path | None = None,
+    check: OtherWorldCheck | None = None,
 ) -> None:
-    """Measure the scene of ``output``; the results go ``into`` another folder or that one."""
+    """Measure the scene of ``output``; the results go ``into`` another folder or that one.
+
+    A ``check`` warns of photographs of another world.
+    """
     truth = _find_ground_truth(dataset, progress, needed=into is not None)
     gaussians, _ = read_gaussian_ply(output / SCENE)
     extent = _extent_world(output, dataset)
@@ -247,6 +252,7 @@ def measure_run(
         truth=truth,
         environment=environment,
         relighter=relighter,
+        check=check,
     )
 
 
@@ -325,11 +331,28 @@ def _evaluate_on(
                 "rename that folder."
             )
     with phase("evaluate", progress, len(dataset.test_indices)):
+        origin = read_metadata(output).origin_world
+        run_views = read_views(output / VIEWS).about(origin) if (output / VIEWS).exists() else None
         write_views(into / VIEWS, dataset.views_record)
         measure_run(
-            dataset=dataset, output=output, config=config, threads=threads, progress=progress, into=into
+            dataset=dataset,
+            output=output,
+            config=config,
+            threads=threads,
+            progress=progress,
+            into=into,
+            check=OtherWorldCheck(on, run_views, _own_psnr(output)),
         )
     return into / "metrics.json"
+
+
+def _own_psnr(output: Path) -> float | None:
+    """Return the mean PSNR of the views that a run held out, in dB, or None where none was measured."""
+    try:
+        value = json.loads((output / METRICS).read_text(encoding="utf-8"))["mean"].get("psnr")
+    except (OSError, ValueError, KeyError):
+        return None
+    return None if value is None else float(value)
 
 
 def _pose_facts(output: Path) -> dict[str, object]:

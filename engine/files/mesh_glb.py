@@ -44,7 +44,13 @@ from octasplat.engine.gaussians.channels import Channels
 from octasplat.engine.gaussians.materials import ALBEDO, METALLIC, ROUGHNESS, has_materials
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.gaussians.octagon import SIDES, octagon_triangles
-from octasplat.engine.geometry.imported_mesh import MIN_OPACITY_KEY, Q_KEY, ImportedMesh
+from octasplat.engine.geometry.imported_mesh import (
+    MIN_OPACITY_KEY,
+    Q_KEY,
+    SCENE_SIZE_KEY,
+    ImportedMesh,
+    scene_size_of,
+)
 
 COMPRESSIONS = ("KHR_draco_mesh_compression", "EXT_meshopt_compression", "KHR_meshopt_compression")
 VIEWER_FORMAT = "viewer-glb"
@@ -148,6 +154,7 @@ def _read_triangles(file: GlbFile, *, with_materials: bool) -> tuple[ImportedMes
         radius=_flatten_scalar(joined["radius"]),
         q=numbers_stated.get(Q_KEY),
         min_opacity=numbers_stated.get(MIN_OPACITY_KEY),
+        scene_size=scene_size_of(stated.get(SCENE_SIZE_KEY)),
         normals=joined.get("normal"),
         rgb_linear=joined.get("color"),
     )
@@ -229,7 +236,7 @@ def _file_extras(soup: OctagonSoup, options: ExportOptions, parts: int) -> list[
     extras: dict[str, object] = {
         Q_KEY: options.q,
         MIN_OPACITY_KEY: options.min_opacity,
-        "octasplat_gaussians": soup.scene_size,
+        SCENE_SIZE_KEY: soup.scene_size,
     }
     if options.opaque:
         extras["octasplat_opaque_cutoff"] = OPAQUE_CUTOFF

@@ -27,9 +27,11 @@ from octasplat.engine.gaussians.octagon import SIDES, octagon_triangles
 from octasplat.engine.geometry.imported_mesh import (
     MIN_OPACITY_KEY,
     Q_KEY,
+    SCENE_SIZE_KEY,
     ImportedMesh,
     flip_v,
     number_in_comments,
+    scene_size_of,
 )
 from octasplat.engine.geometry.mesh_material import MeshMaterial
 from octasplat.engine.geometry.triangle_mesh import TriangleMesh
@@ -83,6 +85,7 @@ def _read(path: Path, parts: ObjParts) -> ImportedMesh:
         uv=uv,
         q=number_in_comments(tuple(parts.comments), Q_KEY),
         min_opacity=number_in_comments(tuple(parts.comments), MIN_OPACITY_KEY),
+        scene_size=scene_size_of(number_in_comments(tuple(parts.comments), SCENE_SIZE_KEY)),
         rounding=rounding,
         **materials,
     )
@@ -139,7 +142,7 @@ def _octagon_lines(soup: OctagonSoup, material_name: str, origin: Origin) -> Ite
     yield (
         f"# octasplat octagons: {SIDES} vertices and 6 triangles per Gaussian, in the order of the scene\n"
         f"# {Q_KEY} {soup.q!r}\n# {MIN_OPACITY_KEY} {soup.min_opacity!r}\n"
-        f"# octasplat_gaussians {soup.scene_size}\n{_origin_lines(origin)}"
+        f"# {SCENE_SIZE_KEY} {soup.scene_size}\n{_origin_lines(origin)}"
         f"mtllib {material_name}\no octagons\nusemtl {MATERIAL}\n"
     )
     for batch in soup.batches():

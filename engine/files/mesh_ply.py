@@ -30,9 +30,11 @@ from octasplat.engine.gaussians.octagon import FAN_TRIANGLES, SIDES, octagon_tri
 from octasplat.engine.geometry.imported_mesh import (
     MIN_OPACITY_KEY,
     Q_KEY,
+    SCENE_SIZE_KEY,
     ImportedMesh,
     flip_v,
     number_in_comments,
+    scene_size_of,
 )
 from octasplat.engine.geometry.triangle_mesh import TriangleMesh
 
@@ -87,6 +89,7 @@ def read(path: Path) -> ImportedMesh:
         radius=_find_attribute(table, "radius"),
         q=number_in_comments(header.comments, Q_KEY),
         min_opacity=number_in_comments(header.comments, MIN_OPACITY_KEY),
+        scene_size=scene_size_of(number_in_comments(header.comments, SCENE_SIZE_KEY)),
     )
 
 
@@ -148,7 +151,7 @@ def write_octagons(gaussians: FlatGaussians, path: Path, options: ExportOptions)
         "octasplat octagons",
         f"{Q_KEY} {options.q!r}",
         f"{MIN_OPACITY_KEY} {options.min_opacity!r}",
-        f"octasplat_gaussians {soup.scene_size}",
+        f"{SCENE_SIZE_KEY} {soup.scene_size}",
         *channel_comments(widths),
         *origin_comments(options.facts.origin_world),
     )

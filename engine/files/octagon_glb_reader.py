@@ -27,7 +27,7 @@ from octasplat.engine.gaussians.channels import Channels
 from octasplat.engine.gaussians.flattening import GaussianCloud
 from octasplat.engine.gaussians.octagon import SIDES, corner_directions
 from octasplat.engine.gaussians.rows import concatenate_rows, select_rows
-from octasplat.engine.geometry.imported_mesh import Q_KEY
+from octasplat.engine.geometry.imported_mesh import Q_KEY, SCENE_SIZE_KEY
 
 UNLIT = "KHR_materials_unlit"
 
@@ -49,7 +49,7 @@ def read_octagons(file: GlbFile, path: Path, q: float, channels: ChannelChoice) 
     parts = [_read_primitive(file, path, q, channels, *found) for found in file.primitives()]
     ids = np.concatenate([own for _, own in parts])
     cloud = select_rows(concatenate_rows([part for part, _ in parts]), np.argsort(ids, kind="stable"))
-    stated = int(file.document["asset"]["extras"].get("octasplat_gaussians", 0))
+    stated = int(file.document["asset"]["extras"].get(SCENE_SIZE_KEY, 0))
     return replace(cloud, notes=missing_gaussians_notes(stated, len(ids)))
 
 

@@ -21,8 +21,8 @@ from octasplat.engine.gaussians.channels import Channels
 from octasplat.engine.gaussians.flattening import GaussianCloud
 from octasplat.engine.gaussians.octagon import SIDES
 from octasplat.engine.gaussians.rows import select_rows
+from octasplat.engine.geometry.imported_mesh import SCENE_SIZE_KEY
 
-_SIZE = "octasplat_gaussians"
 _ROWS_PER_OCTAGON = (*COLORS, "alpha", "gid", "radius")
 
 
@@ -61,7 +61,7 @@ def read(path: Path, channels: ChannelChoice = "own") -> GaussianCloud:
         named = Channels({name: columns(first, own) for name, own in requested.items()})
     except ConfigError as error:
         raise SceneFileError(f"{path}: {error}") from error
-    sizes = [comment.split()[1] for comment in header.comments if comment.startswith(f"{_SIZE} ")]
+    sizes = [comment.split()[1] for comment in header.comments if comment.startswith(f"{SCENE_SIZE_KEY} ")]
     stated = int(sizes[0]) if sizes and sizes[0].isdecimal() else 0
     cloud = GaussianCloud(
         means, quats, log_scales, logits_from_bytes(first["alpha"]),

@@ -24,6 +24,7 @@ class ImportedMesh:
         radius: radius of the octagon in standard deviations likewise.
         q: chi-square quantile of the octagons, where the file still names it.
         min_opacity: octagons were made of Gaussians at least this opaque, where the file still says so.
+        scene_size: number of Gaussians of the exported scene, where the file still says so.
         rounding: how far a coordinate may be off because of the digits that the file keeps, beyond float32.
         corner_uv: of a mesh read with its looks: texture coordinates of the triangles' corners, (0, 0) at the
             upper left, NaN where there are none; None without any.
@@ -41,6 +42,7 @@ class ImportedMesh:
     radius: Float32[np.ndarray, " v"] | None = None
     q: float | None = None
     min_opacity: float | None = None
+    scene_size: int | None = None
     rounding: float = 0.0
     corner_uv: Float32[np.ndarray, "t 3 2"] | None = None
     normals: Float32[np.ndarray, "v 3"] | None = None
@@ -67,7 +69,17 @@ def flip_v(uv: Float32[np.ndarray, "v 2"]) -> Float32[np.ndarray, "v 2"]:
 
 
 Q_KEY = "octasplat_q"
+SCENE_SIZE_KEY = "octasplat_gaussians"
 MIN_OPACITY_KEY = "octasplat_min_opacity"
+
+
+def scene_size_of(stated: object) -> int | None:
+    """Return the size of the scene that a file states, or None where it states none.
+
+    >>> scene_size_of(12.0), scene_size_of(None), scene_size_of("twelve")
+    (12, None, None)
+    """
+    return int(stated) if isinstance(stated, int | float) and stated > 0 else None
 
 
 def number_in_comments(comments: tuple[str, ...], name: str) -> float | None:

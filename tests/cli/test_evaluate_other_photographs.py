@@ -4,10 +4,11 @@ import json
 import shutil
 from pathlib import Path
 
+import numpy as np
 import pycolmap
 import pytest
 
-from octasplat.engine.render.image_files import read_image
+from octasplat.engine.render.image_files import read_image, write_png
 from octasplat.workers.worker.handlers import run_operation
 from octasplat.workers.worker.job_kinds import get_job_kind
 from octasplat.workers.worker.task import Task
@@ -94,3 +95,26 @@ def test_invalid_ground_truth_file_is_refused(run, octasplat, tmp_path):
     result = octasplat("evaluate", run.output, "--other-dataset", folder)
     assert result.exit_code == 1 and str(folder / "truth.json") in result.output
     assert not (run.output / "on" / "odd_truth").exists()
+
+
+def moved_world(scene: Path, folder: Path, shift: float) -> Path:
+    """The photographs of a scene whose model was moved to another world."""
+    shutil.copytree(scene / "images", folder / "images")
+    model = pycolmap.Reconstruction(scene / "sparse" / "0")
+    model.transform(pycolmap.Sim3d(1.0, pycolmap.Rotation3d(), np.array([shift, 0.0, 0.0])))
+    (folder / "sparse" / "0").mkdir(parents=True)
+    model.write(folder / "sparse" / "0")
+    for image in (folder / "images").iterdir():  # other files than those of the run, which are known again
+        write_png(image.with_suffix(".png"), read_image(image)[::-1])
+    return folder
+
+
+def test_photographs_of_another_world_are_warned_of(run, octasplat, tmp_path):
+    folder = moved_world(run.scene, tmp_path / "other_world", 1000.0)
+    result = octasplat("evaluate", run.output, "--other-dataset", folder)
+    assert result.exit_code == 0, result.output
+    words = " ".join(result.output.split())
+    assert "scene extents from the cameras of the run" in words
+    assert "Warning" in words and "name a folder whose model" in words
+    report = (run.output / "on" / folder.name / "report.html").read_text()
+    assert "name a folder whose model" in report
