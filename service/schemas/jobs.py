@@ -54,7 +54,10 @@ class NewJob(RequestBody):
     label: str | None = Field(None, max_length=200)
     queue: str = Field("cpu", pattern="^[a-z][a-z0-9_-]{0,40}$", description="Workers that take this queue.")
     priority: int = Field(
-        0, ge=-100, le=100, description="Higher goes first; high ones are for administrators."
+        0,
+        ge=-100,
+        le=100,
+        description="Among your jobs, higher goes first; high ones are for administrators.",
     )
     webhook: JobWebhook | None = Field(None, description="Be told of this job; see POST /v1/webhooks.")
 

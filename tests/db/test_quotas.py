@@ -127,7 +127,12 @@ def test_quota_command_shows_and_sets_limits(conninfo: str, monkeypatch: pytest.
     assert shown.output.splitlines()[0] == "bytes: 0 of any number", shown.output
     run(quota_command, ["me", "--bytes", "20G"])
     lines = run(quota_command, ["me", "--jobs", "4"]).output.splitlines()
-    assert lines == ["bytes: 0 of 20000000000", "datasets: 0 of any number", "unfinished jobs: 0 of 4"]
+    assert lines == [
+        "bytes: 0 of 20000000000",
+        "datasets: 0 of any number",
+        "unfinished jobs: 0 of 4",
+        "share of the workers: 1",
+    ]
     assert "unfinished jobs: 0 of any number" in run(quota_command, ["me", "--clear"]).output
     assert run(quota_command, ["me", "--jobs", "many"]).exit_code == 2
 

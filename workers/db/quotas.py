@@ -37,11 +37,13 @@ class Quota:
             occurs twice counts once.
         max_datasets: datasets.
         max_jobs: jobs that are queued or running.
+        share: of the workers, where that of others is 1; see :mod:`octasplat.workers.queue.fair_share`.
     """
 
     max_bytes: int | None = None
     max_datasets: int | None = None
     max_jobs: int | None = None
+    share: float | None = None
 
     def with_defaults(self, default: "Quota") -> "Quota":
         """Return these limits, and where there is none that of ``default``."""
@@ -49,6 +51,7 @@ class Quota:
             default.max_bytes if self.max_bytes is None else self.max_bytes,
             default.max_datasets if self.max_datasets is None else self.max_datasets,
             default.max_jobs if self.max_jobs is None else self.max_jobs,
+            default.share if self.share is None else self.share,
         )
 
 
@@ -67,19 +70,21 @@ NO_QUOTA = Quota()
 async def quota_of(connection: Connection, owner: str, default: Quota = NO_QUOTA) -> Quota:
     """Return the limits of an owner."""
     async with connection.cursor(row_factory=class_row(Quota)) as cursor:
-        await cursor.execute("SELECT max_bytes, max_datasets, max_jobs FROM quotas WHERE owner = %s", [owner])
+        await cursor.execute(
+            "SELECT max_bytes, max_datasets, max_jobs, share FROM quotas WHERE owner = %s", [owner]
+        )
         return (await cursor.fetchone() or NO_QUOTA).with_defaults(default)
 
 
 async def set_quota(connection: Connection, owner: str, quota: Quota) -> None:
-    """Set all limits of an owner."""
+    """Set all limits of an owner, and its share."""
     await connection.execute(
         """
-        INSERT INTO quotas (owner, max_bytes, max_datasets, max_jobs) VALUES (%s, %s, %s, %s)
+        INSERT INTO quotas (owner, max_bytes, max_datasets, max_jobs, share) VALUES (%s, %s, %s, %s, %s)
         ON CONFLICT (owner) DO UPDATE SET max_bytes = excluded.max_bytes,
-            max_datasets = excluded.max_datasets, max_jobs = excluded.max_jobs
+            max_datasets = excluded.max_datasets, max_jobs = excluded.max_jobs, share = excluded.share
         """,
-        [owner, quota.max_bytes, quota.max_datasets, quota.max_jobs],
+        [owner, quota.max_bytes, quota.max_datasets, quota.max_jobs, quota.share],
     )
 
 

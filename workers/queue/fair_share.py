@@ -1,7 +1,10 @@
 """Fair share between owners: a queue entry says that some job may begin, not which one.
 
-Among jobs of the same priority, that of an owner with the fewest running jobs goes first, and among these
-that of the owner whose turn was longest ago. Jobs of one owner keep their order.
+The owner with the fewest running jobs goes first, and among these the one whose turn was longest ago. Jobs of
+one owner go by priority, and where it is the same in their order. An owner to whom an administrator gave a
+share other than 1 counts as if so many owners had its jobs.
+
+A choice takes a look at the index for each owner that waits, however many jobs they have queued.
 """
 
 import uuid
@@ -14,6 +17,36 @@ from octasplat.workers.queue.jobs import get_job, requeue_job
 from octasplat.workers.queue.protocol import JobQueue
 
 _MAX_CANDIDATES = 30
+_MAX_JOBS_PER_OWNER = 4
+"""Further jobs of an owner are tried where other workers are just taking the first."""
+_FAIR_ORDER = """
+    WITH RECURSIVE owners AS (
+        (SELECT owner FROM jobs WHERE state = 'queued' AND queue = %(queue)s ORDER BY owner LIMIT 1)
+        UNION ALL
+        SELECT (
+            SELECT jobs.owner FROM jobs
+            WHERE state = 'queued' AND queue = %(queue)s AND jobs.owner > owners.owner
+            ORDER BY jobs.owner LIMIT 1
+        ) FROM owners WHERE owners.owner IS NOT NULL
+    ), busy AS (
+        SELECT owner, count(*) AS n FROM jobs
+        WHERE state IN ('running', 'canceling') AND queue = %(queue)s GROUP BY owner
+    )
+    SELECT candidates.id FROM owners
+    CROSS JOIN LATERAL (
+        SELECT id, priority, slip FROM jobs
+        WHERE state = 'queued' AND queue = %(queue)s AND owner = owners.owner
+          AND (delayed_until IS NULL OR delayed_until <= now())
+        ORDER BY priority DESC, slip LIMIT %(jobs)s
+    ) AS candidates
+    LEFT JOIN busy USING (owner)
+    LEFT JOIN owner_turns turns ON turns.owner = owners.owner AND turns.queue = %(queue)s
+    LEFT JOIN quotas ON quotas.owner = owners.owner
+    ORDER BY coalesce(busy.n, 0) / coalesce(quotas.share, 1),
+        extract(epoch FROM statement_timestamp() - turns.turn_at) * coalesce(quotas.share, 1) DESC NULLS FIRST,
+        owners.owner, candidates.priority DESC, candidates.slip
+    LIMIT %(tried)s
+    """
 
 
 async def choose_job(
@@ -37,17 +70,8 @@ async def choose_job(
 async def _next_fair_job(connection: Connection, job_queue: JobQueue, job: Job) -> Job | None:
     """Return the job that goes before ``job``, its entry taken out of the queue; None if there is none."""
     cursor = await connection.execute(
-        """
-        SELECT jobs.id FROM jobs
-        LEFT JOIN (
-            SELECT owner, count(*) AS n FROM jobs
-            WHERE state IN ('running', 'canceling') AND queue = %(queue)s GROUP BY owner
-        ) AS busy USING (owner)
-        LEFT JOIN owner_turns turns ON turns.owner = jobs.owner AND turns.queue = jobs.queue
-        WHERE jobs.state = 'queued' AND jobs.queue = %(queue)s AND jobs.priority = %(priority)s
-        ORDER BY coalesce(busy.n, 0), turns.turn_at NULLS FIRST, jobs.slip LIMIT %(tried)s
-        """,
-        {"queue": job.queue, "priority": job.priority, "tried": _MAX_CANDIDATES},
+        _FAIR_ORDER,
+        {"queue": job.queue, "jobs": _MAX_JOBS_PER_OWNER, "tried": _MAX_CANDIDATES},
     )
     for row in await cursor.fetchall():
         if row["id"] == job.id:

@@ -126,12 +126,13 @@ async def queue_position(connection: Connection, job: Job) -> int | None:
             SELECT owner, priority, slip FROM jobs WHERE state = 'queued' AND queue = %(queue)s
         ), own AS (
             SELECT count(*) AS n FROM waiting
-            WHERE owner = %(owner)s AND priority = %(priority)s AND slip < %(slip)s
+            WHERE owner = %(owner)s
+              AND (priority > %(priority)s OR priority = %(priority)s AND slip < %(slip)s)
         )
-        SELECT (SELECT count(*) FROM waiting WHERE priority > %(priority)s) + own.n + (
-            SELECT coalesce(sum(least(n, own.n + 1)), 0) FROM (
-                SELECT count(*) AS n FROM waiting
-                WHERE owner <> %(owner)s AND priority = %(priority)s AND slip < %(slip)s GROUP BY owner
+        SELECT own.n + (
+            SELECT coalesce(sum(least(n, own.n + CASE WHEN first < %(slip)s THEN 1 ELSE 0 END)), 0) FROM (
+                SELECT count(*) AS n, min(slip) AS first FROM waiting
+                WHERE owner <> %(owner)s GROUP BY owner
             ) AS others
         ) AS ahead FROM own
         """,
@@ -244,15 +245,22 @@ async def requeue_job(
     entry_id = await job_queue.enqueue(
         connection, job.id, job.queue, job.priority, earlier_entry_id=job.slip, delay_seconds=delay_seconds
     )
+    await connection.execute(
+        """
+        UPDATE jobs SET slip = %(entry)s, delayed_until =
+            CASE WHEN %(delay)s > 0 THEN now() + make_interval(secs => %(delay)s) END
+        WHERE id = %(job)s
+        """,
+        {"entry": entry_id, "delay": delay_seconds, "job": job.id},
+    )
     if without_event:
-        await connection.execute("UPDATE jobs SET slip = %s WHERE id = %s", [entry_id, job.id])
         return
     await connection.execute(
         """
-        UPDATE jobs SET state = 'queued', slip = %s, queued_at = now(), worker = NULL, seconds_left = NULL
+        UPDATE jobs SET state = 'queued', queued_at = now(), worker = NULL, seconds_left = NULL
         WHERE id = %s
         """,
-        [entry_id, job.id],
+        [job.id],
     )
     await add_event(connection, job.id, job.attempt, "state", {"state": "queued"})
 

@@ -68,7 +68,9 @@ def connected(server: str | None, *, awaits_start: bool = False) -> Iterator["Ap
 @request_options(ReconstructOptions)
 @click.option("--label", help="What to call the job.")
 @click.option("--queue", default="cpu", show_default=True, help="Which workers.")
-@click.option("--priority", type=click.IntRange(-100, 100), default=0, help="Higher goes first.")
+@click.option(
+    "--priority", type=click.IntRange(-100, 100), default=0, help="Among your jobs, higher goes first."
+)
 @server_option
 @quiet_option
 def submit(
@@ -144,7 +146,9 @@ def submit(
 @click.option("-o", "--output", type=click.Path(path_type=Path), help="With --wait: folder for the results.")
 @click.option("--label", help="What to call the job.")
 @click.option("--queue", default="cpu", show_default=True, help="Which workers.")
-@click.option("--priority", type=click.IntRange(-100, 100), default=0, help="Higher goes first.")
+@click.option(
+    "--priority", type=click.IntRange(-100, 100), default=0, help="Among your jobs, higher goes first."
+)
 @server_option
 @quiet_option
 def derive(

@@ -27,36 +27,45 @@ class _SizeNumber(click.ParamType[int]):
 @click.option("--bytes", "max_bytes", type=_SizeNumber(), help="Contents stored, e.g. 20G.")
 @click.option("--datasets", "max_datasets", type=_SizeNumber(), help="Datasets.")
 @click.option("--jobs", "max_jobs", type=_SizeNumber(), help="Jobs that are queued or running.")
-@click.option("--clear", is_flag=True, help="Set no limits but those given.")
+@click.option(
+    "--share",
+    type=click.FloatRange(0.01, 100),
+    help="Share of the workers, where that of others is 1.",
+)
+@click.option("--clear", is_flag=True, help="Set no limits and no share but those given.")
 @click.option(
     "--data", type=click.Path(path_type=Path), metavar="FOLDER", help="Data folder of octasplat serve."
 )
-def quota(owner: str, clear: bool, data: Path | None, **limits: int | None) -> None:
+def quota(owner: str, clear: bool, data: Path | None, share: float | None, **limits: int | None) -> None:
     """Show what OWNER has and may have, after setting the limits that are given.
 
-    All tokens of an owner share its limits.
+    All tokens of an owner share its limits. An owner with the share 2 gets twice the work done of one with 1,
+    while both have jobs waiting.
     """
     import asyncio
 
     from octasplat.workers.settings import WorkerSettings, load_settings
 
     settings = load_settings(WorkerSettings, data=data)
-    for line in asyncio.run(_set_and_show(settings.conninfo(), owner, clear, limits)):
+    for line in asyncio.run(_set_and_show(settings.conninfo(), owner, clear, share, limits)):
         click.echo(line)
 
 
-async def _set_and_show(conninfo: str, owner: str, clear: bool, limits: dict[str, int | None]) -> list[str]:
+async def _set_and_show(
+    conninfo: str, owner: str, clear: bool, share: float | None, limits: dict[str, int | None]
+) -> list[str]:
     from octasplat.workers.db.connections import open_pool
     from octasplat.workers.db.quotas import NO_QUOTA, Quota, quota_of, set_quota, usage_of
 
     async with open_pool(conninfo, max_size=1) as pool, pool.connection() as connection:
-        if clear or any(value is not None for value in limits.values()):
+        if clear or any(value is not None for value in (share, *limits.values())):
             present = NO_QUOTA if clear else await quota_of(connection, owner)
-            await set_quota(connection, owner, Quota(**limits).with_defaults(present))
+            await set_quota(connection, owner, Quota(**limits, share=share).with_defaults(present))
         quota, usage = await quota_of(connection, owner), await usage_of(connection, owner)
     rows = (
         ("bytes", usage.bytes, quota.max_bytes),
         ("datasets", usage.datasets, quota.max_datasets),
         ("unfinished jobs", usage.jobs, quota.max_jobs),
     )
-    return [f"{name}: {used} of {'any number' if limit is None else limit}" for name, used, limit in rows]
+    shown = [f"{name}: {used} of {'any number' if limit is None else limit}" for name, used, limit in rows]
+    return [*shown, f"share of the workers: {1 if quota.share is None else quota.share:g}"]
