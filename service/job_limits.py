@@ -1,7 +1,7 @@
 """Resource demands of a job, its check against the limits of the service, and its estimate."""
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from pydantic import BaseModel
@@ -14,7 +14,10 @@ from octasplat.service.settings import ServiceSettings
 from octasplat.workers.db.rows import WorkerRow
 from octasplat.workers.settings import PREFIX
 from octasplat.workers.worker.job_kinds import JobKind
-from octasplat.workers.worker.job_kinds.resource_limits import exceeded_limits
+from octasplat.workers.worker.job_kinds.resource_limits import ResourceDemand, exceeded_limits
+
+_MEMORY_ESTIMATE_MARGIN = 3
+"""Estimates are right within a factor of two; a job above this many times the limit is sure to be stopped."""
 
 
 def check_job_limits(
@@ -89,6 +92,36 @@ def estimate_job(
     return found.with_cold_start(cold) if found is not None and cold else found
 
 
+def check_workers_large_enough(
+    demands: Iterable[ResourceDemand], estimate: Estimate | None, queue: str, workers: Sequence[WorkerRow]
+) -> None:
+    """Refuse a job that none of the live workers of its queue could ever do.
+
+    Without workers, or where one of them does not say what it has, any job is accepted.
+
+    Raises:
+        ProblemError: 422, with what is needed and what there is.
+    """
+    least = max((d.amount for d in demands if d.resource == "workspace_bytes"), default=0)
+    least = max(least, estimate.disk_bytes if estimate is not None else 0)
+    capacity = _largest_of_all(workers, "disk_bytes")
+    memory = estimate.memory_bytes if estimate is not None else 0
+    allowed = _largest_of_all(workers, "memory_limit_bytes")
+    if capacity is not None and least > capacity:
+        detail = (
+            f"The job needs at least {least / 1e9:.1f} GB of disk, and no worker of the queue {queue} has "
+            f"more than {capacity / 1e9:.1f} GB; ask for fewer or smaller images."
+        )
+    elif allowed is not None and memory > _MEMORY_ESTIMATE_MARGIN * allowed:
+        detail = (
+            f"The job needs about {memory / 1e9:.1f} GB of memory, and no worker of the queue {queue} allows "
+            f"more than {allowed / 1e9:.1f} GB; ask for fewer Gaussians, rays or pixels."
+        )
+    else:
+        return
+    raise ProblemError(422, "too-large", detail, errors=[{"pointer": "#/options", "detail": detail}])
+
+
 def limit_notes(
     estimate: Mapping[str, Any] | None, workers: Sequence[WorkerRow], settings: ServiceSettings
 ) -> list[str]:
@@ -97,19 +130,17 @@ def limit_notes(
         return []
     known = Estimate.model_validate(dict(estimate))
     notes = []
-    limits = [row.facts.get("memory_limit_bytes") for row in workers]
-    allowed = [int(limit) for limit in limits if isinstance(limit, int)]
-    if allowed and len(allowed) == len(limits) and known.memory_bytes > max(allowed):
+    allowed = _largest_of_all(workers, "memory_limit_bytes")
+    if allowed is not None and known.memory_bytes > allowed:
         notes.append(
             f"It may need {known.memory_bytes / 1e9:.1f} GB of memory, and its workers allow "
-            f"{max(allowed) / 1e9:.1f} GB; ask for fewer Gaussians, rays or pixels."
+            f"{allowed / 1e9:.1f} GB; ask for fewer Gaussians, rays or pixels."
         )
-    disks = [row.facts.get("disk_bytes") for row in workers]
-    capacities = [int(capacity) for capacity in disks if isinstance(capacity, int)]
-    if capacities and len(capacities) == len(disks) and known.disk_bytes > max(capacities):
+    capacity = _largest_of_all(workers, "disk_bytes")
+    if capacity is not None and known.disk_bytes > capacity:
         notes.append(
             f"It needs at least {known.disk_bytes / 1e9:.1f} GB of disk, and no worker has more than "
-            f"{max(capacities) / 1e9:.1f} GB."
+            f"{capacity / 1e9:.1f} GB."
         )
     hours = settings.max_job_hours
     if hours and known.seconds > 3600 * hours:
@@ -117,6 +148,13 @@ def limit_notes(
             f"It may take {known.seconds / 3600:.0f} hours, and is ended after {hours:g}; ask for less."
         )
     return notes
+
+
+def _largest_of_all(workers: Sequence[WorkerRow], fact: str) -> int | None:
+    """Return the largest value of a number that all workers report; None if one of them does not."""
+    values = [row.facts.get(fact) for row in workers if row.queues]
+    numbers = [int(value) for value in values if isinstance(value, int)]
+    return max(numbers) if numbers and len(numbers) == len(values) else None
 
 
 def _cold_start_seconds(worker: WorkerRow) -> float:

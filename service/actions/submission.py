@@ -15,7 +15,12 @@ from octasplat.service.actions.named_files import check_named_files
 from octasplat.service.actions.validation import input_problem, resolve_options, validate_kind
 from octasplat.service.auth import Principal
 from octasplat.service.idempotency import create_once, fingerprint
-from octasplat.service.job_limits import check_job_limits, check_priority, estimate_job
+from octasplat.service.job_limits import (
+    check_job_limits,
+    check_priority,
+    check_workers_large_enough,
+    estimate_job,
+)
 from octasplat.service.problems import ProblemError
 from octasplat.service.queue_workers import check_formats_writable, live_workers_of_queue
 from octasplat.service.schemas.jobs import JobView, NewJob, RetryRequest
@@ -154,6 +159,8 @@ async def _create_job(
     check_formats_writable(kind, inputs.options, new.queue, workers)
     sizes = await photograph_sizes(connection, inputs.dataset_id) if inputs.dataset_id is not None else []
     check_job_limits(kind, inputs.options, sizes, service.settings)
+    estimate = estimate_job(kind, inputs.options, sizes, workers)
+    check_workers_large_enough(kind.resource_demands(inputs.options, sizes), estimate, new.queue, workers)
     made = rows.NewJob(
         owner=principal.owner,
         kind=kind.name,
@@ -163,7 +170,7 @@ async def _create_job(
         dataset_id=inputs.dataset_id,
         source_id=inputs.source_id,
         label=new.label,
-        estimate=_estimate_as_json(estimate_job(kind, inputs.options, sizes, workers)),
+        estimate=_estimate_as_json(estimate),
         files_id=inputs.files_id,
         traceparent=requested.traceparent,
     )
@@ -278,6 +285,8 @@ async def _revised_options(
     await check_named_files(connection, principal, kind, options, job.files_id)
     sizes = await photograph_sizes(connection, job.dataset_id) if job.dataset_id is not None else []
     check_job_limits(kind, options, sizes, service.settings)
+    estimate = estimate_job(kind, options, sizes, workers)
+    check_workers_large_enough(kind.resource_demands(options, sizes), estimate, job.queue, workers)
     if not request.options:
         return None, None
     if kind.needs == "dataset" and job.dataset_id is not None:
@@ -290,7 +299,7 @@ async def _revised_options(
     ):
         detail = "With these options the work begins anew; ask for that with from: start."
         raise ProblemError(422, "other-work", detail, errors=[{"pointer": "#/options", "detail": detail}])
-    return options.model_dump(mode="json"), _estimate_as_json(estimate_job(kind, options, sizes, workers))
+    return options.model_dump(mode="json"), _estimate_as_json(estimate)
 
 
 def _estimate_as_json(estimate: Estimate | None) -> dict[str, Any] | None:

@@ -22,7 +22,7 @@ async def queue_jobs(pool: Pool, owner: str, count: int, priority: int = 0) -> l
 
 
 async def begin_jobs(pool: Pool, count: int, *, at_once: bool = False) -> list[Job]:
-    """Begin jobs as a worker does with the entries that it gets; each one ends before the next unless at once."""
+    """Begin jobs as a worker with one slot does, or with many if ``at_once``."""
     queue, begun = ProcrastinateQueue(pool, poll_seconds=0.05), []
 
     async def deliver(job_id: object, entry_id: int) -> None:

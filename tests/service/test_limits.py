@@ -107,7 +107,7 @@ async def test_high_priorities_are_for_administrators(connect_service: ConnectSe
 async def test_job_estimate_before_and_at_creation_match(connect_service: ConnectService) -> None:
     async with connect_service() as (http, service):
         async with service.pool.connection() as connection:
-            facts = {"threads": 4, "memory_limit_bytes": 100_000_000}
+            facts = {"threads": 4, "memory_limit_bytes": 400_000_000}
             await record_worker_heartbeat(
                 connection, uuid.uuid4(), name="w", queues=["cpu"], slots=2, facts=facts
             )
@@ -142,7 +142,7 @@ async def test_job_estimate_before_and_at_creation_match(connect_service: Connec
             await http.post("/v1/jobs", json={"dataset_id": dataset, "options": {"preset": "fast"}})
         ).json()
         assert job["estimate"] == fast
-        assert [note for note in job["notes"] if "its workers allow 0.1 GB" in note]
+        assert [note for note in job["notes"] if "its workers allow 0.4 GB" in note]
         assert fast["text"] in (await http.get(f"/jobs/{job['id']}")).text
         stranger = await client_with_token(service, "stranger", "write")
         for name, thing in (("dataset_id", dataset), ("source_id", job["id"])):
@@ -164,3 +164,37 @@ async def test_job_exceeding_workspace_limit_is_refused(connect_service: Connect
         body["options"]["format"] = "png"
         answer = await http.post("/v1/jobs", json=body)
         assert answer.status_code == 202 and answer.json()["estimate"]["disk_bytes"] > 4e8, answer.text
+
+
+async def test_job_too_large_for_every_worker_is_refused(connect_service: ConnectService) -> None:
+    async with connect_service() as (http, service):
+        dataset = await photographed_dataset(service, 64, 48, 3)
+        job = (await http.post("/v1/jobs", json={"dataset_id": dataset, "kind": "reconstruct"})).json()
+        attempt = await claim_job(service, job)
+        await attempt.succeed([ResultFile("scene.ply", "a" * 64, 1, "text/plain")])
+        images = {"frames": 900, "width_px": 2048, "height_px": 2048, "format": "exr"}
+        render = {"kind": "render", "source_id": job["id"], "options": images}
+        training = {"dataset_id": dataset, "options": {"train": {"max_gaussians": 4_000_000}}}
+        waiting = await http.post("/v1/jobs", json=render)  # a worker may come that has more
+        assert waiting.status_code == 202
+        facts = {"disk_bytes": 10 << 30, "memory_limit_bytes": 1 << 30}
+        await worker_reports(service, "small", facts)
+        for body, resource in ((render, "disk"), (training, "memory")):
+            refused = await http.post("/v1/jobs", json=body)
+            assert refused.status_code == 422, refused.text
+            assert refused.json()["type"] == "urn:octasplat:problem:too-large"
+            assert resource in refused.json()["detail"] and "the queue cpu" in refused.json()["detail"]
+        cancelled = await http.post(f"/v1/jobs/{waiting.json()['id']}/cancel")
+        assert cancelled.status_code in (200, 202), cancelled.text
+        retried = await http.post(f"/v1/jobs/{waiting.json()['id']}/retry")
+        assert retried.status_code == 422, retried.text
+        await worker_reports(service, "large", {"disk_bytes": 1 << 40, "memory_limit_bytes": 1 << 40})
+        for body in (render, training):
+            assert (await http.post("/v1/jobs", json=body)).status_code == 202
+
+
+async def worker_reports(service: Service, name: str, facts: dict[str, Any]) -> None:
+    async with service.pool.connection() as connection:
+        await record_worker_heartbeat(
+            connection, uuid.uuid4(), name=name, queues=["cpu"], slots=1, facts=facts
+        )

@@ -43,7 +43,8 @@ _FAIR_ORDER = """
     LEFT JOIN owner_turns turns ON turns.owner = owners.owner AND turns.queue = %(queue)s
     LEFT JOIN quotas ON quotas.owner = owners.owner
     ORDER BY coalesce(busy.n, 0) / coalesce(quotas.share, 1),
-        extract(epoch FROM statement_timestamp() - turns.turn_at) * coalesce(quotas.share, 1) DESC NULLS FIRST,
+        extract(epoch FROM statement_timestamp() - turns.turn_at) * coalesce(quotas.share, 1)
+            DESC NULLS FIRST,
         owners.owner, candidates.priority DESC, candidates.slip
     LIMIT %(tried)s
     """
