@@ -14,8 +14,15 @@ from fastapi import FastAPI
 
 from octasplat.engine.core.errors import OctasplatError
 from octasplat.service.app import create_app
+from octasplat.service.connection_limits import ACCEPT_BACKLOG, raise_file_limit
+from octasplat.service.limited_protocol import (
+    ConnectionTable,
+    LimitedConfig,
+    LimitedProtocol,
+    log_loop_error,
+)
 from octasplat.service.settings import ServiceSettings
-from octasplat.workers.logs import log_to_stderr
+from octasplat.workers.logs import RepeatedMessages, log_to_stderr
 from octasplat.workers.parent_death_signal import die_with_local_service
 from octasplat.workers.sandbox.capabilities import log_missing_capabilities
 from octasplat.workers.sandbox.hiding import forbid_memory_access
@@ -23,21 +30,35 @@ from octasplat.workers.settings import load_settings
 
 SHUTDOWN_SECONDS = 10
 KEEP_ALIVE_SECONDS = 75
+_LISTEN_BACKLOG = 2048
+"""Connections that wait to be accepted."""
+_TICKS_PER_SECOND = 10
+"""Of uvicorn."""
 
 
 class _FrontEndServer(uvicorn.Server):
     """Server that ends event streams first when asked to stop, as they never end by themselves."""
 
-    def __init__(self, config: uvicorn.Config) -> None:
+    def __init__(self, config: LimitedConfig) -> None:
         super().__init__(config)
+        self._connections = config.connections
         self.address = ""
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
         """Start the server and print its address."""
+        asyncio.get_running_loop().set_exception_handler(log_loop_error)
         await super().startup(sockets)
+        for listener in sockets or ():
+            listener.listen(_LISTEN_BACKLOG)
         if self.started:
             sys.stdout.write(f"{self.address}\n")
             sys.stdout.flush()
+
+    async def on_tick(self, counter: int) -> bool:
+        """Close overdue connections, once a second."""
+        if counter % _TICKS_PER_SECOND == 0:
+            self._connections.close_overdue()
+        return await super().on_tick(counter)
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
         """Drain the service, close its event streams, and stop the server."""
@@ -68,8 +89,10 @@ def main() -> int:
             where = f"{settings.host}:{settings.port}"
             sys.stderr.write(f"Error: {where} cannot be listened at ({error.strerror}).\n")
             return 1
-        config = uvicorn.Config(
+        config = LimitedConfig(
             app,
+            http=LimitedProtocol,
+            backlog=ACCEPT_BACKLOG,
             log_config=None,
             access_log=False,
             lifespan="on",
@@ -78,11 +101,13 @@ def main() -> int:
             server_header=False,
             proxy_headers=False,
         )
+        config.connections = ConnectionTable(settings.connection_limits(raise_file_limit()))
         server = _FrontEndServer(config)
         name = f"[{settings.host}]" if family == socket.AF_INET6 else settings.host
         server.address = f"http://{name}:{listener.getsockname()[1]}"
         log = logging.getLogger("uvicorn.error")
         log.setLevel(logging.WARNING)
+        log.addFilter(RepeatedMessages())
         log.addFilter(lambda _record: _startup_error(app) is None)
         with contextlib.suppress(SystemExit):
             asyncio.run(server.serve(sockets=[listener]))

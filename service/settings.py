@@ -8,6 +8,7 @@ from typing import Annotated, Self
 from pydantic import Field, IPvAnyNetwork, SecretStr
 
 from octasplat.engine.core.errors import ConfigError
+from octasplat.service.connection_limits import ConnectionLimits, connections_for
 from octasplat.service.intake.dataset import DatasetLimits
 from octasplat.service.intake.model_check import ModelLimits
 from octasplat.service.intake.receive import UploadLimits
@@ -19,6 +20,8 @@ from octasplat.workers.worker.job_kinds.resource_limits import LIMIT_UNITS
 
 DEFAULT_PORT = 8642
 MIN_TOKEN_BITS = 128
+_BODY_SECONDS = 90.0
+"""Longer than an upload may be silent, which is answered with a problem."""
 _ALPHABETS = (("[0-9]*", 10), ("[0-9a-f]*|[0-9A-F]*", 16), ("[0-9a-z]*|[0-9A-Z]*", 36))
 _MIN_DISTINCT_CHARACTERS = 8
 """A text of fewer is none that was drawn at random."""
@@ -60,6 +63,10 @@ class ServiceSettings(WorkerSettings):
         max_priority: highest priority that whoever is no administrator may give.
         ping_seconds: how often a quiet stream of events gives a sign of life.
         max_streams: streams of events at once.
+        max_connections: connections at once; fewer where the process may open few files. Where all are taken,
+            a new one replaces the one that has waited longest for a request.
+        max_connections_per_address: the same of one address; those of ``proxies`` may have all.
+        header_seconds: how long the headers of a request may take.
     """
 
     host: str = "127.0.0.1"
@@ -89,6 +96,9 @@ class ServiceSettings(WorkerSettings):
     max_priority: int = Field(10, ge=-100, le=100)
     ping_seconds: float = Field(15.0, gt=0)
     max_streams: int = Field(500, gt=0)
+    max_connections: int = Field(4096, gt=0)
+    max_connections_per_address: int = Field(1024, gt=0)
+    header_seconds: float = Field(20.0, gt=0)
 
     @property
     def is_private(self) -> bool:
@@ -114,6 +124,16 @@ class ServiceSettings(WorkerSettings):
     def upload_limits(self) -> UploadLimits:
         """Return the limits of uploads."""
         return UploadLimits(max_file_bytes=self.max_upload_bytes, max_archive_bytes=self.max_archive_bytes)
+
+    def connection_limits(self, open_files: int) -> ConnectionLimits:
+        """Return the limits of connections for a process that may have so many open files."""
+        return ConnectionLimits(
+            max_connections=min(self.max_connections, connections_for(open_files)),
+            max_per_address=min(self.max_connections_per_address, connections_for(open_files)),
+            header_seconds=self.header_seconds,
+            body_seconds=_BODY_SECONDS,
+            proxies=self.proxies,
+        )
 
     def dataset_limits(self) -> DatasetLimits:
         """Return the limits of the validation of datasets."""
