@@ -6,7 +6,7 @@ import logging
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 
-from fastapi import FastAPI
+from fastapi import Depends, FastAPI
 
 from octasplat.engine import __version__
 from octasplat.engine.core.errors import ConfigError, OctasplatError
@@ -24,6 +24,7 @@ from octasplat.service.middleware import (
 from octasplat.service.openapi import extend_openapi, operation_id
 from octasplat.service.problems import add_problem_handlers
 from octasplat.service.proxy_headers import ProxyHeadersMiddleware
+from octasplat.service.query_parameters import refuse_unknown_parameters
 from octasplat.service.routes import (
     artifacts,
     audit,
@@ -34,6 +35,7 @@ from octasplat.service.routes import (
     metrics,
     scene_previews,
     system,
+    tokens,
     webhooks,
 )
 from octasplat.service.settings import ServiceSettings
@@ -99,10 +101,10 @@ def create_app(settings: ServiceSettings | None = None) -> FastAPI:
     )
     for module_router in (
         datasets.router, scene_previews.router, jobs.router, estimates.router,
-        events_and_logs.router, artifacts.router, webhooks.router, system.router,
+        events_and_logs.router, artifacts.router, webhooks.router, tokens.router, system.router,
         system.health_router, metrics.router, audit.router,
     ):  # fmt: skip
-        app.include_router(module_router)
+        app.include_router(module_router, dependencies=[Depends(refuse_unknown_parameters)])
     mount_pages(app)
     add_problem_handlers(app)
     extend_openapi(app)

@@ -1,6 +1,7 @@
 """Authentication and rights: tokens with scopes, and sessions begun with one."""
 
 import uuid
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
@@ -15,7 +16,7 @@ from octasplat.workers.db.rows import Token
 from octasplat.workers.db.sessions import find_session, is_session_valid
 from octasplat.workers.db.tokens import find_token, get_token
 
-Scope = Literal["read", "write", "admin"]
+Scope = Literal["read", "write", "admin", "metrics"]
 SESSION_COOKIE = "octasplat_session"
 SECURE_SESSION_COOKIE = f"__Host-{SESSION_COOKIE}"
 """Where there is TLS: browsers take it from this very host only, and send it nowhere else."""
@@ -23,6 +24,7 @@ _SUFFICIENT_SCOPES: dict[str, frozenset[str]] = {
     "read": frozenset({"read", "write", "admin"}),
     "write": frozenset({"write", "admin"}),
     "admin": frozenset({"admin"}),
+    "metrics": frozenset({"metrics", "admin"}),
 }
 _THROTTLE_RETRY_SECONDS = 5
 
@@ -32,6 +34,12 @@ _cookie = APIKeyCookie(
     auto_error=False,
     description=f"A browser's session; with TLS it is called {SECURE_SESSION_COOKIE}.",
 )
+
+
+def covered_scopes(scopes: Iterable[str]) -> frozenset[str]:
+    """Return these scopes and those that they include."""
+    given = set(scopes)
+    return frozenset(scope for scope, sufficient in _SUFFICIENT_SCOPES.items() if given & sufficient)
 
 
 @dataclass(frozen=True)
@@ -52,7 +60,7 @@ class Principal:
 
     def may(self, scope: Scope) -> bool:
         """Return whether the principal has the rights of ``scope``."""
-        return bool(self.scopes & _SUFFICIENT_SCOPES[scope])
+        return scope in covered_scopes(self.scopes)
 
     @property
     def visible_owner(self) -> str | None:
@@ -155,3 +163,4 @@ class _RequireScope:
 Reader = Annotated[Principal, Depends(_RequireScope("read"))]
 Writer = Annotated[Principal, Depends(_RequireScope("write"))]
 Admin = Annotated[Principal, Depends(_RequireScope("admin"))]
+Monitor = Annotated[Principal, Depends(_RequireScope("metrics"))]

@@ -2,18 +2,18 @@
 
 import re
 import urllib.parse
-from pathlib import PurePosixPath
+from pathlib import Path, PurePosixPath
 
 from fastapi import Request, Response
 from fastapi.responses import FileResponse, StreamingResponse
+from starlette.types import Receive, Scope, Send
 
 from octasplat.service.etags import etag_matches
 from octasplat.service.intake.receive import format_digest
-from octasplat.service.problems import ProblemError
+from octasplat.service.ranges import requested_ranges
 from octasplat.service.state import Service
 from octasplat.service.thread_pools import ThreadPurpose, run_in_pool
 
-_RANGE = re.compile(r"bytes=([0-9]{0,18})-([0-9]{0,18})")
 _INLINE_TYPES = ("image/png", "image/jpeg", "application/json", "text/plain", "model/gltf-binary")
 _SANDBOX_POLICY = (
     "sandbox; default-src 'none'; img-src 'self' data:; style-src 'unsafe-inline'; script-src 'none'"
@@ -47,7 +47,7 @@ async def send_blob(
         inline: show rather than save.
 
     Raises:
-        ProblemError: 416 for a range that is not there.
+        ProblemError: 400 or 416 for ranges that cannot be read or are not there.
         StorageError: the store does not have it.
     """
     etag = f'"{sha256}"'
@@ -79,22 +79,13 @@ def _stored_response(
     service: Service, request: Request, sha256: str, size: int, media_type: str, headers: dict[str, str]
 ) -> Response:
     """Return a response with a local file, or from a remote storage, complete or one range."""
+    ranges = requested_ranges(request, headers["ETag"], size)
     path = service.storage.local_path(sha256)
     if path is not None:
-        return FileResponse(path, media_type=media_type, headers=headers)
+        return _StoredFileResponse(path, ranges, media_type, headers)
     start, stop, status = 0, size, 200
-    requested = _RANGE.fullmatch(request.headers.get("range", ""))
-    condition = request.headers.get("if-range")
-    if requested and any(requested.groups()) and (condition is None or condition == headers["ETag"]):
-        first, last = requested.groups()
-        if first:
-            start, stop = int(first), min(size, int(last) + 1) if last else size
-        else:
-            start = max(0, size - int(last))
-        if start >= stop:
-            raise ProblemError(
-                416, "range", "There is no such range.", headers={"Content-Range": f"bytes */{size}"}
-            )
+    if ranges is not None and len(ranges) == 1:
+        start, stop = ranges[0]
         status = 206
         headers["Content-Range"] = f"bytes {start}-{stop - 1}/{size}"
     headers["Content-Length"] = str(stop - start)
@@ -102,6 +93,23 @@ def _stored_response(
         return Response(status_code=status, headers=headers, media_type=media_type)
     pieces = service.storage.read(sha256, start, stop)
     return StreamingResponse(pieces, status_code=status, headers=headers, media_type=media_type)
+
+
+class _StoredFileResponse(FileResponse):
+    """A file, or those ranges of it that :func:`requested_ranges` has found in the request."""
+
+    def __init__(
+        self, path: Path, ranges: list[tuple[int, int]] | None, media_type: str, headers: dict[str, str]
+    ) -> None:
+        super().__init__(path, media_type=media_type, headers=headers)
+        self._ranges = ranges
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        headers = [pair for pair in scope["headers"] if pair[0] not in (b"range", b"if-range")]
+        if self._ranges is not None:
+            text = ",".join(f"{start}-{stop - 1}" for start, stop in self._ranges)
+            headers.append((b"range", f"bytes={text}".encode()))
+        await super().__call__({**scope, "headers": headers}, receive, send)
 
 
 def _content_disposition(name: str, inline: bool) -> str:

@@ -1,6 +1,9 @@
 """ETags for cheap polling and against lost updates."""
 
-from fastapi import Request
+import hashlib
+
+from fastapi import Response
+from pydantic import BaseModel
 
 from octasplat.service.problems import ProblemError
 
@@ -13,12 +16,30 @@ def etag_matches(header: str | None, etag: str) -> bool:
     return "*" in named or etag in named
 
 
-def check_precondition(request: Request, etag: str) -> None:
+def check_precondition(if_match: str | None, etag: str) -> None:
     """Refuse a change of an object that has changed since the caller read it.
 
     Raises:
         ProblemError: 412.
     """
-    header = request.headers.get("if-match")
-    if header is not None and not etag_matches(header, etag):
+    if if_match is not None and not etag_matches(if_match, etag):
         raise ProblemError(412, "precondition", "It has changed since; look at it again.")
+
+
+def view_etag(view: BaseModel) -> str:
+    """Return the ETag of a view whose row has no version."""
+    return f'"{hashlib.sha256(view.model_dump_json().encode()).hexdigest()[:32]}"'
+
+
+def set_etag(response: Response, etag: str) -> None:
+    """Set the ETag of an answer, which caches may keep but not use without asking."""
+    response.headers.update({"ETag": etag, "Cache-Control": "no-cache"})
+
+
+def unchanged_response(if_none_match: str | None, etag: str) -> Response | None:
+    """Return the answer 304 if the caller knows the content with ``etag``, else None."""
+    if not etag_matches(if_none_match, etag):
+        return None
+    response = Response(status_code=304)
+    set_etag(response, etag)
+    return response

@@ -10,6 +10,7 @@ from fastapi import Query, Request, Response
 from octasplat.service.problems import ProblemError
 
 Limit = Annotated[int, Query(ge=1, le=200, description="Most entries of one answer.")]
+LongLimit = Annotated[int, Query(ge=1, le=5000, description="Most entries of one answer.")]
 Cursor = Annotated[str | None, Query(max_length=2000, description="`next` of the answer before.")]
 
 

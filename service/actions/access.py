@@ -65,14 +65,14 @@ async def open_dataset(connection: Connection, principal: Principal, dataset_id:
 
 
 async def fetch_visible_webhook(
-    connection: Connection, principal: Principal, webhook_id: uuid.UUID
+    connection: Connection, principal: Principal, webhook_id: uuid.UUID, *, lock: bool = False
 ) -> Endpoint:
     """Return the webhook if the principal may see it.
 
     Raises:
         ProblemError: 404 if it does not exist or the principal may not see it.
     """
-    endpoint = await get_webhook_endpoint(connection, webhook_id)
+    endpoint = await get_webhook_endpoint(connection, webhook_id, lock=lock)
     if endpoint is None or not principal.may_see(endpoint.owner):
         raise not_found_error("webhook")
     return endpoint

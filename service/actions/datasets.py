@@ -3,7 +3,7 @@
 import asyncio
 import time
 import uuid
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import asdict
 from typing import Any
@@ -83,15 +83,27 @@ async def get_dataset(service: Service, principal: Principal, dataset_id: uuid.U
 
 @retry_on_deadlock
 async def change_dataset(
-    service: Service, principal: Principal, dataset_id: uuid.UUID, change: DatasetChange
+    service: Service,
+    principal: Principal,
+    dataset_id: uuid.UUID,
+    change: DatasetChange,
+    check: Callable[[Dataset], None] = lambda _: None,
 ) -> Dataset:
     """Rename a dataset, or pin it so that it does not expire.
+
+    Args:
+        service: the service.
+        principal: asks.
+        dataset_id: the dataset.
+        change: what is to be different.
+        check: sees the dataset as it is, while nobody else can change it, and raises to leave it so.
 
     Raises:
         ProblemError: 404 if it does not exist or the principal may not see it.
     """
     async with service.pool.connection() as connection, connection.transaction():
         dataset = await fetch_visible_dataset(connection, principal, dataset_id, lock=True)
+        check(dataset)
         return await rows.change_dataset(
             connection,
             dataset_id,

@@ -4,6 +4,7 @@ import asyncio
 import time
 import uuid
 from collections.abc import AsyncGenerator
+from dataclasses import replace
 
 from octasplat.service.actions.access import read_job
 from octasplat.service.auth import Principal, is_still_valid
@@ -43,7 +44,8 @@ async def read_events(
     """
     await read_job(service, principal, job_id)
     async with service.pool.connection() as connection:
-        return await list_job_events(connection, job_id, after, limit)
+        events = await list_job_events(connection, job_id, after, limit)
+    return [_visible_event(principal, event) for event in events]
 
 
 async def follow_events(
@@ -89,7 +91,7 @@ async def _stream_events(
                 events = await list_job_events(connection, job_id, after, _PAGE_SIZE)
             for event in events:
                 after = event.id
-                yield event
+                yield _visible_event(principal, event)
             if len(events) == _PAGE_SIZE:
                 continue
             if over:
@@ -103,3 +105,10 @@ async def _stream_events(
                     await news.wait()
             except TimeoutError:
                 continue
+
+
+def _visible_event(principal: Principal, event: JobEvent) -> JobEvent:
+    """Return an event as the principal sees it: the worker, named after its host, is for administrators."""
+    if principal.may("admin") or "worker" not in event.data:
+        return event
+    return replace(event, data={name: value for name, value in event.data.items() if name != "worker"})

@@ -11,6 +11,7 @@ from octasplat.engine.core.errors import ConfigError
 from octasplat.service.actions.access import fetch_visible_job
 from octasplat.service.actions.pages import Page, page_of
 from octasplat.service.auth import Principal
+from octasplat.service.idempotency import create_once, fingerprint
 from octasplat.service.job_limits import limit_notes
 from octasplat.service.problems import ProblemError
 from octasplat.service.queue_workers import live_workers_of_queue, queued_job_notes
@@ -84,7 +85,7 @@ async def get_job(service: Service, principal: Principal, job_id: uuid.UUID) -> 
     """
     async with service.pool.connection() as connection:
         job = await fetch_visible_job(connection, principal, job_id)
-        return JobWithView(job, await job_view(connection, service, job))
+        return JobWithView(job, await job_view(connection, service, principal, job))
 
 
 @retry_on_deadlock
@@ -94,7 +95,7 @@ async def change_job(
     job_id: uuid.UUID,
     change: JobChange,
     check: Callable[[JobWithView], None] = lambda _: None,
-) -> JobView:
+) -> JobWithView:
     """Rename a job, or pin it so that it does not expire.
 
     Args:
@@ -109,7 +110,7 @@ async def change_job(
     """
     async with service.pool.connection() as connection, connection.transaction():
         job = await fetch_visible_job(connection, principal, job_id, lock=True)
-        check(JobWithView(job, await job_view(connection, service, job)))
+        check(JobWithView(job, await job_view(connection, service, principal, job)))
         given = change.model_dump(exclude_unset=True)
         job = await rows.change_job(
             connection,
@@ -117,21 +118,30 @@ async def change_job(
             label=given.get("label", job.label),
             pinned=bool(given["pinned"]) if given.get("pinned") is not None else job.pinned,
         )
-        return await job_view(connection, service, job)
+        return JobWithView(job, await job_view(connection, service, principal, job))
 
 
 @retry_on_deadlock
-async def cancel_job(service: Service, principal: Principal, job_id: uuid.UUID) -> JobView:
-    """Ask a job to stop.
+async def cancel_job(
+    service: Service, principal: Principal, job_id: uuid.UUID, *, idempotency_key: str | None = None
+) -> JobView:
+    """Ask a job to stop; the same request with the key again does not stop what was begun anew since.
 
     Raises:
-        ProblemError: 404 if it does not exist or the principal may not see it.
+        ProblemError: 404 if it does not exist or the principal may not see it, 422 for a key used otherwise.
         ConflictError: it is over.
     """
-    async with service.pool.connection() as connection:
+    async with service.pool.connection() as connection, connection.transaction():
         await fetch_visible_job(connection, principal, job_id)
-        job = await rows.cancel_job(connection, service.job_queue, job_id)
-        return await job_view(connection, service, job)
+
+        async def cancel() -> uuid.UUID:
+            await rows.cancel_job(connection, service.job_queue, job_id)
+            return job_id
+
+        named = fingerprint("cancel", str(job_id))
+        await create_once(connection, principal, idempotency_key, named, cancel)
+        job = await fetch_visible_job(connection, principal, job_id)
+        return await job_view(connection, service, principal, job)
 
 
 @retry_on_deadlock
@@ -171,8 +181,11 @@ def stages_of(job: Job) -> list[str]:
         return []
 
 
-async def job_view(connection: Connection, service: Service, job: Job) -> JobView:
-    """Return the view of one job, with its position in the queue and notes while it waits."""
+async def job_view(connection: Connection, service: Service, principal: Principal, job: Job) -> JobView:
+    """Return the view of one job, with its position in the queue and notes while it waits.
+
+    Its worker, which is named after its host, is for administrators.
+    """
     notes: list[str] = []
     if job.state == "queued":
         with suppress(ConfigError, ValidationError):  # of another version
@@ -180,7 +193,13 @@ async def job_view(connection: Connection, service: Service, job: Job) -> JobVie
             workers = await live_workers_of_queue(connection, job.queue, service.settings.stale_seconds)
             notes = queued_job_notes(kind, kind.options.model_validate(job.options), job.queue, workers)
             notes += limit_notes(job.estimate, workers, service.settings)
-    return JobView.from_row(job, stages_of(job), await rows.queue_position(connection, job), notes)
+    return JobView.from_row(
+        job,
+        stages_of(job),
+        await rows.queue_position(connection, job),
+        notes,
+        shows_worker=principal.may("admin"),
+    )
 
 
 def _without_nul(text: str | None) -> str | None:

@@ -94,7 +94,8 @@ async def submit_job(
         # Without what was not asked for: a version that knows more may get the repetition.
         named = fingerprint("job", request.model_dump(mode="json", exclude_defaults=True))
         job_id, _ = await create_once(connection, principal, idempotency_key, named, make)
-        view = await job_view(connection, service, await fetch_visible_job(connection, principal, job_id))
+        job = await fetch_visible_job(connection, principal, job_id)
+        view = await job_view(connection, service, principal, job)
         return view.model_copy(update={"notes": [*view.notes, *notices]})
 
 
@@ -144,7 +145,8 @@ async def retry_job(
         )
         with collect_notices() as notices:
             await create_once(connection, principal, idempotency_key, named, make)
-        view = await job_view(connection, service, await fetch_visible_job(connection, principal, job_id))
+        job = await fetch_visible_job(connection, principal, job_id)
+        view = await job_view(connection, service, principal, job)
         return view.model_copy(update={"notes": [*view.notes, *notices]})
 
 

@@ -63,11 +63,15 @@ async def list_live_workers(service: Service) -> list[WorkerRow]:
         return await live_workers(connection, service.settings.stale_seconds)
 
 
-async def list_queues(service: Service) -> QueueList:
-    """Return the waiting and running jobs of each queue, and the workers."""
+async def list_queues(service: Service, principal: Principal) -> QueueList:
+    """Return the queues with the waiting and running jobs that the principal may see.
+
+    Workers, which are named after their hosts, are for administrators.
+    """
+    owner = principal.visible_owner
     async with service.pool.connection() as connection:
-        depths = {depth.queue: depth for depth in await queue_depths(connection)}
-        running = await running_by_queue(connection)
+        depths = {depth.queue: depth for depth in await queue_depths(connection, owner)}
+        running = await running_by_queue(connection, owner)
         workers = await live_workers(connection, service.settings.stale_seconds)
     slots: dict[str, int] = {}
     for worker in workers:
@@ -85,7 +89,11 @@ async def list_queues(service: Service) -> QueueList:
             )
             for name in names
         ],
-        workers=[WorkerView.model_validate(worker, from_attributes=True) for worker in workers],
+        workers=[
+            WorkerView.model_validate(worker, from_attributes=True)
+            for worker in workers
+            if principal.may("admin")
+        ],
     )
 
 

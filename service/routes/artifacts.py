@@ -1,6 +1,5 @@
 """Routes of job results, and previews of running jobs."""
 
-import uuid
 from typing import Annotated
 
 from fastapi import APIRouter, Path, Query, Request, Response
@@ -9,14 +8,17 @@ from octasplat.service.actions import artifacts as actions
 from octasplat.service.auth import Reader
 from octasplat.service.downloads import send_blob
 from octasplat.service.routes import problem_responses
+from octasplat.service.routes.parameters import IfNoneMatch, IfRange, JobId, Range
 from octasplat.service.schemas.artifacts import ArtifactList, ArtifactView
 from octasplat.service.state import ServiceDep
 
 router = APIRouter(prefix="/v1/jobs", tags=["results"])
 
+ArtifactName = Annotated[str, Path(max_length=1000, description="Such as scene.ply or renders/view_000.png.")]
+
 
 @router.get("/{job_id}/artifacts", responses=problem_responses(404))
-async def list_artifacts(job_id: uuid.UUID, principal: Reader, service: ServiceDep) -> ArtifactList:
+async def list_artifacts(job_id: JobId, principal: Reader, service: ServiceDep) -> ArtifactList:
     """Return the results of a job; none before it has succeeded."""
     found = await actions.list_artifacts(service, principal, job_id)
     return ArtifactList(artifacts=[ArtifactView.from_row(row) for row in found])
@@ -29,9 +31,10 @@ async def list_artifacts(job_id: uuid.UUID, principal: Reader, service: ServiceD
     "/{job_id}/artifacts/{name:path}", responses=problem_responses(404, 410, 416), include_in_schema=False
 )
 async def get_artifact_content(
-    job_id: uuid.UUID, name: Annotated[str, Path(max_length=1000)], principal: Reader, service: ServiceDep,
+    job_id: JobId, name: ArtifactName, principal: Reader, service: ServiceDep,
     request: Request,
     inline: Annotated[bool, Query(description="Show it in the browser rather than save it.")] = False,
+    _range: Range = None, _if_range: IfRange = None, _if_none_match: IfNoneMatch = None,
 ) -> Response:  # fmt: skip
     """Return a result; `Range` and `If-Range` let a download resume."""
     row = await actions.get_artifact(service, principal, job_id, name)
@@ -42,12 +45,13 @@ async def get_artifact_content(
 
 @router.get(
     "/{job_id}/preview",
-    responses={200: {"content": {"image/png": {}}}, **problem_responses(404, 410)},
+    responses={200: {"content": {"image/png": {}}}, **problem_responses(404, 410, 416)},
     response_class=Response,
 )
 async def get_preview(
-    job_id: uuid.UUID, principal: Reader, service: ServiceDep, request: Request
-) -> Response:
+    job_id: JobId, principal: Reader, service: ServiceDep, request: Request,
+    _range: Range = None, _if_none_match: IfNoneMatch = None,
+) -> Response:  # fmt: skip
     """Return the newest preview of a running job."""
     blob = await actions.get_preview(service, principal, job_id)
     response = await send_blob(

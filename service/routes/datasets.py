@@ -1,21 +1,28 @@
 """Routes of datasets: created, filled file by file or by an archive, committed, read, deleted."""
 
-import uuid
 from collections.abc import AsyncIterator
 from typing import Annotated
 
-from fastapi import APIRouter, Header, Path, Query, Request, Response
+from fastapi import APIRouter, Header, Path, Request, Response
 from starlette.requests import ClientDisconnect
 
 from octasplat.service.actions import datasets as actions
 from octasplat.service.actions import uploads
 from octasplat.service.auth import Reader, Writer
 from octasplat.service.downloads import send_blob
+from octasplat.service.etags import check_precondition, set_etag, unchanged_response
 from octasplat.service.intake.receive import parse_digest
-from octasplat.service.paging import Cursor, Limit, decode_cursor, decode_id_cursor, set_next_link
+from octasplat.service.paging import Cursor, Limit, LongLimit, decode_cursor, decode_id_cursor, set_next_link
 from octasplat.service.problems import ProblemError
 from octasplat.service.routes import problem_responses
-from octasplat.service.routes.parameters import IdempotencyKey
+from octasplat.service.routes.parameters import (
+    DatasetId,
+    IdempotencyKey,
+    IfMatch,
+    IfNoneMatch,
+    IfRange,
+    Range,
+)
 from octasplat.service.schemas.datasets import (
     ArchiveView,
     DatasetChange,
@@ -26,6 +33,7 @@ from octasplat.service.schemas.datasets import (
     NewDataset,
 )
 from octasplat.service.state import ServiceDep
+from octasplat.workers.db.rows import Dataset
 from octasplat.workers.worker.media_types import media_type
 
 router = APIRouter(prefix="/v1/datasets", tags=["datasets"])
@@ -37,7 +45,7 @@ Digest = Annotated[
 FilePath = Annotated[str, Path(max_length=1000, description="Such as images/0001.jpg.")]
 
 
-@router.post("", status_code=201, responses=problem_responses())
+@router.post("", status_code=201, responses=problem_responses(404))
 async def create_dataset(
     new: NewDataset, principal: Writer, service: ServiceDep, response: Response, key: IdempotencyKey = None
 ) -> DatasetView:
@@ -58,30 +66,45 @@ async def list_datasets(
     return DatasetPage(datasets=[DatasetView.from_row(row) for row in part.rows], next=following)
 
 
-@router.get("/{dataset_id}", responses=problem_responses(404))
-async def get_dataset(dataset_id: uuid.UUID, principal: Reader, service: ServiceDep) -> DatasetView:
+@router.get("/{dataset_id}", responses={304: {"description": "Not changed"}, **problem_responses(404)})
+async def get_dataset(
+    dataset_id: DatasetId, principal: Reader, service: ServiceDep, response: Response,
+    if_none_match: IfNoneMatch = None,
+) -> DatasetView:  # fmt: skip
     """Return one dataset."""
-    return DatasetView.from_row(await actions.get_dataset(service, principal, dataset_id))
+    dataset = await actions.get_dataset(service, principal, dataset_id)
+    etag = _dataset_etag(dataset)
+    if (unchanged := unchanged_response(if_none_match, etag)) is not None:
+        return unchanged  # type: ignore[return-value]
+    set_etag(response, etag)
+    return DatasetView.from_row(dataset)
 
 
-@router.patch("/{dataset_id}", responses=problem_responses(404))
+@router.patch("/{dataset_id}", responses=problem_responses(404, 412))
 async def change_dataset(
-    dataset_id: uuid.UUID, change: DatasetChange, principal: Writer, service: ServiceDep
-) -> DatasetView:
+    dataset_id: DatasetId, change: DatasetChange, principal: Writer, service: ServiceDep, response: Response,
+    if_match: IfMatch = None,
+) -> DatasetView:  # fmt: skip
     """Rename a dataset, or pin it so that it does not expire."""
-    return DatasetView.from_row(await actions.change_dataset(service, principal, dataset_id, change))
+
+    def check(dataset: Dataset) -> None:
+        check_precondition(if_match, _dataset_etag(dataset))
+
+    dataset = await actions.change_dataset(service, principal, dataset_id, change, check)
+    set_etag(response, _dataset_etag(dataset))
+    return DatasetView.from_row(dataset)
 
 
 @router.delete("/{dataset_id}", status_code=204, responses=problem_responses(404, 409))
-async def delete_dataset(dataset_id: uuid.UUID, principal: Writer, service: ServiceDep) -> None:
+async def delete_dataset(dataset_id: DatasetId, principal: Writer, service: ServiceDep) -> None:
     """Delete a dataset that no job needs."""
     await actions.delete_dataset(service, principal, dataset_id)
 
 
 @router.get("/{dataset_id}/files", responses=problem_responses(404))
 async def list_files(
-    dataset_id: uuid.UUID, principal: Reader, service: ServiceDep, request: Request, response: Response,
-    limit: Annotated[int, Query(ge=1, le=5000)] = 1000, cursor: Cursor = None,
+    dataset_id: DatasetId, principal: Reader, service: ServiceDep, request: Request, response: Response,
+    limit: LongLimit = 1000, cursor: Cursor = None,
 ) -> FilePage:  # fmt: skip
     """List the uploaded files by name; a resumed upload sends only the others."""
     after = decode_cursor(cursor) or ""
@@ -100,7 +123,7 @@ async def list_files(
     openapi_extra={"requestBody": {"content": {"application/octet-stream": {}}, "required": True}},
 )
 async def put_file(
-    dataset_id: uuid.UUID, path: FilePath, principal: Writer, service: ServiceDep, request: Request,
+    dataset_id: DatasetId, path: FilePath, principal: Writer, service: ServiceDep, request: Request,
     response: Response, digest: Digest = None,
 ) -> FileView:  # fmt: skip
     """Send a file: the body is its content. A repeat with the same digest does nothing."""
@@ -117,9 +140,10 @@ async def put_file(
     "/{dataset_id}/files/{path:path}", responses=problem_responses(404, 410, 416), include_in_schema=False
 )
 async def get_file(
-    dataset_id: uuid.UUID, path: FilePath, principal: Reader, service: ServiceDep, request: Request
-) -> Response:
-    """Return the content of a file."""
+    dataset_id: DatasetId, path: FilePath, principal: Reader, service: ServiceDep, request: Request,
+    _range: Range = None, _if_range: IfRange = None, _if_none_match: IfNoneMatch = None,
+) -> Response:  # fmt: skip
+    """Return the content of a file; `Range` and `If-Range` let a download resume."""
     row = await uploads.get_file(service, principal, dataset_id, path)
     return await send_blob(
         service, request, row.sha256, row.size_bytes, media_type=media_type(row.path), name=row.path
@@ -127,7 +151,7 @@ async def get_file(
 
 
 @router.delete("/{dataset_id}/files/{path:path}", status_code=204, responses=problem_responses(404, 409))
-async def delete_file(dataset_id: uuid.UUID, path: FilePath, principal: Writer, service: ServiceDep) -> None:
+async def delete_file(dataset_id: DatasetId, path: FilePath, principal: Writer, service: ServiceDep) -> None:
     """Remove a file from an open dataset."""
     await uploads.remove_file(service, principal, dataset_id, path)
 
@@ -138,7 +162,7 @@ async def delete_file(dataset_id: uuid.UUID, path: FilePath, principal: Writer, 
     openapi_extra={"requestBody": {"content": {"application/zip": {}}, "required": True}},
 )
 async def put_archive(
-    dataset_id: uuid.UUID, principal: Writer, service: ServiceDep, request: Request, digest: Digest = None
+    dataset_id: DatasetId, principal: Writer, service: ServiceDep, request: Request, digest: Digest = None
 ) -> ArchiveView:
     """Upload a scene as a ZIP file; its files are added to those that are there."""
     archive = await uploads.put_archive(service, principal, dataset_id, _upload_of_request(request, digest))
@@ -150,9 +174,15 @@ async def put_archive(
 
 
 @router.post("/{dataset_id}/commit", responses=problem_responses(404, 409))
-async def commit_dataset(dataset_id: uuid.UUID, principal: Writer, service: ServiceDep) -> DatasetView:
+async def commit_dataset(
+    dataset_id: DatasetId, principal: Writer, service: ServiceDep, _key: IdempotencyKey = None
+) -> DatasetView:
     """Validate and commit the dataset; it never changes again and jobs can use it. Faults are in `errors`."""
     return DatasetView.from_row(await actions.commit_dataset(service, principal, dataset_id))
+
+
+def _dataset_etag(dataset: Dataset) -> str:
+    return f'"{dataset.version}"'
 
 
 def _upload_of_request(request: Request, digest: str | None) -> uploads.Upload:

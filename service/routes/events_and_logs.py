@@ -1,7 +1,6 @@
 """Routes of a job's log and events, as a list and as a stream."""
 
 import json
-import uuid
 from collections.abc import AsyncGenerator, AsyncIterator
 from contextlib import aclosing
 from typing import Annotated
@@ -12,7 +11,9 @@ from fastapi.sse import format_sse_event
 
 from octasplat.service.actions import events_and_logs as actions
 from octasplat.service.auth import Reader
+from octasplat.service.paging import LongLimit
 from octasplat.service.routes import problem_responses
+from octasplat.service.routes.parameters import JobId
 from octasplat.service.schemas.events_and_logs import EventPage, EventView, LogLineView, LogPage
 from octasplat.service.state import ServiceDep
 from octasplat.workers.db.rows import JobEvent
@@ -24,8 +25,8 @@ After = Annotated[int, Query(ge=0, lt=1 << 62, description="`next` of the answer
 
 @router.get("/{job_id}/logs", responses=problem_responses(404))
 async def read_log(
-    job_id: uuid.UUID, principal: Reader, service: ServiceDep, after: After = 0,
-    limit: Annotated[int, Query(ge=1, le=5000)] = 1000,
+    job_id: JobId, principal: Reader, service: ServiceDep, after: After = 0,
+    limit: LongLimit = 1000,
 ) -> LogPage:  # fmt: skip
     """Return the job's log: stages, pace, warnings, errors with their cause, and the program's output."""
     lines = await actions.read_log(service, principal, job_id, after=after, limit=limit)
@@ -34,8 +35,8 @@ async def read_log(
 
 @router.get("/{job_id}/timeline", responses=problem_responses(404))
 async def read_timeline(
-    job_id: uuid.UUID, principal: Reader, service: ServiceDep, after: After = 0,
-    limit: Annotated[int, Query(ge=1, le=5000)] = 1000,
+    job_id: JobId, principal: Reader, service: ServiceDep, after: After = 0,
+    limit: LongLimit = 1000,
 ) -> EventPage:  # fmt: skip
     """List the events of the job; `/events` streams the same."""
     events = await actions.read_events(service, principal, job_id, after=after, limit=limit)
@@ -54,8 +55,10 @@ async def read_timeline(
     },
 )
 async def stream_events(
-    job_id: uuid.UUID, principal: Reader, service: ServiceDep,
-    last_event_id: Annotated[str | None, Header(max_length=40)] = None,
+    job_id: JobId, principal: Reader, service: ServiceDep,
+    last_event_id: Annotated[
+        str | None, Header(max_length=40, description="Id of the last event that has arrived.")
+    ] = None,
     after: After = 0,
 ) -> Response:  # fmt: skip
     """Stream the job's events; after a break, `Last-Event-ID` names the last one received."""

@@ -10,10 +10,10 @@ from octasplat.service.actions.jobs import BUSY_RETRY_SECONDS, JobFilter, JobWit
 from octasplat.service.actions.submission import retry_job as retry_again
 from octasplat.service.actions.submission import submit_job
 from octasplat.service.auth import Reader, Writer
-from octasplat.service.etags import check_precondition, etag_matches
+from octasplat.service.etags import check_precondition, set_etag, unchanged_response
 from octasplat.service.paging import Cursor, Limit, decode_id_cursor, set_next_link
 from octasplat.service.routes import problem_responses
-from octasplat.service.routes.parameters import IdempotencyKey
+from octasplat.service.routes.parameters import IdempotencyKey, IfMatch, IfNoneMatch, JobId
 from octasplat.service.schemas.jobs import JobChange, JobPage, JobView, NewJob, RetryRequest
 from octasplat.service.state import ServiceDep
 from octasplat.workers.db.rows import JobState
@@ -38,10 +38,12 @@ async def create_job(
 @router.get("", responses=problem_responses())
 async def list_jobs(
     principal: Reader, service: ServiceDep, request: Request, response: Response,
-    state: Annotated[list[JobState] | None, Query(description="May be given several times.")] = None,
-    kind: Annotated[str | None, Query(max_length=40)] = None,
-    label: Annotated[str | None, Query(max_length=200)] = None,
-    dataset_id: uuid.UUID | None = None,
+    state: Annotated[
+        list[JobState] | None, Query(description="Jobs in this state; may be given several times.")
+    ] = None,
+    kind: Annotated[str | None, Query(max_length=40, description="Jobs of this kind.")] = None,
+    label: Annotated[str | None, Query(max_length=200, description="Jobs of this label.")] = None,
+    dataset_id: Annotated[uuid.UUID | None, Query(description="Jobs on this dataset.")] = None,
     limit: Limit = 50,
     cursor: Cursor = None,
 ) -> JobPage:  # fmt: skip
@@ -51,19 +53,25 @@ async def list_jobs(
         service, principal, job_filter, before=decode_id_cursor(cursor), limit=limit
     )
     following = set_next_link(request, response, part.next_key)
-    return JobPage(jobs=[JobView.from_row(job, stages_of(job)) for job in part.rows], next=following)
+    shows_worker = principal.may("admin")
+    views = [JobView.from_row(job, stages_of(job), shows_worker=shows_worker) for job in part.rows]
+    return JobPage(jobs=views, next=following)
 
 
 @router.get("/{job_id}", responses={304: {"description": "Not changed"}, **problem_responses(404)})
 async def get_job(
-    job_id: uuid.UUID, principal: Reader, service: ServiceDep, request: Request, response: Response
+    job_id: JobId,
+    principal: Reader,
+    service: ServiceDep,
+    response: Response,
+    if_none_match: IfNoneMatch = None,
 ) -> JobView:
     """Return a job; polling with `If-None-Match` is cheap."""
     job = await actions.get_job(service, principal, job_id)
-    headers = {"ETag": _job_etag(job), "Cache-Control": "no-cache"}
-    if etag_matches(request.headers.get("if-none-match"), headers["ETag"]):
-        return Response(status_code=304, headers=headers)  # type: ignore[return-value]
-    response.headers.update(headers)
+    etag = _job_etag(job)
+    if (unchanged := unchanged_response(if_none_match, etag)) is not None:
+        return unchanged  # type: ignore[return-value]
+    set_etag(response, etag)
     if not job.row.is_over:
         _set_retry_after(response, job.view)
     return job.view
@@ -71,29 +79,32 @@ async def get_job(
 
 @router.patch("/{job_id}", responses=problem_responses(404, 412))
 async def change_job(
-    job_id: uuid.UUID, change: JobChange, principal: Writer, service: ServiceDep, request: Request
-) -> JobView:
+    job_id: JobId, change: JobChange, principal: Writer, service: ServiceDep, response: Response,
+    if_match: IfMatch = None,
+) -> JobView:  # fmt: skip
     """Rename a job, or pin it so that it does not expire."""
 
     def check(job: JobWithView) -> None:
-        check_precondition(request, _job_etag(job))
+        check_precondition(if_match, _job_etag(job))
 
-    return await actions.change_job(service, principal, job_id, change, check)
+    changed = await actions.change_job(service, principal, job_id, change, check)
+    set_etag(response, _job_etag(changed))
+    return changed.view
 
 
 @router.post("/{job_id}/cancel", status_code=202, responses=problem_responses(404, 409))
 async def cancel_job(
-    job_id: uuid.UUID, principal: Writer, service: ServiceDep, response: Response
+    job_id: JobId, principal: Writer, service: ServiceDep, response: Response, key: IdempotencyKey = None
 ) -> JobView:
     """Cancel a job; may be repeated. Its checkpoint stays, so that a retry resumes from it."""
-    view = await actions.cancel_job(service, principal, job_id)
+    view = await actions.cancel_job(service, principal, job_id, idempotency_key=key)
     _set_location(response, view)
     return view
 
 
 @router.post("/{job_id}/retry", status_code=202, responses=problem_responses(404, 409))
 async def retry_job(
-    job_id: uuid.UUID, principal: Writer, service: ServiceDep, response: Response,
+    job_id: JobId, principal: Writer, service: ServiceDep, response: Response,
     retry: RetryRequest | None = None, key: IdempotencyKey = None,
 ) -> JobView:  # fmt: skip
     """Queue a failed or cancelled job again, from its newest checkpoint or from the start.
@@ -109,7 +120,7 @@ async def retry_job(
 
 @router.delete("/{job_id}", status_code=204, responses=problem_responses(404, 409))
 async def delete_job(
-    job_id: uuid.UUID, principal: Writer, service: ServiceDep,
+    job_id: JobId, principal: Writer, service: ServiceDep,
     cancel: Annotated[bool, Query(description="Stop it first if it is not over.")] = False,
 ) -> None:  # fmt: skip
     """Delete a finished job with its results; repeat the request for one that is still stopping."""

@@ -1,10 +1,10 @@
-"""Route of the Prometheus metrics; it needs a token like every other (`authorization` in its settings)."""
+"""Route of the Prometheus metrics; its token goes into `authorization` of the settings of Prometheus."""
 
 from fastapi import APIRouter, Response
 from prometheus_client import CONTENT_TYPE_LATEST
 
 from octasplat.service.actions.system import render_metrics
-from octasplat.service.auth import Reader
+from octasplat.service.auth import Monitor
 from octasplat.service.routes import problem_responses
 from octasplat.service.state import ServiceDep
 
@@ -16,7 +16,10 @@ router = APIRouter(tags=["health"])
     responses={200: {"content": {"text/plain": {"schema": {"type": "string"}}}}, **problem_responses()},
     response_class=Response,
 )
-async def get_metrics(_principal: Reader, service: ServiceDep) -> Response:
-    """Return the metrics of the service in the Prometheus format."""
+async def get_metrics(_principal: Monitor, service: ServiceDep) -> Response:
+    """Return the metrics of the service in the Prometheus format.
+
+    They are of all owners, so a token with the scope `metrics` or `admin` is needed.
+    """
     text = await render_metrics(service)
     return Response(text, headers={"Content-Type": CONTENT_TYPE_LATEST, "Cache-Control": "no-store"})

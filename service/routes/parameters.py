@@ -1,8 +1,9 @@
-"""Headers that several routes accept."""
+"""Parameters that several routes have."""
 
+import uuid
 from typing import Annotated
 
-from fastapi import Header
+from fastapi import Header, Path
 
 IdempotencyKey = Annotated[
     str | None,
@@ -11,6 +12,34 @@ IdempotencyKey = Annotated[
         min_length=1,
         max_length=255,
         pattern=r"^[\x21-\x7e]+$",
-        description="A text of your choice; the same request sent again with it makes nothing new.",
+        description="A text of your choice; the same request sent again with it makes nothing new, and is "
+        "answered 404 when what it made was deleted.",
     ),
 ]
+IfMatch = Annotated[
+    str | None,
+    Header(
+        alias="If-Match", max_length=1000, description="ETag that it must still have, else the answer is 412."
+    ),
+]
+IfNoneMatch = Annotated[
+    str | None,
+    Header(
+        alias="If-None-Match",
+        max_length=1000,
+        description="ETag that you have seen; as long as it is that, the answer is 304.",
+    ),
+]
+Range = Annotated[
+    str | None,
+    Header(max_length=1000, description="A part of the content (RFC 9110), such as `bytes=1000-`."),
+]
+IfRange = Annotated[
+    str | None,
+    Header(alias="If-Range", max_length=1000, description="ETag that must hold, else `Range` is ignored."),
+]
+DatasetId = Annotated[uuid.UUID, Path(description="Id of the dataset.")]
+JobId = Annotated[uuid.UUID, Path(description="Id of the job.")]
+TokenId = Annotated[uuid.UUID, Path(description="Id of the token, which is not its secret.")]
+WebhookId = Annotated[uuid.UUID, Path(description="Id of the webhook.")]
+DeliveryId = Annotated[uuid.UUID, Path(description="Id of the message.")]

@@ -13,6 +13,7 @@ from octasplat.service.intake.scene_preview import (
     preview_files,
 )
 from octasplat.service.routes import problem_responses
+from octasplat.service.routes.parameters import IdempotencyKey
 from octasplat.service.schemas.scene_previews import NewScenePreview, ScenePreviewView
 from octasplat.service.state import ServiceDep
 from octasplat.service.thread_pools import ThreadPurpose, run_in_pool
@@ -25,7 +26,9 @@ router = APIRouter(prefix=PREFIX, tags=["datasets"])
 
 
 @router.post("", responses=problem_responses(413))
-async def preview_scene(new: NewScenePreview, _principal: Writer, service: ServiceDep) -> ScenePreviewView:
+async def preview_scene(
+    new: NewScenePreview, _principal: Writer, service: ServiceDep, _key: IdempotencyKey = None
+) -> ScenePreviewView:
     """Say what of a folder would be taken, left out or refused, with the sentences to show."""
     listed = [ListedFile(file.path, file.size_bytes) for file in new.files]
     limits = service.settings.upload_limits()
@@ -40,6 +43,7 @@ async def preview_scene_archive(
     size_bytes: Annotated[int, Query(ge=1, description="Length of the whole archive.")],
     _principal: Writer,
     service: ServiceDep,
+    _key: IdempotencyKey = None,
 ) -> ScenePreviewView:
     """Say the same of a ZIP file; its last bytes, which hold its list of contents, are enough."""
     try:

@@ -1,14 +1,13 @@
 """Routes of webhooks, which notify other programs of job events (https://www.standardwebhooks.com)."""
 
-import uuid
-from typing import Annotated
-
-from fastapi import APIRouter, Query, Request, Response
+from fastapi import APIRouter, Request, Response
 
 from octasplat.service.actions import webhooks as actions
 from octasplat.service.auth import Reader, Writer
+from octasplat.service.etags import check_precondition, set_etag, unchanged_response, view_etag
 from octasplat.service.paging import Cursor, Limit, decode_id_cursor, set_next_link
 from octasplat.service.routes import problem_responses
+from octasplat.service.routes.parameters import DeliveryId, IdempotencyKey, IfMatch, IfNoneMatch, WebhookId
 from octasplat.service.schemas.webhooks import (
     DeliveryList,
     DeliveryView,
@@ -19,13 +18,14 @@ from octasplat.service.schemas.webhooks import (
     WebhookView,
 )
 from octasplat.service.state import ServiceDep
+from octasplat.workers.maintenance.webhooks.rows import Endpoint
 
 router = APIRouter(prefix="/v1/webhooks", tags=["webhooks"])
 
 
 @router.post("", status_code=201, responses=problem_responses(404))
 async def create_webhook(
-    new: NewWebhook, principal: Writer, service: ServiceDep, response: Response
+    new: NewWebhook, principal: Writer, service: ServiceDep, response: Response, key: IdempotencyKey = None
 ) -> MadeWebhook:
     """Create a webhook for your jobs, or for one of them.
 
@@ -33,9 +33,9 @@ async def create_webhook(
     says which job it is about; ask `GET /v1/jobs/{id}` for the rest. It may come more than once and is sent
     again for a day until the answer is 2xx within 15 seconds; an answer 410 disables the webhook.
     """
-    made = await actions.create_webhook(service, principal, new)
-    response.headers["Location"] = f"/v1/webhooks/{made.row.id}"
-    return MadeWebhook(**WebhookView.from_row(made.row).model_dump(), secret=made.secret)
+    made = await actions.create_webhook(service, principal, new, idempotency_key=key)
+    response.headers["Location"] = f"/v1/webhooks/{made.id}"
+    return MadeWebhook(**WebhookView.from_row(made).model_dump(), secret=made.secret)
 
 
 @router.get("", responses=problem_responses())
@@ -49,36 +49,53 @@ async def list_webhooks(
     return WebhookPage(webhooks=[WebhookView.from_row(row) for row in part.rows], next=following)
 
 
-@router.get("/{webhook_id}", responses=problem_responses(404))
-async def get_webhook(webhook_id: uuid.UUID, principal: Reader, service: ServiceDep) -> WebhookView:
+@router.get("/{webhook_id}", responses={304: {"description": "Not changed"}, **problem_responses(404)})
+async def get_webhook(
+    webhook_id: WebhookId, principal: Reader, service: ServiceDep, response: Response,
+    if_none_match: IfNoneMatch = None,
+) -> WebhookView:  # fmt: skip
     """Return a webhook, without its secret."""
-    return WebhookView.from_row(await actions.get_webhook(service, principal, webhook_id))
+    view = WebhookView.from_row(await actions.get_webhook(service, principal, webhook_id))
+    if (unchanged := unchanged_response(if_none_match, view_etag(view))) is not None:
+        return unchanged  # type: ignore[return-value]
+    set_etag(response, view_etag(view))
+    return view
 
 
-@router.patch("/{webhook_id}", responses=problem_responses(404))
+@router.patch("/{webhook_id}", responses=problem_responses(404, 412))
 async def change_webhook(
-    webhook_id: uuid.UUID, change: WebhookChange, principal: Writer, service: ServiceDep
-) -> WebhookView:
+    webhook_id: WebhookId, change: WebhookChange, principal: Writer, service: ServiceDep, response: Response,
+    if_match: IfMatch = None,
+) -> WebhookView:  # fmt: skip
     """Change a webhook, pause it, or enable it again after the service disabled it."""
-    return WebhookView.from_row(await actions.change_webhook(service, principal, webhook_id, change))
+
+    def check(endpoint: Endpoint) -> None:
+        check_precondition(if_match, view_etag(WebhookView.from_row(endpoint)))
+
+    view = WebhookView.from_row(await actions.change_webhook(service, principal, webhook_id, change, check))
+    set_etag(response, view_etag(view))
+    return view
 
 
 @router.delete("/{webhook_id}", status_code=204, responses=problem_responses(404))
-async def delete_webhook(webhook_id: uuid.UUID, principal: Writer, service: ServiceDep) -> None:
+async def delete_webhook(webhook_id: WebhookId, principal: Writer, service: ServiceDep) -> None:
     """Delete a webhook; what was not delivered yet is not sent any more."""
     await actions.delete_webhook(service, principal, webhook_id)
 
 
 @router.post("/{webhook_id}/test", status_code=202, responses=problem_responses(404, 409))
-async def test_webhook(webhook_id: uuid.UUID, principal: Writer, service: ServiceDep) -> DeliveryView:
+async def test_webhook(
+    webhook_id: WebhookId, principal: Writer, service: ServiceDep, key: IdempotencyKey = None
+) -> DeliveryView:
     """Send a message of the type `webhook.test`; its outcome is in `/deliveries`."""
-    return DeliveryView.from_row(await actions.send_test(service, principal, webhook_id))
+    sent = await actions.send_test(service, principal, webhook_id, idempotency_key=key)
+    return DeliveryView.from_row(sent)
 
 
 @router.get("/{webhook_id}/deliveries", responses=problem_responses(404))
 async def list_deliveries(
-    webhook_id: uuid.UUID, principal: Reader, service: ServiceDep,
-    limit: Annotated[int, Query(ge=1, le=200)] = 50,
+    webhook_id: WebhookId, principal: Reader, service: ServiceDep,
+    limit: Limit = 50,
 ) -> DeliveryList:  # fmt: skip
     """List the newest messages and their outcomes; they are kept for 30 days."""
     found = await actions.list_deliveries(service, principal, webhook_id, limit)
@@ -89,7 +106,9 @@ async def list_deliveries(
     "/{webhook_id}/deliveries/{delivery_id}/redeliver", status_code=202, responses=problem_responses(404, 409)
 )
 async def resend_delivery(
-    webhook_id: uuid.UUID, delivery_id: uuid.UUID, principal: Writer, service: ServiceDep
-) -> DeliveryView:
+    webhook_id: WebhookId, delivery_id: DeliveryId, principal: Writer, service: ServiceDep,
+    key: IdempotencyKey = None,
+) -> DeliveryView:  # fmt: skip
     """Send a message again, with the same id and content."""
-    return DeliveryView.from_row(await actions.redeliver(service, principal, webhook_id, delivery_id))
+    sent = await actions.redeliver(service, principal, webhook_id, delivery_id, idempotency_key=key)
+    return DeliveryView.from_row(sent)

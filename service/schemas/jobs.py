@@ -2,6 +2,7 @@
 
 import uuid
 from collections.abc import Sequence
+from dataclasses import replace
 from datetime import datetime
 from typing import Any, Literal
 
@@ -179,7 +180,7 @@ class JobView(BaseModel):
     training_psnr: float | None = Field(
         None, description="Running value over the rays that are trained on, dB; higher than `psnr` as a rule."
     )
-    worker: str | None
+    worker: str | None = Field(description="Which has it; shown to administrators, null for others.")
     queue_position: int | None = Field(description="Jobs that go before it.")
     estimate: Estimate | None = Field(description="What it was reckoned to take when it was accepted.")
     notes: list[str] = Field(
@@ -197,10 +198,17 @@ class JobView(BaseModel):
 
     @classmethod
     def from_row(
-        cls, row: Job, stages: list[str], queue_position: int | None = None, notes: Sequence[str] = ()
+        cls,
+        row: Job,
+        stages: list[str],
+        queue_position: int | None = None,
+        notes: Sequence[str] = (),
+        *,
+        shows_worker: bool = False,
     ) -> "JobView":
         """Return the view of a database row."""
         names = {name for name in cls.model_fields if name not in ("stages", "queue_position", "notes")}
+        row = row if shows_worker else replace(row, worker=None)
         values = {name: getattr(row, name) for name in names}
         return cls(**values, stages=stages, queue_position=queue_position, notes=list(notes))
 

@@ -52,11 +52,11 @@ class InfoView(BaseModel):
 class QueueView(BaseModel):
     """A queue and its workers."""
 
-    queue: str
-    waiting: int
-    oldest_seconds: float | None
-    running: int
-    slots: int
+    queue: str = Field(description="Its name.")
+    waiting: int = Field(description="Your jobs that wait; everybody's for administrators.")
+    oldest_seconds: float | None = Field(description="How long the first of them has waited.")
+    running: int = Field(description="Your jobs that run; everybody's for administrators.")
+    slots: int = Field(description="Jobs that the live workers of the queue do at once.")
 
 
 class WorkerView(BaseModel):
@@ -74,7 +74,7 @@ class QueueList(BaseModel):
     """The queues and the workers."""
 
     queues: list[QueueView]
-    workers: list[WorkerView]
+    workers: list[WorkerView] = Field(description="Shown to administrators; empty for others.")
 
 
 class Health(BaseModel):

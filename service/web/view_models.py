@@ -107,7 +107,7 @@ async def job_detail(service: Service, principal: Principal, job_id: uuid.UUID) 
     async with service.pool.connection() as connection:
         job = await fetch_visible_job(connection, principal, job_id)
         [line] = await _job_rows(service, connection, [job])
-        line = replace(line, job=await job_view(connection, service, job))
+        line = replace(line, job=await job_view(connection, service, principal, job))
         dataset = await get_dataset(connection, job.dataset_id) if job.dataset_id else None
         async with connection.cursor(row_factory=class_row(JobEvent)) as cursor:
             await cursor.execute(

@@ -137,7 +137,7 @@ def check_what_is_shown(api: Api, machine: Machine, job: dict[str, Any]) -> None
         ).stdout
 
     logs = command("logs", job["id"])
-    for line in ("Attempt 1 on", "Lost, and queued again", "Goes on from step", "Loaded 8 photographs in",
+    for line in ("Attempt 1", "Lost, and queued again", "Goes on from step", "Loaded 8 photographs in",
                  "Trained 500 iterations in", "held out", "Exported", "Succeeded"):  # fmt: skip
         assert line in logs, logs
     assert f"PSNR {job['psnr']:.2f} dB over held-out views; {job['training_psnr']:.2f} dB" in command(

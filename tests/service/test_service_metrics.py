@@ -109,6 +109,6 @@ async def test_upload_and_webhook_counters(connect_service: ConnectService) -> N
 
 async def test_metrics_require_token(connect_service: ConnectService) -> None:
     async with connect_service() as (http, service):
-        reader = await client_with_token(service, f"u{uuid.uuid4().hex[:5]}", "read")
+        monitor = await client_with_token(service, f"u{uuid.uuid4().hex[:5]}", "metrics")
         assert (await http.get("/metrics", headers={"Authorization": ""})).status_code == 401
-        assert await read(http, **reader)
+        assert await read(http, **monitor)

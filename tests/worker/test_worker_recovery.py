@@ -257,7 +257,7 @@ def test_job_log_has_stages_and_causes_without_paths(bench: WorkerHarness) -> No
     print_ = "[x.cc:12] Cannot open:cache/pixels.bin, cache/pixels.bin; see https://example.org/home/x"
     lines.remove(print_)  # comes by another way, so perhaps a moment later
     assert lines == [
-        "Attempt 1 on w",
+        "Attempt 1",
         "Loading",
         "Warning: images/a b.jpg is dark; …/support/toy_kind.py says so.",
         "Loaded in 2.0 s",
@@ -283,7 +283,7 @@ def test_flood_of_log_lines_is_cut(bench: WorkerHarness) -> None:
     lines = bench.log(job_id).splitlines()
     assert len(lines) <= 20_001 and any("the rest is left out" in line for line in lines)
     assert [line for line in lines if "library" not in line and "(More" not in line] == [
-        "Attempt 1 on w", "the toy begins at 0", "Training", "Trained 2 iterations in 1.0 s", "Succeeded"
+        "Attempt 1", "the toy begins at 0", "Training", "Trained 2 iterations in 1.0 s", "Succeeded"
     ]  # fmt: skip
     assert psutil.Process(worker.pid).memory_info().rss - before < 40 << 20
 

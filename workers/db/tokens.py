@@ -4,14 +4,17 @@ import hashlib
 import secrets
 import uuid
 from collections.abc import Sequence
-from typing import Literal
+from datetime import datetime
+from typing import Literal, LiteralString
 
 from octasplat.workers.db.connections import Connection, fetch_all, fetch_one
+from octasplat.workers.db.errors import NotFoundError
 from octasplat.workers.db.ids import new_id
 from octasplat.workers.db.rows import Token
 
 PREFIX = "octa_"
-SCOPES = ("read", "write", "admin")
+SCOPES = ("read", "write", "admin", "metrics")
+"""What tokens may do; ``metrics`` reads the figures of the whole service and nothing else."""
 LOCAL_OWNER = "local"
 """Whose things they are that were made on one's own machine."""
 Origin = Literal["environment", "machine"]
@@ -133,9 +136,42 @@ async def get_token(connection: Connection, token_id: uuid.UUID) -> Token | None
     )
 
 
-async def list_tokens(connection: Connection) -> list[Token]:
-    """Return all tokens, the newest first."""
-    return await fetch_all(connection, Token, "SELECT {} FROM tokens ORDER BY id DESC")
+async def get_any_token(connection: Connection, token_id: uuid.UUID, *, lock: bool = False) -> Token | None:
+    """Return the token of that id, valid or not, or None; with ``lock`` until the transaction ends."""
+    query: LiteralString = "SELECT {} FROM tokens WHERE id = %s"
+    if lock:
+        query += " FOR NO KEY UPDATE"  # sessions may begin meanwhile
+    return await fetch_one(connection, Token, query, [token_id])
+
+
+async def list_tokens(connection: Connection, owner: str | None = None) -> list[Token]:
+    """Return the tokens of an owner, the newest first; None takes those of all."""
+    query = "SELECT {} FROM tokens WHERE %(owner)s::text IS NULL OR owner = %(owner)s ORDER BY id DESC"
+    return await fetch_all(connection, Token, query, {"owner": owner})
+
+
+async def change_token(
+    connection: Connection,
+    token_id: uuid.UUID,
+    *,
+    name: str,
+    scopes: Sequence[str],
+    expires_at: datetime | None,
+) -> Token:
+    """Change a token, whose rights the caller has checked; returns it.
+
+    Raises:
+        NotFoundError: there is no such token.
+    """
+    token = await fetch_one(
+        connection,
+        Token,
+        "UPDATE tokens SET name = %s, scopes = %s, expires_at = %s WHERE id = %s RETURNING {}",
+        [name, list(scopes), expires_at, token_id],
+    )
+    if token is None:
+        raise NotFoundError("token")
+    return token
 
 
 async def has_any_token(connection: Connection) -> bool:

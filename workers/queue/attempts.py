@@ -318,7 +318,7 @@ async def claim(pool: Pool, job_id: uuid.UUID, entry_id: int, worker: str) -> At
         )
         await add_event(connection, job_id, job.attempt + 1, "state", {"state": "running", "worker": worker})
         await trim_log(connection, job_id, MAX_EARLIER_LOG_LINES)
-        await add_log_lines(connection, job_id, job.attempt + 1, [f"Attempt {job.attempt + 1} on {worker}"])
+        await add_log_lines(connection, job_id, job.attempt + 1, [f"Attempt {job.attempt + 1}"])
         claimed = await get_job(connection, job_id)
     assert claimed is not None
     return Attempt(pool, claimed)

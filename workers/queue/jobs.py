@@ -318,22 +318,28 @@ async def get_artifact(connection: Connection, job_id: uuid.UUID, name: str) -> 
     )
 
 
-async def queue_depths(connection: Connection) -> list[QueueDepth]:
-    """Return the count of waiting entries of each queue that has some."""
+async def queue_depths(connection: Connection, owner: str | None = None) -> list[QueueDepth]:
+    """Return the count of an owner's waiting jobs in each queue that has some; None counts all owners'."""
     cursor = await connection.execute(
         """
         SELECT queue, count(*) AS waiting,
             extract(epoch FROM now() - min(queued_at))::float8 AS oldest_seconds
-        FROM jobs WHERE state = 'queued' GROUP BY queue ORDER BY queue
-        """
+        FROM jobs WHERE state = 'queued' AND (%(owner)s::text IS NULL OR owner = %(owner)s)
+        GROUP BY queue ORDER BY queue
+        """,
+        {"owner": owner},
     )
     return [QueueDepth(**row) for row in await cursor.fetchall()]
 
 
-async def running_by_queue(connection: Connection) -> dict[str, int]:
-    """Return the number of running jobs by queue."""
+async def running_by_queue(connection: Connection, owner: str | None = None) -> dict[str, int]:
+    """Return the number of an owner's running jobs by queue; None counts all owners'."""
     cursor = await connection.execute(
-        "SELECT queue, count(*) AS n FROM jobs WHERE state IN ('running', 'canceling') GROUP BY queue"
+        """
+        SELECT queue, count(*) AS n FROM jobs WHERE state IN ('running', 'canceling')
+          AND (%(owner)s::text IS NULL OR owner = %(owner)s) GROUP BY queue
+        """,
+        {"owner": owner},
     )
     return {row["queue"]: row["n"] for row in await cursor.fetchall()}
 

@@ -4,7 +4,7 @@ import uuid
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import datetime
-from typing import Any, Literal
+from typing import Any, Literal, LiteralString
 
 from psycopg.rows import class_row
 
@@ -131,11 +131,14 @@ async def add_endpoint(
     return endpoint
 
 
-async def get_webhook_endpoint(connection: Connection, endpoint_id: uuid.UUID) -> Endpoint | None:
-    """Return the webhook endpoint with that id, or None."""
-    return await fetch_one(
-        connection, Endpoint, "SELECT {} FROM webhook_endpoints WHERE id = %s", [endpoint_id]
-    )
+async def get_webhook_endpoint(
+    connection: Connection, endpoint_id: uuid.UUID, *, lock: bool = False
+) -> Endpoint | None:
+    """Return the webhook endpoint with that id, or None; with ``lock`` until the transaction ends."""
+    query: LiteralString = "SELECT {} FROM webhook_endpoints WHERE id = %s"
+    if lock:
+        query += " FOR NO KEY UPDATE"  # jobs may go on to make messages
+    return await fetch_one(connection, Endpoint, query, [endpoint_id])
 
 
 async def list_endpoints(
