@@ -14,6 +14,12 @@ from octasplat.service.state import ServiceDep
 
 router = APIRouter(prefix="/v1/jobs", tags=["results"])
 
+PreviewStep = Annotated[
+    int | None,
+    Query(
+        alias="step", description="Changes nothing: gives each picture an address of its own in a browser."
+    ),
+]
 ArtifactName = Annotated[str, Path(max_length=1000, description="Such as scene.ply or renders/view_000.png.")]
 
 
@@ -50,7 +56,7 @@ async def get_artifact_content(
 )
 async def get_preview(
     job_id: JobId, principal: Reader, service: ServiceDep, request: Request,
-    _range: Range = None, _if_none_match: IfNoneMatch = None,
+    _step: PreviewStep = None, _range: Range = None, _if_none_match: IfNoneMatch = None,
 ) -> Response:  # fmt: skip
     """Return the newest preview of a running job."""
     blob = await actions.get_preview(service, principal, job_id)
