@@ -146,7 +146,7 @@ def problem_from_error(error: OctasplatError) -> ProblemError:
     """Return the problem document of an error of ours."""
     detail, again = str(error), RETRY_SECONDS
     if isinstance(error, IntakeError):
-        status = 408 if error.code == "upload-stalled" else 422
+        status = 408 if error.code in ("upload-stalled", "upload-too-slow") else 422
         detail += _unlisted(len(error.faults))
         faults = [fault.as_dict() for fault in error.faults[:MAX_ERRORS]]
         return ProblemError(status, error.code, detail, errors=faults)

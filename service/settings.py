@@ -46,7 +46,8 @@ class ServiceSettings(WorkerSettings):
         allowed_hosts: further names under which the service is reached while it listens at this machine only.
         max_upload_bytes: length of one uploaded file.
         max_archive_bytes: length of an uploaded archive.
-        max_spool_bytes: of all archives that are being read, on this machine's disk.
+        max_spool_bytes: what has come of all archives that are being read, on this machine's disk.
+        spool_share: the part of them that one owner may take.
         max_checks: datasets that are checked at once.
         max_waiting_checks: requests that wait for their dataset to be checked; further ones are refused.
         max_body_bytes: length of any other request.
@@ -80,7 +81,8 @@ class ServiceSettings(WorkerSettings):
     allowed_hosts: Annotated[tuple[str, ...], *COMMA_SEPARATED] = ()
     max_upload_bytes: int = Field(4 << 30, gt=0)
     max_archive_bytes: int = Field(64 << 30, gt=0)
-    max_spool_bytes: int = Field(64 << 30, gt=0)
+    max_spool_bytes: int = Field(128 << 30, gt=0)
+    spool_share: float = Field(0.5, gt=0, le=1)
     max_checks: int = Field(2, gt=0)
     max_waiting_checks: int = Field(24, ge=0)
     max_body_bytes: int = Field(1 << 20, gt=0)
@@ -142,7 +144,12 @@ class ServiceSettings(WorkerSettings):
     def spool(self) -> SpoolSpace:
         """Return the spool folder for uploaded archives, with its limits."""
         folder = self.work_folder / "archives"
-        return SpoolSpace(folder, max_bytes=self.max_spool_bytes, floor_bytes=self.floor_bytes)
+        return SpoolSpace(
+            folder,
+            max_bytes=self.max_spool_bytes,
+            owner_share=self.spool_share,
+            floor_bytes=self.floor_bytes,
+        )
 
     def checked(self) -> Self:
         """Return the settings if they are consistent; raise otherwise.

@@ -189,6 +189,7 @@ async def put_archive(
             service.storage,
             upload.body,
             service.spool_space,
+            owner=principal.owner,
             sha256=upload.sha256,
             size_bytes=upload.size_bytes,
             limits=service.settings.upload_limits(),

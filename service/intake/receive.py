@@ -5,6 +5,7 @@ import base64
 import binascii
 import re
 import tempfile
+import time
 from collections.abc import AsyncIterator, Callable, Mapping
 from dataclasses import dataclass, field
 from typing import BinaryIO
@@ -26,7 +27,6 @@ from octasplat.workers.storage.protocol import Blob, BlobWriter, Storage
 from octasplat.workers.storage.verifying_writer import VerifyingWriter
 
 PIECE_BYTES = 1 << 20
-_CHECK_EVERY_BYTES = 64 << 20
 _SHA256 = re.compile(r"(?:^|,)\s*sha-256\s*=\s*:([A-Za-z0-9+/=]*):\s*(?:;[^,]*)?(?=,|$)")
 
 
@@ -70,6 +70,7 @@ class UploadLimits:
         max_file_bytes: one file.
         max_archive_bytes: an archive as it is sent.
         idle_seconds: silence after which an upload is given up.
+        min_bytes_per_second: an upload that is slower over ``idle_seconds`` is given up.
         archive: what an archive may unpack to.
         dataset: what a dataset may be.
     """
@@ -77,6 +78,7 @@ class UploadLimits:
     max_file_bytes: int = 4 << 30
     max_archive_bytes: int = 64 << 30
     idle_seconds: float = 60.0
+    min_bytes_per_second: float = 4096.0
     archive: ArchiveLimits = field(default_factory=ArchiveLimits)
     dataset: DatasetLimits = field(default_factory=DatasetLimits)
 
@@ -114,32 +116,21 @@ def format_digest(sha256: str) -> str:
     return f"sha-256=:{base64.b64encode(bytes.fromhex(sha256)).decode()}:"
 
 
-async def receive_body(
-    stream: AsyncIterator[bytes], writer: BlobWriter, *, idle_seconds: float = 60.0
-) -> Blob:
+async def receive_body(stream: AsyncIterator[bytes], writer: BlobWriter, limits: UploadLimits) -> Blob:
     """Write a body to ``writer`` in threads, about a megabyte at a time, and commit it.
 
     Args:
         stream: the body, in pieces of any length.
         writer: where to; it is aborted on any error.
-        idle_seconds: silence after which the upload is given up.
+        limits: how slow it may be.
 
     Raises:
-        IntakeError: ``upload-stalled``.
+        IntakeError: ``upload-stalled`` or ``upload-too-slow``.
         StorageError: the content is not as announced, too large, or there is no room.
     """
     pending = bytearray()
     try:
-        pieces = aiter(stream)
-        while True:
-            try:
-                async with asyncio.timeout(idle_seconds):
-                    piece = await anext(pieces)
-            except StopAsyncIteration:
-                break
-            except TimeoutError:
-                detail = f"Nothing came for {idle_seconds:g} s; send the file again."
-                raise IntakeError(IntakeFault("upload-stalled", detail)) from None
+        async for piece in _limited_in_time(stream, limits):
             pending += piece
             if len(pending) >= PIECE_BYTES:
                 await run_in_pool(ThreadPurpose.UPLOADS, writer.write, bytes(pending))
@@ -150,6 +141,34 @@ async def receive_body(
     except BaseException:
         await asyncio.shield(run_in_pool(ThreadPurpose.UPLOADS, writer.abort))
         raise
+
+
+async def _limited_in_time(stream: AsyncIterator[bytes], limits: UploadLimits) -> AsyncIterator[bytes]:
+    """Yield the pieces of a body; the time in which nobody waits for one does not count."""
+    pieces, seconds = aiter(stream), limits.idle_seconds
+    waited_seconds, arrived_bytes = 0.0, 0
+    while True:
+        began = time.monotonic()
+        try:
+            async with asyncio.timeout(seconds):
+                piece = await anext(pieces)
+        except StopAsyncIteration:
+            return
+        except TimeoutError:
+            detail = f"Nothing came for {seconds:g} s; send the file again."
+            raise IntakeError(IntakeFault("upload-stalled", detail)) from None
+        waited_seconds += time.monotonic() - began
+        arrived_bytes += len(piece)
+        if waited_seconds >= seconds:
+            if arrived_bytes < limits.min_bytes_per_second * waited_seconds:
+                detail = (
+                    f"In {waited_seconds:.0f} s {arrived_bytes} bytes came, and "
+                    f"{limits.min_bytes_per_second:g} are needed each second; send the file over a faster "
+                    "connection, or in smaller files."
+                )
+                raise IntakeError(IntakeFault("upload-too-slow", detail))
+            waited_seconds, arrived_bytes = 0.0, 0
+        yield piece
 
 
 async def receive_file(
@@ -183,7 +202,7 @@ async def receive_file(
     writer = await run_in_pool(
         ThreadPurpose.UPLOADS, storage.open_writer, sha256=sha256, size_bytes=size_bytes, max_bytes=most
     )
-    blob = await receive_body(stream, writer, idle_seconds=limits.idle_seconds)
+    blob = await receive_body(stream, writer, limits)
     header = await run_in_pool(ThreadPurpose.UPLOADS, check, storage, path, blob.sha256, limits.dataset.image)
     return ReceivedFile(path, blob, header_facts(header))
 
@@ -193,6 +212,7 @@ async def receive_archive(
     stream: AsyncIterator[bytes],
     spool: SpoolSpace,
     *,
+    owner: str = "",
     sha256: str | None = None,
     size_bytes: int | None = None,
     limits: UploadLimits = DEFAULT_LIMITS,
@@ -204,6 +224,7 @@ async def receive_archive(
         storage: where to.
         stream: the body.
         spool: for the archive while it is read; the file there has no name and ends with the process.
+        owner: whose share of the spool it takes.
         sha256: digest that was announced.
         size_bytes: length that was announced.
         limits: what is taken.
@@ -220,10 +241,16 @@ async def receive_archive(
     with (
         file,
         _SpoolWriter(
-            file=file, spool=spool, storage=storage, sha256=sha256, size_bytes=size_bytes, max_bytes=most
+            file=file,
+            spool=spool,
+            owner=owner,
+            storage=storage,
+            sha256=sha256,
+            size_bytes=size_bytes,
+            max_bytes=most,
         ) as writer,
     ):
-        blob = await receive_body(stream, writer, idle_seconds=limits.idle_seconds)
+        blob = await receive_body(stream, writer, limits)
         files, listing = await run_in_pool(
             ThreadPurpose.UNPACKING, _unpack_archive, storage, file, limits, max_bytes
         )
@@ -264,12 +291,13 @@ def _unpack_archive(
 
 
 class _SpoolWriter(VerifyingWriter):
-    """Writes an archive into a nameless file of this machine, with its space reserved."""
+    """Writes an archive into a nameless file of this machine, with space taken as it comes."""
 
     def __init__(
         self,
         file: BinaryIO,
         spool: SpoolSpace,
+        owner: str,
         storage: Storage,
         sha256: str | None,
         size_bytes: int | None,
@@ -277,28 +305,24 @@ class _SpoolWriter(VerifyingWriter):
     ) -> None:
         self._file = file
         self._spool = spool
+        self._owner = owner
         self._storage = storage
-        self._reserved_bytes = self._written_bytes = 0
+        self._taken_bytes = 0
         super().__init__(sha256, size_bytes, max_bytes)
         storage.ensure_space(size_bytes or 0)
-        self._reserve(size_bytes or 0)
+        spool.ensure(owner, size_bytes or 0)
 
     def __exit__(self, *exception: object) -> None:
         super().__exit__(*exception)
-        self._spool.release(self._reserved_bytes)
-        self._reserved_bytes = 0
+        self._spool.release(self._owner, self._taken_bytes)
+        self._taken_bytes = 0
 
     def _write_bytes(self, data: bytes | memoryview) -> None:
-        self._written_bytes += len(data)
-        if self._written_bytes > self._reserved_bytes:
-            self._storage.ensure_space(len(data))
-            self._reserve(max(len(data), _CHECK_EVERY_BYTES))
+        self._storage.ensure_space(len(data))
+        self._spool.take(self._owner, len(data))
+        self._taken_bytes += len(data)
         with translate_os_errors(self._spool.folder):
             self._file.write(data)
-
-    def _reserve(self, size_bytes: int) -> None:
-        self._spool.reserve(size_bytes)
-        self._reserved_bytes += size_bytes
 
     def _publish(self, blob: Blob) -> None:
         with translate_os_errors(self._spool.folder):

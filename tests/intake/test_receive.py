@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 
 from octasplat.service.intake.faults import IntakeError
 from octasplat.service.intake.receive import (
+    PIECE_BYTES,
     UploadLimits,
     format_digest,
     parse_digest,
@@ -93,9 +94,40 @@ def test_receive_stalled_upload_is_refused(local_storage: LocalStorage) -> None:
 
     began = time.perf_counter()
     with pytest.raises(IntakeError) as caught:
-        asyncio.run(receive_body(slow(), local_storage.open_writer(), idle_seconds=0.2))
+        asyncio.run(receive_body(slow(), local_storage.open_writer(), UploadLimits(idle_seconds=0.2)))
     assert caught.value.code == "upload-stalled" and time.perf_counter() - began < 5
     assert local_storage.remove_stale_uploads(-60) == 0
+
+
+def test_receive_trickling_upload_is_ended(local_storage: LocalStorage) -> None:
+    async def trickle() -> AsyncIterator[bytes]:
+        while True:
+            await asyncio.sleep(0.05)
+            yield b"x"
+
+    limits = UploadLimits(idle_seconds=0.5, min_bytes_per_second=100)
+    began = time.perf_counter()
+    with pytest.raises(IntakeError, match="100 are needed each second") as caught:
+        asyncio.run(receive_body(trickle(), local_storage.open_writer(), limits))
+    assert caught.value.code == "upload-too-slow" and time.perf_counter() - began < 5
+    assert local_storage.remove_stale_uploads(-60) == 0
+
+
+def test_receive_slow_writing_does_not_count(local_storage: LocalStorage) -> None:
+    async def quick() -> AsyncIterator[bytes]:
+        for _ in range(4):
+            yield bytes(1 << 20)
+
+    writer = local_storage.open_writer()
+    write = writer.write
+
+    def write_slowly(data: bytes | memoryview) -> None:
+        time.sleep(0.3)
+        write(data)
+
+    writer.write = write_slowly  # type: ignore[method-assign]
+    limits = UploadLimits(idle_seconds=0.5, min_bytes_per_second=10 << 20)
+    assert asyncio.run(receive_body(quick(), writer, limits)).size_bytes == 4 << 20
 
 
 async def test_receive_disconnected_client_stores_nothing(local_storage: LocalStorage) -> None:
@@ -107,7 +139,7 @@ async def test_receive_disconnected_client_stores_nothing(local_storage: LocalSt
             arrived.set()
             await asyncio.sleep(0.001)
 
-    task = asyncio.create_task(receive_body(endless(), local_storage.open_writer()))
+    task = asyncio.create_task(receive_body(endless(), local_storage.open_writer(), UploadLimits()))
     await arrived.wait()
     task.cancel()
     with pytest.raises(asyncio.CancelledError):
@@ -171,7 +203,7 @@ def test_receive_without_disk_space_is_refused(tmp_path: Path) -> None:
 MEMORY = """
 import asyncio, resource, sys
 from pathlib import Path
-from octasplat.service.intake.receive import receive_body
+from octasplat.service.intake.receive import UploadLimits, receive_body
 from octasplat.workers.storage.local import LocalStorage
 
 async def body(megabytes):
@@ -180,9 +212,9 @@ async def body(megabytes):
         yield piece
 
 storage = LocalStorage(Path(sys.argv[1]), floor_bytes=0)
-asyncio.run(receive_body(body(4), storage.open_writer()))
+asyncio.run(receive_body(body(4), storage.open_writer(), UploadLimits()))
 before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-blob = asyncio.run(receive_body(body(int(sys.argv[2])), storage.open_writer()))
+blob = asyncio.run(receive_body(body(int(sys.argv[2])), storage.open_writer(), UploadLimits()))
 after = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 print(blob.size_bytes, after - before)
 """
@@ -196,3 +228,45 @@ def test_memory_does_not_grow_with_the_upload(tmp_path: Path) -> None:
     size, grown_kib = map(int, done.stdout.split())
     assert size == 300 << 20
     assert grown_kib < 16 << 10
+
+
+async def test_receive_archive_counts_what_arrived(local_storage: LocalStorage, tmp_path: Path) -> None:
+    data = scene_archive()
+    spool = SpoolSpace(tmp_path / "spool", max_bytes=3 * len(data))
+    arrived = asyncio.Event()
+
+    async def trickle() -> AsyncIterator[bytes]:
+        yield data[:1]
+        arrived.set()
+        await asyncio.sleep(600)
+
+    announced = receive_archive(local_storage, trickle(), spool, owner="alice", size_bytes=3 * len(data))
+    trickling = asyncio.create_task(announced)
+    await arrived.wait()
+    for owner in ("alice", "bob"):
+        found = await receive_archive(local_storage, body(data), spool, owner=owner, size_bytes=len(data))
+        assert found.size_bytes == len(data)
+    trickling.cancel()
+
+
+async def test_receive_archive_leaves_space_to_other_owners(
+    local_storage: LocalStorage, tmp_path: Path
+) -> None:
+    data = scene_archive() + bytes(2 * PIECE_BYTES)
+    spool = SpoolSpace(tmp_path / "spool", max_bytes=3 * len(data), owner_share=0.4)
+    arrived = asyncio.Event()
+
+    async def most_of_it() -> AsyncIterator[bytes]:
+        yield data[:PIECE_BYTES]
+        arrived.set()
+        await asyncio.sleep(600)
+
+    sending = asyncio.create_task(receive_archive(local_storage, most_of_it(), spool, owner="alice"))
+    await arrived.wait()
+    with pytest.raises(StorageFullError, match="Your archives"):
+        await receive_archive(local_storage, body(data), spool, owner="alice", size_bytes=len(data))
+    with pytest.raises(StorageFullError, match="Your archives"):
+        await receive_archive(local_storage, body(data, PIECE_BYTES), spool, owner="alice")
+    with pytest.raises(IntakeError):  # it arrived in full, with bytes after its end
+        await receive_archive(local_storage, body(data), spool, owner="bob", size_bytes=len(data))
+    sending.cancel()
