@@ -42,3 +42,9 @@ class BlobNotFoundError(StorageError):
     """The storage does not hold the requested content."""
 
     error_type = "blob_missing"
+
+
+class UntrustedFileError(StorageError):
+    """A program has put something into its folder that is not taken from there, such as a link."""
+
+    error_type = "not_a_file"

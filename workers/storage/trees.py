@@ -13,6 +13,7 @@ from octasplat.engine.core.portable_names import NameSet
 from octasplat.workers.storage.errors import StorageError
 from octasplat.workers.storage.os_errors import translate_os_errors
 from octasplat.workers.storage.protocol import Storage
+from octasplat.workers.storage.untrusted_folder import UntrustedFolder
 
 _PIECE_BYTES = 1 << 20
 
@@ -51,6 +52,7 @@ def store_tree(
     folder: Path,
     names: Iterable[str] | None = None,
     *,
+    below: str = "",
     metadata: dict[str, str | int | float | bool | None] | None = None,
     on_stored: Callable[[int], None] | None = None,
 ) -> Manifest:
@@ -58,31 +60,33 @@ def store_tree(
 
     Args:
         storage: where to.
-        folder: local folder.
-        names: files to store, relative to it; by default all regular files below it. Links are refused.
+        folder: local folder; what is below it may have been written by a program that is not trusted.
+        names: files to store, relative to the folder ``below``; by default all that it holds.
+        below: a folder below ``folder``, which is one of the names that are not trusted.
         metadata: goes into the manifest.
         on_stored: called with the length of every file stored; it may raise to give up.
 
     Raises:
-        StorageError: a file cannot be read, is a link, or the store does not take it.
+        StorageError: a file cannot be read, is a link or has a name elsewhere, or the store does not take it.
         FileNameError: a name is not portable.
     """
-    if names is None:
-        names = (path.relative_to(folder).as_posix() for path in folder.rglob("*") if not path.is_dir())
     known = NameSet()
     files: list[TreeFile] = []
-    for name in sorted(names):
-        known.add(name)
-        path = folder / name
-        if path.is_symlink() or not path.is_file():
-            raise StorageError(f"{path} is not a regular file and cannot be stored.")
-        with translate_os_errors(path), path.open("rb") as handle, storage.open_writer() as writer:
-            while piece := handle.read(_PIECE_BYTES):
-                writer.write(piece)
-            blob = writer.commit()
-        files.append(TreeFile(path=name, sha256=blob.sha256, size_bytes=blob.size_bytes))
-        if on_stored is not None:
-            on_stored(blob.size_bytes)
+    with UntrustedFolder(folder) as source:
+        for name in sorted(source.names(below) if names is None else names):
+            known.add(name)
+            inner = f"{below}/{name}" if below else name
+            with (
+                source.open(inner) as handle,
+                translate_os_errors(folder / inner),
+                storage.open_writer() as writer,
+            ):
+                while piece := handle.read(_PIECE_BYTES):
+                    writer.write(piece)
+                blob = writer.commit()
+            files.append(TreeFile(path=name, sha256=blob.sha256, size_bytes=blob.size_bytes))
+            if on_stored is not None:
+                on_stored(blob.size_bytes)
     return Manifest(files=tuple(files), about=metadata or {})
 
 

@@ -3,6 +3,7 @@
 import asyncio
 import contextlib
 import json
+import logging
 import os
 import re
 import signal
@@ -16,6 +17,8 @@ import psutil
 
 from octasplat.engine.core.isolated_python import python_command
 from octasplat.engine.files.splat_transform import PROGRAM_VARIABLE as SPLAT_TRANSFORM
+
+logger = logging.getLogger(__name__)
 
 MAX_LINE_BYTES = 1 << 20
 MAX_LAST_LINES = 20
@@ -166,7 +169,11 @@ class ChildProcess:
             self.is_ready = True
         if event["kind"] == "error":
             self.error = {"type": str(event.get("type")), "message": str(event.get("message"))}
-        self._on_event(event)
+        try:
+            self._on_event(event)
+        except (KeyError, TypeError, ValueError, AttributeError) as error:
+            # Of a program that writes what it likes; what follows is still read.
+            logger.info("an event of process %d was left out: %r", self.pid, error)
 
     def _on_stderr_line(self, line: str) -> None:
         text = line[-4000:].split("\r")[-1].rstrip()

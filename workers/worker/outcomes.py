@@ -18,6 +18,7 @@ from octasplat.workers.storage.errors import (
     DigestMismatchError,
     StorageError,
     StorageUnavailableError,
+    UntrustedFileError,
 )
 from octasplat.workers.storage.os_errors import is_disk_full
 from octasplat.workers.worker.context import DatabaseLostError, WorkerContext
@@ -135,7 +136,7 @@ class OutcomeWriter:
         if isinstance(error, StorageUnavailableError):
             await self.diagnose_and_requeue(described["message"])
         elif isinstance(error, StorageError) and not isinstance(
-            error, BlobNotFoundError | DigestMismatchError
+            error, BlobNotFoundError | DigestMismatchError | UntrustedFileError
         ):
             await self.requeue_counted(described)
         else:

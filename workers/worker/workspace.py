@@ -30,6 +30,7 @@ from octasplat.workers.storage.trees import (
     read_manifest,
     store_tree,
 )
+from octasplat.workers.storage.untrusted_folder import UntrustedFolder
 from octasplat.workers.worker.media_types import media_type
 from octasplat.workers.worker.task import FILES_FOLDER, FRAMES_FOLDER, RESULTS_FOLDER, RUN_FOLDER
 
@@ -45,6 +46,8 @@ _CHECKPOINT_FILES = (
 _MAX_TRIES = 5
 METRICS_FILE = "metrics.json"
 MAX_METRICS_BYTES = 16 << 20
+MAX_RECORD_BYTES = 64 << 20
+"""Of the list of finished frames; a longer one is cut, and is then none."""
 
 
 @dataclass(frozen=True)
@@ -133,15 +136,11 @@ class Workspace:
 
     def used_bytes(self) -> int:
         """Return the disk usage of the folder, without files shared with the storage."""
-        blocks: dict[int, int] = {}
-        for folder, names, files in os.walk(self.folder):
-            if Path(folder) == self.folder and FILES_FOLDER in names:
-                names.remove(FILES_FOLDER)
-            for name in files:
-                with contextlib.suppress(FileNotFoundError):
-                    facts = os.lstat(os.path.join(folder, name))  # noqa: PTH118 - thousands of them, each second
-                    blocks[facts.st_ino] = facts.st_blocks
-        taken = 512 * sum(blocks.values())
+        try:
+            with UntrustedFolder(self.folder) as folder:
+                taken = folder.disk_usage_bytes(leave_out=FILES_FOLDER)
+        except StorageError:  # it is gone
+            taken = 0
         self._peak_used_bytes = max(taken, self._peak_used_bytes)
         return taken
 
@@ -206,8 +205,9 @@ class Workspace:
                 files = self._store_files(names)
             except StorageError:
                 # The program replaces files while they are read; whatever else is wrong stays wrong.
-                if all((self.folder / name).exists() for name in names):
-                    raise
+                with UntrustedFolder(self.folder) as folder:
+                    if all(folder.is_file(name) for name in names):
+                        raise
                 time.sleep(0.05)
                 continue
             return Checkpoint(self._job.attempt, stage, step, files)
@@ -217,7 +217,8 @@ class Workspace:
         """Store the results without publishing them."""
         return store_tree(
             self.storage,
-            self.folder / RESULTS_FOLDER,
+            self.folder,
+            below=RESULTS_FOLDER,
             metadata={"job": str(self._job.id), "attempt": self._job.attempt, "kind": self._job.kind},
         )
 
@@ -234,8 +235,7 @@ class Workspace:
 
     def store_partial_results(self) -> list[ResultFile]:
         """Store the finished results of a failed program; only its job's row shows them."""
-        folder = self.folder / RESULTS_FOLDER
-        return _result_files(store_tree(self.storage, folder)) if folder.is_dir() else []
+        return _result_files(store_tree(self.storage, self.folder, below=RESULTS_FOLDER))
 
     def read_psnr(self, results: Sequence[ResultFile]) -> float | None:
         """Return the mean PSNR over the held-out views in dB; None if the results have none."""
@@ -273,35 +273,35 @@ class Workspace:
 
     def _frame_checkpoint_files(self) -> list[str]:
         """Return the record of finished frames, and those that it names."""
-        folder = self.folder / RUN_FOLDER / FRAMES_FOLDER
-        try:
-            rows = [
-                json.loads(line) for line in (folder / RECORD_FILE).read_text(encoding="utf-8").splitlines()
-            ]
-        except (OSError, ValueError):  # none yet, or it is being written
-            return []
-        names = [RECORD_FILE, *(row["file"] for row in rows[1:])]
-        return [f"{RUN_FOLDER}/{FRAMES_FOLDER}/{name}" for name in names if (folder / name).is_file()]
+        frames = f"{RUN_FOLDER}/{FRAMES_FOLDER}"
+        with UntrustedFolder(self.folder) as folder:
+            try:
+                with folder.open(f"{frames}/{RECORD_FILE}") as handle:
+                    rows = [json.loads(line) for line in handle.read(MAX_RECORD_BYTES).splitlines()]
+                names = [RECORD_FILE, *(str(row["file"]) for row in rows[1:])]
+            except (StorageError, ValueError, TypeError, KeyError):  # none yet, or it is being written
+                return []
+            return [name for name in (f"{frames}/{name}" for name in names) if folder.is_file(name)]
 
     def _checkpoint_files(self, stage: str) -> list[str]:
         if stage == "render":
             return self._frame_checkpoint_files()
-        names = [name for name in _CHECKPOINT_FILES if (self.folder / name).is_file()]
-        poses = [
-            path.relative_to(self.folder).as_posix()
-            for path in sorted((self.folder / RUN_FOLDER / POSES_FOLDER).glob("*"))
-        ]
+        with UntrustedFolder(self.folder) as folder:
+            names = [name for name in _CHECKPOINT_FILES if folder.is_file(name)]
+            poses = sorted(_directly_below(folder, f"{RUN_FOLDER}/{POSES_FOLDER}"))
+            checkpoints = _directly_below(folder, f"{RUN_FOLDER}/checkpoints")
         names += poses
         if "run/scene.ply" in names:  # the training is done, its checkpoints are of no more use
             return [name for name in names if not name.endswith(".npz")]
-        checkpoints = [
-            path.relative_to(self.folder).as_posix()
-            for path in (self.folder / RUN_FOLDER / "checkpoints").glob("iteration_*.npz")
-        ]
         newest = max((name for name in checkpoints if _CHECKPOINT.fullmatch(name)), default=None)
         if newest is not None:
             return [*names, newest]
         return names if poses else []
+
+
+def _directly_below(folder: UntrustedFolder, below: str) -> list[str]:
+    """Return the names, relative to ``folder``, of the files of one of its folders."""
+    return [f"{below}/{name}" for name in folder.names(below) if "/" not in name]
 
 
 def sweep_workspaces(root: Path, dataset_seconds: float = 86_400.0) -> int:
@@ -374,7 +374,9 @@ def _results_document(job: Job, attempt: int) -> str:
 
 def _open_locked(path: Path, *, create: bool = True) -> IO[bytes]:
     """Open a file and hold its lock, which ends with this process."""
-    handle = path.open("wb" if create else "r+b")
+    # A program may have put a link in the place of the file.
+    flags = os.O_RDWR | os.O_NOFOLLOW | os.O_CLOEXEC | (os.O_CREAT if create else 0)
+    handle = os.fdopen(os.open(path, flags, 0o600), "r+b")
     try:
         fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except OSError:

@@ -1,0 +1,250 @@
+"""A kind of job whose program does what code in a job's process could do that somebody has planted there."""
+
+import ctypes
+import json
+import mmap
+import os
+import resource
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+from pydantic import BaseModel, ConfigDict
+
+from octasplat.engine.core.events import Event, PhaseStarted
+from octasplat.workers.worker.job_kinds import JobKind, register
+from octasplat.workers.worker.task import Task
+
+DAEMON = """
+import os, sys, time
+if os.fork() == 0:
+    os.setsid()
+    if os.fork() == 0:
+        if sys.argv[1] == "quiet":
+            os.closerange(0, 256)
+        while True:
+            time.sleep(1)
+"""
+SYSCALLS = {"add_key": 248, "bpf": 321, "clone3": 435, "io_uring_setup": 425, "keyctl": 250, "mount": 165}
+NEW_USER_NAMESPACE = 0x10000000
+
+
+class HostileOptions(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    attack: str
+    target: str = ""
+    """A file or folder that is none of the job's."""
+    pids: tuple[int, ...] = ()
+    """Processes that are none of the job's."""
+    size_bytes: int = 0
+
+
+class PreviewClaim(Event):
+    """Says that there is a picture where there is a link."""
+
+    kind = "preview_written"
+
+    def as_dict(self) -> dict[str, object]:
+        return {"kind": self.kind, "path": "token", "step": 1, "view": "a"}
+
+
+class NonsenseEvent(Event):
+    """A known event without what belongs to it."""
+
+    kind = "stage_started"
+
+    def as_dict(self) -> dict[str, object]:
+        return {"kind": self.kind}
+
+
+def run(task: Task) -> None:
+    options = HostileOptions.model_validate(task.options)
+    task.progress(PhaseStarted("train", 1))
+    ATTACKS[options.attack](task, options)
+
+
+def _tell(task: Task, tries: Mapping[str, Callable[[], object]]) -> None:
+    """Write what each try gave: its value, or the kind of its error."""
+    found: dict[str, object] = {}
+    for name, attempt in tries.items():
+        try:
+            found[name] = attempt()
+        except OSError as error:
+            found[name] = type(error).__name__
+    (task.results / "found.json").write_text(json.dumps(found, default=str))
+
+
+def _link_run(task: Task, options: HostileOptions) -> None:
+    """The engine's output folder is replaced by a link, and a picture is announced."""
+    task.progress(NonsenseEvent())
+    if task.run.exists():
+        task.run.rename(task.folder / "aside")
+    task.run.symlink_to(options.target)
+    task.progress(PreviewClaim())
+    _wait_for_gate(task, options)
+    (task.results / "done.txt").write_text("done")
+
+
+def _link_results(task: Task, options: HostileOptions) -> None:
+    (task.folder / "results").symlink_to(options.target)
+
+
+def _link_result(task: Task, options: HostileOptions) -> None:
+    (task.results / "inner").symlink_to(options.target)
+
+
+def _pipe_result(task: Task, _options: HostileOptions) -> None:
+    os.mkfifo(task.results / "pipe")
+
+
+def _wait_for_gate(task: Task, options: HostileOptions) -> None:
+    """Wait for the file ``gate`` beside the target."""
+    while not Path(options.target).with_name("gate").exists() and not task.should_stop():
+        time.sleep(0.05)
+
+
+def _syscall(number: int, *arguments: object) -> int:
+    libc = ctypes.CDLL(None, use_errno=True)
+    result = int(libc.syscall(ctypes.c_long(number), *arguments))
+    if result < 0:
+        raise OSError(ctypes.get_errno(), os.strerror(ctypes.get_errno()))
+    return result
+
+
+def _clone_user_namespace() -> int:
+    child = _syscall(56, ctypes.c_ulong(NEW_USER_NAMESPACE | signal.SIGCHLD), None, None, None, None)
+    if child == 0:
+        os._exit(0)
+    return os.waitpid(child, 0)[1]
+
+
+def _change_what_landlock_does_not_know(task: Task, options: HostileOptions) -> None:
+    path, own = Path(options.target), task.folder / "own"
+    own.write_text("x")
+    handle = os.open(own, os.O_RDONLY)
+    limits = (1, resource.RLIM_INFINITY)
+    calls: dict[str, Callable[[], object]] = {
+        "chmod": lambda: os.chmod(path, 0o644),  # noqa: PTH101
+        "chmod by folder": lambda: os.chmod(path.name, 0o644, dir_fd=os.open(path.parent, os.O_PATH)),
+        "fchmodat2": lambda: _syscall(452, -100, os.fsencode(path), 0o644, 0),
+        "chown": lambda: os.chown(path, os.geteuid(), os.getegid()),
+        "lchown": lambda: os.lchown(path, os.geteuid(), os.getegid()),
+        "utime": lambda: os.utime(path, (1.0, 1.0)),
+        "setxattr": lambda: os.setxattr(path, "user.planted", b"x"),
+        "removexattr": lambda: os.removexattr(path, "user.planted"),
+        "fsetxattr": lambda: os.setxattr(handle, "user.planted", b"x"),
+        "watch": lambda: _syscall(253),
+        "namespace by clone": _clone_user_namespace,
+        "namespace by unshare": lambda: _syscall(272, ctypes.c_ulong(NEW_USER_NAMESPACE)),
+        "chroot": lambda: os.chroot("/"),
+        "memory file": lambda: os.memfd_create("x"),
+        "shared memory": lambda: mmap.mmap(-1, 1 << 20).close(),
+        "system v": lambda: _syscall(29, 0, ctypes.c_size_t(4096), 0o1600),
+        "message queue": lambda: _syscall(240, b"planted", 0o102, 0o600, None),
+        "socket": lambda: socket.socket(socket.AF_UNIX).close(),
+        "terminal": lambda: _syscall(16, 0, 0x5412, b"x"),
+        **{
+            name: (lambda number=number: _syscall(number, 0, 0, 0, 0, 0)) for name, number in SYSCALLS.items()
+        },
+    }
+    for pid in options.pids:
+        calls[f"limits of {pid}"] = lambda pid=pid: resource.prlimit(pid, resource.RLIMIT_CPU, limits)
+        calls[f"cores of {pid}"] = lambda pid=pid: os.sched_setaffinity(pid, {0})
+        calls[f"priority of {pid}"] = lambda pid=pid: os.setpriority(os.PRIO_PROCESS, pid, 19)
+        calls[f"signal to {pid}"] = lambda pid=pid: os.kill(pid, signal.SIGTERM)
+        calls[f"tracing of {pid}"] = lambda pid=pid: _syscall(101, 16, pid, 0, 0)
+    _tell(task, calls)
+
+
+def _leave_quiet_daemon(task: Task, _options: HostileOptions) -> None:
+    _start_daemon("quiet")
+    _tell(task, {})
+
+
+def _leave_daemon_with_pipes(task: Task, options: HostileOptions) -> None:
+    _start_daemon("loud")
+    if options.size_bytes:  # goes on, too
+        while True:
+            time.sleep(1)
+    _tell(task, {})
+
+
+def _start_daemon(how: str) -> None:
+    # With the pipes of the job.
+    subprocess.run([sys.executable, "-c", DAEMON, how], check=True)
+    time.sleep(0.5)
+
+
+def _hog_shared_memory(task: Task, options: HostileOptions) -> None:
+    def hog() -> int:
+        shared = mmap.mmap(-1, options.size_bytes)
+        for start in range(0, options.size_bytes, 1 << 20):
+            shared[start : start + 1] = b"x"
+            shared[start : start + (1 << 20) : 4096] = b"x" * 256
+        time.sleep(5)
+        return len(shared)
+
+    _tell(task, {"hog": hog})
+
+
+def _write_elsewhere(task: Task, options: HostileOptions) -> None:
+    import numpy
+
+    import octasplat
+
+    folders = {
+        "engine": Path(octasplat.__file__).resolve().parent / "engine",
+        "site-packages": Path(numpy.__file__).parents[1],
+        "home": Path.home(),
+        "etc": Path("/etc"),
+        "shared memory": Path("/dev/shm"),
+        "temporary": Path("/tmp"),
+        "lasting temporary": Path("/var/tmp"),
+        "target": Path(options.target),
+    }
+
+    def write(folder: Path) -> str:
+        path = folder / f"planted-{os.path.basename(task.folder)}"  # noqa: PTH119
+        path.write_text("x")
+        path.unlink()
+        return str(path)
+
+    devices = list(Path("/dev").glob("[vs]d[a-z]"))
+    _tell(
+        task,
+        {
+            **{name: (lambda folder=folder: write(folder)) for name, folder in folders.items()},
+            **{str(path): (lambda path=path: path.open("rb").close()) for path in devices},
+            "own folder": lambda: write(task.folder) and "written",
+            "own temporary": lambda: write(Path(os.environ["TMPDIR"])) and "written",
+        },
+    )
+
+
+ATTACKS: Mapping[str, Callable[[Task, HostileOptions], None]] = {
+    "link run": _link_run,
+    "link results": _link_results,
+    "link result": _link_result,
+    "pipe result": _pipe_result,
+    "calls": _change_what_landlock_does_not_know,
+    "daemon": _leave_quiet_daemon,
+    "daemon with pipes": _leave_daemon_with_pipes,
+    "shared memory": _hog_shared_memory,
+    "write elsewhere": _write_elsewhere,
+}
+
+register(
+    JobKind(
+        name="hostile",
+        title="Does harm",
+        needs="dataset",
+        options=HostileOptions,
+        program="tests.support.hostile_kind:run",
+        stages=("train",),
+    )
+)
