@@ -18,6 +18,7 @@ from octasplat.service.login_throttle import LoginThrottle
 from octasplat.service.middleware import (
     AllowedHostsMiddleware,
     BodyLimitMiddleware,
+    CompressionMiddleware,
     SameOriginMiddleware,
     SecurityHeadersMiddleware,
 )
@@ -25,6 +26,7 @@ from octasplat.service.openapi import extend_openapi, operation_id
 from octasplat.service.problems import add_problem_handlers
 from octasplat.service.proxy_headers import ProxyHeadersMiddleware
 from octasplat.service.query_parameters import refuse_unknown_parameters
+from octasplat.service.request_id import RequestIdMiddleware
 from octasplat.service.routes import (
     artifacts,
     audit,
@@ -36,6 +38,7 @@ from octasplat.service.routes import (
     scene_previews,
     system,
     tokens,
+    webhook_messages,
     webhooks,
 )
 from octasplat.service.settings import ServiceSettings
@@ -97,6 +100,8 @@ def create_app(settings: ServiceSettings | None = None) -> FastAPI:
         generate_unique_id_function=operation_id,
         docs_url=None,  # the pages have their own, which needs nothing from elsewhere
         redoc_url=None,
+        webhooks=webhook_messages.router,
+        servers=[{"url": "/", "description": "The service that gave this document."}],
         license_info={"name": "Apache-2.0", "identifier": "Apache-2.0"},
     )
     for module_router in (
@@ -118,8 +123,10 @@ def create_app(settings: ServiceSettings | None = None) -> FastAPI:
     if settings.is_private:
         app.add_middleware(AllowedHostsMiddleware, names=settings.allowed_hosts)
     app.add_middleware(SecurityHeadersMiddleware)
+    app.add_middleware(CompressionMiddleware)
     if settings.proxies:
         app.add_middleware(ProxyHeadersMiddleware, proxies=settings.proxies, style=settings.proxy_headers)
+    app.add_middleware(RequestIdMiddleware)
     return app
 
 

@@ -2,6 +2,9 @@
 
 import re
 import urllib.parse
+from collections.abc import Iterator, Sequence
+from datetime import datetime
+from functools import partial
 from pathlib import Path, PurePosixPath
 
 from fastapi import Request, Response
@@ -13,6 +16,8 @@ from octasplat.service.intake.receive import format_digest
 from octasplat.service.ranges import requested_ranges
 from octasplat.service.state import Service
 from octasplat.service.thread_pools import ThreadPurpose, run_in_pool
+from octasplat.service.zip_stream import ZipEntry, stream_zip
+from octasplat.workers.db.rows import Artifact
 
 _INLINE_TYPES = ("image/png", "image/jpeg", "application/json", "text/plain", "model/gltf-binary")
 _SANDBOX_POLICY = (
@@ -73,6 +78,29 @@ async def send_blob(
         media_type,
         headers,
     )
+
+
+def send_archive(
+    service: Service, artifacts: Sequence[Artifact], name: str, modified_at: datetime
+) -> Response:
+    """Return a response with all results as one ZIP file, which is made while it is sent.
+
+    Args:
+        service: the service.
+        artifacts: the results.
+        name: file name for whoever saves it.
+        modified_at: the time of its entries.
+    """
+
+    def read(artifact: Artifact) -> Iterator[bytes]:
+        return service.storage.read(artifact.sha256, 0, artifact.size_bytes)
+
+    entries = [ZipEntry(row.name, row.size_bytes, partial(read, row)) for row in artifacts]
+    headers = {
+        "Content-Disposition": _content_disposition(name, inline=False),
+        "Cache-Control": "private, no-cache",
+    }
+    return StreamingResponse(stream_zip(entries, modified_at), media_type="application/zip", headers=headers)
 
 
 def _stored_response(

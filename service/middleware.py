@@ -1,10 +1,12 @@
 """Middleware that refuses requests early: foreign hosts, foreign pages, too long bodies."""
 
+import re
 from collections.abc import Mapping
 from urllib.parse import urlsplit
 
 from starlette.datastructures import Headers
 from starlette.middleware.body_limit import RequestBodyLimitMiddleware
+from starlette.middleware.gzip import GZipMiddleware
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from octasplat.service.problems import ProblemError
@@ -94,6 +96,25 @@ class BodyLimitMiddleware:
         await next(limited, self._limited)(scope, receive, send_as_problem)
 
 
+class CompressionMiddleware:
+    """Compresses what is made for an answer.
+
+    Stored content is sent as it is, as its digests and ranges are of its own bytes.
+
+    Args:
+        app: behind it.
+    """
+
+    def __init__(self, app: ASGIApp) -> None:
+        self._app = app
+        self._compressed = GZipMiddleware(app, minimum_size=1000, compresslevel=5)
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Pass a request on, and compress the response if the client can read that."""
+        is_stored = scope["type"] == "http" and _STORED_CONTENT.fullmatch(scope["path"])
+        await (self._app if is_stored else self._compressed)(scope, receive, send)
+
+
 class SecurityHeadersMiddleware:
     """Adds headers that forbid browsers to sniff types, frame pages and store responses."""
 
@@ -115,6 +136,9 @@ class SecurityHeadersMiddleware:
         await self._app(scope, receive, with_headers if scope["type"] == "http" else send)
 
 
+_STORED_CONTENT = re.compile(
+    r"/v1/(jobs|datasets)/[^/]+/((artifacts|files)/.+|preview|archive|events)", re.DOTALL
+)
 _PLAIN_TEXT_HEADER = (b"content-type", b"text/plain; charset=utf-8")
 _SECURITY_HEADERS = (
     (b"x-content-type-options", b"nosniff"),

@@ -7,6 +7,7 @@ from fastapi.routing import APIRoute
 from pydantic.json_schema import models_json_schema
 
 from octasplat.service.problems import ProblemDocument
+from octasplat.service.request_id import HEADER
 from octasplat.workers.worker.job_kinds import JobKind, job_kinds
 
 _REF = "#/components/schemas/"
@@ -31,10 +32,23 @@ def extend_openapi(app: FastAPI) -> None:
             for name in ("HTTPValidationError", "ValidationError"):
                 schemas.pop(name, None)
             add_option_schemas(schemas)
+            _add_request_ids(document)
             app.openapi_schema = document
         return app.openapi_schema
 
     app.openapi = openapi  # type: ignore[method-assign]
+
+
+def _add_request_ids(document: dict[str, Any]) -> None:
+    """Declare the header that every answer has."""
+    header = {
+        "description": "Id of the request, that of its client where it sends one; see the service's log.",
+        "schema": {"type": "string"},
+    }
+    for item in document["paths"].values():
+        for operation in item.values():
+            for answer in operation["responses"].values():
+                answer.setdefault("headers", {})[HEADER] = header
 
 
 def add_option_schemas(schemas: dict[str, Any]) -> None:

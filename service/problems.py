@@ -10,7 +10,7 @@ from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
 from psycopg_pool import PoolTimeout
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from starlette.exceptions import HTTPException
 
 from octasplat.engine.core.errors import OctasplatError
@@ -18,6 +18,7 @@ from octasplat.engine.operations.base import error_text
 from octasplat.engine.pathtracing.stage.stage_file import stage_error_message, stage_key_path
 from octasplat.engine.settings.refusals import InvalidSettingsError
 from octasplat.service.intake.faults import IntakeError
+from octasplat.service.request_id import current_request_id
 from octasplat.workers.db.errors import ConflictError, NotFoundError
 from octasplat.workers.db.quotas import QuotaExceededError
 from octasplat.workers.storage.errors import (
@@ -60,6 +61,7 @@ class ProblemDocument(BaseModel):
     title: str
     status: int
     detail: str
+    request_id: str | None = Field(None, description="Of X-Request-ID; lines of the service's log name it.")
     errors: list[dict[str, Any]] | None = None
 
 
@@ -102,6 +104,8 @@ class ProblemError(Exception):
             "status": self.status,
             "detail": self.detail,
         }
+        if (request_id := current_request_id()) is not None:
+            content["request_id"] = request_id
         if self.errors is not None:
             content["errors"] = [dict(error) for error in self.errors]
         return JSONResponse(content, status_code=self.status, headers=self.headers, media_type=MEDIA_TYPE)

@@ -21,6 +21,7 @@ from octasplat.service.limited_protocol import (
     LimitedProtocol,
     log_loop_error,
 )
+from octasplat.service.request_id import RequestIdFilter
 from octasplat.service.settings import ServiceSettings
 from octasplat.workers.logs import RepeatedMessages, log_to_stderr
 from octasplat.workers.parent_death_signal import die_with_local_service
@@ -74,6 +75,8 @@ def main() -> int:
     """Serve until asked to stop; the address goes to stdout once requests are taken."""
     forbid_memory_access()
     log_to_stderr()
+    for handler in logging.getLogger().handlers:
+        handler.addFilter(RequestIdFilter())
     if not die_with_local_service():
         log_missing_capabilities()
     try:

@@ -7,7 +7,7 @@ from octasplat.service.auth import Principal
 from octasplat.service.problems import not_found_error
 from octasplat.service.state import Service
 from octasplat.service.thread_pools import ThreadPurpose, run_in_pool
-from octasplat.workers.db.rows import Artifact
+from octasplat.workers.db.rows import Artifact, Job
 from octasplat.workers.queue import jobs as rows
 from octasplat.workers.storage.protocol import Blob
 
@@ -21,6 +21,24 @@ async def list_artifacts(service: Service, principal: Principal, job_id: uuid.UU
     async with service.pool.connection() as connection:
         await fetch_visible_job(connection, principal, job_id)
         return await rows.artifacts_of(connection, job_id)
+
+
+async def get_job_with_artifacts(
+    service: Service, principal: Principal, job_id: uuid.UUID
+) -> tuple[Job, list[Artifact]]:
+    """Return a job and its results, of which there is one at least.
+
+    Raises:
+        ProblemError: 404 if it does not exist, has no results, or the principal may not see it.
+        StorageError: the store does not have a result.
+    """
+    async with service.pool.connection() as connection:
+        job = await fetch_visible_job(connection, principal, job_id)
+        found = await rows.artifacts_of(connection, job_id)
+    if not found:
+        raise not_found_error("result")
+    await run_in_pool(ThreadPurpose.DOWNLOADS, lambda: [service.storage.stat(row.sha256) for row in found])
+    return job, found
 
 
 async def get_artifact(

@@ -3,6 +3,7 @@
 from typing import Any
 
 from octasplat.service.problems import MEDIA_TYPE, ProblemDocument
+from octasplat.service.routes.response_headers import CONTENT_RANGE, RETRY_AFTER, WWW_AUTHENTICATE
 
 
 def problem_responses(*statuses: int) -> dict[int | str, dict[str, Any]]:
@@ -15,8 +16,20 @@ def problem_responses(*statuses: int) -> dict[int | str, dict[str, Any]]:
         413: "Too long", 416: "No such range", 421: "A foreign host name", 422: "Refused; see errors",
         429: "Too many requests, or wrong tokens", 503: "Try again later", 507: "No room",
     }  # fmt: skip
+    headers = {
+        401: WWW_AUTHENTICATE,
+        416: CONTENT_RANGE,
+        429: RETRY_AFTER,
+        503: RETRY_AFTER,
+        507: RETRY_AFTER,
+    }
     return {
-        status: {"description": names[status], "content": content, "model": None}
+        status: {
+            "description": names[status],
+            "content": content,
+            "model": None,
+            **({"headers": dict(headers[status])} if status in headers else {}),
+        }
         for status in sorted({400, 401, 403, 421, 422, 429, 503, *statuses})
     }
 

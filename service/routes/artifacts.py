@@ -6,9 +6,10 @@ from fastapi import APIRouter, Path, Query, Request, Response
 
 from octasplat.service.actions import artifacts as actions
 from octasplat.service.auth import Reader
-from octasplat.service.downloads import send_blob
+from octasplat.service.downloads import send_archive, send_blob
 from octasplat.service.routes import problem_responses
 from octasplat.service.routes.parameters import IfNoneMatch, IfRange, JobId, Range
+from octasplat.service.routes.response_headers import DISPOSITION, stored_content, with_headers
 from octasplat.service.schemas.artifacts import ArtifactList, ArtifactView
 from octasplat.service.state import ServiceDep
 
@@ -31,7 +32,9 @@ async def list_artifacts(job_id: JobId, principal: Reader, service: ServiceDep) 
 
 
 @router.get(
-    "/{job_id}/artifacts/{name:path}", responses=problem_responses(404, 410, 416), response_class=Response
+    "/{job_id}/artifacts/{name:path}",
+    responses={**stored_content(), **problem_responses(404, 410, 416)},
+    response_class=Response,
 )
 @router.head(
     "/{job_id}/artifacts/{name:path}", responses=problem_responses(404, 410, 416), include_in_schema=False
@@ -50,8 +53,31 @@ async def get_artifact_content(
 
 
 @router.get(
+    "/{job_id}/archive",
+    responses={
+        **with_headers(
+            200,
+            DISPOSITION,
+            description="The ZIP file",
+            content={"application/zip": {"schema": {"type": "string", "format": "binary"}}},
+        ),
+        **problem_responses(404, 410),
+    },
+    response_class=Response,
+)
+async def get_results_archive(job_id: JobId, principal: Reader, service: ServiceDep) -> Response:
+    """Return all results as one ZIP file, which is made while it is sent.
+
+    Its length is not known before and it cannot be resumed; single results can.
+    """
+    job, found = await actions.get_job_with_artifacts(service, principal, job_id)
+    name = f"octasplat-{job.id.hex[-12:]}.zip"
+    return send_archive(service, found, name, job.finished_at or job.created_at)
+
+
+@router.get(
     "/{job_id}/preview",
-    responses={200: {"content": {"image/png": {}}}, **problem_responses(404, 410, 416)},
+    responses={**stored_content("image/png", "multipart/byteranges"), **problem_responses(404, 410, 416)},
     response_class=Response,
 )
 async def get_preview(

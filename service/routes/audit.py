@@ -6,13 +6,14 @@ from octasplat.service.actions.audit import list_entries
 from octasplat.service.auth import Admin
 from octasplat.service.paging import Cursor, Limit, decode_number_cursor, set_next_link
 from octasplat.service.routes import problem_responses
+from octasplat.service.routes.response_headers import LINK, with_headers
 from octasplat.service.schemas.audit import AuditPage, AuditView
 from octasplat.service.state import ServiceDep
 
 router = APIRouter(prefix="/v1/audit", tags=["service"])
 
 
-@router.get("", responses=problem_responses())
+@router.get("", responses={**with_headers(200, LINK), **problem_responses()})
 async def list_audit_entries(
     _principal: Admin, service: ServiceDep, request: Request, response: Response, limit: Limit = 50,
     cursor: Cursor = None,

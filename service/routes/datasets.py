@@ -1,7 +1,7 @@
 """Routes of datasets: created, filled file by file or by an archive, committed, read, deleted."""
 
 from collections.abc import AsyncIterator
-from typing import Annotated
+from typing import Annotated, Any
 
 from fastapi import APIRouter, Header, Path, Request, Response
 from starlette.requests import ClientDisconnect
@@ -23,6 +23,14 @@ from octasplat.service.routes.parameters import (
     IfRange,
     Range,
 )
+from octasplat.service.routes.response_headers import (
+    ETAG,
+    LINK,
+    LOCATION,
+    not_modified,
+    stored_content,
+    with_headers,
+)
 from octasplat.service.schemas.datasets import (
     ArchiveView,
     DatasetChange,
@@ -42,10 +50,19 @@ Digest = Annotated[
     str | None,
     Header(alias="Repr-Digest", max_length=1000, description="RFC 9530: `sha-256=:<base64>:`"),
 ]
+
+
+def _binary_body(*media_types: str) -> dict[str, Any]:
+    """Return the OpenAPI description of a body of bytes."""
+    schema = {"type": "string", "format": "binary"}
+    content = {name: {"schema": schema} for name in media_types}
+    return {"requestBody": {"content": content, "required": True}}
+
+
 FilePath = Annotated[str, Path(max_length=1000, description="Such as images/0001.jpg.")]
 
 
-@router.post("", status_code=201, responses=problem_responses(404))
+@router.post("", status_code=201, responses={**with_headers(201, LOCATION), **problem_responses(404)})
 async def create_dataset(
     new: NewDataset, principal: Writer, service: ServiceDep, response: Response, key: IdempotencyKey = None
 ) -> DatasetView:
@@ -55,7 +72,7 @@ async def create_dataset(
     return DatasetView.from_row(dataset)
 
 
-@router.get("", responses=problem_responses())
+@router.get("", responses={**with_headers(200, LINK), **problem_responses()})
 async def list_datasets(
     principal: Reader, service: ServiceDep, request: Request, response: Response, limit: Limit = 50,
     cursor: Cursor = None,
@@ -66,7 +83,9 @@ async def list_datasets(
     return DatasetPage(datasets=[DatasetView.from_row(row) for row in part.rows], next=following)
 
 
-@router.get("/{dataset_id}", responses={304: {"description": "Not changed"}, **problem_responses(404)})
+@router.get(
+    "/{dataset_id}", responses={**with_headers(200, ETAG), **not_modified(), **problem_responses(404)}
+)
 async def get_dataset(
     dataset_id: DatasetId, principal: Reader, service: ServiceDep, response: Response,
     if_none_match: IfNoneMatch = None,
@@ -80,7 +99,7 @@ async def get_dataset(
     return DatasetView.from_row(dataset)
 
 
-@router.patch("/{dataset_id}", responses=problem_responses(404, 412))
+@router.patch("/{dataset_id}", responses={**with_headers(200, ETAG), **problem_responses(404, 412)})
 async def change_dataset(
     dataset_id: DatasetId, change: DatasetChange, principal: Writer, service: ServiceDep, response: Response,
     if_match: IfMatch = None,
@@ -101,7 +120,7 @@ async def delete_dataset(dataset_id: DatasetId, principal: Writer, service: Serv
     await actions.delete_dataset(service, principal, dataset_id)
 
 
-@router.get("/{dataset_id}/files", responses=problem_responses(404))
+@router.get("/{dataset_id}/files", responses={**with_headers(200, LINK), **problem_responses(404)})
 async def list_files(
     dataset_id: DatasetId, principal: Reader, service: ServiceDep, request: Request, response: Response,
     limit: LongLimit = 1000, cursor: Cursor = None,
@@ -120,7 +139,7 @@ async def list_files(
         200: {"description": "It was there already", "model": FileView},
         **problem_responses(404, 408, 409, 413, 507),
     },
-    openapi_extra={"requestBody": {"content": {"application/octet-stream": {}}, "required": True}},
+    openapi_extra=_binary_body("application/octet-stream"),
 )
 async def put_file(
     dataset_id: DatasetId, path: FilePath, principal: Writer, service: ServiceDep, request: Request,
@@ -134,7 +153,9 @@ async def put_file(
 
 
 @router.get(
-    "/{dataset_id}/files/{path:path}", responses=problem_responses(404, 410, 416), response_class=Response
+    "/{dataset_id}/files/{path:path}",
+    responses={**stored_content(), **problem_responses(404, 410, 416)},
+    response_class=Response,
 )
 @router.head(
     "/{dataset_id}/files/{path:path}", responses=problem_responses(404, 410, 416), include_in_schema=False
@@ -159,7 +180,7 @@ async def delete_file(dataset_id: DatasetId, path: FilePath, principal: Writer, 
 @router.put(
     "/{dataset_id}/archive",
     responses=problem_responses(404, 408, 409, 413, 507),
-    openapi_extra={"requestBody": {"content": {"application/zip": {}}, "required": True}},
+    openapi_extra=_binary_body("application/octet-stream", "application/zip"),
 )
 async def put_archive(
     dataset_id: DatasetId, principal: Writer, service: ServiceDep, request: Request, digest: Digest = None

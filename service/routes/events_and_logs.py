@@ -49,7 +49,10 @@ async def read_timeline(
     "/{job_id}/events",
     response_class=StreamingResponse,
     responses={
-        200: {"description": "Server-sent events", "content": {"text/event-stream": {}}},
+        200: {
+            "description": "Server-sent events",
+            "content": {"text/event-stream": {"schema": {"type": "string"}}},
+        },
         204: {"description": "The job is over and everything was told"},
         **problem_responses(404),
     },

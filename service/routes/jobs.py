@@ -14,16 +14,25 @@ from octasplat.service.etags import check_precondition, set_etag, unchanged_resp
 from octasplat.service.paging import Cursor, Limit, decode_id_cursor, set_next_link
 from octasplat.service.routes import problem_responses
 from octasplat.service.routes.parameters import IdempotencyKey, IfMatch, IfNoneMatch, JobId
-from octasplat.service.schemas.jobs import JobChange, JobPage, JobView, NewJob, RetryRequest
+from octasplat.service.routes.response_headers import (
+    ETAG,
+    LINK,
+    LOCATION,
+    RETRY_AFTER,
+    not_modified,
+    with_headers,
+)
+from octasplat.service.schemas.jobs import JobChange, JobPage, JobSummary, JobView, NewJob, RetryRequest
 from octasplat.service.state import ServiceDep
 from octasplat.workers.db.rows import JobState
 
 router = APIRouter(prefix="/v1/jobs", tags=["jobs"])
 
 _MAX_RETRY_SECONDS = 30
+ACCEPTED = with_headers(202, LOCATION, RETRY_AFTER)
 
 
-@router.post("", status_code=202, responses=problem_responses(404, 409))
+@router.post("", status_code=202, responses={**ACCEPTED, **problem_responses(404, 409)})
 async def create_job(
     new: NewJob, principal: Writer, service: ServiceDep, request: Request, response: Response,
     key: IdempotencyKey = None,
@@ -35,7 +44,7 @@ async def create_job(
     return view
 
 
-@router.get("", responses=problem_responses())
+@router.get("", responses={**with_headers(200, LINK), **problem_responses()})
 async def list_jobs(
     principal: Reader, service: ServiceDep, request: Request, response: Response,
     state: Annotated[
@@ -47,18 +56,21 @@ async def list_jobs(
     limit: Limit = 50,
     cursor: Cursor = None,
 ) -> JobPage:  # fmt: skip
-    """List your jobs, newest first."""
+    """List your jobs, newest first; their options are at the address of each."""
     job_filter = JobFilter(state or (), kind, label, dataset_id)
     part = await actions.list_jobs(
         service, principal, job_filter, before=decode_id_cursor(cursor), limit=limit
     )
     following = set_next_link(request, response, part.next_key)
     shows_worker = principal.may("admin")
-    views = [JobView.from_row(job, stages_of(job), shows_worker=shows_worker) for job in part.rows]
+    views = [JobSummary.from_row(job, stages_of(job), shows_worker=shows_worker) for job in part.rows]
     return JobPage(jobs=views, next=following)
 
 
-@router.get("/{job_id}", responses={304: {"description": "Not changed"}, **problem_responses(404)})
+@router.get(
+    "/{job_id}",
+    responses={**with_headers(200, ETAG, RETRY_AFTER), **not_modified(), **problem_responses(404)},
+)
 async def get_job(
     job_id: JobId,
     principal: Reader,
@@ -77,7 +89,7 @@ async def get_job(
     return job.view
 
 
-@router.patch("/{job_id}", responses=problem_responses(404, 412))
+@router.patch("/{job_id}", responses={**with_headers(200, ETAG), **problem_responses(404, 412)})
 async def change_job(
     job_id: JobId, change: JobChange, principal: Writer, service: ServiceDep, response: Response,
     if_match: IfMatch = None,
@@ -92,7 +104,7 @@ async def change_job(
     return changed.view
 
 
-@router.post("/{job_id}/cancel", status_code=202, responses=problem_responses(404, 409))
+@router.post("/{job_id}/cancel", status_code=202, responses={**ACCEPTED, **problem_responses(404, 409)})
 async def cancel_job(
     job_id: JobId, principal: Writer, service: ServiceDep, response: Response, key: IdempotencyKey = None
 ) -> JobView:
@@ -102,7 +114,7 @@ async def cancel_job(
     return view
 
 
-@router.post("/{job_id}/retry", status_code=202, responses=problem_responses(404, 409))
+@router.post("/{job_id}/retry", status_code=202, responses={**ACCEPTED, **problem_responses(404, 409)})
 async def retry_job(
     job_id: JobId, principal: Writer, service: ServiceDep, response: Response,
     retry: RetryRequest | None = None, key: IdempotencyKey = None,

@@ -5,9 +5,11 @@ from typing import Annotated
 from fastapi import APIRouter, Path, Response
 
 from octasplat.service.actions import system as actions
+from octasplat.service.actions.usage import read_usage
 from octasplat.service.auth import Reader
 from octasplat.service.routes import problem_responses
 from octasplat.service.schemas.system import Health, InfoView, KindList, KindView, QueueList
+from octasplat.service.schemas.usage import UsageView
 from octasplat.service.state import ServiceDep
 
 router = APIRouter(prefix="/v1", tags=["service"])
@@ -32,6 +34,12 @@ async def get_options(kind: KindName, _principal: Reader, service: ServiceDep) -
 async def get_info(principal: Reader, service: ServiceDep) -> InfoView:
     """Return versions, limits, formats, and your identity."""
     return actions.describe(service, principal)
+
+
+@router.get("/usage", responses=problem_responses())
+async def get_usage(principal: Reader, service: ServiceDep) -> UsageView:
+    """Return what you have stored and asked for, how much you may, and the time that your jobs took."""
+    return await read_usage(service, principal)
 
 
 @router.get("/queues", responses=problem_responses())

@@ -7,6 +7,7 @@ from octasplat.service.auth import Admin, Reader, Writer
 from octasplat.service.etags import check_precondition, set_etag, unchanged_response, view_etag
 from octasplat.service.routes import problem_responses
 from octasplat.service.routes.parameters import IdempotencyKey, IfMatch, IfNoneMatch, TokenId
+from octasplat.service.routes.response_headers import ETAG, LOCATION, not_modified, with_headers
 from octasplat.service.schemas.tokens import (
     MadeToken,
     NewToken,
@@ -28,7 +29,7 @@ async def list_tokens(principal: Reader, service: ServiceDep) -> TokenList:
     return TokenList(tokens=[TokenView.from_row(row) for row in found])
 
 
-@router.post("/tokens", status_code=201, responses=problem_responses(409))
+@router.post("/tokens", status_code=201, responses={**with_headers(201, LOCATION), **problem_responses(409)})
 async def create_token(
     new: NewToken, principal: Admin, service: ServiceDep, response: Response, key: IdempotencyKey = None
 ) -> MadeToken:
@@ -38,7 +39,9 @@ async def create_token(
     return made
 
 
-@router.get("/tokens/{token_id}", responses={304: {"description": "Not changed"}, **problem_responses(404)})
+@router.get(
+    "/tokens/{token_id}", responses={**with_headers(200, ETAG), **not_modified(), **problem_responses(404)}
+)
 async def get_token(
     token_id: TokenId, principal: Reader, service: ServiceDep, response: Response,
     if_none_match: IfNoneMatch = None,
@@ -51,7 +54,7 @@ async def get_token(
     return view
 
 
-@router.patch("/tokens/{token_id}", responses=problem_responses(404, 409, 412))
+@router.patch("/tokens/{token_id}", responses={**with_headers(200, ETAG), **problem_responses(404, 409, 412)})
 async def change_token(
     token_id: TokenId, change: TokenChange, principal: Writer, service: ServiceDep, response: Response,
     if_match: IfMatch = None,

@@ -8,6 +8,7 @@ from octasplat.service.etags import check_precondition, set_etag, unchanged_resp
 from octasplat.service.paging import Cursor, Limit, decode_id_cursor, set_next_link
 from octasplat.service.routes import problem_responses
 from octasplat.service.routes.parameters import DeliveryId, IdempotencyKey, IfMatch, IfNoneMatch, WebhookId
+from octasplat.service.routes.response_headers import ETAG, LINK, LOCATION, not_modified, with_headers
 from octasplat.service.schemas.webhooks import (
     DeliveryList,
     DeliveryView,
@@ -23,7 +24,7 @@ from octasplat.workers.maintenance.webhooks.rows import Endpoint
 router = APIRouter(prefix="/v1/webhooks", tags=["webhooks"])
 
 
-@router.post("", status_code=201, responses=problem_responses(404))
+@router.post("", status_code=201, responses={**with_headers(201, LOCATION), **problem_responses(404)})
 async def create_webhook(
     new: NewWebhook, principal: Writer, service: ServiceDep, response: Response, key: IdempotencyKey = None
 ) -> MadeWebhook:
@@ -38,7 +39,7 @@ async def create_webhook(
     return MadeWebhook(**WebhookView.from_row(made).model_dump(), secret=made.secret)
 
 
-@router.get("", responses=problem_responses())
+@router.get("", responses={**with_headers(200, LINK), **problem_responses()})
 async def list_webhooks(
     principal: Reader, service: ServiceDep, request: Request, response: Response, limit: Limit = 50,
     cursor: Cursor = None,
@@ -49,7 +50,9 @@ async def list_webhooks(
     return WebhookPage(webhooks=[WebhookView.from_row(row) for row in part.rows], next=following)
 
 
-@router.get("/{webhook_id}", responses={304: {"description": "Not changed"}, **problem_responses(404)})
+@router.get(
+    "/{webhook_id}", responses={**with_headers(200, ETAG), **not_modified(), **problem_responses(404)}
+)
 async def get_webhook(
     webhook_id: WebhookId, principal: Reader, service: ServiceDep, response: Response,
     if_none_match: IfNoneMatch = None,
@@ -62,7 +65,7 @@ async def get_webhook(
     return view
 
 
-@router.patch("/{webhook_id}", responses=problem_responses(404, 412))
+@router.patch("/{webhook_id}", responses={**with_headers(200, ETAG), **problem_responses(404, 412)})
 async def change_webhook(
     webhook_id: WebhookId, change: WebhookChange, principal: Writer, service: ServiceDep, response: Response,
     if_match: IfMatch = None,

@@ -4,7 +4,7 @@ import uuid
 from collections.abc import Sequence
 from dataclasses import replace
 from datetime import datetime
-from typing import Any, Literal
+from typing import Any, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -105,7 +105,66 @@ class CheckpointView(BaseModel):
     step: int
 
 
-class JobView(BaseModel):
+class JobSummary(BaseModel):
+    """A job as lists have it, without its options."""
+
+    id: uuid.UUID
+    kind: str
+    dataset_id: uuid.UUID | None
+    source_id: uuid.UUID | None
+    files_id: uuid.UUID | None = None
+    label: str | None
+    queue: str
+    priority: int
+    state: JobState
+    attempt: int = Field(description="Counts starts.")
+    rescues: int = Field(description="How often its worker was lost without a new checkpoint.")
+    stage: str | None
+    stages: list[str]
+    step: int | None
+    total_steps: int | None
+    seconds_left: float | None = Field(description="Of the stage.")
+    psnr: float | None = Field(
+        description="Of the held-out views, dB: of some of their rays while it trains, the mean over all of "
+        "them once they are measured."
+    )
+    training_psnr: float | None = Field(
+        None, description="Running value over the rays that are trained on, dB; higher than `psnr` as a rule."
+    )
+    worker: str | None = Field(description="Which has it; shown to administrators, null for others.")
+    queue_position: int | None = Field(description="Jobs that go before it.")
+    estimate: Estimate | None = Field(description="What it was reckoned to take when it was accepted.")
+    notes: list[str] = Field(
+        description="What its owner should know while it waits, e.g. for want of a worker."
+    )
+    error: JobError | None
+    checkpoint: CheckpointView | None
+    preview: dict[str, Any] | None = Field(description="`step` and `view` of GET /v1/jobs/{id}/preview.")
+    pinned: bool
+    created_at: datetime
+    queued_at: datetime
+    started_at: datetime | None
+    finished_at: datetime | None
+    expires_at: datetime | None
+
+    @classmethod
+    def from_row(
+        cls,
+        row: Job,
+        stages: list[str],
+        queue_position: int | None = None,
+        notes: Sequence[str] = (),
+        *,
+        shows_worker: bool = False,
+    ) -> Self:
+        """Return the view of a database row."""
+        names = {name for name in cls.model_fields if name not in ("stages", "queue_position", "notes")}
+        row = row if shows_worker else replace(row, worker=None)
+        values = {name: getattr(row, name) for name in names}
+        return cls(**values, stages=stages, queue_position=queue_position, notes=list(notes))
+
+
+class JobView(JobSummary):
     """A job."""
 
     model_config = ConfigDict(
@@ -156,65 +215,11 @@ class JobView(BaseModel):
         }
     )
 
-    id: uuid.UUID
-    kind: str
-    dataset_id: uuid.UUID | None
-    source_id: uuid.UUID | None
-    files_id: uuid.UUID | None = None
-    label: str | None
     options: dict[str, Any] = Field(description="Every setting, resolved when the job was accepted.")
-    queue: str
-    priority: int
-    state: JobState
-    attempt: int = Field(description="Counts starts.")
-    rescues: int = Field(description="How often its worker was lost without a new checkpoint.")
-    stage: str | None
-    stages: list[str]
-    step: int | None
-    total_steps: int | None
-    seconds_left: float | None = Field(description="Of the stage.")
-    psnr: float | None = Field(
-        description="Of the held-out views, dB: of some of their rays while it trains, the mean over all of "
-        "them once they are measured."
-    )
-    training_psnr: float | None = Field(
-        None, description="Running value over the rays that are trained on, dB; higher than `psnr` as a rule."
-    )
-    worker: str | None = Field(description="Which has it; shown to administrators, null for others.")
-    queue_position: int | None = Field(description="Jobs that go before it.")
-    estimate: Estimate | None = Field(description="What it was reckoned to take when it was accepted.")
-    notes: list[str] = Field(
-        description="What its owner should know while it waits, e.g. for want of a worker."
-    )
-    error: JobError | None
-    checkpoint: CheckpointView | None
-    preview: dict[str, Any] | None = Field(description="`step` and `view` of GET /v1/jobs/{id}/preview.")
-    pinned: bool
-    created_at: datetime
-    queued_at: datetime
-    started_at: datetime | None
-    finished_at: datetime | None
-    expires_at: datetime | None
-
-    @classmethod
-    def from_row(
-        cls,
-        row: Job,
-        stages: list[str],
-        queue_position: int | None = None,
-        notes: Sequence[str] = (),
-        *,
-        shows_worker: bool = False,
-    ) -> "JobView":
-        """Return the view of a database row."""
-        names = {name for name in cls.model_fields if name not in ("stages", "queue_position", "notes")}
-        row = row if shows_worker else replace(row, worker=None)
-        values = {name: getattr(row, name) for name in names}
-        return cls(**values, stages=stages, queue_position=queue_position, notes=list(notes))
 
 
 class JobPage(BaseModel):
     """A page of the list of jobs, newest first."""
 
-    jobs: list[JobView]
-    next: str | None
+    jobs: list[JobSummary]
+    next: str | None = Field(description="Cursor of the next part; null at the end.")

@@ -2,11 +2,12 @@
 
 import uuid
 from datetime import datetime
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
 from octasplat.service.schemas.base import EXAMPLE_ID, EXAMPLE_TIME, RequestBody
+from octasplat.workers.db.rows import JobState
 from octasplat.workers.maintenance.webhooks.addresses import MAX_URL
 from octasplat.workers.maintenance.webhooks.rows import (
     TERMINAL_EVENTS,
@@ -164,3 +165,53 @@ class DeliveryList(BaseModel):
     """The newest messages of a webhook."""
 
     deliveries: list[DeliveryView]
+
+
+class JobEventData(BaseModel):
+    """Which job a message is about."""
+
+    job_id: uuid.UUID
+    kind: str = Field(description="Of the job, such as reconstruct.")
+    label: str | None
+    state: JobState
+    attempt: int
+
+
+class JobEventMessage(BaseModel):
+    """A message on a change of a job's state."""
+
+    model_config = ConfigDict(
+        json_schema_extra={
+            "examples": [
+                {
+                    "type": "job.succeeded",
+                    "timestamp": EXAMPLE_TIME,
+                    "data": {
+                        "job_id": EXAMPLE_ID,
+                        "kind": "reconstruct",
+                        "label": None,
+                        "state": "succeeded",
+                        "attempt": 1,
+                    },
+                }
+            ]
+        }
+    )
+
+    type: EventName
+    timestamp: datetime
+    data: JobEventData
+
+
+class TestMessageData(BaseModel):
+    """Which webhook a test is about."""
+
+    webhook_id: uuid.UUID
+
+
+class TestMessage(BaseModel):
+    """A message that was asked for by `POST /v1/webhooks/{webhook_id}/test`."""
+
+    type: Literal["webhook.test"]
+    timestamp: datetime
+    data: TestMessageData

@@ -67,7 +67,8 @@ def test_reconstruct_folder_without_poses_succeeds(
     for line in ("Found features 8 photographs", "Matched 28 pairs", "Found the poses of 8 of 8 photographs"):
         assert line in done.stdout
     with Api(machine.address, machine.token) as api:
-        (job,) = api.get("/v1/jobs")["jobs"]
+        (listed,) = api.get("/v1/jobs")["jobs"]
+        job = api.get(f"/v1/jobs/{listed['id']}")
         assert job["stages"] == ["features", "matches", "poses", "load", "train", "evaluate", "export"]
         assert job["options"]["poses"] == "auto" and job["state"] == "succeeded"
         events = api.get(f"/v1/jobs/{job['id']}/timeline", limit=5000)["events"]

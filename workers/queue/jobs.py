@@ -344,6 +344,19 @@ async def running_by_queue(connection: Connection, owner: str | None = None) -> 
     return {row["queue"]: row["n"] for row in await cursor.fetchall()}
 
 
+async def worked_seconds(connection: Connection, owner: str) -> float:
+    """Return how long workers took for an owner's jobs, by the newest attempt of each."""
+    cursor = await connection.execute(
+        """
+        SELECT coalesce(sum(extract(epoch FROM coalesce(finished_at, now()) - started_at)), 0)::float8 AS seconds
+        FROM jobs WHERE owner = %s AND started_at IS NOT NULL AND state <> 'queued'
+        """,
+        [owner],
+    )
+    row = await cursor.fetchone()
+    return max(0.0, float(row["seconds"])) if row is not None else 0.0
+
+
 async def _get_job_or_raise(connection: Connection, job_id: uuid.UUID, *, lock: bool = False) -> Job:
     job = await get_job(connection, job_id, lock=lock)
     if job is None:

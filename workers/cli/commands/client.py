@@ -379,8 +379,7 @@ def _get_job(api: "Api", job_id: str) -> dict[str, Any]:
     newest = api.get("/v1/jobs", limit=1)["jobs"]
     if not newest:
         raise ConfigError("There are no jobs.")
-    first: dict[str, Any] = newest[0]
-    return first
+    return _get_job(api, newest[0]["id"])
 
 
 def _psnr_text(job: dict[str, Any]) -> str:

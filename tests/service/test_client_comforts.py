@@ -1,0 +1,143 @@
+"""What client authors expect: one ZIP of all results, usage, request ids, compression, described webhooks."""
+
+import hashlib
+import io
+import logging
+import zipfile
+from typing import Any
+
+import httpx
+import pytest
+
+from octasplat.service.app import create_app
+from octasplat.service.request_id import RequestIdFilter
+from octasplat.service.state import Service
+from octasplat.service.zip_stream import ZipEntry, stream_zip
+from octasplat.workers.db.quotas import Quota, set_quota
+from octasplat.workers.queue.attempts import ResultFile
+from tests.support.service_harness import (
+    ConnectService,
+    claim_job,
+    client_with_token,
+    committed_dataset,
+    new_job,
+    store_content,
+)
+
+RESULTS = {"scene.ply": b"ply\n" * 1000, "renders/view 1.png": bytes(range(256)) * 9, "empty.txt": b""}
+
+
+async def finished_job(http: httpx.AsyncClient, service: Service) -> dict[str, Any]:
+    job = await new_job(http, service)
+    attempt = await claim_job(service, job)
+    files = [
+        ResultFile(name, store_content(service, content), len(content), "application/octet-stream")
+        for name, content in RESULTS.items()
+    ]
+    await attempt.succeed(files)
+    return job
+
+
+async def test_all_results_come_as_one_zip(connect_service: ConnectService) -> None:
+    async with connect_service() as (http, service):
+        job = await finished_job(http, service)
+        answer = await http.get(f"/v1/jobs/{job['id']}/archive", headers={"Accept-Encoding": "gzip"})
+        assert (answer.status_code, answer.headers["Content-Type"]) == (200, "application/zip")
+        assert "Content-Encoding" not in answer.headers
+        assert answer.headers["Content-Disposition"].endswith(f'-{job["id"][-12:]}.zip"')
+        with zipfile.ZipFile(io.BytesIO(answer.content)) as archive:
+            assert archive.testzip() is None
+            assert {name: archive.read(name) for name in archive.namelist()} == RESULTS
+        again = await http.get(f"/v1/jobs/{job['id']}/archive")
+        assert again.content == answer.content
+        waiting = await new_job(http, service)
+        assert (await http.get(f"/v1/jobs/{waiting['id']}/archive")).status_code == 404
+        stranger = await client_with_token(service, "stranger", "read")
+        assert (await http.get(f"/v1/jobs/{job['id']}/archive", headers=stranger)).status_code == 404
+
+
+def test_zip_is_made_in_pieces_however_large_its_entries_are() -> None:
+    from datetime import datetime
+
+    piece, count = bytes(1 << 20), 2100  # more than 2 GiB, which needs ZIP64
+    digest = hashlib.sha256()
+    size, largest = 0, 0
+    entries = [ZipEntry("large.bin", count << 20, lambda: (piece for _ in range(count)))]
+    for part in stream_zip(entries, datetime(2026, 1, 2)):
+        size, largest = size + len(part), max(largest, len(part))
+        digest.update(part[:64])
+    assert count << 20 < size < (count << 20) + 1000 and largest < 2 << 20
+
+
+async def test_owners_see_their_quota_and_use(connect_service: ConnectService) -> None:
+    async with connect_service(quota_jobs=7) as (http, service):
+        me = await client_with_token(service, "me", "write")
+        dataset = await committed_dataset(service, "me")
+        mine = {"kind": "toy", "dataset_id": dataset}
+        jobs = [(await http.post("/v1/jobs", json=mine, headers=me)).json() for _ in range(2)]
+        await (await claim_job(service, jobs[0])).succeed(
+            [ResultFile("a.bin", store_content(service, b"12345"), 5, "application/octet-stream")]
+        )
+        async with service.pool.connection() as connection:
+            await set_quota(connection, "me", Quota(max_bytes=1000))
+            await connection.execute(
+                "UPDATE jobs SET started_at = finished_at - interval '90 s' WHERE id = %s", [jobs[0]["id"]]
+            )
+        found = (await http.get("/v1/usage", headers=me)).json()
+        assert found["owner"] == "me"
+        assert found["bytes"] == {"used": 5, "limit": 1000}
+        assert found["datasets"] == {"used": 1, "limit": None}
+        assert found["jobs"] == {"used": 1, "limit": 7}
+        assert found["job_seconds"] == pytest.approx(90)
+        other = (await http.get("/v1/usage")).json()
+        assert other["jobs"]["used"] == other["job_seconds"] == 0
+
+
+async def test_requests_have_ids_in_answers_problems_and_logs(
+    connect_service: ConnectService, caplog: pytest.LogCaptureFixture
+) -> None:
+    async with connect_service() as (http, _service):
+        first, second = [await http.get("/v1/info") for _ in range(2)]
+        assert first.headers["X-Request-ID"] != second.headers["X-Request-ID"]
+        missing = await http.get(f"/v1/datasets/{'0' * 32}", headers={"X-Request-ID": "mine-1"})
+        assert missing.headers["X-Request-ID"] == missing.json()["request_id"] == "mine-1"
+        odd = await http.get("/healthz", headers={"X-Request-ID": "a b"})
+        assert odd.headers["X-Request-ID"] != "a b"
+        refused = await http.get("/healthz", headers={"Host": "elsewhere.example"})
+        assert refused.status_code == 421 and refused.headers["X-Request-ID"] == refused.json()["request_id"]
+        with caplog.filtering(RequestIdFilter()), caplog.at_level(logging.WARNING):
+            body = {"name": "a\0b", "owner": "me", "scopes": ["read"]}
+            nul = await http.post("/v1/tokens", json=body, headers={"X-Request-ID": "mine-2"})
+        assert nul.status_code == 422 and "[request mine-2]" in caplog.text
+
+
+async def test_lists_are_compressed_and_stored_content_is_not(connect_service: ConnectService) -> None:
+    async with connect_service() as (http, service):
+        job = await finished_job(http, service)
+        for _ in range(10):
+            await new_job(http, service)
+        packed = await http.get("/v1/jobs", headers={"Accept-Encoding": "gzip"})
+        assert packed.headers["Content-Encoding"] == "gzip"
+        assert int(packed.headers["Content-Length"]) < len(packed.content) / 3
+        plain = await http.get("/v1/jobs", headers={"Accept-Encoding": "identity"})
+        assert "Content-Encoding" not in plain.headers and plain.json() == packed.json()
+        for name, content in RESULTS.items():
+            answer = await http.get(
+                f"/v1/jobs/{job['id']}/artifacts/{name}", headers={"Accept-Encoding": "gzip"}
+            )
+            assert answer.content == content and "Content-Encoding" not in answer.headers
+            assert int(answer.headers["Content-Length"]) == len(content)
+
+
+def test_messages_to_webhooks_are_described() -> None:
+    document = create_app().openapi()
+    ends = {"job.succeeded", "job.failed", "job.canceled"}
+    assert ends | {"job.queued", "job.running", "job.canceling", "webhook.test"} == set(document["webhooks"])
+    operation = document["webhooks"]["job.succeeded"]["post"]
+    assert operation["operationId"] == "onJobSucceeded"
+    assert {p["name"] for p in operation["parameters"]} == {
+        "webhook-id", "webhook-timestamp", "webhook-signature"
+    }  # fmt: skip
+    reference = operation["requestBody"]["content"]["application/json"]["schema"]["$ref"]
+    message = document["components"]["schemas"][reference.rpartition("/")[2]]
+    assert {"type", "timestamp", "data"} == set(message["properties"])
