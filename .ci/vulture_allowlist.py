@@ -67,3 +67,7 @@ fl_x
 fl_y
 is_fisheye
 train_filenames
+# of the OpenAPI document: headers of messages to webhooks, a field of an answer
+webhook_timestamp
+webhook_signature
+job_seconds

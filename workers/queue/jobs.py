@@ -348,7 +348,8 @@ async def worked_seconds(connection: Connection, owner: str) -> float:
     """Return how long workers took for an owner's jobs, by the newest attempt of each."""
     cursor = await connection.execute(
         """
-        SELECT coalesce(sum(extract(epoch FROM coalesce(finished_at, now()) - started_at)), 0)::float8 AS seconds
+        SELECT coalesce(sum(extract(epoch FROM coalesce(finished_at, now()) - started_at)), 0)::float8
+            AS seconds
         FROM jobs WHERE owner = %s AND started_at IS NOT NULL AND state <> 'queued'
         """,
         [owner],
