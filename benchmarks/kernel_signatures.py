@@ -19,7 +19,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
-from octasplat.engine.operations.precompile import TABLE
+from octasplat.engine.operations.precompile import FIRST_ITERATION, TABLE
 
 PROCESSES = 4
 Table = dict[str, Any]
@@ -54,8 +54,16 @@ def record(arguments: list[str]) -> list[dict[str, Any]]:
     from numba.core.caching import NullCache
     from numba.core.dispatcher import Dispatcher
 
-    called: list[tuple[Any, Any, float]] = []
+    from octasplat.engine.core.events import TrainingProgress
+
+    called: list[tuple[Any, Any, float, bool]] = []
     compile_overload = Dispatcher.compile
+    make_event, has_begun = TrainingProgress.__init__, False
+
+    def note_progress(self: Any, *values: Any, **named: Any) -> None:
+        nonlocal has_begun
+        has_begun = True
+        make_event(self, *values, **named)
 
     def note(self: Any, signature: Any) -> Any:
         began = time.thread_time()
@@ -63,9 +71,10 @@ def record(arguments: list[str]) -> list[dict[str, Any]]:
             return compile_overload(self, signature)
         finally:
             if not isinstance(self._cache, NullCache):
-                called.append((self, signature, time.thread_time() - began))
+                called.append((self, signature, time.thread_time() - began, has_begun))
 
     Dispatcher.compile = note
+    TrainingProgress.__init__ = note_progress  # type: ignore[method-assign]
     from octasplat.engine.core.kernel_signatures import encode_type
     from octasplat.workers.cli.main import main
 
@@ -81,8 +90,9 @@ def record(arguments: list[str]) -> list[dict[str, Any]]:
             "function": kernel.__name__,
             "arguments": list(map(encode_type, types)),
             "seconds": round(seconds, 2),
+            "is_after_first_iterations": is_late,
         }
-        for kernel, types, seconds in called
+        for kernel, types, seconds, is_late in called
     ]
 
 
@@ -114,8 +124,10 @@ def collect(folder: Path) -> Table:
     groups: dict[str, list[str]] = {}
     for group, kernels in noted.items():
         for kernel in kernels:
-            took, key = kernel["seconds"], identity(kernel)
+            took, is_late, key = kernel["seconds"], kernel.pop("is_after_first_iterations"), identity(kernel)
             seconds[key] = max(took, seconds.get(key, 0.0))
+            if group == "reconstruct" and not is_late:
+                groups.setdefault(FIRST_ITERATION, []).append(key)
             groups.setdefault(group, []).append(key)
     order = list(seconds)
     return {

@@ -16,7 +16,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
-from numba import njit
+from numba import njit, types
 from numba.core.compiler import Compiler
 
 from octasplat.engine.core.kernel_cache import share_compilation
@@ -57,7 +57,26 @@ def device_function(**options: Any) -> Callable[[Any], Any]:
     Args:
         options: as of ``numba.njit``.
     """
-    return njit(pipeline_class=_DeviceCompiler, **options)
+    compiled = njit(pipeline_class=_DeviceCompiler, **options)
+    return lambda function: _with_plain_integers(compiled(function))
+
+
+def _with_plain_integers(dispatcher: Any) -> Any:
+    """Type calls of a device function with ``int64`` for each literal integer; return the function.
+
+    Numba would compile it once for each literal, and once more for a variable that begins as one.
+    """
+    call_template: Callable[[Any, Any], Any] = dispatcher.get_call_template
+
+    def plain(argument: Any) -> Any:
+        return types.unliteral(argument) if isinstance(argument, types.IntegerLiteral) else argument
+
+    def plain_call_template(arguments: Any, keywords: Any) -> Any:
+        keywords = {name: plain(argument) for name, argument in keywords.items()}
+        return call_template(tuple(map(plain, arguments)), keywords)
+
+    dispatcher.get_call_template = plain_call_template
+    return dispatcher
 
 
 def kernel(**options: Any) -> Callable[[Any], Any]:

@@ -20,6 +20,8 @@ from octasplat.engine.core.kernel_folder import count_code
 from octasplat.engine.core.threads import available_threads
 
 TABLE = Path(__file__).with_name("kernel_signatures.json")
+FIRST_ITERATION = "first-iteration"
+"""The group of what a reconstruction calls until the end of its first iterations."""
 MAX_PROCESSES = 2
 """More compile the functions that kernels share once more each."""
 
@@ -57,15 +59,27 @@ def kernel_groups() -> tuple[str, ...]:
 
 def kernels_of(groups: Sequence[str]) -> tuple[KernelSignature, ...]:
     """Return the kernels of the groups in the order in which they are called; unknown groups have none."""
+    return tuple(found for kernels in kernels_by_group(groups) for found in kernels)
+
+
+def kernels_by_group(groups: Sequence[str]) -> tuple[tuple[KernelSignature, ...], ...]:
+    """Return the kernels of each group that no group before it has, in the order in which they are called."""
     kernels, numbers = _table()
-    wanted = dict.fromkeys(number for group in groups for number in numbers.get(group, ()))
-    return tuple(kernels[number] for number in wanted)
+    seen: set[int] = set()
+    found = []
+    for group in groups:
+        wanted = [number for number in numbers.get(group, ()) if number not in seen]
+        seen.update(wanted)
+        found.append(tuple(kernels[number] for number in wanted))
+    return tuple(found)
 
 
 def request_groups(operation: str, request: Any) -> tuple[str, ...]:
     """Return the groups of kernels that a request, or its options, of an operation calls."""
     if operation == "render" and getattr(request, "stage", None):
         return ("render-stage",)
+    if operation == "reconstruct":
+        return (FIRST_ITERATION, operation)
     return (operation,)
 
 
