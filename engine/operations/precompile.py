@@ -53,8 +53,8 @@ def _table() -> tuple[tuple[KernelSignature, ...], dict[str, tuple[int, ...]]]:
 
 
 def kernel_groups() -> tuple[str, ...]:
-    """Return the names of all groups."""
-    return tuple(_table()[1])
+    """Return the names of all groups; :data:`FIRST_ITERATION` is a part of the reconstruction's."""
+    return tuple(name for name in _table()[1] if name != FIRST_ITERATION)
 
 
 def kernels_of(groups: Sequence[str]) -> tuple[KernelSignature, ...]:

@@ -14,7 +14,13 @@ from octasplat.engine.core import compilation
 from octasplat.engine.core.compiling import MESSAGE, compilation_seconds, report_compilation
 from octasplat.engine.core.events import Event, KernelsCompiled, Noted
 from octasplat.engine.core.kernel_signatures import decode_type, encode_type
-from octasplat.engine.operations.precompile import kernel_groups, kernels_of, missing_kernels, request_groups
+from octasplat.engine.operations.precompile import (
+    kernel_groups,
+    kernels_by_group,
+    kernels_of,
+    missing_kernels,
+    request_groups,
+)
 from octasplat.engine.operations.registry import operation
 from octasplat.workers.reporting.event_lines import ProgressState
 from octasplat.workers.reporting.events import decode_event
@@ -169,6 +175,18 @@ def test_each_kernel_of_the_table_is_one() -> None:
         assert dispatcher.py_func.__name__ == kernel.function
         assert [encode_type(decode_type(one)) for one in kernel.arguments] == list(kernel.arguments)
     assert not missing_kernels(["no such command"])
+
+
+def test_kernels_of_the_first_iterations_are_compiled_first() -> None:
+    groups = request_groups("reconstruct", operation("reconstruct").options())
+    early, late = kernels_by_group(groups)
+    assert {found.function for found in early} >= {
+        "gather_pixels",
+        "adam_step",
+        "backward_packets_shared_sort",
+    }
+    assert {found.function for found in late} >= {"backward_packets", "fuse_view"}
+    assert sorted(map(repr, early + late)) == sorted(map(repr, kernels_of(["reconstruct"])))
 
 
 def test_groups_of_requests() -> None:
