@@ -19,6 +19,7 @@ from octasplat.service.middleware import (
     AllowedHostsMiddleware,
     BodyLimitMiddleware,
     CompressionMiddleware,
+    MessageFramingMiddleware,
     SameOriginMiddleware,
     SecurityHeadersMiddleware,
 )
@@ -122,6 +123,7 @@ def create_app(settings: ServiceSettings | None = None) -> FastAPI:
     app.add_middleware(SameOriginMiddleware)
     if settings.is_private:
         app.add_middleware(AllowedHostsMiddleware, names=settings.allowed_hosts)
+    app.add_middleware(MessageFramingMiddleware)
     app.add_middleware(SecurityHeadersMiddleware)
     app.add_middleware(CompressionMiddleware)
     if settings.proxies:

@@ -1,4 +1,4 @@
-"""Middleware that refuses requests early: foreign hosts, foreign pages, too long bodies."""
+"""Middleware that refuses requests early: two lengths, foreign hosts, foreign pages, too long bodies."""
 
 import re
 from collections.abc import Mapping
@@ -35,6 +35,24 @@ class AllowedHostsMiddleware:
             )
             await ProblemError(421, "host", detail).response()(scope, receive, send)
             return
+        await self._app(scope, receive, send)
+
+
+class MessageFramingMiddleware:
+    """Refuses requests whose length is given in two ways, which servers on the way may read differently."""
+
+    def __init__(self, app: ASGIApp) -> None:
+        self._app = app
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Pass a request on, or answer 400 and close the connection (RFC 9112, section 6.1)."""
+        if scope["type"] == "http":
+            headers = Headers(scope=scope)
+            if "content-length" in headers and "transfer-encoding" in headers:
+                detail = "The request has both Content-Length and Transfer-Encoding; send one of them."
+                problem = ProblemError(400, "framing", detail, headers={"Connection": "close"})
+                await problem.response()(scope, receive, send)
+                return
         await self._app(scope, receive, send)
 
 

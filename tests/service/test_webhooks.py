@@ -19,7 +19,7 @@ from octasplat.service.state import Service
 from octasplat.workers.db.connections import Pool, open_pool
 from octasplat.workers.maintenance.webhooks import addresses
 from octasplat.workers.maintenance.webhooks.addresses import AddressRefusedError, check_url
-from octasplat.workers.maintenance.webhooks.guarded_transport import OWNER_EXTENSION
+from octasplat.workers.maintenance.webhooks.guarded_transport import OWNER_EXTENSION, GuardedTransport
 from octasplat.workers.maintenance.webhooks.outbox import RETRY_DELAYS_SECONDS, lease_due, purge_deliveries
 from octasplat.workers.maintenance.webhooks.sender import (
     MAX_PER_OWNER,
@@ -347,6 +347,23 @@ async def test_webhook_connects_to_checked_address(
             assert headers["host"] == f"hooks.inner.example:{receiver.port}"
             assert names.asked == ["hooks.inner.example"]
             assert Webhook(hook["secret"]).verify(body, headers)["type"] == "webhook.test"
+
+
+async def test_webhook_name_is_judged_again_at_each_connection(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A name that was public when it was judged first and is an inner one afterwards (DNS rebinding)."""
+    connected: list[str] = []
+
+    def answer(request: httpx.Request) -> httpx.Response:
+        connected.append(request.url.host)
+        return httpx.Response(204)
+
+    Names(monkeypatch, hooks=["93.184.216.34", "127.0.0.1"])
+    transport = GuardedTransport((), httpx.MockTransport(answer))
+    async with httpx.AsyncClient(transport=transport) as client:
+        assert (await client.post("https://hooks.example.org/")).status_code == 204
+        with pytest.raises(AddressRefusedError):
+            await client.post("https://hooks.example.org/")
+    assert connected == ["93.184.216.34"]
 
 
 async def test_webhook_to_internal_name_is_refused_when_sending(connect_service: ConnectService) -> None:
