@@ -1,4 +1,4 @@
-"""Requests whose length is given in two ways are refused, and nothing behind them on the connection is read."""
+"""Requests whose length is given in two ways are refused, and nothing behind them is read."""
 
 import socket
 import subprocess
