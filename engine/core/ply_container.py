@@ -29,6 +29,7 @@ TYPE_NAMES: Mapping[str, str] = {
 COUNT_SUFFIX = "__count"
 """A list property ``p`` becomes two fields: ``p`` itself and ``p`` + this, its length."""
 MAX_HEADER_BYTES = 1 << 20
+MAX_ELEMENTS, MAX_PROPERTIES = 100, 10_000
 _BYTE_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "="}
 
 
@@ -88,7 +89,8 @@ class PlyHeader:
 @dataclass
 class _HeaderDraft:
     layout: str = ""
-    elements: list[tuple[str, int, list[PlyProperty]]] = field(default_factory=list)
+    elements: list[tuple[str, int, dict[str, PlyProperty]]] = field(default_factory=list)
+    properties: int = 0
     comments: list[str] = field(default_factory=list)
 
 
@@ -117,12 +119,18 @@ def _parse_header(path: Path, handle: IO[bytes]) -> PlyHeader:
         if text == "end_header":
             if not draft.layout:
                 raise SceneFileError(f"{path}: the PLY header has no 'format' line.")
-            elements = tuple(PlyElement(name, count, tuple(props)) for name, count, props in draft.elements)
+            elements = tuple(
+                PlyElement(name, count, tuple(props.values())) for name, count, props in draft.elements
+            )
             return PlyHeader(draft.layout, elements, tuple(draft.comments), handle.tell())
         try:
             _take_header_line(draft, text)
         except (ValueError, KeyError, IndexError) as error:
             raise SceneFileError(f"{path}: the PLY header line '{text[:80]}' is not understood.") from error
+        if len(draft.elements) > MAX_ELEMENTS or draft.properties > MAX_PROPERTIES:
+            raise SceneFileError(
+                f"{path}: has more than {MAX_ELEMENTS} elements or {MAX_PROPERTIES} properties."
+            )
     raise SceneFileError(
         f"{path}: the PLY header never ends (no 'end_header'); the file is truncated or damaged."
     )
@@ -142,7 +150,7 @@ def _take_header_line(draft: _HeaderDraft, text: str) -> None:
         name, count = words[1], int(words[2])
         if count < 0 or any(name == other for other, _, _ in draft.elements):
             raise ValueError(text)
-        draft.elements.append((name, count, []))
+        draft.elements.append((name, count, {}))
     elif keyword == "property":
         properties = draft.elements[-1][2]
         if words[1] == "list":
@@ -151,9 +159,10 @@ def _take_header_line(draft: _HeaderDraft, text: str) -> None:
             prop = PlyProperty(words[4], SCALAR_TYPES[words[3]], SCALAR_TYPES[words[2]])
         else:
             prop = PlyProperty(words[2], SCALAR_TYPES[words[1]])
-        if any(prop.name == other.name for other in properties):
+        if prop.name in properties:
             raise ValueError(text)
-        properties.append(prop)
+        properties[prop.name] = prop
+        draft.properties += 1
     else:
         raise ValueError(keyword)
 

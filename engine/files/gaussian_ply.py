@@ -25,6 +25,7 @@ from jaxtyping import Float32
 from octasplat.engine.core.errors import ConfigError, SceneFileError
 from octasplat.engine.core.local_origin import NO_ORIGIN, Origin, is_set
 from octasplat.engine.core.ply_container import (
+    MAX_PROPERTIES,
     PlyElement,
     PlyWriteElement,
     columns,
@@ -291,12 +292,15 @@ def _with_mip_filter(cloud: GaussianCloud, deviations: Float32[np.ndarray, " n"]
 
 def declared_channels(comments: Sequence[str]) -> dict[str, tuple[str, ...]]:
     """Return the channels that a PLY's comments name, with their properties."""
-    found = (comment.split() for comment in comments)
-    return {
-        words[1]: column_names(words[1], int(words[2]))
-        for words in found
-        if len(words) == 3 and words[0] == _CHANNEL and words[2].isdecimal() and 0 < int(words[2]) < 1 << 16
-    }
+    declared: dict[str, tuple[str, ...]] = {}
+    left = MAX_PROPERTIES  # a file has no more columns than that, whatever its comments say
+    for words in (comment.split() for comment in comments):
+        if len(words) == 3 and words[0] == _CHANNEL and words[2].isdecimal() and len(words[2]) < 6:
+            width = int(words[2])
+            if 0 < width <= left:
+                declared[words[1]] = column_names(words[1], width)
+                left -= width
+    return declared
 
 
 def channel_comments(widths: Mapping[str, int]) -> tuple[str, ...]:

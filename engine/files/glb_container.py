@@ -8,6 +8,7 @@ import json
 import struct
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -34,7 +35,10 @@ COMPONENTS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 512
 WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 CORE_NODE_NAME = "octasplat_cores"
 """Says in the extras of a primitive that it shows octagons a second time."""
-MAX_NODE_DEPTH = 256
+MAX_CHUNKS = 64
+"""The specification knows two; others are passed over."""
+MAX_PRIMITIVES = 100_000
+MAX_CHANNEL_COLUMNS = 10_000
 ORIGIN_KEY = "octasplat_origin"
 """In the extras of a root node: the origin of large coordinates, which its translation adds."""
 TURN_KEY = "octasplat_turn"
@@ -66,9 +70,11 @@ class GlbFile:
             raise SceneFileError(f"{path}: is no GLB file.")
         document: Any = None
         self._binary = content[:0]
-        offset = HEADER_BYTES
+        offset, chunks = HEADER_BYTES, 0
         while offset + CHUNK_HEADER_BYTES <= len(content):
-            start = offset + CHUNK_HEADER_BYTES
+            start, chunks = offset + CHUNK_HEADER_BYTES, chunks + 1
+            if chunks > MAX_CHUNKS:
+                raise SceneFileError(f"{path}: has more than {MAX_CHUNKS} chunks, so it is damaged.")
             length, kind = struct.unpack("<I4s", content[offset:start].tobytes())
             data = content[start : start + length]
             if len(data) < length:
@@ -102,6 +108,8 @@ class GlbFile:
         width, count = WIDTHS[accessor["type"]], int(accessor["count"])
         offset = view.get("byteOffset", 0) + accessor.get("byteOffset", 0)
         stride = view.get("byteStride", kind.itemsize * width)
+        if stride < kind.itemsize * width:  # rows that overlap could be more than the file has bytes
+            raise ValueError(f"accessor {number} has rows that overlap")
         values: np.ndarray = np.ndarray((count, width), kind, self._binary, offset, (stride, kind.itemsize))
         if accessor.get("normalized") and kind.kind in "iu":
             values = np.maximum(values.astype(np.float64) / np.iinfo(kind).max, -1.0)
@@ -121,22 +129,44 @@ class GlbFile:
         return content
 
     def primitives(self) -> Iterator[tuple[Float64[np.ndarray, "4 4"], dict[str, Any]]]:
-        """Return every primitive of the default scene with its node's matrix, except cores of octagons."""
+        """Return every primitive of the default scene with its node's matrix, except cores of octagons.
+
+        Raises:
+            KeyError, IndexError, TypeError, ValueError: the document says nonsense; a node that is reached
+                twice among it, as graphs of few nodes would become scenes without end.
+        """
+        for matrix, primitives in self._meshes:
+            for primitive in primitives:
+                if not primitive.get("extras", {}).get(CORE_NODE_NAME):
+                    yield matrix, primitive
+
+    @cached_property
+    def _meshes(self) -> list[tuple[Float64[np.ndarray, "4 4"], list[dict[str, Any]]]]:
+        """The primitives of each node of the default scene that has a mesh, with the node's matrix."""
         nodes = self.document.get("nodes", [])
         scenes = self.document.get("scenes", [])
-        roots = scenes[self.document.get("scene", 0)].get("nodes", []) if scenes else range(len(nodes))
-        waiting = [(node, self._about_half_turn(node), 0) for node in reversed(roots)]
+        if scenes:
+            roots = scenes[self.document.get("scene", 0)].get("nodes", [])
+        else:
+            inner = {child for node in nodes for child in node.get("children", [])}
+            roots = [number for number in range(len(nodes)) if number not in inner]
+        waiting = [(node, self._about_half_turn(node)) for node in reversed(roots)]
+        reached: set[int] = set()
+        found, count = [], 0
         while waiting:
-            number, parent, depth = waiting.pop()
-            if depth > MAX_NODE_DEPTH:
-                raise ValueError("its nodes form a circle or are nested too deeply")
+            number, parent = waiting.pop()
+            if number in reached:
+                raise ValueError(f"its nodes form a circle or share node {number}")
+            reached.add(number)
             node = nodes[number]
             matrix = parent @ _node_matrix(node)
             if "mesh" in node:
-                for primitive in self.document["meshes"][node["mesh"]]["primitives"]:
-                    if not primitive.get("extras", {}).get(CORE_NODE_NAME):
-                        yield matrix, primitive
-            waiting += [(child, matrix, depth + 1) for child in reversed(node.get("children", []))]
+                found.append((matrix, self.document["meshes"][node["mesh"]]["primitives"]))
+                count += len(found[-1][1])
+                if count > MAX_PRIMITIVES:
+                    raise ValueError(f"it has more than {MAX_PRIMITIVES} primitives")
+            waiting += [(child, matrix) for child in reversed(node.get("children", []))]
+        return found
 
     def _about_half_turn(self, root: int) -> Float64[np.ndarray, "4 4"]:
         """Return what makes a root that our exporters turned upright one that is turned by half about x."""
@@ -146,8 +176,9 @@ class GlbFile:
             matrix[:3, :3] = rotation_of(HALF_TURN_ABOUT_X) @ rotation_of(turn).T
         return matrix
 
+    @cached_property
     def local_origin(self) -> Origin:
-        """Return the origin of large coordinates in our world frame, zeros where there is none.
+        """The origin of large coordinates in our world frame, zeros where there is none.
 
         It is the translation of the first primitive's node, if our exporters say so, or if it is so large
         against the primitive that 32 bits could not hold the sum.
@@ -169,8 +200,8 @@ class GlbFile:
         return NO_ORIGIN
 
     def about_origin(self, matrix: Float64[np.ndarray, "4 4"]) -> Float64[np.ndarray, "4 4"]:
-        """Return the matrix of a node about :meth:`local_origin`."""
-        x, y, z = self.local_origin()
+        """Return the matrix of a node about :attr:`local_origin`."""
+        x, y, z = self.local_origin
         local = matrix.copy()
         local[:3, 3] -= (x, -y, -z)
         return local
@@ -183,7 +214,7 @@ def read_glb_origin(path: Path) -> Origin:
         SceneFileError: the file is no GLB, or is damaged.
     """
     try:
-        return GlbFile(path).local_origin()
+        return GlbFile(path).local_origin
     except GLB_READ_ERRORS as error:
         raise SceneFileError(f"{path}: its glTF is damaged or not understood ({error}).") from error
 
@@ -303,8 +334,11 @@ def channel_extras(widths: Mapping[str, int]) -> dict[str, object]:
 def declared_channel_attributes(document: Mapping[str, Any]) -> dict[str, tuple[str, ...]]:
     """Return the channels that a file's ``extras`` name, with their attributes in lower case without _."""
     found = document.get("asset", {}).get("extras", {}).get(CHANNELS, {})
+    widths = {name: int(width) for name, width in found.items() if width > 0}
+    if sum(widths.values()) > MAX_CHANNEL_COLUMNS:
+        raise ValueError(f"its channels have more than {MAX_CHANNEL_COLUMNS} columns")
     columns: dict[str, list[str]] = {}
-    for attribute in channel_attributes({name: int(width) for name, width in found.items() if width > 0}):
+    for attribute in channel_attributes(widths):
         columns.setdefault(attribute.channel, []).append(attribute.semantic[1:].lower())
     return {name: tuple(own) for name, own in columns.items()}
 

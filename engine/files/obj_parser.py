@@ -16,6 +16,7 @@ from octasplat.engine.core.errors import SceneFileError
 BLOCK_BYTES = 1 << 22
 NEWLINE, SPACE, TAB = 10, 32, 9  # every other white space lies below the space
 MAX_HEADER_LINES = 64
+MAX_LINE_BYTES = 1 << 26
 DIGIT_LINES = 2000
 _INDENT = re.compile(rb"^[ \t]+", re.MULTILINE)
 
@@ -32,6 +33,7 @@ class ObjParts:
     decimals: int = 0
     vertex_count: int = 0
     uv_count: int = 0
+    triangle_count: int = 0
     with_materials: bool = False
     colors: list[np.ndarray] = field(default_factory=list)
     libraries: list[str] = field(default_factory=list)
@@ -48,6 +50,8 @@ def read_blocks(handle: IO[bytes]) -> Iterator[bytes]:
             rest = tail
         else:
             rest += chunk
+            if len(rest) > MAX_LINE_BYTES:
+                raise SceneFileError(f"{handle.name}: has a line of more than {MAX_LINE_BYTES >> 20} MiB.")
     if rest:
         yield rest + b"\n"
 
@@ -98,11 +102,12 @@ def parse_block(path: Path, block: bytes, parts: ObjParts) -> None:
         spans = _usemtl_ranges(block, starts, first == ord("u"))
     for begin, end, material in spans:
         if material:
-            parts.material_uses.append((sum(map(len, parts.triangles)), material))
-        chosen = is_face.copy()
-        chosen[:begin] = chosen[end:] = False
+            parts.material_uses.append((parts.triangle_count, material))
+        chosen = is_face[begin:end]
         if chosen.any():
-            _parse_faces(path, _select_lines(data, chosen, lengths), before[chosen], parts)
+            lines = data[starts[begin] : ends[end - 1]]
+            text = _select_lines(lines, chosen, lengths[begin:end])
+            _parse_faces(path, text, before[begin:end][chosen], parts)
 
 
 def _parse_libraries(block: bytes, parts: ObjParts) -> None:
@@ -204,6 +209,7 @@ def _add_fans(
     # Numbers count from 1; negative ones count back from the newest vertex before the line.
     positions = np.where(vertex > 0, vertex - 1, vertex + before[:, :1])
     parts.triangles.append(_to_int32(positions[:, fan].reshape(-1, 3)))
+    parts.triangle_count += len(parts.triangles[-1])
     if texture is None:
         parts.triangle_uv.append(np.full((len(vertex) * len(fan), 3), -1, np.int32))
     else:

@@ -23,7 +23,7 @@ RESERVED_COLUMNS = re.compile(
 )
 """Columns that mean something else in some format."""
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
-_NUMBERED = re.compile(r"(.+)_(0|[1-9]\d*)")
+_NUMBERED = re.compile(r"(.+)_(0|[1-9]\d{0,8})")
 
 
 class Channels(Mapping[str, np.ndarray]):
@@ -147,7 +147,8 @@ def group_columns(columns: Iterable[str]) -> dict[str, tuple[str, ...]]:
     for column in found:
         match = _NUMBERED.fullmatch(column)
         if match and match[1] in complete:
-            groups[match[1]] = column_names(match[1], len(numbered[match[1]]))
+            if len(groups.get(match[1], ())) != len(numbered[match[1]]):
+                groups[match[1]] = column_names(match[1], len(numbered[match[1]]))
         else:
             groups[column] = (column,)
     return groups

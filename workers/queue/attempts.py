@@ -16,7 +16,7 @@ from octasplat.workers.db.locks import lock_owner
 from octasplat.workers.db.postgres_text import as_json, storable_text
 from octasplat.workers.db.quotas import NO_QUOTA, Quota, check_bytes
 from octasplat.workers.db.rows import TERMINAL, Job
-from octasplat.workers.queue.job_endings import end_job, recover_attempt
+from octasplat.workers.queue.job_endings import MAX_RECOVERIES, end_job, recover_attempt
 from octasplat.workers.queue.jobs import get_job, requeue_job
 from octasplat.workers.queue.protocol import JobQueue
 from octasplat.workers.queue.storage_leases import StorageLease
@@ -219,6 +219,7 @@ class Attempt:
         *,
         delay_seconds: float = 0.0,
         drop_checkpoint: bool = False,
+        max_recoveries: int = MAX_RECOVERIES,
     ) -> None:
         """Requeue a job whose attempt was lost, or fail it after too many attempts.
 
@@ -229,6 +230,7 @@ class Attempt:
             lease: as in :meth:`fail`.
             delay_seconds: for how long the job is not taken up again.
             drop_checkpoint: at the end; then a retry begins anew.
+            max_recoveries: lost attempts after which it fails.
 
         Raises:
             StorageUnavailableError: as by :meth:`fail`.
@@ -241,7 +243,13 @@ class Attempt:
         ):
             error = self.redact(dict(error))
             failed = await recover_attempt(
-                connection, job_queue, job, error, keep_entry=True, delay_seconds=delay_seconds
+                connection,
+                job_queue,
+                job,
+                error,
+                keep_entry=True,
+                delay_seconds=delay_seconds,
+                max_recoveries=max_recoveries,
             )
             if failed and drop_checkpoint:
                 await connection.execute("UPDATE jobs SET checkpoint = NULL WHERE id = %s", [job.id])

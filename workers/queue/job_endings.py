@@ -12,6 +12,8 @@ from octasplat.workers.queue.protocol import JobQueue
 
 MAX_RECOVERIES = 3
 """Lost attempts without a new checkpoint after which a job is taken for one that kills its workers."""
+MAX_SILENT_RECOVERIES = 1
+"""Likewise where an attempt was ended because it said nothing: each takes as long as that limit."""
 
 
 async def end_job(connection: Connection, job: Job, state: str, error: Mapping[str, Any] | None) -> None:
@@ -42,11 +44,12 @@ async def recover_attempt(
     *,
     keep_entry: bool = False,
     delay_seconds: float = 0.0,
+    max_recoveries: int = MAX_RECOVERIES,
 ) -> bool:
     """Give a job whose attempt was lost to another worker; the caller holds the job's lock.
 
-    A job that was being cancelled is cancelled. One that was lost too often without advancing is failed with
-    ``error``. With ``keep_entry`` the queue entry is still being delivered and is removed by that. The job is
+    A job that was being cancelled is cancelled. One that was lost more than ``max_recoveries`` times without
+    advancing is failed with ``error``. With ``keep_entry`` the queue entry is still being delivered and is removed by that. The job is
     not taken up before ``delay_seconds`` have passed.
 
     Returns:
@@ -56,7 +59,7 @@ async def recover_attempt(
         await job_queue.remove(connection, job.slip)
     if job.state == "canceling":
         await end_job(connection, job, "canceled", None)
-    elif job.rescues >= MAX_RECOVERIES:
+    elif job.rescues >= max_recoveries:
         message = f"{error['message']} This happened {job.rescues + 1} times without getting any further."
         await end_job(connection, job, "failed", {**error, "message": message, "rescues": job.rescues})
         return True

@@ -114,17 +114,22 @@ class OutcomeWriter:
         """Requeue the job for a reason that is not its own."""
         await self._write_with_retries(lambda: self._attempt.requeue(self._context.job_queue, reason))
 
-    async def requeue_or_fail(self, error: dict[str, Any]) -> None:
-        """Requeue the job after a failure that may be its own, or fail it with its finished results."""
-        if self._job.rescues >= MAX_RECOVERIES:
+    async def requeue_or_fail(self, error: dict[str, Any], max_recoveries: int = MAX_RECOVERIES) -> None:
+        """Requeue the job after a failure that may be its own, or fail it with its finished results.
+
+        Args:
+            error: what happened.
+            max_recoveries: lost attempts after which it fails.
+        """
+        if self._job.rescues >= max_recoveries:
             try:
                 await self._with_partial_results(
-                    lambda results, note: self._requeue_counted(error, results, note)
+                    lambda results, note: self._requeue_counted(error, results, note, max_recoveries)
                 )
                 return
             except (StorageError, QuotaExceededError) as storage_error:
                 logger.warning("the results there are could not be stored: %s", storage_error)
-        await self._write_with_retries(lambda: self._requeue_counted(error))
+        await self._write_with_retries(lambda: self._requeue_counted(error, max_recoveries=max_recoveries))
 
     async def requeue_counted(self, error: dict[str, Any]) -> None:
         """Requeue the job for a reason that may pass; the attempt counts."""
@@ -152,7 +157,11 @@ class OutcomeWriter:
             await self.requeue(f"The worker's machine is at fault, which takes no jobs for now: {found}")
 
     async def _requeue_counted(
-        self, error: dict[str, Any], results: Sequence[ResultFile] = (), lease: StorageLease | None = None
+        self,
+        error: dict[str, Any],
+        results: Sequence[ResultFile] = (),
+        lease: StorageLease | None = None,
+        max_recoveries: int = MAX_RECOVERIES,
     ) -> None:
         """Put the job back, which counts.
 
@@ -161,7 +170,9 @@ class OutcomeWriter:
         """
         lacking = await self._context.space_shortage()
         if lacking is None and error["type"] != NO_SPACE_ERROR:
-            await self._attempt.requeue_lost(self._context.job_queue, error, results, lease)
+            await self._attempt.requeue_lost(
+                self._context.job_queue, error, results, lease, max_recoveries=max_recoveries
+            )
             return
         message = f"{error['message']} {lacking or ''}".strip()
         kept_bytes, taken = (

@@ -19,6 +19,7 @@ from octasplat.workers.cancellation import cancel_and_wait
 from octasplat.workers.db.datasets import files_of, get_dataset
 from octasplat.workers.queue.attempts import Attempt, FencedError
 from octasplat.workers.queue.job_deadlines import seconds_spent
+from octasplat.workers.queue.job_endings import MAX_SILENT_RECOVERIES
 from octasplat.workers.queue.jobs import artifacts_of
 from octasplat.workers.sandbox.confinement import MAX_PROCESSES
 from octasplat.workers.storage.errors import (
@@ -235,7 +236,8 @@ class Supervisor:
         elif reason is StopReason.SILENT:
             seconds = self._settings.silent_seconds
             message = f"The job's program said nothing for {seconds:g} s and was stopped."
-            await self._outcomes.requeue_or_fail({"type": "silent", "message": message})
+            error = {"type": "silent", "message": message}
+            await self._outcomes.requeue_or_fail(error, MAX_SILENT_RECOVERIES)
         elif reason is StopReason.TIME_LIMIT:
             message = (
                 f"The job ran for {self._settings.max_job_hours:g} hours, as long as it may; ask for fewer "
