@@ -49,8 +49,8 @@ async def recover_attempt(
     """Give a job whose attempt was lost to another worker; the caller holds the job's lock.
 
     A job that was being cancelled is cancelled. One that was lost more than ``max_recoveries`` times without
-    advancing is failed with ``error``. With ``keep_entry`` the queue entry is still being delivered and is removed by that. The job is
-    not taken up before ``delay_seconds`` have passed.
+    advancing is failed with ``error``. With ``keep_entry`` the queue entry is still being delivered and is
+    removed by that. The job is not taken up before ``delay_seconds`` have passed.
 
     Returns:
         Whether it failed.
