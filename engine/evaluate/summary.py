@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from octasplat.engine.core.durations import format_duration
+from octasplat.engine.runs.result_files import file_label
 
 _METRICS = (
     ("psnr", "PSNR {:.2f} dB"),
@@ -54,7 +55,11 @@ def summarize_evaluation(path: Path) -> list[str]:
 def summarize_run(output: Path, exports: Iterable[str]) -> list[str]:
     """Return lines on what a finished run in ``output`` reached and where its files are."""
     metrics: dict[str, Any] = json.loads((output / "metrics.json").read_text(encoding="utf-8"))
-    files = [("Report", "report.html"), ("Scene", "scene.ply"), *(("Mesh", name) for name in exports)]
+    files = [
+        ("Report", "report.html"),
+        ("Scene", "scene.ply"),
+        *((file_label(name), name) for name in exports),
+    ]
     poses = metrics.get("poses", {})
     placed, moved = poses.get("placed"), len(poses.get("moved", ()))
     return [
@@ -65,8 +70,8 @@ def summarize_run(output: Path, exports: Iterable[str]) -> list[str]:
         *_training_views(metrics.get("training_views") or {}),
         f"{metrics['gaussians']:,} Gaussians after {metrics['iterations']:,} iterations, "
         f"trained in {format_duration(metrics['seconds'])}",
-        *(f"{label + ':':8}{output / name}" for label, name in files if (output / name).exists()),
-        f"{'In 3D:':8}octasplat view {shlex.quote(str(output))}",
+        *(f"{label + ':':10}{output / name}" for label, name in files if (output / name).exists()),
+        f"{'In 3D:':10}octasplat view {shlex.quote(str(output))}",
     ]
 
 

@@ -79,6 +79,10 @@ class Result(BaseModel):
         """Return what a command prints about the result, a sentence each."""
         return tuple(f"Wrote {path}." for path in self.files)
 
+    def facts(self) -> Any:
+        """Return the result as values of which JSON can be made: all fields but the folder of the files."""
+        return {name: getattr(self, name) for name in type(self).model_fields if name != "folder"}
+
     def _repr_html_(self) -> str:
         """Return what a notebook shows."""
         return "<br>".join(escape(line) for line in self.lines())

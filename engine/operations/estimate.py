@@ -1,18 +1,22 @@
 """``estimate``: the cost of a reconstruction, before it starts."""
 
-import os
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 from pydantic import Field
 
 from octasplat.engine.core.events import EventListener, Warned, ignore_events
+from octasplat.engine.core.threads import available_threads
 from octasplat.engine.dataset.image_sizes import ImageSizes
 from octasplat.engine.operations.base import Operation, Request, Result, never_stop
 from octasplat.engine.operations.reconstruct import ReconstructOptions
 from octasplat.engine.settings.fields import Positional, ReadPath, Spelling, Unit
+
+if TYPE_CHECKING:
+    from octasplat.engine.operations.cost_model import Estimate
+    from octasplat.engine.runs.config import ReconstructionConfig
 
 
 class EstimateOptions(ReconstructOptions):
@@ -79,20 +83,34 @@ def run(
         DatasetError: there are no photographs, or one cannot be read.
         ConfigError: a setting cannot be used.
     """
-    from octasplat.engine.dataset.model_sources import has_model
-    from octasplat.engine.operations.cost_model import estimate_reconstruction
-    from octasplat.engine.operations.precompile import cold_start_seconds
     from octasplat.engine.poses.photographs import locate_scene, notes_on_files
 
     scene = locate_scene(request.source)
     for sentence in notes_on_files(scene):
         progress(Warned(sentence))
-    config = request.config().with_poses_decided(has_model(scene))
     sizes = photograph_sizes(scene)
-    cores = request.cores or threads or len(os.sched_getaffinity(0))
-    found = estimate_reconstruction(config, sizes, cores)
-    found = found.with_cold_start(cold_start_seconds(["reconstruct"]))
+    found = estimate_scene(scene, request.config(), sizes, request.cores or threads)
     return EstimateResult(photographs=tuple(sizes), **found.model_dump())
+
+
+def estimate_scene(
+    scene: Path, config: "ReconstructionConfig", sizes: Sequence[ImageSizes], cores: int = 0
+) -> "Estimate":
+    """Return the estimate of a reconstruction on this machine, with the kernels that it lacks.
+
+    Args:
+        scene: folder of the scene.
+        config: settings of the reconstruction.
+        sizes: of the photographs.
+        cores: to reckon with; 0 takes those of this machine.
+    """
+    from octasplat.engine.dataset.model_sources import has_model
+    from octasplat.engine.operations.cost_model import estimate_reconstruction
+    from octasplat.engine.operations.precompile import cold_start_seconds
+
+    decided = config.with_poses_decided(has_model(scene))
+    found = estimate_reconstruction(decided, sizes, cores or available_threads())
+    return found.with_cold_start(cold_start_seconds(["reconstruct"]))
 
 
 def photograph_sizes(scene: Path) -> list[ImageSizes]:

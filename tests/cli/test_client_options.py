@@ -12,7 +12,8 @@ from octasplat.workers.client import submission
 from octasplat.workers.client.submission import Derivation, with_camera_path, with_stage
 
 JOB = {
-    "id": "4711", "kind": "render", "label": None, "state": "failed", "psnr": None, "error": None,
+    "id": "01999999-0000-7000-8000-000000004711", "kind": "render", "label": None, "state": "failed",
+    "psnr": None, "error": None,
     "options": {"frames": 9, "stage": {"meshes": [{"shape": "sphere"}], "integrator": {"samples": 2}}},
 }  # fmt: skip
 
@@ -50,7 +51,7 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[dict]]:
 
 
 def test_nested_assignment_keeps_other_values(octasplat, asked: list[dict]) -> None:
-    done = octasplat("retry", "4711", "--set", "stage.integrator.samples=16", "--set", "frames=3")
+    done = octasplat("retry", JOB["id"], "--set", "stage.integrator.samples=16", "--set", "frames=3")
     assert done.exit_code == 0, done.output
     stage = {"meshes": [{"shape": "sphere"}], "integrator": {"samples": 16}}
     assert asked[0]["options"] == {"frames": 3, "stage": stage}
@@ -70,7 +71,7 @@ def test_assignments_win_over_the_files_of_a_stage_and_a_path(tmp_path) -> None:
     assert options["camera_path"]["fps"] == 7 and options["camera_path"]["width"] == 32
 
 
-@pytest.mark.parametrize("command", [("submit", "photos"), ("derive", "render", "4711")])
+@pytest.mark.parametrize("command", [("submit", "photos"), ("derive", "render", JOB["id"])])
 def test_output_folder_requires_wait(octasplat, asked: list[dict], command) -> None:
     refused = octasplat(*command, "-o", "out")
     assert refused.exit_code == 2 and "--wait" in refused.stderr
@@ -83,4 +84,4 @@ def test_json_output_contains_only_job(octasplat, asked: list[dict], monkeypatch
         return JOB
 
     monkeypatch.setattr(submission, "wait_for_job", wait_for)
-    assert json.loads(octasplat("status", "4711", "--wait", "--json").stdout) == JOB
+    assert json.loads(octasplat("status", JOB["id"], "--wait", "--json").stdout) == JOB

@@ -11,6 +11,7 @@ from octasplat.engine.operations.reconstruct import ReconstructRequest
 from octasplat.engine.runs.config import ReconstructionConfig, read_config
 from octasplat.engine.runs.run_folder import CONFIG
 from octasplat.engine.settings.preset_names import PresetName
+from octasplat.workers.cli.printing import Printer
 from octasplat.workers.cli.progress import show_progress
 from octasplat.workers.cli.reconstruction import run_reconstruction
 from octasplat.workers.cli.signals import exit_on_sigterm
@@ -44,7 +45,7 @@ def make_demo_scene(root: Path, size: Mapping[str, int | None], *, quiet: bool) 
 
 
 def reconstruct_demo_scene(
-    scene: Path, output: Path, preset: PresetName, *, threads: int, quiet: bool
+    scene: Path, output: Path, preset: PresetName, printer: Printer, *, threads: int
 ) -> Path:
     """Reconstruct the demo scene, or go on with it, and return the path of the report.
 
@@ -67,7 +68,7 @@ def reconstruct_demo_scene(
         )
     report = output / "report.html"
     if not (resume and is_complete(output, config)):
-        run_reconstruction(request, threads=threads, quiet=quiet, resumes_automatically=True)
+        run_reconstruction(request, printer, threads=threads, resumes_automatically=True)
     return report
 
 

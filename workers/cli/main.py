@@ -14,7 +14,6 @@ from typing import Any, NoReturn, TextIO
 
 import click
 
-from octasplat.engine import __version__
 from octasplat.engine.core.errors import OctasplatError
 from octasplat.workers.cli.signals import StoppedError
 
@@ -25,50 +24,76 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 DEBUG = "OCTASPLAT_DEBUG"
 EXIT_UNEXPECTED = 70
 EXIT_INTERRUPTED = 130
+_POSIX_MODULES = frozenset({"fcntl", "grp", "pwd", "resource"})
+_NEEDS_POSIX = (
+    "This command needs Linux or macOS; on Windows run it under WSL, or send the work to a service with "
+    "octasplat submit."
+)
 
 
-_COMMANDS = {
-    "reconstruct": ("reconstruct", "Photographs to a scene, its meshes, and measurements."),
-    "estimate": ("estimate", "Estimate what a reconstruction takes, before it is begun."),
-    "evaluate": ("evaluate", "Measure a finished run again."),
-    "info": ("info", "Describe what is in a scene: counts, bounds, sizes, cost."),
-    "config": ("config", "The settings of a reconstruction: list, explain, compare."),
-    "export": ("export", "Gaussians to meshes and other formats."),
-    "import": ("import_", "Splats of any format to a scene of flat Gaussians."),
-    "render": ("render", "Render new views of a scene as images or a video."),
-    "relight": ("relight", "Show a scene with materials in other light."),
-    "stage": ("stage", "Stages: things and lights put into a scene."),
-    "surface": ("surface", "One colored triangle mesh of a scene."),
-    "material": ("material", "Change the materials of a scene."),
-    "edit": ("edit", "Turn a mesh edited elsewhere back into Gaussians."),
-    "deform": ("deform", "Make a scene follow a deformed cage or coarse mesh."),
-    "transform": ("transform", "Move, turn or scale a scene."),
-    "crop": ("crop", "Keep part of a scene."),
-    "merge": ("merge", "Put scenes together."),
-    "clean": ("clean", "Remove faint Gaussians, oversized ones and floaters."),
-    "warm-up": ("warm_up", "Compile everything that the first use would wait for."),
-    "verbs": ("verbs", "The verbs as commands, jobs and Python calls."),
-    "demo": ("demo", "Try everything on a generated scene."),
-    "backup": ("backup", "Copy a service, tables and store, while it runs."),
-    "restore": ("backup", "Put a backup into an empty service."),
-    "serve": ("serve", "Run the whole service on this machine."),
-    "worker": ("worker", "Take jobs from the queue of a service."),
-    "open": ("open", "Sign a browser in to the service."),
-    "token": ("token", "Who may use the service."),
-    "fsck": ("fsck", "Compare the tables of a service with its store."),
-    "quota": ("quota", "Show or set what an owner may take."),
-    "migrate": ("migrate", "Bring a database to this version's tables."),
-    "submit": ("client", "Send a scene to the service and queue its reconstruction."),
-    "derive": ("client", "Queue a job on the results of a finished one, such as a render."),
-    "jobs": ("client", "List jobs."),
-    "status": ("client", "Show a job, or wait for it."),
-    "logs": ("client", "Show the log of a job."),
-    "cancel": ("client", "Stop a job."),
-    "retry": ("client", "Queue a failed or cancelled job again."),
-    "download": ("client", "Save the results of a job."),
+_SECTIONS: dict[str, dict[str, tuple[str, str]]] = {
+    "From photographs to a scene": {
+        "demo": ("demo", "Try everything on a generated scene."),
+        "estimate": ("estimate", "Estimate what a reconstruction takes, before it is begun."),
+        "reconstruct": ("reconstruct", "Photographs to a scene, its meshes, and measurements."),
+        "evaluate": ("evaluate", "Measure a finished run again."),
+    },
+    "Look at a scene": {
+        "view": ("", "Show a scene in the browser, in 3D."),
+        "info": ("info", "Describe what is in a scene: counts, bounds, sizes, cost."),
+        "render": ("render", "Render new views of a scene as images or a video."),
+        "relight": ("relight", "Show a scene with materials in other light."),
+    },
+    "Take a scene to other programs": {
+        "export": ("export", "Gaussians to meshes and other formats."),
+        "surface": ("surface", "One colored triangle mesh of a scene."),
+        "import": ("import_", "Splats of any format to a scene of flat Gaussians."),
+    },
+    "Change a scene": {
+        "clean": ("clean", "Remove faint Gaussians, oversized ones and floaters."),
+        "crop": ("crop", "Keep part of a scene."),
+        "transform": ("transform", "Move, turn or scale a scene."),
+        "merge": ("merge", "Put scenes together."),
+        "edit": ("edit", "Turn a mesh edited elsewhere back into Gaussians."),
+        "deform": ("deform", "Make a scene follow a deformed cage or coarse mesh."),
+        "material": ("material", "Change the materials of a scene."),
+        "stage": ("stage", "Stages: things and lights put into a scene."),
+    },
+    "Work with a service": {
+        "open": ("open", "Sign a browser in to the service."),
+        "submit": ("client", "Send photographs to the service and queue its reconstruction."),
+        "derive": ("client", "Queue a job on the results of a finished one, such as a render."),
+        "jobs": ("client", "List jobs."),
+        "status": ("client", "Show a job, or wait for it."),
+        "logs": ("client", "Show the log of a job."),
+        "cancel": ("client", "Stop a job."),
+        "retry": ("client", "Queue a failed or cancelled job again."),
+        "download": ("client", "Save the results of a job."),
+        "datasets": ("client", "List datasets, which hold the photographs of jobs."),
+        "workers": ("client", "List queues and the workers that take jobs from them."),
+    },
+    "Run a service": {
+        "serve": ("serve", "Run the whole service on this machine."),
+        "api": ("", "Run the HTTP front end alone."),
+        "worker": ("worker", "Take jobs from the queue of a service."),
+        "token": ("token", "Who may use the service."),
+        "quota": ("quota", "Show or set what an owner may take."),
+        "migrate": ("migrate", "Bring a database to this version's tables."),
+        "backup": ("backup", "Copy a service, tables and store, while it runs."),
+        "restore": ("backup", "Put a backup into an empty service."),
+        "fsck": ("fsck", "Compare the tables of a service with its store."),
+    },
+    "About the program": {
+        "config": ("config", "The settings of a reconstruction: list, explain, compare."),
+        "verbs": ("verbs", "The verbs as commands, jobs and Python calls."),
+        "warm-up": ("warm_up", "Compile everything that the first use would wait for."),
+        "completion": ("completion", "Print the completion script of a shell."),
+    },
 }
-"""Each command: its module in :mod:`octasplat.workers.cli.commands`, imported when the command runs, and its
-line in the help."""
+"""Each command by what one wants to do: its module in :mod:`octasplat.workers.cli.commands`, imported when
+the command runs, and its line in the help. Those without a module are added where they are defined."""
+
+_COMMANDS = {name: entry for section in _SECTIONS.values() for name, entry in section.items() if entry[0]}
 
 
 def has_command(name: str) -> bool:
@@ -95,11 +120,11 @@ class _LazyGroup(click.Group):
         return next(command for command in commands if command.name == cmd_name)
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        """Write the list of commands without importing them."""
-        added = {name: command.get_short_help_str(100) for name, command in self.commands.items()}
-        help_texts = {name: text for name, (_, text) in _COMMANDS.items()} | added
-        with formatter.section("Commands"):
-            formatter.write_dl([(name, help_texts[name]) for name in self.list_commands(ctx)])
+        """Write the commands by what one wants to do, without importing them."""
+        known = set(self.list_commands(ctx))
+        for title, section in _SECTIONS.items():
+            with formatter.section(title):
+                formatter.write_dl([(name, text) for name, (_, text) in section.items() if name in known])
 
     def invoke(self, ctx: click.Context) -> Any:
         """Run the chosen command."""
@@ -117,6 +142,8 @@ class _LazyGroup(click.Group):
         except Exception as error:
             if isinstance(error, OSError) and error.errno == errno.EPIPE:
                 raise  # whoever read the output has left, which click treats well
+            if isinstance(error, ModuleNotFoundError) and error.name in _POSIX_MODULES:
+                _fail(ctx, _NEEDS_POSIX, 1)
             if os.environ.get(DEBUG) == "1":
                 traceback.print_exc()
             text = f"{type(error).__name__}: {error} (unexpected; run with {DEBUG}=1 for details)"
@@ -129,12 +156,30 @@ def _fail(ctx: click.Context, message: str, exit_code: int) -> NoReturn:
     ctx.exit(exit_code)
 
 
+def _show_versions(context: click.Context, _parameter: click.Parameter, is_asked: bool) -> None:
+    """Print the versions that results depend on, and what the processor can do."""
+    if not is_asked or context.resilient_parsing:
+        return
+    from octasplat.workers.cli.versions import version_lines
+
+    for line in version_lines():
+        click.echo(line)
+    context.exit()
+
+
 @click.group(
     cls=_LazyGroup, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100}
 )
-@click.version_option(__version__, "--version", prog_name="octasplat")
+@click.option(
+    "--version",
+    is_flag=True,
+    is_eager=True,
+    expose_value=False,
+    callback=_show_versions,
+    help="Show the versions that matter for results, and exit.",
+)
 def cli() -> None:
-    """Reconstruct scenes of flat Gaussians from photographs with COLMAP poses, on an ordinary CPU.
+    """Reconstruct scenes of flat Gaussians from photographs, on an ordinary CPU.
 
     Try it without photographs: octasplat demo
     """

@@ -27,11 +27,6 @@ def threads_option(command: F) -> F:
     )(command)
 
 
-def quiet_option(command: F) -> F:
-    """Add the option ``--quiet`` to a command."""
-    return click.option("--quiet", "-q", is_flag=True, help="Show warnings and errors only.")(command)
-
-
 def parse_export_names(text: str | None) -> tuple[str, ...] | None:
     """Return the names in ``viewer.glb,scene.spz``; None where nothing was given.
 

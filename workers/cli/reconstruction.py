@@ -1,15 +1,18 @@
 """A reconstruction with its progress shown and its signals heard, as several commands need it."""
 
+import contextlib
+
 import click
 
-from octasplat.engine.core.errors import DiskFullError, ExportError
+from octasplat.engine.core.errors import DiskFullError, ExportError, OctasplatError
 from octasplat.engine.operations.reconstruct import OPERATION, ReconstructRequest, run_config
+from octasplat.workers.cli.printing import Printer
 from octasplat.workers.cli.request_options import run_operation
 from octasplat.workers.cli.signals import StoppedError
 
 
 def run_reconstruction(
-    request: ReconstructRequest, *, threads: int, quiet: bool, resumes_automatically: bool = False
+    request: ReconstructRequest, printer: Printer, *, threads: int, resumes_automatically: bool = False
 ) -> None:
     """Reconstruct, show the progress, and at the end what was reached.
 
@@ -24,8 +27,9 @@ def run_reconstruction(
     from octasplat.engine.evaluate.summary import summarize_run
 
     output = request.output
+    _print_estimate(request, printer, threads)
     try:
-        run_operation(OPERATION, request, quiet=quiet, threads=threads, is_stoppable=True)
+        run_operation(OPERATION, request, printer, threads=threads, is_stoppable=True)
     except StoppedError as error:
         if resumes_automatically:
             raise StoppedError("Stopped; the same command goes on.", error.exit_code) from None
@@ -36,6 +40,21 @@ def run_reconstruction(
     except ExportError as error:
         written = [name for name in run_config(request).exports if (output / name).exists()]
         for line in summarize_run(output, written):
-            click.echo(line)
+            printer.note(line)
         again = f"Mend that or name others with --exports, and add --resume: {output} goes on from there."
         raise ExportError(f"{error} {again}") from None
+
+
+def _print_estimate(request: ReconstructRequest, printer: Printer, threads: int) -> None:
+    """Print what the run is to take, unless it goes on from where it is."""
+    from octasplat.engine.operations.estimate import estimate_scene, photograph_sizes
+    from octasplat.engine.poses.photographs import locate_scene
+    from octasplat.engine.runs.run_folder import CONFIG
+
+    if printer.hides_progress or (request.resume and (request.output / CONFIG).exists()):
+        return
+    config = run_config(request)
+    with contextlib.suppress(OctasplatError):  # the run refuses what cannot be read, in its own words
+        scene = locate_scene(request.source)
+        found = estimate_scene(scene, config, photograph_sizes(scene), threads)
+        click.echo(f"Estimate: {found.text}, within a factor of two.", err=True)

@@ -6,6 +6,7 @@ from typing import Any
 import click
 
 from octasplat.engine.evaluate.summary import summarize_run
+from octasplat.workers.cli.printing import Printer
 from octasplat.workers.cli.progress import show_progress
 from octasplat.workers.client import submission
 from octasplat.workers.client.api import Api
@@ -14,65 +15,61 @@ from octasplat.workers.client.submission import Derivation, JobFailedError, Subm
 DEMO_OUTPUT = Path("octasplat-demo")
 
 
-def submit(api: Api, request: Submission, *, quiet: bool = False) -> dict[str, Any]:
+def submit(api: Api, request: Submission, printer: Printer) -> dict[str, Any]:
     """Upload what is missing and queue the job; returns the job."""
-    with show_progress(quiet=quiet) as listener:
+    with show_progress(quiet=printer.hides_progress) as listener:
         job = submission.submit(api, request, listener)
-    _print_notes(job, quiet=quiet)
+    _print_notes(job, printer)
     return job
 
 
-def derive(api: Api, request: Derivation, *, quiet: bool = False) -> dict[str, Any]:
+def derive(api: Api, request: Derivation, printer: Printer) -> dict[str, Any]:
     """Send the files that are named and queue a job on the results of another; returns the job."""
-    with show_progress(quiet=quiet) as listener:
+    with show_progress(quiet=printer.hides_progress) as listener:
         job = submission.derive(api, request, listener)
-    _print_notes(job, quiet=quiet)
+    _print_notes(job, printer)
     return job
 
 
-def wait_for(api: Api, job_id: str, *, quiet: bool = False) -> dict[str, Any]:
+def wait_for(api: Api, job_id: str, printer: Printer) -> dict[str, Any]:
     """Show a job's progress until it is over; returns it."""
-    with show_progress(quiet=quiet) as listener:
-        return submission.wait_for_job(api, job_id, listener, (lambda _note: None) if quiet else click.echo)
+    with show_progress(quiet=printer.hides_progress) as listener:
+        return submission.wait_for_job(api, job_id, listener, printer.note)
 
 
 def download_results(
-    api: Api, job_id: str, folder: Path, names: tuple[str, ...] = (), *, quiet: bool = False
-) -> None:
-    """Save the results of a job."""
-    with show_progress(quiet=quiet) as listener:
+    api: Api, job_id: str, folder: Path, names: tuple[str, ...], printer: Printer
+) -> tuple[Path, ...]:
+    """Save the results of a job, or only those called ``names``; returns the files."""
+    with show_progress(quiet=printer.hides_progress) as listener:
         paths = submission.download_job(api, job_id, folder, names, listener)
-    if not quiet:
-        click.echo(f"Saved {len(paths)} file{'s' if len(paths) > 1 else ''} in {folder}.")
+    printer.note(f"Saved {len(paths)} file{'s' if len(paths) > 1 else ''} in {folder}.")
+    return paths
 
 
-def submit_and_wait(api: Api, request: Submission | Derivation, output: Path, *, quiet: bool = False) -> None:
-    """Submit, wait, download, and print a summary."""
-    job = (
-        derive(api, request, quiet=quiet)
-        if isinstance(request, Derivation)
-        else submit(api, request, quiet=quiet)
-    )
-    if not quiet:
-        click.echo(f"Queued as job {job['id']}.")
+def submit_and_wait(api: Api, request: Submission | Derivation, output: Path, printer: Printer) -> None:
+    """Submit, wait, download, and print a summary, or the job as JSON."""
+    is_derivation = isinstance(request, Derivation)
+    job = derive(api, request, printer) if is_derivation else submit(api, request, printer)
+    printer.note(f"Queued as job {job['id']}.")
     try:
-        job = wait_for(api, job["id"], quiet=quiet)
+        job = wait_for(api, job["id"], printer)
     except JobFailedError:
         if api.get(f"/v1/jobs/{job['id']}/artifacts")["artifacts"]:
-            download_results(api, job["id"], output, quiet=quiet)  # what succeeded
+            download_results(api, job["id"], output, (), printer)  # what succeeded
         raise
     except KeyboardInterrupt:
         click.echo(f"The job goes on without you: octasplat status {job['id']}", err=True)
         raise
-    download_results(api, job["id"], output, quiet=quiet)
-    if not quiet and (output / "metrics.json").exists():
-        for line in summarize_run(output, job["options"].get("exports", ())):
-            click.echo(line)
+    paths = download_results(api, job["id"], output, (), printer)
+    is_run = (output / "metrics.json").exists()
+    summary = summarize_run(output, job["options"].get("exports", ())) if is_run else ()
+    printer.print({"job": job, "files": paths}, summary)
 
 
-def _print_notes(job: dict[str, Any], *, quiet: bool) -> None:
+def _print_notes(job: dict[str, Any], printer: Printer) -> None:
     """Print the notes of a queued job."""
-    if not quiet and job.get("estimate"):
+    if not printer.hides_progress and job.get("estimate"):
         click.echo(f"Estimate: {job['estimate']['text']}, within a factor of two.", err=True)
     for note in job.get("notes", ()):
         click.echo(f"Note: {note}", err=True)
@@ -90,5 +87,5 @@ def run_demo(api: Api, output: Path = DEMO_OUTPUT) -> None:
     scene = output / "scene"
     make_demo_scene(scene, {}, quiet=False)
     options = {"preset": "fast", "train": {"iterations": 2000}}
-    submit_and_wait(api, Submission(scene, options=options, label="demo"), output / "result")
+    submit_and_wait(api, Submission(scene, options=options, label="demo"), output / "result", Printer())
     click.echo(f"Open {output / 'result' / 'report.html'} in a browser to see the result.")

@@ -5,7 +5,8 @@ from typing import Any
 import click
 
 from octasplat.engine.operations.base import Operation
-from octasplat.workers.cli.options import quiet_option, threads_option
+from octasplat.workers.cli.options import threads_option
+from octasplat.workers.cli.printing import Printer, output_options
 from octasplat.workers.cli.request_options import request_from_options, request_options, run_operation
 
 _CAMERA_FIELDS = ("views", "photographs", "other_dataset", "path_file", "camera")
@@ -25,8 +26,8 @@ def render_command(operation: Operation[Any, Any], exr_channels: str) -> click.C
     @click.option("--exr", is_flag=True, help=f"Write EXR files with {exr_channels} instead of PNG files.")
     @request_options(operation.request)
     @threads_option
-    @quiet_option
-    def command(turntable: bool, exr: bool, threads: int, quiet: bool, **given: Any) -> None:
+    @output_options
+    def command(turntable: bool, exr: bool, threads: int, printer: Printer, **given: Any) -> None:
         if turntable:
             if any(given.get(name) for name in _CAMERA_FIELDS):
                 raise click.UsageError("Choose one of --turntable and other cameras.")
@@ -34,6 +35,6 @@ def render_command(operation: Operation[Any, Any], exr_channels: str) -> click.C
         if exr:
             given["format"] = "exr"
         request = request_from_options(operation.request, given)
-        run_operation(operation, request, quiet=quiet, threads=threads, is_stoppable=True)
+        run_operation(operation, request, printer, threads=threads, is_stoppable=True)
 
     return command

@@ -24,7 +24,8 @@ from octasplat.engine.operations.written_files import remember_written
 from octasplat.engine.settings.fields import Positional, Spelling, is_negatable
 from octasplat.engine.settings.renamed_settings import former_names, notify_renamed
 from octasplat.workers.cli.input_paths import check_inputs
-from octasplat.workers.cli.options import quiet_option, threads_option
+from octasplat.workers.cli.options import threads_option
+from octasplat.workers.cli.printing import Printer, output_options
 from octasplat.workers.cli.progress import show_progress
 from octasplat.workers.cli.signals import StoppedError, exit_on_sigterm, request_stop_on_signals
 
@@ -76,12 +77,11 @@ def operation_command(
         cls: class of the command.
     """
 
-    def run(quiet: bool, threads: int = 0, **given: Any) -> None:
+    def run(printer: Printer, threads: int = 0, **given: Any) -> None:
         request = request_from_options(operation.request, given)
-        run_operation(operation, request, quiet=quiet, threads=threads, is_stoppable=is_stoppable)
+        run_operation(operation, request, printer, threads=threads, is_stoppable=is_stoppable)
 
-    command: Command = run
-    command = quiet_option(command)
+    command: Command = output_options(run)
     if threads:
         command = threads_option(command)
     command = request_options(operation.request)(command)
@@ -114,8 +114,8 @@ def request_from_options(model: type[Any], given_values: dict[str, Any]) -> Any:
 def run_operation(
     operation: Operation[Any, ResultT],
     request: Any,
+    printer: Printer,
     *,
-    quiet: bool,
     threads: int = 0,
     is_stoppable: bool = False,
 ) -> ResultT:
@@ -128,19 +128,17 @@ def run_operation(
     if is_stoppable:
         with request_stop_on_signals() as should_stop:
             try:
-                with show_progress(quiet=quiet, should_stop=should_stop) as progress:
+                with show_progress(quiet=printer.hides_progress, should_stop=should_stop) as progress:
                     result = operation.execute(
                         request, progress=progress, should_stop=should_stop, threads=threads
                     )
             except CancelledError as error:
                 raise StoppedError(str(error), should_stop.exit_code) from None
     else:
-        with exit_on_sigterm(), show_progress(quiet=quiet) as progress:
+        with exit_on_sigterm(), show_progress(quiet=printer.hides_progress) as progress:
             result = operation.execute(request, progress=progress, should_stop=never_stop, threads=threads)
     remember_written(operation.name, result.files)
-    if not quiet:
-        for line in result.lines():
-            click.echo(line)
+    printer.print(result, result.lines())
     return result
 
 

@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING
 
 import click
 
+from octasplat.workers.cli.printing import Printer, output_options
+
 if TYPE_CHECKING:
     from octasplat.workers.settings import WorkerSettings
 
@@ -18,7 +20,8 @@ _data_option = click.option(
 @click.command(short_help="Copy a service, tables and store, while it runs.")
 @click.argument("folder", type=click.Path(path_type=Path, file_okay=False))
 @_data_option
-def backup(folder: Path, data: Path | None) -> None:
+@output_options
+def backup(folder: Path, data: Path | None, printer: Printer) -> None:
     """Copy the tables of a service, and everything in its store that they name, into FOLDER.
 
     The service may run meanwhile; everything is of one moment. Into the folder of an earlier backup only new
@@ -32,15 +35,17 @@ def backup(folder: Path, data: Path | None) -> None:
     with _database_connection(settings) as conninfo, translate_database_errors():
         storage = open_storage(settings.storage_address, floor_bytes=0)
         copied = create_backup(conninfo, storage, folder.absolute())
-    click.echo(
-        f"{copied.rows} rows and {copied.contents} contents of {copied.size_bytes} bytes are in {folder}."
+    printer.print(
+        copied,
+        [f"{copied.rows} rows and {copied.contents} contents of {copied.size_bytes} bytes are in {folder}."],
     )
 
 
 @click.command(short_help="Put a backup into an empty service.")
 @click.argument("folder", type=click.Path(path_type=Path, exists=True, file_okay=False))
 @_data_option
-def restore(folder: Path, data: Path | None) -> None:
+@output_options
+def restore(folder: Path, data: Path | None, printer: Printer) -> None:
     """Put the backup in FOLDER into an empty database and an empty store, those of the settings.
 
     No service may run on them. Jobs that were queued or under way when the backup was made are queued again.
@@ -54,8 +59,9 @@ def restore(folder: Path, data: Path | None) -> None:
     with _database_connection(settings, exclusive=True) as conninfo, translate_database_errors():
         storage = open_storage(settings.storage_address, floor_bytes=settings.floor_bytes)
         copied = put_back(conninfo, storage, folder.absolute())
-    click.echo(
-        f"{copied.rows} rows and {copied.contents} contents of {copied.size_bytes} bytes are restored."
+    printer.print(
+        copied,
+        [f"{copied.rows} rows and {copied.contents} contents of {copied.size_bytes} bytes are restored."],
     )
 
 

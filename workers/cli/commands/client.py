@@ -1,11 +1,13 @@
-"""Commands that talk to a service: submit, jobs, status, logs, cancel, retry, download."""
+"""Commands that talk to a service: submit, derive, and those on its jobs, datasets and workers."""
 
 import copy
 import json
 import os
+import re
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -15,7 +17,8 @@ import click
 from octasplat.engine.core.errors import ConfigError
 from octasplat.engine.operations.reconstruct import ReconstructOptions
 from octasplat.engine.settings.renamed_settings import notify_renamed
-from octasplat.workers.cli.options import exports_option, parse_export_names, quiet_option
+from octasplat.workers.cli.options import exports_option, parse_export_names
+from octasplat.workers.cli.printing import Printer, local_time, output_options, table_lines
 from octasplat.workers.cli.request_options import request_from_options, request_options
 
 if TYPE_CHECKING:
@@ -45,6 +48,14 @@ def set_option(command: F) -> F:
     )(command)
 
 
+def limit_option(command: F) -> F:
+    """Add the option ``--limit`` of lists to a command."""
+    return click.option(
+        "--limit", type=click.IntRange(1, 1000), default=20, show_default=True, metavar="N",
+        help="Most rows to list.",
+    )(command)  # fmt: skip
+
+
 @contextmanager
 def connected(server: str | None, *, awaits_start: bool = False) -> Iterator["Api"]:
     """Yield the service that the user means; the token is no option, as others on a machine see those.
@@ -72,7 +83,7 @@ def connected(server: str | None, *, awaits_start: bool = False) -> Iterator["Ap
     "--priority", type=click.IntRange(-100, 100), default=0, help="Among your jobs, higher goes first."
 )
 @server_option
-@quiet_option
+@output_options
 def submit(
     scene: Path,
     wait: bool,
@@ -81,7 +92,7 @@ def submit(
     queue: str,
     priority: int,
     server: str | None,
-    quiet: bool,
+    printer: Printer,
     **given: Any,
 ) -> None:
     """Send SCENE: a folder with images/ (and sparse/0), one of photographs, a ZIP file or a dataset's id.
@@ -97,10 +108,12 @@ def submit(
     requested = options.model_dump(mode="json", exclude_unset=True)
     what = Submission(scene, requested, label, queue, priority)
     with connected(server, awaits_start=True) as api:
+        what = replace(what, scene=_as_dataset(api, scene))
         if wait:
-            submit_and_wait(api, what, output or Path(f"{scene.stem or 'scene'}-result"), quiet=quiet)
+            submit_and_wait(api, what, output or Path(f"{scene.stem or 'scene'}-result"), printer)
             return
-        click.echo(submit(api, what, quiet=quiet)["id"])
+        job = submit(api, what, printer)
+    printer.print(job, [job["id"]], quiet_lines=[job["id"]])
 
 
 @click.command(short_help="Queue a job on the results of a finished one, such as a render.")
@@ -150,7 +163,7 @@ def submit(
     "--priority", type=click.IntRange(-100, 100), default=0, help="Among your jobs, higher goes first."
 )
 @server_option
-@quiet_option
+@output_options
 def derive(
     kind: str,
     job_id: str | None,
@@ -162,7 +175,7 @@ def derive(
     wait: bool,
     output: Path | None,
     server: str | None,
-    quiet: bool,
+    printer: Printer,
     **given: Any,
 ) -> None:
     """Queue a job of a KIND such as render, crop or edit on the results of JOB, or one on files alone.
@@ -174,6 +187,7 @@ def derive(
     """
     from octasplat.workers.cli.named_files import with_named_files
     from octasplat.workers.cli.remote_jobs import derive, submit_and_wait
+    from octasplat.workers.client.short_ids import find_job
     from octasplat.workers.client.submission import (
         Derivation,
         with_camera_path,
@@ -186,11 +200,17 @@ def derive(
         notify_renamed({"--on": "--other-dataset"})
     files = [_parse_file_option(text) for text in given["files"]]
     with connected(server, awaits_start=wait) as api:
-        source = None if job_id is None else _get_job(api, job_id)["id"]
+        source = None if job_id is None else find_job(api, job_id)["id"]
+        photographs = other_dataset or former_on
         what = Derivation(
-            source, kind, _with_assignments({}, given["assignments"]), scene=other_dataset or former_on,
-            label=given["label"], queue=given["queue"], priority=given["priority"],
-        )  # fmt: skip
+            source,
+            kind,
+            _with_assignments({}, given["assignments"]),
+            scene=None if photographs is None else _as_dataset(api, photographs),
+            label=given["label"],
+            queue=given["queue"],
+            priority=given["priority"],
+        )
         what = with_named_files(what, files)
         if stage is not None:
             what = with_stage(what, stage)
@@ -199,90 +219,161 @@ def derive(
         if environments:
             what = with_environments(what, environments)
         if wait:
-            submit_and_wait(api, what, output or Path(f"{kind}-result"), quiet=quiet)
+            submit_and_wait(api, what, output or Path(f"{kind}-result"), printer)
             return
-        click.echo(derive(api, what, quiet=quiet)["id"])
+        job = derive(api, what, printer)
+    printer.print(job, [job["id"]], quiet_lines=[job["id"]])
 
 
 @click.command(short_help="List jobs.")
 @click.option("--state", multiple=True, type=click.Choice(STATES), help="Only these; may be repeated.")
-@click.option("--limit", type=click.IntRange(1, 200), default=20, show_default=True)
+@click.option("--label", metavar="TEXT", help="Only those with exactly this label.")
+@limit_option
 @server_option
-def jobs(state: tuple[str, ...], limit: int, server: str | None) -> None:
-    """List jobs, the newest first."""
+@output_options
+def jobs(state: tuple[str, ...], label: str | None, limit: int, server: str | None, printer: Printer) -> None:
+    """List jobs, the newest first.
+
+    Every command takes the id that is shown, a whole one of the JSON output, or 'last'.
+    """
+    from octasplat.workers.client.short_ids import list_rows, short_id
+
+    query: dict[str, Any] = {"state": list(state)} if state else {}
+    if label is not None:
+        query["label"] = label
     with connected(server) as api:
-        query: dict[str, Any] = {"limit": limit, **({"state": list(state)} if state else {})}
-        found = api.get("/v1/jobs", **query)["jobs"]
-    if not found:
-        click.echo("No jobs.")
-    for job in found:
-        line = (
-            f"{job['id']}  {job['state']:9}  {job['kind']:11}  {_progress_text(job):22}  {_psnr_text(job):8}"
+        found = list(list_rows(api, "jobs", limit=limit, **query))
+    rows = [
+        (
+            short_id(job["id"]),
+            job["state"],
+            job["kind"],
+            local_time(job["created_at"]),
+            _progress_text(job),
+            _psnr_text(job),
+            job["label"] or "",
         )
-        click.echo(f"{line}  {job['label'] or ''}".rstrip())
+        for job in found
+    ]
+    headers = ("Id", "State", "Kind", "Created", "Progress", "PSNR", "Label")
+    printer.print(found, table_lines(headers, rows) or ["No jobs."], quiet_lines=[job["id"] for job in found])
+
+
+@click.command(short_help="List datasets, which hold the photographs of jobs.")
+@limit_option
+@server_option
+@output_options
+def datasets(limit: int, server: str | None, printer: Printer) -> None:
+    """List datasets, the newest first; submit takes the id of one in the place of a folder."""
+    from octasplat.workers.client.short_ids import list_rows, short_id
+
+    with connected(server) as api:
+        found = list(list_rows(api, "datasets", limit=limit))
+    rows = [
+        (
+            short_id(dataset["id"]),
+            dataset["state"],
+            dataset["holds"],
+            dataset["photographs"] or "",
+            "yes" if dataset["has_poses"] else "",
+            local_time(dataset["created_at"]),
+            dataset["name"],
+        )
+        for dataset in found
+    ]
+    headers = ("Id", "State", "Holds", "Photographs", "Poses", "Created", "Name")
+    printer.print(
+        found, table_lines(headers, rows) or ["No datasets."], quiet_lines=[row["id"] for row in found]
+    )
+
+
+@click.command(short_help="List queues and the workers that take jobs from them.")
+@server_option
+@output_options
+def workers(server: str | None, printer: Printer) -> None:
+    """List the queues of the service with what waits in them, and its live workers."""
+    with connected(server) as api:
+        found = api.get("/v1/queues")
+    queues = [(row["queue"], row["waiting"], row["running"], row["slots"]) for row in found["queues"]]
+    live = [
+        (row["name"], ",".join(row["queues"]), row["slots"], local_time(row["started_at"]))
+        for row in found["workers"]
+    ]
+    lines = [
+        *table_lines(("Queue", "Waiting", "Running", "Slots"), queues),
+        *(["", *table_lines(("Worker", "Queues", "Slots", "Since"), live)] if live else ["No live workers."]),
+    ]
+    printer.print(found, lines, quiet_lines=[row["name"] for row in found["workers"]])
 
 
 @click.command(short_help="Show a job, or wait for it.")
 @click.argument("job_id", metavar="JOB")
 @click.option("--wait", is_flag=True, help="Show the progress until it is over.")
-@click.option("--json", "as_json", is_flag=True, help="Everything, as JSON.")
 @server_option
-@quiet_option
-def status(job_id: str, wait: bool, as_json: bool, server: str | None, quiet: bool) -> None:
+@output_options
+def status(job_id: str, wait: bool, server: str | None, printer: Printer) -> None:
     """Show how far JOB is; 'last' is the newest one."""
     from octasplat.workers.cli.remote_jobs import wait_for
+    from octasplat.workers.client.short_ids import find_job
 
     with connected(server, awaits_start=wait) as api:
-        job = _get_job(api, job_id)
+        job = find_job(api, job_id)
         if wait:
-            job = wait_for(api, job["id"], quiet=quiet or as_json)
-    if as_json:
-        click.echo(json.dumps(job, indent=2))
-        return
-    click.echo(f"{job['kind']} {job['id']}: {job['state']} {_progress_text(job)}".rstrip())
+            job = wait_for(api, job["id"], printer)
+    printer.print(job, _job_lines(job), quiet_lines=[job["state"]])
+
+
+def _job_lines(job: dict[str, Any]) -> Iterator[str]:
+    """Yield sentences about a job."""
+    yield f"{job['kind']} {job['id']}: {job['state']} {_progress_text(job)}".rstrip()
     if job.get("estimate") and job["state"] in ("queued", "running"):
-        click.echo(f"Estimated when it was asked for: {job['estimate']['text']}, within a factor of two.")
-    for note in job.get("notes", ()):
-        click.echo(note)
+        yield f"Estimated when it was asked for: {job['estimate']['text']}, within a factor of two."
+    yield from job.get("notes", ())
     if job["psnr"] is not None:
         training = job.get("training_psnr")
         rest = f"; {training:.2f} dB over the training's own rays" if training is not None else ""
-        click.echo(f"PSNR {_psnr_text(job)} over held-out views{rest}")
+        yield f"PSNR {_psnr_text(job)} over held-out views{rest}"
     if job["error"]:
-        click.echo(job["error"]["message"])
+        yield job["error"]["message"]
 
 
 @click.command(short_help="Show the log of a job.")
 @click.argument("job_id", metavar="JOB")
 @click.option("-f", "--follow", is_flag=True, help="Go on until the job is over.")
+@click.option("--json", "as_json", is_flag=True, help="Print each line as a JSON object.")
 @server_option
-def logs(job_id: str, follow: bool, server: str | None) -> None:
+def logs(job_id: str, follow: bool, as_json: bool, server: str | None) -> None:
     """Show what JOB did when, and what its program wrote; times are this machine's."""
+    from octasplat.workers.client.short_ids import find_job
+
     with connected(server) as api:
-        job = _get_job(api, job_id)
+        job = find_job(api, job_id)
         after = 0
         while True:
             over = job["state"] in ("succeeded", "failed", "canceled")
             page = api.get(f"/v1/jobs/{job['id']}/logs", after=after)
             for line in page["lines"]:
-                click.echo(f"{_local_time(line['at'])}  {line['text']}")
+                click.echo(json.dumps(line) if as_json else f"{_local_clock(line['at'])}  {line['text']}")
             after = page["next"]
             if page["lines"]:
                 continue
             if over or not follow:
                 return
             time.sleep(1)
-            job = _get_job(api, job["id"])
+            job = find_job(api, job["id"])
 
 
 @click.command(short_help="Stop a job.")
 @click.argument("job_id", metavar="JOB")
 @server_option
-def cancel(job_id: str, server: str | None) -> None:
+@output_options
+def cancel(job_id: str, server: str | None, printer: Printer) -> None:
     """Stop JOB; it keeps its checkpoint."""
+    from octasplat.workers.client.short_ids import find_job
+
     with connected(server) as api:
-        job = api.post(f"/v1/jobs/{_get_job(api, job_id)['id']}/cancel")
-    click.echo(f"{job['id']}: {job['state']}")
+        job = api.post(f"/v1/jobs/{find_job(api, job_id)['id']}/cancel")
+    printer.print(job, [f"{job['id']}: {job['state']}"])
 
 
 @click.command(short_help="Queue a failed or cancelled job again.")
@@ -291,19 +382,22 @@ def cancel(job_id: str, server: str | None) -> None:
 @exports_option
 @set_option
 @server_option
-def retry(job_id: str, from_start: bool, server: str | None, **given: Any) -> None:
+@output_options
+def retry(job_id: str, from_start: bool, server: str | None, printer: Printer, **given: Any) -> None:
     """Queue JOB again; it goes on from its checkpoint.
 
     With --exports it writes other files from the scene that is trained; other settings of the training need
     --from-start.
     """
+    from octasplat.workers.client.short_ids import find_job
+
     body: dict[str, Any] = {"from": "start" if from_start else "checkpoint"}
     with connected(server) as api:
-        job = _get_job(api, job_id)
+        job = find_job(api, job_id)
         if options := _changed_options(given, job):
             body["options"] = options
         job = api.post(f"/v1/jobs/{job['id']}/retry", body)
-    click.echo(f"{job['id']}: {job['state']}")
+    printer.print(job, [f"{job['id']}: {job['state']}"])
     for note in job.get("notes", ()):
         click.echo(f"Note: {note}", err=True)
 
@@ -313,16 +407,27 @@ def retry(job_id: str, from_start: bool, server: str | None, **given: Any) -> No
 @click.argument("names", nargs=-1)
 @click.option("-o", "--output", type=click.Path(path_type=Path), help="Folder.  [default: octasplat-<job>]")
 @server_option
-@quiet_option
+@output_options
 def download(
-    job_id: str, names: tuple[str, ...], output: Path | None, server: str | None, quiet: bool
+    job_id: str, names: tuple[str, ...], output: Path | None, server: str | None, printer: Printer
 ) -> None:
     """Save the results of JOB, or only those called NAMES; goes on where it broke off."""
     from octasplat.workers.cli.remote_jobs import download_results
+    from octasplat.workers.client.short_ids import find_job, short_id
 
     with connected(server, awaits_start=True) as api:
-        job = _get_job(api, job_id)
-        download_results(api, job["id"], output or Path(f"octasplat-{job['id'][-12:]}"), names, quiet=quiet)
+        job = find_job(api, job_id)
+        folder = output or Path(f"octasplat-{short_id(job['id'])}")
+        paths = download_results(api, job["id"], folder, names, printer)
+    printer.print({"folder": folder, "files": paths}, ())
+
+
+def _as_dataset(api: "Api", scene: Path) -> Path:
+    """Return the whole id of a dataset that is named by the end of it; a path as it is."""
+    from octasplat.workers.client.short_ids import SHOWN_CHARACTERS, find_dataset
+
+    is_short = re.fullmatch(f"[0-9a-f]{{{SHOWN_CHARACTERS}}}", str(scene)) and not scene.exists()
+    return Path(find_dataset(api, str(scene))["id"]) if is_short else scene
 
 
 def _check_output(output: Path | None, *, wait: bool) -> None:
@@ -372,23 +477,13 @@ def _with_assignments(options: dict[str, Any], assignments: tuple[str, ...]) -> 
     return options
 
 
-def _get_job(api: "Api", job_id: str) -> dict[str, Any]:
-    if job_id != "last":
-        job: dict[str, Any] = api.get(f"/v1/jobs/{job_id}")
-        return job
-    newest = api.get("/v1/jobs", limit=1)["jobs"]
-    if not newest:
-        raise ConfigError("There are no jobs.")
-    return _get_job(api, newest[0]["id"])
-
-
 def _psnr_text(job: dict[str, Any]) -> str:
     """Return the PSNR over held-out views."""
     return "" if job["psnr"] is None else f"{job['psnr']:.2f} dB"
 
 
-def _local_time(at: str) -> str:
-    """Return a time of the service as this machine's clock shows it."""
+def _local_clock(at: str) -> str:
+    """Return a time of the service as this machine's clock shows it, to the second."""
     return datetime.fromisoformat(at).astimezone().strftime("%H:%M:%S")
 
 

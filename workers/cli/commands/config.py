@@ -1,6 +1,5 @@
 """``octasplat config``: the settings of a reconstruction."""
 
-import json
 import textwrap
 from dataclasses import asdict
 from pathlib import Path
@@ -9,8 +8,7 @@ from typing import Any, get_args
 import click
 
 from octasplat.engine.settings.fields import SettingLevel
-
-_json_option = click.option("--json", "as_json", is_flag=True, help="Write JSON.")
+from octasplat.workers.cli.printing import Printer, output_options, table_lines
 
 
 @click.group(short_help="The settings of a reconstruction: list, explain, compare.")
@@ -22,8 +20,8 @@ def config() -> None:
 @click.option("--all", "everything", is_flag=True, help="List all settings, not only the basic ones.")
 @click.option("--group", type=click.Choice(get_args(SettingLevel)), help="List the settings of this group.")
 @click.option("--markdown", is_flag=True, help="Write the page docs/settings.md.")
-@_json_option
-def list_settings(everything: bool, group: str | None, markdown: bool, as_json: bool) -> None:
+@output_options
+def list_settings(everything: bool, group: str | None, markdown: bool, printer: Printer) -> None:
     """List the settings, those that most people need unless asked for others."""
     from octasplat.engine.runs.settings_catalog import all_settings, format_value
     from octasplat.engine.runs.settings_page import settings_page
@@ -33,14 +31,22 @@ def list_settings(everything: bool, group: str | None, markdown: bool, as_json: 
         return
     listed_group = group or ("" if everything else "basic")
     entries = [entry for entry in all_settings() if not listed_group or entry.group == listed_group]
-    if as_json:
-        _write_json([_entry_as_dict(entry) for entry in entries])
-        return
-    width = max(len(entry.name) for entry in entries)
-    for entry in entries:
-        value = " ".join((format_value(entry.default), entry.unit)).strip()
-        click.echo(f"{entry.name:{width}}  {value:<24}  {_first_sentence(entry.description)}")
-    if len(entries) < len(all_settings()):
+    printer.print(
+        [_entry_as_dict(entry) for entry in entries],
+        table_lines(
+            ("Setting", "Default", "Meaning"),
+            [
+                (
+                    entry.name,
+                    f"{format_value(entry.default)} {entry.unit}".strip(),
+                    _first_sentence(entry.description),
+                )
+                for entry in entries
+            ],
+        ),
+        quiet_lines=[entry.name for entry in entries],
+    )
+    if len(entries) < len(all_settings()) and not printer.hides_progress:
         click.echo(
             f"{len(entries)} of {len(all_settings())} settings; --all lists the others, too.", err=True
         )
@@ -48,18 +54,14 @@ def list_settings(everything: bool, group: str | None, markdown: bool, as_json: 
 
 @config.command(short_help="Explain a setting.")
 @click.argument("name", metavar="NAME")
-@_json_option
-def explain(name: str, as_json: bool) -> None:
+@output_options
+def explain(name: str, printer: Printer) -> None:
     """Explain the setting NAME, such as lr.mean: what it does, its unit, range and defaults."""
     from octasplat.engine.runs.settings_catalog import find_setting, format_value
 
     entry = find_setting(name)
-    if as_json:
-        _write_json(_entry_as_dict(entry))
-        return
-    click.echo(f"{entry.name} ({entry.group})")
-    for line in textwrap.wrap(entry.description, 92):
-        click.echo(f"  {line}")
+    lines = [f"{entry.name} ({entry.group})"]
+    lines += [f"  {line}" for line in textwrap.wrap(entry.description, 92)]
     facts = {
         "Type": entry.type,
         "Unit": entry.unit,
@@ -67,16 +69,15 @@ def explain(name: str, as_json: bool) -> None:
         "Default": format_value(entry.default),
         **{f"With {preset}": format_value(value) for preset, value in entry.exceptions.items()},
     }
-    for label, text in facts.items():
-        if text:
-            click.echo(f"  {label}: {text}")
+    lines += [f"  {label}: {text}" for label, text in facts.items() if text]
+    printer.print(_entry_as_dict(entry), lines, quiet_lines=[format_value(entry.default)])
 
 
 @config.command(short_help="Tell which settings a run had changed.")
 @click.argument("run", metavar="RUN", type=click.Path(path_type=Path))
 @click.argument("other", metavar="[RUN2]", required=False, type=click.Path(path_type=Path))
-@_json_option
-def diff(run: Path, other: Path | None, as_json: bool) -> None:
+@output_options
+def diff(run: Path, other: Path | None, printer: Printer) -> None:
     """Tell in which settings RUN differs from the defaults of its preset, or RUN2 from RUN."""
     from octasplat.engine.runs.config import read_config
     from octasplat.engine.runs.run_folder import CONFIG
@@ -85,15 +86,11 @@ def diff(run: Path, other: Path | None, as_json: bool) -> None:
     first = read_config(run / CONFIG)
     before, after = (default_values(first), first) if other is None else (first, read_config(other / CONFIG))
     found = setting_differences(before, after)
-    if as_json:
-        _write_json([asdict(difference) for difference in found])
-        return
-    for difference in found:
-        old, new = format_value(difference.before), format_value(difference.after)
-        click.echo(f"{difference.name}: {old} -> {new}")
-    if not found:
-        what = f"the defaults of {first.preset}" if other is None else str(run)
-        click.echo(f"No setting differs from {what}.")
+    what = f"the defaults of {first.preset}" if other is None else str(run)
+    lines = [f"{item.name}: {format_value(item.before)} -> {format_value(item.after)}" for item in found]
+    printer.print(
+        found, lines or [f"No setting differs from {what}."], quiet_lines=[item.name for item in found]
+    )
 
 
 def _entry_as_dict(entry: Any) -> dict[str, Any]:
@@ -102,7 +99,3 @@ def _entry_as_dict(entry: Any) -> dict[str, Any]:
 
 def _first_sentence(text: str) -> str:
     return text.split(". ")[0].split("; ")[0].rstrip(".")
-
-
-def _write_json(content: object) -> None:
-    click.echo(json.dumps(content, indent=2))

@@ -11,7 +11,8 @@ from octasplat.engine.settings import renamed_settings
 from octasplat.engine.settings.fields import Output, Spelling, Unit
 from octasplat.engine.settings.preset_names import PresetName
 from octasplat.workers.cli.browser import has_display
-from octasplat.workers.cli.options import quiet_option, threads_option
+from octasplat.workers.cli.options import threads_option
+from octasplat.workers.cli.printing import Printer, output_options
 from octasplat.workers.cli.request_options import request_from_options, request_options
 
 
@@ -43,8 +44,8 @@ class DemoRequest(Request):
     "--open/--no-open", "open_report", default=None, help="Open the report in a browser at the end."
 )
 @threads_option
-@quiet_option
-def demo(open_report: bool | None, threads: int, quiet: bool, **given: Any) -> None:
+@output_options
+def demo(open_report: bool | None, threads: int, printer: Printer, **given: Any) -> None:
     """Make a scene and reconstruct it; the text of the request is the help."""
     from octasplat.workers.cli.demo_run import make_demo_scene, reconstruct_demo_scene
 
@@ -52,14 +53,15 @@ def demo(open_report: bool | None, threads: int, quiet: bool, **given: Any) -> N
     output = request.output
     size = {"views": request.views, "width_px": request.width_px, "height_px": request.height_px}
     if request.dataset_only:
-        make_demo_scene(output, size, quiet=quiet)
-        click.echo(f"The dataset is in {output}; reconstruct it with: octasplat reconstruct {output} -o OUT")
+        make_demo_scene(output, size, quiet=printer.hides_progress)
+        how = f"octasplat reconstruct {output} -o OUT"
+        printer.print({"dataset": output}, [f"The dataset is in {output}; reconstruct it with: {how}"])
         return
-    make_demo_scene(output / "scene", size, quiet=quiet)
+    make_demo_scene(output / "scene", size, quiet=printer.hides_progress)
     report = reconstruct_demo_scene(
-        output / "scene", output / "result", request.preset, threads=threads, quiet=quiet
+        output / "scene", output / "result", request.preset, printer, threads=threads
     )
-    click.echo(f"Open {report} in a browser to see the result.")
+    printer.note(f"Open {report} in a browser to see the result.")
     if has_display() if open_report is None else open_report:
         import webbrowser
 

@@ -5,6 +5,8 @@ from typing import TYPE_CHECKING
 
 import click
 
+from octasplat.workers.cli.printing import Printer, output_options
+
 if TYPE_CHECKING:
     from octasplat.workers.settings import WorkerSettings
     from octasplat.workers.storage.fsck import Reference, Report
@@ -17,29 +19,22 @@ _MAX_SHOWN_FINDINGS = 50
     "--data", type=click.Path(path_type=Path), metavar="FOLDER", help="Data folder of octasplat serve."
 )
 @click.option("--verify", is_flag=True, help="Read every content and compare its digest; takes long.")
-@click.option("--json", "as_json", is_flag=True, help="Write the report as JSON, whole.")
 @click.option("--recount", is_flag=True, help="Count anew what each owner stores; uploads wait meanwhile.")
-def fsck(data: Path | None, verify: bool, as_json: bool, recount: bool) -> None:
+@output_options
+def fsck(data: Path | None, verify: bool, recount: bool, printer: Printer) -> None:
     """Report contents that the tables name but the store lacks or has damaged, and contents nothing names.
 
     Changes nothing but, with --recount, the numbers of bytes that quotas are checked against. The exit code
     is 1 if something that is needed is missing or damaged.
     """
-    import dataclasses
-    import json
-
     from octasplat.workers.settings import WorkerSettings, load_settings
 
     settings = load_settings(WorkerSettings, data=data)
     if recount:
         for line in _recount_quotas(settings):
-            click.echo(line, err=as_json)
+            printer.note(line)
     report = _print_report(settings, verify)
-    if as_json:
-        click.echo(json.dumps(dataclasses.asdict(report), indent=2))
-    else:
-        for line in report_lines(report):
-            click.echo(line)
+    printer.print(report, report_lines(report))
     raise SystemExit(0 if report.is_sound else 1)
 
 

@@ -1,6 +1,5 @@
 """``octasplat info``: what is in a file or a run."""
 
-import json
 import sys
 from typing import Any
 
@@ -8,6 +7,7 @@ import click
 
 from octasplat.engine.operations.info import OPERATION, InfoRequest
 from octasplat.workers.cli.options import threads_option
+from octasplat.workers.cli.printing import Printer, output_options
 from octasplat.workers.cli.request_options import request_from_options, request_options, run_operation
 
 THUMBNAIL_COLUMNS = 60
@@ -16,16 +16,12 @@ THUMBNAIL_COLUMNS = 60
 
 @click.command("info", short_help=OPERATION.title, help=InfoRequest.__doc__)
 @request_options(InfoRequest)
-@click.option("--json", "as_json", is_flag=True, help="Everything, as JSON.")
 @threads_option
-def info(as_json: bool, threads: int, **given: Any) -> None:
+@output_options
+def info(printer: Printer, threads: int, **given: Any) -> None:
     """Look at a scene."""
-    result = run_operation(
-        OPERATION, request_from_options(InfoRequest, given), quiet=as_json, threads=threads
-    )
-    if as_json:
-        click.echo(json.dumps(result.facts(), indent=2))
-    elif sys.stdout.isatty():
+    result = run_operation(OPERATION, request_from_options(InfoRequest, given), printer, threads=threads)
+    if sys.stdout.isatty() and not printer.hides_progress:
         click.echo(_terminal_image(result.picture_srgb))
 
 

@@ -3,6 +3,7 @@
 import click
 
 from octasplat.workers.cli.commands.client import connected, server_option
+from octasplat.workers.cli.printing import Printer, output_options
 
 
 @click.command("open", short_help="Sign a browser in to the service.")
@@ -10,7 +11,8 @@ from octasplat.workers.cli.commands.client import connected, server_option
     "--print", "print_link", is_flag=True, help="Only print the link.  [default: without a display]"
 )
 @server_option
-def open_page(print_link: bool, server: str | None) -> None:
+@output_options
+def open_page(print_link: bool, server: str | None, printer: Printer) -> None:
     """Open the page in a browser, signed in with the token of octasplat serve, or of OCTASPLAT_TOKEN.
 
     The link that is printed without a display works once, within five minutes.
@@ -18,7 +20,8 @@ def open_page(print_link: bool, server: str | None) -> None:
     from octasplat.workers.cli.browser import has_display, open_signed_in, sign_in_link
 
     with connected(server) as api:
-        if print_link or not has_display():
-            click.echo(sign_in_link(api))
+        if print_link or printer.as_json or not has_display():
+            link = sign_in_link(api)
+            printer.print({"link": link}, [link], quiet_lines=[link])
         else:
             open_signed_in(api)

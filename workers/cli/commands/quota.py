@@ -5,6 +5,8 @@ from typing import Any
 
 import click
 
+from octasplat.workers.cli.printing import Printer, output_options
+
 
 class _SizeNumber(click.ParamType[int]):
     """A number, also with k, M, G or T."""
@@ -36,7 +38,10 @@ class _SizeNumber(click.ParamType[int]):
 @click.option(
     "--data", type=click.Path(path_type=Path), metavar="FOLDER", help="Data folder of octasplat serve."
 )
-def quota(owner: str, clear: bool, data: Path | None, share: float | None, **limits: int | None) -> None:
+@output_options
+def quota(
+    owner: str, clear: bool, data: Path | None, share: float | None, printer: Printer, **limits: int | None
+) -> None:
     """Show what OWNER has and may have, after setting the limits that are given.
 
     All tokens of an owner share its limits. An owner with the share 2 gets twice the work done of one with 1,
@@ -47,13 +52,21 @@ def quota(owner: str, clear: bool, data: Path | None, share: float | None, **lim
     from octasplat.workers.settings import WorkerSettings, load_settings
 
     settings = load_settings(WorkerSettings, data=data)
-    for line in asyncio.run(_set_and_show(settings.conninfo(), owner, clear, share, limits)):
-        click.echo(line)
+    rows, its_share = asyncio.run(_set_and_read(settings.conninfo(), owner, clear, share, limits))
+    shown = [
+        f"{name}: {used} of {'any number' if limit is None else limit}"
+        for name, (used, limit) in rows.items()
+    ]
+    printer.print(
+        {**{name: {"used": used, "limit": limit} for name, (used, limit) in rows.items()}, "share": its_share},
+        [*shown, f"share of the workers: {its_share:g}"],
+    )
 
 
-async def _set_and_show(
+async def _set_and_read(
     conninfo: str, owner: str, clear: bool, share: float | None, limits: dict[str, int | None]
-) -> list[str]:
+) -> tuple[dict[str, tuple[int, int | None]], float]:
+    """Return what is used of what may be, and the share of the workers."""
     from octasplat.workers.db.connections import open_pool
     from octasplat.workers.db.quotas import NO_QUOTA, Quota, quota_of, set_quota, usage_of
 
@@ -62,10 +75,9 @@ async def _set_and_show(
             present = NO_QUOTA if clear else await quota_of(connection, owner)
             await set_quota(connection, owner, Quota(**limits, share=share).with_defaults(present))
         quota, usage = await quota_of(connection, owner), await usage_of(connection, owner)
-    rows = (
-        ("bytes", usage.bytes, quota.max_bytes),
-        ("datasets", usage.datasets, quota.max_datasets),
-        ("unfinished jobs", usage.jobs, quota.max_jobs),
-    )
-    shown = [f"{name}: {used} of {'any number' if limit is None else limit}" for name, used, limit in rows]
-    return [*shown, f"share of the workers: {1 if quota.share is None else quota.share:g}"]
+    rows = {
+        "bytes": (usage.bytes, quota.max_bytes),
+        "datasets": (usage.datasets, quota.max_datasets),
+        "unfinished jobs": (usage.jobs, quota.max_jobs),
+    }
+    return rows, 1.0 if quota.share is None else quota.share

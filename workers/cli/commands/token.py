@@ -4,14 +4,18 @@ import getpass
 import os
 import uuid
 from collections.abc import Awaitable, Callable
+from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
 import click
 
+from octasplat.workers.cli.printing import Printer, output_options, table_lines
+
 if TYPE_CHECKING:
     from octasplat.workers.db.connections import Connection
+    from octasplat.workers.db.rows import Token
 
 T = TypeVar("T")
 
@@ -29,15 +33,21 @@ def token() -> None:
 @click.option("--scope", "scopes", multiple=True, type=click.Choice(SCOPES), help="[default: write]")
 @click.option("--days", type=click.FloatRange(min=0, min_open=True), help="How long it is valid.")
 @click.option("--data", type=click.Path(path_type=Path), metavar="FOLDER")
+@output_options
 def create(
-    name: str, owner: str | None, scopes: tuple[str, ...], days: float | None, data: Path | None
+    name: str,
+    owner: str | None,
+    scopes: tuple[str, ...],
+    days: float | None,
+    data: Path | None,
+    printer: Printer,
 ) -> None:
     """Make a token called NAME and show its secret, this once."""
     from octasplat.workers.db.tokens import add_token, new_secret
 
     secret = new_secret()
 
-    async def add(connection: "Connection") -> None:
+    async def add(connection: "Connection") -> "Token":
         made = await add_token(
             connection,
             secret,
@@ -47,29 +57,40 @@ def create(
             hours=None if days is None else 24 * days,
         )
         await _add_audit_entry(connection, "token create", f"/v1/tokens/{made.id}")
+        return made
 
-    _run_with_database(data, add)
-    click.echo(secret)
+    made = _run_with_database(data, add)
+    printer.print({"id": made.id, "secret": secret}, [secret], quiet_lines=[secret])
 
 
 @token.command("list", short_help="List tokens.")
 @click.option("--data", type=click.Path(path_type=Path), metavar="FOLDER")
-def list_all(data: Path | None) -> None:
+@output_options
+def list_all(data: Path | None, printer: Printer) -> None:
     """List all tokens, without their secrets."""
     from octasplat.workers.db.tokens import list_tokens
 
     now = datetime.now(UTC)
-    for row in _run_with_database(data, list_tokens):
+    found = _run_with_database(data, list_tokens)
+    rows = []
+    for row in found:
         state = "revoked" if row.revoked_at else ",".join(row.scopes)
+        end = ""
         if row.expires_at is not None and not row.revoked_at:
-            state += f"  {'expired' if row.expires_at < now else 'until'} {row.expires_at:%Y-%m-%d}"
-        click.echo(f"{row.id}  {row.name:20}  {row.owner:20}  {state}")
+            end = f"{'expired' if row.expires_at < now else 'until'} {row.expires_at:%Y-%m-%d}"
+        rows.append((row.id, row.name, row.owner, state, end))
+    printer.print(
+        [{name: value for name, value in asdict(row).items() if name != "sha256"} for row in found],
+        table_lines(("Id", "Name", "Owner", "Scopes", "Valid"), rows) or ["No tokens."],
+        quiet_lines=[str(row.id) for row in found],
+    )
 
 
 @token.command(short_help="Shut a token out.")
 @click.argument("token_id", type=click.UUID)
 @click.option("--data", type=click.Path(path_type=Path), metavar="FOLDER")
-def revoke(token_id: uuid.UUID, data: Path | None) -> None:
+@output_options
+def revoke(token_id: uuid.UUID, data: Path | None, printer: Printer) -> None:
     """Revoke the token TOKEN_ID, with the browser sessions that were begun with it."""
     from octasplat.workers.db.tokens import revoke_token
 
@@ -77,7 +98,8 @@ def revoke(token_id: uuid.UUID, data: Path | None) -> None:
         await _add_audit_entry(connection, "token revoke", f"/v1/tokens/{token_id}")
         return await revoke_token(connection, token_id)
 
-    click.echo("Revoked." if _run_with_database(data, shut) else "There is no such token.")
+    revoked = _run_with_database(data, shut)
+    printer.print({"revoked": revoked}, ["Revoked." if revoked else "There is no such token."])
 
 
 async def _add_audit_entry(connection: "Connection", action: str, target: str) -> None:

@@ -2,13 +2,13 @@
 
 import click
 
-from octasplat.workers.cli.options import quiet_option
+from octasplat.workers.cli.printing import Printer, output_options
 
 
 @click.command("warm-up", short_help="Compile everything that the first use would wait for.")
 @click.argument("commands", nargs=-1, metavar="[COMMAND]...")
-@quiet_option
-def warm_up(commands: tuple[str, ...], quiet: bool) -> None:
+@output_options
+def warm_up(commands: tuple[str, ...], printer: Printer) -> None:
     """Compile the kernels of these commands, or of all, and keep their machine code.
 
     It is kept in NUMBA_CACHE_DIR, or in the user's cache folder, for this version of the program and this
@@ -27,11 +27,13 @@ def warm_up(commands: tuple[str, ...], quiet: bool) -> None:
         raise click.UsageError(f"{unknown[0]} has no kernels of its own; choose among {known}.")
     began, missing = time.monotonic(), len(missing_kernels(groups))
     if missing:
-        if not quiet:
-            click.echo(f"Compiling {missing} kernels")
+        printer.note(f"Compiling {missing} kernels")
         compile_now(groups)
         if missing_kernels(groups):
             raise OutputError(f"Some kernels could not be compiled, or not be kept in {cache_folder()}.")
-    if not quiet:
-        took = f" in {format_duration(time.monotonic() - began)}" if missing else ""
-        click.echo(f"All kernels are compiled{took}; their machine code is in {cache_folder()}.")
+    seconds = time.monotonic() - began
+    took = f" in {format_duration(seconds)}" if missing else ""
+    printer.print(
+        {"compiled": missing, "seconds": round(seconds, 1), "folder": cache_folder()},
+        [f"All kernels are compiled{took}; their machine code is in {cache_folder()}."],
+    )
