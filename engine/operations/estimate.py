@@ -43,12 +43,13 @@ class EstimateResult(Result):
 
     Attributes:
         photographs: number of photographs of each size.
-        cpu_seconds: time of all cores together, without finding poses.
+        cpu_seconds: time of all cores together.
         seconds: time by the clock, with nothing else to do.
         cores: number of cores that is reckoned with.
         memory_bytes: largest private memory of the process.
         disk_bytes: least size of the folder of the run.
-        finds_poses: whether poses are found first, which takes time that is not in it.
+        finds_poses: whether poses are found first.
+        poses_seconds: for finding them, in ``seconds``.
         cold_start_seconds: for kernels that are not compiled yet, in ``cpu_seconds`` and ``seconds``.
         text: the same in words.
     """
@@ -60,6 +61,7 @@ class EstimateResult(Result):
     memory_bytes: int
     disk_bytes: int
     finds_poses: bool
+    poses_seconds: float
     cold_start_seconds: float
     text: str
 

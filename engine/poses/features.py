@@ -75,7 +75,7 @@ def extract_features(
     threads: int,
     on_count: OnCount,
 ) -> None:
-    """Fill a database with the features of photographs.
+    """Fill a database with the features of those photographs that it has none of.
 
     Args:
         database: see :func:`create_database`.
@@ -94,8 +94,16 @@ def extract_features(
     options.sift.max_num_features = MAX_FEATURES * (2 if thorough else 1)
     if thorough:
         options.sift.peak_threshold /= 3
-    for start in range(0, len(names), _PHOTOGRAPHS_PER_BATCH):
-        some = list(names[start : start + _PHOTOGRAPHS_PER_BATCH])
+    with pycolmap.Database.open(database) as found:
+        missing = [
+            image.name
+            for image in found.read_all_images()
+            if not (found.exists_keypoints(image.image_id) and found.exists_descriptors(image.image_id))
+        ]
+    wanted = [name for name in names if name in set(missing)]
+    there = len(names) - len(wanted)
+    for start in range(0, len(wanted), _PHOTOGRAPHS_PER_BATCH):
+        some = wanted[start : start + _PHOTOGRAPHS_PER_BATCH]
         pycolmap.extract_features(
             database,
             photographs,
@@ -104,7 +112,7 @@ def extract_features(
             extraction_options=options,
             device=pycolmap.Device.cpu,
         )
-        on_count(start + len(some))
+        on_count(there + start + len(some))
 
 
 def feature_counts(database: Path, photographs: int) -> list[int]:
@@ -123,7 +131,7 @@ def match_pairs(
     threads: int,
     on_count: OnCount,
 ) -> None:
-    """Match the features of pairs, and keep what one geometry explains.
+    """Match the features of those pairs that are not matched yet, and keep what one geometry explains.
 
     Args:
         database: with features.
@@ -141,8 +149,10 @@ def match_pairs(
         options.sift.max_ratio = _RELAXED_MATCH_RATIO
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = config.seed
-    done = 0
-    for some in batch_pairs(pairs, _PAIRS_PER_BATCH):
+    with pycolmap.Database.open(database) as found:
+        wanted = [(a, b) for a, b in pairs if not found.exists_two_view_geometry(a + 1, b + 1)]
+    done = len(pairs) - len(wanted)
+    for some in batch_pairs(wanted, _PAIRS_PER_BATCH):
         _match_pairs(database, names, some, options, verification)
         done += len(some)
         on_count(done)
@@ -161,6 +171,7 @@ def preselect_pairs(
         on_count: hears of pairs that are not alike.
     """
     small = database.with_name("quick.db")
+    small.unlink(missing_ok=True)
     _copy_largest_features(database, small, len(names), PRESELECTION_FEATURES)
     options = pycolmap.FeatureMatchingOptions()
     options.num_threads = threads

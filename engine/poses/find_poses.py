@@ -8,7 +8,7 @@ import shutil
 import signal
 import subprocess
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any
@@ -34,6 +34,8 @@ from octasplat.engine.poses.config import (
 )
 from octasplat.engine.poses.photographs import photographs_of_scene, photographs_sha256
 
+_SEARCH_FILE = "search.json"
+"""Says which photographs and settings a folder for the work belongs to."""
 _POLL_SECONDS = 0.5
 _HEARTBEAT_SECONDS = 30.0
 """How often a step that takes long tells that it is alive."""
@@ -55,12 +57,13 @@ def find_poses(
     There are three stages: ``features``, whose steps are photographs, ``matches``, whose steps are pairs of
     them, and ``poses``, whose steps are photographs again, the last one the number of those placed. Where
     photographs are left out, the three may come a second time. The same photographs give the same files on
-    any number of threads. A result that is there already is taken as it is.
+    any number of threads. A result that is there already is taken as it is. A search that was stopped goes
+    on with the features and matches that it had found.
 
     Args:
         images: folder of photographs, also in folders below it if it is called ``images``.
         output: becomes the folder of the COLMAP model, with ``poses.json`` beside its files. What is needed
-            on the way lies in a hidden folder next to it and is removed.
+            on the way lies in a hidden folder next to it, which is removed when the search ends.
         names: of the photographs, relative to ``images``; None takes all.
         config: settings.
         threads: to use; 0 means all cores.
@@ -83,7 +86,8 @@ def find_poses(
                 f"the results, or remove {output} to find them anew."
             )
         return
-    with _work_folder(output) as work:
+    search = {"photographs_sha256": sha256, "config": config.model_dump(mode="json")}
+    with _work_folder(output, search) as work:
         request = PoseSearchRequest(
             images=images.resolve(), names=tuple(names), work=work.resolve(), config=config, threads=threads
         )
@@ -195,15 +199,38 @@ def adjust_principal_points(
 
 
 @contextmanager
-def _work_folder(output: Path) -> Iterator[Path]:
-    """Yield an empty hidden folder beside ``output``, removed when the block ends."""
+def _work_folder(output: Path, search: Mapping[str, Any] | None = None) -> Iterator[Path]:
+    """Yield a hidden folder beside ``output``, removed when the block ends.
+
+    Args:
+        output: place of the result.
+        search: what is searched for. The folder of the same search that was stopped is yielded as it was,
+            and a block that is stopped keeps it. None always begins with an empty folder.
+    """
     work = output.with_name(f".{output.name}.work")
-    shutil.rmtree(work, ignore_errors=True)
-    work.mkdir(parents=True)
+    if search is None or _stopped_search(work) != search:
+        shutil.rmtree(work, ignore_errors=True)
+        work.mkdir(parents=True)
+        if search is not None:
+            write_json(work / _SEARCH_FILE, dict(search))
+    is_kept = False
     try:
         yield work
+    except (CancelledError, KeyboardInterrupt):
+        is_kept = search is not None
+        raise
     finally:
-        shutil.rmtree(work, ignore_errors=True)
+        if not is_kept:
+            shutil.rmtree(work, ignore_errors=True)
+
+
+def _stopped_search(work: Path) -> dict[str, Any] | None:
+    """Return what the search was for that left a folder; None if there is none."""
+    try:
+        search: dict[str, Any] = json.loads((work / _SEARCH_FILE).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return None
+    return search
 
 
 def read_pose_record(output: Path) -> dict[str, Any]:
@@ -256,9 +283,9 @@ class _ColmapProcess:
         """Return the next bytes from the process; empty at its end."""
         while True:
             if self._should_stop():
-                raise CancelledError(
-                    "Stopped while finding poses; the same command with --resume begins them again."
-                )
+                is_search = self._request.given is None and self._request.lenses_of is None
+                how = "goes on where it was" if is_search else "begins them again"
+                raise CancelledError(f"Stopped while finding poses; the same command with --resume {how}.")
             if select.select([pipe], [], [], _POLL_SECONDS)[0]:
                 return os.read(pipe, 1 << 16)
             if (

@@ -48,7 +48,7 @@ class PoseSearch:
     Args:
         images: folder of the photographs.
         names: of the photographs in it.
-        work: an empty folder.
+        work: an empty folder, or the one in which the same search was stopped.
         config: settings.
         threads: to use; 0 means all cores.
         progress: hears the progress.
@@ -104,7 +104,7 @@ class PoseSearch:
         names = dict(zip(self._aliases, self._names, strict=True))
         for image in best.images.values():
             image.name = names[image.name]
-        found.mkdir()
+        found.mkdir(exist_ok=True)
         best.write_binary(found)
         posed = {best.image(number).name for number in best.reg_image_ids()}
         write_json(
@@ -123,6 +123,8 @@ class PoseSearch:
         self._find_features(database, thorough)
         matched = self._match(database, thorough)
         count = len(self._names)
+        # Mapping adds and removes matches: a search that is stopped in it goes on from what was matched.
+        database = Path(shutil.copy(database, self._work / "mapping.db"))
         with progress_stage(MAPPING_STAGE, count, self._progress) as at:
             best = self._disambiguate(
                 database,
@@ -136,7 +138,11 @@ class PoseSearch:
 
     def _find_features(self, database: Path, thorough: bool) -> None:
         with progress_stage(FEATURES, len(self._names), self._progress) as at:
-            create_database(database, self._photographs, self._aliases, one_camera=self._one_camera)
+            if not database.exists():
+                new = database.with_suffix(".new")
+                new.unlink(missing_ok=True)
+                create_database(new, self._photographs, self._aliases, one_camera=self._one_camera)
+                new.rename(database)
             extract_features(
                 database,
                 self._photographs,
@@ -236,6 +242,7 @@ class PoseSearch:
             DatasetError: too few are left.
         """
         trial = self._work / "readable.db"
+        trial.unlink(missing_ok=True)
         read = set(create_database(trial, self._photographs, self._aliases, one_camera=False))
         trial.unlink()
         kept = [k for k, alias in enumerate(self._aliases) if alias in read]

@@ -1,5 +1,6 @@
 """Working folder of a pose search: photographs under other names, and progress of its stages."""
 
+import shutil
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -23,6 +24,7 @@ def link_photographs(images: Path, names: Sequence[str], folder: Path) -> tuple[
     aliases = tuple(
         f"{k:06d}{suffix if suffix in _COLMAP_SUFFIXES else '.png'}" for k, suffix in enumerate(suffixes)
     )
+    shutil.rmtree(folder, ignore_errors=True)  # of a search that was stopped
     folder.mkdir()
     for alias, name, suffix in zip(aliases, names, suffixes, strict=True):
         if suffix in _COLMAP_SUFFIXES:

@@ -59,7 +59,7 @@ def test_help_of_export_names_every_format(octasplat):
 
 
 def test_version_option_prints_package_version(octasplat):
-    assert octasplat("--version").stdout.split()[-1] == __version__
+    assert octasplat("--version").stdout.splitlines()[0] == f"octasplat, version {__version__}"
 
 
 def one_error_line(result, code=1):

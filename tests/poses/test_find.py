@@ -3,6 +3,7 @@
 import json
 import shutil
 import signal
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -117,7 +118,54 @@ def test_find_poses_should_stop_cancels(taken: Photographs, tmp_path: Path) -> N
     asked = iter(range(1000))
     with pytest.raises(CancelledError):
         find_poses(taken.folder, tmp_path / "out", threads=1, should_stop=lambda: next(asked) >= 1)
-    assert list(tmp_path.iterdir()) == []
+    assert [path.name for path in tmp_path.iterdir()] == [".out.work"]
+
+
+def test_stopped_search_goes_on_with_its_features_and_matches(taken: Photographs, tmp_path: Path) -> None:
+    stopped, whole = tmp_path / "stopped", tmp_path / "whole"
+
+    def stop_in(stage: str, least: int) -> tuple[list[PhaseProgress], Callable[[], bool]]:
+        """Return what was counted, and a question that is answered with yes in that stage."""
+        seen: list[PhaseProgress] = []
+        return seen, lambda: any(event.stage == stage and event.step >= least for event in seen)
+
+    def first_count(seen: list[PhaseProgress], stage: str) -> int:
+        return next(event.step for event in seen if event.stage == stage and event.step)
+
+    for stage, least in (("features", 4), ("matches", 64), ("poses", 3)):
+        seen, should_stop = stop_in(stage, least)
+
+        def keep(event: Event, seen: list[PhaseProgress] = seen) -> None:
+            if isinstance(event, PhaseProgress):
+                seen.append(event)
+
+        with pytest.raises(CancelledError, match="goes on where it was"):
+            find_poses(taken.folder, stopped, threads=1, progress=keep, should_stop=should_stop)
+    assert first_count(seen, "features") == COUNT
+    assert first_count(seen, "matches") == COUNT * (COUNT - 1) // 2
+    find_poses(taken.folder, stopped, threads=1)
+    find_poses(taken.folder, whole, threads=1)
+    assert {path.name: path.read_bytes() for path in stopped.iterdir()} == {
+        path.name: path.read_bytes() for path in whole.iterdir()
+    }
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["stopped", "whole"]
+
+
+def test_stopped_search_with_other_settings_begins_anew(taken: Photographs, tmp_path: Path) -> None:
+    counted: list[int] = []
+
+    def count(event: Event) -> None:
+        if isinstance(event, PhaseProgress) and event.stage == "features":
+            counted.append(event.step)
+
+    for config in (PosesConfig(), PosesConfig(seed=1)):
+        counted.clear()
+        with pytest.raises(CancelledError):
+            find_poses(
+                taken.folder, tmp_path / "out", config=config, threads=1, progress=count,
+                should_stop=lambda: bool(counted and counted[-1] >= 8),
+            )  # fmt: skip
+        assert counted[0] < 8
 
 
 def test_pose_search_is_deterministic(taken: Photographs, tmp_path: Path) -> None:

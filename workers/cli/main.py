@@ -61,7 +61,7 @@ _SECTIONS: dict[str, dict[str, tuple[str, str]]] = {
     },
     "Work with a service": {
         "open": ("open", "Sign a browser in to the service."),
-        "submit": ("client", "Send photographs to the service and queue its reconstruction."),
+        "submit": ("client", "Send a scene to the service and queue its reconstruction."),
         "derive": ("client", "Queue a job on the results of a finished one, such as a render."),
         "jobs": ("client", "List jobs."),
         "status": ("client", "Show a job, or wait for it."),

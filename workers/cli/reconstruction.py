@@ -1,8 +1,6 @@
 """A reconstruction with its progress shown and its signals heard, as several commands need it."""
 
-import contextlib
-
-import click
+import functools
 
 from octasplat.engine.core.errors import DiskFullError, ExportError, OctasplatError
 from octasplat.engine.operations.reconstruct import OPERATION, ReconstructRequest, run_config
@@ -25,11 +23,13 @@ def run_reconstruction(
     """
     import octasplat.engine.pipeline  # noqa: F401 - pycolmap takes SIGTERM when imported, so before we do
     from octasplat.engine.evaluate.summary import summarize_run
+    from octasplat.engine.runs.run_folder import CONFIG
 
     output = request.output
-    _print_estimate(request, printer, threads)
+    goes_on = request.resume and (output / CONFIG).exists()
+    opening = functools.partial(_estimate_sentence, request, threads, goes_on)
     try:
-        run_operation(OPERATION, request, printer, threads=threads, is_stoppable=True)
+        run_operation(OPERATION, request, printer, threads=threads, is_stoppable=True, opening=opening)
     except StoppedError as error:
         if resumes_automatically:
             raise StoppedError("Stopped; the same command goes on.", error.exit_code) from None
@@ -45,16 +45,16 @@ def run_reconstruction(
         raise ExportError(f"{error} {again}") from None
 
 
-def _print_estimate(request: ReconstructRequest, printer: Printer, threads: int) -> None:
-    """Print what the run is to take, unless it goes on from where it is."""
+def _estimate_sentence(request: ReconstructRequest, threads: int, goes_on: bool) -> str | None:
+    """Return what a new run is to take; None where it goes on from where it is or nobody can tell."""
     from octasplat.engine.operations.estimate import estimate_scene, photograph_sizes
     from octasplat.engine.poses.photographs import locate_scene
-    from octasplat.engine.runs.run_folder import CONFIG
 
-    if printer.hides_progress or (request.resume and (request.output / CONFIG).exists()):
-        return
-    config = run_config(request)
-    with contextlib.suppress(OctasplatError):  # the run refuses what cannot be read, in its own words
+    if goes_on:
+        return None
+    try:
         scene = locate_scene(request.source)
-        found = estimate_scene(scene, config, photograph_sizes(scene), threads)
-        click.echo(f"Estimate: {found.text}, within a factor of two.", err=True)
+        found = estimate_scene(scene, run_config(request), photograph_sizes(scene), threads)
+    except OctasplatError:  # the run refuses what cannot be read, in its own words
+        return None
+    return f"Estimate: {found.text}, within a factor of two."

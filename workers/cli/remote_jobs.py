@@ -49,8 +49,7 @@ def download_results(
 
 def submit_and_wait(api: Api, request: Submission | Derivation, output: Path, printer: Printer) -> None:
     """Submit, wait, download, and print a summary, or the job as JSON."""
-    is_derivation = isinstance(request, Derivation)
-    job = derive(api, request, printer) if is_derivation else submit(api, request, printer)
+    job = derive(api, request, printer) if isinstance(request, Derivation) else submit(api, request, printer)
     printer.note(f"Queued as job {job['id']}.")
     try:
         job = wait_for(api, job["id"], printer)

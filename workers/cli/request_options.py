@@ -13,6 +13,7 @@ from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
 
 from octasplat.engine.core.errors import CancelledError
+from octasplat.engine.core.events import Event, EventListener, Noted, PhaseStarted
 from octasplat.engine.operations.base import (
     ContradictoryRequestError,
     Operation,
@@ -118,8 +119,17 @@ def run_operation(
     *,
     threads: int = 0,
     is_stoppable: bool = False,
+    opening: Callable[[], str | None] = lambda: None,
 ) -> ResultT:
     """Do a request with its progress shown, print what came of it, and return it.
+
+    Args:
+        operation: the verb.
+        request: of it.
+        printer: how results are printed.
+        threads: number of threads; 0 means all cores.
+        is_stoppable: as for :func:`operation_command`.
+        opening: returns a sentence to show as the first stage begins, when nothing was refused.
 
     Raises:
         OctasplatError: as the operation does.
@@ -129,8 +139,9 @@ def run_operation(
         with request_stop_on_signals() as should_stop:
             try:
                 with show_progress(quiet=printer.hides_progress, should_stop=should_stop) as progress:
+                    told = progress if printer.hides_progress else _with_opening(progress, opening)
                     result = operation.execute(
-                        request, progress=progress, should_stop=should_stop, threads=threads
+                        request, progress=told, should_stop=should_stop, threads=threads
                     )
             except CancelledError as error:
                 raise StoppedError(str(error), should_stop.exit_code) from None
@@ -140,6 +151,21 @@ def run_operation(
     remember_written(operation.name, result.files)
     printer.print(result, result.lines())
     return result
+
+
+def _with_opening(progress: EventListener, opening: Callable[[], str | None]) -> EventListener:
+    """Return a listener that notes a sentence before the first stage."""
+    is_open = False
+
+    def listen(event: Event) -> None:
+        nonlocal is_open
+        if isinstance(event, PhaseStarted) and not is_open:
+            is_open = True
+            if (sentence := opening()) is not None:
+                progress(Noted(sentence))
+        progress(event)
+
+    return listen
 
 
 def option_name(model: type[BaseModel], path: str) -> str:
