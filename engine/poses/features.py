@@ -102,6 +102,8 @@ def extract_features(
         ]
     wanted = [name for name in names if name in set(missing)]
     there = len(names) - len(wanted)
+    if there:
+        on_count(there)
     for start in range(0, len(wanted), _PHOTOGRAPHS_PER_BATCH):
         some = wanted[start : start + _PHOTOGRAPHS_PER_BATCH]
         pycolmap.extract_features(
@@ -152,6 +154,8 @@ def match_pairs(
     with pycolmap.Database.open(database) as found:
         wanted = [(a, b) for a, b in pairs if not found.exists_two_view_geometry(a + 1, b + 1)]
     done = len(pairs) - len(wanted)
+    if done:
+        on_count(done)
     for some in batch_pairs(wanted, _PAIRS_PER_BATCH):
         _match_pairs(database, names, some, options, verification)
         done += len(some)

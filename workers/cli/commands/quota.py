@@ -57,8 +57,9 @@ def quota(
         f"{name}: {used} of {'any number' if limit is None else limit}"
         for name, (used, limit) in rows.items()
     ]
+    facts = {name: {"used": used, "limit": limit} for name, (used, limit) in rows.items()}
     printer.print(
-        {**{name: {"used": used, "limit": limit} for name, (used, limit) in rows.items()}, "share": its_share},
+        {**facts, "share": its_share},
         [*shown, f"share of the workers: {its_share:g}"],
     )
 
