@@ -14,6 +14,7 @@ PHASE_TITLES = {
     "evaluate": "Evaluating",
     "export": "Exporting",
     "generate": "Generating",
+    "frames": "Choosing frames",
     "render": "Rendering",
     "edit": "Editing",
     "check": "Checking poses",

@@ -124,15 +124,22 @@ class ReconstructOptions(RunSettings, Options):
 class ReconstructRequest(ReconstructOptions, Request):
     """Reconstruct SCENE, a folder with images/ and a COLMAP model in sparse/0, or with photographs alone.
 
-    Where there is no model, COLMAP finds the poses of the photographs. The output folder gets scene.ply,
+    Where there is no model, COLMAP finds the poses of the photographs. SCENE may also be a video: its
+    sharpest frames become photographs, in a folder beside the output. The output folder gets scene.ply,
     meshes, metrics.json, report.html, renders of the held-out views and checkpoints. Ctrl-C stops after
     writing a checkpoint; the same command with --resume goes on.
     """
 
     source: Annotated[Path, Positional("SCENE"), ReadPath()] = Field(
-        description="The folder of the photographs."
+        description="The folder of the photographs, or a video."
     )
     output: Output = Field(description="Folder for the results.")
+    frames_per_second: Annotated[float, Spelling(metavar="N")] = Field(
+        2.0,
+        gt=0,
+        le=120,
+        description="Of a video: so many frames of each second are taken, the sharpest ones.",
+    )
     resume: bool = Field(
         False,
         description="Go on with the run in the output folder, if there is one; without other options its own "
@@ -194,7 +201,7 @@ def run_config(request: ReconstructRequest) -> "ReconstructionConfig":
     """
     from octasplat.engine.runs.config import read_config
 
-    given = request.model_fields_set - {"source", "output", "resume", "exports"}
+    given = request.model_fields_set - {"source", "output", "resume", "exports", "frames_per_second"}
     given -= {name for name in ("train", "assignments") if not getattr(request, name)}
     if not request.resume or given or not (request.output / _CONFIG).exists():
         return request.config()
@@ -202,6 +209,30 @@ def run_config(request: ReconstructRequest) -> "ReconstructionConfig":
     if "exports" in request.model_fields_set:
         config = config.model_copy(update={"exports": request.exports})
     return config
+
+
+def scene_folder(request: ReconstructRequest) -> Path:
+    """Return the folder of the photographs; that of a video's frames is beside the output."""
+    from octasplat.engine.dataset.video_frames import is_video
+
+    source = request.source
+    return request.output.with_name(f"{request.output.name}-frames") if is_video(source) else source
+
+
+def _take_frames(request: ReconstructRequest, folder: Path, progress: EventListener) -> None:
+    """Write the sharpest frames of the request's video, and tell where they are.
+
+    Raises:
+        DatasetError: the video cannot be read.
+        OutputError: the folder of the frames cannot be written.
+    """
+    from octasplat.engine.core.events import Noted
+    from octasplat.engine.core.progress import counted_phase
+    from octasplat.engine.dataset.video_frames import write_frames
+
+    with counted_phase("frames", progress) as count:
+        written = write_frames(request.source, folder, request.frames_per_second, count)
+    progress(Noted(f"{written} frames of {request.source.name} are in {folder}."))
 
 
 def run(
@@ -231,8 +262,11 @@ def run(
 
     config = run_config(request)
     output = request.output
+    scene = scene_folder(request)
+    if scene != request.source:
+        _take_frames(request, scene, stop_when_asked(progress, should_stop))
     reconstruct(
-        locate_scene(request.source),
+        locate_scene(scene),
         output,
         config,
         resume=request.resume,

@@ -97,6 +97,7 @@ def reconstruct(
     seed: int | None = None,
     train: Mapping[str, Any] | None = None,
     assignments: Sequence[str] | None = None,
+    frames_per_second: float | None = None,
     resume: bool = False,
     on_step: OnStep | None = None,
     progress: EventListener | None = None,
@@ -106,7 +107,7 @@ def reconstruct(
     """Photographs to a scene, its meshes, and measurements.
 
     Args:
-        source: The folder of the photographs.
+        source: The folder of the photographs, or a video.
         output: Folder for the results.
         preset: Where the settings of the training come from: fast is a first look, standard is better,
             high is better yet and takes about three times as many iterations, redisplats has the
@@ -147,6 +148,8 @@ def reconstruct(
         train: Settings of the training that are to be otherwise than the preset's.
         assignments: Any other setting, e.g. lr.quat=0.02 or test_every=4, values as JSON; octasplat
             config list shows them.
+        frames_per_second: Of a video: so many frames of each second are taken, the sharpest ones.
+            Default: 2.0.
         resume: Go on with the run in the output folder, if there is one; without other options its own
             settings are taken.
         on_step: called with the state of the training every few iterations; returning False stops it
@@ -195,6 +198,7 @@ def reconstruct(
             "assignments": assignments,
             "source": source,
             "output": output,
+            "frames_per_second": frames_per_second,
             "resume": resume,
         },
         on_step,
@@ -493,8 +497,7 @@ def surface(
         min_component: Remove parts of less than this share of the largest part's area. Default: 0.01.
         fill_holes: Close holes with rims shorter than so many voxels; or 'all'. Default: 0.0.
         fit: Of all colors, take those with which the mesh looks as like the pictures as it can.
-        texture_size: Colors in a square texture of this side instead of in the vertices; .glb and
-            .obj.
+        texture_size: Colors in a square texture of this side instead of in the vertices; .glb and .obj.
         max_memory_gb: Refuse a volume that takes more memory than this. Default: 4.0.
         room: What pictures of a room need, where nothing else is said: unbounded, unseen solid,
             backdrop, settle and finer voxels.
@@ -505,8 +508,8 @@ def surface(
         up: With materials: the axis that points up. [default: the run's, of a file -y]
         dataset: Take the cameras of the photographs in this folder, and of a run the colors. [default:
             the cameras that a run keeps; else none]
-        photographs: A copy of the photographs that the run was made from, for colors alone; left out
-            if it has other poses.
+        photographs: A copy of the photographs that the run was made from, for colors alone; left out if
+            it has other poses.
         progress: told each event; by default they are logged, or shown in a notebook.
         should_stop: asked now and then; True ends the work with ``CancelledError``.
         threads: number of threads; 0 takes all cores. The result does not depend on it.

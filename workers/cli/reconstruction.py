@@ -3,7 +3,12 @@
 import functools
 
 from octasplat.engine.core.errors import DiskFullError, ExportError, OctasplatError
-from octasplat.engine.operations.reconstruct import OPERATION, ReconstructRequest, run_config
+from octasplat.engine.operations.reconstruct import (
+    OPERATION,
+    ReconstructRequest,
+    run_config,
+    scene_folder,
+)
 from octasplat.workers.cli.printing import Printer
 from octasplat.workers.cli.request_options import run_operation
 from octasplat.workers.cli.signals import StoppedError
@@ -53,7 +58,7 @@ def _estimate_sentence(request: ReconstructRequest, threads: int, goes_on: bool)
     if goes_on:
         return None
     try:
-        scene = locate_scene(request.source)
+        scene = locate_scene(scene_folder(request))
         found = estimate_scene(scene, run_config(request), photograph_sizes(scene), threads)
     except OctasplatError:  # the run refuses what cannot be read, in its own words
         return None

@@ -154,12 +154,12 @@ def run_operation(
 
 
 def _with_opening(progress: EventListener, opening: Callable[[], str | None]) -> EventListener:
-    """Return a listener that notes a sentence before the first stage."""
+    """Return a listener that notes a sentence before the first stage on photographs."""
     is_open = False
 
     def listen(event: Event) -> None:
         nonlocal is_open
-        if isinstance(event, PhaseStarted) and not is_open:
+        if isinstance(event, PhaseStarted) and event.stage != "frames" and not is_open:
             is_open = True
             if (sentence := opening()) is not None:
                 progress(Noted(sentence))

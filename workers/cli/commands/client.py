@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from octasplat.workers.client.api import Api
 
 F = TypeVar("F", bound=Callable[..., Any])
+_NO_WORKERS = "No live workers, or none that this token may see; administrators see all."
 STATES = ("queued", "running", "canceling", "succeeded", "failed", "canceled")
 
 
@@ -301,7 +302,7 @@ def workers(server: str | None, printer: Printer) -> None:
     ]
     lines = [
         *table_lines(("Queue", "Waiting", "Running", "Slots"), queues),
-        *(["", *table_lines(("Worker", "Queues", "Slots", "Since"), live)] if live else ["No live workers."]),
+        *(["", *table_lines(("Worker", "Queues", "Slots", "Since"), live)] if live else [_NO_WORKERS]),
     ]
     printer.print(found, lines, quiet_lines=[row["name"] for row in found["workers"]])
 
@@ -423,9 +424,19 @@ def download(
 
 
 def _as_dataset(api: "Api", scene: Path) -> Path:
-    """Return the whole id of a dataset that is named by the end of it; a path as it is."""
+    """Return the whole id of a dataset that is named by the end of it; a path as it is.
+
+    Raises:
+        ConfigError: the path is that of a video.
+    """
+    from octasplat.engine.dataset.video_frames import is_video
     from octasplat.workers.client.short_ids import SHOWN_CHARACTERS, find_dataset
 
+    if is_video(scene):
+        raise ConfigError(
+            f"{scene}: photographs are sent, not videos; octasplat reconstruct takes a video and writes the "
+            "frames that it chooses beside its results."
+        )
     is_short = re.fullmatch(f"[0-9a-f]{{{SHOWN_CHARACTERS}}}", str(scene)) and not scene.exists()
     return Path(find_dataset(api, str(scene))["id"]) if is_short else scene
 
