@@ -5,7 +5,7 @@ compares anew. What the photographs show decides as much as how many they are, s
 within a factor of two, not better. Imports neither torch nor numba.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 from pydantic import BaseModel, computed_field
 
@@ -84,6 +84,7 @@ class Estimate(BaseModel):
         finds_poses: whether poses are found first.
         poses_seconds: by the clock, for finding them, in ``seconds``.
         cold_start_seconds: for kernels that are not compiled yet, in ``cpu_seconds`` and ``seconds``.
+        stage_seconds: ``seconds`` by stage, without a cold start; empty where nobody knows.
     """
 
     cpu_seconds: float
@@ -94,6 +95,7 @@ class Estimate(BaseModel):
     poses_seconds: float = 0.0
     disk_bytes: int = 0
     cold_start_seconds: float = 0.0
+    stage_seconds: dict[str, float] = {}
 
     def with_cold_start(self, seconds: float) -> "Estimate":
         """Return the estimate where kernels are compiled first, which takes one core so long."""
@@ -145,16 +147,16 @@ def estimate_reconstruction(
     each_pixel = _MATERIAL_EVALUATE_CPU_SECONDS_PER_PIXEL if materials else _EVALUATE_CPU_SECONDS_PER_PIXEL
     full_pixels = sum(sizes.width_px * sizes.height_px * sizes.count for sizes in photographs)
     finds_poses = options.poses == "auto"
-    poses_cpu_seconds = _pose_search_cpu_seconds(photographs) if finds_poses else 0.0
-    cpu_seconds = (
-        poses_cpu_seconds
-        + _START_CPU_SECONDS
-        + _LOAD_CPU_SECONDS_PER_PIXEL * full_pixels
-        + _LIFT_CPU_SECONDS_PER_POINT * min(train.initial_points, gaussians) * train.plane_sweep_init
-        + each_pixel * pixels * held_out
-        + training_cpu_seconds
-        + _export_cpu_seconds(options, gaussians)
-    )
+    search = _pose_search_cpu_seconds(photographs) if finds_poses else {}
+    lifting = _LIFT_CPU_SECONDS_PER_POINT * min(train.initial_points, gaussians) * train.plane_sweep_init
+    stages = {
+        **search,
+        "load": _START_CPU_SECONDS + _LOAD_CPU_SECONDS_PER_PIXEL * full_pixels,
+        "train": lifting + training_cpu_seconds,
+        "evaluate": each_pixel * pixels * held_out,
+        "export": _export_cpu_seconds(options, gaussians),
+    }
+    cpu_seconds = sum(stages.values())
     training = _gaussian_bytes(train.sh_degree) * gaussians + _RAY_BYTES * max(
         train.rays_per_batch, train.probe_rays
     )
@@ -162,25 +164,27 @@ def estimate_reconstruction(
         training = max(training + _MATERIAL_TRAIN_BYTES, _MATERIAL_START_BYTES)
     memory = _START_BYTES + max(training, _PIXEL_BYTES * largest)
     disk = reconstruction_bytes(options, photographs)
-    found = _make_estimate(cpu_seconds, memory, cores, finds_poses=finds_poses, disk_bytes=disk)
-    share = poses_cpu_seconds / cpu_seconds
+    found = _make_estimate(
+        cpu_seconds, memory, cores, finds_poses=finds_poses, disk_bytes=disk, stages=stages
+    )
+    share = sum(search.values()) / cpu_seconds
     return found.model_copy(update={"poses_seconds": round(share * found.seconds, 1)})
 
 
-def _pose_search_cpu_seconds(photographs: Sequence[ImageSizes]) -> float:
-    """Return the time to find the poses of photographs, if one search places them all."""
+def _pose_search_cpu_seconds(photographs: Sequence[ImageSizes]) -> dict[str, float]:
+    """Return the time to find the poses of photographs by stage, if one search places them all."""
     shrunk = [_capped_sizes(sizes, MAX_IMAGE_SIDE_PX) for sizes in photographs]
     count = sum(sizes.count for sizes in shrunk)
     pixels = sum(sizes.width_px * sizes.height_px * sizes.count for sizes in shrunk)
     every_pair = count * (count - 1) // 2
     is_exhaustive = count <= DEFAULT_CONFIG.exhaustive_up_to
     pairs = every_pair if is_exhaustive else min(every_pair, count * DEFAULT_CONFIG.partners // 2)
-    return (
-        _FEATURES_CPU_SECONDS_PER_PIXEL * pixels
-        + _MATCH_CPU_SECONDS_PER_PAIR * pairs
-        + _PRESELECT_CPU_SECONDS_PER_PAIR * (0 if is_exhaustive else every_pair)
-        + _MAP_CPU_SECONDS_PER_PHOTOGRAPH * count
-    )
+    preselected = 0 if is_exhaustive else every_pair
+    return {
+        "features": _FEATURES_CPU_SECONDS_PER_PIXEL * pixels,
+        "matches": _MATCH_CPU_SECONDS_PER_PAIR * pairs + _PRESELECT_CPU_SECONDS_PER_PAIR * preselected,
+        "poses": _MAP_CPU_SECONDS_PER_PHOTOGRAPH * count,
+    }
 
 
 def _export_cpu_seconds(options: ReconstructionConfig, gaussians: int) -> float:
@@ -247,15 +251,23 @@ def rendered_pixels(options: PictureOptions, photographs: Sequence[ImageSizes]) 
 
 
 def _make_estimate(
-    cpu_seconds: float, memory_bytes: float, cores: int, *, finds_poses: bool = False, disk_bytes: int = 0
+    cpu_seconds: float,
+    memory_bytes: float,
+    cores: int,
+    *,
+    finds_poses: bool = False,
+    disk_bytes: int = 0,
+    stages: Mapping[str, float] | None = None,
 ) -> Estimate:
+    speedup = max(1, cores) ** _CORE_POWER
     return Estimate(
         cpu_seconds=round(cpu_seconds, 1),
-        seconds=round(cpu_seconds / max(1, cores) ** _CORE_POWER, 1),
+        seconds=round(cpu_seconds / speedup, 1),
         cores=max(1, cores),
         memory_bytes=round(memory_bytes),
         finds_poses=finds_poses,
         disk_bytes=disk_bytes,
+        stage_seconds={name: round(seconds / speedup, 1) for name, seconds in (stages or {}).items()},
     )
 
 

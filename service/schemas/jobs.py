@@ -11,6 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from octasplat.engine.operations.cost_model import Estimate
 from octasplat.service.schemas.base import EXAMPLE_ID, EXAMPLE_TIME, RequestBody
 from octasplat.service.schemas.webhooks import JobWebhook
+from octasplat.service.whole_progress import whole_progress
 from octasplat.workers.db.rows import Job, JobState
 
 
@@ -124,6 +125,8 @@ class JobSummary(BaseModel):
     step: int | None
     total_steps: int | None
     seconds_left: float | None = Field(description="Of the stage.")
+    progress: float | None = Field(None, description="Share of the whole job that is done, 0 to 1.")
+    total_seconds_left: float | None = Field(None, description="Of the whole job, as far as that is known.")
     psnr: float | None = Field(
         description="Of the held-out views, dB: of some of their rays while it trains, the mean over all of "
         "them once they are measured."
@@ -158,10 +161,19 @@ class JobSummary(BaseModel):
         shows_worker: bool = False,
     ) -> Self:
         """Return the view of a database row."""
-        names = {name for name in cls.model_fields if name not in ("stages", "queue_position", "notes")}
+        whole = whole_progress(row, stages)
+        made = ("stages", "queue_position", "notes", "progress", "total_seconds_left")
+        names = {name for name in cls.model_fields if name not in made}
         row = row if shows_worker else replace(row, worker=None)
         values = {name: getattr(row, name) for name in names}
-        return cls(**values, stages=stages, queue_position=queue_position, notes=list(notes))
+        return cls(
+            **values,
+            stages=stages,
+            queue_position=queue_position,
+            notes=list(notes),
+            progress=whole.share,
+            total_seconds_left=whole.seconds_left,
+        )
 
 
 class JobView(JobSummary):
@@ -188,6 +200,8 @@ class JobView(JobSummary):
                     "step": 400,
                     "total_steps": 1500,
                     "seconds_left": 41.2,
+                    "progress": 0.32,
+                    "total_seconds_left": 58.0,
                     "psnr": 24.6,
                     "training_psnr": 25.1,
                     "worker": "host-4711",

@@ -155,6 +155,10 @@ class Client:
         """Yield all jobs, the newest first."""
         return (Job(self._api, content) for content in self._api.iterate_pages("/v1/jobs", "jobs"))
 
+    def usage(self) -> Mapping[str, Any]:
+        """Return what you have stored and asked for, how much you may, and the time that your jobs took."""
+        return cast("Mapping[str, Any]", self._api.get("/v1/usage"))
+
     def __repr__(self) -> str:
         return f"Client({self.url!r})"
 
@@ -200,7 +204,9 @@ class Job:
 
     @property
     def options(self) -> Mapping[str, Any]:
-        """Return all options of the job."""
+        """Return all options of the job, which are requested for one out of a list."""
+        if "options" not in self.content:
+            self.refresh()
         return cast("Mapping[str, Any]", self.content["options"])
 
     def refresh(self) -> "Job":
@@ -271,6 +277,19 @@ class Job:
         return submission.download_job(
             self._api, self.id, Path(folder), names, progress or default_progress()
         )
+
+    def download_archive(self, path: PathLike, *, progress: EventListener | None = None) -> Path:
+        """Save all results as one ZIP file, which replaces a file of that name, and return it.
+
+        Args:
+            path: the ZIP file.
+            progress: told the events of the download; by default they are logged, or shown in a notebook.
+
+        Raises:
+            ServiceError: there are no results.
+            OutputError: the file cannot be written.
+        """
+        return submission.download_job_archive(self._api, self.id, Path(path), progress or default_progress())
 
     def __repr__(self) -> str:
         return f"Job({self.id!r}, {self.kind}, {self.state})"

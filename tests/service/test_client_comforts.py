@@ -2,6 +2,7 @@
 
 import hashlib
 import io
+import json
 import logging
 import zipfile
 from typing import Any
@@ -91,6 +92,36 @@ async def test_owners_see_their_quota_and_use(connect_service: ConnectService) -
         assert found["job_seconds"] == pytest.approx(90)
         other = (await http.get("/v1/usage")).json()
         assert other["jobs"]["used"] == other["job_seconds"] == 0
+
+
+async def test_progress_and_time_left_are_of_the_whole_job(connect_service: ConnectService) -> None:
+    async with connect_service() as (http, service):
+        dataset = await committed_dataset(service)
+        job = (await http.post("/v1/jobs", json={"dataset_id": dataset})).json()
+        address = f"/v1/jobs/{job['id']}"
+        assert (job["progress"], job["total_seconds_left"]) == (0.0, None)
+        estimate = {
+            "cpu_seconds": 1.0, "seconds": 1.0, "cores": 1, "memory_bytes": 1,
+            "stage_seconds": {"load": 10.0, "train": 60.0, "evaluate": 20.0, "export": 10.0},
+        }  # fmt: skip
+        await claim_job(service, job)
+
+        async def found(stage: str, step: int | None, total: int | None, left: float | None) -> list[Any]:
+            async with service.pool.connection() as connection:
+                await connection.execute(
+                    "UPDATE jobs SET stage = %s, step = %s, total_steps = %s, seconds_left = %s, "
+                    "estimate = %s WHERE id = %s",
+                    [stage, step, total, left, json.dumps(estimate), job["id"]],
+                )
+            view = (await http.get(address)).json()
+            return [view["progress"], view["total_seconds_left"]]
+
+        assert await found("load", None, None, None) == [0.0, None]
+        # Half of the training took twice as long as estimated, and so will the 30 s of the other stages.
+        assert await found("train", 50, 100, 60.0) == [0.4, 120.0]
+        assert await found("export", 1, 2, 7.0) == [0.95, 7.0]
+        estimate["stage_seconds"] = {}
+        assert await found("train", 50, 100, 60.0) == [0.375, None]
 
 
 async def test_requests_have_ids_in_answers_problems_and_logs(

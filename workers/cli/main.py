@@ -69,6 +69,7 @@ _SECTIONS: dict[str, dict[str, tuple[str, str]]] = {
         "cancel": ("client", "Stop a job."),
         "retry": ("client", "Queue a failed or cancelled job again."),
         "download": ("client", "Save the results of a job."),
+        "usage": ("usage", "Show what you have stored and what you may."),
         "datasets": ("client", "List datasets, which hold the photographs of jobs."),
         "workers": ("client", "List queues and the workers that take jobs from them."),
     },

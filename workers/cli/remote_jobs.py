@@ -47,6 +47,13 @@ def download_results(
     return paths
 
 
+def download_archive(api: Api, job_id: str, path: Path, printer: Printer) -> None:
+    """Save all results of a job as one ZIP file."""
+    with show_progress(quiet=printer.hides_progress) as listener:
+        submission.download_job_archive(api, job_id, path, listener)
+    printer.note(f"Saved all results in {path}.")
+
+
 def submit_and_wait(api: Api, request: Submission | Derivation, output: Path, printer: Printer) -> None:
     """Submit, wait, download, and print a summary, or the job as JSON."""
     job = derive(api, request, printer) if isinstance(request, Derivation) else submit(api, request, printer)

@@ -2,6 +2,7 @@
 
 import hashlib
 import urllib.parse
+import zipfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -74,6 +75,52 @@ def download_results(
         progress(done, total)
         paths.append(path)
     return paths
+
+
+def download_archive(
+    api: Api,
+    job_id: str,
+    path: Path,
+    *,
+    progress: Callable[[int, int], None] = lambda _done, _total: None,
+) -> Path:
+    """Save all results of a job as one ZIP file, which replaces a file of that name once it is whole.
+
+    Args:
+        api: the service.
+        job_id: which.
+        path: the ZIP file.
+        progress: called with (bytes done, total of the results).
+
+    Raises:
+        ServiceError: there is no such job, or it has no results.
+        ServiceUnreachableError: the service does not answer, or broke off.
+        OutputError: the file cannot be written, or came damaged.
+    """
+    found = api.get(f"/v1/jobs/{job_id}/artifacts")["artifacts"]
+    total = sum(artifact["size_bytes"] for artifact in found)
+    partial = path.with_name(f".{job_id}.partial")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with api.stream("GET", f"/v1/jobs/{job_id}/archive") as response, partial.open("wb") as handle:
+            api.raise_for_stream_status(response)
+            for piece in response.iter_raw():
+                handle.write(piece)
+                progress(min(handle.tell(), total), total)
+        with zipfile.ZipFile(partial) as archive:
+            damaged = archive.testzip()
+        if damaged is not None:
+            raise OutputError(f"{path} came damaged at {damaged}; ask for it again.")
+        partial.replace(path)
+    except httpx.TransportError as error:
+        raise api.unreachable_error(error) from None
+    except zipfile.BadZipFile:
+        raise OutputError(f"{path} came damaged; ask for it again.") from None
+    except OSError as error:
+        raise OutputError(f"{path} cannot be written ({error.strerror or error}).") from None
+    finally:
+        partial.unlink(missing_ok=True)
+    return path
 
 
 def _download_file(

@@ -15,7 +15,7 @@ from octasplat.engine.pathtracing.stage.stage_file import read_stage, referenced
 from octasplat.engine.render.path_document import read_path_document
 from octasplat.engine.settings.nested_options import merge_options
 from octasplat.workers.client.api import Api
-from octasplat.workers.client.download import download_results
+from octasplat.workers.client.download import download_archive, download_results
 from octasplat.workers.client.upload import upload_files, upload_scene
 from octasplat.workers.client.watch import watch_job
 
@@ -240,6 +240,15 @@ def download_job(
                 api, job_id, folder, names=names, progress=lambda d, t: progress(d >> 10, t >> 10)
             )
         )
+
+
+def download_job_archive(api: Api, job_id: str, path: Path, on_event: EventListener = ignore_events) -> Path:
+    """Save all results of a job as one ZIP file; returns it.
+
+    The stage ``download`` is told to ``on_event``.
+    """
+    with counted_phase("download", on_event) as progress:
+        return download_archive(api, job_id, path, progress=lambda d, t: progress(d >> 10, t >> 10))
 
 
 def _upload_if_needed(api: Api, scene: Path, on_event: EventListener) -> str:

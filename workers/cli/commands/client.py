@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
+from octasplat.engine.core.durations import format_duration
 from octasplat.engine.core.errors import ConfigError
 from octasplat.engine.operations.reconstruct import ReconstructOptions
 from octasplat.engine.settings.renamed_settings import notify_renamed
@@ -327,6 +328,9 @@ def status(job_id: str, wait: bool, server: str | None, printer: Printer) -> Non
 def _job_lines(job: dict[str, Any]) -> Iterator[str]:
     """Yield sentences about a job."""
     yield f"{job['kind']} {job['id']}: {job['state']} {_progress_text(job)}".rstrip()
+    if job["state"] == "running" and job.get("total_seconds_left") is not None:
+        left = format_duration(job["total_seconds_left"])
+        yield f"{job['progress']:.0%} of the whole, about {left} left."
     if job.get("estimate") and job["state"] in ("queued", "running"):
         yield f"Estimated when it was asked for: {job['estimate']['text']}, within a factor of two."
     yield from job.get("notes", ())
@@ -407,17 +411,34 @@ def retry(job_id: str, from_start: bool, server: str | None, printer: Printer, *
 @click.argument("job_id", metavar="JOB")
 @click.argument("names", nargs=-1)
 @click.option("-o", "--output", type=click.Path(path_type=Path), help="Folder.  [default: octasplat-<job>]")
+@click.option(
+    "--archive",
+    type=click.Path(path_type=Path, dir_okay=False),
+    metavar="FILE.zip",
+    help="All results as this one ZIP file instead.",
+)
 @server_option
 @output_options
 def download(
-    job_id: str, names: tuple[str, ...], output: Path | None, server: str | None, printer: Printer
+    job_id: str,
+    names: tuple[str, ...],
+    output: Path | None,
+    archive: Path | None,
+    server: str | None,
+    printer: Printer,
 ) -> None:
     """Save the results of JOB, or only those called NAMES; goes on where it broke off."""
-    from octasplat.workers.cli.remote_jobs import download_results
+    from octasplat.workers.cli.remote_jobs import download_archive, download_results
     from octasplat.workers.client.short_ids import find_job, short_id
 
+    if archive is not None and (names or output is not None):
+        raise click.UsageError("--archive takes all results, so it goes with neither NAMES nor -o.")
     with connected(server, awaits_start=True) as api:
         job = find_job(api, job_id)
+        if archive is not None:
+            download_archive(api, job["id"], archive, printer)
+            printer.print({"archive": archive}, ())
+            return
         folder = output or Path(f"octasplat-{short_id(job['id'])}")
         paths = download_results(api, job["id"], folder, names, printer)
     printer.print({"folder": folder, "files": paths}, ())

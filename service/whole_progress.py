@@ -1,0 +1,58 @@
+"""How far a job is as a whole, and how long it still takes, from the stage that it is in."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from octasplat.workers.db.rows import Job
+
+
+@dataclass(frozen=True)
+class WholeProgress:
+    """Progress of a job.
+
+    Attributes:
+        share: what is done of all stages, 0 to 1; None where nobody knows.
+        seconds_left: of all stages; None where nobody knows.
+    """
+
+    share: float | None = None
+    seconds_left: float | None = None
+
+
+def whole_progress(job: Job, stages: Sequence[str]) -> WholeProgress:
+    """Return how far a job is, with the estimated time of each stage as its weight.
+
+    Without such an estimate all stages count alike, and the time left is known in the last one only. Stages
+    to come are taken to be as much slower or faster than estimated as the present one.
+
+    Args:
+        job: the job.
+        stages: the names of its stages, in order.
+    """
+    if job.state == "succeeded":
+        return WholeProgress(1.0, 0.0)
+    if job.is_over or not stages:
+        return WholeProgress()
+    if job.stage not in stages:
+        return WholeProgress(0.0)
+    estimated = _stage_seconds(job.estimate, stages)
+    weights = estimated or dict.fromkeys(stages, 1.0)
+    place = stages.index(job.stage)
+    share = min(1.0, (job.step or 0) / job.total_steps) if job.total_steps else 0.0
+    done = sum(weights[name] for name in stages[:place]) + share * weights[job.stage]
+    later = sum(weights[name] for name in stages[place + 1 :])
+    seconds = job.seconds_left
+    if seconds is not None and later:
+        left_here = (1 - share) * weights[job.stage]
+        seconds = seconds + later * seconds / left_here if estimated and left_here > 0 else None
+    return WholeProgress(
+        round(done / sum(weights.values()), 4), None if seconds is None else round(seconds, 1)
+    )
+
+
+def _stage_seconds(estimate: Mapping[str, Any] | None, stages: Sequence[str]) -> dict[str, float] | None:
+    """Return the estimated seconds of all stages, or None where those of one are not known."""
+    known = (estimate or {}).get("stage_seconds") or {}
+    found = {name: float(known[name]) for name in stages if name in known}
+    return found if len(found) == len(stages) else None
