@@ -67,7 +67,9 @@ fl_x
 fl_y
 is_fisheye
 train_filenames
-# of the OpenAPI document: headers of messages to webhooks, a field of an answer
+# of the OpenAPI document: headers of messages to webhooks, fields of answers
 webhook_timestamp
 webhook_signature
 job_seconds
+stage_seconds
+total_seconds_left

@@ -34,7 +34,7 @@ def whole_progress(job: Job, stages: Sequence[str]) -> WholeProgress:
         return WholeProgress(1.0, 0.0)
     if job.is_over or not stages:
         return WholeProgress()
-    if job.stage not in stages:
+    if job.stage is None or job.stage not in stages:
         return WholeProgress(0.0)
     estimated = _stage_seconds(job.estimate, stages)
     weights = estimated or dict.fromkeys(stages, 1.0)
