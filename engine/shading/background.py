@@ -12,23 +12,28 @@ from jaxtyping import Float32, Float64, Int64
 
 from octasplat.engine.core.compilation import run_ranges
 from octasplat.engine.core.threads import threads_in_use
-from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.shading.adam_map import adam_update, smoothness_gradient
 from octasplat.engine.shading.environment_frame import environment_frame
 from octasplat.engine.shading.environment_levels import solid_angles
 from octasplat.engine.shading.kernels.environment_map import add_to_texels, map_colors
 from octasplat.engine.shading.plain import PLAIN_SHADING
-from octasplat.engine.shading.protocol import ShadedRays, ShadingGradients, ShadingModel, TracedRays
-from octasplat.engine.trace.protocol import GaussianGradients, Tracer
+from octasplat.engine.shading.protocol import (
+    ShadedRayGradients,
+    ShadedRays,
+    ShadingGradients,
+    ShadingModel,
+    ShadingStep,
+    TracedRays,
+)
+from octasplat.engine.shading.wrapper import WrapperModel
 
 UP_WORLD = (0.0, -1.0, 0.0)
 """Up in maps, about right for most worlds that COLMAP makes; it only says how the picture of a map lies."""
 STEP_INTERVAL = 8
 """Iterations between two steps, each for the gradients of all of them: a map has more texels than rays."""
-_STATE = ("rgb_srgb", "first", "second", "sums", "steps")
 
 
-class LearnedBackground:
+class LearnedBackground(WrapperModel):
     """Composite the colors of another model over a learnt map.
 
     Follows :class:`octasplat.engine.shading.protocol.ShadingModel`.
@@ -50,6 +55,7 @@ class LearnedBackground:
     """
 
     name = "background"
+    state_names = ("rgb_srgb", "first", "second", "sums", "steps")
 
     def __init__(
         self,
@@ -70,7 +76,7 @@ class LearnedBackground:
         self._rate = rate
         self._decay = decay
         self._smoothness_weight = smoothness_weight
-        self.inner = inner
+        super().__init__(inner)
 
     @classmethod
     def from_map(
@@ -96,14 +102,6 @@ class LearnedBackground:
         )  # fmt: skip
         return colors
 
-    def features(self, gaussians: FlatGaussians) -> Float32[np.ndarray, "n f"] | None:
-        """Return the features of the inner model."""
-        return self.inner.features(gaussians)
-
-    def on_rebuild(self, gaussians: FlatGaussians, tracer: Tracer, *, training_progress: float) -> None:
-        """Let the inner model look around."""
-        self.inner.on_rebuild(gaussians, tracer, training_progress=training_progress)
-
     def shade(self, traced: TracedRays) -> ShadedRays:
         """Return the inner model's colors over those of the map; nothing stays transparent."""
         inner = self.inner.shade(traced)
@@ -111,23 +109,18 @@ class LearnedBackground:
         rgb = inner.rgb_srgb + inner.transmittance[:, None] * background_srgb
         return ShadedRays(rgb, np.zeros_like(inner.transmittance), (inner, background_srgb), inner.layers)
 
-    def backward(
-        self,
-        traced: TracedRays,
-        shaded: ShadedRays,
-        by_rgb: Float32[np.ndarray, "r 3"],
-        by_transmittance: Float32[np.ndarray, " r"],
-    ) -> ShadingGradients:
+    def backward(self, traced: TracedRays, shaded: ShadedRays, grad: ShadedRayGradients) -> ShadingGradients:
         """Return gradients by what the inner model shaded and by the map's colors along the rays."""
         assert isinstance(shaded.ctx, tuple)
         inner, background_srgb = shaded.ctx
-        through = (by_rgb * background_srgb).sum(axis=1, dtype=np.float32)
-        below = self.inner.backward(traced, inner, by_rgb, through)
-        by_map = {
+        grad_transmittance = (grad.rgb_srgb * background_srgb).sum(axis=1, dtype=np.float32)
+        inner_grad = ShadedRayGradients(grad.rgb_srgb, grad_transmittance)
+        below = self.inner.backward(traced, inner, inner_grad)
+        map_gradients = {
             "background.directions": traced.rays.directions_world,
-            "background.by_colors": inner.transmittance[:, None] * by_rgb,
+            "background.grad_colors": inner.transmittance[:, None] * grad.rgb_srgb,
         }
-        return ShadingGradients(below.trace, below.recorded_traces, {**below.parameters, **by_map})
+        return ShadingGradients(below.trace, below.recorded_traces, {**below.parameters, **map_gradients})
 
     def accumulate(self, parameters: Mapping[str, np.ndarray]) -> None:
         """Add what :meth:`backward` found to the sums over the texels."""
@@ -136,21 +129,14 @@ class LearnedBackground:
             len(self.sums),
             self.frame,
             parameters["background.directions"],
-            parameters["background.by_colors"],
+            parameters["background.grad_colors"],
             self.sums.reshape(-1, 3),
         )
 
-    def step(
-        self,
-        gaussians: FlatGaussians,
-        gradients: GaussianGradients,
-        parameters: Mapping[str, np.ndarray],
-        *,
-        training_progress: float,
-    ) -> None:
+    def step(self, update: ShadingStep) -> None:
         """Count an iteration, and take a step of Adam if it is time; colors stay what a screen can show."""
-        self.inner.step(gaussians, gradients, parameters, training_progress=training_progress)
-        self.accumulate(parameters)
+        super().step(update)
+        self.accumulate(update.parameters)
         self.steps += 1
         if self.steps[0] % STEP_INTERVAL:
             return
@@ -161,15 +147,5 @@ class LearnedBackground:
         self.sums[:] = 0
         count = int(self.steps[0]) // STEP_INTERVAL
         self.first, self.second, change = adam_update(self.first, self.second, gradient, count)
-        rate = self._rate * self._decay**training_progress
+        rate = self._rate * self._decay**update.training_progress
         self.rgb_srgb = np.clip(self.rgb_srgb - rate * change, 0, 1).astype(np.float32)
-
-    def state(self) -> dict[str, np.ndarray]:
-        """Return the map, its moments and sums, and the state of the inner model."""
-        return {**self.inner.state(), **{f"background.{name}": getattr(self, name) for name in _STATE}}
-
-    def restore(self, state: Mapping[str, np.ndarray]) -> None:
-        """Take the state that :meth:`state` returned."""
-        self.inner.restore(state)
-        for name in _STATE:
-            setattr(self, name, state[f"background.{name}"].copy())

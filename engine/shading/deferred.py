@@ -39,10 +39,16 @@ from octasplat.engine.shading.material_settings import (
     MaterialSettings,
 )
 from octasplat.engine.shading.normal_propagation import propagate_normals
-from octasplat.engine.shading.protocol import ShadedRays, ShadingGradients, TracedRays
+from octasplat.engine.shading.protocol import (
+    ShadedRayGradients,
+    ShadedRays,
+    ShadingGradients,
+    ShadingStep,
+    TracedRays,
+)
 from octasplat.engine.shading.reflection_tracing import ReflectionTracer
 from octasplat.engine.shading.split_sum import SurfacePoints, shade, shade_backward
-from octasplat.engine.trace.protocol import GaussianGradients, TraceGradients, Tracer, TraceResult
+from octasplat.engine.trace.protocol import TraceGradients, Tracer, TraceResult
 
 AMBIENT_COLUMN = 5
 INTERREFLECTION_COLUMNS = slice(6, 9)
@@ -244,69 +250,58 @@ class DeferredShading:
         layers = {} if traced.view is not None else self._named_layers(context, rgb)
         return ShadedRays(split.sum_layers(rgb), result.transmittance, context, layers)
 
-    def backward(
-        self,
-        traced: TracedRays,
-        shaded: ShadedRays,
-        by_rgb: Float32[np.ndarray, "r 3"],
-        by_transmittance: Float32[np.ndarray, " r"],
-    ) -> ShadingGradients:
+    def backward(self, traced: TracedRays, shaded: ShadedRays, grad: ShadedRayGradients) -> ShadingGradients:
         """Return gradients by what was blended, by what reflected rays hit, and by the environment."""
         settings, ctx = self.settings, shaded.ctx
         if not isinstance(ctx, ShadingContext):
-            return ShadingGradients(TraceGradients(rgb_srgb=by_rgb, transmittance=by_transmittance))
+            return ShadingGradients(TraceGradients(grad.rgb_srgb, grad.transmittance))
         split, gbuffer, incident = ctx.depth_layers, ctx.gbuffer, ctx.incident
+        grad_rgb = grad.rgb_srgb
         # --- regularisers of the rays' geometry and materials ---
-        by_alpha = -by_transmittance.astype(np.float64)
-        by_normal = np.zeros((len(by_rgb), 3))
-        by_features = np.zeros((len(by_rgb), split.results.features.shape[1]))
-        by_depth = np.zeros(len(by_rgb))
-        add_patch_gradients(traced, settings, by_features, by_alpha, by_normal, by_depth)
-        by_alpha, by_normal = split.expand(by_alpha), split.expand(by_normal)
-        by_features, by_depth = split.expand(by_features), split.expand(by_depth)
+        grad_alpha = -grad.transmittance.astype(np.float64)
+        grad_normal = np.zeros((len(grad_rgb), 3))
+        grad_features = np.zeros((len(grad_rgb), split.results.features.shape[1]))
+        grad_depth = np.zeros(len(grad_rgb))
+        add_patch_gradients(traced, settings, grad_features, grad_alpha, grad_normal, grad_depth)
+        grad_alpha, grad_normal = split.expand(grad_alpha), split.expand(grad_normal)
+        grad_features, grad_depth = split.expand(grad_features), split.expand(grad_depth)
         # --- the split sum at the shaded points ---
-        by_display = split.expand(by_rgb)[gbuffer.ray_ids] * ctx.ramp
-        by_alpha[gbuffer.ray_ids] += (by_display * ctx.display).sum(axis=1)
-        by_linear = self._display_backward(ctx.linear, by_display * gbuffer.alpha[:, None])
+        grad_display = split.expand(grad_rgb)[gbuffer.ray_ids] * ctx.ramp
+        grad_alpha[gbuffer.ray_ids] += (grad_display * ctx.display).sum(axis=1)
+        grad_linear = self._display_backward(ctx.linear, grad_display * gbuffer.alpha[:, None])
         blur = settings.blur_roughness(traced.training_progress)
-        back = shade_backward(ctx.surface, self.light.levels, self.frame, by_linear, blur=blur)
+        back = shade_backward(ctx.surface, self.light.levels, self.frame, grad_linear, blur=blur)
         surface_normal = back.normal
         if settings.reflected_gradient:
-            by_direction = back.reflected + (0.0 if incident is None else incident.normal_gradient(back))
-            surface_normal = surface_normal + clip_gradients(by_direction, settings.normal_gradient_clip)
+            grad_direction = back.reflected + (0.0 if incident is None else incident.normal_gradient(back))
+            surface_normal = surface_normal + clip_gradients(grad_direction, settings.normal_gradient_clip)
         if incident is not None:
             incident.add_roughness_gradient(back)
-        by_harmonics = self._unshaded_part_backward(traced, shaded, ctx, by_rgb, back.material)
+        grad_harmonics = self._unshaded_part_backward(traced, shaded, ctx, grad_rgb, back.material)
         # --- what was blended along the rays ---
-        backward_gbuffer(gbuffer, back.material, surface_normal, by_features, by_alpha, by_normal)
-        normal_spread_gradient(gbuffer, settings.normal_weight / len(by_rgb), by_alpha, by_normal)
-        by_texels = back.sum_texels(len(self.light.levels.texels))
-        reflected = () if incident is None else incident.backward(back, by_texels)
-        by_layers = TraceGradients(
-            rgb_srgb=by_harmonics.astype(np.float32),
-            transmittance=(-by_alpha).astype(np.float32),
-            depth_sum=by_depth.astype(np.float32),
-            normal_world=by_normal.astype(np.float32),
-            features=by_features.astype(np.float32),
+        backward_gbuffer(gbuffer, back.material, surface_normal, grad_features, grad_alpha, grad_normal)
+        normal_spread_gradient(gbuffer, settings.normal_weight / len(grad_rgb), grad_alpha, grad_normal)
+        grad_texels = back.sum_texels(len(self.light.levels.texels))
+        reflected = () if incident is None else incident.backward(back, grad_texels)
+        grad_layers = TraceGradients(
+            rgb_srgb=grad_harmonics.astype(np.float32),
+            transmittance=(-grad_alpha).astype(np.float32),
+            depth_sum=grad_depth.astype(np.float32),
+            normal_world=grad_normal.astype(np.float32),
+            features=grad_features.astype(np.float32),
         )
-        by_trace, fronts = split.backward(by_layers)
-        return ShadingGradients(by_trace, fronts + reflected, {"materials.texels": by_texels})
+        grad_trace, fronts = split.backward(grad_layers)
+        return ShadingGradients(grad_trace, fronts + reflected, {"materials.texels": grad_texels})
 
-    def step(
-        self,
-        gaussians: FlatGaussians,
-        gradients: GaussianGradients,
-        parameters: Mapping[str, np.ndarray],
-        *,
-        training_progress: float,
-    ) -> None:
+    def step(self, update: ShadingStep) -> None:
         """Step the environment, and take over the materials as the optimiser of the Gaussians left them."""
-        first = 0
+        ids, first = update.gradients.ids, 0
         for name, width in MATERIAL_WIDTHS.items():
-            self._features[gradients.ids, first : first + width] = gaussians.channels[name][gradients.ids]
+            self._features[ids, first : first + width] = update.gaussians.channels[name][ids]
             first += width
-        if "materials.texels" in parameters:
-            self.light.step(parameters["materials.texels"], rate=ENVIRONMENT_RATE * 0.1**training_progress)
+        if "materials.texels" in update.parameters:
+            rate = ENVIRONMENT_RATE * 0.1**update.training_progress
+            self.light.step(update.parameters["materials.texels"], rate=rate)
 
     def state(self) -> dict[str, np.ndarray]:
         """Return the environment with its optimiser, and whose turn it is to be measured."""
@@ -365,12 +360,12 @@ class DeferredShading:
         return linear_to_srgb(np.minimum(linear, 1.0))
 
     def _display_backward(
-        self, linear: Float64[np.ndarray, "p 3"], by_display: Float64[np.ndarray, "p 3"]
+        self, linear: Float64[np.ndarray, "p 3"], grad_display: Float64[np.ndarray, "p 3"]
     ) -> Float64[np.ndarray, "p 3"]:
         """Return gradients by radiance from those by the colors with which it is shown."""
-        by_linear = by_display * srgb_derivative(linear)
-        by_linear[(linear >= 1) & (by_linear < 0)] = 0.0  # no photograph is whiter than white
-        return by_linear
+        grad_linear = grad_display * srgb_derivative(linear)
+        grad_linear[(linear >= 1) & (grad_linear < 0)] = 0.0  # no photograph is whiter than white
+        return grad_linear
 
     def _unshaded_part(self, traced: TracedRays, ctx: ShadingContext) -> Float32[np.ndarray, "l 3"]:
         """Return what the harmonics add to the colors of each layer."""
@@ -381,16 +376,16 @@ class DeferredShading:
         traced: TracedRays,
         shaded: ShadedRays,
         ctx: ShadingContext,
-        by_rgb: Float32[np.ndarray, "r 3"],
-        by_material: Float64[np.ndarray, "p 5"],
+        grad_rgb: Float32[np.ndarray, "r 3"],
+        grad_material: Float64[np.ndarray, "p 5"],
     ) -> Float32[np.ndarray, "l 3"]:
-        """Return gradients by the colors of the harmonics; those by materials are added to ``by_material``.
+        """Return gradients by the colors of the harmonics; those by materials are added to ``grad_material``.
 
         Once the harmonics add nothing any more, they learn the shaded colors.
         """
         if ctx.ramp < 1:
-            return ctx.depth_layers.expand(by_rgb * np.float32(1 - ctx.ramp))
-        weight = np.float32(self.settings.harmonics_weight * 2 / (3 * len(by_rgb)))
+            return ctx.depth_layers.expand(grad_rgb * np.float32(1 - ctx.ramp))
+        weight = np.float32(self.settings.harmonics_weight * 2 / (3 * len(grad_rgb)))
         return ctx.depth_layers.expand(weight * (traced.result.rgb_srgb - shaded.rgb_srgb))
 
     def _layer_radiance(

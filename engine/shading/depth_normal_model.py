@@ -9,11 +9,10 @@ neighbours in a patch of a batch where that has neighbouring pixels.
 from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Float32
 
 from octasplat.engine.shading.geometry_losses import add_depth_normal_gradient
 from octasplat.engine.shading.plain import PlainShading
-from octasplat.engine.shading.protocol import ShadedRays, ShadingGradients, TracedRays
+from octasplat.engine.shading.protocol import ShadedRayGradients, ShadedRays, ShadingGradients, TracedRays
 
 
 class DepthNormalShading(PlainShading):
@@ -31,22 +30,16 @@ class DepthNormalShading(PlainShading):
     def __init__(self, weight: float) -> None:
         self._weight = weight
 
-    def backward(
-        self,
-        traced: TracedRays,
-        shaded: ShadedRays,
-        by_rgb: Float32[np.ndarray, "r 3"],
-        by_transmittance: Float32[np.ndarray, " r"],
-    ) -> ShadingGradients:
+    def backward(self, traced: TracedRays, shaded: ShadedRays, grad: ShadedRayGradients) -> ShadingGradients:
         """Return the gradients of the plain model, and those of the term by alphas, depths and normals."""
-        plain = super().backward(traced, shaded, by_rgb, by_transmittance)
-        count = len(by_rgb)
-        by_alpha, by_normal, by_depth = np.zeros(count), np.zeros((count, 3)), np.zeros(count)
-        add_depth_normal_gradient(traced, self._weight, by_alpha, by_normal, by_depth)
-        by_trace = replace(
+        plain = super().backward(traced, shaded, grad)
+        count = len(grad.rgb_srgb)
+        grad_alpha, grad_normal, grad_depth = np.zeros(count), np.zeros((count, 3)), np.zeros(count)
+        add_depth_normal_gradient(traced, self._weight, grad_alpha, grad_normal, grad_depth)
+        grad_trace = replace(
             plain.trace,
-            transmittance=(by_transmittance - by_alpha).astype(np.float32),
-            depth_sum=by_depth.astype(np.float32),
-            normal_world=by_normal.astype(np.float32),
+            transmittance=(grad.transmittance - grad_alpha).astype(np.float32),
+            depth_sum=grad_depth.astype(np.float32),
+            normal_world=grad_normal.astype(np.float32),
         )
-        return replace(plain, trace=by_trace)
+        return replace(plain, trace=grad_trace)

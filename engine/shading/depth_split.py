@@ -70,15 +70,15 @@ class DepthLayers:
         return np.concatenate([values, values[self.split_ids]]) if len(self.split_ids) else values
 
     def backward(
-        self, by_layers: TraceGradients
+        self, grad_layers: TraceGradients
     ) -> tuple[TraceGradients, tuple[tuple[Recording, TraceGradients], ...]]:
         """Return gradients by the whole rays and by the fronts, from those by the layers."""
         if not len(self.split_ids):
-            return by_layers, ()
-        count = len(by_layers.rgb_srgb) - len(self.split_ids)
+            return grad_layers, ()
+        count = len(grad_layers.rgb_srgb) - len(self.split_ids)
         of_rays, of_fronts = {}, {}
         for name in (entry.name for entry in fields(TraceGradients)):
-            value = getattr(by_layers, name)
+            value = getattr(grad_layers, name)
             if value is not None:
                 of_rays[name] = value[:count]
                 of_fronts[name] = np.zeros((len(self.traced), *value.shape[1:]), value.dtype)

@@ -85,14 +85,14 @@ class EnvironmentPrefilter:
             rows.multiply(halved[_SOURCES[level]], texels[self.offsets[level] : self.offsets[level + 1]])
         return EnvironmentLevels(texels, self.offsets[:-1], self.heights, np.array(ROUGHNESSES))
 
-    def backward(self, by_texels: Float64[np.ndarray, "t 3"]) -> Float64[np.ndarray, "h w 3"]:
+    def backward(self, grad_texels: Float64[np.ndarray, "t 3"]) -> Float64[np.ndarray, "h w 3"]:
         """Return gradients by the environment's texels from those by the texels of all its levels."""
         sizes = [2 * (self.height >> halving) ** 2 for halving in range(max(_SOURCES) + 1)]
         sums = [np.zeros((size, 3)) for size in sizes]
-        sums[0] += by_texels[: self.offsets[1]]
+        sums[0] += grad_texels[: self.offsets[1]]
         for level, transposed in enumerate(self._transposed_filters, start=1):
             part = np.empty_like(sums[_SOURCES[level]])
-            transposed.multiply(by_texels[self.offsets[level] : self.offsets[level + 1]], part)
+            transposed.multiply(grad_texels[self.offsets[level] : self.offsets[level + 1]], part)
             sums[_SOURCES[level]] += part
         for halving in range(max(_SOURCES), 0, -1):
             sums[halving - 1] += _halve_backward(sums[halving])

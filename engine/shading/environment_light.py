@@ -76,9 +76,9 @@ class EnvironmentLight:
             self._levels = self._prefilter.levels(self.radiance_linear)
         return self._levels
 
-    def step(self, by_texels: Float64[np.ndarray, "t 3"], *, rate: float) -> None:
+    def step(self, grad_texels: Float64[np.ndarray, "t 3"], *, rate: float) -> None:
         """Count an iteration, and take a step if it is time."""
-        self.sums += by_texels
+        self.sums += grad_texels
         self.steps += 1
         if self.steps[0] % ENVIRONMENT_EVERY:
             return

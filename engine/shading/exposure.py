@@ -13,19 +13,24 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from jaxtyping import Float32, Float64, Int64
 
-from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.shading.exposure_estimation import estimate_values, times_from_names
 from octasplat.engine.shading.plain import PLAIN_SHADING
-from octasplat.engine.shading.protocol import ShadedRays, ShadingGradients, ShadingModel, TracedRays
-from octasplat.engine.trace.protocol import GaussianGradients, Tracer
+from octasplat.engine.shading.protocol import (
+    ShadedRayGradients,
+    ShadedRays,
+    ShadingGradients,
+    ShadingModel,
+    ShadingStep,
+    TracedRays,
+)
+from octasplat.engine.shading.wrapper import WrapperModel
 
 BETA1, BETA2, EPSILON = 0.9, 0.99, 1e-15
 ExposuresByName = Mapping[str, Mapping[str, Sequence[float]]]
 """Log gains and offsets of views, by their names."""
-_STATE = ("log_gains", "offsets", "first", "second", "steps")
 
 
-class ExposureModel:
+class ExposureModel(WrapperModel):
     """Expose the colors of another model: exp(log_gain) * color + offset, for each view and channel.
 
     Follows :class:`octasplat.engine.shading.protocol.ShadingModel`. Rays of no view have the mean
@@ -46,6 +51,7 @@ class ExposureModel:
     """
 
     name = "exposure"
+    state_names = ("log_gains", "offsets", "first", "second", "steps")
 
     def __init__(
         self, views: int, *, rate: float, decay: float = 1.0, inner: ShadingModel = PLAIN_SHADING
@@ -58,7 +64,7 @@ class ExposureModel:
         self._rate = rate
         self._decay = decay
         self._fixed_view: int | None = None
-        self.inner = inner
+        super().__init__(inner)
 
     @classmethod
     def from_known(cls, names: Sequence[str], known: ExposuresByName) -> "ExposureModel":
@@ -66,14 +72,6 @@ class ExposureModel:
         exposures = cls(len(names), rate=0.0)
         exposures.load_known(names, known)
         return exposures
-
-    def features(self, gaussians: FlatGaussians) -> Float32[np.ndarray, "n f"] | None:
-        """Return the features of the inner model."""
-        return self.inner.features(gaussians)
-
-    def on_rebuild(self, gaussians: FlatGaussians, tracer: Tracer, *, training_progress: float) -> None:
-        """Let the inner model look around."""
-        self.inner.on_rebuild(gaussians, tracer, training_progress=training_progress)
 
     def shade(self, traced: TracedRays) -> ShadedRays:
         """Return colors as the rays' views expose them; other rays have the mean or a fixed exposure."""
@@ -116,13 +114,7 @@ class ExposureModel:
             known = values[trained].astype(np.float64)
             values[others] = estimate_values(known, trained, others, times, brightness)
 
-    def backward(
-        self,
-        traced: TracedRays,
-        shaded: ShadedRays,
-        by_rgb: Float32[np.ndarray, "r 3"],
-        by_transmittance: Float32[np.ndarray, " r"],
-    ) -> ShadingGradients:
+    def backward(self, traced: TracedRays, shaded: ShadedRays, grad: ShadedRayGradients) -> ShadingGradients:
         """Return gradients by what the inner model shaded, and by each used view's log gains and offsets."""
         view, inner = traced.view, shaded.ctx
         assert view is not None and isinstance(inner, ShadedRays), (
@@ -130,36 +122,31 @@ class ExposureModel:
         )
         gains = np.exp(self.log_gains)[view]
         used, place = np.unique(view, return_inverse=True)
+        grad_rgb = grad.rgb_srgb
         alpha = np.float32(1) - inner.transmittance
-        terms = np.concatenate([by_rgb * gains * inner.rgb_srgb, by_rgb * alpha[:, None]], axis=1)
+        terms = np.concatenate([grad_rgb * gains * inner.rgb_srgb, grad_rgb * alpha[:, None]], axis=1)
         sums = np.stack([np.bincount(place, terms[:, c], len(used)) for c in range(6)], axis=1)
-        by_alpha = (by_rgb * self.offsets[view]).sum(axis=1)
-        inner_gradients = self.inner.backward(traced, inner, by_rgb * gains, by_transmittance - by_alpha)
-        by_exposures = {"exposure.views": used, "exposure.sums": sums}
+        grad_alpha = (grad_rgb * self.offsets[view]).sum(axis=1)
+        inner_grad = ShadedRayGradients(grad_rgb * gains, grad.transmittance - grad_alpha)
+        inner_gradients = self.inner.backward(traced, inner, inner_grad)
+        exposure_gradients = {"exposure.views": used, "exposure.sums": sums}
         return ShadingGradients(
             inner_gradients.trace,
             inner_gradients.recorded_traces,
-            {**inner_gradients.parameters, **by_exposures},
+            {**inner_gradients.parameters, **exposure_gradients},
         )
 
-    def step(
-        self,
-        gaussians: FlatGaussians,
-        gradients: GaussianGradients,
-        parameters: Mapping[str, np.ndarray],
-        *,
-        training_progress: float,
-    ) -> None:
+    def step(self, update: ShadingStep) -> None:
         """Take a step of Adam for the views of the batch, then subtract the mean over all views so far."""
-        self.inner.step(gaussians, gradients, parameters, training_progress=training_progress)
-        used, sums = parameters["exposure.views"], parameters["exposure.sums"]
+        super().step(update)
+        used, sums = update.parameters["exposure.views"], update.parameters["exposure.sums"]
         self.steps[used] += 1
         steps = self.steps[used, None]
         self.first[used] = BETA1 * self.first[used] + (1 - BETA1) * sums
         self.second[used] = BETA2 * self.second[used] + (1 - BETA2) * sums**2
         mean = self.first[used] / (1 - BETA1**steps)
         size = np.sqrt(self.second[used] / (1 - BETA2**steps)) + EPSILON
-        change = (self._rate * self._decay**training_progress * mean / size).astype(np.float32)
+        change = (self._rate * self._decay**update.training_progress * mean / size).astype(np.float32)
         self.log_gains[used] -= change[:, :3]
         self.offsets[used] -= change[:, 3:]
         is_trained = self.steps > 0
@@ -177,13 +164,3 @@ class ExposureModel:
             if name in known:
                 self.log_gains[number] = known[name]["log_gains"]
                 self.offsets[number] = known[name]["offsets"]
-
-    def state(self) -> dict[str, np.ndarray]:
-        """Return gains, offsets and moments, and the state of the inner model."""
-        return {**self.inner.state(), **{f"exposure.{name}": getattr(self, name) for name in _STATE}}
-
-    def restore(self, state: Mapping[str, np.ndarray]) -> None:
-        """Take the state that :meth:`state` returned."""
-        self.inner.restore(state)
-        for name in _STATE:
-            setattr(self, name, state[f"exposure.{name}"])

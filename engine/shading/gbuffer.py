@@ -63,17 +63,17 @@ def build_gbuffer(rays: RayBatch, result: TraceResult) -> GBuffer:
 
 def backward_gbuffer(
     gbuffer: GBuffer,
-    by_material: Float64[np.ndarray, "p 5"],
-    by_unit_normal: Float64[np.ndarray, "p 3"],
-    by_features: Float64[np.ndarray, "r f"],
-    by_alpha: Float64[np.ndarray, " r"],
-    by_normal: Float64[np.ndarray, "r 3"],
+    grad_material: Float64[np.ndarray, "p 5"],
+    grad_unit_normal: Float64[np.ndarray, "p 3"],
+    grad_features: Float64[np.ndarray, "r f"],
+    grad_alpha: Float64[np.ndarray, " r"],
+    grad_normal: Float64[np.ndarray, "r 3"],
 ) -> None:
     """Add gradients by a buffer's materials and unit normals to those by what was blended."""
     ray_ids, surface = gbuffer.ray_ids, gbuffer.surface
-    by_features[ray_ids, :5] += by_material / gbuffer.alpha[:, None]
-    by_alpha[ray_ids] -= (by_material * surface.material).sum(axis=1) / gbuffer.alpha
-    by_normal[ray_ids] += gbuffer.facing_normals.backward(by_unit_normal, surface.direction_world)
+    grad_features[ray_ids, :5] += grad_material / gbuffer.alpha[:, None]
+    grad_alpha[ray_ids] -= (grad_material * surface.material).sum(axis=1) / gbuffer.alpha
+    grad_normal[ray_ids] += gbuffer.facing_normals.backward(grad_unit_normal, surface.direction_world)
 
 
 def reflected_rays(

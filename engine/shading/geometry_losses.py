@@ -28,42 +28,42 @@ HUBER_DELTA = 0.02
 def normal_spread_gradient(
     gbuffer: GBuffer,
     weight: float,
-    by_alpha: Float64[np.ndarray, " r"],
-    by_normal: Float64[np.ndarray, "r 3"],
+    grad_alpha: Float64[np.ndarray, " r"],
+    grad_normal: Float64[np.ndarray, "r 3"],
 ) -> None:
     """Add the gradient of half the sum of w |n - N|^2 over a ray's Gaussians, N the blended unit normal.
 
     That is the accumulated alpha minus the length of the blended normal: it needs no neighbours.
     """
-    by_alpha[gbuffer.ray_ids] += weight
-    by_normal[gbuffer.ray_ids] -= weight * gbuffer.facing_normals.blended_world
+    grad_alpha[gbuffer.ray_ids] += weight
+    grad_normal[gbuffer.ray_ids] -= weight * gbuffer.facing_normals.blended_world
 
 
 def add_patch_gradients(
     traced: TracedRays,
     settings: MaterialSettings,
-    by_features: Float64[np.ndarray, "r f"],
-    by_alpha: Float64[np.ndarray, " r"],
-    by_normal: Float64[np.ndarray, "r 3"],
-    by_depth: Float64[np.ndarray, " r"],
+    grad_features: Float64[np.ndarray, "r f"],
+    grad_alpha: Float64[np.ndarray, " r"],
+    grad_normal: Float64[np.ndarray, "r 3"],
+    grad_depth: Float64[np.ndarray, " r"],
 ) -> None:
     """Add the gradients of all terms that hold neighbouring rays together: normals, depths, materials."""
     if settings.depth_normal_weight > 0:
-        add_depth_normal_gradient(traced, settings.depth_normal_weight, by_alpha, by_normal, by_depth)
+        add_depth_normal_gradient(traced, settings.depth_normal_weight, grad_alpha, grad_normal, grad_depth)
     if settings.smooth_normal_weight > 0:
-        add_normal_smoothness_gradient(traced, settings.smooth_normal_weight, by_normal)
+        add_normal_smoothness_gradient(traced, settings.smooth_normal_weight, grad_normal)
     if max(settings.smooth_weights) > 0:
         add_material_smoothness_gradient(
-            traced, settings.smooth_weights, settings.smooth_metal, by_features, by_alpha
+            traced, settings.smooth_weights, settings.smooth_metal, grad_features, grad_alpha
         )
 
 
 def add_depth_normal_gradient(
     traced: TracedRays,
     weight: float,
-    by_alpha: Float64[np.ndarray, " r"],
-    by_normal: Float64[np.ndarray, "r 3"],
-    by_depth: Float64[np.ndarray, " r"],
+    grad_alpha: Float64[np.ndarray, " r"],
+    grad_normal: Float64[np.ndarray, "r 3"],
+    grad_depth: Float64[np.ndarray, " r"],
 ) -> None:
     """Add the gradient of one minus the cosine between blended normals and those of neighbouring depths."""
     patches = traced.ray_patches
@@ -92,23 +92,23 @@ def add_depth_normal_gradient(
     counted &= (spanned * towards).sum(axis=-1) > MIN_VIEW_COSINE
     share = np.where(counted, weight / len(result.transmittance), 0.0)[..., None]
     cosine = (spanned * normal).sum(axis=-1, keepdims=True)
-    by_sums = -share * (spanned - cosine * normal) / normal_length
-    by_cross = -share * sign * (normal - cosine * spanned) / length
-    by_a, by_b = np.cross(b, by_cross), np.cross(by_cross, a)
-    by_points = np.zeros_like(points)
-    by_points[:, :-1, 1:] += by_a
-    by_points[:, 1:, :-1] += by_b
-    by_points[:, :-1, :-1] -= by_a + by_b
-    by_depth_sum = (patches.flatten(by_points) * directions).sum(axis=1)
-    by_depth[ray_ids] += by_depth_sum / safe_alpha
-    by_alpha[ray_ids] -= by_depth_sum * depth / safe_alpha
-    by_grid_normals = np.zeros_like(points)
-    by_grid_normals[:, :-1, :-1] = by_sums
-    by_normal[ray_ids] += patches.flatten(by_grid_normals)
+    grad_sums = -share * (spanned - cosine * normal) / normal_length
+    grad_cross = -share * sign * (normal - cosine * spanned) / length
+    grad_a, grad_b = np.cross(b, grad_cross), np.cross(grad_cross, a)
+    grad_points = np.zeros_like(points)
+    grad_points[:, :-1, 1:] += grad_a
+    grad_points[:, 1:, :-1] += grad_b
+    grad_points[:, :-1, :-1] -= grad_a + grad_b
+    grad_depth_sum = (patches.flatten(grad_points) * directions).sum(axis=1)
+    grad_depth[ray_ids] += grad_depth_sum / safe_alpha
+    grad_alpha[ray_ids] -= grad_depth_sum * depth / safe_alpha
+    grad_grid_normals = np.zeros_like(points)
+    grad_grid_normals[:, :-1, :-1] = grad_sums
+    grad_normal[ray_ids] += patches.flatten(grad_grid_normals)
 
 
 def add_normal_smoothness_gradient(
-    traced: TracedRays, weight: float, by_normal: Float64[np.ndarray, "r 3"]
+    traced: TracedRays, weight: float, grad_normal: Float64[np.ndarray, "r 3"]
 ) -> None:
     """Add the gradient of one minus the cosine between neighbouring rays' normals on one smooth surface.
 
@@ -129,15 +129,15 @@ def add_normal_smoothness_gradient(
         share = np.where(counted, weight / len(traced.result.transmittance), 0.0)
         gradient[one] -= share * (normal[other] - cosine * normal[one])
         gradient[other] -= share * (normal[one] - cosine * normal[other])
-    by_normal[ray_ids] += patches.flatten(gradient / length)
+    grad_normal[ray_ids] += patches.flatten(gradient / length)
 
 
 def add_material_smoothness_gradient(
     traced: TracedRays,
     weights: tuple[float, ...],
     metal: float,
-    by_features: Float64[np.ndarray, "r f"],
-    by_alpha: Float64[np.ndarray, " r"],
+    grad_features: Float64[np.ndarray, "r f"],
+    grad_alpha: Float64[np.ndarray, " r"],
 ) -> None:
     """Add the gradient of material differences between neighbouring rays: their size, rounded off near zero.
 
@@ -164,9 +164,9 @@ def add_material_smoothness_gradient(
         slope[..., :3] *= 1 + metal * both**2
         gradient[one] += slope
         gradient[other] -= slope
-    by_flat = patches.flatten(gradient)
-    by_features[ray_ids, :5] += by_flat / safe_alpha
-    by_alpha[ray_ids] -= (by_flat * flat).sum(axis=1) / safe_alpha[:, 0]
+    grad_flat = patches.flatten(gradient)
+    grad_features[ray_ids, :5] += grad_flat / safe_alpha
+    grad_alpha[ray_ids] -= (grad_flat * flat).sum(axis=1) / safe_alpha[:, 0]
 
 
 def _zero_outside(

@@ -10,6 +10,7 @@ from octasplat.engine.core.color import srgb_to_linear
 from octasplat.engine.shading.depth_split import DepthLayers
 from octasplat.engine.shading.gbuffer import GBuffer, RayOffset, reflected_rays
 from octasplat.engine.shading.gradient_ops import srgb_derivative
+from octasplat.engine.shading.kernels.split_sum import ShadeGradients
 from octasplat.engine.shading.material_settings import MaterialSettings
 from octasplat.engine.shading.protocol import TracedRays
 from octasplat.engine.shading.reflection_rays import (
@@ -23,7 +24,6 @@ from octasplat.engine.shading.reflection_rays import (
     trace_ray_pairs,
 )
 from octasplat.engine.shading.reflection_tracing import IncidentLight, ReflectionTracer, backward_reflections
-from octasplat.engine.shading.split_sum import ShadeGradients
 from octasplat.engine.trace.protocol import Recording, TraceGradients
 
 PROGRESS_SALTS = 1 << 20
@@ -49,8 +49,8 @@ class IncidentLightModel(Protocol):
         """Add gradients by the roughness through what reflected rays meet to those of the materials."""
         ...
 
-    def backward(self, back: ShadeGradients, by_texels: Float64[np.ndarray, "t 3"]) -> RecordedGradients:
-        """Return gradients by what reflected rays hit; those by the texels are added to ``by_texels``."""
+    def backward(self, back: ShadeGradients, grad_texels: Float64[np.ndarray, "t 3"]) -> RecordedGradients:
+        """Return gradients by what reflected rays hit; those by the texels are added to ``grad_texels``."""
         ...
 
 
@@ -119,15 +119,15 @@ class RayPairIncidentLight:
         slope = backward_roughness(probe, self.roughness[ids], back.around[ids], back.specular[ids])
         back.material[ids, 4] += slope / self.settings.roughness_probe_fraction
 
-    def backward(self, back: ShadeGradients, by_texels: Float64[np.ndarray, "t 3"]) -> RecordedGradients:
+    def backward(self, back: ShadeGradients, grad_texels: Float64[np.ndarray, "t 3"]) -> RecordedGradients:
         """Return gradients by all that was hit on the way."""
-        by_seen = backward_mean(IncidentLight(back.visibility, back.indirect))
+        grad_seen = backward_mean(IncidentLight(back.visibility, back.indirect))
         return backward_reflections(
             self.pairs.reflected,
             self.reflection_tracer.light,
             self.reflection_tracer.frame,
-            by_seen,
-            by_texels,
+            grad_seen,
+            grad_texels,
         )
 
 
@@ -138,12 +138,12 @@ class SingleRayIncidentLight:
     Attributes:
         incident: what came in.
         recording: recording of the rays; None where there is none, or nothing learns from them.
-        by_rgb: gradient of what came in by the display colors that were met.
+        grad_rgb: gradient of what came in by the display colors that were met.
     """
 
     incident: IncidentLight
     recording: Recording | None = None
-    by_rgb: Float64[np.ndarray, "p #c"] = field(default_factory=lambda: np.zeros((0, 1)))
+    grad_rgb: Float64[np.ndarray, "p #c"] = field(default_factory=lambda: np.zeros((0, 1)))
 
     @classmethod
     def trace(
@@ -171,8 +171,10 @@ class SingleRayIncidentLight:
     def add_roughness_gradient(self, back: ShadeGradients) -> None:
         """Add nothing: one ray says nothing of the directions beside it."""
 
-    def backward(self, back: ShadeGradients, by_texels: Float64[np.ndarray, "t 3"]) -> RecordedGradients:
+    def backward(self, back: ShadeGradients, grad_texels: Float64[np.ndarray, "t 3"]) -> RecordedGradients:
         """Return gradients by the harmonics that were hit."""
         if self.recording is None:
             return ()
-        return ((self.recording, TraceGradients(rgb_srgb=(back.indirect * self.by_rgb).astype(np.float32))),)
+        return (
+            (self.recording, TraceGradients(rgb_srgb=(back.indirect * self.grad_rgb).astype(np.float32))),
+        )

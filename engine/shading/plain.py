@@ -3,11 +3,16 @@
 from collections.abc import Mapping
 
 import numpy as np
-from jaxtyping import Float32
 
 from octasplat.engine.gaussians.model import FlatGaussians
-from octasplat.engine.shading.protocol import ShadedRays, ShadingGradients, TracedRays
-from octasplat.engine.trace.protocol import GaussianGradients, TraceGradients, Tracer
+from octasplat.engine.shading.protocol import (
+    ShadedRayGradients,
+    ShadedRays,
+    ShadingGradients,
+    ShadingStep,
+    TracedRays,
+)
+from octasplat.engine.trace.protocol import TraceGradients, Tracer
 
 
 class PlainShading:
@@ -25,24 +30,11 @@ class PlainShading:
         """Return the colors that were traced."""
         return ShadedRays(traced.result.rgb_srgb, traced.result.transmittance)
 
-    def backward(
-        self,
-        traced: TracedRays,
-        shaded: ShadedRays,
-        by_rgb: Float32[np.ndarray, "r 3"],
-        by_transmittance: Float32[np.ndarray, " r"],
-    ) -> ShadingGradients:
+    def backward(self, traced: TracedRays, shaded: ShadedRays, grad: ShadedRayGradients) -> ShadingGradients:
         """Return the same gradients."""
-        return ShadingGradients(TraceGradients(rgb_srgb=by_rgb, transmittance=by_transmittance))
+        return ShadingGradients(TraceGradients(grad.rgb_srgb, grad.transmittance))
 
-    def step(
-        self,
-        gaussians: FlatGaussians,
-        gradients: GaussianGradients,
-        parameters: Mapping[str, np.ndarray],
-        *,
-        training_progress: float,
-    ) -> None:
+    def step(self, update: ShadingStep) -> None:
         """Do nothing: there are no parameters."""
 
     def state(self) -> dict[str, np.ndarray]:

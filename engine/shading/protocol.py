@@ -9,7 +9,7 @@ Gaussians, and may have parameters of its own: of the views, or of the scene as 
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Protocol, runtime_checkable
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float32, Float64, Int64
@@ -68,20 +68,44 @@ class ShadedRays:
         return self.rgb_srgb + self.transmittance[:, None] * background_srgb
 
 
+class ShadedRayGradients(NamedTuple):
+    """Gradients of a loss with respect to what :meth:`ShadingModel.shade` returned."""
+
+    rgb_srgb: Float32[np.ndarray, "r 3"]
+    transmittance: Float32[np.ndarray, " r"]
+
+
 @dataclass(frozen=True)
 class ShadingGradients:
-    """Gradients of a loss by all that went into :meth:`ShadingModel.shade`.
+    """Gradients of a loss with respect to all that went into :meth:`ShadingModel.shade`.
 
     Attributes:
-        trace: by the outputs of the trace that was shaded.
-        recorded_traces: by those of the traces that the model recorded itself.
-        parameters: by the model's own parameters, in whatever form its ``step`` wants them; names begin
+        trace: of the outputs of the trace that was shaded.
+        recorded_traces: of those of the traces that the model recorded itself.
+        parameters: of the model's own parameters, in whatever form its ``step`` wants them; names begin
             with the model's.
     """
 
     trace: TraceGradients
     recorded_traces: tuple[tuple[Recording, TraceGradients], ...] = ()
     parameters: Mapping[str, np.ndarray] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class ShadingStep:
+    """What one step of the optimiser goes by.
+
+    Attributes:
+        gaussians: those traced, after their own step.
+        gradients: of the Gaussians' parameters and features, those of all traces added up.
+        parameters: gradients that :meth:`ShadingModel.backward` found for the model's own parameters.
+        training_progress: 0 at the first iteration, 1 at the last.
+    """
+
+    gaussians: FlatGaussians
+    gradients: GaussianGradients
+    parameters: Mapping[str, np.ndarray]
+    training_progress: float
 
 
 @runtime_checkable
@@ -114,32 +138,12 @@ class ShadingModel(Protocol):
         """Return what photographs show of ``traced``; depends on nothing else but the model's parameters."""
         ...
 
-    def backward(
-        self,
-        traced: TracedRays,
-        shaded: ShadedRays,
-        by_rgb: Float32[np.ndarray, "r 3"],
-        by_transmittance: Float32[np.ndarray, " r"],
-    ) -> ShadingGradients:
-        """Return gradients by the inputs of ``shaded`` from those by its outputs; changes nothing."""
+    def backward(self, traced: TracedRays, shaded: ShadedRays, grad: ShadedRayGradients) -> ShadingGradients:
+        """Return the gradients of what went into ``shaded`` from those of its outputs; changes nothing."""
         ...
 
-    def step(
-        self,
-        gaussians: FlatGaussians,
-        gradients: GaussianGradients,
-        parameters: Mapping[str, np.ndarray],
-        *,
-        training_progress: float,
-    ) -> None:
-        """Take one step of the optimiser for the model's own parameters.
-
-        Args:
-            gaussians: those traced, after their own step.
-            gradients: by the Gaussians' parameters and features, those of all traces added up.
-            parameters: what :meth:`backward` found.
-            training_progress: 0 at the first iteration, 1 at the last.
-        """
+    def step(self, update: ShadingStep) -> None:
+        """Take one step of the optimiser for the model's own parameters."""
         ...
 
     def state(self) -> dict[str, np.ndarray]:

@@ -25,10 +25,10 @@ from octasplat.engine.shading.depth_split import DepthLayers, single_layer
 from octasplat.engine.shading.gbuffer import GBuffer, reflected_rays
 from octasplat.engine.shading.incident_light import IncidentLightModel, SingleRayIncidentLight
 from octasplat.engine.shading.material_settings import MaterialSettings
-from octasplat.engine.shading.protocol import ShadedRays, TracedRays
+from octasplat.engine.shading.protocol import ShadedRays, ShadingStep, TracedRays
 from octasplat.engine.shading.reflection_tracing import IncidentLight
 from octasplat.engine.shading.split_sum import SurfacePoints
-from octasplat.engine.trace.protocol import GaussianGradients, TraceResult
+from octasplat.engine.trace.protocol import TraceResult
 
 DEFERRED_FROM = 0.36
 """Share of the training after which deferred shading begins, with materials as at first."""
@@ -89,19 +89,12 @@ class RefGaussianShading(DeferredShading):
             noise = rng.uniform(-PROPAGATION_NOISE, PROPAGATION_NOISE, (len(diffuse), 3)) / SH_C0
             gaussians.sh[diffuse, 0] += noise.astype(np.float32)
 
-    def step(
-        self,
-        gaussians: FlatGaussians,
-        gradients: GaussianGradients,
-        parameters: Mapping[str, np.ndarray],
-        *,
-        training_progress: float,
-    ) -> None:
+    def step(self, update: ShadingStep) -> None:
         """Step as the other model, but start materials and environment over when deferred shading begins."""
-        if is_deferred(training_progress) and not self._has_restarted[0]:
-            self._reset_materials(gaussians)
+        if is_deferred(update.training_progress) and not self._has_restarted[0]:
+            self._reset_materials(update.gaussians)
             return
-        super().step(gaussians, gradients, parameters, training_progress=training_progress)
+        super().step(update)
 
     def _reset_materials(self, gaussians: FlatGaussians) -> None:
         first = 0
@@ -143,9 +136,9 @@ class RefGaussianShading(DeferredShading):
         return linear
 
     def _display_backward(
-        self, linear: Float64[np.ndarray, "p 3"], by_display: Float64[np.ndarray, "p 3"]
+        self, linear: Float64[np.ndarray, "p 3"], grad_display: Float64[np.ndarray, "p 3"]
     ) -> Float64[np.ndarray, "p 3"]:
-        return by_display
+        return grad_display
 
     def _unshaded_part(self, traced: TracedRays, ctx: ShadingContext) -> Float32[np.ndarray, "l 3"]:
         """Return what the harmonics add: the diffuse part once deferred shading has begun."""
@@ -160,16 +153,16 @@ class RefGaussianShading(DeferredShading):
         traced: TracedRays,
         shaded: ShadedRays,
         ctx: ShadingContext,
-        by_rgb: Float32[np.ndarray, "r 3"],
-        by_material: Float64[np.ndarray, "p 5"],
+        grad_rgb: Float32[np.ndarray, "r 3"],
+        grad_material: Float64[np.ndarray, "p 5"],
     ) -> Float32[np.ndarray, "l 3"]:
         if not is_deferred(traced.training_progress):
-            return super()._unshaded_part_backward(traced, shaded, ctx, by_rgb, by_material)
+            return super()._unshaded_part_backward(traced, shaded, ctx, grad_rgb, grad_material)
         ray_ids = ctx.gbuffer.ray_ids
-        by_harmonics = by_rgb * np.float32(1 - ctx.ramp)
-        by_harmonics[ray_ids] = by_rgb[ray_ids] * (1 - ctx.surface.material[:, 3:4])
-        by_material[:, 3] -= (by_rgb[ray_ids] * traced.result.rgb_srgb[ray_ids]).sum(axis=1)
-        return by_harmonics
+        grad_harmonics = grad_rgb * np.float32(1 - ctx.ramp)
+        grad_harmonics[ray_ids] = grad_rgb[ray_ids] * (1 - ctx.surface.material[:, 3:4])
+        grad_material[:, 3] -= (grad_rgb[ray_ids] * traced.result.rgb_srgb[ray_ids]).sum(axis=1)
+        return grad_harmonics
 
     def _layer_radiance(
         self, ctx: ShadingContext, rgb_srgb: Float32[np.ndarray, "l 3"]

@@ -157,9 +157,9 @@ def mean_of_pairs(incident: IncidentLight) -> IncidentLight:
     )
 
 
-def backward_mean(by_mean: IncidentLight) -> IncidentLight:
+def backward_mean(grad_mean: IncidentLight) -> IncidentLight:
     """Return gradients by what each of two rays saw, from those by their mean."""
-    visibility, light = by_mean.visibility / 2, by_mean.light_linear / 2
+    visibility, light = grad_mean.visibility / 2, grad_mean.light_linear / 2
     return IncidentLight(np.concatenate([visibility, visibility]), np.concatenate([light, light]))
 
 
@@ -167,7 +167,7 @@ def backward_normals(
     incident: IncidentLight,
     facets: FacetPair,
     around_linear: Float64[np.ndarray, "p 3"],
-    by_incoming: Float64[np.ndarray, "p 3"],
+    grad_incoming: Float64[np.ndarray, "p 3"],
 ) -> Float64[np.ndarray, "p 3"]:
     """Return gradients by the normals through what the two rays of each point see differently.
 
@@ -178,12 +178,12 @@ def backward_normals(
         incident: what the rays saw.
         facets: that they were mirrored at.
         around_linear: the environment as the lobe sees it where nothing hides it.
-        by_incoming: gradient by the light that comes in.
+        grad_incoming: gradient by the light that comes in.
     """
     half = len(facets.slope)
     change = incident.light_linear[:half] - incident.light_linear[half:]
     change += (incident.visibility[:half] - incident.visibility[half:])[:, None] * around_linear
-    along = (by_incoming * change).sum(axis=1) / facets.slope
+    along = (grad_incoming * change).sum(axis=1) / facets.slope
     return along[:, None] * facets.tangent_world
 
 
@@ -191,21 +191,21 @@ def backward_roughness(
     probe: RoughnessProbe,
     roughness: Float64[np.ndarray, " w"],
     around_linear: Float64[np.ndarray, "w 3"],
-    by_incoming: Float64[np.ndarray, "w 3"],
+    grad_incoming: Float64[np.ndarray, "w 3"],
 ) -> Float64[np.ndarray, " w"]:
     """Return gradients by the roughness, from how far the mean of two rays is from the one between them.
 
     That distance grows with the square of the facets' slope where what is seen is smooth, and the slope of
     GGX's facets with the square of the roughness: with its fourth power, then. Where lobes reach an edge it
     grows faster, and beyond it more slowly; the sign is right. As the same pair made the error that
-    ``by_incoming`` comes from, its variance takes part: what makes grain is made less rough, as the loss of
+    ``grad_incoming`` comes from, its variance takes part: what makes grain is made less rough, as the loss of
     pictures with one pair a pixel wants it.
 
     Args:
         probe: what the three rays saw.
         roughness: of the points that sent three.
         around_linear: the environment as their lobes see it where nothing hides it.
-        by_incoming: gradient by the light that comes in there.
+        grad_incoming: gradient by the light that comes in there.
     """
     change = probe.change.light_linear + probe.change.visibility[:, None] * around_linear
-    return np.asarray(4 * (by_incoming * change).sum(axis=1) / np.maximum(roughness, MIN_ROUGHNESS))
+    return np.asarray(4 * (grad_incoming * change).sum(axis=1) / np.maximum(roughness, MIN_ROUGHNESS))

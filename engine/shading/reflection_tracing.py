@@ -121,8 +121,8 @@ def backward_reflections(
     reflected: ReflectedRays,
     light: EnvironmentLevels,
     frame: Float64[np.ndarray, "3 3"],
-    by_incident: IncidentLight,
-    by_texels: Float64[np.ndarray, "t 3"],
+    grad_incident: IncidentLight,
+    grad_texels: Float64[np.ndarray, "t 3"],
 ) -> tuple[tuple[Recording, TraceGradients], ...]:
     """Return gradients by the materials of all that was hit, and by its alpha.
 
@@ -132,34 +132,34 @@ def backward_reflections(
         reflected: what rays met.
         light: see :class:`ReflectionTracer`.
         frame: likewise.
-        by_incident: gradients by what each ray saw.
-        by_texels: those by the texels are added to this.
+        grad_incident: gradients by what each ray saw.
+        grad_texels: those by the texels are added to this.
     """
     gbuffer, trace, split = reflected.gbuffer, reflected.trace, reflected.depth_layers
     assert trace.recording is not None
     ray_ids, count = gbuffer.ray_ids, len(split.rays)
-    by_light = split.expand(by_incident.light_linear)[ray_ids]
-    back = shade_backward(reflected.surface, light, frame, by_light * gbuffer.alpha[:, None])
-    by_texels += back.sum_texels(len(by_texels))
-    by_alpha = -split.expand(by_incident.visibility)
-    by_alpha[ray_ids] += (by_light * reflected.linear).sum(axis=1)
-    by_features, nothing = np.zeros((count, trace.features.shape[1])), np.zeros((count, 3))
+    grad_light = split.expand(grad_incident.light_linear)[ray_ids]
+    back = shade_backward(reflected.surface, light, frame, grad_light * gbuffer.alpha[:, None])
+    grad_texels += back.sum_texels(len(grad_texels))
+    grad_alpha = -split.expand(grad_incident.visibility)
+    grad_alpha[ray_ids] += (grad_light * reflected.linear).sum(axis=1)
+    grad_features, nothing = np.zeros((count, trace.features.shape[1])), np.zeros((count, 3))
     backward_gbuffer(
         gbuffer=gbuffer,
-        by_material=back.material,
-        by_unit_normal=np.zeros_like(back.normal),
-        by_features=by_features,
-        by_alpha=by_alpha,
-        by_normal=nothing,
+        grad_material=back.material,
+        grad_unit_normal=np.zeros_like(back.normal),
+        grad_features=grad_features,
+        grad_alpha=grad_alpha,
+        grad_normal=nothing,
     )
-    by_layers = TraceGradients(
+    grad_layers = TraceGradients(
         rgb_srgb=nothing.astype(np.float32),
-        transmittance=-by_alpha.astype(np.float32),
-        features=by_features.astype(np.float32),
+        transmittance=-grad_alpha.astype(np.float32),
+        features=grad_features.astype(np.float32),
     )
-    by_trace, fronts = split.backward(by_layers)
-    recorded = ((trace.recording, by_trace), *fronts)
+    grad_trace, fronts = split.backward(grad_layers)
+    recorded = ((trace.recording, grad_trace), *fronts)
     if reflected.next_bounce is None:
         return recorded
-    by_next = IncidentLight(back.visibility, back.indirect)
-    return recorded + backward_reflections(reflected.next_bounce, light, frame, by_next, by_texels)
+    grad_next = IncidentLight(back.visibility, back.indirect)
+    return recorded + backward_reflections(reflected.next_bounce, light, frame, grad_next, grad_texels)

@@ -10,21 +10,20 @@ in Unreal Engine 4" (Karis 2013, https://blog.selfshadow.com/publications/s2013-
 
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Float64, Int32
+from jaxtyping import Float, Float64
 
 from octasplat.engine.core.compilation import run_ranges
 from octasplat.engine.core.threads import threads_in_use
 from octasplat.engine.shading.kernels.environment_levels import EnvironmentLevels
 from octasplat.engine.shading.kernels.split_sum import (
     TAPS,
-    GradientArrays,
+    ShadeBackward,
+    ShadeGradients,
     SurfaceArrays,
-    add_to_texels,
+    backward_pixels,
     integrate_table,
-    reverse_pixels,
     shade_pixels,
 )
 
@@ -91,44 +90,6 @@ class SurfacePoints:
         )
 
 
-class ShadeGradients(NamedTuple):
-    """Gradients of a loss by what went into :func:`shade`.
-
-    Attributes:
-        material: by albedo, metallic and roughness.
-        normal: by the normal, but not through the reflected direction.
-        reflected: by the normal through the reflected direction.
-        visibility: by the visibility.
-        indirect: by the indirect light.
-        ambient: by the ambient visibility.
-        bounced: by the bounced light.
-        specular: by what the lobe sees, each channel.
-        diffuse: by the irradiance.
-        around: no gradient: what the lobe would see if nothing hid the environment.
-        taps: texels that were asked.
-        weights: their weights.
-    """
-
-    material: Float64[np.ndarray, "p 5"]
-    normal: Float64[np.ndarray, "p 3"]
-    reflected: Float64[np.ndarray, "p 3"]
-    visibility: Float64[np.ndarray, " p"]
-    indirect: Float64[np.ndarray, "p 3"]
-    ambient: Float64[np.ndarray, " p"]
-    bounced: Float64[np.ndarray, "p 3"]
-    specular: Float64[np.ndarray, "p 3"]
-    diffuse: Float64[np.ndarray, "p 3"]
-    around: Float64[np.ndarray, "p 3"]
-    taps: Int32[np.ndarray, "p 12"]
-    weights: Float64[np.ndarray, "p 12"]
-
-    def sum_texels(self, count: int) -> Float64[np.ndarray, "t 3"]:
-        """Return gradients by the texels of all levels, summed point after point."""
-        sums = np.zeros((count, 3))
-        add_to_texels(self.taps, self.weights, self.specular, self.diffuse, sums)
-        return sums
-
-
 def shade(
     surface: SurfacePoints, light: EnvironmentLevels, frame: Float64[np.ndarray, "3 3"]
 ) -> Float64[np.ndarray, "p 3"]:
@@ -151,7 +112,7 @@ def shade_backward(
     surface: SurfacePoints,
     light: EnvironmentLevels,
     frame: Float64[np.ndarray, "3 3"],
-    by_rgb: Float64[np.ndarray, "p 3"],
+    grad_rgb: Float64[np.ndarray, "p 3"],
     *,
     blur: float = 0.0,
 ) -> ShadeGradients:
@@ -161,7 +122,7 @@ def shade_backward(
         surface: the points.
         light: the environment's levels.
         frame: its right, up and forward in the world, as rows.
-        by_rgb: gradient by the colors.
+        grad_rgb: gradient by the colors.
         blur: roughness from which on up the levels may lead the reflected direction: one that sees far,
             while normals are still wrong. 0 gives the true gradient.
     """
@@ -176,10 +137,11 @@ def shade_backward(
     }
     out = ShadeGradients(**arrays)
     run_ranges(
-        reverse_pixels, threads_in_use(), count,
-        _surface_arrays(surface, frame), light, split_sum_table(), blur, by_rgb,
-        GradientArrays(*out),
-    )  # fmt: skip
+        backward_pixels,
+        threads_in_use(),
+        count,
+        ShadeBackward(_surface_arrays(surface, frame), light, split_sum_table(), blur, grad_rgb, out),
+    )
     return out._replace(normal=out.normal @ frame, reflected=out.reflected @ frame)
 
 

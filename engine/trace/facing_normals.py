@@ -35,15 +35,15 @@ class FacedNormals(NamedTuple):
         self, normal_gradient: Float64[np.ndarray, "r 3"], directions_world: Float[np.ndarray, "r 3"]
     ) -> Float64[np.ndarray, "r 3"]:
         """Return gradients by :func:`face_viewer`'s sums, from those by the unit normals."""
-        by_laid = (
+        grad_laid = (
             normal_gradient
             - (normal_gradient * self.normal_world).sum(axis=1, keepdims=True) * self.normal_world
         )
-        by_laid /= self.tangent_length[:, None]
-        along = (by_laid * directions_world).sum(axis=1, keepdims=True)
-        by_blended = by_laid - np.where(self.is_away[:, None], along * directions_world, 0.0)
-        by_blended -= (by_blended * self.blended_world).sum(axis=1, keepdims=True) * self.blended_world
-        return np.asarray(by_blended / self.length[:, None])
+        grad_laid /= self.tangent_length[:, None]
+        along = (grad_laid * directions_world).sum(axis=1, keepdims=True)
+        grad_blended = grad_laid - np.where(self.is_away[:, None], along * directions_world, 0.0)
+        grad_blended -= (grad_blended * self.blended_world).sum(axis=1, keepdims=True) * self.blended_world
+        return np.asarray(grad_blended / self.length[:, None])
 
 
 def face_viewer(

@@ -48,7 +48,7 @@ def ray_gradients(
     origins, directions = np.zeros((len(rays), 3), np.float32), np.zeros((len(rays), 3), np.float32)
     for part, hits in batched_ray_hits(gaussians, rays, recording, settings):
         given = _OutputGradients.from_slice(gradients, part)
-        by_origin, by_direction = _hit_gradients(
+        grad_origin, grad_direction = _hit_gradients(
             gaussians=gaussians,
             rays=rays[part],
             hits=hits,
@@ -57,8 +57,8 @@ def ray_gradients(
             features=features,
         )
         for axis in range(3):
-            origins[part, axis] = hits.sums_per_ray(by_origin[:, axis])
-            directions[part, axis] = hits.sums_per_ray(by_direction[:, axis])
+            origins[part, axis] = hits.sums_per_ray(grad_origin[:, axis])
+            directions[part, axis] = hits.sums_per_ray(grad_direction[:, axis])
     return RayGradients(origins, directions)
 
 
@@ -105,45 +105,49 @@ def _hit_gradients(
     normals, weight = hits.frames[:, :, 0], hits.weight
 
     # --- color, and the direction in which it is seen ---
-    viewers = np.broadcast_to(rays.t_view_origin, len(rays)).astype(np.float64)[ray]
-    is_near = np.isfinite(viewers)
-    to_viewer = np.where(is_near, viewers, 0.0)[:, None]
-    view = np.where(is_near[:, None], hits.to_mean - to_viewer * directions, directions)
+    t_viewers = np.broadcast_to(rays.t_view_origin, len(rays)).astype(np.float64)[ray]
+    has_viewer = np.isfinite(t_viewers)
+    t_viewer = np.where(has_viewer, t_viewers, 0.0)[:, None]
+    view = np.where(has_viewer[:, None], hits.to_mean - t_viewer * directions, directions)
     length = np.linalg.norm(view, axis=1, keepdims=True)
     view /= length
     sh = gaussians.sh[ids].astype(np.float64)
     color = 0.5 + np.einsum("hk,hkc->hc", sh_basis(view, gaussians.sh_degree), sh)
-    by_color = np.where(color > 0, weight[:, None] * output_gradients.rgb[ray], 0.0)
-    slopes = np.einsum("hki,hkc,hc->hi", sh_basis_gradients(view, gaussians.sh_degree), sh, by_color)
-    by_view = (slopes - (slopes * view).sum(axis=1, keepdims=True) * view) / length
+    grad_color = np.where(color > 0, weight[:, None] * output_gradients.rgb[ray], 0.0)
+    grad_unit_view = np.einsum(
+        "hki,hkc,hc->hi", sh_basis_gradients(view, gaussians.sh_degree), sh, grad_color
+    )
+    grad_view = (grad_unit_view - (grad_unit_view * view).sum(axis=1, keepdims=True) * view) / length
 
     # --- what a hit brings for each unit of its weight ---
     cosine_to_mean = np.einsum("hi,hi->h", hits.to_mean, normals) / np.linalg.norm(hits.to_mean, axis=1)
     facing = np.where(cosine_to_mean > settings.flip_normal_cos, -1.0, 1.0)
-    value = np.einsum("hc,hc->h", np.maximum(color, 0), output_gradients.rgb[ray])
-    value += hits.t * output_gradients.depth_sum[ray]
-    value += facing * np.einsum("hi,hi->h", normals, output_gradients.normal[ray])
+    grad_weight = np.einsum("hc,hc->h", np.maximum(color, 0), output_gradients.rgb[ray])
+    grad_weight += hits.t * output_gradients.depth_sum[ray]
+    grad_weight += facing * np.einsum("hi,hi->h", normals, output_gradients.normal[ray])
     if features is not None and output_gradients.features is not None:
-        value += np.einsum("hf,hf->h", features[ids].astype(np.float64), output_gradients.features[ray])
+        grad_weight += np.einsum("hf,hf->h", features[ids].astype(np.float64), output_gradients.features[ray])
 
     # --- alpha: what it adds here, less what it hides behind ---
-    shares = weight * value
-    behind = hits.sums_per_ray(shares)[ray] - hits.sums_in_front(shares) - shares
-    left = np.exp(hits.sums_per_ray(np.log1p(-hits.alpha)))[ray]
-    by_alpha = hits.transmittance * value - (behind + left * output_gradients.transmittance[ray]) / (
-        1 - hits.alpha
+    weighted_gradient = weight * grad_weight
+    behind = (
+        hits.sums_per_ray(weighted_gradient)[ray] - hits.sums_in_front(weighted_gradient) - weighted_gradient
     )
-    by_uv = np.where(hits.is_clamped, 0.0, -by_alpha * hits.alpha)[:, None] * hits.uv
+    final_transmittance = np.exp(hits.sums_per_ray(np.log1p(-hits.alpha)))[ray]
+    grad_alpha = hits.transmittance * grad_weight - (
+        behind + final_transmittance * output_gradients.transmittance[ray]
+    ) / (1 - hits.alpha)
+    grad_uv = np.where(hits.is_clamped, 0.0, -grad_alpha * hits.alpha)[:, None] * hits.uv
 
     # --- the hit in its plane, and its distance ---
-    by_hit = np.einsum("hik,hk->hi", hits.frames[:, :, 1:], by_uv / hits.scales)
+    grad_hit = np.einsum("hik,hk->hi", hits.frames[:, :, 1:], grad_uv / hits.scales)
     is_median = (hits.transmittance > 0.5) & (hits.transmittance * (1 - hits.alpha) <= 0.5)
-    by_t = weight * output_gradients.depth_sum[ray] + np.where(
+    grad_t = weight * output_gradients.depth_sum[ray] + np.where(
         is_median, output_gradients.depth_median[ray], 0.0
     )
-    by_t += np.einsum("hi,hi->h", by_hit, directions)
-    by_position = by_hit - (by_t / hits.cosine)[:, None] * normals
-    by_origin = by_position - np.where(is_near[:, None], by_view, 0.0)
-    by_direction = hits.t[:, None] * by_position
-    by_direction += np.where(is_near[:, None], -to_viewer * by_view, by_view)
-    return by_origin, by_direction
+    grad_t += np.einsum("hi,hi->h", grad_hit, directions)
+    grad_position = grad_hit - (grad_t / hits.cosine)[:, None] * normals
+    grad_origin = grad_position - np.where(has_viewer[:, None], grad_view, 0.0)
+    grad_direction = hits.t[:, None] * grad_position
+    grad_direction += np.where(has_viewer[:, None], -t_viewer * grad_view, grad_view)
+    return grad_origin, grad_direction

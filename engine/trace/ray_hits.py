@@ -122,7 +122,7 @@ def _evaluate_hits(
     clamped = alpha > settings.alpha_max
     alpha = np.minimum(alpha, settings.alpha_max)
     wide = counts.astype(np.int64)
-    through = np.exp(_segmented_exclusive_cumsum(np.log1p(-alpha), wide))
+    transmittance = np.exp(_segmented_exclusive_cumsum(np.log1p(-alpha), wide))
     return RayHits(
         counts=wide,
         ray_ids=ray,
@@ -135,7 +135,7 @@ def _evaluate_hits(
         uv=uv,
         alpha=alpha,
         is_clamped=clamped,
-        transmittance=through,
+        transmittance=transmittance,
     )
 
 

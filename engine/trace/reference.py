@@ -117,7 +117,7 @@ def trace_reference(
     d = torch.tensor(rays.directions_world, dtype=torch.float64)
     o = torch.tensor(rays.origins_world, dtype=torch.float64).expand_as(d)
     t_min, t_max = (torch.tensor(limit).expand(len(d))[:, None] for limit in (rays.t_min, rays.t_max))
-    viewers = torch.tensor(rays.t_view_origin, dtype=torch.float64).expand(len(d))
+    t_viewers = torch.tensor(rays.t_view_origin, dtype=torch.float64).expand(len(d))
     frames = rotation_matrices(p.quats_wxyz)
     r1, r2, r3 = frames.unbind(-1)
     s2, s3 = p.log_scales.exp().unbind(-1)
@@ -139,9 +139,9 @@ def trace_reference(
     au, av = u.detach().abs(), v.detach().abs()
     inside = torch.maximum(au * cos + av * sin, au * sin + av * cos) <= inner_radius
     t32 = t.detach().float()
-    leaves = torch.tensor(rays.t_backface_cull).expand(len(d))[:, None]
-    left_behind = (cosine > 0) & (t32 < leaves) & (settings.flip_normal_cos > 0)
-    hit = inside & ~grazing & (t32 > t_min) & (t32 < t_max) & (inner_radius > 0) & ~left_behind
+    t_cull = torch.tensor(rays.t_backface_cull).expand(len(d))[:, None]
+    is_culled = (cosine > 0) & (t32 < t_cull) & (settings.flip_normal_cos > 0)
+    hit = inside & ~grazing & (t32 > t_min) & (t32 < t_max) & (inner_radius > 0) & ~is_culled
 
     out: list[list[Tensor]] = []
     hit_ids = []
@@ -152,34 +152,36 @@ def trace_reference(
         ids = ids[torch.sort(order, stable=True).indices]
         ids = ids[: _hit_count(alpha[ray, ids].detach(), settings)]
         hit_ids.append(ids.numpy())
-        al = alpha[ray, ids]
-        through = torch.cat([torch.ones(1, dtype=torch.float64), torch.cumprod(1 - al, 0)])
-        weight = al * through[:-1]  # alpha_k T_k
+        alphas = alpha[ray, ids]
+        transmittance = torch.cat([torch.ones(1, dtype=torch.float64), torch.cumprod(1 - alphas, 0)])
+        weight = alphas * transmittance[:-1]  # alpha_k T_k
         # The direction from the viewer to the mean, the ray's own from infinitely far away.
         view = d[ray].expand(len(ids), 3)
-        if viewers[ray].isfinite():
-            view = to_mean[ray, ids] - viewers[ray] * view
+        if t_viewers[ray].isfinite():
+            view = to_mean[ray, ids] - t_viewers[ray] * view
         basis = sh_basis(view / view.norm(dim=-1, keepdim=True), p.sh.shape[1])
         color = torch.clamp(0.5 + torch.einsum("nk,nkc->nc", basis, p.sh[ids]), min=0)
-        ways = to_mean[ray, ids].detach()
-        away = (ways * r1[ids].detach()).sum(-1) / ways.norm(dim=-1)
-        facing = torch.where(away > settings.flip_normal_cos, -1.0, 1.0)
-        crossing = torch.nonzero((through[:-1] > 0.5) & (through[1:] <= 0.5)).squeeze(-1)
+        to_means = to_mean[ray, ids].detach()
+        cosine_to_mean = (to_means * r1[ids].detach()).sum(-1) / to_means.norm(dim=-1)
+        facing = torch.where(cosine_to_mean > settings.flip_normal_cos, -1.0, 1.0)
+        crossing = torch.nonzero((transmittance[:-1] > 0.5) & (transmittance[1:] <= 0.5)).squeeze(-1)
         median = t[ray, ids[crossing[0]]] if len(crossing) else torch.zeros((), dtype=torch.float64)
         out.append(
             [
                 weight @ color,
-                through[-1],
+                transmittance[-1],
                 weight @ t[ray, ids],
                 median,
                 (weight * facing) @ r1[ids],
                 weight @ p.features[ids],
             ]
         )
-    rgb, through, depth, median, normal, extra = (torch.stack(column) for column in zip(*out, strict=True))
+    rgb, transmittance, depth, median, normal, extra = (
+        torch.stack(column) for column in zip(*out, strict=True)
+    )
     return ReferenceResult(
         rgb_srgb=rgb,
-        transmittance=through,
+        transmittance=transmittance,
         depth_sum=depth,
         depth_median=median,
         normal_world=normal,

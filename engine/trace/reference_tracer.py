@@ -94,12 +94,12 @@ class ReferenceTracer:
         unlimited = self.settings.model_copy(
             update={"transmittance_min": 0.0, "second_phase_min": None, "max_hits": 2**31}
         )
-        left = np.empty(len(rays), np.float32)
+        found = np.empty(len(rays), np.float32)
         with torch.no_grad():
             for piece in self._ray_slices(rays):
-                left[piece] = trace_reference(parameters, rays[piece], unlimited).transmittance.numpy()
-        left[left < self.settings.transmittance_min] = 0.0
-        return left
+                found[piece] = trace_reference(parameters, rays[piece], unlimited).transmittance.numpy()
+        found[found < self.settings.transmittance_min] = 0.0
+        return found
 
     def backward(
         self, recording: Recording, gradients: TraceGradients, *, min_blend_weight: float = 0.0

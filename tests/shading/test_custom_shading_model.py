@@ -15,10 +15,16 @@ from octasplat.engine.core.events import Event, HeldOutMeasured
 from octasplat.engine.core.rays import RayBatch
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.shading.exposure import ExposureModel
-from octasplat.engine.shading.protocol import ShadedRays, ShadingGradients, ShadingModel, TracedRays
+from octasplat.engine.shading.protocol import (
+    ShadedRayGradients,
+    ShadedRays,
+    ShadingGradients,
+    ShadingModel,
+    ShadingStep,
+    TracedRays,
+)
 from octasplat.engine.trace.cpu.tracer import CpuTracer
 from octasplat.engine.trace.protocol import (
-    GaussianGradients,
     TraceGradients,
     Tracer,
     TraceResult,
@@ -61,35 +67,26 @@ class Lamp:
         rgb = traced.result.features * self.lamp * self._facing(traced) + SHARE * beside.rgb_srgb
         return ShadedRays(rgb, traced.result.transmittance, beside)
 
-    def backward(
-        self, traced: TracedRays, shaded: ShadedRays, by_rgb: np.ndarray, by_transmittance: np.ndarray
-    ) -> ShadingGradients:
-        beside = shaded.ctx
+    def backward(self, traced: TracedRays, shaded: ShadedRays, grad: ShadedRayGradients) -> ShadingGradients:
+        grad_rgb, beside = grad.rgb_srgb, shaded.ctx
         assert isinstance(beside, TraceResult) and beside.recording is not None
         facing, features = self._facing(traced), traced.result.features
-        by_facing = (by_rgb * features * self.lamp).sum(axis=1, keepdims=True)
+        grad_facing = (grad_rgb * features * self.lamp).sum(axis=1, keepdims=True)
         return ShadingGradients(
             TraceGradients(
-                rgb_srgb=np.zeros_like(by_rgb),
-                transmittance=by_transmittance,
-                features=by_rgb * self.lamp * facing,
-                normal_world=-by_facing / 2 * traced.rays.directions_world,
+                rgb_srgb=np.zeros_like(grad_rgb),
+                transmittance=grad.transmittance,
+                features=grad_rgb * self.lamp * facing,
+                normal_world=-grad_facing / 2 * traced.rays.directions_world,
             ),
-            recorded_traces=((beside.recording, TraceGradients(rgb_srgb=SHARE * by_rgb)),),
-            parameters={"lamp.lamp": (by_rgb * features * facing).sum(axis=0)},
+            recorded_traces=((beside.recording, TraceGradients(rgb_srgb=SHARE * grad_rgb)),),
+            parameters={"lamp.lamp": (grad_rgb * features * facing).sum(axis=0)},
         )
 
-    def step(
-        self,
-        gaussians: FlatGaussians,
-        gradients: GaussianGradients,
-        parameters: Mapping[str, np.ndarray],
-        *,
-        training_progress: float,
-    ) -> None:
-        assert 0 <= self.settled <= training_progress < 1
-        self.lamp -= np.float32(0.1) * parameters["lamp.lamp"]
-        self.albedo[gradients.ids] -= np.float32(10) * gradients.features
+    def step(self, update: ShadingStep) -> None:
+        assert 0 <= self.settled <= update.training_progress < 1
+        self.lamp -= np.float32(0.1) * update.parameters["lamp.lamp"]
+        self.albedo[update.gradients.ids] -= np.float32(10) * update.gradients.features
 
     def state(self) -> dict[str, np.ndarray]:
         return {"lamp.albedo": self.albedo, "lamp.lamp": self.lamp}

@@ -14,7 +14,7 @@ from octasplat.engine.shading.ambient_occlusion import ambient_visibility, diffu
 from octasplat.engine.shading.deferred import DeferredShading
 from octasplat.engine.shading.gbuffer import RayOffset
 from octasplat.engine.shading.material_settings import MaterialSettings
-from octasplat.engine.shading.protocol import TracedRays
+from octasplat.engine.shading.protocol import ShadedRayGradients, TracedRays
 from octasplat.engine.trace.cpu.tracer import CpuTracer
 from octasplat.engine.trace.gradient_sums import add_gradients
 from octasplat.engine.trace.protocol import TraceSettings
@@ -135,7 +135,9 @@ def test_deferred_reflected_gaussians_have_opacity_gradients() -> None:
         sight = TracedRays(rays, seen, tracer, np.zeros(len(rays), np.int64))
         developed = model.shade(sight)
         error = developed.rgb_srgb - target
-        back = model.backward(sight, developed, 2 * error, np.zeros(len(rays), np.float32))
+        back = model.backward(
+            sight, developed, ShadedRayGradients(2 * error, np.zeros(len(rays), np.float32))
+        )
         recorded = [(seen.recording, back.trace), *back.recorded_traces]
         found = add_gradients([tracer.backward(hits, by).numpy() for hits, by in recorded])
         whole = np.zeros(len(scene))
@@ -174,7 +176,7 @@ def test_deferred_roughness_gradient_follows_reflection_sharpness() -> None:
         assert seen.recording is not None
         sight = TracedRays(rays, seen, tracer, np.zeros(3000, np.int64))
         developed = model.shade(sight)
-        back = model.backward(sight, developed, ones, np.zeros(3000, np.float32))
+        back = model.backward(sight, developed, ShadedRayGradients(ones, np.zeros(3000, np.float32)))
         found = tracer.backward(seen.recording, back.trace).numpy()
         return float(developed.rgb_srgb.sum(dtype=np.float64)), float(found.features[:, 4].sum())
 

@@ -9,7 +9,7 @@ from octasplat.engine.gaussians.model import FlatGaussians, concatenate
 from octasplat.engine.shading.deferred import DeferredShading
 from octasplat.engine.shading.depth_split import split_by_depth
 from octasplat.engine.shading.material_settings import MaterialSettings
-from octasplat.engine.shading.protocol import TracedRays
+from octasplat.engine.shading.protocol import ShadedRayGradients, TracedRays
 from octasplat.engine.trace.cpu.tracer import CpuTracer
 from octasplat.engine.trace.protocol import TraceSettings
 
@@ -96,7 +96,7 @@ def test_gradients_of_both_surfaces_agree_with_finite_differences(visibility: bo
         return float((by_rgb * model.shade(sight).rgb_srgb).astype(np.float64).sum())
 
     tracer, sight = traced(scene, model)
-    back = model.backward(sight, model.shade(sight), by_rgb, np.zeros(3, np.float32))
+    back = model.backward(sight, model.shade(sight), ShadedRayGradients(by_rgb, np.zeros(3, np.float32)))
     assert sight.result.recording is not None and len(back.recorded_traces) == 1
     columns = {"albedo": slice(0, 3), "metallic": slice(3, 4), "roughness": slice(4, 5)}
     whole = {name: np.zeros_like(scene.channels[name]) for name in columns}

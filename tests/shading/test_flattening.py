@@ -13,7 +13,7 @@ from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.runs.config import resolve_config
 from octasplat.engine.shading.depth_normal_model import DepthNormalShading
 from octasplat.engine.shading.plain import PLAIN_SHADING
-from octasplat.engine.shading.protocol import TracedRays
+from octasplat.engine.shading.protocol import ShadedRayGradients, TracedRays
 from octasplat.engine.shading.ray_patches import RayPatches
 from octasplat.engine.trace.cpu.tracer import CpuTracer
 from octasplat.engine.trace.protocol import TraceResult
@@ -73,10 +73,10 @@ def test_gradients_are_those_of_the_term_and_of_the_model_inside() -> None:
     sight, weight = wavy(), 0.3
     seen = sight.result
     rng = np.random.default_rng(4)
-    by_rgb, by_transmittance = rng.normal(size=(COUNT, 3)), rng.normal(size=COUNT)
-    by_rgb, by_transmittance = by_rgb.astype(np.float32), by_transmittance.astype(np.float32)
+    grad_rgb, grad_transmittance = rng.normal(size=(COUNT, 3)), rng.normal(size=COUNT)
+    grad = ShadedRayGradients(grad_rgb.astype(np.float32), grad_transmittance.astype(np.float32))
     model = DepthNormalShading(weight)
-    found = model.backward(sight, model.shade(sight), by_rgb, by_transmittance).trace
+    found = model.backward(sight, model.shade(sight), grad).trace
 
     wide = (seen.alpha, seen.depth_sum, seen.normal_world)
     alpha, depth, normals = (torch.tensor(x.astype(np.float64), requires_grad=True) for x in wide)
@@ -87,11 +87,11 @@ def test_gradients_are_those_of_the_term_and_of_the_model_inside() -> None:
     )
     value.backward()
     assert value > 0.001
-    inside = PLAIN_SHADING.backward(sight, PLAIN_SHADING.shade(sight), by_rgb, by_transmittance).trace
+    inside = PLAIN_SHADING.backward(sight, PLAIN_SHADING.shade(sight), grad).trace
     assert np.array_equal(found.rgb_srgb, inside.rgb_srgb)
     assert found.depth_sum == pytest.approx(depth.grad.numpy(), abs=1e-5)
     assert found.normal_world == pytest.approx(normals.grad.numpy(), abs=1e-5)
-    assert found.transmittance - by_transmittance == pytest.approx(-alpha.grad.numpy(), abs=1e-5)
+    assert found.transmittance - grad.transmittance == pytest.approx(-alpha.grad.numpy(), abs=1e-5)
 
 
 def tilted(world: PlanarDataset) -> FlatGaussians:

@@ -11,7 +11,7 @@ from octasplat.engine.core.rays import RayBatch
 from octasplat.engine.dataset.model import Observations
 from octasplat.engine.shading.exposure import ExposureModel
 from octasplat.engine.shading.exposure_estimation import times_from_names
-from octasplat.engine.shading.protocol import TracedRays
+from octasplat.engine.shading.protocol import ShadedRayGradients, ShadingStep, TracedRays
 from octasplat.engine.trace.cpu.tracer import CpuTracer
 from octasplat.engine.trace.protocol import GaussianGradients, TraceResult
 from octasplat.engine.train.config import TrainConfig
@@ -91,7 +91,8 @@ def test_gradients_agree_with_finite_differences() -> None:
     by_rgb = rng.normal(size=(4, 3)).astype(np.float32)
     by_transmittance = rng.normal(size=4).astype(np.float32)
     seen = sight(view, rgb, alpha)
-    found = exposures.backward(seen, exposures.shade(seen), by_rgb, by_transmittance)
+    grad = ShadedRayGradients(by_rgb, by_transmittance)
+    found = exposures.backward(seen, exposures.shade(seen), grad)
 
     def loss(rgb: np.ndarray = rgb, alpha: np.ndarray = alpha) -> float:
         developed = exposures.shade(sight(view, rgb, alpha))
@@ -142,8 +143,8 @@ def test_known_gains_and_offsets_are_found() -> None:
         seen = sight(view, rgb, alpha)
         developed = exposures.shade(seen)
         error = (developed.rgb_srgb - (np.exp(log_gains[view]) * rgb + offsets[view])).astype(np.float32)
-        found = exposures.backward(seen, developed, error, nothing)
-        exposures.step(gaussians, NO_GRADIENTS, found.parameters, training_progress=iteration / 2000)
+        found = exposures.backward(seen, developed, ShadedRayGradients(error, nothing))
+        exposures.step(ShadingStep(gaussians, NO_GRADIENTS, found.parameters, iteration / 2000))
     np.testing.assert_allclose(exposures.log_gains, log_gains, atol=2e-3)
     np.testing.assert_allclose(exposures.offsets, offsets, atol=2e-3)
 

@@ -14,7 +14,7 @@ from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.render.environment_files import read_background_map, write_background_map
 from octasplat.engine.shading.background import LearnedBackground
 from octasplat.engine.shading.exposure import ExposureModel
-from octasplat.engine.shading.protocol import TracedRays
+from octasplat.engine.shading.protocol import ShadedRayGradients, TracedRays
 from octasplat.engine.trace.cpu.tracer import CpuTracer
 from octasplat.engine.trace.protocol import TraceResult
 from octasplat.engine.train.initialization.initial_background import estimate_background
@@ -115,7 +115,7 @@ def test_gradients_agree_with_finite_differences() -> None:
     before = some_sight(rng)
     by_rgb = rng.normal(size=(5, 3)).astype(np.float32)
     nothing = np.zeros(5, np.float32)
-    found = background.backward(before, background.shade(before), by_rgb, nothing)
+    found = background.backward(before, background.shade(before), ShadedRayGradients(by_rgb, nothing))
 
     def loss(seen: TracedRays = before) -> float:
         developed = background.shade(seen)

@@ -26,12 +26,16 @@ FLAT_TOLERANCE = 1e-9
 of what those to the last two do."""
 TINY_LENGTH = 1e-300
 TURN = 2.0 * math.pi
+TURN_TOLERANCE = 1e-6
+"""Radians that the corners' angles may lack of a full turn where a point lies on a triangle."""
 STEEP_LIMIT = math.tan(math.pi / 8)
 WIDE_ANGLE = 0.25
 """Angles whose cosine is below this are wide."""
 POINT_ROWS, VERTEX_ROWS = 3, 4
 """Rows of eight lanes that are kept: of points their place, of vertices the unit vector to them and one over
 their distance. Of edges it is half the angle that they are seen under over its sine."""
+INVERSE_DISTANCE = 3
+"""Which of a vertex's rows is one over its distance."""
 
 
 def _arctangent(squared: Float64[np.ndarray, " n"]) -> Float64[np.ndarray, " n"]:
@@ -106,7 +110,7 @@ def vertex_rows(
         way = [broadcast(builder, args[1 + axis]) - seen_from[axis] for axis in range(3)]
         length = _dot(way, way).sqrt()
         inverse = _constant_one(builder) / length.maximum(TINY_LENGTH)
-        rows[3] = inverse
+        rows[INVERSE_DISTANCE] = inverse
         for axis in range(3):
             rows[axis] = way[axis] * inverse
         return (length < broadcast(builder, args[4])).to_bitmask()
@@ -223,13 +227,13 @@ def add_means(
 
 
 @intrinsic
-def add_flat_means(
+def add_means_in_plane(
     typingctx: TypingContext,
     corners: tuple[Address, Address, Address],
     edges: tuple[Address, Address, Address],
     sums: tuple[Address, Address, Address],
 ) -> Intrinsic:
-    """Add what :func:`add_means` has left out; bit k: point k lies on the triangle."""
+    """Add what :func:`add_means` left out, of points in the triangle's plane; bit k: point k lies on it."""
     signature = types.int64(THREE_CORNERS, THREE_CORNERS, THREE_CORNERS)
 
     def codegen(
@@ -241,10 +245,10 @@ def add_flat_means(
         beside = size <= sines[0] * FLAT_TOLERANCE
         # In the triangle's plane but not on it, a triangle counts nothing.
         triangle.emit_corner_weights((size <= FLAT_TOLERANCE) & ~beside, args[2])
-        around = _angle(sines[0], _dot(u[1], u[2]))
+        angle_sum = _angle(sines[0], _dot(u[1], u[2]))
         for k in (1, 2):
-            around = around + _angle(sines[k], _dot(u[(k + 1) % 3], u[(k + 2) % 3]))
-        return (beside & (around >= TURN - 1e-6)).to_bitmask()
+            angle_sum = angle_sum + _angle(sines[k], _dot(u[(k + 1) % 3], u[(k + 2) % 3]))
+        return (beside & (angle_sum >= TURN - TURN_TOLERANCE)).to_bitmask()
 
     return signature, codegen
 

@@ -45,12 +45,12 @@ def add_to_texels(
     height: int,
     frame: Float64[np.ndarray, "3 3"],
     directions_world: Float[np.ndarray, "r 3"],
-    by_colors: Float[np.ndarray, "r 3"],
+    grad_colors: Float[np.ndarray, "r 3"],
     sums: Float64[np.ndarray, "t 3"],
 ) -> None:
     """Add gradients by the colors to those by the texels, in the order of the rays: always the same sums."""
     for r in range(len(directions_world)):
-        red, green, blue = by_colors[r, 0], by_colors[r, 1], by_colors[r, 2]
+        red, green, blue = grad_colors[r, 0], grad_colors[r, 1], grad_colors[r, 2]
         if red == 0.0 and green == 0.0 and blue == 0.0:
             continue
         a, b, c, d, x, y, _, _, _ = _place(texels, height, frame, directions_world[r])

@@ -35,8 +35,23 @@ class SurfaceArrays(NamedTuple):
     bounced: Float64[np.ndarray, "p 3"]
 
 
-class GradientArrays(NamedTuple):
-    """The arrays of a :class:`octasplat.engine.shading.split_sum.ShadeGradients`, to be written."""
+class ShadeGradients(NamedTuple):
+    """Gradients of a loss with respect to what was shaded.
+
+    Attributes:
+        material: by albedo, metallic and roughness.
+        normal: by the normal, but not through the reflected direction.
+        reflected: by the normal through the reflected direction.
+        visibility: by the visibility.
+        indirect: by the indirect light.
+        ambient: by the ambient visibility.
+        bounced: by the bounced light.
+        specular: by what the lobe sees, each channel.
+        diffuse: by the irradiance.
+        around: no gradient: what the lobe would see if nothing hid the environment.
+        taps: texels that were asked.
+        weights: their weights.
+    """
 
     material: Float64[np.ndarray, "p 5"]
     normal: Float64[np.ndarray, "p 3"]
@@ -50,6 +65,32 @@ class GradientArrays(NamedTuple):
     around: Float64[np.ndarray, "p 3"]
     taps: Int32[np.ndarray, "p 12"]
     weights: Float64[np.ndarray, "p 12"]
+
+    def sum_texels(self, count: int) -> Float64[np.ndarray, "t 3"]:
+        """Return gradients by the texels of all levels, summed point after point."""
+        sums = np.zeros((count, 3))
+        add_to_texels(self.taps, self.weights, self.specular, self.diffuse, sums)
+        return sums
+
+
+class ShadeBackward(NamedTuple):
+    """What gradients are computed from, and where they go.
+
+    Attributes:
+        surface: the points.
+        light: levels of the environment.
+        table: scale and bias of F0.
+        blur: see :func:`octasplat.engine.shading.split_sum.shade_backward`.
+        grad_rgb: gradient by the colors.
+        out: the gradients that are written.
+    """
+
+    surface: SurfaceArrays
+    light: EnvironmentLevels
+    table: Float64[np.ndarray, "a c 2"]
+    blur: float
+    grad_rgb: Float64[np.ndarray, "p 3"]
+    out: ShadeGradients
 
 
 @kernel(_nrt=False, error_model="numpy")
@@ -98,11 +139,11 @@ def table_slopes(
     a1, b1, c1, d1 = table[j, i, 1], table[j, i + 1, 1], table[j + 1, i, 1], table[j + 1, i + 1, 1]
     scale = (a0 * (1 - x) + b0 * x) * (1 - y) + (c0 * (1 - x) + d0 * x) * y
     bias = (a1 * (1 - x) + b1 * x) * (1 - y) + (c1 * (1 - x) + d1 * x) * y
-    by_cos0 = ((b0 - a0) * (1 - y) + (d0 - c0) * y) * (columns - 1)
-    by_cos1 = ((b1 - a1) * (1 - y) + (d1 - c1) * y) * (columns - 1)
-    by_rough0 = ((c0 - a0) * (1 - x) + (d0 - b0) * x) * (rows - 1)
-    by_rough1 = ((c1 - a1) * (1 - x) + (d1 - b1) * x) * (rows - 1)
-    return scale, bias, by_cos0, by_cos1, by_rough0, by_rough1
+    grad_cos0 = ((b0 - a0) * (1 - y) + (d0 - c0) * y) * (columns - 1)
+    grad_cos1 = ((b1 - a1) * (1 - y) + (d1 - c1) * y) * (columns - 1)
+    grad_rough0 = ((c0 - a0) * (1 - x) + (d0 - b0) * x) * (rows - 1)
+    grad_rough1 = ((c1 - a1) * (1 - x) + (d1 - b1) * x) * (rows - 1)
+    return scale, bias, grad_cos0, grad_cos1, grad_rough0, grad_rough1
 
 
 @device_function(error_model="numpy")
@@ -116,10 +157,10 @@ def mix(
 
 
 @device_function(error_model="numpy")
-def mix_slopes(
+def mix_gradient(
     texels: Float[np.ndarray, "t 3"], a: int, b: int, c: int, d: int, x: float, y: float, channel: int
 ) -> tuple[float, float]:
-    """Return slopes of that by the two fractions."""
+    """Return the gradient of :func:`mix` with respect to the two fractions."""
     p, q, r, s = texels[a, channel], texels[b, channel], texels[c, channel], texels[d, channel]
     return (q - p) * (1.0 - y) + (s - r) * y, (r - p) * (1.0 - x) + (s - q) * x
 
@@ -165,9 +206,9 @@ def shade_pixel(
         f0 = F0 * (1.0 - metallic) + metallic * albedo
         sharp = mix(texels, a, b, c, d, x, y, channel)
         blurred = mix(texels, e, f, g, h, u, v, channel)
-        seen = visibility[p] * (sharp * (1.0 - between) + blurred * between) + indirect[p, channel]
-        lit = ambient[p] * mix(texels, i, j, k, l, s, t, channel) + bounced[p, channel]
-        rgb[p, channel] = (f0 * scale + bias) * seen + (1.0 - metallic) * albedo * lit
+        specular_light = visibility[p] * (sharp * (1.0 - between) + blurred * between) + indirect[p, channel]
+        diffuse_light = ambient[p] * mix(texels, i, j, k, l, s, t, channel) + bounced[p, channel]
+        rgb[p, channel] = (f0 * scale + bias) * specular_light + (1.0 - metallic) * albedo * diffuse_light
 
 
 @kernel(_nrt=False, error_model="numpy")
@@ -185,8 +226,8 @@ def shade_pixels(
 
 
 @device_function(error_model="numpy")
-def look_back(
-    out: GradientArrays,
+def look_up_recorded(
+    out: ShadeGradients,
     p: int,
     place: int,
     light: EnvironmentLevels,
@@ -212,26 +253,19 @@ def look_back(
 
 
 @device_function(error_model="numpy")
-def direction_slope(
+def direction_gradient(
     texels: Float[np.ndarray, "t 3"], found: Lookup, channel: int
 ) -> tuple[float, float, float]:
-    """Return slope of a looked-up value by the direction."""
+    """Return the gradient of a looked-up value with respect to the direction."""
     a, b, c, d, u, v, column_x, column_z, row_y = found
-    by_u, by_v = mix_slopes(texels, a, b, c, d, u, v, channel)
-    return by_u * column_x, by_v * row_y, by_u * column_z
+    grad_u, grad_v = mix_gradient(texels, a, b, c, d, u, v, channel)
+    return grad_u * column_x, grad_v * row_y, grad_u * column_z
 
 
 @device_function(error_model="numpy")
-def reverse_pixel(
-    p: int,
-    surface: SurfaceArrays,
-    light: EnvironmentLevels,
-    table: Float64[np.ndarray, "a c 2"],
-    blur: float,
-    by_rgb: Float64[np.ndarray, "p 3"],
-    out: GradientArrays,
-) -> None:
-    """Write the gradients of one pixel; see :class:`octasplat.engine.shading.split_sum.ShadeGradients`."""
+def backward_pixel(p: int, backward: ShadeBackward) -> None:
+    """Write the gradients of one pixel."""
+    surface, light, table, blur, grad_rgb, out = backward
     material, normal, direction, visibility, indirect, ambient, bounced = surface
     texels, offsets, heights, roughnesses = light.texels, light.offsets, light.heights, light.roughnesses
     n_x, n_y, n_z = normal[p, 0], normal[p, 1], normal[p, 2]
@@ -239,24 +273,28 @@ def reverse_pixel(
     cosine = -(d_x * n_x + d_y * n_y + d_z * n_z)
     r_x, r_y, r_z = d_x + 2.0 * cosine * n_x, d_y + 2.0 * cosine * n_y, d_z + 2.0 * cosine * n_z
     metallic, roughness = material[p, 3], material[p, 4]
-    seen_cosine = max(cosine, LEAST_COSINE)
-    scale, bias, cos0, cos1, rough0, rough1 = table_slopes(table, seen_cosine, roughness)
-    level, between, by_between = level_of(roughnesses, roughness)
+    safe_cosine = max(cosine, LEAST_COSINE)
+    scale, bias, grad_scale_cosine, grad_bias_cosine, grad_scale_roughness, grad_bias_roughness = (
+        table_slopes(table, safe_cosine, roughness)
+    )
+    level, between, grad_between = level_of(roughnesses, roughness)
     # --- what the pixel sees: two levels of the lobe, and the irradiance ---
     reflected = r_x, r_y, r_z
-    near = look_back(out, p, 0, light, level, reflected, visibility[p] * (1.0 - between))
-    far = look_back(out, p, 4, light, level + 1, reflected, visibility[p] * between)
-    facing = look_back(out, p, 8, light, len(heights) - 1, (n_x, n_y, n_z), ambient[p])
-    slope, slope_between, slope_near, slope_far = level, between, near, far
+    near = look_up_recorded(out, p, 0, light, level, reflected, visibility[p] * (1.0 - between))
+    far = look_up_recorded(out, p, 4, light, level + 1, reflected, visibility[p] * between)
+    facing = look_up_recorded(out, p, 8, light, len(heights) - 1, (n_x, n_y, n_z), ambient[p])
+    gradient_level, gradient_between, gradient_near, gradient_far = level, between, near, far
     if blur > roughness:  # the direction is led by a blurred level
-        slope, slope_between, _ = level_of(roughnesses, blur)
-        slope_near = look_up(texels, offsets[slope], heights[slope], r_x, r_y, r_z)
-        slope_far = look_up(texels, offsets[slope + 1], heights[slope + 1], r_x, r_y, r_z)
-    # --- sums over the channels; gr is dL by the reflected direction, gn by the normal ---
-    by_metallic = by_roughness = by_cosine = by_visibility = by_ambient = 0.0
-    gr_x = gr_y = gr_z = gn_x = gn_y = gn_z = 0.0
+        gradient_level, gradient_between, _ = level_of(roughnesses, blur)
+        gradient_near = look_up(texels, offsets[gradient_level], heights[gradient_level], r_x, r_y, r_z)
+        gradient_far = look_up(
+            texels, offsets[gradient_level + 1], heights[gradient_level + 1], r_x, r_y, r_z
+        )
+    # --- sums over the channels; grad_r is by the reflected direction, grad_n by the normal ---
+    grad_metallic = grad_roughness = grad_cosine = grad_visibility = grad_ambient = 0.0
+    grad_r_x = grad_r_y = grad_r_z = grad_n_x = grad_n_y = grad_n_z = 0.0
     for channel in range(3):
-        gradient, albedo = by_rgb[p, channel], material[p, channel]
+        gradient, albedo = grad_rgb[p, channel], material[p, channel]
         f0 = F0 * (1.0 - metallic) + metallic * albedo
         factor = f0 * scale + bias
         sharp = mix(texels, near[0], near[1], near[2], near[3], near[4], near[5], channel)
@@ -264,58 +302,51 @@ def reverse_pixel(
         around = sharp * (1.0 - between) + blurred * between
         out.around[p, channel] = around
         irradiance = mix(texels, facing[0], facing[1], facing[2], facing[3], facing[4], facing[5], channel)
-        seen = visibility[p] * around + indirect[p, channel]
-        lit = ambient[p] * irradiance + bounced[p, channel]
-        matt = (1.0 - metallic) * albedo
-        out.material[p, channel] = gradient * (metallic * scale * seen + (1.0 - metallic) * lit)
-        by_metallic += gradient * ((albedo - F0) * scale * seen - albedo * lit)
-        by_factor = gradient * seen
-        by_cosine += by_factor * (f0 * cos0 + cos1)
-        by_roughness += by_factor * (f0 * rough0 + rough1)
-        by_roughness += gradient * factor * visibility[p] * (blurred - sharp) * by_between
-        by_visibility += gradient * factor * around
-        by_ambient += gradient * matt * irradiance
+        specular_light = visibility[p] * around + indirect[p, channel]
+        diffuse_light = ambient[p] * irradiance + bounced[p, channel]
+        diffuse_albedo = (1.0 - metallic) * albedo
+        out.material[p, channel] = gradient * (
+            metallic * scale * specular_light + (1.0 - metallic) * diffuse_light
+        )
+        grad_metallic += gradient * ((albedo - F0) * scale * specular_light - albedo * diffuse_light)
+        grad_factor = gradient * specular_light
+        grad_cosine += grad_factor * (f0 * grad_scale_cosine + grad_bias_cosine)
+        grad_roughness += grad_factor * (f0 * grad_scale_roughness + grad_bias_roughness)
+        grad_roughness += gradient * factor * visibility[p] * (blurred - sharp) * grad_between
+        grad_visibility += gradient * factor * around
+        grad_ambient += gradient * diffuse_albedo * irradiance
         out.indirect[p, channel] = out.specular[p, channel] = gradient * factor
-        out.bounced[p, channel] = out.diffuse[p, channel] = gradient * matt
+        out.bounced[p, channel] = out.diffuse[p, channel] = gradient * diffuse_albedo
         share = gradient * factor * visibility[p]
-        s_x, s_y, s_z = direction_slope(texels, slope_near, channel)
-        t_x, t_y, t_z = direction_slope(texels, slope_far, channel)
-        gr_x += share * (s_x * (1.0 - slope_between) + t_x * slope_between)
-        gr_y += share * (s_y * (1.0 - slope_between) + t_y * slope_between)
-        gr_z += share * (s_z * (1.0 - slope_between) + t_z * slope_between)
-        share = gradient * matt * ambient[p]
-        s_x, s_y, s_z = direction_slope(texels, facing, channel)
-        gn_x += share * s_x
-        gn_y += share * s_y
-        gn_z += share * s_z
+        s_x, s_y, s_z = direction_gradient(texels, gradient_near, channel)
+        t_x, t_y, t_z = direction_gradient(texels, gradient_far, channel)
+        grad_r_x += share * (s_x * (1.0 - gradient_between) + t_x * gradient_between)
+        grad_r_y += share * (s_y * (1.0 - gradient_between) + t_y * gradient_between)
+        grad_r_z += share * (s_z * (1.0 - gradient_between) + t_z * gradient_between)
+        share = gradient * diffuse_albedo * ambient[p]
+        s_x, s_y, s_z = direction_gradient(texels, facing, channel)
+        grad_n_x += share * s_x
+        grad_n_y += share * s_y
+        grad_n_z += share * s_z
     # --- the rest of the gradients ---
     if cosine < LEAST_COSINE:
-        by_cosine = 0.0
-    along = n_x * gr_x + n_y * gr_y + n_z * gr_z
-    out.reflected[p, 0] = 2.0 * (cosine * gr_x - along * d_x)
-    out.reflected[p, 1] = 2.0 * (cosine * gr_y - along * d_y)
-    out.reflected[p, 2] = 2.0 * (cosine * gr_z - along * d_z)
-    out.normal[p, 0] = gn_x - by_cosine * d_x
-    out.normal[p, 1] = gn_y - by_cosine * d_y
-    out.normal[p, 2] = gn_z - by_cosine * d_z
-    out.material[p, 3], out.material[p, 4] = by_metallic, by_roughness
-    out.visibility[p], out.ambient[p] = by_visibility, by_ambient
+        grad_cosine = 0.0
+    along = n_x * grad_r_x + n_y * grad_r_y + n_z * grad_r_z
+    out.reflected[p, 0] = 2.0 * (cosine * grad_r_x - along * d_x)
+    out.reflected[p, 1] = 2.0 * (cosine * grad_r_y - along * d_y)
+    out.reflected[p, 2] = 2.0 * (cosine * grad_r_z - along * d_z)
+    out.normal[p, 0] = grad_n_x - grad_cosine * d_x
+    out.normal[p, 1] = grad_n_y - grad_cosine * d_y
+    out.normal[p, 2] = grad_n_z - grad_cosine * d_z
+    out.material[p, 3], out.material[p, 4] = grad_metallic, grad_roughness
+    out.visibility[p], out.ambient[p] = grad_visibility, grad_ambient
 
 
 @kernel(_nrt=False, error_model="numpy")
-def reverse_pixels(
-    first: int,
-    last: int,
-    surface: SurfaceArrays,
-    light: EnvironmentLevels,
-    table: Float64[np.ndarray, "a c 2"],
-    blur: float,
-    by_rgb: Float64[np.ndarray, "p 3"],
-    out: GradientArrays,
-) -> None:
+def backward_pixels(first: int, last: int, backward: ShadeBackward) -> None:
     """Write the gradients of the pixels ``first`` to ``last``."""
     for p in range(first, last):
-        reverse_pixel(p, surface, light, table, blur, by_rgb, out)
+        backward_pixel(p, backward)
 
 
 @kernel(error_model="numpy")
@@ -324,7 +355,7 @@ def add_to_texels(
     weights: Float64[np.ndarray, "p 12"],
     specular: Float64[np.ndarray, "p 3"],
     diffuse: Float64[np.ndarray, "p 3"],
-    by_texels: Float64[np.ndarray, "t 3"],
+    grad_texels: Float64[np.ndarray, "t 3"],
 ) -> None:
     """Add each pixel's shares to the texels that it asked, pixel after pixel."""
     for p in range(len(taps)):
@@ -335,4 +366,4 @@ def add_to_texels(
             texel = taps[p, k]
             for channel in range(3):
                 gradient = specular[p, channel] if k < 8 else diffuse[p, channel]
-                by_texels[texel, channel] += weight * gradient
+                grad_texels[texel, channel] += weight * gradient

@@ -48,10 +48,10 @@ def linearise(
         cosine = nx * dx + ny * dy + nz * dz
         if not steady[p] or abs(cosine) <= MIN_COSINE:
             continue
-        by_u = ((vy * nz - vz * ny) * dx + (vz * nx - vx * nz) * dy + (vx * ny - vy * nx) * dz) / area
-        by_v = ((ny * uz - nz * uy) * dx + (nz * ux - nx * uz) * dy + (nx * uy - ny * ux) * dz) / area
+        grad_u = ((vy * nz - vz * ny) * dx + (vz * nx - vx * nz) * dy + (vx * ny - vy * nx) * dz) / area
+        grad_v = ((ny * uz - nz * uy) * dx + (nz * ux - nx * uz) * dy + (nx * uy - ny * ux) * dz) / area
         for c in range(3):
-            step = (rgb[j, c] - rgb[i, c]) * by_u + (rgb[k, c] - rgb[i, c]) * by_v
+            step = (rgb[j, c] - rgb[i, c]) * grad_u + (rgb[k, c] - rgb[i, c]) * grad_v
             change[p, c] = step / cosine
 
 

@@ -194,7 +194,7 @@ class PacketTracer:
         firsts = np.concatenate([[0], np.cumsum(counts, dtype=np.int64)])
         count, basis_count, feature_count = int(firsts[-1]), scene.sh.shape[1], scene.features.shape[1]
         geometry = GEOMETRY_WORDS if backward.output_gradients.has_geometry else 0
-        ids, weights, sums, by_geometry, features = self._pool.empty(
+        ids, weights, sums, geometry_rows, features = self._pool.empty(
             ((count,), np.int32),
             ((count,), np.float32),
             ((count, ROW_WORDS), np.float32),
@@ -202,7 +202,7 @@ class PacketTracer:
             ((count, feature_count), np.float32),
         )
         rows = MomentRows(
-            firsts=firsts, ids=ids, weights=weights, sums=sums, geometry=by_geometry, features=features
+            firsts=firsts, ids=ids, weights=weights, sums=sums, geometry=geometry_rows, features=features
         )
         packets, counter = recording.packets, np.zeros(1, np.int64)
         if isinstance(packet_hits, SharedSortHits):
@@ -220,16 +220,16 @@ class PacketTracer:
                 backward_packets, self._threads,
                 backward, packets, recording.hits, packet_hits, recording.counts, counter, rows,
             )  # fmt: skip
-        by_gaussian = GaussianSegments(
+        gaussian_segments = GaussianSegments(
             *sort_by_gaussian(rows.ids, len(backward.parameters.means), self._threads)
         )
-        met = np.empty(len(by_gaussian.starts) - 1, np.float32)
-        run_ranges(reduce_weights, self._threads, len(met), by_gaussian, rows.weights, met)
+        met = np.empty(len(gaussian_segments.starts) - 1, np.float32)
+        run_ranges(reduce_weights, self._threads, len(met), gaussian_segments, rows.weights, met)
         which = np.flatnonzero(met >= min_blend_weight)
         out = empty_gradients(len(which), basis_count, feature_count)
         run_on_threads(
             reduce_packets, self._threads,
-            backward, packets, by_gaussian, which, rows,
+            backward, packets, gaussian_segments, which, rows,
             REDUCE_CHUNKS_PER_THREAD * self._threads, np.zeros(1, np.int64), gradient_arrays(out),
         )  # fmt: skip
         return out

@@ -108,8 +108,10 @@ class SingleRayTracer:
             backward_rays, self._threads, len(which),
             which, offsets, backward, recording.hits, recording.counts, shares,
         )  # fmt: skip
-        by_gaussian = GaussianSegments(*sort_by_gaussian(ids, len(backward.parameters.means), self._threads))
-        starts = by_gaussian.starts
+        gaussian_segments = GaussianSegments(
+            *sort_by_gaussian(ids, len(backward.parameters.means), self._threads)
+        )
+        starts = gaussian_segments.starts
         segments = len(starts) - 1
         places = np.linspace(0, total, REDUCE_CHUNKS_PER_THREAD * self._threads + 1).astype(np.int64)
         bounds = np.searchsorted(starts, places)
@@ -117,7 +119,7 @@ class SingleRayTracer:
         out = empty_gradients(segments, scene.sh.shape[1], scene.features.shape[1])
         run_on_threads(
             reduce_hits, self._threads,
-            backward, by_gaussian, bounds, np.zeros(1, np.int64), shares, gradient_arrays(out),
+            backward, gaussian_segments, bounds, np.zeros(1, np.int64), shares, gradient_arrays(out),
         )  # fmt: skip
         return out
 

@@ -60,8 +60,7 @@ class StepRates(NamedTuple):
 
     Attributes:
         mean: in world units or, where ``mean_by_size``, in units of the Gaussian's size: the geometric mean
-            of
-            its two scales.
+            of its two scales.
         mean_by_size: see ``mean``.
         own_axes: means and quaternions are stepped along and around the Gaussian's normal and the two axes in
             its plane, each with moments of its own; the first column of the quaternion's is then unused.
@@ -103,6 +102,22 @@ class BiasCorrection(NamedTuple):
     corrections: Float64[np.ndarray, "u 2"]
 
 
+class AdamStep(NamedTuple):
+    """One step for the Gaussians ``ids``.
+
+    ``regular`` adds the gradients of the regularisers. ``mean_steps`` receives each mean's step, world units.
+    """
+
+    ids: Int32[np.ndarray, " u"]
+    bias: BiasCorrection
+    moments: AdamMoments
+    gaussians: ParameterArrays
+    gradients: ParameterGradients
+    rates: StepRates
+    regular: Regularization
+    mean_steps: Float32[np.ndarray, "u 3"]
+
+
 @device_function()
 def _update(
     value: float,
@@ -135,14 +150,17 @@ def own_axes_of(i: int, quats: Float32[np.ndarray, "n 4"], room: Float32[np.ndar
 
 
 @njit_no_refcount(fastmath={"contract"})
-def by_own_turns(
+def own_axes_gradient(
     k: int,
     i: int,
     quats: Float32[np.ndarray, "n 4"],
     g_quats: Float32[np.ndarray, "u 4"],
     out: Float32[np.ndarray, "16"],
 ) -> None:
-    """Gradient of Gaussian ``i`` by turns around its own axes: by d of its quaternion times (1, d)."""
+    """Write the gradient of Gaussian ``i`` with respect to rotations about its own axes.
+
+    That is by d, where its quaternion is multiplied by (1, d).
+    """
     w, x, y, z = quats[i, 0], quats[i, 1], quats[i, 2], quats[i, 3]
     a, b, c, d = g_quats[k, 0], g_quats[k, 1], g_quats[k, 2], g_quats[k, 3]
     out[3] = 0.0
@@ -182,15 +200,15 @@ def step_sh(
     columns = sh.shape[1] * 3
     for column in range(0, columns, LANES):
         sh_at = sh.ctypes.data + (i * columns + column) * 4
-        by_sh_at = g_sh.ctypes.data + (k * columns + column) * 4
+        g_sh_at = g_sh.ctypes.data + (k * columns + column) * 4
         rates_at = rates_sh.ctypes.data + column * 4
         sh_first_at = first_at + (GEOMETRY + column) * 4
         sh_second_at = second_at + (GEOMETRY + column) * 4
-        left = columns - column
-        if left >= LANES:
-            step_lanes(sh_at, by_sh_at, rates_at, sh_first_at, sh_second_at, numbers)
+        columns_left = columns - column
+        if columns_left >= LANES:
+            step_lanes(sh_at, g_sh_at, rates_at, sh_first_at, sh_second_at, numbers)
         else:
-            step_few(sh_at, by_sh_at, rates_at, sh_first_at, sh_second_at, left, few_at, numbers)
+            step_few(sh_at, g_sh_at, rates_at, sh_first_at, sh_second_at, columns_left, few_at, numbers)
 
 
 @njit_no_refcount(fastmath={"contract"})
@@ -198,51 +216,47 @@ def step_gaussian(
     k: int,
     i: int,
     room: Float32[np.ndarray, "10 16"],
-    moments: AdamMoments,
+    step: AdamStep,
     numbers: tuple[float, ...],
-    gaussians: ParameterArrays,
-    gradients: ParameterGradients,
-    rates: StepRates,
-    regular: Regularization,
-    mean_steps: Float32[np.ndarray, "u 3"],
 ) -> None:
-    """Take one step of Gaussian ``i``, row ``k`` of the gradients; see :func:`adam_step`."""
-    means, quats, log_scales, logits, sh = gaussians
-    g_means, g_quats, g_log_scales, g_logits, g_sh = gradients
+    """Take one step of Gaussian ``i``, row ``k`` of the gradients."""
+    moments, rates, regular, mean_steps = step.moments, step.rates, step.regular, step.mean_steps
+    means, quats, log_scales, logits, sh = step.gaussians
+    g_means, g_quats, g_log_scales, g_logits, g_sh = step.gradients
     # --- values, gradients and rates of the geometry, a row each ---
-    values, by_values, by_rates, axes = room[0], room[1], room[2], room[3:6]
+    values, g_values, value_rates, axes = room[0], room[1], room[2], room[3:6]
     few_at = room[6:].ctypes.data
     scale_0, scale_1 = math.exp(np.float64(log_scales[i, 0])), math.exp(np.float64(log_scales[i, 1]))
     rate = rates.mean
     if rates.mean_by_size:
         rate *= math.sqrt(scale_0 * scale_1)
     for axis in range(3):
-        values[axis], by_values[axis], by_rates[axis] = 0.0, g_means[k, axis], rate  # the step alone
+        values[axis], g_values[axis], value_rates[axis] = 0.0, g_means[k, axis], rate  # the step alone
     for axis in range(4):
-        values[3 + axis], by_values[3 + axis], by_rates[3 + axis] = (
+        values[3 + axis], g_values[3 + axis], value_rates[3 + axis] = (
             quats[i, axis], g_quats[k, axis], rates.quat,
         )  # fmt: skip
     for axis in range(2):
-        values[7 + axis], by_rates[7 + axis] = log_scales[i, axis], rates.log_scale
-    by_values[7] = g_log_scales[k, 0] + regular.scale_weight * scale_0
-    by_values[8] = g_log_scales[k, 1] + regular.scale_weight * scale_1
+        values[7 + axis], value_rates[7 + axis] = log_scales[i, axis], rates.log_scale
+    g_values[7] = g_log_scales[k, 0] + regular.scale_weight * scale_0
+    g_values[8] = g_log_scales[k, 1] + regular.scale_weight * scale_1
     if rates.own_axes:
         own_axes_of(i, quats, axes)
         for axis in range(3):
-            by_values[axis] = (
+            g_values[axis] = (
                 axes[axis, 0] * g_means[k, 0] + axes[axis, 1] * g_means[k, 1] + axes[axis, 2] * g_means[k, 2]
             )
             values[4 + axis] = 0.0
-        by_own_turns(k, i, quats, g_quats, by_values)
+        own_axes_gradient(k, i, quats, g_quats, g_values)
     opacity = 0.0
     if regular.opacity_weight != 0.0:
         opacity = 1.0 / (1.0 + math.exp(-np.float64(logits[i])))
-    values[9], by_rates[9] = logits[i], rates.opacity
-    by_values[9] = g_logits[k] + regular.opacity_weight * opacity * (1.0 - opacity)
+    values[9], value_rates[9] = logits[i], rates.opacity
+    g_values[9] = g_logits[k] + regular.opacity_weight * opacity * (1.0 - opacity)
     first_at = moments.first.ctypes.data + i * moments.first.shape[1] * 4
     second_at = moments.second.ctypes.data + i * moments.second.shape[1] * 4
-    values_at, by_values_at, by_rates_at = values.ctypes.data, by_values.ctypes.data, by_rates.ctypes.data
-    step_few(values_at, by_values_at, by_rates_at, first_at, second_at, GEOMETRY, few_at, numbers)
+    values_at, g_values_at, value_rates_at = values.ctypes.data, g_values.ctypes.data, value_rates.ctypes.data
+    step_few(values_at, g_values_at, value_rates_at, first_at, second_at, GEOMETRY, few_at, numbers)
     step_sh(k, i, moments, sh, g_sh, rates.sh, few_at, numbers)
     # --- the new parameters ---
     if rates.own_axes:
@@ -266,23 +280,11 @@ def step_gaussian(
 
 
 @njit_no_refcount(fastmath={"contract"})
-def step_chunk(
-    begin: int,
-    end: int,
-    ids: Int32[np.ndarray, " u"],
-    bias: BiasCorrection,
-    room: Float32[np.ndarray, "10 16"],
-    moments: AdamMoments,
-    gaussians: ParameterArrays,
-    gradients: ParameterGradients,
-    rates: StepRates,
-    regular: Regularization,
-    mean_steps: Float32[np.ndarray, "u 3"],
-) -> None:
+def step_chunk(begin: int, end: int, room: Float32[np.ndarray, "10 16"], step: AdamStep) -> None:
     """Take one step of the Gaussians of rows ``begin`` to ``end``."""
-    first, second, beta1, beta2, epsilon = moments
-    steps, powers, corrections = bias
-    sh = gaussians.sh
+    ids, sh = step.ids, step.gaussians.sh
+    first, second, beta1, beta2, epsilon = step.moments
+    steps, powers, corrections = step.bias
     moments_bytes, sh_bytes = first.shape[1] * 4, sh.shape[1] * 12
     for k in range(begin, end):
         if k + AHEAD < end:
@@ -298,33 +300,20 @@ def step_chunk(
             np.float32(c1), np.float32(c2), np.float32(beta1), np.float32(beta2),
             np.float32(1.0 - beta1), np.float32(1.0 - beta2), np.float32(epsilon),
         )  # fmt: skip
-        step_gaussian(k, i, room, moments, numbers, gaussians, gradients, rates, regular, mean_steps)
+        step_gaussian(k, i, room, step, numbers)
 
 
 @kernel()
 def adam_step(
     first_chunk: int,
     last_chunk: int,
-    ids: Int32[np.ndarray, " u"],
-    bias: BiasCorrection,
-    moments: AdamMoments,
-    gaussians: ParameterArrays,
-    gradients: ParameterGradients,
-    rates: StepRates,
-    regular: Regularization,
-    mean_steps: Float32[np.ndarray, "u 3"],
+    step: AdamStep,
 ) -> None:
-    """Take one step for the Gaussians ``ids`` of some chunks of :data:`CHUNK` each.
-
-    ``regular`` adds the gradients of the regularisers. ``mean_steps`` receives each mean's step, world units.
-    """
-    count = len(ids)
+    """Take a step for the Gaussians of some chunks of :data:`CHUNK` each."""
+    count = len(step.ids)
     for chunk in range(first_chunk, last_chunk):
         room = np.zeros((10, LANES), np.float32)
-        step_chunk(
-            chunk * CHUNK, min(count, (chunk + 1) * CHUNK), ids, bias, room, moments, gaussians, gradients,
-            rates, regular, mean_steps,
-        )  # fmt: skip
+        step_chunk(chunk * CHUNK, min(count, (chunk + 1) * CHUNK), room, step)
 
 
 @kernel()

@@ -1,5 +1,7 @@
 """The pixels' loss and its gradient in one pass."""
 
+from typing import NamedTuple
+
 import numpy as np
 from jaxtyping import Float32, Float64
 
@@ -10,18 +12,23 @@ CHUNKS = 64
 """Parts whose sums are added up one after the other: the same on any number of threads."""
 
 
+class PixelTerms(NamedTuple):
+    """What the loss of the pixels is computed from, and the ``gradient`` that is written.
+
+    ``l1`` and ``l2`` are the factors of the sign and of the difference in the gradient.
+    """
+
+    render: Float32[np.ndarray, "r 3"]
+    target: Float32[np.ndarray, "r 3"]
+    weight: Float32[np.ndarray, " r"]
+    l1: np.float32
+    l2: np.float32
+    gradient: Float32[np.ndarray, "r 3"]
+
+
 @njit_no_refcount()
-def _part(
-    first: int,
-    last: int,
-    render: Float32[np.ndarray, "r 3"],
-    target: Float32[np.ndarray, "r 3"],
-    weight: Float32[np.ndarray, " r"],
-    l1: np.float32,
-    l2: np.float32,
-    gradient: Float32[np.ndarray, "r 3"],
-    sums: Float64[np.ndarray, "2"],
-) -> None:
+def _part(first: int, last: int, terms: PixelTerms, sums: Float64[np.ndarray, "2"]) -> None:
+    render, target, weight, l1, l2, gradient = terms
     absolute = squared = 0.0
     for r in range(first, last):
         for channel in range(3):
@@ -38,20 +45,8 @@ def _part(
 
 
 @kernel(error_model="numpy")
-def pixel_terms(
-    first: int,
-    last: int,
-    render: Float32[np.ndarray, "r 3"],
-    target: Float32[np.ndarray, "r 3"],
-    weight: Float32[np.ndarray, " r"],
-    l1: np.float32,
-    l2: np.float32,
-    gradient: Float32[np.ndarray, "r 3"],
-    sums: Float64[np.ndarray, "chunks 2"],
-) -> None:
+def pixel_terms(first: int, last: int, terms: PixelTerms, sums: Float64[np.ndarray, "chunks 2"]) -> None:
     """Write ``gradient`` = (l1 sign(d) + l2 d) weight, d = render - target, and ``sums`` of |d| and d^2."""
-    count, chunks = len(render), len(sums)
+    count, chunks = len(terms.render), len(sums)
     for c in range(first, last):
-        _part(
-            c * count // chunks, (c + 1) * count // chunks, render, target, weight, l1, l2, gradient, sums[c]
-        )
+        _part(c * count // chunks, (c + 1) * count // chunks, terms, sums[c])

@@ -9,7 +9,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from octasplat.engine.core.errors import TrainingError
-from octasplat.engine.shading.protocol import ShadingModel, TracedRays
+from octasplat.engine.shading.protocol import (
+    ShadedRayGradients,
+    ShadingModel,
+    ShadingStep,
+    TracedRays,
+)
 from octasplat.engine.trace.gradient_sums import add_gradients, drop_low_weight
 from octasplat.engine.trace.protocol import GaussianGradients, Tracer
 from octasplat.engine.train.config import LearningRates, LossWeights
@@ -78,11 +83,12 @@ def loss_and_gradients(
     shaded = shading.shade(traced)
     render = shaded.composite_over(batch.background_srgb)
     loss = batch_loss(render, batch, weights)
-    by_shading = shading.backward(traced, shaded, loss.gradient, loss.gradient @ batch.background_srgb)
-    by_trace = by_shading.trace
+    grad = ShadedRayGradients(loss.gradient, loss.gradient @ batch.background_srgb)
+    grad_shading = shading.backward(traced, shaded, grad)
+    grad_trace = grad_shading.trace
     if with_errors:
-        by_trace = replace(by_trace, ray_errors=ray_errors(render, batch.target_srgb, batch.weight))
-    recorded = [(result.recording, by_trace), *by_shading.recorded_traces]
+        grad_trace = replace(grad_trace, ray_errors=ray_errors(render, batch.target_srgb, batch.weight))
+    recorded = [(result.recording, grad_trace), *grad_shading.recorded_traces]
     if batch.visibility_rays is not None:
         recorded.append(free_space_gradient(batch.visibility_rays, tracer, weights.free_space))
     min_trace_weight = (
@@ -94,7 +100,7 @@ def loss_and_gradients(
     return LossGradients(
         loss=loss,
         gaussians=drop_low_weight(add_gradients(gradients), min_blend_weight),
-        shading=by_shading.parameters,
+        shading=grad_shading.parameters,
         hits_per_ray=float(result.hit_counts.mean()),
     )
 
@@ -144,7 +150,7 @@ def train_step(
     moved = state.adam.step(
         state.gaussians, gradients, lr, loss, training_progress=training_progress, extent=extent
     )
-    shading.step(state.gaussians, gradients, step_gradients.shading, training_progress=training_progress)
+    shading.step(ShadingStep(state.gaussians, gradients, step_gradients.shading, training_progress))
     tracer.refresh(gradients.ids)
     densifier.observe(len(state.gaussians), gradients, moved)
     state.iteration += 1

@@ -9,7 +9,7 @@ from scipy.ndimage import correlate1d
 from octasplat.engine.core.compilation import run_ranges
 from octasplat.engine.core.threads import threads_in_use
 from octasplat.engine.train.config import LossWeights
-from octasplat.engine.train.kernels.losses import CHUNKS, pixel_terms
+from octasplat.engine.train.kernels.losses import CHUNKS, PixelTerms, pixel_terms
 from octasplat.engine.train.sampling.batches import Batch
 
 SSIM_C1, SSIM_C2 = 0.01**2, 0.03**2
@@ -85,9 +85,9 @@ def batch_loss(render: Float32[np.ndarray, "r 3"], batch: Batch, weights: LossWe
     pixel = pixel_loss(render, target, batch.weight, l1=weights.l1, l2=weights.l2)
     if not batch.ssim_patch_count or weights.ssim == 0:
         return pixel
-    structure, by_patches = _ssim_term(render, target, batch)
+    structure, grad_patches = _ssim_term(render, target, batch)
     gradient = pixel.gradient.copy()
-    gradient[-len(by_patches) :] += np.float32(weights.ssim) * by_patches
+    gradient[-len(grad_patches) :] += np.float32(weights.ssim) * grad_patches
     return BatchLoss(pixel.value + weights.ssim * structure, gradient, pixel.squared_error)
 
 
@@ -126,8 +126,10 @@ def pixel_loss(
     gradient, sums = np.empty(render.shape, np.float32), np.empty((CHUNKS, 2))
     run_ranges(
         pixel_terms, threads_in_use(), CHUNKS,
-        render, target, weight, np.float32(l1 / (3 * valid)), np.float32(2 * l2 / (3 * valid)),
-        gradient, sums, grain=1,
+        PixelTerms(
+            render, target, weight, np.float32(l1 / (3 * valid)), np.float32(2 * l2 / (3 * valid)), gradient
+        ),
+        sums, grain=1,
     )  # fmt: skip
     absolute, squared = sums.sum(axis=0) / (3 * valid)
     return BatchLoss(float(l1 * absolute + l2 * squared), gradient, float(squared))

@@ -71,13 +71,13 @@ def write_geometry_gradients(
     out.quats[segment, 1] = factor * (w0 * q0 + w1 * q3 - w2 * q2)
     out.quats[segment, 2] = factor * (w1 * q0 + w2 * q1 - w0 * q3)
     out.quats[segment, 3] = factor * (w2 * q0 + w0 * q2 - w1 * q1)
-    by_view = moments.m0, moments.m1, moments.m2
+    grad_view = moments.m0, moments.m1, moments.m2
     for axis in range(3):
         out.means[segment, axis] = (
             moments.hu * inv_s2 * r2[axis]
             + moments.hv * inv_s3 * r3[axis]
             + moments.tau * r1[axis]
-            + by_view[axis]
+            + grad_view[axis]
         )
     out.log_scales[segment, 0] = moments.huu
     out.log_scales[segment, 1] = moments.hvv

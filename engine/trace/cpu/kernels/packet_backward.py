@@ -127,25 +127,25 @@ def write_transmittance(
     start: int,
     count: int,
     wants_median: bool,
-    transmittance: Float64[np.ndarray, " h"],
+    transmittance_before: Float64[np.ndarray, " h"],
 ) -> tuple[float, int]:
     """Write the transmittance before each of the ``count`` hits from ``start`` on, and behind the last.
 
     Returns:
         That behind the last, and which hit is at the median depth; -1 for none, or where it is not wanted.
     """
-    t, median = 1.0, -1
+    transmittance, median = 1.0, -1
     for begin in range(0, count, WIDTH):
-        t = transmittance_before8(
-            alphas.ctypes.data + (start + begin) * 4, min(WIDTH, count - begin), t,
-            transmittance.ctypes.data + begin * 8,
+        transmittance = transmittance_before8(
+            alphas.ctypes.data + (start + begin) * 4, min(WIDTH, count - begin), transmittance,
+            transmittance_before.ctypes.data + begin * 8,
         )  # fmt: skip
-    transmittance[count] = t
+    transmittance_before[count] = transmittance
     if wants_median:
         for k in range(count):
-            if transmittance[k] > 0.5 and transmittance[k + 1] <= 0.5:
+            if transmittance_before[k] > 0.5 and transmittance_before[k + 1] <= 0.5:
                 median = k
-    return t, median
+    return transmittance, median
 
 
 @njit_no_refcount(fastmath={"contract"})
@@ -165,49 +165,61 @@ def backward_ray_in_packet(
     dL/dalpha_k = <g, T_k c_k - (C - prefix_k)/(1 - alpha_k)> for every channel, the part behind summed from
     the back in float64: as a difference of sums it would drown behind opaque surfaces.
     """
-    through, normals, values = scratch.transmittance_before, scratch.normals, scratch.weight_gradients
-    weights, shares, by_ray = scratch.weights, scratch.log_alpha_gradients, scratch.ray_gradients
+    transmittance_before, weight_gradients = scratch.transmittance_before, scratch.weight_gradients
+    weights, log_alpha_gradients, ray_gradients = (
+        scratch.weights,
+        scratch.log_alpha_gradients,
+        scratch.ray_gradients,
+    )
     features, output_gradients = backward.scene.features, backward.output_gradients
     feature_count = features.shape[1]
     count, start = counts[r], hits.starts[r]
     # --- front to back: the transmittance before each hit, and the hit at the median depth ---
-    t, median = write_transmittance(hits.alphas, start, count, output_gradients.has_geometry, through)
+    transmittance, median = write_transmittance(
+        hits.alphas, start, count, output_gradients.has_geometry, transmittance_before
+    )
     gd, gm, (gn0, gn1, gn2) = geometry_gradient(output_gradients, r)
     # --- what the ray counts for in the rows of its hits ---
-    by_ray[W - 8], by_ray[ERROR - 8] = np.float32(1.0), output_gradients.ray_errors[r]
-    by_ray[RED - 8], by_ray[GREEN - 8], by_ray[BLUE - 8] = (
+    ray_gradients[W - 8], ray_gradients[ERROR - 8] = np.float32(1.0), output_gradients.ray_errors[r]
+    ray_gradients[RED - 8], ray_gradients[GREEN - 8], ray_gradients[BLUE - 8] = (
         output_gradients.rgb[r, 0],
         output_gradients.rgb[r, 1],
         output_gradients.rgb[r, 2],
     )
     # --- back to front, eight hits at a time ---
     out = HitGradients8(
-        rows.sums.ctypes.data + first_row * (ROW_WORDS * 4), weights.ctypes.data, shares.ctypes.data
+        rows.sums.ctypes.data + first_row * (ROW_WORDS * 4),
+        weights.ctypes.data,
+        log_alpha_gradients.ctypes.data,
     )
-    behind = np.float64(output_gradients.transmittance[r]) * t
+    behind = np.float64(output_gradients.transmittance[r]) * transmittance
     for begin in range((count - 1) // WIDTH * WIDTH, -1, -WIDTH):
         n, e = min(WIDTH, count - begin), start + begin
         if output_gradients.has_geometry or feature_count > 0:
             for k in range(n):
                 slot = packet_hits.slots[e + k]
-                value = 0.0
+                weight_gradient = 0.0
                 if output_gradients.has_geometry:
-                    value += gd * hits.distances[e + k]
-                    value += gn0 * normals[slot, 0] + gn1 * normals[slot, 1] + gn2 * normals[slot, 2]
+                    weight_gradient += gd * hits.distances[e + k]
+                    weight_gradient += (
+                        gn0 * scratch.normals[slot, 0]
+                        + gn1 * scratch.normals[slot, 1]
+                        + gn2 * scratch.normals[slot, 2]
+                    )
                 for f in range(feature_count):
-                    value += (
+                    weight_gradient += (
                         np.float64(output_gradients.features[r, f])
                         * features[packet_hits.slot_ids[slot_base + slot], f]
                     )
-                values[k] = value
+                weight_gradients[k] = weight_gradient
         behind = backward_hits8(
             Hits8(
-                hits.alphas.ctypes.data + e * 4, through.ctypes.data + begin * 8,
+                hits.alphas.ctypes.data + e * 4, transmittance_before.ctypes.data + begin * 8,
                 packet_hits.slots.ctypes.data + e * 4, packet_hits.us.ctypes.data + e * 4,
                 packet_hits.vs.ctypes.data + e * 4,
             ),
-            values.ctypes.data, packet_hits.slot_rgb.ctypes.data + slot_base * 12, n, behind,
-            np.float32(backward.limits.alpha_max), by_ray.ctypes.data, out,
+            weight_gradients.ctypes.data, packet_hits.slot_rgb.ctypes.data + slot_base * 12, n, behind,
+            np.float32(backward.limits.alpha_max), ray_gradients.ctypes.data, out,
         )  # fmt: skip
         if not (output_gradients.has_geometry or feature_count > 0):
             continue

@@ -258,7 +258,7 @@ def trace_ray(
     for f in range(feature_count):
         out.features[r, f] = np.float32(0.0)
     # --- the ray so far: transmittance, where its phase ends, median depth, hits composited ---
-    t, stop_below, last_phase = 1.0, limits.eps1, limits.eps2 > 1.0
+    transmittance, stop_below, last_phase = 1.0, limits.eps1, limits.eps2 > 1.0
     median = np.float32(0.0)
     found = 0
     # Hits head to tail have been met and wait; b0 is the next block to be tested.
@@ -280,14 +280,14 @@ def trace_ray(
         while not stop and head < tail and keys[head] < safe:
             keys_at = keys.ctypes.data + head * 8
             bits = composite8(
-                keys_at, min(tail - head, limits.max_hits - found), safe, candidates.alphas.ctypes.data, t,
-                stop_below, scratch.alphas.ctypes.data, scratch.weights.ctypes.data,
+                keys_at, min(tail - head, limits.max_hits - found), safe, candidates.alphas.ctypes.data,
+                transmittance, stop_below, scratch.alphas.ctypes.data, scratch.weights.ctypes.data,
                 scratch.transmittance_after.ctypes.data,
             )  # fmt: skip
             taken, stop, last_phase, stop_below = find_ray_end(
                 bits, bits >> (2 * WIDTH), last_phase, stop_below, limits.eps2, scratch.transmittance_after
             )
-            if t > 0.5:
+            if transmittance > 0.5:
                 halves = (bits >> WIDTH) & ((1 << taken) - 1)
                 if halves != 0:
                     median = float32_from_bits(np.uint32(keys[head + lowest_bit(halves)] >> HIGH_WORD_SHIFT))
@@ -308,12 +308,12 @@ def trace_ray(
             )  # fmt: skip
             if forward.is_recording:
                 store_hits(keys_at, taken, first_hit, packet, scratch)
-            t = scratch.transmittance_after[taken - 1]
+            transmittance = scratch.transmittance_after[taken - 1]
             head, first_hit, found = head + taken, first_hit + taken, found + taken
             stop = stop or found >= limits.max_hits
         b0 = b1
         stop = stop or nearest >= span[1]
-    write_ray_sums(r, found, t, median, scratch, out)
+    write_ray_sums(r, found, transmittance, median, scratch, out)
     return first_hit, slot_count
 
 

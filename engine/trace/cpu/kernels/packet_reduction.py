@@ -127,9 +127,9 @@ def sum_rows_of_origin(
         row = order[k]
         accumulate_row(origin_sums.ctypes.data, rows.sums[row].ctypes.data)
         if with_geometry:
-            by_t = rows.geometry[row]
-            gt, gtu, gtv = gt + by_t[GT], gtu + by_t[GTU], gtv + by_t[GTV]
-            t0, t1, t2 = t0 + by_t[N_0], t1 + by_t[N_1], t2 + by_t[N_2]
+            grad_t = rows.geometry[row]
+            gt, gtu, gtv = gt + grad_t[GT], gtu + grad_t[GTU], gtv + grad_t[GTV]
+            t0, t1, t2 = t0 + grad_t[N_0], t1 + grad_t[N_1], t2 + grad_t[N_2]
         for f in range(len(features)):
             features[f] += rows.features[row, f]
         k += 1
@@ -199,13 +199,13 @@ def reduce_packets_chunk(
             tau_u += (gtu - here[HUUU] - xa * huu - xb * huv) * inverse
             tau_v += (gtv - here[HVVV] - xa * huv - xb * hvv) * inverse
             # --- harmonics, and the mean through the direction of view ---
-            by_color = here[RED], here[GREEN], here[BLUE]
+            grad_color = here[RED], here[GREEN], here[BLUE]
             view = eval_view_basis(basis, basis_count, x, y, z)
-            accumulate_sh_gradient(out.sh, place, basis, basis_count, by_color)
+            accumulate_sh_gradient(out.sh, place, basis, basis_count, grad_color)
             if basis_count > 1:
-                write_basis_gradient(basis, scene.sh, i, basis_count, by_color)
-                by_x, by_y, by_z = mean_gradient(basis, basis_count, view)
-                m0, m1, m2 = m0 + by_x, m1 + by_y, m2 + by_z
+                write_basis_gradient(basis, scene.sh, i, basis_count, grad_color)
+                grad_x, grad_y, grad_z = mean_gradient(basis, basis_count, view)
+                m0, m1, m2 = m0 + grad_x, m1 + grad_y, m2 + grad_z
         moments = GaussianMoments(
             sums[H], sums[HU], sums[HV], sums[HUU], sums[HUV], sums[HVV],
             tau, tau_u, tau_v, n0, n1, n2, m0, m1, m2,

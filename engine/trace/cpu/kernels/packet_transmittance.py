@@ -38,15 +38,15 @@ def ray_transmittance(
     """Return what candidates leave of ray ``r``, ray ``ray_bit`` of its packet; 0 where it is below eps1."""
     slopes, span = ray_slopes(rays, r, frame), ray_limits(rays, r)
     block_count = (count + WIDTH - 1) // WIDTH
-    left = 1.0
+    transmittance = 1.0
     for b0 in range(0, block_count, BLOCKS_PER_CHUNK):
         tail = intersect_blocks(candidates, ray_bit, b0, slopes, span, 0)
         eval_alphas(candidates, 0, tail, limits.alpha_max)
         for m in range(tail):
-            left *= 1.0 - candidates.alphas[m]
-            if left < limits.eps1:
+            transmittance *= 1.0 - candidates.alphas[m]
+            if transmittance < limits.eps1:
                 return 0.0
-    return left
+    return transmittance
 
 
 @kernel(error_model="numpy")

@@ -202,15 +202,15 @@ def backward_group16(
         u, v, _slant, _inverse = _plane_uv(rays, line)
         u, v = _mask_lanes(builder, here, u), _mask_lanes(builder, here, v)
         alpha = _mask_lanes(builder, here, _eval_alpha(builder, u, v, line, alpha_max))
-        per_kept = 1.0 / (1.0 - alpha)
-        left = back[TRANSMITTANCE_BEHIND] * per_kept
-        weight = left * alpha
+        per_passed = 1.0 / (1.0 - alpha)
+        transmittance = back[TRANSMITTANCE_BEHIND] * per_passed
+        weight = transmittance * alpha
         slopes = [back[GRAD_RED + channel] for channel in range(3)]
         value = slopes[0] * line(COLOR) + slopes[1] * line(COLOR + 1) + slopes[2] * line(COLOR + 2)
-        h = (left * value - back[GRAD_BEHIND] * per_kept) * alpha
+        h = (transmittance * value - back[GRAD_BEHIND] * per_passed) * alpha
         h = (alpha >= broadcast(builder, alpha_max, GROUP_SIZE)).select(0.0, h)
         back[GRAD_BEHIND] = weight * value + back[GRAD_BEHIND]
-        back[TRANSMITTANCE_BEHIND] = left
+        back[TRANSMITTANCE_BEHIND] = transmittance
         hu, hv, square = h * u, h * v, u * u + v * v
         count = _mask_lanes(builder, here, Vector(builder, ONES))
         found = (h, hu, hv, hu * u, hu * v, hv * v, hu * square, hv * square, weight, count,

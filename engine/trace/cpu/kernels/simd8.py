@@ -262,23 +262,33 @@ def composite8(
     def codegen(
         context: BaseContext, builder: ir.IRBuilder, sig: Signature, args: Sequence[ir.Value]
     ) -> ir.Value:
-        keys, most, safe, known_alphas, t, stop_below, alphas, weights, after = args
+        (
+            keys,
+            max_count,
+            safe_key,
+            alpha_table,
+            transmittance,
+            min_transmittance,
+            alphas,
+            weights,
+            transmittance_after,
+        ) = args
         key = load(builder, keys, LONG8)
-        valid = builder.icmp_unsigned("<", key, splat(builder, safe, I64))
-        valid = builder.and_(valid, first_lanes_mask(builder, most))
-        alpha = gather(builder, known_alphas, key_indices(builder, key, valid), FLOAT8)
+        valid = builder.icmp_unsigned("<", key, splat(builder, safe_key, I64))
+        valid = builder.and_(valid, first_lanes_mask(builder, max_count))
+        alpha = gather(builder, alpha_table, key_indices(builder, key, valid), FLOAT8)
         alpha = Vector(builder, builder.select(valid, alpha, ir.Constant(FLOAT8, [0.0] * LANES)))
         store(builder, alpha.value, alphas)
         alpha = alpha.to_float64()
         product = prefix_scan(builder, 1.0 - alpha, lambda a, b: a * b, 1.0)
-        through = shift_lanes(builder, product, 1, 1.0)
-        begin = broadcast(builder, t)
-        left = product * begin
-        store(builder, (alpha * (through * begin)).value, weights)
-        store(builder, left.value, after)
+        product_before = shift_lanes(builder, product, 1, 1.0)
+        before_all = broadcast(builder, transmittance)
+        transmittance_behind = product * before_all
+        store(builder, (alpha * (product_before * before_all)).value, weights)
+        store(builder, transmittance_behind.value, transmittance_after)
         count = builder.ctpop(Vector(builder, valid).to_bitmask())
-        stops = (left < broadcast(builder, stop_below)).to_bitmask()
-        halves = builder.shl((left <= 0.5).to_bitmask(), ir.Constant(I64, LANES))
+        stops = (transmittance_behind < broadcast(builder, min_transmittance)).to_bitmask()
+        halves = builder.shl((transmittance_behind <= 0.5).to_bitmask(), ir.Constant(I64, LANES))
         count = builder.shl(count, ir.Constant(I64, 2 * LANES))
         return builder.or_(builder.or_(stops, halves), count)
 

@@ -56,11 +56,17 @@ def transmittance_before8(
     def codegen(
         context: BaseContext, builder: ir.IRBuilder, sig: Signature, args: Sequence[ir.Value]
     ) -> ir.Value:
-        alphas, count, t, through = args
-        alpha = keep_first_lanes(builder, VectorRows(builder, alphas, FLOAT8)[0].to_float64(), count)
+        alphas_at, count, transmittance, transmittance_before_at = args
+        alpha = keep_first_lanes(builder, VectorRows(builder, alphas_at, FLOAT8)[0].to_float64(), count)
         product = prefix_scan(builder, 1.0 - alpha, lambda a, b: a * b, 1.0)
-        store(builder, (shift_lanes(builder, product, 1, 1.0) * broadcast(builder, t)).value, through)
-        return builder.fmul(builder.extract_element(product.value, ir.Constant(I32, LANES - 1)), t)
+        store(
+            builder,
+            (shift_lanes(builder, product, 1, 1.0) * broadcast(builder, transmittance)).value,
+            transmittance_before_at,
+        )
+        return builder.fmul(
+            builder.extract_element(product.value, ir.Constant(I32, LANES - 1)), transmittance
+        )
 
     return signature, codegen
 
@@ -118,35 +124,35 @@ def backward_hits8(
     def codegen(
         context: BaseContext, builder: ir.IRBuilder, sig: Signature, args: Sequence[ir.Value]
     ) -> ir.Value:
-        hits, values, slot_rgb, count, behind, alpha_max, by_ray, out = args
-        alphas, through, slots, us, vs = cgutils.unpack_tuple(builder, hits)
-        rows, weights, shares = cgutils.unpack_tuple(builder, out)
+        hits, weight_gradients, slot_rgb, count, behind, alpha_max, ray_gradients, out = args
+        alphas, transmittance_before, slots, us, vs = cgutils.unpack_tuple(builder, hits)
+        rows, weights, log_alpha_gradients = cgutils.unpack_tuple(builder, out)
         valid = first_lanes_mask(builder, count)
         slot = builder.sext(load(builder, slots, INT8), LONG8)
         slot = builder.select(valid, slot, ir.Constant(LONG8, [0] * LANES))
-        value = VectorRows(builder, values, DOUBLE8)[0]
+        weight_gradient = VectorRows(builder, weight_gradients, DOUBLE8)[0]
         first_word = builder.mul(slot, ir.Constant(LONG8, [3] * LANES))
         for channel in range(3):
             word = builder.add(first_word, ir.Constant(LONG8, [channel] * LANES))
             color = builder.fpext(gather(builder, slot_rgb, word, FLOAT8), DOUBLE8)
-            at = builder.add(by_ray, ir.Constant(I64, (3 + channel) * 4))
-            slope = builder.fpext(builder.load(builder.inttoptr(at, FLOAT.as_pointer())), DOUBLE)
-            value = value + Vector(builder, color) * broadcast(builder, slope)
+            channel_at = builder.add(ray_gradients, ir.Constant(I64, (3 + channel) * 4))
+            slope = builder.fpext(builder.load(builder.inttoptr(channel_at, FLOAT.as_pointer())), DOUBLE)
+            weight_gradient = weight_gradient + Vector(builder, color) * broadcast(builder, slope)
         alpha = VectorRows(builder, alphas, FLOAT8)[0].to_float64()
         clamped = alpha >= broadcast(builder, builder.fpext(alpha_max, DOUBLE))
         alpha = keep_first_lanes(builder, alpha, count)
-        through = VectorRows(builder, through, DOUBLE8)[0]
-        weight = keep_first_lanes(builder, alpha * through, count)
-        seen = keep_first_lanes(builder, weight * value, count)
-        sums = prefix_scan(builder, seen, lambda a, b: a + b, 0.0, reverse=True)
+        transmittance_before = VectorRows(builder, transmittance_before, DOUBLE8)[0]
+        weight = keep_first_lanes(builder, alpha * transmittance_before, count)
+        weighted = keep_first_lanes(builder, weight * weight_gradient, count)
+        sums = prefix_scan(builder, weighted, lambda a, b: a + b, 0.0, reverse=True)
         later = shift_lanes(builder, sums, -1, 0.0) + broadcast(builder, behind)
-        h = (through * value - later / (1.0 - alpha)) * alpha
+        h = (transmittance_before * weight_gradient - later / (1.0 - alpha)) * alpha
         h = keep_first_lanes(builder, clamped.select(0.0, h), count)
         weight, h = builder.fptrunc(weight.value, FLOAT8), builder.fptrunc(h.value, FLOAT8)
         store(builder, weight, weights)
-        store(builder, h, shares)
-        _accumulate_moments(builder, h, load(builder, us, FLOAT8), load(builder, vs, FLOAT8), weights, by_ray,
-                     slots, rows, count)  # fmt: skip
+        store(builder, h, log_alpha_gradients)
+        u, v = load(builder, us, FLOAT8), load(builder, vs, FLOAT8)
+        _accumulate_moments(builder, h, u, v, weights, ray_gradients, slots, rows, count)
         first = builder.extract_element(sums.value, ir.Constant(I32, 0))
         return builder.fadd(first, behind)
 

@@ -72,17 +72,17 @@ def backward_ray(
     """
     rays, limits, output_gradients = backward.rays, backward.limits, backward.output_gradients
     records, features = backward.scene.primitives, backward.scene.features
-    alphas, ts, hit_rgb = hits.alphas, hits.distances, hits.rgb
+    alphas, distances, hit_rgb = hits.alphas, hits.distances, hits.rgb
     weights = hit_gradients.weights
     feature_count = features.shape[1]
-    t = 1.0
+    transmittance = 1.0
     median = -1
     for k in range(counts[r]):
         alpha = np.float64(alphas[hits.starts[r] + k])
-        weights[first + k] = alpha * t
-        if t > 0.5 and t * (1.0 - alpha) <= 0.5:
+        weights[first + k] = alpha * transmittance
+        if transmittance > 0.5 and transmittance * (1.0 - alpha) <= 0.5:
             median = k
-        t *= 1.0 - alpha
+        transmittance *= 1.0 - alpha
     g0, g1, g2 = (
         np.float64(output_gradients.rgb[r, 0]),
         np.float64(output_gradients.rgb[r, 1]),
@@ -92,29 +92,29 @@ def backward_ray(
     ox, oy, oz = ray_origin(rays, r)
     # What lies behind the current hit, as the gradient sees it: <g, C - prefix> over all channels. It is
     # summed from the back in float64: as a difference of sums it would drown behind opaque surfaces.
-    behind = np.float64(output_gradients.transmittance[r]) * t
+    behind = np.float64(output_gradients.transmittance[r]) * transmittance
     for k in range(counts[r] - 1, -1, -1):
         e = hits.starts[r] + k
         out = first + k
         i = hits.ids[e]
         alpha = np.float64(alphas[e])
         weight = np.float64(weights[out])
-        value = g0 * hit_rgb[e, 0] + g1 * hit_rgb[e, 1] + g2 * hit_rgb[e, 2]
+        g_weight = g0 * hit_rgb[e, 0] + g1 * hit_rgb[e, 1] + g2 * hit_rgb[e, 2]
         gt = 0.0
-        through = weight / alpha
+        transmittance_before = weight / alpha
         if output_gradients.has_geometry:
-            value += gd * ts[e]
+            g_weight += gd * distances[e]
             gt = gd * weight
             n0, n1, n2 = primitive_vector(records[i], NORMAL)
             x, y, z = primitive_vector(records[i], MEAN)
             side = facing_sign((x - ox, y - oy, z - oz), (n0, n1, n2), limits)
-            value += side * (gn0 * n0 + gn1 * n1 + gn2 * n2)
+            g_weight += side * (gn0 * n0 + gn1 * n1 + gn2 * n2)
             if k == median:
                 gt += gm
         for f in range(feature_count):
-            value += np.float64(output_gradients.features[r, f]) * features[i, f]
-        g_alpha = through * value - behind / (1.0 - alpha)
-        behind += weight * value
+            g_weight += np.float64(output_gradients.features[r, f]) * features[i, f]
+        g_alpha = transmittance_before * g_weight - behind / (1.0 - alpha)
+        behind += weight * g_weight
         hit_gradients.ids[out] = i
         flags = np.int64(r)
         if hit_rgb[e, 0] <= 0.0:
@@ -272,14 +272,14 @@ def reduce_hits_chunk(
             s_tau, s_tau_u, s_tau_v = s_tau + tau, s_tau_u + tau * u, s_tau_v + tau * v
             s_w += w
             s_error += w * output_gradients.ray_errors[r]
-            by_color = hit_color_gradient(hit_gradients.ray_flags[e], r, w, output_gradients.rgb)
+            grad_color = hit_color_gradient(hit_gradients.ray_flags[e], r, w, output_gradients.rgb)
             if basis_count == 1:  # the value of the basis comes in the end
                 for channel in range(3):
-                    sh_sum[0, channel] += by_color[channel]
+                    sh_sum[0, channel] += grad_color[channel]
             else:
                 view = eval_ray_view_basis(basis, basis_count, to_mean, direction, ray_t_view_origin(rays, r))
-                add_sh_gradient(sh_sum, basis, basis_count, by_color)
-                write_basis_gradient(basis, scene.sh, i, basis_count, by_color)
+                add_sh_gradient(sh_sum, basis, basis_count, grad_color)
+                write_basis_gradient(basis, scene.sh, i, basis_count, grad_color)
                 m_x, m_y, m_z = mean_gradient(basis, basis_count, view)
                 s_m0, s_m1, s_m2 = s_m0 + m_x, s_m1 + m_y, s_m2 + m_z
             if output_gradients.has_geometry:

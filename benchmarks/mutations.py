@@ -1,0 +1,470 @@
+"""Mutation testing of modules whose mistakes would go unseen: each change of their code must fail a test.
+
+    python -m benchmarks.mutations resolver              # every mutant of a subject, and which survive
+    python -m benchmarks.mutations fences --list         # the mutants alone
+    python -m benchmarks.mutations reference --lines reference.py:143-190
+
+A process imports the tests and forks for each mutant; the fork exchanges the code of the changed function and
+runs the tests that reach the changed statement, found by the coverage of one run without changes. What is
+evaluated at import, such as the defaults of fields, is changed in forks that import everything themselves.
+
+Changes are of the syntax tree, and of the SQL in strings, which the usual tools leave alone. Texts with
+spaces are messages and stay as they are.
+"""
+
+import argparse
+import ast
+import contextlib
+import importlib
+import importlib.machinery
+import io
+import json
+import os
+import re
+import select
+import signal
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from types import FunctionType
+from typing import Any
+
+ROOT = Path(__file__).resolve().parent.parent
+PYTEST = ("-q", "-p", "no:cacheprovider", "-p", "anyio", "-W", "ignore::pytest.PytestAssertRewriteWarning")
+"""Without the plugins that only other tests need, see :func:`main`."""
+MIN_SECONDS = 40.0
+"""Limit of one mutant's tests, beyond which it counts as killed; longer tests have four times their time."""
+
+
+@dataclass(frozen=True)
+class Subject:
+    """What is mutated, and the tests that must notice.
+
+    Args:
+        functions: module, relative to the root, -> names of its functions and classes; none means all.
+        tests: arguments of pytest.
+        preload: heavy modules that are imported once.
+    """
+
+    functions: dict[str, tuple[str, ...]]
+    tests: tuple[str, ...]
+    preload: tuple[str, ...]
+
+
+SUBJECTS = {
+    "resolver": Subject(
+        {"engine/runs/config.py": (), "engine/settings/nested_options.py": ()},
+        (
+            "tests/cli/test_settings_resolution.py",
+            "tests/test_renamed_settings.py",
+            "tests/test_settings_catalog.py",
+            "tests/evaluate/test_trained_background.py",
+        ),
+        ("numpy", "pydantic", "click", "torch", "numba", "fastapi", "psycopg", "httpx"),
+    ),
+    "fences": Subject(
+        {
+            "workers/queue/attempts.py": (),
+            "workers/queue/job_endings.py": (),
+            "workers/queue/recovery.py": (),
+            "workers/queue/storage_leases.py": (),
+            "workers/queue/jobs.py": ("get_job", "cancel_job", "retry_job", "requeue_job"),
+        },
+        ("tests/queue", "-k", "not later-tables"),
+        ("numpy", "pydantic", "psycopg", "psycopg_pool", "procrastinate", "anyio"),
+    ),
+    "reference": Subject(
+        {"engine/trace/reference.py": (), "engine/trace/reference_tracer.py": ()},
+        (
+            "tests/trace/test_conformance.py",
+            "tests/trace/test_closed_forms.py",
+            "tests/trace/test_empty.py",
+            "tests/trace/test_reference_comparison.py",
+            "tests/trace/test_finite_differences.py",
+        ),
+        ("numpy", "pydantic", "torch", "numba", "scipy"),
+    ),
+}
+
+_COMPARISONS: dict[type[ast.cmpop], type[ast.cmpop]] = {
+    ast.Lt: ast.LtE, ast.LtE: ast.Lt, ast.Gt: ast.GtE, ast.GtE: ast.Gt, ast.Eq: ast.NotEq, ast.NotEq: ast.Eq,
+    ast.Is: ast.IsNot, ast.IsNot: ast.Is, ast.In: ast.NotIn, ast.NotIn: ast.In,
+}  # fmt: skip
+_OPERATORS: dict[type[ast.operator], type[ast.operator]] = {
+    ast.Add: ast.Sub, ast.Sub: ast.Add, ast.Mult: ast.Div, ast.Div: ast.Mult, ast.FloorDiv: ast.Div,
+    ast.Mod: ast.Mult, ast.Pow: ast.Mult, ast.BitAnd: ast.BitOr, ast.BitOr: ast.BitAnd,
+}  # fmt: skip
+_SQL = re.compile(r"\b(SELECT|UPDATE|INSERT INTO|DELETE FROM)\b")
+_SQL_CHANGES: tuple[tuple[str, str], ...] = (
+    (r"(?<=[\w)]) AND (?!now|clock)", " OR "), (r" OR ", " AND "), (r"\bNOT (?=heartbeat)", ""),
+    (r" <> ", " = "), (r" < ", " <= "), (r" > ", " < "), (r" \+ (?=\w)", " - "), (r" - (?=\w)", " + "),
+    (r"FOR UPDATE( SKIP LOCKED)?", ""), (r" SKIP LOCKED", ""), (r"'(\w+)'", "'other'"), (r"\bmax\(", "min("),
+    (r"\bmin\(", "max("), (r"DO NOTHING", "DO UPDATE SET sha256 = 'x'"),
+    (r"(?<=WHERE )(?=\w)", "NOT "), (r"WHERE (?!.*WHERE)", "WHERE TRUE OR "),
+)  # fmt: skip
+Change = Callable[[], str]
+
+
+@dataclass(frozen=True)
+class Mutant:
+    """One change of a module.
+
+    Args:
+        path: of the module, relative to the root.
+        line: of the change.
+        statement: first and last line of the statement it is in, without the body; None at import.
+        text: what is changed to what.
+        source: of the changed module.
+    """
+
+    path: str
+    line: int
+    statement: tuple[int, int] | None
+    text: str
+    source: str
+
+
+def mutants_of(path: str, names: Sequence[str]) -> Iterator[Mutant]:
+    """Yield the mutants of a module, or of the functions and classes of ``names``."""
+    source = (ROOT / path).read_text(encoding="utf-8")
+    found = list(_changes(ast.parse(source), names))
+    for index, (node, statement, _change) in enumerate(found):
+        tree = ast.parse(source)
+        _node, _statement, change = list(_changes(tree, names))[index]
+        text = change()
+        line = node.target.lineno if isinstance(node, ast.comprehension) else node.lineno
+        yield Mutant(path, line, statement, text, ast.unparse(ast.fix_missing_locations(tree)))
+
+
+def _changes(tree: ast.Module, names: Sequence[str]) -> Iterator[tuple[Any, tuple[int, int] | None, Change]]:
+    """Yield the nodes of a tree with the changes that can be made in place."""
+    for top in tree.body:
+        if names and getattr(top, "name", None) not in names:
+            continue
+        if isinstance(top, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):  # constants are no logic
+            yield from _changes_below(top, None)
+
+
+def _changes_below(
+    node: ast.AST, statement: tuple[int, int] | None, parent: Any = None
+) -> Iterator[tuple[Any, tuple[int, int] | None, Change]]:
+    if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+        statement = (node.body[0].lineno, node.end_lineno or node.lineno)
+    elif isinstance(node, ast.stmt) and statement is not None:
+        body = getattr(node, "body", None)
+        statement = (node.lineno, body[0].lineno - 1 if body else node.end_lineno or node.lineno)
+        statement = (statement[0], max(statement))
+    for change in _changes_of(node, parent):
+        yield node, statement, change
+    skipped = {"annotation", "returns", "decorator_list", "bases"}
+    for name, value in ast.iter_fields(node):
+        if name in skipped or isinstance(node, ast.JoinedStr):
+            continue
+        for child in value if isinstance(value, list) else [value]:
+            is_docstring = isinstance(child, ast.Expr) and isinstance(child.value, ast.Constant)
+            if isinstance(child, ast.AST) and not is_docstring:
+                yield from _changes_below(child, statement, node)
+
+
+def _changes_of(node: Any, parent: Any) -> Iterator[Change]:
+    """Yield the changes of one node, children left out; each returns what it did."""
+
+    def put(holder: Any, name: str, value: Any) -> Change:
+        def change() -> str:
+            before = ast.unparse(node.test if name == "test" else node)
+            setattr(holder, name, value)
+            after = ast.unparse(node.test if name == "test" else node)
+            return f"{_short(before)} -> {_short(after)}"
+
+        return change
+
+    def become(new: Callable[[], ast.AST]) -> Change:
+        def change() -> str:
+            before, made = ast.unparse(node), ast.fix_missing_locations(ast.copy_location(new(), node))
+            for name, value in ast.iter_fields(parent):
+                if value is node:
+                    setattr(parent, name, made)
+                elif isinstance(value, list) and any(item is node for item in value):
+                    setattr(parent, name, [made if item is node else item for item in value])
+            return f"{_short(before)} -> {_short(ast.unparse(made))}"
+
+        return change
+
+    if isinstance(node, ast.Compare):
+        for index, operator in enumerate(node.ops):
+            if type(operator) in _COMPARISONS:
+                ops = [*node.ops[:index], _COMPARISONS[type(operator)](), *node.ops[index + 1 :]]
+                yield put(node, "ops", ops)
+    elif isinstance(node, ast.BinOp | ast.AugAssign) and type(node.op) in _OPERATORS:
+        yield put(node, "op", _OPERATORS[type(node.op)]())
+    elif isinstance(node, ast.BoolOp):
+        yield put(node, "op", ast.And() if isinstance(node.op, ast.Or) else ast.Or())
+    elif isinstance(node, ast.UnaryOp):
+        yield become(lambda: node.operand)
+    elif isinstance(node, ast.Constant) and not isinstance(parent, ast.Subscript | ast.Expr):
+        yield from (put(node, "value", value) for value in _other_values(node.value))
+    elif isinstance(node, ast.Return) and node.value is not None:
+        if not (isinstance(node.value, ast.Constant) and node.value.value is None):
+            yield put(node, "value", ast.Constant(None))
+    elif isinstance(node, ast.Expr | ast.Raise | ast.Break | ast.Continue):
+        yield become(ast.Pass)
+    if isinstance(node, ast.AugAssign):
+        yield become(ast.Pass)
+    if isinstance(node, ast.If | ast.IfExp):
+        yield put(node, "test", ast.Constant(True))
+        yield put(node, "test", ast.Constant(False))
+    elif isinstance(node, ast.comprehension) and node.ifs:
+        yield put(node, "ifs", [])
+    elif isinstance(node, ast.Call):
+        for index, keyword in enumerate(node.keywords):
+            if keyword.arg is not None and keyword.arg != "description":
+                yield put(node, "keywords", [*node.keywords[:index], *node.keywords[index + 1 :]])
+
+
+def _other_values(value: object) -> Iterator[object]:
+    if isinstance(value, bool):
+        yield not value
+    elif isinstance(value, int | float):
+        yield value + 1
+    elif isinstance(value, str) and _SQL.search(value):
+        for pattern, other in _SQL_CHANGES:
+            for match in re.finditer(pattern, value, re.DOTALL):
+                yield value[: match.start()] + other + value[match.end() :]
+        yield from _dropped_assignments(value)
+    elif isinstance(value, str) and value and " " not in value:
+        yield value + "X"
+
+
+def _dropped_assignments(query: str) -> Iterator[str]:
+    """Yield an UPDATE with each of its assignments left out, where it has several."""
+    match = re.search(r"\bSET\b(.*?)(?=\bWHERE\b)", query, re.DOTALL)
+    if not query.lstrip().startswith("UPDATE") or match is None:
+        return
+    parts = re.split(r",(?![^()]*\))", match[1])
+    for index in range(len(parts) if len(parts) > 1 else 0):
+        kept = ",".join(part for at, part in enumerate(parts) if at != index)
+        yield f"{query[: match.start(1)]}{kept} {query[match.end(1) :]}"
+
+
+def _short(text: str) -> str:
+    return " ".join(text.split())
+
+
+class _Coverage:
+    """A plugin of pytest that notes the lines that each test runs, and how long it takes."""
+
+    def __init__(self, files: Sequence[Path]) -> None:
+        import coverage
+
+        self._coverage = coverage.Coverage(
+            data_file=None, config_file=False, include=[str(file) for file in files]
+        )
+        self._files = files
+        self._begun = 0.0
+        self.seconds: dict[str, float] = {}
+        self._coverage.start()
+
+    def pytest_runtest_logstart(self, nodeid: str) -> None:
+        """Begin the lines of a test."""
+        self._coverage.switch_context(nodeid)
+        self._begun = time.perf_counter()
+
+    def pytest_runtest_logfinish(self, nodeid: str) -> None:
+        """End them."""
+        self.seconds[nodeid] = time.perf_counter() - self._begun
+        self._coverage.switch_context("")
+
+    def lines(self) -> dict[str, dict[int, list[str]]]:
+        """Return the tests of each line of each file."""
+        self._coverage.stop()
+        data = self._coverage.get_data()
+        return {str(file.relative_to(ROOT)): data.contexts_by_lineno(str(file)) for file in self._files}
+
+
+def _run_tests(arguments: Sequence[str], plugins: Sequence[object]) -> int:
+    """Run pytest without output; its exit status."""
+    import pytest
+
+    with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
+        return int(pytest.main([*PYTEST, *arguments], plugins=list(plugins)))
+
+
+def _replace_source(path: Path, source: str) -> None:
+    """Have the module at ``path`` imported from ``source``."""
+    read = importlib.machinery.SourceFileLoader.get_data
+    sys.dont_write_bytecode = True
+
+    def get_data(loader: importlib.machinery.SourceFileLoader, wanted: str) -> bytes:
+        file = Path(wanted)
+        if file.suffix == ".pyc" and file.name.startswith(f"{path.stem}."):
+            raise OSError("bytecode of the unchanged module")
+        return source.encode() if file.resolve() == path else read(loader, wanted)
+
+    importlib.machinery.SourceFileLoader.get_data = get_data  # type: ignore[method-assign]
+
+
+def _exchange_code(path: Path, source: str) -> None:
+    """Give the functions of the imported module at ``path`` the code that ``source`` has for them."""
+    module = sys.modules["octasplat." + ".".join(path.relative_to(ROOT).with_suffix("").parts)]
+    changed = type(module)(module.__name__)
+    sys.modules["changed"] = changed
+    assert module.__file__ is not None
+    loader = importlib.machinery.SourceFileLoader(module.__name__, module.__file__)
+    if module.__spec__ is not None and isinstance(
+        module.__spec__.loader, importlib.machinery.SourceFileLoader
+    ):
+        loader = module.__spec__.loader
+    exec(loader.source_to_code(source.encode(), module.__file__), changed.__dict__)
+    for name, value in vars(changed).items():
+        if getattr(value, "__module__", None) != module.__name__:
+            continue
+        before = getattr(module, name)
+        if isinstance(value, type):
+            for attribute, inner in vars(value).items():
+                _exchange_function(vars(before).get(attribute), inner)
+        else:
+            _exchange_function(before, value)
+
+
+def _exchange_function(before: Any, after: Any) -> None:
+    """Give a function, or what is wrapped in it, the code and defaults of another one."""
+    if hasattr(before, "cache_clear"):
+        before.cache_clear()
+    before, after = _innermost(before), _innermost(after)
+    if isinstance(before, FunctionType) and isinstance(after, FunctionType):
+        before.__code__ = after.__code__
+        before.__defaults__, before.__kwdefaults__ = after.__defaults__, after.__kwdefaults__
+
+
+def _innermost(value: Any) -> Any:
+    if isinstance(value, property):
+        value = value.fget
+    while hasattr(value, "__wrapped__") or hasattr(value, "wrapped"):  # by functools, by pydantic
+        value = getattr(value, "__wrapped__", None) or value.wrapped
+    return getattr(value, "__func__", value)
+
+
+def _in_fork(work: Callable[[], object], seconds: float) -> Any:
+    """Return what ``work`` returns in a fork, as JSON; None if it takes too long or dies."""
+    reader, writer = os.pipe()
+    child = os.fork()
+    if child == 0:
+        os.close(reader)
+        silent = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(silent, 1)
+        os.dup2(silent, 2)
+        try:
+            with os.fdopen(writer, "w") as out:
+                json.dump(work(), out)
+        finally:
+            os._exit(0)
+    os.close(writer)
+    chunks: list[bytes] = []
+    deadline = time.monotonic() + seconds
+    while select.select([reader], [], [], max(0.0, deadline - time.monotonic()))[0]:
+        chunk = os.read(reader, 1 << 16)
+        if not chunk:
+            break
+        chunks.append(chunk)
+    else:
+        os.kill(child, signal.SIGINT)  # fixtures stop what they started
+        if not select.select([reader], [], [], 15.0)[0]:
+            os.kill(child, signal.SIGKILL)
+    os.close(reader)
+    os.waitpid(child, 0)
+    try:
+        return json.loads(b"".join(chunks))
+    except ValueError:
+        return None
+
+
+def main() -> None:
+    """Run the mutants of one subject and print the survivors."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("subject", choices=SUBJECTS)
+    parser.add_argument("--list", action="store_true", help="print the mutants; run nothing")
+    parser.add_argument("--lines", help="only the mutants of FILE:FIRST-LAST, FILE by its last part")
+    arguments = parser.parse_args()
+    subject = SUBJECTS[arguments.subject]
+    mutants = [mutant for path, names in subject.functions.items() for mutant in mutants_of(path, names)]
+    if arguments.lines:
+        name, _, lines = arguments.lines.partition(":")
+        first, _, last = lines.partition("-")
+        chosen = range(int(first), int(last or first) + 1)
+        mutants = [m for m in mutants if m.path.endswith(f"/{name}") and m.line in chosen]
+    if arguments.list:
+        for mutant in mutants:
+            print(f"{mutant.path}:{mutant.line}: {mutant.text}")
+        return
+    os.chdir(ROOT)
+    sys.path.insert(0, str(ROOT))
+    os.environ["PYTEST_DISABLE_PLUGIN_AUTOLOAD"] = "1"
+    for module in ("pytest", "coverage", *subject.preload):
+        importlib.import_module(module)
+
+    def baseline() -> object:
+        plugin = _Coverage([ROOT / path for path in subject.functions])
+        status = _run_tests(subject.tests, [plugin])
+        return status, plugin.lines(), plugin.seconds
+
+    status, lines, seconds = _in_fork(baseline, 1200.0) or (None, {}, {})
+    if status != 0:
+        sys.exit(f"The tests do not pass without a change (status {status}).")
+    print(f"{len(seconds)} tests, {sum(seconds.values()):.0f} s; {len(mutants)} mutants", flush=True)
+    counts = {path: [0, 0] for path in subject.functions}
+    mutants.sort(key=lambda mutant: mutant.statement is not None)
+    is_warm = False
+    for mutant in mutants:
+        if mutant.statement is not None and not is_warm:
+            is_warm = True
+            _import_tests(subject)
+        change = _exchange_code if is_warm else _replace_source
+        tests = _tests_of(mutant, lines[mutant.path], seconds)
+        limit = max(MIN_SECONDS, 4 * sum(seconds[test] for test in tests))
+
+        def run(
+            mutant: Mutant = mutant,
+            tests: Sequence[str] = tests,
+            change: Callable[[Path, str], None] = change,
+        ) -> int:
+            change(ROOT / mutant.path, mutant.source)
+            return _run_tests(["-x", *tests], [])
+
+        has_survived = not tests or _in_fork(run, limit) == 0
+        counts[mutant.path][has_survived] += 1
+        if has_survived:
+            reached = f"{len(tests)} tests" if tests else "no test reaches it"
+            print(f"survived: {mutant.path}:{mutant.line}: {mutant.text} ({reached})", flush=True)
+    for path, (killed, survived) in counts.items():
+        print(f"{path}: {killed + survived} mutants, {killed} killed, {survived} survived")
+
+
+def _import_tests(subject: Subject) -> None:
+    """Import the tests and all they need; check that exchanging code for the same code changes nothing."""
+    if _run_tests([*subject.tests, "--collect-only"], []) != 0:
+        sys.exit("The tests cannot be collected.")
+
+    def exchange_all() -> int:
+        for path in subject.functions:
+            _exchange_code(ROOT / path, ast.unparse(ast.parse((ROOT / path).read_text(encoding="utf-8"))))
+        return _run_tests(subject.tests, [])
+
+    if _in_fork(exchange_all, 1200.0) != 0:
+        sys.exit("The tests do not pass with exchanged code.")
+
+
+def _tests_of(mutant: Mutant, tests_by_line: dict[str, list[str]], seconds: dict[str, float]) -> list[str]:
+    """Return the tests that reach a mutant, quickest first."""
+    if mutant.statement is None:
+        return sorted(seconds, key=seconds.__getitem__)
+    first, last = mutant.statement
+    found = {test for line in range(first, last + 1) for test in tests_by_line.get(str(line), ())}
+    return sorted(found - {""}, key=seconds.__getitem__)
+
+
+if __name__ == "__main__":
+    main()
