@@ -4,9 +4,9 @@
     python -m benchmarks.mutations fences --list         # the mutants alone
     python -m benchmarks.mutations reference --lines reference.py:143-190
 
-A process imports the tests and forks for each mutant; the fork exchanges the code of the changed function and
-runs the tests that reach the changed statement, found by the coverage of one run without changes. What is
-evaluated at import, such as the defaults of fields, is changed in forks that import everything themselves.
+The tests run once in this process, which notes the lines that each of them reaches. For each mutant it forks;
+the fork exchanges the code of the changed function and runs the tests that reach the changed statement, the
+quickest first. Code of functions is changed, not what is evaluated at import.
 
 Changes are of the syntax tree, and of the SQL in strings, which the usual tools leave alone. Texts with
 spaces are messages and stay as they are.
@@ -14,14 +14,10 @@ spaces are messages and stay as they are.
 
 import argparse
 import ast
-import contextlib
-import importlib
 import importlib.machinery
-import io
-import json
 import os
 import re
-import select
+import resource
 import signal
 import sys
 import time
@@ -31,11 +27,16 @@ from pathlib import Path
 from types import FunctionType
 from typing import Any
 
+import coverage
+import pytest
+
 ROOT = Path(__file__).resolve().parent.parent
-PYTEST = ("-q", "-p", "no:cacheprovider", "-p", "anyio", "-W", "ignore::pytest.PytestAssertRewriteWarning")
+PYTEST = ("-s", "-p", "no:cacheprovider", "-p", "no:terminal", "-p", "anyio", "-o", "addopts=")
 """Without the plugins that only other tests need, see :func:`main`."""
-MIN_SECONDS = 40.0
-"""Limit of one mutant's tests, beyond which it counts as killed; longer tests have four times their time."""
+MAX_CPU_SECONDS = 60
+"""CPU time of one mutant's tests, beyond which it counts as killed; an endless loop takes no less."""
+MAX_SECONDS = 1200.0
+"""Likewise, by the clock."""
 
 
 @dataclass(frozen=True)
@@ -45,12 +46,10 @@ class Subject:
     Args:
         functions: module, relative to the root, -> names of its functions and classes; none means all.
         tests: arguments of pytest.
-        preload: heavy modules that are imported once.
     """
 
     functions: dict[str, tuple[str, ...]]
     tests: tuple[str, ...]
-    preload: tuple[str, ...]
 
 
 SUBJECTS = {
@@ -62,21 +61,30 @@ SUBJECTS = {
             "tests/test_settings_catalog.py",
             "tests/evaluate/test_trained_background.py",
         ),
-        ("numpy", "pydantic", "click", "torch", "numba", "fastapi", "psycopg", "httpx"),
     ),
     "fences": Subject(
         {
-            "workers/queue/attempts.py": (),
-            "workers/queue/job_endings.py": (),
+            "workers/queue/attempts.py": (
+                "Attempt.heartbeat",
+                "Attempt.read_state",
+                "Attempt._fenced_transaction",
+                "Attempt._check_fence",
+                "claim",
+            ),
             "workers/queue/recovery.py": (),
-            "workers/queue/storage_leases.py": (),
-            "workers/queue/jobs.py": ("get_job", "cancel_job", "retry_job", "requeue_job"),
+            "workers/queue/job_endings.py": ("recover_attempt",),
+            "workers/queue/jobs.py": ("get_job",),
+            "workers/queue/storage_leases.py": (
+                "StorageLease",
+                "expire_stale_leases",
+                "_are_being_removed",
+                "_removal_count",
+            ),
         },
         ("tests/queue", "-k", "not later-tables"),
-        ("numpy", "pydantic", "psycopg", "psycopg_pool", "procrastinate", "anyio"),
     ),
     "reference": Subject(
-        {"engine/trace/reference.py": (), "engine/trace/reference_tracer.py": ()},
+        {"engine/trace/reference.py": ("trace_reference", "_hit_count")},
         (
             "tests/trace/test_conformance.py",
             "tests/trace/test_closed_forms.py",
@@ -84,7 +92,6 @@ SUBJECTS = {
             "tests/trace/test_reference_comparison.py",
             "tests/trace/test_finite_differences.py",
         ),
-        ("numpy", "pydantic", "torch", "numba", "scipy"),
     ),
 }
 
@@ -114,20 +121,20 @@ class Mutant:
     Args:
         path: of the module, relative to the root.
         line: of the change.
-        statement: first and last line of the statement it is in, without the body; None at import.
+        statement: first and last line of the statement it is in, without its body.
         text: what is changed to what.
         source: of the changed module.
     """
 
     path: str
     line: int
-    statement: tuple[int, int] | None
+    statement: tuple[int, int]
     text: str
     source: str
 
 
 def mutants_of(path: str, names: Sequence[str]) -> Iterator[Mutant]:
-    """Yield the mutants of a module, or of the functions and classes of ``names``."""
+    """Yield the mutants of a module, or of what ``names`` lists of it."""
     source = (ROOT / path).read_text(encoding="utf-8")
     found = list(_changes(ast.parse(source), names))
     for index, (node, statement, _change) in enumerate(found):
@@ -138,24 +145,34 @@ def mutants_of(path: str, names: Sequence[str]) -> Iterator[Mutant]:
         yield Mutant(path, line, statement, text, ast.unparse(ast.fix_missing_locations(tree)))
 
 
-def _changes(tree: ast.Module, names: Sequence[str]) -> Iterator[tuple[Any, tuple[int, int] | None, Change]]:
+def _changes(tree: ast.Module, names: Sequence[str]) -> Iterator[tuple[Any, tuple[int, int], Change]]:
     """Yield the nodes of a tree with the changes that can be made in place."""
     for top in tree.body:
-        if names and getattr(top, "name", None) not in names:
-            continue
-        if isinstance(top, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):  # constants are no logic
+        if not isinstance(top, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
+            continue  # constants are no logic
+        if not names or top.name in names:
             yield from _changes_below(top, None)
+        elif isinstance(top, ast.ClassDef):
+            for method in top.body:
+                if f"{top.name}.{getattr(method, 'name', None)}" in names:
+                    yield from _changes_below(method, None)
 
 
 def _changes_below(
     node: ast.AST, statement: tuple[int, int] | None, parent: Any = None
-) -> Iterator[tuple[Any, tuple[int, int] | None, Change]]:
+) -> Iterator[tuple[Any, tuple[int, int], Change]]:
+    if isinstance(node, ast.ClassDef):
+        for method in node.body:
+            if isinstance(method, ast.FunctionDef | ast.AsyncFunctionDef):
+                yield from _changes_below(method, None, node)
+        return
     if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
         statement = (node.body[0].lineno, node.end_lineno or node.lineno)
     elif isinstance(node, ast.stmt) and statement is not None:
         body = getattr(node, "body", None)
         statement = (node.lineno, body[0].lineno - 1 if body else node.end_lineno or node.lineno)
         statement = (statement[0], max(statement))
+    assert statement is not None
     for change in _changes_of(node, parent):
         yield node, statement, change
     skipped = {"annotation", "returns", "decorator_list", "bases"}
@@ -252,59 +269,6 @@ def _short(text: str) -> str:
     return " ".join(text.split())
 
 
-class _Coverage:
-    """A plugin of pytest that notes the lines that each test runs, and how long it takes."""
-
-    def __init__(self, files: Sequence[Path]) -> None:
-        import coverage
-
-        self._coverage = coverage.Coverage(
-            data_file=None, config_file=False, include=[str(file) for file in files]
-        )
-        self._files = files
-        self._begun = 0.0
-        self.seconds: dict[str, float] = {}
-        self._coverage.start()
-
-    def pytest_runtest_logstart(self, nodeid: str) -> None:
-        """Begin the lines of a test."""
-        self._coverage.switch_context(nodeid)
-        self._begun = time.perf_counter()
-
-    def pytest_runtest_logfinish(self, nodeid: str) -> None:
-        """End them."""
-        self.seconds[nodeid] = time.perf_counter() - self._begun
-        self._coverage.switch_context("")
-
-    def lines(self) -> dict[str, dict[int, list[str]]]:
-        """Return the tests of each line of each file."""
-        self._coverage.stop()
-        data = self._coverage.get_data()
-        return {str(file.relative_to(ROOT)): data.contexts_by_lineno(str(file)) for file in self._files}
-
-
-def _run_tests(arguments: Sequence[str], plugins: Sequence[object]) -> int:
-    """Run pytest without output; its exit status."""
-    import pytest
-
-    with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
-        return int(pytest.main([*PYTEST, *arguments], plugins=list(plugins)))
-
-
-def _replace_source(path: Path, source: str) -> None:
-    """Have the module at ``path`` imported from ``source``."""
-    read = importlib.machinery.SourceFileLoader.get_data
-    sys.dont_write_bytecode = True
-
-    def get_data(loader: importlib.machinery.SourceFileLoader, wanted: str) -> bytes:
-        file = Path(wanted)
-        if file.suffix == ".pyc" and file.name.startswith(f"{path.stem}."):
-            raise OSError("bytecode of the unchanged module")
-        return source.encode() if file.resolve() == path else read(loader, wanted)
-
-    importlib.machinery.SourceFileLoader.get_data = get_data  # type: ignore[method-assign]
-
-
 def _exchange_code(path: Path, source: str) -> None:
     """Give the functions of the imported module at ``path`` the code that ``source`` has for them."""
     module = sys.modules["octasplat." + ".".join(path.relative_to(ROOT).with_suffix("").parts)]
@@ -346,38 +310,109 @@ def _innermost(value: Any) -> Any:
     return getattr(value, "__func__", value)
 
 
-def _in_fork(work: Callable[[], object], seconds: float) -> Any:
-    """Return what ``work`` returns in a fork, as JSON; None if it takes too long or dies."""
-    reader, writer = os.pipe()
+def _survives(work: Callable[[], bool]) -> bool:
+    """Return what ``work`` returns in a fork; False if it takes too long or dies."""
     child = os.fork()
     if child == 0:
-        os.close(reader)
-        silent = os.open(os.devnull, os.O_WRONLY)
-        os.dup2(silent, 1)
-        os.dup2(silent, 2)
+        passed = False
         try:
-            with os.fdopen(writer, "w") as out:
-                json.dump(work(), out)
+            silent = os.open(os.devnull, os.O_WRONLY)
+            os.dup2(silent, 1)
+            os.dup2(silent, 2)
+            resource.setrlimit(resource.RLIMIT_CPU, (MAX_CPU_SECONDS, MAX_CPU_SECONDS))
+            passed = work()
         finally:
-            os._exit(0)
-    os.close(writer)
-    chunks: list[bytes] = []
-    deadline = time.monotonic() + seconds
-    while select.select([reader], [], [], max(0.0, deadline - time.monotonic()))[0]:
-        chunk = os.read(reader, 1 << 16)
-        if not chunk:
-            break
-        chunks.append(chunk)
-    else:
-        os.kill(child, signal.SIGINT)  # fixtures stop what they started
-        if not select.select([reader], [], [], 15.0)[0]:
+            os._exit(0 if passed else 1)
+    deadline = time.monotonic() + MAX_SECONDS
+    while True:
+        found, status = os.waitpid(child, os.WNOHANG)
+        if found:
+            return os.waitstatus_to_exitcode(status) == 0
+        if time.monotonic() > deadline:
             os.kill(child, signal.SIGKILL)
-    os.close(reader)
-    os.waitpid(child, 0)
-    try:
-        return json.loads(b"".join(chunks))
-    except ValueError:
-        return None
+            os.waitpid(child, 0)
+            return False
+        time.sleep(0.02)
+
+
+class MutationRun:
+    """A plugin of pytest whose loop runs all tests once, and then those of each mutant in a fork.
+
+    Args:
+        subject: what is mutated.
+        mutants: its mutants.
+    """
+
+    def __init__(self, subject: Subject, mutants: Sequence[Mutant]) -> None:
+        self._subject = subject
+        self._mutants = mutants
+        self._has_failed = False
+
+    def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
+        """Note a failure."""
+        self._has_failed |= report.failed
+
+    def pytest_runtestloop(self, session: pytest.Session) -> bool:
+        """Run the tests and the mutants; print the survivors and the counts."""
+        files = [ROOT / path for path in self._subject.functions]
+        reached, seconds = self._run_all(session.items, files)
+        if self._has_failed:
+            sys.exit("The tests do not pass without a change.")
+        items = {item.nodeid: item for item in session.items}
+
+        def exchange_same() -> bool:
+            for path in self._subject.functions:
+                source = (ROOT / path).read_text(encoding="utf-8")
+                _exchange_code(ROOT / path, ast.unparse(ast.parse(source)))
+            return self._pass(session.items)
+
+        if not _survives(exchange_same):
+            sys.exit("The tests do not pass when code is exchanged for the same code.")
+        print(f"{len(items)} tests, {sum(seconds.values()):.0f} s; {len(self._mutants)} mutants", flush=True)
+        counts = {path: [0, 0] for path in self._subject.functions}
+        for number, mutant in enumerate(self._mutants):
+            print(f"{number} of {len(self._mutants)}", end="\r", file=sys.stderr)
+            first, last = mutant.statement
+            names = {name for line in range(first, last + 1) for name in reached[mutant.path].get(line, ())}
+            tests = [items[name] for name in sorted(names - {""}, key=seconds.__getitem__)]
+
+            def run(mutant: Mutant = mutant, tests: Sequence[pytest.Item] = tests) -> bool:
+                _exchange_code(ROOT / mutant.path, mutant.source)
+                return self._pass(tests)
+
+            has_survived = not tests or _survives(run)
+            counts[mutant.path][has_survived] += 1
+            if has_survived:
+                reach = f"{len(tests)} tests" if tests else "no test reaches it"
+                print(f"survived: {mutant.path}:{mutant.line}: {mutant.text} ({reach})", flush=True)
+        for path, (killed, survived) in counts.items():
+            print(f"{path}: {killed + survived} mutants, {killed} killed, {survived} survived")
+        return True
+
+    def _run_all(
+        self, items: Sequence[pytest.Item], files: Sequence[Path]
+    ) -> tuple[dict[str, dict[int, list[str]]], dict[str, float]]:
+        """Run all tests; return the tests that reach each line of each file, and the tests' seconds."""
+        watch = coverage.Coverage(data_file=None, config_file=False, include=[str(file) for file in files])
+        seconds = {}
+        watch.start()
+        for item, after in zip(items, [*items[1:], items[0]], strict=True):
+            watch.switch_context(item.nodeid)
+            begun = time.perf_counter()
+            item.config.hook.pytest_runtest_protocol(item=item, nextitem=after)
+            seconds[item.nodeid] = time.perf_counter() - begun
+        watch.stop()
+        data = watch.get_data()
+        return {str(file.relative_to(ROOT)): data.contexts_by_lineno(str(file)) for file in files}, seconds
+
+    def _pass(self, items: Sequence[pytest.Item]) -> bool:
+        """Return whether tests pass; ends at the first that does not."""
+        items[0].session._setupstate.teardown_exact(items[0])
+        for item, after in zip(items, [*items[1:], items[0]], strict=True):
+            item.config.hook.pytest_runtest_protocol(item=item, nextitem=after)
+            if self._has_failed:
+                return False
+        return True
 
 
 def main() -> None:
@@ -403,67 +438,7 @@ def main() -> None:
     os.chdir(ROOT)
     sys.path.insert(0, str(ROOT))
     os.environ["PYTEST_DISABLE_PLUGIN_AUTOLOAD"] = "1"
-    for module in ("pytest", "coverage", *subject.preload):
-        importlib.import_module(module)
-
-    def baseline() -> object:
-        plugin = _Coverage([ROOT / path for path in subject.functions])
-        status = _run_tests(subject.tests, [plugin])
-        return status, plugin.lines(), plugin.seconds
-
-    status, lines, seconds = _in_fork(baseline, 1200.0) or (None, {}, {})
-    if status != 0:
-        sys.exit(f"The tests do not pass without a change (status {status}).")
-    print(f"{len(seconds)} tests, {sum(seconds.values()):.0f} s; {len(mutants)} mutants", flush=True)
-    counts = {path: [0, 0] for path in subject.functions}
-    mutants.sort(key=lambda mutant: mutant.statement is not None)
-    is_warm = False
-    for mutant in mutants:
-        if mutant.statement is not None and not is_warm:
-            is_warm = True
-            _import_tests(subject)
-        change = _exchange_code if is_warm else _replace_source
-        tests = _tests_of(mutant, lines[mutant.path], seconds)
-        limit = max(MIN_SECONDS, 4 * sum(seconds[test] for test in tests))
-
-        def run(
-            mutant: Mutant = mutant,
-            tests: Sequence[str] = tests,
-            change: Callable[[Path, str], None] = change,
-        ) -> int:
-            change(ROOT / mutant.path, mutant.source)
-            return _run_tests(["-x", *tests], [])
-
-        has_survived = not tests or _in_fork(run, limit) == 0
-        counts[mutant.path][has_survived] += 1
-        if has_survived:
-            reached = f"{len(tests)} tests" if tests else "no test reaches it"
-            print(f"survived: {mutant.path}:{mutant.line}: {mutant.text} ({reached})", flush=True)
-    for path, (killed, survived) in counts.items():
-        print(f"{path}: {killed + survived} mutants, {killed} killed, {survived} survived")
-
-
-def _import_tests(subject: Subject) -> None:
-    """Import the tests and all they need; check that exchanging code for the same code changes nothing."""
-    if _run_tests([*subject.tests, "--collect-only"], []) != 0:
-        sys.exit("The tests cannot be collected.")
-
-    def exchange_all() -> int:
-        for path in subject.functions:
-            _exchange_code(ROOT / path, ast.unparse(ast.parse((ROOT / path).read_text(encoding="utf-8"))))
-        return _run_tests(subject.tests, [])
-
-    if _in_fork(exchange_all, 1200.0) != 0:
-        sys.exit("The tests do not pass with exchanged code.")
-
-
-def _tests_of(mutant: Mutant, tests_by_line: dict[str, list[str]], seconds: dict[str, float]) -> list[str]:
-    """Return the tests that reach a mutant, quickest first."""
-    if mutant.statement is None:
-        return sorted(seconds, key=seconds.__getitem__)
-    first, last = mutant.statement
-    found = {test for line in range(first, last + 1) for test in tests_by_line.get(str(line), ())}
-    return sorted(found - {""}, key=seconds.__getitem__)
+    sys.exit(pytest.main([*PYTEST, *subject.tests], plugins=[MutationRun(subject, mutants)]))
 
 
 if __name__ == "__main__":

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Float32, Float64, Int, Int64
+from jaxtyping import Float32, Int, Int64
 
 from octasplat.engine.core.errors import DatasetError
 from octasplat.engine.core.local_origin import NO_ORIGIN, Origin
@@ -18,15 +18,14 @@ from octasplat.engine.dataset.model import DatasetModel, DatasetView, Observatio
 from octasplat.engine.dataset.pixel_cache import PixelCache, file_digests, open_pixel_cache
 from octasplat.engine.dataset.ray_tables import (
     MAX_TABLE_BYTES,
-    NO_TABLE_COMPUTED,
     RayTables,
-    has_rays_everywhere,
     open_ray_tables,
     rows_per_block,
 )
 from octasplat.engine.dataset.scene_split import SceneSplit, SplitRule, SplitSource, split_scene
 from octasplat.engine.dataset.split import evaluation_split
 from octasplat.engine.dataset.training_points import training_points
+from octasplat.engine.dataset.view_rays import ViewRays, as_int64, raise_for_pixels
 from octasplat.engine.dataset.views_file import ViewsRecord, views_record
 
 MaskUse = Literal["ignore", "alpha"]
@@ -98,34 +97,12 @@ class Dataset:
         self._mask_is_alpha = masks == "alpha"
         self.has_alpha: bool = len(cache.alpha.values) > 0 or (self._mask_is_alpha and self.has_masks)
         self._cache = cache
-        self._ray_tables = tables
-        self._view_sizes: Int64[np.ndarray, "v 2"] = np.array(
-            [[view.width_px, view.height_px] for view in model.views], dtype=np.int64
-        )
-        self._view_camera: Int64[np.ndarray, " v"] = np.array(
-            [view.camera_index for view in model.views], dtype=np.int64
-        )
-        self._rotations_world_from_cam: Float64[np.ndarray, "v 3 3"] = np.stack(
-            [view.rotation_cam_from_world.T for view in model.views]
-        )
-        origins = np.stack([view.origin_world for view in model.views])
-        self._origins_world: Float32[np.ndarray, "v 3"] = origins.astype(np.float32)
-        self._pinhole_params: Float64[np.ndarray, "c 4"] = np.array(
-            [camera.pinhole_params if camera.is_pinhole else (1.0, 1.0, 0.0, 0.0) for camera in model.cameras]
-        )
-        self._has_no_table = tables.offsets == NO_TABLE_COMPUTED
-        lacks_rays = np.array([not (c.is_pinhole or has_rays_everywhere(c)) for c in model.cameras])
-        self._has_invalid_rays = self._has_no_table & lacks_rays
-        if lacks_rays.any():
-            models = sorted({model.cameras[index].model for index in np.flatnonzero(lacks_rays)})
-            self.warnings.append(
-                f"{int(lacks_rays.sum())} cameras ({', '.join(models)}) cannot un-project parts of their "
-                "images; these pixels do not count."
-            )
+        self._view_rays = ViewRays(model, tables)
+        self.warnings += self._view_rays.warnings
         self.extent: float = self.views_record.extent_world
         self.near_world: float = self._near_distances(near) if near_world is None else near_world
         self._train_pixels: Int64[np.ndarray, " train"] = np.cumsum(
-            self._view_sizes[self.train_indices].prod(axis=1)
+            self._view_rays.sizes[self.train_indices].prod(axis=1)
         )
 
     @classmethod
@@ -247,11 +224,6 @@ class Dataset:
         """Return the number of pixels of all training views, including those of weight 0."""
         return int(self._train_pixels[-1])
 
-    @property
-    def _view_arrays(self) -> gather.ViewArrays:
-        tables = self._ray_tables
-        return gather.ViewArrays(self._view_sizes, self._view_camera, tables.offsets, tables.values.values)
-
     def rays(
         self, view: Int[np.ndarray, " n"], y: Int[np.ndarray, " n"], x: Int[np.ndarray, " n"]
     ) -> RayBatch:
@@ -263,16 +235,7 @@ class Dataset:
         Raises:
             IndexError: a pixel does not exist.
         """
-        view, y, x = _as_int64(view), _as_int64(y), _as_int64(x)
-        origins = np.empty((len(view), 3), dtype=np.float32)
-        directions = np.empty((len(view), 3), dtype=np.float32)
-        bad = gather.gather_rays(
-            gather.PixelIndices(view, y, x), self._view_arrays,
-            self._rotations_world_from_cam, self._origins_world, self._pinhole_params, origins, directions,
-        )  # fmt: skip
-        self._raise_for_pixels(bad, view, y, x)
-        if self._has_no_table.any():
-            self._compute_rays(view, y, x, directions)
+        origins, directions = self._view_rays.trace(view, y, x)
         return RayBatch(origins, directions, self.near_world)
 
     def pixels(
@@ -283,24 +246,21 @@ class Dataset:
         Raises:
             IndexError: a pixel does not exist.
         """
-        view, y, x = _as_int64(view), _as_int64(y), _as_int64(x)
+        view, y, x = as_int64(view), as_int64(y), as_int64(x)
         rgb = np.empty((len(view), 3), dtype=np.float32)
         alpha = np.empty(len(view), dtype=np.float32)
         weight = np.empty(len(view), dtype=np.float32)
         values = self._cache.rgb.values
         bad = gather.gather_pixels(
-            gather.PixelIndices(view, y, x), self._view_arrays,
+            gather.PixelIndices(view, y, x), self._view_rays.arrays,
             gather.PixelPlanes(
                 self._cache.offsets, values, np.float32(np.iinfo(values.dtype).max),
                 self._cache.alpha.values, self._cache.mask.values, self._mask_is_alpha,
             ),
             rgb, alpha, weight,
         )  # fmt: skip
-        self._raise_for_pixels(bad, view, y, x)
-        if self._has_invalid_rays.any():
-            for camera, chosen in self._camera_directions(view, self._has_invalid_rays):
-                found = self.cameras[camera].directions_cam(_pixel_centres(y[chosen], x[chosen]))
-                weight[chosen[np.isnan(found).any(axis=1)]] = 0.0
+        raise_for_pixels(bad, view, y, x)
+        weight[self._view_rays.invalid_rays(view, y, x)] = 0.0
         return rgb, alpha, weight
 
     def view_rays(self, view_index: int) -> ImageRays:
@@ -310,7 +270,7 @@ class Dataset:
         for pixels, view, y, x in _iterate_row_blocks(view_index, width, height):
             directions[pixels] = self.rays(view, y, x).directions_world
         return ImageRays(
-            RayBatch(self._origins_world[[view_index]], directions, self.near_world), height, width
+            RayBatch(self._view_rays.origins_world[[view_index]], directions, self.near_world), height, width
         )
 
     def view_image(
@@ -332,50 +292,21 @@ class Dataset:
         drawn = rng.integers(0, self._train_pixels[-1], size=count, dtype=np.int64)
         which = np.searchsorted(self._train_pixels, drawn, side="right")
         view = self.train_indices[which]
-        width = self._view_sizes[view, 0]
-        inside = drawn - (self._train_pixels[which] - width * self._view_sizes[view, 1])
+        width = self._view_rays.sizes[view, 0]
+        inside = drawn - (self._train_pixels[which] - width * self._view_rays.sizes[view, 1])
         y = inside // width
         return view, y, inside - y * width
 
     def release_pages(self) -> None:
         """Release mapped pages to the system, e.g. before a stage that needs the memory."""
-        for mapped in (self._cache.rgb, self._cache.alpha, self._cache.mask, self._ray_tables.values):
+        for mapped in (self._cache.rgb, self._cache.alpha, self._cache.mask):
             mapped.release()
+        self._view_rays.release_pages()
 
     def _view_size(self, view_index: int) -> tuple[int, int]:
         if not 0 <= view_index < len(self.views):
             raise IndexError(f"there is no view {view_index} among {len(self.views)}")
         return self.views[view_index].width_px, self.views[view_index].height_px
-
-    def _raise_for_pixels(
-        self, bad: int, view: Int[np.ndarray, " n"], y: Int[np.ndarray, " n"], x: Int[np.ndarray, " n"]
-    ) -> None:
-        if bad >= 0:
-            raise IndexError(f"there is no pixel with view {view[bad]}, y {y[bad]}, x {x[bad]}")
-
-    def _camera_directions(
-        self, view: Int64[np.ndarray, " n"], selected: np.ndarray
-    ) -> list[tuple[int, Int64[np.ndarray, " m"]]]:
-        camera = self._view_camera[view]
-        chosen = np.flatnonzero(selected[camera])
-        chosen = chosen[np.argsort(camera[chosen], kind="stable")]
-        if len(chosen) == 0:
-            return []
-        groups = np.split(chosen, np.flatnonzero(np.diff(camera[chosen])) + 1)
-        return [(int(camera[group[0]]), group) for group in groups]
-
-    def _compute_rays(
-        self,
-        view: Int64[np.ndarray, " n"],
-        y: Int64[np.ndarray, " n"],
-        x: Int64[np.ndarray, " n"],
-        directions: Float32[np.ndarray, "n 3"],
-    ) -> None:
-        for camera, chosen in self._camera_directions(view, self._has_no_table):
-            found = self.cameras[camera].directions_cam(_pixel_centres(y[chosen], x[chosen]))
-            known = np.isfinite(found).all(axis=1)
-            rotations = self._rotations_world_from_cam[view[chosen[known]]]
-            directions[chosen[known]] = np.einsum("nij,nj->ni", rotations, found[known])
 
 
 def _require_masks(model: DatasetModel, root: Path, masks: MaskUse) -> None:
@@ -384,14 +315,6 @@ def _require_masks(model: DatasetModel, root: Path, masks: MaskUse) -> None:
             f"Masks are to be the alpha, but {root / 'masks'} holds none of any photograph; put them "
             f"there (as {model.views[0].name}.png) or leave --masks alpha out."
         )
-
-
-def _as_int64(values: Int[np.ndarray, " n"]) -> Int64[np.ndarray, " n"]:
-    return np.ascontiguousarray(values, dtype=np.int64)
-
-
-def _pixel_centres(y: Int64[np.ndarray, " n"], x: Int64[np.ndarray, " n"]) -> Float64[np.ndarray, "n 2"]:
-    return np.stack([x + 0.5, y + 0.5], axis=1)
 
 
 def _iterate_row_blocks(

@@ -78,18 +78,13 @@ def run(
         SceneFileError: the scene cannot be read or written.
     """
     from octasplat.engine.edit.cleaning import clean
-    from octasplat.engine.operations.scene_io import (
-        check_edited_output,
-        describe_edit,
-        open_scene,
-        write_edited_scene,
-    )
+    from octasplat.engine.operations import scene_io
     from octasplat.engine.runs.run_folder import is_run, run_camera_clearance
 
     source: Path = request.source
     if request.output is not None:
-        check_edited_output("clean", request, request.output)
-    gaussians = open_scene(source, progress)
+        scene_io.check_edited_output("clean", request, request.output)
+    gaussians = scene_io.open_scene(source, progress)
     share = request.camera_clearance
     zones = run_camera_clearance(source, share) if share > 0 and is_run(source) else None
     keep, report = clean(gaussians, request, zones)
@@ -107,8 +102,10 @@ def run(
     if request.output is None:
         return CleanResult(notes=(message,), **counts)
     stop_if(should_stop)
-    record = describe_edit("clean", options_of(CleanOptions, request), gaussians=report.kept)
-    written = write_edited_scene(source, gaussians.select(keep), request.output, progress, edit_record=record)
+    record = scene_io.describe_edit("clean", options_of(CleanOptions, request), gaussians=report.kept)
+    written = scene_io.write_edited_scene(
+        source, gaussians.select(keep), request.output, progress, edit_record=record
+    )
     return CleanResult(
         files=written.files, folder=written.folder, notes=(message, written.sentence), **counts
     )

@@ -64,16 +64,11 @@ def run(
     from octasplat.engine.core.local_origin import user_position
     from octasplat.engine.edit.selection import selection_mask
     from octasplat.engine.files import read_metadata
-    from octasplat.engine.operations.scene_io import (
-        check_edited_output,
-        describe_edit,
-        open_scene,
-        write_edited_scene,
-    )
+    from octasplat.engine.operations import scene_io
 
     source: Path = request.source
-    check_edited_output("crop", request, request.output)
-    gaussians, origin = open_scene(source, progress), read_metadata(source).origin_world
+    scene_io.check_edited_output("crop", request, request.output)
+    gaussians, origin = scene_io.open_scene(source, progress), read_metadata(source).origin_world
     keep = selection_mask(gaussians, request, origin)
     if not keep.any():
         means = gaussians.means_world
@@ -85,8 +80,10 @@ def run(
         )
     kept, count = int(keep.sum()), len(keep)
     stop_if(should_stop)
-    record = describe_edit("crop", options_of(CropOptions, request), gaussians=kept)
-    written = write_edited_scene(source, gaussians.select(keep), request.output, progress, edit_record=record)
+    record = scene_io.describe_edit("crop", options_of(CropOptions, request), gaussians=kept)
+    written = scene_io.write_edited_scene(
+        source, gaussians.select(keep), request.output, progress, edit_record=record
+    )
     notes = (f"{source}: {kept:,} of {count:,} Gaussians kept.", written.sentence)
     return CropResult(files=written.files, folder=written.folder, notes=notes, kept=kept, count=count)
 

@@ -118,28 +118,26 @@ def run(
     from octasplat.engine.core.local_origin import local_map, origin_after
     from octasplat.engine.files import read_metadata
     from octasplat.engine.gaussians.affine import mean_scale, transform_gaussians
-    from octasplat.engine.operations.scene_io import (
-        check_edited_output,
-        describe_edit,
-        open_scene,
-        write_edited_scene,
-    )
+    from octasplat.engine.operations import scene_io
 
     source: Path = request.source
-    check_edited_output("transform", request, request.output, [request.matrix])
+    scene_io.check_edited_output("transform", request, request.output, [request.matrix])
     matrix = request.world_map()
-    scene, facts = open_scene(source, progress), read_metadata(source)
+    scene, facts = scene_io.open_scene(source, progress), read_metadata(source)
     origin = origin_after(matrix, scene.means_world, facts.origin_world)
     local = local_map(matrix, facts.origin_world, origin)
     moved = transform_gaussians(scene, local)
     stop_if(should_stop)
     rows = tuple(map(tuple, matrix.tolist()))
-    written = write_edited_scene(
+    written = scene_io.write_edited_scene(
         source,
         moved,
         request.output,
         progress,
-        edit_record={**describe_edit("transform", options_of(TransformOptions, request)), "world_map": rows},
+        edit_record={
+            **scene_io.describe_edit("transform", options_of(TransformOptions, request)),
+            "world_map": rows,
+        },
         facts=replace(facts.scaled(mean_scale(matrix)), origin_world=origin),
         matrix=local,
     )

@@ -8,7 +8,7 @@ After "Reflective Gaussian Splatting" (https://arxiv.org/abs/2412.19282), whose 
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import ClassVar
 
 import numpy as np
@@ -47,34 +47,12 @@ from octasplat.engine.shading.protocol import (
     TracedRays,
 )
 from octasplat.engine.shading.reflection_tracing import ReflectionTracer
+from octasplat.engine.shading.shading_context import ShadingContext
 from octasplat.engine.shading.split_sum import SurfacePoints, shade, shade_backward
 from octasplat.engine.trace.protocol import TraceGradients, Tracer, TraceResult
 
 AMBIENT_COLUMN = 5
 INTERREFLECTION_COLUMNS = slice(6, 9)
-
-
-@dataclass(frozen=True)
-class ShadingContext:
-    """What :meth:`DeferredShading.backward` needs of :meth:`DeferredShading.shade`.
-
-    Attributes:
-        depth_layers: the layers that were shaded separately, ``l`` of ``r`` rays.
-        gbuffer: blended materials, normals and positions of the ``p`` shaded points.
-        surface: the points as they were shaded.
-        linear: their radiance.
-        display: their colors as shown.
-        incident: light along reflected directions; None where none was traced.
-        ramp: share of the picture that is shaded, not taken from the harmonics.
-    """
-
-    depth_layers: DepthLayers
-    gbuffer: GBuffer
-    surface: SurfacePoints
-    linear: Float64[np.ndarray, "p 3"]
-    display: Float64[np.ndarray, "p 3"]
-    incident: IncidentLightModel | None
-    ramp: float
 
 
 class DeferredShading:
@@ -247,7 +225,7 @@ class DeferredShading:
         )
         rgb = self._unshaded_part(traced, context)
         rgb[gbuffer.ray_ids] += (ramp * gbuffer.alpha[:, None] * display).astype(np.float32)
-        layers = {} if traced.view is not None else self._named_layers(context, rgb)
+        layers = {} if traced.view is not None else context.named_layers(self._layer_radiance(context, rgb))
         return ShadedRays(split.sum_layers(rgb), result.transmittance, context, layers)
 
     def backward(self, traced: TracedRays, shaded: ShadedRays, grad: ShadedRayGradients) -> ShadingGradients:
@@ -393,20 +371,3 @@ class DeferredShading:
     ) -> Float64[np.ndarray, "p 3"]:
         """Return the radiance of the shaded points that a finished picture of ``rgb_srgb`` shows."""
         return ctx.linear
-
-    # --- layers of a finished picture ---
-
-    def _named_layers(
-        self, ctx: ShadingContext, rgb_srgb: Float32[np.ndarray, "l 3"]
-    ) -> dict[str, Float32[np.ndarray, "r _"]]:
-        """Return radiance, materials, visibility and indirect light by name, means over each ray's layers."""
-        surface = ctx.surface
-        values = {
-            "linear": self._layer_radiance(ctx, rgb_srgb),
-            "albedo": surface.material[:, :3],
-            "metallic": surface.material[:, 3:4],
-            "roughness": surface.material[:, 4:5],
-            "visibility": surface.visibility[:, None],
-            "indirect": surface.indirect_linear,
-        }
-        return ctx.depth_layers.ray_means(ctx.gbuffer.ray_ids, ctx.gbuffer.alpha, values)

@@ -9,6 +9,7 @@ the guess is the mean of both ways, by the inverse of how much each leaves of th
 
 import re
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float64, Int64
@@ -53,25 +54,30 @@ def estimate_values(
     ours, theirs = times[trained], times[others]
     if brightness is None or len(trained) < MIN_VIEWS_FOR_LINE:
         return _neighbor_mean(known, ours, theirs)[0]
-    light = brightness[trained], brightness[others]
-    ways = [way(known, ours, theirs, *light) for way in (_line_then_neighbors, _neighbors_then_line)]
+    views = _Views(known, ours, theirs, brightness[trained], brightness[others])
+    ways = [_line_then_neighbors(views), _neighbors_then_line(views)]
     shares = np.array([1 / (np.square(left).mean() + 1e-12) for _, left in ways])
     shares /= shares.sum()
     return shares[0] * ways[0][0] + shares[1] * ways[1][0]
+
+
+class _Views(NamedTuple):
+    """Values, times and brightnesses of the trained views, and what is known of the others."""
+
+    known: Float64[np.ndarray, "k c"]
+    times: Float64[np.ndarray, " k"]
+    other_times: Float64[np.ndarray, " m"]
+    brightness: Float64[np.ndarray, " k"]
+    other_brightness: Float64[np.ndarray, " m"]
 
 
 Estimator = tuple[Float64[np.ndarray, "m c"], Float64[np.ndarray, "i c"]]
 """What is said of the other views, and what is left of each trained one when it is left out."""
 
 
-def _line_then_neighbors(
-    known: Float64[np.ndarray, "k c"],
-    times: Float64[np.ndarray, " k"],
-    other_times: Float64[np.ndarray, " m"],
-    brightness: Float64[np.ndarray, " k"],
-    other_brightness: Float64[np.ndarray, " m"],
-) -> Estimator:
+def _line_then_neighbors(views: _Views) -> Estimator:
     """Predict by a line over the brightness, then by the residuals of the views before and after."""
+    known, times, other_times, brightness, other_brightness = views
     middle, height = brightness.mean(), known.mean(axis=0)
     slopes, left_out, trust = _fit_slopes(brightness - middle, known, height)
     off_line = known - trust * (brightness - middle)[:, None] * slopes
@@ -80,14 +86,9 @@ def _line_then_neighbors(
     return trust * (other_brightness - middle)[:, None] * slopes + predicted, residuals + missed
 
 
-def _neighbors_then_line(
-    known: Float64[np.ndarray, "k c"],
-    times: Float64[np.ndarray, " k"],
-    other_times: Float64[np.ndarray, " m"],
-    brightness: Float64[np.ndarray, " k"],
-    other_brightness: Float64[np.ndarray, " m"],
-) -> Estimator:
+def _neighbors_then_line(views: _Views) -> Estimator:
     """Predict by the views before and after, then by a line over how much brighter than these a view is."""
+    known, times, other_times, brightness, other_brightness = views
     predicted, residuals = _neighbor_mean(known, times, other_times)
     brighter = brightness[1:-1] - _leave_one_out_neighbors(brightness[:, None], times)[:, 0]
     slopes, left_out, trust = _fit_slopes(brighter, residuals)

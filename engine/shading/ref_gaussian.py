@@ -20,13 +20,14 @@ from octasplat.engine.gaussians.materials import (
     ROUGHNESS,
 )
 from octasplat.engine.gaussians.model import SH_C0, FlatGaussians
-from octasplat.engine.shading.deferred import DeferredShading, ShadingContext
+from octasplat.engine.shading.deferred import DeferredShading
 from octasplat.engine.shading.depth_split import DepthLayers, single_layer
 from octasplat.engine.shading.gbuffer import GBuffer, reflected_rays
 from octasplat.engine.shading.incident_light import IncidentLightModel, SingleRayIncidentLight
 from octasplat.engine.shading.material_settings import MaterialSettings
 from octasplat.engine.shading.protocol import ShadedRays, ShadingStep, TracedRays
 from octasplat.engine.shading.reflection_tracing import IncidentLight
+from octasplat.engine.shading.shading_context import ShadingContext
 from octasplat.engine.shading.split_sum import SurfacePoints
 from octasplat.engine.trace.protocol import TraceResult
 

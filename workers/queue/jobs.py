@@ -15,7 +15,7 @@ from octasplat.workers.db.ids import new_id
 from octasplat.workers.db.locks import about_to_lock_jobs, lock_owner
 from octasplat.workers.db.postgres_text import as_json, as_json_or_null
 from octasplat.workers.db.rows import Artifact, Job
-from octasplat.workers.queue.protocol import JobQueue, QueueDepth
+from octasplat.workers.queue.protocol import JobQueue, NewEntry, QueueDepth
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ async def create_job(connection: Connection, job_queue: JobQueue, new: NewJob) -
     """Write the job and its queue entry in one transaction."""
     async with connection.transaction():
         job_id = new_id()
-        entry_id = await job_queue.enqueue(connection, job_id, new.queue, new.priority)
+        entry_id = await job_queue.enqueue(connection, NewEntry(job_id, new.queue, new.priority))
         await connection.execute(
             """
             INSERT INTO jobs (id, owner, kind, dataset_id, source_id, label, options, queue, priority, slip,
@@ -242,9 +242,8 @@ async def requeue_job(
     """
     if job.slip is not None and not keep_entry:
         await job_queue.remove(connection, job.slip)
-    entry_id = await job_queue.enqueue(
-        connection, job.id, job.queue, job.priority, earlier_entry_id=job.slip, delay_seconds=delay_seconds
-    )
+    entry = NewEntry(job.id, job.queue, job.priority, job.slip, delay_seconds)
+    entry_id = await job_queue.enqueue(connection, entry)
     await connection.execute(
         """
         UPDATE jobs SET slip = %(entry)s, delayed_until =
@@ -266,7 +265,7 @@ async def requeue_job(
 
 
 async def change_job(connection: Connection, job_id: uuid.UUID, *, label: str | None, pinned: bool) -> Job:
-    """Rename a job, or pin it so that it does not expire."""
+    """Set the label of a job, and whether it is pinned; a pinned job does not expire."""
     await connection.execute(
         """
         UPDATE jobs SET label = %(label)s, pinned = %(pinned)s,

@@ -9,7 +9,7 @@ from procrastinate.manager import JobManager
 from procrastinate.worker import Worker
 
 from octasplat.workers.db.connections import Connection, Pool
-from octasplat.workers.queue.protocol import DeliveryCallback
+from octasplat.workers.queue.protocol import DeliveryCallback, NewEntry
 
 TASK_NAME = "octasplat.run_job"
 _MAX_REQUEUES = 4096
@@ -45,33 +45,17 @@ class ProcrastinateQueue:
         self._workers: set[Worker] = set()
         self._stopped = False
 
-    async def enqueue(
-        self,
-        connection: Connection,
-        job_id: uuid.UUID,
-        queue: str,
-        priority: int,
-        *,
-        earlier_entry_id: int | None = None,
-        delay_seconds: float = 0.0,
-    ) -> int:
+    async def enqueue(self, connection: Connection, entry: NewEntry) -> int:
         """Queue an entry; see the protocol."""
-        if earlier_entry_id is not None:
-            return await _reenqueue(
-                connection,
-                job_id,
-                queue=queue,
-                priority=priority,
-                earlier_entry_id=earlier_entry_id,
-                delay_seconds=delay_seconds,
-            )
+        if entry.earlier_entry_id is not None:
+            return await _reenqueue(connection, entry, entry.earlier_entry_id)
         job = procrastinate.jobs.Job(
-            queue=queue,
-            priority=priority,
+            queue=entry.queue,
+            priority=entry.priority,
             lock=None,
             queueing_lock=None,
             task_name=TASK_NAME,
-            task_kwargs={"job_id": str(job_id)},
+            task_kwargs={"job_id": str(entry.job_id)},
         )
         entry_id = (await self._manager.defer_job_async(job, connection=connection)).id
         assert entry_id is not None
@@ -154,15 +138,8 @@ class ProcrastinateQueue:
             worker.stop()  # type: ignore[no-untyped-call]
 
 
-async def _reenqueue(
-    connection: Connection,
-    job_id: uuid.UUID,
-    queue: str,
-    priority: int,
-    earlier_entry_id: int,
-    delay_seconds: float,
-) -> int:
-    """Queue an entry (a job of Procrastinate) of our job ``job_id`` at the queue position of an earlier one.
+async def _reenqueue(connection: Connection, entry: NewEntry, earlier_entry_id: int) -> int:
+    """Queue an entry (a job of Procrastinate) of our job at the queue position of an earlier one.
 
     Procrastinate's own retry would assign a new id and so lose the position.
     """
@@ -175,11 +152,11 @@ async def _reenqueue(
         """,
         {
             "id": requeued_entry_id(earlier_entry_id),
-            "queue": queue,
+            "queue": entry.queue,
             "task": TASK_NAME,
-            "priority": priority,
-            "job": str(job_id),
-            "delay_seconds": delay_seconds,
+            "priority": entry.priority,
+            "job": str(entry.job_id),
+            "delay_seconds": entry.delay_seconds,
         },
     )
     row = await cursor.fetchone()

@@ -25,30 +25,32 @@ class QueueDepth:
     oldest_seconds: float
 
 
+@dataclass(frozen=True)
+class NewEntry:
+    """An entry to be queued.
+
+    Args:
+        job_id: which job.
+        queue: who may take it.
+        priority: higher goes first; where it is the same, the smaller number does.
+        earlier_entry_id: an earlier queue entry of the job, whose queue position the new one takes: before
+            all that were queued after it. None queues it last.
+        delay_seconds: with ``earlier_entry_id``, for how long others go before it all the same.
+    """
+
+    job_id: uuid.UUID
+    queue: str
+    priority: int
+    earlier_entry_id: int | None = None
+    delay_seconds: float = 0.0
+
+
 @runtime_checkable
 class JobQueue(Protocol):
     """A queue of entries, each for one job."""
 
-    async def enqueue(
-        self,
-        connection: Connection,
-        job_id: uuid.UUID,
-        queue: str,
-        priority: int,
-        *,
-        earlier_entry_id: int | None = None,
-        delay_seconds: float = 0.0,
-    ) -> int:
+    async def enqueue(self, connection: Connection, entry: NewEntry) -> int:
         """Queue an entry for a job within the transaction of ``connection``.
-
-        Args:
-            connection: of the transaction.
-            job_id: which job.
-            queue: who may take it.
-            priority: higher goes first; where it is the same, the smaller number does.
-            earlier_entry_id: an earlier queue entry of the job, whose queue position the new one takes:
-                before all that were queued after it. None queues it last.
-            delay_seconds: with ``earlier_entry_id``, for how long others go before it all the same.
 
         Returns:
             The entry's number, which no queue entry of this job had.
