@@ -9,6 +9,9 @@ from_function
 format_epilog
 format_commands
 get_renderables
+# pytest runs the plugin of the mutations
+pytest_runtest_logreport
+pytest_runtestloop
 # io.RawIOBase and Pillow read files
 seekable
 readinto

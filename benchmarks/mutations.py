@@ -4,9 +4,9 @@
     python -m benchmarks.mutations fences --list         # the mutants alone
     python -m benchmarks.mutations reference --lines reference.py:143-190
 
-The tests run once in this process, which notes the lines that each of them reaches. For each mutant it forks;
-the fork exchanges the code of the changed function and runs the tests that reach the changed statement, the
-quickest first. Code of functions is changed, not what is evaluated at import.
+This process collects the tests. A fork runs them once and notes the lines that each of them reaches; then
+there is one for each mutant, which exchanges the code of the changed function and runs the tests that reach the
+changed statement, the quickest first. Code of functions is changed, not what is evaluated at import.
 
 Changes are of the syntax tree, and of the SQL in strings, which the usual tools leave alone. Texts with
 spaces are messages and stay as they are.
@@ -15,11 +15,13 @@ spaces are messages and stay as they are.
 import argparse
 import ast
 import importlib.machinery
+import json
 import os
 import re
 import resource
 import signal
 import sys
+import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -33,7 +35,7 @@ import pytest
 ROOT = Path(__file__).resolve().parent.parent
 PYTEST = ("-s", "-p", "no:cacheprovider", "-p", "no:terminal", "-p", "anyio", "-o", "addopts=")
 """Without the plugins that only other tests need, see :func:`main`."""
-MAX_CPU_SECONDS = 60
+MAX_CPU_SECONDS = 120
 """CPU time of one mutant's tests, beyond which it counts as killed; an endless loop takes no less."""
 MAX_SECONDS = 1200.0
 """Likewise, by the clock."""
@@ -310,33 +312,34 @@ def _innermost(value: Any) -> Any:
     return getattr(value, "__func__", value)
 
 
-def _survives(work: Callable[[], bool]) -> bool:
-    """Return what ``work`` returns in a fork; False if it takes too long or dies."""
-    child = os.fork()
-    if child == 0:
-        passed = False
-        try:
-            silent = os.open(os.devnull, os.O_WRONLY)
-            os.dup2(silent, 1)
-            os.dup2(silent, 2)
-            resource.setrlimit(resource.RLIMIT_CPU, (MAX_CPU_SECONDS, MAX_CPU_SECONDS))
-            passed = work()
-        finally:
-            os._exit(0 if passed else 1)
-    deadline = time.monotonic() + MAX_SECONDS
-    while True:
-        found, status = os.waitpid(child, os.WNOHANG)
-        if found:
-            return os.waitstatus_to_exitcode(status) == 0
-        if time.monotonic() > deadline:
-            os.kill(child, signal.SIGKILL)
-            os.waitpid(child, 0)
-            return False
-        time.sleep(0.02)
+def _in_fork(work: Callable[[], object]) -> Any:
+    """Return what ``work`` returns in a fork, as JSON; None if it takes too long or dies."""
+    with tempfile.TemporaryFile() as answer:
+        child = os.fork()
+        if child == 0:
+            try:
+                silent = os.open(os.devnull, os.O_WRONLY)
+                os.dup2(silent, 1)
+                os.dup2(silent, 2)
+                resource.setrlimit(resource.RLIMIT_CPU, (MAX_CPU_SECONDS, MAX_CPU_SECONDS))
+                answer.write(json.dumps(work()).encode())
+                answer.flush()
+            finally:
+                os._exit(0)
+        deadline = time.monotonic() + MAX_SECONDS
+        while os.waitpid(child, os.WNOHANG) == (0, 0):
+            if time.monotonic() > deadline:
+                os.kill(child, signal.SIGKILL)
+                os.waitpid(child, 0)
+                return None
+            time.sleep(0.02)
+        answer.seek(0)
+        text = answer.read()
+        return json.loads(text) if text else None
 
 
 class MutationRun:
-    """A plugin of pytest whose loop runs all tests once, and then those of each mutant in a fork.
+    """A plugin of pytest whose loop runs all tests once, and then those of each mutant, each time in a fork.
 
     Args:
         subject: what is mutated.
@@ -355,32 +358,26 @@ class MutationRun:
     def pytest_runtestloop(self, session: pytest.Session) -> bool:
         """Run the tests and the mutants; print the survivors and the counts."""
         files = [ROOT / path for path in self._subject.functions]
-        reached, seconds = self._run_all(session.items, files)
-        if self._has_failed:
+        found = _in_fork(lambda: self._run_all(session.items, files))
+        if found is None:
             sys.exit("The tests do not pass without a change.")
+        reached, seconds = found
         items = {item.nodeid: item for item in session.items}
-
-        def exchange_same() -> bool:
-            for path in self._subject.functions:
-                source = (ROOT / path).read_text(encoding="utf-8")
-                _exchange_code(ROOT / path, ast.unparse(ast.parse(source)))
-            return self._pass(session.items)
-
-        if not _survives(exchange_same):
-            sys.exit("The tests do not pass when code is exchanged for the same code.")
         print(f"{len(items)} tests, {sum(seconds.values()):.0f} s; {len(self._mutants)} mutants", flush=True)
         counts = {path: [0, 0] for path in self._subject.functions}
         for number, mutant in enumerate(self._mutants):
             print(f"{number} of {len(self._mutants)}", end="\r", file=sys.stderr)
             first, last = mutant.statement
-            names = {name for line in range(first, last + 1) for name in reached[mutant.path].get(line, ())}
+            names = {
+                name for line in range(first, last + 1) for name in reached[mutant.path].get(str(line), ())
+            }
             tests = [items[name] for name in sorted(names - {""}, key=seconds.__getitem__)]
 
             def run(mutant: Mutant = mutant, tests: Sequence[pytest.Item] = tests) -> bool:
                 _exchange_code(ROOT / mutant.path, mutant.source)
                 return self._pass(tests)
 
-            has_survived = not tests or _survives(run)
+            has_survived = not tests or _in_fork(run) is True
             counts[mutant.path][has_survived] += 1
             if has_survived:
                 reach = f"{len(tests)} tests" if tests else "no test reaches it"
@@ -393,24 +390,28 @@ class MutationRun:
         self, items: Sequence[pytest.Item], files: Sequence[Path]
     ) -> tuple[dict[str, dict[int, list[str]]], dict[str, float]]:
         """Run all tests; return the tests that reach each line of each file, and the tests' seconds."""
+        for path in self._subject.functions:  # that alone must change nothing
+            _exchange_code(ROOT / path, (ROOT / path).read_text(encoding="utf-8"))
         watch = coverage.Coverage(data_file=None, config_file=False, include=[str(file) for file in files])
         seconds = {}
         watch.start()
-        for item, after in zip(items, [*items[1:], items[0]], strict=True):
+        for item, after in zip(items, [*items[1:], None], strict=True):
             watch.switch_context(item.nodeid)
             begun = time.perf_counter()
             item.config.hook.pytest_runtest_protocol(item=item, nextitem=after)
             seconds[item.nodeid] = time.perf_counter() - begun
         watch.stop()
+        if self._has_failed:
+            raise AssertionError("a test has failed")
         data = watch.get_data()
         return {str(file.relative_to(ROOT)): data.contexts_by_lineno(str(file)) for file in files}, seconds
 
     def _pass(self, items: Sequence[pytest.Item]) -> bool:
         """Return whether tests pass; ends at the first that does not."""
-        items[0].session._setupstate.teardown_exact(items[0])
-        for item, after in zip(items, [*items[1:], items[0]], strict=True):
+        for item, after in zip(items, [*items[1:], None], strict=True):
             item.config.hook.pytest_runtest_protocol(item=item, nextitem=after)
             if self._has_failed:
+                items[0].session._setupstate.teardown_exact(None)  # what fixtures started is stopped
                 return False
         return True
 

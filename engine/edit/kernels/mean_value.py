@@ -21,7 +21,6 @@ from octasplat.engine.edit.kernels.mean_value_simd import (
     vertex_rows,
 )
 from octasplat.engine.trace.cpu.kernels.simd_vector import LANES
-from octasplat.engine.trace.kernels.native import Address
 
 POINTS_PER_TASK = 16 * LANES
 """Points that a thread takes at a time."""
@@ -60,7 +59,7 @@ def _gather(
 @device_function(error_model="numpy")
 def _row_addresses(
     base: int, indices: Int[np.ndarray, "t 3"], t: int, row_bytes: int
-) -> tuple[Address, Address, Address]:
+) -> tuple[np.uintp, np.uintp, np.uintp]:
     """Return the addresses of the three rows ``indices[t]`` of an array that begins at ``base``."""
     return (
         np.uintp(base + indices[t, 0] * row_bytes),
