@@ -5,8 +5,8 @@
     python -m benchmarks.mutations reference --lines reference.py:143-190
 
 This process collects the tests. A fork runs them once and notes the lines that each of them reaches; then
-there is one for each mutant, which exchanges the code of the changed function and runs the tests that reach the
-changed statement, the quickest first. Code of functions is changed, not what is evaluated at import.
+there is one for each mutant, which exchanges the code of the changed function and runs the tests that reach
+the changed statement, the quickest first. Code of functions is changed, not what is evaluated at import.
 
 Changes are of the syntax tree, and of the SQL in strings, which the usual tools leave alone. Texts with
 spaces are messages and stay as they are.
