@@ -55,6 +55,8 @@ from octasplat.workers.storage.factory import open_storage
 
 logger = logging.getLogger(__name__)
 
+_IMPORTS = {"max_concurrent": 8, "max_waiting": 24, "max_per_owner": 4}
+"""Files that are fetched from elsewhere at once: connections, not work."""
 DESCRIPTION = """Photographs in, scenes of flat Gaussians and their octagon meshes out.
 
 1. `POST /v1/datasets`, then `PUT` each file to `/v1/datasets/{id}/files/images/...` (and the COLMAP model to
@@ -166,6 +168,7 @@ async def _service_lifespan(settings: ServiceSettings) -> AsyncIterator[Service]
                 login_throttle=login_throttle,
                 spool_space=settings.spool(),
                 check_limiter=_check_limiter(settings),
+                import_limiter=ConcurrencyLimiter("imports", **_IMPORTS),
             )
         finally:
             await evictor.close()

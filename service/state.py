@@ -33,6 +33,7 @@ class Service:
         login_throttle: counts wrong tokens.
         spool_space: room for archives while they are read.
         check_limiter: lets in those whose datasets are checked.
+        import_limiter: lets in those for whom files are fetched.
         storage_check: what the store was last found to be, or is being.
         metrics: counts what this process does.
         is_draining: whether it is about to stop.
@@ -48,6 +49,7 @@ class Service:
     login_throttle: LoginThrottle
     spool_space: SpoolSpace
     check_limiter: ConcurrencyLimiter
+    import_limiter: ConcurrencyLimiter
     storage_check: "asyncio.Future[str] | None" = None
     metrics: Metrics = field(default_factory=Metrics)
     is_draining: bool = False

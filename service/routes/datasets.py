@@ -7,7 +7,7 @@ from fastapi import APIRouter, Header, Path, Request, Response
 from starlette.requests import ClientDisconnect
 
 from octasplat.service.actions import datasets as actions
-from octasplat.service.actions import uploads
+from octasplat.service.actions import imports, uploads
 from octasplat.service.auth import Reader, Writer
 from octasplat.service.downloads import send_blob
 from octasplat.service.etags import check_precondition, set_etag, unchanged_response
@@ -39,6 +39,7 @@ from octasplat.service.schemas.datasets import (
     FilePage,
     FileView,
     NewDataset,
+    NewImport,
 )
 from octasplat.service.state import ServiceDep
 from octasplat.workers.db.rows import Dataset
@@ -187,11 +188,18 @@ async def put_archive(
 ) -> ArchiveView:
     """Upload a scene as a ZIP file; its files are added to those that are there."""
     archive = await uploads.put_archive(service, principal, dataset_id, _upload_of_request(request, digest))
-    return ArchiveView(
-        files=[FileView.from_row(row) for row in archive.files],
-        left_out=list(archive.left_out),
-        notes=list(archive.notes),
-    )
+    return _archive_view(archive)
+
+
+@router.post("/{dataset_id}/import", responses=problem_responses(404, 408, 409, 413, 507))
+async def import_files(
+    dataset_id: DatasetId, new: NewImport, principal: Writer, service: ServiceDep, _key: IdempotencyKey = None
+) -> ArchiveView:
+    """Fetch a scene as a ZIP file, or one file, from an address; its files are added to those that are there.
+
+    The answer comes when everything is stored; if it is lost on the way, `GET .../files` shows what has come.
+    """
+    return _archive_view(await imports.import_files(service, principal, dataset_id, new))
 
 
 @router.post("/{dataset_id}/commit", responses=problem_responses(404, 409))
@@ -200,6 +208,14 @@ async def commit_dataset(
 ) -> DatasetView:
     """Validate and commit the dataset; it never changes again and jobs can use it. Faults are in `errors`."""
     return DatasetView.from_row(await actions.commit_dataset(service, principal, dataset_id))
+
+
+def _archive_view(archive: uploads.StoredArchive) -> ArchiveView:
+    return ArchiveView(
+        files=[FileView.from_row(row) for row in archive.files],
+        left_out=list(archive.left_out),
+        notes=list(archive.notes),
+    )
 
 
 def _dataset_etag(dataset: Dataset) -> str:

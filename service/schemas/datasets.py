@@ -8,6 +8,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from octasplat.service.schemas.base import EXAMPLE_ID, EXAMPLE_TIME, RequestBody
 from octasplat.workers.db.rows import Dataset, DatasetFile, DatasetHolds, DatasetState
+from octasplat.workers.maintenance.webhooks.addresses import MAX_URL
 
 
 class NewDataset(RequestBody):
@@ -21,6 +22,27 @@ class NewDataset(RequestBody):
         description="`files` takes what the options of a job name, such as the meshes, textures and "
         "surroundings of a stage, under names of your own; jobs get them by `files_id`.",
     )
+
+
+class NewImport(RequestBody):
+    """Files that the service fetches from an address."""
+
+    model_config = ConfigDict(
+        extra="forbid", json_schema_extra={"examples": [{"url": "https://example.org/fox.zip"}]}
+    )
+
+    url: str = Field(
+        min_length=1,
+        max_length=MAX_URL,
+        description="https, port 443 or 8443, reachable from everywhere; so must redirects be.",
+    )
+    path: str | None = Field(
+        None,
+        min_length=1,
+        max_length=1000,
+        description="Name of the one file that it is, such as images/0001.jpg; by default it is a ZIP file.",
+    )
+    sha256: str | None = Field(None, pattern="^[0-9a-f]{64}$", description="What it must be, in hexadecimal.")
 
 
 class DatasetChange(RequestBody):

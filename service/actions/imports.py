@@ -1,0 +1,89 @@
+"""Files of datasets that the service fetches from elsewhere, under the rules of webhooks' addresses."""
+
+import uuid
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from urllib.parse import urljoin
+
+import httpx
+
+from octasplat.service.actions import uploads
+from octasplat.service.actions.uploads import StoredArchive, Upload
+from octasplat.service.auth import Principal
+from octasplat.service.problems import ProblemError
+from octasplat.service.schemas.datasets import NewImport
+from octasplat.service.state import Service
+from octasplat.workers.maintenance.webhooks.addresses import AddressRefusedError, check_url
+from octasplat.workers.maintenance.webhooks.guarded_transport import OWNER_EXTENSION
+from octasplat.workers.maintenance.webhooks.sender import guarded_client
+
+MAX_REDIRECTS = 5
+
+
+async def import_files(
+    service: Service, principal: Principal, dataset_id: uuid.UUID, new: NewImport
+) -> StoredArchive:
+    """Fetch a ZIP file, or one file, from an address and store it as an upload is.
+
+    Raises:
+        ProblemError: 404, 422 for an address that nothing is fetched from or that does not answer well, 429
+            while too many others fetch.
+        ConflictError: the dataset is not open.
+        IntakeError: the content is refused.
+        QuotaExceededError: its owner may not store as much.
+        StorageError: it is not as announced, or there is no room.
+    """
+    async with (
+        service.import_limiter.limited(principal.owner),
+        _opened(service, principal, new.url) as answer,
+    ):
+        text = answer.headers.get("content-length", "")
+        length = int(text) if text.isdigit() and "content-encoding" not in answer.headers else None
+        upload = Upload(_body(answer), sha256=new.sha256, size_bytes=length)
+        if new.path is None:
+            return await uploads.put_archive(service, principal, dataset_id, upload)
+        stored = await uploads.put_file(service, principal, dataset_id, new.path, upload)
+        return StoredArchive([stored.row], (), ())
+
+
+@asynccontextmanager
+async def _opened(service: Service, principal: Principal, url: str) -> AsyncIterator[httpx.Response]:
+    """Open an address, over redirects that are judged as it is."""
+    allowed = service.settings.webhook_hosts
+    async with guarded_client(allowed) as client:
+        for _ in range(MAX_REDIRECTS + 1):
+            try:
+                request = client.build_request(
+                    "GET",
+                    check_url(url, allowed),
+                    headers={"Accept-Encoding": "identity"},
+                    extensions={OWNER_EXTENSION: principal.owner},
+                )
+                answer = await client.send(request, stream=True)
+            except AddressRefusedError as error:
+                raise _import_error(str(error), "import-address") from None
+            except (httpx.HTTPError, httpx.InvalidURL, OSError, ValueError) as error:
+                raise _import_error(f"The address cannot be reached ({type(error).__name__}).") from None
+            try:
+                if not answer.has_redirect_location:
+                    if answer.status_code != 200:
+                        raise _import_error(f"The address answered {answer.status_code}.")
+                    yield answer
+                    return
+                url = urljoin(url, answer.headers["location"])
+            finally:
+                await answer.aclose()
+    raise _import_error(f"The address is redirected more than {MAX_REDIRECTS} times.")
+
+
+async def _body(answer: httpx.Response) -> AsyncIterator[bytes]:
+    """Yield what comes; an answer that breaks off leaves nothing."""
+    try:
+        async for piece in answer.aiter_raw():
+            yield piece
+    except (httpx.HTTPError, OSError) as error:
+        raise _import_error(f"The address broke off ({type(error).__name__}).") from None
+
+
+def _import_error(detail: str, code: str = "import") -> ProblemError:
+    return ProblemError(422, code, detail, errors=[{"pointer": "#/url", "detail": detail}])

@@ -1,0 +1,99 @@
+"""Scenes that the service fetches from an address, and addresses that it must not ask."""
+
+import hashlib
+import threading
+from collections.abc import Iterator
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from typing import Any
+
+import pytest
+
+from tests.support.model_builder import ColmapModelBuilder, photographs
+from tests.support.service_harness import ConnectService, client_with_token
+from tests.support.zip_builder import ZipMember, build_zip
+
+SCENE = {**photographs(), **ColmapModelBuilder().files()}
+ARCHIVE = build_zip(*(ZipMember(name, content) for name, content in SCENE.items()))
+HERE = ("127.0.0.1",)
+
+
+class Elsewhere(BaseHTTPRequestHandler):
+    def do_GET(self) -> None:
+        kind = self.path.strip("/")
+        if kind.startswith("to="):
+            self.send_response(302)
+            self.send_header("Location", kind.removeprefix("to="))
+            self.end_headers()
+            return
+        self.send_response(200 if kind in ("scene.zip", "a.png", "cut.zip") else 404)
+        content = next(iter(photographs().values())) if kind == "a.png" else ARCHIVE
+        self.send_header("Content-Length", str(len(content)))
+        self.end_headers()
+        self.wfile.write(content[: len(content) // 2] if kind == "cut.zip" else content)
+
+    def log_message(self, format: str, *arguments: object) -> None:
+        """Write no log."""
+
+
+@pytest.fixture
+def elsewhere() -> Iterator[str]:
+    server = ThreadingHTTPServer(("127.0.0.1", 0), Elsewhere)
+    thread = threading.Thread(target=server.serve_forever)
+    thread.start()
+    yield f"http://127.0.0.1:{server.server_port}"
+    server.shutdown()
+    server.server_close()
+    thread.join()
+
+
+async def test_scene_is_fetched_from_an_address(connect_service: ConnectService, elsewhere: str) -> None:
+    async with connect_service(webhook_hosts=HERE) as (http, _service):
+
+        async def fetch(**body: Any):  # type: ignore[no-untyped-def]
+            made = (await http.post("/v1/datasets", json={"name": "a"})).json()
+            address = f"/v1/datasets/{made['id']}"
+            return address, await http.post(f"{address}/import", json=body)
+
+        sha256 = hashlib.sha256(ARCHIVE).hexdigest()
+        address, answer = await fetch(url=f"{elsewhere}/to={elsewhere}/scene.zip", sha256=sha256)
+        assert answer.status_code == 200, answer.text
+        assert {file["path"] for file in answer.json()["files"]} == set(SCENE)
+        listed = (await http.get(f"{address}/files")).json()["files"]
+        assert {file["path"]: file["sha256"] for file in listed} == {
+            name: hashlib.sha256(content).hexdigest() for name, content in SCENE.items()
+        }
+        address, answer = await fetch(url=f"{elsewhere}/a.png", path="images/b.png")
+        assert [file["path"] for file in answer.json()["files"]] == ["images/b.png"]
+        for url, kind, words in (
+            (f"{elsewhere}/nothing.zip", "import", "answered 404"),
+            (f"{elsewhere}/cut.zip", "import", "broke off"),
+            (f"{elsewhere}/to=https://10.0.0.1/x.zip", "import-address", "reachable from everywhere"),
+            (f"{elsewhere}/to=file:///etc/passwd", "import-address", "cannot be read"),
+            ("http://127.0.0.1:1/x.zip", "import", "cannot be reached"),
+        ):
+            address, answer = await fetch(url=url)
+            assert answer.status_code == 422, (url, answer.text)
+            assert answer.json()["type"].endswith(f":{kind}") and words in answer.json()["detail"], (
+                answer.text
+            )
+            assert (await http.get(f"{address}/files")).json()["files"] == []
+        _, answer = await fetch(url=f"{elsewhere}/scene.zip", sha256="0" * 64)
+        assert answer.json()["type"].endswith(":digest-mismatch")
+        stranger = await client_with_token(_service, "stranger", "write")
+        body = {"url": f"{elsewhere}/scene.zip"}
+        assert (await http.post(f"{address}/import", json=body, headers=stranger)).status_code == 404
+
+
+@pytest.mark.parametrize(
+    "url",
+    [
+        "http://127.0.0.1/x.zip", "https://127.0.0.1/x.zip", "https://169.254.169.254/latest", "https://[::1]/",
+        "https://[64:ff9b::7f00:1]/", "https://2130706433/", "https://localhost/x", "https://example.org:22/",
+        "https://user:word@example.org/x.zip", "ftp://example.org/x.zip",
+    ],
+)  # fmt: skip
+async def test_inner_addresses_are_not_asked(connect_service: ConnectService, url: str) -> None:
+    async with connect_service() as (http, _service):
+        made = (await http.post("/v1/datasets", json={"name": "a"})).json()
+        answer = await http.post(f"/v1/datasets/{made['id']}/import", json={"url": url})
+        assert (answer.status_code, answer.json()["type"]) == (422, "urn:octasplat:problem:import-address")
