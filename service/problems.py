@@ -158,7 +158,11 @@ def problem_from_error(error: OctasplatError) -> ProblemError:
         # Bytes come back by deleting only, the others also by waiting.
         status = 413 if error.resource == "bytes" else 429
         return ProblemError(
-            status, f"quota-{error.resource}", detail, retry_seconds=again if status == 429 else None
+            status,
+            f"quota-{error.resource}",
+            detail,
+            headers={"RateLimit": f'"{error.resource}";r=0'},
+            retry_seconds=again if status == 429 else None,
         )
     if isinstance(error, NotFoundError):
         return not_found_error(error.kind)

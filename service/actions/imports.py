@@ -8,6 +8,7 @@ from urllib.parse import urljoin
 import httpx
 
 from octasplat.service.actions import uploads
+from octasplat.service.actions.access import check_not_draining, open_dataset
 from octasplat.service.actions.uploads import StoredArchive, Upload
 from octasplat.service.auth import Principal
 from octasplat.service.problems import ProblemError
@@ -33,6 +34,9 @@ async def import_files(
         QuotaExceededError: its owner may not store as much.
         StorageError: it is not as announced, or there is no room.
     """
+    check_not_draining(service)
+    async with service.pool.connection() as connection:
+        await open_dataset(connection, principal, dataset_id)
     async with (
         service.import_limiter.limited(principal.owner),
         _opened(service, principal, new.url) as answer,

@@ -8,6 +8,7 @@ from starlette.requests import ClientDisconnect
 
 from octasplat.service.actions import datasets as actions
 from octasplat.service.actions import imports, uploads
+from octasplat.service.actions.usage import rate_limit_headers
 from octasplat.service.auth import Reader, Writer
 from octasplat.service.downloads import send_blob
 from octasplat.service.etags import check_precondition, set_etag, unchanged_response
@@ -27,6 +28,7 @@ from octasplat.service.routes.response_headers import (
     ETAG,
     LINK,
     LOCATION,
+    RATE_LIMIT,
     not_modified,
     stored_content,
     with_headers,
@@ -63,13 +65,16 @@ def _binary_body(*media_types: str) -> dict[str, Any]:
 FilePath = Annotated[str, Path(max_length=1000, description="Such as images/0001.jpg.")]
 
 
-@router.post("", status_code=201, responses={**with_headers(201, LOCATION), **problem_responses(404)})
+@router.post(
+    "", status_code=201, responses={**with_headers(201, LOCATION, *RATE_LIMIT), **problem_responses(404)}
+)
 async def create_dataset(
     new: NewDataset, principal: Writer, service: ServiceDep, response: Response, key: IdempotencyKey = None
 ) -> DatasetView:
     """Create a dataset for photographs, or for files that the options of jobs name."""
     dataset = await actions.create_dataset(service, principal, new, idempotency_key=key)
     response.headers["Location"] = f"/v1/datasets/{dataset.id}"
+    response.headers.update(await rate_limit_headers(service, principal, "datasets"))
     return DatasetView.from_row(dataset)
 
 

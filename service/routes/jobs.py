@@ -9,6 +9,7 @@ from octasplat.service.actions import jobs as actions
 from octasplat.service.actions.jobs import BUSY_RETRY_SECONDS, JobFilter, JobWithView, stages_of
 from octasplat.service.actions.submission import retry_job as retry_again
 from octasplat.service.actions.submission import submit_job
+from octasplat.service.actions.usage import rate_limit_headers
 from octasplat.service.auth import Reader, Writer
 from octasplat.service.etags import check_precondition, set_etag, unchanged_response
 from octasplat.service.paging import Cursor, Limit, decode_id_cursor, set_next_link
@@ -18,6 +19,7 @@ from octasplat.service.routes.response_headers import (
     ETAG,
     LINK,
     LOCATION,
+    RATE_LIMIT,
     RETRY_AFTER,
     not_modified,
     with_headers,
@@ -30,9 +32,10 @@ router = APIRouter(prefix="/v1/jobs", tags=["jobs"])
 
 _MAX_RETRY_SECONDS = 30
 ACCEPTED = with_headers(202, LOCATION, RETRY_AFTER)
+ACCEPTED_NEW = with_headers(202, LOCATION, RETRY_AFTER, *RATE_LIMIT)
 
 
-@router.post("", status_code=202, responses={**ACCEPTED, **problem_responses(404, 409)})
+@router.post("", status_code=202, responses={**ACCEPTED_NEW, **problem_responses(404, 409)})
 async def create_job(
     new: NewJob, principal: Writer, service: ServiceDep, request: Request, response: Response,
     key: IdempotencyKey = None,
@@ -41,6 +44,7 @@ async def create_job(
     traceparent = request.headers.get("traceparent", "")[:100] or None
     view = await submit_job(service, principal, new, idempotency_key=key, traceparent=traceparent)
     _set_location(response, view)
+    response.headers.update(await rate_limit_headers(service, principal, "jobs"))
     return view
 
 

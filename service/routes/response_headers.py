@@ -13,6 +13,10 @@ def _header(name: str, description: str, kind: str = "string") -> Header:
 LOCATION = _header("Location", "Address of what was made.")
 RETRY_AFTER = _header("Retry-After", "Seconds after which another look, or try, is worth while.", "integer")
 ETAG = _header("ETag", "Changes with the content; for `If-None-Match` and `If-Match`.")
+RATE_LIMIT = (
+    _header("RateLimit-Policy", 'Your quota, such as `"jobs";q=20`; absent without one.'),
+    _header("RateLimit", 'What is left of your quota, such as `"jobs";r=3`; absent without one.'),
+)
 LINK = _header("Link", 'The next part of the list, as `<address>; rel="next"` (RFC 8288); absent at the end.')
 CONTENT_RANGE = _header("Content-Range", "Which bytes of how many.")
 WWW_AUTHENTICATE = _header("WWW-Authenticate", "How to show a token.")

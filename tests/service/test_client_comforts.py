@@ -94,6 +94,19 @@ async def test_owners_see_their_quota_and_use(connect_service: ConnectService) -
         assert other["jobs"]["used"] == other["job_seconds"] == 0
 
 
+async def test_quotas_are_told_as_rate_limits(connect_service: ConnectService) -> None:
+    async with connect_service(quota_jobs=2) as (http, service):
+        body = {"kind": "toy", "dataset_id": await committed_dataset(service)}
+        answers = [await http.post("/v1/jobs", json=body) for _ in range(3)]
+        assert [answer.status_code for answer in answers] == [202, 202, 429]
+        told = [answer.headers["RateLimit"] for answer in answers]
+        assert told == ['"jobs";r=1', '"jobs";r=0', '"jobs";r=0']
+        assert answers[0].headers["RateLimit-Policy"] == '"jobs";q=2'
+        assert int(answers[2].headers["Retry-After"]) > 0
+        unlimited = await http.post("/v1/datasets", json={})
+        assert unlimited.status_code == 201 and "RateLimit" not in unlimited.headers
+
+
 async def test_progress_and_time_left_are_of_the_whole_job(connect_service: ConnectService) -> None:
     async with connect_service() as (http, service):
         dataset = await committed_dataset(service)
