@@ -4,6 +4,7 @@ import asyncio
 import contextlib
 import logging
 import uuid
+from collections import Counter
 from collections.abc import Iterator
 
 import psycopg
@@ -28,12 +29,17 @@ class EventBroker:
         self._conninfo = conninfo
         self._listen = listen
         self._subscribers: dict[uuid.UUID, set[asyncio.Event]] = {}
+        self._owners: Counter[str] = Counter()
         self._closing = asyncio.Event()
 
     @property
     def subscriber_count(self) -> int:
         """Return the number of waiting streams."""
         return sum(len(events) for events in self._subscribers.values())
+
+    def count_of_owner(self, owner: str) -> int:
+        """Return the number of an owner's waiting streams."""
+        return self._owners[owner]
 
     @property
     def is_closing(self) -> bool:
@@ -46,13 +52,22 @@ class EventBroker:
         self._wake_all()
 
     @contextlib.contextmanager
-    def subscribe(self, job_id: uuid.UUID) -> Iterator[asyncio.Event]:
-        """Yield an event that is set whenever the job has new events, until the block ends."""
+    def subscribe(self, job_id: uuid.UUID, owner: str) -> Iterator[asyncio.Event]:
+        """Yield an event that is set whenever the job has new events, until the block ends.
+
+        Args:
+            job_id: the job.
+            owner: whoever listens.
+        """
         event = asyncio.Event()
         self._subscribers.setdefault(job_id, set()).add(event)
+        self._owners[owner] += 1
         try:
             yield event
         finally:
+            self._owners[owner] -= 1
+            if not self._owners[owner]:
+                del self._owners[owner]
             events = self._subscribers[job_id]
             events.discard(event)
             if not events:

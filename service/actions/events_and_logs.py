@@ -56,10 +56,14 @@ async def follow_events(
     In the place of an event comes None as a sign of life, where nothing has happened for a while.
 
     Raises:
-        ProblemError: 404, or 503 with too many who listen.
+        ProblemError: 404, 429 with too many streams of the principal's owner, 503 with too many of all.
     """
     job = await read_job(service, principal, job_id)
-    if service.event_broker.subscriber_count >= service.settings.max_streams:
+    broker, settings = service.event_broker, service.settings
+    if broker.count_of_owner(principal.owner) >= settings.max_streams_per_owner:
+        detail = "You have too many streams open; close some, or poll GET /v1/jobs/{id} instead."
+        raise ProblemError(429, "streams", detail, retry_seconds=_RETRY_SECONDS)
+    if broker.subscriber_count >= settings.max_streams:
         detail = "Too many streams are open; poll GET /v1/jobs/{id} instead."
         raise ProblemError(503, "streams", detail, retry_seconds=_RETRY_SECONDS)
     if job.is_over:
@@ -76,7 +80,7 @@ async def _stream_events(
     quiet = 0.0
     wait = min(ping, _ACCESS_CHECK_SECONDS if service.settings.listen else _POLL_SECONDS)
     checked_at = time.monotonic()
-    with service.event_broker.subscribe(job_id) as news:
+    with service.event_broker.subscribe(job_id, principal.owner) as news:
         while not service.event_broker.is_closing:
             news.clear()
             async with service.pool.connection() as connection:

@@ -9,7 +9,7 @@ import pytest
 
 from octasplat.service.actions import datasets as actions
 from octasplat.service.intake.dataset import DatasetSummary
-from tests.support.service_harness import ConnectService
+from tests.support.service_harness import ConnectService, client_with_token, new_job
 
 PATIENCE_SECONDS = 60.0
 
@@ -53,3 +53,53 @@ async def test_dataset_checks_do_not_block_other_requests(
             slow_checks["release"].set()
             done = [task.result().status_code for task in (await asyncio.wait(commits))[0]]
             assert sorted(done) == [200] * 9 + [429] * 4 and slow_checks["most"] == 2
+
+
+async def test_commits_of_one_owner_take_turns_with_those_of_others(
+    connect_service: ConnectService, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One place, ten commits of one owner, then one of another: it is the next, not the eleventh."""
+    places = threading.Semaphore(0)
+
+    def check(*_: object) -> DatasetSummary:
+        assert places.acquire(timeout=PATIENCE_SECONDS)
+        return DatasetSummary(photographs=3, pixels=1, size_bytes=1, masks=0, has_model=False)
+
+    monkeypatch.setattr(actions, "check_dataset", check)
+    async with asyncio.timeout(PATIENCE_SECONDS):
+        async with connect_service(max_checks=1, max_waiting_checks=20) as (http, service):
+            bob = await client_with_token(service, "bob", "write")
+            mine = [await new_dataset(http) for _ in range(10)]
+            other = (await http.post("/v1/datasets", json={"name": "d"}, headers=bob)).headers["Location"]
+            commits = [asyncio.create_task(http.post(f"{address}/commit")) for address in mine]
+            while service.check_limiter.admitted_count < len(mine):
+                await asyncio.sleep(0.01)
+            quick = asyncio.create_task(http.post(f"{other}/commit", headers=bob))
+            while service.check_limiter.admitted_count < len(mine) + 1:
+                await asyncio.sleep(0.01)
+            places.release()
+            places.release()
+            assert (await quick).status_code == 200
+            assert sum(task.done() for task in commits) <= 1
+            for _ in mine:
+                places.release()
+            assert {answer.status_code for answer in await asyncio.gather(*commits)} == {200}
+
+
+async def test_streams_of_one_owner_leave_room_for_others(connect_service: ConnectService) -> None:
+    async with connect_service(max_streams=10, max_streams_per_owner=3) as (http, service):
+        bob = await client_with_token(service, "bob", "admin")
+        address = f"/v1/jobs/{(await new_job(http, service))['id']}/events"
+        streams = [asyncio.create_task(http.get(address)) for _ in range(3)]
+        try:
+            while service.event_broker.subscriber_count < 3:
+                await asyncio.sleep(0.01)
+            refused = await http.get(address)
+            assert refused.status_code == 429
+            assert refused.json()["type"] == "urn:octasplat:problem:streams"
+            streams.append(asyncio.create_task(http.get(address, headers=bob)))
+            while service.event_broker.subscriber_count < 4:
+                await asyncio.sleep(0.01)
+        finally:
+            service.event_broker.close()
+            await asyncio.gather(*streams)
