@@ -142,6 +142,11 @@ async def _service_lifespan(settings: ServiceSettings) -> AsyncIterator[Service]
     storage = await asyncio.to_thread(
         lambda: open_storage(settings.storage_address, floor_bytes=settings.floor_bytes)
     )
+    free = await asyncio.to_thread(storage.free_bytes)
+    if free is not None and free <= 0:
+        logger.warning(
+            "the store takes no uploads, as less room is left than OCTASPLAT_FLOOR_BYTES keeps free"
+        )
     async with open_pool(conninfo, max_size=settings.pool_size, wait_seconds=10) as pool:
         async with pool.connection() as connection:
             if settings.token is not None:

@@ -1,5 +1,7 @@
 """Responses with stored content: complete or in ranges, with ETag and digest."""
 
+import hashlib
+import logging
 import re
 import urllib.parse
 from collections.abc import Iterator, Sequence
@@ -13,6 +15,7 @@ from starlette.types import Receive, Scope, Send
 
 from octasplat.service.etags import etag_matches
 from octasplat.service.intake.receive import format_digest
+from octasplat.service.problems import ProblemError
 from octasplat.service.ranges import requested_ranges
 from octasplat.service.state import Service
 from octasplat.service.thread_pools import ThreadPurpose, run_in_pool
@@ -23,6 +26,10 @@ _INLINE_TYPES = ("image/png", "image/jpeg", "application/json", "text/plain", "m
 _SANDBOX_POLICY = (
     "sandbox; default-src 'none'; img-src 'self' data:; style-src 'unsafe-inline'; script-src 'none'"
 )
+SMALL_BYTES = 4 << 20
+"""Contents up to this length are read whole before anything is sent."""
+
+logger = logging.getLogger(__name__)
 
 
 async def send_blob(
@@ -52,7 +59,8 @@ async def send_blob(
         inline: show rather than save.
 
     Raises:
-        ProblemError: 400 or 416 for ranges that cannot be read or are not there.
+        ProblemError: 500 for a content that is damaged, 400 or 416 for ranges that cannot be read or are not
+            there.
         StorageError: the store does not have it.
     """
     etag = f'"{sha256}"'
@@ -93,7 +101,8 @@ def send_archive(
     """
 
     def read(artifact: Artifact) -> Iterator[bytes]:
-        return service.storage.read(artifact.sha256, 0, artifact.size_bytes)
+        pieces = service.storage.read(artifact.sha256, 0, artifact.size_bytes)
+        return _verified(pieces, artifact.sha256)
 
     entries = [ZipEntry(row.name, row.size_bytes, partial(read, row)) for row in artifacts]
     headers = {
@@ -106,10 +115,20 @@ def send_archive(
 def _stored_response(
     service: Service, request: Request, sha256: str, size: int, media_type: str, headers: dict[str, str]
 ) -> Response:
-    """Return a response with a local file, or from a remote storage, complete or one range."""
+    """Return a response with a local file, or from a remote storage, complete or one range.
+
+    A small content is compared with its digest first, a large one while it is sent, the last of it being held
+    back until then; of ranges of a large one only the length of the whole is compared.
+
+    Raises:
+        ProblemError: 500 for a content that is damaged, 400 or 416 for ranges.
+    """
     ranges = requested_ranges(request, headers["ETag"], size)
+    is_small = size <= SMALL_BYTES
+    if service.storage.stat(sha256).size_bytes != size or (is_small and not _is_sound(service, sha256)):
+        raise _damaged(sha256)
     path = service.storage.local_path(sha256)
-    if path is not None:
+    if path is not None and (is_small or ranges is not None or request.method == "HEAD"):
         return _StoredFileResponse(path, ranges, media_type, headers)
     start, stop, status = 0, size, 200
     if ranges is not None and len(ranges) == 1:
@@ -120,7 +139,42 @@ def _stored_response(
     if request.method == "HEAD":
         return Response(status_code=status, headers=headers, media_type=media_type)
     pieces = service.storage.read(sha256, start, stop)
+    if status == 200 and not is_small:
+        pieces = _verified(pieces, sha256)
     return StreamingResponse(pieces, status_code=status, headers=headers, media_type=media_type)
+
+
+def _is_sound(service: Service, sha256: str) -> bool:
+    """Return whether a stored content is what its digest says."""
+    digest = hashlib.sha256()
+    for piece in service.storage.read(sha256):
+        digest.update(piece)
+    return digest.hexdigest() == sha256
+
+
+def _verified(pieces: Iterator[bytes], sha256: str) -> Iterator[bytes]:
+    """Yield a whole content; the last piece only once the digest is that of the content.
+
+    Raises:
+        ProblemError: it is damaged; as the answer has begun, the connection is closed before its end.
+    """
+    digest = hashlib.sha256()
+    last = b""
+    for piece in pieces:
+        digest.update(piece)
+        if last:
+            yield last
+        last = piece
+    if digest.hexdigest() != sha256:
+        raise _damaged(sha256)
+    yield last
+
+
+def _damaged(sha256: str) -> ProblemError:
+    """Return the problem of a content that is damaged, and tell the log."""
+    logger.error("the stored content %s is damaged; octasplat fsck --verify names what needs it", sha256)
+    detail = "What is stored under this name is damaged; make it anew, or upload it again."
+    return ProblemError(500, "damaged", detail)
 
 
 class _StoredFileResponse(FileResponse):

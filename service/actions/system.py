@@ -98,10 +98,16 @@ async def list_queues(service: Service, principal: Principal) -> QueueList:
 
 
 async def check_readiness(service: Service) -> dict[str, str]:
-    """Return the readiness of each part: ``ok``, or the fault."""
+    """Return the readiness of each part: ``ok``, or the fault.
+
+    ``uploads`` tells whether files are taken, which a full store does not; everything else works then, so
+    that the service is ready.
+    """
+    storage = await _check_storage(service)
     return {
         "database": await _check_database(service),
-        "storage": await _check_storage(service),
+        "storage": "unreachable" if storage == "unreachable" else "ok",
+        "uploads": storage,
         "service": "draining" if service.is_draining else "ok",
     }
 

@@ -56,9 +56,13 @@ async def healthz() -> Health:
 
 @health_router.get("/readyz", responses={503: {"model": Health, "description": "Not ready"}})
 async def readyz(service: ServiceDep, response: Response) -> Health:
-    """Return whether requests can be served: the database answers, and the disk has space."""
+    """Return whether requests can be served.
+
+    Where only ``uploads`` is not ``ok``, as the store is full, the service is ready: jobs are listed, results
+    are downloaded and deleted.
+    """
     checks = await actions.check_readiness(service)
-    ready = all(state == "ok" for state in checks.values())
+    ready = all(state == "ok" for name, state in checks.items() if name != "uploads")
     if not ready:
         response.status_code = 503
         response.headers["Retry-After"] = "5"

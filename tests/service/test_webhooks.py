@@ -2,6 +2,7 @@
 
 import asyncio
 import base64
+import logging
 import socket
 import threading
 import uuid
@@ -364,6 +365,26 @@ async def test_webhook_name_is_judged_again_at_each_connection(monkeypatch: pyte
         with pytest.raises(AddressRefusedError):
             await client.post("https://hooks.example.org/")
     assert connected == ["93.184.216.34"]
+
+
+async def test_dead_webhook_is_one_line_of_the_log(
+    connect_service: ConnectService, caplog: pytest.LogCaptureFixture
+) -> None:
+    async with connect_service() as (http, service):
+        with receive_webhooks(500, 500, 500, 204) as receiver:
+            hook = await make(http, receiver)
+            sender = WebhookSender(service.pool, HERE)
+            caplog.set_level(logging.INFO, "octasplat.workers.maintenance.webhooks.sender")
+            try:
+                for sent in range(1, 5):
+                    await http.post(f"/v1/webhooks/{hook['id']}/test")
+                    await sender.start_due()
+                    while sender.sent_count < sent:
+                        await sender.wait()
+            finally:
+                await sender.close()
+        lines = [record.message for record in caplog.records if hook["id"] in record.message]
+        assert len(lines) == 2 and "500" in lines[0] and lines[1].endswith("takes messages again")
 
 
 async def test_webhook_to_internal_name_is_refused_when_sending(connect_service: ConnectService) -> None:

@@ -25,7 +25,7 @@ from octasplat.engine import __version__
 from octasplat.engine.core.errors import OctasplatError
 from octasplat.engine.core.writing import write_json
 from octasplat.workers.db.migrate import OWN_COMPONENT, all_migrations, migrate
-from octasplat.workers.storage.errors import BlobNotFoundError
+from octasplat.workers.storage.errors import BlobNotFoundError, DigestMismatchError
 from octasplat.workers.storage.local import LocalStorage
 from octasplat.workers.storage.os_errors import translate_os_errors
 from octasplat.workers.storage.protocol import Storage
@@ -41,17 +41,47 @@ _CONTENTS_QUERY = """
 """
 
 
+_PLACES_QUERY = """
+    SELECT 'The file ' || path || ' of the dataset ' || dataset_id FROM dataset_files
+    WHERE sha256 = %(sha256)s
+    UNION ALL
+    SELECT 'The result ' || name || ' of the job ' || job_id FROM artifacts WHERE sha256 = %(sha256)s
+    UNION ALL
+    SELECT 'The checkpoint of the job ' || id FROM jobs, jsonb_array_elements(checkpoint->'files') AS file
+    WHERE file->>'sha256' = %(sha256)s
+    UNION ALL
+    SELECT 'The preview of the job ' || id FROM jobs WHERE preview->>'sha256' = %(sha256)s LIMIT 1
+"""
+
+
 class BackupError(OctasplatError):
     """A backup cannot be made or put back."""
 
 
 @dataclass(frozen=True)
 class BackupSummary:
-    """Content of a backup: row counts, and the count and total length of its blobs."""
+    """Content of a backup: row counts, the count and total length of its blobs, and what could not be copied.
+
+    Attributes:
+        rows: of all tables.
+        contents: that were copied, or were there already.
+        size_bytes: their length.
+        damaged: contents of the store that are damaged or missing, one sentence each; they are not in it.
+    """
 
     rows: int
     contents: int
     size_bytes: int
+    damaged: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class _Copied:
+    """What was copied: count and total length of the contents, and what is wrong with others by digest."""
+
+    contents: int
+    size_bytes: int
+    faults: dict[str, str]
 
 
 def create_backup(
@@ -96,17 +126,19 @@ def create_backup(
             referenced = {sha256 for (sha256,) in connection.execute(_CONTENTS_QUERY)}
             jobs = {str(job_id) for (job_id,) in connection.execute("SELECT id FROM jobs")}
         copy = LocalStorage(folder / STORE_FOLDER, floor_bytes=0)
-        contents, size_bytes = _copy_store(storage, copy, referenced, jobs, on_content)
+        copied = _copy_store(storage, copy, referenced, jobs, on_content)
+        damaged = tuple(_name_content(collecting, sha256, fault) for sha256, fault in copied.faults.items())
     record = {
         "format": FORMAT, "version": __version__, "folder": rows.name,
-        "steps": steps, "tables": tables, "sequences": sequences,
+        "steps": steps, "tables": tables, "sequences": sequences, "lacks": sorted(copied.faults),
     }  # fmt: skip
     with translate_os_errors(folder):
         write_json(folder / BACKUP_FILE, record)
         for earlier in folder.glob(f"{TABLES_PREFIX}*"):
             if earlier != rows:
                 shutil.rmtree(earlier, ignore_errors=True)
-    return BackupSummary(sum(table["rows"] for table in tables), contents, size_bytes)
+    rows_copied = sum(table["rows"] for table in tables)
+    return BackupSummary(rows_copied, copied.contents, copied.size_bytes, damaged)
 
 
 def restore_backup(
@@ -137,7 +169,8 @@ def restore_backup(
             raise BackupError("The database is not empty; name another one, or another data folder.")
         copy = LocalStorage(folder / STORE_FOLDER, floor_bytes=0)
         listed = {entry.blob.sha256 for entry in copy.list_blobs()}
-        contents, size_bytes = _copy_store(copy, storage, listed, None, on_content)
+        copied = _copy_store(copy, storage, listed, None, on_content)
+        damaged = tuple(_name_content(connection, sha256, fault) for sha256, fault in copied.faults.items())
         for table in record["tables"]:
             _read_table(connection, table, folder / record["folder"])
         for name, value in record["sequences"].items():
@@ -147,12 +180,14 @@ def restore_backup(
         connection.execute("UPDATE jobs SET state = 'queued', worker = NULL WHERE state = 'running'")
         connection.execute("UPDATE jobs SET state = 'canceled', slip = NULL WHERE state = 'canceling'")
         missing = {sha256 for (sha256,) in connection.execute(_CONTENTS_QUERY)} - listed
+        missing -= set(record.get("lacks", ()))  # of which was told when it was made
         if missing:
             raise BackupError(
                 f"The backup lacks {len(missing)} contents that its tables name; use another one."
             )
     migrate(conninfo)
-    return BackupSummary(sum(table["rows"] for table in record["tables"]), contents, size_bytes)
+    rows_copied = sum(table["rows"] for table in record["tables"])
+    return BackupSummary(rows_copied, copied.contents, copied.size_bytes, damaged)
 
 
 def _ordered_tables(connection: psycopg.Connection) -> list[str]:
@@ -221,8 +256,11 @@ def _copy_store(
     digests: set[str],
     jobs: set[str] | None,
     on_content: Callable[[int, int], None],
-) -> tuple[int, int]:
-    """Copy contents and documents; of the latter only those of ``jobs``, and what these name."""
+) -> _Copied:
+    """Copy contents and documents; of the latter only those of ``jobs``, and what these name.
+
+    What is damaged or missing is left out and told.
+    """
     documents = list(source.list_documents())
     if jobs is not None:
         results = [name for name in documents if name.startswith("results/") and name.split("/")[1] in jobs]
@@ -232,29 +270,51 @@ def _copy_store(
             digests = digests | {file.sha256 for file in manifest.files} if manifest is not None else digests
     there = {entry.blob.sha256: entry.blob.size_bytes for entry in target.list_blobs()}
     size_bytes = 0
+    faults: dict[str, str] = {}
     for done, sha256 in enumerate(sorted(digests), start=1):
-        if sha256 not in there:
-            there[sha256] = _copy_content(source, target, sha256)
-        size_bytes += there[sha256]
+        try:
+            if sha256 not in there:
+                there[sha256] = _copy_content(source, target, sha256)
+            size_bytes += there[sha256]
+        except BlobNotFoundError:
+            faults[sha256] = "missing"
+        except DigestMismatchError:
+            faults[sha256] = "damaged"
         on_content(done, len(digests))
     for name in documents:
         document = source.read_document(name)
         if document is not None and not target.publish_document(name, document):
             target.remove_document(name)
             target.publish_document(name, document)
-    return len(digests), size_bytes
+    return _Copied(len(digests) - len(faults), size_bytes, faults)
 
 
 def _copy_content(source: Storage, target: Storage, sha256: str) -> int:
-    try:
-        blob = source.stat(sha256)
-    except BlobNotFoundError:
-        raise BackupError(f"The store lacks {sha256}, which the tables name; run octasplat fsck.") from None
+    """Copy a content; returns its length.
+
+    Raises:
+        BlobNotFoundError: the store lacks it.
+        DigestMismatchError: what is there is another content, or cannot be read.
+    """
+    blob = source.stat(sha256)
     with target.open_writer(sha256=sha256, size_bytes=blob.size_bytes) as writer:
-        for piece in source.read(sha256):
+        pieces = source.read(sha256)
+        while True:
+            try:
+                piece = next(pieces, None)
+            except OSError as error:  # a sector of the disk is bad
+                raise DigestMismatchError(f"The content {sha256} cannot be read.") from error
+            if piece is None:
+                break
             writer.write(piece)
         writer.commit()
     return blob.size_bytes
+
+
+def _name_content(connection: psycopg.Connection, sha256: str, fault: str) -> str:
+    """Return a sentence on a content that is ``damaged`` or ``missing``, with a place that names it."""
+    row = connection.execute(_PLACES_QUERY, {"sha256": sha256}).fetchone()
+    return f"{row[0] if row is not None else 'A content'} is {fault} in the store ({sha256})."
 
 
 def _read_backup_file(folder: Path) -> dict[str, Any]:

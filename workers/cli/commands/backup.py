@@ -1,12 +1,13 @@
 """``octasplat backup`` and ``octasplat restore``: a whole service in a folder, and back."""
 
 import contextlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
+from octasplat.engine.core.errors import OctasplatError
 from octasplat.workers.cli.printing import Printer, output_options
 
 if TYPE_CHECKING:
@@ -25,7 +26,8 @@ def backup(folder: Path, data: Path | None, printer: Printer) -> None:
     """Copy the tables of a service, and everything in its store that they name, into FOLDER.
 
     The service may run meanwhile; everything is of one moment. Into the folder of an earlier backup only new
-    contents are copied. Whoever can read FOLDER can read everything; of tokens it holds digests only.
+    contents are copied. What is damaged or missing in the store is named and left out, and the exit status is
+    not zero. Whoever can read FOLDER can read everything; of tokens it holds digests only.
     """
     from octasplat.workers.maintenance.backup import create_backup, translate_database_errors
     from octasplat.workers.settings import WorkerSettings, load_settings
@@ -39,6 +41,7 @@ def backup(folder: Path, data: Path | None, printer: Printer) -> None:
         copied,
         [f"{copied.rows} rows and {copied.contents} contents of {copied.size_bytes} bytes are in {folder}."],
     )
+    _report_damage(copied.damaged)
 
 
 @click.command(short_help="Put a backup into an empty service.")
@@ -63,6 +66,22 @@ def restore(folder: Path, data: Path | None, printer: Printer) -> None:
         copied,
         [f"{copied.rows} rows and {copied.contents} contents of {copied.size_bytes} bytes are restored."],
     )
+    _report_damage(copied.damaged)
+
+
+def _report_damage(sentences: Sequence[str]) -> None:
+    """Name what could not be copied.
+
+    Raises:
+        OctasplatError: there is something.
+    """
+    for sentence in sentences:
+        click.echo(sentence, err=True)
+    if sentences:
+        raise OctasplatError(
+            f"{len(sentences)} contents could not be copied, everything else was; upload them again, or make "
+            "them anew."
+        )
 
 
 @contextlib.contextmanager

@@ -2,6 +2,7 @@
 
 import asyncio
 import logging
+import uuid
 from collections import Counter
 from datetime import UTC, datetime
 
@@ -39,6 +40,7 @@ class WebhookSender:
         self._client = guarded_client(allowed_hosts)
         self._in_flight: Counter[str] = Counter()
         self._tasks: set[asyncio.Task[None]] = set()
+        self._failing: set[uuid.UUID] = set()
         self.sent_count = 0
 
     async def start_due(self) -> int:
@@ -70,8 +72,7 @@ class WebhookSender:
     async def _send(self, delivery: Delivery, endpoint: Endpoint) -> None:
         try:
             outcome = await send(self._client, delivery, endpoint, self._allowed_hosts)
-            if not outcome.is_success:
-                logger.info("message %s of webhook %s: %s", delivery.id, endpoint.id, outcome.error)
+            self._log_change(endpoint, outcome)
             async with self._pool.connection() as connection:
                 await record_outcome(connection, delivery, outcome)
             self.sent_count += 1
@@ -83,6 +84,16 @@ class WebhookSender:
             self._in_flight[endpoint.owner] -= 1
             if not self._in_flight[endpoint.owner]:
                 del self._in_flight[endpoint.owner]
+
+    def _log_change(self, endpoint: Endpoint, outcome: Outcome) -> None:
+        """Log that a webhook takes no messages any more, or takes them again; not each message."""
+        if outcome.is_success:
+            if endpoint.id in self._failing:
+                self._failing.discard(endpoint.id)
+                logger.info("webhook %s takes messages again", endpoint.id)
+        elif endpoint.id not in self._failing:
+            self._failing.add(endpoint.id)
+            logger.info("webhook %s takes no messages: %s", endpoint.id, outcome.error)
 
 
 def guarded_client(allowed_hosts: tuple[str, ...] = ()) -> httpx.AsyncClient:
