@@ -3,7 +3,8 @@
 import uuid
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 from pydantic import ValidationError
 
@@ -21,6 +22,7 @@ from octasplat.workers.db.connections import Connection, retry_on_deadlock
 from octasplat.workers.db.rows import Job, JobState
 from octasplat.workers.queue import jobs as rows
 from octasplat.workers.worker.job_kinds import get_job_kind
+from octasplat.workers.worker.job_kinds.stored_options import options_of
 
 BUSY_RETRY_SECONDS = 2
 """After which a job that moves is worth another look."""
@@ -172,11 +174,21 @@ async def delete_job(
     service.evictor.evict_if_low_later()
 
 
+def complete_options(job: Job) -> dict[str, Any]:
+    """Return every option of a job: as it runs or ran, or as this version would run it."""
+    if job.settings is not None:
+        return job.settings
+    try:
+        return options_of(get_job_kind(job.kind), job).model_dump(mode="json")
+    except (ConfigError, ValidationError):  # of another version
+        return job.options
+
+
 def stages_of(job: Job) -> list[str]:
     """Return the names of a job's stages, in order."""
     try:
         kind = get_job_kind(job.kind)
-        return list(kind.stages(kind.options.model_validate(job.options)))
+        return list(kind.stages(options_of(kind, job)))
     except (ConfigError, ValidationError):  # of another version
         return []
 
@@ -191,10 +203,10 @@ async def job_view(connection: Connection, service: Service, principal: Principa
         with suppress(ConfigError, ValidationError):  # of another version
             kind = get_job_kind(job.kind)
             workers = await live_workers_of_queue(connection, job.queue, service.settings.stale_seconds)
-            notes = queued_job_notes(kind, kind.options.model_validate(job.options), job.queue, workers)
+            notes = queued_job_notes(kind, options_of(kind, job), job.queue, workers)
             notes += limit_notes(job.estimate, workers, service.settings)
     return JobView.from_row(
-        job,
+        replace(job, options=complete_options(job)),
         stages_of(job),
         await rows.queue_position(connection, job),
         notes,

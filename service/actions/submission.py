@@ -34,6 +34,7 @@ from octasplat.workers.db.rows import Dataset, Job
 from octasplat.workers.maintenance.webhooks.rows import add_endpoint
 from octasplat.workers.queue import jobs as rows
 from octasplat.workers.worker.job_kinds import JobKind, get_job_kind
+from octasplat.workers.worker.job_kinds.stored_options import options_of, without_defaults
 
 
 @dataclass(frozen=True)
@@ -166,7 +167,7 @@ async def _create_job(
     made = rows.NewJob(
         owner=principal.owner,
         kind=kind.name,
-        options=inputs.options.model_dump(mode="json"),
+        options=without_defaults(inputs.options),
         queue=new.queue,
         priority=new.priority,
         dataset_id=inputs.dataset_id,
@@ -272,7 +273,7 @@ async def _revised_options(
     workers = await live_workers_of_queue(connection, job.queue, service.settings.stale_seconds)
     try:
         kind = get_job_kind(job.kind)
-        before = kind.options.model_validate(job.options)
+        before = options_of(kind, job)
     except (ConfigError, ValidationError):
         if not request.options:
             return None, None
@@ -282,7 +283,7 @@ async def _revised_options(
         raise ProblemError(409, "source", "The job whose results it works on was deleted; make a new job.")
     options = before
     if request.options:
-        options = await resolve_options(kind, request.options, before=job.options)
+        options = await resolve_options(kind, request.options, before=before.model_dump(mode="json"))
     check_formats_writable(kind, options, job.queue, workers)
     await check_named_files(connection, principal, kind, options, job.files_id)
     sizes = await photograph_sizes(connection, job.dataset_id) if job.dataset_id is not None else []
@@ -301,7 +302,7 @@ async def _revised_options(
     ):
         detail = "With these options the work begins anew; ask for that with from: start."
         raise ProblemError(422, "other-work", detail, errors=[{"pointer": "#/options", "detail": detail}])
-    return options.model_dump(mode="json"), _estimate_as_json(estimate)
+    return without_defaults(options), _estimate_as_json(estimate)
 
 
 def _estimate_as_json(estimate: Estimate | None) -> dict[str, Any] | None:

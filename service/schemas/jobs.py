@@ -115,6 +115,7 @@ class JobSummary(BaseModel):
     source_id: uuid.UUID | None
     files_id: uuid.UUID | None = None
     label: str | None
+    resolved_by: str | None = Field(description="Version of the worker that resolved the options.")
     queue: str
     priority: int
     state: JobState
@@ -190,6 +191,7 @@ class JobView(JobSummary):
                     "files_id": None,
                     "label": "fox, first try",
                     "options": {"preset": "fast"},
+                    "resolved_by": "0.1.0",
                     "queue": "cpu",
                     "priority": 0,
                     "state": "running",
@@ -229,7 +231,9 @@ class JobView(JobSummary):
         }
     )
 
-    options: dict[str, Any] = Field(description="Every setting, resolved when the job was accepted.")
+    options: dict[str, Any] = Field(
+        description="Every setting: as resolved where the job ran, or as this version would resolve it."
+    )
 
 
 class JobPage(BaseModel):

@@ -1,5 +1,6 @@
 """While a service is brought up to date, two versions of it work side by side and lose nothing."""
 
+import asyncio
 import io
 import os
 import re
@@ -22,7 +23,7 @@ from octasplat.workers.queue.jobs import NewJob, cancel_job, create_job
 from octasplat.workers.queue.procrastinate_queue import ProcrastinateQueue
 from tests.support import lock_order_check
 from tests.support.postgres_fixtures import copied_database
-from tests.support.service_harness import BEARER, TOKEN
+from tests.support.service_harness import BEARER, TOKEN, committed_dataset, running_service
 from tests.support.worker_harness import MAX_WAIT_SECONDS, ROOT, WorkerHarness
 
 PREVIOUS = "6f3bf281170c"
@@ -181,3 +182,27 @@ def test_previous_release_works_beside_current(
             front.wait(30)
             front.stdout.close()
             bench.close()
+
+
+async def test_previous_release_takes_jobs_of_current_front_end(
+    postgres: EmbeddedPostgres, previous: Path, tmp_path: Path
+) -> None:
+    """Settings that only the current version knows are default, and so no reason to leave the job."""
+    with copied_database(postgres, "template0") as conninfo:
+        await asyncio.to_thread(migrate, conninfo)
+        bench = WorkerHarness(conninfo, tmp_path, stale_seconds=STALE_SECONDS)
+        try:
+            async with running_service(conninfo, tmp_path) as (http, service):
+                body = {
+                    "kind": "reconstruct",
+                    "dataset_id": await committed_dataset(service),
+                    "options": {"train": {"iterations": 50}},
+                }
+                job = (await http.post("/v1/jobs", json=body)).json()
+                await asyncio.to_thread(bench.worker, name="old", root=previous)
+                async with asyncio.timeout(MAX_WAIT_SECONDS):
+                    while (now := (await http.get(f"/v1/jobs/{job['id']}")).json())["attempt"] == 0:
+                        await asyncio.sleep(0.1)
+                assert now["worker"] == "old" and now["options"]["train"]["iterations"] == 50
+        finally:
+            await asyncio.to_thread(bench.close)

@@ -72,7 +72,9 @@ class Job:
         dataset_id: what it works on.
         source_id: the finished job whose results it works on.
         label: what its owner calls it.
-        options: every setting, resolved when it was accepted.
+        options: what was asked for; what is not there is default, by the version that runs it.
+        settings: every option, as the version ``resolved_by`` completed them where the job ran last.
+        resolved_by: that version.
         queue: which workers may take it.
         priority: higher goes first.
         slip: its current queue entry in the queue; others are stale.
@@ -141,6 +143,8 @@ class Job:
     version: int
     estimate: dict[str, Any] | None = None
     files_id: uuid.UUID | None = None
+    settings: dict[str, Any] | None = None
+    resolved_by: str | None = None
 
     @property
     def is_over(self) -> bool:

@@ -76,6 +76,14 @@ class Attempt:
                 await connection.execute("UPDATE jobs SET psnr = %s WHERE id = %s", [data["psnr"], job.id])
             await add_event(connection, job.id, job.attempt, kind, self.redact(dict(data)))
 
+    async def record_settings(self, settings: Mapping[str, Any], version: str) -> None:
+        """Record the complete options that this attempt runs with, and the version that completed them."""
+        async with self._fenced_transaction() as (connection, job):
+            await connection.execute(
+                "UPDATE jobs SET settings = %s, resolved_by = %s WHERE id = %s",
+                [as_json(dict(settings)), version, job.id],
+            )
+
     async def add_log_lines(self, lines: Sequence[str]) -> None:
         """Add lines to the log."""
         async with self._fenced_transaction() as (connection, job):

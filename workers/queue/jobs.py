@@ -182,7 +182,7 @@ async def retry_job(
         job_queue: the queue.
         job_id: which.
         from_start: begin from the start, not from the newest checkpoint.
-        options: complete options in the place of the job's own.
+        options: options in the place of the job's own.
         estimate: with them, what the job will take.
 
     Raises:
@@ -203,6 +203,8 @@ async def retry_job(
                 training_psnr = CASE WHEN %(fresh)s THEN NULL ELSE training_psnr END,
                 fresh_after = CASE WHEN %(forget)s THEN attempt ELSE fresh_after END,
                 options = coalesce(%(options)s, options),
+                settings = CASE WHEN %(options)s::jsonb IS NULL THEN settings END,
+                resolved_by = CASE WHEN %(options)s::jsonb IS NULL THEN resolved_by END,
                 estimate = CASE WHEN %(options)s::jsonb IS NULL THEN estimate ELSE %(estimate)s END
             WHERE id = %(id)s
             """,

@@ -12,6 +12,7 @@ from typing import Any, TypeVar
 
 import psycopg
 
+from octasplat.engine import __version__
 from octasplat.engine.core import versions
 from octasplat.engine.core.errors import ConfigError, OctasplatError
 from octasplat.engine.operations.precompile import request_groups
@@ -32,6 +33,7 @@ from octasplat.workers.worker.child_process import ChildProcess
 from octasplat.workers.worker.context import DatabaseLostError, WorkerContext
 from octasplat.workers.worker.heartbeat import DATABASE_ERRORS, Heartbeat
 from octasplat.workers.worker.job_kinds import JobKind, get_job_kind
+from octasplat.workers.worker.job_kinds.stored_options import options_of
 from octasplat.workers.worker.kernels import compile_for_job
 from octasplat.workers.worker.outcomes import OutcomeWriter
 from octasplat.workers.worker.path_redaction import PathRedactor, redact_json
@@ -164,7 +166,9 @@ class Supervisor:
     async def _prepare(self, kind: JobKind) -> dict[str, Any]:
         """Fill the workspace; returns the child's task."""
         job, settings = self._job, self._settings
-        options = kind.options.model_validate(job.options)
+        options = options_of(kind, job)
+        complete = options.model_dump(mode="json")
+        await self._attempt.record_settings(complete, __version__)
         scene, title = None, ""
         async with self._attempt.pool.connection() as connection:
             dataset = await get_dataset(connection, job.dataset_id) if job.dataset_id else None
@@ -197,7 +201,7 @@ class Supervisor:
             "kind": kind.name,
             "kind_modules": list(settings.kind_modules),
             "folder": str(self._workspace.folder),
-            "options": job.options,
+            "options": complete,
             "scene": str(scene) if scene else None,
             "title": title,
             "threads": settings.threads,
