@@ -76,3 +76,4 @@ webhook_signature
 job_seconds
 stage_seconds
 total_seconds_left
+resolved_by
