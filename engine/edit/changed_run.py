@@ -104,7 +104,12 @@ def _copy(source: Path, target: Path) -> None:
         if (source / name).exists():
             shutil.copyfile(source / name, target / name)
     if (source / POSES).is_dir():
-        shutil.copytree(source / POSES, target / POSES)
+        # Not by copytree, which sets access and times as well, as a confined job may not.
+        for path in (source / POSES).rglob("*"):
+            if path.is_file():
+                copy = target / path.relative_to(source)
+                copy.parent.mkdir(parents=True, exist_ok=True)
+                shutil.copyfile(path, copy)
 
 
 def _read_edits(source: Path) -> list[object]:

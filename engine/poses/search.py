@@ -189,7 +189,7 @@ class PoseSearch:
             if len(false) == 0:
                 break
             trial = database.with_name("trial.db")
-            shutil.copy(database, trial)
+            shutil.copyfile(database, trial)
             remove_pairs(trial, false)
             again = map_photographs(trial, self._photographs, seed=self._config.seed, on_count=at)
             if model_rank(again)[0] < model_rank(model)[0]:

@@ -267,12 +267,7 @@ def _enter_sandbox(request: ModelRequest) -> None:
     ):
         with contextlib.suppress(ValueError):  # already lower
             resource.setrlimit(kind, (value, value))
-    confine(
-        hidden=request.hidden,
-        readable=(request.root,),
-        may_start_processes=False,
-        is_read_only_elsewhere=True,
-    )
+    confine(hidden=request.hidden, readable=(request.root,), may_start_processes=False)
 
 
 if __name__ == "__main__":

@@ -27,7 +27,9 @@ if os.fork() == 0:
         if sys.argv[1] == "quiet":
             os.closerange(0, 256)
         while True:
-            time.sleep(1)
+            time.sleep(0.001 if sys.argv[1] == "fleeing" else 1)
+            if sys.argv[1] == "fleeing" and os.fork():
+                os._exit(0)
 """
 SYSCALLS = {"add_key": 248, "bpf": 321, "clone3": 435, "io_uring_setup": 425, "keyctl": 250, "mount": 165}
 NEW_USER_NAMESPACE = 0x10000000
@@ -42,6 +44,8 @@ class HostileOptions(BaseModel):
     pids: tuple[int, ...] = ()
     """Processes that are none of the job's."""
     size_bytes: int = 0
+    lasts: bool = False
+    """Goes on until it is stopped."""
 
 
 class PreviewClaim(Event):
@@ -96,10 +100,6 @@ def _link_results(task: Task, options: HostileOptions) -> None:
 
 def _link_result(task: Task, options: HostileOptions) -> None:
     (task.results / "inner").symlink_to(options.target)
-
-
-def _pipe_result(task: Task, _options: HostileOptions) -> None:
-    os.mkfifo(task.results / "pipe")
 
 
 def _wait_for_gate(task: Task, options: HostileOptions) -> None:
@@ -161,31 +161,22 @@ def _change_what_landlock_does_not_know(task: Task, options: HostileOptions) -> 
     _tell(task, calls)
 
 
-def _leave_quiet_daemon(task: Task, _options: HostileOptions) -> None:
-    _start_daemon("quiet")
+def _leave_daemon(task: Task, options: HostileOptions) -> None:
+    """Leave a process of another session without a parent; ``target`` says what it does."""
+    # With the pipes of the job, and with the name of the attempt, by which it is found.
+    how = options.target or "quiet"
+    subprocess.run([sys.executable, "-c", DAEMON, how, f"daemon of {task.folder.name}"], check=True)
+    task.progress(PhaseStarted("evaluate", 1))
+    while options.lasts and not task.should_stop():
+        time.sleep(0.05)
     _tell(task, {})
-
-
-def _leave_daemon_with_pipes(task: Task, options: HostileOptions) -> None:
-    _start_daemon("loud")
-    if options.size_bytes:  # goes on, too
-        while True:
-            time.sleep(1)
-    _tell(task, {})
-
-
-def _start_daemon(how: str) -> None:
-    # With the pipes of the job.
-    subprocess.run([sys.executable, "-c", DAEMON, how], check=True)
-    time.sleep(0.5)
 
 
 def _hog_shared_memory(task: Task, options: HostileOptions) -> None:
     def hog() -> int:
         shared = mmap.mmap(-1, options.size_bytes)
-        for start in range(0, options.size_bytes, 1 << 20):
-            shared[start : start + 1] = b"x"
-            shared[start : start + (1 << 20) : 4096] = b"x" * 256
+        for start in range(0, options.size_bytes, 4096):
+            shared[start] = 1
         time.sleep(5)
         return len(shared)
 
@@ -230,10 +221,8 @@ ATTACKS: Mapping[str, Callable[[Task, HostileOptions], None]] = {
     "link run": _link_run,
     "link results": _link_results,
     "link result": _link_result,
-    "pipe result": _pipe_result,
     "calls": _change_what_landlock_does_not_know,
-    "daemon": _leave_quiet_daemon,
-    "daemon with pipes": _leave_daemon_with_pipes,
+    "daemon": _leave_daemon,
     "shared memory": _hog_shared_memory,
     "write elsewhere": _write_elsewhere,
 }

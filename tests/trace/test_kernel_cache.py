@@ -106,7 +106,7 @@ def test_confined_process_reads_code_that_it_cannot_write(package: Path, tmp_pat
         from octasplat.workers.sandbox.confinement import confine
         confine(hidden=[pathlib.Path({str(code)!r})], readable=[pathlib.Path({str(code)!r})],
                 writable=[pathlib.Path({str(mine)!r})],
-                may_start_processes=True, is_read_only_elsewhere=False)
+                may_start_processes=True)
         from octasplat.engine.toy import doubled
         print(doubled(21), sum(doubled.stats.cache_hits.values()), doubled(0.5))
         for path in pathlib.Path({str(code)!r}).rglob("*.nbc"):

@@ -21,8 +21,7 @@ READER = """
 import json, os, socket, subprocess, sys
 from pathlib import Path
 from octasplat.workers.sandbox.confinement import confine
-confine(hidden=[Path(sys.argv[1])], readable=[Path(sys.argv[1]) / "open"], may_start_processes=False,
-        is_read_only_elsewhere=True)
+confine(hidden=[Path(sys.argv[1])], readable=[Path(sys.argv[1]) / "open"], may_start_processes=False)
 import numpy
 tries = dict(
     shut=lambda: Path(sys.argv[1], "shut").read_text(),
@@ -40,7 +39,10 @@ print(json.dumps(found))
 """
 WITHOUT_LANDLOCK = """
 from octasplat.workers.sandbox import seccomp
-seccomp._DENIED = {"landlock_create_ruleset": (444, 444)}
+unknown = (9999, 9999)
+seccomp.MMAP = seccomp.IOCTL = seccomp.SET_LIMITS = seccomp.SET_CORES = seccomp.SET_PRIORITY = unknown
+seccomp.ALLOWED = {str(number): (number, number) for number in range(500) if number != 444}
+seccomp.REFUSED = {"landlock_create_ruleset": (444, 444)}
 seccomp.install_seccomp_filter(may_start_processes=True)
 from octasplat.workers.cli.main import main
 main()

@@ -35,25 +35,21 @@ def confine(
     writable: Sequence[Path] = (),
     readable: Sequence[Path] = (),
     may_start_processes: bool,
-    is_read_only_elsewhere: bool,
 ) -> None:
     """Give up rights for good; what the kernel does not support is left out.
 
     Args:
         hidden: folders that cannot be opened, see
             :func:`octasplat.workers.sandbox.landlock.restrict_folders`.
-        writable: what can be written all the same.
-        readable: what can be read all the same.
+        writable: folders that can be written; nothing else can.
+        readable: what can be read within the hidden folders.
         may_start_processes: whether other programs can be started, which have no more rights.
-        is_read_only_elsewhere: whether nothing else can be written.
     """
     forbid_memory_access()
     with contextlib.suppress(OSError):
         prctl(PR_SET_NO_NEW_PRIVS, 1)
     with contextlib.suppress(OSError):
-        restrict_folders(
-            hidden, writable=writable, readable=readable, is_read_only_elsewhere=is_read_only_elsewhere
-        )
+        restrict_folders(hidden, writable=writable, readable=readable)
     with contextlib.suppress(OSError):
         _drop_capabilities()
     with contextlib.suppress(OSError):

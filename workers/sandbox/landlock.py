@@ -22,6 +22,9 @@ _SCOPES = 0b11
 """Neither signals to processes outside nor sockets without a name in the file system; from version 6."""
 _RIGHTS_BY_VERSION = ((2, (1 << 14) - 1), (3, (1 << 15) - 1), (5, (1 << 16) - 1))
 _FILE_RIGHTS = _EXECUTE | _WRITE_FILE | _READ_FILE | _TRUNCATE | _DEVICE_IOCTL
+_DEVICES = Path("/dev")
+_WRITABLE_DEVICES = ("null", "nvidia*", "dri", "kfd")
+_READABLE_DEVICES = ("zero", "full", "random", "urandom")
 _READ_RIGHTS = _EXECUTE | _READ_FILE | _READ_FOLDER
 
 
@@ -44,19 +47,14 @@ def landlock_version() -> int:
 
 
 def restrict_folders(
-    hidden: Sequence[Path],
-    *,
-    writable: Sequence[Path] = (),
-    readable: Sequence[Path] = (),
-    is_read_only_elsewhere: bool,
+    hidden: Sequence[Path], *, writable: Sequence[Path] = (), readable: Sequence[Path] = ()
 ) -> None:
-    """Make folders inaccessible to this process and all that it starts, for good.
+    """Let this process and all that it starts write to some folders only and read no hidden ones, for good.
 
     Args:
-        hidden: what cannot be opened.
+        hidden: what cannot be opened; devices cannot either, but for those of numbers and of graphics cards.
         writable: within the hidden ones, or elsewhere, folders that can be read and written.
         readable: within the hidden ones, folders that can be read.
-        is_read_only_elsewhere: whether all other folders can be read only.
 
     Raises:
         OSError: the kernel has no Landlock of use.
@@ -69,14 +67,15 @@ def restrict_folders(
     length = ctypes.sizeof(attributes) if version >= 6 else 8
     ruleset = syscall(_CREATE, ctypes.byref(attributes), ctypes.c_size_t(length), ctypes.c_uint32(0))
     try:
-        shut = {Path(os.path.realpath(path)) for path in hidden}
+        shut = {Path(os.path.realpath(path)) for path in (*hidden, _DEVICES)}
         reading = _READ_RIGHTS & rights
         for path in _paths_without_hidden(Path("/"), shut):
-            _add_rule(ruleset, path, reading if is_read_only_elsewhere else rights)
+            _add_rule(ruleset, path, reading)
         # Names can be listed everywhere, as whoever looks for modules does on the way to what is hidden.
         _add_rule(ruleset, Path("/"), _READ_FOLDER)
-        for path in (Path("/dev/null"), Path("/dev/zero"), Path("/dev/shm")):  # noqa: S108 - a device
-            _add_rule(ruleset, path, rights)
+        for pattern, given in ((_WRITABLE_DEVICES, rights), (_READABLE_DEVICES, reading)):
+            for path in (path for name in pattern for path in _DEVICES.glob(name)):
+                _add_rule(ruleset, path, given)
         for paths, given in ((writable, rights), (readable, reading)):
             for path in paths:
                 _add_rule(ruleset, Path(os.path.realpath(path)), given)

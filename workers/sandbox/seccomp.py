@@ -1,42 +1,43 @@
-"""Filter of system calls (seccomp): no sockets, no access to other processes, no system changes.
+"""Filter of system calls (seccomp): a list of what is allowed, the same for a process and all that it starts.
 
-https://docs.kernel.org/userspace-api/seccomp_filter.html. It holds for a process and all that it starts.
+https://docs.kernel.org/userspace-api/seccomp_filter.html. The calls are those of
+:mod:`octasplat.workers.sandbox.system_calls`. Some are allowed by their arguments only: limits, cores and
+priority of the calling process itself, memory that is not shared without a file, clones in the namespaces and
+below the process that made them, and device calls but those that type into a terminal.
 """
 
 import ctypes
 import errno
 import platform
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 from octasplat.workers.sandbox.linux import PR_SET_NO_NEW_PRIVS, PR_SET_SECCOMP, prctl
+from octasplat.workers.sandbox.system_calls import (
+    ALLOWED,
+    CLONE,
+    CLONE3,
+    IOCTL,
+    MMAP,
+    PROCESS_CALLS,
+    REFUSED,
+    SET_CORES,
+    SET_LIMITS,
+    SET_PRIORITY,
+)
 
 _MODE_FILTER = 2
 _ALLOW, _ERRNO, _KILL = 0x7FFF0000, 0x00050000, 0x80000000
-_LOAD, _EQUAL, _AT_LEAST, _ANY_BIT, _RETURN = 0x20, 0x15, 0x35, 0x45, 0x06
-_NUMBER_OFFSET, _ARCH_OFFSET, _FIRST_ARGUMENT_OFFSET = 0, 4, 16
-_CLONE_THREAD = 0x00010000
+_REFUSE, _ABSENT = _ERRNO | errno.EPERM, _ERRNO | errno.ENOSYS
+_LOAD, _EQUAL, _AT_LEAST, _ANY_BIT, _MASK, _RETURN = 0x20, 0x15, 0x35, 0x45, 0x54, 0x06
+_NUMBER_OFFSET, _ARCH_OFFSET = 0, 4
 _X32_SYSCALL_BIT = 0x40000000
 _ARCHES = {"x86_64": 0xC000003E, "aarch64": 0xC00000B7}
-# Numbers on x86-64 and on 64-bit ARM; None where there is no such call.
-_DENIED: dict[str, tuple[int | None, int | None]] = {
-    "socket": (41, 198),
-    "ptrace": (101, 117), "process_vm_readv": (310, 270), "process_vm_writev": (311, 271),
-    "pidfd_getfd": (438, 438), "kcmp": (312, 272),
-    "bpf": (321, 280), "perf_event_open": (298, 241), "userfaultfd": (323, 282),
-    "add_key": (248, 217), "request_key": (249, 218), "keyctl": (250, 219),
-    "unshare": (272, 97), "setns": (308, 268), "mount": (165, 40), "umount2": (166, 39),
-    "pivot_root": (155, 41), "chroot": (161, 51), "open_by_handle_at": (304, 265), "open_tree": (428, 428),
-    "move_mount": (429, 429), "fsopen": (430, 430), "mount_setattr": (442, 442),
-    "init_module": (175, 105), "finit_module": (313, 273), "delete_module": (176, 106),
-    "kexec_load": (246, 104), "reboot": (169, 142), "swapon": (167, 224), "swapoff": (168, 225),
-    "settimeofday": (164, 170), "clock_settime": (227, 112), "acct": (163, 89),
-}  # fmt: skip
-_PROCESS_CALLS: dict[str, tuple[int | None, int | None]] = {
-    "fork": (57, None), "vfork": (58, None), "execve": (59, 221), "execveat": (322, 281),
-}  # fmt: skip
-# Programs fall back to older calls where they think that the kernel does not have these.
-_ABSENT: dict[str, tuple[int | None, int | None]] = {"io_uring_setup": (425, 425)}
-_CLONE, _CLONE3 = (56, 220), (435, 435)
+_CLONE_THREAD, _CLONE_PARENT, _CLONE_NEW = 0x00010000, 0x00008000, 0x7E020000
+"""A clone that has another parent would not be counted; the last are all kinds of namespaces."""
+_SHARED_WITHOUT_FILE = 0x21
+"""MAP_SHARED and MAP_ANONYMOUS: such memory stays taken while no process has it mapped."""
+_TERMINAL_INPUT = (0x5412, 0x541C)
+"""TIOCSTI and TIOCLINUX."""
 
 
 class _Instruction(ctypes.Structure):
@@ -64,7 +65,7 @@ def has_seccomp() -> bool:
 
 
 def install_seccomp_filter(*, may_start_processes: bool) -> None:
-    """Block the system calls for good.
+    """Restrict the system calls to those of the list, for good.
 
     Args:
         may_start_processes: whether it may start other programs, which have the same filter.
@@ -89,18 +90,75 @@ def _filter_instructions(machine: str, may_start_processes: bool) -> Iterator[_I
     yield _Instruction(_LOAD, 0, 0, _NUMBER_OFFSET)
     if machine == "x86_64":
         yield _Instruction(_AT_LEAST, 0, 1, _X32_SYSCALL_BIT)
-        yield _Instruction(_RETURN, 0, 0, _ERRNO | errno.EPERM)
-    denied = dict(_DENIED) if may_start_processes else {**_DENIED, **_PROCESS_CALLS}
-    answers = {errno.EPERM: list(denied.values()), errno.ENOSYS: list(_ABSENT.values())}
-    if not may_start_processes:
-        answers[errno.ENOSYS].append(_CLONE3)  # its flags lie in memory, where a filter cannot read them
-    for answer, numbers in answers.items():
-        for number in filter(None, (pair[column] for pair in numbers)):
-            yield _Instruction(_EQUAL, 0, 1, number)
-            yield _Instruction(_RETURN, 0, 0, _ERRNO | answer)
-    if not may_start_processes:
-        yield _Instruction(_EQUAL, 0, 3, _CLONE[column])
-        yield _Instruction(_LOAD, 0, 0, _FIRST_ARGUMENT_OFFSET)
-        yield _Instruction(_ANY_BIT, 1, 0, _CLONE_THREAD)
-        yield _Instruction(_RETURN, 0, 0, _ERRNO | errno.EPERM)
-    yield _Instruction(_RETURN, 0, 0, _ALLOW)
+        yield _Instruction(_RETURN, 0, 0, _REFUSE)
+    # Its flags lie in memory, where a filter cannot read them; libraries make threads without it then.
+    yield from _answer_call(CLONE3[column], [_Instruction(_RETURN, 0, 0, _ABSENT)])
+    for number, check in (
+        (MMAP[column], [*_masked_argument(3, _SHARED_WITHOUT_FILE), *_refuse_if_equal(_SHARED_WITHOUT_FILE)]),
+        (CLONE[column], _clone_check(may_start_processes)),
+        (
+            IOCTL[column],
+            [_argument(1), *(step for call in _TERMINAL_INPUT for step in _refuse_if_equal(call))],
+        ),
+        (SET_LIMITS[column], [_argument(0), *_refuse_unless_zero()]),
+        (SET_CORES[column], [_argument(0), *_refuse_unless_zero()]),
+        (SET_PRIORITY[column], [_argument(0), *_refuse_unless_zero(), _argument(1), *_refuse_unless_zero()]),
+    ):
+        yield from _answer_call(number, [*check, _Instruction(_RETURN, 0, 0, _ALLOW)])
+    allowed = {**ALLOWED, **PROCESS_CALLS} if may_start_processes else ALLOWED
+    refused = REFUSED if may_start_processes else {**REFUSED, **PROCESS_CALLS}
+    for calls, answer in ((allowed, _ALLOW), (refused, _REFUSE)):
+        for first, last in _ranges([pair[column] for pair in calls.values()]):
+            yield _Instruction(_AT_LEAST, 2, 0, last + 1)
+            yield _Instruction(_AT_LEAST, 0, 1, first)
+            yield _Instruction(_RETURN, 0, 0, answer)
+    yield _Instruction(_RETURN, 0, 0, _ABSENT)
+
+
+def _clone_check(may_start_processes: bool) -> list[_Instruction]:
+    flags = _argument(0)
+    if may_start_processes:
+        return [
+            flags,
+            _Instruction(_ANY_BIT, 0, 1, _CLONE_NEW | _CLONE_PARENT),
+            _Instruction(_RETURN, 0, 0, _REFUSE),
+        ]
+    return [flags, _Instruction(_ANY_BIT, 1, 0, _CLONE_THREAD), _Instruction(_RETURN, 0, 0, _REFUSE)]
+
+
+def _answer_call(number: int, answer: Sequence[_Instruction]) -> Iterator[_Instruction]:
+    """Yield instructions that answer one call; the number of any other stays loaded."""
+    yield _Instruction(_EQUAL, 0, len(answer), number)
+    yield from answer
+
+
+def _argument(index: int) -> _Instruction:
+    """Return the instruction that loads the lower half of an argument."""
+    return _Instruction(_LOAD, 0, 0, 16 + 8 * index)
+
+
+def _masked_argument(index: int, mask: int) -> list[_Instruction]:
+    return [_argument(index), _Instruction(_MASK, 0, 0, mask)]
+
+
+def _refuse_if_equal(value: int) -> list[_Instruction]:
+    return [_Instruction(_EQUAL, 0, 1, value), _Instruction(_RETURN, 0, 0, _REFUSE)]
+
+
+def _refuse_unless_zero() -> list[_Instruction]:
+    return [_Instruction(_EQUAL, 1, 0, 0), _Instruction(_RETURN, 0, 0, _REFUSE)]
+
+
+def _ranges(numbers: Sequence[int | None]) -> list[tuple[int, int]]:
+    """Return the ranges of consecutive numbers.
+
+    >>> _ranges([3, None, 1, 2, 7])
+    [(1, 3), (7, 7)]
+    """
+    found: list[tuple[int, int]] = []
+    for number in sorted(number for number in numbers if number is not None):
+        if found and found[-1][1] == number - 1:
+            found[-1] = (found[-1][0], number)
+        else:
+            found.append((number, number))
+    return found

@@ -148,11 +148,10 @@ def _enter_sandbox(task: dict[str, Any]) -> None:
     # Machine code that other processes run is theirs to make; a job reads it.
     kernels = shared_cache_folder()
     confine(
-        hidden=[*(Path(path) for path in task.get("hidden", ())), kernels],
+        hidden=[Path(path) for path in task.get("hidden", ())],
         writable=written,
         readable=[kernels, *([Path(task["scene"])] if task.get("scene") else ())],
         may_start_processes=True,
-        is_read_only_elsewhere=False,
     )
 
 
