@@ -1,158 +1,112 @@
-"""Child process of a worker: runs one job, reports in JSON lines, stops when asked or orphaned.
+"""Guard of a job's process: starts it, and ends whatever it leaves behind.
 
-Run by :func:`octasplat.engine.core.isolated_python.python_command`. The first line of stdin is the task
-(JSON); a later line ``stop`` requests a checkpoint and a stop. If stdin ends, the worker has died. Events go
-to stdout, one JSON object a line; output of libraries goes to stderr, which is the job's log.
+    python -m octasplat.workers.worker.child_main WORKER_PID
+
+Run by :func:`octasplat.engine.core.isolated_python.python_command`. The guard forks; its child runs
+:mod:`octasplat.workers.worker.job_process` with the pipes to the worker, of which the guard keeps none;
+it reads nothing that a job writes. On Linux it is a subreaper: processes that lose their parents become its
+children, whatever session they are in. When the program has ended, when the worker dies, or at
+:data:`END_SIGNAL`, it kills all of them until there are none, and ends as the program has ended.
 """
 
 import contextlib
-import importlib
-import io
-import json
 import os
 import signal
 import sys
-import threading
-import traceback
-from pathlib import Path
-from typing import Any, NoReturn
+import time
+from typing import NoReturn
 
-from octasplat.engine.core.errors import CancelledError, OctasplatError
-from octasplat.engine.core.events import Event
-from octasplat.engine.core.kernel_folder import shared_cache_folder
 from octasplat.workers.parent_death_signal import set_parent_death_signal
-from octasplat.workers.sandbox.confinement import confine, set_resource_limits
-from octasplat.workers.storage.os_errors import is_disk_full
-from octasplat.workers.worker.task import EXIT_REFUSED, EXIT_STOPPED, EXIT_UNEXPECTED, NO_SPACE_ERROR, Task
+from octasplat.workers.sandbox.hiding import forbid_memory_access
+from octasplat.workers.sandbox.linux import PR_SET_CHILD_SUBREAPER, prctl
+from octasplat.workers.sandbox.process_tree import kill_descendants
 
-OOM_SCORE_ADJUSTMENT = 800
-MAX_CAUSE_LINES = 60
-
-
-class _EventStream:
-    """The original stdout, reserved for JSON lines."""
-
-    def __init__(self) -> None:
-        self._file = os.fdopen(os.dup(1), "w", encoding="utf-8")
-        os.dup2(2, 1)
-        if isinstance(sys.stdout, io.TextIOWrapper):
-            sys.stdout.reconfigure(line_buffering=True)  # what is printed belongs between the stages
-        self._lock = threading.Lock()
-
-    def write(self, line: dict[str, object]) -> None:
-        with self._lock:
-            self._file.write(json.dumps(line) + "\n")
-            self._file.flush()
+END_SIGNAL = signal.SIGUSR1
+"""Not SIGTERM, which systemd sends to all processes of a service that is to stop by itself."""
+_HANDLED = {signal.SIGCHLD, signal.SIGTERM, signal.SIGINT, END_SIGNAL}
+_EAGER_ROUNDS = 2_000
+"""At first without pauses, as some may start others as fast as they are killed."""
+_PAUSE_SECONDS = 0.01
 
 
 def main() -> NoReturn:
-    """Run the task from stdin and exit."""
-    lines = _EventStream()
-    given: dict[str, Any] = json.loads(sys.stdin.readline())
-    set_parent_death_signal(
-        given["parent_pid"], signal.SIGKILL
-    )  # elsewhere than on Linux the end of stdin does
-    _raise_oom_score()
-    _enter_sandbox(given)
-    stop = threading.Event()
-    threading.Thread(target=_watch_stdin, args=(stop,), daemon=True).start()
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    code = _run_task(given, lines, stop)
-    sys.stderr.flush()
-    # Not by way of the interpreter's clean-up, in which a library may hang or crash after all is done.
-    os._exit(code)
-
-
-def _run_task(task: dict[str, Any], events: _EventStream, stop: threading.Event) -> int:
-    def report(event: Event) -> None:
-        events.write(event.as_dict())
-
-    try:
-        for module in task["kind_modules"]:
-            importlib.import_module(module)
-        module_name, _, function = task["program"].partition(":")
-        program = getattr(importlib.import_module(module_name), function)
-        if task.get("probe"):
-            return 0
-        # After all imports, as pycolmap takes SIGTERM for itself.
-        signal.signal(signal.SIGTERM, lambda _number, _frame: stop.set())
-        events.write({"kind": "ready"})
-        program(
-            Task(
-                folder=Path(task["folder"]),
-                options=task["options"],
-                scene=Path(task["scene"]) if task["scene"] else None,
-                title=task["title"],
-                threads=task["threads"],
-                progress=report,
-                should_stop=stop.is_set,
-                kind=task.get("kind", ""),
-            )
-        )
-    except CancelledError as error:
-        events.write({"kind": "stopped", "message": str(error)})
-        return EXIT_STOPPED
-    except OctasplatError as error:
-        kind = NO_SPACE_ERROR if is_disk_full(error) else error.error_type
-        events.write({"kind": "error", "type": kind, "message": str(error), "cause": _cause_lines(error)})
-        return EXIT_REFUSED
-    except MemoryError:
-        events.write({"kind": "error", "type": "out_of_memory", "message": "The job ran out of memory."})
-        return EXIT_REFUSED
-    except Exception as error:  # noqa: BLE001 - told to the worker, which tells the user
-        if task.get("probe"):
-            sys.stderr.write(f"{type(error).__name__}: {error}\n")
-        kind = NO_SPACE_ERROR if is_disk_full(error) else "unexpected"
-        message = f"{type(error).__name__}: {error}"
-        cause = "".join(traceback.format_exception(error)).splitlines()[-MAX_CAUSE_LINES:]
-        events.write({"kind": "error", "type": kind, "message": message, "cause": cause})
-        return EXIT_UNEXPECTED
-    events.write({"kind": "done"})
-    return 0
-
-
-def _cause_lines(error: BaseException) -> list[str]:
-    """Return the causes of an error, one line each."""
-    found: list[str] = []
-    while len(found) < MAX_CAUSE_LINES:
-        inner = error.__cause__ or (None if error.__suppress_context__ else error.__context__)
-        if inner is None:
-            break
-        found.append(f"Caused by {type(inner).__name__}: {' '.join(str(inner).split())[:2000]}")
-        error = inner
-    return found
-
-
-def _watch_stdin(stop: threading.Event) -> None:
-    for line in sys.stdin:
-        if line.strip() == "stop":
-            stop.set()
-    os.kill(os.getpid(), signal.SIGKILL)
-
-
-def _raise_oom_score() -> None:
-    """Raise the OOM score, so that the system kills this process before the database."""
+    """Run the job's process and end as it ends."""
+    signal.pthread_sigmask(signal.SIG_BLOCK, _HANDLED)
+    # Elsewhere than on Linux the program sees the end of its stdin.
+    set_parent_death_signal(int(sys.argv[1]), END_SIGNAL)
     with contextlib.suppress(OSError):
-        Path("/proc/self/oom_score_adj").write_text(str(OOM_SCORE_ADJUSTMENT), encoding="ascii")
+        prctl(PR_SET_CHILD_SUBREAPER, 1)
+    guard = os.getpid()
+    program = os.fork()
+    if program == 0:
+        os.setpgid(0, 0)
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, _HANDLED)
+        set_parent_death_signal(guard, signal.SIGKILL)
+        from octasplat.workers.worker.job_process import run_job
+
+        run_job()
+    forbid_memory_access()
+    nothing = os.open(os.devnull, os.O_RDWR)
+    for pipe in (0, 1, 2):
+        os.dup2(nothing, pipe)
+    status = _wait_for_program(program)
+    status = _end_all(program, status)
+    if os.WIFSIGNALED(status):
+        _end_by_signal(os.WTERMSIG(status))
+    os._exit(os.waitstatus_to_exitcode(status))
 
 
-def _enter_sandbox(task: dict[str, Any]) -> None:
-    """Give up rights that the work does not need, while there is one thread; later ones inherit this."""
-    set_resource_limits(task.get("memory_limit_bytes"))
-    written: tuple[Path, ...] = ()
-    if "folder" in task:
-        written = (Path(task["folder"]),)
-        temporary = written[0] / "tmp"
-        temporary.mkdir(exist_ok=True)
-        os.environ["TMPDIR"] = str(temporary)
-    # Machine code that other processes run is theirs to make; a job reads it.
-    kernels = shared_cache_folder()
-    confine(
-        hidden=[Path(path) for path in task.get("hidden", ())],
-        writable=written,
-        readable=[kernels, *([Path(task["scene"])] if task.get("scene") else ())],
-        may_start_processes=True,
-    )
+def _wait_for_program(program: int) -> int | None:
+    """Wait for the end of the program; return its status, or None where it has to be ended."""
+    while True:
+        number = signal.sigwait(_HANDLED)
+        if number == END_SIGNAL:
+            return None
+        if number == signal.SIGTERM:
+            with contextlib.suppress(ProcessLookupError, PermissionError):
+                os.kill(program, number)
+        _, status = _reap(program)
+        if status is not None:
+            return status
+
+
+def _end_all(program: int, status: int | None) -> int:
+    """Kill all descendants until there are none; return the status of the program."""
+    rounds = 0
+    while True:
+        if rounds == 0:  # for systems without subreapers
+            with contextlib.suppress(ProcessLookupError, PermissionError):
+                os.killpg(program, signal.SIGKILL)
+        kill_descendants(os.getpid())
+        is_alone, found = _reap(program)
+        status = found if status is None else status
+        if is_alone:
+            return signal.SIGKILL if status is None else status
+        rounds += 1
+        if rounds > _EAGER_ROUNDS:
+            time.sleep(_PAUSE_SECONDS)
+
+
+def _reap(program: int) -> tuple[bool, int | None]:
+    """Take note of ended children; return whether none is left, and the status of the program if it ended."""
+    found = None
+    try:
+        while True:
+            pid, status = os.waitpid(-1, os.WNOHANG)
+            if pid == 0:
+                return False, found
+            if pid == program:
+                found = status
+    except ChildProcessError:
+        return True, found
+
+
+def _end_by_signal(number: int) -> NoReturn:
+    with contextlib.suppress(OSError, ValueError):  # SIGKILL has no handler
+        signal.signal(number, signal.SIG_DFL)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, {number})
+    os.kill(os.getpid(), number)
+    os._exit(128 + number)
 
 
 if __name__ == "__main__":

@@ -4,30 +4,40 @@ import asyncio
 import contextlib
 import json
 import logging
+import math
 import os
 import re
 import signal
 import time
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import psutil
-
 from octasplat.engine.core.isolated_python import python_command
 from octasplat.engine.files.splat_transform import PROGRAM_VARIABLE as SPLAT_TRANSFORM
+from octasplat.workers.sandbox.process_tree import descendant_count, kill_descendants, tree_memory_bytes
+from octasplat.workers.worker.child_main import END_SIGNAL
 
 logger = logging.getLogger(__name__)
 
 MAX_LINE_BYTES = 1 << 20
 MAX_LAST_LINES = 20
 _READ_BYTES = 1 << 16
+_POLL_SECONDS = 0.02
+_FORCE_SECONDS = 5.0
+"""A guard that takes longer to end its processes is ended itself."""
 _PASSED_VARIABLES = re.compile(
     r"PATH|HOME|USER|LOGNAME|SHELL|LANG|LC_\w+|TZ|TMPDIR|TEMP|TMP|VIRTUAL_ENV|LD_LIBRARY_PATH|"
     r"DYLD_LIBRARY_PATH|XDG_CACHE_HOME|CUDA_\w+|NVIDIA_\w+|NUMBA_\w+|OMP_\w+|MKL_\w+|OPENBLAS_\w+|"
     r"OCTASPLAT_DEBUG|OCTASPLAT_SPLAT_TRANSFORM"
 )
+
+
+def child_command(kind_modules: Sequence[str]) -> tuple[str, ...]:
+    """Return the command that starts a job's process below a guard, which ends with this process."""
+    module = "octasplat.workers.worker.child_main"
+    return python_command(module, str(os.getpid()), further_modules=kind_modules)
 
 
 def child_environment(environment: Mapping[str, str]) -> dict[str, str]:
@@ -66,6 +76,7 @@ class ChildProcess:
         self.last_log_lines: deque[str] = deque(maxlen=MAX_LAST_LINES)
         self.error: dict[str, Any] | None = None
         self.is_ready = False
+        self._force_at = math.inf
         assert process.stdout is not None and process.stderr is not None
         self._readers = (
             asyncio.create_task(self._read_lines(process.stdout, self._on_stdout_line)),
@@ -79,9 +90,9 @@ class ChildProcess:
         on_event: Callable[[dict[str, Any]], None],
         on_log: Callable[[str], None],
     ) -> "ChildProcess":
-        """Start a child with its task, see :mod:`octasplat.workers.worker.child_main`."""
+        """Start a child with its task, see :mod:`octasplat.workers.worker.job_process`."""
         process = await asyncio.create_subprocess_exec(
-            *python_command("octasplat.workers.worker.child_main", further_modules=task["kind_modules"]),
+            *child_command(task["kind_modules"]),
             stdin=asyncio.subprocess.PIPE,
             stdout=asyncio.subprocess.PIPE,
             stderr=asyncio.subprocess.PIPE,
@@ -91,7 +102,7 @@ class ChildProcess:
             limit=MAX_LINE_BYTES,
         )
         child = cls(process, on_event, on_log)
-        child._send(json.dumps({**task, "parent_pid": os.getpid()}))
+        child._send(json.dumps(dict(task)))
         return child
 
     @property
@@ -101,8 +112,12 @@ class ChildProcess:
 
     async def wait(self) -> int:
         """Wait for the end and all output; returns the exit code, negative for a signal."""
-        code = await self._process.wait()
-        # A grandchild may hold the pipes open.
+        # Not by the process's own wait, which lasts until nobody holds the pipes.
+        while self._process.returncode is None:
+            if time.monotonic() > self._force_at:
+                self._force_end()
+            await asyncio.sleep(_POLL_SECONDS)
+        code = self._process.returncode
         _, late = await asyncio.wait(self._readers, timeout=5)
         for reader in late:
             reader.cancel()
@@ -115,30 +130,25 @@ class ChildProcess:
         self._send("stop")
 
     def kill(self) -> None:
-        """Kill the process and whatever it started, at once."""
+        """Have the process and whatever it started killed, at once."""
+        if self._process.returncode is None:
+            with contextlib.suppress(ProcessLookupError, PermissionError):
+                os.kill(self._process.pid, END_SIGNAL)
+            self._force_at = min(self._force_at, time.monotonic() + _FORCE_SECONDS)
+
+    def _force_end(self) -> None:
+        """Kill all of them from here, as their guard does not."""
+        kill_descendants(self._process.pid)
         with contextlib.suppress(ProcessLookupError, PermissionError):
-            os.killpg(self._process.pid, signal.SIGKILL)
+            os.kill(self._process.pid, signal.SIGKILL)
 
     def memory_bytes(self) -> int:
-        """Return the private memory of the child and its descendants.
-
-        Pages of files that are mapped, as those of photographs, belong to the system, which takes them back
-        when it needs them.
-        """
-        total = 0
-        with contextlib.suppress(psutil.Error):
-            child = psutil.Process(self._process.pid)
-            for process in (child, *child.children(recursive=True)):
-                with contextlib.suppress(psutil.Error):
-                    memory = process.memory_info()
-                    total += memory.rss - getattr(memory, "shared", 0)
-        return total
+        """Return the memory of the child and its descendants, shared memory included."""
+        return tree_memory_bytes(self._process.pid)
 
     def process_count(self) -> int:
-        """Return the number of live descendants of the child."""
-        with contextlib.suppress(psutil.Error):
-            return len(psutil.Process(self._process.pid).children(recursive=True))
-        return 0
+        """Return the number of live processes that the job's own has started, directly or not."""
+        return descendant_count(self._process.pid) - 1
 
     def _send(self, line: str) -> None:
         assert self._process.stdin is not None

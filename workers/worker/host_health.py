@@ -10,11 +10,10 @@ import uuid
 from collections.abc import Sequence
 from pathlib import Path
 
-from octasplat.engine.core.isolated_python import python_command
 from octasplat.workers.storage.errors import StorageError, StorageFullError
 from octasplat.workers.storage.os_errors import translate_os_errors
 from octasplat.workers.storage.protocol import Storage
-from octasplat.workers.worker.child_process import child_environment
+from octasplat.workers.worker.child_process import child_command, child_environment
 
 logger = logging.getLogger(__name__)
 
@@ -136,7 +135,7 @@ class HostHealth:
         """Return whether a process starts and can import the program of a job."""
         try:
             process = await asyncio.create_subprocess_exec(
-                *python_command("octasplat.workers.worker.child_main", further_modules=self._kind_modules),
+                *child_command(self._kind_modules),
                 stdin=asyncio.subprocess.PIPE,
                 stdout=asyncio.subprocess.DEVNULL,
                 stderr=asyncio.subprocess.PIPE,
@@ -149,7 +148,6 @@ class HostHealth:
         task = {
             "program": program,
             "kind_modules": self._kind_modules,
-            "parent_pid": os.getpid(),
             "probe": True,
         }
         try:

@@ -1,0 +1,101 @@
+"""Nothing that a job has started or holds outlives it, whatever it has done to be forgotten."""
+
+import json
+import subprocess
+import sys
+import time
+import uuid
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import psutil
+import pytest
+
+from octasplat.workers.sandbox.capabilities import sandbox_capabilities
+from octasplat.workers.sandbox.linux import IS_LINUX
+from octasplat.workers.sandbox.process_tree import tree_memory_bytes
+from tests.support.worker_harness import WorkerHarness
+
+pytestmark = pytest.mark.skipif(not IS_LINUX, reason="processes without parents are found on Linux only")
+SHARED = """
+import mmap, sys
+shared = mmap.mmap(-1, 64 << 20)
+for start in range(0, len(shared), 4096):
+    shared[start] = 1
+print(flush=True)
+sys.stdin.read()
+"""
+
+
+@pytest.fixture
+def bench(conninfo: str, tmp_path: Path) -> Iterator[WorkerHarness]:
+    bench = WorkerHarness(conninfo, tmp_path)
+    yield bench
+    bench.close()
+
+
+def start_worker(bench: WorkerHarness, **settings: str) -> "subprocess.Popen[bytes]":
+    return bench.worker(KIND_MODULES='["tests.support.hostile_kind"]', **settings)
+
+
+def daemons(job_id: uuid.UUID) -> list[int]:
+    found = []
+    for process in psutil.process_iter(("cmdline", "status")):
+        words = process.info["cmdline"] or ()
+        if any(f"daemon of {job_id}" in word for word in words) and process.info["status"] != "zombie":
+            found.append(process.pid)
+    return found
+
+
+def wait_for(condition: Callable[[], object], seconds: float = 60.0) -> None:
+    deadline = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+
+
+@pytest.mark.parametrize("how", ["quiet", "loud", "fleeing"])
+def test_daemons_of_a_job_end_with_it(bench: WorkerHarness, how: str) -> None:
+    start_worker(bench)
+    job_id = bench.submit("hostile", options={"attack": "daemon", "target": how})
+    job = bench.wait_until_finished(job_id, 60)
+    assert job.state == "succeeded" and daemons(job_id) == []
+
+
+def test_canceled_job_with_a_held_pipe_frees_its_slot(bench: WorkerHarness) -> None:
+    start_worker(bench)
+    job_id = bench.submit("hostile", options={"attack": "daemon", "target": "loud", "lasts": True})
+    wait_for(lambda: daemons(job_id))
+    bench.cancel(job_id)
+    job = bench.wait_until_finished(job_id, 60)
+    assert job.state in ("canceled", "succeeded") and daemons(job_id) == []
+    later = bench.submit("hostile", options={"attack": "daemon"})
+    assert bench.wait_until_finished(later, 60).state == "succeeded"
+
+
+def test_daemons_end_when_their_worker_is_killed(bench: WorkerHarness) -> None:
+    worker = start_worker(bench)
+    job_id = bench.submit("hostile", options={"attack": "daemon", "lasts": True})
+    wait_for(lambda: daemons(job_id))
+    worker.kill()
+    wait_for(lambda: not daemons(job_id), 30)
+
+
+def test_shared_memory_does_not_pass_the_memory_limit(bench: WorkerHarness) -> None:
+    start_worker(bench, MEMORY_LIMIT_BYTES=str(400 << 20))
+    job_id = bench.submit("hostile", options={"attack": "shared memory", "size_bytes": 1 << 30})
+    job = bench.wait_until_finished(job_id)
+    if sandbox_capabilities()["calls"] is not None:
+        assert json.loads(bench.results(job_id)["found.json"]) == {"hog": "PermissionError"}
+    else:
+        assert job.error is not None and job.error["type"] == "memory_limit"
+
+
+def test_shared_memory_counts() -> None:
+    with subprocess.Popen(
+        [sys.executable, "-c", SHARED], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+    ) as process:
+        assert process.stdout is not None
+        process.stdout.readline()
+        assert tree_memory_bytes(process.pid) >= 64 << 20
+        process.communicate(b"")

@@ -1,0 +1,81 @@
+"""Ends a process's descendants, also those that have left its session and lost their parents.
+
+Where a process is a subreaper (Linux), whatever its descendants leave behind becomes its own child.
+"""
+
+import contextlib
+import os
+import signal
+from collections.abc import Iterator
+from pathlib import Path
+
+import psutil
+
+
+def kill_descendants(pid: int) -> int:
+    """Kill the descendants of a process, each as soon as it is seen; return how many were seen."""
+    count = 0
+    for descendant in _descendants(pid):
+        count += 1
+        with contextlib.suppress(ProcessLookupError, PermissionError):
+            os.kill(descendant, signal.SIGKILL)
+    return count
+
+
+def tree_memory_bytes(pid: int) -> int:
+    """Return the memory of a process and its descendants that no file holds.
+
+    Memory that they share counts for each of them, also where it lies in ``/dev/shm``. Pages of mapped files,
+    as those of photographs, belong to the system, which takes them back when it needs them.
+    """
+    total = 0
+    for process in _tree(pid):
+        with contextlib.suppress(psutil.Error, OSError, ValueError):
+            total += _memory_bytes(process)
+    return total
+
+
+def descendant_count(pid: int) -> int:
+    """Return the number of live descendants of a process."""
+    return max(0, len(_tree(pid)) - 1)
+
+
+def _tree(pid: int) -> list[psutil.Process]:
+    try:
+        first = psutil.Process(pid)
+        return [first, *first.children(recursive=True)]
+    except psutil.Error:
+        return []
+
+
+def _memory_bytes(process: psutil.Process) -> int:
+    status = Path(f"/proc/{process.pid}/status")
+    if not status.exists():
+        memory = process.memory_info()
+        return int(memory.rss - getattr(memory, "shared", 0))
+    # Readable of other users' processes too, unlike the sums that count shared memory once.
+    lines = (line.split() for line in status.read_text(encoding="utf-8", errors="replace").splitlines())
+    counted = ("RssAnon:", "RssShmem:", "VmSwap:")
+    return 1024 * sum(int(words[1]) for words in lines if words and words[0] in counted)
+
+
+def _descendants(pid: int) -> Iterator[int]:
+    """Yield the ids of descendants while they are looked for, as some may be gone a moment later."""
+    children = Path(f"/proc/{pid}/task/{pid}/children")
+    if not children.exists():  # not Linux, or a kernel without such files
+        with contextlib.suppress(psutil.Error):
+            yield from (process.pid for process in psutil.Process(pid).children(recursive=True))
+        return
+    found: list[int] = []
+    for thread in _threads(pid):
+        with contextlib.suppress(OSError):
+            found += map(int, Path(f"/proc/{pid}/task/{thread}/children").read_text(encoding="ascii").split())
+    for child in found:
+        yield from _descendants(child)
+        yield child
+
+
+def _threads(pid: int) -> list[str]:
+    with contextlib.suppress(OSError):
+        return os.listdir(f"/proc/{pid}/task")  # noqa: PTH208 - names are all that is asked for
+    return []
