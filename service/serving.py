@@ -77,10 +77,11 @@ def main() -> int:
     log_to_stderr()
     for handler in logging.getLogger().handlers:
         handler.addFilter(RequestIdFilter())
-    if not die_with_local_service():
-        log_missing_capabilities()
+    is_alone = not die_with_local_service()
     try:
         settings = load_settings(ServiceSettings)
+        if is_alone:
+            log_missing_capabilities(settings.job_uids)
         app = create_app(settings)
         family = socket.AF_INET6 if ":" in settings.host else socket.AF_INET
         # With the protocol named, asyncio turns Nagle's algorithm off; answers would take 40 ms more.

@@ -7,12 +7,13 @@ from pathlib import Path
 from typing import Annotated, Self, TypeVar
 from urllib.parse import urlsplit
 
-from pydantic import AliasChoices, BeforeValidator, Field, SecretStr, ValidationError
+from pydantic import AliasChoices, BeforeValidator, Field, InstanceOf, SecretStr, ValidationError
 from pydantic_settings import BaseSettings, NoDecode, SettingsConfigDict, SettingsError
 
 from octasplat.engine.core.errors import ConfigError
 from octasplat.workers.data_folder import default_data_folder
 from octasplat.workers.postgres.embedded import EmbeddedPostgres
+from octasplat.workers.sandbox.job_users import parse_uids
 
 PREFIX = "OCTASPLAT_"
 
@@ -24,6 +25,11 @@ def _split_commas(value: object) -> object:
     if value.lstrip().startswith("["):
         return json.loads(value)
     return [part.strip() for part in value.split(",") if part.strip()]
+
+
+def _parse_uids(value: object) -> object:
+    """Return the range of user ids that a text names."""
+    return parse_uids(value) if isinstance(value, str) else value
 
 
 COMMA_SEPARATED = (NoDecode, BeforeValidator(_split_commas))
@@ -74,6 +80,7 @@ class WorkerSettings(BaseSettings):
         max_job_hours: a job whose program has run for so long, over all of its attempts, is ended with what
             it has finished; 0 sets no limit.
         absent_queue_hours: a job that waits so long in a queue that no worker takes fails; 0 lets it wait.
+        job_uids: user ids, as ``200000-200063``, of which each job runs under one of its own; root only.
         threads: of one job's program; 0 takes all cores.
         pool_size: connections of a front end to the database.
         listen: hear of new jobs at once; False behind a pooler in transaction mode.
@@ -111,6 +118,7 @@ class WorkerSettings(BaseSettings):
     quota_bytes: int | None = Field(None, ge=0)
     max_job_hours: float = Field(48.0, ge=0)
     absent_queue_hours: float = Field(72.0, ge=0)
+    job_uids: Annotated[InstanceOf[range] | None, NoDecode, BeforeValidator(_parse_uids)] = None
     threads: int = Field(0, ge=0)
     pool_size: int = Field(12, gt=1)
     listen: bool = True

@@ -53,7 +53,7 @@ def describe(service: Service, principal: Principal) -> InfoView:
         max_archive_bytes=service.settings.max_archive_bytes,
         owner=principal.owner,
         scopes=sorted(principal.scopes),
-        isolation=sandbox_capabilities(),
+        isolation=sandbox_capabilities(service.settings.job_uids),
     )
 
 

@@ -161,6 +161,21 @@ def _change_what_landlock_does_not_know(task: Task, options: HostileOptions) -> 
     _tell(task, calls)
 
 
+def _tell_user(task: Task, options: HostileOptions) -> None:
+    """Who it is, and what it can do as that user."""
+    worker = Path(f"/proc/{os.getppid()}/environ")
+    _tell(
+        task,
+        {
+            "user": lambda: [*os.getresuid(), *os.getresgid(), *os.getgroups()],
+            "return": lambda: os.setresuid(0, 0, 0),
+            "environment of the guard": worker.read_bytes,
+            "target": lambda: Path(options.target).read_text(),
+            "folder": lambda: (task.folder / "own").write_text("x"),
+        },
+    )
+
+
 def _leave_daemon(task: Task, options: HostileOptions) -> None:
     """Leave a process of another session without a parent; ``target`` says what it does."""
     # With the pipes of the job, and with the name of the attempt, by which it is found.
@@ -224,6 +239,7 @@ ATTACKS: Mapping[str, Callable[[Task, HostileOptions], None]] = {
     "calls": _change_what_landlock_does_not_know,
     "daemon": _leave_daemon,
     "shared memory": _hog_shared_memory,
+    "user": _tell_user,
     "write elsewhere": _write_elsewhere,
 }
 

@@ -64,8 +64,8 @@ async def serve(options: ServeOptions, on_ready: Callable[[str], Awaitable[None]
         OctasplatError: something cannot be started.
     """
     forbid_memory_access()
-    log_missing_capabilities()
     settings = options.settings
+    log_missing_capabilities(settings.job_uids)
     with lock_data_folder(settings.data) as address_file:
         database = (
             EmbeddedPostgres(settings.data.absolute(), connections_needed(options))

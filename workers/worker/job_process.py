@@ -20,7 +20,9 @@ from typing import Any, NoReturn
 from octasplat.engine.core.errors import CancelledError, OctasplatError
 from octasplat.engine.core.events import Event
 from octasplat.engine.core.kernel_folder import shared_cache_folder
+from octasplat.workers.parent_death_signal import set_parent_death_signal
 from octasplat.workers.sandbox.confinement import confine, set_resource_limits
+from octasplat.workers.sandbox.job_users import become_user
 from octasplat.workers.storage.os_errors import is_disk_full
 from octasplat.workers.worker.task import EXIT_REFUSED, EXIT_STOPPED, EXIT_UNEXPECTED, NO_SPACE_ERROR, Task
 
@@ -134,6 +136,10 @@ def _raise_oom_score() -> None:
 
 def _enter_sandbox(task: dict[str, Any]) -> None:
     """Give up rights that the work does not need, while there is one thread; later ones inherit this."""
+    if task.get("uid") is not None:
+        guard = os.getppid()
+        become_user(task["uid"], Path(task["folder"]))
+        set_parent_death_signal(guard, signal.SIGKILL)  # which another user is not sent unless it asks anew
     set_resource_limits(task.get("memory_limit_bytes"))
     written: tuple[Path, ...] = ()
     if "folder" in task:

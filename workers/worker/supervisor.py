@@ -196,7 +196,10 @@ class Supervisor:
             self._reporter.add_note,
             lambda: self._stop_reason is not None,
         )
+        uids, workspace = settings.job_uids, self._workspace
+        uid = await asyncio.to_thread(workspace.give_to_user, uids) if uids is not None else None
         return {
+            "uid": uid,
             "program": kind.program,
             "kind": kind.name,
             "kind_modules": list(settings.kind_modules),

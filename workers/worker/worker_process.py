@@ -39,6 +39,7 @@ from octasplat.workers.queue.procrastinate_queue import ProcrastinateQueue
 from octasplat.workers.queue.recovery import StalledAttempts, recover_stalled_jobs
 from octasplat.workers.sandbox.capabilities import log_missing_capabilities, sandbox_capabilities
 from octasplat.workers.sandbox.hiding import forbid_memory_access
+from octasplat.workers.sandbox.job_users import check_job_users
 from octasplat.workers.settings import WorkerSettings, worker_connections
 from octasplat.workers.storage.disk_space import DiskSpace
 from octasplat.workers.storage.errors import StorageError
@@ -105,8 +106,11 @@ async def run_worker(settings: WorkerSettings, queues: Mapping[str, int], *, nam
     """
     forbid_memory_access()
     if not die_with_local_service():
-        log_missing_capabilities()
+        log_missing_capabilities(settings.job_uids)
     settings.checked()
+    slots = sum(queues.values())
+    if settings.job_uids is not None:
+        await asyncio.to_thread(check_job_users, settings.job_uids, slots, settings.work_folder)
     for module in settings.kind_modules:
         importlib.import_module(module)
     conninfo = settings.conninfo()
@@ -123,7 +127,6 @@ async def run_worker(settings: WorkerSettings, queues: Mapping[str, int], *, nam
         name, settings.work_folder, storage,
         kind_modules=settings.kind_modules, cooldown_seconds=settings.recover_seconds,
     )  # fmt: skip
-    slots = sum(queues.values())
     async with open_pool(
         conninfo, max_size=worker_connections(queues), wait_seconds=settings.stale_seconds
     ) as pool:
@@ -330,7 +333,7 @@ class _Worker:
             "memory_free_bytes": memory.available,
             "memory_limit_bytes": self._context.memory_limit_bytes,
             "ailing": self._context.host_health.fault or self._admission.shortage,
-            "isolation": sandbox_capabilities(),
+            "isolation": sandbox_capabilities(self._settings.job_uids),
             # Who only looks after lost jobs may have no compiler.
             "cold_start_seconds": round(cold_start_seconds(kernel_groups()), 1) if self._queues else 0.0,
             **version_facts(),

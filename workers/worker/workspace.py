@@ -19,6 +19,7 @@ from octasplat.engine.core import versions
 from octasplat.engine.render.resume import RECORD_FILE
 from octasplat.workers.db.rows import Artifact, DatasetFile, Job
 from octasplat.workers.queue.attempts import ResultFile
+from octasplat.workers.sandbox.job_users import JobUser, give_folder, open_for_reading, take_user
 from octasplat.workers.storage.errors import StorageError
 from octasplat.workers.storage.os_errors import translate_os_errors
 from octasplat.workers.storage.protocol import Storage
@@ -109,7 +110,9 @@ class Workspace:
         self.storage = storage
         self.folder = root / "attempts" / f"{job.id}.{job.attempt}"
         self._lock: IO[bytes] | None = None
+        self._user: JobUser | None = None
         self._dataset_lock: IO[bytes] | None = None
+        self._dataset: Path | None = None
         self._stored_frames: dict[str, TreeFile] = {}
         self._peak_used_bytes = 0
 
@@ -124,9 +127,26 @@ class Workspace:
             self.folder.mkdir(parents=True, mode=0o700)
             self._lock = _open_locked(self.folder / _LOCK_FILE)
 
+    def give_to_user(self, uids: range) -> int:
+        """Choose the user that the job runs as and give it the folder; return its id.
+
+        Raises:
+            ConfigError: all are taken.
+            StorageError: the folder cannot be given away.
+        """
+        with translate_os_errors(self.folder):
+            self._user = take_user(uids, self._root)
+            give_folder(self.folder, self._user.uid)
+            if self._dataset is not None:
+                open_for_reading(self._dataset.parent)
+        return self._user.uid
+
     def close(self) -> None:
         """Remove the folder and release its locks."""
         shutil.rmtree(self.folder, ignore_errors=True)
+        if self._user is not None:
+            self._user.close()
+            self._user = None
         if self._lock is not None:
             self._lock.close()
             self._lock = None
@@ -163,6 +183,7 @@ class Workspace:
             finally:
                 shutil.rmtree(partial, ignore_errors=True)
         os.utime(folder)
+        self._dataset = place
         return place
 
     def fetch_files(self, files: Sequence[DatasetFile]) -> None:
