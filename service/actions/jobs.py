@@ -37,12 +37,14 @@ class JobFilter:
         kind: its kind.
         label: its label.
         dataset_id: what it works on.
+        text: part of its label, its kind, the name of its dataset, or the end of its id.
     """
 
     states: Sequence[JobState] = ()
     kind: str | None = None
     label: str | None = None
     dataset_id: uuid.UUID | None = None
+    text: str | None = None
 
 
 @dataclass(frozen=True)
@@ -73,6 +75,7 @@ async def list_jobs(
             kind=_without_nul(job_filter.kind),
             label=_without_nul(job_filter.label),
             dataset_id=job_filter.dataset_id,
+            text=_without_nul(job_filter.text),
             before=before,
             limit=limit + 1,
         )

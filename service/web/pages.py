@@ -1,6 +1,7 @@
 """Pages: the list of jobs, one job with its results, a new job; and their parts that refresh themselves."""
 
 import json
+import urllib.parse
 import uuid
 from pathlib import PurePosixPath
 from typing import Annotated, Any, Literal
@@ -59,6 +60,7 @@ MAX_DATASETS = 50
 MAX_PICTURES = 24
 StateFilter = Literal["all", "active", "done", "failed"]
 Cursor = Annotated[str | None, Query(max_length=200)]
+Search = Annotated[str | None, Query(alias="q", max_length=100)]
 
 # The report brings its script along: it runs, but as nobody, and can reach nothing.
 _REPORT_POLICY = (
@@ -69,20 +71,30 @@ _REPORT_POLICY = (
 
 @router.get("/")
 async def show_jobs(
-    request: Request, principal: Reader, service: ServiceDep, show: StateFilter = "all", cursor: Cursor = None
+    request: Request,
+    principal: Reader,
+    service: ServiceDep,
+    show: StateFilter = "all",
+    text: Search = None,
+    cursor: Cursor = None,
 ) -> Response:
     """Return the page with the list of jobs."""
-    values = await _job_list_context(service, principal, show, cursor)
+    values = await _job_list_context(service, principal, show, text, cursor)
     return render_page(request, "jobs.html", principal, **values)
 
 
 @router.get("/parts/jobs")
 async def show_job_list(
-    request: Request, principal: Reader, service: ServiceDep, show: StateFilter = "all", cursor: Cursor = None
+    request: Request,
+    principal: Reader,
+    service: ServiceDep,
+    show: StateFilter = "all",
+    text: Search = None,
+    cursor: Cursor = None,
 ) -> Response:
     """Return the list of jobs without its page."""
     return render_page(
-        request, "_jobs.html", principal, **await _job_list_context(service, principal, show, cursor)
+        request, "_jobs.html", principal, **await _job_list_context(service, principal, show, text, cursor)
     )
 
 
@@ -175,9 +187,14 @@ async def get_cameras(job_id: uuid.UUID, principal: Reader, service: ServiceDep)
 
 @router.get("/new")
 async def show_new(
-    request: Request, principal: Writer, service: ServiceDep, dataset: uuid.UUID | None = None
+    request: Request,
+    principal: Writer,
+    service: ServiceDep,
+    dataset: uuid.UUID | None = None,
+    like: uuid.UUID | None = None,
 ) -> Response:
-    """Return the page that uploads photographs and queues their reconstruction."""
+    """Return the page that uploads photographs and queues their reconstruction, perhaps like another job."""
+    earlier = None if like is None else (await actions.get_job(service, principal, like)).view
     kind = get_job_kind("reconstruct")
     datasets = await list_datasets(service, principal, limit=MAX_DATASETS)
     workers = await list_live_workers(service)
@@ -188,7 +205,8 @@ async def show_new(
         form=options_form(kind, unwritable_formats(workers), limits_by_path(kind, service.settings)),
         from_files=[options_form(other) for other in job_kinds() if other.needs == "files"],
         datasets=[row for row in datasets.rows if row.state == "committed" and row.holds == "photographs"],
-        chosen=dataset,
+        chosen=dataset or (earlier.dataset_id if earlier else None),
+        earlier=earlier,
         queues=sorted({"cpu", *(queue for worker in workers for queue in worker.queues)} - {""}),
         max_file_bytes=service.settings.max_upload_bytes,
     )
@@ -242,15 +260,19 @@ async def _updated_page(
 
 
 async def _job_list_context(
-    service: Service, principal: Principal, show: StateFilter, cursor: str | None
+    service: Service, principal: Principal, show: StateFilter, text: str | None, cursor: str | None
 ) -> dict[str, Any]:
-    part = await list_job_rows(service, principal, show, decode_id_cursor(cursor), PAGE_SIZE)
+    text = (text or "").strip()
+    before = decode_id_cursor(cursor)
+    part = await list_job_rows(service, principal, show, before, PAGE_SIZE, text=text or None)
     return {
         "lines": part.rows,
         "next": None if part.next_key is None else encode_cursor(part.next_key),
         "counts": await job_counts(service, principal),
         "show": show,
         "cursor": cursor,
+        "text": text,
+        "query": urllib.parse.urlencode({"show": show, **({"q": text} if text else {})}),
     }
 
 

@@ -12,6 +12,9 @@ from fastapi.exceptions import RequestValidationError
 from fastapi.responses import RedirectResponse
 from fastapi.routing import APIRoute
 from psycopg_pool import PoolTimeout
+from starlette.datastructures import Headers
+from starlette.routing import Match, Route
+from starlette.types import Scope
 
 from octasplat.engine.core.errors import OctasplatError
 from octasplat.service.problems import ProblemError, not_found_error, problem_from_error
@@ -43,6 +46,23 @@ class PageRoute(APIRoute):
                 return _error_response(request, ProblemError(503, "database", detail))
 
         return handler
+
+
+class UnknownPage(Route):
+    """The page at addresses that nothing else has, for browsers; programs and the API get a problem."""
+
+    def __init__(self) -> None:
+        super().__init__("/{path:path}", _show_unknown_page, include_in_schema=False)
+
+    def matches(self, scope: Scope) -> tuple[Match, Scope]:
+        """Match requests of browsers for pages."""
+        accepts = Headers(scope=scope).get("accept", "") if scope["type"] == "http" else ""
+        is_page = "text/html" in accepts and not scope["path"].startswith("/v1/")
+        return super().matches(scope) if is_page and scope["method"] == "GET" else (Match.NONE, {})
+
+
+async def _show_unknown_page(request: Request) -> Response:
+    return _error_response(request, ProblemError(404, "not-found", "There is nothing at this address."))
 
 
 def is_htmx_request(request: Request) -> bool:

@@ -1,7 +1,6 @@
 """Templates, and the headers of every page."""
 
 import json
-import uuid
 from collections.abc import Mapping
 from functools import cache
 from typing import Any
@@ -12,6 +11,7 @@ from fastapi.responses import HTMLResponse
 from octasplat.engine import __version__
 from octasplat.service.auth import Principal, session_secret
 from octasplat.service.web import formatting
+from octasplat.workers.client.short_ids import short_id
 
 PAGE_HEADERS = {
     "Content-Security-Policy": (
@@ -89,11 +89,6 @@ def _jinja_environment() -> Any:
     )
     environment.globals["state_words"] = STATE_LABELS
     return environment
-
-
-def short_id(job_id: uuid.UUID) -> str:
-    """Return the end of an id; the beginning is the time, which many ids share."""
-    return str(job_id)[-6:]
 
 
 def flatten_settings(values: Mapping[str, Any], prefix: str = "") -> list[tuple[str, str]]:

@@ -15,7 +15,7 @@ from octasplat.service.schemas.jobs import JobView
 from octasplat.service.state import Service
 from octasplat.service.thread_pools import ThreadPurpose, run_in_pool
 from octasplat.service.web.results import METRICS, mean_psnr, read_json
-from octasplat.service.web.templating import short_id
+from octasplat.workers.client.short_ids import short_id
 from octasplat.workers.db.connections import Connection, select_columns
 from octasplat.workers.db.datasets import files_of, get_dataset
 from octasplat.workers.db.rows import Artifact, Dataset, DatasetFile, Job, JobEvent, JobState
@@ -71,12 +71,17 @@ class JobDetail:
 
 
 async def list_job_rows(
-    service: Service, principal: Principal, state_filter: str, before: uuid.UUID | None, limit: int
+    service: Service,
+    principal: Principal,
+    state_filter: str,
+    before: uuid.UUID | None,
+    limit: int,
+    *,
+    text: str | None = None,
 ) -> Page[JobRow]:
-    """Return the newest jobs, of one kind of state."""
-    part = await list_jobs(
-        service, principal, JobFilter(STATE_FILTERS[state_filter]), before=before, limit=limit
-    )
+    """Return the newest jobs of one kind of state, those with ``text`` in their names, kinds or ids."""
+    job_filter = JobFilter(STATE_FILTERS[state_filter], text=text)
+    part = await list_jobs(service, principal, job_filter, before=before, limit=limit)
     async with service.pool.connection() as connection:
         return Page(await _job_rows(service, connection, part.rows), part.next_key)
 

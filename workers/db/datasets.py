@@ -57,6 +57,31 @@ async def list_datasets(
     )
 
 
+@dataclass(frozen=True)
+class DatasetSize:
+    """What a dataset takes: the bytes of its files, and the jobs that work on it."""
+
+    id: uuid.UUID
+    bytes: int
+    jobs: int
+
+
+async def dataset_sizes(connection: Connection, ids: Sequence[uuid.UUID]) -> dict[uuid.UUID, DatasetSize]:
+    """Return what each of these datasets takes."""
+    async with connection.cursor(row_factory=class_row(DatasetSize)) as cursor:
+        await cursor.execute(
+            """
+            SELECT wanted.id,
+                (SELECT coalesce(sum(size_bytes), 0)::bigint FROM dataset_files WHERE dataset_id = wanted.id)
+                    AS bytes,
+                (SELECT count(*) FROM jobs WHERE dataset_id = wanted.id) AS jobs
+            FROM unnest(%s::uuid[]) AS wanted(id)
+            """,
+            [list(ids)],
+        )
+        return {row.id: row for row in await cursor.fetchall()}
+
+
 async def list_files_by_suffix(
     connection: Connection, owner: str, suffixes: Sequence[str], *, limit: int
 ) -> list[tuple[Dataset, str]]:

@@ -76,6 +76,7 @@ async def list_jobs(
     kind: str | None = None,
     label: str | None = None,
     dataset_id: uuid.UUID | None = None,
+    text: str | None = None,
     before: uuid.UUID | None = None,
     limit: int = 50,
 ) -> list[Job]:
@@ -88,6 +89,7 @@ async def list_jobs(
         kind: of this kind.
         label: with this label.
         dataset_id: on this dataset.
+        text: with this in the label, the kind or the name of the dataset, or at the end of the id.
         before: made before this job.
         limit: at most so many.
     """
@@ -102,9 +104,14 @@ async def list_jobs(
               AND (%(label)s::text IS NULL OR label = %(label)s)
               AND (%(dataset)s::uuid IS NULL OR dataset_id = %(dataset)s)
               AND (%(before)s::uuid IS NULL OR id < %(before)s)
+              AND (%(text)s::text IS NULL OR strpos(lower(coalesce(label, '')), lower(%(text)s)) > 0
+                   OR strpos(kind, lower(%(text)s)) > 0 OR right(id::text, length(%(text)s)) = lower(%(text)s)
+                   OR EXISTS (SELECT FROM datasets AS d WHERE d.id = jobs.dataset_id
+                              AND strpos(lower(d.name), lower(%(text)s)) > 0))
             ORDER BY id DESC LIMIT %(limit)s
             """,
         {
+            "text": text,
             "owner": owner,
             "states": list(states),
             "kind": kind,

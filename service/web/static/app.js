@@ -10,9 +10,10 @@ export function notify(text, bad = false) {
 
 document.addEventListener("notice", ({ detail }) => notify(detail.text, detail.bad));
 
-// A page that nobody looks at asks for nothing.
+// A page that nobody looks at asks for nothing, nor does a list in which something is ticked: it would be unticked.
 document.addEventListener("htmx:config:request", (event) => {
-    if (document.hidden && event.target.matches("[data-poll]")) event.preventDefault();
+    const isTicked = document.querySelector(".tick:checked") !== null;
+    if ((document.hidden || isTicked) && event.target.matches("[data-poll]")) event.preventDefault();
 });
 
 let lost = null;

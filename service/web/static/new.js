@@ -1,7 +1,7 @@
 // The page of a new job: photographs are chosen or dropped, sent, and their reconstruction is queued.
 
 import { showEstimates } from "./estimate.js";
-import { followPreset, queueJob, readOptions } from "./options.js";
+import { fillOptions, followPreset, queueJob, readOptions } from "./options.js";
 import { chosenFiles, droppedFiles, sceneOf } from "./scene_files.js";
 import { Upload } from "./upload.js";
 import { thousands } from "./numbers.js";
@@ -11,6 +11,7 @@ const find = (id) => document.getElementById(id);
 const drop = find("drop"), known = find("dataset"), start = find("start"), pause = find("pause"), faults = find("faults");
 let scene = null, upload = null, choice = 0;
 
+if (form.dataset.given) fillOptions(form, JSON.parse(form.dataset.given));
 followPreset(form);
 const estimateAnew = showEstimates(form, find("estimate"), () => ({ scene, dataset: known?.value, queue: find("queue")?.value ?? "cpu" }));
 

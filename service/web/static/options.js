@@ -59,6 +59,31 @@ export function followPreset(form) {
     show();
 }
 
+/** Fills a form with the options of another job; what is as the preset has it stays empty. */
+export function fillOptions(form, given) {
+    const valueAt = (path) => path.split(".").reduce((section, name) => section?.[name], given);
+    const preset = form.querySelector("[data-path=preset]");
+    if (preset && given.preset && given.preset !== preset.dataset.default) preset.value = given.preset;
+    for (const field of form.querySelectorAll("[data-path]")) {
+        const value = valueAt(field.dataset.path);
+        if (value === undefined || value === null || field === preset || field.dataset.type.startsWith("upload")) continue;
+        if (field.dataset.type === "files") {
+            for (const box of field.querySelectorAll("input")) box.checked = value.includes(box.value) && !box.disabled;
+            continue;
+        }
+        const defaults = field.dataset.defaults ? JSON.parse(field.dataset.defaults) : {};
+        const usual = defaults[given.preset] ?? field.dataset.default ?? "";
+        const text = textOf(field.dataset.type, value);
+        if (text !== String(usual) && text !== "") field.value = text;
+    }
+}
+
+function textOf(type, value) {
+    if (type === "numbers") return value.join(" ");
+    if (type === "list" && Array.isArray(value)) return value.join(", ");
+    return type === "json" || typeof value === "object" ? JSON.stringify(value) : String(value);
+}
+
 /** Queues a job; returns its id. Throws an error whose `faults` are single sentences. */
 export async function queueJob(body, key) {
     const response = await fetch("/v1/jobs", {

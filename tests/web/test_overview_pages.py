@@ -1,0 +1,146 @@
+"""Pages besides those of single jobs: search, comparison, datasets, usage, and changes of several jobs."""
+
+import html
+import json
+import re
+import uuid
+
+from octasplat.service.web.comparison import differing_settings
+from octasplat.workers.db.connections import open_pool
+from octasplat.workers.db.datasets import create_dataset, put_file
+from octasplat.workers.db.tokens import add_token
+from octasplat.workers.queue.jobs import NewJob, create_job
+from octasplat.workers.queue.procrastinate_queue import ProcrastinateQueue
+from tests.support.service_harness import ConnectService
+
+BROWSER = {"Accept": "text/html,application/xhtml+xml"}
+
+
+async def make_job(database: str, **values: object) -> uuid.UUID:
+    async with open_pool(database, max_size=1, wait_seconds=10) as pool, pool.connection() as connection:
+        fields = {"owner": "local", "kind": "reconstruct", "options": {}, "queue": "nobody", **values}
+        return (await create_job(connection, ProcrastinateQueue(), NewJob(**fields))).id
+
+
+async def make_dataset(database: str, name: str, size_bytes: int = 5_000_000) -> uuid.UUID:
+    async with open_pool(database, max_size=1, wait_seconds=10) as pool, pool.connection() as connection:
+        made = await create_dataset(connection, "local", name, "photographs")
+        await put_file(connection, made.id, "images/a.jpg", "0" * 64, size_bytes)
+        return made.id
+
+
+def names_in(page: str) -> list[str]:
+    return re.findall(r'<a id="name-[^"]*" href="[^"]*">([^<]*)</a>', page)
+
+
+async def test_jobs_are_found_by_label_dataset_kind_and_end_of_id(
+    connect_service: ConnectService, database: str
+) -> None:
+    async with connect_service() as (http, _):
+        dataset = await make_dataset(database, "Garden gate")
+        gate = await make_job(database, dataset_id=dataset)
+        await make_job(database, label="100% fox")
+        await make_job(database, label="a render", kind="render")
+        for text, wanted in (
+            ("FOX", ["100% fox"]),
+            ("100%", ["100% fox"]),
+            ("gate", ["Garden gate"]),
+            ("render", ["a render"]),
+            (str(gate)[-8:], ["Garden gate"]),
+            ("nothing such", []),
+        ):
+            page = (await http.get("/", params={"q": text})).text
+            assert names_in(page) == wanted, text
+            assert f'value="{html.escape(text)}"' in page
+        part = (await http.get("/parts/jobs", params={"q": "fox", "show": "active"})).text
+        assert names_in(part) == ["100% fox"] and "/parts/jobs?show=active&amp;q=fox" in part
+
+
+async def test_chosen_jobs_are_cancelled_and_deleted(connect_service: ConnectService, database: str) -> None:
+    async with connect_service() as (http, _):
+        ids = [await make_job(database, label=f"job {k}") for k in range(3)]
+        form = {"job": [str(ids[0]), str(ids[1])]}
+        done = await http.post("/jobs/chosen?do=cancel", data=form, follow_redirects=False)
+        assert done.status_code == 303
+        states = [(await http.get(f"/v1/jobs/{one}")).json()["state"] for one in ids]
+        assert states == ["canceled", "canceled", "queued"]
+        done = await http.post("/jobs/chosen?do=delete", data=form, follow_redirects=False)
+        assert done.status_code == 303
+        assert [(await http.get(f"/v1/jobs/{one}")).status_code for one in ids] == [404, 404, 200]
+        refused = await http.post("/jobs/chosen?do=delete", data={"job": [str(ids[0]), "fox"]})
+        assert refused.status_code == 409
+        assert "There is no such job." in refused.text and "fox is no id" in refused.text
+
+
+async def test_variants_are_compared_by_the_settings_that_differ(
+    connect_service: ConnectService, database: str
+) -> None:
+    assert differing_settings([{"a": 1, "b": {"c": 2}}, {"a": 1, "b": {"c": 3}, "d": "x"}]) == [
+        ("b.c", ["2", "3"]),
+        ("d", ["–", "x"]),
+    ]
+    async with connect_service() as (http, _):
+        one = await make_job(database, label="coarse", options={"preset": "fast", "max_side": 320})
+        two = await make_job(database, label="fine", options={"preset": "fast", "max_side": 640})
+        page = await http.get("/compare", params={"job": [str(one), str(two)]})
+        assert page.status_code == 200
+        assert "<code>max_side</code>" in page.text and "<code>preset</code>" not in page.text
+        assert "coarse" in page.text and "640" in page.text
+        assert "Choose two or more jobs" in (await http.get("/compare")).text
+        missing = await http.get("/compare", params={"job": [str(one), str(uuid.uuid4())]})
+        assert missing.status_code == 404 and "text/html" in missing.headers["content-type"]
+
+
+async def test_datasets_are_listed_with_their_size_and_deleted(
+    connect_service: ConnectService, database: str
+) -> None:
+    async with connect_service() as (http, _):
+        dataset = await make_dataset(database, "<b>chair", 2_500_000)
+        used = await make_dataset(database, "in use")
+        await make_job(database, dataset_id=used)
+        page = (await http.get("/datasets")).text
+        assert "&lt;b&gt;chair" in page and "<b>chair" not in page and "2.5 MB" in page
+        refused = await http.post(f"/datasets/{used}/delete")
+        assert refused.status_code == 409 and "text/html" in refused.headers["content-type"]
+        done = await http.post(f"/datasets/{dataset}/delete", follow_redirects=False)
+        assert done.status_code == 303
+        assert "chair" not in (await http.get("/datasets")).text
+
+
+async def test_usage_shows_workers_to_administrators_only(
+    connect_service: ConnectService, database: str
+) -> None:
+    async with connect_service() as (http, _):
+        page = (await http.get("/usage")).text
+        assert "Unfinished jobs" in page and "Queues" in page and "Workers</h2>" in page
+        async with open_pool(database, max_size=1, wait_seconds=10) as pool, pool.connection() as connection:
+            secret = "anna-" + uuid.uuid4().hex
+            await add_token(connection, secret, owner="anna", name="anna", scopes=("write",))
+        page = (await http.get("/usage", headers={"Authorization": f"Bearer {secret}"})).text
+        assert "<b>anna</b>" in page and "Workers</h2>" not in page
+
+
+async def test_form_of_a_new_job_has_the_settings_of_another(
+    connect_service: ConnectService, database: str
+) -> None:
+    options = {"preset": "fast", "max_side": 320, "exports": ["viewer.glb"], "train": {"iterations": 700}}
+    async with connect_service() as (http, _):
+        job = await make_job(database, label='fox "one"', options=options)
+        page = (await http.get("/new", params={"like": str(job)})).text
+        given = re.search(r'data-given="([^"]*)"', page)
+        assert given is not None and json.loads(html.unescape(given[1])) == options
+        assert 'value="fox &#34;one&#34;"' in page
+        assert "data-given" not in (await http.get("/new")).text
+
+
+async def test_unknown_addresses_are_pages_for_browsers_and_problems_for_programs(
+    connect_service: ConnectService,
+) -> None:
+    async with connect_service() as (http, _):
+        page = await http.get("/nothing/here", headers=BROWSER)
+        assert page.status_code == 404 and "text/html" in page.headers["content-type"]
+        assert "There is nothing at this address." in page.text and "To the jobs" in page.text
+        for path, headers in (("/nothing", {"Accept": "application/json"}), ("/v1/nothing", BROWSER)):
+            answer = await http.get(path, headers=headers)
+            assert answer.status_code == 404
+            assert answer.headers["content-type"] == "application/problem+json"
