@@ -271,7 +271,7 @@ async def _job_list_context(
         "counts": await job_counts(service, principal),
         "show": show,
         "cursor": cursor,
-        "text": text,
+        "search": text,
         "query": urllib.parse.urlencode({"show": show, **({"q": text} if text else {})}),
     }
 

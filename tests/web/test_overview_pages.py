@@ -53,6 +53,7 @@ async def test_jobs_are_found_by_label_dataset_kind_and_end_of_id(
             assert names_in(page) == wanted, text
             assert f'value="{html.escape(text)}"' in page
         part = (await http.get("/parts/jobs", params={"q": "fox", "show": "active"})).text
+        assert 'href="/?show=done&amp;q=fox"' in part
         assert names_in(part) == ["100% fox"] and "/parts/jobs?show=active&amp;q=fox" in part
 
 

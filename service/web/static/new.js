@@ -11,7 +11,9 @@ const find = (id) => document.getElementById(id);
 const drop = find("drop"), known = find("dataset"), start = find("start"), pause = find("pause"), faults = find("faults");
 let scene = null, upload = null, choice = 0;
 
-if (form.dataset.given) fillOptions(form, JSON.parse(form.dataset.given));
+// By their attributes: a field of the form has the id "dataset".
+const kind = form.getAttribute("data-kind"), given = form.getAttribute("data-given");
+if (given) fillOptions(form, JSON.parse(given));
 followPreset(form);
 const estimateAnew = showEstimates(form, find("estimate"), () => ({ scene, dataset: known?.value, queue: find("queue")?.value ?? "cpu" }));
 
@@ -156,7 +158,7 @@ form.addEventListener("submit", async (event) => {
             pause.hidden = false;
             id = (await upload.run()).id;
         }
-        const body = { kind: form.dataset.kind, dataset_id: id, options: readOptions(form), queue: find("queue")?.value ?? "cpu" };
+        const body = { kind, dataset_id: id, options: readOptions(form), queue: find("queue")?.value ?? "cpu" };
         if (label) body.label = label;
         const job = await queueJob(body, `page-${id}-${Date.now()}`);
         upload = null;
