@@ -74,7 +74,8 @@ export function fillOptions(form, given) {
         const defaults = field.dataset.defaults ? JSON.parse(field.dataset.defaults) : {};
         const usual = defaults[given.preset] ?? field.dataset.default ?? "";
         const text = textOf(field.dataset.type, value);
-        if (text !== String(usual) && text !== "") field.value = text;
+        const shown = field.dataset.type === "yes_no" ? (value ? "yes" : "no") : text;
+        if (shown !== String(usual) && text !== "") field.value = text;
     }
 }
 
