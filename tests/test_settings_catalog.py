@@ -8,7 +8,7 @@ from click.testing import CliRunner, Result
 from pydantic import BaseModel
 
 from octasplat.engine.core.errors import ConfigError
-from octasplat.engine.poses import PosesConfig
+from octasplat.engine.poses.config import PosesConfig
 from octasplat.engine.runs.config import ReconstructionConfig, resolve_config
 from octasplat.engine.runs.settings_catalog import (
     Difference,

@@ -12,14 +12,14 @@ from octasplat.engine.core.progress import phase
 from octasplat.engine.dataset import Dataset, split_views
 from octasplat.engine.dataset.model_sources import find_model, has_model
 from octasplat.engine.dataset.photograph_files import image_folder
-from octasplat.engine.poses import (
-    GivenModel,
+from octasplat.engine.poses.config import GivenModel
+from octasplat.engine.poses.find_poses import (
     adjust_principal_points,
     find_poses,
-    needs_per_view_principal_points,
+    read_pose_record,
     repair_poses,
 )
-from octasplat.engine.poses.find_poses import read_pose_record
+from octasplat.engine.poses.lens_check import needs_per_view_principal_points
 from octasplat.engine.poses.photograph_check import check_photographs_decode
 from octasplat.engine.poses.photographs import photographs_of_scene
 from octasplat.engine.runs.config import ReconstructionConfig

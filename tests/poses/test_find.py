@@ -15,8 +15,7 @@ from jaxtyping import Float64
 
 from octasplat.engine.core.errors import CancelledError, ColmapCrashError, DatasetError
 from octasplat.engine.core.events import Event, PhaseFinished, PhaseProgress, PhaseStarted, Warned
-from octasplat.engine.poses import find_poses
-from octasplat.engine.poses.find_poses import PosesConfig
+from octasplat.engine.poses.find_poses import PosesConfig, find_poses
 from octasplat.engine.poses.search import PoseSearch
 from octasplat.engine.render.image_files import write_png
 from tests.support.neighbouring_photographs import write_neighbours

@@ -12,7 +12,8 @@ from octasplat.engine.core.events import Event, PhaseFinished, Warned
 from octasplat.engine.dataset.load import load_dataset_model
 from octasplat.engine.dataset.synthetic import SyntheticDatasetConfig, write_synthetic_dataset
 from octasplat.engine.pipeline import reconstruct
-from octasplat.engine.poses import adjust_principal_points, needs_per_view_principal_points
+from octasplat.engine.poses.find_poses import adjust_principal_points
+from octasplat.engine.poses.lens_check import needs_per_view_principal_points
 from octasplat.engine.runs.config import resolve_config
 from tests.support.stopped_run import reconstruct_until
 

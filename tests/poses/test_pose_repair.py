@@ -12,7 +12,8 @@ from octasplat.engine.core.errors import DatasetError
 from octasplat.engine.core.events import Event, PhaseFinished, PhaseStarted, Warned
 from octasplat.engine.dataset.synthetic import SyntheticDatasetConfig, write_synthetic_dataset
 from octasplat.engine.pipeline import reconstruct
-from octasplat.engine.poses import GivenModel, PosesConfig, repair_poses
+from octasplat.engine.poses.config import GivenModel, PosesConfig
+from octasplat.engine.poses.find_poses import repair_poses
 from octasplat.engine.runs.config import resolve_config
 from tests.support.stopped_run import reconstruct_until
 
