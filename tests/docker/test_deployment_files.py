@@ -1,0 +1,139 @@
+"""Compose limits what each container may use and reach; systemd and nginx accept their files."""
+
+import shutil
+import socket
+import subprocess
+import sys
+import threading
+import time
+from http.server import BaseHTTPRequestHandler, HTTPServer
+from pathlib import Path
+from urllib.request import Request, urlopen
+
+import pytest
+
+from tests.docker.test_docker_files import DOCKER, ROOT, compose
+
+DEPLOY = ROOT / "deploy"
+
+
+def test_every_container_has_limits() -> None:
+    for name, service in compose()["services"].items():
+        for limit in ("mem_limit", "cpus", "pids_limit"):
+            assert service.get(limit), f"{name} has no {limit}"
+        assert service["read_only"] is True, name
+        assert service["logging"]["options"].keys() >= {"max-size", "max-file"}, name
+        assert "no-new-privileges:true" in service["security_opt"], name
+
+
+def test_database_and_store_are_reached_from_within_only_and_workers_reach_nothing_else() -> None:
+    loaded = compose()
+    services = loaded["services"]
+    assert loaded["networks"]["inside"] == {"internal": True}
+    for name in ("database", "store", "worker", "bucket"):
+        assert services[name]["networks"] == ["inside"], name
+    subnet = loaded["networks"]["outside"]["ipam"]["config"][0]
+    assert subnet["gateway"] in services["front-end"]["environment"]["OCTASPLAT_PROXIES"]
+
+
+def test_role_of_the_service_is_no_superuser() -> None:
+    loaded = compose()
+    assert "POSTGRES_USER" not in loaded["services"]["database"]["environment"]
+    script = loaded["configs"]["database-role"]["content"]
+    assert "CREATE ROLE octasplat LOGIN PASSWORD" in script and "SUPERUSER" not in script
+    assert subprocess.run(["sh", "-n"], input=script.replace("$$", "$"), text=True).returncode == 0
+
+
+def test_kernel_cache_lies_outside_of_the_data_folder() -> None:
+    text = (DOCKER / "Dockerfile").read_text()
+    worker = compose()["services"]["worker"]
+    [folder] = [volume.partition(":")[2] for volume in worker["volumes"] if volume.startswith("kernels:")]
+    assert f"NUMBA_CACHE_DIR={folder}" in text and not folder.startswith("/data")
+    assert f"-m 0711 /data {folder}" in text  # made for the user of the image
+
+
+def test_compose_file_is_accepted() -> None:
+    asked = ["docker", "compose", "version"]
+    if shutil.which("docker") is None or subprocess.run(asked, capture_output=True).returncode:
+        pytest.skip("docker compose is not installed")
+    environment = {
+        "OCTASPLAT_TOKEN": "t" * 40,
+        "OCTASPLAT_PASSWORD": "p",
+        "PATH": "/usr/bin:/usr/local/bin:/bin",
+    }
+    command = ["docker", "compose", "-f", str(DOCKER / "compose.yaml"), "config", "--quiet"]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+
+
+def test_systemd_accepts_the_unit(tmp_path: Path) -> None:
+    if shutil.which("systemd-analyze") is None:
+        pytest.skip("systemd-analyze is not installed")
+    unit = tmp_path / "octasplat.service"
+    text = (DEPLOY / "octasplat.service").read_text()
+    unit.write_text(text.replace("/opt/octasplat/bin/octasplat", sys.executable))
+    done = subprocess.run(["systemd-analyze", "verify", str(unit)], capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (0, "")
+    for setting in ("DynamicUser=yes", "NoNewPrivileges=yes", "ProtectSystem=strict", "LimitNOFILE=65536"):
+        assert setting in text.splitlines()
+
+
+class _Echo(BaseHTTPRequestHandler):
+    def do_GET(self) -> None:
+        body = str({name.lower(): value for name, value in self.headers.items()}).encode()
+        self.send_response(200)
+        self.send_header("Content-Length", str(len(body)))
+        self.end_headers()
+        self.wfile.write(body)
+
+    def log_message(self, *_: object) -> None:
+        pass
+
+
+def free_port() -> int:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        return int(server.getsockname()[1])
+
+
+def test_nginx_passes_the_address_of_the_client_and_nothing_that_it_claims(tmp_path: Path) -> None:
+    nginx = shutil.which("nginx", path="/usr/sbin:/usr/bin:/usr/local/sbin:/usr/local/bin")
+    if nginx is None:
+        pytest.skip("nginx is not installed")
+    behind = HTTPServer(("127.0.0.1", 0), _Echo)
+    threading.Thread(target=behind.serve_forever, daemon=True).start()
+    port = free_port()
+    site = (
+        (DEPLOY / "nginx.conf").read_text().replace("127.0.0.1:8642", f"127.0.0.1:{behind.server_address[1]}")
+    )
+    lines = [line for line in site.splitlines() if "ssl_certificate" not in line]
+    site = "\n".join(lines).replace("listen 443 ssl", f"listen 127.0.0.1:{port}")
+    folders = "".join(
+        f"{name}_temp_path {tmp_path}/{name};"
+        for name in ("client_body", "proxy", "fastcgi", "uwsgi", "scgi")
+    )
+    (tmp_path / "nginx.conf").write_text(
+        f"daemon off; pid {tmp_path}/pid; error_log {tmp_path}/error.log; events {{}}\n"
+        f"http {{ access_log off; {folders}\n{site}\n}}\n"
+    )
+    with subprocess.Popen([nginx, "-p", str(tmp_path), "-c", str(tmp_path / "nginx.conf")]) as process:
+        try:
+            claims = {
+                "X-Forwarded-For": "6.6.6.6",
+                "Forwarded": "for=6.6.6.6",
+                "Host": "octasplat.example.org",
+            }
+            request = Request(f"http://127.0.0.1:{port}/v1/info", headers=claims)
+            for _ in range(100):
+                try:
+                    with urlopen(request, timeout=10) as answer:
+                        got = answer.read().decode()
+                    break
+                except OSError:
+                    time.sleep(0.1)
+            assert "6.6.6.6" not in got
+            assert "'x-forwarded-for': '127.0.0.1'" in got and "'x-forwarded-proto': 'http'" in got
+            assert "'host': 'octasplat.example.org'" in got
+        finally:
+            process.terminate()
+            behind.shutdown()
+            behind.server_close()
