@@ -1,4 +1,4 @@
-"""Gradients of traced outputs by the rays' origins and directions, in closed form from recorded hits.
+"""Gradients of traced outputs with respect to the rays, in closed form from recorded hits.
 
 A ray o + t d meets the plane of a Gaussian with mean m and normal r1 at t = <m - o, r1> / <d, r1>. The hit
 p = o + t d moves with o and d directly and through t, with dt/do = -r1 / <d, r1> and dt/dd = t dt/do. So the
@@ -33,7 +33,7 @@ def ray_gradients(
     settings: TraceSettings,
     features: Float32[np.ndarray, "n f"] | None = None,
 ) -> RayGradients:
-    """Return the gradients of a loss by the origins and directions of recorded rays.
+    """Return the gradients of a loss with respect to the origins and directions of recorded rays.
 
     As for the parameters, there is none through the edges of octagons, visibility, or the limits of rays.
 
@@ -99,7 +99,7 @@ def _hit_gradients(
     settings: TraceSettings,
     features: Float32[np.ndarray, "n f"] | None,
 ) -> tuple[Float64[np.ndarray, "h 3"], Float64[np.ndarray, "h 3"]]:
-    """Return gradients by the origin and direction of each hit's ray, of this hit alone."""
+    """Return each hit's share of the gradients with respect to the origin and direction of its ray."""
     ray, ids = hits.ray_ids, hits.ids
     directions = rays.directions_world.astype(np.float64)[ray]
     normals, weight = hits.frames[:, :, 0], hits.weight
@@ -119,7 +119,7 @@ def _hit_gradients(
     )
     grad_view = (grad_unit_view - (grad_unit_view * view).sum(axis=1, keepdims=True) * view) / length
 
-    # --- what a hit brings for each unit of its weight ---
+    # --- the gradient with respect to the hit's weight: what it brings for each unit of that ---
     cosine_to_mean = np.einsum("hi,hi->h", hits.to_mean, normals) / np.linalg.norm(hits.to_mean, axis=1)
     facing = np.where(cosine_to_mean > settings.flip_normal_cos, -1.0, 1.0)
     grad_weight = np.einsum("hc,hc->h", np.maximum(color, 0), output_gradients.rgb[ray])
