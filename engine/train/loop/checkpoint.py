@@ -70,7 +70,7 @@ def save_checkpoint(state: TrainState, folder: Path, fingerprint: str) -> Path:
         "running_mse": state.running_mse,
         "best_psnr": state.best_psnr if np.isfinite(state.best_psnr) else None,
         "best_iteration": state.best_iteration,
-        # Keys of former versions, so that their checkpoints are read and they read these.
+        # Keys of former versions, whose checkpoints are read.
         "left_out": state.excluded_views.tolist(),
         "probed": state.probes,
         "hastened_after": state.early_stop_at,
