@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from pydantic import ValidationError
 
 from octasplat.engine.core.errors import ConfigError
 from octasplat.engine.runs.config import (
@@ -184,6 +185,12 @@ def test_unusable_configuration_file_is_refused(tmp_path: Path, content: str | N
     with pytest.raises(ConfigError) as caught:
         read_config(path)
     assert str(caught.value).startswith(f"{path} {sentence}")
+
+
+def test_configuration_that_is_no_mapping_is_refused() -> None:
+    with pytest.raises(ValidationError) as caught:
+        ReconstructionConfig.model_validate([1])
+    assert caught.value.errors()[0]["input"] == [1]
 
 
 def test_section_of_another_kind_begins_anew() -> None:
