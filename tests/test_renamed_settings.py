@@ -89,7 +89,7 @@ def test_former_command_options_are_read_with_notice(monkeypatch: pytest.MonkeyP
     monkeypatch.chdir(tmp_path)
     found: list[ReconstructionConfig] = []
 
-    def keep(request: ReconstructRequest, **_how: object) -> None:
+    def keep(request: ReconstructRequest, _printer: object, **_how: object) -> None:
         found.append(run_config(request))
 
     monkeypatch.setattr("octasplat.workers.cli.reconstruction.run_reconstruction", keep)
@@ -113,7 +113,7 @@ def test_former_command_options_are_read_with_notice(monkeypatch: pytest.MonkeyP
 def test_former_submitted_options_are_read_with_notice(monkeypatch: pytest.MonkeyPatch) -> None:
     found: list[Any] = []
 
-    def keep(_api: object, what: Any, **_how: object) -> dict[str, str]:
+    def keep(_api: object, what: Any, _printer: object) -> dict[str, str]:
         options = json.loads(json.dumps(what.options))
         found.append(asyncio.run(resolve_options(get_job_kind("reconstruct"), options)))
         return {"id": "1"}

@@ -140,7 +140,6 @@ def revise_config(
         return _validate_config({**values, "train": merge_options(former, changes)})
     else:
         former = _changed_values(_preset_settings(before.get("preset"), learnt), former)
-        former.get("materials", {}).pop("learn", None)
     requested = merge_options(former, changes)
     base = _preset_settings(values.get("preset"), _learns_materials(requested))
     return _validate_config({**values, "train": merge_options(base, requested)})

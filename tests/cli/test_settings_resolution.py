@@ -98,7 +98,7 @@ def scene(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 def by_command(preset: str, materials: bool, given: list[str], monkeypatch: pytest.MonkeyPatch) -> Outcome:
     found: list[ReconstructionConfig] = []
 
-    def keep(request: ReconstructRequest, **_how: object) -> None:
+    def keep(request: ReconstructRequest, _printer: object, **_how: object) -> None:
         found.append(run_config(request))
 
     monkeypatch.setattr("octasplat.workers.cli.reconstruction.run_reconstruction", keep)
@@ -109,7 +109,7 @@ def by_command(preset: str, materials: bool, given: list[str], monkeypatch: pyte
 def by_submit(preset: str, materials: bool, given: list[str], monkeypatch: pytest.MonkeyPatch) -> Outcome:
     found: list[ReconstructionConfig] = []
 
-    def keep(_api: object, what: Any, **_how: object) -> dict[str, str]:
+    def keep(_api: object, what: Any, _printer: object) -> dict[str, str]:
         sent = json.loads(json.dumps(what.options))
         found.append(_accepted(sent))
         return {"id": "1"}
