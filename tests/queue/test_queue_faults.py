@@ -301,3 +301,33 @@ async def test_stale_storage_check_keeps_later_files(conninfo: str) -> None:
             await renew_check(connection, later)
             dataset = await end_check(connection, later, is_valid=True, photographs=2)
             assert dataset.state == "committed" and dataset.photographs == 2
+
+
+async def test_write_that_meets_a_recovery_waits_and_is_fenced(conninfo: str) -> None:
+    async with open_pool(conninfo, max_size=6) as pool:
+        ghost = await begun(pool)
+        async with pool.connection() as other, other.transaction():
+            job = await get_job(other, ghost.job.id, lock=True)
+            assert job is not None
+            await other.execute("UPDATE jobs SET attempt = attempt + 1 WHERE id = %s", [job.id])
+            late = asyncio.create_task(ghost.add_log_lines(["late"]))
+            await asyncio.sleep(0.3)
+            assert not late.done()
+        with pytest.raises(FencedError):
+            await asyncio.wait_for(late, SOON_SECONDS)
+        async with pool.connection() as connection:
+            lines = await list_log_lines(connection, ghost.job.id)
+        assert "late" not in str(lines)
+
+
+async def test_entry_that_is_claimed_twice_at_once_begins_one_attempt(conninfo: str) -> None:
+    async with open_pool(conninfo, max_size=6) as pool:
+        async with pool.connection() as connection:
+            job = await create_job(connection, SLIPS, NEW)
+        assert job.slip is not None
+        async with pool.connection() as other, other.transaction():
+            assert await get_job(other, job.id, lock=True) is not None
+            both = [asyncio.create_task(claim(pool, job.id, job.slip, name)) for name in ("a", "b")]
+            await asyncio.sleep(0.3)
+        attempts = [attempt for attempt in await asyncio.gather(*both) if attempt is not None]
+        assert [attempt.job.attempt for attempt in attempts] == [1]
