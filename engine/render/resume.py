@@ -1,7 +1,8 @@
 """Record of a series' finished images, by which an interrupted series is resumed.
 
 Beside the images a file says, a line each, what they are images of and which of them are whole. It is there
-only while the series is unfinished. An image counts if its line is there and its content is as it says.
+only while the series is unfinished. An image counts if its line is there and its content is as it says, or if
+:data:`MOVED_FILE` says that whoever runs the series keeps it elsewhere.
 """
 
 import hashlib
@@ -12,6 +13,8 @@ from octasplat.engine.core.errors import ConfigError, OutputError
 from octasplat.engine.core.writing import report_disk_full, write_text
 
 RECORD_FILE = "unfinished.jsonl"
+MOVED_FILE = "moved.json"
+"""Names and SHA-256 of finished images that were moved from the folder."""
 
 
 class FinishedImages:
@@ -37,6 +40,7 @@ class FinishedImages:
         self.record = folder / record
         self._identity = identity
         self._digests = self._read(resume, or_anew)
+        self._moved = self._read_moved() if self._digests else {}
 
     def __len__(self) -> int:
         """Return the number of images that the record names."""
@@ -45,7 +49,9 @@ class FinishedImages:
     def is_finished(self, path: Path) -> bool:
         """Return whether an image is finished and its file unchanged."""
         digest = self._digests.get(self._name(path))
-        return digest is not None and path.is_file() and _sha256(path) == digest
+        if digest is None:
+            return False
+        return self._moved.get(self._name(path)) == digest or (path.is_file() and _sha256(path) == digest)
 
     def add(self, path: Path) -> None:
         """Record that an image is finished; its file is written.
@@ -67,6 +73,7 @@ class FinishedImages:
     def remove_record(self) -> None:
         """Remove the record, as all images are finished."""
         self.record.unlink(missing_ok=True)
+        (self.folder / MOVED_FILE).unlink(missing_ok=True)
 
     def _name(self, path: Path) -> str:
         return path.relative_to(self.folder).as_posix()
@@ -105,6 +112,13 @@ class FinishedImages:
             write_text(self.record, "".join(complete))
         self._remove_partial()
         return digests
+
+    def _read_moved(self) -> dict[str, str]:
+        try:
+            moved: dict[str, str] = json.loads((self.folder / MOVED_FILE).read_text(encoding="utf-8"))
+        except FileNotFoundError:
+            return {}
+        return moved
 
     def _forget(self) -> dict[str, str]:
         self.record.unlink()

@@ -114,6 +114,19 @@ def fetch_tree(storage: Storage, files: Iterable[TreeFile], folder: Path, *, wri
         storage.materialise(file.sha256, folder / file.path, writable=writable)
 
 
+def merge_files(*groups: Iterable[TreeFile]) -> tuple[TreeFile, ...]:
+    """Return the files of several trees as those of one.
+
+    Raises:
+        FileNameError: a name is not portable, or there are two of it.
+    """
+    files = sorted((file for group in groups for file in group), key=lambda file: file.path)
+    known = NameSet()
+    for file in files:
+        known.add(file.path)
+    return tuple(files)
+
+
 def publish_manifest(storage: Storage, name: str, manifest: Manifest) -> bool:
     """Publish the manifest of a tree whose files are stored; see :meth:`Storage.publish`."""
     return storage.publish_document(name, manifest.to_bytes())

@@ -88,6 +88,16 @@ class UntrustedFolder:
         finally:
             os.close(fd)
 
+    def remove(self, name: str) -> None:
+        """Remove a file, if it is there, or the link that is in its place."""
+        parent, _, last = name.rpartition("/")
+        with suppress(OSError):
+            fd = self._open_beneath(parent, _FOLDER_FLAGS) if parent else os.dup(self._fd)
+            try:
+                os.unlink(last, dir_fd=fd)
+            finally:
+                os.close(fd)
+
     def names(self, below: str = "") -> Iterator[str]:
         """Yield the names of all that is below a folder but folders, relative to that folder.
 

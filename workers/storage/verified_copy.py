@@ -9,6 +9,19 @@ from octasplat.workers.storage.errors import DigestMismatchError
 from octasplat.workers.storage.protocol import Blob
 
 
+def check_content(chunks: Iterable[bytes], sha256: str) -> None:
+    """Check content without a copy.
+
+    Raises:
+        DigestMismatchError: the pieces are not the content of that digest.
+    """
+    digest = hashlib.sha256()
+    for piece in chunks:
+        digest.update(piece)
+    if digest.hexdigest() != sha256:
+        raise DigestMismatchError(f"The stored content {sha256} is damaged; upload it again.")
+
+
 def copy_verified(chunks: Iterable[bytes], blob: Blob, target: Path) -> None:
     """Write ``chunks`` to the new file ``target`` and compare them with ``blob``.
 

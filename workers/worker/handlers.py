@@ -25,6 +25,7 @@ from octasplat.workers.worker.job_kinds import get_job_kind
 from octasplat.workers.worker.job_kinds.operation_kind import OperationKind
 from octasplat.workers.worker.path_redaction import PathRedactor
 from octasplat.workers.worker.preview import PreviewRenderer
+from octasplat.workers.worker.stored_frames import write_moved_results
 from octasplat.workers.worker.task import INFO_FILE, Task
 
 REPORT = "report.html"
@@ -97,9 +98,16 @@ def run_operation(task: Task) -> None:
             result = kind.operation.execute(
                 kind.build_request(task), progress=report, should_stop=task.should_stop, threads=task.threads
             )
+    moved: dict[str, str] = {}
     for path in result.files:
         if not path.is_relative_to(task.results):
-            _publish_file(task, path, kind.result_name(path.relative_to(result.folder or task.run)))
+            name = kind.result_name(path.relative_to(result.folder or task.run))
+            try:
+                _publish_file(task, path, name)
+            except FileNotFoundError:  # stored and removed already
+                moved[name] = path.relative_to(task.folder).as_posix()
+    if moved:
+        write_moved_results(task.folder, moved)
     for line in result.lines():
         task.progress(Noted(_path_redactor(task).replace_job_paths(line)))
 

@@ -247,3 +247,4 @@ class Reporter:
                 self.add_note(f"Warning: from here on no checkpoints are kept: {error}")
                 return
             self._checkpoint = checkpoint
+        await asyncio.to_thread(self._workspace.stored_frames.remove_files)

@@ -16,6 +16,9 @@ SCENE_FILE, CONFIG_FILE = "scene.ply", "config.json"
 FRAMES_FOLDER = "frames"
 """In the engine's output, images of a render that are done; they are kept for later attempts."""
 
+MOVED_RESULTS_FILE = "moved_results.json"
+"""In an attempt's folder, the results that are stored already and were removed from it."""
+
 INFO_FILE = "info.json"
 """The result that tells what is in a scene."""
 

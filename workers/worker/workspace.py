@@ -15,8 +15,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO, Any
 
+from pydantic import ValidationError
+
 from octasplat.engine.core import versions
-from octasplat.engine.render.resume import RECORD_FILE
+from octasplat.engine.core.errors import ConfigError
 from octasplat.workers.db.rows import Artifact, DatasetFile, Job
 from octasplat.workers.queue.attempts import ResultFile
 from octasplat.workers.sandbox.job_users import JobUser, give_folder, open_for_reading, take_user
@@ -27,13 +29,16 @@ from octasplat.workers.storage.trees import (
     Manifest,
     TreeFile,
     fetch_tree,
+    merge_files,
     publish_manifest,
     read_manifest,
     store_tree,
 )
 from octasplat.workers.storage.untrusted_folder import UntrustedFolder
+from octasplat.workers.worker.job_kinds import get_job_kind
 from octasplat.workers.worker.media_types import media_type
-from octasplat.workers.worker.task import FILES_FOLDER, FRAMES_FOLDER, RESULTS_FOLDER, RUN_FOLDER
+from octasplat.workers.worker.stored_frames import StoredFrames
+from octasplat.workers.worker.task import FILES_FOLDER, RESULTS_FOLDER, RUN_FOLDER
 
 POSES_FOLDER = "poses"
 """Poses that the engine found, in its output folder and among the results."""
@@ -47,8 +52,6 @@ _CHECKPOINT_FILES = (
 _MAX_TRIES = 5
 METRICS_FILE = "metrics.json"
 MAX_METRICS_BYTES = 16 << 20
-MAX_RECORD_BYTES = 64 << 20
-"""Of the list of finished frames; a longer one is cut, and is then none."""
 
 
 @dataclass(frozen=True)
@@ -113,7 +116,7 @@ class Workspace:
         self._user: JobUser | None = None
         self._dataset_lock: IO[bytes] | None = None
         self._dataset: Path | None = None
-        self._stored_frames: dict[str, TreeFile] = {}
+        self.stored_frames = StoredFrames(self.folder, are_removed=_removes_stored_frames(job))
         self._peak_used_bytes = 0
 
     def open(self) -> None:
@@ -210,11 +213,13 @@ class Workspace:
         Raises:
             StorageError: some of it is gone or damaged.
         """
-        fetch_tree(self.storage, checkpoint.files, self.folder, writable=True)
+        files = self.stored_frames.adopt(checkpoint.files, self.storage)
+        fetch_tree(self.storage, files, self.folder, writable=True)
 
     def discard_run(self) -> None:
         """Discard what was restored."""
         shutil.rmtree(self.folder / RUN_FOLDER, ignore_errors=True)
+        self.stored_frames = StoredFrames(self.folder, are_removed=_removes_stored_frames(self._job))
 
     def store_checkpoint(self, stage: str, step: int) -> Checkpoint | None:
         """Store what a later attempt needs to resume; None if there is nothing yet."""
@@ -227,7 +232,7 @@ class Workspace:
             except StorageError:
                 # The program replaces files while they are read; whatever else is wrong stays wrong.
                 with UntrustedFolder(self.folder) as folder:
-                    if all(folder.is_file(name) for name in names):
+                    if all(name in self.stored_frames or folder.is_file(name) for name in names):
                         raise
                 time.sleep(0.05)
                 continue
@@ -236,12 +241,14 @@ class Workspace:
 
     def store_results(self) -> Manifest:
         """Store the results without publishing them."""
-        return store_tree(
+        manifest = store_tree(
             self.storage,
             self.folder,
             below=RESULTS_FOLDER,
             metadata={"job": str(self._job.id), "attempt": self._job.attempt, "kind": self._job.kind},
         )
+        files = merge_files(manifest.files, self.stored_frames.results())
+        return manifest.model_copy(update={"files": files})
 
     def publish_results(self, manifest: Manifest) -> list[ResultFile]:
         """Publish the manifest of the stored results; the job's row makes them visible."""
@@ -283,30 +290,14 @@ class Workspace:
 
     def _store_files(self, names: Sequence[str]) -> tuple[TreeFile, ...]:
         """Store files; finished frames never change, so that each of them is read once."""
-        new = [name for name in names if name not in self._stored_frames]
+        new = [name for name in names if name not in self.stored_frames]
         files = {file.path: file for file in store_tree(self.storage, self.folder, new).files}
-        found = tuple(self._stored_frames.get(name) or files[name] for name in names)
-        record = f"{RUN_FOLDER}/{FRAMES_FOLDER}/{RECORD_FILE}"
-        self._stored_frames |= {
-            n: f for n, f in files.items() if n.startswith(f"{RUN_FOLDER}/{FRAMES_FOLDER}/") and n != record
-        }
-        return found
-
-    def _frame_checkpoint_files(self) -> list[str]:
-        """Return the record of finished frames, and those that it names."""
-        frames = f"{RUN_FOLDER}/{FRAMES_FOLDER}"
-        with UntrustedFolder(self.folder) as folder:
-            try:
-                with folder.open(f"{frames}/{RECORD_FILE}") as handle:
-                    rows = [json.loads(line) for line in handle.read(MAX_RECORD_BYTES).splitlines()]
-                names = [RECORD_FILE, *(str(row["file"]) for row in rows[1:])]
-            except (StorageError, ValueError, TypeError, KeyError):  # none yet, or it is being written
-                return []
-            return [name for name in (f"{frames}/{name}" for name in names) if folder.is_file(name)]
+        self.stored_frames.add(files.values())
+        return tuple(files[name] if name in files else self.stored_frames[name] for name in names)
 
     def _checkpoint_files(self, stage: str) -> list[str]:
         if stage == "render":
-            return self._frame_checkpoint_files()
+            return self.stored_frames.checkpoint_names()
         with UntrustedFolder(self.folder) as folder:
             names = [name for name in _CHECKPOINT_FILES if folder.is_file(name)]
             poses = sorted(_directly_below(folder, f"{RUN_FOLDER}/{POSES_FOLDER}"))
@@ -379,6 +370,14 @@ def sweep_temporary(folder: Path, older_than_seconds: float) -> int:
                 shutil.rmtree(left, ignore_errors=True)
                 removed += 1
     return removed
+
+
+def _removes_stored_frames(job: Job) -> bool:
+    """Return whether finished frames of a job leave its folder; not where its kind is unknown here."""
+    with contextlib.suppress(ConfigError, ValidationError):
+        kind = get_job_kind(job.kind)
+        return kind.removes_stored_frames(kind.options.model_validate(job.options))
+    return False
 
 
 def _tree_files(files: Sequence[DatasetFile]) -> list[TreeFile]:

@@ -61,6 +61,10 @@ class ImageKind(OperationKind):
             frames.request_checkpoint()
             raise
 
+    def removes_stored_frames(self, options: Any) -> bool:
+        """Return whether the images are the results themselves; a video is made of its frames at the end."""
+        return bool(options.format != "mp4")
+
     def result_name(self, path: Path) -> str:
         """Return the name among the results of an image."""
         return f"{IMAGE_FOLDER}/{path.as_posix()}"

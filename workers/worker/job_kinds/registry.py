@@ -106,6 +106,10 @@ class JobKind(Generic[OptionsT]):
         """Return the demands of the options that a service may limit, for such photographs."""
         return ()
 
+    def removes_stored_frames(self, options: OptionsT) -> bool:
+        """Return whether finished frames leave the folder once they are stored; see ``stored_frames``."""
+        return False
+
     def named_files(self, options: OptionsT) -> Iterable[tuple[str, str]]:
         """Return the files that the options name, each after the place where they do, with dots."""
         return ()
