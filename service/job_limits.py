@@ -142,6 +142,11 @@ def limit_notes(
             f"It needs at least {known.disk_bytes / 1e9:.1f} GB of disk, and no worker has more than "
             f"{capacity / 1e9:.1f} GB."
         )
+    elif capacity is not None and known.max_disk_bytes > capacity:
+        notes.append(
+            f"It may need up to {known.max_disk_bytes / 1e9:.1f} GB of disk, and no worker has more than "
+            f"{capacity / 1e9:.1f} GB; ask for fewer or smaller images, or for another format."
+        )
     hours = settings.max_job_hours
     if hours and known.seconds > 3600 * hours:
         notes.append(

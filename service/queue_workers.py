@@ -1,6 +1,6 @@
 """Live workers of a queue: which can run a job, and the notes for its owner."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from pydantic import BaseModel
@@ -70,6 +70,20 @@ def queued_job_notes(
     if needy:
         notes.append(f"Whether {' and '.join(needy)} can be written is not known before a worker is there.")
     return notes
+
+
+def busy_workers_note(workers: Sequence[WorkerRow], running: Mapping[str, int], queue: str) -> list[str]:
+    """Return that all workers of a queue are busy, if they are.
+
+    Args:
+        workers: of the queue.
+        running: number of running jobs by queue.
+        queue: its name.
+    """
+    places = sum(row.slots for row in workers)
+    if not places or running.get(queue, 0) < places:
+        return []
+    return [f"The workers of the queue {queue} do as many jobs as they can at once ({places})."]
 
 
 def _refusing_workers_note(queue: str, takers: Sequence[WorkerRow]) -> list[str]:

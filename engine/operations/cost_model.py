@@ -65,8 +65,9 @@ _PIXEL_BYTES = 290
 """For a pixel of the largest photograph, when a view is measured; what training needed is free by then."""
 _CACHED_PIXEL_BYTES = 3
 _IMAGE_PIXEL_BYTES = {"exr": 7.0, "png": 0.4, "mp4": 0.4}
-"""The least that a pixel of a rendered image takes on disk, as measured where most of it is empty (28 and 1.1
-where nothing is). Images of a film are kept as PNG until it is written."""
+_MAX_IMAGE_PIXEL_BYTES = {"exr": 30.0, "png": 1.2, "mp4": 1.2}
+"""The least and the most that a pixel of a rendered image takes on disk, as measured where most of the image
+is empty (7 and 0.4) and where nothing is (30 and 1.1). Images of a film are kept as PNG until it is written."""
 _CORE_POWER = 0.79
 """Two cores train 1.73 times as fast as one."""
 _TYPICAL_RENDER_GAUSSIANS = 100_000
@@ -81,6 +82,7 @@ class Estimate(BaseModel):
         cores: of the machine that is reckoned with.
         memory_bytes: largest private memory of the job's process.
         disk_bytes: the least that its folder takes on the worker's disk; 0 where nobody knows.
+        max_disk_bytes: the most that it may take; 0 where nobody knows.
         finds_poses: whether poses are found first.
         poses_seconds: by the clock, for finding them, in ``seconds``.
         cold_start_seconds: for kernels that are not compiled yet, in ``cpu_seconds`` and ``seconds``.
@@ -94,6 +96,7 @@ class Estimate(BaseModel):
     finds_poses: bool = False
     poses_seconds: float = 0.0
     disk_bytes: int = 0
+    max_disk_bytes: int = 0
     cold_start_seconds: float = 0.0
     stage_seconds: dict[str, float] = {}
 
@@ -207,6 +210,11 @@ def image_bytes(options: PictureOptions, photographs: Sequence[ImageSizes], turn
     return round(_IMAGE_PIXEL_BYTES[options.format] * rendered_pixels(options, photographs) * turns)
 
 
+def _max_image_bytes(disk_bytes: int, image_format: str) -> int:
+    """Return the most that images take of which ``disk_bytes`` is the least."""
+    return round(disk_bytes * _MAX_IMAGE_PIXEL_BYTES[image_format] / _IMAGE_PIXEL_BYTES[image_format])
+
+
 def training_pixels(options: ReconstructionConfig, photographs: Sequence[ImageSizes]) -> int:
     """Return the pixels of a reconstruction's training views, if all photographs have poses."""
     shrunk = [_capped_sizes(sizes, options.max_side) for sizes in photographs]
@@ -223,7 +231,9 @@ def estimate_render(options: RenderOptions, photographs: Sequence[ImageSizes], c
         each += _PATH_CPU_SECONDS * options.stage.integrator.samples
     cpu_seconds = _RENDER_START_CPU_SECONDS + each * pixels
     memory = _START_BYTES + _gaussian_bytes(2) * _TYPICAL_RENDER_GAUSSIANS
-    return _make_estimate(cpu_seconds, memory, cores, disk_bytes=image_bytes(options, photographs))
+    disk = image_bytes(options, photographs)
+    most = _max_image_bytes(disk, options.format)
+    return _make_estimate(cpu_seconds, memory, cores, disk_bytes=disk, max_disk_bytes=most)
 
 
 def estimate_relight(options: RelightOptions, photographs: Sequence[ImageSizes], cores: int) -> Estimate:
@@ -232,7 +242,8 @@ def estimate_relight(options: RelightOptions, photographs: Sequence[ImageSizes],
     cpu_seconds = _RENDER_START_CPU_SECONDS + each * rendered_pixels(options, photographs)
     memory = _START_BYTES + _gaussian_bytes(2) * _TYPICAL_RENDER_GAUSSIANS
     disk = image_bytes(options, photographs, len(options.environments))
-    return _make_estimate(cpu_seconds, memory, cores, disk_bytes=disk)
+    most = _max_image_bytes(disk, options.format)
+    return _make_estimate(cpu_seconds, memory, cores, disk_bytes=disk, max_disk_bytes=most)
 
 
 def rendered_pixels(options: PictureOptions, photographs: Sequence[ImageSizes]) -> int:
@@ -258,6 +269,7 @@ def _make_estimate(
     finds_poses: bool = False,
     disk_bytes: int = 0,
     stages: Mapping[str, float] | None = None,
+    max_disk_bytes: int = 0,
 ) -> Estimate:
     speedup = max(1, cores) ** _CORE_POWER
     return Estimate(
@@ -268,6 +280,7 @@ def _make_estimate(
         finds_poses=finds_poses,
         disk_bytes=disk_bytes,
         stage_seconds={name: round(seconds / speedup, 1) for name, seconds in (stages or {}).items()},
+        max_disk_bytes=max_disk_bytes,
     )
 
 

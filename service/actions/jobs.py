@@ -15,7 +15,7 @@ from octasplat.service.auth import Principal
 from octasplat.service.idempotency import create_once, fingerprint
 from octasplat.service.job_limits import limit_notes
 from octasplat.service.problems import ProblemError
-from octasplat.service.queue_workers import live_workers_of_queue, queued_job_notes
+from octasplat.service.queue_workers import busy_workers_note, live_workers_of_queue, queued_job_notes
 from octasplat.service.schemas.jobs import JobChange, JobView
 from octasplat.service.state import Service
 from octasplat.workers.db.connections import Connection, retry_on_deadlock
@@ -23,6 +23,7 @@ from octasplat.workers.db.rows import Job, JobState
 from octasplat.workers.queue import jobs as rows
 from octasplat.workers.worker.job_kinds import get_job_kind
 from octasplat.workers.worker.job_kinds.stored_options import options_of
+from octasplat.workers.worker.path_redaction import shorten_absolute_paths
 
 BUSY_RETRY_SECONDS = 2
 """After which a job that moves is worth another look."""
@@ -201,13 +202,17 @@ async def job_view(connection: Connection, service: Service, principal: Principa
 
     Its worker, which is named after its host, is for administrators.
     """
-    notes: list[str] = []
+    notes = [job.begun_anew] if job.begun_anew is not None else []
     if job.state == "queued":
+        if job.waits_for is not None:
+            notes.append(shorten_absolute_paths(job.waits_for))
         with suppress(ConfigError, ValidationError):  # of another version
             kind = get_job_kind(job.kind)
             workers = await live_workers_of_queue(connection, job.queue, service.settings.stale_seconds)
-            notes = queued_job_notes(kind, options_of(kind, job), job.queue, workers)
+            notes += queued_job_notes(kind, options_of(kind, job), job.queue, workers)
             notes += limit_notes(job.estimate, workers, service.settings)
+            if not notes:
+                notes += busy_workers_note(workers, await rows.running_by_queue(connection), job.queue)
     return JobView.from_row(
         replace(job, options=complete_options(job)),
         stages_of(job),

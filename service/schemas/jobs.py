@@ -139,7 +139,7 @@ class JobSummary(BaseModel):
     queue_position: int | None = Field(description="Jobs that go before it.")
     estimate: Estimate | None = Field(description="What it was reckoned to take when it was accepted.")
     notes: list[str] = Field(
-        description="What its owner should know while it waits, e.g. for want of a worker."
+        description="What its owner should know: why it waits, and why it was begun anew, if it was."
     )
     error: JobError | None
     checkpoint: CheckpointView | None

@@ -106,6 +106,9 @@ class Job:
         finished_at: when it came to its end.
         expires_at: when retention may remove it.
         version: counts changes but heartbeats.
+        waits_for: why it is in the queue again, or was left there by a worker; None for a job that waits for
+            its turn.
+        begun_anew: why an attempt did not go on from the checkpoint that there was.
     """
 
     id: uuid.UUID
@@ -145,6 +148,8 @@ class Job:
     files_id: uuid.UUID | None = None
     settings: dict[str, Any] | None = None
     resolved_by: str | None = None
+    waits_for: str | None = None
+    begun_anew: str | None = None
 
     @property
     def is_over(self) -> bool:

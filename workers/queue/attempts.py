@@ -141,6 +141,14 @@ class Attempt:
             )
             await add_event(connection, job.id, job.attempt, "preview", preview)
 
+    async def record_begun_anew(self, reason: str) -> None:
+        """Record why the attempt does not go on from the checkpoint of an earlier one."""
+        async with self._fenced_transaction() as (connection, job):
+            await connection.execute(
+                "UPDATE jobs SET begun_anew = %s WHERE id = %s",
+                [storable_text(self.redact(reason)), job.id],
+            )
+
     async def succeed(self, results: Sequence[ResultFile], psnr: float | None = None) -> None:
         """Publish the results and end the job.
 
@@ -216,7 +224,7 @@ class Attempt:
                 return
             await add_event(connection, job.id, job.attempt, "handed_back", {"reason": reason})
             await add_log_lines(connection, job.id, job.attempt, [f"Handed back to the queue: {reason}"])
-            await requeue_job(connection, job_queue, job, keep_entry=True)
+            await requeue_job(connection, job_queue, job, keep_entry=True, reason=reason)
 
     async def requeue_lost(
         self,

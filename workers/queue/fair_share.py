@@ -64,7 +64,9 @@ async def choose_job(
         chosen = await _next_fair_job(connection, job_queue, job)
         if chosen is None or chosen.slip is None:
             return job_id, entry_id
-        await requeue_job(connection, job_queue, job, keep_entry=True, without_event=True)
+        await requeue_job(
+            connection, job_queue, job, keep_entry=True, without_event=True, reason=job.waits_for
+        )
         return chosen.id, chosen.slip
 
 

@@ -92,12 +92,19 @@ async def fail_abandoned_jobs(
 
 
 async def fail_before_start(
-    connection: Connection, job_id: uuid.UUID, entry_id: int, error: Mapping[str, Any]
+    connection: Connection,
+    job_id: uuid.UUID,
+    entry_id: int,
+    error: Mapping[str, Any],
+    *,
+    drop_checkpoint: bool = False,
 ) -> bool:
-    """Fail a job whose entry is being delivered, before any attempt; False if it has continued meanwhile."""
+    """Fail a job whose entry is being delivered, before an attempt; False if it has continued meanwhile."""
     async with connection.transaction():
         job = await get_job(connection, job_id, lock=True)
         if job is None or job.state != "queued" or job.slip != entry_id:
             return False
         await end_job(connection, job, "failed", error)
+        if drop_checkpoint:
+            await connection.execute("UPDATE jobs SET checkpoint = NULL WHERE id = %s", [job_id])
     return True

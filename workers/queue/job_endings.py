@@ -69,5 +69,12 @@ async def recover_attempt(
         await add_event(connection, job.id, job.attempt, "rescued", data)
         lost = f"Lost, and queued again: {error['message']}"
         await add_log_lines(connection, job.id, job.attempt, [lost])
-        await requeue_job(connection, job_queue, job, keep_entry=keep_entry, delay_seconds=delay_seconds)
+        await requeue_job(
+            connection,
+            job_queue,
+            job,
+            keep_entry=keep_entry,
+            delay_seconds=delay_seconds,
+            reason=error["message"],
+        )
     return False

@@ -13,7 +13,7 @@ from octasplat.workers.db.errors import ConflictError, NotFoundError
 from octasplat.workers.db.events_and_logs import add_event
 from octasplat.workers.db.ids import new_id
 from octasplat.workers.db.locks import about_to_lock_jobs, lock_owner
-from octasplat.workers.db.postgres_text import as_json, as_json_or_null
+from octasplat.workers.db.postgres_text import as_json, as_json_or_null, storable_text
 from octasplat.workers.db.rows import Artifact, Job
 from octasplat.workers.queue.protocol import JobQueue, NewEntry, QueueDepth
 
@@ -206,6 +206,7 @@ async def retry_job(
             UPDATE jobs SET rescues = 0, error = NULL, stage = NULL, step = NULL, total_steps = NULL,
                 seconds_left = NULL, finished_at = NULL, worker = NULL, expires_at = NULL,
                 checkpoint = CASE WHEN %(fresh)s THEN NULL ELSE checkpoint END,
+                begun_anew = CASE WHEN %(fresh)s THEN NULL ELSE begun_anew END,
                 psnr = CASE WHEN %(fresh)s THEN NULL ELSE psnr END,
                 training_psnr = CASE WHEN %(fresh)s THEN NULL ELSE training_psnr END,
                 fresh_after = CASE WHEN %(forget)s THEN attempt ELSE fresh_after END,
@@ -235,6 +236,7 @@ async def requeue_job(
     keep_entry: bool = False,
     delay_seconds: float = 0.0,
     without_event: bool = False,
+    reason: str | None = None,
 ) -> None:
     """Put a job back into its queue with a new entry; the caller holds the job's lock.
 
@@ -248,6 +250,7 @@ async def requeue_job(
         keep_entry: the old queue entry is being delivered and goes by itself when that ends.
         delay_seconds: for how long it is not taken up.
         without_event: it never ceased to be queued, so that nobody needs to hear of it.
+        reason: why, for its owner; None where it only waits for its turn.
     """
     if job.slip is not None and not keep_entry:
         await job_queue.remove(connection, job.slip)
@@ -255,11 +258,16 @@ async def requeue_job(
     entry_id = await job_queue.enqueue(connection, entry)
     await connection.execute(
         """
-        UPDATE jobs SET slip = %(entry)s, delayed_until =
+        UPDATE jobs SET slip = %(entry)s, waits_for = %(reason)s, delayed_until =
             CASE WHEN %(delay)s > 0 THEN now() + make_interval(secs => %(delay)s) END
         WHERE id = %(job)s
         """,
-        {"entry": entry_id, "delay": delay_seconds, "job": job.id},
+        {
+            "entry": entry_id,
+            "reason": None if reason is None else storable_text(reason),
+            "delay": delay_seconds,
+            "job": job.id,
+        },
     )
     if without_event:
         return

@@ -3,6 +3,7 @@
 import os
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from octasplat.workers.storage.errors import StorageFullError
 from octasplat.workers.storage.os_errors import FREE_SPACE_HINT, translate_os_errors
@@ -86,6 +87,18 @@ class DiskSpace:
         """
         facts = self._work_statvfs()
         return max(0, facts.f_blocks * facts.f_frsize - self.floor_bytes)
+
+    def facts(self) -> dict[str, Any]:
+        """Return the facts on the disk of ``work`` that a worker publishes.
+
+        Raises:
+            StorageUnavailableError: the disk does not answer.
+        """
+        return {
+            "disk_bytes": self.capacity_bytes(),
+            "disk_free_bytes": self.free_bytes(),
+            "shares_store_disk": self._shares_disk(),
+        }
 
     def ensure_workspace(self, size_bytes: int) -> None:
         """Refuse a size that would use the reserve on the disk of ``work``.

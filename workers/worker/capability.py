@@ -42,7 +42,7 @@ async def reason_incapable(pool: Pool, job_id: uuid.UUID, stale_seconds: float) 
         made_by = Checkpoint.from_row(job.checkpoint).results
         for row in await live_workers(connection, stale_seconds):
             if job.queue in row.queues and row.facts.get("results", 1) == made_by:
-                return f"the worker {row.name} can go on from its checkpoint, which is of another version"
+                return "another worker can go on from its checkpoint, which is of another version"
     return None
 
 

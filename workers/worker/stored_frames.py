@@ -5,16 +5,23 @@ each of them lies on the disk once; a later attempt does not fetch them. The pro
 :data:`~octasplat.engine.render.resume.MOVED_FILE` which there are, and names them where they are results.
 """
 
+import contextlib
 import json
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
+from pydantic import ValidationError
+
+from octasplat.engine.core.errors import ConfigError
 from octasplat.engine.render.resume import MOVED_FILE, RECORD_FILE
+from octasplat.workers.db.rows import Job
 from octasplat.workers.storage.errors import StorageError
 from octasplat.workers.storage.protocol import Storage
 from octasplat.workers.storage.trees import TreeFile
 from octasplat.workers.storage.untrusted_folder import UntrustedFolder
 from octasplat.workers.storage.verified_copy import check_content
+from octasplat.workers.worker.job_kinds import get_job_kind
+from octasplat.workers.worker.job_kinds.stored_options import options_of
 from octasplat.workers.worker.task import FRAMES_FOLDER, MOVED_RESULTS_FILE, RUN_FOLDER
 
 _FRAMES = f"{RUN_FOLDER}/{FRAMES_FOLDER}/"
@@ -59,9 +66,7 @@ class StoredFrames:
 
     def add(self, files: Iterable[TreeFile]) -> None:
         """Add the frames among files that were stored; finished ones never change."""
-        self._files |= {
-            file.path: file for file in files if file.path.startswith(_FRAMES) and file.path not in _RECORDS
-        }
+        self._files |= {file.path: file for file in files if _is_frame(file.path)}
 
     def remove_files(self) -> None:
         """Remove the stored frames from the folder, whose checkpoint is recorded."""
@@ -77,17 +82,21 @@ class StoredFrames:
             StorageError: a frame is gone or damaged.
         """
         files = list(files)
-        if not self._are_removed:
+        fetched = self.fetched(files)
+        if len(fetched) == len(files):
             return files
         self.add(files)
         for file in self._files.values():
             check_content(storage.read(file.sha256), file.sha256)
-        if self._files:
-            moved = {name.removeprefix(_FRAMES): file.sha256 for name, file in self._files.items()}
-            folder = self._folder / RUN_FOLDER / FRAMES_FOLDER
-            folder.mkdir(parents=True, exist_ok=True)
-            (folder / MOVED_FILE).write_text(json.dumps(moved), encoding="utf-8")
-        return [file for file in files if file.path not in self._files]
+        moved = {name.removeprefix(_FRAMES): file.sha256 for name, file in self._files.items()}
+        folder = self._folder / RUN_FOLDER / FRAMES_FOLDER
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / MOVED_FILE).write_text(json.dumps(moved), encoding="utf-8")
+        return fetched
+
+    def fetched(self, files: Iterable[TreeFile]) -> list[TreeFile]:
+        """Return those of a checkpoint's files that another attempt fetches."""
+        return [file for file in files if not (self._are_removed and _is_frame(file.path))]
 
     def results(self) -> list[TreeFile]:
         """Return the results that are stored frames, as the program names them.
@@ -104,9 +113,21 @@ class StoredFrames:
         return found
 
 
+def _is_frame(name: str) -> bool:
+    return name.startswith(_FRAMES) and name not in _RECORDS
+
+
 def write_moved_results(folder: Path, names: Mapping[str, str]) -> None:
     """Write which results are stored frames: in an attempt's folder, by the name of the result."""
     (folder / MOVED_RESULTS_FILE).write_text(json.dumps(dict(names)), encoding="utf-8")
+
+
+def removes_stored_frames(job: Job) -> bool:
+    """Return whether finished frames of a job leave its folder; not where its kind is unknown here."""
+    with contextlib.suppress(ConfigError, ValidationError):
+        kind = get_job_kind(job.kind)
+        return kind.removes_stored_frames(options_of(kind, job))
+    return False
 
 
 def _read_moved_results(folder: Path) -> Mapping[str, str]:

@@ -179,7 +179,9 @@ class Supervisor:
         self._deadline_at = time.monotonic() + left
         checkpoint = None if job.checkpoint is None else Checkpoint.from_row(job.checkpoint)
         copied = sum(a.size_bytes for a in artifacts if a.name in kind.source_files)
-        copied += sum(file.size_bytes for file in checkpoint.files) if checkpoint is not None else 0
+        if checkpoint is not None:
+            fetched = self._workspace.stored_frames.fetched(checkpoint.files)
+            copied += sum(file.size_bytes for file in fetched)
         await asyncio.to_thread(self._context.disk_space.ensure_workspace, copied)
         if dataset is not None and (kind.needs == "dataset" or kind.needs_photographs(options)):
             title = dataset.name
@@ -214,22 +216,24 @@ class Supervisor:
 
     async def _restore(self, checkpoint: Checkpoint) -> None:
         if checkpoint.results != versions.RESULTS_VERSION:
-            self._reporter.add_note(
-                "Warning: the checkpoint is of a version in which the same settings gave other results, so "
-                "the job begins anew."
+            await self._tell_begun_anew(
+                "the checkpoint is of a version in which the same settings gave other results, so the job "
+                "begins anew."
             )
             return
         try:
             await asyncio.to_thread(self._workspace.restore, checkpoint)
         except (BlobNotFoundError, DigestMismatchError) as error:
             await asyncio.to_thread(self._workspace.discard_run)
-            self._reporter.add_note(
-                f"Warning: the checkpoint cannot be used, so the job begins anew: {error}"
-            )
+            await self._tell_begun_anew(f"the checkpoint cannot be used, so the job begins anew: {error}")
             return
         self._reporter.record_resume(checkpoint)
         data = {"stage": checkpoint.stage, "step": checkpoint.step, "attempt": checkpoint.attempt}
         await self._attempt.add_event("resumed", data)
+
+    async def _tell_begun_anew(self, why: str) -> None:
+        self._reporter.add_note(f"Warning: {why}")
+        await self._attempt.record_begun_anew(f"{why[0].upper()}{why[1:]}")
 
     async def _after_stop(self, reason: StopReason) -> None:
         if reason is StopReason.FENCED:

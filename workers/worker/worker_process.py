@@ -295,7 +295,7 @@ class _Worker:
         wait_seconds = DEFERRAL_POLLS * self._settings.poll_seconds * 2 ** min(self._deferrals[job_id], 10)
         wait_seconds = min(wait_seconds, MAX_DEFERRAL_SECONDS)
         self._deferrals[job_id] += 1
-        await defer_job(self._pool, self._context.job_queue, job_id, entry_id, wait_seconds)
+        await defer_job(self._pool, self._context.job_queue, job_id, entry_id, wait_seconds, reason=f"{why}.")
         return True
 
     async def _return_to_queue(self, job_id: uuid.UUID, entry_id: int) -> None:
@@ -317,7 +317,7 @@ class _Worker:
     def _machine_facts(self) -> dict[str, Any]:
         memory, room = psutil.virtual_memory(), self._context.disk_space
         try:
-            disk = {"disk_bytes": room.capacity_bytes(), "disk_free_bytes": room.free_bytes()}
+            disk = room.facts()
         except StorageError:
             disk = {}
         return {

@@ -15,10 +15,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO, Any
 
-from pydantic import ValidationError
-
 from octasplat.engine.core import versions
-from octasplat.engine.core.errors import ConfigError
 from octasplat.workers.db.rows import Artifact, DatasetFile, Job
 from octasplat.workers.queue.attempts import ResultFile
 from octasplat.workers.sandbox.job_users import JobUser, give_folder, open_for_reading, take_user
@@ -35,9 +32,8 @@ from octasplat.workers.storage.trees import (
     store_tree,
 )
 from octasplat.workers.storage.untrusted_folder import UntrustedFolder
-from octasplat.workers.worker.job_kinds import get_job_kind
 from octasplat.workers.worker.media_types import media_type
-from octasplat.workers.worker.stored_frames import StoredFrames
+from octasplat.workers.worker.stored_frames import StoredFrames, removes_stored_frames
 from octasplat.workers.worker.task import FILES_FOLDER, RESULTS_FOLDER, RUN_FOLDER
 
 POSES_FOLDER = "poses"
@@ -90,6 +86,11 @@ class Checkpoint:
         files = tuple(TreeFile.model_validate(file) for file in row["files"])
         return cls(row["attempt"], row["stage"], row["step"], files, row.get("results", 1))
 
+    @property
+    def size_bytes(self) -> int:
+        """Return the size of its files together."""
+        return sum(file.size_bytes for file in self.files)
+
     def is_after(self, other: "Checkpoint | None") -> bool:
         """Return whether the work is further than at ``other``."""
         order = {"poses": 0, "load": 1, "train": 2, "evaluate": 3, "export": 4}
@@ -116,7 +117,7 @@ class Workspace:
         self._user: JobUser | None = None
         self._dataset_lock: IO[bytes] | None = None
         self._dataset: Path | None = None
-        self.stored_frames = StoredFrames(self.folder, are_removed=_removes_stored_frames(job))
+        self.stored_frames = StoredFrames(self.folder, are_removed=removes_stored_frames(job))
         self._peak_used_bytes = 0
 
     def open(self) -> None:
@@ -219,7 +220,7 @@ class Workspace:
     def discard_run(self) -> None:
         """Discard what was restored."""
         shutil.rmtree(self.folder / RUN_FOLDER, ignore_errors=True)
-        self.stored_frames = StoredFrames(self.folder, are_removed=_removes_stored_frames(self._job))
+        self.stored_frames = StoredFrames(self.folder, are_removed=removes_stored_frames(self._job))
 
     def store_checkpoint(self, stage: str, step: int) -> Checkpoint | None:
         """Store what a later attempt needs to resume; None if there is nothing yet."""
@@ -370,14 +371,6 @@ def sweep_temporary(folder: Path, older_than_seconds: float) -> int:
                 shutil.rmtree(left, ignore_errors=True)
                 removed += 1
     return removed
-
-
-def _removes_stored_frames(job: Job) -> bool:
-    """Return whether finished frames of a job leave its folder; not where its kind is unknown here."""
-    with contextlib.suppress(ConfigError, ValidationError):
-        kind = get_job_kind(job.kind)
-        return kind.removes_stored_frames(kind.options.model_validate(job.options))
-    return False
 
 
 def _tree_files(files: Sequence[DatasetFile]) -> list[TreeFile]:
