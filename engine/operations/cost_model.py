@@ -67,7 +67,7 @@ _CACHED_PIXEL_BYTES = 3
 _IMAGE_PIXEL_BYTES = {"exr": 7.0, "png": 0.4, "mp4": 0.4}
 _MAX_IMAGE_PIXEL_BYTES = {"exr": 30.0, "png": 1.2, "mp4": 1.2}
 """The least and the most that a pixel of a rendered image takes on disk, as measured where most of the image
-is empty (7 and 0.4) and where nothing is (30 and 1.1). Images of a film are kept as PNG until it is written."""
+is empty and where nothing is (30 and 1.1). Images of a film are kept as PNG until it is written."""
 _CORE_POWER = 0.79
 """Two cores train 1.73 times as fast as one."""
 _TYPICAL_RENDER_GAUSSIANS = 100_000
