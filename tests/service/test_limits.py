@@ -11,6 +11,7 @@ from octasplat.workers.db.datasets import put_file
 from octasplat.workers.db.locks import lock_owner
 from octasplat.workers.db.workers import record_worker_heartbeat
 from octasplat.workers.queue.attempts import ResultFile
+from octasplat.workers.queue.jobs import get_job, requeue_job
 from tests.support.service_harness import (
     ConnectService,
     claim_job,
@@ -198,3 +199,29 @@ async def worker_reports(service: Service, name: str, facts: dict[str, Any]) -> 
         await record_worker_heartbeat(
             connection, uuid.uuid4(), name=name, queues=["cpu"], slots=1, facts=facts
         )
+
+
+async def test_notes_tell_why_jobs_wait_and_were_begun_anew(connect_service: ConnectService) -> None:
+    async with connect_service() as (http, service):
+
+        async def notes_of(job: dict[str, Any]) -> list[str]:
+            found: list[str] = (await http.get(f"/v1/jobs/{job['id']}")).json()["notes"]
+            return found
+
+        body = {"dataset_id": await committed_dataset(service)}
+        first, second = [(await http.post("/v1/jobs", json=body)).json() for _ in range(2)]
+        await worker_reports(service, "w", {})
+        assert await notes_of(first) == []
+        async with service.pool.connection() as connection, connection.transaction():
+            row = await get_job(connection, uuid.UUID(first["id"]), lock=True)
+            assert row is not None
+            reason = "It needs 9 bytes of disk, and /srv/data/octasplat/work has 5."
+            await requeue_job(connection, service.job_queue, row, without_event=True, reason=reason)
+        assert await notes_of(first) == ["It needs 9 bytes of disk, and …/octasplat/work has 5."]
+        attempt = await claim_job(service, first)
+        assert await notes_of(first) == []
+        await attempt.record_begun_anew("The checkpoint is of another version, so the job begins anew.")
+        assert await notes_of(first) == ["The checkpoint is of another version, so the job begins anew."]
+        assert await notes_of(second) == [
+            "The workers of the queue cpu do as many jobs as they can at once (1)."
+        ]
