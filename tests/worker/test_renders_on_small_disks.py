@@ -1,13 +1,11 @@
 """Renders whose images nearly fill the disk: each lies there once, and a render goes on or says why not."""
 
 import asyncio
-import json
 import uuid
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-import psycopg
 import pytest
 
 import octasplat as osp
@@ -97,25 +95,3 @@ def test_render_that_fills_disk_fails_and_lets_others_go_on(
         assert job.error["type"] == "no_space" and "bytes" in job.error["message"], job.error
         other = bench.wait_until_finished(bench.submit(options={"steps": 3}))
         assert other.state == "succeeded"
-
-
-def test_render_that_never_fits_beside_its_images_fails(
-    conninfo: str, tmp_path: Path, expected: dict[str, bytes]
-) -> None:
-    total = sum(map(len, expected.values()))
-    with bench_on_disk(conninfo, tmp_path / "disk", 2 * total) as bench:
-        job_id = submit_render(bench, tmp_path / "scene", 0)
-        worker = bench.worker(FLOOR_BYTES=str(MIB), **MODULES)
-        bench.wait(job_id, lambda job: (job.checkpoint or {}).get("step", 0) >= FRAMES // 2)
-        worker.kill()
-        with psycopg.connect(conninfo, autocommit=True) as connection:
-            estimate = json.dumps({"disk_bytes": 2 * total - MIB})
-            # As for a film, whose frames are fetched again.
-            connection.execute(
-                'UPDATE jobs SET estimate = %s, options = options || \'{"format": "mp4"}\' WHERE id = %s',
-                [estimate, job_id],
-            )
-        bench.worker(FLOOR_BYTES=str(MIB), FULL_DISK_SECONDS="0.2", **MODULES)
-        job = bench.wait_until_finished(job_id)
-        assert job.state == "failed" and job.error is not None and job.error["type"] == "no_space", job
-        assert "beside its checkpoint of" in job.error["message"], job.error
