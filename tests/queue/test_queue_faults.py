@@ -23,7 +23,7 @@ from octasplat.workers.db.locks import lock_owner, lock_store
 from octasplat.workers.db.rows import Job
 from octasplat.workers.maintenance.webhooks.rows import add_endpoint, delete_endpoint
 from octasplat.workers.queue.attempts import Attempt, FencedError, ResultFile, claim
-from octasplat.workers.queue.jobs import NewJob, change_job, create_job, get_job
+from octasplat.workers.queue.jobs import NewJob, cancel_job, change_job, create_job, get_job
 from octasplat.workers.queue.procrastinate_queue import ProcrastinateQueue
 from octasplat.workers.queue.recovery import StalledAttempts, recover_stalled_jobs
 from octasplat.workers.queue.storage_leases import (
@@ -331,3 +331,15 @@ async def test_entry_that_is_claimed_twice_at_once_begins_one_attempt(conninfo: 
             await asyncio.sleep(0.3)
         attempts = [attempt for attempt in await asyncio.gather(*both) if attempt is not None]
         assert [attempt.job.attempt for attempt in attempts] == [1]
+
+
+async def test_attempt_at_a_job_that_is_being_canceled_still_writes(conninfo: str) -> None:
+    async with open_pool(conninfo, max_size=4) as pool:
+        attempt = await begun(pool)
+        async with pool.connection() as connection:
+            await cancel_job(connection, SLIPS, attempt.job.id)
+        assert await attempt.heartbeat() == await attempt.read_state() == "canceling"
+        await attempt.cancel()
+        assert (await now(pool, attempt)).state == "canceled"
+        with pytest.raises(FencedError):
+            await attempt.heartbeat()
