@@ -167,7 +167,9 @@ class Run:
                     if hashlib.sha256(content).hexdigest() != artifact["sha256"]:
                         found.append(f"job {job_id}: {artifact['name']} does not have its digest")
                     results[artifact["name"]] = artifact["sha256"]
-                    if _is_compared(artifact["name"]) and content != self._undisturbed(job, artifact["name"]):
+                    if _is_compared(artifact["name"]) and content != self._undisturbed(
+                        api, job, artifact["name"]
+                    ):
                         found.append(f"job {job_id}: {artifact['name']} differs from the undisturbed run's")
                 manifests = [
                     {file.path: file.sha256 for file in manifest.files}
@@ -195,9 +197,10 @@ class Run:
             "asked_for_again": sum(self.retried.values()),
         }
 
-    def _undisturbed(self, job: dict[str, Any], name: str) -> bytes | None:
+    def _undisturbed(self, api: Api, job: dict[str, Any], name: str) -> bytes | None:
         if job["kind"] == "chain":
-            return undisturbed(self.photographs, ChainOptions.model_validate(job["options"]))
+            options = api.get(f"/v1/jobs/{job['id']}")["options"]
+            return undisturbed(self.photographs, ChainOptions.model_validate(options))
         return self.expected.get(name)
 
 
