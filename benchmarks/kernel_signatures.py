@@ -23,8 +23,9 @@ from octasplat.engine.operations.precompile import FIRST_ITERATION, TABLE
 
 PROCESSES = 4
 Table = dict[str, Any]
-RUN = ("--max-side", "64", "--iterations", "60", "--set", "max_gaussians=2000", "--threads", "1")
-"""Of the reconstruction: short, and long enough for each kind of iteration."""
+RUN = ("--max-side", "320", "--iterations", "60", "--set", "max_gaussians=2000", "--threads", "1")
+"""Of the reconstruction: short, and long enough for each kind of iteration. The photographs are large enough
+for rays that are traced alone, as those of users are."""
 
 
 def commands(folder: Path) -> dict[str, list[list[str]]]:
@@ -55,6 +56,7 @@ def record(arguments: list[str]) -> list[dict[str, Any]]:
     from numba.core.dispatcher import Dispatcher
 
     from octasplat.engine.core.events import TrainingProgress
+    from octasplat.engine.trace.kernels.native import NativeCallback
 
     called: list[tuple[Any, Any, float, bool]] = []
     compile_overload = Dispatcher.compile
@@ -73,7 +75,17 @@ def record(arguments: list[str]) -> list[dict[str, Any]]:
             if not isinstance(self._cache, NullCache):
                 called.append((self, signature, time.thread_time() - began, has_begun))
 
+    compile_callback = NativeCallback.compile
+
+    def note_callback(self: NativeCallback) -> Any:
+        began = time.thread_time()
+        try:
+            return compile_callback(self)
+        finally:
+            called.append((self.function, (), time.thread_time() - began, has_begun))
+
     Dispatcher.compile = note
+    NativeCallback.compile = note_callback  # type: ignore[method-assign]
     TrainingProgress.__init__ = note_progress  # type: ignore[method-assign]
     from octasplat.engine.core.kernel_signatures import encode_type
     from octasplat.workers.cli.main import main
@@ -100,7 +112,7 @@ def collect(folder: Path) -> Table:
     """Run all commands, the reconstruction first and the others beside each other; return the table."""
     from octasplat.engine.dataset.synthetic import SyntheticDatasetConfig, write_synthetic_dataset
 
-    config = SyntheticDatasetConfig(views=8, width_px=64, height_px=48, samples_per_side=1, points=200)
+    config = SyntheticDatasetConfig(views=8, width_px=320, height_px=240, samples_per_side=1, points=200)
     write_synthetic_dataset(folder / "scene", config)
 
     def kernels_of_group(group: str, lines: list[list[str]]) -> list[dict[str, Any]]:

@@ -63,13 +63,16 @@ def compile_kernel(module: str, function: str, arguments: Sequence[EncodedType],
     Args:
         module: of the kernel.
         function: its name.
-        arguments: encoded types.
+        arguments: encoded types; none of a callback of native code.
         skip_busy: do nothing while another process compiles it.
 
     Returns:
         Whether the code is there now.
     """
     dispatcher = getattr(importlib.import_module(module), function)
+    if not hasattr(dispatcher, "_cache"):  # a callback of native code, whose types are its own
+        dispatcher.compile()
+        return True
     if skip_busy and dispatcher._cache.is_being_compiled():
         return False
     dispatcher.compile(tuple(map(decode_type, arguments)))

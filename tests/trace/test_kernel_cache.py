@@ -22,6 +22,7 @@ from octasplat.engine.operations.precompile import (
     request_groups,
 )
 from octasplat.engine.operations.registry import operation
+from octasplat.engine.trace.kernels.native import NativeCallback
 from octasplat.workers.reporting.event_lines import ProgressState
 from octasplat.workers.reporting.events import decode_event
 from octasplat.workers.reporting.time_left import TimeLeftEstimator
@@ -172,7 +173,8 @@ def test_each_kernel_of_the_table_is_one() -> None:
     assert len(found) > 40
     for kernel in found:
         dispatcher = getattr(importlib.import_module(kernel.module), kernel.function)
-        assert dispatcher.py_func.__name__ == kernel.function
+        function = dispatcher.function if isinstance(dispatcher, NativeCallback) else dispatcher.py_func
+        assert function.__name__ == kernel.function
         assert [encode_type(decode_type(one)) for one in kernel.arguments] == list(kernel.arguments)
     assert not missing_kernels(["no such command"])
 

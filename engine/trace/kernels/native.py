@@ -51,9 +51,13 @@ class NativeCallback:
         self._signature = signature
         self._options = options
 
+    def compile(self) -> Any:
+        """Return the compiled function; its code is kept on the disk."""
+        return cfunc(self._signature, cache=True, **self._options)(self.function)
+
     @cached_property
     def _compiled(self) -> Any:
-        return cfunc(self._signature, cache=True, **self._options)(self.function)
+        return self.compile()
 
     @property
     def address(self) -> Address:
