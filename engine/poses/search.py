@@ -124,7 +124,7 @@ class PoseSearch:
         matched = self._match(database, thorough)
         count = len(self._names)
         # Mapping adds and removes matches: a search that is stopped in it goes on from what was matched.
-        database = Path(shutil.copy(database, self._work / "mapping.db"))
+        database = Path(shutil.copyfile(database, self._work / "mapping.db"))
         with progress_stage(MAPPING_STAGE, count, self._progress) as at:
             best = self._disambiguate(
                 database,

@@ -3,6 +3,8 @@
 import json
 import shutil
 import signal
+import subprocess
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,6 +27,19 @@ pytestmark = pytest.mark.heavy
 
 COUNT = 16
 """The whole ring: without its end there would be nothing to hold the focal length."""
+
+
+CONFINED = """
+import os, sys
+from pathlib import Path
+from octasplat.engine.poses.find_poses import find_poses
+from octasplat.workers.sandbox.confinement import confine
+
+photographs, output = Path(sys.argv[1]), Path(sys.argv[2])
+os.environ["TMPDIR"] = str(output)
+confine(writable=[output], may_start_processes=True)
+find_poses(photographs, output / "poses", threads=2)
+"""
 
 
 @dataclass(frozen=True)
@@ -83,6 +98,17 @@ def test_poses_are_those_of_the_cameras(taken: Photographs, tmp_path: Path) -> N
     events.clear()
     find_poses(taken.folder, model, progress=events.append)
     assert events == []
+
+
+def test_poses_are_found_by_a_confined_job(taken: Photographs, tmp_path: Path) -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", CONFINED, taken.folder, tmp_path],
+        stderr=subprocess.PIPE,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    assert len(centres(tmp_path / "poses")) >= 0.8 * COUNT
 
 
 def test_find_poses_without_features_is_refused(tmp_path: Path) -> None:
