@@ -8,6 +8,8 @@ import contextlib
 import logging
 import socket
 import sys
+from collections.abc import Callable
+from functools import partial
 
 import uvicorn
 from fastapi import FastAPI
@@ -44,14 +46,16 @@ class _FrontEndServer(uvicorn.Server):
         super().__init__(config)
         self._connections = config.connections
         self.address = ""
+        self.on_start: Callable[[], None] = _do_nothing
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
-        """Start the server and print its address."""
+        """Start the server, call ``on_start`` and print the address."""
         asyncio.get_running_loop().set_exception_handler(log_loop_error)
         await super().startup(sockets)
         for listener in sockets or ():
             listener.listen(_LISTEN_BACKLOG)
         if self.started:
+            self.on_start()
             sys.stdout.write(f"{self.address}\n")
             sys.stdout.flush()
 
@@ -80,8 +84,6 @@ def main() -> int:
     is_alone = not die_with_local_service()
     try:
         settings = load_settings(ServiceSettings)
-        if is_alone:
-            log_missing_capabilities(settings.job_uids)
         app = create_app(settings)
         family = socket.AF_INET6 if ":" in settings.host else socket.AF_INET
         # With the protocol named, asyncio turns Nagle's algorithm off; answers would take 40 ms more.
@@ -113,6 +115,8 @@ def main() -> int:
         log.setLevel(logging.WARNING)
         log.addFilter(RepeatedMessages())
         log.addFilter(lambda _record: _startup_error(app) is None)
+        if is_alone:
+            server.on_start = partial(log_missing_capabilities, settings.job_uids)
         with contextlib.suppress(SystemExit):
             asyncio.run(server.serve(sockets=[listener]))
         if (failure := _startup_error(app)) is not None:
@@ -121,6 +125,10 @@ def main() -> int:
         sys.stderr.write(f"Error: {error}\n")
         return 1
     return 0 if server.started else 1
+
+
+def _do_nothing() -> None:
+    pass
 
 
 def _startup_error(app: FastAPI) -> OctasplatError | None:

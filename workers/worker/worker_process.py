@@ -105,8 +105,7 @@ async def run_worker(settings: WorkerSettings, queues: Mapping[str, int], *, nam
         StorageError: the store cannot be used.
     """
     forbid_memory_access()
-    if not die_with_local_service():
-        log_missing_capabilities(settings.job_uids)
+    is_alone = not die_with_local_service()
     settings.checked()
     slots = sum(queues.values())
     if settings.job_uids is not None:
@@ -117,6 +116,8 @@ async def run_worker(settings: WorkerSettings, queues: Mapping[str, int], *, nam
     await asyncio.to_thread(wait_for_tables, conninfo)
     floor_bytes = settings.floor_bytes // 4  # the rest of it is for what jobs under way have to store
     storage = await asyncio.to_thread(lambda: open_storage(settings.storage_address, floor_bytes=floor_bytes))
+    if is_alone:
+        log_missing_capabilities(settings.job_uids)
     name = name or f"{socket.gethostname()}-{os.getpid()}"
     room = DiskSpace(
         storage, settings.work_folder, settings.floor_bytes,
