@@ -5,7 +5,6 @@ beginning with the one that has waited longest. So those who open many and send 
 """
 
 import asyncio
-import ipaddress
 import logging
 import time
 from collections import defaultdict
@@ -16,6 +15,7 @@ import uvicorn
 from uvicorn.protocols.http.h11_impl import H11Protocol
 from uvicorn.server import ServerState
 
+from octasplat.service.client_addresses import client_group, parse_client_address
 from octasplat.service.connection_limits import MIN_BODY_BYTES, ConnectionLimits
 from octasplat.workers.logs import RepeatedMessages
 
@@ -27,7 +27,7 @@ _ACCEPT_FAILED = "socket.accept() out of system resource"
 
 
 class ConnectionTable:
-    """The open connections, by address.
+    """The open connections, by client.
 
     Args:
         limits: of them.
@@ -35,45 +35,42 @@ class ConnectionTable:
 
     def __init__(self, limits: ConnectionLimits) -> None:
         self._limits = limits
-        self._by_address: defaultdict[str, dict[LimitedProtocol, None]] = defaultdict(dict)
+        self._by_client: defaultdict[str, dict[LimitedProtocol, None]] = defaultdict(dict)
         self._count = 0
 
     def add(self, connection: "LimitedProtocol") -> bool:
         """Add a connection, closing another where there are too many; False if there is no place for it."""
-        of_address = self._by_address[connection.address]
-        if len(of_address) >= self._limits.max_per_address and not self._is_proxy(connection.address):
-            if not _close_longest_waiting(of_address):
+        of_client = self._by_client[client_group(connection.address)]
+        if len(of_client) >= self._limits.max_per_address and not self._is_proxy(connection.address):
+            if not _close_longest_waiting(of_client):
                 return False
         elif self._count >= self._limits.max_connections:
             # Whoever has most of them loses one.
-            ranked = sorted(self._by_address.values(), key=len, reverse=True)
+            ranked = sorted(self._by_client.values(), key=len, reverse=True)
             if not any(_close_longest_waiting(group) for group in ranked):
                 return False
-        of_address[connection] = None
+        of_client[connection] = None
         self._count += 1
         return True
 
     def discard(self, connection: "LimitedProtocol") -> None:
         """Remove a connection that is closed, or was not added."""
-        of_address = self._by_address[connection.address]
-        if connection in of_address:
-            del of_address[connection]
+        of_client = self._by_client[client_group(connection.address)]
+        if connection in of_client:
+            del of_client[connection]
             self._count -= 1
-        if not of_address:
-            del self._by_address[connection.address]
+        if not of_client:
+            del self._by_client[client_group(connection.address)]
 
     def close_overdue(self) -> None:
         """Close the connections that have kept the front end waiting for too long."""
-        for group in list(self._by_address.values()):
+        for group in list(self._by_client.values()):
             for connection in list(group):
                 connection.close_if_overdue(self._limits)
 
     def _is_proxy(self, address: str) -> bool:
-        try:
-            parsed = ipaddress.ip_address(address)
-        except ValueError:
-            return False
-        return any(parsed in network for network in self._limits.proxies)
+        parsed = parse_client_address(address)
+        return parsed is not None and any(parsed in network for network in self._limits.proxies)
 
 
 class LimitedConfig(uvicorn.Config):

@@ -4,10 +4,11 @@ Valid tokens are not throttled: they are random enough that looking each one up 
 """
 
 import asyncio
-import ipaddress
 import time
 from collections import OrderedDict
 from dataclasses import dataclass
+
+from octasplat.service.client_addresses import client_group
 
 MAX_DELAY_SECONDS = 10.0
 RESET_SECONDS = 600.0
@@ -53,7 +54,7 @@ class LoginThrottle:
         return is_first
 
     def _attempts_of_client(self, address: str) -> _ClientAttempts:
-        group = _client_key(address)
+        group = client_group(address)
         client = self._clients.pop(group, None)
         if client is None or (not client.waiting and time.monotonic() - client.last > RESET_SECONDS):
             client = _ClientAttempts()
@@ -61,12 +62,3 @@ class LoginThrottle:
         if len(self._clients) > _MAX_ADDRESSES:
             self._clients.popitem(last=False)
         return client
-
-
-def _client_key(address: str) -> str:
-    """Return the part of an address that one client owns: an IPv4 address, or 64 bits of IPv6."""
-    try:
-        parsed = ipaddress.ip_address(address)
-    except ValueError:
-        return address
-    return str(ipaddress.ip_network((parsed, 64), strict=False)) if parsed.version == 6 else str(parsed)

@@ -8,6 +8,8 @@ from typing import Literal
 from starlette.datastructures import Headers
 from starlette.types import ASGIApp, Receive, Scope, Send
 
+from octasplat.service.client_addresses import parse_client_address
+
 Network = ipaddress.IPv4Network | ipaddress.IPv6Network
 HeaderStyle = Literal["x-forwarded", "forwarded"]
 _PAIR = re.compile(r'\s*([A-Za-z]+)\s*=\s*("[^"]*"|[^\s";,]*)\s*')
@@ -56,13 +58,8 @@ class ProxyHeadersMiddleware:
                 return
 
     def _is_trusted_address(self, text: str) -> bool:
-        try:
-            address = ipaddress.ip_address(text)
-        except ValueError:
-            return False
-        if isinstance(address, ipaddress.IPv6Address) and address.ipv4_mapped is not None:
-            address = address.ipv4_mapped
-        return any(address in network for network in self._proxies)
+        address = parse_client_address(text)
+        return address is not None and any(address in network for network in self._proxies)
 
 
 def _parse_x_forwarded(headers: Headers) -> list[dict[str, str]]:

@@ -98,6 +98,7 @@ def main() -> int:
         config = LimitedConfig(
             app,
             http=LimitedProtocol,
+            ws="none",  # nothing here speaks it, and its connections would be counted for ever
             backlog=ACCEPT_BACKLOG,
             log_config=None,
             access_log=False,

@@ -1,5 +1,6 @@
 """Files of datasets that the service fetches from elsewhere, under the rules of webhooks' addresses."""
 
+import asyncio
 import uuid
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
@@ -19,6 +20,8 @@ from octasplat.workers.maintenance.webhooks.guarded_transport import OWNER_EXTEN
 from octasplat.workers.maintenance.webhooks.sender import guarded_client
 
 MAX_REDIRECTS = 5
+HEADER_SECONDS = 30.0
+"""For an address to begin its answer."""
 
 
 async def import_files(
@@ -63,7 +66,9 @@ async def _opened(service: Service, principal: Principal, url: str) -> AsyncIter
                     headers={"Accept-Encoding": "identity"},
                     extensions={OWNER_EXTENSION: principal.owner},
                 )
-                answer = await client.send(request, stream=True)
+                # Each read has a limit of its own, which headers that trickle never reach.
+                async with asyncio.timeout(HEADER_SECONDS):
+                    answer = await client.send(request, stream=True)
             except AddressRefusedError as error:
                 raise _import_error(str(error), "import-address") from None
             except (httpx.HTTPError, httpx.InvalidURL, OSError, ValueError) as error:

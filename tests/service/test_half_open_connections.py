@@ -138,3 +138,26 @@ def test_invalid_requests_are_logged_once(start_front_end: StartFrontEnd) -> Non
                 connection.sendall(b"no request\r\n\r\n")
                 assert connection.recv(1000).startswith(b"HTTP/1.1 400 ")
         assert front_end.log.read_text().count("Invalid HTTP request") == 1
+
+
+def test_upgraded_connections_are_counted_no_longer_than_they_last(start_front_end: StartFrontEnd) -> None:
+    upgrade = b"GET /healthz HTTP/1.1\r\nHost: localhost\r\nConnection: Upgrade\r\nUpgrade: websocket\r\n"
+    upgrade += b"Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: MDEyMzQ1Njc4OWFiY2RlZg==\r\n\r\n"
+    with start_front_end(MAX_CONNECTIONS_PER_ADDRESS="3") as front_end:
+        for _ in range(5):
+            with front_end.connect() as connection:
+                connection.sendall(upgrade)
+                assert connection.recv(1000).startswith(b"HTTP/1.1 200 ")
+        assert front_end.healthz_seconds() < 5
+
+
+def test_proxy_at_socket_of_both_protocols_may_have_all(start_front_end: StartFrontEnd) -> None:
+    limits = {"HOST": "::", "PROXIES": "127.0.0.1", "MAX_CONNECTIONS_PER_ADDRESS": "3"}
+    with start_front_end(**limits) as there, contextlib.ExitStack() as opened:
+        proxied = FrontEnd(("127.0.0.1", there.address[1]), there.log)
+        for _ in range(3):
+            opened.enter_context(proxied.connect()).sendall(
+                b"POST /v1/estimates HTTP/1.1\r\nHost: localhost\r\nContent-Length: 10\r\n\r\n{"
+            )
+        time.sleep(1)
+        assert proxied.healthz_seconds() < 5

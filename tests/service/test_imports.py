@@ -1,7 +1,10 @@
 """Scenes that the service fetches from an address, and addresses that it must not ask."""
 
+import asyncio
+import contextlib
 import hashlib
 import threading
+import time
 from collections.abc import Iterator
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
@@ -25,6 +28,12 @@ class Elsewhere(BaseHTTPRequestHandler):
             self.send_header("Location", kind.removeprefix("to="))
             self.end_headers()
             return
+        if kind == "trickle":
+            with contextlib.suppress(OSError):
+                self.wfile.write(b"HTTP/1.1 200 OK\r\nX-Slow: ")
+                while True:
+                    self.wfile.write(b"x")
+                    time.sleep(0.1)
         self.send_response(200 if kind in ("scene.zip", "a.png", "cut.zip") else 404)
         content = next(iter(photographs().values())) if kind == "a.png" else ARCHIVE
         self.send_header("Content-Length", str(len(content)))
@@ -97,3 +106,16 @@ async def test_inner_addresses_are_not_asked(connect_service: ConnectService, ur
         made = (await http.post("/v1/datasets", json={"name": "a"})).json()
         answer = await http.post(f"/v1/datasets/{made['id']}/import", json={"url": url})
         assert (answer.status_code, answer.json()["type"]) == (422, "urn:octasplat:problem:import-address")
+
+
+async def test_headers_that_trickle_are_not_waited_for(
+    connect_service: ConnectService, elsewhere: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("octasplat.service.actions.imports.HEADER_SECONDS", 0.5)
+    async with connect_service(webhook_hosts=HERE) as (http, _service):
+        made = (await http.post("/v1/datasets", json={"name": "a"})).json()
+        async with asyncio.timeout(20):
+            answer = await http.post(
+                f"/v1/datasets/{made['id']}/import", json={"url": f"{elsewhere}/trickle"}
+            )
+        assert (answer.status_code, answer.json()["type"]) == (422, "urn:octasplat:problem:import")

@@ -7,6 +7,7 @@ from typing import Any
 from psycopg.rows import class_row
 
 from octasplat.workers.db.connections import Connection, Pool, select_columns
+from octasplat.workers.db.locks import lock_owner
 from octasplat.workers.db.rows import TERMINAL, Job
 from octasplat.workers.queue.job_endings import end_job
 from octasplat.workers.queue.jobs import get_job
@@ -101,6 +102,9 @@ async def fail_before_start(
 ) -> bool:
     """Fail a job whose entry is being delivered, before an attempt; False if it has continued meanwhile."""
     async with connection.transaction():
+        job = await get_job(connection, job_id)
+        if job is not None and drop_checkpoint:
+            await lock_owner(connection, job.owner)  # whose bytes get fewer
         job = await get_job(connection, job_id, lock=True)
         if job is None or job.state != "queued" or job.slip != entry_id:
             return False

@@ -57,8 +57,10 @@ class Admission:
                 logger.warning("worker %s takes no jobs: %s", self._name, lacking)
             self.shortage = lacking
             await self._free_space()
-            if time.monotonic() > deadline or self._context.draining.is_set():
-                if not await self._fail_if_crowding(job_id, entry_id):
+            # A worker that stops has not waited, so that it cannot know whether there will be room.
+            is_late = time.monotonic() > deadline
+            if is_late or self._context.draining.is_set():
+                if not (is_late and await self._fail_if_crowding(job_id, entry_id)):
                     await defer_job(self._pool, self._context.job_queue, job_id, entry_id, reason=lacking)
                 return False
             await asyncio.sleep(self._context.settings.poll_seconds)
@@ -68,10 +70,13 @@ class Admission:
         return await self._has_space_for(job_id, entry_id)
 
     async def _fail_if_crowding(self, job_id: uuid.UUID, entry_id: int) -> bool:
-        """Fail a job whose own checkpoint takes the room for lack of which no job begins; return whether."""
+        """Fail a render whose own images take the room for lack of which no job begins; return whether.
+
+        Checkpoints of other jobs do not grow with their work: they wait until there is room again.
+        """
         async with self._pool.connection() as connection:
             job = await get_job(connection, job_id)
-        kept = 0 if job is None else _checkpoint_bytes(job)
+        kept = _checkpoint_bytes(job) if job is not None and removes_stored_frames(job) else 0
         if not kept or await self._context.space_shortage(SpaceUsage(0, kept)) is not None:
             return False
         message = (
