@@ -66,6 +66,18 @@ class NonsenseEvent(Event):
         return {"kind": self.kind}
 
 
+class DeepClaim(Event):
+    """Says something in so many brackets as one can just write."""
+
+    kind = "preview_written"
+
+    def as_dict(self) -> dict[str, object]:
+        path: list[object] = []
+        for _ in range(900):
+            path = [path]
+        return {"kind": self.kind, "path": path, "step": 1, "view": "a"}
+
+
 def run(task: Task) -> None:
     options = HostileOptions.model_validate(task.options)
     task.progress(PhaseStarted("train", 1))
@@ -232,6 +244,19 @@ def _write_elsewhere(task: Task, options: HostileOptions) -> None:
     )
 
 
+def _dig(task: Task, options: HostileOptions) -> None:
+    """Make folders in each other, deeper than a stack is, and tell something as deep."""
+    task.progress(DeepClaim())
+    folder = os.open(task.folder, os.O_RDONLY)
+    for _ in range(1500):
+        os.mkdir("d", dir_fd=folder)
+        outer, folder = folder, os.open("d", os.O_RDONLY, dir_fd=folder)
+        os.close(outer)
+    while options.lasts and not task.should_stop():
+        time.sleep(0.05)
+    _tell(task, {})
+
+
 ATTACKS: Mapping[str, Callable[[Task, HostileOptions], None]] = {
     "link run": _link_run,
     "link results": _link_results,
@@ -241,6 +266,7 @@ ATTACKS: Mapping[str, Callable[[Task, HostileOptions], None]] = {
     "shared memory": _hog_shared_memory,
     "user": _tell_user,
     "write elsewhere": _write_elsewhere,
+    "dig": _dig,
 }
 
 register(

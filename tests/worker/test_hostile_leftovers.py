@@ -1,5 +1,6 @@
 """Nothing that a job has started or holds outlives it, whatever it has done to be forgotten."""
 
+import inspect
 import json
 import subprocess
 import sys
@@ -13,7 +14,7 @@ import pytest
 
 from octasplat.workers.sandbox.capabilities import sandbox_capabilities
 from octasplat.workers.sandbox.linux import IS_LINUX
-from octasplat.workers.sandbox.process_tree import tree_memory_bytes
+from octasplat.workers.sandbox.process_tree import kill_descendants, tree_memory_bytes
 from tests.support.worker_harness import WorkerHarness
 
 pytestmark = pytest.mark.skipif(not IS_LINUX, reason="processes without parents are found on Linux only")
@@ -99,3 +100,45 @@ def test_shared_memory_counts() -> None:
         process.stdout.readline()
         assert tree_memory_bytes(process.pid) >= 64 << 20
         process.communicate(b"")
+
+
+@pytest.mark.parametrize("lasts", [False, True])
+def test_folders_too_deep_end_the_job_and_not_its_worker(bench: WorkerHarness, lasts: bool) -> None:
+    start_worker(bench)
+    job_id = bench.submit("hostile", options={"attack": "dig", "lasts": lasts})
+    job = bench.wait_until_finished(job_id, 60)
+    if lasts:
+        assert job.state == "failed" and job.error is not None and job.error["type"] == "not_a_file"
+    later = bench.submit("hostile", options={"attack": "daemon"})
+    assert bench.wait_until_finished(later, 60).state == "succeeded"
+    wait_for(lambda: not list(bench.folder.glob("work-*/attempts/*")))
+
+
+CHAIN = """
+import os, sys, time
+if os.fork() == 0:
+    # Each is the only child of the one before it.
+    for _ in range(int(sys.argv[1])):
+        if os.fork():
+            time.sleep(120)
+            os._exit(0)
+    os.write(1, b"x")
+    time.sleep(120)
+    os._exit(0)
+os.read(0, 1)
+"""
+
+
+def test_chains_of_processes_longer_than_the_stack_are_killed() -> None:
+    with subprocess.Popen(
+        [sys.executable, "-I", "-S", "-c", CHAIN, "60"], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+    ) as first:
+        assert first.stdout is not None and first.stdout.read(1) == b"x"
+        limit = sys.getrecursionlimit()
+        frames = len(inspect.stack())
+        try:
+            sys.setrecursionlimit(frames + 50)
+            seen = kill_descendants(first.pid)
+        finally:
+            sys.setrecursionlimit(limit)
+        assert seen == 61 and first.poll() is None

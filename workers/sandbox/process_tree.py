@@ -44,7 +44,7 @@ def _tree(pid: int) -> list[psutil.Process]:
     try:
         first = psutil.Process(pid)
         return [first, *first.children(recursive=True)]
-    except psutil.Error:
+    except (psutil.Error, OSError):
         return []
 
 
@@ -60,19 +60,34 @@ def _memory_bytes(process: psutil.Process) -> int:
 
 
 def _descendants(pid: int) -> Iterator[int]:
-    """Yield the ids of descendants while they are looked for, as some may be gone a moment later."""
-    children = Path(f"/proc/{pid}/task/{pid}/children")
-    if not children.exists():  # not Linux, or a kernel without such files
-        with contextlib.suppress(psutil.Error):
+    """Yield the ids of descendants while they are looked for, as some may be gone a moment later.
+
+    Those of each come before it. They may be a chain that is longer than the interpreter's stack.
+    """
+    # Asked of this process, as others may be hidden; there is none on other systems and some kernels.
+    if not Path(f"/proc/self/task/{os.getpid()}/children").exists():
+        with contextlib.suppress(psutil.Error, OSError):
             yield from (process.pid for process in psutil.Process(pid).children(recursive=True))
         return
+    path = [(pid, iter(_children(pid)))]
+    while path:
+        parent, rest = path[-1]
+        child = next(rest, None)
+        if child is not None:
+            path.append((child, iter(_children(child))))
+            continue
+        path.pop()
+        if path:
+            yield parent
+
+
+def _children(pid: int) -> list[int]:
+    """Return the ids of a process's children; none where it is hidden, or gone."""
     found: list[int] = []
     for thread in _threads(pid):
         with contextlib.suppress(OSError):
             found += map(int, Path(f"/proc/{pid}/task/{thread}/children").read_text(encoding="ascii").split())
-    for child in found:
-        yield from _descendants(child)
-        yield child
+    return found
 
 
 def _threads(pid: int) -> list[str]:

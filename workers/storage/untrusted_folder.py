@@ -12,7 +12,7 @@ import stat
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import suppress
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from types import TracebackType
 from typing import BinaryIO, Self
 
@@ -24,6 +24,8 @@ _FILE_FLAGS = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
 """A pipe would otherwise keep the reader waiting for somebody who writes."""
 _NOT_A_FILE = frozenset({errno.ELOOP, errno.ENOTDIR, errno.EMLINK, errno.ENXIO, errno.EISDIR})
 """Answers for links (EMLINK on some BSDs), sockets, and files in the place of folders."""
+MAX_DEPTH = 64
+"""Of folders in each other: each takes a descriptor of its reader and a part of its stack."""
 
 
 class UntrustedFolder:
@@ -105,7 +107,7 @@ class UntrustedFolder:
             below: the folder, relative to this one; where there is none of that name, there are no files.
 
         Raises:
-            UntrustedFileError: the name is that of a link or a file.
+            UntrustedFileError: the name is that of a link or a file, or a folder below it cannot be read.
         """
         try:
             fd = self._open_beneath(below, _FOLDER_FLAGS) if below else os.dup(self._fd)
@@ -114,9 +116,9 @@ class UntrustedFolder:
         except OSError as error:
             raise _refusal(self.path / below, "a folder") from error
         try:
-            for folder, folders, files, folder_fd in os.fwalk(".", dir_fd=fd, follow_symlinks=False):
-                linked = (name for name in folders if not _is_folder(name, folder_fd))
-                yield from ((PurePosixPath(folder) / name).as_posix() for name in (*files, *linked))
+            for folder, files, _ in self._walk(fd, below):
+                inner = folder.removeprefix(below).removeprefix("/")
+                yield from (f"{inner}/{name}" if inner else name for name in files)
         finally:
             os.close(fd)
 
@@ -125,16 +127,52 @@ class UntrustedFolder:
 
         Args:
             leave_out: name of a folder directly below that does not count.
+
+        Raises:
+            UntrustedFileError: a folder cannot be read, so that what is in it is not known.
         """
         blocks: dict[int, int] = {}
-        for folder, folders, files, fd in os.fwalk(".", dir_fd=self._fd, follow_symlinks=False):
-            if folder == "." and leave_out in folders:
-                folders.remove(leave_out)
+        for _, files, fd in self._walk(self._fd, leave_out=leave_out):
             for name in files:
                 with suppress(FileNotFoundError):
                     facts = os.stat(name, dir_fd=fd, follow_symlinks=False)
                     blocks[facts.st_ino] = facts.st_blocks
         return 512 * sum(blocks.values())
+
+    def _walk(
+        self, fd: int, below: str = "", depth: int = 0, leave_out: str = ""
+    ) -> Iterator[tuple[str, list[str], int]]:
+        """Yield each folder: its name relative to this one, the names in it that are no folders, and itself.
+
+        Raises:
+            UntrustedFileError: a folder cannot be read, or lies too deep.
+            StorageUnavailableError: the system cannot do it.
+        """
+        folders: list[str] = []
+        files: list[str] = []
+        with translate_os_errors(self.path / below), os.scandir(fd) as entries:
+            for entry in entries:
+                (folders if entry.is_dir(follow_symlinks=False) else files).append(entry.name)
+        yield below, files, fd
+        for name in folders:
+            inner = f"{below}/{name}" if below else name
+            if inner == leave_out:
+                continue
+            if depth == MAX_DEPTH:
+                raise _refusal(self.path / inner, f"among the first {MAX_DEPTH} folders in each other")
+            with translate_os_errors(self.path / inner):
+                try:
+                    inner_fd = os.open(name, _FOLDER_FLAGS, dir_fd=fd)
+                except PermissionError as error:
+                    raise _refusal(self.path / inner, "a folder that can be read") from error
+                except OSError as error:
+                    if error.errno in (errno.ENOENT, *_NOT_A_FILE):
+                        continue  # gone or replaced this moment
+                    raise
+            try:
+                yield from self._walk(inner_fd, inner, depth + 1, leave_out)
+            finally:
+                os.close(inner_fd)
 
     def _open_beneath(self, name: str, flags: int) -> int:
         """Open what is called ``name``, part by part.
@@ -165,20 +203,12 @@ class UntrustedFolder:
 
     def _count_names(self) -> Counter[tuple[int, int]]:
         found: Counter[tuple[int, int]] = Counter()
-        for _, _, files, fd in os.fwalk(".", dir_fd=self._fd, follow_symlinks=False):
+        for _, files, fd in self._walk(self._fd):
             for name in files:
                 with suppress(FileNotFoundError):
                     facts = os.stat(name, dir_fd=fd, follow_symlinks=False)
                     found[facts.st_dev, facts.st_ino] += 1
         return found
-
-
-def _is_folder(name: str, parent_fd: int) -> bool:
-    """Return whether a name is that of a folder, and not of a link to one."""
-    try:
-        return stat.S_ISDIR(os.stat(name, dir_fd=parent_fd, follow_symlinks=False).st_mode)
-    except FileNotFoundError:
-        return True  # it is gone, and nothing that could be stored
 
 
 def _refusal(path: Path, what: str = "a regular file of its folder alone") -> UntrustedFileError:

@@ -171,7 +171,7 @@ class ChildProcess:
     def _on_stdout_line(self, line: str) -> None:
         try:
             event = json.loads(line)
-        except ValueError:
+        except (ValueError, RecursionError):
             return
         if not isinstance(event, dict) or not isinstance(event.get("kind"), str):
             return
@@ -181,7 +181,7 @@ class ChildProcess:
             self.error = {"type": str(event.get("type")), "message": str(event.get("message"))}
         try:
             self._on_event(event)
-        except (KeyError, TypeError, ValueError, AttributeError) as error:
+        except (KeyError, TypeError, ValueError, AttributeError, RecursionError) as error:
             # Of a program that writes what it likes; what follows is still read.
             logger.info("an event of process %d was left out: %r", self.pid, error)
 

@@ -57,7 +57,8 @@ class StoredFrames:
                 with folder.open(_RECORDS[0]) as handle:
                     rows = [json.loads(line) for line in handle.read(_MAX_LIST_BYTES).splitlines()]
                 digests = {_FRAMES + str(row["file"]): row["sha256"] for row in rows[1:]}
-            except (StorageError, ValueError, KeyError, TypeError):  # none yet, or it is being written
+            except (StorageError, ValueError, KeyError, TypeError, RecursionError):
+                # There are none yet, or they are being written.
                 return []
             there = {name for name in (_RECORDS[0], *digests) if folder.is_file(name)}
         # A series that was begun anew has other frames of the same names.
@@ -135,6 +136,6 @@ def _read_moved_results(folder: Path) -> Mapping[str, str]:
     try:
         with UntrustedFolder(folder) as source, source.open(MOVED_RESULTS_FILE) as handle:
             names = json.loads(handle.read(_MAX_LIST_BYTES))
-    except (StorageError, ValueError):
+    except (StorageError, ValueError, RecursionError):
         return {}
     return names if isinstance(names, dict) else {}

@@ -28,7 +28,9 @@ from octasplat.workers.storage.errors import (
     DigestMismatchError,
     StorageError,
     StorageFullError,
+    UntrustedFileError,
 )
+from octasplat.workers.storage.untrusted_folder import MAX_DEPTH
 from octasplat.workers.worker.child_process import ChildProcess
 from octasplat.workers.worker.context import DatabaseLostError, WorkerContext
 from octasplat.workers.worker.heartbeat import DATABASE_ERRORS, Heartbeat
@@ -62,6 +64,7 @@ class StopReason(Enum):
     PROCESS_LIMIT = "it started more processes than allowed"
     DISK_LIMIT = "its folder took more than allowed"
     DISK_RESERVE = "it took room that is reserved"
+    HIDDEN_FILES = "its folder could not be measured"
 
 
 class Supervisor:
@@ -262,6 +265,11 @@ class Supervisor:
             taken, most = self._workspace.peak_used_bytes(), self._settings.max_workspace_bytes
             message = f"The job's folder took {taken} bytes, and {most} are allowed; ask for fewer images."
             await self._outcomes.fail({"type": "disk_limit", "message": message})
+        elif reason is StopReason.HIDDEN_FILES:
+            message = (
+                f"The job's folder holds folders that cannot be read, or more than {MAX_DEPTH} in each other."
+            )
+            await self._outcomes.fail({"type": UntrustedFileError.error_type, "message": message})
         elif reason is StopReason.DISK_RESERVE:
             taken = self._workspace.peak_used_bytes()
             message = f"The job was stopped with {taken} bytes in its folder, as its disk was full."
@@ -351,7 +359,12 @@ class Supervisor:
     async def _watch_disk(self) -> None:
         """Stop a child that fills the disk; of several the one that used most."""
         around, loop = self._context, asyncio.get_running_loop()
-        taken = await loop.run_in_executor(_WATCH_POOL, self._workspace.used_bytes)
+        try:
+            taken = await loop.run_in_executor(_WATCH_POOL, self._workspace.used_bytes)
+        except UntrustedFileError as error:
+            logger.info("job %s hides what it stores: %s", self._job.id, error)
+            self._stop(StopReason.HIDDEN_FILES)
+            return
         around.taken_bytes[self._job.id] = taken
         if 0 < self._settings.max_workspace_bytes < taken:
             self._stop(StopReason.DISK_LIMIT)

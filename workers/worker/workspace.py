@@ -19,7 +19,8 @@ from octasplat.engine.core import versions
 from octasplat.workers.db.rows import Artifact, DatasetFile, Job
 from octasplat.workers.queue.attempts import ResultFile
 from octasplat.workers.sandbox.job_users import JobUser, give_folder, open_for_reading, take_user
-from octasplat.workers.storage.errors import StorageError
+from octasplat.workers.storage.errors import StorageError, UntrustedFileError
+from octasplat.workers.storage.folder_removal import remove_folder
 from octasplat.workers.storage.os_errors import translate_os_errors
 from octasplat.workers.storage.protocol import Storage
 from octasplat.workers.storage.trees import (
@@ -127,7 +128,7 @@ class Workspace:
             StorageError: it cannot be made.
         """
         with translate_os_errors(self._root):
-            shutil.rmtree(self.folder, ignore_errors=True)
+            remove_folder(self.folder)
             self.folder.mkdir(parents=True, mode=0o700)
             self._lock = _open_locked(self.folder / _LOCK_FILE)
 
@@ -147,7 +148,7 @@ class Workspace:
 
     def close(self) -> None:
         """Remove the folder and release its locks."""
-        shutil.rmtree(self.folder, ignore_errors=True)
+        remove_folder(self.folder)
         if self._user is not None:
             self._user.close()
             self._user = None
@@ -159,10 +160,16 @@ class Workspace:
             self._dataset_lock = None
 
     def used_bytes(self) -> int:
-        """Return the disk usage of the folder, without files shared with the storage."""
+        """Return the disk usage of the folder, without files shared with the storage.
+
+        Raises:
+            UntrustedFileError: the program keeps it from being measured.
+        """
         try:
             with UntrustedFolder(self.folder) as folder:
                 taken = folder.disk_usage_bytes(leave_out=FILES_FOLDER)
+        except UntrustedFileError:
+            raise
         except StorageError:  # it is gone
             taken = 0
         self._peak_used_bytes = max(taken, self._peak_used_bytes)
@@ -170,7 +177,8 @@ class Workspace:
 
     def peak_used_bytes(self) -> int:
         """Return the largest disk usage that was measured."""
-        self.used_bytes()
+        with contextlib.suppress(UntrustedFileError):
+            self.used_bytes()
         return self._peak_used_bytes
 
     def fetch_dataset(self, dataset_id: uuid.UUID, files: Sequence[DatasetFile], name: str) -> Path:
@@ -219,7 +227,7 @@ class Workspace:
 
     def discard_run(self) -> None:
         """Discard what was restored."""
-        shutil.rmtree(self.folder / RUN_FOLDER, ignore_errors=True)
+        remove_folder(self.folder / RUN_FOLDER)
         self.stored_frames = StoredFrames(self.folder, are_removed=removes_stored_frames(self._job))
 
     def store_checkpoint(self, stage: str, step: int) -> Checkpoint | None:
@@ -272,7 +280,7 @@ class Workspace:
             if result.name == METRICS_FILE and result.size_bytes <= MAX_METRICS_BYTES:
                 try:
                     mean = json.loads(b"".join(self.storage.read(result.sha256)))["mean"]["psnr"]
-                except (StorageError, ValueError, TypeError, KeyError):
+                except (StorageError, ValueError, TypeError, KeyError, RecursionError):
                     return None
                 return float(mean) if isinstance(mean, int | float) and math.isfinite(mean) else None
         return None
@@ -336,10 +344,10 @@ def sweep_workspaces(root: Path, dataset_seconds: float = 86_400.0) -> int:
         except OSError:
             if time.time() - folder.stat().st_mtime < 60:
                 continue  # being made right now
-            shutil.rmtree(folder, ignore_errors=True)
+            remove_folder(folder)
         else:
             with lock:
-                shutil.rmtree(folder, ignore_errors=True)
+                remove_folder(folder)
         removed += 1
     for folder in (root / "datasets").glob("*"):
         with contextlib.suppress(OSError):  # in use, or gone already
@@ -347,7 +355,7 @@ def sweep_workspaces(root: Path, dataset_seconds: float = 86_400.0) -> int:
                 continue
             with (folder / _LOCK_FILE).open("ab") as lock:
                 fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                shutil.rmtree(folder, ignore_errors=True)
+                remove_folder(folder)
             removed += 1
     return removed
 
