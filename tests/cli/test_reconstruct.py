@@ -124,7 +124,7 @@ def test_signal_writes_checkpoint_and_resume_completes(
     _, stderr = process.communicate(timeout=60)
     assert process.returncode == code, stderr
     assert re.fullmatch(r"Estimate: .*\nStopped after iteration \d+ of 600; .*--resume.*\n", stderr)
-    stopped_at = int(stderr.split()[3])
+    stopped_at = int(stderr.splitlines()[-1].split()[3])
     assert (output / "checkpoints" / f"iteration_{stopped_at:07d}.npz").exists()
     assert not (output / "scene.ply").exists()
 
