@@ -23,6 +23,6 @@ def test_jobs_survive_random_faults(short_root: Path, tmp_path: Path) -> None:
         numbers = report(those)
     finally:
         machine.stop()
-    assert len(numbers["blows"]) == len(UPHEAVALS) == 4 and numbers["least_in_flight_at_a_blow"] >= 8
+    assert len(numbers["blows"]) == len(UPHEAVALS) == 4 and numbers["least_in_flight_at_a_blow"] >= 4
     assert numbers["commands"] >= 10 and numbers["commands_failed"] == 0
     print(numbers)  # noqa: T201 - shown on request
