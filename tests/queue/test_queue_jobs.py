@@ -23,6 +23,7 @@ from octasplat.workers.queue.jobs import (
     list_jobs,
     queue_position,
     retry_job,
+    worked_seconds,
 )
 from octasplat.workers.queue.procrastinate_queue import ProcrastinateQueue
 from octasplat.workers.queue.protocol import JobQueue
@@ -225,6 +226,23 @@ async def test_list_pages_and_filters(conninfo: str) -> None:
         assert [j.id for j in await list_jobs(connection, states=["canceled"])] == [made[0].id]
         assert await queue_position(connection, made[1]) == 0
         assert await queue_position(connection, other) == 1  # owners take turns
+
+
+async def test_time_in_queue_is_no_time_of_work(conninfo: str) -> None:
+    async with open_pool(conninfo, max_size=4) as pool:
+        async with pool.connection() as connection:
+            made = await create_job(connection, SLIPS, NEW)
+        assert made.slip is not None
+        attempt = await claim(pool, made.id, made.slip, "w")
+        assert attempt is not None
+        await attempt.fail({"type": "toy", "message": "It failed."})
+        async with pool.connection() as connection:
+            await connection.execute("UPDATE jobs SET started_at = now() - interval '4 days'")
+        async with pool.connection() as connection:
+            await retry_job(connection, SLIPS, made.id, from_start=False)
+            job = await cancel_job(connection, SLIPS, made.id)
+            assert (job.state, job.started_at) == ("canceled", None)
+            assert await worked_seconds(connection, "me") == 0
 
 
 def test_ids_sort_by_time() -> None:

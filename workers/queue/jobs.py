@@ -273,7 +273,8 @@ async def requeue_job(
         return
     await connection.execute(
         """
-        UPDATE jobs SET state = 'queued', queued_at = now(), worker = NULL, seconds_left = NULL
+        UPDATE jobs SET state = 'queued', queued_at = now(), started_at = NULL, worker = NULL,
+            seconds_left = NULL
         WHERE id = %s
         """,
         [job.id],
