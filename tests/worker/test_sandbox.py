@@ -113,3 +113,31 @@ def test_missing_sandbox_capabilities_are_logged_once(short_root: Path, tmp_path
     wait_for_end(process.pid)
     lines = [line for line in log.read_text().splitlines() if "nothing keeps the programs" in line]
     assert len(lines) == 1 and "folders" in lines[0] and "network" not in lines[0]
+
+
+def start_numba_threads(_task: object) -> None:
+    import numba
+
+    numba.set_num_threads(1)
+
+
+def test_log_of_a_job_does_not_tell_of_locks_that_it_needs_not(tmp_path: Path) -> None:
+    task = {
+        "kind_modules": [],
+        "program": "tests.worker.test_sandbox:start_numba_threads",
+        "folder": str(tmp_path),
+        "options": {},
+        "scene": None,
+        "title": "",
+        "threads": 1,
+    }
+    with subprocess.Popen(
+        [sys.executable, "-c", "from octasplat.workers.worker.job_process import run_job; run_job()"],
+        stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    ) as process:  # fmt: skip
+        assert process.stdin is not None and process.stdout is not None and process.stderr is not None
+        process.stdin.write(json.dumps(task) + "\n")
+        process.stdin.flush()
+        said, log = process.stdout.read(), process.stderr.read()
+    assert json.loads(said.splitlines()[-1]) == {"kind": "done"}
+    assert log == ""

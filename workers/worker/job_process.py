@@ -14,6 +14,7 @@ import signal
 import sys
 import threading
 import traceback
+import warnings
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -147,6 +148,8 @@ def _enter_sandbox(task: dict[str, Any]) -> None:
         temporary = written[0] / "tmp"
         temporary.mkdir(exist_ok=True)
         os.environ["TMPDIR"] = str(temporary)
+    # numba tells whoever reads the log that /dev/shm is shut, though no other process shares its threads.
+    warnings.filterwarnings("ignore", r"(?s).*multiprocessing lock")
     # Machine code that other processes run is theirs to make; a job reads it.
     kernels = shared_cache_folder()
     confine(
