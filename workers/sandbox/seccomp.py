@@ -2,8 +2,9 @@
 
 https://docs.kernel.org/userspace-api/seccomp_filter.html. The calls are those of
 :mod:`octasplat.workers.sandbox.system_calls`. Some are allowed by their arguments only: limits, cores and
-priority of the calling process itself, memory that is not shared without a file, clones in the namespaces and
-below the process that made them, and device calls but those that type into a terminal.
+priority of the calling process itself, memory that is not shared without a file, files that are emptied as
+they are opened for writing, clones in the namespaces and below the process that made them, and device calls
+but those that type into a terminal.
 """
 
 import ctypes
@@ -18,6 +19,8 @@ from octasplat.workers.sandbox.system_calls import (
     CLONE3,
     IOCTL,
     MMAP,
+    OPEN,
+    OPENAT,
     PROCESS_CALLS,
     REFUSED,
     SET_CORES,
@@ -36,6 +39,9 @@ _CLONE_THREAD, _CLONE_PARENT, _CLONE_NEW = 0x00010000, 0x00008000, 0x7E020000
 """A clone that has another parent would not be counted; the last are all kinds of namespaces."""
 _SHARED_WITHOUT_FILE = 0x21
 """MAP_SHARED and MAP_ANONYMOUS: such memory stays taken while no process has it mapped."""
+_ACCESS_AND_TRUNCATION, _TRUNCATIONS_ALONE = 0x203, (0x200, 0x203)
+"""Of the flags of open: so a file is emptied without being opened for writing, as far as Landlock before
+version 3 knows."""
 _TERMINAL_INPUT = (0x5412, 0x541C)
 """TIOCSTI and TIOCLINUX."""
 
@@ -95,6 +101,8 @@ def _filter_instructions(machine: str, may_start_processes: bool) -> Iterator[_I
     yield from _answer_call(CLONE3[column], [_Instruction(_RETURN, 0, 0, _ABSENT)])
     for number, check in (
         (MMAP[column], [*_masked_argument(3, _SHARED_WITHOUT_FILE), *_refuse_if_equal(_SHARED_WITHOUT_FILE)]),
+        (OPEN[column], _truncation_check(1)),
+        (OPENAT[column], _truncation_check(2)),
         (CLONE[column], _clone_check(may_start_processes)),
         (
             IOCTL[column],
@@ -104,7 +112,8 @@ def _filter_instructions(machine: str, may_start_processes: bool) -> Iterator[_I
         (SET_CORES[column], [_argument(0), *_refuse_unless_zero()]),
         (SET_PRIORITY[column], [_argument(0), *_refuse_unless_zero(), _argument(1), *_refuse_unless_zero()]),
     ):
-        yield from _answer_call(number, [*check, _Instruction(_RETURN, 0, 0, _ALLOW)])
+        if number is not None:
+            yield from _answer_call(number, [*check, _Instruction(_RETURN, 0, 0, _ALLOW)])
     allowed = {**ALLOWED, **PROCESS_CALLS} if may_start_processes else ALLOWED
     refused = REFUSED if may_start_processes else {**REFUSED, **PROCESS_CALLS}
     for calls, answer in ((allowed, _ALLOW), (refused, _REFUSE)):
@@ -124,6 +133,13 @@ def _clone_check(may_start_processes: bool) -> list[_Instruction]:
             _Instruction(_RETURN, 0, 0, _REFUSE),
         ]
     return [flags, _Instruction(_ANY_BIT, 1, 0, _CLONE_THREAD), _Instruction(_RETURN, 0, 0, _REFUSE)]
+
+
+def _truncation_check(flags: int) -> list[_Instruction]:
+    return [
+        *_masked_argument(flags, _ACCESS_AND_TRUNCATION),
+        *(step for alone in _TRUNCATIONS_ALONE for step in _refuse_if_equal(alone)),
+    ]
 
 
 def _answer_call(number: int, answer: Sequence[_Instruction]) -> Iterator[_Instruction]:

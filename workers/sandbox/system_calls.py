@@ -7,14 +7,14 @@ None stands for a call that a processor does not have. A call of neither table d
 SystemCalls = dict[str, tuple[int | None, int | None]]
 
 ALLOWED: SystemCalls = {
-    "read": (0, 63), "write": (1, 64), "open": (2, None), "openat": (257, 56), "openat2": (437, 437),
+    "read": (0, 63), "write": (1, 64),
     "close": (3, 57), "close_range": (436, 436), "creat": (85, None), "lseek": (8, 62), "pread64": (17, 67),
     "pwrite64": (18, 68), "readv": (19, 65), "writev": (20, 66), "preadv": (295, 69), "pwritev": (296, 70),
     "preadv2": (327, 286), "pwritev2": (328, 287), "stat": (4, None), "fstat": (5, 80), "lstat": (6, None),
     "newfstatat": (262, 79), "statx": (332, 291), "access": (21, None), "faccessat": (269, 48),
     "faccessat2": (439, 439), "statfs": (137, 43), "fstatfs": (138, 44), "readlink": (89, None),
     "readlinkat": (267, 78), "getdents": (78, None), "getdents64": (217, 61), "getcwd": (79, 17),
-    "chdir": (80, 49), "fchdir": (81, 50), "truncate": (76, 45), "ftruncate": (77, 46),
+    "chdir": (80, 49), "fchdir": (81, 50), "ftruncate": (77, 46),
     "fallocate": (285, 47), "fsync": (74, 82), "fdatasync": (75, 83), "sync_file_range": (277, 84),
     "fadvise64": (221, 223), "readahead": (187, 213), "copy_file_range": (326, 285), "sendfile": (40, 71),
     "splice": (275, 76), "tee": (276, 77), "vmsplice": (278, 75), "cachestat": (451, 451),
@@ -74,7 +74,7 @@ REFUSED: SystemCalls = {
     "fchmodat2": (452, 452), "chown": (92, None), "lchown": (94, None), "fchown": (93, 55),
     "fchownat": (260, 54), "utime": (132, None), "utimes": (235, None), "futimesat": (261, None),
     "utimensat": (280, 88), "setxattr": (188, 5), "lsetxattr": (189, 6), "fsetxattr": (190, 7),
-    "setxattrat": (463, 463), "removexattr": (197, 14), "lremovexattr": (198, 15),
+    "truncate": (76, 45), "setxattrat": (463, 463), "removexattr": (197, 14), "lremovexattr": (198, 15),
     "fremovexattr": (199, 16), "removexattrat": (466, 466), "mknod": (133, None), "mknodat": (259, 33),
     "inotify_init": (253, None), "inotify_init1": (294, 26), "inotify_add_watch": (254, 27),
     "fanotify_init": (300, 262), "fanotify_mark": (301, 263), "name_to_handle_at": (303, 264),
@@ -103,8 +103,10 @@ REFUSED: SystemCalls = {
     "iopl": (172, None), "ioperm": (173, None), "modify_ldt": (154, None),
 }  # fmt: skip
 """Calls that are answered with EPERM: the network, what Landlock does not know (owner, access, times and
-attributes of files), other processes, memory that is counted nowhere, namespaces and the system."""
+attributes of files, before version 3 their length), other processes, memory that is counted nowhere,
+namespaces and the system."""
 
+OPEN, OPENAT = (2, None), (257, 56)
 MMAP, CLONE, CLONE3, IOCTL = (9, 222), (56, 220), (435, 435), (16, 29)
 SET_LIMITS, SET_CORES, SET_PRIORITY = (302, 261), (203, 122), (141, 140)
 """Calls that are allowed by their arguments, see :mod:`octasplat.workers.sandbox.seccomp`."""
