@@ -270,7 +270,7 @@ def test_commands_take_channels_along_and_warn_once(tmp_path: Path) -> None:
         "merge", source, bare, "-o", tmp_path / "c.ply"
     )
     assert run("export", source, tmp_path / "d.spz").count("label, albedo, spectrum will be left out") == 1
-    export_scene(scene(), tmp_path / "scene.mesh.ply")
+    export_scene(read_scene(source)[0], tmp_path / "scene.mesh.ply")
     mesh = tmp_path / "scene.mesh.ply"
     told = run("edit", source, "--mesh", mesh, "--mesh", mesh, "-o", tmp_path / "e_%02d.splat")
     assert told.count("named channels") == told.count("direction will be left out") == 1

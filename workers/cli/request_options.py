@@ -119,7 +119,7 @@ def run_operation(
     *,
     threads: int = 0,
     is_stoppable: bool = False,
-    opening: Callable[[], str | None] = lambda: None,
+    first_sentence: Callable[[], str | None] = lambda: None,
 ) -> ResultT:
     """Do a request with its progress shown, print what came of it, and return it.
 
@@ -129,7 +129,7 @@ def run_operation(
         printer: how results are printed.
         threads: number of threads; 0 means all cores.
         is_stoppable: as for :func:`operation_command`.
-        opening: returns a sentence to show as the first stage begins, when nothing was refused.
+        first_sentence: returns a sentence to show as the first stage begins, when nothing was refused.
 
     Raises:
         OctasplatError: as the operation does.
@@ -139,9 +139,11 @@ def run_operation(
         with request_stop_on_signals() as should_stop:
             try:
                 with show_progress(quiet=printer.hides_progress, should_stop=should_stop) as progress:
-                    told = progress if printer.hides_progress else _with_opening(progress, opening)
+                    listener = (
+                        progress if printer.hides_progress else _with_first_sentence(progress, first_sentence)
+                    )
                     result = operation.execute(
-                        request, progress=told, should_stop=should_stop, threads=threads
+                        request, progress=listener, should_stop=should_stop, threads=threads
                     )
             except CancelledError as error:
                 raise StoppedError(str(error), should_stop.exit_code) from None
@@ -153,7 +155,7 @@ def run_operation(
     return result
 
 
-def _with_opening(progress: EventListener, opening: Callable[[], str | None]) -> EventListener:
+def _with_first_sentence(progress: EventListener, first_sentence: Callable[[], str | None]) -> EventListener:
     """Return a listener that notes a sentence before the first stage on photographs."""
     is_open = False
 
@@ -161,7 +163,7 @@ def _with_opening(progress: EventListener, opening: Callable[[], str | None]) ->
         nonlocal is_open
         if isinstance(event, PhaseStarted) and event.stage != "frames" and not is_open:
             is_open = True
-            if (sentence := opening()) is not None:
+            if (sentence := first_sentence()) is not None:
                 progress(Noted(sentence))
         progress(event)
 
