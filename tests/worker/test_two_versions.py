@@ -145,6 +145,8 @@ def test_previous_release_works_beside_current(
         try:
             address = front.stdout.readline().decode().strip()  # its tables are there
             old = bench.worker(name="old", root=previous)
+            bench.wait_until_up("old")
+            migrate(conninfo)  # beside the front end and the worker of the earlier release
             gates = [str(tmp_path / f"gate-{number}") for number in range(3)]
             begun = bench.submit(options=bench.wait_until_held(gate=gates[0]))
             bench.wait_at_gate(begun)
@@ -152,7 +154,6 @@ def test_previous_release_works_beside_current(
             stays = bench.submit(options=bench.wait_until_held(gate=gates[1]))
             bench.wait_at_gate(stays)
 
-            migrate(conninfo)
             new = bench.worker(name="new")
             bench.wait_until_up("new")
             old.kill()
