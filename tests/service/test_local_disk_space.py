@@ -25,22 +25,28 @@ async def test_archive_spool_space_is_limited(conninfo: str, tmp_path: Path) -> 
     with small_disk(tmp_path / "disk", 16) as disk:
         settings = {"work": disk, "max_spool_bytes": 5 * MIB, "storage": str(tmp_path / "elsewhere")}
         async with running_service(conninfo, tmp_path, **settings) as (http, _):
+            answer = await http.put(f"{await new_dataset(http)}/archive", content=archive)
+            assert answer.status_code == 507 and "Your archives" in answer.json()["detail"], answer.text
+        settings["spool_share"] = 1.0
+        async with running_service(conninfo, tmp_path, **settings) as (http, _):
             first, second = await new_dataset(http), await new_dataset(http)
             begun, go_on = asyncio.Event(), asyncio.Event()
 
             async def slowly() -> AsyncIterator[bytes]:
-                begun.set()
-                yield archive[:1000]
+                yield archive[:-1000]
+                begun.set()  # what came so far is counted
                 await go_on.wait()
-                yield archive[1000:]
+                yield archive[-1000:]
 
             headers = {"Content-Length": str(len(archive))}
             slow = asyncio.create_task(http.put(f"{first}/archive", content=slowly(), headers=headers))
             await begun.wait()
-            answer = await http.put(f"{second}/archive", content=archive)
+            try:
+                answer = await http.put(f"{second}/archive", content=archive)
+            finally:
+                go_on.set()
             assert answer.status_code == 507, answer.text
-            assert "Archives that are being read" in answer.json()["detail"]
-            go_on.set()
+            assert "archives that are being read" in answer.json()["detail"]
             assert (await slow).status_code == 200
             assert (await http.put(f"{second}/archive", content=archive)).status_code == 200
         settings["floor_bytes"] = 4 * MIB
