@@ -36,6 +36,7 @@ STORAGE_TYPES = {
     "digest_mismatch",
     "too_large",
     "blob_missing",
+    "not_a_file",
 }
 
 
