@@ -4,7 +4,7 @@ import uuid
 from datetime import datetime
 from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, JsonValue
 
 from octasplat.service.schemas.base import EXAMPLE_ID, EXAMPLE_TIME, RequestBody
 from octasplat.workers.db.rows import JobState
@@ -108,6 +108,19 @@ class WebhookPage(BaseModel):
     next: str | None
 
 
+_MESSAGE_EXAMPLE: dict[str, JsonValue] = {
+    "type": "job.succeeded",
+    "timestamp": EXAMPLE_TIME,
+    "data": {
+        "job_id": EXAMPLE_ID,
+        "kind": "reconstruct",
+        "label": None,
+        "state": "succeeded",
+        "attempt": 1,
+    },
+}
+
+
 class DeliveryView(BaseModel):
     """A message and its outcome; the body of the response is not shown."""
 
@@ -118,17 +131,7 @@ class DeliveryView(BaseModel):
                     "id": EXAMPLE_ID,
                     "message_id": "msg_01a1fcac4f59764b97e61be68502c58f",
                     "kind": "job.succeeded",
-                    "payload": {
-                        "type": "job.succeeded",
-                        "timestamp": EXAMPLE_TIME,
-                        "data": {
-                            "job_id": EXAMPLE_ID,
-                            "kind": "reconstruct",
-                            "label": None,
-                            "state": "succeeded",
-                            "attempt": 1,
-                        },
-                    },
+                    "payload": _MESSAGE_EXAMPLE,
                     "state": "delivered",
                     "tries": 1,
                     "due_at": None,
@@ -180,23 +183,7 @@ class JobEventData(BaseModel):
 class JobEventMessage(BaseModel):
     """A message on a change of a job's state."""
 
-    model_config = ConfigDict(
-        json_schema_extra={
-            "examples": [
-                {
-                    "type": "job.succeeded",
-                    "timestamp": EXAMPLE_TIME,
-                    "data": {
-                        "job_id": EXAMPLE_ID,
-                        "kind": "reconstruct",
-                        "label": None,
-                        "state": "succeeded",
-                        "attempt": 1,
-                    },
-                }
-            ]
-        }
-    )
+    model_config = ConfigDict(json_schema_extra={"examples": [_MESSAGE_EXAMPLE]})
 
     type: EventName
     timestamp: datetime

@@ -2,8 +2,8 @@
 
 import click
 
-from octasplat.workers.cli.commands.client import connected, server_option
 from octasplat.workers.cli.printing import Printer, output_options
+from octasplat.workers.cli.service_options import connected, server_option
 
 
 @click.command("open", short_help="Sign a browser in to the service.")

@@ -3,8 +3,8 @@
 import click
 
 from octasplat.engine.core.durations import format_duration
-from octasplat.workers.cli.commands.client import connected, server_option
 from octasplat.workers.cli.printing import Printer, output_options
+from octasplat.workers.cli.service_options import connected, server_option
 
 
 @click.command(short_help="Show what you have stored and what you may.")

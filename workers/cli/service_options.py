@@ -1,0 +1,57 @@
+"""Options and connection of the commands that talk to a service."""
+
+import os
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import click
+
+if TYPE_CHECKING:
+    from octasplat.workers.client.api import Api
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+
+def server_option(command: F) -> F:
+    """Add the option ``--server`` to a command."""
+    return click.option(
+        "--server",
+        metavar="URL",
+        help="The service.  [default: OCTASPLAT_SERVER, or octasplat serve of this machine]",
+    )(command)
+
+
+def set_option(command: F) -> F:
+    """Add the option ``--set`` to a command."""
+    return click.option(
+        "--set",
+        "assignments",
+        multiple=True,
+        metavar="NAME=VALUE",
+        help="Any setting, e.g. test_every=10 or lr.quat=0.02; may be repeated.",
+    )(command)
+
+
+def limit_option(command: F) -> F:
+    """Add the option ``--limit`` of lists to a command."""
+    return click.option(
+        "--limit", type=click.IntRange(1, 1000), default=20, show_default=True, metavar="N",
+        help="Most rows to list.",
+    )(command)  # fmt: skip
+
+
+@contextmanager
+def connected(server: str | None, *, awaits_start: bool = False) -> Iterator["Api"]:
+    """Yield the service that the user means; the token is no option, as others on a machine see those.
+
+    Args:
+        server: its address; None for that of the environment or of this machine.
+        awaits_start: whether the command waits for a service that is being started again, as long work does;
+            else a refused connection is told at once.
+    """
+    from octasplat.workers.client.api import Api, find_address, find_token
+
+    address = server or find_address(os.environ)
+    with Api(address, find_token(os.environ, address), awaits_start=awaits_start) as api:
+        yield api
