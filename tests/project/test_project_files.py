@@ -50,6 +50,12 @@ def test_programs_of_the_checks_are_there() -> None:
             subprocess.run(("bash", "-n", place), cwd=ROOT, check=True)
 
 
+def test_modules_of_tests_have_names_of_their_own() -> None:
+    # The folders are no packages, so pytest imports each module by its file name alone.
+    names = [path.name for path in (ROOT / "tests").rglob("test_*.py")]
+    assert len(names) > 100 and {name for name in names if names.count(name) > 1} == set()
+
+
 def test_tools_of_the_checks_are_installed_with_the_extra_dev() -> None:
     tools = re.findall(r"^\.venv/bin/([\w-]+)", (ROOT / ".ci" / "run").read_text(), re.MULTILINE)
     tools += [hook["entry"].split()[0].removeprefix(".venv/bin/") for hook in hooks()]
