@@ -13,12 +13,12 @@ from pathlib import Path
 from typing import IO, Any
 
 from octasplat.engine.core.compiling import begin_compilation, end_compilation
-from octasplat.engine.core.kernel_folder import PACKAGE, code_folder, source_digest
+from octasplat.engine.core.kernel_folder import PACKAGE, code_folder, readable_code_folder, source_digest
 
 # Read by numba as it is imported: coloring messages of overloads that do not fit takes time.
 os.environ.setdefault("NUMBA_DISABLE_ERROR_MESSAGE_HIGHLIGHTING", "1")
 
-from numba.core.caching import CacheImpl, FunctionCache, _CacheLocator
+from numba.core.caching import CacheImpl, FunctionCache, IndexDataCacheFile, _CacheLocator
 
 try:
     import fcntl
@@ -36,6 +36,12 @@ class _SharedCache(FunctionCache):  # type: ignore[misc]
         super().__init__(function)
         self._lock: IO[bytes] | None = None
         self._is_compiling = False
+        folder = readable_code_folder(function.__module__)
+        self._readable_file: IndexDataCacheFile | None = None
+        if folder is not None:
+            self._readable_file = IndexDataCacheFile(
+                str(folder), self._impl.filename_base, self._impl.locator.get_source_stamp()
+            )
 
     @property
     def _lock_path(self) -> Path:
@@ -64,6 +70,16 @@ class _SharedCache(FunctionCache):  # type: ignore[misc]
         begin_compilation()
         self._take_lock()
         return super().load_overload(sig, target_context)
+
+    def _load_overload(self, sig: Any, target_context: Any) -> Any:
+        found = super()._load_overload(sig, target_context)
+        if found is not None or self._readable_file is None:
+            return found
+        try:
+            data = self._readable_file.load(self._index_key(sig, target_context.codegen()))
+        except OSError:  # kept for another user alone
+            return None
+        return None if data is None else self._impl.rebuild(target_context, data)
 
     def release(self) -> None:
         """End what :meth:`load_overload` began, whether the code was made or not."""

@@ -9,11 +9,9 @@ import importlib.util
 import logging
 import os
 import re
-import shutil
 import stat
 import sys
 import tempfile
-from contextlib import suppress
 from functools import cache
 from importlib.metadata import version
 from pathlib import Path
@@ -138,26 +136,22 @@ def readable_cache_folder() -> Path | None:
 
 @cache
 def code_folder(module: str) -> Path:
-    """Return the folder of the machine code of a module's kernels, of the sources as they are.
+    """Return the folder in which this process keeps the machine code of a module's kernels."""
+    return cache_folder() / _relative_folder(module)
 
-    Where it is not the shared one, it begins with what can be read there.
-    """
-    path = _relative_folder(module)
-    found = cache_folder() / path
+
+@cache
+def readable_code_folder(module: str) -> Path | None:
+    """Return where this process only reads machine code of a module's kernels, see :func:`cache_folder`."""
     shared = readable_cache_folder()
-    if shared is not None and not found.exists() and (shared / path).is_dir():
-        with suppress(OSError):
-            # A confined job cannot set access and times; of an error, which comes last, nothing is missing.
-            unwanted = shutil.ignore_patterns("*.lock", "*.tmp.*")
-            shutil.copytree(shared / path, found, ignore=unwanted, copy_function=shutil.copyfile)
-    return found
+    return None if shared is None else shared / _relative_folder(module)
 
 
 def count_code(module: str, function: str) -> int:
     """Return for how many types of arguments machine code of a kernel is kept where this process looks."""
     pattern = f"{module.rpartition('.')[2]}.{function}-*.nbc"
     folders = (cache_folder(), readable_cache_folder())
-    return max(
+    return sum(
         len(list((folder / _relative_folder(module)).glob(pattern)))
         for folder in folders
         if folder is not None

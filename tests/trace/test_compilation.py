@@ -94,6 +94,21 @@ def test_unwritable_cache_folder_is_replaced(tmp_path: Path) -> None:
     assert list(private.rglob("*.nbi"))
 
 
+def test_code_in_unwritable_cache_folder_is_read_where_it_is(tmp_path: Path) -> None:
+    """As by the processes of jobs, which would copy many megabytes each."""
+    shared, private = tmp_path / "shared", tmp_path / f"octasplat-kernels-{os.getuid()}"
+    assert "[1 2 0]" in run_python(SORT, NUMBA_CACHE_DIR=str(shared))
+    refuse = (
+        "import os, pathlib\n"
+        "from octasplat.engine.core import kernel_folder\n"
+        "usable, shared = kernel_folder._is_usable, pathlib.Path(os.environ['NUMBA_CACHE_DIR'])\n"
+        "kernel_folder._is_usable = lambda folder: folder != shared and usable(folder)\n"
+    )
+    said = run_python(refuse + textwrap.dedent(SORT), NUMBA_CACHE_DIR=str(shared), TMPDIR=str(tmp_path))
+    assert "[1 2 0]" in said and "cannot be kept" not in said
+    assert not [path for path in private.rglob("*") if path.suffix in (".nbi", ".nbc")]
+
+
 def test_world_writable_cache_folder_is_not_used(tmp_path: Path) -> None:
     shared = tmp_path / "shared"
     shared.mkdir()
