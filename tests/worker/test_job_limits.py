@@ -56,3 +56,10 @@ def test_memory_is_shared_out_by_default(bench: WorkerHarness) -> None:
     [worker] = bench.run_query(lambda connection: live_workers(connection, 20))
     limit, total = worker.facts["memory_limit_bytes"], psutil.virtual_memory().total
     assert 0 < limit < total / 2 and {"glb", "spz"} <= set(worker.facts["formats"])
+
+
+def test_job_that_cannot_be_watched_is_stopped(bench: WorkerHarness) -> None:
+    bench.worker(KIND_MODULES='["tests.support.broken_watch"]')
+    job = bench.wait_until_finished(bench.submit(options={"steps": 100_000, "checkpoint_every": 1_000_000}))
+    assert job.state == "failed" and job.error is not None and job.error["type"] == "unwatched"
+    assert job.attempt == 4 and "no such file in /proc" in bench.worker_logs()

@@ -45,7 +45,7 @@ def confine(
         readable: what can be read within the hidden folders.
         may_start_processes: whether other programs can be started, which have no more rights.
     """
-    forbid_memory_access()
+    forbid_memory_access(is_measured=True)
     with contextlib.suppress(OSError):
         prctl(PR_SET_NO_NEW_PRIVS, 1)
     with contextlib.suppress(OSError):

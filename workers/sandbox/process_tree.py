@@ -27,9 +27,17 @@ def tree_memory_bytes(pid: int) -> int:
 
     Memory that they share counts for each of them, also where it lies in ``/dev/shm``. Pages of mapped files,
     as those of photographs, belong to the system, which takes them back when it needs them.
+
+    Raises:
+        PermissionError: the process is there and hidden.
     """
+    tree = _tree(pid)
+    if not tree:
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(pid, 0)
+            raise PermissionError(f"/proc hides the process {pid}, so its memory cannot be measured")
     total = 0
-    for process in _tree(pid):
+    for process in tree:
         with contextlib.suppress(psutil.Error, OSError, ValueError):
             total += _memory_bytes(process)
     return total

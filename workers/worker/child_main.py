@@ -45,7 +45,7 @@ def main() -> NoReturn:
         from octasplat.workers.worker.job_process import run_job
 
         run_job()
-    forbid_memory_access()
+    forbid_memory_access(is_measured=True)
     nothing = os.open(os.devnull, os.O_RDWR)
     for pipe in (0, 1, 2):
         os.dup2(nothing, pipe)
