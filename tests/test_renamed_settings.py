@@ -115,7 +115,7 @@ def test_former_submitted_options_are_read_with_notice(monkeypatch: pytest.Monke
 
     def keep(_api: object, what: Any, _printer: object) -> dict[str, str]:
         options = json.loads(json.dumps(what.options))
-        found.append(asyncio.run(resolve_options(get_job_kind("reconstruct"), options)))
+        found.append(asyncio.run(resolve_options(get_job_kind("reconstruct"), options)).complete)
         return {"id": "1"}
 
     monkeypatch.setattr("octasplat.workers.cli.remote_jobs.submit", keep)
@@ -131,7 +131,7 @@ def test_former_submitted_options_are_read_with_notice(monkeypatch: pytest.Monke
 def test_former_names_in_the_options_of_a_job_mean_the_same() -> None:
     kind = get_job_kind("reconstruct")
     with collect_notices() as notices:
-        assert asyncio.run(resolve_options(kind, FORMER)) == EXPECTED
+        assert asyncio.run(resolve_options(kind, FORMER)).complete == EXPECTED
     assert notices
     stored = EXPECTED.model_dump(mode="json")
     stored |= {"evaluate_background": stored.pop("evaluation_background"), "preset": "paper"}

@@ -88,6 +88,22 @@ class ReconstructOptions(RunSettings, Options):
             assignments=self.assignments,
         )
 
+    def requested(self) -> dict[str, Any]:
+        """Return the given settings as JSON, those of the training by their places below ``train``.
+
+        No defaults and no settings of the preset are among them, so that each version resolves them itself.
+        """
+        from octasplat.engine.runs.config import requested_settings
+
+        given = self.model_dump(mode="json", include=RunSettings.model_fields.keys() & self.model_fields_set)
+        requested = requested_settings(
+            given,
+            materials=self.materials if "materials" in self.model_fields_set else None,
+            train=merge_options(self.train, self._shortcut_settings()),
+            assignments=self.assignments,
+        )
+        return {**requested, "for_surface": True} if self.for_surface else requested
+
     def revised(self, before: Mapping[str, Any]) -> "ReconstructionConfig":
         """Return a complete configuration, given as JSON, overridden by the options that were given.
 
@@ -109,16 +125,20 @@ class ReconstructOptions(RunSettings, Options):
         """Return the training's settings that the options name, nested."""
         from octasplat.engine.train.config import SURFACE_DEPTH_NORMAL_WEIGHT
 
+        shortcuts = self._shortcut_settings()
+        if self.for_surface:
+            shortcuts["loss"] = {"depth_normal": SURFACE_DEPTH_NORMAL_WEIGHT}
+        return merge_options(self.train, shortcuts)
+
+    def _shortcut_settings(self) -> dict[str, Any]:
+        """Return the training's settings that options beside ``train`` name."""
         names = {name: info.metadata for name, info in ReconstructOptions.model_fields.items()}
-        shortcuts: dict[str, Any] = {
+        return {
             mark.setting: getattr(self, name)
             for name, marks in names.items()
             for mark in marks
             if isinstance(mark, Shortcut) and getattr(self, name) is not None
         }
-        if self.for_surface:
-            shortcuts["loss"] = {"depth_normal": SURFACE_DEPTH_NORMAL_WEIGHT}
-        return merge_options(self.train, shortcuts)
 
 
 class ReconstructRequest(ReconstructOptions, Request):

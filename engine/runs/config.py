@@ -106,6 +106,40 @@ def resolve_config(
     return _validate_config({**values, "train": merge_options(base, changes)})
 
 
+def requested_settings(
+    settings: Mapping[str, object],
+    *,
+    materials: bool | None = None,
+    train: Mapping[str, Any] | None = None,
+    assignments: Sequence[str] = (),
+) -> dict[str, Any]:
+    """Return what was given, unresolved: settings of the run, and those of the training below ``train``.
+
+    Args:
+        settings: fields of :class:`RunSettings`.
+        materials: as for :func:`resolve_config`; None where nothing was said of them.
+        train: as for :func:`resolve_config`.
+        assignments: as for :func:`resolve_config`.
+
+    Raises:
+        InvalidSettingsError: an unknown name.
+    """
+    values, changes = _collect_changes(settings, materials, train, assignments)
+    return {**values, "train": changes} if changes else values
+
+
+def revise_requested(requested: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
+    """Return :func:`requested_settings` with changes; another preset brings its own settings."""
+    kept, train = {**requested, **changes}, changes.get("train", {})
+    default = RunSettings.model_fields["preset"].default
+    if kept.get("preset", default) == requested.get("preset", default):
+        train = merge_options(requested.get("train", {}), train)
+    if "depth_normal" in changes.get("train", {}).get("loss", {}) and "for_surface" not in changes:
+        kept.pop("for_surface", None)  # which means a value of its own
+    kept.pop("train", None)
+    return {**kept, "train": train} if train else kept
+
+
 def revise_config(
     before: Mapping[str, Any],
     *,

@@ -20,7 +20,7 @@ async def estimate(service: Service, principal: Principal, new: NewEstimate) -> 
         ProblemError: 422.
     """
     kind = validate_kind(new.kind)
-    options = await resolve_options(kind, new.options)
+    options = (await resolve_options(kind, new.options)).complete
     async with service.pool.connection() as connection:
         sizes = [ImageSizes(group.width_px, group.height_px, group.count) for group in new.photographs]
         sizes += await _sizes_of(connection, principal, new)

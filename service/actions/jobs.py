@@ -22,7 +22,7 @@ from octasplat.workers.db.connections import Connection, retry_on_deadlock
 from octasplat.workers.db.rows import Job, JobState
 from octasplat.workers.queue import jobs as rows
 from octasplat.workers.worker.job_kinds import get_job_kind
-from octasplat.workers.worker.job_kinds.stored_options import options_of
+from octasplat.workers.worker.job_kinds.stored_options import expected_options
 from octasplat.workers.worker.path_redaction import shorten_absolute_paths
 
 BUSY_RETRY_SECONDS = 2
@@ -183,7 +183,7 @@ def complete_options(job: Job) -> dict[str, Any]:
     if job.settings is not None:
         return job.settings
     try:
-        return options_of(get_job_kind(job.kind), job).model_dump(mode="json")
+        return expected_options(get_job_kind(job.kind), job).model_dump(mode="json")
     except (ConfigError, ValidationError):  # of another version
         return job.options
 
@@ -192,7 +192,7 @@ def stages_of(job: Job) -> list[str]:
     """Return the names of a job's stages, in order."""
     try:
         kind = get_job_kind(job.kind)
-        return list(kind.stages(options_of(kind, job)))
+        return list(kind.stages(expected_options(kind, job)))
     except (ConfigError, ValidationError):  # of another version
         return []
 
@@ -209,7 +209,7 @@ async def job_view(connection: Connection, service: Service, principal: Principa
         with suppress(ConfigError, ValidationError):  # of another version
             kind = get_job_kind(job.kind)
             workers = await live_workers_of_queue(connection, job.queue, service.settings.stale_seconds)
-            notes += queued_job_notes(kind, options_of(kind, job), job.queue, workers)
+            notes += queued_job_notes(kind, expected_options(kind, job), job.queue, workers)
             notes += limit_notes(job.estimate, workers, service.settings)
             if not notes:
                 notes += busy_workers_note(workers, await rows.running_by_queue(connection), job.queue)

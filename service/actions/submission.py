@@ -1,6 +1,7 @@
 """Submission of jobs: new ones, and retries."""
 
 import uuid
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -12,7 +13,13 @@ from octasplat.engine.settings.renamed_settings import collect_notices
 from octasplat.service.actions.access import check_not_draining, fetch_visible_job
 from octasplat.service.actions.jobs import job_view
 from octasplat.service.actions.named_files import check_named_files
-from octasplat.service.actions.validation import input_problem, resolve_options, validate_kind
+from octasplat.service.actions.validation import (
+    ResolvedOptions,
+    input_problem,
+    resolve_options,
+    revise_options,
+    validate_kind,
+)
 from octasplat.service.auth import Principal
 from octasplat.service.idempotency import create_once, fingerprint
 from octasplat.service.job_limits import (
@@ -34,16 +41,21 @@ from octasplat.workers.db.rows import Dataset, Job
 from octasplat.workers.maintenance.webhooks.rows import add_endpoint
 from octasplat.workers.queue import jobs as rows
 from octasplat.workers.worker.job_kinds import JobKind, get_job_kind
-from octasplat.workers.worker.job_kinds.stored_options import options_of, without_defaults
+from octasplat.workers.worker.job_kinds.stored_options import (
+    expected_options,
+    with_decisions,
+    without_defaults,
+)
 
 
 @dataclass(frozen=True)
 class _RequestedJob:
-    """A requested job: its kind and complete options."""
+    """A requested job: its kind, and its options complete and as they were asked for."""
 
     new: NewJob
     kind: JobKind
     options: BaseModel
+    requested: Mapping[str, Any] | None
     traceparent: str | None
 
 
@@ -83,7 +95,7 @@ async def submit_job(
     kind = validate_kind(request.kind)
     with collect_notices() as notices:
         options = await resolve_options(kind, request.options)
-    requested = _RequestedJob(request, kind, options, traceparent)
+    requested = _RequestedJob(request, kind, options.complete, options.requested, traceparent)
     check_priority(principal, request.priority, service.settings)
     if request.webhook is not None:
         check_webhook_address(service, request.webhook.url, "#/webhook/url")
@@ -130,14 +142,9 @@ async def retry_job(
             await lock_owner(connection, owner)
             job = await fetch_visible_job(connection, principal, job_id, lock=True)
             await check_new_job(connection, owner, service.settings.quota)
-            options, estimate = await _revised_options(connection, service, principal, job, request)
+            revised = await _revised_options(connection, service, principal, job, request)
             await rows.retry_job(
-                connection,
-                service.job_queue,
-                job_id,
-                from_start=request.start == "start",
-                options=options,
-                estimate=estimate,
+                connection, service.job_queue, job_id, from_start=request.start == "start", revised=revised
             )
             return job_id
 
@@ -168,6 +175,7 @@ async def _create_job(
         owner=principal.owner,
         kind=kind.name,
         options=without_defaults(inputs.options),
+        requested=with_decisions(kind, requested.requested, requested.options, inputs.options),
         queue=new.queue,
         priority=new.priority,
         dataset_id=inputs.dataset_id,
@@ -268,22 +276,24 @@ async def _get_photographs(connection: Connection, principal: Principal, dataset
 
 async def _revised_options(
     connection: Connection, service: Service, principal: Principal, job: Job, request: RetryRequest
-) -> tuple[dict[str, Any] | None, dict[str, Any] | None]:
-    """Return the checked options of a retried job and their estimate; None leaves them as they are."""
+) -> rows.RevisedOptions | None:
+    """Return the checked options of a retried job; None leaves them as they are."""
     workers = await live_workers_of_queue(connection, job.queue, service.settings.stale_seconds)
     try:
         kind = get_job_kind(job.kind)
-        before = options_of(kind, job)
+        before = expected_options(kind, job)
     except (ConfigError, ValidationError):
         if not request.options:
-            return None, None
+            return None
         detail = "The job is of another version, so its options cannot be changed; make a new one."
         raise ProblemError(409, "version", detail) from None
     if kind.needs == "result" and job.source_id is None:
         raise ProblemError(409, "source", "The job whose results it works on was deleted; make a new job.")
-    options = before
+    goes_on = request.start == "checkpoint" and job.checkpoint is not None
+    revised = ResolvedOptions(before, job.requested)
     if request.options:
-        options = await resolve_options(kind, request.options, before=before.model_dump(mode="json"))
+        revised = await revise_options(kind, revised, request.options, goes_on=goes_on)
+    options = revised.complete
     check_formats_writable(kind, options, job.queue, workers)
     await check_named_files(connection, principal, kind, options, job.files_id)
     sizes = await photograph_sizes(connection, job.dataset_id) if job.dataset_id is not None else []
@@ -291,18 +301,19 @@ async def _revised_options(
     estimate = estimate_job(kind, options, sizes, workers)
     check_workers_large_enough(kind.resource_demands(options, sizes), estimate, job.queue, workers)
     if not request.options:
-        return None, None
+        return None
     if kind.needs == "dataset" and job.dataset_id is not None:
         dataset = await get_dataset(connection, job.dataset_id)
         options = kind.with_poses_known(options, dataset is not None and dataset.has_poses)
-    if (
-        request.start == "checkpoint"
-        and job.checkpoint is not None
-        and not kind.is_resumable_with(before, options)
-    ):
+    if goes_on and not kind.is_resumable_with(before, options):
         detail = "With these options the work begins anew; ask for that with from: start."
         raise ProblemError(422, "other-work", detail, errors=[{"pointer": "#/options", "detail": detail}])
-    return without_defaults(options), _estimate_as_json(estimate)
+    return rows.RevisedOptions(
+        options=without_defaults(options),
+        requested=with_decisions(kind, revised.requested, revised.complete, options),
+        settings=options.model_dump(mode="json") if goes_on else None,
+        estimate=_estimate_as_json(estimate),
+    )
 
 
 def _estimate_as_json(estimate: Estimate | None) -> dict[str, Any] | None:

@@ -1,6 +1,7 @@
 """Validation of a requested job kind and its options, before any database access."""
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
 from pydantic import BaseModel, ValidationError
@@ -10,6 +11,7 @@ from octasplat.engine.settings.refusals import InvalidSettingsError
 from octasplat.service.problems import ProblemError, options_error
 from octasplat.service.thread_pools import ThreadPurpose, run_in_pool
 from octasplat.workers.worker.job_kinds import JobKind, get_job_kind
+from octasplat.workers.worker.job_kinds.stored_options import requested_options, resolve_requested
 
 
 def validate_kind(name: str) -> JobKind:
@@ -26,27 +28,66 @@ def validate_kind(name: str) -> JobKind:
         ) from None
 
 
-async def resolve_options(
-    kind: JobKind, values: Mapping[str, Any], *, before: Mapping[str, Any] | None = None
-) -> BaseModel:
-    """Return the complete options, validated in a thread, so that large ones delay no other request.
+@dataclass(frozen=True)
+class ResolvedOptions:
+    """Options of a job, validated.
+
+    Attributes:
+        complete: every option, as this version completes what was asked for.
+        requested: what was asked for; see :attr:`octasplat.workers.db.rows.Job.requested`.
+    """
+
+    complete: BaseModel
+    requested: Mapping[str, Any] | None
+
+
+async def resolve_options(kind: JobKind, values: Mapping[str, Any]) -> ResolvedOptions:
+    """Return the options of a new job, validated in a thread, so that large ones delay no other request.
 
     Args:
         kind: the kind of the job.
         values: what was asked for.
-        before: options of a job that they change; None for a new job.
 
     Raises:
         ProblemError: 422.
     """
-    return await run_in_pool(ThreadPurpose.OPTIONS, _resolve, kind, values, before)
+    return await run_in_pool(ThreadPurpose.OPTIONS, _resolve, kind, values)
 
 
-def _resolve(kind: JobKind, values: Mapping[str, Any], before: Mapping[str, Any] | None) -> BaseModel:
+async def revise_options(
+    kind: JobKind, before: ResolvedOptions, changes: Mapping[str, Any], *, goes_on: bool
+) -> ResolvedOptions:
+    """Return the options of a job that is tried again with changes, validated in a thread.
+
+    Args:
+        kind: the kind of the job.
+        before: its options.
+        changes: what was asked for now.
+        goes_on: whether the job goes on with what it has done, under every setting that is not changed.
+
+    Raises:
+        ProblemError: 422.
+    """
+    return await run_in_pool(ThreadPurpose.OPTIONS, _revise, kind, before, changes, goes_on)
+
+
+def _resolve(kind: JobKind, values: Mapping[str, Any]) -> ResolvedOptions:
     try:
-        if before is not None:
-            return kind.revise(before, values)
-        return kind.options.model_validate(kind.resolve(values).model_dump(mode="json"))
+        complete = resolve_requested(kind, values)
+        return ResolvedOptions(complete, requested_options(kind, values, complete))
+    except (ValidationError, InvalidSettingsError) as error:
+        raise options_error(error) from None
+
+
+def _revise(
+    kind: JobKind, before: ResolvedOptions, changes: Mapping[str, Any], goes_on: bool
+) -> ResolvedOptions:
+    try:
+        revised: BaseModel = kind.revise(before.complete.model_dump(mode="json"), changes)
+        if before.requested is None:
+            return ResolvedOptions(revised, None)
+        requested = kind.revise_requested(before.requested, kind.as_requested(changes))
+        return ResolvedOptions(revised if goes_on else resolve_requested(kind, requested), requested)
     except (ValidationError, InvalidSettingsError) as error:
         raise options_error(error) from None
 

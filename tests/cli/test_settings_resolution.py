@@ -138,7 +138,7 @@ def by_http(options: Mapping[str, Any]) -> Outcome:
 
 
 def _accepted(options: Mapping[str, Any]) -> ReconstructionConfig:
-    found = asyncio.run(resolve_options(get_job_kind("reconstruct"), options))
+    found = asyncio.run(resolve_options(get_job_kind("reconstruct"), options)).complete
     stored = json.loads(json.dumps(found.model_dump(mode="json")))
     return ReconstructionConfig.model_validate(stored)
 

@@ -21,8 +21,8 @@ from octasplat.workers.db.rows import Artifact, Job, JobEvent
 from octasplat.workers.queue.jobs import NewJob, artifacts_of, cancel_job, create_job, retry_job
 from octasplat.workers.queue.procrastinate_queue import ProcrastinateQueue
 from octasplat.workers.storage.factory import open_storage
+from tests.support.releases import ROOT, Release
 
-ROOT = Path(__file__).parents[2]
 FAST = {
     "HEARTBEAT_SECONDS": "0.4",
     "RESCUE_SECONDS": "0.3",
@@ -58,14 +58,12 @@ class WorkerHarness:
         return self.folder.with_name(f"{self.folder.name}.gate")
 
     def worker(
-        self, *, queues: str = "cpu", name: str = "w", root: Path = ROOT, **settings: str
+        self, *, queues: str = "cpu", name: str = "w", release: Release | None = None, **settings: str
     ) -> "subprocess.Popen[bytes]":
-        """Start a worker in a process, of the version in the folder ``root``."""
-        # The toy of the release before lies elsewhere.
-        folders = (root / "src", root) if root == ROOT else (root / "src", root, root / "tests" / "work")
+        """Start a worker in a process, of an installed release or of the sources."""
         given = {
             **FAST,
-            **({} if root == ROOT else {"KIND_MODULES": '["toy_kind"]'}),
+            **({} if release is None else {"KIND_MODULES": '["toy_kind"]'}),
             "STALE_SECONDS": str(self.stale_seconds),
             "STORAGE": str(self.folder / "store"),
             "WORK": str(self.folder / f"work-{name}"),
@@ -75,14 +73,17 @@ class WorkerHarness:
             **os.environ,
             **{f"OCTASPLAT_{key}": value for key, value in given.items()},
             "DATABASE_URL": self.conninfo,
-            "PYTHONPATH": os.pathsep.join(map(str, folders)),
+            "PYTHONPATH": os.pathsep.join([str(ROOT / "src"), str(ROOT)]) if release is None else "",
             "OMP_NUM_THREADS": "1",
             "NUMBA_NUM_THREADS": "2",
             "A_SECRET_TOKEN": "must not reach the child",
         }
-        command = [sys.executable, "-m", "octasplat", "worker", "--queues", queues, "--name", name]
+        python = sys.executable if release is None else str(release.python)
+        command = [python, "-m", "octasplat", "worker", "--queues", queues, "--name", name]
         with (self.folder / f"{name}.log").open("ab") as log:
-            process = subprocess.Popen(command, env=environment, cwd=root, stderr=log)
+            process = subprocess.Popen(
+                command, env=environment, cwd=ROOT if release is None else self.folder, stderr=log
+            )
         self.processes.append(process)
         return process
 

@@ -1,21 +1,20 @@
 """While a service is brought up to date, two versions of it work side by side and lose nothing."""
 
 import asyncio
-import io
+import json
 import os
-import re
 import subprocess
-import sys
-import tarfile
 import time
 import urllib.request
 import uuid
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
+import psycopg
 import pytest
 
-from octasplat.engine.core import versions
 from octasplat.workers.db.connections import Connection
 from octasplat.workers.db.migrate import migrate
 from octasplat.workers.postgres.embedded import EmbeddedPostgres
@@ -23,11 +22,10 @@ from octasplat.workers.queue.jobs import NewJob, cancel_job, create_job
 from octasplat.workers.queue.procrastinate_queue import ProcrastinateQueue
 from tests.support import lock_order_check
 from tests.support.postgres_fixtures import copied_database
-from tests.support.service_harness import BEARER, TOKEN, committed_dataset, running_service
-from tests.support.worker_harness import MAX_WAIT_SECONDS, ROOT, WorkerHarness
+from tests.support.releases import Release, install_current, install_previous
+from tests.support.service_harness import BEARER, api_environment, committed_dataset, running_service
+from tests.support.worker_harness import MAX_WAIT_SECONDS, WorkerHarness
 
-PREVIOUS = "6f3bf281170c"
-"""The commit of the release before this one; it is installed from the repository."""
 STALE_SECONDS = 6.0
 """After which others take a dead worker's jobs, and by half of which a busy machine does not hold one up."""
 
@@ -40,26 +38,14 @@ def bench(conninfo: str, tmp_path: Path) -> Iterator[WorkerHarness]:
     bench.close()
 
 
-@pytest.fixture
-def previous(tmp_path: Path) -> Path:
-    """The folder of the release before this one."""
-    folder = tmp_path / "previous"
-    command = ["git", "archive", PREVIOUS, "engine", "workers", "service", "src", "tests/work"]
-    try:
-        made = subprocess.run(command, cwd=ROOT, capture_output=True, check=True)
-    except (OSError, subprocess.CalledProcessError):
-        pytest.skip(f"the commit {PREVIOUS} is not here")
-    with tarfile.open(fileobj=io.BytesIO(made.stdout)) as archive:
-        archive.extractall(folder, filter="data")
-    return folder
+@pytest.fixture(scope="module")
+def previous(tmp_path_factory: pytest.TempPathFactory) -> Release:
+    return install_previous(tmp_path_factory.mktemp("previous"))
 
 
-def results_version(folder: Path) -> int:
-    """The number of the results that the release in ``folder`` gives."""
-    source = (folder / "engine" / "versions.py").read_text(encoding="utf-8")
-    found = re.search(r"^RESULTS = (\d+)$", source, re.MULTILINE)
-    assert found is not None
-    return int(found[1])
+@pytest.fixture(scope="module")
+def current(tmp_path_factory: pytest.TempPathFactory) -> Release:
+    return install_current(tmp_path_factory.mktemp("current"))
 
 
 async def submit_many(connection: Connection) -> list[uuid.UUID]:
@@ -121,72 +107,182 @@ def test_versions_with_other_results_are_not_mixed(bench: WorkerHarness) -> None
     assert starts(bench, job_id) == [0] and "begins anew" in bench.log(job_id)
 
 
-def test_previous_release_works_beside_current(
-    postgres: EmbeddedPostgres, previous: Path, tmp_path: Path
-) -> None:
-    """Each resumes what the other began if their results are the same; the earlier front end answers."""
+@dataclass
+class Service:
+    """A service that is brought up to date, process by process: the front end and workers of two releases."""
+
+    bench: WorkerHarness
+    previous: Release
+    current: Release
+    front_end: "subprocess.Popen[bytes] | None" = None
+    address: str = ""
+
+    def migrate(self, release: Release) -> None:
+        command = [release.python, "-m", "octasplat", "migrate"]
+        environment = {**os.environ, "DATABASE_URL": self.bench.conninfo, "PYTHONPATH": ""}
+        subprocess.run(command, cwd=self.bench.folder, env=environment, check=True, stdout=subprocess.DEVNULL)
+
+    def start_front_end(self, release: Release) -> None:
+        """Start the front end of a release in the place of the one that runs."""
+        self.stop_front_end()
+        environment = {
+            **api_environment(self.bench.conninfo, self.bench.folder),
+            "OCTASPLAT_STORAGE": str(self.bench.folder / "store"),
+            "OCTASPLAT_KIND_MODULES": '["toy_kind"]',
+            "PYTHONPATH": "",
+        }
+        command = [release.python, "-m", "octasplat", "api"]
+        self.front_end = subprocess.Popen(
+            command, cwd=self.bench.folder, env=environment, stdout=subprocess.PIPE
+        )
+        assert self.front_end.stdout is not None
+        self.address = self.front_end.stdout.readline().decode().strip()
+
+    def stop_front_end(self) -> None:
+        if self.front_end is not None:
+            assert self.front_end.stdout is not None
+            self.front_end.terminate()
+            self.front_end.wait(60)
+            self.front_end.stdout.close()
+            self.front_end = None
+
+    def replace_worker(self, name: str, process: "subprocess.Popen[bytes]") -> "subprocess.Popen[bytes]":
+        """Start a worker of the current release, and stop the earlier one as a rollout does."""
+        started = self.bench.worker(name=name, release=self.current)
+        self.bench.wait_until_up(name)
+        process.terminate()
+        assert process.wait(MAX_WAIT_SECONDS) == 0
+        return started
+
+    def ask(self, path: str, body: dict[str, Any] | None = None) -> bytes:
+        data = None if body is None else json.dumps(body).encode()
+        headers = {**BEARER, "Content-Type": "application/json"}
+        asked = urllib.request.Request(f"{self.address}{path}", data=data, headers=headers)
+        with urllib.request.urlopen(asked, timeout=60) as answer:
+            return bytes(answer.read())
+
+    def submit(self, **options: Any) -> uuid.UUID:
+        with psycopg.connect(self.bench.conninfo) as connection:
+            dataset = uuid.uuid4()
+            query = (
+                "INSERT INTO datasets (id, owner, name, state, photographs) "
+                "VALUES (%s, 'local', 'x', 'committed', 8)"
+            )
+            connection.execute(query, [dataset])
+        body = {"kind": "toy", "dataset_id": str(dataset), "options": options}
+        return uuid.UUID(json.loads(self.ask("/v1/jobs", body))["id"])
+
+    def submit_held(self, gate: Path) -> uuid.UUID:
+        """Queue a job, and wait until it is held and its checkpoint stored, by columns that both know."""
+        job_id = self.submit(**self.bench.wait_until_held(gate=str(gate)))
+        query = "SELECT state = 'running' AND checkpoint['step'] = '30' FROM jobs WHERE id = %s"
+        deadline = time.monotonic() + MAX_WAIT_SECONDS
+        with psycopg.connect(self.bench.conninfo, autocommit=True) as connection:
+            while connection.execute(query, [job_id]).fetchone() != (True,):
+                assert time.monotonic() < deadline, self.bench.worker_logs()
+                time.sleep(0.1)
+        return job_id
+
+    def check_succeeded(self, job_id: uuid.UUID, worker: str, begun_at: list[int]) -> None:
+        """Check by the front end that a job ended well, where it did and where its attempts began."""
+        assert self.bench.wait_until_finished(job_id).state == "succeeded"
+        job = json.loads(self.ask(f"/v1/jobs/{job_id}"))
+        assert (job["state"], self.bench.job(job_id).worker) == ("succeeded", worker)
+        history = self.ask(f"/v1/jobs/{job_id}/artifacts/history.txt").decode()
+        assert [int(line) for line in history.split()] == begun_at
+        total = int(self.ask(f"/v1/jobs/{job_id}/artifacts/sum.txt"))
+        assert total == sum(range(job["options"]["steps"] + 1))
+
+    def begun_twice(self, step: int) -> list[int]:
+        """Where the attempts begin of a job that the releases do one after the other, the first to a step."""
+        return [0, step] if self.previous.results == self.current.results else [0]
+
+
+@pytest.fixture
+def service(
+    postgres: EmbeddedPostgres, previous: Release, current: Release, tmp_path: Path
+) -> Iterator[Service]:
     with copied_database(postgres, "template0") as conninfo:
         bench = WorkerHarness(conninfo, tmp_path, stale_seconds=STALE_SECONDS)
-        environment = {**os.environ, "DATABASE_URL": conninfo, "PYTHONPATH": str(previous / "src")}
-        settings = {
-            "DATA": str(tmp_path),
-            "PORT": "0",
-            "STORAGE": str(tmp_path / "store"),
-            "FLOOR_BYTES": "0",
-            "TOKEN": TOKEN,
-        }
-        front = subprocess.Popen(
-            [sys.executable, "-m", "octasplat", "api"],
-            cwd=previous,
-            env={**environment, **{f"OCTASPLAT_{name}": value for name, value in settings.items()}},
-            stdout=subprocess.PIPE,
-        )
-        assert front.stdout is not None
+        service = Service(bench, previous, current)
         try:
-            address = front.stdout.readline().decode().strip()  # its tables are there
-            old = bench.worker(name="old", root=previous)
-            bench.wait_until_up("old")
-            migrate(conninfo)  # beside the front end and the worker of the earlier release
-            gates = [str(tmp_path / f"gate-{number}") for number in range(3)]
-            begun = bench.submit(options=bench.wait_until_held(gate=gates[0]))
-            bench.wait_at_gate(begun)
-            bench.worker(name="old-too", root=previous)
-            stays = bench.submit(options=bench.wait_until_held(gate=gates[1]))
-            bench.wait_at_gate(stays)
-
-            new = bench.worker(name="new")
-            bench.wait_until_up("new")
-            old.kill()
-            # Only the other old worker is free for what the killed one had begun.
-            handed_back = bench.submit(options=bench.wait_until_held(gate=gates[2]))
-            bench.wait_at_gate(handed_back)
-            assert bench.job(handed_back).worker == "new"
-            Path(gates[1]).touch()
-            assert bench.wait_until_finished(stays).worker == "old-too"
-            bench.wait(begun, lambda job: job.worker == "old-too")
-            Path(gates[0]).touch()
-            assert bench.wait_until_finished(begun).state == "succeeded" and starts(bench, begun) == [0, 30]
-            asked = urllib.request.Request(f"{address}/v1/jobs/{begun}", headers=BEARER)
-            with urllib.request.urlopen(asked, timeout=30) as answer:
-                assert b'"succeeded"' in answer.read()
-
-            new.kill()
-            bench.wait(handed_back, lambda job: job.worker == "old-too")
-            Path(gates[2]).touch()
-            done = bench.wait_until_finished(handed_back)
-            has_same_results = results_version(previous) == versions.RESULTS_VERSION
-            begun_at = [0, 30] if has_same_results else [0]
-            assert (done.state, starts(bench, handed_back)) == ("succeeded", begun_at)
-            assert ("begins anew" in bench.log(handed_back)) != has_same_results
+            service.migrate(previous)
+            service.start_front_end(previous)
+            yield service
         finally:
-            front.terminate()
-            front.wait(30)
-            front.stdout.close()
+            service.stop_front_end()
             bench.close()
 
 
+def test_front_end_is_upgraded_before_workers(service: Service) -> None:
+    """Jobs are under way at both changes, and those of the new front end are run by the old worker."""
+    bench = service.bench
+    old = bench.worker(name="old", release=service.previous)
+    under_way = service.submit_held(bench.folder / "first")
+    service.migrate(service.current)
+    service.start_front_end(service.current)
+    by_new_front_end = service.submit(steps=3)
+    (bench.folder / "first").touch()
+    service.check_succeeded(under_way, "old", [0])
+    service.check_succeeded(by_new_front_end, "old", [0])
+
+    under_way = service.submit_held(bench.folder / "second")
+    service.replace_worker("new", old)
+    bench.wait(under_way, lambda job: job.worker == "new")
+    (bench.folder / "second").touch()
+    service.check_succeeded(under_way, "new", service.begun_twice(35))
+
+
+def test_workers_are_upgraded_before_front_end(service: Service) -> None:
+    """Jobs are under way at both changes, and those of the old front end are run by the new worker."""
+    bench = service.bench
+    old = bench.worker(name="old", release=service.previous)
+    under_way = service.submit_held(bench.folder / "first")
+    service.migrate(service.current)
+    service.replace_worker("new", old)
+    bench.wait(under_way, lambda job: job.worker == "new")
+    by_old_front_end = service.submit(steps=3)
+    (bench.folder / "first").touch()
+    service.check_succeeded(under_way, "new", service.begun_twice(35))
+    service.check_succeeded(by_old_front_end, "new", [0])
+
+    under_way = service.submit_held(bench.folder / "second")
+    service.start_front_end(service.current)
+    (bench.folder / "second").touch()
+    service.check_succeeded(under_way, "new", [0])
+
+
+def test_releases_go_on_with_jobs_of_each_other(service: Service) -> None:
+    """Workers of both are killed; each goes on with what the other began if their results are the same."""
+    bench = service.bench
+    gates = [bench.folder / f"gate-{number}" for number in range(3)]
+    old = bench.worker(name="old", release=service.previous)
+    begun = service.submit_held(gates[0])
+    bench.worker(name="old-too", release=service.previous)
+    stays = service.submit_held(gates[1])
+    service.migrate(service.current)
+
+    new = bench.worker(name="new", release=service.current)
+    bench.wait_until_up("new")
+    old.kill()
+    # Only the other old worker is free for what the killed one had begun.
+    handed_back = service.submit_held(gates[2])
+    assert bench.job(handed_back).worker == "new"
+    gates[1].touch()
+    service.check_succeeded(stays, "old-too", [0])
+    bench.wait(begun, lambda job: job.worker == "old-too")
+    gates[0].touch()
+    service.check_succeeded(begun, "old-too", [0, 30])
+
+    new.kill()
+    bench.wait(handed_back, lambda job: job.worker == "old-too")
+    gates[2].touch()
+    service.check_succeeded(handed_back, "old-too", service.begun_twice(30))
+    assert ("begins anew" in bench.log(handed_back)) != (len(service.begun_twice(30)) == 2)
+
+
 async def test_previous_release_takes_jobs_of_current_front_end(
-    postgres: EmbeddedPostgres, previous: Path, tmp_path: Path
+    postgres: EmbeddedPostgres, previous: Release, tmp_path: Path
 ) -> None:
     """Settings that only the current version knows are default, and so no reason to leave the job."""
     with copied_database(postgres, "template0") as conninfo:
@@ -197,10 +293,10 @@ async def test_previous_release_takes_jobs_of_current_front_end(
                 body = {
                     "kind": "reconstruct",
                     "dataset_id": await committed_dataset(service),
-                    "options": {"train": {"iterations": 50}},
+                    "options": {"preset": "fast", "train": {"iterations": 50}},
                 }
                 job = (await http.post("/v1/jobs", json=body)).json()
-                await asyncio.to_thread(bench.worker, name="old", root=previous)
+                await asyncio.to_thread(bench.worker, name="old", release=previous)
                 async with asyncio.timeout(MAX_WAIT_SECONDS):
                     while (now := (await http.get(f"/v1/jobs/{job['id']}")).json())["attempt"] == 0:
                         await asyncio.sleep(0.1)

@@ -72,7 +72,10 @@ class Job:
         dataset_id: what it works on.
         source_id: the finished job whose results it works on.
         label: what its owner calls it.
-        options: what was asked for; what is not there is default, by the version that runs it.
+        requested: the options as they were asked for, which the version that runs the job completes; None
+            where a front end of the last version queued it.
+        options: the options as the front end completed them, without what is default: for workers of the
+            last version, and to tell what is to be expected.
         settings: every option, as the version ``resolved_by`` completed them where the job ran last.
         resolved_by: that version.
         queue: which workers may take it.
@@ -150,6 +153,7 @@ class Job:
     resolved_by: str | None = None
     waits_for: str | None = None
     begun_anew: str | None = None
+    requested: dict[str, Any] | None = None
 
     @property
     def is_over(self) -> bool:

@@ -33,6 +33,24 @@ class NewJob:
     traceparent: str | None = None
     estimate: Mapping[str, Any] | None = None
     files_id: uuid.UUID | None = None
+    requested: Mapping[str, Any] | None = None
+
+
+@dataclass(frozen=True)
+class RevisedOptions:
+    """Options in the place of those of a job that is tried again; see :class:`octasplat.workers.db.rows.Job`.
+
+    Attributes:
+        options: without defaults.
+        requested: as asked for; None where those before are not known so.
+        settings: every option, of a job that goes on from its checkpoint.
+        estimate: what the job will take.
+    """
+
+    options: Mapping[str, Any]
+    requested: Mapping[str, Any] | None
+    settings: Mapping[str, Any] | None
+    estimate: Mapping[str, Any] | None
 
 
 async def create_job(connection: Connection, job_queue: JobQueue, new: NewJob) -> Job:
@@ -43,13 +61,13 @@ async def create_job(connection: Connection, job_queue: JobQueue, new: NewJob) -
         await connection.execute(
             """
             INSERT INTO jobs (id, owner, kind, dataset_id, source_id, label, options, queue, priority, slip,
-                              traceparent, estimate, files_id)
-            VALUES (%s, %s, %s, %s, %s, %s, %s, %s, %s, %s, %s, %s, %s)
+                              traceparent, estimate, files_id, requested)
+            VALUES (%s, %s, %s, %s, %s, %s, %s, %s, %s, %s, %s, %s, %s, %s)
             """,
             [
                 job_id, new.owner, new.kind, new.dataset_id, new.source_id, new.label,
                 as_json(dict(new.options)), new.queue, new.priority, entry_id, new.traceparent,
-                as_json_or_null(new.estimate), new.files_id,
+                as_json_or_null(new.estimate), new.files_id, as_json_or_null(new.requested),
             ],
         )  # fmt: skip
         for dataset_id in filter(None, (new.dataset_id, new.files_id)):
@@ -179,8 +197,7 @@ async def retry_job(
     job_id: uuid.UUID,
     *,
     from_start: bool,
-    options: Mapping[str, Any] | None = None,
-    estimate: Mapping[str, Any] | None = None,
+    revised: RevisedOptions | None = None,
 ) -> Job:
     """Queue a failed or cancelled job again.
 
@@ -189,8 +206,7 @@ async def retry_job(
         job_queue: the queue.
         job_id: which.
         from_start: begin from the start, not from the newest checkpoint.
-        options: options in the place of the job's own.
-        estimate: with them, what the job will take.
+        revised: options in the place of the job's own.
 
     Raises:
         ConflictError: it is neither failed nor cancelled.
@@ -209,23 +225,39 @@ async def retry_job(
                 begun_anew = CASE WHEN %(fresh)s THEN NULL ELSE begun_anew END,
                 psnr = CASE WHEN %(fresh)s THEN NULL ELSE psnr END,
                 training_psnr = CASE WHEN %(fresh)s THEN NULL ELSE training_psnr END,
-                fresh_after = CASE WHEN %(forget)s THEN attempt ELSE fresh_after END,
-                options = coalesce(%(options)s, options),
-                settings = CASE WHEN %(options)s::jsonb IS NULL THEN settings END,
-                resolved_by = CASE WHEN %(options)s::jsonb IS NULL THEN resolved_by END,
-                estimate = CASE WHEN %(options)s::jsonb IS NULL THEN estimate ELSE %(estimate)s END
+                fresh_after = CASE WHEN %(forget)s THEN attempt ELSE fresh_after END
             WHERE id = %(id)s
             """,
             {
                 "fresh": from_start,
-                "forget": from_start or options is not None,
-                "options": as_json_or_null(options),
-                "estimate": as_json_or_null(estimate),
+                "forget": from_start or revised is not None,
                 "id": job_id,
             },
         )
+        if revised is not None:
+            await _revise_options(connection, job_id, revised)
         await requeue_job(connection, job_queue, job)
         return await _get_job_or_raise(connection, job_id)
+
+
+async def _revise_options(connection: Connection, job_id: uuid.UUID, revised: RevisedOptions) -> None:
+    await connection.execute(
+        """
+        UPDATE jobs SET options = %s, estimate = %s, settings = %s,
+            resolved_by = CASE WHEN %s THEN resolved_by END
+        WHERE id = %s
+        """,
+        [
+            as_json(dict(revised.options)),
+            as_json_or_null(revised.estimate),
+            as_json_or_null(revised.settings),
+            revised.settings is not None,
+            job_id,
+        ],
+    )
+    # By itself: where the options change alone, the database takes it for a front end that knows no others.
+    query = "UPDATE jobs SET requested = %s WHERE id = %s"
+    await connection.execute(query, [as_json_or_null(revised.requested), job_id])
 
 
 async def requeue_job(

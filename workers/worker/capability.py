@@ -4,17 +4,20 @@ A job that this version does not know is left to a newer worker, and no attempt 
 """
 
 import uuid
+from collections.abc import Sequence
 from typing import Any
 
 from pydantic import ValidationError
 
 from octasplat.engine.core import versions
 from octasplat.engine.core.errors import ConfigError
+from octasplat.engine.settings.refusals import InvalidSettingsError
 from octasplat.workers.db.connections import Pool
 from octasplat.workers.db.rows import Job
 from octasplat.workers.db.workers import live_workers
 from octasplat.workers.queue.jobs import get_job
 from octasplat.workers.worker.job_kinds import get_job_kind, job_kinds
+from octasplat.workers.worker.job_kinds.stored_options import resolve_here
 from octasplat.workers.worker.workspace import Checkpoint
 
 
@@ -49,10 +52,15 @@ async def reason_incapable(pool: Pool, job_id: uuid.UUID, stale_seconds: float) 
 def _unknown_to_version(job: Job) -> str | None:
     """Return what this version does not know of a job, or None."""
     try:
-        get_job_kind(job.kind).options.model_validate(job.options)
+        kind = get_job_kind(job.kind)
     except ConfigError:
         return f"the kind {job.kind} is unknown here"
+    try:
+        resolve_here(kind, job)
     except ValidationError as error:  # it was valid where it was accepted
-        where = ".".join(str(part) for part in error.errors()[0]["loc"])
-        return f"the option {where} means nothing here"
-    return None
+        where: Sequence[object] = error.errors()[0]["loc"]
+    except InvalidSettingsError as error:
+        where = error.refusals[0].path
+    else:
+        return None
+    return f"the option {'.'.join(str(part) for part in where)} means nothing here"

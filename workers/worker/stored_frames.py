@@ -21,7 +21,7 @@ from octasplat.workers.storage.trees import TreeFile
 from octasplat.workers.storage.untrusted_folder import UntrustedFolder
 from octasplat.workers.storage.verified_copy import check_content
 from octasplat.workers.worker.job_kinds import get_job_kind
-from octasplat.workers.worker.job_kinds.stored_options import options_of
+from octasplat.workers.worker.job_kinds.stored_options import resolve_here
 from octasplat.workers.worker.task import FRAMES_FOLDER, MOVED_RESULTS_FILE, RUN_FOLDER
 
 _FRAMES = f"{RUN_FOLDER}/{FRAMES_FOLDER}/"
@@ -127,7 +127,7 @@ def removes_stored_frames(job: Job) -> bool:
     """Return whether finished frames of a job leave its folder; not where its kind is unknown here."""
     with contextlib.suppress(ConfigError, ValidationError):
         kind = get_job_kind(job.kind)
-        return kind.removes_stored_frames(options_of(kind, job))
+        return kind.removes_stored_frames(resolve_here(kind, job))
     return False
 
 

@@ -35,7 +35,7 @@ from octasplat.workers.worker.child_process import ChildProcess
 from octasplat.workers.worker.context import DatabaseLostError, WorkerContext
 from octasplat.workers.worker.heartbeat import DATABASE_ERRORS, Heartbeat
 from octasplat.workers.worker.job_kinds import JobKind, get_job_kind
-from octasplat.workers.worker.job_kinds.stored_options import options_of
+from octasplat.workers.worker.job_kinds.stored_options import resolve_here
 from octasplat.workers.worker.kernels import compile_for_job
 from octasplat.workers.worker.outcomes import OutcomeWriter
 from octasplat.workers.worker.path_redaction import PathRedactor, redact_json
@@ -65,6 +65,7 @@ class StopReason(Enum):
     DISK_LIMIT = "its folder took more than allowed"
     DISK_RESERVE = "it took room that is reserved"
     HIDDEN_FILES = "its folder could not be measured"
+    UNWATCHED = "its limits could not be watched any more"
 
 
 class Supervisor:
@@ -169,7 +170,7 @@ class Supervisor:
     async def _prepare(self, kind: JobKind) -> dict[str, Any]:
         """Fill the workspace; returns the child's task."""
         job, settings = self._job, self._settings
-        options = options_of(kind, job)
+        options = resolve_here(kind, job)
         complete = options.model_dump(mode="json")
         await self._attempt.record_settings(complete, __version__)
         scene, title = None, ""
@@ -270,6 +271,9 @@ class Supervisor:
                 f"The job's folder holds folders that cannot be read, or more than {MAX_DEPTH} in each other."
             )
             await self._outcomes.fail({"type": UntrustedFileError.error_type, "message": message})
+        elif reason is StopReason.UNWATCHED:
+            message = "The job was stopped, as its limits could not be watched; see the log of the worker."
+            await self._outcomes.requeue_or_fail({"type": "unwatched", "message": message})
         elif reason is StopReason.DISK_RESERVE:
             taken = self._workspace.peak_used_bytes()
             message = f"The job was stopped with {taken} bytes in its folder, as its disk was full."
@@ -304,6 +308,7 @@ class Supervisor:
         """Wait for the child's end, and stop it when something requires that."""
         exited = asyncio.create_task(child.wait())
         limits = asyncio.create_task(self._watch_limits(child))
+        limits.add_done_callback(self._on_limits_end)
         is_asked_to_stop = False
         try:
             while not exited.done():
@@ -375,6 +380,12 @@ class Supervisor:
                 self._stop(StopReason.DISK_RESERVE)
         except StorageError as error:
             logger.info("the disk of job %s was not looked at: %s", self._job.id, error)
+
+    def _on_limits_end(self, limits: "asyncio.Task[None]") -> None:
+        """Stop a child that nobody watches; the watch ends with it, or by an error."""
+        if not limits.cancelled() and (error := limits.exception()) is not None:
+            logger.error("the limits of job %s are not watched any more", self._job.id, exc_info=error)
+            self._stop(StopReason.UNWATCHED)
 
     def _stop(self, reason: StopReason) -> None:
         """Stop the child for ``reason``; the first reason counts, except for those that forbid writing."""

@@ -25,7 +25,7 @@ from octasplat.engine.operations.relight import OPERATION as RELIGHT
 from octasplat.engine.operations.render import OPERATION as RENDER
 from octasplat.engine.operations.stage_init import OPERATION as STAGE_INIT
 from octasplat.engine.operations.transform import OPERATION as TRANSFORM
-from octasplat.engine.runs.config import ReconstructionConfig
+from octasplat.engine.runs.config import ReconstructionConfig, revise_requested
 from octasplat.engine.train.config import MAX_PLANNED_ITERATIONS, iteration_count, max_gaussian_count
 from octasplat.workers.worker.job_kinds.image_kinds import RelightKind, RenderKind
 from octasplat.workers.worker.job_kinds.operation_kind import OperationKind
@@ -57,6 +57,14 @@ class ReconstructKind(OperationKind):
     def revise(self, options: Mapping[str, Any], changes: Mapping[str, Any]) -> ReconstructionConfig:
         """Return the options of a job with changes; another preset brings its own settings."""
         return options_from_json(changes).revised(options)
+
+    def as_requested(self, values: Mapping[str, Any]) -> dict[str, Any]:
+        """Return the given settings, those of the training by their places below ``train``."""
+        return options_from_json(values).requested()
+
+    def revise_requested(self, requested: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
+        """Return the given settings with changes; another preset brings its own settings."""
+        return revise_requested(requested, changes)
 
     def stages(self, options: ReconstructionConfig) -> tuple[str, ...]:
         """Return the stages, those that find poses among them if there are none."""

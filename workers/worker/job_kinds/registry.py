@@ -9,6 +9,7 @@ from typing_extensions import TypeVar
 from octasplat.engine.core.errors import ConfigError
 from octasplat.engine.dataset.image_sizes import ImageSizes
 from octasplat.engine.operations.cost_model import Estimate
+from octasplat.engine.settings.renamed_settings import replace_former_names
 from octasplat.workers.worker.job_kinds.resource_limits import ResourceDemand
 
 OptionsT = TypeVar("OptionsT", bound=BaseModel, default=Any)
@@ -71,8 +72,16 @@ class JobKind(Generic[OptionsT]):
         return self.options.model_validate(dict(values))
 
     def revise(self, options: Mapping[str, Any], changes: Mapping[str, Any]) -> OptionsT:
-        """Return the options of a job that is tried again with changes; raises as :meth:`resolve` does."""
+        """Return complete options with changes; raises as :meth:`resolve` does."""
         return self.resolve({**options, **changes})
+
+    def as_requested(self, values: Mapping[str, Any]) -> dict[str, Any]:
+        """Return what a user asks for as it is kept: under the present names, and nothing but that."""
+        return replace_former_names((self.user_options,), values)
+
+    def revise_requested(self, requested: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
+        """Return what a user asks for with changes; both are as :meth:`as_requested` keeps them."""
+        return {**requested, **changes}
 
     def stages(self, options: OptionsT) -> tuple[str, ...]:
         """Return the names of its stages, in order."""
