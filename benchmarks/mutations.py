@@ -272,7 +272,7 @@ def _short(text: str) -> str:
 
 def _exchange_code(path: Path, source: str) -> None:
     """Give the functions of the imported module at ``path`` the code that ``source`` has for them."""
-    module = sys.modules["octasplat." + ".".join(path.relative_to(ROOT).with_suffix("").parts)]
+    module = _module_at(path)
     changed = type(module)(module.__name__)
     sys.modules["changed"] = changed
     assert module.__file__ is not None
@@ -301,6 +301,17 @@ def _exchange_function(before: Any, after: Any) -> None:
     if isinstance(before, FunctionType) and isinstance(after, FunctionType):
         before.__code__ = after.__code__
         before.__defaults__, before.__kwdefaults__ = after.__defaults__, after.__kwdefaults__
+
+
+def _clear_caches(path: Path) -> None:
+    """Empty the caches of the functions of the imported module at ``path``."""
+    for value in vars(_module_at(path)).values():
+        if hasattr(value, "cache_clear"):
+            value.cache_clear()
+
+
+def _module_at(path: Path) -> Any:
+    return sys.modules["octasplat." + ".".join(path.relative_to(ROOT).with_suffix("").parts)]
 
 
 def _innermost(value: Any) -> Any:
@@ -396,6 +407,8 @@ class MutationRun:
         watch.start()
         for item, after in zip(items, [*items[1:], None], strict=True):
             watch.switch_context(item.nodeid)
+            for file in files:  # else a cached function is reached by the first test alone
+                _clear_caches(file)
             begun = time.perf_counter()
             item.config.hook.pytest_runtest_protocol(item=item, nextitem=after)
             seconds[item.nodeid] = time.perf_counter() - begun

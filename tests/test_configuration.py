@@ -63,6 +63,11 @@ def test_assignments_are_read_as_json_or_as_text() -> None:
     assert config.held_out == ("a=b.png",)
     for wrong in ("lr.quat", "=5", "lr.quat:5"):
         assert refusal(wrong).startswith(f"{wrong}: write an assignment as name=value")
+        with pytest.raises(InvalidSettingsError) as caught:
+            resolve_config(assignments=[wrong])
+        assert [(refused.path, refused.code) for refused in caught.value.refusals] == [
+            (("assignments",), "assignment")
+        ]
 
 
 def test_unknown_settings_are_refused_with_all_their_names() -> None:
@@ -76,6 +81,19 @@ def test_unknown_settings_are_refused_with_all_their_names() -> None:
     assert "train" in refusal("train=5")
 
 
+def test_former_settings_at_their_constants_are_no_unknown_settings() -> None:
+    assert resolve_config("fast", train={"trace": {"t_min": 0}}) == resolve_config("fast")
+    assert "t_min is no setting any more" in refusal("trace.t_min=1")
+
+
+def test_preset_without_materials_is_refused_at_the_preset() -> None:
+    with pytest.raises(InvalidSettingsError) as caught:
+        resolve_config("redisplats", materials=True)
+    assert [(refused.path, refused.code) for refused in caught.value.refusals] == [
+        (("preset",), "materials")
+    ]
+
+
 def test_materials_are_switched_on_by_flag_settings_or_assignment() -> None:
     expected = resolve_config("fast", materials=True)
     assert expected.train.materials.learn
@@ -85,6 +103,9 @@ def test_materials_are_switched_on_by_flag_settings_or_assignment() -> None:
         "fast"
     )
     assert "materials.learn" in refusal("materials.learn=perhaps")
+    others = resolve_config("fast", train={"materials": {"ray_bias": 0.5}})
+    assert not others.train.materials.learn
+    assert others.train.rays_per_batch == preset("fast").rays_per_batch
 
 
 def test_evaluation_background_follows_a_white_training() -> None:
@@ -154,6 +175,10 @@ def test_revised_materials_bring_their_settings_but_keep_changed_ones() -> None:
     assert after == resolve_config("fast", materials=True, assignments=["lr.quat=0.5", "iterations=7"])
     assert revise_config(as_json(after), materials=False) == before
     assert revise_config(as_json(after), materials=True) == after
+    densified = resolve_config("fast", assignments=["densify.dead_opacity=0.125"])
+    assert revise_config(as_json(densified), materials=True) == resolve_config(
+        "fast", materials=True, assignments=["densify.dead_opacity=0.125"]
+    )
     changed = resolve_config("fast", materials=True, train={"materials": {"ray_bias": 0.5}})
     off = revise_config(as_json(changed), assignments=["materials.learn=false"])
     assert (off.train.materials.learn, off.train.materials.ray_bias) == (False, 0.5)

@@ -246,7 +246,7 @@ def _read_assignment(assignment: str) -> tuple[list[str], Any]:
 
 
 def _preset_settings(preset_name: object, materials: bool) -> dict[str, Any]:
-    """Return the training settings of a preset; empty for an unknown preset, which validation refuses."""
+    """Return a preset's training settings as JSON; empty for an unknown preset, which validation refuses."""
     if preset_name not in PRESETS:
         return {}
     if materials and preset_name not in PRESETS_WITH_MATERIALS:
@@ -257,7 +257,7 @@ def _preset_settings(preset_name: object, materials: bool) -> dict[str, Any]:
         )
         raise InvalidSettingsError([Refusal(("preset",), "materials", sentence)])
     chosen = preset(str(preset_name))
-    return (with_materials(chosen) if materials else chosen).model_dump()
+    return (with_materials(chosen) if materials else chosen).model_dump(mode="json")
 
 
 def _learns_materials(train: Mapping[str, Any]) -> bool:
@@ -280,7 +280,7 @@ def _changed_values(base: Mapping[str, Any], values: Mapping[str, Any]) -> dict[
         if isinstance(value, Mapping) and isinstance(old, Mapping) and value.get("kind") == old.get("kind"):
             if inner := _changed_values(old, value):
                 found[key] = inner
-        elif value != (list(old) if isinstance(old, tuple) else old):
+        elif value != old:
             found[key] = value
     return found
 

@@ -115,9 +115,9 @@ def trace_reference(
     """
     p = parameters
     d = torch.tensor(rays.directions_world, dtype=torch.float64)
-    o = torch.tensor(rays.origins_world, dtype=torch.float64).expand_as(d)
+    o = torch.tensor(rays.origins_world).expand_as(d)
     t_min, t_max = (torch.tensor(limit).expand(len(d))[:, None] for limit in (rays.t_min, rays.t_max))
-    t_viewers = torch.tensor(rays.t_view_origin, dtype=torch.float64).expand(len(d))
+    t_viewers = torch.tensor(rays.t_view_origin).expand(len(d))
     frames = rotation_matrices(p.quats_wxyz)
     r1, r2, r3 = frames.unbind(-1)
     s2, s3 = p.log_scales.exp().unbind(-1)
