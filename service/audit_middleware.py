@@ -6,8 +6,9 @@ from typing import TYPE_CHECKING
 import psycopg
 from psycopg_pool import PoolTimeout
 from starlette.datastructures import Headers
-from starlette.types import ASGIApp, Message, Receive, Scope, Send
+from starlette.types import Message, Receive, Scope, Send
 
+from octasplat.service.http_middleware import HttpMiddleware
 from octasplat.workers.db.audit import add_entry
 
 if TYPE_CHECKING:
@@ -19,21 +20,11 @@ _UNAUDITED_METHODS = frozenset({"GET", "HEAD", "OPTIONS", "TRACE", "PUT"})
 """Reading, and the single files of datasets, whose commits are told."""
 
 
-class AuditMiddleware:
-    """Records changes in the audit log, with the caller if known and the outcome.
+class AuditMiddleware(HttpMiddleware):
+    """Records changes in the audit log, with the caller if known and the outcome."""
 
-    Args:
-        app: behind it.
-    """
-
-    def __init__(self, app: ASGIApp) -> None:
-        self._app = app
-
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+    async def handle(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Pass a request on, and send its response once it is recorded."""
-        if scope["type"] != "http":
-            await self._app(scope, receive, send)
-            return
         state = scope.setdefault("state", {})
         is_recorded = False
 

@@ -1,11 +1,14 @@
 """ETags for cheap polling and against lost updates."""
 
 import hashlib
+from typing import TypeVar
 
 from fastapi import Response
 from pydantic import BaseModel
 
 from octasplat.service.problems import ProblemError
+
+_ViewT = TypeVar("_ViewT", bound=BaseModel)
 
 
 def etag_matches(header: str | None, etag: str) -> bool:
@@ -36,10 +39,18 @@ def set_etag(response: Response, etag: str) -> None:
     response.headers.update({"ETag": etag, "Cache-Control": "no-cache"})
 
 
-def unchanged_response(if_none_match: str | None, etag: str) -> Response | None:
-    """Return the answer 304 if the caller knows the content with ``etag``, else None."""
+def unless_unchanged(response: Response, if_none_match: str | None, etag: str, view: _ViewT) -> _ViewT:
+    """Return what answers a request for a view: the view with its ETag, or 304 if the caller knows it.
+
+    Args:
+        response: the answer that gets the headers.
+        if_none_match: the ETag that the caller has.
+        etag: of the view.
+        view: what was asked for.
+    """
     if not etag_matches(if_none_match, etag):
-        return None
-    response = Response(status_code=304)
-    set_etag(response, etag)
-    return response
+        set_etag(response, etag)
+        return view
+    unchanged = Response(status_code=304)
+    set_etag(unchanged, etag)
+    return unchanged  # type: ignore[return-value]

@@ -9,13 +9,14 @@ from starlette.middleware.body_limit import RequestBodyLimitMiddleware
 from starlette.middleware.gzip import GZipMiddleware
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from octasplat.service.http_middleware import HttpMiddleware
 from octasplat.service.problems import ProblemError
 
 _LOCAL_HOSTS = frozenset({"localhost", "127.0.0.1", "::1"})
 _SAFE_METHODS = frozenset({"GET", "HEAD", "OPTIONS", "TRACE"})
 
 
-class AllowedHostsMiddleware:
+class AllowedHostsMiddleware(HttpMiddleware):
     """Accepts requests for this machine's own names only, against DNS rebinding.
 
     Args:
@@ -24,12 +25,12 @@ class AllowedHostsMiddleware:
     """
 
     def __init__(self, app: ASGIApp, names: tuple[str, ...] = ()) -> None:
-        self._app = app
+        super().__init__(app)
         self._names = _LOCAL_HOSTS | {name.lower() for name in names}
 
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+    async def handle(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Pass a request on, or answer 421."""
-        if scope["type"] == "http" and _host_name(Headers(scope=scope).get("host", "")) not in self._names:
+        if _host_name(Headers(scope=scope).get("host", "")) not in self._names:
             detail = (
                 "This service answers to localhost and 127.0.0.1 only; OCTASPLAT_ALLOWED_HOSTS adds more."
             )
@@ -38,37 +39,26 @@ class AllowedHostsMiddleware:
         await self._app(scope, receive, send)
 
 
-class MessageFramingMiddleware:
+class MessageFramingMiddleware(HttpMiddleware):
     """Refuses requests whose length is given in two ways, which servers on the way may read differently."""
 
-    def __init__(self, app: ASGIApp) -> None:
-        self._app = app
-
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+    async def handle(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Pass a request on, or answer 400 and close the connection (RFC 9112, section 6.1)."""
-        if scope["type"] == "http":
-            headers = Headers(scope=scope)
-            if "content-length" in headers and "transfer-encoding" in headers:
-                detail = "The request has both Content-Length and Transfer-Encoding; send one of them."
-                problem = ProblemError(400, "framing", detail, headers={"Connection": "close"})
-                await problem.response()(scope, receive, send)
-                return
+        headers = Headers(scope=scope)
+        if "content-length" in headers and "transfer-encoding" in headers:
+            detail = "The request has both Content-Length and Transfer-Encoding; send one of them."
+            problem = ProblemError(400, "framing", detail, headers={"Connection": "close"})
+            await problem.response()(scope, receive, send)
+            return
         await self._app(scope, receive, send)
 
 
-class SameOriginMiddleware:
+class SameOriginMiddleware(HttpMiddleware):
     """Refuses changes that a page of another site sends through a browser."""
 
-    def __init__(self, app: ASGIApp) -> None:
-        self._app = app
-
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+    async def handle(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Pass a request on, or answer 403."""
-        if (
-            scope["type"] == "http"
-            and scope["method"] not in _SAFE_METHODS
-            and _is_cross_site(Headers(scope=scope))
-        ):
+        if scope["method"] not in _SAFE_METHODS and _is_cross_site(Headers(scope=scope)):
             detail = "This request comes from a page of another site."
             await ProblemError(403, "origin", detail).response()(scope, receive, send)
             return
@@ -133,13 +123,10 @@ class CompressionMiddleware:
         await (self._app if is_stored else self._compressed)(scope, receive, send)
 
 
-class SecurityHeadersMiddleware:
+class SecurityHeadersMiddleware(HttpMiddleware):
     """Adds headers that forbid browsers to sniff types, frame pages and store responses."""
 
-    def __init__(self, app: ASGIApp) -> None:
-        self._app = app
-
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+    async def handle(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Add the headers to the response."""
 
         async def with_headers(message: Message) -> None:
@@ -151,7 +138,7 @@ class SecurityHeadersMiddleware:
                 ]
             await send(message)
 
-        await self._app(scope, receive, with_headers if scope["type"] == "http" else send)
+        await self._app(scope, receive, with_headers)
 
 
 _STORED_CONTENT = re.compile(

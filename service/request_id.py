@@ -6,7 +6,9 @@ import uuid
 from contextvars import ContextVar
 
 from starlette.datastructures import Headers, MutableHeaders
-from starlette.types import ASGIApp, Message, Receive, Scope, Send
+from starlette.types import Message, Receive, Scope, Send
+
+from octasplat.service.http_middleware import HttpMiddleware
 
 HEADER = "X-Request-ID"
 _VALID = re.compile(r"[A-Za-z0-9._:/+=-]{1,100}")
@@ -18,21 +20,11 @@ def current_request_id() -> str | None:
     return _current.get()
 
 
-class RequestIdMiddleware:
-    """Gives each request an id, that of its client or proxy where it sends one, and answers with it.
+class RequestIdMiddleware(HttpMiddleware):
+    """Gives each request an id, that of its client or proxy where it sends one, and answers with it."""
 
-    Args:
-        app: behind it.
-    """
-
-    def __init__(self, app: ASGIApp) -> None:
-        self._app = app
-
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+    async def handle(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Pass a request on with its id."""
-        if scope["type"] != "http":
-            await self._app(scope, receive, send)
-            return
         given = Headers(scope=scope).get(HEADER, "")
         request_id = given if _VALID.fullmatch(given) else uuid.uuid4().hex
 

@@ -89,9 +89,7 @@ def test_former_settings_at_their_constants_are_no_unknown_settings() -> None:
 def test_preset_without_materials_is_refused_at_the_preset() -> None:
     with pytest.raises(InvalidSettingsError) as caught:
         resolve_config("redisplats", materials=True)
-    assert [(refused.path, refused.code) for refused in caught.value.refusals] == [
-        (("preset",), "materials")
-    ]
+    assert [(refused.path, refused.code) for refused in caught.value.refusals] == [(("preset",), "materials")]
 
 
 def test_materials_are_switched_on_by_flag_settings_or_assignment() -> None:

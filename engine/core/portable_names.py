@@ -80,6 +80,18 @@ def check_name(name: str) -> str:
     return name
 
 
+def name_or(name: str, alternative: str) -> str:
+    """Return the name if it is valid, else the alternative, see :func:`check_name`.
+
+    Raises:
+        FileNameError: the alternative is not valid either.
+    """
+    try:
+        return check_name(name)
+    except FileNameError:
+        return check_name(alternative)
+
+
 def _check_component(component: str, quoted: str) -> None:
     if not component:
         raise FileNameError(

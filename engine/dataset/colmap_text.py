@@ -6,7 +6,7 @@ the check of its code that failed, which helps nobody to find the line.
 
 import codecs
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -103,14 +103,18 @@ def _read_lines(path: Path, repairs: list[str]) -> list[_Line]:
     return [(number, line.strip()) for number, line in numbered if not line.lstrip().startswith("#")]
 
 
+def _records(path: Path, lines: Sequence[_Line], what: str) -> Iterator[tuple[int, str, list[str]]]:
+    """Yield the lines with values, with their numbers and their values; refuse numbers that are none."""
+    for number, line in lines:
+        if parts := line.split():
+            _check_numbers(path, number, what, parts, {})
+            yield number, line, parts
+
+
 def _read_cameras(path: Path, lines: Sequence[_Line], repairs: list[str]) -> dict[int, CameraRecord]:
     cameras: dict[int, CameraRecord] = {}
     known = _KnownIds(path, "camera", repairs)
-    for number, line in lines:
-        parts = line.split()
-        if not parts:
-            continue
-        _check_numbers(path, number, "cameras", parts, {})
+    for number, line, parts in _records(path, lines, "cameras"):
         if len(parts) < 4 or not all(_is_integer(part) for part in (parts[0], *parts[2:4])):
             raise _line_error(path, number, "holds no camera (CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS)")
         models = pycolmap.CameraModelId.__members__.keys() - {"INVALID"}
@@ -180,11 +184,7 @@ def _read_images(path: Path, lines: Sequence[_Line], repairs: list[str]) -> dict
 def _read_points(path: Path, lines: Sequence[_Line], repairs: list[str]) -> dict[int, PointRecord]:
     points: dict[int, PointRecord] = {}
     known = _KnownIds(path, "point", repairs)
-    for number, line in lines:
-        parts = line.split()
-        if not parts:
-            continue
-        _check_numbers(path, number, "points3D", parts, {})
+    for number, line, parts in _records(path, lines, "points3D"):
         form = "holds no point (POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK)"
         try:
             point_id, rgb = int(parts[0]), [int(float(part)) for part in parts[4:7]]

@@ -1,6 +1,7 @@
 """Checks of ownership, and of whether the service accepts work at present."""
 
 import uuid
+from typing import Protocol, TypeVar
 
 from octasplat.service.auth import Principal
 from octasplat.service.problems import ProblemError, not_found_error
@@ -23,10 +24,7 @@ async def fetch_visible_job(
     Raises:
         ProblemError: 404 if it does not exist or the principal may not see it.
     """
-    job = await get_job(connection, job_id, lock=lock)
-    if job is None or not principal.may_see(job.owner):
-        raise not_found_error("job")
-    return job
+    return _if_visible(principal, await get_job(connection, job_id, lock=lock), "job")
 
 
 async def read_job(service: Service, principal: Principal, job_id: uuid.UUID) -> Job:
@@ -43,10 +41,7 @@ async def fetch_visible_dataset(
     Raises:
         ProblemError: 404 if it does not exist or the principal may not see it.
     """
-    dataset = await get_dataset(connection, dataset_id, lock=lock)
-    if dataset is None or not principal.may_see(dataset.owner):
-        raise not_found_error("dataset")
-    return dataset
+    return _if_visible(principal, await get_dataset(connection, dataset_id, lock=lock), "dataset")
 
 
 async def open_dataset(connection: Connection, principal: Principal, dataset_id: uuid.UUID) -> Dataset:
@@ -72,10 +67,21 @@ async def fetch_visible_webhook(
     Raises:
         ProblemError: 404 if it does not exist or the principal may not see it.
     """
-    endpoint = await get_webhook_endpoint(connection, webhook_id, lock=lock)
-    if endpoint is None or not principal.may_see(endpoint.owner):
-        raise not_found_error("webhook")
-    return endpoint
+    return _if_visible(principal, await get_webhook_endpoint(connection, webhook_id, lock=lock), "webhook")
+
+
+class _Owned(Protocol):
+    @property
+    def owner(self) -> str: ...
+
+
+_OwnedT = TypeVar("_OwnedT", bound=_Owned)
+
+
+def _if_visible(principal: Principal, row: _OwnedT | None, kind: str) -> _OwnedT:
+    if row is None or not principal.may_see(row.owner):
+        raise not_found_error(kind)
+    return row
 
 
 def check_searchable_name(name: str, kind: str) -> str:

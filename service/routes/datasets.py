@@ -11,7 +11,7 @@ from octasplat.service.actions import imports, uploads
 from octasplat.service.actions.usage import rate_limit_headers
 from octasplat.service.auth import Reader, Writer
 from octasplat.service.downloads import send_blob
-from octasplat.service.etags import check_precondition, set_etag, unchanged_response
+from octasplat.service.etags import check_precondition, set_etag, unless_unchanged
 from octasplat.service.intake.receive import parse_digest
 from octasplat.service.paging import Cursor, Limit, LongLimit, decode_cursor, decode_id_cursor, set_next_link
 from octasplat.service.problems import ProblemError
@@ -98,11 +98,7 @@ async def get_dataset(
 ) -> DatasetView:  # fmt: skip
     """Return one dataset."""
     dataset = await actions.get_dataset(service, principal, dataset_id)
-    etag = _dataset_etag(dataset)
-    if (unchanged := unchanged_response(if_none_match, etag)) is not None:
-        return unchanged  # type: ignore[return-value]
-    set_etag(response, etag)
-    return DatasetView.from_row(dataset)
+    return unless_unchanged(response, if_none_match, _dataset_etag(dataset), DatasetView.from_row(dataset))
 
 
 @router.patch("/{dataset_id}", responses={**with_headers(200, ETAG), **problem_responses(404, 412)})

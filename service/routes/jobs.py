@@ -11,7 +11,7 @@ from octasplat.service.actions.submission import retry_job as retry_again
 from octasplat.service.actions.submission import submit_job
 from octasplat.service.actions.usage import rate_limit_headers
 from octasplat.service.auth import Reader, Writer
-from octasplat.service.etags import check_precondition, set_etag, unchanged_response
+from octasplat.service.etags import check_precondition, set_etag, unless_unchanged
 from octasplat.service.paging import Cursor, Limit, decode_id_cursor, set_next_link
 from octasplat.service.routes import problem_responses
 from octasplat.service.routes.parameters import IdempotencyKey, IfMatch, IfNoneMatch, JobId
@@ -84,13 +84,9 @@ async def get_job(
 ) -> JobView:
     """Return a job; polling with `If-None-Match` is cheap."""
     job = await actions.get_job(service, principal, job_id)
-    etag = _job_etag(job)
-    if (unchanged := unchanged_response(if_none_match, etag)) is not None:
-        return unchanged  # type: ignore[return-value]
-    set_etag(response, etag)
     if not job.row.is_over:
         _set_retry_after(response, job.view)
-    return job.view
+    return unless_unchanged(response, if_none_match, _job_etag(job), job.view)
 
 
 @router.patch("/{job_id}", responses={**with_headers(200, ETAG), **problem_responses(404, 412)})

@@ -4,7 +4,7 @@ from fastapi import APIRouter, Response
 
 from octasplat.service.actions import tokens as actions
 from octasplat.service.auth import Admin, Reader, Writer
-from octasplat.service.etags import check_precondition, set_etag, unchanged_response, view_etag
+from octasplat.service.etags import check_precondition, set_etag, unless_unchanged, view_etag
 from octasplat.service.routes import problem_responses
 from octasplat.service.routes.parameters import IdempotencyKey, IfMatch, IfNoneMatch, TokenId
 from octasplat.service.routes.response_headers import ETAG, LOCATION, not_modified, with_headers
@@ -48,10 +48,7 @@ async def get_token(
 ) -> TokenView:  # fmt: skip
     """Return one of your tokens, without its secret."""
     view = TokenView.from_row(await actions.get_token(service, principal, token_id))
-    if (unchanged := unchanged_response(if_none_match, view_etag(view))) is not None:
-        return unchanged  # type: ignore[return-value]
-    set_etag(response, view_etag(view))
-    return view
+    return unless_unchanged(response, if_none_match, view_etag(view), view)
 
 
 @router.patch("/tokens/{token_id}", responses={**with_headers(200, ETAG), **problem_responses(404, 409, 412)})

@@ -4,7 +4,7 @@ from fastapi import APIRouter, Request, Response
 
 from octasplat.service.actions import webhooks as actions
 from octasplat.service.auth import Reader, Writer
-from octasplat.service.etags import check_precondition, set_etag, unchanged_response, view_etag
+from octasplat.service.etags import check_precondition, set_etag, unless_unchanged, view_etag
 from octasplat.service.paging import Cursor, Limit, decode_id_cursor, set_next_link
 from octasplat.service.routes import problem_responses
 from octasplat.service.routes.parameters import DeliveryId, IdempotencyKey, IfMatch, IfNoneMatch, WebhookId
@@ -59,10 +59,7 @@ async def get_webhook(
 ) -> WebhookView:  # fmt: skip
     """Return a webhook, without its secret."""
     view = WebhookView.from_row(await actions.get_webhook(service, principal, webhook_id))
-    if (unchanged := unchanged_response(if_none_match, view_etag(view))) is not None:
-        return unchanged  # type: ignore[return-value]
-    set_etag(response, view_etag(view))
-    return view
+    return unless_unchanged(response, if_none_match, view_etag(view), view)
 
 
 @router.patch("/{webhook_id}", responses={**with_headers(200, ETAG), **problem_responses(404, 412)})

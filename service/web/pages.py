@@ -6,7 +6,7 @@ import uuid
 from pathlib import PurePosixPath
 from typing import Annotated, Any, Literal
 
-from fastapi import APIRouter, Query, Request, Response
+from fastapi import APIRouter, Depends, Query, Request, Response
 from fastapi.responses import HTMLResponse, JSONResponse
 
 from octasplat.engine.core.scene_layout import FileRole, file_role
@@ -69,33 +69,41 @@ _REPORT_POLICY = (
 )
 
 
-@router.get("/")
-async def show_jobs(
-    request: Request,
+async def _job_list_context(
     principal: Reader,
     service: ServiceDep,
     show: StateFilter = "all",
     text: Search = None,
     cursor: Cursor = None,
-) -> Response:
+) -> dict[str, Any]:
+    """Return what the list of jobs shows."""
+    text = (text or "").strip()
+    before = decode_id_cursor(cursor)
+    part = await list_job_rows(service, principal, show, before, PAGE_SIZE, text=text or None)
+    return {
+        "lines": part.rows,
+        "next": None if part.next_key is None else encode_cursor(part.next_key),
+        "counts": await job_counts(service, principal),
+        "show": show,
+        "cursor": cursor,
+        "search": text,
+        "query": urllib.parse.urlencode({"show": show, **({"q": text} if text else {})}),
+    }
+
+
+JobListContext = Annotated[dict[str, Any], Depends(_job_list_context)]
+
+
+@router.get("/")
+async def show_jobs(request: Request, principal: Reader, context: JobListContext) -> Response:
     """Return the page with the list of jobs."""
-    values = await _job_list_context(service, principal, show, text, cursor)
-    return render_page(request, "jobs.html", principal, **values)
+    return render_page(request, "jobs.html", principal, **context)
 
 
 @router.get("/parts/jobs")
-async def show_job_list(
-    request: Request,
-    principal: Reader,
-    service: ServiceDep,
-    show: StateFilter = "all",
-    text: Search = None,
-    cursor: Cursor = None,
-) -> Response:
+async def show_job_list(request: Request, principal: Reader, context: JobListContext) -> Response:
     """Return the list of jobs without its page."""
-    return render_page(
-        request, "_jobs.html", principal, **await _job_list_context(service, principal, show, text, cursor)
-    )
+    return render_page(request, "_jobs.html", principal, **context)
 
 
 @router.get("/jobs/{job_id}")
@@ -257,23 +265,6 @@ async def _updated_page(
     response: HTMLResponse = render_page(request, "_status.html", principal, detail=detail)
     response.headers["HX-Trigger"] = json.dumps({"job-changed": {"state": detail.line.job.state}})
     return response
-
-
-async def _job_list_context(
-    service: Service, principal: Principal, show: StateFilter, text: str | None, cursor: str | None
-) -> dict[str, Any]:
-    text = (text or "").strip()
-    before = decode_id_cursor(cursor)
-    part = await list_job_rows(service, principal, show, before, PAGE_SIZE, text=text or None)
-    return {
-        "lines": part.rows,
-        "next": None if part.next_key is None else encode_cursor(part.next_key),
-        "counts": await job_counts(service, principal),
-        "show": show,
-        "cursor": cursor,
-        "search": text,
-        "query": urllib.parse.urlencode({"show": show, **({"q": text} if text else {})}),
-    }
 
 
 def _has_required_file(source_files: tuple[str, ...], names: dict[str, Artifact]) -> bool:

@@ -1,15 +1,14 @@
 """Options of the commands that talk to a service: what is asked for arrives, and nothing more is replaced."""
 
 import json
-import threading
 from collections.abc import Iterator
-from http.server import BaseHTTPRequestHandler, HTTPServer
 
 import pytest
 
 from octasplat.engine.core.events import PhaseFinished
 from octasplat.workers.client import submission
 from octasplat.workers.client.submission import Derivation, with_camera_path, with_stage
+from tests.support.http_server import QuietHandler, serve_http
 
 JOB = {
     "id": "01999999-0000-7000-8000-000000004711", "kind": "render", "label": None, "state": "failed",
@@ -23,31 +22,16 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[dict]]:
     """What is posted to a service with one job."""
     posted: list[dict] = []
 
-    class Service(BaseHTTPRequestHandler):
-        def do_GET(self) -> None:
-            self._answer()
+    class Service(QuietHandler):
+        def respond(self) -> None:
+            if self.command == "POST":
+                posted.append(json.loads(self.rfile.read(int(self.headers["Content-Length"]))))
+            self.answer(json.dumps(JOB).encode())
 
-        def do_POST(self) -> None:
-            posted.append(json.loads(self.rfile.read(int(self.headers["Content-Length"]))))
-            self._answer()
-
-        def _answer(self) -> None:
-            body = json.dumps(JOB).encode()
-            self.send_response(200)
-            self.send_header("Content-Length", str(len(body)))
-            self.end_headers()
-            self.wfile.write(body)
-
-        def log_message(self, *_: object) -> None:
-            pass
-
-    server = HTTPServer(("127.0.0.1", 0), Service)
-    threading.Thread(target=server.serve_forever, daemon=True).start()
-    monkeypatch.setenv("OCTASPLAT_SERVER", f"http://127.0.0.1:{server.server_port}")
-    monkeypatch.setenv("OCTASPLAT_TOKEN", "a-token")
-    yield posted
-    server.shutdown()
-    server.server_close()
+    with serve_http(Service) as address:
+        monkeypatch.setenv("OCTASPLAT_SERVER", address)
+        monkeypatch.setenv("OCTASPLAT_TOKEN", "a-token")
+        yield posted
 
 
 def test_nested_assignment_keeps_other_values(octasplat, asked: list[dict]) -> None:

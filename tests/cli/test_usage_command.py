@@ -2,16 +2,15 @@
 
 import io
 import json
-import threading
 import zipfile
 from collections.abc import Iterator
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
 import pytest
 from click.testing import CliRunner
 
 from octasplat.workers.cli.main import cli
+from tests.support.http_server import QuietHandler, serve_http
 
 JOB = "01a1fcac-4f59-764b-97e6-1be68502c58f"
 USAGE = {
@@ -27,35 +26,23 @@ def archive_of(content: bytes) -> bytes:
     return file.getvalue()
 
 
-class Answers(BaseHTTPRequestHandler):
+class Answers(QuietHandler):
     archive = archive_of(b"ply\n")
 
-    def do_GET(self) -> None:
+    def respond(self) -> None:
         known = {
             "/v1/usage": json.dumps(USAGE).encode(),
             f"/v1/jobs/{JOB}": json.dumps({"id": JOB}).encode(),
             f"/v1/jobs/{JOB}/artifacts": json.dumps({"artifacts": [{"size_bytes": 4}]}).encode(),
             f"/v1/jobs/{JOB}/archive": self.archive,
         }
-        content = known[self.path]
-        self.send_response(200)
-        self.send_header("Content-Length", str(len(content)))
-        self.end_headers()
-        self.wfile.write(content)
-
-    def log_message(self, format: str, *arguments: object) -> None:
-        """Write no log."""
+        self.answer(known[self.path])
 
 
 @pytest.fixture
 def server() -> Iterator[str]:
-    service = ThreadingHTTPServer(("127.0.0.1", 0), Answers)
-    thread = threading.Thread(target=service.serve_forever)
-    thread.start()
-    yield f"http://127.0.0.1:{service.server_port}"
-    service.shutdown()
-    service.server_close()
-    thread.join()
+    with serve_http(Answers) as address:
+        yield address
 
 
 def test_usage_shows_what_is_used_of_what_is_allowed(server: str) -> None:

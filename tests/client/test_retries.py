@@ -5,7 +5,7 @@ import json
 import threading
 import time
 from collections.abc import Callable, Iterator
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from http.server import ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +16,7 @@ from octasplat.workers.client.api import Api, ServiceError, ServiceUnreachableEr
 from octasplat.workers.client.download import download_results
 from octasplat.workers.client.upload import upload_files
 from octasplat.workers.client.watch import watch_job
+from tests.support.http_server import QuietHandler
 
 Answer = tuple[int, dict[str, str], bytes]
 AWAY_SECONDS = 12.5
@@ -29,21 +30,13 @@ class Front:
         self.asked: list[str] = []
         front = self
 
-        class Handler(BaseHTTPRequestHandler):
-            def handle_any(self) -> None:
+        class Handler(QuietHandler):
+            def respond(self) -> None:
                 length = int(self.headers.get("Content-Length") or 0)
                 body = self.rfile.read(length)
                 front.asked.append(f"{self.command} {self.path}")
                 status, headers, content = answer(self.command, self.path, dict(self.headers), body)
-                self.send_response(status)
-                for name, value in {"Content-Length": str(len(content)), **headers}.items():
-                    self.send_header(name, value)
-                self.end_headers()
-                self.wfile.write(content)
-
-            do_GET = do_POST = do_PUT = do_DELETE = handle_any
-
-            def log_message(self, *_arguments: object) -> None: ...
+                self.answer(content, status, **headers)
 
         self._handler = Handler
         self.port = 0

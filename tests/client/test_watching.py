@@ -3,29 +3,25 @@
 import json
 import threading
 import time
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from http.server import ThreadingHTTPServer
 
 import pytest
 
 from octasplat.workers.client import api
 from octasplat.workers.client.watch import watch_job
+from tests.support.http_server import QuietHandler
 
 
-class Front(BaseHTTPRequestHandler):
+class Front(QuietHandler):
     """Ends each stream of events after one, as one that is stopped does; in the end the job is over."""
 
     state = "running"
 
-    def do_GET(self) -> None:
+    def respond(self) -> None:
         body = b'id: 1\nevent: state\ndata: {"state": "running"}\n\n'
         if not self.path.endswith("/events"):
             body = json.dumps({"state": self.state}).encode()
-        self.send_response(200)
-        self.send_header("Content-Length", str(len(body)))
-        self.end_headers()
-        self.wfile.write(body)
-
-    def log_message(self, *_arguments: object) -> None: ...
+        self.answer(body)
 
 
 def serving(address: tuple[str, int]) -> ThreadingHTTPServer:

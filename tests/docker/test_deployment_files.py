@@ -4,15 +4,15 @@ import shutil
 import socket
 import subprocess
 import sys
-import threading
 import time
-from http.server import BaseHTTPRequestHandler, HTTPServer
+from collections.abc import Iterator
 from pathlib import Path
 from urllib.request import Request, urlopen
 
 import pytest
 
 from tests.docker.test_docker_files import DOCKER, ROOT, compose
+from tests.support.http_server import QuietHandler, serve_http
 
 DEPLOY = ROOT / "deploy"
 
@@ -78,16 +78,9 @@ def test_systemd_accepts_the_unit(tmp_path: Path) -> None:
         assert setting in text.splitlines()
 
 
-class _Echo(BaseHTTPRequestHandler):
-    def do_GET(self) -> None:
-        body = str({name.lower(): value for name, value in self.headers.items()}).encode()
-        self.send_response(200)
-        self.send_header("Content-Length", str(len(body)))
-        self.end_headers()
-        self.wfile.write(body)
-
-    def log_message(self, *_: object) -> None:
-        pass
+class _Echo(QuietHandler):
+    def respond(self) -> None:
+        self.answer(str({name.lower(): value for name, value in self.headers.items()}).encode())
 
 
 def free_port() -> int:
@@ -95,16 +88,21 @@ def free_port() -> int:
         return int(server.getsockname()[1])
 
 
-def test_nginx_passes_the_address_of_the_client_and_nothing_that_it_claims(tmp_path: Path) -> None:
+@pytest.fixture
+def service() -> Iterator[str]:
+    """The address of a service behind nginx, which answers with the headers that reach it."""
+    with serve_http(_Echo) as address:
+        yield address
+
+
+def test_nginx_passes_the_address_of_the_client_and_nothing_that_it_claims(
+    service: str, tmp_path: Path
+) -> None:
     nginx = shutil.which("nginx", path="/usr/sbin:/usr/bin:/usr/local/sbin:/usr/local/bin")
     if nginx is None:
         pytest.skip("nginx is not installed")
-    behind = HTTPServer(("127.0.0.1", 0), _Echo)
-    threading.Thread(target=behind.serve_forever, daemon=True).start()
     port = free_port()
-    site = (
-        (DEPLOY / "nginx.conf").read_text().replace("127.0.0.1:8642", f"127.0.0.1:{behind.server_address[1]}")
-    )
+    site = (DEPLOY / "nginx.conf").read_text().replace("127.0.0.1:8642", service.removeprefix("http://"))
     lines = [line for line in site.splitlines() if "ssl_certificate" not in line]
     site = "\n".join(lines).replace("listen 443 ssl", f"listen 127.0.0.1:{port}")
     folders = "".join(
@@ -135,5 +133,3 @@ def test_nginx_passes_the_address_of_the_client_and_nothing_that_it_claims(tmp_p
             assert "'host': 'octasplat.example.org'" in got
         finally:
             process.terminate()
-            behind.shutdown()
-            behind.server_close()

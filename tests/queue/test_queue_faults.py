@@ -3,12 +3,11 @@
 import asyncio
 from collections.abc import Awaitable, Callable
 from pathlib import Path
-from typing import Any
 
 import psycopg
 import pytest
 
-from octasplat.workers.db.connections import Connection, Pool, open_pool, retry_on_deadlock
+from octasplat.workers.db.connections import Connection, open_pool, retry_on_deadlock
 from octasplat.workers.db.datasets import (
     begin_check,
     create_dataset,
@@ -20,11 +19,9 @@ from octasplat.workers.db.datasets import (
 )
 from octasplat.workers.db.events_and_logs import list_job_events, list_log_lines
 from octasplat.workers.db.locks import lock_owner, lock_store
-from octasplat.workers.db.rows import Job
 from octasplat.workers.maintenance.webhooks.rows import add_endpoint, delete_endpoint
-from octasplat.workers.queue.attempts import Attempt, FencedError, ResultFile, claim
-from octasplat.workers.queue.jobs import NewJob, cancel_job, change_job, create_job, get_job
-from octasplat.workers.queue.procrastinate_queue import ProcrastinateQueue
+from octasplat.workers.queue.attempts import FencedError, ResultFile, claim
+from octasplat.workers.queue.jobs import cancel_job, change_job, create_job, get_job
 from octasplat.workers.queue.recovery import StalledAttempts, recover_stalled_jobs
 from octasplat.workers.queue.storage_leases import (
     mark_for_removal,
@@ -34,48 +31,22 @@ from octasplat.workers.queue.storage_leases import (
 )
 from octasplat.workers.storage.errors import StorageUnavailableError
 from octasplat.workers.storage.local import LocalStorage
+from tests.support.queue_jobs import NEW, SLIPS, claimed, fetched
 
-NEW = NewJob(owner="me", kind="toy", options={}, queue="cpu")
-SLIPS = ProcrastinateQueue(stale_seconds=5)
 SOON_SECONDS = 5.0
 """What waits for nobody takes less, also on a busy machine."""
-
-
-def run(conninfo: str, what: Callable[[Pool], Awaitable[Any]]) -> Any:
-    async def inside() -> Any:
-        async with open_pool(conninfo, max_size=6) as pool:
-            return await what(pool)
-
-    return asyncio.run(inside())
-
-
-async def begun(pool: Pool, job: Job | None = None) -> Attempt:
-    if job is None:
-        async with pool.connection() as connection:
-            job = await create_job(connection, SLIPS, NEW)
-    assert job.slip is not None
-    attempt = await claim(pool, job.id, job.slip, "w")
-    assert attempt is not None
-    return attempt
-
-
-async def now(pool: Pool, attempt: Attempt) -> Job:
-    async with pool.connection() as connection:
-        job = await get_job(connection, attempt.job.id)
-    assert job is not None
-    return job
 
 
 async def test_job_events_with_invalid_text_are_stored(conninfo: str) -> None:
     odd = "header \0 and \ud800"
 
     async with open_pool(conninfo, max_size=6) as pool:
-        attempt = await begun(pool)
+        attempt = await claimed(pool)
         await attempt.add_event("warning", {"message": odd, "value": float("nan")})
         await attempt.add_log_lines([odd])
         await attempt.record_checkpoint({"stage": odd, "step": 1, "files": []}, is_progress=True)
         await attempt.fail({"type": "odd", "message": odd})
-        job = await now(pool, attempt)
+        job = await fetched(pool, attempt.job.id)
         assert job.state == "failed" and job.error is not None
         assert job.error["message"] == "header \ufffd and \ufffd"
         async with pool.connection() as connection:
@@ -87,15 +58,15 @@ async def test_job_events_with_invalid_text_are_stored(conninfo: str) -> None:
 
 async def test_job_with_repeated_worker_failures_fails(conninfo: str) -> None:
     async with open_pool(conninfo, max_size=6) as pool:
-        attempt = await begun(pool)
+        attempt = await claimed(pool)
         rescues = []
-        while (job := await now(pool, attempt)).state != "failed":
-            attempt = attempt if job.state == "running" else await begun(pool, job)
+        while (job := await fetched(pool, attempt.job.id)).state != "failed":
+            attempt = attempt if job.state == "running" else await claimed(pool, job)
             if len(rescues) == 2:
                 await attempt.requeue(SLIPS, "its worker is stopping", max_uncounted=3)
-                attempt = await begun(pool, await now(pool, attempt))
+                attempt = await claimed(pool, await fetched(pool, attempt.job.id))
             await attempt.requeue(SLIPS, "its worker failed (KeyError)", max_uncounted=3)
-            rescues.append((await now(pool, attempt)).rescues)
+            rescues.append((await fetched(pool, attempt.job.id)).rescues)
         assert rescues == [0, 0, 0, 1, 2, 3, 3]
         assert job.error is not None and job.error["type"] == "worker_failed"
         assert "its worker failed (KeyError)" in job.error["message"]
@@ -103,13 +74,13 @@ async def test_job_with_repeated_worker_failures_fails(conninfo: str) -> None:
 
 async def test_checkpoint_resets_worker_failures(conninfo: str) -> None:
     async with open_pool(conninfo, max_size=6) as pool:
-        attempt = await begun(pool)
+        attempt = await claimed(pool)
         for step in range(8):
             await attempt.record_checkpoint({"stage": "x", "step": step, "files": []}, is_progress=True)
             await attempt.requeue(SLIPS, "its worker failed (KeyError)", max_uncounted=3)
-            job = await now(pool, attempt)
+            job = await fetched(pool, attempt.job.id)
             assert job.rescues == 0
-            attempt = await begun(pool, job)
+            attempt = await claimed(pool, job)
 
 
 @pytest.mark.parametrize("hours", [-1, 1], ids=["clock-jumped-ahead", "clock-set-back"])
@@ -118,7 +89,7 @@ async def test_lost_worker_is_detected_and_live_one_kept_after_clock_changed(
 ) -> None:
     """Heartbeats look older or newer than they are."""
     async with open_pool(conninfo, max_size=6) as pool:
-        living, lost = await begun(pool), await begun(pool)
+        living, lost = await claimed(pool), await claimed(pool)
         async with pool.connection() as connection:
             await connection.execute(
                 "UPDATE jobs SET heartbeat_at = heartbeat_at + make_interval(hours => %s)", [hours]
@@ -128,7 +99,7 @@ async def test_lost_worker_is_detected_and_live_one_kept_after_clock_changed(
         await living.heartbeat()
         await asyncio.sleep(0.4)
         assert await recover_stalled_jobs(pool, SLIPS, 5, suspects) == 1
-        assert [(await now(pool, a)).state for a in (living, lost)] == ["running", "queued"]
+        assert [(await fetched(pool, a.job.id)).state for a in (living, lost)] == ["running", "queued"]
 
 
 @pytest.mark.parametrize("lock", ["owner", "store"])
@@ -141,7 +112,7 @@ async def test_heartbeat_is_not_blocked_by_other_locks(conninfo: str, tmp_path: 
     manifest = {"stage": "x", "step": 1, "files": [{"path": "a", "sha256": blob.sha256, "size_bytes": 1}]}
 
     async with open_pool(conninfo, max_size=6) as pool:
-        attempt = await begun(pool)
+        attempt = await claimed(pool)
         async with storage_lease(pool, storage) as note, pool.connection() as connection:
             if lock == "owner":
                 await lock_owner(connection, "me")
@@ -159,7 +130,7 @@ async def test_heartbeat_is_not_blocked_by_other_locks(conninfo: str, tmp_path: 
             kept, ended = await asyncio.gather(keeping, ending, return_exceptions=True)
         assert kept is None or isinstance(kept, FencedError)  # they went on in either order
         assert not isinstance(ended, BaseException)
-        assert (await now(pool, attempt)).state == "failed"
+        assert (await fetched(pool, attempt.job.id)).state == "failed"
 
 
 async def test_contents_being_removed_are_awaited_without_lock(conninfo: str, tmp_path: Path) -> None:
@@ -171,7 +142,7 @@ async def test_contents_being_removed_are_awaited_without_lock(conninfo: str, tm
             return writer.commit().sha256
 
     async with open_pool(conninfo, max_size=6) as pool:
-        attempt = await begun(pool)
+        attempt = await claimed(pool)
         async with storage_lease(pool, storage) as note, pool.connection() as connection:
             kept, gone = stored(b"kept"), stored(b"gone")
             async with removal_transaction(connection):
@@ -194,7 +165,7 @@ async def test_contents_being_removed_are_awaited_without_lock(conninfo: str, tm
 
 async def test_webhook_deletion_during_job_end_succeeds(conninfo: str) -> None:
     async with open_pool(conninfo, max_size=6) as pool:
-        attempt = await begun(pool)
+        attempt = await claimed(pool)
         async with pool.connection() as connection:
             hook = await add_endpoint(
                 connection, owner="me", url="https://example.org", secret="s", events=["job.failed"]
@@ -206,14 +177,14 @@ async def test_webhook_deletion_during_job_end_succeeds(conninfo: str) -> None:
             assert not ending.done()
             await connection.commit()
             await ending
-        assert (await now(pool, attempt)).state == "failed"
+        assert (await fetched(pool, attempt.job.id)).state == "failed"
 
 
 async def test_transaction_after_deadlock_is_retried(conninfo: str) -> None:
     """Two that lock the same rows in different orders; the database ends one of them."""
 
     async with open_pool(conninfo, max_size=6) as pool:
-        ids = [(await begun(pool)).job.id for _ in range(2)]
+        ids = [(await claimed(pool)).job.id for _ in range(2)]
         both = asyncio.Barrier(2)
         tries = 0
 
@@ -233,7 +204,7 @@ async def test_transaction_after_deadlock_is_retried(conninfo: str) -> None:
 
 async def test_lock_order_is_checked(conninfo: str) -> None:
     async with open_pool(conninfo, max_size=6) as pool:
-        attempt = await begun(pool)
+        attempt = await claimed(pool)
         for lock in (lambda c: lock_owner(c, "me"), lambda c: lock_store(c, shared=True)):
             with pytest.raises(psycopg.errors.RaiseException, match="order of locks"):
                 async with pool.connection() as connection:
@@ -247,7 +218,7 @@ async def test_lock_order_is_checked(conninfo: str) -> None:
 
 async def test_jobs_are_locked_before_datasets(conninfo: str) -> None:
     async with open_pool(conninfo, max_size=6) as pool:
-        attempt = await begun(pool)
+        attempt = await claimed(pool)
         job_id = attempt.job.id
         async with pool.connection() as connection:
             dataset = await create_dataset(connection, "me", "d")
@@ -305,7 +276,7 @@ async def test_stale_storage_check_keeps_later_files(conninfo: str) -> None:
 
 async def test_write_that_meets_a_recovery_waits_and_is_fenced(conninfo: str) -> None:
     async with open_pool(conninfo, max_size=6) as pool:
-        ghost = await begun(pool)
+        ghost = await claimed(pool)
         async with pool.connection() as other, other.transaction():
             job = await get_job(other, ghost.job.id, lock=True)
             assert job is not None
@@ -335,11 +306,11 @@ async def test_entry_that_is_claimed_twice_at_once_begins_one_attempt(conninfo: 
 
 async def test_attempt_at_a_job_that_is_being_canceled_still_writes(conninfo: str) -> None:
     async with open_pool(conninfo, max_size=4) as pool:
-        attempt = await begun(pool)
+        attempt = await claimed(pool)
         async with pool.connection() as connection:
             await cancel_job(connection, SLIPS, attempt.job.id)
         assert await attempt.heartbeat() == await attempt.read_state() == "canceling"
         await attempt.cancel()
-        assert (await now(pool, attempt)).state == "canceled"
+        assert (await fetched(pool, attempt.job.id)).state == "canceled"
         with pytest.raises(FencedError):
             await attempt.heartbeat()

@@ -1,9 +1,6 @@
 """Jobs and slips are one: written together, fenced, rescued."""
 
-import asyncio
 import uuid
-from collections.abc import Awaitable, Callable
-from typing import Any
 
 import psycopg
 import pytest
@@ -11,8 +8,7 @@ import pytest
 from octasplat.workers.db.connections import Connection, Pool, open_pool
 from octasplat.workers.db.errors import ConflictError, NotFoundError
 from octasplat.workers.db.ids import new_id
-from octasplat.workers.db.rows import Job
-from octasplat.workers.queue.attempts import Attempt, FencedError, ResultFile, claim
+from octasplat.workers.queue.attempts import FencedError, ResultFile, claim
 from octasplat.workers.queue.jobs import (
     NewJob,
     artifacts_of,
@@ -25,20 +21,9 @@ from octasplat.workers.queue.jobs import (
     retry_job,
     worked_seconds,
 )
-from octasplat.workers.queue.procrastinate_queue import ProcrastinateQueue
 from octasplat.workers.queue.protocol import JobQueue
 from octasplat.workers.queue.recovery import StalledAttempts, recover_stalled_jobs
-
-NEW = NewJob(owner="me", kind="toy", options={}, queue="cpu")
-SLIPS = ProcrastinateQueue(stale_seconds=5)
-
-
-def run(conninfo: str, what: Callable[[Pool], Awaitable[Any]]) -> Any:
-    async def inside() -> Any:
-        async with open_pool(conninfo, max_size=4) as pool:
-            return await what(pool)
-
-    return asyncio.run(inside())
+from tests.support.queue_jobs import NEW, SLIPS, claimed, fetched
 
 
 def count(conninfo: str, table: str) -> int:
@@ -46,22 +31,6 @@ def count(conninfo: str, table: str) -> int:
         row = connection.execute(f"SELECT count(*) FROM {table}".encode()).fetchone()
     assert row is not None
     return int(row[0])
-
-
-async def claimed(pool: Pool, new: NewJob = NEW) -> Attempt:
-    async with pool.connection() as connection:
-        job = await create_job(connection, SLIPS, new)
-    assert job.slip is not None
-    attempt = await claim(pool, job.id, job.slip, "w")
-    assert attempt is not None
-    return attempt
-
-
-async def fetched(pool: Pool, job_id: uuid.UUID) -> Job:
-    async with pool.connection() as connection:
-        job = await get_job(connection, job_id)
-    assert job is not None
-    return job
 
 
 async def test_create_job_rolled_back_leaves_no_rows(conninfo: str) -> None:

@@ -3,14 +3,13 @@
 import asyncio
 import contextlib
 import hashlib
-import threading
 import time
 from collections.abc import Iterator
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
 
 import pytest
 
+from tests.support.http_server import QuietHandler, serve_http
 from tests.support.model_builder import ColmapModelBuilder, photographs
 from tests.support.service_harness import ConnectService, client_with_token
 from tests.support.zip_builder import ZipMember, build_zip
@@ -20,13 +19,11 @@ ARCHIVE = build_zip(*(ZipMember(name, content) for name, content in SCENE.items(
 HERE = ("127.0.0.1",)
 
 
-class Elsewhere(BaseHTTPRequestHandler):
-    def do_GET(self) -> None:
+class Elsewhere(QuietHandler):
+    def respond(self) -> None:
         kind = self.path.strip("/")
         if kind.startswith("to="):
-            self.send_response(302)
-            self.send_header("Location", kind.removeprefix("to="))
-            self.end_headers()
+            self.answer(b"", 302, Location=kind.removeprefix("to="))
             return
         if kind == "trickle":
             with contextlib.suppress(OSError):
@@ -40,19 +37,11 @@ class Elsewhere(BaseHTTPRequestHandler):
         self.end_headers()
         self.wfile.write(content[: len(content) // 2] if kind == "cut.zip" else content)
 
-    def log_message(self, format: str, *arguments: object) -> None:
-        """Write no log."""
-
 
 @pytest.fixture
 def elsewhere() -> Iterator[str]:
-    server = ThreadingHTTPServer(("127.0.0.1", 0), Elsewhere)
-    thread = threading.Thread(target=server.serve_forever)
-    thread.start()
-    yield f"http://127.0.0.1:{server.server_port}"
-    server.shutdown()
-    server.server_close()
-    thread.join()
+    with serve_http(Elsewhere) as address:
+        yield address
 
 
 async def test_scene_is_fetched_from_an_address(connect_service: ConnectService, elsewhere: str) -> None:

@@ -1,7 +1,6 @@
 """A kind of job whose program does what code in a job's process could do that somebody has planted there."""
 
 import ctypes
-import json
 import mmap
 import os
 import resource
@@ -18,6 +17,7 @@ from pydantic import BaseModel, ConfigDict
 from octasplat.engine.core.events import Event, PhaseStarted
 from octasplat.workers.worker.job_kinds import JobKind, register
 from octasplat.workers.worker.task import Task
+from tests.support.attempt_outcomes import write_outcomes
 
 DAEMON = """
 import os, sys, time
@@ -82,17 +82,6 @@ def run(task: Task) -> None:
     options = HostileOptions.model_validate(task.options)
     task.progress(PhaseStarted("train", 1))
     ATTACKS[options.attack](task, options)
-
-
-def _tell(task: Task, tries: Mapping[str, Callable[[], object]]) -> None:
-    """Write what each try gave: its value, or the kind of its error."""
-    found: dict[str, object] = {}
-    for name, attempt in tries.items():
-        try:
-            found[name] = attempt()
-        except OSError as error:
-            found[name] = type(error).__name__
-    (task.results / "found.json").write_text(json.dumps(found, default=str))
 
 
 def _link_run(task: Task, options: HostileOptions) -> None:
@@ -173,13 +162,13 @@ def _change_what_landlock_does_not_know(task: Task, options: HostileOptions) -> 
         calls[f"priority of {pid}"] = lambda pid=pid: os.setpriority(os.PRIO_PROCESS, pid, 19)
         calls[f"signal to {pid}"] = lambda pid=pid: os.kill(pid, signal.SIGTERM)
         calls[f"tracing of {pid}"] = lambda pid=pid: _syscall(101, 16, pid, 0, 0)
-    _tell(task, calls)
+    write_outcomes(task, calls)
 
 
 def _tell_user(task: Task, options: HostileOptions) -> None:
     """Who it is, and what it can do as that user."""
     worker = Path(f"/proc/{os.getppid()}/environ")
-    _tell(
+    write_outcomes(
         task,
         {
             "user": lambda: [*os.getresuid(), *os.getresgid(), *os.getgroups()],
@@ -199,7 +188,7 @@ def _leave_daemon(task: Task, options: HostileOptions) -> None:
     task.progress(PhaseStarted("evaluate", 1))
     while options.lasts and not task.should_stop():
         time.sleep(0.05)
-    _tell(task, {})
+    write_outcomes(task, {})
 
 
 def _hog_shared_memory(task: Task, options: HostileOptions) -> None:
@@ -210,7 +199,7 @@ def _hog_shared_memory(task: Task, options: HostileOptions) -> None:
         time.sleep(5)
         return len(shared)
 
-    _tell(task, {"hog": hog})
+    write_outcomes(task, {"hog": hog})
 
 
 def _write_elsewhere(task: Task, options: HostileOptions) -> None:
@@ -236,7 +225,7 @@ def _write_elsewhere(task: Task, options: HostileOptions) -> None:
         return str(path)
 
     devices = list(Path("/dev").glob("[vs]d[a-z]"))
-    _tell(
+    write_outcomes(
         task,
         {
             **{name: (lambda folder=folder: write(folder)) for name, folder in folders.items()},
@@ -257,7 +246,7 @@ def _dig(task: Task, options: HostileOptions) -> None:
         os.close(outer)
     while options.lasts and not task.should_stop():
         time.sleep(0.05)
-    _tell(task, {})
+    write_outcomes(task, {})
 
 
 ATTACKS: Mapping[str, Callable[[Task, HostileOptions], None]] = {

@@ -1,6 +1,5 @@
 """A kind of job that tries what no job has any business with, and tells what it got."""
 
-import json
 import os
 import socket
 from collections.abc import Callable
@@ -10,6 +9,7 @@ from pydantic import BaseModel, ConfigDict
 
 from octasplat.workers.worker.job_kinds import JobKind, register
 from octasplat.workers.worker.task import Task
+from tests.support.attempt_outcomes import write_outcomes
 
 
 class SpyOptions(BaseModel):
@@ -40,13 +40,7 @@ def run(task: Task) -> None:
         "work of others": lambda: (task.folder.parent / "planted").write_text("x"),
         **{f"file {path}": lambda path=path: Path(path).read_text() for path in options.secrets},
     }
-    found: dict[str, object] = {}
-    for name, attempt in tries.items():
-        try:
-            found[name] = attempt()
-        except OSError as error:
-            found[name] = type(error).__name__
-    (task.results / "found.json").write_text(json.dumps(found))
+    write_outcomes(task, tries)
     for _ in range(options.children):
         if os.fork() == 0:
             os.execvp("sleep", ["sleep", "600"])

@@ -4,8 +4,9 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from typing import Any
+from http.server import ThreadingHTTPServer
+
+from tests.support.http_server import QuietHandler
 
 
 @dataclass
@@ -31,19 +32,13 @@ def receive_webhooks(*statuses: int) -> Iterator[WebhookReceiver]:
     """Hear messages until the block ends."""
     receiver = WebhookReceiver(statuses=list(statuses) or [204])
 
-    class Handler(BaseHTTPRequestHandler):
-        def do_POST(self) -> None:
+    class Handler(QuietHandler):
+        def respond(self) -> None:
             body = self.rfile.read(int(self.headers["Content-Length"]))
             receiver.received.append((self.path, {k.lower(): v for k, v in self.headers.items()}, body))
             status = receiver.statuses[0] if len(receiver.statuses) == 1 else receiver.statuses.pop(0)
-            self.send_response(status)
-            if status in (301, 302, 307, 308):
-                self.send_header("Location", receiver.url + "/elsewhere")
-            self.send_header("Content-Length", "0")
-            self.end_headers()
-
-        def log_message(self, format: str, *args: Any) -> None:
-            pass
+            elsewhere = {"Location": f"{receiver.url}/elsewhere"} if status in (301, 302, 307, 308) else {}
+            self.answer(b"", status, **elsewhere)
 
     with _Server(("127.0.0.1", 0), Handler) as server:
         receiver.port = server.server_address[1]

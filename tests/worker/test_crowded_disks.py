@@ -3,7 +3,6 @@
 import asyncio
 import dataclasses
 import uuid
-from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -35,13 +34,6 @@ class CrowdedWorker:
 
     async def space_shortage(self, excluding: SpaceUsage = NO_USAGE) -> str | None:
         return None if excluding.store_bytes else "The store lacks room."
-
-
-@pytest.fixture
-def bench(conninfo: str, tmp_path: Path) -> Iterator[WorkerHarness]:
-    bench = WorkerHarness(conninfo, tmp_path)
-    yield bench
-    bench.close()
 
 
 @pytest.mark.parametrize(

@@ -1,10 +1,5 @@
 """What a failed job publishes as its error's type stays as it is, whatever the classes are called."""
 
-from collections.abc import Iterator
-from pathlib import Path
-
-import pytest
-
 from octasplat.engine.core import errors as engine_errors
 from octasplat.engine.core.errors import OctasplatError
 from octasplat.engine.core.portable_names import FileNameError
@@ -38,13 +33,6 @@ STORAGE_TYPES = {
     "blob_missing",
     "not_a_file",
 }
-
-
-@pytest.fixture
-def bench(conninfo: str, tmp_path: Path) -> Iterator[WorkerHarness]:
-    bench = WorkerHarness(conninfo, tmp_path)
-    yield bench
-    bench.close()
 
 
 def types_in(module: object) -> set[str]:

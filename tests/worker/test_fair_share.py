@@ -1,19 +1,7 @@
 """Owners take turns, however many jobs each of them has queued."""
 
-from collections.abc import Iterator
-from pathlib import Path
-
-import pytest
-
 from octasplat.workers.queue.jobs import queue_position
 from tests.support.worker_harness import WorkerHarness
-
-
-@pytest.fixture
-def bench(conninfo: str, tmp_path: Path) -> Iterator[WorkerHarness]:
-    bench = WorkerHarness(conninfo, tmp_path)
-    yield bench
-    bench.close()
 
 
 def test_owners_alternate_and_keep_their_order(bench: WorkerHarness) -> None:

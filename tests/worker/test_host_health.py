@@ -2,21 +2,12 @@
 
 import os
 import time
-from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import pytest
 
 from octasplat.workers.db.workers import live_workers
 from tests.support.worker_harness import MAX_WAIT_SECONDS, WorkerHarness
-
-
-@pytest.fixture
-def bench(conninfo: str, tmp_path: Path) -> Iterator[WorkerHarness]:
-    bench = WorkerHarness(conninfo, tmp_path)
-    yield bench
-    bench.close()
 
 
 def wait_until_it_ails(bench: WorkerHarness, what: str) -> None:

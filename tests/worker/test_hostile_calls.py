@@ -42,11 +42,9 @@ print(json.dumps(said))
 
 
 @pytest.fixture
-def bench(conninfo: str, tmp_path: Path) -> Iterator[WorkerHarness]:
-    bench = WorkerHarness(conninfo, tmp_path)
+def bench(bench: WorkerHarness) -> WorkerHarness:
     bench.worker(KIND_MODULES='["tests.support.hostile_kind"]')
-    yield bench
-    bench.close()
+    return bench
 
 
 @pytest.fixture

@@ -6,8 +6,7 @@ import subprocess
 import sys
 import time
 import uuid
-from collections.abc import Callable, Iterator
-from pathlib import Path
+from collections.abc import Callable
 
 import psutil
 import pytest
@@ -26,13 +25,6 @@ for start in range(0, len(shared), 4096):
 print(flush=True)
 sys.stdin.read()
 """
-
-
-@pytest.fixture
-def bench(conninfo: str, tmp_path: Path) -> Iterator[WorkerHarness]:
-    bench = WorkerHarness(conninfo, tmp_path)
-    yield bench
-    bench.close()
 
 
 def start_worker(bench: WorkerHarness, **settings: str) -> "subprocess.Popen[bytes]":

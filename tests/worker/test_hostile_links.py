@@ -2,7 +2,6 @@
 
 import hashlib
 import os
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -15,11 +14,9 @@ SECRET = b"the token of the administrator"
 
 
 @pytest.fixture
-def bench(conninfo: str, tmp_path: Path) -> Iterator[WorkerHarness]:
-    bench = WorkerHarness(conninfo, tmp_path)
+def bench(bench: WorkerHarness) -> WorkerHarness:
     bench.worker(KIND_MODULES='["tests.support.hostile_kind"]')
-    yield bench
-    bench.close()
+    return bench
 
 
 @pytest.fixture

@@ -1,22 +1,12 @@
 """Limits of a job's time and memory, kept by the worker."""
 
 import uuid
-from collections.abc import Iterator
 from itertools import pairwise
-from pathlib import Path
 
 import psutil
-import pytest
 
 from octasplat.workers.db.workers import live_workers
 from tests.support.worker_harness import MAX_WAIT_SECONDS, WorkerHarness
-
-
-@pytest.fixture
-def bench(conninfo: str, tmp_path: Path) -> Iterator[WorkerHarness]:
-    bench = WorkerHarness(conninfo, tmp_path)
-    yield bench
-    bench.close()
 
 
 def attempts(bench: WorkerHarness, job_id: uuid.UUID) -> list[float]:

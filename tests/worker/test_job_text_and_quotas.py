@@ -1,19 +1,7 @@
 """What a job says or stores harms neither its worker nor other jobs."""
 
-from collections.abc import Iterator
-from pathlib import Path
-
-import pytest
-
 from octasplat.workers.storage.local import LocalStorage
 from tests.support.worker_harness import WorkerHarness
-
-
-@pytest.fixture
-def bench(conninfo: str, tmp_path: Path) -> Iterator[WorkerHarness]:
-    bench = WorkerHarness(conninfo, tmp_path)
-    yield bench
-    bench.close()
 
 
 def test_job_with_unstorable_text_succeeds(bench: WorkerHarness) -> None:

@@ -6,9 +6,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
 from itertools import pairwise
-from pathlib import Path
 
 import psycopg
 import pytest
@@ -37,13 +35,6 @@ async def main():
 
 asyncio.run(main())
 """
-
-
-@pytest.fixture
-def bench(conninfo: str, tmp_path: Path) -> Iterator[WorkerHarness]:
-    bench = WorkerHarness(conninfo, tmp_path)
-    yield bench
-    bench.close()
 
 
 def renamed(bench: WorkerHarness, before: str, after: str) -> None:

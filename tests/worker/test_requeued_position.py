@@ -1,19 +1,10 @@
 """A job that is interrupted, by a restart or a kill, is not left behind those that wait."""
 
 import uuid
-from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
 
 from tests.support.worker_harness import MAX_WAIT_SECONDS, WorkerHarness
-
-
-@pytest.fixture
-def bench(conninfo: str, tmp_path: Path) -> Iterator[WorkerHarness]:
-    bench = WorkerHarness(conninfo, tmp_path)
-    yield bench
-    bench.close()
 
 
 def begun(bench: WorkerHarness) -> list[tuple[uuid.UUID, int]]:

@@ -5,7 +5,6 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -47,13 +46,6 @@ seccomp.install_seccomp_filter(may_start_processes=True)
 from octasplat.workers.cli.main import main
 main()
 """
-
-
-@pytest.fixture
-def bench(conninfo: str, tmp_path: Path) -> Iterator[WorkerHarness]:
-    bench = WorkerHarness(conninfo, tmp_path)
-    yield bench
-    bench.close()
 
 
 def test_sandboxed_job_sees_no_secrets(bench: WorkerHarness) -> None:

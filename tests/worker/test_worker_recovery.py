@@ -4,7 +4,6 @@ import os
 import signal
 import sys
 import uuid
-from collections.abc import Iterator
 from pathlib import Path
 
 import psutil
@@ -25,13 +24,6 @@ TAKEN_OVER_SECONDS = 20.0
 
 
 SOON = {"STALE_SECONDS": "3"}
-
-
-@pytest.fixture
-def bench(conninfo: str, tmp_path: Path) -> Iterator[WorkerHarness]:
-    bench = WorkerHarness(conninfo, tmp_path)
-    yield bench
-    bench.close()
 
 
 def starts(bench: WorkerHarness, job_id: uuid.UUID) -> list[int]:

@@ -5,7 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from octasplat.engine.core.errors import ConfigError
-from octasplat.engine.core.portable_names import FileNameError, check_name
+from octasplat.engine.core.portable_names import check_name, name_or
 from octasplat.engine.operations import operation, operation_names
 from octasplat.engine.operations.file_patterns import expand_patterns
 from octasplat.workers.client.submission import Derivation
@@ -37,10 +37,7 @@ def _upload_name(path: Path, files: dict[str, Path]) -> str:
     """Return a name for a file among those that are sent, which it is added to."""
     if not path.is_file():
         raise ConfigError(f"{path}: there is no such file.")
-    try:
-        name = check_name(path.name)
-    except FileNameError:
-        name = check_name(f"file_{len(files)}{path.suffix.lower()}")
+    name = name_or(path.name, f"file_{len(files)}{path.suffix.lower()}")
     if name in files:
         name = check_name(f"{len(files)}/{name}")
     files[name] = path

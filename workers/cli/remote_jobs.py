@@ -15,18 +15,13 @@ from octasplat.workers.client.submission import Derivation, JobFailedError, Subm
 DEMO_OUTPUT = Path("octasplat-demo")
 
 
-def submit(api: Api, request: Submission, printer: Printer) -> dict[str, Any]:
-    """Upload what is missing and queue the job; returns the job."""
+def submit(api: Api, request: Submission | Derivation, printer: Printer) -> dict[str, Any]:
+    """Send the files that are missing and queue the job; returns the job."""
     with show_progress(quiet=printer.hides_progress) as listener:
-        job = submission.submit(api, request, listener)
-    _print_notes(job, printer)
-    return job
-
-
-def derive(api: Api, request: Derivation, printer: Printer) -> dict[str, Any]:
-    """Send the files that are named and queue a job on the results of another; returns the job."""
-    with show_progress(quiet=printer.hides_progress) as listener:
-        job = submission.derive(api, request, listener)
+        if isinstance(request, Derivation):
+            job = submission.derive(api, request, listener)
+        else:
+            job = submission.submit(api, request, listener)
     _print_notes(job, printer)
     return job
 
@@ -56,7 +51,7 @@ def download_archive(api: Api, job_id: str, path: Path, printer: Printer) -> Non
 
 def submit_and_wait(api: Api, request: Submission | Derivation, output: Path, printer: Printer) -> None:
     """Submit, wait, download, and print a summary, or the job as JSON."""
-    job = derive(api, request, printer) if isinstance(request, Derivation) else submit(api, request, printer)
+    job = submit(api, request, printer)
     printer.note(f"Queued as job {job['id']}.")
     try:
         job = wait_for(api, job["id"], printer)

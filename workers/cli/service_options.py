@@ -3,6 +3,7 @@
 import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
@@ -31,6 +32,35 @@ def set_option(command: F) -> F:
         metavar="NAME=VALUE",
         help="Any setting, e.g. test_every=10 or lr.quat=0.02; may be repeated.",
     )(command)
+
+
+def wait_options(command: F) -> F:
+    """Add the options ``--wait`` and ``--output`` to a command that queues a job."""
+    for option in (
+        click.option(
+            "-o", "--output", type=click.Path(path_type=Path), help="With --wait: folder for the results."
+        ),
+        click.option("--wait", is_flag=True, help="Show the progress and save the results at the end."),
+    ):
+        command = option(command)
+    return command
+
+
+def job_options(command: F) -> F:
+    """Add ``--label``, ``--queue`` and ``--priority`` of a new job, and ``--server``, to a command."""
+    for option in (
+        server_option,
+        click.option(
+            "--priority",
+            type=click.IntRange(-100, 100),
+            default=0,
+            help="Among your jobs, higher goes first.",
+        ),
+        click.option("--queue", default="cpu", show_default=True, help="Which workers."),
+        click.option("--label", help="What to call the job."),
+    ):
+        command = option(command)
+    return command
 
 
 def limit_option(command: F) -> F:

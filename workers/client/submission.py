@@ -8,7 +8,7 @@ from typing import Any
 
 from octasplat.engine.core.errors import ConfigError, OctasplatError
 from octasplat.engine.core.events import EventListener, Warned, ignore_events
-from octasplat.engine.core.portable_names import FileNameError, check_name
+from octasplat.engine.core.portable_names import name_or
 from octasplat.engine.core.progress import counted_phase
 from octasplat.engine.pathtracing.stage.sidecar_files import sidecar_files
 from octasplat.engine.pathtracing.stage.stage_file import read_stage, referenced_files, with_renamed_files
@@ -104,10 +104,7 @@ def with_stage(derivation: Derivation, stage: Path) -> Derivation:
     read = read_stage(stage)
     names: dict[str, str] = {}
     for _, name in referenced_files(read):
-        try:
-            names[name] = check_name(name)
-        except FileNameError:
-            names[name] = check_name(f"elsewhere/{len(names)}/{Path(name).name}")
+        names[name] = name_or(name, f"elsewhere/{len(names)}/{Path(name).name}")
     files = {sent: stage.parent / name for name, sent in names.items()}
     for sent, path in tuple(files.items()):
         for beside in sidecar_files(path):
@@ -144,10 +141,7 @@ def with_environments(derivation: Derivation, maps: Sequence[Path]) -> Derivatio
     for path in maps:
         if not path.is_file():
             raise ConfigError(f"{path}: there is no such file; name an HDR or EXR image.")
-        try:
-            name = check_name(path.name)
-        except FileNameError:
-            name = check_name(f"map_{len(files)}{path.suffix.lower()}")
+        name = name_or(path.name, f"map_{len(files)}{path.suffix.lower()}")
         if name in files:
             raise ConfigError(f"{path}: two environments are called {name}; rename one.")
         files[name] = path

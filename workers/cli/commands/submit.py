@@ -15,7 +15,13 @@ from octasplat.engine.settings.renamed_settings import notify_renamed
 from octasplat.workers.cli.options import exports_option, parse_export_names
 from octasplat.workers.cli.printing import Printer, output_options
 from octasplat.workers.cli.request_options import request_from_options, request_options
-from octasplat.workers.cli.service_options import connected, server_option, set_option
+from octasplat.workers.cli.service_options import (
+    connected,
+    job_options,
+    server_option,
+    set_option,
+    wait_options,
+)
 
 if TYPE_CHECKING:
     from octasplat.workers.client.api import Api
@@ -23,15 +29,9 @@ if TYPE_CHECKING:
 
 @click.command(short_help="Send a scene to the service and queue its reconstruction.")
 @click.argument("scene", type=click.Path(path_type=Path))
-@click.option("--wait", is_flag=True, help="Show the progress and save the results at the end.")
-@click.option("-o", "--output", type=click.Path(path_type=Path), help="With --wait: folder for the results.")
+@wait_options
 @request_options(ReconstructOptions)
-@click.option("--label", help="What to call the job.")
-@click.option("--queue", default="cpu", show_default=True, help="Which workers.")
-@click.option(
-    "--priority", type=click.IntRange(-100, 100), default=0, help="Among your jobs, higher goes first."
-)
-@server_option
+@job_options
 @output_options
 def submit(
     scene: Path,
@@ -104,14 +104,8 @@ def submit(
 )
 @click.option("--on", "former_on", type=click.Path(path_type=Path), hidden=True)
 @set_option
-@click.option("--wait", is_flag=True, help="Show the progress and save the results at the end.")
-@click.option("-o", "--output", type=click.Path(path_type=Path), help="With --wait: folder for the results.")
-@click.option("--label", help="What to call the job.")
-@click.option("--queue", default="cpu", show_default=True, help="Which workers.")
-@click.option(
-    "--priority", type=click.IntRange(-100, 100), default=0, help="Among your jobs, higher goes first."
-)
-@server_option
+@wait_options
+@job_options
 @output_options
 def derive(
     kind: str,
@@ -135,7 +129,7 @@ def derive(
     octasplat derive edit last --file meshes=edited.ply, or: octasplat derive import --file file=a.splat
     """
     from octasplat.workers.cli.named_files import with_named_files
-    from octasplat.workers.cli.remote_jobs import derive, submit_and_wait
+    from octasplat.workers.cli.remote_jobs import submit, submit_and_wait
     from octasplat.workers.client.short_ids import find_job
     from octasplat.workers.client.submission import (
         Derivation,
@@ -170,7 +164,7 @@ def derive(
         if wait:
             submit_and_wait(api, what, output or Path(f"{kind}-result"), printer)
             return
-        job = derive(api, what, printer)
+        job = submit(api, what, printer)
     printer.print(job, [job["id"]], quiet_lines=[job["id"]])
 
 
