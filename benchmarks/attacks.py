@@ -28,7 +28,7 @@ from octasplat.workers.client.api import Api, find_address, find_token
 from tests.intake.test_archive import NAMES, STRUCTURES, TWINS, linked_kinds
 from tests.intake.test_dataset import HORRORS
 from tests.intake.test_image_headers import BAD
-from tests.service.test_webhooks import REFUSED_URLS
+from tests.service.test_webhook_networks import REFUSED_URLS
 from tests.support.model_builder import ColmapModelBuilder, photographs
 from tests.support.zip_builder import ZipMember, build_zip
 

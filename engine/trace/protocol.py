@@ -72,7 +72,7 @@ class TraceSettings(Settings):
     sort: Annotated[Literal["ray", "packet"], ADVANCED] = Field(
         "ray",
         description="Order in which Gaussians are composited: that of each ray, or one for all rays of a "
-        "packet, which is faster and a little wrong. A training decides it by one_order.",
+        "packet, which is faster and a little wrong. A training decides it by shared_sort_until.",
     )
 
     former_settings: ClassVar = {"t_min": FormerSetting(0)}

@@ -146,14 +146,14 @@ def trace_reference(
     out: list[list[Tensor]] = []
     hit_ids = []
     for ray in range(len(d)):
-        ids = torch.nonzero(hit[ray]).squeeze(-1)
+        ids = torch.nonzero(hit[ray]).flatten()
         # Front to back; equal float32 distances are ordered by id (the sort is stable, ids ascend).
         order = t32[ray, ids] if ranks is None else torch.tensor(ranks[ray])[ids]
         ids = ids[torch.sort(order, stable=True).indices]
         ids = ids[: _hit_count(alpha[ray, ids].detach(), settings)]
         hit_ids.append(ids.numpy())
         alphas = alpha[ray, ids]
-        transmittance = torch.cat([torch.ones(1, dtype=torch.float64), torch.cumprod(1 - alphas, 0)])
+        transmittance = torch.cat([alphas.new_ones(1), torch.cumprod(1 - alphas, 0)])
         weight = alphas * transmittance[:-1]  # alpha_k T_k
         # The direction from the viewer to the mean, the ray's own from infinitely far away.
         view = d[ray].expand(len(ids), 3)
@@ -164,8 +164,8 @@ def trace_reference(
         to_means = to_mean[ray, ids].detach()
         cosine_to_mean = (to_means * r1[ids].detach()).sum(-1) / to_means.norm(dim=-1)
         facing = torch.where(cosine_to_mean > settings.flip_normal_cos, -1.0, 1.0)
-        crossing = torch.nonzero((transmittance[:-1] > 0.5) & (transmittance[1:] <= 0.5)).squeeze(-1)
-        median = t[ray, ids[crossing[0]]] if len(crossing) else torch.zeros((), dtype=torch.float64)
+        crossing = torch.nonzero((transmittance[:-1] > 0.5) & (transmittance[1:] <= 0.5)).flatten()
+        median = t[ray, ids[crossing[0]]] if len(crossing) else t.new_zeros(())
         out.append(
             [
                 weight @ color,

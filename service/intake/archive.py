@@ -14,6 +14,7 @@ from typing import BinaryIO
 
 from octasplat.engine.core.portable_names import FileNameError, check_name, quoted_name
 from octasplat.engine.core.scene_layout import FileRole, file_role, lay_out_scene
+from octasplat.service.intake.faults import raise_intake_error
 from octasplat.service.intake.upload_names import FileNames
 from octasplat.service.intake.zip_records import (
     DEFLATED,
@@ -21,7 +22,6 @@ from octasplat.service.intake.zip_records import (
     IS_STRONG,
     STORED,
     ZipEntry,
-    raise_intake_error,
     read_listed_records,
     read_records,
 )

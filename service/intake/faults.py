@@ -1,6 +1,7 @@
 """Faults of uploaded data, in a form for programs and for people."""
 
 from dataclasses import dataclass
+from typing import NoReturn
 
 from octasplat.engine.core.errors import DatasetError
 
@@ -45,3 +46,12 @@ class IntakeError(DatasetError):
     def code(self) -> str:
         """Return the code of the first fault."""
         return self.faults[0].code
+
+
+def raise_intake_error(code: str, detail: str, name: str | None = None) -> NoReturn:
+    """Refuse the archive.
+
+    Raises:
+        IntakeError: always.
+    """
+    raise IntakeError(IntakeFault(code, detail, name))

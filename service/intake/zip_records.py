@@ -7,25 +7,28 @@ each other without gap or overlap, and after which nothing follows. Source: APPN
 
 import os
 import struct
-import zlib
-from dataclasses import dataclass
-from typing import BinaryIO, NoReturn
+from dataclasses import dataclass, replace
+from typing import BinaryIO
 
 from octasplat.engine.core.portable_names import quoted_name
-from octasplat.service.intake.faults import IntakeError, IntakeFault
+from octasplat.service.intake.faults import raise_intake_error
+from octasplat.service.intake.zip_end import END_LAYOUT, MAX_COMMENT, read_end
+from octasplat.service.intake.zip_fields import (
+    EXTRA_NAME,
+    UNKNOWN_16,
+    UNKNOWN_32,
+    decode_name,
+    extra_fields,
+    full_name,
+    zip64_values,
+)
 
 STORED, DEFLATED = 0, 8
 IS_ENCRYPTED, HAS_DESCRIPTOR, IS_PATCHED, IS_STRONG, IS_UTF8, IS_MASKED = 1, 8, 32, 64, 2048, 8192
 
 _LOCAL_LAYOUT = struct.Struct("<4s5H3I2H")
 _CENTRAL_LAYOUT = struct.Struct("<4s6H3I5H2I")
-_END_LAYOUT = struct.Struct("<4s4H2IH")
-_END_64_LAYOUT = struct.Struct("<4sQ2H2I4Q")
-_LOCATOR_64_LAYOUT = struct.Struct("<4sIQI")
-_MAX_COMMENT = 65_535
 _NEWEST_VERSION = 63
-_UNKNOWN_16, _UNKNOWN_32 = 0xFFFF, 0xFFFFFFFF
-_EXTRA_ZIP64, _EXTRA_NAME = 0x0001, 0x7075
 
 
 @dataclass(frozen=True)
@@ -53,23 +56,6 @@ class ZipEntry:
     header_start: int
     data_start: int
     unix_mode: int
-
-
-@dataclass(frozen=True)
-class _EndRecord:
-    entries: int
-    directory_start: int
-    directory_bytes: int
-    end_of_directory: int
-
-
-def raise_intake_error(code: str, detail: str, name: str | None = None) -> NoReturn:
-    """Refuse the archive.
-
-    Raises:
-        IntakeError: always.
-    """
-    raise IntakeError(IntakeFault(code, detail, name))
 
 
 def read_records(file: BinaryIO, *, max_entries: int, max_directory_bytes: int) -> list[ZipEntry]:
@@ -105,7 +91,7 @@ def _read_directory(
 ) -> tuple[list[tuple[ZipEntry, bytes]], int]:
     """Return records without ``data_start``, with their names as bytes, and where their list begins."""
     length = file.seek(0, os.SEEK_END)
-    end = _read_end(file, length)
+    end = read_end(file, length)
     if end.entries > max_entries:
         raise_intake_error(
             "archive-too-many-entries", f"The archive has {end.entries} entries; {max_entries} are allowed."
@@ -120,79 +106,11 @@ def _read_directory(
         )
     file.seek(end.directory_start)
     directory = file.read(end.directory_bytes)
-    if (directory + file.read(_END_LAYOUT.size + _MAX_COMMENT)).count(b"PK\x05\x06") != 1:
+    if (directory + file.read(END_LAYOUT.size + MAX_COMMENT)).count(b"PK\x05\x06") != 1:
         raise_intake_error(
             "archive-ambiguous", "The archive has two end records; write it anew without a comment."
         )
     return _central_entries(directory, end.entries), end.directory_start
-
-
-def _read_end(file: BinaryIO, length: int) -> _EndRecord:
-    tail_start = max(0, length - _END_LAYOUT.size - _MAX_COMMENT)
-    file.seek(tail_start)
-    tail = file.read(length - tail_start)
-    position = tail.rfind(b"PK\x05\x06")
-    if position < 0 or position + _END_LAYOUT.size > len(tail):
-        raise_intake_error(
-            "archive-damaged", "The archive has no end record; it was cut short or is not a ZIP file."
-        )
-    _, disk, directory_disk, entries_here, entries, size, start, comment = _END_LAYOUT.unpack_from(
-        tail, position
-    )
-    if position + _END_LAYOUT.size + comment != len(tail):
-        raise_intake_error(
-            "archive-data-after-end", "The archive goes on after its end record; write it anew."
-        )
-    end_start = tail_start + position
-    locator = _locator_64(file, end_start)
-    if locator is None:
-        if disk or directory_disk or entries_here != entries:
-            raise_intake_error(
-                "archive-several-disks", "The archive is split into several files; send it as one."
-            )
-        if _UNKNOWN_32 in (size, start) or entries == _UNKNOWN_16:
-            raise_intake_error("archive-damaged", "The archive lacks its ZIP64 record; write it anew.")
-        return _EndRecord(entries, start, size, end_start)
-    return _read_end_64(file, locator, end_start - _LOCATOR_64_LAYOUT.size, (entries, size, start))
-
-
-def _locator_64(file: BinaryIO, end_start: int) -> int | None:
-    if end_start < _LOCATOR_64_LAYOUT.size:
-        return None
-    file.seek(end_start - _LOCATOR_64_LAYOUT.size)
-    signature, disk, where, disks = _LOCATOR_64_LAYOUT.unpack(file.read(_LOCATOR_64_LAYOUT.size))
-    if signature != b"PK\x06\x07":
-        return None
-    if disk != 0 or disks > 1:
-        raise_intake_error(
-            "archive-several-disks", "The archive is split into several files; send it as one."
-        )
-    return int(where)
-
-
-def _read_end_64(file: BinaryIO, where: int, must_end: int, short: tuple[int, int, int]) -> _EndRecord:
-    if where + _END_64_LAYOUT.size != must_end:
-        raise_intake_error(
-            "archive-gap", "The ZIP64 record of the archive is not where it must be; write it anew."
-        )
-    file.seek(where)
-    signature, length, _, _, disk, directory_disk, here, entries, size, start = _END_64_LAYOUT.unpack(
-        file.read(_END_64_LAYOUT.size)
-    )
-    if signature != b"PK\x06\x06" or length != _END_64_LAYOUT.size - 12:
-        raise_intake_error("archive-damaged", "The ZIP64 record of the archive is damaged; write it anew.")
-    if disk or directory_disk or here != entries:
-        raise_intake_error(
-            "archive-several-disks", "The archive is split into several files; send it as one."
-        )
-    for old, new, unknown in zip(
-        short, (entries, size, start), (_UNKNOWN_16, _UNKNOWN_32, _UNKNOWN_32), strict=True
-    ):
-        if old not in (new, unknown):
-            raise_intake_error(
-                "archive-mismatch", "The two end records of the archive contradict each other."
-            )
-    return _EndRecord(entries, start, size, where)
 
 
 def _central_entries(directory: bytes, count: int) -> list[tuple[ZipEntry, bytes]]:
@@ -215,19 +133,19 @@ def _central_entries(directory: bytes, count: int) -> list[tuple[ZipEntry, bytes
                 "archive-damaged", "The list of contents of the archive is damaged; write it anew."
             )
         raw_name = directory[position : position + name_length]
-        name = _decode_name(raw_name)
+        name = decode_name(raw_name)
         _check_version(version, name)
-        extra = _extra_fields(directory[position + name_length : after - comment_length], name)
-        size, packed, start, disk = _zip64_values(
+        extra = extra_fields(directory[position + name_length : after - comment_length], name)
+        size, packed, start, disk = zip64_values(
             extra,
             name,
-            (size, _UNKNOWN_32, 8), (packed, _UNKNOWN_32, 8), (start, _UNKNOWN_32, 8), (disk, _UNKNOWN_16, 4),
+            (size, UNKNOWN_32, 8), (packed, UNKNOWN_32, 8), (start, UNKNOWN_32, 8), (disk, UNKNOWN_16, 4),
         )  # fmt: skip
         if disk != 0:
             raise_intake_error(
                 "archive-several-disks", "The archive is split into several files; send it as one."
             )
-        name = _full_name(raw_name, name, extra)
+        name = full_name(raw_name, name, extra)
         # The upper half of the attributes is the mode on Unix; some programs read it whatever the home.
         entries.append(
             (
@@ -267,8 +185,8 @@ def _with_local_header(file: BinaryIO, record: ZipEntry, raw_name: bytes) -> Zip
     )
     _check_version(version, record.name)
     name = file.read(name_length)
-    extra = _extra_fields(file.read(extra_length), record.name)
-    size, packed = _zip64_values(extra, record.name, (size, _UNKNOWN_32, 8), (packed, _UNKNOWN_32, 8))
+    extra = extra_fields(file.read(extra_length), record.name)
+    size, packed = zip64_values(extra, record.name, (size, UNKNOWN_32, 8), (packed, UNKNOWN_32, 8))
     compared = IS_ENCRYPTED | HAS_DESCRIPTOR | IS_PATCHED | IS_STRONG | IS_UTF8 | IS_MASKED
     same = (name, method, flags & compared) == (raw_name, record.method, record.flags & compared)
     facts, announced = (crc32, packed, size), (record.crc32, record.packed_bytes, record.size_bytes)
@@ -277,8 +195,8 @@ def _with_local_header(file: BinaryIO, record: ZipEntry, raw_name: bytes) -> Zip
     same &= all(
         here == there or (deferred and here == 0) for here, there in zip(facts, announced, strict=True)
     )
-    local_name = _full_name(raw_name, _decode_name(raw_name), extra)
-    if _EXTRA_NAME in extra and local_name != record.name:
+    local_name = full_name(raw_name, decode_name(raw_name), extra)
+    if EXTRA_NAME in extra and local_name != record.name:
         raise_intake_error(
             "archive-second-name", f"The entry {quoted_name(record.name)} carries a second name.", record.name
         )
@@ -289,17 +207,7 @@ def _with_local_header(file: BinaryIO, record: ZipEntry, raw_name: bytes) -> Zip
             record.name,
         )
     data_start = record.header_start + _LOCAL_LAYOUT.size + name_length + extra_length
-    return ZipEntry(
-        name=record.name,
-        method=record.method,
-        flags=record.flags,
-        crc32=record.crc32,
-        packed_bytes=record.packed_bytes,
-        size_bytes=record.size_bytes,
-        header_start=record.header_start,
-        data_start=data_start,
-        unix_mode=record.unix_mode,
-    )
+    return replace(record, data_start=data_start)
 
 
 def _check_version(needed: int, name: str) -> None:
@@ -346,56 +254,3 @@ def _is_descriptor(data: bytes, length: int, record: ZipEntry) -> bool:
             if length == len(signature) + struct.calcsize(layout) and data[: len(signature)] == signature:
                 return struct.unpack_from(layout, data, len(signature)) == facts
     return False
-
-
-def _decode_name(name: bytes) -> str:
-    """Return a name as UTF-8; other bytes become lone surrogates, which no file that is taken may have."""
-    return name.decode("utf-8", "surrogateescape")
-
-
-def _full_name(raw_name: bytes, name: str, extra: dict[int, bytes]) -> str:
-    """Return the name of an entry: that of its Unicode field if it has one that belongs to the other name."""
-    field = extra.get(_EXTRA_NAME)
-    if field is None or field[5:] == raw_name:
-        return name
-    is_for_name = field[:1] == b"\1" and field[1:5] == struct.pack("<I", zlib.crc32(raw_name))
-    # A name in ASCII needs no other.
-    if not is_for_name or raw_name.isascii():
-        raise_intake_error(
-            "archive-second-name", f"The entry {quoted_name(name)} carries a second name.", name
-        )
-    return _decode_name(field[5:])
-
-
-def _extra_fields(data: bytes, name: str) -> dict[int, bytes]:
-    fields: dict[int, bytes] = {}
-    position = 0
-    while position < len(data):
-        if position + 4 > len(data):
-            break  # some programs fill up with up to three zeros
-        kind, length = struct.unpack_from("<2H", data, position)
-        position += 4
-        if position + length > len(data) or (kind in (_EXTRA_ZIP64, _EXTRA_NAME) and kind in fields):
-            raise_intake_error(
-                "archive-damaged", f"The extra data of {quoted_name(name)} in the archive are damaged.", name
-            )
-        fields[kind] = data[position : position + length]
-        position += length
-    return fields
-
-
-def _zip64_values(extra: dict[int, bytes], name: str, *values: tuple[int, int, int]) -> tuple[int, ...]:
-    """Replace values that are full by those of the ZIP64 field; each is (value, full, width in bytes)."""
-    field = extra.get(_EXTRA_ZIP64, b"")
-    position = 0
-    found: list[int] = []
-    for value, full, width in values:
-        if value == full:
-            if position + width > len(field):
-                raise_intake_error(
-                    "archive-damaged", f"The archive lacks the length of {quoted_name(name)}.", name
-                )
-            value = int.from_bytes(field[position : position + width], "little")
-            position += width
-        found.append(value)
-    return tuple(found)

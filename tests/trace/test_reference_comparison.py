@@ -215,6 +215,28 @@ def test_cutoff_settings_match_reference(rng: np.random.Generator, options: dict
     assert ours.hit_counts.max() <= options.get("max_hits", 512)
 
 
+@pytest.mark.parametrize(
+    ("options", "ids"),
+    [
+        ({"transmittance_min": 0.25}, [0, 1, 2]),
+        ({"transmittance_min": 0.6, "second_phase_min": 0.25}, [0, 1, 2, 3]),
+        ({"transmittance_min": 0.01, "q": -2 * np.log(0.5)}, []),
+    ],
+)
+def test_stack_that_meets_limits_exactly(options: dict[str, float], ids: list[int]) -> None:
+    halves = facing_z([[0, 0, z] for z in (1.0, 2.0, 3.0, 4.0, 5.0)], opacities=0.5)
+    seen, _ = assert_matches_reference(halves, RayBatch(f32([[0, 0, 0]]), f32([[0, 0, 1]])), **options)
+    assert hit_lists(seen) == [ids]
+    assert seen.depth_median[0] == (1 if ids else 0)
+
+
+def test_back_at_the_cull_distance_is_hit() -> None:
+    backs = facing_z([[0, 0, z] for z in (1.0, 2.0, 3.0)], opacities=0.5)
+    rays = RayBatch(f32([[0, 0, 0]]), f32([[0, 0, 1]]), t_backface_cull=2.0)
+    seen, _ = assert_matches_reference(backs, rays, flip_normal_cos=0.5)
+    assert hit_lists(seen) == [[1, 2]]
+
+
 @pytest.mark.parametrize("options", [{}, {"max_hits": 200}, {"second_phase_min": 0.9}])
 def test_rays_with_more_hits_than_one_traversal_gathers(
     rng: np.random.Generator, options: dict[str, float]

@@ -15,9 +15,10 @@ from octasplat.workers.db.postgres_text import as_json
 from octasplat.workers.queue.procrastinate_queue import ProcrastinateQueue
 from octasplat.workers.storage.disk_space import NO_USAGE, SpaceUsage
 from octasplat.workers.storage.factory import open_storage
+from octasplat.workers.storage.trees import TreeFile
 from octasplat.workers.worker.admission import Admission
+from octasplat.workers.worker.checkpoint import Checkpoint
 from octasplat.workers.worker.job_kinds import get_job_kind
-from octasplat.workers.worker.workspace import Checkpoint, TreeFile
 from tests.support.worker_harness import WorkerHarness
 
 KEPT = Checkpoint(1, "render", 3, (TreeFile(path="run/frames/a.exr", sha256="0" * 64, size_bytes=1 << 20),))

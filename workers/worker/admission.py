@@ -14,11 +14,12 @@ from octasplat.workers.queue.jobs import get_job, requeue_job
 from octasplat.workers.queue.protocol import JobQueue
 from octasplat.workers.storage.disk_space import SpaceUsage
 from octasplat.workers.storage.errors import StorageError
+from octasplat.workers.worker.checkpoint import Checkpoint
 from octasplat.workers.worker.context import WorkerContext
 from octasplat.workers.worker.heartbeat import DATABASE_ERRORS
 from octasplat.workers.worker.stored_frames import removes_stored_frames
 from octasplat.workers.worker.task import NO_SPACE_ERROR
-from octasplat.workers.worker.workspace import Checkpoint, sweep_workspaces
+from octasplat.workers.worker.workspace_locks import sweep_workspaces
 
 logger = logging.getLogger(__name__)
 

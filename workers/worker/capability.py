@@ -16,9 +16,9 @@ from octasplat.workers.db.connections import Pool
 from octasplat.workers.db.rows import Job
 from octasplat.workers.db.workers import live_workers
 from octasplat.workers.queue.jobs import get_job
+from octasplat.workers.worker.checkpoint import Checkpoint
 from octasplat.workers.worker.job_kinds import get_job_kind, job_kinds
 from octasplat.workers.worker.job_kinds.stored_options import resolve_here
-from octasplat.workers.worker.workspace import Checkpoint
 
 
 def version_facts() -> dict[str, Any]:

@@ -23,8 +23,9 @@ from octasplat.workers.reporting.event_lines import EventLines
 from octasplat.workers.reporting.events import decode_event, encode_training_progress
 from octasplat.workers.reporting.time_left import TimeLeftEstimator
 from octasplat.workers.storage.errors import StorageError
+from octasplat.workers.worker.checkpoint import Checkpoint
 from octasplat.workers.worker.task import RUN_FOLDER
-from octasplat.workers.worker.workspace import Checkpoint, Workspace
+from octasplat.workers.worker.workspace import Workspace
 
 logger = logging.getLogger(__name__)
 

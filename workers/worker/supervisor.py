@@ -31,6 +31,7 @@ from octasplat.workers.storage.errors import (
     UntrustedFileError,
 )
 from octasplat.workers.storage.untrusted_folder import MAX_DEPTH
+from octasplat.workers.worker.checkpoint import Checkpoint
 from octasplat.workers.worker.child_process import ChildProcess
 from octasplat.workers.worker.context import DatabaseLostError, WorkerContext
 from octasplat.workers.worker.heartbeat import DATABASE_ERRORS, Heartbeat
@@ -41,7 +42,7 @@ from octasplat.workers.worker.outcomes import OutcomeWriter
 from octasplat.workers.worker.path_redaction import PathRedactor, redact_json
 from octasplat.workers.worker.reporter import Reporter
 from octasplat.workers.worker.task import EXIT_REFUSED, EXIT_STOPPED, EXIT_UNEXPECTED, NO_SPACE_ERROR
-from octasplat.workers.worker.workspace import Checkpoint, Workspace
+from octasplat.workers.worker.workspace import Workspace
 
 logger = logging.getLogger(__name__)
 T = TypeVar("T")

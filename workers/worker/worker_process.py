@@ -54,7 +54,7 @@ from octasplat.workers.worker.kernels import compile_in_background
 from octasplat.workers.worker.memory_limit import memory_limit_bytes
 from octasplat.workers.worker.periodic_tasks import PeriodicTask, PeriodicTaskError, run_periodically
 from octasplat.workers.worker.supervisor import Supervisor
-from octasplat.workers.worker.workspace import sweep_temporary, sweep_workspaces
+from octasplat.workers.worker.workspace_locks import sweep_temporary, sweep_workspaces
 
 logger = logging.getLogger(__name__)
 

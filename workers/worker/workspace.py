@@ -1,21 +1,17 @@
 """Folder of an attempt: filled from the storage before the work, stored afterwards. All calls block."""
 
 import contextlib
-import fcntl
 import json
 import math
 import os
 import re
 import shutil
-import stat
 import time
 import uuid
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Sequence
 from pathlib import Path
-from typing import IO, Any
+from typing import IO
 
-from octasplat.engine.core import versions
 from octasplat.workers.db.rows import Artifact, DatasetFile, Job
 from octasplat.workers.queue.attempts import ResultFile
 from octasplat.workers.sandbox.job_users import JobUser, give_folder, open_for_reading, take_user
@@ -33,14 +29,15 @@ from octasplat.workers.storage.trees import (
     store_tree,
 )
 from octasplat.workers.storage.untrusted_folder import UntrustedFolder
+from octasplat.workers.worker.checkpoint import Checkpoint
 from octasplat.workers.worker.media_types import media_type
 from octasplat.workers.worker.stored_frames import StoredFrames, removes_stored_frames
 from octasplat.workers.worker.task import FILES_FOLDER, RESULTS_FOLDER, RUN_FOLDER
+from octasplat.workers.worker.workspace_locks import LOCK_FILE, lock_dataset_folder, open_locked
 
 POSES_FOLDER = "poses"
 """Poses that the engine found, in its output folder and among the results."""
 
-_LOCK_FILE = ".lock"
 _CHECKPOINT = re.compile(r"run/checkpoints/iteration_\d+\.npz")
 _CHECKPOINT_FILES = (
     "run/config.json", "run/held_out.json", "run/views.json", "run/events.jsonl", "run/training.json",
@@ -49,55 +46,6 @@ _CHECKPOINT_FILES = (
 _MAX_TRIES = 5
 METRICS_FILE = "metrics.json"
 MAX_METRICS_BYTES = 16 << 20
-
-
-@dataclass(frozen=True)
-class Checkpoint:
-    """Checkpoint from which a later attempt resumes, as the job's row stores it.
-
-    Attributes:
-        attempt: that made it.
-        stage: of the work.
-        step: of the stage.
-        files: what is needed.
-        results: what the same settings gave in the version that made it, see
-            :data:`octasplat.engine.core.versions.RESULTS_VERSION`; versions that did not say so gave the
-            first.
-    """
-
-    attempt: int
-    stage: str
-    step: int
-    files: tuple[TreeFile, ...]
-    results: int = field(default_factory=lambda: versions.RESULTS_VERSION)
-
-    def as_row(self) -> dict[str, Any]:
-        """Return the checkpoint as JSON values."""
-        return {
-            "attempt": self.attempt,
-            "stage": self.stage,
-            "step": self.step,
-            "files": [file.model_dump() for file in self.files],
-            "results": self.results,
-        }
-
-    @classmethod
-    def from_row(cls, row: Mapping[str, Any]) -> "Checkpoint":
-        """Return the checkpoint of JSON values."""
-        files = tuple(TreeFile.model_validate(file) for file in row["files"])
-        return cls(row["attempt"], row["stage"], row["step"], files, row.get("results", 1))
-
-    @property
-    def size_bytes(self) -> int:
-        """Return the size of its files together."""
-        return sum(file.size_bytes for file in self.files)
-
-    def is_after(self, other: "Checkpoint | None") -> bool:
-        """Return whether the work is further than at ``other``."""
-        order = {"poses": 0, "load": 1, "train": 2, "evaluate": 3, "export": 4}
-        if other is None:
-            return True
-        return (order.get(self.stage, 0), self.step) > (order.get(other.stage, 0), other.step)
 
 
 class Workspace:
@@ -130,7 +78,7 @@ class Workspace:
         with translate_os_errors(self._root):
             remove_folder(self.folder)
             self.folder.mkdir(parents=True, mode=0o700)
-            self._lock = _open_locked(self.folder / _LOCK_FILE)
+            self._lock = open_locked(self.folder / LOCK_FILE)
 
     def give_to_user(self, uids: range) -> int:
         """Choose the user that the job runs as and give it the folder; return its id.
@@ -184,7 +132,7 @@ class Workspace:
     def fetch_dataset(self, dataset_id: uuid.UUID, files: Sequence[DatasetFile], name: str) -> Path:
         """Fetch the photographs into a folder shared by all attempts here; its files must not be changed."""
         folder = self._root / "datasets" / str(dataset_id)
-        self._dataset_lock = _lock_dataset_folder(folder)
+        self._dataset_lock = lock_dataset_folder(folder)
         place = folder / (re.sub(r"[^A-Za-z0-9_-]+", "_", name).strip("_")[:60] or "scene")
         if not place.exists():
             partial = folder / f".{uuid.uuid4().hex}.partial"
@@ -325,62 +273,6 @@ def _directly_below(folder: UntrustedFolder, below: str) -> list[str]:
     return [f"{below}/{name}" for name in folder.names(below) if "/" not in name]
 
 
-def sweep_workspaces(root: Path, dataset_seconds: float = 86_400.0) -> int:
-    """Remove the folders of attempts whose worker is gone, and photographs not used for a while.
-
-    Args:
-        root: folder of all work on this machine.
-        dataset_seconds: how long photographs stay that no attempt uses.
-
-    Returns:
-        Number of folders removed.
-    """
-    removed = 0
-    for folder in (root / "attempts").glob("*"):
-        try:
-            lock = _open_locked(folder / _LOCK_FILE, create=False)
-        except BlockingIOError:
-            continue
-        except OSError:
-            if time.time() - folder.stat().st_mtime < 60:
-                continue  # being made right now
-            remove_folder(folder)
-        else:
-            with lock:
-                remove_folder(folder)
-        removed += 1
-    for folder in (root / "datasets").glob("*"):
-        with contextlib.suppress(OSError):  # in use, or gone already
-            if time.time() - folder.stat().st_mtime < dataset_seconds:
-                continue
-            with (folder / _LOCK_FILE).open("ab") as lock:
-                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                remove_folder(folder)
-            removed += 1
-    return removed
-
-
-def sweep_temporary(folder: Path, older_than_seconds: float) -> int:
-    """Remove folders that killed checks of COLMAP models have left among the temporary files of this machine.
-
-    Args:
-        folder: of temporary files.
-        older_than_seconds: what was changed since may be in use.
-
-    Returns:
-        Number of folders removed.
-    """
-    removed = 0
-    for left in folder.glob("octasplat-model-????????"):
-        with contextlib.suppress(OSError):
-            facts = left.lstat()
-            old = time.time() - facts.st_mtime > older_than_seconds
-            if stat.S_ISDIR(facts.st_mode) and facts.st_uid == os.geteuid() and old:
-                shutil.rmtree(left, ignore_errors=True)
-                removed += 1
-    return removed
-
-
 def _tree_files(files: Sequence[DatasetFile]) -> list[TreeFile]:
     return [TreeFile(path=f.path, sha256=f.sha256, size_bytes=f.size_bytes) for f in files]
 
@@ -391,29 +283,3 @@ def _result_files(manifest: Manifest) -> list[ResultFile]:
 
 def _results_document(job: Job, attempt: int) -> str:
     return f"results/{job.id}/{attempt}"
-
-
-def _open_locked(path: Path, *, create: bool = True) -> IO[bytes]:
-    """Open a file and hold its lock, which ends with this process."""
-    # A program may have put a link in the place of the file.
-    flags = os.O_RDWR | os.O_NOFOLLOW | os.O_CLOEXEC | (os.O_CREAT if create else 0)
-    handle = os.fdopen(os.open(path, flags, 0o600), "r+b")
-    try:
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError:
-        handle.close()
-        raise
-    return handle
-
-
-def _lock_dataset_folder(folder: Path) -> IO[bytes]:
-    """Make a folder of photographs and keep it from being swept for as long as the file is open."""
-    while True:
-        folder.mkdir(parents=True, exist_ok=True)
-        with contextlib.suppress(FileNotFoundError):  # swept this moment
-            handle = (folder / _LOCK_FILE).open("ab")
-            fcntl.flock(handle, fcntl.LOCK_SH)
-            with contextlib.suppress(FileNotFoundError):
-                if os.path.samestat(os.fstat(handle.fileno()), (folder / _LOCK_FILE).stat()):
-                    return handle
-            handle.close()

@@ -11,16 +11,30 @@ MIN_THOUSANDS = 5
 """Of iterations, where the photographs decide their number."""
 RAY_SORT_ITERATION_RATIO = 3 / 7
 """Share of the rays that a training has time for where each ray has an order of its own."""
+RAYS_PER_MIN_THOUSANDS = 3
+"""Rays per pixel for each of which so many the minimum is taken once, where each ray has its own order."""
+MAX_ITERATIONS, MAX_ITERATIONS_RAYS = 10_000, 3
+"""At most so many iterations for so many rays per pixel."""
+MIN_PIXELS_PER_GAUSSIAN = 10
+"""Fewer pixels do not constrain a Gaussian: it learns the noise of the training views."""
+MIN_GAUSSIANS = 10_000
+"""Of small photographs, where their pixels constrain so many."""
+MIN_PATCHES_ACROSS = 15
+"""Patches of rays along the longest side of a view, so that each covers a small angle."""
+PATCH_PIXELS_PER_GAUSSIAN_PIXEL = 6
+"""Pixels that a patch spans for each pixel that a Gaussian covers, so that its rays meet the same ones."""
+GAUSSIANS_PER_REBUILD_INTERVAL = 500_000
+"""Gaussians for each of which so many the interval between rebuilds is taken once more."""
 
 
 def iteration_count(config: TrainConfig, training_pixels: int, valid_fraction: float = 1.0) -> int:
     """Return ``config.iterations``, or where that is 0 the number that the training pixels ask for.
 
     That is ``config.rays_per_pixel`` rays for each pixel, rounded to thousands of iterations, at least
-    ``MIN_THOUSANDS`` or one thousand for each ray per pixel, whichever is more, and at most ten thirds of a
-    thousand for each. With per-ray sorting an iteration takes longer, so fewer rays are traced. Where only
-    ``valid_fraction`` of the pixels shows anything, the other rays teach and cost little, and the count is
-    divided by it; not with materials.
+    ``MIN_THOUSANDS`` or one thousand for each ray per pixel, whichever is more, and at most
+    ``MAX_ITERATIONS`` for each ``MAX_ITERATIONS_RAYS`` of them. With per-ray sorting an iteration takes
+    longer, so fewer rays are traced. Where only ``valid_fraction`` of the pixels shows anything, the other
+    rays teach and cost little, and the count is divided by it; not with materials.
 
     Args:
         config: settings of the training.
@@ -33,23 +47,24 @@ def iteration_count(config: TrainConfig, training_pixels: int, valid_fraction: f
     else:
         if not config.materials.learn:  # their presets set rays_per_pixel for per-ray sorting already
             rays_per_pixel = max(1, round(RAY_SORT_ITERATION_RATIO * rays_per_pixel))
-        min_thousands = MIN_THOUSANDS * max(1, rays_per_pixel // 3)
+        min_thousands = MIN_THOUSANDS * max(1, rays_per_pixel // RAYS_PER_MIN_THOUSANDS)
     thousands = max(round(rays_per_pixel * training_pixels / config.rays_per_batch / 1000), min_thousands)
     if not config.materials.learn:
         thousands = round(thousands / valid_fraction)
-    return config.iterations or min(thousands, 10 * rays_per_pixel // 3) * 1000
+    max_thousands = MAX_ITERATIONS // 1000 * rays_per_pixel // MAX_ITERATIONS_RAYS
+    return config.iterations or min(thousands, max_thousands) * 1000
 
 
 def max_gaussian_count(config: GaussianSettings, training_pixels: int, valid_fraction: float = 1.0) -> int:
     """Return ``config.max_gaussians``, or where that is 0 what the pixels of training views can constrain.
 
-    Of those only the share counts that shows anything. More than one for each 10 pixels learn the noise of
-    the training views instead of the scene.
+    Of those only the share counts that shows anything, see ``MIN_PIXELS_PER_GAUSSIAN``.
     """
     if config.max_gaussians:
         return config.max_gaussians
     training_pixels = round(training_pixels * valid_fraction)
-    wanted = max(training_pixels // config.pixels_per_gaussian, min(training_pixels // 10, 10_000), 1)
+    constrained = min(training_pixels // MIN_PIXELS_PER_GAUSSIAN, MIN_GAUSSIANS)
+    wanted = max(training_pixels // config.pixels_per_gaussian, constrained, 1)
     return min(wanted, config.max_gaussians_auto)
 
 
@@ -70,10 +85,10 @@ def ray_patch_side_px(config: TrainConfig, longest_side_px: int, pixels_a_gaussi
     """
     if config.ray_patch_side:
         return config.ray_patch_side
-    widest = max(1, round(longest_side_px / 15))
+    widest = max(1, round(longest_side_px / MIN_PATCHES_ACROSS))
     if not uses_shared_sort(config):
         return widest
-    return min(widest, max(1, round(math.sqrt(6 * pixels_a_gaussian))))
+    return min(widest, max(1, round(math.sqrt(PATCH_PIXELS_PER_GAUSSIAN_PIXEL * pixels_a_gaussian))))
 
 
 def rebuild_interval(rebuild_every: int, gaussians: int) -> int:
@@ -81,4 +96,4 @@ def rebuild_interval(rebuild_every: int, gaussians: int) -> int:
 
     A rebuild takes time for every Gaussian, an iteration only for those that its rays meet.
     """
-    return rebuild_every * (1 + gaussians // 500_000)
+    return rebuild_every * (1 + gaussians // GAUSSIANS_PER_REBUILD_INTERVAL)
