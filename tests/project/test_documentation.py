@@ -194,3 +194,18 @@ def check_command(words: tuple[str, ...]) -> None:
                 find_setting(assignment)
             except OctasplatError as error:
                 raise AssertionError(str(error)) from error
+
+
+def test_named_tests_exist() -> None:
+    """A name without a file is of the row's or an earlier one's; such names are looked for in all files."""
+    names: dict[str, set[str]] = {}
+    for file in (ROOT / "tests").rglob("test_*.py"):
+        found = re.findall(r"^(?:async )?def (test_\w+)", file.read_text(encoding="utf-8"), re.MULTILINE)
+        names[file.relative_to(ROOT).as_posix()] = set(found)
+    missing = [
+        f"{page.name}: {file}::{name}"
+        for page in pages()
+        for file, name in re.findall(r"`(tests/[\w/]+\.py)?::(test_\w+)", page.read_text(encoding="utf-8"))
+        if not any(name in names[place] for place in ([file] if file else names))
+    ]
+    assert missing == []
