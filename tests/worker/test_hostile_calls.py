@@ -24,7 +24,7 @@ from types import SimpleNamespace
 from octasplat.workers.sandbox.confinement import confine
 from tests.support import hostile_kind
 found = {}
-hostile_kind._tell = lambda _task, tries: found.update(tries)
+hostile_kind.write_outcomes = lambda _task, tries: found.update(tries)
 options = hostile_kind.HostileOptions(attack="", target=sys.argv[2], pids=(int(sys.argv[1]),))
 task = SimpleNamespace(folder=Path(sys.argv[3]))
 confine(hidden=[], readable=[], may_start_processes=False)
