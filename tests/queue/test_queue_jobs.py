@@ -9,6 +9,7 @@ from octasplat.workers.db.connections import Connection, Pool, open_pool
 from octasplat.workers.db.errors import ConflictError, NotFoundError
 from octasplat.workers.db.ids import new_id
 from octasplat.workers.queue.attempts import FencedError, ResultFile, claim
+from octasplat.workers.queue.job_endings import MAX_SILENT_RECOVERIES
 from octasplat.workers.queue.jobs import (
     NewJob,
     artifacts_of,
@@ -116,6 +117,20 @@ async def test_lost_jobs_are_rescued_three_times_then_failed(conninfo: str) -> N
         assert job.state == "failed" and job.error is not None and "4 times" in job.error["message"]
         assert job.slip is None
     assert count(conninfo, "procrastinate_jobs") == 0
+
+
+async def test_losses_of_another_kind_do_not_count_as_silence(conninfo: str) -> None:
+    silent = {"type": "silent", "message": "The program said nothing."}
+    async with open_pool(conninfo, max_size=4) as pool:
+        job_id = (await claimed(pool)).job.id
+        await make_old(pool, job_id)
+        await recover_stalled_jobs(pool, SLIPS, 5, StalledAttempts(0.0))
+        states = []
+        for _ in range(2):
+            attempt = await claimed(pool, await fetched(pool, job_id))
+            await attempt.requeue_lost(SLIPS, silent, max_recoveries=MAX_SILENT_RECOVERIES)
+            states.append((await fetched(pool, job_id)).state)
+        assert states == ["queued", "failed"]
 
 
 async def test_new_checkpoint_forgives_lost_workers(conninfo: str) -> None:

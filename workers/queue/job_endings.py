@@ -13,7 +13,7 @@ from octasplat.workers.queue.protocol import JobQueue
 MAX_RECOVERIES = 3
 """Lost attempts without a new checkpoint after which a job is taken for one that kills its workers."""
 MAX_SILENT_RECOVERIES = 1
-"""Likewise where an attempt was ended because it said nothing: each takes as long as that limit."""
+"""So many of them may be attempts that ended because they said nothing: each takes as long as that limit."""
 
 
 async def end_job(connection: Connection, job: Job, state: str, error: Mapping[str, Any] | None) -> None:
@@ -48,9 +48,10 @@ async def recover_attempt(
 ) -> bool:
     """Give a job whose attempt was lost to another worker; the caller holds the job's lock.
 
-    A job that was being cancelled is cancelled. One that was lost more than ``max_recoveries`` times without
-    advancing is failed with ``error``. With ``keep_entry`` the queue entry is still being delivered and is
-    removed by that. The job is not taken up before ``delay_seconds`` have passed.
+    A job that was being cancelled is cancelled. One that was lost more than :data:`MAX_RECOVERIES` times, or
+    more than ``max_recoveries`` times by this error, without advancing is failed with it. With ``keep_entry``
+    the queue entry is still being delivered and is removed by that. The job is not taken up before
+    ``delay_seconds`` have passed.
 
     Returns:
         Whether it failed.
@@ -59,13 +60,13 @@ async def recover_attempt(
         await job_queue.remove(connection, job.slip)
     if job.state == "canceling":
         await end_job(connection, job, "canceled", None)
-    elif job.rescues >= max_recoveries:
+    elif job.rescues >= MAX_RECOVERIES or await _count_same_losses(connection, job, error) >= max_recoveries:
         message = f"{error['message']} This happened {job.rescues + 1} times without getting any further."
         await end_job(connection, job, "failed", {**error, "message": message, "rescues": job.rescues})
         return True
     else:
         await connection.execute("UPDATE jobs SET rescues = rescues + 1 WHERE id = %s", [job.id])
-        data = {"reason": error["message"], "rescues": job.rescues + 1}
+        data = {"reason": error["message"], "type": error.get("type"), "rescues": job.rescues + 1}
         await add_event(connection, job.id, job.attempt, "rescued", data)
         lost = f"Lost, and queued again: {error['message']}"
         await add_log_lines(connection, job.id, job.attempt, [lost])
@@ -78,3 +79,17 @@ async def recover_attempt(
             reason=error["message"],
         )
     return False
+
+
+async def _count_same_losses(connection: Connection, job: Job, error: Mapping[str, Any]) -> int:
+    """Return how many attempts were lost by the same error since the job last advanced."""
+    cursor = await connection.execute(
+        """
+        SELECT count(*) AS n FROM (
+            SELECT data FROM job_events WHERE job_id = %s AND kind = 'rescued' ORDER BY id DESC LIMIT %s
+        ) AS lost WHERE data->>'type' = %s
+        """,
+        [job.id, job.rescues, error.get("type")],
+    )
+    row = await cursor.fetchone()
+    return int(row["n"]) if row else 0
