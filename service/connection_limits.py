@@ -21,6 +21,7 @@ class ConnectionLimits:
         max_per_address: of one address, but for proxies that are named.
         header_seconds: time for the headers of a request, from its first byte or the connection's start.
         body_seconds: time for each :data:`MIN_BODY_BYTES` of a body, or for what is left of it.
+        reader_seconds: time in which a client takes as much of an answer.
         proxies: networks of proxies.
     """
 
@@ -28,6 +29,7 @@ class ConnectionLimits:
     max_per_address: int
     header_seconds: float
     body_seconds: float
+    reader_seconds: float
     proxies: Sequence[IPvAnyNetwork] = ()
 
 

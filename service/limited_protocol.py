@@ -5,7 +5,11 @@ beginning with the one that has waited longest. So those who open many and send 
 """
 
 import asyncio
+import contextlib
+import fcntl
 import logging
+import sys
+import termios
 import time
 from collections import defaultdict
 from typing import Any
@@ -94,6 +98,7 @@ class LimitedProtocol(H11Protocol):
         self.address = ""
         self.waiting_since = time.monotonic()
         self._body_bytes = 0
+        self._unsent_bytes: int | None = None
 
     @property
     def is_waiting_for_request(self) -> bool:
@@ -146,11 +151,32 @@ class LimitedProtocol(H11Protocol):
         elif self._is_waiting_for_body:
             if seconds > limits.body_seconds:
                 self.transport.close()
+        elif self.flow.write_paused:
+            self._close_if_not_reading(limits.reader_seconds)
         elif not self.is_waiting_for_request:
             self._restart_clock()
 
+    def _close_if_not_reading(self, reader_seconds: float) -> None:
+        """Close the connection of a client that takes nothing of an answer, or next to nothing."""
+        unsent = self.transport.get_write_buffer_size() + _unacknowledged_bytes(self.transport)
+        before = self._unsent_bytes
+        # More than before: all of that was taken, and more was written since.
+        if before is None or not before - MIN_BODY_BYTES < unsent <= before:
+            self._restart_clock()
+            self._unsent_bytes = unsent
+        elif time.monotonic() - self.waiting_since > reader_seconds:
+            self.transport.abort()
+
     def _restart_clock(self) -> None:
-        self.waiting_since, self._body_bytes = time.monotonic(), 0
+        self.waiting_since, self._body_bytes, self._unsent_bytes = time.monotonic(), 0, None
+
+
+def _unacknowledged_bytes(transport: asyncio.Transport) -> int:
+    """Return how much of what was written the system still holds; 0 where it does not say."""
+    connection = transport.get_extra_info("socket")
+    with contextlib.suppress(OSError):
+        return int.from_bytes(fcntl.ioctl(connection.fileno(), termios.TIOCOUTQ, bytes(4)), sys.byteorder)
+    return 0
 
 
 def _close_longest_waiting(connections: dict[LimitedProtocol, None]) -> bool:

@@ -69,6 +69,7 @@ class ServiceSettings(WorkerSettings):
             a new one replaces the one that has waited longest for a request.
         max_connections_per_address: the same of one address; those of ``proxies`` may have all.
         header_seconds: how long the headers of a request may take.
+        reader_seconds: how long a client may take to read 64 KiB of an answer.
     """
 
     host: str = "127.0.0.1"
@@ -103,6 +104,7 @@ class ServiceSettings(WorkerSettings):
     max_connections: int = Field(4096, gt=0)
     max_connections_per_address: int = Field(1024, gt=0)
     header_seconds: float = Field(20.0, gt=0)
+    reader_seconds: float = Field(120.0, gt=0)
 
     @property
     def is_private(self) -> bool:
@@ -136,6 +138,7 @@ class ServiceSettings(WorkerSettings):
             max_per_address=min(self.max_connections_per_address, connections_for(open_files)),
             header_seconds=self.header_seconds,
             body_seconds=_BODY_SECONDS,
+            reader_seconds=self.reader_seconds,
             proxies=self.proxies,
         )
 

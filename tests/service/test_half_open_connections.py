@@ -101,6 +101,42 @@ def test_slow_headers_are_ended(start_front_end: StartFrontEnd) -> None:
         assert 1 < time.monotonic() - began < 15
 
 
+LARGE = b"GET /openapi.json HTTP/1.1\r\nHost: localhost\r\nConnection: keep-alive\r\n\r\n"
+
+
+def read_all(connection: socket.socket, count: int, pause_seconds: float) -> int:
+    """The bytes of so many equal answers, of which 128 KiB are read at a time; fewer where it is closed."""
+    received, expected = b"", 0
+    with contextlib.suppress(ConnectionResetError):
+        while not expected or len(received) < expected:
+            piece = connection.recv(128 << 10)
+            if not piece:
+                break
+            received += piece
+            if not expected and b"\r\n\r\n" in received:
+                head = received.partition(b"\r\n\r\n")[0]
+                expected = count * (
+                    len(head) + 4 + int(head.lower().split(b"content-length: ")[1].split()[0])
+                )
+            time.sleep(pause_seconds)
+    return len(received) - expected
+
+
+def test_clients_that_do_not_read_are_not_waited_for(start_front_end: StartFrontEnd) -> None:
+    with start_front_end(READER_SECONDS="2") as front_end, front_end.connect() as connection:
+        connection.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 14)
+        connection.sendall(LARGE * 60)
+        time.sleep(12)
+        assert read_all(connection, 60, 0.0) < 0
+        assert front_end.healthz_seconds() < 5
+
+
+def test_clients_that_read_slowly_get_everything(start_front_end: StartFrontEnd) -> None:
+    with start_front_end(READER_SECONDS="2") as front_end, front_end.connect() as connection:
+        connection.sendall(LARGE * 15)
+        assert read_all(connection, 15, 0.25) == 0
+
+
 def test_kept_connection_takes_further_requests(start_front_end: StartFrontEnd) -> None:
     with start_front_end(HEADER_SECONDS="1") as front_end:
         connection = http.client.HTTPConnection(*front_end.address, timeout=30)
