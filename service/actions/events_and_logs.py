@@ -24,7 +24,7 @@ _RETRY_SECONDS = 10
 async def read_log(
     service: Service, principal: Principal, job_id: uuid.UUID, *, after: int, limit: int
 ) -> list[LogLine]:
-    """Return lines of a job's log after the id ``after``.
+    """Return lines of a job's log after the number ``after``.
 
     Raises:
         ProblemError: 404 if it does not exist or the principal may not see it.
@@ -37,7 +37,7 @@ async def read_log(
 async def read_events(
     service: Service, principal: Principal, job_id: uuid.UUID, *, after: int, limit: int
 ) -> list[JobEvent]:
-    """Return the events of a job after the id ``after``.
+    """Return the events of a job after the number ``after``.
 
     Raises:
         ProblemError: 404 if it does not exist or the principal may not see it.
@@ -94,7 +94,7 @@ async def _stream_events(
                 over = job.is_over
                 events = await list_job_events(connection, job_id, after, _PAGE_SIZE)
             for event in events:
-                after = event.id
+                after = event.number
                 yield _visible_event(principal, event)
             if len(events) == _PAGE_SIZE:
                 continue

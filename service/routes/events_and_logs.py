@@ -30,7 +30,7 @@ async def read_log(
 ) -> LogPage:  # fmt: skip
     """Return the job's log: stages, pace, warnings, errors with their cause, and the program's output."""
     lines = await actions.read_log(service, principal, job_id, after=after, limit=limit)
-    return LogPage(lines=[LogLineView.from_row(row) for row in lines], next=lines[-1].id if lines else after)
+    return LogPage(lines=[LogLineView.from_row(row) for row in lines], next=lines[-1].number if lines else after)
 
 
 @router.get("/{job_id}/timeline", responses=problem_responses(404))
@@ -41,7 +41,7 @@ async def read_timeline(
     """List the events of the job; `/events` streams the same."""
     events = await actions.read_events(service, principal, job_id, after=after, limit=limit)
     return EventPage(
-        events=[EventView.from_row(row) for row in events], next=events[-1].id if events else after
+        events=[EventView.from_row(row) for row in events], next=events[-1].number if events else after
     )
 
 
@@ -84,4 +84,4 @@ async def _encode_stream(events: AsyncGenerator[JobEvent | None, None]) -> Async
 
 def _encode_event(event: JobEvent) -> bytes:
     data = {**event.data, "attempt": event.attempt, "at": event.at.isoformat()}
-    return format_sse_event(data_str=json.dumps(data), event=event.kind, id=str(event.id))
+    return format_sse_event(data_str=json.dumps(data), event=event.kind, id=str(event.number))

@@ -3,7 +3,7 @@
 from datetime import datetime
 from typing import Any
 
-from pydantic import BaseModel
+from pydantic import BaseModel, Field
 
 from octasplat.workers.db.rows import JobEvent, LogLine
 
@@ -11,7 +11,7 @@ from octasplat.workers.db.rows import JobEvent, LogLine
 class LogLineView(BaseModel):
     """A line of a job's log."""
 
-    id: int
+    id: int = Field(description="Number among the lines of the job.")
     attempt: int
     text: str
     at: datetime
@@ -19,7 +19,7 @@ class LogLineView(BaseModel):
     @classmethod
     def from_row(cls, row: LogLine) -> "LogLineView":
         """Return the view of a database row."""
-        return cls.model_validate(row, from_attributes=True)
+        return cls(id=row.number, attempt=row.attempt, text=row.text, at=row.at)
 
 
 class LogPage(BaseModel):
@@ -32,7 +32,7 @@ class LogPage(BaseModel):
 class EventView(BaseModel):
     """An event of a job."""
 
-    id: int
+    id: int = Field(description="Number among the events of the job.")
     attempt: int
     kind: str
     data: dict[str, Any]
@@ -41,7 +41,7 @@ class EventView(BaseModel):
     @classmethod
     def from_row(cls, row: JobEvent) -> "EventView":
         """Return the view of a database row."""
-        return cls.model_validate(row, from_attributes=True)
+        return cls(id=row.number, attempt=row.attempt, kind=row.kind, data=row.data, at=row.at)
 
 
 class EventPage(BaseModel):

@@ -25,6 +25,7 @@ from tests.support.postgres_fixtures import copied_database
 STEPS = [step.name for step in all_migrations() if step.component == OWN_COMPONENT]
 BEFORE_USAGE = [name for name in STEPS if name < "0008"]
 BEFORE_LOCKS = [name for name in STEPS if name < "0012"]
+BEFORE_NUMBERS = [name for name in STEPS if name < "0016"]
 
 
 @pytest.fixture
@@ -95,6 +96,38 @@ def test_uploads_beside_the_counting_are_counted(empty: str) -> None:
         assert usage(connection) == 20_000_000
         connection.execute("DELETE FROM datasets")
         assert usage(connection) == 0
+
+
+def test_events_and_lines_of_both_versions_are_numbered_by_job(empty: str) -> None:
+    migrate(empty, only=BEFORE_NUMBERS)
+    jobs = [uuid.uuid4(), uuid.uuid4()]
+    add_event = "INSERT INTO job_events (job_id, attempt, kind, data) VALUES (%s, 1, 'progress', '{}')"
+    add_lines = "INSERT INTO job_logs (job_id, attempt, text) SELECT %s, 1, unnest(%s::text[])"
+
+    def add(connection: "psycopg.Connection[tuple[int, ...]]") -> None:
+        for job in jobs:
+            connection.execute(add_event, [job])
+            connection.execute(add_lines, [job, ["a", "b"]])
+
+    with psycopg.connect(empty) as connection:
+        for job in jobs:
+            connection.execute(
+                "INSERT INTO jobs (id, owner, kind, options, queue) VALUES (%s, 'me', 'x', '{}', 'cpu')", [job]
+            )
+        add(connection)
+        add(connection)
+    migrate(empty, only=[name for name in STEPS if name <= "0016_numbers.sql"])
+    with psycopg.connect(empty) as connection:
+        add(connection)  # between the two steps, and after them, by a process of the former version
+    migrate(empty)
+    with psycopg.connect(empty) as connection:
+        add(connection)
+        for table, count in (("job_events", 4), ("job_logs", 8)):
+            for job in jobs:
+                rows = connection.execute(
+                    f"SELECT number FROM {table} WHERE job_id = %s ORDER BY id".encode(), [job]
+                ).fetchall()
+                assert [number for (number,) in rows] == list(range(1, count + 1))
 
 
 def test_fsck_recount_corrects_usage(conninfo: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

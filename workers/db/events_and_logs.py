@@ -28,10 +28,14 @@ async def add_log_lines(
     """Add lines to the log of a job."""
     await connection.execute(
         """
-        INSERT INTO job_logs (job_id, attempt, text)
-        SELECT %s, %s, line FROM unnest(%s::text[]) WITH ORDINALITY AS given (line, number) ORDER BY number
+        WITH counted AS MATERIALIZED (
+            SELECT log_lines FROM octasplat_count_job_rows(%(job)s, 0, cardinality(%(lines)s::text[]))
+        )
+        INSERT INTO job_logs (job_id, attempt, text, number)
+        SELECT %(job)s, %(attempt)s, line, log_lines - cardinality(%(lines)s::text[]) + place
+        FROM counted, unnest(%(lines)s::text[]) WITH ORDINALITY AS given (line, place) ORDER BY place
         """,
-        [job_id, attempt, [storable_text(line) for line in lines]],
+        {"job": job_id, "attempt": attempt, "lines": [storable_text(line) for line in lines]},
     )
 
 
@@ -48,24 +52,37 @@ async def trim_log(connection: Connection, job_id: uuid.UUID, max_lines: int) ->
 
 
 async def list_job_events(
-    connection: Connection, job_id: uuid.UUID, after_id: int = 0, limit: int = 500
+    connection: Connection, job_id: uuid.UUID, after: int = 0, limit: int = 500
 ) -> list[JobEvent]:
-    """Return the job's events whose id is above ``after_id``, in ascending order."""
+    """Return the job's events whose number is above ``after``, in ascending order.
+
+    All of them where the job never had an event of that number, as a client has it that was told the numbers
+    of the former version.
+    """
     return await fetch_all(
         connection,
         JobEvent,
-        "SELECT {} FROM job_events WHERE job_id = %s AND id > %s ORDER BY id LIMIT %s",
-        [job_id, after_id, limit],
+        """
+        SELECT {} FROM job_events WHERE job_id = %(job)s AND number > (
+            SELECT CASE WHEN %(after)s > events THEN 0 ELSE %(after)s END FROM job_counts WHERE job_id = %(job)s
+        ) ORDER BY number LIMIT %(limit)s
+        """,
+        {"job": job_id, "after": after, "limit": limit},
     )
 
 
 async def list_log_lines(
-    connection: Connection, job_id: uuid.UUID, after_id: int = 0, limit: int = 1000
+    connection: Connection, job_id: uuid.UUID, after: int = 0, limit: int = 1000
 ) -> list[LogLine]:
-    """Return the job's log lines whose id is above ``after_id``, in ascending order."""
+    """Return the job's log lines whose number is above ``after``, as :func:`list_job_events` does."""
     return await fetch_all(
         connection,
         LogLine,
-        "SELECT {} FROM job_logs WHERE job_id = %s AND id > %s ORDER BY id LIMIT %s",
-        [job_id, after_id, limit],
+        """
+        SELECT {} FROM job_logs WHERE job_id = %(job)s AND number > (
+            SELECT CASE WHEN %(after)s > log_lines THEN 0 ELSE %(after)s END
+            FROM job_counts WHERE job_id = %(job)s
+        ) ORDER BY number LIMIT %(limit)s
+        """,
+        {"job": job_id, "after": after, "limit": limit},
     )

@@ -174,9 +174,9 @@ class Artifact:
 
 @dataclass(frozen=True)
 class JobEvent:
-    """Something that happened to a job; ids rise."""
+    """Something that happened to a job; numbers rise, by job."""
 
-    id: int
+    number: int
     job_id: uuid.UUID
     attempt: int
     kind: str
@@ -186,9 +186,9 @@ class JobEvent:
 
 @dataclass(frozen=True)
 class LogLine:
-    """A line that a job's program wrote; ids rise."""
+    """A line that a job's program wrote; numbers rise, by job."""
 
-    id: int
+    number: int
     job_id: uuid.UUID
     attempt: int
     text: str
