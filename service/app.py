@@ -10,8 +10,8 @@ from fastapi import Depends, FastAPI
 
 from octasplat.engine import __version__
 from octasplat.engine.core.errors import ConfigError, OctasplatError
+from octasplat.service.actions.task_runner import TaskRunner
 from octasplat.service.audit_middleware import AuditMiddleware
-from octasplat.service.concurrency_limiter import ConcurrencyLimiter
 from octasplat.service.event_broker import EventBroker
 from octasplat.service.eviction import SpaceEvictor
 from octasplat.service.login_throttle import LoginThrottle
@@ -31,6 +31,7 @@ from octasplat.service.request_id import RequestIdMiddleware
 from octasplat.service.routes import (
     artifacts,
     audit,
+    dataset_tasks,
     datasets,
     estimates,
     events_and_logs,
@@ -55,13 +56,12 @@ from octasplat.workers.storage.factory import open_storage
 
 logger = logging.getLogger(__name__)
 
-_IMPORTS = {"max_concurrent": 8, "max_waiting": 24, "max_per_owner": 4}
-"""Files that are fetched from elsewhere at once: connections, not work."""
 DESCRIPTION = """Photographs in, scenes of flat Gaussians and their octagon meshes out.
 
 1. `POST /v1/datasets`, then `PUT` each file to `/v1/datasets/{id}/files/images/...` (and the COLMAP model to
    `sparse/0/...`), or one ZIP file to `/archive`; `GET .../files` says what has arrived.
-2. `POST /v1/datasets/{id}/commit` checks it.
+2. `POST /v1/datasets/{id}/commit` checks it; where that takes long, the answer is 202, and its `Location`
+   says how it goes.
 3. `POST /v1/jobs`, then poll its `Location` or listen to `/events`.
 4. `GET /v1/jobs/{id}/artifacts`.
 
@@ -108,7 +108,7 @@ def create_app(settings: ServiceSettings | None = None) -> FastAPI:
         license_info={"name": "Apache-2.0", "identifier": "Apache-2.0"},
     )
     for module_router in (
-        datasets.router, scene_previews.router, jobs.router, estimates.router,
+        datasets.router, dataset_tasks.router, scene_previews.router, jobs.router, estimates.router,
         events_and_logs.router, artifacts.router, webhooks.router, tokens.router, system.router,
         system.health_router, metrics.router, audit.router,
     ):  # fmt: skip
@@ -163,7 +163,7 @@ async def _service_lifespan(settings: ServiceSettings) -> AsyncIterator[Service]
         evictor = SpaceEvictor(pool, storage)
         try:
             login_throttle = LoginThrottle(settings.wrong_token_seconds)
-            yield Service(
+            service = Service(
                 settings=settings,
                 pool=pool,
                 job_queue=ProcrastinateQueue(),
@@ -172,18 +172,15 @@ async def _service_lifespan(settings: ServiceSettings) -> AsyncIterator[Service]
                 evictor=evictor,
                 login_throttle=login_throttle,
                 spool_space=settings.spool(),
-                check_limiter=_check_limiter(settings),
-                import_limiter=ConcurrencyLimiter("imports", **_IMPORTS),
             )
+            tasks = TaskRunner(service)
+            running = asyncio.create_task(tasks.run())
+            try:
+                yield service
+            finally:
+                await cancel_and_wait([running])
+                await tasks.close()
         finally:
             await evictor.close()
             event_broker.close()
             await cancel_and_wait([listening])
-
-
-def _check_limiter(settings: ServiceSettings) -> ConcurrencyLimiter:
-    """Return the limiter of validations; half of the places are reserved for other owners."""
-    at_once, waiting = settings.max_checks, settings.max_waiting_checks
-    return ConcurrencyLimiter(
-        "datasets", max_concurrent=at_once, max_waiting=waiting, max_per_owner=-(-(at_once + waiting) // 2)
-    )

@@ -96,18 +96,31 @@ class ProblemError(Exception):
         if retry_seconds is not None:
             self.headers["Retry-After"] = str(retry_seconds)
 
-    def response(self) -> JSONResponse:
-        """Return the problem as a JSON response (RFC 9457)."""
+    @classmethod
+    def from_document(cls, document: Mapping[str, Any]) -> "ProblemError":
+        """Return the problem of a document of :meth:`document`."""
+        code = str(document["type"]).removeprefix(TYPE_PREFIX)
+        status = int(document["status"])
+        again = RETRY_SECONDS if status in (429, 503, 507) else None
+        return cls(status, code, document["detail"], errors=document.get("errors"), retry_seconds=again)
+
+    def document(self) -> dict[str, Any]:
+        """Return the problem document (RFC 9457), without the id of a request."""
         content: dict[str, Any] = {
             "type": TYPE_PREFIX + self.code,
             "title": HTTPStatus(self.status).phrase,
             "status": self.status,
             "detail": self.detail,
         }
-        if (request_id := current_request_id()) is not None:
-            content["request_id"] = request_id
         if self.errors is not None:
             content["errors"] = [dict(error) for error in self.errors]
+        return content
+
+    def response(self) -> JSONResponse:
+        """Return the problem as a JSON response."""
+        content = self.document()
+        if (request_id := current_request_id()) is not None:
+            content["request_id"] = request_id
         return JSONResponse(content, status_code=self.status, headers=self.headers, media_type=MEDIA_TYPE)
 
 
@@ -184,6 +197,11 @@ def problem_from_error(error: OctasplatError) -> ProblemError:
     return ProblemError(422, "refused", shorten_absolute_paths(detail))
 
 
+def unexpected_problem() -> ProblemError:
+    """Return the problem of an error that nobody expected, of which the log says more."""
+    return ProblemError(500, "unexpected", "Something went wrong here; the service's log says what.")
+
+
 async def _on_problem(_request: Request, error: Exception) -> JSONResponse:
     assert isinstance(error, ProblemError)
     return error.response()
@@ -238,9 +256,7 @@ async def _on_integrity_error(_request: Request, error: Exception) -> JSONRespon
 
 async def _on_exception(request: Request, error: Exception) -> JSONResponse:
     logger.error("%s %s failed", request.method, request.url.path, exc_info=error)
-    return ProblemError(
-        500, "unexpected", "Something went wrong here; the service's log says what."
-    ).response()
+    return unexpected_problem().response()
 
 
 def _unlisted(count: int) -> str:

@@ -3,6 +3,7 @@
 import ipaddress
 import math
 import re
+from dataclasses import dataclass
 from typing import Annotated, Self
 
 from pydantic import Field, IPvAnyNetwork, SecretStr
@@ -20,11 +21,30 @@ from octasplat.workers.worker.job_kinds.resource_limits import LIMIT_UNITS
 
 DEFAULT_PORT = 8642
 MIN_TOKEN_BITS = 128
+MAX_WAIT_SECONDS = 50
+"""An answer waits no longer for a task, as usual proxies give up after 60 s."""
 _BODY_SECONDS = 90.0
 """Longer than an upload may be silent, which is answered with a problem."""
 _ALPHABETS = (("[0-9]*", 10), ("[0-9a-f]*|[0-9A-F]*", 16), ("[0-9a-z]*|[0-9A-Z]*", 36))
 _MIN_DISTINCT_CHARACTERS = 8
 """A text of fewer is none that was drawn at random."""
+
+
+@dataclass(frozen=True)
+class TaskShares:
+    """How many tasks of a kind there may be.
+
+    Attributes:
+        max_running: that one front end works on at once.
+        max_running_per_owner: that all work on at once for one owner.
+        max_unfinished: that wait or are worked on.
+        max_unfinished_per_owner: of those of one owner.
+    """
+
+    max_running: int
+    max_running_per_owner: int
+    max_unfinished: int
+    max_unfinished_per_owner: int
 
 
 class ServiceSettings(WorkerSettings):
@@ -49,7 +69,10 @@ class ServiceSettings(WorkerSettings):
         max_spool_bytes: what has come of all archives that are being read, on this machine's disk.
         spool_share: the part of them that one owner may take.
         max_checks: datasets that are checked at once.
-        max_waiting_checks: requests that wait for their dataset to be checked; further ones are refused.
+        max_waiting_checks: datasets that wait to be checked; further commits are refused, those of one owner
+            from half of all on.
+        commit_wait_seconds: how long the answer to a commit waits for its end unless the request says
+            otherwise.
         max_body_bytes: length of any other request.
         quota_datasets: datasets that an owner may have.
         quota_jobs: jobs of an owner that may be queued or running.
@@ -87,6 +110,7 @@ class ServiceSettings(WorkerSettings):
     spool_share: float = Field(0.5, gt=0, le=1)
     max_checks: int = Field(2, gt=0)
     max_waiting_checks: int = Field(24, ge=0)
+    commit_wait_seconds: float = Field(20.0, ge=0, le=MAX_WAIT_SECONDS)
     max_body_bytes: int = Field(1 << 20, gt=0)
     quota_datasets: int | None = Field(None, ge=0)
     quota_jobs: int | None = Field(None, ge=0)
@@ -130,6 +154,17 @@ class ServiceSettings(WorkerSettings):
     def upload_limits(self) -> UploadLimits:
         """Return the limits of uploads."""
         return UploadLimits(max_file_bytes=self.max_upload_bytes, max_archive_bytes=self.max_archive_bytes)
+
+    def check_shares(self) -> TaskShares:
+        """Return how many commits there may be; half of the places are reserved for other owners."""
+        places = self.max_checks + self.max_waiting_checks
+        return TaskShares(self.max_checks, places, places, -(-places // 2))
+
+    def import_shares(self) -> TaskShares:
+        """Return how many imports there may be: connections, not work."""
+        return TaskShares(
+            max_running=8, max_running_per_owner=4, max_unfinished=64, max_unfinished_per_owner=16
+        )
 
     def connection_limits(self, open_files: int) -> ConnectionLimits:
         """Return the limits of connections for a process that may have so many open files."""

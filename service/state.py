@@ -7,7 +7,6 @@ from typing import Annotated
 
 from fastapi import Depends, Request
 
-from octasplat.service.concurrency_limiter import ConcurrencyLimiter
 from octasplat.service.event_broker import EventBroker
 from octasplat.service.eviction import SpaceEvictor
 from octasplat.service.intake.spool import SpoolSpace
@@ -32,8 +31,7 @@ class Service:
         evictor: makes room in the store.
         login_throttle: counts wrong tokens.
         spool_space: room for archives while they are read.
-        check_limiter: lets in those whose datasets are checked.
-        import_limiter: lets in those for whom files are fetched.
+        task_added: set when a task on a dataset was added, which this process may take.
         storage_check: what the store was last found to be, or is being.
         metrics: counts what this process does.
         is_draining: whether it is about to stop.
@@ -48,8 +46,7 @@ class Service:
     evictor: SpaceEvictor
     login_throttle: LoginThrottle
     spool_space: SpoolSpace
-    check_limiter: ConcurrencyLimiter
-    import_limiter: ConcurrencyLimiter
+    task_added: asyncio.Event = field(default_factory=asyncio.Event)
     storage_check: "asyncio.Future[str] | None" = None
     metrics: Metrics = field(default_factory=Metrics)
     is_draining: bool = False

@@ -15,7 +15,7 @@ from jaxtyping import Float64, Int64
 from octasplat.engine.core.errors import DatasetError
 from octasplat.engine.core.local_origin import NO_ORIGIN, Origin, choose_origin
 from octasplat.engine.dataset.camera import Camera
-from octasplat.engine.dataset.colmap_reading import load_model
+from octasplat.engine.dataset.colmap_reading import LoadedModel, load_model
 from octasplat.engine.dataset.model import SparsePoints
 from octasplat.engine.dataset.pose_check import check_poses
 
@@ -23,6 +23,15 @@ MIN_QUATERNION_NORM = 1e-6
 """Quaternions shorter than this say nothing about a rotation."""
 ROUNDING = 1e-9
 """Camera centres no farther apart than this share of their coordinates stand in one place."""
+_POINT = np.dtype(
+    [
+        ("id", np.uint64),
+        ("xyz", np.float64, 3),
+        ("color", np.uint8, 3),
+        ("track", np.int32),
+        ("error", np.float64),
+    ]
+)
 UNIT_NORM_TOLERANCE = 1e-9
 """Lengths of quaternions this near to 1 need no correction."""
 WARN_NORM_TOLERANCE = 1e-3
@@ -89,15 +98,23 @@ def read_colmap_model(
     Raises:
         DatasetError: the model lacks something, is damaged, or it holds values that are not finite.
     """
-    loaded = load_model(folder, sizes_px)
+    return colmap_model_of(load_model(folder, sizes_px), folder, origin_world=origin_world)
+
+
+def colmap_model_of(loaded: LoadedModel, folder: Path, *, origin_world: Origin | None = None) -> ColmapModel:
+    """Return the content of a model that is loaded already, whose quaternions are normalised in place.
+
+    Arguments and errors are those of :func:`read_colmap_model`.
+    """
     reconstruction, warnings = loaded.reconstruction, list(loaded.notes)
     _normalise_quaternions(reconstruction, folder, warnings)
     images = _posed_images(reconstruction, folder, warnings)
     cameras = _convert_cameras(reconstruction, {image.camera_id for image in images}, folder, warnings)
-    points_world = _point_positions(reconstruction)
+    columns = _point_columns(reconstruction)
+    points_world = columns["xyz"]
     origin = _local_origin(images, points_world) if origin_world is None else origin_world
     images = tuple(_about_origin(image, origin) for image in images)
-    points = _sparse_points(reconstruction, points_world - np.array(origin), folder, warnings)
+    points = _sparse_points(columns, points_world - np.array(origin), folder, warnings)
     if images:
         rotations = np.stack([image.rotation_cam_from_world for image in images])
         translations = np.stack([image.translation_cam_from_world for image in images])
@@ -181,9 +198,11 @@ def _posed_images(reconstruction: Any, folder: Path, warnings: list[str]) -> tup
                 f"The pose of {image.name} in {folder} is not a finite rigid motion; run COLMAP again."
             )
         observed = image.get_observation_points2D()
-        observed_px = np.array([point.xy for point in observed], np.float64).reshape(-1, 2)
+        coordinates = (value for point in observed for value in (point.x(), point.y()))
+        observed_px = np.fromiter(coordinates, np.float64, 2 * len(observed)).reshape(-1, 2)
+        point_ids = np.fromiter((point.point3D_id for point in observed), np.uint64, len(observed))
         # Beyond what a signed number holds lies only COLMAP's mark for none.
-        observed_points = np.array([point.point3D_id for point in observed], np.uint64).astype(np.int64)
+        observed_points = point_ids.astype(np.int64)
         pose = matrix[:, :3].copy(), matrix[:, 3].copy()
         images.append(
             PosedImage(_image_name(image, folder), int(image.camera_id), *pose, observed_px, observed_points)
@@ -234,9 +253,18 @@ def _convert_cameras(
     return cameras
 
 
-def _point_positions(reconstruction: Any) -> Float64[np.ndarray, "n 3"]:
-    points = sorted(reconstruction.points3D.items(), key=lambda item: item[0])
-    return np.array([point.xyz for _, point in points], dtype=np.float64).reshape(-1, 3)
+def _point_columns(reconstruction: Any) -> np.ndarray:
+    """Return the points of a reconstruction by their numbers, as rows of :data:`_POINT`.
+
+    They are read one by one, as objects of Python for millions of them take more memory than the points.
+    """
+    points = reconstruction.points3D
+    rows = (
+        (number, point.xyz, point.color, point.track.length(), point.error)
+        for number, point in points.items()
+    )
+    columns = np.fromiter(rows, _POINT, len(points))
+    return columns[np.argsort(columns["id"])]
 
 
 def _local_origin(images: Sequence[PosedImage], points_world: Float64[np.ndarray, "n 3"]) -> Origin:
@@ -266,18 +294,17 @@ def _about_origin(image: PosedImage, origin: Origin) -> PosedImage:
 
 
 def _sparse_points(
-    reconstruction: Any, xyz_local: Float64[np.ndarray, "n 3"], folder: Path, warnings: list[str]
+    columns: np.ndarray, xyz_local: Float64[np.ndarray, "n 3"], folder: Path, warnings: list[str]
 ) -> SparsePoints:
-    points = [point for _, point in sorted(reconstruction.points3D.items(), key=lambda item: item[0])]
     xyz = xyz_local.astype(np.float32)
-    rgb = np.array([point.color for point in points], dtype=np.float32).reshape(-1, 3) / np.float32(255)
-    tracks = np.array([point.track.length() for point in points], dtype=np.int32)
-    errors = np.array([point.error for point in points], dtype=np.float32)
-    ids = np.array(sorted(reconstruction.points3D), np.uint64).astype(np.int64)
+    rgb = columns["color"].astype(np.float32) / np.float32(255)
+    tracks = columns["track"]
+    errors = columns["error"].astype(np.float32)
+    ids = columns["id"].astype(np.int64)
     announced = _declared_point_count(folder / "points3D.txt")
-    if not (folder / "points3D.bin").is_file() and announced is not None and announced != len(points):
+    if not (folder / "points3D.bin").is_file() and announced is not None and announced != len(columns):
         warnings.append(
-            f"{folder / 'points3D.txt'} announces {announced} points but holds {len(points)}; "
+            f"{folder / 'points3D.txt'} announces {announced} points but holds {len(columns)}; "
             "it may have been cut short."
         )
     finite = np.isfinite(xyz).all(axis=1)

@@ -10,11 +10,16 @@ import httpx
 
 from octasplat.service.actions import uploads
 from octasplat.service.actions.access import check_not_draining, open_dataset
-from octasplat.service.actions.uploads import StoredArchive, Upload
+from octasplat.service.actions.dataset_tasks import TaskOutcome, check_share, new_task
+from octasplat.service.actions.uploads import Upload
 from octasplat.service.auth import Principal
-from octasplat.service.problems import ProblemError
+from octasplat.service.idempotency import create_once, fingerprint
+from octasplat.service.problems import ProblemError, not_found_error
 from octasplat.service.schemas.datasets import NewImport
 from octasplat.service.state import Service
+from octasplat.workers.db.connections import retry_on_deadlock
+from octasplat.workers.db.dataset_tasks import DatasetTask, get_task
+from octasplat.workers.db.locks import lock_owner
 from octasplat.workers.maintenance.webhooks.addresses import AddressRefusedError, check_url
 from octasplat.workers.maintenance.webhooks.guarded_transport import OWNER_EXTENSION
 from octasplat.workers.maintenance.webhooks.sender import guarded_client
@@ -22,35 +27,70 @@ from octasplat.workers.maintenance.webhooks.sender import guarded_client
 MAX_REDIRECTS = 5
 HEADER_SECONDS = 30.0
 """For an address to begin its answer."""
+MAX_LEFT_OUT = 1000
+"""Names of files left out that the result of an import lists at most."""
 
 
-async def import_files(
-    service: Service, principal: Principal, dataset_id: uuid.UUID, new: NewImport
-) -> StoredArchive:
-    """Fetch a ZIP file, or one file, from an address and store it as an upload is.
+@retry_on_deadlock
+async def request_import(
+    service: Service,
+    principal: Principal,
+    dataset_id: uuid.UUID,
+    new: NewImport,
+    *,
+    idempotency_key: str | None = None,
+) -> DatasetTask:
+    """Return the task that fetches a ZIP file, or one file, from an address and stores it as an upload is.
 
     Raises:
-        ProblemError: 404, 422 for an address that nothing is fetched from or that does not answer well, 429
-            while too many others fetch.
+        ProblemError: 404, 422 for an address that nothing is fetched from, 429 with too many that wait.
         ConflictError: the dataset is not open.
+        IntakeError: the name of the file is refused.
+    """
+    check_not_draining(service)
+    try:
+        check_url(new.url, service.settings.webhook_hosts)
+    except AddressRefusedError as error:
+        raise _import_error(str(error), "import-address") from None
+    async with service.pool.connection() as connection, connection.transaction():
+        dataset = await open_dataset(connection, principal, dataset_id)
+        if new.path is not None:
+            uploads.check_file_name_of(dataset, new.path)
+
+        async def make() -> uuid.UUID:
+            await lock_owner(connection, dataset.owner)
+            await check_share(connection, service.settings.import_shares(), dataset.owner, "import")
+            return (await new_task(service, connection, dataset, "import", new.model_dump())).id
+
+        request = fingerprint("import", str(dataset_id), new.model_dump())
+        task_id, _ = await create_once(connection, principal, idempotency_key, request, make)
+        task = await get_task(connection, task_id)
+    if task is None:
+        raise not_found_error("task")
+    return task
+
+
+async def run_import(service: Service, task: DatasetTask) -> TaskOutcome:
+    """Fetch what an import asks for; the outcome counts the files.
+
+    Raises:
+        ProblemError: 422 for an address that does not answer well.
         IntakeError: the content is refused.
         QuotaExceededError: its owner may not store as much.
         StorageError: it is not as announced, or there is no room.
     """
-    check_not_draining(service)
-    async with service.pool.connection() as connection:
-        await open_dataset(connection, principal, dataset_id)
-    async with (
-        service.import_limiter.limited(principal.owner),
-        _opened(service, principal, new.url) as answer,
-    ):
+    new = NewImport.model_validate(task.request)
+    owner = Principal(task.owner, frozenset({"write"}), task.id)
+    async with _opened(service, owner, new.url) as answer:
         text = answer.headers.get("content-length", "")
         length = int(text) if text.isdigit() and "content-encoding" not in answer.headers else None
         upload = Upload(_body(answer), sha256=new.sha256, size_bytes=length)
-        if new.path is None:
-            return await uploads.put_archive(service, principal, dataset_id, upload)
-        stored = await uploads.put_file(service, principal, dataset_id, new.path, upload)
-        return StoredArchive([stored.row], (), ())
+        if new.path is not None:
+            await uploads.put_file(service, owner, task.dataset_id, new.path, upload)
+            return TaskOutcome({"files": 1, "left_out": [], "notes": []})
+        stored = await uploads.put_archive(service, owner, task.dataset_id, upload)
+    left_out = list(stored.left_out[:MAX_LEFT_OUT])
+    return TaskOutcome({"files": len(stored.files), "left_out": left_out, "notes": list(stored.notes)})
 
 
 @asynccontextmanager

@@ -129,7 +129,7 @@ async def put_file(
     check_not_draining(service)
     async with service.pool.connection() as connection:
         dataset = await open_dataset(connection, principal, dataset_id)
-        check = _content_check_for(dataset, path)
+        check = check_file_name_of(dataset, path)
         known = await rows.get_file(connection, dataset_id, path)
         left = await bytes_left(connection, dataset.owner, service.settings.quota)
         had = await owned_bytes(connection, dataset.owner, upload.sha256) if upload.sha256 is not None else 0
@@ -210,8 +210,12 @@ def _is_stored(storage: Storage, file: DatasetFile) -> bool:
         return False
 
 
-def _content_check_for(dataset: Dataset, path: str) -> ContentCheck:
-    """Return the content check for a valid file name."""
+def check_file_name_of(dataset: Dataset, path: str) -> ContentCheck:
+    """Return the content check for a valid file name.
+
+    Raises:
+        IntakeError: a dataset of this kind takes no file of that name.
+    """
     if dataset.holds == "files":
         check_input_name(path)
         return check_input_content

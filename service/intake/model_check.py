@@ -33,13 +33,16 @@ class ModelLimits:
     Attributes:
         memory_bytes: address space of the child; some 0.6 GB of it are the libraries. By default a quarter of
             the machine's memory, but 2 GiB at least and 6 GiB at most.
-        seconds: time.
+        cpu_seconds: processor time; a million points take some 7 s.
+        seconds: time by the clock, several times as long, as a busy machine gives the child a part of one
+            core.
         max_model_bytes: length of the model's files together.
         hidden: folders that the child cannot open.
     """
 
     memory_bytes: int = field(default_factory=lambda: min(6 << 30, max(2 << 30, total_memory_bytes() // 4)))
-    seconds: int = 120
+    cpu_seconds: int = 240
+    seconds: int = 900
     max_model_bytes: int = 4 << 30
     hidden: tuple[Path, ...] = ()
 
@@ -77,7 +80,7 @@ def check_model(
             sizes_px=dict(sizes_px),
             min_views=MIN_VIEWS,
             memory_bytes=limits.memory_bytes,
-            cpu_seconds=limits.seconds,
+            cpu_seconds=limits.cpu_seconds,
             hidden=limits.hidden,
         )
         return _run_model_child(request, limits)
@@ -110,7 +113,10 @@ def _run_model_child(request: ModelRequest, limits: ModelLimits) -> ModelAnswer:
         noise.seek(max(0, noise.seek(0, os.SEEK_END) - 2000))
         output = noise.read(2000)
     if child.returncode == -signal.SIGXCPU or child.returncode == -signal.SIGKILL:
-        return _failed_answer("model-timeout", f"Reading the COLMAP model took more than {limits.seconds} s.")
+        return _failed_answer(
+            "model-timeout",
+            f"Reading the COLMAP model took more than {limits.cpu_seconds} s of processor time.",
+        )
     try:
         return ModelAnswer.model_validate_json(text)
     except ValidationError:

@@ -84,7 +84,7 @@ def main() -> None:
 def check(request: ModelRequest) -> ModelAnswer:
     """Parse the model and list all its faults."""
     from octasplat.engine.core.errors import DatasetError
-    from octasplat.engine.dataset.colmap_model import read_colmap_model
+    from octasplat.engine.dataset.colmap_model import colmap_model_of
     from octasplat.engine.dataset.colmap_reading import load_model
     from octasplat.engine.dataset.model_sources import find_model
 
@@ -97,12 +97,12 @@ def check(request: ModelRequest) -> ModelAnswer:
             if (request.root / path).parent == (folder if folder.is_dir() else folder.parent)
         }
         checker.request = request = request.model_copy(update={"files": own})
-        reconstruction = load_model(folder, request.sizes_px).reconstruction
-        checker.check_images(reconstruction)
-        checker.check_cameras(reconstruction)
+        loaded = load_model(folder, request.sizes_px)
+        checker.check_images(loaded.reconstruction)
+        checker.check_cameras(loaded.reconstruction)
         if checker.faults:
             return ModelAnswer(faults=checker.faults)
-        model = read_colmap_model(folder, sizes_px=request.sizes_px)
+        model = colmap_model_of(loaded, folder)
     except DatasetError as error:
         return _fault_answer(
             "model-damaged", _without_root(str(error), request.root), _file_in_sentence(str(error), request)

@@ -1,4 +1,4 @@
-"""Routes of datasets: created, filled file by file or by an archive, committed, read, deleted."""
+"""Routes of datasets: created, filled file by file or by an archive, read, deleted."""
 
 from collections.abc import AsyncIterator
 from typing import Annotated, Any
@@ -7,7 +7,7 @@ from fastapi import APIRouter, Header, Path, Request, Response
 from starlette.requests import ClientDisconnect
 
 from octasplat.service.actions import datasets as actions
-from octasplat.service.actions import imports, uploads
+from octasplat.service.actions import uploads
 from octasplat.service.actions.usage import rate_limit_headers
 from octasplat.service.auth import Reader, Writer
 from octasplat.service.downloads import send_blob
@@ -41,7 +41,6 @@ from octasplat.service.schemas.datasets import (
     FilePage,
     FileView,
     NewDataset,
-    NewImport,
 )
 from octasplat.service.state import ServiceDep
 from octasplat.workers.db.rows import Dataset
@@ -190,25 +189,6 @@ async def put_archive(
     """Upload a scene as a ZIP file; its files are added to those that are there."""
     archive = await uploads.put_archive(service, principal, dataset_id, _upload_of_request(request, digest))
     return _archive_view(archive)
-
-
-@router.post("/{dataset_id}/import", responses=problem_responses(404, 408, 409, 413, 507))
-async def import_files(
-    dataset_id: DatasetId, new: NewImport, principal: Writer, service: ServiceDep, _key: IdempotencyKey = None
-) -> ArchiveView:
-    """Fetch a scene as a ZIP file, or one file, from an address; its files are added to those that are there.
-
-    The answer comes when everything is stored; if it is lost on the way, `GET .../files` shows what has come.
-    """
-    return _archive_view(await imports.import_files(service, principal, dataset_id, new))
-
-
-@router.post("/{dataset_id}/commit", responses=problem_responses(404, 409))
-async def commit_dataset(
-    dataset_id: DatasetId, principal: Writer, service: ServiceDep, _key: IdempotencyKey = None
-) -> DatasetView:
-    """Validate and commit the dataset; it never changes again and jobs can use it. Faults are in `errors`."""
-    return DatasetView.from_row(await actions.commit_dataset(service, principal, dataset_id))
 
 
 def _archive_view(archive: uploads.StoredArchive) -> ArchiveView:

@@ -30,7 +30,9 @@ async def read_log(
 ) -> LogPage:  # fmt: skip
     """Return the job's log: stages, pace, warnings, errors with their cause, and the program's output."""
     lines = await actions.read_log(service, principal, job_id, after=after, limit=limit)
-    return LogPage(lines=[LogLineView.from_row(row) for row in lines], next=lines[-1].number if lines else after)
+    return LogPage(
+        lines=[LogLineView.from_row(row) for row in lines], next=lines[-1].number if lines else after
+    )
 
 
 @router.get("/{job_id}/timeline", responses=problem_responses(404))

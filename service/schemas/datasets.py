@@ -80,7 +80,9 @@ class DatasetView(BaseModel):
     id: uuid.UUID
     name: str
     holds: DatasetHolds
-    state: DatasetState = Field(description="`open` takes files, `committed` never changes again.")
+    state: DatasetState = Field(
+        description="`open` takes files, `checking` waits for its commit, `committed` never changes again."
+    )
     has_poses: bool = Field(description="Whether it holds a COLMAP model; if not, ask for `poses: auto`.")
     photographs: int
     facts: dict[str, Any] = Field(description="What the check at commit found out.")

@@ -1,6 +1,5 @@
 """Scenes that the service fetches from an address, and addresses that it must not ask."""
 
-import asyncio
 import contextlib
 import hashlib
 import time
@@ -11,7 +10,7 @@ import pytest
 
 from tests.support.http_server import QuietHandler, serve_http
 from tests.support.model_builder import ColmapModelBuilder, photographs
-from tests.support.service_harness import ConnectService, client_with_token
+from tests.support.service_harness import ConnectService, client_with_token, task_over
 from tests.support.zip_builder import ZipMember, build_zip
 
 SCENE = {**photographs(), **ColmapModelBuilder().files()}
@@ -50,18 +49,20 @@ async def test_scene_is_fetched_from_an_address(connect_service: ConnectService,
         async def fetch(**body: Any):  # type: ignore[no-untyped-def]
             made = (await http.post("/v1/datasets", json={"name": "a"})).json()
             address = f"/v1/datasets/{made['id']}"
-            return address, await http.post(f"{address}/import", json=body)
+            return address, await task_over(http, await http.post(f"{address}/import", json=body))
 
         sha256 = hashlib.sha256(ARCHIVE).hexdigest()
-        address, answer = await fetch(url=f"{elsewhere}/to={elsewhere}/scene.zip", sha256=sha256)
-        assert answer.status_code == 200, answer.text
-        assert {file["path"] for file in answer.json()["files"]} == set(SCENE)
+        address, task = await fetch(url=f"{elsewhere}/to={elsewhere}/scene.zip", sha256=sha256)
+        assert task["state"] == "succeeded", task
+        assert task["result"] == {"files": len(SCENE), "left_out": [], "notes": []}
         listed = (await http.get(f"{address}/files")).json()["files"]
         assert {file["path"]: file["sha256"] for file in listed} == {
             name: hashlib.sha256(content).hexdigest() for name, content in SCENE.items()
         }
-        address, answer = await fetch(url=f"{elsewhere}/a.png", path="images/b.png")
-        assert [file["path"] for file in answer.json()["files"]] == ["images/b.png"]
+        address, task = await fetch(url=f"{elsewhere}/a.png", path="images/b.png")
+        assert task["result"]["files"] == 1
+        listed = (await http.get(f"{address}/files")).json()["files"]
+        assert [file["path"] for file in listed] == ["images/b.png"]
         for url, kind, words in (
             (f"{elsewhere}/nothing.zip", "import", "answered 404"),
             (f"{elsewhere}/cut.zip", "import", "broke off"),
@@ -69,14 +70,13 @@ async def test_scene_is_fetched_from_an_address(connect_service: ConnectService,
             (f"{elsewhere}/to=file:///etc/passwd", "import-address", "cannot be read"),
             ("http://127.0.0.1:1/x.zip", "import", "cannot be reached"),
         ):
-            address, answer = await fetch(url=url)
-            assert answer.status_code == 422, (url, answer.text)
-            assert answer.json()["type"].endswith(f":{kind}") and words in answer.json()["detail"], (
-                answer.text
-            )
+            address, task = await fetch(url=url)
+            problem = task["problem"]
+            assert (task["state"], problem["status"]) == ("failed", 422), (url, task)
+            assert problem["type"].endswith(f":{kind}") and words in problem["detail"], problem
             assert (await http.get(f"{address}/files")).json()["files"] == []
-        _, answer = await fetch(url=f"{elsewhere}/scene.zip", sha256="0" * 64)
-        assert answer.json()["type"].endswith(":digest-mismatch")
+        _, task = await fetch(url=f"{elsewhere}/scene.zip", sha256="0" * 64)
+        assert task["problem"]["type"].endswith(":digest-mismatch")
         stranger = await client_with_token(_service, "stranger", "write")
         body = {"url": f"{elsewhere}/scene.zip"}
         assert (await http.post(f"{address}/import", json=body, headers=stranger)).status_code == 404
@@ -103,8 +103,6 @@ async def test_headers_that_trickle_are_not_waited_for(
     monkeypatch.setattr("octasplat.service.actions.imports.HEADER_SECONDS", 0.5)
     async with connect_service(webhook_hosts=HERE) as (http, _service):
         made = (await http.post("/v1/datasets", json={"name": "a"})).json()
-        async with asyncio.timeout(20):
-            answer = await http.post(
-                f"/v1/datasets/{made['id']}/import", json={"url": f"{elsewhere}/trickle"}
-            )
-        assert (answer.status_code, answer.json()["type"]) == (422, "urn:octasplat:problem:import")
+        body = {"url": f"{elsewhere}/trickle"}
+        task = await task_over(http, await http.post(f"/v1/datasets/{made['id']}/import", json=body), 20)
+        assert task["problem"]["type"] == "urn:octasplat:problem:import"

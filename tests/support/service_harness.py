@@ -1,5 +1,6 @@
 """A service within the test's own process, and short ways to its tables."""
 
+import asyncio
 import os
 import uuid
 from collections.abc import AsyncIterator
@@ -102,6 +103,17 @@ def api_environment(conninfo: str, folder: Path) -> dict[str, str]:
     }
 
 
+async def task_over(http: httpx.AsyncClient, answer: httpx.Response, seconds: float = 60.0) -> dict[str, Any]:
+    """The task that an answer of 202 names, when it is over."""
+    assert answer.status_code == 202, answer.text
+    async with asyncio.timeout(seconds):
+        while True:
+            task: dict[str, Any] = (await http.get(answer.headers["Location"])).json()
+            if task["state"] in ("succeeded", "failed"):
+                return task
+            await asyncio.sleep(0.02)
+
+
 async def claim_job(service: Service, job: dict[str, Any]) -> Attempt:
     """The job as a worker has it."""
     async with service.pool.connection() as connection:
@@ -138,4 +150,5 @@ __all__ = [
     "committed_dataset",
     "running_service",
     "store_content",
+    "task_over",
 ]

@@ -124,8 +124,12 @@ class Api:
 
     def post(self, path: str, body: Any = None, *, key: str | None = None) -> Any:
         """Return the JSON of a POST; with a key, which is made if not given, it is safe to try again."""
+        return _response_json(self.post_response(path, body, key=key))
+
+    def post_response(self, path: str, body: Any = None, *, key: str | None = None) -> httpx.Response:
+        """Return the answer to a POST, as :meth:`post`."""
         headers = {"Idempotency-Key": key or uuid.uuid4().hex}
-        return _response_json(self.request("POST", path, json=body, headers=headers))
+        return self.request("POST", path, json=body, headers=headers)
 
     def request(self, method: str, path: str, **arguments: Any) -> httpx.Response:
         """Send a request, again while the service is away or busy; bodies must be content or JSON.
@@ -218,6 +222,16 @@ def _response_json(response: httpx.Response) -> Any:
         ) from None
 
 
+def problem_error(problem: Mapping[str, Any], status: int) -> ServiceError:
+    """Return the error that a problem document (RFC 9457) tells."""
+    detail, errors = str(problem["detail"]), tuple(problem.get("errors") or ())
+    further = [_error_text(e) for e in errors if e.get("detail") and str(e["detail"]) != detail]
+    if further:
+        more = f" and {len(further) - 5} more" if len(further) > 5 else ""
+        detail = f"{detail} {' '.join(further[:5])}{more}"
+    return ServiceError(detail, status, errors)
+
+
 def _service_error(response: httpx.Response) -> ServiceError:
     """Return what the service, or whoever answered for it, refuses."""
     if response.is_redirect:
@@ -227,17 +241,13 @@ def _service_error(response: httpx.Response) -> ServiceError:
             response.status_code,
         )
     try:
-        problem = response.json()
-        detail, errors = str(problem["detail"]), tuple(problem.get("errors") or ())
+        error = problem_error(response.json(), response.status_code)
     except (ValueError, KeyError, TypeError):
-        detail, errors = f"The service answered {response.status_code} to {response.request.url}.", ()
-    further = [_error_text(e) for e in errors if e.get("detail") and str(e["detail"]) != detail]
-    if further:
-        more = f" and {len(further) - 5} more" if len(further) > 5 else ""
-        detail = f"{detail} {' '.join(further[:5])}{more}"
+        detail = f"The service answered {response.status_code} to {response.request.url}."
+        error = ServiceError(detail, response.status_code)
     if response.status_code == 401:
-        detail = f"{detail.split(':')[0]}: set {TOKEN_VARIABLE}."
-    return ServiceError(detail, response.status_code, errors)
+        return ServiceError(f"{str(error).split(':')[0]}: set {TOKEN_VARIABLE}.", 401, error.errors)
+    return error
 
 
 def _error_text(error: Mapping[str, Any]) -> str:

@@ -11,10 +11,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import httpx
+
 from octasplat.engine.core.errors import DatasetError
 from octasplat.engine.core.scene_layout import is_ignored_file
 from octasplat.workers.client.api import Api, ServiceError
 from octasplat.workers.client.backoff import Backoff
+from octasplat.workers.client.dataset_tasks import wait_for_task
 
 PARALLEL_UPLOADS = 4
 MAX_CHECK_WAIT_SECONDS = 600.0
@@ -134,7 +137,7 @@ def upload_scene(
             _send_archive(api, dataset["id"], files[0], progress)
         else:
             _send_missing(api, dataset["id"], files, progress)
-    return _commit(api, dataset)
+    return commit(api, dataset)
 
 
 def upload_files(
@@ -162,21 +165,32 @@ def upload_files(
     dataset = _find_or_create_dataset(api, name, local, holds="files")
     if dataset["state"] == "open":
         _send_missing(api, dataset["id"], local, progress)
-    return _commit(api, dataset)
+    return commit(api, dataset)
 
 
-def _commit(api: Api, dataset: dict[str, Any]) -> dict[str, Any]:
-    """Commit a dataset, after a check that is under way; one that was broken off is taken over in a while."""
+def commit(api: Api, dataset: dict[str, Any]) -> dict[str, Any]:
+    """Commit a dataset, however long its check takes; returns it.
+
+    Raises:
+        ServiceError: the service refuses it; the text names the files.
+    """
     address, patience = f"/v1/datasets/{dataset['id']}", Backoff(MAX_CHECK_WAIT_SECONDS)
     while dataset["state"] != "committed":
         try:
-            dataset = api.post(f"{address}/commit")
+            response = api.post_response(f"{address}/commit")
         except ServiceError as error:
             if error.status != 409:
                 raise
             dataset = api.get(address)
+            # A front end of the former version checks it, or did so until it was lost.
             if dataset["state"] != "committed" and not patience.wait():
                 raise
+        else:
+            if response.status_code == httpx.codes.ACCEPTED:
+                wait_for_task(api, response.json())
+                dataset = api.get(address)
+            else:
+                dataset = response.json()
     return dataset
 
 

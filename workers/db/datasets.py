@@ -235,27 +235,41 @@ class Check:
     said_at: list[datetime] = field(default_factory=list)
 
 
-async def begin_check(connection: Connection, dataset_id: uuid.UUID) -> Check:
-    """Close an open dataset for its validation.
+async def announce_check(connection: Connection, dataset: Dataset) -> None:
+    """Close a dataset, which this transaction has locked, for a validation that is about to begin.
 
     Raises:
         ConflictError: it is being validated already.
+    """
+    if dataset.state == "checking" and not await _is_check_stale(connection, dataset.id):
+        raise ConflictError("The dataset is being checked already; ask again in a moment.")
+    await _close(connection, dataset.id)
+
+
+async def begin_check(connection: Connection, dataset_id: uuid.UUID) -> Check:
+    """Close a dataset for its validation by this process, whoever has closed it before.
+
+    Raises:
         NotFoundError: there is no such dataset.
     """
     async with connection.transaction():
         dataset = await get_dataset(connection, dataset_id, lock=True)
         if dataset is None:
             raise NotFoundError("dataset")
-        if dataset.state == "checking" and not await _is_check_stale(connection, dataset_id):
-            raise ConflictError("The dataset is being checked already; ask again in a moment.")
         check = Check(dataset)
         if dataset.state != "committed":
-            check.said_at.append(await _database_time(connection))
-            await connection.execute(
-                "UPDATE datasets SET state = 'checking', used_at = %s, expires_at = NULL WHERE id = %s",
-                [check.said_at[-1], dataset_id],
-            )
+            check.said_at.append(await _close(connection, dataset_id))
         return check
+
+
+async def _close(connection: Connection, dataset_id: uuid.UUID) -> datetime:
+    """Close a dataset for its validation; returns when."""
+    said_at = await _database_time(connection)
+    await connection.execute(
+        "UPDATE datasets SET state = 'checking', used_at = %s, expires_at = NULL WHERE id = %s",
+        [said_at, dataset_id],
+    )
+    return said_at
 
 
 async def renew_check(connection: Connection, check: Check) -> None:
@@ -271,11 +285,15 @@ async def renew_check(connection: Connection, check: Check) -> None:
 
 
 async def reopen_stale_checks(connection: Connection) -> int:
-    """Reopen datasets whose validation was abandoned; returns how many."""
+    """Reopen datasets whose validation was abandoned and no task goes on with; returns how many."""
     cursor = await connection.execute(
         """
         UPDATE datasets SET state = 'open' WHERE id IN (
             SELECT id FROM datasets WHERE state = 'checking' AND used_at < now() - make_interval(secs => %s)
+              AND NOT EXISTS (
+                SELECT FROM dataset_tasks WHERE dataset_id = datasets.id AND kind = 'commit'
+                  AND state IN ('queued', 'running')
+              )
             ORDER BY id FOR UPDATE SKIP LOCKED
         )
         """,

@@ -64,7 +64,8 @@ async def list_job_events(
         JobEvent,
         """
         SELECT {} FROM job_events WHERE job_id = %(job)s AND number > (
-            SELECT CASE WHEN %(after)s > events THEN 0 ELSE %(after)s END FROM job_counts WHERE job_id = %(job)s
+            SELECT CASE WHEN %(after)s > events THEN 0 ELSE %(after)s END
+            FROM job_counts WHERE job_id = %(job)s
         ) ORDER BY number LIMIT %(limit)s
         """,
         {"job": job_id, "after": after, "limit": limit},

@@ -12,6 +12,7 @@ from psycopg import sql
 
 from octasplat.workers.db.audit import delete_old_entries
 from octasplat.workers.db.connections import Connection, Pool
+from octasplat.workers.db.dataset_tasks import delete_old_tasks
 from octasplat.workers.db.datasets import get_dataset, reopen_stale_checks
 from octasplat.workers.db.errors import ConflictError
 from octasplat.workers.db.locks import about_to_lock_jobs, lock_owner
@@ -55,7 +56,7 @@ async def apply_retention(pool: Pool, retention: Retention, audit_hours: float) 
         await update_expiry_times(connection, retention)
     async with pool.connection() as connection:
         await delete_expired(connection)
-    for forget in (purge_deliveries, delete_old_idempotency_keys, delete_old_sessions):
+    for forget in (purge_deliveries, delete_old_idempotency_keys, delete_old_sessions, delete_old_tasks):
         async with pool.connection() as connection:
             await forget(connection)
     async with pool.connection() as connection:

@@ -39,7 +39,10 @@ export class Upload {
                 if (!archive) await this.removeOthers(dataset.id, arrived, items);
                 await this.sendAll(items, (item) => archive ? `/v1/datasets/${dataset.id}/archive` : address(dataset.id, item.name), arrived);
                 this.report("checking");
-                dataset = await this.again(() => fetch(`/v1/datasets/${dataset.id}/commit`, { method: "POST" }).then(answer));
+            }
+            const { id } = dataset;
+            while (dataset.state !== "committed") { // an answer comes after some seconds, whether it is over or not
+                dataset = await this.again(() => fetch(`/v1/datasets/${id}/commit`, { method: "POST" }).then(answer));
             }
             return dataset;
         } finally {
